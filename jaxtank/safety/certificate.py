@@ -47,11 +47,11 @@ class TankCertificate:
     tank : counted from 0.  limit : H [cm].  certified : True if no plant of the box passes it: the
     conditions of the design hold, and those of `checker.check`.  starts : the levels at t = 0 for
     which that holds (`checker.ANY` or `checker.OWN`), "" where it is not proved.  reason : the
-    condition that failed with both of its numbers, "not covered: FEATURE", or the theorem.  rate, rate_bound :
-    kappa and the largest that is proved [1/s].  gap : how far below the limit the nominal plant
-    rests with its pumps full [cm], nan where they cannot reach it.  reach : what the level never
-    passes [cm]; inf if unknown.  low : low limit [cm], 0 for none.  low_certified, low_reason : of
-    the low limit, as above.
+    theorem, or the condition that failed with both of its numbers, or "not covered: FEATURE".
+    rate, rate_bound : kappa and the largest that is proved [1/s].  gap : how far below the limit
+    the nominal plant rests with its pumps full [cm], nan where they cannot reach it.  reach : what
+    the level never passes [cm]; inf if unknown.  low : low limit [cm], 0 for none.  low_certified,
+    low_reason : of the low limit, as above.
     """
 
     tank: int
@@ -187,7 +187,7 @@ def design(
         sensor,
         hold=hold,
         substeps=substeps,
-        box=_intervals(widths, {"plant": plant, "actuator": actuator, "sensor": sensor}, start),
+        box=_intervals(widths, {"plant": plant, "actuator": actuator, "sensor": sensor}),
         inflow=(draw, inflow),
         volume=volume,
         drawn=drawn,
@@ -198,14 +198,16 @@ def design(
     return guard, tuple(_checked(*pair, plant.units[0]) for pair in zip(rows, verdicts))
 
 
-def _intervals(widths, parts, start):
-    """{dotted name: (lower, upper)} of `widths`."""
+def _intervals(widths, parts):
+    """{dotted name: (lower, upper)} of `widths`; those of levels at t = 0 are in the start."""
     found = {}
     for name, width in widths.items():
-        name = name if "." in name or name.startswith("x0") else f"plant.{name}"
+        if name.startswith("x0"):
+            continue
+        name = name if "." in name else f"plant.{name}"
         part, _, rest = name.partition(".")
         field, _, entry = rest.partition("[")
-        value = start if part.startswith("x0") else getattr(parts.get(part), field, 0.0)
+        value = getattr(parts.get(part), field, 0.0)
         value = np.asarray(0.0 if value is None else value, dtype=float)
         value = value[int(entry[:-1])] if entry else value
         found[name] = (value - np.asarray(width), value + np.asarray(width))

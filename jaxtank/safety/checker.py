@@ -39,7 +39,7 @@ KNOWN = {
     | {"spare", "age", "offset", "low", "bottom", "draw", "held", "kept", "predicted", "substeps"}
     | {"allocate", "divided", "leaks", "running"},
 }
-"""{part: the fields that the checker knows}; a field that is not listed must be None, False or ()."""
+"""{part: fields that the checker knows}; a field that is not listed must be None, False or ()."""
 CLASSES = {"plant": TankNetwork, "actuator": PumpBank, "sensor": LevelSensor, "faults": Faults}
 UNCERTAIN = {
     *(f"plant.{name}" for name in (*FLOWS, "rim", "caught")),
@@ -193,8 +193,9 @@ class _Rig:
         self.guard, self.plant, self.hold = guard, plant, float(hold)
         n = self.tanks = len(np.atleast_1d(plant.rim))
         full = lambda v, size=n: np.broadcast_to(np.asarray(v, dtype=float), (size,))
-        for name in ("limit", "reach", "rate", "band", "slope", "spare", "low", "bottom"):
-            setattr(self, name, full(getattr(guard, name)))
+        self.limit, self.reach, self.spare = map(full, (guard.limit, guard.reach, guard.spare))
+        self.rate, self.slope, self.band = map(full, (guard.rate, guard.slope, guard.band))
+        self.low, self.bottom = full(guard.low), full(guard.bottom)
         self.held, self.kept = set(guard.held), set(guard.kept)
         self.divided, self.running = (set(getattr(guard, k, ())) for k in ("divided", "running"))
         self.predicted = int(guard.predicted)
@@ -342,9 +343,8 @@ class _Rig:
         self.loose = False  # whether faults leave the box to the side that lowers levels
         if why := self._outside(ends, ""):
             return why
-        if self.faults is not None:
-            if why := self._faulty(ends):
-                return why
+        if self.faults is not None and (why := self._faulty(ends)):
+            return why
         return ""
 
     def _faulty(self, ends):
@@ -396,6 +396,17 @@ def _ends(guard):
     return guard.least, guard.most
 
 
+class _At(NamedTuple):
+    """What is assumed of all tanks together (n,): the levels that they do not pass [cm], whether
+    they do not overflow, the highest levels at t = 0 [cm]; and whether those are the case's.
+    """
+
+    bounds: np.ndarray
+    dry: np.ndarray
+    begin: np.ndarray
+    own: bool
+
+
 class _Found(NamedTuple):
     """Why each tank is not proved, or ""; by what it is; levels that no tank passes (n,) [cm]."""
 
@@ -418,6 +429,7 @@ def _joint(rig, start, claimed):
         level[free] = (claimed - rig.spare)[free]
     begin = claimed if start is None else start
     inside, bounded = set(range(n)), set(range(n))
+    dry = np.ones(n, dtype=bool)
     while True:
         bounds = np.full(n, np.inf)
         for i in range(n):
@@ -425,14 +437,17 @@ def _joint(rig, start, claimed):
                 bounds[i] = level[i] + rig.spare[i]
             elif i in bounded:
                 bounds[i] = rig.reach[i]
-        found = [_upper(rig, i, level[i], bounds, begin, start is not None) for i in range(n)]
-        if alone is None:
-            alone = found
+        at = _At(bounds, dry & (bounds <= rig.rim * (1.0 + 1e-12)), begin, start is not None)
+        found = [_upper(rig, i, level[i], at) for i in range(n)]
+        alone = found if alone is None else alone
         outside = {i for i in inside if found[i][0]}
-        loose = {i for i in bounded - inside if not _stays(rig, i, bounds, begin)}
-        if not outside and not loose:
+        stays = {i: _stays(rig, i, at) for i in bounded - inside}
+        loose = {i for i, how in stays.items() if not how}
+        wet = {i for i in range(n) if dry[i] and (i in loose or stays.get(i) == "rim")}
+        if not (outside or loose or wet):
             break
-        inside, bounded = inside - outside, bounded - loose
+        inside, bounded, dry = inside - outside, bounded - loose, dry.copy()
+        dry[list(wet)] = False
     reasons = [found[i][0] if i not in inside else "" for i in range(n)]
     for i in (i for i in range(n) if reasons[i] and not alone[i][0]):
         lost = sorted(k for k in range(n) if k not in inside and k != i)
@@ -442,35 +457,37 @@ def _joint(rig, start, claimed):
     return _Found(reasons, [theorem for _, theorem in found], bounds)
 
 
-def _stays(rig, i, bounds, begin):
-    """Whether no plant takes the level of a tank above its `reach`, with its pumps at full."""
+def _stays(rig, i, at):
+    """What keeps the level of a tank below its `reach`, whatever its pumps do: "flows", or the
+    "rim" over which the rest overflows; or "".
+    """
     top = rig.reach[i] - rig.spare[i]
-    if not (begin[i] <= top * (1.0 + 1e-12) and math.isfinite(top) and top > 0.0):
-        return False
-    if _spilled(rig, i, bounds, begin):
-        return False
-    if rig.plant.overflow and rig.reach[i] >= rig.highest_rim[i]:
-        return True  # a level stops at its rim
-    return rig.rise(i, top, bounds) + rig.brought(i, rig.most) <= _rounding(rig, i, top)
+    if not (at.begin[i] <= top * (1.0 + 1e-12) and math.isfinite(top) and top > 0.0):
+        return ""
+    if _spilled(rig, i, at):
+        return ""
+    if rig.rise(i, top, at.bounds) + rig.brought(i, rig.most) <= _rounding(rig, i, top):
+        return "flows"
+    return "rim" if rig.plant.overflow and rig.reach[i] >= rig.highest_rim[i] else ""
 
 
 def _rounding(rig, i, level):
     return ROUNDING * max(rig.out[i] * _root(level, rig.knee), 1e-9)
 
 
-def _spilled(rig, i, bounds, begin):
+def _spilled(rig, i, at):
     """Why more may enter than the filter counts on, overflow of other tanks included, or ""."""
     entering = rig.entering[i]
     if rig.plant.overflow:
         for (a, b), share in zip(rig.plant.spills, rig.caught):
-            if b == i and not bounds[a] <= rig.rim[a] * (1.0 + 1e-12):
+            if b == i and not at.dry[a]:
                 if _ringed(rig.plant.spills, i):
                     return "not covered: a ring of tanks that overflow into each other"
-                if not begin[a] + rig.spare[a] <= rig.rim[a] * (1.0 + 1e-12):
+                if not at.begin[a] + rig.spare[a] <= rig.rim[a] * (1.0 + 1e-12):
                     return f"not covered: volumes that overflow at once from tank {a + 1}"
-                if why := _spilled(rig, a, bounds, begin):
+                if why := _spilled(rig, a, at):
                     return why
-                over = rig.rise(a, rig.rim[a], bounds) + rig.brought(a, rig.most)
+                over = rig.rise(a, rig.rim[a], at.bounds) + rig.brought(a, rig.most)
                 entering += share * max(over, 0.0) * float(np.asarray(rig.guard.most.area)[a])
     if not entering <= rig.inflow[i] * (1.0 + ROUNDING):
         return f"{entering:.4g} cm^3/s may enter, the filter counts on {rig.inflow[i]:.4g}"
@@ -491,15 +508,15 @@ def _ringed(spills, tank):
     return False
 
 
-def _upper(rig, i, level, bounds, begin, own):
-    """(why the limit of a tank is not proved at the joint bounds (n,) [cm], or ""; the theorem).
+def _upper(rig, i, level, at):
+    """(why the limit of a tank is not proved with the others at their bounds, or ""; the theorem).
 
-    level : its limit before volumes that enter besides.  begin : highest levels at t = 0, `own`:
-    those of the case.
+    level : its limit before volumes that enter besides
     """
-    if not begin[i] <= level * (1.0 + 1e-12):
-        return f"start at {begin[i]:.4g} cm, above the limit {level:.4g} cm", ""
-    if why := _spilled(rig, i, bounds, begin):
+    bounds = at.bounds
+    if not at.begin[i] <= level * (1.0 + 1e-12):
+        return f"start at {at.begin[i]:.4g} cm, above the limit {level:.4g} cm", ""
+    if why := _spilled(rig, i, at):
         return why, ""
     if not all(math.isfinite(bounds[k]) for k in rig.neighbours(i)):
         return "a tank beside it has no bound", ""
@@ -510,7 +527,7 @@ def _upper(rig, i, level, bounds, begin, own):
     if rig.pulsed:
         return "not covered: a pulse dead zone pays out more than was commanded", ""
     if rig.slope[i] > 0.0:
-        return _second_order(rig, i, bounds, begin), "Theorem 2"
+        return _second_order(rig, i, at), "Theorem 2"
     if not rig.gains[i]:
         return "no row: it has neither a pump nor a k1", ""
     entering = rig.rise(i, level, bounds) + _brought(rig, i, rig.lowest)
@@ -525,8 +542,8 @@ def _upper(rig, i, level, bounds, begin, own):
             return f"kappa T = {rig.rate[i] * rig.hold:.3g} above 1", ""
         return "", "Theorem 1"
     if rig.predicted:
-        return _predicted(rig, i, level, bounds, begin), "Theorem 5"
-    return _late(rig, i, level, lag, bounds, begin, own), "Theorem 4" if lag > 0.0 else "Theorem 3"
+        return _predicted(rig, i, level, at), "Theorem 5"
+    return _late(rig, i, level, lag, at), "Theorem 4" if lag > 0.0 else "Theorem 3"
 
 
 def _rim(rig, i, level, entering):
@@ -581,7 +598,7 @@ def _readable(rig, i, bounds):
     return ""
 
 
-def _second_order(rig, i, bounds, begin):
+def _second_order(rig, i, at):
     """Why Theorem 2 does not hold for tank i, or "". Negative inflows and overflow only lower the
     levels in a hold, and g with them rises: README.md, Theorem 2.
     """
@@ -597,7 +614,7 @@ def _second_order(rig, i, bounds, begin):
         return "not covered: second-order rows where the tanks above are fed by others"
     if any(rig.inflow[k] > 0.0 or rig.spare[k] > 0.0 for k in ring):
         return "not covered: second-order rows with inflow disturbances"
-    if why := next((why for j, *_ in sources if (why := _spilled(rig, j, bounds, begin))), ""):
+    if why := next((why for j, *_ in sources if (why := _spilled(rig, j, at))), ""):
         return why
     pumps = {p for j, *_ in sources for p in rig.gains[j]}
     if any(rig.lowest[p] > 0.0 for p in pumps):
@@ -625,8 +642,8 @@ def _second_order(rig, i, bounds, begin):
     steep = rig.out[i] / (2.0 * math.sqrt(lowest))
     if not k1 >= steep:
         return f"(C4) k1 = {k1:.4g} below the slope of the outflow, {steep:.4g} 1/s"
-    g = rig.out[i] * s(begin[i]) + k1 * (top - begin[i])
-    g -= sum(most * max(s(begin[j]), a0) for j, _, most in sources)
+    g = rig.out[i] * s(at.begin[i]) + k1 * (top - at.begin[i])
+    g -= sum(most * max(s(at.begin[j]), a0) for j, _, most in sources)
     if not g >= -1e-12 * full:
         return "start: the tanks above hold more than can be stopped in time"
     return ""
@@ -645,7 +662,7 @@ def _falling(out, k1, top, full, knee):
     return low
 
 
-def _late(rig, i, level, lag, bounds, begin, own):
+def _late(rig, i, level, lag, at):
     """Why Theorem 3 or, with a lag [s], Theorem 4 does not hold for tank i, or ""."""
     what, kappa, pumps = "dead time or lag", rig.rate[i], rig.gains[i]
     if rig.pipes[i]:
@@ -674,7 +691,7 @@ def _late(rig, i, level, lag, bounds, begin, own):
         sigma = _sigma(kappa, lag, age)
         if not sigma > 0.0:
             return f"kappa {kappa:.4g} above its bound {_rate(_best(lag, age), lag, age):.4g} 1/s"
-        filled = _brought(rig, i, rig.most) + rig.rise(i, 0.0, bounds)
+        filled = _brought(rig, i, rig.most) + rig.rise(i, 0.0, at.bounds)
         if not filled <= 0.75 * sigma * level:
             return (
                 f"(F) {filled:.3g} cm/s may enter, above 3/4 sigma H = {0.75 * sigma * level:.3g}"
@@ -684,11 +701,11 @@ def _late(rig, i, level, lag, bounds, begin, own):
         if not kappa * rig.hold <= bound * (1.0 + 1e-12):
             return f"kappa {kappa:.4g} above its bound {bound / rig.hold:.4g} 1/s"
     brought = _brought(rig, i, rig.under_way)
-    allowed = -rig.rise(i, level, bounds)  # by (N), at or below H
-    if own:
+    allowed = -rig.rise(i, level, at.bounds)  # by (N), at or below H
+    if at.own:
         # concave in the level on either side of `empty`
-        others = bounds if lag > 0.0 else _soon(rig, begin, bounds)
-        ends = {0.0, min(begin[i], np.nextafter(empty, 0.0)), begin[i]} | {min(begin[i], empty)}
+        others = at.bounds if lag > 0.0 else _soon(rig, at)
+        ends = {0.0, *(min(at.begin[i], h) for h in (np.nextafter(empty, 0.0), empty, level))}
         allowed = min(kappa * (level - h) - rig.rise(i, h, others) for h in ends)
     if not brought <= allowed + _rounding(rig, i, level):
         return f"(S) start: {brought:.4g} cm/s under way, {max(allowed, 0.0):.4g} allowed"
@@ -709,16 +726,16 @@ def _brought(rig, i, inputs):
     return max(shares)
 
 
-def _soon(rig, begin, bounds):
+def _soon(rig, at):
     """(n,) levels [cm] that the tanks can have until the first input of the filter ends."""
     age = rig.delay[1] + rig.hold
     risen = [
-        begin[k]
+        at.begin[k]
         + rig.spare[k]
-        + age * (rig.brought(k, rig.most) + max(rig.rise(k, 0.0, bounds), 0.0))
+        + age * (rig.brought(k, rig.most) + max(rig.rise(k, 0.0, at.bounds), 0.0))
         for k in range(rig.tanks)
     ]
-    return np.minimum(bounds, risen)
+    return np.minimum(at.bounds, risen)
 
 
 def _far(rig, k):
@@ -752,7 +769,7 @@ def _sigma(kappa, lag, age):
     return low
 
 
-def _predicted(rig, i, level, bounds, begin):
+def _predicted(rig, i, level, at):
     """Why Theorem 5 does not hold for tank i, or ""."""
     if any(rig.pipes) or np.any(rig.lag[1] > 0.0) or rig.zoned or np.any(rig.offset != 0.0):
         return "not covered: prediction with pipes, lag or a dead zone"
@@ -760,7 +777,7 @@ def _predicted(rig, i, level, bounds, begin):
         return "not covered: prediction with inflow pulses"
     if rig.loose or np.any(rig.bottom > 0.0):
         return "not covered: prediction with faults or low limits"
-    if rig.plant.overflow and not bounds[i] <= rig.rim[i]:
+    if rig.plant.overflow and not at.bounds[i] <= rig.rim[i]:
         return "not covered: prediction of a tank that overflows"
     if not rig.draw[i] <= rig.leaving[i]:
         return f"{-rig.leaving[i]:.4g} cm^3/s may be drawn, the filter counts on {-rig.draw[i]:.4g}"
@@ -771,10 +788,10 @@ def _predicted(rig, i, level, bounds, begin):
         )
     if not rig.rate[i] * rig.hold <= 1.0 + 1e-12:
         return f"kappa T = {rig.rate[i] * rig.hold:.3g} above 1"
-    brought, h = rig.brought(i, rig.under_way), float(begin[i])
+    brought, h = rig.brought(i, rig.under_way), float(at.begin[i])
     steps = 500 * rig.predicted
     for _ in range(steps):  # from above: a rate falls while a level rises
-        h += rig.delay[1] / steps * max(brought + rig.rise(i, h, bounds), 0.0)
+        h += rig.delay[1] / steps * max(brought + rig.rise(i, h, at.bounds), 0.0)
         if not h <= level * (1.0 + ROUNDING):
             return f"start: inputs under way may fill it above {level:.4g} cm"
     return ""
