@@ -187,7 +187,8 @@ def design(
         sensor,
         hold=hold,
         substeps=substeps,
-        box=_intervals(widths, {"plant": plant, "actuator": actuator, "sensor": sensor}),
+        box=_intervals(widths, {"plant": plant, "actuator": actuator, "sensor": sensor})
+        | ({} if start is None else {"x0": (start, start)}),
         inflow=(draw, inflow),
         volume=volume,
         drawn=drawn,
@@ -202,12 +203,14 @@ def _intervals(widths, parts):
     """{dotted name: (lower, upper)} of `widths`; those of levels at t = 0 are in the start."""
     found = {}
     for name, width in widths.items():
-        if name.startswith("x0"):
-            continue
-        name = name if "." in name else f"plant.{name}"
+        name = name if "." in name or name.startswith("x0") else f"plant.{name}"
         part, _, rest = name.partition(".")
+        if part not in parts:
+            if not name.startswith("x0"):
+                found[name] = (0.0, 0.0)
+            continue
         field, _, entry = rest.partition("[")
-        value = getattr(parts.get(part), field, 0.0)
+        value = getattr(parts[part], field, 0.0)
         value = np.asarray(0.0 if value is None else value, dtype=float)
         value = value[int(entry[:-1])] if entry else value
         found[name] = (value - np.asarray(width), value + np.asarray(width))

@@ -94,7 +94,7 @@ def check(
     inflow : ((n,) least, (n,) largest) inflow disturbance [cm^3/s]
     volume : (n,) volume that may enter besides, at any time and rate, in all [cm^3]
     drawn : whether volumes may leave besides, at any time
-    start : (n,) levels at t = 0 [cm]; without it limits must hold for any start below them
+    start : (n,) levels at t = 0 [cm], or those of "x0" in the box; without it limits must hold for any start below them
     faults : the faults of the case
     limits : (n,) limits that are claimed [cm]; those of the filter where left out
     """
@@ -105,14 +105,15 @@ def check(
         return _none(tanks, missing)
     rig = _Rig(safety_filter, plant, actuator, sensor, hold, substeps, box, faults)
     rig.disturbed(inflow, volume, drawn)
+    least = start
     if start is not None and "x0" in box:
-        start = np.maximum(np.asarray(start, float), np.asarray(box["x0"][1], float))
+        least, start = (np.asarray(v, dtype=float) for v in box["x0"])
     claimed = rig.limit + rig.spare if limits is None else np.asarray(limits, float)
     if why := rig.uncovered():
         return _none(tanks, why)
     from_any = _joint(rig, None, claimed)
     found = from_any if start is None else _joint(rig, np.asarray(start, float), claimed)
-    lows = _joint_low(rig, start, found)
+    lows = _joint_low(rig, least, found)
     return tuple(
         Verdict(
             tank=i,
@@ -832,8 +833,8 @@ def _lower(rig, i, proved, begin, upper):
     for k in sorted(near.union({i}, *(rig.neighbours(k) for k in near))):
         if not rig.bottom[k] <= proved[k]:
             return f"relies on the low limit of tank {k + 1}, not proved"
-    if upper.reasons[i] or any(upper.reasons[k] for k in near):
-        return "not covered: a low limit where upper limits are not proved"
+    if not all(math.isfinite(upper.bounds[k]) for k in {i} | near):
+        return "not covered: a low limit where a level has no upper bound"
     if i not in rig.kept:
         return "no row of the filter keeps it"
     if rig.delay[1] > 0.0 or np.any(rig.lag[1] > 0.0) or rig.zoned:
@@ -844,7 +845,7 @@ def _lower(rig, i, proved, begin, upper):
         return f"kappa T = {kappa * rig.hold:.3g} above 1"
     if len(gains) > 1 and any(rig.backwards[j] < 0.0 for j in gains):
         return "not covered: a low limit kept by several pumps that may run backwards"
-    edges = np.linspace(low - eps, max(rig.limit[i], low) + eps, PARTS + 1)
+    edges = np.linspace(low - eps, upper.bounds[i] + eps, PARTS + 1)
     asked = [
         -rig.fall(i, b + eps, rig.bottom) - kappa * (a - eps - low)
         for a, b in zip(edges[:-1], edges[1:])

@@ -876,9 +876,63 @@ def test_low_limits_are_checked_by_their_own_conditions():
         "no row": {"kept": ()},
         "dead time": {"actuator": bank(delay=0.5), "rate": [0.4], "age": 0.5},
         "dead zone": {"actuator": bank(dead_zone=[1.0])},
-        "upper limits": {"rate": [2.1]},
+        "no upper bound": {"known": {"start": [31.0]}},
         "floor above cap": {"limit": [2.05], "known": {"start": [2.0]}},
     }.items():
         assert not verdict(**changes).low_holds
         assert words in verdict(**changes).low_reason, words
     assert not Proved(one_tank(), bank(), start=[5.0]).check()[0].low_holds
+
+
+NOTED = {
+    "fault of plant.drain[0]": RIGS["a fault of its own"],
+    "[uncertain] is wider than the widths of the filter for plant.drain": f"""
+{text([1], [5.0], ONE_TANK)}
+values = {{ "clock.dt" = 0.1, "clock.duration" = 5.0 }}
+uncertain = {{ "plant.drain" = 0.2, "plant.pump_gain" = 0.05, "controller.Kc" = 0.5 }}
+safety_filter = {{ widths = {{ drain = 0.05, pump_gain = 1.0 }} }}
+""",
+}
+
+
+@pytest.mark.parametrize("words", NOTED)
+def test_what_lies_outside_the_proof_is_noted_with_exit_code_0(words, tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text(NOTED[words])
+    code, _, err = command("simulate", str(path), "--set", "clock.duration=5")
+    assert code == 0 and words in err
+    inside = NOTED[words].replace('"plant.drain" = 0.2', '"plant.drain" = 0.1')
+    path.write_text(inside.replace("factor = 0.5", "factor = 1.0"))
+    code, _, err = command("simulate", str(path), "--set", "clock.duration=5")
+    assert code == 0 and "safety filter" not in err
+
+
+def test_show_names_the_start_and_the_hypotheses():
+    code, out, _ = command("show", "gouta2015/backstepping", "--json")
+    rows = json.loads(out)["safety_filter"]
+    assert code == 0 and [row["starts"] for row in rows] == [OWN, OWN, ANY, ANY]
+    assert [row["why"] for row in rows] == ["Theorem 2"] * 2 + ["Theorem 1"] * 2
+    out = " ".join(command("show", "gouta2015/backstepping")[1].split())
+    assert "no fault takes a parameter out of its interval" in out
+    assert "at or below the case's start, (3, 3, 2.753, 2.753) cm" in out
+    assert "case 2" in out.partition("Limits on levels")[2]
+
+
+def test_attack_says_that_other_starts_than_the_proved_ones_are_tried():
+    words = ["cascaded/pi", "--safety-filter", "--draws", "2", "--starts", "1", "--iterations", "0"]
+    words += ["--set", "clock.duration=40", "--json"]
+    for start, remarked in (("any", True), ("own", False)):
+        code, out, _ = command("attack", *words, "--start", start)
+        found = json.loads(out)
+        assert code == 0 and [one["starts"] for one in found["worst"]] == [ANY, OWN]
+        said = "Proved from levels at or below the case's start only: tank 2" in str(
+            found["remarks"]
+        )
+        assert said == remarked
+
+
+def test_uncertain_levels_at_the_start_count_with_both_ends():
+    found = Proved(one_tank(), bank(), low=[2.0], start=[5.0])
+    at = lambda low, high: found.check(box={"x0": ([low], [high])})[0]
+    assert at(2.1, 29.9).holds and at(2.1, 29.9).low_holds
+    assert not at(2.1, 30.1).holds and not at(1.9, 29.9).low_holds
