@@ -94,7 +94,8 @@ def check(
     inflow : ((n,) least, (n,) largest) inflow disturbance [cm^3/s]
     volume : (n,) volume that may enter besides, at any time and rate, in all [cm^3]
     drawn : whether volumes may leave besides, at any time
-    start : (n,) levels at t = 0 [cm], or those of "x0" in the box; without it limits must hold for any start below them
+    start : (n,) levels at t = 0 [cm], or the interval "x0" of the box; without it limits must hold
+        for any start below them
     faults : the faults of the case
     limits : (n,) limits that are claimed [cm]; those of the filter where left out
     """
