@@ -11,12 +11,10 @@ import scipy  # its parts are imported when they are first used
 from numpy.typing import ArrayLike
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import get_value
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.safety.box import widths_of
 from jaxtank.safety.certificate import TankCertificate, design
-from jaxtank.safety.checker import HARMLESS
 from jaxtank.safety.filter import SafetyFilter
 from jaxtank.signals.inflows import InflowPulses
 
@@ -96,29 +94,6 @@ def design_for(
     )
 
 
-def beyond(case: Any) -> list[str]:
-    """Return the names of [uncertain] whose intervals are wider than those in the settings of the
-    case's safety filter, which take their place.
-    """
-    widths = (case.safety or {}).get("widths")
-    if case.loop.safety_filter is None or widths is None:
-        return []
-    found = []
-    names = [name for name in case.uncertain if not name.startswith(HARMLESS)]
-    for name in names:
-        base, _, entry = name.partition("[")
-        value = np.asarray(get_value(case.loop, base), dtype=float)
-        half, at = np.zeros(value.shape), int(entry[:-1]) if entry else ...
-        for other, width in widths.items():
-            field, _, index = (other if "." in other else f"plant.{other}").partition("[")
-            if field == base:
-                half[int(index[:-1]) if index else ...] = width
-        wide = case.uncertain[name] * np.abs(value) * (1.0 - 1e-9)
-        if np.any(wide[at] > half[at]):
-            found.append(name)
-    return found
-
-
 def _widths(case):
     """{parameter: half width} of the box of plants that the case itself describes."""
     if case.covariance is not None:
@@ -161,3 +136,24 @@ def _withdrawn(loop, clock):
         return none, bool(np.any(np.asarray(loop.disturbance.volume) < 0.0))
     flows = loop.disturbance.sample(clock)[0]
     return np.array([min(float(np.min(flow)), 0.0) for flow in flows]), False
+
+
+def beyond(case: Any) -> list[str]:
+    """Return the names of [uncertain] whose intervals are wider than those in the settings of the
+    case's safety filter, which take their place.
+    """
+    guard = case.loop.safety_filter
+    if guard is None or "widths" not in (case.safety or {}):
+        return []
+    found = []
+    for name in (name for name in case.uncertain if name.startswith("plant.")):
+        field, _, entry = name.removeprefix("plant.").partition("[")
+        at = int(entry[:-1]) if entry else ...
+        own, least, most = (
+            np.asarray(getattr(plant, field), dtype=float)[at]
+            for plant in (case.loop.plant, guard.least, guard.most)
+        )
+        half = case.uncertain[name] * own * (1.0 - 1e-9)
+        if np.any(own - half < least) or np.any(own + half > most):
+            found.append(name)
+    return found
