@@ -936,3 +936,39 @@ def test_uncertain_levels_at_the_start_count_with_both_ends():
     at = lambda low, high: found.check(box={"x0": ([low], [high])})[0]
     assert at(2.1, 29.9).holds and at(2.1, 29.9).low_holds
     assert not at(2.1, 30.1).holds and not at(1.9, 29.9).low_holds
+
+
+def test_lags_that_differ_need_a_row_for_each_pump():
+    """Each has the share of the row that it has of full pumps, also of what is under way."""
+    plant = one_tank(
+        area=[200.0, 200.0], drain=[0.1, 0.2], feeds=[(0, None), (0, 1)], pump_gain=[8.0, 8.0],
+        split=[1.0, 0.5], rim=[30.0, 60.0],
+    )  # fmt: skip
+    lag = {"lag": [0.7, 0.1], "high": [12.0, 12.0]}
+    found = Proved(plant, bank(2, **lag), 0.1, start=[29.5, 1.0])
+    assert found.guard.divided == (0,) and [v.holds for v in found.check()] == [True, True]
+    assert "lags differ" in reason(found.check(divided=()))
+    most, kappa = found.guard.most, float(found.guard.rate[0])
+    gains = [8.0 * 1.05 * 1.0 / 200.0, float(most.pump_gain[1]) * float(most.split[1]) / 200.0]
+    c = 0.95 * 0.1 * math.sqrt(2 * 981.0) / 200.0
+    allowed = kappa * 0.5 + c * math.sqrt(29.5)
+    edge = allowed * 12.0 / sum(b * 12.0 for b in gains)  # b u = b 12/(sum b 12) allowed
+    for initial, holds in (([0.0, 0.999 * edge], True), ([0.0, 1.001 * edge], False)):
+        before = bank(2, **lag, initial=initial)
+        assert found.check(actuator=before)[0].holds == holds
+
+
+def test_pumps_that_cannot_stop_share_a_row_that_counts_with_them():
+    plant = one_tank(
+        area=[50.0, 50.0], drain=[0.5, 0.3], feeds=[(0, None), (0, 1)], pump_gain=[20.0, 20.0],
+        split=[1.0, 0.3], rim=[20.0, 60.0],
+    )  # fmt: skip
+    found = Proved(plant, bank(2, low=[1.0, 0.5]), 0.1, start=[15.0, 5.0])
+    assert found.guard.running == (0, 1) and found.check()[0].holds
+    assert "lower limits above 0" in reason(found.check(running=(0,)))
+    leaves = 0.95 * 0.5 * math.sqrt(2 * 981.0) * math.sqrt(20.0)
+    most = found.guard.most
+    second = float(most.pump_gain[1]) * float(most.split[1]) * 0.5
+    edge = (leaves - second) / (20.0 * 1.05)
+    for share, holds in ((0.999, True), (1.001, False)):
+        assert found.check(actuator=bank(2, low=[share * edge, 0.5]))[0].holds == holds
