@@ -972,3 +972,20 @@ def test_pumps_that_cannot_stop_share_a_row_that_counts_with_them():
     edge = (leaves - second) / (20.0 * 1.05)
     for share, holds in ((0.999, True), (1.001, False)):
         assert found.check(actuator=bank(2, low=[share * edge, 0.5]))[0].holds == holds
+
+
+def test_rows_are_not_covered_beyond_the_proofs_of_dead_time_lag_and_bands():
+    late = Proved(one_tank(drain=[0.1]), bank(delay=0.5), predict=False, start=[1.0], volume=[4.0])
+    assert "inflow pulses with dead time" in reason(late.check())
+    slow = chain(area=[200.0, 200.0], drain=[0.1, 0.0], orifice=[0.05])
+    found = Proved(slow, bank(2, lag=[0.7, 0.7]), 0.1, start=[1.0, 1.0])
+    assert found.check()[0].holds
+    assert "rates of other tanks" in reason(found.check(age=0.0))
+    second = gouta2015()
+    c, top, full, _, most, _ = by_hand(second)
+    star = brentq(lambda h: c * math.sqrt(h) + 0.19 * (top - h) - full, 1e-9, top)
+    hold = (star - (0.5 * c / 0.19) ** 2) / (full + most * math.sqrt(top))
+    given = {"slope": [0.19, 0.19, 0.0, 0.0], "rate": np.full(4, 0.1)}
+    given["known"] = {"hold": 0.999 * hold}
+    assert second.check(**given)[0].holds
+    assert "(C4)" in reason(second.check(**given, band=np.full(4, 0.05)))
