@@ -168,7 +168,7 @@ def _safety(case, page):
     if page["safety_filter"] is None:
         return []
     heads, rows = safety.rows_of(case, page["safety_filter"])
-    table = grid(rows, heads, (4, 12, 6, 11, 13, 10))
+    table = grid(rows, heads, (4, 12, 6, 6, 11, 13, 10))
     return [*_chapter("Limits on levels"), table, "", *_sentences(safety.sentences(case))]
 
 

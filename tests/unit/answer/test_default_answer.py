@@ -311,7 +311,7 @@ def test_the_json_has_the_keys_of_the_contract(result):
     holds = found["holds"]
     assert (holds["limits_on_validation"], holds["samples"]) == (1.0, 24)
     assert [row["tank"] for row in holds["certified"]] == [1]
-    assert set(holds["certified"][0]) == {"tank", "certified", "why"}
+    assert set(holds["certified"][0]) == {"tank", "certified", "why", "starts"}
     assert found["answer"]["safety_filter"]["band"] == pytest.approx(
         [0.018]
     )  # 6 x 0.1 % of the rim

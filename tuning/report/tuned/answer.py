@@ -8,6 +8,7 @@ import numpy as np
 from jaxtank import measures as ms
 from tuning.answer.setting import limited_levels
 from tuning.problem.wording import numbered
+from tuning.report.safety import PROMISE, start_of
 from tuning.report.tables import number, objective_unit, table
 from tuning.report.tuned.tables import parts_of as all_parts
 
@@ -40,7 +41,9 @@ def of_answer(answer, result=None):
         found += _beyond(answer)
     if result is not None:
         found += [_values(result, answer), ""]
-    return [*found, _effects(answer)]
+    found += [_effects(answer)]
+    proved = [row.starts for row in answer.setting.certificates if row.certified]
+    return [*found, "", _wrapped(f"proved: {PROMISE}, {start_of(proved)}")] if proved else found
 
 
 def _beyond(answer):
