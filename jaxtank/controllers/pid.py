@@ -82,8 +82,8 @@ class PID(Controller):
     (back-calculation, tracking time Tt), and the derivative of the measurement filtered by a lag of
     Td/8. Without Ti, or with Ti infinite, there is no integral action and nothing to wind up; an
     infinite entry does so to its loop alone. Without Td there is no derivative; without `order` the
-    integral is of order one, with it s^-order = (1/s) s^(1-order), where the second factor is Oustaloup's filter: a true integrator
-    is kept. base = bias, or with `feed_forward` the steady-state input of the model on the
+    integral is of order one, with it s^-order = (1/s) s^(1-order), where the second factor is
+    Oustaloup's filter: a true integrator is kept. base = bias, or with `feed_forward` the steady-state input of the model on the
     reference, (r' - f(r))/c2, less d/c2 for a disturbance d of the level rate [cm/s] that the
     observer estimates. Without `feed_forward` no estimate of a disturbance is used.
 

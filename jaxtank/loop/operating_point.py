@@ -62,8 +62,8 @@ def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
 
     The loop is broken between what the actuator is given and the pumps: its dead time and its lag
     belong to the open loop. Sensors without noise and ADC, pumps without limits, without safety
-    filter, inflow pulses and faults; a steady inflow stays. Newton's method finds the state at which a sample
-    changes nothing, of a stable and of an unstable loop; derivatives are those of the implicit
+    filter, inflow pulses and faults; a steady inflow stays. Newton's method finds the state at
+    which a sample changes nothing, of a stable and of an unstable loop; derivatives are those of the implicit
     function. Where a steady state cannot be used (`why`), A, B and C are 0.
 
     Parameters
