@@ -62,7 +62,10 @@ def test_margins_are_those_at_the_inflow(capsys, tmp_path):
     path = tmp_path / "two.toml"
     path.write_text("""
 name = "two"
-tank = [{ area = 50.0, rim = 60.0, level = 4.0 }, { area = 50.0, rim = 60.0, drain = 0.5, level = 20.0, inflow = 40.0 }]
+tank = [
+    { area = 50.0, rim = 60.0, level = 4.0 },
+    { area = 50.0, rim = 60.0, drain = 0.5, level = 20.0, inflow = 40.0 },
+]
 orifice = [{ from = 1, to = 2, area = 0.5 }]
 pump = [{ gain = 10.0, to = 1, high = 12.0 }]
 plant = { outputs = [2] }
