@@ -27,6 +27,7 @@ def leaf(
     strict: bool = False,
     shape: Shape = (),
     like: str | None = None,
+    infinite: bool = False,
     default: Any = dataclasses.MISSING,
 ) -> Any:
     """Return a differentiable field of a component: a number or an array.
@@ -43,6 +44,7 @@ def leaf(
     like : name of a sibling field. Such a leaf may be absent (None), which costs the loop nothing,
         and takes the shape of the sibling when it is set. Write `default=None` beside it, so that
         type checkers see that it may be left out.
+    infinite : whether infinity is allowed; an entry of an absent leaf then has it
     default : function of {field: value} of the fields given, whose result a leaf has that is left
         out
 
@@ -68,6 +70,8 @@ def leaf(
         "shape": tuple(shape),
         "like": like,
     }
+    if infinite:
+        meta["infinite"] = True
     if callable(default):
         meta["default"] = default
     needed = like is None and default is dataclasses.MISSING

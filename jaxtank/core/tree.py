@@ -272,7 +272,8 @@ def _replace(tree: T, path: list[str], index: tuple[int, ...], value: Any, name:
             raise LookupError(name)
         like = fields[head].metadata.get("like")
         if child is None and like is not None:
-            child = np.zeros(np.shape(getattr(tree, like)))
+            absent = np.inf if fields[head].metadata.get("infinite") else 0.0
+            child = np.full(np.shape(getattr(tree, like)), absent)
         new = _fitted(child, index, value, name)
     return cast(T, dataclasses.replace(cast(Any, tree), **{head: new}))
 

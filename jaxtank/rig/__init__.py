@@ -3,7 +3,8 @@
 case = "gouta2015/backstepping"
 
 [values]                     # any parameter by its dotted name; controller.model.* and
-                             # observer.model.* follow plant.* unless they are set
+                             # observer.model.* follow plant.* unless they are set, and the
+                             # observer's the controller's
 "controller.k1" = 0.01
 "plant.area" = [21.2, 21.2, 21.2, 21.2]
 "clock.dt" = 0.01

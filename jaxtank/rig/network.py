@@ -2,6 +2,7 @@
 and [plant]; read to a Case and written from a loop.  Imported by `read` and `sections`.
 """
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -107,20 +108,26 @@ def _loop(plant, columns, control, observer):
     pumps, levels = _fields(columns, "actuator"), number(columns["x0"])
     inflow, initial = columns["disturbance.level"], number(pumps["initial"])
     start = [float(levels[i]) for i in plant.outputs]
+    still: Any = None  # its place is taken below
     sensor = {"gain": np.ones(plant.tanks), "full_scale": np.max(plant.rim)}
     # the pulse is of use only above 0, beside a dead zone
     pulse = [high if high > 0 else 1.0 for high in pumps["high"]]
     bank = {"stop": np.zeros(plant.pumps), "pulse": pulse, **pumps}
-    return ClosedLoop(
+    loop = ClosedLoop(
         plant=plant,
         sensor=LevelSensor(**_numbers({**sensor, **_fields(columns, "sensor")})),
-        observer=Direct() if observer is None else observer_of(observer, plant, levels, initial),
-        controller=controller_of(control, plant, start, initial),
+        observer=Direct(),
+        controller=still,
         actuator=PumpBank(**_numbers(bank)),
         reference=ramps(start, [], ramp=0.0),
         disturbance=Constant(level=number(inflow)) if any(inflow) else None,
         x0=levels,
     )
+    # `rig.from_table` computes a bias that is left out, once all values are set
+    loop = dataclasses.replace(loop, controller=controller_of(control, loop, initial))
+    if observer is None:
+        return loop
+    return dataclasses.replace(loop, observer=observer_of(observer, loop))
 
 
 def _numbers(values):
