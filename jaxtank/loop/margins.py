@@ -44,8 +44,8 @@ def stability_margins(loop: ClosedLoop, clock: Clock) -> tuple[Plateau, ...]:
     One sample of the loop (sensor without noise, observer, controller, pumps with lag and dead time
     but without limits, plant with its steady inflow) is linearised at the steady state of each
     plateau, and broken at the pumps: exact for the sampled loop. With several pumps gain, phase and
-    delay margin are of one pump at a time, the other loops closed, and the sensitivity peak is that of the largest
-    singular value of (I + L)^-1.
+    delay margin are of one pump at a time, the other loops closed, and the sensitivity peak is that
+    of the largest singular value of (I + L)^-1.
 
     Parameters
     ----------
