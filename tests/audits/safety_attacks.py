@@ -547,6 +547,7 @@ class Outcome(NamedTuple):
     rows: tuple  # TankCertificate of each tank
     highest: np.ndarray  # (n,) [cm], of the plants for which each tank's statement holds
     lowest: np.ndarray
+    from_own: np.ndarray  # (n,) highest levels [cm] of the plants that start as the file says
 
 
 def trial(seed, low=False, any_start=False, count=64):
@@ -558,19 +559,18 @@ def trial(seed, low=False, any_start=False, count=64):
             case = rig.from_table(table)
             safety_filter, rows = case.safety_design(**(case.safety or {}))
     except InputError as error:
-        return Outcome(seed, features, str(error), (), np.zeros(0), np.zeros(0))
+        return Outcome(seed, features, str(error), (), *[np.zeros(0)] * 3)
     if not any(r.certified or r.low_certified for r in rows):
-        nothing = np.full(len(rows), np.nan)
-        return Outcome(seed, features, "", rows, nothing, nothing)
-    highest, lowest = attack_file(
+        return Outcome(seed, features, "", rows, *[np.full(len(rows), np.nan)] * 3)
+    levels = attack_file(
         table, case.loop.actuator, safety_filter, rows, seed, low, any_start, count
     )
-    return Outcome(seed, features, "", rows, highest, lowest)
+    return Outcome(seed, features, "", rows, *levels)
 
 
 def attack_file(table, actuator, safety_filter, rows, seed, low, any_start, count):
-    """(highest, lowest) levels (n,) [cm] of the plants of a rig file; each tank's over the plants
-    with starts that its certificate allows.
+    """(highest, lowest) levels (n,) [cm] of the plants of a rig file, each tank's over the plants
+    with starts that its certificate allows; and the highest from the file's own start.
     """
     rng = np.random.default_rng([seed, 7])
     shape, box, hold = shape_of(table), box_of(table), table["values"]["clock.dt"]
@@ -607,7 +607,7 @@ def attack_file(table, actuator, safety_filter, rows, seed, low, any_start, coun
     anywhere = np.ones(len(rows), bool) & anywhere
     highest = np.where(anywhere, high.max(0), own.max(0))
     lowest = np.where(anywhere, least.min(0), np.where(elsewhere[:, None], np.inf, least).min(0))
-    return highest, lowest
+    return highest, lowest, own.max(0)
 
 
 def substeps_of(shape, p, hold):
@@ -624,9 +624,9 @@ def passed(outcome):
     """[(tank, "upper" or "low", by how much [cm])] of the certified limits that a level passed."""
     rows, found = outcome.rows, []
     for r in rows:
-        top = min(r.limit, r.reach)
-        if r.certified and outcome.highest[r.tank] > top + 1e-9:
-            found.append((r.tank, "upper", float(outcome.highest[r.tank] - top)))
+        over = max(outcome.highest[r.tank] - r.limit, outcome.from_own[r.tank] - r.reach)
+        if r.certified and over > 1e-9:
+            found.append((r.tank, "upper", float(over)))
         if r.low_certified and outcome.lowest[r.tank] < r.low - 1e-9:
             found.append((r.tank, "low", float(r.low - outcome.lowest[r.tank])))
     return found
@@ -731,7 +731,7 @@ def line_of(outcome):
     words = []
     for r in outcome.rows:
         word = "proved" if r.certified else "open"
-        text = f"{word} {outcome.highest[r.tank] / min(r.limit, r.reach):.4f}"
+        text = f"{word} {outcome.highest[r.tank] / r.limit:.4f}"
         if r.low > 0.0:
             word = "proved" if r.low_certified else "open"
             text += f", low {word} {outcome.lowest[r.tank] / r.low:.4f}"
