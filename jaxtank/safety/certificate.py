@@ -16,9 +16,11 @@ from numpy.typing import ArrayLike
 from jaxtank.core.errors import InputError
 from jaxtank.instruments.base import Actuator
 from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.plants.faults import Faults
 from jaxtank.plants.tank_network import TankNetwork
-from jaxtank.safety.box import band_of, box_of, narrow_band, top_of
-from jaxtank.safety.conditions import failed_condition, gap_of, settle, theorem_of
+from jaxtank.safety.box import band_of, box_of, interval, narrow_band, spread, top_of, uncovered
+from jaxtank.safety.checker import check
+from jaxtank.safety.conditions import gap_of, settle, spills, steepest, theorem_of
 from jaxtank.safety.filter import SafetyFilter
 from jaxtank.safety.limits import filled_levels, limits_for
 from jaxtank.safety.low_limits import check_low, failed_low
@@ -42,12 +44,14 @@ BELOW_BOUND = 0.9
 class TankCertificate:
     """Whether the limit of one tank is proved, and by what.
 
-    tank : counted from 0.  limit : H [cm].  certified : True if no plant of the box passes it.
-    reason : the condition that failed with both of its numbers, or the theorem.  rate, rate_bound :
-    kappa and the largest that is proved [1/s].  gap : how far below the limit the nominal plant
-    rests with its pumps full [cm], nan where they cannot reach it.  reach : what the level never
-    passes [cm]; inf if unknown.  low : low limit [cm], 0 for none.  low_certified, low_reason : of
-    the low limit, as above.
+    tank : counted from 0.  limit : H [cm].  certified : True if no plant of the box passes it: the
+    conditions of the design hold, and those of `checker.check`.  starts : the levels at t = 0 for
+    which that holds (`checker.ANY` or `checker.OWN`), "" where it is not proved.  reason : the
+    theorem, or the condition that failed with both of its numbers, or "not covered: FEATURE".
+    rate, rate_bound : kappa and the largest that is proved [1/s].  gap : how far below the limit
+    the nominal plant rests with its pumps full [cm], nan where they cannot reach it.  reach : what
+    the level never passes [cm]; inf if unknown.  low : low limit [cm], 0 for none.  low_certified,
+    low_reason : of the low limit, as above.
     """
 
     tank: int
@@ -61,6 +65,7 @@ class TankCertificate:
     low: float = 0.0
     low_certified: bool = False
     low_reason: str = ""
+    starts: str = ""
 
 
 def rate_bound(hold: float, delay: float = 0.0, lag: float = 0.0) -> float:
@@ -101,6 +106,7 @@ def design(
     draw: ArrayLike = 0.0,
     drawn: bool = False,
     predict: bool = True,
+    faults: Faults | None = None,
 ) -> tuple[SafetyFilter, tuple[TankCertificate, ...]]:
     """Return a safety filter for a rig, and the certificate of each tank.
 
@@ -109,7 +115,8 @@ def design(
     plant, actuator, sensor : the rig
     hold : longest time for which an input is held [s]
     widths : {parameter: half width of its interval, in its unit}, the box (see `widths_of`): each
-        entry of each lies somewhere in its interval, and may change there in time
+        entry of each lies somewhere in its interval, and may change there in time. Parameters of
+        the plant, with or without "plant."; "actuator.lag", "sensor.noise", ..; "x0"
     limit : (n,) wanted limits [cm]; the rims where it is left out. Limits may come out lower
     inflow : (n,) largest inflow disturbance [cm^3/s]
     volume : (n,) volume that may enter besides, at any time and rate, in all [cm^3]; limits are
@@ -120,12 +127,13 @@ def design(
         sensor so small that the noise moves a capped pump by 1 % of its range from sample to sample
     substeps : integration steps of a hold
     start : (n,) highest levels at t = 0 [cm]. Without it a certificate holds for starts at or below
-        the limits, and no tank counts as one that full pumps cannot fill
+        the limits, and no tank counts as one that full pumps cannot fill or that pumps above hold
     low : (n,) levels below which no tank may fall [cm]; 0: none
     draw : (n,) least inflow disturbance, 0 or negative [cm^3/s]
     drawn : whether volumes may leave besides, at any time (no low limit is then proved)
     predict : predict levels over the inputs under way where the dead time is longer than a hold,
         and the rig has no pipes, lag, dead zone or volumes that enter besides
+    faults : of the case: nothing is proved where they leave the box
 
     Raises
     ------
@@ -135,50 +143,129 @@ def design(
     if not isinstance(plant, TankNetwork):
         raise InputError("safety_filter: is for tank networks (plants.network) only")
     n, (least, most) = plant.tanks, box_of(plant, widths)
-    given = (inflow, draw, low, volume)
-    inflow, draw, low, volume = (np.broadcast_to(np.asarray(v, float), (n,)) for v in given)
-    dead = np.asarray(actuator.offset if offset is None else offset, dtype=float)
-    band = np.broadcast_to(np.asarray(band_of(sensor) if band is None else band, float), (n,))
+    tankwise = lambda v: np.broadcast_to(np.asarray(v, float), (n,))
+    inflow, draw, low, volume = map(tankwise, (inflow, draw, low, volume))
+    dead = _dead_zone(actuator, widths) if offset is None else np.asarray(offset, dtype=float)
+    band = tankwise(band_of(sensor, widths=widths) if band is None else band)
+    begin, start = (None, None) if start is None else spread(tankwise(start), "x0", widths)
+    flows = lambda enters: _rates(least, most, enters, hold / substeps, draw)
     setting = Setting(
-        rates=jax.tree.map(_plain, rates_of(least, most, inflow, hold / substeps, draw)),
+        rates=flows(inflow),
         hold=float(hold),
         band=band,
-        top=top_of(sensor, n),
+        top=top_of(sensor, n, widths),
         spare=volume / np.asarray(least.area),
         drawn=drawn,
-        **_of_pumps(actuator, dead),
+        uncovered=("; ".join(f"not covered: uncertain {x}" for x in uncovered(widths)),) * n,
+        **_of_pumps(actuator, dead, widths),
     )
-    setting = setting._replace(predicted=predict * _predicted(setting))
+    setting = setting._replace(
+        predicted=predict * _predicted(setting, widths), divided=_divided(setting, actuator, widths)
+    )
     bound = rate_bound(hold, 0.0 if setting.predicted else setting.delay, setting.lag)
-    check_low(low, wanted := _wanted(setting, plant, limit), plant.units[0])
-    prove = lambda kappa: _proved(setting, plant, wanted, kappa, bound, start)
-    kappa = min(FASTEST, SHARE_OF_HOLD / hold, BELOW_BOUND * bound) if rate is None else float(rate)
-    found = prove(kappa)
-    if rate is None and np.any(np.asarray(sensor.noise) > 0.0):
-        kappa = _quiet_rate(setting, sensor, found.heights, kappa)
-        found = prove(kappa)
-    why, bottom = failed_low(setting, low, found, kappa, start)
-    nominal = jax.tree.map(_plain, rates_of(plant, plant, inflow, 0.0))
-    narrow = narrow_band(sensor, band, plant.units[0])
+    check_low(low, wanted := _wanted(setting, least, limit), plant.units[0])
+    falls, prove = np.zeros(n), lambda s: _proved(s, sensor, most, wanted, rate, bound, start)
+    for _ in range(3 * n + 3):
+        found = prove(setting)
+        more, wild = spills(setting, (least, most), found, start)
+        if np.all(more <= falls) and wild == setting.uncovered:
+            break
+        falls = np.maximum(falls, more)
+        setting = setting._replace(rates=flows(inflow + falls), uncovered=wild)
+    else:
+        sinks = {sink for _, sink in least.spills}
+        ring = [why or "not covered: a ring of spills" * (i in sinks) for i, why in enumerate(wild)]
+        setting = setting._replace(uncovered=tuple(ring))
+        found = prove(setting)
+    kappa = found.rate
+    why, bottom = failed_low(setting, low, found, kappa, begin)
+    nominal = _rates(plant, plant, inflow + falls, 0.0, None)
+    narrow = narrow_band(sensor, band, plant.units[0], widths)
     rows = [_row(setting, nominal, found, i, wanted, kappa, bound, narrow[i]) for i in range(n)]
-    return SafetyFilter(
+    guard = SafetyFilter(
         least=least,
         most=most,
         offset=np.broadcast_to(dead, (actuator.pumps,)),
         rate=np.full(n, kappa),
-        inflow=np.array(inflow),
+        inflow=inflow + falls,
         draw=np.array(draw),
         substeps=substeps if setting.predicted else 1,
+        divided=setting.divided,
+        leaks=tuple(int(i) for i in np.flatnonzero(draw < 0.0)) if np.any(found.slopes > 0) else (),
+        running=tuple(int(j) for j in np.flatnonzero(setting.low > 0.0)),
         **_upper(setting, found),
         **_lower(setting, low, bottom),
-    ), tuple(_completed(row, low[row.tank], why[row.tank], plant.units[0]) for row in rows)
+    )
+    rows = [_completed(row, low[row.tank], why[row.tank]) for row in rows]
+    verdicts = check(
+        guard,
+        plant,
+        actuator,
+        sensor,
+        hold=hold,
+        substeps=substeps,
+        box=_intervals(widths, {"plant": plant, "actuator": actuator, "sensor": sensor})
+        | ({} if start is None else {"x0": (begin, start)}),
+        inflow=(draw, inflow),
+        volume=volume,
+        drawn=drawn,
+        start=start,
+        faults=faults,
+        limits=[row.limit for row in rows],
+    )
+    return guard, tuple(_checked(*pair, plant.units[0]) for pair in zip(rows, verdicts))
+
+
+def _intervals(widths, parts):
+    """{dotted name: (lower, upper)} of `widths`; those of levels at t = 0 are in the start."""
+    found = {}
+    for name, width in widths.items():
+        name = name if "." in name or name.startswith("x0") else f"plant.{name}"
+        part, _, rest = name.partition(".")
+        if part not in parts:
+            if not name.startswith("x0"):
+                found[name] = (0.0, 0.0)
+            continue
+        field, _, entry = rest.partition("[")
+        value = getattr(parts[part], field, 0.0)
+        value = np.asarray(0.0 if value is None else value, dtype=float)
+        value = value[int(entry[:-1])] if entry else value
+        found[name] = (value - np.asarray(width), value + np.asarray(width))
+    return found
+
+
+def _checked(row, verdict, length):
+    """A TankCertificate with the verdict of the checker: a limit is proved where design and checker
+    agree. Reasons in the rig's unit of length.
+    """
+    own = lambda text: re.sub(r"\bcm\b", length, text)
+    proved, low_proved = row.certified and verdict.holds, row.low_certified and verdict.low_holds
+    return dataclasses.replace(
+        row,
+        certified=proved,
+        reason=own(verdict.reason if row.certified else row.reason),
+        starts=verdict.starts if proved else "",
+        low_certified=low_proved,
+        low_reason=own(verdict.low_reason if row.low_certified else row.low_reason),
+    )
+
+
+def _rates(least, most, inflow, step, draw):
+    """`rates_of` in plain numbers."""
+    return jax.tree.map(_plain, rates_of(least, most, inflow, step, draw))
+
+
+def _dead_zone(actuator, widths):
+    """The least offset dead zone [V] of each pump, 0 without one."""
+    offset = np.asarray(actuator.offset, dtype=float)
+    return interval(actuator, "actuator.dead_zone", widths)[0] if offset.ndim else offset
 
 
 def _quiet_rate(setting, sensor, heights, kappa):
     """kappa [1/s], or less, so that the noise of a capped pump stays within QUIET of its range."""
     rates, noise, quiet, needed = setting.rates, np.asarray(sensor.noise, dtype=float), kappa, 0.0
     for i in (i for i, gains in enumerate(rates.pumps) if gains):
-        needed = max(needed, rates.out[i] / math.sqrt(heights[i]))
+        needed = max(needed, steepest(setting, i, heights[i]))
         for j, (_, b) in rates.pumps[i].items() if noise[i] > 0.0 else ():
             # the cap M/b moves by kappa dy/b, and two readings differ by sqrt(2) sigma
             span = b * (setting.high[j] - max(setting.low[j], 0.0))
@@ -195,10 +282,11 @@ def _wanted(setting, plant, limit):
     return wanted
 
 
-def _predicted(setting):
+def _predicted(setting, widths):
     """Number of inputs under way over which levels can be predicted; 0: none."""
     samples = math.ceil(setting.delay / setting.hold - 1e-9)
     other = setting.lag > 0.0 or setting.rates.pipes or setting.dead or setting.drawn
+    other = other or "actuator.delay" in widths
     return 0 if samples < 2 or other or np.any(setting.spare > 0.0) else samples
 
 
@@ -210,8 +298,9 @@ def _upper(setting, found):
         "spare": setting.spare,
         "band": np.array(setting.band),
         "slope": found.slopes,
-        # of a lagged input every older reading is a part: neighbours count with their `reach`
-        "age": setting.delay if setting.lag == 0.0 else UNKNOWN,
+        # of a lagged input every older reading is a part: neighbours count with their `reach`; and
+        # where inputs beyond the limits of the pumps are under way
+        "age": UNKNOWN if setting.lag > 0.0 or setting.beyond else setting.delay,
         "held": _held(setting, found),
         "predicted": setting.predicted,
     }
@@ -223,24 +312,47 @@ def _lower(setting, low, bottom):
     return {"low": np.array(low), "bottom": bottom, "kept": kept}
 
 
-def _of_pumps(actuator, dead):
+def _of_pumps(actuator, dead, widths):
     """The fields of Setting that describe the pumps, of dead zones `dead` [V]."""
+    leaves = ("low", "high", "initial", "delay", "lag")
+    least, most = (
+        dict(zip(leaves, ends))
+        for ends in zip(*(interval(actuator, f"actuator.{leaf}", widths) for leaf in leaves))
+    )
+    delay, lag = float(most["delay"]), float(np.max(most["lag"]))
+    under_way = delay > 0.0 or lag > 0.0
+    above = np.any(most["initial"] > least["high"])
     return {
-        "delay": float(actuator.delay),
-        "lag": _largest(getattr(actuator, "lag", None)),
-        "low": np.asarray(actuator.low, dtype=float),
-        "high": np.asarray(actuator.high, dtype=float) - dead,
+        "delay": delay,
+        "lag": lag,
+        "low": most["low"],
+        "high": most["high"] - dead,
+        "weakest": least["high"] - dead,
         "pulse": _pulses(actuator),
         "dead": getattr(actuator, "dead_zone", None) is not None,
-        "before": tuple(np.asarray(actuator.initial, dtype=float) - dead),
+        "before": tuple(most["initial"] - dead) if under_way else (),
+        "beyond": under_way
+        and bool(above or np.any(least["initial"] < np.minimum(least["low"], 0.0))),
     }
 
 
+def _divided(setting, actuator, widths):
+    """Tanks that several pumps feed whose lags differ or may differ: Theorem 4 needs a row each."""
+    ends = np.stack(interval(actuator, "actuator.lag", widths))
+    if setting.lag == 0.0 or not np.all(np.isfinite(setting.high)):
+        return ()
+    lags = np.broadcast_to(ends.reshape(2, -1), (2, len(setting.high)))
+    fed = [list(gains) for gains in setting.rates.pumps]
+    return tuple(i for i, js in enumerate(fed) if len(js) > 1 and np.ptp(lags[:, js]) > 0.0)
+
+
 class _Proved(NamedTuple):
-    """Limits (n,) [cm], k1 (n,) [1/s], which tanks full pumps cannot fill, {tank: condition that
-    failed, or ""}, and levels that no tank passes (n,) [cm], all before volumes that enter besides.
+    """kappa [1/s], limits (n,) [cm], k1 (n,) [1/s], which tanks full pumps cannot fill, {tank:
+    condition that failed, or ""}, and levels that no tank passes (n,) [cm], all before volumes that
+    enter besides.
     """
 
+    rate: float
     heights: np.ndarray
     slopes: np.ndarray
     idle: np.ndarray
@@ -248,18 +360,26 @@ class _Proved(NamedTuple):
     reach: np.ndarray
 
 
-def _proved(setting, plant, wanted, kappa, bound, start):
-    """Return the _Proved of a rig for the `wanted` limits (n,) [cm]."""
-    begin = wanted if start is None else np.broadcast_to(np.asarray(start, float), wanted.shape)
+def _proved(setting, sensor, plant, wanted, rate, bound, start):
+    """Return the _Proved of a rig for the `wanted` limits (n,) [cm] and a `rate`, or None for the
+    default.
+    """
+    begin = wanted if start is None else start
     first = np.minimum(wanted, np.maximum(filled_levels(setting, wanted, begin), begin))
-    heights, slopes, reasons = limits_for(setting, first, kappa)
-    idle = (heights == first) & (heights < wanted)  # full pumps cannot reach the limit
-    for i, why in enumerate(reasons):
-        reasons[i] = why or failed_condition(
-            setting, i, heights, slopes, idle[i], kappa, bound, start
+
+    def at(kappa):
+        heights, slopes, reasons = limits_for(setting, first, kappa)
+        idle = (heights == first) & (heights < wanted)  # full pumps cannot reach the limit
+        return settle(
+            setting, _Proved(kappa, heights, slopes, idle, reasons, heights), bound, start, plant
         )
-    reach = settle(setting, heights, slopes, idle, reasons, plant)
-    return _Proved(heights, slopes, idle, reasons, reach)
+
+    if rate is not None:
+        return at(float(rate))
+    found = at(min(FASTEST, SHARE_OF_HOLD / setting.hold, BELOW_BOUND * bound))
+    if not np.any(np.asarray(sensor.noise) > 0.0):
+        return found
+    return at(_quiet_rate(setting, sensor, found.heights, found.rate))
 
 
 def _held(setting, found):
@@ -288,23 +408,14 @@ def _row(setting, nominal, found, tank, wanted, kappa, bound, narrow):
     )
 
 
-def _completed(row, low, why, length):
-    """A TankCertificate with its low limit [cm] and why that is not proved; reasons in the rig's
-    unit of length.
-    """
-    own = lambda text: re.sub(r"\bcm\b", length, text)
+def _completed(row, low, why):
+    """A TankCertificate with its low limit [cm] and why that is not proved."""
     return dataclasses.replace(
         row,
-        reason=own(row.reason),
         low=float(low),
         low_certified=bool(low > 0.0 and not why),
-        low_reason=own(why) or ("Low limits" if low > 0.0 else ""),
+        low_reason=why or ("Low limits" if low > 0.0 else ""),
     )
-
-
-def _largest(lag):
-    """The longest lag [s] of the pumps, 0 without one."""
-    return 0.0 if lag is None else float(np.max(lag))
 
 
 def _pulses(actuator):

@@ -31,65 +31,98 @@ def theorem_of(setting, tank):
     return "Theorem 3" if setting.delay > 0.0 else "Theorem 1"
 
 
-def failed_condition(setting, tank, heights, slopes, idle, kappa, bound, start):
-    """The condition that keeps the limit of one tank from being proved, or ""."""
-    rates = setting.rates
-    if start is not None and np.asarray(start)[tank] > heights[tank] * (1.0 + 1e-12):
-        return f"start at {np.asarray(start)[tank]:.4g} cm, above the limit {heights[tank]:.4g} cm"
-    if idle:
+def failed_condition(setting, tank, limits, bound, start, reach):
+    """The condition that keeps the limit of one tank from being proved, or "".
+
+    limits : the _Proved of the rig; start : (n,) highest levels at t = 0 [cm], or None; reach :
+    (n,) levels that no tank passes [cm], before volumes that enter besides
+    """
+    rates, top, kappa = setting.rates, limits.heights[tank], limits.rate
+    if start is not None and start[tank] > top * (1.0 + 1e-12):
+        return f"start at {start[tank]:.4g} cm, above the limit {top:.4g} cm"
+    if limits.idle[tank]:
         return ""
     if setting.pulse:
         return "a pulse dead zone pays out more than was commanded"
     if kappa > bound * (1.0 + 1e-12):
         return f"kappa {kappa:.3g} above its bound {bound:.3g} 1/s"
-    if slopes[tank] > 0.0:
-        return _too_high_above(setting, tank, heights, slopes, start)
-    if not rates.pumps[tank] or (setting.delay == 0.0 and setting.lag == 0.0):
+    if limits.slopes[tank] > 0.0:
+        return _too_high_above(setting, tank, limits.heights, limits.slopes, start)
+    if not rates.pumps[tank]:
         return ""
+    if unread := _beyond_adc(setting, tank, reach):
+        return unread
+    if setting.delay == 0.0 and setting.lag == 0.0:
+        return ""
+    begin = limits.heights if start is None else start
     if setting.predicted:
-        return "" if start is None else _filled_under_way(setting, tank, heights, np.asarray(start))
+        return _filled_under_way(setting, tank, top, begin, reach)
     if any(i == tank for i, *_ in rates.pipes):
         return "a pipe with dead time or lag: not proved"
-    steep = rates.out[tank] / math.sqrt(heights[tank])
-    if kappa < steep:
-        return f"(N) kappa {kappa:.3g} below c_min/sqrt(H) = {steep:.3g} 1/s"
+    if kappa < (steep := steepest(setting, tank, top)):
+        return f"(N) kappa {kappa:.3g} below c_min sqrt(H)/(H - h_e) = {steep:.3g} 1/s"
     if setting.lag > 0.0:
-        brought = full_pumps(setting, tank) + setting.phi(tank, 0.0, heights)
+        shallow = max(rates.empty[tank], rates.knee)
+        if shallow > 0.25 * top:
+            return f"(F) laminar or limited outflow up to {shallow:.3g} cm, above 1/4 of the limit"
+        brought = full_pumps(setting, tank) + setting.phi(tank, 0.0, reach)
         filled = brought * (2.0 * setting.lag + setting.delay + setting.hold)
-        if filled > 0.75 * heights[tank]:
+        if filled > 0.75 * top:
             return f"(F) {filled:.3g} cm may be filled within the lag: above 3/4 of the limit"
-    return "" if start is None else _under_way(setting, tank, heights, kappa, np.asarray(start))
+    return _under_way(setting, tank, top, kappa, begin, reach)
 
 
-def _under_way(setting, tank, heights, kappa, start):
-    """Why (S) fails, the inputs under way obey the row of the levels `start`, or ""."""
-    age, others = setting.delay + setting.hold, np.array(heights)
-    for k in range(len(heights)) if setting.lag == 0.0 else ():
-        fastest = full_pumps(setting, k) + max(setting.phi(k, 0.0, heights), 0.0)
-        others[k] = min(heights[k], start[k] + age * fastest)
-    brought = ran_before(setting, tank)
-    allowed = kappa * (heights[tank] - start[tank]) - setting.phi(tank, start[tank], others)
-    if brought <= allowed * (1.0 + 1e-9):
+def steepest(setting, tank, top):
+    """(N): the least kappa [1/s] with Phi_max(h) - Phi_max(H) <= kappa (H - h) for all h below the
+    limit; below h_e = `empty` nothing leaves for certain.
+    """
+    below = max(top - setting.rates.empty[tank], 1e-300)
+    return setting.rates.out[tank] * math.sqrt(top) / below
+
+
+def _beyond_adc(setting, tank, reach):
+    """Why the reading of a neighbour does not bound its level, or ""."""
+    rates, levels = setting.rates, reach + setting.spare
+    joined = {j for j, sink, *_ in rates.links if sink == tank}
+    joined |= {j for i, j, *_ in rates.pipes if i == tank}
+    for j in sorted(j for j in joined if levels[j] > setting.top[j] * (1.0 + 1e-12)):
+        return f"relies on tank {j + 1}, whose ADC reads up to {setting.top[j]:.4g} cm only"
+    return ""
+
+
+def _under_way(setting, tank, top, kappa, start, reach):
+    """Why (S) fails, the inputs under way obey the row of levels up to `start`, or ""."""
+    rates, age, others = setting.rates, setting.delay + setting.hold, np.array(reach)
+    for k in range(len(reach)) if setting.lag == 0.0 else ():
+        fastest = full_pumps(setting, k) + max(setting.phi(k, 0.0, reach), 0.0)
+        others[k] = min(reach[k], start[k] + age * fastest)
+    brought, h = ran_before(setting, tank), start[tank]
+    # what is allowed is concave in the level, but for the step at `empty`
+    allowed = min(
+        kappa * (top - h) - setting.phi(tank, h, others),
+        kappa * (top - min(h, rates.empty[tank])) - setting.phi(tank, 0.0, others),
+    )
+    if brought <= max(allowed * (1.0 + 1e-9), unstoppable(setting, tank)):
         return ""
     return f"(S) start: {brought:.3g} cm/s under way, {max(allowed, 0.0):.3g} allowed"
 
 
-def _filled_under_way(setting, tank, heights, start):
+def _filled_under_way(setting, tank, top, start, reach):
     """Why the inputs under way at the start may fill a tank past its limit, or ""."""
     level, steps = float(start[tank]), 200 * setting.predicted
     step, brought = setting.delay / steps, ran_before(setting, tank)
     for _ in range(steps):  # from above: the explicit step where it rises, no change where it falls
-        level += step * max(brought + setting.phi(tank, level, heights), 0.0)
-        if level > heights[tank] * (1.0 + 1e-9):
-            return f"start: inputs under way may fill it above {heights[tank]:.4g} cm"
+        level += step * max(brought + setting.phi(tank, level, reach), 0.0)
+        if level > top * (1.0 + 1e-9):
+            return f"start: inputs under way may fill it above {top:.4g} cm"
     return ""
 
 
 def _too_high_above(setting, tank, heights, slopes, start):
     """Why the levels `start` do not allow a second-order row to begin (g >= 0), or ""."""
     if start is None:
-        return ""
-    start, rates, knee = np.asarray(start), setting.rates, setting.rates.knee
+        return "start: not known, and the tanks above may hold more than can be stopped in time"
+    rates, knee = setting.rates, setting.rates.knee
     a0 = FLOOR * sqrt_of(heights[tank], knee)
     g = rates.out[tank] * sqrt_of(start[tank], knee)
     g += slopes[tank] * (heights[tank] - start[tank])
@@ -99,47 +132,73 @@ def _too_high_above(setting, tank, heights, slopes, start):
     return "" if g >= 0.0 else "start: the tanks above hold more than can be stopped in time"
 
 
-def settle(setting, heights, slopes, idle, reasons, plant):
-    """(n,) levels that no tank passes [cm]. A tank that relies on one which is not certified loses
-    its certificate (in `reasons`) unless its condition holds for what that one may reach.
+def settle(setting, limits, bound, start, plant):
+    """`limits` with the conditions that failed and the levels that no tank passes. A tank without a
+    certificate may pass its limit: the conditions of the others must hold for what it may reach.
     """
+    reasons = list(limits.reasons)
     while True:
-        reach = _reach(setting, heights, [not why for why in reasons], plant)
+        reach = _reach(setting, limits.heights, reasons, plant, start)
         before = list(reasons)
-        for i, why in enumerate(before):
-            others = [] if why else _relied_on(setting, i, heights, slopes, idle, reasons, reach)
-            if others:
-                names = ", ".join(str(j + 1) for j in others)
-                reasons[i] = f"relies on tank {names}, not certified"
+        for i in (i for i, why in enumerate(before) if not why):
+            reasons[i] = failed_condition(setting, i, limits, bound, start, reach)
+            reasons[i] = reasons[i] or _relied_on(setting, i, limits, before, reach)
         if reasons == before:
-            return reach
+            return limits._replace(reasons=reasons, reach=reach)
 
 
-def _relied_on(setting, tank, heights, slopes, idle, reasons, reach):
-    """[tanks without a certificate that the proof of `tank` needs], [] where it holds as it is."""
+def _relied_on(setting, tank, limits, reasons, reach):
+    """Which tanks without a certificate the proof of `tank` needs, or "" where it needs none."""
     rates = setting.rates
     above = [j for j, sink, *_ in rates.links if sink == tank and reasons[j]]
-    if slopes[tank] > 0.0:
-        return above
-    extra = full_pumps(setting, tank) if idle[tank] else unstoppable(setting, tank)
-    if setting.phi(tank, heights[tank], reach) + extra <= 1e-9 * max(rates.out[tank], 1e-9):
-        return []
-    return above or [j for j, why in enumerate(reasons) if why]
+    if limits.slopes[tank] == 0.0:
+        extra = full_pumps(setting, tank) if limits.idle[tank] else unstoppable(setting, tank)
+        excess = setting.phi(tank, limits.heights[tank], reach) + extra
+        if excess <= max(1e-9 * rates.out[tank], 1e-12):
+            return ""
+        above = above or [j for j, why in enumerate(reasons) if why]
+        if not above:
+            return f"rim condition: {excess:.3g} cm/s too much may enter at the limit"
+    names = ", ".join(str(j + 1) for j in above)
+    return f"relies on tank {names}, not certified" if above else ""
 
 
-def _reach(setting, heights, certified, plant):
-    """(n,) levels that no tank passes [cm]: H where certified, else where its inflow can rest."""
+def _reach(setting, heights, reasons, plant, start):
+    """(n,) levels that no tank passes [cm]: H where certified, else where its inflow can rest, or
+    its start.
+    """
     n, rim = len(heights), np.asarray(plant.rim, dtype=float)
-    reach = np.array(heights)
+    begin = heights if start is None else np.maximum(heights, start)
+    top = np.where(np.array(setting.uncovered) == "", begin, np.inf)
+    reach = np.where([not why for why in reasons], heights, top)
+    highest = np.maximum(rim, begin) if plant.overflow else np.full(n, np.inf)
     for _ in range(50):
         before = reach.copy()
-        for i in (i for i in range(n) if not certified[i]):
-            reach[i] = max(reach[i], resting_level(setting, i, reach))
-            if plant.overflow:
-                reach[i] = min(reach[i], max(rim[i], heights[i]))
+        for i in (i for i in range(n) if reasons[i]):
+            reach[i] = min(max(reach[i], resting_level(setting, i, reach)), highest[i])
         if np.allclose(reach, before, rtol=1e-9, atol=0.0):
             return reach
-    return np.where(certified, heights, rim if plant.overflow else np.inf)
+    return np.where([not why for why in reasons], heights, highest)
+
+
+def spills(setting, plant, limits, start):
+    """((n,) what falls at most into each tank from rims [cm^3/s], (n) features that no theorem
+    covers). A tank spills unless it is proved for a limit at or below its rim.
+
+    plant : (least, most) plant of the box; limits : the _Proved of the rig
+    """
+    (least, most), wild = plant, list(setting.uncovered)
+    falls = np.zeros(len(wild))
+    for k, (source, sink) in enumerate(least.spills if least.overflow else ()):
+        rim, spare = float(least.rim[source]), setting.spare[source]
+        if not limits.reasons[source] and limits.heights[source] + spare <= rim * (1.0 + 1e-12):
+            continue
+        net = full_pumps(setting, source) + setting.phi(source, rim, limits.reach)
+        falls[sink] += float(most.caught[k]) * float(most.area[source]) * max(net, 0.0)
+        at_once = spare > 0.0 or (start is not None and start[source] > rim)
+        if (at_once or setting.uncovered[source]) and not wild[sink]:
+            wild[sink] = f"not covered: volumes that spill from tank {source + 1}"
+    return falls, tuple(wild)
 
 
 def gap_of(setting, nominal, tank, kappa, limit, reach):

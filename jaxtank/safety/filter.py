@@ -44,54 +44,76 @@ class SafetyFilter:
 
     least: TankNetwork
     most: TankNetwork
-    limit: np.ndarray = leaf("cm", "(n,) level that no tank may pass", low=0.0, strict=True)
-    reach: np.ndarray = leaf("cm", "(n,) level that no tank passes for certain", low=0.0)
-    rate: np.ndarray = leaf(
-        "1/s", "(n,) how fast a level may approach its limit (kappa)", low=0.0, strict=True
+    limit: np.ndarray = leaf(
+        "cm", "level that no tank may pass", low=0.0, strict=True, shape=("tank",)
     )
-    band: np.ndarray = leaf("cm", "(n,) largest difference of reading and level", low=0.0)
-    inflow: np.ndarray = leaf("cm^3/s", "(n,) largest inflow disturbance", low=0.0)
+    reach: np.ndarray = leaf(
+        "cm", "level that no tank passes for certain", low=0.0, shape=("tank",)
+    )
+    rate: np.ndarray = leaf(
+        "1/s",
+        "how fast a level may approach its limit (kappa)",
+        low=0.0,
+        strict=True,
+        shape=("tank",),
+    )
+    band: np.ndarray = leaf(
+        "cm", "largest difference of reading and level", low=0.0, shape=("tank",)
+    )
+    inflow: np.ndarray = leaf("cm^3/s", "largest inflow disturbance", low=0.0, shape=("tank",))
     slope: np.ndarray = leaf(
         "1/s",
-        "(n,) k1 of a tank that is held by the pumps above it; 0: by its own",
+        "k1 of a tank that is held by the pumps above it; 0: by its own",
         low=0.0,
         default=lambda own: np.zeros(np.shape(own["limit"])),
+        shape=("tank",),
     )
     spare: np.ndarray = leaf(
         "cm",
-        "(n,) rise by volumes that may enter besides, in all",
+        "rise by volumes that may enter besides, in all",
         low=0.0,
         default=lambda own: np.zeros(np.shape(own["limit"])),
+        shape=("tank",),
     )
     age: np.ndarray | float = leaf(
         "s", "age of a reading when the input computed from it begins to act", low=0.0, default=0.0
     )
     offset: np.ndarray = leaf(
         "V",
-        "(m,) least input that moves liquid, of pumps with an offset dead zone",
+        "least input that moves liquid, of pumps with an offset dead zone",
         default=lambda own: np.zeros(own["least"].pumps),
+        shape=("pump",),
     )
     low: np.ndarray = leaf(
         "cm",
-        "(n,) level below which no tank may fall; 0: none",
+        "level below which no tank may fall; 0: none",
         low=0.0,
         default=lambda own: np.zeros(np.shape(own["limit"])),
+        shape=("tank",),
     )
     bottom: np.ndarray = leaf(
         "cm",
-        "(n,) level below which no tank falls for certain",
+        "level below which no tank falls for certain",
         low=0.0,
         default=lambda own: np.zeros(np.shape(own["limit"])),
+        shape=("tank",),
     )
     draw: np.ndarray = leaf(
         "cm^3/s",
-        "(n,) least inflow disturbance, 0 or negative",
+        "least inflow disturbance, 0 or negative",
         default=lambda own: np.zeros(np.shape(own["limit"])),
+        shape=("tank",),
     )
     held: tuple = static(doc="tanks whose limits are kept, counted from 0")
     kept: tuple = static(doc="tanks whose low limits are kept, counted from 0", default=())
     predicted: int = static(doc="inputs under way over which levels are predicted", default=0)
     substeps: int = static(doc="steps of the prediction in a sample", default=1)
+    divided: tuple = static(
+        doc="tanks whose row is divided among their pumps, in shares of what each brings at full",
+        default=(),
+    )
+    leaks: tuple = static(doc="tanks that second-order rows count with `draw` for", default=())
+    running: tuple = static(doc="pumps whose lower limit is above 0 V", default=())
     allocate: bool = static(
         doc="give the other of two pumps what serves the outputs best where one meets its cap",
         choices=(False, True),
@@ -142,7 +164,7 @@ class SafetyFilter:
         if not shared and not together:
             return u, jnp.where(acts, 1.0, 0.0)
         moving = tuple(v - zone for v, zone in zip(u, dead))
-        held = self.scaled(raised(moving, together, caps), shared)
+        held = self.scaled(raised(moving, together, caps), shared, low)
         acts = acts | _any(a != b for a, b in zip(held, moving))
         return tuple(v + zone for v, zone in zip(held, dead)), jnp.where(acts, 1.0, 0.0)
 
@@ -194,7 +216,9 @@ class SafetyFilter:
                     step = hold / self.substeps
                     least, most = brackets(r, i, levels, line, others, step, self.substeps)
                 m = self.rate[i] * (self.limit[i] - most) - rise(r, i, least, above)
-                rows.append(({j: b for j, (_, b) in r.pumps[i].items()}, lower_clip(m, 0.0)))
+                row = {j: b for j, (_, b) in r.pumps[i].items()}
+                whole = (row, lower_clip(m, 0.0))
+                rows += _divided(*whole, high) if i in self.divided else [whole]
             else:
                 rows.append(self._row_above(r, i, y, hold, high))
         return rows
@@ -218,13 +242,16 @@ class SafetyFilter:
         drains, row = 0.0, {}
         g = r.out[tank] * s(y[tank] - eps) + k1 * (top - y[tank] - eps)
         for j, most in sources:
-            lowest = s(y[j] - self.band[j]) - 0.5 * r.out_most[j] * hold
+            leaves = r.out_most[j] - r.draw[j] / a0 if j in self.leaks else r.out_most[j]
+            lowest = s(y[j] - self.band[j]) - 0.5 * leaves * hold
             drains = drains + jnp.where(lowest >= a0, 0.5 * most * r.out[j], 0.0)
             g = g - most * lower_clip(s(y[j] + self.band[j]), a0)
             steep = most * 0.5 / lower_clip(lowest, a0)
             for pump, (_, b) in r.pumps[j].items():
                 row[pump] = row.get(pump, 0.0) + steep * b
-        lowest = lower_clip(y[tank] - eps - hold * r.out_most[tank] * s(top), 0.0)
+        leaves = r.out_most[tank] * s(top)
+        leaves = leaves - r.draw[tank] if tank in self.leaks else leaves
+        lowest = lower_clip(y[tank] - eps - hold * leaves, 0.0)
         m = lower_clip(drains + k2 * g - k1 * k1 * (top - lowest), 0.0)
         x = y[tank] + eps + hold * full
         far = r.out[tank] * s(x) + k1 * (top - x) >= full
@@ -259,15 +286,33 @@ class SafetyFilter:
         r = rates_of(self.least, self.most, self.inflow, hold, self.draw)
         return floors_of(r, floor_rows(self, r, y, hold, low), low, caps)
 
-    def scaled(self, u: Sequence, shared: list) -> tuple:
-        """Return inputs u (m) [V] lowered so that rows of several pumps hold, all in proportion."""
+    def scaled(self, u: Sequence, shared: list, low: Sequence) -> tuple:
+        """Return inputs u (m) [V] lowered so that rows of several pumps hold, all in proportion and
+        none below its lower limit `low` (m) [V].
+        """
         u = list(u)
         for row, m in shared:
-            total = sum(a * lower_clip(u[j], 0.0) for j, a in row.items())
+            least = {j: low[j] for j in row if j in self.running}
+            above = {j: u[j] - least[j] if j in least else u[j] for j in row}
+            if least:  # which is brought in any case
+                m = lower_clip(m - sum(row[j] * v for j, v in least.items()), 0.0)
+            total = sum(a * lower_clip(above[j], 0.0) for j, a in row.items())
             share = jnp.where(total > m, m / jnp.where(total > m, total, 1.0), 1.0)
-            for j in row:
-                u[j] = jnp.where(u[j] > 0.0, u[j] * share, u[j])
+            for j, v in above.items():
+                lowered = least[j] + v * share if j in least else v * share
+                lowers = (v > 0.0) & (total > m) if j in least else v > 0.0
+                u[j] = jnp.where(lowers, lowered, u[j])
         return tuple(u)
+
+
+def _divided(row, m, high):
+    """The rows [({pump: a}, M)] of single pumps, each with the share of M [cm/s] that it has of
+    what all bring at `high` (m) [V].
+    """
+    full = {j: b * lower_clip(high[j], 0.0) for j, b in row.items()}
+    total = sum(full.values())
+    total = jnp.where(total > 0.0, total, 1.0)
+    return [({j: b}, m * full[j] / total) for j, b in row.items()]
 
 
 def _any(flags):

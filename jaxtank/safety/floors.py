@@ -44,7 +44,7 @@ def lowest(guard: Any, rates: Rates, y: Sequence, hold: Any, low: Sequence) -> l
     below = []
     for i in range(guard.least.tanks):
         drawn = sum(b * lower_clip(-low[j], 0.0) for j, (_, b) in rates.pumps[i].items())
-        fastest = drawn - fall(rates, i, guard.reach[i], guard.bottom)
+        fastest = lower_clip(drawn - fall(rates, i, guard.reach[i], guard.bottom), 0.0)
         least = y[i] - guard.band[i] - (hold + guard.age) * fastest
         below.append(lower_clip(least, guard.bottom[i]))
     return below

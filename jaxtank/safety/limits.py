@@ -12,6 +12,8 @@ from jaxtank.safety.setting import resting_level, sqrt_of, unstoppable
 
 MARGIN = 0.9
 """Share of D = sum c_j o_j / 2 that the choice of k1 counts on."""
+SWEEPS = 500
+"""Sweeps over all tanks after which limits that still fall count as not to be kept."""
 
 
 def filled_levels(setting, wanted, start):
@@ -28,39 +30,56 @@ def filled_levels(setting, wanted, start):
     return filled
 
 
-def limits_for(setting, heights, kappa):
+def limits_for(setting, heights, kappa, unsettled=frozenset()):
     """(limits (n,) [cm], k1 (n,) [1/s], {tank: why it failed}): Theorem 2.
 
     A tank whose inflow alone passes its limit is held by the pumps above it if it has none of its
-    own; otherwise the limits of the tanks above are lowered by one factor until it is not.
+    own; otherwise the limits of the tanks above are lowered by one factor until it is not. Every
+    k1 is chosen again after a limit was lowered, so what is returned meets all conditions at once.
+
+    unsettled : tanks for whose sake no limit is lowered, since that did not come to an end
     """
-    n, rates = len(heights), setting.rates
-    heights, slopes, reasons = np.array(heights), np.zeros(n), [""] * n
-    for _ in range(4 * n):
-        changed = False
-        for i in range(n):
-            excess = setting.phi(i, heights[i], heights) + unstoppable(setting, i)
-            if excess <= 1e-12 or slopes[i] > 0.0 or reasons[i]:
+    n, limits = len(heights), np.array(heights)
+    for _ in range(SWEEPS):
+        slopes, reasons, lowered = np.zeros(n), list(setting.uncovered), set()
+        for i in (i for i in range(n) if not reasons[i]):
+            excess = setting.phi(i, limits[i], limits) + unstoppable(setting, i)
+            if excess <= 1e-12:
                 continue
-            slopes[i], why = _second_order(setting, i, heights, kappa)
+            slopes[i], why = _second_order(setting, i, limits, kappa)
             if slopes[i] > 0.0:
                 continue
-            sources = [(j, most) for j, sink, _, most in rates.links if sink == i]
-            pressed = sum(
-                most * sqrt_of(heights[j] + setting.spare[j], rates.knee) for j, most in sources
-            )
-            margin = rates.out[i] * sqrt_of(heights[i], rates.knee) - (
-                excess + rates.out[i] * sqrt_of(heights[i], rates.knee) - pressed
-            )
-            if not sources or margin <= 0.0:
-                reasons[i] = _rim_words(setting, i, heights) + (f"; {why}" if why else "")
+            if i in unsettled:
+                reasons[i] = f"{_rim_words(setting, i, limits)}; lower limits above do not mend it"
                 continue
-            for j, _ in sources:
-                heights[j] *= (margin / pressed) ** 2 * (1.0 - 1e-12)
-            changed = True
-        if not changed:
-            break
-    return heights, slopes, reasons
+            factor, above = _lowering(setting, i, limits, excess)
+            if not above:
+                reasons[i] = _rim_words(setting, i, limits) + (f"; {why}" if why else "")
+                continue
+            for j in above:
+                limits[j] = factor * (limits[j] + setting.spare[j]) - setting.spare[j]
+            lowered.add(i)
+        if not lowered:
+            return limits, slopes, reasons
+    return limits_for(setting, heights, kappa, unsettled | lowered)
+
+
+def _lowering(setting, tank, limits, excess):
+    """(factor by which the levels of the tanks above must be lower, those tanks), none where that
+    does not mend the rim condition of a tank.
+    """
+    rates, levels = setting.rates, limits + setting.spare
+    sources = {j: most for j, sink, _, most in rates.links if sink == tank}
+    pressed = sum(
+        most * sqrt_of(levels[j], rates.knee) for j, sink, _, most in rates.links if sink == tank
+    )
+    # what the sources may bring: their inflow less what is too much of it
+    margin = pressed - excess
+    if margin <= 0.0:
+        return 1.0, ()
+    factor = (margin / pressed) ** 2 * (1.0 - 1e-12)
+    low = any(factor * levels[j] <= setting.spare[j] for j in sources)
+    return factor, () if low else tuple(sources)
 
 
 def _rim_words(setting, tank, heights):
@@ -95,8 +114,11 @@ def _other_topology(setting, tank, above):
     piped = {i for pipe in rates.pipes for i in pipe[:2]}
     if piped & (above | {tank}):
         return "not proved with pipes"
-    if any(rates.inflow[i] > 0.0 or setting.spare[i] > 0.0 for i in (tank, *above)):
+    both = (tank, *above)
+    if setting.drawn or any(rates.inflow[i] > 0.0 or setting.spare[i] > 0.0 for i in both):
         return "not proved with inflow disturbances"
+    if any(setting.low[j] < 0.0 for i in both for j in rates.pumps[i]):
+        return "not proved for pumps that may run backwards"
     if any(sink in above for _, sink, *_ in rates.links) or not all(rates.pumps[j] for j in above):
         return "not proved where the tanks above are fed by others"
     return "not proved for pumps that cannot stop" if any(setting.low > 0.0) else ""
@@ -127,7 +149,7 @@ def _slope(setting, tank, heights, sources):
             break
         level = _crossing(rates.out[tank], k1, top, full)
         lowest = level - hold * full - 2.0 * setting.band[tank]
-        lowest -= hold * rates.out_most[tank] * sqrt_of(top, knee)
+        lowest -= hold * (rates.out_most[tank] * sqrt_of(top, knee) - rates.draw[tank])
         steep = rates.out[tank] * 0.5 / math.sqrt(lowest) if lowest > knee else math.inf
         if k1**2 * (top - level) <= drained and k1 > steep:  # (C1), (C4)
             return float(k1), ""

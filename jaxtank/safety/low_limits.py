@@ -56,6 +56,8 @@ def _own_condition(setting, tank, low, found, kappa, start):
         return f"above the upper limit that can be kept, {found.heights[tank]:.4g} cm"
     if start is not None and np.asarray(start)[tank] < low[tank]:
         return f"start at {np.asarray(start)[tank]:.4g} cm, below the low limit"
+    if setting.uncovered[tank]:
+        return setting.uncovered[tank]
     if setting.drawn:
         return "not proved with inflow pulses that draw liquid"
     if not setting.rates.pumps[tank]:
@@ -75,7 +77,7 @@ def _own_condition(setting, tank, low, found, kappa, start):
 def _by_others(setting, tank, low, bottom, found, kappa):
     """What fails while the other tanks hold at least `bottom` (n,) [cm], or ""."""
     gains = setting.rates.pumps[tank]
-    full = sum(least * max(setting.high[j], 0.0) for j, (least, _) in gains.items())
+    full = sum(least * max(setting.weakest[j], 0.0) for j, (least, _) in gains.items())
     falling = -phi_min(setting.rates, tank, low[tank], bottom)
     if falling > full * (1.0 + 1e-12):
         return f"{falling:.3g} cm/s may leave at the low limit, {full:.3g} enter for certain"

@@ -13,12 +13,14 @@ from numpy.typing import ArrayLike
 from jaxtank.core.errors import InputError
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants.tank_network import TankNetwork
-from jaxtank.safety.box import widths_of
+from jaxtank.safety.box import spread, widths_of
 from jaxtank.safety.certificate import TankCertificate, design
 from jaxtank.safety.filter import SafetyFilter
 from jaxtank.signals.inflows import InflowPulses
 
 FLOWS = ("drain", "orifice", "pipe", "pump_gain", "split")
+HARMLESS = ("controller.", "observer.", "reference.")
+"""What may be uncertain without a change of the box: limits hold under any controller."""
 SPREAD = 0.05
 """Share by which every flow may be off where a case does not say what is uncertain."""
 PROBABILITY = 0.99
@@ -41,7 +43,8 @@ def design_for(
     ----------
     case : jaxtank.Case
     widths : {parameter of the plant: half width of its interval, in its unit}, the box of plants;
-        left out: `case.uncertain`, or the box of 99 % of `case.covariance`, or 5 % of every flow
+        left out: `case.uncertain`, or the box of 99 % of `case.covariance`, or 5 % of every flow.
+        What `case.uncertain` has of pumps, sensors, starts and disturbances counts in any case
     limit : (n,) levels not to be passed [cm]; left out: the limit on max_level, else the rims
     band : (n,) largest difference of reading and level [cm]; left out: 6 standard deviations of the
         noise, half an ADC step and the offset
@@ -69,45 +72,67 @@ def design_for(
     loop = case.loop
     if not isinstance(loop.plant, TankNetwork) or not isinstance(loop.sensor, LevelSensor):
         raise InputError("safety_filter: needs a TankNetwork as the plant and a LevelSensor")
+    box, more = _box(case, widths)
     inflow, volume = _disturbances(loop, case.clock)
     draw, drawn = _withdrawn(loop, case.clock)
-    share = max((s for n, s in case.uncertain.items() if n == "actuator.dead_zone"), default=0.0)
     return design(
         loop.plant,
         loop.actuator,
         loop.sensor,
         case.clock.dt,
-        widths=_widths(case) if widths is None else widths,
-        limit=_level_limits(case) if limit is None else limit,
-        inflow=inflow,
-        volume=volume,
-        offset=np.asarray(loop.actuator.offset) * (1.0 - share),
+        widths=box,
+        limit=_level_limits(case, box) if limit is None else limit,
+        inflow=inflow * more,
+        volume=volume * more,
         band=band,
         rate=rate,
         substeps=case.clock.substeps,
         start=loop.x0,
         low=case.limits.get("min_level", 0.0) if low is None else low,
-        draw=draw,
+        draw=draw * more,
         drawn=drawn,
         predict=predict,
+        faults=loop.faults,
     )
 
 
-def _widths(case):
-    """{parameter: half width} of the box of plants that the case itself describes."""
+def _box(case, widths):
+    """({parameter: half width} of the box that the case describes, with `widths` in the place of
+    the plant's, the factor by which inflow disturbances may be larger than they are).
+    """
+    shares, flows, box = dict(case.uncertain), dict.fromkeys(FLOWS, SPREAD), {}
     if case.covariance is not None:
         names, matrix = case.covariance
-        flows = [i for i, n in enumerate(names) if n.startswith("plant.")]
-        sigma = np.sqrt(np.diag(np.asarray(matrix, dtype=float)))[flows]
-        reach = np.sqrt(2.0 * scipy.special.gammaincinv(0.5 * max(len(flows), 1), PROBABILITY))
-        return {names[i]: reach * s for i, s in zip(flows, sigma)}
-    shares = {n: s for n, s in case.uncertain.items() if n.startswith("plant.")}
-    return widths_of(case.loop.plant, shares or dict.fromkeys(FLOWS, SPREAD))
+        names = [n for n in names if not n.startswith(HARMLESS)]
+        at = [list(case.covariance[0]).index(n) for n in names]
+        sigma = np.sqrt(np.diag(np.asarray(matrix, dtype=float)))[at]
+        reach = np.sqrt(2.0 * scipy.special.gammaincinv(0.5 * max(len(at), 1), PROBABILITY))
+        box = dict(zip(names, reach * sigma))
+        fields = {n.partition("[")[0] for n in names}
+        shares = {n: s for n, s in shares.items() if not n.startswith("plant.")}
+        shares = {n: s for n, s in shares.items() if n.partition("[")[0] not in fields}
+        flows = {}
+    plant = {n: s for n, s in shares.items() if n.startswith("plant.")} or flows
+    if widths is not None:
+        box = {n: w for n, w in box.items() if not n.startswith("plant.")} | dict(widths)
+        plant = {}
+    box |= widths_of(case.loop.plant, plant)
+    more = 1.0
+    for name, share in shares.items():
+        part, leaf = name.partition("[")[0].rpartition(".")[::2]
+        if name.startswith(("plant.", *HARMLESS)) or name in box:
+            continue
+        if part == "disturbance" and leaf in ("level", "volume"):  # linear in both
+            more = max(more, 1.0 + share)
+            continue
+        owner = case.loop if name.startswith("x0") else getattr(case.loop, part, None)
+        box |= widths_of(owner, {name: share})
+    return box, more
 
 
-def _level_limits(case):
+def _level_limits(case, box):
     """(n,) upper limits on the levels of a case [cm]: of max_level, or the rims."""
-    rim = np.asarray(case.loop.plant.rim, dtype=float)
+    rim = spread(case.loop.plant.rim, "plant.rim", box)[0]
     limit = case.limits.get("max_level", "rim")
     return rim if isinstance(limit, str) else np.minimum(rim, np.asarray(limit, dtype=float))
 
@@ -135,3 +160,24 @@ def _withdrawn(loop, clock):
         return none, bool(np.any(np.asarray(loop.disturbance.volume) < 0.0))
     flows = loop.disturbance.sample(clock)[0]
     return np.array([min(float(np.min(flow)), 0.0) for flow in flows]), False
+
+
+def beyond(case: Any) -> list[str]:
+    """Return the names of [uncertain] whose intervals are wider than those in the settings of the
+    case's safety filter, which take their place.
+    """
+    guard = case.loop.safety_filter
+    if guard is None or "widths" not in (case.safety or {}):
+        return []
+    found = []
+    for name in (name for name in case.uncertain if name.startswith("plant.")):
+        field, _, entry = name.removeprefix("plant.").partition("[")
+        at = int(entry[:-1]) if entry else ...
+        own, least, most = (
+            np.asarray(getattr(plant, field), dtype=float)[at]
+            for plant in (case.loop.plant, guard.least, guard.most)
+        )
+        half = case.uncertain[name] * own * (1.0 - 1e-9)
+        if np.any(own - half < least) or np.any(own + half > most):
+            found.append(name)
+    return found

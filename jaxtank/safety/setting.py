@@ -27,7 +27,11 @@ class Setting(NamedTuple):
     dead: bool = False  # whether a pump stands still for inputs above 0
     drawn: bool = False  # whether inflow pulses draw liquid
     predicted: int = 0  # inputs under way over which levels are predicted
-    before: tuple = ()  # (m) inputs at which the pumps ran before t = 0, less dead zones [V]
+    before: tuple = ()  # (m) inputs under way at t = 0, less dead zones [V]; () for none
+    weakest: tuple = ()  # (m) least upper limits of the pumps, less dead zones [V]
+    beyond: bool = False  # whether inputs under way at t = 0 are beyond the limits of the pumps
+    divided: tuple = ()  # tanks whose row is divided among their pumps
+    uncovered: tuple = ()  # (n) why a tank has a feature that no theorem covers, ""
 
     def phi(self, tank, level, others):
         """Phi_max(level) [cm/s]; others: limits of all tanks, before volumes that enter besides."""
@@ -71,20 +75,33 @@ def sqrt_of(h, knee):
     return math.sqrt(h) if h >= knee else math.sqrt(knee) * (1.5 * h / knee - 0.5 * (h / knee) ** 2)
 
 
+def brought(setting, tank, inputs):
+    """What pumps at `inputs` (m,) [V] bring at most [cm/s]; with a divided row the total at which
+    the pump that needs most of its share has it.
+    """
+    gains = [(j, b) for j, (_, b) in setting.rates.pumps[tank].items() if b > 0.0]
+    if tank not in setting.divided:
+        return sum(b * max(inputs[j], 0.0) for j, b in gains)
+    full = sum(b * max(setting.high[j], 0.0) for j, b in gains)
+    return max(
+        [full * max(inputs[j], 0.0) / max(setting.high[j], 1e-300) for j, _ in gains], default=0.0
+    )
+
+
 def unstoppable(setting, tank):
     """What pumps with a lower limit above 0 V always bring [cm/s]."""
-    return sum(b * max(setting.low[j], 0.0) for j, (_, b) in setting.rates.pumps[tank].items())
+    return brought(setting, tank, setting.low)
 
 
 def full_pumps(setting, tank):
-    """What full pumps bring at most [cm/s]."""
-    return sum(b * max(setting.high[j], 0.0) for j, (_, b) in setting.rates.pumps[tank].items())
+    """What full pumps, and inputs under way at t = 0, bring at most [cm/s]."""
+    high = np.maximum(setting.high, setting.before) if setting.before else setting.high
+    return brought(setting, tank, high)
 
 
 def ran_before(setting, tank):
-    """What the pumps bring at most as they ran before t = 0 [cm/s]."""
-    gains = setting.rates.pumps[tank].items()
-    return sum(b * max(setting.before[j], 0.0) for j, (_, b) in gains if j < len(setting.before))
+    """What the inputs under way at t = 0 bring at most [cm/s]."""
+    return brought(setting, tank, setting.before) if setting.before else 0.0
 
 
 def resting_level(setting, tank, others):
