@@ -507,15 +507,17 @@ def parameters_of(rng, table, box, shape, count, p, target):
 
 
 def starts(rng, table, rows, x0, count, any_start):
-    """(P, n) levels at the start, the file's; any_start: for half of the plants at random at or
-    below the limits, at them for some.
+    """(P, n) levels at the start: the file's x0 (P, n), or between low limits and it for every
+    fourth plant; where any_start (P,), between them and the limits, at them for some.
     """
     limit = np.array([min(r.limit, 2.0 * t["rim"]) for r, t in zip(rows, table["tank"])])
     low = np.array([r.low for r in rows])
     share = rng.uniform(0.0, 1.0, (count, len(limit))) ** rng.choice([0.1, 0.5, 1.0], (count, 1))
     share = np.where(rng.random((count, 1)) < 0.3, np.round(share), share)
     elsewhere = low + (limit - low) * share
-    return np.where(any_start[:, None], elsewhere, x0)
+    below = np.where(x0 > low, low + (x0 - low) * share, x0)
+    own = np.where((np.arange(count) % 4 == 1)[:, None], below, x0)
+    return np.where(any_start[:, None], elsewhere, own)
 
 
 def commands(rng, box, samples, count, down):
@@ -545,9 +547,9 @@ class Outcome(NamedTuple):
     features: tuple
     refused: str  # why the file, or the filter, was refused
     rows: tuple  # TankCertificate of each tank
-    highest: np.ndarray  # (n,) [cm], of the plants for which each tank's statement holds
+    highest: np.ndarray  # (n,) [cm], over the starts for which each tank's statement holds
     lowest: np.ndarray
-    from_own: np.ndarray  # (n,) highest levels [cm] of the plants that start as the file says
+    own: np.ndarray  # (n,) highest levels from the file's start [cm]
 
 
 def trial(seed, low=False, any_start=False, count=64):
@@ -559,18 +561,17 @@ def trial(seed, low=False, any_start=False, count=64):
             case = rig.from_table(table)
             safety_filter, rows = case.safety_design(**(case.safety or {}))
     except InputError as error:
-        return Outcome(seed, features, str(error), (), *[np.zeros(0)] * 3)
+        return Outcome(seed, features, str(error), (), *3 * (np.zeros(0),))
     if not any(r.certified or r.low_certified for r in rows):
-        return Outcome(seed, features, "", rows, *[np.full(len(rows), np.nan)] * 3)
-    levels = attack_file(
-        table, case.loop.actuator, safety_filter, rows, seed, low, any_start, count
-    )
+        return Outcome(seed, features, "", rows, *3 * (np.full(len(rows), np.nan),))
+    pumps = case.loop.actuator
+    levels = attack_file(table, pumps, safety_filter, rows, seed, low, any_start, count)
     return Outcome(seed, features, "", rows, *levels)
 
 
 def attack_file(table, actuator, safety_filter, rows, seed, low, any_start, count):
-    """(highest, lowest) levels (n,) [cm] of the plants of a rig file, each tank's over the plants
-    with starts that its certificate allows; and the highest from the file's own start.
+    """(highest, lowest, highest from the file's start) levels (n,) [cm] of the plants of a rig
+    file; the first two over the starts that the certificate of each tank allows.
     """
     rng = np.random.default_rng([seed, 7])
     shape, box, hold = shape_of(table), box_of(table), table["values"]["clock.dt"]
@@ -603,11 +604,12 @@ def attack_file(table, actuator, safety_filter, rows, seed, low, any_start, coun
     pumps = Pumps(p, kind, delay, hold, substeps)
     with in_numpy():
         high, least = run(shape, safety_filter, actuator, pumps, plan, hold, substeps)
-    own = np.where(elsewhere[:, None], -np.inf, high)
-    anywhere = np.ones(len(rows), bool) & anywhere
-    highest = np.where(anywhere, high.max(0), own.max(0))
-    lowest = np.where(anywhere, least.min(0), np.where(elsewhere[:, None], np.inf, least).min(0))
-    return highest, lowest, own.max(0)
+    own, own_least = high[~elsewhere].max(0), least[~elsewhere].min(0)
+    return (
+        np.where(anywhere, high.max(0), own),
+        np.where(anywhere, least.min(0), own_least),
+        own,
+    )
 
 
 def substeps_of(shape, p, hold):
@@ -621,12 +623,15 @@ def substeps_of(shape, p, hold):
 
 
 def passed(outcome):
-    """[(tank, "upper" or "low", by how much [cm])] of the certified limits that a level passed."""
-    rows, found = outcome.rows, []
-    for r in rows:
-        over = max(outcome.highest[r.tank] - r.limit, outcome.from_own[r.tank] - r.reach)
-        if r.certified and over > 1e-9:
-            found.append((r.tank, "upper", float(over)))
+    """[(tank, "upper", "reach" or "low", by how much [cm])] of the certified levels that a level
+    passed: the limit, what it never passes from the file's start, and the low limit.
+    """
+    found = []
+    for r in outcome.rows:
+        if r.certified and outcome.highest[r.tank] > r.limit + 1e-9:
+            found.append((r.tank, "upper", float(outcome.highest[r.tank] - r.limit)))
+        elif r.certified and outcome.own[r.tank] > r.reach + 1e-9:
+            found.append((r.tank, "reach", float(outcome.own[r.tank] - r.reach)))
         if r.low_certified and outcome.lowest[r.tank] < r.low - 1e-9:
             found.append((r.tank, "low", float(r.low - outcome.lowest[r.tank])))
     return found
@@ -754,10 +759,10 @@ def main(first, last, low, any_start, lines):
         if lines:
             print(seed, line_of(outcome), flush=True)
         for tank, side, excess in over:
-            reason = outcome.rows[tank].reason if side == "upper" else "low limit"
-            names = ", ".join(outcome.features)
-            print(f"PASSED seed {seed} tank {tank + 1} {side} by {excess:.3g} cm: {reason} [{names}]",
-                  flush=True)
+            row = outcome.rows[tank]
+            reason = "low limit" if side == "low" else f"{row.reason} ({row.starts})"
+            where = f"seed {seed} tank {tank + 1} {side} by {excess:.3g} cm"
+            print(f"PASSED {where}: {reason} [{', '.join(outcome.features)}]", flush=True)
     print("feature | rigs | refused | tanks | upper limits proved | low limits proved | passed")
     order = ("all", *rig_files.TOPOLOGIES, *rig_files.FEATURES)
     for name in order:
