@@ -139,7 +139,7 @@ def _pumps(rng, topology, features, links, n):
     tops = [i for i in range(n) if i not in below] or [0]
     free = tops if rng.random() < 0.5 else list(range(n))
     pumps = []
-    for k in range(int(rng.integers(1, 4))):
+    for _ in range(int(rng.integers(1, 4))):
         first = int(rng.choice(free))
         if "several pumps" in features and pumps:
             first = pumps[0]["first"]

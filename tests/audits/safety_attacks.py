@@ -88,9 +88,7 @@ def flows(shape, p):
             gain[:, j, k] += (1.0 - share) * p["pump_gain"][:, k]
     area = p["area"][:, :, None]
     supply = None if shape.step is None else p["area"] / (shape.step * w * outlets + 1e-12)
-    return Flows(
-        own / area, piped / area, gain / area, p["area"], p["rim"], p["caught"], supply
-    )
+    return Flows(own / area, piped / area, gain / area, p["area"], p["rim"], p["caught"], supply)
 
 
 def root(h, knee):
@@ -325,6 +323,7 @@ def shape_of(table):
     number = lambda part, *keys: tuple(tuple(e[k] - 1 for k in keys) for e in table.get(part, ()))
     both = lambda to: (to[0] - 1, to[1] - 1) if isinstance(to, list) else (to - 1, None)
     plant, values = table["plant"], table["values"]
+    step = values["clock.dt"] / values.get("clock.substeps", 1)
     return Shape(
         n=len(table["tank"]),
         links=number("orifice", "from", "to"),
@@ -332,7 +331,7 @@ def shape_of(table):
         feeds=tuple(both(e["to"]) for e in table["pump"]),
         spills=number("spill", "from", "to"),
         overflow=plant.get("overflow", False),
-        step=values["clock.dt"] / values["clock.substeps"] if plant.get("bottom") else None,
+        step=step if plant.get("bottom") else None,
     )
 
 
@@ -404,7 +403,7 @@ def box_of(table):
     return Box(values, widths)
 
 
-def corners(rng, box, shape, count, target):
+def plants_of(rng, box, shape, count, target):
     """{name: (P, entries)}: random corners; where `target` (P,) is a tank, flows fill that tank."""
     found = {}
     for name, value in box.values.items():
@@ -431,7 +430,9 @@ def _towards(sign, name, shape, target):
             sign[target == i, k], sign[target == j, k] = -1.0, 1.0
     if name == "plant.pump_gain":
         for k in entries:
-            sign[(target >= 0) & np.isin(target, [t for t in shape.feeds[k] if t is not None]), k] = 1.0
+            sign[
+                (target >= 0) & np.isin(target, [t for t in shape.feeds[k] if t is not None]), k
+            ] = 1.0
     if name == "plant.split":
         for k in entries:
             i, j = shape.feeds[k]
@@ -496,7 +497,7 @@ def parameters_of(rng, table, box, shape, count, p, target):
     def at(k):
         changes = k > 0 and k % 25 == 0
         if changes:
-            drawn = corners(rng, box, shape, count, target)
+            drawn = plants_of(rng, box, shape, count, target)
             for name in present:
                 if name not in instruments:
                     present[name] = np.where(steady, present[name], drawn[name])
@@ -534,8 +535,11 @@ def commands(rng, box, samples, count, down):
     wanted[:, (kind == 1) | (down & ((kind == 0) | (kind > 5)))] = low - 1.0
     late = rng.integers(1, samples, count)
     filling = (kind == 3) | (kind == 1) & ~np.bool_(down)
-    wanted = np.where((np.arange(samples)[:, None] > late)[:, :, None] & filling[None, :, None],
-                      2.0 * high, wanted)
+    wanted = np.where(
+        (np.arange(samples)[:, None] > late)[:, :, None] & filling[None, :, None],
+        2.0 * high,
+        wanted,
+    )
     follow = held(rng, samples, count, rng.uniform(0.3, 1.2, shape), [20, 100])
     return wanted, np.where((kind == 4)[None, :, None], follow, np.nan)
 
@@ -554,7 +558,11 @@ class Outcome(NamedTuple):
 
 def trial(seed, low=False, any_start=False, count=64):
     """The Outcome of a random rig file."""
-    table, features = rig_files.draw(seed, low)
+    return outcome_of(*rig_files.draw(seed, low), seed, low, any_start, count)
+
+
+def outcome_of(table, features=(), seed=0, low=False, any_start=False, count=64):
+    """The Outcome of the table of a rig file."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -577,7 +585,7 @@ def attack_file(table, actuator, safety_filter, rows, seed, low, any_start, coun
     shape, box, hold = shape_of(table), box_of(table), table["values"]["clock.dt"]
     samples = int(np.clip(90.0 / hold, 200, 500))
     target = np.where(rng.random(count) < 0.6, rng.integers(0, shape.n, count), -1)
-    p = corners(rng, box, shape, count, target)
+    p = plants_of(rng, box, shape, count, target)
     anywhere = np.array([any_start or getattr(r, "starts", "").startswith("any") for r in rows])
     elsewhere = np.arange(count) % 4 >= 2 if anywhere.any() else np.zeros(count, bool)
     start = starts(rng, table, rows, p["x0"], count, elsewhere)
@@ -605,11 +613,7 @@ def attack_file(table, actuator, safety_filter, rows, seed, low, any_start, coun
     with in_numpy():
         high, least = run(shape, safety_filter, actuator, pumps, plan, hold, substeps)
     own, own_least = high[~elsewhere].max(0), least[~elsewhere].min(0)
-    return (
-        np.where(anywhere, high.max(0), own),
-        np.where(anywhere, least.min(0), own_least),
-        own,
-    )
+    return (np.where(anywhere, high.max(0), own), np.where(anywhere, least.min(0), own_least), own)
 
 
 def substeps_of(shape, p, hold):
@@ -647,6 +651,16 @@ def of(plant, share):
 
 def sensor_of(plant):
     return LevelSensor(noise=np.zeros(plant.tanks))
+
+
+def corners(rng, plant, count, spread):
+    """{parameter: (count, ..) values} of plants at random corners of the box."""
+    p = {}
+    for name in NAMES:
+        value = np.asarray(getattr(plant, name), dtype=float)
+        p[name] = value * (1.0 + rng.choice([-1.0, 1.0], (count, *value.shape)) * spread)
+    p["split"] = np.minimum(p["split"], 1.0)
+    return p
 
 
 def random_rig(rng):
@@ -694,10 +708,7 @@ def attack(
     def drawn():
         p = {"area": every(plant.area, n), "rim": every(plant.rim, n), "caught": every(0.0, 1)}
         p["gravity"] = every(plant.gravity, 1)
-        for name in NAMES:
-            value = np.asarray(getattr(plant, name), dtype=float)
-            p[name] = value * (1.0 + rng.choice([-1.0, 1.0], (count, *value.shape)) * spread)
-        return p | {"split": np.minimum(p["split"], 1.0)}
+        return p | corners(rng, plant, count, spread)
 
     p = drawn()
     at = lambda k: p if k == 0 else drawn() if varying and k % period == 0 else None

@@ -21,7 +21,7 @@ HOLD = 0.5
 
 
 def cascade(**changes):
-    """Tank 1 below tank 2 and beside tank 3; pump 1 into tank 1, pump 2 split over tanks 2 and 1."""
+    """Tank 1 below tank 2 and beside tank 3; pump 1 into tank 1, 2 into tanks 2 and 1."""
     parts = {
         "area": [20.0, 30.0, 25.0],
         "drain": [0.30, 0.20, 0.15],
@@ -197,7 +197,7 @@ name = "delayed"
 tank = [{ area = 20.0, rim = 30.0, drain = 0.2, level = 20.0 }]
 pump = [{ gain = 8.0, to = 1, high = 12.0, initial = 1.0 }]
 plant = { outputs = [1] }
-law = { kind = "open-loop", initial = [0.0], changes = [[2.0, 1, 12.0], [6.0, 1, 3.0], [9.0, 1, 12.0]] }
+law = { kind = "open-loop", initial = [0.0], changes = [[2.0, 1, 12.0], [6.0, 1, 3.0]] }
 values = { "clock.dt" = 0.5, "clock.duration" = 30.0, "actuator.delay" = 2.0 }
 [safety_filter]
 """
@@ -311,8 +311,7 @@ def test_a_pipe_with_dead_time_is_not_proved():
         rim=30.0,
     )
     proved = lambda delay: [
-        row.certified
-        for row in designed(plant, PumpBank(low=[0.0], high=[12.0], delay=delay))[1]
+        row.certified for row in designed(plant, PumpBank(low=[0.0], high=[12.0], delay=delay))[1]
     ]
     assert proved(0.0) == [True, True]
     assert proved(HOLD)[0] is False
@@ -354,27 +353,21 @@ def test_c4_k1_is_above_the_slope_of_the_outflow_where_the_row_acts():
     root = (c + math.sqrt(c * c + 4.0 * k1 * (k1 * 20.0 - full))) / (2.0 * k1)
     assert k1 * 20.0 >= full and k1**2 * (20.0 - root**2) <= 0.9 * 0.5 * c_in * o
     lowest = root**2 - hold * (full + 1.05 / 0.95 * c * math.sqrt(20.0))
-    assert 0.0 < lowest and c / (2.0 * math.sqrt(lowest)) > k1
+    assert lowest > 0.0 and c / (2.0 * math.sqrt(lowest)) > k1
     found, rows = below(0.19, 0.35, [0.235], hold=hold)
     assert float(found.slope[0]) == 0.0 and all(r.certified for r in rows)
 
 
 @pytest.mark.parametrize("share", [0.99, 1.01])
 def test_the_weakest_of_two_pumps_decides_whether_floor_and_cap_agree(share):
-    """At L - band the floor asks for f and the cap allows M, of which the weaker pump, at +-20 %
-    beside one at +-0 %, brings 0.8/1.2 for certain.
+    """Readings from L - band: there the floor asks for kappa 2 band, and the cap allows kappa
+    (H - L), of which the weaker of two pumps brings 40/60 for certain.
     """
     plant = network(
         area=[20.0], drain=[0.0], feeds=[(0, None)] * 2, pump_gain=[50.0, 50.0], rim=[30.0]
     )
     actuator = PumpBank(low=[0.0, 0.0], high=[12.0, 12.0])
-    # drain 0: floor kappa (L - y + band), cap kappa (H - y - band); worst at the highest reading
-    # with a floor, y = L + band: over an interval of readings, 1/400 of [L - band, H + band]
-    band, kappa, top = 0.5, 1.0, 30.0
-    # f(y) = 1 (L + band - y), M(y) = H - y - band: at y = L - band f = 2 band, M = H - L
-    weakest = 0.8 / 1.2
-    low = top - 2.0 * band / weakest / share * 1.0
-    _, (row,) = designed(
-        plant, actuator, widths={"pump_gain": [0.0, 10.0]}, band=band, rate=kappa, low=[low]
-    )
+    band, widths = 0.5, {"pump_gain": [0.0, 10.0]}
+    low = 30.0 - 2.0 * band * 60.0 / 40.0 / share
+    _, (row,) = designed(plant, actuator, widths=widths, band=band, rate=1.0, low=[low])
     assert row.low_certified == (share < 1.0)
