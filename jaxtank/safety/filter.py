@@ -283,8 +283,8 @@ class SafetyFilter:
             total = sum(a * lower_clip(above[j], 0.0) for j, a in row.items())
             share = jnp.where(total > m, m / jnp.where(total > m, total, 1.0), 1.0)
             for j, v in above.items():
-                lowered = least[j] + v * share if j in least else v * share
                 lowers = (v > 0.0) & (total > m) if j in least else v > 0.0
+                lowered = least[j] + v * share if j in least else v * share
                 u[j] = jnp.where(lowers, lowered, u[j])
         return tuple(u)
 
