@@ -45,10 +45,10 @@ SCALE = np.array([1, 1, 0.1, 0.1, 10, 10, 0.05, 0.05])  # so that all are about 
 
 @component
 class Network(Controller):
-    w1: np.ndarray = leaf("-", "(16, 8) weights")
-    b1: np.ndarray = leaf("-", "(16,) offsets")
-    w2: np.ndarray = leaf("V", "(2, 16) weights")
-    b2: np.ndarray = leaf("V", "(2,) offsets")
+    w1: np.ndarray = leaf("-", "weights", shape=(16, 8))
+    b1: np.ndarray = leaf("-", "offsets", shape=(16,))
+    w2: np.ndarray = leaf("V", "weights", shape=(2, 16))
+    b2: np.ndarray = leaf("V", "offsets", shape=(2,))
 
     def step(self, state, tick, estimate):
         error = [r - h for r, h in zip(tick.r, estimate.x)]

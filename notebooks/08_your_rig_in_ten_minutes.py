@@ -171,7 +171,7 @@ print(start + step)
 class Cone(jaxtank.plants.base.Plant):
     gain: float = jaxtank.leaf("cm^3/(s V)", "flow of the pump per volt", low=0.0)
     drain: float = jaxtank.leaf("cm^2", "area of the outlet", low=0.0)
-    rim: list = jaxtank.leaf("cm", "(1,) height")
+    rim: list = jaxtank.leaf("cm", "height", shape=("tank",))
     outputs, tanks, pumps = (0,), 1, 1
 
     def derivative(self, t, x, u, d):

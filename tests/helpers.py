@@ -93,6 +93,12 @@ class Output(NamedTuple):
         """The one object on stdout; refuses NaN and infinity, which are not JSON."""
         return json.loads(self.out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
 
+    @property
+    def errors(self):
+        """stderr without notes, as that changes come after the end of a run cut short."""
+        lines = self.err.splitlines(keepends=True)
+        return "".join(line for line in lines if not line.startswith("jaxtank: note: "))
+
 
 def command(*words):
     """Run the command in this process."""

@@ -17,9 +17,12 @@ STEPS = 200
 
 
 class Balance:
-    """Rates and their Jacobian at levels x (n,) and inputs u (m,) of a network of tanks."""
+    """Rates and their Jacobian at levels x (n,) and inputs u (m,) of a network of tanks, with an
+    inflow (n,) [cm^3/s] that no pump brings.
+    """
 
-    def __init__(self, plant: Any):
+    def __init__(self, plant: Any, inflow: Any = None):
+        self.inflow = inflow
         self.knee, self.area = plant.knee, np.asarray(plant.area, dtype=float)
         w = np.sqrt(2.0 * float(plant.gravity))
         ends = lambda pairs: np.array(pairs, dtype=int).reshape(-1, 2).T
@@ -46,7 +49,8 @@ class Balance:
     def rates(self, x: Any, u: Any) -> Any:
         """Return (n,) rates of the levels [cm/s]."""
         q, s = (np.asarray(v) for v in self._roots(x)[0])
-        return (self.roots @ q + self.flows @ s + self.pumps @ u) / self.area
+        flow = self.roots @ q + self.flows @ s + self.pumps @ u
+        return (flow if self.inflow is None else flow + self.inflow) / self.area
 
     def slopes(self, x: Any) -> tuple[Any, Any]:
         """Return their sparse derivatives by the levels (n, n) and by the inputs (n, m)."""
@@ -72,9 +76,10 @@ def _matrix(rows: int, columns: int, *parts: Any) -> Any:
     return scipy.sparse.csr_array((v, (i.astype(int), j.astype(int))), shape=(rows, columns))
 
 
-def balanced(plant: Any, y: Any, enough: float = 1e-14) -> tuple[Any, Any, Any]:
-    """Return (levels (n,), inputs (m,), rates (n,) left) where a network with outputs y (m,) stands
-    still, or as near to it as was found; it ends where no rate is above `enough` [cm/s].
+def balanced(plant: Any, y: Any, enough: float = 1e-14, inflow: Any = None) -> tuple[Any, Any, Any]:
+    """Return (levels (n,), inputs (m,), rates (n,) left) where a network with outputs y (m,) and an
+    inflow (n,) [cm^3/s] stands still, or as near to it as was found; it ends where no rate is above
+    `enough` [cm/s].
 
     Levenberg-Marquardt steps in the roots of the unknown levels, so that no level is negative.
 
@@ -89,7 +94,7 @@ def balanced(plant: Any, y: Any, enough: float = 1e-14) -> tuple[Any, Any, Any]:
     >>> x.round(2).tolist(), bool(abs(left).max() < 1e-9)
     ([8.0, 4.0], True)
     """
-    system, outputs = Balance(plant), np.array(plant.outputs)
+    system, outputs = Balance(plant, inflow), np.array(plant.outputs)
     free = np.setdiff1d(np.arange(plant.tanks), outputs)
     scale = float(np.max(y)) or 1.0
     gain = float(np.min(plant.pump_gain)) / float(np.max(plant.area))
@@ -123,9 +128,10 @@ def balanced(plant: Any, y: Any, enough: float = 1e-14) -> tuple[Any, Any, Any]:
     return (*split(z), left)
 
 
-def responses(plant, xp):
+def responses(plant, xp, inflow=None):
     """(n, outputs) efflux speeds and (m, outputs) inputs by the speeds of the controlled tanks, of
-    a network of many tanks without pipes, by matrices that are filled and not added up.
+    a network of many tanks without pipes, by matrices that are filled and not added up. With an
+    inflow (n,) [cm^3/s] a last column: what it does alone.
 
     xp: jax.numpy, or numpy where nothing is to be differentiated.
 
@@ -149,9 +155,13 @@ def responses(plant, xp):
     pumps = _filled(xp, xp.zeros((n, m)), (first, pump), gain * share)
     pumps = _filled(xp, pumps, (second, pump), gain * (1.0 - share))
     columns = xp.concatenate([efflux[:, free], pumps], axis=1)
-    solution = xp.linalg.solve(columns, -efflux[:, outputs])
+    right, still = -efflux[:, outputs], xp.eye(m)
+    if inflow is not None:
+        right = xp.concatenate([right, -xp.asarray(inflow)[:, None]], axis=1)
+        still = xp.concatenate([still, xp.zeros((m, 1))], axis=1)
+    solution = xp.linalg.solve(columns, right)
     order = np.argsort(np.concatenate([outputs, free]))
-    speeds = xp.concatenate([xp.eye(m), solution[: len(free)]])[order]
+    speeds = xp.concatenate([still, solution[: len(free)]])[order]
     return speeds, solution[len(free) :]
 
 

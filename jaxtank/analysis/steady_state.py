@@ -65,10 +65,10 @@ def steady_flows(plant, y):
     return _from_known_speeds(plant, jnp.sqrt(2.0 * plant.gravity) * jnp.sqrt(jnp.asarray(y)))
 
 
-def _from_known_speeds(plant, known, xp=jnp):
-    """`steady_flows` for the efflux speeds (outputs,) [cm/s] of the controlled tanks, in which it
-    is linear; xp: jax.numpy, or numpy where nothing is to be differentiated, which spares thirty
-    small compilations.
+def _from_known_speeds(plant, known, xp=jnp, inflow=None):
+    """`steady_flows` for the efflux speeds (outputs,) [cm/s] of the controlled tanks and an inflow
+    (n,) [cm^3/s], in which it is linear; xp: jax.numpy, or numpy where nothing is to be
+    differentiated, which spares thirty small compilations.
     """
     if plant.pipes:
         raise InputError(
@@ -81,11 +81,13 @@ def _from_known_speeds(plant, known, xp=jnp):
             f"equilibrium needs as many pumps as outputs: this rig has {m} and {len(plant.outputs)}"
         )
     if n >= vectors.FROM:
-        speeds, inputs = responses(plant, xp)
+        speeds, inputs = responses(plant, xp, inflow)
+        known = known if inflow is None else xp.append(known, 1.0)
         return speeds @ known, inputs @ known
     eye, (free, columns, efflux) = np.eye(n), _unknowns(plant, xp)
     solve = np.linalg.solve if xp is np else elimination.solve
-    solution = solve(columns, -efflux[:, np.array(plant.outputs)] @ known)
+    right = -efflux[:, np.array(plant.outputs)] @ known
+    solution = solve(columns, right if inflow is None else right - inflow)
     speeds = xp.zeros(n)
     for value, i in [*zip(known, plant.outputs), *zip(solution[: len(free)], free)]:
         speeds = speeds + value * eye[i]
@@ -141,7 +143,9 @@ def steady_under(plant: Any, h0: Any, u0: Any, d: Any) -> tuple[tuple[Any, ...],
     return tuple(h), tuple(u + sum(rows[k, j] * d[j] for j in n) for k, u in enumerate(u0))
 
 
-def steady_along(plant: Any, r: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+def steady_along(
+    plant: Any, r: tuple[Any, ...], inflow: Any = None
+) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     """Return the steady state of every sample of a reference, as state feedback prepares it.
 
     Speeds and inputs are linear in the roots of r, so the balance is solved once per output and not
@@ -152,6 +156,7 @@ def steady_along(plant: Any, r: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple
     ----------
     plant : as in `steady_flows`
     r : tuple of arrays (samples,), one per output [cm]
+    inflow : (n,) steady inflow of each tank that no pump brings [cm^3/s], or None
 
     Returns
     -------
@@ -165,14 +170,16 @@ def steady_along(plant: Any, r: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple
     >>> [round(float(v), 3) for v in u[0]]
     [2.949, 3.297]
     """
-    roots = [smooth_sqrt(v, plant.knee) for v in r]
+    roots, w = [smooth_sqrt(v, plant.knee) for v in r], jnp.sqrt(2.0 * plant.gravity)
+    if inflow is not None:  # one more column: what it does alone
+        roots.append(jnp.ones_like(roots[0]) / w)
     if plant.tanks >= vectors.FROM:
-        speeds, inputs = (part @ jnp.stack(roots) for part in responses(plant, jnp))
-        w = jnp.sqrt(2.0 * plant.gravity)
+        speeds, inputs = (part @ jnp.stack(roots) for part in responses(plant, jnp, inflow))
         return tuple((w * speeds) ** 2 / (2.0 * plant.gravity)), tuple(w * inputs)
-    parts = [
-        _from_known_speeds(plant, jnp.sqrt(2.0 * plant.gravity) * one) for one in np.eye(len(r))
-    ]
+    parts = [_from_known_speeds(plant, w * one) for one in np.eye(len(r))]
+    if inflow is not None:
+        alone = _from_known_speeds(plant, jnp.zeros(len(r)), inflow=inflow)
+        parts.append(tuple(w * part for part in alone))
     speeds = tuple(sum(part[0][i] * q for part, q in zip(parts, roots)) for i in range(plant.tanks))
     inputs = tuple(sum(part[1][j] * q for part, q in zip(parts, roots)) for j in range(plant.pumps))
     return tuple(v * v / (2.0 * plant.gravity) for v in speeds), inputs
@@ -208,13 +215,17 @@ def steady_levels(plant, u):
     return speeds * speeds / (2.0 * plant.gravity)
 
 
-def equilibrium(plant, y):
+def equilibrium(plant, y, inflow=None, low=0.0):
     """Return levels and inputs of the steady state with outputs y (gouta2015 notes S2.3).
+
+    Of the plant alone: `loop.steady.steady_state` takes inflow, dead zone and limits of a loop.
 
     Parameters
     ----------
     plant : TankNetwork
     y : (outputs,) levels [cm]
+    inflow : (n,) steady inflow of each tank that no pump brings [cm^3/s], or None
+    low : (m,) least input of each pump [V]; above 0 it counts as 0
 
     Returns
     -------
@@ -222,7 +233,8 @@ def equilibrium(plant, y):
 
     Raises
     ------
-    EquilibriumError, naming the tank or the pump, where a steady state needs a negative flow.
+    EquilibriumError, naming the tank or the pump, where a steady state needs a flow backwards or an
+    input below `low`.
 
     Examples
     --------
@@ -240,25 +252,28 @@ def equilibrium(plant, y):
                 f" {length}"
             )
     at = ", ".join(f"{v:g}" for v in y)
-    if plant.pipes:
-        x, u = _balanced(plant, y, f"outputs ({at}) {length}")
-    else:
-        x, u = _free_discharge(plant, y, f"outputs ({at}) {length}")
+    words = f"outputs ({at}) {length}"
+    if inflow is not None:
+        inflow = np.asarray(inflow, dtype=float)
+        words += " with inflow (" + ", ".join(f"{v:g}" for v in inflow) + f") {length}^3/s"
+    x, u = (_balanced if plant.pipes else _free_discharge)(plant, y, words, inflow)
+    low = np.minimum(np.broadcast_to(np.asarray(low, dtype=float), u.shape), 0.0)
     for j, volts in enumerate(u):
-        if volts < -1e-9 * max(1.0, float(np.max(np.abs(u)))):
+        if volts < low[j] - 1e-9 * max(1.0, float(np.max(np.abs(u)))):
+            least = f", below its low limit of {low[j]:g} {drive}" if low[j] < 0.0 else ""
             raise EquilibriumError(
-                f"outputs ({at}) {length} have no steady state: pump {j + 1} would have to run at"
-                f" {volts:.3g} {drive}"
+                f"{words} have no steady state: pump {j + 1} would have to run at"
+                f" {volts:.3g} {drive}{least}"
             )
-    return x, np.maximum(u, 0.0)
+    return x, np.maximum(u, low)
 
 
-def _free_discharge(plant, y, words):
+def _free_discharge(plant, y, words, inflow):
     """(levels, inputs) of a network without pipes in its steady state; inputs may be negative."""
     with np.errstate(all="ignore"):  # an overflow is reported below
         try:
             speeds, u = _from_known_speeds(
-                plant, np.sqrt(2.0 * float(plant.gravity)) * np.sqrt(y), np
+                plant, np.sqrt(2.0 * float(plant.gravity)) * np.sqrt(y), np, inflow
             )
         except np.linalg.LinAlgError:
             speeds = u = np.array([np.nan])
@@ -288,7 +303,7 @@ def _rate(plant, x, u):
 _slope = jax.jit(jax.jacfwd(_rate, argnums=(1, 2)))
 
 
-def _balanced(plant, y, words):
+def _balanced(plant, y, words, inflow):
     """(levels, inputs) at which a network with pipes stands still, by damped Gauss-Newton in the
     roots of the unknown levels.
     """
@@ -307,7 +322,11 @@ def _balanced(plant, y, words):
         # an area of 1e-300, say, overflows on the way: the check below reports it
         with np.errstate(all="ignore"):
             many = plant.tanks >= vectors.FROM
-            x, u, left = balanced(plant, y, 1e-5 * tolerance) if many else _by_dense(plant, y)
+            x, u, left = (
+                balanced(plant, y, 1e-5 * tolerance, inflow)
+                if many
+                else _by_dense(plant, y, inflow)
+            )
     except (ValueError, np.linalg.LinAlgError):  # not finite where it starts, or on the way
         raise EquilibriumError(f"{words} have no steady state") from None
     if not np.max(np.abs(left)) < tolerance:
@@ -315,7 +334,7 @@ def _balanced(plant, y, words):
     return x, u
 
 
-def _by_dense(plant, y):
+def _by_dense(plant, y, inflow):
     """(levels, inputs, rates left) of a network of few tanks, by a dense Jacobian."""
     free = [i for i in range(plant.tanks) if i not in plant.outputs]
     scale = float(np.max(y)) or 1.0
@@ -329,7 +348,8 @@ def _by_dense(plant, y):
 
     def residual(z):
         with jax.enable_x64(True):
-            return np.asarray(_rate(plant, *split(z)))
+            rate = np.asarray(_rate(plant, *split(z)))
+        return rate if inflow is None else rate + inflow / np.asarray(plant.area)
 
     def jacobian(z):
         with jax.enable_x64(True):

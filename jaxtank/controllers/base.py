@@ -104,6 +104,10 @@ class Controller(abc.ABC):
         ((m) commanded voltages [V], new state)
         """
 
+    def in_force(self) -> dict[str, Any]:
+        """Return {leaf: the value that acts} of the leaves that the controller clips itself."""
+        return {}
+
     def track(self, state: Any, tick: Tick, command: Sequence[Any], applied: Sequence[Any]) -> Any:
         """Return the state after the pumps' limits: anti-windup of controllers with memory.
 

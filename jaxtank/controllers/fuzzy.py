@@ -82,21 +82,22 @@ class FuzzyBlend(Controller):
     """
 
     model: Plant
-    K: np.ndarray = leaf("V/cm", "(2, 4) gain K of the state feedback")
+    K: np.ndarray = leaf("V/cm", "gain K of the state feedback", shape=(2, 4))
     surface: float = leaf("1/s", "slope lambda of the sliding surface", low=0.0, strict=True)
     ks: float = leaf("cm/s^2", "switching gain ks, of both surfaces", low=0.0)
     phi: float = leaf("cm/s", "half width of the boundary layer", low=0.0, strict=True)
     b: np.ndarray = leaf(
         "cm",
-        "(2,) size of error at which both controllers weigh half, per input",
+        "size of error at which both controllers weigh half, per input",
         low=0.0,
         strict=True,
+        shape=(2,),
     )
     w: np.ndarray = leaf(
-        "cm", "(2,) half width of the blend, per input; at most b", low=0.0, strict=True
+        "cm", "half width of the blend, per input; at most b", low=0.0, strict=True, shape=(2,)
     )
-    low: np.ndarray = leaf("V", "(2,) lower limit of the sliding-mode inputs")
-    high: np.ndarray = leaf("V", "(2,) upper limit of the sliding-mode inputs")
+    low: np.ndarray = leaf("V", "lower limit of the sliding-mode inputs", shape=(2,))
+    high: np.ndarray = leaf("V", "upper limit of the sliding-mode inputs", shape=(2,))
     pairing: str = static(
         "-", "which error weights an input", choices=tuple(PAIRINGS), default="cross"
     )
@@ -128,6 +129,9 @@ class FuzzyBlend(Controller):
         size = [magnitude(h - target) for h, target in zip(x, r)]
         pairs = enumerate(PAIRINGS[self.pairing])
         return tuple(membership(size[j], self.b[i], self.w[i]) for i, j in pairs)
+
+    def in_force(self) -> dict[str, Any]:
+        return {"w": np.minimum(self.w, self.b)}
 
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return applied if self.form == "printed" else state

@@ -200,8 +200,10 @@ class Scheduled(Controller):
     """
 
     law: Controller
-    knots: np.ndarray = leaf("cm", "(K,) positions of the operating variable, increasing")
-    values: np.ndarray = leaf("-", "(gains, K) each gain at each knot")
+    knots: np.ndarray = leaf(
+        "cm", "positions of the operating variable, increasing", shape=("knot",)
+    )
+    values: np.ndarray = leaf("-", "each gain at each knot", shape=("gain", "knot"))
     gains: tuple = static(doc="leaves of the controller that are scheduled, one per row of values")
     variable: str = static(
         doc="operating variable: r1, a setpoint, or h1, a level estimate, and so on, counted from 1"
@@ -274,7 +276,7 @@ class Scheduled(Controller):
             rows.append(
                 {**meta, "doc": f"{meta['doc']}: controller.law.{gain} at a knot", "like": None}
             )
-        doc = f"(gains, K) each gain at each knot; a row each for {', '.join(self.gains)}"
+        doc = f"each gain at each knot; a row each for {', '.join(self.gains)}"
         every = {
             "doc": doc,
             "unit": ", ".join(dict.fromkeys(m["unit"] for m in rows)),

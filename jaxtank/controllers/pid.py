@@ -6,8 +6,10 @@ import operator
 from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from jaxtank.controllers.base import Controller
 from jaxtank.controllers.feedback_linearisation import authority, check_own_pumps, drift
@@ -21,6 +23,11 @@ from jaxtank.signals.base import Signal
 
 FILTER = 8.0  # the derivative's filter has the time constant Td/8
 LOWEST, HIGHEST, SECTIONS = 1e-3, 1e2, 5  # Oustaloup's band [rad/s] and N: 2N + 1 sections
+
+
+ENDLESS = 1e6
+"""Integral times of so many tracking times are infinite: the integral would keep what the
+anti-windup has added [-]."""
 
 
 class Memory(NamedTuple):
@@ -78,11 +85,13 @@ class PID(Controller):
 
     (gouta2022 Table 4; gouta2022 notes S4.5) with r, y [cm], v [V], u the input v after the limits
     (back-calculation, tracking time Tt), and the derivative of the measurement filtered by a lag of
-    Td/8. Without Td there is no derivative; without `order` the integral is of order one, with it
-    s^-order = (1/s) s^(1-order), where the second factor is Oustaloup's filter: a true integrator
-    is kept. base = bias, or with `feed_forward` the steady-state input of the model on the
-    reference, (r' - f(r))/c2, less d/c2 for a disturbance d of the level rate [cm/s] that the
-    observer estimates. Without `feed_forward` no estimate of a disturbance is used.
+    Td/8. Without Ti, or with Ti infinite, there is no integral action and nothing to wind up; an
+    infinite entry does so to its loop alone. Without Td there is no derivative; without `order` the
+    integral is of order one, with it s^-order = (1/s) s^(1-order), where the second factor is
+    Oustaloup's filter: a true integrator is kept. base = bias, or with `feed_forward` the
+    steady-state input of the model on the reference, (r' - f(r))/c2, less d/c2 for a disturbance d
+    of the level rate [cm/s] that the observer estimates. Without `feed_forward` no estimate of a
+    disturbance is used. A Ti of 1e6 Tt or more, which can only be meant as infinite, is.
 
     Examples
     --------
@@ -98,25 +107,55 @@ class PID(Controller):
     """
 
     model: Plant
-    Kc: np.ndarray = leaf("V/cm", "(m,) gain Kc, not 0; below 0 where a pump lowers its output")
-    Ti: np.ndarray = leaf("s", "(m,) integral time Ti", low=0.0, strict=True)
+    Kc: np.ndarray = leaf(
+        "V/cm", "gain Kc, not 0; below 0 where a pump lowers its output", shape=("pump",)
+    )
+    Ti: np.ndarray | None = leaf(
+        "s",
+        "integral time Ti; inf: none",
+        low=0.0,
+        strict=True,
+        like="Kc",
+        infinite=True,
+        default=None,
+        shape=("pump",),
+    )
     Td: np.ndarray | None = leaf(
-        "s", "(m,) derivative time Td", low=0.0, strict=True, like="Kc", default=None
+        "s", "derivative time Td", low=0.0, strict=True, like="Kc", default=None, shape=("pump",)
     )
     order: np.ndarray | None = leaf(
         "-",
-        "(m,) order of the integral (lambda)",
+        "order of the integral (lambda)",
         low=0.0,
         high=1.0,
         strict=True,
         like="Kc",
         default=None,
+        shape=("pump",),
     )
-    Tt: np.ndarray = leaf("s", "(m,) tracking time of the anti-windup", low=0.0, strict=True)
-    bias: np.ndarray = leaf("V", "(m,) input added where there is no feed-forward")
+    Tt: np.ndarray | None = leaf(
+        "s",
+        "tracking time of the anti-windup; needed with Ti",
+        low=0.0,
+        strict=True,
+        like="Kc",
+        default=None,
+        shape=("pump",),
+    )
+    bias: np.ndarray = leaf("V", "input added where there is no feed-forward", shape=("pump",))
     feed_forward: bool = static(
         "-", "add the model's input on the reference", choices=(False, True), default=False
     )
+
+    def __post_init__(self) -> None:
+        concrete = isinstance(self.Ti, np.ndarray | jax.Array) and not isinstance(self.Ti, Tracer)
+        if concrete and np.size(self.Ti) and np.all(self._endless()):
+            object.__setattr__(self, "Ti", None)  # no state that never moves
+
+    def _endless(self) -> Any:
+        """Whether each integral time is as good as infinite beside the tracking time."""
+        tracking = isinstance(self.Tt, np.ndarray | jax.Array) and not isinstance(self.Tt, Tracer)
+        return np.isinf(self.Ti) | (np.asarray(self.Ti) >= ENDLESS * self.Tt if tracking else False)
 
     @property
     def arrays(self) -> bool:
@@ -138,7 +177,7 @@ class PID(Controller):
     def init(self, x0: tuple, u0: tuple) -> Any:
         none: Any = each(lambda u: 0.0 * u, u0) if is_array(u0) else (0.0 * u0[0],) * len(u0)
         return Memory(
-            integral=none,
+            integral=() if self.Ti is None else none,
             slow=() if self.Td is None else take(x0, self.model.outputs),
             sections=() if self.order is None else tuple((z,) * (2 * SECTIONS + 1) for z in none),
             error=none,
@@ -151,7 +190,10 @@ class PID(Controller):
             base = tuple(u - d / c for u, d, c in pushed)
         y = take(estimate.x, self.model.outputs)
         e = each(operator.sub, tick.r, y)
-        v = each(lambda e, b, k, i: b + k * e + i, e, base, self.Kc, state.integral)
+        if self.Ti is None:
+            v = each(lambda e, b, k: b + k * e, e, base, self.Kc)
+        else:
+            v = each(lambda e, b, k, i: b + k * e + i, e, base, self.Kc, state.integral)
         slow = state.slow
         if self.Td is not None:
             # (y - slow)/Tf is the filtered derivative; the lag is exact for a level held over the
@@ -166,8 +208,14 @@ class PID(Controller):
         return v, state._replace(slow=slow, error=e)
 
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
+        if self.Ti is None:
+            return state
+        # of one loop an infinite Ti is None; of several, 1 s stands in and the integral stays 0
+        several = np.shape(self.Ti)[-1:] != (1,)
+        finite = lambda Ti: jnp.where(jnp.isinf(Ti), 1.0, Ti) if several else Ti
+        kept = lambda Ti, i: jnp.where(jnp.isinf(Ti), 0.0, i) if several else i
         w = each(
-            lambda v, u, e, Ti, Tt, Kc: e + (Ti / (Tt * Kc)) * (u - v),
+            lambda v, u, e, Ti, Tt, Kc: e + (finite(Ti) / (Tt * Kc)) * (u - v),
             command,
             applied,
             state.error,
@@ -177,7 +225,7 @@ class PID(Controller):
         )
         if self.order is None:
             integral = each(
-                lambda w, i, Kc, Ti: i + (tick.dt * Kc / Ti) * w,
+                lambda w, i, Kc, Ti: kept(Ti, i + (tick.dt * Kc / finite(Ti)) * w),
                 w,
                 state.integral,
                 self.Kc,
@@ -213,5 +261,9 @@ class PID(Controller):
                 f"controller.Kc = {self.Kc}: must not be 0; a negative gain is for a pump that"
                 " lowers its output"
             )
+        if self.Ti is None and self.order is not None:
+            raise InputError("controller.order: needs an integral time, controller.Ti [s]")
+        if self.Ti is not None and self.Tt is None:
+            raise InputError("controller.Tt: needs a tracking time [s] where Ti is given")
         if self.feed_forward:
             check_own_pumps(self.model)

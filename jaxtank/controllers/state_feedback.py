@@ -77,7 +77,7 @@ class StateFeedback(Controller):
     """
 
     model: Plant
-    K: np.ndarray = leaf("V/cm", "(pumps, tanks) gain K")
+    K: np.ndarray = leaf("V/cm", "gain K", shape=("pump", "tank"))
 
     @pointwise
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
@@ -122,13 +122,13 @@ class LQI(Controller):
     # whatever the units of a rig
     Q: np.ndarray = leaf(
         "-",
-        "(tanks + outputs,) weight of each level, over its unit squared, then of each integral,"
-        " over that times s^2",
+        "weight of each level, over its unit squared, then of each integral, over that times s^2",
         low=0.0,
+        shape=("tank + output",),
     )
-    R: np.ndarray = leaf("1/V^2", "(pumps,) weight of each input", low=0.0, strict=True)
+    R: np.ndarray = leaf("1/V^2", "weight of each input", low=0.0, strict=True, shape=("pump",))
     operating_point: np.ndarray = leaf(
-        "cm", "(outputs,) setpoint at which the model is linearised", low=0.0, strict=True
+        "cm", "setpoint at which the model is linearised", low=0.0, strict=True, shape=("output",)
     )
 
     @pointwise

@@ -85,7 +85,7 @@ def check_value(name: str, value: Any, meta: Mapping[str, Any]) -> None:
     low, high = meta["low"], meta["high"]
     # whole numbers of 2^64 and more are no numbers to numpy
     array = number(value) if array.dtype == object else array
-    good = np.isfinite(array)
+    good = ~np.isnan(array) if meta.get("infinite") else np.isfinite(array)
     if low is not None:
         good = good & ((array > low) if meta["strict"] else (array >= low))
     if high is not None:
@@ -114,7 +114,7 @@ def _out_of_range(name: str, entry: Any, index: tuple[int, ...], meta: Mapping[s
     """The message for an entry that is not finite or out of range."""
     unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
     label = name + (f"[{','.join(map(str, index))}]" if index else "")
-    if not np.isfinite(entry):
+    if np.isnan(entry) or (np.isinf(entry) and not meta.get("infinite")):
         return f"{label} = {entry}{unit}: must be a finite number"
     if meta["high"] is not None and entry > meta["high"]:
         return f"{label} = {entry:g}{unit}: must be at most {meta['high']:g}{unit}"

@@ -6,7 +6,7 @@ Part of `jaxtank.core.tree`, through which other folders import it.
 import dataclasses
 import functools
 import numbers
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar, cast, dataclass_transform
 
 import jax
@@ -15,6 +15,7 @@ import numpy as np
 
 T = TypeVar("T")
 Meta = dict[str, Any]
+Shape = tuple[str | int, ...]
 
 
 def leaf(
@@ -24,7 +25,9 @@ def leaf(
     low: float | None = None,
     high: float | None = None,
     strict: bool = False,
+    shape: Shape = (),
     like: str | None = None,
+    infinite: bool = False,
     default: Any = dataclasses.MISSING,
 ) -> Any:
     """Return a differentiable field of a component: a number or an array.
@@ -32,12 +35,16 @@ def leaf(
     Parameters
     ----------
     unit : unit of the value for a rig in centimetres and volts, "-" without one
-    doc : what it is; begins with its shape in brackets, as in "(n,) height of each tank"
+    doc : what it is
     low, high : allowed range, or None
     strict : whether the value `low` itself is excluded
+    shape : size of each axis, () for one number: a number, or a name of what the plant counts:
+        "tank", "pump", "output", "orifice", "pipe", "spill", or a sum, "tank + output". A size of
+        another name ("knot") is for the component to check.
     like : name of a sibling field. Such a leaf may be absent (None), which costs the loop nothing,
         and takes the shape of the sibling when it is set. Write `default=None` beside it, so that
         type checkers see that it may be left out.
+    infinite : whether infinity is allowed; an entry of an absent leaf then has it
     default : function of {field: value} of the fields given, whose result a leaf has that is left
         out
 
@@ -60,8 +67,11 @@ def leaf(
         "low": low,
         "high": high,
         "strict": strict,
+        "shape": tuple(shape),
         "like": like,
     }
+    if infinite:
+        meta["infinite"] = True
     if callable(default):
         meta["default"] = default
     needed = like is None and default is dataclasses.MISSING
@@ -191,6 +201,25 @@ def _converted(value: Any) -> Any:
         except (TypeError, ValueError, OverflowError):  # traced entries, rows of several lengths
             return value
     return value
+
+
+def sizes_of_shape(shape: Shape, counts: Mapping[str, int]) -> tuple[int, ...] | None:
+    """Return the sizes of a leaf's shape for {name: count} of a plant; None where one of its names
+    is not in it.
+
+    Examples
+    --------
+    >>> sizes_of_shape(("pump", "tank + output"), {"tank": 4, "pump": 2, "output": 2})
+    (2, 6)
+    >>> sizes_of_shape(("knot",), {"tank": 4}) is None
+    True
+    """
+    axes = [axis.split(" + ") if isinstance(axis, str) else [axis] for axis in shape]
+    if any(isinstance(term, str) and term not in counts for axis in axes for term in axis):
+        return None
+    return tuple(
+        sum(counts[term] if isinstance(term, str) else term for term in axis) for axis in axes
+    )
 
 
 def is_component(value: Any) -> bool:

@@ -25,6 +25,7 @@ class Key:
     low, high, strict : allowed range, or None; strict: `low` itself is excluded
     choices : allowed values, or None
     default : value, as in a file, where the key is left out; None: it is then absent
+    shape : of a list or an array, as of a leaf
     target : dotted name of the field of ClosedLoop that holds the values of all tables of a list
         ("actuator.low"); a number after it is a part of each entry ("plant.links.0")
     """
@@ -38,6 +39,7 @@ class Key:
     strict: bool = False
     choices: tuple[Any, ...] | None = None
     default: Any = NEEDED
+    shape: tuple[Any, ...] = ()
     target: str = ""
 
     @classmethod
@@ -61,7 +63,7 @@ class Key:
         found = next(f for f in dataclasses.fields(owner) if f.name == field)
         meta = found.metadata
         own: dict[str, Any] = {
-            k: meta[k] for k in ("unit", "doc", "low", "high", "strict") if k in meta
+            k: meta[k] for k in ("unit", "doc", "low", "high", "strict", "shape") if k in meta
         }
         if meta["kind"] == "static":
             own |= {"kind": _KINDS.get(type_of(found), "number"), "choices": meta["choices"]}

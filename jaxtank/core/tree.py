@@ -19,7 +19,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.core.errors import InputError, unknown
-from jaxtank.core.fields import Meta, component, is_component, is_real, leaf, number, static
+from jaxtank.core.fields import (
+    Meta,
+    component,
+    is_component,
+    is_real,
+    leaf,
+    number,
+    sizes_of_shape,
+    static,
+)
 from jaxtank.core.text import shortened
 from jaxtank.core.units import DEFAULT, local
 
@@ -32,6 +41,7 @@ __all__ = [
     "leaf",
     "number",
     "parameters",
+    "sizes_of_shape",
     "split_index",
     "static",
     "walk",
@@ -262,7 +272,8 @@ def _replace(tree: T, path: list[str], index: tuple[int, ...], value: Any, name:
             raise LookupError(name)
         like = fields[head].metadata.get("like")
         if child is None and like is not None:
-            child = np.zeros(np.shape(getattr(tree, like)))
+            absent = np.inf if fields[head].metadata.get("infinite") else 0.0
+            child = np.full(np.shape(getattr(tree, like)), absent)
         new = _fitted(child, index, value, name)
     return cast(T, dataclasses.replace(cast(Any, tree), **{head: new}))
 

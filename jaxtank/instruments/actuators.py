@@ -65,29 +65,39 @@ class PumpBank(Actuator):
     [0.0, 5.0, 12.0]
     """
 
-    low: np.ndarray = leaf("V", "(m,) lower limit of each pump")
-    high: np.ndarray = leaf("V", "(m,) upper limit of each pump")
+    low: np.ndarray = leaf("V", "lower limit of each pump", shape=("pump",))
+    high: np.ndarray = leaf("V", "upper limit of each pump", shape=("pump",))
     dead_zone: Any = leaf(
-        "V", "(m,) input at or below which a pump stands still", low=0.0, like="low", default=None
+        "V",
+        "input at or below which a pump stands still",
+        low=0.0,
+        like="low",
+        default=None,
+        shape=("pump",),
     )
     stop: np.ndarray = leaf(
         "V",
-        "(m,) input below which a turning pump stops (hysteresis)",
+        "input below which a turning pump stops (hysteresis)",
         low=0.0,
         default=lambda own: np.zeros(np.shape(own["low"])),
+        shape=("pump",),
     )
     pulse: np.ndarray = leaf(
         "V",
-        "(m,) input of the pulses that replace a dead zone (pulse)",
+        "input of the pulses that replace a dead zone (pulse)",
         low=0.0,
         strict=True,
         default=lambda own: _largest(own["high"]),
+        shape=("pump",),
     )
-    lag: Any = leaf("s", "(m,) time constant of each pump", low=0.0, like="low", default=None)
+    lag: Any = leaf(
+        "s", "time constant of each pump", low=0.0, like="low", default=None, shape=("pump",)
+    )
     initial: np.ndarray = leaf(
         "V",
-        "(m,) input at which the pumps ran before t = 0",
+        "input at which the pumps ran before t = 0",
         default=lambda own: np.zeros(np.shape(own["low"])),
+        shape=("pump",),
     )
     delay: float = static(
         "s", "transport delay from pump to tank", low=0.0, high=1000.0, default=0.0

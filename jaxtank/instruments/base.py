@@ -153,9 +153,9 @@ class Actuator(abc.ABC):
     >>> from jaxtank import component, leaf
     >>> @component
     ... class RateLimited(Actuator):
-    ...     low: np.ndarray = leaf("V", "(m,) lower limit of each pump")
-    ...     high: np.ndarray = leaf("V", "(m,) upper limit of each pump")
-    ...     initial: np.ndarray = leaf("V", "(m,) input before t = 0")
+    ...     low: np.ndarray = leaf("V", "lower limit of each pump", shape=("pump",))
+    ...     high: np.ndarray = leaf("V", "upper limit of each pump", shape=("pump",))
+    ...     initial: np.ndarray = leaf("V", "input before t = 0", shape=("pump",))
     ...     rate: float = leaf("V/s", "largest rate of change", low=0.0, strict=True)
     ...
     ...     def init(self, clock):

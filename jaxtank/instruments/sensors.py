@@ -41,14 +41,17 @@ class LevelSensor(Sensor):
 
     gain: np.ndarray = leaf(
         "cm/volt",
-        "(n,) level per volt of each sensor (a)",
+        "level per volt of each sensor (a)",
         low=0.0,
         strict=True,
         default=lambda own: _without_adc(own, np.ones(np.shape(own["noise"]))),
+        shape=("tank",),
     )
-    noise: np.ndarray = leaf("cm", "(n,) standard deviation of the noise on each level", low=0.0)
+    noise: np.ndarray = leaf(
+        "cm", "standard deviation of the noise on each level", low=0.0, shape=("tank",)
+    )
     offset: np.ndarray | None = leaf(
-        "cm", "(n,) what each sensor reads of an empty tank", like="gain", default=None
+        "cm", "what each sensor reads of an empty tank", like="gain", default=None, shape=("tank",)
     )
     full_scale: np.ndarray = leaf(
         "volt", "range of the ADC", low=0.0, strict=True, default=lambda own: _without_adc(own, 5.0)

@@ -24,6 +24,7 @@ from jaxtank.core.tree import component, leaf
 from jaxtank.core.vectors import columns, given, is_array, scalars, serves_arrays, total
 from jaxtank.instruments.base import Actuator, Sensor
 from jaxtank.loop.change_windows import windows
+from jaxtank.loop.steady import steady_inflow
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
 from jaxtank.plants.faults import Faults
@@ -74,7 +75,7 @@ class ClosedLoop:
     disturbance: Signal | None = None
     faults: Faults | None = None
     safety_filter: SafetyFilter | None = None
-    x0: np.ndarray[Any, Any] = leaf("cm", "(n,) levels at t = 0", low=0.0)
+    x0: np.ndarray[Any, Any] = leaf("cm", "levels at t = 0", low=0.0, shape=("tank",))
 
     @property
     def units(self) -> tuple[str, str]:
@@ -218,7 +219,12 @@ def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Group) -> 
 def _steady_inputs(loop: ClosedLoop, r: Group) -> Any:
     if not ms.serves("input_deviation", loop):
         raise InputError("input_deviation needs a rig without pipes, with as many pumps as outputs")
-    held = steady_along(loop.plant, _rows_of(r))[1]
+    held, offset = (
+        steady_along(loop.plant, _rows_of(r), steady_inflow(loop))[1],
+        loop.actuator.offset,
+    )
+    if np.ndim(offset):
+        held = tuple(u + offset[i] for i, u in enumerate(held))
     return columns(held) if is_array(r) else held
 
 

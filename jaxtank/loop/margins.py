@@ -21,6 +21,7 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.loop.closed_loop import ClosedLoop, run_of, zero_of
 from jaxtank.loop.operating_point import REASONS, linearised
+from jaxtank.loop.steady import steady_inflow
 from jaxtank.loop.validation import check
 from jaxtank.signals.base import Constant
 from jaxtank.xla.jit import compiled
@@ -41,10 +42,10 @@ def stability_margins(loop: ClosedLoop, clock: Clock) -> tuple[Plateau, ...]:
     """Return the stability margins of the linearised loop at every plateau of its reference.
 
     One sample of the loop (sensor without noise, observer, controller, pumps with lag and dead time
-    but without limits, plant) is linearised at the steady state of each plateau, and broken at the
-    pumps: exact for the sampled loop. With several pumps gain, phase and delay margin are of one
-    pump at a time, the other loops closed, and the sensitivity peak is that of the largest
-    singular value of (I + L)^-1.
+    but without limits, plant with its steady inflow) is linearised at the steady state of each
+    plateau, and broken at the pumps: exact for the sampled loop. With several pumps gain, phase and
+    delay margin are of one pump at a time, the other loops closed, and the sensitivity peak is that
+    of the largest singular value of (I + L)^-1.
 
     Parameters
     ----------
@@ -114,7 +115,11 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
     xp: Any = jnp if traced else np
     r: Any = xp.stack([xp.stack([xp.asarray(v, float) for v in row]) for row in held])
     bare = dataclasses.replace(
-        loop, reference=Constant(level=r[0]), disturbance=None, faults=None, safety_filter=None
+        loop,
+        reference=Constant(level=r[0]),
+        disturbance=None if steady_inflow(loop) is None else loop.disturbance,
+        faults=None,
+        safety_filter=None,
     )
     one = functools.partial(
         _compiled, bare, dataclasses.replace(clock, duration=clock.dt), slopes=traced

@@ -19,6 +19,7 @@ from jaxtank.analysis.frequency import OpenLoop, solve
 from jaxtank.core.clock import Clock
 from jaxtank.core.records import Tick
 from jaxtank.loop.closed_loop import ClosedLoop, Inputs, State, initial
+from jaxtank.loop.steady import steady_inflow
 from jaxtank.loop.step import decide, move
 from jaxtank.measures import Context
 
@@ -37,10 +38,10 @@ KINK = 1e-3
 REASONS = (
     "",
     "a tank would be at its rim",
-    "the controller or an instrument has no derivative there (a switch, a dead zone)",
-    "no steady state of the loop is found there (a switching controller has none)",
     "a tank would be empty, or below its laminar threshold",
     "a pump would run at or beyond its limits",
+    "the controller or an instrument has no derivative there (a switch, a dead zone)",
+    "no steady state of the loop is found there (a switching controller has none)",
     "the controller or an instrument counts samples, and has no steady state",
     "the controller does not use the readings",
 )
@@ -61,9 +62,9 @@ def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
 
     The loop is broken between what the actuator is given and the pumps: its dead time and its lag
     belong to the open loop. Sensors without noise and ADC, pumps without limits, without safety
-    filter, inflow disturbances and faults. Newton's method finds the state at which a sample
-    changes nothing, of a stable and of an unstable loop; derivatives are those of the implicit
-    function. Where a steady state cannot be used (`why`), A, B and C are 0.
+    filter, inflow pulses and faults; a steady inflow stays. Newton's method finds the state at
+    which a sample changes nothing, of a stable and of an unstable loop; derivatives are those of
+    the implicit function. Where a steady state cannot be used (`why`), A, B and C are 0.
 
     Parameters
     ----------
@@ -85,18 +86,22 @@ def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
     ''
     """
     quiet, dead = _without_limits(loop, clock)
-    found, alone = _rest(clock, quiet, r), _plant_at_rest(quiet.plant, r)[0]
+    found, alone = _rest(clock, quiet, r), _plant_at_rest(quiet, r)
     (closed, B, C, after, u), s, kink = found.slopes, found.s, found.kink
     x = s[: loop.plant.tanks]  # the first numbers of a State
-    span = jnp.stack([jnp.asarray(loop.actuator.high), jnp.asarray(loop.actuator.low)])
     moved = jnp.abs(after - s) > 1e-8 * jnp.abs(s) + 1e-10 * jnp.max(jnp.abs(s))
     finite = [jnp.all(jnp.isfinite(v)) for v in (s, closed, B, C)]
+    lost = jnp.any(moved) | ~jnp.all(jnp.stack(finite))
+    # where the loop does not rest, what the plant alone would need tells why
+    levels, volts = (jnp.where(lost, a, b) for a, b in zip(alone, (x, u)))
+    bank, least = loop.actuator, loop.actuator.driving(tuple(jnp.asarray(loop.actuator.low)))
+    low = jnp.where(lost, jnp.stack(list(least)) + jnp.asarray(bank.offset), jnp.asarray(bank.low))
     checks = [
-        jnp.any(alone >= jnp.asarray(loop.plant.rim)) & loop.plant.overflow,
+        jnp.any(levels >= jnp.asarray(loop.plant.rim)) & loop.plant.overflow,
+        jnp.any(levels < getattr(loop.plant, "knee", 0.0)),
+        jnp.any(volts >= jnp.asarray(bank.high)) | jnp.any(volts <= low),
         kink,
-        jnp.any(moved) | ~jnp.all(jnp.stack(finite)),
-        jnp.any(x < getattr(loop.plant, "knee", 0.0)),
-        jnp.any(u >= span[0]) | jnp.any(u <= span[1]),
+        lost,
         found.counts,
         jnp.all(C == 0.0),
     ]
@@ -123,23 +128,30 @@ def _without_limits(loop: ClosedLoop, clock: Clock) -> tuple[ClosedLoop, int]:
         loop,
         sensor=sensor,
         actuator=dataclasses.replace(actuator, **changes),
-        disturbance=None,
+        disturbance=None if steady_inflow(loop) is None else loop.disturbance,
         faults=None,
         safety_filter=None,
     )
     return quiet, dead
 
 
-def _plant_at_rest(plant: Any, r: Any) -> tuple[Any, Any]:
+def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
     """(levels (n,), inputs (m,)) of the plant's steady state with outputs r, without derivatives:
     where Newton's method of the loop starts. Levels that are not controlled start at the mean
     setpoint, and are at least halved by a step that would empty them.
     """
-    plant, r = jax.lax.stop_gradient((plant, r))
+    own, inflow, actuator = loop.plant, steady_inflow(loop), loop.actuator
+    plant, r, inflow, offset = jax.lax.stop_gradient((own, r, inflow, actuator.offset))
     outputs = np.array(plant.outputs)
     free = np.array([i for i in range(plant.tanks) if i not in plant.outputs], dtype=int)
     x = jnp.full(plant.tanks, jnp.mean(jnp.abs(r))).at[outputs].set(r)
-    slope = jax.jacfwd(plant.rates, argnums=(0, 1))
+
+    def rates(x: Any, u: Any) -> Any:
+        if inflow is None:
+            return plant.rates(x, u)
+        return jnp.stack(plant.derivative(0.0, tuple(x), tuple(u), tuple(inflow)))
+
+    slope = jax.jacfwd(rates, argnums=(0, 1))
 
     def newton(_: Any, state: Any) -> Any:
         x, u = state
@@ -148,12 +160,14 @@ def _plant_at_rest(plant: Any, r: Any) -> tuple[Any, Any]:
         scale = jnp.sqrt(jnp.sum(J * J, axis=0))
         J = J / jnp.where(scale > 0.0, scale, 1.0)
         square = J.T @ J + 1e-14 * jnp.eye(J.shape[1])
-        step = solve(square, -(J.T @ plant.rates(x, u))[:, None])[:, 0]
+        step = solve(square, -(J.T @ rates(x, u))[:, None])[:, 0]
         step = step / jnp.where(scale > 0.0, scale, 1.0)
         moved = x[free] + step[: len(free)]
         return x.at[free].set(jnp.maximum(moved, 0.5 * x[free])), u + step[len(free) :]
 
-    return jax.lax.fori_loop(0, PLANT_STEPS, newton, (x, jnp.zeros(plant.pumps, x.dtype)))
+    start = (x, jnp.zeros(plant.pumps, x.dtype))
+    x, u = jax.lax.fori_loop(0, PLANT_STEPS, newton, start)
+    return x, u + jnp.asarray(offset)
 
 
 class _Sample:
@@ -161,7 +175,6 @@ class _Sample:
 
     def __init__(self, loop: ClosedLoop, clock: Clock, r: Any, guess: tuple[Any, Any]):
         x, u = guess
-        u = u + jax.lax.stop_gradient(jnp.asarray(loop.actuator.offset))
         actuator: Any = loop.actuator
         here: Any = dataclasses.replace(actuator, initial=u)
         self.loop, self.clock = loop, clock
@@ -251,7 +264,9 @@ def _constant_inputs(loop: ClosedLoop, clock: Clock, r: Any) -> Inputs:
     own = loop.controller.inputs(dataclasses.replace(clock, duration=clock.dt))
     rows: Any = (columns, zero, zero, plan, own)
     r, dr, ddr, plan, own = jax.tree.map(_first, rows)
-    return Inputs(r, dr, ddr, None, None, Context(), plan, own, None)
+    inflow = steady_inflow(loop)
+    d = None if inflow is None else tuple(inflow[i] for i in range(loop.plant.tanks))
+    return Inputs(r, dr, ddr, d, None, Context(), plan, own, None)
 
 
 def _first(a: Any) -> Any:
@@ -264,7 +279,7 @@ def _rest(clock: Clock, loop: ClosedLoop, r: Any) -> _Rest:
     none. Then PROBES differences on each side of it are compared with the derivatives. One sample
     is compiled once for all of that.
     """
-    sample = _Sample(loop, clock, r, _plant_at_rest(loop.plant, r))
+    sample = _Sample(loop, clock, r, _plant_at_rest(loop, r))
     eye = jnp.eye(sample.start.shape[0], dtype=sample.start.dtype)
     share = jnp.finfo(eye.dtype).eps ** (1.0 / 3.0)
 
@@ -294,7 +309,7 @@ def _rest_jvp(clock: Clock, primals: Any, tangents: Any) -> Any:
     """Derivatives by the implicit function: (I - closed) ds = the change of `after` at s held."""
     loop, r = primals
     found: Any = _rest(clock, loop, r)
-    guess = _plant_at_rest(loop.plant, r)
+    guess = _plant_at_rest(loop, r)
     none = jnp.zeros(loop.plant.pumps, found.s.dtype)
 
     def after(loop: ClosedLoop, r: Any) -> Any:

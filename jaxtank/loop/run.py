@@ -7,6 +7,8 @@ other modules of `loop` and the folders below.
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false
 
+import functools
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
@@ -31,6 +33,7 @@ from jaxtank.loop.closed_loop import (
     takes_arrays,
 )
 from jaxtank.loop.derivatives import sensitivities_compiled
+from jaxtank.loop.floor import FloorWarning, floor_warnings
 from jaxtank.loop.functions import needed_by, values_of
 from jaxtank.loop.margins import run_with
 from jaxtank.loop.saved_rows import simulate_compiled
@@ -51,6 +54,9 @@ def simulate(
     loop: ClosedLoop, clock: Clock, key: jax.Array | None = None, save_every: int = 1
 ) -> Trajectory:
     """Run the loop and keep every `save_every`-th sample.
+
+    Warns (FloorWarning) where a level falls below an empty tank: liquid was drawn that was not
+    there.
 
     Parameters
     ----------
@@ -90,6 +96,9 @@ def simulate(
         )
     trajectory, broken = simulate_compiled(loop, clock, key, min(save_every, clock.samples))
     _report_broken(broken, loop, clock, key)
+    if not isinstance(trajectory.x, Tracer) and np.ndim(trajectory.x) == 2:
+        for line in floor_warnings(loop, trajectory):
+            warnings.warn(line, FloorWarning, stacklevel=2)
     return trajectory
 
 
@@ -118,7 +127,8 @@ def evaluate(
     Raises
     ------
     InputError
-        For invalid input.
+        For invalid input, and for a derivative of a measure that counts whole samples (times of
+        events, shares of samples).
     NonFiniteError
         If a level stops being finite (outside a trace).
 
@@ -140,7 +150,28 @@ def evaluate(
     else:
         values, broken = evaluate_compiled(loop, clock, names, key, False)
     _report_broken(broken, loop, clock, key)
-    return values
+    return {
+        m: _without_slope(m, v, loop) if ms.MEASURES[m].counts else v for m, v in values.items()
+    }
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _without_slope(name: str, value: Any, loop: Any) -> Any:
+    """Return the value of a measure that counts samples; its derivative is an InputError."""
+    return value
+
+
+@_without_slope.defjvp
+def _refused(name: str, primals: Any, tangents: Any) -> Any:
+    raise InputError(_no_slope([name]))
+
+
+def _no_slope(names: Sequence[str]) -> str:
+    return (
+        f"{', '.join(names)}: counts whole samples, so that its derivative is 0 or does not exist;"
+        " differentiate another measure (mean_square_error, mean_square_overshoot,"
+        " saturation_excess), or evaluate this one outside the function that is differentiated"
+    )
 
 
 def _in_batches(tree: Any, clock: Clock, names: tuple[str, ...]) -> Any:
@@ -231,6 +262,8 @@ def sensitivities(
     if not values:
         raise InputError("sensitivities needs at least one parameter: values is empty")
     check(with_values(loop, values), clock, key)
+    if steps := [m for m in _names(measures) if ms.MEASURES[m].counts]:
+        raise InputError(_no_slope(steps))
     squares = {"mean_square_error": 1.0} if squares is None else squares
     for name in _names(squares):
         if not ms.MEASURES[name].residual:

@@ -130,7 +130,7 @@ def step_warnings(loop: ClosedLoop, clock: Clock) -> list[str]:
     tank, height, remedy = max(shown, key=lambda one: one.height / loop.plant.rim[one.tank])
     others = f" (and so do {len(shown) - 1} more)" if len(shown) > 1 else ""
     amount = f"{height:.2g} {length}" if math.isfinite(height) else "no bound"
-    wrong = f"the explicit step is unstable and its level rises to {amount}"
+    wrong = f"the explicit step is unstable and its level rises to {amount} alone, further if fed"
     if getattr(loop.plant, "bottom", False):
         wrong = "its level is wrong"
         if math.isfinite(height):
@@ -149,7 +149,7 @@ def check_run(loop: ClosedLoop, clock: Clock, run: Trajectory) -> None:
     if not shown or any(name.startswith("area") for name, _, _ in _fault_windows(loop)):
         return  # a fault of an area changes what is stored
     plant: Any = loop.plant  # a network of tanks
-    x, least = np.asarray(run.x), _visible_heights(loop, np.asarray(run.x))
+    x, least = np.asarray(run.x), visible_heights(loop, np.asarray(run.x))
     area, inflow = np.asarray(plant.area), _largest_inflow(loop, clock, np.asarray(run.u))
     gained = np.diff(x @ area) - clock.dt * inflow[:-1]  # volume from nowhere
     for tank, _, remedy in shown:
@@ -187,11 +187,11 @@ def _largest_inflow(loop: ClosedLoop, clock: Clock, u: Any) -> Any:
 def _visible(loop: ClosedLoop, clock: Clock) -> list[Unstable]:
     """Those of `unstable_tanks` whose height shows; none where the levels needed are traced."""
     found = list(unstable_tanks(loop, clock))
-    least = _visible_heights(loop) if found else None
+    least = visible_heights(loop) if found else None
     return [] if least is None else [one for one in found if one.height > least[one.tank]]
 
 
-def _visible_heights(loop: ClosedLoop, x: Any = 0.0) -> Any:
+def visible_heights(loop: ClosedLoop, x: Any = 0.0) -> Any:
     """(n,) heights from which an error shows: a share of the rim, or of the highest level of start,
     setpoint and the run's levels `x` where that is lower, for a rim may be a limit far above all
     that happens. Of a run from empty tanks to nowhere, of the rim. None of traced levels.

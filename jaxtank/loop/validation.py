@@ -7,7 +7,6 @@ May import `loop.closed_loop`, `loop.step_size` and the folders below `jaxtank.l
 
 import dataclasses
 import hashlib
-import re
 from collections.abc import Iterator, Mapping
 from typing import Any, cast
 
@@ -20,11 +19,12 @@ from jaxtank.core.checks import check_leaves
 from jaxtank.core.clock import Clock, check_clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import check_key
-from jaxtank.core.tree import is_component
+from jaxtank.core.tree import is_component, sizes_of_shape
 from jaxtank.instruments.base import Actuator
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.step_size import check_step
 from jaxtank.plants.base import Plant
+from jaxtank.plants.faults import Faults
 from jaxtank.plants.network import check_caught
 
 KEPT = 64
@@ -33,9 +33,6 @@ KEPT = 64
 """
 
 _PASSED: dict[Any, None] = {}
-
-_DOCUMENTED = re.compile(r"\(([a-z0-9, +]+)\) ")
-"""The shape with which the documentation of a leaf begins."""
 
 
 def check(
@@ -124,6 +121,7 @@ def _check_parts(
 ) -> None:
     """Every check that looks at the loop."""
     _check_sizes(loop)
+    _check_units(loop.plant)
     _check_saturation(loop)
     _check_delay(loop.actuator, clock)
     check_shapes(loop)
@@ -131,6 +129,9 @@ def _check_parts(
     check_leaves(loop, vacant=[f"controller.law.{gain}" for gain in gains])
     for name, own in _plants(loop):
         check_caught(own, name)
+    faults = loop.faults if isinstance(loop.faults, Faults) else None
+    if faults and not _traced(faults, loop.plant) and (wrong := faults.problems(loop.plant, clock)):
+        raise InputError("; ".join(wrong))
     loop.actuator.check()
     if not _traced(loop.controller, loop.reference):
         loop.controller.check(loop.reference)
@@ -163,6 +164,19 @@ def _check_sizes(loop: ClosedLoop) -> None:
         )
 
 
+def _check_units(plant: Plant) -> None:
+    """Raise InputError where the levels of a plant are in a length that is not its `units`'."""
+    length, drive = plant.units
+    fields = cast(Any, getattr(plant, "__dataclass_fields__", {}))
+    unit = fields["rim"].metadata.get("unit", "cm") if "rim" in fields else "cm"
+    if unit not in ("cm", length):  # metadata in cm are translated
+        raise InputError(
+            f"plant.rim is in {unit} and {type(plant).__name__}.units = {plant.units}: must be the"
+            f' same length; write units = ("{unit}", "{drive}") in the class, with the unit of its'
+            " pump inputs second"
+        )
+
+
 def _check_saturation(loop: ClosedLoop) -> None:
     if loop.actuator.allocates and (loop.plant.pumps != 2 or not loop.controller.allocates):
         raise InputError(
@@ -190,7 +204,7 @@ def _check_noise(loop: ClosedLoop) -> None:
 
 
 def check_shapes(loop: ClosedLoop) -> None:
-    """Raise InputError for a leaf of `loop` that has not the shape its documentation begins with.
+    """Raise InputError for a leaf of `loop` that has not the shape that its class gives it.
 
     Leaves of a batch may have the axes in front that x0 has; sizes that a component knows alone
     (changes, inflow pulses, knots) are its own to check.
@@ -208,44 +222,27 @@ def _check_shapes(tree: Any, prefix: str, sizes: Mapping[str, int], batch: tuple
         if is_component(value):
             _check_shapes(value, f"{name}.", sizes, batch)
         elif field.metadata.get("kind") == "leaf" and value is not None:
-            documented = _DOCUMENTED.match(field.metadata.get("doc") or "")
-            wanted = documented and _shape(documented.group(1), sizes)
-            if documented and wanted is not None:
-                _check_shape(name, np.shape(value), wanted, batch, documented.group(1))
+            wanted = sizes_of_shape(field.metadata["shape"], sizes)
+            if wanted is not None and np.shape(value) not in (wanted, batch + wanted):
+                raise InputError(_refused_shape(name, value, wanted, field.metadata["shape"]))
 
 
-def _check_shape(
-    name: str, shape: tuple[int, ...], wanted: tuple[int, ...], batch: tuple[int, ...], words: str
-) -> None:
-    if shape not in (wanted, batch + wanted):
-        raise InputError(f"{name} has shape {shape}: must be {wanted}, ({words})")
+def _refused_shape(name: str, value: Any, wanted: tuple[int, ...], shape: Any) -> str:
+    has = f"{name} has shape {np.shape(value)}: must be"
+    if not shape:
+        return f'{has} one number; of an array its class says so: leaf(..., shape=("pump",))'
+    return f"{has} {wanted}, one entry per {' and '.join(map(str, shape))}"
 
 
 def _sizes(plant: Plant) -> dict[str, int]:
-    """{word in the documentation of leaves: number} of a plant."""
-    more = {name: len(getattr(plant, name, ())) for name in ("links", "pipes", "spills")}
+    """{name in the shape of a leaf: count} of a plant."""
+    parts = {"orifice": "links", "pipe": "pipes", "spill": "spills"}
     return {
-        "n": plant.tanks,
-        "tanks": plant.tanks,
-        "m": plant.pumps,
-        "pumps": plant.pumps,
-        "outputs": len(plant.outputs),
-        **more,
+        "tank": plant.tanks,
+        "pump": plant.pumps,
+        "output": len(plant.outputs),
+        **{name: len(getattr(plant, field, ())) for name, field in parts.items()},
     }
-
-
-def _shape(words: str, sizes: Mapping[str, int]) -> tuple[int, ...] | None:
-    """(4,) of "n,"; None where a size is not of the plant."""
-    found: list[int] = []
-    for axis in filter(None, (a.strip() for a in words.split(","))):
-        total = 0
-        for term in axis.split(" + "):
-            size = sizes.get(term, int(term) if term.isdigit() else None)
-            if size is None:
-                return None
-            total += size
-        found.append(total)
-    return tuple(found)
 
 
 def _plants(tree: Any, prefix: str = "") -> Iterator[tuple[str, Plant]]:

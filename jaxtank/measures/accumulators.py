@@ -33,6 +33,10 @@ class Run(NamedTuple):
     arrays: bool = False  # whether the vectors of the run are arrays (jaxtank.core.vectors)
     margins: Any = None  # Worst margins of the linearised loop, where a measure reads them
 
+    def lasting(self, sample: Sample, value: Any) -> Any:
+        """Return `value` of a sample, 0 at the last: it is held for dt, but for that at the end."""
+        return jnp.where(sample.t < (self.samples - 1.5) * self.dt, value, 0.0)
+
 
 class Worst(NamedTuple):
     """The worst stability margins of all steady states of a loop."""
@@ -124,6 +128,13 @@ def _sum_of_squares(size, term, refers_to=""):
         update,
         refers_to,
         lambda run, state, sample, context: term(run, sample, context),
+    )
+
+
+def _lasting(term):
+    """`term` of the samples that last for dt: the terms of an integral over the run."""
+    return lambda run, sample, *context: each(
+        lambda v: run.lasting(sample, v), term(run, sample, *context)
     )
 
 
@@ -303,7 +314,8 @@ def _magnitudes(vector):
 
 _BUILT_IN: dict[str, Accumulator] = {
     "e2": _sum_of_squares("outputs", lambda run, s, context: s.e),
-    "abs_e": _sum("outputs", lambda run, s: _magnitudes(s.e)),
+    "lasting_e2": _sum_of_squares("outputs", _lasting(lambda run, s, context: s.e)),
+    "abs_e": _sum("outputs", _lasting(lambda run, s: _magnitudes(s.e))),
     "u2": _sum("pumps", lambda run, s: each(lambda u: u * u, s.u)),
     "estimate2": _sum("tanks", _estimation_error),
     "outside": _sum("pumps", _outside),
@@ -313,8 +325,8 @@ _BUILT_IN: dict[str, Accumulator] = {
         lambda run, state, sample, context: plus(state, sample.filtered),
     ),
     "over_rim2": _sum_of_squares("tanks", _over_rim),
-    "spilled": _sum("tanks", lambda run, s: s.spilled),
-    "shortfall": _sum("tanks", lambda run, s: s.shortfall),
+    "spilled": _sum("tanks", _lasting(lambda run, s: s.spilled)),
+    "shortfall": _sum("tanks", _lasting(lambda run, s: s.shortfall)),
     "max_level": _extreme("tanks", lambda s, context: s.x, lambda a, b: a > b, -jnp.inf),
     "min_level": _extreme("tanks", lambda s, context: s.x, lambda a, b: a < b, jnp.inf),
     "max_error": _extreme(
@@ -334,7 +346,7 @@ _BUILT_IN: dict[str, Accumulator] = {
         lambda run: _rows(run, "outputs", 0.0, 0.0, 0.0), _update_recovery, "since", rows=True
     ),
     "past2": _sum_of_squares("outputs", _past, "window"),
-    "deviation2": _sum_of_squares("pumps", _deviation, "steady"),
+    "deviation2": _sum_of_squares("pumps", _lasting(_deviation), "steady"),
     "travel": Accumulator(_start_travel, _update_travel),
     "changes2": Accumulator(
         _start_travel,

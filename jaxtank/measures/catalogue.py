@@ -1,7 +1,9 @@
 """The measures: numbers that describe a run, each with all that is known of it.
 
-A measure reads accumulators at the end of a run. May import `jaxtank.core` and the
-modules of `measures` that it imports only.
+A measure reads accumulators at the end of a run. Means are over its N + 1 samples, t = 0 to T.
+Integrals and volumes are over [0, T]: sums over the first N samples, each held for dt, which is
+exact for inputs and volumes, and the left rectangle rule for levels. May import `jaxtank.core` and
+the modules of `measures` that it imports only.
 """
 
 from typing import Any
@@ -116,7 +118,9 @@ _BUILT_IN: dict[str, Measure] = {
     "mean_square_error": _sum_of_squares(
         "cm^2", "output", "e2", _mean, "mean square tracking error"
     ),
-    "ise": _sum_of_squares("cm^2 s", "output", "e2", _integral, "integral of the squared error"),
+    "ise": _sum_of_squares(
+        "cm^2 s", "output", "lasting_e2", _integral, "integral of the squared error"
+    ),
     "iae": Measure(
         "cm s",
         "output",

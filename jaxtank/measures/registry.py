@@ -74,7 +74,7 @@ def register(
     ...     "cm",
     ...     "run",
     ...     ("abs_e",),
-    ...     lambda run, sums: sum(sums["abs_e"]) / (run.samples * run.outputs),
+    ...     lambda run, sums: sum(sums["abs_e"]) / ((run.samples - 1) * run.outputs),
     ...     "mean absolute tracking error",
     ... )
     >>> mean is register("mean_absolute_error", mean)
@@ -83,7 +83,7 @@ def register(
     >>> clock = jaxtank.Clock(dt=4.0, duration=40.0)
     >>> values = jaxtank.evaluate(loop, clock, ["mean_absolute_error", "iae"])
     >>> print(round(float(values["iae"][0] / values["mean_absolute_error"]), 3))
-    44.0
+    40.0
     >>> del jaxtank.measures.MEASURES["mean_absolute_error"]  # as it was before this example
     """
     own = dict(accumulators or {})

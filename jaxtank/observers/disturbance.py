@@ -66,7 +66,11 @@ class DisturbanceObserver(Observer):
 
     model: Plant
     l: np.ndarray = leaf(
-        "1/s", "(n,) gain l of each tank; of unmeasured tanks not used", low=0.0, strict=True
+        "1/s",
+        "gain l of each tank; of unmeasured tanks not used",
+        low=0.0,
+        strict=True,
+        shape=("tank",),
     )
     fed: str = static("-", "input that the observer uses", choices=FED, default="applied")
     before_compensation: bool = static(

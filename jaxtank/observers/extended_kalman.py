@@ -59,30 +59,38 @@ class ExtendedKalman(Observer):
 
     model: Plant
     process: np.ndarray = leaf(
-        "cm^2/s", "(n,) variance that each level's own disturbance gains per second (Q)", low=0.0
+        "cm^2/s",
+        "variance that each level's own disturbance gains per second (Q)",
+        low=0.0,
+        shape=("tank",),
     )
     measurement: np.ndarray = leaf(
         "cm^2",
-        "(n,) variance of each sensor's noise (r); of unmeasured tanks not used",
+        "variance of each sensor's noise (r); of unmeasured tanks not used",
         low=0.0,
         strict=True,
+        shape=("tank",),
     )
-    spread: np.ndarray = leaf("cm^2", "(n,) variance of the initial estimate at t = 0", low=0.0)
+    spread: np.ndarray = leaf(
+        "cm^2", "variance of the initial estimate at t = 0", low=0.0, shape=("tank",)
+    )
     start: np.ndarray | None = leaf(
         "cm",
-        "(n,) initial estimate at t = 0; absent: the true ones",
+        "initial estimate at t = 0; absent: the true ones",
         low=0.0,
         like="spread",
         default=None,
+        shape=("tank",),
     )
     walk: np.ndarray | None = leaf(
         "cm^2/s^3",
-        "(n,) variance that the disturbance of each level's rate gains per second; of tanks not in"
+        "variance that the disturbance of each level's rate gains per second; of tanks not in"
         " `disturbed` not used",
         low=0.0,
         strict=True,
         like="process",
         default=None,
+        shape=("tank",),
     )
     measured: tuple = static(doc="tanks whose levels are measured, counted from 0")
     disturbed: tuple = static(

@@ -52,28 +52,31 @@ class Kalman(Observer):
     """
 
     model: Plant
-    levels: np.ndarray = leaf("cm", "(n,) operating levels xo", low=0.0)
-    inputs: np.ndarray = leaf("V", "(m,) operating inputs uo")
+    levels: np.ndarray = leaf("cm", "operating levels xo", low=0.0, shape=("tank",))
+    inputs: np.ndarray = leaf("V", "operating inputs uo", shape=("pump",))
     process: np.ndarray = leaf(
         "cm^2/s",
-        "(n,) variance that each level's own disturbance gains per second",
+        "variance that each level's own disturbance gains per second",
         low=0.0,
         strict=True,
+        shape=("tank",),
     )
     measurement: np.ndarray = leaf(
         "cm^2",
-        "(n,) variance of each sensor's noise; of unmeasured tanks not used",
+        "variance of each sensor's noise; of unmeasured tanks not used",
         low=0.0,
         strict=True,
+        shape=("tank",),
     )
     walk: np.ndarray | None = leaf(
         "cm^2/s^3",
-        "(n,) variance that the disturbance of each level's rate gains per second; of tanks not in"
+        "variance that the disturbance of each level's rate gains per second; of tanks not in"
         " `disturbed` not used",
         low=0.0,
         strict=True,
         like="process",
         default=None,
+        shape=("tank",),
     )
     measured: tuple = static(doc="tanks whose levels are measured, counted from 0")
     disturbed: tuple = static(

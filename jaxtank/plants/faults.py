@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxtank.core.clock import Clock, pointwise, sample_times
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import component, get_value, leaf, number, split_index, static
+from jaxtank.core.tree import component, describe, get_value, leaf, number, split_index, static
 from jaxtank.plants.base import Plant
 
 
@@ -33,9 +33,9 @@ class Faults:
     """
 
     factor: np.ndarray = leaf(
-        "-", "(faults,) what each entry is multiplied by while its fault lasts", low=0.0
+        "-", "what each entry is multiplied by while its fault lasts", low=0.0, shape=("fault",)
     )
-    extra: np.ndarray = leaf("-", "(faults,) what is added to it, in its own unit")
+    extra: np.ndarray = leaf("-", "what is added to it, in its own unit", shape=("fault",))
     windows: tuple[Any, ...] = static(
         doc='(("drain[1]", start [s], end [s]), ...) entry of the plant and when, one per fault'
     )
@@ -49,6 +49,71 @@ class Faults:
             jnp.where((t >= start - half) & (t < end - half), 1.0, 0.0)
             for _, start, end in self.windows
         )
+
+    def unseen(self, clock: Clock) -> list[int]:
+        """Return the faults that no sample lies in which lasts for dt: they do nothing."""
+        times, half = clock.dt * np.arange(clock.samples - 1), 1e-7 * clock.dt
+        first, after = (
+            np.searchsorted(times, [float(window[i]) - half for window in self.windows])
+            for i in (1, 2)
+        )
+        return np.flatnonzero(first == after).tolist()
+
+    def problems(self, plant: Plant, clock: Clock) -> list[str]:
+        """Return a sentence for each fault that makes no physics of `plant`: an entry out of its
+        range, volume from nowhere.
+        """
+        found = []
+        for k, (name, start, end) in enumerate(self.windows):
+            field, (index,) = split_index(name)
+            what = f"fault {k + 1} of {name} from {start:g} s to {end:g} s"
+            meta = describe(plant, field)
+            unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
+            ends = [e for other, _, e in self.windows if other == name and start < e < end]
+            values = [self._value(plant, name, time) for time in (start, *ends)]
+            value, largest, low, high = min(values), max(values), meta["low"], meta["high"]
+            strict = field in ("area", "rim")  # a pump may stand still
+            if low is not None and (value <= low if strict else value < low):
+                words = "above" if strict else "at least"
+                found.append(f"{what}: makes it {value:g}{unit}: must be {words} {low:g}{unit}")
+            elif high is not None and largest > high:
+                found.append(f"{what}: makes it {largest:g}{unit}: must be at most {high:g}{unit}")
+            elif field == "area" and not self._lasts(k, clock):
+                found.append(
+                    f"{what}: volume would come from nowhere as the area changes: must last for the"
+                    f" whole run, from 0 s to {clock.duration:g} s or later"
+                )
+            elif field == "caught":
+                found += self._caught_twice(what, plant, index, start)
+        return found
+
+    def _value(self, plant, name, time):
+        """The value of an entry of the plant at a time."""
+        value = float(get_value(plant, name))
+        for k, (other, start, end) in enumerate(self.windows):
+            if other == name and start <= time < end:
+                value = value * float(self.factor[k]) + float(self.extra[k])
+        return value
+
+    def _lasts(self, k, clock):
+        """Whether fault k lasts from the first sample to the last one that lasts for dt."""
+        _, start, end = self.windows[k]
+        half = 1e-7 * clock.dt
+        return start <= half and end - half > (clock.samples - 2) * clock.dt
+
+    def _caught_twice(self, what, plant, index, time):
+        """A sentence where more than all that passes a rim is caught."""
+        network: Any = plant
+        spills = network.spills
+        source = spills[index][0]
+        own = [i for i, spill in enumerate(spills) if spill[0] == source]
+        total = sum(self._value(plant, f"caught[{i}]", time) for i in own)
+        if total <= 1.0 + 1e-9:
+            return []
+        return [
+            f"{what}: {total:g} of what passes the rim of tank {source + 1} is then caught: must be"
+            " at most 1"
+        ]
 
     arrays = True
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from jaxtank.core.checks import check_value
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import number
-from jaxtank.core.units import DEFAULT, check_unit
+from jaxtank.core.units import DEFAULT, check_units
 from jaxtank.plants.base import Plant
 from jaxtank.plants.hydraulics import default_gravity, default_threshold
 from jaxtank.plants.tank_network import TankNetwork
@@ -116,8 +116,7 @@ def network(
     >>> rig.tanks, rig.area
     (2, array([15., 15.]))
     """
-    for unit in units:
-        check_unit("plant.units: entry", unit)
+    units = check_units("plant.units", units)
     feeds = tuple((int(a), None if b is None else int(b)) for a, b in feeds)
     links, pipes, spills = (
         tuple((int(a), int(b)) for a, b in pairs) for pairs in (links, pipes, spills)

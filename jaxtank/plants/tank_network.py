@@ -55,30 +55,45 @@ class TankNetwork(Plant):
     [0.857]
     """
 
-    area: np.ndarray = leaf("cm^2", "(n,) cross-section A of each tank", low=0.0, strict=True)
+    area: np.ndarray = leaf(
+        "cm^2", "cross-section A of each tank", low=0.0, strict=True, shape=("tank",)
+    )
     drain: np.ndarray = leaf(
-        "cm^2", "(n,) effective orifice area from each tank to the basin; 0: closed", low=0.0
+        "cm^2",
+        "effective orifice area from each tank to the basin; 0: closed",
+        low=0.0,
+        shape=("tank",),
     )
     orifice: np.ndarray = leaf(
         "cm^2",
-        "(links,) effective area of the orifices between tanks, in the order of `links`",
+        "effective area of the orifices between tanks, in the order of `links`",
         low=0.0,
+        shape=("orifice",),
     )
     pipe: np.ndarray = leaf(
         "cm^2",
-        "(pipes,) effective area of the pipes between tanks, in the order of `pipes`",
+        "effective area of the pipes between tanks, in the order of `pipes`",
         low=0.0,
+        shape=("pipe",),
     )
     pump_gain: np.ndarray = leaf(
-        "cm^3/(s V)", "(m,) flow per unit of each pump's input (Kp)", low=0.0, strict=True
+        "cm^3/(s V)",
+        "flow per unit of each pump's input (Kp)",
+        low=0.0,
+        strict=True,
+        shape=("pump",),
     )
     split: np.ndarray = leaf(
-        "-", "(m,) share of each pump that goes to its first tank", low=0.0, high=1.0
+        "-", "share of each pump that goes to its first tank", low=0.0, high=1.0, shape=("pump",)
     )
     gravity: np.ndarray = leaf("cm/s^2", "acceleration g", low=0.0, strict=True)
-    rim: np.ndarray = leaf("cm", "(n,) height of each tank", low=0.0, strict=True)
+    rim: np.ndarray = leaf("cm", "height of each tank", low=0.0, strict=True, shape=("tank",))
     caught: np.ndarray = leaf(
-        "-", "(spills,) share of what passes a rim that falls into another tank", low=0.0, high=1.0
+        "-",
+        "share of what passes a rim that falls into another tank",
+        low=0.0,
+        high=1.0,
+        shape=("spill",),
     )
     links: tuple = static(doc="((from, to), ...) tanks joined by each orifice")
     pipes: tuple = static(doc="((one, other), ...) tanks joined by each pipe", default=())
@@ -104,7 +119,8 @@ class TankNetwork(Plant):
 
     @property
     def tanks(self) -> int:
-        return np.shape(self.rim)[-1]
+        # a fault of a rim makes a tuple of traced numbers of it
+        return len(self.rim) if isinstance(self.rim, tuple) else np.shape(self.rim)[-1]
 
     @property
     def pumps(self) -> int:

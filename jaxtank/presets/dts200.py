@@ -19,7 +19,7 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants.faults import faults
 from jaxtank.plants.network import network
-from jaxtank.presets.paper import Claim, Preset, Published, verdict
+from jaxtank.presets.paper import Claim, Preset, Published
 from jaxtank.signals.setpoints import ramps
 
 AREA, PIPE, HEIGHT, FLOW = 154.0, 0.5, 62.0, 150.0  # [cm^2], [cm^2], [cm], [cm^3/s]
@@ -140,7 +140,7 @@ def measured(run):
         "linear model, A": tuple(map(float, np.ravel(A))),
         "linear model, B": float(B[0, 0]),
         "rest at the operating point": Claim(
-            verdict(abs(float(own[2]) - POINT[2]) < 0.5),
+            abs(float(own[2]) - POINT[2]) < 0.5,
             f"with tanks 1 and 2 at 45 and 15 cm tank 3 rests at {float(own[2]):.2f} cm, with pumps"
             f" at {float(flows[0]):.1f} and {float(flows[1]):.1f} cm^3/s",
         ),

@@ -18,7 +18,7 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants.rigs import JOHANSSON, johansson
-from jaxtank.presets.paper import Claim, Preset, Published, verdict
+from jaxtank.presets.paper import Claim, Preset, Published
 from jaxtank.signals.setpoints import ramps
 
 VOLTS_PER_CM = 0.5  # kc, Table I: the gains are printed for levels in volts
@@ -76,7 +76,9 @@ def _published():
             f"levels, {phase} phase": Published(levels, "cm", "sec. II", 0.10, _LEVELS),
             f"time constants, {phase} phase": Published(times, "s", "sec. II", 0.05),
             f"zeros, {phase} phase": Published(zeros, "1/s", "sec. III", 0.05),
-            f"relative gain, {phase} phase": Published(gain, "-", "sec. III", 0.01),
+            f"relative gain, {phase} phase": Published(
+                gain, "-", "sec. III", 0.01, closed_form="split1 split2 / (split1 + split2 - 1)"
+            ),
             f"gains K, {phase} phase": Published(K, "V/V", "sec. V"),
             f"integral times, {phase} phase": Published(Ti, "s", "sec. V"),
         }
@@ -187,7 +189,7 @@ def measured(run):
     return {
         **found,
         "the zero's half-plane": Claim(
-            verdict(slowest["minimum"] < 0.0 < slowest["non-minimum"]),
+            (slowest["minimum"] < 0.0, slowest["non-minimum"] > 0.0),
             f"{slowest['minimum']:.3f} 1/s with splits of 0.70 and 0.60,"
             f" {slowest['non-minimum']:+.3f} 1/s with 0.43 and 0.34",
         ),

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtank.case import Case
 from jaxtank.controllers import Laguerre
 from jaxtank.presets.loops.khalid import CLOCK, CONTROLLERS, TUNABLE, build
-from jaxtank.presets.paper import Claim, Preset, Published, verdict
+from jaxtank.presets.paper import Claim, Preset, Published
 from jaxtank.presets.rows import khalid as rows
 
 DEPARTURES = (
@@ -61,11 +61,14 @@ PUBLISHED = {
     "controller.a": Published(0.4, "-", "sec. V.A, Fig. 5"),
     "controller.N": Published(4, "-", "sec. V.A"),
     "a long control horizon improves performance": Published(
-        "required", "", "sec. V.A, Figs. 2-3", reason=_SAME_RW
+        "required",
+        "",
+        "sec. V.A, Figs. 2-3",
+        reason=f"the error falls and the overshoot grows; {_SAME_RW}",
     ),
     "control horizon beyond 10": Published("not much improvement", "", "sec. V.A, Figs. 3-4"),
     "overshoot against control horizon": Published(
-        "not eliminated by any", "", "sec. V.A", reason=_SAME_RW
+        "not eliminated by any", "", "sec. V.A", reason=f"true of 10 and 30, not of 2; {_SAME_RW}"
     ),
     "overshoot of Laguerre against GPC 30": Published(
         "reduced considerably",
@@ -75,7 +78,7 @@ PUBLISHED = {
     ),
     "parameters of Laguerre": Published("4 are enough", "", "sec. V.A"),
     "Laguerre against GPC with two pumps": Published(
-        "outperforms", "", "sec. V.B", reason=_SAME_RW
+        "outperforms", "", "sec. V.B", reason=f"equal, with 8 variables for 20; {_SAME_RW}"
     ),
     **rows.PUBLISHED,
 }
@@ -160,20 +163,19 @@ def _horizon_claims(one, over):
     worst = "; ".join(
         f"Nc {n}: {over[k][0]:.2f} %" for n, k in ((2, "gpc-nc2"), (10, "gpc"), (30, "gpc-nc30"))
     )
-    better = one["gpc"] < one["gpc-nc2"] and over["gpc"][0] > over["gpc-nc2"][0]
-    longer = min(over["gpc"][0], over["gpc-nc30"][0]) > 5.0 > over["gpc-nc2"][0]
     return {
         "a long control horizon improves performance": Claim(
-            "partly" if better else "not reproduced",
-            f"RMS error {one['gpc-nc2']:.2f} mm with Nc 2, {one['gpc']:.2f} mm with Nc 10; the"
-            f" overshoot grows: {worst}",
+            (one["gpc"] < one["gpc-nc2"], over["gpc"][0] <= over["gpc-nc2"][0]),
+            f"RMS error {one['gpc-nc2']:.2f} mm with Nc 2, {one['gpc']:.2f} mm with Nc 10;"
+            f" overshoot {worst}",
         ),
         "control horizon beyond 10": Claim(
-            verdict(one["gpc-nc30"] > 0.95 * one["gpc"]),
+            one["gpc-nc30"] > 0.95 * one["gpc"],
             f"RMS error {one['gpc']:.2f} mm with Nc 10, {one['gpc-nc30']:.2f} mm with Nc 30",
         ),
         "overshoot against control horizon": Claim(
-            "partly" if longer else "not reproduced", f"true of 10 and 30, not of 2: {worst}"
+            [over[k][0] > 1.0 for k in ("gpc-nc2", "gpc", "gpc-nc30")],
+            f"{worst} (counts if above 1 %)",
         ),
     }
 
@@ -187,21 +189,21 @@ def _laguerre_claims(error, over):
 
     gain = 1.0 - over["laguerre"][0] / over["gpc-nc30"][0]
     laguerre, gpc = 1e3 * error["laguerre"][0], 1e3 * error["gpc"][0]
-    apart = max(abs(error["laguerre-mimo"] / error["gpc-mimo"] - 1.0))
+    better = error["laguerre-mimo"] < 0.98 * error["gpc-mimo"]
     return {
         "overshoot of Laguerre against GPC 30": Claim(
-            "partly" if 0.0 < gain < 0.2 else verdict(gain >= 0.2),
+            (gain > 0.0, gain >= 0.2),
             f"{over['laguerre'][0]:.2f} % against {over['gpc-nc30'][0]:.2f} %: {100 * gain:.0f} %"
-            " less at the same r_w",
+            " less at the same r_w (considerable: 20 %)",
         ),
         "parameters of Laguerre": Claim(
-            verdict(abs(laguerre / gpc - 1.0) < 0.05),
+            abs(laguerre / gpc - 1.0) < 0.05,
             f"RMS error {laguerre:.2f} mm with 4 variables, {gpc:.2f} mm with the 10 of GPC",
         ),
         "Laguerre against GPC with two pumps": Claim(
-            "not reproduced" if apart < 0.02 else "partly",
-            f"equal, with 8 variables for 20: RMS errors and overshoots {both('laguerre-mimo')};"
-            f" GPC {both('gpc-mimo')}",
+            better,
+            f"RMS errors and overshoots {both('laguerre-mimo')}; GPC {both('gpc-mimo')} (counts if"
+            " 2 % less)",
         ),
     }
 

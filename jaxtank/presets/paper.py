@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from jaxtank.case import Case, Free
 
 
@@ -23,6 +25,10 @@ class Published(NamedTuple):
     reason : why the measured number differs, or why it cannot be measured
     fitted : the assumption of ours that was chosen to come near this number, which is then no
         evidence for the paper; "" for none
+    closed_form : the formula by which the printed number follows from other printed ones, so that
+        a measured one may equal it; "" for none, and a number that equals it is an input
+    ramp : duration of the setpoint ramps of the runs it is measured in [s], where the paper prints
+        none; None for a paper that does, and for what depends on no ramp
 
     Examples
     --------
@@ -36,33 +42,69 @@ class Published(NamedTuple):
     tolerance: float | None = None
     reason: str = ""
     fitted: str = ""
+    closed_form: str = ""
+    ramp: float | None = None
 
 
-class Claim(NamedTuple):
-    """What was found of a claim in words.
+@dataclasses.dataclass(frozen=True)
+class Claim:
+    """What was measured of a claim in words.
 
-    verdict : "reproduced", "partly" or "not reproduced"
+    holds : whether the claim holds, or one boolean for each part of it: comparisons of what was
+        measured, never constants
     text : the numbers from which the verdict follows
+    by_ramp : {duration of the setpoint ramps [s]: whether it holds with that one}
 
     Examples
     --------
-    >>> Claim("reproduced", "largest error 1e-4 m").verdict
+    >>> Claim(1e-4 < 1e-3, "largest error 1e-4 m").verdict
     'reproduced'
+    >>> Claim((True, False), "0.1 cm in tank 1, 3 cm in tank 2").verdict
+    'partly'
     """
 
-    verdict: str
+    holds: Any
     text: str
+    by_ramp: Mapping[float, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        verdict(self.holds)
+
+    @property
+    def verdict(self) -> str:
+        """ "reproduced", "partly" or "not reproduced"."""
+        return verdict(self.holds)
 
 
-def verdict(holds: bool) -> str:
-    """Return the verdict of a claim that was measured to hold, or not to.
+class Sample(NamedTuple):
+    """Numbers measured in several runs with noise, one row a seed: (seeds, entries)."""
+
+    values: Any
+
+    @property
+    def mean(self) -> tuple:
+        return tuple(np.mean(self.values, axis=0).tolist())
+
+    @property
+    def deviation(self) -> tuple:
+        """Standard deviation of a single run."""
+        return tuple(np.std(self.values, axis=0, ddof=1).tolist())
+
+
+def verdict(holds: Any) -> str:
+    """Return the verdict of a claim whose parts were measured to hold, or not to.
+
+    Raises TypeError for anything but a boolean or several.
 
     Examples
     --------
-    >>> verdict(2 > 1)
-    'reproduced'
+    >>> verdict(2 > 1), verdict([2 > 1, 1 > 2]), verdict([False, False])
+    ('reproduced', 'partly', 'not reproduced')
     """
-    return "reproduced" if holds else "not reproduced"
+    parts = np.ravel(np.asarray(holds))
+    if parts.dtype != bool or not parts.size:
+        raise TypeError(f"a claim holds or not, and so does each of its parts: {holds!r}")
+    return "reproduced" if parts.all() else "partly" if parts.any() else "not reproduced"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -75,9 +117,9 @@ class Preset:
     citation : authors, title, year
     cases : {name: Case}
     published : {parameter or quantity: Published}
-    measured : function of `run` that returns {quantity: number, tuple or Claim} for what can be
-        measured, where run(case name, values={}, save_every=1) gives (Case with `values` set,
-        Trajectory as host arrays)
+    measured : function of `run` that returns {quantity: number, tuple, Sample or Claim} for what
+        can be measured, where run(case name, values={}, save_every=1, seed=0) gives (Case with
+        `values` set, Trajectory as host arrays)
     tunable : {parameter: Free}
     uncertain : {parameter: (spread as a share of it, why)}
     departures : sentences, each on what differs from the paper and why

@@ -3,7 +3,8 @@
 case = "gouta2015/backstepping"
 
 [values]                     # any parameter by its dotted name; controller.model.* and
-                             # observer.model.* follow plant.* unless they are set
+                             # observer.model.* follow plant.* unless they are set, and the
+                             # observer's the controller's
 "controller.k1" = 0.01
 "plant.area" = [21.2, 21.2, 21.2, 21.2]
 "clock.dt" = 0.01
@@ -95,6 +96,7 @@ from jaxtank.rig.values import (
     set_and_schedule,
     set_scenario,
     set_values,
+    with_bottom,
 )
 from jaxtank.rig.warnings import case_warnings, clock_warnings, model_warnings
 from jaxtank.rig.write import complete, dump, save, short
@@ -129,4 +131,5 @@ __all__ = [
     "toml",
     "uncovered",
     "unreachable",
+    "with_bottom",
 ]

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxtank import controllers
-from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.installed import imported, installed
 from jaxtank.core.text import shortened
@@ -18,6 +17,7 @@ from jaxtank.core.toml_schema import NEEDED, Key, Section, type_of
 from jaxtank.core.tree import number
 from jaxtank.core.units import DEFAULT
 from jaxtank.instruments import Actuator, LevelSensor, PumpBank, Sensor
+from jaxtank.loop.steady import steady_state
 from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman, Observer
 from jaxtank.plants.hydraulics import in_unit
 from jaxtank.rig.entry import read_entry, sizes_of
@@ -226,34 +226,40 @@ def _key(cls, field, own, units):
         default = in_unit(FLOORS[field.name], units[0])
     changes = {}
     if field.metadata["kind"] == "leaf":
-        changes["kind"] = "scalar" if type_of(field) is float else "array"
+        changes["kind"] = "array" if field.metadata["shape"] else "scalar"
     doc = field.metadata["doc"].replace("counted from 0", "counted from 1")  # as a file has tanks
     return Key.of(cls, field.name, doc, default=default, **changes)
 
 
-def controller_of(table, plant, levels, initial):
+def controller_of(table, loop, bias=None):
     """Return the controller of a [law] table.
 
     Parameters
     ----------
     table : {key: value} as in the file
-    plant : the rig, which is the controller's model
-    levels : (outputs,) levels of the controlled tanks at t = 0 [cm]
-    initial : (m,) inputs before t = 0 [V], what `bias` is where the rig has no steady state
+    loop : ClosedLoop with any controller, whose plant is the new controller's model
+    bias : (m,) inputs where the table leaves `bias` out; those of `steady_bias` where None
     """
     if isinstance(table, dict) and table.get("kind") == "open-loop":
-        start = ramps(np.asarray(initial).tolist(), [], ramp=0.0)
+        start = ramps(np.asarray(loop.actuator.initial).tolist(), [], ramp=0.0)
         section = section_of("law", "open-loop")
         return controllers.OpenLoop(
-            signal=ramps_of(section, table, start, ("pump", "input"), sizes_of(plant))
+            signal=ramps_of(section, table, start, ("pump", "input"), sizes_of(loop.plant))
         )
-    return component("law", table, plant, {"bias": _steady_input(plant, levels, initial)})
+    bias = steady_bias(loop) if bias is None else bias
+    return component("law", table, loop.plant, {"bias": bias})
 
 
-def observer_of(table, plant, levels, initial):
-    """Return the observer of an [observer] table; as `controller_of`, levels of all tanks."""
-    offered = {"levels": levels, "inputs": initial, "measured": list(range(1, plant.tanks + 1))}
-    return component("observer", table, plant, offered)
+def observer_of(table, loop):
+    """Return the observer of an [observer] table, whose model is that of the loop's controller."""
+    plant, model = loop.plant, getattr(getattr(loop.controller, "law", loop.controller), "model", 0)
+    fits = (getattr(model, "tanks", 0), getattr(model, "pumps", 0)) == (plant.tanks, plant.pumps)
+    offered = {
+        "levels": np.asarray(loop.x0),
+        "inputs": loop.actuator.initial,
+        "measured": list(range(1, plant.tanks + 1)),
+    }
+    return component("observer", table, model if fits else plant, offered)
 
 
 def instrument_of(name, table, loop):
@@ -296,14 +302,23 @@ def component(name, table, plant, offered):
     return role.classes[kind](**values)
 
 
-def _steady_input(plant, levels, initial):
-    """(m,) inputs that hold the outputs where they start; `initial` where none do."""
-    if len(levels) != plant.pumps:
-        return initial
+def steady_bias(loop, known=False):
+    """(m,) inputs that hold the outputs where they start, within the limits of the pumps; those
+    before t = 0 where a file has them (`known`, one per pump), and where none hold.
+    """
+    bank, start = loop.actuator, np.asarray(loop.x0)[list(loop.plant.outputs)]
     try:
-        return number(equilibrium(plant, np.asarray(levels))[1])
+        steady = np.clip(steady_state(loop, start)[1], bank.low, bank.high)
     except (EquilibriumError, InputError, FloatingPointError):
-        return initial
+        return bank.initial
+    return number(np.where(known, bank.initial, steady))
+
+
+def leaves_bias(table):
+    """Whether a [law] table leaves out a `bias` that is then `steady_bias`."""
+    kind = table.get("kind")
+    cls = None if kind in REGISTERED else ROLES["law"].classes.get(kind)
+    return "bias" in getattr(cls, "__dataclass_fields__", ()) and "bias" not in table
 
 
 def kind_of(name, part):

@@ -12,7 +12,7 @@ from jaxtank.core.checks import check_value
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.text import shortened
 from jaxtank.core.toml_schema import NEEDED
-from jaxtank.core.tree import number
+from jaxtank.core.tree import number, sizes_of_shape
 from jaxtank.core.units import DEFAULT
 
 LARGEST = 1e300
@@ -29,6 +29,11 @@ class Sizes(NamedTuple):
     outputs: int = 0
     units: tuple = DEFAULT
     names: Mapping[str, int] = {}
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """{name in the shape of a leaf: count}."""
+        return {"tank": self.tanks, "pump": self.pumps, "output": self.outputs}
 
 
 def sizes_of(plant, names: Mapping[str, int] = {}) -> Sizes:
@@ -150,10 +155,10 @@ def _texts(key, label, value, sizes):
 
 
 def _list(key, label, value, sizes):
-    size = size_of(key.doc, sizes)
-    if not (is_finite(value) and np.shape(value) == (size,)):
-        per = {"(n,": ", one per tank", "(m,": ", one per pump"}.get(key.doc[:3], "")
-        numbers = f"{size} finite numbers{unit(key.meta(sizes.units))}{per}"
+    wanted = sizes_of_shape(key.shape, sizes.counts)
+    if not (is_finite(value) and np.shape(value) == wanted):
+        (size,) = wanted
+        numbers = f"{size} finite numbers{unit(key.meta(sizes.units))}, one per {key.shape[0]}"
         raise InputError(f"{label} = {shortened(value)}: must be a list of {numbers}")
     return number(value)
 
@@ -163,8 +168,8 @@ def _array(key, label, value, sizes):
     if not is_numeric(value):
         numbers = f"a number or a list of numbers{unit(key.meta(sizes.units))}"
         raise InputError(f"{label} = {shortened(value)}: must be {numbers}")
-    array, size = number(value), size_of(key.doc, sizes)
-    return np.full(size, array) if size is not None and array.ndim == 0 else array
+    array, wanted = number(value), sizes_of_shape(key.shape, sizes.counts) or ()
+    return np.full(wanted, array) if len(wanted) == 1 and array.ndim == 0 else array
 
 
 def _scalar(key, label, value, sizes):
@@ -254,18 +259,6 @@ WRITTEN = {
     "feed": lambda pair: pair[0] + 1 if pair[1] is None else _numbers(pair),
 }
 """{kind: function of a value} that writes it as a rig file has it, where that is different."""
-
-SHAPES = ("(m,", "(n,", "(outputs,", "(pumps,", "(2,", "(tanks + outputs,")
-
-
-def size_of(doc, sizes):
-    """Number of entries of an array that has one per pump, tank or output, by the shape that its
-    description begins with; None of another.
-    """
-    n, m, outputs = sizes.tanks, sizes.pumps, sizes.outputs
-    counts = dict(zip(SHAPES, (m, n, outputs, m, 2, n + outputs)))
-    shape = doc.split(")")[0]
-    return next((size for start, size in counts.items() if shape.startswith(start)), None)
 
 
 def name_of(where, value):

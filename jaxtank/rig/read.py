@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from jaxtank import presets
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError, unknown
@@ -17,7 +15,14 @@ from jaxtank.core.text import shortened
 from jaxtank.rig import components, network, signals, validation
 from jaxtank.rig.entry import Sizes, read_entry, read_value, sizes_of
 from jaxtank.rig.schema import SECTIONS, TANKWISE
-from jaxtank.rig.values import by_dotted_name, has, set_and_schedule, with_models
+from jaxtank.rig.values import (
+    by_dotted_name,
+    has,
+    set_and_schedule,
+    set_values,
+    with_bottom,
+    with_models,
+)
 
 MOST = 100
 """Parts of a dotted key; the names of a rig have four."""
@@ -191,10 +196,13 @@ def from_table(table: Mapping[str, Any]) -> Case:
     named = {key: by_dotted_name(table[key], key) for key in dotted if key in table}
     table = {**table, **named}
     values = with_models(case.loop, table.get("values", {}))
+    case, values = _with_bias(case, values, table)
     case = set_and_schedule(case, values, table.get("schedule", {}))
     for name, read in TUNING.items():
         if name in table:
             case = case.replace(**{FIELDS.get(name, name): read(case, table[name])})
+    if "bottom" not in table.get("plant", {}) and "plant.bottom" not in values:
+        case = with_bottom(case)
     return filtered(validation.check(case))
 
 
@@ -249,6 +257,31 @@ FIELDS = {"scenario": "scenarios", "safety_filter": "safety"}
 """{section: field of Case}, where it has another name."""
 
 
+def _check_twice(table):
+    """Raise InputError for numbers of tanks and pumps that their own tables and the section of what
+    they belong to, [disturbance], [sensor] or [actuator], give differently; all at once.
+    """
+    wrong = []
+    for name in ("tank", "pump"):
+        entries = table.get(name, [])
+        for key in SECTIONS[name].keys:
+            section, _, field = key.target.partition(".")
+            field = "inflow" if section == "disturbance" else field
+            if field not in table.get(section, {}):
+                continue
+            whole = table[section][field]
+            each = isinstance(whole, list) and len(whole) == len(entries)
+            for i, entry in enumerate(entries):
+                other = whole[i] if each else whole
+                if key.name in entry and entry[key.name] != other:
+                    wrong.append(
+                        f"{name} {i + 1}: {key.name} = {shortened(entry[key.name])}, and"
+                        f" [{section}] {field} has {shortened(other)} for it: give one of them"
+                    )
+    if wrong:
+        raise InputError("; ".join(wrong))
+
+
 def start_of(table):
     """Return the Case of the tables that build: case or tanks, controller, observer,
     instruments, reference, disturbance and faults; before any value is set.
@@ -258,6 +291,7 @@ def start_of(table):
         _with_parts(presets.find(table["case"]), table) if "case" in table else network.build(table)
     )
     loop, changed = case.loop, {}
+    _check_twice(table)
     for name in ("sensor", "actuator"):
         if name in table:
             changed[name] = components.instrument_of(name, table[name], loop)
@@ -317,21 +351,35 @@ def _with_parts(case, table):
     """A case with the controller or observer of a table in the place of its own. What its own
     could be tuned by goes with a controller.
     """
-    loop, changed = case.loop, {}
-    levels, initial = np.asarray(loop.x0), loop.actuator.initial
+    loop, changed = case.loop, []
     if "law" in table:
-        start = [float(levels[i]) for i in loop.plant.outputs]
-        changed["controller"] = components.controller_of(table["law"], loop.plant, start, initial)
-        if type(changed["controller"]) is not type(loop.controller):
+        controller = components.controller_of(table["law"], loop, loop.actuator.initial)
+        if type(controller) is not type(loop.controller):
             case = case.replace(symmetry=None)
+        loop = dataclasses.replace(loop, controller=controller)
+        changed.append("controller.")
     if "observer" in table:
-        changed["observer"] = components.observer_of(table["observer"], loop.plant, levels, initial)
-    if not changed:
-        return case
-    prefix = tuple(f"{name}." for name in changed)
-    free = {
-        n: f
-        for n, f in case.free.items()
-        if not n.startswith(prefix) or has(dataclasses.replace(loop, **changed), n)
-    }
-    return case.replace(loop=dataclasses.replace(loop, **changed), free=free)
+        observer = components.observer_of(table["observer"], loop)
+        loop = dataclasses.replace(loop, observer=observer)
+        changed.append("observer.")
+    kept = lambda name: not name.startswith(tuple(changed)) or has(loop, name)
+    return case.replace(loop=loop, free={n: f for n, f in case.free.items() if kept(n)})
+
+
+def _with_bias(case, values, table):
+    """(case with the bias that its [law] leaves out, the values that are still to be set): after
+    those that the steady state depends on.
+    """
+    law = table.get("law", {})
+    if not components.leaves_bias(law) or any(n.startswith("controller.bias") for n in values):
+        return case, values
+    parts = ("plant.", "actuator.", "disturbance.", "x0")
+    case = set_values(case, {n: v for n, v in values.items() if n.startswith(parts)})
+    name, pumps = "actuator.initial", table.get("pump", [{}] * case.loop.plant.pumps)
+    whole = "initial" in table.get("actuator", {}) or name in values
+    known = [whole or "initial" in pump or f"{name}[{j}]" in values for j, pump in enumerate(pumps)]
+    bias = components.steady_bias(case.loop, known)
+    controller = dataclasses.replace(case.loop.controller, bias=bias)
+    loop = dataclasses.replace(case.loop, controller=controller)
+    later = {n: v for n, v in values.items() if not n.startswith(parts)}
+    return case.replace(loop=loop), later

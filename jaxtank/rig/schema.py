@@ -92,20 +92,26 @@ FILTER = "time constant of a first-order filter behind the ramps of each; 0: non
 COURSE = tuple(Key.of(Ramps, name, default=None) for name in ("ramp", "shape"))
 OPEN_LOOP = (
     KIND,
-    _optional("initial", "(m,) input of each pump before the first change", "list", "V"),
+    _optional(
+        "initial", "input of each pump before the first change", "list", "V", shape=("pump",)
+    ),
     _optional("changes", "[time in s, pump from 1, input] of each change", "any", "V"),
     *COURSE,
-    Key.of(Ramps, "filter", f"(m,) {FILTER}", kind="array", default=None),
+    Key.of(Ramps, "filter", FILTER, kind="array", default=None, shape=("pump",)),
 )
 """[law] of kind "open-loop"; of other kinds the keys are the fields of the class."""
 REFERENCE = (
     _optional(
-        "initial", "(outputs,) setpoint of each output before the first change", "list", "cm"
+        "initial",
+        "setpoint of each output before the first change",
+        "list",
+        "cm",
+        shape=("output",),
     ),
     _optional("changes", "[time in s, output from 1, setpoint] of each change", "any", "cm"),
     *COURSE,
     Key.of(Ramps, "band", default=None),
-    Key.of(Ramps, "filter", f"(outputs,) {FILTER}", kind="array", default=None),
+    Key.of(Ramps, "filter", FILTER, kind="array", default=None, shape=("output",)),
     _optional("sine", "a sine on top: [reference.sine]; {}: none", "table"),
 )
 SINE = (
@@ -120,9 +126,10 @@ SINE = (
 DISTURBANCE = (
     _optional(
         "inflow",
-        "(n,) steady inflow of each tank that no pump brings; negative: a leak",
+        "steady inflow of each tank that no pump brings; negative: a leak",
         "list",
         "cm^3/s",
+        shape=("tank",),
     ),
     Key.of(InflowPulses, "window", default=None),
 )
@@ -151,22 +158,25 @@ COVARIANCE = (
 SAFETY_FILTER = (
     _optional(
         "limit",
-        "(n,) level that each tank may not pass; left out: [limits] max_level, else its rim",
+        "level that each tank may not pass; left out: [limits] max_level, else its rim",
         "list",
         "cm",
+        shape=("tank",),
     ),
     _optional(
         "low",
-        "(n,) level below which no tank may fall, 0: none; left out: [limits] min_level, else none",
+        "level below which no tank may fall, 0: none; left out: [limits] min_level, else none",
         "list",
         "cm",
+        shape=("tank",),
     ),
     _optional(
         "band",
-        "(n,) largest difference of reading and level; left out: 6 standard deviations of the"
+        "largest difference of reading and level; left out: 6 standard deviations of the"
         " noise, half an ADC step and the offset",
         "list",
         "cm",
+        shape=("tank",),
     ),
     _optional(
         "rate", "how fast a level may approach its limit (kappa)", unit="1/s", low=0.0, strict=True

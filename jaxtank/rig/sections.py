@@ -25,7 +25,10 @@ from jaxtank.signals.base import Sum
 PARTS = {
     "plant": "plant: the rig as it is",
     "sensor": "sensor: how levels are measured",
-    "observer": "observer: estimated levels; observer.model.* follows plant.* unless it is set",
+    "observer": (
+        "observer: estimated levels; observer.model.* follows controller.model.*, else plant.*,"
+        " unless it is set"
+    ),
     "controller": (
         "controller; controller.model.* follows plant.* unless it is set, for a wrong model"
     ),
@@ -207,8 +210,8 @@ def _line(case, name, value, meta, built, base):
         if name.startswith("controller.") and schedule.table_of(case.loop):
             return None
         return Line(toml(name), template.absent(case.loop, name, meta), meta, False)
-    follows = _followed(case.loop.plant, name)
-    if follows is not None:  # the plant's value in the file, unless it is written
+    follows = _followed(case.loop, name)
+    if follows is not None:  # that value in the file, unless it is written
         return Line(toml(name), value, meta, follows != toml(value))
     if built and _text_of(base.loop, name) == toml(value):
         return None
@@ -222,11 +225,16 @@ def _text_of(tree, name):
     return None if tree is None else toml(np.asarray(tree).tolist())
 
 
-def _followed(plant, name):
-    """The plant's value, as in a file, that `name` of a model follows; None of another name."""
+def _followed(loop, name):
+    """The value, as in a file, that `name` of a model follows: of the observer's that of the
+    controller's, else the plant's; None of another name.
+    """
     for model in MODELS:
         if name.startswith(model):
-            return _text_of(plant, name.removeprefix(model))
+            inner = name.removeprefix(model)
+            owners = ("plant.",) if model != MODELS[-1] else (*MODELS[:-1], "plant.")
+            texts = (_text_of(loop, owner + inner) for owner in owners)
+            return next((text for text in texts if text is not None), None)
     return None
 
 

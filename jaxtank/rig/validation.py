@@ -9,7 +9,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Case, Free, Scenario
 from jaxtank.core.checks import check_value
 from jaxtank.core.clock import CLOCK_UNITS
@@ -18,6 +17,7 @@ from jaxtank.core.text import shortened
 from jaxtank.core.tree import describe, get_value, split_index
 from jaxtank.loop import run
 from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.loop.steady import steady_state
 from jaxtank.measures import MEASURES, check_names, entries
 from jaxtank.measures import unit as measure_unit
 from jaxtank.rig import schedule
@@ -80,7 +80,7 @@ def unreachable(case: Case) -> str | None:
     if isinstance(reference, Ramps) and plant.pumps == len(plant.outputs):
         for values in reference.plateaus(case.clock.duration):
             try:
-                equilibrium(plant, values)
+                steady_state(case.loop, values)
             except EquilibriumError as error:
                 return f"reference: {error}"
     return None

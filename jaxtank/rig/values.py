@@ -10,14 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Case
 from jaxtank.core.checks import check_value
 from jaxtank.core.clock import CLOCK_UNITS, check_clock
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.text import shortened
-from jaxtank.core.tree import describe, get_value, split_index, walk, with_values
+from jaxtank.core.tree import describe, get_value, parameters, split_index, walk, with_values
 from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.loop.floor import draws
+from jaxtank.loop.steady import steady_state
+from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig import schedule
 from jaxtank.rig.entry import is_numeric, plain, static_value, unit
 
@@ -96,13 +98,15 @@ def set_values(case: Case, values: Mapping[str, Any]) -> Case:
             )
         schedule.check_not_scheduled(case.loop, name)
         loop = with_values(case.loop, {name: value})
-        check_value(name, get_value(loop, name), meta)
+        if parameters(loop).get(split_index(name)[0]) is not None:  # an infinite Ti is none
+            check_value(name, get_value(loop, name), meta)
         case = case.replace(loop=loop)
     return case
 
 
 def with_models(loop, values):
-    """Return `values` with the plant's parameters among them for the models that hold them too.
+    """Return `values` with the plant's parameters among them for the models that hold them too, and
+    those of the controller's model for that of the observer.
 
     Parameters
     ----------
@@ -111,14 +115,13 @@ def with_models(loop, values):
     """
     names = {name for kind in ("leaf", "static") for name, _, _ in walk(loop, kind=kind)}
     found = {}
-    for name, value in values.items():
-        inner = name.removeprefix("plant.")
-        if inner == name:
-            continue
-        for model in MODELS:
-            base = (model + inner).split("[")[0]
-            if base in names and base not in values:
-                found[model + inner] = value
+    for owner, models in (("plant.", MODELS), *((model, MODELS[-1:]) for model in MODELS[:-1])):
+        for name, value in values.items():
+            inner = name.removeprefix(owner)
+            for model in models if inner != name else ():
+                base = (model + inner).split("[")[0]
+                if base in names and base not in values:
+                    found[model + inner] = value
     plants = {name: value for name, value in values.items() if name.startswith("plant.")}
     return {**plants, **{n: v for n, v in found.items() if n not in values}, **values}
 
@@ -152,7 +155,7 @@ def set_scenario(case: Case, values: Mapping[str, Any]) -> Case:
         short = dataclasses.replace(here.clock, duration=here.clock.dt)
         setpoints = [float(np.asarray(v)[0]) for v in here.loop.reference.sample(short)[0]]
         try:
-            levels, inputs = equilibrium(case.loop.plant, setpoints)
+            levels, inputs = steady_state(here.loop, setpoints, case.loop.plant)
         except EquilibriumError as error:
             raise EquilibriumError(f'{steady[0]} = "steady": {error}') from None
         known: dict[str, Any] = dict(zip(STEADY, (levels.tolist(), inputs.tolist(), setpoints)))
@@ -298,6 +301,34 @@ def set_and_schedule(case: Case, values: Mapping[str, Any], table: Mapping[str, 
         before, values = schedule.known(case.loop, values)
         case = schedule.from_table(set_values(case, before), table)
     return set_values(case, values)
+
+
+def with_bottom(case: Case) -> Case:
+    """Return the case with `plant.bottom` where liquid can be drawn out of its tanks, in its own
+    run or in a scenario: no level then falls below 0. Models of the plant follow.
+
+    Examples
+    --------
+    >>> from jaxtank import presets, rig
+    >>> case = rig.set_values(presets.find("gouta2015/ngpc"), {"actuator.low": -1.0})
+    >>> case.loop.plant.bottom, rig.with_bottom(case).loop.plant.bottom
+    (False, True)
+    """
+    plant: Any = case.loop.plant
+    if not isinstance(plant, TankNetwork) or plant.bottom or not _draws(case):
+        return case
+    return set_values(case, with_models(case.loop, {"plant.bottom": True}))
+
+
+def _draws(case):
+    """Whether liquid can be drawn out in the case's own run, or in a scenario."""
+    drawing = ("actuator.", "disturbance.")
+    for s in case.scenarios:
+        own = {name: value for name, value in s.values.items() if name.startswith(drawing)}
+        steady = any(_is_steady(name, value) for name, value in own.items())
+        if own and not steady and draws(set_scenario(case, own).loop):
+            return True
+    return draws(case.loop)
 
 
 def has(loop: ClosedLoop, name: str) -> bool:

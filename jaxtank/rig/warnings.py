@@ -10,17 +10,21 @@ from jaxtank.case import Case
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import get_value, is_component, split_index, walk
 from jaxtank.loop.disturbance_use import is_unused
+from jaxtank.loop.floor import is_open
+from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.signals import steps
+from jaxtank.signals.courses import index
 from jaxtank.signals.inflows import InflowPulses
+from jaxtank.signals.setpoints import Sine
 
 
 def case_warnings(case: Case) -> list[str]:
     """Return sentences on what of a case is hardly meant.
 
-    A run that does not end at a sample, changes and inflow pulses after its end, changes that
-    overlap, levels and setpoints above a rim, pumps that start outside their limits, models that
-    differ from the plant, estimates of disturbances that the controller does not use. (Steps that
-    are too long: `loop.step_size`.)
+    A run that does not end at a sample, changes, inflow pulses and faults after its end, changes
+    that overlap, what no sample sees, levels and setpoints above a rim, pumps that start outside
+    their limits, levels that may fall below 0, models that differ from the plant, estimates of
+    disturbances that the controller does not use. (Steps that are too long: `loop.step_size`.)
 
     Parameters
     ----------
@@ -41,8 +45,10 @@ def case_warnings(case: Case) -> list[str]:
         *clock_warnings(case.clock),
         *_late(case),
         *_overlapping(case),
+        *_unseen(case),
         *_above_rims(case),
         *_pumps(case),
+        *_open_bottoms(case),
         *model_warnings(case),
         *_unused(case),
     ]
@@ -84,7 +90,10 @@ def _late(case):
     )
     changes = () if reference is None else reference.changes
     pulses = disturbance.events if isinstance(disturbance, InflowPulses) else ()
-    for name, events in (("changes of the reference", changes), ("inflow pulses", pulses)):
+    faults = () if case.loop.faults is None else case.loop.faults.windows
+    faults = tuple((start, of) for of, start, _ in faults)
+    kinds = {"changes of the reference": changes, "changes of the inputs": _of_inputs(case)}
+    for name, events in {**kinds, "inflow pulses": pulses, "faults": faults}.items():
         late = sum(time >= end for time, *_ in events)
         if late:
             yield f"{late} of {len(events)} {name} come after the end of the run at {end:g} s"
@@ -106,6 +115,59 @@ def _overlapping(case):
             f" before is over (ramp {reference.ramp:g} s), the first of output {early[0][0] + 1} at"
             f" {early[0][1]:g} s: each starts from where that one has got to"
         )
+
+
+def _of_inputs(case):
+    """The changes of the inputs of an open loop."""
+    signal = steps(getattr(case.loop.controller, "signal", None))
+    return () if signal is None else signal.changes
+
+
+def _unseen(case):
+    """On what happens between samples: faults, a sine and pulses' windows that hold none, and
+    changes that another one follows before the next sample.
+    """
+    loop, clock = case.loop, case.clock
+    between = f"no sample, every {clock.dt:g} s, lies in it: it has no effect"
+    if loop.faults is not None:
+        for k in loop.faults.unseen(clock):
+            of, start, end = loop.faults.windows[k]
+            if start < clock.duration:
+                yield f"fault {k + 1} of {of} from {start:g} s to {end:g} s: {between}"
+        for k, (of, *_) in enumerate(loop.faults.windows):
+            if of.startswith(("rim[", "caught[")) and not loop.plant.overflow:
+                yield f"fault {k + 1} of {of}: rims are limits here: it has no effect"
+    sine = getattr(loop.reference, "second", None)
+    if isinstance(sine, Sine) and not _holds_sample(sine.start, sine.end, clock):
+        yield f"reference.sine from {sine.start:g} s to {sine.end:g} s: {between}"
+    if isinstance(loop.disturbance, InflowPulses):
+        window = loop.disturbance.window
+        for time in loop.disturbance.onset:
+            if time < clock.duration and not _holds_sample(time, time + window, clock):
+                yield f"disturbance.window = {window:g} s after the pulse at {time:g} s: {between}"
+    for name, signal in (("reference", loop.reference), ("inputs", loop.controller)):
+        yield from _replaced(name, steps(getattr(signal, "signal", signal)), clock)
+
+
+def _holds_sample(start, end, clock):
+    """Whether a sample of the run is at or after `start` [s] and before `end` [s]."""
+    first = index(start, clock)
+    return first * clock.dt < end - 1e-7 * clock.dt and first < clock.samples
+
+
+def _replaced(name, signal, clock):
+    """On changes of a channel that another one follows before the next sample."""
+    if signal is None or float(signal.ramp) > 0.0:
+        return
+    before = {}
+    for time, channel in signal.changes:
+        last = before.get(channel)
+        if last is not None and index(last, clock) == index(time, clock):
+            yield (
+                f"{name}: the change of {channel + 1} at {last:g} s is followed by another one at"
+                f" {time:g} s before the next sample, every {clock.dt:g} s: it has no effect"
+            )
+        before[channel] = time
 
 
 def _above_rims(case):
@@ -148,6 +210,15 @@ def _pumps(case):
                 f"pump {j + 1} runs at {volts:g} {drive} before t = 0, outside its limits of"
                 f" {low:g} and {high:g} {drive}"
             )
+
+
+def _open_bottoms(case):
+    """On tanks without a bottom out of which liquid can be drawn."""
+    if isinstance(case.loop.plant, TankNetwork) and is_open(case.loop):
+        yield (
+            "plant.bottom = false, and liquid can be drawn out (an inflow or a pump below 0):"
+            " levels may fall below 0; true stops them there"
+        )
 
 
 def _unused(case):

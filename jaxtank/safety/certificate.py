@@ -16,8 +16,10 @@ from numpy.typing import ArrayLike
 from jaxtank.core.errors import InputError
 from jaxtank.instruments.base import Actuator
 from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.plants.faults import Faults
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.safety.box import band_of, box_of, interval, narrow_band, spread, top_of, uncovered
+from jaxtank.safety.checker import check
 from jaxtank.safety.conditions import gap_of, settle, spills, steepest, theorem_of
 from jaxtank.safety.filter import SafetyFilter
 from jaxtank.safety.limits import filled_levels, limits_for
@@ -42,12 +44,14 @@ BELOW_BOUND = 0.9
 class TankCertificate:
     """Whether the limit of one tank is proved, and by what.
 
-    tank : counted from 0.  limit : H [cm].  certified : True if no plant of the box passes it.
-    reason : the condition that failed with both of its numbers, or the theorem.  rate, rate_bound :
-    kappa and the largest that is proved [1/s].  gap : how far below the limit the nominal plant
-    rests with its pumps full [cm], nan where they cannot reach it.  reach : what the level never
-    passes [cm]; inf if unknown.  low : low limit [cm], 0 for none.  low_certified, low_reason : of
-    the low limit, as above.
+    tank : counted from 0.  limit : H [cm].  certified : True if no plant of the box passes it: the
+    conditions of the design hold, and those of `checker.check`.  starts : the levels at t = 0 for
+    which that holds (`checker.ANY` or `checker.OWN`), "" where it is not proved.  reason : the
+    theorem, or the condition that failed with both of its numbers, or "not covered: FEATURE".
+    rate, rate_bound : kappa and the largest that is proved [1/s].  gap : how far below the limit
+    the nominal plant rests with its pumps full [cm], nan where they cannot reach it.  reach : what
+    the level never passes [cm]; inf if unknown.  low : low limit [cm], 0 for none.  low_certified,
+    low_reason : of the low limit, as above.
     """
 
     tank: int
@@ -61,6 +65,7 @@ class TankCertificate:
     low: float = 0.0
     low_certified: bool = False
     low_reason: str = ""
+    starts: str = ""
 
 
 def rate_bound(hold: float, delay: float = 0.0, lag: float = 0.0) -> float:
@@ -101,6 +106,7 @@ def design(
     draw: ArrayLike = 0.0,
     drawn: bool = False,
     predict: bool = True,
+    faults: Faults | None = None,
 ) -> tuple[SafetyFilter, tuple[TankCertificate, ...]]:
     """Return a safety filter for a rig, and the certificate of each tank.
 
@@ -127,6 +133,7 @@ def design(
     drawn : whether volumes may leave besides, at any time (no low limit is then proved)
     predict : predict levels over the inputs under way where the dead time is longer than a hold,
         and the rig has no pipes, lag, dead zone or volumes that enter besides
+    faults : of the case: nothing is proved where they leave the box
 
     Raises
     ------
@@ -175,7 +182,7 @@ def design(
     nominal = _rates(plant, plant, inflow + falls, 0.0, None)
     narrow = narrow_band(sensor, band, plant.units[0], widths)
     rows = [_row(setting, nominal, found, i, wanted, kappa, bound, narrow[i]) for i in range(n)]
-    return SafetyFilter(
+    guard = SafetyFilter(
         least=least,
         most=most,
         offset=np.broadcast_to(dead, (actuator.pumps,)),
@@ -188,7 +195,59 @@ def design(
         running=tuple(int(j) for j in np.flatnonzero(setting.low > 0.0)),
         **_upper(setting, found),
         **_lower(setting, low, bottom),
-    ), tuple(_completed(row, low[row.tank], why[row.tank], plant.units[0]) for row in rows)
+    )
+    rows = [_completed(row, low[row.tank], why[row.tank]) for row in rows]
+    verdicts = check(
+        guard,
+        plant,
+        actuator,
+        sensor,
+        hold=hold,
+        substeps=substeps,
+        box=_intervals(widths, {"plant": plant, "actuator": actuator, "sensor": sensor})
+        | ({} if start is None else {"x0": (begin, start)}),
+        inflow=(draw, inflow),
+        volume=volume,
+        drawn=drawn,
+        start=start,
+        faults=faults,
+        limits=[row.limit for row in rows],
+    )
+    return guard, tuple(_checked(*pair, plant.units[0]) for pair in zip(rows, verdicts))
+
+
+def _intervals(widths, parts):
+    """{dotted name: (lower, upper)} of `widths`; those of levels at t = 0 are in the start."""
+    found = {}
+    for name, width in widths.items():
+        name = name if "." in name or name.startswith("x0") else f"plant.{name}"
+        part, _, rest = name.partition(".")
+        if part not in parts:
+            if not name.startswith("x0"):
+                found[name] = (0.0, 0.0)
+            continue
+        field, _, entry = rest.partition("[")
+        value = getattr(parts[part], field, 0.0)
+        value = np.asarray(0.0 if value is None else value, dtype=float)
+        value = value[int(entry[:-1])] if entry else value
+        found[name] = (value - np.asarray(width), value + np.asarray(width))
+    return found
+
+
+def _checked(row, verdict, length):
+    """A TankCertificate with the verdict of the checker: a limit is proved where design and checker
+    agree. Reasons in the rig's unit of length.
+    """
+    own = lambda text: re.sub(r"\bcm\b", length, text)
+    proved, low_proved = row.certified and verdict.holds, row.low_certified and verdict.low_holds
+    return dataclasses.replace(
+        row,
+        certified=proved,
+        reason=own(verdict.reason if row.certified else row.reason),
+        starts=verdict.starts if proved else "",
+        low_certified=low_proved,
+        low_reason=own(verdict.low_reason if row.low_certified else row.low_reason),
+    )
 
 
 def _rates(least, most, inflow, step, draw):
@@ -349,17 +408,13 @@ def _row(setting, nominal, found, tank, wanted, kappa, bound, narrow):
     )
 
 
-def _completed(row, low, why, length):
-    """A TankCertificate with its low limit [cm] and why that is not proved; reasons in the rig's
-    unit of length.
-    """
-    own = lambda text: re.sub(r"\bcm\b", length, text)
+def _completed(row, low, why):
+    """A TankCertificate with its low limit [cm] and why that is not proved."""
     return dataclasses.replace(
         row,
-        reason=own(row.reason),
         low=float(low),
         low_certified=bool(low > 0.0 and not why),
-        low_reason=own(why) or ("Low limits" if low > 0.0 else ""),
+        low_reason=why or ("Low limits" if low > 0.0 else ""),
     )
 
 

@@ -44,49 +44,65 @@ class SafetyFilter:
 
     least: TankNetwork
     most: TankNetwork
-    limit: np.ndarray = leaf("cm", "(n,) level that no tank may pass", low=0.0, strict=True)
-    reach: np.ndarray = leaf("cm", "(n,) level that no tank passes for certain", low=0.0)
-    rate: np.ndarray = leaf(
-        "1/s", "(n,) how fast a level may approach its limit (kappa)", low=0.0, strict=True
+    limit: np.ndarray = leaf(
+        "cm", "level that no tank may pass", low=0.0, strict=True, shape=("tank",)
     )
-    band: np.ndarray = leaf("cm", "(n,) largest difference of reading and level", low=0.0)
-    inflow: np.ndarray = leaf("cm^3/s", "(n,) largest inflow disturbance", low=0.0)
+    reach: np.ndarray = leaf(
+        "cm", "level that no tank passes for certain", low=0.0, shape=("tank",)
+    )
+    rate: np.ndarray = leaf(
+        "1/s",
+        "how fast a level may approach its limit (kappa)",
+        low=0.0,
+        strict=True,
+        shape=("tank",),
+    )
+    band: np.ndarray = leaf(
+        "cm", "largest difference of reading and level", low=0.0, shape=("tank",)
+    )
+    inflow: np.ndarray = leaf("cm^3/s", "largest inflow disturbance", low=0.0, shape=("tank",))
     slope: np.ndarray = leaf(
         "1/s",
-        "(n,) k1 of a tank that is held by the pumps above it; 0: by its own",
+        "k1 of a tank that is held by the pumps above it; 0: by its own",
         low=0.0,
         default=lambda own: np.zeros(np.shape(own["limit"])),
+        shape=("tank",),
     )
     spare: np.ndarray = leaf(
         "cm",
-        "(n,) rise by volumes that may enter besides, in all",
+        "rise by volumes that may enter besides, in all",
         low=0.0,
         default=lambda own: np.zeros(np.shape(own["limit"])),
+        shape=("tank",),
     )
     age: np.ndarray | float = leaf(
         "s", "age of a reading when the input computed from it begins to act", low=0.0, default=0.0
     )
     offset: np.ndarray = leaf(
         "V",
-        "(m,) least input that moves liquid, of pumps with an offset dead zone",
+        "least input that moves liquid, of pumps with an offset dead zone",
         default=lambda own: np.zeros(own["least"].pumps),
+        shape=("pump",),
     )
     low: np.ndarray = leaf(
         "cm",
-        "(n,) level below which no tank may fall; 0: none",
+        "level below which no tank may fall; 0: none",
         low=0.0,
         default=lambda own: np.zeros(np.shape(own["limit"])),
+        shape=("tank",),
     )
     bottom: np.ndarray = leaf(
         "cm",
-        "(n,) level below which no tank falls for certain",
+        "level below which no tank falls for certain",
         low=0.0,
         default=lambda own: np.zeros(np.shape(own["limit"])),
+        shape=("tank",),
     )
     draw: np.ndarray = leaf(
         "cm^3/s",
-        "(n,) least inflow disturbance, 0 or negative",
+        "least inflow disturbance, 0 or negative",
         default=lambda own: np.zeros(np.shape(own["limit"])),
+        shape=("tank",),
     )
     held: tuple = static(doc="tanks whose limits are kept, counted from 0")
     kept: tuple = static(doc="tanks whose low limits are kept, counted from 0", default=())

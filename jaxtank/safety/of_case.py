@@ -92,6 +92,7 @@ def design_for(
         draw=draw * more,
         drawn=drawn,
         predict=predict,
+        faults=loop.faults,
     )
 
 
@@ -159,3 +160,24 @@ def _withdrawn(loop, clock):
         return none, bool(np.any(np.asarray(loop.disturbance.volume) < 0.0))
     flows = loop.disturbance.sample(clock)[0]
     return np.array([min(float(np.min(flow)), 0.0) for flow in flows]), False
+
+
+def beyond(case: Any) -> list[str]:
+    """Return the names of [uncertain] whose intervals are wider than those in the settings of the
+    case's safety filter, which take their place.
+    """
+    guard = case.loop.safety_filter
+    if guard is None or "widths" not in (case.safety or {}):
+        return []
+    found = []
+    for name in (name for name in case.uncertain if name.startswith("plant.")):
+        field, _, entry = name.removeprefix("plant.").partition("[")
+        at = int(entry[:-1]) if entry else ...
+        own, least, most = (
+            np.asarray(getattr(plant, field), dtype=float)[at]
+            for plant in (case.loop.plant, guard.least, guard.most)
+        )
+        half = case.uncertain[name] * own * (1.0 - 1e-9)
+        if np.any(own - half < least) or np.any(own + half > most):
+            found.append(name)
+    return found

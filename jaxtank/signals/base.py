@@ -107,8 +107,8 @@ class Constant(Signal):
 
     level: np.ndarray = leaf(
         "-",
-        "(channels,) value, in the unit of what it stands for: a level of a setpoint, a flow of a"
-        " disturbance",
+        "value, in the unit of what it stands for: a level of a setpoint, a flow of a disturbance",
+        shape=("channel",),
     )
 
     @property
@@ -147,7 +147,7 @@ class Table(Signal):
     """
 
     values: np.ndarray = leaf(
-        "-", "(channels, samples) recorded values, in the unit of what they stand for"
+        "-", "recorded values, in the unit of what they stand for", shape=("channel", "sample")
     )
     period: float = static("s", "time between samples", low=0.0, strict=True)
     between: str = static(doc="what is between samples", choices=("hold", "linear"), default="hold")

@@ -31,7 +31,9 @@ class InflowPulses(Signal):
     [0.0, 25.0, 25.0, 0.0, 0.0]
     """
 
-    volume: np.ndarray = leaf("cm^3", "(pulses,) volume of each inflow pulse; negative: taken out")
+    volume: np.ndarray = leaf(
+        "cm^3", "volume of each inflow pulse; negative: taken out", shape=("pulse",)
+    )
     events: tuple = static(doc="((time [s], duration [s], tank), ...) one per inflow pulse")
     width: int = static("-", "number of tanks", low=1, high=5000)
     window: float = static(

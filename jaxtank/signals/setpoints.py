@@ -44,16 +44,17 @@ class Ramps(Signal):
     [3.0, 3.0, 5.5, 8.0, 8.0]
     """
 
-    initial: np.ndarray = leaf("cm", "(channels,) value before the first change")
-    targets: np.ndarray = leaf("cm", "(changes,) value after each change")
+    initial: np.ndarray = leaf("cm", "value before the first change", shape=("channel",))
+    targets: np.ndarray = leaf("cm", "value after each change", shape=("change",))
     changes: tuple = static(doc="((time [s], channel), ...) in order of time")
     ramp: np.ndarray = leaf("s", "duration D of every change", low=0.0, default=lambda values: 60.0)
     filter: Any = leaf(
         "s",
-        "(channels,) time constant of a first-order filter behind the ramps; 0: none",
+        "time constant of a first-order filter behind the ramps; 0: none",
         low=0.0,
         like="initial",
         default=None,
+        shape=("channel",),
     )
     shape: str = static(doc="course of a change", choices=SHAPES, default="linear")
     band: float = static(

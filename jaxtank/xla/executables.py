@@ -7,7 +7,8 @@ its settings, the processor. What cannot be written down exactly, as a class of 
 traced as ever. Imports `xla` only; used by `jit.compiled`.
 
 jax reads an entry by unpickling, and it holds native code: the folder is the user's own, checked by
-`program_cache.prepare`, and entries are checked by their digests.
+`program_cache.prepare`, entries are checked by their digests, and each holds its own name, which is
+that of all it depends on, and the processor that it was compiled for.
 """
 
 import functools
@@ -157,6 +158,8 @@ def _read(path: Path, tree: Any) -> Any:
         data = path.read_bytes()
         size = int.from_bytes(data[:SIZE], "little")
         about = json.loads(data[SIZE : SIZE + size])
+        if about["name"] != path.name or about["processor"] != program_cache.processor():
+            return None
         if about["lapack"]:
             _load_lapack()
         found = deserialize_and_load(
@@ -208,6 +211,7 @@ def _write(path: Path, program: Any, about: dict[str, Any]) -> None:
 
     temporary = path.with_name(f"{path.name}.{os.getpid()}")
     try:
+        about = {**about, "name": path.name, "processor": program_cache.processor()}
         text = json.dumps(about).encode()
         data = len(text).to_bytes(SIZE, "little") + text + serialize(program)[0]
         temporary.write_bytes(data)

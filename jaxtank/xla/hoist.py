@@ -62,7 +62,7 @@ def checkpointed_scan(body: Callable[[Any, Any], Any], carry: Any, xs: Any, leng
         return scan(body, carry, now, length=inner)[0], None
 
     def first(a: Any) -> Any:
-        return a[: outer * inner].reshape(outer, inner)
+        return a[: outer * inner].reshape(outer, inner, *a.shape[1:])
 
     def last(a: Any) -> Any:
         return a[outer * inner :]

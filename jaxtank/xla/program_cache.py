@@ -1,6 +1,7 @@
 """Compiled programs kept between processes, by jax's own cache, in a folder of the user's own.
 
-Entries hold native code, so the folder is checked before it is used, and each entry by its digest.
+Entries hold native code and are unpickled by jax, so every folder above them and every entry is
+checked before it is used: its owner and mode, and its digest, which holds its own name too.
 Imports the standard library (jax in `cache` alone); used by `jaxtank.cache` and the command line.
 """
 
@@ -28,6 +29,9 @@ HALF_WRITTEN = 600.0
 
 ENTRY, DIGEST = "-cache", ".sha256"
 """Ends of the names of an entry, as jax writes it, and of the digest beside it."""
+
+ELSEWHERE = "name a folder of your own by JAXTANK_CACHE=DIR"
+REMEDY = f"remove it, or {ELSEWHERE}"
 
 folder: Path | None = None
 """Where this process keeps its programs, once `cache` or `keep_for_this_process` has said so."""
@@ -168,6 +172,9 @@ def prepare(folder: str | os.PathLike[str] | None = None) -> tuple[Path | None, 
             return None, why
         mine = base.resolve() / f"{_version()}-{processor()}"
         mine.mkdir(mode=0o700, exist_ok=True)
+        why = refused(mine) or _planted(mine)
+        if why:
+            return None, why
         if not os.access(mine, os.W_OK | os.X_OK):
             return None, ""
         _check_entries(mine)
@@ -185,18 +192,39 @@ def refused(folder: Path) -> str:
     >>> refused(Path(__file__)).endswith("is no folder")
     True
     """
-    found, name = os.lstat(folder), repr(str(folder))
-    if stat.S_ISLNK(found.st_mode):
-        found = os.stat(folder)
-    if not stat.S_ISDIR(found.st_mode):
+    status, name = os.stat(folder), repr(str(folder))
+    if not stat.S_ISDIR(status.st_mode):
         return f"{name} is no folder"
     if sys.platform == "win32":  # the profile of a user is the user's alone
         return ""
-    if found.st_uid != os.geteuid():
-        return f"{name} belongs to another user (JAXTANK_CACHE=DIR names a folder of your own)"
-    if stat.S_IMODE(found.st_mode) & 0o077:
-        mode = stat.S_IMODE(found.st_mode)
-        return f"{name} has mode {mode:o}, open to other users: must be 700 (chmod 700 {name})"
+    if status.st_uid != os.geteuid():
+        return f"{name} belongs to another user: {REMEDY}"
+    if mode := stat.S_IMODE(status.st_mode) & 0o077:
+        # what others may have put there cannot be told from what is the user's own: no chmod
+        return f"{name} is open to other users (mode {0o700 | mode:o}, not 700): {REMEDY}"
+    way = dict.fromkeys((*folder.absolute().parents, *folder.resolve().parents))  # of a link, both
+    return next((why for above in way if (why := _open_above(above))), "")
+
+
+def _open_above(folder: Path) -> str:
+    """Return why others can exchange what lies in a folder on the way to the programs, or ""."""
+    status = os.stat(folder)
+    shared = status.st_mode & stat.S_IWOTH
+    if status.st_mode & stat.S_IWGRP and status.st_gid not in (0, os.getegid()):
+        shared = True  # a group of the user's alone has the user's number in most systems
+    if status.st_uid not in (0, os.geteuid()) or (shared and not status.st_mode & stat.S_ISVTX):
+        return f"other users can write to {str(folder)!r}: {ELSEWHERE}"
+    return ""
+
+
+def _planted(folder: Path) -> str:
+    """Return why the entries of a folder are not all the user's own files; "" where they are."""
+    if sys.platform == "win32":
+        return ""
+    for path in folder.iterdir():
+        status = os.lstat(path)
+        if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():
+            return f"{str(path)!r} is no file of yours: remove the folder {str(folder)!r}"
     return ""
 
 
@@ -205,7 +233,9 @@ def seal(folder: Path, since: float) -> None:
     for path in _entries(folder):
         try:
             if path.stat().st_mtime >= since:
-                _digest_of(path).write_text(hashlib.sha256(path.read_bytes()).hexdigest())
+                path.chmod(0o600)
+                _digest_of(path).write_text(_digest(path))
+                _digest_of(path).chmod(0o600)
         except OSError:  # another process has removed it
             continue
 
@@ -285,9 +315,9 @@ def _check_entries(folder: Path) -> None:
     sound: list[tuple[float, int, Path]] = []
     for path in _entries(folder):
         try:
-            digest = _digest_of(path).read_text()
-            good = digest == hashlib.sha256(path.read_bytes()).hexdigest()
             found = path.stat()
+            closed = not (found.st_mode | _digest_of(path).stat().st_mode) & 0o022
+            good = closed and _digest_of(path).read_text() == _digest(path)
         except OSError:
             good, found = False, None
         if found is None or not good:
@@ -311,6 +341,12 @@ def _versions(base: Path) -> list[Path]:
 
 def _entries(folder: Path) -> Iterator[Path]:
     return iter(sorted(folder.glob(f"*{ENTRY}")))
+
+
+def _digest(path: Path) -> str:
+    """Return the SHA-256 of an entry, its name and folder: one that is moved is not known."""
+    name = f"{path.parent.name}/{path.name}\0".encode()
+    return hashlib.sha256(name + path.read_bytes()).hexdigest()
 
 
 def _digest_of(path: Path) -> Path:

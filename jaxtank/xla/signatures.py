@@ -54,7 +54,8 @@ def _process() -> list[str]:
     settings = {n: repr(v) for n, v in config.values.items() if not any(i in n for i in IGNORED)}
     versions = [sys.version, *(importlib.metadata.version(n) for n in ("jax", "jaxlib", "numpy"))]
     flags = [os.environ.get(n, "") for n in ("XLA_FLAGS", "LIBTPU_INIT_ARGS")]
-    return [*versions, *flags, json.dumps(settings, sort_keys=True), *_source()]
+    devices = [f"{d.platform} {d.device_kind} {d.client.platform_version}" for d in jax.devices()]
+    return [*versions, *flags, *devices, json.dumps(settings, sort_keys=True), *_source()]
 
 
 def _source() -> Iterator[str]:

@@ -1,5 +1,6 @@
-"""What is shipped, and what it never does: pickles, evaluates text, talks to a network, or reads a
-file of any size.
+"""What is shipped, and what it never does: unpickle a user's file, evaluate text, talk to a
+network, or read a file of any size. Compiled programs alone are unpickled, by jax, from a folder
+that is checked (`jaxtank.xla.program_cache`), and tasks of Dask workers by Dask.
 """
 
 import ast
@@ -101,12 +102,11 @@ READ = {
     ("tuning.live.engine", "engine", "read_text"): "engine.js of the package",
     ("jaxtank.export.whole.array_values", "library", "read_text"): "arrays.js of the package",
     ("tuning.cli.completion", "words", "read_text"): "names.txt of the package",
-    ("jaxtank.xla.program_cache", "seal", "read_bytes"): "an entry that jax has just written",
-    ("jaxtank.xla.program_cache", "_check_entries", "read_bytes"): "in a folder of mode 700 and"
-    " the user's own, to compare its digest",
+    ("jaxtank.xla.program_cache", "_digest", "read_bytes"): "an entry that jax has just written, or"
+    " one of a folder of mode 700 and the user's own, to compare its digest",
     ("jaxtank.xla.program_cache", "_check_entries", "read_text"): "that digest, compared only",
     ("jaxtank.xla.executables", "_read", "read_bytes"): "an entry of that folder, checked by its"
-    " digest when the process began; jax unpickles it, as it loads native code",
+    " owner, mode and digest when the process began, and by the name and processor it holds",
     ("jaxtank.xla.program_cache", "processor", "open"): "/proc/cpuinfo",
     ("jaxtank.xla.flags", "_text_of", "open"): "the file that XLA_FLAGS names, looked through only",
     ("tuning.identification.csv_log", "_text", "read_bytes"): "after `refusal`",
@@ -164,6 +164,27 @@ def test_nothing_is_imported_that_unpickles_talks_or_starts_programs():
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             found |= {(module, n.split(".")[0]) for n in names if n.split(".")[0] in SUSPECT}
     assert found == set(IMPORTED)
+
+
+UNPICKLES = {
+    ("jaxtank.xla.executables", "_read", "deserialize_and_load"): "a compiled program of the folder"
+    " that `program_cache.prepare` has checked: owner and mode of every level, digest and name",
+    ("tuning.cluster.engine", "_client", "Client"): "results of the workers that the user names, or"
+    " that this process has started with keys of its own",
+}
+"""Calls of others that unpickle what they read."""
+
+
+def test_every_call_that_unpickles_is_known_and_why_it_is_safe():
+    names = {"deserialize_and_load", "Client", "Unpickler", "loads", "deserialize"}
+    plain = ("json.loads", "rig.loads", "rigs.loads", "tomllib.loads", "rig_files.loads", "loads")
+    calls = {
+        (module, where, name)
+        for module, tree in sources()
+        for where, name, whole, _ in called(tree)
+        if name in names and whole not in plain
+    }
+    assert calls == set(UNPICKLES)
 
 
 def test_no_text_is_run():

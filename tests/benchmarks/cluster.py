@@ -40,7 +40,10 @@ KINDS = ("worker", "scheduler", "command")
 @contextlib.contextmanager
 def cluster(count):
     """A client of so many workers."""
-    with local_workers(count) as (address, _), distributed.Client(address) as client:
+    with (
+        local_workers(count) as workers,
+        distributed.Client(workers.address, security=workers.security) as client,
+    ):
         client.wait_for_workers(count, timeout=120)
         yield client
 

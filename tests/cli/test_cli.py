@@ -379,7 +379,7 @@ def test_a_run_without_noise_does_not_depend_on_the_seed():
 
 def test_a_run_that_leaves_the_numbers_is_reported_and_nothing_is_written(here):
     printed = say("simulate", CASE, *SHORT, "--set", "controller.k=1e308", "--out", "out")
-    assert printed.code == 2 and printed.out == "" and printed.err.count("\n") == 1
+    assert printed.code == 2 and printed.out == "" and printed.errors.count("\n") == 1
     assert all(word in printed.err for word in ("tank 1", "t = 0.1 s", "controller.k1"))
     assert list(here.iterdir()) == []
 
@@ -630,7 +630,7 @@ def test_a_scenario_and_an_option_that_set_the_same_are_refused(here):
     printed = say(*NOISY, "--scenario", "sensor.noise=0.1", "--out", "out")
     assert printed.code == 2 and not printed.out and not (here / "out").exists()
     assert (
-        printed.err
+        printed.errors
         == "jaxtank: --scenario 'sensor.noise=0.1' sets sensor.noise, which --set or --dt sets too:"
         " give one of them, or a factor, as sensor.noise=x1.1\n"
     )
@@ -1107,7 +1107,7 @@ def test_bad_input_is_reported_in_one_line_and_leaves_nothing(args, words, here)
     assert printed.code == 2
     assert printed.out == ""
     assert (
-        printed.err.count("\n") == 1
+        printed.errors.count("\n") == 1
         and printed.err.endswith("\n")
         and printed.err.startswith("jaxtank: ")
     )
@@ -1318,7 +1318,7 @@ def test_bad_uncertainty_is_reported_in_one_line(args, words, here):
     assert (
         printed.code == 2
         and printed.out == ""
-        and printed.err.count("\n") == 1
+        and printed.errors.count("\n") == 1
         and words in printed.err
     ), printed.err
     assert not list(here.iterdir())

@@ -96,16 +96,95 @@ def test_the_oldest_entries_are_removed_where_all_are_too_large(entry, monkeypat
     assert new.exists() and not old.exists()
 
 
-def test_a_folder_that_others_can_write_to_is_refused(tmp_path, monkeypatch):
+def other_user(monkeypatch, path):
+    """Have the system say that a file or folder belongs to another user."""
+    for name in ("stat", "lstat"):
+        real = getattr(os, name)
+
+        def status(where, *more, real=real, **options):
+            result = real(where, *more, **options)
+            same = not isinstance(where, int) and os.fspath(where) == os.fspath(path)
+            return os.stat_result((*result[:4], result[4] + 1, *result[5:])) if same else result
+
+        monkeypatch.setattr(kept.os, name, status)
+
+
+@pytest.mark.parametrize("mode", [0o755, 0o770, 0o777])
+def test_a_folder_that_others_can_open_is_refused_and_the_remedy_makes_a_new_one(tmp_path, mode):
+    """A program that another user left there must not run after the remedy."""
     base = tmp_path / "open"
-    base.mkdir(mode=0o755)
-    os.chmod(base, 0o755)
+    base.mkdir()
+    base.chmod(mode)
     folder, why = kept.prepare(base)
-    assert folder is None and "mode 755" in why and list(base.iterdir()) == []
-    os.chmod(base, 0o700)
-    monkeypatch.setattr(kept.os, "geteuid", lambda: base.stat().st_uid + 1)
+    assert folder is None and f"mode {mode:o}" in why and list(base.iterdir()) == []
+    assert "remove it" in why and "chmod" not in why
+
+
+def test_every_level_of_the_folder_must_be_the_users_own(entry, monkeypatch):
+    base, path = entry
+    for level in (base, path.parent, path, path.with_name(path.name + kept.DIGEST)):
+        with monkeypatch.context() as patch:
+            other_user(patch, level)
+            folder, why = kept.prepare(base)
+        assert folder is None and "remove" in why and path.exists()
+    path.parent.chmod(0o777)
     folder, why = kept.prepare(base)
-    assert folder is None and "another user" in why and list(base.iterdir()) == []
+    assert folder is None and f"{path.parent.name}' is open to other users" in why
+    path.parent.chmod(0o700)
+    assert kept.prepare(base) == (path.parent, "")
+
+
+def test_a_folder_above_that_others_can_write_to_is_refused(tmp_path):
+    """Who can rename the folder can put another one there."""
+    above = tmp_path / "above"
+    above.mkdir()
+    above.chmod(0o777)
+    folder, why = kept.prepare(above / "kept")
+    assert folder is None and f"other users can write to {str(above)!r}" in why
+    above.chmod(0o1777)  # as a folder of temporary files is
+    assert kept.prepare(above / "kept")[1] == ""
+
+
+def test_a_link_among_the_entries_is_refused(entry, tmp_path):
+    base, path = entry
+    path.rename(tmp_path / "elsewhere")
+    path.symlink_to(tmp_path / "elsewhere")
+    folder, why = kept.prepare(base)
+    assert folder is None and "is no file of yours" in why
+
+
+def test_an_entry_that_others_can_write_to_is_removed(entry):
+    base, path = entry
+    path.chmod(0o666)
+    assert kept.prepare(base)[1] == "" and not path.exists()
+
+
+def test_an_entry_under_another_name_is_removed(entry):
+    """Two programs of equal shapes, exchanged with their digests, give each other's numbers."""
+    base, path = entry
+    other = path.with_name(f"jit_g-00{kept.ENTRY}")
+    for suffix in ("", kept.DIGEST):
+        path.with_name(path.name + suffix).rename(other.with_name(other.name + suffix))
+    kept.prepare(base)
+    assert not other.exists()
+
+
+def test_exchanged_programs_do_not_give_the_numbers_of_each_other(tmp_path):
+    """Through the command: with digests made anew, by the name inside of each entry."""
+    folder, wanted = tmp_path / "kept", {}
+    for overflow in ("true", "false"):
+        words = [*RUN, "--set", f"plant.overflow={overflow}"]
+        wanted[overflow] = measures(command(folder, *words)[0])
+    assert wanted["true"] != wanted["false"]
+    names = [p for p in entries(folder) if p.name.startswith("evaluate_compiled")]
+    first, second = names
+    data = first.read_bytes(), second.read_bytes()
+    first.write_bytes(data[1])
+    second.write_bytes(data[0])
+    kept.seal(first.parent, 0.0)
+    for overflow, numbers in wanted.items():
+        words = [*RUN, "--set", f"plant.overflow={overflow}"]
+        assert measures(command(folder, *words)[0]) == numbers
 
 
 def test_root_makes_no_folder_in_the_home_of_another(tmp_path, monkeypatch):

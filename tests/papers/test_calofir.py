@@ -518,13 +518,17 @@ def test_what_is_measured():
         wanted = preset.published[name]
         if wanted.tolerance is not None:
             np.testing.assert_allclose(found[name], wanted.value, rtol=wanted.tolerance)
-    assert [v[0] for v in found.values() if hasattr(v, "verdict")] == [
+    assert [v.verdict for v in found.values() if hasattr(v, "verdict")] == [
         *["reproduced"] * 3,
         "partly",
         "not reproduced",
+        *["reproduced"] * 2,
         "partly",
         *["reproduced"] * 3,
     ]
+    # h1 - h3, and the sampled loop beside one of 0.05 s, by another simulator
+    assert "at least 0.0371 m" in found["h1 is at least h3"].text
+    assert "0.503 mm" in found["sampling period of 1 s"].text
     # settling times and saturated shares of notes S7.1, measured on another loop
     assert found["larger gains settle sooner"].text.endswith("271 s, 179 s, 139 s, 193 s")
     shares = re.findall(r"([\d.]+) %", found["larger gains saturate the pump"].text)

@@ -1338,16 +1338,23 @@ def test_every_published_number_that_can_be_measured_is():
     published = load("mirakhorli").published
     assert set(found) <= set(published)
     verdicts = {name: claim.verdict for name, claim in found.items() if hasattr(claim, "verdict")}
-    assert verdicts["SFC rises more slowly"] == verdicts["chattering of the SMC"] == "reproduced"
+    assert verdicts["chattering of the SMC"] == "reproduced"
+    # on the rig that was fitted to Table 3, and not with the cases as they are
+    assert verdicts["SFC rises more slowly"] == "partly"
+    assert "SMC 49.3 s, SFC 42.4 s, hybrid 47.9 s" in found["SFC rises more slowly"].text
+    # by the printed gains, and not once both are tuned
+    assert verdicts["hybrid against SMC and SFC"] == "partly"
+    assert verdicts["Table 3 with the cases as they are"] == "partly"
+    assert "1 of 16 are within 10 %" in found["Table 3 with the cases as they are"].text
     numbers = lambda name: [found[f"{name}, {which}"] for which in ("SMC", "SFC", "hybrid")]
     np.testing.assert_allclose(numbers("overshoot"), (43.7, 9.0, 13.5), atol=0.1)
     np.testing.assert_allclose(numbers("rise time"), (27.5, 34.7, 28.4), atol=0.1)
-    assert verdicts["settling time, SMC"] == "partly" and found["relative degree"] == (1, 1)
+    assert verdicts["settling time, SMC"] == "reproduced" and found["relative degree"] == (1, 1)
     assert verdicts["sign of the SFC"] == verdicts["settling of the hybrid"] == "not reproduced"
     for name in ("non-minimum phase", "hybrid: steady-state error"):
         assert verdicts[name] == "reproduced", found[name]
     assert "-0.1072 and +0.0247 1/s" in found["non-minimum phase"].text
-    assert verdicts["SFC is an optimal gain"] == "partly"  # by a choice of Q, R and gamma
+    assert verdicts["SFC is an optimal gain"] == "reproduced"  # by a choice of Q, R and gamma
     assert verdicts["hybrid switches between the controllers"] == "reproduced"
     assert (
         verdicts["30 % change of an outlet"]
@@ -1377,4 +1384,4 @@ def test_the_verdict_on_zero_error_follows_the_numbers():
 
 
 def _hash(value):
-    return tuple(value) if isinstance(value, list) else value
+    return tuple(map(_hash, value)) if isinstance(value, list) else value

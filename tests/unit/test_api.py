@@ -52,7 +52,7 @@ class Proportional(Controller):
 class Offset(Observer):
     """Levels as they are measured, less a known offset."""
 
-    offset: np.ndarray = jaxtank.leaf("cm", "(n,) offset of each sensor")
+    offset: np.ndarray = jaxtank.leaf("cm", "offset of each sensor", shape=("tank",))
 
     def step(self, state, tick, y):
         x = tuple(h - self.offset[i] for i, h in enumerate(y))

@@ -4,6 +4,7 @@
 
 import dataclasses
 import json
+import re
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ import tuning
 from jaxtank import presets
 from jaxtank.controllers.base import Controller
 from jaxtank.core import numerics
+from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf, number, static
 from jaxtank.export.source import export
 from jaxtank.plants.base import Plant
@@ -28,7 +30,7 @@ class Cone(Plant):
     pump_gain: float = leaf("cm^3/(s V)", "flow per volt k", low=0.0, strict=True)
     drain: float = leaf("cm^2", "outlet area s", low=0.0)
     slope: float = leaf("-", "radius over level R/H", low=0.0, strict=True)
-    rim: np.ndarray = leaf("cm", "(1,) height", low=0.0, strict=True)
+    rim: np.ndarray = leaf("cm", "height", low=0.0, strict=True, shape=("tank",))
     outputs: tuple = static(doc="controlled tanks", default=(0,))
     tanks, pumps = 1, 1
 
@@ -220,3 +222,63 @@ def test_an_input_of_a_controller_is_one_real_number(kind, wrong):
         match="controller Odd: its step returns an input that is no single real number",
     ):
         jaxtank.evaluate(loop, case.clock, ["rms_error"])
+
+
+@component
+class Metres(Plant):
+    """One tank in metres, its pump in %."""
+
+    units = ("m", "%")
+    flow: float = leaf("m^3/(s %)", "flow per % of the pump", low=0.0)
+    valve: float = leaf("m^2", "outlet area", low=0.0)
+    rim: np.ndarray = leaf("m", "height", low=0.0, strict=True, shape=("tank",))
+    outputs: tuple = static(doc="controlled tanks", default=(0,))
+    tanks, pumps = 1, 1
+
+    def derivative(self, t, x, u, d):
+        out = self.valve * jnp.sqrt(2 * 9.81) * numerics.smooth_sqrt(x[0], 1e-4)
+        return ((self.flow * u[0] - out) / 0.1,)
+
+
+@component
+class Unsaid(Metres):
+    """The same, which does not say that it counts in metres."""
+
+    units = ("cm", "V")
+
+
+def metres(case, kind=Metres):
+    plant = kind(flow=1e-5, valve=1e-4, rim=[0.3])
+    controller = Proportional(Kc=100.0, bias=20.0)
+    actuator = jaxtank.instruments.PumpBank(low=[0.0], high=[100.0])
+    loop = dataclasses.replace(
+        case.loop,
+        plant=plant,
+        controller=controller,
+        actuator=actuator,
+        sensor=jaxtank.instruments.LevelSensor(noise=[0.0]),
+        reference=jaxtank.signals.ramps([0.05], [(5.0, 0, 0.12)], ramp=0.0),
+        x0=number([0.05]),
+    )
+    free = {"controller.Kc": presets.Free(10.0, 1000.0)}
+    return case.replace(loop=loop, free=free, uncertain={}, objective={"rms_error_total": 1.0})
+
+
+def test_a_plant_whose_levels_are_not_in_its_units_is_refused(case):
+    with pytest.raises(InputError, match=r'Unsaid.units = .* write units = \("m", "V"\)'):
+        jaxtank.check(metres(case, Unsaid).loop, case.clock)
+
+
+def test_nothing_is_claimed_on_plants_where_nothing_varies(case):
+    """One plant with 8 draws of noise is no 8 plants; named in `uncertain`, there are 8."""
+    one = metres(case)
+    options = {"starts": 1, "iterations": 3, "validation": 8, "safety_filter": False}
+    printed = str(tuning.tune(one, **options))
+    assert "validation plants" not in printed and "every flow" not in printed
+    assert "of 8 runs of one plant, with new noise" in printed
+    text = " ".join(printed.split())
+    assert "nothing of this plant is known to vary" in text and '"plant.valve"' in text
+    assert "[m]" in printed and not re.search(r"\bcm\b|\bV\b", printed)
+    stated = one.replace(uncertain={"plant.valve": 0.05})
+    assert "of 8 validation plants" in str(tuning.tune(stated, **options))
+    assert "8 runs of one plant" in str(tuning.validate(one, samples=8))

@@ -84,6 +84,7 @@ class Answer(Shown):
             "samples": found["samples"] if found else 0,
             "certified": [
                 {"tank": row.tank + 1, "certified": bool(row.certified), "why": row.reason}
+                | {"starts": row.starts or None}
                 for row in self.setting.certificates
             ],
         }

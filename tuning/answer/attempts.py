@@ -16,6 +16,7 @@ from tuning.answer.robustness import move_back
 from tuning.answer.setting import NEAR, PLANTS, Setting
 from tuning.answer.stay_put import Found, search_from
 from tuning.problem.problem import Problem
+from tuning.problem.reported import in_force
 from tuning.problem.scenarios import groups_of, with_noise_drawn
 from tuning.search.driver import event_of
 
@@ -217,7 +218,8 @@ def values_of(problem, found):
     if found.kept is not None:
         stays = found.kept if found.idle is None else found.kept | found.idle
         values |= {n: own[n] for n, same in zip(own, stays) if same}
-    return values
+    acting = in_force(problem.loop, values)
+    return {n: v if v == own[n] else acting[n] for n, v in values.items()}
 
 
 def _misled(cost, after: Judged):

@@ -4,15 +4,17 @@
 code                             reported when
 ===============================  =============================================================
 step-too-long                    the integration step is too long for the answer
+edge-of-stability                the sampled linearised loop is unstable or has Ms above 2.5
+sensitivity-peak                 the linearised loop is less robust than before, Ms above PEAK
+input-total-variation            the inputs change ten times as much per sample as before, or more
 interrupted                      Ctrl-C ended the search
 limit-violated-out-of-sample     a limit is violated on a validation plant
 no-longer-follows                the answer leaves a setpoint that the start held
 not-converged                    searches disagree, and differential evolution found better points
+slope-not-usable                 runs beside the answer or the start contradict the exact slope
 limit-not-certified              the safety filter is on, and a limit is not proved
 parameter-not-exercised          no run depends on the parameter
 parameter-at-bound               the value ended at an end of its range
-input-total-variation            the inputs change much more per sample than before
-sensitivity-peak                 the linearised loop is less robust than before, Ms above PEAK
 constraints-tightened            limits were tightened for the search, to hold on other plants
 noise-assumed                    the case states no sensor noise
 plants-assumed                   the case does not say what is uncertain
@@ -24,18 +26,20 @@ from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
+from jaxtank.core.tree import parameters
 from tuning.answer.answer import Answer
 from tuning.answer.setting import SPREAD
 from tuning.problem.status import Status
 from tuning.problem.wording import numbered
 from tuning.search.result import Message, TuningResult
+from tuning.search.verdicts import FRAGILE, near_the_edge, slope_not_usable
 
 Found = Iterator[Message]
 
 PEAK = 2.0
 """Sensitivity peak above which a loop that became less robust is reported [-]."""
 
-BUSIER = 20.0
+BUSIER = 10.0
 """Growth of the rms change of the inputs per sample above which it is reported [-]."""
 
 
@@ -70,7 +74,8 @@ def _violated(result, answer) -> Found:
         remedy = "--safety-filter keeps levels below their limits"
     yield Message(
         "limit-violated-out-of-sample",
-        f"limits hold on {int(answer.after.held.sum())} of {answer.after.samples} validation plants"
+        f"limits hold on {int(answer.after.held.sum())} of {answer.after.samples}"
+        f" {answer.setting.runs}"
         f" ({'; '.join(parts)}): {remedy}",
     )
 
@@ -92,6 +97,10 @@ def _not_agreed(result, answer) -> Found:
             " evolution found better points: raise --starts or --iterations, or narrow the ranges"
             " (--free)",
         )
+
+
+def _slopes(result, answer) -> Found:
+    yield from slope_not_usable(result)
 
 
 def _certificates(result, answer) -> Found:
@@ -137,17 +146,18 @@ def _busier(result, answer) -> Found:
             "input-total-variation",
             f"the rms change of the inputs per sample is {100 * new:.2g} % of their range,"
             f" {new / old:.0f} times that before",
+            f"inputs change {new / old:.0f} times as much as before",
         )
 
 
 def _less_robust(result, answer) -> Found:
+    yield from near_the_edge(result)
     peaks = [float(m.get("sensitivity_peak", np.nan)) for m in answer.measures.values()]
-    if len(peaks) == 2 and peaks[1] > max(PEAK, 1.05 * peaks[0]):
-        words = "unstable" if np.isinf(peaks[1]) else f"{peaks[1]:.3g}, {peaks[0]:.3g} before"
+    if len(peaks) == 2 and max(PEAK, 1.05 * peaks[0]) < peaks[1] <= FRAGILE:
         yield Message(
             "sensitivity-peak",
-            f"the sensitivity peak of the linearised loop is {words}: --limit"
-            f" sensitivity_peak={PEAK:g} bounds it",
+            f"the sensitivity peak of the linearised loop is {peaks[1]:.3g}, {peaks[0]:.3g} before:"
+            f" --limit sensitivity_peak={PEAK:g} bounds it",
         )
 
 
@@ -160,7 +170,15 @@ def _assumed(result, answer) -> Found:
             f"sensor noise of {setting.noise:.3g} {unit} is assumed (0.1 % of the height; --set"
             " sensor.noise)",
         )
-    if not setting.stated:
+    if not setting.plants_vary:
+        plant = [f'"{n}"' for n in parameters(setting.case.loop) if n.startswith("plant.")]
+        yield Message(
+            "plants-assumed",
+            "nothing of this plant is known to vary, so that nothing is claimed on other plants:"
+            f" name it in `uncertain`, as {{{plant[0] if plant else 'NAME'}: 0.05}} for +-5 %, or"
+            f" with --vary (of {', '.join(plant)})",
+        )
+    elif not setting.stated:
         yield Message(
             "plants-assumed",
             f"the case names nothing uncertain: every flow is taken to be within"
@@ -178,14 +196,15 @@ def _tightened(result, answer) -> Found:
 
 
 RULES: tuple[Callable[..., Found], ...] = (
+    _less_robust,
+    _busier,
     _interrupted,
     _violated,
     _lost,
     _not_agreed,
+    _slopes,
     _certificates,
     _bounds,
-    _busier,
-    _less_robust,
     _tightened,
     _assumed,
     _idle,

@@ -43,6 +43,7 @@ class Judged(Shown):
     limits : the Limits; measures : {name: (N, ...)}.  unit : of length.
     nominal : {name: value} of the nominal plant without noise: the measures above and NOMINAL; None
         where the case states noise, or that run diverged.
+    runs : what the N runs are, in words: plants, or one plant with new noise.
     """
 
     cost: np.ndarray
@@ -56,6 +57,7 @@ class Judged(Shown):
     measures: dict[str, np.ndarray]
     unit: str
     nominal: dict[str, np.ndarray] | None = None
+    runs: str = "plants"
 
     @property
     def samples(self) -> int:
@@ -87,7 +89,7 @@ class Judged(Shown):
         found = self.to_json()
         low, high = (100.0 * end for end in found["interval95"])
         numbers = {
-            "limits held": f"{100 * found['limits_held']:.3g} % of {self.samples} plants"
+            "limits held": f"{100 * found['limits_held']:.3g} % of {self.samples} {self.runs}"
             f" (95 % interval {low:.3g} to {high:.3g} %)"
         }
         if found["error"] is not None:
@@ -225,6 +227,7 @@ def judge(setting: Setting, samples: int, seed: int, round_: int = 0) -> Judged:
         measures=by,
         nominal=found.nominal,
         unit=unit_of(setting),
+        runs="plants" if setting.plants_vary else setting.runs,
     )
 
 

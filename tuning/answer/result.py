@@ -9,7 +9,7 @@ from tuning.problem.problem import Problem
 from tuning.problem.provenance import provenance
 from tuning.problem.status import Status
 from tuning.search import diagnostics
-from tuning.search.kkt import optimality
+from tuning.search.kkt import named_optimality
 from tuning.search.result import ConstraintRow, TuningResult, row_of
 from tuning.uncertainty.validation import summary_of
 
@@ -51,7 +51,7 @@ def result_of(
         wall_s=0.0,
         history=search.history if search else [],
         starts=found.starts,
-        optimality=_optimality(search, point),
+        optimality=named_optimality(search, point),
         curvature=None,
         validation=summary,
         cloud=cloud,
@@ -59,6 +59,7 @@ def result_of(
         problem=problem,
         lost=answer.lost,
         answer=answer,
+        slopes=found.slopes,
     )
 
 
@@ -78,14 +79,6 @@ def _status(answer, found):
     if not answer.held:
         return Status.INFEASIBLE
     return Status.CONVERGED if found.agreed and not answer.lost else Status.NOT_CONVERGED
-
-
-def _optimality(search, point):
-    if search is None or point is None:
-        return {"gradient_norm": None, "kkt_residual": None, "multipliers": {}}
-    norm, residual, multipliers = optimality(search, point)
-    named = {limit.label: float(m) for limit, m in zip(search.problem.limits, multipliers) if m > 0}
-    return {"gradient_norm": norm, "kkt_residual": residual, "multipliers": named}
 
 
 def _parameters(problem, found, values):

@@ -88,6 +88,16 @@ class Setting:
         return {m: v for m, v in self.case.limits.items() if not (proved and m == "max_level")}
 
     @property
+    def plants_vary(self) -> bool:
+        """True if more varies from run to run than what the sensors read."""
+        return any(not name.startswith("sensor.") for name in self.distributions)
+
+    @property
+    def runs(self) -> str:
+        """What the answer is judged on, in the plural."""
+        return "validation plants" if self.plants_vary else "runs of one plant, with new noise"
+
+    @property
     def cost_unit(self) -> str | None:
         """Unit of the default cost, whose price has one of its own; None for a user's objective."""
         return None if self.own_objective else f"{self.case.loop.units[0]}^2"

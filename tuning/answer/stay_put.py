@@ -12,6 +12,7 @@ from tuning.cluster.ahead import evaluate_ahead
 from tuning.cluster.engine import Engine
 from tuning.problem.functions import check_slopes
 from tuning.problem.problem import Problem
+from tuning.problem.slopes import SlopeCheck
 from tuning.search import diagnostics
 from tuning.search.driver import Search
 from tuning.search.methods import METHODS, restore, search_alone
@@ -23,6 +24,7 @@ from tuning.search.screening import (
     evolve,
     sobol,
 )
+from tuning.search.starts import search_from as local_search
 
 WORTH = 0.01
 """A gain is changed only where that lowers the cost by this share [-]."""
@@ -67,6 +69,7 @@ class Found:
     z: Any = None
     kept: Any = None
     idle: Any = None
+    slopes: dict[str, SlopeCheck] = dataclasses.field(default_factory=dict)
     slack: Any = None
     agreed: bool = False
     interrupted: bool = False
@@ -140,6 +143,7 @@ def search_from(
     search.take(reference)
     zs = sobol(LINE, len(first), plan["seed"])
     costs, margins = problem.screen(zs)
+    found.slopes["start"] = search.slope(reference)
     shortfall = np.maximum(0.0, -margins / search.limit_scale)
     merits = costs / search.scale + 10.0 * shortfall.sum(axis=1)
     starts = distinct_starts(zs, merits, plan["starts"], first)
@@ -157,30 +161,17 @@ def search_from(
         METHODS["slsqp"](search, search.best.z, plan["iterations"])
     if search.best is None:
         return
-    if not found.agreed:
+    if not (found.agreed and search.slope(search.best).usable):
         found.agreed = _confirmed(search, found, Population(zs, costs, margins), plan)
     found.idle = diagnostics.unexercised(problem, search, first)
     found.z, found.kept = stay_put(search, first, plan["iterations"], found.slack)
+    found.slopes["answer"] = search.slope(found.point)
 
 
 def _local_search(search, found, z, iterations):
     """Run one local search from z; its outcome is added to those found."""
-    count = len(search.history)
-    search.exhausted = False
-    converged = METHODS[method_of(search.problem)](search, z, iterations)
-    mine = search.history[count:] or [search.history[-1]]
-    reached = min(mine, key=lambda h: (h[2] > 0, h[2] if h[2] > 0 else h[1]))
-    found.starts.append(
-        {
-            "from": search.problem.values(z),
-            "to": search.problem.values(reached[3]),
-            "cost": reached[1],
-            "violation": reached[2],
-            "evaluations": len(mine),
-            "converged": converged,
-            "exhausted": search.exhausted,
-        }
-    )
+    method = METHODS[method_of(search.problem)]
+    local_search(search, found.starts, z, lambda s, z: method(s, z, iterations))
 
 
 def _confirmed(search, found, screened, plan):

@@ -40,6 +40,7 @@ def main(argv=None):
 
         # the note is printed once, where the case is opened
         warnings.filterwarnings("ignore", message=".* runs empty faster than the steps follow")
+        warnings.filterwarnings("ignore", message="the level of tank .* falls below 0")
         warnings.showwarning = _shown(warnings.showwarning)
     try:
         code = _command(argv)

@@ -30,27 +30,30 @@ def open_case(args):
 
     jax.config.update("jax_enable_x64", True)
     from jaxtank import rig
+    from jaxtank.loop import floor
 
     opened = rig.open_case(args.case)
-    # of the file as it is: what --set changes is meant
-    of_file = rig.case_warnings(opened) if args.case.endswith(".toml") and not args.quiet else []
-    for sentence in of_file:
+    known = [] if args.quiet else rig.case_warnings(opened)
+    for sentence in known if args.case.endswith(".toml") else ():
         print(f"jaxtank: {printable(args.case)}: note: {sentence}", file=sys.stderr)
     values, of_filter = _apart(settings(args))
-    case = rig.check(rig.set_and_schedule(opened, values, schedule(args.schedule)))
+    case = rig.set_and_schedule(opened, values, schedule(args.schedule))
     case, replaced = rig.overridden(case, values)
+    if "plant.bottom" not in values and not floor.draws(opened.loop):
+        case = rig.with_bottom(case)
+    case = rig.check(case)
     case = rig.filtered(case, args.safety_filter, of_filter)
     if not args.quiet:
-        for sentence in _warnings(args, opened, case, replaced):
-            if sentence not in of_file:
+        for sentence in _warnings(args, case, replaced):
+            if sentence not in known:
                 print(f"jaxtank: note: {sentence}", file=sys.stderr)
     return case
 
 
-def _warnings(args, opened, case, replaced):
+def _warnings(args, case, replaced):
     """Sentences on a case as --set has changed it.
 
-    opened: the case before; replaced: {name: scenarios whose own value --set replaces}.
+    replaced: {name: scenarios whose own value --set replaces}.
     """
     from jaxtank import rig
     from jaxtank.loop import step_size
@@ -59,9 +62,7 @@ def _warnings(args, opened, case, replaced):
     if args.command == "tune" and not args.scenario:
         for name, scenarios in replaced.items():
             found.append(f"--set {name} also replaces the value of {name} in {_named(scenarios)}")
-    found += rig.model_warnings(case)
-    if case.clock != opened.clock:
-        found += rig.clock_warnings(case.clock)
+    found += rig.case_warnings(case)
     return found + _not_proved(case) + step_size.step_warnings(case.loop, case.clock)
 
 
@@ -76,12 +77,19 @@ def _not_proved(case):
     """Sentences on tanks whose limits the safety filter of the case is not proved to keep."""
     if case.loop.safety_filter is None:
         return []
+    from jaxtank.safety.of_case import beyond
+
     rows = case.safety_design(**case.safety)[1]
     found = [
         f"safety filter: the limit of tank {row.tank + 1} is not proved: {row.reason}"
         for row in rows
         if not row.certified
     ]
+    if names := beyond(case):
+        found.append(
+            f"safety filter: [uncertain] is wider than the widths of the filter for"
+            f" {', '.join(names)}: nothing is proved of plants beyond those widths"
+        )
     return found + [
         f"safety filter: the low limit of tank {row.tank + 1} is not proved: {row.low_reason}"
         for row in rows

@@ -29,6 +29,8 @@ LOOK = 0.5
 MOST = 1024
 """Workers of one machine, at most."""
 
+ENCRYPTED = ("tls://", "wss://")
+
 ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?(\[[0-9A-Fa-f:.]+\]|[\w.-]+):\d{1,5}")
 
 
@@ -205,11 +207,21 @@ def connect(cluster):
         return
     with contextlib.ExitStack() as stack:
         stack.enter_context(_quiet())
-        check = None
+        check = security = None
         if cluster.startswith("local:"):
             count = int(cluster.removeprefix("local:"))
-            cluster, check = stack.enter_context(local_workers(count))
-        yield Engine(stack.enter_context(_client(cluster)), check)
+            cluster, check, security, _ = stack.enter_context(local_workers(count))
+        client = stack.enter_context(_client(cluster, security))
+        engine = Engine(client, check)
+        if not engine.address.startswith(ENCRYPTED):
+            warnings.warn(
+                f"cluster {engine.address}: without TLS anybody who reaches this address"
+                " can run code as the user of its workers, and of this command: give all of them"
+                " certificates and the address as tls://HOST:PORT",
+                ClusterWarning,
+                stacklevel=3,
+            )
+        yield engine
 
 
 def check_cluster(cluster):
@@ -272,14 +284,13 @@ def check_alone(cluster, **other):
 
 
 @contextlib.contextmanager
-def _client(address):
-    """Connect to a scheduler."""
+def _client(address, security=None):
+    """Connect to a scheduler, with keys or those that Dask is configured with."""
     import distributed
 
+    options = {"set_as_default": False, "name": "jaxtank", "direct_to_workers": False}
     try:
-        client = distributed.Client(
-            address, timeout=CONNECT, set_as_default=False, name="jaxtank", direct_to_workers=False
-        )
+        client = distributed.Client(address, timeout=CONNECT, security=security, **options)
     except Exception as error:  # no such host, nobody there, no TLS, another protocol
         why = " ".join(str(error).split())[:120] or type(error).__name__
         raise InputError(

@@ -11,7 +11,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from jaxtank.core.errors import InputError
 from tuning.cluster.parent import FOLDER
@@ -24,21 +24,40 @@ DASK_SETTINGS = {
 take 5 % of the core time. What the user has set stays.
 """
 
+CLOSED = {
+    "DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION": "True",
+    "DASK_DISTRIBUTED__SCHEDULER__HTTP__ROUTES": "[]",
+    "DASK_DISTRIBUTED__WORKER__HTTP__ROUTES": "[]",
+}
+"""Settings that a user's do not replace: no connection without a key of this run, no pages."""
+
 PATIENCE = 60.0
 """Time within which the scheduler must have started [s]."""
 
 
+class Workers(NamedTuple):
+    """A running scheduler: its address, a function that raises InputError where no worker is left,
+    the keys (`distributed.Security`) of its clients, and the words that give a worker its keys."""
+
+    address: str
+    check: Any
+    security: Any
+    words: list[str]
+
+
 @contextlib.contextmanager
 def local_workers(count):
-    """Run a scheduler and `count` workers of one thread on this machine.
+    """Run a scheduler and `count` workers of one thread on this machine, and give its Workers.
 
-    Gives its address, and a function that raises InputError where no worker is left. They listen on
-    127.0.0.1, leave signals of the terminal to this process, and end with it.
+    They listen on 127.0.0.1, to those who have the keys made for this run; they leave signals of
+    the terminal to this process, and end with it.
     """
     with tempfile.TemporaryDirectory(prefix="jaxtank-") as folder, contextlib.ExitStack() as stack:
-        file = Path(folder, "scheduler.json")
-        common = ["--host", "127.0.0.1", "--no-dashboard", "--preload", "tuning.cluster.parent"]
-        words = ["dask_scheduler", "--port", "0", "--scheduler-file", str(file), *common]
+        file, security = Path(folder, "scheduler.json"), _keys()
+        common = ["--host", "127.0.0.1", "--no-dashboard", "--dashboard-address", "127.0.0.1:0"]
+        common += ["--preload", "tuning.cluster.parent", *_key_files(security, folder)]
+        words = ["dask_scheduler", "--port", "0", "--protocol", "tls"]
+        words += ["--scheduler-file", str(file), *common]
         scheduler = stack.enter_context(_process(words, folder, {FOLDER: folder}))
         address = _address(file, scheduler)
         words = ["dask_worker", address, "--nthreads", "1", "--no-nanny", "--memory-limit", "0"]
@@ -51,7 +70,33 @@ def local_workers(count):
                     f"cluster: the workers on this machine have ended ({_last_line(folder)})"
                 )
 
-        yield address, check
+        yield Workers(address, check, security, _key_files(security, folder))
+
+
+def _keys():
+    """A certificate and its key, made anew: who has both is let in."""
+    from distributed import Security
+
+    try:
+        return Security.temporary()
+    except ImportError:
+        raise InputError(
+            "cluster local: needs keys for its connections: pip install cryptography, or"
+            ' ".[cluster]"'
+        ) from None
+
+
+def _key_files(security, folder):
+    """Write the keys into a folder of the user's alone; return the words that name them."""
+    texts = {"--tls-ca-file": security.tls_ca_file, "--tls-cert": security.tls_worker_cert}
+    texts["--tls-key"] = security.tls_worker_key
+    words = []
+    for option, text in texts.items():
+        path = Path(folder, option.lstrip("-") + ".pem")
+        path.touch(mode=0o600)
+        path.write_text(text)
+        words += [option, str(path)]
+    return words
 
 
 @contextlib.contextmanager
@@ -67,7 +112,7 @@ def _process(words, folder, more=None):
             stdout=log,
             stderr=log,
             start_new_session=True,
-            env={**DASK_SETTINGS, **os.environ, **_programs(), **own, **(more or {})},
+            env={**DASK_SETTINGS, **os.environ, **CLOSED, **_programs(), **own, **(more or {})},
         )
     try:
         yield found

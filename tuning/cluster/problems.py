@@ -45,18 +45,12 @@ def sent_problem(problem: Problem) -> tuple[tuple, list]:
             dataclasses.asdict(group.clock),
             [np.asarray(leaf) for leaf in group.leaves],
             group.apart,
-            *_sent_keys(group.keys),
+            None if group.keys is None else np.asarray(jax.random.key_data(group.keys)),
+            None if group.noise is None else np.asarray(group.noise),
         )
         for group in problem.groups
     ]
     return text, arrays
-
-
-def _sent_keys(keys):
-    """(array, True where it is noise that was drawn) of the keys of a group."""
-    if keys is None or not jax.numpy.issubdtype(keys.dtype, jax.dtypes.prng_key):
-        return (None if keys is None else np.asarray(keys)), True
-    return np.asarray(jax.random.key_data(keys)), False
 
 
 def received_problem(text: tuple, arrays: list) -> Problem:
@@ -75,8 +69,9 @@ def received_problem(text: tuple, arrays: list) -> Problem:
             jax.tree.structure(received(rig).loop),
             tuple(leaves),
             tuple(apart),
-            keys if drawn else jax.random.wrap_key_data(jax.numpy.asarray(keys)),
+            None if keys is None else jax.random.wrap_key_data(jax.numpy.asarray(keys)),
+            noise,
         )
-        for rig, mine, clock, leaves, apart, keys, drawn in arrays
+        for rig, mine, clock, leaves, apart, keys, noise in arrays
     ]
     return found

@@ -34,8 +34,8 @@ class GivenErrors(Sensor):
     3.1
     """
 
-    error: Any = leaf("cm", "error of each tank's reading at each sample")
-    top: tuple = static("cm", "(n,) highest level that can be read, None without an ADC")
+    error: Any = leaf("cm", "error of each tank's reading at each sample", shape=("sample", "tank"))
+    top: tuple = static("cm", "highest level that can be read, None without an ADC")
 
     def draw(
         self, key: jax.Array | None, samples: int, piece: Any | None = None
@@ -65,7 +65,7 @@ class PumpPlan(Controller):
     [0.0, 0.0, 12.0, 12.0]
     """
 
-    command: Any = leaf("V", "command of each window and pump")
+    command: Any = leaf("V", "command of each window and pump", shape=("window", "pump"))
     length: Any = leaf("s", "length of a window", low=0.0, strict=True)
 
     @pointwise
@@ -95,7 +95,9 @@ class Course:
     [0.1, 0.1, 0.2, 0.2]
     """
 
-    value: Any = leaf("-", "value of each entry in each window, in its own unit")
+    value: Any = leaf(
+        "-", "value of each entry in each window, in its own unit", shape=("window", "entry")
+    )
     length: Any = leaf("s", "length of a window", low=0.0, strict=True)
     names: tuple[str, ...] = static(doc="entries of the plant, as drain[1]")
     then: Faults | None = None

@@ -31,6 +31,8 @@ class Found:
         Whether the safety filter is proved to keep it; None without a filter.
     reason : str
         The theorem, or the condition that failed.
+    starts : str
+        Levels at t = 0 for which it is proved, "" where it is not.
     nominal, drawn, level : float
         Highest level of the case as it is, of random draws, and in all [cm].
     time_s : float
@@ -45,6 +47,7 @@ class Found:
     limit: float
     certified: bool | None
     reason: str
+    starts: str
     nominal: float
     drawn: float
     level: float

@@ -141,6 +141,7 @@ def _found(case, limits, levels, climbed):
             limit=float(limits.limit[i]),
             certified=None if limits.rows is None else limits.rows[i].certified,
             reason="" if limits.rows is None else limits.rows[i].reason,
+            starts="" if limits.rows is None else limits.rows[i].starts,
             nominal=float(levels[0, i]),
             drawn=float(levels[1:, i].max()),
             level=float(climbed.level[i]),

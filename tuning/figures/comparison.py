@@ -35,7 +35,8 @@ class Comparison(Shown):
     Attributes
     ----------
     pages : dict
-        {paper: {"citation", "notes", "rows"}}, as `jaxtank compare PAPER --json` has them.
+        {paper: page}, as `jaxtank compare PAPER --json` has it: {"citation", "notes", "headline",
+        "ramps", "rows"}.
     notes : tuple of str
         Warnings of the runs.
     """
@@ -45,7 +46,7 @@ class Comparison(Shown):
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """Every row, with its paper: quantity, unit, where, published, measured, verdict, why."""
+        """Every row, with its paper; keys as `jaxtank compare PAPER --json` has them."""
         return [{"paper": name} | row for name, page in self.pages.items() for row in page["rows"]]
 
     def count(self, verdict: str | None = None) -> int:
@@ -77,7 +78,8 @@ class Comparison(Shown):
 
     def _lines(self) -> list[Any]:
         rows = [[name, *map(str, counted)] for name, counted in self._counts()]
-        return [tables.table(rows, ["paper", *papers.VERDICTS]), *self.notes]
+        table = tables.table(rows, ["paper", *papers.VERDICTS])
+        return [table, papers.headline_text(self.rows), *self.notes]
 
     def __str__(self) -> str:
         return "\n".join(map(str, self._lines()))
@@ -87,7 +89,8 @@ class Comparison(Shown):
             [[name, *counted] for name, counted in self._counts()], ["paper", *papers.VERDICTS]
         )
         folded = (_folded(name, page["rows"]) for name, page in self.pages.items())
-        return counts + "".join(folded) + _noted(self.notes)
+        head = f"<p>{html.escape(papers.headline_text(self.rows))}</p>"
+        return head + counts + "".join(folded) + _noted(self.notes)
 
     def _counts(self) -> list[tuple[str, list[int]]]:
         """(paper, rows of each verdict), and their sums."""
@@ -123,7 +126,7 @@ def compare(*names: str) -> Comparison:
     >>> jax.config.update("jax_enable_x64", True)
     >>> found = tuning.compare("cascaded")
     >>> found.row("plant.rim")["verdict"], found.count("differs")
-    ('reproduced', 0)
+    ('input', 0)
     """
     chosen = list(dict.fromkeys(names)) or list(presets.PAPERS)
     for name in chosen:

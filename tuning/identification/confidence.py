@@ -120,7 +120,7 @@ class Spread:
         fit has taken from it (Marriott and Pope, Biometrika 41, 1954, 390).
         """
         estimation, size = self.estimation, self.moving.size
-        shape, dt = estimation.mask.shape, estimation.data.dt
+        shape, dt = estimation.mask.shape, estimation.data.steps
         residual, slopes = np.full(shape, np.nan), np.zeros((*shape, size))
         residual[estimation.mask] = self.residual
         slopes[estimation.mask] = self.fit.jacobian[:, self.moving]

@@ -16,16 +16,14 @@ import numpy as np
 from jaxtank.core.errors import DataError, InputError, nearest
 from jaxtank.core.files import refusal
 from jaxtank.core.text import printable
+from jaxtank.core.units import INPUTS, LEVELS, TIMES, VOLTS, canonical
 from jaxtank.loop.closed_loop import ClosedLoop
-from tuning.identification.data_checks import FLOWS, LENGTHS, VOLTS
-from tuning.identification.experiment import Log, log
+from tuning.identification.experiment import Log, check_hold, log
 
 LARGEST = 512 * 1024 * 1024  # bytes
 MOST_ROWS = 20_000_000
 LONGEST_CELL = 200  # characters
-TIMES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
-SHARES = {"-": 1.0, "1": 1.0, "%": 0.01}
-KNOWN = {**TIMES, **LENGTHS, **VOLTS, **FLOWS, **SHARES}
+KNOWN = {unit for table in (TIMES, *LEVELS, *INPUTS) for unit in table}
 NAMES = {
     "time": ("t", "time", "zeit"),
     "pump": ("pump", "u", "voltage", "input"),
@@ -46,7 +44,11 @@ class _Column(NamedTuple):
 
 
 def read_log(
-    path: str | Path, loop: ClosedLoop, columns: Mapping[str, Any] | None = None, decimal: str = "."
+    path: str | Path,
+    loop: ClosedLoop,
+    columns: Mapping[str, Any] | None = None,
+    decimal: str = ".",
+    hold: str = "",
 ) -> Log:
     """Read experiment data from a CSV file.
 
@@ -65,6 +67,8 @@ def read_log(
         is in other words; "none" leaves a level out.
     decimal : str
         Decimal sign, "." or ",".
+    hold : {"", "zero-order", "first-order"}
+        What inputs do between samples, as in `tuning.log`.
 
     Returns
     -------
@@ -75,7 +79,7 @@ def read_log(
     DataError
         For a file that cannot be read so, naming line and column.
     InputError
-        For `columns` or `decimal` that do not exist.
+        For `columns`, `decimal` or `hold` that do not exist.
 
     Examples
     --------
@@ -90,6 +94,7 @@ def read_log(
     [3.  3.  3.5] [1.  1.5 nan] (1,)
     """
     path = Path(path)
+    check_hold(hold)
     if decimal not in (".", ","):
         raise InputError(f"--decimal {decimal!r}: must be '.' or ','")
     text, name = _text(path), printable(path.name)
@@ -113,6 +118,7 @@ def read_log(
         lines=lines,
         headers=tuple(c.header for c in used),
         units=tuple(c.unit for c in used),
+        hold=hold,
     )
 
 
@@ -228,7 +234,7 @@ def split_header(header):
     if found:
         return found.group(1).strip(), found.group(2)
     stem, line, tail = header.rpartition("_")
-    if line and tail in KNOWN and not tail.isdigit():
+    if line and canonical(tail) in KNOWN and not tail.isdigit():
         return stem.strip(), tail
     return header.strip(), None
 
@@ -338,12 +344,14 @@ def _factor(kind, unit, length, drive, where):
         raise DataError(
             f"{where}: has no unit: write it in the header, as '{slot} [{base}]', or with --column"
         )
+    written, unit, base = unit, canonical(unit), canonical(base)
     if kind == "level" and unit in VOLTS and length not in VOLTS:
         return VOLTS[unit], True
-    choices = {"time": (TIMES,), "pump": (VOLTS, FLOWS, SHARES), "level": (LENGTHS, VOLTS)}[kind]
+    choices = {"time": (TIMES,), "pump": INPUTS, "level": LEVELS}[kind]
     table = next((t for t in choices if base in t), {base: 1.0})
     if unit not in table:
         raise DataError(
-            f"{where}: unit {unit!r} cannot be that of a {kind}: must be one of {', '.join(table)}"
+            f"{where}: unit {written!r} cannot be that of a {kind}: must be one of"
+            f" {', '.join(table)}"
         )
     return table[unit] / table[base], False

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from jaxtank.core.errors import DataError, InputError
-from jaxtank.core.units import DEFAULT
+from jaxtank.core.units import DEFAULT, FLOWS, LENGTHS, VOLTS, canonical
 
 RIM_MARGIN = 1.5
 """Reading, in rims of its tank, above which the column is taken to be in another unit."""
@@ -15,19 +15,11 @@ DRIVE_MARGIN = 2.0
 """The same of a pump's input, in its upper limits."""
 FAINT = 0.015
 """Share of its range below which a pump's input, or every level, is taken to be in another unit."""
+IRREGULAR = 1.25
+"""Ratio of a long to a short step between samples (90th and 10th percentile) above which they are
+no longer those of a controller's own clock, at which its outputs change."""
 FEWEST = 3
 """Fewest samples of a run that can be fitted: residuals have an autocorrelation from three on."""
-
-LENGTHS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 1e-3, "in": 0.0254, "inch": 0.0254}
-VOLTS = {"V": 1.0, "mV": 1e-3}
-FLOWS = {
-    "m^3/s": 1.0,
-    "cm^3/s": 1e-6,
-    "l/min": 1e-3 / 60,
-    "l/s": 1e-3,
-    "ml/s": 1e-6,
-    "l/h": 1e-3 / 3600,
-}
 
 
 def check_float64():
@@ -44,6 +36,7 @@ def check_data(logs, loop, gap):
         raise InputError("no log is given: identification needs experiment data")
     for one in logs:
         check_gaps(one, gap)
+        check_changes(one)
         check_fits(one, loop)
 
 
@@ -91,6 +84,27 @@ def check_gaps(found, most=1.5):
         )
 
 
+def check_changes(found):
+    """Raise DataError where nothing says when inputs changed between readings at irregular times.
+
+    Taken from its row's time on, an input acts later than it did: residuals grow 2 to 3 times, and
+    95 % intervals hold the truth in 40 to 70 % of such logs only.
+    """
+    low, high = np.quantile(np.diff(found.t), [0.1, 0.9])
+    changed = 1 + np.flatnonzero(np.any(np.diff(found.u, axis=0) != 0.0, axis=1))
+    unsure = changed[np.isfinite(found.y[changed]).any(axis=1)]
+    if found.hold or high <= IRREGULAR * low or 2 * len(unsure) <= len(changed):
+        return
+    k = unsure[0]
+    raise DataError(
+        f"{found.where(k)}: an input changed in the {found.t[k] - found.t[k - 1]:g} s before"
+        f" {found.t[k]:g} s, and samples come irregularly, every {low:g} to {high:g} s: when it"
+        " changed is not known, and intervals would exclude the truth. Add a row at the time of"
+        " each change, with its inputs and no readings; or state that inputs change at the times of"
+        " their rows, --hold zero-order, or along a line from row to row, --hold first-order"
+    )
+
+
 def check_fits(found, loop):
     """Raise DataError where the data cannot be of this rig.
 
@@ -134,7 +148,7 @@ def _check_input(found, loop, j, drive):
     _check_range(found, 1 + j, u, drive, ends, f"pump's upper limit is {top:g}")
     most = float(np.max(np.abs(u)))
     # limits in other units are often nominal
-    if np.isfinite(top) and 0 < most < FAINT * top and (drive in VOLTS or drive in FLOWS):
+    if np.isfinite(top) and 0 < most < FAINT * top and canonical(drive) in {**VOLTS, **FLOWS}:
         ends = (2 * FAINT * top, DRIVE_MARGIN * top)
         raise DataError(
             f"{found.where(column=1 + j)}: pump{j + 1} is never above {most:g} {drive}, where its"
@@ -184,8 +198,9 @@ def _check_range(found, index, column, unit, ends, limit):
 
 def _other_units(found, index, column, unit, ends):
     """Return a hint: the units in which a column, held in `unit`, would lie within `ends`."""
+    unit = canonical(unit)
     table = next((t for t in (LENGTHS, VOLTS, FLOWS) if unit in t), {unit: 1.0})
-    named = unit if found.units is None else found.units[index]
+    named = unit if found.units is None else canonical(found.units[index])
     written, slot = column * (table[unit] / table.get(named, table[unit])), found.slot(index)
     fits = [
         f"'{slot} [{u}]'"

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Case
 from jaxtank.core.errors import EquilibriumError, InputError
+from jaxtank.loop.steady import steady_state
 from jaxtank.plants.runge_kutta import advance
 from tuning.identification import simulation
 from tuning.identification.confidence import VAGUE
@@ -110,9 +110,7 @@ def _operating_point(loop):
     found = np.asarray(loop.actuator.initial, dtype=float)
     try:
         if not np.all(found > 0.02 * high):
-            found = np.asarray(
-                equilibrium(plant, np.asarray(loop.reference.initial))[1], dtype=float
-            )
+            found = np.asarray(steady_state(loop, np.asarray(loop.reference.initial))[1])
     except (AttributeError, EquilibriumError, InputError):
         pass
     if not (np.all(np.isfinite(found)) and np.all(found > 0.02 * high)):

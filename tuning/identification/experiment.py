@@ -9,7 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxtank.core.errors import DataError
+from jaxtank.core.errors import DataError, InputError
+
+HOLDS = ("", "zero-order", "first-order")
+"""What inputs do between samples; "": not known, zero-order where samples are regular."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -21,7 +24,7 @@ class Log:
     t : (samples,) array
         Sample times [s], increasing.
     u : (samples, pumps) array
-        Pump inputs in the rig's unit, each held until the next sample.
+        Pump inputs in the rig's unit; between samples as `hold` says.
     y : (samples, channels) array
         Readings, NaN where one is missing.
     tanks : tuple of int
@@ -35,6 +38,8 @@ class Log:
         Line of the file that holds each sample.
     headers, units : tuple or None
         Column names in the file, and the units they were in: of t, of u and of y.
+    hold : {"", "zero-order", "first-order"}
+        As in `tuning.log`.
 
     Examples
     --------
@@ -55,6 +60,7 @@ class Log:
     lines: np.ndarray | None = None
     headers: tuple | None = None
     units: tuple | None = None
+    hold: str = ""
 
     @property
     def samples(self) -> int:
@@ -98,6 +104,7 @@ def log(
     lines: ArrayLike | None = None,
     headers: tuple | None = None,
     units: tuple | None = None,
+    hold: str = "",
 ) -> Log:
     """Return experiment data from arrays, for `tuning.identify`.
 
@@ -106,15 +113,20 @@ def log(
     t : (samples,) array
         Sample times [s], increasing; at least two.
     u : (samples,) or (samples, pumps) array
-        Pump inputs in the rig's unit, each held until the next sample.
+        Pump inputs in the rig's unit, one for each sample.
     y : (samples,) or (samples, channels) array
-        Readings, NaN where one is missing.
+        Readings, NaN where one is missing. A sample without a reading gives the time at which an
+        input changed between two readings.
     tanks : sequence of int, optional
         Tank of each channel, counted from 0; 0, 1, ... by default.
     in_volts : sequence of bool, optional
         Whether each channel is the sensor's voltage; False by default: a level in the rig's unit.
     name, lines, headers, units
         As in `Log`, for messages.
+    hold : {"", "zero-order", "first-order"}
+        Inputs between samples: "zero-order", each held until the next sample; "first-order", a
+        straight line from sample to sample. "": zero-order; `identify` refuses it where readings
+        come at irregular times and inputs change from one to the next.
 
     Returns
     -------
@@ -124,6 +136,8 @@ def log(
     ------
     DataError
         For shapes that do not agree, inputs that are not finite, and times that do not increase.
+    InputError
+        For an unknown `hold`.
 
     Examples
     --------
@@ -136,6 +150,7 @@ def log(
     ...
     jaxtank.core.errors.DataError: log, sample 2: time 0 s is that of the sample before: times ...
     """
+    check_hold(hold)
     t, u, y = _arrays(name, t, u, y)
     tanks = tuple(range(y.shape[1])) if tanks is None else tuple(int(i) for i in tanks)
     in_volts = (False,) * len(tanks) if in_volts is None else tuple(bool(v) for v in in_volts)
@@ -156,6 +171,7 @@ def log(
         lines=None if lines is None else np.asarray(lines),
         headers=headers,
         units=units,
+        hold=hold,
     )
     if len(t) < 2:
         raise DataError(
@@ -164,6 +180,12 @@ def log(
     _check_finite(found)
     _check_times(found)
     return found
+
+
+def check_hold(hold: str) -> None:
+    """Raise InputError for what inputs cannot do between samples."""
+    if hold not in HOLDS:
+        raise InputError(f"hold = {hold!r}: must be one of {', '.join(HOLDS[1:])}")
 
 
 def _arrays(name, t, u, y):

@@ -175,6 +175,7 @@ def _what(case, logs, partial, **options):
         case,
         command="identify",
         logs=digest(*(v for one in logs for v in (one.t, one.u, one.y))),
+        hold=[one.hold for one in logs],
         free=partial.bounds,
         held_back=[one.samples for one in partial.logs],
         noise=partial.noise,

@@ -75,7 +75,7 @@ def with_pi(case, inputs):
     table = {"kind": "pid", "Kc": Kc.tolist(), "Ti": Ti.tolist(), "Tt": Ti.tolist()} | (
         {} if moving else {"bias": inputs.tolist()}
     )
-    controller = controller_of(table, plant, start, loop.actuator.initial)
+    controller = controller_of(table, loop)
     free = {n: f for n, f in case.free.items() if not n.startswith("controller.")}
     free |= {"controller.Kc": Free(float(Kc.min() / 30), float(Kc.max() * 30))}
     free |= {"controller.Ti": Free(float(Ti.min() / 10), float(Ti.max() * 10))}

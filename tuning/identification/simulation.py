@@ -34,7 +34,7 @@ class Rig:
     sensor: LevelSensor
     actuator: Actuator
     disturbance: Constant | None = None
-    x0: np.ndarray = leaf("cm", "(n,) levels at the first sample", low=0.0)
+    x0: np.ndarray = leaf("cm", "levels at the first sample", low=0.0, shape=("tank",))
 
     @property
     def units(self):
@@ -65,7 +65,8 @@ def rig_of(loop):
 class PaddedData(NamedTuple):
     """Experiment data of several runs as arrays, padded to the longest.
 
-    The padding has steps of length zero and no readings.
+    The padding has steps of length zero and no readings. Where inputs change between samples, dt
+    and u have an axis of pieces behind that of the samples, those not in use of length zero.
     """
 
     dt: np.ndarray  # (logs, samples) time to the next sample [s], 0 at the last one and after
@@ -73,39 +74,72 @@ class PaddedData(NamedTuple):
     y: np.ndarray  # (logs, samples, channels), NaN where there is no reading
     channels: tuple  # ((tank, in volts), ...)
 
+    @property
+    def steps(self):
+        """(logs, samples) time to the next sample [s]."""
+        return self.dt if self.dt.ndim == 2 else self.dt.sum(axis=-1)
+
 
 def padded(logs, delay=0.0, samples=0):
     """Return the PaddedData of a list of Log.
 
-    delay: transport delay of the pumps [s]: an input reaches its tank at the first sample that is
-    at least as late. samples: least length to pad to, so that truncated data run through the same
+    delay: transport delay of the pumps [s], any; an input reaches its tank at its own time, also
+    between samples. samples: least length to pad to, so that truncated data run through the same
     compiled program as whole ones.
     """
     channels = tuple(sorted({pair for one in logs for pair in zip(one.tanks, one.in_volts)}))
     n = max(samples, *(one.samples for one in logs))
-    dt, u = np.zeros((len(logs), n)), np.zeros((len(logs), n, logs[0].u.shape[1]))
+    parts = [_pieces(one, delay) for one in logs]
+    most = max(dt.shape[1] for dt, _ in parts)
+    dt, u = np.zeros((len(logs), n, most)), np.zeros((len(logs), n, most, logs[0].u.shape[1]))
     y = np.full((len(logs), n, len(channels)), np.nan)
-    for e, one in enumerate(logs):
-        dt[e, : one.samples - 1] = np.diff(one.t)
-        u[e, : one.samples] = _delayed(one, delay)
+    for e, (one, (lengths, inputs)) in enumerate(zip(logs, parts)):
+        dt[e, : one.samples, : lengths.shape[1]] = lengths
+        u[e, : one.samples, : lengths.shape[1]] = inputs
         for c, pair in enumerate(zip(one.tanks, one.in_volts)):
             y[e, : one.samples, channels.index(pair)] = one.y[:, c]
+    if most == 1:
+        dt, u = dt[:, :, 0], u[:, :, 0]
     return PaddedData(dt, u, y, channels)
 
 
-def _delayed(one, delay):
-    """Return (samples, pumps) inputs of a Log as they reach the tanks `delay` [s] later."""
-    k = np.searchsorted(one.t, one.t - delay + 1e-9 * max(1.0, delay), side="right") - 1
-    return one.u[np.maximum(k, 0)]
+def _pieces(one, delay):
+    """Return (samples, pieces) lengths [s] and (samples, pieces, pumps) inputs of a Log: the steps
+    between its samples, cut where an input that reaches the tanks `delay` [s] later changes.
+    """
+    near = 1e-9 * max(1.0, delay, float(np.abs(one.t).max()))
+    changed = 1 + np.flatnonzero(np.any(np.diff(one.u, axis=0) != 0.0, axis=1))
+    cuts = one.t[changed] + delay
+    if one.hold == "first-order":  # two pieces for each slope: one would delay its volume
+        start, end = one.t[changed - 1] + delay, cuts
+        cuts = np.unique(np.concatenate([start, 0.5 * (start + end), end]))
+    after = np.minimum(np.searchsorted(one.t, cuts - near), one.samples - 1)
+    inside = (np.abs(cuts - one.t[after]) > near) & (cuts > one.t[0]) & (cuts < one.t[-1])
+    edges = np.sort(np.concatenate([one.t, cuts[inside]]))
+    step = np.searchsorted(one.t, edges, side="right") - 1  # the sample before
+    piece = np.arange(len(edges)) - np.searchsorted(edges, one.t)[step]
+    lengths = np.append(np.diff(edges), 0.0)
+    command = edges + lengths / 2 - delay
+    if one.hold == "first-order":
+        levels = np.stack([np.interp(command, one.t, v) for v in one.u.T], axis=-1)
+    else:
+        levels = one.u[np.maximum(np.searchsorted(one.t, command, side="right") - 1, 0)]
+    shape = (one.samples, int(piece.max()) + 1)
+    dt, u = np.zeros(shape), np.zeros((*shape, one.u.shape[1]))
+    dt[step, piece], u[step, piece] = lengths, levels
+    return dt, u
 
 
 def readings(rig, dt, u, channels, substeps):
     """Return (samples, channels) readings without noise, in the channels' units.
 
-    dt: (samples,) [s]; u: (samples, pumps) held until the next sample; each sample takes `substeps`
-    steps of fourth-order Runge-Kutta.
+    dt: (samples,) [s]; u: (samples, pumps) held until the next sample, both with an axis of pieces
+    behind that of the samples where `padded` has cut them; each takes `substeps` steps of
+    fourth-order Runge-Kutta.
     """
-    x, d = tuple(rig.x0[i] + 0.0 * dt[0] for i in range(rig.plant.tanks)), None
+    if dt.ndim == 1:
+        dt, u = dt[:, None], u[:, None]
+    x, d = tuple(rig.x0[i] + 0.0 * dt[0, 0] for i in range(rig.plant.tanks)), None
     if rig.disturbance is not None:
         d = tuple(rig.disturbance.level[i] for i in range(rig.plant.tanks))
     state = jax.tree.map(
@@ -113,10 +147,7 @@ def readings(rig, dt, u, channels, substeps):
         rig.actuator.init(Clock(dt=1.0, duration=1.0)),
     )
 
-    def body(carry, now):
-        x, state = carry
-        step, inputs = now
-        out = tuple(_reading(rig, x, channel) for channel in channels)
+    def piece(x, state, step, inputs):
         # experiment data hold the command, which may lie beyond the pump's limits
         inputs = tuple(
             clip(v, rig.actuator.low[j], rig.actuator.high[j]) for j, v in enumerate(inputs)
@@ -124,10 +155,21 @@ def readings(rig, dt, u, channels, substeps):
         held = jnp.where(step > 0, step, 1.0)  # no division by zero in the padding
         driven, state = rig.actuator.step(state, inputs, held)
         driven = rig.actuator.driving(driven)
-        found = advance(rig.plant, "rk4", 0.0, x, driven, d, step, substeps, rolled=True)
-        return (found.x, state), out
+        return advance(rig.plant, "rk4", 0.0, x, driven, d, step, substeps, rolled=True).x, state
 
-    xs = (dt, tuple(u[:, j] for j in range(rig.plant.pumps)))
+    def body(carry, now):
+        out = tuple(_reading(rig, carry[0], channel) for channel in channels)
+        x, state = piece(*carry, *now[0])
+        for step, inputs in now[1:]:
+            after = piece(x, state, step, inputs)
+            # a piece of length zero is none: a pump with memory would see a sample
+            x, state = jax.tree.map(
+                lambda new, old, step=step: jnp.where(step > 0, new, old), after, (x, state)
+            )
+        return (x, state), out
+
+    pumps = range(rig.plant.pumps)
+    xs = tuple((dt[:, i], tuple(u[:, i, j] for j in pumps)) for i in range(dt.shape[1]))
     return jnp.stack(scan(body, (x, state), xs, length=dt.shape[0])[1], axis=-1)
 
 

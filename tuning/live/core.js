@@ -242,6 +242,23 @@ function marginsOf(limits, measures) {
   return found.sort((a, b) => share(a) - share(b));
 }
 
+const OFF = 0.05; // share of a tank's height by which a level may miss its setpoint
+
+// where a level is farthest from its setpoint at the end of a plateau: {tank, error, setpoint, time, share}, or null
+function farthest(run, outputs, rimOf) {
+  let worst = null;
+  outputs.forEach((tank, o) => {
+    const r = run.r[o], h = run.h[tank], last = r.length - 1, rim = rimOf(tank);
+    const height = Number.isFinite(rim) && rim !== null ? rim : Math.max(...extent([r]).map(Math.abs)) || 1;
+    for (let k = 1; k <= last; k += 1) {
+      if (r[k] !== r[k - 1] || (k < last && r[k + 1] === r[k])) continue;
+      const error = Math.abs(h[k] - r[k]), share = error / height;
+      if (worst === null || share > worst.share) worst = { tank, error, setpoint: r[k], time: run.t[k], share };
+    }
+  });
+  return worst;
+}
+
 // a quantile of numbers, between the nearest two
 function quantile(sorted, share) {
   const at = share * (sorted.length - 1), k = Math.floor(at);

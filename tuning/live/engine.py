@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.case import Case
+from jaxtank.controllers import OpenLoop
 from jaxtank.export.whole.array_values import called
 from jaxtank.export.whole.loop import WholeLoop, traced_leaves, whole_loop
 from jaxtank.export.whole.tangents import TangentLoop, tangent_loop
@@ -226,6 +227,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
             "default_on": loop.safety_filter is not None,
         },
         "noise": bool(np.any(np.asarray(loop.sensor.noise) > 0)),
+        "tracks": not isinstance(loop.controller, OpenLoop),
     }
 
 
@@ -241,7 +243,8 @@ def _measure(case, name, entries):
 
 
 def _limits(case):
-    found = []
+    found, rims = [], isinstance(case.limits.get("max_level"), str)
+    rim = "plant.rim[{}]" if np.ndim(case.loop.plant.rim) else "plant.rim"
     for limit in resolve_limits(case):
         one = ms.MEASURES[limit.measure].per == "run"
         side = "upper" if limit.sign > 0 else "lower"
@@ -254,6 +257,10 @@ def _limits(case):
                 "unit": ms.unit(limit.measure, case.loop.units),
                 "scale": float(limit_scale(limit, case.loop)),
                 "nan_holds": bool(ms.MEASURES[limit.measure].nan_holds),
+                # the parameter that this limit is, where it is no number of its own
+                "follows": rim.format(limit.index)
+                if rims and limit.measure == "max_level"
+                else None,
                 side: float(limit.value),
             }
         )

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxtank import measures as ms
@@ -20,6 +21,7 @@ from jaxtank.loop.rows_and_measures import rows_and_measures
 from tuning.answer.setting import plants_of
 from tuning.problem.bounds import Bound, bounds
 from tuning.problem.scenarios import COARSE, noisy
+from tuning.problem.slopes import contradicted
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import check_whole, probabilities
 
@@ -58,6 +60,8 @@ class Moved:
     measures : {measure: (plants, ...)} of MEASURED.
     nominal : {measure: value or (tanks,)} of the plant as the case states it.
     slopes : {measure: (..., parameters)} exact derivatives of `nominal`.
+    steps : (parameters,) change of each by MORE, of its value or, where that is 0, of its range.
+    changes : {measure: (2, parameters, ...)} of `nominal` by runs with that much more and less.
     failed : (plants,) True where the run diverged; those are in no quantile.
     """
 
@@ -69,6 +73,8 @@ class Moved:
     measures: Mapping[str, np.ndarray]
     nominal: Mapping[str, np.ndarray]
     slopes: Mapping[str, np.ndarray]
+    steps: np.ndarray
+    changes: Mapping[str, np.ndarray]
     failed: np.ndarray
 
 
@@ -134,7 +140,7 @@ class Fan:
         values = self._checked(values or {})
         with jax.enable_x64(True):
             found = self.program(self.case.loop, self.rows, self.keys, values)
-        rows, measures, broken, nominal, slopes = jax.tree.map(np.asarray, found)
+        rows, measures, broken, nominal, slopes, beside = jax.tree.map(np.asarray, found)
         good = ~broken
         x, u = (_quantiles(v, good) for v in (rows.x, rows.u))
         # those of the reference are the same on every plant
@@ -147,6 +153,8 @@ class Fan:
             measures=measures,
             nominal=nominal,
             slopes=slopes,
+            steps=np.array([self._step(b, values[b.name]) for b in self.bounds]),
+            changes={m: v - nominal[m] for m, v in beside.items()},
             failed=broken,
         )
 
@@ -165,7 +173,18 @@ class Fan:
         order = tuple(b.name for b in self.bounds)  # that of `values` is by name inside jit
         at = tuple(values[name] for name in order)
         nominal, slopes, _, _ = sensitivities_compiled(loop, clock, names, order, at, key)
-        return saved, measures, broken, nominal, slopes
+
+        def run(at):
+            here = with_values(loop, dict(zip(order, at)))
+            return lp.evaluate_and_flag(here, clock, names, key)[0]
+
+        moves = jnp.diag(jnp.stack([self._step(b, v) for b, v in zip(self.bounds, at)]))
+        beside = jax.vmap(jax.vmap(run))(jnp.stack(at) + jnp.stack([moves, -moves]))
+        return saved, measures, broken, nominal, slopes, beside
+
+    def _step(self, b: Bound, value: Any) -> Any:
+        """The change by MORE of a parameter at a value."""
+        return MORE * jnp.where(value == 0, b.high - b.low, jnp.abs(value))
 
     def _checked(self, values: Mapping[str, float]) -> dict[str, float]:
         """All values as numbers, in the order of the bounds."""
@@ -198,7 +217,8 @@ class Fan:
         """Return the fan in words: plants over a rim, error, effect of each parameter.
 
         The effect of 10 % more of a parameter is 0.1 times its value times the exact derivative on
-        the plant of the case; of the highest levels the one that changes most.
+        the plant of the case, or where runs contradict that by orders of magnitude the change that
+        such a run shows; of the highest levels the one that changes most.
         """
         over, length = self.over(moved), self.case.loop.units[0]
         good = ~moved.failed
@@ -221,16 +241,24 @@ class Fan:
     def _effect(self, moved: Moved, k: int, b: Bound) -> str:
         """What 10 % more of one parameter changes."""
         value, length = moved.values[b.name], self.case.loop.units[0]
-        by = MORE * abs(value) if value else MORE * (b.high - b.low)
+        by, names = moved.steps[k], ("rms_error_total", "max_level")
         words = f"10 % more {b.name}" if value else f"{b.name} + {by:.3g} {b.unit}"
-        error = by * float(moved.slopes["rms_error_total"][..., k])
-        levels = by * np.asarray(moved.slopes["max_level"])[:, k]
-        if not (np.isfinite(error) and np.isfinite(levels).all()):
-            return f"{words}: no derivative here, the run diverges"
+        effects = {m: by * moved.slopes[m][..., k] for m in names}
+        runs = {m: moved.changes[m][:, k] for m in names}
+        note = ""
+        if any(
+            np.any(contradicted(np.stack([v, -v]), runs[m], moved.nominal[m]))
+            for m, v in effects.items()
+        ):
+            effects = {m: change[0] for m, change in runs.items()}
+            note = " (by a run: the derivative is that of a chaotic or exploding loop)"
+        error, levels = (np.ravel(effects[m]) for m in names)
+        if not (np.isfinite(error).all() and np.isfinite(levels).all()):
+            return f"{words}: no effect to report, the run diverges"
         tank = int(np.argmax(np.abs(levels)))
         return (
-            f"{words}: error {error:+.2g} {length},"
-            f" highest level {levels[tank]:+.2g} {length} at tank {tank + 1}"
+            f"{words}: error {error[0]:+.2g} {length},"
+            f" highest level {levels[tank]:+.2g} {length} at tank {tank + 1}{note}"
         )
 
 

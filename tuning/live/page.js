@@ -50,6 +50,19 @@ function effective() {
 
 const options = () => ({ seed: state.seed, filter: state.filter === true });
 
+// the value of a leaf or of its entry in the loop as it runs, else what the case has
+const inForce = (name, otherwise) => effective()[name] ?? byName.get(name)?.value ?? otherwise;
+const rimOf = (i) => inForce(`plant.rim[${i}]`, inForce("plant.rim", info.tanks[i].rim));
+const pumpOf = (j) => ({
+  lower: inForce(`actuator.low[${j}]`, info.pumps[j].lower), upper: inForce(`actuator.high[${j}]`, info.pumps[j].upper),
+});
+
+// the limits of the loop as it runs: those at a rim follow its slider
+const limitsNow = () => info.limits.map((limit) => {
+  const upper = limit.follows ? inForce(limit.follows, limit.upper) : null;
+  return upper === null ? limit : { ...limit, upper, scale: upper };
+});
+
 // engine.run, as this page prints its measures
 function runOf({ values, options: own }) {
   const found = engine.run(values, own);
@@ -136,6 +149,7 @@ function settle() {
   if (rows < 400 && data.drawn > 1 && current && current.t.length < info.samples && !slow) touch(1);
   if (!framed) history.replaceState(null, "", linkOf(linked(), leaves));
   describe();
+  if (!folded.isConnected) fold();
   if ($("plants").getAttribute("aria-pressed") === "true" && !bands && !worker) manyPlants(false);
 }
 
@@ -200,12 +214,12 @@ function atTime(time) {
   const column = (list) => list.map((values) => values[k]);
   const h = column(current.h), r = column(current.r), u = column(current.u);
   const share = u.map((v, j) => {
-    const { lower, upper } = info.pumps[j];
+    const { lower, upper } = pumpOf(j);
     return upper > lower ? clamp((v - lower) / (upper - lower), 0, 1) : 0.5;
   });
   const before = Math.max(0, k - 1);
   const spills = (current.spilled ?? []).map((values) => values[k] > values[before]);
-  if (rig) rig.update({ h, r, u, share, spills });
+  if (rig) rig.update({ h, r, u, share, spills, rims: info.tanks.map((_, i) => rimOf(i)) });
   charts.forEach(({ spec, read }) => {
     const { what, index, output, unit } = spec;
     const target = what === "h" && output >= 0 ? `, setpoint ${shown(r[output])}` : "";
@@ -229,20 +243,9 @@ const cells = (value) =>
     .map((v) => shown(v)).join(", ");
 
 function showTables() {
-  const margins = marginsOf(info.limits, current.measures);
-  const worst = margins[0];
-  let verdict = "", good = true;
-  if (current.broken) {
-    verdict = "The run diverged: a level stopped being finite.";
-    good = false;
-  } else if (worst) {
-    good = worst.margin >= 0;
-    const which = `${limitWords(worst.limit)}: ${shown(worst.value)} ${worst.limit.unit}`;
-    verdict = good
-      ? `Every limit holds, smallest margin ${shown(worst.margin, 3)} ${worst.limit.unit}`
-      : `Limit exceeded by ${shown(-worst.margin, 3)} ${worst.limit.unit}: ${which}`;
-  }
-  $("verdict").textContent = verdict;
+  const margins = marginsOf(limitsNow(), current.measures);
+  const { words, good } = verdictOf(current, margins);
+  $("verdict").textContent = words;
   $("verdict").className = good ? "good" : "bad";
   const pinned = pins[pins.length - 1];
   fill($("margins"), "Limits", ["", "value", "margin"], margins.map(({ limit, value, margin }) => ({
@@ -257,6 +260,31 @@ function showTables() {
     cells: [cells(current.measures[m.name]), ...(pinned ? [cells(pinned.run.measures[m.name])] : [])],
   }));
   fill($("measures"), "Measures", ["", "now", ...(pinned ? [pinned.name] : [])], rows);
+}
+
+// {words, good} of a run: its limits and, at the end of each plateau, its setpoints
+function verdictOf(found, margins) {
+  if (found.broken) return { words: "The run diverged: a level stopped being finite.", good: false };
+  const worst = margins[0], parts = [];
+  let good = true;
+  if (worst) {
+    good = worst.margin >= 0;
+    const which = `${limitWords(worst.limit)}: ${shown(worst.value)} ${worst.limit.unit}`;
+    parts.push(good
+      ? `Every limit holds, smallest margin ${shown(worst.margin, 3)} ${worst.limit.unit}`
+      : `Limit exceeded by ${shown(-worst.margin, 3)} ${worst.limit.unit}: ${which}`);
+  }
+  const off = info.tracks ? farthest(found, info.outputs, rimOf) : null;
+  if (off) {
+    const { length } = info.units, far = off.share > OFF;
+    good &&= !far;
+    parts.push(far
+      ? `${info.tanks[off.tank].name} is ${shown(off.error, 3)} ${length} from its setpoint of ${
+        shown(off.setpoint, 3)} ${length} at ${shown(off.time)} s`
+      : `setpoints reached within ${shown(off.error, 3)} ${length}`);
+    if (far) parts.reverse();
+  }
+  return { words: parts.join("; "), good };
 }
 
 // e.g. "max_level of tank 3"
@@ -380,9 +408,46 @@ function makeSliders() {
     const count = make("span", { class: "unit" }, ` ${own.length}`);
     const group = make("details", { class: "group" }, make("summary", {}, name, count), ...own.map(slider));
     group.open = rank(name) === 0 || (!groups.has(order[0]) && rank(name) === 1);
+    for (const leaf of own) rows.get(leaf.name).home = group;
     if (name === "sensor" && info.noise) group.append(seedRow());
     $("groups").append(group);
   }
+  folded.addEventListener("toggle", () => folded.open && fold());
+}
+
+// sliders that change nothing in the run as it is are folded away; told by a worker of its own
+const folded = make("details", { class: "group", id: "idle" }, make("summary", {}, "no effect on this run",
+  make("span", { class: "unit" })), make("p", { class: "hint" },
+  "The run is the same at both ends of these sliders. Opening this group tries them again."));
+let trying = null;
+
+function fold() {
+  if (slow || trying) return;
+  const limits = new Set(info.limits.map(({ follows }) => follows));
+  const tried = leaves.filter(({ name }) => rows.has(name) && !state.free.has(name) && !limits.has(name));
+  const names = tried.map((leaf) => {
+    const { low, high } = scaleOf(leaf);
+    return { name: leaf.name, ends: [high, low] };
+  });
+  trying = newWorker();
+  const end = () => {
+    trying.terminate();
+    trying = null;
+  };
+  trying.onerror = end;
+  trying.onmessage = ({ data: answer }) => {
+    end();
+    if (answer.kind !== "effects") return;
+    rows.forEach(({ row, home }, name) => (answer.without.includes(name) ? folded : home).append(row));
+    $("groups").append(folded);
+    for (const group of $("groups").children) {
+      const count = group.querySelectorAll(".row").length;
+      group.querySelector("summary .unit").textContent = ` ${count}`;
+      group.classList.toggle("empty", !count);
+    }
+    search();
+  };
+  trying.postMessage({ kind: "effects", values: effective(), names, every: Math.ceil(info.samples / 400), ...options() });
 }
 
 function seedRow() {
@@ -408,7 +473,7 @@ function search() {
       here ||= !row.hidden;
     });
     group.hidden = !here;
-    if (words.length && here) group.open = true;
+    if (words.length && here && group !== folded) group.open = true;
     any ||= here;
   }
   $("nothing").hidden = any;
@@ -504,7 +569,7 @@ function tuneNow() {
   const alone = data.scenarios ? ` For this run alone; jaxtank tune takes the mean of ${data.scenarios} scenario${data.scenarios > 1 ? "s" : ""}.` : "";
   const words = (found) => `objective ${shown(found.objective)}${
     found.violation > 0 ? `, limits exceeded by ${shown(100 * found.violation, 3)} %` : ""}`;
-  ask({ kind: "tune", values: start, free: names, limits: info.limits, ...options() }, {
+  ask({ kind: "tune", values: start, free: names, limits: limitsNow(), ...options() }, {
     progress(now) {
       if (!best || now.values) best = now;
       say(`Tuning ${names.length === 1 ? "one parameter" : `${names.length} parameters`}: iteration ${now.iterations}, ${words(now)}`);
@@ -542,7 +607,7 @@ function manyPlants(spoken = true) {
     values[leaf.name] = now[leaf.name] ?? leaf.value;
   }
   ask({
-    kind: "plants", count: 64, values: { ...now, ...values }, spread, limits: info.limits, ...options(),
+    kind: "plants", count: 64, values: { ...now, ...values }, spread, limits: limitsNow(), ...options(),
     measures: [...new Set(info.limits.map((limit) => limit.measure))],
     every: Math.max(1, Math.ceil(info.samples / 400)),
   }, {
@@ -661,15 +726,26 @@ function makeCharts() {
   const on = { cursor: atTime, zoom: once, whole: () => zoom(0, info.duration) };
   const { length, drive } = info.units;
   info.tanks.forEach((tank, i) => {
-    const rim = tank.rim === null || tank.rim === undefined ? [] : [{ value: tank.rim, words: `rim ${shown(tank.rim)} ${length}` }];
-    const output = info.outputs.indexOf(i);
+    const rim = rimOf(i), output = info.outputs.indexOf(i);
+    const limits = rim === null || rim === undefined ? [] : [{
+      get value() { return rimOf(i); },
+      get words() { return `rim ${shown(rimOf(i))} ${length}`; },
+    }];
+    for (const { measure, entry, upper, lower, follows } of info.limits) {
+      const value = upper ?? lower;
+      if (entry === i && !follows && ["max_level", "min_level"].includes(measure) && value !== rim && value > 0)
+        limits.push({ value, words: `limit ${shown(value)} ${length}` });
+    }
     charts.push(makeChart($("panels"), {
-      kind: "level", what: "h", index: i, output, unit: length, zero: true, limits: rim,
-      forbidden: tank.rim, title: `${tank.name}${output >= 0 ? ", controlled" : ""} [${length}]`,
+      kind: "level", what: "h", index: i, output, unit: length, zero: true, limits,
+      get forbidden() { return rimOf(i); }, title: `${tank.name}${output >= 0 ? ", controlled" : ""} [${length}]`,
     }, view, on));
   });
   info.pumps.forEach((pump, j) => {
-    const ends = [pump.lower, pump.upper].map((value, k) => ({ value, words: k ? `at most ${shown(value)} ${drive}` : "" }));
+    const ends = ["lower", "upper"].map((end) => ({
+      get value() { return pumpOf(j)[end]; },
+      get words() { return end === "upper" ? `at most ${shown(pumpOf(j).upper)} ${drive}` : ""; },
+    }));
     charts.push(makeChart($("panels"), {
       kind: "input", what: "u", index: j, unit: drive, zero: true, title: `${pump.name} [${drive}]`,
       limits: ends.filter(({ value }) => Number.isFinite(value) && Math.abs(value) < 100 * (1 + Math.abs(info.pumps[j].typical ?? 1))),

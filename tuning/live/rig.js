@@ -31,9 +31,9 @@ function makeRig(svg, rig, info) {
   const spills = rig.overflows.map(([tank, path]) => [tank, line(path, "spill")]);
   const tanks = rig.boxes.map(([x, y, width, height, scale], i) => {
     const place = { x: X(x), width: width * UNIT };
-    add("rect", { class: "inside", ...place, y: Y(y + height), height: height * UNIT });
+    const inside = add("rect", { class: "inside", ...place, y: Y(y + height), height: height * UNIT });
     const water = add("rect", { class: "water", ...place, y: Y(y), height: 0 });
-    return { x, y, width, height, scale, water, controlled: info.outputs.includes(i) };
+    return { x, y, width, height, scale, inside, water, controlled: info.outputs.includes(i) };
   });
   rig.pipes.forEach(([x0, x1, y]) => {
     line([[x0, y], [x1, y]], "pipe");
@@ -42,7 +42,7 @@ function makeRig(svg, rig, info) {
   tanks.forEach((tank, i) => {
     const { x, y, width, height } = tank;
     const wall = [[x, y + height], [x, y], [x + width, y], [x + width, y + height]];
-    line(wall, tank.controlled ? "wall controlled" : "wall");
+    tank.wall = line(wall, tank.controlled ? "wall controlled" : "wall");
     const middle = { x: X(x + width / 2), "text-anchor": "middle" };
     const small = width < 0.7 ? " small" : "";
     add("text", { ...middle, y: Y(y + height / 2) - 4, class: `halo${small}` }, shortened(info.tanks[i].name));
@@ -58,7 +58,15 @@ function makeRig(svg, rig, info) {
   return {
     update(now) {
       tanks.forEach((tank, i) => {
-        const level = now.h[i];
+        const level = now.h[i], rim = now.rims[i];
+        if (Number.isFinite(rim) && rim !== null && rim !== tank.rim) { // as high as its slider says
+          const { x, y, width } = tank;
+          tank.rim = rim;
+          tank.height = Math.min(rim * tank.scale, 1.2);
+          tank.wall.setAttribute("points", points([[x, y + tank.height], [x, y], [x + width, y], [x + width, y + tank.height]]));
+          tank.inside.setAttribute("y", Y(y + tank.height));
+          tank.inside.setAttribute("height", tank.height * UNIT);
+        }
         const deep = clamp((Number.isFinite(level) ? level : 0) * tank.scale, 0, 1.05 * tank.height);
         tank.water.setAttribute("y", Y(tank.y + deep));
         tank.water.setAttribute("height", deep * UNIT);
@@ -72,7 +80,7 @@ function makeRig(svg, rig, info) {
       });
       risers.forEach(([pump, node]) => node.setAttribute("stroke-opacity", 0.25 + 0.75 * now.share[pump]));
       jets.forEach(([tank, node]) => {
-        const part = now.h[tank] / info.tanks[tank].rim || 0;
+        const part = now.h[tank] / now.rims[tank] || 0;
         node.setAttribute("stroke-opacity", clamp(0.15 + Math.sqrt(Math.max(part, 0)), 0, 1));
       });
       spills.forEach(([tank, node]) => node.setAttribute("stroke-opacity", now.spills[tank] ? 1 : 0.2));

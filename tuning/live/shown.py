@@ -10,10 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import write_folder
 from jaxtank.core.tree import parameters
 from tuning.live.page import page
+from tuning.problem.functions import as_measures
 
 HEIGHT = 900
 """Height of the page inside another one [px]."""
@@ -105,6 +107,12 @@ def of_result(result: Any) -> LivePage:
         # designed for the plant, which is the same
         loop = dataclasses.replace(case.loop, safety_filter=tuned.loop.safety_filter)
         case = case.replace(loop=loop, safety=tuned.safety)
+    problem = getattr(result, "problem", None)
+    if problem is not None and problem.given["limits"] is not None:
+        _, limits = as_measures(None, problem.given["limits"])
+        own = set(ms.functions(limits))  # a user's functions do not run in a browser
+        limits = {m: value for m, value in limits.items() if m not in own}
+        case = case.replace(limits=limits)  # those of the search, with --limit
     return of_case(case, states_of(result))
 
 

@@ -46,6 +46,20 @@ function many(message) {
   });
 }
 
+// names of the sliders {name, ends} at whose ends the run is what it is at `values`
+function effects(message) {
+  const { seed, filter, every } = message;
+  const run = (values) => engine.run(values, { every, seed, filter });
+  const before = run(message.values);
+  const equal = (a, b) => (ArrayBuffer.isView(a) || Array.isArray(a)
+    ? a.length === b.length && a.every((v, i) => equal(v, b[i])) : Object.is(a, b));
+  const same = (after) => ["h", "u"].every((what) => equal(before[what], after[what])) &&
+    Object.keys(before.measures).every((m) => equal(before.measures[m], after.measures[m]));
+  const without = message.names.filter(({ name, ends }) =>
+    ends.every((value) => same(run({ ...message.values, [name]: value }))));
+  postMessage({ kind: "effects", without: without.map(({ name }) => name) });
+}
+
 // the run that is asked for; its columns are handed over, not copied
 function one(message) {
   const start = performance.now();
@@ -60,6 +74,7 @@ onmessage = async (event) => {
   try {
     if (message.kind === "run") one(message);
     else if (message.kind === "plants") many(message);
+    else if (message.kind === "effects") effects(message);
     else {
       const progress = (now) => postMessage({ kind: "progress", ...now });
       const { values, free, limits } = message;

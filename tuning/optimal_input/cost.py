@@ -137,8 +137,8 @@ def _search_cost(u, loop, clock, terms, lagrangian):
             )
             variation, before = variation + jnp.where(state.k == 1, 0.0, change), sample.u
         if "iae" in smoothed:
-            absolute = absolute + sum(
-                _smooth_absolute(e, lagrangian.smoothing[1]) for e in sample.e
+            absolute = absolute + run.lasting(
+                sample, sum(_smooth_absolute(e, lagrangian.smoothing[1]) for e in sample.e)
             )
         for multiplier, over in zip(multipliers, _pointwise_excess(terms, lagrangian, sample)):
             force = multiplier + lagrangian.weight * over

@@ -7,9 +7,9 @@ import dataclasses
 import jax
 import numpy as np
 
-from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import InputError, NonFiniteError
 from jaxtank.loop import run as lp
+from jaxtank.loop.steady import steady_state
 from tuning.optimal_input.cost import POINTWISE
 from tuning.optimal_input.lbfgsb import minimise
 from tuning.optimal_input.problem import TOLERANCE, InputProblem
@@ -113,12 +113,11 @@ class InputSearch:
         problem, loop = self.problem, self.problem.case.loop
         clock = dataclasses.replace(problem.coarse, dt=problem.interval)
         r = np.array(loop.reference.sample(clock)[0])[:, : problem.count]
-        offset = np.asarray(loop.actuator.offset)
         known = np.unique(r, axis=1)
         known, steady = known[:, :: -(-known.shape[1] // SETPOINTS)].T, []
         for setpoint in known:
             try:
-                steady.append(equilibrium(loop.plant, setpoint)[1] + offset)
+                steady.append(steady_state(loop, setpoint)[1])
             except InputError:  # none at this setpoint
                 steady.append(0.5 * (problem.low + problem.high))
         nearest = np.argmin(((r[:, None, :] - known.T[:, :, None]) ** 2).sum(axis=0), axis=0)

@@ -19,10 +19,10 @@ import numpy as np
 from jaxtank import presets, rig
 from jaxtank.analysis.linear_model import linearise
 from jaxtank.analysis.riccati import lqr
-from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Case, Free
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.tree import describe, get_value
+from jaxtank.loop.steady import steady_state
 from jaxtank.rig.components import REGISTERED, ROLES, controller_of, kind_of
 from jaxtank.rig.template import around
 
@@ -114,9 +114,10 @@ def _computed(case: Case, kind: str) -> tuple[Any, dict[str, Any]]:
     known = _rig_of(case)
     table, names = START[kind](known)
     plant = getattr(case.loop.controller, "model", case.loop.plant)
-    start = [float(np.asarray(case.loop.x0)[i]) for i in plant.outputs]
     written = {name: np.asarray(value).tolist() for name, value in table.items()}
-    controller = controller_of({"kind": kind, **written}, plant, start, case.loop.actuator.initial)
+    controller = controller_of(
+        {"kind": kind, **written}, dataclasses.replace(case.loop, plant=plant)
+    )
     loop = dataclasses.replace(case.loop, controller=controller)
     free: dict[str, Any] = {}
     for name in names:
@@ -165,7 +166,9 @@ def _steady(case: Case, plant: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]
         plateaus = [np.array([np.mean(r) for r in case.loop.reference.sample(case.clock)[0]])]
     for setpoint in reversed(list(plateaus)):
         try:
-            levels, inputs = (np.asarray(v, float) for v in equilibrium(plant, setpoint))
+            levels, inputs = (
+                np.asarray(v, float) for v in steady_state(case.loop, setpoint, plant)
+            )
         except EquilibriumError:
             continue
         return np.asarray(setpoint, dtype=float), levels, inputs

@@ -231,7 +231,7 @@ class Problem:
     def coarse_point(self, z: Any) -> Point:
         """Return the Point at z (P,) with a tenth of the samples: a start for a search."""
         z = self._counted(z, len(self.runs))
-        groups = [group._replace(clock=sc.coarse_clock(group.clock)) for group in self.groups]
+        groups = [group.at(sc.coarse_clock(group.clock)) for group in self.groups]
         return Point(z, *self.cache.recall("coarse", [z], lambda: self._point(z, groups)))
 
     def batch_point(self, z: Any, batch: int, rng: np.random.Generator) -> Point:

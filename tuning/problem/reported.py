@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.clock import Clock
+from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import ClosedLoop, zero_of
 from jaxtank.loop.margins import worst
@@ -30,6 +31,19 @@ def run_measures(
     """
     values = lp.evaluate(loop, clock, reported_names(loop, besides), key)
     return {m: np.asarray(v) for m, v in values.items()}
+
+
+def in_force(loop: ClosedLoop, values: Mapping[str, float]) -> dict[str, float]:
+    """Return `values` of free parameters, those that the controller clips as they act."""
+    controller = with_values(loop, values).controller
+    clipped = getattr(controller, "in_force", dict)()  # a class of the user's may have none
+    found = dict(values)
+    for leaf, value in clipped.items():
+        for index in np.ndindex(np.shape(value)):
+            entry = f"controller.{leaf}" + (f"[{','.join(map(str, index))}]" if index else "")
+            if entry in found:
+                found[entry] = float(np.asarray(value)[index])
+    return found
 
 
 class Deferred(Mapping[str, Any]):

@@ -96,11 +96,21 @@ class Group(NamedTuple):
     leaves: tuple[Any, ...]  # of the loop, stacked where `apart`
     apart: tuple[bool, ...]  # True where the runs differ
     keys: Any  # (runs,) or None
+    noise: Any = None  # (runs, tanks, samples) that was drawn with these keys, None: in the run
 
     @property
     def shape(self) -> Shape:
         """What the compiled functions are specialised to."""
         return self.structure, self.apart, len(self.runs)
+
+    @property
+    def draws(self) -> Any:
+        """What a run takes its noise from: drawn numbers where there are some, else the keys."""
+        return self.keys if self.noise is None else self.noise
+
+    def at(self, clock: Clock) -> "Group":
+        """Return the group at a clock, to whose samples drawn noise may not belong."""
+        return self if clock == self.clock else self._replace(clock=clock, noise=None)
 
 
 def noisy(case: Case) -> bool:
@@ -195,8 +205,9 @@ def take(group: Group, picked: Any) -> Group:
     """Return the group with the runs at the positions `picked` alone."""
     picked = np.asarray(picked)
     leaves = tuple(v[picked] if a else v for v, a in zip(group.leaves, group.apart))
-    keys = None if group.keys is None else group.keys[picked]
-    return group._replace(runs=tuple(group.runs[i] for i in picked), leaves=leaves, keys=keys)
+    keys, noise = (None if v is None else v[picked] for v in (group.keys, group.noise))
+    runs = tuple(group.runs[i] for i in picked)
+    return group._replace(runs=runs, leaves=leaves, keys=keys, noise=noise)
 
 
 def with_noise_drawn(group: Group) -> Group:
@@ -214,7 +225,7 @@ def with_noise_drawn(group: Group) -> Group:
         return jnp.stack(sensor.draw(key, samples))
 
     drawn: Any = jax.jit(jax.vmap(draw))(group.keys)
-    return group._replace(keys=drawn)
+    return group._replace(noise=drawn)
 
 
 def values_of(
@@ -224,8 +235,8 @@ def values_of(
 
     points : {parameter: (points,)}. clock : the group's own where None.
     """
-    clock = clock or group.clock
-    return _values(group.leaves, group.keys, group.shape, clock, tuple(names), dict(points))
+    group = group.at(clock or group.clock)
+    return _values(group.leaves, group.draws, group.shape, group.clock, tuple(names), dict(points))
 
 
 def slopes_of(
@@ -241,7 +252,7 @@ def slopes_of(
     """
     order, theta = tuple(values), tuple(values.values())
     return _slopes(
-        group.leaves, group.keys, group.shape, group.clock, tuple(names), order, theta, squares
+        group.leaves, group.draws, group.shape, group.clock, tuple(names), order, theta, squares
     )
 
 
@@ -250,7 +261,8 @@ def reverse_slopes_of(
 ) -> tuple[Measures, Measures]:
     """Return (measures, slopes) as `slopes_of`, by reverse mode through checkpoints."""
     order, theta = tuple(values), np.array(list(values.values()))
-    return _reverse(group.leaves, group.keys, group.shape, group.clock, tuple(names), order, theta)
+    static = group.shape, group.clock, tuple(names), order
+    return _reverse(group.leaves, group.draws, *static, theta)
 
 
 def _mapped(function: Callable[..., Any], leaves: Any, keys: Any, shape: Shape) -> Any:

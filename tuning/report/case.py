@@ -12,6 +12,7 @@ from jaxtank import presets
 from jaxtank.case import Free
 from jaxtank.core.clock import CLOCK
 from jaxtank.core.tree import walk
+from jaxtank.core.units import local
 from jaxtank.measures import MEASURES, of_loop
 from jaxtank.measures import unit as measure_unit
 from jaxtank.plots.equations import equations, physics
@@ -22,6 +23,7 @@ from tuning.report.case_loop import actuator, called, own_name, sampled, sensor,
 WIDTH = 100
 # the head of a numpydoc section: a title underlined with dashes
 SECTION = re.compile(r"^[A-Z]\w*(?: \w+)*\n-{3,}$", re.M)
+BRACKETED = re.compile(r"\[([\w^/(). ]+)\]")
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
 """Names of the plant that controller and observer compute with."""
 
@@ -133,10 +135,14 @@ def _loop(case, page):
     loop, lines = case.loop, _chapter("The loop")
     lines += _sentences([*sensor(loop), *actuator(loop), *signals(loop), *sampled(case)])
     lines += _chapter(f"The controller: {page['law']}")
-    lines += _docstring(getattr(loop.controller, "law", loop.controller))
+    lines += _docstring(getattr(loop.controller, "law", loop.controller), loop.units)
     if hasattr(loop.controller, "law"):
-        lines += ["", *_docstring(loop.controller)]
-    return lines + _chapter(f"The observer: {page['observer']}") + _docstring(loop.observer)
+        lines += ["", *_docstring(loop.controller, loop.units)]
+    return (
+        lines
+        + _chapter(f"The observer: {page['observer']}")
+        + _docstring(loop.observer, loop.units)
+    )
 
 
 def _tuning(case, preset, page):
@@ -162,7 +168,7 @@ def _safety(case, page):
     if page["safety_filter"] is None:
         return []
     heads, rows = safety.rows_of(case, page["safety_filter"])
-    table = grid(rows, heads, (4, 12, 6, 11, 13, 10))
+    table = grid(rows, heads, (4, 12, 6, 6, 11, 13, 10))
     return [*_chapter("Limits on levels"), table, "", *_sentences(safety.sentences(case))]
 
 
@@ -233,13 +239,15 @@ def _item(sentence):
     )
 
 
-def _docstring(part):
-    """Return the description of a component's class: its docstring up to the numpydoc sections.
+def _docstring(part, units):
+    """Return the description of a component's class: its docstring up to the numpydoc sections,
+    units in brackets in those of the rig.
 
     Prose is wrapped; indented lines stay as they are.
     """
     lines, prose = [], []
     description = SECTION.split(inspect.cleandoc(type(part).__doc__ or ""), maxsplit=1)[0]
+    description = BRACKETED.sub(lambda found: f"[{local(found[1], units)}]", description)
 
     def flush():
         lines.extend(textwrap.wrap(" ".join(prose), WIDTH))

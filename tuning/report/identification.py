@@ -35,6 +35,7 @@ def message(found):
             *_ending(found),
             f"{agree} of {len(found.starts)} starts ended in the same place",
             *_residuals(found),
+            *_prior(found),
             *(
                 f"{n} ends at its bound, {p['value']:.4g} {p['unit']}: no interval"
                 for n, p in found.parameters.items()
@@ -84,6 +85,18 @@ def _residuals(found):
             f" intervals are widened {q['widened']:.1f} times for it"
         )
     return words
+
+
+def _prior(found):
+    """Return a sentence: the covariance that the case brings is not used."""
+    if found.case.covariance is None:
+        return []
+    count = len(found.case.covariance[0])
+    return [
+        f"the [covariance] of {count} parameter{'s' * (count > 1)} of an earlier identification, in"
+        f" {found.case.name!r}, is not used: values and intervals are those of these data alone;"
+        " give the earlier log too, with another --data"
+    ]
 
 
 def _next_step(found):
@@ -265,7 +278,7 @@ def fit_csv(found):
     """Return CSV text: number of the log, time, inputs, measured and simulated readings."""
     est = found.estimation
     simulated = est.predicted(est.unknowns(found.fit))
-    drive, pumps = found.case.loop.units[1], est.data.u.shape[2]
+    drive, pumps = found.case.loop.units[1], est.data.u.shape[-1]
     heads = ["log", "t [s]", *(f"pump{j + 1} [{drive}]" for j in range(pumps))]
     for name, unit in found.channels:
         heads += [f"{name} measured [{unit}]", f"{name} simulated [{unit}]"]

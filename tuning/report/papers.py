@@ -17,12 +17,14 @@ from jaxtank.core.files import check_folder
 from jaxtank.core.tree import get_value
 from jaxtank.loop import run as lp
 from jaxtank.plants.network import TankNetwork
-from jaxtank.presets.paper import Claim
+from jaxtank.presets.paper import Claim, Sample
+from jaxtank.presets.paper import verdict as verdict_of
 from tuning.problem.scenarios import noisy
 from tuning.report import artifacts, figures, tables
 from tuning.report.html import document, drawings
 from tuning.report.panel import panel
 
+NUMBER, CLAIM = "number", "claim"
 REPRODUCED, FITTED, DIFFERS = "reproduced", "fitted", "differs"
 IMPOSSIBLE, INPUT = "not reproducible", "input"
 VERDICTS = {
@@ -30,24 +32,26 @@ VERDICTS = {
     FITTED: "near the printed number, for which an assumption of ours was chosen: no evidence",
     DIFFERS: "measured, and different or true in part only: the row says why",
     IMPOSSIBLE: "cannot be measured: the row says what is missing",
-    INPUT: "a number that our case has from the paper",
+    INPUT: "a number that our case has from the paper: no evidence",
 }
 """{verdict of a row: what it means}."""
+SAME = 1e-9
+"""Relative difference [-] below which a number was not measured: it is the printed one, set."""
 
 
 def runner(paper):
-    """Return run(case name, values={}, save_every=1) of a paper; each run is made once.
+    """Return run(case name, values={}, save_every=1, seed=0) of a paper; each run is made once.
 
-    It returns (Case with `values` set, Trajectory as host arrays).
+    It returns (Case with `values` set, Trajectory as host arrays); `seed` draws the sensor noise.
     """
     preset, known = presets.load(paper), {}
 
-    def run(name, values=None, save_every=1):
-        key = (name, repr(values), save_every)
+    def run(name, values=None, save_every=1, seed=0):
+        key = (name, repr(values), save_every, seed)
         if key not in known:
             case = rig.set_values(preset.cases[name], values or {})
             found = lp.simulate(
-                case.loop, case.clock, jax.random.key(0) if noisy(case) else None, save_every
+                case.loop, case.clock, jax.random.key(seed) if noisy(case) else None, save_every
             )
             known[key] = case, jax.tree.map(np.asarray, found)
         return known[key]
@@ -58,7 +62,9 @@ def runner(paper):
 def verdict(published, measured):
     """Return (verdict, measured value or text, reason) of one published quantity.
 
-    measured: number, tuple, Claim or None. The verdict is one of VERDICTS.
+    measured: number, tuple, Sample, Claim or None. The verdict is one of VERDICTS. A number that
+    equals the printed one is an input, where no closed form is named: no simulation agrees with a
+    rounded number to 1e-9.
     """
     reason = published.reason
     if isinstance(measured, Claim):
@@ -70,24 +76,36 @@ def verdict(published, measured):
         return DIFFERS, measured.text, f"in part: {reason}" if near else reason
     if measured is None:
         return IMPOSSIBLE, None, reason
+    seeds = len(measured.values) if isinstance(measured, Sample) else 0
+    measured = measured.mean if isinstance(measured, Sample) else measured
+    same = isinstance(published.value, str) or _same(published.value, measured)
+    if same and not published.closed_form:
+        return INPUT, measured, VERDICTS[INPUT]
     if published.tolerance is None:
-        same = isinstance(published.value, str) or _same(published.value, measured)
-        return (INPUT, measured, VERDICTS[INPUT]) if same else (DIFFERS, measured, reason)
-    printed, found = np.ravel(published.value).astype(float), np.ravel(measured).astype(float)
-    near = printed.shape == found.shape and np.all(
-        np.abs(found - printed) <= published.tolerance * np.abs(printed)
-    )
-    if not near:
         return DIFFERS, measured, reason
-    within = f"within {100 * published.tolerance:g} %"
-    chosen = published.fitted
-    return (FITTED, measured, chosen) if chosen else (REPRODUCED, measured, within)
+    printed, values = np.ravel(published.value).astype(float), np.ravel(measured).astype(float)
+    if printed.shape != values.shape:
+        return DIFFERS, measured, reason
+    apart = np.abs(values - printed)
+    if not np.all(apart <= published.tolerance * np.abs(printed)):
+        return DIFFERS, measured, reason
+    apart = max((a / abs(v) for a, v in zip(apart, printed) if v), default=0.0)
+    within = f"within {100 * published.tolerance:g} %: largest difference {100 * apart:.1f} %"
+    if seeds:
+        within += f" (mean of {seeds} seeds of the noise)"
+    if published.fitted:
+        return FITTED, measured, f"{published.fitted}; {within}"
+    return REPRODUCED, measured, within
 
 
 def measure(paper):
-    """Return the comparison of a paper: {"paper", "citation", "notes", "rows"}.
+    """Return the comparison of a paper: {"paper", "citation", "notes", "headline", "ramps",
+    "rows"}.
 
-    The keys of a row: quantity, unit, where, published, measured, verdict, reason.
+    The keys of a row: quantity, kind ("number" or "claim"), unit, where, published, measured,
+    deviation (of one run, where several were made with noise), verdict, reason, ramp_s (duration
+    of the setpoint ramps of its runs [s], where the paper prints none) and by_ramp (its verdict
+    with each duration).
 
     A parameter that the paper prints is compared with the value in the preset's first case that has
     it. Raises InputError for an unknown paper, and KeyError if the preset measures something that
@@ -103,19 +121,76 @@ def measure(paper):
     rows = []
     for name, printed in preset.published.items():
         value = found.get(name)
-        word, value, reason = verdict(printed, _set_in(preset, name) if value is None else value)
+        word, shown, reason = verdict(printed, _set_in(preset, name) if value is None else value)
+        by_ramp = value.by_ramp if isinstance(value, Claim) else {}
         rows.append(
             {
                 "quantity": name,
+                "kind": CLAIM if isinstance(printed.value, str) else NUMBER,
                 "unit": printed.unit,
                 "where": printed.where,
                 "published": tables.clean(printed.value),
-                "measured": tables.clean(value),
+                "measured": tables.clean(shown),
+                "deviation": tables.clean(value.deviation) if isinstance(value, Sample) else None,
                 "verdict": word,
                 "reason": reason,
+                "ramp_s": printed.ramp,
+                "by_ramp": {f"{ramp:g}": verdict_of(holds) for ramp, holds in by_ramp.items()},
             }
         )
-    return {"paper": paper, "citation": preset.citation, "notes": str(preset.notes), "rows": rows}
+    heading = {"paper": paper, "citation": preset.citation, "notes": str(preset.notes)}
+    return heading | {"headline": headline(rows), "ramps": ramps(rows), "rows": rows}
+
+
+def headline(rows):
+    """Return how many printed numbers, and how many claims in words, were reproduced, of how many.
+
+    {"numbers" and "claims": {"reproduced", "fitted", "differs", "of"}, "input", "not
+    reproducible"}: numbers of rows, where "of" is the sum of the three before it.
+    """
+    counts = {}
+    for name, kind in (("numbers", NUMBER), ("claims", CLAIM)):
+        tally = Counter(row["verdict"] for row in rows if row["kind"] == kind)
+        counts[name] = {word: tally[word] for word in (REPRODUCED, FITTED, DIFFERS)}
+        counts[name]["of"] = sum(counts[name].values())
+    tally = Counter(row["verdict"] for row in rows)
+    return counts | {word: tally[word] for word in (INPUT, IMPOSSIBLE)}
+
+
+def headline_text(rows):
+    """Return `headline` as a sentence."""
+    counts = headline(rows)
+    numbers, claims = counts["numbers"], counts["claims"]
+    return (
+        f"printed numbers: {numbers[REPRODUCED]} of {numbers['of']} reproduced, {numbers[FITTED]}"
+        f" fitted; claims in words: {claims[REPRODUCED]} of {claims['of']} hold, {claims[FITTED]}"
+        f" fitted; {counts[INPUT]} inputs, {counts[IMPOSSIBLE]} not reproducible"
+    )
+
+
+def ramps(rows):
+    """Return [{"ramp_s", "reproduced", "of", "differs"}] of the claims that depend on the duration
+    of the setpoint ramps: the same claims for each duration; [] where there are none.
+    """
+    by_ramp = {row["quantity"]: row["by_ramp"] for row in rows if row.get("by_ramp")}
+    return [
+        {
+            "ramp_s": float(ramp),
+            "reproduced": sum(words[ramp] == REPRODUCED for words in by_ramp.values()),
+            "of": len(by_ramp),
+            "differs": [name for name, words in by_ramp.items() if words[ramp] != REPRODUCED],
+        }
+        for ramp in next(iter(by_ramp.values()), ())
+    ]
+
+
+def ramps_text(rows):
+    """Return `ramps` as lines."""
+    return [
+        f"with setpoint ramps of {one['ramp_s']:g} s: {one['reproduced']} of {one['of']} claims"
+        f" that depend on them hold, not {', '.join(one['differs']) or 'one fails'}"
+        for one in ramps(rows)
+    ]
 
 
 def _set_in(preset, name):
@@ -134,11 +209,9 @@ def _set_in(preset, name):
 
 
 def _same(printed, found):
-    """Return whether the preset's value is the printed one (equal entries count as one number)."""
-    if found is None or isinstance(found, str):
-        return False
+    """Return whether the value is the printed one (equal entries count as one number)."""
     a, b = np.ravel(printed).astype(float), np.ravel(found).astype(float)
-    return a.size in (1, b.size) and bool(np.all(np.abs(b - a) <= 1e-9 * np.abs(a)))
+    return a.size in (1, b.size) and bool(np.all(np.abs(b - a) <= SAME * np.abs(a)))
 
 
 def _cell(value):
@@ -159,10 +232,22 @@ def _flat(value):
     return np.unique(np.ravel(value)).size == 1
 
 
+def _measured(row):
+    """The measured value of a row as text, with the deviation of a single run."""
+    spread = row.get("deviation")
+    return _cell(row["measured"]) + (f" (standard deviation {_cell(spread)})" if spread else "")
+
+
+def _reason(row):
+    """Why a row has its verdict, and with which ramps it was measured."""
+    ramp = row.get("ramp_s")
+    return "; ".join(filter(None, [row["reason"], f"ramps of {ramp:g} s" if ramp else ""]))
+
+
 def text(page):
     """Return the page of `jaxtank compare PAPER`."""
     rows = [
-        [r["quantity"], r["unit"], _cell(r["published"]), _cell(r["measured"]), r["verdict"]]
+        [r["quantity"], r["unit"], _cell(r["published"]), _measured(r), r["verdict"]]
         for r in page["rows"]
     ]
     wrapped = [
@@ -172,12 +257,14 @@ def text(page):
     lines = [
         page["citation"],
         f"notes: {presets.load(page['paper']).notes}",
+        headline_text(page["rows"]),
+        *ramps_text(page["rows"]),
         "",
         tables.table(wrapped, ["quantity", "unit", "published", "measured", "verdict"]),
     ]
     for row, cells in zip(page["rows"], rows):
         note = "; ".join(
-            filter(None, [cells[3] if isinstance(row["measured"], str) else "", row["reason"]])
+            filter(None, [cells[3] if isinstance(row["measured"], str) else "", _reason(row)])
         )
         if note:
             lines.append(f"- {row['quantity']} ({row['where']}): {note}")
@@ -212,14 +299,17 @@ def save(pages, folder, command=None):
 
     rows = [row for found in pages.values() for row in found["rows"]]
     count = Counter(row["verdict"] for row in rows)
-    parts = [part for found in pages.values() for part in (found["citation"], *_in_full(found))]
+    parts = [
+        part
+        for found in pages.values()
+        for part in (found["citation"], *ramps_text(found["rows"]), *_in_full(found))
+    ]
 
     def page_of(drawn):
         return document(
             f"{', '.join(pages)}: published and measured",
             "Published numbers, those of the same rigs and controllers here, and why they differ.",
-            f"{count[REPRODUCED]} of {count.total() - count[INPUT] - count[IMPOSSIBLE]} measured"
-            f" quantities and claims reproduced, {count[FITTED]} fitted",
+            headline_text(rows),
             True,
             [(word, str(count[word])) for word in VERDICTS if count[word]],
             [f"{word}: {VERDICTS[word]}" for word in VERDICTS if count[word]],
@@ -306,10 +396,10 @@ def _in_full(found):
             r["quantity"],
             r["unit"],
             _cell(r["published"]),
-            _cell(r["measured"]),
+            _measured(r),
             r["verdict"],
             r["where"],
-            r["reason"],
+            _reason(r),
         ]
         for r in found["rows"]
     ]
@@ -321,17 +411,22 @@ def _in_full(found):
 def markdown(pages):
     """Return the table of tests/benchmarks/README.md: every measured quantity of {paper: page}.
 
-    Parameters that are only quoted are left out.
+    Parameters that are only quoted are left out. The headline of each paper stands above it.
     """
-    lines = ["| paper | quantity | published | measured | verdict |", "|---|---|---|---|---|"]
+    every = [row for page in pages.values() for row in page["rows"]]
+    lines = [f"All papers: {headline_text(every)}.", ""] if len(pages) > 1 else []
+    for paper, page in pages.items():
+        lines += [f"- {paper}: {headline_text(page['rows'])}"]
+        lines += [f"  - {line}" for line in ramps_text(page["rows"])]
+    lines += ["", "| paper | quantity | published | measured | verdict |", "|---|---|---|---|---|"]
     for paper, page in pages.items():
         for r in page["rows"]:
             if r["verdict"] in (INPUT, IMPOSSIBLE):
                 continue
             unit = f" {r['unit']}" if r["unit"] else ""
-            mine = _cell(r["measured"]) + ("" if isinstance(r["measured"], str) else unit)
+            mine = _measured(r) + ("" if isinstance(r["measured"], str) else unit)
             theirs = _cell(r["published"]) + ("" if isinstance(r["published"], str) else unit)
-            why = f": {r['reason']}" if r["reason"] and r["verdict"] != REPRODUCED else ""
+            why = f": {_reason(r)}" if _reason(r) else ""
             lines.append(
                 "| "
                 + " | ".join(

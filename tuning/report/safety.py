@@ -3,15 +3,43 @@
 Imported by the page of `jaxtank show`.
 """
 
+import numpy as np
+
 from jaxtank.core.errors import InputError
 from jaxtank.core.units import local
+from jaxtank.safety.checker import ANY, OWN
 from tuning.report import tables
+
+SHORT = {ANY: "limits", OWN: "case", "": "-"}
+"""Hypotheses on the start in a table."""
+
+
+PROMISE = (
+    "on any plant with parameters in the case's intervals, under any controller, while each reading"
+    " is within its noise band and no fault takes a parameter out of its interval"
+)
+"""Hypotheses of what is proved, but for the start."""
+
+
+def start_of(starts):
+    """Return in words from which levels at t = 0 all of several limits are proved.
+
+    starts : ANY or OWN of each.
+
+    Examples
+    --------
+    >>> start_of(["any at or below the limits", "the given start"])
+    "from levels at or below the case's start"
+    """
+    highest = "the limits" if set(starts) == {ANY} else "the case's start"
+    return f"from levels at or below {highest}"
 
 
 def certificates(case):
-    """Return [{"tank", "limit", "certified", "why", "rate", "rate_bound", "gap", "reach", "low"}],
-    one for each tank, of the safety filter that the case has or could have; tanks from 1; None
-    where there is no filter for its plant. low: {"limit", "certified", "why"}, None without one.
+    """Return [{"tank", "limit", "certified", "why", "starts", "rate", "rate_bound", "gap", "reach",
+    "low"}], one for each tank, of the safety filter that the case has or could have; tanks from 1;
+    None where there is no filter for its plant. starts: None where it is not certified. low:
+    {"limit", "certified", "why"}, None without one.
 
     Examples
     --------
@@ -29,6 +57,7 @@ def certificates(case):
             "limit": row.limit,
             "certified": row.certified,
             "why": row.reason,
+            "starts": row.starts or None,
             "rate": row.rate,
             "rate_bound": row.rate_bound,
             "gap": tables.clean(row.gap),
@@ -44,13 +73,14 @@ def certificates(case):
 def rows_of(case, found):
     """Return (heads, rows) of the table of `certificates`, its numbers in the case's units."""
     length = local("cm", case.loop.units)
-    heads = ["tank", f"limit [{length}]", "proved", "kappa [1/s]", "at most [1/s]"]
+    heads = ["tank", f"limit [{length}]", "proved", "start", "kappa [1/s]", "at most [1/s]"]
     heads += [f"gap [{length}]", "by, or why not"]
     rows = [
         [
             row["tank"],
             f"{row['limit']:.4g}",
             "yes" if row["certified"] else "no",
+            SHORT[row["starts"] or ""],
             f"{row['rate']:.3g}",
             f"{row['rate_bound']:.3g}",
             "-" if row["gap"] is None else f"{row['gap']:.3g}",
@@ -63,6 +93,7 @@ def rows_of(case, found):
             row["tank"],
             f"low {low['limit']:.4g}",
             "yes" if low["certified"] else "no",
+            SHORT[OWN if low["certified"] else ""],
             f"{row['rate']:.3g}",
             "-",
             "-",
@@ -76,12 +107,17 @@ def rows_of(case, found):
 
 def sentences(case):
     """Return what the table of `certificates` is about."""
+    length = local("cm", case.loop.units)
+    start = ", ".join(f"{h:.4g}" for h in np.asarray(case.loop.x0, dtype=float))
     on = "on" if case.loop.safety_filter is not None else "off: --safety-filter turns it on"
     return [
         f"The safety filter is {on}.",
-        "proved: no plant of the case's intervals passes the limit, under any controller and for"
-        " readings within their band. The last column names the theorem (jaxtank/safety/README.md),"
-        " or the condition that failed.",
+        f"proved: no level passes its limit {PROMISE}, from the levels at t = 0 in the column"
+        " start. limits: every tank at or below its limit; case: every tank at or below the case's"
+        f" start, ({start}) {length}, for a low limit from that start. An independent check of the"
+        " finished filter confirms it. The last column names the theorem"
+        " (jaxtank/safety/README.md), the condition that failed, or the feature that the check does"
+        " not cover.",
         "kappa: a level may rise by at most kappa x its distance to the limit; at most: the largest"
         " kappa that is proved.",
         "gap: with its pumps at full command the nominal rig settles this far below the limit, or"

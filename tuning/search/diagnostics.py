@@ -4,16 +4,14 @@ Imported by `tuner` and `messages`.
 """
 
 import math
-import warnings
 
 import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
-from jaxtank.loop import run as lp
 from jaxtank.loop import step_size
-from jaxtank.loop.step_size import StepWarning, check_run
+from jaxtank.loop.halving import halving_warnings
 from tuning.problem.reported import table_of
 
 CHECKED_RUNS = 16
@@ -48,12 +46,9 @@ def step_warnings(problem, tuned, values, key=None):
 
 
 def _unstable_step(loop, clock, key):
-    """Return what `check_run` finds wrong with the run of a loop; None where it is right."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", StepWarning)  # the sentence replaces it
-        run = lp.simulate(loop, clock, key)
+    """Return why the run of a loop is wrong, None where `halving_warnings` does not refuse it."""
     try:
-        check_run(loop, clock, run)
+        halving_warnings(loop, clock, key)
     except InputError as error:
         return str(error)
     return None

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtank import measures as ms
 from tuning.problem.point import DIVERGED, Point
 from tuning.problem.problem import Problem
+from tuning.problem.slopes import SlopeCheck, check_slope
 
 TIGHTENING = 1e-6
 """Share of its limit by which a search keeps a measure inside it, so that the reported value is not
@@ -58,6 +59,7 @@ class Search:
         self.best_start: Any = None
         self.history: list[tuple] = []
         self.memory: dict[bytes, Point] = {}
+        self.slopes: dict[bytes, SlopeCheck] = {}
         self.last_finite = reference
 
     def point(self, z: Any) -> Point:
@@ -78,6 +80,13 @@ class Search:
             if self.best is None or self.better(point, self.best):
                 self.best, self.best_start = point, self.start
         self.report(self)
+
+    def slope(self, point: Point) -> SlopeCheck:
+        """Return whether runs beside a Point bear its slopes out; cached."""
+        key = point.z.tobytes()
+        if key not in self.slopes:
+            self.slopes[key] = check_slope(self.problem, point)
+        return self.slopes[key]
 
     def violation(self, point: Point) -> float:
         """Return the largest violation as a share of its `limit_scale` [-]; 0 where all hold."""

@@ -42,6 +42,18 @@ def optimality(search, point):
     )
 
 
+def named_optimality(search, point):
+    """Return {"gradient_norm", "kkt_residual", "multipliers": {limit: value}} of a point.
+
+    Nothing where there is no point, or no slope of use there.
+    """
+    if search is None or point is None or not search.slope(point).usable:
+        return {"gradient_norm": None, "kkt_residual": None, "multipliers": {}}
+    norm, residual, multipliers = optimality(search, point)
+    named = {limit.label: float(m) for limit, m in zip(search.problem.limits, multipliers) if m > 0}
+    return {"gradient_norm": norm, "kkt_residual": residual, "multipliers": named}
+
+
 def _residual(search, point):
     """Return (what is left of the gradient (P,), multipliers (limits,)); see `optimality`."""
     g = point.gradient / search.scale

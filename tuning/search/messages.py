@@ -6,10 +6,13 @@ Imported by `tuner`. The codes are stable: programs filter by them, and texts ma
 code                             reported when
 ===============================  =============================================================
 step-too-long                    the integration step is too long for the answer
+edge-of-stability                the sampled linearised loop is unstable or has Ms above 2.5
+input-total-variation            the total variation of the inputs grew tenfold or more
 no-longer-follows                the answer leaves a setpoint that the start held
 no-feasible-point-found          the search ended before a point met every limit
 infeasible                       the least violation of the limits is not zero
 interrupted                      Ctrl-C ended the search
+slope-not-usable                 runs beside the answer or the start contradict the exact slope
 objective-without-slope          the gradient of the objective is zero: it changes in steps
 gradient-not-zero                a slope of the objective is left that no active limit blocks
 kink                             the same, but no lower value was found along it
@@ -18,7 +21,6 @@ start-violates-limit             the values before tuning violate a limit
 limit-not-applicable             an output has no step, so a limit of its step does not apply
 limit-active                     a limit determines the answer
 no-limit-active                  limits are given, and none is active
-input-total-variation            the total variation of the inputs grew much
 parameter-not-exercised          no run depends on the parameter
 parameter-at-bound               the value ended at an end of its range
 parameter-insensitive            10 % of the value hardly changes the objective
@@ -46,14 +48,14 @@ from tuning.problem.wording import count
 from tuning.search.diagnostics import direction_words, symmetry_words
 from tuning.search.result import Message, TuningResult, constraint_rows
 from tuning.search.stages import AGREE
-from tuning.search.verdicts import ENDINGS, Found, first_of, violated
+from tuning.search.verdicts import ENDINGS, Found, first_of, near_the_edge, violated
 
 INSENSITIVE = 0.5
 """Change of the objective [%] for 10 % of a parameter, below which the objective is called
 insensitive to the parameter.
 """
 
-CHATTER = 20.0
+CHATTER = 10.0
 """Growth of the total variation of the input above which it is reported [-]."""
 
 
@@ -112,12 +114,14 @@ def _active(result: TuningResult) -> Found:
 def _total_variation(result: TuningResult) -> Found:
     before, after = (float(result.measures[k]["input_travel"].sum()) for k in ("before", "after"))
     if after > CHATTER * before > 0:
+        times = f"{after / before:.0f} times that before"
         unit = ms.unit("input_travel", result.problem.loop.units)
         yield Message(
             "input-total-variation",
-            f"the total variation of the inputs is {after:.4g} {unit}, {after / before:.0f} times"
-            " that before: weigh it or limit it (--objective input_travel=..., --limit"
+            f"the total variation of the inputs is {after:.4g} {unit}, {times}: weigh it or"
+            " limit it (--objective input_travel=..., --limit"
             " input_travel=...), or take a smaller step",
+            f"total variation of the inputs {times}",
         )
 
 
@@ -207,11 +211,12 @@ def _non_finite(result: TuningResult) -> Found:
 
 
 RULES: tuple[Callable[[TuningResult], Found], ...] = (
+    near_the_edge,
+    _total_variation,
     *ENDINGS,
     _start_violates,
     _not_applicable,
     _active,
-    _total_variation,
     _not_exercised,
     _at_bound_or_insensitive,
     _least_sensitive,

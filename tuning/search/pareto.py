@@ -144,11 +144,11 @@ class _Sweep:
             screened = self._candidates(screening, seed)
             other = best_screened(search, screened)
             if other is not None:
-                self.found[k] = _Answer(search, slsqp(search, other, self.iterations))
+                self.found[k] = _answer(search, slsqp(search, other, self.iterations))
             if self.found[k].violation and search.best is not None:
                 find_feasible(search, screened, self.iterations, seed)
                 done = slsqp(search, search.best.z, self.iterations)
-                self.found[k] = _Answer(search, done)
+                self.found[k] = _answer(search, done)
             approach(search)
             self.known.update(search.memory)
 
@@ -162,7 +162,7 @@ class _Sweep:
             restore(search, search.best.z, self.iterations)
             converged = slsqp(search, search.best.z, self.iterations)
         self.known.update(search.memory)
-        return _Answer(search, converged)
+        return _answer(search, converged)
 
     def _candidates(self, screening, seed):
         """Return the Population of screened and of known points, under the present limits."""
@@ -174,6 +174,12 @@ class _Sweep:
             np.concatenate([costs, [p.cost for p in points]]),
             np.concatenate([margins, np.reshape(old, (len(points), margins.shape[1]))]),
         )
+
+
+def _answer(search, converged):
+    """Return the _Answer of a search; not converged where no slope is of use."""
+    best = search.best
+    return _Answer(search, bool(converged) and best is not None and search.slope(best).usable)
 
 
 def _better(one, other):

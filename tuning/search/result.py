@@ -15,6 +15,7 @@ from jaxtank.plants.base import Plant
 from tuning.problem.limits import Limit
 from tuning.problem.problem import Problem
 from tuning.problem.result import Result
+from tuning.problem.slopes import SlopeCheck
 from tuning.problem.status import Status
 
 ACTIVE = 1e-3
@@ -30,6 +31,7 @@ class Message:
     code : kebab-case word that does not change between versions; `tuning.search.messages` lists
         them all, for example "parameter-at-bound", "not-converged", "limit-active".
     text : the sentence that is printed.
+    headline : a few words beside the status, where the finding changes what the status is worth.
 
     Examples
     --------
@@ -39,6 +41,7 @@ class Message:
 
     code: str
     text: str
+    headline: str = ""
 
     def __str__(self) -> str:
         return self.text
@@ -176,7 +179,8 @@ class TuningResult(Result):
     evaluations : numbers of simulations, gradients, non-finite points and repeated screenings.
     wall_s : duration of the search [s].
     history : (start, cost, violation [share of the limit's scale], z) of every evaluation.
-    starts : one dict for each local search: from, to, cost, violation, evaluations, converged.
+    starts : one dict for each local search: from, to, cost, violation, evaluations, converged,
+        exhausted, slope_usable (None where it moved on).
     optimality : {"gradient_norm", "kkt_residual", "multipliers"} of the scaled cost.
     curvature : second derivative at the answer, see `diagnostics.curvature`; None if not computed.
     symmetry : the equivalent answer by a permutation of the gains, see `diagnostics.symmetric`.
@@ -191,6 +195,8 @@ class TuningResult(Result):
         over the ranges, searches from what it found, and how many of those ended lower; None where
         two searches agree and none was needed.
     certificate : violation probability on new plants (`tune_robust`), where asked.
+    slopes : {"start", "answer": SlopeCheck} whether runs beside these points bear the exact slopes
+        out; an answer whose slope they contradict is confirmed by differential evolution alone.
     answer : the `tuning.Answer` of a default answer: its plants, noise and safety filter.
 
     Examples
@@ -230,12 +236,18 @@ class TuningResult(Result):
     answer: Any = None
     lost: tuple[Lost, ...] = ()
     probe: dict[str, int] | None = None
+    slopes: Mapping[str, SlopeCheck] = dataclasses.field(default_factory=dict)
     cloud: dict[str, Any] | None = None
 
     @property
     def message(self) -> str:
         """The texts of `messages`, joined by semicolons."""
         return "; ".join(m.text for m in self.messages)
+
+    @property
+    def headline(self) -> str:
+        """The status, with the findings that change what it is worth."""
+        return ", ".join([self.status, *(m.headline for m in self.messages if m.headline)])
 
     @property
     def success(self) -> bool:

@@ -13,10 +13,10 @@ import scipy  # its parts are imported when they are first used
 from jax.flatten_util import ravel_pytree
 
 from jaxtank import measures as ms
-from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop.closed_loop import Inputs, initial
+from jaxtank.loop.steady import steady_inflow, steady_state
 from jaxtank.loop.step import step
 from tuning.problem.scenarios import screening_clock
 
@@ -69,7 +69,7 @@ def spectral_radius(problem, zs, clock):
     plateaus = problem.loop.reference.plateaus()
     for r in () if plateaus is None else plateaus:
         try:
-            steady.append((r, *equilibrium(problem.loop.plant, r)))
+            steady.append((r, *steady_state(problem.loop, r)))
         except InputError:
             continue
     if not steady:
@@ -98,7 +98,9 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
         leaves, structure = jax.tree.flatten(state)
         moves = [jnp.issubdtype(jnp.result_type(v), jnp.floating) for v in leaves]
         zero = jnp.zeros_like(r)
+        inflow = steady_inflow(loop)
         d = None if loop.disturbance is None else tuple(jnp.zeros(loop.plant.tanks))
+        d = d if inflow is None else tuple(jnp.asarray(inflow))
         plan = here.controller.prepare(
             tuple(r[:, None]), tuple(zero[:, None]), tuple(zero[:, None])
         )

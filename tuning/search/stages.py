@@ -11,6 +11,7 @@ import numpy as np
 
 from tuning.cluster.ahead import evaluate_ahead
 from tuning.problem.problem import Problem
+from tuning.problem.slopes import SlopeCheck
 from tuning.search import diagnostics
 from tuning.search.driver import SETTLED, Search, event_of
 from tuning.search.kkt import LOWER_BY, UNSTABLE, downhill, optimality
@@ -34,6 +35,7 @@ from tuning.search.screening import (
     screen,
     sobol,
 )
+from tuning.search.starts import search_from
 
 RENEWED = 3
 """How often a search is begun again from where it stopped before conditions of an optimum hold."""
@@ -91,6 +93,8 @@ class Outcome:
     change: Any = None  # (P,) percent of the cost by 10 % of each parameter
     idle: Any = None  # (P,) True for parameters that no run exercises
     curvature: dict[str, Any] | None = None
+    # at the start and at the answer, whether runs bear the slopes out
+    slopes: dict[str, SlopeCheck] = dataclasses.field(default_factory=dict)
 
     @property
     def best(self) -> Any:
@@ -116,6 +120,7 @@ def _run_stages(problem, first, plan, found, report):
     search.take(reference)
     *measured, found.redone = screen(problem, plan.screening, plan.seed)
     screened = Population(*measured)
+    found.slopes["start"] = search.slope(reference)
     shortfall = np.maximum(0.0, -screened.margins / search.limit_scale)
     merits = screened.costs / search.scale + 10.0 * shortfall.sum(axis=1)
     starts = distinct_starts(screened.zs, merits, plan.starts, first)
@@ -132,10 +137,12 @@ def _run_stages(problem, first, plan, found, report):
         _finish(search, found, plan)
         _confirm(search, found, plan, screened)
         found.idle = diagnostics.unexercised(problem, search, first)
-        if not _violated(search):
+        if not _violated(search) and search.slope(search.best).usable:
             found.curvature = diagnostics.curvature(problem, search, search.best, found.idle)
     if search.return_to_start():
         found.confirmed, found.curvature = False, None
+    if search.best is not None:
+        found.slopes["answer"] = search.slope(search.best)
 
 
 def _violated(search):
@@ -155,29 +162,33 @@ def _search_screened(search, found, plan, screened):
 
 def _finish(search, found, plan):
     """Search a last time from the best point, and find out whether it is an optimum."""
-    search.start = len(found.starts)
+    search.start, found.ended = len(found.starts), False
+    if not search.slope(search.best).usable:
+        return
     polished = _last_search(search, found, plan)
     settled = not _violated(search) and _nothing_lower(search, plan.iterations)
-    found.ended = settled and (polished or _converged(search, found.starts))
+    ended = settled and (polished or _converged(search, found.starts))
+    found.ended = ended and search.slope(search.best).usable
 
 
 def _confirm(search, found, plan, screened):
     """Look for points that are better than the answer, and search on from them, a few times.
 
     Its neighbours, which are run for its sensitivity, always; where no two searches agree on an
-    answer that has converged, by differential evolution too.
+    answer that has converged, or where no slope is of use, by differential evolution too.
     """
     for k in range(RENEWED):
-        mark = search.best
-        lower = _lower_neighbour(search, found)
-        if lower is None and found.ended and not _agreed(search, found):
+        mark, probed = search.best, False
+        lower, blind = _lower_neighbour(search, found), not search.slope(mark).usable
+        if lower is None and (blind or (found.ended and not _agreed(search, found))):
+            probed = True
             lower = _probe(search, found, screened, plan.seed + k)
         if lower is not None:
             search.start, count = len(found.starts), len(search.history)
             _local_search(search, found, plan, lower, count)
             _finish(search, found, plan)
         if not _is_lower(search, search.best, mark):
-            found.confirmed = found.ended
+            found.confirmed = found.ended or (blind and probed)
             return
         if found.probe:
             found.probe["lower"] += 1
@@ -244,28 +255,8 @@ def _probe(search, found, screened, seed):
 
 
 def _local_search(search, found, plan, z, count):
-    """Run one local search from z; its outcome is added to those found.
-
-    count : evaluations before the first that belongs to this search.
-    """
-    search.exhausted = False
-    converged = run_local(search, z, plan.local)
-    mine = search.history[count:]
-    reached = min(mine, key=lambda h: (h[2] > 0, h[2] if h[2] > 0 else h[1]), default=None)
-    if reached is None:  # every point it asked for was known already
-        point = search.memory.get(np.clip(z, 0, 1).tobytes(), search.best or search.last_finite)
-        reached = (search.start, float(point.cost), search.violation(point), tuple(point.z))
-    found.starts.append(
-        {
-            "from": search.problem.values(z),
-            "to": search.problem.values(reached[3]),
-            "cost": reached[1],
-            "violation": reached[2],
-            "evaluations": len(mine),
-            "converged": converged,
-            "exhausted": search.exhausted,
-        }
-    )
+    """Run one local search from z; `count` : evaluations before the first that belongs to it."""
+    search_from(search, found.starts, z, lambda s, z: run_local(s, z, plan.local), count)
 
 
 def _last_search(search, found, plan):

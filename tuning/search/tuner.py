@@ -16,20 +16,22 @@ from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
+from jaxtank.loop.closed_loop import initial
 from tuning.cluster.engine import connect
 from tuning.cluster.problems import check_sent
 from tuning.problem.functions import as_measures, check_slopes, digests
 from tuning.problem.problem import Problem
 from tuning.problem.provenance import provenance
-from tuning.problem.reported import run_measures, table_of
+from tuning.problem.reported import in_force, margin_measures, run_measures, table_of
 from tuning.problem.scenarios import noisy
 from tuning.search import diagnostics
 from tuning.search.discrete import tune_choices
-from tuning.search.kkt import optimality
+from tuning.search.kkt import named_optimality
 from tuning.search.messages import messages_of
 from tuning.search.methods import OFFERED, UNCONSTRAINED
 from tuning.search.options import Solver, check_options, check_precision, spelled_out
 from tuning.search.result import TuningResult, constraint_rows
+from tuning.search.screening import LARGEST_STATE
 from tuning.search.stages import Outcome, Plan, solve
 from tuning.search.verdicts import lost_outputs, status_of
 from tuning.storage.checkpoint import checkpoint_folder
@@ -184,6 +186,8 @@ def _result(problem, plan, found: Outcome, first, before, key):
     if best is not None and np.array_equal(z, first):
         values = dict(own)
     values |= {n: v for (n, v), idle in zip(own.items(), found.idle) if idle}
+    # what stays as it was before is no change to report
+    values |= {n: v for n, v in in_force(case.loop, values).items() if values[n] != own[n]}
     complete = best is not None and not found.interrupted
     change = found.change if complete and found.change else [None] * len(z)
     tuned = case.replace(loop=with_values(case.loop, values))
@@ -192,17 +196,20 @@ def _result(problem, plan, found: Outcome, first, before, key):
     if problem.scenarios:
         tables = {"before": table_of(problem, own), "after": table_of(problem, values)}
     lost = lost_outputs(problem, tables, values) if complete else ()
-    optimum = _optimality(found.search, best)
+    optimum = named_optimality(found.search, best)
     rows = constraint_rows(problem, tables["after"], tables["before"], optimum["multipliers"])
     return TuningResult(
         case=case,
         tuned=tuned,
         method=plan.method,
         status=status_of(found, all(row.margin >= 0 for row in rows), lost),
-        parameters=_parameters(problem, z, values, change, found.idle.tolist()),
+        parameters=_parameters(problem, values, change, found.idle.tolist()),
         objective={side: problem.total(table) for side, table in tables.items()}
         | {"terms": problem.objective},
-        measures={"before": before, "after": after},
+        measures={
+            "before": before | _margins(case.loop, case.clock),
+            "after": after | _margins(tuned.loop, tuned.clock),
+        },
         tables=tables,
         constraints=rows,
         symmetry=diagnostics.symmetric(problem, found.starts, values) if complete else None,
@@ -222,11 +229,18 @@ def _result(problem, plan, found: Outcome, first, before, key):
         problem=problem,
         lost=lost,
         probe=found.probe,
+        slopes=found.slopes,
     )
 
 
-def _parameters(problem, z, values, change, idle):
-    """Return {name: values before and after, range, sensitivity} of the parameters at z."""
+def _margins(loop, clock):
+    """Return the margins of the linearised loop; {} for a loop with a long state."""
+    small = sum(map(np.size, jax.tree.leaves(initial(loop, clock)))) <= LARGEST_STATE
+    return margin_measures(loop, clock) if small else {}
+
+
+def _parameters(problem, values, change, idle):
+    """Return {name: values before and after, range, sensitivity} of the parameters."""
     own = problem.own_values()
     return {
         b.name: {
@@ -239,7 +253,8 @@ def _parameters(problem, z, values, change, idle):
             "sensitivity_percent": percent,
             "exercised": not still,
         }
-        for b, v, percent, still in zip(problem.bounds, z, change, idle)
+        for b, percent, still in zip(problem.bounds, change, idle)
+        for v in [float(b.to_unit(values[b.name]))]
     }
 
 
@@ -281,12 +296,3 @@ def _method(method, problem, batch):
             f" ({', '.join(ms.squares())}) in the objective: use slsqp"
         )
     return method
-
-
-def _optimality(search, best):
-    """Return the gradient norm, KKT residual and named multipliers at the best point."""
-    if best is None:
-        return {"gradient_norm": None, "kkt_residual": None, "multipliers": {}}
-    norm, residual, multipliers = optimality(search, best)
-    named = {limit.label: float(m) for limit, m in zip(search.problem.limits, multipliers) if m > 0}
-    return {"gradient_norm": norm, "kkt_residual": residual, "multipliers": named}

@@ -15,6 +15,7 @@ from jaxtank.loop import run as lp
 from jaxtank.loop.change_windows import windows
 from tuning.problem.point import DIVERGED
 from tuning.problem.problem import Problem
+from tuning.problem.slopes import unusable_words
 from tuning.problem.status import Status
 from tuning.search.kkt import SLOPING, UNSTABLE
 from tuning.search.result import ConstraintRow, Lost, Message, TuningResult
@@ -38,6 +39,10 @@ CHECKED_RUNS = 8
 
 SAVED = 20_000
 """Samples of a trajectory that are compared, at most."""
+
+FRAGILE = 2.5
+"""Sensitivity peak Ms above which a loop is near the edge of its stability [-]: textbooks recommend
+1.4 to 2."""
 
 Found = Iterator[Message]
 ENDED = (Status.CONVERGED, Status.NOT_CONVERGED)
@@ -158,6 +163,24 @@ def first_of(parts: list[str], joint: str = ", ") -> str:
     return joint.join(parts[:LISTED]) + (f" (and {more} more)" if more > 0 else "")
 
 
+def near_the_edge(result: TuningResult) -> Found:
+    """The answer's linearised loop is unstable, or nearly so."""
+    sides = (result.measures[side] for side in ("before", "after"))
+    before, after = (float(m.get("sensitivity_peak", np.nan)) for m in sides)
+    if not after > FRAGILE:  # NaN: it has none
+        return
+    where = f"{'beyond' if np.isinf(after) else 'at'} the edge of sampled stability"
+    peak = "the linearised loop is unstable" if np.isinf(after) else f"Ms = {after:.3g}"
+    old = "unstable" if np.isinf(before) else f"{before:.3g}"
+    yield Message(
+        "edge-of-stability",
+        f"{where}: {peak} at a plateau, {old} before (sensitivity peak of the sampled loop, at most"
+        " 2 is usual): --limit sensitivity_peak=2 bounds it, a smaller step or narrower ranges"
+        " (--free) may help",
+        f"{where} ({peak})",
+    )
+
+
 def _no_feasible_point(result: TuningResult) -> Found:
     missed = violated(result)
     if result.status == Status.NOT_CONVERGED and missed:
@@ -196,6 +219,23 @@ def _infeasible(result: TuningResult) -> Found:
 def _interrupted(result: TuningResult) -> Found:
     if result.status == Status.INTERRUPTED:
         yield Message("interrupted", "interrupted: this is the best point so far")
+
+
+def slope_not_usable(result: TuningResult) -> Found:
+    """At the answer and at the values before tuning; once where these are the same."""
+    places = {"answer": "the answer", "start": "the values before tuning"}
+    same = all(p["before"] == p["after"] for p in result.parameters.values())
+    for where, words in places.items():
+        check = result.slopes.get(where)
+        if check is None or check.usable or (same and where == "start"):
+            continue
+        role = "judged the answer" if where == "answer" else "searched on"
+        yield Message(
+            "slope-not-usable",
+            f"the slope of the objective at {words} is that of a chaotic or exploding loop:"
+            f" {unusable_words(check)}; it was not used: other starts and differential evolution"
+            f" {role}",
+        )
 
 
 def _flat(result: TuningResult) -> bool:
@@ -299,6 +339,7 @@ ENDINGS: tuple[Callable[[TuningResult], Found], ...] = (
     _infeasible,
     _no_longer_follows,
     _interrupted,
+    slope_not_usable,
     _without_slope,
     _gradient_left,
     _not_converged,

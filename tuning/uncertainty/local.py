@@ -9,8 +9,9 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.errors import NonFiniteError
-from jaxtank.core.tree import get_value
+from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
+from tuning.problem.slopes import contradicted
 from tuning.uncertainty.distributions import Correlated, Discrete, Normal
 
 CHUNK = 16
@@ -18,6 +19,12 @@ CHUNK = 16
 
 NORMAL_WIDTH = 2.0
 """Half-width of a normal distribution, in standard deviations [-]."""
+
+
+UNUSABLE = (
+    "a derivative is not finite, or runs contradict it by orders of magnitude, as in a chaotic or"
+    " exploding loop"
+)
 
 
 class Column(NamedTuple):
@@ -58,6 +65,9 @@ def local_columns(case, draws, names, key, progress=None):
     widths = half_widths(draws)
     scalars = list(dict.fromkeys(name for width in widths for name in width))
     nominal, derivatives = _derivatives(case, scalars, names, key, progress)
+    width = {name: w for width in widths for name, w in width.items()}
+    steps = np.array([width[name] for name in scalars])
+    derivatives = _borne_out(case, scalars, steps, names, key, nominal, derivatives)
     where = {name: i for i, name in enumerate(scalars)}
     effect = [sum(derivatives[:, where[n]] * w for n, w in width.items()) for width in widths]
     effect = np.stack(effect, axis=1)
@@ -77,7 +87,7 @@ def _columns(case, names, nominal, effects):
     for k, (measure, label, unit) in enumerate(entries_of(case, names)):
         row = {quantity: values[k] for quantity, values in effects.items()}
         good = bool(np.isfinite(row["effect"]).all())
-        reason = "" if good else "its derivative is not finite"
+        reason = "" if good else UNUSABLE
         columns.append(Column(measure, label, unit, float(nominal[k]), int(not good), row, reason))
     return columns
 
@@ -100,6 +110,28 @@ def _derivatives(case, scalars, names, key, progress):
             progress(min(start + CHUNK, len(scalars)), len(scalars))
     nominal = np.concatenate([np.ravel(measures[m]) for m in names])
     return nominal, np.concatenate(found, axis=1)
+
+
+def _borne_out(case, scalars, steps, names, key, nominal, derivatives):
+    """Return derivatives (K, scalars), NaN where runs contradict them.
+
+    Runs are made by a step to either side for each scalar by which some entry would change by more
+    than itself.
+    """
+    sizes = np.abs(nominal)
+    large = ~(np.abs(derivatives * steps) <= sizes[:, None])
+    found = derivatives.copy()
+    for j in np.flatnonzero(large.any(axis=0)):
+        moves, value = np.array([1.0, -1.0]) * steps[j], float(get_value(case.loop, scalars[j]))
+        rows = []
+        for to in value + moves:
+            loop = with_values(case.loop, {scalars[j]: to})
+            measures, broken = lp.evaluate_and_flag(loop, case.clock, names, key)
+            run = np.concatenate([np.ravel(measures[m]) for m in names])
+            rows.append(run * np.nan if broken else run)
+        wrong = contradicted(moves[:, None] * derivatives[:, j], np.array(rows) - nominal, sizes)
+        found[wrong, j] = np.nan
+    return found
 
 
 def half_widths(draws):

@@ -15,10 +15,11 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
+from jaxtank.loop import floor
 from jaxtank.loop import run as lp
 from tuning.cluster.engine import check_alone, connect
 from tuning.problem.functions import as_measures, digests
-from tuning.problem.limits import resolve_limits
+from tuning.problem.limits import Limit, resolve_limits
 from tuning.problem.scenarios import noisy
 from tuning.storage.batch_store import BatchStore
 from tuning.storage.checkpoint import checkpoint_folder
@@ -123,7 +124,7 @@ def ensemble(
     check_alone(cluster, devices=devices > 1, shard=shard is not None, merge=merge)
     distributions = spread_of(case) if distributions is None else stated(distributions)
     limits = as_measures(None, limits)[1]
-    limited = resolve_limits(case, limits)
+    limited = [*resolve_limits(case, limits), *_floors(case)]
     names = _measure_names(case, measures, limited)
     plan = _plan(case, Draws(case.loop, distributions), names, samples, key, draws, batch)
     store = None
@@ -153,6 +154,14 @@ def ensemble(
         seed=key,
         method=draws,
     )
+
+
+def _floors(case):
+    """Limits at the bottoms of tanks whose levels may fall below them."""
+    if not floor.is_open(case.loop):
+        return []
+    lowest = floor.lowest(case.loop.plant)
+    return [Limit("min_level", i, float(level)) for i, level in enumerate(lowest)]
 
 
 def _check_arguments(shard, samples, key):

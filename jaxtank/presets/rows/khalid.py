@@ -3,10 +3,14 @@
 Imported by the preset of khalid.
 """
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.presets.loops.khalid import scenario
-from jaxtank.presets.paper import Claim, Published, verdict
+from jaxtank.analysis import qp
+from jaxtank.presets.loops.khalid import CLOCK, scenario
+from jaxtank.presets.paper import Claim, Published
+from jaxtank.presets.rows.operations import operations
 
 _OURS = "at 0 m gravity alone decides: the cases run between levels that a pump can hold (notes S3)"
 _WHERE = "sec. V.A, Figs. 2-5"
@@ -16,7 +20,12 @@ PUBLISHED = {
         (0.0, 0.12, 0.0, 0.15), "m", "sec. V.B", None, _OURS
     ),
     "controller.N, two pumps": Published(4, "-", "sec. V.B"),
-    "computational cost of Laguerre": Published("reduced", "", "sec. V.A, conclusion"),
+    "computational cost of Laguerre": Published(
+        "reduced",
+        "",
+        "sec. V.A, conclusion",
+        reason="with constraints alone: without, both are a fixed gain (eq. 32 is further work)",
+    ),
     "undershoot against control horizon": Published(
         "not eliminated by any", "", "sec. V.A", reason="true of 10 and 30, not of 2 (notes S8)"
     ),
@@ -98,19 +107,42 @@ def _sizes(run):
         name: loop.plant.pumps * getattr(loop.controller, "N", getattr(loop.controller, "Nc", 0))
         for name, loop in loops.items()
     }
+    fixed = {  # du = -K x_e
+        name: operations(jax.make_jaxpr(jnp.matmul)(K, K[0]).jaxpr)
+        for name, loop in loops.items()
+        for K in [np.asarray(loop.controller.gain(CLOCK.dt))]
+    }
+    programme = {name: _programme(loop) for name, loop in loops.items()}
+    order = ("laguerre", "gpc", "gpc-nc30")
     return {
         "pulses of H2, one pump": _pulses(run("gpc", {"clock.substeps": 2})[0]),
         "pulses of H1 and H2, two pumps": _pulses(run("gpc-mimo", {"clock.substeps": 2})[0]),
         "controller.N, two pumps": loops["laguerre-mimo"].controller.N,
         "computational cost of Laguerre": Claim(
-            verdict(
-                count["laguerre"] < count["gpc"] and count["laguerre-mimo"] < count["gpc-mimo"]
-            ),
-            "variables of a programme: {} for {} of GPC with one pump, {} for {} with two".format(
-                *(count[n] for n in ("laguerre", "gpc", "laguerre-mimo", "gpc-mimo"))
+            [
+                cost[laguerre] < cost[gpc]
+                for cost in (fixed, programme)
+                for laguerre, gpc in (("laguerre", "gpc"), ("laguerre-mimo", "gpc-mimo"))
+            ],
+            "arithmetic operations, counted and not timed, with Laguerre functions, GPC 10 and GPC"
+            " 30: without constraints {}, {} and {} a sample; with constraints {}, {} and {} an"
+            " iteration of the programme, of {}, {} and {} variables; with two pumps {} for {} of"
+            " GPC without and {} for {} with constraints".format(
+                *(cost[n] for cost in (fixed, programme, count) for n in order),
+                *(cost[n] for cost in (fixed, programme) for n in reversed(MIMO)),
             ),
         ),
     }
+
+
+def _programme(loop):
+    """Operations of the programme of eq. (32): its setting up and one iteration."""
+    control = loop.controller
+    Omega, Psi, basis = control.design(CLOCK.dt)
+    steps = basis[: control.ahead]
+    rows = jnp.concatenate([steps, jnp.cumsum(steps, axis=0)]).reshape(-1, Omega.shape[0])
+    ends = jnp.ones(rows.shape[0])
+    return operations(jax.make_jaxpr(qp.solve)(Omega, Psi[:, 0], rows, -ends, ends).jaxpr)
 
 
 def _undershoot(run, edges):
@@ -119,10 +151,9 @@ def _undershoot(run, edges):
     for name in SISO[:3]:
         case, t = run(name, {"clock.substeps": 2})
         under[name] = edges(case.loop.reference, t)[0]["overshoot"][1]
-    some = [value > 1.0 for value in under.values()]
     return {
         "undershoot against control horizon": Claim(
-            "partly" if any(some) and not all(some) else verdict(all(some)),
+            [value > 1.0 for value in under.values()],
             "below the lower level with Nc 2, 10, 30: "
             + ", ".join(f"{value:.2f} %" for value in under.values())
             + " of the step (counts if above 1 %)",
@@ -134,33 +165,33 @@ def _from_empty(error, over, under):
     """The claims on pulses from 0 m."""
     one = [error[name][0] for name in SISO]
     top = [over[name][0] for name in SISO]
-    low = max(under[name][0] for name in SISO)
+    low = [under[name][0] for name in SISO]
     gain = 1.0 - top[3] / top[2]
-    apart = float(np.abs(error["laguerre-mimo"] / error["gpc-mimo"] - 1.0).max())
     both = "; ".join(
         "{:.2f}, {:.2f} mm and {:.1f}, {:.1f} % with {}".format(*error[n], *over[n], shown)
         for n, shown in zip(MIMO, ("GPC", "Laguerre functions"))
     )
     return {
         "pulses from 0 m: long control horizon": Claim(
-            "partly" if one[1] < one[0] and top[1] > top[0] else verdict(one[1] < one[0]),
+            (one[1] < one[0], top[1] <= top[0]),
             f"RMS error {one[0]:.2f} mm with Nc 2, {one[1]:.2f} mm with Nc 10; overshoot"
             f" {top[0]:.2f} and {top[1]:.2f} %",
         ),
         "pulses from 0 m: control horizon beyond 10": Claim(
-            verdict(one[2] > 0.95 * one[1]),
+            one[2] > 0.95 * one[1],
             f"RMS error {one[1]:.2f} mm with Nc 10, {one[2]:.2f} mm with Nc 30",
         ),
         "pulses from 0 m: overshoot and undershoot": Claim(
-            "partly" if max(top) > 5.0 else "not reproduced",
+            [value > 1.0 for value in (*top[:3], *low[:3])],
             f"overshoot {top[0]:.2f}, {top[1]:.2f}, {top[2]:.2f} % with Nc 2, 10, 30; undershoot at"
-            f" most {low:.2g} %",
+            f" most {max(low[:3]):.2g} % (lots: above 1 %)",
         ),
         "pulses from 0 m: overshoot of Laguerre": Claim(
-            "partly" if 0.0 < gain < 0.2 else verdict(gain >= 0.2),
+            (gain > 0.0, gain >= 0.2),
             f"{top[3]:.2f} % against {top[2]:.2f} %: {100 * gain:.0f} % less at the same r_w",
         ),
         "pulses from 0 m: Laguerre with two pumps": Claim(
-            "not reproduced" if apart < 0.02 else "partly", f"RMS errors and overshoots {both}"
+            error["laguerre-mimo"] < 0.98 * error["gpc-mimo"],
+            f"RMS errors and overshoots {both} (counts if 2 % less)",
         ),
     }

@@ -144,7 +144,7 @@ def test_noise_that_is_drawn_once_gives_the_same_bits(case):
     plants = setting.plants(setting.searched, 3, 0)
     a, b = (Problem(setting.searched, None, setting.objective, {}, plants) for _ in range(2))
     b.groups = [with_noise_drawn(group) for group in b.groups]
-    assert b.groups[0].keys.shape == (3, 1, case.clock.samples)
+    assert b.groups[0].noise.shape == (3, 1, case.clock.samples)
     z = a.start()
     assert a.point(z).cost == b.point(z).cost
     assert np.array_equal(a.point(z).gradient, b.point(z).gradient)
@@ -311,7 +311,7 @@ def test_the_json_has_the_keys_of_the_contract(result):
     holds = found["holds"]
     assert (holds["limits_on_validation"], holds["samples"]) == (1.0, 24)
     assert [row["tank"] for row in holds["certified"]] == [1]
-    assert set(holds["certified"][0]) == {"tank", "certified", "why"}
+    assert set(holds["certified"][0]) == {"tank", "certified", "why", "starts"}
     assert found["answer"]["safety_filter"]["band"] == pytest.approx(
         [0.018]
     )  # 6 x 0.1 % of the rim

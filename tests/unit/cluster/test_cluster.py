@@ -3,13 +3,17 @@
 One cluster serves the file; workers are killed as it goes on, the scheduler last.
 """
 
+import asyncio
+import contextlib
 import dataclasses
 import os
 import signal
 import subprocess
 import sys
 import time
+import urllib.request
 import warnings
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -29,6 +33,7 @@ from tuning.problem.problem import Problem
 from tuning.uncertainty import remote
 
 distributed = pytest.importorskip("distributed", reason="Dask is not installed")
+psutil = pytest.importorskip("psutil", reason="Dask is not installed")
 
 SPREAD = {"plant.drain": 0.05, "plant.pump_gain": tuning.Normal(relative=0.05)}
 OPTIONS = {"samples": 400, "key": 3, "batch": 16, "fan": False}  # 25 batches
@@ -49,9 +54,12 @@ def whole(case):
 @pytest.fixture(scope="module")
 def client():
     """A client of two workers."""
-    with local_workers(2) as (address, _), distributed.Client(address) as found:
-        found.wait_for_workers(2, timeout=60)
-        yield found
+    with local_workers(2) as workers:
+        client = distributed.Client(workers.address, security=workers.security)
+        with client, warnings.catch_warnings():
+            client.workers = workers
+            client.wait_for_workers(2, timeout=60)
+            yield client
 
 
 class Refusing(Engine):
@@ -72,21 +80,22 @@ def same(a, b):
 
 def test_a_worker_killed_and_one_added_in_mid_run_change_no_bit(case, whole, client, tmp_path):
     victim, pid = next(iter(client.run(os.getpid).items()))
-    address, added, seen = client.scheduler.address, [], []
+    added, seen = [], []
 
     def progress(done):
         seen.append(done)
         if len(seen) == 3:
             os.kill(pid, signal.SIGKILL)
-            words = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--no-nanny"]
-            words += ["--nthreads", "1", "--no-dashboard", "--death-timeout", "30"]
+            words = [sys.executable, "-m", "distributed.cli.dask_worker", client.scheduler.address]
+            words += ["--no-nanny", "--nthreads", "1", "--no-dashboard", "--death-timeout", "30"]
+            words += client.workers.words
             quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
             added.append(subprocess.Popen(words, cwd=tmp_path, **quiet))
 
     folder = tmp_path / "run"
     try:
         found = tuning.ensemble(
-            case, SPREAD, **OPTIONS, cluster=address, folder=folder, progress=progress
+            case, SPREAD, **OPTIONS, cluster=client, folder=folder, progress=progress
         )
         assert same(found, whole)
         assert seen == sorted(seen) and seen[-1] == 400 and len(seen) == 25
@@ -199,20 +208,22 @@ def test_a_result_that_is_lost_before_it_is_fetched_is_computed_again():
 
 
 def test_a_lost_scheduler_is_one_line_and_the_run_goes_on_from_its_folder(case, whole, tmp_path):
-    with local_workers(1) as (address, _):
-        with distributed.Client(address) as found:
-            pid = found.run_on_scheduler(os.getpid)
+    with (
+        local_workers(1) as workers,
+        distributed.Client(workers.address, security=workers.security) as client,
+    ):
+        pid = client.run_on_scheduler(os.getpid)
 
         def progress(done):
             if done == 64:
                 os.kill(pid, signal.SIGKILL)
 
         with (
-            pytest.raises(InputError, match=r"^cluster tcp://.*scheduler was lost.*--resume DIR$"),
+            pytest.raises(InputError, match=r"^cluster tls://.*scheduler was lost.*--resume DIR$"),
             warnings.catch_warnings(action="ignore", category=engines.ClusterWarning),
         ):
             tuning.ensemble(
-                case, SPREAD, **OPTIONS, cluster=address, folder=tmp_path, progress=progress
+                case, SPREAD, **OPTIONS, cluster=client, folder=tmp_path, progress=progress
             )
     kept = len(list(tmp_path.glob("part-*.npz")))
     assert 4 <= kept < 25
@@ -237,9 +248,9 @@ def test_a_process_of_local_ends_with_the_pipe_from_its_parent(tmp_path):
 def test_processes_of_local_end_with_the_one_that_began_them(tmp_path):
     code = (
         "import time\nfrom tuning.cluster.local import local_workers\n"
-        "with local_workers(1) as (address, _):\n"
+        "with local_workers(1) as workers:\n"
         "    import distributed\n"
-        "    client = distributed.Client(address)\n"
+        "    client = distributed.Client(workers.address, security=workers.security)\n"
         "    client.wait_for_workers(1, timeout=60)\n"
         "    import os\n"
         "    print(client.run_on_scheduler(os.getpid), *client.run(os.getpid).values())\n"
@@ -260,6 +271,72 @@ def test_processes_of_local_end_with_the_one_that_began_them(tmp_path):
     while (any(map(alive, pids)) or any(tmp_path.iterdir())) and time.monotonic() < deadline:
         time.sleep(0.1)
     assert not any(map(alive, pids)) and not any(tmp_path.iterdir())
+
+
+def listening(pid):
+    """{address} on which a process waits for connections."""
+    connections = psutil.Process(pid).net_connections(kind="inet")
+    return {c.laddr for c in connections if c.status == psutil.CONN_LISTEN}
+
+
+async def connected(address, keys):
+    """Connect to a process of Dask, with its handshake."""
+    comm = await asyncio.wait_for(distributed.comm.connect(address, timeout=0.7, **keys), 10)
+    await comm.close()
+
+
+def test_local_workers_listen_on_this_machine_alone_and_to_their_own_client_alone(client):
+    pids = [client.run_on_scheduler(os.getpid), *client.run(os.getpid).values()]
+    listeners = set().union(*map(listening, pids))
+    assert len(listeners) >= 2 * len(pids) - 1
+    assert {address.ip for address in listeners} == {"127.0.0.1"}
+    strange = distributed.Security.temporary().get_connection_args("client")
+    for ip, port in listeners:
+        for address, keys in ((f"tcp://{ip}:{port}", {}), (f"tls://{ip}:{port}", strange)):
+            with pytest.raises(OSError):
+                asyncio.run(connected(address, keys))
+        for path in ("/json/identity.json", "/info/main/workers.html", "/health", "/"):
+            with pytest.raises(OSError):  # refused, or no page of that name
+                urllib.request.urlopen(f"http://{ip}:{port}{path}", timeout=2)
+    folder = Path(client.workers.words[1]).parent
+    assert folder.stat().st_mode & 0o077 == 0
+    assert all(path.stat().st_mode & 0o077 == 0 for path in folder.glob("*.pem"))
+
+
+def test_the_command_with_local_workers_opens_nothing_to_others(case, tmp_path):
+    """Through the command: every socket of its processes, while it runs."""
+    rig.save(case, tmp_path / "rig.toml")
+    words = [sys.executable, "-m", "jaxtank", "uncertainty", str(tmp_path / "rig.toml")]
+    words += ["--samples", "200000", "--cluster", "local:1"]
+    begun = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    listeners, until = set(), time.monotonic() + 120
+    try:
+        while len(listeners) < 3 and begun.poll() is None and time.monotonic() < until:
+            for process in psutil.Process(begun.pid).children(recursive=True):
+                with contextlib.suppress(psutil.Error):
+                    listeners |= listening(process.pid)
+            time.sleep(0.2)
+    finally:
+        begun.kill()
+        begun.wait()
+    assert len(listeners) >= 3 and {address.ip for address in listeners} == {"127.0.0.1"}
+
+
+def test_a_scheduler_without_certificates_is_a_warning(case, whole):
+    with (
+        distributed.LocalCluster(
+            n_workers=1, processes=False, protocol="tcp", dashboard_address=None
+        ) as cluster,
+        pytest.warns(engines.ClusterWarning, match="can run code as the user of its workers"),
+        engines.connect(cluster.scheduler_address),
+    ):
+        pass
+
+
+def test_without_cryptography_the_remedy_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cryptography", None)
+    with pytest.raises(InputError, match="pip install cryptography"), local_workers(1):
+        pass
 
 
 def alive(pid):

@@ -1,12 +1,16 @@
 """Units as they are printed: those of the rig, with its powers."""
 
 import json
+import re
 
 import pytest
 
-from jaxtank.core.units import local
+from jaxtank import rig
+from jaxtank.core.errors import InputError
+from jaxtank.core.units import flow_per_input, local
 from jaxtank.measures import MEASURES
 from jaxtank.measures import unit as measure_unit
+from tuning import read_log
 from tuning.cli import main
 
 FLOW = ("m", "m^3/s")
@@ -87,3 +91,119 @@ def test_a_rig_in_litres_per_minute_has_no_volts_in_its_files_and_measures(tmp_p
     (line,) = (row for row in capsys.readouterr().out.splitlines() if row.startswith("rms_input"))
     assert "L/min" in line and "voltage" not in line
     assert not any("voltage" in each.doc for each in MEASURES.values())
+
+
+PUMPED = """
+units = [{}]
+[[tank]]
+area = 0.5
+rim = 1.2
+drain = 4e-4
+level = 0.4
+[[pump]]
+gain = {}
+to = 1
+high = 100.0
+[plant]
+gravity = 9.81
+[law]
+kind = "pid"
+Kc = 1.0
+Ti = 100.0
+[reference]
+initial = [0.4]
+"""
+
+
+@pytest.mark.parametrize(
+    ("spellings", "size"),
+    [
+        (("m^3/h", "m3/h", "m³/h"), 1 / 3600),
+        (("L/min", "l/min"), 1e-3 / 60),
+        (("cm3/s", "cc/s", "mL/s", "ml / s"), 1e-6),
+        (("gpm",), 3.785411784e-3 / 60),  # US gallon
+        (("m3/s",), 1.0),
+    ],
+)
+def test_a_flow_in_any_spelling_is_the_same_flow(tmp_path, spellings, size):
+    """In a rig, whose gain must be the size of the unit, and in a column of another rig's log."""
+    other = rig.loads(PUMPED.format('"m", "l/s"', 1e-3)).loop
+    for spelling in spellings:
+        case = rig.loads(PUMPED.format(f'"m", "{spelling}"', size))
+        assert rig.loads(rig.dump(case)).loop.units == case.loop.units
+        assert flow_per_input(case.loop.units) == pytest.approx(size, rel=1e-12)
+        if size < 1:
+            with pytest.raises(InputError, match=r"pump 1: gain = 1 m\^3/s per .* must be"):
+                rig.loads(PUMPED.format(f'"m", "{spelling}"', 1.0))
+        (tmp_path / "log.csv").write_text(f"t [s],pump1 [{spelling}],h1 [m]\n0,3,0.4\n1,6,0.4\n")
+        read = read_log(tmp_path / "log.csv", other)
+        assert read.u[1, 0] == pytest.approx(6 * size / 1e-3, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("units", "why"),
+    [
+        ('"m", "furlong"', "'furlong' is unknown: must be one of V, mV, "),
+        ('"m", "cm"', "'cm' is no unit of a pump input"),
+        ('"m", "s"', "'s' is no unit of a pump input"),
+        ('"m^3/h", "V"', "'m^3/h' is no unit of a level"),
+        ('"parsec", "V"', "'parsec' is unknown: must be one of m, dm, cm"),
+    ],
+)
+@pytest.mark.parametrize("command", ["simulate", "init", "show"])
+def test_a_unit_that_is_unknown_or_of_another_dimension_is_refused(
+    tmp_path, capsys, command, units, why
+):
+    (tmp_path / "rig.toml").write_text(PUMPED.format(units, 1.0))
+    assert main.main([command, str(tmp_path / "rig.toml")]) == 2
+    out, err = capsys.readouterr()
+    assert why in err and not out and err.count("\n") == 1
+
+
+def test_a_gain_that_pumps_3600_times_too_much_is_refused(tmp_path, capsys):
+    (tmp_path / "rig.toml").write_text(PUMPED.format('"m", "m^3/h"', 1.0))
+    assert main.main(["simulate", str(tmp_path / "rig.toml")]) == 2
+    assert "must be 0.000277778 times the share that the pump delivers" in capsys.readouterr().err
+
+
+def test_a_controller_is_described_in_the_units_of_its_rig(capsys):
+    for name in ("khalid/gpc", "khalid/laguerre"):
+        assert main.main(["show", name]) == 0
+        shown = capsys.readouterr().out
+        assert "[m] and du [U0]" in shown and not re.search(r"\bcm\b|\[V\]", shown)
+
+
+FLOW_RIG = PUMPED.format('"m", "m^3/h"', 1 / 3600).replace("100.0\n[plant]", "5.0\n[plant]") + (
+    'changes = [[20.0, 1, 0.5]]\n[free]\n"controller.Kc" = [0.1, 10.0]\n'
+    '[values]\n"clock.duration" = 120.0\n'
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "command",
+    [
+        "show RIG",
+        "init RIG",
+        "simulate RIG --margins",
+        "tune RIG --starts 1 --iterations 3 --validation 8 --quiet",
+        "tune RIG --nominal --starts 1 --iterations 3 --quiet",
+        "uncertainty RIG --samples 8 --vary plant.drain=uniform:5% --quiet",
+        "sensitivity RIG --samples 8 --vary plant.drain=uniform:5% --quiet",
+        "attack RIG --starts 1 --quiet",
+        "export RIG --lang c",
+        "export RIG --lang m",
+        "export RIG --lang js",
+        "identify RIG --plan",
+    ],
+)
+@pytest.mark.parametrize("units", ["m^3/h", "%"])
+def test_no_command_prints_centimetres_or_volts_of_another_rig(tmp_path, capsys, command, units):
+    file = tmp_path / "rig.toml"
+    file.write_text(FLOW_RIG.replace("m^3/h", units))
+    assert main.main(command.replace("RIG", str(file)).split()) in (0, 3, 4)
+    printed = "".join(capsys.readouterr()).replace(str(tmp_path), "")
+    alien = re.findall(r".*(?:\bcm\b|(?<![\w/.])V\b).*", printed)
+    # a sensor's voltage is one in any rig
+    alien = [row for row in alien if "ADC" not in row and "sensor." not in row]
+    assert not alien, "\n".join(alien[:10])

@@ -670,7 +670,7 @@ def test_uneven_times_and_logs_of_two_lengths(case, away):
         u = np.tile(volts, (count, 1)) + 0.5 * np.sign(np.sin(t / 9))[:, None]
         y = played(case, t, u, x0) + 0.05 * rng.standard_normal((count, 4))
         y[rng.random(y.shape) < 0.1] = np.nan
-        logs.append(tuning.log(t=t, u=u, y=y))
+        logs.append(tuning.log(t=t, u=u, y=y, hold="zero-order"))
     options = {"start": "free", "starts": 1, "noise": 0.05, "substeps": 4}
     both = tuning.identify(away, logs, WIDE, hold_back=0.2, gap=2.5, **options)
     assert both.status == "converged" and len(both.levels) == 2
@@ -684,11 +684,11 @@ def test_uneven_times_and_logs_of_two_lengths(case, away):
 
 
 def test_a_record_shifted_by_the_delay_of_the_pumps():
-    """By hand: samples every 2 s, 3 s of delay: an input reaches the tank at the first sample at
-    least as late, the first one before.
-    """
+    """By hand, samples every 2 s: an input reaches the tank at its own time; before, the first."""
     log = tuning.log(t=[0.0, 2, 4, 6, 8], u=[1.0, 2, 3, 4, 5], y=np.zeros(5))
-    np.testing.assert_array_equal(simulation.padded([log], 3.0).u[0, :, 0], [1, 1, 1, 2, 3])
+    cut = simulation.padded([log], 3.0)
+    np.testing.assert_array_equal(cut.u[0, 2:4, :, 0], [[1, 2], [2, 3]])
+    np.testing.assert_array_equal(cut.dt[0, 2:4], [[1, 1], [1, 1]])
     np.testing.assert_array_equal(simulation.padded([log], 4.0).u[0, :, 0], [1, 1, 1, 2, 3])
     np.testing.assert_array_equal(simulation.padded([log]).u[0, :, 0], [1, 2, 3, 4, 5])
 
@@ -1405,9 +1405,7 @@ def cascaded():
 @pytest.mark.slow
 @recorded
 def test_the_cascaded_tanks(cascaded):
-    """Residual at most 0.26 V on all 1024 samples; published errors on the other record are 0.18 to
-    0.45 V.
-    """
+    """Residual at most 0.26 V on all 1024 samples (0.45 V is published for the other record)."""
     assert cascaded.status == "converged" and cascaded.quality["rmse"][0] <= 0.26
     assert cascaded.validation["samples"] == [700]
     assert (

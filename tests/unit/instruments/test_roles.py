@@ -31,9 +31,9 @@ CLOCK = Clock(dt=DT, duration=DURATION, substeps=4)
 class RateLimited(Actuator):
     """Pumps whose input changes at a limited rate."""
 
-    low: np.ndarray = leaf("V", "(m,) lower limit of each pump")
-    high: np.ndarray = leaf("V", "(m,) upper limit of each pump")
-    initial: np.ndarray = leaf("V", "(m,) input before t = 0")
+    low: np.ndarray = leaf("V", "lower limit of each pump", shape=("pump",))
+    high: np.ndarray = leaf("V", "upper limit of each pump", shape=("pump",))
+    initial: np.ndarray = leaf("V", "input before t = 0", shape=("pump",))
     rate: float = leaf("V/s", "largest rate of change", low=0.0, strict=True)
 
     def init(self, clock):
@@ -59,7 +59,7 @@ class Quantised(Sensor):
 class Lagged(Sensor):
     """Readings that follow the level with a lag, and noise."""
 
-    noise: np.ndarray = leaf("cm", "(n,) standard deviation of the noise", low=0.0)
+    noise: np.ndarray = leaf("cm", "standard deviation of the noise", low=0.0, shape=("tank",))
     tau: float = leaf("s", "time constant", low=0.0, strict=True)
 
     def init(self, x0):

@@ -1,5 +1,6 @@
 """The live page in Chromium, against the library and its own promises."""
 
+import contextlib
 import csv
 import dataclasses
 import io
@@ -504,3 +505,89 @@ def test_a_constant_reference_runs_and_limits_are_ranked_by_their_shares(browser
         assert live.text("#verdict").startswith("Limit exceeded by")
         assert "max_error" in live.text("#verdict")
         assert live.text("#margins tbody th").startswith("max_error")
+
+
+# --- what the header, the limits and the sliders say is of the loop as it runs
+
+
+def verdict(live, *words):
+    """The class of the header once it says all of `words`."""
+    live.wait(
+        f"{list(words)}.every((part) => "
+        "document.querySelector('#verdict').textContent.includes(part))"
+    )
+    return live.page.get_attribute("#verdict", "class")
+
+
+@pytest.fixture(scope="module")
+def four_tanks(tmp_path_factory):
+    path = tmp_path_factory.mktemp("live") / "four.html"
+    path.write_text(page(presets.find("gouta2015/backstepping")), encoding="utf-8")
+    return path
+
+
+def test_limits_and_verdict_follow_the_slider_of_a_rim(browser, four_tanks):
+    """A rim of 36 cm ends the excess of 33.08 cm over 30; one of 20 cm makes it 13.08 cm."""
+    with opened(browser, four_tanks) as live:
+        assert verdict(live, "exceeded by 3.08 cm: max_level, tank 4") == "bad"
+        set_all(live, {f"plant.rim[{i}]": 36.0 for i in range(4)})
+        assert verdict(live, "smallest margin 2.92 cm") == "good"
+        assert "36 cm" in live.page.inner_text("#margins")
+        set_all(live, {"plant.rim[3]": 20.0})
+        assert verdict(live, "exceeded by 13.1 cm: max_level, tank 4") == "bad"
+        row = live.page.locator("#margins tr", has_text="tank 4").inner_text()
+        assert "≤ 20 cm" in row
+        # drawn as high as it is, and asked for by the search
+        heights = [float(h) for h in live.page.locator("#rig .inside").evaluate_all(
+            "nodes => nodes.map((node) => node.getAttribute('height'))")]  # fmt: skip
+        assert heights[3] / heights[2] == pytest.approx(20.0 / 36.0, rel=1e-3)
+
+
+def test_a_level_far_from_its_setpoint_is_no_check_mark(browser, four_tanks):
+    """Tank 1 with a leak, safety filter on: every level limit holds, and 12 cm is not reached."""
+    with opened(browser, four_tanks) as live:
+        live.page.check("#filter")
+        live.page.evaluate("document.getElementById('breaks').open = true")
+        live.page.get_by_role("button", name="leak in tank 1").click()
+        assert verdict(live, "tank 1 is ", "from its setpoint of", "Every limit holds") == "bad"
+
+
+def test_sliders_without_effect_are_folded_and_come_back_with_it(browser, four_tanks):
+    with opened(browser, four_tanks) as live:
+        live.page.wait_for_selector("#idle", state="attached", timeout=120_000)
+        idle = set(live.page.locator("#idle .row label[for]").all_text_contents())
+        idle = {text.split(" [")[0] for text in idle}
+        assert {"sensor.gain[0]", "sensor.full_scale", "actuator.pulse[0]"} <= idle
+        names = set(live.page.evaluate("window.jaxtank.names"))
+        assert len(names) > len(idle) > 10 and not live.page.evaluate("idle.open")
+        assert not any(name.startswith("plant.rim") for name in idle)  # it moves a limit
+        # by the library: no end of a folded slider changes the run
+        case = presets.find("gouta2015/backstepping")
+        before = jaxtank.simulate(case.loop, case.clock, save_every=40)
+        ends = live.page.evaluate(
+            "[...document.querySelectorAll('#idle .row input[type=number]')]"
+            ".map((box) => [box.getAttribute('aria-label').split(' [')[0], +box.min, +box.max])"
+        )
+        assert {name for name, *_ in ends} == idle
+        for name, low, high in ends[::3]:
+            for value in (low, high):
+                loop = with_values(case.loop, {name: value})
+                run = jaxtank.simulate(loop, case.clock, save_every=40)
+                assert np.array_equal(run.x, before.x) and np.array_equal(run.u, before.u), name
+        # the rest changes something: opened again after a change, a group lets go of what does now
+        assert names - idle >= {"controller.k", "plant.orifice[0]", "sensor.noise[0]"}
+
+
+def test_the_frame_of_a_report_has_the_limits_of_the_command(browser, tmp_path):
+    """33 cm for rims of 30: the banner and the frame on one page agree."""
+    words = ["tune", "gouta2015/backstepping", "--nominal", "--dt", "0.1", "--starts", "1"]
+    words += ["--limit", "max_level=33", "--out", str(tmp_path / "tuned")]
+    assert command(*words)[0] == 0
+    with contextlib.closing(browser.new_context()) as context:
+        report = context.new_page()
+        report.goto((tmp_path / "tuned" / "report.html").as_uri())
+        report.locator("iframe.live").scroll_into_view_if_needed()
+        frame = report.frame_locator("iframe.live")
+        frame.locator("#margins table").wait_for(timeout=60_000)
+        assert "≤ 33 cm" in frame.locator("#margins").inner_text()
+        assert frame.locator("#verdict").inner_text().startswith("Every limit holds")

@@ -343,3 +343,63 @@ def test_the_level_of_an_unresolved_laminar_zone_is_reported():
     exact = (0.5 * 8.0 / 0.4) ** 2 / (2 * 981.0)  # Torricelli
     np.testing.assert_allclose(level, 2.0 * 0.5 * 8.0 / 20.0, rtol=1e-9)
     assert exact < level < exact + reported
+
+
+CHAIN = """
+reachable = false
+tank = [{ area = 7.232, rim = 30.0, level = 0.83, drain = 0.115 },
+        { area = 20.134, rim = 30.0, level = 9.7, drain = 0.095 },
+        { area = 4.939, rim = 30.0, level = 5.64, drain = 0.072 }]
+orifice = [{ from = 1, to = 2, area = 0.139 }, { from = 2, to = 3, area = 0.234 }]
+pump = [{ gain = 27.238, to = 1, high = 12.0, initial = 0.0 }]
+plant = { outputs = [3] }
+law = { kind = "pid", Kc = KC, Ti = 38.688 }
+reference = { initial = [5.0], changes = [[30.0, 1, 10.182]], ramp = 0.0 }
+values = { "clock.dt" = 0.5, "clock.duration" = 120.0 }
+"""
+
+
+def finer(case, substeps):
+    """The Trajectory of a case with these substeps."""
+    return jaxtank.simulate(case.loop, dataclasses.replace(case.clock, substeps=substeps))
+
+
+def test_a_run_that_its_steps_spoil_is_refused_with_its_error(tmp_path, capsys):
+    """The level of tank 1 alone would rise to 0.67 cm; the controller makes 19 cm of it. No volume
+    appears at any sample, so that the balance of a run does not see it.
+    """
+    (tmp_path / "chain.toml").write_text(CHAIN.replace("KC", "2.335"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", step_size.StepWarning)
+        case = rig.loads(CHAIN.replace("KC", "2.335"))
+        step_size.check_run(case.loop, case.clock, finer(case, 1))
+        apart = np.abs(np.asarray(finer(case, 1).x) - np.asarray(finer(case, 2).x))
+        right = np.abs(np.asarray(finer(case, 1).x) - np.asarray(finer(case, 8).x)).max()
+        assert main.main(["simulate", str(tmp_path / "chain.toml"), "--out", str(tmp_path)]) == 2
+    tank, sample = np.unravel_index(np.argmax(apart.T), apart.T.shape)
+    printed = capsys.readouterr().err
+    assert f"the level of tank {tank + 1} differs by {apart.max():.3g} cm at" in printed
+    assert f"at t = {0.5 * sample:g} s" in printed and "clock.substeps = 5 is short" in printed
+    np.testing.assert_allclose(apart.max(), right, rtol=0.05)  # half the step tells the error
+    assert list(tmp_path.iterdir()) == [tmp_path / "chain.toml"]
+
+
+def test_the_note_on_the_step_reports_measured_errors(tmp_path, capsys):
+    """Levels, inputs and measures, against the same run with half the step."""
+    text = CHAIN.replace("KC", "2.3").replace("27.238", "4.0")
+    (tmp_path / "chain.toml").write_text(text)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", step_size.StepWarning)
+        case = rig.loads(text)
+        runs = [finer(case, substeps) for substeps in (1, 2)]
+        assert main.main(["simulate", str(tmp_path / "chain.toml")]) == 0
+    (note,) = [x for x in capsys.readouterr().err.splitlines() if "with half the step" in x]
+    x, u = (
+        np.abs(np.asarray(getattr(runs[0], name)) - np.asarray(getattr(runs[1], name)))
+        for name in ("x", "u")
+    )
+    assert f"differs by {x[:, 0].max():.3g} cm" in note
+    assert f"the input of pump 1 by {u.max():.3g} V" in note
+    travel = [np.abs(np.diff(np.asarray(run.u)[:, 0])).sum() for run in runs]
+    words = f"input_travel of pump 1 is {travel[1]:.3g} V in place of {travel[0]:.3g} V"
+    assert words in note

@@ -1,17 +1,20 @@
 """Papers compared in Python: counts, rows and the table of a notebook; figures by name."""
 
+import json
 import warnings
 
 import pytest
 
 import tuning
 from jaxtank.core.errors import InputError
+from tuning.cli import main
 from tuning.figures import comparison
 from tuning.report import papers
 
 
 def row(quantity, verdict, **more):
     found = {"quantity": quantity, "unit": "cm", "where": "Table 1", "published": 2.0}
+    found |= {"kind": "number", "deviation": None, "ramp_s": None, "by_ramp": {}}
     return found | {"measured": [2.0, 2.5], "verdict": verdict, "reason": "because"} | more
 
 
@@ -33,6 +36,7 @@ def test_rows_are_counted_by_verdict_and_found_by_quantity():
         ["two", "0", "1", "1", "0", "0"],
         ["all", "1", "1", "2", "0", "0"],
     ]
+    assert text[-2].startswith("printed numbers: 1 of 4 reproduced, 1 fitted; claims in words: 0")
     assert "a <note>" in text[-1] and set(found.to_json()) == {"one", "two"}
 
 
@@ -84,4 +88,56 @@ def test_the_rows_of_a_paper_are_those_of_the_command():
     found = tuning.compare("cascaded")
     assert found.row("plant.rim")["measured"] == 10.0  # the rim of the public record [V]
     assert found.row("record, sampling period")["measured"] == 4.0  # s
+    assert found.count("input") == 2 and found.count("reproduced") == 0
     assert str(found).splitlines()[2].split()[0] == "cascaded"
+
+
+def test_the_headline_counts_numbers_and_claims_apart():
+    rows = [
+        *(row("a", word) for word in ("reproduced", "differs", "fitted", "input")),
+        *(row("b", word, kind="claim") for word in ("reproduced", "reproduced", "differs")),
+        row("c", "not reproducible", kind="claim"),
+    ]
+    counts = papers.headline(rows)
+    assert counts["numbers"] == {"reproduced": 1, "fitted": 1, "differs": 1, "of": 3}
+    assert counts["claims"] == {"reproduced": 2, "fitted": 0, "differs": 1, "of": 3}
+    assert counts["input"] == counts["not reproducible"] == 1
+
+
+def test_the_claims_of_a_ramp_are_the_same_for_each():
+    rows = [
+        row("error", "differs", kind="claim", by_ramp={"30": "reproduced", "60": "partly"}),
+        row("rims", "differs", kind="claim", by_ramp={"30": "not reproduced", "60": "reproduced"}),
+        row("other", "reproduced"),
+    ]
+    assert papers.ramps(rows) == [
+        {"ramp_s": 30.0, "reproduced": 1, "of": 2, "differs": ["rims"]},
+        {"ramp_s": 60.0, "reproduced": 1, "of": 2, "differs": ["error"]},
+    ]
+    assert papers.ramps(rows[2:]) == []
+
+
+def test_the_command_says_numbers_and_claims_apart(capsys, monkeypatch, tmp_path):
+    """In the terminal, in JSON and on the page."""
+    text = "printed numbers: 1 of 2 reproduced, 0 fitted; claims in words: 1 of 1 hold, 0 fitted"
+    claim = row("rims", "reproduced", kind="claim", published="below", measured="29 cm")
+    claim |= {"by_ramp": {"30": "partly", "60": "reproduced"}, "ramp_s": 60.0}
+    rows = [row("a", "reproduced"), row("b", "differs"), claim]
+
+    def measure(paper):
+        whole = {"headline": papers.headline(rows), "ramps": papers.ramps(rows), "rows": rows}
+        return {"paper": paper, "citation": "C", "notes": "N"} | whole
+
+    monkeypatch.setattr(papers, "measure", measure)
+    assert main.main(["compare", "calofir", "--out", str(tmp_path), "--quiet"]) == 0
+    printed = capsys.readouterr().out
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    for shown in (printed, page):
+        assert text in shown and "with setpoint ramps of 60 s: 1 of 1 claims" in shown
+        assert "with setpoint ramps of 30 s: 0 of 1 claims" in shown and "ramps of 60 s" in shown
+    assert main.main(["compare", "calofir", "--json", "--quiet"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["headline"]["numbers"]["of"] == 2 and found["headline"]["claims"]["of"] == 1
+    assert [one["reproduced"] for one in found["ramps"]] == [0, 1]
+    assert main.main(["compare", "all", "--quiet"]) == 0
+    assert "all papers: printed numbers: 8 of 16 reproduced" in capsys.readouterr().out

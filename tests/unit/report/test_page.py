@@ -107,6 +107,7 @@ def results(case, tmp_path_factory):
         "measured": 2.0,
         "verdict": "differs",
         "reason": NASTY,
+        "kind": "number",
     }
     pages = {
         "calofir": {
@@ -329,6 +330,7 @@ def test_compare_and_show_write_to_the_folder_asked_for(tmp_path, monkeypatch, c
         "measured": 1.0,
         "verdict": "reproduced",
         "reason": "",
+        "kind": "number",
     }
     monkeypatch.setattr(
         papers, "measure", lambda paper: {"paper": paper, "citation": "C", "rows": [row]}
@@ -508,6 +510,7 @@ def test_no_column_of_a_page_of_claims_is_cut(tmp_path, width):
         "where": "sec. 5.1, 5.3, Table 2",
     }
     row |= {"published": words, "measured": words, "verdict": "differs", "reason": words}
+    row["kind"] = "claim"
     listed = row | {
         "published": tuple(0.123456 + k for k in range(16)),
         "measured": tuple(0.654321 + k for k in range(16)),

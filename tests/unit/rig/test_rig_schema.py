@@ -272,7 +272,8 @@ KINDS = {
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_value_of_each_kind_is_written_as_it_is_read_and_another_is_refused(kind):
-    key = Key("key", "what it is" if kind == "scalar" else "(n,) what it is", kind, unit="cm")
+    shape = () if kind == "scalar" else ("tank",)
+    key = Key("key", "what it is", kind, unit="cm", shape=shape)
     good, bad = KINDS[kind]
     assert written(key, read_value(key, "tank 1: key", good, SIZES)) == good
     with pytest.raises(InputError, match=r"tank 1: key.* must .*") as refused:

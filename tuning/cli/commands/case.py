@@ -136,7 +136,8 @@ def simulate(args):
     other = None if args.against is None else _other(args.against)
     import jax
 
-    from jaxtank.loop import run, step_size
+    from jaxtank.loop import run
+    from jaxtank.loop.halving import halving_warnings
     from jaxtank.loop.margins import stability_margins
     from tuning.problem import provenance, reported
     from tuning.problem.scenarios import noisy
@@ -144,9 +145,11 @@ def simulate(args):
     from tuning.report import case as manual
 
     key = jax.random.key(seed) if noisy(case) else None
-    if step_size.step_warnings(case.loop, case.clock):
-        step_size.check_run(case.loop, case.clock, run.simulate(case.loop, case.clock, key))
+    of_run = halving_warnings(case.loop, case.clock, key)
     values = dict(reported.run_measures(case.loop, case.clock, key))
+    of_run += _below_floor(case, values, key)
+    for sentence in [] if args.quiet else of_run:
+        print(f"jaxtank: note: {sentence}", file=sys.stderr)
     plateaus = stability_margins(case.loop, case.clock) if args.margins else ()
     values |= reported.margin_measures(case.loop, case.clock) if args.margins else {}
     payload = {
@@ -184,6 +187,19 @@ def simulate(args):
             print("\nThe safety filter is on: jaxtank show prints what is proved of each tank.")
     report_written(written, args)
     return 0
+
+
+def _below_floor(case, values, key):
+    """Sentences on levels that fell below 0 in the run of these measures."""
+    import numpy as np
+
+    from jaxtank.loop import floor
+    from jaxtank.loop.saved_rows import simulate_compiled
+
+    if not np.any(np.asarray(values["min_level"]) < floor.lowest(case.loop.plant)):
+        return []
+    run, _ = simulate_compiled(case.loop, case.clock, key, 1)
+    return floor.floor_warnings(case.loop, run)
 
 
 def _checked_columns(args):

@@ -47,6 +47,8 @@ def _add_data(one):
     )
     option(one, "--decimal", "SIGN", "decimal sign of the data: . (default) or ,", ".")
     option(one, "--gap", "X", "longest step between samples, in median steps (default 1.5)", "1.5")
+    text = "inputs between samples: zero-order (each until the next row) or first-order (a line)"
+    option(one, "--hold", "HOW", text, "")
     text = "end of the data that validates a first fit: share, or samples (default 0.25)"
     option(one, "--hold-back", "SHARE", text, "0.25")
     text = "standard deviation of the readings, one or one per channel (default: from the data)"
@@ -153,7 +155,7 @@ def _read(args, case):
 
     pairs = [values.pair("--column", text, _column) for text in args.column]
     columns = dict(case.log) | (values.once("--column", pairs) or {})
-    return [read_log(path, case.loop, columns, args.decimal) for path in args.data]
+    return [read_log(path, case.loop, columns, args.decimal, args.hold) for path in args.data]
 
 
 def _column(text):

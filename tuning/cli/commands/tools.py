@@ -123,7 +123,9 @@ def compare(args):
     elif args.markdown:
         print(report.markdown(found))
     else:
-        print("\n\n".join(report.text(page) for page in found.values()))
+        every = [row for page in found.values() for row in page["rows"]]
+        total = [f"all papers: {report.headline_text(every)}"] if len(found) > 1 else []
+        print("\n\n".join([*total, *(report.text(page) for page in found.values())]))
     report_written(written, args)
     return 0
 

@@ -6,9 +6,11 @@ import numpy as np
 
 from jaxtank.core.tree import describe, get_value
 from jaxtank.core.units import local
+from jaxtank.safety.checker import OWN
 from tuning.problem import provenance
-from tuning.problem.wording import count
+from tuning.problem.wording import count, numbered
 from tuning.report import tables
+from tuning.report.safety import start_of
 
 BOUND = (
     "What an attack finds is a lower bound of the worst: a limit that is not passed here may be"
@@ -55,6 +57,7 @@ def _row(attack, one):
             "passed": one.passed,
             "certified": one.certified,
             "why": one.reason or None,
+            "starts": one.starts or None,
             "nominal": one.nominal,
             "drawn": one.drawn,
             "rise_between_samples": one.rise,
@@ -76,6 +79,11 @@ def remarks_of(attack):
             "The rims of this rig are physics: no level passes them, and the rest overflows. The"
             " attack is on the same rig without overflow, whose levels show what would overflow."
         )
+    if beyond := [one.tank + 1 for one in attack.found if _starts_elsewhere(attack, one)]:
+        found.append(
+            f"Proved {start_of([OWN])} only: {numbered('tank', beyond)}. This attack starts"
+            " anywhere below the limits; --start own keeps to the case's start."
+        )
     if outside := _outside(attack):
         found.append(
             f"The intervals of {', '.join(outside)} are wider than those that the safety filter"
@@ -90,6 +98,11 @@ def remarks_of(attack):
             " safety filter: nothing is proved of such readings."
         )
     return [*found, BOUND]
+
+
+def _starts_elsewhere(attack, one):
+    """Whether a limit is proved from the case's start only, and the attack has others."""
+    return one.starts == OWN and attack.attacked.start == "any"
 
 
 def _outside(attack):
@@ -144,7 +157,10 @@ def _scope(attack):
             f"{varying} of them with a value of its own in each of {attacked.windows} windows of"
             f" {(clock.duration + clock.dt) / attacked.windows:.4g} s"
         )
-    words.append("any start up to the limits" if attacked.start == "any" else "the case's start")
+    kept = "any start up to the limits"
+    if loop.safety_filter is not None:
+        kept = "any start from which the filter can keep the limits"
+    words.append(kept if attacked.start == "any" else "the case's start")
     if "bias" in attacked.shapes:
         band = ", ".join(f"{b:.3g}" for b in attacked.band)
         kind = "at each sample" if "noise" in attacked.shapes else "constant"
@@ -186,6 +202,7 @@ def verdict(attack):
     words = ", ".join(
         f"tank {one.tank + 1} by {-one.margin:.3g} {unit}"
         + (f" ({one.reason})" if one.certified is False else "")
+        + (f" (proved {start_of([OWN])} only)" if _starts_elsewhere(attack, one) else "")
         for one in attack.passed
     )
     return f"Limits are passed: {words}."

@@ -91,6 +91,9 @@ def notes_of(result):
         found.append(f"{result.failed} of {count(result.runs, 'run')} diverged")
     if result.method != "local":
         found += _left_out(result)
+    else:
+        reasons = dict.fromkeys(c.reason for c in result.columns if c.reason)
+        found += [f"-: {reason}" for reason in reasons]
     if result.method == "sobol":
         found += _precision(result)
     return found

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtank import measures as ms
 from tuning.answer.setting import limited_levels
 from tuning.problem.wording import numbered
+from tuning.report.safety import PROMISE, start_of
 from tuning.report.tables import number, objective_unit, table
 from tuning.report.tuned.tables import parts_of as all_parts
 
@@ -40,7 +41,9 @@ def of_answer(answer, result=None):
         found += _beyond(answer)
     if result is not None:
         found += [_values(result, answer), ""]
-    return [*found, _effects(answer)]
+    found += [_effects(answer)]
+    proved = [row.starts for row in answer.setting.certificates if row.certified]
+    return [*found, "", _wrapped(f"proved: {PROMISE}, {start_of(proved)}")] if proved else found
 
 
 def _beyond(answer):
@@ -79,14 +82,13 @@ def json_parts(result) -> dict[str, Any]:
 
 def _headline(result):
     """One sentence on the outcome."""
-    answer, status = result.answer, str(result.status).replace("_", " ")
+    answer, status = result.answer, result.headline.replace("_", " ")
     start = f"{result.tuned.name}: {status}"
     if answer.after is None:
         return f"{start}; no validation plants ({result.wall_s:.1f} s)"
     held, samples = int(answer.after.held.sum()), answer.after.samples
-    limited = (
-        f"; limits hold on {held} of {samples} validation plants" if answer.after.limits else ""
-    )
+    on = f"; limits hold on {held} of {samples} {answer.setting.runs}"
+    limited = on if answer.after.limits else ""
     tanks = [r.tank + 1 for r in answer.setting.certificates if r.certified]
     proved = f", proved for {numbered('tank', tanks)}" if tanks and limited else ""
     changed = sum(not stays for stays in answer.kept.values())

@@ -24,6 +24,7 @@ def json_of(result):
         "method": result.method,
         "success": result.success,
         "status": str(result.status),
+        "headline": result.headline,
         "message": result.message,
         "messages": [{"code": m.code, "text": m.text} for m in result.messages],
         "parameters": {n: {**clean(p), "interval": None} for n, p in result.parameters.items()},
@@ -42,6 +43,7 @@ def json_of(result):
         "symmetry": clean(result.symmetry),
         "choices": clean(result.choices),
         "optimality": clean(result.optimality),
+        "slopes": {where: check.to_json() for where, check in result.slopes.items()},
         "curvature": clean(result.curvature),
         "tradeoff": clean(result.tradeoff),
         "certificate": None if result.certificate is None else result.certificate._asdict(),
@@ -99,7 +101,7 @@ def page_of(result, drawn, command=None):
     return html.document(
         f"{result.tuned.name}: tuned",
         result.case.title,
-        result.status.replace("_", " ")
+        result.headline.replace("_", " ")
         + ("; every limit holds" if result.constraints and not broken else ""),
         result.success,
         _facts(result, len(broken)),

@@ -14,7 +14,7 @@ def parts_of(result):
     """Return what is printed of a TuningResult but for its message: lines and Tables."""
     evaluations = result.evaluations
     parts = [
-        f"{result.tuned.name}: {result.status} ({result.method},"
+        f"{result.tuned.name}: {result.headline} ({result.method},"
         f" {evaluations['simulations']} simulations, {evaluations['gradients']} of them with"
         f" gradients, {result.wall_s:.1f} s)",
         "",

@@ -1,0 +1,79 @@
+"""The bottom of a tank: whether liquid can be drawn out of a rig, and runs in which a level fell
+below it.
+
+May import the folders below `jaxtank.loop`.
+"""
+
+from typing import Any, cast
+
+import numpy as np
+
+from jaxtank.core.tree import is_component, walk
+from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.loop.trajectory import Trajectory
+from jaxtank.plants.tank_network import TankNetwork
+
+
+class FloorWarning(UserWarning):
+    """A level fell below an empty tank. The command prints a note of its own."""
+
+
+def draws(loop: ClosedLoop) -> bool:
+    """Return whether anything can take liquid out of a tank besides its outlets: an inflow below 0,
+    or a pump that may run backwards.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> draws(presets.find("gouta2015/ngpc").loop), draws(presets.find("cascaded/pi").loop)
+    (False, True)
+    """
+    actuator: Any = loop.actuator
+    numbers = [getattr(actuator, name, 0.0) for name in ("low", "initial")]
+    if is_component(loop.disturbance):
+        numbers += [v for _, v, _ in walk(loop.disturbance)]
+    return any(np.any(np.asarray(v, dtype=float) < 0.0) for v in numbers if v is not None)
+
+
+def lowest(plant: Any) -> Any:
+    """Return (n,) levels [cm] below which a tank has given what it did not hold: rounding and the
+    laminar zone aside.
+    """
+    rim = np.broadcast_to(np.asarray(plant.rim, dtype=float), (plant.tanks,))
+    return -np.minimum(getattr(plant, "knee", np.inf), 1e-3 * np.where(np.isfinite(rim), rim, 1.0))
+
+
+def is_open(loop: ClosedLoop) -> bool:
+    """Return whether levels may fall below 0: liquid can be drawn from a network without `bottom`,
+    or the plant is of a user's class.
+    """
+    kind: Any = type(loop.plant)  # a subclass may have flows of its own
+    network = kind.derivative is cast(Any, TankNetwork).derivative
+    return not loop.plant.bottom and (not network or draws(loop))
+
+
+def floor_warnings(loop: ClosedLoop, run: Trajectory) -> list[str]:
+    """Return a sentence for each tank whose level falls below 0 in a run: how far, when, and the
+    volume that the tank has given without holding it.
+    """
+    plant: Any = loop.plant
+    x, length = np.asarray(run.x), loop.units[0]
+    found: list[str] = []
+    for i, limit in enumerate(lowest(plant)):
+        column = np.where(np.isfinite(x[:, i]), x[:, i], 0.0)
+        if not column.min() < limit:
+            continue
+        area = np.ravel(np.asarray(getattr(plant, "area", np.nan), dtype=float))
+        volume = -column.min() * (area[i] if area.size == plant.tanks else np.nan)
+        amount = f", {volume:.4g} {length}^3 that it did not hold" if np.isfinite(volume) else ""
+        remedy = (
+            "plant.bottom = true stops it at 0"
+            if isinstance(plant, TankNetwork)
+            else "limit the outflow in its derivative"
+        )
+        found.append(
+            f"the level of tank {i + 1} falls below 0 at t = {run.t[np.argmax(column < limit)]:g} s"
+            f" and reaches {column.min():.4g} {length} at t = {run.t[np.argmin(column)]:g} s"
+            f"{amount}: {remedy}"
+        )
+    return found

@@ -1,0 +1,82 @@
+"""The error of a run by its steps, measured: against the same run with steps of half the length.
+
+May import the other modules of `loop` and the folders below.
+"""
+# jax leaves the types of its trees partly open.
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxtank import measures as ms
+from jaxtank.core.clock import Clock
+from jaxtank.core.errors import InputError
+from jaxtank.loop import step_size
+from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.loop.run import evaluate_and_flag
+from jaxtank.loop.saved_rows import simulate_compiled
+
+REFUSED = 5.0
+"""Error of a level from which a run is refused, in errors that show (`step_size.SEEN`) [-]."""
+LISTED = 0.01
+"""Share by which a measure must differ to be listed [-]."""
+MOST = 4
+"""Measures that are listed, those that differ most."""
+
+
+def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> list[str]:
+    """Return a sentence on how far levels, inputs and measures of a run are from those with half
+    the steps; none where steps are short enough for tanks that run empty, or it does not show.
+
+    Raises InputError for a run that is wrong: `step_size.check_run`, and where a level differs by
+    more than 5 % of the rim, or of the levels that the run is about.
+    """
+    unstable = list(step_size.unstable_tanks(loop, clock))
+    if not unstable:
+        return []
+    finer = dataclasses.replace(clock, substeps=2 * clock.substeps)
+    (run, broken), (half, _) = (simulate_compiled(loop, c, key, 1) for c in (clock, finer))
+    if bool(broken):
+        return []  # reported by the run itself
+    step_size.check_run(loop, clock, run)
+    x, apart = np.asarray(run.x), np.abs(np.asarray(run.x) - np.asarray(half.x))
+    errors = apart.max(axis=0) / step_size.visible_heights(loop, x)
+    tank, length = int(np.argmax(errors)), loop.units[0]
+    time = float(run.t[np.argmax(apart[:, tank])])
+    if not errors[tank] > 1.0:
+        return []
+    found = (
+        f"with half the step, {0.5 * clock.dt / clock.substeps:g} s, the level of tank {tank + 1}"
+        f" differs by {apart[:, tank].max():.3g} {length} at t = {time:g} s"
+    )
+    if errors[tank] > REFUSED:
+        remedy = max(unstable, key=lambda one: one.height).remedy
+        raise InputError(
+            f"clock.dt = {clock.dt:g} s: steps too long to follow tank"
+            f" {', '.join(str(one.tank + 1) for one in unstable)}, near empty: {found}: {remedy}"
+        )
+    inputs = np.abs(np.asarray(run.u) - np.asarray(half.u)).max(axis=0)
+    pump = int(np.argmax(inputs))
+    found += f", the input of pump {pump + 1} by {inputs[pump]:.3g} {loop.units[1]}"
+    return [", ".join([found, *_changed(loop, clock, finer, key)])]
+
+
+def _changed(loop: ClosedLoop, clock: Clock, finer: Clock, key: Any) -> list[str]:
+    """ "name of what 8.6 V in place of 15.1 V" of the measures that half the steps change most."""
+    names = tuple(m for m in ms.placed("summary") if ms.serves(m, loop))
+    values, half = (evaluate_and_flag(loop, c, names, key)[0] for c in (clock, finer))
+    found: list[tuple[float, str]] = []
+    for name in names:
+        pairs = np.column_stack([np.ravel(values[name]), np.ravel(half[name])])
+        for i, (value, better) in enumerate(pairs):
+            size = max(abs(value), abs(better))
+            if np.isfinite(size) and size > 0.0 and abs(value - better) > LISTED * size:
+                per, unit = ms.MEASURES[name].per, ms.unit(name, loop.units)
+                of = name if per == "run" else f"{name} of {per} {i + 1}"
+                unit = "" if unit == "-" else f" {unit}"
+                words = f"{of} is {better:.3g}{unit} in place of {value:.3g}{unit}"
+                found.append((abs(value - better) / size, words))
+    return [words for _, words in sorted(found, reverse=True)[:MOST]]

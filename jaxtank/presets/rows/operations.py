@@ -1,0 +1,66 @@
+"""Arithmetic operations of a traced program: a cost that does not depend on the machine.
+
+Imported by the rows of papers that claim a cost.
+"""
+
+import math
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxtank.core.clock import Clock
+from jaxtank.core.records import Tick
+from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.loop.step import decide
+
+ONE_EACH = frozenset(
+    ("add", "add_any", "sub", "mul", "div", "sqrt", "rsqrt", "max", "min", "neg", "abs", "sign")
+    + ("exp", "log", "tanh", "pow", "integer_pow")
+)
+"""Primitives with one operation for each entry of their result."""
+
+
+def operations(jaxpr: Any) -> int:
+    """Return the arithmetic operations of a jaxpr; a loop without a fixed length counts once.
+
+    Examples
+    --------
+    >>> import jax.numpy as jnp
+    >>> traced = jax.make_jaxpr(lambda a, b: a @ b + 1.0)(jnp.ones((2, 3)), jnp.ones(3))
+    >>> operations(traced.jaxpr)  # 6 products, 6 additions, and 2
+    14
+    """
+    count = 0
+    for eqn in jaxpr.eqns:
+        name, size = eqn.primitive.name, math.prod(eqn.outvars[0].aval.shape) if eqn.outvars else 0
+        if name in ONE_EACH:
+            count += size
+        elif name == "dot_general":
+            ((summed, _), _) = eqn.params["dimension_numbers"]
+            shape = eqn.invars[0].aval.shape
+            count += 2 * size * math.prod(shape[i] for i in summed)
+        elif name.startswith(("reduce_", "cum")):
+            count += math.prod(eqn.invars[0].aval.shape)
+        passes = eqn.params.get("length", 1) if name == "scan" else 1
+        count += passes * sum(operations(inner) for inner in _inner(eqn.params))
+    return count
+
+
+def _inner(params: Any) -> list[Any]:
+    """The jaxprs among the parameters of a primitive."""
+    parts = jax.tree.leaves(list(params.values()), is_leaf=lambda part: hasattr(part, "eqns"))
+    return [getattr(part, "jaxpr", part) for part in parts if hasattr(part, "eqns")]
+
+
+def sample_operations(loop: ClosedLoop, clock: Clock) -> int:
+    """Return the arithmetic operations of observer and controller in one sample."""
+    levels = tuple(map(float, np.ravel(loop.x0)))
+    before = tuple(map(float, np.ravel(loop.actuator.initial)))
+    outputs = tuple(levels[i] for i in loop.plant.outputs)
+    state = loop.observer.init(levels), loop.controller.init(levels, before)
+
+    def sample(state: Any, y: Any, r: Any, dr: Any) -> Any:
+        return decide(loop, *state, Tick(t=0.0, r=r, dr=dr, ddr=dr, dt=clock.dt), y)
+
+    return operations(jax.make_jaxpr(sample)(state, levels, outputs, outputs).jaxpr)

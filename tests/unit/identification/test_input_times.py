@@ -1,0 +1,224 @@
+"""Inputs that reach the tanks between samples: dead times, irregular logs. Logs are made by an
+integrator of their own (numpy), in which every input acts at its own time.
+"""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+import tuning
+from jaxtank import rig
+from jaxtank.core.errors import DataError
+from jaxtank.core.tree import number
+from tuning.cli.main import main
+from tuning.identification import simulation
+
+RIG = """
+units = ["m", "%"]
+[[tank]]
+area = 0.5
+rim = 1.2
+level = 0.4
+[[tank]]
+area = 0.25
+rim = 1.0
+drain = 4.15e-4
+level = 0.5
+[[orifice]]
+from = 1
+to = 2
+area = 3.2e-4
+[[pump]]
+gain = 2.64e-5
+to = 1
+high = 100.0
+[plant]
+outputs = [2]
+gravity = 9.81
+[law]
+kind = "open-loop"
+initial = [40.0]
+changes = [[10.0, 1, 50.0]]
+[reference]
+initial = [0.5]
+[values]
+"clock.dt" = 0.1
+"""
+TRUTH = {"plant.pump_gain[0]": 2.64e-5, "plant.orifice[0]": 3.2e-4, "plant.drain[1]": 4.15e-4}
+FREE = {
+    "plant.pump_gain": (1e-5, 1e-4),
+    "plant.orifice": (1e-4, 1e-3),
+    "plant.drain[1]": (1e-4, 1e-3),
+}
+NOISE = 0.002  # m
+
+
+def _rate(h, u):
+    root = np.sqrt(2 * 9.81 * np.maximum(h, 0.0)) * [3.2e-4, 4.15e-4]
+    return np.array([(2.64e-5 * u - root[0]) / 0.5, (root[0] - root[1]) / 0.25])
+
+
+def _levels(t, input_at, h=(0.4, 0.5), dt=0.05):
+    """(samples, 2) levels at the times t, multiples of dt, of a plant under input_at(time)."""
+    h, found, sampled = np.array(h), [], set(np.round(t / dt).astype(int))
+    for k in range(round(t[-1] / dt) + 1):
+        if k in sampled:
+            found.append(h)
+        u = input_at((k + 0.5) * dt)
+        a = _rate(h, u)
+        b = _rate(h + 0.5 * dt * a, u)
+        c = _rate(h + 0.5 * dt * b, u)
+        h = h + dt / 6 * (a + 2 * b + 2 * c + _rate(h + dt * c, u))
+    return np.array(found)
+
+
+def _commands(seed, every=60.0, end=3600.0):
+    """(times, inputs) of steps every 5 s at least, `every` on average."""
+    rng = np.random.default_rng(seed)
+    t = np.concatenate([[0.0], 5.0 * np.cumsum(rng.integers(1, int(every / 2.5), 400))])
+    t = t[t < end]
+    return t, rng.uniform(20.0, 70.0, len(t))
+
+
+def _held(times, inputs):
+    return lambda t: inputs[np.maximum(np.searchsorted(times, t, side="right") - 1, 0)]
+
+
+def _write(folder, t, u, y):
+    rows = [
+        f"{a:.10g},{b:.10g}," + ",".join("" if np.isnan(v) else f"{v:.10g}" for v in c)
+        for a, b, c in zip(t, u, y)
+    ]
+    (folder / "log.csv").write_text("t [s],pump1 [%],h1 [m],h2 [m]\n" + "\n".join(rows) + "\n")
+    (folder / "rig.toml").write_text(RIG)
+
+
+def _identify(folder, capsys, *options):
+    """(exit code, result, stderr) of the command."""
+    free = [f"--free={name}={low}:{high}" for name, (low, high) in FREE.items()]
+    files = [str(folder / "rig.toml"), "--data", str(folder / "log.csv")]
+    code = main(["identify", *files, *free, "--starts", "1", "--json", *options])
+    out, err = capsys.readouterr()
+    return code, json.loads(out) if code == 0 else {}, err
+
+
+def _outside(found):
+    interval = {n: row["interval95"] for n, row in found["parameters"].items()}
+    return [n for n, v in TRUTH.items() if not interval[n][0] <= v <= interval[n][1]]
+
+
+def test_a_dead_time_within_a_step_of_the_log_is_its_own(tmp_path, capsys):
+    """Log every 5 s of a plant with 3 s of dead time: with 3 s residuals are the noise and the
+    intervals hold the truth; 2 and 5 s are other models, not the same one.
+    """
+    times, inputs = _commands(0)
+    t = np.arange(0.0, 3600.0, 5.0)
+    played = _levels(t, lambda at: _held(times, inputs)(at - 3.0))
+    noise = NOISE * np.random.default_rng(1).standard_normal(played.shape)
+    _write(tmp_path, t, _held(times, inputs)(t), played + noise)
+    rmse = {}
+    for delay in (2, 3, 5):
+        code, found, err = _identify(tmp_path, capsys, "--set", f"actuator.delay={delay}")
+        assert code == 0, err
+        rmse[delay] = found["fit"]["rmse"][0]
+        if delay == 3:
+            assert not _outside(found)
+    assert rmse[3] == pytest.approx(np.std(noise[:, 0]), rel=0.02)
+    assert rmse[2] > 1.03 * rmse[3] and rmse[5] > 1.15 * rmse[3]
+
+
+def _irregular(seed=2):
+    """(times of readings every 3 to 10 s, times of inputs, inputs, readings)."""
+    rng = np.random.default_rng(seed)
+    times, inputs = _commands(seed)
+    t = np.round(np.concatenate([[0.0], np.cumsum(rng.uniform(3.0, 10.0, 700))]), 1)
+    t = t[t < 3600.0]
+    y = _levels(t, _held(times, inputs)) + NOISE * rng.standard_normal((len(t), 2))
+    return t, times, inputs, y
+
+
+def test_an_irregular_log_that_does_not_tell_when_inputs_change_is_refused(tmp_path, capsys):
+    t, times, inputs, y = _irregular()
+    _write(tmp_path, t, _held(times, inputs)(t), y)
+    code, _, err = _identify(tmp_path, capsys, "--gap", "2")
+    assert code == 5 and "when it changed is not known" in err
+    assert "--hold first-order" in err and "no readings" in err
+    log = tuning.log(t=t, u=_held(times, inputs)(t), y=y)
+    with pytest.raises(DataError, match="when it changed is not known"):
+        tuning.identify(rig.load(tmp_path / "rig.toml"), log, gap=2.0)
+
+
+@pytest.mark.parametrize("delay", [0.0, 7.3])
+def test_rows_of_inputs_between_readings_act_at_their_own_times(tmp_path, capsys, delay):
+    """Irregular readings, and a row without readings where an input changes."""
+    t, times, inputs, y = _irregular()
+    if delay:
+        rng = np.random.default_rng(5)
+        played = _levels(t, lambda at: _held(times, inputs)(at - delay))
+        y = played + NOISE * rng.standard_normal(y.shape)
+    rows = np.union1d(t, times)
+    table = np.full((len(rows), 2), np.nan)
+    table[np.searchsorted(rows, t)] = y
+    _write(tmp_path, rows, _held(times, inputs)(rows), table)
+    options = ["--gap", "5", "--set", f"actuator.delay={delay:g}"]
+    code, found, err = _identify(tmp_path, capsys, *options)
+    assert code == 0 and not _outside(found), err
+
+
+def test_a_record_cut_where_delayed_inputs_change():
+    """By hand: samples every 2 s, 3 s of delay, and lines between samples."""
+    data = {"t": [0.0, 2, 4, 6, 8], "u": [1.0, 1, 3, 3, 5], "y": np.zeros(5)}
+    cut = simulation.padded([tuning.log(**data)], 3.0)
+    assert cut.dt[0].tolist() == [[2, 0], [2, 0], [2, 0], [1, 1], [0, 0]]
+    assert cut.u[0, :4, :, 0].tolist() == [[1, 0], [1, 0], [1, 0], [1, 3]]
+    assert cut.steps[0].tolist() == [2, 2, 2, 2, 0]
+    cut = simulation.padded([tuning.log(**data, hold="first-order")], 0.0)
+    assert cut.dt[0].tolist() == [[2, 0], [1, 1], [2, 0], [1, 1], [0, 0]]
+    assert cut.u[0, :4, :, 0].tolist() == [[1, 0], [1.5, 2.5], [3, 0], [3.5, 4.5]]
+
+
+def test_a_piece_of_length_zero_is_none_to_pumps_with_memory(tmp_path):
+    """A lag: whole steps, and steps with a piece of length zero behind."""
+    (tmp_path / "rig.toml").write_text(RIG)
+    loop = rig.load(tmp_path / "rig.toml").loop
+    lagged = dataclasses.replace(loop.actuator, lag=number([4.0]))
+    played = simulation.rig_of(dataclasses.replace(loop, actuator=lagged))
+    dt, u = np.full((1, 40), 2.0), np.random.default_rng(0).uniform(20, 80, (1, 40, 1))
+    options = {"channels": ((0, False), (1, False)), "substeps": 2}
+    whole = simulation.play(played, dt, u, np.array([[0.4, 0.5]]), **options)
+    dt, u = np.stack([dt, 0 * dt], axis=-1), np.stack([u, u + 50], axis=2)
+    cut = simulation.play(played, dt, u, np.array([[0.4, 0.5]]), **options)
+    np.testing.assert_allclose(cut, whole, rtol=1e-13)
+
+
+def test_a_covariance_that_is_not_used_is_reported(tmp_path, capsys):
+    times, inputs = _commands(0)
+    t = np.arange(0.0, 600.0, 5.0)
+    y = _levels(t, _held(times, inputs)) + NOISE * np.random.default_rng(1).standard_normal(
+        (120, 2)
+    )
+    _write(tmp_path, t, _held(times, inputs)(t), y)
+    prior = '[covariance]\nnames = ["plant.drain[1]"]\nmatrix = [[1e-12]]\n'
+    code, alone, _ = _identify(tmp_path, capsys)
+    assert code == 0 and "[covariance]" not in alone["message"]
+    (tmp_path / "rig.toml").write_text(RIG + prior)
+    code, found, _ = _identify(tmp_path, capsys)
+    assert code == 0 and found["parameters"] == alone["parameters"]
+    assert "[covariance] of 1 parameter of an earlier identification" in found["message"]
+
+
+def test_inputs_along_a_line_from_row_to_row(tmp_path, capsys):
+    """Irregular rows, inputs that move steadily in between: a line fits, steps do not."""
+    rng = np.random.default_rng(6)
+    t = np.round(np.concatenate([[0.0], np.cumsum(rng.uniform(10.0, 30.0, 200))]), 1)
+    t = t[t < 3600.0]
+    u = rng.uniform(20.0, 70.0, len(t))
+    y = _levels(t, lambda at: np.interp(at, t, u)) + NOISE * rng.standard_normal((len(t), 2))
+    _write(tmp_path, t, u, y)
+    code, line, err = _identify(tmp_path, capsys, "--gap", "2", "--hold", "first-order")
+    assert code == 0 and not _outside(line), err
+    code, steps, err = _identify(tmp_path, capsys, "--gap", "2", "--hold", "zero-order")
+    assert code == 0 and steps["fit"]["rmse"][0] > 3 * line["fit"]["rmse"][0]
+    assert main(["identify", str(tmp_path / "rig.toml"), "--data", "log.csv", "--hold", "foh"]) == 2

@@ -1,0 +1,67 @@
+"""Measures that count whole samples: a closed list, and no derivative that is a silent zero."""
+
+import dataclasses
+
+import jax
+import pytest
+
+import jaxtank
+from jaxtank import measures as ms
+from jaxtank import presets
+from jaxtank.core.errors import InputError
+
+COUNTS = (
+    "saturated_fraction",
+    "filter_active_fraction",
+    "rise_time",
+    "settling_time",
+    "recovery_time",
+    "time_of_max_level",
+    "time_of_min_level",
+)
+
+
+@pytest.fixture(scope="module")
+def case():
+    case = presets.find("cascaded/pi")
+    return case.replace(clock=dataclasses.replace(case.clock, duration=800.0))
+
+
+def at(case, Kc):
+    return jaxtank.with_values(case.loop, {"controller.Kc[0]": Kc})
+
+
+def test_the_list_is_that_of_the_catalogue_and_the_values_have_steps(case):
+    """Close enough together, two gains give the same number, and others do not."""
+    assert tuple(m for m, spec in ms.MEASURES.items() if spec.counts) == COUNTS
+    names = ("settling_time", "rise_time", "rms_error_total")
+    a, b, far = (jaxtank.evaluate(at(case, k), case.clock, names) for k in (1.0, 1 + 1e-9, 2.0))
+    for name in names[:2]:
+        assert a[name] == b[name] != far[name]
+    assert a["rms_error_total"] != b["rms_error_total"]
+
+
+@pytest.mark.parametrize("transform", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("name", [m for m in COUNTS if m not in COUNTS[1::3]])
+def test_a_derivative_of_a_count_of_samples_is_refused(case, transform, name):
+    def measured(Kc):
+        return jaxtank.evaluate(at(case, Kc), case.clock, [name])[name]
+
+    for f in (transform(measured), jax.jit(transform(measured))):
+        with pytest.raises(InputError, match=f"{name}: counts whole samples"):
+            f(1.0)
+
+
+def test_sensitivities_of_a_count_are_refused(case):
+    with pytest.raises(InputError, match="settling_time: counts whole samples"):
+        jaxtank.sensitivities(case.loop, case.clock, ["settling_time"], {"controller.Kc[0]": 1.0})
+
+
+def test_other_measures_keep_their_derivatives_and_counts_their_values(case):
+    def error(Kc):
+        return jaxtank.evaluate(at(case, Kc), case.clock, ["rms_error_total"])["rms_error_total"]
+
+    assert jax.grad(error)(1.0) != 0.0
+    both = jax.vmap(lambda Kc: jaxtank.evaluate(at(case, Kc), case.clock, ["settling_time"]))
+    one = jaxtank.evaluate(at(case, 1.0), case.clock, ["settling_time"])["settling_time"]
+    assert both(jax.numpy.array([1.0, 2.0]))["settling_time"][0] == one

@@ -1,0 +1,82 @@
+"""Answers near the edge of stability are news of the headline; values are reported as they act."""
+
+import numpy as np
+from helpers import command
+
+import jaxtank
+import tuning
+from jaxtank import presets
+from tuning.problem.reported import in_force
+from tuning.search.messages import messages_of
+
+WORDS = ["--nominal", "--starts", "1", "--screening", "1", "--validation", "0", "--quiet"]
+
+
+def test_an_answer_beyond_sampled_stability_is_news_of_the_headline(tmp_path):
+    """k = 39.9 1/s at a step of 0.05 s: 1 - k dt = -0.997, and more between the tanks."""
+    case = ["gouta2015/backstepping-slow", "--dt", "0.05", "--set", "controller.k=20"]
+    done = command("tune", *case, *WORDS, "--json", "--out", str(tmp_path / "run"))
+    found = done.json
+    assert done.code == 0 and found["status"] == "converged"
+    k = found["parameters"]["controller.k"]["after"]
+    assert abs(1.0 - k * 0.05) > 0.98
+    assert found["measures"]["after"]["sensitivity_peak"] is None  # not finite: unstable
+    assert found["messages"][0]["code"] == "edge-of-stability"
+    assert "edge of sampled stability" in found["headline"]
+    assert "edge of sampled stability" in found["message"].split(";")[0]
+    assert "converged, beyond the edge" in (tmp_path / "run" / "report.html").read_text()
+
+
+def test_a_sensitivity_peak_of_four_is_news_and_one_of_two_is_none():
+    result = tuning.tune(
+        presets.find("cascaded/pi"),
+        nominal=True,
+        starts=1,
+        screening=1,
+        iterations=1,
+        validation=0,
+        limits={},
+    )
+
+    def codes(peak, travel=1.0):
+        before = {**result.measures["before"], "input_travel": np.array([1.0])}
+        after = {**before, "sensitivity_peak": peak, "input_travel": np.array([travel])}
+        measures = {"before": before, "after": after}
+        return result.replace(measures=measures, messages=()), messages_of(
+            result.replace(measures=measures)
+        )
+
+    for peak, travel, news in ((1.9, 1.0, 0), (4.05, 1.0, 1), (np.inf, 1.0, 1), (1.9, 11.0, 1)):
+        other, messages = codes(peak, travel)
+        headline = other.replace(messages=messages).headline
+        assert headline.startswith(str(other.status)) and headline.count(", ") == news
+
+
+def test_a_width_that_the_controller_clips_is_reported_as_it_acts():
+    case = presets.find("mirakhorli/hybrid")
+    values = {"controller.b[0]": 0.63, "controller.w[0]": 4.4, "controller.w[1]": 0.2}
+    acting = in_force(case.loop, values)
+    assert acting == values | {"controller.w[0]": 0.63}
+    clock = jaxtank.Clock(dt=case.clock.dt, duration=20.0)
+    runs = [
+        jaxtank.evaluate(jaxtank.with_values(case.loop, v), clock, ["rms_error_total"])
+        for v in (values, acting)
+    ]
+    assert runs[0] == runs[1]
+
+
+def test_a_tuned_width_is_at_most_its_size():
+    case = presets.find("mirakhorli/hybrid").replace(scenarios=())
+    clock = jaxtank.Clock(dt=case.clock.dt, duration=100.0)
+    found = tuning.tune(
+        case.replace(clock=clock),
+        nominal=True,
+        free={"controller.b": (0.3, 12.0), "controller.w": (0.05, 12.0)},
+        starts=2,
+        screening=8,
+        iterations=8,
+        validation=0,
+    )
+    for i in range(2):
+        b, w = (found[f"controller.{n}[{i}]"].after for n in "bw")
+        assert w <= b or w == found[f"controller.w[{i}]"].before

@@ -1,0 +1,96 @@
+"""Whether a derivative is a slope to search with: runs beside a point contradict some by orders.
+
+The tangents of a loop in a limit cycle, or beyond the stability of its step, grow while the run
+itself stays within the limits of its pumps: the derivative is exact, and no run shows such a slope.
+Imported by `search`, `answer`, `live` and `uncertainty`.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tuning.problem.point import Point
+from tuning.problem.problem import Problem
+
+STEPS = (1e-3, 3e-4)
+"""Lengths of the two secants, as shares of a range [-]."""
+
+ORDERS = 2.0
+"""Orders of magnitude by which a derivative must exceed every secant to be contradicted [-]."""
+
+ROUNDING = 1e-9
+"""Share of a value by which rounding may change it from run to run [-]."""
+
+
+class SlopeCheck(NamedTuple):
+    """The slope of the cost at a point, along its gradient, beside the runs near it.
+
+    Examples
+    --------
+    >>> SlopeCheck(False, (-0.6, -0.5), 6.7).to_json()
+    {'usable': False, 'secants': [-0.6, -0.5], 'orders_above': 6.7}
+    """
+
+    usable: bool
+    secants: tuple[float, ...]  # central differences of the cost, per unit of z, of either length
+    # of magnitude by which a derivative that is of no use exceeds them; None: it is not finite
+    orders: float | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the check as plain numbers."""
+        secants = [v if np.isfinite(v) else None for v in self.secants]
+        return {"usable": self.usable, "secants": secants, "orders_above": self.orders}
+
+
+def contradicted(predicted: Any, actual: Any, size: Any) -> Any:
+    """Return (...,) True where derivatives predict changes that exceed all actual ones by ORDERS.
+
+    One change on either side that agrees is enough: at a kink the derivative is that of one side.
+
+    predicted, actual : (moves, ...) changes of values; NaN or infinite where a run diverged.
+    size : (...,) the values themselves.
+
+    Examples
+    --------
+    >>> contradicted(np.array([3e3, -3e3]), np.array([2e-3, 0.1]), 1.0)
+    True
+    >>> contradicted(np.array([3.0, -3.0]), np.array([3.0, 3.0]), 1.0)
+    False
+    """
+    predicted, actual = np.asarray(predicted), np.asarray(actual)
+    actual = np.where(np.isfinite(actual), np.abs(actual), np.inf)
+    borne_out = np.abs(predicted) <= 10.0**ORDERS * (actual + ROUNDING * np.abs(size))
+    still = predicted == 0.0
+    found = np.any(~still, axis=0) & np.all(still | ~borne_out, axis=0)
+    return bool(found) if np.ndim(found) == 0 else found
+
+
+@np.errstate(all="ignore")  # derivatives may be infinite here
+def check_slope(problem: Problem, point: Point) -> SlopeCheck:
+    """Return the SlopeCheck of a Point, by the cost and the limits of four runs beside it.
+
+    As many points as `diagnostics.neighbours` has, so that one compiled program serves both.
+    """
+    z, count = point.z, len(point.z)
+    norm = float(np.linalg.norm(point.gradient))
+    along = point.gradient / norm if 0.0 < norm < np.inf else np.full(count, count**-0.5)
+    moves = [np.clip(z + sign * h * along, 0.0, 1.0) - z for h in STEPS for sign in (1.0, -1.0)]
+    zs = np.concatenate([z[None], z + moves, np.repeat(z[None], max(0, 2 * count - 4), axis=0)])
+    costs, margins = (v[:5] for v in problem.screen(zs))
+    changes, steps = costs[1:] - costs[0], np.linalg.norm(moves, axis=1)
+    predicted = np.array(moves) @ point.gradient
+    unusable = contradicted(predicted, changes, costs[0]) or np.any(
+        contradicted(np.array(moves) @ point.margin_slopes.T, margins[1:] - margins[0], margins[0])
+    )
+    secants = (changes[::2] - changes[1::2]) / (steps[::2] + steps[1::2])
+    ratio = np.log10(norm / np.max(np.abs(secants)))
+    usable = not (point.valued and unusable)
+    orders = None if usable or not np.isfinite(ratio) else round(float(ratio), 1)
+    return SlopeCheck(usable, tuple(map(float, secants)), orders)
+
+
+def unusable_words(check: SlopeCheck) -> str:
+    """Return how far a slope is from what runs show, in words."""
+    shown = f"{check.secants[0]:.2g} per range of a parameter"
+    by = "is not finite" if check.orders is None else f"is 1e{check.orders:.0f} times as large"
+    return f"runs beside it show a slope of {shown}, the exact derivative {by}"
