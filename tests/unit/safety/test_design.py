@@ -59,10 +59,11 @@ def highest(case, guard, seconds, lag=None, off=0.0, spread=0.05, count=24, subs
     rng = np.random.default_rng(seed)
     loop, hold = case.loop, case.clock.dt
     plant, pumps = loop.plant, loop.actuator
-    p = {
-        name: 1.0 + spread * rng.choice([-1.0, 1.0], (count, 1))
-        for name in ("drain", "orifice", "pump_gain")
-    }
+    p = {}
+    for name, worst in (("drain", -1.0), ("orifice", 1.0), ("pump_gain", 1.0)):
+        sign = rng.choice([-1.0, 1.0], (count, 1))
+        sign[::2] = worst
+        p[name] = 1.0 + spread * sign
     low, high = np.asarray(pumps.low, float), np.asarray(pumps.high, float)
 
     @jax.jit
@@ -75,8 +76,8 @@ def highest(case, guard, seconds, lag=None, off=0.0, spread=0.05, count=24, subs
     v = np.tile(np.asarray(pumps.initial, float), (count, 1))
     line = [v] * round(pumps.delay / hold)
     lag = np.zeros(len(low)) if lag is None else np.asarray(lag, float)
-    first = rng.integers(len(low), size=count)[:, None] == np.arange(len(low))
-    joins = rng.uniform(0.0, seconds, (count, 1))
+    first = (np.arange(count) // 2 % len(low))[:, None] == np.arange(len(low))
+    joins = rng.uniform(0.6 * seconds, seconds, (count, 1))
     top, least, step = x.copy(), np.full(len(low), np.inf), hold / substeps
     keep = np.where(lag > 0.0, np.exp(-step / np.where(lag > 0.0, lag, 1.0)), 0.0)
     for k in range(round(seconds / hold)):
