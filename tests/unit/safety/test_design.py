@@ -31,16 +31,16 @@ def root(h):
 
 
 def rates(plant, p, x, v):
-    """Rates (P, n) [cm/s] of plants with flows times p, by Torricelli's law."""
+    """Rates (P, n) [cm/s] of plants with flows p, by Torricelli's law."""
     w, flow = math.sqrt(2.0 * float(plant.gravity)), np.zeros_like(x)
     q = w * root(x)
-    flow -= p["drain"] * np.asarray(plant.drain) * q
+    flow -= p["drain"] * q
     for k, (i, j) in enumerate(plant.links):
-        passed = p["orifice"] * float(plant.orifice[k]) * q[:, i : i + 1]
-        flow[:, i : i + 1] -= passed
-        flow[:, j : j + 1] += passed
+        passed = p["orifice"][:, k] * q[:, i]
+        flow[:, i] -= passed
+        flow[:, j] += passed
     for k, (i, j) in enumerate(plant.feeds):
-        pumped = p["pump_gain"][:, 0] * float(plant.pump_gain[k]) * v[:, k]
+        pumped = p["pump_gain"][:, k] * v[:, k]
         share = 1.0 if j is None else float(plant.split[k])
         flow[:, i] += share * pumped
         if j is not None:
@@ -61,9 +61,11 @@ def highest(case, guard, seconds, lag=None, off=0.0, spread=0.05, count=24, subs
     plant, pumps = loop.plant, loop.actuator
     p = {}
     for name, worst in (("drain", -1.0), ("orifice", 1.0), ("pump_gain", 1.0)):
-        sign = rng.choice([-1.0, 1.0], (count, 1))
+        value = np.asarray(getattr(plant, name), float)
+        sign = rng.choice([-1.0, 1.0], (count, len(value)))
         sign[::2] = worst
-        p[name] = 1.0 + spread * sign
+        sign[::2, 1:] *= -1.0 if name == "orifice" else 1.0  # much in at the top, little out
+        p[name] = value * (1.0 + spread * sign)
     low, high = np.asarray(pumps.low, float), np.asarray(pumps.high, float)
 
     @jax.jit
