@@ -77,7 +77,9 @@ def with_pi(case, inputs):
         {} if moving else {"bias": inputs.tolist()}
     )
     # the identified plant is its model, whatever the file's controller has
-    controller = controller_of(table, dataclasses.replace(loop, controller=OpenLoop(signal=loop.reference)))
+    controller = controller_of(
+        table, dataclasses.replace(loop, controller=OpenLoop(signal=loop.reference))
+    )
     free = {n: f for n, f in case.free.items() if not n.startswith("controller.")}
     free |= {"controller.Kc": Free(float(Kc.min() / 30), float(Kc.max() * 30))}
     free |= {"controller.Ti": Free(float(Ti.min() / 10), float(Ti.max() * 10))}
