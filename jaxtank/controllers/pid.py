@@ -149,8 +149,10 @@ class PID(Controller):
 
     def __post_init__(self) -> None:
         concrete = isinstance(self.Ti, np.ndarray | jax.Array) and not isinstance(self.Ti, Tracer)
-        if concrete and np.size(self.Ti) and np.all(self._endless()):
-            object.__setattr__(self, "Ti", None)  # no state that never moves
+        if concrete and np.size(self.Ti) and np.any(endless := self._endless()):
+            # of all loops: no state that never moves
+            Ti = None if np.all(endless) else np.where(endless, np.inf, self.Ti)
+            object.__setattr__(self, "Ti", Ti)
 
     def _endless(self) -> Any:
         """Whether each integral time is as good as infinite beside the tracking time."""
