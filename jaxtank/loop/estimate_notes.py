@@ -50,7 +50,7 @@ def linear_distance(observer: Kalman, x: Any, u: Any) -> tuple[Any, Any, Any]:
         return jnp.stack(observer.model.derivative(0.0, tuple(x), tuple(u), None))
 
     centre = (jnp.asarray(observer.levels), jnp.asarray(observer.inputs))
-    dx, du = x - centre[0], u - centre[1]
+    dx, du = (jnp.asarray(v) - of for v, of in zip((x, u), centre))
     error = rates(*centre) + dx @ A.T + du @ B.T - jax.vmap(rates)(jnp.asarray(x), jnp.asarray(u))
     return np.abs(dx), np.abs(error), np.abs(dx) @ np.abs(A).T
 

@@ -240,6 +240,46 @@ def inputs_of(case, run, signals):
     return np.array(run_node(export(case, "js", name="law") + REPLAY, data))
 
 
+PROPORTIONAL = """
+case = "cascaded/pi"
+[law]
+kind = "pid"
+Kc = 2.0
+bias = 1.5
+"""
+
+
+@pytest.mark.parametrize(
+    "lang", [pytest.param("c", marks=needs_gcc), "m", pytest.param("js", marks=needs_node)]
+)
+def test_a_proportional_controller_is_exported(lang, tmp_path, capsys):
+    """Of the command, saturated at times: bias + Kc e within the limits of the pump."""
+    path = tmp_path / "p.toml"
+    path.write_text(PROPORTIONAL)
+    assert main.main(["show", str(path)]) == 0
+    assert re.search(r"controller.Ti +not in use", capsys.readouterr().out)
+    assert main.main(["export", str(path), "--lang", lang, "--name", "law"]) == 0
+    case = rig.load(path)
+    run = jaxtank.simulate(case.loop, case.clock)
+    run = jax.tree.map(np.asarray, run)
+    expected = np.clip(1.5 + 2.0 * (run.r - run.y[:, list(case.loop.plant.outputs)]), 0.0, 10.0)
+    np.testing.assert_allclose(run.applied, expected, atol=1e-9)
+    assert 0 < np.mean((expected <= 0.0) | (expected >= 10.0)) < 1
+    assert capsys.readouterr().out.strip() == export(case, lang, name="law").strip()
+    signals = (run.r, 0.0 * run.r, 0.0 * run.r)
+    if lang == "c":
+        inputs = Compiled(case, tmp_path).run(case, run, signals)
+    elif lang == "js":
+        inputs = inputs_of(case, run, signals)
+    else:
+        controller, s, inputs = matlab(export(case, "m")), None, []
+        for k in range(len(run.t)):
+            last = inputs[-1] if inputs else list(map(float, case.loop.actuator.initial))
+            u, s = controller(s, run.t[k], run.y[k], *(v[k] for v in signals), last)
+            inputs.append(u)
+    np.testing.assert_allclose(inputs, expected, atol=1e-9)
+
+
 @needs_node
 @pytest.mark.parametrize(
     "name",
