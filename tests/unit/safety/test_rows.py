@@ -197,7 +197,7 @@ name = "delayed"
 tank = [{ area = 20.0, rim = 30.0, drain = 0.2, level = 20.0 }]
 pump = [{ gain = 8.0, to = 1, high = 12.0, initial = 1.0 }]
 plant = { outputs = [1] }
-law = { kind = "open-loop", initial = [0.0], changes = [[2.0, 1, 12.0], [6.0, 1, 3.0]] }
+law = { kind = "open-loop", initial = [0.0], changes = [[2.0, 1, 12.0], [20.0, 1, 3.0]] }
 values = { "clock.dt" = 0.5, "clock.duration" = 30.0, "actuator.delay" = 2.0 }
 [safety_filter]
 """
