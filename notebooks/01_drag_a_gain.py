@@ -4,7 +4,7 @@
 # **Question:** What does one number of a controller do to four tanks, and to 200 plants that are
 # not exactly the one in the paper?
 #
-# The rig is the state-coupled four-tank rig of A. Gouta, S. Hadj Said and F. M'sahli,
+# The rig is the state-coupled four-tank rig of H. Gouta, S. Hadj Said and F. M'sahli,
 # [J. Franklin Inst. (2015)](https://doi.org/10.1016/j.jfranklin.2015.08.004), under its
 # backstepping controller.
 #

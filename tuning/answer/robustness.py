@@ -12,33 +12,26 @@ from tuning.answer.stay_put import LINE, STRIDE, WORTH, Found
 from tuning.problem.reported import margin_measures
 
 PEAK = 2.5
-"""Sensitivity peak Ms that an answer may have, unless that of the first values is higher [-].
+"""Sensitivity peak Ms that an answer may have, unless a lower one costs more than PRICE [-].
 Textbooks recommend 1.4 to 2: above 2 a rise is reported, above this it is taken back."""
 
 PRICE = 0.05
 """Share of the cost that a lower Ms may cost: half of it as a share of the error [-]."""
 
-
-def highest_peak(before: float) -> float:
-    """Return the sensitivity peak that an answer may have, where that of the first values is
-    `before`.
-
-    Examples
-    --------
-    >>> highest_peak(1.4), highest_peak(2.9)
-    (2.5, 2.9)
-    """
-    return max(PEAK, before)
+SPAN = 0.01
+"""Half the distance of the points of a difference of Ms, as a share of a range [-]."""
 
 
 def move_back(setting: Setting, problem: Any, found: Found) -> None:
-    """Move the answer in `found` towards the first values until Ms is at most `highest_peak`.
+    """Move the answer in `found` to a point whose Ms is at most PEAK.
 
-    Along the straight line in the search's coordinates, to the first of LINE points whose
-    sensitivity peak (of the nominal loop, at the case's own step, the worst of its plateaus) is low
-    enough, whose cost is within PRICE of the answer's, and that keeps the limits as well; to the
-    first values themselves where they fit and cost less than WORTH more than that point. The answer
-    stays where there is none, or where the loop has no sensitivity peak.
+    Along a straight line in the search's coordinates, to the first of LINE points whose sensitivity
+    peak (of the nominal loop, at the case's own step, the worst of its plateaus) is low enough,
+    whose cost is within PRICE of the answer's, and that keeps the limits as well. The line leads
+    towards the first values, whose own Ms counts where they exceed PEAK; and before that, where
+    they do, along the steepest descent of Ms from the answer, to the lowest peak where none is low
+    enough. To the first values themselves where they fit and cost less than WORTH more than the
+    point. The answer stays where there is none, or where the loop has no sensitivity peak.
 
     Parameters
     ----------
@@ -50,8 +43,17 @@ def move_back(setting: Setting, problem: Any, found: Found) -> None:
     if search is None or found.point is None or np.array_equal(found.point.z, first):
         return
     z, point = found.point.z, found.point
-    allowed = highest_peak(_peak(setting, problem, first))
-    if not _peak(setting, problem, z) > allowed:  # NaN: it has none
+    highest = _peak(setting, problem, z)
+    if not highest > PEAK:  # NaN: it has none
+        return
+    before = _peak(setting, problem, first)
+    if before > PEAK:
+        calmer = _descended(setting, problem, found, highest)
+        if calmer is not None:
+            found.z, found.kept = calmer, calmer == first
+            return
+    allowed = max(PEAK, before)
+    if not highest > allowed:
         return
     line = z + np.arange(1, LINE + 1)[:, None] / LINE * (first - z)
     ceiling, violation = point.cost + PRICE * abs(point.cost), search.violation(point)
@@ -69,6 +71,43 @@ def move_back(setting: Setting, problem: Any, found: Found) -> None:
                     each = first.copy()
                 found.z, found.kept = each, each == first
                 return
+
+
+def _descended(setting, problem, found, highest):
+    """Return the point below the peak `highest` that the steepest descent of Ms leads to within
+    PRICE, the first whose peak is at most PEAK; None where there is none.
+    """
+    search, z, point = found.search, found.point.z, found.point
+    ceiling, violation = point.cost + PRICE * abs(point.cost), search.violation(point)
+    free, calmer, lowest = ~np.asarray(found.kept), None, highest
+    for _ in range(LINE // STRIDE):
+        slope = _peak_slope(setting, problem, z) * free
+        norm = float(np.linalg.norm(slope))
+        if not 0.0 < norm < np.inf:
+            return calmer
+        line = np.clip(z - np.arange(1, STRIDE + 1)[:, None] / LINE * slope / norm, 0.0, 1.0)
+        costs, _ = problem.screen(line)
+        peaks = np.array([_peak(setting, problem, each) for each in line])
+        for each, cost, peak in zip(line, costs, peaks):
+            if not (cost <= ceiling and search.violation(search.point(each)) <= violation):
+                return calmer
+            if peak < lowest:
+                calmer, lowest = each, float(peak)
+            if lowest <= PEAK:
+                return calmer
+        z = line[-1]
+    return calmer
+
+
+def _peak_slope(setting, problem, z):
+    """Return (P,) the slope of the logarithm of Ms at z, by differences; 0 where it has none."""
+    slope = np.zeros(len(z))
+    for i, unit in enumerate(np.eye(len(z))):
+        ends = [np.clip(z + sign * SPAN * unit, 0.0, 1.0) for sign in (1.0, -1.0)]
+        up, down = (np.log(_peak(setting, problem, end)) for end in ends)
+        if np.isfinite(up - down):
+            slope[i] = (up - down) / (ends[0] - ends[1])[i]
+    return slope
 
 
 def _peak(setting, problem, z):

@@ -33,7 +33,7 @@ from tuning.search.options import Solver, check_options, check_precision, spelle
 from tuning.search.result import TuningResult, constraint_rows
 from tuning.search.screening import LARGEST_STATE
 from tuning.search.stages import Outcome, Plan, solve
-from tuning.search.verdicts import lost_outputs, status_of
+from tuning.search.verdicts import lost_outputs, points_to_fragile, status_of
 from tuning.storage.checkpoint import checkpoint_folder
 from tuning.storage.evaluation_log import EvaluationLog
 from tuning.storage.fingerprint import fingerprint
@@ -196,6 +196,7 @@ def _result(problem, plan, found: Outcome, first, before, key):
     if problem.scenarios:
         tables = {"before": table_of(problem, own), "after": table_of(problem, values)}
     lost = lost_outputs(problem, tables, values) if complete else ()
+    rings = points_to_fragile(case.loop, before, after)
     optimum = named_optimality(found.search, best)
     rows = constraint_rows(problem, tables["after"], tables["before"], optimum["multipliers"])
     return TuningResult(
@@ -207,8 +208,8 @@ def _result(problem, plan, found: Outcome, first, before, key):
         objective={side: problem.total(table) for side, table in tables.items()}
         | {"terms": problem.objective},
         measures={
-            "before": before | _margins(case.loop, case.clock),
-            "after": after | _margins(tuned.loop, tuned.clock),
+            "before": before | (_margins(case.loop, case.clock) if rings else {}),
+            "after": after | (_margins(tuned.loop, tuned.clock) if rings else {}),
         },
         tables=tables,
         constraints=rows,

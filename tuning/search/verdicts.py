@@ -44,6 +44,10 @@ FRAGILE = 2.5
 """Sensitivity peak Ms above which a loop is near the edge of its stability [-]: textbooks recommend
 1.4 to 2."""
 
+BUSY, EXCURSIONS, RINGING = 2.0, 2.0, 25.0
+"""Growth of an input's total variation, its size in ranges of the pump for each plateau, and the
+overshoot [%] above which a run points to a fragile loop: an Ms above FRAGILE overshoots by more."""
+
 Found = Iterator[Message]
 ENDED = (Status.CONVERGED, Status.NOT_CONVERGED)
 
@@ -161,6 +165,29 @@ def first_of(parts: list[str], joint: str = ", ") -> str:
     """Return the first LISTED parts, and how many more there are."""
     more = len(parts) - LISTED
     return joint.join(parts[:LISTED]) + (f" (and {more} more)" if more > 0 else "")
+
+
+def points_to_fragile(loop: Any, before: Mapping[str, Any], after: Mapping[str, Any]) -> bool:
+    """Return True if the run with an answer rings: only then are its margins worth a program, which
+    takes as long to compile as those of a search.
+
+    loop : that before. before, after : {measure: value} of the runs.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> calm, busy = ({"input_travel": np.array([v, 9.0])} for v in (10.0, 25.0))
+    >>> loop = presets.find("gouta2015/backstepping").loop
+    >>> points_to_fragile(loop, calm, calm), points_to_fragile(loop, calm, busy)
+    (False, True)
+    """
+    old, new = (np.asarray(m["input_travel"]) for m in (before, after))
+    ranges = np.asarray(loop.actuator.high) - np.asarray(loop.actuator.low)
+    held = loop.reference.held()
+    excursions = EXCURSIONS * ranges * (1 if held is None else len(held))
+    overshoot = np.asarray(after.get("overshoot_percent", 0.0), dtype=float)
+    busy = (new > BUSY * old) | (new > excursions)
+    return bool(np.any(busy) or np.any(overshoot > RINGING))
 
 
 def near_the_edge(result: TuningResult) -> Found:

@@ -65,7 +65,8 @@ class Needs:
         count = len(next(iter(values.values()))) if values else 1
         drawn = lambda name: drawn_values(loop, name, values, count)
         inflow = drawn("disturbance.level") if isinstance(loop.disturbance, Constant) else 0.0
-        self.offset = drawn("actuator.dead_zone") if np.ndim(loop.actuator.offset) else 0.0
+        zoned = np.ndim(loop.actuator.offset) > 0
+        self.offset = drawn("actuator.dead_zone") if zoned else np.zeros((1, loop.plant.pumps))
         flows = {name: drawn(f"plant.{name}") for name in FLOWS}
         self.case, self.values, self.limits = case, dict(values), limits
         self.plateaus, self.count = plateaus, count
@@ -77,7 +78,7 @@ class Needs:
         self.at_rim, level = _limit_of(case, limits)
         top = np.where(self.at_rim, self.rim, level)
         low = drawn("actuator.low")
-        low = np.maximum(low, self.offset) if np.ndim(self.offset) else low
+        low = np.maximum(low, self.offset) if zoned else low
         self.low = np.concatenate([np.zeros_like(top), low], axis=1)
         self.high = np.concatenate([top, drawn("actuator.high")], axis=1)
 
@@ -91,7 +92,7 @@ class Needs:
         Those of the case where None. A level below 0: the flow would have to run backwards.
         """
         levels, inputs = self.states.at(self.setpoints if setpoints is None else setpoints)
-        return np.concatenate([levels, inputs + np.expand_dims(self.offset, -2)], axis=2)
+        return np.concatenate([levels, inputs + self.offset[:, None]], axis=2)
 
     def excess(self, needed: Any = None, low: Any = None, high: Any = None) -> np.ndarray:
         """Return (N, P, n + m) by how much `needed` passes a limit [cm, V]; negative: a margin.
