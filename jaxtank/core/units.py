@@ -45,7 +45,7 @@ def canonical(unit: str) -> str:
     text = re.sub(
         r"(?<=[a-z])\^?([23]|[²³])", lambda m: "^" + m[1].translate(_RAISED), unit.strip()
     )
-    text = re.sub(r"\s*/\s*", "/", text.replace("L/", "l/"))
+    text = re.sub(r"\s*/\s*", "/", text).replace("L/", "l/")
     return re.sub(r"^cc/", "cm^3/", text)
 
 

@@ -51,7 +51,8 @@ class Trajectory:
     x, y, x_hat : (rows, tanks) arrays
         Levels, measured levels, estimated levels [cm].
     d_hat : (rows, tanks) array
-        Estimated disturbance of each level's rate [cm/s].
+        Estimated disturbance of each level's rate [cm/s]: all that the observer's model does not
+        explain, inflows, errors of the model, and what an offset dead zone of a pump withholds.
     r, e : (rows, outputs) arrays
         Setpoints, and tracking errors x - r [cm].
     command, applied, u : (rows, pumps) arrays

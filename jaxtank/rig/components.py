@@ -237,7 +237,7 @@ def controller_of(table, loop, bias=None):
     Parameters
     ----------
     table : {key: value} as in the file
-    loop : ClosedLoop with any controller, whose plant is the new controller's model
+    loop : ClosedLoop with any controller, whose model is that of the new one
     bias : (m,) inputs where the table leaves `bias` out; those of `steady_bias` where None
     """
     if isinstance(table, dict) and table.get("kind") == "open-loop":
@@ -247,19 +247,27 @@ def controller_of(table, loop, bias=None):
             signal=ramps_of(section, table, start, ("pump", "input"), sizes_of(loop.plant))
         )
     bias = steady_bias(loop) if bias is None else bias
-    return component("law", table, loop.plant, {"bias": bias})
+    return component("law", table, model_of(loop), {"bias": bias})
 
 
 def observer_of(table, loop):
     """Return the observer of an [observer] table, whose model is that of the loop's controller."""
-    plant, model = loop.plant, getattr(getattr(loop.controller, "law", loop.controller), "model", 0)
-    fits = (getattr(model, "tanks", 0), getattr(model, "pumps", 0)) == (plant.tanks, plant.pumps)
     offered = {
         "levels": np.asarray(loop.x0),
         "inputs": loop.actuator.initial,
-        "measured": list(range(1, plant.tanks + 1)),
+        "measured": list(range(1, loop.plant.tanks + 1)),
     }
-    return component("observer", table, model if fits else plant, offered)
+    return component("observer", table, model_of(loop), offered)
+
+
+def model_of(loop):
+    """The model of the loop's controller, scheduled or not; the plant where it has none that fits.
+
+    What takes its place takes its model.
+    """
+    plant, model = loop.plant, getattr(getattr(loop.controller, "law", loop.controller), "model", 0)
+    fits = (getattr(model, "tanks", 0), getattr(model, "pumps", 0)) == (plant.tanks, plant.pumps)
+    return model if fits else plant
 
 
 def instrument_of(name, table, loop):

@@ -191,7 +191,6 @@ def design(
         draw=np.array(draw),
         substeps=substeps if setting.predicted else 1,
         divided=setting.divided,
-        leaks=tuple(int(i) for i in np.flatnonzero(draw < 0.0)) if np.any(found.slopes > 0) else (),
         running=tuple(int(j) for j in np.flatnonzero(setting.low > 0.0)),
         **_upper(setting, found),
         **_lower(setting, low, bottom),

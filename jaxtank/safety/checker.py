@@ -275,6 +275,13 @@ class _Rig:
         self.offset, (self.backwards, self.lowest) = full(self.guard.offset, m), span("low")
         self.weakest, self.high = (v - self.offset for v in span("high"))
         self.capped = full(bank.high, m) - self.offset
+        # pumps whose lower limit, or input before the start, may be above what the filter counts on
+        self.stronger = self.lowest > np.maximum(full(bank.low, m), 0.0)
+        self.unsure = any(
+            np.any(self.span(f"actuator.{name}", getattr(bank, name))[end] != getattr(bank, name))
+            for name in ("low", "high", "initial")
+            for end in (0, 1)
+        )
         self.under_way = np.zeros(m)
         if self.delay[1] > 0.0 or np.any(self.lag[1] > 0.0):
             self.under_way = np.maximum(span("initial")[1] - self.offset, 0.0)
@@ -538,6 +545,8 @@ def _upper(rig, i, level, at):
     together = len(rig.gains[i]) > 1 and i not in rig.divided
     if together and any(rig.lowest[j] > 0.0 and j not in rig.running for j in rig.gains[i]):
         return "not covered: lower limits above 0 of several pumps of one tank", ""
+    if together and any(rig.stronger[j] for j in rig.gains[i]):
+        return "not covered: uncertain lower limits above 0 of several pumps of one tank", ""
     lag = max(rig.lag[1][j] for j in rig.gains[i])
     if rig.delay[1] == 0.0 and lag == 0.0:
         if not rig.rate[i] * rig.hold <= 1.0 + 1e-12:
@@ -777,6 +786,8 @@ def _predicted(rig, i, level, at):
         return "not covered: prediction with pipes, lag or a dead zone"
     if np.any(rig.spare > 0.0) or rig.drawn:
         return "not covered: prediction with inflow pulses"
+    if rig.unsure:
+        return "not covered: prediction with uncertain limits or initial inputs of pumps"
     if rig.loose or np.any(rig.bottom > 0.0):
         return "not covered: prediction with faults or low limits"
     if rig.plant.overflow and not at.bounds[i] <= rig.rim[i]:

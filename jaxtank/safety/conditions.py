@@ -189,9 +189,10 @@ def spills(setting, plant, limits, start):
     """
     (least, most), wild = plant, list(setting.uncovered)
     falls = np.zeros(len(wild))
-    for k, (source, sink) in enumerate(least.spills if least.overflow else ()):
+    for k, (source, sink) in enumerate(least.spills):
         rim, spare = float(least.rim[source]), setting.spare[source]
-        if not limits.reasons[source] and limits.heights[source] + spare <= rim * (1.0 + 1e-12):
+        dry = not limits.reasons[source] and limits.heights[source] + spare <= rim * (1.0 + 1e-12)
+        if dry or not least.overflow:
             continue
         net = full_pumps(setting, source) + setting.phi(source, rim, limits.reach)
         falls[sink] += float(most.caught[k]) * float(most.area[source]) * max(net, 0.0)

@@ -112,7 +112,6 @@ class SafetyFilter:
         doc="tanks whose row is divided among their pumps, in shares of what each brings at full",
         default=(),
     )
-    leaks: tuple = static(doc="tanks that second-order rows count with `draw` for", default=())
     running: tuple = static(doc="pumps whose lower limit is above 0 V", default=())
     allocate: bool = static(
         doc="give the other of two pumps what serves the outputs best where one meets its cap",
@@ -242,16 +241,13 @@ class SafetyFilter:
         drains, row = 0.0, {}
         g = r.out[tank] * s(y[tank] - eps) + k1 * (top - y[tank] - eps)
         for j, most in sources:
-            leaves = r.out_most[j] - r.draw[j] / a0 if j in self.leaks else r.out_most[j]
-            lowest = s(y[j] - self.band[j]) - 0.5 * leaves * hold
+            lowest = s(y[j] - self.band[j]) - 0.5 * r.out_most[j] * hold
             drains = drains + jnp.where(lowest >= a0, 0.5 * most * r.out[j], 0.0)
             g = g - most * lower_clip(s(y[j] + self.band[j]), a0)
             steep = most * 0.5 / lower_clip(lowest, a0)
             for pump, (_, b) in r.pumps[j].items():
                 row[pump] = row.get(pump, 0.0) + steep * b
-        leaves = r.out_most[tank] * s(top)
-        leaves = leaves - r.draw[tank] if tank in self.leaks else leaves
-        lowest = lower_clip(y[tank] - eps - hold * leaves, 0.0)
+        lowest = lower_clip(y[tank] - eps - hold * r.out_most[tank] * s(top), 0.0)
         m = lower_clip(drains + k2 * g - k1 * k1 * (top - lowest), 0.0)
         x = y[tank] + eps + hold * full
         far = r.out[tank] * s(x) + k1 * (top - x) >= full
@@ -299,8 +295,8 @@ class SafetyFilter:
             total = sum(a * lower_clip(above[j], 0.0) for j, a in row.items())
             share = jnp.where(total > m, m / jnp.where(total > m, total, 1.0), 1.0)
             for j, v in above.items():
-                lowered = least[j] + v * share if j in least else v * share
                 lowers = (v > 0.0) & (total > m) if j in least else v > 0.0
+                lowered = least[j] + v * share if j in least else v * share
                 u[j] = jnp.where(lowers, lowered, u[j])
         return tuple(u)
 

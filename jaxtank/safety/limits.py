@@ -14,6 +14,8 @@ MARGIN = 0.9
 """Share of D = sum c_j o_j / 2 that the choice of k1 counts on."""
 SWEEPS = 500
 """Sweeps over all tanks after which limits that still fall count as not to be kept."""
+LEAST = 1e-3
+"""Share of a limit below which it is not lowered: a ring of orifices may lower limits to 0."""
 
 
 def filled_levels(setting, wanted, start):
@@ -56,6 +58,8 @@ def limits_for(setting, heights, kappa, unsettled=frozenset()):
             if not above:
                 reasons[i] = _rim_words(setting, i, limits) + (f"; {why}" if why else "")
                 continue
+            if any(factor * limits[j] < LEAST * heights[j] for j in above):
+                return limits_for(setting, heights, kappa, unsettled | lowered | {i})
             for j in above:
                 limits[j] = factor * (limits[j] + setting.spare[j]) - setting.spare[j]
             lowered.add(i)
@@ -115,10 +119,8 @@ def _other_topology(setting, tank, above):
     if piped & (above | {tank}):
         return "not proved with pipes"
     both = (tank, *above)
-    if setting.drawn or any(rates.inflow[i] > 0.0 or setting.spare[i] > 0.0 for i in both):
+    if any(rates.inflow[i] > 0.0 or setting.spare[i] > 0.0 for i in both):
         return "not proved with inflow disturbances"
-    if any(setting.low[j] < 0.0 for i in both for j in rates.pumps[i]):
-        return "not proved for pumps that may run backwards"
     if any(sink in above for _, sink, *_ in rates.links) or not all(rates.pumps[j] for j in above):
         return "not proved where the tanks above are fed by others"
     return "not proved for pumps that cannot stop" if any(setting.low > 0.0) else ""
@@ -149,7 +151,7 @@ def _slope(setting, tank, heights, sources):
             break
         level = _crossing(rates.out[tank], k1, top, full)
         lowest = level - hold * full - 2.0 * setting.band[tank]
-        lowest -= hold * (rates.out_most[tank] * sqrt_of(top, knee) - rates.draw[tank])
+        lowest -= hold * rates.out_most[tank] * sqrt_of(top, knee)
         steep = rates.out[tank] * 0.5 / math.sqrt(lowest) if lowest > knee else math.inf
         if k1**2 * (top - level) <= drained and k1 > steep:  # (C1), (C4)
             return float(k1), ""

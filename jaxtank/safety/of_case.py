@@ -100,7 +100,8 @@ def _box(case, widths):
     """({parameter: half width} of the box that the case describes, with `widths` in the place of
     the plant's, the factor by which inflow disturbances may be larger than they are).
     """
-    shares, flows, box = dict(case.uncertain), dict.fromkeys(FLOWS, SPREAD), {}
+    shares, box = dict(case.uncertain), {}
+    flows: dict[str, float] = {name: SPREAD for name in FLOWS}
     if case.covariance is not None:
         names, matrix = case.covariance
         names = [n for n in names if not n.startswith(HARMLESS)]

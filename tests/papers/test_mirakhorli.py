@@ -1371,10 +1371,8 @@ def test_the_verdict_on_zero_error_follows_the_numbers():
 
     def reported(instead, always):
         def other(name, values=None, save_every=1):
-            values = {
-                **{k.replace(".", "__"): _hash(v) for k, v in (values or {}).items()},
-                **always,
-            }
+            values = {k: v for k, v in (values or {}).items() if name not in instead}
+            values = {**{k.replace(".", "__"): _hash(v) for k, v in values.items()}, **always}
             return run(instead.get(name, name), **values)
 
         return measured(other)["zero steady-state error of the SFC"].verdict

@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 from jaxtank import rig as rigs
 from jaxtank.analysis.linear_model import linearise
 from jaxtank.case import Free
+from jaxtank.controllers import OpenLoop
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import number
 from jaxtank.rig.components import controller_of
@@ -75,7 +76,10 @@ def with_pi(case, inputs):
     table = {"kind": "pid", "Kc": Kc.tolist(), "Ti": Ti.tolist(), "Tt": Ti.tolist()} | (
         {} if moving else {"bias": inputs.tolist()}
     )
-    controller = controller_of(table, loop)
+    # the identified plant is its model, whatever the file's controller has
+    controller = controller_of(
+        table, dataclasses.replace(loop, controller=OpenLoop(signal=loop.reference))
+    )
     free = {n: f for n, f in case.free.items() if not n.startswith("controller.")}
     free |= {"controller.Kc": Free(float(Kc.min() / 30), float(Kc.max() * 30))}
     free |= {"controller.Ti": Free(float(Ti.min() / 10), float(Ti.max() * 10))}

@@ -23,7 +23,7 @@ from jaxtank.case import Case, Free
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.tree import describe, get_value
 from jaxtank.loop.steady import steady_state
-from jaxtank.rig.components import REGISTERED, ROLES, controller_of, kind_of
+from jaxtank.rig.components import REGISTERED, ROLES, controller_of, kind_of, model_of
 from jaxtank.rig.template import around
 
 NAMES = ("controller.kind", "law.kind")
@@ -98,7 +98,10 @@ def _published(case: Case, kind: str) -> tuple[Any, dict[str, Any]] | None:
     for other in presets.load(paper).cases.values():
         if kind_of("law", other.loop.controller) == kind and _same(other, case):
             free = {n: f for n, f in other.free.items() if n.startswith("controller.")}
-            return other.loop.controller, free
+            controller: Any = other.loop.controller
+            if hasattr(controller, "model"):
+                controller = dataclasses.replace(controller, model=model_of(case.loop))
+            return controller, free
     return None
 
 
@@ -113,11 +116,8 @@ def _computed(case: Case, kind: str) -> tuple[Any, dict[str, Any]]:
     """Return (controller, ranges) of a kind with the first gains of `START`."""
     known = _rig_of(case)
     table, names = START[kind](known)
-    plant = getattr(case.loop.controller, "model", case.loop.plant)
     written = {name: np.asarray(value).tolist() for name, value in table.items()}
-    controller = controller_of(
-        {"kind": kind, **written}, dataclasses.replace(case.loop, plant=plant)
-    )
+    controller = controller_of({"kind": kind, **written}, case.loop)
     loop = dataclasses.replace(case.loop, controller=controller)
     free: dict[str, Any] = {}
     for name in names:
@@ -136,7 +136,7 @@ def _rig_of(case: Case) -> Rig:
 
     Raises InputError where no plateau of the reference has a steady state.
     """
-    plant: Any = getattr(case.loop.controller, "model", case.loop.plant)
+    plant: Any = model_of(case.loop)
     pumps = (plant.pumps,)
     if plant.pumps != len(plant.outputs):
         raise InputError(

@@ -13,6 +13,7 @@ from jaxtank.case import Free
 from jaxtank.core.clock import CLOCK
 from jaxtank.core.tree import walk
 from jaxtank.core.units import local
+from jaxtank.loop.estimate_notes import design_notes
 from jaxtank.measures import MEASURES, of_loop
 from jaxtank.measures import unit as measure_unit
 from jaxtank.plots.equations import equations, physics
@@ -142,6 +143,7 @@ def _loop(case, page):
         lines
         + _chapter(f"The observer: {page['observer']}")
         + _docstring(loop.observer, loop.units)
+        + _sentences(design_notes(loop, np.stack(loop.reference.sample(case.clock)[0], axis=-1)))
     )
 
 

@@ -536,7 +536,7 @@ LARGE = 10**20  # a whole number that a float holds and no integer of numpy does
         '[free]\n"controller.k" = [0.1, BIG]',
         '[[scenario]]\nweight = BIG\nvalues = { "sensor.noise" = BIG }',
         "[[pour]]\ntime = 1\nduration = BIG\ntank = 1\nvolume = BIG",
-        "[disturbance]\ninflow = [0, 0, 0, BIG]",
+        "reachable = false\n[disturbance]\ninflow = [0, 0, 0, BIG]",
         '[[fault]]\nof = "drain[0]"\nstart = 1\nend = BIG\nextra = BIG',
     ],
 )

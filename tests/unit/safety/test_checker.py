@@ -696,6 +696,9 @@ def test_lags_that_differ_are_not_covered_in_one_row():
         ("may be drawn", {"known": {"inflow": (-1.0, 0.0)}}),
         ("inputs under way", {"actuator": bank(delay=2.0, initial=[12.0])}),
         ("counts on", {"box": {"plant.drain": ([0.28], [0.33])}}),
+        ("limits or initial", {"box": {"actuator.low": ([0.0], [0.1])}}),
+        ("limits or initial", {"box": {"actuator.high": ([11.0], [12.0])}}),
+        ("limits or initial", {"box": {"actuator.initial": ([0.0], [1.0])}}),
     ],
 )
 def test_prediction_is_proved_for_what_it_predicts_only(words, changes):
@@ -966,6 +969,10 @@ def test_pumps_that_cannot_stop_share_a_row_that_counts_with_them():
     found = Proved(plant, bank(2, low=[1.0, 0.5]), 0.1, start=[15.0, 5.0])
     assert found.guard.running == (0, 1) and found.check()[0].holds
     assert "lower limits above 0" in reason(found.check(running=(0,)))
+    low = {"actuator.low": ([0.9, 0.4], [1.0, 0.5])}
+    assert found.check(box=low)[0].holds  # none is above what the row counts with
+    low = {"actuator.low": ([1.0, 0.5], [1.0, 0.501])}
+    assert "uncertain lower limits above 0" in reason(found.check(box=low))
     leaves = 0.95 * 0.5 * math.sqrt(2 * 981.0) * math.sqrt(20.0)
     most = found.guard.most
     second = float(most.pump_gain[1]) * float(most.split[1]) * 0.5

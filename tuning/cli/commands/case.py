@@ -147,7 +147,7 @@ def simulate(args):
     key = jax.random.key(seed) if noisy(case) else None
     of_run = halving_warnings(case.loop, case.clock, key)
     values = dict(reported.run_measures(case.loop, case.clock, key))
-    of_run += _below_floor(case, values, key)
+    of_run += _of_run(case, values, key)
     for sentence in [] if args.quiet else of_run:
         print(f"jaxtank: note: {sentence}", file=sys.stderr)
     plateaus = stability_margins(case.loop, case.clock) if args.margins else ()
@@ -189,17 +189,18 @@ def simulate(args):
     return 0
 
 
-def _below_floor(case, values, key):
-    """Sentences on levels that fell below 0 in the run of these measures."""
+def _of_run(case, values, key):
+    """Sentences on levels that fell below 0 in the run of these measures, and on its estimates."""
     import numpy as np
 
-    from jaxtank.loop import floor
+    from jaxtank.loop import estimate_notes, floor
     from jaxtank.loop.saved_rows import simulate_compiled
 
-    if not np.any(np.asarray(values["min_level"]) < floor.lowest(case.loop.plant)):
+    below = np.any(np.asarray(values["min_level"]) < floor.lowest(case.loop.plant))
+    if not below and not estimate_notes.needs_run(case.loop):
         return []
     run, _ = simulate_compiled(case.loop, case.clock, key, 1)
-    return floor.floor_warnings(case.loop, run)
+    return floor.floor_warnings(case.loop, run) + estimate_notes.estimate_notes(case.loop, run)
 
 
 def _checked_columns(args):

@@ -1,0 +1,109 @@
+"""What the estimates of an observer contain besides inflows: offset dead zones, and the error of a
+model that is linearised once.
+
+May import the folders below `jaxtank.loop`.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.analysis.linear_model import linearise
+from jaxtank.core.errors import InputError
+from jaxtank.core.units import local
+from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.loop.steady import steady_state
+from jaxtank.loop.trajectory import Trajectory
+from jaxtank.observers import DisturbanceObserver, ExtendedKalman, Kalman
+
+FAR = 0.1
+"""Share of the linear model's own change of a rate by which it may be wrong without a note [-]."""
+
+
+def withheld(loop: ClosedLoop) -> Any:
+    """Return (n,) rates [cm/s] that the offset dead zones of running pumps take from what the
+    observer expects: part of any estimate of a disturbance.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> withheld(presets.find("gouta2022/chadpc").loop).round(3).tolist()
+    [-0.425, -0.667]
+    """
+    plant, bank = loop.plant, loop.actuator
+    x = tuple(np.asarray(loop.x0, dtype=float))
+    offset = np.broadcast_to(np.asarray(bank.offset, dtype=float), (plant.pumps,))
+    rates = [np.asarray(plant.derivative(0.0, x, tuple(u), None)) for u in (0.0 * offset, offset)]
+    return rates[0] - rates[1]
+
+
+def linear_distance(observer: Kalman, x: Any, u: Any) -> tuple[Any, Any, Any]:
+    """Return (distances [cm], errors [cm/s], changes [cm/s]), each (rows, n): of levels x (rows, n)
+    from the operating levels, of the linear model's rates from the model's with inputs u (rows, m),
+    and the size of the linear model's own change.
+    """
+    A, B, _ = linearise(observer.model, observer.levels, observer.inputs)
+
+    def rates(x: Any, u: Any) -> Any:
+        return jnp.stack(observer.model.derivative(0.0, tuple(x), tuple(u), None))
+
+    centre = (jnp.asarray(observer.levels), jnp.asarray(observer.inputs))
+    dx, du = x - centre[0], u - centre[1]
+    error = rates(*centre) + dx @ A.T + du @ B.T - jax.vmap(rates)(jnp.asarray(x), jnp.asarray(u))
+    return np.abs(dx), np.abs(error), np.abs(dx) @ np.abs(A).T
+
+
+def _far(loop: ClosedLoop, x: Any, u: Any, when: str) -> list[str]:
+    """A sentence where the linear model of a Kalman filter is wrong at levels x."""
+    observer = loop.observer
+    if not isinstance(observer, Kalman):
+        return []
+    distance, error, change = linear_distance(observer, np.asarray(x), np.asarray(u))
+    if not np.any(error > FAR * change):
+        return []
+    i, j = (int(np.argmax(v.max(axis=0))) for v in (distance, error))
+    length, rate = (local(unit, loop.units) for unit in ("cm", "cm/s"))
+    return [
+        f"observer.levels: {when} the level of tank {i + 1} is up to {distance.max():.3g} {length}"
+        f" from the operating level {float(np.asarray(observer.levels)[i]):g} {length}, and the"
+        f" linear model is wrong by up to {error.max():.3g} {rate} in the rate of tank {j + 1}:"
+        " the filter's estimates have that error in them; choose operating levels nearer by, or the"
+        " extended filter"
+    ]
+
+
+def needs_run(loop: ClosedLoop) -> bool:
+    """Return whether `estimate_notes` may have something to say of a run."""
+    estimates = isinstance(loop.observer, DisturbanceObserver | ExtendedKalman)
+    return isinstance(loop.observer, Kalman) or (estimates and bool(np.any(withheld(loop))))
+
+
+def estimate_notes(loop: ClosedLoop, run: Trajectory) -> list[str]:
+    """Return sentences on what the estimates of a run contain that is no inflow."""
+    sentences = _far(loop, run.x, run.applied, "in this run")
+    parts = withheld(loop) if np.any(np.asarray(run.d_hat)) else np.zeros(1)
+    if np.any(parts):
+        values = ", ".join(f"{v:.3g}" for v in parts)
+        sentences.append(
+            "d_hat is all that the observer's model does not explain: besides inflows it contains"
+            f" what the offset dead zones withhold while the pumps run, {values}"
+            f" {local('cm/s', loop.units)} of the tanks in order"
+        )
+    return sentences
+
+
+def design_notes(loop: ClosedLoop, setpoints: Any) -> list[str]:
+    """Return sentences on a Kalman filter at the steady states of setpoints (rows, outputs): those
+    farthest from its operating levels.
+    """
+    observer = loop.observer
+    if not isinstance(observer, Kalman) or not len(setpoints):
+        return []
+    away = np.abs(setpoints - np.asarray(observer.levels)[list(loop.plant.outputs)]).max(axis=1)
+    try:
+        x, u = steady_state(loop, setpoints[int(np.argmax(away))], observer.model)
+    except (InputError, FloatingPointError):
+        return []
+    return _far(loop, x[None], u[None], "at rest at the setpoints")
