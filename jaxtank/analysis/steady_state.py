@@ -215,7 +215,7 @@ def steady_levels(plant, u):
     return speeds * speeds / (2.0 * plant.gravity)
 
 
-def equilibrium(plant, y, inflow=None, low=0.0):
+def equilibrium(plant: Any, y: Any, inflow: Any = None, low: Any = 0.0) -> tuple[Any, Any]:
     """Return levels and inputs of the steady state with outputs y (gouta2015 notes S2.3).
 
     Of the plant alone: `loop.steady.steady_state` takes inflow, dead zone and limits of a loop.
