@@ -176,7 +176,7 @@ def steady_along(
     if plant.tanks >= vectors.FROM:
         speeds, inputs = (part @ jnp.stack(roots) for part in responses(plant, jnp, inflow))
         return tuple((w * speeds) ** 2 / (2.0 * plant.gravity)), tuple(w * inputs)
-    parts = [_from_known_speeds(plant, w * one) for one in np.eye(len(r))]
+    parts: list[Any] = [_from_known_speeds(plant, w * one) for one in np.eye(len(r))]
     if inflow is not None:
         alone = _from_known_speeds(plant, jnp.zeros(len(r)), inflow=inflow)
         parts.append(tuple(w * part for part in alone))

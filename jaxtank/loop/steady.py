@@ -20,8 +20,8 @@ def steady_inflow(loop: Any) -> Any:
     if not isinstance(disturbance, Constant):
         return None
     level: Any = disturbance.level
-    lasts = isinstance(level, Tracer) or bool(np.any(np.asarray(level)))
-    return level if lasts else None
+    unknown: bool = isinstance(disturbance.level, Tracer)
+    return level if unknown or np.any(np.asarray(level)) else None
 
 
 def steady_state(loop: Any, y: Any, plant: Any = None) -> tuple[Any, Any]:

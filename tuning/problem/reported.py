@@ -36,7 +36,8 @@ def run_measures(
 def in_force(loop: ClosedLoop, values: Mapping[str, float]) -> dict[str, float]:
     """Return `values` of free parameters, those that the controller clips as they act."""
     controller: Any = with_values(loop, values).controller
-    clipped: dict[str, Any] = getattr(controller, "in_force", dict)()  # a class of the user's may have none
+    # a class of the user's may have none
+    clipped: dict[str, Any] = getattr(controller, "in_force", dict)()
     found = dict(values)
     for leaf, value in clipped.items():
         for index in np.ndindex(np.shape(value)):
