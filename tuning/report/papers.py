@@ -6,7 +6,7 @@ Imported by the command line and the benchmarks.
 import textwrap
 from collections import Counter
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -159,7 +159,7 @@ def headline(rows):
 
 def headline_text(rows):
     """Return `headline` as a sentence."""
-    counts = headline(rows)
+    counts: Any = headline(rows)
     numbers, claims = counts["numbers"], counts["claims"]
     return (
         f"printed numbers: {numbers[REPRODUCED]} of {numbers['of']} reproduced, {numbers[FITTED]}"
