@@ -176,7 +176,7 @@ def steady_along(
     if plant.tanks >= vectors.FROM:
         speeds, inputs = (part @ jnp.stack(roots) for part in responses(plant, jnp, inflow))
         return tuple((w * speeds) ** 2 / (2.0 * plant.gravity)), tuple(w * inputs)
-    parts = [_from_known_speeds(plant, w * one) for one in np.eye(len(r))]
+    parts: list[Any] = [_from_known_speeds(plant, w * one) for one in np.eye(len(r))]
     if inflow is not None:
         alone = _from_known_speeds(plant, jnp.zeros(len(r)), inflow=inflow)
         parts.append(tuple(w * part for part in alone))
@@ -215,7 +215,7 @@ def steady_levels(plant, u):
     return speeds * speeds / (2.0 * plant.gravity)
 
 
-def equilibrium(plant, y, inflow=None, low=0.0):
+def equilibrium(plant: Any, y: Any, inflow: Any = None, low: Any = 0.0) -> tuple[Any, Any]:
     """Return levels and inputs of the steady state with outputs y (gouta2015 notes S2.3).
 
     Of the plant alone: `loop.steady.steady_state` takes inflow, dead zone and limits of a loop.

@@ -3,6 +3,9 @@ model that is linearised once.
 
 May import the folders below `jaxtank.loop`.
 """
+# jax leaves the types of asarray and others partly open.
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownVariableType=false
 
 from typing import Any
 

@@ -20,7 +20,8 @@ def steady_inflow(loop: Any) -> Any:
     if not isinstance(disturbance, Constant):
         return None
     level: Any = disturbance.level
-    return level if isinstance(level, Tracer) or np.any(np.asarray(level)) else None
+    unknown: bool = isinstance(disturbance.level, Tracer)
+    return level if unknown or np.any(np.asarray(level)) else None
 
 
 def steady_state(loop: Any, y: Any, plant: Any = None) -> tuple[Any, Any]:

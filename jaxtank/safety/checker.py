@@ -37,7 +37,7 @@ KNOWN = {
     "faults": {"factor", "extra", "windows"},
     "safety_filter": {"least", "most", "limit", "reach", "rate", "band", "inflow", "slope"}
     | {"spare", "age", "offset", "low", "bottom", "draw", "held", "kept", "predicted", "substeps"}
-    | {"allocate", "divided", "leaks", "running"},
+    | {"allocate", "divided", "running"},
 }
 """{part: fields that the checker knows}; a field that is not listed must be None, False or ()."""
 CLASSES = {"plant": TankNetwork, "actuator": PumpBank, "sensor": LevelSensor, "faults": Faults}

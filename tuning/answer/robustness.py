@@ -18,8 +18,9 @@ Textbooks recommend 1.4 to 2: above 2 a rise is reported, above this it is taken
 PRICE = 0.05
 """Share of the cost that a lower Ms may cost: half of it as a share of the error [-]."""
 
-SPAN = 0.01
-"""Half the distance of the points of a difference of Ms, as a share of a range [-]."""
+SPAN, ROUNDS = 0.01, 16
+"""A step of the descent of Ms and of its differences, as a share of a range [-]; how often STRIDE
+steps are taken along one direction, at most."""
 
 
 def move_back(setting: Setting, problem: Any, found: Found) -> None:
@@ -28,10 +29,10 @@ def move_back(setting: Setting, problem: Any, found: Found) -> None:
     Along a straight line in the search's coordinates, to the first of LINE points whose sensitivity
     peak (of the nominal loop, at the case's own step, the worst of its plateaus) is low enough,
     whose cost is within PRICE of the answer's, and that keeps the limits as well. The line leads
-    towards the first values, whose own Ms counts where they exceed PEAK; and before that, where
-    they do, along the steepest descent of Ms from the answer, to the lowest peak where none is low
-    enough. To the first values themselves where they fit and cost less than WORTH more than the
-    point. The answer stays where there is none, or where the loop has no sensitivity peak.
+    towards the first values; where their own peak is above PEAK, along the steepest descent of Ms,
+    to the lowest peak where none is low enough, and towards them only if it is above theirs. To
+    the first values themselves where they fit and cost less than WORTH more than the point. The
+    answer stays where there is none, or where the loop has no sensitivity peak.
 
     Parameters
     ----------
@@ -47,12 +48,10 @@ def move_back(setting: Setting, problem: Any, found: Found) -> None:
     if not highest > PEAK:  # NaN: it has none
         return
     before = _peak(setting, problem, first)
-    if before > PEAK:
-        calmer = _descended(setting, problem, found, highest)
-        if calmer is not None:
-            found.z, found.kept = calmer, calmer == first
-            return
     allowed = max(PEAK, before)
+    if before > PEAK:
+        calmer, highest = _descended(setting, problem, found, highest)
+        found.z, found.kept = calmer, calmer == first
     if not highest > allowed:
         return
     line = z + np.arange(1, LINE + 1)[:, None] / LINE * (first - z)
@@ -74,29 +73,31 @@ def move_back(setting: Setting, problem: Any, found: Found) -> None:
 
 
 def _descended(setting, problem, found, highest):
-    """Return the point below the peak `highest` that the steepest descent of Ms leads to within
-    PRICE, the first whose peak is at most PEAK; None where there is none.
+    """Return (point of the lowest peak within PRICE along the steepest descent of Ms from the
+    answer, whose peak is `highest`, or the first whose peak is at most PEAK; that peak).
     """
     search, z, point = found.search, found.point.z, found.point
     ceiling, violation = point.cost + PRICE * abs(point.cost), search.violation(point)
-    free, calmer, lowest = ~np.asarray(found.kept), None, highest
-    for _ in range(LINE // STRIDE):
+    free, calmer, lowest = ~np.asarray(found.kept), z, highest
+    for _ in range(ROUNDS):
         slope = _peak_slope(setting, problem, z) * free
         norm = float(np.linalg.norm(slope))
         if not 0.0 < norm < np.inf:
-            return calmer
-        line = np.clip(z - np.arange(1, STRIDE + 1)[:, None] / LINE * slope / norm, 0.0, 1.0)
-        costs, _ = problem.screen(line)
-        peaks = np.array([_peak(setting, problem, each) for each in line])
-        for each, cost, peak in zip(line, costs, peaks):
-            if not (cost <= ceiling and search.violation(search.point(each)) <= violation):
-                return calmer
+            break
+        steps = np.arange(1, STRIDE + 1)[:, None] * SPAN
+        line = np.clip(z - steps * slope / norm, 0.0, 1.0)
+        costs, margins = problem.screen(line)
+        beyond = np.max(-margins / search.limit_scale, axis=1, initial=0.0)
+        for each, fits in zip(line, (costs <= ceiling) & (beyond <= violation)):
+            if not fits:
+                return calmer, lowest
+            peak = _peak(setting, problem, each)
             if peak < lowest:
-                calmer, lowest = each, float(peak)
+                calmer, lowest = each, peak
             if lowest <= PEAK:
-                return calmer
+                return calmer, lowest
         z = line[-1]
-    return calmer
+    return calmer, lowest
 
 
 def _peak_slope(setting, problem, z):

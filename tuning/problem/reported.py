@@ -35,8 +35,9 @@ def run_measures(
 
 def in_force(loop: ClosedLoop, values: Mapping[str, float]) -> dict[str, float]:
     """Return `values` of free parameters, those that the controller clips as they act."""
-    controller = with_values(loop, values).controller
-    clipped = getattr(controller, "in_force", dict)()  # a class of the user's may have none
+    controller: Any = with_values(loop, values).controller
+    # a class of the user's may have none
+    clipped: dict[str, Any] = getattr(controller, "in_force", dict)()
     found = dict(values)
     for leaf, value in clipped.items():
         for index in np.ndindex(np.shape(value)):

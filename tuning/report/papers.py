@@ -6,7 +6,7 @@ Imported by the command line and the benchmarks.
 import textwrap
 from collections import Counter
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -43,6 +43,7 @@ def runner(paper):
     """Return run(case name, values={}, save_every=1, seed=0) of a paper; each run is made once.
 
     It returns (Case with `values` set, Trajectory as host arrays); `seed` draws the sensor noise.
+    run.cost(name, values={}) is the `cost` of such a case.
     """
     preset, known = presets.load(paper), {}
 
@@ -56,7 +57,19 @@ def runner(paper):
             known[key] = case, jax.tree.map(np.asarray, found)
         return known[key]
 
+    run.cost = lambda name, values=None: cost(rig.set_values(preset.cases[name], values or {}))
     return run
+
+
+def cost(case):
+    """Return the objective of a case, the mean over its scenarios, as `tune --nominal` has it."""
+    costs = []
+    for scenario in case.scenarios:
+        changed = rig.set_scenario(case, scenario.values)
+        key = jax.random.fold_in(jax.random.key(0), scenario.seed)
+        measures = lp.evaluate(changed.loop, changed.clock, list(case.objective), key)
+        costs.append(sum(w * float(np.sum(measures[m])) for m, w in case.objective.items()))
+    return float(np.mean(costs))
 
 
 def verdict(published, measured):
@@ -159,7 +172,7 @@ def headline(rows):
 
 def headline_text(rows):
     """Return `headline` as a sentence."""
-    counts = headline(rows)
+    counts: Any = headline(rows)
     numbers, claims = counts["numbers"], counts["claims"]
     return (
         f"printed numbers: {numbers[REPRODUCED]} of {numbers['of']} reproduced, {numbers[FITTED]}"

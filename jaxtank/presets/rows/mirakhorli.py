@@ -5,14 +5,11 @@ Imported by the preset of mirakhorli.
 
 import dataclasses
 
-import jax
 import numpy as np
 
-from jaxtank import rig
 from jaxtank.analysis.linear_model import linearise, transmission_zeros
 from jaxtank.analysis.riccati import lqr
 from jaxtank.analysis.steady_state import equilibrium
-from jaxtank.loop.run import evaluate
 from jaxtank.presets.loops.mirakhorli import CONTROLLERS, SETPOINT, UNROUNDED_SPLIT
 from jaxtank.presets.paper import Claim, Published
 
@@ -223,21 +220,10 @@ TUNED = {
 }
 
 
-def cost(case):
-    """Return J of notes S10, the mean over the case's scenarios, as `tune` has it [cm^2 s]."""
-    costs = []
-    for scenario in case.scenarios:
-        changed = rig.set_scenario(case, scenario.values)
-        key = jax.random.fold_in(jax.random.key(0), scenario.seed)
-        measures = evaluate(changed.loop, changed.clock, list(case.objective), key)
-        costs.append(sum(w * float(np.sum(measures[m])) for m, w in case.objective.items()))
-    return float(np.mean(costs))
-
-
 def _once_tuned(run):
     """The cost of the hybrid beside those of its parts, with the given gains and once tuned."""
-    given = {kind: cost(run(kind)[0]) for kind in ("hybrid", "smc", "sfc", "lqi")}
-    tuned = {kind: cost(run(kind, values)[0]) for kind, values in TUNED.items()}
+    given = {kind: run.cost(kind) for kind in ("hybrid", "smc", "sfc", "lqi")}
+    tuned = {kind: run.cost(kind, values) for kind, values in TUNED.items()}
     return Claim(
         (given["hybrid"] < min(given["smc"], given["sfc"]), tuned["hybrid"] < tuned["sfc"]),
         "mean J of notes S10: hybrid {:.0f}, SMC {:.0f}, SFC {:.0f}, lqi {:.0f} with the given"

@@ -458,6 +458,19 @@ def test_k1_of_a_second_order_row_is_bounded_by_c1_and_c4():
     assert at(0.19, hold=0.999 * hold)[0].holds and "(C4)" in reason(at(0.19, hold=1.001 * hold))
 
 
+def test_a_second_order_row_needs_tanks_above_that_hold_more_than_a0():
+    """(C3): c_min s(H) less what the others bring, above c_in a0 of each, a0 = 0.05 s(H)."""
+    found = gouta2015()
+    c, _, _, _, _, above = by_hand(found)
+    share = sum(c_in for _, c_in in above) - min(0.95 * c_in for _, c_in in above)
+    least = found.guard.least
+    for factor, holds in ((1.001, True), (0.999, False)):
+        drain = np.array(least.drain, dtype=float)
+        drain[0] *= factor * share / c
+        verdict = found.check(least=dataclasses.replace(least, drain=drain))[0]
+        assert ("(C3)" in verdict.reason) != holds
+
+
 def test_a_second_order_row_needs_its_start_its_reach_and_its_rate():
     found = gouta2015()
     c, top, _, _, _, above = by_hand(found)

@@ -1,11 +1,12 @@
 """Answers near the edge of stability are news of the headline; values are reported as they act."""
 
 import numpy as np
+import pytest
 from helpers import command
 
 import jaxtank
 import tuning
-from jaxtank import presets
+from jaxtank import presets, rig
 from tuning.problem.reported import in_force
 from tuning.search.messages import messages_of
 
@@ -25,6 +26,58 @@ def test_an_answer_beyond_sampled_stability_is_news_of_the_headline(tmp_path):
     assert "edge of sampled stability" in found["headline"]
     assert "edge of sampled stability" in found["message"].split(";")[0]
     assert "converged, beyond the edge" in (tmp_path / "run" / "report.html").read_text()
+
+
+RIG = """
+units = ["m", "%"]
+tank = [
+    {area = 0.5, rim = 1.2, level = 0.55},
+    {area = 0.25, rim = 1.0, level = 0.5},
+    {area = 0.25, rim = 0.8, level = 0.4, drain = 4.15e-4},
+]
+orifice = [{from = 1, to = 2, area = 3.2e-4}, {from = 2, to = 3, area = 2.6e-4}]
+pump = [{gain = 2.64e-5, to = 1, high = 100.0}, {gain = 1.144e-5, to = 3, high = 100.0}]
+plant = {outputs = [2, 3], gravity = 9.81}
+law = {kind = "pid", Kc = [100.0, 100.0], Ti = [200.0, 200.0], Tt = [200.0, 200.0]}
+reference = {initial = [0.5, 0.4], changes = [[100.0, 1, 0.6], [1500.0, 2, 0.45]], ramp = 0.0}
+values = {"clock.dt" = 1.0, "clock.duration" = 3000.0}
+free = {"controller.Kc" = [10.0, 3000.0], "controller.Ti" = [20.0, 3000.0]}
+"""
+"""Levels in m, pumps in %; Ms of the start is 6.56."""
+
+
+@pytest.fixture
+def fragile(tmp_path):
+    """A rig file whose PI controllers are nearly unstable."""
+    path = tmp_path / "fragile.toml"
+    path.write_text(RIG)
+    return path
+
+
+def test_a_nominal_answer_with_a_high_sensitivity_peak_is_news_of_the_headline(fragile):
+    fixed = [f"--free=controller.Kc[{i}]=10:3000" for i in range(2)]
+    found = command("tune", str(fragile), *fixed, *WORDS, "--json").json
+    assert found["measures"]["before"]["sensitivity_peak"] > 6.0
+    assert found["measures"]["after"]["sensitivity_peak"] > 4.0
+    assert "at the edge of sampled stability (Ms = " in found["headline"]
+
+
+def test_the_default_answer_of_a_fragile_start_prefers_a_lower_sensitivity_peak(fragile):
+    """The search alone ends at 3.45, below the start's 6.56."""
+    found = tuning.tune(rig.load(fragile))
+    before, after = (found.measures[s]["sensitivity_peak"] for s in ("before", "after"))
+    assert before > 6.0 and after < 2.8
+
+
+def test_a_calm_nominal_answer_costs_no_program_of_margins():
+    """Gains move by large factors, and the pumps less than before."""
+    found = command("tune", "gouta2015/backstepping", *WORDS, "--json").json
+    travel = [np.max(found["measures"][side]["input_travel"]) for side in ("before", "after")]
+    assert travel[1] < 1.1 * travel[0]
+    ratios = [p["after"] / p["before"] for p in found["parameters"].values()]
+    assert max(abs(np.log10(ratios))) > 1.0
+    assert "sensitivity_peak" not in found["measures"]["after"]
+    assert found["headline"] == found["status"]
 
 
 def test_a_sensitivity_peak_of_four_is_news_and_one_of_two_is_none():
