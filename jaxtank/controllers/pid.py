@@ -149,15 +149,19 @@ class PID(Controller):
 
     def __post_init__(self) -> None:
         concrete = isinstance(self.Ti, np.ndarray | jax.Array) and not isinstance(self.Ti, Tracer)
-        if concrete and np.size(self.Ti) and np.any(endless := self._endless()):
-            # of all loops: no state that never moves
-            Ti = None if np.all(endless) else np.where(endless, np.inf, self.Ti)
-            object.__setattr__(self, "Ti", Ti)
+        if not concrete or not np.size(self.Ti):
+            return
+        Ti, endless = np.asarray(self.Ti), self._endless()
+        if np.all(endless):
+            object.__setattr__(self, "Ti", None)  # no state that never moves
+        elif np.any(endless) and Ti.shape[-1] > 1:  # `track` reads inf of several loops alone
+            object.__setattr__(self, "Ti", np.where(endless, np.inf, Ti))
 
     def _endless(self) -> Any:
         """Whether each integral time is as good as infinite beside the tracking time."""
-        tracking = isinstance(self.Tt, np.ndarray | jax.Array) and not isinstance(self.Tt, Tracer)
-        return np.isinf(self.Ti) | (np.asarray(self.Ti) >= ENDLESS * self.Tt if tracking else False)
+        Ti, Tt = np.asarray(cast(Any, self.Ti)), cast(Any, self.Tt)
+        tracking = isinstance(Tt, np.ndarray | jax.Array) and not isinstance(Tt, Tracer)
+        return np.isinf(Ti) | (np.asarray(ENDLESS * Tt <= Ti) if tracking else False)
 
     @property
     def arrays(self) -> bool:
@@ -238,14 +242,14 @@ class PID(Controller):
 
     def _fractional(self, state, tick, w):
         """The state after errors w (m,) at the input of fractional integrals."""
-        integral, sections, order = [], [], cast(Any, self.order)
+        integral, sections, order, Ti = [], [], cast(Any, self.order), cast(Any, self.Ti)
         for i, error in enumerate(w):
             gain, poles, residues = oustaloup(1.0 - order[i])
             keep = jnp.exp(-poles * tick.dt)
             enter = residues * (1.0 - keep) / poles
             rate = gain * error + sum(state.sections[i])
             integral.append(
-                state.integral[i] + tick.dt * self.Kc[i] * self.Ti[i] ** -order[i] * rate
+                state.integral[i] + tick.dt * self.Kc[i] * Ti[i] ** -order[i] * rate
             )
             sections.append(
                 tuple(keep[j] * s + enter[j] * error for j, s in enumerate(state.sections[i]))

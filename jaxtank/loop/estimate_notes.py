@@ -32,7 +32,7 @@ def withheld(loop: ClosedLoop) -> Any:
     Examples
     --------
     >>> from jaxtank import presets
-    >>> withheld(presets.find("gouta2022/chadpc").loop).round(3).tolist()
+    >>> [round(float(v), 3) for v in withheld(presets.find("gouta2022/chadpc").loop)]
     [-0.425, -0.667]
     """
     plant, bank = loop.plant, loop.actuator
