@@ -148,13 +148,14 @@ class PID(Controller):
     )
 
     def __post_init__(self) -> None:
-        concrete = isinstance(self.Ti, np.ndarray | jax.Array) and not isinstance(self.Ti, Tracer)
-        if not concrete or not np.size(self.Ti):
+        Ti: Any = self.Ti
+        concrete = isinstance(Ti, np.ndarray | jax.Array) and not isinstance(Ti, Tracer)
+        if not concrete or not np.size(Ti):
             return
-        Ti, endless = np.asarray(self.Ti), self._endless()
+        endless = self._endless()
         if np.all(endless):
             object.__setattr__(self, "Ti", None)  # no state that never moves
-        elif np.any(endless) and Ti.shape[-1] > 1:  # `track` reads inf of several loops alone
+        elif np.any(endless) and np.shape(Ti)[-1] > 1:  # `track` reads inf of several loops alone
             object.__setattr__(self, "Ti", np.where(endless, np.inf, Ti))
 
     def _endless(self) -> Any:
@@ -248,9 +249,7 @@ class PID(Controller):
             keep = jnp.exp(-poles * tick.dt)
             enter = residues * (1.0 - keep) / poles
             rate = gain * error + sum(state.sections[i])
-            integral.append(
-                state.integral[i] + tick.dt * self.Kc[i] * Ti[i] ** -order[i] * rate
-            )
+            integral.append(state.integral[i] + tick.dt * self.Kc[i] * Ti[i] ** -order[i] * rate)
             sections.append(
                 tuple(keep[j] * s + enter[j] * error for j, s in enumerate(state.sections[i]))
             )
