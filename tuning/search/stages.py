@@ -88,7 +88,7 @@ class Outcome:
     redone: int = 0  # screening points that were run again at the true step
     least: bool = False  # whether the search for the least violation came to its end
     ended: bool = False  # whether the search that gave the answer converged, and so it stayed
-    confirmed: bool = False  # whether two searches agree, or evolution found nothing better too
+    confirmed: bool = False  # whether it converged, and two agree or evolution found nothing better
     probe: dict[str, int] | None = None  # what evolution found, see TuningResult
     change: Any = None  # (P,) percent of the cost by 10 % of each parameter
     idle: Any = None  # (P,) True for parameters that no run exercises
