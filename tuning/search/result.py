@@ -196,7 +196,7 @@ class TuningResult(Result):
         two searches agree and none was needed.
     certificate : violation probability on new plants (`tune_robust`), where asked.
     slopes : {"start", "answer": SlopeCheck} whether runs beside these points bear the exact slopes
-        out; an answer whose slope they contradict is confirmed by differential evolution alone.
+        out; an answer whose slope they contradict is not converged.
     answer : the `tuning.Answer` of a default answer: its plants, noise and safety filter.
 
     Examples

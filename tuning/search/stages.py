@@ -88,7 +88,7 @@ class Outcome:
     redone: int = 0  # screening points that were run again at the true step
     least: bool = False  # whether the search for the least violation came to its end
     ended: bool = False  # whether the search that gave the answer converged, and so it stayed
-    confirmed: bool = False  # whether two searches agree, or evolution found nothing better
+    confirmed: bool = False  # whether it converged, and two agree or evolution found nothing better
     probe: dict[str, int] | None = None  # what evolution found, see TuningResult
     change: Any = None  # (P,) percent of the cost by 10 % of each parameter
     idle: Any = None  # (P,) True for parameters that no run exercises
@@ -178,17 +178,16 @@ def _confirm(search, found, plan, screened):
     answer that has converged, or where no slope is of use, by differential evolution too.
     """
     for k in range(RENEWED):
-        mark, probed = search.best, False
+        mark = search.best
         lower, blind = _lower_neighbour(search, found), not search.slope(mark).usable
         if lower is None and (blind or (found.ended and not _agreed(search, found))):
-            probed = True
             lower = _probe(search, found, screened, plan.seed + k)
         if lower is not None:
             search.start, count = len(found.starts), len(search.history)
             _local_search(search, found, plan, lower, count)
             _finish(search, found, plan)
         if not _is_lower(search, search.best, mark):
-            found.confirmed = found.ended or (blind and probed)
+            found.confirmed = found.ended
             return
         if found.probe:
             found.probe["lower"] += 1

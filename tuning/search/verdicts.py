@@ -313,7 +313,9 @@ def _why_not_converged(result: TuningResult) -> str:
             " at every point that was tried, as where noise and delay make the loop unstable;"
             " start from other values (--set) or narrow the ranges (--free)"
         )
-    if (result.optimality["kkt_residual"] or 0.0) >= UNSTABLE:
+    check = result.slopes.get("answer")
+    useless = check is not None and not check.usable
+    if useless or (result.optimality["kkt_residual"] or 0.0) >= UNSTABLE:
         return (
             "the gradient at this point is that of an unstable or chaotic run (noise and delay at"
             " a high gain give one), and points along it are not lower; try more --starts, or"
