@@ -361,12 +361,14 @@ def test_every_code_is_kebab_case_and_is_in_the_table_of_codes():
     folder = Path(messages.__file__).parent
     report = folder.parent / "report" / "tuned" / "report.py"
     _check_codes([*folder.glob("*.py"), report], messages.__doc__)
-    _check_codes(Path(findings.__file__).parent.glob("*.py"), findings.__doc__)
+    answers = Path(findings.__file__).parent.glob("*.py")
+    shared = {"edge-of-stability", "slope-not-usable"}  # of both, made by search/verdicts
+    _check_codes(answers, findings.__doc__, shared)
 
 
-def _check_codes(paths, table):
+def _check_codes(paths, table, found=frozenset()):
     """The codes of all Messages that the modules make are those of the table, each once."""
-    found = set()
+    found = set(found)
     for path in paths:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Message":
@@ -429,7 +431,7 @@ def test_every_result_has_the_same_ways_out(tuned):
     assert type(found["status"]) is str and found["case"] == "own"
     assert found["parameters"]["controller.Kc"]["after"] == tuned["controller.Kc"].after
     assert json.loads(json.dumps(found, allow_nan=False)) == found
-    assert str(tuned).startswith("own: converged (trf") and "controller.Kc" in str(tuned)
+    assert str(tuned).startswith("own: converged") and "controller.Kc" in str(tuned)
 
 
 def test_tune_keeps_its_log_in_the_checkpoint_and_goes_on_from_it(own, tuned, tmp_path):

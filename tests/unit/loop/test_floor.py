@@ -3,6 +3,7 @@
 import dataclasses
 import warnings
 
+import jax
 import numpy as np
 import pytest
 
@@ -113,8 +114,8 @@ class Leaky(Plant):
     units = ("m", "-")
     outputs = (0,)
     tanks = pumps = 1
-    rim: float = leaf("cm", "(n,) height")
-    area: float = leaf("cm^2", "(n,) area")
+    rim: jax.Array = leaf("cm", "height", shape=("tank",))
+    area: jax.Array = leaf("cm^2", "area", shape=("tank",))
 
     def derivative(self, t, x, u, d):
         return (0.1 * u[0] - 0.01,)
