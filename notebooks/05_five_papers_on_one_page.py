@@ -41,9 +41,8 @@ compared
 
 # %% [markdown]
 # Of the claims in words {{words.count("reproduced")}} are reproduced and {{words.count("differs")}} are
-# not, or in part only: {{100 * words.count("reproduced") / (words.count("reproduced") + words.count("differs")):.0f}} %. Of the rows that are *numbers* only {{numbers.count("reproduced")}} are reproduced, and
-# these are coefficients and setpoints that follow from other printed numbers, not results of a run;
-# {{numbers.count("differs")}} differ, and {{numbers.count("fitted")}} are fitted. (A few of those that differ are choices of
+# not, or in part only: {{100 * words.count("reproduced") / (words.count("reproduced") + words.count("differs")):.0f}} %. Of the rows that are *numbers* {{numbers.count("reproduced")}} are reproduced by
+# a run: what agrees is an input or fitted. {{numbers.count("differs")}} differ, and {{numbers.count("fitted")}} are fitted. (A few of those that differ are choices of
 # ours where the printed number cannot be right, and each result of gouta2022 is there twice: for an
 # ideal rig and for one with a dead zone, a delay and noise, called paper-like.) The shape of a curve is
 # easier to reproduce than its numbers: they depend on pumps, noise and delays of a real rig, which papers
