@@ -1,7 +1,4 @@
-"""A case: one rig, one controller, one reference, one clock, and what may be tuned on it.
-
-May import `jaxtank.loop` and below; rig files and pictures are opened when they are asked for.
-"""
+"""A case: one rig, one controller, one reference, one clock, and what may be tuned on it."""
 
 import dataclasses
 import importlib

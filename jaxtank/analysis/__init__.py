@@ -1,7 +1,4 @@
-"""Steady states, linear models, Riccati equations and quadratic programmes.
-
-Imports core; may be imported by every folder above.
-"""
+"""Steady states, linear models, Riccati equations and quadratic programmes."""
 
 from jaxtank.analysis.linear_model import (
     linearise,

@@ -3,7 +3,7 @@
 A LAPACK call takes longer than the work on so small a matrix, and in jaxlib 0.10 a batched call
 divides its work among the threads on which it runs itself: as many such calls at once as there are
 threads wait for each other for ever. A kept program with LAPACK in it takes 0.1 s longer to load,
-for jax looks its functions up in scipy. Imports jax only; imported by `qp` and `steady_state`.
+for jax looks its functions up in scipy.
 """
 
 import contextlib
@@ -20,14 +20,7 @@ STAGES = 4  # parts of a larger one: 1 takes twice the time of 4 at 100 variable
 
 @contextlib.contextmanager
 def rolled() -> Iterator[None]:
-    """Trace eliminations of any size as loops: what is written out fills pages of exported code.
-
-    Examples
-    --------
-    >>> with rolled():
-    ...     isinstance(factor(jnp.eye(4)), list)
-    False
-    """
+    """Trace eliminations of any size as loops: what is written out fills pages of exported code."""
     global UNROLLED
     before, UNROLLED = UNROLLED, STAGES - 1
     try:
@@ -37,15 +30,8 @@ def rolled() -> Iterator[None]:
 
 
 def solve(A, b):
-    """Return x (n,) of A x = b, for a small matrix A (n, n): Gauss-Jordan with row pivots.
-
-    Unrolled. Entries are not finite where a pivot is exactly 0.
-
-    Examples
-    --------
-    >>> solve(jnp.array([[0.0, 2.0], [1.0, 1.0]]), jnp.array([2.0, 3.0])).tolist()
-    [2.0, 1.0]
-    """
+    """Return x (n,) of A x = b, for a small matrix A (n, n): Gauss-Jordan with row pivots."""
+    # Unrolled. Entries are not finite where a pivot is exactly 0.
     rows = jnp.concatenate([A, b[:, None]], axis=1)
     index = np.arange(A.shape[0])[:, None]
     for j in range(A.shape[0]):
@@ -58,23 +44,15 @@ def solve(A, b):
 
 
 def normal_matrix(H, G, weight):
-    """Return H + G' diag(weight) G (n, n) for H (n, n), G (rows, n) and weight (rows,).
-
-    Examples
-    --------
-    >>> normal_matrix(jnp.eye(1), jnp.array([[2.0]]), jnp.array([0.5])).tolist()
-    [[3.0]]
-    """
+    """Return H + G' diag(weight) G (n, n) for H (n, n), G (rows, n) and weight (rows,)."""
     return H + (_weighted(G, weight) if H.shape[0] > UNROLLED else (G.T * weight) @ G)
 
 
 @jax.jit
 def _weighted(G, weight):
-    """Return G' diag(weight) G (n, n) for G (rows, n), row by row.
-
-    Inside a loop that is one compiled function XLA writes the product of a vector and a matrix for
-    the processor's vector unit, and that of two matrices as three plain loops.
-    """
+    """Return G' diag(weight) G (n, n) for G (rows, n), row by row."""
+    # Inside a loop that is one compiled function XLA writes the product of a vector and a matrix
+    # for the processor's vector unit, and that of two matrices as three plain loops.
     product = jnp.zeros((G.shape[1], G.shape[1]), G.dtype)
 
     def row(j, product):
@@ -85,17 +63,9 @@ def _weighted(G, weight):
 
 
 def factor(A):
-    """Return a factor of A (n, n) symmetric positive definite, for `_substitute`.
-
-    Up to UNROLLED variables: [(column of L, pivot), ...] of A = L D L', written out column by
-        column.
-    Above: `_cholesky`.
-
-    Examples
-    --------
-    >>> float(substitute(factor(jnp.array([[4.0]])), jnp.array([2.0]))[0])
-    0.5
-    """
+    """Return a factor of A (n, n) symmetric positive definite, for `_substitute`."""
+    # Up to UNROLLED variables: [(column of L, pivot), ...] of A = L D L', written out column by
+    # column. Above: `_cholesky`.
     if A.shape[0] > UNROLLED:
         return _cholesky(A)
     columns = []
@@ -122,12 +92,11 @@ def substitute(factor, b):
 def _cholesky(A):
     """Return U (n, n) upper triangular, A = U'U, for A symmetric positive definite (NaN where it is
     not).
-
-    One row of U at a time, from a product of the rows before it. The rows are done in STAGES parts
-    of fixed shape, so that little of a product is spent on entries that are zero.
-    `jaxtank.export.lowering` writes this function, `_cholesky_solve` and `_weighted` as loops of
-    its own: it knows them by their names.
     """
+    # One row of U at a time, from a product of the rows before it. The rows are done in STAGES
+    # parts of fixed shape, so that little of a product is spent on entries that are zero.
+    # `jaxtank.export.lowering` writes this function, `_cholesky_solve` and `_weighted` as loops of
+    # its own: it knows them by their names.
     n = A.shape[0]
     ends = [round(n * k / STAGES) for k in range(STAGES + 1)]
     U = jnp.zeros((0, n), A.dtype)

@@ -1,7 +1,4 @@
-"""Frequency response of a sampled open loop, without LAPACK: it vmaps, and runs on any device.
-
-Imports jax only; imported by `analysis.margins`.
-"""
+"""Frequency response of a sampled open loop, without LAPACK: it vmaps, and runs on any device."""
 
 from typing import Any, NamedTuple
 
@@ -17,17 +14,7 @@ SQUARINGS = 40
 
 
 class OpenLoop(NamedTuple):
-    """L(z) = C (z I - A)^-1 B z^-dead, the loop broken at its m inputs; closed with u = -L u.
-
-    A (n, n), B (n, m), C (m, n): one sample of `dt` [s]; dead: samples of dead time, a whole
-    number known when a program is compiled.
-
-    Examples
-    --------
-    >>> one = jnp.eye(1)
-    >>> OpenLoop(0.9 * one, one, 0.5 * one, dead=0, dt=1.0).dead
-    0
-    """
+    """L(z) = C (z I - A)^-1 B z^-dead, the loop broken at its m inputs; closed with u = -L u."""
 
     A: Any
     B: Any
@@ -37,14 +24,8 @@ class OpenLoop(NamedTuple):
 
 
 def solve(M: Any, rhs: Any) -> Any:
-    """Return M^-1 rhs for M (n, n), real or complex, and rhs (n, k); Gauss with partial pivoting.
-
-    Not finite where M is singular.
-
-    Examples
-    --------
-    >>> solve(jnp.array([[0.0, 2.0], [1.0, 0.0]]), jnp.array([[4.0], [3.0]])).ravel().tolist()
-    [3.0, 2.0]
+    """Return M^-1 rhs for M (n, n), real or complex, and rhs (n, k); Gauss with partial
+    pivoting.
     """
     n, index = M.shape[0], np.arange(M.shape[0])
 
@@ -64,15 +45,7 @@ def _size(value):
 
 
 def is_stable(A: Any) -> Any:
-    """Return True if the spectral radius of A (n, n) is at most 1, to 1e-9.
-
-    By repeated squaring: the logarithm of |A^(2^k)|, divided by 2^k.
-
-    Examples
-    --------
-    >>> bool(is_stable(jnp.array([[0.5, 9.0], [0.0, -0.99]]))), bool(is_stable(jnp.eye(1) * 1.01))
-    (True, False)
-    """
+    """Return True if the spectral radius of A (n, n) is at most 1, to 1e-9."""
 
     def square(_, state):
         P, log, power = state
@@ -87,15 +60,7 @@ def is_stable(A: Any) -> Any:
 
 
 def hessenberg(loop: OpenLoop) -> OpenLoop:
-    """Return the same loop with A in Hessenberg form, by Householder's reflections (Laub 1981).
-
-    Examples
-    --------
-    >>> A = jnp.arange(9.0).reshape(3, 3)
-    >>> found = hessenberg(OpenLoop(A, jnp.ones((3, 1)), jnp.ones((1, 3)), 0, 1.0))
-    >>> abs(float(found.A[2, 0])) < 1e-6
-    True
-    """
+    """Return the same loop with A in Hessenberg form, by Householder's reflections (Laub 1981)."""
     index = np.arange(loop.A.shape[0])
 
     def reflect(k, state):
@@ -117,15 +82,7 @@ def hessenberg(loop: OpenLoop) -> OpenLoop:
 
 
 def response(loop: OpenLoop, z: Any) -> tuple[Any, Any]:
-    """Return (L (F, m, m), det(I - A/z) (F,)) at z (F,) of a loop in Hessenberg form.
-
-    Examples
-    --------
-    >>> one = jnp.eye(1)
-    >>> L, det = response(OpenLoop(0.5 * one, one, one, 1, 1.0), jnp.array([2.0 + 0j]))
-    >>> round(float(L[0, 0, 0].real), 4), round(float(det[0].real), 4)
-    (0.3333, 0.75)
-    """
+    """Return (L (F, m, m), det(I - A/z) (F,)) at z (F,) of a loop in Hessenberg form."""
     H, B, C, dead, _ = loop
     n, F = H.shape[0], z.shape[0]
     eye = jnp.eye(n, dtype=z.dtype)
@@ -166,14 +123,7 @@ class Held(NamedTuple):
 
 
 def held(loop: OpenLoop, w: Any) -> Held:
-    """Return what `near` needs at frequencies w (K,) [rad/s].
-
-    Examples
-    --------
-    >>> one = jnp.eye(1)
-    >>> held(OpenLoop(0.9 * one, one, 0.5 * one, 0, 1.0), jnp.array([0.5])).X.shape
-    (1, 1, 1)
-    """
+    """Return what `near` needs at frequencies w (K,) [rad/s]."""
     (A, B, C), w = jax.lax.stop_gradient((loop[:3], w))
 
     def one(w):
@@ -190,18 +140,6 @@ def held(loop: OpenLoop, w: Any) -> Held:
 def near(loop: OpenLoop, held: Held, w: Any) -> Any:
     """Return L (K, m, m) at frequencies w (K,) [rad/s] next to those of `held`, to second order,
     with first derivatives by the loop and w.
-
-    C X + Y (B - (z I - A) X) has the value of C X and the derivatives of L: no system is solved
-    for each of many directions.
-
-    Examples
-    --------
-    >>> one, w = jnp.eye(1), jnp.array([0.5])
-    >>> loop = lambda a: OpenLoop(a * one, one, one, 0, 1.0)
-    >>> L = lambda a: near(loop(a), held(loop(a), w), w)[0, 0, 0].real
-    >>> exact = (1.0 / (np.exp(0.5j) - 0.3) ** 2).real
-    >>> bool(abs(float(jax.grad(L)(0.3)) - exact) < 1e-5)
-    True
     """
     A, B, C, dead, dt = loop
     z = jnp.exp(1j * w * dt)

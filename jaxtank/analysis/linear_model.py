@@ -1,7 +1,4 @@
-"""Linear models of a rig about a steady state: gains, interaction, transmission zeros.
-
-Imports core; may be imported by every folder above.
-"""
+"""Linear models of a rig about a steady state: gains, interaction, transmission zeros."""
 
 import jax
 import jax.numpy as jnp

@@ -1,7 +1,4 @@
-"""Stability margins of a sampled open loop: sensitivity peak, gain, phase and delay margin.
-
-Imports `analysis.frequency`; may be imported by every folder above.
-"""
+"""Stability margins of a sampled open loop: sensitivity peak, gain, phase and delay margin."""
 
 from typing import Any, NamedTuple
 
@@ -31,9 +28,8 @@ CLOSER = 10
 
 
 class Margins(NamedTuple):
-    """Margins of a loop with m inputs; inf where nothing crosses, and all of them only if `stable`.
-
-    Gain, phase and delay margin are of one input at a time, with the other loops closed.
+    """Margins of a loop with m inputs; inf where nothing crosses, and all of them only if
+    `stable`.
     """
 
     stable: Any  # True if the closed loop is stable
@@ -48,33 +44,11 @@ class Margins(NamedTuple):
 
 
 def margins(loop: OpenLoop, slopes: bool = True) -> Margins:
-    """Return the Margins of a loop, with derivatives of the margins by A, B and C.
-
-    The sensitivity peak and every crossover are bracketed on a grid of frequencies and narrowed
-    down. The derivative is that at the frequency found: a peak does not move to first order, and
-    a crossover is followed by one Newton step. At the Nyquist frequency, where L is real, a
-    negative L counts as a crossover of the phase.
-
-    Parameters
-    ----------
-    loop : OpenLoop
-    slopes : False for the margins alone (their derivatives are then 0), whose program compiles in
-        four fifths of the time.
-
-    Returns
-    -------
-    Margins
-
-    Examples
-    --------
-    A sampled integrator L = 0.5/(z - 1): 1 + k L is zero at z = -1 for k = 4.
-
-    >>> jax.config.update("jax_enable_x64", True)
-    >>> one = jnp.eye(1)
-    >>> found = margins(OpenLoop(one, 0.5 * one, one, 0, 1.0))
-    >>> bool(found.stable), round(float(found.gain_margin[0]), 4)
-    (True, 4.0)
-    """
+    """Return the Margins of a loop, with derivatives of the margins by A, B and C."""
+    # The sensitivity peak and every crossover are bracketed on a grid of frequencies and narrowed
+    # down. The derivative is that at the frequency found: a peak does not move to first order, and
+    # a crossover is followed by one Newton step. At the Nyquist frequency, where L is real, a
+    # negative L counts as a crossover of the phase.
     still = jax.lax.stop_gradient(loop._replace(dead=0))._replace(dead=loop.dead)
     form = fr.hessenberg(still)
     w = _grid(still)

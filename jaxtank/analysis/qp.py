@@ -1,5 +1,5 @@
 """Small quadratic programmes with two-sided rows, solved by an interior-point method and
-differentiable in all data. Imports jax and `elimination`; may be imported by every folder above.
+differentiable in all data.
 
     min_x 1/2 x'H x + f'x    subject to    l <= G x <= u
 
@@ -56,27 +56,7 @@ class Point(NamedTuple):
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(5,))
 def solve(H, f, G, l, u, iterations=MOST):
-    """Return x that minimises 1/2 x'Hx + f'x within l <= G x <= u; differentiable in all five.
-
-    Parameters
-    ----------
-    H : (n, n) symmetric, positive definite
-    f : (n,)
-    G : (rows, n); rows may be collinear, and x is unique all the same
-    l, u : (rows,) finite, l < u
-    iterations : most iterations
-
-    Returns
-    -------
-    (n,); meaningless where no point is feasible: nothing is raised inside a trace
-
-    Examples
-    --------
-    >>> with jax.enable_x64(True):
-    ...     x = solve(jnp.eye(2), jnp.array([-2.0, -0.5]), jnp.eye(2), jnp.zeros(2), jnp.ones(2))
-    >>> [round(float(v), 3) for v in x]
-    [1.0, 0.5]
-    """
+    """Return x that minimises 1/2 x'Hx + f'x within l <= G x <= u; differentiable in all five."""
     unit, inside = _scaled(H, f, G, l, u)
     return unit * interior_point(*inside, iterations).x
 
@@ -135,15 +115,13 @@ def _held_slope(primals, tangents):
 def _implicit(point, data, moved):
     """How x moves when the `data` (H, f, G, l, u) do: one Newton step on the optimality conditions
     at the solution,
-
-        H dx + A' v = a,    A dx - D v = b,
-
-    of x and of v, the change of lu - ll, with the slacks eliminated; each row is scaled so that
-    every entry is of the order of 1. The matrix H + A' D^-1 A that v leaves for dx (`_normal`)
-    loses four to ten digits of H in the shadow of binding rows; corrections by what the two
-    equations above leave bring them back. The elimination itself is not differentiated: second
-    derivatives are those of a linear system.
     """
+    # H dx + A' v = a, A dx - D v = b,
+    # of x and of v, the change of lu - ll, with the slacks eliminated; each row is scaled so that
+    # every entry is of the order of 1. The matrix H + A' D^-1 A that v leaves for dx (`_normal`)
+    # loses four to ten digits of H in the shadow of binding rows; corrections by what the two
+    # equations above leave bring them back. The elimination itself is not differentiated: second
+    # derivatives are those of a linear system.
     H, _, G, _, _ = data
     x, su, sl, lu, ll = point
     up, low = lu / su, ll / sl
@@ -175,18 +153,7 @@ def _implicit(point, data, moved):
 
 
 def interior_point(H, f, G, l, u, iterations=MOST):
-    """Return the `Point` at which the iterates converge, or the last of `iterations`.
-
-    Arguments as in `solve`. Not for reverse mode.
-
-    Examples
-    --------
-    >>> with jax.enable_x64(True):
-    ...     limits = jnp.zeros(1), jnp.ones(1)
-    ...     found = interior_point(jnp.eye(1), jnp.array([-2.0]), jnp.eye(1), *limits)
-    >>> round(float(found.x[0]), 3)
-    1.0
-    """
+    """Return the `Point` at which the iterates converge, or the last of `iterations`."""
     x = jnp.zeros_like(f)
     one = jnp.full(G.shape[0], 0.1, f.dtype)
     rounding = 64.0 * jnp.finfo(f.dtype).eps * jnp.maximum(1.0, jnp.maximum(jnp.abs(u), jnp.abs(l)))

@@ -1,7 +1,7 @@
 """Linear systems: discretisation, Lyapunov and Riccati equations, linear-quadratic gains.
 
 Jittable and differentiable, forward and reverse; for use before the time loop (in a controller's
-`step` too: the loop hoists such work). Imports jax only; may be imported by every folder above.
+`step` too: the loop hoists such work).
 """
 
 import jax
@@ -15,20 +15,7 @@ DOUBLINGS = 40  # 2^40 samples of memory: closed-loop poles up to 1 - 1e-11
 
 
 def zero_order_hold(A, B, dt):
-    """Return (Ad, Bd) of x' = A x + B u sampled with u held: exp([[A, B], [0, 0]] dt).
-
-    Parameters
-    ----------
-    A : (n, n) [1/s]
-    B : (n, m) [unit of x per s and unit of u]
-    dt : sampling period [s]
-
-    Examples
-    --------
-    >>> Ad, Bd = zero_order_hold(jnp.array([[-1.0]]), jnp.array([[1.0]]), 1.0)
-    >>> round(float(Ad[0, 0]), 4), round(float(Bd[0, 0]), 4)
-    (0.3679, 0.6321)
-    """
+    """Return (Ad, Bd) of x' = A x + B u sampled with u held: exp([[A, B], [0, 0]] dt)."""
     n, m = B.shape
     block = jnp.concatenate([jnp.concatenate([A, B], axis=1), jnp.zeros((m, n + m))], axis=0)
     held = expm(block * dt)
@@ -36,70 +23,20 @@ def zero_order_hold(A, B, dt):
 
 
 def lyapunov(A, Q):
-    """Return X (n, n) of A X + X A' + Q = 0, by one linear system of n^2 unknowns.
-
-    Meant for n up to about 10.
-
-    Parameters
-    ----------
-    A : (n, n) [1/s]; where two of its eigenvalues sum to zero, X is not finite
-    Q : (n, n) [unit of X per s]
-
-    Examples
-    --------
-    >>> float(lyapunov(jnp.array([[-1.0]]), jnp.array([[2.0]]))[0, 0])
-    1.0
-    """
+    """Return X (n, n) of A X + X A' + Q = 0, by one linear system of n^2 unknowns."""
     n = A.shape[0]
     eye = jnp.eye(n)
     return jnp.linalg.solve(jnp.kron(A, eye) + jnp.kron(eye, A), -jnp.ravel(Q)).reshape(n, n)
 
 
 def discrete_lyapunov(A, Q):
-    """Return X (n, n) of X = A X A' + Q, by one linear system of n^2 unknowns.
-
-    Parameters
-    ----------
-    A : (n, n) [-]
-    Q : (n, n) [unit of X]
-
-    Examples
-    --------
-    >>> round(float(discrete_lyapunov(jnp.array([[0.5]]), jnp.array([[3.0]]))[0, 0]), 6)
-    4.0
-    """
+    """Return X (n, n) of X = A X A' + Q, by one linear system of n^2 unknowns."""
     n = A.shape[0]
     return jnp.linalg.solve(jnp.eye(n * n) - jnp.kron(A, A), jnp.ravel(Q)).reshape(n, n)
 
 
 def riccati(A, B, Q, R):
-    """Return the stabilising P (n, n) of A'P + P A - P B R^-1 B'P + Q = 0.
-
-    Parameters
-    ----------
-    A : (n, n) [1/s]
-    B : (n, m)
-    Q : (n, n) symmetric, at least 0
-    R : (m, m) symmetric, above 0
-
-    Returns
-    -------
-    (n, n); not finite, or no solution, where (A, B) is not stabilisable or a mode of A on the
-    imaginary axis is unobservable through Q
-
-    Notes
-    -----
-    P0 comes from the matrix sign of the Hamiltonian (Roberts 1980), without derivatives. One Newton
-    step of Kleinman (1968) from P0, a Lyapunov equation, gives P and its derivatives: Newton's map
-    has slope zero in P0 at the solution, so what is left, its slope in A, B, Q and R, is the
-    derivative of the implicit function.
-
-    Examples
-    --------
-    >>> one = jnp.eye(1)
-    >>> round(float(riccati(0.0 * one, one, one, one)[0, 0]), 6)
-    1.0
-    """
+    """Return the stabilising P (n, n) of A'P + P A - P B R^-1 B'P + Q = 0."""
     P = jax.lax.stop_gradient(_riccati_by_sign(*(jax.lax.stop_gradient(a) for a in (A, B, Q, R))))
     K = jnp.linalg.solve(R, B.T @ P)
     closed = A - B @ K
@@ -127,43 +64,13 @@ def _riccati_by_sign(A, B, Q, R):
 
 
 def lqr(A, B, Q, R):
-    """Return K (m, n) of u = -K x that minimises the integral of x'Q x + u'R u.
-
-    K = R^-1 B'P (mirakhorli eq. 15, without its transpose); arguments as in `riccati`.
-
-    Examples
-    --------
-    >>> one = jnp.eye(1)
-    >>> round(float(lqr(0.0 * one, one, 4.0 * one, one)[0, 0]), 6)
-    2.0
-    """
+    """Return K (m, n) of u = -K x that minimises the integral of x'Q x + u'R u."""
+    # K = R^-1 B'P (mirakhorli eq. 15, without its transpose); arguments as in `riccati`.
     return jnp.linalg.solve(R, B.T @ riccati(A, B, Q, R))
 
 
 def discrete_riccati(A, B, Q, R):
-    """Return the stabilising P (n, n) of P = A'P A - A'P B (R + B'P B)^-1 B'P A + Q.
-
-    For a Kalman filter's prior covariance give A', C' and the covariances of process and
-    measurement. Conditions as in `riccati`, with the unit circle.
-
-    Parameters
-    ----------
-    A : (n, n) [-]
-    B : (n, m)
-    Q : (n, n) symmetric, at least 0
-    R : (m, m) symmetric, above 0
-
-    Notes
-    -----
-    P0 by structured doubling (Anderson 1978; Chu et al. 2004), without derivatives; P and its
-    derivatives by one step of Hewer (1971), as in `riccati`.
-
-    Examples
-    --------
-    >>> one = jnp.eye(1)
-    >>> round(float(discrete_riccati(0.0 * one, one, 3.0 * one, one)[0, 0]), 6)
-    3.0
-    """
+    """Return the stabilising P (n, n) of P = A'P A - A'P B (R + B'P B)^-1 B'P A + Q."""
     P = jax.lax.stop_gradient(
         _discrete_riccati_by_doubling(*(jax.lax.stop_gradient(a) for a in (A, B, Q, R)))
     )

@@ -1,7 +1,4 @@
-"""Which gains of a controller may follow a schedule: what its traced methods use them for.
-
-Imported by `controllers.gain_schedule`.
-"""
+"""Which gains of a controller may follow a schedule: what its traced methods use them for."""
 
 import functools
 
@@ -16,28 +13,8 @@ from jaxtank.xla.reachability import use_of
 
 
 def refusal(controller, gains, gain, on_setpoint, channels):
-    """Return why `gain` cannot be scheduled together with the other `gains`, or None.
-
-    Derived from the traced methods of the controller, not from its values.
-
-    Parameters
-    ----------
-    controller : with absent (None) gains or without
-    gains, gain : names of all scheduled leaves, and one of them
-    on_setpoint : whether the operating variable is a setpoint
-    channels : number of channels of the reference
-
-    Returns
-    -------
-    The reason as part of a sentence, or None
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> controller = presets.find("khalid/gpc").loop.controller
-    >>> refusal(controller, ("u_low[0]",), "u_low[0]", True, 1)
-    'the controller does not use it'
-    """
+    """Return why `gain` cannot be scheduled together with the other `gains`, or None."""
+    # Derived from the traced methods of the controller, not from its values.
     leaves, structure = jax.tree.flatten(controller)
     return _refusal(
         structure, tuple(np.shape(v) for v in leaves), gains, gain, on_setpoint, channels

@@ -1,6 +1,6 @@
 """Steady states of large networks with pipes: Newton's method with a sparse Jacobian, on the host.
 
-With 1,000 tanks a dense one takes minutes. Imports core; imported by `steady_state`.
+With 1,000 tanks a dense one takes minutes.
 """
 
 from typing import Any
@@ -80,20 +80,8 @@ def balanced(plant: Any, y: Any, enough: float = 1e-14, inflow: Any = None) -> t
     """Return (levels (n,), inputs (m,), rates (n,) left) where a network with outputs y (m,) and an
     inflow (n,) [cm^3/s] stands still, or as near to it as was found; it ends where no rate is above
     `enough` [cm/s].
-
-    Levenberg-Marquardt steps in the roots of the unknown levels, so that no level is negative.
-
-    Examples
-    --------
-    >>> from jaxtank.plants import network
-    >>> pair = network(
-    ...     area=15.0, drain=[0.0, 0.2], pipes=[(0, 1)], pipe=0.2, pump_gain=8.0,
-    ...     feeds=[(0, None)], rim=30.0, outputs=[0],
-    ... )
-    >>> x, u, left = balanced(pair, np.array([8.0]))
-    >>> x.round(2).tolist(), bool(abs(left).max() < 1e-9)
-    ([8.0, 4.0], True)
     """
+    # Levenberg-Marquardt steps in the roots of the unknown levels, so that no level is negative.
     system, outputs = Balance(plant, inflow), np.array(plant.outputs)
     free = np.setdiff1d(np.arange(plant.tanks), outputs)
     scale = float(np.max(y)) or 1.0
@@ -132,15 +120,6 @@ def responses(plant, xp, inflow=None):
     """(n, outputs) efflux speeds and (m, outputs) inputs by the speeds of the controlled tanks, of
     a network of many tanks without pipes, by matrices that are filled and not added up. With an
     inflow (n,) [cm^3/s] a last column: what it does alone.
-
-    xp: jax.numpy, or numpy where nothing is to be differentiated.
-
-    Examples
-    --------
-    >>> from jaxtank.plants import network
-    >>> tank = network(area=[25.0], drain=[0.3], pump_gain=[6.0], feeds=[(0, None)], rim=[30.0])
-    >>> [part.round(6).tolist() for part in responses(tank, np)]
-    [[[1.0]], [[0.05]]]
     """
     n, m, outputs = plant.tanks, plant.pumps, np.array(plant.outputs)
     free = np.setdiff1d(np.arange(n), outputs)

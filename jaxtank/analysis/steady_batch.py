@@ -1,7 +1,4 @@
-"""Steady states of many plants of one topology at once, on the host: no compilation.
-
-Imports core and plants; may be imported by every folder above.
-"""
+"""Steady states of many plants of one topology at once, on the host: no compilation."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -19,31 +16,10 @@ ITERATIONS = 60
 
 
 class SteadyStates:
-    """The steady states of N plants that differ in numbers, as a function of their outputs.
+    """The steady states of N plants that differ in numbers, as a function of their outputs."""
 
-    Without pipes, efflux speeds and inputs are affine in the roots of the outputs and are solved
-    for once; with pipes, by Newton's method in the levels that are not controlled.
-
-    Parameters
-    ----------
-    plant : TankNetwork with as many pumps as outputs
-    values : {name of FLOWS: (N, ...)}; those left out are the plant's own
-    inflow : (n,) or (N, n) steady inflow of each tank that no pump brings [cm^3/s]
-
-    Raises
-    ------
-    InputError for another plant.
-
-    Examples
-    --------
-    >>> from jaxtank.plants import state_coupled_four_tank
-    >>> plant = state_coupled_four_tank(15.0)
-    >>> levels, inputs = SteadyStates(plant, {"pump_gain": plant.pump_gain * [[1.0], [0.5]]}).at(
-    ...     [[8.0, 8.0]]
-    ... )
-    >>> levels.shape, inputs.round(3).tolist()
-    ((2, 1, 4), [[[2.949, 2.949]], [[5.898, 5.898]]])
-    """
+    # Without pipes, efflux speeds and inputs are affine in the roots of the outputs and are solved
+    # for once; with pipes, by Newton's method in the levels that are not controlled.
 
     def __init__(self, plant: Any, values: Mapping[str, ArrayLike], inflow: ArrayLike = 0.0):
         if plant.pumps != len(plant.outputs):
@@ -65,11 +41,9 @@ class SteadyStates:
             self.speeds, self.inputs, self.constant = self._affine()
 
     def at(self, outputs: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Return levels (N, P, n) [cm] and inputs (N, P, m) [V] at outputs (P, m) or (N, P, m).
-
-        A level below zero stands for an efflux that would have to flow backwards: no steady state
-        exists. NaN where none was found.
-        """
+        """Return levels (N, P, n) [cm] and inputs (N, P, m) [V] at outputs (P, m) or (N, P, m)."""
+        # A level below zero stands for an efflux that would have to flow backwards: no steady state
+        # exists. NaN where none was found.
         y = np.asarray(outputs, dtype=float)
         if self.plant.pipes:
             return self._with_pipes(np.broadcast_to(y, (len(self.out), *y.shape[-2:])))

@@ -1,7 +1,4 @@
-"""Steady states of a rig.
-
-Imports core; may be imported by every folder above.
-"""
+"""Steady states of a rig."""
 
 from typing import Any
 
@@ -104,33 +101,10 @@ def _unknowns(plant, xp=jnp):
 
 
 def steady_under(plant: Any, h0: Any, u0: Any, d: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """Return the steady state with the same outputs under disturbances of the level rates.
-
-        0 = efflux v + pumps u + A d,   v_outputs as before:   the balance is linear in v, u and d
-
-    so the matrix of d is solved once, in front of the time loop. A tank that would have to flow
-    backwards is empty.
-
-    Parameters
-    ----------
-    plant : as in `steady_flows`
-    h0, u0 : (n) levels [cm] and (m) inputs [V] of the steady state without, from `steady_along`
-    d : (n) disturbances of the level rates [cm/s]
-
-    Returns
-    -------
-    ((n) levels [cm], (m) inputs [V])
-
-    Examples
-    --------
-    >>> from jaxtank.plants import state_coupled_four_tank
-    >>> rig = state_coupled_four_tank(15.0)
-    >>> h0, u0 = equilibrium(rig, (8.0, 10.0))
-    >>> h, u = steady_under(rig, tuple(h0), tuple(u0), (0.1, 0.0, -0.1, 0.0))
-    >>> rates = rig.derivative(0.0, h, u, (1.5, 0.0, -1.5, 0.0))
-    >>> max(abs(float(rate)) for rate in rates) < 1e-6
-    True
-    """
+    """Return the steady state with the same outputs under disturbances of the level rates."""
+    # 0 = efflux v + pumps u + A d, v_outputs as before: the balance is linear in v, u and d
+    # so the matrix of d is solved once, in front of the time loop. A tank that would have to flow
+    # backwards is empty.
     free, columns, _ = _unknowns(plant)
     moved = jnp.linalg.solve(columns, -jnp.diag(jnp.asarray(plant.area)))
     double = 2.0 * plant.gravity

@@ -1,7 +1,4 @@
-"""Controllers: from setpoint and estimate to pump voltages.
-
-Imports analysis, plants, instruments, signals and core; may be imported by the loop and above.
-"""
+"""Controllers: from setpoint and estimate to pump voltages."""
 
 from jaxtank.controllers.backstepping import Backstepping
 from jaxtank.controllers.base import Controller

@@ -1,7 +1,4 @@
-"""Interface between a controller and the loop.
-
-Imports core, instruments and signals; may be imported by the loop and by every controller.
-"""
+"""Interface between a controller and the loop."""
 
 import abc
 from collections.abc import Sequence

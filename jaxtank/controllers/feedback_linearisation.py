@@ -1,7 +1,5 @@
 """Inversion that both controllers of gouta2015 share: from demanded output accelerations to
 voltages.
-
-Imports plants, signals and core; may be imported by controllers and observers.
 """
 
 from typing import Any, NamedTuple
@@ -17,92 +15,18 @@ from jaxtank.signals.setpoints import Ramps
 
 
 def drift(model, x):
-    """Return f(h): level rates of the model with its pumps off.
-
-    Parameters
-    ----------
-    model : plant
-    x : (n) levels, scalars or arrays [cm]
-
-    Returns
-    -------
-    Tuple of rates, one per output [cm/s]
-
-    Examples
-    --------
-    >>> from jaxtank.plants.rigs import coupled_tanks
-    >>> rig = coupled_tanks(
-    ...     area=225.0,
-    ...     drain=0.0,
-    ...     pipe=0.0,
-    ...     pump_gain=45.0,
-    ...     rim=30.0,
-    ...     outputs=(0, 1),
-    ...     feeds=(0, 1),
-    ... )
-    >>> [float(rate) for rate in drift(rig, (8.0, 8.0))]  # no outlets
-    [0.0, 0.0]
-    """
+    """Return f(h): level rates of the model with its pumps off."""
     rate = model.derivative(0.0, tuple(x), (0.0,) * model.pumps, None)
     return tuple(rate[i] for i in model.outputs)
 
 
 def authority(model):
-    """Return c2 = Kp/A: level rate per volt of each pump in its own tank (gouta2022 eq. 3).
-
-    Parameters
-    ----------
-    model : network of which pump j fills one tank
-
-    Returns
-    -------
-    Tuple of c2, one per pump [cm/(s V)]
-
-    Examples
-    --------
-    >>> from jaxtank.plants.rigs import coupled_tanks
-    >>> rig = coupled_tanks(
-    ...     area=225.0,
-    ...     drain=0.0,
-    ...     pipe=0.0,
-    ...     pump_gain=45.0,
-    ...     rim=30.0,
-    ...     outputs=(0, 1),
-    ...     feeds=(0, 1),
-    ... )
-    >>> [float(c2) for c2 in authority(rig)]
-    [0.2, 0.2]
-    """
+    """Return c2 = Kp/A: level rate per volt of each pump in its own tank (gouta2022 eq. 3)."""
     return tuple(model.pump_gain[j] / model.area[first] for j, (first, _) in enumerate(model.feeds))
 
 
 def check_own_pumps(model, every=True, holder="controller"):
-    """Check that pump j fills the j-th controlled tank alone.
-
-    Parameters
-    ----------
-    model : network
-    every : whether every tank must be controlled too
-    holder : whose model it is, as messages name it
-
-    Raises
-    ------
-    InputError otherwise.
-
-    Examples
-    --------
-    >>> from jaxtank.plants.rigs import coupled_tanks
-    >>> rig = coupled_tanks(
-    ...     area=225.0,
-    ...     drain=0.0,
-    ...     pipe=0.0,
-    ...     pump_gain=45.0,
-    ...     rim=30.0,
-    ...     outputs=(0, 1),
-    ...     feeds=(0, 1),
-    ... )
-    >>> check_own_pumps(rig)
-    """
+    """Check that pump j fills the j-th controlled tank alone."""
     if tuple(first for first, _ in model.feeds) != model.outputs or any(
         second is not None for _, second in model.feeds
     ):
@@ -118,9 +42,9 @@ def check_own_pumps(model, every=True, holder="controller"):
 
 
 class Coefficients(NamedTuple):
-    """c1 .. c10 of gouta2015 eq. (7), with the receiving tank's area (gouta2015 notes E1)
-    [cm^0.5/s]; c8, c10 [cm/(V s)].
-    """
+    """c1 .. c10 of gouta2015 eq."""
+
+    # (7), with the receiving tank's area (gouta2015 notes E1) [cm^0.5/s]; c8, c10 [cm/(V s)].
 
     c1: Any
     c2: Any
@@ -142,14 +66,7 @@ class Coefficients(NamedTuple):
 
 
 def coefficients(model):
-    """Return c1 .. c10 of gouta2015 eq. (7) for a state-coupled `TankNetwork`.
-
-    Examples
-    --------
-    >>> from jaxtank.plants.rigs import state_coupled_four_tank
-    >>> round(float(coefficients(state_coupled_four_tank(76.87)).c8), 6)  # Kp/A [cm/(V s)]
-    0.1
-    """
+    """Return c1 .. c10 of gouta2015 eq. (7) for a state-coupled `TankNetwork`."""
     s31, s32, s41, s42 = (model.orifice[i] for i in range(4))
     a1, a2, a3, a4 = (model.area[i] for i in range(4))
     w = jnp.sqrt(2.0 * model.gravity)
@@ -168,55 +85,20 @@ def coefficients(model):
 
 
 def floored_roots(levels, floor):
-    """Return sqrt(max(h, floor)) of each level.
-
-    The lower clip keeps roots and their inverses finite where a tank is dry or noise makes a level
-    negative. The command is proportional to the roots of the upper levels, so with a dry tank it is
-    zero and stays so; with a clip of about 1 cm the loop restarts (gouta2015 notes H3).
-
-    Parameters
-    ----------
-    levels : (n) [cm]
-    floor : lower clip of the levels [cm]
-
-    Returns
-    -------
-    Tuple of roots, one per level [cm^0.5]
-
-    Examples
-    --------
-    >>> [float(s) for s in floored_roots((9.0, -1.0), 0.25)]
-    [3.0, 0.5]
-    """
+    """Return sqrt(max(h, floor)) of each level."""
+    # The lower clip keeps roots and their inverses finite where a tank is dry or noise makes a
+    # level negative. The command is proportional to the roots of the upper levels, so with a dry
+    # tank it is zero and stays so; with a clip of about 1 cm the loop restarts (gouta2015 notes
+    # H3).
     return tuple(clipped_sqrt(h, floor) for h in levels)
 
 
 def decouple(c, s3, s4, v1, v2, scale=1.0):
     """Return the voltages that give the outputs the accelerations scale * v: b^-1 (v - g),
     division-free (gouta2015 eqs. 28, 48).
-
-        u1 = [sqrt(h3) (c6 v1 - c3 v2)/alpha + c7 sqrt(h3)] / c8,   u2 likewise
-
-    b is not formed: its entries grow as 1/sqrt(h) while its inverse stays finite.
-
-    Parameters
-    ----------
-    c : Coefficients
-    s3, s4 : roots of the upper levels [cm^0.5]
-    v1, v2 : scale * v1, scale * v2 are accelerations without the terms of the lower outlets
-        [cm/s^2]
-    scale : common factor
-
-    Returns
-    -------
-    (u1, u2) [V]
-
-    Examples
-    --------
-    >>> c = Coefficients(*[2.0, 2.0, 1.0, 2.0, 1.0, 2.0, 3.0, 0.5, 3.0, 0.5])
-    >>> decouple(c, 1.0, 1.0, 0.0, 0.0)  # holds the upper levels: c7 sqrt(h3) = c8 u1
-    (6.0, 6.0)
     """
+    # u1 = [sqrt(h3) (c6 v1 - c3 v2)/alpha + c7 sqrt(h3)] / c8, u2 likewise
+    # b is not formed: its entries grow as 1/sqrt(h) while its inverse stays finite.
     a8, a10 = c.alpha * c.c8, c.alpha * c.c10
     u1 = s3 * ((c.c7 / c.c8 + (scale * c.c6 / a8) * v1) - (scale * c.c3 / a8) * v2)
     u2 = s4 * ((c.c9 / c.c10 - (scale * c.c5 / a10) * v1) + (scale * c.c2 / a10) * v2)
@@ -224,50 +106,17 @@ def decouple(c, s3, s4, v1, v2, scale=1.0):
 
 
 def less_upper(c, u, d):
-    """Return the voltages (u1, u2) less what the disturbances of the upper tanks do without them.
-
-        h3' = -c7 sqrt(h3) + c8 u1 + d3,   so that u1 - d3/c8 has the effect that u1 was meant to
-        have; u2 likewise
-
-    These disturbances are matched: they enter where the pumps do.
-
-    Parameters
-    ----------
-    c : Coefficients
-    u : (u1, u2) of `decouple` [V]
-    d : (4) disturbances of the level rates [cm/s]
-
-    Returns
-    -------
-    (u1, u2) [V]
-
-    Examples
-    --------
-    >>> c = Coefficients(*[2.0, 2.0, 1.0, 2.0, 1.0, 2.0, 3.0, 0.5, 3.0, 0.5])
-    >>> less_upper(c, (6.0, 6.0), (0.0, 0.0, 1.0, -0.5))
-    (4.0, 7.0)
+    """Return the voltages (u1, u2) less what the disturbances of the upper tanks do
+    without them.
     """
+    # h3' = -c7 sqrt(h3) + c8 u1 + d3, so that u1 - d3/c8 has the effect that u1 was meant to have;
+    # u2 likewise
     return u[0] - d[2] / c.c8, u[1] - d[3] / c.c10
 
 
 def input_metric(c, s3, s4):
     """Return (g11, g12, g22) of G = b'b, b = B/2 diag(1/sqrt(h3), 1/sqrt(h4)) diag(c8, c10)
     (gouta2015 eq. 26; gouta2015 notes S4.5).
-
-    Parameters
-    ----------
-    c : Coefficients
-    s3, s4 : roots of the upper levels [cm^0.5]
-
-    Returns
-    -------
-    (g11, g12, g22) [cm^2/(s^4 V^2)]
-
-    Examples
-    --------
-    >>> c = Coefficients(*[2.0, 2.0, 1.0, 2.0, 1.0, 2.0, 3.0, 2.0, 3.0, 2.0])
-    >>> input_metric(c, 1.0, 1.0)
-    (5.0, 4.0, 5.0)
     """
     p, q = 0.5 * c.c8 / s3, 0.5 * c.c10 / s4
     return (
@@ -278,22 +127,7 @@ def input_metric(c, s3, s4):
 
 
 def check_state_coupled(model, reference):
-    """Check the model and the reference of a controller of gouta2015.
-
-    Parameters
-    ----------
-    model : must be a state-coupled four-tank whose outputs can be decoupled
-    reference : must stay above 0 cm (the controllers compute sqrt(r))
-
-    Raises
-    ------
-    InputError otherwise.
-
-    Examples
-    --------
-    >>> from jaxtank.plants.rigs import state_coupled_four_tank
-    >>> check_state_coupled(state_coupled_four_tank(21.213), Constant(level=[9.0, 9.0]))
-    """
+    """Check the model and the reference of a controller of gouta2015."""
     if (
         model.links != STATE_COUPLED_LINKS
         or model.feeds != STATE_COUPLED_FEEDS

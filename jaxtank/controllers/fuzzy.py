@@ -24,26 +24,8 @@ PAIRINGS = {"cross": (1, 0), "same": (0, 1)}
 def membership(size, b, w):
     """Return the membership of a size |e| in "high": 0 up to b - w, 1 from b + w, the C1 smoothstep
     3x^2 - 2x^3 between.
-
-    The membership in "low" is 1 minus this (mirakhorli notes S4.5).
-
-    Parameters
-    ----------
-    size : |e| [cm]
-    b : size where the membership is 1/2 [cm]
-    w : half width, clipped to at most b, so that the membership is exactly 0 at no error [cm]. At
-        w = b, where the clip begins to act, the slopes in w and b are the means of those of both
-        sides, as a central difference has them
-
-    Returns
-    -------
-    Membership in [0, 1]
-
-    Examples
-    --------
-    >>> [float(membership(size, 1.0, 0.5)) for size in (0.5, 1.0, 1.5)]
-    [0.0, 0.5, 1.0]
     """
+    # The membership in "low" is 1 minus this (mirakhorli notes S4.5).
     w = jnp.minimum(w, b)  # its slopes at a tie are halves: the mean of both sides
     x = clip((size - b + w) / (2.0 * w), 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)

@@ -20,26 +20,7 @@ VARIABLE = re.compile(r"[rh][1-9]\d*")
 
 
 def check_gains(controller, gains):
-    """Check that each of `gains` names a number among the leaves of a controller, once.
-
-    Parameters
-    ----------
-    controller : of which the gains are leaves
-    gains : names such as "k" or "Kc[0]"
-
-    Raises
-    ------
-    InputError for no gain, an unknown or a repeated one, a static value, and a whole array.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> controller = presets.find("gouta2015/backstepping").loop.controller
-    >>> check_gains(controller, ("k", "k1"))
-    >>> check_gains(controller, ("k", "k"))
-    Traceback (most recent call last):
-    jaxtank.core.errors.InputError: gain k is scheduled twice
-    """
+    """Check that each of `gains` names a number among the leaves of a controller, once."""
     if not gains:
         raise InputError("a schedule needs at least one gain")
     names = [n for n in parameters(controller)]
@@ -67,26 +48,7 @@ def check_gains(controller, gains):
 
 
 def check_variable(variable, outputs, tanks):
-    """Check the operating variable of a schedule.
-
-    Parameters
-    ----------
-    variable : "r1" to "r<outputs>", a setpoint, or "h1" to "h<tanks>", a level
-    outputs : number of outputs
-    tanks : number of tanks; None: not known
-
-    Raises
-    ------
-    InputError for any other variable.
-
-    Examples
-    --------
-    >>> check_variable("h2", 1, 2)
-    >>> check_variable("r2", 1, 2)
-    Traceback (most recent call last):
-    jaxtank.core.errors.InputError: schedule variable 'r2' does not exist: must be r1 to r1, the \
-setpoint of an output, or h1 to h2, the level of a tank
-    """
+    """Check the operating variable of a schedule."""
     good = isinstance(variable, str) and VARIABLE.fullmatch(variable)
     most = (outputs if variable[0] == "r" else tanks) if good else 0
     if not good or (most is not None and int(variable[1:]) > most):
@@ -98,24 +60,7 @@ setpoint of an output, or h1 to h2, the level of a tank
 
 
 def check_knots(knots):
-    """Check that there are at least two knots, finite and increasing.
-
-    Parameters
-    ----------
-    knots : (K,) positions of the operating variable [cm]
-
-    Raises
-    ------
-    InputError otherwise.
-
-    Examples
-    --------
-    >>> check_knots([3.0, 9.0])
-    >>> check_knots([3.0])
-    Traceback (most recent call last):
-    jaxtank.core.errors.InputError: schedule knots [3.0]: must be at least two finite numbers, \
-each above the one before
-    """
+    """Check that there are at least two knots, finite and increasing."""
     p = np.asarray(knots, dtype=float)
     if p.ndim != 1 or p.size < 2 or not np.all(np.isfinite(p)) or not np.all(np.diff(p) > 0):
         raise InputError(
@@ -134,28 +79,8 @@ class Memory(NamedTuple):
 
 
 def interpolate(at, knots, values):
-    """Return piecewise-linear functions of the operating variable, constant outside the knots.
-
-        g(s) = v_1 + sum_j (v_{j+1} - v_j)/(p_{j+1} - p_j) (min(max(s, p_j), p_{j+1}) - p_j)
-
-    Exactly v where all values of a gain are equal. On a knot the derivatives are the means of those
-    of both sides; a level at a knot within rounding has those of the side it is on.
-
-    Parameters
-    ----------
-    at : scalar, operating variable [cm]
-    knots : (K,) increasing [cm]
-    values : (gains, K), each in the unit of its gain
-
-    Returns
-    -------
-    Tuple of scalars, one per gain
-
-    Examples
-    --------
-    >>> [float(v) for v in interpolate(4.0, np.array([3.0, 5.0]), np.array([[1.0, 2.0]]))]
-    [1.5]
-    """
+    """Return piecewise-linear functions of the operating variable, constant outside the knots."""
+    # g(s) = v_1 + sum_j (v_{j+1} - v_j)/(p_{j+1} - p_j) (min(max(s, p_j), p_{j+1}) - p_j)
     count, intervals = np.shape(values)[0], np.shape(knots)[0] - 1
     parts = [portion(at, knots[j], knots[j + 1]) for j in range(intervals)]
     slope = lambda i, j: (values[i, j + 1] - values[i, j]) / (knots[j + 1] - knots[j])

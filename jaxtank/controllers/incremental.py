@@ -38,30 +38,8 @@ class Memory(NamedTuple):
 def incremental_model(model, operating_point, dt):
     """Return (A, B, C) of x = [dx_m; y], dx_m the change of the levels since the last sample
     (khalid eqs. 16-17, khalid notes S4.1; C_m for C_m^T).
-
-        A = [[Am, 0], [Cm Am, I]],   B = [Bm; Cm Bm],   C = [0, I]
-
-    Am, Bm: the rig linearised at the operating point and sampled. No steady-state input enters:
-    u is absolute, and its increments are optimised.
-
-    Parameters
-    ----------
-    model : network of n tanks, m pumps and q outputs
-    operating_point : (n,) levels [cm]
-    dt : sampling period [s]
-
-    Returns
-    -------
-    A (n+q, n+q), B (n+q, m), C (q, n+q)
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> model = presets.find("khalid/gpc").loop.plant
-    >>> point = np.array([0.3, 0.06])
-    >>> [v.shape for v in jax.eval_shape(lambda: incremental_model(model, point, 5.0))]
-    [(3, 3), (3, 1), (1, 3)]
     """
+    # A = [[Am, 0], [Cm Am, I]], B = [Bm; Cm Bm], C = [0, I]
     still = jnp.zeros(model.pumps)  # the rig is linear in its inputs, so any value serves
     Ac, Bc, Cm = linearise(dataclasses.replace(model, knee=EXACT), operating_point, still)
     Am, Bm = zero_order_hold(Ac, Bc, dt)
@@ -77,31 +55,11 @@ def incremental_model(model, operating_point, dt):
 def quadratic_cost(A, B, C, q, r_w, basis):
     """Return (Omega, Psi) of J = eta' Omega eta + 2 eta' Psi x_e + const, for increments du(k+m) =
     basis(m) eta (khalid eqs. 29-31, khalid notes S4.3).
-
-        phi(m)' = A phi(m-1)' + B basis(m-1),   Omega = sum_m phi(m) Q phi(m)' + r_w I,   Psi =
-        sum_m phi(m) Q A^m,   m = 1 .. Np
-
-    with Q = C' diag(q) C and x_e = [dx_m; y - r]. The sums go to Np, not to the number of terms as
-    printed (khalid notes E10).
-
-    Parameters
-    ----------
-    A, B, C : from `incremental_model`
-    q : (outputs,) weights [-]
-    r_w : weight of the increments [cm^2/V^2]
-    basis : (Np, m, variables)
-
-    Returns
-    -------
-    Omega (variables, variables) [cm^2/V^2], Psi (variables, n+q) [cm/V]
-
-    Examples
-    --------
-    >>> one = jnp.eye(1)
-    >>> omega, psi = quadratic_cost(one, one, one, jnp.ones(1), 0.5, jnp.ones((1, 1, 1)))
-    >>> float(omega[0, 0]), float(psi[0, 0])  # one step of an integrator: 1 + r_w, 1
-    (1.5, 1.0)
     """
+    # phi(m)' = A phi(m-1)' + B basis(m-1), Omega = sum_m phi(m) Q phi(m)' + r_w I, Psi = sum_m
+    # phi(m) Q A^m, m = 1 .. Np
+    # with Q = C' diag(q) C and x_e = [dx_m; y - r]. The sums go to Np, not to the number of terms
+    # as printed (khalid notes E10).
     n, variables = A.shape[0], basis.shape[2]
 
     def ahead(carry, now):
@@ -221,8 +179,6 @@ class LinearPredictive(Controller):
     def _constrained(self, before, error, dt):
         """Return the first increments (m,) of the quadratic programme, for inputs `before` (m) and
         error x_e (n+q,).
-
-        Rows of Laguerre functions are nearly collinear; the interior point converges all the same.
         """
         Omega, Psi, basis = self.design(dt)
         steps = basis[: self.ahead]

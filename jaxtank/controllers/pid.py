@@ -40,29 +40,9 @@ class Memory(NamedTuple):
 
 
 def oustaloup(g):
-    """Return direct gain, poles and residues of s^g on [1e-3, 1e2] rad/s:
-
-        s^g ~ direct + sum residue/(s + pole)
-
-    Zeros wb (wh/wb)^((j + N + (1-g)/2)/(2N+1)), poles with (1+g)/2, j = -N .. N, gain wh^g
-    (Oustaloup 2000; gouta2022 notes S4.5).
-
-    Parameters
-    ----------
-    g : order [-]
-
-    Returns
-    -------
-    (direct gain, poles (2N+1) [rad/s], residues (2N+1))
-
-    Examples
-    --------
-    >>> direct, poles, residues = oustaloup(0.5)
-    >>> direct, poles.size
-    (10.0, 11)
-    >>> round(abs(complex(direct + (residues / (0.3j + poles)).sum())) / 0.3**0.5, 2)
-    1.0
-    """
+    """Return direct gain, poles and residues of s^g on [1e-3, 1e2] rad/s:"""
+    # Zeros wb (wh/wb)^((j + N + (1-g)/2)/(2N+1)), poles with (1+g)/2, j = -N .. N, gain wh^g
+    # (Oustaloup 2000; gouta2022 notes S4.5).
     j = np.arange(2 * SECTIONS + 1)
     at = lambda shift: (
         LOWEST * (HIGHEST / LOWEST) ** ((j + 0.5 * (1.0 + shift)) / (2 * SECTIONS + 1))

@@ -38,13 +38,11 @@ class LowerTanks(NamedTuple):
 
 
 def lower_tanks(model, x):
-    """Return `LowerTanks` of a quadruple tank at levels x (4) [cm].
-
-    phi1 = (-q1 + q3)/A1 and phi2 = (-q2 + q4)/A2 with q_i = a_i sqrt(2 g h_i): mirakhorli eq. (2)
-    less the direct flow. The root is the smooth one (numerics.smooth_signed_sqrt): its slope, which
-    the controller needs, has no kink at an empty tank. The steady-state input at 12 cm differs by
-    6e-5 V.
-    """
+    """Return `LowerTanks` of a quadruple tank at levels x (4) [cm]."""
+    # phi1 = (-q1 + q3)/A1 and phi2 = (-q2 + q4)/A2 with q_i = a_i sqrt(2 g h_i): mirakhorli eq. (2)
+    # less the direct flow. The root is the smooth one (numerics.smooth_signed_sqrt): its slope,
+    # which the controller needs, has no kink at an empty tank. The steady-state input at 12 cm
+    # differs by 6e-5 V.
     w, area = jnp.sqrt(2.0 * model.gravity), [model.area[i] for i in range(4)]
     q = [w * smooth_signed_sqrt(h, model.knee) for h in x]
     dq = [w * smooth_signed_sqrt_slope(h, model.knee) for h in x]
@@ -69,11 +67,9 @@ class Acceleration(NamedTuple):
 
 
 def acceleration(tanks, damping):
-    """Return f and M of d/dt(damping h_i + phi_i) = f_i + (M u)_i.
-
-    damping: [1/s]; 0 gives f and G of mirakhorli eq. (4), all terms of which
-    are right except that gamma_i k_i u_i'/A_i is missing from it (mirakhorli notes E2).
-    """
+    """Return f and M of d/dt(damping h_i + phi_i) = f_i + (M u)_i."""
+    # damping: [1/s]; 0 gives f and G of mirakhorli eq. (4), all terms of which are right except
+    # that gamma_i k_i u_i'/A_i is missing from it (mirakhorli notes E2).
     net = tuple(damping - d for d in tanks.slope)
     return Acceleration(
         f=tuple(n * p - c * a for n, p, c, a in zip(net, tanks.drift, tanks.cross, tanks.above)),
@@ -85,10 +81,6 @@ def acceleration(tanks, damping):
 def slide(model, surface, ks, phi, switch, form, x, r, u0, previous, d=()) -> tuple[Any, Any]:
     """Return the (2) voltages [V] of the sliding-mode control law, not limited; arguments as the
     fields of `SlidingMode`.
-
-    x: (4) levels [cm]; r: (2) setpoint [cm]; u0: (2) steady voltages of the setpoint; previous: (2)
-    voltages now at the pumps [V], used by the printed form alone; d: (4) disturbances of the level
-    rates that the observer estimates [cm/s], or (): u0 then is that under them.
     """
     printed = form == "printed"
     tanks = lower_tanks(model, x)

@@ -25,15 +25,9 @@ from jaxtank.signals.base import Signal
 def feedback(K, x, h0, u0):
     """Return u0 - K (h - h0): (m) voltages [V] for a gain K (m, n) [V/cm], levels x (n) [cm] and
     the steady state h0 (n) [cm], u0 (m) [V].
-
-    mirakhorli eqs. (14)-(15) print u = -K'x with K = -R^-1 B'P: the literal sign is unstable, and
-    without u0 the pumps are off (mirakhorli notes E11).
-
-    Examples
-    --------
-    >>> [float(u) for u in feedback(np.array([[0.5, 0.0]]), (12.0, 8.0), (10.0, 8.0), (3.0,))]
-    [2.0]
     """
+    # mirakhorli eqs. (14)-(15) print u = -K'x with K = -R^-1 B'P: the literal sign is unstable, and
+    # without u0 the pumps are off (mirakhorli notes E11).
     away = [h - h_s for h, h_s in zip(x, h0)]
     return tuple(u - sum(K[j, i] * a for i, a in enumerate(away)) for j, u in enumerate(u0))
 

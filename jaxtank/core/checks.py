@@ -1,7 +1,4 @@
-"""Input validation of leaves: real, finite and within their ranges.
-
-Imports core only; may be imported by every folder.
-"""
+"""Input validation of leaves: real, finite and within their ranges."""
 
 import math
 from collections.abc import Collection, Mapping
@@ -23,25 +20,7 @@ SMALL = 16
 def check_leaves(
     tree: Any, names: Collection[str] | None = None, vacant: Collection[str] = ()
 ) -> None:
-    """Check the concrete leaves of a component; traced ones are passed over.
-
-    Parameters
-    ----------
-    tree : component
-    names : dotted names of the leaves to check; all of them where None
-    vacant : dotted names of leaves that may be None, which a gain schedule fills
-
-    Raises
-    ------
-    InputError for a leaf that is no real number, not finite or out of its range.
-
-    Examples
-    --------
-    >>> from jaxtank.instruments import LevelSensor
-    >>> check_leaves(LevelSensor(noise=[-1.0]))
-    Traceback (most recent call last):
-    jaxtank.core.errors.InputError: noise[0] = -1 cm: must be at least 0 cm
-    """
+    """Check the concrete leaves of a component; traced ones are passed over."""
     for name, value, meta in walk(tree):
         if names is not None and name not in names:
             continue
@@ -53,24 +32,7 @@ def check_leaves(
 
 
 def check_value(name: str, value: Any, meta: Mapping[str, Any]) -> None:
-    """Check that every entry of a value is real, finite and within its range.
-
-    Parameters
-    ----------
-    name : what messages call it
-    value : number or array
-    meta : its "unit", "low", "high" and "strict", as `leaf` stores them
-
-    Raises
-    ------
-    InputError, naming the first entry that fails.
-
-    Examples
-    --------
-    >>> check_value("k", 0.0, {"unit": "1/s", "low": 0.0, "high": None, "strict": True})
-    Traceback (most recent call last):
-    jaxtank.core.errors.InputError: k = 0 1/s: must be above 0 1/s
-    """
+    """Check that every entry of a value is real, finite and within its range."""
     if _is_good(value, meta):
         return
     if isinstance(value, list | tuple | str):  # to jax a list is several leaves, and no array
@@ -123,26 +85,7 @@ def _out_of_range(name: str, entry: Any, index: tuple[int, ...], meta: Mapping[s
 
 
 def check_order(name: str, part: Any, lower: str, upper: str, equal: bool = False) -> None:
-    """Check that each entry of one leaf is below that of another; traced ones are passed over.
-
-    Parameters
-    ----------
-    name : what messages call the component
-    part : component
-    lower, upper : names of its leaves, of equal shapes [V]
-    equal : whether they may be equal
-
-    Raises
-    ------
-    InputError, naming the first entry that fails.
-
-    Examples
-    --------
-    >>> from jaxtank.instruments import PumpBank
-    >>> check_order("actuator", PumpBank(low=[5.0], high=[3.0]), "low", "high")
-    Traceback (most recent call last):
-    jaxtank.core.errors.InputError: actuator.low[0] = 5 V: must be below actuator.high[0] = 3 V
-    """
+    """Check that each entry of one leaf is below that of another; traced ones are passed over."""
     a, b = getattr(part, lower), getattr(part, upper)
     if any(isinstance(v, Tracer) for v in jax.tree.leaves((a, b))):
         return

@@ -3,7 +3,7 @@
 What is known of every sample before the time loop starts (setpoints, noise) is then known of one
 chunk at a time, so that memory does not grow. A chunk can be asked for where every sample follows
 from its time alone; methods of which that is so are marked `pointwise`. A run with any other, such
-as recorded samples or a controller that looks ahead, is made in one chunk. Imports core only.
+as recorded samples or a controller that looks ahead, is made in one chunk.
 """
 
 import dataclasses
@@ -69,51 +69,23 @@ class Chunk(NamedTuple):
 
 
 def indices(clock: Clock | Chunk) -> jax.Array:
-    """Return (samples,) indices of the samples.
-
-    Examples
-    --------
-    >>> indices(Chunk(first=2, samples=3, dt=0.5)).tolist()
-    [2, 3, 4]
-    """
+    """Return (samples,) indices of the samples."""
     return clock.first + cast(Any, jnp).arange(clock.samples)
 
 
 def sample_times(clock: Clock | Chunk) -> jax.Array:
-    """Return (samples,) times t_k = k dt [s], from the integer k: no drift over long runs.
-
-    Examples
-    --------
-    >>> sample_times(Clock(dt=0.5, duration=1.0)).tolist()
-    [0.0, 0.5, 1.0]
-    """
+    """Return (samples,) times t_k = k dt [s], from the integer k: no drift over long runs."""
     return indices(clock) * clock.dt
 
 
 def pointwise(method: F) -> F:
-    """Mark a method whose sample k depends on t_k and on sample k of its arguments alone.
-
-    Examples
-    --------
-    >>> @pointwise
-    ... def sample(self, clock):
-    ...     return jnp.sin(sample_times(clock))
-    >>> sample.pointwise
-    True
-    """
+    """Mark a method whose sample k depends on t_k and on sample k of its arguments alone."""
     cast(Any, method).pointwise = True
     return method
 
 
 def is_pointwise(part: Any) -> bool:
-    """Return whether a component, with all inside it, can be asked for its samples by chunks.
-
-    Examples
-    --------
-    >>> from jaxtank.signals import Constant, Table
-    >>> is_pointwise(Constant(level=[1.0])), is_pointwise(Table(values=[[1.0, 2.0]], period=1.0))
-    (True, False)
-    """
+    """Return whether a component, with all inside it, can be asked for its samples by chunks."""
     cls = cast(Any, type(part))
     asked = [getattr(cls, name) for name in METHODS if hasattr(cls, name)]
     inside = [getattr(part, field.name) for field in dataclasses.fields(part)]
@@ -145,18 +117,7 @@ CLOCK_UNITS: dict[str, str] = {name: meta["unit"] for name, meta in CLOCK.items(
 
 
 def check_clock(clock: Any) -> None:
-    """Check that a clock describes a run.
-
-    Raises
-    ------
-    InputError, naming the field, its value and what is allowed.
-
-    Examples
-    --------
-    >>> check_clock(Clock(dt=2.0, duration=1.0))
-    Traceback (most recent call last):
-    jaxtank.core.errors.InputError: clock.dt = 2 s: must be at most clock.duration = 1 s
-    """
+    """Check that a clock describes a run."""
     if not isinstance(clock, Clock):
         raise InputError(
             f"clock is a {type(clock).__name__}: must be a jaxtank.Clock, as case.clock (first the"

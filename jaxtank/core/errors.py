@@ -1,5 +1,5 @@
 """Errors of input validation: one line that names the thing, its value, what is allowed, and the
-nearest valid name. Imports nothing of ours; may be imported by every folder.
+nearest valid name.
 """
 
 import difflib
@@ -17,9 +17,7 @@ class EquilibriumError(InputError):
 
 
 class DataError(InputError):
-    """Experiment data cannot be used. The message is one line and names file, line and column; the
-    command line ends with exit code 5.
-    """
+    """Experiment data cannot be used."""
 
 
 class NonFiniteError(ArithmeticError):
@@ -29,13 +27,7 @@ class NonFiniteError(ArithmeticError):
 
 
 def nearest(name: str, names: Iterable[str], count: int = 3) -> str:
-    """Return the tail of an error message: the `count` names closest to `name`.
-
-    Examples
-    --------
-    >>> nearest("areas", ["rim", "area"], count=1)
-    '; nearest: area'
-    """
+    """Return the tail of an error message: the `count` names closest to `name`."""
     names = list(names)
     close = (
         difflib.get_close_matches(name, names, n=count, cutoff=0.3)
@@ -49,11 +41,5 @@ def nearest(name: str, names: Iterable[str], count: int = 3) -> str:
 
 
 def unknown(kind: str, name: str, names: Iterable[str]) -> InputError:
-    """Return an InputError for an unknown name, with the nearest valid ones.
-
-    Examples
-    --------
-    >>> print(unknown("parameter", "areas", ["area"]))
-    unknown parameter 'areas'; nearest: area
-    """
+    """Return an InputError for an unknown name, with the nearest valid ones."""
     return InputError(f"unknown {kind} {name!r}{nearest(name, names)}")

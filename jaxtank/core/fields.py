@@ -206,13 +206,6 @@ def _converted(value: Any) -> Any:
 def sizes_of_shape(shape: Shape, counts: Mapping[str, int]) -> tuple[int, ...] | None:
     """Return the sizes of a leaf's shape for {name: count} of a plant; None where one of its names
     is not in it.
-
-    Examples
-    --------
-    >>> sizes_of_shape(("pump", "tank + output"), {"tank": 4, "pump": 2, "output": 2})
-    (2, 6)
-    >>> sizes_of_shape(("knot",), {"tank": 4}) is None
-    True
     """
     axes = [axis.split(" + ") if isinstance(axis, str) else [axis] for axis in shape]
     if any(isinstance(term, str) and term not in counts for axis in axes for term in axis):
@@ -223,38 +216,17 @@ def sizes_of_shape(shape: Shape, counts: Mapping[str, int]) -> tuple[int, ...] |
 
 
 def is_component(value: Any) -> bool:
-    """Return whether `value` is an instance of a class made by `component`.
-
-    Examples
-    --------
-    >>> from jaxtank.instruments import LevelSensor
-    >>> is_component(LevelSensor(noise=[0.0])), is_component(3.0)
-    (True, False)
-    """
+    """Return whether `value` is an instance of a class made by `component`."""
     return dataclasses.is_dataclass(value) and not isinstance(value, type)
 
 
 def number(value: Any) -> Any:
-    """Return `value` as a host array of float64, the form in which constructors store leaves.
-
-    Examples
-    --------
-    >>> number([1, 2])
-    array([1., 2.])
-    """
+    """Return `value` as a host array of float64, the form in which constructors store leaves."""
     return np.asarray(value, dtype=np.float64)
 
 
 def is_real(value: Any) -> bool:
-    """Return whether a value, or every entry of a list or array, is a real number.
-
-    Text, truth values, complex numbers, random keys and None are none.
-
-    Examples
-    --------
-    >>> is_real([1, 2.5]), is_real(True), is_real("1")
-    (True, False, False)
-    """
+    """Return whether a value, or every entry of a list or array, is a real number."""
     if isinstance(value, list | tuple):
         return all(is_real(v) for v in cast(Iterable[Any], value))
     kind = getattr(value, "dtype", None)

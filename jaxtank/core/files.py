@@ -1,7 +1,4 @@
-"""Reading and writing of files: each is written whole or not at all.
-
-Imports core only; may be imported by every folder.
-"""
+"""Reading and writing of files: each is written whole or not at all."""
 
 import contextlib
 import errno
@@ -26,54 +23,20 @@ ASIDE = ".jaxtank"
 
 
 def untouched(folder: str | os.PathLike[str]) -> bool:
-    """Return whether a run began in a folder and wrote nothing else there.
-
-    Examples
-    --------
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     Path(folder, LOCK).touch()
-    ...     untouched(folder)
-    True
-    """
+    """Return whether a run began in a folder and wrote nothing else there."""
     return os.path.isdir(folder) and os.listdir(folder) == [LOCK]
 
 
 def write_atomic(path: str | os.PathLike[str], data: str | bytes) -> None:
-    """Write a file by way of a temporary one in the same folder; a link is not followed.
-
-    Examples
-    --------
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_atomic(Path(folder, "a.txt"), "text")
-    ...     Path(folder, "a.txt").read_text()
-    'text'
-    """
+    """Write a file by way of a temporary one in the same folder; a link is not followed."""
     path = Path(path)
     write_together(path.parent, {path.name: data})
 
 
 def write_together(folder: str | os.PathLike[str], files: Mapping[str, Content]) -> None:
-    """Write several files to a folder, all of them or none.
-
-    All are complete on the disk before the first replaces an older one, so that a full disk leaves
-    what was there as it was.
-
-    Parameters
-    ----------
-    folder : existing folder
-    files : {name: text, bytes or parts of a text, of which one at a time is in memory}
-
-    Raises
-    ------
-    OSError where a file cannot be written.
-
-    Examples
-    --------
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_together(folder, {"a.txt": "text", "b.bin": b"bytes"})
-    ...     sorted(os.listdir(folder))
-    ['a.txt', 'b.bin']
-    """
+    """Write several files to a folder, all of them or none."""
+    # All are complete on the disk before the first replaces an older one, so that a full disk
+    # leaves what was there as it was.
     folder, aside = Path(folder), list[tuple[str, Path]]()
     try:
         for name, data in files.items():
@@ -97,23 +60,7 @@ def write_together(folder: str | os.PathLike[str], files: Mapping[str, Content])
 
 
 def write_folder(folder: str | Path, files: Mapping[str, Content]) -> list[Path]:
-    """Write files to a folder, made if need be, all of them or none; return their paths.
-
-    Parameters
-    ----------
-    folder : path
-    files : {name: text or bytes}
-
-    Raises
-    ------
-    InputError for a folder that cannot be written to.
-
-    Examples
-    --------
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     [path.name for path in write_folder(folder, {"a.txt": "1"})]
-    ['a.txt']
-    """
+    """Write files to a folder, made if need be, all of them or none; return their paths."""
     check_folder(folder)
     folder = Path(folder)
     try:
@@ -128,16 +75,7 @@ def write_folder(folder: str | Path, files: Mapping[str, Content]) -> list[Path]
 
 
 def sweep(folder: str | os.PathLike[str]) -> None:
-    """Remove the incomplete files that a killed run left in a folder.
-
-    Examples
-    --------
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     Path(folder, f".a.txt.{ASIDE}").touch()
-    ...     sweep(folder)
-    ...     os.listdir(folder)
-    []
-    """
+    """Remove the incomplete files that a killed run left in a folder."""
     for path in Path(folder).glob(f".*{ASIDE}"):
         with contextlib.suppress(OSError):
             path.unlink()
@@ -150,16 +88,7 @@ def _umask() -> int:
 
 
 def check_folder(path: str | os.PathLike[str]) -> None:
-    """Check that a path is, or can become, a folder to write to. Nothing is made yet.
-
-    Raises
-    ------
-    InputError, naming the path and what is in the way.
-
-    Examples
-    --------
-    >>> check_folder(tempfile.gettempdir())
-    """
+    """Check that a path is, or can become, a folder to write to. Nothing is made yet."""
     path = Path(path)
     if "\0" in str(path):
         raise InputError(f"--out {str(path)!r}: a name cannot hold the character NUL")
@@ -182,24 +111,8 @@ def check_folder(path: str | os.PathLike[str]) -> None:
 
 
 def refusal(path: str | os.PathLike[str], largest: int) -> str | None:
-    """Return why a file is not to be read, or None.
-
-    A folder, a device or a pipe, which may never end, is not read.
-
-    Parameters
-    ----------
-    path : the file
-    largest : the most bytes that are read
-
-    Raises
-    ------
-    OSError where there is no such file.
-
-    Examples
-    --------
-    >>> refusal(tempfile.gettempdir(), 10)
-    'is not a file'
-    """
+    """Return why a file is not to be read, or None."""
+    # A folder, a device or a pipe, which may never end, is not read.
     found = os.stat(path)
     if not stat.S_ISREG(found.st_mode):
         return "is not a file"
@@ -211,23 +124,7 @@ def refusal(path: str | os.PathLike[str], largest: int) -> str | None:
 
 
 def read_text(path: str | os.PathLike[str], kind: str) -> str:
-    """Return the text of a file of at most 4 MiB.
-
-    Parameters
-    ----------
-    path : the file
-    kind : what messages call it, as in "rig file"
-
-    Raises
-    ------
-    InputError if it is missing, too large, or not UTF-8.
-
-    Examples
-    --------
-    >>> read_text("missing.toml", "rig file")
-    Traceback (most recent call last):
-    jaxtank.core.errors.InputError: rig file 'missing.toml' does not exist
-    """
+    """Return the text of a file of at most 4 MiB."""
     path = Path(path)
     if not path.exists():
         raise InputError(f"{kind} {str(path)!r} does not exist")

@@ -11,23 +11,13 @@ from jaxtank.core.text import one_line
 
 
 def installed(group: str) -> dict[str, metadata.EntryPoint]:
-    """Return {name: entry point} of a group, none of them imported.
-
-    Examples
-    --------
-    >>> installed("no.such.group")
-    {}
-    """
+    """Return {name: entry point} of a group, none of them imported."""
     return {point.name: point for point in metadata.entry_points(group=group)}
 
 
 def imported(point: metadata.EntryPoint) -> Any:
-    """Return the object of an entry point; InputError with the package's name where it cannot be.
-
-    Examples
-    --------
-    >>> imported(metadata.EntryPoint(name="root", value="math:sqrt", group="roots"))(4.0)
-    2.0
+    """Return the object of an entry point; InputError with the package's name where it
+    cannot be.
     """
     try:
         return point.load()

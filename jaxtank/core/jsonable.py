@@ -7,14 +7,7 @@ import numpy as np
 
 
 def clean(value: Any) -> Any:
-    """Return `value` for JSON: arrays as lists, NaN and infinity as None.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> clean({"h": np.array([1.0, np.nan])})
-    {'h': [1.0, None]}
-    """
+    """Return `value` for JSON: arrays as lists, NaN and infinity as None."""
     if isinstance(value, dict):
         return {k: clean(v) for k, v in cast(dict[Any, Any], value).items()}
     if isinstance(value, (list, tuple)):

@@ -2,7 +2,7 @@
 
 Every function works on scalars and arrays, costs a few operations, and is safe under forward and
 reverse differentiation: where two branches meet, the branch not taken is evaluated at a point where
-it is finite (a NaN there would reach the sum). Imports jax only; may be imported by every folder.
+it is finite (a NaN there would reach the sum).
 """
 
 import functools
@@ -24,35 +24,15 @@ LAMINAR_THRESHOLD = 0.01
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def smooth_sqrt(h: Real, threshold: float = LAMINAR_THRESHOLD) -> jax.Array:
-    r"""Return the square root of a level, C1 through zero and below.
-
-        q(h) = sqrt(h)                           h >= h0 = threshold
-             = sqrt(h0) (1.5 x - 0.5 x^2)        0 <= h < h0,  x = h/h0
-             = 1.5 sqrt(h0) x                    h < 0
-
-    Exact at and above the laminar threshold. Between, it is below the square root by at most 0.175
-    sqrt(h0) (at x = 0.13): at small depth the outflow is laminar, slower than Torricelli's. Value
-    and slope are continuous; the slope at 0 is 1.5/sqrt(h0) = 15 cm^-0.5 for the default. Negative
-    levels are drawn back to 0. A run whose levels stay above the threshold is that of the exact
-    root; with ramps of 30 s, where NGPC brings tank 3 of the benchmark down to 0.004 cm, no level
-    changes by more than 3e-3 cm.
-
-    Parameters
-    ----------
-    h : (...) level [cm]
-    threshold : h0 [cm]
-
-    Returns
-    -------
-    (...) [cm^0.5]
-
-    Examples
-    --------
-    >>> float(smooth_sqrt(4.0)), float(smooth_sqrt(0.0))
-    (2.0, 0.0)
-    >>> round(float(jax.grad(smooth_sqrt)(0.0)), 3)
-    15.0
-    """
+    """Return the square root of a level, C1 through zero and below."""
+    # q(h) = sqrt(h) h >= h0 = threshold = sqrt(h0) (1.5 x - 0.5 x^2) 0 <= h < h0, x = h/h0 = 1.5
+    # sqrt(h0) x h < 0
+    # Exact at and above the laminar threshold. Between, it is below the square root by at most
+    # 0.175 sqrt(h0) (at x = 0.13): at small depth the outflow is laminar, slower than Torricelli's.
+    # Value and slope are continuous; the slope at 0 is 1.5/sqrt(h0) = 15 cm^-0.5 for the default.
+    # Negative levels are drawn back to 0. A run whose levels stay above the threshold is that of
+    # the exact root; with ramps of 30 s, where NGPC brings tank 3 of the benchmark down to 0.004
+    # cm, no level changes by more than 3e-3 cm.
     # sqrt(h) of a negative level is NaN and not taken; the rule below keeps it out of the
     # derivatives, which spares the select in front of every root of the time loop
     laminar = h * (1.5 * threshold**-0.5 - (0.5 * threshold**-1.5) * jnp.where(h > 0.0, h, 0.0))
@@ -69,76 +49,21 @@ def _smooth_sqrt_jvp(threshold: float, primals: Any, tangents: Any) -> Any:
 
 
 def smooth_signed_sqrt(x: Real, threshold: float = LAMINAR_THRESHOLD) -> jax.Array:
-    r"""Return the signed square root of a difference of levels, smooth through zero.
-
-        s(x) = x / (x^2 + threshold^2)^(1/4)          (gouta2022 notes S2.1)
-
-    It drives the flow in a pipe between two tanks. Odd; slope threshold^-1/2 at 0, where sign(x)
-    sqrt(|x|) has none (a NaN gradient at equal levels). Below the exact root in size, by at most
-    0.255 sqrt(threshold) (at 0.28 threshold) and by 0.25 % of it at 10 thresholds: a pipe between
-    nearly equal levels flows laminar.
-
-    Parameters
-    ----------
-    x : (...) difference of levels [cm]
-    threshold : half width of the laminar zone [cm]
-
-    Returns
-    -------
-    (...) [cm^0.5]
-
-    Examples
-    --------
-    >>> round(float(smooth_signed_sqrt(-4.0)), 4), float(smooth_signed_sqrt(0.0))
-    (-2.0, 0.0)
-    """
+    """Return the signed square root of a difference of levels, smooth through zero."""
+    # s(x) = x / (x^2 + threshold^2)^(1/4) (gouta2022 notes S2.1)
     return x / jnp.sqrt(jnp.sqrt(x * x + threshold * threshold))
 
 
 def smooth_signed_sqrt_slope(x: Real, threshold: float = LAMINAR_THRESHOLD) -> jax.Array:
-    """Return the slope of `smooth_signed_sqrt`, itself smooth.
-
-        s'(x) = (1 - x^2 / (2 (x^2 + threshold^2))) / (x^2 + threshold^2)^(1/4)
-
-    Parameters
-    ----------
-    x : (...) difference of levels [cm]
-    threshold : as in `smooth_signed_sqrt` [cm]
-
-    Returns
-    -------
-    (...) [cm^-0.5]; threshold^-1/2 at 0
-
-    Examples
-    --------
-    >>> round(float(smooth_signed_sqrt_slope(0.0)), 3)
-    10.0
-    """
+    """Return the slope of `smooth_signed_sqrt`, itself smooth."""
+    # s'(x) = (1 - x^2 / (2 (x^2 + threshold^2))) / (x^2 + threshold^2)^(1/4)
     square = x * x + threshold * threshold
     return (1.0 - 0.5 * x * x / square) / jnp.sqrt(jnp.sqrt(square))
 
 
 def limited_sqrt(h: Real, threshold: float, supply: Real) -> jax.Array:
-    r"""Return the smaller of `smooth_sqrt(h, threshold)` and supply h; 0 below an empty tank.
-
-    Slope `supply` at h = 0, the one from above: a level comes no lower.
-
-    Parameters
-    ----------
-    h : (...) level [cm]
-    threshold : as in `smooth_sqrt` [cm]
-    supply : largest ratio of root to level [cm^-0.5], at most 1.5 threshold^-0.5 (the slope of
-        `smooth_sqrt` at 0, which then holds nowhere)
-
-    Returns
-    -------
-    (...) [cm^0.5]
-
-    Examples
-    --------
-    >>> float(limited_sqrt(4.0, 0.01, 0.5)), float(limited_sqrt(1.0, 0.01, 0.5))
-    (2.0, 0.5)
-    """
+    """Return the smaller of `smooth_sqrt(h, threshold)` and supply h; 0 below an empty tank."""
+    # Slope `supply` at h = 0, the one from above: a level comes no lower.
     held = lower_clip(h, 0.0)
     q, most = cast(jax.Array, smooth_sqrt(held, threshold)), supply * held
     return jnp.where(most <= q, most, q)
@@ -146,26 +71,7 @@ def limited_sqrt(h: Real, threshold: float, supply: Real) -> jax.Array:
 
 @jax.custom_jvp
 def limited_flow(s: Real, most: Real, least: Real) -> jax.Array:
-    """Return the flow of a pipe, limited to what the tanks at its two ends can give.
-
-    At a tie the slopes are those from above of most and least, which are 0 at an empty tank and
-    come no lower.
-
-    Parameters
-    ----------
-    s : (...) flow, in any unit
-    most : (...) what the first tank can give, >= 0
-    least : (...) what the second tank can give, >= 0
-
-    Returns
-    -------
-    (...) s in [-least, most]
-
-    Examples
-    --------
-    >>> float(limited_flow(3.0, 2.0, 1.0)), float(limited_flow(-3.0, 2.0, 1.0))
-    (2.0, -1.0)
-    """
+    """Return the flow of a pipe, limited to what the tanks at its two ends can give."""
     return jnp.where(s > most, most, jnp.where(s < -least, -least, s))
 
 
@@ -179,23 +85,8 @@ def _limited_flow_jvp(primals: Any, tangents: Any) -> Any:
 
 @jax.custom_jvp
 def clipped_sqrt(h: Real, lower: Real) -> jax.Array:
-    """Return sqrt(max(h, lower)): the root of a level that a controller multiplies or divides by.
-
-    Slope 0 in `h` below the lower clip.
-
-    Parameters
-    ----------
-    h : (...) level [cm]
-    lower : lower clip of the level, > 0 [cm]
-
-    Returns
-    -------
-    (...) [cm^0.5]
-
-    Examples
-    --------
-    >>> float(clipped_sqrt(-1.0, 0.25))
-    0.5
+    """Return sqrt(max(h, lower)): the root of a level that a controller multiplies or
+    divides by.
     """
     return jnp.where(h >= lower, jnp.sqrt(h), jnp.sqrt(lower))
 
@@ -208,31 +99,13 @@ def _clipped_sqrt_jvp(primals: Any, tangents: Any) -> Any:
 
 
 def root_of_mean(x: Real) -> jax.Array:
-    """Return sqrt(x) of a mean of squares x >= 0, with slope 0 at exactly 0.
-
-    A norm has no slope there: what is zero throughout stays so. NaN stays NaN.
-
-    Examples
-    --------
-    >>> float(root_of_mean(4.0)), float(jax.grad(root_of_mean)(0.0))
-    (2.0, 0.0)
-    """
+    """Return sqrt(x) of a mean of squares x >= 0, with slope 0 at exactly 0."""
     return jnp.where(x == 0.0, 0.0, jnp.sqrt(jnp.where(x == 0.0, 1.0, x)))
 
 
 @jax.custom_jvp
 def magnitude(x: Real) -> jax.Array:
-    """Return |x|, with slope 0 at exactly 0.
-
-    Whatever the slopes of `x` to the left and to the right, a and b, those of |x| are -|a| and |b|,
-    and 0 lies between. (jnp.abs takes +1: behind a clip at its end, where a pump is at its limit,
-    that is neither.)
-
-    Examples
-    --------
-    >>> float(magnitude(-2.0)), float(jax.grad(magnitude)(0.0))
-    (2.0, 0.0)
-    """
+    """Return |x|, with slope 0 at exactly 0."""
     return jnp.abs(x)
 
 
@@ -243,55 +116,25 @@ def _magnitude_jvp(primals: Any, tangents: Any) -> Any:
 
 
 def lower_clip(x: Real, lower: Bound) -> jax.Array:
-    """Return the larger of `x` and `lower`.
-
-    Slope 1 in `x` at and above the lower clip, 0 below (jnp.maximum halves it at a tie).
-
-    Examples
-    --------
-    >>> float(lower_clip(0.5, 1.0)), float(jax.grad(lower_clip)(1.0, 1.0))
-    (1.0, 1.0)
-    """
+    """Return the larger of `x` and `lower`."""
     return jnp.where(x >= lower, x, lower)
 
 
 def clip(x: Real, low: Bound, high: Bound) -> jax.Array:
-    """Return `x` held in [low, high].
-
-    Slope 1 inside, ends included, 0 outside; the bounds get the slope when they hold.
-
-    Examples
-    --------
-    >>> float(clip(14.0, 0.0, 12.0)), float(jax.grad(clip)(12.0, 0.0, 12.0))
-    (12.0, 1.0)
-    """
+    """Return `x` held in [low, high]."""
     return jnp.where(x < low, low, jnp.where(x > high, high, x))
 
 
 def portion(x: Real, low: Real, high: Real) -> jax.Array:
-    """Return how much of [low, high] lies below `x`: 0, x - low, or high - low.
-
-    Slope 1 inside, 0 outside and 1/2 at the two ends, where a central difference gives the same: of
-    two segments that meet at a knot, the mean of both slopes and not their sum.
-
-    Examples
-    --------
-    >>> float(portion(3.0, 2.0, 6.0)), float(portion(9.0, 2.0, 6.0))
-    (1.0, 4.0)
-    """
+    """Return how much of [low, high] lies below `x`: 0, x - low, or high - low."""
+    # Slope 1 inside, 0 outside and 1/2 at the two ends, where a central difference gives the same:
+    # of two segments that meet at a knot, the mean of both slopes and not their sum.
     return jnp.minimum(jnp.maximum(x, low), high) - low
 
 
 def quantise(x: Real, step: Real) -> jax.Array:
-    """Return `x` rounded to a multiple of `step` (> 0), as an ADC does.
-
-    The slope is 1, the mean of the staircase: its true slope is 0 almost everywhere and does not
-    describe a change larger than one step.
-
-    Examples
-    --------
-    >>> float(quantise(1.3, 0.5)), float(jax.grad(quantise)(1.3, 0.5))
-    (1.5, 1.0)
-    """
+    """Return `x` rounded to a multiple of `step` (> 0), as an ADC does."""
+    # The slope is 1, the mean of the staircase: its true slope is 0 almost everywhere and does not
+    # describe a change larger than one step.
     rounded = jnp.round(x / step) * step
     return x + jax.lax.stop_gradient(rounded - x)

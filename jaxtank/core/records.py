@@ -1,7 +1,4 @@
-"""Records that sensors, observers, controllers and measures exchange; check of a random key.
-
-Imports core only; may be imported by every folder.
-"""
+"""Records that sensors, observers, controllers and measures exchange; check of a random key."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -14,20 +11,7 @@ from jaxtank.core.errors import InputError
 
 
 def check_key(key: Any) -> None:
-    """Check a random key: None, or one key of jax, typed or a row of unsigned integers.
-
-    Raises
-    ------
-    InputError for anything else; traced keys and placeholders pass.
-
-    Examples
-    --------
-    >>> check_key(jax.random.key(0))
-    >>> check_key(0)
-    Traceback (most recent call last):
-    jaxtank.core.errors.InputError: key is a int: must be one random key, as jax.random.key(0), or \
-None where there is no noise
-    """
+    """Check a random key: None, or one key of jax, typed or a row of unsigned integers."""
     kind, ndim = getattr(key, "dtype", None), len(getattr(key, "shape", ()))
     typed = kind is not None and jnp.issubdtype(kind, jax.dtypes.prng_key)
     if (typed and ndim == 0) or (

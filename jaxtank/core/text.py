@@ -1,7 +1,4 @@
-"""Text for a terminal: one printable line of limited length for any name, value or error.
-
-Imports nothing of ours; may be imported by every folder.
-"""
+"""Text for a terminal: one printable line of limited length for any name, value or error."""
 
 import base64
 import html
@@ -15,15 +12,7 @@ ends with what is wrong.
 
 
 def shortened(value: object) -> str:
-    """Return `value` for a message, cut where it would fill the screen.
-
-    Examples
-    --------
-    >>> shortened([1, 2])
-    '[1, 2]'
-    >>> len(shortened("x" * 1000))
-    80
-    """
+    """Return `value` for a message, cut where it would fill the screen."""
     try:
         text = repr(value)
     # an int of thousands of digits, or a list in a list in a list ...
@@ -34,12 +23,8 @@ def shortened(value: object) -> str:
 
 
 def printable(text: object) -> str:
-    r"""Return `text` with control characters, and those a terminal cannot print, as their escapes.
-
-    Examples
-    --------
-    >>> print(printable("a\x1b[31m.csv"))
-    a\x1b[31m.csv
+    """Return `text` with control characters, and those a terminal cannot print, as their
+    escapes.
     """
     return "".join(
         c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in str(text)
@@ -47,13 +32,7 @@ def printable(text: object) -> str:
 
 
 def one_line(text: object, most: int = MOST) -> str:
-    """Return `text` as one printable line of at most `most` characters.
-
-    Examples
-    --------
-    >>> one_line("two  lines\\nof text")
-    'two lines of text'
-    """
+    """Return `text` as one printable line of at most `most` characters."""
     line = printable(" ".join(str(text).split()))
     if len(line) <= most:
         return line
@@ -63,29 +42,7 @@ def one_line(text: object, most: int = MOST) -> str:
 
 
 def html_table(rows: Iterable[Iterable[Any]], head: Iterable[Any] = (), caption: str = "") -> str:
-    """Return a small HTML table for a notebook, every text of it escaped.
-
-    Parameters
-    ----------
-    rows : sequence of rows
-        Each a sequence of texts or numbers.
-    head : sequence, optional
-        Headings of the columns.
-    caption : str, optional
-        A line above the table.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> print(html_table([["h1 < 5", 2.0]], ["level", "cm"], "run"))
-    <table><caption>run</caption>
-    <tr><th>level</th><th>cm</th></tr>
-    <tr><td>h1 &lt; 5</td><td>2.0</td></tr>
-    </table>
-    """
+    """Return a small HTML table for a notebook, every text of it escaped."""
 
     def row(cells: Iterable[Any], tag: str) -> str:
         return "<tr>" + "".join(f"<{tag}>{html.escape(str(c))}</{tag}>" for c in cells) + "</tr>\n"
@@ -102,21 +59,6 @@ PICTURES = [False]
 def with_picture(table: str, draw: Callable[[], bytes | None]) -> str:
     """Return the HTML of a result, with a small picture below it once `jaxtank.notebook()` has been
     called.
-
-    Parameters
-    ----------
-    table : str
-        HTML.
-    draw : function that returns a PNG file as bytes, None where there is nothing to draw
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> with_picture("<p>", lambda: b"PNG")
-    '<p>'
     """
     if not PICTURES[0]:
         return table

@@ -14,21 +14,7 @@ NEEDED: Any = object()
 
 @dataclasses.dataclass(frozen=True)
 class Key:
-    """A key of a section: what it is, which values it may have, and where its value goes.
-
-    Parameters
-    ----------
-    name : the key in the file
-    doc : what it is, printed by `init` and where it is missing
-    kind : how a value is read and written, a name in `entry.READ`
-    unit : of its number, written for ("cm", "V")
-    low, high, strict : allowed range, or None; strict: `low` itself is excluded
-    choices : allowed values, or None
-    default : value, as in a file, where the key is left out; None: it is then absent
-    shape : of a list or an array, as of a leaf
-    target : dotted name of the field of ClosedLoop that holds the values of all tables of a list
-        ("actuator.low"); a number after it is a part of each entry ("plant.links.0")
-    """
+    """A key of a section: what it is, which values it may have, and where its value goes."""
 
     name: str
     doc: str = ""
@@ -44,21 +30,8 @@ class Key:
 
     @classmethod
     def of(cls, owner: type, field: str, doc: str = "", **changes: Any) -> "Key":
-        """Return the key of a component's field: unit, description, range and kind are the field's.
-
-        Parameters
-        ----------
-        owner : class made by `jaxtank.component`
-        field : name of one of its leaves or static fields
-        doc : what the key is; "": what the field is
-        changes : what is different in the key
-
-        Examples
-        --------
-        >>> from jaxtank.plants.network import TankNetwork
-        >>> key = Key.of(TankNetwork, "rim", "height")
-        >>> key.name, key.kind, key.unit, key.low, key.strict
-        ('rim', 'number', 'cm', 0.0, True)
+        """Return the key of a component's field: unit, description, range and kind are
+        the field's.
         """
         found = next(f for f in dataclasses.fields(owner) if f.name == field)
         meta = found.metadata
@@ -73,28 +46,14 @@ class Key:
         return cls(**values)
 
     def meta(self, units: tuple[str, str] = DEFAULT) -> dict[str, Any]:
-        """Return the metadata of a value, as of a leaf, in the units of a rig.
-
-        >>> Key("level", unit="cm").meta(("m", "V"))["unit"]
-        'm'
-        """
+        """Return the metadata of a value, as of a leaf, in the units of a rig."""
         found = {k: getattr(self, k) for k in ("kind", "doc", "low", "high", "strict", "choices")}
         return {**found, "unit": local(self.unit, units)}
 
 
 @dataclasses.dataclass(frozen=True)
 class Section:
-    """A table of a rig file, or a list of tables.
-
-    Parameters
-    ----------
-    name : of the table, "reference.sine" for a table in a table
-    keys : what it may have; () where the names are parameters, measures, or fields of a class
-    many : whether it is a list of tables, [[name]]
-    prose : sentence that `init` prints above it where a case has none
-    per : field of TankNetwork with an entry for each table of the list
-    elsewhere : (part of the loop, class) whose other fields are in [values], for all tables at once
-    """
+    """A table of a rig file, or a list of tables."""
 
     name: str
     keys: tuple[Key, ...] = ()

@@ -6,7 +6,7 @@ number or an array that may be differentiated, with a unit and an allowed range)
 
 A constructor converts leaves given as lists and numbers. JAX rebuilds components without it, with
 whatever a transformation carries (tracers, batches, axes, placeholders). Checks of values:
-`jaxtank.core.checks`. Imports core only; may be imported by every folder.
+`jaxtank.core.checks`.
 """
 
 import dataclasses
@@ -56,29 +56,7 @@ T = TypeVar("T")
 def walk(
     tree: Any, prefix: str = "", kind: str = "leaf", units: tuple[str, str] = DEFAULT
 ) -> Iterator[tuple[str, Any, Meta]]:
-    """Yield every field of one kind below a component, in the order of its fields.
-
-    A component whose fields mean what those of another do (the gains in `controllers.Scheduled`)
-    has a method `metadata_of(field)` that returns what to change of the metadata of its class;
-    "rows" in it is the metadata of each row of an array.
-
-    Parameters
-    ----------
-    tree : component
-    prefix : what the names begin with
-    kind : "leaf" or "static"
-    units : (length, pump input) in which units are written, unless `tree` has its own
-
-    Yields
-    ------
-    (dotted name, value, metadata: unit, doc, low, high, strict and more)
-
-    Examples
-    --------
-    >>> from jaxtank.signals import ramps
-    >>> [name for name, *_ in walk(ramps([3.0], []), "reference.")]
-    ['reference.initial', 'reference.targets', 'reference.ramp', 'reference.filter']
-    """
+    """Yield every field of one kind below a component, in the order of its fields."""
     units = getattr(tree, "units", units)
     for field in dataclasses.fields(tree):
         value, name = getattr(tree, field.name), f"{prefix}{field.name}"
@@ -110,27 +88,7 @@ def parameters(tree: Any) -> dict[str, Any]:
 
 
 def describe(tree: Any, name: str) -> Meta:
-    """Return the metadata of a leaf or static field.
-
-    Parameters
-    ----------
-    tree : component
-    name : dotted name, with or without an index
-
-    Returns
-    -------
-    {"unit", "doc", "low", "high", "strict", ...}
-
-    Raises
-    ------
-    InputError where there is none, naming the closest ones.
-
-    Examples
-    --------
-    >>> from jaxtank.instruments import LevelSensor
-    >>> describe(LevelSensor(noise=[0.1]), "noise")["unit"]
-    'cm'
-    """
+    """Return the metadata of a leaf or static field."""
     base = name.split("[")[0]
     for kind in ("leaf", "static"):
         for other, _, meta in walk(tree, kind=kind):
@@ -141,23 +99,7 @@ def describe(tree: Any, name: str) -> Meta:
 
 
 def get_value(tree: Any, name: str) -> Any:
-    """Return the value of a leaf, or one entry of it.
-
-    Parameters
-    ----------
-    tree : component
-    name : dotted name; "name[i]" or "name[i,j]" for an entry
-
-    Raises
-    ------
-    InputError for an unknown name, an entry that does not exist, and a leaf that is not in use.
-
-    Examples
-    --------
-    >>> from jaxtank.instruments import LevelSensor
-    >>> float(get_value(LevelSensor(noise=[0.1, 0.2]), "noise[1]"))
-    0.2
-    """
+    """Return the value of a leaf, or one entry of it."""
     base, index = split_index(name)
     values = parameters(tree)
     if base in values:
@@ -210,17 +152,7 @@ def with_values(tree: T, values: Mapping[str, Any]) -> T:
 
 
 def split_index(name: str) -> tuple[str, tuple[int, ...]]:
-    """Return a dotted name without its index, and the index.
-
-    Raises
-    ------
-    InputError for a malformed name.
-
-    Examples
-    --------
-    >>> split_index("plant.drain[0]"), split_index("plant.drain")
-    (('plant.drain', (0,)), ('plant.drain', ()))
-    """
+    """Return a dotted name without its index, and the index."""
     parts = name.split(".")
     last = _STEP.fullmatch(parts[-1])
     if (

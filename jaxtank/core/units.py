@@ -1,5 +1,5 @@
 """Units of a rig. Metadata is written for centimetres and volts; a rig in other units declares
-them, and every printed unit follows. Imports core only; may be imported by every folder.
+them, and every printed unit follows.
 
 `plant.units` is (length, pump input): ("cm", "V") unless its paper counts otherwise, as in ("m",
 "m^3/s").
@@ -35,13 +35,7 @@ is in m^3/s, a length in m."""
 
 
 def canonical(unit: str) -> str:
-    """Return a unit as the tables spell it.
-
-    Examples
-    --------
-    >>> [canonical(unit) for unit in ("m³/h", "m3/h", "L/min", "mL / s", "cc/s")]
-    ['m^3/h', 'm^3/h', 'l/min', 'ml/s', 'cm^3/s']
-    """
+    """Return a unit as the tables spell it."""
     text = re.sub(
         r"(?<=[a-z])\^?([23]|[²³])", lambda m: "^" + m[1].translate(_RAISED), unit.strip()
     )
@@ -53,17 +47,7 @@ _RAISED = str.maketrans("²³", "23")
 
 
 def check_units(where: str, units: tuple[str, str]) -> tuple[str, str]:
-    """Return the units of a rig, (length, pump input), powers written with ^.
-
-    Raises
-    ------
-    InputError for a unit that is unknown, or not one of a level or of a pump's input.
-
-    Examples
-    --------
-    >>> check_units("units", ("m", "m3/h"))
-    ('m', 'm^3/h')
-    """
+    """Return the units of a rig, (length, pump input), powers written with ^."""
     checked = []
     for what, text, tables in zip(("level", "pump input"), units, (LEVELS, INPUTS)):
         check_unit(f"{where}: entry", text)
@@ -82,11 +66,6 @@ def check_units(where: str, units: tuple[str, str]) -> tuple[str, str]:
 def flow_per_input(units: tuple[str, str]) -> float | None:
     """Return the flow [length^3/s] that one unit of the pump's input stands for; None where the
     input is no flow, or the level no length.
-
-    Examples
-    --------
-    >>> flow_per_input(("m", "m^3/h")) == 1 / 3600, flow_per_input(("cm", "V"))
-    (True, None)
     """
     length, drive = map(canonical, units)
     if drive not in FLOWS or length not in LENGTHS:
@@ -99,26 +78,7 @@ LONGEST = 40
 
 
 def check_unit(where: str, text: str) -> str:
-    """Return `text` if it is a unit, such as "cm", "L/min", "m^3/s" or "cm^3/(s V)".
-
-    A unit is names joined by *, / or a space, each with ^ and a number where it has an exponent; a
-    product may stand in brackets. A name is letters, digits and _, and begins with a letter; "%",
-    "1" and "-" are units too.
-
-    Parameters
-    ----------
-    where : what messages call it
-    text : the unit
-
-    Raises
-    ------
-    InputError for any other text.
-
-    Examples
-    --------
-    >>> check_unit("column h1", "L/min")
-    'L/min'
-    """
+    """Return `text` if it is a unit, such as "cm", "L/min", "m^3/s" or "cm^3/(s V)"."""
     name = r"(?:[^\W\d_]\w*|°[CF]|%|1)"
     factor = rf"{name}(?:\^-?\d+(?:\.\d+)?)?"
     joint = r"(?: ?[*/·] ?| )"
@@ -135,20 +95,7 @@ def check_unit(where: str, text: str) -> str:
 
 @functools.cache
 def local(unit: str, units: tuple[str, str] = DEFAULT) -> str:
-    """Return a unit in the units of a rig.
-
-    A unit of several factors is put in brackets where it is one of several itself.
-
-    Parameters
-    ----------
-    unit : written with "cm" for the length, "V" for the pump input and "volt" for a sensor's volt
-    units : (length, pump input) of the rig
-
-    Examples
-    --------
-    >>> local("cm/V", ("m", "m^3/s"))
-    'm/(m^3/s)'
-    """
+    """Return a unit in the units of a rig."""
     length, drive = units
     if drive == f"{length}^3/s" and unit == "cm^3/(s V)":  # the input is the flow itself
         return "-"

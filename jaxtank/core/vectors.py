@@ -3,7 +3,6 @@
 A tuple of scalars compiles to straight-line code, which is fastest for a few tanks; its program
 grows with the number of tanks, and so does the time to compile it. An array keeps the program the
 same for any number. Formulas that are written with `each`, `take` and `total` serve both forms.
-Imports jax only; may be imported by every folder.
 """
 # jax leaves the types of its functions partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
@@ -22,73 +21,29 @@ FROM = 10
 def serves_arrays(part: Any) -> bool:
     """Return whether a component takes vectors as arrays: where its class itself says `arrays =
     True`, or has a property `arrays`; a class derived from it may not.
-
-    Examples
-    --------
-    >>> from jaxtank.observers import Direct
-    >>> serves_arrays(Direct())
-    True
     """
     return "arrays" in vars(type(part)) and bool(part.arrays)
 
 
 def is_array(vector: Any) -> bool:
-    """Return whether a vector is an array of jax, and not a tuple of scalars.
-
-    Examples
-    --------
-    >>> is_array(jnp.zeros(3)), is_array((0.0, 0.0))
-    (True, False)
-    """
+    """Return whether a vector is an array of jax, and not a tuple of scalars."""
     return isinstance(vector, jax.Array)
 
 
 def each(function: Callable[..., Any], vector: Any, *others: Any) -> Any:
-    """Return `function` of the entries of vectors, or of the whole arrays.
-
-    Parameters
-    ----------
-    function : of one entry of each vector; elementwise, so that it also takes arrays
-    vector : (n,) the one whose form counts: a tuple of scalars or an array
-    others : (n,) more vectors of that form, leaves (arrays in both), and states of n entries: n
-        tuples, or one tuple of arrays
-
-    Returns
-    -------
-    A tuple with the n results, or the result for the arrays: an array, or a tuple of arrays where
-    `function` returns a tuple.
-
-    Examples
-    --------
-    >>> each(lambda h, rim: h - rim, (3.0, 4.0), (1.0, 1.0))
-    (2.0, 3.0)
-    >>> each(lambda h, rim: h - rim, jnp.array([3.0, 4.0]), np.ones(2)).tolist()
-    [2.0, 3.0]
-    """
+    """Return `function` of the entries of vectors, or of the whole arrays."""
     if is_array(vector):
         return function(vector, *others)
     return tuple(function(v, *(o[i] for o in others)) for i, v in enumerate(vector))
 
 
 def unzipped(vector: Any, results: Any) -> tuple[Any, ...]:
-    """Return the vectors of what `each` returned for a function with several results.
-
-    Examples
-    --------
-    >>> unzipped((1.0, 2.0), each(lambda v: (v, -v), (1.0, 2.0)))
-    ((1.0, 2.0), (-1.0, -2.0))
-    """
+    """Return the vectors of what `each` returned for a function with several results."""
     return results if is_array(vector) else tuple(zip(*results))
 
 
 def take(vector: Any, indices: Any) -> Any:
-    """Return the entries of a vector at fixed places: numbers, or an array of whole numbers.
-
-    Examples
-    --------
-    >>> take((5.0, 6.0, 7.0), (2, 0)), take(jnp.array([5.0, 6.0, 7.0]), (2, 0)).tolist()
-    ((7.0, 5.0), [7.0, 5.0])
-    """
+    """Return the entries of a vector at fixed places: numbers, or an array of whole numbers."""
     if not is_array(vector):
         return tuple(vector[i] for i in indices)
     places = np.asarray(indices, dtype=np.int32)
@@ -101,68 +56,32 @@ def take(vector: Any, indices: Any) -> Any:
 
 
 def total(vector: Any) -> Any:
-    """Return the sum of the entries.
-
-    Examples
-    --------
-    >>> total((1.0, 2.0)), float(total(jnp.array([1.0, 2.0])))
-    (3.0, 3.0)
-    """
+    """Return the sum of the entries."""
     return jnp.sum(vector) if is_array(vector) else sum(vector)
 
 
 def zeros(vector: Any) -> Any:
-    """Return zeros in the form of a vector.
-
-    Examples
-    --------
-    >>> zeros((3.0, 4.0))
-    (0.0, 0.0)
-    """
+    """Return zeros in the form of a vector."""
     return jnp.zeros_like(vector) if is_array(vector) else (0.0,) * len(vector)
 
 
 def scalars(vector: Any) -> Any:
-    """Return the tuple of the entries of an array; anything else as it is.
-
-    Examples
-    --------
-    >>> [float(v) for v in scalars(jnp.array([1.0, 2.0]))]
-    [1.0, 2.0]
-    """
+    """Return the tuple of the entries of an array; anything else as it is."""
     return tuple(vector[i] for i in range(vector.shape[0])) if is_array(vector) else vector
 
 
 def like(vector: Any, other: Any) -> Any:
-    """Return a vector in the form of another one; an empty one, of what is not in use, as it is.
-
-    Examples
-    --------
-    >>> like((1.0, 2.0), jnp.zeros(1)).tolist()
-    [1.0, 2.0]
-    """
+    """Return a vector in the form of another one; an empty one, of what is not in use, as it is."""
     if is_array(other) and len(vector):
         return vector if is_array(vector) else jnp.stack([jnp.asarray(v) for v in vector])
     return scalars(vector)
 
 
 def given(part: Any, vector: Any) -> Any:
-    """Return a vector in the form that a component takes: scalars, unless it `serves_arrays`.
-
-    Examples
-    --------
-    >>> given(object(), jnp.zeros(1))[0].shape
-    ()
-    """
+    """Return a vector in the form that a component takes: scalars, unless it `serves_arrays`."""
     return vector if serves_arrays(part) else scalars(vector)
 
 
 def columns(signals: Any) -> jax.Array:
-    """Return an array (samples, n) of n arrays (samples,).
-
-    Examples
-    --------
-    >>> columns((jnp.zeros(4), jnp.ones(4))).shape
-    (4, 2)
-    """
+    """Return an array (samples, n) of n arrays (samples,)."""
     return signals if is_array(signals) else jnp.stack(list(signals), axis=1)

@@ -1,4 +1,4 @@
-"""Controllers as C99. Imported by `jaxtank.export.source`."""
+"""Controllers as C99."""
 
 import re
 
@@ -10,13 +10,7 @@ MATHS = [*FUNCTIONS, "fabs", "pow", "rint", "fmod", "cbrt", "exp2", "atan2"]
 
 
 class C(Printer):
-    """The statements of C99.
-
-    Examples
-    --------
-    >>> C().value(-1.5)
-    'R((-1.5))'
-    """
+    """The statements of C99."""
 
     operations = {
         **OPERATIONS,
@@ -107,22 +101,7 @@ static void backward(int n, int k, const real *a, const real *b, real *out)
 
 
 def print_c(program, name, precision):
-    """Return a Program as the text of a C99 file.
-
-    Parameters
-    ----------
-    program : Program
-    name : what the functions NAME_init and NAME_step begin with
-    precision : "double" or "float"
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> from jaxtank.export.program import program
-    >>> text = print_c(program(presets.find("cascaded/pi")), "tanks", "double")
-    >>> "#define TANKS_DT 4.0" in text
-    True
-    """
+    """Return a Program as the text of a C99 file."""
     begin = f"{name}_init takes the levels and inputs before the first period."
     lines = [
         "/*",

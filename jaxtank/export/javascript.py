@@ -1,4 +1,4 @@
-"""Controllers as JavaScript. Imported by `jaxtank.export.source` and by `tuning.live`."""
+"""Controllers as JavaScript."""
 
 from jaxtank.export.printer import FUNCTIONS, OPERATIONS, Printer, header
 from jaxtank.export.statements import REAL, TRUTH, WHOLE, Define, Ref, every, matrix_operations
@@ -8,13 +8,7 @@ MISSING = ("erf", "erfc")
 
 
 class JavaScript(Printer):
-    """The statements of JavaScript (ECMAScript 2015), in double precision.
-
-    Examples
-    --------
-    >>> JavaScript().value(-1.5)
-    '(-1.5)'
-    """
+    """The statements of JavaScript (ECMAScript 2015), in double precision."""
 
     operations = {
         **OPERATIONS,
@@ -157,24 +151,7 @@ def helpers(statements):
 
 
 def print_javascript(program, name, precision):
-    """Return a Program as the text of a JavaScript file.
-
-    It is a script that defines NAME, an object of functions and sizes, and a module of node.
-
-    Parameters
-    ----------
-    program : Program
-    name : of the object
-    precision : "double", which is JavaScript's
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> from jaxtank.export.program import program
-    >>> text = print_javascript(program(presets.find("cascaded/pi")), "tanks", "double")
-    >>> "const tanks = (() => {" in text, "dt: 4," in text
-    (True, True)
-    """
+    """Return a Program as the text of a JavaScript file."""
     printer = JavaScript()
     begin = f"{name}.init(y, u) returns the state from the levels and inputs before the first."
     sizes = {

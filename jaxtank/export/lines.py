@@ -17,17 +17,7 @@ SMALL = 64
 
 
 def written(jaxpr):
-    """Return the inputs of a jaxpr that it writes to at an index that it computes.
-
-    Examples
-    --------
-    >>> import jax
-    >>> line = jax.ShapeDtypeStruct((3,), np.float32)
-    >>> whole = jax.ShapeDtypeStruct((), np.int32)
-    >>> put = lambda a, i: jax.lax.dynamic_update_slice(a, a[:1], (i,))
-    >>> len(written(jax.make_jaxpr(put)(line, whole).jaxpr))
-    1
-    """
+    """Return the inputs of a jaxpr that it writes to at an index that it computes."""
     inputs, found = set(jaxpr.invars), set()
     for eqn in jaxpr.eqns:
         operands = [None if isinstance(v, Literal) else v for v in eqn.invars]
@@ -41,13 +31,7 @@ def written(jaxpr):
 
 
 def elements_of(name, size):
-    """Return the elements of the line `name`.
-
-    Examples
-    --------
-    >>> elements_of("c_3", 2).tolist()
-    [Ref(name='c_3', index=0), Ref(name='c_3', index=1)]
-    """
+    """Return the elements of the line `name`."""
     out = np.empty(size, dtype=object)
     out[:] = [Ref(name, i) for i in range(size)]
     return out

@@ -3,7 +3,6 @@
 Every element of an array becomes a `Ref` or a number. What only moves elements (slices, transposes,
 broadcasts) costs nothing, what depends on constants alone is computed here, and what is not used is
 left out. Loops (`jax.lax.scan`, `jax.lax.while_loop`) and products of large matrices stay loops.
-Imported by `jaxtank.export.printer`.
 """
 
 from typing import Any, NamedTuple
@@ -22,11 +21,10 @@ RULES = {**primitives.RULES, **matrices.RULES, **loops.RULES, **lines.RULES}
 
 
 class Writer:
-    """The statements of one function while they are written.
+    """The statements of one function while they are written."""
 
-    scopes: the statements of the function and of the loops that are open; known: in each of them,
-    {operation: its Ref}, so that nothing is computed twice.
-    """
+    # scopes: the statements of the function and of the loops that are open; known: in each of them,
+    # {operation: its Ref}, so that nothing is computed twice.
 
     def __init__(self):
         self.counter, self.scopes, self.known = 0, [[]], [{}]
@@ -102,31 +100,7 @@ def _called(eqn):
 
 
 def lower(f, arguments):
-    """Return (statements, outputs) of a function.
-
-    Parameters
-    ----------
-    f : function of trees of arrays that returns a tree of arrays
-    arguments : {name: tree of jax.ShapeDtypeStruct}, in the order of f's arguments. Element k of
-        the argument y is Ref("y", k), counted over all its arrays; a scalar t is Ref("t").
-
-    Returns
-    -------
-    statements : list of Statement
-    outputs : list of arrays of Refs and numbers, one for each leaf of what f returns
-
-    Raises
-    ------
-    InputError
-        For an operation that has no counterpart here.
-
-    Examples
-    --------
-    >>> pair = jax.ShapeDtypeStruct((2,), np.float32)
-    >>> statements, outputs = lower(lambda y: y[0] * y[1] + 0.0, {"y": pair})
-    >>> [(s.name, s.op, s.args) for s in statements]
-    [('v1', 'mul', (Ref(name='y', index=0), Ref(name='y', index=1)))]
-    """
+    """Return (statements, outputs) of a function."""
     made = lower_all(f, arguments)
     outputs = [np.asarray(v, dtype=object) for v in jax.tree.leaves(made.outputs)]
     return made.statements, outputs
@@ -143,17 +117,7 @@ class Lowered(NamedTuple):
 
 
 def lower_all(f, arguments, writer=None):
-    """Return the Lowered form of a function: `lower`, with the outputs as the tree they are.
-
-    An array of the arguments that the function writes to at an index that it computes is an input
-    of its own, of which element i is Ref(its name, i).
-
-    Examples
-    --------
-    >>> pair = jax.ShapeDtypeStruct((2,), np.float32)
-    >>> lower_all(lambda y: {"twice": 2.0 * y[1]}, {"y": pair}).outputs
-    {'twice': array(Ref(name='v1', index=None), dtype=object)}
-    """
+    """Return the Lowered form of a function: `lower`, with the outputs as the tree they are."""
     closed, shape = jax.make_jaxpr(f, return_shape=True)(*arguments.values())
     writer, moved = writer or Writer(), lines.written(closed.jaxpr)
     inputs, found = [], {}

@@ -1,17 +1,11 @@
-"""Controllers as a MATLAB function. Imported by `jaxtank.export.source`."""
+"""Controllers as a MATLAB function."""
 
 from jaxtank.export.printer import FUNCTIONS, OPERATIONS, Printer, header
 from jaxtank.export.statements import Define, every, matrix_operations
 
 
 class Matlab(Printer):
-    """The statements of MATLAB.
-
-    Examples
-    --------
-    >>> Matlab().value(float("-inf"))
-    '(-Inf)'
-    """
+    """The statements of MATLAB."""
 
     operations = {
         **OPERATIONS,
@@ -85,21 +79,7 @@ RESERVED = frozenset(_RESERVED.split()) | set(FUNCTIONS)
 
 
 def print_matlab(program, name, precision):
-    """Return a Program as the text of a MATLAB file with one function.
-
-    Parameters
-    ----------
-    program : Program
-    name : of the function
-    precision : "double", which is MATLAB's
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> from jaxtank.export.program import program
-    >>> print_matlab(program(presets.find("cascaded/pi")), "tanks", "double").split("\\n")[0]
-    'function [u, s] = tanks(s, t, y, r, dr, ddr, u)'
-    """
+    """Return a Program as the text of a MATLAB file with one function."""
     printer = Matlab()
     begin = "s: state; give [] in the first period, and u, the inputs before it."
     first, after, u = (map(printer.value, e) for e in (program.first, program.after, program.u))

@@ -15,14 +15,7 @@ LARGE = 300
 
 
 def product(writer, a, b, dimensions):
-    """Return the elements of a product of two arrays.
-
-    Parameters
-    ----------
-    writer : Writer
-    a, b : arrays of elements
-    dimensions : ((axes of a, axes of b), (batch axes of a, of b)), as in `jax.lax.dot_general`
-    """
+    """Return the elements of a product of two arrays."""
     (left, right), batches = dimensions
     if any(batches):
         raise no_code("it multiplies stacks of matrices")
@@ -68,9 +61,8 @@ def _triangular(writer, eqn, operands):
 
 
 def _linear_solve(writer, eqn, operands):
-    """Solves with the matrix of a linear function, found by applying it to unit vectors. Numbers
-    that do not meet in it (several right sides) are solved for apart.
-    """
+    """Solves with the matrix of a linear function, found by applying it to unit vectors."""
+    # Numbers that do not meet in it (several right sides) are solved for apart.
     lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
     right = operands[sum(lengths) :]
     if len(right) != 1:

@@ -19,37 +19,19 @@ TRUTHS = {"lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite"}
 
 
 def no_code(reason):
-    """Return the InputError for a controller that cannot be exported.
-
-    Examples
-    --------
-    >>> str(no_code("it uses the operation sort"))
-    'this controller cannot be exported: it uses the operation sort'
-    """
+    """Return the InputError for a controller that cannot be exported."""
     return InputError(f"this controller cannot be exported: {reason}")
 
 
 def kind_of(dtype):
-    """Return the kind of variable, REAL, WHOLE or TRUTH, that holds an element of this type.
-
-    Examples
-    --------
-    >>> kind_of(np.dtype(np.float32)), kind_of(np.dtype(np.int32)), kind_of(np.dtype(bool))
-    ('real', 'whole', 'truth')
-    """
+    """Return the kind of variable, REAL, WHOLE or TRUTH, that holds an element of this type."""
     if jnp.issubdtype(dtype, jnp.floating):
         return REAL
     return TRUTH if dtype == jnp.bool_ else WHOLE
 
 
 def elements(value):
-    """Return the numbers of an array as Python numbers, in an array of objects.
-
-    Examples
-    --------
-    >>> elements(np.array([1.5, 2.0])).tolist()
-    [1.5, 2.0]
-    """
+    """Return the numbers of an array as Python numbers, in an array of objects."""
     array = np.asarray(value)
     out = np.empty(array.shape, dtype=object)
     plain = {REAL: float, WHOLE: int, TRUTH: bool}[kind_of(array.dtype)]
@@ -59,13 +41,7 @@ def elements(value):
 
 
 def each(f, *arrays):
-    """Return f of the elements of arrays, which are broadcast against each other.
-
-    Examples
-    --------
-    >>> each(max, np.array([1, 5], dtype=object), np.array(3, dtype=object)).tolist()
-    [3, 5]
-    """
+    """Return f of the elements of arrays, which are broadcast against each other."""
     arrays = np.broadcast_arrays(*arrays)
     out = np.empty(arrays[0].shape, dtype=object)
     for i in np.ndindex(out.shape):

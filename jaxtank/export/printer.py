@@ -1,7 +1,4 @@
-"""How statements are printed: templates that a language fills in, and the header of a file.
-
-Imported by the languages of this folder and by languages from outside.
-"""
+"""How statements are printed: templates that a language fills in, and the header of a file."""
 
 import re
 from collections.abc import Mapping
@@ -40,17 +37,7 @@ FUNCTIONS = _FUNCTIONS.split()
 
 
 class Printer:
-    """The statements of a language: templates, of which a derived class sets its own.
-
-    The right side of a statement is a format of its arguments, which are variables and numbers; a
-    language without a counterpart for an operation leaves it out, and its use is an InputError.
-
-    Examples
-    --------
-    >>> statement = Define(REAL, "v1", "mul", (Ref("y", 0), 2.0))
-    >>> Printer().lines([statement])
-    ['    v1 = y[0] * 2.0;']
-    """
+    """The statements of a language: templates, of which a derived class sets its own."""
 
     operations: Mapping[str, str] = OPERATIONS
     kinds: Mapping[str, str] = {REAL: "", WHOLE: "", TRUTH: ""}
@@ -146,54 +133,20 @@ class Printer:
 
 
 def function_name(case):
-    """Return the name of a case with each character that no language allows replaced by _.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> function_name(presets.find("gouta2022/pi-ff"))
-    'gouta2022_pi_ff'
-    """
+    """Return the name of a case with each character that no language allows replaced by _."""
     return re.sub(r"[^A-Za-z0-9]+", "_", case.name).strip("_")
 
 
 def comment(text):
-    """Return a text as one line that may stand in a comment of any language and does not end it.
-
-    Characters that do not print, line breaks of every script among them, are replaced by spaces,
-    backslashes by slashes; the ends of comments and the trigraphs of C are taken apart.
-
-    Examples
-    --------
-    >>> comment("a */ int b;")
-    'a * / int b;'
-    """
+    """Return a text as one line that may stand in a comment of any language and does not end it."""
+    # Characters that do not print, line breaks of every script among them, are replaced by spaces,
+    # backslashes by slashes; the ends of comments and the trigraphs of C are taken apart.
     text = "".join(c if c.isprintable() else " " for c in text).replace("\\", "/")
     return re.sub(r"\*(?=/)|/(?=\*)|\?(?=\?)", lambda found: found[0] + " ", text)
 
 
 def header(program, mark, call, begin):
-    """Return the comment at the top of a file: the case, the arguments with units, the gains.
-
-    Parameters
-    ----------
-    program : Program
-    mark : what a line of the comment begins with
-    call : name of the function to call in each period
-    begin : sentence on the first period
-
-    Returns
-    -------
-    list of lines
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> from jaxtank.export.program import program
-    >>> lines = header(program(presets.find("cascaded/pi")), "#", "step", "")
-    >>> lines[0]
-    '# cascaded/pi: two tanks in cascade, PI'
-    """
+    """Return the comment at the top of a file: the case, the arguments with units, the gains."""
     case = program.case
     length, drive = case.loop.units
     outputs, pumps = (s * (n > 1) for s, n in (("s", program.outputs), ("s", program.pumps)))

@@ -1,7 +1,4 @@
-"""A controller and its observer as statements: what every language prints.
-
-Imported by `jaxtank.export.source` and by the languages.
-"""
+"""A controller and its observer as statements: what every language prints."""
 
 import dataclasses
 import functools
@@ -21,23 +18,11 @@ from jaxtank.loop.step import decide
 
 
 def functions(case):
-    """Return (step, begin), the functions of one sample and of the first state, of arrays.
-
-    step(state, t, y, r, dr, ddr) -> (u, state), with t [s], y (tanks,) measured levels, r, dr, ddr
-    (outputs,) setpoints with their first and second time derivatives, and u (pumps,) inputs within
-    the limits of the pumps. begin(y, u) -> state, from the levels and inputs before the first
-    sample. The order of one sample is that of `jaxtank.loop.step.decide`, which is called.
-
-    Examples
-    --------
-    >>> import jax.numpy as jnp
-    >>> from jaxtank import presets
-    >>> step, begin = functions(presets.find("cascaded/pi"))
-    >>> y, r, zero = jnp.array([5.0, 5.0]), jnp.array([5.0]), jnp.zeros(1)
-    >>> u, state = step(begin(y, jnp.array([2.0])), 0.0, y, r, zero, zero)
-    >>> u.shape
-    (1,)
-    """
+    """Return (step, begin), the functions of one sample and of the first state, of arrays."""
+    # step(state, t, y, r, dr, ddr) -> (u, state), with t [s], y (tanks,) measured levels, r, dr,
+    # ddr (outputs,) setpoints with their first and second time derivatives, and u (pumps,) inputs
+    # within the limits of the pumps. begin(y, u) -> state, from the levels and inputs before the
+    # first sample. The order of one sample is that of `jaxtank.loop.step.decide`, which is called.
     loop, dt = case.loop, case.clock.dt
 
     def scalars(array):
@@ -60,17 +45,7 @@ def functions(case):
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """The statements of the two functions of a case, and the sizes of their arguments.
-
-    The arguments of `step` are Refs of s (state), t, y, r, dr and ddr, those of `begin` of y and u.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> found = program(presets.find("cascaded/pi"))
-    >>> found.tanks, found.outputs, found.pumps, len(found.u)
-    (2, 1, 1, 1)
-    """
+    """The statements of the two functions of a case, and the sizes of their arguments."""
 
     case: Case
     state: int
@@ -101,24 +76,7 @@ class Program:
 
 
 def program(case: Case) -> Program:
-    """Return the Program of a case.
-
-    Parameters
-    ----------
-    case : Case
-
-    Raises
-    ------
-    InputError
-        For a controller that uses an operation without a counterpart, or whose first state has
-        another size than the next ones.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> program(presets.find("cascaded/pi")).state
-    2
-    """
+    """Return the Program of a case."""
     plant = case.loop.plant
     step, begin = functions(case)
     real = functools.partial(jax.ShapeDtypeStruct, dtype=jnp.result_type(float))

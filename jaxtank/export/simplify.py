@@ -1,7 +1,4 @@
-"""Operations on numbers and variables, evaluated or shortened where the arguments allow it.
-
-Imported by `jaxtank.export.lowering` for each operation, before a statement is written.
-"""
+"""Operations on numbers and variables, evaluated or shortened where the arguments allow it."""
 
 import math
 import operator
@@ -79,35 +76,14 @@ def is_number(value) -> bool:
 
 
 def simplified(op, args):
-    """Return op(args) where it is a number or one of the arguments, else None.
-
-    Parameters
-    ----------
-    op : name of an operation
-    args : tuple of numbers and Refs
-
-    Examples
-    --------
-    >>> simplified("add", (Ref("x", 0), 0.0))
-    Ref(name='x', index=0)
-    >>> simplified("mul", (2.0, 3.0))
-    6.0
-    >>> simplified("mul", (2.0, Ref("x", 0))) is None
-    True
-    """
+    """Return op(args) where it is a number or one of the arguments, else None."""
     if op != "select" and all(map(is_number, args)):
         return compute(op, args)
     return RULES[op](*args) if op in RULES else None
 
 
 def compute(op, args):
-    """Return op(args) of numbers.
-
-    Examples
-    --------
-    >>> compute("rem", (7.5, 2.0)), compute("quotient", (-7, 2))
-    (1.5, -3)
-    """
+    """Return op(args) of numbers."""
     return OPERATORS[op](*args) if op in OPERATORS else float(FUNCTIONS[op](*args))
 
 

@@ -1,6 +1,6 @@
 """A controller and its observer as one source file without dependencies: `export` and `register`.
 
-The file is made from the step function that is simulated. Imported by users and the command line.
+The file is made from the step function that is simulated.
 """
 
 import re

@@ -1,7 +1,4 @@
-"""The statements of exported code, on scalars: what lowering makes and the printers print.
-
-Imports nothing of this package; may be imported by every module of this folder.
-"""
+"""The statements of exported code, on scalars: what lowering makes and the printers print."""
 
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
@@ -43,11 +40,10 @@ class Array(NamedTuple):
 
 
 class Matrix(NamedTuple):
-    """A matrix operation, name = op(operands), on arrays by name.
+    """A matrix operation, name = op(operands), on arrays by name."""
 
-    Operations and their `sizes`: "product" (m, k, n) of A (m, k) and B (k, n); "cholesky" (n,);
-    "forward" and "backward" (n, k): solve L x = b and L' x = b; "solve" (n, k): A x = b, any A.
-    """
+    # Operations and their `sizes`: "product" (m, k, n) of A (m, k) and B (k, n); "cholesky" (n,);
+    # "forward" and "backward" (n, k): solve L x = b and L' x = b; "solve" (n, k): A x = b, any A.
 
     name: str
     op: str
@@ -86,10 +82,7 @@ class Until(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """A loop of `count` passes, or until it ends by itself where `count` is None.
-
-    After each pass of the body every carried variable takes its new value, all at once.
-    """
+    """A loop of `count` passes, or until it ends by itself where `count` is None."""
 
     count: int | None
     carried: tuple  # ((kind, name, start), ...)
@@ -113,14 +106,7 @@ def names(entries: Iterable) -> set[str]:
 
 
 def every(statements: Iterable[Statement]) -> Iterator[Statement]:
-    """Yield each statement, and those of a loop's body after the loop.
-
-    Examples
-    --------
-    >>> inner = Define(REAL, "v1", "sqrt", (Ref("x", 0),))
-    >>> [type(s).__name__ for s in every([Loop(3, (), [inner], ())])]
-    ['Loop', 'Define']
-    """
+    """Yield each statement, and those of a loop's body after the loop."""
     for s in statements:
         yield s
         if isinstance(s, Loop):
@@ -128,26 +114,12 @@ def every(statements: Iterable[Statement]) -> Iterator[Statement]:
 
 
 def matrix_operations(statements: Iterable[Statement]) -> set[str]:
-    """Return the matrix operations that occur in the statements.
-
-    Examples
-    --------
-    >>> sorted(matrix_operations([Matrix("m2", "cholesky", ("a1",), (3,))]))
-    ['cholesky']
-    """
+    """Return the matrix operations that occur in the statements."""
     return {s.op for s in every(statements) if isinstance(s, Matrix)}
 
 
 def used(statements: list[Statement], wanted: set[str]) -> list[Statement]:
-    """Return the statements that the variables named in `wanted` depend on, in order.
-
-    Examples
-    --------
-    >>> a = Define(REAL, "v1", "sqrt", (Ref("x", 0),))
-    >>> b = Define(REAL, "v2", "exp", (Ref("x", 0),))
-    >>> [s.name for s in used([a, b], {"v1"})]
-    ['v1']
-    """
+    """Return the statements that the variables named in `wanted` depend on, in order."""
     kept = []
     for s in reversed(statements):
         if isinstance(s, Loop):

@@ -1,7 +1,4 @@
-"""Sensors and actuators: the roles, and the concrete ones of the papers' rigs.
-
-Imports core; may be imported by every folder above.
-"""
+"""Sensors and actuators: the roles, and the concrete ones of the papers' rigs."""
 
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.base import Actuator, Sensor

@@ -1,7 +1,4 @@
-"""PumpBank: saturation or allocation, dead zone, lag and transport delay of pumps, in this order.
-
-Imports core and the role Actuator; may be imported by every folder above.
-"""
+"""PumpBank: saturation or allocation, dead zone, lag and transport delay of pumps, in order."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -245,33 +242,10 @@ def _next(head, line):
 
 
 def allocate(command, metric, low, high):
-    """Return the inputs in the box that are best by a controller's cost.
-
-        argmin over w in [low, high]^2 of (w - u)' G (w - u)
-
-    For the predictive controller of gouta2015 G = b'b makes this the exact constrained minimiser of
-    its cost (eq. 21; gouta2015 notes S4.5). The four faces of the box are tried and the cheapest is
-    kept; a command inside the box is unchanged.
-
-    Parameters
-    ----------
-    command : u (2,) [V]
-    metric : (g11, g12, g22), G positive definite
-    low, high : (2,) limits [V]
-
-    Returns
-    -------
-    (2,) inputs [V]
-
-    Raises
-    ------
-    ValueError for other than two pumps.
-
-    Examples
-    --------
-    >>> [float(v) for v in allocate((14.0, 5.0), (2.0, 1.0, 2.0), (0.0, 0.0), (12.0, 12.0))]
-    [12.0, 6.0]
-    """
+    """Return the inputs in the box that are best by a controller's cost."""
+    # For the predictive controller of gouta2015 G = b'b makes this the exact constrained minimiser
+    # of its cost (eq. 21; gouta2015 notes S4.5). The four faces of the box are tried and the
+    # cheapest is kept; a command inside the box is unchanged.
     if len(command) != 2:
         raise ValueError(f"allocation by box QP is for two pumps, not {len(command)}")
     (a, b), (g11, g12, g22) = command, metric

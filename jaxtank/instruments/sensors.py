@@ -1,7 +1,4 @@
-"""LevelSensor: readings of levels with noise and an ADC.
-
-Imports core and the role Sensor; may be imported by every folder above.
-"""
+"""LevelSensor: readings of levels with noise and an ADC."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,4 @@
-"""A rig as a Gymnasium environment, for reinforcement learning (pip install ".[gym]").
-
-Imports loop; imported as `jaxtank.environment` where gymnasium is installed.
-"""
+"""A rig as a Gymnasium environment, for reinforcement learning (pip install ".[gym]")."""
 
 import functools
 
@@ -25,41 +22,18 @@ PENALTY = 100.0
 
 
 class TankEnv(gymnasium.Env):
-    """An environment of Gymnasium whose episode is one run of a case without its controller.
+    """An environment of Gymnasium whose episode is one run of a case without its controller."""
 
-    Action: (m,) inputs of the pumps, scaled to [-1, 1] over their limits. Observation:
-    (n + 2 outputs,) readings, setpoints and their rates, each as a share of the highest rim (rates
-    per 100 s). Reward [-]: -mean(e^2)/R^2 - 100 sum(max(h - rim, 0)^2)/R^2, R the highest rim.
-    Truncated at the end of the clock; terminated where a level is not finite. info: {"t" [s],
-    "x" (n,) levels, "y" (n,) readings, "u" (m,) inputs at the plant, "e" (outputs,) errors,
-    "spilled" (n,) volume that has overflowed each rim [cm^3], "filtered" 0.0 or 1.0} in the rig's
-    units.
-
-    A safety filter of the case limits each action as it limits the command of a controller, by the
-    readings of the last observation; info["filtered"] is 1.0 where it changed the action.
-
-    Pumps (dead zone, lag, delay), plant and its faults, disturbances, rims, sensors (noise, offset,
-    ADC) and reference are the case's own: with the inputs of `jaxtank.simulate(case.loop,
-    case.clock, key=jax.random.key(seed))` (its `applied`) as actions, the episode after
-    reset(seed=seed) is that run, to rounding.
-
-    Parameters
-    ----------
-    case : Case
-
-    Raises
-    ------
-    InputError for a case that cannot be run.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> env = TankEnv(presets.find("cascaded/pi"))
-    >>> env.action_space.shape, env.observation_space.shape
-    ((1,), (4,))
-    >>> observation, info = env.reset(seed=0)  # doctest: +SKIP
-    >>> observation, reward, terminated, truncated, info = env.step([0.5])  # doctest: +SKIP
-    """
+    # Action: (m,) inputs of the pumps, scaled to [-1, 1] over their limits. Observation: (n + 2
+    # outputs,) readings, setpoints and their rates, each as a share of the highest rim (rates per
+    # 100 s). Reward [-]: -mean(e^2)/R^2 - 100 sum(max(h - rim, 0)^2)/R^2, R the highest rim.
+    # Truncated at the end of the clock; terminated where a level is not finite. info: {"t" [s], "x"
+    # (n,) levels, "y" (n,) readings, "u" (m,) inputs at the plant, "e" (outputs,) errors, "spilled"
+    # (n,) volume that has overflowed each rim [cm^3], "filtered" 0.0 or 1.0} in the rig's units.
+    # Pumps (dead zone, lag, delay), plant and its faults, disturbances, rims, sensors (noise,
+    # offset, ADC) and reference are the case's own: with the inputs of `jaxtank.simulate(case.loop,
+    # case.clock, key=jax.random.key(seed))` (its `applied`) as actions, the episode after
+    # reset(seed=seed) is that run, to rounding.
 
     metadata = {"render_modes": []}
 

@@ -1,7 +1,4 @@
-"""Conversion of a rig to python-control, and of the columns of a run to pandas or xarray.
-
-Imports analysis and core; imported by users.
-"""
+"""Conversion of a rig to python-control, and of the columns of a run to pandas or xarray."""
 
 import numpy as np
 
@@ -14,32 +11,9 @@ __all__ = ["columns", "to_control"]
 
 
 def to_control(plant, outputs=None, *, setpoints=None, levels=None, inputs=None):
-    """Return the rig linearised at a steady state as a `control.StateSpace` of python-control.
-
-    delta x' = A delta x + B delta u, delta y = C delta x; states are named h1 .., inputs
-    pump1 .., outputs y_h1 ...
-
-    Parameters
-    ----------
-    plant : a rig of n tanks and m pumps.
-    outputs : indices of the tanks, from 0, whose levels are the system's outputs;
-        None: the rig's own, `plant.outputs`.
-    setpoints : (p,) steady levels of the rig's controlled tanks, in its unit of length.
-    levels, inputs : (n,) and (m,), instead of setpoints: the operating point itself.
-
-    Raises
-    ------
-    InputError : python-control is not installed (pip install control), an output is no tank of
-        the rig, or the operating point is missing, given twice or not finite.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> plant = presets.find("mirakhorli/sfc").loop.plant
-    >>> system = to_control(plant, setpoints=(12.0, 12.0))  # doctest: +SKIP
-    >>> system.nstates, system.ninputs, system.noutputs  # doctest: +SKIP
-    (4, 2, 2)
-    """
+    """Return the rig linearised at a steady state as a `control.StateSpace` of python-control."""
+    # delta x' = A delta x + B delta u, delta y = C delta x; states are named h1 .., inputs pump1
+    # .., outputs y_h1 ...
     try:
         import control
     except ImportError:

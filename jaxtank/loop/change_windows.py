@@ -1,7 +1,4 @@
-"""What overshoot, rise and settling of a run refer to: the last change of each setpoint.
-
-May import the folders below `jaxtank.loop` only.
-"""
+"""What overshoot, rise and settling of a run refer to: the last change of each setpoint."""
 # jax leaves the types of its functions partly open.
 # pyright: reportUnknownMemberType=false
 
@@ -21,18 +18,10 @@ share of the setpoint [-]."""
 def windows(loop: Any, times: Any, arrays: bool = False) -> Any:
     """Return what overshoot, rise and settling refer to, as `Signal.windows`; None without changes.
     With `arrays`, a tuple of four arrays (samples, outputs).
-
-    A start away from the setpoint counts as a change at t = 0 of an output whose setpoint has none
-    of its own: the step is the setpoint less the level in `loop.x0`, if it is more than AWAY of the
-    setpoint.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> case = presets.load("cascaded/pi")
-    >>> [len(windows(case.loop, case.clock)), float(windows(case.loop, case.clock)[0][1][-1])]
-    [1, 2.0]
     """
+    # A start away from the setpoint counts as a change at t = 0 of an output whose setpoint has
+    # none of its own: the step is the setpoint less the level in `loop.x0`, if it is more than AWAY
+    # of the setpoint.
     reference: Any = loop.reference
     if arrays and serves_arrays(reference):
         return _array_windows(loop, times)

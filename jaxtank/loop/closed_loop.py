@@ -1,7 +1,4 @@
-"""The closed loop: its components, its state, and what is known of each sample beforehand.
-
-May import the folders below `jaxtank.loop` only; the other modules of `loop` import this one.
-"""
+"""The closed loop: its components, its state, and what is known of each sample beforehand."""
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false
 
@@ -114,12 +111,6 @@ class Inputs(NamedTuple):
 def takes_arrays(loop: ClosedLoop) -> bool:
     """Return whether the vectors of a run of this loop are arrays: those of many tanks, of a plant
     and faults that take them.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> takes_arrays(presets.load("cascaded/pi").loop)
-    False
     """
     parts = [part for part in (loop.plant, loop.faults) if part is not None]
     return loop.plant.tanks >= vectors.FROM and all(map(serves_arrays, parts))
@@ -136,8 +127,6 @@ def inputs(
 ) -> Inputs:
     """Return the samples of references, disturbances and noise, and what the measures `names` refer
     to; of a long run's `batch`, a number, its `samples` alone. arrays: the form of vectors.
-
-    Raises InputError for a measure that means nothing for this loop.
     """
     times: Any = clock
     if batch is not None:

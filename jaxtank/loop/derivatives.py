@@ -1,7 +1,4 @@
-"""Exact derivatives of the measures, carried along with the run (forward mode).
-
-May import `loop.closed_loop`, `loop.step` and the folders below `jaxtank.loop`.
-"""
+"""Exact derivatives of the measures, carried along with the run (forward mode)."""
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false
 
@@ -207,9 +204,7 @@ def _pushed(
 def _pushed_stored(
     f: Callable[..., Any], point: tuple[Any, ...], *tangents: Any, ins: Any = -1, outs: Any = -1
 ) -> Any:
-    """`_pushed`, where what the tangents are multiplied by is computed once and stored. For many
-    runs side by side: of one alone, fetching costs more.
-    """
+    """`_pushed`, where what the tangents are multiplied by is computed once and stored."""
     linearize = cast(Any, jax.linearize)
     value, linear, rest = linearize(f, *point, has_aux=True)
     converted = cast(Any, jax.closure_convert(linear, *point))

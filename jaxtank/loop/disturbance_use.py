@@ -1,7 +1,4 @@
-"""Whether a disturbance that the observer of a loop estimates has an effect on its inputs.
-
-May import the folders below `jaxtank.loop`.
-"""
+"""Whether a disturbance that the observer of a loop estimates has an effect on its inputs."""
 # jax leaves the types of eval_shape and trees partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # pyright: reportUnknownVariableType=false
@@ -18,25 +15,9 @@ from jaxtank.xla.reachability import use_of
 
 
 def is_unused(loop: ClosedLoop) -> bool:
-    """Return True if the observer estimates disturbances and the controller does not use them.
-
-    Found by tracing one sample, so that controllers of a user's own are judged too; nothing is
-    computed. False where a setting of the controller states that they are not to be used.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-
-    Returns
-    -------
-    bool
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> is_unused(presets.find("gouta2022/chadpc").loop)
-    False
-    """
+    """Return True if the observer estimates disturbances and the controller does not use them."""
+    # Found by tracing one sample, so that controllers of a user's own are judged too; nothing is
+    # computed. False where a setting of the controller states that they are not to be used.
     if loop.controller.ignores_disturbance:
         return False
     number = jax.ShapeDtypeStruct((), jnp.result_type(float))

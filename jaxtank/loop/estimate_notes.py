@@ -1,7 +1,5 @@
 """What the estimates of an observer contain besides inflows: offset dead zones, and the error of a
 model that is linearised once.
-
-May import the folders below `jaxtank.loop`.
 """
 # jax leaves the types of asarray and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
@@ -28,12 +26,6 @@ FAR = 0.1
 def withheld(loop: ClosedLoop) -> Any:
     """Return (n,) rates [cm/s] that the offset dead zones of running pumps take from what the
     observer expects: part of any estimate of a disturbance.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> [round(float(v), 3) for v in withheld(presets.find("gouta2022/chadpc").loop)]
-    [-0.425, -0.667]
     """
     plant, bank = loop.plant, loop.actuator
     x = tuple(np.asarray(loop.x0, dtype=float))

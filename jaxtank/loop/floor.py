@@ -1,7 +1,5 @@
 """The bottom of a tank: whether liquid can be drawn out of a rig, and runs in which a level fell
 below it.
-
-May import the folders below `jaxtank.loop`.
 """
 
 from typing import Any, cast
@@ -21,12 +19,6 @@ class FloorWarning(UserWarning):
 def draws(loop: ClosedLoop) -> bool:
     """Return whether anything can take liquid out of a tank besides its outlets: an inflow below 0,
     or a pump that may run backwards.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> draws(presets.find("gouta2015/ngpc").loop), draws(presets.find("cascaded/pi").loop)
-    (False, True)
     """
     actuator: Any = loop.actuator
     numbers = [getattr(actuator, name, 0.0) for name in ("low", "initial")]

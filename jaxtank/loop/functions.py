@@ -1,7 +1,4 @@
-"""Measures that are a function of a whole run: which other measures they read, and their values.
-
-May import `loop.closed_loop`, `loop.saved_rows` and the folders below `jaxtank.loop`.
-"""
+"""Measures that are a function of a whole run: which other measures they read, and their values."""
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false
 
@@ -54,8 +51,6 @@ class Measures(Mapping[str, Any]):
 def needed_by(loop: ClosedLoop, clock: Clock, names: tuple[str, ...]) -> tuple[str, ...]:
     """Return those of `names` that are kept along with the run, and those that functions among
     `names` read.
-
-    Raises InputError as `check_functions`.
     """
     own = ms.functions(names)
     read = (m for name, spec in own.items() for m in _read_by(loop, clock, name, spec))
@@ -69,10 +64,9 @@ _PROGRAMS: dict[Any, str] = {}
 def check_functions(loop: ClosedLoop, clock: Clock, names: tuple[str, ...]) -> None:
     """Raise InputError for a function among `names` that jax cannot trace, that reads a measure
     which this rig does not have, or that does not return one real number.
-
-    A function whose program is another than at the last call, because a number that it closes over
-    or a global one has changed, is compiled again: jax would run the first one.
     """
+    # A function whose program is another than at the last call, because a number that it closes
+    # over or a global one has changed, is compiled again: jax would run the first one.
     needed_by(loop, clock, names)
     for name in ms.functions(names):
         where: Any = (name, jax.tree.structure(loop), clock)
@@ -91,9 +85,8 @@ def values_of(
     measures: Mapping[str, Any],
     checkpoint: bool = False,
 ) -> dict[str, Any]:
-    """Return {name: value} of `names`: those of `measures`, and functions of them and of the run.
-
-    key: of the sensor noise, as of the run that `measures` are of. checkpoint: for reverse mode.
+    """Return {name: value} of `names`: those of `measures`, and functions of them and of
+    the run.
     """
     own, served, zero = ms.functions(names), _served(loop), zero_of(loop)
     rows: dict[int, Any] = {}

@@ -1,7 +1,4 @@
-"""The error of a run by its steps, measured: against the same run with steps of half the length.
-
-May import the other modules of `loop` and the folders below.
-"""
+"""The error of a run by its steps, measured: against the same run with steps of half the length."""
 # jax leaves the types of its trees partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 
@@ -30,9 +27,6 @@ MOST = 4
 def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> list[str]:
     """Return a sentence on how far levels, inputs and measures of a run are from those with half
     the steps; none where steps are short enough for tanks that run empty, or it does not show.
-
-    Raises InputError for a run that is wrong: `step_size.check_run`, and where a level differs by
-    more than 5 % of the rim, or of the levels that the run is about.
     """
     unstable = list(step_size.unstable_tanks(loop, clock))
     if not unstable:

@@ -1,7 +1,4 @@
-"""Running measures of one loop at many values, in batches that fit the cache, or in a kernel.
-
-May import `loop.run` and the folders below `jaxtank.loop`.
-"""
+"""Running measures of one loop at many values, in batches that fit the cache, or in a kernel."""
 # jax leaves the types of its trees partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 # pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false

@@ -1,6 +1,5 @@
-"""Stability margins of a closed loop: at the steady state of every plateau, and the worst of them.
-
-May import `loop.operating_point`, `loop.validation` and the folders below `jaxtank.loop`.
+"""Stability margins of a closed loop: at the steady state of every plateau, and the worst
+of them.
 """
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
@@ -95,10 +94,8 @@ def serves(loop: ClosedLoop) -> bool:
 
 
 def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
-    """(setpoints (P, outputs), Linearised, Margins), each with the plateaus in front.
-
-    What does not matter is left out first, so that loops that differ in it share a program.
-    """
+    """(setpoints (P, outputs), Linearised, Margins), each with the plateaus in front."""
+    # What does not matter is left out first, so that loops that differ in it share a program.
     if zero_of(loop).dtype != jnp.float64:
         raise InputError(
             "stability margins need float64: call jax.config.update('jax_enable_x64', True) first,"
@@ -145,12 +142,7 @@ def _compiled(loop: ClosedLoop, clock: Clock, r: Any, slopes: bool) -> tuple[Any
 
 
 def worst(loop: ClosedLoop, clock: Clock) -> ms.Worst:
-    """Return the worst margins of all plateaus, for the measures: differentiable, and vmaps.
-
-    A plateau without a usable steady state is left out. Where none is left, NaN; where the loop is
-    unstable at one, the worst value that there is: infinite for the sensitivity peak, minus
-    infinite for the margins.
-    """
+    """Return the worst margins of all plateaus, for the measures: differentiable, and vmaps."""
     _, linear, found = _of_plateaus(loop, clock)
     xp: Any = np if isinstance(linear.why, np.ndarray) else jnp  # by numpy nothing is compiled
     good, unstable = linear.why == 0, (linear.why == 0) & ~found.stable

@@ -1,7 +1,4 @@
-"""Steady states of the closed loop, and one sample of it linearised there, broken at the pumps.
-
-May import `loop.closed_loop`, `loop.step` and the folders below `jaxtank.loop`.
-"""
+"""Steady states of the closed loop, and one sample of it linearised there, broken at the pumps."""
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # pyright: reportUnknownVariableType=false, reportUnknownLambdaType=false
@@ -58,33 +55,12 @@ class Linearised(NamedTuple):
 
 
 def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
-    """Return one sample of the loop linearised at the steady state of constant setpoints.
-
-    The loop is broken between what the actuator is given and the pumps: its dead time and its lag
-    belong to the open loop. Sensors without noise and ADC, pumps without limits, without safety
-    filter, inflow pulses and faults; a steady inflow stays. Newton's method finds the state at
-    which a sample changes nothing, of a stable and of an unstable loop; derivatives are those of
-    the implicit function. Where a steady state cannot be used (`why`), A, B and C are 0.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    clock : Clock
-    r : (outputs,) setpoints [cm]
-
-    Returns
-    -------
-    Linearised
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> jax.config.update("jax_enable_x64", True)
-    >>> case = presets.find("cascaded/pi")
-    >>> found = jax.jit(lambda r: linearised(case.loop, case.clock, r).why)(jnp.array([5.0]))
-    >>> REASONS[int(found)]
-    ''
-    """
+    """Return one sample of the loop linearised at the steady state of constant setpoints."""
+    # The loop is broken between what the actuator is given and the pumps: its dead time and its lag
+    # belong to the open loop. Sensors without noise and ADC, pumps without limits, without safety
+    # filter, inflow pulses and faults; a steady inflow stays. Newton's method finds the state at
+    # which a sample changes nothing, of a stable and of an unstable loop; derivatives are those of
+    # the implicit function. Where a steady state cannot be used (`why`), A, B and C are 0.
     quiet, dead = _without_limits(loop, clock)
     found, alone = _rest(clock, quiet, r), _plant_at_rest(quiet, r)
     (closed, B, C, after, u), s, kink = found.slopes, found.s, found.kink

@@ -41,20 +41,9 @@ class Rows(NamedTuple):
 def rows_and_measures(
     loop: ClosedLoop, clock: Clock, key: jax.Array | None, save_every: int, names: tuple[str, ...]
 ) -> tuple[Rows, dict[str, jax.Array], jax.Array]:
-    """Return (Rows, {measure: value}, True if the run diverged), unchecked.
-
-    The rows are those of `simulate`, the measures those of `evaluate`; functions of the user's and
-    stability margins are not among them.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> loop = presets.find("cascaded/pi").loop
-    >>> clock = Clock(dt=4.0, duration=40.0)
-    >>> rows, measures, broken = rows_and_measures(loop, clock, None, 5, ("max_level",))
-    >>> rows.x.shape, measures["max_level"].shape, bool(broken)
-    ((3, 2), (2,), False)
-    """
+    """Return (Rows, {measure: value}, True if the run diverged), unchecked."""
+    # The rows are those of `simulate`, the measures those of `evaluate`; functions of the user's
+    # and stability margins are not among them.
     loop, arrays = keyed(loop, key), takes_arrays(loop)
     run: Any = run_of(loop, clock, arrays)
     xs: Any = inputs(loop, clock, names, key, arrays=arrays)

@@ -1,8 +1,7 @@
 """A whole run: a trajectory for people, measures for tuning, and exact derivatives of the measures.
 
 Row k of a run is the state at t_k: y_k is measured, u_k is computed, and held over [t_k, t_k + dt).
-All are pure: jit, vmap, grad and jacfwd work on them with the loop as an argument. May import the
-other modules of `loop` and the folders below.
+All are pure: jit, vmap, grad and jacfwd work on them with the loop as an argument.
 """
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false
@@ -198,10 +197,9 @@ def evaluate_for_reverse(
 ) -> dict[str, jax.Array]:
     """Return `evaluate`'s values by a run cut into about sqrt(samples) chunks that are recomputed
     on the way back, for reverse mode.
-
-    Same values, but never NonFiniteError; memory of a gradient grows with the root of the
-    samples. Best above about ten parameters.
     """
+    # Same values, but never NonFiniteError; memory of a gradient grows with the root of the
+    # samples. Best above about ten parameters.
     names = _names(measures)
     check(loop, clock, key)
     return evaluate_compiled(loop, clock, names, key, True)[0]
@@ -331,9 +329,7 @@ def evaluate_compiled(
 def _report_broken(
     broken: jax.Array, loop: ClosedLoop, clock: Clock, key: jax.Array | None
 ) -> None:
-    """Raise NonFiniteError for a run that diverged, with time, tank and the controller's values.
-    Nothing inside a trace.
-    """
+    """Raise NonFiniteError for a run that diverged, with time, tank and the controller's values."""
     if isinstance(broken, Tracer) or np.ndim(broken) or not broken:
         return
     loop = jax.lax.stop_gradient(loop)  # under grad its leaves are known, and traced all the same

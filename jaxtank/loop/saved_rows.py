@@ -1,5 +1,5 @@
 """A run that keeps every so many samples, compiled: what `simulate` and functions of a trajectory
-call. May import `loop.closed_loop`, `loop.step`, `loop.trajectory` and the folders below.
+call.
 """
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false
@@ -31,10 +31,7 @@ from jaxtank.xla.jit import compiled
 def simulate_compiled(
     loop: ClosedLoop, clock: Clock, key: jax.Array | None, save_every: int, checkpoint: bool = False
 ) -> tuple[Trajectory, jax.Array]:
-    """Return (Trajectory, True if the run diverged), unchecked.
-
-    checkpoint: for reverse mode, each row is recomputed on the way back.
-    """
+    """Return (Trajectory, True if the run diverged), unchecked."""
     loop, arrays = keyed(loop, key), takes_arrays(loop)
     rows = (clock.samples - 1) // save_every + 1
     spare = rows * save_every - clock.samples  # steps after the last row: run, but not kept

@@ -1,6 +1,5 @@
-"""The steady state of a closed loop: with its inflow, the dead zones and the limits of its pumps.
-
-May import the folders below `jaxtank.loop`.
+"""The steady state of a closed loop: with its inflow, the dead zones and the limits of
+its pumps.
 """
 
 from typing import Any
@@ -25,32 +24,7 @@ def steady_inflow(loop: Any) -> Any:
 
 
 def steady_state(loop: Any, y: Any, plant: Any = None) -> tuple[Any, Any]:
-    """Return levels and inputs at which a loop stands still with outputs y.
-
-    The inputs are those at the pumps: with an offset dead zone by so much above what moves liquid.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    y : (outputs,) levels [cm]
-    plant : in place of the loop's own, such as the model of its controller
-
-    Returns
-    -------
-    (levels (n,) [cm], inputs (m,) [V]) as host arrays
-
-    Raises
-    ------
-    EquilibriumError, naming the tank or the pump, where a flow would have to run backwards or an
-    input to be below what its pump can give; inputs above the upper limits are returned.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> loop = presets.find("gouta2022/pi").loop
-    >>> (steady_state(loop, (8.0, 10.0))[1] - loop.actuator.dead_zone).round(2).tolist()
-    [1.18, 4.82]
-    """
+    """Return levels and inputs at which a loop stands still with outputs y."""
     low = loop.actuator.driving(tuple(np.asarray(loop.actuator.low, dtype=float)))
     x, u = equilibrium(
         loop.plant if plant is None else plant, y, steady_inflow(loop), np.asarray(low, dtype=float)

@@ -1,7 +1,6 @@
 """One sample of the closed loop: the order of its parts, written once.
 
-Simulation, derivatives, export and Gymnasium call it. May import `loop.closed_loop` and the folders
-below `jaxtank.loop`.
+Simulation, derivatives, export and Gymnasium call it.
 """
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false
@@ -67,24 +66,8 @@ def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[Sta
 def decide(
     loop: ClosedLoop, observer: Any, controller: Any, tick: Tick, y: Sequence[Any]
 ) -> Decision:
-    """Return what observer and controller make of one sample: the order of a sample, written once.
-
-    The observer corrects its estimate by the readings, the controller commands, the actuator limits
-    the command, and both are given what was applied. Simulation and export call it.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    observer, controller : tree
-        Their states before the sample.
-    tick : Tick
-        What is known at its time.
-    y : (n) sequence
-        Readings [cm].
-
-    Returns
-    -------
-    Decision
+    """Return what observer and controller make of one sample: the order of a sample,
+    written once.
     """
     guard, line = loop.safety_filter, None
     if guard is not None and guard.predicted:
@@ -176,11 +159,9 @@ def time_of(state: State, clock: Clock) -> Any:
 def commanded(
     loop: ClosedLoop, state: Any, tick: Tick, estimate: Estimate
 ) -> tuple[Sequence[Any], Any]:
-    """Return the controller's ((m,) inputs before their limits, new state).
-
-    Raises InputError, while the loop is traced, for a number of inputs that is not that of the
-    pumps, and for an input that is no single real number.
-    """
+    """Return the controller's ((m,) inputs before their limits, new state)."""
+    # Raises InputError, while the loop is traced, for a number of inputs that is not that of the
+    # pumps, and for an input that is no single real number.
     seen = _seen_by(loop.controller, tick)
     command, state = loop.controller.step(state, seen, _seen(loop, estimate))
     _check_command(command, loop.plant.pumps, type(loop.controller).__name__)

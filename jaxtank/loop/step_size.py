@@ -1,7 +1,5 @@
 """Integration steps too long for a tank that runs empty: there the explicit step is unstable.
 
-May import the folders below `jaxtank.loop`.
-
 Near its bottom a tank of area A with outlets a_j (and pipes p_k) empties at the rate
 
     lambda = sqrt(2 g) (1.5 sum a_j + 2 sum p_k) / (A sqrt(threshold))    [1/s]

@@ -1,6 +1,5 @@
-"""A run for people: arrays with one row per saved sample, as text, table, JSON, CSV and pictures.
-
-May import `jaxtank.core`; pictures are drawn by `jaxtank.plots`, opened when they are asked for.
+"""A run for people: arrays with one row per saved sample, as text, table, JSON, CSV and
+pictures.
 """
 
 import dataclasses
@@ -169,35 +168,7 @@ class Trajectory:
 def columns(
     run: Trajectory, units: tuple[str, str] = DEFAULT, dimension: str | None = None
 ) -> dict[str, Any]:
-    """Return the columns of a Trajectory, for pandas or xarray.
-
-    Time, levels h, readings y, estimates, setpoints r, inputs u, commands, and what was lost over
-    the rims.
-
-    Parameters
-    ----------
-    run : Trajectory
-        As `jaxtank.simulate` returns it.
-    units : (length, pump input)
-        Of the rig, `loop.units`.
-    dimension : str, optional
-        Name of the one dimension that all columns share in xarray.
-
-    Returns
-    -------
-    {"h1 [cm]": (rows,) array} without a dimension: `pandas.DataFrame(columns(run))`.
-    {"h1": ("t", (rows,) array, {"units": "cm"})} with dimension="t", time being its coordinate "t":
-    `xarray.Dataset(columns(run, dimension="t"))`.
-
-    Examples
-    --------
-    >>> import jaxtank
-    >>> from jaxtank import presets
-    >>> loop = presets.load("cascaded/open-loop").loop
-    >>> run = jaxtank.simulate(loop, jaxtank.Clock(dt=4.0, duration=8.0))
-    >>> list(columns(run, loop.units))[:3]
-    ['t [s]', 'h1 [V]', 'h2 [V]']
-    """
+    """Return the columns of a Trajectory, for pandas or xarray."""
     found: dict[tuple[str, str], Any] = {("t", "s"): np.asarray(run.t)}
     for name, field, unit in FIELDS:
         if getattr(run, field) is None:  # not of this controller
@@ -215,16 +186,9 @@ def columns(
 
 
 def stride(samples: int, rows: int = 3000) -> int:
-    """Return the distance of saved samples that leaves about `rows` of them.
-
-    It is odd, so that a pump that chatters from sample to sample is not drawn as one that is
-    constant, and ends at the end where it can.
-
-    Examples
-    --------
-    >>> stride(120_001), stride(701)
-    (75, 1)
-    """
+    """Return the distance of saved samples that leaves about `rows` of them."""
+    # It is odd, so that a pump that chatters from sample to sample is not drawn as one that is
+    # constant, and ends at the end where it can.
     steps = samples - 1
     least = max(1, steps // rows)
     return next((k for k in range(least, 2 * least + 1) if k % 2 and steps % k == 0), least | 1)

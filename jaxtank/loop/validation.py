@@ -1,7 +1,4 @@
-"""Input validation of a loop and a clock, before anything is compiled.
-
-May import `loop.closed_loop`, `loop.step_size` and the folders below `jaxtank.loop`.
-"""
+"""Input validation of a loop and a clock, before anything is compiled."""
 # jax leaves the types of its trees partly open.
 # pyright: reportUnknownMemberType=false
 
@@ -204,11 +201,7 @@ def _check_noise(loop: ClosedLoop) -> None:
 
 
 def check_shapes(loop: ClosedLoop) -> None:
-    """Raise InputError for a leaf of `loop` that has not the shape that its class gives it.
-
-    Leaves of a batch may have the axes in front that x0 has; sizes that a component knows alone
-    (changes, inflow pulses, knots) are its own to check.
-    """
+    """Raise InputError for a leaf of `loop` that has not the shape that its class gives it."""
     _check_shapes(loop, "", {}, np.shape(loop.x0)[:-1])
 
 

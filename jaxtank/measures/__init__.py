@@ -2,7 +2,7 @@
 
 `catalogue` holds the measures, `accumulators` what the loop carries for them, `registry` what is
 known of them by name, `running` what the loop calls, `functions` those that are a function of a
-whole run. May import `jaxtank.core` only.
+whole run.
 """
 
 from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context, Run, Worst

@@ -1,6 +1,6 @@
 """What the time loop carries for each measure: running sums, extremes and times.
 
-`measures.catalogue` names what it reads of them. May import `jaxtank.core` only.
+`measures.catalogue` names what it reads of them.
 """
 
 import operator

@@ -2,8 +2,7 @@
 
 A measure reads accumulators at the end of a run. Means are over its N + 1 samples, t = 0 to T.
 Integrals and volumes are over [0, T]: sums over the first N samples, each held for dt, which is
-exact for inputs and volumes, and the left rectangle rule for levels. May import `jaxtank.core` and
-the modules of `measures` that it imports only.
+exact for inputs and volumes, and the left rectangle rule for levels.
 """
 
 from typing import Any

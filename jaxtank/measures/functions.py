@@ -1,7 +1,4 @@
-"""Measures of a user's own that are a function of other measures and of the trajectory.
-
-May import the other modules of `measures` only; `jaxtank.loop.functions` computes them.
-"""
+"""Measures of a user's own that are a function of other measures and of the trajectory."""
 
 import dataclasses
 import inspect

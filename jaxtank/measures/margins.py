@@ -1,6 +1,6 @@
 """Measures of the linearised loop: stability margins, the worst of all plateaus.
 
-`loop.margins` computes them. May import `measures.measure` only.
+`loop.margins` computes them.
 """
 
 from typing import Any

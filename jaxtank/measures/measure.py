@@ -1,7 +1,4 @@
-"""What is known of a measure: the fields of its entry in the catalogue.
-
-May import `measures.accumulators` only.
-"""
+"""What is known of a measure: the fields of its entry in the catalogue."""
 
 import math
 from collections.abc import Callable

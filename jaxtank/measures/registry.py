@@ -1,7 +1,4 @@
-"""Which measures there are and what is known of them by name; a user's own are registered here.
-
-May import `jaxtank.core` and the other modules of `measures` only.
-"""
+"""Which measures there are and what is known of them by name; a user's own are registered here."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping

@@ -1,7 +1,4 @@
-"""What the time loop calls: start, update and read the accumulators that some measures need.
-
-May import `jaxtank.core` and the other modules of `measures` only.
-"""
+"""What the time loop calls: start, update and read the accumulators that some measures need."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, cast

@@ -1,7 +1,4 @@
-"""Input validation that observers share: their model, and the tanks that they name.
-
-Imported by the observers of this folder.
-"""
+"""Input validation that observers share: their model, and the tanks that they name."""
 
 import jax
 import numpy as np
@@ -47,19 +44,10 @@ def check_tanks(observer, name, plant, least=1):
 
 
 def check_disturbed(observer, plant, levels, shares: ArrayLike = 1.0):
-    """Raise InputError unless the disturbances of a Kalman filter can be found.
-
-    A constant disturbance of the rates of the tanks `disturbed` shows in the readings if [[A, E],
-    [C, 0]] has full column rank, A the slope of the level rates, E and C the columns and rows of
-    the identity of `disturbed` and `measured` (Popov, Belevitch and Hautus, at the eigenvalue 0).
-
-    Parameters
-    ----------
-    observer : with `disturbed`, `measured` and `walk`
-    plant : of the loop
-    levels, shares : (n,) A is taken at levels [cm] times shares [-]; nothing is checked where
-        they or the model are traced
-    """
+    """Raise InputError unless the disturbances of a Kalman filter can be found."""
+    # A constant disturbance of the rates of the tanks `disturbed` shows in the readings if [[A, E],
+    # [C, 0]] has full column rank, A the slope of the level rates, E and C the columns and rows of
+    # the identity of `disturbed` and `measured` (Popov, Belevitch and Hautus, at the eigenvalue 0).
     check_tanks(observer, "disturbed", plant, least=0)
     if not observer.disturbed:
         return

@@ -132,28 +132,7 @@ class DisturbanceObserver(Observer):
 
 
 def level_rates(model, x, u):
-    """Return f(h) + g u of every tank: the level rates of the model.
-
-    Of a network f is computed first, and what the pumps bring is added to it, as gouta2022 eq. (3)
-    has it: the order of the sum decides the last bit of recorded runs.
-
-    Parameters
-    ----------
-    model : plant
-    x : (n) levels [cm]
-    u : (m) inputs [V]
-
-    Returns
-    -------
-    Tuple of rates, one per tank [cm/s]
-
-    Examples
-    --------
-    >>> from jaxtank.plants import network
-    >>> tank = network(area=[25.0], drain=[0.3], pump_gain=[8.0], feeds=[(0, None)], rim=[30.0])
-    >>> [round(float(rate), 3) for rate in level_rates(tank, (4.0,), (6.0,))]
-    [0.857]
-    """
+    """Return f(h) + g u of every tank: the level rates of the model."""
     shares = getattr(model, "shares", None)
     if shares is None:
         return tuple(model.derivative(0.0, tuple(x), tuple(u), None))

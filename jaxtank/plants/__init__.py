@@ -1,5 +1,5 @@
 """Plants: vector fields of levels. `TankNetwork` serves every rig; a named rig is a function that
-builds one. Imports core and xla.
+builds one.
 """
 
 from jaxtank.plants.base import Plant

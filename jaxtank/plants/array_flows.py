@@ -1,7 +1,6 @@
 """The flows of a `TankNetwork` of many tanks on arrays: the same formulas, by fixed gathers.
 
-The number of operations does not depend on the number of tanks. Imports core, xla and modules of
-plants; `tank_network` calls it where levels are arrays.
+The number of operations does not depend on the number of tanks.
 """
 
 from typing import Any

@@ -1,7 +1,4 @@
-"""The role Plant: what a closed loop, observers and model-based controllers ask of a plant.
-
-Imports core only; may be imported by every folder above.
-"""
+"""The role Plant: what a closed loop, observers and model-based controllers ask of a plant."""
 
 import abc
 from collections.abc import Callable, Sequence

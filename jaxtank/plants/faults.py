@@ -1,7 +1,4 @@
-"""Faults: parameters of the plant that change for a while.
-
-Imports core and the role Plant; may be imported by every folder above.
-"""
+"""Faults: parameters of the plant that change for a while."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -147,24 +144,7 @@ class Faults:
 
 
 def faults(plant, entries):
-    """Return a `Faults` built from a list.
-
-    Parameters
-    ----------
-    plant : Plant
-    entries : (entry of the plant, start [s], end [s], factor [-], extra [unit of the entry]) each
-
-    Raises
-    ------
-    InputError for an entry that the plant does not have, and for a window that ends before it
-    starts.
-
-    Examples
-    --------
-    >>> from jaxtank.plants import state_coupled_four_tank
-    >>> faults(state_coupled_four_tank(15.0), [("drain[0]", 9.0, 10.0, 1.0, 0.2)]).extra
-    array([0.2])
-    """
+    """Return a `Faults` built from a list."""
     for name, start, end, _, _ in entries:
         if np.ndim(get_value(plant, name)) != 0 or not split_index(name)[1]:
             raise InputError(f"fault of {name}: name one entry, as in {name}[0]")

@@ -1,7 +1,4 @@
-"""Physical relations and constants of tanks: scalars or arrays, lengths in the rig's unit.
-
-Imports core only; may be imported by every folder above.
-"""
+"""Physical relations and constants of tanks: scalars or arrays, lengths in the rig's unit."""
 
 import math
 
@@ -26,30 +23,13 @@ PER_CENTIMETRE = {
 
 
 def in_unit(centimetres, length):
-    """Return a length [cm], or acceleration [cm/s^2], in the unit `length` of a rig.
-
-    Unchanged where `length` is no unit of length: levels in the volts of a sensor have no other
-    scale.
-
-    Examples
-    --------
-    >>> in_unit(981.0, "m"), in_unit(0.01, "V")
-    (9.81, 0.01)
-    """
+    """Return a length [cm], or acceleration [cm/s^2], in the unit `length` of a rig."""
     return centimetres * PER_CENTIMETRE.get(length, 1.0)
 
 
 def default_gravity(length):
-    """Return the acceleration g [length/s^2] of a rig whose unit of length is `length`: 981 cm/s^2.
-
-    Raises
-    ------
-    InputError where `length` is no unit of length, as the volts of a sensor.
-
-    Examples
-    --------
-    >>> default_gravity("m")
-    9.81
+    """Return the acceleration g [length/s^2] of a rig whose unit of length is `length`:
+    981 cm/s^2.
     """
     if length not in PER_CENTIMETRE:
         raise InputError(
@@ -60,43 +40,15 @@ def default_gravity(length):
 
 
 def default_threshold(length):
-    """Return the default laminar threshold, 0.01 cm, in the unit `length` of a rig.
-
-    Examples
-    --------
-    >>> default_threshold("mm")
-    0.1
-    """
+    """Return the default laminar threshold, 0.01 cm, in the unit `length` of a rig."""
     return in_unit(LAMINAR_THRESHOLD, length)
 
 
 def disc(diameter):
-    """Return the area of a disc [cm^2] of `diameter` [cm]: s = pi d^2 / 4.
-
-    Examples
-    --------
-    >>> round(disc(2.0), 4)
-    3.1416
-    """
+    """Return the area of a disc [cm^2] of `diameter` [cm]: s = pi d^2 / 4."""
     return math.pi * diameter**2 / 4
 
 
 def efflux(level, gravity, threshold):
-    """Return Torricelli's speed of efflux v = sqrt(2 g h), C1 through zero (`smooth_sqrt`).
-
-    Parameters
-    ----------
-    level : (...) h [cm]
-    gravity : g [cm/s^2]
-    threshold : laminar threshold [cm]
-
-    Returns
-    -------
-    (...) [cm/s]
-
-    Examples
-    --------
-    >>> round(float(efflux(10.0, 981.0, 0.01)), 2)
-    140.07
-    """
+    """Return Torricelli's speed of efflux v = sqrt(2 g h), C1 through zero (`smooth_sqrt`)."""
     return jnp.sqrt(2.0 * gravity) * smooth_sqrt(level, threshold)

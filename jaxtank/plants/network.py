@@ -1,7 +1,4 @@
-"""Building a `TankNetwork` from plain numbers, and checking its topology.
-
-Imports core and modules of plants; other folders import it from `jaxtank.plants`.
-"""
+"""Building a `TankNetwork` from plain numbers, and checking its topology."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -24,25 +21,7 @@ SURPLUS = 1e-6
 
 
 def check_caught(plant: Plant, name: str = "plant") -> None:
-    """Check that no tank's overflow is caught more than once: volume would come from nowhere.
-
-    Parameters
-    ----------
-    plant : one whose shares are traced or of a batch, or that has none, is passed over
-    name : what messages call it
-
-    Raises
-    ------
-    InputError, naming the tank and the shares.
-
-    Examples
-    --------
-    >>> rig = network(
-    ...     area=15.0, drain=0.2, pump_gain=5.0, feeds=[(0, None)], rim=20.0, spills=[(0, 1)],
-    ...     caught=0.5
-    ... )
-    >>> check_caught(rig)
-    """
+    """Check that no tank's overflow is caught more than once: volume would come from nowhere."""
     shares: Any = getattr(plant, "caught", None)
     if isinstance(shares, Tracer) or np.ndim(shares) != 1:
         return

@@ -1,7 +1,4 @@
-"""Overflow at the rims: in which order tanks overflow into each other, and overflow on arrays.
-
-Imports core, xla and modules of plants; `tank_network` calls it.
-"""
+"""Overflow at the rims: in which order tanks overflow into each other, and overflow on arrays."""
 
 import functools
 from typing import Any, NamedTuple
@@ -24,11 +21,6 @@ Pairs = tuple[tuple[int, int], ...]
 def downwards(spills: Pairs, tanks: int) -> tuple[list[int], list[int]]:
     """Return (every tank, after those that overflow into it; the tanks of rings, where there is no
     such order): what a tank receives must be in it before its own overflow is computed.
-
-    Examples
-    --------
-    >>> downwards(((2, 0), (0, 1)), 3), downwards(((0, 1), (1, 0)), 2)
-    (([2, 0, 1], []), ([0, 1], [0, 1]))
     """
     below: list[list[int]] = [[] for _ in range(tanks)]
     waits = [0] * tanks
@@ -61,13 +53,7 @@ class Cascade(NamedTuple):
 
 @functools.lru_cache(maxsize=256)
 def cascade(spills: Pairs, tanks: int) -> Cascade:
-    """Return the Cascade of the spills of a rig.
-
-    Examples
-    --------
-    >>> cascade(((0, 1), (1, 2)), 3).depth
-    2
-    """
+    """Return the Cascade of the spills of a rig."""
     order, ring = downwards(spills, tanks)
     place = {tank: k for k, tank in enumerate(order)}
     forward = [k for k, (source, sink) in enumerate(spills) if place[source] < place[sink]]

@@ -1,5 +1,5 @@
 """The rigs of the papers: functions that build a `TankNetwork`, and their topologies, by which
-controllers check their model. Imports core and modules of plants.
+controllers check their model.
 """
 
 from collections.abc import Sequence
@@ -99,25 +99,7 @@ JOHANSSON = {
 
 
 def johansson(phase):
-    """Return Johansson's laboratory process (IEEE Trans. CST 8(3), 2000).
-
-    Parameters
-    ----------
-    phase : "minimum", where the pumps feed mostly the lower tanks (P-), or "non-minimum" (P+)
-
-    Returns
-    -------
-    (rig, operating voltages (2,) [V])
-
-    Raises
-    ------
-    InputError for another phase.
-
-    Examples
-    --------
-    >>> johansson("non-minimum")[1]
-    (3.15, 3.15)
-    """
+    """Return Johansson's laboratory process (IEEE Trans. CST 8(3), 2000)."""
     if phase not in JOHANSSON:
         raise InputError(f"phase = {phase!r}: must be one of {', '.join(JOHANSSON)}")
     pump_gain, split, voltages = JOHANSSON[phase]
@@ -172,22 +154,7 @@ def coupled_tanks(
 
 
 def check_topology(model, like, **wanted):
-    """Check that the model of a controller is the rig that it inverts.
-
-    Parameters
-    ----------
-    model : Plant
-    like : that rig in words
-    wanted : its fields, such as links and feeds
-
-    Raises
-    ------
-    InputError, naming the field that differs.
-
-    Examples
-    --------
-    >>> check_topology(state_coupled_four_tank(15.0), "a four-tank", feeds=STATE_COUPLED_FEEDS)
-    """
+    """Check that the model of a controller is the rig that it inverts."""
     for name, value in wanted.items():
         if getattr(model, name, None) != value:
             raise InputError(

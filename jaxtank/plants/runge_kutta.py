@@ -1,7 +1,4 @@
-"""Integration of a plant over a sample: the only copy, for the loop, observers and experiments.
-
-Imports core and xla only.
-"""
+"""Integration of a plant over a sample: the only copy, for the loop, observers and experiments."""
 
 import operator
 from collections.abc import Sequence
@@ -39,36 +36,7 @@ def advance(
     excess: Sequence[Any] = (),
     rolled: bool = False,
 ) -> Advanced:
-    """Return the plant's levels a sample later, with overflow after each of its substeps.
-
-    Parameters
-    ----------
-    plant : Plant
-    integrator : "rk4" or "midpoint"
-    t : time at the start of the sample [s]
-    x : (n) levels [cm]
-    u : (m) inputs at the plant, held over the sample [V]
-    d : (n) inflows, held over the sample [cm^3/s], or None
-    dt : length of the sample [s]
-    substeps : number of integrator steps, of equal length; may be traced where `rolled`
-    excess : (n) of the sample before [cm]: sums are compensated (float32); () for plain sums
-    rolled : a compiled loop over the substeps. Many unrolled steps take minutes to compile with
-        their derivatives; one that may be traced cannot be differentiated in reverse mode.
-
-    Returns
-    -------
-    Advanced
-
-    Examples
-    --------
-    >>> from jaxtank.plants import state_coupled_four_tank
-    >>> empty = (0.0,) * 4
-    >>> found = advance(
-    ...     state_coupled_four_tank(15.0), "rk4", 0.0, empty, (3.0, 3.0), None, dt=1.0, substeps=2
-    ... )
-    >>> all(level >= 0.0 for level in found.x)
-    True
-    """
+    """Return the plant's levels a sample later, with overflow after each of its substeps."""
     h = dt / substeps
 
     def substep(j, before):
@@ -105,25 +73,7 @@ def integrate(plant, integrator, t, x, u, d, h):
 
 
 def euler(plant: Plant, x: Sequence[Any], rates: Sequence[Any], h: Any) -> tuple[Any, ...]:
-    """Return the levels a step `h` [s] later at given rates, with overflow: forward Euler.
-
-    Parameters
-    ----------
-    plant : Plant
-    x : (n) levels [cm]
-    rates : (n) [cm/s]
-    h : [s]
-
-    Returns
-    -------
-    (n) levels [cm]
-
-    Examples
-    --------
-    >>> from jaxtank.plants import state_coupled_four_tank
-    >>> euler(state_coupled_four_tank(15.0), (5.0,) * 4, (1.0, 2.0, 0.0, -1.0), 0.5)
-    (5.5, 6.0, 5.0, 4.5)
-    """
+    """Return the levels a step `h` [s] later at given rates, with overflow: forward Euler."""
     return tuple(plant.spill(_along(x, rates, h))[0])
 
 

@@ -1,7 +1,4 @@
-"""TankNetwork: tanks joined by orifices and pipes, filled by pumps; one class serves every rig.
-
-Imports core and modules of plants; other folders import it from `jaxtank.plants`.
-"""
+"""TankNetwork: tanks joined by orifices and pipes, filled by pumps; one class serves every rig."""
 
 import functools
 from collections.abc import Callable, Sequence

@@ -1,6 +1,6 @@
 """A run, or two beside each other, as a film: levels, what is above a rim, setpoints, inputs, time.
 
-Time runs slowly where much changes. Imported by reports and notebooks.
+Time runs slowly where much changes.
 """
 
 import hashlib
@@ -39,35 +39,6 @@ inputs change [-].
 def animate(loop, trajectory, path, seconds=8, against=None, titles=()):
     """Write a run as a GIF of at most 600 kB and return its path; the file is complete or not
     there.
-
-    Time passes slowly where levels, setpoints and inputs change. It needs Pillow, which matplotlib
-    installs.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    trajectory : of `jaxtank.simulate(loop, ...)`
-    path : ends in .gif
-    seconds : duration of the animation, 1 to 60 [s]
-    against : (ClosedLoop, Trajectory) of a second rig, drawn beside the first, or None
-    titles : names above the rigs
-
-    Raises
-    ------
-    InputError
-        For another duration or ending, for a trajectory of another rig, and for a rig of more than
-        24 tanks.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> import jaxtank
-    >>> from jaxtank import presets
-    >>> loop = presets.find("cascaded/pi").loop
-    >>> run = jaxtank.simulate(loop, jaxtank.Clock(dt=4.0, duration=40.0))
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     animate(loop, run, Path(folder) / "run.gif", seconds=1).name
-    'run.gif'
     """
     path = Path(path)
     if path.suffix.lower() != ".gif":
@@ -77,19 +48,7 @@ def animate(loop, trajectory, path, seconds=8, against=None, titles=()):
 
 
 def film(loop, trajectory, seconds=8, against=None, titles=()):
-    """Return (a GIF as bytes, a still as the bytes of a PNG file): the still shows four moments.
-
-    Parameters and errors as of `animate`.
-
-    Examples
-    --------
-    >>> import jaxtank
-    >>> from jaxtank import presets
-    >>> loop = presets.find("cascaded/pi").loop
-    >>> run = jaxtank.simulate(loop, jaxtank.Clock(dt=4.0, duration=40.0))
-    >>> [data[:3] for data in film(loop, run, seconds=1)]
-    [b'GIF', b'\x89PN']
-    """
+    """Return (a GIF as bytes, a still as the bytes of a PNG file): the still shows four moments."""
     with styled():
         scene = _scene(loop, trajectory, seconds, against, titles)
         pictures = []
@@ -103,20 +62,9 @@ def film(loop, trajectory, seconds=8, against=None, titles=()):
 
 
 def to_html(loop, trajectory, seconds=8, against=None, titles=()):
-    """Return a film as an HTML fragment with buttons, for `IPython.display.HTML` in a notebook.
-
-    It is complete: fonts and scripts are not loaded from the network. Parameters and errors as of
-    `animate`.
-
-    Examples
-    --------
-    >>> import jaxtank
-    >>> from jaxtank import presets
-    >>> loop = presets.find("cascaded/pi").loop
-    >>> run = jaxtank.simulate(loop, jaxtank.Clock(dt=4.0, duration=40.0))
-    >>> "<link" in to_html(loop, run, seconds=1)
-    False
-    """
+    """Return a film as an HTML fragment with buttons, for `IPython.display.HTML` in a notebook."""
+    # It is complete: fonts and scripts are not loaded from the network. Parameters and errors as of
+    # `animate`.
     with styled({"animation.embed_limit": 20.0, "figure.dpi": 80, "savefig.dpi": 80}):
         scene = _scene(loop, trajectory, seconds, against, titles)
         animation = FuncAnimation(
@@ -158,20 +106,6 @@ SIGNS = {
 def moments(runs, count, ranges):
     """Return `count` times [s] from the start to the end of the longest run: evenly spaced for a
     quarter of them, for the others by how much changes.
-
-    Parameters
-    ----------
-    runs : sequence of Trajectory
-    count : number of times
-    ranges : for each run (rims (tanks,), ranges of the inputs (pumps,)), by which changes count
-
-    Examples
-    --------
-    >>> from types import SimpleNamespace
-    >>> level = np.array([0.0, 0.0, 0.0, 4.0, 8.0])[:, None]
-    >>> run = SimpleNamespace(t=np.arange(5.0), x=level, r=0.0 * level, u=0.0 * level)
-    >>> moments([run], 5, [(np.array([8.0]), np.array([1.0]))]).round(1).tolist()
-    [0.0, 2.3, 2.9, 3.4, 4.0]
     """
     end = max(float(run.t[-1]) for run in runs)
     grid = np.unique(np.concatenate([np.asarray(run.t, dtype=float) for run in runs]))

@@ -12,28 +12,7 @@ SLICES = 240
 
 
 def phase(ax, trajectories, tanks, rims=None, unit="cm"):
-    """Draw the level of one tank over that of another; dots at the start, squares at the end.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    trajectories : {name: (Trajectory, colour, line style)}
-    tanks : (index on the horizontal axis, index on the vertical axis)
-    rims : (tanks,) [unit] or None; what lies past them is shaded where a line comes near
-    unit : of levels
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> from types import SimpleNamespace
-    >>> run = SimpleNamespace(x=np.ones((3, 2)))
-    >>> phase(Figure().gca(), {"run": (run, "C0", "-")}, (0, 1)).get_title()
-    'tanks 1 and 2'
-    """
+    """Draw the level of one tank over that of another; dots at the start, squares at the end."""
     across, up = tanks
     for name, (run, colour, style) in trajectories.items():
         h = np.asarray(run.x)
@@ -65,30 +44,7 @@ def phase(ax, trajectories, tanks, rims=None, unit="cm"):
 
 
 def saturation(ax, runs, low, high):
-    """Draw when each pump was commanded past its limits, in a strip per pump and run.
-
-    A strip goes up for the upper limit and down for the lower one; its height is the share of each
-    interval of time, and the label gives the shares of the whole run.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    runs : {name: Trajectory}
-    low, high : (pumps,) limits [unit of the inputs]
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> from types import SimpleNamespace
-    >>> run = SimpleNamespace(t=np.arange(4.0), command=np.array([[5.0], [15.0], [15.0], [5.0]]))
-    >>> ax = saturation(Figure().gca(), {"run": run}, [0.0], [12.0])
-    >>> [label.get_text() for label in ax.get_yticklabels()]
-    ['pump 1\\n50 % up, 0 % down']
-    """
+    """Draw when each pump was commanded past its limits, in a strip per pump and run."""
     names, heights = [], []
     for j in range(len(low)):
         for k, (name, run) in enumerate(runs.items()):
@@ -139,28 +95,7 @@ def _slices(t, mask):
 
 
 def estimate(ax, run, tank, unit="cm"):
-    """Draw the estimate of one level, with the measured and the true one.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    run : Trajectory
-    tank : index of the tank
-    unit : of levels
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> from types import SimpleNamespace
-    >>> h = np.ones((3, 1))
-    >>> run = SimpleNamespace(t=np.arange(3.0), x=h, y=h + 0.1, x_hat=h)
-    >>> len(estimate(Figure().gca(), run, 0).lines)
-    3
-    """
+    """Draw the estimate of one level, with the measured and the true one."""
     if np.any(run.y[:, tank] != run.x[:, tank]):
         ax.plot(
             run.t,
@@ -180,28 +115,7 @@ def estimate(ax, run, tank, unit="cm"):
 
 
 def disturbance(ax, run, tank, inflow=None, unit="cm/s"):
-    """Draw the estimated disturbance of one level's rate, which holds all model errors.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    run : Trajectory
-    tank : index of the tank
-    inflow : (rows,) true inflow disturbance [unit] where it is known, or None
-    unit : of the rate
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> from types import SimpleNamespace
-    >>> run = SimpleNamespace(t=np.arange(3.0), d_hat=np.zeros((3, 1)))
-    >>> disturbance(Figure().gca(), run, 0).get_title()
-    'disturbance of tank 1'
-    """
+    """Draw the estimated disturbance of one level's rate, which holds all model errors."""
     if inflow is not None:
         ax.plot(run.t, inflow, color=REFERENCE, linewidth=1.3, label="inflow disturbance")
     ax.plot(
@@ -218,22 +132,7 @@ def disturbance(ax, run, tank, inflow=None, unit="cm/s"):
 
 
 def share(ax, run, pump, of=("sliding mode", "state feedback")):
-    """Draw the share of two blended controllers, named in `of`, in one input; returns the axes.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    run : Trajectory with `share`
-    pump : index of the pump
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> from types import SimpleNamespace
-    >>> run = SimpleNamespace(t=np.arange(3.0), share=np.ones((3, 1)))
-    >>> len(share(Figure().gca(), run, 0).collections)
-    2
-    """
+    """Draw the share of two blended controllers, named in `of`, in one input; returns the axes."""
     first = run.share[:, pump]
     ax.fill_between(run.t, 0.0, first, color=BEFORE, alpha=0.55, linewidth=0, label=of[0])
     ax.fill_between(run.t, first, 1.0, color=AFTER, alpha=0.35, linewidth=0, label=of[1])
@@ -247,26 +146,7 @@ MANY = 16
 
 
 def margins(ax, rows):
-    """Draw the margin of each limit as a share of it, the smallest at the top.
-
-    Violated limits are to the left of zero.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    rows : list of {"name", "limit", "value", "margin", "unit"}, as `TuningResult.constraints`
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> row = {"name": "max_level", "limit": 30.0, "value": 27.0, "margin": 3.0, "unit": "cm"}
-    >>> float(margins(Figure().gca(), [row]).patches[0].get_width())
-    10.0
-    """
+    """Draw the margin of each limit as a share of it, the smallest at the top."""
     shares = [100.0 * r["margin"] / (abs(r["limit"]) or 1.0) for r in rows]
     order = np.argsort(shares, kind="stable")[:MANY]
     y = np.arange(len(order))
@@ -300,25 +180,8 @@ def margins(ax, rows):
 
 
 def tradeoff(ax, points, measure, unit, cost_unit):
-    """Draw the best objective over the limit of a measure; crosses: none that holds it was found.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    points : list of {"limit", "status": "converged", "not_converged" or "infeasible", "objective"},
-        as `tuning.tradeoff` gives them
-    measure, unit, cost_unit : the measure, its unit, the unit of the objective
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> point = {"limit": 30.0, "status": "converged", "objective": 1.5}
-    >>> tradeoff(Figure().gca(), [point], "max_level", "cm", "cm").get_xlabel()
-    'limit of max_level [cm]'
+    """Draw the best objective over the limit of a measure; crosses: none that holds it
+    was found.
     """
     points = sorted(points, key=lambda p: p["limit"])
     kept = [p for p in points if p["status"] != "infeasible"]

@@ -9,26 +9,7 @@ BARS = 14
 
 
 def tornado(ax, names, effects, unit, title):
-    """Draw the change of a measure with each parameter at the two ends of its range.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    names : of the D parameters, the largest effect first
-    effects : (D,) signed change at the upper end [unit]
-    unit, title : of the measure, of the panel
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> ax = tornado(Figure().gca(), ["k", "b"], [2.0, -1.0], "cm", "rms_error")
-    >>> len(ax.patches)
-    4
-    """
+    """Draw the change of a measure with each parameter at the two ends of its range."""
     y = _bars(ax, names, title)
     effects = np.asarray(effects)[: len(y)]
     ax.barh(y, effects, color=AFTER, height=0.62, label="parameter high")
@@ -39,28 +20,7 @@ def tornado(ax, names, effects, unit, title):
 
 
 def elementary(ax, names, size, intervals, spread, unit, title):
-    """Draw the elementary effects of each parameter on a measure (Morris).
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    names : of the D parameters, the largest effect first
-    size, intervals : (D,) mean size and (D, 2) its 95 % intervals [unit]
-    spread : (D,) standard deviation [unit]
-    unit, title : of the measure, of the panel
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> ends = np.array([[1.5, 2.5]])
-    >>> ax = elementary(Figure().gca(), ["k"], [2.0], ends, [0.5], "cm", "rms_error")
-    >>> ax.get_xlabel()
-    'change over the range [cm]'
-    """
+    """Draw the elementary effects of each parameter on a measure (Morris)."""
     y = _bars(ax, names, title)
     size, intervals, spread = (np.asarray(v)[: len(y)] for v in (size, intervals, spread))
     ax.barh(y, size, color=AFTER, height=0.62, label="mean size, mu*")
@@ -80,28 +40,7 @@ def elementary(ax, names, size, intervals, spread, unit, title):
 
 
 def shares(ax, names, first, total, first_intervals, total_intervals, title):
-    """Draw the first-order and total shares of the variance of a measure (Sobol).
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    names : of the D parameters, the largest total first
-    first, total : (D,) shares [-]
-    first_intervals, total_intervals : (D, 2) their 95 % intervals
-    title : of the panel
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> ends = np.array([[0.4, 0.6]])
-    >>> ax = shares(Figure().gca(), ["k"], [0.5], [0.5], ends, ends, "rms_error")
-    >>> ax.get_xlabel()
-    'share of the variance [-]'
-    """
+    """Draw the first-order and total shares of the variance of a measure (Sobol)."""
     y = _bars(ax, names, title)
     for values, ends, side, colour, label in (
         (first, first_intervals, -0.2, BEFORE, "first order: alone"),
@@ -116,20 +55,7 @@ def shares(ax, names, first, total, first_intervals, total_intervals, title):
 
 
 def panels(draw, title, rows):
-    """Return a figure with one panel for each function in `draw`, and one legend for all.
-
-    Parameters
-    ----------
-    draw : list of functions of the axes
-    title : text above the panels
-    rows : number of bars in each, which sets the height
-
-    Examples
-    --------
-    >>> one = lambda ax: tornado(ax, ["k"], [2.0], "cm", "rms_error")
-    >>> len(panels([one, one], "two measures", 1).axes)
-    2
-    """
+    """Return a figure with one panel for each function in `draw`, and one legend for all."""
     columns = min(3, len(draw))
     lines = -(-len(draw) // columns)
     with styled():

@@ -1,7 +1,4 @@
-"""The equations of a rig in plain text, read from its topology: with letters, and in numbers.
-
-Imports no matplotlib; imported by reports.
-"""
+"""The equations of a rig in plain text, read from its topology: with letters, and in numbers."""
 
 from collections.abc import Iterator
 
@@ -11,25 +8,7 @@ from jaxtank.core.units import local
 
 
 def equations(plant, disturbed=False):
-    """Return the lines of a rig's equations.
-
-    They are A_i h_i' of every tank with letters, the meaning of the letters, and h_i' in numbers. A
-    closed outlet (0) is left out.
-
-    Parameters
-    ----------
-    plant : TankNetwork
-    disturbed : whether there is an inflow d_i that no pump brings
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> lines = equations(presets.find("cascaded/pi").loop.plant)
-    >>> print(lines[1])
-    A2 h2' = s12 q(h1) - a2 q(h2)
-    >>> print(lines[-1])
-    h2' = 0.03864 sqrt(h1) - 0.04081 sqrt(h2)
-    """
+    """Return the lines of a rig's equations."""
     letters, numbers = [], []
     for i in range(plant.tanks):
         area, terms = float(plant.area[i]), list(_terms(plant, i))
@@ -116,14 +95,7 @@ def _sum(terms):
 
 
 def physics(plant):
-    """Return sentences on rims, empty tanks, overflow and laminar flow.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> physics(presets.find("cascaded/pi").loop.plant)[1]
-    '92.81 % of what passes the rim of tank 1 falls into tank 2.'
-    """
+    """Return sentences on rims, empty tanks, overflow and laminar flow."""
     length = plant.units[0]
     rims = ", ".join(f"{v:g}" for v in np.asarray(plant.rim))
     found = [

@@ -9,27 +9,7 @@ from jaxtank.plots.style import AFTER, BEFORE, FORBIDDEN, OTHER, REFERENCE
 
 
 def measured(ax, t, y, simulated, name, unit, validation_from=None):
-    """Draw a measured level and that of the fitted rig; the part for validation is shaded.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    t : (samples,) times [s]
-    y, simulated : (samples,) levels [unit]
-    name, unit : of the level
-    validation_from : time from which data were not used in the first fit [s], or None
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> t = np.arange(3.0)
-    >>> measured(Figure().gca(), t, t, t, "h1", "cm", 1.0).get_ylabel()
-    'h1 [cm]'
-    """
+    """Draw a measured level and that of the fitted rig; the part for validation is shaded."""
     ax.plot(t, y, ".", color=BEFORE, markersize=2.0, label="measured")
     ax.plot(t, simulated, color=AFTER, linewidth=1.2, label="simulated")
     if validation_from is not None:
@@ -40,25 +20,7 @@ def measured(ax, t, y, simulated, name, unit, validation_from=None):
 
 
 def inputs(ax, t, u, unit):
-    """Draw the inputs of the pumps.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    t : (samples,) times [s]
-    u : (samples, pumps) inputs [unit]
-    unit : of inputs
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> inputs(Figure().gca(), np.arange(3.0), np.ones((3, 1)), "V").get_ylabel()
-    'input [V]'
-    """
+    """Draw the inputs of the pumps."""
     for j in range(u.shape[1]):
         ax.step(
             t,
@@ -74,26 +36,7 @@ def inputs(ax, t, u, unit):
 
 
 def residual(ax, t, r, name, unit, noise=None):
-    """Draw a residual, with a band of two standard deviations of the noise.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    t : (samples,) times [s]
-    r : (samples,) measured less simulated [unit]
-    name, unit : of the level
-    noise : standard deviation of the noise in the data [unit], or None
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> residual(Figure().gca(), np.arange(3.0), np.zeros(3), "h1", "cm", 0.1).get_ylabel()
-    'h1: residual [cm]'
-    """
+    """Draw a residual, with a band of two standard deviations of the noise."""
     ax.plot(t, r, color=AFTER, linewidth=0.8)
     ax.axhline(0.0, color=REFERENCE, linewidth=0.8, linestyle=":")
     if noise is not None:
@@ -111,25 +54,7 @@ def residual(ax, t, r, name, unit, noise=None):
 
 
 def autocorrelation(ax, acf, samples, name):
-    """Draw the autocorrelation of a residual, with the 95 % band of white noise.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    acf : (lags + 1,) autocorrelation [-]
-    samples : number of samples
-    name : of the level
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> autocorrelation(Figure().gca(), [1.0, 0.1, 0.0], 100, "h1").get_xlabel()
-    'lag [samples]'
-    """
+    """Draw the autocorrelation of a residual, with the 95 % band of white noise."""
     lags = np.arange(1, len(acf))
     ax.vlines(lags, 0.0, acf[1:], color=AFTER, linewidth=1.4)
     bound = 1.96 / np.sqrt(max(samples, 1))
@@ -140,24 +65,7 @@ def autocorrelation(ax, acf, samples, name):
 
 
 def correlation(ax, names, matrix):
-    """Draw the correlation of the estimates, with its numbers up to 14 parameters.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    names : of the n parameters
-    matrix : (n, n) correlation [-]
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> len(correlation(Figure().gca(), ["k", "a"], np.eye(2)).texts)
-    4
-    """
+    """Draw the correlation of the estimates, with its numbers up to 14 parameters."""
     image = ax.imshow(matrix, cmap="PuOr", vmin=-1, vmax=1)
     ax.set_xticks(range(len(names)), names, rotation=40, ha="right")
     ax.set_yticks(range(len(names)), names)
@@ -179,25 +87,7 @@ def correlation(ax, names, matrix):
 
 
 def profile(ax, found):
-    """Draw the profile likelihood of a parameter, with its 95 % line and interval.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    found : {"name", "unit", "values" (n,), "rise" (n,) of -2 log likelihood, "interval95": (low,
-        high), None for an end that was not found}
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> found = {"name": "k", "unit": "-", "values": [1, 2], "rise": [0, 5], "interval95": (1, 2)}
-    >>> profile(Figure().gca(), found).get_xlabel()
-    'k [-]'
-    """
+    """Draw the profile likelihood of a parameter, with its 95 % line and interval."""
     values, rise = np.array(found["values"]), np.array(found["rise"])
     ax.plot(
         values,

@@ -1,7 +1,4 @@
-"""Positions of the parts of a rig in a drawing: tanks in rows, pumps below, pipework between.
-
-Imported by `schematic` and `animation`, and by reports for the size of a figure.
-"""
+"""Positions of the parts of a rig in a drawing: tanks in rows, pumps below, pipework between."""
 
 from typing import NamedTuple
 
@@ -15,13 +12,7 @@ STOREY = 1.75
 
 
 class Box(NamedTuple):
-    """A tank: its left lower corner, its width and its height, in heights of the tallest tank.
-
-    Examples
-    --------
-    >>> Box(1.0, 0.0, 0.5, 1.0, 0.1).middle
-    1.25
-    """
+    """A tank: its left lower corner, its width and its height, in heights of the tallest tank."""
 
     x: float
     y: float
@@ -35,19 +26,7 @@ class Box(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Positions of all parts of a rig.
-
-    boxes : one Box per tank
-    pumps : one (x, y) each
-    risers : (pump, tank, path ((x, y), ...)) of each pump and tank that it fills
-    left, right, bottom, top : ends of the drawing
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> len(place(presets.find("cascaded/pi").loop.plant).boxes)
-    2
-    """
+    """Positions of all parts of a rig."""
 
     boxes: tuple
     pumps: tuple
@@ -59,17 +38,9 @@ class Layout(NamedTuple):
 
 
 def storeys(plant):
-    """Return the row (n,) of each tank, 0 the lowest.
-
-    A tank is above every tank that it flows into, and level with those that a pipe joins to it.
-    Tanks that flow in a circle, which gravity does not allow, have the rows that they reach.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> storeys(presets.find("cascaded/pi").loop.plant)
-    (1, 0)
-    """
+    """Return the row (n,) of each tank, 0 the lowest."""
+    # A tank is above every tank that it flows into, and level with those that a pipe joins to it.
+    # Tanks that flow in a circle, which gravity does not allow, have the rows that they reach.
     row = [0] * plant.tanks
     for _ in range(plant.tanks):
         for source, sink in (*plant.links, *plant.spills):
@@ -81,16 +52,7 @@ def storeys(plant):
 
 
 def place(plant):
-    """Return the Layout of a `TankNetwork`.
-
-    Heights are to scale within the rig; widths follow the roots of the areas, within limits.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> [round(box.height, 2) for box in place(presets.find("cascaded/pi").loop.plant).boxes]
-    [1.0, 1.0]
-    """
+    """Return the Layout of a `TankNetwork`."""
     rims, areas = (np.asarray(v, dtype=float) for v in (plant.rim, plant.area))
     heights = np.clip(rims / rims.max(), 0.3, 1.0)
     widths = 0.95 * np.clip(np.sqrt(areas / areas.max()), 0.4, 1.0)
@@ -114,13 +76,6 @@ def place(plant):
 def jets(plant, where):
     """Return [(tank, path ((x, y), ...))] of the free jets from the floors of the tanks: into the
     tanks below, and into the basin. A closed orifice (area 0) has none.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> plant = presets.find("cascaded/pi").loop.plant
-    >>> [(tank, len(path)) for tank, path in jets(plant, place(plant))]
-    [(0, 3), (1, 2)]
     """
     found = []
     for i, box in enumerate(where.boxes):
@@ -147,15 +102,7 @@ def jets(plant, where):
 
 
 def pipes(plant, where):
-    """Return [(left end, right end, height)] of the pipes that are open, below the surface.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> plant = presets.find("gouta2022/enmpc").loop.plant
-    >>> len(pipes(plant, place(plant)))
-    1
-    """
+    """Return [(left end, right end, height)] of the pipes that are open, below the surface."""
     found = []
     for k, (one, other) in enumerate(plant.pipes):
         if float(np.asarray(plant.pipe)[k]) > 0:
@@ -165,15 +112,7 @@ def pipes(plant, where):
 
 
 def overflows(plant, where):
-    """Return [(tank, path ((x, y), ...))] of what runs over a rim into another tank.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> plant = presets.find("cascaded/pi").loop.plant
-    >>> [tank for tank, _ in overflows(plant, place(plant))]
-    [0]
-    """
+    """Return [(tank, path ((x, y), ...))] of what runs over a rim into another tank."""
     found = []
     for tank, into in plant.spills:
         source, sink = where.boxes[tank], where.boxes[into]
@@ -193,10 +132,7 @@ def overflows(plant, where):
 
 
 def _with_pumps(plant, boxes, rows, width):
-    """The Layout with pumps in the basin, at the nearer side of the first tank that they fill.
-
-    Each has a riser and a height of its own above a row.
-    """
+    """The Layout with pumps in the basin, at the nearer side of the first tank that they fill."""
     sides = [_side(plant, boxes, width, j) for j in range(plant.pumps)]
     pumps, risers, above = [], [], {}
     for j, feed in enumerate(plant.feeds):

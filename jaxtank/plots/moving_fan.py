@@ -1,7 +1,6 @@
 """A fan of many runs that is drawn again and again: its lines and bands are moved, never rebuilt.
 
-What does not move (axes, grid, numbers) is drawn once and kept as pixels. Imported by the live
-figure of notebooks.
+What does not move (axes, grid, numbers) is drawn once and kept as pixels.
 """
 
 import io
@@ -40,26 +39,7 @@ UNLIMITED = 1e12
 
 
 class MovingFan:
-    """A figure of the quantiles of levels and inputs over many plants.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    t : (rows,) [s]
-    r : (rows, outputs) setpoints [unit of length]
-    x, u : (6, rows, tanks), (6, rows, pumps)
-        Quantiles 5, 25, 50, 75, 95 % and the highest: those of the start, whose medians stay in
-        the picture as the published ones.
-    dpi : pixels per inch
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> x, u = np.ones((6, 3, 2)), np.ones((6, 3, 1))
-    >>> fan = MovingFan(presets.find("cascaded/pi").loop, np.arange(3.0), np.ones((3, 1)), x, u)
-    >>> fan.draw(2.0 * x, u, [0.0, 1.0])[1:4]
-    b'PNG'
-    """
+    """A figure of the quantiles of levels and inputs over many plants."""
 
     def __init__(self, loop: Any, t: Any, r: Any, x: Any, u: Any, dpi: int = 90):
         self.t, self.dpi = np.asarray(t), dpi
@@ -100,10 +80,7 @@ class MovingFan:
         self.drawn = 0  # times that everything was drawn
 
     def draw(self, x: Any, u: Any, over: Sequence[float]) -> bytes:
-        """Move everything to quantiles x, u and return the picture as PNG bytes.
-
-        over : (tanks,) share of the plants that rise above the rim of each tank [-].
-        """
+        """Move everything to quantiles x, u and return the picture as PNG bytes."""
         fits = True
         # a compiled run leaves floating-point flags, which numpy would report as an overflow
         with styled(), np.errstate(all="ignore"):

@@ -1,6 +1,6 @@
 """A large rig at a glance: tanks as cells in reading order, the fullest ones named.
 
-Draws on given matplotlib axes. Imported by `schematic`, `run` and `responses`.
+Draws on given matplotlib axes.
 """
 
 import math
@@ -22,36 +22,18 @@ CELL, PITCH = 0.62, 1.0
 
 
 def worst(values, most=NAMED):
-    """Return the places of the largest of some values, in the order of their places.
-
-    Examples
-    --------
-    >>> worst([3.0, 9.0, 1.0, 5.0], 2)
-    [1, 3]
-    """
+    """Return the places of the largest of some values, in the order of their places."""
     order = np.argsort(-np.asarray(values, dtype=float), kind="stable")
     return sorted(int(i) for i in order[:most])
 
 
 def per_line(tanks):
-    """Return the number of cells in a line, for about twice as many as there are lines.
-
-    Examples
-    --------
-    >>> per_line(100), per_line(1000)
-    (15, 45)
-    """
+    """Return the number of cells in a line, for about twice as many as there are lines."""
     return math.ceil(math.sqrt(2.0 * tanks))
 
 
 def size(tanks):
-    """Return (width, height) of the figure of `overview` [inch].
-
-    Examples
-    --------
-    >>> [round(v, 2) for v in size(100)]
-    [7.2, 4.13]
-    """
+    """Return (width, height) of the figure of `overview` [inch]."""
     columns = per_line(tanks)
     lines = math.ceil(tanks / columns)
     return 7.2, 7.2 * (lines + 1.2) / (columns + 0.6) + 0.35
@@ -60,31 +42,6 @@ def size(tanks):
 def overview(ax, plant, levels=None):
     """Draw a rig of many tanks: a cell each, in the order of their numbers, filled as a share of
     its rim.
-
-    Controlled tanks have a heavier outline, a triangle marks a pump, grey lines are pipes, blue
-    ones orifices, dotted ones overflow. The fullest tanks have their numbers and an outline of
-    their own; at the left are the numbers with which lines begin.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    plant : TankNetwork
-    levels : (tanks,) [cm], or None for empty tanks
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> from jaxtank.plants import network
-    >>> rig = network(
-    ...     area=np.full(30, 15.0), drain=0.1, pump_gain=5.0, feeds=[(0, None)], rim=20.0
-    ... )
-    >>> ax = overview(Figure().gca(), rig, np.arange(30.0) / 2.0)
-    >>> sorted(int(t.get_text()) for t in ax.texts if t.get_gid() == "fullest")[:3]
-    [19, 20, 21]
     """
     n, columns = plant.tanks, per_line(plant.tanks)
     corners = np.array([(i % columns, -(i // columns)) for i in range(n)], dtype=float) * PITCH

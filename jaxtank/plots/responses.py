@@ -83,29 +83,7 @@ def _example() -> Any:
 
 
 def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm", spills=None):
-    """Draw the level of one tank, with its setpoint, rim and limit.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    trajectories : {name: (Trajectory, colour, line style)}
-    tank : index of the tank
-    output : index of its setpoint, None for a tank that is not controlled
-    rim, limit : level [unit] or None
-    unit : of levels
-    spills : {name: Spilled} of the runs (`jaxtank.plots.spills`), or None
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> ax = level(Figure().gca(), {"run": (_example(), "C0", "-")}, tank=0, output=0, rim=2.0)
-    >>> ax.get_title(), len(ax.lines)
-    ('tank 1', 2)
-    """
+    """Draw the level of one tank, with its setpoint, rim and limit."""
     for name, (run, colour, style) in trajectories.items():
         ax.plot(
             run.t, run.x[:, tank], color=colour, linestyle=style, linewidth=1.4, label=plain(name)
@@ -135,27 +113,7 @@ def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm", 
 
 
 def voltage(ax, trajectories, pump, low, high, unit="V"):
-    """Draw the input of one pump; what lies outside its limits is shaded.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    trajectories : {name: (Trajectory, colour, line style)}
-    pump : index of the pump
-    low, high : its limits [unit]
-    unit : of inputs
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> ax = voltage(Figure().gca(), {"run": (_example(), "C0", "-")}, 0, 0.0, 12.0)
-    >>> ax.get_ylabel()
-    'voltage [V]'
-    """
+    """Draw the input of one pump; what lies outside its limits is shaded."""
     for name, (run, colour, style) in trajectories.items():
         ax.plot(
             run.t, run.u[:, pump], color=colour, linestyle=style, linewidth=1.2, label=plain(name)
@@ -174,26 +132,7 @@ def voltage(ax, trajectories, pump, low, high, unit="V"):
 
 
 def error(ax, trajectories, output, tank, unit="cm"):
-    """Draw the tracking error of one output.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    trajectories : {name: (Trajectory, colour, line style)}
-    output, tank : index of the output, and of its tank
-    unit : of levels
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> ax = error(Figure().gca(), {"run": (_example(), "C0", "-")}, output=0, tank=0)
-    >>> ax.get_title()
-    'tracking error of tank 1'
-    """
+    """Draw the tracking error of one output."""
     for name, (run, colour, style) in trajectories.items():
         ax.plot(
             run.t, run.e[:, output], color=colour, linestyle=style, linewidth=1.2, label=plain(name)
@@ -204,32 +143,7 @@ def error(ax, trajectories, output, tank, unit="cm"):
 
 
 def responses(loop, trajectories, title="", limits=None):
-    """Return a figure of a run, or of several in the same panels.
-
-    Its rows are outputs with setpoints, errors, other tanks with rims, and inputs with limits.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    trajectories : {name: Trajectory}; where there are several, the first is dashed
-    title : text above the panels
-    limits : (tanks,) limits of the levels [cm], or None
-
-    Raises
-    ------
-    InputError
-        Where there is no run.
-
-    Examples
-    --------
-    >>> import jaxtank
-    >>> from jaxtank import presets
-    >>> loop = presets.find("cascaded/pi").loop
-    >>> run = jaxtank.simulate(loop, jaxtank.Clock(dt=4.0, duration=40.0))
-    >>> figure = responses(loop, {"PI": run}, "a title")
-    >>> [ax.get_title() for ax in figure.axes]
-    ['tank 2', 'tracking error of tank 2', 'tank 1', 'pump 1']
-    """
+    """Return a figure of a run, or of several in the same panels."""
     if not trajectories:
         raise InputError("trajectories = {}: there is no run to draw")
     drawn = {

@@ -1,7 +1,4 @@
-"""Pictures that a `Trajectory` and a `Case` draw of themselves, and figures as PNG bytes.
-
-May import the other modules of `plots` and what they import.
-"""
+"""Pictures that a `Trajectory` and a `Case` draw of themselves, and figures as PNG bytes."""
 
 import io
 from collections.abc import Mapping
@@ -112,9 +109,8 @@ def png(figure: Any) -> bytes:
 def for_journal(drawn: Mapping[str, Any], columns: int = 1) -> dict[str, bytes]:
     """Return {file name: bytes} of {name: figure} as SVG and as PNG of 300 dpi, in the width of one
     or two columns of a journal; the figures are closed.
-
-    Figures that `style.for_print` has not made are scaled to that width.
     """
+    # Figures that `style.for_print` has not made are scaled to that width.
     found: dict[str, bytes] = {}
     for name, figure in drawn.items():
         wide, high = figure.get_size_inches()
@@ -133,19 +129,9 @@ def for_journal(drawn: Mapping[str, Any], columns: int = 1) -> dict[str, bytes]:
 def save_for_print(drawn: Mapping[str, Any], folder: str | Path, columns: int = 1) -> list[Path]:
     """Write {name: figure} to a folder, made if need be, as `for_journal` makes them: all of them
     or none; return the paths. `result.plot()` inside `style.for_print(columns)` makes the figures.
-
-    Raises InputError for a number of columns that is none, and a folder that cannot be written to.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from jaxtank import presets
-    >>> with for_print(1):
-    ...     figures = presets.find("cascaded/pi").plot()
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     [path.name for path in save_for_print(figures, folder)]
-    ['rig.svg', 'rig.png']
     """
+    # Raises InputError for a number of columns that is none, and a folder that cannot be written
+    # to.
     with for_print(columns):  # which refuses other numbers
         return write_folder(folder, for_journal(drawn, columns))
 
@@ -166,9 +152,7 @@ def pngs(drawn: Mapping[str, Any]) -> dict[str, bytes]:
 
 
 def gif(pictures: Any, rate: int) -> bytes:
-    """Return pictures of a film as a GIF of at most GIF_BYTES, `rate` of them per second. Of a
-    larger one some are left out, and the others shown for as long.
-    """
+    """Return pictures of a film as a GIF of at most GIF_BYTES, `rate` of them per second."""
     parts = Image.new("RGB", (pictures[0].width, 3 * pictures[0].height))
     for k in range(3):  # one palette for all
         parts.paste(pictures[k * (len(pictures) - 1) // 2], (0, k * pictures[0].height))

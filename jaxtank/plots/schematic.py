@@ -1,6 +1,6 @@
 """A rig drawn from its topology: tanks, pumps and their splits, outlets, pipes, overflow, basin.
 
-Draws on given matplotlib axes. Imported by `animation`, reports and notebooks.
+Draws on given matplotlib axes.
 """
 
 import numpy as np
@@ -21,33 +21,11 @@ HALO: list[AbstractPathEffect] = [withStroke(linewidth=2.2, foreground="white")]
 
 
 def schematic(ax, plant, levels=None, setpoints=None, lost=None):
-    """Draw a rig: each tank above those that it flows into, heights to scale.
-
-    Controlled tanks have a heavier outline. A closed orifice (area 0) is not drawn. Dashed lines
-    are free jets, dotted lines overflow, double lines pipes below the surface. Hatched is what is
-    above a rim: what the tank cannot hold, or has lost, in its own cross-section. A rig of more
-    than 24 tanks is drawn by `overview.overview`.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    plant : TankNetwork
-    levels : (tanks,) [cm], or None for empty tanks
-    setpoints : (outputs,) [cm] to mark on the controlled tanks, or None
-    lost : (tanks,) volumes lost over the rims [cm^3], of a rig with overflow; or None
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> from jaxtank import presets
-    >>> ax = schematic(Figure().gca(), presets.find("cascaded/pi").loop.plant, levels=[4.0, 5.0])
-    >>> [text.get_text() for text in ax.texts if "tank" in text.get_text()]
-    ['tank 1\\n4 V', 'tank 2\\n5 V']
-    """
+    """Draw a rig: each tank above those that it flows into, heights to scale."""
+    # Controlled tanks have a heavier outline. A closed orifice (area 0) is not drawn. Dashed lines
+    # are free jets, dotted lines overflow, double lines pipes below the surface. Hatched is what is
+    # above a rim: what the tank cannot hold, or has lost, in its own cross-section. A rig of more
+    # than 24 tanks is drawn by `overview.overview`.
     if plant.tanks > LARGEST:
         return overview(ax, plant, levels)
     where, unit = place(plant), plant.units[0]
@@ -109,15 +87,8 @@ def schematic(ax, plant, levels=None, setpoints=None, lost=None):
 
 
 def mark(ax, box, setpoint):
-    """Mark a setpoint [cm] with a line and a triangle at the right of a tank; return both artists.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> from jaxtank.plots.layout import Box
-    >>> line, triangle = mark(Figure().gca(), Box(0.0, 0.0, 1.0, 1.0, 0.1), 5.0)
-    >>> float(triangle.get_ydata()[0])
-    0.5
+    """Mark a setpoint [cm] with a line and a triangle at the right of a tank; return both
+    artists.
     """
     y, x = mark_height(box, setpoint), box.x + box.width
     (line,) = ax.plot([x - 0.1 * box.width, x], [y, y], color=REFERENCE, linewidth=1.3, zorder=4)
@@ -126,26 +97,12 @@ def mark(ax, box, setpoint):
 
 
 def mark_height(box, setpoint):
-    """Return the height of the mark of a setpoint [cm], at most 5 % above the rim.
-
-    Examples
-    --------
-    >>> from jaxtank.plots.layout import Box
-    >>> mark_height(Box(0.0, 0.0, 1.0, 1.0, 0.1), 50.0)
-    1.05
-    """
+    """Return the height of the mark of a setpoint [cm], at most 5 % above the rim."""
     return box.y + min(max(setpoint, 0.0) * box.scale, 1.05 * box.height)
 
 
 def depth(box, level):
-    """Return the drawn depth of a level [cm], at most up to the rim; `spills` draws the rest.
-
-    Examples
-    --------
-    >>> from jaxtank.plots.layout import Box
-    >>> depth(Box(0.0, 0.0, 1.0, 1.0, 0.1), 4.0)
-    0.4
-    """
+    """Return the drawn depth of a level [cm], at most up to the rim; `spills` draws the rest."""
     return min(max(float(level), 0.0) * box.scale, box.height)
 
 

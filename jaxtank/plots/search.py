@@ -11,29 +11,7 @@ from jaxtank.plots.style import AFTER, BEFORE, FORBIDDEN, plain
 
 
 def convergence(ax, history, unit, limited):
-    """Draw the objective of every evaluation in the order of the search, one colour per start.
-
-    Crosses violate a limit; the line is the best so far.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    history : list of (start, objective [unit], violation, ...), violation > 0 where a limit is
-    unit : of the objective
-    limited : whether there are limits
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> history = [(0, 2.0, 0.0), (0, 1.5, 0.1), (0, 1.0, 0.0)]
-    >>> ax = convergence(Figure().gca(), history, "cm", True)
-    >>> ax.get_ylabel()
-    'objective [cm]'
-    """
+    """Draw the objective of every evaluation in the order of the search, one colour per start."""
     start, cost, violation = (np.array([h[k] for h in history]) for k in range(3))
     broken, index = violation > 0, np.arange(1, len(history) + 1)
     for s in np.unique(start):
@@ -77,30 +55,7 @@ def _limit_height(ax, cost):
 
 
 def curve(ax, values, cost, violation, name, unit, cost_unit, before, after, logarithmic):
-    """Draw the objective along one parameter; the part that violates a limit is shaded.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    values, cost, violation : (n,) parameter [unit], objective [cost_unit], > 0 beyond a limit
-    name, unit, cost_unit : of the parameter, and the unit of the objective
-    before, after : (value, cost) of the two points that are marked
-    logarithmic : whether the parameter has a logarithmic axis
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> x = np.linspace(0.0, 1.0, 5)
-    >>> ax = curve(
-    ...     Figure().gca(), x, x**2, 0 * x, "k", "1/s", "cm", (1.0, 1.0), (0.0, 0.0), False
-    ... )
-    >>> ax.get_xlabel()
-    'k [1/s]'
-    """
+    """Draw the objective along one parameter; the part that violates a limit is shaded."""
     ax.plot(values, cost, color="0.3", linewidth=1.3)
     broken = np.asarray(violation) > 0
     if broken.any():
@@ -129,32 +84,7 @@ def curve(ax, values, cost, violation, name, unit, cost_unit, before, after, log
 
 
 def contours(ax, x, y, cost, violation, names, units, cost_unit, before, after, logarithmic):
-    """Draw the objective over two parameters; beyond the pink line a limit is violated.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    x, y : (n,), (m,) values of the parameters [units]
-    cost, violation : (m, n) objective [cost_unit], > 0 beyond a limit
-    names, units : of the two parameters
-    cost_unit : unit of the objective
-    before, after : (x, y) of the two points that are marked
-    logarithmic : whether each parameter has a logarithmic axis
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> x = np.linspace(0.0, 1.0, 5)
-    >>> cost = x[:, None] + x**2
-    >>> ends, names = ((1.0, 1.0), (0.0, 0.0)), (("k", "b"), ("1/s", "V"))
-    >>> ax = contours(Figure().gca(), x, x, cost, cost - 9, *names, "cm", *ends, (False, False))
-    >>> ax.get_ylabel()
-    'b [V]'
-    """
+    """Draw the objective over two parameters; beyond the pink line a limit is violated."""
     finite = np.where(np.isfinite(cost), cost, np.nan)
     low, high = np.nanmin(finite), np.nanquantile(finite, 0.98)
     # a colour for each factor in the distance from the minimum, so that its surroundings are seen

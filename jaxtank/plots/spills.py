@@ -23,19 +23,11 @@ HIGHEST = 0.65
 
 
 class Spilled(NamedTuple):
-    """Volumes above the rims in the course of a run; made by `spilled`.
+    """Volumes above the rims in the course of a run; made by `spilled`."""
 
-    simulated : True if rims are physics: volumes are then lost since the start, else they stand
-        above the rims at this moment.
-    volume : (rows, tanks) [cm^3]
-    most : (tanks,) the largest of each column [cm^3]
-    unit : of volumes
-
-    Examples
-    --------
-    >>> Spilled(True, np.zeros((1, 2)), np.zeros(2), "cm^3").any
-    False
-    """
+    # simulated : True if rims are physics: volumes are then lost since the start, else they stand
+    # above the rims at this moment. volume : (rows, tanks) [cm^3] most : (tanks,) the largest of
+    # each column [cm^3] unit : of volumes
 
     simulated: bool
     volume: Any
@@ -59,19 +51,8 @@ class Spilled(NamedTuple):
 
 
 def spilled(plant: Any, run: Any) -> Spilled:
-    """Return the volumes above the rims of a Trajectory of `plant`.
-
-    What is captured by another tank is not lost, and not in it.
-
-    Examples
-    --------
-    >>> from types import SimpleNamespace
-    >>> from jaxtank.plants import network
-    >>> rig = network(area=10.0, drain=0.1, pump_gain=5.0, feeds=[(0, None)], rim=30.0)
-    >>> run = SimpleNamespace(x=np.array([[20.0], [48.0], [25.0]]))
-    >>> spilled(rig, run).words()
-    'no overflow in the model: up to 180 cm^3 above the rims'
-    """
+    """Return the volumes above the rims of a Trajectory of `plant`."""
+    # What is captured by another tank is not lost, and not in it.
     x = np.asarray(run.x, dtype=float)
     if getattr(plant, "overflow", False):
         volume = np.asarray(run.spilled, dtype=float)
@@ -88,13 +69,7 @@ def spilled(plant: Any, run: Any) -> Spilled:
 
 
 def amount(volume: float, unit: str) -> str:
-    """Return a volume as three figures with its unit.
-
-    Examples
-    --------
-    >>> amount(773.6, "cm^3"), amount(12345.6, "cm^3"), amount(0.0, "cm^3")
-    ('774 cm^3', '12300 cm^3', '0 cm^3')
-    """
+    """Return a volume as three figures with its unit."""
     if volume <= 0.0:
         return f"0 {unit}"
     digits = max(0, 2 - int(np.floor(np.log10(volume))))
@@ -105,15 +80,6 @@ def amount(volume: float, unit: str) -> str:
 class Stack:
     """Liquid above the rim of a tank, hatched, with the rim as a line; a triangle on top where it
     is higher than drawn.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> from jaxtank.plots.layout import Box
-    >>> stack = Stack(Figure().gca(), Box(0.0, 0.0, 1.0, 1.0, 0.02), area=10.0)
-    >>> stack.set(100.0)
-    >>> stack.patch.get_height()
-    0.2
     """
 
     def __init__(self, ax: Any, box: Any, area: float):
@@ -146,10 +112,8 @@ def headroom(ax: Any, stacks: Any) -> None:
 
 
 def above_rim(ax: Any, trajectories: Any, tank: int, rim: Any, spills: Any) -> str:
-    """Hatch what is above the rim of a tank in a picture of its level over time; return
-    ": 774 cm^3 above the rim" for the title, "" where nothing is.
-
-    trajectories : {name: (Trajectory, colour, line style)}; spills : {name: Spilled}, or None.
+    """Hatch what is above the rim of a tank in a picture of its level over time; return ": 774 cm^3
+    above the rim" for the title, "" where nothing is.
     """
     wet = {n: found for n, found in (spills or {}).items() if found.most[tank] > 0}
     for name, found in wet.items():

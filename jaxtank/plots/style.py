@@ -1,4 +1,4 @@
-"""Colours, line styles and settings of all pictures. Imported by every module of this folder."""
+"""Colours, line styles and settings of all pictures."""
 
 import contextlib
 import importlib
@@ -94,26 +94,7 @@ _COLUMNS: list[int] = []  # of a journal, innermost last: figures are made for i
 
 @contextlib.contextmanager
 def for_print(columns=1):
-    """Make figures for a journal within a `with` block: their width, their letters, no title.
-
-    `jaxtank.plots.run.save_for_print` writes them as SVG and as PNG of 300 dpi.
-
-    Parameters
-    ----------
-    columns : 1 or 2
-        Of the journal, that a figure is wide.
-
-    Raises
-    ------
-    InputError
-        For another number.
-
-    Examples
-    --------
-    >>> with for_print(2), styled():
-    ...     width(9.6), plt.rcParams["savefig.dpi"]
-    (7.16, 300.0)
-    """
+    """Make figures for a journal within a `with` block: their width, their letters, no title."""
     if columns not in WIDTHS or isinstance(columns, bool):
         raise InputError(f"columns = {columns!r}: a figure is 1 or 2 columns of a journal wide")
     _COLUMNS.append(columns)
@@ -124,65 +105,32 @@ def for_print(columns=1):
 
 
 def printing():
-    """Return whether figures are made for a journal.
-
-    Examples
-    --------
-    >>> printing()
-    False
-    """
+    """Return whether figures are made for a journal."""
     return bool(_COLUMNS)
 
 
 def width(usual):
-    """Return the width of a figure [inch]: that of a journal's columns, or `usual`.
-
-    Examples
-    --------
-    >>> width(9.6)
-    9.6
-    """
+    """Return the width of a figure [inch]: that of a journal's columns, or `usual`."""
     return WIDTHS[_COLUMNS[-1]] if _COLUMNS else usual
 
 
 def beside(most):
     """Return how many panels stand beside each other: as many as a journal's columns take, or
     `most`.
-
-    Examples
-    --------
-    >>> with for_print(1):
-    ...     beside(4)
-    1
     """
     return min(most, max(1, int(width(0.0) / PANEL))) if _COLUMNS else most
 
 
 def height(usual, rows, legend=0.5):
-    """Return the height of a figure of rows of panels [inch]: 1.3 each for a journal, or `usual`.
-
-    Examples
-    --------
-    >>> height(7.0, 3)
-    7.0
+    """Return the height of a figure of rows of panels [inch]: 1.3 each for a journal, or
+    `usual`.
     """
     return min(1.3 * rows + legend, TALLEST) if _COLUMNS else usual
 
 
 @contextlib.contextmanager
 def styled(more=None):
-    """Set matplotlib's settings to STYLE, and to `more` {setting: value}, within a `with` block.
-
-    Afterwards these settings are as before, and only these: `plt.rc_context` restores all of them.
-    If the first figure of a notebook is drawn inside that one, it undoes the interactive mode which
-    the notebook's backend has just switched on, and no later figure is shown.
-
-    Examples
-    --------
-    >>> with styled({"font.size": 20}):
-    ...     plt.rcParams["font.size"]
-    20.0
-    """
+    """Set matplotlib's settings to STYLE, and to `more` {setting: value}, within a `with` block."""
     settings = STYLE | (PRINT if _COLUMNS else {}) | (more or {})
     before: dict[Any, Any] = {name: plt.rcParams[name] for name in settings}
     plt.rcParams.update(settings)
@@ -235,13 +183,7 @@ def notebook(dpi: int = 110, sharp: bool = False, pictures: bool = True) -> None
 
 
 def plain(text):
-    r"""Return a text in which matplotlib takes no dollar sign as the start of mathematics.
-
-    Examples
-    --------
-    >>> print(plain("a $ b"))
-    a \$ b
-    """
+    """Return a text in which matplotlib takes no dollar sign as the start of mathematics."""
     return text.replace("$", r"\$")
 
 

@@ -28,23 +28,7 @@ CUT = 0.05
 
 
 def fan(loop, bands, title):
-    """Return a figure of the quantiles of levels over many draws, with setpoints and rims.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    bands : {"t" (rows,) [s], "r" (rows, outputs) setpoints, "x" (5, rows, tanks) quantiles 5, 25,
-        50, 75, 95 % of the levels}
-    title : text above the panels
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> bands = {"t": np.arange(3.0), "r": np.ones((3, 1)), "x": np.ones((5, 3, 2))}
-    >>> figure = fan(presets.find("cascaded/pi").loop, bands, "many runs")
-    >>> [ax.get_title() for ax in figure.axes]
-    ['tank 1', 'tank 2']
-    """
+    """Return a figure of the quantiles of levels over many draws, with setpoints and rims."""
     tanks = loop.plant.tanks
     columns = beside(min(2, tanks))
     rows = -(-tanks // columns)
@@ -82,32 +66,7 @@ def _band(ax, loop, bands, i):
 
 
 def cloud(ax, pairs, held, name, unit, limit=None):
-    """Draw one point for each run: a measure before tuning across, after tuning up.
-
-    Both are on the same plant and noise; below the diagonal the measure decreased. Blue points hold
-    every limit on both sides, orange squares violated one before and none after, pink crosses
-    violate one after, whatever they did before.
-
-    Parameters
-    ----------
-    ax : matplotlib axes
-    pairs : (runs, 2) before and after [unit]
-    held : (runs, 2) True where every limit holds
-    name, unit : of the measure
-    limit : of the measure [unit], drawn on both axes, or None
-
-    Returns
-    -------
-    The axes.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> held = np.ones((2, 2), dtype=bool)
-    >>> ax = cloud(Figure().gca(), [[2.0, 1.0], [3.0, 1.5]], held, "rms_error", "cm")
-    >>> ax.get_xlabel()
-    'rms_error before [cm]'
-    """
+    """Draw one point for each run: a measure before tuning across, after tuning up."""
     pairs, held = np.asarray(pairs, dtype=float), np.asarray(held)
     sorts = (
         (held[:, 1] & ~held[:, 0], "s", BEFORE, 7, "violated a limit before, none after"),
@@ -156,19 +115,7 @@ def _square(ax, values):
 
 
 def violations(rows, samples):
-    """Return a figure of the probability that each limit is violated, with its 95 % interval.
-
-    Parameters
-    ----------
-    rows : list of {"name", "limit", "unit", "probability", "interval95"}, as `Ensemble.violations`
-    samples : number of draws
-
-    Examples
-    --------
-    >>> row = {"name": "max_level", "limit": 30.0, "probability": 0.1, "interval95": (0.05, 0.2)}
-    >>> violations([row], 100).axes[0].get_xlabel()
-    'probability of violating the limit [-], 100 draws'
-    """
+    """Return a figure of the probability that each limit is violated, with its 95 % interval."""
     with styled():
         figure, ax = plt.subplots(figsize=(6.4, 0.9 + 0.35 * len(rows)), layout="constrained")
         y, p = np.arange(len(rows)), np.array([r["probability"] for r in rows])
@@ -196,20 +143,8 @@ def violations(rows, samples):
 
 
 def plants(sides, limits, unit):
-    """Return a figure of many plants: how their errors are distributed, and their highest levels.
-
-    Parameters
-    ----------
-    sides : {name: (errors (N,), highest levels (N, tanks))}
-        One, or before and after.
-    limits : (tanks,) on the levels, inf where there is none
-    unit : of lengths
-
-    Examples
-    --------
-    >>> figure = plants({"after": (np.ones(8), np.full((8, 2), 20.0))}, [30.0, 30.0], "cm")
-    >>> [ax.get_xlabel() for ax in figure.axes]
-    ['total rms error [cm]', 'tank']
+    """Return a figure of many plants: how their errors are distributed, and their highest
+    levels.
     """
     colours = [TUNED] if len(sides) == 1 else [PUBLISHED, TUNED]
     with styled():

@@ -109,10 +109,7 @@ PUBLISHED = {
 
 
 def rig():
-    """Return the paper's tanks T1 and T3 in m and m^3/s.
-
-    T1 is pumped and its level is the output; T3 drains to the basin.
-    """
+    """Return the paper's tanks T1 and T3 in m and m^3/s."""
     return coupled_tanks(
         area=A,
         drain=[0.0, C2 / SPEED],
@@ -175,10 +172,7 @@ def constant_flow(case):
 
 
 def same_everywhere(run, values):
-    """Return the largest difference between two decays of h3 - h3r, as a share of the step.
-
-    They follow steps of h1r by 0.1 m from the levels STEP.
-    """
+    """Return the largest difference between two decays of h3 - h3r, as a share of the step."""
     shares = []
     for level in STEP:
         start = {

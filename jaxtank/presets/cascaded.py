@@ -126,20 +126,8 @@ def loop(controller, reference, x0, u0=0.0):
 
 
 def playback(pump, level):
-    """Return (loop, clock) that apply a recorded pump voltage to the rig.
-
-    The recorded level is the reference, so that the tracking error is the simulation error.
-
-    Parameters
-    ----------
-    pump, level : (samples,) pump voltage and lower level every 4 s [V]
-
-    Examples
-    --------
-    >>> loop, clock = playback([2.0, 2.0, 3.0], [5.0, 5.1, 5.2])
-    >>> clock.duration
-    8.0
-    """
+    """Return (loop, clock) that apply a recorded pump voltage to the rig."""
+    # The recorded level is the reference, so that the tracking error is the simulation error.
     controller = OpenLoop(signal=Table(values=number([pump]), period=PERIOD))
     reference = Table(values=number([level]), period=PERIOD)
     return loop(controller, reference, START), Clock(
@@ -148,24 +136,15 @@ def playback(pump, level):
 
 
 def steady_state(level):
-    """Return ((upper, lower) levels, pump) of the steady state with the lower level at `level` [V].
-
-    Examples
-    --------
-    >>> (upper, lower), pump = steady_state(4.0)
-    >>> round(upper, 3), lower, round(pump, 3)
-    (4.461, 4.0, 2.5)
+    """Return ((upper, lower) levels, pump) of the steady state with the lower level at
+    `level` [V].
     """
     flow = K_LOWER * level**0.5
     return ((flow / K_UPPER) ** 2, level), flow / K_PUMP - OFFSET
 
 
 def measured(run):
-    """Return what can be measured of PUBLISHED without a record (see `paper.Preset`).
-
-    The rim, by flooding both tanks; the period at which a record is played. The simulation error
-    needs a record (`playback`), and none is shipped.
-    """
+    """Return what can be measured of PUBLISHED without a record (see `paper.Preset`)."""
     case, flood = run(
         "open-loop", {"controller.signal.initial": 10.0, "controller.signal.targets": 10.0}
     )

@@ -90,13 +90,7 @@ def rig():
 
 
 def loop(faulty=False):
-    """Return the closed loop, with a leak of tank 3 and a plugged pipe if `faulty`.
-
-    Examples
-    --------
-    >>> loop().plant.pipes
-    ((0, 2), (2, 1))
-    """
+    """Return the closed loop, with a leak of tank 3 and a plugged pipe if `faulty`."""
     plant = rig()
     x0, u0 = equilibrium(plant, np.array([40.0, 15.0]))
     events = [("drain[2]", 500.0, 700.0, 1.0, LEAK), ("pipe[0]", 1300.0, 1500.0, PLUGGED, 0.0)]

@@ -200,10 +200,7 @@ PUBLISHED = {
 
 
 def _rises(case, run):
-    """The claim on the inflow pulses of tank 2 at 500 s and tank 1 at 700 s.
-
-    Volume over area, and the rise of the simulated level, are compared [% of the level].
-    """
+    """The claim on the inflow pulses of tank 2 at 500 s and tank 1 at 700 s."""
     before, jumps = rows.jumps(run)
     by_volume = 100.0 * rows.instant(case) / before
     by_level = 100.0 * jumps / before

@@ -118,17 +118,7 @@ DEPARTURES = (
 
 
 def loop(phase):
-    """Return the closed loop at one of the two operating points.
-
-    Parameters
-    ----------
-    phase : "minimum" or "non-minimum"
-
-    Examples
-    --------
-    >>> loop("minimum").controller.Kc
-    array([1.5 , 1.35])
-    """
+    """Return the closed loop at one of the two operating points."""
     rig, volts = johansson(phase)
     levels = np.asarray(steady_levels(rig, volts))
     K, Ti = PRINTED_GAINS[phase]
@@ -161,11 +151,7 @@ def loop(phase):
 
 
 def measured(run):
-    """Return what is found of PUBLISHED (see `paper.Preset`).
-
-    Time constants and relative gains are those at the printed levels; so are the zeros of the
-    minimum phase. The zeros of the non-minimum phase are those at the model's equilibrium.
-    """
+    """Return what is found of PUBLISHED (see `paper.Preset`)."""
     found, slowest = {}, {}
     for phase, (levels, *_) in POINTS.items():
         plant, volts = run(NAMES[phase])[0].loop.plant, JOHANSSON[phase][2]

@@ -134,10 +134,7 @@ DEPARTURES = (
 
 
 def steady_error(run, kind, values):
-    """Return the mean error (2,) [cm] of the last 100 s of 400 s.
-
-    The run begins at the steady state at SETPOINT, and the parameters `values` are changed.
-    """
+    """Return the mean error (2,) [cm] of the last 100 s of 400 s."""
     x0, u0 = equilibrium(plant(), SETPOINT)
     start = {
         "x0": x0.tolist(),
@@ -209,10 +206,7 @@ def _steady_errors(run):
 
 
 def _fitted(name, case):
-    """The case `name` of FITTED, made of the one that it starts from.
-
-    Of the blend the memberships are tuned, the relay is as printed.
-    """
+    """The case `name` of FITTED, made of the one that it starts from."""
     loop, blend = fitted(name), ("controller.b", "controller.w")
     more = {"free": {p: TUNABLE[p] for p in blend}, "objective": CHATTER_COST, "scenarios": ()}
     return case.replace(

@@ -1,7 +1,4 @@
-"""What a paper is made of: its cases, what it prints, and what is found of that.
-
-Imported by the papers of this folder, and by papers from outside.
-"""
+"""What a paper is made of: its cases, what it prints, and what is found of that."""
 
 import dataclasses
 import inspect
@@ -92,15 +89,7 @@ class Sample(NamedTuple):
 
 
 def verdict(holds: Any) -> str:
-    """Return the verdict of a claim whose parts were measured to hold, or not to.
-
-    Raises TypeError for anything but a boolean or several.
-
-    Examples
-    --------
-    >>> verdict(2 > 1), verdict([2 > 1, 1 > 2]), verdict([False, False])
-    ('reproduced', 'partly', 'not reproduced')
-    """
+    """Return the verdict of a claim whose parts were measured to hold, or not to."""
     parts = np.ravel(np.asarray(holds))
     if parts.dtype != bool or not parts.size:
         raise TypeError(f"a claim holds or not, and so does each of its parts: {holds!r}")

@@ -1,5 +1,5 @@
 """[law], [observer], [sensor] and [actuator] of a rig file: a component by its kind, and its fields
-by their names.  Imported by the readers and writers of `rig`.
+by their names.
 """
 
 import dataclasses
@@ -197,14 +197,7 @@ FLOORS = {"level_floor": 0.01, "difference_floor": 0.01}
 
 
 def section_of(name, kind, units=DEFAULT):
-    """Return the Section of a kind of component: the leaves and static fields of its class.
-
-    Parameters
-    ----------
-    name : "law", "observer", "sensor" or "actuator"
-    kind : name of one of its classes
-    units : (length, pump input), in which defaults are
-    """
+    """Return the Section of a kind of component: the leaves and static fields of its class."""
     known = ROLES[name].classes
     first = dataclasses.replace(KIND, doc=f"one of {', '.join(known)}")
     if known[kind] is controllers.OpenLoop:
@@ -232,14 +225,7 @@ def _key(cls, field, own, units):
 
 
 def controller_of(table, loop, bias=None):
-    """Return the controller of a [law] table.
-
-    Parameters
-    ----------
-    table : {key: value} as in the file
-    loop : ClosedLoop with any controller, whose model is that of the new one
-    bias : (m,) inputs where the table leaves `bias` out; those of `steady_bias` where None
-    """
+    """Return the controller of a [law] table."""
     if isinstance(table, dict) and table.get("kind") == "open-loop":
         start = ramps(np.asarray(loop.actuator.initial).tolist(), [], ramp=0.0)
         section = section_of("law", "open-loop")
@@ -261,9 +247,8 @@ def observer_of(table, loop):
 
 
 def model_of(loop):
-    """The model of the loop's controller, scheduled or not; the plant where it has none that fits.
-
-    What takes its place takes its model.
+    """The model of the loop's controller, scheduled or not; the plant where it has none
+    that fits.
     """
     plant, model = loop.plant, getattr(getattr(loop.controller, "law", loop.controller), "model", 0)
     fits = (getattr(model, "tanks", 0), getattr(model, "pumps", 0)) == (plant.tanks, plant.pumps)
@@ -280,16 +265,7 @@ def instrument_of(name, table, loop):
 
 
 def component(name, table, plant, offered):
-    """Return the component of a table: kind, then the fields of its class.
-
-    Parameters
-    ----------
-    name : "law", "observer", "sensor" or "actuator"
-    table : {key: value} as in the file
-    plant : the rig, its field `model`
-    offered : {key: value} that a table may leave out; of a controller or observer for classes of
-        ours only
-    """
+    """Return the component of a table: kind, then the fields of its class."""
     role = ROLES[name]
     if not isinstance(table, dict):
         raise InputError(f"[{name}]: must be a table")

@@ -1,7 +1,4 @@
-"""A section of a rig file read by its schema: known keys, kinds of values, ranges, units.
-
-Imported by the rest of `rig` and, for the checks of numbers, by its callers.
-"""
+"""A section of a rig file read by its schema: known keys, kinds of values, ranges, units."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -44,32 +41,7 @@ def sizes_of(plant, names: Mapping[str, int] = {}) -> Sizes:
 def read_entry(
     section, table: Any, sizes: Sizes, index: int | None = None, title: str = ""
 ) -> dict[str, Any]:
-    """Return the values of a table of a rig file, checked key by key against its section.
-
-    Parameters
-    ----------
-    section : Section
-    table : {key: value} as in the file
-    sizes : of the rig
-    index : number of the table in its list, from 0, or None
-    title : what messages on missing keys call it; "": its title
-
-    Returns
-    -------
-    {key: value}, tanks as indices from 0; a default where the table leaves a key out, nothing where
-    that is None.
-
-    Raises
-    ------
-    InputError naming the key, its value, unit and range: a key that is unknown (with the nearest)
-    or missing, a value of the wrong kind, and one out of range.
-
-    Examples
-    --------
-    >>> from jaxtank.rig.schema import SECTIONS
-    >>> read_entry(SECTIONS["pipe"], {"between": [1, 2], "area": 0.5}, Sizes(tanks=2), 0)
-    {'between': (0, 1), 'area': 0.5}
-    """
+    """Return the values of a table of a rig file, checked key by key against its section."""
     where = section.name if index is None else f"{section.name} {index + 1}"
     if not isinstance(table, Mapping):
         raise InputError(f"{where} = {shortened(table)}: must be a table")
@@ -327,9 +299,7 @@ def unit(meta):
 
 
 def allowed(meta, value=0.0):
-    """The range in `meta` in words, "above 0" for one; value: whether numbers are whole.
-    Empty where all numbers are allowed.
-    """
+    """The range in `meta` in words, "above 0" for one; value: whether numbers are whole."""
     if meta.get("choices") is not None:
         return " or ".join(
             str(c).lower() if isinstance(c, bool) else f'"{c}"' for c in meta["choices"]

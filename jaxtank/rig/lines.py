@@ -1,6 +1,5 @@
-"""Lines of a rig file: values as TOML, a section as a block of "key = value" with what each key is.
-
-Imported by the writers in `rig`, and by `jaxtank.rig` for `toml`.
+"""Lines of a rig file: values as TOML, a section as a block of "key = value" with what
+each key is.
 """
 
 from collections.abc import Mapping
@@ -34,14 +33,7 @@ class Block(NamedTuple):
 
 
 def lines_of(section: Section, values: Mapping[str, Any], units=DEFAULT) -> list[Line]:
-    """Return the lines of a section's keys that have a value, in the order of its schema.
-
-    Parameters
-    ----------
-    section : Section
-    values : {key: value}, as the loop has it: tanks from 0, arrays
-    units : (length, pump input) of the rig
-    """
+    """Return the lines of a section's keys that have a value, in the order of its schema."""
     return [
         Line(k.name, written(k, values[k.name]), k.meta(units))
         for k in section.keys
@@ -50,22 +42,12 @@ def lines_of(section: Section, values: Mapping[str, Any], units=DEFAULT) -> list
 
 
 def block(section: Section, values: Mapping[str, Any], units=DEFAULT) -> Block:
-    """Return the Block of a section with `lines_of` its values.
-
-    Examples
-    --------
-    >>> from jaxtank.rig.schema import SECTIONS
-    >>> found = block(SECTIONS["pipe"], {"between": (0, 1), "area": 0.5})
-    >>> terse(found)[1:]  # doctest: +ELLIPSIS
-    ['between = [1, 2]  # the two tanks ...', 'area = 0.5  # [cm^2] effective area']
-    """
+    """Return the Block of a section with `lines_of` its values."""
     return Block(section.title, lines_of(section, values, units))
 
 
 def suggestion(section: Section, values: Mapping[str, Any], units=DEFAULT) -> Block:
-    """Return the Block of a section that could be in a file, commented out. A key without a value
-    has its default.
-    """
+    """Return the Block of a section that could be in a file, commented out."""
     given = {k.name: k.default for k in section.keys if isinstance(k.default, (int, float, str))}
     lines = lines_of(section, {**given, **values}, units)
     return Block(section.title, lines, (section.prose,), False)

@@ -1,5 +1,5 @@
 """A rig described tank by tank in a rig file: [[tank]], [[orifice]], [[pipe]], [[spill]], [[pump]]
-and [plant]; read to a Case and written from a loop.  Imported by `read` and `sections`.
+and [plant]; read to a Case and written from a loop.
 """
 
 import dataclasses
@@ -41,18 +41,7 @@ def names_in(table):
 
 
 def build(table):
-    """Return the Case of a table of a rig file that has [[tank]].
-
-    Reference, values, limits and the rest come after (`rig.from_table`).
-
-    Parameters
-    ----------
-    table : {section: table or list of tables}
-
-    Raises
-    ------
-    InputError for a key, a value or a topology that makes no rig.
-    """
+    """Return the Case of a table of a rig file that has [[tank]]."""
     table = {**table, **{name: _list(table, name) for name in LISTS}}
     sizes = Sizes(
         len(table["tank"]), units=_units(table.get("units", list(DEFAULT))), names=names_in(table)
@@ -220,19 +209,7 @@ def _list(table, name):
 
 
 def entries_of(loop, names):
-    """Return [(section, number from 1, {key: value})] that describe a loop's rig tank by tank.
-
-    A steady inflow is the tanks' own; keys without a value are left out.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    names : {"tank" or "pump": a name of each}, those of a Case
-
-    Raises
-    ------
-    InputError for a plant of another class than TankNetwork.
-    """
+    """Return [(section, number from 1, {key: value})] that describe a loop's rig tank by tank."""
     plant = loop.plant
     if not isinstance(plant, TankNetwork):
         raise InputError(f"its {type(plant).__name__} has no name in a rig file")

@@ -11,18 +11,7 @@ from jaxtank.rig import components, schedule, signals
 
 
 def origin_of(case):
-    """Return the preset that a case came from.
-
-    Of several, the one with the same controller and observer, then of the same name, then with the
-    most static fields in common: its title is the one that the file will show. What a file has
-    tables of its own for (reference, disturbances, faults) may differ.
-
-    Returns
-    -------
-    (Case of a preset with the same rig, which of "law", "observer", "sensor" and "actuator" are of
-    the same kind as its own), or (None, ()): also of a rig whose tanks have names, which only a
-    file that describes it tank by tank can have.
-    """
+    """Return the preset that a case came from."""
     if case.names:
         return None, ()
     loop = schedule.unscheduled(case.loop)

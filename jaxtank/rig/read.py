@@ -1,4 +1,4 @@
-"""From a rig file to a Case.  Imported by `sections` and by `jaxtank.rig`."""
+"""From a rig file to a Case."""
 
 import dataclasses
 import re
@@ -348,9 +348,7 @@ def _check_sections(table):
 
 
 def _with_parts(case, table):
-    """A case with the controller or observer of a table in the place of its own. What its own
-    could be tuned by goes with a controller.
-    """
+    """A case with the controller or observer of a table in the place of its own."""
     loop, changed = case.loop, []
     if "law" in table:
         controller = components.controller_of(table["law"], loop, loop.actuator.initial)

@@ -1,5 +1,5 @@
 """Turning gains of a case into a schedule, and back: what rig files and the command line do with
-`controllers.Scheduled`.  Imported by `values`, `sections` and users.
+`controllers.Scheduled`.
 """
 
 import dataclasses
@@ -27,34 +27,6 @@ START = "controller."
 def schedule(case, gains, knots):
     """Return a copy of `case` whose controller has scheduled gains: the same run, until the values
     at the knots are changed.
-
-    The values, controller.values (gains, K), are the gain's present one at every knot. What was
-    free of a scheduled gain becomes free at every knot, within the same range; other names of the
-    controller are now controller.law.*.
-
-    Parameters
-    ----------
-    case : Case
-    gains : {dotted name of a gain: operating variable}; an array stands for all its entries; the
-        variable, a setpoint ("r1") or a level estimate ("h2"), counted from 1, is one for all
-    knots : (K,) increasing positions of the variable, in the rig's unit of length
-
-    Returns
-    -------
-    Case.
-
-    Raises
-    ------
-    InputError for an unknown gain (with the nearest), a static one, one that the controller uses
-    outside its step (see `Scheduled`), a variable that the rig does not have, and knots that do not
-    increase.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> case = schedule(presets.find("gouta2015/ngpc"), {"controller.Tp": "r1"}, [5.0, 10.0])
-    >>> list(case.free)
-    ['controller.values[0,0]', 'controller.values[0,1]']
     """
     loop, part = case.loop, case.loop.controller
     if isinstance(part, Scheduled):
@@ -133,12 +105,7 @@ def table_of(loop):
 
 
 def from_table(case, table):
-    """Return `schedule` of a table as `table_of` makes it.
-
-    Raises
-    ------
-    InputError for a key that is unknown, missing, or not of its kind.
-    """
+    """Return `schedule` of a table as `table_of` makes it."""
     values = read_entry(SECTIONS["schedule"], table, sizes_of(case.loop.plant))
     gains, knots = values["gains"], table["knots"]
     for gain in gains:

@@ -1,6 +1,5 @@
-"""The blocks of a rig file that describe a case: the one source of `dump`, `complete` and `short`.
-
-Imported by `write`.
+"""The blocks of a rig file that describe a case: the one source of `dump`, `complete` and
+`short`.
 """
 
 import dataclasses
@@ -41,17 +40,7 @@ PARTS = {
 
 
 def sections(case, tankwise=False):
-    """Return the Blocks of a case.
-
-    Parameters
-    ----------
-    case : Case
-    tankwise : whether to describe it tank by tank even where a preset has the same rig
-
-    Raises
-    ------
-    InputError for a case that no file can describe.
-    """
+    """Return the Blocks of a case."""
     if case.loop.safety_filter is not None and case.safety is None:
         raise InputError(
             f"{case.name}: cannot be written as a rig file: its safety filter is not that of"
@@ -93,10 +82,7 @@ def _none(name, doc="none"):
 
 
 def _reachable(case, base):
-    """The line `reachable` where it is not as in `base`. A file whose plateaus have no steady state
-    is only read with `false`, and an identified or tuned plant may have none: the file then has
-    false, and why.
-    """
+    """The line `reachable` where it is not as in `base`."""
     why, section = unreachable(case) if case.reachable else None, SECTIONS[""]
     if why:
         return [Line("reachable", False, {"unit": "-", "doc": why})]

@@ -1,5 +1,5 @@
 """What moves a rig besides its controller, as tables of a rig file: [reference], [reference.sine],
-[disturbance], [[pour]] and [[fault]].  Imported by `components`, `read` and `sections`.
+[disturbance], [[pour]] and [[fault]].
 """
 
 import dataclasses
@@ -117,14 +117,7 @@ def sine_values(sine):
 
 
 def disturbance_of(table, loop, names):
-    """What [disturbance] and [[pour]] of a rig file make of a loop's disturbance.
-
-    Parameters
-    ----------
-    table : {section: table or list of tables}
-    loop : ClosedLoop
-    names : {name: index} of the tanks that have a name
-    """
+    """What [disturbance] and [[pour]] of a rig file make of a loop's disturbance."""
     old, sizes = loop.disturbance, sizes_of(loop.plant, names)
     more = read_entry(SECTIONS["disturbance"], table.get("disturbance", {}), sizes)
     if "inflow" in more:

@@ -1,5 +1,5 @@
 """Suggestions of a complete rig file, commented out: what could be set besides, each line of which
-can be used as it stands.  Imported by `sections`.
+can be used as it stands.
 """
 
 import numpy as np
@@ -126,13 +126,7 @@ def uncertain(case):
 
 
 def suggestions(case, have):
-    """Return the Blocks of tables that a case does not have, as they could be.
-
-    Parameters
-    ----------
-    case : Case
-    have : titles and top-level keys that its file has already
-    """
+    """Return the Blocks of tables that a case does not have, as they could be."""
     given = have - {section.title for section in SECTIONS.values() if section.many}
     found = []
     for name, example in EXAMPLES.items():

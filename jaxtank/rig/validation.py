@@ -1,5 +1,5 @@
 """Input validation of the sections on tuning: limits, objective, what is free and
-uncertain, covariance, scenarios, columns of experiment data.  Imported by `read` and `jaxtank.rig`.
+uncertain, covariance, scenarios, columns of experiment data.
 """
 
 import math
@@ -263,9 +263,7 @@ def check_free(loop: ClosedLoop, name: str, low: Any, high: Any, scale: str = "l
 
 
 def free_of(loop, table):
-    """{name: Free} of a [free] table. A gain that a schedule gives is free at every knot, and other
-    names of the scheduled controller are found.
-    """
+    """{name: Free} of a [free] table."""
     found = {}
     for name, spec in table.items():
         good = isinstance(spec, list) and len(spec) in (2, 3)

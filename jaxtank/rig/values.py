@@ -1,7 +1,4 @@
-"""Setting what a case has by dotted name: leaves, static fields, the clock; scenarios.
-
-Imported by `read`, `validate` and `jaxtank.rig`.
-"""
+"""Setting what a case has by dotted name: leaves, static fields, the clock; scenarios."""
 
 import dataclasses
 import re
@@ -107,11 +104,6 @@ def set_values(case: Case, values: Mapping[str, Any]) -> Case:
 def with_models(loop, values):
     """Return `values` with the plant's parameters among them for the models that hold them too, and
     those of the controller's model for that of the observer.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    values : {dotted name: value}; a model's parameter among them keeps the value that it has there
     """
     names = {name for kind in ("leaf", "static") for name, _, _ in walk(loop, kind=kind)}
     found = {}

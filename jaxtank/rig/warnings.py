@@ -1,6 +1,5 @@
-"""Warnings about a case that can run but is hardly meant: reported by the commands, never refused.
-
-Imported by `jaxtank.rig`.
+"""Warnings about a case that can run but is hardly meant: reported by the commands, never
+refused.
 """
 
 import numpy as np

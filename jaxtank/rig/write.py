@@ -1,5 +1,5 @@
 """From a Case to a rig file: terse (`dump`), complete with every key that can be set (`complete`),
-or what differs from a preset (`short`).  Imported by `jaxtank.rig`.
+or what differs from a preset (`short`).
 """
 
 import textwrap

@@ -1,7 +1,4 @@
-"""Limits on levels that hold for every plant of a box: the filter, and when it is proved.
-
-May be imported by the loop and everything above it.
-"""
+"""Limits on levels that hold for every plant of a box: the filter, and when it is proved."""
 
 from jaxtank.safety.certificate import TankCertificate, design
 from jaxtank.safety.filter import SafetyFilter

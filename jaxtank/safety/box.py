@@ -1,7 +1,4 @@
-"""The box of plants and readings for which limits are to hold.
-
-May be imported by the rest of `jaxtank.safety`.
-"""
+"""The box of plants and readings for which limits are to hold."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -23,18 +20,7 @@ LEAST_SIGMAS = 5.0
 
 
 def box_of(plant: TankNetwork, widths: Mapping[str, ArrayLike]) -> tuple[TankNetwork, TankNetwork]:
-    """Return the plants at the lower and the upper end of a box.
-
-    Parameters
-    ----------
-    widths : {parameter of the plant: half width of its interval, in its unit}; "drain", or
-        "plant.drain", or one entry, "plant.drain[1]". Names of instruments are passed over
-
-    Raises
-    ------
-    InputError
-        for a name that the plant does not have, or an interval that reaches 0
-    """
+    """Return the plants at the lower and the upper end of a box."""
     ends: tuple[dict, dict] = ({}, {})
     leaves = {f.name for f in dataclasses.fields(plant) if f.metadata.get("kind") == "leaf"}
     for name, width in widths.items():
@@ -95,8 +81,6 @@ def spread(value: ArrayLike, name: str, widths: Mapping[str, ArrayLike]) -> tupl
 def widths_of(part: Any, spread: Mapping[str, float]) -> dict[str, np.ndarray]:
     """Return the half widths of `box_of` for parameters of a plant or an instrument that may be off
     by a share of their value.
-
-    Raises InputError for a share outside [0, 1).
     """
     found = {}
     for name, share in spread.items():
@@ -113,10 +97,7 @@ def widths_of(part: Any, spread: Mapping[str, float]) -> dict[str, np.ndarray]:
 def narrow_band(
     sensor: LevelSensor, band: np.ndarray, unit: str, widths: Mapping[str, ArrayLike]
 ) -> list[str]:
-    """Return for each tank why a band cannot be relied on, "" where it can.
-
-    band : (n,) largest difference of reading and level that is assumed [cm].
-    """
+    """Return for each tank why a band cannot be relied on, "" where it can."""
     least = band_of(sensor, LEAST_SIGMAS, widths) + 0.0 * band
     words = (
         f"below {LEAST_SIGMAS:g} standard deviations of the noise, half an ADC step and the offset"

@@ -1,6 +1,6 @@
 """For which limits a safety filter is proved, tank by tank, and what it costs.
 
-Works on plain numbers, before a run. May be imported by the rig files, the command line and tests.
+Works on plain numbers, before a run.
 """
 
 import dataclasses
@@ -69,16 +69,9 @@ class TankCertificate:
 
 
 def rate_bound(hold: float, delay: float = 0.0, lag: float = 0.0) -> float:
-    """Return the largest kappa [1/s] that is proved for a hold, a dead time and a lag [s].
-
-    Without lag, d = delay/hold whole samples: kappa T <= d^d/(d + 1)^(d + 1) (1 for d = 0).
-    With a lag tau and age a = delay + hold: max over sigma of sigma (1 - tau sigma) exp(-sigma a).
-
-    Examples
-    --------
-    >>> rate_bound(0.1), round(rate_bound(0.1, delay=0.1), 3)
-    (10.0, 2.5)
-    """
+    """Return the largest kappa [1/s] that is proved for a hold, a dead time and a lag [s]."""
+    # Without lag, d = delay/hold whole samples: kappa T <= d^d/(d + 1)^(d + 1) (1 for d = 0). With
+    # a lag tau and age a = delay + hold: max over sigma of sigma (1 - tau sigma) exp(-sigma a).
     if lag > 0.0:
         age = delay + hold
         sigma = 2.0 / (2.0 * lag + age + math.sqrt(4.0 * lag**2 + age**2))

@@ -52,12 +52,11 @@ HARMLESS = ("controller.", "observer.", "reference.")
 
 
 class Verdict(NamedTuple):
-    """Whether no plant of the box passes the limits of one tank, and by what.
+    """Whether no plant of the box passes the limits of one tank, and by what."""
 
-    tank : counted from 0.  holds, low_holds : of the upper and the low limit.  reason, low_reason :
-    the theorem, the condition that fails with both numbers, or "not covered: FEATURE".  starts :
-    ANY or OWN, the levels at t = 0 for which it holds.
-    """
+    # tank : counted from 0. holds, low_holds : of the upper and the low limit. reason, low_reason :
+    # the theorem, the condition that fails with both numbers, or "not covered: FEATURE". starts :
+    # ANY or OWN, the levels at t = 0 for which it holds.
 
     tank: int
     holds: bool
@@ -83,22 +82,7 @@ def check(
     faults: Any = None,
     limits: Any = None,
 ) -> tuple[Verdict, ...]:
-    """Return the Verdict of each tank.
-
-    Parameters
-    ----------
-    safety_filter, plant, actuator, sensor : the finished filter and the rig
-    hold : longest time for which an input is held [s]
-    substeps : integration steps of a hold
-    box : {dotted name: (lower, upper)} of every uncertain leaf of the case
-    inflow : ((n,) least, (n,) largest) inflow disturbance [cm^3/s]
-    volume : (n,) volume that may enter besides, at any time and rate, in all [cm^3]
-    drawn : whether volumes may leave besides, at any time
-    start : (n,) levels at t = 0 [cm], or the interval "x0" of the box; without it limits must hold
-        for any start below them
-    faults : the faults of the case
-    limits : (n,) limits that are claimed [cm]; those of the filter where left out
-    """
+    """Return the Verdict of each tank."""
     parts = {"plant": plant, "actuator": actuator, "sensor": sensor, "safety_filter": safety_filter}
     parts |= {} if faults is None else {"faults": faults}
     tanks = len(np.atleast_1d(safety_filter.limit))
@@ -427,9 +411,6 @@ class _Found(NamedTuple):
 def _joint(rig, start, claimed):
     """The largest set of tanks whose limits are kept together, from `start` or (None) from any
     levels at or below the claimed limits (n,) [cm].
-
-    One tank that leaves the set only raises the bounds of the others, so tanks are removed until
-    the conditions of all that remain hold at the joint bounds.
     """
     n, alone = rig.tanks, None
     level = np.array(rig.limit)  # before volumes that enter besides
@@ -518,9 +499,8 @@ def _ringed(spills, tank):
 
 
 def _upper(rig, i, level, at):
-    """(why the limit of a tank is not proved with the others at their bounds, or ""; the theorem).
-
-    level : its limit before volumes that enter besides
+    """(why the limit of a tank is not proved with the others at their bounds, or ""; the
+    theorem).
     """
     bounds = at.bounds
     if not at.begin[i] <= level * (1.0 + 1e-12):
@@ -610,9 +590,7 @@ def _readable(rig, i, bounds):
 
 
 def _second_order(rig, i, at):
-    """Why Theorem 2 does not hold for tank i, or "". Negative inflows and overflow only lower the
-    levels in a hold, and g with them rises: README.md, Theorem 2.
-    """
+    """Why Theorem 2 does not hold for tank i, or ""."""
     k1, top, knee, sources = rig.slope[i], rig.limit[i], rig.knee, rig.into[i]
     ring = {i} | {j for j, *_ in sources}
     if rig.gains[i] or not sources:

@@ -1,7 +1,4 @@
-"""The conditions of the theorems, tank by tank, and what a filter costs.
-
-May be imported by `safety.certificate`.
-"""
+"""The conditions of the theorems, tank by tank, and what a filter costs."""
 
 import math
 
@@ -32,11 +29,9 @@ def theorem_of(setting, tank):
 
 
 def failed_condition(setting, tank, limits, bound, start, reach):
-    """The condition that keeps the limit of one tank from being proved, or "".
-
-    limits : the _Proved of the rig; start : (n,) highest levels at t = 0 [cm], or None; reach :
-    (n,) levels that no tank passes [cm], before volumes that enter besides
-    """
+    """The condition that keeps the limit of one tank from being proved, or ""."""
+    # limits : the _Proved of the rig; start : (n,) highest levels at t = 0 [cm], or None; reach :
+    # (n,) levels that no tank passes [cm], before volumes that enter besides
     rates, top, kappa = setting.rates, limits.heights[tank], limits.rate
     if start is not None and start[tank] > top * (1.0 + 1e-12):
         return f"start at {start[tank]:.4g} cm, above the limit {top:.4g} cm"
@@ -133,9 +128,7 @@ def _too_high_above(setting, tank, heights, slopes, start):
 
 
 def settle(setting, limits, bound, start, plant):
-    """`limits` with the conditions that failed and the levels that no tank passes. A tank without a
-    certificate may pass its limit: the conditions of the others must hold for what it may reach.
-    """
+    """`limits` with the conditions that failed and the levels that no tank passes."""
     reasons = list(limits.reasons)
     while True:
         reach = _reach(setting, limits.heights, reasons, plant, start)
@@ -184,8 +177,6 @@ def _reach(setting, heights, reasons, plant, start):
 def spills(setting, plant, limits, start):
     """((n,) what falls at most into each tank from rims [cm^3/s], (n) features that no theorem
     covers). A tank spills unless it is proved for a limit at or below its rim.
-
-    plant : (least, most) plant of the box; limits : the _Proved of the rig
     """
     (least, most), wild = plant, list(setting.uncovered)
     falls = np.zeros(len(wild))

@@ -228,11 +228,9 @@ class SafetyFilter:
         return pumped + lower_clip(rise(r, tank, 0.0, self.reach), 0.0)
 
     def _row_above(self, r, tank, y, hold, high):
-        """Return the row of a tank without a pump on the pumps of the tanks that feed it.
-
-        g = c_min s(h) + k1 (H - h) - sum_j c_j,max max(s(h_j), a0)    g >= 0 keeps h' <= k1 (H - h)
-        sum_j c_j,max b_j,max S_j u_j <= M = max(0, D + k2 g_low - k1^2 (H - l))
-        """
+        """Return the row of a tank without a pump on the pumps of the tanks that feed it."""
+        # g = c_min s(h) + k1 (H - h) - sum_j c_j,max max(s(h_j), a0) g >= 0 keeps h' <= k1 (H - h)
+        # sum_j c_j,max b_j,max S_j u_j <= M = max(0, D + k2 g_low - k1^2 (H - l))
         s = lambda h: smooth_sqrt(lower_clip(h, 0.0), r.knee)
         k1, k2, top, eps = self.slope[tank], self.rate[tank], self.limit[tank], self.band[tank]
         a0 = FLOOR * s(top)

@@ -1,6 +1,6 @@
 """Lower limits on the pumps, computed from the readings, that keep levels above low limits.
 
-The signs of the caps turned: README.md of this folder, "Low limits". Imported by `safety.filter`.
+The signs of the caps turned: README.md of this folder, "Low limits".
 """
 
 from collections.abc import Sequence
@@ -13,18 +13,8 @@ from jaxtank.safety.worst_case import Rates, fall
 
 
 def floor_rows(guard: Any, rates: Rates, y: Sequence, hold: Any, low: Sequence) -> list:
-    """Return [(tank, f)] of the tanks with a low limit: sum_j b_j,min u_j >= f [cm/s] keeps it.
-
-        f = -Phi_min(y + band) - rate (y - band - low)
-
-    Parameters
-    ----------
-    guard : SafetyFilter
-    rates : Rates of its box
-    y : (n) readings [cm]
-    hold : longest time for which an input is held [s]
-    low : (m) lower limits of the pumps [V]
-    """
+    """Return [(tank, f)] of the tanks with a low limit: sum_j b_j,min u_j >= f [cm/s] keeps it."""
+    # f = -Phi_min(y + band) - rate (y - band - low)
     below = lowest(guard, rates, y, hold, low)
     return [
         (
@@ -37,10 +27,7 @@ def floor_rows(guard: Any, rates: Rates, y: Sequence, hold: Any, low: Sequence) 
 
 
 def lowest(guard: Any, rates: Rates, y: Sequence, hold: Any, low: Sequence) -> list:
-    """Return the (n) least that each level can be until the inputs of this sample end [cm].
-
-    Parameters as of `floor_rows`.
-    """
+    """Return the (n) least that each level can be until the inputs of this sample end [cm]."""
     below = []
     for i in range(guard.least.tanks):
         drawn = sum(b * lower_clip(-low[j], 0.0) for j, (_, b) in rates.pumps[i].items())
@@ -53,12 +40,6 @@ def lowest(guard: Any, rates: Rates, y: Sequence, hold: Any, low: Sequence) -> l
 def floors_of(rates: Rates, rows: Sequence, low: Sequence, caps: Sequence) -> tuple:
     """Return ((m) lower limits of the inputs [V], none above its cap, the rows [({pump: b_min}, f)]
     of tanks with two pumps or more).
-
-    Parameters
-    ----------
-    rates : Rates
-    rows : those of `floor_rows`
-    low, caps : (m) limits of the inputs without low limits on levels [V]
     """
     floors, shared = list(low), []
     for tank, f in rows:

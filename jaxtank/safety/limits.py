@@ -1,7 +1,4 @@
-"""Theorem 2: which limits can be kept, and how.
-
-May be imported by `safety.certificate`.
-"""
+"""Theorem 2: which limits can be kept, and how."""
 
 import math
 
@@ -33,14 +30,12 @@ def filled_levels(setting, wanted, start):
 
 
 def limits_for(setting, heights, kappa, unsettled=frozenset()):
-    """(limits (n,) [cm], k1 (n,) [1/s], {tank: why it failed}): Theorem 2.
-
-    A tank whose inflow alone passes its limit is held by the pumps above it if it has none of its
-    own; otherwise the limits of the tanks above are lowered by one factor until it is not. Every
-    k1 is chosen again after a limit was lowered, so what is returned meets all conditions at once.
-
-    unsettled : tanks for whose sake no limit is lowered, since that did not come to an end
-    """
+    """(limits (n,) [cm], k1 (n,) [1/s], {tank: why it failed}): Theorem 2."""
+    # A tank whose inflow alone passes its limit is held by the pumps above it if it has none of its
+    # own; otherwise the limits of the tanks above are lowered by one factor until it is not. Every
+    # k1 is chosen again after a limit was lowered, so what is returned meets all conditions at
+    # once.
+    # unsettled : tanks for whose sake no limit is lowered, since that did not come to an end
     n, limits = len(heights), np.array(heights)
     for _ in range(SWEEPS):
         slopes, reasons, lowered = np.zeros(n), list(setting.uncovered), set()

@@ -1,7 +1,4 @@
-"""The conditions under which low limits on levels are proved, tank by tank.
-
-May be imported by `safety.certificate`.
-"""
+"""The conditions under which low limits on levels are proved, tank by tank."""
 
 import numpy as np
 
@@ -13,10 +10,7 @@ INTERVALS = 400
 
 
 def check_low(low, limits, length):
-    """Raise InputError for a low limit that is not between 0 and the upper one (n,) [cm].
-
-    length : unit of levels of the rig
-    """
+    """Raise InputError for a low limit that is not between 0 and the upper one (n,) [cm]."""
     for i, (value, top) in enumerate(zip(low, limits)):
         if not 0.0 <= value < top:
             raise InputError(
@@ -28,8 +22,6 @@ def check_low(low, limits, length):
 def failed_low(setting, low, found, kappa, start):
     """[the condition that keeps the low limit of each tank from being proved, or ""; "" too where
     there is none] and (n,) the levels below which no tank falls for certain [cm].
-
-    found : limits (n,) `heights` and `reach` [cm], and `slopes` of the second-order rows
     """
     own = [
         _own_condition(setting, i, low, found, kappa, start) if low[i] > 0.0 else ""

@@ -1,7 +1,4 @@
-"""A safety filter for a case: its box of plants, its limits and its disturbances.
-
-May be imported by `jaxtank.case` and everything above it.
-"""
+"""A safety filter for a case: its box of plants, its limits and its disturbances."""
 
 from collections.abc import Mapping
 from typing import Any

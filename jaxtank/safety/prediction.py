@@ -1,6 +1,6 @@
 """Levels at the end of a dead time, from above and from below, over the inputs under way.
 
-Two copies of each tank: Theorem 5 of README.md of this folder. Imported by `safety.filter`.
+Two copies of each tank: Theorem 5 of README.md of this folder.
 """
 
 from collections.abc import Sequence
@@ -32,19 +32,7 @@ def brackets(
     step: Any,
     substeps: int,
 ) -> tuple:
-    """Return (least, largest) level [cm] of a tank without pipes after the inputs under way.
-
-    A level moves monotonically towards its equilibrium. So the explicit Euler step bounds it from
-    above where it rises and from below where it falls, and the implicit one the other way; both are
-    monotone in the level, whatever the step.
-
-    Parameters
-    ----------
-    levels : (least, largest) level now, and the limit [cm], which the largest never passes
-    line : (m) arrays (samples,) of inputs under way, the oldest first [V]
-    others : ((n) least, (n) largest) levels of the other tanks meanwhile [cm]
-    step : sampling period over substeps [s]
-    """
+    """Return (least, largest) level [cm] of a tank without pipes after the inputs under way."""
     low, high, top = levels
     above, below = others[1], others[0]
     enters = rise(rates, tank, 0.0 * top, above)

@@ -1,7 +1,4 @@
-"""What the conditions of the theorems are computed from, in plain numbers.
-
-May be imported by the rest of `jaxtank.safety`.
-"""
+"""What the conditions of the theorems are computed from, in plain numbers."""
 
 import math
 from typing import Any, NamedTuple

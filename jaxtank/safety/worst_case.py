@@ -1,7 +1,4 @@
-"""The largest rates a level can have over a box of plants, tank by tank.
-
-Imported by the filter (on traced scalars) and by the certificate (on plain numbers).
-"""
+"""The largest rates a level can have over a box of plants, tank by tank."""
 
 from typing import Any, NamedTuple
 
@@ -12,15 +9,7 @@ from jaxtank.plants.tank_network import TankNetwork
 
 
 class Rates(NamedTuple):
-    """Coefficients of h' over a box of plants, each divided by the area of its tank.
-
-    `out`, `out_most` : (n) least and largest of what leaves a tank freely, per sqrt(level)
-    [cm^0.5/s].  `links` : [(source, sink, least, largest)] per orifice between tanks.  `pipes` :
-    [(tank, other, least, largest)], each pipe once from either end.  `pumps` : (n) {pump: (least,
-    largest)} [cm/(s V)].  `inflow` : (n) largest inflow disturbance [cm/s].  `knee` : laminar
-    threshold [cm].  `empty` : (n) level below which outflow counts as nothing [cm].  `draw` : (n)
-    least inflow disturbance, 0 or negative [cm/s].
-    """
+    """Coefficients of h' over a box of plants, each divided by the area of its tank."""
 
     out: tuple
     out_most: tuple
@@ -36,16 +25,7 @@ class Rates(NamedTuple):
 def rates_of(
     least: TankNetwork, most: TankNetwork, inflow: Any, step: Any, draw: Any = None
 ) -> Rates:
-    """Return the Rates of all plants whose parameters lie between those of two networks.
-
-    Parameters
-    ----------
-    least, most : TankNetwork
-        Lower and upper end of every parameter; the topology is that of `least`.
-    inflow : (n,) largest inflow disturbance into each tank [cm^3/s]
-    step : longest integration step [s], for plants with `bottom`
-    draw : (n,) least inflow disturbance, 0 or negative [cm^3/s]; 0 where left out
-    """
+    """Return the Rates of all plants whose parameters lie between those of two networks."""
     n = least.tanks
     slow, fast = jnp.sqrt(2.0 * least.gravity), jnp.sqrt(2.0 * most.gravity)
     out, out_most = _free_outlets(least), _free_outlets(most)
@@ -109,16 +89,9 @@ def _feed(pumps, pump, least, most, tank, share_least, share_most):
 
 
 def rise(rates: Rates, tank: int, level: Any, others: Any) -> Any:
-    """Return Phi_max [cm/s]: the largest rate of a tank's level when its pumps stand still.
-
-        Phi_max(h) = -c_min s(h) + sum_in c_max s(h_k) + sum_pipes P(h_k - h) + d_max,
-        P(z) = p_max s(z) for z >= 0, p_min s(z) for z < 0
-
-    Parameters
-    ----------
-    level : (...) the least the level may be [cm]; Phi_max never rises with it
-    others : (n) the most the other levels may be [cm]
-    """
+    """Return Phi_max [cm/s]: the largest rate of a tank's level when its pumps stand still."""
+    # Phi_max(h) = -c_min s(h) + sum_in c_max s(h_k) + sum_pipes P(h_k - h) + d_max, P(z) = p_max
+    # s(z) for z >= 0, p_min s(z) for z < 0
     h = lower_clip(level, 0.0)
     rate = rates.inflow[tank] - rates.out[tank] * smooth_sqrt(h, rates.knee)
     for i, j, least, most in rates.pipes:
@@ -142,16 +115,9 @@ def _inflows_only(rates, tank, h, others):
 
 
 def fall(rates: Rates, tank: int, level: Any, others: Any) -> Any:
-    """Return Phi_min [cm/s]: the least rate of a tank's level when its pumps stand still.
-
-        Phi_min(h) = -c_max s(h) + sum_in c_min s(h_k) + sum_pipes P(h_k - h) + d_min,
-        P(z) = p_min s(z) for z >= 0, p_max s(z) for z < 0
-
-    Parameters
-    ----------
-    level : (...) the most the level may be [cm]; Phi_min never rises with it
-    others : (n) the least the other levels may be [cm]
-    """
+    """Return Phi_min [cm/s]: the least rate of a tank's level when its pumps stand still."""
+    # Phi_min(h) = -c_max s(h) + sum_in c_min s(h_k) + sum_pipes P(h_k - h) + d_min, P(z) = p_min
+    # s(z) for z >= 0, p_max s(z) for z < 0
     h = lower_clip(level, 0.0)
     rate = rates.draw[tank] - rates.out_most[tank] * smooth_sqrt(h, rates.knee)
     flow = lambda source, value: jnp.where(others[source] < rates.empty[source], 0.0, value)

@@ -1,7 +1,4 @@
-"""References and disturbances as functions of time, sampled before the time loop starts.
-
-Imports core; may be imported by every folder above.
-"""
+"""References and disturbances as functions of time, sampled before the time loop starts."""
 
 from jaxtank.signals.base import Constant, Signal, Sum, Table
 from jaxtank.signals.inflows import InflowPulses, Pours, inflow_pulses, pours

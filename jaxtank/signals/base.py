@@ -1,7 +1,4 @@
-"""The role Signal, and signals for any purpose: constant, table, sum.
-
-Imports core; may be imported by every folder above.
-"""
+"""The role Signal, and signals for any purpose: constant, table, sum."""
 
 import abc
 import math
@@ -79,13 +76,7 @@ class Signal(abc.ABC):
 
 
 def sampled(signal: Signal, clock: Clock, arrays: bool = False) -> tuple[Any, Any, Any]:
-    """Return `signal.sample(clock)`, whose vectors are arrays (samples, channels) if `arrays`.
-
-    Examples
-    --------
-    >>> sampled(Constant(level=[4.0]), Clock(dt=1.0, duration=2.0), arrays=True)[0].shape
-    (3, 1)
-    """
+    """Return `signal.sample(clock)`, whose vectors are arrays (samples, channels) if `arrays`."""
     if arrays and serves_arrays(signal):
         return cast(Any, signal).sample_arrays(clock)
     value, rate, second = signal.sample(clock)

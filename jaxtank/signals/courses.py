@@ -1,7 +1,7 @@
 """The course of one setpoint channel: changes joined end to end, and a first-order filter behind.
 
 Times of changes are part of the compiled program; levels, the duration of a change and the time
-constant of the filter may be traced, and derivatives by them are exact. Imported by `setpoints`.
+constant of the filter may be traced, and derivatives by them are exact.
 """
 
 import functools
@@ -28,22 +28,7 @@ def index(time, clock):
 
 
 def channel(clock, initial, changes, duration, shape, lag=None):
-    """Return (value, rate, second derivative) of one channel at the samples of a clock.
-
-    Parameters
-    ----------
-    clock : Clock or Chunk
-    initial : value before the first change; of several channels with as many changes, an array (g,)
-    changes : [(time [s], target)] in order of time, of several channels arrays (g,); a change that
-        begins before the last one has ended starts from the value reached by then
-    duration : of every change [s]
-    shape : "linear" or "quintic"
-    lag : time constant of a first-order filter behind [s], 0 for none; or None
-
-    Returns
-    -------
-    Three arrays (samples,), or (samples, g)
-    """
+    """Return (value, rate, second derivative) of one channel at the samples of a clock."""
     pieces: list[Any] = [(0, functools.partial(_flat, initial))]
     for start, target in changes:
         first = index(start, clock)
@@ -59,12 +44,10 @@ def channel(clock, initial, changes, duration, shape, lag=None):
 
 
 def _change(level, target, start, duration, shape, dt, k, t):
-    """Value, rate and second derivative of a change from `level` at samples k, times t >= start.
-
-    The rate of a linear change at its last sample is its mean over that sample, so that rates add
-    up to the step for any duration, and depend on it continuously. Where the change ends on a
-    sample, the derivatives by the duration are those from below.
-    """
+    """Value, rate and second derivative of a change from `level` at samples k, times t >= start."""
+    # The rate of a linear change at its last sample is its mean over that sample, so that rates add
+    # up to the step for any duration, and depend on it continuously. Where the change ends on a
+    # sample, the derivatives by the duration are those from below.
     left = (start + duration) / dt - k  # samples until the end
     tolerance = TOLERANCE + 4.0 * jnp.finfo(jnp.result_type(left)).eps * jnp.abs(left + k)
     moving = left > tolerance

@@ -1,7 +1,4 @@
-"""Inflow disturbances: volumes added to a tank for a while.
-
-Imports core; may be imported by every folder above.
-"""
+"""Inflow disturbances: volumes added to a tank for a while."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,6 @@
 """Setpoints as functions of time: ramps and a sine.
 
 Their samples are inputs of the loop: interpolating inside it would cost more than the plant does.
-Imports core; may be imported by every folder above.
 """
 
 import math

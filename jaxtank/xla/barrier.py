@@ -1,6 +1,6 @@
 """A barrier to fusion: values that the compiler computes once, instead of again in every reader.
 
-Necessary with the CPU compiler of jaxlib 0.10 and 0.11. Imports jax only.
+Necessary with the CPU compiler of jaxlib 0.10 and 0.11.
 
 XLA fuses the work that leads to a value into every reader of that value. A step of a closed loop is
 a chain of values that are read by several others each (a pump's voltage by every Runge-Kutta stage,
@@ -26,15 +26,7 @@ T = TypeVar("T")
 
 
 def materialised(tree: T) -> T:
-    """Return a pytree of the same values, each computed once.
-
-    Transparent to jit, vmap and both modes of differentiation. No effect off the CPU.
-
-    Examples
-    --------
-    >>> [float(v) for v in materialised((1.0, 2.0))]
-    [1.0, 2.0]
-    """
+    """Return a pytree of the same values, each computed once."""
     if jax.default_backend() != "cpu":
         return tree
     with set_xla_metadata(inlineable="false"):
@@ -44,12 +36,6 @@ def materialised(tree: T) -> T:
 def with_one_slope(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """Return an elementwise function of an array whose slope is computed once, and not again for
     each of the directions of a derivative.
-
-    Examples
-    --------
-    >>> import jax.numpy as jnp
-    >>> float(jax.grad(lambda x: with_one_slope(jnp.sqrt)(x).sum())(jnp.ones(1))[0])
-    0.5
     """
     sloped: Any = jax.custom_jvp(function)
 

@@ -1,4 +1,4 @@
-"""Functions of which `jax.vmap` runs a limited number of elements at a time. Imports jax only."""
+"""Functions of which `jax.vmap` runs a limited number of elements at a time."""
 # jax leaves the types of primitives and their rules partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 # pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
@@ -20,19 +20,8 @@ _call.multiple_results = True
 
 
 def in_batches(function: Callable[..., Any], batch: int) -> Callable[..., Any]:
-    """Return `function` of arrays; on a CPU `jax.vmap` of it runs at most `batch` elements at once.
-
-    What is computed side by side then fits the cache. On a GPU, and wherever derivatives are taken,
-    all elements run at once; of nested vmaps the innermost is divided.
-
-    Examples
-    --------
-    >>> import jax.numpy as jnp
-    >>> square = in_batches(lambda x: x * x, 4)
-    >>> jax.vmap(square)(jnp.arange(6.0)).tolist()
-    [0.0, 1.0, 4.0, 9.0, 16.0, 25.0]
-    >>> jax.vmap(jax.grad(square))(jnp.arange(3.0)).tolist()
-    [0.0, 2.0, 4.0]
+    """Return `function` of arrays; on a CPU `jax.vmap` of it runs at most `batch`
+    elements at once.
     """
 
     def whole(*arguments: Any) -> Any:

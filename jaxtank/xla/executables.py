@@ -4,7 +4,7 @@ jax's own cache, which `program_cache` sets up, saves the compiler; tracing and 
 loop takes as long as its run again. An entry is found by everything that a trace depends on
 (`signature`): types, shapes and static values of the arguments, the source of this package, jax and
 its settings, the processor. What cannot be written down exactly, as a class of a user's own, is
-traced as ever. Imports `xla` only; used by `jit.compiled`.
+traced as ever.
 
 jax reads an entry by unpickling, and it holds native code: the folder is the user's own, checked by
 `program_cache.prepare`, entries are checked by their digests, and each holds its own name, which is
@@ -38,14 +38,7 @@ SIZE = 4
 
 
 class Kept:
-    """A compiled function whose programs are kept between processes where the user keeps any.
-
-    Parameters
-    ----------
-    function : what was compiled.
-    compiled : `jax.jit` of it; inside of a trace, it is what is called.
-    static : names of its static arguments.
-    """
+    """A compiled function whose programs are kept between processes where the user keeps any."""
 
     def __init__(self, function: Callable[..., Any], compiled: Any, static: tuple[str, ...]):
         functools.update_wrapper(self, function)
@@ -101,11 +94,7 @@ class Kept:
 
 
 class Tried:
-    """A program that was read, with a mark beside its entry until it has run once.
-
-    Where that fails, it is traced and compiled; where the process ends in it, the next one finds
-    the mark.
-    """
+    """A program that was read, with a mark beside its entry until it has run once."""
 
     def __init__(self, program: Any, path: Path, traced: Callable[[Any, Any], Any]):
         self.program, self.path, self.traced, self.ran = program, path, traced, False
@@ -188,10 +177,8 @@ def _about(lowered: Any) -> dict[str, Any] | None:
 
 
 def _compile(lowered: Any, about: dict[str, Any], path: Path) -> Any:
-    """The program, compiled, and kept as an entry in the place of one of jax's own.
-
-    A program that jax has read from its cache cannot be written again (XLA leaves out functions).
-    """
+    """The program, compiled, and kept as an entry in the place of one of jax's own."""
+    # A program that jax has read from its cache cannot be written again (XLA leaves out functions).
     config: Any = jax.config
     least = config.jax_persistent_cache_min_compile_time_secs
     _HITS.clear()

@@ -1,7 +1,4 @@
-"""XLA options that compile a closed loop to one fast function (jaxlib 0.10 and 0.11, CPU).
-
-Imports nothing of ours; read by `jaxtank/__init__.py` before jax starts.
-"""
+"""XLA options that compile a closed loop to one fast function (jaxlib 0.10 and 0.11, CPU)."""
 
 import os
 import re
@@ -38,18 +35,9 @@ in XLA_FLAGS. Unknown extra options are ignored.
 
 
 def append_option(flags):
-    """Return `flags`, the text of XLA_FLAGS, with the options added.
-
-    What the user set, these options included, stays as it is. A text that does not begin with "--"
-    names a file of flags, to which nothing can be appended.
-
-    Examples
-    --------
-    >>> append_option("--xla_backend_extra_options=a=1").count("=") > 2
-    True
-    >>> append_option("flags.txt")
-    'flags.txt'
-    """
+    """Return `flags`, the text of XLA_FLAGS, with the options added."""
+    # What the user set, these options included, stays as it is. A text that does not begin with
+    # "--" names a file of flags, to which nothing can be appended.
     if flags.strip() and not flags.lstrip().startswith("--"):
         return flags
     if VECTOR_WIDTH.split("=")[0] not in flags and jaxlib.version.__version_info__ < UNTRIED:

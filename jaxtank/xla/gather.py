@@ -2,7 +2,7 @@
 
 What meets at a tank is summed by gathers: each row reads at most `width` values, padded with ones
 of weight 0. A scatter would break the time loop's compilation to one function (five times slower
-with 100 tanks); so would a sparse matrix. Imports core only.
+with 100 tanks); so would a sparse matrix.
 """
 
 import functools
@@ -28,24 +28,7 @@ class Round(NamedTuple):
 
 @functools.lru_cache(maxsize=256)
 def rounds(ends: tuple[int, ...], tanks: int) -> tuple[Round, ...]:
-    """Return what sums values, each of which ends at a tank, over the values of each tank.
-
-    Parameters
-    ----------
-    ends : (values,) tank of each value
-    tanks : number n of tanks
-
-    Returns
-    -------
-    (Round, ...) the first reads the values, each further one the rows of the one before; the last
-    one has a row for each tank. () without values.
-
-    Examples
-    --------
-    >>> one, = rounds((0, 2, 2), 3)
-    >>> one.index.tolist(), one.present.tolist()
-    ([[0, 0], [0, 0], [1, 2]], [[1.0, 0.0], [0.0, 0.0], [1.0, 1.0]])
-    """
+    """Return what sums values, each of which ends at a tank, over the values of each tank."""
     if not ends:
         return ()
     groups: list[list[int]] = [[] for _ in range(tanks)]
@@ -72,21 +55,7 @@ def rounds(ends: tuple[int, ...], tanks: int) -> tuple[Round, ...]:
 
 
 def gathered(weights: Any, values: Any, ends: tuple[int, ...], tanks: int, of: Any = None) -> Any:
-    """Return (n,) sums over what ends at each tank of weight times value; None without any.
-
-    Parameters
-    ----------
-    weights : (k,) of each value
-    values : (k,) or, with `of`, an array from which value k is read at of[k]; None: ones
-    ends : (k,) tank at which each ends
-    tanks : number n of tanks
-    of : (k,) places in `values`, where k of them are read from another array
-
-    Examples
-    --------
-    >>> gathered(jnp.ones(3), jnp.array([1.0, 2.0, 4.0]), (0, 2, 2), 3).tolist()
-    [1.0, 0.0, 6.0]
-    """
+    """Return (n,) sums over what ends at each tank of weight times value; None without any."""
     found: Any = None
     for level, (index, present) in enumerate(rounds(ends, tanks)):
         terms: list[Any] = []

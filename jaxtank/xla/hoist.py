@@ -3,7 +3,7 @@
 Controllers and plants compute their coefficients from their leaves where they use them, as their
 papers write them. XLA (jaxlib 0.10 and 0.11) leaves such work inside a compiled loop, a fifth of a
 run of the four-tank. Here the body is traced once, and what depends on constants alone is computed
-once; equal coefficients (each Runge-Kutta stage makes its own) become one. Imports jax only.
+once; equal coefficients (each Runge-Kutta stage makes its own) become one.
 """
 
 import math
@@ -16,26 +16,8 @@ from jax.extend.core import Literal
 
 
 def scan(body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-    """Return jax.lax.scan(body, carry, xs, length) with loop-invariant work done before the loop.
-
-    Values and derivatives are the same.
-
-    Parameters
-    ----------
-    body : (carry, x) -> (carry, y)
-    carry : pytree of arrays or numbers
-    xs : pytree of arrays (length, ...)
-    length : number of steps
-
-    Returns
-    -------
-    (carry after the last step, pytree of stacked y)
-
-    Examples
-    --------
-    >>> total, partial = scan(lambda c, x: (c + x, c), 0.0, jnp.arange(3.0), 3)
-    >>> float(total), partial.tolist()
-    (3.0, [0.0, 0.0, 1.0])
+    """Return jax.lax.scan(body, carry, xs, length) with loop-invariant work done before
+    the loop.
     """
     closed, shape = jax.make_jaxpr(body, return_shape=True)(
         _like(carry), jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), xs)
@@ -109,14 +91,6 @@ def _key(eqn, operands):
 def run(eqns, values, same):
     """Do the operations in order, reading and writing {variable: value}; same: {variable: the one
     it equals}.
-
-    Examples
-    --------
-    >>> jaxpr = jax.make_jaxpr(lambda x: 2.0 * x)(1.0).jaxpr
-    >>> values = {jaxpr.invars[0]: 3.0}
-    >>> run(jaxpr.eqns, values, {})
-    >>> float(read(jaxpr.outvars[0], values, {}))
-    6.0
     """
     for eqn in eqns:
         bound = eqn.primitive.get_bind_params(eqn.params)
@@ -130,13 +104,7 @@ def run(eqns, values, same):
 
 
 def read(v, values, same):
-    """Return the value of a variable, or of a literal.
-
-    Examples
-    --------
-    >>> read(Literal(2.0, jax.core.ShapedArray((), jnp.float32)), {}, {})
-    2.0
-    """
+    """Return the value of a variable, or of a literal."""
     return v.val if isinstance(v, Literal) else values[same.get(v, v)]
 
 

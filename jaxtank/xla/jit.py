@@ -1,4 +1,4 @@
-"""`jax.jit` with the type of the function that it compiles kept. Imports `xla` only."""
+"""`jax.jit` with the type of the function that it compiles kept."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
@@ -11,22 +11,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def compiled(*static: str, keep: bool = False) -> Callable[[F], F]:
-    """Return `jax.jit` as a decorator.
-
-    Parameters
-    ----------
-    static : names of the arguments that are part of the program.
-    keep : whether programs are kept between processes, where the user keeps any (`jaxtank.cache`):
-        for those that take long to trace.
-
-    Examples
-    --------
-    >>> @compiled("n")
-    ... def power(x: float, n: int) -> float:
-    ...     return x**n
-    >>> float(power(2.0, n=3))
-    8.0
-    """
+    """Return `jax.jit` as a decorator."""
 
     def decorate(function: F) -> F:
         jit: Any = jax.jit

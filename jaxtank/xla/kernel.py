@@ -1,7 +1,5 @@
 """A loop over samples of many runs in one Pallas kernel: a block of runs to a program.
 
-Imports `xla` only; used by `loop.many`.
-
 What it is for, estimated for an H100 in float64, 1e6 plants of 120,001 steps: about 600 operations
 a step and plant are 7e13, 2 s at the 34e12 a second of its data sheet; with square roots and
 divisions 5 to 7 s in a loop that keeps levels and sums in registers. As `jax.lax.scan` each step is
@@ -36,29 +34,7 @@ class Unfit(ValueError):
 
 
 def looped(advance: Callable[..., Any], rows: Any, start: Any, xs: Any, block: int) -> Any:
-    """Return the carry of N runs after the last sample, by programs that run a block each.
-
-    On a CPU the kernel is interpreted.
-
-    Parameters
-    ----------
-    advance : (rows, carry, x) -> carry, of a block: arrays (block, ...); x is the same for all.
-    rows : pytree of arrays (N, ...), N a multiple of block
-    start : the carry, pytree of arrays (N, ...)
-    xs : pytree of arrays (samples, ...), at least one
-    block : a power of 2 on a GPU
-
-    Raises
-    ------
-    Unfit
-        Where a step has arrays of a run.
-
-    Examples
-    --------
-    >>> xs = jnp.arange(3.0)
-    >>> looped(lambda a, c, x: c + a * x, jnp.ones(4), jnp.zeros(4), xs, 2).tolist()
-    [3.0, 3.0, 3.0, 3.0]
-    """
+    """Return the carry of N runs after the last sample, by programs that run a block each."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 

@@ -2,7 +2,6 @@
 
 Entries hold native code and are unpickled by jax, so every folder above them and every entry is
 checked before it is used: its owner and mode, and its digest, which holds its own name too.
-Imports the standard library (jax in `cache` alone); used by `jaxtank.cache` and the command line.
 """
 
 import atexit
@@ -85,18 +84,7 @@ def cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
 
 
 def keep_for_this_process() -> str:
-    """Do what `cache` does by environment variables, before jax is imported.
-
-    Returns
-    -------
-    str
-        Why programs are not kept; "" where they are, or where the user wants none.
-
-    Examples
-    --------
-    >>> keep_for_this_process()  # doctest: +SKIP
-    ''
-    """
+    """Do what `cache` does by environment variables, before jax is imported."""
     if "jax" in sys.modules or os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return ""
     folder, why = prepare()
@@ -118,13 +106,7 @@ def _remember(found: Path) -> None:
 
 
 def base_folder(folder: str | os.PathLike[str] | None = None) -> Path | None:
-    """Return the folder of all versions; None where JAXTANK_CACHE=0, or there is no home.
-
-    Examples
-    --------
-    >>> base_folder("kept") == Path("kept").absolute()
-    True
-    """
+    """Return the folder of all versions; None where JAXTANK_CACHE=0, or there is no home."""
     given = os.environ.get(SWITCH, "") if folder is None else os.fspath(folder)
     if folder is None and given.lower() in OFF:
         return None
@@ -143,21 +125,8 @@ def base_folder(folder: str | os.PathLike[str] | None = None) -> Path | None:
 
 
 def prepare(folder: str | os.PathLike[str] | None = None) -> tuple[Path | None, str]:
-    """Return (folder of this version's programs, ""), made and checked, or (None, why not).
-
-    why not is "" where there is nothing that the user could mend, or would want to.
-
-    Entries without a digest, or with another one (a process was killed while it wrote, a disk is
-    damaged), are removed, and so are the oldest where all exceed LARGEST bytes.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     found, why = prepare(folder)
-    ...     found.parent == Path(folder).resolve(), why
-    (True, '')
-    """
+    """Return (folder of this version's programs, ""), made and checked, or (None, why not)."""
+    # why not is "" where there is nothing that the user could mend, or would want to.
     base = base_folder(folder)
     if base is None:
         return None, ""
@@ -185,13 +154,7 @@ def prepare(folder: str | os.PathLike[str] | None = None) -> tuple[Path | None, 
 
 
 def refused(folder: Path) -> str:
-    """Return why native code in a folder cannot be trusted; "" where it can.
-
-    Examples
-    --------
-    >>> refused(Path(__file__)).endswith("is no folder")
-    True
-    """
+    """Return why native code in a folder cannot be trusted; "" where it can."""
     status, name = os.stat(folder), repr(str(folder))
     if not stat.S_ISDIR(status.st_mode):
         return f"{name} is no folder"
@@ -241,13 +204,7 @@ def seal(folder: Path, since: float) -> None:
 
 
 def contents(base: Path) -> dict[str, tuple[int, int]]:
-    """Return {folder of a version: (programs, their bytes)} below the folder of all versions.
-
-    Examples
-    --------
-    >>> contents(Path("no-such-folder"))
-    {}
-    """
+    """Return {folder of a version: (programs, their bytes)} below the folder of all versions."""
     found: dict[str, tuple[int, int]] = {}
     for folder in _versions(base):
         sizes = [path.stat().st_size for path in _entries(folder)]
@@ -256,13 +213,7 @@ def contents(base: Path) -> dict[str, tuple[int, int]]:
 
 
 def clear(base: Path) -> int:
-    """Remove the programs of all versions, and nothing else; returns how many there were.
-
-    Examples
-    --------
-    >>> clear(Path("no-such-folder"))
-    0
-    """
+    """Remove the programs of all versions, and nothing else; returns how many there were."""
     count = 0
     for folder in _versions(base):
         for path in _entries(folder):
@@ -288,11 +239,6 @@ def _version() -> str:
 def processor() -> str:
     """Return what native code depends on, as 12 hexadecimal digits: programs for one processor may
     end on another, which shares the home, by an illegal instruction.
-
-    Examples
-    --------
-    >>> len(processor())
-    12
     """
     words = [platform.machine(), sys.platform]
     try:

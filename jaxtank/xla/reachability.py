@@ -1,6 +1,6 @@
 """Which results of a function depend on some of its arguments, read from its traced program.
 
-Nothing is computed. Imports jax only; may be imported by every folder.
+Nothing is computed.
 """
 
 import math
@@ -24,37 +24,13 @@ class Use(NamedTuple):
 
 
 def use_of(function, watched, *others):
-    """Return how function(watched, *others) uses its first argument.
-
-    A dependence that is there in the program and cancels in value counts as one. Raises what
-    `function` raises when it is traced, as a controller does that branches on the value of a leaf.
-
-    Parameters
-    ----------
-    function : function that JAX can trace
-    watched, others : pytrees of numbers, arrays or `jax.ShapeDtypeStruct`s
-
-    Returns
-    -------
-    Use
-
-    Examples
-    --------
-    >>> use_of(lambda a, b: 2.0 * b, 1.0, 2.0).reached
-    False
-    """
+    """Return how function(watched, *others) uses its first argument."""
     jaxpr = jax.make_jaxpr(function)(watched, *others).jaxpr
     return _follow(jaxpr, set(jaxpr.invars[: len(jax.tree.leaves(watched))]))[0]
 
 
 def reached(function: Callable[[Any], Any], watched: Any) -> list[bool]:
-    """Return, for each leaf of function(watched), whether it depends on `watched`.
-
-    Examples
-    --------
-    >>> reached(lambda a: (a, 1.0), 2.0)
-    [True, False]
-    """
+    """Return, for each leaf of function(watched), whether it depends on `watched`."""
     jaxpr = jax.make_jaxpr(function)(watched).jaxpr
     return _follow(jaxpr, set(jaxpr.invars))[1]
 

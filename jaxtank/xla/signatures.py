@@ -1,8 +1,7 @@
 """What a compiled program depends on, written down: equal words mean an equal program.
 
 Types, shapes and static values of the arguments, the source of this package, jax and its settings.
-What cannot be written down exactly, as a class of a user's own, is `Unknown`. Imports nothing of
-ours; used by `executables`.
+What cannot be written down exactly, as a class of a user's own, is `Unknown`.
 """
 
 import dataclasses
@@ -37,13 +36,7 @@ class Unknown(Exception):
 
 
 def signature(words: list[str]) -> str:
-    """Return the digest of a program: of `words` and of all that holds for this process.
-
-    Examples
-    --------
-    >>> signature(["a"]) == signature(["a"]) != signature(["b"])
-    True
-    """
+    """Return the digest of a program: of `words` and of all that holds for this process."""
     return hashlib.sha256("\0".join([*_process(), *words]).encode()).hexdigest()
 
 

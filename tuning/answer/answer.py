@@ -1,7 +1,4 @@
-"""What the default answer of `tune` gives besides the gains, as data.
-
-Imported by `recommend`, `findings` and the report.
-"""
+"""What the default answer of `tune` gives besides the gains, as data."""
 
 import dataclasses
 import importlib

@@ -1,7 +1,4 @@
-"""The searches behind a default answer: with a filter, at the true step, on more plants.
-
-Imported by `recommend`.
-"""
+"""The searches behind a default answer: with a filter, at the true step, on more plants."""
 
 import dataclasses
 from typing import Any
@@ -81,16 +78,7 @@ class Task:
 
 @dataclasses.dataclass
 class Outcome:
-    """What a search led to.
-
-    Parameters
-    ----------
-    setting : Setting of the search.
-    found, problem : of the last search; None before it.
-    after : Judged, None where the search was interrupted.
-    tightened : largest share by which limits were tightened [-].
-    attempt : its number, from 0: every answer is judged on plants of its own.
-    """
+    """What a search led to."""
 
     setting: Setting
     found: Found = dataclasses.field(default_factory=Found)
@@ -139,10 +127,7 @@ def attempts(task: Task, setting: Setting, near: np.ndarray) -> Outcome:
 
 
 def _search(task, made, case, limits, least):
-    """Search, and again on more plants until the limits hold on those that are looked at.
-
-    Returns the Checks, None where everything is proved.
-    """
+    """Search, and again on more plants until the limits hold on those that are looked at."""
     setting = made.setting
 
     def search(found, checks=None, stays=False):

@@ -1,7 +1,4 @@
-"""Plants that are looked at during a search: on them too, limits that nothing proves shall hold.
-
-Imported by `attempts`.
-"""
+"""Plants that are looked at during a search: on them too, limits that nothing proves shall hold."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -42,16 +39,7 @@ Key = tuple[str, int]
 
 
 class Checks:
-    """Limits on CHECKED plants: how much each is tightened, and which plants a search needs.
-
-    Parameters
-    ----------
-    setting : of the answer.
-    case : the searched case, at the clock of the search.
-    free : free parameters, as in `tuning.tune`.
-    limits : {measure: value}, those that nothing proves.
-    least : {key: tightening}, which no tightening falls below; {} for none.
-    """
+    """Limits on CHECKED plants: how much each is tightened, and which plants a search needs."""
 
     def __init__(
         self, setting: Setting, case: Case, free: Any, limits: Mapping[str, Any], least: Mapping

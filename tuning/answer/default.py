@@ -1,7 +1,4 @@
-"""tune: the default answer, or the optimum of a problem as it is stated.
-
-Imported by the command line and as `tuning.tune`.
-"""
+"""tune: the default answer, or the optimum of a problem as it is stated."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

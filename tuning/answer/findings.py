@@ -44,10 +44,7 @@ BUSIER = 10.0
 
 
 def findings_of(result: TuningResult, steps: Iterable[str] = ()) -> tuple[Message, ...]:
-    """Return the findings about a default answer, most important first.
-
-    steps : sentences on integration steps that are too long.
-    """
+    """Return the findings about a default answer, most important first."""
     first = [Message("step-too-long", text) for text in steps]
     answer: Answer = result.answer
     return (*first, *(m for rule in RULES for m in rule(result, answer)))

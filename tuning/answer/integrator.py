@@ -1,6 +1,5 @@
-"""Whether the midpoint rule follows a plant closely enough for a search.
-
-Imported by `setting`. What a search finds is judged at the case's own step and integrator.
+"""Whether the midpoint rule follows a plant closely enough for a search. What a search
+finds is judged at the case's own step and integrator.
 """
 
 import dataclasses
@@ -29,32 +28,7 @@ step, which is checked separately."""
 
 
 def midpoint_error(case: Case, clock: Clock, height: float, span: np.ndarray) -> float:
-    """Return the relative difference of the midpoint rule and RK4 over one sample.
-
-    The root of the mean square of the differences of all levels after one sample, over that of
-    their changes by RK4, at random levels and inputs.
-
-    Parameters
-    ----------
-    case : the plant and its limits of the inputs.
-    clock : step and substeps.
-    height : largest level; levels are drawn from 5 % to 100 % of it [unit of length].
-    span : (pumps,) range of the inputs above their lower limit [unit of the inputs].
-
-    Returns
-    -------
-    Share [-]; inf where no level changes, where a number is not finite, and where the midpoint rule
-    is unstable in a tank that runs empty.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> case = presets.find("gouta2015/backstepping")
-    >>> short = midpoint_error(case, Clock(dt=0.05), 30.0, np.full(2, 12.0))
-    >>> long = midpoint_error(case, Clock(dt=0.1), 30.0, np.full(2, 12.0))
-    >>> bool(short < long < LARGEST_ERROR)
-    True
-    """
+    """Return the relative difference of the midpoint rule and RK4 over one sample."""
     loop, plant = case.loop, case.loop.plant
     if any(unstable_tanks(loop, dataclasses.replace(clock, integrator="midpoint"))):
         return np.inf

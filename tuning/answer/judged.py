@@ -1,7 +1,4 @@
-"""How a set of gains does on plants that no search has used, at the case's own step.
-
-Imported by `recommend` and by the report.
-"""
+"""How a set of gains does on plants that no search has used, at the case's own step."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -194,10 +191,7 @@ def validate(
 
 
 def judge(setting: Setting, samples: int, seed: int, round_: int = 0) -> Judged:
-    """Return how the searched case of a setting does on `samples` plants.
-
-    The same plants and noise for the same seed and round; other ones than any search draws.
-    """
+    """Return how the searched case of a setting does on `samples` plants."""
     case, names = setting.searched, measured(setting)
     limits = resolve_limits(case, setting.case.limits)
     wanted = (*names, *(limit.measure for limit in limits))

@@ -1,7 +1,4 @@
-"""Runs of a case on drawn plants and on the nominal one, side by side in one program.
-
-Imported by `judged`.
-"""
+"""Runs of a case on drawn plants and on the nominal one, side by side in one program."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -41,31 +38,7 @@ def run_plants(
     names: Sequence[str],
     quiet: bool = False,
 ) -> PlantRuns:
-    """Run a case on `samples` drawn plants with the noise of its sensors.
-
-    The same numbers as those of `tuning.ensemble` with that seed.
-
-    Parameters
-    ----------
-    case, distributions, samples : as in `tuning.ensemble`.
-    seed : of the plants and the noise.
-    names : of the measures, each in the unit of `jaxtank.measures.unit`.
-    quiet : run the nominal plant without noise too, where the noise can be set to 0 for one run.
-
-    Raises
-    ------
-    InputError : for a distribution or a loop that cannot be run.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> from tuning import Uniform
-    >>> found = run_plants(
-    ...     presets.find("cascaded/pi"), {"plant.area": Uniform(relative=0.05)}, 3, 0, ["iae"], True
-    ... )
-    >>> found.measures["iae"].shape, found.nominal["iae"].shape
-    ((3, 1), (1,))
-    """
+    """Run a case on `samples` drawn plants with the noise of its sensors."""
     space = Draws(case.loop, distributions)
     random = noisy(case) or any(n.startswith(NOISE) for n in space.labels)
     lp.check(case.loop, case.clock, jax.random.key(0) if random else None)

@@ -1,6 +1,5 @@
-"""The default answer of `tune`: noise, many plants, priced inputs, a safety filter, a validation.
-
-Imported by `default`.
+"""The default answer of `tune`: noise, many plants, priced inputs, a safety filter, a
+validation.
 """
 
 import dataclasses
@@ -53,10 +52,7 @@ def recommend(
     progress: Callable | None = None,
     engine: Engine | None = None,
 ) -> TuningResult:
-    """Return the default answer; parameters and errors as `tuning.tune`.
-
-    engine : of a cluster, None without.
-    """
+    """Return the default answer; parameters and errors as `tuning.tune`."""
     began = time.perf_counter()
     case, mended = _mended(case, mend, distributions, limits, seed)
     if safety_filter and not case.safety:  # asked for here: the case as given has none

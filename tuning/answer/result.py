@@ -17,11 +17,7 @@ from tuning.uncertainty.validation import summary_of
 def result_of(
     answer: Answer, found: Found, problem: Problem, values: dict[str, float], validation: int
 ) -> TuningResult:
-    """Return the TuningResult of an Answer, without messages.
-
-    objective : mean over the plants that judged it.  tables : the plants of the search.
-    constraints : of each limit its worst value on the plants that judged.
-    """
+    """Return the TuningResult of an Answer, without messages."""
     setting, search = answer.setting, found.search
     tuned, point = setting.tuned(values), found.point
     summary, cloud = _validation(answer, problem) if validation else (None, None)

@@ -1,7 +1,4 @@
-"""A last step of the default answer: gains that make the linearised loop fragile are moved back.
-
-Imported by `attempts`.
-"""
+"""A last step of the default answer: gains that make the linearised loop fragile are moved back."""
 
 from typing import Any
 
@@ -24,22 +21,7 @@ steps are taken along one direction, at most."""
 
 
 def move_back(setting: Setting, problem: Any, found: Found) -> None:
-    """Move the answer in `found` to a point whose Ms is at most PEAK.
-
-    Along a straight line in the search's coordinates, to the first of LINE points whose sensitivity
-    peak (of the nominal loop, at the case's own step, the worst of its plateaus) is low enough,
-    whose cost is within PRICE of the answer's, and that keeps the limits as well. The line leads
-    towards the first values; where their own peak is above PEAK, along the steepest descent of Ms,
-    to the lowest peak where none is low enough, and towards them only if it is above theirs. To
-    the first values themselves where they fit and cost less than WORTH more than the point. The
-    answer stays where there is none, or where the loop has no sensitivity peak.
-
-    Parameters
-    ----------
-    setting : what is searched.
-    problem : Problem of the search.
-    found : its outcome; `z` and `kept` change.
-    """
+    """Move the answer in `found` to a point whose Ms is at most PEAK."""
     search, first = found.search, problem.start()
     if search is None or found.point is None or np.array_equal(found.point.z, first):
         return

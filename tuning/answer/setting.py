@@ -1,6 +1,5 @@
-"""What the default answer is searched on: noise, plants, cost, safety filter, and a coarser clock.
-
-Imported by the other modules of `answer`.
+"""What the default answer is searched on: noise, plants, cost, safety filter, and a
+coarser clock.
 """
 
 import dataclasses
@@ -50,20 +49,7 @@ COST = ("mean_square_error", "mean_square_travel")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Setting:
-    """The case as given, and what is searched and judged in its place.
-
-    Parameters
-    ----------
-    case : as given, with the limits that were asked for.
-    searched : the case with sensor noise, and a safety filter where it helps.
-    objective : {measure: weight} that is minimised, the mean over the plants.
-    own_objective : True where the objective is the user's.
-    distributions : what varies from plant to plant; stated : True if the case says so.
-    noise : standard deviation of the sensor noise [unit of length]; assumed : not of the case.
-    span : (pumps,) range of each input.
-    filter : settings of the safety filter, None where there is none.
-    certificates : a TankCertificate of each tank with a filter, else ().
-    """
+    """The case as given, and what is searched and judged in its place."""
 
     case: Case
     searched: Case
@@ -126,11 +112,7 @@ class Setting:
         return scenarios_of(case, self.distributions, samples, seed)
 
     def with_filter(self, near: np.ndarray | None = None) -> "Setting":
-        """Return the setting with a safety filter; itself where the plant can have none.
-
-        near : (tanks,) True for tanks whose limits matter, all where None. Where a limit of
-        another tank could only be proved by lowering a level that matters, it is left out.
-        """
+        """Return the setting with a safety filter; itself where the plant can have none."""
         given = dict(self.case.safety or {})
         try:
             found, rows = self.searched.without_safety_filter().safety_design(**given)
@@ -197,11 +179,7 @@ def setting_of(
     limits: Mapping[str, Any] | None = None,
     distributions: Mapping[str, Any] | None = None,
 ) -> Setting:
-    """Return the Setting of a case, without a safety filter unless the case has one.
-
-    objective, limits, distributions : those asked for; where None, the limits and the uncertainty
-    of the case, and its objective if that is neither the default of cases nor that of a preset.
-    """
+    """Return the Setting of a case, without a safety filter unless the case has one."""
     if limits is not None:
         case = case.replace(limits=dict(limits))
     case = case.replace(limits=dict(rig.check_limits(case.loop, case.limits)))
@@ -246,11 +224,9 @@ def height(case: Case) -> float:
 
 
 def input_range(case: Case) -> np.ndarray:
-    """Return the (pumps,) range of each pump's input.
-
-    Limits below 0 or without end are those of a model, not of a pump: its range is then taken as
-    twice the rms input of the case's own run.
-    """
+    """Return the (pumps,) range of each pump's input."""
+    # Limits below 0 or without end are those of a model, not of a pump: its range is then taken as
+    # twice the rms input of the case's own run.
     actuator = case.loop.actuator
     shape = (case.loop.plant.pumps,)
     low, high = (
@@ -305,11 +281,7 @@ def is_stated(case: Case) -> bool:
 
 
 def plants_of(case: Case) -> dict[str, Any]:
-    """Return {name: distribution} of what a case calls uncertain.
-
-    Where it says nothing, of every flow of the plant within SPREAD; of the noise alone where the
-    plant has no such names.
-    """
+    """Return {name: distribution} of what a case calls uncertain."""
     if is_stated(case):
         return spread_of(case)
     names = parameters(case.loop)

@@ -1,6 +1,5 @@
-"""The search behind the default answer: a few local searches, then every gain that may stays put.
-
-Imported by `recommend`.
+"""The search behind the default answer: a few local searches, then every gain that may
+stays put.
 """
 
 import dataclasses
@@ -56,13 +55,7 @@ MANY = 4
 
 @dataclasses.dataclass
 class Found:
-    """What the search found so far; Ctrl-C leaves it as it is.
-
-    z : (P,) the answer.  kept : (P,) True for gains at their first value.  agreed : True if two
-    searches ended within AGREE, or evolution found nothing better.  starts : as in `TuningResult`.
-    slack : (limits,) by how much the first values may violate the limits of the search, in the unit
-    of each; None for nothing.
-    """
+    """What the search found so far; Ctrl-C leaves it as it is."""
 
     search: Search | None = None
     starts: list[dict[str, Any]] = dataclasses.field(default_factory=list)
@@ -116,13 +109,8 @@ class Subspace(Search):
 
 
 def method_of(problem: Problem) -> str:
-    """Return the local method: Gauss-Newton where no limit is to be kept and the cost has squares.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> method_of(Problem(presets.find("cascaded/pi"), limits={}))
-    'trf'
+    """Return the local method: Gauss-Newton where no limit is to be kept and the cost has
+    squares.
     """
     if problem.model and not problem.limits:
         return "trf"
@@ -132,9 +120,8 @@ def method_of(problem: Problem) -> str:
 def search_from(
     problem: Problem, plan: dict[str, int], report: Any, found: Found, engine: Engine | None = None
 ) -> None:
-    """Search the problem from its start and from screened points, and keep in `found` the answer.
-
-    plan : {"starts", "iterations", "seed"}. engine : of a cluster, None without.
+    """Search the problem from its start and from screened points, and keep in `found` the
+    answer.
     """
     first = problem.start()
     reference = problem.point(first)
@@ -175,11 +162,7 @@ def _local_search(search, found, z, iterations):
 
 
 def _confirmed(search, found, screened, plan):
-    """Return True if differential evolution finds nothing that is better by AGREE than the best.
-
-    From the best point, points around it and the best screened ones. Where it does, a local search
-    goes on from there, PROBES times at most.
-    """
+    """Return True if differential evolution finds nothing that is better by AGREE than the best."""
     _, generations = evolution_size(search, screened)
     order = np.argsort(screened.merits(search), kind="stable")
     for k in range(PROBES):
@@ -213,12 +196,10 @@ def _agree(starts):
 def stay_put(
     search: Search, first: np.ndarray, iterations: int, slack: Any = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (z (P,), kept (P,)): the point nearest to the first values that costs little more.
-
-    One gain after the other is set back to its value in `first` and the rest searched again. It
-    stays there (kept) if the cost is within WORTH of the best found, and no limit that the best
-    point keeps is violated. A gain that cannot is moved back as far as it can.
-    """
+    """Return (z (P,), kept (P,)): the point nearest to the first values that costs little more."""
+    # One gain after the other is set back to its value in `first` and the rest searched again. It
+    # stays there (kept) if the cost is within WORTH of the best found, and no limit that the best
+    # point keeps is violated. A gain that cannot is moved back as far as it can.
     best = search.best
     kept, z = np.zeros(len(first), dtype=bool), best.z
     ceiling = best.cost + WORTH * abs(best.cost)

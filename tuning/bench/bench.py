@@ -96,10 +96,7 @@ def c_runner(function, case, rk4=True):
 
 
 def timed(calls, rounds):
-    """Return {name: [seconds of each round]} and {name: first result} of functions.
-
-    Every function is called once a round, in turn, after a warm-up.
-    """
+    """Return {name: [seconds of each round]} and {name: first result} of functions."""
     results = {name: jax.block_until_ready(call()) for name, call in calls.items()}
     seconds = {name: [] for name in calls}
     for _ in range(rounds):
@@ -111,10 +108,7 @@ def timed(calls, rounds):
 
 
 def measure(rounds=7):
-    """Return the figures of `jaxtank bench`, as a dict for JSON.
-
-    rounds: interleaved rounds that medians are taken of.
-    """
+    """Return the figures of `jaxtank bench`, as a dict for JSON."""
     cases = {name: presets.find(name) for name in CASES}
     first, calls, compile_s = cases[CASES[0]], _calls(cases), {}
     for name, call in calls.items():
@@ -231,10 +225,7 @@ def text(found):
 
 
 def is_one_function(program, samples):
-    """Return whether XLA runs the time loop of a compiled program as one function.
-
-    program: its text; samples: number of turns of the loop.
-    """
+    """Return whether XLA runs the time loop of a compiled program as one function."""
     small = set(
         re.findall(r'to_apply=(%[\w.-]+), frontend_attributes={xla_cpu_small_call="true"', program)
     )
@@ -263,11 +254,9 @@ OFF = (
 
 
 def reasons(program, samples, option, dtype, compiled):
-    """Return why a run is slower or less exact than it could be, as sentences.
-
-    program: text of the compiled run; samples: of its loop; option: whether the XLA options are on;
-    dtype: of the levels; compiled: how many programs three further runs compiled.
-    """
+    """Return why a run is slower or less exact than it could be, as sentences."""
+    # program: text of the compiled run; samples: of its loop; option: whether the XLA options are
+    # on; dtype: of the levels; compiled: how many programs three further runs compiled.
     found = []
     if not is_one_function(program, samples):
         named = [word for word in BLOCKING if f" {word}(" in program]
@@ -292,10 +281,7 @@ def reasons(program, samples, option, dtype, compiled):
 
 
 def measure_cases(cases, rounds=3):
-    """Return the time of a run with two measures of each of {name: Case}, median of `rounds`.
-
-    Its keys: ns_per_step, ms, samples, one_function, first_call_s, reasons.
-    """
+    """Return the time of a run with two measures of each of {name: Case}, median of `rounds`."""
     found = {}
     for name, case in cases.items():
         key = jax.random.key(0) if noisy(case) else None

@@ -1,7 +1,4 @@
-"""The argument parser of the command line and the options that several commands share.
-
-Imported by every command; imports nothing heavy.
-"""
+"""The argument parser of the command line and the options that several commands share."""
 
 import argparse
 import sys
@@ -24,10 +21,9 @@ class Once(argparse.Action):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line with the nearest valid word.
+    """A parser whose errors are one line with the nearest valid word."""
 
-    An option that is not made to be repeated is refused the second time.
-    """
+    # An option that is not made to be repeated is refused the second time.
 
     def __init__(self, **options):
         super().__init__(**options)

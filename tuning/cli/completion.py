@@ -1,6 +1,6 @@
 """Shell completion, generated from the parser: `jaxtank completion bash|zsh|fish` prints a script.
 
-Imported by the command line only; jax is not started. The words that only a started jax knows
+The words that only a started jax knows
 (cases, parameters, measures) are in names.txt beside this file: `refresh()` writes it anew, and a
 test compares it with the library.
 """
@@ -69,26 +69,7 @@ class Command(NamedTuple):
 
 
 def script(shell, parser):
-    """Return the completion script of a shell.
-
-    Parameters
-    ----------
-    shell : str
-        One of SHELLS.
-    parser : argparse.ArgumentParser
-        With subcommands.
-
-    Raises
-    ------
-    InputError
-        Another shell.
-
-    Examples
-    --------
-    >>> from tuning.cli.parser import parser
-    >>> "-a tune -d" in script("fish", parser())
-    True
-    """
+    """Return the completion script of a shell."""
     if shell not in SHELLS:
         raise unknown("shell", shell, SHELLS)
     commands = commands_of(parser)

@@ -122,10 +122,7 @@ class before_leaving:
 
 
 class Interrupts:
-    """Ctrl-C or SIGTERM of a search: one ends it with the best point so far, the next at once.
-
-    It takes effect from the first `check` on; before that there is no point to report.
-    """
+    """Ctrl-C or SIGTERM of a search: one ends it with the best point so far, the next at once."""
 
     def __init__(self):
         self.stop = self.taken = False

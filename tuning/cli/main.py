@@ -16,23 +16,7 @@ COMPILES_NOTHING = ("cache", "completion", "list")
 
 
 def main(argv=None):
-    """Run the command and return its exit code.
-
-    Parameters
-    ----------
-    argv : list of str or None
-        Words after `jaxtank`; None: a program of its own, which reads sys.argv and answers
-        SIGINT and SIGTERM.
-
-    Returns
-    -------
-    int
-
-    Examples
-    --------
-    >>> main(["completion", "elvish"])
-    2
-    """
+    """Run the command and return its exit code."""
     if argv is None:
         terminal.guard()
         interrupts.listen()  # before anything that takes time is imported

@@ -1,7 +1,4 @@
-"""Values of the options that several commands share, and the report of written files.
-
-Imported by the commands.
-"""
+"""Values of the options that several commands share, and the report of written files."""
 
 import re
 import sys

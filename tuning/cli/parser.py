@@ -1,21 +1,11 @@
-"""The parser of the command `jaxtank`: each module of commands adds its own.
-
-Imports nothing heavy, so that --help is quick.
-"""
+"""The parser of the command `jaxtank`: each module of commands adds its own."""
 
 from tuning.cli.arguments import Parser, shared
 from tuning.cli.commands import case, explore, falsification, identification, studies, tools, tuning
 
 
 def parser():
-    """Return the argument parser of every command.
-
-    Examples
-    --------
-    >>> args = parser().parse_args(["tune", "cascaded/pi", "--starts", "2"])
-    >>> args.command, args.case, args.starts
-    ('tune', 'cascaded/pi', '2')
-    """
+    """Return the argument parser of every command."""
     top = Parser(
         prog="jaxtank",
         description=(

@@ -1,4 +1,4 @@
-"""What `tune` reports of its search while it runs. Imported by that command."""
+"""What `tune` reports of its search while it runs."""
 
 import sys
 
@@ -8,11 +8,7 @@ from tuning.cli.watch import Watch
 
 
 class Progress(Interrupts):
-    """A line per evaluation on a terminal, a line per local search elsewhere.
-
-    Ctrl-C is taken between evaluations, from the second on: the first is of the values that the
-    case has, and what follows it is compiled first. `watch`: the page that follows the search.
-    """
+    """A line per evaluation on a terminal, a line per local search elsewhere."""
 
     def __init__(self, unit, quiet, option=None):
         super().__init__()

@@ -1,7 +1,7 @@
 """The standard streams of the program, and the line of progress on stderr.
 
 A stream that the shell has closed exists all the same, and a closed stderr does not end the
-program. Imported by the command line only.
+program.
 """
 
 import io
@@ -36,11 +36,10 @@ class Forgiving(io.RawIOBase):
 
 
 def guard():
-    """Replace closed standard streams: for a program of its own, never in a caller's process.
-
-    Descriptors that were closed (`>&-`) are taken first: the next file to be opened would get their
-    number. A stdout that was closed raises OSError once it is written to. stderr is `Forgiving`.
-    """
+    """Replace closed standard streams: for a program of its own, never in a caller's process."""
+    # Descriptors that were closed (`>&-`) are taken first: the next file to be opened would get
+    # their number. A stdout that was closed raises OSError once it is written to. stderr is
+    # `Forgiving`.
     for descriptor, mode in ((0, os.O_WRONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
         try:
             os.fstat(descriptor)
@@ -63,13 +62,7 @@ def guard():
 
 
 class Line:
-    """Progress on stderr: one line that is overwritten on a terminal, few lines elsewhere.
-
-    Parameters
-    ----------
-    quiet : bool
-        Print nothing.
-    """
+    """Progress on stderr: one line that is overwritten on a terminal, few lines elsewhere."""
 
     def __init__(self, quiet):
         self.quiet, self.terminal = quiet, sys.stderr.isatty()

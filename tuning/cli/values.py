@@ -1,7 +1,4 @@
-"""Values of a command line: numbers, ranges, NAME=VALUE, and the case that they describe.
-
-Imported by the commands; imports nothing heavy before a case is opened.
-"""
+"""Values of a command line: numbers, ranges, NAME=VALUE, and the case that they describe."""
 
 import os
 import re
@@ -14,18 +11,7 @@ from tuning.problem.wording import count
 
 
 def open_case(args):
-    """Return the checked case of the command line, in float64; warnings go to stderr.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Of a command with the options of `arguments.changes`.
-
-    Raises
-    ------
-    InputError
-        An unknown case, a file that is no rig, a value out of its range.
-    """
+    """Return the checked case of the command line, in float64; warnings go to stderr."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -51,10 +37,7 @@ def open_case(args):
 
 
 def _warnings(args, case, replaced):
-    """Sentences on a case as --set has changed it.
-
-    replaced: {name: scenarios whose own value --set replaces}.
-    """
+    """Sentences on a case as --set has changed it."""
     from jaxtank import rig
     from jaxtank.loop import step_size
 
@@ -136,22 +119,7 @@ def schedule(texts):
 
 
 def pair(option, text, read=None) -> tuple[str, Any]:
-    """Return (name, value) of NAME=VALUE.
-
-    Parameters
-    ----------
-    option : str
-        Its name, for the error.
-    text : str
-        NAME=VALUE.
-    read : callable or None
-        Makes the value of its text; `parse_value` where None.
-
-    Examples
-    --------
-    >>> pair("--set", "controller.k = 0.05")
-    ('controller.k', 0.05)
-    """
+    """Return (name, value) of NAME=VALUE."""
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
         raise InputError(f"{option} {text!r}: must be NAME=VALUE")
@@ -160,10 +128,7 @@ def pair(option, text, read=None) -> tuple[str, Any]:
 
 
 def once(option, pairs):
-    """Return {name: value} of (name, value) pairs, None where there is none.
-
-    Raises InputError for a name that is given twice.
-    """
+    """Return {name: value} of (name, value) pairs, None where there is none."""
     names = [name for name, _ in pairs]
     for name in names:
         if names.count(name) > 1:
@@ -176,26 +141,7 @@ DECIMAL_COMMA = re.compile(r"([+-]?)(\d+|[1-9]\d{0,2}(?:\.\d{3})+),(\d+(?:[eE][+
 
 
 def parse_value(text, where):
-    """Return a number, a truth value, a list of numbers ("[1,2]", "1,2,3"), or the text itself.
-
-    A list needs brackets where a decimal comma could be meant.
-
-    Parameters
-    ----------
-    text : str
-    where : str
-        Option and name, for the error.
-
-    Raises
-    ------
-    InputError
-        A decimal comma, an empty entry of a list, an entry such as 05.
-
-    Examples
-    --------
-    >>> [parse_value(text, "--set x") for text in ("3", "0.5", "true", "[1,2]", "clip")]
-    [3, 0.5, True, [1, 2], 'clip']
-    """
+    """Return a number, a truth value, a list of numbers ("[1,2]", "1,2,3"), or the text itself."""
     if text.lower() in ("true", "false"):
         return text.lower() == "true"
     bracketed = text.startswith("[") and text.endswith("]")
@@ -212,10 +158,7 @@ def parse_value(text, where):
 
 
 def _check_list(text, parts, found, where):
-    """Raise InputError where a list of numbers may be meant otherwise.
-
-    parts: texts of the entries; found: their numbers.
-    """
+    """Raise InputError where a list of numbers may be meant otherwise."""
     if len(found) < len(parts):
         raise InputError(
             f"{where}: an entry of the list is empty: leave out the comma, or give its number"
@@ -236,15 +179,8 @@ def _check_list(text, parts, found, where):
 
 
 def plain_number(text):
-    """Return an int where `text` is written as one and a float can hold it, else a float.
-
-    Raises ValueError for a text that is no number; underscores are not numbers.
-
-    Examples
-    --------
-    >>> plain_number("12"), plain_number("1e3")
-    (12, 1000.0)
-    """
+    """Return an int where `text` is written as one and a float can hold it, else a float."""
+    # Raises ValueError for a text that is no number; underscores are not numbers.
     if "_" in text:
         raise ValueError(text)
     try:
@@ -264,13 +200,7 @@ def number(option, text):
 
 
 def whole(option, text, low, high):
-    """Return the whole number of an option, from `low` to `high`; InputError otherwise.
-
-    Examples
-    --------
-    >>> whole("--starts", "8", 1, 1000)
-    8
-    """
+    """Return the whole number of an option, from `low` to `high`; InputError otherwise."""
     try:
         value = int(text)
     except ValueError:
@@ -286,10 +216,8 @@ def seed(args):
 
 
 def folder_of(args) -> Any:
-    """Return the folder that a command writes to, None where it writes to none.
-
-    Raises InputError where it cannot be written to; nothing is made yet.
-    """
+    """Return the folder that a command writes to, None where it writes to none."""
+    # Raises InputError where it cannot be written to; nothing is made yet.
     out, resume = getattr(args, "out", None), getattr(args, "resume", None)
     for name, folder in (("--out", out), ("--resume", resume)):
         if folder is not None and not folder.strip():
@@ -307,12 +235,8 @@ def folder_of(args) -> Any:
 
 
 def span(text):
-    """Return (low, high, "log" or "linear") of a range LOW:HIGH, LOW:HIGH:log or LOW:HIGH:linear.
-
-    Examples
-    --------
-    >>> span("0.1:10"), span("0:10")
-    ((0.1, 10.0, 'log'), (0.0, 10.0, 'linear'))
+    """Return (low, high, "log" or "linear") of a range LOW:HIGH, LOW:HIGH:log or
+    LOW:HIGH:linear.
     """
     parts = text.split(":")
     try:

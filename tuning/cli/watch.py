@@ -1,4 +1,4 @@
-"""`--watch`: a page in the folder of a search that follows it. Imported by the command `tune`."""
+"""`--watch`: a page in the folder of a search that follows it."""
 
 import contextlib
 import re
@@ -21,18 +21,7 @@ MOST = 1500
 
 
 class Watch:
-    """Writes watch.html and watch.js to a folder while a search runs; no failure of it ends one.
-
-    As a context it is that of the search: an end without a result is written too, and one by a
-    second signal.
-
-    Parameters
-    ----------
-    folder : path; made at the first evaluation, so that bad input leaves nothing.
-    case : Case
-    written : called with the path of the page once it is there.
-    clock : returns the time [s since 1970].
-    """
+    """Writes watch.html and watch.js to a folder while a search runs; no failure of it ends one."""
 
     def __init__(
         self,
@@ -89,11 +78,8 @@ class Watch:
         result: bool = False,
         values: dict[str, float] | None = None,
     ) -> None:
-        """Write the last page, if there was one before; state : "ended", "interrupted", "failed".
-
-        lines : sentences about the result. result : whether it was written, with a report; one
-        that is in the folder may be that of an earlier search. values : {name: value} of the
-        result.
+        """Write the last page, if there was one before; state : "ended", "interrupted",
+        "failed".
         """
         if not self.there:
             return
@@ -117,10 +103,7 @@ class Watch:
 
 
 def watch_of(args: Any, case: Any, folder: str | None, line: Any) -> Watch | None:
-    """Return the Watch of a search with the options `args`; None where nothing is to follow it.
-
-    line : the `tuning.cli.terminal.Line` of the search. Raises InputError without a folder.
-    """
+    """Return the Watch of a search with the options `args`; None where nothing is to follow it."""
     if args.watch and folder is None:
         raise InputError("--watch writes DIR/watch.html: give --out DIR")
     if folder is None or not (args.watch or (line.terminal and not args.quiet)):
@@ -135,13 +118,7 @@ def watch_of(args: Any, case: Any, folder: str | None, line: Any) -> Watch | Non
 
 
 def first_sentence(text: str) -> str:
-    """Return the first lines of a result up to the one that ends in its time, as one line.
-
-    Examples
-    --------
-    >>> first_sentence("paper/case: converged;\\n2 gains changed (3.0 s)\\nand a table")
-    'paper/case: converged; 2 gains changed (3.0 s)'
-    """
+    """Return the first lines of a result up to the one that ends in its time, as one line."""
     return re.split(r"(?<= s\))\n|\n\n", text, maxsplit=1)[0].replace("\n", " ")
 
 

@@ -1,7 +1,7 @@
 """Local searches on workers: what they evaluate is entered into the evaluation cache of a problem.
 
 The search itself then runs as without a cluster, and finds its evaluations in the cache: the answer
-is the same to the bit. Imported by `tuning.search` and `tuning.answer`.
+is the same to the bit.
 """
 
 import copy
@@ -22,13 +22,8 @@ def evaluate_ahead(
     run: Callable[..., Any],
     waiting: Callable[[], Any],
 ) -> None:
-    """Make searches on the workers, and enter what they evaluate into the cache of the problem.
-
-    What the cache holds already, of a run that is continued, is not evaluated again.
-
-    engine : None for nothing. searches : arguments of `run` after the problem, of each search.
-    run : makes a search of a problem. waiting : as in `Engine.run`.
-    """
+    """Make searches on the workers, and enter what they evaluate into the cache of the problem."""
+    # What the cache holds already, of a run that is continued, is not evaluated again.
     if engine is None:
         return
     given = []
@@ -50,10 +45,7 @@ def evaluate_ahead(
 def recorded(
     text: tuple, arrays: list, run: Callable[..., Any], arguments: tuple, known: list
 ) -> list:
-    """Return the new evaluations of a search of the problem of `sent_problem`, on a worker.
-
-    known : [(kind, key, result)] evaluations that were made before, as those that are returned.
-    """
+    """Return the new evaluations of a search of the problem of `sent_problem`, on a worker."""
     cache = _Recorded()
     for entry in known:
         cache.enter(*entry)

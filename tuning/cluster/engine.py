@@ -1,7 +1,4 @@
-"""Tasks on a Dask cluster: a scheduler at an address, or workers of this machine.
-
-Imported by `uncertainty` and `search`; imports Dask where a cluster is asked for, not before.
-"""
+"""Tasks on a Dask cluster: a scheduler at an address, or workers of this machine."""
 
 import contextlib
 import logging
@@ -39,32 +36,14 @@ class ClusterWarning(UserWarning):
 
 
 class Engine:
-    """Runs tasks on a Dask cluster; made by `connect`.
-
-    client : distributed.Client. check : called where there is no worker; it may raise.
-    """
+    """Runs tasks on a Dask cluster; made by `connect`."""
 
     def __init__(self, client, check=None):
         self.client, self.address, self.check = client, client.scheduler.address, check
         self.processors, self.threads, self.looked = set(), 0, 0.0
 
     def run(self, task, given, waiting=None):
-        """Run a task many times on the workers and yield (number, result) as the results come.
-
-        A task whose worker has gone is run again on another one.
-
-        Parameters
-        ----------
-        task : a name of `task.TASKS`
-        given : iterable of (number, arguments of its function), taken as workers become free
-        waiting : callable or None
-            Called without arguments every half second; what it raises ends the run.
-
-        Raises
-        ------
-        InputError
-            The scheduler has gone, a task has ended several workers, or the function raised it.
-        """
+        """Run a task many times on the workers and yield (number, result) as the results come."""
         import jax
 
         config: Any = jax.config
@@ -180,24 +159,7 @@ class Engine:
 
 @contextlib.contextmanager
 def connect(cluster):
-    """Give an Engine of a cluster, None for None.
-
-    Parameters
-    ----------
-    cluster : None, an Engine, "HOST:PORT" or "tls://HOST:PORT" of a scheduler, "local:N" for N
-        workers on this machine, or a `distributed.Client`, which stays open.
-
-    Raises
-    ------
-    InputError
-        For anything else, where Dask is not installed, and where no scheduler answers.
-
-    Examples
-    --------
-    >>> with connect(None) as engine:
-    ...     print(engine)
-    None
-    """
+    """Give an Engine of a cluster, None for None."""
     if cluster is None or isinstance(cluster, Engine):
         yield cluster
         return
@@ -225,15 +187,8 @@ def connect(cluster):
 
 
 def check_cluster(cluster):
-    """Raise InputError unless `cluster` is something that `connect` takes, and Dask is installed.
-
-    Examples
-    --------
-    >>> check_cluster("local:0")
-    Traceback (most recent call last):
-    ...
-    jaxtank.core.errors.InputError: cluster = 'local:0': must be HOST:PORT of a Dask scheduler, \
-tls://HOST:PORT, or local:N for N workers on this machine, from 1 to 1024
+    """Raise InputError unless `cluster` is something that `connect` takes, and Dask is
+    installed.
     """
     if cluster is None or isinstance(cluster, Engine):
         return
@@ -264,17 +219,8 @@ tls://HOST:PORT, or local:N for N workers on this machine, from 1 to 1024
 
 
 def check_alone(cluster, **other):
-    """Raise InputError for a cluster that cannot be used, or beside what does not go with one.
-
-    other : {what does not: whether it is given}
-
-    Examples
-    --------
-    >>> check_alone("local:2", devices=True, shard=False)
-    Traceback (most recent call last):
-    ...
-    jaxtank.core.errors.InputError: cluster and devices: give one of them
-    """
+    """Raise InputError for a cluster that cannot be used, or beside what does not go with one."""
+    # other : {what does not: whether it is given}
     if cluster is None:
         return
     for name, given in other.items():

@@ -1,6 +1,5 @@
 """A Dask scheduler and workers as processes of this machine, for `--cluster local:N`.
-
-Imported by `engine`. Dask's own LocalCluster would import the user's script anew in each worker.
+Dask's own LocalCluster would import the user's script anew in each worker.
 """
 
 import contextlib
@@ -47,11 +46,7 @@ class Workers(NamedTuple):
 
 @contextlib.contextmanager
 def local_workers(count):
-    """Run a scheduler and `count` workers of one thread on this machine, and give its Workers.
-
-    They listen on 127.0.0.1, to those who have the keys made for this run; they leave signals of
-    the terminal to this process, and end with it.
-    """
+    """Run a scheduler and `count` workers of one thread on this machine, and give its Workers."""
     with tempfile.TemporaryDirectory(prefix="jaxtank-") as folder, contextlib.ExitStack() as stack:
         file, security = Path(folder, "scheduler.json"), _keys()
         common = ["--host", "127.0.0.1", "--no-dashboard", "--dashboard-address", "127.0.0.1:0"]

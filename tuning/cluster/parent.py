@@ -1,5 +1,5 @@
 """Loaded by the scheduler and the workers of `local`: they end when the process that began them
-does, however it ends. Imports the standard library alone.
+does, however it ends.
 """
 
 import os

@@ -1,7 +1,4 @@
-"""A problem of a search as texts, numbers and arrays, and the problem that a worker makes of it.
-
-Imported by `ahead` and `tuning.search`.
-"""
+"""A problem of a search as texts, numbers and arrays, and the problem that a worker makes of it."""
 
 import dataclasses
 
@@ -23,11 +20,7 @@ def check_sent(engine: Engine | None, problem: Problem) -> None:
 
 
 def sent_problem(problem: Problem) -> tuple[tuple, list]:
-    """Return a problem as texts and numbers, and the arrays of its groups.
-
-    A group is the structure of a loop, of which a rig file is sent, and arrays: no file describes
-    the loop of a drawn plant under the safety filter of another one.
-    """
+    """Return a problem as texts and numbers, and the arrays of its groups."""
     base, structure = sent(problem.case, problem.needed), jax.tree.structure(problem.loop)
     limits = [dataclasses.astuple(limit) for limit in problem.limits]
     text = (

@@ -1,6 +1,5 @@
-"""A case as text, and the case that a worker makes of it: the same loop, to the bit, or an error.
-
-Imported by the tasks of `uncertainty` and `search`.
+"""A case as text, and the case that a worker makes of it: the same loop, to the bit, or
+an error.
 """
 
 import functools
@@ -18,21 +17,7 @@ from tuning.storage.fingerprint import fingerprint
 
 
 def sent(case: Case, names: Sequence[str] = ()) -> str:
-    """Return a case as JSON: its rig file, and the fingerprint of its loop, clock and versions.
-
-    names : measures that the workers are to compute.
-
-    Raises InputError where no rig file describes the case, or a measure is a function of one's own:
-    neither is sent as code. What a package names in its entry points `jaxtank.components`, the
-    workers find, too.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> case = presets.find("cascaded/pi")
-    >>> received(sent(case)).name
-    'cascaded/pi'
-    """
+    """Return a case as JSON: its rig file, and the fingerprint of its loop, clock and versions."""
     if own := ms.functions(names):
         raise InputError(
             f"cluster: {next(iter(own))} is a function of your own, and workers are sent no code:"
@@ -51,11 +36,7 @@ def sent(case: Case, names: Sequence[str] = ()) -> str:
 
 @functools.lru_cache(maxsize=8)
 def received(text: str) -> Case:
-    """Return the case of `sent`, made anew; the same object for the same text.
-
-    Raises InputError, naming what differs, where the loop made here is another one, where versions
-    of jaxtank or jax differ, and where jax had started without the options of jaxtank.
-    """
+    """Return the case of `sent`, made anew; the same object for the same text."""
     found = json.loads(text)
     case = rig.loads(found["rig"], "rig file sent to this worker")
     mine, theirs = _fingerprint(case), found["fingerprint"]

@@ -9,19 +9,7 @@ TASKS = {
 
 
 def call(task, x64, *arguments):
-    """Run a task on a worker.
-
-    Parameters
-    ----------
-    task : a name of TASKS
-    x64 : bool
-        Whether floats have 64 bits; of this thread alone, a worker may have other work.
-    arguments : of its function
-
-    Returns
-    -------
-    (digest of the type of processor, what the function returns)
-    """
+    """Run a task on a worker."""
     import importlib
 
     import jax

@@ -1,7 +1,4 @@
-"""Ascent by the signs of the slopes, in the unit cube, many points at once.
-
-Imported by `tuning.falsification.study`.
-"""
+"""Ascent by the signs of the slopes, in the unit cube, many points at once."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -24,25 +21,10 @@ class Ascent(NamedTuple):
 def ascend(
     slopes: Callable, z: dict[str, np.ndarray], iterations: int, report: Callable | None = None
 ) -> Ascent:
-    """Return points with higher values than those of `z`, in the unit cube.
-
-    Each point moves by its own step along the signs of its slopes, z + step sign(dz) cut to the
-    cube: a step of 1 goes to the corner that a linear function is highest at. A point that does
-    not rise stays, and its step is halved.
-
-    Parameters
-    ----------
-    slopes : ({variable: (runs, ...)}) -> (values (runs,), {variable: slopes (runs, ...)})
-    z : {variable: (runs, ...)}, the points to start from
-    iterations : steps of each point at most
-    report : called after each step with the number of steps done
-
-    Examples
-    --------
-    >>> value = lambda z: (z["a"].sum(1), {"a": np.ones_like(z["a"])})
-    >>> ascend(value, {"a": np.full((1, 2), 0.5)}, 3).z["a"].tolist()
-    [[1.0, 1.0]]
-    """
+    """Return points with higher values than those of `z`, in the unit cube."""
+    # Each point moves by its own step along the signs of its slopes, z + step sign(dz) cut to the
+    # cube: a step of 1 goes to the corner that a linear function is highest at. A point that does
+    # not rise stays, and its step is halved.
     value, slope = slopes(z)
     step, history = np.ones(len(value)), [value]
     for done in range(iterations):

@@ -1,7 +1,4 @@
-"""A case whose coefficients, start and readings are variables of the unit cube.
-
-Imported by `tuning.falsification.study`.
-"""
+"""A case whose coefficients, start and readings are variables of the unit cube."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -43,36 +40,7 @@ class Levels(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Attacked:
-    """A case as a function of variables in the unit cube.
-
-    Parameters
-    ----------
-    case : Case
-    coefficients : list of Coefficient
-    windows : int
-        Windows of equal length in each of which a coefficient of the flows is constant.
-    pumps : {"own", "full", "random"}
-        What commands the pumps: the case's controller, full command, or commands that are
-        variables.
-    start : {"any", "own"}
-        Any levels up to the ceiling from which the case's filter can hold its limits, or the
-        case's own.
-    noise : bool
-        An error of its own for each sample, besides the constant one.
-    ceiling : (n,) array
-        Levels [cm] below which starts lie.
-
-    Attributes
-    ----------
-    band : (n,) array
-        Largest error of a reading [cm].
-    original : Case
-        `case` with its own controller.
-    physical_rims : bool
-        Whether the case has overflow, which the attacked one has not.
-    shapes : dict
-        {variable: shape}; all lie in [0, 1].
-    """
+    """A case as a function of variables in the unit cube."""
 
     case: Case
     coefficients: list[Coefficient]
@@ -133,14 +101,7 @@ class Attacked:
         return found
 
     def values(self, z: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the values that variables z in the unit cube stand for.
-
-        Returns
-        -------
-        {"varying" (coefficients, windows) and "constant" (coefficients,) in their own units, "x0"
-        (n,) [cm], "error" of the readings (n, samples), (n, 1) where constant [cm], "command"
-        (SWITCHES, m) [V]}; the last two where they are variables.
-        """
+        """Return the values that variables z in the unit cube stand for."""
         loop, found = self.case.loop, {}
         low, high = (np.array([c[i] for c in self.coefficients]) for i in (2, 3))
         n = self.shapes["varying"][0]
@@ -206,12 +167,7 @@ class Attacked:
         return dataclasses.replace(loop, **changes)
 
     def levels(self, values: Mapping[str, Any], checkpoint: bool = False) -> Levels:
-        """Return the highest levels of a run with these values; -inf where the run diverged.
-
-        checkpoint: keep the state of each sample alone for reverse mode, and compute each sample
-        anew on the way back. A program with `loop.run`'s chunks takes four times as long to
-        compile.
-        """
+        """Return the highest levels of a run with these values; -inf where the run diverged."""
         loop, clock = self.loop_of(values), self.case.clock
         state = initial(loop, clock)
         none = tuple(jnp.full_like(x, -jnp.inf) for x in state.x)
@@ -241,24 +197,15 @@ class Attacked:
 
 
 def of_plant(coefficient: Coefficient) -> bool:
-    """Return whether a coefficient is an entry of an array of the plant, which may have a course.
-
-    Examples
-    --------
-    >>> of_plant(Coefficient("plant.drain[0]", 1.0, 0.9, 1.1, True))
-    True
+    """Return whether a coefficient is an entry of an array of the plant, which may have a
+    course.
     """
     return coefficient.name.startswith("plant.") and len(split_index(coefficient.name)[1]) == 1
 
 
 def without_overflow(loop: ClosedLoop) -> ClosedLoop:
-    """Return a loop whose levels may rise past the rims: at a rim, nothing could be seen to pass.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> without_overflow(presets.find("cascaded/pi").loop).plant.overflow
-    False
+    """Return a loop whose levels may rise past the rims: at a rim, nothing could be seen
+    to pass.
     """
     plant: Any = loop.plant
     if not plant.overflow:
@@ -269,13 +216,6 @@ def without_overflow(loop: ClosedLoop) -> ClosedLoop:
 def reading_band(loop: ClosedLoop) -> np.ndarray:
     """Return the (n,) largest error of readings [cm]: of the sensor's noise (6 standard
     deviations), ADC and offset, or the band of the safety filter where that is wider.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> loop = presets.find("cascaded/pi").loop
-    >>> reading_band(with_values(loop, {"sensor.noise": 0.01})).tolist()
-    [0.06, 0.06]
     """
     n, sensor, guard = loop.plant.tanks, loop.sensor, loop.safety_filter
     own = band_of(sensor) if isinstance(sensor, LevelSensor) else 6.0 * np.asarray(sensor.noise)

@@ -1,7 +1,4 @@
-"""The coefficients that an attack may change, each with its interval.
-
-Imported by the other modules of `tuning.falsification`.
-"""
+"""The coefficients that an attack may change, each with its interval."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -17,10 +14,7 @@ from tuning.uncertainty.sampling import spread_of
 
 
 class Coefficient(NamedTuple):
-    """One number of the loop and its interval, in its own unit.
-
-    `name` : dotted, with its entry.  `varies` : True where it may change in time.
-    """
+    """One number of the loop and its interval, in its own unit."""
 
     name: str
     nominal: float
@@ -30,33 +24,7 @@ class Coefficient(NamedTuple):
 
 
 def coefficients_of(case: Any, distributions: Any = None) -> list[Coefficient]:
-    """Return the coefficients of a case that lie in intervals, with their intervals.
-
-    Parameters
-    ----------
-    case : Case
-    distributions : {name: distribution}, or None
-        The interval of each entry is the range of its distribution, for `Correlated` that of each
-        parameter alone. None: the box of the case's safety filter, or that which a filter would
-        be designed for.
-
-    Returns
-    -------
-    list of Coefficient
-        Those of the plant's flows may change in time.
-
-    Raises
-    ------
-    InputError
-        A discrete distribution; nothing that varies.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> found = coefficients_of(presets.find("cascaded/pi"), {"plant.pump_gain": 0.1})
-    >>> [(c.name, round(c.low / c.nominal, 3), c.varies) for c in found]
-    [('plant.pump_gain[0]', 0.9, True)]
-    """
+    """Return the coefficients of a case that lie in intervals, with their intervals."""
     loop = case.loop
     if distributions is None:
         ends = _ends_of_box(case)

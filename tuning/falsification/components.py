@@ -1,7 +1,5 @@
 """Parts of an attacked loop: readings with given errors, pumps that follow a plan, coefficients
 that change in time.
-
-Imported by `tuning.falsification.attacked`.
 """
 
 import dataclasses
@@ -23,16 +21,7 @@ from jaxtank.plants.faults import Faults
 
 @component
 class GivenErrors(Sensor):
-    """Readings y = h + error, a given error of each sample; an ADC reads no more than `top`.
-
-    Examples
-    --------
-    >>> sensor = GivenErrors(error=[[0.1, -0.1]], top=(None,))
-    >>> [float(e) for e in sensor.draw(None, 2)[0]]
-    [0.1, -0.1]
-    >>> float(sensor.step((), (3.0,), (0.1,), 1.0)[0][0])
-    3.1
-    """
+    """Readings y = h + error, a given error of each sample; an ADC reads no more than `top`."""
 
     error: Any = leaf("cm", "error of each tank's reading at each sample", shape=("sample", "tank"))
     top: tuple = static("cm", "highest level that can be read, None without an ADC")
@@ -56,14 +45,7 @@ class GivenErrors(Sensor):
 
 @component
 class PumpPlan(Controller):
-    """Commands that are constant over windows of equal length, whatever the levels.
-
-    Examples
-    --------
-    >>> plan = PumpPlan(command=[[0.0], [12.0]], length=2.0)
-    >>> plan.inputs(Clock(dt=1.0, duration=3.0))[0].tolist()
-    [0.0, 0.0, 12.0, 12.0]
-    """
+    """Commands that are constant over windows of equal length, whatever the levels."""
 
     command: Any = leaf("V", "command of each window and pump", shape=("window", "pump"))
     length: Any = leaf("s", "length of a window", low=0.0, strict=True)
@@ -87,12 +69,6 @@ class PumpPlan(Controller):
 class Course:
     """Entries of the plant whose values are constant over windows of equal length, unknown to
     controller and filter; takes the place of a loop's `Faults`, which follow in `then`.
-
-    Examples
-    --------
-    >>> course = Course(value=[[0.1, 0.2]], length=2.0, names=("drain[0]",))
-    >>> course.sample(Clock(dt=1.0, duration=3.0))[0][0].tolist()
-    [0.1, 0.1, 0.2, 0.2]
     """
 
     value: Any = leaf(

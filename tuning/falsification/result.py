@@ -19,29 +19,7 @@ TOLERANCE = 1e-9
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Found:
-    """The highest level that an attack found in one tank, and the run that has it.
-
-    Attributes
-    ----------
-    tank : int
-        Counted from 0.
-    limit : float
-        Level that must not be passed [cm].
-    certified : bool or None
-        Whether the safety filter is proved to keep it; None without a filter.
-    reason : str
-        The theorem, or the condition that failed.
-    starts : str
-        Levels at t = 0 for which it is proved, "" where it is not.
-    nominal, drawn, level : float
-        Highest level of the case as it is, of random draws, and in all [cm].
-    time_s : float
-        When it was reached [s].
-    rise : float
-        What the level can rise by at most between two samples [cm]; nan where it is not known.
-    values : dict
-        As `Attacked.values`.
-    """
+    """The highest level that an attack found in one tank, and the run that has it."""
 
     tank: int
     limit: float
@@ -162,9 +140,8 @@ class Attack(Result):
         return missing
 
     def _faults(self, one):
-        """The Faults of the plant in the run of `one`, equal windows joined; the case's own last.
-
-        None where there are none.
+        """The Faults of the plant in the run of `one`, equal windows joined; the case's
+        own last.
         """
         clock, own = self.case.clock, self.case.loop.faults
         edges = np.linspace(0.0, clock.duration + clock.dt, self.attacked.windows + 1)

@@ -1,7 +1,4 @@
-"""Find the plant, the start and the reading errors that drive levels highest.
-
-Imported by `tuning` and its commands.
-"""
+"""Find the plant, the start and the reading errors that drive levels highest."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -164,14 +161,7 @@ class Limits(NamedTuple):
 
 
 def limits_of(case: Case) -> Limits:
-    """Return the level limits of a case: those of its safety filter, or max_level and the rims.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> limits_of(presets.find("cascaded/pi")).limit.tolist()
-    [10.0, 10.0]
-    """
+    """Return the level limits of a case: those of its safety filter, or max_level and the rims."""
     loop, guard = case.loop, case.loop.safety_filter
     if guard is None:
         rim = np.asarray(loop.plant.rim, dtype=float)

@@ -1,7 +1,7 @@
 """The smallest changes that make the plateaus of a case feasible for 95 % of its plants.
 
 Each is found on one set of draws, for a share above the target (AIM), so that another set confirms
-it, and rounded away from the case. Imported by `study`.
+it, and rounded away from the case.
 """
 
 import math
@@ -46,12 +46,7 @@ LARGEST = 1e6
 
 
 def find_mends(needs: Needs) -> tuple[Mend, ...]:
-    """Return the mends of each kind that has one; () where the case needs none.
-
-    Parameters
-    ----------
-    needs : Needs of the draws that the mends are found with
-    """
+    """Return the mends of each kind that has one; () where the case needs none."""
     if needs.feasible().mean() >= TARGET:
         return ()
     searches = {"setpoints": _setpoints, "rims": _rims, "orifices": _orifices, "pumps": _pumps}

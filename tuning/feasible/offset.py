@@ -1,7 +1,4 @@
-"""The least distance from the setpoints that any controller can leave on each plant.
-
-Imported by `study`.
-"""
+"""The least distance from the setpoints that any controller can leave on each plant."""
 
 import numpy as np
 
@@ -20,12 +17,9 @@ REACHED = 1e-4
 def least_offsets(needs: Needs) -> np.ndarray:
     """Return (N, P) least distance of a steady state within the limits from each plateau's
     setpoints [cm, Euclidean over outputs]; NaN where none was found.
-
-        min |y - r|^2   over outputs y whose levels and inputs are within the limits
-
-    by sequential quadratic programming from y = r, all plants at once: the limits are linearised at
-    y, and r is projected onto them by Hildreth's method (dual coordinate ascent).
     """
+    # by sequential quadratic programming from y = r, all plants at once: the limits are linearised
+    # at y, and r is projected onto them by Hildreth's method (dual coordinate ascent).
     r = np.broadcast_to(needs.setpoints, (needs.count, *needs.setpoints.shape[1:]))
     size = np.maximum(np.abs(needs.high), np.abs(needs.low))[:, None]
     wrong = needs.excess() > 0

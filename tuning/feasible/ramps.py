@@ -1,7 +1,4 @@
-"""The shortest ramps with which the nominal run of a case holds its limits.
-
-Imported by `study`.
-"""
+"""The shortest ramps with which the nominal run of a case holds its limits."""
 
 import math
 
@@ -19,19 +16,7 @@ STEPS = 9
 
 
 def mended_ramp(case: Case) -> Mend | None:
-    """Return the shortest `reference.ramp` with which the case's own run holds its limits.
-
-    At the case's gains and clock, noise as in its own run. With none longer than the shortest time
-    between two changes of an output, None.
-
-    Parameters
-    ----------
-    case : Case
-
-    Raises
-    ------
-    InputError for a reference that has no ramps.
-    """
+    """Return the shortest `reference.ramp` with which the case's own run holds its limits."""
     reference = case.loop.reference
     if not isinstance(reference, Ramps) or not reference.changes:
         raise InputError(f"{case.name}: its reference has no ramps to mend")

@@ -15,25 +15,7 @@ from tuning.uncertainty.sampling import clopper_pearson
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PlateauNeed:
-    """A level or an input that a plateau needs and that some plants cannot have.
-
-    Attributes
-    ----------
-    time_s : float
-        From when the plateau is held [s].
-    setpoints : tuple of float
-        (outputs,) [cm].
-    tank, pump : int or None
-        Which tank or pump, counted from 1; the other one is None.
-    needed : float
-        By the nominal plant [cm or V]; below 0 for a level: its flow would have to run backwards.
-    needed_p95 : float
-        Exceeded (a lower limit: fallen below) by 5 % of the plants.
-    limit : float
-    share : float
-        Plants that need more (a lower limit: less) [-].
-    unit : str
-    """
+    """A level or an input that a plateau needs and that some plants cannot have."""
 
     time_s: float
     setpoints: tuple[float, ...]

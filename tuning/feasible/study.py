@@ -127,20 +127,6 @@ def _rows(needs, nominal, excess):
 def can_judge(case: Case) -> bool:
     """Return whether `feasibility` is defined for a case: its reference has plateaus, and its rig
     as many pumps as outputs.
-
-    Parameters
-    ----------
-    case : Case
-
-    Returns
-    -------
-    bool
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> can_judge(presets.find("gouta2022/pi")), can_judge(presets.find("cascaded/pi"))
-    (False, True)
     """
     return judges(case)
 

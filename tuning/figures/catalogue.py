@@ -1,4 +1,4 @@
-"""All figures of the papers by name. Imports their tables; may be imported by the command."""
+"""All figures of the papers by name."""
 
 from jaxtank.core.errors import InputError, unknown
 from tuning.figures import calofir, gouta2015, gouta2022, khalid, mirakhorli
@@ -13,22 +13,7 @@ FIGURES = {
 
 
 def find(name: str) -> Figure:
-    """Return a figure that can be redrawn.
-
-    Parameters
-    ----------
-    name : "PAPER/NUMBER"
-
-    Raises
-    ------
-    InputError
-        For a name that no figure has, with the nearest one, and for a figure that is no result.
-
-    Examples
-    --------
-    >>> find("khalid/5").kind
-    'levels'
-    """
+    """Return a figure that can be redrawn."""
     if name not in FIGURES:
         raise unknown("figure", name, FIGURES)
     found = FIGURES[name]

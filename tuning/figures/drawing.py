@@ -1,4 +1,4 @@
-"""A figure of a paper drawn by our runs, with a caption. Imports plots and reports."""
+"""A figure of a paper drawn by our runs, with a caption."""
 
 import io
 import textwrap
@@ -36,16 +36,7 @@ class Drawn(NamedTuple):
 
 
 def run(figure: Figure) -> Drawn:
-    """Return the runs of a figure; noise is that of seed 0.
-
-    Examples
-    --------
-    >>> import jax
-    >>> from tuning.figures.catalogue import find
-    >>> jax.config.update("jax_enable_x64", True)
-    >>> run(find("mirakhorli/10")).ours[0].startswith("hybrid: ")
-    True
-    """
+    """Return the runs of a figure; noise is that of seed 0."""
     runs = {}
     for one in figure.runs:
         case = rig.set_values(presets.find(one.case), dict(one.values))
@@ -90,13 +81,7 @@ def _several(values, digits=3):
 
 
 def caption(figure: Figure, ours: tuple[str, ...]) -> list[str]:
-    """Return the paragraphs below a figure: what the paper shows and says, what ours shows.
-
-    Examples
-    --------
-    >>> caption(Figure("p", 1, "Levels", "Fast."), ("A: 1 cm",))
-    ['p, figure 1. Levels.', 'The paper: Fast.', 'Here: A: 1 cm.']
-    """
+    """Return the paragraphs below a figure: what the paper shows and says, what ours shows."""
     found = [f"{figure.paper}, figure {figure.number}. {figure.shows}."]
     found += [f"The paper: {figure.states}"] if figure.states else []
     found += [f"Here: {'; '.join(ours)}."] if ours else []
@@ -104,17 +89,7 @@ def caption(figure: Figure, ours: tuple[str, ...]) -> list[str]:
 
 
 def draw(figure: Figure, drawn: Drawn) -> Any:
-    """Return the matplotlib figure, with its caption below.
-
-    Examples
-    --------
-    >>> import jax
-    >>> from tuning.figures.catalogue import find
-    >>> jax.config.update("jax_enable_x64", True)
-    >>> one = find("mirakhorli/3")
-    >>> [ax.get_title() for ax in draw(one, run(one)).axes][0]
-    'memberships of input 1'
-    """
+    """Return the matplotlib figure, with its caption below."""
     from matplotlib.figure import Figure as Blank
 
     from jaxtank.plots import responses
@@ -205,19 +180,7 @@ def _memberships(ax, law, i, unit):
 
 
 def rendered(figure: Any, name: str) -> bytes:
-    """Return a matplotlib figure as the bytes of a file, by the end of its name.
-
-    Raises
-    ------
-    InputError
-        For an end that is none of FORMATS.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure as Blank
-    >>> rendered(Blank(), "a.png")[1:4]
-    b'PNG'
-    """
+    """Return a matplotlib figure as the bytes of a file, by the end of its name."""
     import matplotlib
 
     check_name(name)
@@ -229,11 +192,6 @@ def rendered(figure: Any, name: str) -> bytes:
 
 
 def check_name(name: str) -> None:
-    """Raise InputError for a file name with an end that is none of FORMATS.
-
-    Examples
-    --------
-    >>> check_name("a.svg")
-    """
+    """Raise InputError for a file name with an end that is none of FORMATS."""
     if name.rpartition(".")[2].lower() not in FORMATS or "." not in name:
         raise InputError(f"--out {name}: must end in {', '.join('.' + f for f in FORMATS)}")

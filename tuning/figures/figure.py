@@ -8,12 +8,7 @@ KINDS = ("levels", "errors", "inputs", "estimates", "shares", "setpoints", "memb
 
 
 class Run(NamedTuple):
-    """One run in a figure.
-
-    label : in the legend.
-    case : name of the case.
-    values : what is set in it, by dotted names.
-    """
+    """One run in a figure."""
 
     label: str
     case: str
@@ -21,19 +16,7 @@ class Run(NamedTuple):
 
 
 class Figure(NamedTuple):
-    """One figure of a paper.
-
-    Parameters
-    ----------
-    paper, number : as in "gouta2015/6".
-    shows : what the paper draws.
-    states : what its text says of it; "" for nothing that can be checked.
-    runs : ours, of which the first gives setpoints, rims and limits of the pumps.
-    kind : one or several of KINDS, with spaces between; "" for a figure that is no result.
-    tanks : indices of the tanks of "levels"; () for all.
-    window : (from, to) [s] that is drawn; None for the whole run.
-    remark : on our runs: what was assumed, and what cannot be as in the paper.
-    """
+    """One figure of a paper."""
 
     paper: str
     number: int

@@ -197,12 +197,7 @@ class _Batch:
 def normal_equations(
     rig, dt, u, y, weight, q, initial, scale, *, coordinates, tanks, channels, substeps
 ):
-    """Return the _Normal of every log by unknowns q / scale.
-
-    dt: (logs, samples) [s]; u: (logs, samples, pumps); y, weight: (logs, samples, channels); q:
-    (logs, unknowns) coordinates, then levels of `tanks`; initial: (logs, all tanks) levels of the
-    others.
-    """
+    """Return the _Normal of every log by unknowns q / scale."""
     shared = coordinates.size
 
     def one(dt, u, y, weight, q, initial):
@@ -225,10 +220,7 @@ def normal_equations(
 
 
 def _minimise(batch, iterations):
-    """Return (unknowns, _Normal, converged, iterations) of bounded Levenberg-Marquardt.
-
-    Every fit has its own damping (Nielsen's rule); a trial that lowers the cost is kept.
-    """
+    """Return (unknowns, _Normal, converged, iterations) of bounded Levenberg-Marquardt."""
     z = np.clip(batch.begin, batch.low, batch.high)
     here = batch.normal(z)
     damping, growth = np.full(len(z), 1e-3), np.full(len(z), 2.0)
@@ -275,10 +267,8 @@ def _step(batch, z, here, damping):
 
 
 def _spread(batch, e, z, cost, matrix):
-    """Return (unknowns, unknowns) covariance of the values of fit e.
-
-    NaN in the rows of what is not identifiable or at its bound (see confidence.Spread).
-    """
+    """Return (unknowns, unknowns) covariance of the values of fit e."""
+    # NaN in the rows of what is not identifiable or at its bound (see confidence.Spread).
     problem, size, shared = batch.problem, len(z), batch.problem.coordinates.size
     edge = 1e-6 * (batch.high[e] - batch.low[e])
     held = (z < batch.low[e] + edge) | (z > batch.high[e] - edge)

@@ -1,7 +1,4 @@
-"""Confidence in a fit: standard deviations, 95 % intervals, and what is not identifiable.
-
-Imported by `fit`, `batch`, `design` and reports.
-"""
+"""Confidence in a fit: standard deviations, 95 % intervals, and what is not identifiable."""
 
 import math
 from typing import Any, cast
@@ -27,14 +24,14 @@ SHARE = 0.1
 
 
 class Spread:
-    """Covariance of the estimates from J'J, without the directions that are not identifiable.
+    """Covariance of the estimates from J'J, without the directions that are not identifiable."""
 
-    Where residuals are correlated from sample to sample, as those of a model that differs from the
-    rig, the covariance is the sandwich (J'J)^-1 S (J'J)^-1, with S of Newey and West (Econometrica
-    55, 1987, 703) or S = J' C J with C that of first-order noise with the residuals'
-    autocorrelation, whichever is wider: the first is too narrow for slow noise, the second for slow
-    noise under fast noise. `widened` is the factor by which this widens the intervals.
-    """
+    # Where residuals are correlated from sample to sample, as those of a model that differs from
+    # the rig, the covariance is the sandwich (J'J)^-1 S (J'J)^-1, with S of Newey and West
+    # (Econometrica 55, 1987, 703) or S = J' C J with C that of first-order noise with the
+    # residuals' autocorrelation, whichever is wider: the first is too narrow for slow noise, the
+    # second for slow noise under fast noise. `widened` is the factor by which this widens the
+    # intervals.
 
     def __init__(self, estimation: Estimation, fit: Fit, quality: dict):
         self.estimation, self.fit, self.residual = estimation, fit, pseudo(fit)
@@ -58,10 +55,8 @@ class Spread:
         self.at_bound &= ~self.vague
 
     def _decompose(self, moving):
-        """Set singular values and axes of the Jacobian by the unknowns `moving`.
-
-        `open`: which axes are not identifiable.
-        """
+        """Set singular values and axes of the Jacobian by the unknowns `moving`."""
+        # `open`: which axes are not identifiable.
         self.moving, residual = moving, self.residual
         self.freedom = max(residual.size - moving.size, 1)
         self.scale = float(residual @ residual) / self.freedom
@@ -114,11 +109,7 @@ class Spread:
         return np.einsum("eki,ekj->ij", window, window) / (lags + 1)
 
     def _first_order(self):
-        """Return J' C J with C of noise correlated as rho^(time / median step) in a channel.
-
-        rho is the autocorrelation of the residuals from sample to sample, corrected for what the
-        fit has taken from it (Marriott and Pope, Biometrika 41, 1954, 390).
-        """
+        """Return J' C J with C of noise correlated as rho^(time / median step) in a channel."""
         estimation, size = self.estimation, self.moving.size
         shape, dt = estimation.mask.shape, estimation.data.steps
         residual, slopes = np.full(shape, np.nan), np.zeros((*shape, size))
@@ -165,10 +156,7 @@ class Spread:
         return hidden
 
     def parameters(self):
-        """Return {name: {"before", "value", "unit", "lower", "upper", "sd", "interval95", ...}}.
-
-        The last keys are "identifiable" and "at_bound".
-        """
+        """Return {name: {"before", "value", "unit", "lower", "upper", "sd", "interval95", ...}}."""
         est = self.estimation
         values, hidden = est.coordinates.values(self.fit.p), self._without_interval()
         sd = np.sqrt(np.diag(self._covariance_of_values()))
@@ -191,10 +179,8 @@ class Spread:
         return {b.name: found[b.name] for b in est.bounds}
 
     def levels(self):
-        """Return {"value", "interval95"} of each tank of each log.
-
-        The interval is None where the level is not estimated or not identifiable.
-        """
+        """Return {"value", "interval95"} of each tank of each log."""
+        # The interval is None where the level is not estimated or not identifiable.
         est = self.estimation
         levels, shared = est.first_levels(est.unknowns(self.fit)), est.coordinates.size
         sd, hidden = np.sqrt(np.diag(self._covariance_of_values())), self._without_interval()
@@ -219,11 +205,7 @@ class Spread:
         return tuple(names[i] for i in present), self._covariance_of_values()[block]
 
     def directions(self):
-        """Return what is not identifiable, the vaguest direction first.
-
-        [{"words", "parameters" {name: factor or change}, "sd"}]: a step along the direction by
-        which no reading changes noticeably.
-        """
+        """Return what is not identifiable, the vaguest direction first."""
         est, found = self.estimation, []
         z, shared = est.unknowns(self.fit), est.coordinates.size
         for axis, sd in zip(*self._open_directions()):
@@ -265,10 +247,7 @@ class Spread:
         return named
 
     def _open_directions(self):
-        """Return (axes, standard deviations) of the open directions, the vaguest first.
-
-        Of several, the combinations of fewest unknowns, by QR with pivoting.
-        """
+        """Return (axes, standard deviations) of the open directions, the vaguest first."""
         axes, sd = self.axes[self.open][::-1], self.sd_of_axes[self.open][::-1]
         if len(axes) < 2:
             return axes, sd
@@ -281,10 +260,8 @@ class Spread:
         return plain[order], np.where(reach < 1e100, reach, np.inf)[order]
 
     def worst(self):
-        """Return (name, standard deviation of its coordinate) of the least certain parameter.
-
-        None for the standard deviation of one that is not identifiable.
-        """
+        """Return (name, standard deviation of its coordinate) of the least certain parameter."""
+        # None for the standard deviation of one that is not identifiable.
         est, shared = self.estimation, self.estimation.coordinates.size
         if self.vague[:shared].any():
             part = np.zeros(est.size)
@@ -306,10 +283,7 @@ def _within(meta, low, high):
 
 
 def at_search_bounds(loop, parameters):
-    """Return names of the parameters at a bound of their search that is not one of their range.
-
-    A share, for example, may end at 0 or 1.
-    """
+    """Return names of the parameters at a bound of their search that is not one of their range."""
     names = []
     for name, p in parameters.items():
         meta = describe(loop, name)

@@ -1,7 +1,4 @@
-"""CSV files of experiment data: columns and units from the header, or from a rig's [log] table.
-
-Imported by the command `identify` and as `tuning.read_log`.
-"""
+"""CSV files of experiment data: columns and units from the header, or from a rig's [log] table."""
 
 import csv
 import io
@@ -225,11 +222,7 @@ def _is_number(cell):
 
 
 def split_header(header):
-    """Return (name, unit or None) of a column's header: "h1 [cm]", "h1 (cm)", "pump1_V", "h1".
-
-    >>> split_header("h1 [cm]"), split_header("pump1_V"), split_header("level")
-    (('h1', 'cm'), ('pump1', 'V'), ('level', None))
-    """
+    """Return (name, unit or None) of a column's header: "h1 [cm]", "h1 (cm)", "pump1_V", "h1"."""
     found = re.fullmatch(r"(.*?)\s*[\[(]\s*(.*?)\s*[\])]", header)
     if found:
         return found.group(1).strip(), found.group(2)

@@ -1,7 +1,4 @@
-"""Checks of experiment data against the rig: gaps, length, pumps and tanks, ranges, units.
-
-Imported by `fit`, `batch` and `csv_log`.
-"""
+"""Checks of experiment data against the rig: gaps, length, pumps and tanks, ranges, units."""
 
 import jax
 import numpy as np
@@ -41,10 +38,7 @@ def check_data(logs, loop, gap):
 
 
 def first_samples(one, hold_back):
-    """Return the number of samples of a Log before its validation set.
-
-    hold_back: share below 1, or number of samples, of the validation set.
-    """
+    """Return the number of samples of a Log before its validation set."""
     if not (
         isinstance(hold_back, (int, float))
         and not isinstance(hold_back, bool)
@@ -68,10 +62,8 @@ def check_length(logs):
 
 
 def check_gaps(found, most=1.5):
-    """Raise DataError where two samples lie further apart than `most` times the median step.
-
-    What the pumps did in between is not known.
-    """
+    """Raise DataError where two samples lie further apart than `most` times the median step."""
+    # What the pumps did in between is not known.
     steps = np.diff(found.t)
     usual = float(np.median(steps))
     k = int(np.argmax(steps))
@@ -85,10 +77,8 @@ def check_gaps(found, most=1.5):
 
 
 def check_changes(found):
-    """Raise DataError where nothing says when inputs changed between readings at irregular times.
-
-    Taken from its row's time on, an input acts later than it did: residuals grow 2 to 3 times, and
-    95 % intervals hold the truth in 40 to 70 % of such logs only.
+    """Raise DataError where nothing says when inputs changed between readings at
+    irregular times.
     """
     low, high = np.quantile(np.diff(found.t), [0.1, 0.9])
     changed = 1 + np.flatnonzero(np.any(np.diff(found.u, axis=0) != 0.0, axis=1))
@@ -106,10 +96,8 @@ def check_changes(found):
 
 
 def check_fits(found, loop):
-    """Raise DataError where the data cannot be of this rig.
-
-    That is another number of pumps, a tank it does not have, readings or inputs far out of range.
-    """
+    """Raise DataError where the data cannot be of this rig."""
+    # That is another number of pumps, a tank it does not have, readings or inputs far out of range.
     plant, (length, drive) = loop.plant, getattr(loop, "units", DEFAULT)
     if found.u.shape[1] != plant.pumps:
         raise DataError(

@@ -1,5 +1,5 @@
 """Experiment design: candidate inputs, the standard deviations that each would leave, and which
-experiment would identify what the data do not. Imported by `fit` and by `identify --plan`.
+experiment would identify what the data do not.
 """
 
 import dataclasses
@@ -26,10 +26,7 @@ REGISTER = 7
 
 
 def prbs(bits, channel):
-    """Return (bits,) of +-1: a maximum-length sequence of x^7 + x^6 + 1.
-
-    Each further `channel` begins a third of its length later.
-    """
+    """Return (bits,) of +-1: a maximum-length sequence of x^7 + x^6 + 1."""
     state, out = [1] * REGISTER, []
     for _ in range(2**REGISTER - 1):
         out.append(state[-1])
@@ -39,15 +36,8 @@ def prbs(bits, channel):
 
 
 def candidates(loop, *, duration, dt, size=None, voltage=None, bit=None):
-    """Return inputs to compare, {description: (t (samples,) [s], u (samples, pumps), x0 (tanks,))}.
-
-    From empty tanks steps of all pumps at once and one after the other; from steady state a small
-    step of all, staggered steps, and a pseudo-random binary sequence. The inputs stay within the
-    pumps' limits.
-
-    duration, dt: [s]; voltage: (pumps,) operating point, by default the case's own; size: of the
-    small changes, in the pumps' unit, by default a tenth of the voltage; bit: length of a bit of
-    the sequence [s], by default a twentieth of the duration.
+    """Return inputs to compare, {description: (t (samples,) [s], u (samples, pumps), x0
+    (tanks,))}.
     """
     plant = loop.plant
     t = np.arange(round(duration / dt) + 1) * dt
@@ -100,11 +90,9 @@ def settled(plant, voltage):
 
 
 def _operating_point(loop):
-    """Return (pumps,) inputs at which the case's pumps run before it starts.
-
-    Where they stand, those of its first setpoint, else half of their range; less where a tank would
-    come near its rim.
-    """
+    """Return (pumps,) inputs at which the case's pumps run before it starts."""
+    # Where they stand, those of its first setpoint, else half of their range; less where a tank
+    # would come near its rim.
     plant, high = loop.plant, np.asarray(loop.actuator.high, dtype=float)
     high = np.where(np.isfinite(high), high, 2.0)
     found = np.asarray(loop.actuator.initial, dtype=float)
@@ -230,13 +218,7 @@ def _precision(moved, p, values, jacobian):
 
 
 def most_informative(found):
-    """Return the experiment of `compare_experiments` with the least product of deviations.
-
-    None where none identifies every parameter.
-
-    >>> most_informative({"a": {"sd": {"k": 2.0}}, "b": {"sd": {"k": 0.5}}})
-    'b'
-    """
+    """Return the experiment of `compare_experiments` with the least product of deviations."""
     whole = {
         name: np.sum(np.log(list(row["sd"].values())))
         for name, row in found.items()
@@ -273,9 +255,8 @@ def _jacobian(rig, moved, p, t, u, x0, tanks, start, count):
 
 
 def remedies(estimation, fit, spread):
-    """Return sentences: which experiments would identify what is not identifiable from these data.
-
-    By the sensitivities of the fitted model.
+    """Return sentences: which experiments would identify what is not identifiable from
+    these data.
     """
     z = estimation.unknowns(fit)
     noise = np.sqrt(max(spread.scale, 1e-12))
@@ -317,10 +298,7 @@ def _alternatives(estimation, z):
 
 
 def _largest_deviation(estimation, z, experiment, scale):
-    """Return the largest standard deviation of a direction of the coordinates.
-
-    None where it is infinite. scale: factor on the noise of the channels.
-    """
+    """Return the largest standard deviation of a direction of the coordinates."""
     t, u, x0, tanks = experiment
     usual = float(np.mean(estimation.noise)) * scale
     noise: dict[int, float] = {i: usual for i in tanks}

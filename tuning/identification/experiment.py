@@ -1,7 +1,4 @@
-"""Experiment data: sample times, the inputs of the pumps, the readings of the level sensors.
-
-Imported by the other modules of this folder, by reports and by the command `identify`.
-"""
+"""Experiment data: sample times, the inputs of the pumps, the readings of the level sensors."""
 
 import dataclasses
 from collections.abc import Sequence

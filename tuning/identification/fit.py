@@ -246,10 +246,8 @@ def _searches(cache, estimation, starts, seed, loss, iterations, progress):
 
 
 def _search(cache, estimation, z, loss, iterations):
-    """Return the Fit of a first search from z.
-
-    One from the checkpoint has where it ended, not its residual and Jacobian.
-    """
+    """Return the Fit of a first search from z."""
+    # One from the checkpoint has where it ended, not its residual and Jacobian.
     made = []
 
     def compute():
@@ -317,10 +315,7 @@ def _spread(estimation, best, settings):
 
 
 def _nearest(estimation, best, scale, settings):
-    """Return a Fit in the 95 % region about `best` that is near the case's own values.
-
-    A search along an insensitive direction ends at an arbitrary point of it.
-    """
+    """Return a Fit in the 95 % region about `best` that is near the case's own values."""
     nominal = estimation.nominal()
     most = best.residual @ best.residual + chi2.ppf(0.95, estimation.size) * scale
     for strength in (100.0, 30.0, 10.0, 3.0, 1.0):

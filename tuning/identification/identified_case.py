@@ -1,7 +1,4 @@
-"""The case before an identification, where only a plant is given, and the one after it.
-
-Imported by `fit` and `result`.
-"""
+"""The case before an identification, where only a plant is given, and the one after it."""
 
 import numpy as np
 
@@ -52,10 +49,7 @@ def bare(plant):
 
 
 def proposed(result):
-    """Return (case, reason): `identified_plant` under a controller of the kind `result.law`.
-
-    The case's own controller and the reason where there is none.
-    """
+    """Return (case, reason): `identified_plant` under a controller of the kind `result.law`."""
     case = identified_plant(result)
     if result.law is None:
         return case, None
@@ -68,11 +62,7 @@ def proposed(result):
 
 
 def identified_plant(result):
-    """Return the Case of an Identification, with the covariance of its estimates.
-
-    Estimates are set in plant, sensor and pumps, and in the models of controller and observer; the
-    sensor noise is that of the residuals where they are white, else that of the data.
-    """
+    """Return the Case of an Identification, with the covariance of its estimates."""
     case = result.case
     values = {n: p["value"] for n, p in result.parameters.items()}
     loop = case.loop

@@ -1,5 +1,5 @@
 """The search of a fit: SciPy's bounded trust region on exact sensitivities, and the profile
-likelihood. Imported by `fit`, which calls it, and by `confidence` for the type of its result.
+likelihood.
 """
 
 import dataclasses
@@ -32,11 +32,10 @@ class Fit:
 
 
 class _Residual:
-    """Residual and Jacobian by the unknowns that are free, evaluated once per point.
+    """Residual and Jacobian by the unknowns that are free, evaluated once per point."""
 
-    prior: (point (unknowns,), strength), as readings of every unknown with standard deviation
-    1 / strength would add; of a level a tenth of that.
-    """
+    # prior: (point (unknowns,), strength), as readings of every unknown with standard deviation 1 /
+    # strength would add; of a level a tenth of that.
 
     def __init__(self, estimation, start, fixed, prior):
         self.estimation, self.point, self.last = estimation, start.copy(), None
@@ -78,11 +77,7 @@ def solve(
     tolerance: float = 1e-14,
     prior: Any = None,
 ) -> Fit:
-    """Return the Fit of a search from the unknowns `start` (unknowns,).
-
-    fixed: {index: value} of unknowns that stay, in coordinates; tolerance: gain of an iteration, as
-    a share of the cost, at which it ends; prior: as in `_Residual`.
-    """
+    """Return the Fit of a search from the unknowns `start` (unknowns,)."""
     before, residual = estimation.evaluations, _Residual(estimation, start, fixed or {}, prior)
     low, high = (side[residual.free] for side in estimation.box)
     begin = np.clip(residual.point[residual.free], low, high)
@@ -130,12 +125,10 @@ def solve(
 
 
 def profile_likelihood(estimation, fit, spread, loss="linear", points=11, reach=3.0):
-    """Return the profile likelihood of the least certain parameter.
-
-    It is fixed at each of `points` values within `reach` standard deviations, and all others are
-    fitted again. {"name", "unit", "values", "rise" (points,): 2 log of the likelihood ratio,
-    "interval95": where it passes 3.84, interpolated, None on a side where it does not}.
-    """
+    """Return the profile likelihood of the least certain parameter."""
+    # It is fixed at each of `points` values within `reach` standard deviations, and all others are
+    # fitted again. {"name", "unit", "values", "rise" (points,): 2 log of the likelihood ratio,
+    # "interval95": where it passes 3.84, interpolated, None on a side where it does not}.
     name, sd = spread.worst()
     levels = estimation.unknowns(fit)[estimation.coordinates.size :]
     values = estimation.coordinates.values(fit.p)

@@ -1,5 +1,5 @@
 """Coordinates of a fit: logarithms of positive parameters, branch gains of pumps that feed two
-tanks, and shares of the range for the rest. Imported by the other modules of this folder.
+tanks, and shares of the range for the rest.
 """
 
 import dataclasses
@@ -14,13 +14,12 @@ from jaxtank.signals.base import Constant
 
 @dataclasses.dataclass(frozen=True)
 class Coordinates:
-    """The coordinates p of the scalars to be estimated, as a hashable description.
+    """The coordinates p of the scalars to be estimated, as a hashable description."""
 
-    items: ("log", name, low, high) with value exp(p); ("linear", name, low, high) with value low +
-    p (high - low); ("branch", gain, split, (low, high) of both branches): p = (log c1, log c2), c1
-    = k s and c2 = k (1 - s) the gains of a pump's two branches, in which the inflows are linear
-    (mirakhorli notes S11), gain k = c1 + c2, split s = c1 / (c1 + c2).
-    """
+    # items: ("log", name, low, high) with value exp(p); ("linear", name, low, high) with value low
+    # + p (high - low); ("branch", gain, split, (low, high) of both branches): p = (log c1, log c2),
+    # c1 = k s and c2 = k (1 - s) the gains of a pump's two branches, in which the inflows are
+    # linear (mirakhorli notes S11), gain k = c1 + c2, split s = c1 / (c1 + c2).
 
     items: tuple
 
@@ -33,10 +32,7 @@ class Coordinates:
 
     @property
     def pairs(self):
-        """((i, i + 1), ...): coordinates that are the two branches of one pump.
-
-        Gain and split of the pump depend on both.
-        """
+        """((i, i + 1), ...): coordinates that are the two branches of one pump."""
         found, i = [], 0
         for kind, *_ in self.items:
             if kind == "branch":
@@ -113,11 +109,7 @@ class Coordinates:
 
 
 def coordinates(bounds, branches=True):
-    """Return the Coordinates of a list of tuning.problem.bounds.Bound.
-
-    Gain and split of a pump, where both are free, become its branch gains; without `branches`, they
-    are coordinates themselves.
-    """
+    """Return the Coordinates of a list of tuning.problem.bounds.Bound."""
     by_name = {b.name: b for b in bounds} if branches else {}
     items, done = [], set()
     for b in bounds:
@@ -146,11 +138,9 @@ def coordinates(bounds, branches=True):
 
 
 def default_free(loop):
-    """Return {name: (low, high, scale)}: the default unknowns of an identification.
-
-    Pump gains, splits between two tanks, open orifices, pipes, the captured share of an overflow
-    and a constant disturbance; not areas, which are measured with a ruler.
-    """
+    """Return {name: (low, high, scale)}: the default unknowns of an identification."""
+    # Pump gains, splits between two tanks, open orifices, pipes, the captured share of an overflow
+    # and a constant disturbance; not areas, which are measured with a ruler.
     plant, found = loop.plant, {}
     for name in ("pump_gain", "drain", "orifice", "pipe"):
         values = np.asarray(getattr(plant, name, ()))
@@ -180,10 +170,7 @@ def nominal(loop, names):
 
 
 def specification(loop, free):
-    """Return {name: (low, high, scale)} of `free`: logarithmic by default above 0.
-
-    free: {name: (low, high)} or {name: (low, high, scale)}; None for `default_free`.
-    """
+    """Return {name: (low, high, scale)} of `free`: logarithmic by default above 0."""
     if free is None:
         return default_free(loop)
     return {n: (*v, "log" if v[0] > 0 else "linear")[:3] for n, v in free.items()}

@@ -1,7 +1,4 @@
-"""The problem of an identification: the unknowns, the experiment data, and the residual.
-
-Imported by the other modules of this folder.
-"""
+"""The problem of an identification: the unknowns, the experiment data, and the residual."""
 
 import copy
 import dataclasses
@@ -127,10 +124,7 @@ class Estimation:
         self.substeps = self._substeps() if substeps is None else int(substeps)
 
     def _substeps(self):
-        """Return Runge-Kutta steps per sample at the case's own values.
-
-        Raises DataError where a step between samples is too long for any number of them.
-        """
+        """Return Runge-Kutta steps per sample at the case's own values."""
         z = self.nominal()
         found, moved = simulation.substeps_for(
             self.rig_at(z), self.data, self.first_levels(z), 0.1 * self.noise
@@ -296,10 +290,7 @@ class Estimation:
 
 
 def _bounds(loop, spec):
-    """Return the Bounds of {name: (low, high, scale)}; raise InputError for what has no effect.
-
-    The splits of pumps that feed one tank are left out of an array, and refused by name.
-    """
+    """Return the Bounds of {name: (low, high, scale)}; raise InputError for what has no effect."""
     for name in spec:
         if not name.startswith(ESTIMATED):
             raise InputError(

@@ -1,7 +1,4 @@
-"""A first controller for an identified rig (`identify --law pi`): gains from which to tune.
-
-Imported by `fit` and `identified_case`.
-"""
+"""A first controller for an identified rig (`identify --law pi`): gains from which to tune."""
 
 import dataclasses
 import math
@@ -52,15 +49,13 @@ def check_kind(kind, case):
 
 
 def with_pi(case, inputs):
-    """Return `case` under one PI controller per pump, output i to pump i, with [free] ranges.
-
-    T-sum rule (Kuhn 1995): Kc = 0.5/K, Ti = T/2, with the gain K [cm/V] and the sum of time
-    constants T [s] of each output's response to its own pump, linearised at the steady state for
-    `inputs` (m,) [V], the pumps' delay added to T. Kc of all loops is halved until the linear
-    closed loop is stable. A case whose setpoints never change is given a change of each, by 10 %,
-    from that steady state. Raises InputError where there is no such steady state, model or
-    setpoint.
-    """
+    """Return `case` under one PI controller per pump, output i to pump i, with [free] ranges."""
+    # T-sum rule (Kuhn 1995): Kc = 0.5/K, Ti = T/2, with the gain K [cm/V] and the sum of time
+    # constants T [s] of each output's response to its own pump, linearised at the steady state for
+    # `inputs` (m,) [V], the pumps' delay added to T. Kc of all loops is halved until the linear
+    # closed loop is stable. A case whose setpoints never change is given a change of each, by 10 %,
+    # from that steady state. Raises InputError where there is no such steady state, model or
+    # setpoint.
     loop = case.loop
     plant = loop.plant
     inputs = np.clip(inputs, np.asarray(loop.actuator.low), np.asarray(loop.actuator.high))
@@ -130,9 +125,8 @@ def _stable(model, Kc, Ti):
 
 
 def _with_changes(case, x, start, inputs, slowest):
-    """Return `case` from the steady state x with a change of each setpoint that the rig can hold.
-
-    slowest: largest sum of time constants [s]; the changes are five of them apart.
+    """Return `case` from the steady state x with a change of each setpoint that the rig
+    can hold.
     """
     loop, outputs = case.loop, range(len(start))
     pause = case.clock.dt * min(math.ceil(5 * slowest / case.clock.dt), MOST // len(start))

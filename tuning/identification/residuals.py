@@ -1,5 +1,5 @@
 """Noise of the readings and residuals of a fit: quality, autocorrelation, prediction of a
-validation set. Imported by `problem`, `confidence`, `fit` and reports.
+validation set.
 """
 
 from typing import Any
@@ -28,12 +28,10 @@ def given_noise(noise, channels):
 
 
 def noise_of(data):
-    """Return (channels,) standard deviation of the noise in PaddedData.
-
-    Estimated from second differences, for a level is smooth, by their median absolute deviation,
-    which steps do not affect. At least a thousandth of the range of the channel: with less, weights
-    would be those of round-off.
-    """
+    """Return (channels,) standard deviation of the noise in PaddedData."""
+    # Estimated from second differences, for a level is smooth, by their median absolute deviation,
+    # which steps do not affect. At least a thousandth of the range of the channel: with less,
+    # weights would be those of round-off.
     found, least = [], []
     for c in range(len(data.channels)):
         bends, spans = [], []
@@ -71,10 +69,7 @@ def residuals_of(estimation, fit):
 
 
 def quality(estimation, fit):
-    """Return {"rmse", "nrmse_percent", "residual_autocorrelation"}, one entry per channel.
-
-    rmse in the channel's unit, percent as `percent`, autocorrelation at one sample.
-    """
+    """Return {"rmse", "nrmse_percent", "residual_autocorrelation"}, one entry per channel."""
     residuals = residuals_of(estimation, fit)
     found = {"rmse": [], "nrmse_percent": [], "residual_autocorrelation": []}
     for c in range(residuals.shape[-1]):
@@ -87,11 +82,7 @@ def quality(estimation, fit):
 
 
 def percent(residual, y):
-    """Return 100 (1 - |residual| / |y - mean y|), as MATLAB's `compare`; None for a constant y.
-
-    >>> percent(np.array([0.1, -0.1, np.nan]), np.array([1.0, 2.0, np.nan]))
-    80.0
-    """
+    """Return 100 (1 - |residual| / |y - mean y|), as MATLAB's `compare`; None for a constant y."""
     spread = np.sqrt(np.nansum((y - np.nanmean(y)) ** 2))
     return (
         float(100 * (1 - np.sqrt(np.nansum(residual**2)) / spread))
@@ -101,13 +92,7 @@ def percent(residual, y):
 
 
 def autocorrelation(residual, lags=LAGS):
-    """Return (lags + 1,) autocorrelation of residuals (logs, samples), NaN skipped.
-
-    0 where there is nothing to correlate.
-
-    >>> autocorrelation(np.array([[1.0, -1.0, 1.0, -1.0]]), 2).round(6).tolist()
-    [1.0, -1.0, 1.0]
-    """
+    """Return (lags + 1,) autocorrelation of residuals (logs, samples), NaN skipped."""
     lags = min(lags, residual.shape[-1] - 2)
     present = np.isfinite(residual)
     products, pairs = (
@@ -130,10 +115,8 @@ def _lagged(v, lags):
 
 
 def pseudo(fit):
-    """Return (rows,) pseudo-residuals psi(r) / mean psi'(r) (Huber, Robust Statistics, 1981, 7.6).
-
-    The residuals themselves for the linear loss. An outlier then widens an interval by its weight
-    in the fit, and no more.
+    """Return (rows,) pseudo-residuals psi(r) / mean psi'(r) (Huber, Robust Statistics,
+    1981, 7.6).
     """
     r, limit = fit.residual, ROBUST_LIMIT
     if fit.loss == "huber":
@@ -146,11 +129,7 @@ def pseudo(fit):
 
 
 def validate(estimation, partial, fit, kept):
-    """Return how a fit to the first `kept` samples of each log predicts the rest.
-
-    {"samples", "fitted": quality, "held_back": quality}, both simulated in one run from the first
-    sample on.
-    """
+    """Return how a fit to the first `kept` samples of each log predicts the rest."""
     z = partial.unknowns(fit)
     predicted = np.asarray(
         simulation.play(

@@ -1,7 +1,4 @@
-"""The results of `identify` (estimates with intervals, the identified case) and `identify_many`.
-
-Imported by `fit` and `batch`; reports are opened when they are asked for.
-"""
+"""The results of `identify` (estimates with intervals, the identified case) and `identify_many`."""
 
 import dataclasses
 import functools
@@ -22,11 +19,6 @@ from tuning.problem.status import Status
 class Experiments(dict[str, dict[str, Any]]):
     """Result of `tuning.compare_experiments`: {description: {"sd", "condition", "open"}}, which a
     notebook shows as a table.
-
-    Attributes
-    ----------
-    case : Case
-        The rig, with the values at which the sensitivities were taken.
     """
 
     case: Case

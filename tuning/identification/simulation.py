@@ -1,7 +1,4 @@
-"""Simulated readings of a rig for the inputs of experiment data, and their sensitivities.
-
-Imported by the other modules of this folder.
-"""
+"""Simulated readings of a rig for the inputs of experiment data, and their sensitivities."""
 
 import dataclasses
 import functools
@@ -25,10 +22,7 @@ from jaxtank.xla.hoist import scan
 
 @component
 class Rig:
-    """The part of a closed loop that experiment data describe: all but controller and observer.
-
-    Names of its leaves are those of the loop.
-    """
+    """The part of a closed loop that experiment data describe: all but controller and observer."""
 
     plant: Plant
     sensor: LevelSensor
@@ -43,11 +37,9 @@ class Rig:
 
 
 def rig_of(loop):
-    """Return the Rig of a loop.
-
-    A constant disturbance belongs to it; one that varies belongs to another run and does not. The
-    transport delay of the pumps is applied by `padded`.
-    """
+    """Return the Rig of a loop."""
+    # A constant disturbance belongs to it; one that varies belongs to another run and does not. The
+    # transport delay of the pumps is applied by `padded`.
     disturbance = loop.disturbance if isinstance(loop.disturbance, Constant) else None
     if not isinstance(loop.sensor, LevelSensor):
         raise InputError(
@@ -63,11 +55,10 @@ def rig_of(loop):
 
 
 class PaddedData(NamedTuple):
-    """Experiment data of several runs as arrays, padded to the longest.
+    """Experiment data of several runs as arrays, padded to the longest."""
 
-    The padding has steps of length zero and no readings. Where inputs change between samples, dt
-    and u have an axis of pieces behind that of the samples, those not in use of length zero.
-    """
+    # The padding has steps of length zero and no readings. Where inputs change between samples, dt
+    # and u have an axis of pieces behind that of the samples, those not in use of length zero.
 
     dt: np.ndarray  # (logs, samples) time to the next sample [s], 0 at the last one and after
     u: np.ndarray  # (logs, samples, pumps)
@@ -81,12 +72,10 @@ class PaddedData(NamedTuple):
 
 
 def padded(logs, delay=0.0, samples=0):
-    """Return the PaddedData of a list of Log.
-
-    delay: transport delay of the pumps [s], any; an input reaches its tank at its own time, also
-    between samples. samples: least length to pad to, so that truncated data run through the same
-    compiled program as whole ones.
-    """
+    """Return the PaddedData of a list of Log."""
+    # delay: transport delay of the pumps [s], any; an input reaches its tank at its own time, also
+    # between samples. samples: least length to pad to, so that truncated data run through the same
+    # compiled program as whole ones.
     channels = tuple(sorted({pair for one in logs for pair in zip(one.tanks, one.in_volts)}))
     n = max(samples, *(one.samples for one in logs))
     parts = [_pieces(one, delay) for one in logs]
@@ -131,12 +120,7 @@ def _pieces(one, delay):
 
 
 def readings(rig, dt, u, channels, substeps):
-    """Return (samples, channels) readings without noise, in the channels' units.
-
-    dt: (samples,) [s]; u: (samples, pumps) held until the next sample, both with an axis of pieces
-    behind that of the samples where `padded` has cut them; each takes `substeps` steps of
-    fourth-order Runge-Kutta.
-    """
+    """Return (samples, channels) readings without noise, in the channels' units."""
     if dt.ndim == 1:
         dt, u = dt[:, None], u[:, None]
     x, d = tuple(rig.x0[i] + 0.0 * dt[0, 0] for i in range(rig.plant.tanks)), None
@@ -182,12 +166,7 @@ def _reading(rig, x, channel):
 
 @functools.partial(jax.jit, static_argnames=("coordinates", "tanks", "channels", "substeps"))
 def sensitivities(rig, dt, u, p, first, *, coordinates, tanks, channels, substeps):
-    """Return readings and their derivatives by the unknowns, of all runs at once.
-
-    p: (shared,) coordinates common to all runs; first: (logs, len(tanks)) levels of `tanks` at the
-    first sample of each. Returns (logs, samples, channels) and (logs, samples, channels, shared +
-    len(tanks)).
-    """
+    """Return readings and their derivatives by the unknowns, of all runs at once."""
     shared = coordinates.size
 
     def one(dt, u, first):
@@ -221,12 +200,7 @@ MOST_SUBSTEPS = 64
 
 
 def substeps_for(rig, data, first, error):
-    """Return how many Runge-Kutta steps each sample needs, and the error that is left.
-
-    With twice as many no reading moves by more than `error` (channels,), in the channels' units; at
-    most 64. The second is (channels,) by how much they move: NaN or infinite where the simulation
-    diverges.
-    """
+    """Return how many Runge-Kutta steps each sample needs, and the error that is left."""
     first, before, count = np.asarray(first), None, 1
     while count <= MOST_SUBSTEPS:
         y = np.asarray(

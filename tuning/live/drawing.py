@@ -1,32 +1,10 @@
-"""The drawing of a rig as data for the live page, in the geometry of the package's pictures.
-
-Imported by `page` and its tests.
-"""
+"""The drawing of a rig as data for the live page, in the geometry of the package's pictures."""
 
 from jaxtank.plots.layout import jets, overflows, pipes, place
 
 
 def drawing(plant):
-    """Return the positions of all parts of a rig, in heights of its tallest tank.
-
-    Parameters
-    ----------
-    plant : Plant
-        None is returned for one that is no network of tanks.
-
-    Returns
-    -------
-    {"boxes": [[x, y, width, height, drawn height of one unit of level]], "pumps": [[x, y]],
-    "risers": [[pump, tank, path]], "pipes": [[left, right, height]], "jets": [[tank, path]],
-    "overflows": [[tank, path]], "left", "right", "bottom", "top"}
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> found = drawing(presets.find("cascaded/pi").loop.plant)
-    >>> len(found["boxes"]), len(found["risers"])
-    (2, 1)
-    """
+    """Return the positions of all parts of a rig, in heights of its tallest tank."""
     if not hasattr(plant, "links"):
         return None
     where = place(plant)

@@ -1,6 +1,6 @@
 """The engine of a live page: a closed loop as JavaScript text, and what is known of it as data.
 
-The text needs no page: node runs it too. Imported by the page.
+The text needs no page: node runs it too.
 """
 
 import json
@@ -99,25 +99,13 @@ def _packed(facts: dict[str, Any]) -> dict[str, Any]:
 
 
 def bare(script: str) -> str:
-    """Return a script of ours without comments in blocks, indentation and empty lines.
-
-    Examples
-    --------
-    >>> bare("/* a\\nb */\\nif (x) {\\n  y = 1;\\n}")
-    'if (x) {\\ny = 1;\\n}'
-    """
+    """Return a script of ours without comments in blocks, indentation and empty lines."""
     lines = (line.strip() for line in re.sub(r"/\*.*?\*/", "", script, flags=re.S).splitlines())
     return "\n".join(filter(None, lines))
 
 
 def data(value: Any) -> str:
-    """Return a JSON object as JavaScript that may stand in a page: no text of it ends a script.
-
-    Examples
-    --------
-    >>> data({"a": "</script>"})
-    '{"a":"\\\\u003c/script>"}'
-    """
+    """Return a JSON object as JavaScript that may stand in a page: no text of it ends a script."""
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c")
 
@@ -132,12 +120,8 @@ def _tangents(case: Case) -> TangentLoop:
 
 
 def squares_of(objective: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
-    """Return ((measure, weight), ...) of the Gauss-Newton matrix of an objective, as `tune` has it.
-
-    Examples
-    --------
-    >>> squares_of({"ise": 2.0, "iae": 1.0})
-    (('ise', 2.0),)
+    """Return ((measure, weight), ...) of the Gauss-Newton matrix of an objective, as
+    `tune` has it.
     """
     own = tuple((m, w) for m, w in objective.items() if m in ms.squares())
     return (("mean_square_error", 1.0),) if ROOT in objective or not own else own

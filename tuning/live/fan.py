@@ -1,7 +1,4 @@
-"""Many plants of a case at once for any setting of its free parameters, by one compiled program.
-
-Imported by `live_figure`.
-"""
+"""Many plants of a case at once for any setting of its free parameters, by one compiled program."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -49,21 +46,7 @@ MORE = 0.1
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Moved:
-    """A fan at one setting of the free parameters; made by `Fan.move`.
-
-    Parameters
-    ----------
-    values : {dotted name: value}
-    t : (rows,) [s]; r : (rows, outputs) setpoints [unit of length].
-    x : (6, rows, tanks) quantiles CUTS of the levels [unit of length].
-    u : (6, rows, pumps) the same of the inputs [unit of the pumps].
-    measures : {measure: (plants, ...)} of MEASURED.
-    nominal : {measure: value or (tanks,)} of the plant as the case states it.
-    slopes : {measure: (..., parameters)} exact derivatives of `nominal`.
-    steps : (parameters,) change of each by MORE, of its value or, where that is 0, of its range.
-    changes : {measure: (2, parameters, ...)} of `nominal` by runs with that much more and less.
-    failed : (plants,) True where the run diverged; those are in no quantile.
-    """
+    """A fan at one setting of the free parameters; made by `Fan.move`."""
 
     values: Mapping[str, float]
     t: np.ndarray
@@ -79,34 +62,10 @@ class Moved:
 
 
 class Fan:
-    """A case on `plants` plants drawn from what it calls uncertain, ready to run at any setting.
+    """A case on `plants` plants drawn from what it calls uncertain, ready to run at any setting."""
 
-    The plants and their sensor noise are those of `tuning.ensemble(case, samples=plants,
-    key=seed)`.
-
-    Parameters
-    ----------
-    case : Case
-    free : {dotted name: (low, high) or Free}, optional
-        What can be moved; what the case calls free where None.
-    plants : number of plants, 1 to 2000.
-    seed : of plants and noise.
-
-    Attributes
-    ----------
-    case : the case as it is run: at a longer step where its own would take too long.
-    bounds : list of Bound, one for each number that can be moved.
-    rows : {dotted name: (plants, ...)} values of the uncertain parameters.
-    keys : (plants,) of the sensor noise, None where there is none.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> with jax.enable_x64(True):
-    ...     moved = Fan(presets.find("cascaded/pi"), plants=8).move({"controller.Kc[0]": 1.5})
-    >>> moved.x.shape, moved.measures["max_level"].shape
-    ((6, 351, 2), (8, 2))
-    """
+    # The plants and their sensor noise are those of `tuning.ensemble(case, samples=plants,
+    # key=seed)`.
 
     def __init__(
         self, case: Case, free: Mapping[str, Any] | None = None, plants: int = PLANTS, seed: int = 0
@@ -133,10 +92,8 @@ class Fan:
         return {b.name: float(np.clip(own[b.name], b.low, b.high)) for b in self.bounds}
 
     def move(self, values: Mapping[str, float] | None = None) -> Moved:
-        """Return the fan at `values`; parameters that are not named keep the values of the case.
-
-        Raises InputError for a name that is not free, and a value outside its range.
-        """
+        """Return the fan at `values`; parameters that are not named keep the values of the case."""
+        # Raises InputError for a name that is not free, and a value outside its range.
         values = self._checked(values or {})
         with jax.enable_x64(True):
             found = self.program(self.case.loop, self.rows, self.keys, values)
@@ -214,12 +171,7 @@ class Fan:
         return found | moved.failed[:, None]
 
     def sentences(self, moved: Moved) -> list[str]:
-        """Return the fan in words: plants over a rim, error, effect of each parameter.
-
-        The effect of 10 % more of a parameter is 0.1 times its value times the exact derivative on
-        the plant of the case, or where runs contradict that by orders of magnitude the change that
-        such a run shows; of the highest levels the one that changes most.
-        """
+        """Return the fan in words: plants over a rim, error, effect of each parameter."""
         over, length = self.over(moved), self.case.loop.units[0]
         good = ~moved.failed
         share = 100.0 * over.any(axis=1).mean()
@@ -265,12 +217,6 @@ class Fan:
 def quick(case: Case, plants: int) -> Case:
     """Return the case at ten times its step, if all its plants have more than LONGEST samples and
     the longer step is allowed; else the case itself.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> quick(presets.find("gouta2015/backstepping"), 200).clock.dt
-    0.1
     """
     clock = dataclasses.replace(case.clock, dt=case.clock.dt * COARSE)
     if case.clock.samples * plants <= LONGEST or clock.samples < ROWS:

@@ -1,7 +1,4 @@
-"""A gallery: the live page of every case, and one page that lists them by paper.
-
-Imported by the command `explore --all`.
-"""
+"""A gallery: the live page of every case, and one page that lists them by paper."""
 
 import html
 
@@ -30,23 +27,8 @@ path { fill: none; stroke: currentcolor; stroke-width: .04; } .riser { stroke: #
 
 
 def gallery(folder, names=None, each=None):
-    """Write the live page of each case and index.html, which lists them; return their paths.
-
-    A case that cannot be run in a browser is listed with the reason.
-
-    Parameters
-    ----------
-    folder : str or Path
-        Made if need be.
-    names : list of str or None
-        Cases; None: every case of `jaxtank list`.
-    each : function of a name, called before its page is made, or None
-
-    Raises
-    ------
-    InputError
-        For a folder that cannot be written to.
-    """
+    """Write the live page of each case and index.html, which lists them; return their paths."""
+    # A case that cannot be run in a browser is listed with the reason.
     check_folder(folder)
     listed, written = {}, []
     for name in names or presets.names():
@@ -62,18 +44,7 @@ def gallery(folder, names=None, each=None):
 
 
 def index(listed):
-    """Return the page that lists cases.
-
-    Parameters
-    ----------
-    listed : {name: (Case, file of its live page or None, why there is none)}
-
-    Examples
-    --------
-    >>> case = presets.find("cascaded/pi")
-    >>> 'href="pi.html"' in index({"cascaded/pi": (case, "pi.html", "")})
-    True
-    """
+    """Return the page that lists cases."""
     papers = list(dict.fromkeys(name.split("/")[0] for name in listed))
     body = ["<h1>Closed loops to explore</h1>", "<p>Each page runs its loop in the browser.</p>"]
     for paper in papers:

@@ -34,31 +34,7 @@ KINDS = ("png", "svg", "pdf")
 
 
 class LiveFigure:
-    """A fan of many plants that follows its sliders; made by `case.explore(plants=...)`.
-
-    Parameters
-    ----------
-    fan : Fan
-
-    Attributes
-    ----------
-    moved : Moved
-        The numbers that are shown.
-    sliders : {dotted name: slider}
-    words : list of str
-        The result in words, as below the sliders.
-
-    Examples
-    --------
-    >>> import jax
-    >>> from jaxtank import presets
-    >>> fan = Fan(presets.find("cascaded/pi"), plants=8)
-    >>> figure = LiveFigure(fan, widgets=False)
-    >>> figure.move({"controller.Kc[0]": 1.5}).values["controller.Kc[0]"]
-    1.5
-    >>> figure.case.loop.controller.Kc.tolist()
-    [1.5]
-    """
+    """A fan of many plants that follows its sliders; made by `case.explore(plants=...)`."""
 
     def __init__(self, fan: Fan, widgets: bool = True):
         self.fan = fan
@@ -80,11 +56,9 @@ class LiveFigure:
             self._build()
 
     def move(self, values: Mapping[str, float] | None = None) -> Moved:
-        """Show the plants at `values`; parameters that are not named are those of the case.
-
-        Returns the numbers that are shown. Raises InputError for a name that is not free, and a
-        value outside its range.
-        """
+        """Show the plants at `values`; parameters that are not named are those of the case."""
+        # Returns the numbers that are shown. Raises InputError for a name that is not free, and a
+        # value outside its range.
         moved = self.fan.move(values)
         self._draw(moved)
         self._still = True
@@ -191,24 +165,7 @@ class LiveFigure:
 def of_case(
     case: Case, free: Mapping[str, Any] | None = None, plants: int | None = None, seed: int = 0
 ) -> Any:
-    """Return the LiveFigure of a case in a notebook with ipywidgets; elsewhere its LivePage.
-
-    Parameters
-    ----------
-    case : Case
-    free : {dotted name: (low, high) or Free}, optional
-        What can be moved; what the case calls free where None.
-    plants : number of plants; 200 where None.
-    seed : of plants and noise.
-
-    Raises InputError for a name or a value that cannot be used.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> type(of_case(presets.find("cascaded/pi"), plants=50)).__name__
-    'LivePage'
-    """
+    """Return the LiveFigure of a case in a notebook with ipywidgets; elsewhere its LivePage."""
     fan = Fan(case, free, PLANTS if plants is None else plants, seed)
     if in_notebook():
         return LiveFigure(fan)
@@ -217,13 +174,7 @@ def of_case(
 
 
 def in_notebook() -> bool:
-    """Return whether this is a notebook's kernel, and ipywidgets is installed.
-
-    Examples
-    --------
-    >>> in_notebook()
-    False
-    """
+    """Return whether this is a notebook's kernel, and ipywidgets is installed."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return hasattr(shell, "kernel") and importlib.util.find_spec("ipywidgets") is not None
 

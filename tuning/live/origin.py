@@ -1,7 +1,4 @@
-"""Where a case comes from: the words of the command line that make it, and its filter's twin.
-
-Imported by `page`.
-"""
+"""Where a case comes from: the words of the command line that make it, and its filter's twin."""
 
 import contextlib
 import shlex
@@ -22,18 +19,7 @@ NEW = "rig.toml"
 
 
 class Origin(NamedTuple):
-    """How `jaxtank simulate` makes a case.
-
-    words : the case, with --set of its static fields and clock
-    values : {name of one entry: value before} of the leaves that differ from the preset or the file
-    filtered : whether the preset or the file has a safety filter
-    guard : --set of the settings of the filter that differ, for runs with it
-
-    Examples
-    --------
-    >>> origin_of(presets.find("cascaded/pi"))
-    Origin(words='cascaded/pi', values={}, filtered=False, guard='')
-    """
+    """How `jaxtank simulate` makes a case."""
 
     words: str
     values: dict[str, float]
@@ -42,20 +28,7 @@ class Origin(NamedTuple):
 
 
 def origin_of(case, source=None):
-    """Return the Origin of a case.
-
-    Parameters
-    ----------
-    case : Case
-    source : str or None
-        The rig file that it was read from, as the command line names it.
-
-    Examples
-    --------
-    >>> case = rig.set_values(presets.find("cascaded/pi"), {"clock.dt": 2.0, "plant.rim[0]": 8.0})
-    >>> origin_of(case).words, origin_of(case).values["plant.rim[0]"]
-    ('cascaded/pi --set clock.dt=2.0', 10.0)
-    """
+    """Return the Origin of a case."""
     source = source or (case.name if case.name in presets.names() else None)
     known, words = None, None
     if source is not None:
@@ -111,13 +84,7 @@ def _fields(loop):
 
 
 def entries(loop, values):
-    """Return {name of one entry: number} of {dotted name: number or array}.
-
-    Examples
-    --------
-    >>> entries(presets.find("cascaded/pi").loop, {"plant.rim": 5.0})
-    {'plant.rim[0]': 5.0, 'plant.rim[1]': 5.0}
-    """
+    """Return {name of one entry: number} of {dotted name: number or array}."""
     found, own = {}, parameters(loop)
     for name, value in values.items():
         if name.startswith(GUARD):
@@ -133,14 +100,7 @@ def entries(loop, values):
 
 
 def both(case):
-    """Return (case without a safety filter, the same with one or None, whether it has one now).
-
-    Examples
-    --------
-    >>> off, on, now = both(presets.find("cascaded/pi"))
-    >>> off.loop.safety_filter is None, on.loop.safety_filter is None, now
-    (True, False, False)
-    """
+    """Return (case without a safety filter, the same with one or None, whether it has one now)."""
     has = case.loop.safety_filter is not None
     try:
         return case.without_safety_filter(), case if has else rig.filtered(case, on=True), has

@@ -1,6 +1,6 @@
 """The live page as text: one HTML file that asks nothing of any network, everything in it escaped.
 
-Imported by the command `explore`, by reports and by notebooks. Beside it lie the parts of the page:
+Beside it lie the parts of the page:
 page.html, page.css, core.js, charts.js, rig.js, runner.js, page.js, worker.js, tune.js, and uPlot
 in vendor/.
 """
@@ -49,33 +49,7 @@ _KEPT = {}
 
 
 def page(case, presets=(), source=None):
-    """Return the live page of a case as the text of an HTML file.
-
-    Parameters
-    ----------
-    case : Case
-    presets : sequence of (name, {dotted name: value}, safety filter: True, False or None)
-        States to start from; None leaves the filter as in the case. The page opens with the last
-        one and draws the others for comparison. Without any, it opens with the case.
-    source : str or None
-        The rig file that the case was read from, as the command line names it.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    InputError
-        For a case that cannot be run in a browser.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> text = page(presets.find("cascaded/pi"))
-    >>> text[:15], "http-equiv" in text
-    ('<!DOCTYPE html>', True)
-    """
+    """Return the live page of a case as the text of an HTML file."""
     check_pointwise(case)
     off, on, filtered = both(case)
     data = data_of(case, presets, source)
@@ -93,10 +67,7 @@ def page(case, presets=(), source=None):
 
 
 def _engine(off, on):
-    """The engine of a case and of the same with a safety filter or None.
-
-    It is kept for the next page of the same case: two seconds of work.
-    """
+    """The engine of a case and of the same with a safety filter or None."""
     try:
         texts = [rig.dump(one) for one in (off, on) if one is not None]
     except InputError:  # a class of the user's own
@@ -110,26 +81,7 @@ def _engine(off, on):
 
 
 def data_of(case, presets=(), source=None):
-    """Return what the page knows of a case besides the engine, a JSON object.
-
-    Parameters
-    ----------
-    case, presets, source : as of `page`
-
-    Returns
-    -------
-    {"version", "origin": an Origin, "filter": whether it is on, "every" and "drawn": strides of the
-    rows of a CSV file and of a picture [samples], "toml": rig file of the case, "rig": `drawing`,
-    "scenarios": how many `jaxtank tune` takes the mean of, 0 where it has the run alone, "presets",
-    "breaks": faults that can be switched on, "uncertain": {dotted name: half-width as a share}}
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> found = data_of(presets.find("cascaded/pi"))
-    >>> found["breaks"][0]["name"], found["uncertain"]["plant.drain"]
-    ('pump 1 at 70 %', 0.05)
-    """
+    """Return what the page knows of a case besides the engine, a JSON object."""
     try:
         toml = rig.dump(case)
     except InputError as error:  # a class of the user's own without a name
@@ -185,11 +137,7 @@ def _breaks(case):
 
 
 def _uncertain(case):
-    """{dotted name: half-width as a share} of what varies from plant to plant.
-
-    Parameters that were identified together have the half-width of a uniform distribution with
-    their standard deviation.
-    """
+    """{dotted name: half-width as a share} of what varies from plant to plant."""
     found = {}
     for name, one in plants_of(case).items():
         if getattr(one, "relative", None) is not None:
@@ -203,27 +151,7 @@ def _uncertain(case):
 
 
 def assemble(engine_text, name, data):
-    """Return the page as text.
-
-    Parameters
-    ----------
-    engine_text : str
-        JavaScript that defines `makeEngine`.
-    name : str
-        Of the case.
-    data : dict
-        What `data_of` returns.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> text = assemble("function makeEngine() {}", "a <b>", {"toml": "</script>"})
-    >>> "a &lt;b&gt;" in text, text.count("</script>")
-    (True, 2)
-    """
+    """Return the page as text."""
     uplot, core, own = _read("vendor/uPlot.iife.min.js"), _script("core"), _own()
     # the scripts of the page are one function, as loader.js joins them
     run = [engine_text, uplot, f'(() => {{"use strict";\n{core}\n{own}\n}})();', _loader()]
@@ -264,13 +192,7 @@ def _packed(text):
 
 
 def source_of(text):
-    """Return the source of a content-security policy that allows exactly this script or style.
-
-    Examples
-    --------
-    >>> source_of("")
-    "'sha256-47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU='"
-    """
+    """Return the source of a content-security policy that allows exactly this script or style."""
     digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
     return f"'sha256-{digest}'"
 

@@ -1,7 +1,4 @@
-"""The functions of one case as JavaScript: what depends on its numbers alone, signals, the run.
-
-Imported by `tuning.live.engine`.
-"""
+"""The functions of one case as JavaScript: what depends on its numbers alone, signals, the run."""
 
 from collections.abc import Iterable
 from typing import Any, cast
@@ -29,13 +26,7 @@ FIXED = frozenset(_FIXED.split())
 
 
 class Printed:
-    """The printed functions of a WholeLoop.
-
-    lead(p) -> [numbers for signals, run and read, state c, delay lines L]; signals(q, k, K, S)
-    fills S, arrays of what is known of each sample k to K - 1; run(q, c, L, S, N, k, K, every, R)
-    moves c and L over those samples, with the deviates N of the noise, writes a row to R of one
-    sample in `every`, and returns how many numbers it wrote; read(q, c) returns the measures.
-    """
+    """The printed functions of a WholeLoop."""
 
     def __init__(
         self,
@@ -270,15 +261,7 @@ def place(e: Ref) -> tuple[str, Any]:
 
 
 def function(name: str, arguments: str, lines: Iterable[str]) -> str:
-    """Return a function as text, with constants that follow each other in one statement.
-
-    Examples
-    --------
-    >>> print(function("f", "q", ["const[a]=q;", "const b=a+1;", "return b;"]))
-    function f(q){const[a]=q,
-    b=a+1;
-    return b;}
-    """
+    """Return a function as text, with constants that follow each other in one statement."""
     short: list[str] = []
     constant = False
     for line in lines:

@@ -1,4 +1,4 @@
-"""The functions of the derivatives of one case as JavaScript. Imported by `tuning.live.engine`."""
+"""The functions of the derivatives of one case as JavaScript."""
 
 from jaxtank.export.statements import Array, Matrix, Ref, Statement, every, names, used
 from jaxtank.export.whole.compact import Text
@@ -8,13 +8,7 @@ from tuning.live.printed import ALONE, MOVING, TIMED, Printed, function, place
 
 
 class PrintedTangents(Printed):
-    """The printed functions of a TangentLoop: lead, signals, read, as those of `Printed`, and
-
-    aim(q, d) -> [numbers for push, for slope, tangents of c, delay lines], of a direction d with
-    the fourth numbers of lead; push(q, c, L, S, N, k, K, P, D, T, M, G) moves the state and the
-    tangents T of P directions over samples k to K - 1 and adds to G, the Gauss-Newton matrix;
-    slope(q, c, D, T) -> the measures' derivatives along one direction, with the fifth numbers.
-    """
+    """The printed functions of a TangentLoop: lead, signals, read, as those of `Printed`, and"""
 
     def __init__(self, tangents: TangentLoop):
         self.tangents = tangents

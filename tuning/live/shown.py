@@ -1,7 +1,4 @@
-"""The live page of a case or a result: saved as a file, shown by a notebook, put into a report.
-
-Imported by `case.explore()` and `result.explore()` when they are called, by reports and commands.
-"""
+"""The live page of a case or a result: saved as a file, shown by a notebook, put into a report."""
 
 import dataclasses
 import html
@@ -23,32 +20,13 @@ HEIGHT = 900
 
 @dataclasses.dataclass(frozen=True)
 class LivePage:
-    """The live page of a case, which a notebook shows.
-
-    Parameters
-    ----------
-    name : str
-        Of the case.
-    text : str
-        The HTML file.
-
-    Examples
-    --------
-    >>> LivePage("mine", "<!DOCTYPE html>")
-    LivePage('mine', 15 characters): .save(path) writes it
-    """
+    """The live page of a case, which a notebook shows."""
 
     name: str
     text: str
 
     def save(self, path: str | Path) -> Path:
-        """Write the page to a file, whole or not at all; return its path.
-
-        Raises
-        ------
-        InputError
-            `path` cannot be written to.
-        """
+        """Write the page to a file, whole or not at all; return its path."""
         path = Path(path)
         if path.is_dir():
             raise InputError(f"--out {str(path)!r} is a folder: give a file, as {path}/page.html")
@@ -62,19 +40,7 @@ class LivePage:
 
 
 def frame(live: LivePage, height: int = HEIGHT) -> str:
-    """Return an element that shows a live page inside another page, without access to that one.
-
-    Parameters
-    ----------
-    live : LivePage
-    height : int
-        Of the element [px].
-
-    Examples
-    --------
-    >>> frame(LivePage("mine", "<p>"))[:40]
-    '<iframe class="live" title="mine, live" '
-    """
+    """Return an element that shows a live page inside another page, without access to that one."""
     title = html.escape(f"{live.name}, live")
     # in an attribute between double quotes; "<" also, for readers that look for elements
     inside = live.text.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
@@ -86,20 +52,16 @@ def frame(live: LivePage, height: int = HEIGHT) -> str:
 
 
 def of_case(case: Any, presets: Any = (), source: str | None = None) -> LivePage:
-    """Return the LivePage of a case; presets and source as `tuning.live.page.page`
-    takes them.
-
-    Raises InputError for a case that cannot be run in a browser.
-    """
+    """Return the LivePage of a case; presets and source as `tuning.live.page.page` takes them."""
+    # Raises InputError for a case that cannot be run in a browser.
     return LivePage(case.name, page(case, presets, source))
 
 
 def of_result(result: Any) -> LivePage:
     """Return the LivePage of a result of `tuning`: of its case, or of the tuned one with the values
     before and after as states to start from.
-
-    Raises InputError for a result without a case, and a case that cannot be run in a browser.
     """
+    # Raises InputError for a result without a case, and a case that cannot be run in a browser.
     case, tuned = getattr(result, "case", None), getattr(result, "tuned", None)
     if case is None:
         raise InputError(f"{type(result).__name__} has no case of its own to explore")
@@ -117,10 +79,7 @@ def of_result(result: Any) -> LivePage:
 
 
 def states_of(result: Any) -> list[tuple[str, dict[str, Any], bool]]:
-    """Return the states "before" and "after" of a TuningResult, [] of another result.
-
-    Each is (name, {dotted name: value}, whether the safety filter is on).
-    """
+    """Return the states "before" and "after" of a TuningResult, [] of another result."""
     tuned = getattr(result, "tuned", None)
     if tuned is None:
         return []

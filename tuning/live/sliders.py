@@ -1,7 +1,4 @@
-"""The numbers of a loop as sliders: name, unit, value, sensible ends, group.
-
-Imported by `tuning.live.engine`.
-"""
+"""The numbers of a loop as sliders: name, unit, value, sensible ends, group."""
 
 import math
 from typing import Any
@@ -34,21 +31,7 @@ NOISE = 0.02
 
 
 def leaf_of(case: Case, name: str, index: tuple[int, ...]) -> dict[str, Any]:
-    """Return the slider of one number of a loop, as a JSON object.
-
-    Parameters
-    ----------
-    case : Case
-    name : dotted name of a leaf
-    index : of the entry; () for a single number
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> found = leaf_of(presets.find("cascaded/pi"), "controller.Kc", (0,))
-    >>> found["name"], found["group"]
-    ('controller.Kc[0]', 'controller')
-    """
+    """Return the slider of one number of a loop, as a JSON object."""
     full = f"{name}[{','.join(map(str, index))}]" if index else name
     meta = describe(case.loop, full)
     value = float(np.asarray(get_value(case.loop, full)))

@@ -1,6 +1,5 @@
 """The page of a search that is running, and the script by which an open page follows it.
-
-Imported by the command line. Nothing here reads a clock or writes a file.
+Nothing here reads a clock or writes a file.
 """
 
 import dataclasses
@@ -26,22 +25,16 @@ SIGNIFICANT = 5
 
 @dataclasses.dataclass
 class Watched:
-    """What is known of a search.
+    """What is known of a search."""
 
-    case, title : of the case. began, now : times [s since 1970]. state : "running", "ended",
-    "interrupted" or "failed".
-    stage : what is done, in words; "" before the first evaluation. unit : of the cost.
-    costs : [(number of the evaluation, cost, whether every limit holds)]. bests : [[(number, best
-    cost so far)] of each search]. parameters, limits : as `tuning.search.driver.details_of`.
-    violation : of the best point, as a share of a limit; None without one. answer : sentences about
-    the result. values : {name: value} of the result, which may be another point than the best of
-    the search. report : name of the page of the result, None while there is none.
-
-    Examples
-    --------
-    >>> Watched("paper/case", "a title", 0.0).state
-    'running'
-    """
+    # case, title : of the case. began, now : times [s since 1970]. state : "running", "ended",
+    # "interrupted" or "failed". stage : what is done, in words; "" before the first evaluation.
+    # unit : of the cost. costs : [(number of the evaluation, cost, whether every limit holds)].
+    # bests : [[(number, best cost so far)] of each search]. parameters, limits : as
+    # `tuning.search.driver.details_of`. violation : of the best point, as a share of a limit; None
+    # without one. answer : sentences about the result. values : {name: value} of the result, which
+    # may be another point than the best of the search. report : name of the page of the result,
+    # None while there is none.
 
     case: str
     title: str
@@ -63,23 +56,13 @@ class Watched:
 
 
 def files(watched: Watched) -> dict[str, str]:
-    """Return {name: text} of the page and of the script that brings an open page up to date.
-
-    Examples
-    --------
-    >>> found = files(Watched("<b>", "", 0.0))
-    >>> sorted(found), "<b>" in found["watch.html"]
-    (['watch.html', 'watch.js'], False)
-    """
+    """Return {name: text} of the page and of the script that brings an open page up to date."""
     text = json.dumps({"title": _title(watched), "body": body(watched)})
     return {PAGE: page(watched), SCRIPT: f"jaxtankWatch({text});\n"}
 
 
 def page(watched: Watched) -> str:
-    """Return the page as text: whole as it stands, without scripts too.
-
-    Where there are no scripts a running search is loaded again every five seconds.
-    """
+    """Return the page as text: whole as it stands, without scripts too."""
     again = '<noscript><meta http-equiv="refresh" content="5"></noscript>'
     policy = "; ".join(
         [
@@ -142,14 +125,8 @@ def body(watched: Watched) -> str:
 
 
 def picture(watched: Watched) -> str:
-    """Return the best cost over the evaluations as an <svg> element; dots are single evaluations.
-
-    Examples
-    --------
-    >>> one = Watched("c", "", 0.0, costs=[(1, 2.0, True), (2, 1.0, True)],
-    ...               bests=[[(1, 2.0), (2, 1.0)]], best=1.0, evaluations=2)
-    >>> picture(one).count("<circle"), picture(one).count("<path class=\\"best")
-    (2, 1)
+    """Return the best cost over the evaluations as an <svg> element; dots are single
+    evaluations.
     """
     lines = [[(n, c) for n, c in line if math.isfinite(c)] for line in watched.bests]
     values = [c for line in lines for _, c in line]
@@ -208,13 +185,7 @@ def _axes(x: Any, y: Any, low: float, high: float, log: bool, last: int) -> str:
 
 
 def ticks(low: float, high: float, most: int) -> list[float]:
-    """Return at most about `most` round numbers between two numbers.
-
-    Examples
-    --------
-    >>> ticks(0.0, 1.0, 5)
-    [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
-    """
+    """Return at most about `most` round numbers between two numbers."""
     span = high - low
     if not span > 0:
         return [low]

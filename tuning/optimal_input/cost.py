@@ -1,5 +1,5 @@
 """The cost of a run as a function of every input, with the exact gradient by checkpointed reverse
-mode. Imported by `problem` and `perfect_information`.
+mode.
 """
 
 import dataclasses
@@ -47,10 +47,7 @@ class Lagrangian(NamedTuple):
 
 
 def open_loop(loop, u, interval):
-    """Return `loop` with the inputs u (pumps, intervals) in place of its controller.
-
-    Each is held for `interval` [s]; without sensor noise.
-    """
+    """Return `loop` with the inputs u (pumps, intervals) in place of its controller."""
     return dataclasses.replace(
         loop,
         controller=OpenLoop(signal=Table(values=u, period=interval)),
@@ -66,10 +63,7 @@ def open_loop(loop, u, interval):
 
 
 def _pointwise_excess(terms, lagrangian, sample):
-    """Return the excess over each pointwise limit at a sample, as a share of its size [-].
-
-    Negative where the limit holds.
-    """
+    """Return the excess over each pointwise limit at a sample, as a share of its size [-]."""
     found = []
     for j, (measure, i) in enumerate(terms.pointwise):
         quantity = magnitude(sample.e[i]) if measure == "max_error" else sample.x[i]
@@ -94,10 +88,7 @@ def value_and_gradient(loop, clock, terms, u, lagrangian):
 
 @functools.partial(jax.jit, static_argnames=("clock", "terms"))
 def evaluate(loop, clock, terms, u, lagrangian):
-    """Return the excesses and the measures of the inputs u.
-
-    ((pointwise,) tuple of (samples,), (integral,), {measure: value}); excesses as shares of sizes.
-    """
+    """Return the excesses and the measures of the inputs u."""
     loop = _with_inputs(loop, u)
     names = _names(terms)
     run = run_of(loop, clock)

@@ -19,19 +19,7 @@ FLAT = 5
 
 
 def minimise(function, z, iterations, tolerance=1e-8):
-    """Return (z, value, gradient, iterations) of a local minimum over the unit cube.
-
-    Two-metric projection (Bertsekas 1982): the direction is that of limited-memory BFGS (Nocedal
-    1980) in the coordinates that no bound holds; the step is projected onto the bounds, and halved
-    until the value falls by a ten-thousandth of the linear prediction.
-
-    function: z (n,) -> (value, gradient (n,)); z: (n,) start, inside. Ends after `iterations`, or
-    where FLAT iterations in a row gain less than `tolerance` of the value or of 1e-2.
-
-    >>> z, *_ = minimise(lambda z: (float(z @ z - 4 * z[0]), 2 * z - [4, 0]), np.full(2, 0.5), 50)
-    >>> z.round(6).tolist()
-    [1.0, 0.0]
-    """
+    """Return (z, value, gradient, iterations) of a local minimum over the unit cube."""
     value, gradient = function(z)
     pairs, flat, count = deque(maxlen=MEMORY), 0, 0
     for _ in range(iterations):

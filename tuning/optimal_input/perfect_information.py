@@ -22,48 +22,7 @@ from tuning.problem.result import Result
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
 class InputBound(Result):
-    """Result of `tuning.bound`; costs and measures are exact, at the case's own step.
-
-    Attributes
-    ----------
-    case : Case
-    objective : dict
-        {measure: weight}.
-    cost : float
-        Weighted sum of the objective.
-    measures : dict
-        {name: value} of every measure that is defined without a controller.
-    u : (intervals, pumps) array
-        Inputs [V], each held for `interval` [s].
-    interval : float
-    constraints : list of dict
-        Name, limit, value, margin, tank and time of each limit.
-    holds : bool
-        Whether each limit holds to 3e-5 of it.
-    closed_loop : dict or None
-        {cost, holds, constraints} of the case's own controller on the same run without noise; None
-        where that run diverges.
-    source : {"search", "closed loop"}
-        "closed loop" where no search found a lower cost than the case's own controller, whose
-        inputs are then given.
-    grids : list of dict
-        {interval_s, cost, excess} of each refinement of the intervals.
-    slope : float
-        Largest derivative of the scaled cost by the share of an input's range, where it is free.
-    iterations, gradients, simulations : int
-        Of the search.
-    interrupted : bool
-    wall_s : float
-        Run time [s].
-
-    Examples
-    --------
-    >>> result = tuning.bound(case)  # doctest: +SKIP
-    >>> result.cost, result.holds, result.gain_percent  # doctest: +SKIP
-    (0.0302, True, 12.1)
-    >>> result.trajectory().x.shape  # doctest: +SKIP
-    (60001, 4)
-    """
+    """Result of `tuning.bound`; costs and measures are exact, at the case's own step."""
 
     REPORT = "tuning.report.optimal_input"
 
@@ -87,10 +46,7 @@ class InputBound(Result):
 
     @property
     def gain_percent(self) -> float | None:
-        """Most that another controller could save [% of the cost of the case's own].
-
-        None where that breaks a limit or diverges.
-        """
+        """Most that another controller could save [% of the cost of the case's own]."""
         if (
             self.closed_loop is None
             or not self.closed_loop["holds"]

@@ -1,5 +1,5 @@
 """The problem of the optimal inputs: objective, limits, intervals, and what a run with given inputs
-costs. Imported by `search`.
+costs.
 """
 
 import dataclasses
@@ -43,11 +43,7 @@ SENSITIVE = {"u2", "travel", "deviation2", "changes2", "past2"}
 
 
 class InputProblem:
-    """Inputs (pumps, intervals) of a case as unknowns: their box, cost and limits.
-
-    case: Case; objective: {measure: weight}, limits: {measure: value}, the case's own where None;
-    interval: for which each input is held [s], or None.
-    """
+    """Inputs (pumps, intervals) of a case as unknowns: their box, cost and limits."""
 
     def __init__(self, case, objective, limits, interval):
         self.case = case
@@ -73,10 +69,7 @@ class InputProblem:
         self.start = self._terms(dry)  # the Lagrangian with the limits as given
 
     def _terms(self, dry):
-        """Set `terms`; return the first Lagrangian. dry: tanks that must not overflow.
-
-        No overflow is a level at most at the rim: a level that stops at the rim has no slope.
-        """
+        """Set `terms`; return the first Lagrangian. dry: tanks that must not overflow."""
         loop = self.case.loop
         rim = np.asarray(loop.plant.rim)
         limits = [_limit_of(v, rim, dry) for v in self.limits]
@@ -144,10 +137,7 @@ class InputProblem:
         }
 
     def _constraints(self, over, integral):
-        """Return a dict for each limit: name, measure, limit, value, margin, tank, time_s.
-
-        tank counted from 1; time of the sample with the least margin.
-        """
+        """Return a dict for each limit: name, measure, limit, value, margin, tank, time_s."""
         rows = []
         for j, (m, i) in enumerate(self.terms.pointwise):
             at, limit = int(np.argmax(over[j])), float(self.start.pointwise[j])

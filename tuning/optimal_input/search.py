@@ -1,5 +1,5 @@
 """The search for the optimal inputs: coarse to fine intervals, L-BFGS in a box, and an augmented
-Lagrangian with one multiplier per sample. Imported by `perfect_information`.
+Lagrangian with one multiplier per sample.
 """
 
 import dataclasses
@@ -67,10 +67,7 @@ class InputSearch:
             )
 
     def _start(self, group):
-        """Return the better of two searches with the coarsest intervals.
-
-        One starts from the inputs of the case's own controller, one from steady-state inputs.
-        """
+        """Return the better of two searches with the coarsest intervals."""
         starts = [s for s in (self._closed_loop(), self._steady()) if s is not None]
         self._rescale(starts[0])
         found = [self._descend(u, group) for u in starts]
@@ -82,9 +79,8 @@ class InputSearch:
         return min(found, key=lambda pair: pair[1] if np.isfinite(pair[1]) else np.inf)[0]
 
     def _closed_loop(self):
-        """Return the means over each interval of the case's own inputs, None if the run diverges.
-
-        Sets `closed` to the check of these inputs, sample by sample.
+        """Return the means over each interval of the case's own inputs, None if the run
+        diverges.
         """
         problem = self.problem
         loop, clock = problem.case.loop, problem.case.clock
@@ -106,10 +102,7 @@ class InputSearch:
         )
 
     def _steady(self):
-        """Return steady-state inputs of the nearest of a few setpoints.
-
-        The middle of the range for a setpoint without a steady state.
-        """
+        """Return steady-state inputs of the nearest of a few setpoints."""
         problem, loop = self.problem, self.problem.case.loop
         clock = dataclasses.replace(problem.coarse, dt=problem.interval)
         r = np.array(loop.reference.sample(clock)[0])[:, : problem.count]
@@ -144,10 +137,7 @@ class InputSearch:
         )
 
     def _descend(self, u, group):
-        """Return (inputs, search cost) of L-BFGS from u, with `group` intervals as one.
-
-        The unknowns are shares of the range of each input.
-        """
+        """Return (inputs, search cost) of L-BFGS from u, with `group` intervals as one."""
         problem = self.problem
         low, span = problem.low[:, None], (problem.high - problem.low)[:, None]
         edges = np.arange(0, problem.count, group)
@@ -171,10 +161,8 @@ class InputSearch:
         return inputs(z), value
 
     def _settle(self, u, group, rounds):
-        """Return (inputs, their check) after rounds of descent and new multipliers.
-
-        The weight is raised where an excess does not shrink.
-        """
+        """Return (inputs, their check) after rounds of descent and new multipliers."""
+        # The weight is raised where an excess does not shrink.
         last, before, found = np.inf, np.inf, {}
         for _ in range(rounds):
             u, _ = self._descend(u, group)
@@ -214,9 +202,8 @@ class InputSearch:
         )
 
     def _repair(self, u, found):
-        """Return the check of inputs that hold the limits at the case's own step, if any are found.
-
-        By a higher weight, then by limits tightened by the remaining excess.
+        """Return the check of inputs that hold the limits at the case's own step, if any
+        are found.
         """
         for k in range(ROUNDS):
             if found["excess"] <= TOLERANCE:

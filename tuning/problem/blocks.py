@@ -17,19 +17,10 @@ Screened = tuple[Floats, Floats]
 
 
 class Blocks:
-    """How many points a program runs: as many as in an earlier call where that serves.
+    """How many points a program runs: as many as in an earlier call where that serves."""
 
-    The sizes follow from the calls alone, not from what is known already: a search that is
-    continued gives the same bits.
-
-    runs : of each point.
-
-    Examples
-    --------
-    >>> blocks = Blocks(runs=32)
-    >>> [blocks.size(points, False, samples=1000) for points in (32, 5, 64)]
-    [8, 8, 8]
-    """
+    # The sizes follow from the calls alone, not from what is known already: a search that is
+    # continued gives the same bits.
 
     def __init__(self, runs: int):
         self.runs = runs
@@ -45,15 +36,7 @@ class Blocks:
 
 
 def in_blocks(screen: Callable[[Floats], Screened], zs: Floats, size: int) -> Screened:
-    """Return screen(zs), called with `size` points at a time, the last one repeated to fill up.
-
-    Examples
-    --------
-    >>> counted = lambda zs: (zs[:, 0], np.full((len(zs), 1), len(zs)))
-    >>> costs, margins = in_blocks(counted, np.arange(5.0)[:, None], size=3)
-    >>> costs.tolist(), margins[:, 0].tolist()
-    ([0.0, 1.0, 2.0, 3.0, 4.0], [3, 3, 3, 3, 3])
-    """
+    """Return screen(zs), called with `size` points at a time, the last one repeated to fill up."""
     filled = np.concatenate([zs, np.repeat(zs[-1:], -len(zs) % size, axis=0)])
     found = [screen(filled[i : i + size]) for i in range(0, len(filled), size)]
     costs, margins = (np.concatenate(parts)[: len(zs)] for parts in zip(*found))

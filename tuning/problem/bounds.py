@@ -56,17 +56,9 @@ class Bound(NamedTuple):
 
 
 def bounds(loop: ClosedLoop, free: Mapping[str, Any]) -> list[Bound]:
-    """Return the Bounds of {name: Free}; the name of an array stands for all its entries.
-
-    Raises InputError for an unknown name, a range that is empty, not finite or outside what the
-    parameter allows.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> [b.name for b in bounds(presets.find("cascaded/pi").loop, {"x0": (1.0, 2.0)})]
-    ['x0[0]', 'x0[1]']
-    """
+    """Return the Bounds of {name: Free}; the name of an array stands for all its entries."""
+    # Raises InputError for an unknown name, a range that is empty, not finite or outside what the
+    # parameter allows.
     if not free:
         raise InputError("nothing to tune: name at least one parameter with --free NAME=LOW:HIGH")
     found: list[Bound] = []

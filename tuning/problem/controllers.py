@@ -1,7 +1,4 @@
-"""A case with a controller of another kind, with gains to start from and ranges to tune in.
-
-Imported by `search.discrete`.
-"""
+"""A case with a controller of another kind, with gains to start from and ranges to tune in."""
 
 # the linear models of jaxtank.analysis and the readers of jaxtank.rig have no types
 # pyright: reportUnknownMemberType=false
@@ -53,27 +50,7 @@ class Rig(NamedTuple):
 
 
 def with_kind(case: Case, kind: str) -> Case:
-    """Return a case with a controller of another kind in the place of its own.
-
-    Gains and ranges: of the case itself where it has that kind; else of a case of the same paper
-    that has it on the same plant; else the first gains of `START`, computed from a linear model,
-    and a decade each way, as in the rig file of `jaxtank init`.
-
-    Parameters
-    ----------
-    case : Case
-    kind : name of a controller in rig files
-
-    Raises
-    ------
-    InputError : for an unknown kind, one without gains to start from, and one that does not fit.
-
-    Examples
-    --------
-    >>> case = with_kind(presets.find("cascaded/pi"), "state-feedback")
-    >>> type(case.loop.controller).__name__, list(case.free)
-    ('StateFeedback', ['controller.K'])
-    """
+    """Return a case with a controller of another kind in the place of its own."""
     known = ROLES["law"].classes
     if kind not in known:
         raise unknown("controller kind", str(kind), known)
@@ -132,10 +109,7 @@ def _computed(case: Case, kind: str) -> tuple[Any, dict[str, Any]]:
 
 
 def _rig_of(case: Case) -> Rig:
-    """Return what the first gains are computed from.
-
-    Raises InputError where no plateau of the reference has a steady state.
-    """
+    """Return what the first gains are computed from."""
     plant: Any = model_of(case.loop)
     pumps = (plant.pumps,)
     if plant.pumps != len(plant.outputs):
@@ -176,13 +150,10 @@ def _steady(case: Case, plant: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _pid(known: Rig) -> Any:
-    """SIMC (Skogestad, J. Process Control 13, 2003) of each pump's own output:
-
-        Kc = tau / (k (tau_c + theta)),  Ti = min(tau, 4 (tau_c + theta)),  tau_c = T / FASTER
-
-    with the steady gain k. A pump that fills its output directly has theta = 0; else half of the
-    other time constants is taken for a dead time.
-    """
+    """SIMC (Skogestad, J. Process Control 13, 2003) of each pump's own output:"""
+    # Kc = tau / (k (tau_c + theta)), Ti = min(tau, 4 (tau_c + theta)), tau_c = T / FASTER
+    # with the steady gain k. A pump that fills its output directly has theta = 0; else half of the
+    # other time constants is taken for a dead time.
     n, T = len(known.A), known.slowest
     # a rig that integrates has the gain of its first T seconds
     gain = known.C @ np.linalg.solve(np.eye(n) * (1e-3 / T) - known.A, known.B)

@@ -1,7 +1,4 @@
-"""Objectives and constraints that are functions of a user's own: each becomes a named measure.
-
-Imported by `problem` and by what takes an objective or limits: `search`, `answer`.
-"""
+"""Objectives and constraints that are functions of a user's own: each becomes a named measure."""
 
 # functions of jax and of `measures` whose types are not complete
 # pyright: reportUnknownMemberType=false
@@ -115,25 +112,7 @@ class Constraint:
 
 
 def as_measures(objective: Any, limits: Any, taken: Iterable[str] = ()) -> tuple[Any, Any]:
-    """Return ({measure: weight}, {measure: limit}) of an objective and limits, None where None.
-
-    Functions among them are registered as measures. taken : names of functions that are in use
-    already, and stay as they are.
-
-    Parameters
-    ----------
-    objective : {measure, Objective or function: weight}, or one Objective or function alone.
-    limits : {measure: value}, a Constraint, or a list of both.
-
-    Raises
-    ------
-    InputError : for what is none of these, and for a name that stands for two functions.
-
-    Examples
-    --------
-    >>> as_measures({"ise": 1.0}, [{"max_level": "rim"}, {"ise": 3.0}])
-    ({'ise': 1.0}, {'max_level': 'rim', 'ise': 3.0})
-    """
+    """Return ({measure: weight}, {measure: limit}) of an objective and limits, None where None."""
     found: dict[str, ms.Measure] = {name: ms.MEASURES[name] for name in ms.functions(taken)}
     weights = None if objective is None else _weights(objective, found)
     limited = None if limits is None else _limited(limits, found)
@@ -212,14 +191,8 @@ def _enter(name: str, measure: ms.Measure, found: dict[str, ms.Measure]) -> str:
 
 
 def digests(loop: ClosedLoop, clock: Any, names: Iterable[str]) -> dict[str, Any]:
-    """Return {"functions": {name: digest of its program}} for a fingerprint; {} without functions.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> case = presets.find("cascaded/pi")
-    >>> digests(case.loop, case.clock, ["rms_error"])
-    {}
+    """Return {"functions": {name: digest of its program}} for a fingerprint; {} without
+    functions.
     """
     own = ms.functions(names)
     found = {name: digest(program_of(loop, clock, name)) for name in own}
@@ -227,10 +200,7 @@ def digests(loop: ClosedLoop, clock: Any, names: Iterable[str]) -> dict[str, Any
 
 
 def check_slopes(problem: Any, point: Point) -> None:
-    """Raise InputError for a function of the user's whose derivative at the start is NaN.
-
-    problem : the Problem. point : its Point at the starting values.
-    """
+    """Raise InputError for a function of the user's whose derivative at the start is NaN."""
     if not np.isfinite(point.cost):
         return
     bad = [*ms.functions(problem.objective)] if np.isnan(point.gradient).any() else []

@@ -1,7 +1,4 @@
-"""Limits: a measure, its limit, and the margin to it.
-
-Imported by `problem`, `search` and `uncertainty`.
-"""
+"""Limits: a measure, its limit, and the margin to it."""
 
 # functions of jax and of `measures` whose types are not complete
 # pyright: reportUnknownMemberType=false
@@ -37,16 +34,7 @@ NO_OVERFLOW = 1e-6
 
 @dataclasses.dataclass(frozen=True)
 class Limit:
-    """One hard constraint: entry `index` of `measure` at most (or at least) `value`, in one run.
-
-    The value is in the measure's unit; run is the scenario's index in `Problem.runs`.
-
-    Examples
-    --------
-    >>> limit = Limit("max_level", 2, 30.0)
-    >>> limit.label, limit.sign, limit.margin({"max_level": np.array([9.0, 8.0, 29.5])})
-    ('max_level of tank 3', 1.0, 0.5)
-    """
+    """One hard constraint: entry `index` of `measure` at most (or at least) `value`, in one run."""
 
     measure: str
     index: int
@@ -73,12 +61,10 @@ class Limit:
         return float(self.margins(np.ravel(measures[self.measure])[self.index]))
 
     def margins(self, values: ArrayLike) -> NDArray[np.float64]:
-        """Return the margin for each of `values` of the measure, in its unit.
-
-        An infinite value (never settled) violates the limit by UNDEFINED_MARGIN, as does an
-        undefined one (a rise that never reached 90 %). An undefined settling time holds: the
-        output never left its band.
-        """
+        """Return the margin for each of `values` of the measure, in its unit."""
+        # An infinite value (never settled) violates the limit by UNDEFINED_MARGIN, as does an
+        # undefined one (a rise that never reached 90 %). An undefined settling time holds: the
+        # output never left its band.
         undefined = UNDEFINED_MARGIN if ms.MEASURES[self.measure].nan_holds else -UNDEFINED_MARGIN
         distance = self.sign * (self.value - np.asarray(values))
         found = np.clip(distance, -UNDEFINED_MARGIN, UNDEFINED_MARGIN)
@@ -86,20 +72,9 @@ class Limit:
 
 
 def limit_scale(limit: Limit, loop: ClosedLoop) -> float:
-    """Return the size by which a limit's margin counts, in the measure's unit.
-
-    The limit's own size, but no less than a thousandth of the measured quantity (the tanks' height
-    or volume, 1 for a share, 100 for percent), which matters where a limit is 0 or nearly.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> loop = presets.find("cascaded/pi").loop
-    >>> limit_scale(Limit("saturated_fraction", 0, 0.2), loop)
-    0.2
-    >>> limit_scale(Limit("saturated_fraction", 0, 0.0), loop)
-    0.001
-    """
+    """Return the size by which a limit's margin counts, in the measure's unit."""
+    # The limit's own size, but no less than a thousandth of the measured quantity (the tanks'
+    # height or volume, 1 for a share, 100 for percent), which matters where a limit is 0 or nearly.
     plant: Any = loop.plant  # of any class: no other plant overflows, and some have no area to name
     length, rim = loop.units[0], np.asarray(plant.rim)
     area = np.asarray(plant.area) if plant.overflow else 1.0
@@ -117,29 +92,18 @@ def limit_scale(limit: Limit, loop: ClosedLoop) -> float:
 def resolve_limits(
     case: Case, limits: Mapping[str, Any] | None = None, run: int = 0, scenario: str = ""
 ) -> list[Limit]:
-    """Return the Limits of {measure: number, list or "rim"}; the case's own where None.
-
-    With rims as physics a level cannot pass its rim, so a limit at the rim becomes one of no
-    overflow volume. An entry that is undefined on the case's run (see `undefined`) has no Limit.
-    Raises InputError for an unknown measure, a value that is no number, and a measure all of whose
-    entries are undefined.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> [limit.label for limit in resolve_limits(presets.find("cascaded/pi"), {"ise": 3.0})]
-    ['ise of output 1']
-    """
+    """Return the Limits of {measure: number, list or "rim"}; the case's own where None."""
+    # With rims as physics a level cannot pass its rim, so a limit at the rim becomes one of no
+    # overflow volume. An entry that is undefined on the case's run (see `undefined`) has no Limit.
+    # Raises InputError for an unknown measure, a value that is no number, and a measure all of
+    # whose entries are undefined.
     return resolve_in([ScenarioRun(scenario, case, None, 1.0)], limits, run)
 
 
 def resolve_in(
     runs: Sequence[ScenarioRun], limits: Mapping[str, Any] | None = None, first: int = 0
 ) -> list[Limit]:
-    """Return the Limits of `resolve_limits` in each of `runs`, numbered from `first`.
-
-    Raises InputError as it does, for a measure that is undefined in all of them.
-    """
+    """Return the Limits of `resolve_limits` in each of `runs`, numbered from `first`."""
     found: list[Limit] = []
     why: dict[str, tuple[Any, str]] = {}
     for i, run in enumerate(runs, first):
@@ -175,17 +139,8 @@ def _without_overflow(measure: str, index: int, value: float, plant: Any) -> tup
 
 
 def undefined(measure: str, case: Case) -> tuple[str, list[bool]]:
-    """Return (reason and remedy, (entries,) True where `measure` has no value on the case's run).
-
-    Whatever the gains, overshoot, rise and settling are undefined for an output whose setpoint has
-    no step within the run and that starts at its setpoint (`windows`), and recovery where there is
-    no inflow disturbance.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> undefined("ise", presets.find("cascaded/pi"))
-    ('', [False])
+    """Return (reason and remedy, (entries,) True where `measure` has no value on the
+    case's run).
     """
     wanted, clock, loop = ms.refers_to([measure]), case.clock, case.loop
     onset = None if loop.disturbance is None else loop.disturbance.since(clock)

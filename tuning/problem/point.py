@@ -1,7 +1,4 @@
-"""A problem at one point: cost, margins and their derivatives.
-
-Imported by `problem` and `search`.
-"""
+"""A problem at one point: cost, margins and their derivatives."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -19,16 +16,7 @@ NO_MATRIX: Floats = np.zeros((0, 0))
 
 
 class Point(NamedTuple):
-    """The problem at one point z of the unit cube, derivatives with respect to z.
-
-    Examples
-    --------
-    >>> one = np.ones(1)
-    >>> Point(one, 2.0, one, np.eye(1), one, np.eye(1), ()).finite
-    True
-    >>> Point(one, np.inf, one, np.eye(1), one, np.eye(1), ()).finite
-    False
-    """
+    """The problem at one point z of the unit cube, derivatives with respect to z."""
 
     z: Floats  # (P,)
     cost: float  # weighted sum of measures, over the scenarios by `risk`
@@ -44,10 +32,7 @@ class Point(NamedTuple):
 
     @property
     def finite(self) -> bool:
-        """True if cost, margins and derivatives are numbers that one can search with.
-
-        A slope of 1e9 is that of a loop that has become unstable.
-        """
+        """True if cost, margins and derivatives are numbers that one can search with."""
         return all(
             bool(np.all(np.abs(v) < DIVERGED))
             for v in (self.cost, self.gradient, self.margins, self.margin_slopes)

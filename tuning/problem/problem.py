@@ -1,7 +1,4 @@
-"""What is minimised and what must hold, as numbers with exact derivatives.
-
-Imported by `search`, and as `tuning.Problem`.
-"""
+"""What is minimised and what must hold, as numbers with exact derivatives."""
 
 # functions of jax and of `measures` whose types are not complete
 # pyright: reportUnknownMemberType=false
@@ -285,10 +282,7 @@ class Problem:
     def _derivatives(
         self, z: Floats, groups: Sequence[sc.Group]
     ) -> tuple[list[Any], list[Any], list[Any], bool]:
-        """Return (measures, their slopes by z, Gauss-Newton) of each run, None where not run.
-
-        And whether one of them diverged.
-        """
+        """Return (measures, their slopes by z, Gauss-Newton) of each run, None where not run."""
         values = {name: np.float64(v) for name, v in self.values(z).items()}
         per_z = np.array(
             [float(b.slope(np.float64(v))) for b, v in zip(self.bounds, values.values())]

@@ -19,14 +19,7 @@ from tuning.problem.scenarios import screening_clock
 
 
 def provenance(case: Case, seed: int | None) -> dict[str, Any]:
-    """Return the versions and settings that a result depends on.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> provenance(presets.find("cascaded/pi"), seed=3)["seed"]
-    3
-    """
+    """Return the versions and settings that a result depends on."""
     import scipy
 
     return {

@@ -1,7 +1,4 @@
-"""Measures that a result reports, of the case's own run and of every scenario.
-
-Imported by `search` and by `jaxtank simulate`.
-"""
+"""Measures that a result reports, of the case's own run and of every scenario."""
 
 # functions of jax and of `measures` whose types are not complete
 # pyright: reportUnknownMemberType=false
@@ -24,11 +21,7 @@ from tuning.problem.problem import Problem
 def run_measures(
     loop: ClosedLoop, clock: Clock, key: Any, besides: Iterable[str] = ()
 ) -> dict[str, np.ndarray]:
-    """Return {measure: value} of everything that is reported of one run.
-
-    key : of the sensor noise, None where there is none. besides : names, of which the functions of
-    the user's and the margins of the linearised loop are reported too.
-    """
+    """Return {measure: value} of everything that is reported of one run."""
     values = lp.evaluate(loop, clock, reported_names(loop, besides), key)
     return {m: np.asarray(v) for m, v in values.items()}
 
@@ -48,24 +41,7 @@ def in_force(loop: ClosedLoop, values: Mapping[str, float]) -> dict[str, float]:
 
 
 class Deferred(Mapping[str, Any]):
-    """Measures of a run that is made when one is asked for that is not known yet.
-
-    Two programs with all that is reported take as long to compile as those of the search: the text
-    of a default answer needs only a few measures, its JSON and its report need all. Printed, copied
-    and pickled it is the dict of all.
-
-    Parameters
-    ----------
-    names : of all measures.
-    known : {measure: value}, some of them.
-    make : returns {measure: value} of all.
-
-    Examples
-    --------
-    >>> found = Deferred(["b", "a"], {"a": 1.0}, lambda: {"b": 2.0, "a": 1.0})
-    >>> found["a"], list(found), found.made, found["b"], found.made
-    (1.0, ['b', 'a'], False, 2.0, True)
-    """
+    """Measures of a run that is made when one is asked for that is not known yet."""
 
     def __init__(
         self, names: Iterable[str], known: Mapping[str, Any], make: Callable[[], Mapping[str, Any]]
@@ -118,10 +94,7 @@ def table_of(problem: Problem, values: dict[str, float]) -> list[dict[str, Any]]
 
 
 def reported_names(loop: ClosedLoop, besides: Iterable[str] = ()) -> tuple[str, ...]:
-    """Return the measures that are reported of a loop, and when levels were reached.
-
-    besides : as of `run_measures`.
-    """
+    """Return the measures that are reported of a loop, and when levels were reached."""
     known = (m for m in ms.reported() if ms.serves(m, loop))
     besides = tuple(besides)
     linear = (m for m in besides if ms.MEASURES[m].linear)

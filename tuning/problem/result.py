@@ -30,10 +30,7 @@ class Shown:
 
 
 class Result(Shown):
-    """A result with a report: `print(result)`, `.to_json()`, `.plot()`, `.save(folder)`.
-
-    `REPORT` names the module with its `lines`, `json_of`, `figures` and `save`.
-    """
+    """A result with a report: `print(result)`, `.to_json()`, `.plot()`, `.save(folder)`."""
 
     REPORT: ClassVar[str]
 
@@ -57,12 +54,8 @@ class Result(Shown):
     def explore(self, plants: int | None = None) -> Any:
         """Return the live page of the result's case, a `tuning.live.shown.LivePage`: of a tuned one
         with its values before and after. A notebook shows it, and `.save(path)` writes it.
-
-        With `plants`, in a notebook with ipywidgets, it is a live figure of so many plants that
-        begins with the values after (`case.explore`).
-
-        Raises InputError for a case that cannot be run in a browser.
         """
+        # Raises InputError for a case that cannot be run in a browser.
         live = importlib.import_module("tuning.live.shown")
         own = getattr(self, "tuned", None) or getattr(self, "case", None)
         if plants is None or own is None:
@@ -70,20 +63,7 @@ class Result(Shown):
         return own.explore(plants=plants)
 
     def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
-        """Write result.json, tables, pictures and report.html to `folder`; return their paths.
-
-        Parameters
-        ----------
-        folder
-            Where to write; made if need be.
-        command
-            The command line that made the result, printed in the report.
-
-        Raises
-        ------
-        InputError
-            `folder` cannot be written to.
-        """
+        """Write result.json, tables, pictures and report.html to `folder`; return their paths."""
         return self._report().save(self, folder, command)
 
 

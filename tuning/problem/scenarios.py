@@ -1,7 +1,4 @@
-"""Several runs behind one cost: scenarios that differ in numbers run as one compiled batch.
-
-Imported by `problem`, `search` and `uncertainty`.
-"""
+"""Several runs behind one cost: scenarios that differ in numbers run as one compiled batch."""
 
 # jax's transformations have no complete types
 # pyright: reportUnknownMemberType=false
@@ -47,30 +44,14 @@ Shape = tuple[Any, tuple[bool, ...], int]
 
 
 def screening_clock(clock: Clock) -> Clock:
-    """Return the clock of the screening: ten times the step.
-
-    Where that leaves at least a thousand samples; else the clock itself.
-
-    Examples
-    --------
-    >>> screening_clock(Clock(dt=0.01, duration=200.0)).dt
-    0.1
-    """
+    """Return the clock of the screening: ten times the step."""
     if clock.samples < 1000 * COARSE:
         return clock
     return dataclasses.replace(clock, dt=clock.dt * COARSE)
 
 
 def coarse_clock(clock: Clock) -> Clock:
-    """Return the clock of a first local search: ten times the step.
-
-    Where that leaves at least FEWEST samples; else the clock itself.
-
-    Examples
-    --------
-    >>> coarse_clock(Clock(dt=0.01, duration=20.0)).dt
-    0.1
-    """
+    """Return the clock of a first local search: ten times the step."""
     return (
         clock
         if clock.samples < FEWEST * COARSE
@@ -114,14 +95,7 @@ class Group(NamedTuple):
 
 
 def noisy(case: Case) -> bool:
-    """Return True if a run of the case draws noise.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> noisy(presets.find("gouta2015/backstepping"))
-    False
-    """
+    """Return True if a run of the case draws noise."""
     return bool(np.any(np.asarray(case.loop.sensor.noise) > 0))
 
 
@@ -157,10 +131,7 @@ def _check_scenario(s: Scenario, free: Sequence[str]) -> None:
 
 
 def runs_of(case: Case, scenarios: Sequence[Scenario], seed: int) -> list[ScenarioRun]:
-    """Return the ScenarioRuns of a case: one for each scenario, or one for the case itself.
-
-    Raises InputError, naming the scenario.
-    """
+    """Return the ScenarioRuns of a case: one for each scenario, or one for the case itself."""
     if not scenarios:
         key = jax.random.key(seed) if noisy(case) else None
         return [ScenarioRun("", case, key, 1.0)]
@@ -211,11 +182,7 @@ def take(group: Group, picked: Any) -> Group:
 
 
 def with_noise_drawn(group: Group) -> Group:
-    """Return the group with its noise drawn once, for runs that are repeated many times.
-
-    The group itself where it has none, where its runs are long, or the noise takes more than
-    LARGEST_NOISE numbers.
-    """
+    """Return the group with its noise drawn once, for runs that are repeated many times."""
     samples, sensor = group.clock.samples, jax.tree.unflatten(group.structure, group.leaves).sensor
     count = len(group.runs) * samples * int(np.size(np.asarray(sensor.noise)))
     if group.keys is None or samples > CHUNK or count > LARGEST_NOISE:
@@ -231,10 +198,7 @@ def with_noise_drawn(group: Group) -> Group:
 def values_of(
     group: Group, names: Sequence[str], points: Mapping[str, Any], clock: Clock | None = None
 ) -> tuple[Measures, Any]:
-    """Return (measures {name: (points, runs, ...)}, (points, runs) True where not finite).
-
-    points : {parameter: (points,)}. clock : the group's own where None.
-    """
+    """Return (measures {name: (points, runs, ...)}, (points, runs) True where not finite)."""
     group = group.at(clock or group.clock)
     return _values(group.leaves, group.draws, group.shape, group.clock, tuple(names), dict(points))
 
@@ -245,11 +209,9 @@ def slopes_of(
     values: Mapping[str, Any],
     squares: tuple[tuple[str, float], ...],
 ) -> tuple[Measures, Measures, Any, Any]:
-    """Return measures, slopes, Gauss-Newton and flags of a group at `values`, by forward mode.
-
-    Measures {name: (runs, ...)}, slopes {name: (runs, ..., P)}, the Gauss-Newton matrix (runs, P,
-    P) of `squares`, and (runs,) True where a run is not finite.
-    """
+    """Return measures, slopes, Gauss-Newton and flags of a group at `values`, by forward mode."""
+    # Measures {name: (runs, ...)}, slopes {name: (runs, ..., P)}, the Gauss-Newton matrix (runs, P,
+    # P) of `squares`, and (runs,) True where a run is not finite.
     order, theta = tuple(values), tuple(values.values())
     return _slopes(
         group.leaves, group.draws, group.shape, group.clock, tuple(names), order, theta, squares

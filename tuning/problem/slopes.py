@@ -2,7 +2,6 @@
 
 The tangents of a loop in a limit cycle, or beyond the stability of its step, grow while the run
 itself stays within the limits of its pumps: the derivative is exact, and no run shows such a slope.
-Imported by `search`, `answer`, `live` and `uncertainty`.
 """
 
 from typing import Any, NamedTuple
@@ -23,13 +22,7 @@ ROUNDING = 1e-9
 
 
 class SlopeCheck(NamedTuple):
-    """The slope of the cost at a point, along its gradient, beside the runs near it.
-
-    Examples
-    --------
-    >>> SlopeCheck(False, (-0.6, -0.5), 6.7).to_json()
-    {'usable': False, 'secants': [-0.6, -0.5], 'orders_above': 6.7}
-    """
+    """The slope of the cost at a point, along its gradient, beside the runs near it."""
 
     usable: bool
     secants: tuple[float, ...]  # central differences of the cost, per unit of z, of either length
@@ -43,19 +36,8 @@ class SlopeCheck(NamedTuple):
 
 
 def contradicted(predicted: Any, actual: Any, size: Any) -> Any:
-    """Return (...,) True where derivatives predict changes that exceed all actual ones by ORDERS.
-
-    One change on either side that agrees is enough: at a kink the derivative is that of one side.
-
-    predicted, actual : (moves, ...) changes of values; NaN or infinite where a run diverged.
-    size : (...,) the values themselves.
-
-    Examples
-    --------
-    >>> contradicted(np.array([3e3, -3e3]), np.array([2e-3, 0.1]), 1.0)
-    True
-    >>> contradicted(np.array([3.0, -3.0]), np.array([3.0, 3.0]), 1.0)
-    False
+    """Return (...,) True where derivatives predict changes that exceed all actual ones by
+    ORDERS.
     """
     predicted, actual = np.asarray(predicted), np.asarray(actual)
     actual = np.where(np.isfinite(actual), np.abs(actual), np.inf)
@@ -67,10 +49,8 @@ def contradicted(predicted: Any, actual: Any, size: Any) -> Any:
 
 @np.errstate(all="ignore")  # derivatives may be infinite here
 def check_slope(problem: Problem, point: Point) -> SlopeCheck:
-    """Return the SlopeCheck of a Point, by the cost and the limits of four runs beside it.
-
-    As many points as `diagnostics.neighbours` has, so that one compiled program serves both.
-    """
+    """Return the SlopeCheck of a Point, by the cost and the limits of four runs beside it."""
+    # As many points as `diagnostics.neighbours` has, so that one compiled program serves both.
     z, count = point.z, len(point.z)
     norm = float(np.linalg.norm(point.gradient))
     along = point.gradient / norm if 0.0 < norm < np.inf else np.full(count, count**-0.5)

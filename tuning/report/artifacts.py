@@ -16,17 +16,8 @@ from tuning.report.tables import dumps
 
 
 def rig_text(case):
-    """Return (text of the rig file of a case, None), or (None, why there is none).
-
-    A plant or controller class that is not registered has no name in a rig file.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> text, why = rig_text(presets.find("cascaded/pi"))
-    >>> 'case = "cascaded/pi"' in text, why
-    (True, None)
-    """
+    """Return (text of the rig file of a case, None), or (None, why there is none)."""
+    # A plant or controller class that is not registered has no name in a rig file.
     try:
         return rig.dump(case), None
     except InputError as error:
@@ -41,9 +32,8 @@ def run_for_people(case, key=None, rows=3000):
 
 
 def pngs(drawn):
-    """{file name: bytes} of {name: figure}; the figures are closed. One that cannot be drawn is
-    left out, with a note on stderr.
-    """
+    """{file name: bytes} of {name: figure}; the figures are closed."""
+    # One that cannot be drawn is left out, with a note on stderr.
     from jaxtank.plots.run import png
 
     found = {}
@@ -66,12 +56,10 @@ def earlier(folder, names):
 def write_result(folder, files, draw, page=None, stale=()):
     """Write `files` {name: text, its parts, or bytes} of a result to `folder`, all or none, then
     its pictures, all or none; returns the paths.
-
-    draw: function that returns {name: figure}, called once the files are written; page: function of
-        these that returns report.html;
-    stale: paths of an earlier result, removed between the two. What cannot be drawn is left out,
-        with a note on stderr.
     """
+    # draw: function that returns {name: figure}, called once the files are written; page: function
+    # of these that returns report.html; stale: paths of an earlier result, removed between the two.
+    # What cannot be drawn is left out, with a note on stderr.
     folder = Path(folder)
     written = write_folder(folder, files)
     for path in stale:

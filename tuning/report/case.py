@@ -30,13 +30,7 @@ MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
 
 
 def clock(clock):
-    """Return the clock as a dict.
-
-    Examples
-    --------
-    >>> clock(presets.find("cascaded/pi").clock)["dt"]
-    4.0
-    """
+    """Return the clock as a dict."""
     return dataclasses.asdict(clock)
 
 
@@ -95,13 +89,7 @@ def _parameters(case, preset):
 
 
 def text(case):
-    """Return the page of `jaxtank show`.
-
-    Examples
-    --------
-    >>> print(text(presets.find("cascaded/pi")).splitlines()[0])
-    cascaded/pi: two tanks in cascade, PI
-    """
+    """Return the page of `jaxtank show`."""
     page, preset = json_of(case), _preset(case)
     head = [
         *textwrap.wrap(f"{page['case']}: {page['title']}", WIDTH),
@@ -211,10 +199,7 @@ def _paper(case, preset, page):
 
 
 def grid(rows, head, widths):
-    """Return rows as a table whose cells are wrapped.
-
-    widths: of all columns but the last, which fills WIDTH.
-    """
+    """Return rows as a table whose cells are wrapped."""
     rows = [[str(c) for c in row] for row in rows]
     widths = [min(w, max(len(row[i]) for row in [head, *rows])) for i, w in enumerate(widths)]
     widths = [*widths, WIDTH - sum(widths) - 2 * len(widths)]
@@ -244,8 +229,6 @@ def _item(sentence):
 def _docstring(part, units):
     """Return the description of a component's class: its docstring up to the numpydoc sections,
     units in brackets in those of the rig.
-
-    Prose is wrapped; indented lines stay as they are.
     """
     lines, prose = [], []
     description = SECTION.split(inspect.cleandoc(type(part).__doc__ or ""), maxsplit=1)[0]

@@ -10,10 +10,7 @@ from tuning.problem.wording import count
 
 
 def own_name(case, kind, i):
-    """Return " (left)" for the tank or pump `i` that its rig file calls left, else "".
-
-    kind: "tank" or "pump".
-    """
+    """Return " (left)" for the tank or pump `i` that its rig file calls left, else ""."""
     name = case.names.get(kind, {i: ""})[i]
     return f" ({name})" if name else ""
 

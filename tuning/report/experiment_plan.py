@@ -1,4 +1,4 @@
-"""The text of `jaxtank identify --plan`. Imported by this command."""
+"""The text of `jaxtank identify --plan`."""
 
 import numpy as np
 
@@ -7,10 +7,8 @@ from tuning.report import tables
 
 
 def plan_text(case, found, best, plan):
-    """Return the text of `identify --plan`: a table of `compare_experiments` and the best one.
-
-    plan: {"duration" [s], "dt" [s], "noise", "levels": measured tanks or None}.
-    """
+    """Return the text of `identify --plan`: a table of `compare_experiments` and the best one."""
+    # plan: {"duration" [s], "dt" [s], "noise", "levels": measured tanks or None}.
     letters, rows = dict(zip("ABCDEFGH", found)), []
     for name in next(iter(found.values()))["sd"]:
         value = float(np.asarray(get_value(case.loop, name)))

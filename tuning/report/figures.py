@@ -1,5 +1,5 @@
 """Figures of what lies behind a run: the rig, its upper tanks and its pumps, the observer, the
-limits. Imported by the reports; a figure without content is left out.
+limits.
 """
 
 import sys
@@ -24,20 +24,14 @@ def failed(name, error, *figures):
 
 
 def rig(loop, run=None, title=""):
-    """Return {"rig": schematic of the loop's plant, filled as at the end of `run`}.
-
-    {} for a plant that is no network of tanks.
-    """
+    """Return {"rig": schematic of the loop's plant, filled as at the end of `run`}."""
     from jaxtank.plots.run import rig
 
     return rig(loop.plant, run, title)
 
 
 def inner(loop, runs):
-    """Return {"inner": phase plot of the first two tanks that are not controlled}, {} without.
-
-    runs: {name: Trajectory}, before and after, or one.
-    """
+    """Return {"inner": phase plot of the first two tanks that are not controlled}, {} without."""
     import matplotlib.pyplot as plt
 
     from jaxtank.plots import diagnostics, responses
@@ -59,10 +53,7 @@ def inner(loop, runs):
 
 
 def saturation(loop, runs):
-    """Return {"saturation": when each pump was commanded beyond its limits}; {} where none was.
-
-    runs: {name: Trajectory}.
-    """
+    """Return {"saturation": when each pump was commanded beyond its limits}; {} where none was."""
     import matplotlib.pyplot as plt
 
     from jaxtank.plots import diagnostics, responses
@@ -80,10 +71,8 @@ def saturation(loop, runs):
 
 
 def estimates(loop, clock, run, title=""):
-    """Return {"estimates": levels and disturbances as the observer estimated them}.
-
-    {} where the controller takes the levels as they are measured.
-    """
+    """Return {"estimates": levels and disturbances as the observer estimated them}."""
+    # {} where the controller takes the levels as they are measured.
     import matplotlib.pyplot as plt
 
     from jaxtank.plots import diagnostics, responses
@@ -165,10 +154,7 @@ def margins(rows):
 
 
 def tradeoff(found, unit, cost_unit):
-    """Return {"tradeoff": least objective over a limit}; {} where `found` is None.
-
-    found: as `tuning.tradeoff` returns it.
-    """
+    """Return {"tradeoff": least objective over a limit}; {} where `found` is None."""
     import matplotlib.pyplot as plt
 
     from jaxtank.plots import diagnostics, responses

@@ -38,34 +38,12 @@ def style():
 
 
 def escape(text):
-    """Return `text` as it may stand in HTML, in an attribute as well.
-
-    Examples
-    --------
-    >>> escape('<script>"1" & 2')
-    '&lt;script&gt;&quot;1&quot; &amp; 2'
-    """
+    """Return `text` as it may stand in HTML, in an attribute as well."""
     return html.escape(str(text), quote=True)
 
 
 def fragment(lines):
-    """Return lines and Tables as HTML for a notebook: tables, lists and paragraphs, all escaped.
-
-    Parameters
-    ----------
-    lines : list of str or Table
-        What a result prints. Lines of the form "name: value" make a table of two columns where
-        there is no other table.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> "<td>cost</td><td>1.5 &lt;b&gt;</td>" in fragment(["cost: 1.5 <b>"])
-    True
-    """
+    """Return lines and Tables as HTML for a notebook: tables, lists and paragraphs, all escaped."""
     if not any(hasattr(line, "rows") for line in lines):
         cells = [line.partition(": ") for text in lines for line in str(text).splitlines()]
         lines = [table([[name, value] for name, _, value in cells], ["", ""])]
@@ -87,35 +65,7 @@ def document(
     live="",
     live_last=False,
 ):
-    """Return the whole page as text; the same arguments give the same bytes.
-
-    Parameters
-    ----------
-    title, subtitle : str
-        Of the page.
-    status : str
-        How the study ended.
-    good : bool
-        False marks the status as a warning.
-    facts : list of (str, str)
-        (what, value) to be read first.
-    sentences : list of str
-        The result in words.
-    pictures : list of (str, str, str)
-        (unique name, SVG of `svg`, caption).
-    parts : list of str or Table
-        Lines and tables as the command prints them.
-    command : str or None
-        The command line that made the result.
-    provenance : dict or None
-        {name: value}.
-    files : dict or None
-        {name: text} to be unfolded.
-    live : str
-        Element with the live page (`tuning.report.panel`), "" for none.
-    live_last : bool
-        Whether the live page follows the numbers; otherwise it comes before the words.
-    """
+    """Return the whole page as text; the same arguments give the same bytes."""
     body = [f"<h1>{escape(title)}</h1>", f"<p>{escape(subtitle)}</p>" if subtitle else ""]
     body.append(f'<p class="status{"" if good else " warn"}">{escape(status)}</p>')
     if facts:
@@ -248,21 +198,13 @@ def _cell(value, heading):
 
 
 def identifier(name):
-    """Return `name` as an id of HTML and SVG.
-
-    Examples
-    --------
-    >>> identifier("Fit of log 1")
-    'fit-of-log-1'
-    """
+    """Return `name` as an id of HTML and SVG."""
     return re.sub(r"[^a-z0-9]+", "-", str(name).lower()).strip("-") or "picture"
 
 
 def drawings(drawn, captions):
-    """Return [(name, SVG, caption)] of {name: figure}.
-
-    A figure that cannot be drawn is removed from `drawn`, with a note on stderr.
-    """
+    """Return [(name, SVG, caption)] of {name: figure}."""
+    # A figure that cannot be drawn is removed from `drawn`, with a note on stderr.
     found = []
     for name, figure in list(drawn.items()):
         try:
@@ -274,17 +216,9 @@ def drawings(drawn, captions):
 
 
 def svg(figure, name, caption=""):
-    """Return a matplotlib figure as an <svg> element without dates; its ids begin with `name`.
-
-    A picture of more than LARGEST characters has its dense lines rasterised. The figure is left
-    open, its layout as it is now: what is drawn of it later need not be laid out again.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> svg(Figure(), "empty", "no axes")[:39]
-    '<svg role="img" aria-label="no axes" wi'
-    """
+    """Return a matplotlib figure as an <svg> element without dates; its ids begin with `name`."""
+    # A picture of more than LARGEST characters has its dense lines rasterised. The figure is left
+    # open, its layout as it is now: what is drawn of it later need not be laid out again.
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     text = _saved(figure, name)

@@ -324,9 +324,8 @@ def page_of(found, drawn, command=None):
 
 
 def save(found, folder, command=None):
-    """Write result.json, fit.csv, figures, report.html and, if identifiable, rig.toml to `folder`.
-
-    command: the command line, for the report. Returns the paths.
+    """Write result.json, fit.csv, figures, report.html and, if identifiable, rig.toml to
+    `folder`.
     """
     check_folder(folder)
     rig, why = artifacts.rig_text(found.identified) if found.identifiable else (None, None)
@@ -348,10 +347,8 @@ def save(found, folder, command=None):
 
 
 def _left_over(folder, files):
-    """Return files of an earlier identification in the folder that this one does not write.
-
-    A rig file of the earlier one must not be taken for that of this one.
-    """
+    """Return files of an earlier identification in the folder that this one does not write."""
+    # A rig file of the earlier one must not be taken for that of this one.
     if not (folder / "fit.csv").exists():
         return []
     ours = [folder / n for n in ("rig.toml", "fit.png", "correlation.png", "profile.png")]

@@ -1,6 +1,5 @@
-"""Figures of an Identification: fit, residuals, correlation of the estimates, profile likelihood.
-
-Imported by `identification`.
+"""Figures of an Identification: fit, residuals, correlation of the estimates, profile
+likelihood.
 """
 
 import numpy as np

@@ -7,13 +7,7 @@ from tuning.report.tables import number, table
 
 
 def json_of(plateaus):
-    """Return the list `margins` of the JSON of `simulate`: an object for each plateau.
-
-    Examples
-    --------
-    >>> json_of(())
-    []
-    """
+    """Return the list `margins` of the JSON of `simulate`: an object for each plateau."""
     rows = []
     for p in plateaus:
         values = {m: v for m, v in p.margins._asdict().items() if m != "stable"}
@@ -23,18 +17,8 @@ def json_of(plateaus):
 
 
 def text(loop, plateaus):
-    """Return a table of the margins at each plateau, the worst one marked, and why there are none.
-
-    Examples
-    --------
-    >>> import jax
-    >>> import jaxtank
-    >>> from jaxtank import presets
-    >>> jax.config.update("jax_enable_x64", True)
-    >>> case = presets.find("cascaded/pi")
-    >>> found = jaxtank.stability_margins(case.loop, case.clock)
-    >>> print(*text(case.loop, found).splitlines()[3].split())
-    4 V 1.86 17.3 37.9 35.9
+    """Return a table of the margins at each plateau, the worst one marked, and why there
+    are none.
     """
     if not plateaus:
         return "no stability margins: the reference holds no setpoints"

@@ -5,16 +5,8 @@ from tuning.report.figures import failed
 
 
 def panel(result):
-    """Return an element with the live page of a result or of a Case, for a report.
-
-    "" for a case that cannot be run in a browser, with a note on stderr where that is not known.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> panel(presets.find("cascaded/pi"))[:20]
-    '<iframe class="live"'
-    """
+    """Return an element with the live page of a result or of a Case, for a report."""
+    # "" for a case that cannot be run in a browser, with a note on stderr where that is not known.
     from tuning.live import shown  # only where a page is written
 
     try:

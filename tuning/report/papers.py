@@ -1,7 +1,4 @@
-"""`jaxtank compare`: what a paper prints beside what is measured here, with a verdict.
-
-Imported by the command line and the benchmarks.
-"""
+"""`jaxtank compare`: what a paper prints beside what is measured here, with a verdict."""
 
 import textwrap
 from collections import Counter
@@ -40,11 +37,9 @@ SAME = 1e-9
 
 
 def runner(paper):
-    """Return run(case name, values={}, save_every=1, seed=0) of a paper; each run is made once.
-
-    It returns (Case with `values` set, Trajectory as host arrays); `seed` draws the sensor noise.
-    run.cost(name, values={}) is the `cost` of such a case.
-    """
+    """Return run(case name, values={}, save_every=1, seed=0) of a paper; each run is made once."""
+    # It returns (Case with `values` set, Trajectory as host arrays); `seed` draws the sensor noise.
+    # run.cost(name, values={}) is the `cost` of such a case.
     preset, known = presets.load(paper), {}
 
     def run(name, values=None, save_every=1, seed=0):
@@ -73,12 +68,10 @@ def cost(case):
 
 
 def verdict(published, measured):
-    """Return (verdict, measured value or text, reason) of one published quantity.
-
-    measured: number, tuple, Sample, Claim or None. The verdict is one of VERDICTS. A number that
-    equals the printed one is an input, where no closed form is named: no simulation agrees with a
-    rounded number to 1e-9.
-    """
+    """Return (verdict, measured value or text, reason) of one published quantity."""
+    # measured: number, tuple, Sample, Claim or None. The verdict is one of VERDICTS. A number that
+    # equals the printed one is an input, where no closed form is named: no simulation agrees with a
+    # rounded number to 1e-9.
     reason = published.reason
     if isinstance(measured, Claim):
         near = measured.verdict != "not reproduced"
@@ -114,16 +107,14 @@ def verdict(published, measured):
 def measure(paper):
     """Return the comparison of a paper: {"paper", "citation", "notes", "headline", "ramps",
     "rows"}.
-
-    The keys of a row: quantity, kind ("number" or "claim"), unit, where, published, measured,
-    deviation (of one run, where several were made with noise), verdict, reason, ramp_s (duration
-    of the setpoint ramps of its runs [s], where the paper prints none) and by_ramp (its verdict
-    with each duration).
-
-    A parameter that the paper prints is compared with the value in the preset's first case that has
-    it. Raises InputError for an unknown paper, and KeyError if the preset measures something that
-    it does not list as published.
     """
+    # The keys of a row: quantity, kind ("number" or "claim"), unit, where, published, measured,
+    # deviation (of one run, where several were made with noise), verdict, reason, ramp_s (duration
+    # of the setpoint ramps of its runs [s], where the paper prints none) and by_ramp (its verdict
+    # with each duration).
+    # A parameter that the paper prints is compared with the value in the preset's first case that
+    # has it. Raises InputError for an unknown paper, and KeyError if the preset measures something
+    # that it does not list as published.
     preset = presets.load(paper)
     found = preset.measured(runner(paper))
     stray = set(found) - set(preset.published)
@@ -422,10 +413,7 @@ def _in_full(found):
 
 
 def markdown(pages):
-    """Return the table of tests/benchmarks/README.md: every measured quantity of {paper: page}.
-
-    Parameters that are only quoted are left out. The headline of each paper stands above it.
-    """
+    """Return the table of tests/benchmarks/README.md: every measured quantity of {paper: page}."""
     every = [row for page in pages.values() for row in page["rows"]]
     lines = [f"All papers: {headline_text(every)}.", ""] if len(pages) > 1 else []
     for paper, page in pages.items():

@@ -25,17 +25,7 @@ WORST = 12
 
 
 def page_of(case, values, drawn, command=None, provenance=None):
-    """Return the page of a run: whether the limits hold, the live page, pictures, measures.
-
-    Parameters
-    ----------
-    case : Case
-    values : {measure: value}
-    drawn : {name of CAPTIONS: figure}
-    command : str or None
-        The line that made it.
-    provenance : dict or None
-    """
+    """Return the page of a run: whether the limits hold, the live page, pictures, measures."""
     rows = _limits(case, values)
     broken = [words for words, margin in rows if not margin >= 0.0]
     status = "no limits"

@@ -1,7 +1,4 @@
-"""What is proved of the levels of a case: the tables of its safety filter.
-
-Imported by the page of `jaxtank show`.
-"""
+"""What is proved of the levels of a case: the tables of its safety filter."""
 
 import numpy as np
 
@@ -22,15 +19,7 @@ PROMISE = (
 
 
 def start_of(starts):
-    """Return in words from which levels at t = 0 all of several limits are proved.
-
-    starts : ANY or OWN of each.
-
-    Examples
-    --------
-    >>> start_of(["any at or below the limits", "the given start"])
-    "from levels at or below the case's start"
-    """
+    """Return in words from which levels at t = 0 all of several limits are proved."""
     highest = "the limits" if set(starts) == {ANY} else "the case's start"
     return f"from levels at or below {highest}"
 
@@ -40,12 +29,6 @@ def certificates(case):
     "low"}], one for each tank, of the safety filter that the case has or could have; tanks from 1;
     None where there is no filter for its plant. starts: None where it is not certified. low:
     {"limit", "certified", "why"}, None without one.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> [row["certified"] for row in certificates(presets.find("cascaded/pi"))]
-    [True, True]
     """
     try:
         _, rows = case.safety_design(**(case.safety or {}))

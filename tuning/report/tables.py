@@ -11,12 +11,8 @@ from jaxtank.core.units import DEFAULT
 
 
 def number(value, digits=5):
-    """Return a number for people: at most `digits` significant digits, a dash where there is none.
-
-    Examples
-    --------
-    >>> number(1.23456789), number(1.5e-7), number(float("nan"))
-    ('1.2346', '1.5000e-07', '-')
+    """Return a number for people: at most `digits` significant digits, a dash where there
+    is none.
     """
     value = float(value)
     if not math.isfinite(value):
@@ -28,15 +24,8 @@ def number(value, digits=5):
 
 
 def numbers(value, digits=5):
-    """Return the entries of a measure, side by side; "none" for one that is undefined.
-
-    A dash would read as the sign of the entry after it.
-
-    Examples
-    --------
-    >>> numbers([1.0, 2.5]), numbers([float("inf"), 3.0])
-    ('1  2.5', 'none  3')
-    """
+    """Return the entries of a measure, side by side; "none" for one that is undefined."""
+    # A dash would read as the sign of the entry after it.
     values = np.ravel(np.asarray(value, dtype=float))
     return "  ".join(number(v, digits) if math.isfinite(v) else "none" for v in values)
 
@@ -46,15 +35,7 @@ MANY = 16
 
 
 def entries(measure, value):
-    """Return the entries of a measure; of more than 16, the four worst with their numbers.
-
-    Examples
-    --------
-    >>> entries("max_level", [1.0, 2.5])
-    '1  2.5'
-    >>> entries("max_level", range(20))
-    'worst of 20: 19 (tank 20), 18 (tank 19), 17 (tank 18), 16 (tank 17)'
-    """
+    """Return the entries of a measure; of more than 16, the four worst with their numbers."""
     values, spec = np.ravel(np.asarray(value, dtype=float)), ms.MEASURES[measure]
     if len(values) <= MANY:
         return numbers(values)
@@ -68,15 +49,7 @@ def entries(measure, value):
 
 
 def undefined(measures):
-    """Return sentences: why entries of {measure: value} are printed as "none".
-
-    Examples
-    --------
-    >>> undefined({"max_level": [3.0]})
-    []
-    >>> undefined({"estimation_rms": [float("nan")]})[0].startswith("estimation_rms: none, because")
-    True
-    """
+    """Return sentences: why entries of {measure: value} are printed as "none"."""
     return [
         f"{m}: none, because {why}"
         for m, v in measures.items()
@@ -85,13 +58,7 @@ def undefined(measures):
 
 
 def reasons(measures):
-    """Return {measure: why} of every measure that is absent or has an entry that is not finite.
-
-    Examples
-    --------
-    >>> reasons({"settling_time": [3.0, float("inf")]})["settling_time"]
-    'the output was outside its band as the setpoint changed again or the run ended'
-    """
+    """Return {measure: why} of every measure that is absent or has an entry that is not finite."""
     found = {m: why for m, values in measures.items() if (why := _why(m, values))}
     return {**found, **{m: why for m, why in _unserved().items() if m not in measures}}
 
@@ -122,24 +89,12 @@ def measures_json(measures):
 
 
 def dumps(table):
-    """Return one JSON object as text; ValueError for NaN.
-
-    Examples
-    --------
-    >>> dumps({"a": 1})
-    '{\\n  "a": 1\\n}'
-    """
+    """Return one JSON object as text; ValueError for NaN."""
     return json.dumps(table, indent=2, allow_nan=False)
 
 
 def units(rig_units):
-    """Return {measure: unit} on a rig with these (length, pump input) units.
-
-    Examples
-    --------
-    >>> units(DEFAULT)["max_level"]
-    'cm'
-    """
+    """Return {measure: unit} on a rig with these (length, pump input) units."""
     return {m: ms.unit(m, rig_units) for m in ms.MEASURES}
 
 
@@ -151,15 +106,7 @@ class Table(str):
 
 
 def table(rows, head=None):
-    """Return rows of text as aligned columns: a Table.
-
-    Examples
-    --------
-    >>> print(table([["k", 1.5]], ["gain", "value"]))
-    gain  value
-    -----------
-    k     1.5
-    """
+    """Return rows of text as aligned columns: a Table."""
     body = [[str(c) for c in row] for row in rows]
     rows = ([head] if head else []) + body
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
@@ -184,25 +131,12 @@ def measure_table(values, rig_units=DEFAULT):
 
 
 def wrap(message):
-    """Return the parts of a message as lines that begin with a dash.
-
-    Examples
-    --------
-    >>> print(wrap("no limit is tight; the search converged"))
-    - no limit is tight
-    - the search converged
-    """
+    """Return the parts of a message as lines that begin with a dash."""
     return "\n".join(f"- {part}" for part in message.split("; "))
 
 
 def objective_unit(terms, rig_units=DEFAULT):
-    """Return the unit of a weighted sum: that of its measures where they share one, else "-".
-
-    Examples
-    --------
-    >>> objective_unit({"rms_error": 1.0}), objective_unit({"rms_error": 1.0, "iae": 1.0})
-    ('cm', '-')
-    """
+    """Return the unit of a weighted sum: that of its measures where they share one, else "-"."""
     found = {ms.unit(m, rig_units) for m in terms}
     return found.pop() if len(found) == 1 else "-"
 

@@ -1,7 +1,4 @@
-"""What is computed about an answer: sensitivity, curvature, symmetry, length of the steps.
-
-Imported by `tuner` and `messages`.
-"""
+"""What is computed about an answer: sensitivity, curvature, symmetry, length of the steps."""
 
 import math
 
@@ -25,13 +22,10 @@ LARGEST_CURVATURE = 24
 
 
 def step_warnings(problem, tuned, values, key=None):
-    """Return [] where the steps of the tuned case and of its scenarios are short enough.
-
-    Else one sentence: which run is wrong, because an explicit step was unstable near an empty tank,
-    or what would happen to a tank that runs empty. Runs are made only where there is a warning.
-
-    values : {parameter: the answer's}. key : of the sensor noise of the case's own run.
-    """
+    """Return [] where the steps of the tuned case and of its scenarios are short enough."""
+    # Else one sentence: which run is wrong, because an explicit step was unstable near an empty
+    # tank, or what would happen to a tank that runs empty. Runs are made only where there is a
+    # warning.
     runs = [("", tuned.loop, tuned.clock, key)]
     for run in problem.runs[:CHECKED_RUNS] if problem.scenarios else ():
         loop = with_values(run.case.loop, values)
@@ -55,10 +49,7 @@ def _unstable_step(loop, clock, key):
 
 
 def neighbours(problem, z):
-    """Return (2 P + 1, P) z (P,) itself, and with 10 % less and 10 % more of each parameter.
-
-    10 % of the range where a parameter is linear.
-    """
+    """Return (2 P + 1, P) z (P,) itself, and with 10 % less and 10 % more of each parameter."""
     trials = [z]
     for i, b in enumerate(problem.bounds):
         value = float(b.from_unit(z[i]))
@@ -69,27 +60,15 @@ def neighbours(problem, z):
 
 
 def sensitivities(costs):
-    """Return the larger change [%] by each parameter, of the costs of `neighbours`.
-
-    None where the objective is not finite.
-
-    Examples
-    --------
-    >>> sensitivities(np.array([2.0, 2.5, 3.0, np.nan, 2.0]))
-    [50.0, None]
-    """
+    """Return the larger change [%] by each parameter, of the costs of `neighbours`."""
+    # None where the objective is not finite.
     with np.errstate(divide="ignore", invalid="ignore"):  # a cost of 0 has no percent
         change = 100 * np.abs(costs[1:] / costs[0] - 1).reshape(-1, 2).max(axis=1)
     return [float(c) if np.isfinite(c) else None for c in change]
 
 
 def unexercised(problem, search, first):
-    """Return (P,) True for each parameter that no run exercises at the best point of a Search.
-
-    Such a parameter (a knot of a schedule outside the range of the setpoints) has no slope in the
-    cost, in a limit or in a scenario, and no reported measure changes with its value. The best
-    point is replaced by one where these parameters have their values at `first` (P,), the start.
-    """
+    """Return (P,) True for each parameter that no run exercises at the best point of a Search."""
     point = search.best
     flat = ~np.any(np.vstack([point.gradient, point.margin_slopes, point.run_slopes]), axis=0)
     idle = np.zeros(len(first), dtype=bool)
@@ -123,17 +102,7 @@ def unexercised(problem, search, first):
 
 
 def curvature(problem, search, point, idle=None):
-    """Return the second derivative of the scaled cost along the free directions.
-
-    Those that no active limit or bound fixes; by differences of the exact gradient.
-
-    idle : (P,) True for parameters that are left as they are.
-    Returns None where there is none to compute, else {"eigenvalues": [...] rising, "directions":
-    [{name: component}, ...] in the unit cube, "least_sensitive": {...}}: a step along the first
-    direction that changes its largest component by 10 % (of the range, where the parameter is
-    linear), {"factors": {name: ratio or change, as printed}, "changes_percent": of the objective,
-    run with these very numbers}.
-    """
+    """Return the second derivative of the scaled cost along the free directions."""
     z, count = point.z, len(point.z)
     # nothing is a share of an objective of 0
     if count < 2 or count > LARGEST_CURVATURE or point.cost == 0.0:
@@ -223,10 +192,7 @@ def _short_factors(bounds, z, there, gradient, matrix):
 
 
 def _rounded(b, old, new, decimals):
-    """Return the ratio (a change, where the parameter is linear) that takes z = old to new.
-
-    To so many decimals (of the range) within it.
-    """
+    """Return the ratio (a change, where the parameter is linear) that takes z = old to new."""
     before, after = float(b.from_unit(old)), float(b.from_unit(new))
     exact = after / before if b.scale == "log" else after - before
     size = min(exact, 1.0) if b.scale == "log" else b.high - b.low
@@ -264,11 +230,7 @@ def direction_words(problem, found):
 
 
 def symmetric(problem, outcomes, values):
-    """Return the answer with the gains exchanged that the case names as a permutation symmetry.
-
-    None where the case has none, or outside the ranges. Else {"words", "values" {name: value},
-    "objective", "starts": indices of the searches that ended there rather than here}.
-    """
+    """Return the answer with the gains exchanged that the case names as a permutation symmetry."""
     if problem.case.symmetry is None:
         return None
     image = problem.case.symmetry.image(values)

@@ -1,7 +1,5 @@
 """Discrete choices (a number of Laguerre terms, a pairing, the controller) by enumeration: the best
 is taken.
-
-Imported by `tuner`, which it calls through its argument.
 """
 
 import itertools
@@ -37,23 +35,11 @@ def tune_choices(
     resume: bool = False,
     **options: Any,
 ) -> TuningResult:
-    """Return the best TuningResult of all combinations of `choices`, with `choices` a row for each.
-
-    One that holds every limit is preferred to one that does not, then the smaller violation, then
-    the lower objective.
-
-    Parameters
-    ----------
-    tune : what is called for each combination, with `options`.
-    choices : {static name: [values]}; "controller.kind" (or "law.kind", as the table of a rig file
-        is called) is the controller, each kind with its own gains and ranges (`with_kind`). A kind
-        that the rig cannot have is a row of `choices` that says why.
-    checkpoint : folder with a log of its own for every combination, which resume=True continues.
-
-    Raises
-    ------
-    InputError : for a choice that the case cannot have.
+    """Return the best TuningResult of all combinations of `choices`, with `choices` a row
+    for each.
     """
+    # One that holds every limit is preferred to one that does not, then the smaller violation, then
+    # the lower objective.
     variants = _variants(case, choices, options.get("free"))
     if resume and not any(_folder(checkpoint, i).is_dir() for i in range(len(variants))):
         raise InputError(

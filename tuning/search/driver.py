@@ -1,7 +1,4 @@
-"""A search as a solver uses it: scaled cost and margins, cached points, the best point so far.
-
-Imported by the methods, which call nothing of the problem but this.
-"""
+"""A search as a solver uses it: scaled cost and margins, cached points, the best point so far."""
 
 import dataclasses
 from collections.abc import Callable
@@ -26,15 +23,7 @@ converged.
 
 
 class Search:
-    """A problem as a solver uses it.
-
-    Parameters
-    ----------
-    problem : the Problem.
-    reference : a Point; the cost is scaled by its own.
-    report : called with this Search after every evaluation.
-    tolerance : change of the scaled cost below which a search has converged [-].
-    """
+    """A problem as a solver uses it."""
 
     def __init__(
         self,
@@ -93,11 +82,7 @@ class Search:
         return float(max(0.0, *(-point.margins / self.limit_scale))) if len(point.margins) else 0.0
 
     def return_to_start(self) -> bool:
-        """Return True if the best point is now the start, whose derivatives are not finite.
-
-        No search can go on from there, but nothing that was found is better. Any other point of
-        this kind, of an unstable or chaotic run, is no answer.
-        """
+        """Return True if the best point is now the start, whose derivatives are not finite."""
         start = self.reference
         if start.finite or not start.valued:
             return False
@@ -112,11 +97,9 @@ class Search:
         return va < vb if max(va, vb) > 0 and va != vb else a.cost < b.cost
 
     def cost(self, z: Any) -> tuple[float, np.ndarray]:
-        """Return (scaled cost, gradient (P,)).
-
-        A point that is not finite costs ten times the start, and its gradient points back to the
-        last finite one.
-        """
+        """Return (scaled cost, gradient (P,))."""
+        # A point that is not finite costs ten times the start, and its gradient points back to the
+        # last finite one.
         point = self.point(z)
         if point.finite:
             return point.cost / self.scale, point.gradient / self.scale
@@ -131,10 +114,8 @@ class Search:
 
 
 def event_of(search: Search, starts: int, **more: Any) -> dict[str, Any]:
-    """Return what `progress` is called with after an evaluation: numbers of the search, and `more`.
-
-    "details" is a function without arguments: parameters and limits at the best point so far, as
-    `details_of` returns them.
+    """Return what `progress` is called with after an evaluation: numbers of the search,
+    and `more`.
     """
     best, last = search.best, search.history[-1]
     return {
@@ -152,12 +133,7 @@ def event_of(search: Search, starts: int, **more: Any) -> dict[str, Any]:
 
 
 def details_of(problem: Problem, best: Point | None) -> dict[str, Any]:
-    """Return the parameters and the limits of a problem at a point, as JSON objects.
-
-    {"parameters": [{"name", "unit", "low", "high", "before", "now"}], "limits": [{"name", "unit",
-    "value", "sense": 1 for an upper limit and -1 for a lower one, "margin": the smallest of all
-    runs}]}; "now" is None and "limits" is empty without a point.
-    """
+    """Return the parameters and the limits of a problem at a point, as JSON objects."""
     now: dict[str, float] = {} if best is None else problem.values(best.z)
     parameters = [
         {
@@ -189,10 +165,7 @@ def details_of(problem: Problem, best: Point | None) -> dict[str, Any]:
 
 
 class CoarseSearch(Search):
-    """The same problem at a tenth of the samples, on the same scale.
-
-    What it finds is a start, and is no candidate for the best point.
-    """
+    """The same problem at a tenth of the samples, on the same scale."""
 
     def __init__(self, search: Search):
         super().__init__(search.problem, search.last_finite, search.report)

@@ -12,20 +12,14 @@ cost near instability should turn it back, and not move it far away.
 
 
 def lbfgs(search, z, iterations):
-    """Return True if optax's L-BFGS converged: halving steps, projected onto the bounds.
-
-    Limits by augmented Lagrangian.
-    """
+    """Return True if optax's L-BFGS converged: halving steps, projected onto the bounds."""
     import optax
 
     return _augmented(search, z, iterations, optax.scale_by_lbfgs(memory_size=8), descend=True)
 
 
 def adam(search, z, iterations):
-    """Return True if optax's Adam converged: five steps an iteration, projected onto the bounds.
-
-    Limits by augmented Lagrangian.
-    """
+    """Return True if optax's Adam converged: five steps an iteration, projected onto the bounds."""
     import optax
 
     steps = 5 * iterations
@@ -34,11 +28,7 @@ def adam(search, z, iterations):
 
 
 def minibatches(search, z, iterations, batch, rng):
-    """Return True if optax's Adam converged on `batch` scenarios, drawn anew for every step.
-
-    Their limits by a quadratic penalty. All scenarios are evaluated ten times on the way, and those
-    evaluations decide what is best.
-    """
+    """Return True if optax's Adam converged on `batch` scenarios, drawn anew for every step."""
     import optax
 
     steps = 5 * iterations

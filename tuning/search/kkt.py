@@ -26,12 +26,10 @@ LOWER_BY = 1e-4
 
 
 def optimality(search, point):
-    """Return (gradient norm, KKT residual, multipliers of the limits) at a point.
-
-    All of the scaled cost per unit of z. The residual is what is left of the gradient after the
-    best non-negative combination of the slopes of active limits and bounds. Infinite where a
-    derivative is not finite.
-    """
+    """Return (gradient norm, KKT residual, multipliers of the limits) at a point."""
+    # All of the scaled cost per unit of z. The residual is what is left of the gradient after the
+    # best non-negative combination of the slopes of active limits and bounds. Infinite where a
+    # derivative is not finite.
     if not point.finite:
         return np.inf, np.inf, np.zeros(len(point.margins))
     residual, multipliers = _residual(search, point)
@@ -43,10 +41,7 @@ def optimality(search, point):
 
 
 def named_optimality(search, point):
-    """Return {"gradient_norm", "kkt_residual", "multipliers": {limit: value}} of a point.
-
-    Nothing where there is no point, or no slope of use there.
-    """
+    """Return {"gradient_norm", "kkt_residual", "multipliers": {limit: value}} of a point."""
     if search is None or point is None or not search.slope(point).usable:
         return {"gradient_norm": None, "kkt_residual": None, "multipliers": {}}
     norm, residual, multipliers = optimality(search, point)
@@ -81,11 +76,7 @@ def _residual(search, point):
 
 
 def downhill(search, point):
-    """Return a feasible Point that is lower than `point`, found along the gradient that is left.
-
-    Lower by more than the cost can be trusted to. None where there is none: the point is an
-    optimum, or at a kink.
-    """
+    """Return a feasible Point that is lower than `point`, found along the gradient that is left."""
     if not point.finite:
         return None
     residual, _ = _residual(search, point)

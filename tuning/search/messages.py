@@ -1,6 +1,6 @@
 """Findings about a tuning result as Messages: one small function for each, in the order of RULES.
 
-Imported by `tuner`. The codes are stable: programs filter by them, and texts may change.
+The codes are stable: programs filter by them, and texts may change.
 
 ===============================  =============================================================
 code                             reported when
@@ -60,10 +60,7 @@ CHATTER = 10.0
 
 
 def messages_of(result: TuningResult, steps: Iterable[str] = ()) -> tuple[Message, ...]:
-    """Return the findings about a result, most important first.
-
-    steps : sentences on integration steps that are too long for the answer.
-    """
+    """Return the findings about a result, most important first."""
     first = [Message("step-too-long", text) for text in steps]
     return (*first, *(message for rule in RULES for message in rule(result)))
 

@@ -1,7 +1,4 @@
-"""Local searches from one start: each takes a Search, may stop early, and may not fail.
-
-Imported by `stages`, `pareto` and `tuning.answer`; `search_task` by workers of a cluster.
-"""
+"""Local searches from one start: each takes a Search, may stop early, and may not fail."""
 
 from typing import NamedTuple
 
@@ -101,10 +98,8 @@ class _Watch:
 
 
 def _epigraph(search, z, iterations, tolerance):
-    """Return True if `slsqp` of the worst scenario converged.
-
-    min t subject to cost_i <= t, which is smooth where the largest cost is not.
-    """
+    """Return True if `slsqp` of the worst scenario converged."""
+    # min t subject to cost_i <= t, which is smooth where the largest cost is not.
 
     def known(z):
         point = search.point(z)
@@ -134,14 +129,7 @@ def _epigraph(search, z, iterations, tolerance):
 
 
 def trf(search, z, iterations, tolerance=1e-10):
-    """Return True if a bounded Gauss-Newton trust region converged, without the limits.
-
-    tolerance: share of the cost, of the step and of the slope at which it ends, or that of the
-    search where this is wider than EXACT: what a mean over plants is worth.
-    On P + 1 residuals that have the cost's value, gradient and second derivative, the latter
-    without the residuals' own curvature: with value c, gradient g and normal matrix L L', the
-    residuals are (L^-1 g, sqrt(c - |L^-1 g|^2)) and their Jacobian is (L', 0).
-    """
+    """Return True if a bounded Gauss-Newton trust region converged, without the limits."""
     tolerance = max(tolerance, search.tolerance) if search.tolerance > EXACT else tolerance
     squared = search.problem.model == "square"
     weight = search.problem.objective[ROOT] if squared else 1.0
@@ -186,11 +174,7 @@ def trf(search, z, iterations, tolerance=1e-10):
 
 
 def coarse_first(search, z, iterations):
-    """Return True if `trf` at a tenth of the samples, then at all of them, converged.
-
-    The second search begins where the first ended, or at z where the coarse runs mislead (at ten
-    times the step a loop may chatter). Limits are ignored.
-    """
+    """Return True if `trf` at a tenth of the samples, then at all of them, converged."""
     coarse = CoarseSearch(search)
     began = coarse.point(z)
     trf(coarse, z, iterations, tolerance=COARSE_TOLERANCE)
@@ -201,9 +185,8 @@ def coarse_first(search, z, iterations):
 
 
 def gauss_newton_first(search, z, iterations):
-    """Return True if `trf` without the limits converged to a feasible point, else `slsqp` from z.
-
-    The cheapest way where no limit is active.
+    """Return True if `trf` without the limits converged to a feasible point, else `slsqp`
+    from z.
     """
     mark = len(search.history)
     converged = trf(search, z, iterations, tolerance=1e-6)
@@ -214,10 +197,8 @@ def gauss_newton_first(search, z, iterations):
 
 
 def restore(search, z, iterations):
-    """Return True if a search for the least violation of the limits converged.
-
-    min t subject to scaled margin_i >= -t, t >= 0, by SLSQP on (z, t).
-    """
+    """Return True if a search for the least violation of the limits converged."""
+    # min t subject to scaled margin_i >= -t, t >= 0, by SLSQP on (z, t).
     if not search.problem.limits:
         return True
 
@@ -242,12 +223,7 @@ def restore(search, z, iterations):
 
 
 def approach(search):
-    """Move the best feasible point towards a lower infeasible one, by halving the distance.
-
-    Only where each limit that is violated there has no slope at the feasible point: a measure that
-    changes in steps, or is 0 in all of the feasible set (overshoot), gives SLSQP no direction along
-    its boundary.
-    """
+    """Move the best feasible point towards a lower infeasible one, by halving the distance."""
     best = search.best
     if best is None or search.violation(best) > 0:
         return
@@ -272,11 +248,7 @@ def approach(search):
 
 
 def find_feasible(search, screened, iterations, seed):
-    """Return True if the searches for the least violation of the limits came to their end.
-
-    Where no search met the limits: from the best point so far, from the screened points of least
-    violation, a distance apart, and from what differential evolution makes of those.
-    """
+    """Return True if the searches for the least violation of the limits came to their end."""
     short = np.maximum(0.0, -screened.margins / search.limit_scale).max(axis=1, initial=0.0)
     starts = distinct_starts(screened.zs, short, RESTORED, search.best.z)
     ended = []
@@ -308,13 +280,7 @@ METHODS = {
 
 
 class Local(NamedTuple):
-    """How local searches run.
-
-    Examples
-    --------
-    >>> Local("slsqp", 40).batch is None
-    True
-    """
+    """How local searches run."""
 
     method: str
     iterations: int

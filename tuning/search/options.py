@@ -18,18 +18,7 @@ DEFAULTS = {"starts": 8, "screening": 64, "iterations": 60, "batch": None, "tole
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Solver:
-    """What every method has.
-
-    Parameters
-    ----------
-    starts : number of local searches.
-    screening : number of Sobol points, of which the best are starts.
-    iterations : of each local search.
-
-    Raises
-    ------
-    InputError : when it is made, for a number that is out of range.
-    """
+    """What every method has."""
 
     method: ClassVar[str]
     starts: int = DEFAULTS["starts"]
@@ -149,10 +138,7 @@ def check_options(*, tolerance=None, **counts):
 
 
 def spelled_out(case, method, options):
-    """Return (Case, name of the method, keywords of `tune`) of a Problem or a Solver.
-
-    Raises InputError for a keyword that contradicts what the Problem or the Solver has.
-    """
+    """Return (Case, name of the method, keywords of `tune`) of a Problem or a Solver."""
     options = dict(options)
     if isinstance(case, Problem):
         own = case.given

@@ -1,7 +1,4 @@
-"""The trade-off between the objective and one limit, by the epsilon-constraint method.
-
-Imported by the command line and as `tuning.tradeoff`.
-"""
+"""The trade-off between the objective and one limit, by the epsilon-constraint method."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -120,10 +117,7 @@ class _Sweep:
         self.known = {}  # every Point that was evaluated
 
     def tighten(self, begin):
-        """Solve each step from the answer before it, the first from `begin` (P,).
-
-        Returns z of the last.
-        """
+        """Solve each step from the answer before it, the first from `begin` (P,)."""
         z = begin
         for limits in self.steps:
             answer = self._solve(limits, z)

@@ -138,20 +138,7 @@ class ConstraintRow:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Lost:
-    """An output that follows its setpoint before tuning, and no longer afterwards.
-
-    Parameters
-    ----------
-    output : its number, from 1.
-    before, after : its largest distance from the setpoint at the end of a plateau [unit].
-    share : `after` as a share of the change that led to the plateau [-].
-    unit : unit of level.
-
-    Examples
-    --------
-    >>> Lost(output=1, before=0.0, after=2.5, share=0.5, unit="cm").share
-    0.5
-    """
+    """An output that follows its setpoint before tuning, and no longer afterwards."""
 
     output: int
     before: float
@@ -277,13 +264,7 @@ def constraint_rows(
     before: Sequence[Mapping[str, Any]] | None = None,
     multipliers: Mapping[str, float] | None = None,
 ) -> list[ConstraintRow]:
-    """Return a ConstraintRow for each limit of the problem.
-
-    Parameters
-    ----------
-    after, before : measures of every scenario, {name: value}, after and before tuning.
-    multipliers : {limit's label: Lagrange multiplier}, 0 for any other limit.
-    """
+    """Return a ConstraintRow for each limit of the problem."""
     multipliers = multipliers or {}
     rows = []
     for limit in problem.limits:

@@ -1,7 +1,4 @@
-"""Robust tuning: gains for many plants at once, and the violation probability on new plants.
-
-Imported by the command line and as `tuning.tune_robust`.
-"""
+"""Robust tuning: gains for many plants at once, and the violation probability on new plants."""
 
 import functools
 import math
@@ -73,11 +70,9 @@ class Certificate(NamedTuple):
 
 
 def scenarios_of(case, distributions=None, samples=64, seed=0):
-    """Return `samples` Scenarios of a case, each on a plant drawn from `distributions`.
-
-    The case's own scenarios in turn (its own run, where it has none), each with noise of its own.
-    Latin hypercube draws. Raises InputError for what cannot be drawn.
-    """
+    """Return `samples` Scenarios of a case, each on a plant drawn from `distributions`."""
+    # The case's own scenarios in turn (its own run, where it has none), each with noise of its own.
+    # Latin hypercube draws. Raises InputError for what cannot be drawn.
     distributions = spread_of(case) if distributions is None else stated(distributions)
     space = Draws(case.loop, distributions)
     values = space.values(probabilities("latin", space.dimensions, samples, seed))
@@ -99,24 +94,15 @@ def scenarios_of(case, distributions=None, samples=64, seed=0):
 
 
 def scenario_bound(scenarios, support, beta=CONFIDENCE):
-    """Return the largest violation probability of an answer, with confidence 1 - beta.
-
-    scenarios : N plants in the search. support : k of them that determine the answer.
-
-    eps(k) = 1 - (beta / (N C(N, k)))^(1 / (N - k)): M. C. Campi, S. Garatti, F. A. Ramponi, A
-    general scenario theory for nonconvex optimization and decision making, IEEE TAC 63(12), 2018.
-    It holds for any distribution and any way to find the answer, for independent plants and the
-    support by which the same answer is found. What is counted here are the plants at a limit and
-    (for the worst case) at the cost: for the mean, and in part for cvar, every plant changes the
-    gains a little; strictly, the support is then all of them and the bound 1, and this figure is an
-    indication. Latin hypercube draws are not independent either. The runs on new plants are the
-    evidence.
-
-    Examples
-    --------
-    >>> round(scenario_bound(64, 1), 3)
-    0.296
-    """
+    """Return the largest violation probability of an answer, with confidence 1 - beta."""
+    # eps(k) = 1 - (beta / (N C(N, k)))^(1 / (N - k)): M. C. Campi, S. Garatti, F. A. Ramponi, A
+    # general scenario theory for nonconvex optimization and decision making, IEEE TAC 63(12), 2018.
+    # It holds for any distribution and any way to find the answer, for independent plants and the
+    # support by which the same answer is found. What is counted here are the plants at a limit and
+    # (for the worst case) at the cost: for the mean, and in part for cvar, every plant changes the
+    # gains a little; strictly, the support is then all of them and the bound 1, and this figure is
+    # an indication. Latin hypercube draws are not independent either. The runs on new plants are
+    # the evidence.
     if not 0 <= support <= scenarios:
         raise InputError(f"support = {support}: must be from 0 to the {scenarios} scenarios")
     if support >= scenarios:
@@ -228,15 +214,7 @@ def _check(samples, fresh, back_off):
 
 
 def certificate_messages(known: Certificate, risk: str, back_off: float) -> tuple[Message, ...]:
-    """Return the Messages of a Certificate: what was measured, and what was to be expected.
-
-    Examples
-    --------
-    >>> for m in certificate_messages(Certificate(16, 0, 0.4, 256, 0, [0.0, 0.0143]), "worst", 0.0):
-    ...     print(m.text)
-    on 256 new plants a limit was violated 0 times (95 % interval 0 to 0.014)
-    by scenario theory, the probability is at most 0.4 (confidence 1 - 1e-6, support 0 of 16 plants)
-    """
+    """Return the Messages of a Certificate: what was measured, and what was to be expected."""
     low, high = known.interval95
     indication = (
         ""
@@ -308,10 +286,7 @@ def _run(distributions, limits, fresh, seed, cluster, case, names):
 
 
 def _on_new_plants(result, judge, run, distributions):
-    """Return (summary, cloud, how many violate a limit after tuning) on new plants.
-
-    Before and after tuning on the same draws. run : `_run` of a case and measures.
-    """
+    """Return (summary, cloud, how many violate a limit after tuning) on new plants."""
     names = tuple(dict.fromkeys([*judge.objective, "max_level"]))
     sides = [run(case, names) for case in (result.case, result.tuned)]
     weights = judge.objective.items()

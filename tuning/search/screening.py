@@ -1,6 +1,5 @@
-"""Where to start: Sobol points at a coarse step, and which of them only that step makes unstable.
-
-Imported by `stages` and `pareto`.
+"""Where to start: Sobol points at a coarse step, and which of them only that step makes
+unstable.
 """
 
 import functools
@@ -44,27 +43,18 @@ cube.
 
 
 def sobol(count, dimensions, seed):
-    """Return (count, dimensions) scrambled Sobol points in the unit cube.
-
-    count : should be a power of 2. seed : of the scrambling.
-
-    Examples
-    --------
-    >>> sobol(4, 2, seed=0).shape
-    (4, 2)
-    """
+    """Return (count, dimensions) scrambled Sobol points in the unit cube."""
     return scipy.stats.qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed)).random(
         count
     )
 
 
 def spectral_radius(problem, zs, clock):
-    """Return (points,) the largest eigenvalue modulus of one sample of the linearised loop.
-
-    Linearised at the reference's plateaus, at zs (points, P). Above 1, the sampled loop is unstable
-    there: it chatters between the limits of the pumps however good its gains would be at a smaller
-    step. NaN where no plateau has a steady state, or a transport delay makes the state too long.
-    """
+    """Return (points,) the largest eigenvalue modulus of one sample of the linearised loop."""
+    # Linearised at the reference's plateaus, at zs (points, P). Above 1, the sampled loop is
+    # unstable there: it chatters between the limits of the pumps however good its gains would be at
+    # a smaller step. NaN where no plateau has a steady state, or a transport delay makes the state
+    # too long.
     steady = []
     plateaus = problem.loop.reference.plateaus()
     for r in () if plateaus is None else plateaus:
@@ -131,12 +121,10 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
 
 
 def screen(problem, count, seed):
-    """Return (zs, costs, margins, redone) of `count` Sobol points.
-
-    zs (points, P), costs (points,), margins (points, limits). At the true step where all runs have
-    few samples. Else at a coarse step: points that this step alone makes unstable, or whose coarse
-    run is not finite, are run again at the true step; `redone` counts the first.
-    """
+    """Return (zs, costs, margins, redone) of `count` Sobol points."""
+    # zs (points, P), costs (points,), margins (points, limits). At the true step where all runs
+    # have few samples. Else at a coarse step: points that this step alone makes unstable, or whose
+    # coarse run is not finite, are run again at the true step; `redone` counts the first.
     zs = sobol(count, len(problem.bounds), seed)
     clock, unstable = screening_clock(problem.clock), np.zeros(count, dtype=bool)
     if count * len(problem.runs) * problem.clock.samples <= AFFORDED:
@@ -153,14 +141,7 @@ def screen(problem, count, seed):
 
 
 def distinct_starts(zs, merits, count, first):
-    """Return up to `count` points: `first`, then those of lowest merit at a distance from these.
-
-    Examples
-    --------
-    >>> zs = np.array([[0.5], [0.51], [0.9]])
-    >>> [float(z[0]) for z in distinct_starts(zs, np.array([1.0, 2.0, 3.0]), 3, np.array([0.1]))]
-    [0.1, 0.5, 0.9]
-    """
+    """Return up to `count` points: `first`, then those of lowest merit at a distance from these."""
     taken = [np.asarray(first, dtype=float)]
     apart = 0.5 / max(2, count) * np.sqrt(len(first))
     order = [i for i in np.argsort(merits, kind="stable") if np.isfinite(merits[i])]
@@ -173,10 +154,8 @@ def distinct_starts(zs, merits, count, first):
 
 
 def best_screened(search, screened):
-    """Return the screened point (P,) that keeps the limits and is better than the best of a Search.
-
-    None where none is, at the true step. Every point that the coarse step rates better is run again
-    at the true step, and enters the Search.
+    """Return the screened point (P,) that keeps the limits and is better than the best of
+    a Search.
     """
     zs, costs, margins = screened
     held = np.isfinite(costs) & np.all(margins >= 0, axis=1)
@@ -216,20 +195,7 @@ def evolution_size(search, screened):
 
 
 def evolve(search, zs, generations, seed, coarse=True):
-    """Return the Population after differential evolution of points zs, and that of zs itself.
-
-    Storn and Price, J. Global Optimization 11 (1997): members move by the scaled difference of two
-    others, from themselves towards the best (one half) or from a third (the other), and are kept
-    where they are better. A generation is one batch of runs: with as many points as the screening
-    it compiles nothing.
-
-    Parameters
-    ----------
-    zs : (points, P), four at least.
-    generations : number of batches.
-    seed : of the moves.
-    coarse : with the clock of the screening.
-    """
+    """Return the Population after differential evolution of points zs, and that of zs itself."""
     rng, count = np.random.default_rng([seed, 1997]), len(zs)
     first = now = Population(zs, *search.problem.screen(zs, coarse))
     merits = now.merits(search)
@@ -254,13 +220,7 @@ def evolve(search, zs, generations, seed, coarse=True):
 
 
 def around(z, count, seed):
-    """Return (count, P) points about z in the unit cube, at distances from 0.002 to 0.2.
-
-    Examples
-    --------
-    >>> around(np.array([0.5, 1.0]), 3, seed=0).shape
-    (3, 2)
-    """
+    """Return (count, P) points about z in the unit cube, at distances from 0.002 to 0.2."""
     rng = np.random.default_rng([seed, 2])
     radius = np.exp(rng.uniform(np.log(0.002), np.log(0.2), (count, 1)))
     return np.clip(z + radius * rng.standard_normal((count, len(z))), 0.0, 1.0)

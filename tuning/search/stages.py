@@ -1,7 +1,4 @@
-"""The stages of one tuning: screening, local searches, feasibility, a final search, diagnostics.
-
-Imported by `tuner`.
-"""
+"""The stages of one tuning: screening, local searches, feasibility, a final search, diagnostics."""
 
 import dataclasses
 from collections.abc import Callable
@@ -172,11 +169,7 @@ def _finish(search, found, plan):
 
 
 def _confirm(search, found, plan, screened):
-    """Look for points that are better than the answer, and search on from them, a few times.
-
-    Its neighbours, which are run for its sensitivity, always; where no two searches agree on an
-    answer that has converged, or where no slope is of use, by differential evolution too.
-    """
+    """Look for points that are better than the answer, and search on from them, a few times."""
     for k in range(RENEWED):
         mark = search.best
         lower, blind = _lower_neighbour(search, found), not search.slope(mark).usable
@@ -221,11 +214,9 @@ def _lower_neighbour(search, found):
 
 
 def _probe(search, found, screened, seed):
-    """Return z of a point that may be better than the answer, by differential evolution.
-
-    Its members are the answer, points around it, and the best of the screened and of new Sobol
-    points. On coarse runs, unless they mislead: then a search decides at the true step.
-    """
+    """Return z of a point that may be better than the answer, by differential evolution."""
+    # Its members are the answer, points around it, and the best of the screened and of new Sobol
+    # points. On coarse runs, unless they mislead: then a search decides at the true step.
     problem, best, mark = search.problem, search.best, search.problem.simulations
     count, generations = evolution_size(search, screened)
     new = np.split(sobol(FRESH * MEMBERS, len(best.z), seed + 1)[: FRESH * count], FRESH)
@@ -259,11 +250,7 @@ def _local_search(search, found, plan, z, count):
 
 
 def _last_search(search, found, plan):
-    """Return True if a last search from the best point converged.
-
-    With a tolerance of the user's own, a search also ends where one step of its line search
-    happened to be short, and is begun again from there, a few times.
-    """
+    """Return True if a last search from the best point converged."""
     if plan.tolerance is None:
         if plan.method not in ("slsqp", "trf", "coarse-trf", "trf-slsqp"):
             return False
@@ -278,11 +265,7 @@ def _last_search(search, found, plan):
 
 
 def _nothing_lower(search, iterations):
-    """Return True if nothing lower is found along the gradient that is left at the best point.
-
-    And that gradient is below UNSTABLE. Where there is something lower, the search goes on from
-    it, a few times.
-    """
+    """Return True if nothing lower is found along the gradient that is left at the best point."""
     for _ in range(RENEWED):
         better = downhill(search, search.best)
         if better is None:

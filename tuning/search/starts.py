@@ -1,7 +1,4 @@
-"""One local search and its outcome, as `TuningResult.starts` lists it.
-
-Imported by `stages` and `tuning.answer`.
-"""
+"""One local search and its outcome, as `TuningResult.starts` lists it."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,13 +11,7 @@ from tuning.search.driver import Search
 def search_from(
     search: Search, starts: list[dict[str, Any]], z: Any, run: Callable, count: int | None = None
 ) -> None:
-    """Make a local search from z, run(search, z); its outcome is added to `starts`.
-
-    Not converged without a slope to go by: neither where runs contradict that at z, nor where it
-    ends at z without having moved and they do.
-
-    count : evaluations before the first that belongs to this search.
-    """
+    """Make a local search from z, run(search, z); its outcome is added to `starts`."""
     count = len(search.history) if count is None else count
     z, search.exhausted = np.clip(z, 0.0, 1.0), False
     blind = search.slopes.get(z.tobytes())

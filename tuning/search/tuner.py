@@ -1,7 +1,4 @@
-"""tune: better gains for a case, found through the simulation and checked at its own step.
-
-Imported by `robust`, by the command line and as `tuning.tune`.
-"""
+"""tune: better gains for a case, found through the simulation and checked at its own step."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -66,30 +63,7 @@ def tune(
     progress: Callable | None = None,
     cluster: Any = None,
 ) -> TuningResult:
-    """Return better values for the free parameters of a case, under its limits.
-
-    min over z in [0, 1]^P of the objective, subject to every limit in every scenario: Sobol
-    screening at a coarse step, local searches with exact derivatives from distinct starts, a last
-    search from the best point, and a validation set.
-
-    Parameters, of which every one is of the nominal optimum, and their units as in `tuning.tune`.
-
-    Returns
-    -------
-    TuningResult
-
-    Raises
-    ------
-    InputError : for anything that cannot be used, before anything is run.
-
-    Examples
-    --------
-    >>> import jax, tuning
-    >>> from jaxtank import presets
-    >>> jax.config.update("jax_enable_x64", True)
-    >>> result = tuning.tune(presets.find("gouta2015/backstepping"))  # doctest: +SKIP
-    >>> result["controller.k"].after  # doctest: +SKIP
-    """
+    """Return better values for the free parameters of a case, under its limits."""
     folder = checkpoint_folder(checkpoint, log=log)
     objective, limits = as_measures(objective, limits)
     options: dict[str, Any] = dict(

@@ -1,7 +1,4 @@
-"""How a search ended: its status, whether the loop still follows, and the Messages about both.
-
-Imported by `tuner` and `messages`.
-"""
+"""How a search ended: its status, whether the loop still follows, and the Messages about both."""
 
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -53,13 +50,7 @@ ENDED = (Status.CONVERGED, Status.NOT_CONVERGED)
 
 
 def status_of(found: Outcome, feasible: bool, lost: Sequence[Lost] = ()) -> Status:
-    """Return how the stages ended; feasible : whether every limit holds at the answer.
-
-    Converged: the search that gave the answer converged, or the last one did; nothing lower lies
-    along a gradient that is left; two searches agree, or differential evolution found nothing
-    better; and no output that followed its setpoint is `lost`. Infeasible: the searches for the
-    least violation came to their end, and some was left.
-    """
+    """Return how the stages ended; feasible : whether every limit holds at the answer."""
     if found.interrupted:
         return Status.INTERRUPTED
     if found.search is None or found.best is None:
@@ -73,14 +64,7 @@ def status_of(found: Outcome, feasible: bool, lost: Sequence[Lost] = ()) -> Stat
 def lost_outputs(
     problem: Problem, tables: Mapping[str, Sequence[Any]], values: Mapping[str, float]
 ) -> tuple[Lost, ...]:
-    """Return the outputs that follow their setpoints before tuning, and no longer afterwards.
-
-    In more than half of the runs (by weight) the output is further than OFF of the change from its
-    setpoint at the end of a plateau, and WORSE times as far as before. Trajectories are compared
-    only where the measures give a reason to.
-
-    tables : {"before", "after": [{measure: value}]} of every run. values : those after tuning.
-    """
+    """Return the outputs that follow their setpoints before tuning, and no longer afterwards."""
     suspects = [_suspect(run, *rows) for run, *rows in zip(problem.runs, *tables.values())]
     weights = np.array([run.weight for run in problem.runs])
     lost: list[Lost] = []
@@ -129,11 +113,7 @@ def _distances(run, values, i) -> list[tuple[float, float]]:
 
 
 def _farthest(loop, clock, key, i) -> tuple[float, float]:
-    """Return the largest distance of output i from its setpoint at the end of a plateau.
-
-    As a share of the change that led to it (of the setpoint, where there was none) and in the unit
-    of level, of the mean over the last tenth of the plateau.
-    """
+    """Return the largest distance of output i from its setpoint at the end of a plateau."""
     every = max(1, clock.samples // SAVED)
     errors = np.asarray(lp.simulate(loop, clock, key, save_every=every).e)[:, i]
     setpoints, found = _followed(loop, clock)
@@ -170,16 +150,6 @@ def first_of(parts: list[str], joint: str = ", ") -> str:
 def points_to_fragile(loop: Any, before: Mapping[str, Any], after: Mapping[str, Any]) -> bool:
     """Return True if the run with an answer rings: only then are its margins worth a program, which
     takes as long to compile as those of a search.
-
-    loop : that before. before, after : {measure: value} of the runs.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> calm, busy = ({"input_travel": np.array([v, 9.0])} for v in (10.0, 25.0))
-    >>> loop = presets.find("gouta2015/backstepping").loop
-    >>> points_to_fragile(loop, calm, calm), points_to_fragile(loop, calm, busy)
-    (False, True)
     """
     old, new = (np.asarray(m["input_travel"]) for m in (before, after))
     ranges = np.asarray(loop.actuator.high) - np.asarray(loop.actuator.low)

@@ -1,7 +1,4 @@
-"""Finished batches of an ensemble as files: each whole or not at all, read back without trust.
-
-Imported by `uncertainty`, and by `report` to remove what is no longer needed.
-"""
+"""Finished batches of an ensemble as files: each whole or not at all, read back without trust."""
 
 import io
 import json
@@ -25,30 +22,8 @@ NAME = re.compile(r"part-(\d{6})\.npz")
 
 
 class BatchStore:
-    """The finished batches of an ensemble in a folder, with a manifest of the problem they are of.
-
-    Parameters
-    ----------
-    folder : where the files are, or will be; shards of one ensemble may share it.
-    problem : the `fingerprint` of the ensemble, with "measures", a list of names.
-    origin : what the manifest holds besides, for `merge`; it does not decide a number.
-    resume : True to continue with the batches that are there.
-    shared : True where other shards write there, too.
-    begin : whether resume may begin one of which a kill left nothing but its lock.
-
-    Raises
-    ------
-    InputError : for a folder that holds another ensemble, for one that holds batches where neither
-        resume nor shared is True, and for one with nothing to resume.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     store = BatchStore(folder, {"measures": ["ise"]})
-    ...     store.put(0, {"ise": np.ones(4), "failed": np.zeros(4)})
-    ...     store.get(0, {"ise": (4,), "failed": (4,)})["ise"]
-    array([1., 1., 1., 1.])
+    """The finished batches of an ensemble in a folder, with a manifest of the problem
+    they are of.
     """
 
     def __init__(
@@ -100,11 +75,10 @@ class BatchStore:
             write_atomic(path, data)
 
     def get(self, k: int, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
-        """Return batch k as {name: array} of these {name: shape}.
-
-        Raises InputError for a file that is not one of ours, or not what was written as batch k of
-        this ensemble, by its seal (which whoever has this program can make) or by what it holds.
-        """
+        """Return batch k as {name: array} of these {name: shape}."""
+        # Raises InputError for a file that is not one of ours, or not what was written as batch k
+        # of this ensemble, by its seal (which whoever has this program can make) or by what it
+        # holds.
         path = self.path(k)
         found = read_batch(path, {*self.checkpoint.problem["measures"], "failed", "seal"})
         seal = found.pop("seal")
@@ -136,11 +110,9 @@ def remove_batches(folder: Folder) -> None:
 
 
 def read_batch(path: Path, names: Iterable[str]) -> dict[str, Any]:
-    """Return {name: array} of a batch file.
-
-    Nothing is unpickled, and nothing larger than it should be is unpacked. Raises InputError for a
-    file that is not one of ours.
-    """
+    """Return {name: array} of a batch file."""
+    # Nothing is unpickled, and nothing larger than it should be is unpacked. Raises InputError for
+    # a file that is not one of ours.
     try:
         if why := refusal(path, LARGEST):
             raise ValueError(why)

@@ -1,7 +1,4 @@
-"""A folder that holds the finished records of one problem, from which a killed run continues.
-
-Imported by the two forms of it: `evaluation_log` (a line each) and `batch_store` (a file each).
-"""
+"""A folder that holds the finished records of one problem, from which a killed run continues."""
 
 import contextlib
 import json
@@ -20,15 +17,7 @@ Folder = str | Path
 
 
 def checkpoint_folder(checkpoint: Folder | None, **former: Folder | None) -> Folder | None:
-    """Return the folder where a search or study keeps what is done, None for none.
-
-    former : {its former keyword: value}. Raises InputError where both are given, for two folders.
-
-    Examples
-    --------
-    >>> checkpoint_folder("run1", log=None)
-    'run1'
-    """
+    """Return the folder where a search or study keeps what is done, None for none."""
     ((name, folder),) = former.items()
     if checkpoint is None or folder is None or Path(checkpoint) == Path(folder):
         return folder if checkpoint is None else checkpoint
@@ -36,22 +25,10 @@ def checkpoint_folder(checkpoint: Folder | None, **former: Folder | None) -> Fol
 
 
 class Checkpoint:
-    """A folder, the problem its records are of, and what is common to every form of record.
+    """A folder, the problem its records are of, and what is common to every form of record."""
 
-    problem : the `fingerprint` of the run. Every record carries a `seal`, so that one that was
-    changed, by hand or by a bad disk, or that is of another problem, is refused.
-
-    Examples
-    --------
-    >>> one, other = Checkpoint("run", {"seed": 0}), Checkpoint("run", {"seed": 1})
-    >>> one.seal(b"record") == other.seal(b"record")
-    False
-    >>> one.check_same(other.problem)
-    Traceback (most recent call last):
-    ...
-    jaxtank.core.errors.InputError: --resume: the checkpoint in 'run' is of another problem; what \
-differs: seed
-    """
+    # problem : the `fingerprint` of the run. Every record carries a `seal`, so that one that was
+    # changed, by hand or by a bad disk, or that is of another problem, is refused.
 
     def __init__(self, folder: Folder, problem: Mapping[str, Any]):
         check_folder(folder)

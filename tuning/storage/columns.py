@@ -1,6 +1,5 @@
-"""Arrays with a row for each draw, filled some rows at a time; large ones in a file, not in memory.
-
-Imported by `uncertainty`.
+"""Arrays with a row for each draw, filled some rows at a time; large ones in a file, not
+in memory.
 """
 
 import os
@@ -24,32 +23,11 @@ Array = NDArray[Any]
 
 
 class Columns(Mapping[str, Array]):
-    """{name: (rows, ...) array}, filled some rows at a time.
+    """{name: (rows, ...) array}, filled some rows at a time."""
 
-    Above IN_MEMORY bytes the arrays are in a file without a name, which ends with this object; each
-    look-up then maps the array anew, to be read, so that nothing stays in memory that is not held.
-    Pickled as a dict of arrays.
-
-    Parameters
-    ----------
-    like : {name: (any number, ...) array}
-        Whose entries have the shape and the type of each row.
-    rows : int
-    folder : path or None
-        Where the file is made; the folder of temporary files where None.
-
-    Raises
-    ------
-    InputError
-        Where the disk is full.
-
-    Examples
-    --------
-    >>> table = Columns({"level": np.zeros((1, 2))}, rows=3)
-    >>> table.put(1, {"level": np.array([[4.0, 5.0]])})
-    >>> table["level"].tolist()
-    [[0.0, 0.0], [4.0, 5.0], [0.0, 0.0]]
-    """
+    # Above IN_MEMORY bytes the arrays are in a file without a name, which ends with this object;
+    # each look-up then maps the array anew, to be read, so that nothing stays in memory that is not
+    # held. Pickled as a dict of arrays.
 
     def __init__(self, like: Mapping[str, Array], rows: int, folder: Folder | None = None):
         self.rows = rows
@@ -121,13 +99,7 @@ class Columns(Mapping[str, Array]):
 
 
 def row_blocks(rows: int, size: int | None = None) -> Iterator[slice]:
-    """Return slices that cover so many rows, `size` at a time, ROWS where None.
-
-    Examples
-    --------
-    >>> list(row_blocks(5, 3))
-    [slice(0, 3, None), slice(3, 5, None)]
-    """
+    """Return slices that cover so many rows, `size` at a time, ROWS where None."""
     size = ROWS if size is None else size
     return (slice(i, min(i + size, rows)) for i in range(0, rows, size))
 
@@ -135,12 +107,8 @@ def row_blocks(rows: int, size: int | None = None) -> Iterator[slice]:
 def column(
     table: Mapping[str, Array], name: str, entry: int, kept: Array, out: Array | None = None
 ) -> Array:
-    """Return one entry of an array over the rows where `kept` (rows,) is True, in `out` if given.
-
-    Examples
-    --------
-    >>> column({"a": np.array([[1.0, 2.0], [3.0, 4.0]])}, "a", 1, np.array([False, True])).tolist()
-    [4.0]
+    """Return one entry of an array over the rows where `kept` (rows,) is True, in `out`
+    if given.
     """
     found = np.empty(int(np.sum(kept)), table[name].dtype) if out is None else out
     end = 0

@@ -1,7 +1,4 @@
-"""Results of evaluations, kept in memory or as lines of a file that a killed run continues from.
-
-Imported by `problem` (the cache) and by `tune` and `identify` (the file).
-"""
+"""Results of evaluations, kept in memory or as lines of a file that a killed run continues from."""
 
 import contextlib
 import json
@@ -31,19 +28,7 @@ end.
 
 
 class EvaluationCache:
-    """Results by what was evaluated.
-
-    A search evaluates in an order that its results alone decide, so one that is started again and
-    finds its earlier results here follows the same path, and continues where they end.
-
-    Examples
-    --------
-    >>> cache = EvaluationCache()
-    >>> cache.recall("cost", [np.zeros(2)], lambda: (1.5,))
-    (1.5,)
-    >>> cache.recall("cost", [np.zeros(2)], lambda: (7.0,))
-    (1.5,)
-    """
+    """Results by what was evaluated."""
 
     def __init__(self):
         self.found: dict[str, Any] = {}
@@ -72,29 +57,8 @@ class EvaluationCache:
 
 
 class EvaluationLog(EvaluationCache):
-    """An EvaluationCache that is also a file: a line for each evaluation, numbers in hexadecimal.
-
-    The first line holds the problem, and every other one ends with its seal (`Checkpoint.seal`). A
-    line that a kill cut short is dropped.
-
-    Parameters
-    ----------
-    folder : where the file is, or will be.
-    problem : the `fingerprint` of the run.
-    resume : True to continue from the lines that are there.
-
-    Raises
-    ------
-    InputError : for a line that was changed, a log of another problem, and what is no log.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     log = EvaluationLog(folder, {"seed": 0})
-    ...     _ = log.recall("cost", [0.5], lambda: (1.5,))
-    ...     EvaluationLog(folder, {"seed": 0}, resume=True).resumed
-    1
+    """An EvaluationCache that is also a file: a line for each evaluation, numbers in
+    hexadecimal.
     """
 
     def __init__(self, folder: Folder, problem: Mapping[str, Any], resume: bool = False):

@@ -1,7 +1,4 @@
-"""What two runs must share for one to continue the other, as plain JSON; and digests of data.
-
-Imported by every command that keeps a checkpoint: `tune`, `identify`, `ensemble`.
-"""
+"""What two runs must share for one to continue the other, as plain JSON; and digests of data."""
 
 import dataclasses
 import hashlib
@@ -18,15 +15,8 @@ from jaxtank.xla.flags import KEY
 
 
 def digest(*parts: Any) -> str:
-    """Return the hexadecimal SHA-256 digest of texts, bytes and arrays, in their order.
-
-    An array counts with its type and shape, so that equal bytes of another shape differ.
-
-    Examples
-    --------
-    >>> digest("a", [1.0, 2.0]) == digest("a", np.array([1.0, 2.0])) != digest("a", [[1.0, 2.0]])
-    True
-    """
+    """Return the hexadecimal SHA-256 digest of texts, bytes and arrays, in their order."""
+    # An array counts with its type and shape, so that equal bytes of another shape differ.
     found = hashlib.sha256()
     for part in parts:
         if isinstance(part, str):
@@ -39,24 +29,7 @@ def digest(*parts: Any) -> str:
 
 
 def fingerprint(case: Case, **what: Any) -> dict[str, Any]:
-    """Return what two runs must share for one to continue the other, to the same bits.
-
-    Parameters
-    ----------
-    case : the Case that is run; its loop (structure and values) and its clock count.
-    what : everything else that decides a number: options, limits, data as their `digest`.
-
-    Returns
-    -------
-    {name: text, number, list or dict}, equal after a round trip through JSON.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> found = fingerprint(presets.find("cascaded/pi"), seed=0, limits=[("max_level", 30.0)])
-    >>> found["case"], found["seed"], found["limits"]
-    ('cascaded/pi', 0, [['max_level', 30.0]])
-    """
+    """Return what two runs must share for one to continue the other, to the same bits."""
     leaves, structure = jax.tree.flatten(case.loop)
     return {
         "case": case.name,

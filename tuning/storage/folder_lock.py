@@ -25,12 +25,11 @@ in less.
 def hold(folder, shared=False, leaving: Callable = contextlib.nullcontext):
     """Hold `folder`, made if need be, against other runs; shared=True: against all but those that
     share it.
-
-    The lock is the system's own (flock on a file with the process id in it): it ends with its
-    process however that ends, so that what a kill left behind is taken over, unfinished files
-    (`jaxtank.core.files.sweep`) included. A folder that was made for this and got nothing is
-    removed again. folder None: nothing is held. Raises InputError where another run holds it.
     """
+    # The lock is the system's own (flock on a file with the process id in it): it ends with its
+    # process however that ends, so that what a kill left behind is taken over, unfinished files
+    # (`jaxtank.core.files.sweep`) included. A folder that was made for this and got nothing is
+    # removed again. folder None: nothing is held. Raises InputError where another run holds it.
     if folder is None or fcntl is None:
         yield
         return

@@ -48,11 +48,10 @@ def batch_size(case, noisy, samples):
 
 
 class Runner:
-    """Runs a batch on each of `devices` at once, each by the program of a single device.
+    """Runs a batch on each of `devices` at once, each by the program of a single device."""
 
-    Each device has a thread. One program partitioned over the devices (shard_map) rounds the last
-    bit differently from the program of a single device; this does not.
-    """
+    # Each device has a thread. One program partitioned over the devices (shard_map) rounds the last
+    # bit differently from the program of a single device; this does not.
 
     def __init__(self, case, names, seed, devices):
         self.case, self.names, self.seed = case, names, seed
@@ -60,10 +59,7 @@ class Runner:
         self.pool = ThreadPoolExecutor(devices)
 
     def each(self, numbers, rows_of):
-        """Yield (number, batch) in order; rows_of(number): (values, numbers of the draws).
-
-        batch : {measure: (batch, ...), "failed": (batch,)}
-        """
+        """Yield (number, batch) in order; rows_of(number): (values, numbers of the draws)."""
         width = len(self.devices)
         for group in (numbers[i : i + width] for i in range(0, len(numbers), width)):
             rows, indices = zip(*map(rows_of, group))
@@ -74,9 +70,8 @@ class Runner:
 
 
 def run_batch(case, names, seed, rows, indices, device=None):
-    """Return {measure: (batch, ...), "failed": (batch,)} of the draws `indices` at values `rows`.
-
-    device : None for the first one.
+    """Return {measure: (batch, ...), "failed": (batch,)} of the draws `indices` at values
+    `rows`.
     """
     values, indices = jax.device_put((rows, indices.astype(np.uint32)), device)
     found = _run(case.loop, values, indices, seed, case.clock, names)
@@ -114,16 +109,12 @@ def _share(count, most):
 
 
 class Runs:
-    """A case as a function of (n, D) probabilities; returns (n, K) entries of measures.
+    """A case as a function of (n, D) probabilities; returns (n, K) entries of measures."""
 
-    An entry is NaN where its run is not finite.
-
-    Batches have one size, so that one compiled program serves; the case's own run goes first. After
-    a call `nominal` (K,) holds its values and `failed` the number of other runs that stopped being
-    finite.
-
-    each : as `_each`, in the place of the devices of this process.
-    """
+    # An entry is NaN where its run is not finite.
+    # Batches have one size, so that one compiled program serves; the case's own run goes first.
+    # After a call `nominal` (K,) holds its values and `failed` the number of other runs that
+    # stopped being finite.
 
     def __init__(
         self, case, draws, names, key, batch=None, progress=None, devices=1, each: Any = None
@@ -189,22 +180,7 @@ def run_points(group, names, values):
 
 
 def fan_of(case, values, seed):
-    """Return the quantiles CUTS of the trajectories of drawn parameters at fixed times.
-
-    Parameters
-    ----------
-    case : Case
-    values : dict
-        {name: (draws, ...)}.
-    seed : int or None
-        Of the sensor noise; None without.
-
-    Returns
-    -------
-    dict or None
-        {"t" (rows,), "r" (rows, outputs), "x" (5, rows, tanks), "u" (5, rows, pumps), "draws" that
-        are finite, "of" how many}; None where no draw is finite.
-    """
+    """Return the quantiles CUTS of the trajectories of drawn parameters at fixed times."""
     every = max(1, (case.clock.samples - 1) // FAN_ROWS)
     size, found = len(next(iter(values.values()))), []
     for start in range(0, size, FAN_BATCH):

@@ -255,23 +255,7 @@ KINDS = {"uniform": Uniform, "loguniform": LogUniform, "normal": Normal, "discre
 
 
 def stated(distributions):
-    """Return {name: distribution} of what a study was given.
-
-    Parameters
-    ----------
-    distributions : dict
-        {name: distribution, or a relative half-width as in a case's `uncertain`}.
-
-    Raises
-    ------
-    InputError
-        A value that is neither.
-
-    Examples
-    --------
-    >>> stated({"plant.drain": 0.1})["plant.drain"].relative
-    0.1
-    """
+    """Return {name: distribution} of what a study was given."""
     if not isinstance(distributions, Mapping):
         raise InputError(
             f"what varies is a {type(distributions).__name__}: must be {{name: distribution}}, as"
@@ -291,27 +275,7 @@ def stated(distributions):
 
 
 def parse(name, text):
-    """Return the distribution of a text of the command line.
-
-    Parameters
-    ----------
-    name : str
-        The parameter, for the error.
-    text : str
-        "uniform:LOW:HIGH", "uniform:5%", "loguniform:LOW:HIGH", "loguniform:FACTOR",
-        "normal:5%", "normal:MEAN:SD" or "discrete:V1:V2:..."; ":tied" at the end gives all
-        entries of an array one draw.
-
-    Raises
-    ------
-    InputError
-        Any other text.
-
-    Examples
-    --------
-    >>> parse("plant.drain", "uniform:5%").relative
-    0.05
-    """
+    """Return the distribution of a text of the command line."""
     kind, *parts = [p.strip() for p in text.split(":")]
     tied = bool(parts) and parts[-1] == "tied"
     fields = _fields(kind, parts[:-1] if tied else parts)

@@ -1,7 +1,4 @@
-"""The map from the unit cube to values of the uncertain parameters of a loop.
-
-Imported by every study of `tuning`.
-"""
+"""The map from the unit cube to values of the uncertain parameters of a loop."""
 
 import math
 
@@ -15,40 +12,10 @@ from tuning.uncertainty.distributions import Correlated, Discrete
 
 
 class Draws:
-    """The distributions of a case as a map from the unit cube to values of its parameters.
+    """The distributions of a case as a map from the unit cube to values of its parameters."""
 
-    The entries of an array vary each on its own, unless tied; zeros of a relative distribution
-    stay zero and take no dimension.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    distributions : dict
-        {dotted name: distribution}.
-
-    Attributes
-    ----------
-    dimensions : int
-        Probabilities of a draw.
-    labels : list of str
-        (dimensions,) what each of them moves.
-
-    Raises
-    ------
-    InputError
-        An unknown or static parameter, one given twice, a distribution that can leave the range
-        that its parameter allows.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> from tuning import Uniform
-    >>> draws = Draws(presets.find("cascaded/pi").loop, {"plant.area": Uniform(relative=0.1)})
-    >>> draws.labels
-    ['plant.area[0]', 'plant.area[1]']
-    >>> draws.values(np.array([[0.0, 1.0]]))["plant.area"].round(6).tolist()
-    [[0.9, 1.1]]
-    """
+    # The entries of an array vary each on its own, unless tied; zeros of a relative distribution
+    # stay zero and take no dimension.
 
     def __init__(self, loop, distributions):
         if not distributions:

@@ -1,7 +1,5 @@
 """Sensitivity of any function on the unit cube: designs and estimators, plain arrays in and out.
 
-Imported by `sensitivity_study`.
-
 Elementary effects: Morris, Technometrics 33(2) 1991, 161; their absolute mean: Campolongo, Cariboni
 and Saltelli, Environ. Model. Softw. 22(10) 2007, 1509. Shares of the variance: Saltelli et al.,
 Comput. Phys. Commun. 181(2) 2010, 259, first order by its table 2 (b), total order by Jansen's
@@ -25,25 +23,7 @@ FLAT = 1e-10
 
 
 def sobol_points(dimensions, samples, seed):
-    """Return the points that `sobol_indices` needs.
-
-    In each row A, then A with one column of B for each of the D columns, then B; A and B are the
-    two halves of a scrambled Sobol sequence in 2 D dimensions.
-
-    Parameters
-    ----------
-    dimensions, samples, seed : int
-        samples is best a power of 2.
-
-    Returns
-    -------
-    (samples, D + 2, D) array
-
-    Examples
-    --------
-    >>> sobol_points(3, 8, seed=0).shape
-    (8, 5, 3)
-    """
+    """Return the points that `sobol_indices` needs."""
     base = stats.qmc.Sobol(2 * dimensions, scramble=True, rng=np.random.default_rng(seed)).random(
         samples
     )
@@ -56,34 +36,10 @@ def sobol_points(dimensions, samples, seed):
 
 
 def sobol_indices(y, seed=0):
-    """Return the shares of the variance of y that each input has: alone and in all.
-
-    S_j = mean(f(B) (f(A_Bj) - f(A))) / V, T_j = mean((f(A) - f(A_Bj))^2) / (2 V), V the variance
-    over A and B. A row with an output that is not finite is left out whole, so that what remains
-    stays paired. Source: Saltelli et al. 2010, table 2 (b) and (f).
-
-    Parameters
-    ----------
-    y : (samples, D + 2) array
-        Outputs at `sobol_points`.
-    seed : int
-        Of the bootstrap.
-
-    Returns
-    -------
-    dict
-        "first", "total": (D,); "first_interval95", "total_interval95": (D, 2), quantiles of a
-        bootstrap over rows (for Sobol points, more even than random ones, too wide); "kept": rows
-        used; "sd": standard deviation of y. Shares are NaN where y does not vary or fewer than 2
-        rows remain.
-
-    Examples
-    --------
-    >>> points = sobol_points(2, 256, seed=0)
-    >>> found = sobol_indices(points @ np.array([1.0, 2.0]))  # variances 1 : 4
-    >>> found["total"].round(1).tolist()
-    [0.2, 0.8]
-    """
+    """Return the shares of the variance of y that each input has: alone and in all."""
+    # S_j = mean(f(B) (f(A_Bj) - f(A))) / V, T_j = mean((f(A) - f(A_Bj))^2) / (2 V), V the variance
+    # over A and B. A row with an output that is not finite is left out whole, so that what remains
+    # stays paired. Source: Saltelli et al. 2010, table 2 (b) and (f).
     y = np.asarray(y, dtype=float)
     dimensions = y.shape[1] - 2
     kept = y[np.isfinite(y).all(axis=1)]
@@ -137,26 +93,7 @@ def bootstrap_means(terms, seed, resamples=RESAMPLES):
 
 
 def morris_points(dimensions, trajectories, seed, levels=LEVELS):
-    """Return the points that `morris_effects` needs.
-
-    From a random point of the grid, each coordinate in a random order steps once by
-    levels / (2 (levels - 1)), to the side that stays inside.
-
-    Parameters
-    ----------
-    dimensions, trajectories, seed : int
-    levels : int
-        Of the grid; even.
-
-    Returns
-    -------
-    (trajectories, D + 1, D) array
-
-    Examples
-    --------
-    >>> morris_points(3, 4, seed=0).shape
-    (4, 4, 3)
-    """
+    """Return the points that `morris_effects` needs."""
     rng, step = np.random.default_rng(seed), levels / (2.0 * (levels - 1))
     base = rng.integers(levels, size=(trajectories, dimensions)) / (levels - 1)
     moved = np.clip(np.where(base < 0.5, base + step, base - step), 0.0, 1.0)
@@ -170,28 +107,7 @@ def morris_points(dimensions, trajectories, seed, levels=LEVELS):
 # outputs near the largest number come out as not finite
 @np.errstate(over="ignore", invalid="ignore")
 def morris_effects(points, y):
-    """Return the elementary effects: change of y over the step, per unit of the cube.
-
-    Source: Morris 1991.
-
-    Parameters
-    ----------
-    points : (trajectories, D + 1, D) array
-        Of `morris_points`.
-    y : (trajectories, D + 1) array
-        Outputs there.
-
-    Returns
-    -------
-    (trajectories, D) array
-        NaN where an end of the step is not finite.
-
-    Examples
-    --------
-    >>> points = morris_points(2, 3, seed=0)
-    >>> morris_effects(points, points @ np.array([1.0, 2.0])).round(6).tolist()[0]
-    [1.0, 2.0]
-    """
+    """Return the elementary effects: change of y over the step, per unit of the cube."""
     y = np.where(np.isfinite(y), y, np.nan)
     change = np.diff(points, axis=1)
     mover = np.abs(change).argmax(axis=2)
@@ -204,27 +120,7 @@ def morris_effects(points, y):
 # outputs near the largest number come out as not finite
 @np.errstate(over="ignore", invalid="ignore")
 def morris_indices(effects):
-    """Return mean, mean size and standard deviation of the elementary effects of each input.
-
-    mu near mu_star in size: the effect has one sign; sigma near mu_star: it depends on the other
-    inputs or is curved. Source: Campolongo, Cariboni and Saltelli 2007.
-
-    Parameters
-    ----------
-    effects : (trajectories, D) array
-        Those that are not finite are left out.
-
-    Returns
-    -------
-    dict
-        "mu", "mu_star", "sigma": (D,); "mu_interval95", "mu_star_interval95": (D, 2), Student's,
-        trajectories being independent; "kept": (D,) effects used. NaN below 2 effects.
-
-    Examples
-    --------
-    >>> morris_indices(np.array([[1.0], [-1.0]]))["mu_star"].tolist()
-    [1.0]
-    """
+    """Return mean, mean size and standard deviation of the elementary effects of each input."""
     dimensions = effects.shape[1]
     found = {k: np.full(dimensions, np.nan) for k in ("mu", "mu_star", "sigma")}
     found |= {k: np.full((dimensions, 2), np.nan) for k in ("mu_interval95", "mu_star_interval95")}

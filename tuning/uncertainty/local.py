@@ -1,7 +1,4 @@
-"""The columns of a sensitivity study, and exact derivatives as one way to fill them.
-
-Imported by `sensitivity_study` and its report.
-"""
+"""The columns of a sensitivity study, and exact derivatives as one way to fill them."""
 
 from typing import NamedTuple, cast
 
@@ -28,10 +25,7 @@ UNUSABLE = (
 
 
 class Column(NamedTuple):
-    """The sensitivity of one entry of one measure to every parameter.
-
-    effects: {quantity: (D,) or (D, 2)} in the order of the parameters.
-    """
+    """The sensitivity of one entry of one measure to every parameter."""
 
     measure: str
     label: str
@@ -56,12 +50,7 @@ def entries_of(case, names):
 
 
 def local_columns(case, draws, names, key, progress=None):
-    """Return the Columns by derivatives at the case's own values, and {parameter: half-width}.
-
-    Their effects: "effect", derivative times half-width; "derivative", NaN where entries are tied;
-    "elasticity", percent of the measure for each percent of the parameter. A parameter whose
-    entries are tied moves all of them by their own half-widths. Raises NonFiniteError.
-    """
+    """Return the Columns by derivatives at the case's own values, and {parameter: half-width}."""
     widths = half_widths(draws)
     scalars = list(dict.fromkeys(name for width in widths for name in width))
     nominal, derivatives = _derivatives(case, scalars, names, key, progress)
@@ -113,11 +102,9 @@ def _derivatives(case, scalars, names, key, progress):
 
 
 def _borne_out(case, scalars, steps, names, key, nominal, derivatives):
-    """Return derivatives (K, scalars), NaN where runs contradict them.
-
-    Runs are made by a step to either side for each scalar by which some entry would change by more
-    than itself.
-    """
+    """Return derivatives (K, scalars), NaN where runs contradict them."""
+    # Runs are made by a step to either side for each scalar by which some entry would change by
+    # more than itself.
     sizes = np.abs(nominal)
     large = ~(np.abs(derivatives * steps) <= sizes[:, None])
     found = derivatives.copy()
@@ -135,11 +122,7 @@ def _borne_out(case, scalars, steps, names, key, nominal, derivatives):
 
 
 def half_widths(draws):
-    """Return for each dimension {name of a scalar that it moves: half-width}.
-
-    The half-width is half the range of the distribution, or NORMAL_WIDTH standard deviations of a
-    normal one (of each by itself, where several are correlated).
-    """
+    """Return for each dimension {name of a scalar that it moves: half-width}."""
     found = []
     for name, d, nominal, _ in draws.parts:
         if isinstance(d, Correlated):

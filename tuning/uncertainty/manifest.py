@@ -1,6 +1,5 @@
-"""What the shards of an ensemble are of, as JSON in their manifest, so that a folder can be joined.
-
-Imported by `study` and the command `merge`.
+"""What the shards of an ensemble are of, as JSON in their manifest, so that a folder can
+be joined.
 """
 
 import dataclasses
@@ -39,13 +38,7 @@ def origin_of(case, limits):
 
 
 def to_json(distributions):
-    """Return {name: {"kind", fields}} of {name: distribution}.
-
-    Examples
-    --------
-    >>> to_json({"plant.drain": ds.Uniform(relative=0.1)})["plant.drain"]["relative"]
-    0.1
-    """
+    """Return {name: {"kind", fields}} of {name: distribution}."""
     return {
         n: {
             "kind": type(d).__name__,
@@ -59,13 +52,7 @@ def to_json(distributions):
 
 
 def from_json(found):
-    """Return {name: distribution} of what `to_json` gives; InputError for anything else.
-
-    Examples
-    --------
-    >>> from_json(to_json({"plant.drain": ds.Uniform(relative=0.1)}))["plant.drain"].relative
-    0.1
-    """
+    """Return {name: distribution} of what `to_json` gives; InputError for anything else."""
     built = {}
     for name, fields in found.items():
         kind = KINDS.get(cast(Any, fields.get("kind"))) if isinstance(fields, dict) else None
@@ -84,12 +71,10 @@ def _tuples(value) -> Any:
 
 
 def restore(folder):
-    """Return (Case, options of `ensemble`) of the shards in a folder.
-
-    Nothing is trusted: the rig file is read as any other, and the loop made from it must be, bit
-    for bit, that of the shards (`ensemble` compares their digests). Raises InputError where the
-    manifest does not state them.
-    """
+    """Return (Case, options of `ensemble`) of the shards in a folder."""
+    # Nothing is trusted: the rig file is read as any other, and the loop made from it must be, bit
+    # for bit, that of the shards (`ensemble` compares their digests). Raises InputError where the
+    # manifest does not state them.
     manifest = batch_store.read_manifest(folder)
     bad = [name for name, kind in WORDS.items() if not isinstance(manifest.get(name), kind)]
     asked = manifest.get("origin")

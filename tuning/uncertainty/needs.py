@@ -1,5 +1,5 @@
 """What the steady states of a reference need of many plants: levels and inputs, and which plants
-can give them. Imported by `study` and `tuning.feasible`.
+can give them.
 """
 
 from collections.abc import Mapping
@@ -24,33 +24,7 @@ TOLERANCE = 1e-9
 
 
 class Needs:
-    """Levels and inputs of the steady states at every plateau of a case, for each of N plants.
-
-    Parameters
-    ----------
-    case : Case
-    values : {dotted name: (N, ...)} drawn parameters
-    limits : {measure: limit} as in `tune`, of which `max_level` counts; those of the case where
-        None. A tank without a limit has its rim.
-
-    Attributes
-    ----------
-    plateaus : list of Plateau
-    low, high : (N, n + m) limits of the n levels [cm] and the m inputs [V]
-
-    Raises
-    ------
-    InputError
-        The case has no plateaus, or another number of pumps than outputs.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> case = presets.find("gouta2015/backstepping")
-    >>> needs = Needs(case, {"plant.pump_gain": case.loop.plant.pump_gain * [[1.0], [0.4]]})
-    >>> needs.at().shape, needs.feasible().tolist()
-    ((2, 6, 6), [True, False])
-    """
+    """Levels and inputs of the steady states at every plateau of a case, for each of N plants."""
 
     def __init__(
         self, case: Case, values: Mapping[str, Any], limits: Mapping[str, Any] | None = None
@@ -87,19 +61,13 @@ class Needs:
         return Needs(self.case, {n: v[:count] for n, v in self.values.items()}, self.limits)
 
     def at(self, setpoints: Any = None) -> np.ndarray:
-        """Return (N, P, n + m) levels and inputs at setpoints (P, outputs) or (N, P, outputs).
-
-        Those of the case where None. A level below 0: the flow would have to run backwards.
-        """
+        """Return (N, P, n + m) levels and inputs at setpoints (P, outputs) or (N, P, outputs)."""
+        # Those of the case where None. A level below 0: the flow would have to run backwards.
         levels, inputs = self.states.at(self.setpoints if setpoints is None else setpoints)
         return np.concatenate([levels, inputs + self.offset[:, None]], axis=2)
 
     def excess(self, needed: Any = None, low: Any = None, high: Any = None) -> np.ndarray:
-        """Return (N, P, n + m) by how much `needed` passes a limit [cm, V]; negative: a margin.
-
-        `low` and `high` take the place of the limits of the case; inf where there is no steady
-        state.
-        """
+        """Return (N, P, n + m) by how much `needed` passes a limit [cm, V]; negative: a margin."""
         needed = self.at() if needed is None else needed
         low, high = self.low if low is None else low, self.high if high is None else high
         scale = TOLERANCE * np.maximum(np.abs(low), np.abs(high))
@@ -112,18 +80,7 @@ class Needs:
 
 
 def judges(case: Case) -> bool:
-    """Return whether `Needs` is defined for a case.
-
-    Parameters
-    ----------
-    case : Case
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> judges(presets.find("cascaded/pi"))
-    True
-    """
+    """Return whether `Needs` is defined for a case."""
     plant = case.loop.plant
     return (
         isinstance(plant, TankNetwork)
@@ -133,21 +90,7 @@ def judges(case: Case) -> bool:
 
 
 def drawn_values(loop: Any, name: str, values: Mapping[str, Any], count: int) -> np.ndarray:
-    """Return (count, ...) values of a leaf, or of an entry of it, over the draws.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    name : dotted name
-    values : {dotted name: (count, ...)}, of leaves and of entries
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> loop = presets.find("cascaded/pi").loop
-    >>> drawn_values(loop, "x0[1]", {"x0": np.array([[1.0, 2.0], [3.0, 4.0]])}, 2).tolist()
-    [2.0, 4.0]
-    """
+    """Return (count, ...) values of a leaf, or of an entry of it, over the draws."""
     base, index = split_index(name)
     whole = np.asarray(get_value(loop, base), dtype=float)
     found = np.array(np.broadcast_to(whole, (count, *whole.shape)))
@@ -174,18 +117,7 @@ def _limit_of(case, limits):
 
 
 def infeasible(case: Case, values: Mapping[str, Any]) -> np.ndarray | None:
-    """Return where a plateau of the reference has no steady state within rims and pump limits.
-
-    Parameters
-    ----------
-    case : Case
-    values : {name: (N, ...)} drawn parameters
-
-    Returns
-    -------
-    (N,) array of bool, or None
-        None where the steady states of the plant have no closed form.
-    """
+    """Return where a plateau of the reference has no steady state within rims and pump limits."""
     if getattr(case.loop.plant, "pipes", None) != () or not judges(case):
         return None
     count = len(next(iter(values.values())))

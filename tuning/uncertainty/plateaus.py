@@ -1,7 +1,4 @@
-"""The plateaus of a reference: when each is held, and the names of the setpoints that make it.
-
-Imported by `needs` and `tuning.feasible`.
-"""
+"""The plateaus of a reference: when each is held, and the names of the setpoints that make it."""
 
 from typing import Any, NamedTuple
 
@@ -13,13 +10,7 @@ from jaxtank.signals.setpoints import Ramps
 
 
 class Plateau(NamedTuple):
-    """Setpoints that are held for a while.
-
-    Examples
-    --------
-    >>> Plateau(80.0, ("reference.targets[0]",), (8.0,)).time_s
-    80.0
-    """
+    """Setpoints that are held for a while."""
 
     time_s: float
     """From when on [s]."""
@@ -30,21 +21,7 @@ class Plateau(NamedTuple):
 
 
 def plateaus_of(case: Case) -> list[Plateau] | None:
-    """Return the plateaus of a case in order of time, or None where its reference has none.
-
-    Those whose changes end before the next one and the end of the run. A reference with a sine has
-    none: its setpoints move.
-
-    Parameters
-    ----------
-    case : Case
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> [p.values for p in plateaus_of(presets.find("gouta2015/backstepping"))][1:3]
-    [(8.0, 8.0), (8.0, 14.0)]
-    """
+    """Return the plateaus of a case in order of time, or None where its reference has none."""
     reference: Any = case.loop.reference
     if isinstance(reference, Ramps):
         return _of_ramps(reference, case.clock.duration)

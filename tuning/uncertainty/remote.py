@@ -1,6 +1,5 @@
-"""Batches of the studies on a Dask cluster: the tasks, and what takes the place of local devices.
-
-Imported by the studies and, by name, on workers.
+"""Batches of the studies on a Dask cluster: the tasks, and what takes the place of local
+devices.
 """
 
 import functools
@@ -29,8 +28,6 @@ def batches(text, names, seed, chunks):
 def points(text, names, seed, chunks):
     """Return what `run_points` gives for the case of `sent` and each array of values of `chunks`; a
     task.
-
-    seed : None without noise.
     """
     return [run_points(_group(text, seed), names, values) for values in chunks]
 
@@ -41,17 +38,7 @@ def _group(text, seed):
 
 
 def grouped(numbers, samples):
-    """Return `numbers` of batches in groups, one for each task.
-
-    samples : number of samples of all runs of one batch [-].
-
-    Examples
-    --------
-    >>> [len(group) for group in grouped(range(40), 1 << 23)]
-    [2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2]
-    >>> len(grouped(range(40), 1 << 30))
-    40
-    """
+    """Return `numbers` of batches in groups, one for each task."""
     size = max(1, min(WORK // max(1, samples), len(numbers) // SHARES))
     return [tuple(numbers[i : i + size]) for i in range(0, len(numbers), size)]
 

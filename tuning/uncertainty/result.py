@@ -169,10 +169,7 @@ def _sum_of_rows(values):
 
 
 def _within(name, ends, end):
-    """Return `end` of an interval of a measure, moved to what the measure cannot pass.
-
-    ends: least and largest value that it had; one that did pass it moves the bound.
-    """
+    """Return `end` of an interval of a measure, moved to what the measure cannot pass."""
     low, high = ms.MEASURES[name].low, ms.MEASURES[name].high
     if low is not None:
         end = np.maximum(end, np.minimum(low, ends[0]))

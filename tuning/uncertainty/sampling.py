@@ -1,6 +1,5 @@
-"""Points to draw at, default distributions, the interval of a counted share, checks of arguments.
-
-Imported by every study of `tuning`.
+"""Points to draw at, default distributions, the interval of a counted share, checks of
+arguments.
 """
 
 import numpy as np
@@ -14,15 +13,7 @@ METHODS = ("random", "latin", "sobol")
 
 
 def check_whole(name, value, low, high=None):
-    """Raise InputError unless `value` is a whole number from `low` to `high`.
-
-    Examples
-    --------
-    >>> check_whole("samples", 0, 1)
-    Traceback (most recent call last):
-        ...
-    jaxtank.core.errors.InputError: samples = 0: must be a whole number of at least 1
-    """
+    """Raise InputError unless `value` is a whole number from `low` to `high`."""
     good = isinstance(value, int) and not isinstance(value, bool) and value >= low
     if not good or (high is not None and value > high):
         ends = f"of at least {low}" if high is None else f"from {low} to {high}"
@@ -30,20 +21,7 @@ def check_whole(name, value, low, high=None):
 
 
 def clopper_pearson(count, samples, level=0.95):
-    """Return [low, high], the exact interval of a probability by Clopper and Pearson.
-
-    Parameters
-    ----------
-    count, samples : int
-        `count` of `samples` independent trials had the event.
-    level : float
-        Confidence [-].
-
-    Examples
-    --------
-    >>> [round(end, 4) for end in clopper_pearson(0, 100)]
-    [0.0, 0.0362]
-    """
+    """Return [low, high], the exact interval of a probability by Clopper and Pearson."""
     tail, beta = (1.0 - level) / 2, scipy.special.betaincinv  # quantile of the beta distribution
     low = 0.0 if count == 0 else float(beta(count, samples - count + 1, tail))
     high = 1.0 if count == samples else float(beta(count + 1, samples - count, 1.0 - tail))
@@ -51,46 +29,13 @@ def clopper_pearson(count, samples, level=0.95):
 
 
 def probabilities(method, dimensions, samples, seed):
-    """Return points of the open unit cube.
-
-    Parameters
-    ----------
-    method : {"random", "latin", "sobol"}
-        Of "random" the first N points are the same whatever the number of samples.
-    dimensions, samples, seed : int
-
-    Returns
-    -------
-    (samples, dimensions) array
-
-    Examples
-    --------
-    >>> probabilities("sobol", 2, 5, seed=0).shape
-    (5, 2)
-    """
+    """Return points of the open unit cube."""
     return Points(method, dimensions, samples, seed).rows(0, samples)
 
 
 class Points:
-    """The rows of `probabilities`, some at a time: the same bits without an array of all of them.
-
-    Latin hypercube points are held all at once: each depends on all others.
-
-    Parameters
-    ----------
-    method : {"random", "latin", "sobol"}
-    dimensions, samples, seed : int
-
-    Raises
-    ------
-    InputError
-        For another method.
-
-    Examples
-    --------
-    >>> points = Points("random", 2, 1000, seed=0)
-    >>> bool(np.all(points.rows(990, 993) == probabilities("random", 2, 1000, 0)[990:993]))
-    True
+    """The rows of `probabilities`, some at a time: the same bits without an array of all
+    of them.
     """
 
     def __init__(self, method, dimensions, samples, seed):
@@ -128,27 +73,7 @@ class Points:
 
 
 def spread_of(case, share=None):
-    """Return {name: distribution} of what a case calls uncertain.
-
-    Uniform, each entry on its own; what was identified together varies by its covariance.
-
-    Parameters
-    ----------
-    case : Case
-    share : float or None
-        One relative half-width for all of it, in place of those of the case [-].
-
-    Raises
-    ------
-    InputError
-        The case names nothing uncertain.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> spread_of(presets.find("cascaded/pi"), 0.1)["plant.pump_gain"].relative
-    0.1
-    """
+    """Return {name: distribution} of what a case calls uncertain."""
     if not case.uncertain and case.covariance is None:
         raise InputError(
             f"{case.name} names nothing uncertain: say what varies with --vary NAME=DISTRIBUTION"

@@ -1,7 +1,4 @@
-"""Which parameter changes which measure: derivatives, Morris' elementary effects, Sobol indices.
-
-Imported by `tuning` and its commands.
-"""
+"""Which parameter changes which measure: derivatives, Morris' elementary effects, Sobol indices."""
 
 import dataclasses
 import time
@@ -39,31 +36,7 @@ RANKED_BY = {"local": "effect", "morris": "mu_star", "sobol": "total"}
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
 class SensitivityResult(Result):
-    """How sensitive measures of a case are to its parameters; made by `tuning.sensitivity`.
-
-    Attributes
-    ----------
-    case : Case
-    method : str
-        "local", "morris" or "sobol".
-    samples : int or None
-        Trajectories or base points; None for the local method.
-    runs, failed : int
-        Simulations, and how many of them diverged.
-    seed : int
-    distributions : dict
-        {dotted name: distribution}.
-    parameters : list of str
-        (D,) dotted names of what varies.
-    half_width : dict
-        {name: half-width, a list where entries are tied} of the local method, in the parameter's
-        unit.
-    columns : list of Column
-        One for each entry of each measure.
-    notes : list of str
-    wall_s : float
-        [s].
-    """
+    """How sensitive measures of a case are to its parameters; made by `tuning.sensitivity`."""
 
     REPORT = "tuning.report.studies.sensitivity_page"
 
@@ -81,10 +54,7 @@ class SensitivityResult(Result):
     wall_s: float
 
     def order(self, column):
-        """Return the indices of the parameters, the most influential one first.
-
-        Those without a sensitivity come last.
-        """
+        """Return the indices of the parameters, the most influential one first."""
         size = np.abs(column.effects[RANKED_BY[self.method]])
         return np.argsort(np.where(np.isfinite(size), -size, np.inf), kind="stable")
 
@@ -217,10 +187,7 @@ def _check_arguments(given, method, seed, batch):
 
 
 def what_varies(case, distributions=None, spread=None):
-    """Return {name: distribution} of a study.
-
-    Those given, or what the case calls uncertain, within one `spread` or its own.
-    """
+    """Return {name: distribution} of a study."""
     if spread is not None and (
         isinstance(spread, bool) or not isinstance(spread, (int, float)) or not 0 < spread < 1
     ):
@@ -234,10 +201,8 @@ def what_varies(case, distributions=None, spread=None):
 
 
 def check_measures(case, measures, method):
-    """Return the names of the measures of a study.
-
-    Raises InputError where the case lacks one or the method cannot treat it.
-    """
+    """Return the names of the measures of a study."""
+    # Raises InputError where the case lacks one or the method cannot treat it.
     if measures is None:
         names = [
             m for m in (*case.objective, "rms_error_total", "max_level") if ms.serves(m, case.loop)
@@ -263,10 +228,8 @@ def check_measures(case, measures, method):
 
 
 def check_samples(samples, method, notes):
-    """Return the number of samples, for Sobol a power of 2, None for the local method.
-
-    A note is added to `notes` where it is not what was asked for.
-    """
+    """Return the number of samples, for Sobol a power of 2, None for the local method."""
+    # A note is added to `notes` where it is not what was asked for.
     if method == "local":
         if samples is not None:
             notes.append("the local method takes one run and its derivatives: samples are not used")

@@ -1,7 +1,4 @@
-"""Run a case on many draws of what is uncertain: fixed-size batches, running measures only.
-
-Imported by `tuning` and its commands.
-"""
+"""Run a case on many draws of what is uncertain: fixed-size batches, running measures only."""
 
 import contextlib
 import time
@@ -198,10 +195,7 @@ class _Plan(NamedTuple):
     shapes: dict  # {name: shape} of what a batch holds
 
     def rows(self, k):
-        """Return ({name: (batch, ...)} values, (batch,) numbers) of the draws of batch k.
-
-        The last draw is repeated to fill the last batch.
-        """
+        """Return ({name: (batch, ...)} values, (batch,) numbers) of the draws of batch k."""
         indices = np.arange(k * self.batch, (k + 1) * self.batch)
         inside = indices[indices < self.points.samples]
         points = self.points.rows(int(inside[0]), int(inside[-1]) + 1)

@@ -1,7 +1,4 @@
-"""Values before and after tuning on a validation set: perturbed plants with other noise.
-
-Imported by `tuning.search`.
-"""
+"""Values before and after tuning on a validation set: perturbed plants with other noise."""
 
 import jax
 import numpy as np
@@ -18,12 +15,7 @@ SIDES = ("before", "after")
 
 
 def perturbed(problem, samples, seed):
-    """Return `samples` ScenarioRuns that the search does not use.
-
-    Its scenarios in turn, with every uncertain parameter of the plant changed by its own factor,
-    uniform within the case's spread, what was identified together drawn from its covariance, and
-    other sensor noise.
-    """
+    """Return `samples` ScenarioRuns that the search does not use."""
     rng, runs = np.random.default_rng([SEED_OFFSET, seed]), []
     for i in range(samples):
         run = problem.runs[i % len(problem.runs)]
@@ -77,26 +69,7 @@ def validate(problem, before, after, samples, seed):
 
 
 def summary_of(problem, costs, held, levels, diverged, spread, noise):
-    """Return (summary, cloud) of runs before and after tuning, on the same draws.
-
-    Parameters
-    ----------
-    costs : (samples, 2) before and after.
-    held : (samples, 2) True where every limit holds.
-    levels : (samples, 2, tanks) highest [cm].
-    diverged : (samples,) True where a run is not finite.
-    spread : {name: share}; noise : True if the runs have noise of their own.
-
-    Returns
-    -------
-    summary : {"samples", "spread", "noise", "failed", "objective" {"before"/"after": {"mean",
-        "p05", "p50", "p95"}}, "better_share": of the runs in which the tuned values cost less,
-        "limits_held" {"before"/"after": share of the runs in which every limit holds},
-        "comparable": share of the runs in which both hold them, "better_share_of_comparable"}.
-    cloud : of the runs that did not fail, {"objective" (runs, 2), "level" (runs, 2) of the tank
-        that comes highest, "limit" [cm] or None, "past": True where the tanks' limits differ and
-        "level" is how far the worst is above its own, "held" (runs, 2)}.
-    """
+    """Return (summary, cloud) of runs before and after tuning, on the same draws."""
     good = ~diverged & np.isfinite(costs).all(axis=1)
     both = good & held.all(axis=1)
     found = {

@@ -1,7 +1,4 @@
-"""Sums, products and linear systems of arrays. RULES holds the primitives of jax.
-
-Imported by `jaxtank.export.whole.array_text`.
-"""
+"""Sums, products and linear systems of arrays. RULES holds the primitives of jax."""
 
 import numpy as np
 from jax.core import eval_jaxpr

@@ -1,7 +1,4 @@
-"""Which results of a loop or a choice depend on which arguments: they are computed apart.
-
-Imported by the other modules on arrays of this folder.
-"""
+"""Which results of a loop or a choice depend on which arguments: they are computed apart."""
 
 from jax.extend.core import Literal
 

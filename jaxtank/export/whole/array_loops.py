@@ -1,7 +1,4 @@
-"""Loops and choices of array operations. RULES holds the primitives of jax.
-
-Imported by `jaxtank.export.whole.array_text`.
-"""
+"""Loops and choices of array operations. RULES holds the primitives of jax."""
 
 import re
 

@@ -1,7 +1,4 @@
-"""Array operations that only move elements. RULES holds the primitives of jax.
-
-Imported by `jaxtank.export.whole.array_text`.
-"""
+"""Array operations that only move elements. RULES holds the primitives of jax."""
 
 from typing import Any
 
@@ -30,13 +27,7 @@ def view(text, operand, shape, strides, start: Any = 0):
 
 
 def merged(shape, strides):
-    """Return [(length, stride)] of the axes, without those of length 1, runs of them as one.
-
-    Examples
-    --------
-    >>> merged((2, 1, 3), (3, 3, 1)), merged((3, 2), (1, 3))
-    ([(6, 1)], [(3, 1), (2, 3)])
-    """
+    """Return [(length, stride)] of the axes, without those of length 1, runs of them as one."""
     axes: list[tuple[int, int]] = []
     for length, stride in zip(shape, strides):
         if length == 1:
@@ -49,13 +40,7 @@ def merged(shape, strides):
 
 
 def place(start, terms):
-    """Return the text of an index: start + counter stride + ...
-
-    Examples
-    --------
-    >>> place(0, [("x", 1)]), place(5, [("i", 0), ("j", -2)]), place("k", [("i", 3)])
-    ('x', '5+j*-2', 'k+i*3')
-    """
+    """Return the text of an index: start + counter stride + ..."""
     parts = [] if start == 0 or start == "0" else [str(start)]
     parts += [i if step == 1 else f"{i}*{step}" for i, step in terms if step]
     return "+".join(parts) or "0"

@@ -1,7 +1,4 @@
-"""The operations of a jaxpr on whole arrays as lines of JavaScript.
-
-Imported by `jaxtank.export.whole.arrays`.
-"""
+"""The operations of a jaxpr on whole arrays as lines of JavaScript."""
 
 import itertools
 import re
@@ -45,12 +42,7 @@ RULES: dict[str, Callable[..., Any]] = {
 
 
 class ArrayText:
-    """The lines of a function on arrays. Values are texts: names of arrays, or numbers.
-
-    An array that a line fills is made once and for all, for the engine of a browser takes longer to
-    make one of more than eight entries than to fill it: it holds its entries until the line is
-    executed again. What a function returns is a copy.
-    """
+    """The lines of a function on arrays. Values are texts: names of arrays, or numbers."""
 
     def __init__(self, names, outer=None):
         self.names = names

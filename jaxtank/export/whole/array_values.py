@@ -1,7 +1,4 @@
-"""Arrays of numbers as JavaScript, and the functions on arrays that a text calls.
-
-Imported by the other modules on arrays of this folder.
-"""
+"""Arrays of numbers as JavaScript, and the functions on arrays that a text calls."""
 
 import functools
 import re
@@ -17,13 +14,7 @@ PART = "function part(a, b, m) {\n  return m.subarray(a, b);\n}"
 
 
 def constant(array: np.ndarray) -> str:
-    """Return an array of numbers as text.
-
-    Examples
-    --------
-    >>> constant(np.ones(3)), constant(np.array([0.0, 2.0])), constant(np.eye(9))[:30]
-    ('1', 'F(0,2)', 'sparse(81,[0,10,20,30,40,50,60')
-    """
+    """Return an array of numbers as text."""
     flat = np.asarray(array, dtype=float).ravel()
     if flat.size and np.all(flat == flat[0]):
         return literal(float(flat[0]))

@@ -1,7 +1,7 @@
 """Work on larger arrays as calls of JavaScript functions, where single elements would fill pages.
 
 Designs of gains, quadratic programmes and their derivatives: whatever has an array of more than
-`LARGEST` entries. Imported by `jaxtank.export.whole.loop`.
+`LARGEST` entries.
 """
 
 import re

@@ -1,7 +1,4 @@
-"""Statements as short JavaScript: values that are read once become part of what reads them.
-
-Imported by `tuning.live`.
-"""
+"""Statements as short JavaScript: values that are read once become part of what reads them."""
 
 import itertools
 from collections import Counter
@@ -64,13 +61,7 @@ LETTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 
 def short_names(taken: Iterable[str] = ()) -> Iterator[str]:
-    """Yield names, short ones first, without keywords, functions of Math and `taken`.
-
-    Examples
-    --------
-    >>> list(itertools.islice(short_names({"b"}), 3))
-    ['a', 'c', 'd']
-    """
+    """Yield names, short ones first, without keywords, functions of Math and `taken`."""
     avoid = TAKEN | set(MATHS) | set(taken)
     for size in itertools.count(1):
         for letters in itertools.product(LETTERS, repeat=size):
@@ -80,13 +71,7 @@ def short_names(taken: Iterable[str] = ()) -> Iterator[str]:
 
 
 def literal(value: Any) -> str:
-    """Return a number as text, in as few characters as it takes.
-
-    Examples
-    --------
-    >>> literal(2.0), literal(0.5), literal(-1e-05), literal(float("inf")), literal(True)
-    ('2', '.5', '-1e-5', 'Infinity', 'true')
-    """
+    """Return a number as text, in as few characters as it takes."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, float) and not np.isfinite(value):
@@ -96,20 +81,7 @@ def literal(value: Any) -> str:
 
 
 class Text:
-    """The statements of one function as they are written.
-
-    given: {Ref or name of an array: text of an input}; names: of new variables.
-
-    Examples
-    --------
-    >>> text = Text({Ref("x"): "x"}, short_names())
-    >>> once = Define("real", "v1", "add", (Ref("x"), 1.0))
-    >>> twice = Define("real", "v2", "mul", (Ref("v1"), -2.0))
-    >>> text.write([once, twice], [Ref("v2")])
-    []
-    >>> text.of(Ref("v2"))
-    '(x+1)*-2'
-    """
+    """The statements of one function as they are written."""
 
     def __init__(self, given: Mapping[Any, str], names: Iterator[str]):
         self.given, self.names = dict(given), names

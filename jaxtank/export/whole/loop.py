@@ -1,7 +1,7 @@
 """One sample of the whole closed loop as statements, with every number of the loop as an input.
 
 References, disturbances, sensor, observer, controller, safety filter, pumps, plant, overflow and
-measures: the functions that are simulated, traced. Imported by `tuning.live`.
+measures: the functions that are simulated, traced.
 """
 
 import dataclasses
@@ -34,12 +34,7 @@ LARGEST = 24
 
 @dataclasses.dataclass(frozen=True)
 class WholeLoop:
-    """The statements of one sample, in order, and what they lead to.
-
-    Inputs are Refs of p (numbers of the loop), k (index of the sample), c (what one sample hands to
-    the next) and n (deviates of the sensor noise, one per tank). An array of the state that is read
-    at an index, such as the line of a transport delay, is an input by itself, a Line.
-    """
+    """The statements of one sample, in order, and what they lead to."""
 
     case: Case
     leaves: tuple[tuple[str, tuple[int, ...]], ...]
@@ -60,39 +55,19 @@ class WholeLoop:
 
 
 def traced_leaves(case: Case, largest: int = 64) -> dict[str, np.ndarray]:
-    """Return {dotted name: value} of the numbers of a loop that are inputs of its statements.
-
-    Longer arrays, such as recorded samples, stay constants.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> list(traced_leaves(presets.find("cascaded/pi")))[:2]
-    ['plant.area', 'plant.drain']
-    """
+    """Return {dotted name: value} of the numbers of a loop that are inputs of its statements."""
     found = {n: np.asarray(v, dtype=float) for n, v in parameters(case.loop).items()}
     return {n: v for n, v in found.items() if 0 < v.size <= largest}
 
 
 def served(case: Case) -> tuple[str, ...]:
-    """Return the names of the measures that mean something for a case, those of times included.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> "recovery_time" in served(presets.find("cascaded/pi"))
-    False
-    """
+    """Return the names of the measures that mean something for a case, those of times included."""
     return (*(m for m in ms.reported() if ms.serves(m, case.loop)), *ms.times())
 
 
 def sample_of(case: Case, names: Sequence[str], squares: Sequence[tuple[str, float]] = ()) -> Any:
     """Return the function (p, k, c, n) -> (c before the first sample, c after this one, saved,
     measures, residuals) of a case.
-
-    p: {dotted name: array}; k: index of the sample; c: (state, accumulators, volume lost over each
-    rim); n: (tanks,) deviates. Measures are those of a run that ended with c, residuals the numbers
-    whose squares the measures of `squares` add at this sample.
     """
     clock, names = case.clock, tuple(names)
 
@@ -119,23 +94,7 @@ def sample_of(case: Case, names: Sequence[str], squares: Sequence[tuple[str, flo
 
 
 def whole_loop(case: Case, names: Sequence[str] | None = None) -> WholeLoop:
-    """Return the WholeLoop of a case with the measures `names`; None: all that it serves.
-
-    Raises
-    ------
-    InputError
-        For an operation without a counterpart, and a signal whose samples do not follow from their
-        times alone.
-
-    Examples
-    --------
-    >>> import jax
-    >>> from jaxtank import presets
-    >>> with jax.enable_x64(True):
-    ...     found = whole_loop(presets.find("cascaded/pi"), ["rms_error_total"])
-    >>> len(found.first) == len(found.after), list(found.measures)
-    (True, ['rms_error_total'])
-    """
+    """Return the WholeLoop of a case with the measures `names`; None: all that it serves."""
     check_pointwise(case)
     names = served(case) if names is None else tuple(names)
     whole, shapes = sample_of(case, names), arguments(case, names)

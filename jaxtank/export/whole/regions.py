@@ -1,7 +1,4 @@
-"""Statements sorted by what they depend on, so that each is computed as seldom as possible.
-
-Imported by the printers of whole loops.
-"""
+"""Statements sorted by what they depend on, so that each is computed as seldom as possible."""
 
 from collections.abc import Iterable, Mapping
 from typing import cast
@@ -27,15 +24,7 @@ CHEAP = frozenset(_CHEAP.split())
 
 
 def hoisted(statements: Iterable[Statement]) -> list[Statement]:
-    """Return statements with those of a loop's body that no pass changes moved in front of it.
-
-    Examples
-    --------
-    >>> inner = Define("real", "v1", "sqrt", (Ref("x"),))
-    >>> loop = Loop(3, (("real", "c1", 0.0),), [inner], (Ref("v1"),))
-    >>> [type(s).__name__ for s in hoisted([loop])]
-    ['Define', 'Loop']
-    """
+    """Return statements with those of a loop's body that no pass changes moved in front of it."""
     out: list[Statement] = []
     for s in statements:
         if not isinstance(s, Loop):
@@ -61,16 +50,7 @@ def defined(statement: Statement) -> set[str]:
 
 
 def ranks(statements: Iterable[Statement], given: Mapping[str, int]) -> dict[str, int]:
-    """Return {name: rank} of every variable: the largest rank of what it depends on.
-
-    given: {input: its rank}.
-
-    Examples
-    --------
-    >>> one = Define("real", "v1", "add", (Ref("x"), Ref("t")))
-    >>> ranks([one], {"x": 0, "t": 1})["v1"]
-    1
-    """
+    """Return {name: rank} of every variable: the largest rank of what it depends on."""
     found = dict(given)
     for s in statements:
         own = s.reads if not isinstance(s, Loop) else s.reads - local(s)
@@ -84,14 +64,6 @@ def ranks(statements: Iterable[Statement], given: Mapping[str, int]) -> dict[str
 def split(statements: Iterable[Statement], given: Mapping[str, int]) -> list[Statement]:
     """Return statements with each loop of mixed ranks, 0 and 1, as two: one of what has rank 0, and
     one of all, of which only the rest is read.
-
-    Examples
-    --------
-    >>> carried = (("real", "c1", 1.0), ("real", "c2", Ref("d")))
-    >>> double = [Define("real", f"v{i}", "mul", (Ref(f"c{i}"), 2.0)) for i in (1, 2)]
-    >>> found = split([Loop(3, carried, double, (Ref("v1"), Ref("v2")))], {"d": 1})
-    >>> [[name for _, name, _ in loop.carried] for loop in found]
-    [['c1'], ['c1_', 'c2']]
     """
     rank, out = dict(given), []
     for s in statements:
@@ -198,16 +170,7 @@ def entries_read(s: Statement) -> tuple:
 def kept_in_time(
     timed: list[Statement], wanted: set[Ref], rank: Mapping[str, int]
 ) -> tuple[set[Ref], list[Statement]]:
-    """Return (values of rank 1 to keep for every sample, statements that follow from them).
-
-    Parameters
-    ----------
-    timed : statements of rank 1, in order
-    wanted : values of rank 1 that the state depends on
-    rank : of every variable
-
-    A value that follows from others that are kept anyway by one cheap operation is computed again.
-    """
+    """Return (values of rank 1 to keep for every sample, statements that follow from them)."""
     made = {s.name: s for s in timed if isinstance(s, Define)}
     kept, again = set(wanted), set()
 

@@ -1,7 +1,4 @@
-"""The derivative of one sample of the whole loop along one direction, as statements.
-
-Imported by `tuning.live`.
-"""
+"""The derivative of one sample of the whole loop along one direction, as statements."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -35,11 +32,7 @@ LINEAR = ("product", "forward", "backward", "solve")
 
 @dataclasses.dataclass(frozen=True)
 class TangentLoop:
-    """A WholeLoop without saved columns, and the tangents of its sample along one direction.
-
-    Inputs besides those of the WholeLoop: d (the direction, numbers of `leaves`) and e (tangents of
-    c, at the entries `places`).
-    """
+    """A WholeLoop without saved columns, and the tangents of its sample along one direction."""
 
     loop: WholeLoop
     leaves: tuple[tuple[str, tuple[int, ...]], ...]
@@ -58,26 +51,7 @@ class TangentLoop:
 def tangent_loop(
     case: Case, names: Sequence[str], free: Sequence[str], squares: Sequence[tuple[str, float]]
 ) -> TangentLoop:
-    """Return the TangentLoop of a case.
-
-    Parameters
-    ----------
-    case : Case
-    names : measures
-    free : dotted names of the leaves that a direction may have entries of
-    squares : ((measure, weight), ...) of the Gauss-Newton matrix
-
-    Examples
-    --------
-    >>> import jax
-    >>> from jaxtank import presets
-    >>> squares = (("mean_square_error", 1.0),)
-    >>> with jax.enable_x64(True):
-    ...     case = presets.find("cascaded/pi")
-    ...     found = tangent_loop(case, ["rms_error_total"], ["controller.Kc"], squares)
-    >>> len(found.errors), found.leaves
-    (1, (('controller.Kc', (0,)),))
-    """
+    """Return the TangentLoop of a case."""
     check_pointwise(case)
     kept = tuple(dict.fromkeys([*names, *(m for m, _ in squares)]))
     shapes = arguments(case, kept)
@@ -222,15 +196,7 @@ def _renamed(s, place):
 def pruned(
     statements: list[Statement], known: dict[Ref, Any]
 ) -> tuple[list[Statement], dict[Ref, Any]]:
-    """Return statements with known values put in, and every value that is known then.
-
-    Examples
-    --------
-    >>> once = Define("real", "v1", "mul", (Ref("e", 0), Ref("x")))
-    >>> found = pruned([once], {Ref("e", 0): 0.0})
-    >>> found[0], found[1][Ref("v1")]
-    ([], 0.0)
-    """
+    """Return statements with known values put in, and every value that is known then."""
     known, kept, arrays = dict(known), [], {}
     for s in statements:
         if isinstance(s, Define):

@@ -1,7 +1,4 @@
-"""The rig and the closed loops of gouta2022: ENMPC, CHADPC, PI, PID and fractional PI.
-
-Imported by `jaxtank.presets.gouta2022`.
-"""
+"""The rig and the closed loops of gouta2022: ENMPC, CHADPC, PI, PID and fractional PI."""
 
 import dataclasses
 
@@ -82,10 +79,8 @@ def rig(pump_gain=RECONCILED_GAIN):
 
 
 def benchmark(band=0.05):
-    """Return the reference of benchmark 1 (sec. 5.1; notes S3.1).
-
-    r1 = 8 from 10 s on, plus a raised sine with a period of 250 s from 50 to 800 s; r2 = 10.
-    """
+    """Return the reference of benchmark 1 (sec. 5.1; notes S3.1)."""
+    # r1 = 8 from 10 s on, plus a raised sine with a period of 250 s from 50 to 800 s; r2 = 10.
     steps = ramps((0.0, 0.0), [(0.0, 1, 10.0), (10.0, 0, 8.0)], ramp=0.0, band=band)
     sine = Sine(
         amplitude=number(3.0),
@@ -101,10 +96,8 @@ def benchmark(band=0.05):
 
 
 def trapezoids():
-    """Return the reference of benchmark 2, with both levels starting at 1 cm.
-
-    Slopes that last 40 s are two of 20 s (notes S3.3, assumed but for 330 to 560 s).
-    """
+    """Return the reference of benchmark 2, with both levels starting at 1 cm."""
+    # Slopes that last 40 s are two of 20 s (notes S3.3, assumed but for 330 to 560 s).
     first = [(20.0, 8.0), (330.0, 14.0), (790.0, 12.0), (810.0, 10.0), (1250.0, 12.0)]
     second = [(20.0, 8.0), (560.0, 14.0), (1020.0, 12.0), (1040.0, 10.0)]
     return ramps(

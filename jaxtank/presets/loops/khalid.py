@@ -1,6 +1,6 @@
 """The rig, the scenarios and the closed loops of khalid: GPC and Laguerre functions.
 
-Lengths in m, inputs in U0 = 1e-4 m^3/s. Imported by `jaxtank.presets.khalid`.
+Lengths in m, inputs in U0 = 1e-4 m^3/s.
 """
 
 import math
@@ -67,11 +67,7 @@ CONTROLLERS = {  # case: (controller, its static fields, scenario, title)
 
 
 def tanks(pumps):
-    """Return the coupled tanks with one pump or with two.
-
-    With one, tank 1 has no outlet of its own and H2 is controlled (eqs. 8-9); with two, both levels
-    are (eqs. 6-7).
-    """
+    """Return the coupled tanks with one pump or with two."""
     first, second, between = (CHANNEL * a for a in DISCHARGE)
     return coupled_tanks(
         area=9350e-6,  # A1 = A2, Table I [m^2]
@@ -89,13 +85,7 @@ def tanks(pumps):
 
 
 def steady_input(pumps, x):
-    """Return the inputs (pumps,) [U0] that hold the levels x = (H1, H2) [m] (notes S2.2).
-
-    Examples
-    --------
-    >>> round(steady_input(1, (0.15, 0.03))[0], 4)
-    0.6019
-    """
+    """Return the inputs (pumps,) [U0] that hold the levels x = (H1, H2) [m] (notes S2.2)."""
     alpha = [CHANNEL * a * math.sqrt(2 * GRAVITY) / U0 for a in DISCHARGE]
     between = alpha[2] * math.copysign(math.sqrt(abs(x[0] - x[1])), x[0] - x[1])
     return (
@@ -106,10 +96,7 @@ def steady_input(pumps, x):
 
 
 def scenario(name):
-    """Return (reference, x0 [m], inputs before t = 0 [U0]) of a scenario of notes S3.
-
-    It has two periods of pulses, the high level first; in M3 those of the last output begin later.
-    """
+    """Return (reference, x0 [m], inputs before t = 0 [U0]) of a scenario of notes S3."""
     pumps, spans, x0, delay = SCENARIOS[name]
     changes = []
     for channel, (low, high) in enumerate(spans):
@@ -123,10 +110,7 @@ def scenario(name):
 
 
 def build(kind, where=None, mode="unconstrained"):
-    """Return the closed loop of a case of CONTROLLERS.
-
-    where: name of the scenario, None for the case's; mode: as in `LinearPredictive`.
-    """
+    """Return the closed loop of a case of CONTROLLERS."""
     controller, sizes, default, _ = CONTROLLERS[kind]
     reference, x0, u0 = scenario(where or default)
     pumps = len(u0)

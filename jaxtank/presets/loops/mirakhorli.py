@@ -1,6 +1,5 @@
-"""The rig and the closed loops of mirakhorli: state feedback, sliding mode, and their fuzzy blend.
-
-Imported by `jaxtank.presets.mirakhorli`.
+"""The rig and the closed loops of mirakhorli: state feedback, sliding mode, and their
+fuzzy blend.
 """
 
 import dataclasses
@@ -136,12 +135,10 @@ def fitted(name):
 
 
 def tuning_scenarios():
-    """Return the scenarios that `tune` evaluates (notes S10).
-
-    They are the case's own start, and starts from the steady state at the setpoint with one
-    parameter of the plant changed; all with 0.05 cm of noise where the case has none, without
-    which the optimal gains are not bounded.
-    """
+    """Return the scenarios that `tune` evaluates (notes S10)."""
+    # They are the case's own start, and starts from the steady state at the setpoint with one
+    # parameter of the plant changed; all with 0.05 cm of noise where the case has none, without
+    # which the optimal gains are not bounded.
     steady = {
         **dict.fromkeys(("x0", "actuator.initial", "reference.initial"), "steady"),
         "clock.duration": "x0.75",

@@ -1,4 +1,3 @@
-"""Published numbers and claims, and what is measured of them, where the preset would be too long.
-
-Imported by the presets; may import what they import.
+"""Published numbers and claims, and what is measured of them, where the preset would be
+too long.
 """

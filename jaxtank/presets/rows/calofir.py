@@ -1,4 +1,4 @@
-"""calofir, secs. 2 to 5: further rows of `jaxtank compare`. Imported by the preset of calofir."""
+"""calofir, secs. 2 to 5: further rows of `jaxtank compare`."""
 
 import numpy as np
 

@@ -1,7 +1,4 @@
-"""gouta2015, secs. 4 to 6: rows of `jaxtank compare` on the nominal plant.
-
-Imported by its preset.
-"""
+"""gouta2015, secs. 4 to 6: rows of `jaxtank compare` on the nominal plant."""
 
 import dataclasses
 

@@ -1,7 +1,4 @@
-"""gouta2022, secs. 3 to 5: rows of `jaxtank compare` beside those of Tables 3 and 4.
-
-Imported by the preset of gouta2022.
-"""
+"""gouta2022, secs. 3 to 5: rows of `jaxtank compare` beside those of Tables 3 and 4."""
 
 import dataclasses
 
@@ -122,30 +119,13 @@ def _cm(values):
 
 
 def quiet(t):
-    """Return the samples at which means of d^ and offsets are taken (notes A6).
-
-    They are later than 60 s, and not within 30 s after an inflow pulse. t: times [s].
-
-    Examples
-    --------
-    >>> quiet(np.array([10.0, 100.0, 510.0])).tolist()
-    [False, True, False]
-    """
+    """Return the samples at which means of d^ and offsets are taken (notes A6)."""
+    # They are later than 60 s, and not within 30 s after an inflow pulse. t: times [s].
     return (t > 60) & ~((t >= 500) & (t < 530)) & ~((t >= 700) & (t < 730))
 
 
 def figures(run):
-    """Return the numbers of a run of benchmark 1 as Table 3 defines them (notes A6).
-
-    Parameters
-    ----------
-    run : Trajectory as host arrays
-
-    Returns
-    -------
-    {"error" RMS [cm], "voltage" RMS [V], "settling" time [s], "recovery" time [s], "d" mean d^
-    [cm/s]}: a pair each, one number per output
-    """
+    """Return the numbers of a run of benchmark 1 as Table 3 defines them (notes A6)."""
     t, e = run.t, np.abs(run.e)
 
     def last(mask, output, band, begin):

@@ -1,7 +1,4 @@
-"""khalid, sec. V: further rows of `jaxtank compare`, of the pulses from 0 m as printed.
-
-Imported by the preset of khalid.
-"""
+"""khalid, sec. V: further rows of `jaxtank compare`, of the pulses from 0 m as printed."""
 
 import jax
 import jax.numpy as jnp
@@ -61,13 +58,7 @@ MIMO = ("gpc-mimo", "laguerre-mimo")
 
 
 def from_empty(name):
-    """Return the values that make scenario `name` of notes S3 of a case with its pumps.
-
-    Examples
-    --------
-    >>> from_empty("S1")["reference.targets"]
-    [0.12, 0.0, 0.12, 0.0]
-    """
+    """Return the values that make scenario `name` of notes S3 of a case with its pumps."""
     reference, x0, u0 = scenario(name)
     return {
         "reference.initial": np.asarray(reference.initial).tolist(),

@@ -1,7 +1,4 @@
-"""mirakhorli: Table 3 as numbers, and further rows of `jaxtank compare`.
-
-Imported by the preset of mirakhorli.
-"""
+"""mirakhorli: Table 3 as numbers, and further rows of `jaxtank compare`."""
 
 import dataclasses
 
@@ -106,27 +103,7 @@ PUBLISHED = {
 
 
 def response(trajectory, output=0):
-    """Return the characteristics of a step from the steady state to SETPOINT (notes S3).
-
-    Parameters
-    ----------
-    trajectory : Trajectory as host arrays
-    output : index of the output
-
-    Returns
-    -------
-    {"overshoot" [% of the setpoint], "rise" from 10 to 90 % [s], "arrival" first at the setpoint
-    [s], "settling" last outside 5 % of it [s], "mean_square" of the error over the square of the
-    setpoint [-]}; a time that does not exist is None.
-
-    Examples
-    --------
-    >>> from types import SimpleNamespace
-    >>> t = np.arange(0.0, 100.0)
-    >>> run = SimpleNamespace(t=t, x=12.0 * (1.0 - np.exp(-t / 10.0))[:, None])
-    >>> response(run)["rise"], response(run)["settling"]
-    (22.0, 29.0)
-    """
+    """Return the characteristics of a step from the steady state to SETPOINT (notes S3)."""
     t, h, r = trajectory.t, trajectory.x[:, output], SETPOINT[output]
 
     def first(level):
@@ -160,10 +137,8 @@ SAME_CONTROLLER = {"SMC": ("smc", "smc-printed"), "SFC": ("sfc",), "hybrid": ("h
 
 
 def measured(run, assumed):
-    """Return {quantity: what was found} of PUBLISHED, but for what cannot be measured.
-
-    assumed : {controller of Table 3: its `response` with what notes S7.2 assumes}
-    """
+    """Return {quantity: what was found} of PUBLISHED, but for what cannot be measured."""
+    # assumed : {controller of Table 3: its `response` with what notes S7.2 assumes}
     rise = {name: found["arrival"] for name, found in assumed.items()}
     settled = [assumed[name]["settling"] for name in ("SFC", "hybrid")]
     own = {name: response(run(cases[0])[1])["arrival"] for name, cases in SAME_CONTROLLER.items()}

@@ -1,8 +1,7 @@
 """gouta2015 sec. 5.3: both controllers on plants whose coefficients are off, with 95 % intervals.
 
 200 plants with c1, c2, c3, c7, c8 (and their twins) off by up to 5 and 10 %; the paper gives
-neither ranges nor numbers. Ramps of 30 s, steps of 0.02 s (gouta2015 notes S11). Imported by the
-preset of gouta2015.
+neither ranges nor numbers. Ramps of 30 s, steps of 0.02 s (gouta2015 notes S11).
 """
 
 from typing import NamedTuple
@@ -77,12 +76,7 @@ PUBLISHED = {name: row._replace(ramp=SETTING["reference.ramp"]) for name, row in
 
 
 class Found(NamedTuple):
-    """One controller on N plants.
-
-    measures : {measure: (N, ...)}
-    errors : (N, rows, 2) every EVERY seconds [cm]
-    failed : (N,) True where a run diverged
-    """
+    """One controller on N plants."""
 
     measures: dict
     errors: np.ndarray
@@ -92,10 +86,6 @@ class Found(NamedTuple):
 def coefficients(plant, spread):
     """Return {name: (N, ...)} of the plant with c1, c2, c3, c7, c8 (and their twins) off by factors
     of their own, uniform within +-spread.
-
-    c7, what leaves an upper tank, then differs from c2 + c3, what arrives below: an outlet takes up
-    the difference, or, where that is negative, a source (the paper varies c7 by itself, which no
-    rig can do).
     """
     f1, f2, f3, f7, f8 = np.random.default_rng(2015).uniform(1 - spread, 1 + spread, (5, N))
     inner, outer = np.asarray(plant.orifice)[:2]
@@ -152,37 +142,19 @@ def interval(values, of=np.mean, draws=2000):
 
 
 def exact(count, total):
-    """Return (low, high), the interval of a probability by Clopper and Pearson.
-
-    Examples
-    --------
-    >>> [round(float(end), 4) for end in exact(0, 100)]
-    [0.0, 0.0362]
-    """
+    """Return (low, high), the interval of a probability by Clopper and Pearson."""
     from scipy.stats import binomtest  # takes half a second to import
 
     return tuple(binomtest(count, total).proportion_ci())
 
 
 def above_zero(triples):
-    """Return, for each spread, whether the interval of a difference lies above zero.
-
-    Examples
-    --------
-    >>> above_zero([(1.0, 0.5, 2.0), (1.0, -0.1, 2.0)])
-    [True, False]
-    """
+    """Return, for each spread, whether the interval of a difference lies above zero."""
     return [low > 0.0 for _, low, _ in triples]
 
 
 def printed(triple, unit):
-    """Return estimate, interval and unit as text.
-
-    Examples
-    --------
-    >>> printed((0.42, 0.4, 0.45), "cm")
-    '+0.42 cm (+0.4 to +0.45)'
-    """
+    """Return estimate, interval and unit as text."""
     estimate, low, high = triple
     return f"{estimate:+.3g}{' ' + unit if unit else ''} ({low:+.3g} to {high:+.3g})"
 

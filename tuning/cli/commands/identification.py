@@ -1,5 +1,5 @@
 """The command `jaxtank identify`: experiment data in, a rig to tune out; `--plan` compares
-experiments before one is made. Imports nothing heavy before it runs.
+experiments before one is made.
 """
 
 import sys

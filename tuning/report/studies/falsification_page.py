@@ -61,10 +61,7 @@ CAPTIONS = {
 
 
 def page_of(attack, drawn, command=None):
-    """Return the page report.html of an Attack.
-
-    drawn: the figures of `figures`; command: the command line that made it.
-    """
+    """Return the page report.html of an Attack."""
     worst, unit = attack.worst, attack.case.loop.units[0]
     return html.document(
         f"{attack.case.name}: attack",

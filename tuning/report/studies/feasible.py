@@ -41,14 +41,7 @@ def json_of(found):
 
 
 def mend_json(mend):
-    """Return the JSON object of a Mend.
-
-    Examples
-    --------
-    >>> from tuning.feasible.result import Mend
-    >>> mend_json(Mend(what="ramps", set={"reference.ramp": 170.0}, share=None, words="ramps"))
-    {'what': 'ramps', 'set': {'reference.ramp': 170.0}, 'share': None, 'words': 'ramps'}
-    """
+    """Return the JSON object of a Mend."""
     return {
         "what": mend.what,
         "set": tables.clean(dict(mend.set)),
@@ -71,13 +64,7 @@ def lines(found):
 
 
 def percent(share):
-    """Return a share in per cent, to two digits.
-
-    Examples
-    --------
-    >>> percent(0.762), percent(0.0003)
-    ('76 %', '0.03 %')
-    """
+    """Return a share in per cent, to two digits."""
     return f"{100 * share:.2g} %"
 
 

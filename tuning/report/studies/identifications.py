@@ -21,14 +21,7 @@ LISTED = 12
 
 
 def labels(found):
-    """Return a name of each record that no other has.
-
-    Examples
-    --------
-    >>> import types
-    >>> labels(types.SimpleNamespace(logs=("log", "log")))
-    ['log 1', 'log 2']
-    """
+    """Return a name of each record that no other has."""
     if len(set(found.logs)) == len(found.logs):
         return list(found.logs)
     return [f"{name} {e + 1}" for e, name in enumerate(found.logs)]

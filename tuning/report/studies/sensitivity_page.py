@@ -31,10 +31,7 @@ def lines(result):
 
 
 def json_of(result):
-    """Return the JSON object of `jaxtank sensitivity --json`.
-
-    Measures by name and entry, each with every parameter, the most influential one first.
-    """
+    """Return the JSON object of `jaxtank sensitivity --json`."""
     return {
         "case": result.case.name,
         "method": result.method,
@@ -144,10 +141,7 @@ def _panel(plotting, result, c, ax):
 
 
 def page_of(result, drawn, command=None):
-    """Return the page report.html of a SensitivityResult.
-
-    drawn: the figures of `figures`; command: the command line that made it.
-    """
+    """Return the page report.html of a SensitivityResult."""
     first = next((c for c in result.columns if not c.empty), None)
     facts = [
         ("parameters", str(len(result.parameters))),
@@ -182,10 +176,7 @@ def page_of(result, drawn, command=None):
 
 
 def save(result, folder, command=None):
-    """Write result.json, sensitivity.csv, tornado.png or sobol.png, and report.html to `folder`.
-
-    Returns their paths. command: the command line that made the result.
-    """
+    """Write result.json, sensitivity.csv, tornado.png or sobol.png, and report.html to `folder`."""
     check_folder(folder)
     files = {
         "result.json": tables.dumps(json_of(result)) + "\n",

@@ -63,13 +63,7 @@ LEFT_OUT = {
 
 
 def per(unit, of):
-    """Return the unit of a derivative: of a measure in `unit` by a parameter in the unit `of`.
-
-    Examples
-    --------
-    >>> per("cm", "1/s"), per("cm", "-"), per("-", "V")
-    ('cm per 1/s', 'cm', '1 per V')
-    """
+    """Return the unit of a derivative: of a measure in `unit` by a parameter in the unit `of`."""
     return unit if of == "-" else f"{'1' if unit == '-' else unit} per {of}"
 
 

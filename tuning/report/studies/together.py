@@ -29,12 +29,7 @@ CAPTIONS = {"responses": "The runs over each other, on the rims and limits of th
 
 
 class Run(NamedTuple):
-    """One of several runs.
-
-    case : with the disturbances, faults and sensors of the first.
-    measures : {measure: value}.
-    differs : what else is different from the first case, in words.
-    """
+    """One of several runs."""
 
     case: Case
     measures: dict[str, np.ndarray]
@@ -42,28 +37,7 @@ class Run(NamedTuple):
 
 
 def run_together(cases: list[Case], seed: int = 0) -> list[Run]:
-    """Return the runs of cases under the disturbances, faults and noise of the first.
-
-    Parameters
-    ----------
-    cases : of one size (tanks, outputs, pumps), with the same units and the same length of the run.
-    seed : of the sensor noise.
-
-    Raises
-    ------
-    InputError
-        For cases that do not fit on each other.
-
-    Examples
-    --------
-    >>> import jax
-    >>> from jaxtank import presets, rig
-    >>> jax.config.update("jax_enable_x64", True)
-    >>> short = {"clock.duration": 20.0, "clock.dt": 0.1}
-    >>> cases = [rig.set_values(presets.find(f"gouta2022/{n}"), short) for n in ("pi", "pid")]
-    >>> [list(run.differs) for run in run_together(cases)]
-    [[], []]
-    """
+    """Return the runs of cases under the disturbances, faults and noise of the first."""
     first = _checked(cases)[0]
     found = []
     for case in cases:

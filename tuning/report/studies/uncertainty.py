@@ -143,15 +143,7 @@ def _violation_table(ensemble):
 
 
 def in_words(distribution):
-    """Return a distribution in words, in the unit of its parameter.
-
-    Examples
-    --------
-    >>> in_words(Uniform(relative=0.1))
-    '+-10 % (uniform)'
-    >>> in_words(Normal(mean=2.0, sd=0.1))
-    '2 sd 0.1 (normal, truncated at 3 sd)'
-    """
+    """Return a distribution in words, in the unit of its parameter."""
     d = distribution
     if isinstance(d, Correlated):
         means = "" if d.mean is None else " and means of their own"
@@ -184,8 +176,6 @@ def _extent(d):
 def draws_csv(ensemble):
     """Return every draw as CSV, some lines at a time: number, whether it diverged, parameters,
     measures.
-
-    Units are in the header.
     """
     sources = ((ensemble.values, None), (ensemble.measures, ms.unit))
     heads = ["draw", "failed"]
@@ -241,10 +231,7 @@ CAPTIONS = {
 
 
 def page_of(ensemble, drawn, command=None):
-    """Return the page report.html of an Ensemble.
-
-    drawn: the figures of `figures`; command: the command line that made it.
-    """
+    """Return the page report.html of an Ensemble."""
     diverged, broken = int(ensemble.failed.sum()), ensemble.violations() if ensemble.limits else []
     facts = [
         ("draws", str(ensemble.samples)),
@@ -309,11 +296,7 @@ def _typical_error(ensemble):
 
 
 def save(ensemble, folder, command=None):
-    """Write result.json, draws.csv, pictures and report.html to `folder`; return their paths.
-
-    The checkpoint in it, which is no longer needed, is removed. command: the command line that
-    made the ensemble.
-    """
+    """Write result.json, draws.csv, pictures and report.html to `folder`; return their paths."""
     check_folder(folder)
     folder = Path(folder)
     files = {

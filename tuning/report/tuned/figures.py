@@ -17,9 +17,8 @@ def result_key(result):
 
 
 def figures(result, runs=None):
-    """Return matplotlib figures of a TuningResult: those of CAPTIONS that have something to show.
-
-    runs: {"before", "after": Trajectory} of the case's own run; simulated where None.
+    """Return matplotlib figures of a TuningResult: those of CAPTIONS that have something
+    to show.
     """
     from jaxtank.plots import responses
     from tuning.report import figures as pictures

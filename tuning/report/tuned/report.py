@@ -63,11 +63,9 @@ def lines(result):
 
 
 def _facts(result, broken):
-    """(name, number) of what stands at the top of the page; broken : limits that are violated.
-
-    Of a default answer the errors in the unit of the levels, unless the user has minimised
-    something else.
-    """
+    """(name, number) of what stands at the top of the page; broken : limits that are violated."""
+    # Of a default answer the errors in the unit of the levels, unless the user has minimised
+    # something else.
     unit = cost_unit(result).replace("-", "")
     before, after = result.objective["before"], result.objective["after"]
     held = f"{len(result.constraints) - broken} of {len(result.constraints)} hold"
@@ -127,11 +125,6 @@ def rig_of(result):
 def save(result, folder, command=None):
     """Write result.json, rig.toml, trajectory.csv, to `folder`, all or none, then PNG pictures and
     report.html; returns their paths.
-
-    command: the line that made the result, for the report, where there is one. A case that no rig
-    file can describe (with a plant or a controller class of one's own) has no rig.toml: a
-    UserWarning, result.json and the report give the reason, and the rig.toml of an earlier result
-    is removed.
     """
     check_folder(folder)
     folder = Path(folder)

@@ -86,10 +86,7 @@ def _measure_table(result):
 
 
 def _notes(shown, units):
-    """Return sentences on entries that are not plain numbers: undefined ones, negative times.
-
-    shown : {measure: (before, after)}.
-    """
+    """Return sentences on entries that are not plain numbers: undefined ones, negative times."""
     before, after = (undefined({m: pair[i] for m, pair in shown.items()}) for i in (0, 1))
     words = [line for line in before if line in after]
     words += [f"before, {line}" for line in before if line not in after]
@@ -121,10 +118,7 @@ def _limit_table(result):
 
 
 def _runs_of(result, others):
-    """Return a line on the runs that the objective is of, where these are scenarios.
-
-    others: whether the table of measures has other rows.
-    """
+    """Return a line on the runs that the objective is of, where these are scenarios."""
     problem = result.problem
     if not problem.scenarios:
         return []
@@ -140,24 +134,7 @@ def _runs_of(result, others):
 
 
 def worst_of_scenarios(constraints):
-    """Return of the rows of `constraints` that differ by their scenario alone the worst ones.
-
-    Parameters
-    ----------
-    constraints : list of ConstraintRow
-        Rows of `TuningResult.constraints`.
-
-    Returns
-    -------
-    list of dict
-        For each limit, the row with the least margin.
-
-    Examples
-    --------
-    >>> row = {"measure": "max_level", "tank": 1, "name": "max_level tank 1", "scenario": None}
-    >>> [r["margin"] for r in worst_of_scenarios([row | {"margin": m} for m in (2.0, 0.5)])]
-    [0.5]
-    """
+    """Return of the rows of `constraints` that differ by their scenario alone the worst ones."""
     worst = {}
     for c in constraints:
         same = (c["measure"], c["tank"], c["name"].removesuffix(f" in {c['scenario']}"))
@@ -167,10 +144,7 @@ def worst_of_scenarios(constraints):
 
 
 def scenario_rows(result):
-    """Return one dict for each scenario of a TuningResult, [] for the case's own run alone.
-
-    Its keys: name, weight, objective {before, after}, limits_held {before, after}.
-    """
+    """Return one dict for each scenario of a TuningResult, [] for the case's own run alone."""
     problem = result.problem
     if not problem.scenarios:
         return []
@@ -260,10 +234,7 @@ def _why_not_validated(result):
 
 
 def _improved(found):
-    """Return in how many validation runs tuning improved the objective, in words.
-
-    Runs are compared where both hold every limit: to break one may lower the objective.
-    """
+    """Return in how many validation runs tuning improved the objective, in words."""
     if found["comparable"] == 1.0:
         return f"tuning improved the objective in {100 * found['better_share']:.0f} % of them"
     share = found["better_share_of_comparable"]
