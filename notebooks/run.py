@@ -29,7 +29,6 @@ from stale import differences, joined, text_differs
 
 FOLDER = Path(__file__).resolve().parent
 FIELD = re.compile(r"\{\{(.+?)\}\}")
-LONGEST = 60  # [s] a notebook may take on two quiet cores
 HOSTS = {
     "Colab": "https://colab.research.google.com/github/{}/blob/HEAD/notebooks/{}",
     "Binder": "https://mybinder.org/v2/gh/{}/HEAD?labpath=notebooks/{}",

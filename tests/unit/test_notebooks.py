@@ -60,7 +60,7 @@ def test_first_cell_has_title_question_source_and_run_time(source):
     assert re.search(r"^\*\*Question[:.]?\*\*[:.]? \S", first, re.M)
     assert re.search(r"\]\(https://doi\.org/10\.\d{4,}/\S+\)", first)
     seconds = int(re.search(r"Run time: about (\d+) s", first)[1])
-    assert 0 < seconds <= 60
+    assert 0 < seconds <= 120  # 05 measures the 200 rows of five papers
     assert "{{run_time}}" in source.read_text() and "{{links}}" in source.read_text()
 
 

@@ -57,6 +57,7 @@ def test_sensitivities_of_a_count_are_refused(case):
         jaxtank.sensitivities(case.loop, case.clock, ["settling_time"], {"controller.Kc[0]": 1.0})
 
 
+@pytest.mark.slow
 def test_other_measures_keep_their_derivatives_and_counts_their_values(case):
     def error(Kc):
         return jaxtank.evaluate(at(case, Kc), case.clock, ["rms_error_total"])["rms_error_total"]

@@ -277,6 +277,7 @@ def test_by_the_duration_of_a_ramp_and_its_target_through_a_run():
     np.testing.assert_allclose(forward, differences(f, z), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_matrix_of_many_parameters_is_that_of_few(monkeypatch):
     """Slopes that are stored first give the matrix and the slopes of those that are not, of one run
     and of several side by side: nothing is written over before it is read.

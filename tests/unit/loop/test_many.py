@@ -210,6 +210,7 @@ def test_a_large_vmap_of_evaluate_runs_in_batches():
     assert widths(direct, 700) == {700}
 
 
+@pytest.mark.slow
 def test_derivatives_of_evaluate_are_those_of_the_run_in_every_order_with_vmap():
     value, direct, points = batched_and_direct()
     for of in (
@@ -240,6 +241,10 @@ STAGED = {
 }
 
 
+@pytest.mark.slow_for(
+    *[f"2-{form}" for form in STAGED],
+    *("4-grad of jit of vmap", "4-jacfwd of jit of vmap", "4-vmap of checkpoint", "4-linearize"),
+)
 @pytest.mark.parametrize("form", STAGED)
 @pytest.mark.parametrize("count", [2, 4])  # as there are outputs, and tanks: axes could be confused
 def test_derivatives_of_a_staged_vmap_have_the_right_numbers_and_axes(form, count):
@@ -278,6 +283,7 @@ def test_results_that_do_not_depend_on_what_is_mapped_have_its_axis():
     assert jnp.shape(jax.grad(lambda k: jnp.sum(run(k)))(0.03)) == ()
 
 
+@pytest.mark.slow
 def test_a_controller_may_close_over_what_is_traced():
     loop, clock = short("cascaded/pi")
 

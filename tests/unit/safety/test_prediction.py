@@ -78,6 +78,7 @@ def test_levels_of_every_plant_lie_between_the_brackets(seed):
     assert widths[1] < 0.2 * widths[0] + 0.02
 
 
+@pytest.mark.slow_for("30-0.87")
 @pytest.mark.parametrize(("delay", "prototype"), [(10, 0.36), (30, 0.87)])
 def test_pumps_at_full_rest_at_the_gap_worked_out_by_hand(delay, prototype):
     """0.1 c s(H) (1/kappa + dead time) at +-5 %: what the box brings in during the dead time, and
