@@ -19,12 +19,12 @@ amplitude = 1.0
 period = 100.0
 output = 1
 
-[observer]                   # another one than the preset's, or [law]: kind, and its fields
+[observer]                   # another one than the preset's, or [controller]: kind, and its fields
 kind = "extended-kalman"
 process = 1e-4
 measurement = 1e-4
 
-[[pour]]                     # inflow pulses, or [disturbance] inflow = [one per tank]
+[[inflow]]                   # inflow pulses, or [disturbance] inflow = [one per tank]
 time = 500.0
 duration = 1.0
 tank = 2

@@ -1,6 +1,4 @@
-"""[law], [observer], [sensor] and [actuator] of a rig file: a component by its kind, and its fields
-by their names.
-"""
+"""[controller], [observer], [sensor] and [actuator] of a rig file: a component by its kind."""
 
 import dataclasses
 import inspect
@@ -40,7 +38,7 @@ class Role(NamedTuple):
 
 
 ROLES = {
-    "law": Role(
+    "controller": Role(
         "controller",
         controllers.Controller,
         {
@@ -88,7 +86,7 @@ _FIELDS = (bool, int, float, str, tuple)
 def register(kind: str, cls: type) -> type:
     """Give a controller, observer, sensor or actuator of one's own a name in rig files.
 
-    `kind = "..."` of [law] (a controller), [observer], [sensor] or [actuator] then makes a
+    `kind = "..."` of [controller] (a controller), [observer], [sensor] or [actuator] then makes a
     component of the class. Its leaves and static fields are keys of the table; a field `model` is
     the plant of the rig. A static field of type tuple holds tanks, which a file counts from 1.
     `rig.dump`, `rig.complete` and `result.save` write such a case.
@@ -119,7 +117,7 @@ def register(kind: str, cls: type) -> type:
     >>> cls = rig.register("proportional", Proportional)
     >>> own = rig.loads('''
     ... case = "cascaded/pi"
-    ... [law]
+    ... [controller]
     ... kind = "proportional"
     ... Kc = 2.0
     ... [free]
@@ -225,15 +223,15 @@ def _key(cls, field, own, units):
 
 
 def controller_of(table, loop, bias=None):
-    """Return the controller of a [law] table."""
+    """Return the controller of a [controller] table."""
     if isinstance(table, dict) and table.get("kind") == "open-loop":
         start = ramps(np.asarray(loop.actuator.initial).tolist(), [], ramp=0.0)
-        section = section_of("law", "open-loop")
+        section = section_of("controller", "open-loop")
         return controllers.OpenLoop(
             signal=ramps_of(section, table, start, ("pump", "input"), sizes_of(loop.plant))
         )
     bias = steady_bias(loop) if bias is None else bias
-    return component("law", table, model_of(loop), {"bias": bias})
+    return component("controller", table, model_of(loop), {"bias": bias})
 
 
 def observer_of(table, loop):
@@ -299,9 +297,9 @@ def steady_bias(loop, known=False):
 
 
 def leaves_bias(table):
-    """Whether a [law] table leaves out a `bias` that is then `steady_bias`."""
+    """Whether a [controller] table leaves out a `bias` that is then `steady_bias`."""
     kind = table.get("kind")
-    cls = None if kind in REGISTERED else ROLES["law"].classes.get(kind)
+    cls = None if kind in REGISTERED else ROLES["controller"].classes.get(kind)
     return "bias" in getattr(cls, "__dataclass_fields__", ()) and "bias" not in table
 
 

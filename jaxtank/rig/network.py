@@ -57,7 +57,7 @@ def build(table):
     if not outputs:
         raise InputError("plant.outputs = []: must be a list of at least one tank")
     plant = network(**_fields(columns, "plant"), **more, outputs=outputs, units=sizes.units)
-    control = table.get("law", {})
+    control = table.get("controller", {})
     return Case(
         name="my rig",
         title=f"{sizes.tanks} tank{'s' * (sizes.tanks > 1)}, {control.get('kind', '')}",

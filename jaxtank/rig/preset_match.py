@@ -23,7 +23,7 @@ def origin_of(case):
             if same is None:
                 continue
             common = sum(a == b for a, b in zip(statics, _statics(other.loop)))
-            score = ("law" in same, "observer" in same, other.name == case.name, common)
+            score = ("controller" in same, "observer" in same, other.name == case.name, common)
             if best is None or score > best:
                 best, found = score, (other, same)
     return found

@@ -191,6 +191,7 @@ def from_table(table: Mapping[str, Any]) -> Case:
     >>> rig.from_table({"case": "cascaded/pi", "limits": {"max_level": 9.0}}).limits
     {'max_level': 9.0}
     """
+    table = renamed(table)
     case = start_of(table)
     dotted = ("values", "free", "uncertain")
     named = {key: by_dotted_name(table[key], key) for key in dotted if key in table}
@@ -204,6 +205,18 @@ def from_table(table: Mapping[str, Any]) -> Case:
     if "bottom" not in table.get("plant", {}) and "plant.bottom" not in values:
         case = with_bottom(case)
     return filtered(validation.check(case))
+
+
+FORMER = {"law": "controller", "pour": "inflow"}
+"""Sections of older files, which are read under their present names."""
+
+
+def renamed(table):
+    """A table of a rig file with the sections of FORMER under their present names."""
+    for old, new in FORMER.items():
+        if old in table and new in table:
+            raise InputError(f"[{old}] is an older name of [{new}]: give one of them")
+    return {FORMER.get(name, name): value for name, value in table.items()}
 
 
 def filtered(case: Case, on: bool | None = None, changes: Mapping[str, Any] | None = None) -> Case:
@@ -297,7 +310,7 @@ def start_of(table):
             changed[name] = components.instrument_of(name, table[name], loop)
     if "reference" in table:
         changed["reference"] = signals.reference_of(table["reference"], loop.reference, loop.plant)
-    if "disturbance" in table or "pour" in table:
+    if "disturbance" in table or "inflow" in table:
         names = network.names_in(table)
         changed["disturbance"] = signals.disturbance_of(table, loop, names)
     if "fault" in table:
@@ -350,8 +363,8 @@ def _check_sections(table):
 def _with_parts(case, table):
     """A case with the controller or observer of a table in the place of its own."""
     loop, changed = case.loop, []
-    if "law" in table:
-        controller = components.controller_of(table["law"], loop, loop.actuator.initial)
+    if "controller" in table:
+        controller = components.controller_of(table["controller"], loop, loop.actuator.initial)
         if type(controller) is not type(loop.controller):
             case = case.replace(symmetry=None)
         loop = dataclasses.replace(loop, controller=controller)
@@ -365,11 +378,9 @@ def _with_parts(case, table):
 
 
 def _with_bias(case, values, table):
-    """(case with the bias that its [law] leaves out, the values that are still to be set): after
-    those that the steady state depends on.
-    """
-    law = table.get("law", {})
-    if not components.leaves_bias(law) or any(n.startswith("controller.bias") for n in values):
+    """(case with the bias that its [controller] leaves out, the values still to be set)."""
+    control = table.get("controller", {})
+    if not components.leaves_bias(control) or any(n.startswith("controller.bias") for n in values):
         return case, values
     parts = ("plant.", "actuator.", "disturbance.", "x0")
     case = set_values(case, {n: v for n, v in values.items() if n.startswith(parts)})

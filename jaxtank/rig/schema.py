@@ -99,7 +99,7 @@ OPEN_LOOP = (
     *COURSE,
     Key.of(Ramps, "filter", FILTER, kind="array", default=None, shape=("pump",)),
 )
-"""[law] of kind "open-loop"; of other kinds the keys are the fields of the class."""
+"""[controller] of kind "open-loop"; of other kinds the keys are the fields of the class."""
 REFERENCE = (
     _optional(
         "initial",
@@ -133,7 +133,7 @@ DISTURBANCE = (
     ),
     Key.of(InflowPulses, "window", default=None),
 )
-POUR = (
+INFLOW = (
     Key("time", "when it begins", unit="s", low=0.0),
     Key("duration", "how long it lasts", unit="s", low=0.0, strict=True),
     Key("tank", f"the tank, {BY_NAME}", "tank"),
@@ -217,7 +217,7 @@ _ALL = (
     Section("spill", SPILL, many=True, per="spills"),
     Section("pump", PUMP, many=True, per="feeds", elsewhere=("actuator", PumpBank)),
     Section("plant", PLANT),
-    Section("law"),
+    Section("controller"),
     Section("observer"),
     Section("sensor"),
     Section("actuator"),
@@ -231,11 +231,11 @@ _ALL = (
     Section(
         "disturbance",
         DISTURBANCE,
-        prose="A steady inflow of each tank, or pulses of inflow, [[pour]]: one of the two.",
+        prose="A steady inflow of each tank, or pulses of inflow, [[inflow]]: one of the two.",
     ),
     Section(
-        "pour",
-        POUR,
+        "inflow",
+        INFLOW,
         many=True,
         prose="A pulse of inflow into a tank, for recovery_time; as many as you like.",
     ),

@@ -113,7 +113,7 @@ def _building(case, origin, same):
     tables = [*disturbing, *signals.fault_tables(loop.faults)]
     none = [
         _none(name)
-        for name, field in (("pour", "disturbance"), ("fault", "faults"))
+        for name, field in (("inflow", "disturbance"), ("fault", "faults"))
         if getattr(loop, field) is None and getattr(start, field, None) is not None
     ]
     first = Block("", [*lines_of(SECTIONS[""], top, units), *none])

@@ -149,18 +149,17 @@ def _seconds(case, share):
 def _controller(case):
     """The case's own controller, as a start for another."""
     part = case.loop.controller
-    known = components.kind_of("law", part) is not None
+    known = components.kind_of("controller", part) is not None
     if not known or not is_component(getattr(part, "model", None)):
         return None  # also of a controller with a schedule, whose class has no name
-    return _component("law", part)
+    return _component("controller", part)
 
 
 def _component(name, part):
     """{key: value} of a controller or observer, and its section."""
     section, values = components.values_of(name, part)
-    word = {"law": "controller"}.get(name, name)
-    prose = f"Another {word} than the preset's: {', '.join(components.ROLES[name].classes)}."
-    if name == "law":
+    prose = f"Another {name} than the preset's: {', '.join(components.ROLES[name].classes)}."
+    if name == "controller":
         prose += " [values] above then has the names of that controller."
     return {"section": Section(name, section.keys, prose=prose), **values}
 
@@ -221,7 +220,7 @@ def _disturbance(case):
     return {"inflow": np.zeros(tanks)} if case.loop.disturbance is None else None
 
 
-def _pour(case):
+def _inflow(case):
     """A pulse of 1 % of the first tank, where there is no steady inflow."""
     steady, plant = case.loop.disturbance, case.loop.plant
     if isinstance(steady, Constant) and np.any(np.asarray(steady.level)):
@@ -281,12 +280,12 @@ def _log(case):
 
 
 EXAMPLES = {
-    "law": _controller,
+    "controller": _controller,
     "schedule": schedule,
     "observer": _observer,
     "reference.sine": _sine,
     "disturbance": _disturbance,
-    "pour": _pour,
+    "inflow": _inflow,
     "fault": _fault,
     "covariance": _covariance,
     "safety_filter": _safety_filter,

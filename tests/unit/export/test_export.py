@@ -242,7 +242,7 @@ def inputs_of(case, run, signals):
 
 PROPORTIONAL = """
 case = "cascaded/pi"
-[law]
+[controller]
 kind = "pid"
 Kc = 2.0
 bias = 1.5
@@ -607,7 +607,7 @@ high = 12.0
 [plant]
 gravity = 0.5
 
-[law]
+[controller]
 kind = "pid"
 Kc = 1.6
 Ti = 10.0

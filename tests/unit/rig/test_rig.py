@@ -223,7 +223,7 @@ drain = 0.2
 gain = 3.0
 to = 1
 high = 10.0
-[law]
+[controller]
 kind = "pid"
 Kc = 1.0
 Ti = 50.0
@@ -535,7 +535,7 @@ LARGE = 10**20  # a whole number that a float holds and no integer of numpy does
         "[objective]\nrms_error = BIG",
         '[free]\n"controller.k" = [0.1, BIG]',
         '[[scenario]]\nweight = BIG\nvalues = { "sensor.noise" = BIG }',
-        "[[pour]]\ntime = 1\nduration = BIG\ntank = 1\nvolume = BIG",
+        "[[inflow]]\ntime = 1\nduration = BIG\ntank = 1\nvolume = BIG",
         "reachable = false\n[disturbance]\ninflow = [0, 0, 0, BIG]",
         '[[fault]]\nof = "drain[0]"\nstart = 1\nend = BIG\nextra = BIG',
     ],

@@ -34,7 +34,7 @@ from jaxtank.core.tree import parameters, walk
 
 docs, results = set(), {}
 FILLED = '''case = "gouta2022/pi"
-[law]
+[controller]
 kind = "pid"
 Kc = 2.0
 Ti = 40.0
