@@ -20,7 +20,7 @@ from jaxtank.loop.run import simulate
 from jaxtank.observers import Direct
 from jaxtank.plants.faults import faults
 from jaxtank.plants.rigs import coupled_tanks
-from jaxtank.presets.paper import Claim, Preset, Published
+from jaxtank.presets.paper import Claim, Preset, printed
 from jaxtank.presets.rows import calofir as rows
 from jaxtank.signals.setpoints import ramps
 
@@ -34,78 +34,6 @@ START = 0.05  # h1 at t = 0 [m] (notes A2)
 TUNABLE = {"controller.K_phi": Free(1e-3, 1.0), "controller.K_y": Free(1e-3, 1.0)}
 
 KS = tuple(TUNABLE)
-
-DEPARTURES = (
-    (
-        "Equations: the errata of the paper are corrected (notes S5): signs of (12a), (14) and of"
-        " the first term of f_a in (16); d phi/d z in (4); (20) is v, not phi; in (21) a/z0 for"
-        " z/z0, and the denominators of v_i and v_ii. As printed, the controller does not settle at"
-        " the reference."
-    ),
-    (
-        "The controller computes in physical units (notes S4.2): z0 and Q0 cancel exactly, as long"
-        " as z0 is one number."
-    ),
-    (
-        "Gains: none are printed. K_phi = 0.02 1/s, K_y = 0.1 1/s: no overshoot, because K_phi is"
-        " below b/(2 sqrt(h3r)) + a/(2 z3r) (notes S4.3)."
-    ),
-    (
-        "Scenario: Figs. 2 and 3 are missing in our copy. 0.48 m for 600 s, then 0.30 m for 600 s,"
-        " from h = (0.05, 0.05 kappa) m (notes A2)."
-    ),
-    (
-        "Perturbed: c2 at 75 % for 300-450 s and a leak 0.2 c1 sqrt(h1) out of the first tank for"
-        " 900-1050 s; the paper does not say what its faults were (notes A3)."
-    ),
-    (
-        "Lower clips in the controller only: h3 and h1 - h3 are taken as at least 1e-4 m, without"
-        " which it never starts from empty tanks (notes A4, H1)."
-    ),
-    (
-        "Gravity: only the products c1, c2 are printed; orifice areas are c/sqrt(2 g) with g = 9.81"
-        " m/s^2."
-    ),
-    "Rims are physics: levels stop at 0.6 m and at 0 m.",
-)
-
-PUBLISHED = {
-    "plant.area": Published(A, "m^2", "sec. 3.1"),
-    "c1": Published(C1, "m^2.5/s", "sec. 3.2"),
-    "c2": Published(C2, "m^2.5/s", "sec. 3.2"),
-    "actuator.high": Published(Q0, "m^3/s", "sec. 3.1"),
-    "plant.rim": Published(H0, "m", "sec. 3.1"),
-    "clock.dt": Published(1.0, "s", "sec. 4"),
-    "plant.pipe": Published(
-        5e-5,
-        "m^2",
-        "sec. 3.1, S1 = S3",
-        reason="a section; ours is c1/sqrt(2 g), that times a flow coefficient of 0.46",
-    ),
-    "setpoints, share of h0": Published((0.8, 0.5), "-", "sec. 4"),
-    "steady state follows very accurately": Published(
-        "level of the first tank, without perturbation", "", "sec. 4, Fig. 2"
-    ),
-    "reacts rapidly to faults": Published(
-        "in the direction to counteract them",
-        "",
-        "sec. 4, Fig. 3 (whose faults are not described)",
-        reason="faults of ours",
-    ),
-    "some steady state errors": Published(
-        "due to unmodelled dynamics",
-        "",
-        "sec. 5",
-        reason="no integral action, and h3 rather than h1 is regulated",
-    ),
-    "same performance in any operating point": Published(
-        "whatever the level", "", "sec. 5", reason="the pump's limits"
-    ),
-    "globally asymptotically stabilises": Published(
-        "Proposition 2.1", "", "sec. 2", reason="needs h3 > 0, h1 > h3 and a pump without limits"
-    ),
-    **rows.PUBLISHED,
-}
 
 
 def rig():
@@ -186,7 +114,7 @@ def same_everywhere(run, values):
 
 
 def measured(run):
-    """Return what can be measured of PUBLISHED (see `jaxtank.presets.paper.Preset`)."""
+    """Return what can be measured of the published rows (see `jaxtank.presets.paper.Preset`)."""
     case, plain = run("backstepping")
     hurt_case, hurt = run("backstepping-perturbed")
     plant, ends, e = case.loop.plant, [449, 1049], plain.e[:, 0]
@@ -272,20 +200,4 @@ def preset():
         )
         for name, title in titles.items()
     }
-    return Preset(
-        paper="calofir",
-        citation=(
-            "V. Calofir, V. Tanasa, I. Fagarasan, I. Stamatescu, N. Arghira, G. Stamatescu, A"
-            " backstepping control method for a nonlinear process - two coupled-tanks"
-        ),
-        cases=cases,
-        published=PUBLISHED,
-        measured=measured,
-        tunable=TUNABLE,
-        uncertain={
-            "plant.pipe": (0.05, "c1: 'experimentally determined' (sec. 3.2), no interval printed"),
-            "plant.drain": (0.05, "c2: likewise"),
-            "plant.pump_gain": (0.05, "the pump's calibration is not printed"),
-        },
-        departures=DEPARTURES,
-    )
+    return Preset(**printed("calofir"), cases=cases, measured=measured, tunable=TUNABLE)

@@ -19,7 +19,7 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct, DisturbanceObserver
 from jaxtank.plants import state_coupled_four_tank
 from jaxtank.plants.hydraulics import disc
-from jaxtank.presets.paper import Claim, Preset, Published
+from jaxtank.presets.paper import Claim, Preset, printed
 from jaxtank.presets.rows import gouta2015 as rows
 from jaxtank.presets.rows import robustness
 from jaxtank.signals.setpoints import ramps
@@ -68,80 +68,6 @@ VARIANTS = {
     "-table1": "plant A: areas as printed in Table 1",
     "-boxqp": "inputs allocated by box QP instead of clipped",
     "-slow": "ramps of 200 s, with which backstepping holds the 30 cm limit",
-}
-
-DEPARTURES = (
-    (
-        "Areas: Table 1 as printed (D = 15 sqrt(2) cm, 353.4 cm^2) gives a plant about 17 times too"
-        " slow for the printed gains. The default plant reads 15 sqrt(2) as an area (21.2 cm^2),"
-        " which reproduces most of the text; '-table1' keeps the printed one (notes S1, E13)."
-    ),
-    (
-        "Reference: Fig. 5 is missing in our copy. Each change is a ramp that starts at the stated"
-        " time and lasts 60 s; its second derivative is 0 (notes A2, A3)."
-    ),
-    "Start: all tanks at the steady state of r(0) = (3, 3) cm (notes A4).",
-    (
-        "Dead zone: the benchmark's steady voltages go down to 1.05 V, below the 3 V of Remark 4;"
-        " it is off by default, and on with actuator.dead_zone = 3 the run fails as Remark 4 states"
-        " (notes S8.1)."
-    ),
-    (
-        "Lower clip of levels in the controllers: 0.01 cm, so that roots and gradients stay finite"
-        " when a tank runs dry (notes A7)."
-    ),
-    (
-        "Rims: levels may rise past 30 cm, so that the limit on max_level has an effect;"
-        " plant.overflow = true makes them physics."
-    ),
-    (
-        "backstepping-ff and -boxqp are not in the paper: the first adds the rates that eq. (46)"
-        " lacks (notes S4.4), the second takes the exact constrained minimiser of the paper's cost"
-        " instead of clipping (notes S4.5)."
-    ),
-    (
-        "ngpc-observer and backstepping-observer are not in the paper: they have the disturbance"
-        " observer of gouta2022, whose estimate the controllers take into their model (notes S4.6)."
-    ),
-    "Kp is printed in cm^3/V; its dimension is cm^3/(s V) (E2).",
-)
-
-PUBLISHED = {
-    "controller.Tp": Published(11.0, "s", "sec. 5.1"),
-    "controller.k": Published(0.03, "1/s", "sec. 5.1"),
-    "controller.k1": Published(0.088, "1/s", "sec. 5.1"),
-    "clock.dt": Published(0.01, "s", "sec. 5"),
-    "actuator.high": Published(12.0, "V", "eq. (9)"),
-    "plant.rim": Published(30.0, "cm", "sec. 5"),
-    "actuator.low": Published(0.0, "V", "eq. (9)"),
-    "clock.duration": Published(1200.0, "s", "sec. 5"),
-    "plant.pump_gain": Published(7.687, "cm^3/(s V)", "Table 1 (printed without 1/s)"),
-    "plant.gravity": Published(981.0, "cm/s^2", "Table 1"),
-    "sensor.gain": Published((9.4458, 8.7106, 8.5106, 9.3458), "cm/V", "sec. 5.2"),
-    "diameters of outlets 1 and 2": Published((0.48, 0.48), "cm", "Table 1"),
-    "diameters of orifices 31, 32, 41, 42": Published((0.38, 0.31, 0.31, 0.38), "cm", "Table 1"),
-    "changes of the setpoints": Published(
-        (20.0, 270.0, 470.0, 760.0, 900.0), "s", "sec. 5, 5.3 (ours begin at these times)"
-    ),
-    "setpoints of h1 and of h2": Published(
-        (3.0, 8.0, 16.0, 12.0, 3.0, 8.0, 14.0, 10.0), "cm", "sec. 5.3"
-    ),
-    "areas as printed": Published(
-        "D = 15 sqrt(2) cm serves the printed gains",
-        "",
-        "Table 1",
-        reason="the plant is then 17 times too slow for them (notes S1)",
-        ramp=rows.OWN,
-    ),
-    "dead zone of 3 V": Published("'failure of the control test'", "", "Remark 4", ramp=rows.OWN),
-    **rows.PUBLISHED,
-    **robustness.PUBLISHED,
-}
-
-UNCERTAIN = {
-    "plant.drain": (0.05, "c1, c4: sec. 5.3 varies c1, c2, c3, c7, c8 and gives no ranges"),
-    "plant.orifice": (0.05, "c2, c3, c5, c6, c7, c9"),
-    "plant.pump_gain": (0.05, "c8, c10"),
 }
 
 
@@ -221,7 +147,7 @@ def _setpoints(reference):
 
 
 def measured(run):
-    """Return what can be measured of PUBLISHED (see `jaxtank.presets.paper.Preset`)."""
+    """Return what can be measured of the published rows (see `jaxtank.presets.paper.Preset`)."""
     case, near = run("ngpc")
     slow = rows.total(run("ngpc-table1")[1])
     still = run("ngpc", {"actuator.dead_zone": 3.0})[1]
@@ -265,18 +191,4 @@ def preset():
             free={p: TUNABLE[p] for p in free},
             objective={"rms_error_total": 1.0},
         )
-    return Preset(
-        paper="gouta2015",
-        citation=(
-            "H. Gouta, S. Hadj Said, F. M'sahli, Model-based Predictive and Backstepping"
-            " controllers for a state coupled four-tank system with bounded control inputs: A"
-            " comparative study, Journal of the Franklin Institute, 2015, doi"
-            " 10.1016/j.jfranklin.2015.08.004"
-        ),
-        cases=cases,
-        published=PUBLISHED,
-        measured=measured,
-        tunable=TUNABLE,
-        uncertain=UNCERTAIN,
-        departures=DEPARTURES,
-    )
+    return Preset(**printed("gouta2015"), cases=cases, measured=measured, tunable=TUNABLE)

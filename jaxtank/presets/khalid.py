@@ -10,84 +10,8 @@ import numpy as np
 from jaxtank.case import Case
 from jaxtank.controllers import Laguerre
 from jaxtank.presets.loops.khalid import CLOCK, CONTROLLERS, TUNABLE, build
-from jaxtank.presets.paper import Claim, Preset, Published
+from jaxtank.presets.paper import Claim, Preset, printed
 from jaxtank.presets.rows import khalid as rows
-
-DEPARTURES = (
-    (
-        "Not printed, so chosen (notes A1-A5): sampling period 2 s, r_w = 0.01 (levels in m, inputs"
-        " in 1e-4 m^3/s), half period of the pulses 300 s, linearisation at the middle of the"
-        " pulse, (0.30, 0.06) m with one pump and (0.06, 0.075) m with two."
-    ),
-    (
-        "Pulses: the cases run between 0.03 m and 0.15 m with one pump, 0.04-0.16 m and 0.03-0.18 m"
-        " with two (scenarios S2 and M2 of notes S3). The printed pulses down to 0 m end at empty"
-        " tanks, where gravity alone decides; `scenario('S1')` and 'M1' are those."
-    ),
-    (
-        "Limits: the paper's simulations show none, and its conclusion leaves constraints to"
-        " further work. The base cases let the flow go negative (limits of 1000 U0, levels stop at"
-        " 0 m); '-constrained' solves the programme of eq. (32) with u in [0, 3] U0 and du within"
-        " 0.5 U0 per sample. controller.mode = clipped clips the linear controller to the same"
-        " limits."
-    ),
-    (
-        "Pipe: sgn(H1-H2) sqrt|H1-H2| for the printed sqrt(H1-H2), since the references with two"
-        " pumps have H1 < H2; its root and those of the outlets are smooth within 1e-4 m, which"
-        " moves no level by more than 4e-5 m (notes H2)."
-    ),
-    (
-        "Signs of eq. (2) and (9), C_m of eq. (16), the numerator of eq. (23), the sums of eq. (31)"
-        " to Np: corrected (notes S5)."
-    ),
-    (
-        "Rim: the height of the tanks is not given; 1 m is above the highest level of the base"
-        " cases, 0.91 m."
-    ),
-    "Sensor: both levels are measured without noise; the converter's range is ours, and it is off.",
-)
-
-_SAME_RW = (
-    "figures without numbers; r_w and the sampling period are not printed, and the finding depends"
-    " on them (notes S8)"
-)
-PUBLISHED = {
-    "plant.area": Published(9350e-6, "m^2", "Table I"),
-    "plant.drain": Published(78.5e-6, "m^2", "Table I, s times a0 = 1"),
-    "plant.pipe": Published(39.25e-6, "m^2", "Table I, s times a1 = 0.5"),
-    "plant.gravity": Published(9.8, "m/s^2", "Table I"),
-    "controller.Np": Published(40, "-", "sec. V"),
-    "controller.Nc": Published((2, 10, 30), "-", "sec. V.A, Figs. 2-4"),
-    "controller.a": Published(0.4, "-", "sec. V.A, Fig. 5"),
-    "controller.N": Published(4, "-", "sec. V.A"),
-    "a long control horizon improves performance": Published(
-        "required",
-        "",
-        "sec. V.A, Figs. 2-3",
-        reason=f"the error falls and the overshoot grows; {_SAME_RW}",
-    ),
-    "control horizon beyond 10": Published("not much improvement", "", "sec. V.A, Figs. 3-4"),
-    "overshoot against control horizon": Published(
-        "not eliminated by any", "", "sec. V.A", reason=f"true of 10 and 30, not of 2; {_SAME_RW}"
-    ),
-    "overshoot of Laguerre against GPC 30": Published(
-        "reduced considerably",
-        "",
-        "sec. V.A, Fig. 5",
-        reason=f"a different r_w in the two figures would explain it; {_SAME_RW}",
-    ),
-    "parameters of Laguerre": Published("4 are enough", "", "sec. V.A"),
-    "Laguerre against GPC with two pumps": Published(
-        "outperforms", "", "sec. V.B", reason=f"equal, with 8 variables for 20; {_SAME_RW}"
-    ),
-    **rows.PUBLISHED,
-}
-
-UNCERTAIN = {
-    "plant.drain": (0.05, "discharge coefficients of 1 are idealised"),
-    "plant.pipe": (0.05, "the discharge coefficient of 0.5 is rounded"),
-    "plant.pump_gain": (0.05, "pumps are not described"),
-}
 
 
 def edges(reference, run, dt=2.0):
@@ -118,7 +42,7 @@ def edges(reference, run, dt=2.0):
 
 
 def measured(run):
-    """Return what can be measured of PUBLISHED (see `jaxtank.presets.paper.Preset`)."""
+    """Return what can be measured of the published rows (see `jaxtank.presets.paper.Preset`)."""
     # The claims are decided at the reference point, r_w = 0.01 in S2 and M2, with Runge-Kutta steps
     # of 1 s instead of 0.25 s, which compile faster and change no RMS error by more than 2e-7 m.
     error, over, loops = {}, {}, {}  # RMS [m] and overshoot [%] of each output, by case
@@ -222,17 +146,4 @@ def preset():
                     "mean_square_overshoot": 1e5,
                 },
             )
-    return Preset(
-        paper="khalid",
-        citation=(
-            "M. U. Khalid, M. B. Kadri, Liquid level control of nonlinear coupled tanks system"
-            " using linear model predictive control, Pakistan Navy Engineering College, National"
-            " University of Sciences and Technology, Karachi"
-        ),
-        cases=cases,
-        published=PUBLISHED,
-        measured=measured,
-        tunable=TUNABLE,
-        uncertain=UNCERTAIN,
-        departures=DEPARTURES,
-    )
+    return Preset(**printed("khalid"), cases=cases, measured=measured, tunable=TUNABLE)

@@ -13,17 +13,15 @@ from jaxtank.core.clock import Clock
 from jaxtank.presets.loops.mirakhorli import (
     CONTROLLERS,
     FITTED,
-    GAIN,
     RELAY,
     SETPOINT,
-    SPLIT,
     TUNABLE,
     build,
     fitted,
     plant,
     tuning_scenarios,
 )
-from jaxtank.presets.paper import Claim, Preset, Published
+from jaxtank.presets.paper import Claim, Preset, printed
 from jaxtank.presets.rows import mirakhorli as rows
 from jaxtank.presets.rows.mirakhorli import response
 
@@ -31,106 +29,6 @@ from jaxtank.presets.rows.mirakhorli import response
 COST = {"ise": 1.0, "input_deviation": 3.0, "input_travel": 0.1}
 # for the controller that chatters: its derivatives are not worth seven runs
 CHATTER_COST = {"rms_error_total": 1.0, "input_travel": 1e-3}
-
-PUBLISHED = {
-    "plant.split": Published(SPLIT, "-", "Table 1"),
-    "plant.pump_gain": Published((27.43, 19.55), "cm^3/(s V)", "Table 1"),
-    "plant.area": Published(138.9, "cm^2", "Table 2"),
-    "plant.orifice": Published(0.50265, "cm^2", "Table 2"),
-    "plant.gravity": Published(981.0, "cm/s^2", "Table 2"),
-    "plant.rim": Published(30.0, "cm", "sec. 6"),
-    "reference.targets": Published(12.0, "cm", "Fig. 6"),
-    "gamma1 + gamma2": Published(0.76, "-", "sec. 3"),
-    "controller.K": Published(tuple(v for row in GAIN for v in row), "V/cm", "sec. 6"),
-    "controller.surface": Published(
-        10.0,
-        "1/s",
-        "sec. 6",
-        reason=(
-            "no sliding mode exists above 0.088 1/s (notes S4.3); smc-printed has it, smc and"
-            " hybrid 0.05"
-        ),
-    ),
-    "controller.ks": Published(
-        1.0,
-        "cm/s^2",
-        "sec. 6",
-        reason=(
-            "40 to 60 times what the pumps can do (notes S1); smc-printed has it, smc and hybrid"
-            " 0.03"
-        ),
-    ),
-    "fit of the model": Published(
-        84.0, "%", "sec. 3", reason="the record and Appendix I are not available"
-    ),
-    **rows.PUBLISHED,
-    "chattering of the SMC": Published("undesirable; none with the hybrid", "", "sec. 6, Fig. 7"),
-    "30 % change of an outlet": Published(
-        "hits the SFC much more than the hybrid",
-        "",
-        "sec. 6, Fig. 9",
-        reason=(
-            "'the outlet hose of pump 1' may be the pump's hose or the outlet of tank 1: it holds"
-            " for some readings (notes S7.3)"
-        ),
-    ),
-    "zero steady-state error of the SFC": Published(
-        "zero", "", "sec. 4.3, 7", reason="it has no integral action (notes E21)"
-    ),
-    "stability proof": Published(
-        "sec. 5",
-        "",
-        "eqs. (18)-(36)",
-        reason=(
-            "P of eq. (33) has rank 2 of 6 and eq. (36) is indefinite for the printed K (notes"
-            " E14-E20): not a proof"
-        ),
-    ),
-}
-
-UNCERTAIN = {
-    "plant.pump_gain": (0.05, "k1, k2: estimated with a fit of 84 %"),
-    "plant.split": (0.05, "gamma1, gamma2: likewise, and rounded"),
-    "plant.drain": (0.05, "a1, a2: bores of 8 mm with a discharge coefficient of 1"),
-    "plant.orifice": (0.05, "a3, a4: likewise"),
-}
-
-DEPARTURES = (
-    (
-        "Start and pumps: neither the initial levels nor the pumps' range is given. Empty tanks (or"
-        " the steady state at 6 cm, '-warm') and 0 to 5 V, at which tank 1 just reaches its rim"
-        " (notes A1, A2)."
-    ),
-    (
-        "SFC: u = u0 - K (h - h0). Eqs. (14)-(15) print u = -K'x with K = -R^-1 B'P, which is"
-        " unstable and leaves the pumps off (notes E11)."
-    ),
-    (
-        "smc, hybrid: the corrected sliding mode of notes S4.4 with its own lambda, ks and boundary"
-        " layer. As printed, with the direct flow left out of the design, no sliding mode exists on"
-        " the paper's own model; smc-printed shows it, with the level rates of the full model"
-        " (notes S4.2, reading a)."
-    ),
-    (
-        "hybrid: Fig. 3 is missing. Memberships are smoothsteps of |e| that cross at b with half"
-        " width w; the sliding-mode voltages are held within 0 to 5 V before they are blended"
-        " (controller.low, controller.high: change them together with actuator.high) (notes S4.5)."
-    ),
-    (
-        "hybrid: |e1| decides on u2 and |e2| on u1, as the text has it; eq. (17) pairs equal"
-        " indices (controller.pairing = 'same')."
-    ),
-    "lqi is not in the paper: the baseline with integral action (notes S4.6).",
-    (
-        "'-fitted': pumps to 5.8 V and 5 % stronger than modelled, the printed sliding mode as a"
-        " relay, memberships of 3.25 +- 1.5 cm, chosen to come near Table 3 (notes S7.2)."
-    ),
-    (
-        "K was found to be the linear-quadratic gain of Q = C'C and R = 3 I with gamma = (0.4165,"
-        " 0.3414); the rig has the printed (0.42, 0.34)."
-    ),
-    "The sensors' range and the 400 s of a run are not in the paper.",
-)
 
 
 def steady_error(run, kind, values):
@@ -145,7 +43,7 @@ def steady_error(run, kind, values):
 
 
 def measured(run):
-    """Return what can be measured of PUBLISHED (see `jaxtank.presets.paper.Preset`)."""
+    """Return what can be measured of the published rows (see `jaxtank.presets.paper.Preset`)."""
     assumed = {name: response(run(case)[1]) for name, case in zip(("SMC", "SFC", "hybrid"), FITTED)}
     return {
         **rows.measured(run, assumed),
@@ -240,16 +138,4 @@ def preset():
             )
     for name in FITTED:
         cases[name] = _fitted(name, cases[FITTED[name]])
-    return Preset(
-        paper="mirakhorli",
-        citation=(
-            "E. Mirakhorli, M. Farrokhi, Fuzzy Sliding-Mode State-Feedback Control of Non-Minimum"
-            " Phase Quadruple Tank System, 2016"
-        ),
-        cases=cases,
-        published=PUBLISHED,
-        measured=measured,
-        tunable=TUNABLE,
-        uncertain=UNCERTAIN,
-        departures=DEPARTURES,
-    )
+    return Preset(**printed("mirakhorli"), cases=cases, measured=measured, tunable=TUNABLE)

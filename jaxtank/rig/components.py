@@ -25,9 +25,8 @@ from jaxtank.signals.setpoints import Ramps, ramps
 
 
 class Role(NamedTuple):
-    """What a section of a rig file describes: field of the loop, abstract class, {kind: class},
-    fields that are the case's own where a file leaves them out, and the class that needs no
-    section, for [values] set its fields.
+    """What a section describes: field of the loop, abstract class, classes by kind, fields that a table
+    may leave out, and the class that needs no section.
     """
 
     field: str
@@ -245,18 +244,14 @@ def observer_of(table, loop):
 
 
 def model_of(loop):
-    """The model of the loop's controller, scheduled or not; the plant where it has none
-    that fits.
-    """
+    """Return the model of the loop's controller, the plant where it has none that fits."""
     plant, model = loop.plant, getattr(getattr(loop.controller, "law", loop.controller), "model", 0)
     fits = (getattr(model, "tanks", 0), getattr(model, "pumps", 0)) == (plant.tanks, plant.pumps)
     return model if fits else plant
 
 
 def instrument_of(name, table, loop):
-    """Return the sensor or actuator of a table; noise and limits that it leaves out are those of
-    the loop's own. name: "sensor" or "actuator".
-    """
+    """Return the sensor or actuator of a table; what it leaves out of `kept` is the loop's."""
     role = ROLES[name]
     own = {key: getattr(getattr(loop, role.field), key) for key in role.kept}
     return component(name, table, loop.plant, own)
@@ -285,9 +280,7 @@ def component(name, table, plant, offered):
 
 
 def steady_bias(loop, known=False):
-    """(m,) inputs that hold the outputs where they start, within the limits of the pumps; those
-    before t = 0 where a file has them (`known`, one per pump), and where none hold.
-    """
+    """Return (m,) inputs that hold the outputs at x0; those before t = 0 where `known` or none hold."""
     bank, start = loop.actuator, np.asarray(loop.x0)[list(loop.plant.outputs)]
     try:
         steady = np.clip(steady_state(loop, start)[1], bank.low, bank.high)
@@ -309,9 +302,7 @@ def kind_of(name, part):
 
 
 def has_section(name, part):
-    """Whether a file has the section for a part that is not the preset's: [values] set the fields
-    of LevelSensor and PumpBank.
-    """
+    """Whether a part needs a section: [values] set the fields of LevelSensor and PumpBank."""
     return ROLES[name].default is None or type(part) is not ROLES[name].default
 
 
@@ -321,9 +312,7 @@ def is_written(name, part):
 
 
 def values_of(name, part):
-    """Return (section, {key: value}) of a component, None of an optional leaf that is not in use.
-    InputError where no rig file describes it.
-    """
+    """Return (section, {key: value}) of a component; InputError where no rig file describes it."""
     kind, cls = kind_of(name, part), type(part).__name__
     if kind is None:
         raise InputError(f"its {cls} has no name in a rig file")

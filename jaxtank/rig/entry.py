@@ -17,9 +17,7 @@ LARGEST = 1e300
 
 
 class Sizes(NamedTuple):
-    """What is known of a rig while its file is read: how many tanks, pumps and controlled tanks it
-    has, the units it counts in, and {name: index} of its tanks.
-    """
+    """What is known of a rig while its file is read: counts, units, and {name: index} of its tanks."""
 
     tanks: int
     pumps: int = 0
@@ -272,9 +270,7 @@ def plain(name, value):
 
 
 def static_value(name, value, meta, kind):
-    """`value` for a static field of type `kind` (bool, int, float or str); InputError where it is
-    another, out of range, or no choice.
-    """
+    """Return `value` for a static field of type `kind`; InputError for another, or out of range."""
     if meta["choices"] is not None:
         choices = meta["choices"]
         good = not isinstance(value, (list, dict)) and value in choices

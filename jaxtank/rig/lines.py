@@ -54,9 +54,7 @@ def suggestion(section: Section, values: Mapping[str, Any], units=DEFAULT) -> Bl
 
 
 def terse(block: Block) -> list[str]:
-    """Return the lines of a Block in a terse file: its title, and "name = value  # [unit] what it
-    is" of every line that is on.
-    """
+    """Return the lines of a terse file: title, and "name = value  # [unit] doc" of what is on."""
     return [block.title] * bool(block.title) + [
         f"{line.name} = {toml(line.value)}" + (f"  # {note}" if (note := _note(line.meta)) else "")
         for line in block.lines

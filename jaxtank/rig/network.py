@@ -139,9 +139,7 @@ FLOW_MARGIN = 2.0
 
 
 def _check_gains(gains, units):
-    """Raise InputError for a gain that is not near the size of the flow unit of its input: units
-    are names here, the gain converts.
-    """
+    """Raise InputError for a gain that is not near the flow that a unit of its input stands for."""
     factor = flow_per_input(units)
     for j, gain in enumerate(gains):
         if factor and gain > 0 and not 1 / FLOW_MARGIN <= gain / factor <= FLOW_MARGIN:
@@ -163,9 +161,7 @@ def _check_names(tanks):
 
 
 def _check_links(table, entries):
-    """Raise InputError for an orifice or a spill from a tank to itself, and where one of several
-    spills of a tank has no share and the sum is above 1: the flows are then not defined.
-    """
+    """Raise InputError for a link from a tank to itself, and for shares of spills above 1 in sum."""
     for name in ("orifice", "spill"):
         for i, (entry, given) in enumerate(zip(entries[name], table[name])):
             value = [given["from"], given["to"]]

@@ -30,9 +30,7 @@ def origin_of(case):
 
 
 def _same_parts(loop, mine, other):
-    """Which sections `other` has of the same kind as `loop`, whose structures are `mine`; None
-    where a file cannot make one loop of the other.
-    """
+    """Sections in which `other` is of the kind of `loop`; None where no file makes one of the other."""
     theirs = structures(other)
     if mine["rest"] != theirs["rest"] or not _has_optional(other, "plant", loop):
         return None
@@ -64,9 +62,7 @@ def _optional(loop):
 
 
 def structures(loop):
-    """Pytree structures of controller, observer and the rest, with what a rig file can set made
-    alike: they compare by their components.
-    """
+    """Return pytree structures of the parts of a loop, with what a rig file can set made alike."""
 
     def settle(tree):
         changed = {}

@@ -68,26 +68,7 @@ def check_keys(text):
 
 
 def open_case(name: str) -> Case:
-    """Return the Case of "paper/case", or of a rig file where `name` ends in .toml, checked.
-
-    Parameters
-    ----------
-    name : "paper/case" as `jaxtank list` prints it, or a path
-
-    Returns
-    -------
-    Case, checked.
-
-    Raises
-    ------
-    InputError for a case that does not exist, and as `load`.
-
-    Examples
-    --------
-    >>> from jaxtank import rig
-    >>> rig.open_case("cascaded/pi").name
-    'cascaded/pi'
-    """
+    """Return the Case of "paper/case", or of the rig file `name` where it ends in .toml, checked."""
     return load(name) if name.endswith(".toml") else presets.find(name)
 
 
@@ -171,26 +152,7 @@ def loads(text: str, words: str = "rig file") -> Case:
 
 
 def from_table(table: Mapping[str, Any]) -> Case:
-    """Return the Case described by a table of the form of a rig file.
-
-    Parameters
-    ----------
-    table : {key or section: value, table, or list of tables}
-
-    Returns
-    -------
-    Case, checked.
-
-    Raises
-    ------
-    InputError as `load`.
-
-    Examples
-    --------
-    >>> from jaxtank import rig
-    >>> rig.from_table({"case": "cascaded/pi", "limits": {"max_level": 9.0}}).limits
-    {'max_level': 9.0}
-    """
+    """Return the Case of a table of the form of a rig file, {key or section: value}, checked."""
     table = renamed(table)
     case = start_of(table)
     dotted = ("values", "free", "uncertain")
@@ -220,25 +182,7 @@ def renamed(table):
 
 
 def filtered(case: Case, on: bool | None = None, changes: Mapping[str, Any] | None = None) -> Case:
-    """Return the case with the safety filter of its settings, designed for its present values.
-
-    Parameters
-    ----------
-    case : Case
-    on : True: with default settings where it has none; False: without a filter
-    changes : {key of [safety_filter]: value} in place of the case's
-
-    Raises
-    ------
-    InputError for an unknown key, a value out of its range, and changes without a filter.
-
-    Examples
-    --------
-    >>> from jaxtank import presets, rig
-    >>> case = rig.filtered(presets.find("cascaded/pi"), on=True, changes={"rate": 0.1})
-    >>> case.safety, case.loop.safety_filter.rate.tolist()
-    ({'rate': 0.1}, [0.1, 0.1])
-    """
+    """Return the case with the safety filter of its settings and `changes`, or with it on or off."""
     changes = read_entry(SECTIONS["safety_filter"], changes or {}, sizes_of(case.loop.plant))
     if (case.safety is None and not on) or on is False:
         if changes:

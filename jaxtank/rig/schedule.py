@@ -25,9 +25,7 @@ START = "controller."
 
 
 def schedule(case, gains, knots):
-    """Return a copy of `case` whose controller has scheduled gains: the same run, until the values
-    at the knots are changed.
-    """
+    """Return a copy of `case` with scheduled gains: the same run, until values at knots change."""
     loop, part = case.loop, case.loop.controller
     if isinstance(part, Scheduled):
         raise InputError("the controller has a schedule already: name all its gains in one")
@@ -53,9 +51,7 @@ def schedule(case, gains, knots):
 
 
 def unscheduled(loop):
-    """Return `loop` with the controller that a schedule was made for, its gains those of the first
-    knot; `loop` itself where there is none.
-    """
+    """Return `loop` with its controller without a schedule, its gains those of the first knot."""
     part = loop.controller
     if not isinstance(part, Scheduled):
         return loop
@@ -74,9 +70,7 @@ def check_not_scheduled(loop, name):
 
 
 def names_of(loop, name):
-    """Where `name`, as the controller has it without a schedule, is found in `loop`: at every knot
-    of a scheduled gain, else under its new name.
-    """
+    """Return the names in `loop` of what an unscheduled controller calls `name`."""
     part, inner = loop.controller, name.removeprefix(START)
     if (
         not isinstance(part, Scheduled)
@@ -91,9 +85,7 @@ def names_of(loop, name):
 
 
 def table_of(loop):
-    """{"gains", "variable", "knots"} of a scheduled loop, as in a rig file; empty where there is no
-    schedule.
-    """
+    """Return {"gains", "variable", "knots"} of a scheduled loop; empty without a schedule."""
     part = loop.controller
     if not isinstance(part, Scheduled):
         return {}
@@ -117,9 +109,7 @@ def from_table(case, table):
 
 
 def known(loop, values):
-    """({name: value} that `loop` has a leaf, a static field or a clock's field for, the others):
-    what is set before a schedule is made, and what after.
-    """
+    """Return (values of names that `loop` or a clock has, the others)."""
     names = {name for kind in ("leaf", "static") for name, _, _ in walk(loop, kind=kind)}
     before = {n: v for n, v in values.items() if n.split("[")[0] in names or n.startswith("clock.")}
     return before, {n: v for n, v in values.items() if n not in before}
@@ -156,9 +146,7 @@ def _without(tree, path):
 
 
 def _free(case, gains, knots):
-    """What is free after gains have been scheduled: their values at the knots, and all else under
-    its new name.
-    """
+    """What is free after gains are scheduled: their values at the knots, the rest under new names."""
     free = {}
     for name, spec in case.free.items():
         if not name.startswith(START):

@@ -150,9 +150,7 @@ def _reference(loop, start):
 
 
 def _values(case, base, tankwise, same):
-    """The Blocks of [values], one for each part of the loop: every leaf and static field that the
-    tables before it have not set.
-    """
+    """The Blocks of [values]: every leaf and static field that no table before it has set."""
     groups = {}
     for name, value, meta in _settable(case):
         part = name.partition(".")[0]
@@ -212,9 +210,7 @@ def _text_of(tree, name):
 
 
 def _followed(loop, name):
-    """The value, as in a file, that `name` of a model follows: of the observer's that of the
-    controller's, else the plant's; None of another name.
-    """
+    """The text of the value that `name` of a model follows; None of another name."""
     for model in MODELS:
         if name.startswith(model):
             inner = name.removeprefix(model)

@@ -20,9 +20,7 @@ COURSE = ("ramp", "shape", "band", "filter")
 
 
 def steps(reference):
-    """The `Ramps` of a reference that [reference] can describe: itself, or what a sine is added to;
-    None of another.
-    """
+    """Return the `Ramps` of a reference that [reference] can describe; None of another."""
     if (
         isinstance(reference, Sum)
         and isinstance(reference.first, Ramps)
@@ -45,9 +43,7 @@ def reference_of(table, old, plant):
 
 
 def ramps_of(section, table, old, words, sizes):
-    """The Ramps of a table; what it leaves out is as in `old`. words: what a channel and its value
-    are called.
-    """
+    """Return the Ramps of a table; what it leaves out is as in `old`. words: channel and value."""
     own, known = {k.name: k for k in section.keys}, ramp_values(old)
     given = {name: v for name, v in known.items() if name in own and v is not None}
     start = {name: written(own[name], value) for name, value in given.items()}
@@ -58,9 +54,7 @@ def ramps_of(section, table, old, words, sizes):
 
 
 def _changes(label, changes, words, channels):
-    """[(time [s], channel from 0, value)] of a list as in a file; InputError unless they are in
-    order of time, and one for a channel and a time.
-    """
+    """[(time [s], channel from 0, value)] of a list as in a file, in order of time."""
     form = f"[time [s], {words[0]} from 1 to {channels}, {words[1]}]"
     if not isinstance(changes, list):
         raise InputError(f"{label} = {shortened(changes)}: must be a list of {form}")

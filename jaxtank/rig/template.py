@@ -20,9 +20,7 @@ from jaxtank.signals.setpoints import Ramps
 
 
 def absent(loop, name, meta):
-    """A value for an optional leaf that is not in use: the least one that is allowed, in the shape
-    of the leaf that it goes with.
-    """
+    """Return the least allowed value of an optional leaf that is not in use, in its shape."""
     *path, _ = name.split(".")
     owner = loop
     for step in path:
@@ -80,9 +78,7 @@ def objective(case):
 
 
 def free(case):
-    """Lines of the parameters of controller and observer that could be free, over a decade each
-    way.
-    """
+    """Lines of gains of controller and observer that could be free, over a decade each way."""
     found, taken = [], {name.split("[")[0] for name in case.free} | {"controller.knots"}
     for name, value, meta in walk(case.loop):
         part, _, rest = name.partition(".")
@@ -95,9 +91,7 @@ def free(case):
 
 
 def around(value, meta):
-    """Free of a tenth to ten times a value within its range, or either side of 0 where it is not
-    positive; None of a range that is empty. meta: its description, as of `describe`.
-    """
+    """Return Free of a tenth to ten times a value within its range, None of an empty one."""
     value = np.asarray(value, dtype=float)
     if value.size == 0:
         return None
@@ -165,9 +159,7 @@ def _component(name, part):
 
 
 def schedule(case):
-    """A [schedule] table that the case's controller allows, None where it allows none: its first
-    free gain along the first setpoint.
-    """
+    """The first free gain along the first setpoint, None where the controller allows no schedule."""
     if scheduling.table_of(case.loop):
         return None
     rim = float(np.asarray(case.loop.plant.rim)[case.loop.plant.outputs[0]])

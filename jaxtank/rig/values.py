@@ -33,10 +33,7 @@ _RELATIVE = re.compile(
 
 
 def by_dotted_name(table, where):
-    """{dotted name: value} of a table in which names may be written without quotation marks:
-    `clock.dt = 0.5` and [values.controller] are tables in tables to TOML. InputError, naming the
-    table `where`, for a name that is given both ways.
-    """
+    """Return {dotted name: value} of a table in which names may be written without quotes."""
     found = {}
     for key, value in table.items():
         # a name that is quoted is whole: its value is no table
@@ -102,9 +99,7 @@ def set_values(case: Case, values: Mapping[str, Any]) -> Case:
 
 
 def with_models(loop, values):
-    """Return `values` with the plant's parameters among them for the models that hold them too, and
-    those of the controller's model for that of the observer.
-    """
+    """Return `values` with those of the plant for the models that follow it."""
     names = {name for kind in ("leaf", "static") for name, _, _ in walk(loop, kind=kind)}
     found = {}
     for owner, models in (("plant.", MODELS), *((model, MODELS[-1:]) for model in MODELS[:-1])):
@@ -156,28 +151,7 @@ def set_scenario(case: Case, values: Mapping[str, Any]) -> Case:
 
 
 def overridden(case: Case, values: Mapping[str, Any]) -> tuple[Case, dict[str, list[str]]]:
-    """Let values that were set in a case take the place of those of its scenarios.
-
-    A factor ("x1.3") or an offset ("by -0.5") of a scenario stays, and is applied to what is set.
-
-    Parameters
-    ----------
-    case : Case in which `values` are set
-    values : {dotted name: value}
-
-    Returns
-    -------
-    (Case, {name in `values`: names of the scenarios that had their own}).
-
-    Examples
-    --------
-    >>> from jaxtank import presets, rig
-    >>> from jaxtank.case import Scenario
-    >>> noisy = Scenario("noisy", {"sensor.noise": 0.1})
-    >>> case = presets.find("cascaded/pi").replace(scenarios=(noisy,))
-    >>> rig.overridden(case, {"sensor.noise": 0.0})[1]
-    {'sensor.noise': ['noisy']}
-    """
+    """Return (case with `values` in place of its scenarios' own, {name: scenarios that had it})."""
     scenarios, replaced = [], {}
     for s in case.scenarios:
         kept = {}
@@ -193,32 +167,12 @@ def overridden(case: Case, values: Mapping[str, Any]) -> tuple[Case, dict[str, l
 
 
 def overlap(one: str, other: str) -> bool:
-    """Return whether two dotted names have an entry in common.
-
-    Parameters
-    ----------
-    one, other : dotted names, each of a leaf or of an entry of it
-
-    Examples
-    --------
-    >>> overlap("x0", "x0[1]"), overlap("x0[0]", "x0[1]")
-    (True, False)
-    """
+    """Return whether two dotted names, of leaves or of entries, have an entry in common."""
     return one == other or split_index(one)[0] == other or one == split_index(other)[0]
 
 
 def is_change(value: Any) -> bool:
-    """Return whether the value of a scenario is a factor or an offset on the case's own.
-
-    Parameters
-    ----------
-    value : number, list, or text as in `set_scenario`
-
-    Examples
-    --------
-    >>> is_change("x1.3"), is_change("by -0.5"), is_change("0.02 if zero"), is_change(1.3)
-    (True, True, False, False)
-    """
+    """Return whether the value of a scenario is a factor or an offset on the case's own."""
     found = _RELATIVE.fullmatch(value.strip()) if isinstance(value, str) else None
     return found is not None and found["default"] is None
 
@@ -266,29 +220,7 @@ def _meta(case, name):
 
 
 def set_and_schedule(case: Case, values: Mapping[str, Any], table: Mapping[str, Any]) -> Case:
-    """Return `set_values` of a case with a schedule of gains.
-
-    What the case has by name is set before the schedule is made, which starts from it; what only
-    the scheduled case has, as controller.values, after.
-
-    Parameters
-    ----------
-    case : Case
-    values : {dotted name: value}
-    table : {"gains", "variable", "knots"} as [schedule] of a rig file; {} for no schedule
-
-    Raises
-    ------
-    InputError as `set_values`, and for gains, a variable or knots that make no schedule.
-
-    Examples
-    --------
-    >>> from jaxtank import presets, rig
-    >>> table = {"gains": ["controller.Tp"], "variable": "r1", "knots": [5.0, 10.0]}
-    >>> case = presets.find("gouta2015/ngpc")
-    >>> rig.set_and_schedule(case, {"controller.Tp": 3.0}, table).loop.controller.values.tolist()
-    [[3.0, 3.0]]
-    """
+    """Return `set_values` of a case with the schedule of a [schedule] table; {}: none."""
     if table:
         before, values = schedule.known(case.loop, values)
         case = schedule.from_table(set_values(case, before), table)
@@ -296,16 +228,7 @@ def set_and_schedule(case: Case, values: Mapping[str, Any], table: Mapping[str, 
 
 
 def with_bottom(case: Case) -> Case:
-    """Return the case with `plant.bottom` where liquid can be drawn out of its tanks, in its own
-    run or in a scenario: no level then falls below 0. Models of the plant follow.
-
-    Examples
-    --------
-    >>> from jaxtank import presets, rig
-    >>> case = rig.set_values(presets.find("gouta2015/ngpc"), {"actuator.low": -1.0})
-    >>> case.loop.plant.bottom, rig.with_bottom(case).loop.plant.bottom
-    (False, True)
-    """
+    """Return the case with `plant.bottom` where liquid can be drawn out of its tanks."""
     plant: Any = case.loop.plant
     if not isinstance(plant, TankNetwork) or plant.bottom or not _draws(case):
         return case
@@ -324,19 +247,7 @@ def _draws(case):
 
 
 def has(loop: ClosedLoop, name: str) -> bool:
-    """Return whether a loop has a leaf.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    name : dotted name of a leaf, or of an entry of it, "name[i]"
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> has(presets.find("cascaded/pi").loop, "x0[2]")
-    False
-    """
+    """Return whether a loop has a leaf, or an entry of one, of this dotted name."""
     try:
         get_value(loop, name)
     except InputError:

@@ -135,9 +135,7 @@ def _tuned(case):
 
 
 def _kept(mine, theirs, suggested):
-    """The Blocks of a file that differ from those of its preset, or that SHORT or `suggested`
-    names.
-    """
+    """The Blocks of a file that differ from its preset's, or that SHORT or `suggested` names."""
     known = {line for block in theirs for line in terse(block)}
     same, in_values, kept = _same_tables(mine, theirs), False, []
     for block in mine:
@@ -155,9 +153,7 @@ def _kept(mine, theirs, suggested):
 
 
 def _differing(line, known, suggested):
-    """A line of [values] if the preset does not have it, commented out if it is suggested; None of
-    another.
-    """
+    """A line of [values] that the preset lacks, commented out if it is suggested; else None."""
     if not line.on:
         return None
     if not set(terse(Block("", [line]))) <= known:
@@ -166,9 +162,7 @@ def _differing(line, known, suggested):
 
 
 def _same_tables(mine, theirs):
-    """Titles of the tables that two files have alike, those of a list in the same number: an empty
-    [uncertain] is not a preset's.
-    """
+    """Titles of the tables that two files have alike, those of a list in the same number."""
     tables = [{}, {}]
     for found, blocks in zip(tables, (mine, theirs)):
         for block in blocks:

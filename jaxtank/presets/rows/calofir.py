@@ -2,44 +2,10 @@
 
 import numpy as np
 
-from jaxtank.presets.paper import Claim, Published
+from jaxtank.presets.paper import Claim
 
 GAINS = ((0.01, 0.01), (0.02, 0.02), (0.02, 0.1), (0.1, 0.1))  # K_phi, K_y of notes S7.1 [1/s]
 FINE = 0.05  # sampling period that stands for continuous time [s]
-PUBLISHED = {
-    "controller.K_phi and controller.K_y": Published(
-        "chosen by experiment",
-        "1/s",
-        "sec. 2",
-        reason="no values are printed; ours follow from overshoot (notes S4.3)",
-    ),
-    "larger gains settle sooner": Published(
-        "larger K_y and K_phi reduce the settling time",
-        "",
-        "sec. 2",
-        reason="up to 0.02 and 0.1 1/s; beyond, h1 overshoots, since h3 is regulated, and takes"
-        " longer (notes S4.3)",
-    ),
-    "larger gains saturate the pump": Published(
-        "the input grows, and is often limited", "", "sec. 2"
-    ),
-    "level of the second tank": Published("has the same characteristic", "", "sec. 4, Fig. 2"),
-    "needs an exact model": Published("requires it", "", "sec. 5"),
-    "h1 is at least h3": Published("h1 >= h3 in every operating point", "", "sec. 3.2"),
-    "sampling period of 1 s": Published(
-        "small enough to emulate the continuous controller", "", "sec. 4"
-    ),
-    "faults of Fig. 3": Published(
-        "some faults", "", "sec. 4, Fig. 3", reason="neither described nor quantified (notes A3)"
-    ),
-    "equations as printed": Published(
-        "eqs. (12)-(21)",
-        "",
-        "sec. 3",
-        reason="they contradict each other: (12a) has no steady state, (20) defines v and calls it"
-        " phi; no controller follows from them (notes S5)",
-    ),
-}
 
 
 def settling(trajectory):
@@ -51,7 +17,7 @@ def settling(trajectory):
 
 
 def measured(run):
-    """Return {quantity: Claim} of PUBLISHED, but for what cannot be measured."""
+    """Return {quantity: Claim} of the published rows, but for what cannot be measured."""
     (case, plain), hurt = run("backstepping"), run("backstepping-perturbed")[1]
     runs = [run("backstepping", _gains(*pair))[1] for pair in GAINS]
     times = [settling(t) for t in runs]

@@ -6,137 +6,13 @@ import numpy as np
 
 from jaxtank.loop.margins import stability_margins
 from jaxtank.loop.run import simulate
-from jaxtank.presets.paper import Claim, Published
+from jaxtank.presets.paper import Claim
 from jaxtank.signals.inflows import inflow_pulses
 
 RAMPS = (20.0, 30.0, 60.0, 200.0)  # durations of the setpoint ramps, not printed [s]
 OWN = 60.0  # that of the cases [s]
 EVERY = 10  # samples between those that are kept of these runs: 0.1 s
 POUR = (620.0, 1.0, 0, 100.0)  # disturbance of ours: time, duration [s], tank, volume [cm^3]
-
-_HIDDEN = "the record of the experiment is in figures alone, which are not in the text"
-BY_RAMP = {
-    "tracking error": Published(
-        "'negligible' (NGPC), 'more important' (backstepping)",
-        "",
-        "sec. 5.1, 5.3, Table 2",
-        reason="no numbers are printed",
-    ),
-    "which tracks better": Published(
-        "backstepping, of which saturation changes little",
-        "",
-        "sec. 5.1",
-        reason="sec. 5.3 and Table 2 say the opposite; without the rates of the setpoint, as eq."
-        " (48) is printed, backstepping lags behind ramps",
-    ),
-    "which moves the pumps less": Published("backstepping", "", "sec. 5.1, Fig. 9"),
-    "inputs within the limits of the pumps": Published("of both controllers", "", "sec. 5.1"),
-    "levels below the rims": Published(
-        "levels 'do not exceed 30 cm'",
-        "",
-        "Remark 2",
-        reason="tank 4 needs more, but for backstepping with ramps of 200 s (notes S3)",
-    ),
-    "levels above 3 cm": Published(
-        "'always greater than 3 cm'",
-        "",
-        "sec. 2.1, assumption ii",
-        reason="setpoints of 3 and 8 cm need lower levels in tanks 3 and 4",
-    ),
-    "voltages of 3 V and less": Published(
-        "the pumps do not always run at 3 V and less, where the benchmark needs it", "", "Remark 4"
-    ),
-    "control effort": Published("larger with NGPC", "", "sec. 5.3, Fig. 14, Fig. 17"),
-    "commands outside the range without limits": Published(
-        "an important portion",
-        "",
-        "sec. 5.1",
-        reason="the printed gains keep within the range with slow ramps; with the areas as printed"
-        " nearly all commands are outside (notes S7)",
-    ),
-    "effect of the limits on the error": Published(
-        "NGPC degrades, backstepping stays virtually the same",
-        "",
-        "sec. 5.1, Figs. 6-9",
-        reason="slow ramps do not reach the limits",
-    ),
-    "first change of both setpoints": Published(
-        "h1 and h2 follow in a similar manner with the two controllers",
-        "",
-        "sec. 5.3",
-        reason="backstepping lags behind the ramp; that h1 and h2 are alike follows from the"
-        " symmetry of rig and setpoints with any controller",
-    ),
-    "changes of one setpoint at 760 and 900 s": Published(
-        "small perturbations of the other level", "", "sec. 5.3"
-    ),
-    "NGPC follows the setpoint's rate": Published(
-        "the error obeys e'' + K2 e' + K1 e = 0",
-        "",
-        "eqs. (24)-(28)",
-        reason="at the limits of the pumps it does not",
-    ),
-}
-PUBLISHED = {
-    **{name: row._replace(ramp=OWN) for name, row in BY_RAMP.items()},
-    "disturbance rejection": Published(
-        "better with backstepping",
-        "",
-        "sec. 5.1",
-        reason="true of the other tank; the disturbed level itself recovers as fast with NGPC",
-        ramp=OWN,
-    ),
-    "fluctuations with backstepping": Published(
-        "noticeable, around 16-14 cm and 12 cm",
-        "",
-        "sec. 5.3",
-        reason="noise does not cause them, nor does a dead zone as modelled (notes S8); their"
-        " cause is in the rig of the paper",
-        ramp=OWN,
-    ),
-    "Theorem 1": Published(
-        "asymptotic stability for every reference with a bounded rate",
-        "",
-        "sec. 4.1, 6",
-        reason="for constant setpoints only: eq. (46) lacks the rate of the setpoint (notes E8)",
-        ramp=OWN,
-    ),
-    "relative stability": Published(
-        "good (NGPC), excellent (backstepping)",
-        "",
-        "Table 2",
-        reason="true of the delay margin; the sensitivity peaks differ by 2 %",
-    ),
-    "parameters to tune, NGPC and backstepping": Published(
-        (1, 2), "-", "sec. 5 (complexity 'low' and 'high' in Table 2)"
-    ),
-    "complexity of implementation": Published(
-        "high (NGPC), low (backstepping)",
-        "",
-        "Table 2",
-        reason="no measure of it is given; eqs. (28) and (48) are both in closed form, and share"
-        " the inversion of the plant (notes S4)",
-    ),
-    "possibilities of controller design": Published(
-        "medium (NGPC), medium (backstepping)", "", "Table 2", reason="no measure of it is given"
-    ),
-    "tuning procedure": Published(
-        "five steps by trial and error", "", "Remark 3", reason="no stopping rule is given"
-    ),
-    "comparison with earlier controllers": Published(
-        "acceptable results without linearisation",
-        "",
-        "Remark 5",
-        reason="neither rigs nor numbers of refs. [2]-[6], [16], [26] are given",
-    ),
-    "measured responses": Published("Figs. 12-17", "", "sec. 5.2", reason=_HIDDEN),
-    "identified coefficients c1 to c10": Published(
-        "tuned until model and rig agree",
-        "",
-        "Remark 1",
-        reason="the tuned values are not printed: Table 1 has the geometry alone",
-    ),
-}
 
 
 def total(trajectory):
@@ -150,7 +26,7 @@ def outside(trajectory):
 
 
 def measured(run):
-    """Return {quantity: what was measured} of PUBLISHED, but for what cannot be measured."""
+    """Return {quantity: what was measured} of the rows that can be measured."""
     far = run("backstepping")[1]
     return {
         **_by_ramp(run),

@@ -6,111 +6,9 @@ import numpy as np
 
 from jaxtank.core.tree import get_value
 from jaxtank.observers import Direct
-from jaxtank.presets.paper import Claim, Published
+from jaxtank.presets.paper import Claim
 from jaxtank.presets.rows.operations import sample_operations
 
-_SIMULATED = "sec. 5.2, Fig. 6"
-PUBLISHED = {
-    "third experiment, error": Published(
-        "reduced to a small neighbourhood of zero; excellent decoupling", "", "sec. 5.2, Fig. 11"
-    ),
-    "third experiment, pump 2 from 330 to 560 s": Published(
-        "pumps less, since liquid comes from tank 1", "", "sec. 5.2, Fig. 12 (printed: Fig. 13)"
-    ),
-    "third experiment, sign of d^": Published(
-        "negative throughout",
-        "",
-        "sec. 5.2, Fig. 13",
-        fitted="the dead zones of the pumps, chosen for the means of d^, make it negative",
-    ),
-    "third experiment, d^ against the level": Published(
-        "|d^| decreases when the level increases",
-        "",
-        "sec. 5.2, Fig. 13",
-        reason="a dead zone gives a constant d^, and wrong coefficients one that grows with the"
-        " flow (notes S2.3)",
-    ),
-    "kick on the other tank": Published(
-        "of ENMPC, and none of CHADPC",
-        "",
-        _SIMULATED,
-        reason="ENMPC has none either: it cancels the flow between the tanks by f(h) (notes S8)",
-    ),
-    "overshoot of CHADPC": Published(
-        "less than that of ENMPC",
-        "",
-        _SIMULATED,
-        reason="on the step of r2 neither overshoots: the pumps leave their limit near the"
-        " setpoint",
-    ),
-    "u2 in antiphase to h1": Published(
-        "same period, opposite phase; u1 in phase", "", "sec. 5.2, Fig. 9"
-    ),
-    "pumps stop after an inflow pulse": Published("u2 and u1 drop to 0 V", "", "sec. 5.2, Fig. 9"),
-    "range of d^": Published(
-        "-1 to 0 and -1.25 to -0.5 cm/s",
-        "",
-        "sec. 5.2, Fig. 10",
-        reason="d^ stays inside, and does not vary: its dead zone is constant",
-        fitted="the dead zones of the pumps were chosen for the means of d^ (notes S2.3)",
-    ),
-    "jump of the level by an inflow pulse": Published(
-        (2.5, 2.5),
-        "cm",
-        "sec. 5.2 ('about 2.5 cm in each level')",
-        0.1,
-        "500 cm^3 over 225 cm^2 are 2.22 cm, as the 22 % of 10 cm in the same section (notes S5);"
-        " the pulse lasts 1.1 s and the pumps react",
-    ),
-    "tracking with noise": Published("poorest with ENMPC", "", "sec. 5.2, Figs. 7-8"),
-    "steady error of ENMPC": Published(
-        "compensated",
-        "",
-        "sec. 5.2",
-        reason="without the observer an offset d/k is left: it has no integral action (notes S4.1)",
-    ),
-    "Proposition 3.1": Published(
-        "ENMPC makes the error decay exponentially",
-        "",
-        "sec. 3, eqs. (13)-(21)",
-        reason="with + f(h) in eq. (12), the disturbance known and pumps without limits, at the"
-        " rate k = 3/(2 Tp); the proof takes ||f(h)|| <= delta ||e||, which is false (notes S5)",
-    ),
-    "order of fractional PI, PI and PID": Published(
-        "RMS error least with fractional PI and feed-forward, largest with PID",
-        "",
-        "Table 4",
-        reason="of tank 2 and of the total; in tank 1 PID is better than PI, by less than what"
-        " their gains, ours, decide (notes S4.5)",
-    ),
-    "smaller error than PI, PID and fractional PI": Published(
-        "with ENMPC and CHADPC",
-        "",
-        "sec. 5.3, Table 4",
-        reason="true without a delay; with 0.5 s the gains of Table 2 oscillate between the limits"
-        " of the pumps (notes S8). Table 4 compares different rigs",
-    ),
-    "wavelet network MPC of [28]": Published(
-        "slightly better, with much more computation",
-        "",
-        "Table 4, sec. 5.3",
-        reason="a network on another rig, without weights or numbers",
-    ),
-    "levels between 1 and 30 cm": Published(
-        "always greater than 1 cm and less than 30 cm",
-        "",
-        "sec. 2",
-        reason="r1 = 0 before 10 s asks for less than 1 cm",
-    ),
-    "decay of the estimation error": Published(
-        "e_d' = -l e_d with l = 10 1/s", "", "eq. (25), Table 2"
-    ),
-    "divergence by a wrong estimate": Published(
-        "may be caused by each miscalculation of the observer", "", "sec. 5.2"
-    ),
-    "computation of CHADPC": Published("more than that of ENMPC, by the observer", "", "sec. 5.2"),
-    "parameters to tune, ENMPC and CHADPC": Published((1, 3), "-", "sec. 5.1, 5.2"),
-}
 CALM = 60.0  # when the start has passed [s]
 
 
@@ -171,7 +69,7 @@ def total(trajectory):
 
 
 def measured(run):
-    """Return {quantity: what was measured} of PUBLISHED."""
+    """Return {quantity: what was measured} of the published rows."""
     (plain, enmpc), (case, chadpc) = run("enmpc"), run("chadpc")
     return {
         **_third(run("chadpc-trapezoid")[1]),

@@ -6,53 +6,9 @@ import numpy as np
 
 from jaxtank.analysis import qp
 from jaxtank.presets.loops.khalid import CLOCK, scenario
-from jaxtank.presets.paper import Claim, Published
+from jaxtank.presets.paper import Claim
 from jaxtank.presets.rows.operations import operations
 
-_OURS = "at 0 m gravity alone decides: the cases run between levels that a pump can hold (notes S3)"
-_WHERE = "sec. V.A, Figs. 2-5"
-PUBLISHED = {
-    "pulses of H2, one pump": Published((0.0, 0.12), "m", "sec. V.A", reason=_OURS),
-    "pulses of H1 and H2, two pumps": Published(
-        (0.0, 0.12, 0.0, 0.15), "m", "sec. V.B", None, _OURS
-    ),
-    "controller.N, two pumps": Published(4, "-", "sec. V.B"),
-    "computational cost of Laguerre": Published(
-        "reduced",
-        "",
-        "sec. V.A, conclusion",
-        reason="with constraints alone: without, both are a fixed gain (eq. 32 is further work)",
-    ),
-    "undershoot against control horizon": Published(
-        "not eliminated by any", "", "sec. V.A", reason="true of 10 and 30, not of 2 (notes S8)"
-    ),
-    "pulses from 0 m: long control horizon": Published(
-        "improves performance",
-        "",
-        _WHERE,
-        reason="the error falls and the overshoot grows (notes S8)",
-    ),
-    "pulses from 0 m: control horizon beyond 10": Published("not much improvement", "", _WHERE),
-    "pulses from 0 m: overshoot and undershoot": Published(
-        "lots of both, with every control horizon",
-        "",
-        _WHERE,
-        reason="no level falls below an empty tank: undershoots of Figs. 2-4 are of deviations, or"
-        " of a model without an end at 0 m (notes H3)",
-    ),
-    "pulses from 0 m: overshoot of Laguerre": Published(
-        "reduced considerably against GPC 30",
-        "",
-        "sec. V.A, Fig. 5",
-        reason="r_w is not printed; at the same r_w little changes (notes S8)",
-    ),
-    "pulses from 0 m: Laguerre with two pumps": Published(
-        "outperforms GPC",
-        "",
-        "sec. V.B, Figs. 6-7",
-        reason="they are equal at the same r_w, with 8 variables for 20 (notes S8)",
-    ),
-}
 SISO = ("gpc-nc2", "gpc", "gpc-nc30", "laguerre")
 MIMO = ("gpc-mimo", "laguerre-mimo")
 
@@ -69,7 +25,7 @@ def from_empty(name):
 
 
 def measured(run, edges):
-    """Return {quantity: what was found} of PUBLISHED; edges: of `jaxtank.presets.khalid`."""
+    """Return {quantity: what was measured}; edges: of `jaxtank.presets.khalid`."""
     error, over, under = {}, {}, {}  # RMS [mm], overshoot and undershoot [%] of each output
     for names, start in ((SISO, "S1"), (MIMO, "M1")):
         for name in names:

@@ -8,98 +8,7 @@ from jaxtank.analysis.linear_model import linearise, transmission_zeros
 from jaxtank.analysis.riccati import lqr
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.presets.loops.mirakhorli import CONTROLLERS, SETPOINT, UNROUNDED_SPLIT
-from jaxtank.presets.paper import Claim, Published
-
-_MISSING = (
-    "h(0), the pumps' range, the estimator of the level rates, the membership functions (Fig. 3)"
-    " and the length of the record are not given; the overshoots agree under one set of"
-    " assumptions, the rise times do not at the same time (notes S7.2)"
-)
-_LMSE = (
-    "the mean square error is not defined; ours is the mean of e^2 over 400 s, as a share of the"
-    " setpoint squared (notes S3)"
-)
-_CHOSEN = "the assumptions of notes S7.2 were chosen to come near Table 3"
-_TABLE = "Table 3, tank 1"
-
-TABLE_3 = {  # unit; SMC, SFC, hybrid
-    "overshoot": ("%", 44.16, 10.0, 13.33),
-    "rise time": ("s", 66.0, 80.0, 65.0),
-    "settling time": ("s", "none", 120.0, 90.0),
-    "LMSE": ("", 0.4275, 0.0339, 0.0331),
-}
-PUBLISHED = {
-    **{
-        f"{name}, {controller}": Published(
-            value,
-            unit,
-            _TABLE,
-            None if isinstance(value, str) else 0.1,
-            _LMSE if name == "LMSE" else _MISSING,
-            _CHOSEN,
-        )
-        for name, (unit, *values) in TABLE_3.items()
-        for controller, value in zip(("SMC", "SFC", "hybrid"), values)
-    },
-    "Table 3 with the cases as they are": Published(
-        "the numbers of Table 3",
-        "",
-        _TABLE,
-        reason="pumps to 5 V and an exact model, the corrected sliding mode: less overshoot, and"
-        " sooner at the setpoint, but for SMC as printed, which never settles",
-    ),
-    "SFC rises more slowly": Published(
-        "than SMC and hybrid",
-        "",
-        "sec. 6, Table 3",
-        reason="on the rig fitted to Table 3 alone (notes S7.2); with the cases as they are SFC is"
-        " the first at the setpoint",
-    ),
-    "hybrid against SMC and SFC": Published(
-        "better response as compared to both controllers",
-        "",
-        "sec. 6",
-        reason="with the printed gains; once both are tuned for the same cost SFC is better, and"
-        " integral action, without tuning, is better than either",
-    ),
-    "settling of the hybrid": Published(
-        "25 % sooner than SFC", "", _TABLE, reason="both settle at nearly the same time there"
-    ),
-    "hybrid: steady-state error": Published("insignificant", "", "sec. 7, Fig. 6"),
-    "hybrid switches between the controllers": Published(
-        "continuously, once an outlet has changed", "", "sec. 6, Figs. 10-11"
-    ),
-    "relative degree": Published(
-        (2, 2),
-        "-",
-        "sec. 4.1",
-        0.0,
-        "each pump also feeds a lower tank directly; eq. (4) leaves out the rate of that flow"
-        " (notes E2, E4)",
-    ),
-    "non-minimum phase": Published("a zero in the right half-plane", "", "sec. 2, eq. (1)"),
-    "SFC is an optimal gain": Published(
-        "K solves a Riccati equation",
-        "",
-        "eqs. (13)-(15)",
-        fitted="Q, R and the unrounded splits were chosen to give the printed K (notes S4.1)",
-    ),
-    "sign of the SFC": Published(
-        "u = -K' x with K = -R^-1 B' P",
-        "",
-        "eqs. (14)-(15)",
-        reason="two signs and a transpose too many: u = u0 - K (h - h0) (notes E11)",
-    ),
-    "membership functions and shares": Published(
-        "Figs. 3 and 8", "", "sec. 4.3, 6", reason="in figures alone, which are not in the text"
-    ),
-    "choice of Q and R": Published(
-        "positive definite",
-        "",
-        "sec. 4.2",
-        reason="not printed; Q = C'C, R = 3 I fit K (notes S4.1)",
-    ),
-}
+from jaxtank.presets.paper import Claim, printed
 
 
 def response(trajectory, output=0):
@@ -137,7 +46,7 @@ SAME_CONTROLLER = {"SMC": ("smc", "smc-printed"), "SFC": ("sfc",), "hybrid": ("h
 
 
 def measured(run, assumed):
-    """Return {quantity: what was found} of PUBLISHED, but for what cannot be measured."""
+    """Return {quantity: what was measured} of the rows that can be measured."""
     # assumed : {controller of Table 3: its `response` with what notes S7.2 assumes}
     rise = {name: found["arrival"] for name, found in assumed.items()}
     settled = [assumed[name]["settling"] for name in ("SFC", "hybrid")]
@@ -215,16 +124,16 @@ def _text(value, unit):
 def _table_3(run, assumed):
     """The numbers of Table 3 under the assumptions of notes S7.2, and as the cases are."""
     own, found = {kind: response(run(kind)[1]) for kind in CONTROLLERS}, {}
-    near, words = [], []
+    near, words, published = [], [], printed("mirakhorli")["published"]
     for quantity, (name, unit) in QUANTITIES.items():
         for controller in SAME_CONTROLLER:
             value = assumed[controller][quantity]
-            printed = PUBLISHED[f"{name}, {controller}"].value
-            if value is None or isinstance(printed, str):  # it never settles
-                never = value is None and isinstance(printed, str)
+            target = published[f"{name}, {controller}"].value
+            if value is None or isinstance(target, str):  # it never settles
+                never = value is None and isinstance(target, str)
                 value = Claim(never, _text(value, unit))
             found[f"{name}, {controller}"] = value
-            near += [_near(own[case][quantity], printed) for case in SAME_CONTROLLER[controller]]
+            near += [_near(own[case][quantity], target) for case in SAME_CONTROLLER[controller]]
         cases = [case for cases in SAME_CONTROLLER.values() for case in cases]
         each = ", ".join(f"{_text(own[case][quantity], unit)} in {case}" for case in cases)
         words.append(f"{name} {each}")
@@ -232,11 +141,11 @@ def _table_3(run, assumed):
     return found | {"Table 3 with the cases as they are": Claim(near, "; ".join(words))}
 
 
-def _near(value, printed):
+def _near(value, target):
     """Whether a value of ours, None for never, is within 10 % of the printed one."""
-    if value is None or isinstance(printed, str):
-        return value is None and isinstance(printed, str)
-    return abs(value / printed - 1.0) <= 0.1
+    if value is None or isinstance(target, str):
+        return value is None and isinstance(target, str)
+    return abs(value / target - 1.0) <= 0.1
 
 
 def _linear(loop):
