@@ -77,7 +77,7 @@ values = { "sensor.noise" = "0.02 if zero", "plant.pump_gain" = "x1.3", "x0" = [
 
 from jaxtank.case import Case
 from jaxtank.rig.components import register
-from jaxtank.rig.lines import toml
+from jaxtank.rig.entry import toml
 from jaxtank.rig.read import filtered as filtered
 from jaxtank.rig.read import from_table as from_table
 from jaxtank.rig.read import load, loads

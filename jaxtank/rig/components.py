@@ -11,7 +11,6 @@ from jaxtank import controllers
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.installed import imported, installed
 from jaxtank.core.text import shortened
-from jaxtank.core.toml_schema import NEEDED, Key, Section, type_of
 from jaxtank.core.tree import number
 from jaxtank.core.units import DEFAULT
 from jaxtank.instruments import Actuator, LevelSensor, PumpBank, Sensor
@@ -19,15 +18,13 @@ from jaxtank.loop.steady import steady_state
 from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman, Observer
 from jaxtank.plants.hydraulics import in_unit
 from jaxtank.rig.entry import read_entry, sizes_of
-from jaxtank.rig.schema import KIND, OPEN_LOOP
+from jaxtank.rig.schema import KIND, NEEDED, OPEN_LOOP, Key, Section, type_of
 from jaxtank.rig.signals import ramp_values, ramps_of
 from jaxtank.signals.setpoints import Ramps, ramps
 
 
 class Role(NamedTuple):
-    """What a section describes: field of the loop, abstract class, classes by kind, fields that a table
-    may leave out, and the class that needs no section.
-    """
+    """A section: field of the loop, abstract class, {kind: class}, fields it may leave out."""
 
     field: str
     base: type
@@ -251,7 +248,7 @@ def model_of(loop):
 
 
 def instrument_of(name, table, loop):
-    """Return the sensor or actuator of a table; what it leaves out of `kept` is the loop's."""
+    """Return the sensor or actuator of a table; `kept` fields that it leaves out are the loop's."""
     role = ROLES[name]
     own = {key: getattr(getattr(loop, role.field), key) for key in role.kept}
     return component(name, table, loop.plant, own)
@@ -280,7 +277,7 @@ def component(name, table, plant, offered):
 
 
 def steady_bias(loop, known=False):
-    """Return (m,) inputs that hold the outputs at x0; those before t = 0 where `known` or none hold."""
+    """Return (m,) inputs that hold the outputs at x0; those before t = 0 if `known`."""
     bank, start = loop.actuator, np.asarray(loop.x0)[list(loop.plant.outputs)]
     try:
         steady = np.clip(steady_state(loop, start)[1], bank.low, bank.high)

@@ -139,7 +139,7 @@ FLOW_MARGIN = 2.0
 
 
 def _check_gains(gains, units):
-    """Raise InputError for a gain that is not near the flow that a unit of its input stands for."""
+    """Raise InputError for a gain that is not near the flow of a unit of its input."""
     factor = flow_per_input(units)
     for j, gain in enumerate(gains):
         if factor and gain > 0 and not 1 / FLOW_MARGIN <= gain / factor <= FLOW_MARGIN:
@@ -161,7 +161,7 @@ def _check_names(tanks):
 
 
 def _check_links(table, entries):
-    """Raise InputError for a link from a tank to itself, and for shares of spills above 1 in sum."""
+    """Raise InputError for a link of a tank to itself, and for spills of more than 1 in sum."""
     for name in ("orifice", "spill"):
         for i, (entry, given) in enumerate(zip(entries[name], table[name])):
             value = [given["from"], given["to"]]

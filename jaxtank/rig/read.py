@@ -68,7 +68,7 @@ def check_keys(text):
 
 
 def open_case(name: str) -> Case:
-    """Return the Case of "paper/case", or of the rig file `name` where it ends in .toml, checked."""
+    """Return the Case of "paper/case", or of the rig file `name` if it ends in .toml, checked."""
     return load(name) if name.endswith(".toml") else presets.find(name)
 
 
@@ -182,7 +182,7 @@ def renamed(table):
 
 
 def filtered(case: Case, on: bool | None = None, changes: Mapping[str, Any] | None = None) -> Case:
-    """Return the case with the safety filter of its settings and `changes`, or with it on or off."""
+    """Return the case with the safety filter of its settings and `changes`, or without it."""
     changes = read_entry(SECTIONS["safety_filter"], changes or {}, sizes_of(case.loop.plant))
     if (case.safety is None and not on) or on is False:
         if changes:

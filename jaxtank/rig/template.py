@@ -6,21 +6,20 @@ import numpy as np
 
 from jaxtank.case import Free
 from jaxtank.core.errors import InputError
-from jaxtank.core.toml_schema import Section
 from jaxtank.core.tree import describe, get_value, is_component, parameters, walk
 from jaxtank.measures import MEASURES, of_loop
 from jaxtank.measures import unit as measure_unit
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig import components
-from jaxtank.rig import schedule as scheduling
-from jaxtank.rig.lines import Block, Line, suggestion, toml
-from jaxtank.rig.schema import SECTIONS, SHARE, WEIGHT
+from jaxtank.rig.entry import Block, Line, suggestion, toml
+from jaxtank.rig.schema import SECTIONS, SHARE, WEIGHT, Section
+from jaxtank.rig.values import schedule, schedule_table
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps
 
 
 def absent(loop, name, meta):
-    """Return the least allowed value of an optional leaf that is not in use, in its shape."""
+    """Return the least allowed value of an absent optional leaf, in its shape."""
     *path, _ = name.split(".")
     owner = loop
     for step in path:
@@ -158,9 +157,9 @@ def _component(name, part):
     return {"section": Section(name, section.keys, prose=prose), **values}
 
 
-def schedule(case):
-    """The first free gain along the first setpoint, None where the controller allows no schedule."""
-    if scheduling.table_of(case.loop):
+def _schedule(case):
+    """The first free gain along the first setpoint, None where no schedule is allowed."""
+    if schedule_table(case.loop):
         return None
     rim = float(np.asarray(case.loop.plant.rim)[case.loop.plant.outputs[0]])
     knots = [_rounded(share * rim) for share in (0.25, 0.5, 0.75)]
@@ -168,7 +167,7 @@ def schedule(case):
         if name.startswith("controller.") and "model" not in name:
             for variable in ("r1", "h1"):
                 try:
-                    found = scheduling.schedule(case, {name: variable}, knots)
+                    found = schedule(case, {name: variable}, knots)
                     found.loop.controller.check(found.loop.reference)
                 except (InputError, LookupError, TypeError, ValueError):
                     continue
@@ -273,7 +272,7 @@ def _log(case):
 
 EXAMPLES = {
     "controller": _controller,
-    "schedule": schedule,
+    "schedule": _schedule,
     "observer": _observer,
     "reference.sine": _sine,
     "disturbance": _disturbance,

@@ -20,10 +20,9 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.steady import steady_state
 from jaxtank.measures import MEASURES, check_names, entries
 from jaxtank.measures import unit as measure_unit
-from jaxtank.rig import schedule
 from jaxtank.rig.entry import is_finite, is_numeric, read_entry, sizes_of
 from jaxtank.rig.schema import SECTIONS
-from jaxtank.rig.values import by_dotted_name, set_scenario
+from jaxtank.rig.values import by_dotted_name, check_not_scheduled, scheduled_names, set_scenario
 from jaxtank.signals.setpoints import Ramps
 
 
@@ -140,7 +139,7 @@ def check_free(loop: ClosedLoop, name: str, low: Any, high: Any, scale: str = "l
             f"free {name}: cannot be tuned, it is part of the compiled program and not a number"
             " with a derivative"
         )
-    schedule.check_not_scheduled(loop, name)
+    check_not_scheduled(loop, name)
     get_value(loop, name)
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
@@ -166,7 +165,7 @@ def free_of(loop, table):
                 f'free {name} = {shortened(spec)}: must be [low, high] or [low, high, "log" or'
                 ' "linear"]'
             )
-        for own in schedule.names_of(loop, name):
+        for own in scheduled_names(loop, name):
             found[own] = check_free(loop, own, *spec)
     return found
 

@@ -1,4 +1,4 @@
-"""Setting what a case has by dotted name: leaves, static fields, the clock; scenarios."""
+"""What a case has by dotted name, set: leaves, static fields, the clock; scenarios; schedules."""
 
 import dataclasses
 import re
@@ -7,18 +7,27 @@ from typing import Any
 
 import numpy as np
 
-from jaxtank.case import Case
+from jaxtank.case import Case, Free
+from jaxtank.controllers.gain_schedule import Scheduled, check_gains, check_knots, check_variable
 from jaxtank.core.checks import check_value
 from jaxtank.core.clock import CLOCK_UNITS, check_clock
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.text import shortened
-from jaxtank.core.tree import describe, get_value, parameters, split_index, walk, with_values
+from jaxtank.core.tree import (
+    describe,
+    get_value,
+    number,
+    parameters,
+    split_index,
+    walk,
+    with_values,
+)
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.floor import draws
 from jaxtank.loop.steady import steady_state
 from jaxtank.plants.tank_network import TankNetwork
-from jaxtank.rig import schedule
-from jaxtank.rig.entry import is_numeric, plain, static_value, unit
+from jaxtank.rig.entry import is_numeric, plain, read_entry, sizes_of, static_value, unit
+from jaxtank.rig.schema import SECTIONS
 
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
 """Where controller and observer hold the plant's parameters, by the same names."""
@@ -90,7 +99,7 @@ def set_values(case: Case, values: Mapping[str, Any]) -> Case:
             raise InputError(
                 f"{name} = {shortened(value)}: must be a number or a list of numbers{unit(meta)}"
             )
-        schedule.check_not_scheduled(case.loop, name)
+        check_not_scheduled(case.loop, name)
         loop = with_values(case.loop, {name: value})
         if parameters(loop).get(split_index(name)[0]) is not None:  # an infinite Ti is none
             check_value(name, get_value(loop, name), meta)
@@ -222,8 +231,8 @@ def _meta(case, name):
 def set_and_schedule(case: Case, values: Mapping[str, Any], table: Mapping[str, Any]) -> Case:
     """Return `set_values` of a case with the schedule of a [schedule] table; {}: none."""
     if table:
-        before, values = schedule.known(case.loop, values)
-        case = schedule.from_table(set_values(case, before), table)
+        before, values = _known(case.loop, values)
+        case = _with_schedule(set_values(case, before), table)
     return set_values(case, values)
 
 
@@ -282,3 +291,147 @@ def _set_static(tree, name, path, value, meta):
             f"{name} is the topology of the rig and cannot be set: choose another case"
         )
     return dataclasses.replace(tree, **{path[0]: static_value(name, value, meta, type(old))})
+
+
+CONTROLLER = "controller."
+
+
+def schedule(case, gains, knots):
+    """Return a copy of `case` with scheduled gains: the same run, until values at knots change."""
+    loop, part = case.loop, case.loop.controller
+    if isinstance(part, Scheduled):
+        raise InputError("the controller has a schedule already: name all its gains in one")
+    names = [entry for name in gains for entry in _entries(loop, name)]
+    check_gains(part, tuple(names))
+    if len(set(gains.values())) != 1:
+        raise InputError(
+            f"schedule variables {', '.join(map(str, gains.values()))}: must be one for all gains"
+        )
+    variable = next(iter(gains.values()))
+    check_variable(variable, len(loop.plant.outputs), loop.plant.tanks)
+    check_knots(knots)
+    knots = number(knots)
+    values = number([[float(get_value(part, name))] * knots.size for name in names])
+    numbers = [name for name in names if not split_index(name)[1]]
+    part = _emptied(part, numbers)
+    controller = Scheduled(
+        law=part, knots=knots, values=values, gains=tuple(names), variable=variable
+    )
+    controller.check(loop.reference)
+    free = _free(case, names, knots.size)
+    return case.replace(loop=dataclasses.replace(loop, controller=controller), free=free)
+
+
+def unscheduled(loop):
+    """Return `loop` with its controller without a schedule, its gains those of the first knot."""
+    part = loop.controller
+    if not isinstance(part, Scheduled):
+        return loop
+    first = dict(zip(part.gains, np.asarray(part.values)[:, 0]))
+    return dataclasses.replace(loop, controller=with_values(part.law, first))
+
+
+def check_not_scheduled(loop, name):
+    """Raise InputError if `name` is a gain that a schedule gives, and not the controller's own."""
+    part, inner = loop.controller, name.removeprefix(f"{CONTROLLER}law.")
+    if isinstance(part, Scheduled) and name.startswith(f"{CONTROLLER}law.") and inner in part.gains:
+        raise InputError(
+            f"{name} is scheduled: it is controller.values[{part.gains.index(inner)},j] at knot j,"
+            " counted from 0"
+        )
+
+
+def scheduled_names(loop, name):
+    """Return the names in `loop` of what an unscheduled controller calls `name`."""
+    part, inner = loop.controller, name.removeprefix(CONTROLLER)
+    if (
+        not isinstance(part, Scheduled)
+        or not name.startswith(CONTROLLER)
+        or inner.split("[")[0].split(".")[0] in ("law", "values", "knots")
+    ):
+        return [name]
+    rows = [i for i, gain in enumerate(part.gains) if gain == inner or gain.split("[")[0] == inner]
+    if rows:
+        return [f"{CONTROLLER}values[{i},{j}]" for i in rows for j in range(np.size(part.knots))]
+    return [f"{CONTROLLER}law.{inner}"]
+
+
+def schedule_table(loop):
+    """Return {"gains", "variable", "knots"} of a scheduled loop; empty without a schedule."""
+    part = loop.controller
+    if not isinstance(part, Scheduled):
+        return {}
+    return {
+        "gains": [CONTROLLER + g for g in part.gains],
+        "variable": part.variable,
+        "knots": np.asarray(part.knots).tolist(),
+    }
+
+
+def _with_schedule(case, table):
+    """Return `schedule` of a table as `schedule_table` makes it."""
+    values = read_entry(SECTIONS["schedule"], table, sizes_of(case.loop.plant))
+    gains, knots = values["gains"], table["knots"]
+    for gain in gains:
+        if gains.count(gain) > 1:
+            raise InputError(f"schedule.gains: {gain} is scheduled twice: name it once")
+    if not isinstance(knots, list):
+        raise InputError(f"schedule.knots = {knots!r}: must be a list of numbers")
+    return schedule(case, dict.fromkeys(gains, table["variable"]), knots)
+
+
+def _known(loop, values):
+    """Return (values of names that `loop` or a clock has, the others)."""
+    names = {name for kind in ("leaf", "static") for name, _, _ in walk(loop, kind=kind)}
+    before = {n: v for n, v in values.items() if n.split("[")[0] in names or n.startswith("clock.")}
+    return before, {n: v for n, v in values.items() if n not in before}
+
+
+def _entries(loop, name):
+    """The scalars that a name stands for, without the "controller."."""
+    if not name.startswith(CONTROLLER):
+        raise unknown("gain", name, [n for n in parameters(loop) if n.startswith(CONTROLLER)])
+    inner = name.removeprefix(CONTROLLER)
+    try:
+        found = describe(loop, name)
+    except InputError:
+        raise unknown(
+            "gain", name, [n for n in parameters(loop) if n.startswith(CONTROLLER)]
+        ) from None
+    if found["kind"] == "static" or split_index(name)[1]:
+        return [inner]
+    return [
+        inner + (f"[{','.join(map(str, i))}]" if i else "")
+        for i in np.ndindex(np.shape(get_value(loop, name)))
+    ]
+
+
+def _emptied(part, names):
+    """`part` without the leaves `names`."""
+    for name in names:
+        part = _without(part, name.split("."))
+    return part
+
+
+def _without(tree, path):
+    return dataclasses.replace(
+        tree, **{path[0]: _without(getattr(tree, path[0]), path[1:]) if path[1:] else None}
+    )
+
+
+def _free(case, gains, knots):
+    """What is free with scheduled gains: their values at knots, the rest under new names."""
+    free = {}
+    for name, spec in case.free.items():
+        if not name.startswith(CONTROLLER):
+            free[name] = spec
+            continue
+        entries = _entries(case.loop, name)
+        untouched = not set(entries) & set(gains)
+        for entry in [name.removeprefix(CONTROLLER)] if untouched else entries:
+            if entry in gains:
+                row = gains.index(entry)
+                free |= {f"{CONTROLLER}values[{row},{j}]": Free(*spec) for j in range(knots)}
+            else:
+                free[f"{CONTROLLER}law.{entry}"] = spec
+    return free

@@ -28,7 +28,7 @@ from jaxtank.export.matlab import Matlab
 from jaxtank.export.source import export
 from jaxtank.export.statements import Matrix
 from jaxtank.plants.network import network
-from jaxtank.rig import lines as rig_lines
+from jaxtank.rig import entry as rig_lines
 from tuning.cli import main
 
 SAMPLES = 10_000

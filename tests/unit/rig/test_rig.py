@@ -15,7 +15,7 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.files import LARGEST_TEXT
 from jaxtank.core.tree import parameters
-from jaxtank.rig.lines import toml
+from jaxtank.rig.entry import toml
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
 

@@ -9,13 +9,11 @@ import pytest
 
 from jaxtank import rig
 from jaxtank.core.errors import InputError
-from jaxtank.core.toml_schema import NEEDED, Key
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.rig import components, schema
-from jaxtank.rig.entry import Sizes, read_value, written
-from jaxtank.rig.lines import toml
-from jaxtank.rig.schema import SECTIONS
+from jaxtank.rig.entry import Sizes, read_value, toml, written
+from jaxtank.rig.schema import NEEDED, SECTIONS, Key
 
 # every key of every section, none of them at its default
 EVERY = """
