@@ -29,24 +29,6 @@ def round_trip(case, folder):
     return rig.load(path)
 
 
-@pytest.mark.slow_for(
-    "khalid/gpc-constrained",
-    "khalid/gpc-mimo-constrained",
-    "khalid/gpc-mimo",
-    "khalid/gpc-nc2-constrained",
-    "khalid/gpc-nc2",
-    "khalid/gpc-nc30-constrained",
-    "khalid/gpc-nc30",
-    "khalid/laguerre-constrained",
-    "khalid/laguerre-mimo",
-    "khalid/laguerre",
-)
-@pytest.mark.parametrize("name", presets.names())
-def test_every_case_is_read_back_as_it_was_written(name, tmp_path):
-    case = presets.find(name)
-    assert_same(round_trip(case, tmp_path), case)
-
-
 @pytest.mark.parametrize(
     "values",
     [
