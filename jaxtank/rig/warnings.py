@@ -12,9 +12,8 @@ from jaxtank.loop.disturbance_use import is_unused
 from jaxtank.loop.floor import is_open
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.signals import steps
-from jaxtank.signals.courses import index
 from jaxtank.signals.inflows import InflowPulses
-from jaxtank.signals.setpoints import Sine
+from jaxtank.signals.setpoints import Sine, index
 
 
 def case_warnings(case: Case) -> list[str]:
