@@ -1,4 +1,4 @@
-"""The error of a run by its steps, measured: against the same run with steps of half the length."""
+"""The integration error of a run, estimated from the same run with half the step."""
 # jax leaves the types of its trees partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 
@@ -16,8 +16,8 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.run import evaluate_and_flag
 from jaxtank.loop.saved_rows import simulate_compiled
 
-REFUSED = 5.0
-"""Error of a level from which a run is refused, in errors that show (`step_size.SEEN`) [-]."""
+MAX_ERROR = 5.0
+"""Error of a level above which a run is refused, in `step_size.visible_heights` (1 %) [-]."""
 LISTED = 0.01
 """Share by which a measure must differ to be listed [-]."""
 MOST = 4
@@ -25,8 +25,8 @@ MOST = 4
 
 
 def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> list[str]:
-    """Return a sentence on how far levels, inputs and measures of a run are from those with half
-    the steps; none where steps are short enough for tanks that run empty, or it does not show.
+    """Return one sentence on how levels, inputs and measures change with half the step; [] if the
+    step is stable for tanks that run empty, or no level changes by more than `step_size.SEEN`.
     """
     unstable = list(step_size.unstable_tanks(loop, clock))
     if not unstable:
@@ -46,7 +46,7 @@ def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> l
         f"with half the step, {0.5 * clock.dt / clock.substeps:g} s, the level of tank {tank + 1}"
         f" differs by {apart[:, tank].max():.3g} {length} at t = {time:g} s"
     )
-    if errors[tank] > REFUSED:
+    if errors[tank] > MAX_ERROR:
         remedy = max(unstable, key=lambda one: one.height).remedy
         raise InputError(
             f"clock.dt = {clock.dt:g} s: steps too long to follow tank"
@@ -59,7 +59,7 @@ def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> l
 
 
 def _changed(loop: ClosedLoop, clock: Clock, finer: Clock, key: Any) -> list[str]:
-    """ "name of what 8.6 V in place of 15.1 V" of the measures that half the steps change most."""
+    """Return up to MOST phrases, largest relative change first: "rms_error of output 1 is ..."."""
     names = tuple(m for m in ms.placed("summary") if ms.serves(m, loop))
     values, half = (evaluate_and_flag(loop, c, names, key)[0] for c in (clock, finer))
     found: list[tuple[float, str]] = []

@@ -1,6 +1,7 @@
 """Stability margins of a closed loop: at the steady state of every plateau, and the worst
 of them.
 """
+
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 
@@ -16,14 +17,318 @@ from jax.core import Tracer
 
 from jaxtank import measures as ms
 from jaxtank.analysis import margins as am
+
+# jax leaves the types of zeros, eval_shape, flatten and others partly open.
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownVariableType=false, reportUnknownLambdaType=false
+# pyright: reportConstantRedefinition=false
+from jaxtank.analysis.frequency import OpenLoop, solve
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
-from jaxtank.loop.closed_loop import ClosedLoop, run_of, zero_of
-from jaxtank.loop.operating_point import REASONS, linearised
+from jaxtank.core.records import Tick
+from jaxtank.loop.closed_loop import ClosedLoop, Inputs, State, initial, run_of, zero_of
 from jaxtank.loop.steady import steady_inflow
+from jaxtank.loop.step import decide, move
 from jaxtank.loop.validation import check
+from jaxtank.measures import Context
 from jaxtank.signals.base import Constant
 from jaxtank.xla.jit import compiled
+
+PLANT_STEPS, LOOP_STEPS = 40, 10
+"""Newton steps to the steady state of the plant, and from there to that of the loop."""
+
+FAR = 1e6
+"""Limits of pumps that are inactive, in ranges of the pump."""
+
+PROBES = 2
+"""Directions in which differences on both sides of a steady state are compared with slopes."""
+
+KINK = 1e-3
+"""Share of a slope by which it may differ from that of a finite difference [-]."""
+
+REASONS = (
+    "",
+    "a tank would be at its rim",
+    "a tank would be empty, or below its laminar threshold",
+    "a pump would run at or beyond its limits",
+    "the controller or an instrument has no derivative there (a switch, a dead zone)",
+    "no steady state of the loop is found there (a switching controller has none)",
+    "the controller or an instrument counts samples, and has no steady state",
+    "the controller does not use the readings",
+)
+"""Why a steady state cannot be used, by the number of `Linearised.why`; 0: it can."""
+
+
+class Linearised(NamedTuple):
+    """The loop at the steady state of one plateau."""
+
+    open_loop: OpenLoop
+    x: Any  # (n,) levels [cm]
+    u: Any  # (m,) inputs within their limits [V]
+    why: Any  # 0, or the number of a reason in REASONS
+
+
+def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
+    """Return one sample of the loop linearised at the steady state of constant setpoints."""
+    # The loop is broken between what the actuator is given and the pumps: its dead time and its lag
+    # belong to the open loop. Sensors without noise and ADC, pumps without limits, without safety
+    # filter, inflow pulses and faults; a steady inflow stays. Newton's method finds the state at
+    # which a sample changes nothing, of a stable and of an unstable loop; derivatives are those of
+    # the implicit function. Where a steady state cannot be used (`why`), A, B and C are 0.
+    quiet, dead = _without_limits(loop, clock)
+    found, alone = _rest(clock, quiet, r), _plant_at_rest(quiet, r)
+    (closed, B, C, after, u), s, kink = found.slopes, found.s, found.kink
+    x = s[: loop.plant.tanks]  # the first numbers of a State
+    moved = jnp.abs(after - s) > 1e-8 * jnp.abs(s) + 1e-10 * jnp.max(jnp.abs(s))
+    finite = [jnp.all(jnp.isfinite(v)) for v in (s, closed, B, C)]
+    lost = jnp.any(moved) | ~jnp.all(jnp.stack(finite))
+    # where the loop does not rest, what the plant alone would need tells why
+    levels, volts = (jnp.where(lost, a, b) for a, b in zip(alone, (x, u)))
+    bank, least = loop.actuator, loop.actuator.driving(tuple(jnp.asarray(loop.actuator.low)))
+    low = jnp.where(lost, jnp.stack(list(least)) + jnp.asarray(bank.offset), jnp.asarray(bank.low))
+    checks = [
+        jnp.any(levels >= jnp.asarray(loop.plant.rim)) & loop.plant.overflow,
+        jnp.any(levels < getattr(loop.plant, "knee", 0.0)),
+        jnp.any(volts >= jnp.asarray(bank.high)) | jnp.any(volts <= low),
+        kink,
+        lost,
+        found.counts,
+        jnp.all(C == 0.0),
+    ]
+    why = jnp.select(checks, list(range(1, len(REASONS))), 0)
+    A, B, C = (jnp.where(why == 0, v, 0.0) for v in (closed - B @ C, B, C))
+    return Linearised(OpenLoop(A, B, -C, dead, clock.dt), x, u, why)
+
+
+def _without_limits(loop: ClosedLoop, clock: Clock) -> tuple[ClosedLoop, int]:
+    """(the loop without noise, ADC, limits, dead time, filter and disturbance, its dead time in
+    samples).
+    """
+    sensor: Any = loop.sensor.without_noise()
+    if getattr(sensor, "bits", 0):
+        sensor = dataclasses.replace(sensor, bits=0)
+    actuator: Any = loop.actuator
+    low, high = jnp.asarray(actuator.low), jnp.asarray(actuator.high)
+    far = FAR * jnp.where(jnp.isfinite(high - low), high - low, 1.0)
+    changes: dict[str, Any] = {"low": low - far, "high": high + far}
+    dead = round(float(actuator.delay) / clock.dt)
+    if dead:
+        changes["delay"] = 0.0
+    quiet = dataclasses.replace(
+        loop,
+        sensor=sensor,
+        actuator=dataclasses.replace(actuator, **changes),
+        disturbance=None if steady_inflow(loop) is None else loop.disturbance,
+        faults=None,
+        safety_filter=None,
+    )
+    return quiet, dead
+
+
+def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
+    """(levels (n,), inputs (m,)) of the plant's steady state with outputs r, without derivatives:
+    where Newton's method of the loop starts. Levels that are not controlled start at the mean
+    setpoint, and are at least halved by a step that would empty them.
+    """
+    own, inflow, actuator = loop.plant, steady_inflow(loop), loop.actuator
+    plant, r, inflow, offset = jax.lax.stop_gradient((own, r, inflow, actuator.offset))
+    outputs = np.array(plant.outputs)
+    free = np.array([i for i in range(plant.tanks) if i not in plant.outputs], dtype=int)
+    x = jnp.full(plant.tanks, jnp.mean(jnp.abs(r))).at[outputs].set(r)
+
+    def rates(x: Any, u: Any) -> Any:
+        if inflow is None:
+            return plant.rates(x, u)
+        return jnp.stack(plant.derivative(0.0, tuple(x), tuple(u), tuple(inflow)))
+
+    slope = jax.jacfwd(rates, argnums=(0, 1))
+
+    def newton(_: Any, state: Any) -> Any:
+        x, u = state
+        by_x, by_u = slope(x, u)
+        J = jnp.concatenate([by_x[:, free], by_u], axis=1)
+        scale = jnp.sqrt(jnp.sum(J * J, axis=0))
+        J = J / jnp.where(scale > 0.0, scale, 1.0)
+        square = J.T @ J + 1e-14 * jnp.eye(J.shape[1])
+        step = solve(square, -(J.T @ rates(x, u))[:, None])[:, 0]
+        step = step / jnp.where(scale > 0.0, scale, 1.0)
+        moved = x[free] + step[: len(free)]
+        return x.at[free].set(jnp.maximum(moved, 0.5 * x[free])), u + step[len(free) :]
+
+    start = (x, jnp.zeros(plant.pumps, x.dtype))
+    x, u = jax.lax.fori_loop(0, PLANT_STEPS, newton, start)
+    return x, u + jnp.asarray(offset)
+
+
+class _Sample:
+    """One sample of a loop with constant setpoints as a function of its state, a vector (N,)."""
+
+    def __init__(self, loop: ClosedLoop, clock: Clock, r: Any, guess: tuple[Any, Any]):
+        x, u = guess
+        actuator: Any = loop.actuator
+        here: Any = dataclasses.replace(actuator, initial=u)
+        self.loop, self.clock = loop, clock
+        self.now = _constant_inputs(loop, clock, r)
+        first = initial(dataclasses.replace(loop, x0=x, actuator=here), clock)
+        leaves, self.structure = jax.tree.flatten(first)
+        self.moving = [bool(jnp.issubdtype(v.dtype, jnp.floating)) for v in leaves]
+        self.shapes = [v.shape for v, m in zip(leaves, self.moving) if m]
+        self.still = [v for v, m in zip(leaves, self.moving) if not m]
+        self.start = jax.lax.stop_gradient(self.flat(leaves))
+        self.counts = False  # True where a sample changes whole numbers of the state
+
+    def flat(self, leaves: Any) -> Any:
+        """The vector of the leaves that are real numbers."""
+        return jnp.concatenate([jnp.ravel(v) for v, m in zip(leaves, self.moving) if m])
+
+    def state(self, s: Any) -> State:
+        """The State of a vector."""
+        ends = np.cumsum([int(np.prod(shape)) for shape in self.shapes])[:-1]
+        parts = jnp.split(s, ends)
+        floats = iter(v.reshape(shape) for v, shape in zip(parts, self.shapes))
+        rest = iter(self.still)
+        leaves: list[Any] = [next(floats) if m else next(rest) for m in self.moving]
+        return jax.tree.unflatten(self.structure, leaves)
+
+    def decided(self, s: Any) -> Any:
+        """(State with observer, controller and sensor after the sample, (m,) inputs within their
+        limits).
+        """
+        state, now, loop = self.state(s), self.now, self.loop
+        y, sensor = loop.sensor.step(state.sensor, state.x, None, self.clock.dt)
+        t = jnp.zeros_like(state.x[0])
+        tick = Tick(t, now.r, now.dr, now.ddr, self.clock.dt, now.plan, now.own)
+        made = decide(loop, state.observer, state.controller, tick, y)
+        parts = dict(observer=made.observer, controller=made.controller, sensor=sensor)
+        return state._replace(**parts), made.applied
+
+    def after(self, s: Any, w: Any) -> tuple[Any, Any]:
+        """(state after a sample, (m,) inputs that the loop applies) with w (m,) added to them on
+        their way to the pumps.
+        """
+        state, applied = self.decided(s)
+        given = tuple(a + v for a, v in zip(applied, w))
+        moved = move(self.loop, self.clock, state, given, self.now)[0]
+        leaves: list[Any] = jax.tree.leaves(moved._replace(k=state.k))
+        rest = [v for v, m in zip(leaves, self.moving) if not m]
+        self.counts = any(a is not b for a, b in zip(rest, self.still))
+        return self.flat(leaves), jnp.stack(list(applied))
+
+    def slopes(self, s: Any) -> "_Slopes":
+        """What `after` returns, and its derivatives."""
+
+        def both(s: Any, w: Any) -> Any:
+            found = self.after(s, w)
+            return found, found
+
+        jacobian: Any = jax.jacfwd(both, argnums=(0, 1), has_aux=True)
+        found: Any = jacobian(s, jnp.zeros(self.loop.plant.pumps, s.dtype))
+        ((closed, B), (C, _)), (after, applied) = found
+        return _Slopes(closed, B, C, after, applied)
+
+
+class _Slopes(NamedTuple):
+    """A sample of the closed loop and its derivatives, with N numbers in its state."""
+
+    closed: Any  # (N, N) of the state after a sample by the state
+    B: Any  # (N, m) of it by inputs added at the pumps
+    C: Any  # (m, N) of what the loop applies by the state
+    after: Any  # (N,) state after the sample
+    applied: Any  # (m,) what the loop applies [V]
+
+
+class _Rest(NamedTuple):
+    """The steady state of a loop, whether it is one or not."""
+
+    slopes: _Slopes
+    s: Any  # (N,) state
+    kink: Any  # True where differences of a sample differ from its derivatives
+    counts: Any  # True where a sample changes whole numbers of the state
+
+
+def _constant_inputs(loop: ClosedLoop, clock: Clock, r: Any) -> Inputs:
+    """The Inputs of one sample with setpoints r (outputs,) that do not change."""
+    columns = tuple(v[None] for v in r)
+    zero = tuple(jnp.zeros_like(v) for v in columns)
+    plan = loop.controller.prepare(columns, zero, zero)
+    own = loop.controller.inputs(dataclasses.replace(clock, duration=clock.dt))
+    rows: Any = (columns, zero, zero, plan, own)
+    r, dr, ddr, plan, own = jax.tree.map(_first, rows)
+    inflow = steady_inflow(loop)
+    d = None if inflow is None else tuple(inflow[i] for i in range(loop.plant.tanks))
+    return Inputs(r, dr, ddr, d, None, Context(), plan, own, None)
+
+
+def _first(a: Any) -> Any:
+    return a[0]
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _rest(clock: Clock, loop: ClosedLoop, r: Any) -> _Rest:
+    """The state at which a sample changes nothing, by Newton's method; not finite where there is
+    none. Then PROBES differences on each side of it are compared with the derivatives. One sample
+    is compiled once for all of that.
+    """
+    sample = _Sample(loop, clock, r, _plant_at_rest(loop, r))
+    eye = jnp.eye(sample.start.shape[0], dtype=sample.start.dtype)
+    share = jnp.finfo(eye.dtype).eps ** (1.0 / 3.0)
+
+    def body(state: Any, k: Any) -> Any:
+        point, s, held, kink = state
+        found = sample.slopes(point)
+        kink = kink | ((k > LOOP_STEPS) & _differs(found, held, point - s))
+        searching = k <= LOOP_STEPS
+        held = jax.tree.map(lambda a, b: jnp.where(searching, a, b), found, held)
+        s = jnp.where(searching, point, s)
+        newton = s + solve(eye - found.closed, (found.after - s)[:, None])[:, 0]
+        size = jnp.maximum(jnp.abs(s), 1e-3 * jnp.max(jnp.abs(s)))
+        probe = s + share * size * _direction(k, len(eye))
+        return (jnp.where(k < LOOP_STEPS, newton, probe), s, held, kink), None
+
+    nothing = jax.tree.map(
+        lambda v: jnp.zeros(v.shape, v.dtype), jax.eval_shape(sample.slopes, sample.start)
+    )
+    start = (sample.start, sample.start, nothing, jnp.array(False))
+    found: Any = jax.lax.scan(body, start, jnp.arange(LOOP_STEPS + 1 + 2 * PROBES))[0]
+    _, s, held, kink = found
+    return _Rest(held, s, kink, jnp.array(sample.counts))
+
+
+@_rest.defjvp
+def _rest_jvp(clock: Clock, primals: Any, tangents: Any) -> Any:
+    """Derivatives by the implicit function: (I - closed) ds = the change of `after` at s held."""
+    loop, r = primals
+    found: Any = _rest(clock, loop, r)
+    guess = _plant_at_rest(loop, r)
+    none = jnp.zeros(loop.plant.pumps, found.s.dtype)
+
+    def after(loop: ClosedLoop, r: Any) -> Any:
+        return _Sample(loop, clock, r, guess).after(found.s, none)[0]
+
+    def slopes(s: Any, loop: ClosedLoop, r: Any) -> _Slopes:
+        return _Sample(loop, clock, r, guess).slopes(s)
+
+    pushed: Any = jax.jvp(after, primals, tangents)[1]
+    eye = jnp.eye(found.s.shape[0], dtype=found.s.dtype)
+    ds = solve(eye - found.slopes.closed, eye) @ pushed
+    moved: Any = jax.jvp(slopes, (found.s, loop, r), (ds, *tangents))[1]
+    no = np.zeros((), jax.dtypes.float0)
+    return found, _Rest(moved, ds, no, no)
+
+
+def _direction(k: Any, n: int) -> Any:
+    """(n,) numbers between 0.5 and 1.5 in size, of generic signs; on both sides in turn."""
+    turns = (k // 2 + 1.0) * np.sqrt(np.arange(2.0, n + 2.0) + 0.7)
+    spread = jnp.mod(turns, 1.0) + 0.5
+    signs = jnp.where(jnp.mod(3.0 * turns, 1.0) < 0.5, 1.0, -1.0)
+    return spread * signs * jnp.where(k % 2 == 0, 1.0, -1.0)
+
+
+def _differs(found: _Slopes, held: _Slopes, step: Any) -> Any:
+    """True where a sample at a distance `step` from the one held is not the tangent's."""
+    slope = jnp.concatenate([held.closed, held.C])
+    change = jnp.concatenate([found.after - held.after, found.applied - held.applied])
+    return jnp.any(jnp.abs(change - slope @ step) > KINK * (jnp.abs(slope) @ jnp.abs(step)))
 
 
 class Plateau(NamedTuple):

@@ -1,5 +1,5 @@
-"""The steady state of a closed loop: with its inflow, the dead zones and the limits of
-its pumps.
+"""The steady state of a closed loop: with its steady inflow, and the dead zones and lower limits
+of its pumps (upper limits are not checked).
 """
 
 from typing import Any

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,11 +19,185 @@ from jaxtank.core.numerics import (
 )
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.core.units import DEFAULT
-from jaxtank.core.vectors import each, is_array, zeros
-from jaxtank.plants import array_flows
+from jaxtank.core.vectors import each, is_array, take, zeros
 from jaxtank.plants.base import Plant
 from jaxtank.plants.hydraulics import efflux
-from jaxtank.plants.overflow import downwards, overflowed
+from jaxtank.xla.barrier import materialised, with_one_slope
+from jaxtank.xla.gather import gathered
+
+
+def first_of(pairs: tuple[tuple[int, ...], ...]) -> tuple[int, ...]:
+    """Return the first entry of each pair."""
+    return tuple(a for a, _ in pairs)
+
+
+def second_of(pairs: tuple[tuple[int, ...], ...]) -> tuple[int, ...]:
+    """Return the second entry of each pair."""
+    return tuple(b for _, b in pairs)
+
+
+def pumped(net: Any, u: Any) -> Any:
+    """Return (n,) what the pumps bring to each tank [cm^3/s] for inputs u (m,)."""
+    one = [(j, first, second is not None) for j, (first, second) in enumerate(net.feeds)]
+    two = [(j, second) for j, (_, second) in enumerate(net.feeds) if second is not None]
+    gain, split = jnp.asarray(net.pump_gain), jnp.asarray(net.split)
+    # a pump without a second tank brings all to its first, whatever its split is
+    shared = np.array([s for *_, s in one])
+    shares = gain * jnp.where(shared, split, 1.0)
+    pumps, ends = [j for j, *_ in one], [tank for _, tank, _ in one]
+    if two:
+        at = np.array([j for j, _ in two])
+        shares = jnp.concatenate([shares, take(gain * (1.0 - split), at)])
+        pumps, ends = pumps + [j for j, _ in two], ends + [tank for _, tank in two]
+    return gathered(shares, u, tuple(ends), net.tanks, of=pumps)
+
+
+def outlets(net: Any) -> Any:
+    """Return (n,) area of the outlets of each tank, orifices and drain [cm^2]."""
+    leaving = gathered(jnp.asarray(net.orifice), None, first_of(net.links), net.tanks)
+    return jnp.asarray(net.drain) + (0.0 if leaving is None else leaving)
+
+
+def supply(net: Any, step: Any) -> Any:
+    """Return (n,) largest ratio of root to level in a step [cm^-0.5] (`TankNetwork.limited`)."""
+    pipe = jnp.asarray(net.pipe)
+    areas = outlets(net)
+    for ends in (first_of(net.pipes), second_of(net.pipes)):
+        if ends:
+            areas = areas + gathered(pipe, None, ends, net.tanks)
+    # of the inverse, which is 0 and not infinite for a tank without outlets
+    turnover = step * jnp.sqrt(2.0 * net.gravity)
+    return 1.0 / lower_clip(turnover * areas / jnp.asarray(net.area), net.knee**0.5 / 1.5)
+
+
+def flows(net: Any, x: Any, u: Any, d: Any, step: Any = None) -> Any:
+    """Return the rates (n,) [cm/s] of levels x (n,), as `TankNetwork.derivative`; with `step`, of
+    the vector field of `TankNetwork.limited`.
+    """
+    w, per_area = jnp.sqrt(2.0 * net.gravity), 1.0 / jnp.asarray(net.area)
+    enters = pumped(net, u) if d is None else pumped(net, u) + d
+    most: Any = None if step is None else supply(net, step)
+    root = with_one_slope(lambda h: smooth_sqrt(h, net.knee))
+    q = root(x) if step is None else limited_sqrt(x, net.knee, most)
+    v = w * q
+    if net.links:
+        v = materialised(v)  # read by every orifice
+        orifice, ends = jnp.asarray(net.orifice), second_of(net.links)
+        enters = enters + gathered(orifice, v, ends, net.tanks, of=first_of(net.links))
+    rate = (enters - outlets(net) * v) * per_area
+    return rate + piped(net, x, most) * per_area if net.pipes else rate
+
+
+def piped(net: Any, x: Any, most: Any) -> Any:
+    """Return (n,) what the pipes bring to each tank [cm^3/s]."""
+    one, other = first_of(net.pipes), second_of(net.pipes)
+    held = x if most is None else lower_clip(x, 0.0)
+    root = with_one_slope(lambda h: smooth_signed_sqrt(h, net.knee))
+    s = root(take(held, one) - take(held, other))
+    if most is not None:
+        s = limited_flow(s, take(most * held, one), take(most * held, other))
+    flow = materialised(jnp.asarray(net.pipe) * jnp.sqrt(2.0 * net.gravity) * s)
+    pipes = range(len(one))
+    signs = np.repeat([-1.0, 1.0], len(one))
+    return gathered(signs, flow, one + other, net.tanks, of=(*pipes, *pipes))
+
+
+UNROLLED = 4
+"""Overflows into each other, one after the other, up to which each is written out."""
+
+Pairs = tuple[tuple[int, int], ...]
+
+
+@functools.lru_cache(maxsize=256)
+def downwards(spills: Pairs, tanks: int) -> tuple[list[int], list[int]]:
+    """Return (every tank, after those that overflow into it; the tanks of rings, where there is no
+    such order): what a tank receives must be in it before its own overflow is computed.
+    """
+    below: list[list[int]] = [[] for _ in range(tanks)]
+    waits = [0] * tanks
+    for source, sink in spills:
+        below[source].append(sink)
+        waits[sink] += 1
+    order: list[int] = []
+    free = [i for i in range(tanks) if not waits[i]]
+    while free:
+        order += free
+        after: list[int] = []
+        for sink in (sink for i in free for sink in below[i]):
+            waits[sink] -= 1
+            if not waits[sink]:
+                after.append(sink)
+        free = sorted(after)
+    placed = set(order)
+    ring = [i for i in range(tanks) if i not in placed]
+    return [*order, *ring], ring
+
+
+class Cascade(NamedTuple):
+    """The spills of a rig, in the order in which its tanks overflow."""
+
+    forth: np.ndarray[Any, Any]  # spills into a tank that comes later in the order
+    back: np.ndarray[Any, Any]  # those of a ring into a tank that has overflowed before
+    ring: np.ndarray[Any, Any]  # (n,) whether a tank belongs to a ring, or follows one
+    depth: int  # how many overflows can follow each other
+
+
+@functools.lru_cache(maxsize=256)
+def cascade(spills: Pairs, tanks: int) -> Cascade:
+    """Return the Cascade of the spills of a rig."""
+    order, ring = downwards(spills, tanks)
+    place = {tank: k for k, tank in enumerate(order)}
+    forward = [k for k, (source, sink) in enumerate(spills) if place[source] < place[sink]]
+    behind = [k for k in range(len(spills)) if k not in set(forward)]
+    level = [0] * tanks
+    for k in sorted(forward, key=lambda k: place[spills[k][0]]):
+        source, sink = spills[k]
+        level[sink] = max(level[sink], level[source] + 1)
+    rings = np.zeros(tanks, dtype=bool)
+    rings[ring] = True
+    return Cascade(np.array(forward, int), np.array(behind, int), rings, max(level, default=0))
+
+
+def overflowed(net: Any, x: Any) -> tuple[Any, Any]:
+    """Return (levels (n,) at or below the rims, volume lost over each rim (n,) [cm^3])."""
+    area, rim, caught = (jnp.asarray(v) for v in (net.area, net.rim, net.caught))
+    found = cascade(net.spills, net.tanks)
+
+    def over(levels: Any) -> Any:
+        return materialised(area * (levels - clip(levels, -rim, rim)))
+
+    def caught_of(volumes: Any, which: np.ndarray[Any, Any]) -> Any:
+        """(n,) what the spills `which` bring to each tank, as a rise of its level [cm]."""
+        source = [net.spills[k][0] for k in which]
+        sink = tuple(net.spills[k][1] for k in which)
+        return gathered(caught[which], volumes, sink, net.tanks, of=source) / area
+
+    def further(volumes: Any, _: Any) -> Any:
+        return over(x + caught_of(volumes, found.forth)), None
+
+    volumes = over(x)
+    if found.depth > UNROLLED:
+
+        def all_of(volumes: Any) -> Any:
+            return jax.lax.scan(further, volumes, None, length=found.depth)[0]
+
+        # most samples have no overflow, and none then follows
+        full = jnp.any(volumes != 0.0)
+        volumes = jax.lax.cond(full, all_of, lambda volumes: volumes, volumes)
+    else:
+        for _ in range(found.depth):
+            volumes, _ = further(volumes, None)
+    if found.depth:
+        x = x + caught_of(volumes, found.forth)
+    x, lost = clip(x, -rim, rim), volumes
+    if net.spills:
+        kept = gathered(caught, None, tuple(a for a, _ in net.spills), net.tanks)
+        lost = volumes * (1.0 - kept)
+    if len(found.back):  # what has come back to a full tank leaves the rig there
+        x = x + caught_of(volumes, found.back)
+        held = jnp.where(found.ring, clip(x, -rim, rim), x)
+        lost, x = lost + area * (x - held), held
+    return x, lost
 
 
 @component
@@ -178,7 +352,7 @@ class TankNetwork(Plant):
 
     def _flows(self, t, x, u, d, step=None):
         if is_array(x):
-            return array_flows.flows(self, x, u, d, step)
+            return flows(self, x, u, d, step)
         # Coefficients that do not depend on the state (the c_i of gouta2015 eq. 7) are computed
         # once by the loop. What u and d bring
         # comes first in each sum: within a Runge-Kutta step it is ready before the roots are.

@@ -21,11 +21,290 @@ from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.safety.box import band_of, box_of, interval, narrow_band, spread, top_of, uncovered
 from jaxtank.safety.checker import check
 from jaxtank.safety.conditions import gap_of, settle, spills, steepest, theorem_of
-from jaxtank.safety.filter import SafetyFilter
-from jaxtank.safety.limits import filled_levels, limits_for
-from jaxtank.safety.low_limits import check_low, failed_low
-from jaxtank.safety.setting import Setting
+from jaxtank.safety.filter import FLOOR, SafetyFilter
+from jaxtank.safety.setting import Setting, phi, phi_min, resting_level, sqrt_of, unstoppable
 from jaxtank.safety.worst_case import rates_of
+
+INTERVALS = 400
+"""Intervals of readings on which floor and cap are compared."""
+
+
+def check_low(low, limits, length):
+    """Raise InputError for a low limit that is not between 0 and the upper one (n,) [cm]."""
+    for i, (value, top) in enumerate(zip(low, limits)):
+        if not 0.0 <= value < top:
+            raise InputError(
+                f"safety_filter.low[{i}] = {value:g} {length}: must be from 0 to below the upper"
+                f" limit of the tank, {top:.6g} {length}"
+            )
+
+
+def failed_low(setting, low, found, kappa, start):
+    """[the condition that keeps the low limit of each tank from being proved, or ""; "" too where
+    there is none] and (n,) the levels below which no tank falls for certain [cm].
+    """
+    own = [
+        _own_condition(setting, i, low, found, kappa, start) if low[i] > 0.0 else ""
+        for i in _all(low)
+    ]
+    while True:
+        bottom = np.array([0.0 if own[i] else low[i] for i in _all(low)])
+        reasons = [
+            own[i] or (_by_others(setting, i, low, bottom, found, kappa) if low[i] > 0.0 else "")
+            for i in _all(low)
+        ]
+        if reasons == own:
+            return reasons, bottom
+        own = reasons
+
+
+def _all(values):
+    return range(len(values))
+
+
+def _own_condition(setting, tank, low, found, kappa, start):
+    """What fails whatever the other tanks hold, or ""."""
+    if low[tank] >= found.heights[tank]:
+        return f"above the upper limit that can be kept, {found.heights[tank]:.4g} cm"
+    if start is not None and np.asarray(start)[tank] < low[tank]:
+        return f"start at {np.asarray(start)[tank]:.4g} cm, below the low limit"
+    if setting.uncovered[tank]:
+        return setting.uncovered[tank]
+    if setting.drawn:
+        return "not proved with inflow pulses that draw liquid"
+    if not setting.rates.pumps[tank]:
+        return ""
+    if setting.delay > 0.0 or setting.lag > 0.0:
+        return "not proved with dead time or lag"
+    if setting.dead:
+        return "not proved with a dead zone"
+    if kappa * setting.hold > 1.0 + 1e-12:
+        return f"kappa T = {kappa * setting.hold:.3g} above 1"
+    several = len(setting.rates.pumps[tank]) > 1
+    if several and any(setting.low[j] < 0.0 for j in setting.rates.pumps[tank]):
+        return "not proved for several pumps that may run backwards"
+    return ""
+
+
+def _by_others(setting, tank, low, bottom, found, kappa):
+    """What fails while the other tanks hold at least `bottom` (n,) [cm], or ""."""
+    gains = setting.rates.pumps[tank]
+    full = sum(least * max(setting.weakest[j], 0.0) for j, (least, _) in gains.items())
+    falling = -phi_min(setting.rates, tank, low[tank], bottom)
+    if falling > full * (1.0 + 1e-12):
+        return f"{falling:.3g} cm/s may leave at the low limit, {full:.3g} enter for certain"
+    if not gains:
+        return ""
+    edges = np.linspace(
+        low[tank] - setting.band[tank], found.heights[tank] + setting.band[tank], INTERVALS + 1
+    )
+    needed = _floors(setting, tank, low, bottom, kappa, edges)
+    needed = np.minimum(needed, full)  # what full pumps bring is enough: the condition above
+    if np.any(needed > _share(gains) * _caps(setting, tank, found, kappa, edges) + 1e-12):
+        return "floor above cap: the upper limit is kept first"
+    return _other_caps(setting, tank, float(needed.max()), found, kappa)
+
+
+def _other_caps(setting, tank, needed, found, kappa):
+    """Which cap of another tank may stop a pump that the floor `needed` [cm/s] relies on."""
+    gains = setting.rates.pumps[tank]
+    if needed <= 0.0:
+        return ""
+    for k, others in enumerate(setting.rates.pumps):
+        if k == tank or found.idle[k] or not (common := set(others) & set(gains)):
+            continue
+        edges = np.linspace(0.0, found.heights[k] + setting.band[k], INTERVALS + 1)
+        least = float(_caps(setting, k, found, kappa, edges).min())
+        alone = len(gains) == len(others) == 1
+        wanted = sum(others[j][1] / gains[j][0] * needed for j in common if gains[j][0] > 0.0)
+        if not alone or wanted > least:
+            return f"the cap for tank {k + 1} may stop a pump that the floor relies on"
+    sinks = {
+        sink
+        for j in gains
+        for k, fed in enumerate(setting.rates.pumps)
+        if j in fed
+        for source, sink, *_ in setting.rates.links
+        if source == k
+    }
+    for k in sorted(sinks):
+        if found.slopes[k] > 0.0 and not found.idle[k]:
+            return f"the cap for tank {k + 1} may stop a pump that the floor relies on"
+    return ""
+
+
+def _floors(setting, tank, low, bottom, kappa, edges):
+    """(intervals,) the most that the floor may ask for in each interval of readings [cm/s]."""
+    eps = setting.band[tank]
+    falls = [-phi_min(setting.rates, tank, y + eps, bottom) for y in edges[1:]]
+    return np.array(falls) - kappa * (edges[:-1] - eps - low[tank])
+
+
+def _caps(setting, tank, found, kappa, edges):
+    """(intervals,) the least that the cap may allow in each interval of readings [cm/s]."""
+    eps, others = setting.band[tank], np.minimum(found.reach + setting.spare, 1e6)
+    rises = [phi(setting.rates, tank, y - eps, others) for y in edges[:-1]]
+    allowed = kappa * (found.heights[tank] - edges[1:] - eps) - np.array(rises)
+    cap = np.maximum(allowed, 0.0)
+    return np.full_like(cap, np.inf) if found.idle[tank] else cap
+
+
+def _share(gains):
+    """What is certain to arrive of the most that may arrive, of the weakest of a tank's pumps."""
+    return min(least / most for least, most in gains.values() if most > 0.0)
+
+
+MARGIN = 0.9
+"""Share of D = sum c_j o_j / 2 that the choice of k1 counts on."""
+SWEEPS = 500
+"""Sweeps over all tanks after which limits that still fall count as not to be kept."""
+LEAST = 1e-3
+"""Share of a limit below which it is not lowered: a ring of orifices may lower limits to 0."""
+
+
+def filled_levels(setting, wanted, start):
+    """(n,) levels [cm] to which full pumps fill the tanks at most, no tank above its wanted limit
+    or its start; inf for tanks with pipes.
+    """
+    filled, rates = np.full(len(wanted), np.inf), setting.rates
+    for _ in filled:
+        others = np.minimum(wanted, np.maximum(filled, start))
+        for i in range(len(filled)):
+            if not any(tank == i for tank, *_ in rates.pipes):
+                rest = resting_level(setting, i, others)
+                filled[i] = max(rest, rates.empty[i])
+    return filled
+
+
+def limits_for(setting, heights, kappa, unsettled=frozenset()):
+    """(limits (n,) [cm], k1 (n,) [1/s], {tank: why it failed}): Theorem 2."""
+    # A tank whose inflow alone passes its limit is held by the pumps above it if it has none of its
+    # own; otherwise the limits of the tanks above are lowered by one factor until it is not. Every
+    # k1 is chosen again after a limit was lowered, so what is returned meets all conditions at
+    # once.
+    # unsettled : tanks for whose sake no limit is lowered, since that did not come to an end
+    n, limits = len(heights), np.array(heights)
+    for _ in range(SWEEPS):
+        slopes, reasons, lowered = np.zeros(n), list(setting.uncovered), set()
+        for i in (i for i in range(n) if not reasons[i]):
+            excess = setting.phi(i, limits[i], limits) + unstoppable(setting, i)
+            if excess <= 1e-12:
+                continue
+            slopes[i], why = _second_order(setting, i, limits, kappa)
+            if slopes[i] > 0.0:
+                continue
+            if i in unsettled:
+                reasons[i] = f"{_rim_words(setting, i, limits)}; lower limits above do not mend it"
+                continue
+            factor, above = _lowering(setting, i, limits, excess)
+            if not above:
+                reasons[i] = _rim_words(setting, i, limits) + (f"; {why}" if why else "")
+                continue
+            if any(factor * limits[j] < LEAST * heights[j] for j in above):
+                return limits_for(setting, heights, kappa, unsettled | lowered | {i})
+            for j in above:
+                limits[j] = factor * (limits[j] + setting.spare[j]) - setting.spare[j]
+            lowered.add(i)
+        if not lowered:
+            return limits, slopes, reasons
+    return limits_for(setting, heights, kappa, unsettled | lowered)
+
+
+def _lowering(setting, tank, limits, excess):
+    """(factor by which the levels of the tanks above must be lower, those tanks), none where that
+    does not mend the rim condition of a tank.
+    """
+    rates, levels = setting.rates, limits + setting.spare
+    sources = {j: most for j, sink, _, most in rates.links if sink == tank}
+    pressed = sum(
+        most * sqrt_of(levels[j], rates.knee) for j, sink, _, most in rates.links if sink == tank
+    )
+    # what the sources may bring: their inflow less what is too much of it
+    margin = pressed - excess
+    if margin <= 0.0:
+        return 1.0, ()
+    factor = (margin / pressed) ** 2 * (1.0 - 1e-12)
+    low = any(factor * levels[j] <= setting.spare[j] for j in sources)
+    return factor, () if low else tuple(sources)
+
+
+def _rim_words(setting, tank, heights):
+    """The rim condition with both of its numbers."""
+    rates = setting.rates
+    leaves = rates.out[tank] * sqrt_of(heights[tank], rates.knee)
+    enters = setting.phi(tank, heights[tank], heights) + leaves + unstoppable(setting, tank)
+    return (
+        f"rim condition: {enters:.3g} cm/s may enter at the limit, {leaves:.3g} leave for certain"
+    )
+
+
+def _second_order(setting, tank, heights, kappa):
+    """(k1 [1/s], "") for a tank that the pumps above it can hold, or (0, the failed condition)."""
+    rates = setting.rates
+    if rates.pumps[tank]:
+        return 0.0, ""
+    sources = [(j, most) for j, sink, _, most in rates.links if sink == tank]
+    why = _other_topology(setting, tank, {j for j, _ in sources})
+    if not why and kappa * setting.hold > 1.0:
+        why = f"k2 T = {kappa * setting.hold:.3g} above 1"
+    why = why or _empty_above(setting, tank, heights, sources)
+    slope, why = (0.0, why) if why else _slope(setting, tank, heights, sources)
+    return slope, why and f"second order: {why}"
+
+
+def _other_topology(setting, tank, above):
+    """Why the proof does not cover a tank below the tanks `above`, or ""."""
+    rates = setting.rates
+    if setting.delay > 0.0 or setting.lag > 0.0:
+        return "not proved with dead time or lag"
+    piped = {i for pipe in rates.pipes for i in pipe[:2]}
+    if piped & (above | {tank}):
+        return "not proved with pipes"
+    both = (tank, *above)
+    if any(rates.inflow[i] > 0.0 or setting.spare[i] > 0.0 for i in both):
+        return "not proved with inflow disturbances"
+    if any(sink in above for _, sink, *_ in rates.links) or not all(rates.pumps[j] for j in above):
+        return "not proved where the tanks above are fed by others"
+    return "not proved for pumps that cannot stop" if any(setting.low > 0.0) else ""
+
+
+def _empty_above(setting, tank, heights, sources):
+    """Why (C3) fails: at g = 0 every tank above holds more than a0; or ""."""
+    rates, knee = setting.rates, setting.rates.knee
+    a0 = FLOOR * sqrt_of(heights[tank], knee)
+    if a0**2 < knee:
+        return f"laminar threshold {knee:g} above {a0**2:.3g}"
+    full = sum(most * sqrt_of(heights[j], knee) for j, most in sources)
+    certain = rates.out[tank] * sqrt_of(heights[tank], knee)
+    for j, most in sources:
+        left = certain - (full - most * sqrt_of(heights[j], knee))
+        if left <= most * a0:
+            return f"(C3) {left:.3g} not above {most * a0:.3g} cm/s"
+    return ""
+
+
+def _slope(setting, tank, heights, sources):
+    """(the largest k1 [1/s] that meets (C1), (C2) and (C4), "") or (0, why there is none)."""
+    rates, hold, top, knee = setting.rates, setting.hold, heights[tank], setting.rates.knee
+    full = sum(most * sqrt_of(heights[j], knee) for j, most in sources)
+    drained = MARGIN * sum(0.5 * most * rates.out[j] for j, most in sources)
+    for k1 in np.geomspace(1.0 / hold, 1e-4, 2000):
+        if k1 * top < full:  # (C2)
+            break
+        level = _crossing(rates.out[tank], k1, top, full)
+        lowest = level - hold * full - 2.0 * setting.band[tank]
+        lowest -= hold * rates.out_most[tank] * sqrt_of(top, knee)
+        steep = rates.out[tank] * 0.5 / math.sqrt(lowest) if lowest > knee else math.inf
+        if k1**2 * (top - level) <= drained and k1 > steep:  # (C1), (C4)
+            return float(k1), ""
+    return 0.0, f"no k1 with (C1) k1^2 (H - h*) <= {drained:.3g} cm/s^2"
+
+
+def _crossing(out, k1, top, full):
+    """h* [cm] with out sqrt(h*) + k1 (H - h*) = F, on the falling side."""
+    root = (out + math.sqrt(out**2 + 4.0 * k1 * (k1 * top - full))) / (2.0 * k1)
+    return min(root**2, top)
+
 
 UNKNOWN = 1e6
 """Stands for a level [cm] or a time [s] without a bound."""

@@ -52,7 +52,7 @@ HARMLESS = ("controller.", "observer.", "reference.")
 
 
 class Verdict(NamedTuple):
-    """Whether no plant of the box passes the limits of one tank, and by what."""
+    """Whether the limits of one tank are proved on every plant of the box, and the reason."""
 
     # tank : counted from 0. holds, low_holds : of the upper and the low limit. reason, low_reason :
     # the theorem, the condition that fails with both numbers, or "not covered: FEATURE". starts :
@@ -333,7 +333,7 @@ class _Rig:
             if any(getattr(end, name) != getattr(plant, name) for end in (guard.least, guard.most)):
                 return f"not covered: plant.{name} differs from that of the safety filter"
         ends = {name: self.span(f"plant.{name}", getattr(plant, name)) for name in FLOWS}
-        self.loose = False  # whether faults leave the box to the side that lowers levels
+        self.faults_lower_levels = False  # outside the box, but only lowering levels
         if why := self._outside(ends, ""):
             return why
         if self.faults is not None and (why := self._faulty(ends)):
@@ -359,7 +359,7 @@ class _Rig:
                 gentle = wide[0], counted[field][1][at]
             elif field == "pump_gain":
                 gentle = counted[field][0][at], wide[1]
-            self.loose |= gentle != wide
+            self.faults_lower_levels |= gentle != wide
             counted[field][0][at], counted[field][1][at] = gentle
             if why := self._outside(counted, "fault of "):
                 return why
@@ -389,9 +389,9 @@ def _ends(guard):
     return guard.least, guard.most
 
 
-class _At(NamedTuple):
-    """What is assumed of all tanks together (n,): the levels that they do not pass [cm], whether
-    they do not overflow, the highest levels at t = 0 [cm]; and whether those are the case's.
+class _Hypotheses(NamedTuple):
+    """Assumptions on all tanks (n,): upper bounds of the levels [cm], whether a tank never
+    overflows, largest levels at t = 0 [cm]; and whether these are the case's start.
     """
 
     bounds: np.ndarray
@@ -400,8 +400,8 @@ class _At(NamedTuple):
     own: bool
 
 
-class _Found(NamedTuple):
-    """Why each tank is not proved, or ""; by what it is; levels that no tank passes (n,) [cm]."""
+class _JointResult(NamedTuple):
+    """Of each tank: the condition that fails, or ""; the theorem; the bound of its level [cm]."""
 
     reasons: list[str]
     theorems: list[str]
@@ -427,7 +427,9 @@ def _joint(rig, start, claimed):
                 bounds[i] = level[i] + rig.spare[i]
             elif i in bounded:
                 bounds[i] = rig.reach[i]
-        at = _At(bounds, dry & (bounds <= rig.rim * (1.0 + 1e-12)), begin, start is not None)
+        at = _Hypotheses(
+            bounds, dry & (bounds <= rig.rim * (1.0 + 1e-12)), begin, start is not None
+        )
         found = [_upper(rig, i, level[i], at) for i in range(n)]
         alone = found if alone is None else alone
         outside = {i for i in inside if found[i][0]}
@@ -444,7 +446,7 @@ def _joint(rig, start, claimed):
         near = [k for k in lost if k in rig.neighbours(i)] or lost
         reasons[i] = f"relies on tank {', '.join(str(k + 1) for k in near)}, not proved"
     reasons = [alone[i][0] or reasons[i] for i in range(n)]
-    return _Found(reasons, [theorem for _, theorem in found], bounds)
+    return _JointResult(reasons, [theorem for _, theorem in found], bounds)
 
 
 def _stays(rig, i, at):
@@ -519,7 +521,7 @@ def _upper(rig, i, level, at):
         return _second_order(rig, i, at), "Theorem 2"
     if not rig.gains[i]:
         return "no row: it has neither a pump nor a k1", ""
-    entering = rig.rise(i, level, bounds) + _brought(rig, i, rig.lowest)
+    entering = rig.rise(i, level, bounds) + _row_inflow(rig, i, rig.lowest)
     if not entering <= _rounding(rig, i, level):
         return _rim(rig, i, level, entering), ""
     together = len(rig.gains[i]) > 1 and i not in rig.divided
@@ -680,7 +682,7 @@ def _late(rig, i, level, lag, at):
         sigma = _sigma(kappa, lag, age)
         if not sigma > 0.0:
             return f"kappa {kappa:.4g} above its bound {_rate(_best(lag, age), lag, age):.4g} 1/s"
-        filled = _brought(rig, i, rig.most) + rig.rise(i, 0.0, at.bounds)
+        filled = _row_inflow(rig, i, rig.most) + rig.rise(i, 0.0, at.bounds)
         if not filled <= 0.75 * sigma * level:
             return (
                 f"(F) {filled:.3g} cm/s may enter, above 3/4 sigma H = {0.75 * sigma * level:.3g}"
@@ -689,7 +691,7 @@ def _late(rig, i, level, lag, at):
         bound = samples**samples / (samples + 1) ** (samples + 1)
         if not kappa * rig.hold <= bound * (1.0 + 1e-12):
             return f"kappa {kappa:.4g} above its bound {bound / rig.hold:.4g} 1/s"
-    brought = _brought(rig, i, rig.under_way)
+    brought = _row_inflow(rig, i, rig.under_way)
     allowed = -rig.rise(i, level, at.bounds)  # by (N), at or below H
     if at.own:
         # concave in the level on either side of `empty`
@@ -701,9 +703,9 @@ def _late(rig, i, level, lag, at):
     return ""
 
 
-def _brought(rig, i, inputs):
-    """The most that pumps at `inputs` (m) [V] bring [cm/s]; where each has a share of the row, what
-    all bring if each uses its share as much as the one that uses it most.
+def _row_inflow(rig, i, inputs):
+    """Largest rise rate [cm/s] by pumps at `inputs` (m) [V]; for a divided row, that of all pumps
+    if each used the same part of its share as the pump that uses the largest part.
     """
     if i not in rig.divided:
         return rig.brought(i, inputs)
@@ -766,7 +768,7 @@ def _predicted(rig, i, level, at):
         return "not covered: prediction with inflow pulses"
     if rig.unsure:
         return "not covered: prediction with uncertain limits or initial inputs of pumps"
-    if rig.loose or np.any(rig.bottom > 0.0):
+    if rig.faults_lower_levels or np.any(rig.bottom > 0.0):
         return "not covered: prediction with faults or low limits"
     if rig.plant.overflow and not at.bounds[i] <= rig.rim[i]:
         return "not covered: prediction of a tank that overflows"
@@ -809,7 +811,7 @@ def _lower(rig, i, proved, begin, upper):
     low, gains, kappa, eps = rig.low[i], rig.gains[i], rig.rate[i], rig.band[i]
     if not begin[i] >= low * (1.0 - 1e-12):
         return f"start at {begin[i]:.4g} cm, below the low limit"
-    if rig.drawn or rig.loose:
+    if rig.drawn or rig.faults_lower_levels:
         return "not covered: a low limit with faults, or inflow pulses that draw liquid"
     if not rig.draw[i] <= rig.leaving[i]:
         return f"{-rig.leaving[i]:.4g} cm^3/s may be drawn, the filter counts on {-rig.draw[i]:.4g}"

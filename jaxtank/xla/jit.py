@@ -1,11 +1,245 @@
-"""`jax.jit` with the type of the function that it compiles kept."""
+"""`jax.jit` whose programs are kept between processes: a known one is not traced or compiled.
 
+jax's own cache, which `program_cache` sets up, saves the compiler; tracing and lowering a closed
+loop takes as long as its run again. An entry is found by everything that a trace depends on
+(`signature`): types, shapes and static values of the arguments, the source of this package, jax and
+its settings, the processor. What cannot be written down exactly, as a class of a user's own, is
+traced as ever.
+
+jax reads an entry by unpickling, and it holds native code: the folder is the user's own, checked by
+`program_cache.prepare`, entries are checked by their digests, and each holds its own name, which is
+that of all it depends on, and the processor that it was compiled for.
+"""
+
+import functools
+import importlib
+import json
+import os
+import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import jax
+import numpy as np
+from jax.core import Tracer
 
-from jaxtank.xla.executables import Kept
+from jaxtank.xla import program_cache
+from jaxtank.xla.signatures import OURS, Unknown, context, kind_of, name_of, signature, words_of
+
+ENDING = f"-whole{program_cache.ENTRY}"
+"""End of the name of an entry: it counts, is checked and is removed as those of jax."""
+
+NEVER = 1e9
+"""Time to compile from which jax keeps a program, where none is to be kept [s]."""
+
+SIZE = 4
+"""Bytes of the length of the JSON text in front of an entry."""
+
+
+class Kept:
+    """A compiled function whose programs are kept between processes where the user keeps any."""
+
+    def __init__(self, function: Callable[..., Any], compiled: Any, static: tuple[str, ...]):
+        functools.update_wrapper(self, function)
+        self.compiled, self.static = compiled, frozenset(static)
+        code = function.__code__
+        self.names = code.co_varnames[: code.co_argcount]
+        self.programs: dict[Any, Any] = {}
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Return what the function returns."""
+        folder = program_cache.folder
+        if folder is None:
+            return self.compiled(*args, **kwargs)
+        static = {n: v for n, v in zip(self.names, args) if n in self.static}
+        static |= {n: v for n, v in kwargs.items() if n in self.static}
+        given = tuple(v for n, v in zip(self.names, args) if n not in self.static)
+        named = {n: v for n, v in kwargs.items() if n not in self.static}
+        leaves, tree = jax.tree.flatten((given, named))
+        if any(isinstance(v, Tracer) for v in leaves) or not _simple():
+            return self.compiled(*args, **kwargs)
+        kinds = tuple(map(kind_of, leaves))
+        key = tree, kinds, tuple(sorted(static.items())), context()
+        if key not in self.programs:
+            self.programs[key] = self._program(folder, tree, kinds, static, (args, kwargs))
+        program = self.programs[key]
+        return program(*given, **named) if program else self.compiled(*args, **kwargs)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.compiled, name)
+
+    def _program(self, folder, tree, kinds, static, call):
+        """The program of these arguments, read or compiled and written; None if it has no name."""
+        if None in kinds:
+            return None
+        try:
+            about = {"kinds": repr(kinds), "context": repr(context()), **static}
+            words = [self.__module__, self.__qualname__, *words_of(tree), *words_of(about)]
+        except Unknown:
+            return None
+        name = signature(words)
+        path = folder / f"{self.__name__}-{name}{ENDING}"
+        found = _read(path, tree)
+        if found is not None:
+            return Tried(found, path, functools.partial(self._traced, static))
+        lowered = self.compiled.lower(*call[0], **call[1])
+        about = _about(lowered)
+        return lowered.compile() if about is None else _compile(lowered, about, path)
+
+    def _traced(self, static, given, named):
+        """What the function returns, by a program that is traced and compiled."""
+        moving = (n for n in self.names if n not in self.static)
+        return self.compiled(**dict(zip(moving, given)), **named, **static)
+
+
+class Tried:
+    """A program that was read, with a mark beside its entry until it has run once."""
+
+    def __init__(self, program: Any, path: Path, traced: Callable[[Any, Any], Any]):
+        self.program, self.path, self.traced, self.ran = program, path, traced, False
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Return what the program returns."""
+        if self.ran:
+            return self.program(*args, **kwargs)
+        try:
+            found = jax.block_until_ready(self.program(*args, **kwargs))
+        except jax.errors.JaxRuntimeError:
+            self.path.unlink(missing_ok=True)
+            self.program = lambda *args, **kwargs: self.traced(args, kwargs)
+            found = self.program(*args, **kwargs)
+        self.ran = True
+        _mark_of(self.path).unlink(missing_ok=True)
+        return found
+
+
+_HITS: list[str] = []
+"""Programs that jax has read from its own cache since this was emptied."""
+
+
+def _hit(event: str, **about: Any) -> None:
+    if event == "/jax/compilation_cache/cache_hits":
+        _HITS.append(event)
+
+
+jax.monitoring.register_event_listener(_hit)
+
+
+def _simple() -> bool:
+    """Return whether arguments of one process and device are all there is to a program."""
+    config: Any = jax.config
+    return not config.jax_disable_jit and jax.device_count() == 1
+
+
+def _mark_of(path: Path) -> Path:
+    return path.with_name(f"{path.name}.tried")
+
+
+def _read(path: Path, tree: Any) -> Any:
+    """The program of an entry; None where there is none, or it cannot be used."""
+    from jax.experimental.serialize_executable import deserialize_and_load
+
+    try:
+        if _mark_of(path).exists():
+            path.unlink(missing_ok=True)
+            _mark_of(path).unlink(missing_ok=True)
+        data = path.read_bytes()
+        size = int.from_bytes(data[:SIZE], "little")
+        about = json.loads(data[SIZE : SIZE + size])
+        if about["name"] != path.name or about["processor"] != program_cache.processor():
+            return None
+        if about["lapack"]:
+            _load_lapack()
+        found = deserialize_and_load(
+            data[SIZE + size :], tree, jax.tree.structure(_tree(about["out"]))
+        )
+        _mark_of(path).touch()
+        return found
+    except FileNotFoundError:
+        return None
+    except Exception:  # of another build of jax, damaged, or a disk that is full: it is compiled
+        return None
+
+
+def _about(lowered: Any) -> dict[str, Any] | None:
+    """What is written in front of a program; None for one that cannot be kept."""
+    calls = set(re.findall(r"custom_call @(\w+)", lowered.as_text()))
+    lapack = {name for name in calls if name.startswith("lapack_")}
+    if calls - lapack:  # functions that a new process may not have
+        return None
+    try:
+        count = lowered.out_tree.num_leaves
+        out = _words(jax.tree.unflatten(lowered.out_tree, range(count)))
+    except Unknown:
+        return None
+    return {"lapack": bool(lapack), "out": out}
+
+
+def _compile(lowered: Any, about: dict[str, Any], path: Path) -> Any:
+    """The program, compiled, and kept as an entry in the place of one of jax's own."""
+    # A program that jax has read from its cache cannot be written again (XLA leaves out functions).
+    config: Any = jax.config
+    least = config.jax_persistent_cache_min_compile_time_secs
+    _HITS.clear()
+    config.update("jax_persistent_cache_min_compile_time_secs", NEVER)
+    try:
+        program = lowered.compile()
+    finally:
+        config.update("jax_persistent_cache_min_compile_time_secs", least)
+    if not _HITS:
+        _write(path, program, about)
+    return program
+
+
+def _write(path: Path, program: Any, about: dict[str, Any]) -> None:
+    """Write an entry, whole or not at all; nothing where jax cannot, or the disk is full."""
+    from jax.experimental.serialize_executable import serialize
+
+    temporary = path.with_name(f"{path.name}.{os.getpid()}")
+    try:
+        about = {**about, "name": path.name, "processor": program_cache.processor()}
+        text = json.dumps(about).encode()
+        data = len(text).to_bytes(SIZE, "little") + text + serialize(program)[0]
+        temporary.write_bytes(data)
+        temporary.replace(path)
+    except (ValueError, NotImplementedError, OSError):
+        temporary.unlink(missing_ok=True)
+
+
+def _load_lapack() -> None:
+    """Have jax look up the functions of LAPACK, as it does when it lowers a call of one."""
+    jax.jit(jax.lax.linalg.cholesky).lower(np.eye(2))
+
+
+def _words(tree: Any) -> Any:
+    """A structure of results as JSON: dicts, lists, tuples and named tuples of ours."""
+    if isinstance(tree, dict):
+        return ["dict", {name: _words(value) for name, value in tree.items()}]
+    if hasattr(tree, "_fields"):
+        return [name_of(type(tree)), [_words(value) for value in tree]]
+    if type(tree) in (tuple, list):
+        return [type(tree).__name__, [_words(value) for value in tree]]
+    if tree is None or isinstance(tree, int):
+        return tree
+    raise Unknown
+
+
+def _tree(words: Any) -> Any:
+    """The structure of `_words`."""
+    if not isinstance(words, list):
+        return words
+    kind, own = words
+    if kind == "dict":
+        return {name: _tree(value) for name, value in own.items()}
+    parts = [_tree(value) for value in own]
+    if kind in ("tuple", "list"):
+        return tuple(parts) if kind == "tuple" else parts
+    module, name = kind.split(":")
+    if module.split(".")[0] not in OURS:
+        raise Unknown
+    return getattr(importlib.import_module(module), name)(*parts)
+
 
 F = TypeVar("F", bound=Callable[..., Any])
 

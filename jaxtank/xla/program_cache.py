@@ -100,7 +100,7 @@ def keep_for_this_process() -> str:
 
 
 def _remember(found: Path) -> None:
-    """Keep whole programs (`executables`) there too."""
+    """Keep whole programs (`jit`) there too."""
     global folder
     folder = found
 

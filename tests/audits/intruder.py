@@ -16,7 +16,7 @@ from pathlib import Path
 
 import psutil
 
-from jaxtank.xla import executables, program_cache
+from jaxtank.xla import jit, program_cache
 
 NOBODY = 65534
 RUN = ["simulate", "cascaded/pi", "--json", "--dt", "8"]
@@ -43,8 +43,8 @@ def run(cache, *words):
 def planted(entry, mark):
     """The bytes of an entry with a program of ours in the place of the compiled one."""
     data = entry.read_bytes()
-    size = executables.SIZE + int.from_bytes(data[: executables.SIZE], "little")
-    json.loads(data[executables.SIZE : size])
+    size = jit.SIZE + int.from_bytes(data[: jit.SIZE], "little")
+    json.loads(data[jit.SIZE : size])
     return data[:size] + pickle.dumps(Touch(mark))
 
 
@@ -68,7 +68,7 @@ def cache_attack(folder):
     base, mark, outcome = folder / "kept", folder / "mark", []
     run(folder / "model", *RUN)
     (version,) = (p for p in (folder / "model").iterdir() if p.is_dir())
-    entries = list(version.glob(f"*{executables.ENDING}"))
+    entries = list(version.glob(f"*{jit.ENDING}"))
     base.mkdir()
     base.chmod(0o777)
     plant(base, version.name, {p.name: planted(p, mark) for p in entries})

@@ -80,7 +80,7 @@ READS = {
 MADE = {
     ("tuning.answer.answer", "_lines", "import_module"): "its own report, by a constant name",
     ("jaxtank", "__getattr__", "import_module"): "names of its own table, in its own package",
-    ("jaxtank.xla.executables", "_tree", "import_module"): "of a named tuple of ours, of an entry",
+    ("jaxtank.xla.jit", "_tree", "import_module"): "of a named tuple of ours, of an entry",
     ("tuning", "__getattr__", "import_module"): "names of its own table, in its own package",
     ("tuning.problem.result", "_report", "import_module"): "the report of its own class",
     ("tuning.problem.result", "explore", "import_module"): "the live page, by a constant name",
@@ -105,7 +105,7 @@ READ = {
     ("jaxtank.xla.program_cache", "_digest", "read_bytes"): "an entry that jax has just written, or"
     " one of a folder of mode 700 and the user's own, to compare its digest",
     ("jaxtank.xla.program_cache", "_check_entries", "read_text"): "that digest, compared only",
-    ("jaxtank.xla.executables", "_read", "read_bytes"): "an entry of that folder, checked by its"
+    ("jaxtank.xla.jit", "_read", "read_bytes"): "an entry of that folder, checked by its"
     " owner, mode and digest when the process began, and by the name and processor it holds",
     ("jaxtank.xla.program_cache", "processor", "open"): "/proc/cpuinfo",
     ("jaxtank.xla.flags", "_text_of", "open"): "the file that XLA_FLAGS names, looked through only",
@@ -167,7 +167,7 @@ def test_nothing_is_imported_that_unpickles_talks_or_starts_programs():
 
 
 UNPICKLES = {
-    ("jaxtank.xla.executables", "_read", "deserialize_and_load"): "a compiled program of the folder"
+    ("jaxtank.xla.jit", "_read", "deserialize_and_load"): "a compiled program of the folder"
     " that `program_cache.prepare` has checked: owner and mode of every level, digest and name",
     ("tuning.cluster.engine", "_client", "Client"): "results of the workers that the user names, or"
     " that this process has started with keys of its own",

@@ -18,7 +18,7 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
-from jaxtank.xla import executables
+from jaxtank.xla import jit
 from tuning.answer.judged import judge
 from tuning.answer.setting import input_range, setting_of
 from tuning.answer.stay_put import WORTH, Found, search_from
@@ -230,7 +230,7 @@ def test_a_default_answer_has_five_programs_and_the_json_two_more(path, tmp_path
         [*line, *words], env=env | {"JAXTANK_CACHE": str(kept)}, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    names = [p.name.rsplit("-", 3)[0] for p in kept.glob(f"*/*{executables.ENDING}")]
+    names = [p.name.rsplit("-", 3)[0] for p in kept.glob(f"*/*{jit.ENDING}")]
     assert Counter(names) == DEFAULT_ANSWER | more
 
 

@@ -13,7 +13,7 @@ import pytest
 import jaxtank
 from jaxtank import measures, presets
 from jaxtank.loop.run import evaluate_compiled
-from jaxtank.xla import executables, program_cache, signatures
+from jaxtank.xla import jit, program_cache, signatures
 
 SCRIPT = """
 import json, sys, jax
@@ -46,7 +46,7 @@ def run(folder):
 
 
 def whole(folder):
-    return sorted(folder.glob(f"*/*{executables.ENDING}"))
+    return sorted(folder.glob(f"*/*{jit.ENDING}"))
 
 
 def test_a_program_that_is_known_is_not_traced_and_gives_the_same_bits(tmp_path):
@@ -80,7 +80,7 @@ def evaluated(loop, names=("iae",), dt=4.0, duration=104.0):
 
 
 def names_of(folder):
-    return {path.name for path in folder.glob(f"*{executables.ENDING}")}
+    return {path.name for path in folder.glob(f"*{jit.ENDING}")}
 
 
 def test_whatever_changes_a_program_changes_its_name(folder, monkeypatch):

@@ -16,7 +16,7 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants import network
 from jaxtank.safety import SafetyFilter, design
 from jaxtank.safety.box import narrow_band
-from jaxtank.safety.low_limits import _share as least_share
+from jaxtank.safety.certificate import _share as least_share
 
 W = math.sqrt(2 * 981.0)
 HOLD = 0.5
