@@ -276,7 +276,7 @@ def component(name, table, plant, offered):
     return role.classes[kind](**values)
 
 
-def steady_bias(loop, known=False):
+def steady_bias(loop, known: bool | list[bool] = False):
     """Return (m,) inputs that hold the outputs at x0; those before t = 0 if `known`."""
     bank, start = loop.actuator, np.asarray(loop.x0)[list(loop.plant.outputs)]
     try:

@@ -125,7 +125,7 @@ def _texts(key, label, value, sizes):
 
 
 def _list(key, label, value, sizes):
-    wanted = sizes_of_shape(key.shape, sizes.counts)
+    wanted = sizes_of_shape(key.shape, sizes.counts) or ()
     if not (is_finite(value) and np.shape(value) == wanted):
         (size,) = wanted
         numbers = f"{size} finite numbers{unit(key.meta(sizes.units))}, one per {key.shape[0]}"

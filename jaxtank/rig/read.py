@@ -332,7 +332,8 @@ def _with_bias(case, values, table):
     whole = "initial" in table.get("actuator", {}) or name in values
     known = [whole or "initial" in pump or f"{name}[{j}]" in values for j, pump in enumerate(pumps)]
     bias = components.steady_bias(case.loop, known)
-    controller = dataclasses.replace(case.loop.controller, bias=bias)
+    controller: Any = case.loop.controller
+    controller = dataclasses.replace(controller, bias=bias)
     loop = dataclasses.replace(case.loop, controller=controller)
     later = {n: v for n, v in values.items() if not n.startswith(parts)}
     return case.replace(loop=loop), later
