@@ -51,8 +51,6 @@ if TYPE_CHECKING:
     from jaxtank.core.tree import parameters as parameters
     from jaxtank.core.tree import static as static
     from jaxtank.core.tree import with_values as with_values
-    from jaxtank.interop import gymnasium as environment  # noqa: F401
-    from jaxtank.interop import python_control as neighbours  # noqa: F401
     from jaxtank.loop.closed_loop import ClosedLoop as ClosedLoop
     from jaxtank.loop.many import evaluate_many as evaluate_many
     from jaxtank.loop.margins import stability_margins as stability_margins
@@ -107,12 +105,7 @@ _FOLDERS = (
     "xla",
 )
 # Not in __all__: `import *` must not need gymnasium.
-_OPTIONAL = {
-    "export": "jaxtank.export",
-    "interop": "jaxtank.interop",
-    "neighbours": "jaxtank.interop.python_control",
-    "environment": "jaxtank.interop.gymnasium",
-}
+_OPTIONAL = {"export": "jaxtank.export", "interop": "jaxtank.interop"}
 
 # the names of the table
 __all__ = [*_NAMES, *_FOLDERS]  # pyright: ignore[reportUnsupportedDunderAll]

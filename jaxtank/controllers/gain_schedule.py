@@ -98,7 +98,7 @@ class Scheduled(Controller):
     gains: names of leaves of the controller `law`, "k" or an entry "Kc[0]", "K[0,1]". A scheduled
     leaf that is a number is absent (None) in `law`; of an array the scheduled entries are not used.
     variable: "r1", the setpoint of output 1, or "h2", the estimated level of tank 2, counted
-    from 1 as on the rig. Build one with `jaxtank.rig.schedule.schedule`.
+    from 1 as on the rig. Build one with `jaxtank.rig.values.schedule`.
 
     `check` refuses a gain that is used before the loop (`prepare`, `inputs`, `init`), or from which
     `step` designs matrices or computes in a loop (weights of a Riccati equation or of a predictive

@@ -9,9 +9,8 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.fields import is_real, number
 from jaxtank.core.text import shortened
-from jaxtank.core.tree import walk
+from jaxtank.core.tree import is_real, number, walk
 
 SMALL = 16
 """Entries of an array that is checked number by number, at most."""

@@ -48,7 +48,7 @@ _RAISED = str.maketrans("²³", "23")
 
 def check_units(where: str, units: tuple[str, str]) -> tuple[str, str]:
     """Return the units of a rig, (length, pump input), powers written with ^."""
-    checked = []
+    checked: list[str] = []
     for what, text, tables in zip(("level", "pump input"), units, (LEVELS, INPUTS)):
         check_unit(f"{where}: entry", text)
         unit = canonical(text)

@@ -6,7 +6,7 @@ try:
     import gymnasium
 except ImportError:
     raise ImportError(
-        'jaxtank.environment needs gymnasium: pip install gymnasium, or "jaxtank[gym]"'
+        'jaxtank.interop.gymnasium needs gymnasium: pip install gymnasium, or "jaxtank[gym]"'
     ) from None
 import jax
 import jax.numpy as jnp

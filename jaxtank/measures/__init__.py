@@ -6,9 +6,8 @@ whole run.
 """
 
 from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context, Run, Worst
-from jaxtank.measures.catalogue import MEASURES
+from jaxtank.measures.catalogue import MEASURES, Measure
 from jaxtank.measures.functions import RunFunction, from_function, functions, name_of
-from jaxtank.measures.measure import Measure
 from jaxtank.measures.registry import (
     check_names,
     entries,

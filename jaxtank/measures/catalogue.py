@@ -5,15 +5,144 @@ Integrals and volumes are over [0, T]: sums over the first N samples, each held 
 exact for inputs and volumes, and the left rectangle rule for levels.
 """
 
-from typing import Any
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
 from jaxtank.core.numerics import lower_clip, root_of_mean
 from jaxtank.core.vectors import each, is_array, total
-from jaxtank.measures.accumulators import settled
-from jaxtank.measures.margins import MARGINS
-from jaxtank.measures.measure import Measure
+from jaxtank.measures.accumulators import Run, settled
+
+
+class Measure(NamedTuple):
+    """A named number or list, and all that reports, limits and searches need to know of it.
+
+    `jaxtank.measures.register` adds one of a user's own.
+
+    Examples
+    --------
+    >>> from jaxtank.measures import MEASURES
+    >>> MEASURES["max_level"].unit, MEASURES["max_level"].per, MEASURES["min_level"].sense
+    ('cm', 'tank', -1.0)
+    """
+
+    unit: str  # with "cm" standing for the rig's length unit and "V" for that of its inputs
+    per: str  # "run", "output", "tank" or "pump"
+    needs: tuple[str, ...]  # names of accumulators
+    read: Callable[[Run, dict[str, Any]], Any]  # (run, {accumulator: state}) -> scalar or array
+    doc: str
+    residual: str = ""  # the accumulator of squares that it is a multiple of, if it is one
+    scale: Callable[[Run], Any] | None = None  # run -> factor of that sum
+    low: float | None = 0.0  # least and largest value that it can have, None where there is none
+    high: float | None = None
+    sense: float = 1.0  # +1 where a larger value is worse (limits are upper ones), -1 a smaller
+    counts: bool = False  # counts whole samples: a step function of the parameters, no derivative
+    by_input: bool = False  # a sum over the run with a slope in every input: `bound` minimises it
+    shown: int = 0  # its place in the table of a tuning result; 0: not in it
+    summary: int = 0  # its place in an ensemble's summary unless others are named; 0: not in it
+    reached: str = ""  # the measure that holds the time at which this one was reached
+    undefined: str = "the value is not a finite number"  # why a run has no value of it
+    worst: str = ""  # why it is infinite on the side that is worse; "": as `undefined`
+    unlimited: str = ""  # why it is infinite on the side that is better; "": as `undefined`
+    unserved: str = ""  # why a case has none, reported where it is not computed
+    nan_holds: str = ""  # what NaN means where a limit holds with it; "": NaN breaks a limit
+    linear: bool = False  # of the linearised loop (`Run.margins`): computed where it is named only
+    arrays: bool = False  # whether `read` takes states of either form; else of tuples of scalars
+
+    def cause(self, value: float) -> str:
+        """Return why a value is not a finite number.
+
+        Examples
+        --------
+        >>> from jaxtank.measures import MEASURES
+        >>> MEASURES["settling_time"].cause(float("nan"))
+        'no change of its setpoint took the output out of its band'
+        """
+        if math.isnan(value):
+            return self.nan_holds or self.undefined
+        return (self.worst if value * self.sense > 0.0 else self.unlimited) or self.undefined
+
+
+UNSTABLE = "the linearised loop is unstable at a steady state"
+NONE_LEFT = (
+    "at no plateau of the reference is there a steady state at which the loop can be linearised;"
+    " jaxtank.stability_margins says why of each"
+)
+NOTHING_HELD = "the reference holds no setpoints at which the loop could be linearised"
+
+
+def _margin(
+    field: str, unit: str, doc: str, unlimited: str, shown: int, low: float, high: float | None
+) -> Measure:
+    """A margin of each pump: larger is better, infinite where nothing crosses."""
+
+    def read(run: Run, accumulated: dict[str, Any]) -> Any:
+        return getattr(run.margins, field)
+
+    return Measure(
+        unit,
+        "pump",
+        (),
+        read,
+        doc,
+        low=low,
+        high=high,
+        sense=-1.0,
+        shown=shown,
+        undefined=NONE_LEFT,
+        worst=UNSTABLE,
+        unlimited=unlimited,
+        unserved=NOTHING_HELD,
+        linear=True,
+    )
+
+
+MARGINS: dict[str, Measure] = {
+    "sensitivity_peak": Measure(
+        "-",
+        "run",
+        (),
+        lambda run, accumulated: run.margins.sensitivity_peak,
+        "Ms of the linearised loop: largest gain of 1/(1 + L), at the pumps",
+        low=1.0,  # the mean of log|S| over frequency is at least 0 (Bode), as L is strictly proper
+        shown=110,
+        undefined=NONE_LEFT,
+        worst=UNSTABLE,
+        unserved=NOTHING_HELD,
+        linear=True,
+    ),
+    "gain_margin": _margin(
+        "gain_margin",
+        "-",
+        "factor on the loop gain, up or down, that the linearised loop stands",
+        "the phase never reaches -180 deg",
+        120,
+        low=1.0,
+        high=None,
+    ),
+    "phase_margin": _margin(
+        "phase_margin",
+        "deg",
+        "change of the phase that the linearised loop stands",
+        "the gain never reaches 1",
+        130,
+        low=0.0,
+        high=180.0,
+    ),
+    "delay_margin": _margin(
+        "delay_margin",
+        "s",
+        "additional dead time that the linearised loop stands",
+        "the gain never reaches 1",
+        140,
+        low=0.0,
+        high=None,
+    ),
+}
+"""{name: Measure}, entries of the catalogue."""
+
 
 NO_CHANGES = "the reference has no changes that end"
 

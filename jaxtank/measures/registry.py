@@ -11,9 +11,8 @@ from jaxtank.core.installed import imported, installed
 from jaxtank.core.tree import shortened
 from jaxtank.core.units import DEFAULT, local
 from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context
-from jaxtank.measures.catalogue import MEASURES
+from jaxtank.measures.catalogue import MEASURES, Measure
 from jaxtank.measures.functions import from_function, functions
-from jaxtank.measures.measure import Measure
 from jaxtank.xla.signatures import OWN
 
 BUILT_IN = frozenset(MEASURES)

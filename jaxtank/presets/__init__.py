@@ -1,8 +1,7 @@
 """The papers, one file each: rigs, cases, published numbers, tunable parameters, departures.
 
 A paper is a module of this folder with a function `preset`, found by its name; `register` adds one
-from outside. Where one file would be too long, the closed loops are in `loops/<paper>.py`. May be
-imported by every folder above `jaxtank.case`.
+from outside. What a paper prints is data, in <paper>.toml; the derivation is in notes/<paper>.md.
 
 preset = presets.load("gouta2015")
 case = preset.cases["backstepping"]     # .loop .clock .limits

@@ -20,9 +20,70 @@ from jaxtank.loop.run import simulate
 from jaxtank.observers import Direct
 from jaxtank.plants.faults import faults
 from jaxtank.plants.rigs import coupled_tanks
-from jaxtank.presets.paper import Claim, Preset, Published
-from jaxtank.presets.rows import calofir as rows
+from jaxtank.presets.paper import Claim, Preset, printed
 from jaxtank.signals.setpoints import ramps
+
+GAINS = ((0.01, 0.01), (0.02, 0.02), (0.02, 0.1), (0.1, 0.1))  # K_phi, K_y of notes S7.1 [1/s]
+FINE = 0.05  # sampling period that stands for continuous time [s]
+
+
+def settling(trajectory):
+    """Return when h1 has entered 2 % of its first step for the last time [s]."""
+    first = trajectory.e[:600, 0]
+    step = abs(float(trajectory.r[0, 0] - trajectory.x[0, 0]))
+    outside = np.flatnonzero(np.abs(first) > 0.02 * step)
+    return float(trajectory.t[outside[-1] + 1]) if outside.size else 0.0
+
+
+def measured_rows(run):
+    """Return {quantity: Claim} of the published rows, but for what cannot be measured."""
+    (case, plain), hurt = run("backstepping"), run("backstepping-perturbed")[1]
+    runs = [run("backstepping", _gains(*pair))[1] for pair in GAINS]
+    times = [settling(t) for t in runs]
+    limits = [float(case.loop.actuator.low[0]), float(case.loop.actuator.high[0])]
+    full = [100.0 * float(np.isin(t.u, limits).mean()) for t in runs]
+    sooner = np.diff(times) < 0.0
+    listed = ", ".join(f"{a:g} and {b:g} 1/s" for a, b in GAINS)
+    drain = np.asarray(case.loop.plant.drain)
+    off = run("backstepping", {"plant.drain": (0.75 * drain).tolist()})[1]
+    ends = np.abs(off.e[[599, 1199], 0])
+    share = plain.x[[599, 1199], 1] / plain.x[[599, 1199], 0]
+    above = min(float((t.x[:, 0] - t.x[:, 1]).min()) for t in (plain, hurt))
+    fine = run("backstepping", {"clock.dt": FINE}, round(1.0 / FINE))[1]
+    apart = np.abs(plain.x[:, 0] - fine.x[:, 0])
+    alike = float(np.corrcoef(plain.x[:, 0], plain.x[:, 1])[0, 1])
+    return {
+        "h1 is at least h3": Claim(
+            above >= 0.0, f"h1 - h3 is at least {above:.4f} m, with and without faults"
+        ),
+        "sampling period of 1 s": Claim(
+            bool(apart.max() < 1e-3),
+            f"h1 is at most {1e3 * apart.max():.3f} mm from that with {FINE:g} s, at"
+            f" {plain.t[np.argmax(apart)]:.0f} s (counts if below 1 mm)",
+        ),
+        "larger gains settle sooner": Claim(
+            sooner, f"step to 0.48 m with {listed}: {', '.join(f'{t:.0f} s' for t in times)}"
+        ),
+        "larger gains saturate the pump": Claim(
+            bool(np.all(np.diff(full) >= 0.0)) and full[-1] > full[0],
+            f"at a limit with {listed}: {', '.join(f'{s:.3g} %' for s in full)} of the time",
+        ),
+        "level of the second tank": Claim(
+            (alike > 0.9, bool(abs(share[0] / share[1] - 1.0) < 0.01)),
+            f"correlation with h1 {alike:.3f}; h3/h1 {share[0]:.4f} and {share[1]:.4f} at the ends"
+            " of the plateaus",
+        ),
+        "needs an exact model": Claim(
+            bool(ends.max() > 1e-3),
+            f"c2 smaller by 25 % than in the model leaves {ends[0]:.4f} and {ends[1]:.4f} m (counts"
+            " if above 0.001 m)",
+        ),
+    }
+
+
+def _gains(phi, y):
+    return {"controller.K_phi": phi, "controller.K_y": y}
+
 
 A, C1, C2 = 0.0154, 1.0167e-4, 1.7253e-4  # sec. 3.1 [m^2], sec. 3.2 [m^2.5/s]
 Q0, H0 = 1e-4, 0.6  # sec. 3.1: largest flow [m^3/s] and level [m]
@@ -34,78 +95,6 @@ START = 0.05  # h1 at t = 0 [m] (notes A2)
 TUNABLE = {"controller.K_phi": Free(1e-3, 1.0), "controller.K_y": Free(1e-3, 1.0)}
 
 KS = tuple(TUNABLE)
-
-DEPARTURES = (
-    (
-        "Equations: the errata of the paper are corrected (notes S5): signs of (12a), (14) and of"
-        " the first term of f_a in (16); d phi/d z in (4); (20) is v, not phi; in (21) a/z0 for"
-        " z/z0, and the denominators of v_i and v_ii. As printed, the controller does not settle at"
-        " the reference."
-    ),
-    (
-        "The controller computes in physical units (notes S4.2): z0 and Q0 cancel exactly, as long"
-        " as z0 is one number."
-    ),
-    (
-        "Gains: none are printed. K_phi = 0.02 1/s, K_y = 0.1 1/s: no overshoot, because K_phi is"
-        " below b/(2 sqrt(h3r)) + a/(2 z3r) (notes S4.3)."
-    ),
-    (
-        "Scenario: Figs. 2 and 3 are missing in our copy. 0.48 m for 600 s, then 0.30 m for 600 s,"
-        " from h = (0.05, 0.05 kappa) m (notes A2)."
-    ),
-    (
-        "Perturbed: c2 at 75 % for 300-450 s and a leak 0.2 c1 sqrt(h1) out of the first tank for"
-        " 900-1050 s; the paper does not say what its faults were (notes A3)."
-    ),
-    (
-        "Lower clips in the controller only: h3 and h1 - h3 are taken as at least 1e-4 m, without"
-        " which it never starts from empty tanks (notes A4, H1)."
-    ),
-    (
-        "Gravity: only the products c1, c2 are printed; orifice areas are c/sqrt(2 g) with g = 9.81"
-        " m/s^2."
-    ),
-    "Rims are physics: levels stop at 0.6 m and at 0 m.",
-)
-
-PUBLISHED = {
-    "plant.area": Published(A, "m^2", "sec. 3.1"),
-    "c1": Published(C1, "m^2.5/s", "sec. 3.2"),
-    "c2": Published(C2, "m^2.5/s", "sec. 3.2"),
-    "actuator.high": Published(Q0, "m^3/s", "sec. 3.1"),
-    "plant.rim": Published(H0, "m", "sec. 3.1"),
-    "clock.dt": Published(1.0, "s", "sec. 4"),
-    "plant.pipe": Published(
-        5e-5,
-        "m^2",
-        "sec. 3.1, S1 = S3",
-        reason="a section; ours is c1/sqrt(2 g), that times a flow coefficient of 0.46",
-    ),
-    "setpoints, share of h0": Published((0.8, 0.5), "-", "sec. 4"),
-    "steady state follows very accurately": Published(
-        "level of the first tank, without perturbation", "", "sec. 4, Fig. 2"
-    ),
-    "reacts rapidly to faults": Published(
-        "in the direction to counteract them",
-        "",
-        "sec. 4, Fig. 3 (whose faults are not described)",
-        reason="faults of ours",
-    ),
-    "some steady state errors": Published(
-        "due to unmodelled dynamics",
-        "",
-        "sec. 5",
-        reason="no integral action, and h3 rather than h1 is regulated",
-    ),
-    "same performance in any operating point": Published(
-        "whatever the level", "", "sec. 5", reason="the pump's limits"
-    ),
-    "globally asymptotically stabilises": Published(
-        "Proposition 2.1", "", "sec. 2", reason="needs h3 > 0, h1 > h3 and a pump without limits"
-    ),
-    **rows.PUBLISHED,
-}
 
 
 def rig():
@@ -186,7 +175,7 @@ def same_everywhere(run, values):
 
 
 def measured(run):
-    """Return what can be measured of PUBLISHED (see `jaxtank.presets.paper.Preset`)."""
+    """Return what can be measured of the published rows (see `jaxtank.presets.paper.Preset`)."""
     case, plain = run("backstepping")
     hurt_case, hurt = run("backstepping-perturbed")
     plant, ends, e = case.loop.plant, [449, 1049], plain.e[:, 0]
@@ -237,7 +226,7 @@ def measured(run):
             "from empty tanks, without a lower clip of h1 - h3, h1"
             f" {f'stays below {top:.0e}' if (top := dry.x[:, 0].max()) else 'stays at 0'} m",
         ),
-        **rows.measured(run),
+        **measured_rows(run),
     }
 
 
@@ -272,20 +261,4 @@ def preset():
         )
         for name, title in titles.items()
     }
-    return Preset(
-        paper="calofir",
-        citation=(
-            "V. Calofir, V. Tanasa, I. Fagarasan, I. Stamatescu, N. Arghira, G. Stamatescu, A"
-            " backstepping control method for a nonlinear process - two coupled-tanks"
-        ),
-        cases=cases,
-        published=PUBLISHED,
-        measured=measured,
-        tunable=TUNABLE,
-        uncertain={
-            "plant.pipe": (0.05, "c1: 'experimentally determined' (sec. 3.2), no interval printed"),
-            "plant.drain": (0.05, "c2: likewise"),
-            "plant.pump_gain": (0.05, "the pump's calibration is not printed"),
-        },
-        departures=DEPARTURES,
-    )
+    return Preset(**printed("calofir"), cases=cases, measured=measured, tunable=TUNABLE)

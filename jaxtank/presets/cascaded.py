@@ -14,7 +14,7 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants.network import network
-from jaxtank.presets.paper import Preset, Published
+from jaxtank.presets.paper import Preset, printed
 from jaxtank.signals.base import Constant, Table
 from jaxtank.signals.setpoints import ramps
 
@@ -39,47 +39,6 @@ TUNABLE = {
     "controller.bias": Free(0.0, 5.0, "linear"),
     "controller.signal.initial": Free(0.0, 10.0, "linear"),
     "controller.signal.targets": Free(0.0, 10.0, "linear"),
-}
-
-DEPARTURES = (
-    (
-        "Units: levels are the sensor's volts. Cross-sections are not known and only ratios show in"
-        " the record: area = 1 for both, gravity = 0.5 (so that sqrt(2 g) = 1), and orifices and"
-        " pump gain are then the benchmark's k in V^0.5/s and 1/s."
-    ),
-    (
-        "k1 = k2: what leaves the upper tank reaches the lower one, in tanks of equal"
-        " cross-section; the benchmark leaves both free."
-    ),
-    "The parameters are fitted here to the estimation record (RMS error 0.254 V); none is printed.",
-    (
-        "The pump delivers k4 (u - 0.734 V), which takes the fit from 0.450 to 0.254 V RMS. The"
-        " constant part is a disturbing inflow of the upper tank, so that below 0.734 V the model"
-        " draws from it, where a real pump stands still (levels stop at 0)."
-    ),
-    (
-        "Both setpoints and gains of `pi`, and the flow of `open-loop`, are ours: the benchmark is"
-        " one of identification."
-    ),
-    (
-        "Level sensors of both tanks, as far as the controllers go; in the record only that of the"
-        " lower tank is kept."
-    ),
-)
-
-PUBLISHED = {
-    "plant.rim": Published(RIM, "V", "data description: both tanks overflow at 10 V"),
-    "record, sampling period": Published(PERIOD, "s", "data description"),
-    "RMS error of simulated level": Published(
-        0.4498,
-        "V",
-        "polynomial state space, validation record: Table 2 of doi 10.1155/2021/6613425",
-        reason=(
-            "no record is shipped with this package; `playback` gives 0.254 V on the estimation"
-            " record, to which the model was fitted, and the published error is on the other one,"
-            " which no fit has seen: not to be compared"
-        ),
-    ),
 }
 
 
@@ -144,7 +103,7 @@ def steady_state(level):
 
 
 def measured(run):
-    """Return what can be measured of PUBLISHED without a record (see `paper.Preset`)."""
+    """Return what can be measured of the published rows without a record (see `paper.Preset`)."""
     case, flood = run(
         "open-loop", {"controller.signal.initial": 10.0, "controller.signal.targets": 10.0}
     )
@@ -189,20 +148,4 @@ def preset():
         )
         for name, (title, controller, free) in controllers.items()
     }
-    return Preset(
-        paper="cascaded",
-        citation=(
-            "M. Schoukens, P. Mattsson, T. Wigren, J.-P. Noel, Cascaded tanks benchmark combining"
-            " soft and hard nonlinearities, Workshop on Nonlinear System Identification Benchmarks,"
-            " 2016"
-        ),
-        cases=cases,
-        published=PUBLISHED,
-        measured=measured,
-        tunable=TUNABLE,
-        uncertain={
-            name: (0.05, "fitted to one record")
-            for name in ("plant.drain", "plant.orifice", "plant.pump_gain")
-        },
-        departures=DEPARTURES,
-    )
+    return Preset(**printed("cascaded"), cases=cases, measured=measured, tunable=TUNABLE)

@@ -19,13 +19,12 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants.faults import faults
 from jaxtank.plants.network import network
-from jaxtank.presets.paper import Claim, Preset, Published
+from jaxtank.presets.paper import Claim, Preset, printed
 from jaxtank.signals.setpoints import ramps
 
 AREA, PIPE, HEIGHT, FLOW = 154.0, 0.5, 62.0, 150.0  # [cm^2], [cm^2], [cm], [cm^3/s]
 COEFFICIENTS = (0.46, 0.60, 0.45)  # of pipe 1 to 3, of the outlet of tank 2, of pipe 3 to 2
 POINT = (45.0, 15.0, 30.0)  # levels at which the printed model is linearised [cm]
-LINEAR = (-0.0085, 0.0, 0.0085, 0.0, -0.0195, 0.0084, 0.0085, 0.0084, -0.0169)  # A [1/s]
 
 KC, TI = 10.0, 100.0  # ours [cm^2/s], [s]
 DURATION = 2400.0
@@ -37,38 +36,6 @@ TUNABLE = {
     "controller.Kc": Free(0.5, 100.0),
     "controller.Ti": Free(5.0, 2000.0),
     "controller.Tt": Free(5.0, 2000.0),
-}
-
-UNCERTAIN = {
-    "plant.pipe": (0.05, "coefficients printed to two digits"),
-    "plant.drain": (0.05, "likewise"),
-    "plant.pump_gain": (0.05, "pumps that are calibrated in flow"),
-}
-
-DEPARTURES = (
-    "Setpoints, gains, sampling period and faults are ours: the source is a benchmark (notes A1).",
-    (
-        "Inputs are flows in cm^3/s, pump_gain = 1: the rig's pumps are calibrated. Their lower"
-        " limit is 0 (notes A2)."
-    ),
-    (
-        "Around equal levels the flow through a pipe is proportional to the difference, within the"
-        " laminar threshold `plant.knee` of 0.01 cm; the printed root has an infinite slope there"
-        " (notes H1)."
-    ),
-)
-
-PUBLISHED = {
-    "plant.area": Published(AREA, "cm^2", "table of parameters"),
-    "plant.pipe": Published((0.46 * PIPE, 0.45 * PIPE), "cm^2", "table: coefficient x section"),
-    "plant.drain": Published((0.0, 0.60 * PIPE, 0.0), "cm^2", "table: coefficient x section"),
-    "plant.rim": Published(HEIGHT, "cm", "table of parameters"),
-    "actuator.high": Published(FLOW, "cm^3/s", "table of parameters"),
-    "linear model, A": Published(LINEAR, "1/s", "linear model at 45, 15 and 30 cm", 0.01),
-    "linear model, B": Published(0.0065, "1/cm^2", "linear model at 45, 15 and 30 cm", 0.01),
-    "rest at the operating point": Published(
-        "45, 15 and 30 cm are an operating point", "", "linear model"
-    ),
 }
 
 
@@ -121,7 +88,7 @@ def loop(faulty=False):
 
 
 def measured(run):
-    """Return what is found of PUBLISHED (see `paper.Preset`)."""
+    """Return what is found of the published rows (see `paper.Preset`)."""
     plant = run("pi")[0].loop.plant
     levels = np.array(POINT)
     speed = np.sqrt(2 * 981.0)
@@ -159,16 +126,4 @@ def preset():
             ("pi-faults", "PI; a leak of tank 3, then a half plugged pipe", True),
         )
     }
-    return Preset(
-        paper="dts200",
-        citation=(
-            "Three-tank laboratory rig DTS200, model and parameters as in S. X. Ding, Model-based"
-            " fault diagnosis techniques, 2nd ed., Springer, 2013, doi:10.1007/978-1-4471-4799-2"
-        ),
-        cases=cases,
-        published=PUBLISHED,
-        measured=measured,
-        tunable=TUNABLE,
-        uncertain=UNCERTAIN,
-        departures=DEPARTURES,
-    )
+    return Preset(**printed("dts200"), cases=cases, measured=measured, tunable=TUNABLE)

@@ -18,7 +18,7 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants.rigs import JOHANSSON, johansson
-from jaxtank.presets.paper import Claim, Preset, Published
+from jaxtank.presets.paper import Claim, Preset, printed
 from jaxtank.signals.setpoints import ramps
 
 VOLTS_PER_CM = 0.5  # kc, Table I: the gains are printed for levels in volts
@@ -53,68 +53,6 @@ POINTS = {
     "minimum": ((12.4, 12.7, 1.8, 1.4), (62.0, 90.0, 23.0, 30.0), (-0.060, -0.018), 1.40),
     "non-minimum": ((12.6, 13.0, 4.8, 4.9), (63.0, 91.0, 39.0, 56.0), (-0.057, 0.013), -0.64),
 }
-_LEVELS = (
-    "measured on the rig; the model's own equilibrium at the printed voltages is up to 10 % off in"
-    " an upper tank"
-)
-
-
-def _published():
-    found = {
-        "plant.area": Published((28.0, 32.0, 28.0, 32.0), "cm^2", "Table I"),
-        "plant.drain": Published((0.071, 0.057, 0.0, 0.0), "cm^2", "Table I"),
-        "plant.orifice": Published((0.071, 0.057), "cm^2", "Table I"),
-        "sensor.gain": Published(1.0 / VOLTS_PER_CM, "cm/V", "Table I: 0.50 V/cm"),
-    }
-    for phase, (levels, times, zeros, gain) in POINTS.items():
-        pump, split, volts = JOHANSSON[phase]
-        K, Ti = PRINTED_GAINS[phase]
-        found |= {
-            f"pump gains, {phase} phase": Published(pump, "cm^3/(s V)", "sec. II"),
-            f"splits, {phase} phase": Published(split, "-", "sec. II"),
-            f"voltages, {phase} phase": Published(volts, "V", "sec. II"),
-            f"levels, {phase} phase": Published(levels, "cm", "sec. II", 0.10, _LEVELS),
-            f"time constants, {phase} phase": Published(times, "s", "sec. II", 0.05),
-            f"zeros, {phase} phase": Published(zeros, "1/s", "sec. III", 0.05),
-            f"relative gain, {phase} phase": Published(
-                gain, "-", "sec. III", 0.01, closed_form="split1 split2 / (split1 + split2 - 1)"
-            ),
-            f"gains K, {phase} phase": Published(K, "V/V", "sec. V"),
-            f"integral times, {phase} phase": Published(Ti, "s", "sec. V"),
-        }
-    return {
-        **found,
-        "the zero's half-plane": Published("left or right, by changing a valve", "", "abstract"),
-    }
-
-
-PUBLISHED = _published()
-
-UNCERTAIN = {
-    "plant.pump_gain": (0.05, "measured, printed to three digits"),
-    "plant.split": (0.05, "set by a valve, printed to two digits"),
-    "plant.drain": (0.05, "outlets printed to two digits"),
-    "plant.orifice": (0.05, "likewise"),
-}
-
-DEPARTURES = (
-    "Rims: a height of 20 cm is taken for the tanks (notes A1).",
-    (
-        "Setpoints: steps of 2 cm (1 V of the sensor) in each output, one after the other, from"
-        " the steady state of the printed voltages; neither times nor sampling period are taken"
-        " from the paper (notes A2)."
-    ),
-    "Gains are printed for levels in volts, 0.5 V/cm: Kc = 0.5 K in V/cm.",
-    (
-        "Anti-windup: back-calculation with the integral time of each loop; the paper's is not"
-        " described (notes A3)."
-    ),
-    (
-        "The gain of loop 2 of the non-minimum phase is negative as printed: pump 2 acts on tank 2"
-        " mostly through the other loop, and the pairing of the paper is kept. Pairing the other"
-        " way is plant.outputs = [1, 0] in a rig file (notes S4)."
-    ),
-)
 
 
 def loop(phase):
@@ -151,7 +89,7 @@ def loop(phase):
 
 
 def measured(run):
-    """Return what is found of PUBLISHED (see `paper.Preset`)."""
+    """Return what is found of the published rows (see `paper.Preset`)."""
     found, slowest = {}, {}
     for phase, (levels, *_) in POINTS.items():
         plant, volts = run(NAMES[phase])[0].loop.plant, JOHANSSON[phase][2]
@@ -197,17 +135,4 @@ def preset():
         )
         for phase, name in NAMES.items()
     }
-    return Preset(
-        paper="johansson",
-        citation=(
-            "K. H. Johansson, The quadruple-tank process: a multivariable laboratory process with"
-            " an adjustable zero, IEEE Transactions on Control Systems Technology 8(3), 456-465,"
-            " 2000, doi:10.1109/87.845876"
-        ),
-        cases=cases,
-        published=PUBLISHED,
-        measured=measured,
-        tunable=TUNABLE,
-        uncertain=UNCERTAIN,
-        departures=DEPARTURES,
-    )
+    return Preset(**printed("johansson"), cases=cases, measured=measured, tunable=TUNABLE)

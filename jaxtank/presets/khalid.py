@@ -1,93 +1,292 @@
 """Khalid, Kadri: linear predictive control of coupled tanks, GPC and Laguerre functions.
 
-The rig, scenarios and closed loops are in `loops/khalid.py`, the derivation in `notes/khalid.md`.
+The derivation is in `notes/khalid.md`.
 """
 
 import functools
+import math
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.case import Case
-from jaxtank.controllers import Laguerre
-from jaxtank.presets.loops.khalid import CLOCK, CONTROLLERS, TUNABLE, build
-from jaxtank.presets.paper import Claim, Preset, Published
-from jaxtank.presets.rows import khalid as rows
+from jaxtank.analysis import qp
+from jaxtank.case import Case, Free
+from jaxtank.controllers import GPC, Laguerre
+from jaxtank.core.clock import Clock
+from jaxtank.core.tree import number
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.observers import Direct
+from jaxtank.plants import coupled_tanks
+from jaxtank.presets.paper import Claim, Preset, printed
+from jaxtank.presets.rows.operations import operations
+from jaxtank.signals.setpoints import ramps
 
-DEPARTURES = (
-    (
-        "Not printed, so chosen (notes A1-A5): sampling period 2 s, r_w = 0.01 (levels in m, inputs"
-        " in 1e-4 m^3/s), half period of the pulses 300 s, linearisation at the middle of the"
-        " pulse, (0.30, 0.06) m with one pump and (0.06, 0.075) m with two."
-    ),
-    (
-        "Pulses: the cases run between 0.03 m and 0.15 m with one pump, 0.04-0.16 m and 0.03-0.18 m"
-        " with two (scenarios S2 and M2 of notes S3). The printed pulses down to 0 m end at empty"
-        " tanks, where gravity alone decides; `scenario('S1')` and 'M1' are those."
-    ),
-    (
-        "Limits: the paper's simulations show none, and its conclusion leaves constraints to"
-        " further work. The base cases let the flow go negative (limits of 1000 U0, levels stop at"
-        " 0 m); '-constrained' solves the programme of eq. (32) with u in [0, 3] U0 and du within"
-        " 0.5 U0 per sample. controller.mode = clipped clips the linear controller to the same"
-        " limits."
-    ),
-    (
-        "Pipe: sgn(H1-H2) sqrt|H1-H2| for the printed sqrt(H1-H2), since the references with two"
-        " pumps have H1 < H2; its root and those of the outlets are smooth within 1e-4 m, which"
-        " moves no level by more than 4e-5 m (notes H2)."
-    ),
-    (
-        "Signs of eq. (2) and (9), C_m of eq. (16), the numerator of eq. (23), the sums of eq. (31)"
-        " to Np: corrected (notes S5)."
-    ),
-    (
-        "Rim: the height of the tanks is not given; 1 m is above the highest level of the base"
-        " cases, 0.91 m."
-    ),
-    "Sensor: both levels are measured without noise; the converter's range is ours, and it is off.",
-)
+U0 = 1e-4  # unit of the inputs (notes S2.1) [m^3/s]
 
-_SAME_RW = (
-    "figures without numbers; r_w and the sampling period are not printed, and the finding depends"
-    " on them (notes S8)"
-)
-PUBLISHED = {
-    "plant.area": Published(9350e-6, "m^2", "Table I"),
-    "plant.drain": Published(78.5e-6, "m^2", "Table I, s times a0 = 1"),
-    "plant.pipe": Published(39.25e-6, "m^2", "Table I, s times a1 = 0.5"),
-    "plant.gravity": Published(9.8, "m/s^2", "Table I"),
-    "controller.Np": Published(40, "-", "sec. V"),
-    "controller.Nc": Published((2, 10, 30), "-", "sec. V.A, Figs. 2-4"),
-    "controller.a": Published(0.4, "-", "sec. V.A, Fig. 5"),
-    "controller.N": Published(4, "-", "sec. V.A"),
-    "a long control horizon improves performance": Published(
-        "required",
-        "",
-        "sec. V.A, Figs. 2-3",
-        reason=f"the error falls and the overshoot grows; {_SAME_RW}",
-    ),
-    "control horizon beyond 10": Published("not much improvement", "", "sec. V.A, Figs. 3-4"),
-    "overshoot against control horizon": Published(
-        "not eliminated by any", "", "sec. V.A", reason=f"true of 10 and 30, not of 2; {_SAME_RW}"
-    ),
-    "overshoot of Laguerre against GPC 30": Published(
-        "reduced considerably",
-        "",
-        "sec. V.A, Fig. 5",
-        reason=f"a different r_w in the two figures would explain it; {_SAME_RW}",
-    ),
-    "parameters of Laguerre": Published("4 are enough", "", "sec. V.A"),
-    "Laguerre against GPC with two pumps": Published(
-        "outperforms", "", "sec. V.B", reason=f"equal, with 8 variables for 20; {_SAME_RW}"
-    ),
-    **rows.PUBLISHED,
+
+CHANNEL = 78.5e-6  # s1 = s2 = s3, Table I [m^2]
+DISCHARGE = (1.0, 1.0, 0.5)  # a0, a0, a1, Table I [-]
+GRAVITY = 9.8  # g, Table I [m/s^2]
+WIDE = 1e3  # limit of pumps that have none [U0]
+HALF = 300.0  # half period of the pulses (notes A5) [s]
+# Ts, 600 samples (notes A1, S3), Runge-Kutta steps of 0.25 s
+CLOCK = Clock(dt=2.0, duration=1198.0, substeps=8)
+
+MIDDLE = {
+    1: (0.30, 0.06),
+    2: (0.06, 0.075),
+}  # where the model is linearised: the middle of the pulse, by number of pumps (notes A4) [m]
+
+# scenario: (pumps, (low, high) of each output [m], start (H1, H2) [m], delay of the last output's
+# pulses [s])
+SCENARIOS = {
+    "S1": (1, ((0.0, 0.12),), (0.0, 0.0), 0.0),
+    "S2": (1, ((0.03, 0.15),), (0.15, 0.03), 0.0),
+    "M1": (2, ((0.0, 0.12), (0.0, 0.15)), (0.0, 0.0), 0.0),
+    "M2": (2, ((0.04, 0.16), (0.03, 0.18)), (0.04, 0.03), 0.0),
+    "M3": (2, ((0.0, 0.12), (0.0, 0.15)), (0.0, 0.0), 150.0),
 }
 
-UNCERTAIN = {
-    "plant.drain": (0.05, "discharge coefficients of 1 are idealised"),
-    "plant.pipe": (0.05, "the discharge coefficient of 0.5 is rounded"),
-    "plant.pump_gain": (0.05, "pumps are not described"),
+TUNABLE = {
+    "controller.r_w": Free(1e-5, 1.0),
+    "controller.a": Free(0.0, 0.95, "linear"),
+    "controller.q": Free(0.1, 10.0),
+    "controller.operating_point": Free(0.01, 1.0),
+    # with one pump: apart from the highest H2, where the model has no slope
+    "controller.operating_point[0]": Free(0.18, 0.8),
+    "controller.operating_point[1]": Free(0.02, 0.16),
+    "controller.du_limit": Free(0.05, 3.0),
+    "controller.u_low": Free(0.0, 0.5, "linear"),
+    "controller.u_high": Free(1.7, 5.0),
 }
+
+
+CONTROLLERS = {  # case: (controller, its static fields, scenario, title)
+    "gpc": (GPC, {"Nc": 10}, "S2", "one pump, GPC with a control horizon of 10"),
+    "gpc-nc2": (GPC, {"Nc": 2}, "S2", "one pump, GPC with a control horizon of 2"),
+    "gpc-nc30": (GPC, {"Nc": 30}, "S2", "one pump, GPC with a control horizon of 30"),
+    "laguerre": (Laguerre, {"N": 4}, "S2", "one pump, four Laguerre functions"),
+    "gpc-mimo": (GPC, {"Nc": 10}, "M2", "two pumps, GPC with a control horizon of 10"),
+    "laguerre-mimo": (Laguerre, {"N": 4}, "M2", "two pumps, four Laguerre functions each"),
+}
+
+
+def tanks(pumps):
+    """Return the coupled tanks with one pump or with two."""
+    first, second, between = (CHANNEL * a for a in DISCHARGE)
+    return coupled_tanks(
+        area=9350e-6,  # A1 = A2, Table I [m^2]
+        drain=[0.0 if pumps == 1 else first, second],
+        pipe=between,
+        pump_gain=U0,
+        rim=1.0,
+        outputs=(1,) if pumps == 1 else (0, 1),
+        feeds=tuple(range(pumps)),
+        gravity=GRAVITY,
+        knee=1e-4,
+        bottom=True,
+        units=("m", "U0"),
+    )
+
+
+def steady_input(pumps, x):
+    """Return the inputs (pumps,) [U0] that hold the levels x = (H1, H2) [m] (notes S2.2)."""
+    alpha = [CHANNEL * a * math.sqrt(2 * GRAVITY) / U0 for a in DISCHARGE]
+    between = alpha[2] * math.copysign(math.sqrt(abs(x[0] - x[1])), x[0] - x[1])
+    return (
+        (between,)
+        if pumps == 1
+        else (alpha[0] * math.sqrt(x[0]) + between, alpha[1] * math.sqrt(x[1]) - between)
+    )
+
+
+def scenario(name):
+    """Return (reference, x0 [m], inputs before t = 0 [U0]) of a scenario of notes S3."""
+    pumps, spans, x0, delay = SCENARIOS[name]
+    changes = []
+    for channel, (low, high) in enumerate(spans):
+        begin = delay if channel == len(spans) - 1 else 0.0
+        changes += [(begin + k * HALF, channel, low if k % 2 else high) for k in range(4)]
+    return (
+        ramps([low for low, _ in spans], changes, ramp=0.0),
+        number(x0),
+        number(steady_input(pumps, x0)),
+    )
+
+
+def build(kind, where=None, mode="unconstrained"):
+    """Return the closed loop of a case of CONTROLLERS."""
+    controller, sizes, default, _ = CONTROLLERS[kind]
+    reference, x0, u0 = scenario(where or default)
+    pumps = len(u0)
+    plant, free = tanks(pumps), mode == "unconstrained"
+    poles = {"a": number([0.4] * pumps)} if controller is Laguerre else {}  # sec. V.A
+    return ClosedLoop(
+        plant=plant,
+        sensor=LevelSensor(
+            gain=number([0.1] * 2), noise=number([0.0] * 2), full_scale=number(10.0)
+        ),
+        observer=Direct(),
+        controller=controller(
+            model=plant,
+            operating_point=number(MIDDLE[pumps]),
+            r_w=number(1e-2),
+            q=number([1.0] * pumps),
+            du_limit=number([0.5] * pumps),
+            u_low=number([0.0] * pumps),
+            u_high=number([3.0] * pumps),
+            mode=mode,
+            **poles,
+            **sizes,
+        ),
+        actuator=PumpBank(
+            low=number([-WIDE if free else 0.0] * pumps),
+            high=number([WIDE if free else 3.0] * pumps),
+            stop=number([0.0] * pumps),
+            pulse=number([1.0] * pumps),
+            initial=u0,
+        ),
+        reference=reference,
+        x0=x0,
+    )
+
+
+SISO = ("gpc-nc2", "gpc", "gpc-nc30", "laguerre")
+MIMO = ("gpc-mimo", "laguerre-mimo")
+
+
+def from_empty(name):
+    """Return the values that make scenario `name` of notes S3 of a case with its pumps."""
+    reference, x0, u0 = scenario(name)
+    return {
+        "reference.initial": np.asarray(reference.initial).tolist(),
+        "reference.targets": np.asarray(reference.targets).tolist(),
+        "x0": np.asarray(x0).tolist(),
+        "actuator.initial": np.asarray(u0).tolist(),
+    }
+
+
+def measured_rows(run, edges):
+    """Return {quantity: what was measured}; edges: of `jaxtank.presets.khalid`."""
+    error, over, under = {}, {}, {}  # RMS [mm], overshoot and undershoot [%] of each output
+    for names, start in ((SISO, "S1"), (MIMO, "M1")):
+        for name in names:
+            case, t = run(name, from_empty(start))
+            found = edges(case.loop.reference, t)
+            error[name] = 1e3 * np.sqrt((t.e**2).mean(axis=0))
+            over[name] = [channel["overshoot"][0] for channel in found]
+            under[name] = [channel["overshoot"][1] for channel in found]
+    return {**_sizes(run), **_undershoot(run, edges), **_from_empty(error, over, under)}
+
+
+def _pulses(case):
+    """(low, high) of each output's pulses [m]."""
+    reference = case.loop.reference
+    levels = [
+        [float(v) for (_, i), v in zip(reference.changes, reference.targets) if i == output]
+        for output in range(reference.channels)
+    ]
+    return tuple(v for one in levels for v in (min(one), max(one)))
+
+
+def _sizes(run):
+    """The pulses of our cases, and the variables of the programmes."""
+    loops = {name: run(name, {"clock.substeps": 2})[0].loop for name in (*SISO, *MIMO)}
+    count = {
+        name: loop.plant.pumps * getattr(loop.controller, "N", getattr(loop.controller, "Nc", 0))
+        for name, loop in loops.items()
+    }
+    fixed = {  # du = -K x_e
+        name: operations(jax.make_jaxpr(jnp.matmul)(K, K[0]).jaxpr)
+        for name, loop in loops.items()
+        for K in [np.asarray(loop.controller.gain(CLOCK.dt))]
+    }
+    programme = {name: _programme(loop) for name, loop in loops.items()}
+    order = ("laguerre", "gpc", "gpc-nc30")
+    return {
+        "pulses of H2, one pump": _pulses(run("gpc", {"clock.substeps": 2})[0]),
+        "pulses of H1 and H2, two pumps": _pulses(run("gpc-mimo", {"clock.substeps": 2})[0]),
+        "controller.N, two pumps": loops["laguerre-mimo"].controller.N,
+        "computational cost of Laguerre": Claim(
+            [
+                cost[laguerre] < cost[gpc]
+                for cost in (fixed, programme)
+                for laguerre, gpc in (("laguerre", "gpc"), ("laguerre-mimo", "gpc-mimo"))
+            ],
+            "arithmetic operations, counted and not timed, with Laguerre functions, GPC 10 and GPC"
+            " 30: without constraints {}, {} and {} a sample; with constraints {}, {} and {} an"
+            " iteration of the programme, of {}, {} and {} variables; with two pumps {} for {} of"
+            " GPC without and {} for {} with constraints".format(
+                *(cost[n] for cost in (fixed, programme, count) for n in order),
+                *(cost[n] for cost in (fixed, programme) for n in reversed(MIMO)),
+            ),
+        ),
+    }
+
+
+def _programme(loop):
+    """Operations of the programme of eq. (32): its setting up and one iteration."""
+    control = loop.controller
+    Omega, Psi, basis = control.design(CLOCK.dt)
+    steps = basis[: control.ahead]
+    rows = jnp.concatenate([steps, jnp.cumsum(steps, axis=0)]).reshape(-1, Omega.shape[0])
+    ends = jnp.ones(rows.shape[0])
+    return operations(jax.make_jaxpr(qp.solve)(Omega, Psi[:, 0], rows, -ends, ends).jaxpr)
+
+
+def _undershoot(run, edges):
+    """The undershoot at falling edges of the cases' own pulses [%]."""
+    under = {}
+    for name in SISO[:3]:
+        case, t = run(name, {"clock.substeps": 2})
+        under[name] = edges(case.loop.reference, t)[0]["overshoot"][1]
+    return {
+        "undershoot against control horizon": Claim(
+            [value > 1.0 for value in under.values()],
+            "below the lower level with Nc 2, 10, 30: "
+            + ", ".join(f"{value:.2f} %" for value in under.values())
+            + " of the step (counts if above 1 %)",
+        )
+    }
+
+
+def _from_empty(error, over, under):
+    """The claims on pulses from 0 m."""
+    one = [error[name][0] for name in SISO]
+    top = [over[name][0] for name in SISO]
+    low = [under[name][0] for name in SISO]
+    gain = 1.0 - top[3] / top[2]
+    both = "; ".join(
+        "{:.2f}, {:.2f} mm and {:.1f}, {:.1f} % with {}".format(*error[n], *over[n], shown)
+        for n, shown in zip(MIMO, ("GPC", "Laguerre functions"))
+    )
+    return {
+        "pulses from 0 m: long control horizon": Claim(
+            (one[1] < one[0], top[1] <= top[0]),
+            f"RMS error {one[0]:.2f} mm with Nc 2, {one[1]:.2f} mm with Nc 10; overshoot"
+            f" {top[0]:.2f} and {top[1]:.2f} %",
+        ),
+        "pulses from 0 m: control horizon beyond 10": Claim(
+            one[2] > 0.95 * one[1],
+            f"RMS error {one[1]:.2f} mm with Nc 10, {one[2]:.2f} mm with Nc 30",
+        ),
+        "pulses from 0 m: overshoot and undershoot": Claim(
+            [value > 1.0 for value in (*top[:3], *low[:3])],
+            f"overshoot {top[0]:.2f}, {top[1]:.2f}, {top[2]:.2f} % with Nc 2, 10, 30; undershoot at"
+            f" most {max(low[:3]):.2g} % (lots: above 1 %)",
+        ),
+        "pulses from 0 m: overshoot of Laguerre": Claim(
+            (gain > 0.0, gain >= 0.2),
+            f"{top[3]:.2f} % against {top[2]:.2f} %: {100 * gain:.0f} % less at the same r_w",
+        ),
+        "pulses from 0 m: Laguerre with two pumps": Claim(
+            error["laguerre-mimo"] < 0.98 * error["gpc-mimo"],
+            f"RMS errors and overshoots {both} (counts if 2 % less)",
+        ),
+    }
 
 
 def edges(reference, run, dt=2.0):
@@ -118,7 +317,7 @@ def edges(reference, run, dt=2.0):
 
 
 def measured(run):
-    """Return what can be measured of PUBLISHED (see `jaxtank.presets.paper.Preset`)."""
+    """Return what can be measured of the published rows (see `jaxtank.presets.paper.Preset`)."""
     # The claims are decided at the reference point, r_w = 0.01 in S2 and M2, with Runge-Kutta steps
     # of 1 s instead of 0.25 s, which compile faster and change no RMS error by more than 2e-7 m.
     error, over, loops = {}, {}, {}  # RMS [m] and overshoot [%] of each output, by case
@@ -139,7 +338,7 @@ def measured(run):
         "controller.N": laguerre.N,
         **_horizon_claims({k: 1e3 * v[0] for k, v in error.items()}, over),
         **_laguerre_claims(error, over),
-        **rows.measured(run, edges),
+        **measured_rows(run, edges),
     }
 
 
@@ -222,17 +421,4 @@ def preset():
                     "mean_square_overshoot": 1e5,
                 },
             )
-    return Preset(
-        paper="khalid",
-        citation=(
-            "M. U. Khalid, M. B. Kadri, Liquid level control of nonlinear coupled tanks system"
-            " using linear model predictive control, Pakistan Navy Engineering College, National"
-            " University of Sciences and Technology, Karachi"
-        ),
-        cases=cases,
-        published=PUBLISHED,
-        measured=measured,
-        tunable=TUNABLE,
-        uncertain=UNCERTAIN,
-        departures=DEPARTURES,
-    )
+    return Preset(**printed("khalid"), cases=cases, measured=measured, tunable=TUNABLE)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -137,3 +138,19 @@ class Preset:
         It is notes/<paper>.md beside the file that defines `measured`. Messages name its sections.
         """
         return Path(inspect.getfile(self.measured)).with_name("notes") / f"{self.paper}.md"
+
+
+def printed(paper: str) -> dict[str, Any]:
+    """Return the fields of a Preset that are data, from <paper>.toml: its rows keep their order."""
+    table = tomllib.loads(Path(__file__).with_name(f"{paper}.toml").read_text("utf-8"))
+    rows = table["published"]
+    for row in rows.values():
+        if isinstance(row["value"], list):
+            row["value"] = tuple(row["value"])
+    return {
+        "paper": paper,
+        "citation": table["citation"],
+        "published": {name: Published(**row) for name, row in rows.items()},
+        "uncertain": {name: tuple(entry) for name, entry in table["uncertain"].items()},
+        "departures": tuple(table["departures"]),
+    }

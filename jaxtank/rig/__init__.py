@@ -19,12 +19,12 @@ amplitude = 1.0
 period = 100.0
 output = 1
 
-[observer]                   # another one than the preset's, or [law]: kind, and its fields
+[observer]                   # another one than the preset's, or [controller]: kind, and its fields
 kind = "extended-kalman"
 process = 1e-4
 measurement = 1e-4
 
-[[pour]]                     # inflow pulses, or [disturbance] inflow = [one per tank]
+[[inflow]]                   # inflow pulses, or [disturbance] inflow = [one per tank]
 time = 500.0
 duration = 1.0
 tank = 2
@@ -77,59 +77,42 @@ values = { "sensor.noise" = "0.02 if zero", "plant.pump_gain" = "x1.3", "x0" = [
 
 from jaxtank.case import Case
 from jaxtank.rig.components import register
-from jaxtank.rig.lines import toml
-from jaxtank.rig.read import filtered, from_table, load, loads, open_case
-from jaxtank.rig.validation import (
-    check,
-    check_free,
-    check_limits,
-    check_objective,
-    check_uncertain,
-    uncovered,
-    unreachable,
-)
-from jaxtank.rig.values import (
-    has,
-    is_change,
-    overlap,
-    overridden,
-    set_and_schedule,
-    set_scenario,
-    set_values,
-    with_bottom,
-)
-from jaxtank.rig.warnings import case_warnings, clock_warnings, model_warnings
+from jaxtank.rig.entry import toml
+from jaxtank.rig.read import filtered as filtered
+from jaxtank.rig.read import from_table as from_table
+from jaxtank.rig.read import load, loads
+from jaxtank.rig.read import open_case as open_case
+from jaxtank.rig.validation import check
+from jaxtank.rig.validation import check_free as check_free
+from jaxtank.rig.validation import check_limits as check_limits
+from jaxtank.rig.validation import check_objective as check_objective
+from jaxtank.rig.validation import check_uncertain as check_uncertain
+from jaxtank.rig.validation import uncovered as uncovered
+from jaxtank.rig.validation import unreachable as unreachable
+from jaxtank.rig.values import has as has
+from jaxtank.rig.values import is_change as is_change
+from jaxtank.rig.values import overlap as overlap
+from jaxtank.rig.values import overridden as overridden
+from jaxtank.rig.values import set_and_schedule as set_and_schedule
+from jaxtank.rig.values import set_scenario, set_values
+from jaxtank.rig.values import with_bottom as with_bottom
+from jaxtank.rig.warnings import case_warnings
+from jaxtank.rig.warnings import clock_warnings as clock_warnings
+from jaxtank.rig.warnings import model_warnings as model_warnings
 from jaxtank.rig.write import complete, dump, save, short
 
 __all__ = [
     "Case",
     "case_warnings",
     "check",
-    "check_free",
-    "check_limits",
-    "check_objective",
-    "check_uncertain",
-    "clock_warnings",
     "complete",
     "dump",
-    "filtered",
-    "from_table",
-    "has",
-    "is_change",
     "load",
     "loads",
-    "model_warnings",
-    "open_case",
-    "overlap",
-    "overridden",
     "register",
     "save",
-    "set_and_schedule",
     "set_scenario",
     "set_values",
     "short",
     "toml",
-    "uncovered",
-    "unreachable",
-    "with_bottom",
 ]

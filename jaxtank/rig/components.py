@@ -1,6 +1,4 @@
-"""[law], [observer], [sensor] and [actuator] of a rig file: a component by its kind, and its fields
-by their names.
-"""
+"""[controller], [observer], [sensor] and [actuator] of a rig file: a component by its kind."""
 
 import dataclasses
 import inspect
@@ -13,7 +11,6 @@ from jaxtank import controllers
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.installed import imported, installed
 from jaxtank.core.text import shortened
-from jaxtank.core.toml_schema import NEEDED, Key, Section, type_of
 from jaxtank.core.tree import number
 from jaxtank.core.units import DEFAULT
 from jaxtank.instruments import Actuator, LevelSensor, PumpBank, Sensor
@@ -21,16 +18,13 @@ from jaxtank.loop.steady import steady_state
 from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman, Observer
 from jaxtank.plants.hydraulics import in_unit
 from jaxtank.rig.entry import read_entry, sizes_of
-from jaxtank.rig.schema import KIND, OPEN_LOOP
+from jaxtank.rig.schema import KIND, NEEDED, OPEN_LOOP, Key, Section, type_of
 from jaxtank.rig.signals import ramp_values, ramps_of
 from jaxtank.signals.setpoints import Ramps, ramps
 
 
 class Role(NamedTuple):
-    """What a section of a rig file describes: field of the loop, abstract class, {kind: class},
-    fields that are the case's own where a file leaves them out, and the class that needs no
-    section, for [values] set its fields.
-    """
+    """A section: field of the loop, abstract class, {kind: class}, fields it may leave out."""
 
     field: str
     base: type
@@ -40,7 +34,7 @@ class Role(NamedTuple):
 
 
 ROLES = {
-    "law": Role(
+    "controller": Role(
         "controller",
         controllers.Controller,
         {
@@ -88,7 +82,7 @@ _FIELDS = (bool, int, float, str, tuple)
 def register(kind: str, cls: type) -> type:
     """Give a controller, observer, sensor or actuator of one's own a name in rig files.
 
-    `kind = "..."` of [law] (a controller), [observer], [sensor] or [actuator] then makes a
+    `kind = "..."` of [controller] (a controller), [observer], [sensor] or [actuator] then makes a
     component of the class. Its leaves and static fields are keys of the table; a field `model` is
     the plant of the rig. A static field of type tuple holds tanks, which a file counts from 1.
     `rig.dump`, `rig.complete` and `result.save` write such a case.
@@ -119,7 +113,7 @@ def register(kind: str, cls: type) -> type:
     >>> cls = rig.register("proportional", Proportional)
     >>> own = rig.loads('''
     ... case = "cascaded/pi"
-    ... [law]
+    ... [controller]
     ... kind = "proportional"
     ... Kc = 2.0
     ... [free]
@@ -225,15 +219,15 @@ def _key(cls, field, own, units):
 
 
 def controller_of(table, loop, bias=None):
-    """Return the controller of a [law] table."""
+    """Return the controller of a [controller] table."""
     if isinstance(table, dict) and table.get("kind") == "open-loop":
         start = ramps(np.asarray(loop.actuator.initial).tolist(), [], ramp=0.0)
-        section = section_of("law", "open-loop")
+        section = section_of("controller", "open-loop")
         return controllers.OpenLoop(
             signal=ramps_of(section, table, start, ("pump", "input"), sizes_of(loop.plant))
         )
     bias = steady_bias(loop) if bias is None else bias
-    return component("law", table, model_of(loop), {"bias": bias})
+    return component("controller", table, model_of(loop), {"bias": bias})
 
 
 def observer_of(table, loop):
@@ -247,18 +241,14 @@ def observer_of(table, loop):
 
 
 def model_of(loop):
-    """The model of the loop's controller, scheduled or not; the plant where it has none
-    that fits.
-    """
+    """Return the model of the loop's controller, the plant where it has none that fits."""
     plant, model = loop.plant, getattr(getattr(loop.controller, "law", loop.controller), "model", 0)
     fits = (getattr(model, "tanks", 0), getattr(model, "pumps", 0)) == (plant.tanks, plant.pumps)
     return model if fits else plant
 
 
 def instrument_of(name, table, loop):
-    """Return the sensor or actuator of a table; noise and limits that it leaves out are those of
-    the loop's own. name: "sensor" or "actuator".
-    """
+    """Return the sensor or actuator of a table; `kept` fields that it leaves out are the loop's."""
     role = ROLES[name]
     own = {key: getattr(getattr(loop, role.field), key) for key in role.kept}
     return component(name, table, loop.plant, own)
@@ -286,10 +276,8 @@ def component(name, table, plant, offered):
     return role.classes[kind](**values)
 
 
-def steady_bias(loop, known=False):
-    """(m,) inputs that hold the outputs where they start, within the limits of the pumps; those
-    before t = 0 where a file has them (`known`, one per pump), and where none hold.
-    """
+def steady_bias(loop, known: bool | list[bool] = False):
+    """Return (m,) inputs that hold the outputs at x0; those before t = 0 if `known`."""
     bank, start = loop.actuator, np.asarray(loop.x0)[list(loop.plant.outputs)]
     try:
         steady = np.clip(steady_state(loop, start)[1], bank.low, bank.high)
@@ -299,9 +287,9 @@ def steady_bias(loop, known=False):
 
 
 def leaves_bias(table):
-    """Whether a [law] table leaves out a `bias` that is then `steady_bias`."""
+    """Whether a [controller] table leaves out a `bias` that is then `steady_bias`."""
     kind = table.get("kind")
-    cls = None if kind in REGISTERED else ROLES["law"].classes.get(kind)
+    cls = None if kind in REGISTERED else ROLES["controller"].classes.get(kind)
     return "bias" in getattr(cls, "__dataclass_fields__", ()) and "bias" not in table
 
 
@@ -311,9 +299,7 @@ def kind_of(name, part):
 
 
 def has_section(name, part):
-    """Whether a file has the section for a part that is not the preset's: [values] set the fields
-    of LevelSensor and PumpBank.
-    """
+    """Whether a part needs a section: [values] set the fields of LevelSensor and PumpBank."""
     return ROLES[name].default is None or type(part) is not ROLES[name].default
 
 
@@ -323,9 +309,7 @@ def is_written(name, part):
 
 
 def values_of(name, part):
-    """Return (section, {key: value}) of a component, None of an optional leaf that is not in use.
-    InputError where no rig file describes it.
-    """
+    """Return (section, {key: value}) of a component; InputError where no rig file describes it."""
     kind, cls = kind_of(name, part), type(part).__name__
     if kind is None:
         raise InputError(f"its {cls} has no name in a rig file")

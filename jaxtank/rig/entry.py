@@ -1,4 +1,4 @@
-"""A section of a rig file read by its schema: known keys, kinds of values, ranges, units."""
+"""Values of a rig file, read and written by their Key: kinds, ranges, units, lines of TOML."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -8,18 +8,16 @@ import numpy as np
 from jaxtank.core.checks import check_value
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.text import shortened
-from jaxtank.core.toml_schema import NEEDED
 from jaxtank.core.tree import number, sizes_of_shape
 from jaxtank.core.units import DEFAULT
+from jaxtank.rig.schema import NEEDED, Section
 
 LARGEST = 1e300
 """Magnitude of a number of a rig file: products of two stay finite for most."""
 
 
 class Sizes(NamedTuple):
-    """What is known of a rig while its file is read: how many tanks, pumps and controlled tanks it
-    has, the units it counts in, and {name: index} of its tanks.
-    """
+    """What is known of a rig while it is read: counts, units, and {name: index} of its tanks."""
 
     tanks: int
     pumps: int = 0
@@ -127,7 +125,7 @@ def _texts(key, label, value, sizes):
 
 
 def _list(key, label, value, sizes):
-    wanted = sizes_of_shape(key.shape, sizes.counts)
+    wanted = sizes_of_shape(key.shape, sizes.counts) or ()
     if not (is_finite(value) and np.shape(value) == wanted):
         (size,) = wanted
         numbers = f"{size} finite numbers{unit(key.meta(sizes.units))}, one per {key.shape[0]}"
@@ -272,9 +270,7 @@ def plain(name, value):
 
 
 def static_value(name, value, meta, kind):
-    """`value` for a static field of type `kind` (bool, int, float or str); InputError where it is
-    another, out of range, or no choice.
-    """
+    """Return `value` for a static field of type `kind`; InputError for another, or out of range."""
     if meta["choices"] is not None:
         choices = meta["choices"]
         good = not isinstance(value, (list, dict)) and value in choices
@@ -310,3 +306,89 @@ def allowed(meta, value=0.0):
     integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     integer = integer and meta.get("kind") not in ("tank", "feed")  # by name too
     return ", ".join(filter(None, ["whole number" if integer else "", above, below]))
+
+
+class Line(NamedTuple):
+    """A line "name = value" of a rig file; on: False where it is a suggestion, commented out."""
+
+    name: str
+    value: Any
+    meta: Mapping[str, Any]
+    on: bool = True
+
+
+class Block(NamedTuple):
+    """A table of a rig file; title: "[values]" or "" for lines that go on; prose: sentences above
+    it; on: False: commented out as a whole.
+    """
+
+    title: str
+    lines: list
+    prose: tuple = ()
+    on: bool = True
+
+
+def lines_of(section: Section, values: Mapping[str, Any], units=DEFAULT) -> list[Line]:
+    """Return the lines of a section's keys that have a value, in the order of its schema."""
+    return [
+        Line(k.name, written(k, values[k.name]), k.meta(units))
+        for k in section.keys
+        if values.get(k.name) is not None
+    ]
+
+
+def block_of(section: Section, values: Mapping[str, Any], units=DEFAULT) -> Block:
+    """Return the Block of a section with `lines_of` its values."""
+    return Block(section.title, lines_of(section, values, units))
+
+
+def suggestion(section: Section, values: Mapping[str, Any], units=DEFAULT) -> Block:
+    """Return the Block of a section that could be in a file, commented out."""
+    given = {k.name: k.default for k in section.keys if isinstance(k.default, (int, float, str))}
+    lines = lines_of(section, {**given, **values}, units)
+    return Block(section.title, lines, (section.prose,), False)
+
+
+def terse(block: Block) -> list[str]:
+    """Return the lines of a terse file: title, and "name = value  # [unit] doc" of what is on."""
+    return [block.title] * bool(block.title) + [
+        f"{line.name} = {toml(line.value)}" + (f"  # {note}" if (note := _note(line.meta)) else "")
+        for line in block.lines
+        if line.on
+    ]
+
+
+def _note(meta):
+    return " ".join(filter(None, [unit(meta).strip(), meta["doc"]]))
+
+
+def toml(value: Any) -> str:
+    """Return `value` as TOML: numbers to their last digit, texts escaped, lists and tuples as
+    arrays.
+
+    Parameters
+    ----------
+    value : number, text, truth value, array, list, tuple or dict of such
+
+    Returns
+    -------
+    Text of one line.
+
+    Examples
+    --------
+    >>> toml([0.1, True, "a b"])
+    '[0.1, true, "a b"]'
+    """
+    if isinstance(value, (np.generic, np.ndarray)):
+        value = value.tolist()
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+        return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(toml(v) for v in value) + "]"
+    if isinstance(value, dict):
+        inside = ", ".join(f"{toml(k)} = {toml(v)}" for k, v in value.items())
+        return f"{{ {inside} }}" if inside else "{}"
+    return repr(value)

@@ -57,7 +57,7 @@ def build(table):
     if not outputs:
         raise InputError("plant.outputs = []: must be a list of at least one tank")
     plant = network(**_fields(columns, "plant"), **more, outputs=outputs, units=sizes.units)
-    control = table.get("law", {})
+    control = table.get("controller", {})
     return Case(
         name="my rig",
         title=f"{sizes.tanks} tank{'s' * (sizes.tanks > 1)}, {control.get('kind', '')}",
@@ -139,9 +139,7 @@ FLOW_MARGIN = 2.0
 
 
 def _check_gains(gains, units):
-    """Raise InputError for a gain that is not near the size of the flow unit of its input: units
-    are names here, the gain converts.
-    """
+    """Raise InputError for a gain that is not near the flow of a unit of its input."""
     factor = flow_per_input(units)
     for j, gain in enumerate(gains):
         if factor and gain > 0 and not 1 / FLOW_MARGIN <= gain / factor <= FLOW_MARGIN:
@@ -163,9 +161,7 @@ def _check_names(tanks):
 
 
 def _check_links(table, entries):
-    """Raise InputError for an orifice or a spill from a tank to itself, and where one of several
-    spills of a tank has no share and the sum is above 1: the flows are then not defined.
-    """
+    """Raise InputError for a link of a tank to itself, and for spills of more than 1 in sum."""
     for name in ("orifice", "spill"):
         for i, (entry, given) in enumerate(zip(entries[name], table[name])):
             value = [given["from"], given["to"]]

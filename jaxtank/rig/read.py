@@ -68,26 +68,7 @@ def check_keys(text):
 
 
 def open_case(name: str) -> Case:
-    """Return the Case of "paper/case", or of a rig file where `name` ends in .toml, checked.
-
-    Parameters
-    ----------
-    name : "paper/case" as `jaxtank list` prints it, or a path
-
-    Returns
-    -------
-    Case, checked.
-
-    Raises
-    ------
-    InputError for a case that does not exist, and as `load`.
-
-    Examples
-    --------
-    >>> from jaxtank import rig
-    >>> rig.open_case("cascaded/pi").name
-    'cascaded/pi'
-    """
+    """Return the Case of "paper/case", or of the rig file `name` if it ends in .toml, checked."""
     return load(name) if name.endswith(".toml") else presets.find(name)
 
 
@@ -171,26 +152,8 @@ def loads(text: str, words: str = "rig file") -> Case:
 
 
 def from_table(table: Mapping[str, Any]) -> Case:
-    """Return the Case described by a table of the form of a rig file.
-
-    Parameters
-    ----------
-    table : {key or section: value, table, or list of tables}
-
-    Returns
-    -------
-    Case, checked.
-
-    Raises
-    ------
-    InputError as `load`.
-
-    Examples
-    --------
-    >>> from jaxtank import rig
-    >>> rig.from_table({"case": "cascaded/pi", "limits": {"max_level": 9.0}}).limits
-    {'max_level': 9.0}
-    """
+    """Return the Case of a table of the form of a rig file, {key or section: value}, checked."""
+    table = renamed(table)
     case = start_of(table)
     dotted = ("values", "free", "uncertain")
     named = {key: by_dotted_name(table[key], key) for key in dotted if key in table}
@@ -206,26 +169,20 @@ def from_table(table: Mapping[str, Any]) -> Case:
     return filtered(validation.check(case))
 
 
+FORMER = {"law": "controller", "pour": "inflow"}
+"""Sections of older files, which are read under their present names."""
+
+
+def renamed(table):
+    """A table of a rig file with the sections of FORMER under their present names."""
+    for old, new in FORMER.items():
+        if old in table and new in table:
+            raise InputError(f"[{old}] is an older name of [{new}]: give one of them")
+    return {FORMER.get(name, name): value for name, value in table.items()}
+
+
 def filtered(case: Case, on: bool | None = None, changes: Mapping[str, Any] | None = None) -> Case:
-    """Return the case with the safety filter of its settings, designed for its present values.
-
-    Parameters
-    ----------
-    case : Case
-    on : True: with default settings where it has none; False: without a filter
-    changes : {key of [safety_filter]: value} in place of the case's
-
-    Raises
-    ------
-    InputError for an unknown key, a value out of its range, and changes without a filter.
-
-    Examples
-    --------
-    >>> from jaxtank import presets, rig
-    >>> case = rig.filtered(presets.find("cascaded/pi"), on=True, changes={"rate": 0.1})
-    >>> case.safety, case.loop.safety_filter.rate.tolist()
-    ({'rate': 0.1}, [0.1, 0.1])
-    """
+    """Return the case with the safety filter of its settings and `changes`, or without it."""
     changes = read_entry(SECTIONS["safety_filter"], changes or {}, sizes_of(case.loop.plant))
     if (case.safety is None and not on) or on is False:
         if changes:
@@ -297,7 +254,7 @@ def start_of(table):
             changed[name] = components.instrument_of(name, table[name], loop)
     if "reference" in table:
         changed["reference"] = signals.reference_of(table["reference"], loop.reference, loop.plant)
-    if "disturbance" in table or "pour" in table:
+    if "disturbance" in table or "inflow" in table:
         names = network.names_in(table)
         changed["disturbance"] = signals.disturbance_of(table, loop, names)
     if "fault" in table:
@@ -350,8 +307,8 @@ def _check_sections(table):
 def _with_parts(case, table):
     """A case with the controller or observer of a table in the place of its own."""
     loop, changed = case.loop, []
-    if "law" in table:
-        controller = components.controller_of(table["law"], loop, loop.actuator.initial)
+    if "controller" in table:
+        controller = components.controller_of(table["controller"], loop, loop.actuator.initial)
         if type(controller) is not type(loop.controller):
             case = case.replace(symmetry=None)
         loop = dataclasses.replace(loop, controller=controller)
@@ -365,11 +322,9 @@ def _with_parts(case, table):
 
 
 def _with_bias(case, values, table):
-    """(case with the bias that its [law] leaves out, the values that are still to be set): after
-    those that the steady state depends on.
-    """
-    law = table.get("law", {})
-    if not components.leaves_bias(law) or any(n.startswith("controller.bias") for n in values):
+    """(case with the bias that its [controller] leaves out, the values still to be set)."""
+    control = table.get("controller", {})
+    if not components.leaves_bias(control) or any(n.startswith("controller.bias") for n in values):
         return case, values
     parts = ("plant.", "actuator.", "disturbance.", "x0")
     case = set_values(case, {n: v for n, v in values.items() if n.startswith(parts)})
@@ -377,7 +332,8 @@ def _with_bias(case, values, table):
     whole = "initial" in table.get("actuator", {}) or name in values
     known = [whole or "initial" in pump or f"{name}[{j}]" in values for j, pump in enumerate(pumps)]
     bias = components.steady_bias(case.loop, known)
-    controller = dataclasses.replace(case.loop.controller, bias=bias)
+    controller: Any = case.loop.controller
+    controller = dataclasses.replace(controller, bias=bias)
     loop = dataclasses.replace(case.loop, controller=controller)
     later = {n: v for n, v in values.items() if not n.startswith(parts)}
     return case.replace(loop=loop), later

@@ -1,12 +1,13 @@
-"""The schema of a rig file: one table of keys for each TOML section.
+"""The schema of a rig file: a Key for each value, a Section of keys for each TOML table.
 
-Reading, writing, `jaxtank init` and validation all follow `SECTIONS`; imported by the rest of rig.
+Reading, writing, `jaxtank init` and validation all follow `SECTIONS`.
 """
 
+import dataclasses
 import functools
+from typing import Any
 
-from jaxtank.core.toml_schema import Key, Section
-from jaxtank.core.units import DEFAULT
+from jaxtank.core.units import DEFAULT, local
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
@@ -14,6 +15,83 @@ from jaxtank.plants.faults import Faults
 from jaxtank.plants.network import TankNetwork
 from jaxtank.signals.inflows import InflowPulses
 from jaxtank.signals.setpoints import Ramps, Sine
+
+NEEDED: Any = object()
+"""Default of a key that a file must have."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Key:
+    """A key of a section: what it is, which values it may have, and where its value goes."""
+
+    name: str
+    doc: str = ""
+    kind: str = "number"
+    unit: str = "-"
+    low: float | None = None
+    high: float | None = None
+    strict: bool = False
+    choices: tuple[Any, ...] | None = None
+    default: Any = NEEDED
+    shape: tuple[Any, ...] = ()
+    target: str = ""
+
+    @classmethod
+    def of(cls, owner: type, field: str, doc: str = "", **changes: Any) -> "Key":
+        """Return the key of a component's field: unit, description, range and kind are
+        the field's.
+        """
+        found = next(f for f in dataclasses.fields(owner) if f.name == field)
+        meta = found.metadata
+        own: dict[str, Any] = {
+            k: meta[k] for k in ("unit", "doc", "low", "high", "strict", "shape") if k in meta
+        }
+        if meta["kind"] == "static":
+            own |= {"kind": _KINDS.get(type_of(found), "number"), "choices": meta["choices"]}
+        if doc:
+            own["doc"] = doc
+        values: dict[str, Any] = {"name": field, **own, **changes}
+        return cls(**values)
+
+    def meta(self, units: tuple[str, str] = DEFAULT) -> dict[str, Any]:
+        """Return the metadata of a value, as of a leaf, in the units of a rig."""
+        found = {k: getattr(self, k) for k in ("kind", "doc", "low", "high", "strict", "choices")}
+        return {**found, "unit": local(self.unit, units)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Section:
+    """A table of a rig file, or a list of tables."""
+
+    name: str
+    keys: tuple[Key, ...] = ()
+    many: bool = False
+    prose: str = ""
+    per: str = ""
+    elsewhere: tuple[Any, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """The line that begins the table: "[plant]", "[[tank]]"; "" of the top of a file."""
+        return f"[[{self.name}]]" if self.many else f"[{self.name}]" if self.name else ""
+
+    @property
+    def names(self) -> list[str]:
+        """The names of its keys."""
+        return [key.name for key in self.keys]
+
+    def __getitem__(self, name: str) -> Key:
+        return next(key for key in self.keys if key.name == name)
+
+
+_KINDS: dict[Any, str] = {bool: "flag", int: "integer", str: "choice", tuple: "tanks"}
+_TYPES: dict[Any, Any] = {kind.__name__: kind for kind in (bool, int, float, str, tuple)}
+
+
+def type_of(field: dataclasses.Field[Any]) -> Any:
+    """The type of a field, also where `from __future__ import annotations` makes it a text."""
+    kind: Any = field.type
+    return _TYPES.get(kind, kind)
 
 
 def _of(owner, part, field, doc, name="", **changes):
@@ -99,7 +177,7 @@ OPEN_LOOP = (
     *COURSE,
     Key.of(Ramps, "filter", FILTER, kind="array", default=None, shape=("pump",)),
 )
-"""[law] of kind "open-loop"; of other kinds the keys are the fields of the class."""
+"""[controller] of kind "open-loop"; of other kinds the keys are the fields of the class."""
 REFERENCE = (
     _optional(
         "initial",
@@ -133,7 +211,7 @@ DISTURBANCE = (
     ),
     Key.of(InflowPulses, "window", default=None),
 )
-POUR = (
+INFLOW = (
     Key("time", "when it begins", unit="s", low=0.0),
     Key("duration", "how long it lasts", unit="s", low=0.0, strict=True),
     Key("tank", f"the tank, {BY_NAME}", "tank"),
@@ -217,7 +295,7 @@ _ALL = (
     Section("spill", SPILL, many=True, per="spills"),
     Section("pump", PUMP, many=True, per="feeds", elsewhere=("actuator", PumpBank)),
     Section("plant", PLANT),
-    Section("law"),
+    Section("controller"),
     Section("observer"),
     Section("sensor"),
     Section("actuator"),
@@ -231,11 +309,11 @@ _ALL = (
     Section(
         "disturbance",
         DISTURBANCE,
-        prose="A steady inflow of each tank, or pulses of inflow, [[pour]]: one of the two.",
+        prose="A steady inflow of each tank, or pulses of inflow, [[inflow]]: one of the two.",
     ),
     Section(
-        "pour",
-        POUR,
+        "inflow",
+        INFLOW,
         many=True,
         prose="A pulse of inflow into a tank, for recovery_time; as many as you like.",
     ),

@@ -1,5 +1,5 @@
 """What moves a rig besides its controller, as tables of a rig file: [reference], [reference.sine],
-[disturbance], [[pour]] and [[fault]].
+[disturbance], [[inflow]] and [[fault]].
 """
 
 import dataclasses
@@ -20,9 +20,7 @@ COURSE = ("ramp", "shape", "band", "filter")
 
 
 def steps(reference):
-    """The `Ramps` of a reference that [reference] can describe: itself, or what a sine is added to;
-    None of another.
-    """
+    """Return the `Ramps` of a reference that [reference] can describe; None of another."""
     if (
         isinstance(reference, Sum)
         and isinstance(reference.first, Ramps)
@@ -45,9 +43,7 @@ def reference_of(table, old, plant):
 
 
 def ramps_of(section, table, old, words, sizes):
-    """The Ramps of a table; what it leaves out is as in `old`. words: what a channel and its value
-    are called.
-    """
+    """Return the Ramps of a table; what it leaves out is as in `old`. words: channel and value."""
     own, known = {k.name: k for k in section.keys}, ramp_values(old)
     given = {name: v for name, v in known.items() if name in own and v is not None}
     start = {name: written(own[name], value) for name, value in given.items()}
@@ -58,9 +54,7 @@ def ramps_of(section, table, old, words, sizes):
 
 
 def _changes(label, changes, words, channels):
-    """[(time [s], channel from 0, value)] of a list as in a file; InputError unless they are in
-    order of time, and one for a channel and a time.
-    """
+    """[(time [s], channel from 0, value)] of a list as in a file, in order of time."""
     form = f"[time [s], {words[0]} from 1 to {channels}, {words[1]}]"
     if not isinstance(changes, list):
         raise InputError(f"{label} = {shortened(changes)}: must be a list of {form}")
@@ -117,32 +111,32 @@ def sine_values(sine):
 
 
 def disturbance_of(table, loop, names):
-    """What [disturbance] and [[pour]] of a rig file make of a loop's disturbance."""
+    """What [disturbance] and [[inflow]] of a rig file make of a loop's disturbance."""
     old, sizes = loop.disturbance, sizes_of(loop.plant, names)
     more = read_entry(SECTIONS["disturbance"], table.get("disturbance", {}), sizes)
     if "inflow" in more:
-        if table.get("pour"):
-            raise InputError("[disturbance] inflow and [[pour]]: give one of them")
+        if table.get("inflow"):
+            raise InputError("[disturbance] inflow and [[inflow]]: give one of them")
         old = Constant(level=more["inflow"])
-    if "pour" in table:
-        old = _pulses(read_entries(SECTIONS["pour"], table, sizes), old, loop.plant.tanks)
+    if "inflow" in table:
+        old = _pulses(read_entries(SECTIONS["inflow"], table, sizes), old, loop.plant.tanks)
     if "window" in more:
         if not isinstance(old, InflowPulses):
             raise InputError(
                 f"disturbance.window = {more['window']:g} s: is how long tanks are watched after a"
-                " [[pour]], and there is none: leave it out"
+                " [[inflow]], and there is none: leave it out"
             )
         old = dataclasses.replace(old, window=more["window"])
     return old
 
 
 def _pulses(entries, old, tanks):
-    """The disturbance of the [[pour]] tables; without any, `old` if it is no pulses."""
+    """The disturbance of the [[inflow]] tables; without any, `old` if it is no pulses."""
     if not entries:
         return None if isinstance(old, InflowPulses) else old
     if isinstance(old, Constant) and np.any(np.asarray(old.level) != 0.0):
         raise InputError(
-            "[[pour]]: this rig has a steady inflow already, and a rig file can have one of the two"
+            "[[inflow]]: this rig has a steady inflow already: a rig file can have one of the two"
         )
     return inflow_pulses(
         tanks, [(e["time"], e["duration"], e["tank"], e["volume"]) for e in entries]
@@ -174,7 +168,7 @@ def disturbance_tables(disturbance):
     volumes = np.asarray(disturbance.volume).tolist()
     rows = [(*event, volume) for event, volume in zip(disturbance.events, volumes)]
     pulses = [dict(zip(("time", "duration", "tank", "volume"), row)) for row in rows]
-    return [(steady, {"window": disturbance.window}), *((SECTIONS["pour"], p) for p in pulses)]
+    return [(steady, {"window": disturbance.window}), *((SECTIONS["inflow"], p) for p in pulses)]
 
 
 def fault_tables(found):

@@ -6,23 +6,20 @@ import numpy as np
 
 from jaxtank.case import Free
 from jaxtank.core.errors import InputError
-from jaxtank.core.toml_schema import Section
 from jaxtank.core.tree import describe, get_value, is_component, parameters, walk
 from jaxtank.measures import MEASURES, of_loop
 from jaxtank.measures import unit as measure_unit
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig import components
-from jaxtank.rig import schedule as scheduling
-from jaxtank.rig.lines import Block, Line, suggestion, toml
-from jaxtank.rig.schema import SECTIONS, SHARE, WEIGHT
+from jaxtank.rig.entry import Block, Line, suggestion, toml
+from jaxtank.rig.schema import SECTIONS, SHARE, WEIGHT, Section
+from jaxtank.rig.values import schedule, schedule_table
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps
 
 
 def absent(loop, name, meta):
-    """A value for an optional leaf that is not in use: the least one that is allowed, in the shape
-    of the leaf that it goes with.
-    """
+    """Return the least allowed value of an absent optional leaf, in its shape."""
     *path, _ = name.split(".")
     owner = loop
     for step in path:
@@ -80,9 +77,7 @@ def objective(case):
 
 
 def free(case):
-    """Lines of the parameters of controller and observer that could be free, over a decade each
-    way.
-    """
+    """Lines of gains of controller and observer that could be free, over a decade each way."""
     found, taken = [], {name.split("[")[0] for name in case.free} | {"controller.knots"}
     for name, value, meta in walk(case.loop):
         part, _, rest = name.partition(".")
@@ -95,9 +90,7 @@ def free(case):
 
 
 def around(value, meta):
-    """Free of a tenth to ten times a value within its range, or either side of 0 where it is not
-    positive; None of a range that is empty. meta: its description, as of `describe`.
-    """
+    """Return Free of a tenth to ten times a value within its range, None of an empty one."""
     value = np.asarray(value, dtype=float)
     if value.size == 0:
         return None
@@ -149,27 +142,24 @@ def _seconds(case, share):
 def _controller(case):
     """The case's own controller, as a start for another."""
     part = case.loop.controller
-    known = components.kind_of("law", part) is not None
+    known = components.kind_of("controller", part) is not None
     if not known or not is_component(getattr(part, "model", None)):
         return None  # also of a controller with a schedule, whose class has no name
-    return _component("law", part)
+    return _component("controller", part)
 
 
 def _component(name, part):
     """{key: value} of a controller or observer, and its section."""
     section, values = components.values_of(name, part)
-    word = {"law": "controller"}.get(name, name)
-    prose = f"Another {word} than the preset's: {', '.join(components.ROLES[name].classes)}."
-    if name == "law":
+    prose = f"Another {name} than the preset's: {', '.join(components.ROLES[name].classes)}."
+    if name == "controller":
         prose += " [values] above then has the names of that controller."
     return {"section": Section(name, section.keys, prose=prose), **values}
 
 
-def schedule(case):
-    """A [schedule] table that the case's controller allows, None where it allows none: its first
-    free gain along the first setpoint.
-    """
-    if scheduling.table_of(case.loop):
+def _schedule(case):
+    """The first free gain along the first setpoint, None where no schedule is allowed."""
+    if schedule_table(case.loop):
         return None
     rim = float(np.asarray(case.loop.plant.rim)[case.loop.plant.outputs[0]])
     knots = [_rounded(share * rim) for share in (0.25, 0.5, 0.75)]
@@ -177,7 +167,7 @@ def schedule(case):
         if name.startswith("controller.") and "model" not in name:
             for variable in ("r1", "h1"):
                 try:
-                    found = scheduling.schedule(case, {name: variable}, knots)
+                    found = schedule(case, {name: variable}, knots)
                     found.loop.controller.check(found.loop.reference)
                 except (InputError, LookupError, TypeError, ValueError):
                     continue
@@ -221,7 +211,7 @@ def _disturbance(case):
     return {"inflow": np.zeros(tanks)} if case.loop.disturbance is None else None
 
 
-def _pour(case):
+def _inflow(case):
     """A pulse of 1 % of the first tank, where there is no steady inflow."""
     steady, plant = case.loop.disturbance, case.loop.plant
     if isinstance(steady, Constant) and np.any(np.asarray(steady.level)):
@@ -281,12 +271,12 @@ def _log(case):
 
 
 EXAMPLES = {
-    "law": _controller,
-    "schedule": schedule,
+    "controller": _controller,
+    "schedule": _schedule,
     "observer": _observer,
     "reference.sine": _sine,
     "disturbance": _disturbance,
-    "pour": _pour,
+    "inflow": _inflow,
     "fault": _fault,
     "covariance": _covariance,
     "safety_filter": _safety_filter,

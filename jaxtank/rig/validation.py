@@ -20,10 +20,9 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.steady import steady_state
 from jaxtank.measures import MEASURES, check_names, entries
 from jaxtank.measures import unit as measure_unit
-from jaxtank.rig import schedule
 from jaxtank.rig.entry import is_finite, is_numeric, read_entry, sizes_of
 from jaxtank.rig.schema import SECTIONS
-from jaxtank.rig.values import by_dotted_name, set_scenario
+from jaxtank.rig.values import by_dotted_name, check_not_scheduled, scheduled_names, set_scenario
 from jaxtank.signals.setpoints import Ramps
 
 
@@ -58,24 +57,7 @@ def check(case: Case) -> Case:
 
 
 def unreachable(case: Case) -> str | None:
-    """Return which plateau of the reference has no steady state on this plant, and why, in a
-    sentence; None where all of them have one.
-
-    Parameters
-    ----------
-    case : Case
-
-    Returns
-    -------
-    A sentence, or None.
-
-    Examples
-    --------
-    >>> from jaxtank import presets, rig
-    >>> case = presets.find("gouta2015/backstepping")
-    >>> rig.unreachable(rig.set_values(case, {"reference.initial": [16.0, 3.0]}))[:40]
-    'reference: outputs (16, 3) cm have no st'
-    """
+    """Return why a plateau of the reference has no steady state, None where all have one."""
     plant, reference = case.loop.plant, case.loop.reference
     if isinstance(reference, Ramps) and plant.pumps == len(plant.outputs):
         for values in reference.plateaus(case.clock.duration):
@@ -87,23 +69,7 @@ def unreachable(case: Case) -> str | None:
 
 
 def check_uncertain(loop: ClosedLoop, uncertain: Mapping[str, Any]) -> dict[str, float]:
-    """Return the spreads of uncertain parameters after input validation.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    uncertain : {dotted name: spread as a share of the parameter [-]}
-
-    Raises
-    ------
-    InputError for a parameter that is not in use, and for a share that is not above 0 and below 1.
-
-    Examples
-    --------
-    >>> from jaxtank import presets, rig
-    >>> rig.check_uncertain(presets.find("cascaded/pi").loop, {"plant.drain": 0.1})
-    {'plant.drain': 0.1}
-    """
+    """Return {dotted name: spread as a share} after input validation."""
     for name, share in uncertain.items():
         get_value(loop, name)
         if not (is_finite(share, 0) and 0 < share < 1):
@@ -116,27 +82,7 @@ def check_uncertain(loop: ClosedLoop, uncertain: Mapping[str, Any]) -> dict[str,
 def uncovered(
     loop: ClosedLoop, name: str, share: float, covered: Iterable[str]
 ) -> dict[str, float]:
-    """Return the part of a spread in [uncertain] that other parameters do not cover.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    name : dotted name of the parameter
-    share : its spread [-]
-    covered : dotted names of parameters whose covariance is known
-
-    Returns
-    -------
-    {name: share}, entry by entry where `covered` has some entries of an array; a spread of an entry
-    of 0 is left out.
-
-    Examples
-    --------
-    >>> from jaxtank import presets, rig
-    >>> loop = presets.find("gouta2015/ngpc").loop
-    >>> rig.uncovered(loop, "plant.pump_gain", 0.1, ["plant.pump_gain[0]"])
-    {'plant.pump_gain[1]': 0.1}
-    """
+    """Return {name: share} of the entries of a spread that the names `covered` leave out."""
     if not any(split_index(c)[0] == split_index(name)[0] for c in covered):
         return {name: share}
     if "[" in name:
@@ -148,23 +94,7 @@ def uncovered(
 
 
 def check_limits(loop: ClosedLoop, limits: Mapping[str, Any]) -> dict[str, Any]:
-    """Return hard limits of measures after input validation.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    limits : {measure: upper limit in its unit, one or one per entry; "rim" for max_level}
-
-    Raises
-    ------
-    InputError for an unknown measure, and for a limit of another kind or number of entries.
-
-    Examples
-    --------
-    >>> from jaxtank import presets, rig
-    >>> rig.check_limits(presets.find("cascaded/pi").loop, {"max_level": "rim"})
-    {'max_level': 'rim'}
-    """
+    """Return {measure: upper limit, one or one per entry} after input validation."""
     check_names(limits)
     for measure, value in limits.items():
         if isinstance(value, str) and value == "rim" and measure == "max_level":
@@ -188,22 +118,7 @@ def check_limits(loop: ClosedLoop, limits: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_objective(objective: Mapping[str, Any]) -> dict[str, float]:
-    """Return the weights of an objective after input validation.
-
-    Parameters
-    ----------
-    objective : {measure: weight [-]}
-
-    Raises
-    ------
-    InputError for an unknown measure, a weight below 0, and no weight above 0.
-
-    Examples
-    --------
-    >>> from jaxtank import rig
-    >>> rig.check_objective({"rms_error_total": 1})
-    {'rms_error_total': 1.0}
-    """
+    """Return {measure: weight} after input validation."""
     check_names(objective)
     for measure, weight in objective.items():
         if not (is_finite(weight, 0) and weight >= 0):
@@ -216,30 +131,7 @@ def check_objective(objective: Mapping[str, Any]) -> dict[str, float]:
 
 
 def check_free(loop: ClosedLoop, name: str, low: Any, high: Any, scale: str = "log") -> Free:
-    """Return the range of a free parameter after input validation.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    name : dotted name of a leaf, or of an entry of it
-    low, high : ends of the range, in the parameter's unit
-    scale : "log" or "linear"
-
-    Returns
-    -------
-    Free; its scale is "linear" where `low` is not above 0.
-
-    Raises
-    ------
-    InputError for a parameter that does not exist, is not in use or is no number, and for a range
-    that is empty or not within what the parameter allows.
-
-    Examples
-    --------
-    >>> from jaxtank import presets, rig
-    >>> rig.check_free(presets.find("cascaded/pi").loop, "controller.Kc", 0.1, 10.0)
-    Free(low=0.1, high=10.0, scale='log')
-    """
+    """Return the range of a free parameter after input validation; linear where low <= 0."""
     is_clock = name.startswith("clock.") and name.removeprefix("clock.") in CLOCK_UNITS
     meta: dict[str, Any] = {"kind": "static"} if is_clock else describe(loop, name)
     if meta["kind"] == "static":
@@ -247,7 +139,7 @@ def check_free(loop: ClosedLoop, name: str, low: Any, high: Any, scale: str = "l
             f"free {name}: cannot be tuned, it is part of the compiled program and not a number"
             " with a derivative"
         )
-    schedule.check_not_scheduled(loop, name)
+    check_not_scheduled(loop, name)
     get_value(loop, name)
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
@@ -273,7 +165,7 @@ def free_of(loop, table):
                 f'free {name} = {shortened(spec)}: must be [low, high] or [low, high, "log" or'
                 ' "linear"]'
             )
-        for own in schedule.names_of(loop, name):
+        for own in scheduled_names(loop, name):
             found[own] = check_free(loop, own, *spec)
     return found
 
@@ -294,9 +186,7 @@ def scenario(case, entry, index):
 
 
 def check_log(plant, table):
-    """{slot: header or (header, unit)} of a [log] table; InputError for a slot that the plant does
-    not have, and for a column that is given twice.
-    """
+    """Return {slot: header or (header, unit)} of a [log] table after input validation."""
     pumps = (f"pump{j + 1}" for j in range(plant.pumps))
     slots = ["t", *pumps, *(f"h{i + 1}" for i in range(plant.tanks))]
     found = {}
@@ -320,9 +210,7 @@ def check_log(plant, table):
 
 
 def check_covariance(loop, table):
-    """(names, rows) of a [covariance] table; InputError unless it is a covariance of scalars of the
-    loop.
-    """
+    """Return (names, rows) of a [covariance] table after input validation."""
     values = read_entry(SECTIONS["covariance"], table, sizes_of(loop.plant))
     names, size = values["names"], len(values["names"])
     if len(set(names)) < size:

@@ -1,4 +1,4 @@
-"""Setting what a case has by dotted name: leaves, static fields, the clock; scenarios."""
+"""What a case has by dotted name, set: leaves, static fields, the clock; scenarios; schedules."""
 
 import dataclasses
 import re
@@ -7,18 +7,27 @@ from typing import Any
 
 import numpy as np
 
-from jaxtank.case import Case
+from jaxtank.case import Case, Free
+from jaxtank.controllers.gain_schedule import Scheduled, check_gains, check_knots, check_variable
 from jaxtank.core.checks import check_value
 from jaxtank.core.clock import CLOCK_UNITS, check_clock
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.text import shortened
-from jaxtank.core.tree import describe, get_value, parameters, split_index, walk, with_values
+from jaxtank.core.tree import (
+    describe,
+    get_value,
+    number,
+    parameters,
+    split_index,
+    walk,
+    with_values,
+)
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.floor import draws
 from jaxtank.loop.steady import steady_state
 from jaxtank.plants.tank_network import TankNetwork
-from jaxtank.rig import schedule
-from jaxtank.rig.entry import is_numeric, plain, static_value, unit
+from jaxtank.rig.entry import is_numeric, plain, read_entry, sizes_of, static_value, unit
+from jaxtank.rig.schema import SECTIONS
 
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
 """Where controller and observer hold the plant's parameters, by the same names."""
@@ -33,10 +42,7 @@ _RELATIVE = re.compile(
 
 
 def by_dotted_name(table, where):
-    """{dotted name: value} of a table in which names may be written without quotation marks:
-    `clock.dt = 0.5` and [values.controller] are tables in tables to TOML. InputError, naming the
-    table `where`, for a name that is given both ways.
-    """
+    """Return {dotted name: value} of a table in which names may be written without quotes."""
     found = {}
     for key, value in table.items():
         # a name that is quoted is whole: its value is no table
@@ -93,7 +99,7 @@ def set_values(case: Case, values: Mapping[str, Any]) -> Case:
             raise InputError(
                 f"{name} = {shortened(value)}: must be a number or a list of numbers{unit(meta)}"
             )
-        schedule.check_not_scheduled(case.loop, name)
+        check_not_scheduled(case.loop, name)
         loop = with_values(case.loop, {name: value})
         if parameters(loop).get(split_index(name)[0]) is not None:  # an infinite Ti is none
             check_value(name, get_value(loop, name), meta)
@@ -102,9 +108,7 @@ def set_values(case: Case, values: Mapping[str, Any]) -> Case:
 
 
 def with_models(loop, values):
-    """Return `values` with the plant's parameters among them for the models that hold them too, and
-    those of the controller's model for that of the observer.
-    """
+    """Return `values` with those of the plant for the models that follow it."""
     names = {name for kind in ("leaf", "static") for name, _, _ in walk(loop, kind=kind)}
     found = {}
     for owner, models in (("plant.", MODELS), *((model, MODELS[-1:]) for model in MODELS[:-1])):
@@ -156,28 +160,7 @@ def set_scenario(case: Case, values: Mapping[str, Any]) -> Case:
 
 
 def overridden(case: Case, values: Mapping[str, Any]) -> tuple[Case, dict[str, list[str]]]:
-    """Let values that were set in a case take the place of those of its scenarios.
-
-    A factor ("x1.3") or an offset ("by -0.5") of a scenario stays, and is applied to what is set.
-
-    Parameters
-    ----------
-    case : Case in which `values` are set
-    values : {dotted name: value}
-
-    Returns
-    -------
-    (Case, {name in `values`: names of the scenarios that had their own}).
-
-    Examples
-    --------
-    >>> from jaxtank import presets, rig
-    >>> from jaxtank.case import Scenario
-    >>> noisy = Scenario("noisy", {"sensor.noise": 0.1})
-    >>> case = presets.find("cascaded/pi").replace(scenarios=(noisy,))
-    >>> rig.overridden(case, {"sensor.noise": 0.0})[1]
-    {'sensor.noise': ['noisy']}
-    """
+    """Return (case with `values` in place of its scenarios' own, {name: scenarios that had it})."""
     scenarios, replaced = [], {}
     for s in case.scenarios:
         kept = {}
@@ -193,32 +176,12 @@ def overridden(case: Case, values: Mapping[str, Any]) -> tuple[Case, dict[str, l
 
 
 def overlap(one: str, other: str) -> bool:
-    """Return whether two dotted names have an entry in common.
-
-    Parameters
-    ----------
-    one, other : dotted names, each of a leaf or of an entry of it
-
-    Examples
-    --------
-    >>> overlap("x0", "x0[1]"), overlap("x0[0]", "x0[1]")
-    (True, False)
-    """
+    """Return whether two dotted names, of leaves or of entries, have an entry in common."""
     return one == other or split_index(one)[0] == other or one == split_index(other)[0]
 
 
 def is_change(value: Any) -> bool:
-    """Return whether the value of a scenario is a factor or an offset on the case's own.
-
-    Parameters
-    ----------
-    value : number, list, or text as in `set_scenario`
-
-    Examples
-    --------
-    >>> is_change("x1.3"), is_change("by -0.5"), is_change("0.02 if zero"), is_change(1.3)
-    (True, True, False, False)
-    """
+    """Return whether the value of a scenario is a factor or an offset on the case's own."""
     found = _RELATIVE.fullmatch(value.strip()) if isinstance(value, str) else None
     return found is not None and found["default"] is None
 
@@ -266,46 +229,15 @@ def _meta(case, name):
 
 
 def set_and_schedule(case: Case, values: Mapping[str, Any], table: Mapping[str, Any]) -> Case:
-    """Return `set_values` of a case with a schedule of gains.
-
-    What the case has by name is set before the schedule is made, which starts from it; what only
-    the scheduled case has, as controller.values, after.
-
-    Parameters
-    ----------
-    case : Case
-    values : {dotted name: value}
-    table : {"gains", "variable", "knots"} as [schedule] of a rig file; {} for no schedule
-
-    Raises
-    ------
-    InputError as `set_values`, and for gains, a variable or knots that make no schedule.
-
-    Examples
-    --------
-    >>> from jaxtank import presets, rig
-    >>> table = {"gains": ["controller.Tp"], "variable": "r1", "knots": [5.0, 10.0]}
-    >>> case = presets.find("gouta2015/ngpc")
-    >>> rig.set_and_schedule(case, {"controller.Tp": 3.0}, table).loop.controller.values.tolist()
-    [[3.0, 3.0]]
-    """
+    """Return `set_values` of a case with the schedule of a [schedule] table; {}: none."""
     if table:
-        before, values = schedule.known(case.loop, values)
-        case = schedule.from_table(set_values(case, before), table)
+        before, values = _known(case.loop, values)
+        case = _with_schedule(set_values(case, before), table)
     return set_values(case, values)
 
 
 def with_bottom(case: Case) -> Case:
-    """Return the case with `plant.bottom` where liquid can be drawn out of its tanks, in its own
-    run or in a scenario: no level then falls below 0. Models of the plant follow.
-
-    Examples
-    --------
-    >>> from jaxtank import presets, rig
-    >>> case = rig.set_values(presets.find("gouta2015/ngpc"), {"actuator.low": -1.0})
-    >>> case.loop.plant.bottom, rig.with_bottom(case).loop.plant.bottom
-    (False, True)
-    """
+    """Return the case with `plant.bottom` where liquid can be drawn out of its tanks."""
     plant: Any = case.loop.plant
     if not isinstance(plant, TankNetwork) or plant.bottom or not _draws(case):
         return case
@@ -324,19 +256,7 @@ def _draws(case):
 
 
 def has(loop: ClosedLoop, name: str) -> bool:
-    """Return whether a loop has a leaf.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    name : dotted name of a leaf, or of an entry of it, "name[i]"
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> has(presets.find("cascaded/pi").loop, "x0[2]")
-    False
-    """
+    """Return whether a loop has a leaf, or an entry of one, of this dotted name."""
     try:
         get_value(loop, name)
     except InputError:
@@ -371,3 +291,147 @@ def _set_static(tree, name, path, value, meta):
             f"{name} is the topology of the rig and cannot be set: choose another case"
         )
     return dataclasses.replace(tree, **{path[0]: static_value(name, value, meta, type(old))})
+
+
+CONTROLLER = "controller."
+
+
+def schedule(case, gains, knots):
+    """Return a copy of `case` with scheduled gains: the same run, until values at knots change."""
+    loop, part = case.loop, case.loop.controller
+    if isinstance(part, Scheduled):
+        raise InputError("the controller has a schedule already: name all its gains in one")
+    names = [entry for name in gains for entry in _entries(loop, name)]
+    check_gains(part, tuple(names))
+    if len(set(gains.values())) != 1:
+        raise InputError(
+            f"schedule variables {', '.join(map(str, gains.values()))}: must be one for all gains"
+        )
+    variable = next(iter(gains.values()))
+    check_variable(variable, len(loop.plant.outputs), loop.plant.tanks)
+    check_knots(knots)
+    knots = number(knots)
+    values = number([[float(get_value(part, name))] * knots.size for name in names])
+    numbers = [name for name in names if not split_index(name)[1]]
+    part = _emptied(part, numbers)
+    controller = Scheduled(
+        law=part, knots=knots, values=values, gains=tuple(names), variable=variable
+    )
+    controller.check(loop.reference)
+    free = _free(case, names, knots.size)
+    return case.replace(loop=dataclasses.replace(loop, controller=controller), free=free)
+
+
+def unscheduled(loop):
+    """Return `loop` with its controller without a schedule, its gains those of the first knot."""
+    part = loop.controller
+    if not isinstance(part, Scheduled):
+        return loop
+    first = dict(zip(part.gains, np.asarray(part.values)[:, 0]))
+    return dataclasses.replace(loop, controller=with_values(part.law, first))
+
+
+def check_not_scheduled(loop, name):
+    """Raise InputError if `name` is a gain that a schedule gives, and not the controller's own."""
+    part, inner = loop.controller, name.removeprefix(f"{CONTROLLER}law.")
+    if isinstance(part, Scheduled) and name.startswith(f"{CONTROLLER}law.") and inner in part.gains:
+        raise InputError(
+            f"{name} is scheduled: it is controller.values[{part.gains.index(inner)},j] at knot j,"
+            " counted from 0"
+        )
+
+
+def scheduled_names(loop, name):
+    """Return the names in `loop` of what an unscheduled controller calls `name`."""
+    part, inner = loop.controller, name.removeprefix(CONTROLLER)
+    if (
+        not isinstance(part, Scheduled)
+        or not name.startswith(CONTROLLER)
+        or inner.split("[")[0].split(".")[0] in ("law", "values", "knots")
+    ):
+        return [name]
+    rows = [i for i, gain in enumerate(part.gains) if gain == inner or gain.split("[")[0] == inner]
+    if rows:
+        return [f"{CONTROLLER}values[{i},{j}]" for i in rows for j in range(np.size(part.knots))]
+    return [f"{CONTROLLER}law.{inner}"]
+
+
+def schedule_table(loop):
+    """Return {"gains", "variable", "knots"} of a scheduled loop; empty without a schedule."""
+    part = loop.controller
+    if not isinstance(part, Scheduled):
+        return {}
+    return {
+        "gains": [CONTROLLER + g for g in part.gains],
+        "variable": part.variable,
+        "knots": np.asarray(part.knots).tolist(),
+    }
+
+
+def _with_schedule(case, table):
+    """Return `schedule` of a table as `schedule_table` makes it."""
+    values = read_entry(SECTIONS["schedule"], table, sizes_of(case.loop.plant))
+    gains, knots = values["gains"], table["knots"]
+    for gain in gains:
+        if gains.count(gain) > 1:
+            raise InputError(f"schedule.gains: {gain} is scheduled twice: name it once")
+    if not isinstance(knots, list):
+        raise InputError(f"schedule.knots = {knots!r}: must be a list of numbers")
+    return schedule(case, dict.fromkeys(gains, table["variable"]), knots)
+
+
+def _known(loop, values):
+    """Return (values of names that `loop` or a clock has, the others)."""
+    names = {name for kind in ("leaf", "static") for name, _, _ in walk(loop, kind=kind)}
+    before = {n: v for n, v in values.items() if n.split("[")[0] in names or n.startswith("clock.")}
+    return before, {n: v for n, v in values.items() if n not in before}
+
+
+def _entries(loop, name):
+    """The scalars that a name stands for, without the "controller."."""
+    if not name.startswith(CONTROLLER):
+        raise unknown("gain", name, [n for n in parameters(loop) if n.startswith(CONTROLLER)])
+    inner = name.removeprefix(CONTROLLER)
+    try:
+        found = describe(loop, name)
+    except InputError:
+        raise unknown(
+            "gain", name, [n for n in parameters(loop) if n.startswith(CONTROLLER)]
+        ) from None
+    if found["kind"] == "static" or split_index(name)[1]:
+        return [inner]
+    return [
+        inner + (f"[{','.join(map(str, i))}]" if i else "")
+        for i in np.ndindex(np.shape(get_value(loop, name)))
+    ]
+
+
+def _emptied(part, names):
+    """`part` without the leaves `names`."""
+    for name in names:
+        part = _without(part, name.split("."))
+    return part
+
+
+def _without(tree, path):
+    return dataclasses.replace(
+        tree, **{path[0]: _without(getattr(tree, path[0]), path[1:]) if path[1:] else None}
+    )
+
+
+def _free(case, gains, knots):
+    """What is free with scheduled gains: their values at knots, the rest under new names."""
+    free = {}
+    for name, spec in case.free.items():
+        if not name.startswith(CONTROLLER):
+            free[name] = spec
+            continue
+        entries = _entries(case.loop, name)
+        untouched = not set(entries) & set(gains)
+        for entry in [name.removeprefix(CONTROLLER)] if untouched else entries:
+            if entry in gains:
+                row = gains.index(entry)
+                free |= {f"{CONTROLLER}values[{row},{j}]": Free(*spec) for j in range(knots)}
+            else:
+                free[f"{CONTROLLER}law.{entry}"] = spec
+    return free

@@ -12,9 +12,8 @@ from jaxtank.loop.disturbance_use import is_unused
 from jaxtank.loop.floor import is_open
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.signals import steps
-from jaxtank.signals.courses import index
 from jaxtank.signals.inflows import InflowPulses
-from jaxtank.signals.setpoints import Sine
+from jaxtank.signals.setpoints import Sine, index
 
 
 def case_warnings(case: Case) -> list[str]:
@@ -54,23 +53,7 @@ def case_warnings(case: Case) -> list[str]:
 
 
 def clock_warnings(clock: Clock) -> list[str]:
-    """Return a sentence where a run, which is made of whole samples, does not end when it is asked
-    to.
-
-    Parameters
-    ----------
-    clock : Clock
-
-    Returns
-    -------
-    At most one sentence.
-
-    Examples
-    --------
-    >>> from jaxtank import Clock, rig
-    >>> rig.clock_warnings(Clock(dt=7.0, duration=300.0))[0].partition(":")[2]
-    ' the run ends at 301 s'
-    """
+    """Return a sentence where a run of whole samples does not end when it is asked to."""
     end = (clock.samples - 1) * clock.dt
     if abs(end - clock.duration) <= 1e-6 * clock.dt:
         return []
@@ -232,29 +215,7 @@ def _unused(case):
 
 
 def model_warnings(case: Case) -> list[str]:
-    """Return a sentence for each parameter in a model of controller or observer that differs from
-    the plant's by more than its uncertainty.
-
-    The uncertainty is the share in [uncertain], or two standard deviations of [covariance]; nothing
-    but rounding where neither has the parameter. Rims count only in a model in which they are
-    physics, and no model that its controller does not read (PID without feed-forward).
-
-    Parameters
-    ----------
-    case : Case
-
-    Returns
-    -------
-    A sentence for each parameter.
-
-    Examples
-    --------
-    >>> from jaxtank import presets, rig
-    >>> case = presets.find("gouta2015/ngpc")
-    >>> wrong = rig.set_values(case, {"controller.model.gravity": 900.0})
-    >>> rig.model_warnings(wrong)[0][:66]
-    'controller.model.gravity = 900 cm/s^2, and plant.gravity = 981 cm/'
-    """
+    """Return a sentence for each parameter of a model that is off by more than its uncertainty."""
     found = []
     for holder in ("controller", "observer"):
         part = getattr(case.loop, holder)

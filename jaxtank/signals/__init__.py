@@ -1,19 +1,17 @@
 """References and disturbances as functions of time, sampled before the time loop starts."""
 
 from jaxtank.signals.base import Constant, Signal, Sum, Table
-from jaxtank.signals.inflows import InflowPulses, Pours, inflow_pulses, pours
+from jaxtank.signals.inflows import InflowPulses, inflow_pulses
 from jaxtank.signals.setpoints import Ramps, Sine, ramps
 
 __all__ = [
     "Constant",
     "InflowPulses",
-    "Pours",
     "Ramps",
     "Signal",
     "Sine",
     "Sum",
     "Table",
     "inflow_pulses",
-    "pours",
     "ramps",
 ]

@@ -120,6 +120,3 @@ def inflow_pulses(tanks: int, entries: Sequence[tuple[float, float, int, float]]
         ),
         width=tanks,
     )
-
-
-Pours, pours = InflowPulses, inflow_pulses  # their former names

@@ -128,7 +128,7 @@ def _tanks(rng, topology, features):
         "safety_filter": {},
     }
     table["plant"]["outputs"] = [int(rng.integers(n)) + 1]
-    table["law"] = {"kind": "open-loop", "initial": [0.0] * len(table["pump"])}
+    table["controller"] = {"kind": "open-loop", "initial": [0.0] * len(table["pump"])}
     table["values"] |= {"clock.duration": 600.0, "clock.substeps": int(rng.choice([1, 4]))}
     return {name: part for name, part in table.items() if part != []}
 
@@ -286,7 +286,7 @@ def _pulses(low, high):
     def addition(rng, table):
         for tank in table["tank"]:
             tank.pop("inflow", None)
-        table["pour"] = [
+        table["inflow"] = [
             {
                 "time": float(rng.uniform(0.0, 60.0)),
                 "duration": float(rng.uniform(0.2, 5.0)),
@@ -329,7 +329,7 @@ def _there(table, name):
     if part == "actuator":
         return field in ("low", "high", "initial") or name in table["values"]
     if part == "disturbance":
-        return "pour" in table if field == "volume" else _inflow_there(table)
+        return "inflow" in table if field == "volume" else _inflow_there(table)
     return "fault" in table if part == "faults" else True
 
 
@@ -355,7 +355,7 @@ def _uncertain_instruments(rng, table):
 
 
 def _uncertain_inflow(rng, table):
-    if "pour" not in table and not _inflow_there(table):
+    if "inflow" not in table and not _inflow_there(table):
         _inflow(0.0, 25.0)(rng, table)
     _uncertain("disturbance.level", "disturbance.volume")(rng, table)
 

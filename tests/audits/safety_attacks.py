@@ -363,7 +363,7 @@ def values_of(table):
         "sensor.gain": np.ones(n),
         "sensor.full_scale": np.array([5.0]),
         "disturbance.level": column("tank", "inflow", 0.0),
-        "disturbance.volume": column("pour", "volume"),
+        "disturbance.volume": column("inflow", "volume"),
         "faults.factor": column("fault", "factor"),
         "x0": column("tank", "level"),
     }
@@ -462,7 +462,7 @@ def inflow_of(rng, table, box, samples, count):
         drawn = rng.choice([0.0, 1.0, 1.0], (samples, count, n))
         signs = rng.choice([-1.0, 1.0], (samples, count, n))
         inflow += held(rng, samples, count, drawn * (level + signs * width), [10, 100])
-    for k, pulse in enumerate(table.get("pour", ())):
+    for k, pulse in enumerate(table.get("inflow", ())):
         volume, off = box.values["disturbance.volume"], box.widths.get("disturbance.volume")
         for row in range(count):
             length = max(1, round(pulse["duration"] / hold)) if row % 2 else 1

@@ -67,7 +67,7 @@ def broken(text, rng):
         elif what == 4:
             lines.insert(
                 i,
-                f"{rng.choice(['tank', 'values', 'x', 'clock.dt', 'law', 'case'])} ="
+                f"{rng.choice(['tank', 'values', 'x', 'clock.dt', 'controller', 'case'])} ="
                 f" {rng.choice(WORDS)}",
             )
         elif what == 5:
@@ -77,7 +77,7 @@ def broken(text, rng):
                     [
                         "[values]",
                         "[[tank]]",
-                        "[law]",
+                        "[controller]",
                         "[reference]",
                         "[]",
                         "[[",

@@ -36,7 +36,7 @@ from scipy.optimize import minimize
 import jaxtank  # noqa: F401  (before jax starts)
 from jaxtank import presets
 from jaxtank.case import Free
-from jaxtank.rig.schedule import schedule
+from jaxtank.rig.values import schedule
 from jaxtank.signals.setpoints import ramps
 from tuning.problem.problem import Problem
 from tuning.problem.scenarios import coarse_clock

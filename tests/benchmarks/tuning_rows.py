@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from jaxtank import presets, rig
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Free, Scenario
-from jaxtank.presets.loops import khalid, mirakhorli
+from jaxtank.presets import khalid, mirakhorli
 
 
 class Bound(NamedTuple):

@@ -15,8 +15,8 @@ from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.controllers.pid import oustaloup
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import EquilibriumError, InputError
+from jaxtank.presets import gouta2022 as loops
 from jaxtank.presets import gouta2022 as paper
-from jaxtank.presets.loops import gouta2022 as loops
 
 CASES = paper.preset().cases
 NO_DEAD_ZONE = {"actuator.dead_zone": 0.0}
@@ -543,7 +543,7 @@ def test_verdicts_follow_the_numbers():
         "the observer spares the pumps",
     ]
     found = paper.measured(known_run)
-    assert set(found) <= set(paper.PUBLISHED)
+    assert set(found) <= set(presets.load("gouta2022").published)
     assert [found[c].verdict for c in claims] == ["not reproduced"] * 4
     assert found["rise of tank 2 and 1 by an inflow pulse"].verdict == "partly"
     swap = {"enmpc-printed": "enmpc", "chadpc": "enmpc", "enmpc": "chadpc"}

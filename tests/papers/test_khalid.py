@@ -28,8 +28,8 @@ from jaxtank.controllers.laguerre import laguerre_functions
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop.run import evaluate_compiled
+from jaxtank.presets import khalid
 from jaxtank.presets import khalid as paper
-from jaxtank.presets.loops import khalid
 
 DT = 2.0
 PRESET = presets.load("khalid")

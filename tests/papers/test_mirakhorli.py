@@ -41,9 +41,17 @@ from jaxtank.plants.network import TankNetwork
 from jaxtank.plants.rigs import johansson
 from jaxtank.plants.runge_kutta import integrate
 from jaxtank.presets import load
-from jaxtank.presets.loops.mirakhorli import GAIN, RELAY, SETPOINT, UNROUNDED_SPLIT, plant, sliding
-from jaxtank.presets.mirakhorli import measured, response
-from jaxtank.presets.rows import mirakhorli as rows
+from jaxtank.presets import mirakhorli as rows
+from jaxtank.presets.mirakhorli import (
+    GAIN,
+    RELAY,
+    SETPOINT,
+    UNROUNDED_SPLIT,
+    measured,
+    plant,
+    response,
+    sliding,
+)
 from tuning.report import papers
 
 PLANT = plant()

@@ -38,7 +38,7 @@ def labels(paper):
 def sources():
     """(path, text) of every module and test that may refer to a note."""
     for folder in (Path(jaxtank.__file__).parent, Path(tuning.__file__).parent, TESTS):
-        for path in sorted(folder.rglob("*.py")):
+        for path in sorted((*folder.rglob("*.py"), *folder.rglob("presets/*.toml"))):
             if path != Path(__file__):
                 yield path, path.read_text()
 

@@ -13,8 +13,9 @@ from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import parameters, with_values
 from jaxtank.observers import Direct
+from jaxtank.presets import gouta2022, mirakhorli
 from jaxtank.presets.paper import Claim, Published, Sample
-from jaxtank.presets.rows import gouta2022, mirakhorli, robustness
+from jaxtank.presets.rows import robustness
 from jaxtank.presets.rows.operations import operations, sample_operations
 from tuning.problem.problem import Problem
 from tuning.report import papers

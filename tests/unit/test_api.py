@@ -62,7 +62,7 @@ class Offset(Observer):
 RIG = """
 case = "cascaded/pi"
 name = "own"
-[law]
+[controller]
 kind = "proportional"
 Kc = 2.0
 bias = 4.0
@@ -132,9 +132,9 @@ def test_keys_of_a_registered_controller_are_checked(own):
     for text, words in (
         (RIG.replace("Kc = 2.0\n", ""), r"needs Kc \[V/V\]: gain"),
         (RIG.replace("bias = 4.0\n", ""), "needs bias"),
-        (RIG.replace("divisor = 2", "divisor = 0.5"), "law.divisor = 0.5: must be"),
-        (RIG.replace("divisor = 2", "divider = 2"), "unknown key of .law. 'divider'"),
-        (RIG.replace("Kc = 2.0", "Kc = [2.0]"), "law.Kc = .*one number"),
+        (RIG.replace("divisor = 2", "divisor = 0.5"), "controller.divisor = 0.5: must be"),
+        (RIG.replace("divisor = 2", "divider = 2"), "unknown key of .controller. 'divider'"),
+        (RIG.replace("Kc = 2.0", "Kc = [2.0]"), "controller.Kc = .*one number"),
         (RIG.replace('kind = "offset"', 'kind = "proportional"'), "unknown observer kind"),
     ):
         with pytest.raises(InputError, match=words):

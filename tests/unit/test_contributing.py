@@ -48,7 +48,7 @@ def added(tmp_path):
 RIG = """
 case = "cascaded/pi"
 name = "own"
-[law]
+[controller]
 kind = "biased-proportional"
 Kc = 1.0
 bias = 4.0
@@ -115,7 +115,7 @@ def test_the_command_finds_a_controller_of_an_installed_package(installed, tmp_p
     path.write_text(RIG)
     (tmp_path / "fake_control.py").write_text("raise SystemExit('imported from beside the rig')")
     found = command("simulate", str(path))
-    assert found.code == 2 and "unknown law kind 'biased-proportional'" in found.err
+    assert found.code == 2 and "unknown controller kind 'biased-proportional'" in found.err
     installed()
     path.write_text(RIG.replace("biased-", "biassed-"))
     found = command("show", str(path))

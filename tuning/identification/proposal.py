@@ -38,13 +38,13 @@ def check_kind(kind, case):
     if kind not in KINDS:
         raise InputError(
             f"--law {kind!r}: must be one of {', '.join(KINDS)}; other controllers go into the"
-            " [law] section of a rig file"
+            " [controller] section of a rig file"
         )
     plant = case.loop.plant
     if len(plant.outputs) != plant.pumps:
         raise InputError(
             f"--law {kind}: needs one pump per controlled tank, the rig has {plant.pumps} pumps and"
-            f" {len(plant.outputs)}: add a [law] section of another kind to the rig file"
+            f" {len(plant.outputs)}: add a [controller] section of another kind to the rig file"
         )
 
 
@@ -104,7 +104,7 @@ def _gain_and_time(loop, model, inputs):
             at = ", ".join(f"{v:g}" for v in inputs)
             raise InputError(
                 f"pump {j + 1} does not settle tank {loop.plant.outputs[j] + 1} at inputs ({at})"
-                f" {loop.units[1]}: no PI of its own, use another [law]"
+                f" {loop.units[1]}: no PI of its own, use another [controller]"
             )
     return gain, area / gain + loop.actuator.delay
 
@@ -120,7 +120,7 @@ def _stable(model, Kc, Ti):
             return Kc
         Kc = 0.5 * Kc
     raise InputError(
-        "output i under a PI of pump i is not stable at any gain tried: use another [law]"
+        "output i under a PI of pump i is not stable at any gain tried: use another [controller]"
     )
 
 
@@ -141,7 +141,7 @@ def _with_changes(case, x, start, inputs, slowest):
             return rigs.check(found.replace(reachable=True))
     raise InputError(
         f"no setpoints about {', '.join(f'{v:.4g}' for v in start)} {loop.units[0]} can be held:"
-        " add [law] and [reference]"
+        " add [controller] and [reference]"
     )
 
 
@@ -168,6 +168,6 @@ def _steady(loop, inputs):
     for i in np.flatnonzero((x >= rim) | (x <= 1e-3 * rim) | (span > LONGEST)):
         raise InputError(
             f"tank {i + 1} has no steady level between 0 and its rim at the mean inputs of the"
-            f" data, ({at}) {loop.units[1]}: add [law], [reference] and [free]"
+            f" data, ({at}) {loop.units[1]}: add [controller], [reference] and [free]"
         )
     return x

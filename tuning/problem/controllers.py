@@ -51,10 +51,10 @@ class Rig(NamedTuple):
 
 def with_kind(case: Case, kind: str) -> Case:
     """Return a case with a controller of another kind in the place of its own."""
-    known = ROLES["law"].classes
+    known = ROLES["controller"].classes
     if kind not in known:
         raise unknown("controller kind", str(kind), known)
-    if kind_of("law", case.loop.controller) == kind:
+    if kind_of("controller", case.loop.controller) == kind:
         return case
     if kind in REGISTERED or kind not in START:
         raise InputError(
@@ -73,7 +73,7 @@ def _published(case: Case, kind: str) -> tuple[Any, dict[str, Any]] | None:
     if paper not in presets.PAPERS:
         return None
     for other in presets.load(paper).cases.values():
-        if kind_of("law", other.loop.controller) == kind and _same(other, case):
+        if kind_of("controller", other.loop.controller) == kind and _same(other, case):
             free = {n: f for n, f in other.free.items() if n.startswith("controller.")}
             controller: Any = other.loop.controller
             if hasattr(controller, "model"):

@@ -146,7 +146,7 @@ def undefined(measure: str, case: Case) -> tuple[str, list[bool]]:
     onset = None if loop.disturbance is None else loop.disturbance.since(clock)
     since = np.full(1, -1.0) if onset is None else np.asarray(onset)
     if "since" in wanted and onset is not None:
-        why = f"no inflow disturbance begins within its {clock.duration:g} s; add one ([[pour]])"
+        why = f"no inflow disturbance begins within its {clock.duration:g} s; add one ([[inflow]])"
         return why, [not np.any(since >= 0.0)] * ms.entries(measure, loop.plant)
     found = windows(loop, clock) if "window" in wanted else None
     if found is not None:

@@ -123,8 +123,8 @@ def _variant(case, values, kinds, free):
     rest = {name: value for name, value in values.items() if name not in kinds}
     if kinds:
         kind = values[kinds[0]]
-        if kind not in ROLES["law"].classes:
-            raise unknown("controller kind", str(kind), ROLES["law"].classes)
+        if kind not in ROLES["controller"].classes:
+            raise unknown("controller kind", str(kind), ROLES["controller"].classes)
         try:
             case = with_kind(case, kind)
         except InputError as error:

@@ -50,6 +50,6 @@ def sample_operations(loop: ClosedLoop, clock: Clock) -> int:
     state = loop.observer.init(levels), loop.controller.init(levels, before)
 
     def sample(state: Any, y: Any, r: Any, dr: Any) -> Any:
-        return decide(loop, *state, Tick(t=0.0, r=r, dr=dr, ddr=dr, dt=clock.dt), y)
+        return decide(loop, state[0], state[1], Tick(t=0.0, r=r, dr=dr, ddr=dr, dt=clock.dt), y)
 
     return operations(jax.make_jaxpr(sample)(state, levels, outputs, outputs).jaxpr)

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
-from jaxtank.presets.paper import Claim, Published
+from jaxtank.presets.paper import Claim
 from jaxtank.xla.jit import compiled
 
 N = 200
@@ -28,51 +28,6 @@ MEASURES = (
     "saturated_fraction",
     "overshoot_percent",
 )
-
-_WHERE = "sec. 5.3"
-_ROWS = {
-    "uncertain plants: stable loops": Published("with both controllers", "", _WHERE),
-    "uncertain plants: growth of the error": Published(
-        "smaller with backstepping (more robust)", "", f"{_WHERE}, Table 2"
-    ),
-    "uncertain plants: size of the error": Published(
-        "smaller with backstepping (more robust)",
-        "",
-        f"{_WHERE}, Table 2",
-        reason="only the growth of the error over its nominal value is smaller: backstepping lags"
-        " behind ramps on every plant (gouta2015 notes S11)",
-    ),
-    "uncertain plants: precision": Published("better with NGPC", "", f"{_WHERE}, Table 2"),
-    "uncertain plants: steady error": Published(
-        "compensated by both controllers",
-        "",
-        _WHERE,
-        reason="no controller here has integral action (gouta2015 notes S7.4): true of the nominal"
-        " plant alone",
-    ),
-    "uncertain plants: overshoot": Published("especially with NGPC", "", _WHERE),
-    "uncertain plants: voltage": Published("larger with NGPC (control effort)", "", _WHERE),
-    "uncertain plants: changes of the voltage": Published(
-        "larger with NGPC (aggressive control)", "", _WHERE
-    ),
-    "uncertain plants: time at the limits": Published(
-        "longer with NGPC (input saturation)", "", f"{_WHERE}, Table 2"
-    ),
-    "uncertain plants: error of h1 when r2 goes to 14 cm": Published(
-        "larger with NGPC", "", _WHERE
-    ),
-    "uncertain plants: error of h2 while r1 goes to 16 cm": Published(
-        "enlarged with both controllers", "", _WHERE
-    ),
-    "uncertain plants: feasible trajectories": Published(
-        "levels below 30 cm with both controllers",
-        "",
-        _WHERE,
-        reason="with ramps of 30 s tank 4 of the nominal plant needs more than 30 cm"
-        " (gouta2015 notes S3)",
-    ),
-}
-PUBLISHED = {name: row._replace(ramp=SETTING["reference.ramp"]) for name, row in _ROWS.items()}
 
 
 class Found(NamedTuple):
@@ -186,7 +141,7 @@ def _growth(nominal):
 
 
 def claims(found, nominal):
-    """Return {quantity: Claim} of PUBLISHED."""
+    """Return {quantity: Claim} of the published rows."""
     pairs = list(zip(*([found[controller, s] for s in SPREADS] for controller in CONTROLLERS)))
 
     def compared(triples, unit, words="NGPC less backstepping "):

@@ -23,7 +23,7 @@ from jaxtank.core.numerics import portion
 from jaxtank.core.tree import component, describe, get_value, leaf, parameters, with_values
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.loop.run import evaluate_and_flag, evaluate_compiled, evaluate_for_reverse
-from jaxtank.rig.schedule import schedule
+from jaxtank.rig.values import schedule
 from jaxtank.xla.reachability import use_of
 
 # 8 cm is a plateau of the reference: on a knot for minutes. The ramps have no sample within

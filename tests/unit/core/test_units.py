@@ -57,7 +57,7 @@ def test_weights_of_lqi_are_asked_for_in_no_unit_of_another_rig(tmp_path, capsys
         'name = "r"\nunits = ["m", "m^3/s"]\n'
         "[[tank]]\narea = 0.01\nrim = 0.5\ndrain = 1e-4\nlevel = 0.1\n"
         "[[pump]]\ngain = 1.0\nto = 1\nlow = 0.0\nhigh = 1e-3\n"
-        '[law]\nkind = "lqi"\nR = [1.0]\n'
+        '[controller]\nkind = "lqi"\nR = [1.0]\n'
         "[reference]\ninitial = [0.2]\n"
     )
     assert main.main(["simulate", str(file)]) == 2
@@ -74,7 +74,7 @@ def test_a_rig_in_litres_per_minute_has_no_volts_in_its_files_and_measures(tmp_p
         'name = "litres"\nunits = ["cm", "L/min"]\n'
         "[[tank]]\narea = 100.0\nrim = 50.0\ndrain = 0.5\nlevel = 10.0\n"
         "[[pump]]\ngain = 16.67\nto = 1\nlow = 0.0\nhigh = 20.0\n"
-        '[law]\nkind = "pid"\nKc = 1.0\nTi = 30.0\n'
+        '[controller]\nkind = "pid"\nKc = 1.0\nTi = 30.0\n'
         "[reference]\ninitial = [10.0]\nchanges = [[5.0, 1, 12.0]]\n"
     )
     for language in ("c", "m"):
@@ -106,7 +106,7 @@ to = 1
 high = 100.0
 [plant]
 gravity = 9.81
-[law]
+[controller]
 kind = "pid"
 Kc = 1.0
 Ti = 100.0

@@ -28,7 +28,7 @@ from jaxtank.export.matlab import Matlab
 from jaxtank.export.source import export
 from jaxtank.export.statements import Matrix
 from jaxtank.plants.network import network
-from jaxtank.rig import lines as rig_lines
+from jaxtank.rig import entry as rig_lines
 from tuning.cli import main
 
 SAMPLES = 10_000
@@ -242,7 +242,7 @@ def inputs_of(case, run, signals):
 
 PROPORTIONAL = """
 case = "cascaded/pi"
-[law]
+[controller]
 kind = "pid"
 Kc = 2.0
 bias = 1.5
@@ -607,7 +607,7 @@ high = 12.0
 [plant]
 gravity = 0.5
 
-[law]
+[controller]
 kind = "pid"
 Kc = 1.6
 Ti = 10.0

@@ -1245,7 +1245,7 @@ gain = 15.0
 to = 1
 high = 10.0
 initial = 3.0
-[law]
+[controller]
 kind = "open-loop"
 initial = [3.0]
 changes = [[60.0, 1, 6.0], [260.0, 1, 4.0]]

@@ -37,7 +37,7 @@ high = 100.0
 [plant]
 outputs = [2]
 gravity = 9.81
-[law]
+[controller]
 kind = "open-loop"
 initial = [40.0]
 changes = [[10.0, 1, 50.0]]

@@ -194,7 +194,7 @@ to = 1
 low = 0.0
 high = 12.0
 initial = 2.0
-[law]
+[controller]
 kind = "proportional"
 Kc = 2.0
 [reference]

@@ -266,22 +266,13 @@ import jaxtank
 from jaxtank import *
 opened = {"jaxtank.interop.python_control", "jaxtank.interop.gymnasium", "jaxtank.export"}
 assert not opened & set(sys.modules)
-assert {"neighbours", "environment", "export"} <= set(dir(jaxtank))
-assert callable(jaxtank.neighbours.columns) and callable(jaxtank.export.export)
+assert {"interop", "export"} <= set(dir(jaxtank)) and callable(jaxtank.export.export)
+import jaxtank.interop.python_control
 try:
-    jaxtank.environment
+    import jaxtank.interop.gymnasium
 except ImportError as error:
     print(error)
 """
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert ran.returncode == 0, ran.stderr
-    assert ran.stdout.startswith("jaxtank.environment needs gymnasium: pip install gymnasium")
-
-
-def test_the_environment_is_reached_from_the_package():
-    pytest.importorskip("gymnasium")
-    ran = subprocess.run(
-        [sys.executable, "-c", "import jaxtank; print(jaxtank.environment.TankEnv.__name__)"],
-        capture_output=True,
-    )
-    assert ran.stdout.decode().strip() == "TankEnv", ran.stderr
+    assert ran.stdout.startswith("jaxtank.interop.gymnasium needs gymnasium: pip install gymnasium")

@@ -38,7 +38,7 @@ law = { kind = "open-loop" }
 DRAWN = {  # every way in which a rig file can draw liquid out of a tank
     "inflow of a tank": QUIET.replace("drain = 0.01", "drain = 0.01, inflow = -0.02"),
     "disturbance": QUIET + "disturbance = { inflow = [-0.02] }",
-    "pour": QUIET + "pour = [{ time = 1.0, duration = 1.0, tank = 1, volume = -5.0 }]",
+    "pour": QUIET + "inflow = [{ time = 1.0, duration = 1.0, tank = 1, volume = -5.0 }]",
     "pump": QUIET.replace("high = 1.0", "low = -1.0, high = 1.0"),
     "initial": QUIET.replace("high = 1.0", "high = 1.0, initial = -1.0"),
     "actuator": QUIET + 'actuator = { kind = "pumps", low = [-1.0] }',

@@ -34,7 +34,7 @@ gain = 8.0
 to = 1
 high = 12.0
 initial = 0.0
-[law]
+[controller]
 kind = "open-loop"
 """
 
@@ -141,7 +141,7 @@ gain = 1.0
 to = 1
 high = 10.0
 initial = 1.0
-[law]
+[controller]
 kind = "open-loop"
 [reference]
 initial = [{setpoint}]
@@ -241,7 +241,7 @@ level = 4.0
 gain = 60.0
 to = 1
 high = 12.0
-[law]
+[controller]
 kind = "pid"
 Kc = 0.5
 Ti = 0.2

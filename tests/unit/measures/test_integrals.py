@@ -20,7 +20,7 @@ tank = [{ area = 1.0, rim = 10.0, level = 10.0 }]
 pump = [{ gain = 1.0, to = 1, high = 1.0, initial = 0.05 }]
 plant = { gravity = 9.81, overflow = true, bottom = true }
 law = { kind = "open-loop", initial = [0.05] }
-pour = [{ time = 0.0, duration = 1800.0, tank = 1, volume = -54.0 },
+inflow = [{ time = 0.0, duration = 1800.0, tank = 1, volume = -54.0 },
         { time = 1800.0, duration = 1800.0, tank = 1, volume = -90.0 }]
 values = { "clock.dt" = 1.0, "clock.duration" = 3600.0 }
 """
@@ -38,7 +38,7 @@ pump = [{ gain = 8.0, to = [1, 3], split = 0.7, high = 12.0, initial = 3.0 }]
 plant = { outputs = [3], overflow = true, bottom = true }
 law = { kind = "pid", Kc = 4.0, Ti = 20.0 }
 reference = { changes = [[5.0, 1, 5.0]], ramp = 0.0 }
-pour = [{ time = 2.25, duration = 3.1, tank = 2, volume = 90.0 },
+inflow = [{ time = 2.25, duration = 3.1, tank = 2, volume = 90.0 },
         { time = 12.0, duration = 5.0, tank = 1, volume = -900.0 },
         { time = 29.75, duration = 10.0, tank = 3, volume = 800.0 }]
 actuator = { kind = "pumps", lag = [1.5] }

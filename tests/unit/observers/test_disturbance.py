@@ -41,7 +41,7 @@ def row(n, observer, disturbed, more=""):
         lines += ["[[pipe]]", f"between = [{i}, {i + 1}]", "area = 0.3"]
     for tank in (1, n):
         lines += ["[[pump]]", "gain = 10.0", f"to = {tank}", "high = 12.0", "initial = 5.0"]
-    lines += ["[law]", 'kind = "open-loop"', "initial = [5.0, 5.0]", "[observer]", *observer]
+    lines += ["[controller]", 'kind = "open-loop"', "initial = [5.0, 5.0]", "[observer]", *observer]
     lines += ["[reference]", "initial = [19.0, 17.0]", "[values]"]
     return "\n".join([*lines, '"clock.dt" = 0.5', '"clock.duration" = 200.0', more])
 

@@ -125,7 +125,7 @@ def test_another_controller_takes_the_model_of_the_one_it_replaces(name, kind):
 
 
 def test_a_controller_of_a_file_takes_the_model_of_its_preset():
-    law = '[law]\nkind = "pid"\nKc = 4.0\nTi = 6.0\nTt = 36.0\nfeed_forward = true\n'
+    law = '[controller]\nkind = "pid"\nKc = 4.0\nTi = 6.0\nTt = 36.0\nfeed_forward = true\n'
     case = rig.loads('case = "gouta2022/enmpc-fitted"\n' + law)
     theirs = presets.find("gouta2022/enmpc-fitted").loop
     assert float(case.loop.controller.model.drain[0]) == float(theirs.controller.model.drain[0])

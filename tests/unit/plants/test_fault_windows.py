@@ -143,7 +143,7 @@ def test_a_pump_may_stand_still():
         ),
         (
             RIG + "disturbance = { window = 0.2 }\n"
-            "pour = [{ time = 5.1, duration = 1.0, tank = 1, volume = 5.0 }]",
+            "inflow = [{ time = 5.1, duration = 1.0, tank = 1, volume = 5.0 }]",
             "disturbance.window = 0.2 s after the pulse at 5.1 s: no sample",
         ),
     ],

@@ -194,7 +194,7 @@ def test_every_column_of_a_fan_has_its_times_below(tanks, labelled):
     table = {
         "tank": [{"area": 10.0, "rim": 30.0, "drain": 0.1, "level": 3.0}] * tanks,
         "pump": [{"gain": 5.0, "to": 1, "high": 12.0}],
-        "law": {"kind": "open-loop", "initial": [3.0]},
+        "controller": {"kind": "open-loop", "initial": [3.0]},
         "reachable": False,
     }
     t = np.linspace(0.0, 10.0, 11)

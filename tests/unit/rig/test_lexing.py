@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxtank import presets, rig
+from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.rig.read import MOST, MOST_WORDS, check_keys
 
@@ -71,11 +71,6 @@ def test_more_words_than_any_rig_has_are_reported():
             InputError, match=f"^rig file: has more than {MOST_WORDS} keys and values$"
         ):
             rig.loads(text)
-
-
-@pytest.mark.parametrize("name", presets.names())
-def test_every_complete_file_passes(name):
-    check_keys(rig.complete(presets.find(name)))
 
 
 @given(st.text(alphabet="ab.\"'\\#=\n[]{} \t", max_size=60))

@@ -61,7 +61,7 @@ gain = 7.7
 to = ["right", "upper left"]
 split = 0.34
 high = 12.0
-[law]
+[controller]
 kind = "pid"
 Kc = [0.5, 0.6]
 Ti = 60.0
@@ -174,19 +174,31 @@ def test_the_step_task_of_the_watertank_is_met(tmp_path):
             "unknown key of \\[\\[pump\\]\\] 'gian'; nearest: gain",
         ),
         ({"pipe": [{"between": [1, 1], "area": 0.1}]}, "two different tanks"),
-        ({"law": {}}, "needs kind"),
-        ({"law": {"kind": "pdi"}}, "unknown law kind 'pdi'; nearest: pid"),
-        ({"law": {"kind": "pid", "Kc": 1.0, "Ti": 1.0, "K": 2.0}}, "unknown key of \\[law\\] 'K'"),
-        ({"law": {"kind": "pid", "Kc": "much", "Ti": 1.0}}, "law.Kc = 'much'"),
-        ({"law": {"kind": "pid", "Kc": True, "Ti": 1.0}}, "law.Kc = True: must be a number"),
-        ({"law": {"kind": "pid", "Kc": "3", "Ti": 1.0}}, "law.Kc = '3': must be a number"),
-        ({"law": {**GPC, "r_w": [0.1, 0.2]}}, r"law.r_w = \[0.1, 0.2\]: must be one number"),
+        ({"controller": {}}, "needs kind"),
+        ({"controller": {"kind": "pdi"}}, "unknown controller kind 'pdi'; nearest: pid"),
         (
-            {"law": {"kind": "sliding-mode", "surface": 0.1, "ks": [0.1, 0.2], "phi": 0.1}},
-            r"law.ks = \[0.1, 0.2\]: must be one number",
+            {"controller": {"kind": "pid", "Kc": 1.0, "Ti": 1.0, "K": 2.0}},
+            "unknown key of \\[controller\\] 'K'",
         ),
-        ({"law": {"kind": "pid", "Kc": 1.0, "Ti": -1.0}}, "controller.Ti\\[0\\] = -1"),
-        ({"law": {"kind": "pid", "Kc": 0.0, "Ti": 1.0}}, "controller.Kc = .*must not be 0"),
+        ({"controller": {"kind": "pid", "Kc": "much", "Ti": 1.0}}, "controller.Kc = 'much'"),
+        (
+            {"controller": {"kind": "pid", "Kc": True, "Ti": 1.0}},
+            "controller.Kc = True: must be a number",
+        ),
+        (
+            {"controller": {"kind": "pid", "Kc": "3", "Ti": 1.0}},
+            "controller.Kc = '3': must be a number",
+        ),
+        (
+            {"controller": {**GPC, "r_w": [0.1, 0.2]}},
+            r"controller.r_w = \[0.1, 0.2\]: must be one number",
+        ),
+        (
+            {"controller": {"kind": "sliding-mode", "surface": 0.1, "ks": [0.1, 0.2], "phi": 0.1}},
+            r"controller.ks = \[0.1, 0.2\]: must be one number",
+        ),
+        ({"controller": {"kind": "pid", "Kc": 1.0, "Ti": -1.0}}, "controller.Ti\\[0\\] = -1"),
+        ({"controller": {"kind": "pid", "Kc": 0.0, "Ti": 1.0}}, "controller.Kc = .*must not be 0"),
         ({"plant": {"outputs": [1]}}, "list of 1"),
         ({"plant": {"outputs": [1, 9]}}, "from 1 to 4"),
         ({"plant": {"overflow": 1}}, "true or false"),
@@ -270,7 +282,7 @@ def test_a_rig_is_the_same_in_any_unit_of_length():
             [plant]
             gravity = {981 * c}
             bottom = true
-            [law]
+            [controller]
             {controller(c)}
             [reference]
             initial = [{2 * c}]
@@ -299,7 +311,7 @@ def test_a_rig_is_the_same_in_any_unit_of_length():
 def test_gravity_and_laminar_zone_of_a_network_are_those_of_its_unit():
     one = {"area": 1.0, "drain": 1.0, "pump_gain": 1.0, "feeds": [(0, None)], "rim": 1.0}
     file = 'units = ["{}", "V"]\n[[tank]]\narea = 1e6\nrim = 1.0\ndrain = 1e-3\n'
-    file += '[[pump]]\ngain = 1.0\nto = 1\nhigh = 1.0\n[law]\nkind = "open-loop"\n'
+    file += '[[pump]]\ngain = 1.0\nto = 1\nhigh = 1.0\n[controller]\nkind = "open-loop"\n'
     for unit, gravity, knee in (
         ("cm", 981.0, 0.01),
         ("m", 9.81, 1e-4),
@@ -352,7 +364,7 @@ gain = 5.0
 to = 1
 high = 10.0
 initial = 10.0
-[law]
+[controller]
 kind = "open-loop"
 [values]
 "clock.dt" = 0.1
@@ -435,3 +447,14 @@ def test_spills_are_weighed_wherever_their_shares_are_given(tmp_path, capsys):
         spills=[(0, 1), (0, 2), (0, 3)],
         caught=[third] * 3,
     )
+
+
+def test_sections_of_older_files_are_read_under_their_present_names():
+    pulse = "time = 1\nduration = 1\ntank = 1\nvolume = 1\n"
+    new = 'case = "gouta2022/pi"\n[controller]\nkind = "pid"\nKc = 2.0\n[[inflow]]\n' + pulse
+    old = new.replace("[controller]", "[law]").replace("[[inflow]]", "[[pour]]")
+    assert rig.dump(rig.loads(old)) == rig.dump(rig.loads(new))
+    assert "[[inflow]]" in rig.dump(rig.loads(old)) and "pour" not in rig.complete(rig.loads(old))
+    for name, extra in (("law", "law = {}"), ("pour", "pour = []")):
+        with pytest.raises(InputError, match=rf"\[{name}\] .* \[(controller|inflow)\]"):
+            rig.loads(f"{extra}\n{new}")

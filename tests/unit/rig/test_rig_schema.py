@@ -9,13 +9,11 @@ import pytest
 
 from jaxtank import rig
 from jaxtank.core.errors import InputError
-from jaxtank.core.toml_schema import NEEDED, Key
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.rig import components, schema
-from jaxtank.rig.entry import Sizes, read_value, written
-from jaxtank.rig.lines import toml
-from jaxtank.rig.schema import SECTIONS
+from jaxtank.rig.entry import Sizes, read_value, toml, written
+from jaxtank.rig.schema import NEEDED, SECTIONS, Key
 
 # every key of every section, none of them at its default
 EVERY = """
@@ -61,7 +59,7 @@ gravity = 98.0
 overflow = true
 bottom = true
 knee = 0.002
-[law]
+[controller]
 kind = "pid"
 Kc = [1.0]
 Ti = [9.0]
@@ -88,7 +86,7 @@ end = 300.0
 output = 1
 [disturbance]
 window = 50.0
-[[pour]]
+[[inflow]]
 time = 100.0
 duration = 2.0
 tank = 2
@@ -119,7 +117,7 @@ seed = 7
 weight = 2.0
 values = { "sensor.noise" = 0.1 }
 """
-# read beside another one only: a steady inflow is no [[pour]], a file with tanks is no case
+# read beside another one only: a steady inflow is no [[inflow]], a file with tanks is no case
 APART = {("tank", "inflow"), ("disturbance", "inflow"), ("", "case"), ("reference", "sine")}
 KEYS = [
     (section.name, key.name)
@@ -174,7 +172,7 @@ level = 3.0
 gain = 5.0
 to = 1
 high = 12.0
-[law]
+[controller]
 kind = "pid"
 Kc = 1.0
 Ti = 9.0
@@ -243,8 +241,8 @@ def test_a_key_added_to_a_suggested_section_is_in_the_file_of_init(monkeypatch):
 
 def test_the_fields_of_a_class_are_the_keys_of_its_section():
     """A controller's leaves are not repeated: unit, range and description are its own."""
-    section = components.section_of("law", "backstepping")
-    fields = components.ROLES["law"].classes["backstepping"].__dataclass_fields__
+    section = components.section_of("controller", "backstepping")
+    fields = components.ROLES["controller"].classes["backstepping"].__dataclass_fields__
     for key in section.keys[1:]:
         meta = fields[key.name].metadata
         assert (key.unit, key.low, key.high) == (meta["unit"], meta["low"], meta["high"])

@@ -63,7 +63,7 @@ def test_limits_that_are_lowered_for_each_other_hold(parts):
         "orifice": orifices,
         "pump": [pump | {"low": 0.0}],
         "plant": {"outputs": [1]},
-        "law": {"kind": "open-loop", "initial": [0.0]},
+        "controller": {"kind": "open-loop", "initial": [0.0]},
         "reachable": False,
         "values": {"clock.dt": 0.2, "clock.duration": 300.0},
         "safety_filter": {},

@@ -26,7 +26,7 @@ def forty_tanks():
             *(orifice.format(i, i + 1) for i in numbers[1:]),
             *(pump.format(i + 1) for i in numbers),
             f"[plant]\noutputs = {[i + 1 for i in numbers]}",
-            f'[law]\nkind = "pid"\nKc = {[1 + 0.01 * i for i in numbers]}',
+            f'[controller]\nkind = "pid"\nKc = {[1 + 0.01 * i for i in numbers]}',
             f"Ti = {[20 + 0.1 * i for i in numbers]}",
             f"[reference]\ninitial = {[5.0] * TANKS}\nramp = 3.0\nchanges = {changes}",
             '[values]\n"clock.dt" = 1.0\n"clock.duration" = 40.0',

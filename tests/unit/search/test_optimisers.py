@@ -11,7 +11,7 @@ from jaxtank import presets
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run
 from jaxtank.loop.derivatives import OUTER
-from jaxtank.rig.schedule import schedule
+from jaxtank.rig.values import schedule
 from jaxtank.signals.setpoints import ramps
 from tuning.problem.problem import Problem
 from tuning.problem.scenarios import coarse_clock

@@ -240,7 +240,7 @@ def _next_command(found, file):
         return f"go on with: jaxtank tune {file} --robust cvar"
     return (
         f"{file} has no controller to tune: identify with --law pi for a PI controller with gains"
-        " from this model, or give the file a [law], a [reference] that changes and [free] ranges"
+        " from this model, or give the file a [controller], a [reference] with changes, and [free]"
     )
 
 

@@ -1,1 +1,0 @@
-"""Rigs and closed loops of the papers whose preset alone would be too long."""
