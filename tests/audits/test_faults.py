@@ -296,17 +296,17 @@ def test_output_that_cannot_be_written_is_one_line():
 HOLDER = """
 import sys, time
 from tuning.storage.folder_lock import hold
-with hold(sys.argv[1], shared=sys.argv[2] == "shared"):
+with hold(sys.argv[1]):
     print("held", flush=True)
     time.sleep(60)
 """
 
 
 @contextlib.contextmanager
-def another(folder, kind="alone"):
+def another(folder):
     """A process that holds a folder."""
     process = subprocess.Popen(
-        [sys.executable, "-c", HOLDER, str(folder), kind], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", HOLDER, str(folder)], stdout=subprocess.PIPE, text=True
     )
     try:
         assert process.stdout.readline() == "held\n"
@@ -330,15 +330,6 @@ def test_a_folder_is_one_runs_at_a_time_and_a_dead_one_holds_nothing(tmp_path, c
         assert {p.name for p in folder.iterdir()} == {files.LOCK, ".mine"}
         assert int((folder / files.LOCK).read_text()) == os.getpid()
     assert [p.name for p in folder.iterdir()] == [".mine"]
-
-
-def test_shares_of_one_ensemble_hold_a_folder_together(tmp_path):
-    with another(tmp_path, "shared"):
-        with folder_lock.hold(tmp_path, shared=True):
-            (tmp_path / f".part{files.ASIDE}").write_text("of the other")
-        assert (tmp_path / files.LOCK).exists() and (tmp_path / f".part{files.ASIDE}").exists()
-        with pytest.raises(InputError, match="another run"), folder_lock.hold(tmp_path):
-            pass
 
 
 def test_a_folder_made_for_nothing_is_removed(tmp_path):
@@ -590,12 +581,12 @@ def test_an_identification_goes_on_where_it_was_interrupted(tmp_path):
 
     whole = tuning.identify(case, log, free, **options)
     assert (
-        tuning.identify(case, log, free, folder=tmp_path, progress=stop, **options).status
+        tuning.identify(case, log, free, checkpoint=tmp_path, progress=stop, **options).status
         == "interrupted"
     )
     assert (tmp_path / evaluation_log.NAME).read_bytes().count(b"\n") == 3
     again = tuning.identify(
-        case, log, free, folder=tmp_path, resume=True, progress=seen.append, **options
+        case, log, free, checkpoint=tmp_path, resume=True, progress=seen.append, **options
     )
     # what is recalled has no slopes
     assert [fit.jacobian.size > 0 for fit in seen[2:]] == [False, False, True]
@@ -604,7 +595,9 @@ def test_an_identification_goes_on_where_it_was_interrupted(tmp_path):
     ]
     assert json.dumps(reported[0]) == json.dumps(reported[1])
     with pytest.raises(InputError, match="of another problem; what differs: noise"):
-        tuning.identify(case, log, free, folder=tmp_path, resume=True, **{**options, "noise": 0.06})
+        tuning.identify(
+            case, log, free, checkpoint=tmp_path, resume=True, **{**options, "noise": 0.06}
+        )
 
 
 # Kills.

@@ -443,21 +443,12 @@ def test_tune_keeps_its_log_in_the_checkpoint_and_goes_on_from_it(own, tuned, tm
     assert (tmp_path / "evaluations.jsonl").read_text().splitlines() == lines
 
 
-@pytest.mark.parametrize(
-    "run", [tuning.tune, tuning.ensemble, lambda case, **more: tuning.identify(case, [], **more)]
-)
-def test_a_checkpoint_and_its_former_name_are_one_folder(own, run):
-    name = "log" if run is tuning.tune else "folder"
-    with pytest.raises(InputError, match=f"checkpoint and {name} are two names"):
-        run(own, checkpoint="one", **{name: "two"})
-
-
 def test_an_ensemble_keeps_its_batches_in_the_checkpoint(own, tmp_path):
     options = {"measures": ("max_level",), "limits": {}, "fan": False, "batch": 2}
     spread = {"plant.pump_gain": tuning.Normal(relative=0.05)}
-    tuning.ensemble(own, spread, 4, checkpoint=tmp_path, shard=(1, 2), **options)
-    with pytest.raises(InputError, match="1 of 2 batches are missing"):
-        tuning.ensemble(own, spread, 4, checkpoint=tmp_path, resume=True, merge=True, **options)
+    tuning.ensemble(own, spread, 4, checkpoint=tmp_path, **options)
+    with pytest.raises(InputError, match="--resume continues"):
+        tuning.ensemble(own, spread, 4, checkpoint=tmp_path, **options)
 
 
 @pytest.fixture(scope="module")

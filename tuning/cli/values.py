@@ -1,6 +1,5 @@
 """Values of a command line: numbers, ranges, NAME=VALUE, and the case that they describe."""
 
-import os
 import re
 import sys
 from typing import Any
@@ -224,8 +223,6 @@ def folder_of(args) -> Any:
             raise InputError(f"{name} '': must name a folder")
     if resume and out and resume != out:
         raise InputError("--resume and --out name different folders: a run is continued in its own")
-    if args.command == "merge" and not out:
-        return args.case if os.path.isdir(args.case) else None
     folder = resume or out
     if folder is not None:
         from jaxtank.core.files import check_folder

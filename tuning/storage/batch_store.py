@@ -30,30 +30,24 @@ class BatchStore:
         self,
         folder: Folder,
         problem: Mapping[str, Any],
-        origin: Any = None,
         *,
         resume: bool = False,
         shared: bool = False,
-        begin: bool = True,
     ):
         self.checkpoint = Checkpoint(folder, problem)
         self.folder = self.checkpoint.folder
         path = self.folder / MANIFEST
         if path.exists():
-            theirs = read_manifest(self.folder)
-            theirs.pop("origin", None)
-            self.checkpoint.check_same(theirs)
+            self.checkpoint.check_same(read_manifest(self.folder))
             if not (resume or shared) and any(self.folder.glob("part-*.npz")):
                 raise InputError(
                     f"{str(folder)!r} holds finished batches of this ensemble: --resume continues"
                     " with them"
                 )
             return
-        if resume and not (begin and self.checkpoint.begun()):
+        if resume and not self.checkpoint.begun():
             self.checkpoint.refuse_empty(MANIFEST)
-        self._write(
-            path, json.dumps({**self.checkpoint.problem, "origin": origin}, indent=1) + "\n"
-        )
+        self._write(path, json.dumps(self.checkpoint.problem, indent=1) + "\n")
 
     def path(self, k: int) -> Path:
         """Return the file of batch k."""

@@ -95,7 +95,7 @@ def test_a_worker_killed_and_one_added_in_mid_run_change_no_bit(case, whole, cli
     folder = tmp_path / "run"
     try:
         found = tuning.ensemble(
-            case, SPREAD, **OPTIONS, cluster=client, folder=folder, progress=progress
+            case, SPREAD, **OPTIONS, cluster=client, checkpoint=folder, progress=progress
         )
         assert same(found, whole)
         assert seen == sorted(seen) and seen[-1] == 400 and len(seen) == 25
@@ -223,11 +223,11 @@ def test_a_lost_scheduler_is_one_line_and_the_run_goes_on_from_its_folder(case, 
             warnings.catch_warnings(action="ignore", category=engines.ClusterWarning),
         ):
             tuning.ensemble(
-                case, SPREAD, **OPTIONS, cluster=client, folder=tmp_path, progress=progress
+                case, SPREAD, **OPTIONS, cluster=client, checkpoint=tmp_path, progress=progress
             )
     kept = len(list(tmp_path.glob("part-*.npz")))
     assert 4 <= kept < 25
-    assert same(tuning.ensemble(case, SPREAD, **OPTIONS, folder=tmp_path, resume=True), whole)
+    assert same(tuning.ensemble(case, SPREAD, **OPTIONS, checkpoint=tmp_path, resume=True), whole)
 
 
 def test_a_process_of_local_ends_with_the_pipe_from_its_parent(tmp_path):
@@ -366,12 +366,6 @@ def test_where_nobody_answers_is_an_error_in_time(case, monkeypatch, tmp_path):
         with pytest.raises(InputError, match=r"^cluster 127.0.0.1:1: no Dask scheduler answers"):
             run(case, cluster="127.0.0.1:1", checkpoint=tmp_path / "run")
     assert not any(tmp_path.iterdir())
-
-
-def test_a_cluster_goes_with_no_devices_shard_or_merge(case, tmp_path):
-    for other in ({"shard": (1, 2)}, {"merge": True}):
-        with pytest.raises(InputError, match=r"cluster and (shard|merge): give one of them"):
-            tuning.ensemble(case, SPREAD, cluster="local:2", folder=tmp_path, **other)
 
 
 def test_without_dask_the_remedy_is_named(case, monkeypatch):

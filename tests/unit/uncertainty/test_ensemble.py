@@ -22,7 +22,7 @@ from jaxtank.loop import run as lp
 from jaxtank.presets import Scenario
 from tuning.search import robust
 from tuning.storage import batch_store
-from tuning.uncertainty import manifest, validation
+from tuning.uncertainty import validation
 from tuning.uncertainty.distributions import parse, stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import clopper_pearson, probabilities
@@ -72,49 +72,45 @@ def test_the_first_draws_do_not_depend_on_how_many_there_are(case, whole):
         assert np.array_equal(fewer.measures[m], whole.measures[m][:20])
 
 
-def test_shards_joined_are_the_whole_and_an_incomplete_set_is_refused(case, whole, tmp_path):
-    assert tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, shard=(2, 3)) is None
-    with pytest.raises(InputError, match="3 of 4 batches are missing"):
-        tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, resume=True, merge=True)
-    for i in (1, 3):
-        tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, shard=(i, 3))
-    assert same(
-        tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, resume=True, merge=True), whole
-    )
+class Cut(Exception):
+    """A run ends here."""
+
+
+def cut_off(draws, case, *args, **options):
+    """Run an ensemble that ends once so many draws are done."""
+
+    def stop(done):
+        if done >= draws:
+            raise Cut
+
+    with pytest.raises(Cut):
+        tuning.ensemble(case, *args, **options, progress=stop)
 
 
 @pytest.mark.parametrize("done", [0, 1, 3])
 def test_a_run_cut_off_goes_on_to_the_same_bits(case, whole, tmp_path, done):
-    class Cut(Exception):
-        pass
-
-    def stop(draws):
-        if draws >= 16 * done:
-            raise Cut
-
     if done:
-        with pytest.raises(Cut):
-            tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, progress=stop)
+        cut_off(16 * done, case, TWO, **OPTIONS, checkpoint=tmp_path)
         assert len(list(tmp_path.glob("part-*.npz"))) == done
     else:
         with pytest.raises(InputError, match="holds no checkpoint to continue"):
-            tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, resume=True)
-    assert same(tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, resume=done > 0), whole)
+            tuning.ensemble(case, TWO, **OPTIONS, checkpoint=tmp_path, resume=True)
+    assert same(tuning.ensemble(case, TWO, **OPTIONS, checkpoint=tmp_path, resume=done > 0), whole)
 
 
 def test_folders_of_another_ensemble_are_refused(case, tmp_path):
-    tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, shard=(1, 2))
+    cut_off(32, case, TWO, **OPTIONS, checkpoint=tmp_path)
     with pytest.raises(InputError, match="what differs: key"):
-        tuning.ensemble(case, TWO, **{**OPTIONS, "key": 4}, folder=tmp_path, resume=True)
+        tuning.ensemble(case, TWO, **{**OPTIONS, "key": 4}, checkpoint=tmp_path, resume=True)
     with pytest.raises(InputError, match="--resume continues"):
-        tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path)
+        tuning.ensemble(case, TWO, **OPTIONS, checkpoint=tmp_path)
     path = tmp_path / "part-000000.npz"
     path.write_bytes(b"PK not a batch")
     with pytest.raises(InputError, match="not a batch"):
-        tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, resume=True)
+        tuning.ensemble(case, TWO, **OPTIONS, checkpoint=tmp_path, resume=True)
     np.savez(path, failed=np.array([{}], dtype=object))
     with pytest.raises(InputError, match="does not hold the measures"):
-        tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, resume=True)
+        tuning.ensemble(case, TWO, **OPTIONS, checkpoint=tmp_path, resume=True)
     with pytest.raises(InputError, match="not a batch"):
         batch_store.read_batch(path, {"failed"})  # a pickle inside is never opened
 
@@ -162,49 +158,6 @@ def test_one_device_two_devices_and_two_processes_give_the_same_bits(whole, tmp_
             assert all(
                 np.array_equal(found[m], whole.measures[m], equal_nan=True) for m in whole.measures
             )
-
-
-def test_a_manifest_states_what_its_shards_are_of_and_is_not_trusted(case, whole, tmp_path):
-    tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, shard=(1, 1), limits={"max_level": 31.0})
-    there, options = manifest.restore(tmp_path)
-    assert options["distributions"] == TWO and options["limits"] == {"max_level": 31.0}
-    assert same(
-        tuning.ensemble(there, **options, fan=False, folder=tmp_path, resume=True, merge=True),
-        whole,
-    )
-    path = tmp_path / "manifest.json"
-    printed = json.loads(path.read_text())
-    for change, words in (
-        ({"origin": None}, "does not say"),
-        ({"origin": {"rig": None, "limits": {}}}, "no rig file describes"),
-        ({"origin": {"rig": "x = ", "limits": {}}}, "is not TOML"),
-        ({"samples": "50"}, "does not say"),
-        ({"batch": 0}, "not one of this program"),
-        ({"distributions": {"plant.drain": {"kind": "Path"}}}, "not a distribution"),
-        (
-            {
-                "distributions": {
-                    "plant.drain": {
-                        "kind": "Uniform",
-                        "low": "a",
-                        "high": 1.0,
-                        "relative": None,
-                        "tied": False,
-                    }
-                }
-            },
-            "not a distribution",
-        ),
-    ):
-        path.write_text(json.dumps(printed | change))
-        with pytest.raises(InputError, match=words):
-            manifest.restore(tmp_path)
-    every = {
-        "a": tuning.LogUniform(factor=2.0),
-        "b": tuning.Discrete(values=(1.0, 2.0)),
-        "c": tuning.Correlated(names=("d", "e"), covariance=((1.0, 0.5), (0.5, 1.0))),
-    }
-    assert manifest.from_json(json.loads(json.dumps(manifest.to_json(every)))) == every
 
 
 # statistics
@@ -297,8 +250,7 @@ def test_a_batch_that_was_changed_is_refused(case, tmp_path, change):
     to be of.
     """
     options = {"samples": 40, "batch": 16, "key": 5, "measures": ("max_level",), "fan": False}
-    for i in (1, 2):
-        tuning.ensemble(case, folder=tmp_path, shard=(i, 2), **options)
+    cut_off(options["samples"], case, checkpoint=tmp_path, **options)
     paths = sorted(tmp_path.glob("part-*.npz"))
     if change == "exchange":
         first, second = (p.read_bytes() for p in paths[:2])
@@ -322,7 +274,7 @@ def test_a_batch_that_was_changed_is_refused(case, tmp_path, change):
             arrays["max_level"] = arrays["max_level"].astype("S8")
         np.savez(paths[0], **arrays)
     with pytest.raises(InputError, match=r"part-00000.*is not what was written as batch"):
-        tuning.ensemble(case, folder=tmp_path, resume=True, merge=True, **options)
+        tuning.ensemble(case, checkpoint=tmp_path, resume=True, **options)
     assert len(list(tmp_path.glob("part-*.npz"))) == len(paths)
 
 
@@ -342,26 +294,14 @@ FORGED = {
 def test_a_batch_whose_seal_is_right_is_not_trusted_either(case, name, forged, tmp_path):
     """Whoever has the program can seal a batch: what it holds is looked at, too."""
     options = {"samples": 8, "batch": 4, "measures": ("max_level", "rms_error_total"), "fan": False}
-    for i in (1, 2):
-        tuning.ensemble(case, folder=tmp_path, shard=(i, 2), **options)
+    cut_off(options["samples"], case, checkpoint=tmp_path, **options)
     problem = batch_store.read_manifest(tmp_path)
-    store = batch_store.BatchStore(tmp_path, problem | {"origin": None}, resume=True)
+    store = batch_store.BatchStore(tmp_path, problem, resume=True)
     with np.load(store.path(1)) as table:
         arrays = {n: table[n] for n in table.files if n != "seal"}
     store.put(1, arrays | {name: forged(arrays[name])})
     with pytest.raises(InputError, match=r"part-000001.*is not what was written as batch"):
-        tuning.ensemble(case, folder=tmp_path, resume=True, merge=True, **options)
-
-
-@pytest.mark.parametrize("measures", [[[[]]], [None], [{}]])
-def test_a_manifest_with_measures_that_are_no_names_is_refused(case, measures, tmp_path):
-    tuning.ensemble(
-        case, folder=tmp_path, shard=(1, 2), samples=8, batch=4, measures=("max_level",), fan=False
-    )
-    altered = batch_store.read_manifest(tmp_path) | {"measures": measures}
-    (tmp_path / "manifest.json").write_text(json.dumps(altered))
-    with pytest.raises(InputError, match="the manifest is not one of this program"):
-        manifest.restore(tmp_path)
+        tuning.ensemble(case, checkpoint=tmp_path, resume=True, **options)
 
 
 def test_every_value_of_a_discrete_distribution_is_looked_at(case):
