@@ -17,9 +17,9 @@ from tuning.cluster.engine import check_alone, connect
 from tuning.problem.functions import as_measures, digests
 from tuning.problem.limits import Limit, resolve_limits
 from tuning.problem.scenarios import noisy
-from tuning.storage.batch_store import BatchStore
 from tuning.storage.columns import Columns, row_blocks
 from tuning.storage.fingerprint import fingerprint
+from tuning.storage.store import Store
 from tuning.uncertainty.batches import Runner, batch_size, check_devices, fan_of, gather
 from tuning.uncertainty.distributions import stated
 from tuning.uncertainty.draws import Draws
@@ -118,7 +118,7 @@ def ensemble(
     with _runner(case, names, plan.seed, devices, cluster) as runner:
         if checkpoint is not None:
             what = _what(case, distributions, samples, key, draws, names, plan.batch)
-            store = BatchStore(checkpoint, what, resume=resume, shared=jax.process_count() > 1)
+            store = Store(checkpoint, what, resume=resume, shared=jax.process_count() > 1)
         joined = _joined(plan, store, runner, progress)
     values, beyond = _drawn(case, plan, checkpoint)
     first = {n: np.array(v[:FAN_DRAWS]) for n, v in values.items()}
@@ -232,18 +232,28 @@ def _drawn(case, plan, folder):
 def _batches(plan, store, runner, progress, put):
     """Run the batches of this process that the store lacks; put(number, batch) takes each."""
     mine = range(jax.process_index(), plan.count, jax.process_count())
-    missing = [k for k in mine if store is None or not store.has(k)]
+    finished = set() if store is None else set(store.finished())
+    missing = [k for k in mine if str(k) not in finished]
     done = len(mine) - len(missing)
     for k, batch in runner.each(missing, plan.rows):
         if store is not None:
-            store.put(k, batch)
+            store.put(str(k), batch)
         put(k, batch)
         done += 1
         if progress is not None:
             progress(min(plan.points.samples, plan.batch * done))
     if store is not None:
         for k in sorted(set(mine) - set(missing)):
-            put(k, store.get(k, plan.shapes))
+            put(k, _stored(store, k, plan.shapes))
+        store.close()
+
+
+def _stored(store, k, shapes):
+    """Return batch k of a store. Raises InputError unless it has these {name: shape}."""
+    batch = store.get(str(k))
+    if not isinstance(batch, dict) or {n: np.shape(v) for n, v in batch.items()} != shapes:
+        raise store.changed(str(k))
+    return batch
 
 
 def _what(case, distributions, samples, key, draws, names, batch):

@@ -109,7 +109,7 @@ def _identify(args, case, free):
     _check_data_given(args)
     from tuning.identification.fit import identify
     from tuning.report import tables
-    from tuning.storage.evaluation_log import discard
+    from tuning.storage.store import discard
 
     logs = _read(args, case)
     options = _options(args, logs)

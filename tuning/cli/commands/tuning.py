@@ -156,7 +156,7 @@ def _tune(args):
             **{k: v for k, v in task.items() if k != "scenarios"},
             **own,
             **_numbers(args),
-            log=folder,
+            checkpoint=folder,
             resume=args.resume is not None,
             progress=progress,
             cluster=args.cluster,
@@ -323,7 +323,7 @@ def _finish(args, result):
     finally:  # a full disk costs the files, not the printed result; and the checkpoint is kept
         print(tables.dumps(result.to_json()) if args.json else str(result))
     if args.out and result.status != "interrupted":
-        from tuning.storage.evaluation_log import discard
+        from tuning.storage.store import discard
 
         discard(args.out)
     report_written(written, args)
