@@ -122,7 +122,7 @@ def test_a_checkpoint_on_a_full_disk(tmp_path):
 
 def test_a_log_on_a_disk_that_fills_up_is_good_to_go_on_from(tmp_path):
     log = evaluation_log.EvaluationLog(tmp_path, {"p": 1})
-    with small_disk(60_000), pytest.raises(InputError, match="free disk space, then --resume"):
+    with small_disk(90_000), pytest.raises(InputError, match="free disk space, then --resume"):
         for i in range(100):
             log.recall("x", [float(i)], lambda i=i: (float(i), 1 / 3))
     again, made = evaluation_log.EvaluationLog(tmp_path, {"p": 1}, resume=True), []

@@ -86,7 +86,11 @@ MADE = {
     ("jaxtank.case", "explore", "import_module"): "the live page, by a constant name",
     ("tuning.live.live_figure", "_build", "import_module"): "ipywidgets, by a constant name",
     ("jaxtank.plots.style", "notebook", "import_module"): "matplotlib_inline, by a constant name",
-    ("tuning.cluster.task", "call", "import_module"): "names of its own table, in its own package",
+    (
+        "tuning.cluster.engine",
+        "call",
+        "import_module",
+    ): "names of its own table, in its own package",
     ("jaxtank.presets", "_load", "import_module"): "names of presets.PAPERS, checked before",
 }
 READ = {

@@ -14,8 +14,8 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import initial
+from tuning.cluster.ahead import check_sent
 from tuning.cluster.engine import connect
-from tuning.cluster.problems import check_sent
 from tuning.problem.functions import as_measures, check_slopes, digests
 from tuning.problem.problem import Problem
 from tuning.problem.provenance import provenance

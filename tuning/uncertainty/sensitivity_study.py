@@ -12,15 +12,14 @@ from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.loop import run as lp
-from tuning.cluster.engine import check_alone, connect
+from tuning.cluster.engine import check_cluster, connect
 from tuning.problem import scenarios as sc
 from tuning.problem.result import Result
 from tuning.uncertainty import indices
-from tuning.uncertainty.batches import Runs, check_devices
+from tuning.uncertainty.batches import Runs, check_devices, points_on
 from tuning.uncertainty.distributions import Correlated, stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.local import Column, entries_of, local_columns
-from tuning.uncertainty.remote import points_on
 from tuning.uncertainty.sampling import check_whole, spread_of
 
 METHODS = ("local", "morris", "sobol")
@@ -139,7 +138,7 @@ def sensitivity(
     samples = check_samples(samples, method, notes)
     _check_arguments(given, method, seed, batch)
     check_devices(devices)
-    check_alone(cluster, devices=devices > 1)
+    check_cluster(cluster, devices)
     random = sc.noisy(case) or any(n.startswith("sensor.noise") for n in draws.labels)
     # one key for all runs: differences are the parameters' alone
     key = jax.random.key(seed) if random else None

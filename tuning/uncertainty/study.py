@@ -13,18 +13,24 @@ from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.loop import floor
 from jaxtank.loop import run as lp
-from tuning.cluster.engine import check_alone, connect
+from tuning.cluster.engine import check_cluster, connect
 from tuning.problem.functions import as_measures, digests
 from tuning.problem.limits import Limit, resolve_limits
 from tuning.problem.scenarios import noisy
 from tuning.storage.columns import Columns, row_blocks
 from tuning.storage.fingerprint import fingerprint
 from tuning.storage.store import Store
-from tuning.uncertainty.batches import Runner, batch_size, check_devices, fan_of, gather
+from tuning.uncertainty.batches import (
+    RemoteRunner,
+    Runner,
+    batch_size,
+    check_devices,
+    fan_of,
+    gather,
+)
 from tuning.uncertainty.distributions import stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.needs import BLOCK, infeasible
-from tuning.uncertainty.remote import RemoteRunner
 from tuning.uncertainty.result import Ensemble
 from tuning.uncertainty.sampling import Points, check_whole, spread_of
 
@@ -108,7 +114,7 @@ def ensemble(
     check_whole("samples", samples, 1, 2**31 - 1)
     check_whole("key", key, 0, 2**31 - 1)
     check_devices(devices)
-    check_alone(cluster, devices=devices > 1)
+    check_cluster(cluster, devices)
     distributions = spread_of(case) if distributions is None else stated(distributions)
     limits = as_measures(None, limits)[1]
     limited = [*resolve_limits(case, limits), *_floors(case)]
