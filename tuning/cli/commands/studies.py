@@ -1,10 +1,9 @@
 """`jaxtank uncertainty` and `sensitivity`: many runs of a case."""
 
-from tuning.cli.arguments import on_devices, option, repeatable, uncertain
-from tuning.cli.options import devices_of, distributions_of, limits_of, report_written
+from tuning.cli.arguments import on_devices, option, repeatable, uncertain, whole
+from tuning.cli.options import devices_of, distributions_of, finish, limits_of
 from tuning.cli.terminal import Line
-from tuning.cli.values import open_case, whole
-from tuning.cli.values import seed as seed_of
+from tuning.cli.values import open_case
 
 
 def add(commands, parents):
@@ -16,7 +15,7 @@ def add(commands, parents):
         help="the same loop over N draws: bands, percentiles, violations",
     )
     one.set_defaults(run=uncertainty)
-    option(one, "--samples", "N", "draws (default 1000)", "1000")
+    option(one, "--samples", "N", "draws (default 1000)", 1000, whole(1, 10**8))
     option(one, "--draws", "KIND", "random (default), latin or sobol", "random")
     repeatable(one, "--limit", "MEASURE=VALUE", "a limit to count violations of")
     repeatable(one, "--measure", "NAME", "a measure to keep, in place of the default ones")
@@ -34,7 +33,7 @@ def _add_sensitivity(commands, parents):
     text = "local (default: exact derivatives), morris or sobol"
     option(one, "--method", "NAME", text, "local")
     text = "trajectories of morris (default 32), base points of sobol (default 512, a power of 2)"
-    option(one, "--samples", "N", text)
+    option(one, "--samples", "N", text, None, whole(1, 1 << 20))
     repeatable(
         one,
         "--measure",
@@ -55,8 +54,8 @@ def uncertainty(args):
     found = ensemble(
         case,
         distributions_of(args, case),
-        samples=whole("--samples", args.samples, 1, 10**8),
-        key=seed_of(args),
+        samples=args.samples,
+        key=args.seed,
         draws=args.draws,
         measures=tuple(args.measure) or None,
         limits=limits_of(args, case),
@@ -67,25 +66,14 @@ def uncertainty(args):
         progress=lambda done: line.show(f"{done} draws"),
     )
     line.end()
-    return _finish(found, args)
-
-
-def _finish(result, args):
-    """Write and print a result; returns the exit code."""
-    from tuning.report import tables
-
-    try:
-        written = result.save(args.out, args.line) if args.out else []
-    finally:  # a full disk costs the files, not the printed result
-        print(tables.dumps(result.to_json()) if args.json else str(result))
-    report_written(written, args)
+    finish(found, args)
     return 0
 
 
 def sensitivity(args):
     """Print which parameter changes which measure."""
     devices = devices_of(args)
-    seed, case = seed_of(args), open_case(args)
+    case = open_case(args)
     varied = distributions_of(args, case)
     from tuning.uncertainty import sensitivity_study as study
 
@@ -97,11 +85,12 @@ def sensitivity(args):
         varied,
         method=args.method,
         measures=args.measure or None,
-        samples=None if args.samples is None else whole("--samples", args.samples, 1, study.MOST),
-        seed=seed,
+        samples=args.samples,
+        seed=args.seed,
         devices=devices,
         cluster=args.cluster,
         progress=line.runs,
     )
     line.end()
-    return _finish(result, args)
+    finish(result, args)
+    return 0
