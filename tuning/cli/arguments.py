@@ -16,7 +16,7 @@ class Once(argparse.Action):
         given = vars(namespace).setdefault("given", set())
         if option_string is not None and self.dest in given:
             raise InputError(
-                f"{option_string} is given twice, the second time as {values!r}: give it once"
+                f"{option_string} is given twice, the second time as {values}: give it once"
             )
         given.add(self.dest)
         setattr(namespace, self.dest, values)
@@ -42,7 +42,7 @@ class Parser(argparse.ArgumentParser):
 
     def _get_value(self, action, arg_string):
         """Return the value of an option; argparse would reword the error of its type."""
-        return arg_string if action.type is None else action.type(arg_string)
+        return action.type(arg_string) if callable(action.type) else arg_string
 
     def _print_message(self, message, file=None):
         """Print help; argparse would ignore an OSError."""

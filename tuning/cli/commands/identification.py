@@ -139,7 +139,7 @@ def _check_data_given(args):
     for name in PLANNED:
         if getattr(args, name) is not None:
             raise InputError(
-                f"--{name} {getattr(args, name)!r}: belongs to a planned experiment, with --plan"
+                f"--{name} {getattr(args, name)}: belongs to a planned experiment, with --plan"
             )
     if not args.data:
         raise InputError(

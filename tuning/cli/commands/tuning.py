@@ -7,7 +7,7 @@ from typing import Any
 
 from jaxtank.core.errors import InputError
 from tuning.cli.arguments import on_cluster, option, repeatable, uncertain, whole
-from tuning.cli.interrupts import put_back
+from tuning.cli.interrupts import Interrupts, put_back
 from tuning.cli.options import (
     choices_of,
     distributions_of,
@@ -17,9 +17,40 @@ from tuning.cli.options import (
     scenarios_of,
     tradeoff_of,
 )
-from tuning.cli.progress import Progress
+from tuning.cli.terminal import Line
 from tuning.cli.values import number, once, open_case, pair, span
-from tuning.cli.watch import first_sentence, watch_of
+from tuning.cli.watch import Watch, first_sentence, watch_of
+
+
+class Progress(Interrupts):
+    """A line per evaluation on a terminal, a line per local search elsewhere."""
+
+    def __init__(self, unit, quiet, option=None):
+        super().__init__()
+        self.unit, self.last, self.line = unit, None, Line(quiet)
+        self.watch: Watch | None = None
+        self.note = option and f"{option} implies --nominal: the optimum of the case as it is"
+        self.line.compiling("the simulation and its derivatives", 15)
+
+    def __call__(self, event):
+        if self.note:  # not before the search begins: an error is one line
+            print(f"jaxtank: note: {self.note}", file=sys.stderr)
+            self.note = None
+        if event["evaluations"] > 1:
+            self.check()
+        if self.watch is not None:
+            self.watch(event | {"unit": event.get("unit") or self.unit})
+        if not self.line.terminal and event["start"] == self.last:
+            return
+        self.last = event["start"]
+        breaks = " (breaks a limit)" if event["best_violation"] else ""
+        unit = event.get("unit") or self.unit
+        best = "none yet" if event["best"] is None else f"{event['best']:.6g} {unit}{breaks}"
+        self.line.show(
+            f"start {min(event['start'] + 1, event['starts'])}/{event['starts']}  evaluation"
+            f" {event['evaluations']}  best {best}"
+        )
+
 
 CODES = """exit codes:
   0    converged (two searches within 1 % of each other (--nominal: 0.1 %), or differential
