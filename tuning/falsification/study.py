@@ -13,8 +13,7 @@ from jaxtank.core.numerics import lower_clip
 from jaxtank.loop.validation import check
 from jaxtank.safety.certificate import TankCertificate
 from jaxtank.safety.worst_case import rates_of, rise
-from tuning.falsification.attacked import Attacked, batch_size, programs
-from tuning.falsification.coefficients import coefficients_of
+from tuning.falsification.attacked import Attacked, batch_size, coefficients_of, programs
 from tuning.falsification.result import Attack, Found
 from tuning.problem.scenarios import noisy
 from tuning.uncertainty.sampling import check_whole

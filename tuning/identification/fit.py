@@ -16,13 +16,12 @@ from jaxtank.core.errors import DataError, InputError
 from jaxtank.plants.base import Plant
 from tuning.identification import experiment
 from tuning.identification.confidence import Spread, at_search_bounds
-from tuning.identification.data_checks import check_data, check_float64, check_length, first_samples
 from tuning.identification.design import remedies
-from tuning.identification.identified_case import bare
+from tuning.identification.experiment import check_data, check_float64, check_length, first_samples
+from tuning.identification.identified_case import bare, check_kind
 from tuning.identification.least_squares import Fit, solve
 from tuning.identification.least_squares import profile_likelihood as _profile
 from tuning.identification.problem import Estimation
-from tuning.identification.proposal import check_kind
 from tuning.identification.residuals import quality, validate
 from tuning.identification.result import Identification
 from tuning.problem.status import Status
@@ -99,7 +98,7 @@ def identify(
     ready : callable, optional
         Called once all inputs are checked, before the first search.
     law : {"pi"}, optional
-        Propose a PI controller with gains from the identified model (`proposal.py`); the case's own
+        Propose a PI controller with gains from the identified model; the case's own
         controller by default.
 
     Returns
