@@ -57,26 +57,31 @@ def batch_size(case, noisy, samples):
     return 1 << (min(most, max(1, samples)).bit_length() - 1)
 
 
-class Runner:
-    """Runs a batch on each of `devices` at once, each by the program of a single device."""
+def on_devices(devices, run):
+    """Return each(numbers, rows_of, runs): (number, run(device, rows_of(number))), in order."""
+    # Each device has a thread, and runs the program of a single device. One program partitioned
+    # over the devices (shard_map) rounds the last bit differently; this does not.
+    local, pool = jax.local_devices()[:devices], ThreadPoolExecutor(devices)
 
-    # Each device has a thread. One program partitioned over the devices (shard_map) rounds the last
-    # bit differently from the program of a single device; this does not.
+    def each(numbers, rows_of, runs):
+        for i in range(0, len(numbers), devices):
+            group = numbers[i : i + devices]
+            yield from zip(group, pool.map(run, local, map(rows_of, group)))
 
-    def __init__(self, case, names, seed, devices):
-        self.case, self.names, self.seed = case, names, seed
-        self.devices = jax.local_devices()[:devices]
-        self.pool = ThreadPoolExecutor(devices)
+    return each
 
-    def each(self, numbers, rows_of):
-        """Yield (number, batch) in order; rows_of(number): (values, numbers of the draws)."""
-        width = len(self.devices)
-        for group in (numbers[i : i + width] for i in range(0, len(numbers), width)):
-            rows, indices = zip(*map(rows_of, group))
-            yield from zip(group, self.pool.map(self._one, self.devices, rows, indices))
 
-    def _one(self, device, rows, indices):
-        return run_batch(self.case, self.names, self.seed, rows, indices, device)
+def on_workers(engine, task, case, names, seed):
+    """Return what `on_devices` gives, on the workers of an Engine: as the batches come."""
+    given = sent(case, names), names, seed
+
+    def each(numbers, rows_of, runs):
+        groups = grouped(numbers, runs * case.clock.samples)
+        tasks = ((group, (*given, [rows_of(k) for k in group])) for group in groups)
+        for group, found in engine.run(task, tasks):
+            yield from zip(group, found, strict=True)
+
+    return each
 
 
 def run_batch(case, names, seed, rows, indices, device=None):
@@ -129,7 +134,7 @@ class Runs:
     def __init__(
         self, case, draws, names, key, batch=None, progress=None, devices=1, each: Any = None
     ):
-        self.group, self.each = group_of(case, key), each or self._each
+        self.group = group_of(case, key)
         self.own = {
             name: np.asarray(get_value(case.loop, name))[None]
             for name in draws.values(np.zeros((0, draws.dimensions)))
@@ -140,17 +145,10 @@ class Runs:
         )
         self.nominal: Any = None
         self.failed = 0
-        self.devices, self.pool = jax.local_devices()[:devices], ThreadPoolExecutor(devices)
-
-    def _each(self, starts, rows_of):
-        """Yield (start, what `run_points` gives) in order; rows_of(start): values of a batch."""
-
-        def one(device, values):
-            return run_points(self.group, self.names, jax.device_put(values, device))
-
-        width = len(self.devices)
-        for group in (starts[i : i + width] for i in range(0, len(starts), width)):
-            yield from zip(group, self.pool.map(one, self.devices, map(rows_of, group)))
+        self.each = each or on_devices(
+            devices,
+            lambda device, values: run_points(self.group, names, jax.device_put(values, device)),
+        )
 
     def __call__(self, p):
         values = {
@@ -164,7 +162,7 @@ class Runs:
             index = np.minimum(np.arange(start, start + size), total - 1)
             return {name: v[index] for name, v in values.items()}
 
-        for start, (flat, diverged) in self.each(starts, rows_of):
+        for start, (flat, diverged) in self.each(starts, rows_of, size):
             found[start] = flat[: total - start]
             # the case's own run, the very first, is not counted
             self.failed += int(diverged[int(start == 0) : total - start].sum())
@@ -246,36 +244,3 @@ def grouped(numbers, samples):
     """Return `numbers` of batches in groups, one for each task."""
     size = max(1, min(WORK // max(1, samples), len(numbers) // SHARES))
     return [tuple(numbers[i : i + size]) for i in range(0, len(numbers), size)]
-
-
-class RemoteRunner:
-    """Runs batches of an ensemble on the workers of an Engine; used as `batches.Runner` is."""
-
-    def __init__(self, case, names, seed, engine):
-        self.engine, self.given = engine, (sent(case, names), names, seed)
-        self.samples = case.clock.samples
-
-    def each(self, numbers, rows_of):
-        """Yield (number, batch) as they come; rows_of(number): (values, numbers of the draws)."""
-        runs = len(rows_of(numbers[0])[1]) if numbers else 1
-        groups = grouped(numbers, runs * self.samples)
-        yield from _each(self.engine, "batches", self.given, groups, rows_of)
-
-
-def points_on(case, names, seed, engine):
-    """Return what takes the place of `batches.Runs._each` on the workers of an Engine."""
-    given = sent(case, names), names, seed
-
-    def each(starts, rows_of):
-        runs = starts[1] - starts[0] if len(starts) > 1 else 1
-        groups = grouped(starts, runs * case.clock.samples)
-        yield from _each(engine, "points", given, groups, rows_of)
-
-    return each
-
-
-def _each(engine, task, given, groups, rows_of):
-    """Yield (number, result) of the batches of all groups, a group at a time."""
-    tasks = ((group, (*given, [rows_of(k) for k in group])) for group in groups)
-    for group, found in engine.run(task, tasks):
-        yield from zip(group, found, strict=True)

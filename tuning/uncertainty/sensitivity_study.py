@@ -18,7 +18,7 @@ from tuning.problem import scenarios as sc
 from tuning.problem.result import Result
 from tuning.problem.slopes import contradicted
 from tuning.uncertainty import indices
-from tuning.uncertainty.batches import Runs, check_devices, points_on
+from tuning.uncertainty.batches import Runs, check_devices, on_workers
 from tuning.uncertainty.distributions import Correlated, Discrete, Normal, stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import check_whole, spread_of
@@ -153,7 +153,8 @@ def sensitivity(
         make = indices.morris_points if method == "morris" else indices.sobol_points
         points = make(draws.dimensions, samples, seed)
         with connect(cluster) as engine:
-            each = engine and points_on(case, names, seed if random else None, engine)
+            noise = seed if random else None
+            each = engine and on_workers(engine, "points", case, names, noise)
             run = Runs(case, draws, names, key, batch, progress, devices, each)
             columns = _columns(case, names, method, points, run, seed)
         runs, failed = points.shape[0] * points.shape[1], run.failed

@@ -21,12 +21,13 @@ from tuning.storage.columns import Columns, row_blocks
 from tuning.storage.fingerprint import fingerprint
 from tuning.storage.store import Store
 from tuning.uncertainty.batches import (
-    RemoteRunner,
-    Runner,
     batch_size,
     check_devices,
     fan_of,
     gather,
+    on_devices,
+    on_workers,
+    run_batch,
 )
 from tuning.uncertainty.distributions import stated
 from tuning.uncertainty.draws import Draws
@@ -197,11 +198,11 @@ def _plan(case, space, names, samples, key, draws, batch):
 @contextlib.contextmanager
 def _runner(case, names, seed, devices, cluster):
     """Give what runs batches: the devices of this process, or the workers of a cluster."""
-    if cluster is None:
-        yield Runner(case, names, seed, devices)
-        return
     with connect(cluster) as engine:
-        yield RemoteRunner(case, names, seed, engine)
+        if engine is not None:
+            yield on_workers(engine, "batches", case, names, seed)
+        else:
+            yield on_devices(devices, lambda at, rows: run_batch(case, names, seed, *rows, at))
 
 
 def _joined(plan, store, runner, progress):
@@ -241,7 +242,7 @@ def _batches(plan, store, runner, progress, put):
     finished = set() if store is None else set(store.finished())
     missing = [k for k in mine if str(k) not in finished]
     done = len(mine) - len(missing)
-    for k, batch in runner.each(missing, plan.rows):
+    for k, batch in runner(missing, plan.rows, plan.batch):
         if store is not None:
             store.put(str(k), batch)
         put(k, batch)
