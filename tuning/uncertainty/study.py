@@ -202,7 +202,9 @@ def _runner(case, names, seed, devices, cluster):
         if engine is not None:
             yield on_workers(engine, "batches", case, names, seed)
         else:
-            yield on_devices(devices, lambda at, rows: run_batch(case, names, seed, *rows, at))
+            yield on_devices(
+                devices, lambda at, rows: run_batch(case, names, seed, rows[0], rows[1], at)
+            )
 
 
 def _joined(plan, store, runner, progress):
