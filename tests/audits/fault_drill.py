@@ -12,12 +12,14 @@ that the runs left alone compiled (jax's compilation cache): a kill tells more i
 seconds of imports and compilation.
 """
 
+import contextlib
 import json
 import os
 import random
 import re
 import shutil
 import signal
+import sqlite3
 import sys
 import tempfile
 import time
@@ -89,10 +91,14 @@ def ended(child, patience=PATIENCE):
 
 
 def kept(folder):
-    """How much of a run is kept in its folder: lines of the log, or batches."""
-    log = folder / "evaluations.jsonl"
-    lines = log.read_bytes().count(b"\n") if log.exists() else 0
-    return lines + len(list(folder.glob("part-*.npz")))
+    """How many evaluations or batches of a run are kept in its folder."""
+    path = (Path(folder) / "checkpoint.sqlite3").absolute()
+    try:
+        with contextlib.closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as file:
+            (count,) = file.execute("SELECT count(*) FROM record").fetchone()
+    except sqlite3.Error:
+        return 0
+    return max(0, count - 1)  # one says what the others are of
 
 
 def kill(child, folder, seconds, count):

@@ -15,6 +15,7 @@ from pathlib import Path
 import interrupt_drill
 import numpy as np
 import pytest
+from fault_drill import kept
 
 import tuning
 from jaxtank import presets
@@ -23,7 +24,8 @@ from jaxtank.core.errors import InputError
 from jaxtank.plots import responses
 from tuning.cli import main
 from tuning.report import figures
-from tuning.storage import batch_store, evaluation_log, folder_lock
+from tuning.storage import evaluation_log, folder_lock
+from tuning.storage.store import NAME, Store
 
 HERE = Path(__file__).parent
 SHORT = ["cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400"]
@@ -113,19 +115,14 @@ def test_files_are_replaced_together_or_not_at_all(tmp_path):
     assert ((tmp_path / "a").read_text(), (tmp_path / "b").read_text()) == ("new a", "new b")
 
 
-def test_a_log_and_batches_on_a_full_disk(tmp_path):
-    """/dev/full takes nothing."""
-    (tmp_path / evaluation_log.NAME).symlink_to("/dev/full")
-    with pytest.raises(InputError, match=r"evaluations\.jsonl.*No space left.*--resume"):
-        evaluation_log.EvaluationLog(tmp_path, {"p": 1})
-    with small_disk(100), pytest.raises(InputError, match=r"manifest\.json.*too large.*--resume"):
-        batch_store.BatchStore(tmp_path / "new", {"measures": ["x" * 200]})
-    assert not list((tmp_path / "new").iterdir())
+def test_a_checkpoint_on_a_full_disk(tmp_path):
+    with small_disk(100), pytest.raises(InputError, match=r"sqlite3' cannot be written.*--resume"):
+        Store(tmp_path / "new", {"measures": ["x" * 200]})
 
 
 def test_a_log_on_a_disk_that_fills_up_is_good_to_go_on_from(tmp_path):
     log = evaluation_log.EvaluationLog(tmp_path, {"p": 1})
-    with small_disk(2000), pytest.raises(InputError, match="free disk space, then --resume"):
+    with small_disk(90_000), pytest.raises(InputError, match="free disk space, then --resume"):
         for i in range(100):
             log.recall("x", [float(i)], lambda i=i: (float(i), 1 / 3))
     again, made = evaluation_log.EvaluationLog(tmp_path, {"p": 1}, resume=True), []
@@ -186,10 +183,7 @@ def test_a_full_disk_leaves_one_result_whole(name, tmp_path, capsys, monkeypatch
         )
     # the old result of identify here is its result.json alone
     left = after.keys() - before.keys() - ({"fit.csv", "rig.toml"} if name == "identify" else set())
-    assert all(
-        n == evaluation_log.NAME or n == batch_store.MANIFEST or batch_store.NAME.fullmatch(n)
-        for n in left
-    ), left
+    assert all(n.startswith(NAME) for n in left), left
     if name in ("tune", "uncertainty", "sensitivity", "identify"):
         assert out.strip()  # the answer is told all the same
 
@@ -296,17 +290,17 @@ def test_output_that_cannot_be_written_is_one_line():
 HOLDER = """
 import sys, time
 from tuning.storage.folder_lock import hold
-with hold(sys.argv[1], shared=sys.argv[2] == "shared"):
+with hold(sys.argv[1]):
     print("held", flush=True)
     time.sleep(60)
 """
 
 
 @contextlib.contextmanager
-def another(folder, kind="alone"):
+def another(folder):
     """A process that holds a folder."""
     process = subprocess.Popen(
-        [sys.executable, "-c", HOLDER, str(folder), kind], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", HOLDER, str(folder)], stdout=subprocess.PIPE, text=True
     )
     try:
         assert process.stdout.readline() == "held\n"
@@ -330,15 +324,6 @@ def test_a_folder_is_one_runs_at_a_time_and_a_dead_one_holds_nothing(tmp_path, c
         assert {p.name for p in folder.iterdir()} == {files.LOCK, ".mine"}
         assert int((folder / files.LOCK).read_text()) == os.getpid()
     assert [p.name for p in folder.iterdir()] == [".mine"]
-
-
-def test_shares_of_one_ensemble_hold_a_folder_together(tmp_path):
-    with another(tmp_path, "shared"):
-        with folder_lock.hold(tmp_path, shared=True):
-            (tmp_path / f".part{files.ASIDE}").write_text("of the other")
-        assert (tmp_path / files.LOCK).exists() and (tmp_path / f".part{files.ASIDE}").exists()
-        with pytest.raises(InputError, match="another run"), folder_lock.hold(tmp_path):
-            pass
 
 
 def test_a_folder_made_for_nothing_is_removed(tmp_path):
@@ -394,7 +379,7 @@ def test_two_at_once(tmp_path):
 
 
 def interrupted(words, folder, lines, number=signal.SIGINT):
-    """(stderr, exit code) of a command that gets a signal once its log has so many lines; 0: as
+    """(stderr, exit code) of a command that gets a signal once so many evaluations are kept; 0: as
     soon as the folder is there.
     """
     process = subprocess.Popen(
@@ -403,11 +388,9 @@ def interrupted(words, folder, lines, number=signal.SIGINT):
         stderr=subprocess.PIPE,
         text=True,
     )
-    log, until = folder / evaluation_log.NAME, time.monotonic() + 120
+    until = time.monotonic() + 120
     while process.poll() is None and time.monotonic() < until:
-        if (lines == 0 and folder.exists()) or (
-            log.exists() and log.read_bytes().count(b"\n") >= lines > 0
-        ):
+        if (lines == 0 and folder.exists()) or kept(folder) >= lines > 0:
             break
         time.sleep(0.005)
     process.send_signal(number)
@@ -435,8 +418,7 @@ def test_ctrl_c_gives_the_best_point_so_far(lines, tmp_path):
     assert code == 130 and "interrupted" in printed and "Traceback" not in printed, printed
     found = json.loads((tmp_path / "out" / "result.json").read_text())
     assert found["status"] == "interrupted" and "best point so far" in found["message"]
-    evaluated = (tmp_path / "out" / evaluation_log.NAME).read_bytes().count(b"\n") - 1
-    assert 0 < evaluated < 200 and found["evaluations"]["simulations"] > 0
+    assert 0 < kept(tmp_path / "out") < 200 and found["evaluations"]["simulations"] > 0
     assert (tmp_path / "out" / "rig.toml").exists() and not (tmp_path / "out" / files.LOCK).exists()
 
 
@@ -455,7 +437,7 @@ def test_a_signal_before_anything_was_found_ends_the_program_and_frees_its_folde
     printed, code = interrupted([*LONG, "--quiet"], tmp_path / "out", lines, number)
     assert (printed, code) == (f"jaxtank: {word}\n", 128 + number)
     left = {p.name for p in (tmp_path / "out").iterdir()} if (tmp_path / "out").exists() else set()
-    assert left <= {evaluation_log.NAME}
+    assert all(name.startswith(NAME) for name in left)
     with folder_lock.hold(tmp_path / "out"):
         pass
 
@@ -590,12 +572,12 @@ def test_an_identification_goes_on_where_it_was_interrupted(tmp_path):
 
     whole = tuning.identify(case, log, free, **options)
     assert (
-        tuning.identify(case, log, free, folder=tmp_path, progress=stop, **options).status
+        tuning.identify(case, log, free, checkpoint=tmp_path, progress=stop, **options).status
         == "interrupted"
     )
-    assert (tmp_path / evaluation_log.NAME).read_bytes().count(b"\n") == 3
+    assert kept(tmp_path) == 2
     again = tuning.identify(
-        case, log, free, folder=tmp_path, resume=True, progress=seen.append, **options
+        case, log, free, checkpoint=tmp_path, resume=True, progress=seen.append, **options
     )
     # what is recalled has no slopes
     assert [fit.jacobian.size > 0 for fit in seen[2:]] == [False, False, True]
@@ -604,7 +586,9 @@ def test_an_identification_goes_on_where_it_was_interrupted(tmp_path):
     ]
     assert json.dumps(reported[0]) == json.dumps(reported[1])
     with pytest.raises(InputError, match="of another problem; what differs: noise"):
-        tuning.identify(case, log, free, folder=tmp_path, resume=True, **{**options, "noise": 0.06})
+        tuning.identify(
+            case, log, free, checkpoint=tmp_path, resume=True, **{**options, "noise": 0.06}
+        )
 
 
 # Kills.

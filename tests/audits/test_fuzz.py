@@ -130,7 +130,7 @@ def test_broken_rig_files(tmp_path):
 OPTIONS = [
     "--set", "--dt", "--seed", "--out", "--free", "--limit", "--objective", "--scenario",
     "--choose", "--tradeoff", "--starts",
-    "--robust", "--samples", "--spread", "--vary", "--shard", "--resume", "--data", "--column",
+    "--robust", "--samples", "--spread", "--vary", "--resume", "--data", "--column",
     "--gap", "--start", "--lang",
     "--precision", "--name", "--schedule", "--method", "--batch", "--validation", "--iterations",
     "--screening", "--devices",
@@ -151,7 +151,6 @@ COMMANDS = [
     "uncertainty",
     "sensitivity",
     "identify",
-    "merge",
     "init",
     "export",
     "compare",

@@ -5,7 +5,6 @@ that is checked (`jaxtank.xla.program_cache`), and tasks of Dask workers by Dask
 
 import ast
 import importlib.util
-import json
 import os
 import subprocess
 import sys
@@ -23,7 +22,7 @@ from jaxtank import presets
 from jaxtank.core import files
 from jaxtank.core.errors import DataError, InputError
 from tuning.identification import csv_log
-from tuning.storage import batch_store, checkpoint, evaluation_log
+from tuning.storage.store import NAME, Store
 
 PACKAGES = {p.__name__: Path(p.__file__).parent for p in (jaxtank, tuning)}
 
@@ -87,7 +86,11 @@ MADE = {
     ("jaxtank.case", "explore", "import_module"): "the live page, by a constant name",
     ("tuning.live.live_figure", "_build", "import_module"): "ipywidgets, by a constant name",
     ("jaxtank.plots.style", "notebook", "import_module"): "matplotlib_inline, by a constant name",
-    ("tuning.cluster.task", "call", "import_module"): "names of its own table, in its own package",
+    (
+        "tuning.cluster.engine",
+        "call",
+        "import_module",
+    ): "names of its own table, in its own package",
     ("jaxtank.presets", "_load", "import_module"): "names of presets.PAPERS, checked before",
 }
 READ = {
@@ -110,16 +113,6 @@ READ = {
     ("jaxtank.xla.program_cache", "processor", "open"): "/proc/cpuinfo",
     ("jaxtank.xla.flags", "_text_of", "open"): "the file that XLA_FLAGS names, looked through only",
     ("tuning.identification.csv_log", "_text", "read_bytes"): "after `refusal`",
-    ("tuning.storage.evaluation_log", "_data", "read_bytes"): "after `refusal`",
-    ("tuning.storage.evaluation_log", "__init__", "open"): "to write",
-    ("tuning.storage.evaluation_log", "keep", "open"): "to write",
-    (
-        "tuning.storage.batch_store",
-        "read_batch",
-        "ZipFile",
-    ): "after `refusal`; unpacked sizes are added up first",
-    ("tuning.storage.batch_store", "read_batch", "load"): "after that; allow_pickle=False",
-    ("tuning.storage.batch_store", "read_manifest", "read_text"): "after `refusal`",
     ("tuning.storage.columns", "__getitem__", "memmap"): "a file without a name, its own",
     ("tuning.cluster.local", "_process", "open"): "to write",
     ("tuning.cluster.local", "_address", "read_text"): "in a new folder of its own, mode 700",
@@ -223,9 +216,7 @@ def test_every_reading_of_a_file_is_known_and_why_it_is_safe():
 
 
 def test_what_never_ends_or_is_too_large_is_not_read(tmp_path):
-    """A device, a pipe, a folder, a huge file where a log, a batch, a manifest or a rig file should
-    be.
-    """
+    """A device, a pipe, a folder, a huge file where a checkpoint, a log or a rig file should be."""
     (tmp_path / "huge").touch()
     os.truncate(tmp_path / "huge", 1 << 32)  # takes no room
     os.mkfifo(tmp_path / "pipe")
@@ -233,111 +224,15 @@ def test_what_never_ends_or_is_too_large_is_not_read(tmp_path):
     for i, odd in enumerate((Path("/dev/zero"), tmp_path / "pipe", tmp_path, tmp_path / "huge")):
         folder = tmp_path / f"run{i}"
         folder.mkdir()
-        for name in (
-            evaluation_log.NAME,
-            batch_store.MANIFEST,
-            "part-000000.npz",
-            "rig.toml",
-            "log.csv",
-        ):
+        for name in (NAME, "rig.toml", "log.csv"):
             (folder / name).symlink_to(odd)
         states = "is not a file|at most"
-        with pytest.raises(InputError, match=states):
-            evaluation_log.EvaluationLog(folder, {"p": 1}, resume=True)
-        with pytest.raises(InputError, match=states):
-            batch_store.read_manifest(folder)
-        with pytest.raises(InputError, match=states):
-            batch_store.read_batch(folder / "part-000000.npz", {"x"})
+        with pytest.raises(InputError, match=f"{states}|is not a checkpoint"):
+            Store(folder, {"p": 1}, resume=True)
         with pytest.raises(InputError, match=states):
             files.read_text(folder / "rig.toml", "rig file")
         with pytest.raises(DataError, match=states):
             csv_log.read_log(folder / "log.csv", loop)
-
-
-def header(shape):
-    """The beginning of an .npy file that claims to hold an array of this shape."""
-    text = (
-        f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117).encode()
-        + b"\n"
-    )
-    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
-
-
-ARRAY = header("(2,)") + bytes(16)
-HOSTILE = {
-    "a bomb": {"x.npy": ARRAY + bytes(1 << 29)},
-    "a name that climbs": {"../../x.npy": ARRAY},
-    "a name of a folder": {"/x.npy": ARRAY},
-    "a batch twice": {"x.npy": ARRAY, "y.npy": ARRAY},
-    "an array of 745 GiB": {"x.npy": header("(100000000000,)") + bytes(16)},
-    "a header that is a program": {
-        "x.npy": b"\x93NUMPY\x01\x00\x20\x00" + b"__import__('os').abort()".ljust(31) + b"\n"
-    },
-    "a header of 9,000 brackets": {
-        "x.npy": b"\x93NUMPY\x01\x00" + (9000).to_bytes(2, "little") + b"[" * 9000
-    },
-    "a header of 9,000 signs": {
-        "x.npy": b"\x93NUMPY\x01\x00" + (9001).to_bytes(2, "little") + b"-" * 9000 + b"1"
-    },
-    "an array longer than a number can say": {"x.npy": header(f"({10**30},)")},
-    "an object, pickled": {"x.npy": ARRAY.replace(b"<f8", b"|O ")},
-    "nothing": {},
-}
-
-
-@pytest.mark.parametrize("held", HOSTILE.values(), ids=HOSTILE)
-def test_a_batch_is_not_trusted(held, tmp_path):
-    path = tmp_path / "part-000000.npz"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in held.items():
-            archive.writestr(name, data)
-    with pytest.raises(InputError, match=r"part-000000\.npz: is not a batch of this program"):
-        batch_store.read_batch(path, {"x"})
-    assert [p.name for p in tmp_path.iterdir()] == [path.name] and not (
-        tmp_path.parent / "x.npy"
-    ).exists()
-
-
-def test_a_batch_that_lies_about_its_size_or_is_cut_or_locked(tmp_path):
-    path = tmp_path / "part-000000.npz"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("x.npy", ARRAY + bytes(1 << 20))
-    whole = path.read_bytes()
-    at = whole.rfind(b"PK\x01\x02")  # its entry in the directory
-    for where, value in (
-        (at + 24, b"\x0a\0\0\0"),
-        (at + 8, b"\x01\0"),
-        (at + 10, b"\x63\0"),
-        (60, b"\xff" * 40),
-        (0, b"\0" * 4),
-    ):
-        path.write_bytes(whole[:where] + value + whole[where + len(value) :])
-        with pytest.raises(InputError, match="not a batch of this program"):
-            batch_store.read_batch(path, {"x"})
-    path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match="not a batch of this program"):
-        batch_store.read_batch(path, {"x"})
-
-
-def test_json_without_end_is_refused(tmp_path):
-    head = json.dumps({"problem": {"format": checkpoint.FORMAT, "p": 1}}) + "\n"
-    deep = "[" * 200_000 + "\n"
-    (tmp_path / batch_store.MANIFEST).write_text(deep)
-    with pytest.raises(InputError, match="is not a manifest"):
-        batch_store.read_manifest(tmp_path)
-    entry = '{"kind": "x", "key": "k", "result": ['
-    for text, words in (
-        (deep, "not a log"),
-        (head + deep, "line 2"),
-        # JSON that is read, and is too deep to be a result
-        (head + entry + '{"all": [' * 900 + "]}" * 900 + "]}\n", "line 2"),
-        (head + entry + '{"shape": [1000000000, 1000000000], "hex": ["0x1p0"]}]}\n', "line 2"),
-        (head + entry + '{"shape": [1], "hex": ["__import__"]}]}\n', "line 2"),
-    ):
-        (tmp_path / evaluation_log.NAME).write_text(text)
-        with pytest.raises(InputError, match=words):
-            evaluation_log.EvaluationLog(tmp_path, {"p": 1}, resume=True)
-        assert (tmp_path / evaluation_log.NAME).read_text() == text
 
 
 @pytest.fixture(scope="module")

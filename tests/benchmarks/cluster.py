@@ -18,6 +18,7 @@ import logging
 import os
 import random
 import signal
+import sqlite3
 import statistics
 import subprocess
 import sys
@@ -77,6 +78,16 @@ def times(case, samples, rounds):
         )
 
 
+def kept(folder):
+    """How many batches are kept in a folder."""
+    path = (Path(folder) / "checkpoint.sqlite3").absolute()
+    try:
+        with contextlib.closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as file:
+            return file.execute("SELECT count(*) FROM record").fetchone()[0] - 1
+    except sqlite3.Error:
+        return 0
+
+
 def drill(kind, folder, whole, chance):
     """Kill a process of a run at a random moment; returns whether draws.csv has the same bytes."""
     with cluster(2) as client:
@@ -84,7 +95,7 @@ def drill(kind, folder, whole, chance):
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
         begun = subprocess.Popen([*words, "--out", folder], **quiet)
         most = chance.randint(1, 12)  # of 16 batches
-        while begun.poll() is None and len(list(Path(folder).glob("part-*.npz"))) < most:
+        while begun.poll() is None and kept(folder) < most:
             time.sleep(0.005)
         pid = begun.pid
         if kind == "scheduler":

@@ -1223,8 +1223,8 @@ def test_uncertainty_json_has_the_keys_of_the_contract_and_the_numbers_of_the_li
 
 
 @pytest.mark.slow
-def test_uncertainty_in_shards_is_that_of_one_run(here):
-    one = done("uncertainty", CASE, *SHORT, *DRAWS, "--quiet", "--json", "--out", "one").json
+def test_uncertainty_writes_its_result_and_no_batches(here):
+    done("uncertainty", CASE, *SHORT, *DRAWS, "--quiet", "--out", "one")
     assert {p.name for p in (here / "one").iterdir()} == {
         "result.json",
         "draws.csv",
@@ -1235,23 +1235,8 @@ def test_uncertainty_in_shards_is_that_of_one_run(here):
     }
     for picture in (here / "one").glob("*.png"):
         assert_picture(picture)
-    printed = say("merge", CASE, *SHORT, *DRAWS, "--out", "two")
-    assert printed.code == 2 and "no checkpoint to continue" in printed.err
-    done("uncertainty", CASE, *SHORT, *DRAWS, "--quiet", "--out", "two", "--shard", "1/1")
-    joined = done("merge", CASE, *SHORT, *DRAWS, "--out", "two", "--quiet", "--json").json
-    assert joined | {"wall_s": 0} == one | {"wall_s": 0}
-    for i in (1, 2):
-        done("uncertainty", CASE, *SHORT, *DRAWS, "--quiet", "--out", "three", "--shard", f"{i}/2")
-    assert "leave the other options out" in say("merge", "three", "--samples", "8").err
-    tampered = (here / "three" / "manifest.json").read_text()
-    (here / "three" / "manifest.json").write_text(tampered.replace("0.088", "0.089"))
-    assert "what differs: loop" in say("merge", "three").err
-    (here / "three" / "manifest.json").write_text(tampered)
-    again = done("merge", "three", "--quiet", "--json").json  # nothing is said twice
-    assert again | {"wall_s": 0} == one | {"wall_s": 0}
     rows = (here / "one" / "draws.csv").read_text().splitlines()
     assert len(rows) == 25 and rows[0].startswith('"draw","failed","plant.drain[0]"')
-    assert not list((here / "two").glob("part-*")) and not (here / "two" / "manifest.json").exists()
 
 
 @pytest.mark.slow
@@ -1297,14 +1282,8 @@ def test_robust_tuning_from_the_command_line():
         (("uncertainty", CASE, "--spread", "2"), "--spread '2'"),
         (("uncertainty", CASE, "--draws", "halton"), "random, latin or sobol"),
         (("uncertainty", CASE, "--measure", "rms"), "unknown measure 'rms'"),
-        (("uncertainty", CASE, "--shard", "1/2"), "--out DIR"),
-        (("uncertainty", CASE, "--shard", "3/2", "--out", "o"), "they are 1/2 to 2/2"),
-        (("uncertainty", CASE, "--shard", "0/4", "--out", "o"), "they are 1/4 to 4/4"),
-        (("uncertainty", CASE, "--shard", "1-4", "--out", "o"), "must be I/N"),
         (("uncertainty", CASE, "--resume", "nothing"), "there is no such folder"),
         (("uncertainty", CASE, "--devices", "0"), "--devices '0'"),
-        (("merge", CASE), "--out DIR"),
-        (("merge", "."), "cannot be read"),
         (("tune", CASE, "--samples", "8"), "belong to --robust"),
         (("tune", CASE, "--back-off", "0.1"), "belong to --robust"),
         (("tune", CASE, "--robust", "mean", "--back-off", "2"), "from 0 to below 1"),

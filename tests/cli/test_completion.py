@@ -14,7 +14,7 @@ from tuning.cli import completion, main
 from tuning.cli.parser import parser
 
 COMMANDS = {
-    *("list", "show", "simulate", "tune", "uncertainty", "merge", "sensitivity", "identify"),
+    *("list", "show", "simulate", "tune", "uncertainty", "sensitivity", "identify"),
     *("attack", "explore"),
     *("init", "export", "compare", "figure", "completion", "bench", "cache"),
 }

@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from tuning.cli import terminal
-from tuning.cli.progress import Progress
+from tuning.cli.commands.tuning import Progress
 
 JAXTANK = [sys.executable, "-m", "tuning.cli.main"]
 SHORT = ["cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400"]

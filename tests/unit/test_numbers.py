@@ -1,8 +1,8 @@
 """The same numbers whatever runs them: another process, two devices, the XLA option off; and where
 float32 is refused, with the reason.
 
-Beside test_compiled_loop.py (jit, vmap, sums in float32) and test_ensemble.py (devices, processes
-and shards of an ensemble).
+Beside test_compiled_loop.py (jit, vmap, sums in float32) and test_ensemble.py (devices and
+processes of an ensemble).
 """
 
 import dataclasses

@@ -14,7 +14,6 @@ from tuning.problem.problem import Problem
 from tuning.search import tuner
 from tuning.search.options import Solver, check_options, check_precision
 from tuning.search.result import TuningResult
-from tuning.storage.checkpoint import checkpoint_folder
 
 DEFAULT = {"starts": 4, "iterations": 40, "validation": FRESH}
 NOMINAL = {"starts": 8, "screening": 64, "iterations": 60, "validation": 64}
@@ -41,7 +40,6 @@ def tune(
     batch: int | None = None,
     validation: int | None = None,
     tolerance: float | None = None,
-    log: str | Path | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
     progress: Callable | None = None,
@@ -99,7 +97,7 @@ def tune(
     tolerance : change of the objective, as a share of its first value, below which a search under
         limits has converged; None for 1e-8 and a last search to 1e-12; nominal only.
     checkpoint : folder for the log of evaluations, with which a killed search is continued by
-        resume=True, to the same bits; `log` is its former name.
+        resume=True, to the same bits.
     progress : called with a dict after every evaluation. Ctrl-C ends the search with the best
         point so far.
     cluster : Dask cluster on which the local searches run side by side, to the same answer:
@@ -128,7 +126,7 @@ def tune(
     own = NOMINAL if nominal or asked or isinstance(case, Problem) else DEFAULT
     counts = {"starts": starts, "iterations": iterations, "validation": validation}
     common: dict[str, Any] = dict(free=free, objective=objective, limits=limits, seed=seed)
-    common |= dict(checkpoint=checkpoint_folder(checkpoint, log=log), resume=resume)
+    common |= dict(checkpoint=checkpoint, resume=resume)
     common |= {n: own[n] if v is None else v for n, v in counts.items()} | {"progress": progress}
     given = {"distributions": distributions, "safety_filter": safety_filter, "mend": mend}
     if own is DEFAULT:

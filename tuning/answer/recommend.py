@@ -20,8 +20,8 @@ from tuning.answer.findings import findings_of
 from tuning.answer.judged import FRESH, judge, matters
 from tuning.answer.result import result_of
 from tuning.answer.setting import NEAR, limited_levels, plants_of, setting_of
+from tuning.cluster.ahead import check_sent
 from tuning.cluster.engine import Engine
-from tuning.cluster.problems import check_sent
 from tuning.feasible.study import apply_mend, can_judge, feasibility
 from tuning.problem.functions import digests
 from tuning.problem.problem import Problem

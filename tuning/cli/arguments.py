@@ -1,10 +1,12 @@
 """The argument parser of the command line and the options that several commands share."""
 
 import argparse
+import functools
 import sys
 from typing import NamedTuple
 
 from jaxtank.core.errors import InputError, nearest
+from tuning.cli.values import number, whole_number
 
 
 class Once(argparse.Action):
@@ -14,7 +16,7 @@ class Once(argparse.Action):
         given = vars(namespace).setdefault("given", set())
         if option_string is not None and self.dest in given:
             raise InputError(
-                f"{option_string} is given twice, the second time as {values!r}: give it once"
+                f"{option_string} is given twice, the second time as {values}: give it once"
             )
         given.add(self.dest)
         setattr(namespace, self.dest, values)
@@ -38,6 +40,10 @@ class Parser(argparse.ArgumentParser):
             message = f"unknown command {words[0]!r}{nearest(words[0], choices)}"
         raise InputError(message)
 
+    def _get_value(self, action, arg_string):
+        """Return the value of an option; argparse would reword the error of its type."""
+        return action.type(arg_string) if callable(action.type) else arg_string
+
     def _print_message(self, message, file=None):
         """Print help; argparse would ignore an OSError."""
         (sys.stderr if file is None else file).write(message)
@@ -55,9 +61,15 @@ class Parser(argparse.ArgumentParser):
         return [spelling for a in actions for spelling in a.option_strings]
 
 
-def option(parser, flag, metavar, text, default=None):
-    """Add an option with a value, kept as text; its command reads the value."""
-    parser.add_argument(flag, default=default, metavar=metavar, help=text)
+def option(parser, flag, metavar, text, default=None, read=None):
+    """Add an option with a value: text, or what read(flag, text) makes of it."""
+    kind = None if read is None else functools.partial(read, flag)
+    parser.add_argument(flag, default=default, metavar=metavar, help=text, type=kind)
+
+
+def whole(low, high):
+    """Return what reads a whole number from `low` to `high`."""
+    return functools.partial(whole_number, low=low, high=high)
 
 
 def repeatable(parser, flag, metavar, text, dest=None):
@@ -88,9 +100,8 @@ def shared():
         "case", metavar="CASE", help='"paper/case" (see jaxtank list) or a rig file ending in .toml'
     )
     run = Parser(add_help=False)
-    option(
-        run, "--seed", "N", "seed of what is drawn: noise, plants, search points (default 0)", "0"
-    )
+    text = "seed of what is drawn: noise, plants, search points (default 0)"
+    option(run, "--seed", "N", text, 0, whole(0, 2**31 - 1))
     option(
         run,
         "--out",
@@ -112,7 +123,7 @@ def changes():
         "a gain that follows a setpoint (r1, ..) or a level (h1, ..), linear between knots; the"
         " same variable and knots for all gains",
     )
-    option(found, "--dt", "S", "sampling period [s], short for --set clock.dt=S")
+    option(found, "--dt", "S", "sampling period [s], short for --set clock.dt=S", None, number)
     found.add_argument(
         "--safety-filter",
         action=argparse.BooleanOptionalAction,
@@ -159,5 +170,5 @@ def on_cluster():
 def on_devices():
     """Return the parent parser of --devices and --cluster."""
     found = Parser(add_help=False, parents=[on_cluster()])
-    option(found, "--devices", "N", "devices of this machine to use (default 1)", "1")
+    option(found, "--devices", "N", "devices of this machine to use (default 1)", 1, whole(1, 1024))
     return found

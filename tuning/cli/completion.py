@@ -42,7 +42,6 @@ FEW = {
     ("tune", "--robust"): ("mean", "cvar", "worst"),
     ("sensitivity", "--method"): ("local", "morris", "sobol"),
     ("uncertainty", "--draws"): ("random", "latin", "sobol"),
-    ("merge", "--draws"): ("random", "latin", "sobol"),
     ("attack", "--pumps"): ("own", "full", "random"),
     ("attack", "--start"): ("any", "own"),
     ("identify", "--loss"): ("linear", "soft_l1", "huber"),

@@ -56,10 +56,9 @@ def _command(argv):
         raise InputError(
             f"--resume: {folder!r} cannot be read as a run to go on with: there is no such folder"
         )
-    shared = getattr(args, "shard", None) is not None
     if argv is None and args.command not in COMPILES_NOTHING:
         _keep_programs(args)
-    with hold(folder, shared=shared, leaving=interrupts.before_leaving):
+    with hold(folder, leaving=interrupts.before_leaving):
         return args.run(args)
 
 

@@ -5,7 +5,7 @@ import sys
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import printable
-from tuning.cli.values import number, once, pair, parse_value, plain_number, settings, whole
+from tuning.cli.values import number, once, pair, parse_value, plain_number, settings
 
 
 def limits_of(args, case):
@@ -136,12 +136,28 @@ def _pair_of(text, case):
 
 def devices_of(args):
     """Return the number of --devices; jax must be configured before it starts."""
-    devices = whole("--devices", args.devices, 1, 1024)
-    if devices > 1:
+    if args.devices > 1:
         import jax
 
-        jax.config.update("jax_num_cpu_devices", devices)
-    return devices
+        jax.config.update("jax_num_cpu_devices", args.devices)
+    return args.devices
+
+
+def finish(result, args):
+    """Write a result to --out and print it; return the paths that were written."""
+    from tuning.report import tables
+
+    written = []
+    try:
+        written = result.save(args.out, args.line) if args.out else []
+    finally:  # a full disk costs the files, not the printed result; and the checkpoint is kept
+        print(tables.dumps(result.to_json()) if args.json else str(result))
+    if args.out and hasattr(args, "resume") and getattr(result, "status", "") != "interrupted":
+        from tuning.storage.store import discard
+
+        discard(args.out)
+    report_written(written, args)
+    return written
 
 
 def report_written(paths, args):

@@ -1,6 +1,5 @@
 """Values of a command line: numbers, ranges, NAME=VALUE, and the case that they describe."""
 
-import os
 import re
 import sys
 from typing import Any
@@ -86,9 +85,9 @@ def settings(args):
     if args.dt is not None:
         if "clock.dt" in values:
             raise InputError(
-                f"--dt {args.dt} beside --set clock.dt={values['clock.dt']}: give one of them"
+                f"--dt {args.dt:g} beside --set clock.dt={values['clock.dt']}: give one of them"
             )
-        values["clock.dt"] = number("--dt", args.dt)
+        values["clock.dt"] = args.dt
     return values
 
 
@@ -199,7 +198,7 @@ def number(option, text):
         raise InputError(f"{option} {text!r}: must be a number") from None
 
 
-def whole(option, text, low, high):
+def whole_number(option, text, low, high):
     """Return the whole number of an option, from `low` to `high`; InputError otherwise."""
     try:
         value = int(text)
@@ -208,11 +207,6 @@ def whole(option, text, low, high):
     if value is None or not low <= value <= high:
         raise InputError(f"{option} {text!r}: must be a whole number from {low} to {high}")
     return value
-
-
-def seed(args):
-    """Return the number of --seed."""
-    return whole("--seed", args.seed, 0, 2**31 - 1)
 
 
 def folder_of(args) -> Any:
@@ -224,8 +218,6 @@ def folder_of(args) -> Any:
             raise InputError(f"{name} '': must name a folder")
     if resume and out and resume != out:
         raise InputError("--resume and --out name different folders: a run is continued in its own")
-    if args.command == "merge" and not out:
-        return args.case if os.path.isdir(args.case) else None
     folder = resume or out
     if folder is not None:
         from jaxtank.core.files import check_folder

@@ -1,17 +1,17 @@
 """Tasks on a Dask cluster: a scheduler at an address, or workers of this machine."""
 
 import contextlib
+import itertools
 import logging
-import queue
 import re
 import sys
 import time
 import warnings
+from concurrent.futures import FIRST_COMPLETED, CancelledError, wait
 from typing import Any
 
 from jaxtank.core.errors import InputError
 from tuning.cluster.local import local_workers
-from tuning.cluster.task import call
 
 CONNECT = 8.0
 """Time within which a scheduler must answer [s]."""
@@ -35,8 +35,36 @@ class ClusterWarning(UserWarning):
     """Something about a cluster that a user should know; the command prints it as a note."""
 
 
+TASKS = {
+    "batches": ("tuning.uncertainty.batches", "batches"),
+    "points": ("tuning.uncertainty.batches", "points"),
+    "search": ("tuning.search.methods", "search_task"),
+}
+"""{name of a task: module and function}; names, texts, numbers and arrays are sent to it."""
+
+
+def call(task, x64, *arguments):
+    """Run a task on a worker."""
+    import importlib
+
+    import jax
+
+    import jaxtank  # noqa: F401  it sets the options of the compiler, before jax starts
+    from jaxtank.xla.program_cache import processor
+
+    module, name = TASKS[task]
+    function = getattr(importlib.import_module(module), name)
+    with jax.enable_x64(x64):
+        return processor(), function(*arguments)
+
+
+# Dask sends a function of the main module as its code: a worker without this program then raises
+# an error of its own rather than end, and the scheduler needs no more than Dask
+call.__module__ = "__main__"
+
+
 class Engine:
-    """Runs tasks on a Dask cluster; made by `connect`."""
+    """Runs tasks on a Dask cluster, by its `concurrent.futures.Executor`; made by `connect`."""
 
     def __init__(self, client, check=None):
         self.client, self.address, self.check = client, client.scheduler.address, check
@@ -47,39 +75,26 @@ class Engine:
         import jax
 
         config: Any = jax.config
-        x64, done = bool(config.jax_enable_x64), queue.SimpleQueue()
-        given, pending = iter(given), {}
-
-        def send(number, arguments):
-            future = self._submit(task, x64, arguments)
-            pending[future.key] = number, arguments, future
-            future.add_done_callback(done.put)
-
+        x64, given, pending = bool(config.jax_enable_x64), iter(given), {}
+        executor = self.client.get_executor(pure=False)
         try:
             while True:
                 self._look(waiting)
-                while len(pending) < max(LEAST, (1 + AHEAD) * self.threads):
-                    number, arguments = next(given, (None, None))
-                    if arguments is None:
-                        break
-                    send(number, arguments)
+                room = max(LEAST, (1 + AHEAD) * self.threads) - len(pending)
+                for number, arguments in itertools.islice(given, room):
+                    pending[self._submit(executor, task, x64, *arguments)] = number
                 if not pending:
                     return
-                with contextlib.suppress(queue.Empty):
-                    future = done.get(timeout=LOOK)
-                    number, arguments, _ = pending.pop(future.key)
-                    found = self._result(future, waiting)
-                    if found is None:  # lost with its worker
-                        send(number, arguments)
-                    else:
-                        yield number, found[0]
+                done = wait(pending, timeout=LOOK, return_when=FIRST_COMPLETED).done
+                for future in done:
+                    yield pending.pop(future), self._result(future)
         finally:
             with contextlib.suppress(Exception):  # the connection has gone
-                self.client.cancel([future for *_, future in pending.values()])
+                executor.shutdown(wait=False)
 
-    def _submit(self, task, x64, arguments):
+    def _submit(self, executor, *arguments):
         try:
-            return self.client.submit(call, task, x64, *arguments, pure=False)
+            return executor.submit(call, *arguments)
         except Exception as error:
             raise self._lost(error) from None
 
@@ -105,38 +120,26 @@ class Engine:
             )
         self.threads, self.looked = found, now
 
-    def _result(self, future, waiting):
-        """Return (what a task returned,), None where that was lost with its worker; raise what it
-        raised, in one line.
-        """
-        while future.status == "finished":
-            try:
-                processor, found = future.result(timeout=CONNECT)
-            except TimeoutError:  # its worker has gone: is there another one?
-                self._look(waiting)
-                continue
-            except Exception as error:
-                if future.status == "lost":
-                    return None
-                raise self._lost(error) from None
-            self._same(processor)
-            return (found,)
-        if future.status in ("lost", "pending") and self.client.status == "running":
-            return None
-        if future.status != "error":
-            raise self._lost()
-        error = future.exception()
-        if type(error).__name__ == "KilledWorker":
-            raise InputError(
-                f"cluster {self.address}: several workers ended while they ran the same task,"
-                " probably out of memory: start workers with more memory, and --resume DIR"
-            )
-        if isinstance(error, ImportError):
+    def _result(self, future):
+        """Return what a task returned; raise what it raised, in one line."""
+        try:
+            processor, found = future.result()
+        except ImportError as error:
             raise InputError(
                 f"cluster {self.address}: a worker has no jaxtank"
                 f" {sys.modules['jaxtank'].__version__} ({error})"
-            )
-        raise error
+            ) from None
+        except (CancelledError, Exception) as error:
+            if type(error).__name__ == "KilledWorker":
+                raise InputError(
+                    f"cluster {self.address}: several workers ended while they ran the same task,"
+                    " probably out of memory: start workers with more memory, and --resume DIR"
+                ) from None
+            if self.client.status != "running" or isinstance(error, CancelledError):
+                raise self._lost(error) from None
+            raise
+        self._same(processor)
+        return found
 
     def _same(self, processor):
         """Warn once where workers have processors of two types."""
@@ -186,12 +189,12 @@ def connect(cluster):
         yield engine
 
 
-def check_cluster(cluster):
-    """Raise InputError unless `cluster` is something that `connect` takes, and Dask is
-    installed.
-    """
+def check_cluster(cluster, devices=1):
+    """Raise InputError unless `cluster` is what `connect` takes, on one device, with Dask."""
     if cluster is None or isinstance(cluster, Engine):
         return
+    if devices > 1:
+        raise InputError("cluster and devices: give one of them")
     if isinstance(cluster, str):
         kind, _, count = cluster.partition(":")
         if kind == "local":
@@ -216,17 +219,6 @@ def check_cluster(cluster):
             f"cluster is a {type(cluster).__name__}: must be an address, local:N, or a"
             " distributed.Client that is not asynchronous"
         )
-
-
-def check_alone(cluster, **other):
-    """Raise InputError for a cluster that cannot be used, or beside what does not go with one."""
-    # other : {what does not: whether it is given}
-    if cluster is None:
-        return
-    for name, given in other.items():
-        if given:
-            raise InputError(f"cluster and {name}: give one of them")
-    check_cluster(cluster)
 
 
 @contextlib.contextmanager

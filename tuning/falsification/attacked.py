@@ -1,7 +1,7 @@
 """A case whose coefficients, start and readings are variables of the unit cube."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -9,18 +9,187 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.case import Case
+from jaxtank.controllers.base import Controller
+from jaxtank.core.clock import CHUNK, Clock, pointwise, sample_times
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip, lower_clip, smooth_sqrt
-from jaxtank.core.tree import split_index, with_values
+from jaxtank.core.records import Estimate, Tick
+from jaxtank.core.tree import component, get_value, leaf, split_index, static, with_values
+from jaxtank.instruments.base import Sensor
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken
 from jaxtank.loop.step import step
+from jaxtank.plants.faults import Faults
 from jaxtank.safety.box import band_of, top_of
 from jaxtank.safety.filter import FLOOR
+from jaxtank.safety.of_case import FLOWS
 from jaxtank.safety.worst_case import rates_of
 from jaxtank.xla.hoist import scan
-from tuning.falsification.coefficients import Coefficient
-from tuning.falsification.components import Course, GivenErrors, PumpPlan
+from tuning.uncertainty.distributions import Correlated, Discrete, stated
+from tuning.uncertainty.draws import Draws
+from tuning.uncertainty.sampling import spread_of
+
+
+class Coefficient(NamedTuple):
+    """One number of the loop and its interval, in its own unit."""
+
+    name: str
+    nominal: float
+    low: float
+    high: float
+    varies: bool
+
+
+def coefficients_of(case: Any, distributions: Any = None) -> list[Coefficient]:
+    """Return the coefficients of a case that lie in intervals, with their intervals."""
+    loop = case.loop
+    if distributions is None:
+        ends = _ends_of_box(case)
+    else:
+        ends = _ends_of(loop, stated(distributions))
+    found = [c for name, (low, high) in ends.items() for c in _entries(loop, name, low, high)]
+    if not found:
+        raise InputError(
+            f"attack {case.name}: no interval is wider than 0: name what varies, as --spread 0.05"
+            " or --vary plant.drain=uniform:5%"
+        )
+    return found
+
+
+def _ends_of_box(case):
+    """{name: (low, high)} of the filter's box, and of what else the case calls uncertain."""
+    guard = case.loop.safety_filter
+    if guard is None:
+        try:
+            guard, _ = case.safety_design()
+        except InputError:  # no network of tanks
+            return _ends_of(case.loop, spread_of(case))
+    least, most = guard.least, guard.most
+    names = [f.name for f in dataclasses.fields(least) if f.metadata.get("kind") == "leaf"]
+    ends = {f"plant.{name}": (getattr(least, name), getattr(most, name)) for name in names}
+    others = {n: s for n, s in case.uncertain.items() if n.split(".")[0] not in NOT_OTHERS}
+    return ends | (_ends_of(case.loop, stated(others)) if others else {})
+
+
+NOT_OTHERS = ("plant", "sensor", "x0")
+"""Parts whose uncertainty is in the box of plants, the band of readings and the starts."""
+
+
+def _ends_of(loop, distributions):
+    """{name: (low, high)} of {name: distribution}."""
+    for name, distribution in distributions.items():
+        if isinstance(distribution, Discrete):
+            raise InputError(f"attack: {name} is discrete: must have an interval, as uniform:5%")
+    draws = Draws(loop, distributions)
+    together = [d for d in distributions.values() if isinstance(d, Correlated)]
+    corners = [draws.values(np.full((1, draws.dimensions), p)) for p in (0.0, 1.0)]
+    ends = {name: (corners[0][name][0], corners[1][name][0]) for name in corners[0]}
+    for d in together:
+        reach = d.cut * np.sqrt(np.diag(np.asarray(d.covariance, dtype=float)))
+        for i, name in enumerate(d.names):
+            mean = float(get_value(loop, name)) if d.mean is None else float(d.mean[i])
+            ends[name] = (max(mean - reach[i], 0.0), mean + reach[i])
+    return ends
+
+
+def _entries(loop, name, low, high):
+    """The Coefficients of the entries of one parameter whose interval has a width."""
+    base, index = split_index(name)
+    whole = np.asarray(get_value(loop, base), dtype=float)
+    nominal = np.asarray(get_value(loop, name), dtype=float)
+    varies = base.removeprefix("plant.") in FLOWS and whole.ndim == 1
+    low, high = (np.broadcast_to(np.asarray(v, dtype=float), nominal.shape) for v in (low, high))
+    for at in np.ndindex(nominal.shape):
+        if high[at] > low[at]:
+            entry = f"{base}[{','.join(map(str, index or at))}]" if index or at else base
+            yield Coefficient(entry, float(nominal[at]), float(low[at]), float(high[at]), varies)
+
+
+@component
+class GivenErrors(Sensor):
+    """Readings y = h + error, a given error of each sample; an ADC reads no more than `top`."""
+
+    error: Any = leaf("cm", "error of each tank's reading at each sample", shape=("sample", "tank"))
+    top: tuple = static("cm", "highest level that can be read, None without an ADC")
+
+    def draw(
+        self, key: jax.Array | None, samples: int, piece: Any | None = None
+    ) -> tuple[Any, ...]:
+        """Return the (n) errors (samples,) [cm] of a run, or of the chunk `piece` of it."""
+        error = jnp.asarray(self.error)
+        if piece is not None:
+            error = jax.lax.dynamic_slice_in_dim(error, piece * CHUNK, samples, 1)
+        return tuple(error[i, :samples] for i in range(error.shape[0]))
+
+    def step(
+        self, state: Any, x: Sequence[Any], xi: Sequence[Any] | None, dt: Any
+    ) -> tuple[Sequence[Any], Any]:
+        assert xi is not None  # `draw`
+        y = tuple(h + e for h, e in zip(x, xi))
+        return tuple(v if t is None else clip(v, 0.0, t) for v, t in zip(y, self.top)), state
+
+
+@component
+class PumpPlan(Controller):
+    """Commands that are constant over windows of equal length, whatever the levels."""
+
+    command: Any = leaf("V", "command of each window and pump", shape=("window", "pump"))
+    length: Any = leaf("s", "length of a window", low=0.0, strict=True)
+
+    @pointwise
+    def inputs(self, clock: Clock) -> Any:
+        """Return the (m) commands (samples,) [V]."""
+        command = jnp.asarray(self.command)
+        window = _window(clock, self.length, command.shape[0])
+        return tuple(command[window, j] for j in range(command.shape[1]))
+
+    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence[Any], Any]:
+        return tick.own, state
+
+    @property
+    def reads_model(self) -> bool:
+        return False
+
+
+@component
+class Course:
+    """Entries of the plant whose values are constant over windows of equal length, unknown to
+    controller and filter; takes the place of a loop's `Faults`, which follow in `then`.
+    """
+
+    value: Any = leaf(
+        "-", "value of each entry in each window, in its own unit", shape=("window", "entry")
+    )
+    length: Any = leaf("s", "length of a window", low=0.0, strict=True)
+    names: tuple[str, ...] = static(doc="entries of the plant, as drain[1]")
+    then: Faults | None = None
+
+    @pointwise
+    def sample(self, clock: Clock) -> tuple[Any, Any]:
+        """Return (values (samples,) of each entry, samples of the faults that follow)."""
+        value = jnp.asarray(self.value)
+        window = _window(clock, self.length, value.shape[1])
+        own = tuple(value[i, window] for i in range(value.shape[0]))
+        return own, () if self.then is None else self.then.sample(clock)
+
+    def apply(self, plant: Any, active: Sequence[Any]) -> Any:
+        """Return the plant of a sample; active: a sample of `sample`."""
+        own, then = active
+        changed = {}
+        for name, v in zip(self.names, own):
+            field, (index,) = split_index(name)
+            value = getattr(plant, field)
+            entries = changed.setdefault(field, [value[i] for i in range(np.shape(value)[0])])
+            entries[index] = v
+        plant = dataclasses.replace(plant, **{f: tuple(e) for f, e in changed.items()})
+        return plant if self.then is None else self.then.apply(plant, then)
+
+
+def _window(clock, length, count):
+    """(samples,) index of the window of `length` [s] in which each sample lies."""
+    window = jnp.floor((sample_times(clock) + 1e-7 * clock.dt) / length).astype(int)
+    return jnp.clip(window, 0, count - 1)
+
 
 SWITCHES = 64
 """Windows of the commands in place of a controller's."""

@@ -36,7 +36,7 @@ class Mend:
     Attributes
     ----------
     what : str
-        One of `tuning.feasible.mends.KINDS`.
+        One of `tuning.feasible.study.KINDS`.
     set : dict
         {dotted name: number or list} as for `--set`; {} where nothing needs to change.
     share : float or None

@@ -3,20 +3,25 @@
 Imported as `tuning.feasibility` and by the commands.
 """
 
+import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+import scipy  # its parts are imported when they are first used
 
 from jaxtank import rig
+from jaxtank.analysis.steady_batch import SteadyStates
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
+from jaxtank.core.tree import get_value
+from jaxtank.loop import run as lp
 from jaxtank.rig.values import with_models
-from tuning.feasible.mends import DESIGN, KINDS, TARGET, find_mends
-from tuning.feasible.offset import least_offsets
-from tuning.feasible.ramps import mended_ramp
+from jaxtank.signals.setpoints import Ramps
 from tuning.feasible.result import Feasibility, Mend, PlateauNeed
+from tuning.problem.limits import resolve_limits
+from tuning.problem.scenarios import runs_of
 from tuning.uncertainty.distributions import stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.needs import Needs, judges
@@ -252,3 +257,364 @@ def _others(found):
     """What else would be enough, for a message."""
     kinds = ", ".join(m.what for m in found.mends)
     return f"; what is: {kinds}" if kinds else ""
+
+
+ROUNDS = 12
+"""Times that the limits are linearised."""
+
+SWEEPS = 60
+"""Sweeps of Hildreth's method over the linearised limits."""
+
+REACHED = 1e-4
+"""Excess over a limit, as a share of it, with which an answer counts as within the limits."""
+
+
+def least_offsets(needs: Needs) -> np.ndarray:
+    """Return (N, P) least distance of a steady state within the limits from each plateau's
+    setpoints [cm, Euclidean over outputs]; NaN where none was found.
+    """
+    # by sequential quadratic programming from y = r, all plants at once: the limits are linearised
+    # at y, and r is projected onto them by Hildreth's method (dual coordinate ascent).
+    r = np.broadcast_to(needs.setpoints, (needs.count, *needs.setpoints.shape[1:]))
+    size = np.maximum(np.abs(needs.high), np.abs(needs.low))[:, None]
+    wrong = needs.excess() > 0
+    found = np.zeros(r.shape[:2])
+    plants = np.flatnonzero(wrong.any(axis=(1, 2)))
+    if not len(plants):
+        return found
+    few = Needs(needs.case, {n: v[plants] for n, v in needs.values.items()}, needs.limits)
+    few_r, size = r[plants], size[plants]
+    low, high = few.low[:, None] / size, few.high[:, None] / size
+    y, best = few_r.copy(), np.full(few_r.shape[:2], np.inf)
+    step = 1e-5 * np.maximum(few_r, 1e-2 * few_r.max())
+    for _ in range(ROUNDS):
+        needed = few.at(y) / size
+        slopes = np.stack(
+            [
+                (few.at(y + step * one) - few.at(y - step * one))
+                / size
+                / (2.0 * step * one).sum(-1)[..., None]
+                for one in np.eye(r.shape[2])
+            ],
+            axis=-1,
+        )
+        best = _kept(best, y, few_r, np.maximum(needed - high, low - needed))
+        rows = np.concatenate([slopes, -slopes], axis=2)
+        ends = np.concatenate([high - needed, needed - low], axis=2)
+        ends = ends + np.einsum("spqm,spm->spq", rows, y)
+        y = np.maximum(_projected(few_r, rows, ends), 1e-3 * few_r.max())
+    needed = few.at(y) / size
+    best = _kept(best, y, few_r, np.maximum(needed - high, low - needed))
+    found[plants] = np.where(np.isfinite(best), best, np.nan)
+    return found
+
+
+def _kept(best, y, r, over):
+    """The smaller of `best` and the distance of y from r, where y is within the limits."""
+    good = np.nan_to_num(over, nan=np.inf).max(axis=2) <= REACHED
+    return np.minimum(best, np.where(good, np.linalg.norm(y - r, axis=2), np.inf))
+
+
+def _projected(r, rows, ends):
+    """The points next to r with rows . y <= ends, by Hildreth's method."""
+    weight = np.sum(rows * rows, axis=3)
+    weight = np.where(weight > 1e-18, weight, np.inf)
+    y, dual = r.copy(), np.zeros(ends.shape)
+    for _ in range(SWEEPS):
+        before = dual.copy()
+        for q in range(ends.shape[2]):
+            row = rows[:, :, q]
+            over = np.einsum("spm,spm->sp", row, y) - ends[:, :, q]
+            new = np.maximum(0.0, dual[:, :, q] + over / weight[:, :, q])
+            y = y - row * (new - dual[:, :, q])[..., None]
+            dual[:, :, q] = new
+        if np.max(np.abs(dual - before)) <= 1e-9 * max(1.0, np.max(np.abs(dual))):
+            break
+    return y
+
+
+STEPS = 9
+"""Runs of a bisection: to 1/500 of its first interval."""
+
+
+def mended_ramp(case: Case) -> Mend | None:
+    """Return the shortest `reference.ramp` with which the case's own run holds its limits."""
+    reference = case.loop.reference
+    if not isinstance(reference, Ramps) or not reference.changes:
+        raise InputError(f"{case.name}: its reference has no ramps to mend")
+    now, most = float(reference.ramp), _longest(reference, case.clock.duration)
+    if _holds(case, now):
+        return Mend(what="ramps", set={}, share=None, words="the ramps need no change")
+    bad, good = now, max(now, 1.0)
+    while good < most:
+        good = min(1.6 * good, most)
+        if _holds(case, good):
+            break
+        bad = good
+    else:
+        return None
+    for _ in range(STEPS):
+        middle = 0.5 * (bad + good)
+        bad, good = (bad, middle) if _holds(case, middle) else (middle, good)
+    rounded = _up(good)
+    good = rounded if rounded <= most and _holds(case, rounded) else good
+    words = f"ramps of {good:g} s"
+    return Mend(what="ramps", set={"reference.ramp": good}, share=None, words=words)
+
+
+def _longest(reference, duration):
+    """The shortest time between two changes of an output, or to the end of the run [s]."""
+    gaps = []
+    for channel in range(reference.channels):
+        times = [t for t, i in reference.changes if i == channel]
+        gaps += [b - a for a, b in zip(times, [*times[1:], duration])]
+    return min(gap for gap in gaps if gap > 0)
+
+
+def _up(value):
+    """`value` [s] rounded up to three digits."""
+    scale = 10.0 ** (2 - math.floor(math.log10(value)))
+    return math.ceil(value * scale - 1e-9) / scale
+
+
+def _holds(case, ramp):
+    """Whether the nominal run with ramps of `ramp` [s] holds every limit of the case."""
+    mended = rig.set_values(case.replace(scenarios=()), {"reference.ramp": float(ramp)})
+    limits = resolve_limits(mended)
+    if not limits:
+        return True
+    key = runs_of(mended, (), 0)[0].key
+    names = tuple(dict.fromkeys(limit.measure for limit in limits))
+    measured, diverged = lp.evaluate_and_flag(mended.loop, mended.clock, names, key)
+    return not bool(diverged) and all(limit.margin(measured) >= 0 for limit in limits)
+
+
+KINDS = ("setpoints", "rims", "orifices", "pumps", "ramps")
+
+TARGET = 0.95
+"""Share of the plants that a mend makes feasible [-]."""
+
+AIM = 0.956
+"""Share on the draws that it is found with: nearly two standard deviations of the share of 4,096
+others above TARGET [-].
+"""
+
+DESIGN = 2
+"""Draws that mends are found with, for each one that is counted: less scatter of their own."""
+
+COARSE = 1024
+"""Draws with which the direction of a move of setpoints is found; its size is found with all."""
+
+FACTORS = (1.02, 1.05, 1.1, 1.2, 1.35, 1.6, 2.0, 3.0)
+"""Factors on the areas of orifices among which the smallest is looked for."""
+
+FAR = 0.4
+"""Margin, as a share of a limit, of what a move of setpoints does not look at."""
+
+ROUNDING = 1e-4
+"""Margin, as a share of a limit, that a search of setpoints keeps."""
+
+LARGEST = 1e6
+"""Excess, as a share of a limit, that stands for no steady state."""
+
+
+def find_mends(needs: Needs) -> tuple[Mend, ...]:
+    """Return the mends of each kind that has one; () where the case needs none."""
+    if needs.feasible().mean() >= TARGET:
+        return ()
+    searches = {"setpoints": _setpoints, "rims": _rims, "orifices": _orifices, "pumps": _pumps}
+    return tuple(mend for search in searches.values() if (mend := search(needs)) is not None)
+
+
+def _least(good: Callable, low: float, high: float, steps: int = 14) -> float:
+    """The least number between `low`, which is not good, and `high`, which is."""
+    for _ in range(steps):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if good(middle) else (middle, high)
+    return high
+
+
+def _rounded(value: float, old: float, digits: int = 2) -> float:
+    """`value` rounded away from `old`, to `digits` digits of the change behind its first."""
+    change = abs(value - old)
+    if change == 0.0:
+        return value
+    places = digits - math.floor(math.log10(change))
+    scale = 10.0**places
+    away = math.ceil if value > old else math.floor
+    found = away(round(value * scale, 6)) / scale
+    return round(found, max(places, 0))
+
+
+# setpoints
+
+
+def _setpoints(needs: Needs) -> Mend | None:
+    """The least change of all setpoints, in the sum of its squares."""
+    names = list(dict.fromkeys(name for p in needs.plateaus for name in p.names))
+    where = np.array([[names.index(name) for name in p.names] for p in needs.plateaus])
+    moved = lambda change: needs.setpoints + change[where]
+    share = lambda change: needs.feasible(needs.at(moved(change))).mean()
+    old = {n: v for p in needs.plateaus for n, v in zip(p.names, p.values)}
+    values = np.array([old[name] for name in names])
+    found, quantile, coarse = np.zeros(len(names)), AIM, needs.first(COARSE)
+    low, high = AIM, 1.0 - (1.0 - AIM) / 8.0
+    best = None
+    for _ in range(5):  # the quantile of each need at which they hold together
+        found = _least_move(coarse, where, values, quantile, found)
+        enough = share(found) >= AIM
+        best = found if enough else best
+        low, high = (low, quantile) if enough else (quantile, high)
+        quantile = 0.5 * (low + high)
+    if best is None:
+        return None
+    scale = _least(lambda s: share(s * best) >= AIM, 0.0, 1.0, 10)
+    return _rounded_setpoints(names, values, scale * best, share)
+
+
+def _rounded_setpoints(names, values, change, share):
+    """The Mend of a change, rounded away from the case; a little more where rounding lost some."""
+    digits = 10.0 ** (math.floor(math.log10(np.max(np.abs(change)))) - 2)
+    for more in 1.0 + 0.005 * np.arange(20):
+        kept = np.where(np.abs(change) < digits, 0.0, more * change)
+        away = np.sign(kept) * np.ceil(np.abs(kept) / digits - 1e-9) * digits
+        places = max(0, -round(math.log10(digits)))
+        new = {n: round(float(v + c), places) for n, v, c in zip(names, values, away) if c != 0.0}
+        exact = np.array([new.get(n, v) for n, v in zip(names, values)]) - values
+        if (found := share(exact)) >= AIM:
+            pairs = [f"{n} {v:g} -> {new[n]:g}" for n, v in zip(names, values) if n in new]
+            return Mend(what="setpoints", set=new, share=float(found), words=", ".join(pairs))
+    return None
+
+
+def _least_move(needs, where, values, quantile, start):
+    """(names,) least change for which the quantile of each need is within its limit."""
+    size = np.maximum(np.abs(needs.high), np.abs(needs.low))[:, None]
+    outputs = where.shape[1]
+
+    def over(change):
+        found = needs.excess(needs.at(np.maximum(needs.setpoints + change, 1e-6))) / size
+        return np.minimum(found, LARGEST)
+
+    rank = min(needs.count, math.ceil(quantile * needs.count)) - 1
+    # what is far from its limit is left out; the share at the end counts all
+    near = np.partition(over(0.0), rank, axis=0)[rank] > -FAR
+
+    def needed(change):
+        return np.partition(over(change)[:, near], rank, axis=0)[rank]
+
+    def slopes(change):
+        h, base = 1e-4 * float(np.max(np.abs(values))), change[where]
+        matrix = np.zeros((*near.shape, len(values)))
+        for j in range(outputs):
+            step = h * np.eye(outputs)[j]
+            found = np.zeros(near.shape)
+            found[near] = -(needed(base + step) - needed(base - step)) / (2.0 * h)
+            for k, name in enumerate(where[:, j]):
+                matrix[k, :, name] += found[k]
+        return matrix[near]
+
+    return scipy.optimize.minimize(
+        lambda change: float(change @ change),
+        start,
+        jac=lambda change: 2.0 * change,
+        method="SLSQP",
+        bounds=[(-0.9 * v, None) if v > 0 else (0.0, None) for v in values],
+        constraints={"type": "ineq", "fun": lambda c: -needed(c[where]) - ROUNDING, "jac": slopes},
+        options={"maxiter": 40, "ftol": 1e-4},
+    ).x
+
+
+# rims and pumps
+
+
+def _rims(needs: Needs) -> Mend | None:
+    """Rims raised; none where a limit of its own is below."""
+    if np.ptp(needs.rim, axis=0).any():
+        return None
+    tanks = needs.rim.shape[1]
+    return _raised(needs, "rims", "plant.rim", 0, np.flatnonzero(needs.at_rim), tanks)
+
+
+def _pumps(needs: Needs) -> Mend | None:
+    """Upper limits of the pumps raised."""
+    tanks, whole = needs.rim.shape[1], needs.high.shape[1]
+    if np.ptp(needs.high[:, tanks:], axis=0).any():
+        return None
+    return _raised(needs, "pumps", "actuator.high", tanks, np.arange(tanks, whole), whole)
+
+
+def _raised(needs, what, leaf, first, columns, end) -> Mend | None:
+    """The Mend that raises those of the limits `columns` that are passed; one height for all whose
+    limits are the same.
+    """
+    needed = needs.at()
+    most = np.nan_to_num(needed, nan=np.inf).max(axis=1)
+    old = needs.high[0]
+
+    def raised(quantile):
+        high = needs.high.copy()
+        for i in columns:
+            new = np.quantile(most[:, i], quantile, method="higher")
+            if new > old[i] and np.isfinite(new):
+                high[:, i] = new
+        return high
+
+    share = lambda high: needs.feasible(needed, high=high).mean()
+    if share(raised(1.0)) < AIM:
+        return None
+    quantile = _least(lambda p: share(raised(p)) >= AIM, 0.5, 1.0)
+    high = raised(quantile)[0]
+    changed = [int(i) for i in columns if high[i] > old[i]]
+    new = {i: _rounded(float(high[i]), float(old[i])) for i in changed}
+    if len(changed) > 1 and len({old[i] for i in changed}) == 1:
+        bound = max(new.values())
+        level = lambda top: np.where(np.isin(np.arange(len(old)), changed), top, needs.high)
+        one = _least(lambda top: share(level(top)) >= AIM, float(old[changed[0]]), bound)
+        new = dict.fromkeys(changed, _rounded(one, float(old[changed[0]])))
+    top = needs.high.copy()
+    top[:, changed] = [new[i] for i in changed]
+    which = ", ".join(str(i - first + 1) for i in changed)
+    unit = needs.case.loop.units[0 if first == 0 else 1]
+    heights = ", ".join(dict.fromkeys(f"{v:g}" for v in new.values()))
+    noun = ("rim" if what == "rims" else "pump") + "s" * (len(changed) > 1)
+    words = f"{noun} of tank{'s' * (len(changed) > 1)} {which} at {heights} {unit}"
+    if what == "pumps":
+        words = f"{noun} {which} up to {heights} {unit}"
+    values = {f"{leaf}[{i - first}]": v for i, v in new.items()}
+    return Mend(what=what, set=values, share=float(share(top)), words=words)
+
+
+# orifices
+
+
+def _orifices(needs: Needs) -> Mend | None:
+    """One factor on the areas of all orifices and pipes between tanks, the one nearest to 1."""
+    leaves = [n for n in ("orifice", "pipe") if needs.states.own[n].shape[1]]
+    if not leaves:
+        return None
+
+    def share(factor):
+        own = {n: v * (factor if n in leaves else 1.0) for n, v in needs.states.own.items()}
+        states = SteadyStates(needs.states.plant, own, needs.states.inflow)
+        needed = np.concatenate(states.at(needs.setpoints), axis=2)
+        return needs.feasible(needed).mean()
+
+    good = lambda factor: share(factor) >= AIM
+    for before, after in zip((1.0, *FACTORS), FACTORS):
+        ways = [way for way in (1.0, -1.0) if good(after**way)]
+        if ways:
+            found = [_least(lambda f, w=w: good(f**w), before, after, 9) ** w for w in ways]
+            return _scaled(needs, leaves, min(found, key=lambda f: abs(math.log(f))), share)
+    return None
+
+
+def _scaled(needs, leaves, factor, share):
+    factor = _rounded(factor, 1.0, 2)
+    loop: Any = needs.case.loop
+    new = {}
+    for name in leaves:
+        values = np.asarray(get_value(loop, f"plant.{name}"), dtype=float)
+        new[f"plant.{name}"] = [float(f"{v * factor:.6g}") for v in values]
+    words = f"{' and '.join(f'{n}s' for n in leaves)} x {factor:g}"
+    return Mend(what="orifices", set=new, share=float(share(factor)), words=words)

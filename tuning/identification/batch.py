@@ -18,8 +18,7 @@ from jaxtank.case import Case
 from jaxtank.core.tree import with_values
 from tuning.identification import simulation
 from tuning.identification.confidence import ROUND_OFF, VAGUE
-from tuning.identification.data_checks import check_data, check_float64, check_length
-from tuning.identification.experiment import Log
+from tuning.identification.experiment import Log, check_data, check_float64, check_length
 from tuning.identification.problem import Estimation
 from tuning.identification.result import Identifications
 

@@ -17,7 +17,7 @@ from jaxtank.loop.steady import steady_state
 from jaxtank.plants.runge_kutta import advance
 from tuning.identification import simulation
 from tuning.identification.confidence import VAGUE
-from tuning.identification.parametrisation import coordinates, nominal, specification
+from tuning.identification.problem import coordinates, nominal, specification
 from tuning.identification.result import Experiments
 from tuning.problem.bounds import bounds
 

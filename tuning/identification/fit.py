@@ -16,17 +16,15 @@ from jaxtank.core.errors import DataError, InputError
 from jaxtank.plants.base import Plant
 from tuning.identification import experiment
 from tuning.identification.confidence import Spread, at_search_bounds
-from tuning.identification.data_checks import check_data, check_float64, check_length, first_samples
 from tuning.identification.design import remedies
-from tuning.identification.identified_case import bare
+from tuning.identification.experiment import check_data, check_float64, check_length, first_samples
+from tuning.identification.identified_case import bare, check_kind
 from tuning.identification.least_squares import Fit, solve
 from tuning.identification.least_squares import profile_likelihood as _profile
 from tuning.identification.problem import Estimation
-from tuning.identification.proposal import check_kind
 from tuning.identification.residuals import quality, validate
 from tuning.identification.result import Identification
 from tuning.problem.status import Status
-from tuning.storage.checkpoint import checkpoint_folder
 from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
 from tuning.storage.fingerprint import digest, fingerprint
 
@@ -50,7 +48,6 @@ def identify(
     profile: bool = False,
     iterations: int = 100,
     gap: float = 1.5,
-    folder: str | Path | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
     progress: Callable | None = None,
@@ -92,8 +89,7 @@ def identify(
     gap : float
         Longest step between samples, in median steps.
     checkpoint : path, optional
-        Folder of finished searches, from which `resume=True` continues to the same bits; `folder`
-        is its former name.
+        Folder of finished searches, from which `resume=True` continues to the same bits.
     resume : bool
         Continue from `checkpoint`.
     progress : callable, optional
@@ -102,7 +98,7 @@ def identify(
     ready : callable, optional
         Called once all inputs are checked, before the first search.
     law : {"pi"}, optional
-        Propose a PI controller with gains from the identified model (`proposal.py`); the case's own
+        Propose a PI controller with gains from the identified model; the case's own
         controller by default.
 
     Returns
@@ -129,7 +125,7 @@ def identify(
     >>> result.status, list(result.parameters)
     (<Status.CONVERGED: 'converged'>, ['plant.pump_gain[0]'])
     """
-    began, folder = time.perf_counter(), checkpoint_folder(checkpoint, folder=folder)
+    began = time.perf_counter()
     check_float64()
     _check_options(loss, starts=starts, iterations=iterations)
     case = bare(case) if isinstance(case, Plant) else case
@@ -142,9 +138,9 @@ def identify(
     check_length(logs)
     settings = {"loss": loss, "iterations": iterations}
     cache = EvaluationCache()
-    if folder is not None:
+    if checkpoint is not None:
         what = _what(case, logs, partial, start=start, gap=gap, **settings)
-        cache = EvaluationLog(folder, what, resume)
+        cache = EvaluationLog(checkpoint, what, resume)
     if ready is not None:
         ready()
     fits, interrupted = _searches(cache, partial, starts, seed, loss, iterations, progress)

@@ -1,9 +1,16 @@
 """The case before an identification, where only a plant is given, and the one after it."""
 
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
 import numpy as np
+from scipy.integrate import solve_ivp
 
 from jaxtank import rig as rigs
-from jaxtank.case import Case
+from jaxtank.analysis.linear_model import linearise
+from jaxtank.case import Case, Free
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
@@ -12,8 +19,9 @@ from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
+from jaxtank.rig.components import controller_of
 from jaxtank.signals.base import Constant
-from tuning.identification.proposal import with_pi
+from jaxtank.signals.setpoints import Ramps, ramps
 
 
 def bare(plant):
@@ -90,3 +98,158 @@ def identified_plant(result):
     return case.replace(
         name=f"{case.name} identified", loop=loop, uncertain=uncertain, covariance=covariance
     )
+
+
+KINDS = ("pi",)
+STEPS = (1.1, 0.9, 1.05, 0.95)
+"""Setpoint of each output after its change, over its steady level [-]: the first that the rig can
+hold is taken.
+"""
+
+LONGEST = 1e8
+"""Time by which a rig with constant inputs must have come to its steady state [s]."""
+
+MOST = 100_000
+"""Samples of the proposed run at most."""
+
+
+def check_kind(kind, case):
+    """Raise InputError unless `kind` is None or one of KINDS that suits the rig of `case`."""
+    if kind is None:
+        return
+    if kind not in KINDS:
+        raise InputError(
+            f"--law {kind!r}: must be one of {', '.join(KINDS)}; other controllers go into the"
+            " [controller] section of a rig file"
+        )
+    plant = case.loop.plant
+    if len(plant.outputs) != plant.pumps:
+        raise InputError(
+            f"--law {kind}: needs one pump per controlled tank, the rig has {plant.pumps} pumps and"
+            f" {len(plant.outputs)}: add a [controller] section of another kind to the rig file"
+        )
+
+
+def with_pi(case, inputs):
+    """Return `case` under one PI controller per pump, output i to pump i, with [free] ranges."""
+    # T-sum rule (Kuhn 1995): Kc = 0.5/K, Ti = T/2, with the gain K [cm/V] and the sum of time
+    # constants T [s] of each output's response to its own pump, linearised at the steady state for
+    # `inputs` (m,) [V], the pumps' delay added to T. Kc of all loops is halved until the linear
+    # closed loop is stable. A case whose setpoints never change is given a change of each, by 10 %,
+    # from that steady state. Raises InputError where there is no such steady state, model or
+    # setpoint.
+    loop = case.loop
+    plant = loop.plant
+    inputs = np.clip(inputs, np.asarray(loop.actuator.low), np.asarray(loop.actuator.high))
+    x = _steady(loop, inputs)
+    model = tuple(np.asarray(M) for M in linearise(plant, x, inputs))
+    gain, total = _gain_and_time(loop, model, inputs)
+    Kc, Ti = _stable(model, 0.5 / gain, 0.5 * total), 0.5 * total
+    moving = not isinstance(loop.reference, Constant) and not (
+        isinstance(loop.reference, Ramps) and not loop.reference.changes
+    )
+    outputs = list(plant.outputs)
+    start = [float(loop.x0[i]) for i in outputs] if moving else x[outputs].tolist()
+    table = {"kind": "pid", "Kc": Kc.tolist(), "Ti": Ti.tolist(), "Tt": Ti.tolist()} | (
+        {} if moving else {"bias": inputs.tolist()}
+    )
+    # the identified plant is its model, whatever the file's controller has
+    controller = controller_of(
+        table, dataclasses.replace(loop, controller=OpenLoop(signal=loop.reference))
+    )
+    free = {n: f for n, f in case.free.items() if not n.startswith("controller.")}
+    free |= {"controller.Kc": Free(float(Kc.min() / 30), float(Kc.max() * 30))}
+    free |= {"controller.Ti": Free(float(Ti.min() / 10), float(Ti.max() * 10))}
+    found = case.replace(
+        loop=dataclasses.replace(loop, controller=controller),
+        free=free,
+        symmetry=None,
+        objective=case.objective or {"rms_error_total": 1.0},
+        scenarios=tuple(
+            s for s in case.scenarios if not any(n.startswith("controller.") for n in s.values)
+        ),
+    )
+    return rigs.check(found) if moving else _with_changes(found, x, start, inputs, total.max())
+
+
+def _gain_and_time(loop, model, inputs):
+    """Return (K (m,) [cm/V], T (m,) [s]) of each output's response to its own pump."""
+    A, B, C = model
+    pumps = loop.plant.pumps
+    try:
+        once = np.linalg.solve(A, B)
+        gain, area = -np.diag(C @ once), np.diag(C @ np.linalg.solve(A, once))
+    except np.linalg.LinAlgError:
+        gain = area = np.zeros(pumps)
+    for j, (k, a) in enumerate(zip(gain, area)):
+        if not (k > 0 and a > 0 and math.isfinite(a / k)):
+            at = ", ".join(f"{v:g}" for v in inputs)
+            raise InputError(
+                f"pump {j + 1} does not settle tank {loop.plant.outputs[j] + 1} at inputs ({at})"
+                f" {loop.units[1]}: no PI of its own, use another [controller]"
+            )
+    return gain, area / gain + loop.actuator.delay
+
+
+def _stable(model, Kc, Ti):
+    """Return Kc, halved until the linear closed loop is stable."""
+    A, B, C = model
+    for _ in range(8):
+        closed = np.block(
+            [[A - B * Kc @ C, B], [-(Kc / Ti)[:, None] * C, np.zeros((Kc.size, Kc.size))]]
+        )
+        if np.linalg.eigvals(closed).real.max() < 0:
+            return Kc
+        Kc = 0.5 * Kc
+    raise InputError(
+        "output i under a PI of pump i is not stable at any gain tried: use another [controller]"
+    )
+
+
+def _with_changes(case, x, start, inputs, slowest):
+    """Return `case` from the steady state x with a change of each setpoint that the rig
+    can hold.
+    """
+    loop, outputs = case.loop, range(len(start))
+    pause = case.clock.dt * min(math.ceil(5 * slowest / case.clock.dt), MOST // len(start))
+    clock = dataclasses.replace(case.clock, duration=pause * len(start))
+    times = [round(0.1 * pause / clock.dt) * clock.dt + k * pause for k in outputs]
+    pumps = dataclasses.replace(loop.actuator, initial=number(inputs))
+    for share in STEPS:
+        reference = ramps(start, [(times[k], k, share * start[k]) for k in outputs], ramp=0.0)
+        moved = dataclasses.replace(loop, reference=reference, x0=number(x), actuator=pumps)
+        found = case.replace(loop=moved, clock=clock)
+        if not rigs.unreachable(found):
+            return rigs.check(found.replace(reachable=True))
+    raise InputError(
+        f"no setpoints about {', '.join(f'{v:.4g}' for v in start)} {loop.units[0]} can be held:"
+        " add [controller] and [reference]"
+    )
+
+
+def _steady(loop, inputs):
+    """Return (n,) steady levels at constant `inputs`; raise InputError unless below the rims."""
+    plant = loop.plant
+    constant = isinstance(loop.disturbance, Constant)
+    inflow = tuple(np.asarray(loop.disturbance.level)) if constant else None
+    derivative = jax.jit(
+        lambda x: jnp.stack(
+            plant.derivative(0.0, tuple(jnp.maximum(x, 0.0)), tuple(inputs), inflow)
+        )
+    )
+    rate = lambda _, x: np.asarray(derivative(x))
+    rim, span = np.asarray(plant.rim), 100.0
+    x = np.maximum(np.asarray(loop.x0, dtype=float), 1e-3 * rim)
+    while span <= LONGEST:
+        run = solve_ivp(rate, (0.0, span), x, method="LSODA", rtol=1e-9, atol=1e-9 * rim.min())
+        x = np.maximum(run.y[:, -1], 0.0)
+        if np.any(x > 10 * rim) or np.all(np.abs(rate(0.0, x)) * span <= 1e-6 * rim):
+            break
+        span *= 10
+    at = ", ".join(f"{v:.4g}" for v in inputs)
+    for i in np.flatnonzero((x >= rim) | (x <= 1e-3 * rim) | (span > LONGEST)):
+        raise InputError(
+            f"tank {i + 1} has no steady level between 0 and its rim at the mean inputs of the"
+            f" data, ({at}) {loop.units[1]}: add [controller], [reference] and [free]"
+        )
+    return x

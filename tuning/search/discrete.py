@@ -16,7 +16,7 @@ from tuning.problem.bounds import bounds
 from tuning.problem.controllers import NAMES, with_kind
 from tuning.problem.status import Status
 from tuning.search.result import Message, TuningResult
-from tuning.storage.evaluation_log import NAME
+from tuning.storage.store import NAME
 
 MANY = 64
 """Combinations that are tried at most."""

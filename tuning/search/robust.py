@@ -20,7 +20,6 @@ from tuning.search.result import Message, TuningResult
 from tuning.search.tuner import tune
 from tuning.uncertainty.distributions import stated
 from tuning.uncertainty.draws import Draws
-from tuning.uncertainty.result import Ensemble
 from tuning.uncertainty.sampling import clopper_pearson, probabilities, spread_of
 from tuning.uncertainty.study import ensemble
 from tuning.uncertainty.validation import SEED_OFFSET, summary_of, validate
@@ -277,7 +276,6 @@ def _run(distributions, limits, fresh, seed, cluster, case, names):
         fan=False,
         cluster=cluster,
     )
-    assert isinstance(found, Ensemble)  # None for a shard
     past = [
         limit.margins(found.measures[limit.measure].reshape(fresh, -1)[:, limit.index]) < 0
         for limit in found.limits

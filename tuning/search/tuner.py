@@ -14,8 +14,8 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import initial
+from tuning.cluster.ahead import check_sent
 from tuning.cluster.engine import connect
-from tuning.cluster.problems import check_sent
 from tuning.problem.functions import as_measures, check_slopes, digests
 from tuning.problem.problem import Problem
 from tuning.problem.provenance import provenance
@@ -31,7 +31,6 @@ from tuning.search.result import TuningResult, constraint_rows
 from tuning.search.screening import LARGEST_STATE
 from tuning.search.stages import Outcome, Plan, solve
 from tuning.search.verdicts import lost_outputs, points_to_fragile, status_of
-from tuning.storage.checkpoint import checkpoint_folder
 from tuning.storage.evaluation_log import EvaluationLog
 from tuning.storage.fingerprint import fingerprint
 from tuning.uncertainty.validation import validate
@@ -57,14 +56,12 @@ def tune(
     batch: int | None = None,
     validation: int = 64,
     tolerance: float | None = None,
-    log: str | Path | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
     progress: Callable | None = None,
     cluster: Any = None,
 ) -> TuningResult:
     """Return better values for the free parameters of a case, under its limits."""
-    folder = checkpoint_folder(checkpoint, log=log)
     objective, limits = as_measures(objective, limits)
     options: dict[str, Any] = dict(
         free=free,
@@ -83,7 +80,7 @@ def tune(
     )
     if isinstance(case, Problem) or isinstance(method, Solver):
         case, method, options = spelled_out(case, method, options)
-    keep: dict[str, Any] = dict(checkpoint=folder, resume=resume)
+    keep: dict[str, Any] = dict(checkpoint=checkpoint, resume=resume)
     with connect(cluster) as engine:
         if choices:
             return tune_choices(tune, case, method, choices, cluster=engine, **keep, **options)

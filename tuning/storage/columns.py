@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxtank.core.errors import InputError
-from tuning.storage.checkpoint import Folder
+from tuning.storage.store import Folder
 
 IN_MEMORY = 1 << 24
 """Bytes of all arrays up to which they are held in memory."""

@@ -22,10 +22,8 @@ in less.
 
 
 @contextlib.contextmanager
-def hold(folder, shared=False, leaving: Callable = contextlib.nullcontext):
-    """Hold `folder`, made if need be, against other runs; shared=True: against all but those that
-    share it.
-    """
+def hold(folder, leaving: Callable = contextlib.nullcontext):
+    """Hold `folder`, made if need be, against other runs."""
     # The lock is the system's own (flock on a file with the process id in it): it ends with its
     # process however that ends, so that what a kill left behind is taken over, unfinished files
     # (`jaxtank.core.files.sweep`) included. A folder that was made for this and got nothing is
@@ -40,7 +38,7 @@ def hold(folder, shared=False, leaving: Callable = contextlib.nullcontext):
 
     def release():
         """What is done where a signal ends the process."""
-        if file is not None and not shared:
+        if file is not None:
             sweep(folder)
         # without one of ours, a file that was made and not yet locked
         with contextlib.suppress(OSError):
@@ -55,10 +53,9 @@ def hold(folder, shared=False, leaving: Callable = contextlib.nullcontext):
     try:
         with leaving(release):
             folder.mkdir(parents=True, exist_ok=True)
-            file = _locked(folder, shared, opened)
+            file = _locked(folder, opened)
             try:
-                if not shared:
-                    sweep(folder)
+                sweep(folder)
                 yield
             finally:
                 _let_go(folder / LOCK, file)
@@ -66,21 +63,17 @@ def hold(folder, shared=False, leaving: Callable = contextlib.nullcontext):
         tidy()
 
 
-def _locked(folder, shared, opened):
+def _locked(folder, opened):
     """The open lock file of a folder, None where there are no locks; opened: list that holds what
     is open meanwhile.
     """
     assert fcntl is not None  # `hold` comes no further without it
-    path, kind, until = (
-        folder / LOCK,
-        fcntl.LOCK_SH if shared else fcntl.LOCK_EX,
-        time.monotonic() + PATIENCE,
-    )
+    path, until = folder / LOCK, time.monotonic() + PATIENCE
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
         opened[:] = [file]
         try:
-            fcntl.flock(file, kind | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             owner = os.pread(file, 20, 0).decode("ascii", "replace").strip()
             os.close(file)
@@ -108,7 +101,7 @@ def _locked(folder, shared, opened):
 
 
 def _let_go(path, file):
-    """Remove the lock file, unless others share it, and close it."""
+    """Remove the lock file and close it."""
     if file is None:
         return
     assert fcntl is not None  # there is a file

@@ -1,5 +1,6 @@
 """Batches of runs of one case on drawn parameters, on one device or many; used by the studies."""
 
+import functools
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -11,6 +12,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
 from jaxtank.xla.jit import compiled
+from tuning.cluster.sent import received, sent
 from tuning.problem import scenarios as sc
 from tuning.uncertainty.sampling import check_whole
 
@@ -25,6 +27,14 @@ NOISE = 1 << 27
 
 FAN_BATCH, FAN_ROWS = 64, 240
 """Draws simulated at once, and time stamps, of a fan chart."""
+
+WORK = 1 << 24
+"""Samples of all runs of a batch from which it is a task of its own [-]: 0.1 s of work, while the
+command and the scheduler need 5 ms for a task.
+"""
+
+SHARES = 16
+"""Least number of tasks, where there are as many batches: workers end at about the same time."""
 
 CUTS = (0.05, 0.25, 0.5, 0.75, 0.95)
 """Quantiles of a fan chart [-]."""
@@ -47,26 +57,31 @@ def batch_size(case, noisy, samples):
     return 1 << (min(most, max(1, samples)).bit_length() - 1)
 
 
-class Runner:
-    """Runs a batch on each of `devices` at once, each by the program of a single device."""
+def on_devices(devices, run):
+    """Return each(numbers, rows_of, runs): (number, run(device, rows_of(number))), in order."""
+    # Each device has a thread, and runs the program of a single device. One program partitioned
+    # over the devices (shard_map) rounds the last bit differently; this does not.
+    local, pool = jax.local_devices()[:devices], ThreadPoolExecutor(devices)
 
-    # Each device has a thread. One program partitioned over the devices (shard_map) rounds the last
-    # bit differently from the program of a single device; this does not.
+    def each(numbers, rows_of, runs):
+        for i in range(0, len(numbers), devices):
+            group = numbers[i : i + devices]
+            yield from zip(group, pool.map(run, local, map(rows_of, group)))
 
-    def __init__(self, case, names, seed, devices):
-        self.case, self.names, self.seed = case, names, seed
-        self.devices = jax.local_devices()[:devices]
-        self.pool = ThreadPoolExecutor(devices)
+    return each
 
-    def each(self, numbers, rows_of):
-        """Yield (number, batch) in order; rows_of(number): (values, numbers of the draws)."""
-        width = len(self.devices)
-        for group in (numbers[i : i + width] for i in range(0, len(numbers), width)):
-            rows, indices = zip(*map(rows_of, group))
-            yield from zip(group, self.pool.map(self._one, self.devices, rows, indices))
 
-    def _one(self, device, rows, indices):
-        return run_batch(self.case, self.names, self.seed, rows, indices, device)
+def on_workers(engine, task, case, names, seed):
+    """Return what `on_devices` gives, on the workers of an Engine: as the batches come."""
+    given = sent(case, names), names, seed
+
+    def each(numbers, rows_of, runs):
+        groups = grouped(numbers, runs * case.clock.samples)
+        tasks = ((group, (*given, [rows_of(k) for k in group])) for group in groups)
+        for group, found in engine.run(task, tasks):
+            yield from zip(group, found, strict=True)
+
+    return each
 
 
 def run_batch(case, names, seed, rows, indices, device=None):
@@ -119,7 +134,7 @@ class Runs:
     def __init__(
         self, case, draws, names, key, batch=None, progress=None, devices=1, each: Any = None
     ):
-        self.group, self.each = group_of(case, key), each or self._each
+        self.group = group_of(case, key)
         self.own = {
             name: np.asarray(get_value(case.loop, name))[None]
             for name in draws.values(np.zeros((0, draws.dimensions)))
@@ -130,17 +145,10 @@ class Runs:
         )
         self.nominal: Any = None
         self.failed = 0
-        self.devices, self.pool = jax.local_devices()[:devices], ThreadPoolExecutor(devices)
-
-    def _each(self, starts, rows_of):
-        """Yield (start, what `run_points` gives) in order; rows_of(start): values of a batch."""
-
-        def one(device, values):
-            return run_points(self.group, self.names, jax.device_put(values, device))
-
-        width = len(self.devices)
-        for group in (starts[i : i + width] for i in range(0, len(starts), width)):
-            yield from zip(group, self.pool.map(one, self.devices, map(rows_of, group)))
+        self.each = each or on_devices(
+            devices,
+            lambda device, values: run_points(self.group, names, jax.device_put(values, device)),
+        )
 
     def __call__(self, p):
         values = {
@@ -154,7 +162,7 @@ class Runs:
             index = np.minimum(np.arange(start, start + size), total - 1)
             return {name: v[index] for name, v in values.items()}
 
-        for start, (flat, diverged) in self.each(starts, rows_of):
+        for start, (flat, diverged) in self.each(starts, rows_of, size):
             found[start] = flat[: total - start]
             # the case's own run, the very first, is not counted
             self.failed += int(diverged[int(start == 0) : total - start].sum())
@@ -211,3 +219,28 @@ def _trajectories(loop, values, indices, seed, clock, every):
         return run.t, run.r, run.x, run.u
 
     return jax.vmap(one)(values, indices)
+
+
+def batches(text, names, seed, chunks):
+    """Return what `run_batch` gives for the case of `sent` and each (values, indices) of `chunks`;
+    a task.
+    """
+    return [run_batch(received(text), names, seed, *chunk) for chunk in chunks]
+
+
+def points(text, names, seed, chunks):
+    """Return what `run_points` gives for the case of `sent` and each array of values of `chunks`; a
+    task.
+    """
+    return [run_points(_group(text, seed), names, values) for values in chunks]
+
+
+@functools.lru_cache(maxsize=8)
+def _group(text, seed):
+    return group_of(received(text), None if seed is None else jax.random.key(seed))
+
+
+def grouped(numbers, samples):
+    """Return `numbers` of batches in groups, one for each task."""
+    size = max(1, min(WORK // max(1, samples), len(numbers) // SHARES))
+    return [tuple(numbers[i : i + size]) for i in range(0, len(numbers), size)]

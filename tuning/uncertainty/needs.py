@@ -3,7 +3,7 @@ can give them.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,46 @@ from jaxtank.core.tree import get_value, split_index
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig import check_limits
 from jaxtank.signals.base import Constant
-from tuning.uncertainty.plateaus import plateaus_of
+from jaxtank.signals.setpoints import Ramps
+
+
+class Plateau(NamedTuple):
+    """Setpoints that are held for a while."""
+
+    time_s: float
+    """From when on [s]."""
+    names: tuple[str, ...]
+    """(outputs,) dotted name of each setpoint."""
+    values: tuple[float, ...]
+    """(outputs,) each setpoint [cm]."""
+
+
+def plateaus_of(case: Case) -> list[Plateau] | None:
+    """Return the plateaus of a case in order of time, or None where its reference has none."""
+    reference: Any = case.loop.reference
+    if isinstance(reference, Ramps):
+        return _of_ramps(reference, case.clock.duration)
+    if isinstance(reference, Constant):
+        names = tuple(f"reference.level[{i}]" for i in range(reference.channels))
+        return [Plateau(0.0, names, tuple(map(float, reference.level)))]
+    return None
+
+
+def _of_ramps(reference, duration):
+    """The plateaus of Ramps."""
+    ramp = float(reference.ramp)
+    names = [f"reference.initial[{i}]" for i in range(reference.channels)]
+    values = [float(v) for v in reference.initial]
+    starts = sorted({time for time, _ in reference.changes})
+    found = [] if starts and starts[0] <= 0.0 else [Plateau(0.0, tuple(names), tuple(values))]
+    for start, following in zip(starts, [*starts[1:], np.inf]):
+        for j, (time, i) in enumerate(reference.changes):
+            if time == start:
+                names[i], values[i] = f"reference.targets[{j}]", float(reference.targets[j])
+        if start + ramp <= min(following, duration):
+            found.append(Plateau(start + ramp, tuple(names), tuple(values)))
+    return found
+
 
 BLOCK = 1 << 14
 """Draws whose steady states are computed at once: a plateau takes some 100 bytes a draw."""

@@ -11,23 +11,27 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.case import Case
-from jaxtank.core.errors import InputError
 from jaxtank.loop import floor
 from jaxtank.loop import run as lp
-from tuning.cluster.engine import check_alone, connect
+from tuning.cluster.engine import check_cluster, connect
 from tuning.problem.functions import as_measures, digests
 from tuning.problem.limits import Limit, resolve_limits
 from tuning.problem.scenarios import noisy
-from tuning.storage.batch_store import BatchStore
-from tuning.storage.checkpoint import checkpoint_folder
 from tuning.storage.columns import Columns, row_blocks
 from tuning.storage.fingerprint import fingerprint
-from tuning.uncertainty import manifest as shards
-from tuning.uncertainty.batches import Runner, batch_size, check_devices, fan_of, gather
+from tuning.storage.store import Store
+from tuning.uncertainty.batches import (
+    batch_size,
+    check_devices,
+    fan_of,
+    gather,
+    on_devices,
+    on_workers,
+    run_batch,
+)
 from tuning.uncertainty.distributions import stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.needs import BLOCK, infeasible
-from tuning.uncertainty.remote import RemoteRunner
 from tuning.uncertainty.result import Ensemble
 from tuning.uncertainty.sampling import Points, check_whole, spread_of
 
@@ -48,16 +52,14 @@ def ensemble(
     batch: int | None = None,
     devices: int = 1,
     cluster: Any = None,
-    shard: tuple[int, int] | None = None,
-    folder: str | Path | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
-    merge: bool = False,
     progress: Callable | None = None,
-) -> Ensemble | None:
+) -> Ensemble:
     """Run a case on `samples` draws of what is uncertain.
 
-    The numbers of a draw do not depend on batches, devices, shards or processes.
+    The numbers of a draw do not depend on batches, devices or processes. Under `jax.distributed`
+    every process runs its share of the batches and all get the whole.
 
     Parameters
     ----------
@@ -83,27 +85,21 @@ def ensemble(
     cluster : str, distributed.Client or None
         Run the batches on a Dask cluster: "HOST:PORT" of its scheduler, "local:N" for N workers on
         this machine, or a Client. A worker that is killed or added changes no number.
-    shard : (int, int) or None
-        (i, n): run only the i-th of n shares of the batches, into the checkpoint (`merge` joins
-        them). Under `jax.distributed` every process runs its share and all get the whole.
     checkpoint : path or None
-        Folder where finished batches are kept; `folder` is its former name.
+        Folder where finished batches are kept.
     resume : bool
         Go on with the batches in the checkpoint.
-    merge : bool
-        Run nothing, only join the batches in the checkpoint.
     progress : callable or None
         Called with the number of draws done.
 
     Returns
     -------
-    Ensemble or None
-        None for a shard.
+    Ensemble
 
     Raises
     ------
     InputError
-        Before anything is run; for `merge` also where a batch is missing.
+        Before anything is run.
 
     Examples
     --------
@@ -115,10 +111,11 @@ def ensemble(
     >>> found.samples, found.measures["max_level"].shape
     (4, (4, 2))
     """
-    began, folder = time.perf_counter(), checkpoint_folder(checkpoint, folder=folder)
-    _check_arguments(shard, samples, key)
+    began = time.perf_counter()
+    check_whole("samples", samples, 1, 2**31 - 1)
+    check_whole("key", key, 0, 2**31 - 1)
     check_devices(devices)
-    check_alone(cluster, devices=devices > 1, shard=shard is not None, merge=merge)
+    check_cluster(cluster, devices)
     distributions = spread_of(case) if distributions is None else stated(distributions)
     limits = as_measures(None, limits)[1]
     limited = [*resolve_limits(case, limits), *_floors(case)]
@@ -126,16 +123,11 @@ def ensemble(
     plan = _plan(case, Draws(case.loop, distributions), names, samples, key, draws, batch)
     store = None
     with _runner(case, names, plan.seed, devices, cluster) as runner:
-        if folder is not None:
+        if checkpoint is not None:
             what = _what(case, distributions, samples, key, draws, names, plan.batch)
-            origin = shards.origin_of(case, case.limits if limits is None else limits)
-            shared = shard is not None or jax.process_count() > 1
-            store = BatchStore(folder, what, origin, resume=resume, shared=shared, begin=not merge)
-        if shard is not None:
-            _batches(plan, store, runner, shard, merge, progress, lambda k, batch: None)
-            return None
-        joined = _joined(plan, store, runner, merge, progress)
-    values, beyond = _drawn(case, plan, folder)
+            store = Store(checkpoint, what, resume=resume, shared=jax.process_count() > 1)
+        joined = _joined(plan, store, runner, progress)
+    values, beyond = _drawn(case, plan, checkpoint)
     first = {n: np.array(v[:FAN_DRAWS]) for n, v in values.items()}
     return Ensemble(
         case=case,
@@ -161,27 +153,12 @@ def _floors(case):
     return [Limit("min_level", i, float(level)) for i, level in enumerate(lowest)]
 
 
-def _check_arguments(shard, samples, key):
-    """Raise InputError for a shard, a number of samples or a seed that is none."""
-    good = isinstance(shard, tuple) and len(shard) == 2 and 1 <= shard[0] <= shard[1]
-    if shard is not None and not good:
-        raise InputError(f"shard = {shard!r}: must be (i, n), i from 1 to n")
-    check_whole("samples", samples, 1, 2**31 - 1)
-    check_whole("key", key, 0, 2**31 - 1)
-
-
 def _measure_names(case, measures, limited):
     """The measures of a study, those of its limits among them."""
     if measures is None:
         measures = [m for m in ms.placed("summary") if ms.serves(m, case.loop)]
     ms.check_names(tuple(measures))
     return tuple(dict.fromkeys([*measures, *(limit.measure for limit in limited)]))
-
-
-def _numbers(count, shard):
-    """The numbers of the batches that this shard and this process run."""
-    mine = [k for k in range(count) if shard is None or k % shard[1] == shard[0] - 1]
-    return [k for k in mine if k % jax.process_count() == jax.process_index()]
 
 
 class _Plan(NamedTuple):
@@ -221,14 +198,16 @@ def _plan(case, space, names, samples, key, draws, batch):
 @contextlib.contextmanager
 def _runner(case, names, seed, devices, cluster):
     """Give what runs batches: the devices of this process, or the workers of a cluster."""
-    if cluster is None:
-        yield Runner(case, names, seed, devices)
-        return
     with connect(cluster) as engine:
-        yield RemoteRunner(case, names, seed, engine)
+        if engine is not None:
+            yield on_workers(engine, "batches", case, names, seed)
+        else:
+            yield on_devices(
+                devices, lambda at, rows: run_batch(case, names, seed, rows[0], rows[1], at)
+            )
 
 
-def _joined(plan, store, runner, merge, progress):
+def _joined(plan, store, runner, progress):
     """Run the batches that the store lacks; returns (Columns of the measures, (draws,) failed)."""
     folder, several = None if store is None else store.folder, jax.process_count() > 1
     samples, mine = plan.points.samples, {}
@@ -242,7 +221,7 @@ def _joined(plan, store, runner, merge, progress):
         rows = slice(k * plan.batch, min((k + 1) * plan.batch, samples))
         failed[rows] = batch["failed"][: rows.stop - rows.start] > 0
 
-    _batches(plan, store, runner, None, merge, progress, mine.__setitem__ if several else put)
+    _batches(plan, store, runner, progress, mine.__setitem__ if several else put)
     for k, batch in gather(mine, plan.count).items() if several else ():
         put(k, batch)
     return tables[0], failed
@@ -259,34 +238,38 @@ def _drawn(case, plan, folder):
     return values, None if beyond[0] is None else np.concatenate(beyond)
 
 
-def _batches(plan, store, runner, shard, merge, progress, put):
-    """Run the batches of this shard that the store lacks; put(number, batch) takes each of them."""
-    mine = _numbers(plan.count, shard)
-    missing = [k for k in mine if store is None or not store.has(k)]
-    if merge and missing:
-        where = repr(str(store.folder)) if store is not None else "no folder"
-        raise InputError(
-            f"merge: {len(missing)} of {plan.count} batches are missing in {where}, the first of"
-            f" them number {missing[0]}"
-        )
+def _batches(plan, store, runner, progress, put):
+    """Run the batches of this process that the store lacks; put(number, batch) takes each."""
+    mine = range(jax.process_index(), plan.count, jax.process_count())
+    finished = set() if store is None else set(store.finished())
+    missing = [k for k in mine if str(k) not in finished]
     done = len(mine) - len(missing)
-    for k, batch in runner.each(missing, plan.rows):
+    for k, batch in runner(missing, plan.rows, plan.batch):
         if store is not None:
-            store.put(k, batch)
+            store.put(str(k), batch)
         put(k, batch)
         done += 1
         if progress is not None:
             progress(min(plan.points.samples, plan.batch * done))
-    if shard is None and store is not None:
+    if store is not None:
         for k in sorted(set(mine) - set(missing)):
-            put(k, store.get(k, plan.shapes))
+            put(k, _stored(store, k, plan.shapes))
+        store.close()
+
+
+def _stored(store, k, shapes):
+    """Return batch k of a store. Raises InputError unless it has these {name: shape}."""
+    batch = store.get(str(k))
+    if not isinstance(batch, dict) or {n: np.shape(v) for n, v in batch.items()} != shapes:
+        raise store.changed(str(k))
+    return batch
 
 
 def _what(case, distributions, samples, key, draws, names, batch):
     """Return the fingerprint of an ensemble: batches of another one are refused."""
     return fingerprint(
         case,
-        distributions=shards.to_json(distributions),
+        distributions={name: [type(d).__name__, d] for name, d in distributions.items()},
         samples=samples,
         key=key,
         draws=draws,

@@ -18,6 +18,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from fault_drill import kept
 from helpers import command
 
 import tuning
@@ -30,7 +31,7 @@ from tuning.cluster.local import local_workers
 from tuning.cluster.sent import received, sent
 from tuning.problem.functions import as_measures
 from tuning.problem.problem import Problem
-from tuning.uncertainty import remote
+from tuning.uncertainty import batches
 
 distributed = pytest.importorskip("distributed", reason="Dask is not installed")
 psutil = pytest.importorskip("psutil", reason="Dask is not installed")
@@ -95,11 +96,11 @@ def test_a_worker_killed_and_one_added_in_mid_run_change_no_bit(case, whole, cli
     folder = tmp_path / "run"
     try:
         found = tuning.ensemble(
-            case, SPREAD, **OPTIONS, cluster=client, folder=folder, progress=progress
+            case, SPREAD, **OPTIONS, cluster=client, checkpoint=folder, progress=progress
         )
         assert same(found, whole)
         assert seen == sorted(seen) and seen[-1] == 400 and len(seen) == 25
-        assert len(list(folder.glob("part-*.npz"))) == 25  # written by this process as they came
+        assert kept(folder) == 25  # written by this process as they came
         assert victim not in client.nthreads()
     finally:
         for process in added:
@@ -109,13 +110,11 @@ def test_a_worker_killed_and_one_added_in_mid_run_change_no_bit(case, whole, cli
 
 def test_short_batches_share_a_task_and_change_no_bit(case, whole, client, monkeypatch):
     sent_tasks, submit = [], Engine._submit
-    monkeypatch.setattr(
-        Engine, "_submit", lambda *a: sent_tasks.append(len(a[-1][-1])) or submit(*a)
-    )
-    monkeypatch.setattr(remote, "SHARES", 6)
+    monkeypatch.setattr(Engine, "_submit", lambda *a: sent_tasks.append(len(a[-1])) or submit(*a))
+    monkeypatch.setattr(batches, "SHARES", 6)
     assert same(tuning.ensemble(case, SPREAD, **OPTIONS, cluster=client), whole)
     assert sent_tasks == [4] * 6 + [1]
-    monkeypatch.setattr(remote, "WORK", 2 * 16 * case.clock.samples)
+    monkeypatch.setattr(batches, "WORK", 2 * 16 * case.clock.samples)
     assert same(tuning.ensemble(case, SPREAD, **OPTIONS, cluster=client), whole)
     assert sent_tasks[7:] == [2] * 12 + [1]
 
@@ -166,47 +165,6 @@ def test_what_is_known_is_not_sent_again(case, tmp_path):
         tuning.tune(case, **SEARCH, cluster=Refusing())
 
 
-class Losing:
-    """A client whose first result of a task is lost with its worker before it is fetched."""
-
-    status, keys = "running", iter(range(99))
-
-    def __init__(self):
-        self.lost = set()
-
-    def nthreads(self):
-        return {"worker": 1}
-
-    def cancel(self, futures):
-        pass
-
-    def submit(self, function, task, x64, number, pure):
-        lose = number not in self.lost
-        self.lost.add(number)
-        return Future(next(self.keys), lose, number)
-
-
-class Future:
-    def __init__(self, key, lose, number):
-        self.key, self.lose, self.number, self.status = key, lose, number, "finished"
-
-    def add_done_callback(self, done):
-        done(self)
-
-    def result(self, timeout):
-        if self.lose:
-            self.status = "lost"
-            raise TimeoutError
-        return "processor", 10 * self.number
-
-
-def test_a_result_that_is_lost_before_it_is_fetched_is_computed_again():
-    client = Losing()
-    client.scheduler = type("Scheduler", (), {"address": "nowhere"})
-    given = ((n, (n,)) for n in range(5))
-    assert sorted(Engine(client).run("batches", given)) == [(n, 10 * n) for n in range(5)]
-
-
 def test_a_lost_scheduler_is_one_line_and_the_run_goes_on_from_its_folder(case, whole, tmp_path):
     with (
         local_workers(1) as workers,
@@ -223,11 +181,10 @@ def test_a_lost_scheduler_is_one_line_and_the_run_goes_on_from_its_folder(case, 
             warnings.catch_warnings(action="ignore", category=engines.ClusterWarning),
         ):
             tuning.ensemble(
-                case, SPREAD, **OPTIONS, cluster=client, folder=tmp_path, progress=progress
+                case, SPREAD, **OPTIONS, cluster=client, checkpoint=tmp_path, progress=progress
             )
-    kept = len(list(tmp_path.glob("part-*.npz")))
-    assert 4 <= kept < 25
-    assert same(tuning.ensemble(case, SPREAD, **OPTIONS, folder=tmp_path, resume=True), whole)
+    assert 4 <= kept(tmp_path) < 25
+    assert same(tuning.ensemble(case, SPREAD, **OPTIONS, checkpoint=tmp_path, resume=True), whole)
 
 
 def test_a_process_of_local_ends_with_the_pipe_from_its_parent(tmp_path):
@@ -366,12 +323,6 @@ def test_where_nobody_answers_is_an_error_in_time(case, monkeypatch, tmp_path):
         with pytest.raises(InputError, match=r"^cluster 127.0.0.1:1: no Dask scheduler answers"):
             run(case, cluster="127.0.0.1:1", checkpoint=tmp_path / "run")
     assert not any(tmp_path.iterdir())
-
-
-def test_a_cluster_goes_with_no_devices_shard_or_merge(case, tmp_path):
-    for other in ({"shard": (1, 2)}, {"merge": True}):
-        with pytest.raises(InputError, match=r"cluster and (shard|merge): give one of them"):
-            tuning.ensemble(case, SPREAD, cluster="local:2", folder=tmp_path, **other)
 
 
 def test_without_dask_the_remedy_is_named(case, monkeypatch):

@@ -14,9 +14,8 @@ from jaxtank.controllers import PID
 from jaxtank.core.errors import InputError
 from jaxtank.safety.box import widths_of
 from jaxtank.safety.worst_case import rates_of
-from tuning.falsification.ascent import ascend
-from tuning.falsification.attacked import Attacked, programs
-from tuning.falsification.coefficients import coefficients_of
+from tuning.falsification.attacked import Attacked, coefficients_of, programs
+from tuning.falsification.study import ascend
 
 TANK = RIGS / "watertank.toml"  # A h' = b u - a sqrt(h), A = 20 cm^2, b = 5, a = 2 (g = 0.5)
 SPREAD = {"plant.drain": 0.1, "plant.pump_gain": 0.1}

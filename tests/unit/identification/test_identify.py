@@ -20,8 +20,8 @@ from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tree import get_value, with_values
 from tuning.identification import residuals, simulation
 from tuning.identification.design import candidates, compare_experiments, settled
-from tuning.identification.parametrisation import coordinates
-from tuning.identification.proposal import with_pi
+from tuning.identification.identified_case import with_pi
+from tuning.identification.problem import coordinates
 from tuning.problem.bounds import bounds
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import spread_of

@@ -9,7 +9,7 @@ from helpers import command
 import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import DataError, InputError
-from tuning.identification import data_checks
+from tuning.identification import experiment
 from tuning.identification.csv_log import read_log, split_header
 
 HEADER = "t [s],pump1 [V],pump2 [V],h1 [cm],h2 [cm],h3 [cm],h4 [cm]"
@@ -488,12 +488,12 @@ def test_a_pump_without_a_true_limit_may_be_faint():
     """khalid's input is a dimensionless one with limits of +-1000 in name only."""
     loop = presets.load("khalid").cases["gpc"].loop
     found = tuning.log(t=np.arange(5.0), u=np.full(5, 2.0), y=np.full((5, 2), 0.2))
-    data_checks.check_fits(found, loop)
+    experiment.check_fits(found, loop)
 
 
 def test_a_pump_that_stands_still_is_no_mistake(case):
     u = np.stack([np.full(5, 3.0), np.zeros(5)], axis=1)
-    data_checks.check_fits(tuning.log(t=np.arange(5.0), u=u, y=np.ones((5, 4))), case.loop)
+    experiment.check_fits(tuning.log(t=np.arange(5.0), u=u, y=np.ones((5, 4))), case.loop)
 
 
 @pytest.mark.parametrize(
@@ -517,18 +517,18 @@ def test_arrays_that_are_no_log(change, words):
 def test_a_log_of_another_rig(case):
     whole = {"t": np.arange(5.0), "u": np.ones((5, 2)), "y": np.ones((5, 4))}
     with pytest.raises(DataError, match="has 1 pump columns, the rig 2 pumps"):
-        data_checks.check_fits(tuning.log(**(whole | {"u": np.ones(5)})), case.loop)
+        experiment.check_fits(tuning.log(**(whole | {"u": np.ones(5)})), case.loop)
     with pytest.raises(DataError, match="measures tank 8, the rig has 4"):
-        data_checks.check_fits(tuning.log(**whole, tanks=(0, 1, 2, 7)), case.loop)
+        experiment.check_fits(tuning.log(**whole, tanks=(0, 1, 2, 7)), case.loop)
 
 
 def test_gaps_are_counted_in_usual_steps():
     t = np.array([0.0, 1, 2, 3, 5, 6, 7])
     found = tuning.log(t=t, u=np.ones(7), y=np.ones(7))
     with pytest.raises(DataError, match=r"sample 5: a gap of 2 s after 3 s.*--gap 2$"):
-        data_checks.check_gaps(found)
-    data_checks.check_gaps(found, 2.0)
-    data_checks.check_gaps(
+        experiment.check_gaps(found)
+    experiment.check_gaps(found, 2.0)
+    experiment.check_gaps(
         tuning.log(t=np.array([0.0, 1, 2.4, 3, 4.4, 5]), u=np.ones(6), y=np.ones(6))
     )
 

@@ -11,7 +11,7 @@ from jaxtank import presets, rig
 from tuning.live.fan import Fan
 from tuning.problem.point import Point
 from tuning.problem.slopes import check_slope
-from tuning.uncertainty.local import UNUSABLE
+from tuning.uncertainty.sensitivity_study import UNUSABLE
 
 
 class Bowl:

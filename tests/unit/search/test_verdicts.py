@@ -212,7 +212,7 @@ def test_a_search_over_choices_is_resumed(tmp_path, capsys):
     )
     options |= dict(starts=1, screening=2, iterations=3, validation=0)
     with pytest.raises(RuntimeError):
-        tuning.tune(case, nominal=True, log=halted, progress=stop, **options)
+        tuning.tune(case, nominal=True, checkpoint=halted, progress=stop, **options)
     assert list(halted.glob("choice_*"))
     main.main(["tune", "mirakhorli/hybrid", *words, "--resume", str(halted)])
     again = json.loads(capsys.readouterr().out)

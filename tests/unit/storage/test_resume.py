@@ -1,8 +1,11 @@
 """A search that is killed goes on where it ended, to the same bits."""
 
+import contextlib
 import json
 import os
+import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
@@ -14,8 +17,8 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.core import files
 from jaxtank.core.errors import InputError
-from tuning.storage import batch_store, evaluation_log
-from tuning.storage.evaluation_log import NAME, EvaluationCache, EvaluationLog
+from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
+from tuning.storage.store import NAME, SCHEMA, Store
 
 OPTIONS = {"starts": 2, "screening": 8, "validation": 8}
 SAME = (
@@ -46,8 +49,28 @@ def reported(result):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
+    """The result of a search, and its records."""
     folder = tmp_path_factory.mktemp("whole")
-    return (tuning.tune(case(), nominal=True, log=folder, **OPTIONS), (folder / NAME).read_bytes())
+    result = tuning.tune(case(), nominal=True, checkpoint=folder, **OPTIONS)
+    return result, folder
+
+
+def copied(whole, folder):
+    """Copy the records of a search into a folder."""
+    shutil.copy(whole[1] / NAME, folder)
+
+
+def rows(folder):
+    """All records of a folder."""
+    with contextlib.closing(sqlite3.connect(folder / NAME)) as file:
+        return file.execute("SELECT * FROM record ORDER BY rowid").fetchall()
+
+
+def change(folder, words, *values):
+    """Change the records of a folder."""
+    with contextlib.closing(sqlite3.connect(folder / NAME)) as file, file:
+        file.execute(words, values)
+        assert file.total_changes
 
 
 def test_with_and_without_a_log_alike(whole):
@@ -55,84 +78,121 @@ def test_with_and_without_a_log_alike(whole):
 
 
 @pytest.mark.parametrize("share", [0.02, 0.4, 0.97])
-def test_a_log_cut_anywhere_is_gone_on_with(whole, tmp_path, share):
-    data = whole[1]
-    (tmp_path / NAME).write_bytes(data[: int(share * len(data))])
-    kept = data[: int(share * len(data))].count(b"\n")
-    result = tuning.tune(case(), nominal=True, log=tmp_path, resume=True, **OPTIONS)
+def test_a_log_that_ends_anywhere_is_gone_on_with(whole, tmp_path, share):
+    copied(whole, tmp_path)
+    count = len(rows(tmp_path))
+    change(tmp_path, "DELETE FROM record WHERE rowid > ?", 1 + int(share * count))
+    result = tuning.tune(case(), nominal=True, checkpoint=tmp_path, resume=True, **OPTIONS)
     assert reported(result) == reported(whole[0])
-    assert (tmp_path / NAME).read_bytes() == data and kept < data.count(b"\n")
+    assert rows(tmp_path) == rows(whole[1])
 
 
 def test_what_is_in_the_log_is_not_run_again(whole, tmp_path, monkeypatch):
-    (tmp_path / NAME).write_bytes(whole[1])
+    copied(whole, tmp_path)
     monkeypatch.setattr(EvaluationLog, "keep", lambda *_: pytest.fail("something was evaluated"))
     assert reported(
-        tuning.tune(case(), nominal=True, log=tmp_path, resume=True, **OPTIONS)
+        tuning.tune(case(), nominal=True, checkpoint=tmp_path, resume=True, **OPTIONS)
     ) == reported(whole[0])
 
 
 def test_a_log_of_another_problem_is_refused_and_kept(whole, tmp_path):
-    (tmp_path / NAME).write_bytes(whole[1])
+    copied(whole, tmp_path)
+    options = {"nominal": True, "checkpoint": tmp_path, "resume": True, **OPTIONS}
     with pytest.raises(InputError, match="of another problem; what differs: seed"):
-        tuning.tune(case(), nominal=True, log=tmp_path, resume=True, seed=1, **OPTIONS)
+        tuning.tune(case(), seed=1, **options)
     with pytest.raises(InputError, match="what differs: loop"):
-        tuning.tune(
-            case({"controller.Kc": [1.4]}), nominal=True, log=tmp_path, resume=True, **OPTIONS
-        )
-    assert (tmp_path / NAME).read_bytes() == whole[1]
+        tuning.tune(case({"controller.Kc": [1.4]}), **options)
+    assert rows(tmp_path) == rows(whole[1])
     with pytest.raises(InputError, match="holds no checkpoint to continue"):
-        tuning.tune(case(), nominal=True, log=tmp_path / "none", resume=True, **OPTIONS)
+        tuning.tune(case(), **{**options, "checkpoint": tmp_path / "none"})
 
 
-@pytest.mark.parametrize("text", [b"hello\n", b"[1]\n", b'{"jaxtank": 1}\n', b"\xff\xfe\n"])
-def test_what_is_no_log_is_refused(tmp_path, text):
-    (tmp_path / NAME).write_bytes(text)
-    with pytest.raises(InputError, match="not a log"):
-        tuning.tune(case(), nominal=True, log=tmp_path, resume=True, **OPTIONS)
-    assert (tmp_path / NAME).read_bytes() == text
+def tables(words):
+    """The bytes of a database."""
+    with contextlib.closing(sqlite3.connect(":memory:")) as file:
+        file.executescript(words)
+        return file.serialize()
 
 
-def test_a_broken_line_inside_is_refused(whole, tmp_path):
-    lines = whole[1].splitlines(keepends=True)
-    (tmp_path / NAME).write_bytes(b"".join([*lines[:3], b"{}\n", *lines[3:]]))
-    with pytest.raises(InputError, match="line 4"):
-        tuning.tune(case(), nominal=True, log=tmp_path, resume=True, **OPTIONS)
+OTHER = {
+    "text": b"hello\n",
+    "another database": tables("CREATE TABLE record (key TEXT)"),
+    "a view besides": tables(f"{SCHEMA}; CREATE VIEW other AS SELECT * FROM record"),
+    "a trigger": tables(
+        f"{SCHEMA}; CREATE TRIGGER t AFTER INSERT ON record BEGIN DELETE FROM record; END"
+    ),
+}
 
 
-@pytest.mark.parametrize(
-    "change", ["a bit of a number", "another key", "a line of another log", "no digest"]
-)
-def test_a_line_that_was_changed_is_refused(tmp_path, change):
-    """Every one of them is JSON that could be an entry; the file is left as it is."""
+@pytest.mark.parametrize("data", OTHER.values(), ids=OTHER)
+def test_what_is_no_checkpoint_is_refused(tmp_path, data):
+    (tmp_path / NAME).write_bytes(data)
+    with pytest.raises(InputError, match="not a checkpoint of this program"):
+        tuning.tune(case(), nominal=True, checkpoint=tmp_path, resume=True, **OPTIONS)
+    assert (tmp_path / NAME).read_bytes() == data
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7, 0.99])
+def test_a_file_that_is_cut_is_refused(whole, tmp_path, share):
+    data = (whole[1] / NAME).read_bytes()
+    (tmp_path / NAME).write_bytes(data[: int(share * len(data))])
+    with pytest.raises(InputError, match="not a checkpoint of this program, or was changed"):
+        tuning.tune(case(), nominal=True, checkpoint=tmp_path, resume=True, **OPTIONS)
+
+
+CHANGES = {
+    "a bit of a number": "UPDATE record SET value = replace(value, 'AEA=', 'AEE=') WHERE rowid = 3",
+    "another key": "UPDATE record SET key = '0' || substr(key, 2) || 'x' WHERE rowid = 3",
+    "no seal": "UPDATE record SET seal = NULL WHERE rowid = 3",
+    "no text": "UPDATE record SET value = x'ff' WHERE rowid = 3",
+}
+
+
+@pytest.mark.parametrize("words", CHANGES.values(), ids=CHANGES)
+def test_a_record_that_was_changed_is_refused(tmp_path, words):
     log = EvaluationLog(tmp_path, {"p": 1})
     for i in range(3):
         log.recall("x", [np.array(float(i))], lambda i=i: (1.0 + i, np.arange(2.0)))
-    lines = (tmp_path / NAME).read_bytes().splitlines(keepends=True)
-    if change == "a bit of a number":
-        assert b"0x1.0000000000000p+1" in lines[2]
-        lines[2] = lines[2].replace(b"0x1.0000000000000p+1", b"0x1.0000000000001p+1")
-    elif change == "another key":
-        keys = [json.loads(line)["key"].encode() for line in lines[1:]]
-        lines[2] = lines[2].replace(keys[1], keys[1][::-1])
-    elif change == "a line of another log":
-        (tmp_path / "other").mkdir()
-        other = EvaluationLog(tmp_path / "other", {"p": 2})
-        other.recall("x", [np.array(1.0)], lambda: (9.0, np.arange(2.0)))
-        lines[2] = other.path.read_bytes().splitlines(keepends=True)[1]
-    else:
-        entry = json.loads(lines[2])
-        lines[2] = json.dumps({k: entry[k] for k in ("kind", "key", "result")}).encode() + b"\n"
-    data = b"".join(lines)
-    (tmp_path / NAME).write_bytes(data)
-    with pytest.raises(
-        InputError,
-        match=r"^--resume: line 3 of evaluations\.jsonl is not one of its entries, or was changed",
-    ):
+    log.in_memory()
+    change(tmp_path, words)
+    before = rows(tmp_path)
+    with pytest.raises(InputError, match=r"^--resume: record .* is not what was written"):
         EvaluationLog(tmp_path, {"p": 1}, resume=True)
-    assert (tmp_path / NAME).read_bytes() == data
-    (tmp_path / NAME).write_bytes(b"".join(lines[:2] + lines[3:]))  # as the message says
-    assert EvaluationLog(tmp_path, {"p": 1}, resume=True).resumed == 2
+    assert rows(tmp_path) == before
+    change(tmp_path, "DELETE FROM record WHERE rowid = 3")
+    assert len(EvaluationLog(tmp_path, {"p": 1}, resume=True).found) == 2
+
+
+def test_a_record_of_another_problem_is_refused(tmp_path):
+    for name in ("one", "other"):
+        log = EvaluationLog(tmp_path / name, {"p": name})
+        log.recall("x", [np.array(1.0)], lambda: (9.0,))
+        log.in_memory()
+    change(tmp_path / "one", "DELETE FROM record WHERE rowid = 2")
+    change(tmp_path / "one", "INSERT INTO record VALUES (?, ?, ?)", *rows(tmp_path / "other")[1])
+    with pytest.raises(InputError, match="is not what was written"):
+        EvaluationLog(tmp_path / "one", {"p": "one"}, resume=True)
+
+
+DEEP = "[" * 100_000
+HOSTILE = {
+    "no end": DEEP,
+    "too deep": '{"all": [' * 900 + "]}" * 900,
+    "a shape that is none": '{"type": "<f8", "shape": [1000000000, 1000000000], "data": ""}',
+    "objects": '{"type": "|O8", "shape": [1], "data": "AAAAAAAAAAA="}',
+    "texts": '{"type": "<U2", "shape": [1], "data": "AAAAAAAAAAA="}',
+    "no base64": '{"type": "<f8", "shape": [1], "data": "__import__"}',
+    "a number": "1",
+}
+
+
+@pytest.mark.parametrize("text", HOSTILE.values(), ids=HOSTILE)
+def test_a_record_whose_seal_is_right_is_not_trusted_either(tmp_path, text):
+    store = Store(tmp_path, {"p": 1})
+    store._insert("k", text)
+    store.close()
+    with pytest.raises(InputError, match=r"record k of .* is not what was written"):
+        EvaluationLog(tmp_path, {"p": 1}, resume=True)
 
 
 def test_numbers_go_through_a_log_without_loss(tmp_path):
@@ -205,8 +265,7 @@ def test_the_command_killed_and_resumed(tmp_path, wait):
     assert not (tmp_path / "run" / NAME).exists()
 
 
-@pytest.mark.parametrize("command", ["tune", "uncertainty"])
-def test_a_run_that_was_killed_before_its_first_line_goes_on(command, tmp_path):
+def test_a_run_that_was_killed_before_its_first_record_goes_on(tmp_path):
     """All that it left is its lock: there is nothing to lose, and a script that runs or else
     resumes need not know. A folder that is not there, or has anything else in it, is refused as
     before.
@@ -215,20 +274,18 @@ def test_a_run_that_was_killed_before_its_first_line_goes_on(command, tmp_path):
     assert files.untouched(tmp_path)
     (tmp_path / "note.txt").write_text("mine")
     assert not files.untouched(tmp_path)
-    with pytest.raises(
-        InputError,
-        match=r"no checkpoint to continue: there is no (evaluations\.jsonl|manifest\.json)",
-    ):
-        began(command, tmp_path)
+    with pytest.raises(InputError, match=r"no checkpoint to continue: there is no checkpoint\."):
+        Store(tmp_path, {}, resume=True)
     (tmp_path / "note.txt").unlink()
-    began(command, tmp_path)
-    assert {p.name for p in tmp_path.iterdir()} > {files.LOCK}  # and what it writes now
+    Store(tmp_path, {}, resume=True).close()
+    assert {p.name for p in tmp_path.iterdir()} == {files.LOCK, NAME}
 
 
-def began(command, folder):
-    """Open the log, or the store of batches, of a run that goes on in `folder`."""
-    (
-        evaluation_log.EvaluationLog(folder, {}, resume=True)
-        if command == "tune"
-        else batch_store.BatchStore(folder, {}, resume=True)
-    )
+def test_finished_batches_are_not_overwritten_and_a_log_is(tmp_path):
+    store = Store(tmp_path, {"p": 1})
+    store.put("0", 1.0)
+    store.close()
+    with pytest.raises(InputError, match="--resume continues"):
+        Store(tmp_path, {"p": 1})
+    assert Store(tmp_path, {"p": 1}, shared=True).get("0") == 1.0
+    assert EvaluationLog(tmp_path, {"p": 1}).found == {}

@@ -1,9 +1,11 @@
 """Many draws at once: against runs made one by one, closed forms, and other layouts."""
 
+import contextlib
 import dataclasses
 import json
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
@@ -11,6 +13,7 @@ import time
 import jax
 import numpy as np
 import pytest
+from fault_drill import kept
 from scipy import stats
 
 import jaxtank
@@ -21,8 +24,8 @@ from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from jaxtank.presets import Scenario
 from tuning.search import robust
-from tuning.storage import batch_store
-from tuning.uncertainty import manifest, validation
+from tuning.storage.store import NAME, Store
+from tuning.uncertainty import validation
 from tuning.uncertainty.distributions import parse, stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import clopper_pearson, probabilities
@@ -72,51 +75,38 @@ def test_the_first_draws_do_not_depend_on_how_many_there_are(case, whole):
         assert np.array_equal(fewer.measures[m], whole.measures[m][:20])
 
 
-def test_shards_joined_are_the_whole_and_an_incomplete_set_is_refused(case, whole, tmp_path):
-    assert tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, shard=(2, 3)) is None
-    with pytest.raises(InputError, match="3 of 4 batches are missing"):
-        tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, resume=True, merge=True)
-    for i in (1, 3):
-        tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, shard=(i, 3))
-    assert same(
-        tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, resume=True, merge=True), whole
-    )
+class Cut(Exception):
+    """A run ends here."""
+
+
+def cut_off(draws, case, *args, **options):
+    """Run an ensemble that ends once so many draws are done."""
+
+    def stop(done):
+        if done >= draws:
+            raise Cut
+
+    with pytest.raises(Cut):
+        tuning.ensemble(case, *args, **options, progress=stop)
 
 
 @pytest.mark.parametrize("done", [0, 1, 3])
 def test_a_run_cut_off_goes_on_to_the_same_bits(case, whole, tmp_path, done):
-    class Cut(Exception):
-        pass
-
-    def stop(draws):
-        if draws >= 16 * done:
-            raise Cut
-
     if done:
-        with pytest.raises(Cut):
-            tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, progress=stop)
-        assert len(list(tmp_path.glob("part-*.npz"))) == done
+        cut_off(16 * done, case, TWO, **OPTIONS, checkpoint=tmp_path)
+        assert kept(tmp_path) == done
     else:
         with pytest.raises(InputError, match="holds no checkpoint to continue"):
-            tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, resume=True)
-    assert same(tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, resume=done > 0), whole)
+            tuning.ensemble(case, TWO, **OPTIONS, checkpoint=tmp_path, resume=True)
+    assert same(tuning.ensemble(case, TWO, **OPTIONS, checkpoint=tmp_path, resume=done > 0), whole)
 
 
 def test_folders_of_another_ensemble_are_refused(case, tmp_path):
-    tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, shard=(1, 2))
+    cut_off(32, case, TWO, **OPTIONS, checkpoint=tmp_path)
     with pytest.raises(InputError, match="what differs: key"):
-        tuning.ensemble(case, TWO, **{**OPTIONS, "key": 4}, folder=tmp_path, resume=True)
+        tuning.ensemble(case, TWO, **{**OPTIONS, "key": 4}, checkpoint=tmp_path, resume=True)
     with pytest.raises(InputError, match="--resume continues"):
-        tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path)
-    path = tmp_path / "part-000000.npz"
-    path.write_bytes(b"PK not a batch")
-    with pytest.raises(InputError, match="not a batch"):
-        tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, resume=True)
-    np.savez(path, failed=np.array([{}], dtype=object))
-    with pytest.raises(InputError, match="does not hold the measures"):
-        tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, resume=True)
-    with pytest.raises(InputError, match="not a batch"):
-        batch_store.read_batch(path, {"failed"})  # a pickle inside is never opened
+        tuning.ensemble(case, TWO, **OPTIONS, checkpoint=tmp_path)
 
 
 LAYOUT = """
@@ -162,49 +152,6 @@ def test_one_device_two_devices_and_two_processes_give_the_same_bits(whole, tmp_
             assert all(
                 np.array_equal(found[m], whole.measures[m], equal_nan=True) for m in whole.measures
             )
-
-
-def test_a_manifest_states_what_its_shards_are_of_and_is_not_trusted(case, whole, tmp_path):
-    tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, shard=(1, 1), limits={"max_level": 31.0})
-    there, options = manifest.restore(tmp_path)
-    assert options["distributions"] == TWO and options["limits"] == {"max_level": 31.0}
-    assert same(
-        tuning.ensemble(there, **options, fan=False, folder=tmp_path, resume=True, merge=True),
-        whole,
-    )
-    path = tmp_path / "manifest.json"
-    printed = json.loads(path.read_text())
-    for change, words in (
-        ({"origin": None}, "does not say"),
-        ({"origin": {"rig": None, "limits": {}}}, "no rig file describes"),
-        ({"origin": {"rig": "x = ", "limits": {}}}, "is not TOML"),
-        ({"samples": "50"}, "does not say"),
-        ({"batch": 0}, "not one of this program"),
-        ({"distributions": {"plant.drain": {"kind": "Path"}}}, "not a distribution"),
-        (
-            {
-                "distributions": {
-                    "plant.drain": {
-                        "kind": "Uniform",
-                        "low": "a",
-                        "high": 1.0,
-                        "relative": None,
-                        "tied": False,
-                    }
-                }
-            },
-            "not a distribution",
-        ),
-    ):
-        path.write_text(json.dumps(printed | change))
-        with pytest.raises(InputError, match=words):
-            manifest.restore(tmp_path)
-    every = {
-        "a": tuning.LogUniform(factor=2.0),
-        "b": tuning.Discrete(values=(1.0, 2.0)),
-        "c": tuning.Correlated(names=("d", "e"), covariance=((1.0, 0.5), (0.5, 1.0))),
-    }
-    assert manifest.from_json(json.loads(json.dumps(manifest.to_json(every)))) == every
 
 
 # statistics
@@ -291,77 +238,49 @@ def test_one_draw_claims_no_spread(case):
     )
 
 
-@pytest.mark.parametrize("change", ["value", "exchange", "failed", "rows", "type", "manifest"])
+@pytest.mark.parametrize("change", ["value", "exchange", "problem"])
 def test_a_batch_that_was_changed_is_refused(case, tmp_path, change):
-    """Whatever was done to it: a number, another batch in its place, its shape, or what it is said
-    to be of.
-    """
+    """A number in it, another batch in its place, or what it is said to be of."""
     options = {"samples": 40, "batch": 16, "key": 5, "measures": ("max_level",), "fan": False}
-    for i in (1, 2):
-        tuning.ensemble(case, folder=tmp_path, shard=(i, 2), **options)
-    paths = sorted(tmp_path.glob("part-*.npz"))
-    if change == "exchange":
-        first, second = (p.read_bytes() for p in paths[:2])
-        paths[0].write_bytes(second)
-        paths[1].write_bytes(first)
-    elif change == "manifest":
-        table = json.loads((tmp_path / "manifest.json").read_text())
-        table["key"] = 6
-        (tmp_path / "manifest.json").write_text(json.dumps(table))
-        options["key"] = 6
-    else:
-        with np.load(paths[0]) as table:
-            arrays = {n: table[n] for n in table.files}
+    cut_off(40, case, checkpoint=tmp_path, **options)
+    with contextlib.closing(sqlite3.connect(tmp_path / NAME)) as file, file:
         if change == "value":
-            arrays["max_level"] = arrays["max_level"] * 0.5
-        elif change == "failed":
-            arrays["failed"] = 1 - arrays["failed"]
-        elif change == "rows":
-            arrays["max_level"] = arrays["max_level"][:3]
+            file.execute("UPDATE record SET value = replace(value, '8A', '8B') WHERE key = '1'")
+        elif change == "exchange":
+            for old, new in (("0", "x"), ("1", "0"), ("x", "1")):
+                file.execute("UPDATE record SET key = ? WHERE key = ?", (new, old))
         else:
-            arrays["max_level"] = arrays["max_level"].astype("S8")
-        np.savez(paths[0], **arrays)
-    with pytest.raises(InputError, match=r"part-00000.*is not what was written as batch"):
-        tuning.ensemble(case, folder=tmp_path, resume=True, merge=True, **options)
-    assert len(list(tmp_path.glob("part-*.npz"))) == len(paths)
+            words = "UPDATE record SET value = replace(value, '\"key\": 5', '\"key\": 6')"
+            file.execute(words)
+            options["key"] = 6
+        assert file.total_changes
+    with pytest.raises(InputError, match=r"record \d of .* is not what was written"):
+        tuning.ensemble(case, checkpoint=tmp_path, resume=True, **options)
+    assert kept(tmp_path) == 3
 
 
 FORGED = {
-    "texts": lambda a: np.full(a.shape, "<b>"),
-    "complex": lambda a: a + 1j,
     "fewer": lambda a: a[:1],
     "a number": lambda a: a.ravel()[0],
     "another shape": lambda a: np.zeros((len(a), 7)),
-    "records": lambda a: np.zeros(a.shape, dtype=[("a", float)]),
-    "times": lambda a: np.zeros(a.shape, dtype="M8[s]"),
+    "several": lambda a: (a, a),
 }
 
 
 @pytest.mark.parametrize("name", ["failed", "max_level", "rms_error_total"])
 @pytest.mark.parametrize("forged", FORGED.values(), ids=FORGED)
 def test_a_batch_whose_seal_is_right_is_not_trusted_either(case, name, forged, tmp_path):
-    """Whoever has the program can seal a batch: what it holds is looked at, too."""
+    """Whoever has the program can seal a batch: its shapes are looked at, too."""
     options = {"samples": 8, "batch": 4, "measures": ("max_level", "rms_error_total"), "fan": False}
-    for i in (1, 2):
-        tuning.ensemble(case, folder=tmp_path, shard=(i, 2), **options)
-    problem = batch_store.read_manifest(tmp_path)
-    store = batch_store.BatchStore(tmp_path, problem | {"origin": None}, resume=True)
-    with np.load(store.path(1)) as table:
-        arrays = {n: table[n] for n in table.files if n != "seal"}
-    store.put(1, arrays | {name: forged(arrays[name])})
-    with pytest.raises(InputError, match=r"part-000001.*is not what was written as batch"):
-        tuning.ensemble(case, folder=tmp_path, resume=True, merge=True, **options)
-
-
-@pytest.mark.parametrize("measures", [[[[]]], [None], [{}]])
-def test_a_manifest_with_measures_that_are_no_names_is_refused(case, measures, tmp_path):
-    tuning.ensemble(
-        case, folder=tmp_path, shard=(1, 2), samples=8, batch=4, measures=("max_level",), fan=False
-    )
-    altered = batch_store.read_manifest(tmp_path) | {"measures": measures}
-    (tmp_path / "manifest.json").write_text(json.dumps(altered))
-    with pytest.raises(InputError, match="the manifest is not one of this program"):
-        manifest.restore(tmp_path)
+    cut_off(4, case, checkpoint=tmp_path, **options)
+    with contextlib.closing(sqlite3.connect(tmp_path / NAME)) as file:
+        rows = file.execute("SELECT value FROM record WHERE key = 'problem'").fetchone()
+    store = Store(tmp_path, json.loads(rows[0]), resume=True)
+    arrays = store.get("0")
+    store.put("1", arrays | {name: forged(arrays[name])})
+    store.close()
+    with pytest.raises(InputError, match=r"record 1 of .* is not what was written"):
+        tuning.ensemble(case, checkpoint=tmp_path, resume=True, **options)
 
 
 def test_every_value_of_a_discrete_distribution_is_looked_at(case):
@@ -830,11 +749,7 @@ def test_sigkill_and_resume_of_the_command(tmp_path):
     folder = tmp_path / "run"
     process = subprocess.Popen([*command, "--out", str(folder)], stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
-    while (
-        len(list(folder.glob("part-*.npz"))) < 3
-        and process.poll() is None
-        and time.monotonic() < deadline
-    ):
+    while kept(folder) < 3 and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.05)
     assert process.poll() is None
     os.kill(process.pid, signal.SIGKILL)

@@ -21,7 +21,7 @@ from jaxtank.core.tree import get_value, with_values
 from jaxtank.plots import responses
 from tuning.problem.scenarios import ScenarioRun, groups_of, values_of
 from tuning.report.studies import sensitivity_tables
-from tuning.uncertainty import distributions, indices, local
+from tuning.uncertainty import distributions, indices, sensitivity_study
 from tuning.uncertainty.distributions import Discrete, LogUniform, Normal, Uniform
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sensitivity_study import sensitivity, what_varies
@@ -215,7 +215,7 @@ def test_local_against_central_differences(case, monkeypatch):
     step of 1e-5 of the half-width leaves 1e-9 of third derivatives and 1e-11 of rounding over a
     slope of 1e-2 or more.
     """
-    monkeypatch.setattr(local, "CHUNK", 4)
+    monkeypatch.setattr(sensitivity_study, "CHUNK", 4)
     loop, names = case.loop, ("rms_error_total", "max_level", "rms_input")
     varied = {
         "plant.drain": Uniform(relative=0.05),
@@ -410,7 +410,7 @@ def test_bad_input(case, options, words):
 def test_correlated_parameters_have_local_effects_only(case):
     names = ("plant.drain[0]", "plant.drain[1]")
     joint = {"fit": distributions.Correlated(names=names, covariance=((4e-4, 3e-4), (3e-4, 9e-4)))}
-    assert local.half_widths(Draws(case.loop, joint)) == [
+    assert sensitivity_study.half_widths(Draws(case.loop, joint)) == [
         {names[0]: 0.04},
         {names[1]: pytest.approx(0.06)},
     ]

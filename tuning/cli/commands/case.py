@@ -9,7 +9,6 @@ from jaxtank.core.files import write_folder
 from tuning.cli.arguments import option
 from tuning.cli.options import report_written
 from tuning.cli.values import open_case
-from tuning.cli.values import seed as seed_of
 
 
 def add(commands, parents):
@@ -132,7 +131,7 @@ def simulate(args):
     if args.others:
         return _together(args)
     columns = _checked_columns(args)
-    seed, case = seed_of(args), open_case(args)
+    seed, case = args.seed, open_case(args)
     other = None if args.against is None else _other(args.against)
     import jax
 
@@ -223,8 +222,7 @@ def _together(args):
     for flag, given in alone.items():
         if given:
             raise InputError(f"{flag}: of one case alone, and {1 + len(args.others)} are given")
-    seed = seed_of(args)
-    names = [args.case, *args.others]
+    seed, names = args.seed, [args.case, *args.others]
     cases = [open_case(argparse.Namespace(**{**vars(args), "case": name})) for name in names]
     from tuning.report import tables
     from tuning.report.studies import together

@@ -1,10 +1,9 @@
 """`jaxtank attack`: the plant, start and reading errors that drive levels highest."""
 
-from tuning.cli.arguments import option, uncertain
-from tuning.cli.options import distributions_of, report_written
+from tuning.cli.arguments import option, uncertain, whole
+from tuning.cli.options import distributions_of, finish
 from tuning.cli.terminal import Line
-from tuning.cli.values import open_case, whole
-from tuning.cli.values import seed as seed_of
+from tuning.cli.values import open_case
 
 PASSED = 4
 """Exit code where a limit is passed."""
@@ -21,11 +20,20 @@ def add(commands, parents):
         " interrupted.",
     )
     one.set_defaults(run=attack)
-    option(one, "--starts", "N", "ascents for each tank, from the best draws (default 8)", "8")
-    option(one, "--iterations", "N", "steps of the ascent at most (default 12)", "12")
-    option(one, "--draws", "N", "random draws, half of them corners (default 64)", "64")
+    option(
+        one,
+        "--starts",
+        "N",
+        "ascents for each tank, from the best draws (default 8)",
+        8,
+        whole(1, 10**4),
+    )
+    text = "most steps of the ascent (default 12)"
+    option(one, "--iterations", "N", text, 12, whole(0, 10**4))
+    text = "random draws, half of them corners (default 64)"
+    option(one, "--draws", "N", text, 64, whole(1, 10**6))
     text = "windows of time in each of which a flow coefficient has its own value (default 4)"
-    option(one, "--windows", "N", text, "4")
+    option(one, "--windows", "N", text, 4, whole(1, 1000))
     text = "what commands the pumps: own (default: the controller), full, or random switching"
     option(one, "--pumps", "KIND", text, "own")
     text = "levels at t = 0: any (default) up to the limits, or own: those of the case"
@@ -39,30 +47,25 @@ def add(commands, parents):
 
 def attack(args):
     """Print the highest levels found; returns 4 where a limit is passed."""
-    seed, case = seed_of(args), open_case(args)
+    case = open_case(args)
     distributions = distributions_of(args, case)
     from tuning.falsification import study
-    from tuning.report import tables
 
     line = Line(args.quiet)
     line.compiling("the simulation and its derivatives", 15)
     found = study.attack(
         case,
         distributions,
-        starts=whole("--starts", args.starts, 1, 10**4),
-        iterations=whole("--iterations", args.iterations, 0, 10**4),
-        seed=seed,
-        windows=whole("--windows", args.windows, 1, 1000),
-        draws=whole("--draws", args.draws, 1, 10**6),
+        starts=args.starts,
+        iterations=args.iterations,
+        seed=args.seed,
+        windows=args.windows,
+        draws=args.draws,
         pumps=args.pumps,
         start=args.start,
         noise=not args.constant_errors,
         progress=lambda done, total: line.show(f"step {done}/{total}"),
     )
     line.end()
-    try:
-        written = found.save(args.out, args.line) if args.out else []
-    finally:  # a full disk costs the files, not the printed result
-        print(tables.dumps(found.to_json()) if args.json else str(found))
-    report_written(written, args)
+    finish(found, args)
     return PASSED if found.passed else 0

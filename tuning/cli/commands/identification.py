@@ -7,10 +7,11 @@ import sys
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import printable
 from tuning.cli import values
-from tuning.cli.arguments import option, repeatable
+from tuning.cli.arguments import option, repeatable, whole
 from tuning.cli.interrupts import Interrupts, put_back
-from tuning.cli.options import report_unreachable, report_written
+from tuning.cli.options import finish, report_unreachable
 from tuning.cli.terminal import Line
+from tuning.cli.values import number
 
 LONGEST = 1e7
 """Longest planned experiment [s]: four months."""
@@ -46,11 +47,18 @@ def _add_data(one):
         " that level out",
     )
     option(one, "--decimal", "SIGN", "decimal sign of the data: . (default) or ,", ".")
-    option(one, "--gap", "X", "longest step between samples, in median steps (default 1.5)", "1.5")
+    option(
+        one,
+        "--gap",
+        "X",
+        "longest step between samples, in median steps (default 1.5)",
+        1.5,
+        number,
+    )
     text = "inputs between samples: zero-order (each until the next row) or first-order (a line)"
     option(one, "--hold", "HOW", text, "")
     text = "end of the data that validates a first fit: share, or samples (default 0.25)"
-    option(one, "--hold-back", "SHARE", text, "0.25")
+    option(one, "--hold-back", "SHARE", text, 0.25, number)
     text = "standard deviation of the readings, one or one per channel (default: from the data)"
     option(one, "--noise", "SD", text)
 
@@ -65,8 +73,9 @@ def _add_fit(one):
         " orifices, pipes)",
     )
     option(one, "--start", "HOW", "first levels: free (default), measured, or case", "free")
-    option(one, "--starts", "N", "searches (default 8)", "8")
-    option(one, "--iterations", "N", "evaluations of each search (default 100)", "100")
+    option(one, "--starts", "N", "searches (default 8)", 8, whole(1, 1000))
+    text = "evaluations of each search (default 100)"
+    option(one, "--iterations", "N", text, 100, whole(1, 100_000))
     option(one, "--loss", "NAME", "linear (default), soft_l1 or huber", "linear")
     text = "write the rig under a controller to tune: pi, with gains from the identified model"
     option(one, "--law", "KIND", text)
@@ -86,7 +95,7 @@ def _add_plan(one):
         action="store_true",
         help="no data: compare experiments by the standard deviations they would leave",
     )
-    option(one, "--duration", "S", "of a planned experiment [s] (default 300)")
+    option(one, "--duration", "S", "of a planned experiment [s] (default 300)", None, number)
     text = "inputs about which a planned experiment works (default: the case's own)"
     option(one, "--voltage", "V1,V2", text)
     option(one, "--measure", "H1,H2", "tanks measured in a planned experiment (default all)")
@@ -108,8 +117,6 @@ def _identify(args, case, free):
     args.out = args.resume or args.out
     _check_data_given(args)
     from tuning.identification.fit import identify
-    from tuning.report import tables
-    from tuning.storage.evaluation_log import discard
 
     logs = _read(args, case)
     options = _options(args, logs)
@@ -123,15 +130,7 @@ def _identify(args, case, free):
     line, interrupts = Line(args.quiet), Interrupts()
     found = identify(case, logs, free, progress=interrupts.check, ready=ready, **options)
     line.end()
-    written = []
-    try:
-        written = found.save(args.out, args.line) if args.out else []
-    finally:  # a full disk costs the files, not the result; the checkpoint is kept
-        print(tables.dumps(found.to_json()) if args.json else repr(found))
-    if args.out and found.status != "interrupted":
-        discard(args.out)  # the result is complete: the checkpoint is not needed
-    report_written(written, args)
-    _report_next(args, found, free, written)
+    _report_next(args, found, free, finish(found, args))
     return interrupts.code if interrupts.stop else STATUS[found.status]
 
 
@@ -140,7 +139,7 @@ def _check_data_given(args):
     for name in PLANNED:
         if getattr(args, name) is not None:
             raise InputError(
-                f"--{name} {getattr(args, name)!r}: belongs to a planned experiment, with --plan"
+                f"--{name} {getattr(args, name)}: belongs to a planned experiment, with --plan"
             )
     if not args.data:
         raise InputError(
@@ -166,20 +165,18 @@ def _column(text):
 
 def _options(args, logs):
     """Return the keyword arguments of `identify`."""
-    gap = values.number("--gap", args.gap)
-    hold, noise = _hold_back(args, logs), _noise(args)
-    if not gap >= 1:
-        raise InputError(f"--gap {args.gap!r}: must be at least 1")
+    if not args.gap >= 1:
+        raise InputError(f"--gap {args.gap:g}: must be at least 1")
     return {
         "start": args.start,
-        "starts": values.whole("--starts", args.starts, 1, 1000),
-        "seed": values.seed(args),
-        "hold_back": hold,
-        "noise": noise,
+        "starts": args.starts,
+        "seed": args.seed,
+        "hold_back": _hold_back(args, logs),
+        "noise": _noise(args),
         "loss": args.loss,
         "profile": args.profile,
-        "iterations": values.whole("--iterations", args.iterations, 1, 100_000),
-        "gap": gap,
+        "iterations": args.iterations,
+        "gap": args.gap,
         "checkpoint": args.out,
         "resume": args.resume is not None,
         "law": args.law,
@@ -188,10 +185,10 @@ def _options(args, logs):
 
 def _hold_back(args, logs):
     """Return the share, or number of samples, of the validation set."""
-    hold = values.number("--hold-back", args.hold_back)
+    hold = args.hold_back
     if not 0 <= hold < min(one.samples for one in logs) or (hold >= 1 and hold != int(hold)):
         raise InputError(
-            f"--hold-back {args.hold_back!r}: must be a share from 0 to below 1, or a whole number"
+            f"--hold-back {hold:g}: must be a share from 0 to below 1, or a whole number"
             " of samples, fewer than the data have"
         )
     return hold if hold < 1 else int(hold)
@@ -265,12 +262,9 @@ def _plan(args, case, free):
     from tuning.identification.design import compare_experiments, most_informative
     from tuning.report import experiment_plan, tables
 
-    values.seed(args)
-    duration = 300.0 if args.duration is None else values.number("--duration", args.duration)
+    duration = 300.0 if args.duration is None else args.duration
     if not 0 < duration <= LONGEST:
-        raise InputError(
-            f"--duration {args.duration!r}: must be above 0 s and at most {LONGEST:g} s"
-        )
+        raise InputError(f"--duration {duration:g}: must be above 0 s and at most {LONGEST:g} s")
     plan = {
         "duration": duration,
         "dt": duration / 300,
@@ -320,7 +314,7 @@ def _voltage(args, case):
     """Return the inputs of --voltage, or None for the case's own."""
     if args.voltage is None:
         return None
-    voltage = [values.number("--voltage", text) for text in args.voltage.split(",")]
+    voltage = [number("--voltage", text) for text in args.voltage.split(",")]
     high = [float(v) for v in case.loop.actuator.high]
     if len(voltage) != len(high) or not all(0 < v <= top for v, top in zip(voltage, high)):
         raise InputError(
@@ -333,7 +327,7 @@ def _voltage(args, case):
 def _planned_noise(args, case):
     """Return the standard deviation of the readings: given, the case's, or 0.5 % of the rim."""
     if args.noise:
-        noise = values.number("--noise", args.noise)
+        noise = number("--noise", args.noise)
     else:
         noise = max(map(float, case.loop.sensor.noise)) or 0.005 * max(
             map(float, case.loop.plant.rim)

@@ -9,9 +9,8 @@ from pathlib import Path
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder, write_folder
 from jaxtank.core.text import printable
-from tuning.cli.arguments import option
+from tuning.cli.arguments import option, whole
 from tuning.cli.options import report_written
-from tuning.cli.values import whole
 
 
 def add(commands, parents):
@@ -60,7 +59,14 @@ def add(commands, parents):
     )
     one.set_defaults(run=bench)
     one.add_argument("cases", nargs="*", metavar="CASE", help='cases to time instead, or "all"')
-    option(one, "--rounds", "N", "interleaved rounds to take the median of (default 7)", "7")
+    option(
+        one,
+        "--rounds",
+        "N",
+        "interleaved rounds to take the median of (default 7)",
+        7,
+        whole(1, 1000),
+    )
 
 
 def figure(args):
@@ -132,7 +138,6 @@ def compare(args):
 
 def bench(args):
     """Time the closed loop on this machine."""
-    rounds = whole("--rounds", args.rounds, 1, 1000)
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -143,10 +148,10 @@ def bench(args):
         from jaxtank import presets, rig
 
         names = presets.names() if args.cases == ["all"] else args.cases
-        found = timing.measure_cases({name: rig.open_case(name) for name in names}, rounds)
+        found = timing.measure_cases({name: rig.open_case(name) for name in names}, args.rounds)
         print(tables.dumps(found) if args.json else timing.text_of_cases(found))
         return 0
-    found = timing.measure(rounds)
+    found = timing.measure(args.rounds)
     print(tables.dumps(found) if args.json else timing.text(found))
     return 0
 

@@ -6,21 +6,51 @@ import sys
 from typing import Any
 
 from jaxtank.core.errors import InputError
-from tuning.cli.arguments import on_cluster, option, repeatable, uncertain
-from tuning.cli.interrupts import put_back
+from tuning.cli.arguments import on_cluster, option, repeatable, uncertain, whole
+from tuning.cli.interrupts import Interrupts, put_back
 from tuning.cli.options import (
     choices_of,
     distributions_of,
+    finish,
     limits_of,
     report_unreachable,
-    report_written,
     scenarios_of,
     tradeoff_of,
 )
-from tuning.cli.progress import Progress
-from tuning.cli.values import number, once, open_case, pair, span, whole
-from tuning.cli.values import seed as seed_of
-from tuning.cli.watch import first_sentence, watch_of
+from tuning.cli.terminal import Line
+from tuning.cli.values import number, once, open_case, pair, span
+from tuning.cli.watch import Watch, first_sentence, watch_of
+
+
+class Progress(Interrupts):
+    """A line per evaluation on a terminal, a line per local search elsewhere."""
+
+    def __init__(self, unit, quiet, option=None):
+        super().__init__()
+        self.unit, self.last, self.line = unit, None, Line(quiet)
+        self.watch: Watch | None = None
+        self.note = option and f"{option} implies --nominal: the optimum of the case as it is"
+        self.line.compiling("the simulation and its derivatives", 15)
+
+    def __call__(self, event):
+        if self.note:  # not before the search begins: an error is one line
+            print(f"jaxtank: note: {self.note}", file=sys.stderr)
+            self.note = None
+        if event["evaluations"] > 1:
+            self.check()
+        if self.watch is not None:
+            self.watch(event | {"unit": event.get("unit") or self.unit})
+        if not self.line.terminal and event["start"] == self.last:
+            return
+        self.last = event["start"]
+        breaks = " (breaks a limit)" if event["best_violation"] else ""
+        unit = event.get("unit") or self.unit
+        best = "none yet" if event["best"] is None else f"{event['best']:.6g} {unit}{breaks}"
+        self.line.show(
+            f"start {min(event['start'] + 1, event['starts'])}/{event['starts']}  evaluation"
+            f" {event['evaluations']}  best {best}"
+        )
+
 
 CODES = """exit codes:
   0    converged (two searches within 1 % of each other (--nominal: 0.1 %), or differential
@@ -75,7 +105,7 @@ def _add_problem(one):
     )
     repeatable(one, "--choose", "NAME=V1,V2", text)
     text = "validation plants (default 256; --nominal: 64, 0 for none)"
-    option(one, "--validation", "N", text)
+    option(one, "--validation", "N", text, None, whole(0, 100_000))
     text = (
         "first make the smallest design change of one kind (setpoints, rims, orifices, pumps or"
         " ramps) with which 95 % of the plants can hold the setpoints (ramps: with which the"
@@ -103,11 +133,13 @@ def _add_search(one):
     text = "auto (default), trf, coarse-trf, slsqp, lbfgs or adam"
     option(one, "--method", "NAME", text, "auto")
     text = "local searches (default 4 at most, until two agree; --nominal: 8)"
-    option(one, "--starts", "N", text)
-    option(one, "--screening", "N", "Sobol points of --nominal (default 64)")
+    option(one, "--starts", "N", text, None, whole(1, 1000))
+    text = "Sobol points of --nominal (default 64)"
+    option(one, "--screening", "N", text, None, whole(1, 65536))
     text = "iterations of each local search (default 40; --nominal: 60)"
-    option(one, "--iterations", "N", text)
-    option(one, "--batch", "N", "scenarios drawn for each step of method adam (default all)")
+    option(one, "--iterations", "N", text, None, whole(1, 100_000))
+    text = "scenarios drawn for each step of method adam (default all)"
+    option(one, "--batch", "N", text, None, whole(1, 100_000))
     one.add_argument(
         "--watch",
         action="store_true",
@@ -122,10 +154,11 @@ def _add_robust(one):
     """Options on many plants at once."""
     text = "many drawn plants at once: mean, cvar or worst of their costs, limits kept on every one"
     option(one, "--robust", "RISK", text)
-    option(one, "--samples", "N", "plants of --robust (default 64)")
-    option(one, "--fresh", "N", "validation plants of --robust (default 1024)")
+    option(one, "--samples", "N", "plants of --robust (default 64)", None, whole(2, 100_000))
+    text = "validation plants of --robust (default 1024)"
+    option(one, "--fresh", "N", text, None, whole(1, 100_000))
     text = "constraint tightening of --robust, as a share of each limit; validation is without it"
-    option(one, "--back-off", "SHARE", text)
+    option(one, "--back-off", "SHARE", text, None, number)
 
 
 def tune(args):
@@ -138,7 +171,7 @@ def tune(args):
 
 def _tune(args):
     """Tune, then what was asked for besides; write and print the result."""
-    seed, case = seed_of(args), open_case(args)
+    seed, case = args.seed, open_case(args)
     from tuning.report import tables
 
     task, sweep = _task(args, case, seed), tradeoff_of(args)
@@ -156,7 +189,7 @@ def _tune(args):
             **{k: v for k, v in task.items() if k != "scenarios"},
             **own,
             **_numbers(args),
-            log=folder,
+            checkpoint=folder,
             resume=args.resume is not None,
             progress=progress,
             cluster=args.cluster,
@@ -164,7 +197,10 @@ def _tune(args):
         progress.line.end()
         result = _besides(args, case, result, task, sweep, progress)
         args.out = folder
-        _finish(args, result)
+        written = finish(result, args)
+        report_unreachable(result.tuned, written, args)
+        if not args.out and not args.json and not args.quiet:
+            print("Add --out DIR for the tuned rig, the trajectory and pictures.", file=sys.stderr)
         if progress.watch is not None:
             stopped = progress.stop or result.status == "interrupted"
             state = "interrupted" if stopped else "ended"
@@ -225,9 +261,9 @@ def _finder(args, case, task):
         {
             "distributions": varied,
             "risk": args.robust,
-            "samples": whole("--samples", args.samples or "64", 2, 100_000),
-            "fresh": whole("--fresh", args.fresh or "1024", 1, 100_000),
-            "back_off": number("--back-off", args.back_off or "0"),
+            "samples": args.samples or 64,
+            "fresh": args.fresh or 1024,
+            "back_off": args.back_off or 0.0,
         },
     )
 
@@ -278,19 +314,9 @@ def _is_nominal(args):
 
 def _numbers(args) -> dict[str, Any]:
     """Method and numbers of the search that are given: keywords of the finder."""
-    given = {
-        "batch": (args.batch, 1, 100_000),
-        "validation": (args.validation, 0, 100_000),
-        "starts": (args.starts, 1, 1000),
-        "screening": (args.screening, 1, 65536),
-        "iterations": (args.iterations, 1, 100_000),
-    }
-    read: dict[str, Any] = {
-        name: whole(f"--{name}", text, low, high)
-        for name, (text, low, high) in given.items()
-        if text is not None
-    }
-    return read | ({} if args.method == "auto" else {"method": args.method})
+    names = ("batch", "validation", "starts", "screening", "iterations")
+    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    return given | ({} if args.method == "auto" else {"method": args.method})
 
 
 def _besides(args, case, result, task, sweep, progress):
@@ -299,7 +325,7 @@ def _besides(args, case, result, task, sweep, progress):
         from tuning.search.pareto import tradeoff
 
         start = {n: p["after"] for n, p in result.parameters.items()}
-        screening = whole("--screening", args.screening or "64", 1, 65536)
+        screening = args.screening or 64
         with contextlib.suppress(KeyboardInterrupt):  # the answer is given without it
             found = tradeoff(
                 case, *sweep, start=start, screening=screening, progress=progress.check, **task
@@ -311,22 +337,3 @@ def _besides(args, case, result, task, sweep, progress):
         found = bound(result.tuned, task["objective"], task["limits"], progress=progress.check)
         result = result.replace(bound=found)
     return result
-
-
-def _finish(args, result):
-    """Write and print the result; a checkpoint that is no longer needed is removed."""
-    from tuning.report import tables
-
-    written = []
-    try:
-        written = result.save(args.out, args.line) if args.out else []
-    finally:  # a full disk costs the files, not the printed result; and the checkpoint is kept
-        print(tables.dumps(result.to_json()) if args.json else str(result))
-    if args.out and result.status != "interrupted":
-        from tuning.storage.evaluation_log import discard
-
-        discard(args.out)
-    report_written(written, args)
-    report_unreachable(result.tuned, written, args)
-    if not args.out and not args.json and not args.quiet:
-        print("Add --out DIR for the tuned rig, the trajectory and pictures.", file=sys.stderr)

@@ -19,7 +19,7 @@ from tuning.report.studies.sensitivity_tables import (
     table_csv,
 )
 from tuning.uncertainty.distributions import Correlated, Normal
-from tuning.uncertainty.local import NORMAL_WIDTH
+from tuning.uncertainty.sensitivity_study import NORMAL_WIDTH
 
 PANELS = 12
 """Measures in the picture."""

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtank.core.tree import describe
 from tuning.problem.wording import count
 from tuning.report import tables
-from tuning.uncertainty.local import NORMAL_WIDTH
+from tuning.uncertainty.sensitivity_study import NORMAL_WIDTH
 
 SHOWN = 8
 """Parameters in the table of a measure."""

@@ -14,8 +14,8 @@ from tuning.problem import provenance
 from tuning.problem.wording import count
 from tuning.report import artifacts, html, tables
 from tuning.report.panel import panel
-from tuning.storage.batch_store import remove_batches
 from tuning.storage.columns import row_blocks
+from tuning.storage.store import discard
 from tuning.uncertainty.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
 
 QUANTITIES = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
@@ -310,5 +310,5 @@ def save(ensemble, folder, command=None):
         lambda drawn: page_of(ensemble, drawn, command),
         artifacts.earlier(folder, CAPTIONS),
     )
-    remove_batches(folder)
+    discard(folder)
     return written
