@@ -192,6 +192,25 @@ def grid(rows, columns, size, **more):
     return plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained", **more)
 
 
+def picture(draw, size, rows=1, columns=1, legend=0, title="", **more):
+    """Return a figure of `size` [inch] on whose axes `draw` has drawn; `legend`: most columns of
+    one legend below, with each label once, 0 for none.
+    """
+    with styled():
+        figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", **more)
+        draw(axes)
+        handles = {}
+        for ax in figure.axes if legend else ():
+            for handle, label in zip(*ax.get_legend_handles_labels()):
+                handles.setdefault(label, handle)
+        if handles:
+            style = {"loc": "outside lower center", "ncols": min(legend, len(handles))}
+            figure.legend(handles.values(), handles.keys(), **style)
+        if title:
+            figure.suptitle(plain(title), fontsize=10)
+    return figure
+
+
 def hide(axes):
     """Hide axes that have no picture."""
     for ax in axes:

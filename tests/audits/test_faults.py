@@ -21,8 +21,8 @@ from jaxtank import presets
 from jaxtank.core import files
 from jaxtank.core.errors import InputError
 from jaxtank.plots import responses
+from jaxtank.plots import run as figures
 from tuning.cli import main
-from tuning.report import figures
 from tuning.storage import batch_store, evaluation_log, folder_lock
 
 HERE = Path(__file__).parent

@@ -96,7 +96,7 @@ READ = {
     ("jaxtank.core.files", "read_text", "read_text"): "after `refusal`: a file of at most 4 MiB",
     ("jaxtank.rig.read", "load", "read_text"): "that of jaxtank.files",
     ("tuning.bench.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",
-    ("tuning.report.html", "style", "read_text"): "page.css of the package",
+    ("tuning.report.html", "_style", "read_text"): "page.css of the package",
     ("tuning.live.page", "_read", "read_text"): "a part of the page, of the package",
     ("tuning.live.watch", "_read", "read_text"): "watch.js and watch.css of the package",
     ("tuning.live.engine", "engine", "read_text"): "engine.js of the package",

@@ -15,7 +15,7 @@ from jaxtank.core.units import local
 from jaxtank.loop.trajectory import Trajectory
 from tuning.figures.figure import Figure
 from tuning.problem.scenarios import noisy
-from tuning.report.artifacts import run_for_people
+from tuning.report.simulated import run_for_people
 from tuning.report.tables import number
 
 FORMATS = ("svg", "png", "pdf")

@@ -182,7 +182,7 @@ class Identifications(Result):
         Run time [s].
     """
 
-    REPORT = "tuning.report.studies.identifications"
+    REPORT = "tuning.report.identifications"
 
     case: Case
     logs: tuple[str, ...]

@@ -54,7 +54,7 @@ class Certificate(NamedTuple):
     interval95: list  # Clopper and Pearson
 
     _repr_html_ = Shown._repr_html_
-    _lines = Shown._lines
+    _sections = Shown._sections
 
     def __str__(self):
         low, high = self.interval95

@@ -20,7 +20,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.plots import responses
 from tuning.problem.scenarios import ScenarioRun, groups_of, values_of
-from tuning.report.studies import sensitivity_tables
+from tuning.report import sensitivities as report
 from tuning.uncertainty import distributions, indices, local
 from tuning.uncertainty.distributions import Discrete, LogUniform, Normal, Uniform
 from tuning.uncertainty.draws import Draws
@@ -472,7 +472,7 @@ def test_command(tmp_path, method, samples, picture):
     assert json.loads((tmp_path / "found" / "result.json").read_text()) == printed
     rows = list(csv.DictReader((tmp_path / "found" / "sensitivity.csv").open()))
     assert len(rows) == 6 and {r["rank"] for r in rows} == {"1", "2"}
-    index = sensitivity_tables.HEADS[method]
+    index = report.HEADS[method]
     (key,) = [k for k in index if k in ("effect", "mu_star", "total")]
     for row in rows:
         value = printed["measures"][row["measure"]]["parameters"][row["parameter"]][key]
@@ -618,7 +618,7 @@ def test_pictures():
     ],
 )
 def test_the_unit_of_a_derivative(unit, of, words):
-    assert sensitivity_tables.per(unit, of) == words
+    assert report.per(unit, of) == words
 
 
 def test_numbers_with_a_unit_say_it(tmp_path):

@@ -108,6 +108,7 @@ def compare(args):
     from jaxtank import presets
     from tuning.report import papers as report
     from tuning.report import tables
+    from tuning.report.document import terminal
 
     papers = presets.PAPERS if args.paper == "all" else (args.paper,)
     for paper in papers:
@@ -123,9 +124,7 @@ def compare(args):
     elif args.markdown:
         print(report.markdown(found))
     else:
-        every = [row for page in found.values() for row in page["rows"]]
-        total = [f"all papers: {report.headline_text(every)}"] if len(found) > 1 else []
-        print("\n\n".join([*total, *(report.text(page) for page in found.values())]))
+        print(terminal(report.report(found)))
     report_written(written, args)
     return 0
 

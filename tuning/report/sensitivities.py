@@ -1,15 +1,24 @@
-"""Tables and notes of a sensitivity study; imported by its report."""
+"""The report of a sensitivity study: text, JSON, CSV, picture, page and folder."""
 
 import csv
 import dataclasses
+import functools
 import io
 
 import numpy as np
 
-from jaxtank.core.tree import describe
+from jaxtank.core.tree import describe, get_value
+from tuning.problem import provenance
 from tuning.problem.wording import count
-from tuning.report import tables
+from tuning.report.document import Report, Text, figures_of
+from tuning.report.folder import earlier
+from tuning.report.folder import save as save_all
+from tuning.report.tables import Table, Value, clean, number
+from tuning.uncertainty.distributions import Correlated, Normal
 from tuning.uncertainty.local import NORMAL_WIDTH
+
+PANELS = 12
+"""Measures in the picture."""
 
 SHOWN = 8
 """Parameters in the table of a measure."""
@@ -121,13 +130,35 @@ def _precision(result):
     return found
 
 
-def parts_of(result):
-    """Return what is printed of a SensitivityResult but for its notes: lines and Tables."""
+def report(result, drawn=None):
+    """Return the Report of a SensitivityResult."""
     varied = ", ".join(f"{n} {_in_words(d)}" for n, d in result.distributions.items())
-    parts = [_headline(result), f"varied: {varied}", ""]
-    for c in result.columns:
-        parts += [*_column_table(result, c), ""]
-    return parts
+    facts = [
+        ("parameters", len(result.parameters)),
+        ("runs", result.runs),
+        ("time", f"{result.wall_s:.1f} s"),
+    ]
+    first = next((c for c in result.columns if not c.empty), None)
+    if first is not None:
+        most = result.parameters[result.order(first)[0]]
+        facts.insert(0, (f"{first.label} is most sensitive to", most))
+    diverged = f"{count(result.failed, 'run')} diverged"
+    title = TITLES[result.method]
+    captions = dict.fromkeys(drawn or {}, f"{title[0].upper()}{title[1:]}.")
+    return Report(
+        f"{result.case.name}: sensitivity",
+        f"{result.method}: {diverged if result.failed else 'every run is finite'}",
+        facts,
+        [
+            Text([_headline(result)], on="terminal"),
+            Text([f"varied: {varied}"]),
+            *(section for c in result.columns for section in _column(result, c)),
+            Text(notes_of(result), items=True, gap=True),
+            *figures_of(drawn or {}, captions),
+        ],
+        not result.failed,
+        result.case.title,
+    )
 
 
 def _headline(result):
@@ -143,21 +174,20 @@ def _headline(result):
     )
 
 
-def _column_table(result, c):
+def _column(result, c):
     """The most influential parameters of a Column, under its title."""
-    title = f"{c.label} [{c.unit}], {tables.number(c.nominal)} in the case's own run"
+    title = f"{c.label} [{c.unit}], {number(c.nominal)} in the case's own run"
     if c.empty:
-        return [f"{title}: no indices, {c.reason}"]
+        return [Text([f"{title}: no indices, {c.reason}"], gap=True)]
     rows = [[result.parameters[i], *_cells(result, c, i)] for i in result.order(c)[:SHOWN]]
-    found = [title, tables.table(rows, ["parameter", *_heads(result.method, c.unit)])]
-    more = len(result.parameters) - len(rows)
+    notes, more = [], len(result.parameters) - len(rows)
     if more > 0:
-        found.append(f"and {count(more, 'more parameter')}, each of less influence")
+        notes.append(f"and {count(more, 'more parameter')}, each of less influence")
     if result.method == "sobol":
-        found.append(
-            f"first-order shares sum to {np.sum(c.effects['first']):.3f} (1 without interactions)"
-        )
-    return found
+        total = np.sum(c.effects["first"])
+        notes.append(f"first-order shares sum to {total:.3f} (1 without interactions)")
+    heads = ["parameter", *_heads(result.method, c.unit)]
+    return [Text([title], gap=True), Table(rows, heads), Text(notes)]
 
 
 def _in_words(distribution):
@@ -169,18 +199,113 @@ def _in_words(distribution):
 
 def _cells(result, c, i):
     """The cells of parameter `i`; a derivative with its unit, which differs from row to row."""
-    cells = {q: _cell(c.effects[q][i]) for q in HEADS[result.method]}
-    if "derivative" in cells and np.isfinite(c.effects["derivative"][i]):
-        cells["derivative"] += f" {derivative_unit(result, c, result.parameters[i])}"
-    return cells.values()
+    unit = derivative_unit(result, c, result.parameters[i])
+    units = {"derivative": unit} if result.method == "local" else {}
+    effects = {q: c.effects[q][i] for q in HEADS[result.method]}
+    return [
+        Value(v, 3, between=" : ") if np.ndim(v) else Value(v, 4, units.get(q, ""))
+        for q, v in effects.items()
+    ]
 
 
-def _cell(value):
-    return (
-        " : ".join(tables.number(v, 3) for v in value)
-        if np.ndim(value)
-        else tables.number(value, 4)
-    )
+def json_of(result):
+    """Return the JSON object of `jaxtank sensitivity --json`."""
+    return {
+        "case": result.case.name,
+        "method": result.method,
+        "samples": result.samples,
+        "runs": result.runs,
+        "failed": result.failed,
+        "distributions": {
+            n: {
+                "kind": type(d).__name__,
+                **{k: v for k, v in dataclasses.asdict(d).items() if v is not None},
+            }
+            for n, d in result.distributions.items()
+        },
+        "parameters": {n: _parameter_json(result, n) for n in result.parameters},
+        "measures": {c.label: _column_json(result, c) for c in result.columns},
+        "notes": notes_of(result),
+        "wall_s": result.wall_s,
+        "provenance": provenance.provenance(result.case, result.seed),
+    }
+
+
+def _parameter_json(result, name):
+    found = {
+        "value": clean(np.asarray(get_value(result.case.loop, name))),
+        "unit": describe(result.case.loop, name)["unit"],
+    }
+    if result.half_width:
+        words = _width_in_words(result, name)
+        found |= {"half_width": result.half_width[name], "half_width_is": words}
+    return found
+
+
+def _width_in_words(result, label):
+    for name, d in result.distributions.items():
+        if label in getattr(d, "names", (name,)) or label.split("[")[0] == name:
+            normal = isinstance(d, (Normal, Correlated))
+            width = f"{min(NORMAL_WIDTH, d.cut):g} standard deviations" if normal else ""
+            return width or "half the range"
+    return ""
+
+
+def _column_json(result, c):
+    extra, rows = {}, {}
+    if result.method == "sobol":
+        extra = {
+            "sd": clean(float(c.effects["sd"])),
+            "sum_of_first": clean(float(np.sum(c.effects["first"]))),
+            "base_points_used": int(c.effects["kept"]),
+        }
+    for i in result.order(c):
+        name = result.parameters[i]
+        rows[name] = row = {q: clean(c.effects[q][i]) for q in HEADS[result.method]}
+        if result.method == "local":
+            row["derivative_unit"] = derivative_unit(result, c, name)
+        if result.method == "morris":
+            row["mu_interval95"] = clean(c.effects["mu_interval95"][i])
+            row["effects_used"] = int(c.effects["kept"][i])
+    return {
+        "measure": c.measure,
+        "unit": c.unit,
+        "nominal": clean(c.nominal),
+        "not_finite": c.not_finite,
+        "reason": c.reason or None,
+        **extra,
+        "parameters": rows,
+    }
+
+
+def figures(result):
+    """Return {"tornado" or "sobol": Figure} with a panel for each measure, at most PANELS."""
+    from jaxtank.plots import responses as plotting
+
+    shown = [c for c in result.columns if not c.empty][:PANELS]
+    if not shown:
+        return {}
+    draws = [functools.partial(_panel, plotting, result, c) for c in shown]
+    name = "sobol" if result.method == "sobol" else "tornado"
+    rows = min(len(result.parameters), plotting.BARS)
+    title = f"{result.case.name}: {TITLES[result.method]}"
+    return {name: plotting.panels(draws, title, rows)}
+
+
+def _panel(plotting, result, c, ax):
+    """Draw the sensitivities of one Column."""
+    order, method, unit = result.order(c), result.method, c.unit
+    names = [result.parameters[i] for i in order]
+    effects = {q: np.asarray(c.effects[q])[order] for q in HEADS[method]}
+    title = f"{c.label} ({number(c.nominal, 4)} {unit})"
+    if method == "local":
+        return plotting.tornado(ax, names, effects["effect"], unit, title)
+    if method == "morris":
+        size, spread = effects["mu_star"], effects["sigma"]
+        interval = effects["mu_star_interval95"]
+        return plotting.elementary(ax, names, size, interval, spread, unit, title)
+    shares = [effects[q] for q in ("first", "total", "first_interval95", "total_interval95")]
+    return plotting.shares(ax, names, *shares, title)
 
 
 def table_csv(result):
@@ -202,3 +327,10 @@ def table_csv(result):
             more = [derivative_unit(result, c, name) for _ in local]
             writer.writerow([c.label, c.unit, name, unit, rank, *numbers, *more])
     return out.getvalue()
+
+
+def save(result, folder, command=None):
+    """Write result.json, sensitivity.csv, tornado.png or sobol.png, and report.html to `folder`."""
+    files, stale = {"sensitivity.csv": table_csv(result)}, earlier(folder, ["tornado", "sobol"])
+    draw, page = lambda: figures(result), lambda drawn: report(result, drawn)
+    return save_all(folder, json_of(result), files, draw, page, command, stale)
