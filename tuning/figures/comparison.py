@@ -11,7 +11,8 @@ from typing import Any
 from jaxtank import presets
 from jaxtank.core.errors import unknown
 from jaxtank.core.text import html_table
-from tuning.figures import catalogue, drawing
+from tuning.figures import drawing
+from tuning.figures.figure import find
 from tuning.problem.result import Shown
 from tuning.report import papers, tables
 
@@ -155,8 +156,8 @@ def redraw(name: str) -> Any:
     >>> figure.axes[0].get_title()
     'memberships of input 1'
     """
-    found = catalogue.find(name)
-    return drawing.draw(found, drawing.run(found))
+    figure = find(name)
+    return drawing.draw(figure, drawing.run(figure))
 
 
 def _folded(name: str, rows: list[dict[str, Any]]) -> str:

@@ -68,7 +68,7 @@ def figure(args):
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from tuning.figures.catalogue import FIGURES, find
+    from tuning.figures.figure import FIGURES, find
     from tuning.report import tables
 
     if args.figure is None:
