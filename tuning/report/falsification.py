@@ -24,8 +24,8 @@ REPRODUCED = 1e-9
 """Share of a level to which the rig file must give it again."""
 
 CAPTIONS = {
-    "worst": "The case as it is (dashed), and the run that comes highest by its limit.",
-    "ascent": "The highest level of each tank after each step of the ascent, by its limit.",
+    "worst": "The case itself (dashed), and the run with the smallest margin to its limit.",
+    "ascent": "The highest level of each tank after each step of the ascent, over its limit.",
 }
 
 
@@ -164,7 +164,10 @@ def report(attack, drawn=None):
             Text([head, *_scope(attack)]),
             _levels(attack),
             Text([verdict(attack)], gap=True),
-            Text([f"The run that brings tank {worst.tank + 1} highest by its limit:"], gap=True),
+            Text(
+                [f"The run with the smallest margin to its limit, in tank {worst.tank + 1}:"],
+                gap=True,
+            ),
             _parameters(attack, worst),
             Text(options, gap=True),
             Text(remarks_of(attack), items=True, gap=True),

@@ -305,16 +305,16 @@ def sections_of(result):
         first, *others = optimal_input.report(result.bound).sections
         sections += [dataclasses.replace(first, gap=True), *others]
     if loop.plant.overflow:
-        rims = "rims are physics: liquid above them overflows"
+        rims = "overflow is simulated: liquid above a rim leaves its tank"
     elif not any(limit["measure"] == "max_level" for limit in result.constraints):
         rims = (
-            "rims are neither physics nor limits here: nothing spills in the model, and a level"
-            " above its rim is not reported"
+            "overflow is not simulated and no level limit is set: a level above its rim is not"
+            " reported"
         )
     elif loop.safety_filter is not None:
         rims = "rims are limits, for which a safety filter caps the pumps"
     else:
-        rims = "rims are limits only: nothing spills in the model, so a level may be above its rim"
+        rims = "rims are limits only: overflow is not simulated, and a level may rise above its rim"
     return [*sections, Text([f"{rims}; evaluated at dt = {result.tuned.clock.dt:g} s"], gap=True)]
 
 

@@ -269,7 +269,7 @@ def test_lower_limits_and_several_measures(gouta):
 def test_rims_as_physics_turn_the_limit_into_one_of_overflow(gouta):
     result = quick(gouta, values={"plant.overflow": True})
     assert {c["measure"] for c in result.constraints} == {"overflow_volume"}
-    assert "rims are physics" in repr(result)
+    assert "overflow is simulated" in repr(result)
 
 
 @pytest.mark.slow
