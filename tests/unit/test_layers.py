@@ -15,6 +15,7 @@ import tuning
 LAZY = {
     ("tuning.problem.result", "tuning.report.document"),
     ("tuning.problem.result", "tuning.report.html"),
+    ("tuning.problem.result", "tuning.report.tables"),
     ("jaxtank.__main__", "tuning.cli.main"),
     ("jaxtank.case", "jaxtank.plots.run"),
     ("jaxtank.case", "jaxtank.rig.write"),

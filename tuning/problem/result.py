@@ -7,7 +7,7 @@ The base classes of the results of `tuning`; their reports are opened when they 
 # pyright: reportUnknownVariableType=false
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -28,9 +28,16 @@ class Shown:
 
     def _sections(self) -> Sequence[Any]:
         """Return the sections of the result's Report."""
-        from tuning.report.document import Text
+        from tuning.report.tables import Table
 
-        return [Text(str(self).splitlines(), layout=True)]
+        return [Table(list(self._rows().items()))]
+
+    def _rows(self) -> Mapping[str, Any]:
+        """Return {name: value} of a result without a report."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        return "\n".join(f"{name}: {value}" for name, value in self._rows().items())
 
 
 class Result(Shown):
@@ -43,6 +50,9 @@ class Result(Shown):
 
     def _sections(self) -> Sequence[Any]:
         return self._report().report(self).sections
+
+    def __str__(self) -> str:
+        return repr(self)
 
     def __repr__(self) -> str:
         from tuning.report.document import terminal

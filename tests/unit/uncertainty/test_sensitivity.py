@@ -20,7 +20,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.plots import responses
 from tuning.problem.scenarios import ScenarioRun, groups_of, values_of
-from tuning.report import sensitivities as report
+from tuning.report import effects as report
 from tuning.uncertainty import distributions, indices, local
 from tuning.uncertainty.distributions import Discrete, LogUniform, Normal, Uniform
 from tuning.uncertainty.draws import Draws
