@@ -24,6 +24,7 @@ from jaxtank.plots.style import (
     REFERENCE,
     RUNS,
     STYLE,
+    add_legend,
     beside,
     for_print,
     grid,
@@ -161,7 +162,9 @@ def responses(loop, trajectories, title="", limits=None):
             last = [ax for ax in column if ax.get_visible()][-1]
             last.set_xlabel("time [s]")
             last.tick_params(labelbottom=True)
-        _legend(figure, axes, wide)
+        most = max(2, round(wide))
+        few = lambda labels: labels if labels <= 6 else max(4, round(wide / 2))
+        add_legend(figure, lambda labels: min(few(labels), most))
         lines = ("" if printing() else title) + note  # a journal has captions
         figure.suptitle(
             "\n".join(
@@ -234,17 +237,6 @@ def _rows(loop, drawn, which, limits):
     ]
     most = beside(COLUMNS)
     return [row[i : i + most] for row in kinds for i in range(0, len(row), most)]
-
-
-def _legend(figure, axes, width):
-    """One legend for all panels, with each label once."""
-    handles = {}
-    for ax in axes.flat:
-        for handle, label in zip(*ax.get_legend_handles_labels()):
-            handles.setdefault(label, handle)
-    columns = len(handles) if len(handles) <= 6 else max(4, round(width / 2))
-    columns = min(columns, max(2, round(width)))
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
 
 
 def _at(array, i) -> Any:

@@ -199,16 +199,22 @@ def picture(draw, size, rows=1, columns=1, legend=0, title="", **more):
     with styled():
         figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", **more)
         draw(axes)
-        handles = {}
-        for ax in figure.axes if legend else ():
-            for handle, label in zip(*ax.get_legend_handles_labels()):
-                handles.setdefault(label, handle)
-        if handles:
-            style = {"loc": "outside lower center", "ncols": min(legend, len(handles))}
-            figure.legend(handles.values(), handles.keys(), **style)
+        if legend:
+            add_legend(figure, lambda labels: min(legend, labels))
         if title:
             figure.suptitle(plain(title), fontsize=10)
     return figure
+
+
+def add_legend(figure, columns):
+    """Add one legend below all panels, with each label once, in columns(number of labels)."""
+    handles = {}
+    for ax in figure.axes:
+        for handle, label in zip(*ax.get_legend_handles_labels()):
+            handles.setdefault(label, handle)
+    if handles:
+        place = {"loc": "outside lower center", "ncols": columns(len(handles))}
+        figure.legend(handles.values(), handles.keys(), **place)
 
 
 def hide(axes):

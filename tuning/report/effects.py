@@ -14,6 +14,7 @@ from tuning.report.document import Report, Text, figures_of
 from tuning.report.folder import earlier
 from tuning.report.folder import save as save_all
 from tuning.report.tables import Table, Value, clean, number
+from tuning.report.uncertainty import in_words
 from tuning.uncertainty.distributions import Correlated, Normal
 from tuning.uncertainty.local import NORMAL_WIDTH
 
@@ -132,7 +133,7 @@ def _precision(result):
 
 def report(result, drawn=None):
     """Return the Report of a SensitivityResult."""
-    varied = ", ".join(f"{n} {_in_words(d)}" for n, d in result.distributions.items())
+    varied = ", ".join(f"{n} {in_words(d)}" for n, d in result.distributions.items())
     facts = [
         ("parameters", len(result.parameters)),
         ("runs", result.runs),
@@ -188,13 +189,6 @@ def _column(result, c):
         notes.append(f"first-order shares sum to {total:.3f} (1 without interactions)")
     heads = ["parameter", *_heads(result.method, c.unit)]
     return [Text([title], gap=True), Table(rows, heads), Text(notes)]
-
-
-def _in_words(distribution):
-    """A distribution by its fields."""
-    fields = dataclasses.asdict(distribution).items()
-    given = ", ".join(f"{n} {v}" for n, v in fields if v is not None and v is not False)
-    return f"{type(distribution).__name__.lower()} ({given})"
 
 
 def _cells(result, c, i):
