@@ -103,6 +103,9 @@ def gif(pictures):
     for k in range(3):
         parts.paste(pictures[k * (len(pictures) - 1) // 2], (0, k * pictures[0].height))
     palette, out = parts.quantize(64, dither=Image.Dither.NONE), io.BytesIO()
+    colours = np.reshape(np.array(palette.getpalette() or ()), (-1, 3))
+    colours[colours.min(axis=1) >= 248] = 255  # paper stays white
+    palette.putpalette(colours.ravel().tolist())
     first, *others = (one.quantize(palette=palette, dither=Image.Dither.NONE) for one in pictures)
     options = {"save_all": True, "duration": round(1000 / RATE), "loop": 0, "optimize": True}
     first.save(out, "GIF", append_images=others, **options)

@@ -45,7 +45,9 @@ def _figures() -> dict[str, Figure]:
     for paper, rows in tomllib.loads(text).items():
         for row in rows:
             runs = tuple(Run(**run) for run in row.pop("runs", ()))
-            rest = {k: tuple(v) if isinstance(v, list) else v for k, v in row.items()}
+            rest: dict[str, Any] = {
+                k: tuple(v) if isinstance(v, list) else v for k, v in row.items()
+            }
             figure = Figure(paper, runs=runs, **rest)
             figures[figure.name] = figure
     return figures
