@@ -1,9 +1,7 @@
-"""A run, or two beside each other, as a film: levels, what is above a rim, setpoints, inputs, time.
-
-Time runs slowly where much changes.
-"""
+"""A run, or two beside each other, as a film: levels, liquid above a rim, setpoints, inputs."""
 
 import hashlib
+import io
 import re
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +17,6 @@ from jaxtank.core.files import write_atomic
 from jaxtank.core.text import one_line
 from jaxtank.plots.layout import place
 from jaxtank.plots.overview import LARGEST as MOST_TANKS
-from jaxtank.plots.run import gif, still
 from jaxtank.plots.schematic import HALO, depth, mark, mark_height, schematic
 from jaxtank.plots.spills import Stack, headroom, spilled
 from jaxtank.plots.style import PUMPS, TUNED, WATER, plain, styled
@@ -30,16 +27,12 @@ RATE = 12
 LONGEST = 60.0
 """Of an animation [s]."""
 
-STEADY = 0.25
-"""Share of a film in which time passes evenly; in the rest it passes where levels, setpoints and
-inputs change [-].
-"""
+STILLS = 4
+"""Moments of a still."""
 
 
 def animate(loop, trajectory, path, seconds=8, against=None, titles=()):
-    """Write a run as a GIF of at most 600 kB and return its path; the file is complete or not
-    there.
-    """
+    """Write a run as a GIF and return its path; the file is complete or not there."""
     path = Path(path)
     if path.suffix.lower() != ".gif":
         raise InputError(f"animation {str(path)!r}: is written as a GIF: its name must end in .gif")
@@ -58,7 +51,7 @@ def film(loop, trajectory, seconds=8, against=None, titles=()):
             pixels = np.asarray(scene.figure.canvas.buffer_rgba())[:, :, :3]
             pictures.append(Image.fromarray(np.ascontiguousarray(pixels)))
         plt.close(scene.figure)
-    return gif(pictures, RATE), still(pictures)
+    return gif(pictures), still(pictures)
 
 
 def to_html(loop, trajectory, seconds=8, against=None, titles=()):
@@ -103,25 +96,34 @@ SIGNS = {
 """Labels of the buttons of `to_html`."""
 
 
-def moments(runs, count, ranges):
-    """Return `count` times [s] from the start to the end of the longest run: evenly spaced for a
-    quarter of them, for the others by how much changes.
-    """
-    end = max(float(run.t[-1]) for run in runs)
-    grid = np.unique(np.concatenate([np.asarray(run.t, dtype=float) for run in runs]))
-    changed = np.zeros(len(grid))
-    for run, (rims, spans) in zip(runs, ranges):
-        t = np.asarray(run.t, dtype=float)
-        steps = np.zeros(len(t))
-        for values, span in ((run.x, np.max(rims)), (run.r, np.max(rims)), (run.u, spans)):
-            steps[1:] += np.sum(np.abs(np.diff(np.asarray(values), axis=0)) / span, axis=1)
-        # a pump that chatters must not take all of the time
-        typical = np.quantile(steps[steps > 0], 0.9) if np.any(steps > 0) else 1.0
-        changed += np.interp(grid, t, np.cumsum(np.minimum(steps, typical)))
-    even = grid / end if end > 0 else grid
-    share = changed / changed[-1] if changed[-1] > 0 else even
-    passed = STEADY * even + (1.0 - STEADY) * share
-    return np.interp(np.linspace(0.0, 1.0, count), passed, grid)
+def gif(pictures):
+    """Return the pictures of a film as a GIF, RATE of them per second."""
+    # one palette for all, of three of them side by side
+    parts = Image.new("RGB", (pictures[0].width, 3 * pictures[0].height))
+    for k in range(3):
+        parts.paste(pictures[k * (len(pictures) - 1) // 2], (0, k * pictures[0].height))
+    palette, out = parts.quantize(64, dither=Image.Dither.NONE), io.BytesIO()
+    colours = np.reshape(np.array(palette.getpalette() or ()), (-1, 3))
+    colours[colours.min(axis=1) >= 248] = 255  # paper stays white
+    palette.putpalette(colours.ravel().tolist())
+    first, *others = (one.quantize(palette=palette, dither=Image.Dither.NONE) for one in pictures)
+    options = {"save_all": True, "duration": round(1000 / RATE), "loop": 0, "optimize": True}
+    first.save(out, "GIF", append_images=others, **options)
+    return out.getvalue()
+
+
+def still(pictures):
+    """Return four moments of a film as a PNG file, in two rows where the film is wide."""
+    places = np.unique(np.linspace(0, len(pictures) - 1, STILLS + 1).round().astype(int))[1:]
+    chosen = [pictures[k] for k in places] or pictures[:1]
+    width, height = chosen[0].size
+    columns = len(chosen) if width < 1.3 * height else min(2, len(chosen))
+    rows = -(-len(chosen) // columns)
+    strip, out = Image.new("RGB", (columns * width, rows * height), "white"), io.BytesIO()
+    for k, one in enumerate(chosen):
+        strip.paste(one, (k % columns * width, k // columns * height))
+    strip.save(out, format="PNG", optimize=True)
+    return out.getvalue()
 
 
 class _Scene(NamedTuple):
@@ -140,10 +142,8 @@ def _scene(loop, trajectory, seconds, against, titles):
     for one, run in pairs:
         _check(one, run)
     runs = [run for _, run in pairs]
-    span = lambda actuator: np.asarray(actuator.high, float) - np.asarray(actuator.low, float)
-    ranges = [(np.asarray(one.plant.rim, dtype=float), span(one.actuator)) for one, _ in pairs]
-    count = min(max(len(run.t) for run in runs), round(seconds * RATE))
-    times = moments(runs, count, ranges)
+    end = max(float(run.t[-1]) for run in runs)
+    times = np.linspace(0.0, end, min(max(len(run.t) for run in runs), round(seconds * RATE)))
     places = [place(one.plant) for one, _ in pairs]
     shapes = [(where.top - where.bottom) / (where.right - where.left) for where in places]
     width = 4.6 if len(pairs) == 1 else 3.9
@@ -160,7 +160,6 @@ def _scene(loop, trajectory, seconds, against, titles):
     clock = figure.text(0.5, 1.0 - 0.05 * inch, "", ha="center", va="top", fontsize=10)
     bar = Rectangle((0.0, 0.0), 0.0, 0.05 * inch, color=TUNED, linewidth=0)
     figure.add_artist(bar)
-    end = max(float(run.t[-1]) for run in runs)
 
     def draw(t):
         clock.set_text(f"t = {t:.0f} s of {end:.0f} s")

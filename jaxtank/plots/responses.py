@@ -1,19 +1,19 @@
-"""Pictures of runs: levels, errors and inputs over time.
+"""Pictures of runs over time, of a search and its objective, and of sensitivities.
 
-Each function draws on given matplotlib axes and returns them; `responses` makes a whole figure. The
-pictures of searches, sensitivities and many runs can be taken from here too, as notebooks do.
+Each function draws on given matplotlib axes and returns them; `responses` and `panels` make whole
+figures. The pictures of many runs can be taken from here too, as notebooks do.
 """
 
 import itertools
 import textwrap
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.colors import BoundaryNorm
 
 from jaxtank.core.errors import InputError
-from jaxtank.plots.effects import BARS, elementary, panels, shares, tornado
 from jaxtank.plots.overview import NAMED, worst
-from jaxtank.plots.search import contours, convergence, curve
 from jaxtank.plots.spills import above_rim, spill_note, spilled
 from jaxtank.plots.style import (
     AFTER,
@@ -24,6 +24,7 @@ from jaxtank.plots.style import (
     REFERENCE,
     RUNS,
     STYLE,
+    add_legend,
     beside,
     for_print,
     grid,
@@ -65,21 +66,15 @@ __all__ = [
     "voltage",
 ]
 
+BARS = 14
+"""Bars in a picture at most; the smallest are left out, and the title gives their number."""
+
+
 COLUMNS = 4
 """Panels beside each other."""
 
 SHOWN = 16
 """Tanks between, outputs and pumps that are drawn each; of more, those that matter."""
-
-
-def _example() -> Any:
-    """A run of one tank and one pump, for the examples."""
-    from jaxtank.loop.trajectory import COLUMNS, Trajectory
-
-    t = np.linspace(0.0, 10.0, 11)
-    column = (t / 10.0)[:, None]
-    arrays: dict[str, Any] = dict.fromkeys(COLUMNS, column) | {"t": t}
-    return Trajectory(**arrays)
 
 
 def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm", spills=None):
@@ -167,7 +162,9 @@ def responses(loop, trajectories, title="", limits=None):
             last = [ax for ax in column if ax.get_visible()][-1]
             last.set_xlabel("time [s]")
             last.tick_params(labelbottom=True)
-        _legend(figure, axes, wide)
+        most = max(2, round(wide))
+        few = lambda labels: labels if labels <= 6 else max(4, round(wide / 2))
+        add_legend(figure, lambda labels: min(few(labels), most))
         lines = ("" if printing() else title) + note  # a journal has captions
         figure.suptitle(
             "\n".join(
@@ -242,16 +239,203 @@ def _rows(loop, drawn, which, limits):
     return [row[i : i + most] for row in kinds for i in range(0, len(row), most)]
 
 
-def _legend(figure, axes, width):
-    """One legend for all panels, with each label once."""
-    handles = {}
-    for ax in axes.flat:
-        for handle, label in zip(*ax.get_legend_handles_labels()):
-            handles.setdefault(label, handle)
-    columns = len(handles) if len(handles) <= 6 else max(4, round(width / 2))
-    columns = min(columns, max(2, round(width)))
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
-
-
 def _at(array, i) -> Any:
     return None if array is None else float(np.asarray(array)[i])
+
+
+def convergence(ax, history, unit, limited):
+    """Draw the objective of every evaluation in the order of the search, one colour per start."""
+    start, cost, violation = (np.array([h[k] for h in history]) for k in range(3))
+    broken, index = violation > 0, np.arange(1, len(history) + 1)
+    for s in np.unique(start):
+        here, colour = start == s, plt.get_cmap("cividis")(0.1 + 0.8 * s / max(1, start.max()))
+        ax.plot(index[here & ~broken], cost[here & ~broken], "o", color=colour, markersize=3.5)
+        ax.plot(index[here & broken], cost[here & broken], "x", color=colour, markersize=4)
+    best = np.minimum.accumulate(np.where(broken, np.inf, cost))
+    shown = np.isfinite(best)
+    ax.plot(
+        index[shown],
+        best[shown],
+        color=AFTER,
+        linewidth=1.4,
+        drawstyle="steps-post",
+        label="best that holds every limit" if limited else "best",
+    )
+    if broken.any():
+        ax.plot([], [], "x", color="0.4", label="violates a limit")
+    for s in np.unique(start)[1:]:
+        ax.axvline(index[start == s][0] - 0.5, color="0.85", linewidth=0.8, zorder=0)
+    ax.set(
+        xlabel="evaluation (grey lines: next start)",
+        ylabel=f"objective [{unit}]",
+        title="convergence",
+    )
+    _limit_height(ax, cost[np.isfinite(cost)])
+    ax.legend(loc="best", framealpha=0.8, frameon=True, edgecolor="none")
+    return ax
+
+
+def _limit_height(ax, cost):
+    """Cut the axis above the first and most of the costs: outliers would compress the rest."""
+    top = max(float(np.quantile(cost, 0.95)), float(cost[0]))
+    high = min(float(cost.max()), 1.5 * top) if top > 0 else float(cost.max())
+    if high > 5 * cost.min() > 0:
+        ax.set_yscale("log")
+    if high < cost.max():
+        low = None if ax.get_yscale() == "log" else cost.min() - 0.05 * (high - cost.min())
+        ax.set_ylim(low, high)
+        ax.set_title(f"convergence ({int((cost > high).sum())} evaluations above the picture)")
+
+
+def curve(ax, values, cost, violation, name, unit, cost_unit, before, after, logarithmic):
+    """Draw the objective along one parameter; the part that violates a limit is shaded."""
+    ax.plot(values, cost, color="0.3", linewidth=1.3)
+    broken = np.asarray(violation) > 0
+    if broken.any():
+        low, high = ax.get_ylim()
+        ax.fill_between(
+            values,
+            low,
+            high,
+            where=broken,
+            color=FORBIDDEN,
+            alpha=0.18,
+            linewidth=0,
+            label="a limit is violated",
+        )
+        ax.set_ylim(low, high)
+    ax.plot(*before, "s", color=BEFORE, label="before")
+    ax.plot(*after, "o", color=AFTER, label="after")
+    ax.set(
+        xlabel=plain(f"{name} [{unit}]"),
+        ylabel=f"objective [{cost_unit}]",
+        title="landscape",
+        xscale="log" if logarithmic else "linear",
+    )
+    ax.legend()
+    return ax
+
+
+def contours(ax, x, y, cost, violation, names, units, cost_unit, before, after, logarithmic):
+    """Draw the objective over two parameters; beyond the pink line a limit is violated."""
+    finite = np.where(np.isfinite(cost), cost, np.nan)
+    low, high = np.nanmin(finite), np.nanquantile(finite, 0.98)
+    # a colour for each factor in the distance from the minimum, so that its surroundings are seen
+    levels = np.unique(np.append(low, low + max(high - low, 1e-12) * np.geomspace(1e-3, 1.0, 16)))
+    filled = ax.contourf(
+        x,
+        y,
+        finite,
+        levels=levels,
+        cmap="cividis_r",
+        extend="both",
+        norm=BoundaryNorm(levels, 256, extend="both"),
+    )
+    ax.figure.colorbar(
+        filled, ax=ax, label=f"objective [{cost_unit}]", format="%.4g", ticks=levels[::3]
+    )
+    if np.nanmax(violation) > 0 and np.nanmin(violation) <= 0:
+        ax.contour(x, y, violation, levels=[0.0], colors=[FORBIDDEN], linewidths=2.0)
+        ax.contourf(x, y, violation, levels=[0.0, np.inf], colors="none", hatches=["///"])
+        ax.plot(
+            [],
+            [],
+            color=FORBIDDEN,
+            linewidth=2.0,
+            label="a limit is reached; violated where hatched",
+        )
+    point = {"markeredgecolor": "white", "clip_on": False, "zorder": 5}
+    ax.plot(*before, "s", color=BEFORE, markersize=8, label="before", **point)
+    ax.plot(*after, "o", color=AFTER, markersize=9, label="after", **point)
+    ax.set(
+        xlabel=plain(f"{names[0]} [{units[0]}]"),
+        ylabel=plain(f"{names[1]} [{units[1]}]"),
+        title="landscape",
+    )
+    ax.set_xscale("log" if logarithmic[0] else "linear")
+    ax.set_yscale("log" if logarithmic[1] else "linear")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
+    return ax
+
+
+def tornado(ax, names, effects, unit, title):
+    """Draw the change of a measure with each parameter at the two ends of its range."""
+    y = _bars(ax, names, title)
+    effects = np.asarray(effects)[: len(y)]
+    ax.barh(y, effects, color=AFTER, height=0.62, label="parameter high")
+    ax.barh(y, -effects, color=BEFORE, height=0.62, label="parameter low")
+    ax.axvline(0.0, color=REFERENCE, linewidth=0.8)
+    ax.set_xlabel(f"change [{unit}]")
+    return ax
+
+
+def elementary(ax, names, size, intervals, spread, unit, title):
+    """Draw the elementary effects of each parameter on a measure (Morris)."""
+    y = _bars(ax, names, title)
+    size, intervals, spread = (np.asarray(v)[: len(y)] for v in (size, intervals, spread))
+    ax.barh(y, size, color=AFTER, height=0.62, label="mean size, mu*")
+    _whiskers(ax, y, size, intervals)
+    ax.plot(
+        spread,
+        y,
+        "D",
+        color=BEFORE,
+        markeredgecolor="white",
+        markersize=6,
+        label="standard deviation, sigma",
+    )
+    ax.set_xlim(left=0.0)
+    ax.set_xlabel(f"change over the range [{unit}]")
+    return ax
+
+
+def shares(ax, names, first, total, first_intervals, total_intervals, title):
+    """Draw the first-order and total shares of the variance of a measure (Sobol)."""
+    y = _bars(ax, names, title)
+    for values, ends, side, colour, label in (
+        (first, first_intervals, -0.2, BEFORE, "first order: alone"),
+        (total, total_intervals, 0.2, AFTER, "total: with interactions"),
+    ):
+        values, ends = np.asarray(values)[: len(y)], np.asarray(ends)[: len(y)]
+        ax.barh(y + side, values, color=colour, height=0.36, label=label)
+        _whiskers(ax, y + side, values, ends)
+    ax.axvline(0.0, color=REFERENCE, linewidth=0.8)
+    ax.set_xlabel("share of the variance [-]")
+    return ax
+
+
+def panels(draw, title, rows):
+    """Return a figure with one panel for each function in `draw`, and one legend for all."""
+    columns = min(3, len(draw))
+    lines = -(-len(draw) // columns)
+    with styled():
+        size = (4.3 * columns, (0.9 + 0.26 * rows) * lines + 0.7)
+        figure, axes = grid(lines, columns, size)
+        for one, ax in zip(draw, axes.flat):
+            one(ax)
+        hide(axes.flat[len(draw) :])
+        handles, labels = axes.flat[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
+        figure.suptitle(plain(title), fontsize=10)
+    return figure
+
+
+def _bars(ax, names, title):
+    """Positions of the bars, the first at the top, with the names beside them."""
+    y = np.arange(min(len(names), BARS))
+    ax.set_yticks(y, names[:BARS])
+    ax.invert_yaxis()
+    ax.grid(False, axis="y")
+    ax.set_axisbelow(True)
+    ax.set_title(
+        title + (f"; {len(names) - BARS} smaller ones not shown" if len(names) > BARS else "")
+    )
+    return y
+
+
+def _whiskers(ax, y, values, ends):
+    """Intervals (D, 2) around values (D,)."""
+    low, high = np.maximum(0.0, values - ends[:, 0]), np.maximum(0.0, ends[:, 1] - values)
+    ax.errorbar(
+        values, y, xerr=[low, high], fmt="none", ecolor=REFERENCE, elinewidth=1.0, capsize=2.5
+    )

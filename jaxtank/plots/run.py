@@ -7,7 +7,6 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from PIL import Image
 
 from jaxtank.core.files import write_folder
 from jaxtank.core.units import local
@@ -17,15 +16,6 @@ from jaxtank.plots.overview import LARGEST, size, worst
 from jaxtank.plots.schematic import schematic
 from jaxtank.plots.spills import amount, spilled
 from jaxtank.plots.style import TALLEST, WIDTHS, for_print, styled
-
-GIF_BYTES = 600_000
-"""Size of a GIF [bytes], above which it has fewer pictures per second."""
-
-COLOURS = 64
-"""Colours of a GIF."""
-
-STILLS = 4
-"""Moments of a still."""
 
 SOFTWARE = {"Software": None}
 """Metadata of a PNG file: nothing that differs from machine to machine."""
@@ -149,38 +139,3 @@ def small(drawn: Mapping[str, Any]) -> bytes | None:
 def pngs(drawn: Mapping[str, Any]) -> dict[str, bytes]:
     """Return {file name: PNG bytes} of {name: figure}; the figures are closed."""
     return {f"{name}.png": png(figure) for name, figure in drawn.items()}
-
-
-def gif(pictures: Any, rate: int) -> bytes:
-    """Return pictures of a film as a GIF of at most GIF_BYTES, `rate` of them per second."""
-    parts = Image.new("RGB", (pictures[0].width, 3 * pictures[0].height))
-    for k in range(3):  # one palette for all
-        parts.paste(pictures[k * (len(pictures) - 1) // 2], (0, k * pictures[0].height))
-    palette = parts.quantize(COLOURS, dither=Image.Dither.NONE)
-    colours = np.reshape(np.array(palette.getpalette() or ()), (-1, 3))
-    colours[colours.min(axis=1) >= 248] = 255  # paper stays white
-    palette.putpalette(colours.ravel().tolist())
-    drawn = [one.quantize(palette=palette, dither=Image.Dither.NONE) for one in pictures]
-    for every in (1, 2, 3, 4, 6, 8):
-        out, kept = io.BytesIO(), drawn[::every]
-        pause = round(1000 * every / rate)
-        kept[0].save(
-            out, "GIF", save_all=True, append_images=kept[1:], duration=pause, loop=0, optimize=True
-        )
-        if out.tell() <= GIF_BYTES:
-            break
-    return out.getvalue()
-
-
-def still(pictures: Any) -> bytes:
-    """Return four moments of a film as a PNG file, in two rows where the film is wide."""
-    places = np.unique(np.linspace(0, len(pictures) - 1, STILLS + 1).round().astype(int))[1:]
-    chosen = [pictures[k] for k in places] or pictures[:1]
-    width, height = chosen[0].size
-    columns = len(chosen) if width < 1.3 * height else min(2, len(chosen))
-    rows = -(-len(chosen) // columns)
-    strip, out = Image.new("RGB", (columns * width, rows * height), "white"), io.BytesIO()
-    for k, one in enumerate(chosen):
-        strip.paste(one, (k % columns * width, k // columns * height))
-    strip.save(out, format="PNG", optimize=True)
-    return out.getvalue()

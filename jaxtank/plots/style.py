@@ -192,6 +192,31 @@ def grid(rows, columns, size, **more):
     return plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained", **more)
 
 
+def picture(draw, size, rows=1, columns=1, legend=0, title="", **more):
+    """Return a figure of `size` [inch] on whose axes `draw` has drawn; `legend`: most columns of
+    one legend below, with each label once, 0 for none.
+    """
+    with styled():
+        figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", **more)
+        draw(axes)
+        if legend:
+            add_legend(figure, lambda labels: min(legend, labels))
+        if title:
+            figure.suptitle(plain(title), fontsize=10)
+    return figure
+
+
+def add_legend(figure, columns):
+    """Add one legend below all panels, with each label once, in columns(number of labels)."""
+    handles = {}
+    for ax in figure.axes:
+        for handle, label in zip(*ax.get_legend_handles_labels()):
+            handles.setdefault(label, handle)
+    if handles:
+        place = {"loc": "outside lower center", "ncols": columns(len(handles))}
+        figure.legend(handles.values(), handles.keys(), **place)
+
+
 def hide(axes):
     """Hide axes that have no picture."""
     for ax in axes:

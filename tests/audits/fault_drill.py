@@ -52,7 +52,7 @@ def prepare(cache):
 
     import tuning.identification.fit
     import tuning.report.identification
-    import tuning.report.studies.uncertainty
+    import tuning.report.uncertainty
     import tuning.search.tuner  # noqa: F401
     from tuning.cli import main as cli
 

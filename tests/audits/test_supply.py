@@ -77,7 +77,7 @@ READS = {
     "CDLL",
 }
 MADE = {
-    ("tuning.answer.answer", "_lines", "import_module"): "its own report, by a constant name",
+    ("tuning.answer.answer", "_report", "import_module"): "its own report, by a constant name",
     ("jaxtank", "__getattr__", "import_module"): "names of its own table, in its own package",
     ("jaxtank.xla.jit", "_tree", "import_module"): "of a named tuple of ours, of an entry",
     ("tuning", "__getattr__", "import_module"): "names of its own table, in its own package",
@@ -99,7 +99,8 @@ READ = {
     ("jaxtank.core.files", "read_text", "read_text"): "after `refusal`: a file of at most 4 MiB",
     ("jaxtank.rig.read", "load", "read_text"): "that of jaxtank.files",
     ("tuning.bench.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",
-    ("tuning.report.html", "style", "read_text"): "page.css of the package",
+    ("tuning.figures.figure", "_figures", "read_text"): "figures.toml of the package",
+    ("tuning.report.html", "_style", "read_text"): "page.css of the package",
     ("tuning.live.page", "_read", "read_text"): "a part of the page, of the package",
     ("tuning.live.watch", "_read", "read_text"): "watch.js and watch.css of the package",
     ("tuning.live.engine", "engine", "read_text"): "engine.js of the package",
@@ -272,7 +273,7 @@ def test_the_wheel_holds_the_two_packages_and_nothing_else(built):
         "tuning/README.md",
     } <= packed
     assert {n.rsplit(".", 1)[1] for n in packed} == {
-        *("py", "c", "css", "html", "js", "md", "txt", "typed")
+        *("py", "c", "css", "html", "js", "md", "toml", "txt", "typed")
     }
     assert license_there and "METADATA" in info and "jaxtank = tuning.cli.main:main" in entry
 

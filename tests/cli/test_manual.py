@@ -16,6 +16,7 @@ from jaxtank.core.tree import walk
 from jaxtank.plots.equations import equations
 from tuning.cli import main
 from tuning.report import case as manual
+from tuning.report.document import terminal
 
 NAMES = list(
     {
@@ -27,6 +28,10 @@ NAMES = list(
         for n in presets.names()
     }.values()
 )
+
+
+def text_of(case):
+    return terminal(manual.report(case))
 
 
 def rate(line, h, u):
@@ -68,7 +73,7 @@ def test_the_letters_follow_the_topology():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_everything_of_a_case_is_on_its_page(name):
-    case, page = presets.find(name), manual.text(presets.find(name))
+    case, page = presets.find(name), text_of(presets.find(name))
     preset = presets.load(name.split("/")[0])
     assert max(map(len, page.splitlines())) <= 100
     squeeze = lambda text: re.sub(r"\s+", "", text)
@@ -114,7 +119,7 @@ def test_what_is_set_is_what_is_reported():
         "actuator.delay": 0.2,
         "reference.second.amplitude": 2.5,
     }
-    page = " ".join(manual.text(rig.set_values(case, values)).split())
+    page = " ".join(text_of(rig.set_values(case, values)).split())
     for words in (
         "noise of 0.02 cm",
         "an ADC of 12 bits",
@@ -124,16 +129,16 @@ def test_what_is_set_is_what_is_reported():
         "steps at 0 s r2 to 10; 10 s r1 to 8",
     ):
         assert words in page, words
-    faulty = " ".join(manual.text(presets.find("calofir/backstepping-perturbed")).split())
+    faulty = " ".join(text_of(presets.find("calofir/backstepping-perturbed")).split())
     assert (
         "plant.drain[1] times 0.75 from 300 to 450 s" in faulty
         and "Rims at 0.6, 0.6 m are physics" in faulty
     )
     loop = dataclasses.replace(case.loop, disturbance=None)
-    assert "No disturbance." in manual.text(case.replace(loop=loop))
+    assert "No disturbance." in text_of(case.replace(loop=loop))
     assert (
         "recovery_time"
-        not in manual.text(case.replace(loop=loop))
+        not in text_of(case.replace(loop=loop))
         .partition("What is measured")[2]
         .partition("What the paper")[0]
     )
@@ -157,13 +162,11 @@ def test_python_m_jaxtank_is_the_command():
         [sys.executable, "-m", "jaxtank", "show", "cascaded/pi"], capture_output=True, text=True
     )
     kept = lambda text: [line for line in text.splitlines() if not line.startswith("notes: ")]
-    assert done.returncode == 0 and kept(done.stdout) == kept(
-        manual.text(presets.find("cascaded/pi"))
-    )
+    assert done.returncode == 0 and kept(done.stdout) == kept(text_of(presets.find("cascaded/pi")))
 
 
 def test_the_page_prints_the_description_of_a_class_without_its_sections():
     case = presets.find("gouta2015/backstepping")
-    page = manual.text(case)
+    page = text_of(case)
     assert "Examples\n--------" in (type(case.loop.controller).__doc__ or "").replace("    ", "")
     assert "Examples" not in page and "Parameters\n---" not in page and ">>>" not in page

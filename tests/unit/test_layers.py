@@ -13,7 +13,9 @@ import tuning
 # A result displays itself as HTML (and opens the module of its report by name); `python -m jaxtank`
 # is the command.
 LAZY = {
+    ("tuning.problem.result", "tuning.report.document"),
     ("tuning.problem.result", "tuning.report.html"),
+    ("tuning.problem.result", "tuning.report.tables"),
     ("jaxtank.__main__", "tuning.cli.main"),
     ("jaxtank.case", "jaxtank.plots.run"),
     ("jaxtank.case", "jaxtank.rig.write"),

@@ -60,11 +60,14 @@ class Answer(Shown):
         """True if every limit holds on every plant that judged the answer."""
         return self.after is not None and bool(self.after.held.all())
 
-    def _lines(self) -> list[Any]:
-        return importlib.import_module("tuning.report.tuned.answer").of_answer(self)
+    def _report(self) -> Any:
+        return importlib.import_module("tuning.report.tuned")
+
+    def _sections(self) -> list[Any]:
+        return self._report().of_answer(self)
 
     def __str__(self) -> str:
-        return "\n".join(map(str, self._lines()))
+        return self._report().answer_text(self)
 
     def plot(self) -> dict[str, Any]:
         """Return matplotlib figures {"plants": errors and highest levels before and after}."""

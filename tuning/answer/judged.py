@@ -82,7 +82,7 @@ class Judged(Shown):
             "interval95": held["interval95"],
         }
 
-    def __str__(self) -> str:
+    def _rows(self) -> dict[str, str]:
         found = self.to_json()
         low, high = (100.0 * end for end in found["interval95"])
         numbers = {
@@ -98,7 +98,7 @@ class Judged(Shown):
             }
         if found["failed"]:
             numbers["diverged"] = f"{found['failed']} plants"
-        return "\n".join(f"{name}: {text}" for name, text in numbers.items())
+        return numbers
 
     def plot(self) -> dict[str, Any]:
         """Return matplotlib figures {"plants": errors and highest levels}; {} where every run

@@ -129,7 +129,7 @@ def gather():
     from jaxtank.core.clock import CLOCK
     from jaxtank.core.tree import walk
     from jaxtank.measures import MEASURES, functions
-    from tuning.figures.catalogue import FIGURES
+    from tuning.figures.figure import FIGURES
 
     names = {f"clock.{k}" for k in CLOCK}
     for case in presets.names():

@@ -61,7 +61,7 @@ class Attack(Result):
         [s].
     """
 
-    REPORT = "tuning.report.studies.falsification_page"
+    REPORT = "tuning.report.falsification"
 
     attacked: Attacked
     found: tuple[Found, ...]

@@ -86,7 +86,7 @@ class Feasibility(Result):
     mends_s : float
     """
 
-    REPORT = "tuning.report.studies.feasible"
+    REPORT = "tuning.report.feasible"
 
     case: Any
     distributions: Mapping[str, Any]

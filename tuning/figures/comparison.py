@@ -8,12 +8,11 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import numpy as np
-
 from jaxtank import presets
 from jaxtank.core.errors import unknown
 from jaxtank.core.text import html_table
-from tuning.figures import catalogue, drawing
+from tuning.figures import drawing
+from tuning.figures.figure import find
 from tuning.problem.result import Shown
 from tuning.report import papers, tables
 
@@ -76,30 +75,24 @@ class Comparison(Shown):
         """Return matplotlib figures {"published": measured over published, coloured by verdict}."""
         return papers.overview(self.pages)
 
-    def _lines(self) -> list[Any]:
-        rows = [[name, *map(str, counted)] for name, counted in self._counts()]
-        table = tables.table(rows, ["paper", *papers.VERDICTS])
-        return [table, papers.headline_text(self.rows), *self.notes]
-
     def __str__(self) -> str:
-        return "\n".join(map(str, self._lines()))
+        counts = tables.table(self._counts(), ["paper", *papers.VERDICTS])
+        return "\n".join([counts, papers.headline_text(self.rows), *self.notes])
 
     def _repr_html_(self) -> str:
-        counts = html_table(
-            [[name, *counted] for name, counted in self._counts()], ["paper", *papers.VERDICTS]
-        )
+        counts = html_table(self._counts(), ["paper", *papers.VERDICTS])
         folded = (_folded(name, page["rows"]) for name, page in self.pages.items())
         head = f"<p>{html.escape(papers.headline_text(self.rows))}</p>"
         return head + counts + "".join(folded) + _noted(self.notes)
 
-    def _counts(self) -> list[tuple[str, list[int]]]:
-        """(paper, rows of each verdict), and their sums."""
-        found = []
+    def _counts(self) -> list[list[Any]]:
+        """Rows of paper and number of rows of each verdict, and their sums."""
+        rows: list[list[Any]] = []
         for name, page in self.pages.items():
             tally = Counter(row["verdict"] for row in page["rows"])
-            found.append((name, [tally[word] for word in papers.VERDICTS]))
-        sums = np.sum([counted for _, counted in found], axis=0, dtype=int)
-        return [*found, ("all", [int(n) for n in sums])] if len(found) > 1 else found
+            rows.append([name, *(tally[word] for word in papers.VERDICTS)])
+        sums = ["all", *(sum(column) for column in list(zip(*rows))[1:])]
+        return [*rows, sums] if len(rows) > 1 else rows
 
 
 def compare(*names: str) -> Comparison:
@@ -163,8 +156,8 @@ def redraw(name: str) -> Any:
     >>> figure.axes[0].get_title()
     'memberships of input 1'
     """
-    found = catalogue.find(name)
-    return drawing.draw(found, drawing.run(found))
+    figure = find(name)
+    return drawing.draw(figure, drawing.run(figure))
 
 
 def _folded(name: str, rows: list[dict[str, Any]]) -> str:
@@ -198,4 +191,4 @@ def _line(row: dict[str, Any]) -> str:
 def _number(value: Any) -> str:
     if value is None:
         return "-"
-    return value if isinstance(value, str) else tables.numbers(value, 4)
+    return value if isinstance(value, str) else str(tables.numbers(value, 4))

@@ -15,7 +15,7 @@ from jaxtank.core.units import local
 from jaxtank.loop.trajectory import Trajectory
 from tuning.figures.figure import Figure
 from tuning.problem.scenarios import noisy
-from tuning.report.artifacts import run_for_people
+from tuning.report.simulated import run_for_people
 from tuning.report.tables import number
 
 FORMATS = ("svg", "png", "pdf")
@@ -43,35 +43,37 @@ def run(figure: Figure) -> Drawn:
         key = jax.random.key(0) if noisy(case) else None
         runs[one.label] = case, run_for_people(case, key)
     kinds = figure.kind.split()
-    facts = {n: _facts(kinds, case, found, figure) for n, (case, found) in runs.items()}
+    facts = {n: _facts(kinds, case, trajectory, figure) for n, (case, trajectory) in runs.items()}
     ours = [f"{label}: {'; '.join(shown)}" for label, shown in facts.items() if shown]
     return Drawn(runs, tuple(ours))
 
 
-def _facts(kinds, case, found, figure):
+def _facts(kinds, case, trajectory, figure):
     """What a run shows of what is drawn, in numbers."""
     length, drive = case.loop.units
     facts = []
     if "levels" in kinds or "errors" in kinds:
-        errors = np.sqrt(np.mean(np.asarray(found.e) ** 2, axis=0))
+        errors = np.sqrt(np.mean(np.asarray(trajectory.e) ** 2, axis=0))
         drawn = figure.tanks or range(case.loop.plant.tanks)
         shown = [j for j, tank in enumerate(case.loop.plant.outputs) if tank in drawn]
         facts.append(f"RMS error {_several(errors[shown])} {length}")
         if "levels" in kinds:
-            facts.append(f"error at the end {_several(np.asarray(found.e)[-1][shown])} {length}")
+            facts.append(
+                f"error at the end {_several(np.asarray(trajectory.e)[-1][shown])} {length}"
+            )
     if "levels" in kinds:
         tanks = list(figure.tanks) or list(range(case.loop.plant.tanks))
-        facts.append(f"highest level {_several(np.max(found.x, axis=0)[tanks])} {length}")
+        facts.append(f"highest level {_several(np.max(trajectory.x, axis=0)[tanks])} {length}")
     if "inputs" in kinds:
-        low, high = np.min(found.u, axis=0), np.max(found.u, axis=0)
+        low, high = np.min(trajectory.u, axis=0), np.max(trajectory.u, axis=0)
         spans = [f"{number(a, 3)} to {number(b, 3)}" for a, b in zip(low, high)]
         facts.append(f"inputs from {' and '.join(spans)} {drive}")
     if "estimates" in kinds:
         rate = local("cm/s", case.loop.units)
-        facts.append(f"median {_several(np.median(found.d_hat, axis=0), 4)} {rate}")
-        facts.append(f"at most {_several(np.max(found.d_hat, axis=0))} {rate}")
+        facts.append(f"median {_several(np.median(trajectory.d_hat, axis=0), 4)} {rate}")
+        facts.append(f"at most {_several(np.max(trajectory.d_hat, axis=0))} {rate}")
     if "shares" in kinds:
-        time = 100.0 * np.mean(np.asarray(found.share) > SHARE, axis=0)
+        time = 100.0 * np.mean(np.asarray(trajectory.share) > SHARE, axis=0)
         facts.append(f"sliding mode has the larger share in {_several(time)} % of the time")
     return facts
 
@@ -82,10 +84,10 @@ def _several(values, digits=3):
 
 def caption(figure: Figure, ours: tuple[str, ...]) -> list[str]:
     """Return the paragraphs below a figure: what the paper shows and says, what ours shows."""
-    found = [f"{figure.paper}, figure {figure.number}. {figure.shows}."]
-    found += [f"The paper: {figure.states}"] if figure.states else []
-    found += [f"Here: {'; '.join(ours)}."] if ours else []
-    return [*found, *([figure.remark] if figure.remark else [])]
+    texts = [f"{figure.paper}, figure {figure.number}. {figure.shows}."]
+    texts += [f"The paper: {figure.states}"] if figure.states else []
+    texts += [f"Here: {'; '.join(ours)}."] if ours else []
+    return [*texts, *([figure.remark] if figure.remark else [])]
 
 
 def draw(figure: Figure, drawn: Drawn) -> Any:
@@ -132,8 +134,8 @@ def _panels(kind, figure, drawn):
     case, first = next(iter(drawn.runs.values()))
     plant, (length, drive) = case.loop.plant, case.loop.units
     outputs = {tank: j for j, tank in enumerate(plant.outputs)}
-    styles = responses.styles_of([found for _, found in drawn.runs.values()])
-    lines = {n: (found, *s) for (n, (_, found)), s in zip(drawn.runs.items(), styles)}
+    styles = responses.styles_of([trajectory for _, trajectory in drawn.runs.values()])
+    lines = {n: (trajectory, *s) for (n, (_, trajectory)), s in zip(drawn.runs.items(), styles)}
     rims = np.broadcast_to(np.asarray(plant.rim, dtype=float), (plant.tanks,))
     rims = [float(v) if np.isfinite(v) else None for v in rims]
     if kind == "levels":
@@ -163,9 +165,11 @@ def _panels(kind, figure, drawn):
     return [lambda ax, i=i: _memberships(ax, case.loop.controller, i, length) for i in range(2)]
 
 
-def _setpoints(ax, case, found):
+def _setpoints(ax, case, trajectory):
     for j, tank in enumerate(case.loop.plant.outputs):
-        ax.plot(found.t, found.r[:, j], linewidth=1.4, label=f"setpoint of tank {tank + 1}")
+        ax.plot(
+            trajectory.t, trajectory.r[:, j], linewidth=1.4, label=f"setpoint of tank {tank + 1}"
+        )
     ax.set(ylabel=f"level [{case.loop.units[0]}]", title="setpoints")
 
 

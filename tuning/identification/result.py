@@ -145,7 +145,7 @@ class Identification(Result):
     @property
     def message(self) -> str:
         """How it ended, in one line."""
-        return self._report().message(self)
+        return "; ".join(self._report().sentences_of(self))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False, eq=False)
@@ -182,7 +182,7 @@ class Identifications(Result):
         Run time [s].
     """
 
-    REPORT = "tuning.report.studies.identifications"
+    REPORT = "tuning.report.identifications"
 
     case: Case
     logs: tuple[str, ...]

@@ -7,9 +7,11 @@ The base classes of the results of `tuning`; their reports are opened when they 
 # pyright: reportUnknownVariableType=false
 
 import importlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
+from jaxtank.core.files import check_folder
 from jaxtank.core.text import with_picture
 
 
@@ -17,16 +19,25 @@ class Shown:
     """A result that a notebook displays as HTML: what `str` reports, all of it escaped."""
 
     def _repr_html_(self) -> str:
-        """Return the lines and tables of the result as a fragment of HTML, with a small picture
+        """Return the texts and tables of the result as a fragment of HTML, with a small picture
         once `jaxtank.notebook()` has been called.
         """
         from tuning.report.html import fragment
 
-        return with_picture(fragment(self._lines()), lambda: _first_picture(self))
+        return with_picture(fragment(self._sections()), lambda: _first_picture(self))
 
-    def _lines(self) -> list[Any]:
-        """Return what `str` reports: lines of text and tables."""
-        return str(self).splitlines()
+    def _sections(self) -> Sequence[Any]:
+        """Return the sections of the result's Report."""
+        from tuning.report.tables import Table
+
+        return [Table(list(self._rows().items()))]
+
+    def _rows(self) -> Mapping[str, Any]:
+        """Return {name: value} of a result without a report."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        return "\n".join(f"{name}: {value}" for name, value in self._rows().items())
 
 
 class Result(Shown):
@@ -37,11 +48,16 @@ class Result(Shown):
     def _report(self) -> Any:
         return importlib.import_module(self.REPORT)
 
-    def _lines(self) -> list[Any]:
-        return self._report().lines(self)
+    def _sections(self) -> Sequence[Any]:
+        return self._report().report(self).sections
+
+    def __str__(self) -> str:
+        return repr(self)
 
     def __repr__(self) -> str:
-        return "\n".join(map(str, self._lines()))
+        from tuning.report.document import terminal
+
+        return terminal(self._report().report(self))
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON object that the command prints with --json: plain numbers, no NaN."""
@@ -64,6 +80,7 @@ class Result(Shown):
 
     def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
         """Write result.json, tables, pictures and report.html to `folder`; return their paths."""
+        check_folder(folder)
         return self._report().save(self, folder, command)
 
 

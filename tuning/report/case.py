@@ -1,10 +1,9 @@
 """`jaxtank show`: one case as the manual of it, 100 columns wide."""
 
-import dataclasses
 import inspect
-import itertools
 import re
 import textwrap
+from typing import Any
 
 import numpy as np
 
@@ -13,13 +12,18 @@ from jaxtank.case import Free
 from jaxtank.core.clock import CLOCK
 from jaxtank.core.tree import walk
 from jaxtank.core.units import local
+from jaxtank.instruments import LevelSensor, PumpBank
 from jaxtank.loop.estimate_notes import design_notes
 from jaxtank.measures import MEASURES, of_loop
 from jaxtank.measures import unit as measure_unit
 from jaxtank.plots.equations import equations, physics
+from jaxtank.signals.base import Constant, Sum
+from jaxtank.signals.inflows import InflowPulses
+from jaxtank.signals.setpoints import Ramps, Sine
 from tuning.problem.wording import count
-from tuning.report import safety, tables
-from tuning.report.case_loop import actuator, called, own_name, sampled, sensor, signals
+from tuning.report import safety
+from tuning.report.document import Report, Text
+from tuning.report.tables import Table, Value, clean
 
 WIDTH = 100
 # the head of a numpydoc section: a title underlined with dashes
@@ -28,10 +32,12 @@ BRACKETED = re.compile(r"\[([\w^/(). ]+)\]")
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
 """Names of the plant that controller and observer compute with."""
 
-
-def clock(clock):
-    """Return the clock as a dict."""
-    return dataclasses.asdict(clock)
+NOTES = (
+    "*: part of the compiled program: --set and rig files reach it, derivatives do not.",
+    "controller.model.* and observer.model.* are the plant that controller and observer compute"
+    " with, by the same names; --set plant.* changes the rig and leaves them, in a rig file they"
+    " follow plant.* unless they are set.",
+)
 
 
 def _preset(case):
@@ -55,11 +61,11 @@ def json_of(case):
         "observer": type(loop.observer).__name__,
         "parameters": _parameters(case, preset),
         "free": {n: list(Free(*spec)) for n, spec in case.free.items()},
-        "limits": tables.clean(dict(case.limits)),
+        "limits": clean(dict(case.limits)),
         "objective": dict(case.objective),
         "safety_filter": safety.certificates(case),
         "published": {
-            n: [tables.clean(p.value), " ".join(filter(None, [p.unit, p.where]))]
+            n: [clean(p.value), " ".join(filter(None, [p.unit, p.where]))]
             for n, p in published.items()
         },
         "departures": list(preset.departures) if preset else [],
@@ -69,189 +75,121 @@ def json_of(case):
 def _parameters(case, preset):
     """{name: {value, unit, low, high, static, about}} of every leaf, static field and the clock."""
     ranges = {**(preset.tunable if preset else {}), **case.free}
-    found = {}
-    for kind in ("leaf", "static"):
-        for name, value, meta in walk(case.loop, kind=kind):
-            low, high = list(Free(*ranges[name]))[:2] if name in ranges else (None, None)
-            found[name] = {
-                "value": tables.clean(value),
-                "unit": meta["unit"],
-                "low": low,
-                "high": high,
-                "static": kind == "static",
-                "about": meta["doc"],
-            }
-    for name, meta in CLOCK.items():
-        value = getattr(case.clock, name)
-        more = {"low": None, "high": None, "static": True, "about": meta["doc"]}
-        found[f"clock.{name}"] = {"value": value, "unit": meta["unit"], **more}
-    return found
+    rows = [(kind, *row) for kind in ("leaf", "static") for row in walk(case.loop, kind=kind)]
+    rows += [("static", f"clock.{n}", getattr(case.clock, n), meta) for n, meta in CLOCK.items()]
+    parameters = {}
+    for kind, name, value, meta in rows:
+        low, high = list(Free(*ranges[name]))[:2] if name in ranges else (None, None)
+        parameters[name] = {
+            "value": clean(value),
+            "unit": meta["unit"],
+            "low": low,
+            "high": high,
+            "static": kind == "static",
+            "about": meta["doc"],
+        }
+    return parameters
 
 
-def text(case):
-    """Return the page of `jaxtank show`."""
-    page, preset = json_of(case), _preset(case)
-    head = [
-        *textwrap.wrap(f"{page['case']}: {page['title']}", WIDTH),
-        *textwrap.wrap(page["citation"] or "", WIDTH),
-        *([f"notes: {page['notes']}"] if preset else []),
+def report(case):
+    """Return the Report of a case: its rig, its loop, what is tuned, and every parameter."""
+    page, preset, loop = json_of(case), _preset(case), case.loop
+    outputs = ", ".join(f"h{i + 1}{_own_name(case, 'tank', i)}" for i in loop.plant.outputs)
+    size = f"{count(loop.plant.tanks, 'tank')}, {count(loop.plant.pumps, 'pump')}"
+    indents: dict[str, Any] = {"initial_indent": "  ", "subsequent_indent": "      "}
+    rows = [line for row in page["equations"] for line in textwrap.wrap(row, WIDTH, **indents)]
+    measured = [_sensor(loop), _actuator(loop), *_signals(loop), _sampled(case)]
+    setpoints = np.stack(loop.reference.sample(case.clock)[0], axis=-1)
+    sections = [
+        Text(rows, heading=f"The rig: {size}; controlled: {outputs}", layout=True),
+        Text([*_called(case), *physics(loop.plant)], items=True, gap=True),
+        Text(measured, items=True, heading="The loop"),
+        _docstring(
+            getattr(loop.controller, "law", loop.controller), loop, f"The controller: {page['law']}"
+        ),
+        *([_docstring(loop.controller, loop)] if hasattr(loop.controller, "law") else []),
+        _docstring(loop.observer, loop, f"The observer: {page['observer']}"),
+        Text(design_notes(loop, setpoints), items=True),
+        *_tuning(case, preset, page),
     ]
-    chapters = [
-        _rig(case, page),
-        _loop(case, page),
-        _tuning(case, preset, page),
-        _safety(case, page),
-        _all_parameters(page),
-        _measured(case),
-        _paper(case, preset, page),
+    if page["safety_filter"] is not None:
+        sections.append(safety.table_of(case, page["safety_filter"]))
+        sections.append(Text(safety.sentences(case), items=True, gap=True))
+    measures = [
+        [m, measure_unit(m, loop.units), "" if s.per == "run" else s.per, s.doc]
+        for m, s in ((m, MEASURES[m]) for m in of_loop(loop))
     ]
-    return "\n".join([*head, *(line for chapter in chapters for line in chapter)])
-
-
-def _rig(case, page):
-    """The chapter on the plant: its equations and its physics."""
-    plant = case.loop.plant
-    outputs = ", ".join(f"h{i + 1}{own_name(case, 'tank', i)}" for i in plant.outputs)
-    size = f"{count(plant.tanks, 'tank')}, {count(plant.pumps, 'pump')}"
-    lines = _chapter(f"The rig: {size}; controlled: {outputs}")
-    for row in page["equations"]:
-        lines += textwrap.wrap(row, WIDTH, initial_indent="  ", subsequent_indent="      ")
-    return [*lines, "", *_sentences([*called(case), *physics(plant)])]
-
-
-def _loop(case, page):
-    """The chapters on sensors, pumps and signals, on the controller and on the observer."""
-    loop, lines = case.loop, _chapter("The loop")
-    lines += _sentences([*sensor(loop), *actuator(loop), *signals(loop), *sampled(case)])
-    lines += _chapter(f"The controller: {page['law']}")
-    lines += _docstring(getattr(loop.controller, "law", loop.controller), loop.units)
-    if hasattr(loop.controller, "law"):
-        lines += ["", *_docstring(loop.controller, loop.units)]
-    return (
-        lines
-        + _chapter(f"The observer: {page['observer']}")
-        + _docstring(loop.observer, loop.units)
-        + _sentences(design_notes(loop, np.stack(loop.reference.sample(case.clock)[0], axis=-1)))
-    )
+    sections += [
+        Table(
+            _every(page),
+            ["parameter", "value", "unit", "tunable in", "what it is"],
+            heading="Every parameter",
+            widths=(30, 18, 11, 13),
+        ),
+        Text(NOTES, items=True, gap=True),
+        Table(
+            measures,
+            ["measure", "unit", "of each", "what it is"],
+            heading="What is measured",
+            widths=(22, 9, 8),
+        ),
+        *_paper(case, preset, page),
+    ]
+    title = f"{page['case']}: {page['title']}"
+    head = [title, *([preset.citation, f"notes: {page['notes']}"] if preset else [])]
+    return Report(title, "", (), [Text(head), *sections], width=WIDTH)
 
 
 def _tuning(case, preset, page):
-    """The chapter on what is tuned: gains, limits, objective, scenarios."""
-    heads = ["parameter", "value", "published", "unit", "range", "what it is"]
-    lines = _chapter("What is tuned")
-    lines.append(grid(_tuned(case, preset, page["parameters"]), heads, (26, 18, 12, 8, 14)))
+    """What is tuned: gains, limits, objective, scenarios."""
     limited = (
         f"{m} at {'least' if MEASURES[m].sense < 0 else 'most'} {v}"
         for m, v in page["limits"].items()
     )
     weighed = " + ".join(f"{w:g} {m}" for m, w in page["objective"].items())
-    lines += ["", *textwrap.wrap("limits of tune: " + (", ".join(limited) or "none"), WIDTH)]
-    lines += textwrap.wrap(f"objective of tune: {weighed}", WIDTH)
+    lines = ["limits of tune: " + (", ".join(limited) or "none"), f"objective of tune: {weighed}"]
     if case.scenarios:
-        names = "; ".join(s.name for s in case.scenarios)
-        lines += textwrap.wrap(f"scenarios of tune: {names}", WIDTH)
-    return lines
-
-
-def _safety(case, page):
-    """The chapter on the safety filter: which limits on levels are proved."""
-    if page["safety_filter"] is None:
-        return []
-    heads, rows = safety.rows_of(case, page["safety_filter"])
-    table = grid(rows, heads, (4, 12, 6, 6, 11, 13, 10))
-    return [*_chapter("Limits on levels"), table, "", *_sentences(safety.sentences(case))]
-
-
-def _all_parameters(page):
-    """The chapter on every parameter."""
-    heads = ["parameter", "value", "unit", "tunable in", "what it is"]
-    notes = [
-        "*: part of the compiled program: --set and rig files reach it, derivatives do not.",
-        "controller.model.* and observer.model.* are the plant that controller and observer"
-        " compute with, by the same names; --set plant.* changes the rig and leaves them, in a rig"
-        " file they follow plant.* unless they are set.",
-    ]
-    table = grid(_every(page), heads, (30, 18, 11, 13))
-    return [*_chapter("Every parameter"), table, "", *_sentences(notes)]
-
-
-def _measured(case):
-    """The chapter on the measures."""
-    heads = ["measure", "unit", "of each", "what it is"]
-    return [*_chapter("What is measured"), grid(_measures(case), heads, (22, 9, 8))]
+        lines.append(f"scenarios of tune: {'; '.join(s.name for s in case.scenarios)}")
+    heads = ["parameter", "value", "published", "unit", "range", "what it is"]
+    rows, widths = _tuned(case, preset, page["parameters"]), (26, 18, 12, 8, 14)
+    return [Table(rows, heads, heading="What is tuned", widths=widths), Text(lines, gap=True)]
 
 
 def _paper(case, preset, page):
-    """The chapters on what the paper prints, what is uncertain, and departures from the paper."""
-    lines = []
+    """What the paper prints, what is uncertain, and departures from the paper."""
+    sections = []
     if preset and preset.published:
-        compared = f"`jaxtank compare {preset.paper}` measures it again"
-        heads = ["published", "value", "here", "where"]
+        heading = f"What the paper prints (`jaxtank compare {preset.paper}` measures it again)"
         rows = _published(preset, page["parameters"])
-        lines += [*_chapter(f"What the paper prints ({compared})"), grid(rows, heads, (34, 22, 16))]
+        heads = ["published", "value", "here", "where"]
+        sections.append(Table(rows, heads, heading=heading, widths=(34, 22, 16)))
     if preset and (preset.uncertain or case.uncertain):
         uncertain = preset.uncertain.items()
-        lines += _chapter("What is uncertain")
-        lines += _sentences(f"{n}, +-{100 * share:g} %: {why}" for n, (share, why) in uncertain)
+        words = [f"{n}, +-{100 * share:g} %: {why}" for n, (share, why) in uncertain]
+        sections.append(Text(words, items=True, heading="What is uncertain"))
     if page["departures"]:
-        lines += ["", "departures from the paper", *_sentences(page["departures"])]
-    return lines
+        sections.append(Text(["departures from the paper"], gap=True))
+        sections.append(Text(page["departures"], items=True))
+    return sections
 
 
-def grid(rows, head, widths):
-    """Return rows as a table whose cells are wrapped."""
-    rows = [[str(c) for c in row] for row in rows]
-    widths = [min(w, max(len(row[i]) for row in [head, *rows])) for i, w in enumerate(widths)]
-    widths = [*widths, WIDTH - sum(widths) - 2 * len(widths)]
-    lines = ["  ".join(h.ljust(w) for h, w in zip(head, widths)).rstrip(), "-" * WIDTH]
-    for row in rows:
-        cells = [textwrap.wrap(cell, w) or [""] for cell, w in zip(row, widths)]
-        for parts in itertools.zip_longest(*cells, fillvalue=""):
-            lines.append("  ".join(c.ljust(w) for c, w in zip(parts, widths)).rstrip())
-    return "\n".join(lines)
-
-
-def _chapter(title):
-    return ["", *textwrap.wrap(title, WIDTH), "=" * min(WIDTH, len(title))]
-
-
-def _sentences(found):
-    """Each sentence as an item of a list, wrapped."""
-    return [line for sentence in found for line in _item(sentence)]
-
-
-def _item(sentence):
-    return textwrap.wrap(
-        sentence, WIDTH, initial_indent="- ", subsequent_indent="  ", break_on_hyphens=False
-    )
-
-
-def _docstring(part, units):
-    """Return the description of a component's class: its docstring up to the numpydoc sections,
-    units in brackets in those of the rig.
+def _docstring(part, loop, heading=""):
+    """The description of a component's class: its docstring up to the numpydoc sections, units in
+    brackets in those of the rig.
     """
     lines, prose = [], []
     description = SECTION.split(inspect.cleandoc(type(part).__doc__ or ""), maxsplit=1)[0]
-    description = BRACKETED.sub(lambda found: f"[{local(found[1], units)}]", description)
-
-    def flush():
-        lines.extend(textwrap.wrap(" ".join(prose), WIDTH))
-        prose.clear()
-
-    for line in description.rstrip().splitlines():
-        if not line.strip() or line.startswith("  "):
-            flush()
-            lines.extend(
-                [line.rstrip()]
-                if len(line) <= WIDTH
-                else textwrap.wrap(
-                    line.strip(), WIDTH, initial_indent="    ", subsequent_indent="        "
-                )
-            )
-        else:
+    description = BRACKETED.sub(lambda unit: f"[{local(unit[1], loop.units)}]", description)
+    indents: dict[str, Any] = {"initial_indent": "    ", "subsequent_indent": "        "}
+    for line in [*description.rstrip().splitlines(), ""]:
+        if line.strip() and not line.startswith("  "):
             prose.append(line.strip())
-    flush()
-    return lines
+            continue
+        lines += textwrap.wrap(" ".join(prose), WIDTH)
+        prose = []
+        long = len(line) > WIDTH
+        lines += textwrap.wrap(line.strip(), WIDTH, **indents) if long else [line.rstrip()]
+    return Text(lines[:-1], gap=True, heading=heading, layout=True)
 
 
 def _class_of(controller):
@@ -266,68 +204,48 @@ def _tuned(case, preset, parameters):
         if name in parameters:
             ranges.setdefault(name, spec)
     for name, spec in ranges.items():
-        free, own = Free(*spec), parameters.get(name.split("[")[0])
-        if own is None or own["value"] is None:
+        free, parameter = Free(*spec), parameters.get(name.split("[")[0])
+        if parameter is None or parameter["value"] is None:
             continue
         published = preset.published.get(name) if preset else None
-        about = own["about"] + ("" if name in case.free else " (not by this case)")
-        rows.append(
-            [
-                name,
-                _shown(own["value"], False),
-                "" if published is None else _plain(published.value),
-                own["unit"],
-                f"{free.low:g} : {free.high:g}",
-                about,
-            ]
-        )
+        printed = "" if published is None else _plain(published.value)
+        about = parameter["about"] + ("" if name in case.free else " (not by this case)")
+        span = f"{free.low:g} : {free.high:g}"
+        value = _shown(parameter["value"], False)
+        rows.append([name, value, printed, parameter["unit"], span, about])
     return rows or [["none", "", "", "", "", ""]]
 
 
 def _every(page):
     rows = []
     for name, p in page["parameters"].items():
-        if name.startswith(MODELS) or (
-            isinstance(p["value"], (list, tuple)) and (p["static"] or not p["value"])
-        ):
-            continue  # topology is in the equations, and a rig without pipes has none to set
-        span = f"{p['low']:g} : {p['high']:g}" if p["low"] is not None else ""
-        rows.append(
-            [name + "*" * p["static"], _shown(p["value"], p["static"]), p["unit"], span, p["about"]]
-        )
+        # topology is in the equations, and a rig without pipes has none to set
+        hidden = isinstance(p["value"], (list, tuple)) and (p["static"] or not p["value"])
+        if not hidden and not name.startswith(MODELS):
+            span = f"{p['low']:g} : {p['high']:g}" if p["low"] is not None else ""
+            value = _shown(p["value"], p["static"])
+            rows.append([name + "*" * p["static"], value, p["unit"], span, p["about"]])
     return rows
-
-
-def _measures(case):
-    """The measures that a run of the case has."""
-    known = {m: MEASURES[m] for m in of_loop(case.loop)}
-    return [
-        [m, measure_unit(m, case.loop.units), "" if s.per == "run" else s.per, s.doc]
-        for m, s in known.items()
-    ]
 
 
 def _published(preset, parameters):
     """What the paper prints, and beside it what this case has where it is a parameter."""
     rows = []
     for name, p in preset.published.items():
-        own, here = parameters.get(name), ""
-        if own is not None and own["value"] is not None:
-            value = own["value"]
-            here = str(value) if own["static"] else _shown(value, False) or str(value)
+        parameter, value = parameters.get(name), ""
+        if parameter is not None and parameter["value"] is not None:
+            value = parameter["value"]
+            value = str(value if parameter["static"] else _shown(value, False)) or str(value)
         printed = f"{_plain(p.value)} {p.unit if p.unit != '-' else ''}".strip()
-        rows.append([name, printed, here, p.where + (f"; {p.reason}" if p.reason else "")])
+        rows.append([name, printed, value, p.where + (f"; {p.reason}" if p.reason else "")])
     return rows
 
 
 def _plain(value):
     if isinstance(value, (tuple, list)):
         return " ".join(_plain(v) for v in value)
-    return (
-        tables.number(value, 6)
-        if isinstance(value, (int, float)) and not isinstance(value, bool)
-        else str(value)
-    )
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return str(Value(value, 6)) if number else str(value)
 
 
 def _shown(value, is_static):
@@ -335,4 +253,109 @@ def _shown(value, is_static):
         return "not in use"
     if is_static:
         return str(value).lower() if isinstance(value, bool) else str(value)
-    return " ".join(tables.number(v, 6) for v in np.ravel(value))
+    return Value(value, 6, between=" ")
+
+
+def _own_name(case, kind, i):
+    """Return " (left)" for the tank or pump `i` that its rig file calls left, else ""."""
+    name = case.names.get(kind, {i: ""})[i]
+    return f" ({name})" if name else ""
+
+
+def _called(case):
+    """Return a sentence on the names that the rig file has for its tanks and pumps."""
+    names = [
+        f"{kind} {i + 1} is {name!r}"
+        for kind in ("tank", "pump")
+        for i, name in enumerate(case.names.get(kind, ()))
+        if name
+    ]
+    return [f"The names of its file: {', '.join(names)}."] if names else []
+
+
+def _list(values):
+    texts = [f"{float(v):g}" for v in np.ravel(values)]
+    return texts[0] if len(set(texts)) == 1 else ", ".join(texts)
+
+
+def _sensor(loop):
+    """Return a sentence on how the levels are measured."""
+    sensor, length = loop.sensor, loop.units[0]
+    if not isinstance(sensor, LevelSensor):
+        return f"Sensors: {type(sensor).__name__}."
+    noise = "no noise (sensor.noise)"
+    if np.any(np.asarray(sensor.noise) > 0):
+        noise = f"noise of {_list(sensor.noise)} {length} (standard deviation)"
+    bits = f"an ADC of {sensor.bits} bits" if sensor.bits else "no ADC (sensor.bits)"
+    offset = "" if sensor.offset is None else f", offset {_list(sensor.offset)} {length}"
+    return f"Sensors: one per tank, {noise}, {bits}{offset}."
+
+
+def _actuator(loop):
+    """Return a sentence on what the pumps do to a command, in that order."""
+    bank, drive = loop.actuator, loop.units[1]
+    limits = f"from {_list(bank.low)} to {_list(bank.high)} {drive}"
+    if not isinstance(bank, PumpBank):
+        return f"Pumps: {bank.pumps}, {limits}, a {type(bank).__name__}."
+    kinds = {"clip": "each clipped", "boxqp": "allocated by the controller's own cost"}
+    dead = "no dead zone"
+    if bank.dead_zone is not None:
+        dead = f"dead zone {_list(bank.dead_zone)} {drive} ({bank.dead_zone_kind})"
+    lag = f"lag {_list(bank.lag)} s" if bank.lag is not None else "no lag"
+    delay = f"transport delay {bank.delay:g} s" if bank.delay else "no delay"
+    return f"Pumps: {bank.pumps}, {limits} ({kinds[bank.saturation]}); {dead}; {lag}; {delay}."
+
+
+def _signals(loop):
+    """Return sentences on reference, disturbances and faults."""
+    length, signal = loop.units[0], loop.disturbance
+    if signal is None:
+        words = "No disturbance."
+    elif isinstance(signal, Constant):
+        levels = ", ".join(f"{float(v):g}" for v in signal.level)
+        words = f"Constant inflow disturbance: {levels} {length}^3/s, by tank."
+    elif isinstance(signal, InflowPulses):
+        each = (
+            f"{float(v):g} {length}^3 into tank {tank + 1} at {t:g} s over {s:g} s"
+            for (t, s, tank), v in zip(signal.events, signal.volume)
+        )
+        words = f"Inflow disturbance: {'; '.join(each)}."
+    else:
+        words = f"Disturbance: {type(signal).__name__}."
+    sentences = [_reference(loop.reference, length), words]
+    if loop.faults is not None:
+        each = (
+            f"plant.{n} times {float(f):g}{f' plus {float(e):g}' if float(e) else ''} from {a:g} to"
+            f" {b:g} s"
+            for (n, a, b), f, e in zip(loop.faults.windows, loop.faults.factor, loop.faults.extra)
+        )
+        sentences.append(f"Faults, unknown to the controller: {'; '.join(each)}.")
+    return sentences
+
+
+def _reference(signal, length):
+    if isinstance(signal, Sum):
+        return f"{_reference(signal.first, length)} {_reference(signal.second, length)}"
+    if isinstance(signal, Ramps):
+        kind = "ramps" if signal.shape == "linear" else "S-curves"
+        course = "steps" if signal.ramp == 0 else f"{kind} of {signal.ramp:g} s"
+        start = ", ".join(f"r{i + 1} = {float(v):g}" for i, v in enumerate(signal.initial))
+        changes = "; ".join(
+            f"{t:g} s r{i + 1} to {float(v):g}" for (t, i), v in zip(signal.changes, signal.targets)
+        )
+        return f"Setpoints [{length}]: {start}" + (f"; {course} at {changes}." if changes else ".")
+    if isinstance(signal, Sine):
+        size = f"{float(signal.amplitude):g} {length} about {float(signal.offset):g} {length}"
+        time = f"period {signal.period:g} s, from {signal.start:g} to {signal.end:g} s"
+        return f"On r{signal.channel + 1} a sine of {size}, {time}."
+    return f"Setpoints: {type(signal).__name__} with {signal.channels} channels."
+
+
+def _sampled(case):
+    """Return a sentence on sampling and on the initial levels."""
+    clock, start = case.clock, ", ".join(f"{float(v):.4g}" for v in case.loop.x0)
+    steps = f"{count(clock.substeps, 'step')} of {clock.integrator} per sample"
+    return (
+        f"Sampled every {clock.dt:g} s for {clock.duration:g} s, {steps}; levels start at {start}"
+        f" {case.loop.units[0]}."
+    )

@@ -1,24 +1,35 @@
-"""The report of an Identification: message, tables, JSON, files and the page report.html.
+"""The report of an Identification, and of a planned experiment: text, JSON, pictures and files."""
 
-Opened by `Identification` and by the command `identify`.
-"""
-
-import io
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jaxtank import rig as rigs
-from jaxtank.core.files import check_folder
+from jaxtank.core.tree import get_value
 from jaxtank.core.units import local
+from tuning.identification import residuals
 from tuning.identification.confidence import at_search_bounds
 from tuning.problem import provenance
-from tuning.report import artifacts, html, tables
-from tuning.report import figures as pictures
-from tuning.report.identification_figures import CAPTIONS, figures
+from tuning.problem.wording import count
+from tuning.report.document import Report, Text, figures_of
+from tuning.report.folder import earlier, rig_text
+from tuning.report.folder import save as save_all
+from tuning.report.tables import Table, Value, clean
 
-__all__ = ["figures", "json_of", "lines", "message", "save"]
+__all__ = ["figures", "json_of", "report", "save"]
+
+CAPTIONS = {
+    "fit": "Measured readings (dots), the fitted rig (line), and the inputs of the pumps.",
+    "residuals": "Residuals of the fitted rig: over time, and their autocorrelation. What lies"
+    " beyond the band is not noise.",
+    "correlation": "Correlation of the estimates: near 1 or -1, the data determine a combination of"
+    " the two better than each.",
+    "profile": "Increase of the misfit when one parameter is fixed away from its estimate and all"
+    " others are fitted again.",
+    "rig": "The rig, drawn from its own topology; a heavier outline is a tank that is controlled.",
+}
 
 
 def not_identifiable(direction):
@@ -27,56 +38,54 @@ def not_identifiable(direction):
     return names[0] if len(names) == 1 else direction["words"]
 
 
-def message(found):
-    """Return how an identification ended, sentences separated by "; "."""
-    agree = sum(s["agrees"] for s in found.starts)
-    return "; ".join(
-        [
-            *_ending(found),
-            f"{agree} of {len(found.starts)} starts ended in the same place",
-            *_residuals(found),
-            *_prior(found),
-            *(
-                f"{n} ends at its bound, {p['value']:.4g} {p['unit']}: no interval"
-                for n, p in found.parameters.items()
-                if p["at_bound"]
-            ),
-            *_next_step(found),
-        ]
-    )
+def sentences_of(fit):
+    """Return sentences: how an identification ended, and what it needs next."""
+    agree = sum(s["agrees"] for s in fit.starts)
+    return [
+        *_ending(fit),
+        f"{agree} of {len(fit.starts)} starts ended in the same place",
+        *_residuals(fit),
+        *_prior(fit),
+        *(
+            f"{n} ends at its bound, {p['value']:.4g} {p['unit']}: no interval"
+            for n, p in fit.parameters.items()
+            if p["at_bound"]
+        ),
+        *_next_step(fit),
+    ]
 
 
-def _ending(found):
+def _ending(fit):
     """Return sentences: why the result is not a converged one."""
     words = []
-    if found.status == "interrupted":
+    if fit.status == "interrupted":
         words.append("interrupted: the best of the searches that had ended")
-    ended = at_search_bounds(found.case.loop, found.parameters)
-    if found.status == "not_converged" and ended:
+    ended = at_search_bounds(fit.case.loop, fit.parameters)
+    if fit.status == "not_converged" and ended:
         words.append(
             f"{', '.join(ended)} {'ends' if len(ended) == 1 else 'end'} at the bound of the search:"
             " check the ranges (--free), and units and columns of the data"
         )
-    if found.status == "not_converged" and found.fit.status <= 0:
+    if fit.status == "not_converged" and fit.fit.status <= 0:
         words.append("the best search did not converge in its iterations: raise --iterations")
-    for d in found.directions:
+    for d in fit.directions:
         alone = len(d["parameters"]) == 1
         what = f"{not_identifiable(d)} is not" if alone else "not separately"
         words.append(f"{what} identifiable: {d['words']} changes no reading noticeably")
-    if found.status == "not_identifiable":
+    if fit.status == "not_identifiable":
         words.append("of the values that fit equally well, some near the case's own are printed")
     return words
 
 
-def _residuals(found):
+def _residuals(fit):
     """Return sentences: the residual of each channel, and what its correlation means."""
-    q, words = found.quality, []
+    q, words = fit.quality, []
     for (name, unit), rmse, share, rho in zip(
-        found.channels, q["rmse"], q["nrmse_percent"], q["residual_autocorrelation"]
+        fit.channels, q["rmse"], q["nrmse_percent"], q["residual_autocorrelation"]
     ):
-        fit = "" if share is None else f", fit {share:.1f} %"
+        percent = "" if share is None else f", fit {share:.1f} %"
         words.append(
-            f"{name}: residual {rmse:.3g} {unit} RMS{fit}, correlation from sample to sample"
+            f"{name}: residual {rmse:.3g} {unit} RMS{percent}, correlation from sample to sample"
             f" {rho:.2f}"
         )
     if q["widened"] > 1.05:
@@ -87,37 +96,37 @@ def _residuals(found):
     return words
 
 
-def _prior(found):
+def _prior(fit):
     """Return a sentence: the covariance that the case brings is not used."""
-    if found.case.covariance is None:
+    if fit.case.covariance is None:
         return []
-    count = len(found.case.covariance[0])
+    parameters = count(len(fit.case.covariance[0]), "parameter")
     return [
-        f"the [covariance] of {count} parameter{'s' * (count > 1)} of an earlier identification, in"
-        f" {found.case.name!r}, is not used: values and intervals are those of these data alone;"
-        " give the earlier log too, with another --data"
+        f"the [covariance] of {parameters} of an earlier identification, in {fit.case.name!r}, is"
+        " not used: values and intervals are those of these data alone; give the earlier log too,"
+        " with another --data"
     ]
 
 
-def _next_step(found):
+def _next_step(fit):
     """Return sentences: what the identified rig needs before it is tuned."""
     words = []
-    if not found.identifiable:
+    if not fit.identifiable:
         return words
-    if found.case.reachable and (why := rigs.unreachable(found.identified)):
+    if fit.case.reachable and (why := rigs.unreachable(fit.identified)):
         words.append(
             f"{why}; rig.toml has reachable = false for it: choose other setpoints before tuning"
         )
-    if found.law:
-        words.append(_proposal(found))
+    if fit.law:
+        words.append(_proposal(fit))
     return words
 
 
-def _proposal(found):
+def _proposal(fit):
     """Return a sentence: the controller that is proposed."""
-    case, why = found.proposed
+    case, why = fit.proposed
     if why:
-        return f"no {found.law} controller is proposed: {why}"
+        return f"no {fit.law} controller is proposed: {why}"
     pi = case.loop.controller
     Kc, Ti = (", ".join(f"{v:.4g}" for v in np.asarray(values)) for values in (pi.Kc, pi.Ti))
     unit = local("V/cm", case.loop.units)
@@ -127,223 +136,198 @@ def _proposal(found):
     )
 
 
-def lines(found):
-    """Return what is printed of an Identification: lines and tables."""
-    simulations = sum(s["evaluations"] for s in found.starts)
-    return [
-        f"{found.case.name}: {found.status.replace('_', ' ')}",
-        _data(found.estimation),
-        "",
-        _parameters(found),
-        "",
-        _levels(found),
-        "",
-        tables.wrap(message(found)),
-        *(["", *_validation(found)] if found.validation else []),
-        *(["", *_remedies(found)] if found.remedies else []),
-        *(["", _profile(found.profile)] if found.profile else []),
-        "",
-        f"{found.wall_s:.1f} s, {simulations} simulations with sensitivities",
+def report(fit, drawn=None):
+    """Return the Report of an Identification."""
+    certain = sum(p["interval95"] is not None for p in fit.parameters.values())
+    samples = sum(log.samples for log in fit.estimation.logs)
+    facts: list[tuple[str, Any]] = [
+        ("parameters with an interval", f"{certain} of {len(fit.parameters)}")
     ]
+    facts.append(("samples", samples))
+    quality = zip(fit.channels, fit.quality["rmse"], fit.quality["nrmse_percent"])
+    for (name, unit), rmse, share in quality:
+        percent = "" if share is None else f" ({share:.1f} %)"
+        facts.append((f"residual of {name}", f"{rmse:.3g} {unit}{percent}"))
+    rig, why = (None, None)
+    if drawn is not None and fit.status != "not_identifiable":
+        rig, why = rig_text(fit.identified)
+    simulations = sum(s["evaluations"] for s in fit.starts)
+    status = fit.status.replace("_", " ")
+    return Report(
+        f"{fit.case.name}: identified",
+        status,
+        facts,
+        [
+            Text([f"{fit.case.name}: {status}"], on="terminal"),
+            Text([_data(fit.estimation)]),
+            _parameters(fit),
+            Text(_levels(fit), gap=True),
+            Text([*sentences_of(fit), *([why] if why else [])], items=True, gap=True),
+            *_validation(fit),
+            *_remedies(fit),
+            *_profile(fit.profile),
+            Text([f"{fit.wall_s:.1f} s, {simulations} simulations with sensitivities"], gap=True),
+            *figures_of(drawn or {}, {n: CAPTIONS[n.split("_")[0]] for n in drawn or {}}),
+        ],
+        fit.status == "converged",
+        ", ".join(log.name for log in fit.estimation.logs),
+        files={"The identified rig as a file (rig.toml)": rig} if rig else {},
+    )
 
 
 def _data(est):
     """Return a line: how much experiment data, and how it is simulated."""
     readings = int(est.mask.sum())
-    steps = np.concatenate([np.diff(one.t) for one in est.logs])
-    even = np.ptp(steps) < 1e-6 * steps.mean()
-    pace = (
-        f"every {np.median(steps):g} s" if even else f"{steps.min():g} to {steps.max():g} s apart"
-    )
-    missing = sum(one.y.size for one in est.logs) - readings
+    steps = np.concatenate([np.diff(log.t) for log in est.logs])
+    pace = f"{steps.min():g} to {steps.max():g} s apart"
+    if np.ptp(steps) < 1e-6 * steps.mean():
+        pace = f"every {np.median(steps):g} s"
+    missing = sum(log.y.size for log in est.logs) - readings
     return (
-        f"{', '.join(one.name for one in est.logs)}: {sum(one.samples for one in est.logs)} samples"
-        f" {pace}, {readings} readings"
-        + (f" ({missing} missing)" if missing else "")
-        + f", {est.size} unknowns, {est.substeps} Runge-Kutta step{'s' if est.substeps > 1 else ''}"
-        " a sample"
+        f"{', '.join(log.name for log in est.logs)}: {sum(log.samples for log in est.logs)} samples"
+        f" {pace}, {readings} readings" + (f" ({missing} missing)" if missing else "") + ","
+        f" {est.size} unknowns, {count(est.substeps, 'Runge-Kutta step')} a sample"
     )
 
 
-def _parameters(found):
+def _parameters(fit):
     """Return the table of estimates."""
     rows = []
-    for n, p in found.parameters.items():
-        interval = (
-            f"{p['interval95'][0]:.5g} .. {p['interval95'][1]:.5g}"
-            if p["interval95"]
-            else "none: " + ("at a bound" if p["at_bound"] else "not identifiable")
-        )
-        sd = (
-            f"{100 * p['sd'] / abs(p['value']):.2g} %"
-            if p["sd"] is not None and p["value"]
-            else "-"
-        )
-        rows.append([n, p["unit"], f"{p['before']:.5g}", f"{p['value']:.5g}", interval, sd])
-    return tables.table(rows, ["parameter", "unit", "before", "estimate", "95 % interval", "sd"])
+    for n, p in fit.parameters.items():
+        interval = "none: " + ("at a bound" if p["at_bound"] else "not identifiable")
+        if p["interval95"]:
+            interval = Value(p["interval95"], between=" .. ")
+        share = None if p["sd"] is None or not p["value"] else 100 * p["sd"] / abs(p["value"])
+        cells = [Value(p["before"]), Value(p["value"]), interval, Value(share, 2, "%")]
+        rows.append([n, p["unit"], *cells])
+    heads = ["parameter", "unit", "before", "estimate", "95 % interval", "sd"]
+    return Table(rows, heads, gap=True)
 
 
-def _levels(found):
+def _levels(fit):
     """Return lines: the levels at the first sample of each log."""
-    unit, rows = found.case.loop.units[0], []
-    for e, row in enumerate(found.levels):
+    unit, rows = fit.case.loop.units[0], []
+    for e, row in enumerate(fit.levels):
         levels = []
         for i, level in enumerate(row):
             ends = level["interval95"]
             interval = f" ({ends[0]:.4g} .. {ends[1]:.4g})" if ends else ""
             levels.append(f"h{i + 1} {level['value']:.4g}{interval}")
-        which = f" of log {e + 1}" if len(found.levels) > 1 else ""
+        which = f" of log {e + 1}" if len(fit.levels) > 1 else ""
         rows.append(f"levels at the first sample{which} [{unit}]: " + ", ".join(levels))
-    return "\n".join(rows)
+    return rows
 
 
-def _validation(found):
-    """Return a line and a table: prediction of the validation set."""
-    v, rows = found.validation, []
-    for c, (name, unit) in enumerate(found.channels):
+def _validation(fit):
+    """Return sections: prediction of the validation set."""
+    v, rows = fit.validation, []
+    if not v:
+        return []
+    for c, (name, unit) in enumerate(fit.channels):
         for side, words in (("fitted", "fitted"), ("held_back", "validation")):
-            rmse, share = v[side]["rmse"][c], v[side]["nrmse_percent"][c]
-            rows.append(
-                [
-                    name,
-                    words,
-                    "-" if rmse is None else f"{rmse:.4g} {unit}",
-                    "-" if share is None else f"{share:.1f} %",
-                ]
-            )
+            share = v[side]["nrmse_percent"][c]
+            percent = "-" if share is None else f"{share:.1f} %"
+            rows.append([name, words, Value(v[side]["rmse"][c], 4, unit), percent])
     head = (
         f"fit to the first {', '.join(map(str, v['samples']))} samples, validated on the rest by"
         " one simulation from the same start"
     )
-    return [head, tables.table(rows, ["reading", "part", "RMS", "fit"])]
+    return [Text([head], gap=True), Table(rows, ["reading", "part", "RMS", "fit"])]
 
 
-def _remedies(found):
-    """Return lines: which experiments would identify what is not identifiable."""
-    alone = all(len(d["parameters"]) == 1 for d in found.directions)
-    what = "it" if alone and len(found.directions) == 1 else "them" if alone else "them separately"
-    return [f"What would identify {what}:", *(f"- {words}" for words in found.remedies)]
+def _remedies(fit):
+    """Return sections: which experiments would identify what is not identifiable."""
+    if not fit.remedies:
+        return []
+    alone = all(len(d["parameters"]) == 1 for d in fit.directions)
+    what = "it" if alone and len(fit.directions) == 1 else "them" if alone else "them separately"
+    return [Text([f"What would identify {what}:"], gap=True), Text(fit.remedies, items=True)]
 
 
 def _profile(p):
-    """Return a line: the interval of the profile likelihood."""
+    """Return a section: the interval of the profile likelihood."""
+    if not p:
+        return []
     unit = "" if p["unit"] == "-" else f" {p['unit']}"
     ends = [
         f"{e:.5g}{unit}" if e is not None else f"beyond the {side} one tried"
         for e, side in zip(p["interval95"], ("lowest", "highest"))
     ]
-    return f"profile likelihood of {p['name']}: 95 % from {ends[0]} to {ends[1]}"
+    words = f"profile likelihood of {p['name']}: 95 % from {ends[0]} to {ends[1]}"
+    return [Text([words], gap=True)]
 
 
-def json_of(found):
+def json_of(fit):
     """Return the JSON object of `jaxtank identify --json`."""
-    names, correlation = found.correlation
-    quality, est = found.quality, found.estimation
+    names, correlation = fit.correlation
+    quality, est = fit.quality, fit.estimation
     return {
-        "case": found.case.name,
-        "status": str(found.status),
-        "success": found.status == "converged",
-        "message": message(found),
-        "parameters": {n: tables.clean(p) for n, p in found.parameters.items()},
-        "fit": tables.clean(
+        "case": fit.case.name,
+        "status": str(fit.status),
+        "success": fit.status == "converged",
+        "message": "; ".join(sentences_of(fit)),
+        "parameters": {n: clean(p) for n, p in fit.parameters.items()},
+        "fit": clean(
             {k: quality[k] for k in ("rmse", "nrmse_percent", "residual_autocorrelation")}
         ),
         "channels": [
-            {"name": n, "unit": u, "noise": s}
-            for (n, u), s in zip(found.channels, quality["noise"])
+            {"name": n, "unit": u, "noise": s} for (n, u), s in zip(fit.channels, quality["noise"])
         ],
         "intervals_widened": quality["widened"],
-        "initial_levels": [[tables.clean(v) for v in row] for row in found.levels],
+        "initial_levels": [[clean(v) for v in row] for row in fit.levels],
         "covariance": {
-            "names": list(found.covariance[0]),
-            "matrix": np.asarray(found.covariance[1]).tolist(),
+            "names": list(fit.covariance[0]),
+            "matrix": np.asarray(fit.covariance[1]).tolist(),
         },
         "correlation": {"names": list(names), "matrix": correlation.tolist()},
-        "free_combinations": tables.clean(found.directions),
-        "remedies": found.remedies,
-        "validation": tables.clean(found.validation),
-        "profile": tables.clean(found.profile),
-        "starts": tables.clean(found.starts),
+        "free_combinations": clean(fit.directions),
+        "remedies": fit.remedies,
+        "validation": clean(fit.validation),
+        "profile": clean(fit.profile),
+        "starts": clean(fit.starts),
         "data": [
-            {"name": one.name, "samples": one.samples, "readings": int(np.isfinite(one.y).sum())}
-            for one in est.logs
+            {"name": log.name, "samples": log.samples, "readings": int(np.isfinite(log.y).sum())}
+            for log in est.logs
         ],
         "substeps": est.substeps,
-        "wall_s": found.wall_s,
-        "provenance": provenance.provenance(found.case, found.seed),
+        "wall_s": fit.wall_s,
+        "provenance": provenance.provenance(fit.case, fit.seed),
     }
 
 
-def fit_csv(found):
+def fit_csv(fit):
     """Return CSV text: number of the log, time, inputs, measured and simulated readings."""
-    est = found.estimation
-    simulated = est.predicted(est.unknowns(found.fit))
-    drive, pumps = found.case.loop.units[1], est.data.u.shape[-1]
-    heads = ["log", "t [s]", *(f"pump{j + 1} [{drive}]" for j in range(pumps))]
-    for name, unit in found.channels:
+    est, drive = fit.estimation, fit.case.loop.units[1]
+    simulated = est.predicted(est.unknowns(fit.fit))
+    heads = ["log", "t [s]", *(f"pump{j + 1} [{drive}]" for j in range(est.data.u.shape[-1]))]
+    for name, unit in fit.channels:
         heads += [f"{name} measured [{unit}]", f"{name} simulated [{unit}]"]
-    out = io.StringIO()
-    out.write(",".join(heads) + "\n")
-    for e, one in enumerate(est.logs):
-        for k in range(one.samples):
-            cells = [str(e + 1), f"{one.t[k]:.10g}", *(f"{v:.10g}" for v in one.u[k])]
-            for y, model in zip(est.data.y[e, k], simulated[e, k]):
-                cells += ["" if np.isnan(y) else f"{y:.10g}", f"{model:.10g}"]
-            out.write(",".join(cells) + "\n")
-    return out.getvalue()
+    lines = [",".join(heads)]
+    for e, log in enumerate(est.logs):
+        for k in range(log.samples):
+            readings = np.column_stack([est.data.y[e, k], simulated[e, k]]).ravel()
+            numbers = ["" if np.isnan(v) else f"{v:.10g}" for v in (log.t[k], *log.u[k], *readings)]
+            lines.append(",".join([str(e + 1), *numbers]))
+    return "\n".join(lines) + "\n"
 
 
-def page_of(found, drawn, command=None):
-    """Return the page report.html with `drawn`, {name: figure}, and the command line, if any."""
-    certain = sum(p["interval95"] is not None for p in found.parameters.values())
-    facts = [
-        ("parameters with an interval", f"{certain} of {len(found.parameters)}"),
-        ("samples", str(sum(one.samples for one in found.estimation.logs))),
-    ]
-    for (name, unit), rmse, share in zip(
-        found.channels, found.quality["rmse"], found.quality["nrmse_percent"]
-    ):
-        percent = "" if share is None else f" ({share:.1f} %)"
-        facts.append((f"residual of {name}", f"{rmse:.3g} {unit}{percent}"))
-    sentences = message(found)
-    refused = found.status == "not_identifiable"
-    rig, why = (None, None) if refused else artifacts.rig_text(found.identified)
-    return html.document(
-        f"{found.case.name}: identified",
-        ", ".join(one.name for one in found.estimation.logs),
-        found.status.replace("_", " "),
-        found.status == "converged",
-        facts,
-        [*sentences.split("; "), *([why] if why else [])],
-        html.drawings(drawn, {n: CAPTIONS[n.split("_")[0]] for n in drawn}),
-        [part for part in lines(found)[1:] if part != tables.wrap(sentences)],
-        command,
-        provenance.provenance(found.case, found.seed),
-        {"The identified rig as a file (rig.toml)": rig} if rig else None,
-    )
-
-
-def save(found, folder, command=None):
-    """Write result.json, fit.csv, figures, report.html and, if identifiable, rig.toml to
-    `folder`.
-    """
-    check_folder(folder)
-    rig, why = artifacts.rig_text(found.identified) if found.identifiable else (None, None)
-    payload = json_of(found)
+def save(fit, folder, command=None):
+    """Write result.json, fit.csv, figures, report.html and, if identifiable, rig.toml."""
+    rig, why = rig_text(fit.identified) if fit.identifiable else (None, None)
+    payload = json_of(fit)
     if why:
-        warnings.warn(why, stacklevel=3)  # the line that called found.save
+        warnings.warn(why, stacklevel=3)  # the line that called fit.save
         payload["message"] += f"; {why}"
-    files = {"result.json": tables.dumps(payload), "fit.csv": fit_csv(found)}
-    if rig:
-        files["rig.toml"] = rig
-    stale = [*_left_over(Path(folder), files), *artifacts.earlier(folder, ["residuals", "rig"])]
+    files = {"fit.csv": fit_csv(fit), **({"rig.toml": rig} if rig else {})}
+    stale = [*_left_over(Path(folder), files), *earlier(folder, ["residuals", "rig"])]
 
     def draw():
-        return figures(found) | pictures.rig(found.identified.loop, None, found.case.name)
+        from jaxtank.plots import run as plots
 
-    return artifacts.write_result(
-        folder, files, draw, lambda drawn: page_of(found, drawn, command), stale
-    )
+        return figures(fit) | plots.rig(fit.identified.loop.plant, None, fit.case.name)
+
+    page = lambda drawn: report(fit, drawn)
+    return save_all(folder, payload, files, draw, page, command, stale)
 
 
 def _left_over(folder, files):
@@ -351,6 +335,106 @@ def _left_over(folder, files):
     # A rig file of the earlier one must not be taken for that of this one.
     if not (folder / "fit.csv").exists():
         return []
-    ours = [folder / n for n in ("rig.toml", "fit.png", "correlation.png", "profile.png")]
-    ours += sorted(folder.glob("fit_[0-9]*.png"))
-    return [path for path in ours if path.name not in files and path.is_file()]
+    names = ["rig.toml", "fit.png", "correlation.png", "profile.png"]
+    paths = [*(folder / name for name in names), *sorted(folder.glob("fit_[0-9]*.png"))]
+    return [path for path in paths if path.name not in files and path.is_file()]
+
+
+def figures(fit):
+    """Return {name: matplotlib Figure}: "fit" (or "fit_1", ..), "residuals", "correlation", .."""
+    from jaxtank.plots import fit as plots
+    from jaxtank.plots import style
+
+    est = fit.estimation
+    simulated = est.predicted(est.unknowns(fit.fit))
+    several = len(est.logs) > 1
+    rows = len(fit.channels)
+    title = lambda words: f"{fit.case.name}: {words}"
+    drawn = {}
+    for e, log in enumerate(est.logs):
+        draw = lambda axes, e=e: _fit(axes, fit, e, simulated[e])
+        words = title(f"{log.name}, measured and simulated with the fitted rig")
+        size = (7.0, 1.0 + 1.7 * (rows + 1))
+        name = f"fit_{e + 1}" if several else "fit"
+        drawn[name] = style.picture(draw, size, rows + 1, title=words, sharex=True)
+    of = f" (the first of {len(est.logs)} logs; correlations of all)" if several else ""
+    words, size = title(f"measured less simulated{of}"), (8.4, 0.9 + 1.9 * rows)
+    draw = lambda axes: _residual_axes(axes, fit)
+    drawn["residuals"] = style.picture(draw, size, rows, 2, title=words, squeeze=False)
+    names, matrix = fit.correlation
+    if len(names) > 1:
+        side, words = 2.6 + 0.42 * len(names), title("correlation of the estimates")
+        draw = lambda ax: plots.correlation(ax, names, matrix)
+        drawn["correlation"] = style.picture(draw, (side + 1.0, side), title=words)
+    if fit.profile:
+        draw, words = lambda ax: plots.profile(ax, fit.profile), title("profile likelihood")
+        drawn["profile"] = style.picture(draw, (5.2, 3.4), title=words)
+    return drawn
+
+
+def _fit(axes, fit, e, simulated):
+    """Draw log e: readings, simulated (samples, channels), and inputs."""
+    from jaxtank.plots import fit as plots
+
+    est, log, legend = fit.estimation, fit.estimation.logs[e], {"loc": "lower right"}
+    legend |= {"bbox_to_anchor": (1.0, 0.98)}
+    n, validated = log.samples, fit.validation and fit.validation["samples"][e]
+    begin = log.t[validated] if fit.validation and validated < n else None
+    for c, (name, unit) in enumerate(fit.channels):
+        plots.measured(axes[c], log.t, est.data.y[e, :n, c], simulated[:n, c], name, unit, begin)
+    axes[0].legend(ncols=3, **legend)
+    plots.inputs(axes[-1], log.t, log.u, fit.case.loop.units[1])
+    if log.u.shape[1] > 1:
+        axes[-1].legend(ncols=log.u.shape[1], **legend)
+    axes[0].figure.align_ylabels(axes)
+
+
+def _residual_axes(axes, fit):
+    """Draw the residuals over time and their autocorrelation."""
+    from jaxtank.plots import fit as plots
+
+    differences, log = residuals.residuals_of(fit.estimation, fit.fit), fit.estimation.logs[0]
+    for c, (name, unit) in enumerate(fit.channels):
+        r, noise = differences[..., c], fit.quality["noise"][c]
+        plots.residual(axes[c, 0], log.t, r[0, : log.samples], name, unit, noise)
+        acf, readings = residuals.autocorrelation(r), int(np.isfinite(r).sum())
+        plots.autocorrelation(axes[c, 1], acf, readings, name)
+        for ax in axes[c] if c < len(axes) - 1 else ():
+            ax.set_xlabel("")
+    for ax in axes[0]:
+        ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98))
+    axes[0, 0].figure.align_ylabels(axes)
+
+
+def plan_report(case, experiments, best, plan):
+    """Return the Report of `identify --plan`: a table of `compare_experiments` and the best one."""
+    # plan: {"duration" [s], "dt" [s], "noise", "levels": measured tanks or None}.
+    letters, rows = dict(zip("ABCDEFGH", experiments)), []
+    for name in next(iter(experiments.values()))["sd"]:
+        value = float(np.asarray(get_value(case.loop, name)))
+        shares = [_share(experiments[one]["sd"][name], value) for one in letters.values()]
+        rows.append([name, Value(value), *shares])
+    conditions = (experiments[one]["condition"] for one in letters.values())
+    known = [None if c is None or c > 1e15 else c for c in conditions]
+    rows.append(["condition of J'J", "", *(Value(c, 3) for c in known)])
+    levels = plan["levels"]
+    measured = "every level" if levels is None else ", ".join(f"h{i + 1}" for i in levels)
+    head = (
+        f"{case.name}: standard deviations that {plan['duration']:g} s, {measured} read every"
+        f" {plan['dt']:g} s with noise of {plan['noise']:g} {case.loop.units[0]} would leave"
+    )
+    last = f"Most informative: {best}." if best else "None identifies all of these parameters."
+    sections = [
+        Text([head]),
+        Table(rows, ["parameter", "value", *letters], gap=True),
+        Text([f"{letter}  {one}" for letter, one in letters.items()], gap=True),
+        Text([last], gap=True),
+    ]
+    return Report(f"{case.name}: planned experiments", last, (), sections)
+
+
+def _share(sd, value):
+    """A standard deviation in per cent of a value, or in its unit where that is 0."""
+    if sd is None:
+        return "open"
+    return Value(100 * sd / abs(value), 2, "%") if value else Value(sd, 2)

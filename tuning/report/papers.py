@@ -10,16 +10,16 @@ import numpy as np
 
 import jaxtank
 from jaxtank import presets, rig
-from jaxtank.core.files import check_folder
 from jaxtank.core.tree import get_value
 from jaxtank.loop import run as lp
 from jaxtank.plants.network import TankNetwork
 from jaxtank.presets.paper import Claim, Sample
 from jaxtank.presets.paper import verdict as verdict_of
 from tuning.problem.scenarios import noisy
-from tuning.report import artifacts, figures, tables
-from tuning.report.html import document, drawings
-from tuning.report.panel import panel
+from tuning.report.document import Live, Report, Text, figures_of
+from tuning.report.folder import earlier
+from tuning.report.folder import save as save_all
+from tuning.report.tables import Table, Value, clean
 
 NUMBER, CLAIM = "number", "claim"
 REPRODUCED, FITTED, DIFFERS = "reproduced", "fitted", "differs"
@@ -133,9 +133,9 @@ def measure(paper):
                 "kind": CLAIM if isinstance(printed.value, str) else NUMBER,
                 "unit": printed.unit,
                 "where": printed.where,
-                "published": tables.clean(printed.value),
-                "measured": tables.clean(shown),
-                "deviation": tables.clean(value.deviation) if isinstance(value, Sample) else None,
+                "published": clean(printed.value),
+                "measured": clean(shown),
+                "deviation": clean(value.deviation) if isinstance(value, Sample) else None,
                 "verdict": word,
                 "reason": reason,
                 "ramp_s": printed.ramp,
@@ -219,27 +219,16 @@ def _same(printed, found):
 
 
 def _cell(value):
-    if value is None:
-        return "-"
-    return (
-        value
-        if isinstance(value, str)
-        else (
-            ", ".join(tables.number(v, 4) for v in np.unique(np.ravel(value)))
-            if _flat(value)
-            else (", ".join(tables.number(v, 4) for v in np.ravel(value)))
-        )
-    )
-
-
-def _flat(value):
-    return np.unique(np.ravel(value)).size == 1
+    if value is None or isinstance(value, str):
+        return value or "-"
+    entries = np.unique(np.ravel(value))
+    return Value(entries if entries.size == 1 else value, 4, between=", ")
 
 
 def _measured(row):
-    """The measured value of a row as text, with the deviation of a single run."""
-    spread = row.get("deviation")
-    return _cell(row["measured"]) + (f" (standard deviation {_cell(spread)})" if spread else "")
+    """The measured value of a row, with the deviation of a single run."""
+    spread, value = row.get("deviation"), _cell(row["measured"])
+    return f"{value} (standard deviation {_cell(spread)})" if spread else value
 
 
 def _reason(row):
@@ -248,89 +237,78 @@ def _reason(row):
     return "; ".join(filter(None, [row["reason"], f"ramps of {ramp:g} s" if ramp else ""]))
 
 
-def text(page):
-    """Return the page of `jaxtank compare PAPER`."""
-    rows = [
-        [r["quantity"], r["unit"], _cell(r["published"]), _measured(r), r["verdict"]]
-        for r in page["rows"]
+def report(pages, drawn=None, captions=None):
+    """Return the Report of {paper: page}."""
+    rows = [row for page in pages.values() for row in page["rows"]]
+    tally = Counter(row["verdict"] for row in rows)
+    verdicts = [word for word in VERDICTS if tally[word]]
+    head = [Text([f"all papers: {headline_text(rows)}"], on="terminal")] if len(pages) > 1 else []
+    meanings = Text([f"{word}: {VERDICTS[word]}" for word in verdicts], items=True, on="page")
+    return Report(
+        f"{', '.join(pages)}: published and measured",
+        headline_text(rows),
+        [(word, tally[word]) for word in verdicts],
+        [
+            *head,
+            meanings,
+            *(section for page in pages.values() for section in _sections(page)),
+            *figures_of(drawn or {}, captions or {}),
+            *(Live(next(iter(presets.load(p).cases.values()))) for p in pages),
+        ],
+        subtitle="Published numbers, those of the same rigs and controllers here, and why they"
+        " differ.",
+    )
+
+
+def _sections(page):
+    """The sections of one paper: on a terminal long texts stand below the table."""
+    rows, ramped, notes = [], ramps_text(page["rows"]), []
+    for r in page["rows"]:
+        published, measured = _cell(r["published"]), _measured(r)
+        rows.append([r["quantity"], r["unit"], published, measured, r["verdict"]])
+        claim = r["measured"] if isinstance(r["measured"], str) else ""
+        if note := "; ".join(filter(None, [claim, _reason(r)])):
+            notes.append(f"{r['quantity']} ({r['where']}): {note}")
+    short = lambda cell: textwrap.shorten(str(cell), 60, placeholder=" ...")
+    brief = [[q, unit, short(a), short(b), word] for q, unit, a, b, word in rows]
+    full = [[*row, r["where"], _reason(r)] for row, r in zip(rows, page["rows"])]
+    heads = ["quantity", "unit", "published", "measured", "verdict"]
+    head = [page["citation"], f"notes: {presets.load(page['paper']).notes}"]
+    return [
+        Text([*head, headline_text(page["rows"]), *ramped], gap=True, on="terminal"),
+        Table(brief, heads, gap=True, on="terminal"),
+        Text(notes, items=True, on="terminal"),
+        Text([page["citation"], *ramped], on="page"),
+        Table(full, [*heads, "where", "why"], on="page"),
     ]
-    wrapped = [
-        [row[0], row[1], *(textwrap.shorten(c, 60, placeholder=" ...") for c in row[2:4]), row[4]]
-        for row in rows
-    ]
-    lines = [
-        page["citation"],
-        f"notes: {presets.load(page['paper']).notes}",
-        headline_text(page["rows"]),
-        *ramps_text(page["rows"]),
-        "",
-        tables.table(wrapped, ["quantity", "unit", "published", "measured", "verdict"]),
-    ]
-    for row, cells in zip(page["rows"], rows):
-        note = "; ".join(
-            filter(None, [cells[3] if isinstance(row["measured"], str) else "", _reason(row)])
-        )
-        if note:
-            lines.append(f"- {row['quantity']} ({row['where']}): {note}")
-    return "\n".join(lines)
 
 
 def save(pages, folder, command=None):
     """Write result.json, report.html and the rigs of {paper: page}; return their paths."""
-    check_folder(folder)
+    from jaxtank.plots import run as plots
+
     captions = {"published": OVERVIEW}
 
     def draw():
         drawn = overview(pages)
-        for paper, found in pages.items():
-            seen = []
+        for paper, page in pages.items():
+            topologies = []
             for name, case in presets.load(paper).cases.items():
                 plant = cast(TankNetwork, case.loop.plant)  # as every preset's
-                drawing = (
-                    plant.links,
-                    plant.pipes,
-                    plant.feeds,
-                    plant.spills,
-                    plant.outputs,
-                    np.asarray(plant.rim).tolist(),
-                )
-                if drawing not in seen:  # cases of one paper share their rig, but for some
-                    seen.append(drawing)
-                    of = f"rig-{paper}" + ("" if len(seen) == 1 else f"-{len(seen)}")
-                    drawn[of] = figures.rig(case.loop, None, f"{paper}/{name}")["rig"]
-                    captions[of] = f"The rig of {paper}/{name}. {found['citation']}"
+                parts = (plant.links, plant.pipes, plant.feeds, plant.spills, plant.outputs)
+                topology = (*parts, np.asarray(plant.rim).tolist())
+                if topology not in topologies:  # cases of one paper share their rig, but for some
+                    topologies.append(topology)
+                    of = f"rig-{paper}" + f"-{len(topologies)}" * (len(topologies) > 1)
+                    drawn[of] = plots.rig(plant, None, f"{paper}/{name}")["rig"]
+                    captions[of] = f"The rig of {paper}/{name}. {page['citation']}"
         return drawn
 
-    rows = [row for found in pages.values() for row in found["rows"]]
-    count = Counter(row["verdict"] for row in rows)
-    parts = [
-        part
-        for found in pages.values()
-        for part in (found["citation"], *ramps_text(found["rows"]), *_in_full(found))
-    ]
-
-    def page_of(drawn):
-        return document(
-            f"{', '.join(pages)}: published and measured",
-            "Published numbers, those of the same rigs and controllers here, and why they differ.",
-            headline_text(rows),
-            True,
-            [(word, str(count[word])) for word in VERDICTS if count[word]],
-            [f"{word}: {VERDICTS[word]}" for word in VERDICTS if count[word]],
-            drawings(drawn, captions),
-            parts,
-            command,
-            {"jaxtank": jaxtank.__version__, "jax": jax.__version__, "numpy": np.__version__},
-            live="\n".join(panel(next(iter(presets.load(p).cases.values()))) for p in pages),
-            live_last=True,
-        )
-
     old = [path.stem for paper in presets.PAPERS for path in Path(folder).glob(f"rig-{paper}*.png")]
-    stale = artifacts.earlier(folder, [*old, "published"])
-    table = pages if len(pages) > 1 else next(iter(pages.values()))
-    return artifacts.write_result(
-        folder, {"result.json": tables.dumps(table) + "\n"}, draw, page_of, stale
-    )
+    payload = pages if len(pages) > 1 else next(iter(pages.values()))
+    made = {"jaxtank": jaxtank.__version__, "jax": jax.__version__, "numpy": np.__version__}
+    page, stale = lambda drawn: report(pages, drawn, captions), earlier(folder, [*old, "published"])
+    return save_all(folder, payload, {}, draw, page, command, stale, made)
 
 
 OVERVIEW = (
@@ -341,75 +319,44 @@ OVERVIEW = (
 
 def overview(pages):
     """Return {"published": figure of measured over published numbers}, {} without any."""
-    import matplotlib.pyplot as plt
-
-    from jaxtank.plots import responses
+    from jaxtank.plots import style
 
     rows = [(paper, row, _ratios(row)) for paper, page in pages.items() for row in page["rows"]]
     rows = [one for one in rows if one[2].size]
-    if not rows:
-        return {}
-    styles = {
-        REPRODUCED: (responses.AFTER, "o"),
-        FITTED: ("#E69F00", "s"),
-        DIFFERS: (responses.BEFORE, "X"),
-    }
-    with responses.styled():
-        figure, ax = plt.subplots(
-            figsize=(7.2 if len(pages) > 1 else 6.0, 0.8 + 0.2 * len(rows)), layout="constrained"
-        )
-        styles = {
-            word: styles[word] for word in styles if word in {r["verdict"] for _, r, _ in rows}
-        }
+    verdicts = {row["verdict"] for _, row, _ in rows}
+    looks = {REPRODUCED: (style.AFTER, "o"), FITTED: ("#E69F00", "s"), DIFFERS: (style.BEFORE, "X")}
+
+    def draw(ax):
         for k, (_, row, ratios) in enumerate(rows):
-            colour, marker = styles[row["verdict"]]
+            colour, marker = looks[row["verdict"]]
             ax.plot(ratios, [k] * len(ratios), marker, color=colour, markersize=5, alpha=0.8)
-        ax.axvline(1.0, color=responses.REFERENCE, linewidth=1.0)
+        ax.axvline(1.0, color=style.REFERENCE, linewidth=1.0)
         ax.set_xscale("log")
         ax.set(xlabel="measured / published [-]", ylim=(len(rows) - 0.4, -0.6))
         start = (lambda paper: f"{paper}: ") if len(pages) > 1 else (lambda paper: "")
-        names = [start(paper) + responses.plain(row["quantity"]) for paper, row, _ in rows]
+        names = [start(paper) + style.plain(row["quantity"]) for paper, row, _ in rows]
         ax.set_yticks(range(len(rows)), names, fontsize=7)
-        for word, (colour, marker) in styles.items():
-            ax.plot([], [], marker, color=colour, label=word)
-        figure.legend(
-            *ax.get_legend_handles_labels(), loc="outside lower center", ncols=len(styles)
-        )
-    return {"published": figure}
+        for word, (colour, marker) in looks.items():
+            if word in verdicts:
+                ax.plot([], [], marker, color=colour, label=word)
+
+    size = (7.2 if len(pages) > 1 else 6.0, 0.8 + 0.2 * len(rows))
+    return {"published": style.picture(draw, size, legend=3)} if rows else {}
 
 
 def _ratios(row):
     """Measured over published numbers of a row, one for each entry; none for claims."""
-    given = (row["published"], row["measured"])
-    if row["verdict"] in (INPUT, IMPOSSIBLE) or any(v is None or isinstance(v, str) for v in given):
+    pair = (row["published"], row["measured"])
+    if row["verdict"] in (INPUT, IMPOSSIBLE) or any(v is None or isinstance(v, str) for v in pair):
         return np.zeros(0)
-    printed, found = (np.ravel(np.asarray(v, dtype=float)) for v in given)
-    if printed.size not in (1, found.size):
+    printed, measured = (np.ravel(np.asarray(v, dtype=float)) for v in pair)
+    if printed.size not in (1, measured.size):
         return np.zeros(0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratios = found / printed
+        ratios = measured / printed
     ratios = ratios[np.isfinite(ratios) & (ratios > 0.0)]
     # Entries that differ by rounding alone are one point, whatever the processor.
     return np.unique([float(f"{ratio:.6g}") for ratio in ratios])
-
-
-def _in_full(found):
-    """The table of a page with where each number is printed and the reason for a difference."""
-    rows = [
-        [
-            r["quantity"],
-            r["unit"],
-            _cell(r["published"]),
-            _measured(r),
-            r["verdict"],
-            r["where"],
-            _reason(r),
-        ]
-        for r in found["rows"]
-    ]
-    return [
-        tables.table(rows, ["quantity", "unit", "published", "measured", "verdict", "where", "why"])
-    ]
 
 
 def markdown(pages):
@@ -420,20 +367,13 @@ def markdown(pages):
         lines += [f"- {paper}: {headline_text(page['rows'])}"]
         lines += [f"  - {line}" for line in ramps_text(page["rows"])]
     lines += ["", "| paper | quantity | published | measured | verdict |", "|---|---|---|---|---|"]
-    for paper, page in pages.items():
-        for r in page["rows"]:
-            if r["verdict"] in (INPUT, IMPOSSIBLE):
-                continue
-            unit = f" {r['unit']}" if r["unit"] else ""
-            mine = _measured(r) + ("" if isinstance(r["measured"], str) else unit)
-            theirs = _cell(r["published"]) + ("" if isinstance(r["published"], str) else unit)
-            why = f": {_reason(r)}" if _reason(r) else ""
-            lines.append(
-                "| "
-                + " | ".join(
-                    c.replace("|", "\\|")
-                    for c in (paper, r["quantity"], theirs, mine, r["verdict"] + why)
-                )
-                + " |"
-            )
+    for paper, r in ((paper, r) for paper, page in pages.items() for r in page["rows"]):
+        if r["verdict"] in (INPUT, IMPOSSIBLE):
+            continue
+        unit = f" {r['unit']}" if r["unit"] else ""
+        mine = f"{_measured(r)}" + ("" if isinstance(r["measured"], str) else unit)
+        theirs = f"{_cell(r['published'])}" + ("" if isinstance(r["published"], str) else unit)
+        why = f": {_reason(r)}" if _reason(r) else ""
+        cells = (paper, r["quantity"], theirs, mine, r["verdict"] + why)
+        lines.append(f"| {' | '.join(c.replace('|', chr(92) + '|') for c in cells)} |")
     return "\n".join(lines)

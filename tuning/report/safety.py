@@ -5,7 +5,7 @@ import numpy as np
 from jaxtank.core.errors import InputError
 from jaxtank.core.units import local
 from jaxtank.safety.checker import ANY, OWN
-from tuning.report import tables
+from tuning.report.tables import Table, Value, clean
 
 SHORT = {ANY: "limits", OWN: "case", "": "-"}
 """Hypotheses on the start in a table."""
@@ -43,8 +43,8 @@ def certificates(case):
             "starts": row.starts or None,
             "rate": row.rate,
             "rate_bound": row.rate_bound,
-            "gap": tables.clean(row.gap),
-            "reach": tables.clean(row.reach),
+            "gap": clean(row.gap),
+            "reach": clean(row.reach),
             "low": {"limit": row.low, "certified": row.low_certified, "why": row.low_reason}
             if row.low > 0.0
             else None,
@@ -53,39 +53,24 @@ def certificates(case):
     ]
 
 
-def rows_of(case, found):
-    """Return (heads, rows) of the table of `certificates`, its numbers in the case's units."""
-    length = local("cm", case.loop.units)
+def table_of(case, rows):
+    """Return the Table of `certificates`, its numbers in the case's units."""
+    length, cells = local("cm", case.loop.units), []
+    for row in rows:
+        proved, start = "yes" if row["certified"] else "no", SHORT[row["starts"] or ""]
+        rates = [Value(row["rate"], 3), Value(row["rate_bound"], 3)]
+        limit, gap = Value(row["limit"], 4), Value(row["gap"], 3)
+        cells.append([row["tank"], limit, proved, start, *rates, gap, row["why"]])
+    for row in rows:
+        if low := row["low"]:
+            proved, start = "yes" if low["certified"] else "no", SHORT[OWN * low["certified"]]
+            limit = f"low {low['limit']:.4g}"
+            rate = Value(row["rate"], 3)
+            cells.append([row["tank"], limit, proved, start, rate, "-", "-", low["why"]])
     heads = ["tank", f"limit [{length}]", "proved", "start", "kappa [1/s]", "at most [1/s]"]
     heads += [f"gap [{length}]", "by, or why not"]
-    rows = [
-        [
-            row["tank"],
-            f"{row['limit']:.4g}",
-            "yes" if row["certified"] else "no",
-            SHORT[row["starts"] or ""],
-            f"{row['rate']:.3g}",
-            f"{row['rate_bound']:.3g}",
-            "-" if row["gap"] is None else f"{row['gap']:.3g}",
-            row["why"],
-        ]
-        for row in found
-    ]
-    rows += [
-        [
-            row["tank"],
-            f"low {low['limit']:.4g}",
-            "yes" if low["certified"] else "no",
-            SHORT[OWN if low["certified"] else ""],
-            f"{row['rate']:.3g}",
-            "-",
-            "-",
-            low["why"],
-        ]
-        for row in found
-        if (low := row["low"])
-    ]
-    return heads, rows
+    widths = (4, 12, 6, 6, 11, 13, 10)
+    return Table(cells, heads, heading="Limits on levels", widths=widths)
 
 
 def sentences(case):

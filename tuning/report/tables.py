@@ -1,7 +1,12 @@
-"""Numbers, tables and JSON of results, for people and for programs; imported by the reports."""
+"""Numbers, tables and JSON of results, for people and for programs."""
 
+import dataclasses
+import itertools
 import json
 import math
+import textwrap
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -9,11 +14,15 @@ from jaxtank import measures as ms
 from jaxtank.core.jsonable import clean as clean
 from jaxtank.core.units import DEFAULT
 
+LONGEST = 100
+"""Characters of the line under the head of a table."""
+
+MANY = 16
+"""Entries of a measure that are printed side by side; of more, the worst."""
+
 
 def number(value, digits=5):
-    """Return a number for people: at most `digits` significant digits, a dash where there
-    is none.
-    """
+    """Return a number of at most `digits` significant digits, a dash where there is none."""
     value = float(value)
     if not math.isfinite(value):
         return "-"
@@ -23,15 +32,27 @@ def number(value, digits=5):
     return text if "e" not in text else f"{value:.{digits - 1}e}"
 
 
+@dataclasses.dataclass(frozen=True)
+class Value:
+    """A number, or several side by side, with its significant digits and its unit."""
+
+    value: Any
+    digits: int = 5
+    unit: str = ""
+    between: str = "  "
+    missing: str = "-"
+
+    def __str__(self):
+        values = np.ravel(np.asarray(self.value, dtype=float))
+        shown = [number(v, self.digits) if math.isfinite(v) else self.missing for v in values]
+        text = self.between.join(shown)
+        return f"{text} {self.unit}" if self.unit and np.isfinite(values).any() else text
+
+
 def numbers(value, digits=5):
-    """Return the entries of a measure, side by side; "none" for one that is undefined."""
+    """Return the entries of a measure; "none" for one that is undefined."""
     # A dash would read as the sign of the entry after it.
-    values = np.ravel(np.asarray(value, dtype=float))
-    return "  ".join(number(v, digits) if math.isfinite(v) else "none" for v in values)
-
-
-MANY = 16
-"""Entries of a measure that are printed side by side; of more, the worst."""
+    return Value(value, digits, missing="none")
 
 
 def entries(measure, value):
@@ -44,8 +65,57 @@ def entries(measure, value):
     # what is undefined first
     worse = spec.sense * np.where(np.isnan(values), spec.sense * np.inf, values)
     order = np.argsort(-worse, kind="stable")
-    found = ", ".join(f"{numbers(values[i])} ({spec.per} {i + 1})" for i in order[:4])
-    return f"worst of {len(values)}: {found}"
+    worst = ", ".join(f"{numbers(values[i])} ({spec.per} {i + 1})" for i in order[:4])
+    return f"worst of {len(values)}: {worst}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """A table: cells are texts, numbers and Values; `gap`: after an empty line on a terminal."""
+
+    rows: Sequence[Sequence[Any]]
+    head: Sequence[str] = ()
+    gap: bool = False
+    heading: str = ""
+    on: str = ""
+    widths: Sequence[int] = ()  # of the columns but the last one, whose cells are then wrapped
+
+    def lines(self, width=0):
+        """Return the lines of the table as aligned columns."""
+        body = [[str(cell) for cell in row] for row in self.rows]
+        rows = [*([list(self.head)] if self.head else []), *body]
+        widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+        if self.widths:
+            widths = [min(pair) for pair in zip(widths, self.widths)]
+            widths.append(width - sum(widths) - 2 * len(widths))
+        lines = []
+        for row in rows:
+            cells = [[c] for c in row]
+            if self.widths:
+                cells = [textwrap.wrap(c, w) or [""] for c, w in zip(row, widths)]
+            for parts in itertools.zip_longest(*cells, fillvalue=""):
+                lines.append("  ".join(c.ljust(w) for c, w in zip(parts, widths)).rstrip())
+        if self.head:
+            lines[1:1] = ["-" * (width if self.widths else min(LONGEST, len(max(lines, key=len))))]
+        return lines
+
+    def __str__(self):
+        return "\n".join(self.lines())
+
+
+def table(rows, head=()):
+    """Return rows as the text of aligned columns."""
+    return str(Table(rows, head))
+
+
+def measure_table(values, rig_units=DEFAULT, gap=False):
+    """Return the Table of {measure: value}: unit, entries and what the measure is."""
+    rows = [
+        [m, ms.unit(m, rig_units), entries(m, values[m]), spec.doc]
+        for m, spec in ms.MEASURES.items()
+        if m in values and m not in ms.times()
+    ]
+    return Table(rows, ["measure", "unit", "value", ""], gap)
 
 
 def undefined(measures):
@@ -59,8 +129,8 @@ def undefined(measures):
 
 def reasons(measures):
     """Return {measure: why} of every measure that is absent or has an entry that is not finite."""
-    found = {m: why for m, values in measures.items() if (why := _why(m, values))}
-    return {**found, **{m: why for m, why in _unserved().items() if m not in measures}}
+    causes = {m: why for m, values in measures.items() if (why := _why(m, values))}
+    return {**causes, **{m: why for m, why in _unserved().items() if m not in measures}}
 
 
 def _why(measure, values):
@@ -82,10 +152,8 @@ def _unserved():
 
 def measures_json(measures):
     """Return measures as JSON; None for those undefined for the case (`reasons` has the cause)."""
-    return {
-        **dict.fromkeys(_unserved()),
-        **clean({m: v for m, v in measures.items() if m not in ms.times()}),
-    }
+    known = {m: v for m, v in measures.items() if m not in ms.times()}
+    return {**dict.fromkeys(_unserved()), **clean(known)}
 
 
 def dumps(table):
@@ -98,52 +166,14 @@ def units(rig_units):
     return {m: ms.unit(m, rig_units) for m in ms.MEASURES}
 
 
-class Table(str):
-    """Aligned columns as text, with its `head` and `rows` for other ways of display."""
-
-    head: list
-    rows: list
-
-
-def table(rows, head=None):
-    """Return rows of text as aligned columns: a Table."""
-    body = [[str(c) for c in row] for row in rows]
-    rows = ([head] if head else []) + body
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths)).rstrip() for row in rows]
-    found = Table(
-        "\n".join(
-            lines[:1] + ["-" * min(100, len(max(lines, key=len)))] + lines[1:] if head else lines
-        )
-    )
-    found.head, found.rows = head or [], body
-    return found
-
-
-def measure_table(values, rig_units=DEFAULT):
-    """Return the Table of {measure: value}: unit, entries and what the measure is."""
-    rows = [
-        [m, ms.unit(m, rig_units), entries(m, values[m]), spec.doc]
-        for m, spec in ms.MEASURES.items()
-        if m in values and m not in ms.times()
-    ]
-    return table(rows, ["measure", "unit", "value", ""])
-
-
-def wrap(message):
-    """Return the parts of a message as lines that begin with a dash."""
-    return "\n".join(f"- {part}" for part in message.split("; "))
-
-
 def objective_unit(terms, rig_units=DEFAULT):
     """Return the unit of a weighted sum: that of its measures where they share one, else "-"."""
-    found = {ms.unit(m, rig_units) for m in terms}
-    return found.pop() if len(found) == 1 else "-"
+    shared = {ms.unit(m, rig_units) for m in terms}
+    return shared.pop() if len(shared) == 1 else "-"
 
 
 def cost_unit(result):
-    """Return the unit of the objective of a TuningResult; a default answer knows that of its own,
-    whose price on changes of the inputs is in the unit of the squared error.
-    """
-    own = result.answer and result.answer.setting.cost_unit
-    return own or objective_unit(result.objective["terms"], result.tuned.loop.units)
+    """Return the unit of the objective of a TuningResult."""
+    # Of a default answer: that of the squared error, which the price on input changes has too.
+    unit = result.answer and result.answer.setting.cost_unit
+    return unit or objective_unit(result.objective["terms"], result.tuned.loop.units)

@@ -194,7 +194,7 @@ class TuningResult(Result):
     >>> result["controller.Kc[0]"].after, result.status  # doctest: +SKIP
     """
 
-    REPORT = "tuning.report.tuned.report"
+    REPORT = "tuning.report.tuned"
 
     case: Any
     tuned: Any

@@ -53,11 +53,12 @@ class Certificate(NamedTuple):
     interval95: list  # Clopper and Pearson
 
     _repr_html_ = Shown._repr_html_
-    _lines = Shown._lines
+    _sections = Shown._sections
+    __str__ = Shown.__str__
 
-    def __str__(self):
+    def _rows(self):
         low, high = self.interval95
-        rows = {
+        return {
             "plants of the search": self.scenarios,
             "support scenarios": self.support,
             "scenario bound": f"{self.bound:.2g} (confidence 1 - {CONFIDENCE:g})",
@@ -65,7 +66,6 @@ class Certificate(NamedTuple):
             "new plants that violate a limit": self.broken,
             "probability of violating a limit": f"{low:.2g} to {high:.2g} (95 % interval)",
         }
-        return "\n".join(f"{name}: {value}" for name, value in rows.items())
 
 
 def scenarios_of(case, distributions=None, samples=64, seed=0):

@@ -56,7 +56,7 @@ class Ensemble(Result):
         "random", "latin" or "sobol".
     """
 
-    REPORT = "tuning.report.studies.uncertainty"
+    REPORT = "tuning.report.uncertainty"
 
     case: Any
     distributions: dict

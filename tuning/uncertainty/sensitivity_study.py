@@ -38,7 +38,7 @@ RANKED_BY = {"local": "effect", "morris": "mu_star", "sobol": "total"}
 class SensitivityResult(Result):
     """How sensitive measures of a case are to its parameters; made by `tuning.sensitivity`."""
 
-    REPORT = "tuning.report.studies.sensitivity_page"
+    REPORT = "tuning.report.effects"
 
     case: Any
     method: str

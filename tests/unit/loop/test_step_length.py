@@ -21,7 +21,7 @@ from jaxtank.loop import step_size
 from jaxtank.plants.faults import faults
 from jaxtank.signals.inflows import inflow_pulses
 from tuning.cli import main
-from tuning.report.tuned import report
+from tuning.report import tuned as report
 
 ONE = """
 [[tank]]

@@ -16,8 +16,7 @@ import jaxtank
 from jaxtank.core.errors import InputError
 from jaxtank.plants import network
 from jaxtank.plots import animation, style
-from jaxtank.plots import run as run_plots
-from tuning.report import artifacts
+from tuning.report import simulated
 
 
 @pytest.fixture(scope="module")
@@ -41,11 +40,11 @@ def blue(picture):
 def test_the_tanks_of_the_gif_hold_what_the_run_says(short, tmp_path):
     loop, run = short
     path = animation.animate(loop, run, tmp_path / "run.gif", seconds=1)
-    assert path.stat().st_size < 600_000 and [p.name for p in tmp_path.iterdir()] == ["run.gif"]
+    assert [p.name for p in tmp_path.iterdir()] == ["run.gif"]
     seen = np.array([blue(f) for f in frames(path)])
     assert len(seen) == animation.RATE
     # tanks of one size; in between rows the one before is shown
-    times = animation.moments([run], len(seen), [(loop.plant.rim, np.array([12.0, 12.0]))])
+    times = np.linspace(0.0, run.t[-1], len(seen))
     rows = np.searchsorted(run.t, times + 1e-6, side="right") - 1
     stored = np.asarray(run.x)[rows].sum(axis=1)
     # a straight line: what is not the tanks' water (none) plus pixels per cm; edges and words cost
@@ -55,19 +54,6 @@ def test_the_tanks_of_the_gif_hold_what_the_run_says(short, tmp_path):
     assert np.abs(np.polyval(slope, stored) - seen).max() < 0.05 * np.ptp(seen)
 
 
-def test_time_passes_slowly_where_something_changes():
-    """A level that rises from 40 to 60 s of 100 s: three quarters of the pictures, less what is
-    evenly spread, lie in that fifth of the time; the ends are met.
-    """
-    t = np.linspace(0.0, 100.0, 1001)
-    level = np.interp(t, [40.0, 60.0], [0.0, 10.0])[:, None]
-    run = SimpleNamespace(t=t, x=level, r=0.0 * level, u=0.0 * level)
-    times = animation.moments([run], 201, [(np.array([30.0]), np.array([1.0]))])
-    assert times[0] == 0.0 and times[-1] == 100.0 and np.all(np.diff(times) > 0)
-    inside = np.mean((times > 40.0) & (times < 60.0))
-    assert inside == pytest.approx(0.75 + 0.25 * 0.2, abs=0.01)
-
-
 def test_two_rigs_stand_beside_each_other_and_the_shorter_run_stays_at_its_end(short):
     loop, run = short
     other = jaxtank.presets.find("cascaded/pi").loop
@@ -75,21 +61,9 @@ def test_two_rigs_stand_beside_each_other_and_the_shorter_run_stays_at_its_end(s
     one, _ = animation.film(loop, run, 1)
     two, still = animation.film(loop, run, 1, (other, brief), ("four $tanks", "two <tanks>"))
     sizes = [Image.open(io.BytesIO(data)).size for data in (one, two)]
-    assert sizes[1][0] > 1.5 * sizes[0][0] and len(two) < 600_000
+    assert sizes[1][0] > 1.5 * sizes[0][0]
     # two of them in a row
     assert Image.open(io.BytesIO(still)).size == (2 * sizes[1][0], 2 * sizes[1][1])
-
-
-def test_a_film_that_would_be_too_large_has_fewer_pictures(monkeypatch):
-    """Each is shown for longer, so that the film lasts as long."""
-    rng = np.random.default_rng(0)
-    pictures = [Image.fromarray(rng.integers(0, 255, (60, 60, 3), np.uint8)) for _ in range(24)]
-    whole = Image.open(io.BytesIO(run_plots.gif(pictures, 12)))
-    monkeypatch.setattr(run_plots, "GIF_BYTES", 55_000)
-    data = run_plots.gif(pictures, 12)
-    fewer = Image.open(io.BytesIO(data))
-    assert whole.n_frames == 24 and len(data) <= 55_000 and fewer.n_frames == 12
-    assert fewer.info["duration"] == pytest.approx(2 * whole.info["duration"], abs=20)
 
 
 def test_liquid_above_a_rim_is_in_the_film_and_a_rig_of_many_tanks_is_refused(short, tmp_path):
@@ -169,9 +143,9 @@ def test_simulate_writes_one_where_asked(tmp_path, capsys):
 
 def test_titles_of_a_film_mention_the_safety_filter_where_one_rig_has_it():
     case = lambda safety: SimpleNamespace(name="a/b", loop=SimpleNamespace(safety_filter=safety))
-    assert artifacts._titles([case(None), case(1)]) == ("a/b", "a/b, safety filter")
-    assert artifacts._titles([case(1), case(1)]) == ("a/b", "a/b")
-    assert artifacts._titles([case(None)]) == ("a/b",)
+    assert simulated._titles([case(None), case(1)]) == ("a/b", "a/b, safety filter")
+    assert simulated._titles([case(1), case(1)]) == ("a/b", "a/b")
+    assert simulated._titles([case(None)]) == ("a/b",)
 
 
 @pytest.mark.parametrize(

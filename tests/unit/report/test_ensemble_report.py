@@ -94,7 +94,7 @@ def test_two_draws_have_a_spread(case):
 
 
 def test_a_fan_of_some_draws_states_of_which(case, monkeypatch):
-    from tuning.report.studies import uncertainty
+    from tuning.report import uncertainty
 
     monkeypatch.setattr(importlib.import_module("tuning.uncertainty.study"), "FAN_DRAWS", 3)
     for samples, words in ((5, "the first 3 of 5 draws"), (3, "3 draws")):

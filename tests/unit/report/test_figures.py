@@ -10,8 +10,7 @@ from helpers import command
 import jaxtank
 from jaxtank import presets, rig
 from tuning.figures import drawing
-from tuning.figures.catalogue import FIGURES, find
-from tuning.figures.figure import KINDS
+from tuning.figures.figure import FIGURES, KINDS, find
 
 # figures of each paper, by its last number
 COUNTS = {"calofir": 3, "gouta2015": 17, "gouta2022": 13, "khalid": 7, "mirakhorli": 11}

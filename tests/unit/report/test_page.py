@@ -18,10 +18,12 @@ import pytest
 import tuning
 from jaxtank import rig
 from jaxtank.plots import responses
+from jaxtank.plots import run as pictures
 from tuning.cli import main
 from tuning.identification.csv_log import read_log
-from tuning.report import figures as pictures
 from tuning.report import html, papers, tables
+from tuning.report.document import Report, Text, terminal
+from tuning.report.tables import Table, Value
 
 NASTY = "a <b>\"rig\"</b> & $\\x{$ 'y' </style><script>alert(1)</script>"
 KINDS = ("tune", "uncertainty", "sensitivity", "identify", "compare")
@@ -358,44 +360,24 @@ def test_compare_and_show_write_to_the_folder_asked_for(tmp_path, monkeypatch, c
     assert capsys.readouterr().err.count("is a file") == 2
 
 
-def test_parts_become_tables_lists_and_paragraphs():
-    table = tables.table([["x<1", 2], ["y", "-"]], ["name", "value"])
-    text = html.document(
-        "t",
-        "",
-        "s",
-        True,
-        [],
-        [],
-        [],
-        ["a line", "- first", "- second", "", table, "one   two\n---------"],
-    )
-    read = Reader(text)
+def shown(*sections):
+    return html.document(Report("t", "s", [], sections))
+
+
+def test_sections_become_tables_lists_and_paragraphs():
+    table = Table([["x<1", Value(2)], ["y", "-"]], ["name", "value"])
+    columns = Text(["one   two"], layout=True)
+    words = "limits hold on 256 of 256 plants of the rig with two tanks, proved for the first tank"
+    notes = Text(["first", "second"], items=True)
+    sections = [Text([words, "other"]), notes, table, columns, Text(["never"], on="terminal")]
+    read = Reader(shown(*sections))
     tags = [tag for tag, _ in read.tags]
-    assert (
-        tags.count("li") == 2
-        and tags.count("ul") == 1
-        and tags.count("td") == 4
-        and tags.count("th") == 2
-        and "pre" in tags
-    )
-    # still text where text is wanted
-    assert "x<1" in read.words and str(table).splitlines()[0] == "name  value"
-
-
-def test_lines_wrapped_for_a_terminal_are_one_paragraph_or_item():
-    sentence = (
-        "limits hold on 256 of 256 validation plants of the rig with two tanks, proved for tank 1"
-    )
-    item = (
-        "the search tightened limits by up to 13 %, so that they hold on validation plants as well"
-    )
-    lines = textwrap.wrap(sentence, 80) + ["short", "another"]
-    lines += textwrap.wrap(item, 80, initial_indent="- ", subsequent_indent="  ")
-    table = tables.table([["x", 2]], ["name", "value"])
-    text = html.fragment(["\n".join(lines), table])
-    for whole in (f"<p>{sentence}</p>", "<p>short</p>", "<p>another</p>", f"<li>{item}</li>"):
-        assert whole in text
+    counts = {"li": 2, "ul": 1, "td": 4, "th": 2, "pre": 1}
+    assert {tag: tags.count(tag) for tag in counts} == counts
+    assert ("td", {"class": "number"}) in read.tags and "never" not in read.words
+    assert "x<1" in read.words and f"<p>{words}</p>" in html.fragment(sections)
+    text = terminal(Report("t", "s", [], sections, width=80)).splitlines()
+    assert text[:6] == [*textwrap.wrap(words, 80), "other", "- first", "- second", "name  value"]
 
 
 BROWSER = next(
@@ -527,11 +509,8 @@ def test_no_column_of_a_page_of_claims_is_cut(tmp_path, width):
 
 def test_cells_of_a_table_of_texts_carry_their_headings():
     """A narrow window shows them one below the other."""
-    table = tables.table([["x", 2, "w" * 80], ["y", 3, ""]], ["name", "value", 'why "so"'])
-    read = html.document("t", "", "s", True, [], [], [], [table])
+    read = shown(Table([["x", 2, "w" * 80], ["y", 3, ""]], ["name", "value", 'why "so"']))
     assert '<div class="scroll texts">' in read and read.count('data-head="name"') == 2
-    assert 'data-head="why &quot;so&quot;"' in read
-    plain = html.document(
-        "t", "", "s", True, [], [], [], [tables.table([["x", 2]], ["name", "value"])]
-    )
+    assert 'data-head="why &#34;so&#34;"' in read
+    plain = shown(Table([["x", 2]], ["name", "value"]))
     assert "data-head=" not in plain and '<div class="scroll">' in plain

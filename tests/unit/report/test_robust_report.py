@@ -10,7 +10,7 @@ import jaxtank
 import tuning
 from jaxtank import rig
 from jaxtank.presets import Scenario
-from tuning.report.tuned import report
+from tuning.report import tuned as report
 from tuning.search.robust import Certificate, certificate_messages
 
 SEARCH = {"starts": 1, "screening": 1, "iterations": 2, "limits": {}}

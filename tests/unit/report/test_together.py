@@ -11,7 +11,8 @@ from helpers import command
 import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.tree import with_values
-from tuning.report.studies.together import lines_of, run_together
+from tuning.report.document import terminal
+from tuning.report.together import report, run_together
 
 SHORT = ["--set", "clock.duration=40", "--dt", "0.2"]
 PAIR = ["gouta2022/pi", "gouta2022/pid"]
@@ -52,7 +53,7 @@ def test_all_have_the_disturbances_of_the_first_and_what_differs_is_said():
     np.testing.assert_array_equal(runs[1].measures["rms_error"], found)
     words = ("plant", "disturbances (those of gouta2022/pi are used)")
     assert runs[0].differs == () and runs[1].differs == words
-    text = "\n".join(map(str, lines_of(runs)))
+    text = terminal(report(runs))
     assert f"gouta2022/pid has its own {words[0]}, {words[1]}" in text
 
 

@@ -269,7 +269,7 @@ def test_lower_limits_and_several_measures(gouta):
 def test_rims_as_physics_turn_the_limit_into_one_of_overflow(gouta):
     result = quick(gouta, values={"plant.overflow": True})
     assert {c["measure"] for c in result.constraints} == {"overflow_volume"}
-    assert "rims are physics" in repr(result)
+    assert "overflow is simulated" in repr(result)
 
 
 @pytest.mark.slow
@@ -517,7 +517,7 @@ def test_chatter_is_told_and_drawn(gouta, short):
     """k + k1 = 22 1/s at a step of 0.1 s, past 2/dt: the pumps jump from limit to limit at every
     sample.
     """
-    from tuning.report.artifacts import run_for_people
+    from tuning.report.simulated import run_for_people
     from tuning.search.messages import messages_of
 
     wild = gouta("backstepping", {"clock.dt": 0.1, "controller.k": 22.0})

@@ -41,7 +41,7 @@ def case(values=None):
 
 
 def reported(result):
-    from tuning.report.tuned import report
+    from tuning.report import tuned as report
 
     page = report.json_of(result)
     return json.dumps({k: page[k] for k in SAME}, sort_keys=True)

@@ -764,7 +764,7 @@ def test_sigkill_and_resume_of_the_command(tmp_path):
 
 def test_distributions_are_put_into_words():
     from tuning import Correlated, Normal, Uniform
-    from tuning.report.studies.uncertainty import in_words
+    from tuning.report.uncertainty import in_words
 
     pair = Correlated(names=("a", "b"), covariance=((1.0, 0.0), (0.0, 1.0)))
     assert in_words(Uniform(relative=0.1)) == "+-10 % (uniform)"

@@ -1,6 +1,7 @@
 """`jaxtank list`, `show`, `simulate`, `init` and `export`: the cases, and one case as it is."""
 
 import argparse
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -103,27 +104,31 @@ def show(args):
     """Print the manual of one case; with --out draw its rig."""
     case = open_case(args)
     from tuning.report import case as manual
-    from tuning.report import tables
+    from tuning.report.document import terminal
+    from tuning.report.tables import dumps
 
     written = _draw_rig(case, Path(args.out)) if args.out else []
-    print(tables.dumps(manual.json_of(case)) if args.json else manual.text(case))
+    print(dumps(manual.json_of(case)) if args.json else terminal(manual.report(case)))
     report_written(written, args)
     return 0
 
 
 def _draw_rig(case, folder):
     """Write rig.svg and rig.png; where the rig cannot be drawn, remove those of another one."""
-    from tuning.report import artifacts, figures, html
+    from jaxtank.plots.run import rig
+    from tuning.report import html
+    from tuning.report.document import failed
+    from tuning.report.folder import pngs
 
     try:
-        drawn = figures.rig(case.loop, None, case.name)
+        drawn = rig(case.loop.plant, None, case.name)
         alone = {f"{name}.svg": html.alone(figure, name) for name, figure in drawn.items()}
     except Exception as error:
-        figures.failed("rig", error)
+        failed("rig", error)
         for name in ("rig.svg", "rig.png"):
             (folder / name).unlink(missing_ok=True)
         return []
-    return write_folder(folder, alone | artifacts.pngs(drawn))
+    return write_folder(folder, alone | pngs(drawn))
 
 
 def simulate(args):
@@ -140,8 +145,8 @@ def simulate(args):
     from jaxtank.loop.margins import stability_margins
     from tuning.problem import provenance, reported
     from tuning.problem.scenarios import noisy
-    from tuning.report import artifacts, margin_tables, run_page, tables
-    from tuning.report import case as manual
+    from tuning.report import simulated, tables
+    from tuning.report.document import terminal
 
     key = jax.random.key(seed) if noisy(case) else None
     of_run = halving_warnings(case.loop, case.clock, key)
@@ -149,41 +154,34 @@ def simulate(args):
     of_run += _of_run(case, values, key)
     for sentence in [] if args.quiet else of_run:
         print(f"jaxtank: note: {sentence}", file=sys.stderr)
-    plateaus = stability_margins(case.loop, case.clock) if args.margins else ()
+    plateaus = stability_margins(case.loop, case.clock) if args.margins else None
     values |= reported.margin_measures(case.loop, case.clock) if args.margins else {}
     payload = {
         "case": case.name,
         "measures": tables.measures_json(values),
         "units": tables.units(case.loop.units),
         "reasons": tables.reasons(values),
-        "clock": manual.clock(case.clock),
+        "clock": dataclasses.asdict(case.clock),
         "parameters": tables.clean(run.parameters(case.loop)),
         "provenance": provenance.provenance(case, seed),
     }
-    if args.margins:
-        payload["margins"] = margin_tables.json_of(plateaus)
+    if plateaus is not None:
+        payload["margins"] = simulated.margins_json(plateaus)
     written = []
     if args.out:
-        trajectory = artifacts.run_for_people(case, key)
-        made = payload["provenance"]
-        page = lambda drawn: run_page.page_of(case, values, drawn, args.line, made)
+        trajectory = simulated.run_for_people(case, key)
+        page = lambda drawn: simulated.report(case, values, plateaus, drawn)
         beside = None
         if other is not None:
             noise = jax.random.key(seed) if noisy(other) else None
-            beside = (other, artifacts.run_for_people(other, noise))
-        written = artifacts.save_run(
-            case, trajectory, payload, args.out, args.gif, page, beside, columns
+            beside = (other, simulated.run_for_people(other, noise))
+        written = simulated.save(
+            case, trajectory, payload, args.out, page, args.line, args.gif, beside, columns
         )
     if args.json:
         print(tables.dumps(payload))
     else:
-        print(f"{case.name}: {case.title}\n\n{tables.measure_table(values, case.loop.units)}")
-        for line in tables.undefined(values):
-            print(line)
-        if args.margins:
-            print(f"\n{margin_tables.text(case.loop, plateaus)}")
-        if case.loop.safety_filter is not None:
-            print("\nThe safety filter is on: jaxtank show prints what is proved of each tank.")
+        print(terminal(simulated.report(case, values, plateaus)))
     report_written(written, args)
     return 0
 
@@ -224,15 +222,15 @@ def _together(args):
             raise InputError(f"{flag}: of one case alone, and {1 + len(args.others)} are given")
     seed, names = args.seed, [args.case, *args.others]
     cases = [open_case(argparse.Namespace(**{**vars(args), "case": name})) for name in names]
-    from tuning.report import tables
-    from tuning.report.studies import together
+    from tuning.report import tables, together
+    from tuning.report.document import terminal
 
     runs = together.run_together(cases, seed)
     written = together.save(runs, args.out, seed, args.line) if args.out else []
     if args.json:
         print(tables.dumps(together.json_of(runs, seed)))
     else:
-        print("\n".join(map(str, together.lines_of(runs))))
+        print(terminal(together.report(runs)))
     report_written(written, args)
     return 0
 

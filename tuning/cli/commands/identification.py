@@ -260,7 +260,9 @@ def _plan(args, case, free):
     """Compare experiments and print the result; returns the exit code."""
     _check_plan(args)
     from tuning.identification.design import compare_experiments, most_informative
-    from tuning.report import experiment_plan, tables
+    from tuning.report import tables
+    from tuning.report.document import terminal
+    from tuning.report.identification import plan_report
 
     duration = 300.0 if args.duration is None else args.duration
     if not 0 < duration <= LONGEST:
@@ -275,7 +277,7 @@ def _plan(args, case, free):
     found = compare_experiments(case, free, start="known", **plan)
     best = most_informative(found)
     if not args.json:
-        print(experiment_plan.plan_text(case, found, best, plan))
+        print(terminal(plan_report(case, found, best, plan)))
         return 0
     given = {n: plan[n] for n in ("noise", "duration", "dt")}
     result = {"case": case.name, **given, "experiments": found, "most_informative": best}

@@ -74,7 +74,7 @@ def figure(args):
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from tuning.figures.catalogue import FIGURES, find
+    from tuning.figures.figure import FIGURES, find
     from tuning.report import tables
 
     if args.figure is None:
@@ -114,6 +114,7 @@ def compare(args):
     from jaxtank import presets
     from tuning.report import papers as report
     from tuning.report import tables
+    from tuning.report.document import terminal
 
     papers = presets.PAPERS if args.paper == "all" else (args.paper,)
     for paper in papers:
@@ -129,9 +130,7 @@ def compare(args):
     elif args.markdown:
         print(report.markdown(found))
     else:
-        every = [row for page in found.values() for row in page["rows"]]
-        total = [f"all papers: {report.headline_text(every)}"] if len(found) > 1 else []
-        print("\n\n".join([*total, *(report.text(page) for page in found.values())]))
+        print(terminal(report.report(found)))
     report_written(written, args)
     return 0
 

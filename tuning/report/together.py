@@ -16,8 +16,19 @@ from jaxtank.loop.trajectory import csv
 from tuning.problem import provenance, reported
 from tuning.problem.scenarios import noisy
 from tuning.problem.wording import count, numbered
-from tuning.report import html, tables
-from tuning.report.artifacts import run_for_people, write_result
+from tuning.report.document import Report, Text, figures_of
+from tuning.report.folder import save as save_all
+from tuning.report.simulated import run_for_people
+from tuning.report.tables import (
+    Table,
+    Value,
+    clean,
+    entries,
+    measures_json,
+    reasons,
+    undefined,
+    units,
+)
 
 MOST = 6
 """Cases in one picture: as many as have a colour of their own."""
@@ -107,19 +118,33 @@ def _equal(one, other):
     return all(np.shape(a) == np.shape(b) and np.array_equal(a, b) for a, b in pairs)
 
 
-def lines_of(runs: list[Run]) -> list[Any]:
-    """Return the Table of measures, a column for each case, and sentences on what differs."""
-    units = runs[0].case.loop.units
+def report(runs: list[Run], drawn: Any = None) -> Report:
+    """Return the Report of several runs: measures, a column for each case, and what differs."""
+    of_rig = runs[0].case.loop.units
     shown = [m for m in ms.MEASURES if all(m in r.measures for r in runs) and m not in ms.times()]
-    rows = [
-        [m, ms.unit(m, units), *(tables.entries(m, run.measures[m]) for run in runs)] for m in shown
-    ]
-    found: list[Any] = [tables.table(rows, ["measure", "unit", *(r.case.name for r in runs)])]
+    rows = [[m, ms.unit(m, of_rig), *(entries(m, run.measures[m]) for run in runs)] for m in shown]
+    words = []
     for run in runs:
-        found += [f"{run.case.name}: {line}" for line in tables.undefined(run.measures)]
+        words += [f"{run.case.name}: {line}" for line in undefined(run.measures)]
         if run.differs:
-            found.append(f"{run.case.name} has its own {', '.join(run.differs)}")
-    return found
+            words.append(f"{run.case.name} has its own {', '.join(run.differs)}")
+    errors = [
+        (run.case.name, f"{Value(run.measures['rms_error_total'], 4, of_rig[0])} rms error")
+        for run in runs
+        if "rms_error_total" in run.measures
+    ]
+    return Report(
+        f"{len(runs)} cases",
+        "the disturbances, faults and sensor noise of the first case for all",
+        errors,
+        [
+            Table(rows, ["measure", "unit", *(r.case.name for r in runs)]),
+            Text(words, on="terminal"),
+            Text(words, items=True, on="page"),
+            *figures_of(drawn or {}, CAPTIONS),
+        ],
+        subtitle=", ".join(run.case.name for run in runs),
+    )
 
 
 def json_of(runs: list[Run], seed: int) -> dict[str, Any]:
@@ -130,11 +155,11 @@ def json_of(runs: list[Run], seed: int) -> dict[str, Any]:
         rows.append(
             {
                 "case": run.case.name,
-                "measures": tables.measures_json(run.measures),
-                "units": tables.units(loop.units),
-                "reasons": tables.reasons(run.measures),
+                "measures": measures_json(run.measures),
+                "units": units(loop.units),
+                "reasons": reasons(run.measures),
                 "clock": dataclasses.asdict(run.case.clock),
-                "parameters": tables.clean(reported.lp.parameters(loop)),
+                "parameters": clean(reported.lp.parameters(loop)),
                 "differs": list(run.differs),
                 "provenance": provenance.provenance(run.case, seed),
             }
@@ -143,52 +168,19 @@ def json_of(runs: list[Run], seed: int) -> dict[str, Any]:
 
 
 def save(runs: list[Run], folder: str | Path, seed: int, command: str | None = None) -> list[Path]:
-    """Write result.json, a CSV file for each case, responses.png and report.html; return the paths.
-
-    Raises InputError for a folder that cannot be written to.
-    """
+    """Write result.json, a CSV file for each case, responses.png and report.html."""
     from jaxtank.plots import responses
 
     check_folder(folder)
-    names = {run.case.name: _file_of(run.case.name) for run in runs}
     keys = [jax.random.key(seed) if noisy(run.case) else None for run in runs]
     drawn = {r.case.name: run_for_people(r.case, key) for r, key in zip(runs, keys)}
-    files = {"result.json": tables.dumps(json_of(runs, seed)) + "\n"}
-    files |= {names[n]: csv(run, runs[0].case.loop.units) for n, run in drawn.items()}
-    title = ", ".join(drawn)
-    return write_result(
-        folder,
-        files,
-        lambda: {"responses": responses.responses(runs[0].case.loop, drawn, title)},
-        lambda pictures: _page(runs, pictures, command, json_of(runs, seed)["cases"][0]),
-    )
+    loop, title, payload = runs[0].case.loop, ", ".join(drawn), json_of(runs, seed)
+    files = {_file_of(name): csv(run, loop.units) for name, run in drawn.items()}
+    draw = lambda: {"responses": responses.responses(loop, drawn, title)}
+    page, made = lambda pictures: report(runs, pictures), payload["cases"][0]["provenance"]
+    return save_all(folder, payload, files, draw, page, command, provenance=made)
 
 
-def _file_of(name):
+def _file_of(name: str) -> str:
     """The CSV file of a case: its name without what a file name cannot hold."""
     return f"{re.sub(r'[^A-Za-z0-9._-]+', '-', name).strip('.-') or 'case'}.csv"
-
-
-def _page(runs, pictures, command, first):
-    """The page of all runs."""
-    parts = lines_of(runs)
-    return html.document(
-        f"{len(runs)} cases",
-        ", ".join(run.case.name for run in runs),
-        "the disturbances, faults and sensor noise of the first case for all",
-        True,
-        [
-            (run.case.name, f"{_error(run)} {run.case.loop.units[0]} rms error")
-            for run in runs
-            if "rms_error_total" in run.measures
-        ],
-        parts[1:],
-        html.drawings(pictures, CAPTIONS),
-        parts[:1],
-        command,
-        first["provenance"],
-    )
-
-
-def _error(run):
-    return tables.number(float(run.measures["rms_error_total"]), 4)

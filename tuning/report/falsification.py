@@ -1,16 +1,33 @@
-"""The result of an attack as text and JSON; imported by `falsification_page`."""
+"""The report of an attack: text, JSON, pictures, page and folder."""
 
+import dataclasses
 import shlex
 
 import numpy as np
 
+from jaxtank import rig as rigs
 from jaxtank.core.tree import describe, get_value
 from jaxtank.core.units import local
+from jaxtank.loop import run as lp
+from jaxtank.loop.trajectory import csv
 from jaxtank.safety.checker import OWN
 from tuning.problem import provenance
 from tuning.problem.wording import count, numbered
-from tuning.report import tables
+from tuning.report.document import Report, Text, figures_of
+from tuning.report.folder import earlier, rig_text
+from tuning.report.folder import save as save_all
 from tuning.report.safety import start_of
+from tuning.report.simulated import run_for_people
+from tuning.report.tables import Table, Value, clean
+
+REPRODUCED = 1e-9
+"""Share of a level to which the rig file must give it again."""
+
+CAPTIONS = {
+    "worst": "The case itself (dashed), and the run with the smallest margin to its limit.",
+    "ascent": "The highest level of each tank after each step of the ascent, over its limit.",
+}
+
 
 BOUND = (
     "What an attack finds is a lower bound of the worst: a limit that is not passed here may be"
@@ -32,12 +49,12 @@ def json_of(attack):
             for c in attacked.coefficients
         },
         "windows": attacked.windows,
-        "reading_band": tables.clean(attacked.band),
+        "reading_band": clean(attacked.band),
         "pumps": attacked.pumps,
         "start": attacked.start,
         "starts": attack.starts,
         "draws": attack.draws,
-        "history": tables.clean(attack.history),
+        "history": clean(attack.history),
         "remarks": remarks_of(attack),
         "wall_s": attack.wall_s,
         "provenance": provenance.provenance(case, attack.seed),
@@ -46,7 +63,7 @@ def json_of(attack):
 
 def _row(attack, one):
     """The JSON object of one tank."""
-    return tables.clean(
+    return clean(
         {
             "tank": one.tank + 1,
             "level": one.level,
@@ -121,30 +138,44 @@ def _outside(attack):
     return found
 
 
-def lines(attack):
-    """Return what is printed of an Attack: lines and Tables."""
-    worst = attack.worst
-    found = [
-        f"{attack.case.name}: attack from {count(attack.draws, 'draw')}, ascent of"
+def report(attack, drawn=None):
+    """Return the Report of an Attack."""
+    worst, case = attack.worst, attack.case
+    head = (
+        f"{case.name}: attack from {count(attack.draws, 'draw')}, ascent of"
         f" {count(attack.starts, 'start')} for each tank in {len(attack.history) - 1} steps (seed"
-        f" {attack.seed}), {attack.wall_s:.1f} s",
-        *_scope(attack),
-        "",
-        _table(attack),
-        "",
-        verdict(attack),
-        "",
-        f"The run that brings tank {worst.tank + 1} highest by its limit:",
-        _parameters(attack, worst),
-        "",
-        f"as options: {settings(attack, worst)}",
-    ]
-    if attack.case.loop.safety_filter is not None:
-        found.append(
+        f" {attack.seed}), {attack.wall_s:.1f} s"
+    )
+    options = [f"as options: {settings(attack, worst)}"]
+    if case.loop.safety_filter is not None:
+        options.append(
             "(--set also moves the intervals that the safety filter is designed for; worst.toml of"
             " --out keeps them, as faults of the nominal plant)"
         )
-    return [*found, "", *(f"- {line}" for line in remarks_of(attack))]
+    return Report(
+        f"{case.name}: attack",
+        verdict(attack),
+        [
+            ("highest level", f"{worst.level:.5g} {case.loop.units[0]} (tank {worst.tank + 1})"),
+            ("its limit", Value(worst.limit, unit=case.loop.units[0])),
+            ("time", f"{attack.wall_s:.1f} s"),
+        ],
+        [
+            Text([head, *_scope(attack)]),
+            _levels(attack),
+            Text([verdict(attack)], gap=True),
+            Text(
+                [f"The run with the smallest margin to its limit, in tank {worst.tank + 1}:"],
+                gap=True,
+            ),
+            _parameters(attack, worst),
+            Text(options, gap=True),
+            Text(remarks_of(attack), items=True, gap=True),
+            *figures_of(drawn or {}, CAPTIONS),
+        ],
+        not attack.passed,
+        case.title,
+    )
 
 
 def _scope(attack):
@@ -174,24 +205,24 @@ def _scope(attack):
     return [f"over: {', '.join(words)}", f"commands: {pumps}, {guard}"]
 
 
-def _table(attack):
-    """The levels of each tank."""
-    unit = attack.case.loop.units[0]
+def _levels(attack):
+    """The table of the levels of each tank."""
+    unit, proved = attack.case.loop.units[0], {None: "-", True: "yes", False: "no"}
     rows = [
         [
             one.tank + 1,
-            tables.number(one.limit, 6),
-            {None: "-", True: "yes", False: "no"}[one.certified],
-            *(tables.number(v, 6) for v in (one.nominal, one.drawn, one.level)),
-            f"{one.margin:.3g}",
-            tables.number(one.time_s),
+            Value(one.limit, 6),
+            proved[one.certified],
+            *(Value(v, 6) for v in (one.nominal, one.drawn, one.level)),
+            Value(one.margin, 3),
+            Value(one.time_s),
             "passed" if one.passed else "holds",
         ]
         for one in attack.found
     ]
     heads = ["tank", f"limit [{unit}]", "proved", f"nominal [{unit}]", f"draws [{unit}]"]
     heads += [f"highest [{unit}]", f"margin [{unit}]", "at [s]", ""]
-    return tables.table(rows, heads)
+    return Table(rows, heads, gap=True)
 
 
 def verdict(attack):
@@ -209,26 +240,20 @@ def verdict(attack):
 
 
 def _parameters(attack, one):
-    """The Table of the coefficients, start and mean reading errors of one run."""
+    """The table of the coefficients, start and mean reading errors of one run."""
     attacked, loop, rows = attack.attacked, attack.case.loop, []
-    known = {c.name: c for c in attacked.coefficients}
+    entries = {}  # {name: (nominal, ends, unit)}
+    for i, (start, top, band) in enumerate(zip(loop.x0, attacked.ceiling, attacked.band)):
+        ends = None if attacked.start == "own" else (0.0, top)
+        entries[f"x0[{i}]"] = (float(start), ends, local("cm", loop.units))
+        entries[f"sensor.offset[{i}]"] = (0.0, (-band, band), local("cm", loop.units))
+    for c in attacked.coefficients:
+        unit = describe(attacked.original.loop, c.name)["unit"]
+        entries[c.name] = (c.nominal, (c.low, c.high), unit)
     for name, value in attack.parameters(one).items():
-        values = value if isinstance(value, list) else [value]
-        if name in known:
-            c = known[name]
-            own, ends = c.nominal, f"{c.low:.4g} : {c.high:.4g}"
-            unit = describe(attacked.original.loop, name)["unit"]
-        else:
-            part, index = name.rstrip("]").split("[")
-            band = attacked.band[int(index)]
-            top = attacked.ceiling[int(index)]
-            own = float(loop.x0[int(index)]) if part == "x0" else 0.0
-            ends = f"0 : {top:.4g}" if part == "x0" else f"{-band:.4g} : {band:.4g}"
-            ends = "-" if part == "x0" and attacked.start == "own" else ends
-            unit = local("cm", loop.units)
-        shown = "  ".join(tables.number(v) for v in values)
-        rows.append([name, unit, tables.number(own), ends, shown])
-    return tables.table(rows, ["", "unit", "nominal", "interval", "value (in each window)"])
+        nominal, ends, unit = entries[name]
+        rows.append([name, unit, Value(nominal), Value(ends, 4, between=" : "), Value(value)])
+    return Table(rows, ["", "unit", "nominal", "interval", "value (in each window)"])
 
 
 def settings(attack, one):
@@ -241,3 +266,80 @@ def settings(attack, one):
             number = value[at] if isinstance(value, list) else value
             words.append(shlex.quote(f"{name}={number:.6g}"))
     return " ".join(f"--set {word}" for word in words)
+
+
+def runs_of(attack):
+    """Return {"nominal": Trajectory, "worst": Trajectory}, of about 3000 rows each."""
+    case, original = attack.case, attack.attacked.original
+    sensor = original.loop.sensor.without_noise()
+    quiet = original.replace(loop=dataclasses.replace(original.loop, sensor=sensor))
+    worst = case.replace(loop=attack.loop(attack.worst))
+    return {"nominal": run_for_people(quiet), "worst": run_for_people(worst)}
+
+
+def figures(attack, runs=None):
+    """Return matplotlib figures {name: Figure}: "worst" run beside the nominal one, "ascent"."""
+    import matplotlib.pyplot as plt
+
+    from jaxtank.plots import responses
+
+    runs, worst = runs or runs_of(attack), attack.worst
+    limits = np.array([one.limit for one in attack.found])
+    title = (
+        f"{attack.case.name}: tank {worst.tank + 1} reaches {worst.level:.4g}"
+        f" {attack.case.loop.units[0]}, limit {worst.limit:.4g}"
+    )
+    drawn = {"worst": responses.responses(attack.case.loop, runs, title, limits)}
+    with responses.styled():
+        figure, ax = plt.subplots(figsize=(6.0, 3.4), layout="constrained")
+        for i, limit in enumerate(limits):
+            ax.plot(attack.history[:, i] / limit, marker=".", label=f"tank {i + 1}")
+        ax.axhline(1.0, color=responses.FORBIDDEN, linewidth=1.0, label="limit")
+        ax.set(xlabel="step of the ascent", ylabel="highest level / limit [-]")
+        ax.legend()
+    return drawn | {"ascent": figure}
+
+
+def rig_of(attack):
+    """Return (text of worst.toml or None, {"level" of its run [cm], "difference" to the level that
+    was found [cm], "same": within REPRODUCED of it, "missing": what no rig file can describe}).
+    """
+    one = attack.worst
+    text, why = rig_text(attack.rig(one))
+    missing = attack.not_in_rig(one)
+    if text is None:
+        return None, {"level": None, "difference": None, "same": False, "missing": [why, *missing]}
+    case = rigs.loads(text)
+    run, _ = lp.simulate_compiled(case.loop, case.clock, None, 1)
+    level = np.asarray(run.x)[:, one.tank]
+    rising = level[1:][level[1:] > level[:-1]]
+    highest = float(rising.max()) if rising.size else float(level[-1])
+    difference = highest - one.level
+    same = abs(difference) <= REPRODUCED * one.limit
+    if not same and not missing:
+        missing = ["the safety filter, which is designed anew for this start"]
+    return text, {"level": highest, "difference": difference, "same": same, "missing": missing}
+
+
+def save(attack, folder, command=None):
+    """Write result.json, worst.toml, trajectory.csv of the worst run, pictures and report.html."""
+    text, checked = rig_of(attack)
+    runs = runs_of(attack)
+    files = {"trajectory.csv": csv(runs["worst"], attack.case.loop.units)}
+    if text is not None:
+        files["worst.toml"] = f"# {_head(attack, checked)}\n{text}"
+    payload, stale = {**json_of(attack), "rig": checked}, earlier(folder, CAPTIONS)
+    draw, page = lambda: figures(attack, runs), lambda drawn: report(attack, drawn)
+    return save_all(folder, payload, files, draw, page, command, stale)
+
+
+def _head(attack, checked):
+    """The comment of worst.toml."""
+    one, unit = attack.worst, attack.case.loop.units[0]
+    words = f"the worst found by jaxtank attack: tank {one.tank + 1} at {one.level:.10g} {unit}"
+    if checked["same"]:
+        return f"{words}, which `jaxtank simulate` of this file gives again"
+    return (
+        f"{words}; this file gives {checked['level']:.10g} {unit}: it lacks"
+        f" {', '.join(checked['missing'])}"
+    )

@@ -1,0 +1,91 @@
+"""A result as a Report: sections of texts, tables, figures and live pages, for any renderer."""
+
+import dataclasses
+import sys
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from jaxtank.core.text import one_line
+from tuning.report.tables import Table
+
+
+@dataclasses.dataclass(frozen=True)
+class Text:
+    """Sentences, each a paragraph or an item of a list; `on`: "terminal" or "page" alone."""
+
+    sentences: Sequence[str]
+    items: bool = False
+    gap: bool = False  # after an empty line on a terminal
+    heading: str = ""
+    on: str = ""
+    layout: bool = False  # columns of characters, as of equations
+
+    def lines(self, width=0):
+        """Return the lines of the sentences, wrapped to `width` characters (0: not wrapped)."""
+        first, rest = ("- ", "  ") if self.items else ("", "")
+        if not width or self.layout:
+            return [first + sentence for sentence in self.sentences]
+        style: dict[str, Any] = {"break_on_hyphens": False, "break_long_words": False}
+        style |= {"initial_indent": first, "subsequent_indent": rest}
+        return [line for s in self.sentences for line in textwrap.wrap(s, width, **style) or [""]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Figure:
+    """A matplotlib figure with its caption."""
+
+    name: str
+    caption: str
+    drawing: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Live:
+    """The live page of a result or of a Case."""
+
+    result: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """What is printed and shown of a result, as data."""
+
+    title: str
+    verdict: str
+    facts: Sequence[tuple[str, Any]]
+    sections: Sequence[Text | Table | Figure | Live]
+    good: bool = True
+    subtitle: str = ""
+    width: int = 0  # of lines on a terminal [characters]; 0: not wrapped
+    files: Mapping[str, str] = dataclasses.field(default_factory=dict)  # {heading: text}
+
+
+def terminal(report: Report) -> str:
+    """Return the text of a Report for a terminal."""
+    lines: list[str] = []
+    for section in report.sections:
+        if isinstance(section, (Figure, Live)) or section.on == "page":
+            continue
+        if (section.gap or section.heading) and lines:
+            lines.append("")
+        if section.heading:
+            lines += textwrap.wrap(section.heading, report.width or 80)
+            lines.append("=" * min(report.width or 80, len(section.heading)))
+        lines += section.lines(report.width)
+    return "\n".join(lines)
+
+
+def figures_of(drawn: Mapping[str, Any], captions: Mapping[str, str]) -> list[Figure]:
+    """Return the Figures of {name: matplotlib figure}."""
+    return [Figure(name, captions[name], drawing) for name, drawing in drawn.items()]
+
+
+def failed(name: str, error: Exception, *drawings: Any) -> None:
+    """Report on stderr that the picture `name` could not be drawn, and close its figures."""
+    import matplotlib.pyplot as plt
+
+    for drawing in drawings:
+        plt.close(drawing)
+    why = f"{type(error).__name__}: {one_line(error, 200)}"
+    print(f"jaxtank: note: {name} could not be drawn ({why})", file=sys.stderr)

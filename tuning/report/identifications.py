@@ -1,0 +1,178 @@
+"""The report of Identifications: many records, each fitted separately."""
+
+import csv
+import io
+
+import numpy as np
+
+from tuning.problem import provenance
+from tuning.problem.wording import count
+from tuning.report.document import Report, Text, figures_of
+from tuning.report.folder import save as save_all
+from tuning.report.tables import Table, Value, clean
+
+CAPTIONS = {
+    "estimates": "Estimate of each record with its 95 % interval; a record without an interval is a"
+    " cross."
+}
+LISTED = 12
+"""Most records that are printed one by one; `estimates.csv` has all of them."""
+
+
+def labels(fits):
+    """Return a name of each record that no other has."""
+    if len(set(fits.logs)) == len(fits.logs):
+        return list(fits.logs)
+    return [f"{name} {e + 1}" for e, name in enumerate(fits.logs)]
+
+
+def report(fits, drawn=None):
+    """Return the Report of Identifications."""
+    converged, records = int(fits.converged.sum()), count(len(fits), "record")
+    head = (
+        f"{fits.case.name}: {records}, each fitted separately; {converged} converged,"
+        f" {fits.iterations} iterations at most"
+    )
+    good = converged == len(fits)
+    return Report(
+        f"{fits.case.name}: {len(fits)} records identified",
+        "converged" if good else "not every fit converged",
+        [("records", len(fits)), ("converged", converged)],
+        [
+            Text([head]),
+            _summary(fits),
+            *([_records(fits)] if len(fits) <= LISTED else []),
+            Text(_residuals(fits), gap=True),
+            Text([f"{fits.wall_s:.1f} s"], gap=True),
+            *figures_of(drawn or {}, CAPTIONS),
+        ],
+        good,
+    )
+
+
+def _summary(fits):
+    """Return the table of the parameters over all records."""
+    rows = []
+    for i, (name, unit) in enumerate(zip(fits.names, fits.units)):
+        values, certain = fits.values[:, i], fits.sd[:, i][np.isfinite(fits.sd[:, i])]
+        spread = values.std(ddof=1) if len(values) > 1 else None
+        mean = certain.mean() if certain.size else None
+        cells = [Value(values.mean()), Value(spread, 2), Value(mean, 2)]
+        rows.append([name, unit, *cells, f"{certain.size} of {len(fits)}"])
+    head = ["parameter", "unit", "mean", "sd over records", "mean sd of a fit", "with an interval"]
+    return Table(rows, head, gap=True)
+
+
+def _records(fits):
+    """Return the table of the estimates of each record, with their standard deviations."""
+    heads = [f"{n} [{u}]" for n, u in zip(fits.names, fits.units)]
+    rows = []
+    for e, name in enumerate(labels(fits)):
+        pairs = zip(fits.values[e], fits.sd[e])
+        deviations = ((v, f"sd {sd:.2g}" if np.isfinite(sd) else "no interval") for v, sd in pairs)
+        estimates = [f"{value:.5g} ({sd})" for value, sd in deviations]
+        rows.append([name, "yes" if fits.converged[e] else "NO", *estimates])
+    return Table(rows, ["record", "converged", *heads], gap=True)
+
+
+def _residuals(fits):
+    """Return a line a channel: residuals over all records."""
+    words = []
+    for c, (name, unit) in enumerate(fits.channels):
+        rmse, rho = (x[:, c][np.isfinite(x[:, c])] for x in (fits.rmse, fits.autocorrelation))
+        mean = f", mean correlation from sample to sample {rho.mean():.2f}" if rho.size else ""
+        if rmse.size:
+            span = f"{rmse.min():.3g} to {rmse.max():.3g}"
+            words.append(f"{name}: residual {span} {unit} RMS{mean}")
+    return words
+
+
+def json_of(fits):
+    """Return a JSON object: the estimates of every record, null where there is no interval."""
+    return {
+        "case": fits.case.name,
+        "success": bool(fits.converged.all()),
+        "channels": [{"name": n, "unit": u} for n, u in fits.channels],
+        "records": [_record(fits, e, name) for e, name in enumerate(labels(fits))],
+        "iterations": int(fits.iterations),
+        "wall_s": fits.wall_s,
+        "provenance": provenance.provenance(fits.case, None),
+    }
+
+
+def _record(fits, e, name):
+    """Return the JSON object of record e."""
+    interval = np.isfinite(fits.interval95[e]).all(axis=-1)
+    return clean(
+        {
+            "name": name,
+            "converged": bool(fits.converged[e]),
+            "parameters": {
+                parameter: {
+                    "value": float(fits.values[e, i]),
+                    "unit": fits.units[i],
+                    "sd": float(fits.sd[e, i]),
+                    "interval95": fits.interval95[e, i].tolist() if interval[i] else None,
+                }
+                for i, parameter in enumerate(fits.names)
+            },
+            "covariance": fits.covariance[e].tolist(),
+            "initial_levels": [
+                {"value": float(value), "sd": float(sd)}
+                for value, sd in zip(fits.levels[e], fits.levels_sd[e])
+            ],
+            "fit": {
+                "rmse": fits.rmse[e].tolist(),
+                "residual_autocorrelation": fits.autocorrelation[e].tolist(),
+            },
+        }
+    )
+
+
+def figures(fits):
+    """Return {"estimates": matplotlib Figure}: each parameter over the records."""
+    from jaxtank.plots import style
+
+    columns = min(3, len(fits.names))
+    rows = -(-len(fits.names) // columns)
+
+    def draw(axes):
+        for i, ax in enumerate(axes.flat):
+            if i >= len(fits.names):
+                ax.set_axis_off()
+                continue
+            record, values = np.arange(1, len(fits) + 1), fits.values[:, i]
+            certain = np.isfinite(fits.interval95[:, i]).all(axis=-1)
+            ax.vlines(record[certain], *fits.interval95[certain, i].T, lw=1.0, color=style.AFTER)
+            ax.plot(record[certain], values[certain], ".", ms=4, color=style.AFTER)
+            ax.plot(record[~certain], values[~certain], "x", ms=4, color=style.BEFORE)
+            label = style.plain(f"{fits.names[i]} [{fits.units[i]}]")
+            ax.set(xlabel="record", ylabel=label)
+
+    title, size = f"{fits.case.name}: estimates of {len(fits)} records", (3.4 * columns, 2.4 * rows)
+    return {"estimates": style.picture(draw, size, rows, columns, title=title, squeeze=False)}
+
+
+def estimates_csv(fits):
+    """Return CSV text, a row a record: name, convergence, estimates, deviations, levels."""
+    length = fits.case.loop.units[0]
+    heads = ["record", "converged"]
+    for name, unit in zip(fits.names, fits.units):
+        heads += [f"{name} [{unit}]", f"sd of {name} [{unit}]"]
+    heads += [f"h{i + 1} at the first sample [{length}]" for i in range(fits.levels.shape[1])]
+    heads += [f"RMS residual of {name} [{unit}]" for name, unit in fits.channels]
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(heads)
+    for e, name in enumerate(labels(fits)):
+        pairs = np.column_stack([fits.values[e], fits.sd[e]]).ravel()
+        numbers = [*pairs, *fits.levels[e], *fits.rmse[e]]
+        cells = ["" if np.isnan(v) else f"{v:.10g}" for v in numbers]
+        writer.writerow([name, int(fits.converged[e]), *cells])
+    return out.getvalue()
+
+
+def save(fits, folder, command=None):
+    """Write result.json, estimates.csv, estimates.png and report.html; return their paths."""
+    files, page = {"estimates.csv": estimates_csv(fits)}, lambda drawn: report(fits, drawn)
+    return save_all(folder, json_of(fits), files, lambda: figures(fits), page, command)

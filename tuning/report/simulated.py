@@ -1,0 +1,233 @@
+"""The report of a simulated run: text, stability margins, pictures, page, film and folder."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxtank import measures as ms
+from jaxtank.core.errors import InputError
+from jaxtank.core.files import check_folder, write_folder
+from jaxtank.core.units import local
+from jaxtank.loop import run as lp
+from jaxtank.loop.trajectory import csv, stride
+from tuning.problem.limits import resolve_limits
+from tuning.report.document import Live, Report, Text, failed, figures_of
+from tuning.report.folder import save as save_all
+from tuning.report.tables import (
+    MANY,
+    Table,
+    Value,
+    clean,
+    entries,
+    measure_table,
+    number,
+    undefined,
+)
+
+CAPTIONS = {
+    "responses": "Levels with setpoints and rims, and the inputs of the pumps.",
+    "estimates": "What the observer estimated: levels with their readings, and disturbances of"
+    " their rates with the inflow disturbance, where there is one; they hold all errors of the"
+    " model.",
+    "shares": "The share of each of the two blended controllers in each input: the first acts far"
+    " from the setpoint, the second near it.",
+}
+
+WORST = 12
+"""Limits that are listed where there are many: the tightest ones."""
+
+
+def run_for_people(case, key=None, rows=3000):
+    """A Trajectory of about `rows` rows, as host arrays."""
+    every = stride(case.clock.samples, rows)
+    return jax.tree.map(np.asarray, lp.simulate(case.loop, case.clock, key, save_every=every))
+
+
+def report(case, values, plateaus=None, drawn=None):
+    """Return the Report of a run with the measures `values`."""
+    rows, loop = _limits(case, values), case.loop
+    broken = [words for words, margin in rows if not margin >= 0.0]
+    facts = [
+        (name, f"{entries(name, values[name])} {ms.unit(name, loop.units)}".strip())
+        for name in case.objective
+        if name in values
+    ]
+    facts += [("length", f"{case.clock.duration:g} s"), ("sampled every", f"{case.clock.dt:g} s")]
+    sections = [
+        Live(case),
+        Text([f"{case.name}: {case.title}"], on="terminal"),
+        measure_table(values, loop.units, gap=True),
+        Text(undefined(values)),
+        *(_margins(loop, plateaus) if plateaus is not None else ()),
+        Text([words for words, _ in rows], items=True, on="page"),
+        *figures_of(drawn or {}, CAPTIONS),
+    ]
+    if loop.safety_filter is not None:
+        words = "The safety filter is on: jaxtank show prints what is proved of each tank."
+        sections.append(Text([words], gap=True, on="terminal"))
+    verdict = "; ".join(broken) if broken else "every limit holds" if rows else "no limits"
+    return Report(case.name, verdict, facts, sections, not broken, case.title)
+
+
+def _limits(case, values):
+    """[(sentence, margin)] of the limits that the measures show."""
+    rows = []
+    for limit in resolve_limits(case):
+        if limit.measure in values:
+            margin = limit.margin(values)
+            value = float(np.ravel(values[limit.measure])[limit.index])
+            side = "holds" if margin >= 0.0 else "is passed"
+            unit = ms.unit(limit.measure, case.loop.units)
+            most = f"{number(float(limit.value))} {unit}"
+            words = f"{limit.label}: {number(value)} {unit}, the limit of {most} {side}"
+            rows.append((words, margin))
+    if len(rows) > MANY:  # the tightest ones
+        rows = sorted(rows, key=lambda row: row[1])
+        rows, rest = rows[:WORST], rows[WORST:]
+        passed = sum(not margin >= 0.0 for _, margin in rest)
+        words = f"{len(rest)} further limits have larger margins"
+        rows.append((words + (f", and {passed} of them are passed" if passed else ""), rest[0][1]))
+    return rows
+
+
+def margins_json(plateaus):
+    """Return the list `margins` of the JSON of `simulate`: an object for each plateau."""
+    rows = []
+    for p in plateaus:
+        values = {m: v for m, v in p.margins._asdict().items() if m != "stable"}
+        row = {"setpoints": p.setpoints, "levels": p.x, "inputs": p.u, "stable": p.stable}
+        rows.append(clean({**row, "why": p.why or None, **values}))
+    return rows
+
+
+def _margins(loop, plateaus):
+    """Sections on the stability margins at each plateau, the worst one marked."""
+    if not plateaus:
+        return [Text(["no stability margins: the reference holds no setpoints"], gap=True)]
+    stable = [p for p in plateaus if p.stable]
+    worst = max(stable, key=lambda p: float(p.margins.sensitivity_peak), default=None)
+    rows, notes = [], []
+    for p in plateaus:
+        name = f"{Value(p.setpoints, 6, loop.units[0], ', ')}"
+        if p.why:
+            notes.append(f"{name}: no margins, {p.why}")
+        elif not p.stable:
+            notes.append(f"{name}: the linearised loop is unstable")
+        else:
+            m = p.margins
+            several = (m.gain_margin, m.phase_margin, m.delay_margin)
+            cells = [Value(m.sensitivity_peak, 3), *(Value(v, 3, missing="any") for v in several)]
+            rows.append([name + (" (worst)" if p is worst else ""), *cells])
+    heads = ["setpoints", "Ms [-]", "gain margin [-]", "phase margin [deg]", "delay margin [s]"]
+    title = "stability margins of the linearised loop, one pump at a time (Ms: all)"
+    return [Text([title], gap=True), *([Table(rows, heads)] if rows else []), Text(notes)]
+
+
+def save(
+    case, run, payload, folder, page=None, command=None, gif=False, against=None, columns=None
+):
+    """Write result.json, trajectory.csv, pictures and report.html of one simulation to `folder`,
+    from which those of an earlier one are removed; if asked, a film and the responses for a
+    journal of `columns`.
+    """
+    # page: function of the pictures that returns the Report; against: (Case, Trajectory) of a rig
+    # that the film, run.gif, and its still, film.png, show beside it.
+    from jaxtank.plots import responses
+
+    check_folder(folder)
+    # of an earlier run, known by its trajectory: its tanks must not be taken for those of this one
+    old = (Path(folder) / "trajectory.csv").exists()
+    names = "responses.png estimates.png shares.png run.gif film.png report.html print.svg"
+    stale = [Path(folder) / name for name in f"{names} print.png".split()] if old else []
+
+    def draw():
+        return {
+            "responses": responses.responses(case.loop, {case.name: run}, case.title),
+            **estimates(case.loop, case.clock, run, f"{case.name}: estimates"),
+            **shares(run, f"{case.name}: shares of the blended controllers"),
+        }
+
+    files = {"trajectory.csv": csv(run, case.loop.units)}
+    written = save_all(folder, payload, files, draw, page, command, stale)
+    if columns is not None:
+        written += _for_journal(case, run, folder, columns)
+    if gif:
+        from jaxtank.plots.animation import film
+
+        cases = [case, *([] if against is None else [against[0]])]
+        beside = None if against is None else (against[0].loop, against[1])
+        try:
+            moving, still = film(case.loop, run, against=beside, titles=_titles(cases))
+        except Exception as error:
+            failed("run.gif", error)
+        else:
+            written += write_folder(Path(folder), {"run.gif": moving, "film.png": still})
+    return written
+
+
+def _titles(cases):
+    """Names of the cases of a film, with the safety filter where not all of them have one."""
+    some = len({case.loop.safety_filter is None for case in cases}) > 1
+    filtered = lambda case: some and case.loop.safety_filter is not None
+    return tuple(case.name + ", safety filter" * filtered(case) for case in cases)
+
+
+def _for_journal(case, run, folder, columns):
+    """Write the responses of a run for a journal; returns the paths."""
+    from jaxtank.plots import responses
+    from jaxtank.plots.run import save_for_print
+
+    try:
+        with responses.for_print(columns):
+            figure = responses.responses(case.loop, {case.name: run})
+        return save_for_print({"print": figure}, folder, columns)
+    except InputError:
+        raise
+    except Exception as error:
+        failed("print.svg", error)
+        return []
+
+
+def estimates(loop, clock, run, title=""):
+    """Return {"estimates": levels and disturbances as the observer estimated them}."""
+    # {} where the controller takes the levels as they are measured.
+    from jaxtank.plots import diagnostics, style
+
+    tanks, disturbed = loop.plant.tanks, bool(np.any(run.d_hat))
+    if not disturbed and np.array_equal(run.x_hat, run.y):
+        return {}
+    inflow = [None] * tanks
+    if loop.disturbance is not None and not callable(loop.plant.area):
+        index = np.clip(np.rint(np.asarray(run.t) / clock.dt).astype(int), 0, clock.samples - 1)
+        flows = loop.disturbance.sample(clock)[0]
+        inflow = [np.asarray(d)[index] / a for d, a in zip(flows, np.asarray(loop.plant.area))]
+
+    def draw(axes):
+        for i in range(tanks):
+            diagnostics.estimate(axes[0, i], run, i, loop.units[0])
+            if disturbed:
+                diagnostics.disturbance(axes[1, i], run, i, inflow[i], local("cm/s", loop.units))
+            axes[-1, i].set_xlabel("time [s]")
+
+    rows = 2 if disturbed else 1
+    size = (max(6.4, 3.2 * tanks), 2.3 * rows + 0.5)
+    of = {"legend": 5, "title": title, "sharex": True, "squeeze": False}
+    return {"estimates": style.picture(draw, size, rows, tanks, **of)}
+
+
+def shares(run, title=""):
+    """Return {"shares": share of two blended controllers in each input}; {} without any."""
+    from jaxtank.plots import diagnostics, style
+
+    if run.share is None:
+        return {}
+    pumps = run.share.shape[1]
+
+    def draw(axes):
+        for j, ax in enumerate(axes[0]):
+            diagnostics.share(ax, run, j)
+            ax.set_xlabel("time [s]")
+
+    size, of = (max(6.4, 3.2 * pumps), 2.9), {"legend": 2, "title": title, "squeeze": False}
+    return {"shares": style.picture(draw, size, 1, pumps, **of)}

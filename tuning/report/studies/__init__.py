@@ -1,1 +1,0 @@
-"""Reports of studies of many runs: uncertainty and sensitivity."""

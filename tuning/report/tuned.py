@@ -1,0 +1,701 @@
+"""The report of a tuning result: text, JSON, pictures, page and folder."""
+
+import dataclasses
+import warnings
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxtank import measures as ms
+from jaxtank.loop.trajectory import csv
+from tuning.answer.setting import limited_levels
+from tuning.problem.problem import TAIL
+from tuning.problem.wording import numbered
+from tuning.report import optimal_input
+from tuning.report.document import Live, Report, Text, figures_of, terminal
+from tuning.report.folder import earlier, rig_text
+from tuning.report.folder import save as save_all
+from tuning.report.safety import PROMISE, start_of
+from tuning.report.simulated import estimates, run_for_people
+from tuning.report.tables import (
+    Table,
+    Value,
+    clean,
+    cost_unit,
+    measures_json,
+    number,
+    numbers,
+    objective_unit,
+    reasons,
+    undefined,
+    units,
+)
+from tuning.search.result import Message
+
+COSTLIEST, MANY = 5, 12
+"""Scenarios in a table that would have more than MANY rows."""
+
+MATTERS = 0.05
+"""Share of the plants that a need must concern to be a row [-]."""
+
+SIDES = ("before", "after")
+
+CAPTIONS = {
+    "responses": "The run before tuning (orange, dashed) and after (blue): controlled levels with"
+    " their setpoints, tracking errors, the other tanks, and the pump inputs. Shaded: beyond a"
+    " limit.",
+    "margins": "Margin of the tuned run to each limit: left of zero the limit is broken.",
+    "inner": "The tanks without a setpoint, one against the other, from the dot to the square.",
+    "saturation": "When pumps were commanded beyond their limits: upwards above the upper limit,"
+    " downwards below the lower one; the height is the share of the time.",
+    "estimates": "Estimates of the observer and true values, in the tuned run.",
+    "clouds": "Validation runs, on perturbed plants and with new sensor noise where the case has"
+    " them: one dot a run, before tuning on the horizontal axis, after it on the vertical one.",
+    "convergence": "Every evaluation of the search in its order.",
+    "landscape": "The objective around the tuned values, at the case's own step.",
+    "tradeoff": "The least objective that was found under each value of the limit.",
+    "rig": "The rig, drawn from its own topology; triangles are setpoints, a heavier outline is a"
+    " tank that is controlled.",
+}
+
+
+def json_of(result):
+    """The JSON object of `jaxtank tune --json`."""
+    answer = result.answer
+    parts: dict[str, Any] = dict.fromkeys(("holds", "feasibility", "answer"))
+    if answer is not None:
+        feasibility = None if answer.feasibility is None else answer.feasibility.to_json()
+        parts = {"holds": answer.holds(), "feasibility": feasibility, "answer": answer.to_json()}
+    return {
+        "case": result.tuned.name,
+        "method": result.method,
+        "success": result.success,
+        "status": str(result.status),
+        "headline": result.headline,
+        "message": result.message,
+        "messages": [{"code": m.code, "text": m.text} for m in result.messages],
+        "parameters": {n: {**clean(p), "interval": None} for n, p in result.parameters.items()},
+        "interval_reason": "no measurements were fitted, so there is no confidence interval",
+        "objective": {k: clean(result.objective[k]) for k in ("before", "after", "terms")},
+        "measures": {side: measures_json(result.measures[side]) for side in SIDES},
+        "reasons": {**reasons(result.measures["before"]), **reasons(result.measures["after"])},
+        "units": units(result.tuned.loop.units),
+        "constraints": clean([c.to_json() for c in result.constraints]),
+        "evaluations": result.evaluations,
+        "scenarios": scenario_rows(result),
+        "starts": clean(result.starts),
+        "symmetry": clean(result.symmetry),
+        "choices": clean(result.choices),
+        "optimality": clean(result.optimality),
+        "slopes": {where: check.to_json() for where, check in result.slopes.items()},
+        "curvature": clean(result.curvature),
+        "tradeoff": clean(result.tradeoff),
+        "certificate": None if result.certificate is None else result.certificate._asdict(),
+        "wall_s": result.wall_s,
+        **parts,
+        "bound": None if result.bound is None else clean(result.bound.to_json()),
+        "validation": clean(result.validation),
+        "provenance": result.provenance,
+    }
+
+
+def report(result, drawn=None):
+    """Return the Report of a TuningResult, with its pictures {name: figure}."""
+    answer, rig = result.answer, None if drawn is None else rig_of(result)[0]
+    broken = [c for c in result.constraints if c["margin"] < 0]
+    holds = "; every limit holds" if result.constraints and not broken else ""
+    if answer is None:
+        sections = sections_of(result)
+    else:
+        sections = [Text([_headline(result)], on="terminal"), *of_answer(answer, result)]
+        if drawn is not None:  # measures that a terminal does not show are computed for the page
+            sections += [dataclasses.replace(s, on="page") for s in sections_of(result)[1:]]
+    notes = Text([m.text for m in result.messages], items=True)
+    return Report(
+        f"{result.tuned.name}: tuned",
+        result.headline.replace("_", " ") + holds,
+        _facts(result, len(broken)),
+        [Live(result), *sections, notes, *figures_of(drawn or {}, CAPTIONS)],
+        result.success,
+        result.case.title,
+        0 if answer is None else 80,
+        {"The tuned rig as a file (rig.toml)": rig} if rig else {},
+    )
+
+
+def _facts(result, broken):
+    """(name, value) of what stands at the top of the page; broken: limits that are violated."""
+    # Of a default answer the errors in the unit of the levels, unless the user has minimised
+    # something else.
+    unit, answer = cost_unit(result).replace("-", ""), result.answer
+    before, after = result.objective["before"], result.objective["after"]
+    held = f"{len(result.constraints) - broken} of {len(result.constraints)} hold"
+    facts: list[Any] = [
+        (f"objective {side}", Value(result.objective[side], unit=unit)) for side in SIDES
+    ]
+    if answer and not answer.setting.own_objective and answer.after is not None:
+        length, sides = answer.setting.case.loop.units[0], (answer.before, answer.after)
+        joined = {"digits": 3, "unit": length, "between": " -> "}
+        means = [_mean(s.error, s).value for s in sides]
+        facts = [
+            (f"error, mean of {answer.after.samples} plants", Value(means, **joined)),
+            ("error, nominal plant", Value(list(answer.nominal.values()), **joined)),
+        ]
+    facts += [
+        ("limits", held if result.constraints else "none"),
+        ("gains tuned", sum(p["exercised"] for p in result.parameters.values())),
+        ("simulations", result.evaluations["simulations"]),
+        ("time", f"{result.wall_s:.1f} s"),
+    ]
+    kept = result.validation["limits_held"] if result.validation else {}
+    if answer and result.constraints and None not in kept.values():
+        shares = Value([100 * share for share in kept.values()], 3, "%", " % -> ")
+        facts[2] = ("plants that keep every limit", shares)
+    elif np.isfinite(before) and before and not broken:
+        facts.insert(2, ("change", f"{100 * (after / before - 1):+.3g} %"))
+    return facts
+
+
+def of_answer(answer, result=None):
+    """Return the sections on an Answer; with the values to set of its result, where given."""
+    sections = []
+    if answer.mended is not None:
+        sections.append(Text([f"mended first: {answer.mended.words}"]))
+    if answer.feasibility is not None and answer.feasibility.infeasible_for_any_controller > 0:
+        sections += _beyond(answer.feasibility)
+    if result is not None:
+        sections.append(_values(result, answer))
+    sections.append(_effects(answer, gap=result is not None))
+    proved = [row.starts for row in answer.setting.certificates if row.certified]
+    if proved:
+        sections.append(Text([f"proved: {PROMISE}, {start_of(proved)}"], gap=True))
+    return sections
+
+
+def answer_text(answer):
+    """Return the text of an Answer alone."""
+    return terminal(Report("default answer", "", (), of_answer(answer), width=80))
+
+
+def _beyond(feasibility):
+    """What no gain can change: the needs of MATTERS of the plants at least, and what would."""
+    unit = feasibility.case.loop.units[0]
+    rows = [
+        [
+            Value(row.setpoints, 6, unit, ", "),
+            f"tank {row.tank}" if row.pump is None else f"pump {row.pump}",
+            *(Value(v, 3, row.unit) for v in (row.needed, row.needed_p95, row.limit)),
+            f"{100 * row.share:.0f} %",
+        ]
+        for row in feasibility.plateaus
+        if row.share >= MATTERS
+    ]
+    share = number(100 * feasibility.infeasible_for_any_controller, 2)
+    text = f"No controller can hold every setpoint on {share} % of {feasibility.samples} plants"
+    sections: list[Any] = [Text([text + " within the limits" + (":" if rows else ".")])]
+    if rows:
+        heads = ["setpoints", "", "needs", "95 % need", "limit", "plants that cannot"]
+        sections.append(Table(rows, heads))
+    if feasibility.mends:  # that of the setpoints is long: JSON and feasibility page have it
+        kinds = [
+            f"--mend {m.what}" + (f" ({m.words})" if m.what != "setpoints" else "")
+            for m in feasibility.mends
+        ]
+        sections.append(Text([f"95 % of the plants can follow with {' or '.join(kinds)}"]))
+    return sections
+
+
+def _headline(result):
+    """One sentence on the outcome."""
+    answer, status = result.answer, result.headline.replace("_", " ")
+    start = f"{result.tuned.name}: {status}"
+    if answer.after is None:
+        return f"{start}; no validation plants ({result.wall_s:.1f} s)"
+    held, samples = int(answer.after.held.sum()), answer.after.samples
+    on = f"; limits hold on {held} of {samples} {answer.setting.runs}"
+    limited = on if answer.after.limits else ""
+    tanks = [r.tank + 1 for r in answer.setting.certificates if r.certified]
+    proved = f", proved for {numbered('tank', tanks)}" if tanks and limited else ""
+    changed = sum(not stays for stays in answer.kept.values())
+    gains = f"; {changed} of {len(answer.kept)} gains changed" if answer.kept else ""
+    return f"{start}{limited}{proved}{gains} ({result.wall_s:.1f} s)"
+
+
+def _values(result, answer):
+    """The table of what to set."""
+    rows = []
+    for name, p in result.parameters.items():
+        remark = "kept (a change gains little)" if answer.kept.get(name, False) else ""
+        remark = remark if p["exercised"] else "kept: no effect in any run"
+        remark = f"at its {p['at_bound']} bound" if p["at_bound"] and not remark else remark
+        rows.append([f"{name} [{p['unit']}]", *(Value(p[s], 4) for s in SIDES), remark])
+    loop = result.case.loop
+    row = ["safety filter", "off" if loop.safety_filter is None else "on", "off", ""]
+    if answer.setting.filter is not None:
+        chosen = answer.setting.searched.loop.safety_filter
+        rate, band = float(np.max(chosen.rate)), float(np.max(chosen.band))
+        row[2:] = ["on", f"rate {rate:.3g} 1/s, noise band {band:.3g} {loop.units[0]}"]
+    return Table([*rows, row], ["what to set", "was", "now", ""])
+
+
+def _effects(answer, gap):
+    """The table of what the answer gives, before and after, on the plants that judged it."""
+    unit, terms = answer.setting.case.loop.units[0], answer.setting.objective
+    sides = [side for side in (answer.before, answer.after) if side is not None]
+    n, rows = answer.before.samples, []
+    if answer.setting.own_objective:
+        of = objective_unit(terms, answer.setting.case.loop.units)
+        name = f"objective{f' {next(iter(terms))}' if len(terms) == 1 else ''}, mean of {n} plants"
+        name += "" if of == "-" else f" [{of}]"
+        rows.append([name, *(_mean(s.cost, s) for s in sides)])
+    rows.append([f"error, mean of {n} plants [{unit}]", *(_mean(s.error, s) for s in sides)])
+    cannot = answer.before.infeasible
+    if cannot is not None and cannot.any() and not cannot.all():
+        able = f"  on those that can follow ({100 * np.mean(~cannot):.0f} %)"
+        rows.append([able, *(_mean(s.error[~cannot], s, of=~cannot) for s in sides)])
+    rows.append([f"error, nominal plant [{unit}]", *(Value(e, 3) for e in answer.nominal.values())])
+    rows += _margins(answer)
+    if answer.before.limits:
+        broken = [f"{100 * (1 - s.held.mean()):.3g} %" for s in sides]
+        rows.append(["plants that violate a limit", *broken])
+    limited = np.isfinite(limited_levels(answer.setting.case))
+    if limited.any():
+        levels = [s.level[~s.failed][:, limited] for s in sides]
+        highest = [Value(v.max() if v.size else np.nan, 4) for v in levels]
+        rows.append([f"highest level [{unit}]", *highest])
+    changes = [_mean(100 * s.travel, s, 2) for s in sides]
+    rows.append(["rms change of input per sample [% of range]", *changes])
+    return Table(rows, ["what it gives", "before", "now"][: 1 + len(sides)], gap)
+
+
+def _margins(answer):
+    """The rows of the sensitivity peak and the delay margin of the linearised nominal loop."""
+    sides = [m for m in answer.measures.values() if "sensitivity_peak" in m]
+    if not sides or not any(np.isfinite(m["sensitivity_peak"]) for m in sides):
+        return []
+    peaks = [float(m["sensitivity_peak"]) for m in sides]
+    delays = [float(np.min(m["delay_margin"])) for m in sides]
+    cells = [Value(p, 3, missing="unstable" if p == np.inf else "-") for p in peaks]
+    rows = [["sensitivity peak Ms, nominal plant [-]", *cells]]
+    if any(np.isfinite(delays)):
+        cells = [Value(d, 3, missing="any" if d == np.inf else "-") for d in delays]
+        rows.append(["delay margin, nominal plant [s]", *cells])
+    return rows
+
+
+def _mean(values, judged, digits=3, of=slice(None)):
+    """The mean over the plants, or those `of` them, whose run is finite."""
+    good = values[~judged.failed[of]]
+    return Value(good.mean() if good.size else np.nan, digits)
+
+
+def sections_of(result):
+    """Return every table of a TuningResult, but for its messages."""
+    counts, loop = result.evaluations, result.tuned.loop
+    head = (
+        f"{result.tuned.name}: {result.headline} ({result.method}, {counts['simulations']}"
+        f" simulations, {counts['gradients']} of them with gradients, {result.wall_s:.1f} s)"
+    )
+    sections = [Text([head], on="terminal"), _parameter_table(result), *_measure_table(result)]
+    sections += _limit_table(result) + _scenario_table(result) + _validation_table(result)
+    sections += _choice_table(result) + _tradeoff_table(result)
+    if result.bound is not None:
+        first, *others = optimal_input.report(result.bound).sections
+        sections += [dataclasses.replace(first, gap=True), *others]
+    if loop.plant.overflow:
+        rims = "overflow is simulated: liquid above a rim leaves its tank"
+    elif not any(limit["measure"] == "max_level" for limit in result.constraints):
+        rims = (
+            "overflow is not simulated and no level limit is set: a level above its rim is not"
+            " reported"
+        )
+    elif loop.safety_filter is not None:
+        rims = "rims are limits, for which a safety filter caps the pumps"
+    else:
+        rims = "rims are limits only: overflow is not simulated, and a level may rise above its rim"
+    return [*sections, Text([f"{rims}; evaluated at dt = {result.tuned.clock.dt:g} s"], gap=True)]
+
+
+def _parameter_table(result):
+    """Every free parameter before and after, its range, and the sensitivity of the objective."""
+    rows = []
+    for name, p in result.parameters.items():
+        remark = f"at {p['at_bound']} bound" if p["at_bound"] else ""
+        ends = Value([p["lower"], p["upper"]], between=" : ")
+        change = Value(p["sensitivity_percent"], 2, "%")
+        remark = remark if p["exercised"] else "without effect, kept"
+        rows.append([name, p["unit"], Value(p["before"]), Value(p["after"]), ends, change, remark])
+    heads = ["parameter", "unit", "before", "after", "range", "10 % of it changes the objective by"]
+    return Table(rows, [*heads, ""], gap=True)
+
+
+def _measure_table(result):
+    """The objective and the measures of the case's own run, and a line on which run they are of."""
+    units, objective, measures = result.tuned.loop.units, result.objective, result.measures
+    rows = [["objective", cost_unit(result), *(Value(objective[side]) for side in SIDES)]]
+    shown = []
+    for m in (*ms.placed("shown"), *ms.functions(measures["after"])):
+        if m not in measures["after"] or (m == "rms_error_total" and {*objective["terms"]} == {m}):
+            continue
+        shown.append(m)
+        after = numbers(measures["after"][m], 5 if "level" in m else 4)
+        rows.append([m, ms.unit(m, units), numbers(measures["before"][m], 4), after])
+    terms = " + ".join(m if w == 1 else f"{w:g} {m}" for m, w in objective["terms"].items())
+    runs = _runs_of(result, len(rows) > 1)
+    before, after = ({m: measures[side][m] for m in shown} for side in SIDES)
+    lines = ["; ".join([f"objective: {terms}", *runs]), *_notes(before, after, units)]
+    return [Table(rows, ["measure", "unit", "before", "after"], gap=True), Text(lines)]
+
+
+def _notes(before, after, units):
+    """Return sentences on entries that are not plain numbers: undefined ones, negative times."""
+    early, late = undefined(before), undefined(after)
+    words = [line for line in early if line in late]
+    words += [f"before, {line}" for line in early if line not in late]
+    words += [f"after, {line}" for line in late if line not in early]
+    times = [side["settling_time"] for side in (before, after) if "settling_time" in side]
+    if any(np.any(np.asarray(v) < 0) for v in times):
+        words.append(
+            f"settling_time: a negative time [{ms.unit('settling_time', units)}] is one before the"
+            " end of the change of the setpoint"
+        )
+    return words
+
+
+def _limit_table(result):
+    """Every limit in its worst scenario: value, margin, and when it was reached."""
+    rows = [
+        [
+            c["name"],
+            c["unit"],
+            (">= " if ms.MEASURES[c["measure"]].sense < 0 else "<= ") + number(c["limit"], 7),
+            Value(c["value"], 7),
+            Value(c["margin"], 3) if c["reason"] is None else "undefined",
+            f"{c['time_s']:.2f} s" if c["time_s"] is not None else "-",
+        ]
+        for c in worst_of_scenarios(result.constraints)
+    ]
+    heads = ["limit", "unit", "limit", "value", "margin", "reached at"]
+    return [Table(rows, heads, gap=True)] if rows else []
+
+
+def _runs_of(result, others):
+    """Return a line on the runs that the objective is of, where these are scenarios."""
+    problem = result.problem
+    if not problem.scenarios:
+        return []
+    what = "plants" if result.certificate is not None else "scenarios"
+    weighted = len({run.weight for run in problem.runs}) > 1
+    of = {
+        "mean": "the weighted mean" if weighted else "the mean",
+        "cvar": f"the mean of the worst {100 * TAIL:g} %",
+        "worst": "the worst",
+    }
+    rest = "; the other rows: the case's own run, on its own plant" if others else ""
+    return [f"{of[problem.risk]} of {len(problem.runs)} {what}{rest}"]
+
+
+def worst_of_scenarios(constraints):
+    """Return of the rows of `constraints` that differ by their scenario alone the worst ones."""
+    worst = {}
+    for c in constraints:
+        same = (c["measure"], c["tank"], c["pump"])
+        if same not in worst or c["margin"] < worst[same]["margin"]:
+            worst[same] = c
+    return list(worst.values())
+
+
+def scenario_rows(result):
+    """Return one dict for each scenario of a TuningResult, [] for the case's own run alone."""
+    problem = result.problem
+    if not problem.scenarios:
+        return []
+    rows = []
+    for i, run in enumerate(problem.runs):
+        limits = [limit for limit in problem.limits if limit.run == i]
+        sides = {side: tables[i] for side, tables in result.tables.items()}
+        held = {s: all(limit.margin(t) >= 0 for limit in limits) for s, t in sides.items()}
+        costs = clean({side: problem.cost(table) for side, table in sides.items()})
+        rows.append(
+            {"name": run.name, "weight": run.weight, "objective": costs, "limits_held": held}
+        )
+    return rows
+
+
+def _scenario_table(result):
+    """Every scenario, or of more than MANY the costliest."""
+    scenarios, limited = scenario_rows(result), bool(result.problem.limits)
+    if not scenarios:
+        return []
+    cost = lambda s, side="after": np.inf if (v := s["objective"][side]) is None else v
+    many = len(scenarios) > MANY
+    rows = [
+        [
+            s["name"],
+            Value(s["weight"], 3),
+            *(Value(cost(s, side)) for side in SIDES),
+            ("yes" if s["limits_held"]["after"] else "no") if limited else "-",
+        ]
+        for s in (sorted(scenarios, key=lambda s: -cost(s))[:COSTLIEST] if many else scenarios)
+    ]
+    heads = ["scenario", "weight", "objective before", "after", "limits held after"]
+    held = sum(s["limits_held"]["after"] for s in scenarios)
+    kept = f"; limits held after in {held}" if limited else ""
+    note = Text([f"the {COSTLIEST} costliest of {len(scenarios)} scenarios{kept}"])
+    return [Table(rows, heads, gap=True), *([note] if many else [])]
+
+
+def _validation_table(result):
+    """The objective and the limits on the validation set, before and after."""
+    checked, case = result.validation, result.case
+    if not checked:
+        noise = any(run.key is not None for run in result.problem.runs)
+        if case.uncertain or case.covariance or noise:
+            return []
+        why = (
+            "no validation on other plants: the rig names nothing that is uncertain. An [uncertain]"
+            ' table in its file ("plant.drain" = 0.05 for +-5 %) makes tune validate the answer'
+        )
+        return [Text([why], gap=True)]
+    limited = bool(result.problem.limits)
+    rows = [
+        [
+            side,
+            *(Value(checked["objective"][side][k]) for k in ("mean", "p05", "p50", "p95")),
+            *([f"{100 * checked['limits_held'][side]:.0f} %"] if limited else []),
+        ]
+        for side in SIDES
+        if checked["limits_held"][side] is not None
+    ]
+    if not rows:
+        return [Text([f"validation runs: all {checked['samples']} failed"], gap=True)]
+    heads = [f"on {checked['samples']} validation runs", "mean objective", "5 %", "median", "95 %"]
+    heads += ["all limits held in"] if limited else []
+    perturbed = (
+        n if share is None else f"{n} +-{100 * share:g} %" for n, share in checked["spread"].items()
+    )
+    perturbed = ", ".join(perturbed) or "nothing of the plant"
+    noise = ", new sensor noise" if checked["noise"] else ""
+    failed = f"; {checked['failed']} runs failed and are left out" if checked["failed"] else ""
+    note = f"{_improved(checked)}; perturbed: {perturbed}{noise}{failed}"
+    return [Table(rows, heads, gap=True), Text([note])]
+
+
+def _improved(checked):
+    """Return in how many validation runs tuning improved the objective, in words."""
+    if checked["comparable"] == 1.0:
+        return f"tuning improved the objective in {100 * checked['better_share']:.0f} % of them"
+    share = checked["better_share_of_comparable"]
+    if share is None:
+        return (
+            "in no run do the starting and the tuned values both hold all limits, so the"
+            " objectives cannot be compared"
+        )
+    runs = round(checked["comparable"] * (checked["samples"] - checked["failed"]))
+    return (
+        f"the starting and the tuned values both hold all limits in {runs} of these runs"
+        f" ({100 * checked['comparable']:.3g} %); there tuning improved the objective in"
+        f" {100 * share:.0f} %"
+    )
+
+
+def _choice_table(result):
+    rows = [
+        [
+            ", ".join(f"{n} = {v}" for n, v in c["values"].items()),
+            c["status"],
+            *map(Value, c["objective"].values()),
+        ]
+        for c in result.choices
+    ]
+    sides = [f"objective {side} [{cost_unit(result)}]" for side in SIDES]
+    return [Table(rows, ["choice", "status", *sides], gap=True)] if rows else []
+
+
+def _tradeoff_table(result):
+    if not result.tradeoff:
+        return []
+    measure = result.tradeoff["measure"]
+    rows = [
+        [
+            Value(p["limit"]),
+            p["status"],
+            Value(p["objective"]),
+            ", ".join(f"{n} {number(v, 4)}" for n, v in p["parameters"].items()),
+        ]
+        for p in result.tradeoff["points"]
+    ]
+    head = f"limit of {measure} [{ms.unit(measure, result.tuned.loop.units)}]"
+    return [Table(rows, [head, "status", "objective", "at"], gap=True)]
+
+
+def rig_of(result):
+    """Return (text of rig.toml, None), or (None, why there is none and what to set in Python)."""
+    text, why = rig_text(result.tuned)
+    if why is None:
+        return text, None
+    gains = ", ".join(f"{n} = {p['after']!r} {p['unit']}" for n, p in result.parameters.items())
+    return None, f"{why}; set in Python what was tuned: {gains}"
+
+
+def save(result, folder, command=None):
+    """Write result.json, rig.toml, trajectory.csv, before.csv, pictures and report.html."""
+    rig, why = rig_of(result)
+    if why:
+        warnings.warn(why, stacklevel=3)  # the line that called result.save
+        result = result.replace(messages=(*result.messages, Message("no-rig-file", why)))
+    runs = _runs(result)
+    files = {
+        **({"rig.toml": rig} if rig else {}),
+        "trajectory.csv": csv(runs["after"], result.tuned.loop.units),
+        "before.csv": csv(runs["before"], result.case.loop.units),
+    }
+    stale = earlier(folder, CAPTIONS)
+    if not rig and (Path(folder) / "result.json").is_file():
+        # of another result: its gains must not be taken for these
+        stale.append(Path(folder) / "rig.toml")
+    draw, page = lambda: figures(result, runs), lambda drawn: report(result, drawn)
+    return save_all(folder, json_of(result), files, draw, page, command, stale)
+
+
+def _runs(result):
+    """{"before", "after": Trajectory} with the same sensor noise, where the case has any."""
+    noise = np.asarray(result.case.loop.sensor.noise)
+    key = jax.random.key(result.problem.seed) if bool(np.any(noise > 0)) else None
+    return {s: run_for_people(c, key) for s, c in zip(SIDES, (result.case, result.tuned))}
+
+
+def figures(result, runs=None):
+    """Return {name: figure} of a TuningResult: those of CAPTIONS that have something to show."""
+    from jaxtank.plots import diagnostics, responses, style
+    from jaxtank.plots import run as plots
+
+    runs = runs or _runs(result)
+    loop, name, unit = result.tuned.loop, result.tuned.name, cost_unit(result)
+    drawn = {
+        "responses": responses.responses(loop, runs, _title(result), _level_limits(result)),
+        **plots.rig(loop.plant, runs["after"], f"{name} at the end of the tuned run"),
+    }
+    if rows := worst_of_scenarios(result.constraints):
+        size = (6.4, 0.9 + 0.42 * min(len(rows), diagnostics.MANY))
+        drawn["margins"] = style.picture(lambda ax: diagnostics.margins(ax, rows), size)
+    between = [i for i in range(loop.plant.tanks) if i not in loop.plant.outputs][:2]
+    if len(between) == 2:
+        looks = zip(runs.items(), ((style.BEFORE, "--"), (style.AFTER, "-")))
+        lines = {side: (run, *look) for (side, run), look in looks}
+        rims = np.asarray(loop.plant.rim)
+        phase = lambda ax: diagnostics.phase(ax, lines, between, rims, loop.units[0])
+        drawn["inner"] = style.picture(phase, (5.0, 4.0), legend=3)
+    low, high = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
+    if any(np.any(run.command > high) or np.any(run.command < low) for run in runs.values()):
+        size = (6.4, 1.4 + 0.62 * len(runs) * loop.plant.pumps)
+        strips = lambda ax: diagnostics.saturation(ax, runs, low, high)
+        drawn["saturation"] = style.picture(strips, size, legend=2)
+    observed = f"{name}, tuned: what its observer estimated"
+    drawn |= estimates(loop, result.tuned.clock, runs["after"], observed)
+    if result.cloud is not None and len(result.cloud["objective"]):
+        drawn["clouds"] = _clouds(result, unit)
+    if result.history:
+        limited = bool(result.problem.limits)
+        course = lambda ax: responses.convergence(ax, result.history, unit, limited)
+        drawn["convergence"] = style.picture(course, (6.4, 3.8))
+    around = _curve if len(result.parameters) == 1 else _contours
+    drawn["landscape"] = style.picture(lambda ax: around(ax, result, unit), (6.4, 4.8))
+    if result.tradeoff:
+        measure, points = result.tradeoff["measure"], result.tradeoff["points"]
+        of = (measure, ms.unit(measure, loop.units), unit)
+        draw = lambda ax: diagnostics.tradeoff(ax, points, *of)
+        drawn["tradeoff"] = style.picture(draw, (6.0, 3.6))
+    return drawn
+
+
+def _level_limits(result):
+    """The highest allowed level of each tank: its limit, or else its rim."""
+    limits = {
+        limit.index: limit.value
+        for limit in result.problem.limits
+        if limit.measure == "max_level" and limit.run == 0
+    }
+    rims = np.asarray(result.tuned.loop.plant.rim)
+    return [limits.get(i, rims[i]) for i in range(result.tuned.loop.plant.tanks)]
+
+
+def _title(result):
+    """The objective and the first gains before and after, as the title of the responses."""
+    held = dict.fromkeys(SIDES, "")
+    if result.problem.limits:
+        for side, table in result.tables.items():
+            broken = (result.problem.margins(table) < 0).any()
+            held[side] = ", breaks a limit" if broken else ", holds all limits"
+    unit = cost_unit(result)
+    unit = "" if unit == "-" else f" {unit}"
+    before, after = (number(result.objective[side], 4) for side in SIDES)
+    gains = ", ".join(
+        f"{n.removeprefix('controller.')} {number(p['before'], 4)} -> {number(p['after'], 4)}"
+        f" {p['unit']}"
+        for n, p in list(result.parameters.items())[:4]
+    )
+    first = f"{before}{held['before']} -> {after}{unit}{held['after']}"
+    return f"{result.tuned.name}: objective {first}\n({gains})"
+
+
+def _clouds(result, unit):
+    """Validation runs before against after: the objective, and the level nearest to its limit."""
+    from jaxtank.plots import responses, style
+
+    runs, length = result.cloud, result.tuned.loop.units[0]
+    level = "highest level over its limit" if runs["past"] else "highest level"
+
+    def draw(axes):
+        responses.cloud(axes[0], runs["objective"], runs["held"], "objective", unit)
+        responses.cloud(axes[1], runs["level"], runs["held"], level, length, runs["limit"])
+
+    title = f"{result.tuned.name}: {len(runs['objective'])} validation runs"
+    return style.picture(draw, (8.6, 4.9), 1, 2, legend=3, title=title)
+
+
+def _curve(ax, result, unit):
+    """The objective along the only free parameter, at the case's own step."""
+    from jaxtank.plots import responses
+
+    grid, b = np.linspace(0.0, 1.0, 128), result.problem.bounds[0]
+    costs, margins = result.problem.screen(grid[:, None])
+    violation = np.maximum(0.0, -margins).max(axis=1, initial=0.0)
+    before, after = ((result.parameters[b.name][s], result.objective[s]) for s in SIDES)
+    axis, log = (b.name, b.unit, unit), b.scale == "log"
+    responses.curve(ax, b.from_unit(grid), costs, violation, *axis, before, after, log)
+
+
+def _contours(ax, result, unit):
+    """The objective over the two parameters that it is most sensitive to, the others as tuned."""
+    from jaxtank.plots import responses
+
+    problem, start = result.problem, result.problem.start()
+    values = zip(problem.bounds, result.parameters.values())
+    tuned = np.array([float(b.to_unit(p["after"])) for b, p in values])
+    effect = [-(p["sensitivity_percent"] or 0.0) for p in result.parameters.values()]
+    pair = sorted(np.argsort(effect, kind="stable")[:2])
+    across, up = np.meshgrid(np.linspace(0.0, 1.0, 24), np.linspace(0.0, 1.0, 24))
+    points = np.tile(tuned, (across.size, 1))
+    points[:, pair[0]], points[:, pair[1]] = across.ravel(), up.ravel()
+    costs, margins = problem.screen(points)
+    worst = -margins.min(axis=1) if margins.size else np.zeros(len(costs))
+    x, y = (problem.bounds[i] for i in pair)
+    place = lambda z: (x.from_unit(z[pair[0]]), y.from_unit(z[pair[1]]))
+    responses.contours(
+        ax,
+        x.from_unit(across),
+        y.from_unit(up),
+        costs.reshape(across.shape),
+        worst.reshape(across.shape),
+        (x.name, y.name),
+        (x.unit, y.unit),
+        unit,
+        place(start),
+        place(tuned),
+        (x.scale == "log", y.scale == "log"),
+    )
+    if len(tuned) > 2:
+        ax.set_title("landscape (the other parameters as tuned)")
