@@ -4,7 +4,6 @@ import sys
 
 from tuning.cli.interrupts import Interrupts
 from tuning.cli.terminal import Line
-from tuning.cli.watch import Watch
 
 
 class Progress(Interrupts):
@@ -13,7 +12,6 @@ class Progress(Interrupts):
     def __init__(self, unit, quiet, option=None):
         super().__init__()
         self.unit, self.last, self.line = unit, None, Line(quiet)
-        self.watch: Watch | None = None
         self.note = option and f"{option} implies --nominal: the optimum of the case as it is"
         self.line.compiling("the simulation and its derivatives", 15)
 
@@ -23,8 +21,6 @@ class Progress(Interrupts):
             self.note = None
         if event["evaluations"] > 1:
             self.check()
-        if self.watch is not None:
-            self.watch(event | {"unit": event.get("unit") or self.unit})
         if not self.line.terminal and event["start"] == self.last:
             return
         self.last = event["start"]

@@ -27,6 +27,8 @@ from tuning.answer.setting import plants_of
 from tuning.live.drawing import drawing
 from tuning.live.engine import engine
 from tuning.live.origin import both, entries, origin_of
+from tuning.problem.bounds import bounds
+from tuning.uncertainty.sampling import check_whole
 
 HERE = Path(__file__).parent
 SCRIPTS = ("charts", "rig", "runner", "page")
@@ -42,17 +44,21 @@ END = "\0"
 KEPT = 8
 """Engines that are kept in memory."""
 
+PLANTS, MOST_PLANTS = 64, 2000
+"""Plants of the band of a page: where it is not said how many, and at most."""
+
 LEAK = 1.5
 """Factor of an outlet that leaks [-]."""
 
 _KEPT = {}
 
 
-def page(case, presets=(), source=None):
-    """Return the live page of a case as the text of an HTML file."""
+def page(case, presets=(), source=None, plants=None):
+    """Return the live page of a case as the text of an HTML file; `plants` plants shown at once."""
     check_pointwise(case)
+    bounds(case.loop, case.free)
     off, on, filtered = both(case)
-    data = data_of(case, presets, source)
+    data = data_of(case, presets, source, plants)
     try:
         text = assemble(_engine(off, on), case.name, data)
     except InputError as error:
@@ -80,8 +86,10 @@ def _engine(off, on):
     return _KEPT[key]
 
 
-def data_of(case, presets=(), source=None):
+def data_of(case, presets=(), source=None, plants=None):
     """Return what the page knows of a case besides the engine, a JSON object."""
+    if plants is not None:
+        check_whole("plants", plants, 1, MOST_PLANTS)
     try:
         toml = rig.dump(case)
     except InputError as error:  # a class of the user's own without a name
@@ -102,6 +110,8 @@ def data_of(case, presets=(), source=None):
         ],
         "breaks": _breaks(case),
         "uncertain": _uncertain(case),
+        "plants": plants or PLANTS,
+        "band": plants is not None,
     }
 
 

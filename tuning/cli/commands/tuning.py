@@ -20,7 +20,6 @@ from tuning.cli.options import (
 from tuning.cli.progress import Progress
 from tuning.cli.values import number, once, open_case, pair, span, whole
 from tuning.cli.values import seed as seed_of
-from tuning.cli.watch import first_sentence, watch_of
 
 CODES = """exit codes:
   0    converged (two searches within 1 % of each other (--nominal: 0.1 %), or differential
@@ -108,12 +107,6 @@ def _add_search(one):
     text = "iterations of each local search (default 40; --nominal: 60)"
     option(one, "--iterations", "N", text)
     option(one, "--batch", "N", "scenarios drawn for each step of method adam (default all)")
-    one.add_argument(
-        "--watch",
-        action="store_true",
-        help="write DIR/watch.html, a page that shows the running search (needs --out DIR; written"
-        " without the option too where stderr is a terminal)",
-    )
     text = "go on where a killed run with --out DIR ended, to the same answer"
     option(one, "--resume", "DIR", text)
 
@@ -149,27 +142,20 @@ def _tune(args):
     unit = tables.objective_unit(task["objective"] or case.objective, case.loop.units)
     option = None if args.robust or args.nominal or args.quiet else _goes_with_nominal(args)
     progress = Progress(unit, args.quiet, option)
-    progress.watch = watch_of(args, case, folder, progress.line)
-    with contextlib.nullcontext() if progress.watch is None else progress.watch:
-        result = finder(
-            case,
-            **{k: v for k, v in task.items() if k != "scenarios"},
-            **own,
-            **_numbers(args),
-            log=folder,
-            resume=args.resume is not None,
-            progress=progress,
-            cluster=args.cluster,
-        )
-        progress.line.end()
-        result = _besides(args, case, result, task, sweep, progress)
-        args.out = folder
-        _finish(args, result)
-        if progress.watch is not None:
-            stopped = progress.stop or result.status == "interrupted"
-            state = "interrupted" if stopped else "ended"
-            values = {name: result[name].after for name in result}
-            progress.watch.end(state, [first_sentence(str(result))], True, values)
+    result = finder(
+        case,
+        **{k: v for k, v in task.items() if k != "scenarios"},
+        **own,
+        **_numbers(args),
+        log=folder,
+        resume=args.resume is not None,
+        progress=progress,
+        cluster=args.cluster,
+    )
+    progress.line.end()
+    result = _besides(args, case, result, task, sweep, progress)
+    args.out = folder
+    _finish(args, result)
     return progress.code if progress.stop else EXIT[result.status]
 
 
