@@ -98,7 +98,6 @@ READ = {
     ("tuning.report.html", "style", "read_text"): "page.css of the package",
     ("tuning.live.page", "_read", "read_text"): "a part of the page, of the package",
     ("tuning.live.engine", "engine", "read_text"): "engine.js of the package",
-    ("jaxtank.export.whole.array_values", "library", "read_text"): "arrays.js of the package",
     ("tuning.cli.completion", "words", "read_text"): "names.txt of the package",
     ("jaxtank.xla.program_cache", "_digest", "read_bytes"): "an entry that jax has just written, or"
     " one of a folder of mode 700 and the user's own, to compare its digest",
