@@ -197,7 +197,7 @@ class WholeWriter(Writer):
     def array(self, entries: np.ndarray) -> str:
         """Return the name of an array with these entries: a result, an earlier one or a new one."""
         elements = tuple(entries.ravel())
-        name = getattr(elements[0], "name", None)
+        name = getattr(elements[0], "name", "")
         whole = tuple(Ref(name, i) for i in range(self.sizes.get(name, 0)))
         if elements == whole:
             return name
