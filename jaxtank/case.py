@@ -198,23 +198,18 @@ class Case:
 
         return rig(self.loop.plant, title=self.name)
 
-    def explore(
-        self, free: Mapping[str, Any] | None = None, plants: int | None = None, seed: int = 0
-    ) -> Any:
+    def explore(self, free: Mapping[str, Any] | None = None, plants: int | None = None) -> Any:
         """Return the live page, in which the loop runs while sliders move: a notebook shows it, and
         `.save(path)` writes it. Opens `tuning.live`.
 
-        With `plants` or `free` it is a live figure in a notebook with ipywidgets: sliders of the
-        parameters `free` {dotted name: (low, high)} move a fan of `plants` plants (200) that are
-        drawn with `seed`, as `tuning.ensemble` draws them.
+        `free` {dotted name: (low, high)} replaces the free parameters of the case and their ranges.
+        With `plants` the page shows a band of that many drawn plants (1 to 2000).
 
         Raises InputError for a case that cannot be run in a browser, and for names and values that
         cannot be used.
         """
-        if free is None and plants is None:
-            return importlib.import_module("tuning.live.shown").of_case(self)
-        opened = importlib.import_module("tuning.live.live_figure")
-        return opened.of_case(self, free, plants, seed)
+        case = self if free is None else self.replace(free={n: Free(*v) for n, v in free.items()})
+        return importlib.import_module("tuning.live.shown").of_case(case, plants=plants)
 
     def save(self, folder: str | Path) -> list[Path]:
         """Write case.json, rig.toml and the pictures of `plot` to a folder, made if need be; return

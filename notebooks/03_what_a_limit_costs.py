@@ -135,29 +135,24 @@ ax.legend();
 #
 # ## A slider on the rim
 #
-# The limit of the filter is a number like any other. If you run this notebook, the sliders of this figure move
-# the limits of tanks 3 and 4, for 200 plants whose flows differ by up to 5 %. Here both are moved to
-# 24 cm.
+# The limit of the filter is a number like any other. In the page below the safety filter has a slider for each limit, and
+# the band shows 200 plants whose flows differ by up to 5 %: if you run this notebook, drag both limits to 24 cm.
 #
 # **Guess first:** which setpoints can no longer be held?
 
 # %%
-limits = {"safety_filter.limit[2]": (20.0, 30.0), "safety_filter.limit[3]": (20.0, 30.0)}
-figure = fast.with_safety_filter().explore(free=limits, plants=200)
-wide, many = figure.moved, case.explore(plants=200).moved.measures["max_level"]
+guarded = fast.with_safety_filter()
+lowered = jaxtank.with_values(guarded.loop, {f"safety_filter.limit[{i}]": 24.0 for i in (2, 3)})
+lowered = guarded.replace(loop=lowered)
+wide, low, many = (tuning.ensemble(c, samples=200) for c in (guarded, lowered, case))
 rest, rest2 = (jaxtank.analysis.equilibrium(case.loop.plant, r)[0] for r in ((8, 14), (16, 10)))
-low = figure.move({name: 24.0 for name in limits})
-figure
+guarded.explore(plants=200)
 
 # %% [markdown]
 # Two pairs cannot be held: on the nominal plant 8 and 14 cm need {{rest[3]:.1f}} cm in tank 4, and 16 and
 # 10 cm need {{rest2[2]:.1f}} cm in tank 3. The levels of both stop at 24 cm on every plant, and the lower tanks
 # share the inflow that is left. The mean error over the 200 plants is {{low.measures["rms_error_total"].mean():.2f}} cm, in
-# place of {{wide.measures["rms_error_total"].mean():.2f}} cm with limits of 30 cm. The words below the
-# sliders tell what 10 % of a limit is worth, from exact derivatives (`limit[2]` is that of tank 3):
-#
-# - {{figure.words[2]}}
-# - {{figure.words[3]}}
+# place of {{wide.measures["rms_error_total"].mean():.2f}} cm with limits of 30 cm.
 
 # %% [markdown]
 # ## Conclusion
@@ -197,6 +192,6 @@ figure
 #
 # <details><summary>Answer</summary>
 #
-# {{float(published["max_level"].max()):.1f}} cm, and {{np.quantile(many.max(axis=1), 0.95):.1f}} cm
-# (`case.explore(plants=200).moved.measures["max_level"]` has the highest levels of each plant).
+# {{float(published["max_level"].max()):.1f}} cm, and {{np.quantile(many.measures["max_level"].max(axis=1), 0.95):.1f}} cm
+# (`tuning.ensemble(case, samples=200).measures["max_level"]` has the highest levels of each plant).
 # </details>

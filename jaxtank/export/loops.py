@@ -5,7 +5,7 @@ RULES holds the primitives of jax; `jaxtank.export.lowering` looks them up there
 
 import numpy as np
 
-from jaxtank.export.primitives import chosen, kind_of, no_code
+from jaxtank.export.primitives import chosen, kind_of
 from jaxtank.export.statements import REAL, WHOLE, Loop, Ref, Until
 
 
@@ -22,9 +22,9 @@ def _cond(writer, eqn, operands):
 def _scan(writer, eqn, operands):
     p = eqn.params
     first, last = p["num_consts"], p["num_consts"] + p["num_carry"]
-    if len(eqn.outvars) > p["num_carry"]:
-        raise no_code("a loop in it writes a sequence")
     closed, sequences = p["jaxpr"], operands[last:]
+    if len(eqn.outvars) > p["num_carry"]:
+        return _unrolled(writer, p, operands[:first], operands[first:last], sequences)
     starts, read = operands[first:last], lambda *counter: []
     if sequences:
         starts = [*starts, np.array(0, dtype=object)]
@@ -41,6 +41,18 @@ def _scan(writer, eqn, operands):
 
     kinds = [kind_of(v.aval.dtype) for v in eqn.outvars] + [WHOLE] * bool(sequences)
     return _loop(writer, kinds, starts, p["length"], body)[: len(eqn.outvars)]
+
+
+def _unrolled(writer, p, consts, carry, sequences):
+    """The results of a loop that writes sequences, pass by pass."""
+    passes, rows = range(p["length"]), []
+    for i in reversed(passes) if p["reverse"] else passes:
+        inputs = [*consts, *carry, *(s[i] for s in sequences)]
+        out = writer.run(p["jaxpr"].jaxpr, p["jaxpr"].consts, inputs)
+        carry = out[: p["num_carry"]]
+        rows.append(out[p["num_carry"] :])
+    rows = rows[::-1] if p["reverse"] else rows
+    return [*carry, *(np.stack(column) for column in zip(*rows))]
 
 
 def _reader(writer, sequences, variables, backwards):

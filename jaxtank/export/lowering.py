@@ -26,6 +26,9 @@ class Writer:
     # scopes: the statements of the function and of the loops that are open; known: in each of them,
     # {operation: its Ref}, so that nothing is computed twice.
 
+    large = 300
+    """Number of multiplications in a matrix product above which it is a loop."""
+
     def __init__(self):
         self.counter, self.scopes, self.known = 0, [[]], [{}]
 

@@ -10,9 +10,6 @@ from jaxtank.export.primitives import each, no_code
 from jaxtank.export.simplify import is_number
 from jaxtank.export.statements import REAL
 
-LARGE = 300
-"""Number of multiplications in a matrix product above which it is a loop."""
-
 
 def product(writer, a, b, dimensions):
     """Return the elements of a product of two arrays."""
@@ -24,7 +21,7 @@ def product(writer, a, b, dimensions):
     A = a.transpose(*rows, *left).reshape(int(np.prod([a.shape[i] for i in rows])), -1)
     B = b.transpose(*right, *columns).reshape(A.shape[1], -1)
     shape = tuple(a.shape[i] for i in rows) + tuple(b.shape[i] for i in columns)
-    if A.shape[0] * A.shape[1] * B.shape[1] > LARGE:
+    if A.shape[0] * A.shape[1] * B.shape[1] > writer.large:
         return writer.matrix("product", (A, B), (*A.shape, B.shape[1]), shape)
     out = np.empty((A.shape[0], B.shape[1]), dtype=object)
     for i, j in np.ndindex(out.shape):

@@ -109,7 +109,7 @@ def _move(writer, eqn, operands):
     """The elements that an operation only moves, found by moving their numbers."""
     table, ids = [], []
     for o, v in zip(operands, eqn.invars):
-        if eqn.primitive.name in ("gather", "dynamic_slice") and o is not operands[0]:  # indices
+        if v in eqn.invars[INDICES.get(eqn.primitive.name, slice(0))]:
             if not all(map(is_number, o.ravel())):
                 raise no_code("it reads an array at an index that it computes")
             ids.append(_numbers(o, v))
@@ -220,9 +220,12 @@ def _position(largest):
     return rule
 
 
+INDICES = {"gather": slice(1, 2), "dynamic_slice": slice(1, None), "scatter": slice(1, 2)}
+"""{primitive that reads or writes at indices: its operands that are indices}."""
+
 MOVES = """
 broadcast_in_dim reshape transpose squeeze expand_dims slice concatenate pad rev stack tile split
-gather dynamic_slice
+gather dynamic_slice scatter
 """
 """Primitives that only move elements."""
 

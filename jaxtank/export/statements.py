@@ -120,7 +120,7 @@ def matrix_operations(statements: Iterable[Statement]) -> set[str]:
 
 def used(statements: list[Statement], wanted: set[str]) -> list[Statement]:
     """Return the statements that the variables named in `wanted` depend on, in order."""
-    kept = []
+    kept, wanted = [], set(wanted)
     for s in reversed(statements):
         if isinstance(s, Loop):
             if not wanted & {name for _, name, _ in s.carried}:
@@ -128,6 +128,6 @@ def used(statements: list[Statement], wanted: set[str]) -> list[Statement]:
             s = s._replace(body=used(s.body, names(s.new)))
         elif not isinstance(s, Until) and s.name not in wanted:
             continue
-        wanted = wanted | s.reads
+        wanted |= s.reads
         kept.append(s)
     return kept[::-1]

@@ -1,4 +1,4 @@
-"""Running measures of one loop at many values, in batches that fit the cache, or in a kernel."""
+"""Running measures of one loop at many values, in batches that fit the cache."""
 # jax leaves the types of its trees partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 # pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
@@ -18,13 +18,10 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import describe, get_value, with_values
-from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken, run_of, takes_arrays
+from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.run import BATCH, evaluate_and_flag
-from jaxtank.loop.step import step
 from jaxtank.loop.validation import check
 from jaxtank.xla.jit import compiled
-from jaxtank.xla.kernel import Unfit, looped
-from jaxtank.xla.reachability import reached
 
 
 def evaluate_many(
@@ -35,7 +32,6 @@ def evaluate_many(
     key: jax.Array | None = None,
     *,
     batch: int = BATCH,
-    kernel: bool = False,
 ) -> dict[str, jax.Array]:
     """Run the loop at N sets of values and keep only running measures.
 
@@ -53,11 +49,7 @@ def evaluate_many(
     key : jax random key, optional
         For the sensor noise; run i has that of jax.random.fold_in(key, i).
     batch : int
-        Runs side by side; in a kernel a power of 2.
-    kernel : bool
-        Run the samples in one Pallas kernel, for a GPU: a loop without a launch for each step. It
-        has no noise, no derivatives, and setpoints that are the same in all runs. Without a GPU it
-        is interpreted, which is slow and for tests.
+        Runs side by side.
 
     Returns
     -------
@@ -67,7 +59,7 @@ def evaluate_many(
     Raises
     ------
     InputError
-        For invalid input; with `kernel` for what it cannot run.
+        For invalid input.
 
     Examples
     --------
@@ -84,10 +76,6 @@ def evaluate_many(
     rows = _rows(values)
     count = _count(loop, rows, batch)
     check(with_values(loop, {n: v[0] for n, v in rows.items()}), clock, key)
-    if kernel:
-        if batch & (batch - 1):
-            raise InputError(f"batch = {batch}: must be a power of 2 runs in a kernel")
-        return _in_kernel(loop, clock, names, rows, key, batch)
     return _mapped(loop, rows, key, clock, names, min(batch, count))
 
 
@@ -143,70 +131,3 @@ def _mapped(
 
     count = next(iter(rows.values())).shape[0]
     return cast(Any, jax.lax.map(one, (jnp.arange(count), rows), batch_size=batch))
-
-
-def _in_kernel(
-    loop: ClosedLoop,
-    clock: Clock,
-    names: tuple[str, ...],
-    rows: Mapping[str, jax.Array],
-    key: jax.Array | None,
-    block: int,
-) -> dict[str, jax.Array]:
-    """The same of checked rows, `block` runs to a program of a kernel."""
-    arrays = takes_arrays(loop)
-    _check_kernel(loop, clock, names, rows, key, arrays)
-    xs = inputs(loop, clock, names, None, None, clock.samples, arrays)
-
-    def begin(row: Any) -> Any:
-        here = with_values(loop, row)
-        return initial(here, clock, arrays), ms.start(run_of(here, clock, arrays), names)
-
-    def advance(row: Any, carry: Any, now: Any) -> Any:
-        here, (state, sums) = with_values(loop, row), carry
-        state, sample = step(here, clock, state, now)
-        return state, ms.update(run_of(here, clock, arrays), sums, sample, now.context)
-
-    def finish(row: Any, carry: Any) -> Any:
-        state, sums = carry
-        found = ms.read(run_of(with_values(loop, row), clock, arrays), sums, names)
-        return jax.tree.map(lambda v: jnp.where(is_broken(state), jnp.nan, v), found)
-
-    count = next(iter(rows.values())).shape[0]
-    index = np.minimum(np.arange(-(-count // block) * block), count - 1)  # the last one repeated
-    padded = {name: v[index] for name, v in rows.items()}
-    start = jax.vmap(begin)(padded)
-    try:
-        ended = looped(jax.vmap(advance, in_axes=(0, 0, None)), padded, start, xs, block)
-    except Unfit as error:
-        raise InputError(
-            "kernel: a step of this loop has arrays (a quadratic programme, a Kalman filter, ten"
-            " tanks or more), which a kernel of single numbers cannot hold: kernel=False"
-        ) from error
-    found: Any = jax.vmap(finish)(padded, ended)
-    return jax.tree.map(lambda v: v[:count], found)
-
-
-def _check_kernel(
-    loop: ClosedLoop, clock: Clock, names: Any, rows: Any, key: Any, arrays: bool
-) -> None:
-    """Raise InputError for what the kernel cannot run."""
-    beyond = [n for n in names if ms.MEASURES[n].linear or n in ms.functions(names)]
-    if beyond:
-        raise InputError(
-            f"kernel: {beyond[0]} is no running measure; leave it out, or kernel=False"
-        )
-    if key is not None:
-        raise InputError("kernel: it has no noise: leave key out, or kernel=False")
-    short = Clock(dt=clock.dt, duration=clock.dt, substeps=clock.substeps)
-    for name, value in rows.items():
-
-        def prepared(v: Any, name: str = name) -> Any:
-            here = with_values(loop, {name: v})
-            return jax.tree.leaves(inputs(here, short, names, None, None, short.samples, arrays))
-
-        if any(reached(prepared, value[0])):
-            raise InputError(
-                f"kernel: setpoints, or what the controller prepares from them, depend on {name},"
-                " and must be the same in all runs; leave it out, or kernel=False"
-            )

@@ -84,7 +84,6 @@ MADE = {
     ("tuning.problem.result", "_report", "import_module"): "the report of its own class",
     ("tuning.problem.result", "explore", "import_module"): "the live page, by a constant name",
     ("jaxtank.case", "explore", "import_module"): "the live page, by a constant name",
-    ("tuning.live.live_figure", "_build", "import_module"): "ipywidgets, by a constant name",
     ("jaxtank.plots.style", "notebook", "import_module"): "matplotlib_inline, by a constant name",
     (
         "tuning.cluster.engine",
@@ -102,9 +101,7 @@ READ = {
     ("tuning.figures.figure", "_figures", "read_text"): "figures.toml of the package",
     ("tuning.report.html", "_style", "read_text"): "page.css of the package",
     ("tuning.live.page", "_read", "read_text"): "a part of the page, of the package",
-    ("tuning.live.watch", "_read", "read_text"): "watch.js and watch.css of the package",
     ("tuning.live.engine", "engine", "read_text"): "engine.js of the package",
-    ("jaxtank.export.whole.array_values", "library", "read_text"): "arrays.js of the package",
     ("tuning.cli.completion", "words", "read_text"): "names.txt of the package",
     ("jaxtank.xla.program_cache", "_digest", "read_bytes"): "an entry that jax has just written, or"
     " one of a folder of mode 700 and the user's own, to compare its digest",

@@ -15,7 +15,7 @@ import jax
 
 import jaxtank
 from jaxtank import presets
-from jaxtank.export.whole.loop import served
+from jaxtank.export.whole import served
 from tuning.live.engine import engine
 
 SCRIPT = """
@@ -32,7 +32,7 @@ const least = (work) => {
 const leaf = e.info.leaves.find((one) => one.name === free[0]);
 const moved = (i) => ({ [leaf.name]: leaf.value * (1 + 1e-3 * i) });
 const run = least((i) => e.run(moved(i), { every: n }));
-console.log(JSON.stringify([run, least((i) => e.tangents(moved(i), free)), free.length]));
+console.log(JSON.stringify([run, least((i) => e.slopes(moved(i), free)), free.length]));
 """
 
 

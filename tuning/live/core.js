@@ -265,7 +265,7 @@ function quantile(sorted, share) {
   return k + 1 < sorted.length ? sorted[k] + (at - k) * (sorted[k + 1] - sorted[k]) : sorted[k];
 }
 
-// uniform numbers in [0, 1) from a seed (mulberry32), for the 64 plants
+// uniform numbers in [0, 1) from a seed (mulberry32), for the plants of the band
 function uniform(seed) {
   let a = seed >>> 0;
   return () => {

@@ -79,6 +79,8 @@ info.leaves = info.leaves.flatMap(([unit, doc, group, entries]) =>
   entries.map(([name, value, lower, upper]) => ({ name, unit, doc, value, lower, upper, group })));
 
 const PIECE = 500; // samples
+const RESIDUALS = 4000; // samples whose residuals make a Gauss-Newton matrix, about
+const STEP = 1e-6; // of a difference, as a share of the number
 
 function makeEngine() {
   const defaults = new Map(info.leaves.map((leaf) => [leaf.name, leaf.value]));
@@ -132,7 +134,7 @@ function makeEngine() {
   function measuresOf(program, values) {
     const found = {};
     let at = 0;
-    for (const { name, size } of program.along ? [] : info.measures)
+    for (const { name, size } of program.search ? info.measures : [])
       found[name] = size === null ? NaN : Array(size).fill(NaN);
     for (const [name, size] of program.measures) {
       found[name] = size === null ? values[at++] : values.slice(at, at += size);
@@ -141,8 +143,8 @@ function makeEngine() {
   }
 
   function run(values, options) {
-    const { every = info.save_every_default, seed = 0, filter, measures = true } = options || {};
-    const program = programs[chosen(filter)], p = numbers(program, values);
+    const { every = info.save_every_default, seed = 0, filter, measures = true, search } = options || {};
+    const whole = programs[chosen(filter)], program = search ? whole.search : whole, p = numbers(program, values);
     const [forSignals, forRun, forRead, state, lines] = program.lead(p);
     const S = signals(program, forSignals), N = noise(values, seed);
     const width = program.columns.reduce((sum, [, size]) => sum + size, 0);
@@ -163,57 +165,53 @@ function makeEngine() {
     }
     out.h = out.x;
     delete out.x;
-    if (!out.d_hat.some((column) => column.some((v) => v !== 0))) out.d_hat = null;
+    if (!search && !out.d_hat.some((column) => column.some((v) => v !== 0))) out.d_hat = null;
     if (measures) out.measures = measuresOf(program, program.read(forRead, state));
     out.broken = diverged(state);
     return out;
   }
 
-  /* Measures, their derivatives by `names` and the Gauss-Newton matrix, of one run. */
-  function tangents(values, names, options) {
-    const { seed = 0, filter } = options || {};
-    const program = programs[chosen(filter)].tangents, p = numbers(program, values);
-    const [forSignals, forPush, forRead, forAim, forSlope, state, lines] = program.lead(p);
-    const P = names.length, aims = names.map((name) => {
-      const d = new Float64Array(program.along.length), i = program.along.indexOf(name);
-      if (i < 0) throw new Error(`no derivative with respect to ${name} in this page`);
-      d[i] = 1;
-      return program.aim(forAim, d);
+  /* Measures, their derivatives by `names` and the Gauss-Newton matrix, by differences of runs.
+  base: the run at `values`, if known. */
+  const every = Math.max(1, Math.floor(samples / RESIDUALS));
+
+  function slopes(values, names, options, base = null) {
+    const P = names.length;
+    const { weights } = programs[chosen((options || {}).filter)].search;
+    const go = (at) => run(at, { ...options, every, search: true });
+    const before = base || go(values), jacobian = {}, G = new Float64Array(P * P);
+    const moved = names.map((name) => {
+      const leaf = info.leaves.find((one) => one.name === name), at = numberOf(values, name);
+      const size = STEP * (Math.abs(at) || leaf.upper - leaf.lower);
+      const next = at > (leaf.lower + leaf.upper) / 2 ? at - size : at + size;
+      return { h: next - at, after: go({ ...values, [name]: next }) };
     });
-    const S = signals(program, forSignals), N = noise(values, seed);
-    const D = Object.assign(joined(aims.map((a) => a[0])), { A: aims.map((a) => a[0].A) }), T = joined(aims.map((a) => a[2]));
-    const M = aims.map((a) => a[3]), G = new Float64Array(P * P);
-    pieces((k, K) => program.push(forPush, state, lines, S, N, k, K, P, D, T, M, G));
-    for (let a = 0; a < P; ++a)
-      for (let b = 0; b <= a; ++b) G[b * P + a] = G[a * P + b] *= 2;
-    const width = P ? T.length / P : 0, jacobian = {};
-    const slopes = aims.map((a, j) =>
-      program.slope(forSlope, state, a[1], T.subarray(j * width, (j + 1) * width)));
-    let first = 0;
-    for (const [name, size] of program.measures) {
-      const n = size === null ? 1 : size, rows = new Float64Array(n * P);
-      for (let i = 0; i < n; ++i) for (let j = 0; j < P; ++j) rows[i * P + j] = slopes[j][first + i];
-      jacobian[name] = rows;
-      first += n;
+    for (const [m, value] of Object.entries(before.measures)) {
+      const found = [].concat(value);
+      jacobian[m] = new Float64Array(found.length * P);
+      moved.forEach(({ h, after }, j) => {
+        const other = [].concat(after.measures[m]);
+        found.forEach((v, i) => (jacobian[m][i * P + j] = (other[i] - v) / h));
+      });
     }
-    const measures = measuresOf(program, program.read(forRead, state));
-    return { measures, jacobian, gauss_newton: G, broken: diverged(state) };
+    const changes = moved.map(({ h, after }) => after.errors.map((column, i) =>
+      column.map((v, k) => (v - before.errors[i][k]) / h)));
+    for (let a = 0; a < P; ++a)
+      for (let b = 0; b <= a; ++b) {
+        let s = 0;
+        weights.forEach((w, i) => {
+          const x = changes[a][i], y = changes[b][i];
+          for (let k = 0; k < x.length; ++k) s += w * x[k] * y[k];
+        });
+        G[b * P + a] = G[a * P + b] = 2 * every * s;
+      }
+    return { run: before, measures: before.measures, jacobian, gauss_newton: G, broken: before.broken };
   }
 
   function diverged(state) {
     let level = 0;
     for (let i = 0; i < tanks; ++i) level += state[i];
     return !Number.isFinite(level);
-  }
-
-  function joined(parts) {
-    const out = new Float64Array(parts.reduce((sum, part) => sum + part.length, 0));
-    let at = 0;
-    for (const part of parts) {
-      out.set(part, at);
-      at += part.length;
-    }
-    return out;
   }
 
   function command(values, options) {
@@ -229,7 +227,7 @@ function makeEngine() {
     return words.join(" ");
   }
 
-  return { info, run, tangents, command };
+  return { info, run, slopes, every, command };
 }
 
 function quoted(text) {

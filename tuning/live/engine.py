@@ -5,7 +5,7 @@ The text needs no page: node runs it too.
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import resources
 from typing import Any
 
@@ -15,11 +15,8 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.controllers import OpenLoop
-from jaxtank.export.whole.array_values import called
-from jaxtank.export.whole.loop import WholeLoop, traced_leaves, whole_loop
-from jaxtank.export.whole.tangents import TangentLoop, tangent_loop
+from jaxtank.export.whole import WholeLoop, library, whole_loop
 from tuning.live.printed import Printed, maths
-from tuning.live.printed_tangents import PrintedTangents
 from tuning.live.sliders import leaf_of
 from tuning.problem.bounds import bounds
 from tuning.problem.limits import limit_scale, resolve_limits
@@ -27,13 +24,24 @@ from tuning.problem.problem import ROOT
 
 ROWS = 3000
 """Rows of a run for people, about: those of `jaxtank simulate --out`."""
+ALWAYS = ("rms_error_total", "max_level")
+"""Measures of a search whatever a case minimises and limits."""
 SHARED = ("unit", "doc", "group")
 """What the entries of one array have in common."""
-ALWAYS = ("rms_error_total", "max_level")
-"""Measures that have derivatives whatever a case minimises and limits."""
 
 
-def engine(case: Case, filtered: Case | None = None) -> str:
+def program_of(case: Case) -> tuple[WholeLoop, str]:
+    """Return the loop of a case, and its functions as JavaScript with those of a search."""
+    with jax.enable_x64(True):
+        loop = whole_loop(case)
+        return loop, _program(loop, f"search:{_program(_lean(case))}")
+
+
+def engine(
+    case: Case,
+    filtered: Case | None = None,
+    printed: Callable[[Case], tuple[WholeLoop, str]] = program_of,
+) -> str:
     """Return a text of JavaScript that defines makeEngine(), which runs the loop of a case.
 
     Parameters
@@ -41,11 +49,13 @@ def engine(case: Case, filtered: Case | None = None) -> str:
     case : Case
     filtered : Case, optional
         The same with its safety filter, to be switched on and off.
+    printed : callable
+        `program_of`, or a function that remembers its results.
 
     Raises
     ------
     InputError
-        For a loop that has no code of single samples (`jaxtank.export.whole.loop`).
+        For a loop that has no code of single samples (`jaxtank.export.whole`).
 
     Examples
     --------
@@ -54,12 +64,11 @@ def engine(case: Case, filtered: Case | None = None) -> str:
     True
     """
     with jax.enable_x64(True):
-        cases = [one for one in (case, filtered) if one is not None]
-        loops = [whole_loop(one) for one in cases]
-        facts = _facts(case, loops)
-        shared: dict[str, str] = {}
-        own = ",\n".join(_program(loop, _tangents(loop.case), shared) for loop in loops)
-        programs = _with_functions(own, shared)
+        parts = [printed(one) for one in (case, filtered) if one is not None]
+        facts = _facts(case, [loop for loop, _ in parts])
+        programs = ",\n".join(text for _, text in parts)
+        functions = "\n".join(map(bare, library(programs)))
+    programs = f"(()=>{{{maths(functions + programs)}\n{functions}\nreturn[{programs}];}})()"
     driver = resources.files("tuning.live").joinpath("engine.js").read_text(encoding="utf-8")
     return "\n".join(
         [
@@ -110,15 +119,6 @@ def data(value: Any) -> str:
     return text.replace("<", "\\u003c")
 
 
-def _tangents(case: Case) -> TangentLoop:
-    """The derivatives that a search of the case asks for."""
-    wanted = [*case.objective, *(x.measure for x in resolve_limits(case)), *ALWAYS]
-    measures = [m for m in dict.fromkeys(wanted) if ms.serves(m, case.loop)]
-    names = [n for n in traced_leaves(case) if n.startswith("controller.") and ".model." not in n]
-    names += [name.split("[")[0] for name in case.free]
-    return tangent_loop(case, measures, list(dict.fromkeys(names)), squares_of(case.objective))
-
-
 def squares_of(objective: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
     """Return ((measure, weight), ...) of the Gauss-Newton matrix of an objective, as
     `tune` has it.
@@ -127,33 +127,26 @@ def squares_of(objective: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
     return (("mean_square_error", 1.0),) if ROOT in objective or not own else own
 
 
-def _program(loop: WholeLoop, tangents: TangentLoop, shared: dict[str, str]) -> str:
-    """One loop as an object of its functions; functions on arrays are added to `shared`."""
-    columns = [[f, len(found)] for f, found in loop.saved.items()]
-    main, slopes = Printed(loop), PrintedTangents(tangents)
-    along = [_name(*leaf) for leaf in tangents.leaves]
-    own = _block(slopes, "lead,signals,read,aim,push,slope", f"along:{data(along)}", shared)
-    return _block(main, "lead,signals,run,read", f"columns:{data(columns)},tangents:{own}", shared)
+def _lean(case: Case) -> WholeLoop:
+    """The loop with only what a search asks for: its measures, and residuals."""
+    names = [*case.objective, *(x.measure for x in resolve_limits(case)), *ALWAYS]
+    measures = [m for m in dict.fromkeys(names) if ms.serves(m, case.loop)]
+    return whole_loop(case, measures, squares_of(case.objective))
 
 
-def _block(printed: Printed, functions: str, facts: str, shared: dict[str, str]) -> str:
-    """Functions in a scope of their own; shared: {text of a function on arrays: its name}."""
-    own = [
-        f"{name}={shared.setdefault(text, f'g{len(shared)}')}"
-        for name, text in printed.helpers().items()
-    ]
-    body = "\n".join([*([f"const {','.join(own)};"] if own else []), printed.text()])
-    measures = data([[m, _size(m, found)] for m, found in printed.loop.measures.items()])
-    leaves = data([_name(*leaf) for leaf in printed.loop.leaves])
-    facts = f"streams:{len(printed.streams())},measures:{measures},leaves:{leaves},{facts}"
-    return f"(()=>{{{body}\nreturn{{{functions},{facts}}};}})()"
-
-
-def _with_functions(programs: str, shared: dict[str, str]) -> str:
-    """An array of programs, with the functions that they call."""
-    own = "\n".join(f"const {name}={text};" for text, name in shared.items())
-    above = "\n".join([*map(bare, called(f"{own}\n{programs}")), own])
-    return f"(()=>{{{maths(f'{above} {programs}')}\n{above}\nreturn[{programs}];}})()"
+def _program(loop: WholeLoop, search: str = "") -> str:
+    """One loop as an object of its functions and of what their numbers are."""
+    printed = Printed(loop)
+    facts = {
+        "streams": len(printed.streams()),
+        "columns": [[field, len(entries)] for field, entries in loop.saved.items()],
+        "measures": [[m, _size(m, entries)] for m, entries in loop.measures.items()],
+        "leaves": [_name(*leaf) for leaf in loop.leaves],
+        "weights": loop.weights,
+    }
+    return (
+        f"(()=>{{{printed.text()}\nreturn{{lead,signals,run,read,...{data(facts)},{search}}};}})()"
+    )
 
 
 def _name(name, index):

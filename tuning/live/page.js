@@ -517,7 +517,7 @@ function makeLegend() {
     return make("span", { class: `key pin${i}` }, one.name, remove);
   });
   $("legend").replaceChildren(key("run", "this run"), ...own, key("setpoint", "setpoint"),
-    ...(bands ? [key("band", `90 % of 64 plants${bands.words}`)] : []));
+    ...(bands ? [key("band", `90 % of ${data.plants} plants${bands.words}`)] : []));
 }
 
 function newWorker() {
@@ -607,7 +607,7 @@ function manyPlants(spoken = true) {
     values[leaf.name] = now[leaf.name] ?? leaf.value;
   }
   ask({
-    kind: "plants", count: 64, values: { ...now, ...values }, spread, limits: limitsNow(), ...options(),
+    kind: "plants", count: data.plants, values: { ...now, ...values }, spread, limits: limitsNow(), ...options(),
     measures: [...new Set(info.limits.map((limit) => limit.measure))],
     every: Math.max(1, Math.ceil(info.samples / 400)),
   }, {
@@ -682,7 +682,7 @@ function reset() {
   state.free = new Set(entriesOf(info.free));
   pins.length = 0;
   bands = null;
-  $("plants").setAttribute("aria-pressed", "false");
+  $("plants").setAttribute("aria-pressed", String(data.band));
   zoom(0, info.duration);
   makeLegend();
   refresh();
@@ -848,6 +848,8 @@ function start() {
   document.title = `${info.case}: live`;
   $("foot").textContent = `jaxtank ${data.version}: ${info.samples} samples of ${shown(info.dt)} s. Charts by uPlot (MIT).`;
   $("link").hidden = framed;
+  $("plants").textContent = `${data.plants} plant${data.plants > 1 ? "s" : ""}`;
+  $("plants").setAttribute("aria-pressed", String(data.band));
   if (!info.filter.present) $("filter-row").hidden = true;
   if (data.rig) rig = makeRig($("rig"), data.rig, info);
   else $("rig").parentNode.hidden = true;

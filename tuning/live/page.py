@@ -20,18 +20,20 @@ import jaxtank
 from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, parameters
-from jaxtank.export.whole.loop import check_pointwise
+from jaxtank.export.whole import check_pointwise
 from jaxtank.loop.closed_loop import takes_arrays
 from jaxtank.loop.trajectory import stride
 from tuning.answer.setting import plants_of
 from tuning.live.drawing import drawing
-from tuning.live.engine import engine
+from tuning.live.engine import engine, program_of
 from tuning.live.origin import both, entries, origin_of
+from tuning.problem.bounds import bounds
+from tuning.uncertainty.sampling import check_whole
 
 HERE = Path(__file__).parent
 SCRIPTS = ("charts", "rig", "runner", "page")
-LARGEST = 150_000
-"""Characters of a page, above which the safety filter that a case has not is left out."""
+LARGEST = 110_000
+"""Characters of a page above which the safety filter that a case has not is left out."""
 
 DIGITS = str.maketrans("&<>`", ",.:[")
 """Digits of base 85 that HTML reads as something else, and what stands for them (inflate.js)."""
@@ -42,46 +44,64 @@ END = "\0"
 KEPT = 8
 """Engines that are kept in memory."""
 
+PLANTS, MOST_PLANTS = 64, 2000
+"""Plants of the band of a page: where it is not said how many, and at most."""
+
 LEAK = 1.5
 """Factor of an outlet that leaks [-]."""
 
 _KEPT = {}
 
 
-def page(case, presets=(), source=None):
-    """Return the live page of a case as the text of an HTML file."""
+def page(case, presets=(), source=None, plants=None):
+    """Return the live page of a case as the text of an HTML file; `plants` plants shown at once."""
     check_pointwise(case)
+    bounds(case.loop, case.free)
     off, on, filtered = both(case)
-    data = data_of(case, presets, source)
+    data = data_of(case, presets, source, plants)
     try:
-        text = assemble(_engine(off, on), case.name, data)
+        return _smallest(off, on, filtered, lambda text: assemble(text, case.name, data))
     except InputError as error:
         if not takes_arrays(case.loop):
             raise
         tanks = case.loop.plant.tanks
         words = f"{case.name}: no live page of its {tanks} tanks, which run as arrays ({error})"
         raise InputError(words) from None
-    if len(text) > LARGEST and not filtered:  # then without a safety filter to switch on
-        text = assemble(_engine(off, None), case.name, data)
-    return text
 
 
-def _engine(off, on):
+def _smallest(off, on, filtered, assembled):
+    """The page; without a safety filter to switch on where that of a large loop is not on."""
+    texts = {}
+
+    def printed(one):
+        if id(one) not in texts:
+            texts[id(one)] = program_of(one)
+        return texts[id(one)]
+
+    if filtered or on is None:
+        return assembled(_engine(off, on, printed))
+    text = assembled(_engine(off, None, printed))
+    return text if len(text) > LARGEST else assembled(_engine(off, on, printed))
+
+
+def _engine(off, on, printed):
     """The engine of a case and of the same with a safety filter or None."""
     try:
         texts = [rig.dump(one) for one in (off, on) if one is not None]
     except InputError:  # a class of the user's own
-        return engine(off, on)
+        return engine(off, on, printed)
     key = repr((texts, off.title, off.names))
     if key not in _KEPT:
         if len(_KEPT) >= KEPT:
             _KEPT.pop(next(iter(_KEPT)))
-        _KEPT[key] = engine(off, on)
+        _KEPT[key] = engine(off, on, printed)
     return _KEPT[key]
 
 
-def data_of(case, presets=(), source=None):
+def data_of(case, presets=(), source=None, plants=None):
     """Return what the page knows of a case besides the engine, a JSON object."""
+    if plants is not None:
+        check_whole("plants", plants, 1, MOST_PLANTS)
     try:
         toml = rig.dump(case)
     except InputError as error:  # a class of the user's own without a name
@@ -102,6 +122,8 @@ def data_of(case, presets=(), source=None):
         ],
         "breaks": _breaks(case),
         "uncertain": _uncertain(case),
+        "plants": plants or PLANTS,
+        "band": plants is not None,
     }
 
 

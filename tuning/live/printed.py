@@ -14,30 +14,29 @@ from jaxtank.export.statements import (
     names,
     used,
 )
-from jaxtank.export.whole.compact import MATHS, Text, short_names
-from jaxtank.export.whole.loop import SAVED, WholeLoop
-from jaxtank.export.whole.regions import hoisted, kept_in_time, of_rank, ranks, refs
+from jaxtank.export.whole import (
+    MATHS,
+    Text,
+    WholeLoop,
+    hoisted,
+    kept_in_time,
+    of_rank,
+    ranks,
+    refs,
+    short_names,
+)
 
 ALONE, TIMED, MOVING = 0, 1, 2
 """Ranks: what depends on the numbers of the loop alone, on time too, on the state too."""
-_FIXED = "p d k c e q j o S N L R K P D T M G E every"
-FIXED = frozenset(_FIXED.split())
+FIXED = frozenset({"every", *"pkcqoSNLRK"})
 """Names of arguments of the printed functions."""
 
 
 class Printed:
     """The printed functions of a WholeLoop."""
 
-    def __init__(
-        self,
-        loop: WholeLoop,
-        statements: list[Statement] | None = None,
-        others: Iterable[Any] = (),
-        at_end: Iterable[Any] = (),
-    ):
-        """others: what else is read at each sample; at_end: what else is read after the last."""
-        self.loop, self.others, self.at_end = loop, list(others), list(at_end)
-        self.statements = hoisted(loop.statements) if statements is None else statements
+    def __init__(self, loop: WholeLoop):
+        self.loop, self.statements = loop, hoisted(loop.statements)
         lines = dict.fromkeys(loop.lines.values(), MOVING)
         given = {"p": ALONE, "k": TIMED, "c": MOVING, "n": MOVING, **lines}
         self.rank = ranks(self.statements, given)
@@ -59,27 +58,13 @@ class Printed:
         functions = [self._lead(), self._signals(), self._run(), self._read()]
         return "\n".join(functions)
 
-    def helpers(self) -> dict[str, str]:
-        """Return {name: text} of the functions on arrays that the printed ones call."""
-        own = {s.op for s in every(self.used()) if isinstance(s, Matrix)}
-        return {name: text for name, text in self.loop.functions.items() if name in own}
-
-    def used(self) -> list[Statement]:
-        """Return every statement that is printed."""
-        return self.statements
-
     def streams(self) -> list[Ref]:
         """Return what is known of each sample, in the order of S."""
         return sorted(self.kept)
 
-    def columns(self) -> dict[str, int]:
-        """Return {saved field: number of its entries}, in the order of a row of R."""
-        return {field: len(self.loop.saved[field]) for field in SAVED}
-
     def _live(self):
         """The entries of c, without delay lines, that what is saved or measured depends on."""
-        wanted = [e for f in SAVED for e in self.loop.saved[f]] + self._measures()
-        wanted += [*self.others, *(self.loop.after[i] for i in self._levels())]
+        wanted = [*self._saved(), *self._measures(), *(self.loop.after[i] for i in self._levels())]
         lines = [self.loop.after[i] for i in self.loop.lines]
         every, live = self._ranked(MOVING), []
         while True:
@@ -92,10 +77,13 @@ class Printed:
 
     def _outputs(self):
         after = [self.loop.after[i] for i in (*self.state, *self.loop.lines)]
-        return [*after, *self.others, *(e for f in SAVED for e in self.loop.saved[f])]
+        return [*after, *self._saved()]
+
+    def _saved(self):
+        return [e for entries in self.loop.saved.values() for e in entries]
 
     def _measures(self):
-        return [*self.at_end, *(e for found in self.loop.measures.values() for e in found)]
+        return [e for entries in self.loop.measures.values() for e in entries]
 
     def _levels(self):
         """The entries of c that are levels: those whose sum tells a run that diverged."""
@@ -195,7 +183,7 @@ class Printed:
 
     def _run(self):
         text, lines, body, state = self._sample()
-        rows = [f"R[o++]={self._real(e)}{text.of(e)};" for f in SAVED for e in self.loop.saved[f]]
+        rows = [f"R[o++]={self._real(e)}{text.of(e)};" for e in self._saved()]
         body += ["if(k%every===0){", *rows, "}", *self._next(text)]
         lines += ["let o=0;", "for(;k<K;++k){", *body, "}"]
         lines += [f"c[{j}]={own};" for j, own in enumerate(state)]
@@ -250,8 +238,8 @@ class Printed:
         state = [next(text.names) for _ in self.state]
         text.given |= {Ref("c", i): own for i, own in zip(self.state, state)}
         lines.append(f"const[{','.join(state)}]=c;")
-        outputs = [e for found in self.loop.measures.values() for e in found]
-        lines += text.write(used(self.measured, names(outputs)), outputs, hold=outputs)
+        outputs = self._measures()
+        lines += text.write(self.measured, outputs, hold=outputs)
         return function("read", "q,c", [*lines, f"return[{','.join(map(text.of, outputs))}];"])
 
 

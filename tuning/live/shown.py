@@ -51,13 +51,15 @@ def frame(live: LivePage, height: int = HEIGHT) -> str:
     )
 
 
-def of_case(case: Any, presets: Any = (), source: str | None = None) -> LivePage:
-    """Return the LivePage of a case; presets and source as `tuning.live.page.page` takes them."""
+def of_case(
+    case: Any, presets: Any = (), source: str | None = None, plants: int | None = None
+) -> LivePage:
+    """Return the LivePage of a case; the arguments are those of `tuning.live.page.page`."""
     # Raises InputError for a case that cannot be run in a browser.
-    return LivePage(case.name, page(case, presets, source))
+    return LivePage(case.name, page(case, presets, source, plants))
 
 
-def of_result(result: Any) -> LivePage:
+def of_result(result: Any, plants: int | None = None) -> LivePage:
     """Return the LivePage of a result of `tuning`: of its case, or of the tuned one with the values
     before and after as states to start from.
     """
@@ -75,7 +77,7 @@ def of_result(result: Any) -> LivePage:
         own = set(ms.functions(limits))  # a user's functions do not run in a browser
         limits = {m: value for m, value in limits.items() if m not in own}
         case = case.replace(limits=limits)  # those of the search, with --limit
-    return of_case(case, states_of(result))
+    return of_case(case, states_of(result), plants=plants)
 
 
 def states_of(result: Any) -> list[tuple[str, dict[str, Any], bool]]:

@@ -7,7 +7,7 @@ No DOM: a worker and node run the same text. */
 /* tune(engine, values, free, limits, onProgress, shouldStop, options) ->
   {values, objective, violation, iterations, evaluations, status}
 
-values: {name: number} to start from; free: names to change, of engine.info.derivatives; limits: as
+values: {name: number} to start from; free: names to change, of engine.info.leaves; limits: as
 engine.info.limits; options: {filter, seed, starts, most}. Violation: the largest share by which a
 limit is passed, 0 where all hold. Status: "converged", "stopped", "limit of iterations",
 "limits not met". The best values so far are returned whenever shouldStop() is true. */
@@ -85,14 +85,14 @@ function searchOf(engine, values, free, limits, options) {
     },
     value(z) {
       if (known.has(z.join())) return known.get(z.join());
-      const run = engine.tangents(at(z), [], options);
-      return judged(z, run.measures, run.broken);
+      const run = engine.run(at(z), { ...options, every: engine.every, search: true });
+      return Object.assign(judged(z, run.measures, run.broken), { run });
     },
     point(z) {
       const before = known.get(z.join());
       if (before && before.gradient) return before;
-      const run = engine.tangents(at(z), free, options), P = free.length;
-      const point = judged(z, run.measures, run.broken), per = boxes.map((box, j) => box.slope(z[j]));
+      const run = engine.slopes(at(z), free, options, before && before.run), P = free.length;
+      const point = before || judged(z, run.measures, run.broken), per = boxes.map((box, j) => box.slope(z[j]));
       const gradient = new Float64Array(P);
       const row = (m, i, j) => run.jacobian[m][i * P + j] * per[j];
       for (const [m, w] of weights)
@@ -160,7 +160,6 @@ const INSIDE = 1e-7; // share of a limit that a search stays away from it
 const CLOSE = 1e-7; // predicted fall of the merit at which a search has converged
 
 const NEAR = 0.03; // of the end of another search, where nothing new is expected
-const FEW = 4; // free numbers up to which a step that may well be taken is tried with its derivatives
 
 /* A local search from z; returns its status. */
 function local(search, z, most, report, stop) {
@@ -192,7 +191,7 @@ function local(search, z, most, report, stop) {
       penalty *= 10;
       continue;
     }
-    const next = moved(point.z, step), tried = taken && P <= FEW ? search.point(next) : search.value(next);
+    const next = moved(point.z, step), tried = search.value(next);
     const gained = (merit(point) - merit(tried)) / fall;
     taken = gained > 1e-4;
     if (taken) {

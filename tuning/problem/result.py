@@ -72,11 +72,7 @@ class Result(Shown):
         with its values before and after. A notebook shows it, and `.save(path)` writes it.
         """
         # Raises InputError for a case that cannot be run in a browser.
-        live = importlib.import_module("tuning.live.shown")
-        own = getattr(self, "tuned", None) or getattr(self, "case", None)
-        if plants is None or own is None:
-            return live.of_result(self)
-        return own.explore(plants=plants)
+        return importlib.import_module("tuning.live.shown").of_result(self, plants)
 
     def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
         """Write result.json, tables, pictures and report.html to `folder`; return their paths."""

@@ -18,7 +18,6 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.signals.base import Constant
 from tuning.live import shown
-from tuning.live.gallery import gallery
 from tuning.live.page import page
 
 SETTINGS = {
@@ -287,9 +286,8 @@ def test_the_command_writes_one_file_or_none(tmp_path):
     assert done.code == 0 and done.json["bytes"] == path.stat().st_size
     assert "cascaded/pi" in path.read_text(encoding="utf-8")
     for words, error in (
-        ((), "give a case"),
+        ((), "CASE"),
         (("cascaded/pi",), "--out page.html"),
-        (("cascaded/pi", "--all", "--out", str(tmp_path)), "give a case"),
         (("cascaded/pi", "--out", str(tmp_path)), "is a folder"),
         (("cascaded/pj", "--out", str(tmp_path / "a.html")), "cascaded/pi"),
         (("cascaded/pi", "--out", str(path / "a.html")), "is a file"),
@@ -328,25 +326,32 @@ def test_a_filtered_case_is_repeated_with_its_settings(browser, tmp_path):
     assert np.max(found["filter_active_fraction"]) > 0.0
 
 
-def test_the_gallery_lists_what_it_has(browser, tmp_path):
-    paths = gallery(tmp_path, ["cascaded/pi"])
-    assert [p.name for p in paths] == ["index.html", "cascaded-pi.html"]
-    context = browser.new_context(offline=True)
-    try:
-        tab = context.new_page()
-        tab.goto(paths[0].as_uri())
-        tab.click("text=pi")
-        assert tab.text_content("#case") == "cascaded/pi"
-    finally:
-        context.close()
-
-
 def test_a_result_without_a_case_has_no_page():
     with pytest.raises(InputError, match="has no case of its own"):
         shown.of_result(object())
     live = presets.find("cascaded/pi").explore()
     assert isinstance(live, shown.LivePage) and "srcdoc=" in live._repr_html_()
     assert json.dumps(live.name) in repr(live).replace("'", '"')
+
+
+def test_a_page_of_n_plants_shows_their_band_at_once_and_tunes_what_is_free(browser, tmp_path):
+    case = presets.find("cascaded/pi")
+    path = case.explore({"controller.Ti": (60.0, 600.0)}, plants=20).save(tmp_path / "page.html")
+    with opened(browser, path) as live:
+        live.wait("document.querySelector('#legend').textContent.includes('90 % of 20 plants')")
+        assert live.text("#plants") == "20 plants"
+        live.page.click("#plants")
+        assert "plants" not in live.text("#legend")
+        assert live("makeEngine().info.free") == ["controller.Ti[0]"]
+        assert live("makeEngine().info.bounds") == {"controller.Ti[0]": [60.0, 600.0]}
+
+
+@pytest.mark.parametrize(
+    ("free", "plants"), [(None, 0), (None, 2001), (None, 1.5), ({"controller.Kp": (0, 1)}, 5)]
+)
+def test_plants_and_free_parameters_of_a_page_are_checked(free, plants):
+    with pytest.raises(InputError):
+        presets.find("cascaded/pi").explore(free, plants)
 
 
 @pytest.mark.slow

@@ -116,12 +116,6 @@ def test_every_way_to_run_has_the_same_integrals(chain, sums):
         )
 
 
-def test_a_kernel_has_the_same_integrals(chain, sums):
-    gains = {"controller.Kc": np.full((1, 1), 4.0)}
-    found = jaxtank.evaluate_many(chain.loop, chain.clock, ["ise"], gains, batch=1, kernel=True)
-    np.testing.assert_allclose(found["ise"][0], sums["ise"], rtol=1e-9)
-
-
 def test_residuals_of_the_integral_are_those_of_its_samples(chain):
     loop, clock = chain.loop, chain.clock
     point = {"reference.targets": loop.reference.targets}

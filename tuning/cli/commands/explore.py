@@ -1,4 +1,4 @@
-"""`jaxtank explore`: the live page of a case, and a gallery of all of them."""
+"""`jaxtank explore`: the live page of a case."""
 
 import sys
 import tempfile
@@ -23,40 +23,18 @@ def add(commands, parents):
     )
     one.set_defaults(run=explore)
     one.add_argument(
-        "case",
-        metavar="CASE",
-        nargs="?",
-        help='"paper/case" (see jaxtank list) or a rig file ending in .toml',
+        "case", metavar="CASE", help='"paper/case" (see jaxtank list) or a rig file ending in .toml'
     )
-    one.add_argument(
-        "--out",
-        dest="page",
-        metavar="HTML",
-        help="file to write, as page.html; with --all the folder of the pages",
-    )
+    one.add_argument("--out", dest="page", metavar="HTML", help="file to write, as page.html")
     one.add_argument("--open", action="store_true", help="open the page in the browser")
-    one.add_argument("--all", action="store_true", help="a page of each case, and index.html")
 
 
 def explore(args):
-    """Write the live page of a case, or of all cases with a page that lists them."""
-    if args.all == (args.case is not None):
-        raise InputError("explore: give a case (see jaxtank list), or --all for every case")
-    if args.page is None and (args.all or not args.open):
-        raise InputError(
-            f"explore: give --out {'DIR' if args.all else 'page.html'}"
-            + ("" if args.all else ", or --open to look at it")
-        )
+    """Write the live page of a case."""
+    if args.page is None and not args.open:
+        raise InputError("explore: give --out page.html, or --open to look at it")
     if args.page is not None and not args.page.strip():
         raise InputError("--out '': must name a file")
-    written = _gallery(args) if args.all else _page(args)
-    if args.open:
-        webbrowser.open_new_tab(written[0].resolve().as_uri())
-    return 0
-
-
-def _page(args):
-    """Write the page of one case; returns its path."""
     path = Path(args.page or Path(tempfile.mkdtemp(prefix="jaxtank-"), "page.html"))
     if path.is_dir():
         raise InputError(f"--out {str(path)!r} is a folder: give a file, as {path}/page.html")
@@ -69,26 +47,9 @@ def _page(args):
     live = shown.of_case(case, source=args.case if args.case.endswith(".toml") else None)
     live.save(path)
     _report(args, {"case": case.name, "page": str(path), "bytes": len(live.text.encode())})
-    return [path]
-
-
-def _gallery(args):
-    """Write the pages of all cases and index.html; returns their paths."""
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    from tuning.live.gallery import gallery
-
-    def note(name):
-        if not args.quiet:
-            print(f"writing {name}", file=sys.stderr, flush=True)
-
-    paths = gallery(args.page, each=note)
-    if args.json:
-        from tuning.report import tables
-
-        print(tables.dumps({"pages": [str(path) for path in paths]}))
-    return paths
+    if args.open:
+        webbrowser.open_new_tab(path.resolve().as_uri())
+    return 0
 
 
 def _report(args, payload):

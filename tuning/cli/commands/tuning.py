@@ -19,7 +19,6 @@ from tuning.cli.options import (
 )
 from tuning.cli.terminal import Line
 from tuning.cli.values import number, once, open_case, pair, span
-from tuning.cli.watch import Watch, first_sentence, watch_of
 
 
 class Progress(Interrupts):
@@ -28,7 +27,6 @@ class Progress(Interrupts):
     def __init__(self, unit, quiet, option=None):
         super().__init__()
         self.unit, self.last, self.line = unit, None, Line(quiet)
-        self.watch: Watch | None = None
         self.note = option and f"{option} implies --nominal: the optimum of the case as it is"
         self.line.compiling("the simulation and its derivatives", 15)
 
@@ -38,8 +36,6 @@ class Progress(Interrupts):
             self.note = None
         if event["evaluations"] > 1:
             self.check()
-        if self.watch is not None:
-            self.watch(event | {"unit": event.get("unit") or self.unit})
         if not self.line.terminal and event["start"] == self.last:
             return
         self.last = event["start"]
@@ -140,12 +136,6 @@ def _add_search(one):
     option(one, "--iterations", "N", text, None, whole(1, 100_000))
     text = "scenarios drawn for each step of method adam (default all)"
     option(one, "--batch", "N", text, None, whole(1, 100_000))
-    one.add_argument(
-        "--watch",
-        action="store_true",
-        help="write DIR/watch.html, a page that shows the running search (needs --out DIR; written"
-        " without the option too where stderr is a terminal)",
-    )
     text = "go on where a killed run with --out DIR ended, to the same answer"
     option(one, "--resume", "DIR", text)
 
@@ -182,30 +172,23 @@ def _tune(args):
     unit = tables.objective_unit(task["objective"] or case.objective, case.loop.units)
     option = None if args.robust or args.nominal or args.quiet else _goes_with_nominal(args)
     progress = Progress(unit, args.quiet, option)
-    progress.watch = watch_of(args, case, folder, progress.line)
-    with contextlib.nullcontext() if progress.watch is None else progress.watch:
-        result = finder(
-            case,
-            **{k: v for k, v in task.items() if k != "scenarios"},
-            **own,
-            **_numbers(args),
-            checkpoint=folder,
-            resume=args.resume is not None,
-            progress=progress,
-            cluster=args.cluster,
-        )
-        progress.line.end()
-        result = _besides(args, case, result, task, sweep, progress)
-        args.out = folder
-        written = finish(result, args)
-        report_unreachable(result.tuned, written, args)
-        if not args.out and not args.json and not args.quiet:
-            print("Add --out DIR for the tuned rig, the trajectory and pictures.", file=sys.stderr)
-        if progress.watch is not None:
-            stopped = progress.stop or result.status == "interrupted"
-            state = "interrupted" if stopped else "ended"
-            values = {name: result[name].after for name in result}
-            progress.watch.end(state, [first_sentence(str(result))], True, values)
+    result = finder(
+        case,
+        **{k: v for k, v in task.items() if k != "scenarios"},
+        **own,
+        **_numbers(args),
+        checkpoint=folder,
+        resume=args.resume is not None,
+        progress=progress,
+        cluster=args.cluster,
+    )
+    progress.line.end()
+    result = _besides(args, case, result, task, sweep, progress)
+    args.out = folder
+    written = finish(result, args)
+    report_unreachable(result.tuned, written, args)
+    if not args.out and not args.json and not args.quiet:
+        print("Add --out DIR for the tuned rig, the trajectory and pictures.", file=sys.stderr)
     return progress.code if progress.stop else EXIT[result.status]
 
 

@@ -1,0 +1,562 @@
+"""One sample of the whole closed loop as statements, and their text as short JavaScript.
+
+References, disturbances, sensor, observer, controller, safety filter, pumps, plant, overflow and
+measures: the functions that are simulated, traced with every number of the loop as an input. Then
+statements sorted by what they depend on, so that each is computed as seldom as possible, and
+printed in few characters: a value that is read once becomes part of what reads it.
+"""
+
+import dataclasses
+import itertools
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank import measures as ms
+from jaxtank.analysis.elimination import rolled
+from jaxtank.case import Case
+from jaxtank.core.clock import Chunk, is_pointwise
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import parameters, with_values
+from jaxtank.export.javascript import MATRICES, ROUND
+from jaxtank.export.lowering import Writer, lower_all
+from jaxtank.export.statements import (
+    Array,
+    Define,
+    Loop,
+    Matrix,
+    Ref,
+    Statement,
+    Store,
+    Until,
+    names,
+    used,
+)
+from jaxtank.loop.closed_loop import initial, inputs_at, run_of, zero_of
+from jaxtank.loop.step import step
+
+SAVED = ("x", "y", "r", "u", "command", "spilled", "d_hat")
+"""What is kept of a sample: fields of a Trajectory."""
+
+
+LARGEST = 24
+"""Tanks of a loop that is written as code."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WholeLoop:
+    """The statements of one sample, in order, and what they lead to."""
+
+    case: Case
+    leaves: tuple[tuple[str, tuple[int, ...]], ...]
+    """(dotted name, index in it) of each entry of p."""
+    statements: list[Statement]
+    first: list[Any]
+    """Entries of c before the first sample."""
+    after: list[Any]
+    """Entries of c after a sample."""
+    saved: dict[str, list[Any]]
+    """{field of `SAVED`, or "errors": its entries at a sample}."""
+    weights: list[float]
+    """Weight of the square of each of the errors."""
+    measures: dict[str, list[Any]]
+    """{measure: its entries}, read of c after the last sample."""
+    lines: dict[int, str]
+    """{entry of c at which a Line begins: its name}."""
+
+
+def traced_leaves(case: Case, largest: int = 64) -> dict[str, np.ndarray]:
+    """Return {dotted name: value} of the numbers of a loop that are inputs of its statements."""
+    found = {n: np.asarray(v, dtype=float) for n, v in parameters(case.loop).items()}
+    return {n: v for n, v in found.items() if 0 < v.size <= largest}
+
+
+def served(case: Case) -> tuple[str, ...]:
+    """Return the names of the measures that mean something for a case, those of times included."""
+    return (*(m for m in ms.reported() if ms.serves(m, case.loop)), *ms.times())
+
+
+def sample_of(case: Case, names: Sequence[str], squares: Sequence[tuple[str, float]] = ()) -> Any:
+    """Return the function (p, k, c, n) -> (c before the first sample, c after this one, saved,
+    measures, residuals) of a case.
+    """
+    clock, names = case.clock, tuple(names)
+
+    def whole(p: Any, k: Any, c: Any, n: Any) -> Any:
+        loop = with_values(case.loop, p)
+        state, acc, spilled = c
+        state = state._replace(k=k)
+        noisy = np.ndim(loop.sensor.noise) > 0
+        xi = tuple(v[None] for v in n) if noisy else None
+        now = inputs_at(loop, Chunk(first=k, samples=1, dt=clock.dt), names, xi)
+        now = jax.tree.map(lambda a: a[0], now)
+        run = run_of(loop, clock)
+        after, sample = step(loop, clock, state, now)
+        errors = ms.residuals(run, acc, sample, now.context, squares)
+        update = ms.update(run, acc, sample, now.context)
+        saved = {f: tuple(getattr(sample, f)) for f in SAVED} | {"spilled": spilled}
+        total = tuple(a + b for a, b in zip(spilled, sample.spilled))
+        start = initial(loop, clock)._replace(k=())
+        before = (start, ms.start(run, names), (zero_of(loop),) * loop.plant.tanks)
+        found = ms.read(run, acc, names)
+        return before, (after._replace(k=()), update, total), saved, found, errors
+
+    return whole
+
+
+def whole_loop(
+    case: Case, names: Sequence[str] | None = None, squares: Sequence[tuple[str, float]] = ()
+) -> WholeLoop:
+    """Return the WholeLoop of a case with the measures `names`, all that it serves if None.
+
+    With `squares` all that it saves is "errors", the residuals of these weighted measures.
+    """
+    check_pointwise(case)
+    names = served(case) if names is None else tuple(names)
+    kept = tuple(dict.fromkeys([*names, *(m for m, _ in squares)]))
+    shapes = arguments(case, kept)
+    with rolled():
+        made = lower_all(sample_of(case, kept, squares), shapes, WholeWriter())
+    before, after, saved, found, errors = made.outputs
+    return WholeLoop(
+        case=case,
+        leaves=entries_of(shapes["p"]),
+        statements=made.statements,
+        first=flat(before),
+        after=flat(after),
+        saved={"errors": flat(errors)} if squares else {f: flat(saved[f]) for f in SAVED},
+        weights=[float(w) for w in ms.residual_weights(run_of(case.loop, case.clock), squares)],
+        measures={m: flat(found[m]) for m in names},
+        lines={start.index: name for start, name in made.lines.items()},
+    )
+
+
+def check_pointwise(case: Case) -> None:
+    """Raise InputError for a loop whose signals do not follow from their times alone, and for one
+    of too many tanks: their code, a statement for each number, takes minutes to write.
+    """
+    if case.loop.plant.tanks > LARGEST:
+        raise InputError(
+            f"{case.name}: its rig has {case.loop.plant.tanks} tanks: a loop as code may have at"
+            f" most {LARGEST}"
+        )
+    if not is_pointwise(case.loop):
+        raise InputError(
+            f"{case.name}: its signals are recorded samples, or its controller looks ahead; its"
+            " loop has no code of single samples"
+        )
+
+
+def arguments(case: Case, names: Sequence[str]) -> dict[str, Any]:
+    """Return {name: shapes and types} of the arguments of `sample_of`, with measures `names`."""
+    real = jnp.result_type(float)
+    return {
+        "p": {n: jax.ShapeDtypeStruct(v.shape, real) for n, v in traced_leaves(case).items()},
+        "k": jax.ShapeDtypeStruct((), jnp.int32),
+        "c": carried(case, names),
+        "n": (jax.ShapeDtypeStruct((), real),) * case.loop.plant.tanks,
+    }
+
+
+def entries_of(shapes: dict[str, Any]) -> tuple[tuple[str, tuple[int, ...]], ...]:
+    """Return (dotted name, index in it) of each entry of arrays, in the order of an argument."""
+    return tuple((name, i) for name in sorted(shapes) for i in np.ndindex(shapes[name].shape))
+
+
+def carried(case: Case, names: Sequence[str]) -> Any:
+    """Return the shapes and types of what one sample hands to the next, with measures `names`."""
+
+    def start() -> Any:
+        run = run_of(case.loop, case.clock)
+        state = initial(case.loop, case.clock)._replace(k=())
+        zero = (zero_of(case.loop),) * case.loop.plant.tanks
+        return state, ms.start(run, names), zero
+
+    return jax.eval_shape(start)
+
+
+class WholeWriter(Writer):
+    """A Writer for the many matrices that are computed from the numbers of a loop."""
+
+    large = 60
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sizes: dict[str, int] = {}
+        self.arrays: dict[tuple[Any, ...], str] = {}
+
+    def matrix(self, op: str, operands: Any, sizes: Any, shape: Any) -> np.ndarray:
+        out = super().matrix(op, operands, sizes, shape)
+        self.sizes[out.ravel()[0].name] = out.size
+        return out
+
+    def array(self, entries: np.ndarray) -> str:
+        """Return the name of an array with these entries: a result, an earlier one or a new one."""
+        elements = tuple(entries.ravel())
+        name = getattr(elements[0], "name", "")
+        whole = tuple(Ref(name, i) for i in range(self.sizes.get(name, 0)))
+        if elements == whole:
+            return name
+        if len(self.scopes) > 1:
+            return super().array(entries)
+        key = tuple((type(e), e) for e in elements)
+        if key not in self.arrays:
+            self.arrays[key] = super().array(entries)
+        return self.arrays[key]
+
+
+def flat(tree: Any) -> list[Any]:
+    """Return the entries of all arrays of a tree."""
+    return [e for array in jax.tree.leaves(tree) for e in np.ravel(array)]
+
+
+_CHEAP = """
+add sub mul neg abs max min lt le gt ge eq ne and or not select real square truth
+"""
+CHEAP = frozenset(_CHEAP.split())
+"""Operations that cost less than a number that is kept for every sample."""
+
+
+def hoisted(statements: Iterable[Statement]) -> list[Statement]:
+    """Return statements with those of a loop's body that no pass changes moved in front of it."""
+    out: list[Statement] = []
+    for s in statements:
+        if not isinstance(s, Loop):
+            out.append(s)
+            continue
+        inside, own = {name for _, name, _ in s.carried}, []
+        for one in hoisted(s.body):
+            free = isinstance(one, Define | Array) and not one.reads & inside
+            if free:
+                out.append(one)
+                continue
+            own.append(one)
+            inside |= defined(one)
+        out.append(s._replace(body=own))
+    return out
+
+
+def defined(statement: Statement) -> set[str]:
+    """Return the names that a statement defines for those after it."""
+    if isinstance(statement, Loop):
+        return {name for _, name, _ in statement.carried}
+    return set() if isinstance(statement, Until) else {statement.name}
+
+
+def ranks(statements: Iterable[Statement], given: Mapping[str, int]) -> dict[str, int]:
+    """Return {name: rank} of every variable: the largest rank of what it depends on."""
+    found = dict(given)
+    for s in statements:
+        own = s.reads if not isinstance(s, Loop) else s.reads - local(s)
+        rank = max((found[n] for n in own), default=0)
+        if isinstance(s, Store):
+            rank = max(rank, found[s.array])
+        found.update(dict.fromkeys(defined(s), rank))
+    return found
+
+
+def local(loop: Loop) -> set[str]:
+    """Return the names that exist in a loop's body alone, and its carried variables."""
+    inside = {name for _, name, _ in loop.carried}
+    for s in loop.body:
+        inside |= local(s) if isinstance(s, Loop) else defined(s)
+    return inside
+
+
+def of_rank(
+    statements: Iterable[Statement], rank: Mapping[str, int], wanted: int
+) -> list[Statement]:
+    """Return the statements of one rank, in order."""
+    return [s for s in statements if any(rank[n] == wanted for n in defined(s))]
+
+
+def refs(statements: Iterable[Statement], entries: Iterable = ()) -> set[Ref]:
+    """Return every Ref that statements and entries read, without those that a loop has inside; of
+    an array that is read at a variable index, the array and the index.
+    """
+    found = {e for e in entries if isinstance(e, Ref)}
+    for s in statements:
+        if isinstance(s, Loop):
+            inside = refs(s.body, [*s.new, *(start for *_, start in s.carried)])
+            own = local(s)
+            found |= {e for e in inside if e.name not in own}
+        else:
+            found |= {e for e in entries_read(s) if isinstance(e, Ref)}
+    moving = {e for e in found if isinstance(e.index, Ref)}
+    return (found - moving) | {r for e in moving for r in (Ref(e.name), cast(Ref, e.index))}
+
+
+def entries_read(s: Statement) -> tuple:
+    """Return the numbers and Refs that a statement, not a loop, reads one by one."""
+    if isinstance(s, Define):
+        return s.args
+    if isinstance(s, Array):
+        return s.entries
+    if isinstance(s, Store):
+        return s.index, s.value, Ref(s.array)
+    return (s.test,) if isinstance(s, Until) else ()
+
+
+def kept_in_time(
+    timed: list[Statement], wanted: set[Ref], rank: Mapping[str, int]
+) -> tuple[set[Ref], list[Statement]]:
+    """Return (values of rank 1 to keep for every sample, statements that follow from them)."""
+    made = {s.name: s for s in timed if isinstance(s, Define)}
+    kept, again = set(wanted), set()
+
+    def free(ref: Ref, depth: int) -> bool:
+        """Whether a value needs nothing to be kept that is not."""
+        if rank[ref.name] == 0 or ref in kept or ref.name == "k":
+            return True
+        s = made.get(ref.name)
+        if s is None or s.op not in CHEAP or depth == 0:
+            return False
+        return all(free(a, depth - 1) for a in s.args if isinstance(a, Ref))
+
+    for ref in sorted(wanted, key=lambda r: order(timed, r), reverse=True):
+        s = made.get(ref.name)
+        if s is None or s.op not in CHEAP:
+            continue
+        kept.discard(ref)
+        if all(free(a, 1) for a in s.args if isinstance(a, Ref)):
+            again.add(ref)
+        else:
+            kept.add(ref)
+    rest = [s for s in timed if not isinstance(s, Define) or Ref(s.name) not in kept]
+    return kept, used(rest, names(again))
+
+
+def order(statements: list[Statement], ref: Ref) -> int:
+    """Return the position of the statement that defines a Ref, -1 for an input."""
+    return next((i for i, s in enumerate(statements) if ref.name in defined(s)), -1)
+
+
+LOOSE, CHOICE, TIGHT = 1, 2, 20
+BINARY = {
+    "or": ("||", 3),
+    "and": ("&&", 4),
+    "eq": ("===", 8),
+    "ne": ("!==", 8),
+    "lt": ("<", 9),
+    "le": ("<=", 9),
+    "gt": (">", 9),
+    "ge": (">=", 9),
+    "add": ("+", 11),
+    "sub": ("-", 11),
+    "mul": ("*", 12),
+    "div": ("/", 12),
+    "rem": ("%", 12),
+    "remainder": ("%", 12),
+}
+"""{operation: (operator, how tightly it binds)}."""
+
+LAZY = {"select": 1, "and": 1, "or": 1}
+"""{operation: first argument that JavaScript may leave out}. Work on it is done all the same: V8
+throws compiled code away when a branch that it has never seen is taken.
+"""
+
+UNARY = {"neg": "-", "not": "!", "real": "+"}
+_MATHS = """
+abs max min pow atan2 sign sqrt exp log tanh sin cos floor ceil log1p expm1 tan asin acos atan sinh
+cosh asinh acosh atanh cbrt trunc
+"""
+MATHS = _MATHS.split()
+"""Functions of Math that a text has by their own names."""
+
+FORMS = {
+    "square": "{0}*{0}",
+    "rsqrt": "1/sqrt({0})",
+    "exp2": "pow(2,{0})",
+    "logistic": "1/(1+exp(-{0}))",
+    "quotient": "trunc({0}/{1})",
+    "whole": "trunc({0})",
+    "truth": "{0}!=0",
+    "round": "rint({0})",
+    "is_finite": "isFinite({0})",
+}
+"""Operations on names and numbers alone, as formats."""
+
+_TAKEN = "do if in of as is for let new try var get set int Map Set"
+TAKEN = frozenset(_TAKEN.split())
+LETTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ"
+
+
+def short_names(taken: Iterable[str] = ()) -> Iterator[str]:
+    """Yield names, short ones first, without keywords, functions of Math and `taken`."""
+    avoid = TAKEN | set(MATHS) | set(taken)
+    for size in itertools.count(1):
+        for letters in itertools.product(LETTERS, repeat=size):
+            name = "".join(letters)
+            if name not in avoid:
+                yield name
+
+
+def literal(value: Any) -> str:
+    """Return a number as text, in as few characters as it takes."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float) and not np.isfinite(value):
+        return "NaN" if np.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    text = repr(value).removesuffix(".0").replace("e-0", "e-").replace("e+", "e")
+    return text[1:] if text.startswith("0.") else text.replace("-0.", "-.", 1)
+
+
+class Text:
+    """The statements of one function as they are written."""
+
+    def __init__(self, given: Mapping[Any, str], names: Iterator[str]):
+        self.given, self.names = dict(given), names
+        self.pending: dict[str, tuple[str, int]] = {}
+        self.uses: Counter = Counter()
+
+    def write(
+        self, statements: list[Statement], outputs: Iterable[Any], hold: Iterable[Any] = ()
+    ) -> list[str]:
+        """Return the lines of statements whose results `outputs` are read afterwards, once each;
+        those of `hold` get a variable.
+        """
+        self.uses = _uses(statements, outputs)
+        for e in hold:
+            if isinstance(e, Ref):
+                self.uses[e.name] += 2
+        return self._block(statements)
+
+    def of(self, e: Any) -> str:
+        """Return a number or a Ref as text."""
+        return self._expression(e)[0]
+
+    def _block(self, statements):
+        return [line for s in statements for line in self._lines(s)]
+
+    def _expression(self, e) -> tuple[str, int]:
+        if not isinstance(e, Ref):
+            text = literal(e)
+            return text, 14 if text.startswith("-") else TIGHT
+        if e in self.given:
+            return self.given[e], TIGHT
+        if e.index is None and e.name in self.pending:
+            return self.pending.pop(e.name)
+        name = self.given[e.name]
+        if e.index is None:
+            return name, TIGHT
+        at = self.of(e.index) if isinstance(e.index, Ref) else e.index
+        return f"{name}[{at}]", TIGHT
+
+    def _bound(self, e, least):
+        """The text of an operand that binds at least as tightly as `least`."""
+        text, tight = self._expression(e)
+        return text if tight >= least else f"({text})"
+
+    def _operation(self, op, args):
+        """(text, how tightly it binds) of an operation."""
+        if op in BINARY:
+            sign, tight = BINARY[op]
+            left, right = self._bound(args[0], tight), self._bound(args[1], tight + 1)
+            clash = right[0] in "+-" and sign == right[0]
+            return f"{left}{sign}{f'({right})' if clash else right}", tight
+        if op in UNARY:
+            inner = self._bound(args[0], 14)
+            return UNARY[op] + (f"({inner})" if inner[0] in "+-" else inner), 14
+        if op == "select":
+            test, no, yes = args
+            # the last branch may be a choice itself
+            texts = [self._bound(test, CHOICE + 1), self._bound(yes, CHOICE + 1)]
+            return f"{texts[0]}?{texts[1]}:{self._bound(no, CHOICE)}", CHOICE
+        if op == "item":
+            return f"{self.given[args[0].name]}[{self.of(args[1])}]", TIGHT
+        if op in MATHS:
+            return f"{op}({','.join(map(self.of, args))})", TIGHT
+        if op not in FORMS:
+            raise InputError(f"this loop has no JavaScript: it uses the operation {op}")
+        loose = op in ("whole", "round", "is_finite")
+        texts = [self.of(a) if loose else self._bound(a, 14) for a in args]
+        return FORMS[op].format(*texts), 8 if op == "truth" else 12 if "/" in FORMS[op] else TIGHT
+
+    def _lines(self, s):
+        if isinstance(s, Define):
+            return self._define(s)
+        if isinstance(s, Array):
+            return [f"const {self._named(s.name)}=[{','.join(map(self.of, s.entries))}];"]
+        if isinstance(s, Matrix):
+            operands = [*map(str, s.sizes), *(self.given[o] for o in s.operands)]
+            return [f"const {self._named(s.name)}={s.op}({','.join(operands)});"]
+        if isinstance(s, Store):
+            line = f"{self.given[s.array]}[{self.of(s.index)}]={self.of(s.value)};"
+            self.given[s.name] = self.given[s.array]
+            return [line]
+        if isinstance(s, Until):
+            return [f"if(!{self._bound(s.test, 14)})break;"]
+        return self._loop(s)
+
+    def _named(self, name):
+        self.given[name] = next(self.names)
+        return self.given[name]
+
+    def _define(self, s):
+        text, tight = self._operation(s.op, s.args)
+        if self.uses[s.name] == 1 and s.op != "item":
+            self.pending[s.name] = text, 12 if s.op == "square" else tight
+            return []
+        return [f"const {self._named(s.name)}={text};"]
+
+    def _loop(self, s):
+        starts = [self.of(start) for *_, start in s.carried]
+        own = [self._named(name) for _, name, _ in s.carried]
+        lines = [f"let {n}={v};" for n, v in zip(own, starts)]
+        counter = next(self.names)
+        lines.append(
+            "for(;;){"
+            if s.count is None
+            else f"for(let {counter}=0;{counter}<{s.count};++{counter}){{"
+        )
+        lines += self._block(s.body)
+        new = [
+            (n, self.of(e))
+            for n, e in zip(own, s.new)
+            if self.given.get(getattr(e, "name", "")) != n
+        ]
+        temporary = [next(self.names) for _ in new]
+        lines += [f"const {t}={e};" for t, (_, e) in zip(temporary, new)]
+        return [*lines, *(f"{n}={t};" for t, (n, _) in zip(temporary, new)), "}"]
+
+
+def _uses(statements, outputs):
+    """{name: how often it is read}; what a loop reads of outside counts as often."""
+    found: Counter = Counter()
+
+    def read(e, times=1):
+        if isinstance(e, Ref):
+            found[e.name] += times
+            read(e.index, 2)
+
+    for e in outputs:
+        read(e)
+    for s in statements:
+        if isinstance(s, Define):
+            for i, e in enumerate(s.args):
+                read(e, 2 if s.op == "square" or i >= LAZY.get(s.op, 9) else 1)
+        elif isinstance(s, Array):
+            for e in s.entries:
+                read(e)
+        elif isinstance(s, Store):
+            read(s.index)
+            read(s.value)
+        elif isinstance(s, Until):
+            read(s.test)
+        elif isinstance(s, Loop):
+            inside = {one.name for one in s.body if isinstance(one, Define)}
+            for name, count in _uses(s.body, s.new).items():
+                found[name] += count if name in inside else 2
+            for *_, start in s.carried:
+                read(start)
+    return found
+
+
+def library(text: str) -> list[str]:
+    """Return the functions that a text calls and JavaScript does not have."""
+    functions = {**MATRICES, "rint": ROUND}
+    return [source.strip() for name, source in functions.items() if f"{name}(" in text]

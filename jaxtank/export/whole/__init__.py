@@ -1,1 +1,0 @@
-"""A whole closed loop as code: its sample as statements, sorted and printed in few characters."""
