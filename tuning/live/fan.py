@@ -15,10 +15,10 @@ from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.loop.rows_and_measures import rows_and_measures
-from tuning.answer.setting import plants_of
 from tuning.problem.bounds import Bound, bounds
 from tuning.problem.scenarios import COARSE, noisy
 from tuning.problem.slopes import contradicted
+from tuning.search.setting import plants_of
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import check_whole, probabilities
 

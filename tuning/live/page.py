@@ -23,10 +23,10 @@ from jaxtank.core.tree import get_value, parameters
 from jaxtank.export.whole.loop import check_pointwise
 from jaxtank.loop.closed_loop import takes_arrays
 from jaxtank.loop.trajectory import stride
-from tuning.answer.setting import plants_of
 from tuning.live.drawing import drawing
 from tuning.live.engine import engine
 from tuning.live.origin import both, entries, origin_of
+from tuning.search.setting import plants_of
 
 HERE = Path(__file__).parent
 SCRIPTS = ("charts", "rig", "runner", "page")

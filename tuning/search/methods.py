@@ -8,10 +8,94 @@ import scipy  # its parts are imported when they are first used
 from tuning.cluster.ahead import recorded
 from tuning.problem.point import DIVERGED
 from tuning.problem.problem import ROOT
-from tuning.search.driver import CoarseSearch, Search
-from tuning.search.first_order import adam, lbfgs, minibatches
-from tuning.search.kkt import LOWER_BY
+from tuning.search.driver import LOWER_BY, SETTLED, CoarseSearch, Search, optimality
 from tuning.search.screening import MEMBERS, distinct_starts, evolution_size, evolve, sobol
+
+STEEPEST = 10.0
+"""Largest gradient, of the scaled cost per unit of z, that a first-order method is given: a steep
+cost near instability should turn it back, and not move it far away.
+"""
+
+
+def lbfgs(search, z, iterations):
+    """Return True if optax's L-BFGS converged: halving steps, projected onto the bounds."""
+    import optax
+
+    return _augmented(search, z, iterations, optax.scale_by_lbfgs(memory_size=8), descend=True)
+
+
+def adam(search, z, iterations):
+    """Return True if optax's Adam converged: five steps an iteration, projected onto the bounds."""
+    import optax
+
+    steps = 5 * iterations
+    schedule = optax.cosine_decay_schedule(0.05, max(steps // _rounds(search), 1), 0.002)
+    return _augmented(search, z, steps, optax.adam(schedule), descend=False)
+
+
+def minibatches(search, z, iterations, batch, rng):
+    """Return True if optax's Adam converged on `batch` scenarios, drawn anew for every step."""
+    import optax
+
+    steps = 5 * iterations
+    optimiser = optax.adam(optax.cosine_decay_schedule(0.05, steps, 0.002))
+    state, every = optimiser.init(z), max(1, steps // 10)
+    for k in range(steps):
+        point = search.problem.batch_point(z, batch, rng)
+        search.report(search)
+        if not point.finite:
+            z = 0.5 * (z + search.last_finite.z)
+            continue
+        scale = search.limit_scale[list(point.rows)]
+        penalty = 100.0 * np.maximum(0.0, -point.margins / scale)
+        g = point.gradient / search.scale - penalty @ (point.margin_slopes / scale[:, None])
+        g = g * min(1.0, STEEPEST / max(float(np.linalg.norm(g)), 1e-300))
+        update, state = optimiser.update(g, state, z)
+        z = np.clip(z + np.asarray(update), 0.0, 1.0)
+        if (k + 1) % every == 0:
+            search.point(z)
+    search.exhausted = True
+    return search.best is not None and optimality(search, search.best)[1] < SETTLED
+
+
+def _rounds(search):
+    """Return how often the multipliers of the limits are updated."""
+    return 4 if search.problem.limits else 1
+
+
+def _augmented(search, z, iterations, optimiser, descend):
+    """Return True if an optax optimiser converged on the augmented Lagrangian of the limits."""
+    weights, stiffness, rounds = np.zeros(len(search.problem.limits)), 100.0, _rounds(search)
+
+    def value(z):
+        f, g = search.cost(z)
+        if not len(weights):
+            return f, g
+        m, slopes = search.margins(z)
+        penalty = np.maximum(0.0, weights - stiffness * m)
+        return f + float(penalty @ penalty) / (2 * stiffness), g - penalty @ slopes
+
+    for _ in range(rounds):
+        state = optimiser.init(z)
+        for _ in range(max(1, iterations // rounds)):
+            f, g = value(z)
+            g = g * min(1.0, STEEPEST / max(float(np.linalg.norm(g)), 1e-300))
+            update, state = optimiser.update(g, state, z)
+            step = np.asarray(update) if not descend else -np.asarray(update)
+            new = np.clip(z + step, 0.0, 1.0)
+            halvings = 0
+            while descend and value(new)[0] > f - 1e-4 * abs(g @ (new - z)) and halvings < 12:
+                step, halvings = 0.5 * step, halvings + 1
+                new = np.clip(z + step, 0.0, 1.0)
+            moved, z = float(np.linalg.norm(new - z)), new
+            search.exhausted = moved >= 1e-6
+            if not search.exhausted:
+                break
+        if len(weights):
+            weights = np.maximum(0.0, weights - stiffness * search.margins(z)[0])
+            stiffness *= 4
+    return search.best is not None and optimality(search, search.best)[1] < SETTLED
+
 
 PROGRESS, PATIENCE = 1e-9, 25
 """Share by which the best cost must fall within PATIENCE evaluations for a search to go on: at a
@@ -32,6 +116,9 @@ RESTORED = 5
 
 NEAR, HALVINGS = 0.1, 10
 """Largest violation of a point that `approach` moves towards [-], and number of halvings."""
+
+MANY = 4
+"""Number of parameters from which "auto" tries Gauss-Newton before it considers limits."""
 
 OFFERED = ("trf", "coarse-trf", "slsqp", "lbfgs", "adam")
 """Methods that can be asked for by name."""
@@ -247,7 +334,7 @@ def approach(search):
             out = middle.z
 
 
-def find_feasible(search, screened, iterations, seed):
+def find_feasible(search, screened, iterations, seed, coarse=True):
     """Return True if the searches for the least violation of the limits came to their end."""
     short = np.maximum(0.0, -screened.margins / search.limit_scale).max(axis=1, initial=0.0)
     starts = distinct_starts(screened.zs, short, RESTORED, search.best.z)
@@ -261,12 +348,21 @@ def find_feasible(search, screened, iterations, seed):
     more = sobol(MEMBERS, len(search.best.z), seed + 1)
     order = np.argsort(np.where(np.isfinite(short), short, np.inf), kind="stable")
     members = np.concatenate([search.best.z[None], screened.zs[order[: count // 2]], more])[:count]
-    now, _ = evolve(search, members, generations, seed)
+    now, _ = evolve(search, members, generations, seed, coarse)
     z = now.zs[np.argmin(now.merits(search))]
     ended.append(restore(search, z, iterations))
     if search.violation(search.best) == 0:
         slsqp(search, search.best.z, iterations)
     return any(ended)
+
+
+def automatic(problem):
+    """Return the method "auto": Gauss-Newton where the cost has squares and no limit is to be kept,
+    or the parameters are many.
+    """
+    if problem.model and not problem.limits:
+        return "trf"
+    return "trf-slsqp" if problem.model and len(problem.bounds) >= MANY else "slsqp"
 
 
 METHODS = {

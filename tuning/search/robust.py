@@ -8,20 +8,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.case import Case, Scenario
+from jaxtank.case import Case
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import split_index
 from jaxtank.rig import check_limits
 from tuning.cluster.engine import connect
 from tuning.problem.functions import as_measures
 from tuning.problem.problem import Problem
 from tuning.problem.result import Shown
 from tuning.search.result import Message, TuningResult
+from tuning.search.setting import scenarios_of
 from tuning.search.tuner import tune
 from tuning.uncertainty.distributions import stated
-from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.result import Ensemble
-from tuning.uncertainty.sampling import clopper_pearson, probabilities, spread_of
+from tuning.uncertainty.sampling import clopper_pearson, spread_of
 from tuning.uncertainty.study import ensemble
 from tuning.uncertainty.validation import SEED_OFFSET, summary_of, validate
 
@@ -67,30 +66,6 @@ class Certificate(NamedTuple):
             "probability of violating a limit": f"{low:.2g} to {high:.2g} (95 % interval)",
         }
         return "\n".join(f"{name}: {value}" for name, value in rows.items())
-
-
-def scenarios_of(case, distributions=None, samples=64, seed=0):
-    """Return `samples` Scenarios of a case, each on a plant drawn from `distributions`."""
-    # The case's own scenarios in turn (its own run, where it has none), each with noise of its own.
-    # Latin hypercube draws. Raises InputError for what cannot be drawn.
-    distributions = spread_of(case) if distributions is None else stated(distributions)
-    space = Draws(case.loop, distributions)
-    values = space.values(probabilities("latin", space.dimensions, samples, seed))
-    base, found = case.scenarios or (Scenario("run"),), []
-    for i in range(samples):
-        own = base[i % len(base)]
-        drawn = {n: v[i].tolist() for n, v in values.items()}
-        set_here = {split_index(n)[0] for n in own.values}
-        kept = {n: v for n, v in drawn.items() if split_index(n)[0] not in set_here}
-        found.append(
-            Scenario(
-                f"plant {i + 1}",
-                {**own.values, **kept},
-                seed=(own.seed + 7919 * (i + 1)) % 2**31,
-                weight=own.weight,
-            )
-        )
-    return tuple(found)
 
 
 def scenario_bound(scenarios, support, beta=CONFIDENCE):

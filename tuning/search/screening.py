@@ -120,17 +120,19 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
     return jax.vmap(lambda v: jax.vmap(lambda *at: jacobian(v, *at))(r, x, u))(values)
 
 
-def screen(problem, count, seed):
+def screen(problem, count, seed, coarse=True):
     """Return (zs, costs, margins, redone) of `count` Sobol points."""
     # zs (points, P), costs (points,), margins (points, limits). At the true step where all runs
-    # have few samples. Else at a coarse step: points that this step alone makes unstable, or whose
-    # coarse run is not finite, are run again at the true step; `redone` counts the first.
+    # have few samples, or not `coarse`. Else at a coarse step: points that this step alone makes
+    # unstable, or whose coarse run is not finite, are run again at the true step; `redone` counts
+    # the first.
     zs = sobol(count, len(problem.bounds), seed)
-    clock, unstable = screening_clock(problem.clock), np.zeros(count, dtype=bool)
-    if count * len(problem.runs) * problem.clock.samples <= AFFORDED:
-        clock = problem.clock
-    costs, margins = problem.screen(zs, coarse=clock != problem.clock)
-    if clock != problem.clock:
+    unstable = np.zeros(count, dtype=bool)
+    coarse = coarse and count * len(problem.runs) * problem.clock.samples > AFFORDED
+    clock = screening_clock(problem.clock) if coarse else None
+    coarse = coarse and clock != problem.clock
+    costs, margins = problem.screen(zs, coarse)
+    if coarse:
         unstable = (spectral_radius(problem, zs, clock) > 1.0) & ~(
             spectral_radius(problem, zs, problem.clock) > 1.0
         )

@@ -1,17 +1,27 @@
 """The stages of one tuning: screening, local searches, feasibility, a final search, diagnostics."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from tuning.cluster.ahead import evaluate_ahead
+from tuning.problem.functions import check_slopes
 from tuning.problem.problem import Problem
 from tuning.problem.slopes import SlopeCheck
+from tuning.problem.status import Status
 from tuning.search import diagnostics
-from tuning.search.driver import SETTLED, Search, event_of
-from tuning.search.kkt import LOWER_BY, UNSTABLE, downhill, optimality
+from tuning.search.driver import (
+    LOWER_BY,
+    SETTLED,
+    UNSTABLE,
+    Search,
+    downhill,
+    event_of,
+    optimality,
+    search_from,
+)
 from tuning.search.methods import (
     UNCONSTRAINED,
     Local,
@@ -21,6 +31,7 @@ from tuning.search.methods import (
     search_alone,
     slsqp,
 )
+from tuning.search.result import Lost
 from tuning.search.screening import (
     MEMBERS,
     Population,
@@ -32,13 +43,12 @@ from tuning.search.screening import (
     screen,
     sobol,
 )
-from tuning.search.starts import search_from
 
 RENEWED = 3
 """How often a search is begun again from where it stopped before conditions of an optimum hold."""
 
-AGREE = 1.001
-"""Two searches whose objectives differ by less than this factor agree [-]."""
+AGREE = 1e-3
+"""Two searches whose objectives differ by less than this share agree [-]."""
 
 SAME = 1e-9
 """Share of the cost by which two programs that compute it may differ, by rounding [-]."""
@@ -65,9 +75,14 @@ class Plan:
     screening: int
     iterations: int
     seed: int
-    batch: int | None
-    tolerance: float | None
+    batch: int | None = None
+    tolerance: float | None = None
     engine: Any = None  # of a cluster, on which the local searches run first
+    # search on to rounding, look at neighbours, and compute the curvature of the answer
+    polish: bool = True
+    coarse: bool = True  # screen and look for better points at ten times the step
+    agree: float = AGREE  # share by which the costs of two searches that agree differ [-]
+    lower_by: float = LOWER_BY  # share by which a point must be lower to be searched from [-]
 
     @property
     def local(self) -> Local:
@@ -92,30 +107,41 @@ class Outcome:
     curvature: dict[str, Any] | None = None
     # at the start and at the answer, whether runs bear the slopes out
     slopes: dict[str, SlopeCheck] = dataclasses.field(default_factory=dict)
+    z: Any = None  # (P,) the answer, where it is not the best point
+    kept: Any = None  # (P,) True for parameters that stay at their first values
+    slack: Any = None  # (limits,) by how much limits are tighter than they were given
 
     @property
     def best(self) -> Any:
         """The best Point; None where no finite one was found."""
         return self.search.best if self.search else None
 
+    @property
+    def point(self) -> Any:
+        """The Point of the answer; None where none is finite."""
+        return self.best if self.search is None or self.z is None else self.search.point(self.z)
+
 
 def solve(problem: Problem, first: np.ndarray, plan: Plan, progress: Callable | None) -> Outcome:
     """Return the Outcome of all stages from z = first (P,); Ctrl-C ends them early."""
     found = Outcome(idle=np.zeros(len(first), dtype=bool))
     try:
-        _run_stages(problem, first, plan, found, _reporter(progress, plan.starts))
+        run_stages(problem, first, plan, found, reporter(progress, plan.starts))
     except KeyboardInterrupt:
         found.interrupted = True
     return found
 
 
-def _run_stages(problem, first, plan, found, report):
+def run_stages(
+    problem: Problem, first: np.ndarray, plan: Plan, found: Outcome, report: Callable
+) -> None:
     """Run the stages one after the other, and keep in `found` what each of them gave."""
     reference = problem.point(first)
+    check_slopes(problem, reference)
     tolerance = {} if plan.tolerance is None else {"tolerance": plan.tolerance}
     search = found.search = Search(problem, reference, report, **tolerance)
     search.take(reference)
-    *measured, found.redone = screen(problem, plan.screening, plan.seed)
+    *measured, found.redone = screen(problem, plan.screening, plan.seed, plan.coarse)
     screened = Population(*measured)
     found.slopes["start"] = search.slope(reference)
     shortfall = np.maximum(0.0, -screened.margins / search.limit_scale)
@@ -126,17 +152,20 @@ def _run_stages(problem, first, plan, found, report):
     for z in starts:
         search.start = len(found.starts)
         _local_search(search, found, plan, z, len(search.history))
+        if _agreed(search, found, plan):
+            break
     _search_screened(search, found, plan, screened)
     if _violated(search) and plan.method not in UNCONSTRAINED:
-        found.least = find_feasible(search, screened, plan.iterations, plan.seed)
-    approach(search)
+        found.least = find_feasible(search, screened, plan.iterations, plan.seed, plan.coarse)
+    if plan.polish:
+        approach(search)
     if search.best is not None:
         _finish(search, found, plan)
         _confirm(search, found, plan, screened)
         found.idle = diagnostics.unexercised(problem, search, first)
-        if not _violated(search) and search.slope(search.best).usable:
+        if plan.polish and not _violated(search) and search.slope(search.best).usable:
             found.curvature = diagnostics.curvature(problem, search, search.best, found.idle)
-    if search.return_to_start():
+    if plan.polish and search.return_to_start():
         found.confirmed, found.curvature = False, None
     if search.best is not None:
         found.slopes["answer"] = search.slope(search.best)
@@ -159,8 +188,8 @@ def _search_screened(search, found, plan, screened):
 
 def _finish(search, found, plan):
     """Search a last time from the best point, and find out whether it is an optimum."""
-    search.start, found.ended = len(found.starts), False
-    if not search.slope(search.best).usable:
+    search.start, found.ended = len(found.starts), not plan.polish and not _violated(search)
+    if not plan.polish or not search.slope(search.best).usable:
         return
     polished = _last_search(search, found, plan)
     settled = not _violated(search) and _nothing_lower(search, plan.iterations)
@@ -172,35 +201,38 @@ def _confirm(search, found, plan, screened):
     """Look for points that are better than the answer, and search on from them, a few times."""
     for k in range(RENEWED):
         mark = search.best
-        lower, blind = _lower_neighbour(search, found), not search.slope(mark).usable
-        if lower is None and (blind or (found.ended and not _agreed(search, found))):
-            lower = _probe(search, found, screened, plan.seed + k)
+        lower = _lower_neighbour(search, found, plan) if plan.polish else None
+        blind = not search.slope(mark).usable
+        if lower is None and (blind or (found.ended and not _agreed(search, found, plan))):
+            lower = _probe(search, found, plan, screened, plan.seed + k)
         if lower is not None:
             search.start, count = len(found.starts), len(search.history)
             _local_search(search, found, plan, lower, count)
             _finish(search, found, plan)
-        if not _is_lower(search, search.best, mark):
+        if not _is_lower(search, search.best, mark, plan):
             found.confirmed = found.ended
             return
         if found.probe:
             found.probe["lower"] += 1
-    found.confirmed = found.ended and _agreed(search, found)
+    found.confirmed = found.ended and _agreed(search, found, plan)
 
 
-def _is_lower(search, point, other):
+def _is_lower(search, point, other, plan):
     """Return True if a point is better than another by more than the cost can be trusted to."""
     if search.violation(other) > 0 or search.violation(point) > 0:
         return search.better(point, other)
-    return point.cost < other.cost - LOWER_BY * abs(other.cost)
+    return point.cost < other.cost - plan.lower_by * abs(other.cost)
 
 
-def _agreed(search, found):
-    """Return True if two searches ended at the answer, or in its value."""
-    most = search.best.cost + (AGREE - 1.0) * abs(search.best.cost)
+def _agreed(search, found, plan):
+    """Return True if two searches ended at the answer, or in its value, and one converged."""
+    if search.best is None or not any(o["converged"] for o in found.starts):
+        return False
+    most = search.best.cost + plan.agree * abs(search.best.cost)
     return sum(o["violation"] == 0.0 and o["cost"] <= most for o in found.starts) > 1
 
 
-def _lower_neighbour(search, found):
+def _lower_neighbour(search, found, plan):
     """Return z of a neighbour of the best point that is lower; None where none is."""
     best = search.best
     near = diagnostics.neighbours(search.problem, best.z)
@@ -210,22 +242,22 @@ def _lower_neighbour(search, found):
     i = int(np.argmin(merits))
     if merits[i] >= merits[0] - SAME * abs(merits[0]):
         return None
-    return near[i] if _is_lower(search, search.point(near[i]), best) else None
+    return near[i] if _is_lower(search, search.point(near[i]), best, plan) else None
 
 
-def _probe(search, found, screened, seed):
+def _probe(search, found, plan, screened, seed):
     """Return z of a point that may be better than the answer, by differential evolution."""
     # Its members are the answer, points around it, and the best of the screened and of new Sobol
     # points. On coarse runs, unless they mislead: then a search decides at the true step.
     problem, best, mark = search.problem, search.best, search.problem.simulations
     count, generations = evolution_size(search, screened)
     new = np.split(sobol(FRESH * MEMBERS, len(best.z), seed + 1)[: FRESH * count], FRESH)
-    seen = [screened, *(Population(zs, *problem.screen(zs, coarse=True)) for zs in new)]
+    seen = [screened, *(Population(zs, *problem.screen(zs, plan.coarse)) for zs in new)]
     seen = Population(*(np.concatenate(parts) for parts in zip(*seen)))
     order = np.argsort(seen.merits(search), kind="stable")
     near = around(best.z, count // 4, seed)
     members = np.concatenate([best.z[None], near, seen.zs[order]])[:count]
-    now, began = evolve(search, members, generations, seed)
+    now, began = evolve(search, members, generations, seed, plan.coarse)
     here = began.merits(search)[0]
     if not np.isclose(here, best.cost, rtol=MISLED) and len(problem.runs) == 1:
         now, began = evolve(search, members, max(2, generations // 8), seed, coarse=False)
@@ -235,7 +267,7 @@ def _probe(search, found, screened, seed):
     found.probe["runs"] += runs
     merits = now.merits(search)
     for i in np.argsort(merits, kind="stable")[:TRIED]:
-        if merits[i] >= here - LOWER_BY * abs(here):
+        if merits[i] >= here - plan.lower_by * abs(here):
             search.point(now.zs[i])  # nothing lower, but it may be, by a little
             return None
         if search.point(now.zs[i]).finite:
@@ -285,11 +317,23 @@ def without_slope(search):
     return not np.any(search.best.gradient) and search.best.cost != 0.0
 
 
-def _reporter(progress, starts):
+def reporter(progress: Callable | None, starts: int, **more: Any) -> Callable:
     """Return what a Search calls after every evaluation: `progress` with a dict."""
 
     def report(search):
         if progress is not None and search.history:
-            progress(event_of(search, starts))
+            progress(event_of(search, starts, **more))
 
     return report
+
+
+def status_of(found: Outcome, feasible: bool, lost: Sequence[Lost] = ()) -> Status:
+    """Return how the stages ended; feasible : whether every limit holds at the answer."""
+    if found.interrupted:
+        return Status.INTERRUPTED
+    if found.search is None or found.best is None:
+        return Status.NOT_CONVERGED
+    if not feasible:
+        return Status.INFEASIBLE if found.least else Status.NOT_CONVERGED
+    done = found.confirmed and not without_slope(found.search) and not lost
+    return Status.CONVERGED if done else Status.NOT_CONVERGED

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from jaxtank import presets
-from tuning.answer.attempts import Task
-from tuning.answer.checks import Checks
-from tuning.answer.setting import setting_of
 from tuning.problem.problem import Problem
-from tuning.search.robust import scenarios_of
+from tuning.search.attempts import Checks, Task
+from tuning.search.setting import scenarios_of, setting_of
 
 FREE = {"controller.Kc": (0.2, 4.0), "controller.Ti": (20.0, 400.0)}
 LIMITS = {"max_level": 9.0}

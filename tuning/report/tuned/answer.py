@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from jaxtank import measures as ms
-from tuning.answer.setting import limited_levels
 from tuning.problem.wording import numbered
 from tuning.report.safety import PROMISE, start_of
 from tuning.report.tables import number, objective_unit, table
 from tuning.report.tuned.tables import parts_of as all_parts
+from tuning.search.setting import limited_levels
 
 WIDTH = 80
 

@@ -19,11 +19,13 @@ from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.xla import executables
-from tuning.answer.judged import judge
-from tuning.answer.setting import input_range, setting_of
-from tuning.answer.stay_put import WORTH, Found, search_from
 from tuning.problem.problem import Problem
 from tuning.problem.scenarios import with_noise_drawn
+from tuning.search import diagnostics
+from tuning.search.judged import judge
+from tuning.search.setting import input_range, setting_of
+from tuning.search.small_changes import WORTH, stay_put
+from tuning.search.stages import Outcome, Plan, run_stages
 
 TANK = """
 name = "one tank"
@@ -282,10 +284,14 @@ class Bowl:
 
 
 @pytest.mark.parametrize("worth, stays", [(0.02, True), (0.5, False)])
-def test_a_gain_stays_where_a_change_is_worth_less_than_one_percent(worth, stays):
-    found, problem = Found(), Bowl(worth)
-    search_from(problem, {"starts": 4, "iterations": 40, "seed": 0}, lambda search: None, found)
-    assert found.agreed and found.kept.tolist() == [False, stays]
+def test_a_gain_stays_where_a_change_is_worth_less_than_one_percent(monkeypatch, worth, stays):
+    found, problem = Outcome(), Bowl(worth)
+    how = dict(starts=4, screening=32, iterations=40, seed=0, tolerance=1e-4, agree=0.01)
+    plan = Plan(method="trf", polish=False, coarse=False, **how)
+    monkeypatch.setattr(diagnostics, "table_of", lambda problem, values: [])
+    run_stages(problem, problem.start(), plan, found, lambda search: None)
+    found.z, found.kept = stay_put(found.search, problem.start(), 40)
+    assert found.confirmed and found.kept.tolist() == [False, stays]
     best, cost = 1.0, found.point.cost
     assert cost <= (1.0 + WORTH) * best + 1e-12
     if stays:  # 0.02 x 0.5^2 = 0.5 %; what is left of 1 % takes the other gain towards its start
@@ -411,7 +417,7 @@ def test_an_interrupt_keeps_the_answer_of_an_earlier_search_that_was_judged(case
             raise KeyboardInterrupt
         return dataclasses.replace(judge(*given, **keywords), held=np.zeros(24, dtype=bool))
 
-    monkeypatch.setattr("tuning.answer.attempts.judge", judged)
+    monkeypatch.setattr("tuning.search.attempts.judge", judged)
     result = tuning.tune(case, **options)
     assert len(calls) == 2, "there was a second search"
     assert result.status == "interrupted" and result.answer.after is not None
