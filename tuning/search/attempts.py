@@ -12,7 +12,7 @@ from jaxtank.core.tree import with_values
 from tuning.problem.limits import UNDEFINED_MARGIN
 from tuning.problem.problem import Problem
 from tuning.problem.reported import in_force
-from tuning.problem.scenarios import ScenarioRun, groups_of, with_noise_drawn
+from tuning.problem.scenarios import ScenarioRun, runs_of
 from tuning.search.judged import Judged, judge, matters
 from tuning.search.methods import automatic
 from tuning.search.setting import NEAR, PLANTS, Setting
@@ -153,17 +153,14 @@ class Task:
         """Return the problem of the search on the plants of a case, and on those of `checks`."""
         seed = self.plan.seed
         plants = setting.plants(case, PLANTS, seed)
+        cache, self.cache = self.cache, None
+        stated = case, self.free, setting.objective
         if checks is None:
-            problem = Problem(case, self.free, setting.objective, {}, plants, seed)
-        else:
-            every, limits = (*plants, *checks.scenarios()), checks.limits()
-            problem = Problem(case, self.free, setting.objective, limits, every, seed)
-            problem.runs[PLANTS:] = checks.runs(problem.runs[-1].weight)
-            problem.groups = groups_of(problem.runs)
-        problem.groups = [with_noise_drawn(group) for group in problem.groups]
-        if self.cache is not None:
-            problem.cache, self.cache = self.cache, None
-        return problem
+            return Problem(*stated, {}, plants, seed, cache, drawn=True)
+        every = (*plants, *checks.scenarios())
+        runs = runs_of(case, every, seed)
+        runs[PLANTS:] = checks.runs(runs[-1].weight)
+        return Problem(*stated, checks.limits(), every, seed, cache, runs=runs, drawn=True)
 
     def report(self, unit):
         """Return what a Search calls after every evaluation; unit : of the cost, None: unknown."""

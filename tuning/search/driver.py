@@ -8,8 +8,7 @@ import numpy as np
 import scipy
 
 from jaxtank import measures as ms
-from tuning.problem.point import DIVERGED, Point
-from tuning.problem.problem import Problem
+from tuning.problem.problem import DIVERGED, Point, Problem
 from tuning.problem.slopes import SlopeCheck, check_slope
 
 TIGHTENING = 1e-6

@@ -52,7 +52,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.tree import parameters
-from tuning.problem.point import DIVERGED
+from tuning.problem.problem import DIVERGED
 from tuning.problem.slopes import unusable_words
 from tuning.problem.status import Status
 from tuning.problem.wording import count, numbered

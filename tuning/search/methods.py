@@ -6,8 +6,7 @@ import numpy as np
 import scipy  # its parts are imported when they are first used
 
 from tuning.cluster.ahead import recorded
-from tuning.problem.point import DIVERGED
-from tuning.problem.problem import ROOT
+from tuning.problem.problem import DIVERGED, ROOT
 from tuning.search.driver import LOWER_BY, SETTLED, CoarseSearch, Search, optimality
 from tuning.search.screening import MEMBERS, distinct_starts, evolution_size, evolve, sobol
 

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from tuning.cluster.ahead import evaluate_ahead
-from tuning.problem.functions import check_slopes
 from tuning.problem.problem import Problem
-from tuning.problem.slopes import SlopeCheck
+from tuning.problem.slopes import SlopeCheck, check_slopes
 from tuning.problem.status import Status
 from tuning.search import diagnostics
 from tuning.search.driver import (

@@ -17,7 +17,7 @@ from jaxtank.loop.closed_loop import initial
 from tuning.cluster.engine import connect
 from tuning.cluster.problems import check_sent
 from tuning.feasible.study import apply_mend, can_judge, feasibility
-from tuning.problem.functions import as_measures, check_slopes, digests
+from tuning.problem.functions import as_measures, digests
 from tuning.problem.problem import Problem
 from tuning.problem.provenance import provenance
 from tuning.problem.reported import (
@@ -28,6 +28,7 @@ from tuning.problem.reported import (
     table_of,
 )
 from tuning.problem.scenarios import noisy
+from tuning.problem.slopes import check_slopes
 from tuning.search import diagnostics
 from tuning.search.attempts import Task, attempts, values_of
 from tuning.search.diagnostics import lost_outputs, points_to_fragile

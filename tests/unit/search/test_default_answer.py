@@ -20,7 +20,6 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.xla import executables
 from tuning.problem.problem import Problem
-from tuning.problem.scenarios import with_noise_drawn
 from tuning.search import diagnostics
 from tuning.search.judged import judge
 from tuning.search.setting import input_range, setting_of
@@ -144,8 +143,8 @@ def test_plants_that_cannot_follow_are_those_of_the_limits(case):
 def test_noise_that_is_drawn_once_gives_the_same_bits(case):
     setting = setting_of(case)
     plants = setting.plants(setting.searched, 3, 0)
-    a, b = (Problem(setting.searched, None, setting.objective, {}, plants) for _ in range(2))
-    b.groups = [with_noise_drawn(group) for group in b.groups]
+    stated = setting.searched, None, setting.objective, {}, plants
+    a, b = (Problem(*stated, drawn=drawn) for drawn in (False, True))
     assert b.groups[0].noise.shape == (3, 1, case.clock.samples)
     z = a.start()
     assert a.point(z).cost == b.point(z).cost
@@ -261,7 +260,7 @@ class Bowl:
         return {"a": float(z[0]), "b": float(z[1])}
 
     def point(self, z):
-        from tuning.problem.point import Point
+        from tuning.problem.problem import Point
 
         d, w = np.asarray(z) - np.array([0.8, 0.2]), np.array([1.0, self.worth])
         return Point(

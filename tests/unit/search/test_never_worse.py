@@ -14,7 +14,7 @@ from jaxtank.core.clock import Clock
 from jaxtank.signals.setpoints import ramps
 from tuning.problem.bounds import Bound
 from tuning.problem.limits import Limit, resolve_limits, undefined
-from tuning.problem.point import Point
+from tuning.problem.problem import Point
 from tuning.problem.reported import table_of
 from tuning.search import diagnostics
 from tuning.search.diagnostics import lost_outputs
