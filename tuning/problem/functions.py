@@ -17,8 +17,7 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.functions import program_of
 from tuning.storage.fingerprint import digest
 
-UNNAMED = "own_objective"
-"""Name of an objective that is a function without one."""
+UNNAMED = "own_objective"  # name of an objective that is a function without one
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,9 +189,7 @@ def _enter(name: str, measure: ms.Measure, found: dict[str, ms.Measure]) -> str:
 
 
 def digests(loop: ClosedLoop, clock: Any, names: Iterable[str]) -> dict[str, Any]:
-    """Return {"functions": {name: digest of its program}} for a fingerprint; {} without
-    functions.
-    """
+    """Return {"functions": {name: digest of its program}} for a fingerprint, {} without any."""
     own = ms.functions(names)
     found = {name: digest(program_of(loop, clock, name)) for name in own}
     return {"functions": found} if found else {}

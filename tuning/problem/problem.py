@@ -24,8 +24,7 @@ from tuning.storage.evaluation_log import EvaluationCache
 
 Floats = NDArray[np.float64]
 
-DIVERGED = 1e9
-"""Size at which a cost, a margin or a slope is no longer a number to search with."""
+DIVERGED = 1e9  # size at which a cost, a margin or a slope is no longer a number to search with
 
 NO_VECTOR: Floats = np.zeros(0)
 NO_MATRIX: Floats = np.zeros((0, 0))
@@ -66,8 +65,7 @@ LANES = 256
 IDLE = 2**23
 """Samples of runs that are made in vain, at most, so as to use a program that is compiled."""
 
-Screened = tuple[Floats, Floats]
-"""(costs (points,), margins (points, limits))."""
+Screened = tuple[Floats, Floats]  # (costs (points,), margins (points, limits))
 
 
 class Blocks:
@@ -104,19 +102,16 @@ much again as reverse mode, and a search needs fewer of them: 44 instead of 230
 (tests/benchmarks/README.md, Many parameters).
 """
 
-ROOT = "rms_error_total"
-"""The measure that is the root of a sum of squares over all outputs."""
+ROOT = "rms_error_total"  # the measure that is the root of a sum of squares over all outputs
 
 RISKS = ("mean", "cvar", "worst")
 """The cost of several scenarios: their weighted mean, the mean of the worst TAIL of them, or the
 worst.
 """
 
-TAIL = 0.05
-"""Share of the scenarios that "cvar" is the mean of [-]."""
+TAIL = 0.05  # share of the scenarios that "cvar" is the mean of [-]
 
-Row = Mapping[str, Any]
-"""Measures of one scenario, {name: value}."""
+Row = Mapping[str, Any]  # measures of one scenario, {name: value}
 
 
 class Problem:

@@ -12,14 +12,12 @@ from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
 from tuning.problem.problem import Point, Problem
 
-STEPS = (1e-3, 3e-4)
-"""Lengths of the two secants, as shares of a range [-]."""
+STEPS = (1e-3, 3e-4)  # lengths of the two secants, as shares of a range [-]
 
 ORDERS = 2.0
 """Orders of magnitude by which a derivative must exceed every secant to be contradicted [-]."""
 
-ROUNDING = 1e-9
-"""Share of a value by which rounding may change it from run to run [-]."""
+ROUNDING = 1e-9  # share of a value by which rounding may change it from run to run [-]
 
 
 class SlopeCheck(NamedTuple):
@@ -37,9 +35,7 @@ class SlopeCheck(NamedTuple):
 
 
 def contradicted(predicted: Any, actual: Any, size: Any) -> Any:
-    """Return (...,) True where derivatives predict changes that exceed all actual ones by
-    ORDERS.
-    """
+    """Return (...,) True where derivatives exceed all actual changes by ORDERS."""
     predicted, actual = np.asarray(predicted), np.asarray(actual)
     actual = np.where(np.isfinite(actual), np.abs(actual), np.inf)
     borne_out = np.abs(predicted) <= 10.0**ORDERS * (actual + ROUNDING * np.abs(size))

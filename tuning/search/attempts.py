@@ -19,30 +19,22 @@ from tuning.search.setting import NEAR, PLANTS, Setting
 from tuning.search.small_changes import move_back, stay_put
 from tuning.search.stages import Outcome, reporter, run_stages
 
-CHECKED = 256
-"""Plants that are looked at."""
+CHECKED = 256  # plants that are looked at
 
 SEED = 20_011
 """Of these plants and their noise, whatever the seed of a search, so that limits bind alike."""
 
-ADDED = 8
-"""Plants that join those of the search."""
-
-WORST = 2
-"""Of each limit, the plants that come nearest to it are added, as many as this."""
+ADDED = 8  # plants that join those of the search
+WORST = 2  # of each limit, the plants that come nearest to it are added, as many as this
 
 SHARE = 0.4
 """Tightening of a limit, as a share of the distance from the 90 % quantile over the plants to their
 worst: other plants are worse than all of them now and then [-]."""
 
-LARGEST = 0.25
-"""Largest tightening, as a share of the limit [-]."""
+LARGEST = 0.25  # largest tightening, as a share of the limit [-]
+LIGHT = 1e-9  # weight of an added plant in the cost [-]: it serves the limits alone
 
-LIGHT = 1e-9
-"""Weight of an added plant in the cost [-]: it serves the limits alone."""
-
-Key = tuple[str, int]
-"""(measure, entry) of a limit."""
+Key = tuple[str, int]  # (measure, entry) of a limit
 
 
 class Checks:

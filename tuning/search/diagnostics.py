@@ -19,34 +19,23 @@ from tuning.problem.problem import Problem
 from tuning.problem.reported import table_of
 from tuning.search.result import Lost
 
-CHECKED_RUNS = 16
-"""Scenarios that are run, at most, to look for a step that is too long."""
-
-STEP = 1e-4
-"""Step of the differences of the gradient, in the unit cube [-]."""
+CHECKED_RUNS = 16  # scenarios that are run, at most, to look for a step that is too long
+STEP = 1e-4  # step of the differences of the gradient, in the unit cube [-]
 
 OFF = 0.1
 """Distance from the setpoint at the end of a plateau, as a share of the change that led to it,
 from which an output does not follow: twice the band of the settling time [-]."""
 
-WORSE = 2.0
-"""Factor by which that distance must have grown to be called a change for the worse [-]."""
-
-LATE = 0.1
-"""Share of a plateau, at its end, over which the distance is averaged [-]."""
-
-COMPARED_RUNS = 8
-"""Scenarios whose trajectories are compared, at most."""
-
-SAVED = 20_000
-"""Samples of a trajectory that are compared, at most."""
+WORSE = 2.0  # factor by which that distance must have grown to be called a change for the worse [-]
+LATE = 0.1  # share of a plateau, at its end, over which the distance is averaged [-]
+COMPARED_RUNS = 8  # scenarios whose trajectories are compared, at most
+SAVED = 20_000  # samples of a trajectory that are compared, at most
 
 BUSY, EXCURSIONS, RINGING = 2.0, 2.0, 25.0
 """Growth of an input's total variation, its size in ranges of the pump for each plateau, and the
 overshoot [%] above which a run points to a fragile loop: an Ms above 2.5 overshoots by more."""
 
-LARGEST_CURVATURE = 24
-"""Number of parameters up to which the second derivative is computed."""
+LARGEST_CURVATURE = 24  # number of parameters up to which the second derivative is computed
 
 
 def step_warnings(problem, tuned, values, key=None):
@@ -196,12 +185,9 @@ def _step_of_ten_percent(bounds, z, direction):
 
 
 def _short_factors(bounds, z, there, gradient, matrix):
-    """Return (factors, z of them) of the step from z to `there`, with as few decimals as suffice.
-
-    As many as leave the change of the cost, by the quadratic model, within 5 %: along a least
-    sensitive direction a component of 1e-4 can matter, because the objective rises steeply beside
-    it.
-    """
+    """Return (factors, z of them) of the step to `there`, in as few decimals as suffice."""
+    # As many as leave the change of the cost, by the quadratic model, within 5 %: along a least
+    # sensitive direction a component of 1e-4 can matter, for the objective is steep beside.
 
     def model(to):
         return gradient @ (to - z) + 0.5 * (to - z) @ matrix @ (to - z)
@@ -338,9 +324,7 @@ def _suspect(run, before, after) -> set[int]:
 
 @functools.partial(jax.jit, static_argnames="clock")
 def _followed(loop: Any, clock: Any) -> Any:
-    """Return (setpoints of all samples, windows of their changes): one program, not one for each of
-    some eighty operations.
-    """
+    """Return (setpoints of all samples, windows of their changes) by one program."""
     return loop.reference.sample(clock)[0], windows(loop, clock)
 
 
@@ -378,9 +362,7 @@ def _farthest(loop, clock, key, i) -> tuple[float, float]:
 
 
 def points_to_fragile(loop: Any, before: Mapping[str, Any], after: Mapping[str, Any]) -> bool:
-    """Return True if the run with an answer rings: only then are its margins worth a program, which
-    takes as long to compile as those of a search.
-    """
+    """Return True if the run of an answer rings: else its margins are not worth a program."""
     old, new = (np.asarray(m["input_travel"]) for m in (before, after))
     ranges = np.asarray(loop.actuator.high) - np.asarray(loop.actuator.low)
     held = loop.reference.held()

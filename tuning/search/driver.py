@@ -114,9 +114,7 @@ class Search:
 
 
 def event_of(search: Search, starts: int, **more: Any) -> dict[str, Any]:
-    """Return what `progress` is called with after an evaluation: numbers of the search,
-    and `more`.
-    """
+    """Return what `progress` is called with after an evaluation, and `more`."""
     best, last = search.best, search.history[-1]
     return {
         "start": search.start,

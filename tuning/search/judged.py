@@ -25,8 +25,7 @@ from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import Points, clopper_pearson
 from tuning.uncertainty.validation import SEED_OFFSET
 
-LANES = 8
-"""Runs in a batch are a multiple of this: numbers in a vector register."""
+LANES = 8  # runs in a batch are a multiple of this: numbers in a vector register
 
 NOISE = "sensor.noise"
 
@@ -72,9 +71,7 @@ def run_plants(
 
 
 def _batch(most: int, count: int) -> int:
-    """Runs in a batch: the multiple of LANES with the fewest runs in vain, between a half of `most`
-    and an eighth above it.
-    """
+    """Runs in a batch: the multiple of LANES near `most` with the fewest runs in vain."""
     if most < LANES:
         return most
     sizes = range(max(LANES, most // 2), most + most // 8 + 1, LANES)
@@ -82,9 +79,7 @@ def _batch(most: int, count: int) -> int:
 
 
 def _nominal(case: Case, drawn: Mapping[str, Any]) -> dict[str, Any] | None:
-    """{name: value} of the nominal plant without noise; None where the noise is drawn by entries,
-    or the sensor has none.
-    """
+    """{name: value} of the nominal plant without noise; None where it cannot be told apart."""
     entries = any(n.startswith(f"{NOISE}[") for n in drawn)
     if entries or np.ndim(case.loop.sensor.noise) == 0:
         return None
@@ -100,8 +95,7 @@ def _with_row(drawn: Mapping[str, Any], last: Mapping[str, Any], case: Case) -> 
     return {n: np.concatenate([np.asarray(v), last[n][None]]) for n, v in every.items()}
 
 
-FRESH = 256
-"""Plants on which an answer is judged."""
+FRESH = 256  # plants on which an answer is judged
 
 NOMINAL = ("rms_error_total", "rms_error", "settling_time", "recovery_time")
 """Measures of the nominal plant, which runs beside them, besides those of every plant."""
@@ -208,9 +202,7 @@ class Judged(Shown):
 
 
 def drawn(sides: Mapping[str, Judged]) -> dict[str, Any]:
-    """Return {"plants": figure} of {name: Judged}, one or before and after; {} where every run of
-    one diverged.
-    """
+    """Return {"plants": figure} of {name: Judged}; {} where every run of one diverged."""
     if any(one.failed.all() for one in sides.values()):
         return {}
     from jaxtank.plots.uncertainty import plants

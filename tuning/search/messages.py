@@ -62,8 +62,7 @@ from tuning.search.result import ConstraintRow, Message, TuningResult, constrain
 from tuning.search.setting import SPREAD
 from tuning.search.stages import AGREE, RENEWED
 
-LISTED = 4
-"""Limits that one message names at most."""
+LISTED = 4  # limits that one message names at most
 
 FRAGILE, PEAK = 2.5, 2.0
 """Sensitivity peak Ms above which a loop is near the edge of its stability, and above which a loop

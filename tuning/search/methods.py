@@ -101,8 +101,7 @@ PROGRESS, PATIENCE = 1e-9, 25
 kink a line search does not end by itself [-].
 """
 
-ITERATION_LIMIT = 9
-"""Status of scipy's SLSQP that has used up its iterations."""
+ITERATION_LIMIT = 9  # status of scipy's SLSQP that has used up its iterations
 
 COARSE_TOLERANCE = 1e-4
 """Tolerance of the search at a tenth of the samples, whose own error is larger [-]."""
@@ -116,14 +115,9 @@ RESTORED = 5
 NEAR, HALVINGS = 0.1, 10
 """Largest violation of a point that `approach` moves towards [-], and number of halvings."""
 
-MANY = 4
-"""Number of parameters from which "auto" tries Gauss-Newton before it considers limits."""
-
-OFFERED = ("trf", "coarse-trf", "slsqp", "lbfgs", "adam")
-"""Methods that can be asked for by name."""
-
-UNCONSTRAINED = ("trf", "coarse-trf")
-"""Those that ignore limits."""
+MANY = 4  # number of parameters from which "auto" tries Gauss-Newton before it considers limits
+OFFERED = ("trf", "coarse-trf", "slsqp", "lbfgs", "adam")  # methods that can be asked for by name
+UNCONSTRAINED = ("trf", "coarse-trf")  # those that ignore limits
 
 
 def slsqp(search, z, iterations, tolerance=None):
@@ -141,21 +135,31 @@ def slsqp(search, z, iterations, tolerance=None):
             }
         ]
     try:
-        done = scipy.optimize.minimize(
-            _Watch(search),
-            z,
-            jac=True,
-            method="SLSQP",
-            bounds=[(0.0, 1.0)] * len(z),
-            constraints=constraints,
-            options={"maxiter": iterations, "ftol": tolerance},
-        )
+        return _minimise(search, _Watch(search), z, [], constraints, iterations, tolerance)
     except _NoProgress:
         return True
+
+
+def _minimise(search, function, y, more, constraints, iterations, tolerance):
+    """Return True if SLSQP converged from y in [0, 1], the last ones in the ranges `more`."""
+    done = scipy.optimize.minimize(
+        function,
+        y,
+        jac=True,
+        method="SLSQP",
+        bounds=[(0.0, 1.0)] * (len(y) - len(more)) + more,
+        constraints=constraints,
+        options={"maxiter": iterations, "ftol": tolerance},
+    )
     search.exhausted = done.status == ITERATION_LIMIT
     # 8: no further descent along the search direction, which is how a solver ends at the precision
     # of a kinked cost
     return bool(done.success) or done.status == 8
+
+
+def _last(y):
+    """Return (the last of y, its gradient), which is minimised as a bound of other values."""
+    return y[-1], np.eye(len(y))[-1]
 
 
 class _NoProgress(Exception):
@@ -201,17 +205,9 @@ def _epigraph(search, z, iterations, tolerance):
         rows = search.margins(y[:-1])[1].reshape(-1, len(y) - 1)
         return np.vstack([costs, np.hstack([rows, np.zeros((len(rows), 1))])])
 
-    done = scipy.optimize.minimize(
-        lambda y: (y[-1], np.eye(len(y))[-1]),
-        np.append(z, known(z).run_costs.max() / search.scale),
-        jac=True,
-        method="SLSQP",
-        bounds=[(0.0, 1.0)] * len(z) + [(None, None)],
-        constraints=[{"type": "ineq", "fun": holds, "jac": slopes}],
-        options={"maxiter": iterations, "ftol": tolerance},
-    )
-    search.exhausted = done.status == ITERATION_LIMIT
-    return bool(done.success) or done.status == 8
+    y = np.append(z, known(z).run_costs.max() / search.scale)
+    rows = [{"type": "ineq", "fun": holds, "jac": slopes}]
+    return _minimise(search, _last, y, [(None, None)], rows, iterations, tolerance)
 
 
 def trf(search, z, iterations, tolerance=1e-10):
@@ -271,9 +267,7 @@ def coarse_first(search, z, iterations):
 
 
 def gauss_newton_first(search, z, iterations):
-    """Return True if `trf` without the limits converged to a feasible point, else `slsqp`
-    from z.
-    """
+    """Return True if `trf` converged to a feasible point, else if `slsqp` from z did."""
     mark = len(search.history)
     converged = trf(search, z, iterations, tolerance=1e-6)
     mine = [h for h in search.history[mark:] if np.isfinite(h[1])]
@@ -295,17 +289,9 @@ def restore(search, z, iterations):
         rows = search.margins(y[:-1])[1]
         return np.hstack([rows, np.ones((len(rows), 1))])
 
-    worst = max(0.0, float(-search.margins(z)[0].min()))
-    done = scipy.optimize.minimize(
-        lambda y: (y[-1], np.eye(len(y))[-1]),
-        np.append(z, worst),
-        jac=True,
-        method="SLSQP",
-        bounds=[(0.0, 1.0)] * len(z) + [(0.0, None)],
-        constraints=[{"type": "ineq", "fun": holds, "jac": slopes}],
-        options={"maxiter": iterations, "ftol": 1e-10},
-    )
-    return bool(done.success) or done.status == 8
+    y = np.append(z, max(0.0, float(-search.margins(z)[0].min())))
+    rows = [{"type": "ineq", "fun": holds, "jac": slopes}]
+    return _minimise(search, _last, y, [(0.0, None)], rows, iterations, 1e-10)
 
 
 def approach(search):
@@ -356,9 +342,7 @@ def find_feasible(search, screened, iterations, seed, coarse=True):
 
 
 def automatic(problem):
-    """Return the method "auto": Gauss-Newton where the cost has squares and no limit is to be kept,
-    or the parameters are many.
-    """
+    """Return the method "auto": Gauss-Newton without limits or for many parameters, else SLSQP."""
     if problem.model and not problem.limits:
         return "trf"
     return "trf-slsqp" if problem.model and len(problem.bounds) >= MANY else "slsqp"

@@ -15,8 +15,7 @@ from tuning.search.driver import Search
 from tuning.search.methods import approach, find_feasible, restore, slsqp
 from tuning.search.screening import Population, best_screened, screen
 
-MANY = 50
-"""Values of the limit at most."""
+MANY = 50  # values of the limit at most
 
 
 def tradeoff(

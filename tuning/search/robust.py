@@ -24,8 +24,7 @@ from tuning.uncertainty.sampling import clopper_pearson, spread_of
 from tuning.uncertainty.study import ensemble
 from tuning.uncertainty.validation import SEED_OFFSET, summary_of, validate
 
-CONFIDENCE = 1e-6
-"""Probability beta with which the scenario bound may fail [-]."""
+CONFIDENCE = 1e-6  # probability beta with which the scenario bound may fail [-]
 
 TOLERANCE = 1e-4
 """Change of the objective, as a share of its first value, at which a search over drawn plants has

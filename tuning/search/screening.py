@@ -22,11 +22,8 @@ from tuning.problem.scenarios import screening_clock
 FEWEST, MEMBERS = 32, 64
 """Members of a differential evolution, at least and at most: else as many as were screened."""
 
-GENERATIONS, RUNS = 14, 100_000
-"""Its generations, and its coarse runs, at most."""
-
-MUCH = 1e12
-"""Merit of a point that violates a limit: above every cost (see `DIVERGED`) [-]."""
+GENERATIONS, RUNS = 14, 100_000  # its generations, and its coarse runs, at most
+MUCH = 1e12  # merit of a point that violates a limit: above every cost (see `DIVERGED`) [-]
 
 CROSSED = 0.9
 """Share of the parameters that a member of the differential evolution takes from its move [-]."""
@@ -156,9 +153,7 @@ def distinct_starts(zs, merits, count, first):
 
 
 def best_screened(search, screened):
-    """Return the screened point (P,) that keeps the limits and is better than the best of
-    a Search.
-    """
+    """Return the feasible screened point (P,) better than the best of a Search, or None."""
     zs, costs, margins = screened
     held = np.isfinite(costs) & np.all(margins >= 0, axis=1)
     for i in np.argsort(costs, kind="stable"):
@@ -180,10 +175,7 @@ class Population(NamedTuple):
     margins: np.ndarray  # (points, limits)
 
     def merits(self, search):
-        """Return (points,) what ranks them: costs where the limits hold, else far above, violation.
-
-        Infinite where a point is not finite.
-        """
+        """Return (points,) costs where limits hold, else far above by violation, or infinite."""
         short = np.maximum(0.0, -self.margins / search.limit_scale).max(axis=1, initial=0.0)
         merits = np.where(short > 0, MUCH * (1.0 + short), self.costs)
         return np.where(np.isfinite(self.costs) & np.isfinite(merits), merits, np.inf)

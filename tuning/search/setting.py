@@ -31,8 +31,7 @@ LARGEST_ERROR = 1e-3
 """Largest `midpoint_error` with which the midpoint rule is used [-]: a fiftieth of the 5 % by which
 flows differ from plant to plant."""
 
-STATES = 256
-"""States and inputs at which both are compared."""
+STATES = 256  # states and inputs at which both are compared
 
 LOWEST = 0.05
 """Least level of these states, as a share of the height [-]: closer to empty, stability limits the
@@ -73,17 +72,10 @@ of the second share of its range [-].
 """
 
 FLOWS = ("drain", "orifice", "pipe", "pump_gain", "split")
-SPREAD = 0.05
-"""Share by which every flow may be off where a case does not say what is uncertain."""
-
-NEAR = 0.9
-"""Share of its limit that a level must reach on some plant for the limit to matter."""
-
-FREE = 10.0
-"""Limit of a tank that a safety filter leaves alone, in heights of the rig."""
-
-PLANTS = 32
-"""Plants that the search runs on."""
+SPREAD = 0.05  # share by which every flow may be off where a case does not say what is uncertain
+NEAR = 0.9  # share of its limit that a level must reach on some plant for the limit to matter
+FREE = 10.0  # limit of a tank that a safety filter leaves alone, in heights of the rig
+PLANTS = 32  # plants that the search runs on
 
 COST = ("mean_square_error", "mean_square_travel")
 
@@ -130,10 +122,8 @@ class Setting:
         return None if self.own_objective else f"{self.case.loop.units[0]}^2"
 
     def coarse(self) -> Case:
-        """Return the searched case at ten times its step, integrated by the midpoint rule where the
-        error of that is small enough; the case as it is where too few samples would remain, or
-        where it cannot run at that step.
-        """
+        """Return the searched case at ten times its step, itself where it cannot run so."""
+        # By the midpoint rule where its error is small enough; itself too with too few samples.
         clock = screening_clock(self.searched.clock)
         if clock == self.searched.clock:
             return self.searched
@@ -270,9 +260,7 @@ def setting_of(
 
 
 def _with_box(case, distributions):
-    """Return the case with the box of `distributions`, where they are shares of parameters: a
-    safety filter is then designed for it.
-    """
+    """Return the case with `distributions` as its tolerances, where they are shares."""
     shares = {n: d.relative for n, d in distributions.items() if isinstance(d, Uniform)}
     if len(shares) < len(distributions) or None in shares.values():
         return case
@@ -323,9 +311,7 @@ def _has_own_objective(case):
 
 
 def _noise(case):
-    """Return (standard deviation of the sensor noise, True if it is neither the case's nor that of
-    one of its scenarios).
-    """
+    """Return (standard deviation of the sensor noise, True if neither case nor scenario has it)."""
     own = float(np.max(np.asarray(case.loop.sensor.noise)))
     loops = [rig.set_scenario(case, s.values).loop for s in case.scenarios]
     stated = max([own, *(float(np.max(np.asarray(loop.sensor.noise))) for loop in loops)])

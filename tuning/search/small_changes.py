@@ -12,15 +12,13 @@ from tuning.search.methods import METHODS, automatic
 from tuning.search.setting import Setting
 from tuning.search.stages import Outcome
 
-WORTH = 0.01
-"""A gain is changed only where that lowers the cost by this share [-]."""
+WORTH = 0.01  # a gain is changed only where that lowers the cost by this share [-]
 
 AGAIN = 1.25
 """All gains stay at their first values where that costs less than this many times WORTH: those of
 an earlier answer, which may cost WORTH already, on plants and limits that differ a little [-]."""
 
-FINE = 0.1
-"""Share of WORTH to which the cost with some gains at their first values is searched [-]."""
+FINE = 0.1  # share of WORTH to which the cost with some gains at their first values is searched [-]
 
 LINE, STRIDE = 32, 8
 """Values that are tried between a gain's best and its first value, and how
@@ -109,10 +107,8 @@ def _without(search, trial, first, z, iterations):
 
 
 def _towards(search, i, first, z, ceiling, allowed, good):
-    """Return z with gain i moved towards its first value as far as the cost stays below `ceiling`.
-
-    LINE values at most, a few at once, up to the first that does not fit; without derivatives.
-    """
+    """Return z with gain i moved towards its first value while the cost is below `ceiling`."""
+    # LINE values, STRIDE at once, up to the first that does not fit; without derivatives.
     shares = np.arange(1, LINE + 1) / (LINE + 1)
     line = np.repeat(z[None], LINE, axis=0)
     line[:, i] = z[i] + shares * (first[i] - z[i])
@@ -134,8 +130,7 @@ PEAK = 2.5
 """Sensitivity peak Ms that an answer may have, unless a lower one costs more than PRICE [-].
 Textbooks recommend 1.4 to 2: above 2 a rise is reported, above this it is taken back."""
 
-PRICE = 0.05
-"""Share of the cost that a lower Ms may cost: half of it as a share of the error [-]."""
+PRICE = 0.05  # share of the cost that a lower Ms may cost: half of it as a share of the error [-]
 
 SPAN, ROUNDS = 0.01, 16
 """A step of the descent of Ms and of its differences, as a share of a range [-]; how often STRIDE
@@ -177,9 +172,7 @@ def move_back(setting: Setting, problem: Any, found: Outcome) -> None:
 
 
 def _descended(setting, problem, found, highest):
-    """Return (point of the lowest peak within PRICE along the steepest descent of Ms from the
-    answer, whose peak is `highest`, or the first whose peak is at most PEAK; that peak).
-    """
+    """Return (point of the lowest peak within PRICE along the steepest descent, that peak)."""
     search, z, point = found.search, found.point.z, found.point
     ceiling, violation = point.cost + PRICE * abs(point.cost), search.violation(point)
     free, calmer, lowest = ~np.asarray(found.kept), z, highest

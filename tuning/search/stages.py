@@ -46,14 +46,9 @@ from tuning.search.screening import (
 RENEWED = 3
 """How often a search is begun again from where it stopped before conditions of an optimum hold."""
 
-AGREE = 1e-3
-"""Two searches whose objectives differ by less than this share agree [-]."""
-
-SAME = 1e-9
-"""Share of the cost by which two programs that compute it may differ, by rounding [-]."""
-
-FRESH = 2
-"""New Sobol points, as multiples of the members of a differential evolution."""
+AGREE = 1e-3  # two searches whose objectives differ by less than this share agree [-]
+SAME = 1e-9  # share of the cost by which two programs that compute it may differ, by rounding [-]
+FRESH = 2  # new Sobol points, as multiples of the members of a differential evolution
 
 TRIED = 8
 """Members of a differential evolution of which the first that is no chaotic run is a start."""
@@ -61,8 +56,7 @@ TRIED = 8
 MISLED = 0.1
 """Share by which the cost of a coarse run may differ from the true one to be searched with [-]."""
 
-POLISHED = 1e-12
-"""Tolerance of the last search, from the best point [-]."""
+POLISHED = 1e-12  # tolerance of the last search, from the best point [-]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -47,8 +47,7 @@ from tuning.storage.evaluation_log import EvaluationLog
 from tuning.storage.fingerprint import fingerprint
 from tuning.uncertainty.validation import summary_of, validate
 
-SCREENED = 32
-"""Sobol points of the search of a default answer."""
+SCREENED = 32  # Sobol points of the search of a default answer
 
 TOLERANCE = 1e-4
 """Change of the cost, as a share of its first value, at which a search has converged [-]."""
@@ -546,10 +545,7 @@ def _lost(setting, problem, nominal, values):
 
 
 def _nominal(case, judged, needed):
-    """Return the measures of the case's own run, without noise unless it has some, and the
-    stability margins of its linearised loop. What was not judged beside the plants is run when it
-    is asked for.
-    """
+    """Return the measures and margins of the case's own run; run now if not judged already."""
     margins = margin_measures(case.loop, case.clock)
     of_run = [m for m in needed if m not in ms.linear()]
 
