@@ -175,7 +175,7 @@ class Attempt:
     """A search on plants, and how its answer does on validation plants."""
 
     setting: Setting
-    found: Outcome = dataclasses.field(default_factory=Outcome)
+    outcome: Outcome = dataclasses.field(default_factory=Outcome)
     problem: Any = None
     after: Judged | None = None
     tightened: float = 0.0
@@ -192,17 +192,17 @@ def attempts(task: Task, setting: Setting, near: np.ndarray) -> Attempt:
         try:
             task.stage = _words_of(setting, case)
             checks = _search(task, attempt, case, limits, least)
-            if attempt.found.point is None:
+            if attempt.outcome.point is None:
                 return dataclasses.replace(attempt, number=0)
-            move_back(setting, attempt.problem, attempt.found)
-            tuned = _at(setting, values_of(attempt.problem, attempt.found))
+            move_back(setting, attempt.problem, attempt.outcome)
+            tuned = _at(setting, values_of(attempt.problem, attempt.outcome))
             task.enter(f"judging the answer on {task.samples} validation plants")
             attempt.after = judge(tuned, task.samples, task.plan.seed, round_=number)
         except KeyboardInterrupt:
             last = dataclasses.replace(attempt, number=0) if last is None else last
-            last.found.interrupted = True
+            last.outcome.interrupted = True
             return last
-        last, cost = attempt, attempt.found.point.cost
+        last, cost = attempt, attempt.outcome.point.cost
         if coarse and case is not setting.searched and _misled(cost, attempt.after):
             coarse = False
         elif attempt.after.held.all():
@@ -211,7 +211,7 @@ def attempts(task: Task, setting: Setting, near: np.ndarray) -> Attempt:
             filtered = setting.with_filter(matters(setting, attempt.after, NEAR))
             limits = dict(setting.case.limits) if filtered is setting else dict(filtered.limits)
             setting = filtered
-        elif checks and attempt.found.search.violation(attempt.found.point) == 0:
+        elif checks and attempt.outcome.search.violation(attempt.outcome.point) == 0:
             least = _tighter(attempt.after, checks)
         else:
             break
@@ -234,16 +234,16 @@ def _search(task, attempt, case, limits, least):
             outcome.slopes["answer"] = outcome.search.slope(outcome.point)
 
     if not limits:
-        search(attempt.found)
+        search(attempt.outcome)
         return None
     checks = Checks(setting, case, task.free, limits, least)
     checks.look(checks.problem.start())
     stays = not least and checks.hold(share=0.0)
     for _ in range(ROUNDS):
         outcome, attempt.tightened = Outcome(), checks.share
-        attempt.found = outcome if attempt.found.point is None else attempt.found
+        attempt.outcome = outcome if attempt.outcome.point is None else attempt.outcome
         search(outcome, checks, stays)
-        attempt.found = outcome
+        attempt.outcome = outcome
         if outcome.point is None:
             break
         checks.look(outcome.point.z)
@@ -282,16 +282,16 @@ def _at(setting, values):
     return setting.replace(searched=setting.searched.replace(loop=loop))
 
 
-def values_of(problem, found):
+def values_of(problem, outcome):
     """Return {name: value} of the answer; exactly the first value of a gain that stays."""
-    own, point = problem.own_values(), found.point
+    own, point = problem.own_values(), outcome.point
     if point is None:
         return own
     values = problem.values(point.z)
     if np.array_equal(point.z, problem.start()):
         values = dict(own)
-    stays = np.zeros(len(own), dtype=bool) if found.idle is None else np.asarray(found.idle)
-    stays = stays if found.kept is None else stays | found.kept
+    stays = np.zeros(len(own), dtype=bool) if outcome.idle is None else np.asarray(outcome.idle)
+    stays = stays if outcome.kept is None else stays | outcome.kept
     values |= {n: own[n] for n, same in zip(own, stays) if same}
     acting = in_force(problem.loop, values)
     return {n: v if v == own[n] else acting[n] for n, v in values.items()}

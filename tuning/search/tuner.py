@@ -131,7 +131,7 @@ def tune(
     choices : {static name: [values]}, each combination of which is tuned, the best taken;
         {"controller.kind": ["pid", "lqi"]} tunes each of these controllers with gains and ranges of
         its own.
-    starts : local searches, 8 if nominal; else at most 4, until two agree.
+    starts : local searches at most, until two agree (4; 8 if nominal).
     seed : of the Sobol points, the plants and the sensor noise.
     screening : number of Sobol points (64); nominal only.
     iterations : of each local search (60; 40 of the default answer).
@@ -220,43 +220,43 @@ def _optimum(case, method, *, engine, checkpoint, resume, validation, progress, 
     if checkpoint is not None:
         what = _what(problem, validation, "tune", vars(plan))
         problem.cache = EvaluationLog(checkpoint, what, resume)
-    found = solve(problem, first, plan, progress)
-    values = values_of(problem, found)
+    outcome = solve(problem, first, plan, progress)
+    values = values_of(problem, outcome)
     tuned = case.replace(loop=with_values(case.loop, values))
     after = run_measures(tuned.loop, tuned.clock, key, problem.needed)
     tables = {"before": [before], "after": [after]}
     if problem.scenarios:
         own = problem.own_values()
         tables = {"before": table_of(problem, own), "after": table_of(problem, values)}
-    complete = found.best is not None and not found.interrupted
+    complete = outcome.best is not None and not outcome.interrupted
     lost = lost_outputs(problem, tables, values) if complete else ()
-    multipliers = named_optimality(found.search, found.best)["multipliers"]
+    multipliers = named_optimality(outcome.search, outcome.best)["multipliers"]
     rows = constraint_rows(problem, tables["after"], tables["before"], multipliers)
     sides = {"before": (case, before), "after": (tuned, after)}
     if points_to_fragile(case.loop, before, after):
         sides = {n: (side, m | _margins(side.loop, side.clock)) for n, (side, m) in sides.items()}
     summary, cloud = None, None
-    if validation and not found.interrupted and _varies(problem):
+    if validation and not outcome.interrupted and _varies(problem):
         summary, cloud = validate(problem, problem.own_values(), values, validation, plan.seed)
     result = _result(
         problem,
-        found,
+        outcome,
         values,
         case=case,
         tuned=tuned,
         method=plan.method,
-        status=status_of(found, all(row.margin >= 0 for row in rows), lost),
+        status=status_of(outcome, all(row.margin >= 0 for row in rows), lost),
         objective={side: problem.total(table) for side, table in tables.items()}
         | {"terms": problem.objective},
         measures={side: measures for side, (_, measures) in sides.items()},
         tables=tables,
         constraints=rows,
-        symmetry=diagnostics.symmetric(problem, found.starts, values) if complete else None,
+        symmetry=diagnostics.symmetric(problem, outcome.starts, values) if complete else None,
         validation=summary,
         cloud=cloud,
         lost=lost,
     )
-    return _told(result, diagnostics.step_warnings(problem, tuned, values, key), began)
+    return _with_messages(result, diagnostics.step_warnings(problem, tuned, values, key), began)
 
 
 def _recommend(
@@ -323,29 +323,29 @@ def _recommend(
     if safety_filter or (safety_filter is None and near.any()):
         setting = setting.with_filter(near)
     attempt = attempts(task, setting, near)
-    setting, found, problem = attempt.setting, attempt.found, attempt.problem
+    setting, outcome, problem = attempt.setting, attempt.outcome, attempt.problem
     if attempt.number:  # the plants that asked for another search do not judge it
         as_given = setting.replace(searched=_as_given(setting))
         before = judge(as_given, validation, seed, round_=attempt.number)
-    values = values_of(problem, found)
+    values = values_of(problem, outcome)
     answer = _answer(attempt, before, values, mended)
-    found.least = True  # of the limits on plants that judged
-    first = found.search.point(problem.start()) if found.search is not None else None
+    outcome.least = True  # of the limits on plants that judged
+    first = outcome.search.point(problem.start()) if outcome.search is not None else None
     summary, cloud = _validation(answer, problem)
     result = _result(
         problem,
-        found,
+        outcome,
         values,
         case=setting.case,
         tuned=setting.tuned(values),
         method="default answer",
-        status=status_of(found, answer.held, answer.lost),
+        status=status_of(outcome, answer.held, answer.lost),
         objective={"before": _mean(before), "after": _mean(answer.after)}
         | {"terms": dict(setting.objective)},
         measures=dict(answer.measures),
         tables={
             side: [] if p is None else list(p.measures)
-            for side, p in {"before": first, "after": found.point}.items()
+            for side, p in {"before": first, "after": outcome.point}.items()
         },
         constraints=_rows(answer, problem),
         symmetry=None,
@@ -354,10 +354,12 @@ def _recommend(
         lost=answer.lost,
         answer=answer,
     )
-    return _told(result, diagnostics.step_warnings(_own(problem), result.tuned, values), began)
+    return _with_messages(
+        result, diagnostics.step_warnings(_own(problem), result.tuned, values), began
+    )
 
 
-def _told(result, steps, began):
+def _with_messages(result, steps, began):
     """Return a result with its messages and its duration; its problem needs no log any more."""
     result.problem.cache = result.problem.cache.in_memory()
     messages = messages_of(result, steps)
@@ -386,38 +388,38 @@ def _varies(problem):
     return case.uncertain or case.covariance or any(run.key is not None for run in problem.runs)
 
 
-def _result(problem: Problem, found: Outcome, values: Mapping[str, float], **parts: Any):
+def _result(problem: Problem, outcome: Outcome, values: Mapping[str, float], **parts: Any):
     """Return the TuningResult of a search, without messages; parts : fields of their own."""
     return TuningResult(
-        parameters=_parameters(problem, found, values),
+        parameters=_parameters(problem, outcome, values),
         evaluations={
             "simulations": problem.simulations,
             "gradients": problem.gradients,
             "non_finite": problem.non_finite,
-            "redone_at_true_step": found.redone,
+            "redone_at_true_step": outcome.redone,
         },
         wall_s=0.0,
-        history=found.search.history if found.search else [],
-        starts=found.starts,
-        optimality=named_optimality(found.search, found.point),
-        curvature=found.curvature,
+        history=outcome.search.history if outcome.search else [],
+        starts=outcome.starts,
+        optimality=named_optimality(outcome.search, outcome.point),
+        curvature=outcome.curvature,
         provenance=provenance(parts["case"], problem.seed),
         problem=problem,
-        probe=found.probe,
-        slopes=found.slopes,
+        probe=outcome.probe,
+        slopes=outcome.slopes,
         **parts,
     )
 
 
-def _parameters(problem, found, values):
+def _parameters(problem, outcome, values):
     """Return {name: values before and after, range, sensitivity} of the parameters."""
-    own, point, change = problem.own_values(), found.point, found.change
-    if point is None or found.interrupted:
+    own, point, change = problem.own_values(), outcome.point, outcome.change
+    if point is None or outcome.interrupted:
         change = [None] * len(own)
     elif change is None:
         costs, _ = problem.screen(diagnostics.neighbours(problem, point.z))
         change = diagnostics.sensitivities(costs)
-    idle = np.zeros(len(own), dtype=bool) if found.idle is None else found.idle
+    idle = np.zeros(len(own), dtype=bool) if outcome.idle is None else outcome.idle
     return {
         b.name: {
             "before": own[b.name],
@@ -513,19 +515,24 @@ def _own(problem):
 
 def _answer(attempt, before, values, mended):
     """Return the Answer: what was judged, on which plants, and the case's own run."""
-    setting, found, problem, after = attempt.setting, attempt.found, attempt.problem, attempt.after
+    setting, outcome, problem, after = (
+        attempt.setting,
+        attempt.outcome,
+        attempt.problem,
+        attempt.after,
+    )
     own = problem.own_values()
     sides = {"before": (setting.case, before), "after": (setting.tuned(values), after)}
     nominal = {side: _nominal(*both, problem.needed) for side, both in sides.items()}
     errors = {side: float(m["rms_error_total"]) for side, m in nominal.items()}
-    stays = {n: bool(k) for n, k in zip(own, found.kept)} if found.kept is not None else {}
+    stays = {n: bool(k) for n, k in zip(own, outcome.kept)} if outcome.kept is not None else {}
     return Answer(
         setting=setting,
         before=before,
         after=after,
         nominal=errors,
         kept=stays or dict.fromkeys(own, False),
-        agreed=found.confirmed,
+        agreed=outcome.confirmed,
         lost=_lost(setting, problem, nominal, values),
         idle=tuple(int(i) + 1 for i in _idle(setting, before, after)),
         tightened=attempt.tightened,

@@ -102,7 +102,7 @@ def _add_search(one):
     """Options on how the search runs."""
     text = "auto (default), trf, coarse-trf, slsqp, lbfgs or adam"
     option(one, "--method", "NAME", text, "auto")
-    text = "local searches (default 4 at most, until two agree; --nominal: 8)"
+    text = "local searches at most, until two agree (default 4; --nominal: 8)"
     option(one, "--starts", "N", text)
     option(one, "--screening", "N", "Sobol points of --nominal (default 64)")
     text = "iterations of each local search (default 40; --nominal: 60)"
