@@ -89,7 +89,7 @@ def stay_put(
 
 
 def _all_stay(search, start, allowed, slack):
-    """Return True if the first values may stay, all of them: see AGAIN; slack : how much tighter limits are than given."""
+    """Return True if all first values may stay (AGAIN), limits being looser by `slack`."""
     given = start if slack is None else start._replace(margins=start.margins + slack)
     dearest = search.best.cost + AGAIN * WORTH * abs(search.best.cost)
     return start.finite and start.cost <= dearest and search.violation(given) <= allowed
