@@ -202,7 +202,7 @@ def attempts(task: Task, setting: Setting, near: np.ndarray) -> Attempt:
             last = dataclasses.replace(attempt, number=0) if last is None else last
             last.outcome.interrupted = True
             return last
-        last, cost = attempt, attempt.outcome.point.cost
+        last, cost, search = attempt, attempt.outcome.point.cost, attempt.outcome.search
         if coarse and case is not setting.searched and _misled(cost, attempt.after):
             coarse = False
         elif attempt.after.held.all():
@@ -211,7 +211,7 @@ def attempts(task: Task, setting: Setting, near: np.ndarray) -> Attempt:
             filtered = setting.with_filter(matters(setting, attempt.after, NEAR))
             limits = dict(setting.case.limits) if filtered is setting else dict(filtered.limits)
             setting = filtered
-        elif checks and attempt.outcome.search.violation(attempt.outcome.point) == 0:
+        elif checks and search and search.violation(attempt.outcome.point) == 0:
             least = _tighter(attempt.after, checks)
         else:
             break

@@ -176,7 +176,8 @@ def tune(
     numbers = {"starts": starts, "screening": screening, "iterations": iterations}
     numbers["validation"] = validation
     usual = NOMINAL if nominal else DEFAULT
-    options = stated | {n: usual[n] if v is None else v for n, v in numbers.items()}
+    filled = {n: usual[n] if v is None else v for n, v in numbers.items()}
+    options: dict[str, Any] = {**stated, **filled}
     options["progress"] = progress
     keep: dict[str, Any] = dict(checkpoint=folder, resume=resume)
     own = {"distributions": distributions, "safety_filter": safety_filter, "mend": mend}
