@@ -45,7 +45,6 @@ RANKS = [
     "tuning.uncertainty tuning.identification tuning.optimal_input",
     "tuning.feasible",
     "tuning.search tuning.falsification",
-    "tuning.answer",
     "tuning.live",
     "tuning.report",
     "tuning.figures",

@@ -13,10 +13,6 @@ import importlib
 # A type checker reads these imports in place of `__getattr__`; at run time none is made here.
 TYPE_CHECKING = False  # for a checker it is True; `typing` would slow down --help
 if TYPE_CHECKING:
-    from tuning.answer.answer import Answer as Answer
-    from tuning.answer.default import tune as tune
-    from tuning.answer.judged import Judged as Judged
-    from tuning.answer.judged import validate as validate
     from tuning.falsification.result import Attack as Attack
     from tuning.falsification.study import attack as attack
     from tuning.feasible.result import Feasibility as Feasibility
@@ -43,6 +39,9 @@ if TYPE_CHECKING:
     from tuning.problem.functions import Objective as Objective
     from tuning.problem.problem import Problem as Problem
     from tuning.problem.status import Status as Status
+    from tuning.search.judged import Answer as Answer
+    from tuning.search.judged import Judged as Judged
+    from tuning.search.judged import validate as validate
     from tuning.search.options import LBFGS as LBFGS
     from tuning.search.options import SQP as SQP
     from tuning.search.options import TRF as TRF
@@ -54,6 +53,7 @@ if TYPE_CHECKING:
     from tuning.search.result import TuningResult as TuningResult
     from tuning.search.robust import Certificate as Certificate
     from tuning.search.robust import tune_robust as tune_robust
+    from tuning.search.tuner import tune as tune
     from tuning.uncertainty.distributions import Correlated as Correlated
     from tuning.uncertainty.distributions import Discrete as Discrete
     from tuning.uncertainty.distributions import LogUniform as LogUniform
@@ -109,10 +109,10 @@ _NAMES = {
     "tune_robust": "tuning.search.robust",
     "sensitivity": "tuning.uncertainty.sensitivity_study",
     "tradeoff": "tuning.search.pareto",
-    "Answer": "tuning.answer.answer",
-    "Judged": "tuning.answer.judged",
-    "validate": "tuning.answer.judged",
-    "tune": "tuning.answer.default",
+    "Answer": "tuning.search.judged",
+    "Judged": "tuning.search.judged",
+    "validate": "tuning.search.judged",
+    "tune": "tuning.search.tuner",
 }
 
 __all__ = list(_NAMES)  # pyright: ignore[reportUnsupportedDunderAll]  the names of the table

@@ -77,7 +77,7 @@ READS = {
     "CDLL",
 }
 MADE = {
-    ("tuning.answer.answer", "_report", "import_module"): "its own report, by a constant name",
+    ("tuning.search.judged", "_report", "import_module"): "its own report, by a constant name",
     ("jaxtank", "__getattr__", "import_module"): "names of its own table, in its own package",
     ("jaxtank.xla.jit", "_tree", "import_module"): "of a named tuple of ours, of an entry",
     ("tuning", "__getattr__", "import_module"): "names of its own table, in its own package",

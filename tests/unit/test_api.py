@@ -28,7 +28,6 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.observers import Observer
 from jaxtank.plants.base import Plant
 from jaxtank.rig import components
-from tuning.answer import findings
 from tuning.cli.main import main
 from tuning.optimal_input.perfect_information import InputBound
 from tuning.search import messages
@@ -364,9 +363,6 @@ def test_every_code_is_kebab_case_and_is_in_the_table_of_codes():
     folder = Path(messages.__file__).parent
     report = folder.parent / "report" / "tuned" / "report.py"
     _check_codes([*folder.glob("*.py"), report], messages.__doc__)
-    answers = Path(findings.__file__).parent.glob("*.py")
-    shared = {"edge-of-stability", "slope-not-usable"}  # of both, made by search/verdicts
-    _check_codes(answers, findings.__doc__, shared)
 
 
 def _check_codes(paths, table, found=frozenset()):

@@ -23,11 +23,11 @@ from jaxtank.core.tree import get_value, parameters
 from jaxtank.export.whole import check_pointwise
 from jaxtank.loop.closed_loop import takes_arrays
 from jaxtank.loop.trajectory import stride
-from tuning.answer.setting import plants_of
 from tuning.live.drawing import drawing
 from tuning.live.engine import engine, program_of
 from tuning.live.origin import both, entries, origin_of
 from tuning.problem.bounds import bounds
+from tuning.search.setting import plants_of
 from tuning.uncertainty.sampling import check_whole
 
 HERE = Path(__file__).parent

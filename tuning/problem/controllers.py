@@ -26,8 +26,7 @@ from jaxtank.rig.template import around
 NAMES = ("controller.kind", "law.kind")
 """Names by which a choice of the controller is known: in Python, and of the table of a rig file."""
 
-FASTER = 10.0
-"""Ratio of the time constant of the rig to that of the first closed loop [-]."""
+FASTER = 10.0  # ratio of the time constant of the rig to that of the first closed loop [-]
 
 DEVIATION, EFFORT = 0.05, 0.25
 """A level off by the first share of the tanks' height counts as much as an input off by the second
@@ -132,9 +131,7 @@ def _rig_of(case: Case) -> Rig:
 
 
 def _steady(case: Case, plant: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (setpoints, levels, inputs) of the last plateau that has a steady state, of the mean
-    setpoints where there are no plateaus.
-    """
+    """Return (setpoints, levels, inputs) of the last plateau with a steady state, or the mean."""
     plateaus = case.loop.reference.plateaus()
     if plateaus is None:
         plateaus = [np.array([np.mean(r) for r in case.loop.reference.sample(case.clock)[0]])]

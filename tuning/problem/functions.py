@@ -15,11 +15,9 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.text import shortened
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.functions import program_of
-from tuning.problem.point import Point
 from tuning.storage.fingerprint import digest
 
-UNNAMED = "own_objective"
-"""Name of an objective that is a function without one."""
+UNNAMED = "own_objective"  # name of an objective that is a function without one
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,23 +189,7 @@ def _enter(name: str, measure: ms.Measure, found: dict[str, ms.Measure]) -> str:
 
 
 def digests(loop: ClosedLoop, clock: Any, names: Iterable[str]) -> dict[str, Any]:
-    """Return {"functions": {name: digest of its program}} for a fingerprint; {} without
-    functions.
-    """
+    """Return {"functions": {name: digest of its program}} for a fingerprint, {} without any."""
     own = ms.functions(names)
     found = {name: digest(program_of(loop, clock, name)) for name in own}
     return {"functions": found} if found else {}
-
-
-def check_slopes(problem: Any, point: Point) -> None:
-    """Raise InputError for a function of the user's whose derivative at the start is NaN."""
-    if not np.isfinite(point.cost):
-        return
-    bad = [*ms.functions(problem.objective)] if np.isnan(point.gradient).any() else []
-    measured = zip(problem.limits, point.margin_slopes)
-    bad += [limit.measure for limit, slope in measured if np.isnan(slope).any()]
-    for name in ms.functions(bad):
-        raise InputError(
-            f"function {name}: its derivative by {', '.join(problem.names)} is not a number at the"
-            " starting values, as of a root or a quotient at 0"
-        )

@@ -139,9 +139,7 @@ def _without_overflow(measure: str, index: int, value: float, plant: Any) -> tup
 
 
 def undefined(measure: str, case: Case) -> tuple[str, list[bool]]:
-    """Return (reason and remedy, (entries,) True where `measure` has no value on the
-    case's run).
-    """
+    """Return (reason and remedy, (entries,) True where `measure` has no value on the run)."""
     wanted, clock, loop = ms.refers_to([measure]), case.clock, case.loop
     onset = None if loop.disturbance is None else loop.disturbance.since(clock)
     since = np.full(1, -1.0) if onset is None else np.asarray(onset)

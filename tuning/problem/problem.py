@@ -3,10 +3,11 @@
 # functions of jax and of `measures` whose types are not complete
 # pyright: reportUnknownMemberType=false
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaxtank import measures as ms
 from jaxtank.case import Case, Scenario
@@ -16,12 +17,83 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.functions import check_functions
 from jaxtank.rig import check_objective
 from tuning.problem import scenarios as sc
-from tuning.problem.blocks import Blocks, in_blocks
 from tuning.problem.bounds import bounds
 from tuning.problem.functions import as_measures
 from tuning.problem.limits import UNDEFINED_MARGIN, Limit, limit_scale, resolve_in
-from tuning.problem.point import Floats, Point
 from tuning.storage.evaluation_log import EvaluationCache
+
+Floats = NDArray[np.float64]
+
+DIVERGED = 1e9  # size at which a cost, a margin or a slope is no longer a number to search with
+
+NO_VECTOR: Floats = np.zeros(0)
+NO_MATRIX: Floats = np.zeros((0, 0))
+
+
+class Point(NamedTuple):
+    """The problem at one point z of the unit cube, derivatives with respect to z."""
+
+    z: Floats  # (P,)
+    cost: float  # weighted sum of measures, over the scenarios by `risk`
+    gradient: Floats  # (P,)
+    # (P, P) second derivative of what `Problem.model` names, without the residuals' own curvature
+    gauss_newton: Floats
+    margins: Floats  # (limits,) in each measure's unit
+    margin_slopes: Floats  # (limits, P)
+    measures: tuple[Mapping[str, Any], ...]  # of each scenario, {name: value}
+    run_costs: Floats = NO_VECTOR  # (scenarios,)
+    run_slopes: Floats = NO_MATRIX  # (scenarios, P)
+    rows: tuple[int, ...] = ()  # which of the problem's limits the margins are of, where not all
+
+    @property
+    def finite(self) -> bool:
+        """True if cost, margins and derivatives are numbers that one can search with."""
+        return all(
+            bool(np.all(np.abs(v) < DIVERGED))
+            for v in (self.cost, self.gradient, self.margins, self.margin_slopes)
+        )
+
+    @property
+    def valued(self) -> bool:
+        """True if cost and margins are numbers that one can compare, whatever the derivatives."""
+        return all(bool(np.all(np.abs(v) < DIVERGED)) for v in (self.cost, self.margins))
+
+
+LANES = 256
+"""Runs without derivatives that one program makes side by side: enough to fill the vector units."""
+
+IDLE = 2**23
+"""Samples of runs that are made in vain, at most, so as to use a program that is compiled."""
+
+Screened = tuple[Floats, Floats]  # (costs (points,), margins (points, limits))
+
+
+class Blocks:
+    """How many points a program runs: as many as in an earlier call where that serves."""
+
+    # The sizes follow from the calls alone, not from what is known already: a search that is
+    # continued gives the same bits.
+
+    def __init__(self, runs: int):
+        self.runs = runs
+        self.sizes: dict[bool, int] = {}
+
+    def size(self, points: int, coarse: bool, samples: int) -> int:
+        """Return the points of a block, for a call with so many points of runs of `samples`."""
+        size, wanted = self.sizes.get(coarse, 0), max(1, min(points, LANES // self.runs))
+        if size < wanted:
+            self.sizes[coarse] = wanted
+            return wanted
+        return size if -points % size * self.runs * samples <= IDLE else wanted
+
+
+def in_blocks(screen: Callable[[Floats], Screened], zs: Floats, size: int) -> Screened:
+    """Return screen(zs), called with `size` points at a time, the last one repeated to fill up."""
+    filled = np.concatenate([zs, np.repeat(zs[-1:], -len(zs) % size, axis=0)])
+    found = [screen(filled[i : i + size]) for i in range(0, len(filled), size)]
+    costs, margins = (np.concatenate(parts)[: len(zs)] for parts in zip(*found))
+    return costs, margins
+
 
 FORWARD_LIMIT = 60
 """Number of free parameters up to which derivatives run forward with the simulation; above,
@@ -30,19 +102,16 @@ much again as reverse mode, and a search needs fewer of them: 44 instead of 230
 (tests/benchmarks/README.md, Many parameters).
 """
 
-ROOT = "rms_error_total"
-"""The measure that is the root of a sum of squares over all outputs."""
+ROOT = "rms_error_total"  # the measure that is the root of a sum of squares over all outputs
 
 RISKS = ("mean", "cvar", "worst")
 """The cost of several scenarios: their weighted mean, the mean of the worst TAIL of them, or the
 worst.
 """
 
-TAIL = 0.05
-"""Share of the scenarios that "cvar" is the mean of [-]."""
+TAIL = 0.05  # share of the scenarios that "cvar" is the mean of [-]
 
-Row = Mapping[str, Any]
-"""Measures of one scenario, {name: value}."""
+Row = Mapping[str, Any]  # measures of one scenario, {name: value}
 
 
 class Problem:
@@ -61,6 +130,8 @@ class Problem:
     seed : of the sensor noise, which is the same for every evaluation (common random numbers).
     cache : an EvaluationCache of what was evaluated before.
     risk : how the costs of the scenarios are combined, one of RISKS.
+    runs : the runs of the scenarios, where their noise or weights are not those of the seed.
+    drawn : True if the noise is drawn once, for a problem that is evaluated many times.
 
     Raises
     ------
@@ -84,6 +155,9 @@ class Problem:
         seed: int = 0,
         cache: EvaluationCache | None = None,
         risk: str = "mean",
+        *,
+        runs: Sequence[sc.ScenarioRun] | None = None,
+        drawn: bool = False,
     ):
         self.case, self.loop, self.clock, self.seed = case, case.loop, case.clock, seed
         self.given: dict[str, Any] = dict(
@@ -98,17 +172,10 @@ class Problem:
         self.scenarios = sc.check_scenarios(
             case, case.scenarios if scenarios is None else scenarios, self.names
         )
-        self.runs = sc.runs_of(case, self.scenarios, seed)
+        self.runs = sc.runs_of(case, self.scenarios, seed) if runs is None else list(runs)
         self.groups = sc.groups_of(self.runs)
-        self.limit(limits)
-        self.cache = EvaluationCache() if cache is None else cache
-        self.simulations, self.gradients, self.non_finite = 0, 0, 0
-        self.blocks = Blocks(len(self.runs))
-
-    def limit(self, limits: Any) -> None:
-        """Replace the limits by `limits`, as in `resolve_limits`.
-
-        The evaluation cache holds margins of the former limits, and is emptied."""
+        if drawn:
+            self.groups = [sc.with_noise_drawn(group) for group in self.groups]
         self.given["limits"] = limits
         _, named = as_measures(None, limits, self.objective)
         self.limits: list[Limit] = resolve_in(self.runs, named)
@@ -117,7 +184,14 @@ class Problem:
             dict.fromkeys([*self.objective, *(limit.measure for limit in self.limits)])
         )
         check_functions(self.loop, self.clock, self.needed)
-        self.cache = EvaluationCache()
+        self.cache = EvaluationCache() if cache is None else cache
+        self.simulations, self.gradients, self.non_finite = 0, 0, 0
+        self.blocks = Blocks(len(self.runs))
+
+    def with_limits(self, limits: Any) -> "Problem":
+        """Return the problem under other limits, with a cache of its own."""
+        more = {**self.given, "limits": limits}
+        return Problem(self.case, seed=self.seed, runs=self.runs, **more)
 
     @property
     def names(self) -> list[str]:

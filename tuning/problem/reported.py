@@ -71,9 +71,7 @@ class Deferred(Mapping[str, Any]):
 
 
 def margin_measures(loop: ClosedLoop, clock: Clock) -> dict[str, np.ndarray]:
-    """Return {measure: value} of the linearised loop, the worst of its plateaus; {} where the
-    reference holds no setpoints, and outside float64.
-    """
+    """Return {measure: value} of the linearised loop at its worst plateau; {} without setpoints."""
     names = tuple(m for m in ms.linear() if ms.serves(m, loop))
     if not names or zero_of(loop).dtype != np.float64:
         return {}

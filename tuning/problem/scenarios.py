@@ -24,20 +24,12 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.xla.jit import compiled
 
-MANY = 1024
-"""Scenarios that one tuning may have."""
+MANY = 1024  # scenarios that one tuning may have
+COARSE = 10  # how many samples of the case make one of the coarse stage
+FEWEST = 200  # samples that a first local search needs at least
+LARGEST_NOISE = 2**24  # numbers of sensor noise that are kept, at most: 128 MiB
 
-COARSE = 10
-"""How many samples of the case make one of the coarse stage."""
-
-FEWEST = 200
-"""Samples that a first local search needs at least."""
-
-LARGEST_NOISE = 2**24
-"""Numbers of sensor noise that are kept, at most: 128 MiB."""
-
-Measures = dict[str, Any]
-"""{name: array}."""
+Measures = dict[str, Any]  # {name: array}
 
 Shape = tuple[Any, tuple[bool, ...], int]
 """Structure of the loop, which leaves differ, number of runs."""

@@ -8,17 +8,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tuning.problem.point import Point
-from tuning.problem.problem import Problem
+from jaxtank import measures as ms
+from jaxtank.core.errors import InputError
+from tuning.problem.problem import Point, Problem
 
-STEPS = (1e-3, 3e-4)
-"""Lengths of the two secants, as shares of a range [-]."""
+STEPS = (1e-3, 3e-4)  # lengths of the two secants, as shares of a range [-]
 
 ORDERS = 2.0
 """Orders of magnitude by which a derivative must exceed every secant to be contradicted [-]."""
 
-ROUNDING = 1e-9
-"""Share of a value by which rounding may change it from run to run [-]."""
+ROUNDING = 1e-9  # share of a value by which rounding may change it from run to run [-]
 
 
 class SlopeCheck(NamedTuple):
@@ -36,9 +35,7 @@ class SlopeCheck(NamedTuple):
 
 
 def contradicted(predicted: Any, actual: Any, size: Any) -> Any:
-    """Return (...,) True where derivatives predict changes that exceed all actual ones by
-    ORDERS.
-    """
+    """Return (...,) True where derivatives exceed all actual changes by ORDERS."""
     predicted, actual = np.asarray(predicted), np.asarray(actual)
     actual = np.where(np.isfinite(actual), np.abs(actual), np.inf)
     borne_out = np.abs(predicted) <= 10.0**ORDERS * (actual + ROUNDING * np.abs(size))
@@ -67,6 +64,20 @@ def check_slope(problem: Problem, point: Point) -> SlopeCheck:
     usable = not (point.valued and unusable)
     orders = None if usable or not np.isfinite(ratio) else round(float(ratio), 1)
     return SlopeCheck(usable, tuple(map(float, secants)), orders)
+
+
+def check_slopes(problem: Problem, point: Point) -> None:
+    """Raise InputError for a function of the user's whose derivative at the start is NaN."""
+    if not np.isfinite(point.cost):
+        return
+    bad = [*ms.functions(problem.objective)] if np.isnan(point.gradient).any() else []
+    measured = zip(problem.limits, point.margin_slopes)
+    bad += [limit.measure for limit, slope in measured if np.isnan(slope).any()]
+    for name in ms.functions(bad):
+        raise InputError(
+            f"function {name}: its derivative by {', '.join(problem.names)} is not a number at the"
+            " starting values, as of a root or a quotient at 0"
+        )
 
 
 def unusable_words(check: SlopeCheck) -> str:

@@ -10,7 +10,6 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.loop.trajectory import csv
-from tuning.answer.setting import limited_levels
 from tuning.problem.problem import TAIL
 from tuning.problem.wording import numbered
 from tuning.report import optimal_input
@@ -33,6 +32,7 @@ from tuning.report.tables import (
     units,
 )
 from tuning.search.result import Message
+from tuning.search.setting import limited_levels
 
 COSTLIEST, MANY = 5, 12
 """Scenarios in a table that would have more than MANY rows."""

@@ -1,24 +1,41 @@
 """What is computed about an answer: sensitivity, curvature, symmetry, length of the steps."""
 
+import functools
 import math
+from collections.abc import Mapping, Sequence
+from typing import Any
 
+import jax
 import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
+from jaxtank.loop import run as lp
 from jaxtank.loop import step_size
+from jaxtank.loop.change_windows import windows
 from jaxtank.loop.halving import halving_warnings
+from tuning.problem.problem import Problem
 from tuning.problem.reported import table_of
+from tuning.search.result import Lost
 
-CHECKED_RUNS = 16
-"""Scenarios that are run, at most, to look for a step that is too long."""
+CHECKED_RUNS = 16  # scenarios that are run, at most, to look for a step that is too long
+STEP = 1e-4  # step of the differences of the gradient, in the unit cube [-]
 
-STEP = 1e-4
-"""Step of the differences of the gradient, in the unit cube [-]."""
+OFF = 0.1
+"""Distance from the setpoint at the end of a plateau, as a share of the change that led to it,
+from which an output does not follow: twice the band of the settling time [-]."""
 
-LARGEST_CURVATURE = 24
-"""Number of parameters up to which the second derivative is computed."""
+WORSE = 2.0  # factor by which that distance must have grown to be called a change for the worse [-]
+LATE = 0.1  # share of a plateau, at its end, over which the distance is averaged [-]
+COMPARED_RUNS = 8  # scenarios whose trajectories are compared, at most
+SAVED = 20_000  # samples of a trajectory that are compared, at most
+
+BUSY, EXCURSIONS, RINGING = 2.0, 2.0, 25.0
+"""Growth of an input's total variation, its size in ranges of the pump for each plateau, and the
+overshoot [%] above which a run points to a fragile loop: an Ms above 2.5 overshoots by more."""
+
+LARGEST_CURVATURE = 24  # number of parameters up to which the second derivative is computed
 
 
 def step_warnings(problem, tuned, values, key=None):
@@ -168,12 +185,9 @@ def _step_of_ten_percent(bounds, z, direction):
 
 
 def _short_factors(bounds, z, there, gradient, matrix):
-    """Return (factors, z of them) of the step from z to `there`, with as few decimals as suffice.
-
-    As many as leave the change of the cost, by the quadratic model, within 5 %: along a least
-    sensitive direction a component of 1e-4 can matter, because the objective rises steeply beside
-    it.
-    """
+    """Return (factors, z of them) of the step to `there`, in as few decimals as suffice."""
+    # As many as leave the change of the cost, by the quadratic model, within 5 %: along a least
+    # sensitive direction a component of 1e-4 can matter, for the objective is steep beside.
 
     def model(to):
         return gradient @ (to - z) + 0.5 * (to - z) @ matrix @ (to - z)
@@ -271,3 +285,88 @@ def symmetry_words(image, objective):
     searches = len(image["starts"])
     ended = f", {searches} of the searches ended there and count as this answer" * (searches > 0)
     return f"permutation symmetry: {image['words']}: {at} gives {same}{ended}"
+
+
+def lost_outputs(
+    problem: Problem, tables: Mapping[str, Sequence[Any]], values: Mapping[str, float]
+) -> tuple[Lost, ...]:
+    """Return the outputs that follow their setpoints before tuning, and no longer afterwards."""
+    suspects = [_suspect(run, *rows) for run, *rows in zip(problem.runs, *tables.values())]
+    weights = np.array([run.weight for run in problem.runs])
+    lost: list[Lost] = []
+    for i in range(len(problem.loop.plant.outputs)):
+        runs = [k for k, outputs in enumerate(suspects) if i in outputs]
+        if weights[runs].sum() <= 0.5 * weights.sum():
+            continue
+        runs = runs[:COMPARED_RUNS]
+        pairs = [_distances(problem.runs[k], values, i) for k in runs]
+        bad = [after for before, after in pairs if after[0] > max(OFF, WORSE * before[0])]
+        if len(bad) > 0.5 * len(runs):
+            worst = max(range(len(pairs)), key=lambda k: pairs[k][1][0])
+            (_, before), (share, after) = pairs[worst]
+            unit = problem.loop.units[0]
+            lost.append(Lost(output=i + 1, share=share, before=before, after=after, unit=unit))
+    return tuple(lost)
+
+
+def _suspect(run, before, after) -> set[int]:
+    """Return the outputs (from 0) whose measures give a reason to compare their trajectories."""
+    suspect = np.asarray(after["rms_error"]) > WORSE * np.asarray(before["rms_error"])
+    if suspect.any():
+        setpoints, _ = _followed(run.case.loop, run.case.clock)
+        size = np.array([float(np.max(np.abs(v))) for v in setpoints])
+        suspect &= np.asarray(after["rms_error"]) > 0.5 * OFF * size
+    for measure in ("settling_time", "recovery_time"):
+        if measure in before:
+            suspect |= np.isposinf(after[measure]) & ~np.isposinf(before[measure])
+    return set(map(int, np.flatnonzero(suspect)))
+
+
+@functools.partial(jax.jit, static_argnames="clock")
+def _followed(loop: Any, clock: Any) -> Any:
+    """Return (setpoints of all samples, windows of their changes) by one program."""
+    return loop.reference.sample(clock)[0], windows(loop, clock)
+
+
+def _distances(run, values, i) -> list[tuple[float, float]]:
+    """Return [(share of the change, in the unit of level)] of output i, before and after."""
+    loop = run.case.loop
+    return [
+        _farthest(here, run.case.clock, run.key, i) for here in (loop, with_values(loop, values))
+    ]
+
+
+def _farthest(loop, clock, key, i) -> tuple[float, float]:
+    """Return the largest distance of output i from its setpoint at the end of a plateau."""
+    every = max(1, clock.samples // SAVED)
+    errors = np.asarray(lp.simulate(loop, clock, key, save_every=every).e)[:, i]
+    setpoints, found = _followed(loop, clock)
+    setpoint = np.asarray(setpoints[i])[::every][: len(errors)]
+    target, step = (
+        (setpoint, 0 * setpoint)
+        if found is None
+        else (
+            np.broadcast_to(np.asarray(v), (clock.samples,))[::every][: len(errors)]
+            for v in found[i][:2]
+        )
+    )
+    ends = [*np.flatnonzero(np.diff(target)), len(errors) - 1] if found else [len(errors) - 1]
+    worst = (0.0, 0.0)
+    for first, last in zip([-1, *ends], ends):
+        tail = slice(last + 1 - max(1, int(LATE * (last - first))), last + 1)
+        off = abs(float(np.mean(errors[tail])))
+        size = abs(step[last]) or abs(setpoint[last])
+        if size > 0:
+            worst = max(worst, (off / float(size), off))
+    return worst
+
+
+def points_to_fragile(loop: Any, before: Mapping[str, Any], after: Mapping[str, Any]) -> bool:
+    """Return True if the run of an answer rings: else its margins are not worth a program."""
+    old, new = (np.asarray(m["input_travel"]) for m in (before, after))
+    ranges = np.asarray(loop.actuator.high) - np.asarray(loop.actuator.low)
+    held = loop.reference.held()
+    excursions = EXCURSIONS * ranges * (1 if held is None else len(held))
+    overshoot = np.asarray(after.get("overshoot_percent", 0.0), dtype=float)
+    busy = (new > BUSY * old) | (new > excursions)
+    return bool(np.any(busy) or np.any(overshoot > RINGING))

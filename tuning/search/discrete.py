@@ -18,11 +18,8 @@ from tuning.problem.status import Status
 from tuning.search.result import Message, TuningResult
 from tuning.storage.store import NAME
 
-MANY = 64
-"""Combinations that are tried at most."""
-
-UNFIT = "does not fit"
-"""Status of a combination that the rig cannot have."""
+MANY = 64  # combinations that are tried at most
+UNFIT = "does not fit"  # status of a combination that the rig cannot have
 
 
 def tune_choices(
@@ -35,9 +32,7 @@ def tune_choices(
     resume: bool = False,
     **options: Any,
 ) -> TuningResult:
-    """Return the best TuningResult of all combinations of `choices`, with `choices` a row
-    for each.
-    """
+    """Return the best TuningResult of all combinations, with `choices` a row for each."""
     # One that holds every limit is preferred to one that does not, then the smaller violation, then
     # the lower objective.
     variants = _variants(case, choices, options.get("free"))
@@ -141,9 +136,7 @@ def _variant(case, values, kinds, free):
 
 
 def _free_of(case, free):
-    """Return what is free in a case with another controller: of `free` what it has, and its own
-    ranges where that leaves the controller without any.
-    """
+    """Return what is free with another controller: of `free` what it has, else its own gains."""
     if free is None:
         return None
     found = {name: spec for name, spec in free.items() if rig.has(case.loop, name)}

@@ -31,8 +31,13 @@ permutation-symmetry             exchanged gains give an equivalent answer
 limit-violated-out-of-sample     a limit is violated on a validation plant
 limits-hold-out-of-sample        no limit was violated on validation plants (`tune_robust`)
 scenario-bound                   bound of the violation probability (`tune_robust`)
-constraints-tightened            limits were tightened for the search (`back_off=`)
+constraints-tightened            limits were tightened for the search
 support-scenarios                violations on validation plants that were to be expected
+limit-not-certified              the safety filter is on, and a limit is not proved
+sensitivity-peak                 the linearised loop is less robust than before, Ms above PEAK
+noise-assumed                    the case states no sensor noise
+plants-assumed                   the case does not say what is uncertain
+limit-idle                       no plant comes near a limit on a level
 screened-at-true-step            screening points were unstable at the coarse step only
 non-finite-points                trial points gave non-finite numbers
 best-of-choices                  which discrete choice is best (`choices=`)
@@ -41,14 +46,27 @@ no-rig-file                      no rig file describes the case (`save`)
 ===============================  =============================================================
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+
+import numpy as np
 
 from jaxtank import measures as ms
-from tuning.problem.wording import count
+from jaxtank.core.tree import parameters
+from tuning.problem.problem import DIVERGED
+from tuning.problem.slopes import unusable_words
+from tuning.problem.status import Status
+from tuning.problem.wording import count, numbered
 from tuning.search.diagnostics import direction_words, symmetry_words
-from tuning.search.result import Message, TuningResult, constraint_rows
-from tuning.search.stages import AGREE
-from tuning.search.verdicts import ENDINGS, Found, first_of, near_the_edge, violated
+from tuning.search.driver import SLOPING, UNSTABLE
+from tuning.search.result import ConstraintRow, Message, TuningResult, constraint_rows
+from tuning.search.setting import SPREAD
+from tuning.search.stages import AGREE, RENEWED
+
+LISTED = 4  # limits that one message names at most
+
+FRAGILE, PEAK = 2.5, 2.0
+"""Sensitivity peak Ms above which a loop is near the edge of its stability, and above which a loop
+that became less robust is reported [-]: textbooks recommend 1.4 to 2."""
 
 INSENSITIVE = 0.5
 """Change of the objective [%] for 10 % of a parameter, below which the objective is called
@@ -56,13 +74,279 @@ insensitive to the parameter.
 """
 
 CHATTER = 10.0
-"""Growth of the total variation of the input above which it is reported [-]."""
+"""Growth of the total variation of the inputs, or of their rms change per sample, above which it is
+reported [-]."""
+
+Found = Iterator[Message]
 
 
 def messages_of(result: TuningResult, steps: Iterable[str] = ()) -> tuple[Message, ...]:
     """Return the findings about a result, most important first."""
     first = [Message("step-too-long", text) for text in steps]
-    return (*first, *(message for rule in RULES for message in rule(result)))
+    rules = [r for r, of in RULES if of in (ANY, OPTIMUM if result.answer is None else ANSWER)]
+    return (*first, *(message for rule in rules for message in rule(result)))
+
+
+def violated(result: TuningResult) -> list[ConstraintRow]:
+    return [c for c in result.constraints if c.margin < 0]
+
+
+def first_of(parts: list[str], joint: str = ", ") -> str:
+    """Return the first LISTED parts, and how many more there are."""
+    more = len(parts) - LISTED
+    return joint.join(parts[:LISTED]) + (f" (and {more} more)" if more > 0 else "")
+
+
+def _near_the_edge(result: TuningResult) -> Found:
+    """The answer's linearised loop is unstable, or nearly so."""
+    sides = (result.measures[side] for side in ("before", "after"))
+    before, after = (float(m.get("sensitivity_peak", np.nan)) for m in sides)
+    if not after > FRAGILE:  # NaN: it has none
+        return
+    where = f"{'beyond' if np.isinf(after) else 'at'} the edge of sampled stability"
+    peak = "the linearised loop is unstable" if np.isinf(after) else f"Ms = {after:.3g}"
+    old = "unstable" if np.isinf(before) else f"{before:.3g}"
+    yield Message(
+        "edge-of-stability",
+        f"{where}: {peak} at a plateau, {old} before (sensitivity peak of the sampled loop, at most"
+        " 2 is usual): --limit sensitivity_peak=2 bounds it, a smaller step or narrower ranges"
+        " (--free) may help",
+        f"{where} ({peak})",
+    )
+
+
+def _less_robust(result: TuningResult) -> Found:
+    peaks = [float(m.get("sensitivity_peak", np.nan)) for m in result.measures.values()]
+    if len(peaks) == 2 and max(PEAK, 1.05 * peaks[0]) < peaks[1] <= FRAGILE:
+        yield Message(
+            "sensitivity-peak",
+            f"the sensitivity peak of the linearised loop is {peaks[1]:.3g}, {peaks[0]:.3g} before:"
+            f" --limit sensitivity_peak={PEAK:g} bounds it",
+        )
+
+
+def _total_variation(result: TuningResult) -> Found:
+    before, after = (float(result.measures[k]["input_travel"].sum()) for k in ("before", "after"))
+    if after > CHATTER * before > 0:
+        times = f"{after / before:.0f} times that before"
+        unit = ms.unit("input_travel", result.problem.loop.units)
+        yield Message(
+            "input-total-variation",
+            f"the total variation of the inputs is {after:.4g} {unit}, {times}: weigh it or"
+            " limit it (--objective input_travel=..., --limit"
+            " input_travel=...), or take a smaller step",
+            f"total variation of the inputs {times}",
+        )
+
+
+def _busier(result: TuningResult) -> Found:
+    answer = result.answer
+    if answer.after is None or answer.after.failed.all():
+        return
+    old, new = (float(np.nanmean(side.travel)) for side in (answer.before, answer.after))
+    if new > CHATTER * old > 0:
+        yield Message(
+            "input-total-variation",
+            f"the rms change of the inputs per sample is {100 * new:.2g} % of their range,"
+            f" {new / old:.0f} times that before",
+            f"inputs change {new / old:.0f} times as much as before",
+        )
+
+
+def _no_feasible_point(result: TuningResult) -> Found:
+    missed = violated(result)
+    if result.status == Status.NOT_CONVERGED and missed:
+        c = missed[0]
+        yield Message(
+            "no-feasible-point-found",
+            "no point that meets every limit was found before the search ended"
+            f" ({c.name} is {c.amount()}, limit {c.limit:.6g} {c.unit}): more --iterations,"
+            " --starts or --screening may find one",
+        )
+
+
+def _infeasible(result: TuningResult) -> Found:
+    if result.status != Status.INFEASIBLE:
+        return
+    scales = result.problem.limit_scales
+    shares = [c.margin / scale for c, scale in zip(result.constraints, scales)]
+    order = [i for i in np.argsort(shares, kind="stable") if shares[i] < 0]
+    worst = [result.constraints[i] for i in order]
+    missed = [
+        f"{c.name} is {c.amount()}, limit {c.limit:.6g} {c.unit}"
+        + ("" if c.reason else f", missed by {-c.margin:.3g} {c.unit}")
+        for c in worst
+    ]
+    least = (
+        ""
+        if worst[0].reason
+        else f"; the largest violation, {-100 * shares[order[0]]:.3g} % of its limit, is the least"
+        " that was found"
+    )
+    yield Message(
+        "infeasible", f"no point was found that meets every limit: {first_of(missed)}{least}"
+    )
+
+
+def _interrupted(result: TuningResult) -> Found:
+    if result.status == Status.INTERRUPTED:
+        words = "this is the best point so far"
+        if result.answer is not None:
+            judged = result.answer.after is not None
+            words = "of the search before this one" if judged else "not yet validated"
+            words = f"these are the best gains so far, {words}"
+        yield Message("interrupted", f"interrupted: {words}")
+
+
+def _violated_on_plants(result: TuningResult) -> Found:
+    answer = result.answer
+    if answer.after is None or answer.held:
+        return
+    worst = violated(result)
+    parts = [f"{c.name} is {c.amount()}, limit {c.limit:.4g} {c.unit}" for c in worst[:4]]
+    if answer.after.failed.any():
+        parts.append(f"{int(answer.after.failed.sum())} runs diverged")
+    remedy = (
+        "a limit that is not proved may be violated on some plants; try other --free ranges, or a"
+        " limit that leaves more margin"
+    )
+    if answer.setting.filter is None and any(c.measure == "max_level" for c in worst):
+        remedy = "--safety-filter keeps levels below their limits"
+    yield Message(
+        "limit-violated-out-of-sample",
+        f"limits hold on {int(answer.after.held.sum())} of {answer.after.samples}"
+        f" {answer.setting.runs}"
+        f" ({'; '.join(parts)}): {remedy}",
+    )
+
+
+def _no_longer_follows(result: TuningResult) -> Found:
+    forced = any(c.active for c in result.constraints)
+    remedy = (
+        "the active limits force it: loosen them or change the setpoints (--limit, --set)"
+        if forced
+        else "weigh the error in the objective or narrow the ranges (--objective, --free)"
+    )
+    for x in result.lost:
+        yield Message(
+            "no-longer-follows",
+            f"output {x.output} no longer follows its setpoint: at the end of a plateau it is"
+            f" {x.after:.3g} {x.unit} off ({100 * x.share:.3g} % of the setpoint change),"
+            f" {x.before:.3g} {x.unit} before tuning; {remedy}",
+        )
+
+
+def _not_agreed(result: TuningResult) -> Found:
+    if result.status != Status.INTERRUPTED and not result.answer.agreed:
+        yield Message(
+            "not-converged",
+            "no two of the local searches ended within 1 % of each other, and differential"
+            " evolution found better points: raise --starts or --iterations, or narrow the ranges"
+            " (--free)",
+        )
+
+
+def _slope_not_usable(result: TuningResult) -> Found:
+    """At the answer and at the values before tuning; once where these are the same."""
+    places = {"answer": "the answer", "start": "the values before tuning"}
+    same = all(p["before"] == p["after"] for p in result.parameters.values())
+    for where, words in places.items():
+        check = result.slopes.get(where)
+        if check is None or check.usable or (same and where == "start"):
+            continue
+        role = "judged the answer" if where == "answer" else "searched on"
+        yield Message(
+            "slope-not-usable",
+            f"the slope of the objective at {words} is that of a chaotic or exploding loop:"
+            f" {unusable_words(check)}; it was not used: other starts and differential evolution"
+            f" {role}",
+        )
+
+
+def _flat(result: TuningResult) -> bool:
+    """Return True if the gradient is exactly zero at an objective that is not."""
+    return result.optimality["gradient_norm"] == 0.0 and result.objective["after"] != 0.0
+
+
+def _without_slope(result: TuningResult) -> Found:
+    if result.status != Status.INFEASIBLE and _flat(result):
+        yield Message(
+            "objective-without-slope",
+            "the gradient of the objective is zero here: the objective changes in steps, as times"
+            " and counts do, and a search by gradients cannot show that this is its minimum; add a"
+            " smooth measure to the objective",
+        )
+
+
+def _gradient_left(result: TuningResult) -> Found:
+    residual = result.optimality["kkt_residual"]
+    if (
+        _flat(result)
+        or result.status not in (Status.CONVERGED, Status.NOT_CONVERGED)
+        or violated(result)
+    ):
+        return
+    if residual is not None and residual > SLOPING:
+        kink = result.status == Status.CONVERGED
+        yield Message(
+            "kink" if kink else "gradient-not-zero",
+            "the objective has a slope in a direction that no active limit blocks (KKT residual"
+            f" {residual:.2g} of the objective per range of a parameter): "
+            + (
+                "a kink, because no lower value was found along it within the limits"
+                if kink
+                else "not yet an optimum"
+            ),
+        )
+
+
+def _not_converged(result: TuningResult) -> Found:
+    zero = result.optimality["gradient_norm"] == 0.0
+    ended = result.status != Status.NOT_CONVERGED or bool(result.lost)
+    if not ended and not violated(result) and not zero:
+        yield Message("not-converged", _why_not_converged(result))
+
+
+def _why_not_converged(result: TuningResult) -> str:
+    """Return why a search that violates no limit did not converge, and the remedy."""
+    if all(not np.isfinite(violation) for _, _, violation, _ in result.history):
+        return (
+            f"no search could begin: the objective, a limit or a derivative exceeds {DIVERGED:.0e}"
+            " at every point that was tried, as where noise and delay make the loop unstable;"
+            " start from other values (--set) or narrow the ranges (--free)"
+        )
+    check = result.slopes.get("answer")
+    useless = check is not None and not check.usable
+    if useless or (result.optimality["kkt_residual"] or 0.0) >= UNSTABLE:
+        return (
+            "the gradient at this point is that of an unstable or chaotic run (noise and delay at"
+            " a high gain give one), and points along it are not lower; try more --starts, or"
+            " other ranges (--free)"
+        )
+    if any(o["exhausted"] for o in result.starts):
+        return (
+            "no search met the conditions of an optimum before its iterations were used up: raise"
+            " --iterations, or try other starts"
+        )
+    if result.probe and result.probe["lower"] >= RENEWED:
+        return (
+            f"{result.probe['lower']} searches from points of differential evolution each ended"
+            " lower than what was found before, and there may be better points still: raise"
+            " --starts and --screening"
+        )
+    return (
+        "the searches stopped before their iterations were used up, at a kink or in the noise of"
+        " the objective: no line search found a lower point, and the conditions of an optimum do"
+        " not hold there; try more --starts or other starting values"
+    )
+
+
+def _nothing_better(result: TuningResult) -> Found:
+    if result.status == Status.CONVERGED and result.probe:
+        yield Message(
+            "nothing-better-found",
+            f"differential evolution found nothing better in {result.probe['runs']} runs",
+        )
 
 
 def _start_violates(result: TuningResult) -> Found:
@@ -108,18 +392,13 @@ def _active(result: TuningResult) -> Found:
         yield Message("no-limit-active", "no limit is active")
 
 
-def _total_variation(result: TuningResult) -> Found:
-    before, after = (float(result.measures[k]["input_travel"].sum()) for k in ("before", "after"))
-    if after > CHATTER * before > 0:
-        times = f"{after / before:.0f} times that before"
-        unit = ms.unit("input_travel", result.problem.loop.units)
-        yield Message(
-            "input-total-variation",
-            f"the total variation of the inputs is {after:.4g} {unit}, {times}: weigh it or"
-            " limit it (--objective input_travel=..., --limit"
-            " input_travel=...), or take a smaller step",
-            f"total variation of the inputs {times}",
-        )
+def _certificates(result: TuningResult) -> Found:
+    for row in result.answer.setting.certificates:
+        if not row.certified:
+            yield Message(
+                "limit-not-certified",
+                f"the limit of tank {row.tank + 1} is not proved: {row.reason}",
+            )
 
 
 def _not_exercised(result: TuningResult) -> Found:
@@ -137,7 +416,7 @@ def _at_bound_or_insensitive(result: TuningResult) -> Found:
     for name in result:
         p = result[name]
         change = p.sensitivity_percent
-        insensitive = change is not None and change < INSENSITIVE
+        insensitive = not result.answer and change is not None and change < INSENSITIVE
         changes = f"(10 % changes it by {change:.2g} %)" if insensitive else ""
         if not p.exercised:
             continue
@@ -164,7 +443,7 @@ def _agreement(result: TuningResult) -> Found:
     feasible = [o["cost"] for o in result.starts if o["violation"] == 0.0]
     if not feasible:  # nothing to agree on
         return
-    alike = sum(cost <= min(feasible) * AGREE for cost in feasible)
+    alike = sum(cost <= min(feasible) * (1.0 + AGREE) for cost in feasible)
     searches = count(len(result.starts), "search")
     yield Message(
         "starts-agree", f"{alike} of {searches} ended within 0.1 % of the best objective found"
@@ -188,6 +467,49 @@ def _out_of_sample(result: TuningResult) -> Found:
         )
 
 
+def _tightened(result: TuningResult) -> Found:
+    answer = result.answer
+    if answer.tightened and not all(answer.kept.values()):
+        yield Message(
+            "constraints-tightened",
+            f"the search tightened limits by up to {100 * answer.tightened:.2g} %, so that they"
+            " hold on validation plants",
+        )
+
+
+def _assumed(result: TuningResult) -> Found:
+    setting = result.answer.setting
+    if setting.assumed:
+        unit = setting.case.loop.units[0]
+        yield Message(
+            "noise-assumed",
+            f"sensor noise of {setting.noise:.3g} {unit} is assumed (0.1 % of the height; --set"
+            " sensor.noise)",
+        )
+    if not setting.plants_vary:
+        plant = [f'"{n}"' for n in parameters(setting.case.loop) if n.startswith("plant.")]
+        yield Message(
+            "plants-assumed",
+            "nothing of this plant is known to vary, so that nothing is claimed on other plants:"
+            f" name it in `uncertain`, as {{{plant[0] if plant else 'NAME'}: 0.05}} for +-5 %, or"
+            f" with --vary (of {', '.join(plant)})",
+        )
+    elif not setting.stated:
+        yield Message(
+            "plants-assumed",
+            f"the case names nothing uncertain: every flow is taken to be within"
+            f" {100 * SPREAD:g} %; a table [uncertain] or --vary states it",
+        )
+
+
+def _idle(result: TuningResult) -> Found:
+    if result.answer.idle:
+        tanks = numbered("tank", result.answer.idle)
+        yield Message(
+            "limit-idle", f"no plant comes within 10 % of the limit on the level of {tanks}"
+        )
+
+
 def _screened_again(result: TuningResult) -> Found:
     redone = result.evaluations["redone_at_true_step"]
     if redone:
@@ -207,18 +529,38 @@ def _non_finite(result: TuningResult) -> Found:
         )
 
 
-RULES: tuple[Callable[[TuningResult], Found], ...] = (
-    near_the_edge,
-    _total_variation,
-    *ENDINGS,
-    _start_violates,
-    _not_applicable,
-    _active,
-    _not_exercised,
-    _at_bound_or_insensitive,
-    _least_sensitive,
-    _agreement,
-    _out_of_sample,
-    _screened_again,
-    _non_finite,
+ANY, OPTIMUM, ANSWER = "any", "optimum", "answer"
+"""Results that a rule is about: all, those of `--nominal` and `--robust`, default answers."""
+
+RULES: tuple[tuple[Callable[[TuningResult], Found], str], ...] = (
+    (_near_the_edge, ANY),
+    (_less_robust, ANSWER),
+    (_total_variation, OPTIMUM),
+    (_busier, ANSWER),
+    (_no_feasible_point, OPTIMUM),
+    (_infeasible, OPTIMUM),
+    (_interrupted, ANY),
+    (_violated_on_plants, ANSWER),
+    (_no_longer_follows, ANY),
+    (_not_agreed, ANSWER),
+    (_slope_not_usable, ANY),
+    (_certificates, ANSWER),
+    (_without_slope, OPTIMUM),
+    (_gradient_left, OPTIMUM),
+    (_not_converged, OPTIMUM),
+    (_nothing_better, OPTIMUM),
+    (_start_violates, OPTIMUM),
+    (_not_applicable, OPTIMUM),
+    (_active, OPTIMUM),
+    (_not_exercised, ANY),
+    (_at_bound_or_insensitive, ANY),
+    (_tightened, ANSWER),
+    (_assumed, ANSWER),
+    (_idle, ANSWER),
+    (_least_sensitive, OPTIMUM),
+    (_agreement, OPTIMUM),
+    (_out_of_sample, OPTIMUM),
+    (_screened_again, OPTIMUM),
+    (_non_finite, OPTIMUM),
 )
+"""Every rule, most important first."""

@@ -6,20 +6,102 @@ import numpy as np
 import scipy  # its parts are imported when they are first used
 
 from tuning.cluster.ahead import recorded
-from tuning.problem.point import DIVERGED
-from tuning.problem.problem import ROOT
-from tuning.search.driver import CoarseSearch, Search
-from tuning.search.first_order import adam, lbfgs, minibatches
-from tuning.search.kkt import LOWER_BY
+from tuning.problem.problem import DIVERGED, ROOT
+from tuning.search.driver import LOWER_BY, SETTLED, CoarseSearch, Search, optimality
 from tuning.search.screening import MEMBERS, distinct_starts, evolution_size, evolve, sobol
+
+STEEPEST = 10.0
+"""Largest gradient, of the scaled cost per unit of z, that a first-order method is given: a steep
+cost near instability should turn it back, and not move it far away.
+"""
+
+
+def lbfgs(search, z, iterations):
+    """Return True if optax's L-BFGS converged: halving steps, projected onto the bounds."""
+    import optax
+
+    return _augmented(search, z, iterations, optax.scale_by_lbfgs(memory_size=8), descend=True)
+
+
+def adam(search, z, iterations):
+    """Return True if optax's Adam converged: five steps an iteration, projected onto the bounds."""
+    import optax
+
+    steps = 5 * iterations
+    schedule = optax.cosine_decay_schedule(0.05, max(steps // _rounds(search), 1), 0.002)
+    return _augmented(search, z, steps, optax.adam(schedule), descend=False)
+
+
+def minibatches(search, z, iterations, batch, rng):
+    """Return True if optax's Adam converged on `batch` scenarios, drawn anew for every step."""
+    import optax
+
+    steps = 5 * iterations
+    optimiser = optax.adam(optax.cosine_decay_schedule(0.05, steps, 0.002))
+    state, every = optimiser.init(z), max(1, steps // 10)
+    for k in range(steps):
+        point = search.problem.batch_point(z, batch, rng)
+        search.report(search)
+        if not point.finite:
+            z = 0.5 * (z + search.last_finite.z)
+            continue
+        scale = search.limit_scale[list(point.rows)]
+        penalty = 100.0 * np.maximum(0.0, -point.margins / scale)
+        g = point.gradient / search.scale - penalty @ (point.margin_slopes / scale[:, None])
+        g = g * min(1.0, STEEPEST / max(float(np.linalg.norm(g)), 1e-300))
+        update, state = optimiser.update(g, state, z)
+        z = np.clip(z + np.asarray(update), 0.0, 1.0)
+        if (k + 1) % every == 0:
+            search.point(z)
+    search.exhausted = True
+    return search.best is not None and optimality(search, search.best)[1] < SETTLED
+
+
+def _rounds(search):
+    """Return how often the multipliers of the limits are updated."""
+    return 4 if search.problem.limits else 1
+
+
+def _augmented(search, z, iterations, optimiser, descend):
+    """Return True if an optax optimiser converged on the augmented Lagrangian of the limits."""
+    weights, stiffness, rounds = np.zeros(len(search.problem.limits)), 100.0, _rounds(search)
+
+    def value(z):
+        f, g = search.cost(z)
+        if not len(weights):
+            return f, g
+        m, slopes = search.margins(z)
+        penalty = np.maximum(0.0, weights - stiffness * m)
+        return f + float(penalty @ penalty) / (2 * stiffness), g - penalty @ slopes
+
+    for _ in range(rounds):
+        state = optimiser.init(z)
+        for _ in range(max(1, iterations // rounds)):
+            f, g = value(z)
+            g = g * min(1.0, STEEPEST / max(float(np.linalg.norm(g)), 1e-300))
+            update, state = optimiser.update(g, state, z)
+            step = np.asarray(update) if not descend else -np.asarray(update)
+            new = np.clip(z + step, 0.0, 1.0)
+            halvings = 0
+            while descend and value(new)[0] > f - 1e-4 * abs(g @ (new - z)) and halvings < 12:
+                step, halvings = 0.5 * step, halvings + 1
+                new = np.clip(z + step, 0.0, 1.0)
+            moved, z = float(np.linalg.norm(new - z)), new
+            search.exhausted = moved >= 1e-6
+            if not search.exhausted:
+                break
+        if len(weights):
+            weights = np.maximum(0.0, weights - stiffness * search.margins(z)[0])
+            stiffness *= 4
+    return search.best is not None and optimality(search, search.best)[1] < SETTLED
+
 
 PROGRESS, PATIENCE = 1e-9, 25
 """Share by which the best cost must fall within PATIENCE evaluations for a search to go on: at a
 kink a line search does not end by itself [-].
 """
 
-ITERATION_LIMIT = 9
-"""Status of scipy's SLSQP that has used up its iterations."""
+ITERATION_LIMIT = 9  # status of scipy's SLSQP that has used up its iterations
 
 COARSE_TOLERANCE = 1e-4
 """Tolerance of the search at a tenth of the samples, whose own error is larger [-]."""
@@ -33,11 +115,9 @@ RESTORED = 5
 NEAR, HALVINGS = 0.1, 10
 """Largest violation of a point that `approach` moves towards [-], and number of halvings."""
 
-OFFERED = ("trf", "coarse-trf", "slsqp", "lbfgs", "adam")
-"""Methods that can be asked for by name."""
-
-UNCONSTRAINED = ("trf", "coarse-trf")
-"""Those that ignore limits."""
+MANY = 4  # number of parameters from which "auto" tries Gauss-Newton before it considers limits
+OFFERED = ("trf", "coarse-trf", "slsqp", "lbfgs", "adam")  # methods that can be asked for by name
+UNCONSTRAINED = ("trf", "coarse-trf")  # those that ignore limits
 
 
 def slsqp(search, z, iterations, tolerance=None):
@@ -55,21 +135,31 @@ def slsqp(search, z, iterations, tolerance=None):
             }
         ]
     try:
-        done = scipy.optimize.minimize(
-            _Watch(search),
-            z,
-            jac=True,
-            method="SLSQP",
-            bounds=[(0.0, 1.0)] * len(z),
-            constraints=constraints,
-            options={"maxiter": iterations, "ftol": tolerance},
-        )
+        return _minimise(search, _Watch(search), z, [], constraints, iterations, tolerance)
     except _NoProgress:
         return True
+
+
+def _minimise(search, function, y, more, constraints, iterations, tolerance):
+    """Return True if SLSQP converged from y in [0, 1], the last ones in the ranges `more`."""
+    done = scipy.optimize.minimize(
+        function,
+        y,
+        jac=True,
+        method="SLSQP",
+        bounds=[(0.0, 1.0)] * (len(y) - len(more)) + more,
+        constraints=constraints,
+        options={"maxiter": iterations, "ftol": tolerance},
+    )
     search.exhausted = done.status == ITERATION_LIMIT
     # 8: no further descent along the search direction, which is how a solver ends at the precision
     # of a kinked cost
     return bool(done.success) or done.status == 8
+
+
+def _last(y):
+    """Return (the last of y, its gradient), which is minimised as a bound of other values."""
+    return y[-1], np.eye(len(y))[-1]
 
 
 class _NoProgress(Exception):
@@ -115,17 +205,9 @@ def _epigraph(search, z, iterations, tolerance):
         rows = search.margins(y[:-1])[1].reshape(-1, len(y) - 1)
         return np.vstack([costs, np.hstack([rows, np.zeros((len(rows), 1))])])
 
-    done = scipy.optimize.minimize(
-        lambda y: (y[-1], np.eye(len(y))[-1]),
-        np.append(z, known(z).run_costs.max() / search.scale),
-        jac=True,
-        method="SLSQP",
-        bounds=[(0.0, 1.0)] * len(z) + [(None, None)],
-        constraints=[{"type": "ineq", "fun": holds, "jac": slopes}],
-        options={"maxiter": iterations, "ftol": tolerance},
-    )
-    search.exhausted = done.status == ITERATION_LIMIT
-    return bool(done.success) or done.status == 8
+    y = np.append(z, known(z).run_costs.max() / search.scale)
+    rows = [{"type": "ineq", "fun": holds, "jac": slopes}]
+    return _minimise(search, _last, y, [(None, None)], rows, iterations, tolerance)
 
 
 def trf(search, z, iterations, tolerance=1e-10):
@@ -185,9 +267,7 @@ def coarse_first(search, z, iterations):
 
 
 def gauss_newton_first(search, z, iterations):
-    """Return True if `trf` without the limits converged to a feasible point, else `slsqp`
-    from z.
-    """
+    """Return True if `trf` converged to a feasible point, else if `slsqp` from z did."""
     mark = len(search.history)
     converged = trf(search, z, iterations, tolerance=1e-6)
     mine = [h for h in search.history[mark:] if np.isfinite(h[1])]
@@ -209,17 +289,9 @@ def restore(search, z, iterations):
         rows = search.margins(y[:-1])[1]
         return np.hstack([rows, np.ones((len(rows), 1))])
 
-    worst = max(0.0, float(-search.margins(z)[0].min()))
-    done = scipy.optimize.minimize(
-        lambda y: (y[-1], np.eye(len(y))[-1]),
-        np.append(z, worst),
-        jac=True,
-        method="SLSQP",
-        bounds=[(0.0, 1.0)] * len(z) + [(0.0, None)],
-        constraints=[{"type": "ineq", "fun": holds, "jac": slopes}],
-        options={"maxiter": iterations, "ftol": 1e-10},
-    )
-    return bool(done.success) or done.status == 8
+    y = np.append(z, max(0.0, float(-search.margins(z)[0].min())))
+    rows = [{"type": "ineq", "fun": holds, "jac": slopes}]
+    return _minimise(search, _last, y, [(0.0, None)], rows, iterations, 1e-10)
 
 
 def approach(search):
@@ -247,7 +319,7 @@ def approach(search):
             out = middle.z
 
 
-def find_feasible(search, screened, iterations, seed):
+def find_feasible(search, screened, iterations, seed, coarse=True):
     """Return True if the searches for the least violation of the limits came to their end."""
     short = np.maximum(0.0, -screened.margins / search.limit_scale).max(axis=1, initial=0.0)
     starts = distinct_starts(screened.zs, short, RESTORED, search.best.z)
@@ -261,12 +333,19 @@ def find_feasible(search, screened, iterations, seed):
     more = sobol(MEMBERS, len(search.best.z), seed + 1)
     order = np.argsort(np.where(np.isfinite(short), short, np.inf), kind="stable")
     members = np.concatenate([search.best.z[None], screened.zs[order[: count // 2]], more])[:count]
-    now, _ = evolve(search, members, generations, seed)
+    now, _ = evolve(search, members, generations, seed, coarse)
     z = now.zs[np.argmin(now.merits(search))]
     ended.append(restore(search, z, iterations))
     if search.violation(search.best) == 0:
         slsqp(search, search.best.z, iterations)
     return any(ended)
+
+
+def automatic(problem):
+    """Return the method "auto": Gauss-Newton without limits or for many parameters, else SLSQP."""
+    if problem.model and not problem.limits:
+        return "trf"
+    return "trf-slsqp" if problem.model and len(problem.bounds) >= MANY else "slsqp"
 
 
 METHODS = {

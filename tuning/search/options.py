@@ -1,4 +1,4 @@
-"""How `tune` searches, as frozen dataclasses: SQP, TRF, LBFGS, Adam; imported by `tuner`."""
+"""How `tune` searches, as frozen dataclasses: SQP, TRF, LBFGS, Adam."""
 
 import dataclasses
 from typing import ClassVar

@@ -15,8 +15,7 @@ from tuning.search.driver import Search
 from tuning.search.methods import approach, find_feasible, restore, slsqp
 from tuning.search.screening import Population, best_screened, screen
 
-MANY = 50
-"""Values of the limit at most."""
+MANY = 50  # values of the limit at most
 
 
 def tradeoff(
@@ -133,9 +132,8 @@ class _Sweep:
             if k + 1 < len(self.steps) and not self.found[k + 1].violation:
                 nearby = self._solve(self.steps[k], self.found[k + 1].best.z)
                 self.found[k] = _better(self.found[k], nearby)
-            self.problem.limit(self.steps[k])
             search = self.found[k].search
-            screened = self._candidates(screening, seed)
+            screened = self._candidates(search.problem, screening, seed)
             other = best_screened(search, screened)
             if other is not None:
                 self.found[k] = _answer(search, slsqp(search, other, self.iterations))
@@ -148,8 +146,7 @@ class _Sweep:
 
     def _solve(self, limits, z):
         """Return the _Answer under `limits` {measure: value}, searched from z (P,)."""
-        problem = self.problem
-        problem.limit(limits)
+        problem = self.problem.with_limits(limits)
         search = Search(problem, problem.point(problem.start()), self.progress)
         converged = slsqp(search, z, self.iterations)
         if search.best is not None and search.violation(search.best) > 0:
@@ -158,11 +155,11 @@ class _Sweep:
         self.known.update(search.memory)
         return _answer(search, converged)
 
-    def _candidates(self, screening, seed):
+    def _candidates(self, problem, screening, seed):
         """Return the Population of screened and of known points, under the present limits."""
-        zs, costs, margins, _ = screen(self.problem, screening, seed)
+        zs, costs, margins, _ = screen(problem, screening, seed)
         points = [p for p in self.known.values() if p.finite]
-        old = [self.problem.margins(p.measures) for p in points]
+        old = [problem.margins(p.measures) for p in points]
         return Population(
             np.concatenate([zs, [p.z for p in points]]),
             np.concatenate([costs, [p.cost for p in points]]),

@@ -18,8 +18,7 @@ from tuning.problem.result import Result
 from tuning.problem.slopes import SlopeCheck
 from tuning.problem.status import Status
 
-ACTIVE = 1e-3
-"""Margin, as a share of its limit, below which a limit counts as active [-]."""
+ACTIVE = 1e-3  # margin, as a share of its limit, below which a limit counts as active [-]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,24 +8,22 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.case import Case, Scenario
+from jaxtank.case import Case
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import split_index
 from jaxtank.rig import check_limits
 from tuning.cluster.engine import connect
 from tuning.problem.functions import as_measures
 from tuning.problem.problem import Problem
 from tuning.problem.result import Shown
 from tuning.search.result import Message, TuningResult
+from tuning.search.setting import scenarios_of
 from tuning.search.tuner import tune
 from tuning.uncertainty.distributions import stated
-from tuning.uncertainty.draws import Draws
-from tuning.uncertainty.sampling import clopper_pearson, probabilities, spread_of
+from tuning.uncertainty.sampling import clopper_pearson, spread_of
 from tuning.uncertainty.study import ensemble
 from tuning.uncertainty.validation import SEED_OFFSET, summary_of, validate
 
-CONFIDENCE = 1e-6
-"""Probability beta with which the scenario bound may fail [-]."""
+CONFIDENCE = 1e-6  # probability beta with which the scenario bound may fail [-]
 
 TOLERANCE = 1e-4
 """Change of the objective, as a share of its first value, at which a search over drawn plants has
@@ -66,30 +64,6 @@ class Certificate(NamedTuple):
             "new plants that violate a limit": self.broken,
             "probability of violating a limit": f"{low:.2g} to {high:.2g} (95 % interval)",
         }
-
-
-def scenarios_of(case, distributions=None, samples=64, seed=0):
-    """Return `samples` Scenarios of a case, each on a plant drawn from `distributions`."""
-    # The case's own scenarios in turn (its own run, where it has none), each with noise of its own.
-    # Latin hypercube draws. Raises InputError for what cannot be drawn.
-    distributions = spread_of(case) if distributions is None else stated(distributions)
-    space = Draws(case.loop, distributions)
-    values = space.values(probabilities("latin", space.dimensions, samples, seed))
-    base, found = case.scenarios or (Scenario("run"),), []
-    for i in range(samples):
-        own = base[i % len(base)]
-        drawn = {n: v[i].tolist() for n, v in values.items()}
-        set_here = {split_index(n)[0] for n in own.values}
-        kept = {n: v for n, v in drawn.items() if split_index(n)[0] not in set_here}
-        found.append(
-            Scenario(
-                f"plant {i + 1}",
-                {**own.values, **kept},
-                seed=(own.seed + 7919 * (i + 1)) % 2**31,
-                weight=own.weight,
-            )
-        )
-    return tuple(found)
 
 
 def scenario_bound(scenarios, support, beta=CONFIDENCE):

@@ -22,11 +22,8 @@ from tuning.problem.scenarios import screening_clock
 FEWEST, MEMBERS = 32, 64
 """Members of a differential evolution, at least and at most: else as many as were screened."""
 
-GENERATIONS, RUNS = 14, 100_000
-"""Its generations, and its coarse runs, at most."""
-
-MUCH = 1e12
-"""Merit of a point that violates a limit: above every cost (see `DIVERGED`) [-]."""
+GENERATIONS, RUNS = 14, 100_000  # its generations, and its coarse runs, at most
+MUCH = 1e12  # merit of a point that violates a limit: above every cost (see `DIVERGED`) [-]
 
 CROSSED = 0.9
 """Share of the parameters that a member of the differential evolution takes from its move [-]."""
@@ -120,17 +117,19 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
     return jax.vmap(lambda v: jax.vmap(lambda *at: jacobian(v, *at))(r, x, u))(values)
 
 
-def screen(problem, count, seed):
+def screen(problem, count, seed, coarse=True):
     """Return (zs, costs, margins, redone) of `count` Sobol points."""
     # zs (points, P), costs (points,), margins (points, limits). At the true step where all runs
-    # have few samples. Else at a coarse step: points that this step alone makes unstable, or whose
-    # coarse run is not finite, are run again at the true step; `redone` counts the first.
+    # have few samples, or not `coarse`. Else at a coarse step: points that this step alone makes
+    # unstable, or whose coarse run is not finite, are run again at the true step; `redone` counts
+    # the first.
     zs = sobol(count, len(problem.bounds), seed)
-    clock, unstable = screening_clock(problem.clock), np.zeros(count, dtype=bool)
-    if count * len(problem.runs) * problem.clock.samples <= AFFORDED:
-        clock = problem.clock
-    costs, margins = problem.screen(zs, coarse=clock != problem.clock)
-    if clock != problem.clock:
+    unstable = np.zeros(count, dtype=bool)
+    coarse = coarse and count * len(problem.runs) * problem.clock.samples > AFFORDED
+    clock = screening_clock(problem.clock) if coarse else None
+    coarse = coarse and clock != problem.clock
+    costs, margins = problem.screen(zs, coarse)
+    if coarse:
         unstable = (spectral_radius(problem, zs, clock) > 1.0) & ~(
             spectral_radius(problem, zs, problem.clock) > 1.0
         )
@@ -154,9 +153,7 @@ def distinct_starts(zs, merits, count, first):
 
 
 def best_screened(search, screened):
-    """Return the screened point (P,) that keeps the limits and is better than the best of
-    a Search.
-    """
+    """Return the feasible screened point (P,) better than the best of a Search, or None."""
     zs, costs, margins = screened
     held = np.isfinite(costs) & np.all(margins >= 0, axis=1)
     for i in np.argsort(costs, kind="stable"):
@@ -178,10 +175,7 @@ class Population(NamedTuple):
     margins: np.ndarray  # (points, limits)
 
     def merits(self, search):
-        """Return (points,) what ranks them: costs where the limits hold, else far above, violation.
-
-        Infinite where a point is not finite.
-        """
+        """Return (points,) costs where limits hold, else far above by violation, or infinite."""
         short = np.maximum(0.0, -self.margins / search.limit_scale).max(axis=1, initial=0.0)
         merits = np.where(short > 0, MUCH * (1.0 + short), self.costs)
         return np.where(np.isfinite(self.costs) & np.isfinite(merits), merits, np.inf)

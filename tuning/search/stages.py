@@ -1,17 +1,17 @@
 """The stages of one tuning: screening, local searches, feasibility, a final search, diagnostics."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from tuning.cluster.ahead import evaluate_ahead
 from tuning.problem.problem import Problem
-from tuning.problem.slopes import SlopeCheck
+from tuning.problem.slopes import SlopeCheck, check_slopes
+from tuning.problem.status import Status
 from tuning.search import diagnostics
-from tuning.search.driver import SETTLED, Search, event_of
-from tuning.search.kkt import LOWER_BY, UNSTABLE, downhill, optimality
+from tuning.search.driver import LOWER_BY, SETTLED, UNSTABLE, Search, downhill, event_of, optimality
 from tuning.search.methods import (
     UNCONSTRAINED,
     Local,
@@ -21,6 +21,7 @@ from tuning.search.methods import (
     search_alone,
     slsqp,
 )
+from tuning.search.result import Lost
 from tuning.search.screening import (
     MEMBERS,
     Population,
@@ -32,19 +33,13 @@ from tuning.search.screening import (
     screen,
     sobol,
 )
-from tuning.search.starts import search_from
 
 RENEWED = 3
 """How often a search is begun again from where it stopped before conditions of an optimum hold."""
 
-AGREE = 1.001
-"""Two searches whose objectives differ by less than this factor agree [-]."""
-
-SAME = 1e-9
-"""Share of the cost by which two programs that compute it may differ, by rounding [-]."""
-
-FRESH = 2
-"""New Sobol points, as multiples of the members of a differential evolution."""
+AGREE = 1e-3  # two searches whose objectives differ by less than this share agree [-]
+SAME = 1e-9  # share of the cost by which two programs that compute it may differ, by rounding [-]
+FRESH = 2  # new Sobol points, as multiples of the members of a differential evolution
 
 TRIED = 8
 """Members of a differential evolution of which the first that is no chaotic run is a start."""
@@ -52,8 +47,7 @@ TRIED = 8
 MISLED = 0.1
 """Share by which the cost of a coarse run may differ from the true one to be searched with [-]."""
 
-POLISHED = 1e-12
-"""Tolerance of the last search, from the best point [-]."""
+POLISHED = 1e-12  # tolerance of the last search, from the best point [-]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -65,9 +59,14 @@ class Plan:
     screening: int
     iterations: int
     seed: int
-    batch: int | None
-    tolerance: float | None
+    batch: int | None = None
+    tolerance: float | None = None
     engine: Any = None  # of a cluster, on which the local searches run first
+    # search on to rounding, look at neighbours, and compute the curvature of the answer
+    polish: bool = True
+    coarse: bool = True  # screen and look for better points at ten times the step
+    agree: float = AGREE  # share by which the costs of two searches that agree differ [-]
+    lower_by: float = LOWER_BY  # share by which a point must be lower to be searched from [-]
 
     @property
     def local(self) -> Local:
@@ -92,54 +91,66 @@ class Outcome:
     curvature: dict[str, Any] | None = None
     # at the start and at the answer, whether runs bear the slopes out
     slopes: dict[str, SlopeCheck] = dataclasses.field(default_factory=dict)
+    z: Any = None  # (P,) the answer, where it is not the best point
+    kept: Any = None  # (P,) True for parameters that stay at their first values
 
     @property
     def best(self) -> Any:
         """The best Point; None where no finite one was found."""
         return self.search.best if self.search else None
 
+    @property
+    def point(self) -> Any:
+        """The Point of the answer; None where none is finite."""
+        return self.best if self.search is None or self.z is None else self.search.point(self.z)
+
 
 def solve(problem: Problem, first: np.ndarray, plan: Plan, progress: Callable | None) -> Outcome:
     """Return the Outcome of all stages from z = first (P,); Ctrl-C ends them early."""
-    found = Outcome(idle=np.zeros(len(first), dtype=bool))
+    outcome = Outcome(idle=np.zeros(len(first), dtype=bool))
     try:
-        _run_stages(problem, first, plan, found, _reporter(progress, plan.starts))
+        run_stages(problem, first, plan, outcome, reporter(progress, plan.starts))
     except KeyboardInterrupt:
-        found.interrupted = True
-    return found
+        outcome.interrupted = True
+    return outcome
 
 
-def _run_stages(problem, first, plan, found, report):
+def run_stages(
+    problem: Problem, first: np.ndarray, plan: Plan, outcome: Outcome, report: Callable
+) -> None:
     """Run the stages one after the other, and keep in `found` what each of them gave."""
     reference = problem.point(first)
+    check_slopes(problem, reference)
     tolerance = {} if plan.tolerance is None else {"tolerance": plan.tolerance}
-    search = found.search = Search(problem, reference, report, **tolerance)
+    search = outcome.search = Search(problem, reference, report, **tolerance)
     search.take(reference)
-    *measured, found.redone = screen(problem, plan.screening, plan.seed)
+    *measured, outcome.redone = screen(problem, plan.screening, plan.seed, plan.coarse)
     screened = Population(*measured)
-    found.slopes["start"] = search.slope(reference)
+    outcome.slopes["start"] = search.slope(reference)
     shortfall = np.maximum(0.0, -screened.margins / search.limit_scale)
     merits = screened.costs / search.scale + 10.0 * shortfall.sum(axis=1)
     starts = distinct_starts(screened.zs, merits, plan.starts, first)
     searches = [(z, number, tuple(plan.local)) for number, z in enumerate(starts)]
     evaluate_ahead(plan.engine, problem, searches, search_alone, lambda: report(search))
     for z in starts:
-        search.start = len(found.starts)
-        _local_search(search, found, plan, z, len(search.history))
-    _search_screened(search, found, plan, screened)
+        _local_search(search, outcome, plan, z)
+        if _agreed(search, outcome, plan):
+            break
+    _search_screened(search, outcome, plan, screened)
     if _violated(search) and plan.method not in UNCONSTRAINED:
-        found.least = find_feasible(search, screened, plan.iterations, plan.seed)
-    approach(search)
+        outcome.least = find_feasible(search, screened, plan.iterations, plan.seed, plan.coarse)
+    if plan.polish:
+        approach(search)
     if search.best is not None:
-        _finish(search, found, plan)
-        _confirm(search, found, plan, screened)
-        found.idle = diagnostics.unexercised(problem, search, first)
-        if not _violated(search) and search.slope(search.best).usable:
-            found.curvature = diagnostics.curvature(problem, search, search.best, found.idle)
-    if search.return_to_start():
-        found.confirmed, found.curvature = False, None
+        _finish(search, outcome, plan)
+        _confirm(search, outcome, plan, screened)
+        outcome.idle = diagnostics.unexercised(problem, search, first)
+        if plan.polish and not _violated(search) and search.slope(search.best).usable:
+            outcome.curvature = diagnostics.curvature(problem, search, search.best, outcome.idle)
+    if plan.polish and search.return_to_start():
+        outcome.confirmed, outcome.curvature = False, None
     if search.best is not None:
-        found.slopes["answer"] = search.slope(search.best)
+        outcome.slopes["answer"] = search.slope(search.best)
 
 
 def _violated(search):
@@ -147,109 +158,135 @@ def _violated(search):
     return search.best is not None and search.violation(search.best) > 0
 
 
-def _search_screened(search, found, plan, screened):
+def _search_screened(search, outcome, plan, screened):
     """Search on from each screened point that is better than all searches, until none is."""
     while True:
-        search.start, count = len(found.starts), len(search.history)
+        search.start, count = len(outcome.starts), len(search.history)
         z = best_screened(search, screened)
         if z is None:
             return
-        _local_search(search, found, plan, z, count)
+        _local_search(search, outcome, plan, z, count)
 
 
-def _finish(search, found, plan):
+def _finish(search, outcome, plan):
     """Search a last time from the best point, and find out whether it is an optimum."""
-    search.start, found.ended = len(found.starts), False
-    if not search.slope(search.best).usable:
+    search.start, outcome.ended = len(outcome.starts), not plan.polish and not _violated(search)
+    if not plan.polish or not search.slope(search.best).usable:
         return
-    polished = _last_search(search, found, plan)
+    polished = _last_search(search, outcome, plan)
     settled = not _violated(search) and _nothing_lower(search, plan.iterations)
-    ended = settled and (polished or _converged(search, found.starts))
-    found.ended = ended and search.slope(search.best).usable
+    ended = settled and (polished or _converged(search, outcome.starts))
+    outcome.ended = ended and search.slope(search.best).usable
 
 
-def _confirm(search, found, plan, screened):
+def _confirm(search, outcome, plan, screened):
     """Look for points that are better than the answer, and search on from them, a few times."""
     for k in range(RENEWED):
         mark = search.best
-        lower, blind = _lower_neighbour(search, found), not search.slope(mark).usable
-        if lower is None and (blind or (found.ended and not _agreed(search, found))):
-            lower = _probe(search, found, screened, plan.seed + k)
+        lower = _lower_neighbour(search, outcome, plan) if plan.polish else None
+        blind = not search.slope(mark).usable
+        if lower is None and (blind or (outcome.ended and not _agreed(search, outcome, plan))):
+            lower = _probe(search, outcome, plan, screened, plan.seed + k)
         if lower is not None:
-            search.start, count = len(found.starts), len(search.history)
-            _local_search(search, found, plan, lower, count)
-            _finish(search, found, plan)
-        if not _is_lower(search, search.best, mark):
-            found.confirmed = found.ended
+            _local_search(search, outcome, plan, lower)
+            _finish(search, outcome, plan)
+        if not _is_lower(search, search.best, mark, plan):
+            outcome.confirmed = outcome.ended
             return
-        if found.probe:
-            found.probe["lower"] += 1
-    found.confirmed = found.ended and _agreed(search, found)
+        if outcome.probe:
+            outcome.probe["lower"] += 1
+    outcome.confirmed = outcome.ended and _agreed(search, outcome, plan)
 
 
-def _is_lower(search, point, other):
+def _is_lower(search, point, other, plan):
     """Return True if a point is better than another by more than the cost can be trusted to."""
     if search.violation(other) > 0 or search.violation(point) > 0:
         return search.better(point, other)
-    return point.cost < other.cost - LOWER_BY * abs(other.cost)
+    return point.cost < other.cost - plan.lower_by * abs(other.cost)
 
 
-def _agreed(search, found):
-    """Return True if two searches ended at the answer, or in its value."""
-    most = search.best.cost + (AGREE - 1.0) * abs(search.best.cost)
-    return sum(o["violation"] == 0.0 and o["cost"] <= most for o in found.starts) > 1
+def _agreed(search, outcome, plan):
+    """Return True if two searches ended at the answer, or in its value, and one converged."""
+    if search.best is None or not any(o["converged"] for o in outcome.starts):
+        return False
+    most = search.best.cost + plan.agree * abs(search.best.cost)
+    return sum(o["violation"] == 0.0 and o["cost"] <= most for o in outcome.starts) > 1
 
 
-def _lower_neighbour(search, found):
+def _lower_neighbour(search, outcome, plan):
     """Return z of a neighbour of the best point that is lower; None where none is."""
     best = search.best
     near = diagnostics.neighbours(search.problem, best.z)
     costs, margins = search.problem.screen(near)
-    found.change = diagnostics.sensitivities(costs)
+    outcome.change = diagnostics.sensitivities(costs)
     merits = Population(near, costs, margins).merits(search)
     i = int(np.argmin(merits))
     if merits[i] >= merits[0] - SAME * abs(merits[0]):
         return None
-    return near[i] if _is_lower(search, search.point(near[i]), best) else None
+    return near[i] if _is_lower(search, search.point(near[i]), best, plan) else None
 
 
-def _probe(search, found, screened, seed):
+def _probe(search, outcome, plan, screened, seed):
     """Return z of a point that may be better than the answer, by differential evolution."""
     # Its members are the answer, points around it, and the best of the screened and of new Sobol
     # points. On coarse runs, unless they mislead: then a search decides at the true step.
     problem, best, mark = search.problem, search.best, search.problem.simulations
     count, generations = evolution_size(search, screened)
     new = np.split(sobol(FRESH * MEMBERS, len(best.z), seed + 1)[: FRESH * count], FRESH)
-    seen = [screened, *(Population(zs, *problem.screen(zs, coarse=True)) for zs in new)]
+    seen = [screened, *(Population(zs, *problem.screen(zs, plan.coarse)) for zs in new)]
     seen = Population(*(np.concatenate(parts) for parts in zip(*seen)))
     order = np.argsort(seen.merits(search), kind="stable")
     near = around(best.z, count // 4, seed)
     members = np.concatenate([best.z[None], near, seen.zs[order]])[:count]
-    now, began = evolve(search, members, generations, seed)
+    now, began = evolve(search, members, generations, seed, plan.coarse)
     here = began.merits(search)[0]
     if not np.isclose(here, best.cost, rtol=MISLED) and len(problem.runs) == 1:
         now, began = evolve(search, members, max(2, generations // 8), seed, coarse=False)
         here = began.merits(search)[0]
     runs = problem.simulations - mark
-    found.probe = found.probe or {"runs": 0, "searches": 0, "lower": 0}
-    found.probe["runs"] += runs
+    outcome.probe = outcome.probe or {"runs": 0, "searches": 0, "lower": 0}
+    outcome.probe["runs"] += runs
     merits = now.merits(search)
     for i in np.argsort(merits, kind="stable")[:TRIED]:
-        if merits[i] >= here - LOWER_BY * abs(here):
+        if merits[i] >= here - plan.lower_by * abs(here):
             search.point(now.zs[i])  # nothing lower, but it may be, by a little
             return None
         if search.point(now.zs[i]).finite:
-            found.probe["searches"] += 1
+            outcome.probe["searches"] += 1
             return now.zs[i]
     return None
 
 
-def _local_search(search, found, plan, z, count):
+def _local_search(search, outcome, plan, z, count=None):
     """Run one local search from z; `count` : evaluations before the first that belongs to it."""
-    search_from(search, found.starts, z, lambda s, z: run_local(s, z, plan.local), count)
+    search.start = len(outcome.starts)
+    count = len(search.history) if count is None else count
+    z, search.exhausted = np.clip(z, 0.0, 1.0), False
+    blind = search.slopes.get(z.tobytes())
+    converged = bool(run_local(search, z, plan.local)) if blind is None or blind.usable else False
+    mine = search.history[count:]
+    reached = min(mine, key=lambda h: (h[2] > 0, h[2] if h[2] > 0 else h[1]), default=None)
+    if reached is None:  # every point it asked for was known already
+        point = search.memory.get(z.tobytes(), search.best or search.last_finite)
+        reached = (search.start, float(point.cost), search.violation(point), tuple(point.z))
+    if np.array_equal(reached[3], z):
+        blind = search.slope(search.point(z))
+    usable = None if blind is None else blind.usable
+    outcome.starts.append(
+        {
+            "from": search.problem.values(z),
+            "to": search.problem.values(reached[3]),
+            "cost": reached[1],
+            "violation": reached[2],
+            "evaluations": len(mine),
+            "converged": converged and usable is not False,
+            "exhausted": search.exhausted,
+            "slope_usable": usable,
+        }
+    )
 
 
-def _last_search(search, found, plan):
+def _last_search(search, outcome, plan):
     """Return True if a last search from the best point converged."""
     if plan.tolerance is None:
         if plan.method not in ("slsqp", "trf", "coarse-trf", "trf-slsqp"):
@@ -259,7 +296,7 @@ def _last_search(search, found, plan):
     def optimal():
         return optimality(search, search.best)[1] < SETTLED
 
-    if _converged(search, found.starts) and optimal():
+    if _converged(search, outcome.starts) and optimal():
         return True
     return any(slsqp(search, search.best.z, plan.iterations) and optimal() for _ in range(RENEWED))
 
@@ -285,11 +322,23 @@ def without_slope(search):
     return not np.any(search.best.gradient) and search.best.cost != 0.0
 
 
-def _reporter(progress, starts):
+def reporter(progress: Callable | None, starts: int, **more: Any) -> Callable:
     """Return what a Search calls after every evaluation: `progress` with a dict."""
 
     def report(search):
         if progress is not None and search.history:
-            progress(event_of(search, starts))
+            progress(event_of(search, starts, **more))
 
     return report
+
+
+def status_of(outcome: Outcome, feasible: bool, lost: Sequence[Lost] = ()) -> Status:
+    """Return how the stages ended; feasible : whether every limit holds at the answer."""
+    if outcome.interrupted:
+        return Status.INTERRUPTED
+    if outcome.search is None or outcome.best is None:
+        return Status.NOT_CONVERGED
+    if not feasible:
+        return Status.INFEASIBLE if outcome.least else Status.NOT_CONVERGED
+    done = outcome.confirmed and not without_slope(outcome.search) and not lost
+    return Status.CONVERGED if done else Status.NOT_CONVERGED

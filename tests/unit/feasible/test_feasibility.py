@@ -11,7 +11,7 @@ from jaxtank import presets, rig
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.tree import get_value, parameters, with_values
-from tuning.answer.setting import setting_of
+from tuning.search.setting import setting_of
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import spread_of
 

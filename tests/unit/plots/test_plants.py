@@ -9,7 +9,7 @@ import pytest
 from matplotlib.colors import to_hex
 
 from jaxtank.plots import style
-from tuning.answer.judged import Judged, drawn
+from tuning.search.judged import Judged, drawn
 
 
 @pytest.fixture

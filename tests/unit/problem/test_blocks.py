@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from jaxtank import presets, rig
-from tuning.problem.blocks import IDLE, LANES, Blocks
-from tuning.problem.problem import Problem
+from tuning.problem.problem import IDLE, LANES, Blocks, Problem
 
 
 @pytest.mark.parametrize("runs", [1, 3, 32, 1024])

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from jaxtank import presets
-from tuning.answer.attempts import Task
-from tuning.answer.checks import Checks
-from tuning.answer.setting import setting_of
 from tuning.problem.problem import Problem
-from tuning.search.robust import scenarios_of
+from tuning.search.attempts import Checks, Task
+from tuning.search.setting import scenarios_of, setting_of
+from tuning.search.stages import Plan
 
 FREE = {"controller.Kc": (0.2, 4.0), "controller.Ti": (20.0, 400.0)}
 LIMITS = {"max_level": 9.0}
@@ -27,7 +26,8 @@ def robust(case):
 
 def default(case, checked=False):
     setting = setting_of(case, limits=LIMITS)
-    task = Task(FREE, {"starts": 1, "iterations": 1, "seed": 0}, 4, None)
+    plan = Plan(method="slsqp", starts=1, screening=1, iterations=1, seed=0)
+    task = Task(FREE, plan, 4, None)
     checks = Checks(setting, setting.searched, FREE, setting.limits, {}) if checked else None
     if checks:
         checks.look(checks.problem.start())
@@ -40,12 +40,12 @@ def default_with_checks(case):
 
 def points(problem):
     """What each public name of a Problem gives at one point; the names are checked to be all."""
-    limits, z = problem.limit(LIMITS), problem.start()
+    limits, z = problem.with_limits(LIMITS), problem.start()
     point = problem.point(z)
     coarse = problem.coarse_point(z)
     batch = problem.batch_point(z, 3, np.random.default_rng(0))
     return {
-        "limit": limits,
+        "with_limits": limits,
         "names": problem.names,
         "model": problem.model,
         "start": z,

@@ -18,7 +18,7 @@ from jaxtank.loop.run import evaluate_for_reverse
 from jaxtank.measures import from_function, register, registry
 from tuning.problem.problem import FORWARD_LIMIT, Problem
 from tuning.search import tuner
-from tuning.search.robust import scenarios_of
+from tuning.search.setting import scenarios_of
 
 GAINS = {"controller.k": 0.03, "controller.k1": 0.1}
 

@@ -6,7 +6,7 @@ from helpers import command
 
 import tuning
 from jaxtank import presets, rig
-from tuning.problem.point import Point
+from tuning.problem.problem import Point
 from tuning.problem.slopes import check_slope
 from tuning.uncertainty.sensitivity_study import UNUSABLE
 

@@ -15,8 +15,7 @@ from tuning.problem.limits import Limit
 from tuning.problem.problem import ROOT, Point, Problem
 from tuning.problem.reported import run_measures
 from tuning.problem.scenarios import screening_clock
-from tuning.search.driver import Search
-from tuning.search.kkt import optimality
+from tuning.search.driver import Search, optimality
 from tuning.search.methods import METHODS
 from tuning.search.screening import distinct_starts, screen, sobol, spectral_radius
 from tuning.storage.evaluation_log import EvaluationCache

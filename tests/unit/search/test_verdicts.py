@@ -16,8 +16,7 @@ from jaxtank.signals.setpoints import ramps
 from tuning.cli import main
 from tuning.problem.limits import Limit, limit_scale, resolve_limits
 from tuning.problem.problem import Point
-from tuning.search.driver import Search
-from tuning.search.kkt import downhill
+from tuning.search.driver import Search, downhill
 from tuning.search.methods import slsqp
 
 

@@ -128,7 +128,7 @@ def _add_search(one):
     """Options on how the search runs."""
     text = "auto (default), trf, coarse-trf, slsqp, lbfgs or adam"
     option(one, "--method", "NAME", text, "auto")
-    text = "local searches (default 4 at most, until two agree; --nominal: 8)"
+    text = "local searches at most, until two agree (default 4; --nominal: 8)"
     option(one, "--starts", "N", text, None, whole(1, 1000))
     text = "Sobol points of --nominal (default 64)"
     option(one, "--screening", "N", text, None, whole(1, 65536))
@@ -253,7 +253,7 @@ def _finder(args, case, task):
 
 def _varied(args, case):
     """{name: distribution} of --vary or --spread, None without."""
-    from tuning.answer.setting import is_stated, plants_of
+    from tuning.search.setting import is_stated, plants_of
 
     if args.robust is None and (args.spread or args.vary) and _is_nominal(args):
         raise InputError("--spread and --vary of tune belong to the default answer and to --robust")
@@ -264,16 +264,15 @@ def _varied(args, case):
 
 def _not_robust(args, case, task, choices, varied):
     """`_finder` without --robust: the default answer, or the optimum of the case as it is."""
-    if not _is_nominal(args):
-        from tuning.answer.default import tune as finder
+    from tuning.search.tuner import tune as finder
 
+    if not _is_nominal(args):
         own = {"distributions": varied, "safety_filter": args.safety_filter, "mend": args.mend}
         return finder, case, own
     if args.mend is not None:
         raise InputError("--mend belongs to the default answer, not to --nominal")
-    from tuning.search.tuner import tune as finder
-
-    return finder, case, {"choices": choices, "scenarios": task["scenarios"]}
+    own = {"nominal": True, "choices": choices, "scenarios": task["scenarios"]}
+    return finder, case, own
 
 
 def _goes_with_nominal(args):

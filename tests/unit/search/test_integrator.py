@@ -7,8 +7,7 @@ import pytest
 
 from jaxtank import Clock, presets, rig
 from jaxtank.loop.closed_loop import takes_arrays
-from tuning.answer.integrator import LARGEST_ERROR, midpoint_error
-from tuning.answer.setting import height, input_range, setting_of
+from tuning.search.setting import LARGEST_ERROR, height, input_range, midpoint_error, setting_of
 
 TANK = """
 name = "one tank"

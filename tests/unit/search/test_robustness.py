@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from jaxtank import presets, rig
-from tuning.answer import robustness
-from tuning.answer.setting import setting_of
-from tuning.answer.stay_put import LINE, Found
 from tuning.problem.problem import Problem
+from tuning.search import small_changes as robustness
 from tuning.search.driver import Search
+from tuning.search.setting import setting_of
+from tuning.search.small_changes import LINE
+from tuning.search.stages import Outcome
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +29,7 @@ def found_at(problem, search, Kc):
     low, high = problem.case.free["controller.Kc"][:2]
     z = np.array([np.log(Kc / low) / np.log(high / low), problem.start()[1]])
     search.take(search.point(z))
-    return Found(search=search, z=z, kept=np.array([False, True]))
+    return Outcome(search=search, z=z, kept=np.array([False, True]))
 
 
 def peak(setting, problem, z):

@@ -1,26 +1,101 @@
 """How a set of gains does on plants that no search has used, at the case's own step."""
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any
+import importlib
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.case import Case
-from tuning.answer.plants import run_plants
-from tuning.answer.setting import Setting, limited_levels, measured, setting_of
+from jaxtank.core.jsonable import clean
+from jaxtank.core.tree import get_value
+from jaxtank.loop import run as lp
 from tuning.feasible.study import can_follow, can_judge
 from tuning.problem.functions import as_measures
 from tuning.problem.limits import resolve_limits
 from tuning.problem.result import Shown
 from tuning.problem.scenarios import noisy
 from tuning.search.options import check_options, check_precision
-from tuning.uncertainty.sampling import clopper_pearson
+from tuning.search.setting import Setting, limited_levels, measured, setting_of
+from tuning.uncertainty.batches import batch_size, run_batch
+from tuning.uncertainty.draws import Draws
+from tuning.uncertainty.sampling import Points, clopper_pearson
 from tuning.uncertainty.validation import SEED_OFFSET
 
-FRESH = 256
-"""Plants on which an answer is judged."""
+LANES = 8  # runs in a batch are a multiple of this: numbers in a vector register
+
+NOISE = "sensor.noise"
+
+
+class PlantRuns(NamedTuple):
+    """Measures of N drawn plants, and of the nominal one."""
+
+    values: Mapping[str, Any]  # {parameter: (N, ...)} as drawn
+    measures: dict[str, np.ndarray[Any, Any]]  # {name: (N, ...)}
+    failed: np.ndarray[Any, Any]  # (N,) True where the run diverged
+    # {name: value} of the nominal plant without noise; None where it diverged, or was not run
+    nominal: dict[str, np.ndarray[Any, Any]] | None
+
+
+def run_plants(
+    case: Case,
+    distributions: Mapping[str, Any],
+    samples: int,
+    seed: int,
+    names: Sequence[str],
+    quiet: bool = False,
+) -> PlantRuns:
+    """Run a case on `samples` drawn plants with the noise of its sensors."""
+    space = Draws(case.loop, distributions)
+    random = noisy(case) or any(n.startswith(NOISE) for n in space.labels)
+    lp.check(case.loop, case.clock, jax.random.key(0) if random else None)
+    drawn = space.values(Points("random", space.dimensions, samples, seed).rows(0, samples))
+    last = _nominal(case, drawn) if quiet else None
+    count = samples + (last is not None)
+    size = _batch(batch_size(case, random, count), count)
+    rows = np.minimum(np.arange(-(-count // size) * size), count - 1)  # the last one repeated
+    values = dict(drawn) if last is None else _with_row(drawn, last, case)
+    numbers, key = np.arange(len(rows)), seed if random else None
+    batches: list[Any] = []
+    for one in np.split(numbers, len(rows) // size):
+        here = {n: np.asarray(v)[rows[one]] for n, v in values.items()}
+        batches.append(run_batch(case, tuple(names), key, here, one))
+    found = {n: np.concatenate([b[n] for b in batches]) for n in batches[0]}
+    failed, own = found.pop("failed") > 0, None
+    if last is not None and not failed[samples]:
+        own = {n: v[samples] for n, v in found.items()}
+    return PlantRuns(drawn, {n: v[:samples] for n, v in found.items()}, failed[:samples], own)
+
+
+def _batch(most: int, count: int) -> int:
+    """Runs in a batch: the multiple of LANES near `most` with the fewest runs in vain."""
+    if most < LANES:
+        return most
+    sizes = range(max(LANES, most // 2), most + most // 8 + 1, LANES)
+    return min(sizes, key=lambda size: (-(-count // size) * size, -size))
+
+
+def _nominal(case: Case, drawn: Mapping[str, Any]) -> dict[str, Any] | None:
+    """{name: value} of the nominal plant without noise; None where it cannot be told apart."""
+    entries = any(n.startswith(f"{NOISE}[") for n in drawn)
+    if entries or np.ndim(case.loop.sensor.noise) == 0:
+        return None
+    own = {n: np.asarray(get_value(case.loop, n), dtype=float) for n in drawn}
+    return own | {NOISE: np.zeros(np.shape(case.loop.sensor.noise))}
+
+
+def _with_row(drawn: Mapping[str, Any], last: Mapping[str, Any], case: Case) -> dict[str, Any]:
+    """{name: (N + 1, ...)} of the drawn values and those of the last run."""
+    count = len(next(iter(drawn.values())))
+    noise = np.asarray(case.loop.sensor.noise, dtype=float)
+    every = {NOISE: np.broadcast_to(noise, (count, *noise.shape))} | dict(drawn)
+    return {n: np.concatenate([np.asarray(v), last[n][None]]) for n, v in every.items()}
+
+
+FRESH = 256  # plants on which an answer is judged
 
 NOMINAL = ("rms_error_total", "rms_error", "settling_time", "recovery_time")
 """Measures of the nominal plant, which runs beside them, besides those of every plant."""
@@ -127,9 +202,7 @@ class Judged(Shown):
 
 
 def drawn(sides: Mapping[str, Judged]) -> dict[str, Any]:
-    """Return {"plants": figure} of {name: Judged}, one or before and after; {} where every run of
-    one diverged.
-    """
+    """Return {"plants": figure} of {name: Judged}; {} where every run of one diverged."""
     if any(one.failed.all() for one in sides.values()):
         return {}
     from jaxtank.plots.uncertainty import plants
@@ -241,3 +314,105 @@ def matters(setting: Setting, judged: Judged, near: float) -> np.ndarray:
 def unit_of(setting: Setting) -> str:
     """Return the unit of length of the rig."""
     return ms.unit("max_level", setting.case.loop.units)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
+class Answer(Shown):
+    """How the default answer was found and judged: `TuningResult.answer`.
+
+    Parameters
+    ----------
+    setting : what was searched: noise, plants, cost, safety filter.
+    before, after : the case as given and the tuned case on the same validation plants.
+    nominal : {"before", "after": total rms error of the case's own run, without noise}.
+    kept : {parameter: True where it stays at its start}.
+    agreed : True if two searches ended within 1 % of each other, or differential evolution found
+        nothing better.
+    lost : outputs that no longer follow their setpoints, as `tuning.search.result.Lost`.
+    idle : numbers of the tanks, from 1, whose limit no plant comes near.
+    tightened : largest share by which a limit was tightened for the search [-].
+    coarse_dt : step of the search [s]; integrator : its integrator.
+    measures : {"before", "after": {measure: value} of the case's own run}.
+    feasibility : a `tuning.Feasibility`, None where it is not known; mended : the Mend that was
+        applied first, None where none was asked for.
+
+    Examples
+    --------
+    >>> import tuning
+    >>> from jaxtank import presets
+    >>> result = tuning.tune(presets.find("gouta2015/backstepping"))  # doctest: +SKIP
+    >>> result.answer.after.share_held()["share"]  # doctest: +SKIP
+    1.0
+    """
+
+    setting: Setting
+    before: Judged
+    after: Judged | None
+    nominal: Mapping[str, float]
+    kept: Mapping[str, bool]
+    agreed: bool
+    lost: tuple
+    idle: tuple[int, ...]
+    tightened: float
+    coarse_dt: float
+    integrator: str = "rk4"
+    measures: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    feasibility: Any = None
+    mended: Any = None
+
+    @property
+    def held(self) -> bool:
+        """True if every limit holds on every plant that judged the answer."""
+        return self.after is not None and bool(self.after.held.all())
+
+    def _report(self) -> Any:
+        return importlib.import_module("tuning.report.tuned")
+
+    def _sections(self) -> list[Any]:
+        return self._report().of_answer(self)
+
+    def __str__(self) -> str:
+        return self._report().answer_text(self)
+
+    def plot(self) -> dict[str, Any]:
+        """Return matplotlib figures {"plants": errors and highest levels before and after}."""
+        sides = {"before": self.before, "after": self.after}
+        return drawn({name: one for name, one in sides.items() if one is not None})
+
+    def holds(self) -> dict[str, Any]:
+        """Return the object `holds` of the JSON: share of plants, interval, certificates."""
+        known = self.after is not None and bool(self.after.limits)
+        found = self.after.share_held() if self.after is not None and known else None
+        return {
+            "limits_on_validation": found["share"] if found else None,
+            "interval95": found["interval95"] if found else None,
+            "samples": found["samples"] if found else 0,
+            "certified": [
+                {"tank": row.tank + 1, "certified": bool(row.certified), "why": row.reason}
+                | {"starts": row.starts or None}
+                for row in self.setting.certificates
+            ],
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what the JSON of a result says of its plants, its noise and its safety filter."""
+        sides = {"before": self.before, "after": self.after}
+        return clean(
+            {
+                "noise": self.setting.noise,
+                "noise_assumed": self.setting.assumed,
+                "plants_stated": self.setting.stated,
+                "objective": dict(self.setting.objective),
+                "safety_filter": self.setting.filter,
+                "nominal_error": {  # of the run whose measures the JSON has, to the last digit
+                    side: float(dict(m)["rms_error_total"]) for side, m in self.measures.items()
+                },
+                "plants": {name: j.to_json() for name, j in sides.items() if j is not None},
+                "kept": [name for name, stays in self.kept.items() if stays],
+                "idle_limits_of_tanks": list(self.idle),
+                "limits_tightened": self.tightened,
+                "search_dt_s": self.coarse_dt,
+                "search_integrator": self.integrator,
+                "mended": None if self.mended is None else dict(self.mended.set),
+            }
+        )

@@ -7,8 +7,8 @@ import jaxtank
 import tuning
 from jaxtank import rig
 from jaxtank.core.tree import with_values
-from tuning.answer.checks import LARGEST, SHARE, Checks
-from tuning.answer.setting import setting_of
+from tuning.search.attempts import LARGEST, SHARE, Checks
+from tuning.search.setting import setting_of
 
 TANK = """
 name = "one tank, stepped"

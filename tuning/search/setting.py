@@ -7,21 +7,61 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank import rig
 from jaxtank.case import Case, Scenario
+from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import parameters, with_values
+from jaxtank.core.tree import parameters, split_index, with_values
 from jaxtank.loop import run as lp
+from jaxtank.loop.closed_loop import takes_arrays
+from jaxtank.loop.step_size import unstable_tanks
+from jaxtank.plants.runge_kutta import advance
 from jaxtank.presets import find
-from tuning.answer.integrator import LARGEST_ERROR, midpoint_error
 from tuning.problem.scenarios import screening_clock
-from tuning.search.robust import scenarios_of
 from tuning.uncertainty.distributions import Uniform
 from tuning.uncertainty.distributions import stated as stated_of
-from tuning.uncertainty.sampling import spread_of
+from tuning.uncertainty.draws import Draws
+from tuning.uncertainty.sampling import probabilities, spread_of
+
+LARGEST_ERROR = 1e-3
+"""Largest `midpoint_error` with which the midpoint rule is used [-]: a fiftieth of the 5 % by which
+flows differ from plant to plant."""
+
+STATES = 256  # states and inputs at which both are compared
+
+LOWEST = 0.05
+"""Least level of these states, as a share of the height [-]: closer to empty, stability limits the
+step, which is checked separately."""
+
+
+def midpoint_error(case: Case, clock: Clock, height: float, span: np.ndarray) -> float:
+    """Return the relative difference of the midpoint rule and RK4 over one sample."""
+    loop, plant = case.loop, case.loop.plant
+    if any(unstable_tanks(loop, dataclasses.replace(clock, integrator="midpoint"))):
+        return np.inf
+    random, arrays = np.random.default_rng(0), takes_arrays(loop)
+    low = np.broadcast_to(np.asarray(loop.actuator.low, float), (plant.pumps,))
+    low = np.where(np.isfinite(low), np.maximum(low, -span), 0.0)
+    x = height * random.uniform(LOWEST, 1.0, (STATES, plant.tanks))
+    u = low + span * random.uniform(size=(STATES, plant.pumps))
+
+    def changes(x: Any, u: Any) -> Any:
+        start, inputs = (x, u) if arrays else (tuple(x), tuple(u))
+        found = (
+            advance(plant, rule, 0.0, start, inputs, None, clock.dt, clock.substeps).x
+            for rule in ("midpoint", "rk4")
+        )
+        midpoint, rk4 = (jnp.asarray(levels) for levels in found)
+        return jnp.sum((midpoint - rk4) ** 2), jnp.sum((rk4 - x) ** 2)
+
+    off, moved = (float(jnp.sum(v)) for v in jax.jit(jax.vmap(changes))(x, u))
+    share = np.sqrt(off / moved) if moved > 0.0 else np.inf
+    return float(share) if np.isfinite(share) else np.inf
+
 
 NOISE = 1e-3
 """Standard deviation of the sensor noise where the case states none, as a share of the rim [-]."""
@@ -32,17 +72,10 @@ of the second share of its range [-].
 """
 
 FLOWS = ("drain", "orifice", "pipe", "pump_gain", "split")
-SPREAD = 0.05
-"""Share by which every flow may be off where a case does not say what is uncertain."""
-
-NEAR = 0.9
-"""Share of its limit that a level must reach on some plant for the limit to matter."""
-
-FREE = 10.0
-"""Limit of a tank that a safety filter leaves alone, in heights of the rig."""
-
-PLANTS = 32
-"""Plants that the search runs on."""
+SPREAD = 0.05  # share by which every flow may be off where a case does not say what is uncertain
+NEAR = 0.9  # share of its limit that a level must reach on some plant for the limit to matter
+FREE = 10.0  # limit of a tank that a safety filter leaves alone, in heights of the rig
+PLANTS = 32  # plants that the search runs on
 
 COST = ("mean_square_error", "mean_square_travel")
 
@@ -89,10 +122,8 @@ class Setting:
         return None if self.own_objective else f"{self.case.loop.units[0]}^2"
 
     def coarse(self) -> Case:
-        """Return the searched case at ten times its step, integrated by the midpoint rule where the
-        error of that is small enough; the case as it is where too few samples would remain, or
-        where it cannot run at that step.
-        """
+        """Return the searched case at ten times its step, itself where it cannot run so."""
+        # By the midpoint rule where its error is small enough; itself too with too few samples.
         clock = screening_clock(self.searched.clock)
         if clock == self.searched.clock:
             return self.searched
@@ -142,6 +173,30 @@ class Setting:
         if self.filter is None:
             return found.without_safety_filter()
         return found.without_safety_filter().with_safety_filter(**self.filter)
+
+
+def scenarios_of(case, distributions=None, samples=64, seed=0):
+    """Return `samples` Scenarios of a case, each on a plant drawn from `distributions`."""
+    # The case's own scenarios in turn (its own run, where it has none), each with noise of its own.
+    # Latin hypercube draws. Raises InputError for what cannot be drawn.
+    distributions = spread_of(case) if distributions is None else stated_of(distributions)
+    space = Draws(case.loop, distributions)
+    values = space.values(probabilities("latin", space.dimensions, samples, seed))
+    base, found = case.scenarios or (Scenario("run"),), []
+    for i in range(samples):
+        own = base[i % len(base)]
+        drawn = {n: v[i].tolist() for n, v in values.items()}
+        set_here = {split_index(n)[0] for n in own.values}
+        kept = {n: v for n, v in drawn.items() if split_index(n)[0] not in set_here}
+        found.append(
+            Scenario(
+                f"plant {i + 1}",
+                {**own.values, **kept},
+                seed=(own.seed + 7919 * (i + 1)) % 2**31,
+                weight=own.weight,
+            )
+        )
+    return tuple(found)
 
 
 def _for_these_plants(setting, row):
@@ -205,9 +260,7 @@ def setting_of(
 
 
 def _with_box(case, distributions):
-    """Return the case with the box of `distributions`, where they are shares of parameters: a
-    safety filter is then designed for it.
-    """
+    """Return the case with `distributions` as its tolerances, where they are shares."""
     shares = {n: d.relative for n, d in distributions.items() if isinstance(d, Uniform)}
     if len(shares) < len(distributions) or None in shares.values():
         return case
@@ -258,9 +311,7 @@ def _has_own_objective(case):
 
 
 def _noise(case):
-    """Return (standard deviation of the sensor noise, True if it is neither the case's nor that of
-    one of its scenarios).
-    """
+    """Return (standard deviation of the sensor noise, True if neither case nor scenario has it)."""
     own = float(np.max(np.asarray(case.loop.sensor.noise)))
     loops = [rig.set_scenario(case, s.values).loop for s in case.scenarios]
     stated = max([own, *(float(np.max(np.asarray(loop.sensor.noise))) for loop in loops)])

@@ -1,1 +1,0 @@
-"""The default answer of `tune`: many plants, noise, priced inputs and a safety filter."""

@@ -1,0 +1,215 @@
+"""What follows the search of a default answer: every gain that may stays where it was, and gains
+that make the linearised loop fragile are moved back.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from tuning.problem.reported import margin_measures
+from tuning.search.driver import Search
+from tuning.search.methods import METHODS, automatic
+from tuning.search.setting import Setting
+from tuning.search.stages import Outcome
+
+WORTH = 0.01  # a gain is changed only where that lowers the cost by this share [-]
+
+AGAIN = 1.25
+"""All gains stay at their first values where that costs less than this many times WORTH: those of
+an earlier answer, which may cost WORTH already, on plants and limits that differ a little [-]."""
+
+FINE = 0.1  # share of WORTH to which the cost with some gains at their first values is searched [-]
+
+LINE, STRIDE = 32, 8
+"""Values that are tried between a gain's best and its first value, and how
+many of these values are run at once."""
+
+
+class Subspace(Search):
+    """A search over some of the parameters, the others fixed; every point is one of the owner's."""
+
+    def __init__(self, owner: Search, z: np.ndarray, free: np.ndarray):
+        # its owner reports every evaluation already
+        tolerance = max(owner.tolerance, FINE * WORTH)
+        super().__init__(owner.problem, owner.last_finite, lambda search: None, tolerance)
+        self.scale, self.owner, self.fixed = owner.scale, owner, z
+        self.free: np.ndarray = np.asarray(free)
+
+    def full(self, z: Any) -> np.ndarray:
+        """Return (P,) the point of the owner at z, values of the free parameters."""
+        found = self.fixed.copy()
+        found[self.free] = np.clip(z, 0.0, 1.0)
+        return found
+
+    def point(self, z: Any) -> Any:
+        """Return the Point at z, derivatives by the free parameters alone; cached."""
+        z = np.clip(z, 0.0, 1.0)
+        if z.tobytes() not in self.memory:
+            found, free = self.owner.point(self.full(z)), self.free
+            self.take(
+                found._replace(
+                    z=z,
+                    gradient=found.gradient[free],
+                    gauss_newton=found.gauss_newton[free][:, free],
+                    margin_slopes=found.margin_slopes[:, free],
+                    run_slopes=found.run_slopes[:, free] if found.run_slopes.size else np.zeros(0),
+                )
+            )
+        return self.memory[z.tobytes()]
+
+
+def stay_put(
+    search: Search, first: np.ndarray, iterations: int, slack: Any = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (z (P,), kept (P,)): the point nearest to the first values that costs little more."""
+    # One gain after the other is set back to its value in `first` and the rest searched again. It
+    # stays there (kept) if the cost is within WORTH of the best found, and no limit that the best
+    # point keeps is violated. A gain that cannot is moved back as far as it can.
+    best = search.best
+    kept, z = np.zeros(len(first), dtype=bool), best.z
+    ceiling = best.cost + WORTH * abs(best.cost)
+    allowed = search.violation(best)
+
+    def good(point):
+        return point.finite and point.cost <= ceiling and search.violation(point) <= allowed
+
+    if _all_stay(search, search.point(first), allowed, slack):
+        return first.copy(), ~kept
+    # first those whose value costs least by the curvature at the best point
+    order = np.argsort(np.diag(best.gauss_newton) * (best.z - first) ** 2, kind="stable")
+    for i in order:
+        trial = kept.copy()
+        trial[i] = True
+        reached = _without(search, trial, first, z, iterations)
+        if reached is not None and good(search.point(reached)):
+            kept, z = trial, reached
+        else:
+            z = _towards(search, i, first, z, ceiling, allowed, good)
+    return z, kept
+
+
+def _all_stay(search, start, allowed, slack):
+    """Return True if all first values may stay (AGAIN), limits being looser by `slack`."""
+    given = start if slack is None else start._replace(margins=start.margins + slack)
+    dearest = search.best.cost + AGAIN * WORTH * abs(search.best.cost)
+    return start.finite and start.cost <= dearest and search.violation(given) <= allowed
+
+
+def _without(search, trial, first, z, iterations):
+    """Return the best point with the gains of `trial` at their first values, if there is one."""
+    begin = np.where(trial, first, z)
+    if trial.all():
+        return begin
+    free = np.flatnonzero(~trial)
+    inner = Subspace(search, begin, free)
+    METHODS[automatic(search.problem)](inner, begin[free], iterations)
+    return None if inner.best is None else inner.full(inner.best.z)
+
+
+def _towards(search, i, first, z, ceiling, allowed, good):
+    """Return z with gain i moved towards its first value while the cost is below `ceiling`."""
+    # LINE values, STRIDE at once, up to the first that does not fit; without derivatives.
+    shares = np.arange(1, LINE + 1) / (LINE + 1)
+    line = np.repeat(z[None], LINE, axis=0)
+    line[:, i] = z[i] + shares * (first[i] - z[i])
+    count = 0
+    for some in np.split(line, LINE // STRIDE):
+        costs, margins = search.problem.screen(some)
+        shortfall = np.max(-margins / search.limit_scale, axis=1, initial=0.0)
+        fits = np.isfinite(costs) & (costs <= ceiling) & (shortfall <= allowed)
+        count += STRIDE if fits.all() else int(np.argmin(fits))
+        if not fits.all():
+            break
+    for k in range(count - 1, -1, -1):
+        if good(search.point(line[k])):
+            return line[k]
+    return z
+
+
+PEAK = 2.5
+"""Sensitivity peak Ms that an answer may have, unless a lower one costs more than PRICE [-].
+Textbooks recommend 1.4 to 2: above 2 a rise is reported, above this it is taken back."""
+
+PRICE = 0.05  # share of the cost that a lower Ms may cost: half of it as a share of the error [-]
+
+SPAN, ROUNDS = 0.01, 16
+"""A step of the descent of Ms and of its differences, as a share of a range [-]; how often STRIDE
+steps are taken along one direction, at most."""
+
+
+def move_back(setting: Setting, problem: Any, found: Outcome) -> None:
+    """Move the answer in `found` to a point whose Ms is at most PEAK."""
+    search, first = found.search, problem.start()
+    if search is None or found.point is None or np.array_equal(found.point.z, first):
+        return
+    z, point = found.point.z, found.point
+    highest = _peak(setting, problem, z)
+    if not highest > PEAK:  # NaN: it has none
+        return
+    before = _peak(setting, problem, first)
+    allowed = max(PEAK, before)
+    if before > PEAK:
+        calmer, highest = _descended(setting, problem, found, highest)
+        found.z, found.kept = calmer, calmer == first
+    if not highest > allowed:
+        return
+    line = z + np.arange(1, LINE + 1)[:, None] / LINE * (first - z)
+    ceiling, violation = point.cost + PRICE * abs(point.cost), search.violation(point)
+    for some in np.split(line, LINE // STRIDE):
+        low = np.array([_peak(setting, problem, each) <= allowed for each in some])
+        if not low.any():
+            continue
+        costs, _ = problem.screen(some)
+        for each in some[low & (costs <= ceiling)]:
+            there = search.point(each)
+            if search.violation(there) <= violation:
+                dearest = min(ceiling, there.cost + WORTH * abs(there.cost))
+                here = search.point(first)
+                if here.cost <= dearest and search.violation(here) <= violation:
+                    each = first.copy()
+                found.z, found.kept = each, each == first
+                return
+
+
+def _descended(setting, problem, found, highest):
+    """Return (point of the lowest peak within PRICE along the steepest descent, that peak)."""
+    search, z, point = found.search, found.point.z, found.point
+    ceiling, violation = point.cost + PRICE * abs(point.cost), search.violation(point)
+    free, calmer, lowest = ~np.asarray(found.kept), z, highest
+    for _ in range(ROUNDS):
+        slope = _peak_slope(setting, problem, z) * free
+        norm = float(np.linalg.norm(slope))
+        if not 0.0 < norm < np.inf:
+            break
+        steps = np.arange(1, STRIDE + 1)[:, None] * SPAN
+        line = np.clip(z - steps * slope / norm, 0.0, 1.0)
+        costs, margins = problem.screen(line)
+        beyond = np.max(-margins / search.limit_scale, axis=1, initial=0.0)
+        for each, fits in zip(line, (costs <= ceiling) & (beyond <= violation)):
+            if not fits:
+                return calmer, lowest
+            peak = _peak(setting, problem, each)
+            if peak < lowest:
+                calmer, lowest = each, peak
+            if lowest <= PEAK:
+                return calmer, lowest
+        z = line[-1]
+    return calmer, lowest
+
+
+def _peak_slope(setting, problem, z):
+    """Return (P,) the slope of the logarithm of Ms at z, by differences; 0 where it has none."""
+    slope = np.zeros(len(z))
+    for i, unit in enumerate(np.eye(len(z))):
+        ends = [np.clip(z + sign * SPAN * unit, 0.0, 1.0) for sign in (1.0, -1.0)]
+        up, down = (np.log(_peak(setting, problem, end)) for end in ends)
+        if np.isfinite(up - down):
+            slope[i] = (up - down) / (ends[0] - ends[1])[i]
+    return slope
+
+
+def _peak(setting, problem, z):
+    """Return the sensitivity peak at z (P,); NaN where the loop has none."""
+    case = setting.tuned(problem.values(z))
+    found = margin_measures(case.loop, case.clock)
+    return float(found.get("sensitivity_peak", np.nan))
