@@ -127,7 +127,7 @@ def _texts(key, label, value, sizes):
 def _list(key, label, value, sizes):
     wanted = sizes_of_shape(key.shape, sizes.counts) or ()
     if not (is_finite(value) and np.shape(value) == wanted):
-        (size,) = wanted
+        size = wanted[0] if wanted else 1
         numbers = f"{size} finite numbers{unit(key.meta(sizes.units))}, one per {key.shape[0]}"
         raise InputError(f"{label} = {shortened(value)}: must be a list of {numbers}")
     return number(value)

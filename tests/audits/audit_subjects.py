@@ -23,7 +23,7 @@ from jaxtank.plants.network import network
 from jaxtank.plants.rigs import johansson, state_coupled_four_tank
 from jaxtank.plants.runge_kutta import integrate
 from jaxtank.presets.gouta2015 import FAST_AREA
-from jaxtank.rig import schedule
+from jaxtank.rig import values as rig_values
 
 SUBJECTS, QUICK = {}, set()
 POINTS = 12
@@ -617,7 +617,9 @@ for _paper, _names in CONTROLLERS.items():
 
 
 def with_a_schedule(case):
-    case = schedule.schedule(case, {"controller.k": "h1", "controller.k1": "h1"}, [5.0, 10.0, 20.0])
+    case = rig_values.schedule(
+        case, {"controller.k": "h1", "controller.k1": "h1"}, [5.0, 10.0, 20.0]
+    )
     control = case.loop.controller
     control = dataclasses.replace(
         control, values=np.asarray(control.values) * np.array([1.0, 1.5, 0.8])
