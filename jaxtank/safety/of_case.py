@@ -1,8 +1,10 @@
 """A safety filter for a case: its box of plants, its limits and its disturbances."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+import jax
 import numpy as np
 import scipy  # its parts are imported when they are first used
 from numpy.typing import ArrayLike
@@ -72,7 +74,7 @@ def design_for(
     box, more = _box(case, widths)
     inflow, volume = _disturbances(loop, case.clock)
     draw, drawn = _withdrawn(loop, case.clock)
-    return design(
+    safety_filter, rows = design(
         loop.plant,
         loop.actuator,
         loop.sensor,
@@ -91,6 +93,40 @@ def design_for(
         predict=predict,
         faults=loop.faults,
     )
+    names = [] if widths is None else _beyond(case, safety_filter)
+    if names:
+        reason = f"not covered: {', '.join(names)} beyond the widths of the filter"
+        rows = tuple(_not_proved(row, reason) for row in rows)
+    return safety_filter, rows
+
+
+def certificates_of(case: Any) -> tuple[TankCertificate, ...]:
+    """Return the certificates of the filter in the loop; without one, of the one that it could have.
+
+    A filter whose numbers were changed after its design is not certified.
+    """
+    safety_filter, rows = design_for(case, **(case.safety or {}))
+    present = case.loop.safety_filter
+    if present is None or _equal(present, safety_filter):
+        return rows
+    reason = "not covered: a filter that was not designed for this rig (with_safety_filter)"
+    return tuple(_not_proved(row, reason) for row in rows)
+
+
+def _not_proved(row, reason):
+    """The certificate of a tank without its claims."""
+    low = {"low_certified": False, "low_reason": reason} if row.low_certified else {}
+    upper = {"certified": False, "starts": "", "reason": reason} if row.certified else {}
+    return dataclasses.replace(row, **upper, **low)
+
+
+def _equal(first, second):
+    """Whether two filters have the same structure and, to rounding, the same numbers."""
+    leaves = [jax.tree.flatten(one) for one in (first, second)]
+    return leaves[0][1] == leaves[1][1] and all(
+        np.shape(a) == np.shape(b) and np.allclose(a, b, rtol=1e-9, atol=0.0, equal_nan=True)
+        for a, b in zip(leaves[0][0], leaves[1][0])
+    )
 
 
 def _box(case, widths):
@@ -106,15 +142,13 @@ def _box(case, widths):
         sigma = np.sqrt(np.diag(np.asarray(matrix, dtype=float)))[at]
         reach = np.sqrt(2.0 * scipy.special.gammaincinv(0.5 * max(len(at), 1), PROBABILITY))
         box = dict(zip(names, reach * sigma))
-        fields = {n.partition("[")[0] for n in names}
-        shares = {n: s for n, s in shares.items() if not n.startswith("plant.")}
-        shares = {n: s for n, s in shares.items() if n.partition("[")[0] not in fields}
-        flows = {}
+        flows = {}  # what the covariance leaves out is exact, unless `uncertain` names it
     plant = {n: s for n, s in shares.items() if n.startswith("plant.")} or flows
     if widths is not None:
         box = {n: w for n, w in box.items() if not n.startswith("plant.")} | dict(widths)
         plant = {}
-    box |= widths_of(case.loop.plant, plant)
+    for name, half in widths_of(case.loop.plant, plant).items():
+        box[name] = np.maximum(half, box.get(name, 0.0))
     more = 1.0
     for name, share in shares.items():
         part, leaf = name.partition("[")[0].rpartition(".")[::2]
@@ -160,22 +194,21 @@ def _withdrawn(loop, clock):
     return np.array([min(float(np.min(flow)), 0.0) for flow in flows]), False
 
 
-def beyond(case: Any) -> list[str]:
-    """Return the names of [uncertain] whose intervals are wider than those in the settings of the
-    case's safety filter, which take their place.
-    """
-    guard = case.loop.safety_filter
-    if guard is None or "widths" not in (case.safety or {}):
-        return []
-    found = []
-    for name in (name for name in case.uncertain if name.startswith("plant.")):
+def _beyond(case, safety_filter):
+    """Names of the plant's parameters that the case calls uncertain beyond the box of a filter."""
+    box, _ = _box(case, None)
+    stated = case.covariance is not None or any(n.startswith("plant.") for n in case.uncertain)
+    names = [name for name in box if name.startswith("plant.")] if stated else []
+    beyond = []
+    for name in names:
         field, _, entry = name.removeprefix("plant.").partition("[")
         at = int(entry[:-1]) if entry else ...
-        own, least, most = (
+        value, least, most = (
             np.asarray(getattr(plant, field), dtype=float)[at]
-            for plant in (case.loop.plant, guard.least, guard.most)
+            for plant in (case.loop.plant, safety_filter.least, safety_filter.most)
         )
-        half = case.uncertain[name] * own * (1.0 - 1e-9)
-        if np.any(own - half < least) or np.any(own + half > most):
-            found.append(name)
-    return found
+        half = np.asarray(box[name]) * (1.0 - 1e-9)
+        top = np.minimum(value + half, 1.0) if field in ("split", "caught") else value + half
+        if np.any(value - half < least) or np.any(top > most):
+            beyond.append(name)
+    return beyond

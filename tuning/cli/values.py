@@ -59,19 +59,14 @@ def _not_proved(case):
     """Sentences on tanks whose limits the safety filter of the case is not proved to keep."""
     if case.loop.safety_filter is None:
         return []
-    from jaxtank.safety.of_case import beyond
+    from jaxtank.safety.of_case import certificates_of
 
-    rows = case.safety_design(**case.safety)[1]
+    rows = certificates_of(case)
     found = [
         f"safety filter: the limit of tank {row.tank + 1} is not proved: {row.reason}"
         for row in rows
         if not row.certified
     ]
-    if names := beyond(case):
-        found.append(
-            f"safety filter: [uncertain] is wider than the widths of the filter for"
-            f" {', '.join(names)}: nothing is proved of plants beyond those widths"
-        )
     return found + [
         f"safety filter: the low limit of tank {row.tank + 1} is not proved: {row.low_reason}"
         for row in rows

@@ -12,6 +12,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import lower_clip
 from jaxtank.loop.validation import check
 from jaxtank.safety.certificate import TankCertificate
+from jaxtank.safety.of_case import certificates_of
 from jaxtank.safety.worst_case import rates_of, rise
 from tuning.falsification.attacked import Attacked, batch_size, coefficients_of, programs
 from tuning.falsification.result import Attack, Found
@@ -169,7 +170,7 @@ def limits_of(case: Case) -> Limits:
     limit = np.asarray(guard.limit, dtype=float)
     if case.safety is None:  # made by hand
         return Limits(limit + np.asarray(guard.spare), limit, None)
-    rows = case.safety_design(**case.safety)[1]
+    rows = certificates_of(case)
     return Limits(np.array([row.limit for row in rows]), limit, rows)
 
 

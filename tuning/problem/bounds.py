@@ -63,6 +63,11 @@ def bounds(loop: ClosedLoop, free: Mapping[str, Any]) -> list[Bound]:
         raise InputError("nothing to tune: name at least one parameter with --free NAME=LOW:HIGH")
     found: list[Bound] = []
     for name, spec in free.items():
+        if name.startswith("safety_filter."):
+            raise InputError(
+                f"free {name}: the safety filter is designed for the rig, not tuned: its settings go"
+                " into [safety_filter] of a rig file"
+            )
         low, high, scale = check_free(loop, name, *spec)
         unit = describe(loop, name)["unit"]
         base, _ = split_index(name)

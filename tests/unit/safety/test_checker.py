@@ -902,7 +902,7 @@ def test_low_limits_are_checked_by_their_own_conditions():
 
 NOTED = {
     "fault of plant.drain[0]": RIGS["a fault of its own"],
-    "[uncertain] is wider than the widths of the filter for plant.drain": f"""
+    "not covered: plant.drain beyond the widths of the filter": f"""
 {text([1], [5.0], ONE_TANK)}
 values = {{ "clock.dt" = 0.1, "clock.duration" = 5.0 }}
 uncertain = {{ "plant.drain" = 0.2, "plant.pump_gain" = 0.05, "controller.Kc" = 0.5 }}
