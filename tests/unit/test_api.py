@@ -361,7 +361,7 @@ def test_the_message_on_a_bound_names_value_unit_and_sensitivity(tuned):
 
 def test_every_code_is_kebab_case_and_is_in_the_table_of_codes():
     folder = Path(messages.__file__).parent
-    report = folder.parent / "report" / "tuned" / "report.py"
+    report = folder.parent / "report" / "tuned.py"
     _check_codes([*folder.glob("*.py"), report], messages.__doc__)
 
 

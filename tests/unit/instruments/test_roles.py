@@ -302,7 +302,7 @@ def test_every_leaf_of_an_instrument_or_signal_converts_lists_and_numbers():
         (LevelSensor(noise=[0], gain=[1], offset=[2], full_scale=5), ("noise", "gain", "offset")),
         (Constant(level=[1]), ("level",)),
         (jaxtank.signals.Table(values=[[1, 2]], period=1.0), ("values",)),
-        (jaxtank.signals.Pours(volume=[5], events=((0.0, 1.0, 0),), width=1), ("volume",)),
+        (jaxtank.signals.InflowPulses(volume=[5], events=((0.0, 1.0, 0),), width=1), ("volume",)),
         (LIMITED, ("low", "high", "initial", "rate")),
         (dataclasses.replace(ramps([1], []), initial=[3]), ("initial",)),
         (dataclasses.replace(network(**TANK), area=[25], drain=[0]), ("area", "drain")),
