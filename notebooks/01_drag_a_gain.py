@@ -116,7 +116,8 @@ case.explore(plants=200)
 # %% tags=["thumbnail"]
 larger = jaxtank.rig.set_values(case, {"controller.k1": 0.17})
 before, after = (tuning.ensemble(c, samples=200) for c in (case, larger))
-after.plot()["fan"]
+figures = after.plot()
+[plt.close(figure) for name, figure in figures.items() if name != "fan"];
 
 # %% [markdown]
 # With $k_1$ = 0.17 1/s {{100 * float((after.measures["max_level"] > 30).any(axis=1).mean()):.3g}} % of the plants rise above a rim, and the mean error is

@@ -225,7 +225,8 @@ within = np.mean(((seen > low) & (seen < high))[plants.fan["t"] >= record.t[768]
 # %%
 raised = jaxtank.rig.set_values(found.identified, {"controller.Kc[0]": 1.0})
 slow, higher = (tuning.ensemble(c, samples=100) for c in (found.identified, raised))
-higher.plot()["fan"]
+figures = higher.plot()
+[plt.close(figure) for name, figure in figures.items() if name != "fan"];
 
 # %% [markdown]
 # The lower tank follows sooner and overshoots, and the upper one comes to its limits:

@@ -246,9 +246,11 @@ legend = figure.legend(loc="outside lower center", ncols=3), axes[0].set_ylabel(
 
 # %%
 gain = float(plant.pump_gain[0])
-worn_pump = trained.replace(loop=jaxtank.with_values(trained.loop, {"plant.pump_gain[0]": 0.8 * gain}))
+weaker = jaxtank.with_values(trained.loop, {"plant.pump_gain[0]": 0.8 * gain})
+worn_pump = trained.replace(loop=weaker)
 sound, worn = (tuning.ensemble(c, samples=64) for c in (trained, worn_pump))
-worn.plot()["fan"]
+figures = worn.plot()
+[plt.close(figure) for name, figure in figures.items() if name != "fan"];
 
 # %% [markdown]
 # The mean error of the 64 plants is {{np.mean(worn.measures["rms_error_total"]):.2f}} cm, with the nominal gain
