@@ -44,7 +44,7 @@ COMMANDS = {
     "compare": "compare calofir",
     "bound": "tune cascaded/pi --nominal --starts 1 --bound",
 }
-VOLATILE = {"wall_s", "provenance", "elapsed_s", "seconds", "saved", "files"}
+VOLATILE = {"mends_s", "wall_s", "provenance", "elapsed_s", "seconds", "saved", "files"}
 
 
 def stable(value):
