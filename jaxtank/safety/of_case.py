@@ -101,7 +101,7 @@ def design_for(
 
 
 def certificates_of(case: Any) -> tuple[TankCertificate, ...]:
-    """Return the certificates of the filter in the loop; without one, of the one that it could have.
+    """Return the certificates of the filter in the loop; without one, of the filter that fits it.
 
     A filter whose numbers were changed after its design is not certified.
     """

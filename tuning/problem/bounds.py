@@ -65,8 +65,8 @@ def bounds(loop: ClosedLoop, free: Mapping[str, Any]) -> list[Bound]:
     for name, spec in free.items():
         if name.startswith("safety_filter."):
             raise InputError(
-                f"free {name}: the safety filter is designed for the rig, not tuned: its settings go"
-                " into [safety_filter] of a rig file"
+                f"free {name}: the safety filter is designed for the rig, not tuned: its settings"
+                " go into [safety_filter] of a rig file"
             )
         low, high, scale = check_free(loop, name, *spec)
         unit = describe(loop, name)["unit"]
