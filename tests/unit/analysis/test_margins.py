@@ -77,6 +77,7 @@ def test_margins_of_two_lags_under_pi_are_those_of_python_control(dead):
     assert compared > 8
 
 
+@pytest.mark.slow
 def test_with_two_inputs_the_peak_is_that_of_the_largest_singular_value():
     rng = np.random.default_rng(5)
     systems = []

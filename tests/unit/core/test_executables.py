@@ -49,6 +49,7 @@ def whole(folder):
     return sorted(folder.glob(f"*/*{jit.ENDING}"))
 
 
+@pytest.mark.slow
 def test_a_program_that_is_known_is_not_traced_and_gives_the_same_bits(tmp_path):
     """With LAPACK in it, whose functions a new process has not looked up yet; and damaged."""
     folder = tmp_path / "kept"

@@ -540,6 +540,7 @@ def test_c_of_the_functions_that_a_controller_of_ones_own_may_use(tmp_path):
         np.testing.assert_allclose(code.state, expected(y[0] - 3.0), rtol=1e-12, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_matlab_of_the_functions_that_a_controller_of_ones_own_may_use():
     case, errors = own()
     controller = matlab(export(case, "m"))

@@ -1337,6 +1337,7 @@ def test_a_pi_controller_is_proposed_and_what_is_proposed_next_runs(logged):
     assert code in (0, 3) and "controller.Kc[0]" in out, err
 
 
+@pytest.mark.slow
 def test_robust_tuning_without_the_scenarios_of_the_rig(logged):
     """Costs of the drawn plants are those of the rig's own run, not of its scenario with a setpoint
     ten times further.

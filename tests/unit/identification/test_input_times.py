@@ -109,6 +109,7 @@ def _outside(found):
     return [n for n, v in TRUTH.items() if not interval[n][0] <= v <= interval[n][1]]
 
 
+@pytest.mark.slow
 def test_a_dead_time_within_a_step_of_the_log_is_its_own(tmp_path, capsys):
     """Log every 5 s of a plant with 3 s of dead time: with 3 s residuals are the noise and the
     intervals hold the truth; 2 and 5 s are other models, not the same one.
@@ -209,6 +210,7 @@ def test_a_covariance_that_is_not_used_is_reported(tmp_path, capsys):
     assert "[covariance] of 1 parameter of an earlier identification" in found["message"]
 
 
+@pytest.mark.slow
 def test_inputs_along_a_line_from_row_to_row(tmp_path, capsys):
     """Irregular rows, inputs that move steadily in between: a line fits, steps do not."""
     rng = np.random.default_rng(6)

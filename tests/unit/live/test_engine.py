@@ -183,6 +183,7 @@ def test_deviates_are_those_of_jax():
     np.testing.assert_allclose(np.array(found), expected, rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_the_safety_filter_is_switched_on():
     case = short("gouta2015/backstepping")
     agrees(case, [{}], 1e-9, filtered=rig.filtered(case, True))

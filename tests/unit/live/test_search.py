@@ -18,6 +18,7 @@ console.log(JSON.stringify(tune(e, {}, e.info.free, e.info.limits, null, null, {
 """
 
 
+@pytest.mark.slow
 def test_a_search_ends_where_a_scan_has_its_minimum():
     """Of one gain, within 0.5 % of the cost of the best of 60 values."""
     case = presets.find("cascaded/pi").replace(limits={})
@@ -92,6 +93,7 @@ def ends_like_the_command(name):
     return found["violation"], wanted
 
 
+@pytest.mark.slow
 def test_a_search_ends_where_that_of_the_command_ends():
     assert ends_like_the_command("dts200/pi")[0] == 0.0
 

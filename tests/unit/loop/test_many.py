@@ -83,6 +83,7 @@ def for_gpu(monkeypatch):
     jax.clear_caches()
 
 
+@pytest.mark.slow
 def test_one_program_for_a_gpu_without_a_call_to_the_host(for_gpu):
     loop, clock = short("gouta2015/backstepping")
     rows = spread(loop, "plant.orifice", 64)

@@ -152,6 +152,7 @@ def test_a_registered_measure_is_evaluated_with_its_derivative(registered):
     assert found[2].shape == (1, 1) and float(found[2][0, 0]) > 0.0
 
 
+@pytest.mark.slow
 def test_a_registered_measure_is_tuned_by_limited_and_drawn(registered):
     case = rig.loads(RIG)
     assert rig.loads(rig.dump(case)).objective == {"triple": 1.0}

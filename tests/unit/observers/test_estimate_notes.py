@@ -76,6 +76,7 @@ def test_the_distance_of_a_linear_filter_is_that_of_its_square_root():
     np.testing.assert_allclose(error, [[lacking, lacking], [0.0, 0.0]], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_linear_filter_far_from_its_operating_point_is_named(capsys, tmp_path):
     path = tmp_path / "two.toml"
     path.write_text(TWO)

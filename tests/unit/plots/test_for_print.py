@@ -71,6 +71,7 @@ def test_another_number_of_columns_is_refused(columns, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_the_command_writes_both_files(tmp_path):
     asked = ["simulate", "cascaded/pi", "--set", "clock.duration=400", "--quiet", "--columns", "1"]
     found = command(*asked)

@@ -203,6 +203,7 @@ def test_bfgs_ends_where_gauss_newton_does_on_gouta2015():
     assert own["controller.k1"].after == pytest.approx(other["controller.k1"].after, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_an_own_constraint_is_active_at_the_least_cost_of_a_grid_that_keeps_it(watertank):
     """One gain: 400 values of it, run one beside the other, without the tuner."""
     limit, low, high = 60.0, 0.5, 20.0

@@ -81,6 +81,7 @@ def test_every_kind_has_first_gains_for_a_rig_that_it_fits(kind):
     assert all(np.all(np.isfinite(np.asarray(v))) for v in values)
 
 
+@pytest.mark.slow
 def test_the_best_kind_is_that_of_searches_of_each_kind_alone(watertank):
     """Each described in a rig file, with the gains and ranges that the choice begins with."""
     kinds, watertank = ["pid", "lqi"], rig.set_values(watertank, {"clock.dt": 0.2})

@@ -13,6 +13,7 @@ from tuning.search.messages import messages_of
 WORDS = ["--nominal", "--starts", "1", "--screening", "1", "--validation", "0", "--quiet"]
 
 
+@pytest.mark.slow
 def test_an_answer_beyond_sampled_stability_is_news_of_the_headline(tmp_path):
     """k = 39.9 1/s at a step of 0.05 s: 1 - k dt = -0.997, and more between the tanks."""
     case = ["gouta2015/backstepping-slow", "--dt", "0.05", "--set", "controller.k=20"]
@@ -69,6 +70,7 @@ def test_the_default_answer_of_a_fragile_start_prefers_a_lower_sensitivity_peak(
     assert before > 6.0 and after < 2.8
 
 
+@pytest.mark.slow
 def test_a_calm_nominal_answer_costs_no_program_of_margins():
     """Gains move by large factors, and the pumps less than before."""
     found = command("tune", "gouta2015/backstepping", *WORDS, "--json").json
@@ -80,6 +82,7 @@ def test_a_calm_nominal_answer_costs_no_program_of_margins():
     assert found["headline"] == found["status"]
 
 
+@pytest.mark.slow
 def test_a_sensitivity_peak_of_four_is_news_and_one_of_two_is_none():
     result = tuning.tune(
         presets.find("cascaded/pi"),
@@ -118,6 +121,7 @@ def test_a_width_that_the_controller_clips_is_reported_as_it_acts():
     assert runs[0] == runs[1]
 
 
+@pytest.mark.slow
 def test_a_tuned_width_is_at_most_its_size():
     case = presets.find("mirakhorli/hybrid").replace(scenarios=())
     clock = jaxtank.Clock(dt=case.clock.dt, duration=100.0)

@@ -42,6 +42,7 @@ def file(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_eighty_gains_are_tuned(file):
     words = ["--starts", "1", "--screening", "1", "--iterations", "3", "--validation", "0"]
     done = command("tune", str(file), "--nominal", *words, "--json", "--quiet")

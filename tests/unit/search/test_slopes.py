@@ -48,6 +48,7 @@ def test_a_slope_that_exceeds_every_secant_by_orders_is_of_no_use(factor, z):
         assert found.orders == pytest.approx(np.log10(abs(factor)), abs=0.06)
 
 
+@pytest.mark.slow
 def test_a_search_without_a_slope_has_not_converged():
     """calofir far from its gains: a limit cycle, exact slope 1e12 times that of runs beside it."""
     gains = ["--set", "controller.K_phi=0.9", "--set", "controller.K_y=0.9"]

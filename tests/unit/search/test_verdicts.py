@@ -107,6 +107,7 @@ def test_a_search_cut_short_does_not_say_that_limits_cannot_be_met(quick):
     assert not all(c["margin"] >= 0 for c in short.constraints)
 
 
+@pytest.mark.slow
 def test_what_is_missed_is_told_in_full_and_is_the_least_by_one_measure():
     """Levels below the setpoints, with small errors from them."""
     small = rig.set_values(presets.find("cascaded/pi"), {"clock.duration": 1200.0})

@@ -73,6 +73,7 @@ def change(folder, words, *values):
         assert file.total_changes
 
 
+@pytest.mark.slow
 def test_with_and_without_a_log_alike(whole):
     assert reported(tuning.tune(case(), nominal=True, **OPTIONS)) == reported(whole[0])
 
