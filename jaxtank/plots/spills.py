@@ -1,8 +1,7 @@
 """What leaves a tank over its rim: volumes, words for them, and how they are drawn.
 
-A rig whose rims are physics (`plant.overflow`) counts what it loses; in any other one a level rises
-past its rim, and what stands above it is the volume that the tank cannot hold. Imported by
-`responses`, `schematic`, `run` and `animation`.
+A rig whose overflow is simulated (`plant.overflow`) counts the volume lost; in other rigs a level
+rises past its rim, and the volume above the rim is what the tank cannot hold.
 """
 
 from typing import Any, NamedTuple
@@ -25,9 +24,9 @@ HIGHEST = 0.65
 class Spilled(NamedTuple):
     """Volumes above the rims in the course of a run; made by `spilled`."""
 
-    # simulated : True if rims are physics: volumes are then lost since the start, else they stand
-    # above the rims at this moment. volume : (rows, tanks) [cm^3] most : (tanks,) the largest of
-    # each column [cm^3] unit : of volumes
+    # simulated : True if overflow is simulated: volumes lost since the start, else volumes above
+    # the rims at this moment. volume : (rows, tanks) [cm^3]. most : (tanks,) the largest of each
+    # column [cm^3]. unit : of volumes.
 
     simulated: bool
     volume: Any

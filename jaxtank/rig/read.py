@@ -305,7 +305,7 @@ def _check_sections(table):
 
 
 def _with_parts(case, table):
-    """A case with the controller or observer of a table in the place of its own."""
+    """A case whose controller or observer is replaced by that of a table."""
     loop, changed = case.loop, []
     if "controller" in table:
         controller = components.controller_of(table["controller"], loop, loop.actuator.initial)

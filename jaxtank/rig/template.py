@@ -38,7 +38,7 @@ def of_measure(case, name):
     per = MEASURES[name].per
     each = "" if per == "run" else f", of each {per}"
     rim = '; "rim": that of each tank' if name == "max_level" else ""
-    # where rims are physics no level passes one (tuning.objective)
+    # where overflow is simulated no level passes a rim (tuning.objective)
     if rim and case.loop.plant.overflow:
         rim += ", which beside overflow = true is a limit on overflow_volume: none may overflow"
     unit = measure_unit(name, case.loop.units)

@@ -177,7 +177,7 @@ def _about(lowered: Any) -> dict[str, Any] | None:
 
 
 def _compile(lowered: Any, about: dict[str, Any], path: Path) -> Any:
-    """The program, compiled, and kept as an entry in the place of one of jax's own."""
+    """The program, compiled, and kept as an entry that replaces that of jax."""
     # A program that jax has read from its cache cannot be written again (XLA leaves out functions).
     config: Any = jax.config
     least = config.jax_persistent_cache_min_compile_time_secs

@@ -72,8 +72,11 @@ def of_result(result: Any, plants: int | None = None) -> LivePage:
         loop = dataclasses.replace(case.loop, safety_filter=tuned.loop.safety_filter)
         case = case.replace(loop=loop, safety=tuned.safety)
     problem = getattr(result, "problem", None)
-    if problem is not None and problem.given["limits"] is not None:
-        _, limits = as_measures(None, problem.given["limits"])
+    stated = None if problem is None else problem.given["limits"]
+    if getattr(result, "answer", None) is not None:
+        stated = result.tuned.limits  # its search leaves out limits that the safety filter keeps
+    if stated is not None:
+        _, limits = as_measures(None, stated)
         own = set(ms.functions(limits))  # a user's functions do not run in a browser
         limits = {m: value for m, value in limits.items() if m not in own}
         case = case.replace(limits=limits)  # those of the search, with --limit

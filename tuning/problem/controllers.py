@@ -49,7 +49,7 @@ class Rig(NamedTuple):
 
 
 def with_kind(case: Case, kind: str) -> Case:
-    """Return a case with a controller of another kind in the place of its own."""
+    """Return a case whose controller is replaced by one of another kind."""
     known = ROLES["controller"].classes
     if kind not in known:
         raise unknown("controller kind", str(kind), known)

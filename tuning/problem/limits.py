@@ -27,9 +27,7 @@ SMALLEST_SCALE = 1e-3
 """Share of the size of the measured quantity below which a limit is as good as 0 [-]."""
 
 NO_OVERFLOW = 1e-6
-"""Overflow volume that counts as none, where rims are physics, as a share of the tank's volume
-[-].
-"""
+"""Volume lost that counts as no overflow where overflow is simulated, in tank volumes [-]."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -124,7 +124,7 @@ class Problem:
     case : the Case.
     free : {name: (low, high) or Free}; the case's own where None, as for the next three.
     objective : {measure: weight}; a measure with several entries counts with their sum. Also a
-        function of one's own, or a `tuning.Objective`, alone or in the place of a measure.
+        custom function, or a `tuning.Objective`, alone or in the place of a measure.
     limits : as in `resolve_limits`, or a list with `tuning.Constraint`s; of every scenario.
     scenarios : tuple of Scenario, () for the case's own run alone.
     seed : of the sensor noise, which is the same for every evaluation (common random numbers).

@@ -79,7 +79,7 @@ def _batch(most: int, count: int) -> int:
 
 
 def _nominal(case: Case, drawn: Mapping[str, Any]) -> dict[str, Any] | None:
-    """{name: value} of the nominal plant without noise; None where it cannot be told apart."""
+    """{name: value} of the nominal plant without noise; None where noise is a number or drawn."""
     entries = any(n.startswith(f"{NOISE}[") for n in drawn)
     if entries or np.ndim(case.loop.sensor.noise) == 0:
         return None
@@ -237,7 +237,7 @@ def validate(
     seed : of plants and noise.
     distributions : {name: distribution or share}; what the case calls uncertain where None, 5 % of
         every flow where that is nothing.
-    objective : {measure: weight} or a function of one's own; as in `tuning.tune`.
+    objective : {measure: weight} or a custom function, as in `tuning.tune`.
     limits : {measure: value}, and `Constraint`s, as in `tuning.tune`; those of the case where None.
 
     Returns

@@ -113,7 +113,7 @@ def tune(
         default answer unless method, scenarios, risk, choices, batch, screening or tolerance are
         given.
     free : {name: (low, high) or Free}; the case's own where None.
-    objective : {measure: weight}, or a function of one's own, (measures) or (measures, trajectory)
+    objective : {measure: weight}, or a custom function, (measures) or (measures, trajectory)
         -> number, alone or in the place of a measure (`Objective` gives it a name and a unit);
         where None the case's own (of a preset, the default cost, unless nominal).
     limits : {measure: value}, {} for none, the case's own where None. A list of such and of

@@ -19,6 +19,7 @@ from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.xla import jit
+from tuning.live import shown
 from tuning.problem.problem import Problem
 from tuning.search import diagnostics
 from tuning.search.judged import judge
@@ -322,6 +323,13 @@ def test_the_json_has_the_keys_of_the_contract(result):
     )  # 6 x 0.1 % of the rim
     row = found["constraints"][0]
     assert row["margin"] >= 0 and row["scenario"] == "the worst of 24 plants"
+
+
+def test_the_page_of_an_answer_judges_the_limits_that_the_filter_keeps(result, monkeypatch):
+    """The search itself has none of them: they are proved."""
+    monkeypatch.setattr(shown, "page", lambda case, *_: str(dict(case.limits)))
+    assert not result.problem.limits
+    assert result.explore().text == "{'max_level': 2.7}"
 
 
 def test_the_answer_fits_a_terminal(result):
