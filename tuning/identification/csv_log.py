@@ -20,24 +20,27 @@ from tuning.identification.experiment import Log, check_hold, log
 LARGEST = 512 * 1024 * 1024  # bytes
 MOST_ROWS = 20_000_000
 LONGEST_CELL = 200  # characters
+MISSING = {"", "nan", "na", "null", "-"}
 KNOWN = {unit for table in (TIMES, *LEVELS, *INPUTS) for unit in table}
-NAMES = {
-    "time": ("t", "time", "zeit"),
-    "pump": ("pump", "u", "voltage", "input"),
-    "level": ("h", "level", "y", "tank", "x"),
+WORDS = {
+    **dict.fromkeys(("t", "time", "zeit"), "t"),
+    **dict.fromkeys(("pump", "u", "voltage", "input"), "pump"),
+    **dict.fromkeys(("h", "level", "y", "tank", "x"), "h"),
 }
+"""What a column's header may call time, a pump's input and a level."""
+KINDS = {"t": "time", "pump": "pump", "h": "level"}
 
 
 class _Column(NamedTuple):
     """A column of the file: its index, what it holds, and the factor to the rig's unit."""
 
     index: int
-    kind: str  # "time", "pump" or "level"
+    kind: str  # "t", "pump" or "h"
     number: int  # of the pump or the tank, counted from 0
     header: str
     unit: str
     factor: float
-    in_volts: bool = False  # a level as the sensor's voltage
+    in_volts: bool  # a level as the sensor's voltage
 
 
 def read_log(
@@ -96,21 +99,28 @@ def read_log(
         raise InputError(f"--decimal {decimal!r}: must be '.' or ','")
     text, name = _text(path), printable(path.name)
     rows = _rows(text, name)
-    first, header = next(rows, (0, None))
-    if header is None:
+    line, header = next(rows, (0, ()))
+    if not header:
         raise DataError(f"{name}: is empty: a header line and samples are needed")
     header = [cell.strip() for cell in header]
-    used = _columns(header, f"{name}, line {first}", loop, columns or {})
-    table, lines = _table(rows, header, used, decimal, name)
+    used = _columns(header, f"{name}, line {line}", loop, columns or {})
+    table, lines = [], []
+    for line, cells in rows:
+        table.append(_numbers(cells, header, used, decimal, f"{name}, line {line}"))
+        lines.append(line)
+        if len(table) > MOST_ROWS:
+            raise DataError(f"{name}: more than {MOST_ROWS} samples")
+    if not table:
+        raise DataError(f"{name}: has a header, but no samples")
     data = np.array(table) * [c.factor for c in used]
-    inputs = [i for i, c in enumerate(used) if c.kind == "pump"]
-    levels = [i for i, c in enumerate(used) if c.kind == "level"]
+    kinds = np.array([c.kind for c in used])
+    levels = [c for c in used if c.kind == "h"]
     return log(
         t=data[:, 0],
-        u=data[:, inputs],
-        y=data[:, levels],
-        tanks=[used[i].number for i in levels],
-        in_volts=[used[i].in_volts for i in levels],
+        u=data[:, kinds == "pump"],
+        y=data[:, kinds == "h"],
+        tanks=[c.number for c in levels],
+        in_volts=[c.in_volts for c in levels],
         name=name,
         lines=lines,
         headers=tuple(c.header for c in used),
@@ -124,13 +134,11 @@ def _text(path):
     try:
         if why := refusal(path, LARGEST):
             raise DataError(f"file {str(path)!r} {why}")
-        data = path.read_bytes()
+        text = path.read_bytes().decode("utf-8-sig")
     except FileNotFoundError:
         raise DataError(f"file {str(path)!r} does not exist") from None
     except OSError as error:  # a name that is too long for the disk, too
         raise DataError(f"file {str(path)!r} cannot be read: {error.strerror}") from None
-    try:
-        text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise DataError(f"file {path.name!r} is not UTF-8 text (byte {error.start})") from None
     if "\0" in text:
@@ -140,92 +148,69 @@ def _text(path):
 
 def _rows(text, name):
     """Yield (line number, cells) of every line that is not empty and not a comment."""
-    first = next(
-        (line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")),
-        "",
-    )
+    lines = (line for line in text.splitlines() if not line.lstrip().startswith(("#", "\n")))
+    first = next(filter(str.strip, lines), "")
     delimiter = max((";", "\t", ","), key=lambda d: (first.count(d), d == ","))
-    reader = csv.reader(io.StringIO(text), delimiter=delimiter)
+    reader, end = csv.reader(io.StringIO(text), delimiter=delimiter), 0
     try:
-        end = 0
         for cells in reader:
             start, end = end + 1, reader.line_num
             if end > start:
                 raise DataError(
                     f"{name}, line {start}: a quotation mark opens and does not close on that line"
                 )
-            if cells and any(c.strip() for c in cells) and not cells[0].lstrip().startswith("#"):
-                yield reader.line_num, cells
+            if any(c.strip() for c in cells) and not cells[0].lstrip().startswith("#"):
+                yield end, cells
     except csv.Error as error:
         raise DataError(f"{name}, line {reader.line_num}: {error}") from None
 
 
-def _table(rows, header, used, decimal, name):
-    """Return (numbers of the used columns, line of each sample)."""
-    table, lines = [], []
-    for line, cells in rows:
-        # a separator at the end of the line
-        while len(cells) > len(header) and not cells[-1].strip():
-            cells.pop()
-        if len(cells) != len(header):
-            hint = (
-                ": a comma within a number? Cells need another separator then, as ';' with"
-                " --decimal ,"
-                if len(cells) > len(header)
-                else ""
-            )
-            raise DataError(
-                f"{name}, line {line}: {len(cells)} cells under {len(header)} column names{hint}"
-            )
-        if len(table) >= MOST_ROWS:
-            raise DataError(f"{name}: more than {MOST_ROWS} samples")
-        table.append([_number(cells[c.index], decimal, name, line, c) for c in used])
-        lines.append(line)
-    if not table:
-        raise DataError(f"{name}: has a header, but no samples")
-    return table, lines
-
-
-def _number(cell, decimal, name, line, column):
-    """Return the number in a cell, NaN for a missing reading."""
-    text = cell.strip()
-    where = f"{name}, line {line}, column {column.header!r}"
-    if len(text) > LONGEST_CELL:
-        raise DataError(f"{where}: a cell of {len(text)} characters is no number")
-    if text.lower() in ("", "nan", "na", "null", "-"):
-        if column.kind == "level":
-            return math.nan
+def _numbers(cells, header, used, decimal, where):
+    """Return the numbers of the used columns of a row."""
+    while len(cells) > len(header) and not cells[-1].strip():  # a separator at the end of the line
+        cells.pop()
+    if len(cells) != len(header):
+        comma = ": a comma within a number? Cells need another separator then, as ';' with"
         raise DataError(
-            f"{where}: is empty: every sample needs its time and the input of every pump"
+            f"{where}: {len(cells)} cells under {len(header)} column names"
+            + (f"{comma} --decimal ," if len(cells) > len(header) else "")
         )
+    numbers = []
+    for column in used:
+        try:
+            numbers.append(_number(cells[column.index].strip(), decimal, column.kind))
+        except ValueError as error:
+            raise DataError(f"{where}, column {column.header!r}: {error}") from None
+    return numbers
+
+
+def _number(text, decimal, kind):
+    """Return the number in a cell, NaN for a missing reading."""
+    if len(text) > LONGEST_CELL:
+        raise ValueError(f"a cell of {len(text)} characters is no number")
+    if text.lower() in MISSING:
+        if kind == "h":
+            return math.nan
+        raise ValueError("is empty: every sample needs its time and the input of every pump")
     if decimal == "," and "." in text:
-        raise DataError(f"{where}: {text!r} has a point, where the decimal sign is a comma")
+        raise ValueError(f"{text!r} has a point, where the decimal sign is a comma")
     try:
         if "_" in text or not text.isascii():
-            raise ValueError(text)
+            raise ValueError
         value = float(text.replace(",", ".") if decimal == "," else text)
     except ValueError:
-        hint = (
-            ": a decimal comma? read it with --decimal ,"
-            if decimal == "." and re.fullmatch(r"[-+]?\d+,\d+([eE][-+]?\d+)?", text)
-            else ""
-        )
-        raise DataError(f"{where}: {text!r} is not a number{hint}") from None
+        comma = decimal == "." and re.fullmatch(r"[-+]?\d+,\d+([eE][-+]?\d+)?", text)
+        hint = ": a decimal comma? read it with --decimal ," if comma else ""
+        raise ValueError(f"{text!r} is not a number{hint}") from None
     if not math.isfinite(value):
-        raise DataError(f"{where}: {text!r} is not finite; leave a missing reading empty")
+        raise ValueError(f"{text!r} is not finite; leave a missing reading empty")
     return value
-
-
-def _is_number(cell):
-    """Return whether a cell of the header is a number."""
-    return re.fullmatch(r"[-+]?[\d.,]+([eE][-+]?\d+)?", cell) is not None
 
 
 def split_header(header):
     """Return (name, unit or None) of a column's header: "h1 [cm]", "h1 (cm)", "pump1_V", "h1"."""
-    found = re.fullmatch(r"(.*?)\s*[\[(]\s*(.*?)\s*[\])]", header)
-    if found:
-        return found.group(1).strip(), found.group(2)
+    if brackets := re.fullmatch(r"(.*?)\s*[\[(]\s*(.*?)\s*[\])]", header):
+        return brackets[1].strip(), brackets[2]
     stem, line, tail = header.rpartition("_")
     if line and canonical(tail) in KNOWN and not tail.isdigit():
         return stem.strip(), tail
@@ -235,36 +220,38 @@ def split_header(header):
 def _columns(header, where, loop, named):
     """Return the columns in use: time, then pumps, then levels."""
     plant, (length, drive) = loop.plant, loop.units
-    if all(_is_number(cell) for cell in header):
+    if all(re.fullmatch(r"[-+]?[\d.,]+([eE][-+]?\d+)?", cell) for cell in header):
         raise DataError(
             f"{where}: has numbers where the columns' names should be: begin with a header, as"
             f" 't [s],pump1 [{drive}],h1 [{length}]'"
         )
-    slots = {"t": ("time", 0), **{f"pump{j + 1}": ("pump", j) for j in range(plant.pumps)}}
-    slots |= {f"h{i + 1}": ("level", i) for i in range(plant.tanks)}
+    slots = {"t": ("t", 0), **{f"pump{j + 1}": ("pump", j) for j in range(plant.pumps)}}
+    slots |= {f"h{i + 1}": ("h", i) for i in range(plant.tanks)}
     taken = _named_columns(header, where, slots, named)
-    taken |= _recognised_columns(header, where, plant, taken, named)
-    found = []
+    taken |= _recognised_columns(header, where, slots, taken, named)
+    columns, names = [], ", ".join(map(repr, header[:20]))
+    names += f" and {len(header) - 20} more" if len(header) > 20 else ""
     for slot, (kind, number) in slots.items():
-        if slot in taken:
-            index, unit = taken[slot]
-            if header.count(header[index]) > 1:
-                raise DataError(f"{where}: two columns are called {header[index]!r}")
-            place = f"{where}, column {header[index]!r}"
-            factor, in_volts = _factor(kind, unit, length, drive, place)
-            found.append(_Column(index, kind, number, header[index], unit, factor, in_volts))
-        elif kind != "level":
-            raise DataError(
-                f"{where}: no column for {slot}"
-                f" ({'time' if kind == 'time' else f'pump {number + 1}'}) among"
-                f" {_listed(header)}; name it with --column {slot}=HEADER"
-            )
-    if not any(c.kind == "level" for c in found):
-        raise DataError(
-            f"{where}: no column for a level among {_listed(header)}; name it with"
-            " --column h1=HEADER"
+        if slot not in taken:
+            if kind != "h":
+                what = "time" if kind == "t" else f"pump {number + 1}"
+                raise DataError(
+                    f"{where}: no column for {slot} ({what}) among {names}; name it with --column"
+                    f" {slot}=HEADER"
+                )
+            continue
+        index, unit = taken[slot]
+        if header.count(header[index]) > 1:
+            raise DataError(f"{where}: two columns are called {header[index]!r}")
+        factor, in_volts = _factor(
+            kind, slot, unit, loop.units, f"{where}, column {header[index]!r}"
         )
-    return found
+        columns.append(_Column(index, kind, number, header[index], unit, factor, in_volts))
+    if columns[-1].kind != "h":
+        raise DataError(
+            f"{where}: no column for a level among {names}; name it with --column h1=HEADER"
+        )
+    return columns
 
 
 def _named_columns(header, where, slots, named):
@@ -273,78 +260,71 @@ def _named_columns(header, where, slots, named):
     for slot, spec in named.items():
         if slot not in slots:
             raise InputError(f"unknown column {slot!r}{nearest(slot, slots)}")
-        wanted, unit = (spec, None) if isinstance(spec, str) else spec
-        if wanted.strip() == "none" and wanted not in header:
-            if slots[slot][0] != "level":
+        name, unit = (spec, None) if isinstance(spec, str) else spec
+        if name.strip() == "none" and name not in header:
+            if slots[slot][0] != "h":
                 raise InputError(f"column {slot} = none: only a level may be left out, as h1=none")
             continue
-        if wanted not in header:
+        if name not in header:
             raise DataError(
-                f"{where}: there is no column {wanted!r} for {slot}{nearest(wanted, header)}"
+                f"{where}: there is no column {name!r} for {slot}{nearest(name, header)}"
             )
-        index = header.index(wanted)
+        index = header.index(name)
         if other := next((known for known, (column, _) in taken.items() if column == index), None):
             raise DataError(
-                f"{where}: column {wanted!r} is given for {other} and for {slot}: name one column"
+                f"{where}: column {name!r} is given for {other} and for {slot}: name one column"
                 " for each"
             )
-        taken[slot] = (index, unit or split_header(wanted)[1])
+        taken[slot] = (index, unit or split_header(name)[1])
     return taken
 
 
-def _recognised_columns(header, where, plant, taken, named):
+def _recognised_columns(header, where, slots, taken, named):
     """Return {slot: (index, unit)} of the other columns whose headers name a slot themselves."""
-    used, found = {index for index, _ in taken.values()}, {}
+    used, columns = {index for index, _ in taken.values()}, {}
     for index, cell in enumerate(header):
         stem, unit = split_header(cell)
-        slot = _slot(stem, plant)
+        slot = _slot(stem, slots)
         if index in used or slot is None or slot in named:
             continue
-        if slot in found:
+        if slot in columns:
             raise DataError(
-                f"{where}: columns {header[found[slot][0]]!r} and {cell!r} both look like {slot};"
+                f"{where}: columns {header[columns[slot][0]]!r} and {cell!r} both look like {slot};"
                 " name one with --column"
             )
-        found[slot] = (index, unit)
-    return found
+        columns[slot] = (index, unit)
+    return columns
 
 
-def _listed(header, most=20):
-    """Return the names of the columns, the first of them where there are many."""
-    more = f" and {len(header) - most} more" if len(header) > most else ""
-    return ", ".join(map(repr, header[:most])) + more
-
-
-def _slot(stem, plant):
+def _slot(stem, slots):
     """Return the slot ("t", "pump1", "h2") that a column's name means, or None."""
     # no rig has a tank of seven digits
     word = re.fullmatch(r"([a-z]+)[ _]?(\d{0,6})", stem.strip().lower())
-    kind = word and next((k for k, names in NAMES.items() if word.group(1) in names), None)
-    if not word or kind is None:
+    kind = word and WORDS.get(word[1])
+    if not kind:
         return None
-    if kind == "time":
-        return None if word.group(2) else "t"
-    count = plant.pumps if kind == "pump" else plant.tanks
-    number = int(word.group(2)) if word.group(2) else 1 if count == 1 else 0
-    return f"{'pump' if kind == 'pump' else 'h'}{number}" if 1 <= number <= count else None
+    number = word[2] and str(int(word[2]))
+    alone = kind != "t" and not number and f"{kind}2" not in slots  # "level" of a single tank
+    slot = f"{kind}1" if alone else f"{kind}{number}"
+    return slot if slot in slots else None
 
 
-def _factor(kind, unit, length, drive, where):
+def _factor(kind, slot, unit, units, where):
     """Return (factor of a cell to the rig's unit, whether it is the sensor's voltage)."""
-    base = {"time": "s", "pump": drive, "level": length}[kind]
+    length, drive = units
+    base = {"t": "s", "pump": drive, "h": length}[kind]
     if unit is None:
-        slot = {"time": "t", "pump": "pump1", "level": "h1"}[kind]
         raise DataError(
             f"{where}: has no unit: write it in the header, as '{slot} [{base}]', or with --column"
         )
-    written, unit, base = unit, canonical(unit), canonical(base)
-    if kind == "level" and unit in VOLTS and length not in VOLTS:
-        return VOLTS[unit], True
-    choices = {"time": (TIMES,), "pump": INPUTS, "level": LEVELS}[kind]
+    name, base = canonical(unit), canonical(base)
+    if kind == "h" and name in VOLTS and length not in VOLTS:
+        return VOLTS[name], True
+    choices = {"t": (TIMES,), "pump": INPUTS, "h": LEVELS}[kind]
     table = next((t for t in choices if base in t), {base: 1.0})
-    if unit not in table:
+    if name not in table:
         raise DataError(
-            f"{where}: unit {written!r} cannot be that of a {kind}: must be one of"
+            f"{where}: unit {unit!r} cannot be that of a {KINDS[kind]}: must be one of"
             f" {', '.join(table)}"
         )
-    return table[unit] / table[base], False
+    return table[name] / table[base], False

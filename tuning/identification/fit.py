@@ -1,5 +1,5 @@
-"""`identify`: output-error estimation of plant parameters, by Gauss-Newton with exact sensitivities
-from several starts. Imported as `tuning.identify` and by the command `identify`.
+"""`tuning.identify`: output-error estimation of plant parameters, by Gauss-Newton with exact
+sensitivities from several starts.
 """
 
 import time
@@ -14,15 +14,14 @@ from scipy.stats import chi2
 from jaxtank.case import Case
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.plants.base import Plant
-from tuning.identification import experiment
 from tuning.identification.confidence import Spread, at_search_bounds
+from tuning.identification.data_checks import checked, first_samples
 from tuning.identification.design import remedies
-from tuning.identification.experiment import check_data, check_float64, check_length, first_samples
+from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare, check_kind
-from tuning.identification.least_squares import Fit, solve
-from tuning.identification.least_squares import profile_likelihood as _profile
+from tuning.identification.least_squares import Fit, profile_likelihood, solve
 from tuning.identification.problem import Estimation
-from tuning.identification.residuals import quality, validate
+from tuning.identification.residuals import quality, residuals_of, validate
 from tuning.identification.result import Identification
 from tuning.problem.status import Status
 from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
@@ -35,7 +34,7 @@ AGREE = 1.001
 
 def identify(
     case: Case | Plant,
-    log: experiment.Log | Sequence[experiment.Log],
+    log: Log | Sequence[Log],
     free: Mapping[str, Any] | None = None,
     *,
     start: str = "free",
@@ -126,16 +125,22 @@ def identify(
     (<Status.CONVERGED: 'converged'>, ['plant.pump_gain[0]'])
     """
     began = time.perf_counter()
-    check_float64()
-    _check_options(loss, starts=starts, iterations=iterations)
+    if loss not in LOSSES:
+        raise InputError(f"loss = {loss!r}: must be one of {', '.join(LOSSES)}")
+    for name, count in (("starts", starts), ("iterations", iterations)):
+        if not isinstance(count, int) or isinstance(count, bool) or count < 1:
+            raise InputError(f"{name} = {count!r}: must be a whole number above 0")
     case = bare(case) if isinstance(case, Plant) else case
     check_kind(law, case)
-    logs = [log] if isinstance(log, experiment.Log) else list(log)
-    check_data(logs, case.loop, gap)
-    kept = [first_samples(one, hold_back) for one in logs]
-    options = {"free": free, "start": start, "noise": noise, "substeps": substeps}
-    partial, options = _first_problem(case, logs, kept, options)
-    check_length(logs)
+    logs = checked(log, case.loop, gap)
+    counts = [first_samples(log, hold_back) for log in logs]
+    options: dict[str, Any] = {"start": start, "noise": noise, "substeps": substeps}
+    options |= {"free": free, "samples": max(log.samples for log in logs)}
+    parts = [log.part(0, count) for log, count in zip(logs, counts)]
+    longest, fitted = (max(np.diff(log.t).max() for log in side) for side in (logs, parts))
+    if substeps is None and longest > 1.01 * fitted:  # the validation set needs more
+        options["substeps"] = Estimation(case, logs, **options).substeps
+    partial = Estimation(case, parts, **options)
     settings = {"loss": loss, "iterations": iterations}
     cache = EvaluationCache()
     if checkpoint is not None:
@@ -143,22 +148,54 @@ def identify(
         cache = EvaluationLog(checkpoint, what, resume)
     if ready is not None:
         ready()
-    fits, interrupted = _searches(cache, partial, starts, seed, loss, iterations, progress)
+    fits, interrupted = _searches(cache, partial, starts, seed, settings, progress)
     first = min(fits, key=lambda f: f.cost if np.isfinite(f.cost) else np.inf)
     if not np.isfinite(first.cost):
         raise DataError(f"{logs[0].name}: no search ended with finite readings")
-    estimation, best, validation = _final_fit(partial, first, logs, kept, options, settings)
-    best, spread, fit_quality = _spread(estimation, best, settings)
+    best, validation = solve(partial, partial.unknowns(first), **settings), None
+    estimation = partial
+    if any(count < log.samples for count, log in zip(counts, logs)):
+        options |= {"substeps": partial.substeps, "noise": partial.noise}
+        estimation = Estimation(case, logs, **options)
+        validation = validate(estimation, partial, best, counts)
+        best = solve(estimation, partial.unknowns(best), **settings)
+    estimation, best = _within_ranges(estimation, best, settings)
+    if not np.isfinite(best.cost):
+        raise DataError(
+            f"{logs[0].name}: the fit to the first {counts[0]} samples diverges when simulated over"
+            " all of them"
+        )
+    spread, fit_quality = _spread(estimation, best)
+    if spread.open.any():
+        best = _nearest(estimation, best, spread.scale, settings)
+        spread, fit_quality = _spread(estimation, best)
+    parameters = spread.parameters()
+    status = _status(case, best, parameters, interrupted)
+    unclear = status is Status.NOT_IDENTIFIABLE
     return Identification(
         case=case,
         estimation=estimation,
         fit=best,
-        **_estimates(case, estimation, best, spread, interrupted),
+        status=status,
+        parameters=parameters,
+        levels=spread.levels(),
+        covariance=spread.covariance_of_parameters(),
+        directions=spread.directions(),
+        remedies=remedies(estimation, best, spread) if unclear else [],
         quality=fit_quality
         | {"widened": spread.widened, "noise": [float(v) for v in estimation.noise]},
-        starts=_agreement(fits, first.cost),
+        starts=[
+            {
+                "cost": fit.cost,
+                "evaluations": fit.evaluations,
+                "agrees": bool(fit.cost <= first.cost * AGREE + 1e-12),
+            }
+            for fit in fits
+        ],
         validation=validation,
-        profile=None if interrupted or not profile else _profile(estimation, best, spread, loss),
+        profile=profile_likelihood(estimation, best, spread, loss)
+        if profile and not interrupted
+        else None,
         wall_s=time.perf_counter() - began,
         seed=seed,
         law=law,
@@ -170,68 +207,22 @@ def _what(case, logs, partial, **options):
     return fingerprint(
         case,
         command="identify",
-        logs=digest(*(v for one in logs for v in (one.t, one.u, one.y))),
-        hold=[one.hold for one in logs],
+        logs=digest(*(v for log in logs for v in (log.t, log.u, log.y))),
+        hold=[log.hold for log in logs],
         free=partial.bounds,
-        held_back=[one.samples for one in partial.logs],
+        held_back=[log.samples for log in partial.logs],
         noise=partial.noise,
         substeps=partial.substeps,
         **options,
     )
 
 
-def _estimates(case, estimation, best, spread, interrupted):
-    """Return status, estimates with intervals, and what is not identifiable."""
-    parameters = spread.parameters()
-    status = _status(case, best, parameters, interrupted)
-    unclear = status is Status.NOT_IDENTIFIABLE
-    return {
-        "status": status,
-        "parameters": parameters,
-        "levels": spread.levels(),
-        "covariance": spread.covariance_of_parameters(),
-        "directions": spread.directions(),
-        "remedies": remedies(estimation, best, spread) if unclear else [],
-    }
-
-
-def _agreement(fits, least):
-    """Return {"cost", "evaluations", "agrees"} of each search; least: the lowest cost."""
-    return [
-        {
-            "cost": f.cost,
-            "evaluations": f.evaluations,
-            "agrees": bool(f.cost <= least * AGREE + 1e-12),
-        }
-        for f in fits
-    ]
-
-
-def _check_options(loss, **counts):
-    """Raise InputError for an unknown loss, or for a count below 1."""
-    if loss not in LOSSES:
-        raise InputError(f"loss = {loss!r}: must be one of {', '.join(LOSSES)}")
-    for name, count in counts.items():
-        if not isinstance(count, int) or isinstance(count, bool) or count < 1:
-            raise InputError(f"{name} = {count!r}: must be a whole number above 0")
-
-
-def _first_problem(case, logs, kept, options):
-    """Return the Estimation of the first `kept` samples of each log, and all its options."""
-    options = options | {"samples": max(one.samples for one in logs)}
-    begin = [one.part(0, n) for one, n in zip(logs, kept)]
-    longest, first = (max(np.diff(one.t).max() for one in side) for side in (logs, begin))
-    if options["substeps"] is None and longest > 1.01 * first:  # the validation set needs more
-        options["substeps"] = Estimation(case, logs, **options).substeps
-    return Estimation(case, begin, **options), options
-
-
-def _searches(cache, estimation, starts, seed, loss, iterations, progress):
+def _searches(cache, estimation, starts, seed, settings, progress):
     """Return (Fits of the searches that ended, whether they were interrupted)."""
     fits = []
     try:
         for z in estimation.starts(starts, seed):
-            fits.append(_search(cache, estimation, z, loss, iterations))
+            fits.append(_search(cache, estimation, z, settings))
             if progress is not None:
                 progress(fits[-1])
     except KeyboardInterrupt:
@@ -241,73 +232,51 @@ def _searches(cache, estimation, starts, seed, loss, iterations, progress):
     return fits, False
 
 
-def _search(cache, estimation, z, loss, iterations):
-    """Return the Fit of a first search from z."""
-    # One from the checkpoint has where it ended, not its residual and Jacobian.
-    made = []
+def _search(cache, estimation, z, settings):
+    """Return the Fit of a first search from z; of one from the checkpoint where it ended, without
+    its residual and Jacobian.
+    """
+    new = []
 
     def compute():
-        one = solve(estimation, z, loss, iterations, tolerance=1e-8)
-        made.append(one)
-        return one.p, one.levels, one.cost, float(one.evaluations), float(one.status)
+        new.append(fit := solve(estimation, z, tolerance=1e-8, **settings))
+        return fit.p, fit.levels, fit.cost, float(fit.evaluations), float(fit.status)
 
     p, levels, cost, evaluations, status = cache.recall("search", [z], compute)
-    if made:
-        return made[0]
-    none = np.zeros((0, estimation.size))
+    if new:
+        return new[0]
     return Fit(
         p=p,
         levels=levels,
         cost=cost,
-        residual=none[:, 0],
-        jacobian=none,
+        residual=np.zeros(0),
+        jacobian=np.zeros((0, estimation.size)),
         evaluations=int(evaluations),
         status=int(status),
-        loss=loss,
+        loss=settings["loss"],
     )
 
 
-def _final_fit(partial, first, logs, kept, options, settings):
-    """Return (Estimation, Fit, validation) to all samples, from the best of the first searches."""
-    best = solve(partial, partial.unknowns(first), **settings)
-    estimation, validation = partial, None
-    if any(n < one.samples for n, one in zip(kept, logs)):
-        same = {"substeps": partial.substeps, "noise": partial.noise}
-        estimation = Estimation(partial.case, logs, **(options | same))
-        validation = validate(estimation, partial, best, kept)
-        best = solve(estimation, partial.unknowns(best), **settings)
+def _within_ranges(estimation, fit, settings):
+    """Return (Estimation, Fit) with every value in its range."""
     # branch gains may leave the ranges of gain and split: the same search in these themselves
-    if not _within(estimation, best):
-        plain = estimation.without_branch_gains()
-        p = plain.coordinates.point(estimation.coordinates.values(best.p))
-        begin = np.concatenate([p, best.levels.ravel() / plain.level_scale])
-        estimation, best = plain, solve(plain, np.clip(begin, *plain.box), **settings)
-    if not np.isfinite(best.cost):
-        raise DataError(
-            f"{logs[0].name}: the fit to the first {kept[0]} samples diverges when simulated over"
-            " all of them"
-        )
-    return estimation, best, validation
-
-
-def _within(estimation, fit):
-    """Return whether every value lies in its range."""
     values = estimation.coordinates.values(fit.p)
-    return all(
+    if all(
         b.low - 1e-9 * abs(b.high) <= values[b.name] <= b.high + 1e-9 * abs(b.high)
         for b in estimation.bounds
+    ):
+        return estimation, fit
+    plain = estimation.without_branch_gains()
+    start = np.concatenate(
+        [plain.coordinates.point(values), fit.levels.ravel() / plain.level_scale]
     )
+    return plain, solve(plain, np.clip(start, *plain.box), **settings)
 
 
-def _spread(estimation, best, settings):
-    """Return (Fit, Spread, quality): where something is not identifiable, of a fit near nominal."""
-    found = quality(estimation, best)
-    spread = Spread(estimation, best, found)
-    if spread.open.any():
-        best = _nearest(estimation, best, spread.scale, settings)
-        found = quality(estimation, best)
-        spread = Spread(estimation, best, found)
-    return best, spread, found
+def _spread(estimation, fit):
+    """Return (Spread, quality) of a Fit."""
+    fit_quality = quality(estimation.data.y, residuals_of(estimation, fit))
+    return Spread(estimation, fit, fit_quality["residual_autocorrelation"]), fit_quality
 
 
 def _nearest(estimation, best, scale, settings):

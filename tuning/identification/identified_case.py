@@ -61,8 +61,7 @@ def proposed(result):
     case = identified_plant(result)
     if result.law is None:
         return case, None
-    logs = result.estimation.logs
-    inputs = np.concatenate([one.u for one in logs]).mean(axis=0)
+    inputs = np.concatenate([log.u for log in result.estimation.logs]).mean(axis=0)
     try:
         return with_pi(case, inputs), None
     except InputError as error:
@@ -71,29 +70,25 @@ def proposed(result):
 
 def identified_plant(result):
     """Return the Case of an Identification, with the covariance of its estimates."""
-    case = result.case
-    values = {n: p["value"] for n, p in result.parameters.items()}
-    loop = case.loop
-    for name, value in values.items():
-        loop = with_values(loop, {name: value})
+    case, loop = result.case, result.case.loop
+    for name, p in result.parameters.items():
+        loop = with_values(loop, {name: p["value"]})
         for holder in ("controller", "observer"):
             model = getattr(getattr(loop, holder), "model", None)
             inner = f"{holder}.model.{name.removeprefix('plant.')}"
             if name.startswith("plant.") and model is not None and rigs.has(loop, inner):
-                loop = with_values(loop, {inner: value})
+                loop = with_values(loop, {inner: p["value"]})
     noise = np.array(loop.sensor.noise, dtype=float)
     white = result.quality["widened"] <= 1.05
-    for (tank, volts), rmse, sd in zip(
-        result.estimation.data.channels, result.quality["rmse"], result.quality["noise"]
-    ):
+    channels = result.estimation.data.channels
+    for (tank, volts), rmse, sd in zip(channels, result.quality["rmse"], result.quality["noise"]):
         gain = float(loop.sensor.gain[tank]) if volts else 1.0
         noise[tank] = (rmse if white else min(rmse, sd)) * gain
     loop = with_values(loop, {"sensor.noise": noise})
     names, matrix = result.covariance
-    covered = set(names)
     uncertain = {}
     for name, share in case.uncertain.items():
-        uncertain |= rigs.uncovered(loop, name, share, covered)
+        uncertain |= rigs.uncovered(loop, name, share, set(names))
     covariance = (tuple(names), tuple(tuple(map(float, row)) for row in matrix)) if names else None
     return case.replace(
         name=f"{case.name} identified", loop=loop, uncertain=uncertain, covariance=covariance
@@ -103,14 +98,11 @@ def identified_plant(result):
 KINDS = ("pi",)
 STEPS = (1.1, 0.9, 1.05, 0.95)
 """Setpoint of each output after its change, over its steady level [-]: the first that the rig can
-hold is taken.
-"""
-
+hold is taken."""
 LONGEST = 1e8
 """Time by which a rig with constant inputs must have come to its steady state [s]."""
-
 MOST = 100_000
-"""Samples of the proposed run at most."""
+"""Most samples of the proposed run."""
 
 
 def check_kind(kind, case):
@@ -138,56 +130,49 @@ def with_pi(case, inputs):
     # closed loop is stable. A case whose setpoints never change is given a change of each, by 10 %,
     # from that steady state. Raises InputError where there is no such steady state, model or
     # setpoint.
-    loop = case.loop
-    plant = loop.plant
+    loop, outputs = case.loop, list(case.loop.plant.outputs)
     inputs = np.clip(inputs, np.asarray(loop.actuator.low), np.asarray(loop.actuator.high))
     x = _steady(loop, inputs)
-    model = tuple(np.asarray(M) for M in linearise(plant, x, inputs))
+    model = tuple(np.asarray(M) for M in linearise(loop.plant, x, inputs))
     gain, total = _gain_and_time(loop, model, inputs)
     Kc, Ti = _stable(model, 0.5 / gain, 0.5 * total), 0.5 * total
-    moving = not isinstance(loop.reference, Constant) and not (
-        isinstance(loop.reference, Ramps) and not loop.reference.changes
-    )
-    outputs = list(plant.outputs)
-    start = [float(loop.x0[i]) for i in outputs] if moving else x[outputs].tolist()
-    table = {"kind": "pid", "Kc": Kc.tolist(), "Ti": Ti.tolist(), "Tt": Ti.tolist()} | (
-        {} if moving else {"bias": inputs.tolist()}
-    )
+    still = isinstance(loop.reference, Ramps) and not loop.reference.changes
+    still = still or isinstance(loop.reference, Constant)
+    start = x[outputs].tolist() if still else [float(loop.x0[i]) for i in outputs]
+    table = {"kind": "pid", "Kc": Kc.tolist(), "Ti": Ti.tolist(), "Tt": Ti.tolist()}
+    table |= {"bias": inputs.tolist()} if still else {}
     # the identified plant is its model, whatever the file's controller has
-    controller = controller_of(
-        table, dataclasses.replace(loop, controller=OpenLoop(signal=loop.reference))
-    )
-    free = {n: f for n, f in case.free.items() if not n.startswith("controller.")}
-    free |= {"controller.Kc": Free(float(Kc.min() / 30), float(Kc.max() * 30))}
-    free |= {"controller.Ti": Free(float(Ti.min() / 10), float(Ti.max() * 10))}
-    found = case.replace(
+    open_loop = dataclasses.replace(loop, controller=OpenLoop(signal=loop.reference))
+    controller = controller_of(table, open_loop)
+    ours = lambda name: name.startswith("controller.")
+    free = {n: f for n, f in case.free.items() if not ours(n)} | {
+        "controller.Kc": Free(float(Kc.min() / 30), float(Kc.max() * 30)),
+        "controller.Ti": Free(float(Ti.min() / 10), float(Ti.max() * 10)),
+    }
+    case = case.replace(
         loop=dataclasses.replace(loop, controller=controller),
         free=free,
         symmetry=None,
         objective=case.objective or {"rms_error_total": 1.0},
-        scenarios=tuple(
-            s for s in case.scenarios if not any(n.startswith("controller.") for n in s.values)
-        ),
+        scenarios=tuple(s for s in case.scenarios if not any(map(ours, s.values))),
     )
-    return rigs.check(found) if moving else _with_changes(found, x, start, inputs, total.max())
+    return _with_changes(case, x, start, inputs, total.max()) if still else rigs.check(case)
 
 
 def _gain_and_time(loop, model, inputs):
     """Return (K (m,) [cm/V], T (m,) [s]) of each output's response to its own pump."""
     A, B, C = model
-    pumps = loop.plant.pumps
     try:
         once = np.linalg.solve(A, B)
         gain, area = -np.diag(C @ once), np.diag(C @ np.linalg.solve(A, once))
     except np.linalg.LinAlgError:
-        gain = area = np.zeros(pumps)
-    for j, (k, a) in enumerate(zip(gain, area)):
-        if not (k > 0 and a > 0 and math.isfinite(a / k)):
-            at = ", ".join(f"{v:g}" for v in inputs)
-            raise InputError(
-                f"pump {j + 1} does not settle tank {loop.plant.outputs[j] + 1} at inputs ({at})"
-                f" {loop.units[1]}: no PI of its own, use another [controller]"
-            )
+        gain = area = np.zeros(loop.plant.pumps)
+    for j in np.flatnonzero(~((gain > 0) & (area > 0) & np.isfinite(area)))[:1]:
+        at = ", ".join(f"{v:g}" for v in inputs)
+        raise InputError(
+            f"pump {j + 1} does not settle tank {loop.plant.outputs[j] + 1} at inputs ({at})"
+            f" {loop.units[1]}: no PI of its own, use another [controller]"
+        )
     return gain, area / gain + loop.actuator.delay
 
 
@@ -207,9 +192,7 @@ def _stable(model, Kc, Ti):
 
 
 def _with_changes(case, x, start, inputs, slowest):
-    """Return `case` from the steady state x with a change of each setpoint that the rig
-    can hold.
-    """
+    """Return `case` from the steady state x with changes of the setpoints that the rig can hold."""
     loop, outputs = case.loop, range(len(start))
     pause = case.clock.dt * min(math.ceil(5 * slowest / case.clock.dt), MOST // len(start))
     clock = dataclasses.replace(case.clock, duration=pause * len(start))
@@ -218,9 +201,9 @@ def _with_changes(case, x, start, inputs, slowest):
     for share in STEPS:
         reference = ramps(start, [(times[k], k, share * start[k]) for k in outputs], ramp=0.0)
         moved = dataclasses.replace(loop, reference=reference, x0=number(x), actuator=pumps)
-        found = case.replace(loop=moved, clock=clock)
-        if not rigs.unreachable(found):
-            return rigs.check(found.replace(reachable=True))
+        changed = case.replace(loop=moved, clock=clock)
+        if not rigs.unreachable(changed):
+            return rigs.check(changed.replace(reachable=True))
     raise InputError(
         f"no setpoints about {', '.join(f'{v:.4g}' for v in start)} {loop.units[0]} can be held:"
         " add [controller] and [reference]"

@@ -1,6 +1,4 @@
-"""The search of a fit: SciPy's bounded trust region on exact sensitivities, and the profile
-likelihood.
-"""
+"""The search of a fit, by SciPy's bounded trust region, and the profile likelihood."""
 
 import dataclasses
 import math
@@ -40,13 +38,11 @@ class _Residual:
     def __init__(self, estimation, start, fixed, prior):
         self.estimation, self.point, self.last = estimation, start.copy(), None
         self.free = np.array([i for i in range(estimation.size) if i not in fixed])
-        for i, value in fixed.items():
-            self.point[i] = value
-        self.prior, self.weight = None, np.zeros(0)
+        self.point[list(fixed)] = list(fixed.values())
+        self.prior, self.weight = np.zeros(0), np.zeros(0)
         if prior is not None:
-            levels = self.free >= estimation.coordinates.size
             self.prior = prior[0][self.free]
-            self.weight = prior[1] * np.where(levels, 10.0, 1.0)
+            self.weight = prior[1] * np.where(self.free < estimation.coordinates.size, 1.0, 10.0)
 
     def at(self, v):
         """Return (residual, jacobian) of the readings at the free unknowns v."""
@@ -57,15 +53,13 @@ class _Residual:
 
     def value(self, v):
         """Return the residual with the rows of the prior."""
-        residual = self.at(v)[0]
-        if self.prior is None:
-            return residual
-        return np.concatenate([residual, self.weight * (v - self.prior)])
+        rows = self.weight * (v - self.prior) if self.prior.size else self.prior
+        return np.concatenate([self.at(v)[0], rows])
 
     def slope(self, v):
         """Return the Jacobian by the free unknowns with the rows of the prior."""
-        inner = self.at(v)[1][:, self.free]
-        return inner if self.prior is None else np.concatenate([inner, np.diag(self.weight)])
+        slopes = self.at(v)[1][:, self.free]
+        return np.concatenate([slopes, np.diag(self.weight)]) if self.prior.size else slopes
 
 
 def solve(
@@ -81,45 +75,37 @@ def solve(
     before, residual = estimation.evaluations, _Residual(estimation, start, fixed or {}, prior)
     low, high = (side[residual.free] for side in estimation.box)
     begin = np.clip(residual.point[residual.free], low, high)
-    if not np.all(np.isfinite(residual.at(begin)[0])):
-        p, levels = estimation.split(residual.point)
-        empty = np.zeros((0, estimation.size))
-        return Fit(
-            p=p.copy(),
-            levels=levels,
-            cost=np.inf,
-            residual=empty[:, 0],
-            jacobian=empty,
-            evaluations=estimation.evaluations - before,
-            status=-1,
-        )
-    # with a wide range scipy's step to the edge of its trust region overflows
-    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-        found = optimize.least_squares(
-            residual.value,
-            begin,
-            cast(Any, residual.slope),
-            bounds=(low - 1e-12, high + 1e-12),
-            x_scale=1.0,
-            loss=loss,
-            f_scale=ROBUST_LIMIT,
-            xtol=min(1e-8, 1e2 * tolerance),
-            ftol=tolerance,
-            gtol=min(1e-8, 1e2 * tolerance),
-            max_nfev=iterations,
-        )
-    end = residual.point
-    end[residual.free] = np.clip(found.x, low, high)
-    rows, jacobian = estimation.residual_and_jacobian(end)
+    cost, status, end = np.inf, -1, residual.point
+    rows, jacobian = np.zeros(0), np.zeros((0, estimation.size))
+    if np.all(np.isfinite(residual.at(begin)[0])):
+        # with a wide range scipy's step to the edge of its trust region overflows
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            solution = optimize.least_squares(
+                residual.value,
+                begin,
+                cast(Any, residual.slope),
+                bounds=(low - 1e-12, high + 1e-12),
+                x_scale=1.0,
+                loss=loss,
+                f_scale=ROBUST_LIMIT,
+                xtol=min(1e-8, 1e2 * tolerance),
+                ftol=tolerance,
+                gtol=min(1e-8, 1e2 * tolerance),
+                max_nfev=iterations,
+            )
+        end[residual.free] = np.clip(solution.x, low, high)
+        rows, jacobian = estimation.residual_and_jacobian(end)
+        cost = float(solution.cost) if prior is None else 0.5 * float(rows @ rows)
+        status = solution.status
     p, levels = estimation.split(end)
     return Fit(
         p=p.copy(),
         levels=levels,
-        cost=float(found.cost) if prior is None else 0.5 * float(rows @ rows),
+        cost=cost,
         residual=rows,
         jacobian=jacobian,
         evaluations=estimation.evaluations - before,
-        status=found.status,
+        status=status,
         loss=loss,
     )
 
@@ -131,33 +117,31 @@ def profile_likelihood(estimation, fit, spread, loss="linear", points=11, reach=
     # "interval95": where it passes 3.84, interpolated, None on a side where it does not}.
     name, sd = spread.worst()
     levels = estimation.unknowns(fit)[estimation.coordinates.size :]
-    values = estimation.coordinates.values(fit.p)
+    at_fit = estimation.coordinates.values(fit.p)
     estimation = estimation.without_branch_gains()
     i = estimation.coordinates.names.index(name)
-    z = np.concatenate([estimation.coordinates.point(values), levels])
+    z = np.concatenate([estimation.coordinates.point(at_fit), levels])
     grid = np.linspace(-reach, reach, points) * (sd if sd else 1 / reach)
     # a bound may truncate it
     grid = np.unique(np.clip(z[i] + grid, estimation.box[0][i], estimation.box[1][i]))
     inflate = max(spread.widened, 1.0) ** 2 * max(spread.scale, 1e-300)
-    points, middle = len(grid), int(np.argmin(np.abs(grid - z[i])))
-    upward, downward = list(range(middle, points)), list(range(middle, -1, -1))
-    rise, values = np.zeros(points), np.zeros(points)
+    middle = int(np.argmin(np.abs(grid - z[i])))
+    upward, downward = list(range(middle, len(grid))), list(range(middle, -1, -1))
+    rise, values = np.zeros(len(grid)), np.zeros(len(grid))
     for side in (upward, downward):
         start = z.copy()
         for j in side:
-            one = solve(estimation, start, loss, fixed={i: grid[j]})
-            start = estimation.unknowns(one)
-            rise[j] = max(2 * (one.cost - fit.cost) / inflate, 0.0)
-            values[j] = float(estimation.coordinates.values(one.p)[name])
-    low, high = (_crossing(values[side], rise[side]) for side in (downward, upward))
-    if low is not None and high is not None and high < low:
-        low, high = high, low
+            near = solve(estimation, start, loss, fixed={i: grid[j]})
+            start = estimation.unknowns(near)
+            rise[j] = max(2 * (near.cost - fit.cost) / inflate, 0.0)
+            values[j] = float(estimation.coordinates.values(near.p)[name])
+    ends = [_crossing(values[side], rise[side]) for side in (downward, upward)]
     return {
         "name": name,
         "unit": next(b.unit for b in estimation.bounds if b.name == name),
         "values": values.tolist(),
         "rise": rise.tolist(),
-        "interval95": [low, high],
+        "interval95": ends if None in ends else sorted(ends),
     }
 
 

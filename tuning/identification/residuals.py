@@ -1,13 +1,8 @@
-"""Noise of the readings and residuals of a fit: quality, autocorrelation, prediction of a
-validation set.
-"""
-
-from typing import Any
+"""Noise of readings and residuals of a fit: quality, autocorrelation, validation."""
 
 import numpy as np
 
 from jaxtank.core.errors import InputError
-from tuning.identification import simulation
 
 ENOUGH = 10
 """Fewest second differences from which the noise of a channel is estimated."""
@@ -29,37 +24,27 @@ def given_noise(noise, channels):
 
 def noise_of(data):
     """Return (channels,) standard deviation of the noise in PaddedData."""
-    # Estimated from second differences, for a level is smooth, by their median absolute deviation,
-    # which steps do not affect. At least a thousandth of the range of the channel: with less,
-    # weights would be those of round-off.
-    found, least = [], []
-    for c in range(len(data.channels)):
-        bends, spans = [], []
-        for y in data.y[..., c]:
-            # consecutive readings only: across a gap a level is not smooth
-            bend = np.abs(np.diff(y, 2)) / np.sqrt(6.0)
-            bends.append(bend[np.isfinite(bend)])
-            present = y[np.isfinite(y)]
-            spans.append(np.ptp(present) if present.size else 0.0)
-        bends = np.concatenate(bends)
-        least.append(max(1e-3 * max(spans), 1e-12))
-        found.append(
-            max(1.4826 * float(np.median(bends)), least[-1]) if bends.size >= ENOUGH else np.nan
-        )
-    for c, (_, volts) in enumerate(data.channels):
+    # From second differences, for a level is smooth, by their median absolute deviation, which
+    # steps do not affect. At least a thousandth of the range of the channel: with less, weights
+    # would be those of round-off.
+    present = np.isfinite(data.y)
+    top = np.max(data.y, axis=1, where=present, initial=-np.inf)
+    span = top - np.min(data.y, axis=1, where=present, initial=np.inf)
+    least = np.maximum(1e-3 * span.max(axis=0), 1e-12)
+    noise = np.full(least.shape, np.nan)
+    for c in range(len(least)):
+        # of consecutive readings only: across a gap a level is not smooth
+        bends = np.abs(np.diff(data.y[..., c], 2, axis=1)) / np.sqrt(6.0)
+        bends = bends[np.isfinite(bends)]
+        if bends.size >= ENOUGH:
+            noise[c] = max(1.4826 * np.median(bends), least[c])
+    volts = np.array([in_volts for _, in_volts in data.channels])
+    for c in np.flatnonzero(np.isnan(noise)):
         # too few readings: the noise of other channels of this kind, or a hundredth of the range
-        if np.isnan(found[c]):
-            alike = [
-                v
-                for v, (_, other) in zip(found, data.channels)
-                if other == volts and np.isfinite(v)
-            ]
-            found[c] = (
-                max([*alike, least[c]])
-                if alike
-                else max(10 * least[c], 1e-3 * np.nanmax(np.abs(data.y[..., c])))
-            )
-    return np.array(found)
+        alike = noise[(volts == volts[c]) & np.isfinite(noise)]
+        largest = np.nanmax(np.abs(data.y[..., c]))
+        noise[c] = max([*alike, least[c]] if alike.size else [10 * least[c], 1e-3 * largest])
+    return noise
 
 
 def residuals_of(estimation, fit):
@@ -68,27 +53,33 @@ def residuals_of(estimation, fit):
     return np.where(estimation.mask, estimation.data.y - y, np.nan)
 
 
-def quality(estimation, fit):
-    """Return {"rmse", "nrmse_percent", "residual_autocorrelation"}, one entry per channel."""
-    residuals = residuals_of(estimation, fit)
-    found = {"rmse": [], "nrmse_percent": [], "residual_autocorrelation": []}
-    for c in range(residuals.shape[-1]):
-        r = residuals[..., c]
-        y = np.where(estimation.mask[..., c], estimation.data.y[..., c], np.nan)
-        found["rmse"].append(float(np.sqrt(np.nanmean(r**2))))
-        found["nrmse_percent"].append(percent(r, y))
-        found["residual_autocorrelation"].append(float(autocorrelation(r, 1)[1]))
-    return found
+def quality(y, residual):
+    """Return {"rmse", "nrmse_percent", "residual_autocorrelation"} of each channel."""
+    return fit_of(y, residual) | {
+        "residual_autocorrelation": [
+            float(autocorrelation(r, 1)[1]) for r in np.moveaxis(residual, -1, 0)
+        ]
+    }
 
 
-def percent(residual, y):
+def fit_of(y, residual):
+    """Return {"rmse", "nrmse_percent"} of each channel, None where it has no residual."""
+    fit = {"rmse": [], "nrmse_percent": []}
+    for values, r in zip(np.moveaxis(y, -1, 0), np.moveaxis(residual, -1, 0)):
+        present = np.isfinite(r).any()
+        fit["rmse"].append(float(np.sqrt(np.nanmean(r**2))) if present else None)
+        fit["nrmse_percent"].append(_percent(np.where(np.isnan(r), np.nan, values), r))
+    return fit
+
+
+def _percent(y, residual):
     """Return 100 (1 - |residual| / |y - mean y|), as MATLAB's `compare`; None for a constant y."""
+    if not np.isfinite(y).any():
+        return None
     spread = np.sqrt(np.nansum((y - np.nanmean(y)) ** 2))
-    return (
-        float(100 * (1 - np.sqrt(np.nansum(residual**2)) / spread))
-        if spread > 1e-9 * np.sqrt(np.nansum(y**2))
-        else None
-    )
+    if spread <= 1e-9 * np.sqrt(np.nansum(y**2)):
+        return None
+    return float(100 * (1 - np.sqrt(np.nansum(residual**2)) / spread))
 
 
 def autocorrelation(residual, lags=LAGS):
@@ -100,18 +91,16 @@ def autocorrelation(residual, lags=LAGS):
     )
     total = products[0] / max(pairs[0], 1.0)
     usable = (np.round(pairs) > 0) & (total > 0)
-    found = np.where(usable, products / np.maximum(np.round(pairs), 1.0) / (total or 1.0), 0.0)
-    found[0] = 1.0
-    return found
+    result = np.where(usable, products / np.maximum(np.round(pairs), 1.0) / (total or 1.0), 0.0)
+    result[0] = 1.0
+    return result
 
 
 def _lagged(v, lags):
     """Return (lags + 1,) sums of v_k v_{k + lag} over v (logs, samples), by FFT."""
     n = v.shape[-1]
-    spectrum = np.fft.rfft(v, 2 * n, axis=-1)
-    return np.fft.irfft(np.sum(np.abs(spectrum) ** 2, axis=tuple(range(v.ndim - 1))), 2 * n)[
-        : lags + 1
-    ]
+    power = np.sum(np.abs(np.fft.rfft(v, 2 * n, axis=-1)) ** 2, axis=tuple(range(v.ndim - 1)))
+    return np.fft.irfft(power, 2 * n)[: lags + 1]
 
 
 def pseudo(fit):
@@ -128,28 +117,16 @@ def pseudo(fit):
     return r
 
 
-def validate(estimation, partial, fit, kept):
-    """Return how a fit to the first `kept` samples of each log predicts the rest."""
-    z = partial.unknowns(fit)
-    predicted = np.asarray(
-        simulation.play(
-            partial.rig_at(z),
-            estimation.data.dt,
-            estimation.data.u,
-            partial.first_levels(z),
-            channels=estimation.data.channels,
-            substeps=partial.substeps,
-        )
+def validate(estimation, partial, fit, counts):
+    """Return how a fit of `partial` to the first samples of each log predicts the rest."""
+    residual = np.where(
+        estimation.mask,
+        estimation.data.y - partial.predicted(partial.unknowns(fit), estimation.data),
+        np.nan,
     )
-    y = np.where(estimation.mask, estimation.data.y, np.nan)
-    residual, sample = y - predicted, np.arange(y.shape[1])
-    fitted = sample < np.array(kept)[:, None]  # (logs, samples)
-    found: dict[str, Any] = {"samples": [int(n) for n in kept]}
-    for side, rows in (("fitted", fitted), ("held_back", ~fitted)):
-        found[side] = {"rmse": [], "nrmse_percent": []}
-        for c in range(y.shape[-1]):
-            r, measured = (np.where(rows, v[..., c], np.nan) for v in (residual, y))
-            present = np.isfinite(r).any()
-            found[side]["rmse"].append(float(np.sqrt(np.nanmean(r**2))) if present else None)
-            found[side]["nrmse_percent"].append(percent(r, measured) if present else None)
-    return found
+    first = (np.arange(residual.shape[1]) < np.array(counts)[:, None])[..., None]
+    return {
+        "samples": [int(n) for n in counts],
+        "fitted": fit_of(estimation.data.y, np.where(first, residual, np.nan)),
+        "held_back": fit_of(estimation.data.y, np.where(first, np.nan, residual)),
+    }

@@ -23,8 +23,8 @@ class Experiments(dict[str, dict[str, Any]]):
 
     case: Case
 
-    def __init__(self, case: Case, found: dict[str, dict[str, Any]]):
-        super().__init__(found)
+    def __init__(self, case: Case, experiments: dict[str, dict[str, Any]]):
+        super().__init__(experiments)
         self.case = case
 
     def _repr_html_(self) -> str:
@@ -40,9 +40,7 @@ class Experiments(dict[str, dict[str, Any]]):
             percent = 100 * sd / size[name]
             return f"{percent:.2g} %" if percent < 100 else f"{percent:.0f} %"
 
-        rows = [
-            [words, *(cell(*pair) for pair in one["sd"].items())] for words, one in self.items()
-        ]
+        rows = [[name, *(cell(*sd) for sd in row["sd"].items())] for name, row in self.items()]
         caption = f"{self.case.name}: standard deviations that each experiment would leave"
         return html_table(rows, ["experiment", *names], caption)
 

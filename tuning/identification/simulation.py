@@ -72,51 +72,55 @@ class PaddedData(NamedTuple):
 
 
 def padded(logs, delay=0.0, samples=0):
-    """Return the PaddedData of a list of Log."""
-    # delay: transport delay of the pumps [s], any; an input reaches its tank at its own time, also
-    # between samples. samples: least length to pad to, so that truncated data run through the same
-    # compiled program as whole ones.
-    channels = tuple(sorted({pair for one in logs for pair in zip(one.tanks, one.in_volts)}))
-    n = max(samples, *(one.samples for one in logs))
-    parts = [_pieces(one, delay) for one in logs]
-    most = max(dt.shape[1] for dt, _ in parts)
+    """Return the PaddedData of a list of Log, of at least `samples` samples."""
+    # An input reaches its tank after the pumps' delay [s], also between samples. Truncated data
+    # padded to the length of the whole run through the same compiled program.
+    channels = tuple(sorted({pair for log in logs for pair in zip(log.tanks, log.in_volts)}))
+    n = max(samples, *(log.samples for log in logs))
+    parts = [_pieces(log, delay) for log in logs]
+    most = max(lengths.shape[1] for lengths, _ in parts)
     dt, u = np.zeros((len(logs), n, most)), np.zeros((len(logs), n, most, logs[0].u.shape[1]))
     y = np.full((len(logs), n, len(channels)), np.nan)
-    for e, (one, (lengths, inputs)) in enumerate(zip(logs, parts)):
-        dt[e, : one.samples, : lengths.shape[1]] = lengths
-        u[e, : one.samples, : lengths.shape[1]] = inputs
-        for c, pair in enumerate(zip(one.tanks, one.in_volts)):
-            y[e, : one.samples, channels.index(pair)] = one.y[:, c]
+    for e, (log, (lengths, inputs)) in enumerate(zip(logs, parts)):
+        dt[e, : log.samples, : lengths.shape[1]] = lengths
+        u[e, : log.samples, : lengths.shape[1]] = inputs
+        columns = [channels.index(pair) for pair in zip(log.tanks, log.in_volts)]
+        y[e, : log.samples, columns] = log.y.T
     if most == 1:
         dt, u = dt[:, :, 0], u[:, :, 0]
     return PaddedData(dt, u, y, channels)
 
 
-def _pieces(one, delay):
+def _pieces(log, delay):
     """Return (samples, pieces) lengths [s] and (samples, pieces, pumps) inputs of a Log: the steps
     between its samples, cut where an input that reaches the tanks `delay` [s] later changes.
     """
-    near = 1e-9 * max(1.0, delay, float(np.abs(one.t).max()))
-    changed = 1 + np.flatnonzero(np.any(np.diff(one.u, axis=0) != 0.0, axis=1))
-    cuts = one.t[changed] + delay
-    if one.hold == "first-order":  # two pieces for each slope: one would delay its volume
-        start, end = one.t[changed - 1] + delay, cuts
+    near = 1e-9 * max(1.0, delay, float(np.abs(log.t).max()))
+    changed = changes_of(log.u)
+    cuts = log.t[changed] + delay
+    if log.hold == "first-order":  # two pieces for each slope: one would delay its volume
+        start, end = log.t[changed - 1] + delay, cuts
         cuts = np.unique(np.concatenate([start, 0.5 * (start + end), end]))
-    after = np.minimum(np.searchsorted(one.t, cuts - near), one.samples - 1)
-    inside = (np.abs(cuts - one.t[after]) > near) & (cuts > one.t[0]) & (cuts < one.t[-1])
-    edges = np.sort(np.concatenate([one.t, cuts[inside]]))
-    step = np.searchsorted(one.t, edges, side="right") - 1  # the sample before
-    piece = np.arange(len(edges)) - np.searchsorted(edges, one.t)[step]
+    after = np.minimum(np.searchsorted(log.t, cuts - near), log.samples - 1)
+    inside = (np.abs(cuts - log.t[after]) > near) & (cuts > log.t[0]) & (cuts < log.t[-1])
+    edges = np.sort(np.concatenate([log.t, cuts[inside]]))
+    step = np.searchsorted(log.t, edges, side="right") - 1  # the sample before
+    piece = np.arange(len(edges)) - np.searchsorted(edges, log.t)[step]
     lengths = np.append(np.diff(edges), 0.0)
     command = edges + lengths / 2 - delay
-    if one.hold == "first-order":
-        levels = np.stack([np.interp(command, one.t, v) for v in one.u.T], axis=-1)
+    if log.hold == "first-order":
+        inputs = np.stack([np.interp(command, log.t, v) for v in log.u.T], axis=-1)
     else:
-        levels = one.u[np.maximum(np.searchsorted(one.t, command, side="right") - 1, 0)]
-    shape = (one.samples, int(piece.max()) + 1)
-    dt, u = np.zeros(shape), np.zeros((*shape, one.u.shape[1]))
-    dt[step, piece], u[step, piece] = lengths, levels
+        inputs = log.u[np.maximum(np.searchsorted(log.t, command, side="right") - 1, 0)]
+    shape = (log.samples, int(piece.max()) + 1)
+    dt, u = np.zeros(shape), np.zeros((*shape, log.u.shape[1]))
+    dt[step, piece], u[step, piece] = lengths, inputs
     return dt, u
+
+
+def changes_of(u):
+    """Return the samples at which an input of u (samples, pumps) differs from the one before."""
+    return 1 + np.flatnonzero(np.any(np.diff(u, axis=0) != 0.0, axis=1))
 
 
 def readings(rig, dt, u, channels, substeps):
@@ -131,30 +135,31 @@ def readings(rig, dt, u, channels, substeps):
         rig.actuator.init(Clock(dt=1.0, duration=1.0)),
     )
 
-    def piece(x, state, step, inputs):
+    def advanced(x, state, step, inputs):
         # experiment data hold the command, which may lie beyond the pump's limits
         inputs = tuple(
             clip(v, rig.actuator.low[j], rig.actuator.high[j]) for j, v in enumerate(inputs)
         )
-        held = jnp.where(step > 0, step, 1.0)  # no division by zero in the padding
-        driven, state = rig.actuator.step(state, inputs, held)
+        # no division by zero in the padding
+        driven, state = rig.actuator.step(state, inputs, jnp.where(step > 0, step, 1.0))
         driven = rig.actuator.driving(driven)
         return advance(rig.plant, "rk4", 0.0, x, driven, d, step, substeps, rolled=True).x, state
 
-    def body(carry, now):
-        out = tuple(_reading(rig, carry[0], channel) for channel in channels)
-        x, state = piece(*carry, *now[0])
-        for step, inputs in now[1:]:
-            after = piece(x, state, step, inputs)
+    def sample(carry, pieces):
+        y = tuple(_reading(rig, carry[0], channel) for channel in channels)
+        x, state = advanced(*carry, *pieces[0])
+        for step, inputs in pieces[1:]:
             # a piece of length zero is none: a pump with memory would see a sample
             x, state = jax.tree.map(
-                lambda new, old, step=step: jnp.where(step > 0, new, old), after, (x, state)
+                lambda new, old, step=step: jnp.where(step > 0, new, old),
+                advanced(x, state, step, inputs),
+                (x, state),
             )
-        return (x, state), out
+        return (x, state), y
 
     pumps = range(rig.plant.pumps)
-    xs = tuple((dt[:, i], tuple(u[:, i, j] for j in pumps)) for i in range(dt.shape[1]))
-    return jnp.stack(scan(body, (x, state), xs, length=dt.shape[0])[1], axis=-1)
+    pieces = tuple((dt[:, i], tuple(u[:, i, j] for j in pumps)) for i in range(dt.shape[1]))
+    return jnp.stack(scan(sample, (x, state), pieces, length=dt.shape[0])[1], axis=-1)
 
 
 def _reading(rig, x, channel):
@@ -166,24 +171,22 @@ def _reading(rig, x, channel):
 
 @functools.partial(jax.jit, static_argnames=("coordinates", "tanks", "channels", "substeps"))
 def sensitivities(rig, dt, u, p, first, *, coordinates, tanks, channels, substeps):
-    """Return readings and their derivatives by the unknowns, of all runs at once."""
+    """Return (logs, samples, channels) readings and their derivatives by the unknowns of each log:
+    coordinates p, of all logs or (logs, coordinates), then levels `first` (logs, tanks).
+    """
     shared = coordinates.size
 
-    def one(dt, u, first):
+    def of_log(dt, u, p, first):
         def predicted(q):
             r = with_values(rig, coordinates.values(q[:shared]))
             r = with_values(r, {f"x0[{tank}]": q[shared + i] for i, tank in enumerate(tanks)})
             return readings(r, dt, u, channels, substeps)
 
         q = jnp.concatenate([p, first])
+        slope = lambda tangent: jax.jvp(predicted, (q,), (tangent,))
+        return jax.vmap(slope, out_axes=(None, -1))(jnp.eye(q.size, dtype=q.dtype))
 
-        def both(tangent):
-            return jax.jvp(predicted, (q,), (tangent,))
-
-        y, slopes = jax.vmap(both, out_axes=(None, -1))(jnp.eye(q.size, dtype=q.dtype))
-        return y, slopes
-
-    return jax.vmap(one)(dt, u, first)
+    return jax.vmap(of_log, in_axes=(0, 0, 0 if p.ndim == 2 else None, 0))(dt, u, p, first)
 
 
 def _play(rig, dt, u, first, *, channels, substeps):
@@ -201,15 +204,16 @@ MOST_SUBSTEPS = 64
 
 def substeps_for(rig, data, first, error):
     """Return how many Runge-Kutta steps each sample needs, and the error that is left."""
-    first, before, count = np.asarray(first), None, 1
-    while count <= MOST_SUBSTEPS:
-        y = np.asarray(
-            _play_any(rig, data.dt, data.u, first, channels=data.channels, substeps=count)
-        )
-        if before is not None:
-            with np.errstate(invalid="ignore", over="ignore"):
-                moved = np.max(np.abs(y - before), axis=(0, 1))
-            if np.all(moved <= error):
-                return count // 2, moved
-        before, count = y, 2 * count
-    return MOST_SUBSTEPS, moved
+    simulate = lambda count: np.asarray(
+        _play_any(rig, data.dt, data.u, np.asarray(first), channels=data.channels, substeps=count)
+    )
+    count, coarse = 1, simulate(1)
+    while True:
+        fine = simulate(2 * count)
+        with np.errstate(invalid="ignore", over="ignore"):
+            moved = np.max(np.abs(fine - coarse), axis=(0, 1))
+        if np.all(moved <= error):
+            return count, moved
+        count, coarse = 2 * count, fine
+        if count == MOST_SUBSTEPS:
+            return count, moved

@@ -19,9 +19,9 @@ from jaxtank import presets, rig
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tree import get_value, with_values
 from tuning.identification import residuals, simulation
+from tuning.identification.coordinates import coordinates_of
 from tuning.identification.design import candidates, compare_experiments, settled
 from tuning.identification.identified_case import with_pi
-from tuning.identification.problem import coordinates
 from tuning.problem.bounds import bounds
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import spread_of
@@ -532,7 +532,7 @@ def slopes_of(case, names, t, u, x0, channels, tanks=()):
         for n, v in zip(names, truth(case, names))
     }
 
-    moved = coordinates(bounds(case.loop, free))
+    moved = coordinates_of(bounds(case.loop, free))
     p, played_rig = moved.point(dict(zip(names, truth(case, names)))), simulation.rig_of(case.loop)
     step, x0 = np.append(np.diff(t), 0.0)[None], np.asarray(x0, float)
     own = x0[list(tanks)][None] if tanks else np.zeros((1, 0))
@@ -955,7 +955,7 @@ def test_refused_by_input_validation(case, clean, options, words):
 
 def test_too_few_readings(case, clean):
     with pytest.raises(DataError, match=r"readings cannot determine"):
-        tuning.identify(case, clean.part(100, 102), FREE, hold_back=0)
+        tuning.identify(case, only(clean.part(100, 103)), FREE, hold_back=0)
 
 
 def test_several_logs_measure_what_they_measure(case, clean):

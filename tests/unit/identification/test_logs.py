@@ -9,8 +9,8 @@ from helpers import command
 import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import DataError, InputError
-from tuning.identification import experiment
 from tuning.identification.csv_log import read_log, split_header
+from tuning.identification.data_checks import findings
 
 HEADER = "t [s],pump1 [V],pump2 [V],h1 [cm],h2 [cm],h3 [cm],h4 [cm]"
 
@@ -283,7 +283,7 @@ BAD = {
         text().split("\n", 1)[1],
         r"line 1: has numbers where the columns' names should be",
     ),
-    "single sample": (bad(rows(1)), r"has 1 sample, at least 2 are needed"),
+    "single sample": (bad(rows(1)), r"number of samples is 1, an identification needs at least 3"),
     "duplicated time": (
         bad(changed(3, 0, "2")),
         r"line 5, column 't \[s\]': time 2 s is that of the sample before",
@@ -488,12 +488,12 @@ def test_a_pump_without_a_true_limit_may_be_faint():
     """khalid's input is a dimensionless one with limits of +-1000 in name only."""
     loop = presets.load("khalid").cases["gpc"].loop
     found = tuning.log(t=np.arange(5.0), u=np.full(5, 2.0), y=np.full((5, 2), 0.2))
-    experiment.check_fits(found, loop)
+    assert not findings(found, loop)
 
 
 def test_a_pump_that_stands_still_is_no_mistake(case):
     u = np.stack([np.full(5, 3.0), np.zeros(5)], axis=1)
-    experiment.check_fits(tuning.log(t=np.arange(5.0), u=u, y=np.ones((5, 4))), case.loop)
+    assert not findings(tuning.log(t=np.arange(5.0), u=u, y=np.ones((5, 4))), case.loop)
 
 
 @pytest.mark.parametrize(
@@ -516,21 +516,25 @@ def test_arrays_that_are_no_log(change, words):
 
 def test_a_log_of_another_rig(case):
     whole = {"t": np.arange(5.0), "u": np.ones((5, 2)), "y": np.ones((5, 4))}
-    with pytest.raises(DataError, match="has 1 pump columns, the rig 2 pumps"):
-        experiment.check_fits(tuning.log(**(whole | {"u": np.ones(5)})), case.loop)
-    with pytest.raises(DataError, match="measures tank 8, the rig has 4"):
-        experiment.check_fits(tuning.log(**whole, tanks=(0, 1, 2, 7)), case.loop)
+    codes = lambda log: [code for code, _ in findings(log, case.loop)]
+    assert codes(tuning.log(**(whole | {"u": np.ones(5)}))) == ["pumps"]
+    assert codes(tuning.log(**whole, tanks=(0, 1, 2, 7))) == ["tanks"]
 
 
-def test_gaps_are_counted_in_usual_steps():
-    t = np.array([0.0, 1, 2, 3, 5, 6, 7])
-    found = tuning.log(t=t, u=np.ones(7), y=np.ones(7))
-    with pytest.raises(DataError, match=r"sample 5: a gap of 2 s after 3 s.*--gap 2$"):
-        experiment.check_gaps(found)
-    experiment.check_gaps(found, 2.0)
-    experiment.check_gaps(
-        tuning.log(t=np.array([0.0, 1, 2.4, 3, 4.4, 5]), u=np.ones(6), y=np.ones(6))
-    )
+def test_gaps_are_counted_in_usual_steps(case):
+    def of(t, gap=1.5):
+        log = tuning.log(t=t, u=np.ones((len(t), 2)), y=np.ones((len(t), 4)))
+        return findings(log, case.loop, gap)
+
+    ((code, message),) = of([0.0, 1, 2, 3, 5, 6, 7])
+    assert code == "gap" and "sample 5: a gap of 2 s after 3 s" in message
+    assert message.endswith("--gap 2")
+    assert not of([0.0, 1, 2, 3, 5, 6, 7], 2.0) and not of([0.0, 1, 2.4, 3, 4.4, 5])
+
+
+def test_every_column_in_another_unit_is_reported_at_once(case):
+    log = tuning.log(t=np.arange(5.0), u=np.full((5, 2), 3000.0), y=np.full((5, 4), 60.0))
+    assert [code for code, _ in findings(log, case.loop)] == ["range"] * 6
 
 
 def test_a_part_keeps_its_lines(read):

@@ -74,12 +74,12 @@ def refused(tmp_path, capsys, monkeypatch):
 
 
 def test_two_samples_are_too_few(refused):
-    assert "l.csv: has 2 samples, an identification needs at least 3" in refused(text(*made(2)))
+    assert "l.csv: number of samples is 2" in refused(text(*made(2)))
 
 
 def test_two_samples_are_too_few_beside_others(case):
     logs = [tuning.log(t=t, u=u, y=y) for t, u, y in (made(20), made(2))]
-    with pytest.raises(DataError, match="has 2 samples, an identification needs at least 3"):
+    with pytest.raises(DataError, match="number of samples is 2"):
         tuning.identify_many(case, logs, FREE, start="case", noise=0.1)
 
 

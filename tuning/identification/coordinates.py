@@ -1,0 +1,207 @@
+"""Which parameters an identification estimates, and the coordinates in which it searches."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.linalg import block_diag
+
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import get_value, split_index
+from jaxtank.signals.base import Constant
+from tuning.problem.bounds import bounds
+
+ESTIMATED = ("plant.", "sensor.", "actuator.", "disturbance.")
+WITHOUT_EFFECT = {
+    *("sensor.noise", "sensor.full_scale", "actuator.low", "actuator.high"),
+    *("actuator.initial", "actuator.stop", "actuator.pulse"),
+}
+
+
+class Scalar(NamedTuple):
+    """One parameter: p its logarithm, or its share of the range."""
+
+    name: str
+    low: float
+    high: float
+    scale: str  # "log" or "linear"
+
+    @property
+    def names(self):
+        """(1,) name of the value."""
+        return (self.name,)
+
+    @property
+    def box(self):
+        """(low, high) of the coordinate."""
+        return [(np.log(self.low), np.log(self.high)) if self.scale == "log" else (0.0, 1.0)]
+
+    def values(self, p, exp):
+        """Return (value,) at (p,)."""
+        return (exp(p[0]) if self.scale == "log" else self.low + p[0] * (self.high - self.low),)
+
+    def point(self, value):
+        """Return [p] of a value."""
+        if self.scale == "log":
+            return [np.log(max(value, 1e-300))]
+        return [(value - self.low) / (self.high - self.low)]
+
+    def slopes(self, p):
+        """Return [[d value / dp]]."""
+        return [[np.exp(p[0]) if self.scale == "log" else self.high - self.low]]
+
+
+class Branches(NamedTuple):
+    """Gain k and split s of a pump: p = (log c1, log c2), c1 = k s and c2 = k (1 - s) the gains of
+    its two branches, in which the inflows are linear (mirakhorli notes S11)."""
+
+    gain: str
+    split: str
+    first: tuple  # (low, high) of c1
+    second: tuple
+
+    @property
+    def names(self):
+        """(2,) names of the values."""
+        return (self.gain, self.split)
+
+    @property
+    def box(self):
+        """(low, high) of each coordinate."""
+        return [tuple(np.log(self.first)), tuple(np.log(self.second))]
+
+    def values(self, p, exp):
+        """Return (gain, split) at p (2,)."""
+        first, second = exp(p[0]), exp(p[1])
+        return first + second, first / (first + second)
+
+    def point(self, gain, split):
+        """Return p (2,) of a gain and a split."""
+        split = np.clip(split, 1e-9, 1 - 1e-9)
+        return [np.log(gain * split), np.log(gain * (1 - split))]
+
+    def slopes(self, p):
+        """Return (2, 2) derivatives of (gain, split)."""
+        first, second = np.exp(p)
+        share = first / (first + second)
+        return [[first, second], [share * (1 - share), -share * (1 - share)]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Coordinates:
+    """The coordinates p of the parameters to be estimated, as a hashable description."""
+
+    items: tuple  # of Scalar and Branches
+
+    @property
+    def names(self):
+        """(size,) dotted name of the value of each coordinate; of a branch, gain then split."""
+        return tuple(name for item in self.items for name in item.names)
+
+    @property
+    def size(self):
+        """Number of coordinates [-]."""
+        return len(self.names)
+
+    @property
+    def pairs(self):
+        """[[i, i + 1], ..]: coordinates that are the two branches of one pump."""
+        return [i for item, i in self._items(range(self.size)) if isinstance(item, Branches)]
+
+    @property
+    def box(self):
+        """(low (size,), high (size,)) of the coordinates."""
+        ends = [end for item in self.items for end in item.box]
+        return tuple(np.array(ends, dtype=float).reshape(-1, 2).T)
+
+    def _items(self, p):
+        """Return [(item, its entries of p)]."""
+        entries = iter(p[i] for i in range(self.size))
+        return [(item, [next(entries) for _ in item.names]) for item in self.items]
+
+    def values(self, p):
+        """Return {name: value} at coordinates p (size,), of numpy or jax."""
+        exp = np.exp if isinstance(p, np.ndarray) else jnp.exp
+        items = self._items(p)
+        return {n: v for item, q in items for n, v in zip(item.names, item.values(q, exp))}
+
+    def point(self, values):
+        """Return (size,) coordinates of {name: value}, projected onto the bounds."""
+        p = [q for item in self.items for q in item.point(*(values[n] for n in item.names))]
+        return np.clip(np.array(p, dtype=float), *self.box)
+
+    def slopes(self, p):
+        """Return (size, size) derivatives of the values, ordered as `names`, by the coordinates."""
+        return block_diag(*(item.slopes(entries) for item, entries in self._items(p)))
+
+
+def coordinates_of(bounds, branches=True):
+    """Return the Coordinates of a list of tuning.problem.bounds.Bound."""
+    by_name = {b.name: b for b in bounds}
+    items = {}
+    for b in bounds:
+        _, index = split_index(b.name)
+        pump = index[0] if index else None
+        gain, split = (by_name.get(f"plant.{n}[{pump}]") for n in ("pump_gain", "split"))
+        if not (branches and gain and split and b in (gain, split)):
+            items[b.name] = Scalar(b.name, b.low, b.high, b.scale)
+            continue
+        low, high = max(split.low, 1e-6), min(split.high, 1 - 1e-6)
+        first = (gain.low * low, gain.high * high)
+        second = (gain.low * (1 - high), gain.high * (1 - low))
+        if b is gain:
+            items[gain.name] = Branches(gain.name, split.name, first, second)
+    return Coordinates(tuple(items.values()))
+
+
+def free_bounds(loop, free):
+    """Return the Bounds of {name: (low, high)}; raise InputError for what no reading shows."""
+    free = default_free(loop) if free is None else free
+    for name in free:
+        if not name.startswith(ESTIMATED):
+            raise InputError(
+                f"free {name}: an identification estimates what begins with"
+                f" {', '.join(ESTIMATED)}; levels with --start"
+            )
+        if split_index(name)[0] in WITHOUT_EFFECT:
+            raise InputError(f"free {name}: no reading depends on it in a way that could be fitted")
+    spec = {n: (*v, "log" if v[0] > 0 else "linear")[:3] for n, v in free.items()}
+    ranges = bounds(loop, spec)
+    feeds = getattr(loop.plant, "feeds", ())
+    idle = {f"plant.split[{j}]" for j, (_, second) in enumerate(feeds) if second is None}
+    for name in idle & set(free):
+        raise InputError(f"free {name}: this pump feeds one tank alone, its split changes nothing")
+    ranges = [b for b in ranges if b.name not in idle]
+    if not ranges:
+        raise InputError(
+            f"free {', '.join(free)}: these pumps feed one tank each, their splits change nothing"
+        )
+    return ranges
+
+
+def default_free(loop):
+    """Return {name: (low, high)}: the default unknowns of an identification."""
+    # Pump gains, splits between two tanks, open orifices, pipes, the captured share of an overflow
+    # and a constant disturbance; not areas, which are measured with a ruler.
+    plant: Any = loop.plant
+    free = {}
+    for name in ("pump_gain", "drain", "orifice", "pipe"):
+        values = np.ravel(np.asarray(getattr(plant, name, ()), dtype=float))
+        open_ = [(i, float(v)) for i, v in enumerate(values) if v > 0]
+        free |= {f"plant.{name}[{i}]": (v / 10, v * 10) for i, v in open_}
+    feeds = enumerate(getattr(plant, "feeds", ()))
+    free |= {
+        f"plant.split[{j}]": (0.02, 0.98, "linear") for j, (_, tank) in feeds if tank is not None
+    }
+    if getattr(plant, "overflow", False):
+        free |= {f"plant.caught[{k}]": (0.0, 1.0) for k in range(len(plant.spills))}
+    if isinstance(loop.disturbance, Constant):
+        sizes = enumerate(np.abs(np.asarray(loop.disturbance.level, dtype=float)).tolist())
+        free |= {f"disturbance.level[{i}]": (-10 * v, 10 * v) for i, v in sizes if v}
+    return free
+
+
+def nominal(loop, names):
+    """Return {name: value} of a loop as floats."""
+    return {name: float(np.asarray(get_value(loop, name))) for name in names}

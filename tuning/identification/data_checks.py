@@ -1,0 +1,228 @@
+"""Checks of experiment data against a rig: what each finds, and what it says."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxtank.core.errors import DataError, InputError
+from jaxtank.core.units import FLOWS, LENGTHS, VOLTS, canonical
+from tuning.identification.experiment import Log
+from tuning.identification.simulation import changes_of
+
+RIM_MARGIN = 1.5
+"""Reading, in rims of its tank, above which the column is taken to be in another unit."""
+DRIVE_MARGIN = 2.0
+"""The same of a pump's input, in its upper limits."""
+FAINT = 0.015
+"""Share of its range below which a pump's input, or every level, is taken to be in another unit."""
+IRREGULAR = 1.25
+"""Ratio of a long to a short step between samples (90th and 10th percentile) above which they are
+no longer those of a controller's own clock, at which its outputs change."""
+FEWEST = 3
+"""Fewest samples of a run that can be fitted: residuals have an autocorrelation from three on."""
+
+
+def checked(log, loop, gap: float) -> list[Log]:
+    """Return the Logs of one Log or several; raise an error for data that cannot be of this rig."""
+    if not jax.config.read("jax_enable_x64"):
+        raise InputError(
+            "identification needs float64: call jax.config.update('jax_enable_x64', True) first"
+        )
+    logs = [log] if isinstance(log, Log) else list(log)
+    if not logs:
+        raise InputError("no log is given: identification needs experiment data")
+    messages = [message for log in logs for _, message in findings(log, loop, gap)]
+    if messages:
+        raise DataError("; ".join(messages))
+    return logs
+
+
+def findings(log: Log, loop, gap: float = 1.5) -> list[tuple[str, str]]:
+    """Return (code, message) of all that is wrong with experiment data of a rig."""
+    rows = []
+    for check in CHECKS:
+        for sample, column, values in check.find(log, loop, gap):
+            place = log.where(sample, column)
+            if column is not None:
+                values["slot"] = log.slot(column)
+            rows.append((check.code, f"{place}: {check.message.format(**values)}"))
+        if rows and check.ends:
+            return rows
+    return rows
+
+
+def first_samples(log, hold_back):
+    """Return the number of samples of a Log before its validation set."""
+    number = isinstance(hold_back, int | float) and not isinstance(hold_back, bool)
+    if not (number and 0 <= hold_back < log.samples):
+        raise InputError(
+            f"hold_back = {hold_back!r}: must be a share from 0 to below 1, or a number of samples"
+            f" below {log.samples}"
+        )
+    last = round(hold_back * log.samples) if hold_back < 1 else int(hold_back)
+    return max(log.samples - last, 2)
+
+
+def _few_samples(log, loop, gap):
+    if log.samples < FEWEST:
+        yield None, None, {"count": log.samples, "fewest": FEWEST}
+
+
+def _pump_count(log, loop, gap):
+    if log.u.shape[1] != loop.plant.pumps:
+        yield None, None, {"columns": log.u.shape[1], "pumps": loop.plant.pumps}
+
+
+def _unknown_tanks(log, loop, gap):
+    for column, tank in enumerate(log.tanks, 1 + loop.plant.pumps):
+        if not 0 <= tank < loop.plant.tanks:
+            yield None, column, {"tank": tank + 1, "tanks": loop.plant.tanks}
+
+
+def _gaps(log, loop, gap):
+    steps = np.diff(log.t)
+    usual, k = float(np.median(steps)), int(np.argmax(steps))
+    if steps[k] > gap * usual * (1 + 1e-9):
+        enough = np.ceil(10 * steps[k] / usual) / 10
+        yield k + 1, 0, {"step": steps[k], "t": log.t[k], "usual": usual, "enough": enough}
+
+
+def _unknown_changes(log, loop, gap):
+    low, high = np.quantile(np.diff(log.t), [0.1, 0.9])
+    changed = changes_of(log.u)
+    unsure = changed[np.isfinite(log.y[changed]).any(axis=1)]
+    if not log.hold and high > IRREGULAR * low and 2 * len(unsure) > len(changed):
+        k = unsure[0]
+        yield k, None, {"step": log.t[k] - log.t[k - 1], "t": log.t[k], "low": low, "high": high}
+
+
+def _empty_channels(log, loop, gap):
+    for column in np.flatnonzero(~np.isfinite(log.y).any(axis=0)):
+        yield None, 1 + loop.plant.pumps + column, {}
+
+
+def _out_of_range(log, loop, gap):
+    pumps = [(u, loop.units[1], min(low, 0.0) - 0.1 * top, DRIVE_MARGIN * top,
+              f"pump's upper limit is {top:g}") for u, low, top in _pumps(log, loop)]  # fmt: skip
+    levels = [(y, unit, -0.25 * top, RIM_MARGIN * top, f"{what} is {top:g}")
+              for y, (top, unit, what) in zip(log.y.T, _channels(log, loop))]  # fmt: skip
+    for column, (values, unit, low, high, limit) in enumerate([*pumps, *levels], 1):
+        for k in np.flatnonzero((values < low) | (values > high))[:1]:
+            hint = _other_units(log, column, values, unit, (low, high))
+            yield k, column, {"value": values[k], "unit": unit, "limit": limit, "hint": hint}
+
+
+def _faint_inputs(log, loop, gap):
+    drive = loop.units[1]
+    if canonical(drive) not in {**VOLTS, **FLOWS}:  # limits in other units are often nominal
+        return
+    for j, (u, _, top) in enumerate(_pumps(log, loop)):
+        most = np.max(np.abs(u))
+        if np.isfinite(top) and 0 < most < FAINT * top:
+            ends = (2 * FAINT * top, DRIVE_MARGIN * top)
+            hint = _other_units(log, 1 + j, most, drive, ends)
+            yield None, 1 + j, {"most": most, "unit": drive, "top": top, "hint": hint}
+
+
+def _faint_levels(log, loop, gap):
+    tops, units, _ = zip(*_channels(log, loop))
+    most = np.max(np.abs(log.y), axis=0, initial=0.0, where=np.isfinite(log.y))
+    c = int(np.argmax(most / tops))
+    if 0 < most[c] < FAINT * tops[c]:
+        ends = (2 * FAINT * tops[c], RIM_MARGIN * tops[c])
+        hint = _other_units(log, 1 + loop.plant.pumps + c, most[c], units[c], ends)
+        values = {"most": most[c], "unit": units[c], "top": tops[c], "hint": hint}
+        yield None, 1 + loop.plant.pumps + c, {"percent": 100 * FAINT, **values}
+
+
+def _nothing_moves(log, loop, gap):
+    if not np.any(np.abs(log.y) > 0):
+        yield None, 1 + loop.plant.pumps, {}
+
+
+def _channels(log, loop):
+    """Return (top of the range, its unit, its name) of each channel of readings."""
+    sensor = (float(loop.sensor.full_scale), "V", "sensor's range")
+    rim = [(float(top), loop.units[0], "rim") for top in np.asarray(loop.plant.rim)]
+    return [sensor if volts else rim[tank] for tank, volts in zip(log.tanks, log.in_volts)]
+
+
+def _pumps(log, loop):
+    """Return (inputs (samples,), lower limit, upper limit) of each pump."""
+    limits = np.asarray(loop.actuator.low), np.asarray(loop.actuator.high)
+    return [(u, float(low), float(high)) for u, low, high in zip(log.u.T, *limits)]
+
+
+def _other_units(log, column, values, unit, ends):
+    """Return a hint: the units in which values, held in `unit`, would lie within `ends`."""
+    unit = canonical(unit)
+    table = next((t for t in (LENGTHS, VOLTS, FLOWS) if unit in t), {unit: 1.0})
+    header = unit if log.units is None else canonical(log.units[column])
+    cells, slot = values * (table[unit] / table.get(header, table[unit])), log.slot(column)
+    fits = [
+        f"'{slot} [{name}]'"
+        for name, size in table.items()
+        if name != header
+        and np.nanmin(cells) * size >= ends[0] * table[unit]
+        and np.nanmax(cells) * size <= ends[1] * table[unit]
+    ]
+    return f" Write it in the header, as {' or '.join(fits[:2])}" if fits else ""
+
+
+class Check(NamedTuple):
+    """A check: its code, what it finds, and the message."""
+
+    code: str
+    find: Callable[..., Sequence]  # of (log, loop, gap): (sample or None, column or None, values)
+    message: str
+    ends: bool = False  # the checks after it need what it checks
+
+
+UNIT = "is the column in another unit?{hint}"
+CHECKS = (
+    Check(
+        "samples",
+        _few_samples,
+        "number of samples is {count}, an identification needs at least {fewest}",
+        ends=True,
+    ),
+    Check("pumps", _pump_count, "has {columns} pump columns, the rig {pumps} pumps", ends=True),
+    Check("tanks", _unknown_tanks, "measures tank {tank}, the rig has {tanks}", ends=True),
+    Check(
+        "gap",
+        _gaps,
+        "a gap of {step:g} s after {t:g} s, where samples come every {usual:g} s: what the pumps"
+        " did there is not known; cut the file in two (give both with --data), or hold the input"
+        " over it with --gap {enough:g}",
+    ),
+    Check(
+        "input-times",
+        _unknown_changes,
+        "an input changed in the {step:g} s before {t:g} s, and samples come irregularly, every"
+        " {low:g} to {high:g} s: when it changed is not known, and intervals would exclude the"
+        " truth. Add a row at the time of each change, with its inputs and no readings; or state"
+        " that inputs change at the times of their rows, --hold zero-order, or along a line from"
+        " row to row, --hold first-order",
+    ),
+    Check("no-reading", _empty_channels, "{slot} has no reading", ends=True),
+    Check("range", _out_of_range, "{slot} = {value:g} {unit}, where the {limit} {unit}: " + UNIT),
+    Check(
+        "input-faint",
+        _faint_inputs,
+        "{slot} is never above {most:g} {unit}, where its upper limit is {top:g} {unit}: " + UNIT,
+    ),
+    Check(
+        "level-faint",
+        _faint_levels,
+        "no level reads more than {percent:g} % of its range, {slot} at most {most:g} {unit} of"
+        " {top:g} {unit}: " + UNIT,
+    ),
+    Check(
+        "level-zero",
+        _nothing_moves,
+        "every level reads 0 throughout: nothing moves that could be fitted",
+    ),
+)
+"""In this order."""
