@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxtank.core.errors import InputError
+from jaxtank.core.tree import split_index
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants.tank_network import TankNetwork
 
@@ -18,26 +19,34 @@ SIGMAS = 6.0
 LEAST_SIGMAS = 5.0
 """Standard deviations of the noise below which a band of the user's own is not relied on."""
 
+COVERED = {
+    "actuator": ("low", "high", "dead_zone", "stop", "pulse", "lag", "initial", "delay"),
+    "sensor": ("noise", "offset", "gain", "full_scale"),
+}
+"""Leaves of instruments whose intervals the design counts with."""
 
-def box_of(plant: TankNetwork, widths: Mapping[str, ArrayLike]) -> tuple[TankNetwork, TankNetwork]:
+Widths = Mapping[str, ArrayLike]
+NONE: Widths = MappingProxyType({})
+
+
+def box_of(plant: TankNetwork, widths: Widths) -> tuple[TankNetwork, TankNetwork]:
     """Return the plants at the lower and the upper end of a box."""
     ends: tuple[dict, dict] = ({}, {})
     leaves = {f.name for f in dataclasses.fields(plant) if f.metadata.get("kind") == "leaf"}
     for name, width in widths.items():
-        field, _, entry = name.removeprefix("plant.").partition("[")
+        field, entry = split_index(name.removeprefix("plant."))
         if "." in field or field == "x0":
             continue
         if field not in leaves:
             raise InputError(f"safety_filter: {name} is no parameter of this plant's flows")
         value = np.array(getattr(plant, field), dtype=float)
         half = np.zeros(value.shape)
-        half[int(entry[:-1]) if entry else ...] = width
+        half[entry] = width
         for end, sign in zip(ends, (-1.0, 1.0)):
             end[field] = end.get(field, value) + sign * half
-        if np.any(ends[0][field] < 0.0) or (
-            field not in ("drain", "orifice", "pipe", "split", "caught")
-            and np.any(ends[0][field] <= 0.0)
-        ):
+        may_be_zero = field in ("drain", "orifice", "pipe", "split", "caught")
+        least = ends[0][field]
+        if np.any(least < 0.0) or (not may_be_zero and np.any(least <= 0.0)):
             raise InputError(f"safety_filter: the interval of {name} reaches below 0")
     for share in {"split", "caught"} & set(ends[1]):
         ends[1][share] = np.minimum(ends[1][share], 1.0)
@@ -45,21 +54,14 @@ def box_of(plant: TankNetwork, widths: Mapping[str, ArrayLike]) -> tuple[TankNet
     return least, most
 
 
-COVERED = {
-    "actuator": ("low", "high", "dead_zone", "stop", "pulse", "lag", "initial", "delay"),
-    "sensor": ("noise", "offset", "gain", "full_scale"),
-}
-"""Leaves of instruments whose intervals the design counts with."""
-
-
-def uncovered(widths: Mapping[str, ArrayLike]) -> list[str]:
+def uncovered(widths: Widths) -> list[str]:
     """Return the names of `widths` that the design does not count with."""
-    fields = (name.split("[")[0].removeprefix("plant.") for name in widths)
-    known = {f"{part}.{leaf}" for part, leaves in COVERED.items() for leaf in leaves}
-    return [name for name, f in zip(widths, fields) if "." in f and f not in known]
+    covered = {f"{part}.{leaf}" for part, leaves in COVERED.items() for leaf in leaves}
+    field = lambda name: split_index(name.removeprefix("plant."))[0]
+    return [name for name in widths if "." in field(name) and field(name) not in covered]
 
 
-def interval(part: Any, name: str, widths: Mapping[str, ArrayLike]) -> tuple:
+def interval(part: Any, name: str, widths: Widths) -> tuple:
     """Return the (least, largest) value of a leaf of an instrument, such as "actuator.lag"; 0 where
     it is not in use.
     """
@@ -67,36 +69,50 @@ def interval(part: Any, name: str, widths: Mapping[str, ArrayLike]) -> tuple:
     return spread(0.0 if value is None else value, name, widths)
 
 
-def spread(value: ArrayLike, name: str, widths: Mapping[str, ArrayLike]) -> tuple:
+def spread(value: ArrayLike, name: str, widths: Widths) -> tuple:
     """Return the (least, largest) value of a parameter over a box."""
     value = np.array(value, dtype=float)
     half = np.zeros(value.shape)
     for key, width in widths.items():
-        field, _, entry = key.partition("[")
+        field, entry = split_index(key)
         if field == name:
-            half[int(entry[:-1]) if entry else ...] = width
+            half[entry] = width
     return value - half, value + half
+
+
+def intervals(widths: Widths, parts: Mapping[str, Any]) -> dict[str, tuple]:
+    """Return {dotted name: (lower, upper)} of `widths`, but for the levels at t = 0."""
+    ends: dict[str, tuple] = {}
+    for name, width in widths.items():
+        name = name if "." in name or name.startswith("x0") else f"plant.{name}"
+        field, entry = split_index(name)
+        part, _, leaf = field.partition(".")
+        if part in parts:
+            value = getattr(parts[part], leaf, None)
+            value = np.asarray(0.0 if value is None else value, dtype=float)[entry]
+            ends[name] = (value - np.asarray(width), value + np.asarray(width))
+        elif field != "x0":
+            ends[name] = (0.0, 0.0)
+    return ends
 
 
 def widths_of(part: Any, spread: Mapping[str, float]) -> dict[str, np.ndarray]:
     """Return the half widths of `box_of` for parameters of a plant or an instrument that may be off
     by a share of their value.
     """
-    found = {}
+    widths = {}
     for name, share in spread.items():
         if not 0.0 <= share < 1.0:
             raise InputError(
                 f"safety_filter: spread of {name} = {share:g}: must be from 0 to below 1"
             )
-        field, _, entry = name.rpartition(".")[2].partition("[")
+        field, entry = split_index(name.rpartition(".")[2])
         value = np.abs(np.asarray(getattr(part, field, 0.0), dtype=float))
-        found[name] = share * (value[int(entry[:-1])] if entry else value)
-    return found
+        widths[name] = share * value[entry]
+    return widths
 
 
-def narrow_band(
-    sensor: LevelSensor, band: np.ndarray, unit: str, widths: Mapping[str, ArrayLike]
-) -> list[str]:
+def narrow_band(sensor: LevelSensor, band: np.ndarray, unit: str, widths: Widths) -> list[str]:
     """Return for each tank why a band cannot be relied on, "" where it can."""
     least = band_of(sensor, LEAST_SIGMAS, widths) + 0.0 * band
     words = (
@@ -108,11 +124,7 @@ def narrow_band(
     ]
 
 
-def band_of(
-    sensor: LevelSensor,
-    sigmas: float = SIGMAS,
-    widths: Mapping[str, ArrayLike] = MappingProxyType({}),
-) -> np.ndarray:
+def band_of(sensor: LevelSensor, sigmas: float = SIGMAS, widths: Widths = NONE) -> np.ndarray:
     """Return the (n,) band of readings [cm]: 6 standard deviations, half an ADC step, offset; each
     the largest over the box.
     """
@@ -125,9 +137,7 @@ def band_of(
     return band
 
 
-def top_of(
-    sensor: LevelSensor, tanks: int, widths: Mapping[str, ArrayLike] = MappingProxyType({})
-) -> np.ndarray:
+def top_of(sensor: LevelSensor, tanks: int, widths: Widths = NONE) -> np.ndarray:
     """Return the (n,) highest level that sensors read for certain [cm]; inf without an ADC."""
     if not sensor.bits:
         return np.full(tanks, np.inf)

@@ -3,7 +3,7 @@
 Works on the final numbers alone, with formulas of its own, and knows a closed list of features:
 README.md of this folder, "What the checker covers".
 """
-# Every condition is tested as "not (a <= b)", so that a NaN fails it.
+# Conditions are generators of (holds, reason), holds written so that a NaN fails it.
 
 import dataclasses
 import math
@@ -17,14 +17,14 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants.faults import Faults
 from jaxtank.plants.tank_network import TankNetwork
 
-ANY, OWN = "any at or below the limits", "the given start"
-"""Hypotheses on the start."""
+LIMITS, CASE = "limits", "case"
+"""Levels at t = 0 for which a verdict holds: any at or below the limits, or the case's start."""
 SIGMAS = 5.0
 """Standard deviations of the noise that a band must have at least."""
 SHALLOW = 0.05
 """a0 of Theorem 2 as a share of the root of the limit."""
 PARTS = 1000
-"""Intervals of readings on which floors and caps are compared."""
+"""Intervals of readings on which least inputs and caps are compared."""
 ROUNDING = 1e-9
 
 FLOWS = ("area", "drain", "orifice", "pipe", "pump_gain", "split", "gravity")
@@ -56,7 +56,7 @@ class Verdict(NamedTuple):
 
     # tank : counted from 0. holds, low_holds : of the upper and the low limit. reason, low_reason :
     # the theorem, the condition that fails with both numbers, or "not covered: FEATURE". starts :
-    # ANY or OWN, the levels at t = 0 for which it holds.
+    # LIMITS or CASE.
 
     tank: int
     holds: bool
@@ -77,7 +77,7 @@ def check(
     box: Mapping[str, tuple[Any, Any]],
     inflow: tuple[Any, Any] = (0.0, 0.0),
     volume: Any = 0.0,
-    drawn: bool = False,
+    draws: bool = False,
     start: Any = None,
     faults: Any = None,
     limits: Any = None,
@@ -86,25 +86,26 @@ def check(
     parts = {"plant": plant, "actuator": actuator, "sensor": sensor, "safety_filter": safety_filter}
     parts |= {} if faults is None else {"faults": faults}
     tanks = len(np.atleast_1d(safety_filter.limit))
-    if missing := _not_known(parts, box):
-        return _none(tanks, missing)
+    not_proved = lambda why: tuple(Verdict(i, False, why, CASE, False, why) for i in range(tanks))
+    if why := _not_known(parts, box):
+        return not_proved(why)
     rig = _Rig(safety_filter, plant, actuator, sensor, hold, substeps, box, faults)
-    rig.disturbed(inflow, volume, drawn)
+    rig.disturbed(inflow, volume, draws)
     least = start
     if start is not None and "x0" in box:
         least, start = (np.asarray(v, dtype=float) for v in box["x0"])
     claimed = rig.limit + rig.spare if limits is None else np.asarray(limits, float)
     if why := rig.uncovered():
-        return _none(tanks, why)
+        return not_proved(why)
     from_any = _joint(rig, None, claimed)
-    found = from_any if start is None else _joint(rig, np.asarray(start, float), claimed)
-    lows = _joint_low(rig, least, found)
+    upper = from_any if start is None else _joint(rig, np.asarray(start, float), claimed)
+    lows = _joint_low(rig, least, upper)
     return tuple(
         Verdict(
             tank=i,
-            holds=not found.reasons[i],
-            reason=found.reasons[i] or found.theorems[i],
-            starts=OWN if from_any.reasons[i] else ANY,
+            holds=not upper.reasons[i],
+            reason=upper.reasons[i] or upper.theorems[i],
+            starts=CASE if from_any.reasons[i] else LIMITS,
             low_holds=bool(rig.low[i] > 0.0 and not lows[i]),
             low_reason=lows[i] or ("Low limits" if rig.low[i] > 0.0 else ""),
         )
@@ -112,38 +113,48 @@ def check(
     )
 
 
-def _none(tanks, why):
-    """Verdicts of a rig on which nothing is proved."""
-    return tuple(Verdict(i, False, why, OWN, False, why) for i in range(tanks))
+def _first_failure(conditions):
+    """The reason of the first of [(holds, reason)] that does not hold, or ""."""
+    return next((why for holds, why in conditions if not holds), "")
 
 
 def _not_known(parts, box):
     """The first feature that is not on the closed list, or a number that is none; or ""."""
-    for part, value in parts.items():
-        kind = CLASSES.get(part)
-        if kind is not None and type(value) is not kind:
-            return f"not covered: {part} of class {type(value).__name__}"
-    guard = parts["safety_filter"]
-    if (type(guard).__module__, type(guard).__name__) != ("jaxtank.safety.filter", "SafetyFilter"):
-        return f"not covered: safety filter of class {type(guard).__name__}"
-    inner = {"safety_filter.least": guard.least, "safety_filter.most": guard.most}
-    for part, value in {**parts, **inner}.items():
-        if part in inner and type(value) is not TankNetwork:
-            return f"not covered: {part} of class {type(value).__name__}"
-        known = KNOWN["plant" if part in inner else part]
-        for field in dataclasses.fields(value):
-            entry = getattr(value, field.name)
-            if field.name not in known and not _neutral(entry):
-                return f"not covered: {part}.{field.name}"
-            if field.name in known and _has_nan(entry):
-                return f"not covered: {part}.{field.name} is no number"
+    why = _first_failure(_known_classes(parts)) or _first_failure(_known_fields(parts))
+    return why or _first_failure(_known_names(box))
+
+
+def _known_classes(parts):
+    for part, kind in CLASSES.items():
+        value = parts.get(part)
+        if part in parts:
+            yield type(value) is kind, f"not covered: {part} of class {type(value).__name__}"
+    kind = type(parts["safety_filter"])
+    same = (kind.__module__, kind.__name__) == ("jaxtank.safety.filter", "SafetyFilter")
+    yield same, f"not covered: safety filter of class {kind.__name__}"
+    for end in ("least", "most"):
+        kind = type(getattr(parts["safety_filter"], end))
+        known = kind is TankNetwork
+        yield known, f"not covered: safety_filter.{end} of class {kind.__name__}"
+
+
+def _known_fields(parts):
+    safety_filter = parts["safety_filter"]
+    ends = {f"safety_filter.{end}": getattr(safety_filter, end) for end in ("least", "most")}
+    for part, value in {**parts, **ends}.items():
+        known = KNOWN["plant" if part in ends else part]
+        for name in (field.name for field in dataclasses.fields(value)):
+            entry = getattr(value, name)
+            yield name in known or _neutral(entry), f"not covered: {part}.{name}"
+            number = name not in known or not _has_nan(entry)
+            yield number, f"not covered: {part}.{name} is no number"
+
+
+def _known_names(box):
     for name, ends in box.items():
-        base = name.partition("[")[0]
-        if base not in UNCERTAIN and not name.startswith(HARMLESS):
-            return f"not covered: uncertain {name}"
-        if any(_has_nan(end) for end in ends):
-            return f"not covered: uncertain {name} is no number"
-    return ""
+        known = name.partition("[")[0] in UNCERTAIN or name.startswith(HARMLESS)
+        yield known, f"not covered: uncertain {name}"
+        yield not any(map(_has_nan, ends)), f"not covered: uncertain {name} is no number"
 
 
 def _neutral(entry):
@@ -157,6 +168,12 @@ def _has_nan(entry):
         return bool(np.isnan(np.asarray(entry, dtype=float)).any())
     except (TypeError, ValueError):  # names, another component
         return False
+
+
+def _at(name):
+    """(name without its index, index of its entry or ...)."""
+    base, _, entry = name.partition("[")
+    return base, int(entry.rstrip("]")) if entry else ...
 
 
 def _root(h, knee):
@@ -175,20 +192,20 @@ def _pipe_root(z, knee):
 class _Rig:
     """The final numbers: coefficients per tank of the filter's plants, limits, pumps, readings."""
 
-    def __init__(self, guard, plant, actuator, sensor, hold, substeps, box, faults):
-        self.guard, self.plant, self.hold = guard, plant, float(hold)
+    def __init__(self, safety_filter, plant, actuator, sensor, hold, substeps, box, faults):
+        self.filter, self.plant, self.hold = safety_filter, plant, float(hold)
+        self.unit, self.knee = plant.units[0], float(plant.knee)
         n = self.tanks = len(np.atleast_1d(plant.rim))
         full = lambda v, size=n: np.broadcast_to(np.asarray(v, dtype=float), (size,))
-        self.limit, self.reach, self.spare = map(full, (guard.limit, guard.reach, guard.spare))
-        self.rate, self.slope, self.band = map(full, (guard.rate, guard.slope, guard.band))
-        self.low, self.bottom = full(guard.low), full(guard.bottom)
-        self.held, self.kept = set(guard.held), set(guard.kept)
-        self.divided, self.running = (set(getattr(guard, k, ())) for k in ("divided", "running"))
-        self.predicted = int(guard.predicted)
+        for name in ("limit", "reach", "spare", "rate", "slope", "band", "low", "bottom"):
+            setattr(self, name, full(getattr(safety_filter, name)))
+        for name in ("held", "kept", "divided", "running"):
+            setattr(self, name, set(getattr(safety_filter, name, ())))
+        self.predicted = int(safety_filter.predicted)
         self.box, self.faults = dict(box), faults
         self.rim, self.highest_rim = (full(v) for v in self.span("plant.rim", plant.rim))
         self.caught = self.span("plant.caught", plant.caught)[1]
-        self._coefficients(guard.least, guard.most, hold / substeps)
+        self._coefficients(safety_filter.least, safety_filter.most, hold / substeps)
         self._pumps(actuator, full)
         self._readings(sensor, full)
 
@@ -197,13 +214,10 @@ class _Rig:
         value = np.asarray(0.0 if value is None else value, dtype=float)
         low, high = value.copy(), value.copy()
         for other, (lower, upper) in self.box.items():
-            base, _, entry = other.partition("[")
+            base, at = _at(other)
             if base == name:
-                at = int(entry.rstrip("]")) if entry else ...
-                low[at], high[at] = (
-                    np.minimum(low[at], np.asarray(lower, float)),
-                    np.maximum(high[at], np.asarray(upper, float)),
-                )
+                low[at] = np.minimum(low[at], np.asarray(lower, float))
+                high[at] = np.maximum(high[at], np.asarray(upper, float))
         return low, high
 
     def _coefficients(self, least, most, step):
@@ -211,88 +225,76 @@ class _Rig:
         slow, fast = math.sqrt(2.0 * float(least.gravity)), math.sqrt(2.0 * float(most.gravity))
         small, large = np.asarray(least.area, float), np.asarray(most.area, float)
         self.area = small
-        self.knee = float(plant.knee)
         free = [np.array(p.drain, dtype=float) for p in (least, most)]
-        self.into = [[] for _ in range(n)]  # (source, least, largest) of each tank
-        self.below = [set() for _ in range(n)]
-        self.pipes = [[] for _ in range(n)]  # (other, least, largest)
+        # of each tank: {source: (least, largest)} of its orifices together, {tanks below}, [(other,
+        # least, largest)] of its pipes, {pump: (least, largest)}
+        self.into, self.below = [{} for _ in range(n)], [set() for _ in range(n)]
+        self.pipes, self.gains = [[] for _ in range(n)], [{} for _ in range(n)]
         for k, (i, j) in enumerate(plant.links):
             free[0][i] += least.orifice[k]
             free[1][i] += most.orifice[k]
             ends = slow * least.orifice[k] / large[j], fast * most.orifice[k] / small[j]
-            self.into[j].append((i, *map(float, ends)))
+            _add(self.into[j], i, ends)
             self.below[i].add(j)
-        everything = free[1].copy()
-        for k, (i, j) in enumerate(plant.pipes):
-            for one, other in ((i, j), (j, i)):
-                everything[one] += most.pipe[k]
-                ends = slow * least.pipe[k] / large[one], fast * most.pipe[k] / small[one]
-                self.pipes[one].append((other, *map(float, ends)))
+        outlets = free[1].copy()
+        for k, pair in enumerate(plant.pipes):
+            for i, j in (pair, pair[::-1]):
+                outlets[i] += most.pipe[k]
+                ends = slow * least.pipe[k] / large[i], fast * most.pipe[k] / small[i]
+                self.pipes[i].append((j, *map(float, ends)))
         self.out, self.out_most = slow * free[0] / large, fast * free[1] / small
         # with `bottom` a tank gives less than its outlets would below this level
-        self.empty = (step * fast * everything / small) ** 2 if plant.bottom else np.zeros(n)
-        self.gains = [{} for _ in range(n)]  # {pump: (least, largest)}
+        self.empty = (step * fast * outlets / small) ** 2 if plant.bottom else np.zeros(n)
         for j, (first, second) in enumerate(plant.feeds):
             shares = [(first, 1.0, 1.0)]
             if second is not None:
                 a, b = float(least.split[j]), float(most.split[j])
                 shares = [(first, a, b), (second, 1.0 - b, 1.0 - a)]
             for i, a, b in shares:
-                before = self.gains[i].get(j, (0.0, 0.0))
-                self.gains[i][j] = (
-                    before[0] + float(least.pump_gain[j]) * a / large[i],
-                    before[1] + float(most.pump_gain[j]) * b / small[i],
-                )
+                ends = float(least.pump_gain[j]) * a / large[i], most.pump_gain[j] * b / small[i]
+                _add(self.gains[i], j, ends)
 
     def _pumps(self, bank, full):
         m = len(self.plant.feeds)
-        self.lag = tuple(full(v, m) for v in self.span("actuator.lag", bank.lag))
-        self.delay = tuple(float(v) for v in self.span("actuator.delay", bank.delay))
-        self.pulsed = bank.dead_zone is not None and bank.dead_zone_kind == "pulse"
+        span = lambda name: self.span(f"actuator.{name}", getattr(bank, name))
+        each = lambda name: tuple(full(v, m) for v in span(name))
+        self.lag, self.delay = each("lag"), tuple(float(v) for v in span("delay"))
         self.zoned = bank.dead_zone is not None
-        dead = self.span("actuator.dead_zone", bank.dead_zone)[0]
-        self.dead = full(dead if self.zoned and bank.dead_zone_kind == "offset" else 0.0, m)
-        span = lambda name: tuple(
-            full(v, m) for v in self.span(f"actuator.{name}", getattr(bank, name))
-        )
+        self.pulsed = self.zoned and bank.dead_zone_kind == "pulse"
+        dead = span("dead_zone")[0] if self.zoned and bank.dead_zone_kind == "offset" else 0.0
+        self.dead = full(dead, m)
         # inputs as the filter counts them, less its offset
-        self.offset, (self.backwards, self.lowest) = full(self.guard.offset, m), span("low")
-        self.weakest, self.high = (v - self.offset for v in span("high"))
+        self.offset, (self.backwards, self.lowest) = full(self.filter.offset, m), each("low")
+        self.weakest, self.high = (v - self.offset for v in each("high"))
         self.capped = full(bank.high, m) - self.offset
         # pumps whose lower limit, or input before the start, may be above what the filter counts on
         self.stronger = self.lowest > np.maximum(full(bank.low, m), 0.0)
-        self.unsure = any(
-            np.any(self.span(f"actuator.{name}", getattr(bank, name))[end] != getattr(bank, name))
-            for name in ("low", "high", "initial")
-            for end in (0, 1)
-        )
+        leaves = ("low", "high", "initial")
+        self.unsure = any(np.any(e != getattr(bank, name)) for name in leaves for e in span(name))
         self.under_way = np.zeros(m)
         if self.delay[1] > 0.0 or np.any(self.lag[1] > 0.0):
-            self.under_way = np.maximum(span("initial")[1] - self.offset, 0.0)
+            self.under_way = np.maximum(each("initial")[1] - self.offset, 0.0)
         self.most = np.maximum(np.maximum(self.high, self.under_way), 0.0)
         if self.pulsed:
-            self.most = np.maximum(self.most, span("pulse")[1])
+            self.most = np.maximum(self.most, each("pulse")[1])
 
     def _readings(self, sensor, full):
-        off = [np.abs(v) for v in self.span("sensor.offset", sensor.offset)]
-        self.needed = full(SIGMAS * self.span("sensor.noise", sensor.noise)[1])
-        self.needed = self.needed + np.maximum(*off)
+        span = lambda name: self.span(f"sensor.{name}", getattr(sensor, name))
+        self.needed = full(SIGMAS * span("noise")[1]) + np.maximum(*map(np.abs, span("offset")))
         self.top = np.full(self.tanks, np.inf)
         if sensor.bits:
-            gain, scale = (
-                self.span(f"sensor.{k}", getattr(sensor, k)) for k in ("gain", "full_scale")
-            )
+            gain, scale = span("gain"), span("full_scale")
             self.needed = self.needed + 0.5 * full(gain[1]) * scale[1] / 2**sensor.bits
             self.top = full(gain[0]) * scale[0]
 
-    def disturbed(self, inflow, volume, drawn):
+    def disturbed(self, inflow, volume, draws):
         """Take the inflow disturbances of the case."""
         full = lambda v: np.broadcast_to(np.asarray(v, dtype=float), (self.tanks,))
-        self.entering, self.leaving = full(inflow[1]), full(inflow[0])
-        self.volume, self.drawn = full(volume), bool(drawn)
-        self.inflow, self.draw = (full(getattr(self.guard, k)) for k in ("inflow", "draw"))
+        self.leaving, self.entering, self.volume = full(inflow[0]), full(inflow[1]), full(volume)
+        self.draws = bool(draws)
+        self.inflow, self.draw = full(self.filter.inflow), full(self.filter.draw)
 
-    def brought(self, tank, inputs):
+    def pumped(self, tank, inputs):
         """The most that pumps at `inputs` (m) [V] bring [cm/s]."""
         return sum(b * max(inputs[j], 0.0) for j, (_, b) in self.gains[tank].items())
 
@@ -305,7 +307,7 @@ class _Rig:
         for other, least, most in self.pipes[tank]:
             s = _pipe_root(others[other] - h, self.knee)
             rate += most * s if s >= 0.0 else least * s if leaves else 0.0
-        for source, _, most in self.into[tank]:
+        for source, (_, most) in self.into[tank].items():
             rate += most * _root(others[source], self.knee) if most > 0.0 else 0.0
         return float(rate)
 
@@ -317,38 +319,36 @@ class _Rig:
             s = _pipe_root(others[other] - h, self.knee)
             gives = others[other] >= self.empty[other]
             rate += most * s if s < 0.0 else least * s if gives else 0.0
-        for source, least, _ in self.into[tank]:
+        for source, (least, _) in self.into[tank].items():
             if others[source] >= self.empty[source]:
                 rate += least * _root(others[source], self.knee)
         return float(rate)
 
     def neighbours(self, tank):
         """Tanks on whose levels the rate of this one depends."""
-        return {k for k, *_ in self.into[tank]} | {k for k, *_ in self.pipes[tank]}
+        return set(self.into[tank]) | {k for k, *_ in self.pipes[tank]}
+
+    def rounding(self, tank, level):
+        return ROUNDING * max(self.out[tank] * _root(level, self.knee), 1e-9)
 
     def uncovered(self):
         """What the filter does not count on, of the whole rig; or ""."""
-        guard, plant = self.guard, self.plant
-        for name in SHAPE:
-            if any(getattr(end, name) != getattr(plant, name) for end in (guard.least, guard.most)):
-                return f"not covered: plant.{name} differs from that of the safety filter"
-        ends = {name: self.span(f"plant.{name}", getattr(plant, name)) for name in FLOWS}
         self.faults_lower_levels = False  # outside the box, but only lowering levels
-        if why := self._outside(ends, ""):
-            return why
-        if self.faults is not None and (why := self._faulty(ends)):
-            return why
-        return ""
+        return _first_failure(self._covered())
 
-    def _faulty(self, ends):
-        """Why the faults of a case leave the box, or ""; `ends` : {leaf: (lower, upper)}."""
-        entries = zip(self.faults.windows, self.faults.factor, self.faults.extra)
+    def _covered(self):
+        """(holds, reason): the plant, its box and its faults are in the filter's box."""
+        for name in SHAPE:
+            same = all(getattr(e, name) == getattr(self.plant, name) for e in _ends(self.filter))
+            yield same, f"not covered: plant.{name} differs from that of the safety filter"
+        ends = {name: self.span(f"plant.{name}", getattr(self.plant, name)) for name in FLOWS}
+        yield from self._inside(ends, "")
+        faults = self.faults
         counted = {name: (low.copy(), high.copy()) for name, (low, high) in ends.items()}
+        entries = () if faults is None else zip(faults.windows, faults.factor, faults.extra)
         for (name, *_), factor, extra in entries:
-            field, _, entry = name.partition("[")
-            if field not in ends:
-                return f"not covered: fault of plant.{name}"
-            at = int(entry.rstrip("]")) if entry else ...
+            field, at = _at(name)
+            yield field in ends, f"not covered: fault of plant.{name}"
             low, high = (end[at] for end in ends[field])
             moved = factor * low + extra, factor * high + extra
             wide = min(low, *moved), max(high, *moved)
@@ -361,32 +361,31 @@ class _Rig:
                 gentle = counted[field][0][at], wide[1]
             self.faults_lower_levels |= gentle != wide
             counted[field][0][at], counted[field][1][at] = gentle
-            if why := self._outside(counted, "fault of "):
-                return why
-        return ""
+            yield from self._inside(counted, "fault of ")
 
-    def _outside(self, ends, what):
-        """The first coefficient outside the filter's box, or ""."""
+    def _inside(self, ends, what):
+        """(holds, reason) of each coefficient being in the filter's box."""
         for name, (low, high) in ends.items():
-            least, most = (np.asarray(getattr(p, name), float) for p in _ends(self.guard))
+            least, most = (np.asarray(getattr(p, name), float) for p in _ends(self.filter))
             low, high = np.broadcast_to(low, least.shape), np.broadcast_to(high, most.shape)
             slack = 1e-12 * np.maximum(np.abs(low), np.abs(high))
-            bad = ~((least <= low + slack) & (most >= high - slack))
-            if name == "split":  # a share above 1 is none
-                bad = ~((least <= low + slack) & (most >= np.minimum(high, 1.0) - slack))
-            if bad.any():
-                at = np.argwhere(bad)[0]
-                place = f"[{at[0]}]" if len(at) else ""
-                a, b, c, d = (float(v[tuple(at)]) for v in (low, high, least, most))
-                return (
-                    f"not covered: {what}plant.{name}{place} from {a:.4g} to {b:.4g}, the filter"
-                    f" counts on {c:.4g} to {d:.4g}"
-                )
-        return ""
+            top = np.minimum(high, 1.0) if name == "split" else high  # a share above 1 is none
+            for at in np.ndindex(least.shape):
+                a, b, c, d = (float(v[at]) for v in (low, high, least, most))
+                holds = c <= a + slack[at] and d >= float(top[at]) - slack[at]
+                place = f"plant.{name}" + "".join(f"[{k}]" for k in at)
+                counts = f"the filter counts on {c:.4g} to {d:.4g}"
+                yield holds, f"not covered: {what}{place} from {a:.4g} to {b:.4g}, {counts}"
 
 
-def _ends(guard):
-    return guard.least, guard.most
+def _add(table, key, ends):
+    """Add (least, largest) to those that a table has of a key."""
+    before = table.get(key, (0.0, 0.0))
+    table[key] = (before[0] + float(ends[0]), before[1] + float(ends[1]))
+
+
+def _ends(safety_filter):
+    return safety_filter.least, safety_filter.most
 
 
 class _Hypotheses(NamedTuple):
@@ -397,7 +396,7 @@ class _Hypotheses(NamedTuple):
     bounds: np.ndarray
     dry: np.ndarray
     begin: np.ndarray
-    own: bool
+    of_case: bool
 
 
 class _JointResult(NamedTuple):
@@ -422,17 +421,13 @@ def _joint(rig, start, claimed):
     dry = np.ones(n, dtype=bool)
     while True:
         bounds = np.full(n, np.inf)
-        for i in range(n):
-            if i in inside:
-                bounds[i] = level[i] + rig.spare[i]
-            elif i in bounded:
-                bounds[i] = rig.reach[i]
-        at = _Hypotheses(
-            bounds, dry & (bounds <= rig.rim * (1.0 + 1e-12)), begin, start is not None
-        )
-        found = [_upper(rig, i, level[i], at) for i in range(n)]
-        alone = found if alone is None else alone
-        outside = {i for i in inside if found[i][0]}
+        for i in bounded | inside:
+            bounds[i] = level[i] + rig.spare[i] if i in inside else rig.reach[i]
+        still = dry & (bounds <= rig.rim * (1.0 + 1e-12))
+        at = _Hypotheses(bounds, still, begin, start is not None)
+        upper = [_upper(rig, i, level[i], at) for i in range(n)]
+        alone = upper if alone is None else alone
+        outside = {i for i in inside if upper[i][0]}
         stays = {i: _stays(rig, i, at) for i in bounded - inside}
         loose = {i for i, how in stays.items() if not how}
         wet = {i for i in range(n) if dry[i] and (i in loose or stays.get(i) == "rim")}
@@ -440,13 +435,13 @@ def _joint(rig, start, claimed):
             break
         inside, bounded, dry = inside - outside, bounded - loose, dry.copy()
         dry[list(wet)] = False
-    reasons = [found[i][0] if i not in inside else "" for i in range(n)]
+    reasons = [upper[i][0] if i not in inside else "" for i in range(n)]
     for i in (i for i in range(n) if reasons[i] and not alone[i][0]):
         lost = sorted(k for k in range(n) if k not in inside and k != i)
         near = [k for k in lost if k in rig.neighbours(i)] or lost
         reasons[i] = f"relies on tank {', '.join(str(k + 1) for k in near)}, not proved"
     reasons = [alone[i][0] or reasons[i] for i in range(n)]
-    return _JointResult(reasons, [theorem for _, theorem in found], bounds)
+    return _JointResult(reasons, [theorem for _, theorem in upper], bounds)
 
 
 def _stays(rig, i, at):
@@ -456,37 +451,31 @@ def _stays(rig, i, at):
     top = rig.reach[i] - rig.spare[i]
     if not (at.begin[i] <= top * (1.0 + 1e-12) and math.isfinite(top) and top > 0.0):
         return ""
-    if _spilled(rig, i, at):
+    if _first_failure(_entering(rig, i, at)):
         return ""
-    if rig.rise(i, top, at.bounds) + rig.brought(i, rig.most) <= _rounding(rig, i, top):
+    if rig.rise(i, top, at.bounds) + rig.pumped(i, rig.most) <= rig.rounding(i, top):
         return "flows"
     return "rim" if rig.plant.overflow and rig.reach[i] >= rig.highest_rim[i] else ""
 
 
-def _rounding(rig, i, level):
-    return ROUNDING * max(rig.out[i] * _root(level, rig.knee), 1e-9)
-
-
-def _spilled(rig, i, at):
-    """Why more may enter than the filter counts on, overflow of other tanks included, or ""."""
-    entering = rig.entering[i]
-    if rig.plant.overflow:
-        for (a, b), share in zip(rig.plant.spills, rig.caught):
-            if b == i and not at.dry[a]:
-                if _ringed(rig.plant.spills, i):
-                    return "not covered: a ring of tanks that overflow into each other"
-                if not at.begin[a] + rig.spare[a] <= rig.rim[a] * (1.0 + 1e-12):
-                    return f"not covered: volumes that overflow at once from tank {a + 1}"
-                if why := _spilled(rig, a, at):
-                    return why
-                over = rig.rise(a, rig.rim[a], at.bounds) + rig.brought(a, rig.most)
-                entering += share * max(over, 0.0) * float(np.asarray(rig.guard.most.area)[a])
-    if not entering <= rig.inflow[i] * (1.0 + ROUNDING):
-        return f"{entering:.4g} cm^3/s may enter, the filter counts on {rig.inflow[i]:.4g}"
+def _entering(rig, i, at):
+    """(holds, reason): no more enters than the filter counts on, overflow of others included."""
+    entering, counts = rig.entering[i], "the filter counts on"
+    for (a, b), share in zip(rig.plant.spills, rig.caught) if rig.plant.overflow else ():
+        if b != i or at.dry[a]:
+            continue
+        ringed = _ringed(rig.plant.spills, i)
+        yield not ringed, "not covered: a ring of tanks that overflow into each other"
+        below = at.begin[a] + rig.spare[a] <= rig.rim[a] * (1.0 + 1e-12)
+        yield below, f"not covered: volumes that overflow at once from tank {a + 1}"
+        yield from _entering(rig, a, at)
+        over = rig.rise(a, rig.rim[a], at.bounds) + rig.pumped(a, rig.most)
+        entering += share * max(over, 0.0) * float(np.asarray(rig.filter.most.area)[a])
+    reason = f"{entering:.4g} {rig.unit}^3/s may enter, {counts} {rig.inflow[i]:.4g}"
+    yield entering <= rig.inflow[i] * (1.0 + ROUNDING), reason
     risen = rig.volume[i] / rig.area[i]
-    if not risen <= rig.spare[i] * (1.0 + ROUNDING):
-        return f"inflow pulses raise it by {risen:.4g} cm, the filter counts on {rig.spare[i]:.4g}"
-    return ""
+    reason = f"inflow pulses raise it by {risen:.4g} {rig.unit}, {counts} {rig.spare[i]:.4g}"
+    yield risen <= rig.spare[i] * (1.0 + ROUNDING), reason
 
 
 def _ringed(spills, tank):
@@ -504,140 +493,143 @@ def _upper(rig, i, level, at):
     """(why the limit of a tank is not proved with the others at their bounds, or ""; the
     theorem).
     """
-    bounds = at.bounds
-    if not at.begin[i] <= level * (1.0 + 1e-12):
-        return f"start at {at.begin[i]:.4g} cm, above the limit {level:.4g} cm", ""
-    if why := _spilled(rig, i, at):
+    if why := _first_failure(_begins(rig, i, level, at)):
         return why, ""
-    if not all(math.isfinite(bounds[k]) for k in rig.neighbours(i)):
-        return "a tank beside it has no bound", ""
     if i not in rig.held:
-        return _unheld(rig, i, level, bounds)
-    if why := _readable(rig, i, bounds):
+        theorem = "full pumps stay below" if rig.gains[i] else ""
+        theorem = theorem or "no pump, and its inflow cannot pass the limit"
+        why = _rim(rig, i, level, rig.rise(i, level, at.bounds) + rig.pumped(i, rig.most))
+        return why, "" if why else theorem
+    if why := _first_failure(_readable(rig, i, at.bounds)):
         return why, ""
     if rig.pulsed:
         return "not covered: a pulse dead zone pays out more than was commanded", ""
     if rig.slope[i] > 0.0:
-        return _second_order(rig, i, at), "Theorem 2"
-    if not rig.gains[i]:
-        return "no row: it has neither a pump nor a k1", ""
-    entering = rig.rise(i, level, bounds) + _row_inflow(rig, i, rig.lowest)
-    if not entering <= _rounding(rig, i, level):
-        return _rim(rig, i, level, entering), ""
-    together = len(rig.gains[i]) > 1 and i not in rig.divided
-    if together and any(rig.lowest[j] > 0.0 and j not in rig.running for j in rig.gains[i]):
-        return "not covered: lower limits above 0 of several pumps of one tank", ""
-    if together and any(rig.stronger[j] for j in rig.gains[i]):
-        return "not covered: uncertain lower limits above 0 of several pumps of one tank", ""
+        return _first_failure(_second_order(rig, i, at)), "Theorem 2"
+    if why := _first_failure(_row(rig, i, level, at)):
+        return why, ""
     lag = max(rig.lag[1][j] for j in rig.gains[i])
     if rig.delay[1] == 0.0 and lag == 0.0:
-        if not rig.rate[i] * rig.hold <= 1.0 + 1e-12:
-            return f"kappa T = {rig.rate[i] * rig.hold:.3g} above 1", ""
-        return "", "Theorem 1"
+        why = _first_failure([_rate_of_hold(rig, i, "kappa T")])
+        return why, "" if why else "Theorem 1"
     if rig.predicted:
-        return _predicted(rig, i, level, at), "Theorem 5"
-    return _late(rig, i, level, lag, at), "Theorem 4" if lag > 0.0 else "Theorem 3"
+        return _first_failure(_predicted(rig, i, level, at)), "Theorem 5"
+    theorem = "Theorem 4" if lag > 0.0 else "Theorem 3"
+    return _first_failure(_late(rig, i, level, lag, at)), theorem
+
+
+def _begins(rig, i, level, at):
+    reason = f"start at {at.begin[i]:.4g} {rig.unit}, above the limit {level:.4g} {rig.unit}"
+    yield at.begin[i] <= level * (1.0 + 1e-12), reason
+    yield from _entering(rig, i, at)
+    bounded = all(math.isfinite(at.bounds[k]) for k in rig.neighbours(i))
+    yield bounded, "a tank beside it has no bound"
+
+
+def _rate_of_hold(rig, i, what):
+    value = rig.rate[i] * rig.hold
+    return value <= 1.0 + 1e-12, f"{what} = {value:.3g} above 1"
 
 
 def _rim(rig, i, level, entering):
+    """The rim condition of a tank into which `entering` [cm/s] more enters than leaves, or ""."""
+    if entering <= rig.rounding(i, level):
+        return ""
     leaves = rig.out[i] * _root(level, rig.knee)
-    return (
-        f"rim condition: {entering + leaves:.4g} cm/s may enter at the limit, {leaves:.4g} leave"
-        " for certain"
-    )
+    enters = f"rim condition: {entering + leaves:.4g} {rig.unit}/s may enter at the limit"
+    return f"{enters}, {leaves:.4g} leave for certain"
 
 
-def _unheld(rig, i, level, bounds):
-    """Of a tank without a row: with pumps at full it cannot rise at its limit."""
-    entering = rig.rise(i, level, bounds) + rig.brought(i, rig.most)
-    if not entering <= _rounding(rig, i, level):
-        return _rim(rig, i, level, entering), ""
-    if rig.gains[i]:
-        return "", "full pumps stay below"
-    return "", "no pump, and its inflow cannot pass the limit"
+def _row(rig, i, level, at):
+    """(holds, reason) of what each row on a tank's own pumps needs."""
+    gains = rig.gains[i]
+    yield gains, "no row: it has neither a pump nor a k1"
+    why = _rim(rig, i, level, rig.rise(i, level, at.bounds) + _row_inflow(rig, i, rig.lowest))
+    yield not why, why
+    together = len(gains) > 1 and i not in rig.divided
+    stoppable = not any(rig.lowest[j] > 0.0 and j not in rig.running for j in gains)
+    reason = "lower limits above 0 of several pumps of one tank"
+    yield not together or stoppable, f"not covered: {reason}"
+    sure = not any(rig.stronger[j] for j in gains)
+    yield not together or sure, f"not covered: uncertain {reason}"
 
 
 def _readable(rig, i, bounds):
-    """Why the row of a tank may count on readings or bounds that do not hold, or ""."""
-    near = rig.neighbours(i)
+    """(holds, reason): the row of a tank counts on readings and bounds that hold."""
+    near, unit, counts = rig.neighbours(i), rig.unit, "the filter counts on"
     for k in sorted({i} | near):
-        if not rig.band[k] >= rig.needed[k] * (1.0 - ROUNDING):
-            return (
-                f"noise band {rig.band[k]:.3g} cm below {SIGMAS:g} standard deviations of the"
-                f" noise, half an ADC step and the offset, {rig.needed[k]:.3g} cm"
-            )
-        if not bounds[k] <= rig.top[k] * (1.0 + 1e-12):
-            return f"level {bounds[k]:.4g} cm above what the sensor can read, {rig.top[k]:.4g} cm"
+        yield (
+            rig.band[k] >= rig.needed[k] * (1.0 - ROUNDING),
+            f"noise band {rig.band[k]:.3g} {unit} below {SIGMAS:g} standard deviations of the"
+            f" noise, half an ADC step and the offset, {rig.needed[k]:.3g} {unit}",
+        )
+        reason = f"above what the sensor can read, {rig.top[k]:.4g} {unit}"
+        readable = bounds[k] <= rig.top[k] * (1.0 + 1e-12)
+        yield readable, f"level {bounds[k]:.4g} {unit} {reason}"
     for k in sorted(near.union(*(rig.neighbours(k) for k in near))):
-        if not rig.reach[k] >= bounds[k] * (1.0 - ROUNDING):
-            return (
-                f"tank {k + 1} may reach {bounds[k]:.4g} cm, the filter counts on"
-                f" {rig.reach[k]:.4g} cm"
-            )
-    for j in range(len(rig.dead)):
-        if not rig.offset[j] <= rig.dead[j] * (1.0 + 1e-12):
-            return (
-                f"pump {j + 1} may move liquid above {rig.dead[j]:.4g} V, the filter counts on"
-                f" {rig.offset[j]:.4g} V"
-            )
-    if near and not float(rig.guard.age) >= rig.delay[1] * (1.0 - ROUNDING):
-        return f"dead time {rig.delay[1]:.4g} s, the filter counts on {float(rig.guard.age):.4g} s"
-    if float(rig.guard.age) < 1e5 and any(
+        reason = f"may reach {bounds[k]:.4g} {unit}, {counts} {rig.reach[k]:.4g} {unit}"
+        yield rig.reach[k] >= bounds[k] * (1.0 - ROUNDING), f"tank {k + 1} {reason}"
+    for j, dead in enumerate(rig.dead):
+        reason = f"may move liquid above {dead:.4g} V, {counts} {rig.offset[j]:.4g} V"
+        yield rig.offset[j] <= dead * (1.0 + 1e-12), f"pump {j + 1} {reason}"
+    age = float(rig.filter.age)
+    yield (
+        not near or age >= rig.delay[1] * (1.0 - ROUNDING),
+        f"dead time {rig.delay[1]:.4g} s, {counts} {age:.4g} s",
+    )
+    beyond = any(
         rig.under_way[j] > max(rig.capped[j], 0.0) or rig.high[j] > rig.capped[j]
         for k in near
         for j in rig.gains[k]
-    ):
-        return "not covered: a pump of a tank beside it may run above its upper limit"
-    return ""
+    )
+    reason = "not covered: a pump of a tank beside it may run above its upper limit"
+    yield age >= 1e5 or not beyond, reason
 
 
 def _second_order(rig, i, at):
-    """Why Theorem 2 does not hold for tank i, or ""."""
-    k1, top, knee, sources = rig.slope[i], rig.limit[i], rig.knee, rig.into[i]
-    ring = {i} | {j for j, *_ in sources}
-    if rig.gains[i] or not sources:
-        return "not covered: a second-order row of a tank with a pump or without tanks above"
-    if rig.delay[1] > 0.0 or np.any(rig.lag[1] > 0.0):
-        return "not covered: second-order rows with dead time or lag"
-    if any(rig.pipes[k] for k in ring):
-        return "not covered: second-order rows with pipes"
-    if any(rig.into[j] for j, *_ in sources):
-        return "not covered: second-order rows where the tanks above are fed by others"
-    if any(rig.inflow[k] > 0.0 or rig.spare[k] > 0.0 for k in ring):
-        return "not covered: second-order rows with inflow disturbances"
-    if why := next((why for j, *_ in sources if (why := _spilled(rig, j, at))), ""):
-        return why
-    pumps = {p for j, *_ in sources for p in rig.gains[j]}
-    if any(rig.lowest[p] > 0.0 for p in pumps):
-        return "not covered: second-order rows on pumps that cannot stop"
-    if not rig.rate[i] * rig.hold <= 1.0 + 1e-12:
-        return f"k2 T = {rig.rate[i] * rig.hold:.3g} above 1"
+    """(holds, reason) of Theorem 2 for tank i."""
+    k1, top, knee, unit = rig.slope[i], rig.limit[i], rig.knee, rig.unit
+    sources = {j: most for j, (_, most) in rig.into[i].items()}
+    ring = {i, *sources}
+    row = "second-order row"
+    alone = not rig.gains[i] and sources
+    yield alone, f"not covered: a {row} of a tank with a pump or without tanks above"
+    late = rig.delay[1] > 0.0 or np.any(rig.lag[1] > 0.0)
+    yield not late, f"not covered: {row}s with dead time or lag"
+    yield not any(rig.pipes[k] for k in ring), f"not covered: {row}s with pipes"
+    fed = any(rig.into[j] for j in sources)
+    yield not fed, f"not covered: {row}s where the tanks above are fed by others"
+    still = all(rig.inflow[k] <= 0.0 and rig.spare[k] <= 0.0 for k in ring)
+    yield still, f"not covered: {row}s with inflow disturbances"
+    for j in sources:
+        yield from _entering(rig, j, at)
+    stop = all(rig.lowest[p] <= 0.0 for j in sources for p in rig.gains[j])
+    yield stop, f"not covered: {row}s on pumps that cannot stop"
+    yield _rate_of_hold(rig, i, "k2 T")
     s, a0 = (lambda h: _root(h, knee)), SHALLOW * _root(top, knee)
-    flows = {j: most * s(rig.reach[j]) for j, _, most in sources}
+    flows = {j: most * s(rig.reach[j]) for j, most in sources.items()}
     full, leaves = sum(flows.values()), rig.out[i] * s(top)
-    shallow = max([knee, *(rig.empty[j] for j, *_ in sources)])
-    if not a0 * a0 >= shallow:
-        return f"(C3) a0^2 = {a0 * a0:.3g} cm below {shallow:.3g} cm, where outflow is less"
-    for j, _, most in sources:
-        if not leaves - (full - flows[j]) > most * a0:
-            return f"(C3) {leaves - full + flows[j]:.3g} not above {most * a0:.3g} cm/s"
-    if not k1 * top >= full * (1.0 - ROUNDING):
-        return f"(C2) k1 H = {k1 * top:.4g} below F = {full:.4g} cm/s"
-    star, drained = _falling(rig.out[i], k1, top, full, knee), 0.0
-    drained = sum(0.5 * most * rig.out[j] for j, _, most in sources)
-    if not k1 * k1 * (top - star) <= drained:
-        return f"(C1) k1^2 (H - h*) = {k1 * k1 * (top - star):.4g} above D = {drained:.4g} cm/s^2"
+    shallow = max([knee, *(rig.empty[j] for j in sources)])
+    less = "where outflow is less"
+    yield a0 * a0 >= shallow, f"(C3) a0^2 = {a0 * a0:.3g} {unit} below {shallow:.3g} {unit}, {less}"
+    for j, most in sources.items():
+        rest = leaves - (full - flows[j])
+        yield rest > most * a0, f"(C3) {rest:.3g} not above {most * a0:.3g} {unit}/s"
+    reason = f"(C2) k1 H = {k1 * top:.4g} below F = {full:.4g} {unit}/s"
+    yield k1 * top >= full * (1.0 - ROUNDING), reason
+    star = _falling(rig.out[i], k1, top, full, knee)
+    drained = sum(0.5 * most * rig.out[j] for j, most in sources.items())
+    steep = k1 * k1 * (top - star)
+    reason = f"(C1) k1^2 (H - h*) = {steep:.4g} above D = {drained:.4g} {unit}/s^2"
+    yield steep <= drained, reason
     lowest = star - rig.hold * (full + rig.out_most[i] * s(top)) - 2.0 * rig.band[i]
-    if not lowest >= max(knee, rig.empty[i]):
-        return f"(C4) the row acts down to {lowest:.3g} cm, where outflow is less"
+    reason = f"(C4) the row acts down to {lowest:.3g} {unit}, {less}"
+    yield lowest >= max(knee, rig.empty[i]), reason
     steep = rig.out[i] / (2.0 * math.sqrt(lowest))
-    if not k1 >= steep:
-        return f"(C4) k1 = {k1:.4g} below the slope of the outflow, {steep:.4g} 1/s"
+    yield k1 >= steep, f"(C4) k1 = {k1:.4g} below the slope of the outflow, {steep:.4g} 1/s"
     g = rig.out[i] * s(at.begin[i]) + k1 * (top - at.begin[i])
-    g -= sum(most * max(s(at.begin[j]), a0) for j, _, most in sources)
-    if not g >= -1e-12 * full:
-        return "start: the tanks above hold more than can be stopped in time"
-    return ""
+    g -= sum(most * max(s(at.begin[j]), a0) for j, most in sources.items())
+    yield g >= -1e-12 * full, "start: the tanks above hold more than can be stopped in time"
 
 
 def _falling(out, k1, top, full, knee):
@@ -645,62 +637,59 @@ def _falling(out, k1, top, full, knee):
     f = lambda h: out * _root(h, knee) + k1 * (top - h)
     if f(top) >= full:
         return top
-    # f is concave and f(0) >= F: one crossing
-    low, high = 0.0, top
+    return _bisected(lambda h: f(h) >= full, 0.0, top)  # f is concave and f(0) >= F: one crossing
+
+
+def _bisected(below, low, high):
+    """The largest number between low and high up to which below(number) is true."""
     for _ in range(200):
         mid = 0.5 * (low + high)
-        low, high = (mid, high) if f(mid) >= full else (low, mid)
+        low, high = (mid, high) if below(mid) else (low, mid)
     return low
 
 
 def _late(rig, i, level, lag, at):
-    """Why Theorem 3 or, with a lag [s], Theorem 4 does not hold for tank i, or ""."""
-    what, kappa, pumps = "dead time or lag", rig.rate[i], rig.gains[i]
-    if rig.pipes[i]:
-        return f"not covered: a pipe with {what}"
-    if rig.spare[i] > 0.0:
-        return f"not covered: inflow pulses with {what}"
-    low, high = rig.lag[0], rig.lag[1]
-    if len(pumps) > 1 and i not in rig.divided:
-        ends = {float(v) for j in pumps for v in (low[j], high[j])}
-        if len(ends) > 1:
-            return "not covered: pumps of one tank whose lags differ, in one row"
-    empty = rig.empty[i]
-    if not level > empty:
-        return f"limit {level:.3g} cm below {empty:.3g} cm, where outflow is less"
+    """(holds, reason) of Theorem 3 or, with a lag [s], Theorem 4 for tank i."""
+    what, kappa, pumps, unit = "dead time or lag", rig.rate[i], rig.gains[i], rig.unit
+    yield not rig.pipes[i], f"not covered: a pipe with {what}"
+    yield rig.spare[i] <= 0.0, f"not covered: inflow pulses with {what}"
+    lags = {float(end[j]) for j in pumps for end in rig.lag}
+    one_row = len(pumps) == 1 or i in rig.divided or len(lags) <= 1
+    yield one_row, "not covered: pumps of one tank whose lags differ, in one row"
+    empty, less = rig.empty[i], "where outflow is less"
+    yield level > empty, f"limit {level:.3g} {unit} below {empty:.3g} {unit}, {less}"
     steep = rig.out[i] * _root(level, rig.knee) / (level - empty)
-    if not kappa >= steep * (1.0 - ROUNDING):
-        return f"(N) kappa {kappa:.4g} below c_min s(H)/(H - empty) = {steep:.4g} 1/s"
+    reason = f"(N) kappa {kappa:.4g} below c_min s(H)/(H - empty) = {steep:.4g} 1/s"
+    yield kappa >= steep * (1.0 - ROUNDING), reason
     samples = math.ceil(rig.delay[1] / rig.hold - 1e-6)
     age = samples * rig.hold + rig.hold
     if lag > 0.0:
-        if not max(rig.knee, empty) <= 0.25 * level:
-            return f"not covered: a limit below 4 x {max(rig.knee, empty):.3g} cm with lag"
-        far = [k for k in rig.neighbours(i) if not _far(rig, k)]
-        if far:
-            return "not covered: lag where the rates of other tanks bound their levels"
-        sigma = _sigma(kappa, lag, age)
-        if not sigma > 0.0:
-            return f"kappa {kappa:.4g} above its bound {_rate(_best(lag, age), lag, age):.4g} 1/s"
-        filled = _row_inflow(rig, i, rig.most) + rig.rise(i, 0.0, at.bounds)
-        if not filled <= 0.75 * sigma * level:
-            return (
-                f"(F) {filled:.3g} cm/s may enter, above 3/4 sigma H = {0.75 * sigma * level:.3g}"
-            )
+        shallow = max(rig.knee, empty)
+        reason = f"not covered: a limit below 4 x {shallow:.3g} {unit} with lag"
+        yield shallow <= 0.25 * level, reason
+        far = all(_far(rig, k) for k in rig.neighbours(i))
+        yield far, "not covered: lag where the rates of other tanks bound their levels"
+        sigma, bound = _sigma(kappa, lag, age), _rate(_best(lag, age), lag, age)
+        yield sigma > 0.0, f"kappa {kappa:.4g} above its bound {bound:.4g} 1/s"
+        filled, most = (
+            _row_inflow(rig, i, rig.most) + rig.rise(i, 0.0, at.bounds),
+            0.75 * sigma * level,
+        )
+        reason = f"(F) {filled:.3g} {unit}/s may enter, above 3/4 sigma H = {most:.3g}"
+        yield filled <= most, reason
     else:
         bound = samples**samples / (samples + 1) ** (samples + 1)
-        if not kappa * rig.hold <= bound * (1.0 + 1e-12):
-            return f"kappa {kappa:.4g} above its bound {bound / rig.hold:.4g} 1/s"
-    brought = _row_inflow(rig, i, rig.under_way)
+        reason = f"kappa {kappa:.4g} above its bound {bound / rig.hold:.4g} 1/s"
+        yield kappa * rig.hold <= bound * (1.0 + 1e-12), reason
+    entering = _row_inflow(rig, i, rig.under_way)
     allowed = -rig.rise(i, level, at.bounds)  # by (N), at or below H
-    if at.own:
+    if at.of_case:
         # concave in the level on either side of `empty`
         others = at.bounds if lag > 0.0 else _soon(rig, at)
         ends = {0.0, *(min(at.begin[i], h) for h in (np.nextafter(empty, 0.0), empty, level))}
         allowed = min(kappa * (level - h) - rig.rise(i, h, others) for h in ends)
-    if not brought <= allowed + _rounding(rig, i, level):
-        return f"(S) start: {brought:.4g} cm/s under way, {max(allowed, 0.0):.4g} allowed"
-    return ""
+    reason = f"{entering:.4g} {unit}/s under way, {max(allowed, 0.0):.4g} allowed"
+    yield entering <= allowed + rig.rounding(i, level), f"(S) start: {reason}"
 
 
 def _row_inflow(rig, i, inputs):
@@ -708,8 +697,8 @@ def _row_inflow(rig, i, inputs):
     if each used the same part of its share as the pump that uses the largest part.
     """
     if i not in rig.divided:
-        return rig.brought(i, inputs)
-    full, shares = rig.brought(i, rig.capped), [0.0]
+        return rig.pumped(i, inputs)
+    full, shares = rig.pumped(i, rig.capped), [0.0]
     for j, (_, b) in rig.gains[i].items():
         if b * max(inputs[j], 0.0) > 0.0:
             share = b * max(rig.capped[j], 0.0) / full if full > 0.0 else 0.0
@@ -720,19 +709,15 @@ def _row_inflow(rig, i, inputs):
 def _soon(rig, at):
     """(n,) levels [cm] that the tanks can have until the first input of the filter ends."""
     age = rig.delay[1] + rig.hold
-    risen = [
-        at.begin[k]
-        + rig.spare[k]
-        + age * (rig.brought(k, rig.most) + max(rig.rise(k, 0.0, at.bounds), 0.0))
-        for k in range(rig.tanks)
-    ]
+    fastest = lambda k: rig.pumped(k, rig.most) + max(rig.rise(k, 0.0, at.bounds), 0.0)
+    risen = [at.begin[k] + rig.spare[k] + age * fastest(k) for k in range(rig.tanks)]
     return np.minimum(at.bounds, risen)
 
 
 def _far(rig, k):
     """Whether the filter bounds the level of tank k by its `reach` alone, whatever it reads."""
-    rate = rig.brought(k, rig.capped) + max(rig.rise(k, 0.0, rig.reach), 0.0)
-    return (rig.hold + float(rig.guard.age)) * rate + rig.spare[k] >= rig.reach[k]
+    rate = rig.pumped(k, rig.capped) + max(rig.rise(k, 0.0, rig.reach), 0.0)
+    return (rig.hold + float(rig.filter.age)) * rate + rig.spare[k] >= rig.reach[k]
 
 
 def _rate(sigma, lag, age):
@@ -741,112 +726,99 @@ def _rate(sigma, lag, age):
 
 def _best(lag, age):
     """The sigma that allows the largest kappa: where the slope of `_rate` is 0."""
-    low, high = 0.0, 1.0 / lag
-    for _ in range(200):
-        mid = 0.5 * (low + high)
-        rising = (1.0 - 2.0 * lag * mid) - age * mid * (1.0 - lag * mid) > 0.0
-        low, high = (mid, high) if rising else (low, mid)
-    return low
+    slope = lambda sigma: (1.0 - 2.0 * lag * sigma) - age * sigma * (1.0 - lag * sigma)
+    return _bisected(lambda sigma: slope(sigma) > 0.0, 0.0, 1.0 / lag)
 
 
 def _sigma(kappa, lag, age):
     """The largest sigma [1/s] with kappa <= sigma (1 - tau sigma) e^(-sigma a), 0 if none."""
-    low, high = _best(lag, age), 1.0 / lag
-    if not kappa <= _rate(low, lag, age) * (1.0 + 1e-12):
+    best = _best(lag, age)
+    if not kappa <= _rate(best, lag, age) * (1.0 + 1e-12):
         return 0.0
-    for _ in range(200):
-        mid = 0.5 * (low + high)
-        low, high = (mid, high) if _rate(mid, lag, age) >= kappa else (low, mid)
-    return low
+    return _bisected(lambda sigma: _rate(sigma, lag, age) >= kappa, best, 1.0 / lag)
 
 
 def _predicted(rig, i, level, at):
-    """Why Theorem 5 does not hold for tank i, or ""."""
-    if any(rig.pipes) or np.any(rig.lag[1] > 0.0) or rig.zoned or np.any(rig.offset != 0.0):
-        return "not covered: prediction with pipes, lag or a dead zone"
-    if np.any(rig.spare > 0.0) or rig.drawn:
-        return "not covered: prediction with inflow pulses"
-    if rig.unsure:
-        return "not covered: prediction with uncertain limits or initial inputs of pumps"
-    if rig.faults_lower_levels or np.any(rig.bottom > 0.0):
-        return "not covered: prediction with faults or low limits"
-    if rig.plant.overflow and not at.bounds[i] <= rig.rim[i]:
-        return "not covered: prediction of a tank that overflows"
-    if not rig.draw[i] <= rig.leaving[i]:
-        return f"{-rig.leaving[i]:.4g} cm^3/s may be drawn, the filter counts on {-rig.draw[i]:.4g}"
-    if not max(abs(d - rig.predicted * rig.hold) for d in rig.delay) <= 1e-6 * rig.hold:
-        return (
-            f"dead time from {rig.delay[0]:.4g} to {rig.delay[1]:.4g} s, the filter predicts"
-            f" {rig.predicted * rig.hold:.4g} s"
-        )
-    if not rig.rate[i] * rig.hold <= 1.0 + 1e-12:
-        return f"kappa T = {rig.rate[i] * rig.hold:.3g} above 1"
-    brought, h = rig.brought(i, rig.under_way), float(at.begin[i])
+    """(holds, reason) of Theorem 5 for tank i."""
+    other = any(rig.pipes) or np.any(rig.lag[1] > 0.0) or rig.zoned or np.any(rig.offset != 0.0)
+    yield not other, "not covered: prediction with pipes, lag or a dead zone"
+    pulses = np.any(rig.spare > 0.0) or rig.draws
+    yield not pulses, "not covered: prediction with inflow pulses"
+    reason = "not covered: prediction with uncertain limits or initial inputs of pumps"
+    yield not rig.unsure, reason
+    lowered = rig.faults_lower_levels or np.any(rig.bottom > 0.0)
+    yield not lowered, "not covered: prediction with faults or low limits"
+    dry = not rig.plant.overflow or at.bounds[i] <= rig.rim[i]
+    yield dry, "not covered: prediction of a tank that overflows"
+    yield _drawn(rig, i)
+    apart = max(abs(d - rig.predicted * rig.hold) for d in rig.delay)
+    reason = f"dead time from {rig.delay[0]:.4g} to {rig.delay[1]:.4g} s, the filter predicts"
+    yield apart <= 1e-6 * rig.hold, f"{reason} {rig.predicted * rig.hold:.4g} s"
+    yield _rate_of_hold(rig, i, "kappa T")
+    entering, h = rig.pumped(i, rig.under_way), float(at.begin[i])
     steps = 500 * rig.predicted
+    reason = f"start: inputs under way may fill it above {level:.4g} {rig.unit}"
     for _ in range(steps):  # from above: a rate falls while a level rises
-        h += rig.delay[1] / steps * max(brought + rig.rise(i, h, at.bounds), 0.0)
-        if not h <= level * (1.0 + ROUNDING):
-            return f"start: inputs under way may fill it above {level:.4g} cm"
-    return ""
+        h += rig.delay[1] / steps * max(entering + rig.rise(i, h, at.bounds), 0.0)
+        yield h <= level * (1.0 + ROUNDING), reason
+
+
+def _drawn(rig, i):
+    """(holds, reason): no more is drawn than the filter counts on."""
+    reason = f"may be drawn, the filter counts on {-rig.draw[i]:.4g}"
+    return rig.draw[i] <= rig.leaving[i], f"{-rig.leaving[i]:.4g} {rig.unit}^3/s {reason}"
 
 
 def _joint_low(rig, start, upper):
     """[why the low limit of each tank is not proved, or ""]: the largest set kept together."""
-    n = rig.tanks
     begin = rig.low if start is None else np.asarray(start, float)
-    reasons = [""] * n
+    reasons = [""] * rig.tanks
     while True:
-        proved = [rig.low[i] if rig.low[i] > 0.0 and not reasons[i] else 0.0 for i in range(n)]
-        after = [
-            reasons[i] or (_lower(rig, i, proved, begin, upper) if rig.low[i] > 0.0 else "")
-            for i in range(n)
-        ]
-        if after == reasons:
+        proved = np.where([bool(why) for why in reasons], 0.0, np.maximum(rig.low, 0.0))
+        before, reasons = reasons, list(reasons)
+        for i in (i for i in range(rig.tanks) if rig.low[i] > 0.0 and not before[i]):
+            reasons[i] = _first_failure(_lower(rig, i, proved, begin, upper))
+        if reasons == before:
             return reasons
-        reasons = after
 
 
 def _lower(rig, i, proved, begin, upper):
-    """Why the low limit of a tank is not kept while the others stay above `proved` (n,) [cm]."""
-    low, gains, kappa, eps = rig.low[i], rig.gains[i], rig.rate[i], rig.band[i]
-    if not begin[i] >= low * (1.0 - 1e-12):
-        return f"start at {begin[i]:.4g} cm, below the low limit"
-    if rig.drawn or rig.faults_lower_levels:
-        return "not covered: a low limit with faults, or inflow pulses that draw liquid"
-    if not rig.draw[i] <= rig.leaving[i]:
-        return f"{-rig.leaving[i]:.4g} cm^3/s may be drawn, the filter counts on {-rig.draw[i]:.4g}"
+    """(holds, reason) of a low limit while the others stay above `proved` (n,) [cm]."""
+    low, gains, kappa, eps, unit = rig.low[i], rig.gains[i], rig.rate[i], rig.band[i], rig.unit
+    reason = f"start at {begin[i]:.4g} {unit}, below the low limit"
+    yield begin[i] >= low * (1.0 - 1e-12), reason
+    reason = "not covered: a low limit with faults, or inflow pulses that draw liquid"
+    yield not (rig.draws or rig.faults_lower_levels), reason
+    yield _drawn(rig, i)
     full = sum(a * max(rig.weakest[j], 0.0) for j, (a, _) in gains.items())
     falling = -rig.fall(i, low, proved)
-    if not falling <= full * (1.0 + ROUNDING) + 1e-15:
-        return f"{falling:.4g} cm/s may leave at the low limit, {full:.4g} enter for certain"
+    reason = f"{falling:.4g} {unit}/s may leave at the low limit, {full:.4g} enter for certain"
+    yield falling <= full * (1.0 + ROUNDING) + 1e-15, reason
     if not gains:
-        return ""
+        return
     near = rig.neighbours(i)
     for k in sorted(near.union({i}, *(rig.neighbours(k) for k in near))):
-        if not rig.bottom[k] <= proved[k]:
-            return f"relies on the low limit of tank {k + 1}, not proved"
-    if not all(math.isfinite(upper.bounds[k]) for k in {i} | near):
-        return "not covered: a low limit where a level has no upper bound"
-    if i not in rig.kept:
-        return "no row of the filter keeps it"
-    if rig.delay[1] > 0.0 or np.any(rig.lag[1] > 0.0) or rig.zoned:
-        return "not covered: low limits with dead time, lag or a dead zone"
-    if why := _readable(rig, i, upper.bounds):
-        return why
-    if not kappa * rig.hold <= 1.0 + 1e-12:
-        return f"kappa T = {kappa * rig.hold:.3g} above 1"
-    if len(gains) > 1 and any(rig.backwards[j] < 0.0 for j in gains):
-        return "not covered: a low limit kept by several pumps that may run backwards"
+        yield rig.bottom[k] <= proved[k], f"relies on the low limit of tank {k + 1}, not proved"
+    bounded = all(math.isfinite(upper.bounds[k]) for k in {i} | near)
+    yield bounded, "not covered: a low limit where a level has no upper bound"
+    yield i in rig.kept, "no row of the filter keeps it"
+    late = rig.delay[1] > 0.0 or np.any(rig.lag[1] > 0.0) or rig.zoned
+    yield not late, "not covered: low limits with dead time, lag or a dead zone"
+    yield from _readable(rig, i, upper.bounds)
+    yield _rate_of_hold(rig, i, "kappa T")
+    forwards = len(gains) == 1 or all(rig.backwards[j] >= 0.0 for j in gains)
+    reason = "not covered: a low limit kept by several pumps that may run backwards"
+    yield forwards, reason
     edges = np.linspace(low - eps, upper.bounds[i] + eps, PARTS + 1)
-    asked = [
+    needed = [
         -rig.fall(i, b + eps, rig.bottom) - kappa * (a - eps - low)
         for a, b in zip(edges[:-1], edges[1:])
     ]
-    asked = np.minimum(asked, full)
+    needed = np.minimum(needed, full)
     share = min(a / b for a, b in gains.values() if b > 0.0)
-    if np.any(~(asked <= share * _caps(rig, i, edges) + 1e-12)):
-        return "floor above cap: the upper limit is kept first"
-    return _other_caps(rig, i, float(asked.max()))
+    allowed = np.all(needed <= share * _caps(rig, i, edges) + 1e-12)
+    yield allowed, "floor above cap: the upper limit is kept first"
+    yield from _caps_of_others(rig, i, float(needed.max()))
 
 
 def _caps(rig, i, edges):
@@ -861,21 +833,17 @@ def _caps(rig, i, edges):
     return np.maximum(allowed, 0.0)
 
 
-def _other_caps(rig, i, asked):
-    """The row of another tank that may stop a pump on which a floor [cm/s] relies, or ""."""
-    if asked <= 0.0:
-        return ""
-    fed = {k for k in range(rig.tanks) if set(rig.gains[k]) & set(rig.gains[i])}
-    for k in sorted(fed - {i}):
-        if k not in rig.held:
-            continue
+def _caps_of_others(rig, i, needed):
+    """(holds, reason): no row of another tank stops a pump on which `needed` [cm/s] relies."""
+    if needed <= 0.0:
+        return
+    gains, stops = rig.gains[i], "may stop a pump that the floor relies on"
+    fed = {k for k in range(rig.tanks) if set(rig.gains[k]) & set(gains)}
+    for k in sorted((fed - {i}) & rig.held):
         edges = np.linspace(0.0, rig.limit[k] + rig.band[k], PARTS + 1)
-        common = set(rig.gains[k]) & set(rig.gains[i])
-        wanted = sum(rig.gains[k][j][1] / max(rig.gains[i][j][0], 1e-300) for j in common) * asked
-        alone = len(rig.gains[i]) == len(rig.gains[k]) == 1
-        if not (alone and wanted <= _caps(rig, k, edges).min()):
-            return f"the cap for tank {k + 1} may stop a pump that the floor relies on"
-    for k in sorted({k for f in fed for k in rig.below[f]}):
-        if k in rig.held and rig.slope[k] > 0.0:
-            return f"the cap for tank {k + 1} may stop a pump that the floor relies on"
-    return ""
+        common = set(rig.gains[k]) & set(gains)
+        asked = sum(rig.gains[k][j][1] / max(gains[j][0], 1e-300) for j in common) * needed
+        alone = len(gains) == len(rig.gains[k]) == 1
+        yield alone and asked <= _caps(rig, k, edges).min(), f"the cap for tank {k + 1} {stops}"
+    for k in sorted({k for f in fed for k in rig.below[f]} & rig.held):
+        yield not rig.slope[k] > 0.0, f"the cap for tank {k + 1} {stops}"

@@ -1,20 +1,110 @@
-"""The conditions of the theorems, tank by tank, and what a filter costs."""
+"""The conditions of the theorems, tank by tank, in plain numbers before a run."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from jaxtank.safety.filter import FLOOR
-from jaxtank.safety.setting import (
-    full_pumps,
-    highest_level,
-    phi,
-    phi_min,
-    ran_before,
-    resting_level,
-    sqrt_of,
-    unstoppable,
-)
+from jaxtank.safety.filter import SHALLOW
+from jaxtank.safety.worst_case import PLAIN, Rates, fall, plain_root, rise
+
+
+class Setting(NamedTuple):
+    """What the conditions need: coefficients over the box, times [s], pumps' limits [V], bands."""
+
+    rates: Rates
+    hold: float
+    delay: float
+    lag: float
+    low: np.ndarray
+    high: np.ndarray
+    band: np.ndarray
+    top: np.ndarray
+    spare: np.ndarray
+    pulse: bool
+    dead: bool = False  # whether a pump stands still for inputs above 0
+    draws: bool = False  # whether inflow pulses draw liquid
+    predicted: int = 0  # inputs under way over which levels are predicted
+    before: tuple = ()  # (m) inputs under way at t = 0, less dead zones [V]; () for none
+    weakest: tuple = ()  # (m) least upper limits of the pumps, less dead zones [V]
+    beyond: bool = False  # whether inputs under way at t = 0 are beyond the limits of the pumps
+    divided: tuple = ()  # tanks whose row is divided among their pumps
+    uncovered: tuple = ()  # (n) why a tank has a feature that no theorem covers, ""
+    unit: str = "cm"  # of a length
+
+    def rise(self, tank, level, others):
+        """Phi_max(level) [cm/s]; others: limits of all tanks, before volumes that enter besides."""
+        return rise(self.rates, tank, level, np.asarray(others) + self.spare, PLAIN)
+
+    def fall(self, tank, level, others):
+        """Phi_min(level) [cm/s]."""
+        return fall(self.rates, tank, level, others, PLAIN)
+
+    def root(self, level):
+        return plain_root(level, self.rates.knee)
+
+    def sources(self, tank):
+        """[(j, c_max)] of the orifices into a tank."""
+        return [(j, most) for j, sink, _, most in self.rates.links if sink == tank]
+
+    def pumped(self, tank, inputs):
+        """What pumps at `inputs` (m,) [V] bring at most [cm/s]; with a divided row the total at
+        which the pump that needs most of its share has it.
+        """
+        gains = [(j, b) for j, (_, b) in self.rates.pumps[tank].items() if b > 0.0]
+        if tank not in self.divided:
+            return sum(b * max(inputs[j], 0.0) for j, b in gains)
+        full = sum(b * max(self.high[j], 0.0) for j, b in gains)
+        shares = [max(inputs[j], 0.0) / max(self.high[j], 1e-300) for j, _ in gains]
+        return full * max(shares, default=0.0)
+
+    def unstoppable(self, tank):
+        """What pumps with a lower limit above 0 V always bring [cm/s]."""
+        return self.pumped(tank, self.low)
+
+    def full_pumps(self, tank):
+        """What full pumps, and inputs under way at t = 0, bring at most [cm/s]."""
+        return self.pumped(tank, np.maximum(self.high, self.before) if self.before else self.high)
+
+    def under_way(self, tank):
+        """What the inputs under way at t = 0 bring at most [cm/s]."""
+        return self.pumped(tank, self.before) if self.before else 0.0
+
+    def resting_level(self, tank, others):
+        """Level [cm] at which a tank rests with the most that may enter; inf if it never does."""
+        full = self.full_pumps(tank)
+        level = highest_level(lambda h: full + self.rise(tank, h, others), 1e6)
+        return math.inf if level == 1e6 else level * (1.0 + 1e-9)
+
+
+class Chosen(NamedTuple):
+    """kappa [1/s], limits (n,) [cm], k1 (n,) [1/s], which tanks full pumps cannot fill, [the
+    condition of each tank that failed, or ""], and levels that no tank passes (n,) [cm], all before
+    volumes that enter besides.
+    """
+
+    rate: float
+    heights: np.ndarray
+    slopes: np.ndarray
+    idle: np.ndarray
+    reasons: list[str]
+    reach: np.ndarray
+
+
+def first_failure(conditions):
+    """The reason of the first of [(holds, reason)] that does not hold, or ""."""
+    return next((reason for holds, reason in conditions if not holds), "")
+
+
+def highest_level(rate, top):
+    """The level [cm] up to which rate(level), which falls with it, is above 0; `top` at most."""
+    low, high = 0.0, top
+    if rate(top) > 0.0:
+        return top
+    for _ in range(60):
+        mid = 0.5 * (low + high)
+        low, high = (mid, high) if rate(mid) > 0.0 else (low, mid)
+    return low
 
 
 def theorem_of(setting, tank):
@@ -28,43 +118,62 @@ def theorem_of(setting, tank):
     return "Theorem 3" if setting.delay > 0.0 else "Theorem 1"
 
 
-def failed_condition(setting, tank, limits, bound, start, reach):
-    """The condition that keeps the limit of one tank from being proved, or ""."""
-    # limits : the _Proved of the rig; start : (n,) highest levels at t = 0 [cm], or None; reach :
+def _conditions(setting, tank, limits, bound, start, reach):
+    """(holds, reason) of what proves the limit of one tank."""
+    # limits : the Chosen of the rig; start : (n,) highest levels at t = 0 [cm], or None; reach :
     # (n,) levels that no tank passes [cm], before volumes that enter besides
-    rates, top, kappa = setting.rates, limits.heights[tank], limits.rate
-    if start is not None and start[tank] > top * (1.0 + 1e-12):
-        return f"start at {start[tank]:.4g} cm, above the limit {top:.4g} cm"
+    rates, top, kappa, unit = setting.rates, limits.heights[tank], limits.rate, setting.unit
+    if start is not None:
+        reason = f"start at {start[tank]:.4g} {unit}, above the limit {top:.4g} {unit}"
+        yield start[tank] <= top * (1.0 + 1e-12), reason
     if limits.idle[tank]:
-        return ""
-    if setting.pulse:
-        return "a pulse dead zone pays out more than was commanded"
-    if kappa > bound * (1.0 + 1e-12):
-        return f"kappa {kappa:.3g} above its bound {bound:.3g} 1/s"
+        return
+    yield not setting.pulse, "a pulse dead zone pays out more than was commanded"
+    yield kappa <= bound * (1.0 + 1e-12), f"kappa {kappa:.3g} above its bound {bound:.3g} 1/s"
     if limits.slopes[tank] > 0.0:
-        return _too_high_above(setting, tank, limits.heights, limits.slopes, start)
+        yield from _second_order_begins(setting, tank, limits, start)
+        return
     if not rates.pumps[tank]:
-        return ""
-    if unread := _beyond_adc(setting, tank, reach):
-        return unread
+        return
+    joined = {j for j, _ in setting.sources(tank)} | {j for i, j, *_ in rates.pipes if i == tank}
+    for j in sorted(joined):
+        readable = reach[j] + setting.spare[j] <= setting.top[j] * (1.0 + 1e-12)
+        only = f"up to {setting.top[j]:.4g} {unit} only"
+        yield readable, f"relies on tank {j + 1}, whose ADC reads {only}"
     if setting.delay == 0.0 and setting.lag == 0.0:
-        return ""
+        return
     begin = limits.heights if start is None else start
     if setting.predicted:
-        return _filled_under_way(setting, tank, top, begin, reach)
-    if any(i == tank for i, *_ in rates.pipes):
-        return "a pipe with dead time or lag: not proved"
-    if kappa < (steep := steepest(setting, tank, top)):
-        return f"(N) kappa {kappa:.3g} below c_min sqrt(H)/(H - h_e) = {steep:.3g} 1/s"
+        stays = not _filled_under_way(setting, tank, top, begin, reach)
+        yield stays, f"start: inputs under way may fill it above {top:.4g} {unit}"
+        return
+    piped = any(i == tank for i, *_ in rates.pipes)
+    yield not piped, "a pipe with dead time or lag: not proved"
+    steep = steepest(setting, tank, top)
+    yield kappa >= steep, f"(N) kappa {kappa:.3g} below c_min sqrt(H)/(H - h_e) = {steep:.3g} 1/s"
     if setting.lag > 0.0:
         shallow = max(rates.empty[tank], rates.knee)
-        if shallow > 0.25 * top:
-            return f"(F) laminar or limited outflow up to {shallow:.3g} cm, above 1/4 of the limit"
-        brought = full_pumps(setting, tank) + setting.phi(tank, 0.0, reach)
-        filled = brought * (2.0 * setting.lag + setting.delay + setting.hold)
-        if filled > 0.75 * top:
-            return f"(F) {filled:.3g} cm may be filled within the lag: above 3/4 of the limit"
-    return _under_way(setting, tank, top, kappa, begin, reach)
+        limited = f"laminar or limited outflow up to {shallow:.3g} {unit}, above 1/4 of the limit"
+        yield shallow <= 0.25 * top, f"(F) {limited}"
+        entering = setting.full_pumps(tank) + setting.rise(tank, 0.0, reach)
+        filled = entering * (2.0 * setting.lag + setting.delay + setting.hold)
+        reason = f"(F) {filled:.3g} {unit} may be filled within the lag: above 3/4 of the limit"
+        yield filled <= 0.75 * top, reason
+    # (S): the inputs under way obey the row of levels up to the start
+    age, others = setting.delay + setting.hold, np.array(reach)
+    for k in range(len(reach)) if setting.lag == 0.0 else ():
+        fastest = setting.full_pumps(k) + max(setting.rise(k, 0.0, reach), 0.0)
+        others[k] = min(reach[k], begin[k] + age * fastest)
+    entering, h = setting.under_way(tank), begin[tank]
+    # what is allowed is concave in the level, but for the step at `empty`
+    allowed = min(
+        kappa * (top - h) - setting.rise(tank, h, others),
+        kappa * (top - min(h, rates.empty[tank])) - setting.rise(tank, 0.0, others),
+    )
+    yield (
+        entering <= max(allowed * (1.0 + 1e-9), setting.unstoppable(tank)),
+        f"(S) start: {entering:.3g} {unit}/s under way, {max(allowed, 0.0):.3g} allowed",
+    )
 
 
 def steepest(setting, tank, top):
@@ -75,56 +184,27 @@ def steepest(setting, tank, top):
     return setting.rates.out[tank] * math.sqrt(top) / below
 
 
-def _beyond_adc(setting, tank, reach):
-    """Why the reading of a neighbour does not bound its level, or ""."""
-    rates, levels = setting.rates, reach + setting.spare
-    joined = {j for j, sink, *_ in rates.links if sink == tank}
-    joined |= {j for i, j, *_ in rates.pipes if i == tank}
-    for j in sorted(j for j in joined if levels[j] > setting.top[j] * (1.0 + 1e-12)):
-        return f"relies on tank {j + 1}, whose ADC reads up to {setting.top[j]:.4g} cm only"
-    return ""
-
-
-def _under_way(setting, tank, top, kappa, start, reach):
-    """Why (S) fails, the inputs under way obey the row of levels up to `start`, or ""."""
-    rates, age, others = setting.rates, setting.delay + setting.hold, np.array(reach)
-    for k in range(len(reach)) if setting.lag == 0.0 else ():
-        fastest = full_pumps(setting, k) + max(setting.phi(k, 0.0, reach), 0.0)
-        others[k] = min(reach[k], start[k] + age * fastest)
-    brought, h = ran_before(setting, tank), start[tank]
-    # what is allowed is concave in the level, but for the step at `empty`
-    allowed = min(
-        kappa * (top - h) - setting.phi(tank, h, others),
-        kappa * (top - min(h, rates.empty[tank])) - setting.phi(tank, 0.0, others),
-    )
-    if brought <= max(allowed * (1.0 + 1e-9), unstoppable(setting, tank)):
-        return ""
-    return f"(S) start: {brought:.3g} cm/s under way, {max(allowed, 0.0):.3g} allowed"
-
-
 def _filled_under_way(setting, tank, top, start, reach):
-    """Why the inputs under way at the start may fill a tank past its limit, or ""."""
+    """Whether the inputs under way at the start may fill a tank past its limit."""
     level, steps = float(start[tank]), 200 * setting.predicted
-    step, brought = setting.delay / steps, ran_before(setting, tank)
+    step, pumped = setting.delay / steps, setting.under_way(tank)
     for _ in range(steps):  # from above: the explicit step where it rises, no change where it falls
-        level += step * max(brought + setting.phi(tank, level, reach), 0.0)
+        level += step * max(pumped + setting.rise(tank, level, reach), 0.0)
         if level > top * (1.0 + 1e-9):
-            return f"start: inputs under way may fill it above {top:.4g} cm"
-    return ""
+            return True
+    return False
 
 
-def _too_high_above(setting, tank, heights, slopes, start):
-    """Why the levels `start` do not allow a second-order row to begin (g >= 0), or ""."""
-    if start is None:
-        return "start: not known, and the tanks above may hold more than can be stopped in time"
-    rates, knee = setting.rates, setting.rates.knee
-    a0 = FLOOR * sqrt_of(heights[tank], knee)
-    g = rates.out[tank] * sqrt_of(start[tank], knee)
-    g += slopes[tank] * (heights[tank] - start[tank])
-    for j, sink, _, most in rates.links:
-        if sink == tank:
-            g -= most * max(sqrt_of(start[j], knee), a0)
-    return "" if g >= 0.0 else "start: the tanks above hold more than can be stopped in time"
+def _second_order_begins(setting, tank, limits, start):
+    """(holds, reason) of g >= 0 at t = 0 for a second-order row."""
+    reason = "start: not known, and the tanks above may hold more than can be stopped in time"
+    yield start is not None, reason
+    top, root = limits.heights[tank], setting.root
+    a0 = SHALLOW * root(top)
+    g = setting.rates.out[tank] * root(start[tank]) + limits.slopes[tank] * (top - start[tank])
+    for j, most in setting.sources(tank):
+        g -= most * max(root(start[j]), a0)
+    yield g >= 0.0, "start: the tanks above hold more than can be stopped in time"
 
 
 def settle(setting, limits, bound, start, plant):
@@ -133,8 +213,8 @@ def settle(setting, limits, bound, start, plant):
     while True:
         reach = _reach(setting, limits.heights, reasons, plant, start)
         before = list(reasons)
-        for i in (i for i, why in enumerate(before) if not why):
-            reasons[i] = failed_condition(setting, i, limits, bound, start, reach)
+        for i in (i for i, reason in enumerate(before) if not reason):
+            reasons[i] = first_failure(_conditions(setting, i, limits, bound, start, reach))
             reasons[i] = reasons[i] or _relied_on(setting, i, limits, before, reach)
         if reasons == before:
             return limits._replace(reasons=reasons, reach=reach)
@@ -142,16 +222,15 @@ def settle(setting, limits, bound, start, plant):
 
 def _relied_on(setting, tank, limits, reasons, reach):
     """Which tanks without a certificate the proof of `tank` needs, or "" where it needs none."""
-    rates = setting.rates
-    above = [j for j, sink, *_ in rates.links if sink == tank and reasons[j]]
+    above = [j for j, _ in setting.sources(tank) if reasons[j]]
     if limits.slopes[tank] == 0.0:
-        extra = full_pumps(setting, tank) if limits.idle[tank] else unstoppable(setting, tank)
-        excess = setting.phi(tank, limits.heights[tank], reach) + extra
-        if excess <= max(1e-9 * rates.out[tank], 1e-12):
+        extra = setting.full_pumps(tank) if limits.idle[tank] else setting.unstoppable(tank)
+        excess = setting.rise(tank, limits.heights[tank], reach) + extra
+        if excess <= max(1e-9 * setting.rates.out[tank], 1e-12):
             return ""
-        above = above or [j for j, why in enumerate(reasons) if why]
+        above = above or [j for j, reason in enumerate(reasons) if reason]
         if not above:
-            return f"rim condition: {excess:.3g} cm/s too much may enter at the limit"
+            return f"rim condition: {excess:.3g} {setting.unit}/s too much may enter at the limit"
     names = ", ".join(str(j + 1) for j in above)
     return f"relies on tank {names}, not certified" if above else ""
 
@@ -160,71 +239,62 @@ def _reach(setting, heights, reasons, plant, start):
     """(n,) levels that no tank passes [cm]: H where certified, else where its inflow can rest, or
     its start.
     """
-    n, rim = len(heights), np.asarray(plant.rim, dtype=float)
     begin = heights if start is None else np.maximum(heights, start)
-    top = np.where(np.array(setting.uncovered) == "", begin, np.inf)
-    reach = np.where([not why for why in reasons], heights, top)
-    highest = np.maximum(rim, begin) if plant.overflow else np.full(n, np.inf)
+    rim = np.asarray(plant.rim, dtype=float)
+    highest = np.maximum(rim, begin) if plant.overflow else np.full(len(heights), np.inf)
+    certified = np.array([not reason for reason in reasons])
+    reach = np.where(certified, heights, np.where(np.array(setting.uncovered) == "", begin, np.inf))
     for _ in range(50):
         before = reach.copy()
-        for i in (i for i in range(n) if reasons[i]):
-            reach[i] = min(max(reach[i], resting_level(setting, i, reach)), highest[i])
+        for i in np.flatnonzero(~certified):
+            reach[i] = min(max(reach[i], setting.resting_level(i, reach)), highest[i])
         if np.allclose(reach, before, rtol=1e-9, atol=0.0):
             return reach
-    return np.where([not why for why in reasons], heights, highest)
+    return np.where(certified, heights, highest)
 
 
 def spills(setting, plant, limits, start):
     """((n,) what falls at most into each tank from rims [cm^3/s], (n) features that no theorem
     covers). A tank spills unless it is proved for a limit at or below its rim.
     """
-    (least, most), wild = plant, list(setting.uncovered)
-    falls = np.zeros(len(wild))
+    (least, most), uncovered = plant, list(setting.uncovered)
+    falls = np.zeros(len(uncovered))
     for k, (source, sink) in enumerate(least.spills):
         rim, spare = float(least.rim[source]), setting.spare[source]
         dry = not limits.reasons[source] and limits.heights[source] + spare <= rim * (1.0 + 1e-12)
         if dry or not least.overflow:
             continue
-        net = full_pumps(setting, source) + setting.phi(source, rim, limits.reach)
+        net = setting.full_pumps(source) + setting.rise(source, rim, limits.reach)
         falls[sink] += float(most.caught[k]) * float(most.area[source]) * max(net, 0.0)
         at_once = spare > 0.0 or (start is not None and start[source] > rim)
-        if (at_once or setting.uncovered[source]) and not wild[sink]:
-            wild[sink] = f"not covered: volumes that spill from tank {source + 1}"
-    return falls, tuple(wild)
+        if (at_once or setting.uncovered[source]) and not uncovered[sink]:
+            uncovered[sink] = f"not covered: volumes that spill from tank {source + 1}"
+    return falls, tuple(uncovered)
 
 
 def gap_of(setting, nominal, tank, kappa, limit, reach):
     """By how much [cm] the filter lowers the level at which the nominal plant rests with its pumps
     full, or its limit where that is lower; nan for a tank without a pump.
     """
-    rates, eps = setting.rates, setting.band[tank]
-    if not rates.pumps[tank]:
+    gains = setting.rates.pumps[tank]
+    if not gains:
         return math.nan
-    most = sum(b for _, b in rates.pumps[tank].values())
+    least, most = (sum(b[end] for b in gains.values()) for end in (0, 1))
     full = sum(b * max(setting.high[j], 0.0) for j, (_, b) in nominal.pumps[tank].items())
     gain = sum(b for _, b in nominal.pumps[tank].values())
     others = np.minimum(reach + setting.spare, 1e6)
+    unpumped = lambda h: rise(nominal, tank, h, others, PLAIN)
+    bounded, steps = setting._replace(spare=0.0), 4 * setting.predicted
 
     def filtered(h):
-        low, high = h - eps, h + eps
-        if setting.predicted:
-            brought = max(-phi(nominal, tank, h, others), 0.0) / gain  # at rest
-            low, high = _under_way_at_rest(setting, tank, (low, high), brought, others)
-        cap = max(0.0, kappa * (limit - high) - phi(rates, tank, low, others))
-        return min(full, gain / most * cap) + phi(nominal, tank, h, others)
+        low, high = h - setting.band[tank], h + setting.band[tank]
+        u = max(-unpumped(h), 0.0) / gain if steps else 0.0  # the input at rest
+        for _ in range(steps):
+            low += setting.delay / steps * (least * u + setting.fall(tank, low, 0.0 * others))
+            high += setting.delay / steps * (most * u + bounded.rise(tank, high, others))
+        cap = max(0.0, kappa * (limit - high) - bounded.rise(tank, low, others))
+        return min(full, gain / most * cap) + unpumped(h)
 
-    free = lambda h: full + phi(nominal, tank, h, others)
+    free = lambda h: full + unpumped(h)
     # the levels are found to about 1e-12 of the limit
     return max(round(float(highest_level(free, limit) - highest_level(filtered, limit)), 9), 0.0)
-
-
-def _under_way_at_rest(setting, tank, levels, brought, others):
-    """(least, largest) level [cm] predicted from `levels` with pumps that bring `brought` times
-    their gain.
-    """
-    rates, (low, high), steps = setting.rates, levels, 4 * setting.predicted
-    least, most = (sum(b[end] for b in rates.pumps[tank].values()) for end in (0, 1))
-    for _ in range(steps):
-        low += setting.delay / steps * (least * brought + phi_min(rates, tank, low, 0.0 * others))
-        high += setting.delay / steps * (most * brought + phi(rates, tank, high, others))
-    return low, high

@@ -18,68 +18,19 @@ from jaxtank.instruments.actuators import allocate
 from jaxtank.instruments.base import Actuator
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.safety.prediction import brackets
-from jaxtank.safety.worst_case import Rates, fall, rates_of, rise
+from jaxtank.safety.worst_case import fall, rates_of, rise
 from jaxtank.xla.barrier import materialised
 
-
-def floor_rows(guard: Any, rates: Rates, y: Sequence, hold: Any, low: Sequence) -> list:
-    """Return [(tank, f)] of the tanks with a low limit: sum_j b_j,min u_j >= f [cm/s] keeps it."""
-    # f = -Phi_min(y + band) - rate (y - band - low)
-    below = lowest(guard, rates, y, hold, low)
-    return [
-        (
-            i,
-            -fall(rates, i, y[i] + guard.band[i], below)
-            - guard.rate[i] * (y[i] - guard.band[i] - guard.low[i]),
-        )
-        for i in guard.kept
-    ]
-
-
-def lowest(guard: Any, rates: Rates, y: Sequence, hold: Any, low: Sequence) -> list:
-    """Return the (n) least that each level can be until the inputs of this sample end [cm]."""
-    below = []
-    for i in range(guard.least.tanks):
-        drawn = sum(b * lower_clip(-low[j], 0.0) for j, (_, b) in rates.pumps[i].items())
-        fastest = lower_clip(drawn - fall(rates, i, guard.reach[i], guard.bottom), 0.0)
-        least = y[i] - guard.band[i] - (hold + guard.age) * fastest
-        below.append(lower_clip(least, guard.bottom[i]))
-    return below
-
-
-def floors_of(rates: Rates, rows: Sequence, low: Sequence, caps: Sequence) -> tuple:
-    """Return ((m) lower limits of the inputs [V], none above its cap, the rows [({pump: b_min}, f)]
-    of tanks with two pumps or more).
-    """
-    floors, shared = list(low), []
-    for tank, f in rows:
-        gains = rates.pumps[tank]
-        if len(gains) > 1:
-            shared.append(({j: b for j, (b, _) in gains.items()}, f))
-            for j in gains:  # none of them draws
-                floors[j] = lower_clip(floors[j], 0.0)
-            continue
-        ((j, (least, most)),) = gains.items()
-        gain = jnp.where(f >= 0.0, least, most)
-        needed = jnp.where(gain > 0.0, f / jnp.where(gain > 0.0, gain, 1.0), low[j])
-        floors[j] = lower_clip(floors[j], needed)
-    return tuple(jnp.where(f < cap, f, cap) for f, cap in zip(floors, caps)), shared
-
-
-def raised(u: Sequence, shared: Sequence, caps: Sequence) -> tuple:
-    """Return inputs u (m) [V] raised towards their caps until the rows of several pumps hold."""
-    u = list(u)
-    for row, f in shared:
-        lacking = f - sum(b * u[j] for j, b in row.items())
-        left = sum(b * lower_clip(caps[j] - u[j], 0.0) for j, b in row.items())
-        share = clip(lacking / jnp.where(left > 0.0, left, 1.0), 0.0, 1.0)
-        for j in row:
-            u[j] = u[j] + share * lower_clip(caps[j] - u[j], 0.0)
-    return tuple(u)
-
-
-FLOOR = 0.05
+SHALLOW = 0.05
 """a0 as a share of s(H): below it the root of a feeding tank's level counts as constant."""
+
+
+def _tanks(unit, doc, **more):
+    return leaf(unit, doc, shape=("tank",), **more)
+
+
+def _tanks_or_0(unit, doc, **more):
+    return _tanks(unit, doc, default=lambda own: np.zeros(np.shape(own["limit"])), **more)
 
 
 @component
@@ -95,42 +46,23 @@ class SafetyFilter:
     above it (`slope` > 0; second order, see `_row_above`). u = 0 serves every row, and lowering an
     input never breaks one.
 
-    Low limits (`low`, tanks `kept`) raise the inputs instead, as far as the caps allow (`floors`).
+    Low limits (`low`, tanks `kept`) raise the inputs instead, as far as the caps allow
+    (`least_inputs`).
     """
 
     least: TankNetwork
     most: TankNetwork
-    limit: np.ndarray = leaf(
-        "cm", "level that no tank may pass", low=0.0, strict=True, shape=("tank",)
+    limit: np.ndarray = _tanks("cm", "level that no tank may pass", low=0.0, strict=True)
+    reach: np.ndarray = _tanks("cm", "level that no tank passes for certain", low=0.0)
+    rate: np.ndarray = _tanks(
+        "1/s", "how fast a level may approach its limit (kappa)", low=0.0, strict=True
     )
-    reach: np.ndarray = leaf(
-        "cm", "level that no tank passes for certain", low=0.0, shape=("tank",)
+    band: np.ndarray = _tanks("cm", "largest difference of reading and level", low=0.0)
+    inflow: np.ndarray = _tanks("cm^3/s", "largest inflow disturbance", low=0.0)
+    slope: np.ndarray = _tanks_or_0(
+        "1/s", "k1 of a tank that is held by the pumps above it; 0: by its own", low=0.0
     )
-    rate: np.ndarray = leaf(
-        "1/s",
-        "how fast a level may approach its limit (kappa)",
-        low=0.0,
-        strict=True,
-        shape=("tank",),
-    )
-    band: np.ndarray = leaf(
-        "cm", "largest difference of reading and level", low=0.0, shape=("tank",)
-    )
-    inflow: np.ndarray = leaf("cm^3/s", "largest inflow disturbance", low=0.0, shape=("tank",))
-    slope: np.ndarray = leaf(
-        "1/s",
-        "k1 of a tank that is held by the pumps above it; 0: by its own",
-        low=0.0,
-        default=lambda own: np.zeros(np.shape(own["limit"])),
-        shape=("tank",),
-    )
-    spare: np.ndarray = leaf(
-        "cm",
-        "rise by volumes that may enter besides, in all",
-        low=0.0,
-        default=lambda own: np.zeros(np.shape(own["limit"])),
-        shape=("tank",),
-    )
+    spare: np.ndarray = _tanks_or_0("cm", "rise by volumes that may enter besides, in all", low=0.0)
     age: np.ndarray | float = leaf(
         "s", "age of a reading when the input computed from it begins to act", low=0.0, default=0.0
     )
@@ -140,26 +72,9 @@ class SafetyFilter:
         default=lambda own: np.zeros(own["least"].pumps),
         shape=("pump",),
     )
-    low: np.ndarray = leaf(
-        "cm",
-        "level below which no tank may fall; 0: none",
-        low=0.0,
-        default=lambda own: np.zeros(np.shape(own["limit"])),
-        shape=("tank",),
-    )
-    bottom: np.ndarray = leaf(
-        "cm",
-        "level below which no tank falls for certain",
-        low=0.0,
-        default=lambda own: np.zeros(np.shape(own["limit"])),
-        shape=("tank",),
-    )
-    draw: np.ndarray = leaf(
-        "cm^3/s",
-        "least inflow disturbance, 0 or negative",
-        default=lambda own: np.zeros(np.shape(own["limit"])),
-        shape=("tank",),
-    )
+    low: np.ndarray = _tanks_or_0("cm", "level below which no tank may fall; 0: none", low=0.0)
+    bottom: np.ndarray = _tanks_or_0("cm", "level below which no tank falls for certain", low=0.0)
+    draw: np.ndarray = _tanks_or_0("cm^3/s", "least inflow disturbance, 0 or negative")
     held: tuple = static(doc="tanks whose limits are kept, counted from 0")
     kept: tuple = static(doc="tanks whose low limits are kept, counted from 0", default=())
     predicted: int = static(doc="inputs under way over which levels are predicted", default=0)
@@ -184,8 +99,8 @@ class SafetyFilter:
         hold: Any,
         line: Sequence[Any] | None = None,
     ) -> tuple[tuple[Any, ...], Any]:
-        """Return ((m) inputs within the pumps' limits, the caps and the floors [V] for a command
-        (m) [V], 1.0 where a cap or a floor changed the command, else 0.0).
+        """Return ((m) inputs within the pumps' limits, the caps and the least inputs [V] for a
+        command (m) [V], 1.0 where one of these two changed the command, else 0.0).
 
         Parameters
         ----------
@@ -203,10 +118,9 @@ class SafetyFilter:
         low, dead = [actuator.low[j] for j in pumps], [self.offset[j] for j in pumps]
         high = [actuator.high[j] - dead[j] for j in pumps]
         caps, shared = materialised(self.limits(y, hold, low, high, line))
-        floors, together = self.floors(y, hold, low, caps)
-        least = tuple(low)
+        least, raising = self.least_inputs(y, hold, low, caps)
         if self.kept:
-            least = tuple(jnp.where(f > v, f + z, v) for f, v, z in zip(floors, low, dead))
+            least = tuple(jnp.where(f > v, f + z, v) for f, v, z in zip(least, low, dead))
         most = tuple(cap + zone for cap, zone in zip(caps, dead))
         least, most = materialised((least, most))
         if self.allocate and actuator.pumps == 2:
@@ -216,12 +130,12 @@ class SafetyFilter:
         u = materialised(u)
         free = [clip(command[j], low[j], actuator.high[j]) for j in pumps]
         acts = _any((free[j] > most[j]) | (free[j] < least[j]) for j in pumps)
-        if not shared and not together:
+        if not shared and not raising:
             return u, jnp.where(acts, 1.0, 0.0)
         moving = tuple(v - zone for v, zone in zip(u, dead))
-        held = self.scaled(raised(moving, together, caps), shared, low)
-        acts = acts | _any(a != b for a, b in zip(held, moving))
-        return tuple(v + zone for v, zone in zip(held, dead)), jnp.where(acts, 1.0, 0.0)
+        scaled = self.scaled(_raised(moving, raising, caps), shared, low)
+        acts = acts | _any(a != b for a, b in zip(scaled, moving))
+        return tuple(v + zone for v, zone in zip(scaled, dead)), jnp.where(acts, 1.0, 0.0)
 
     def _metric(self, y):
         """(g11, g12, g22) of G = J'J, J_oj the effect of pump j on output o: on its rate, or on its
@@ -244,14 +158,8 @@ class SafetyFilter:
     def bounds(
         self, y: Sequence, hold: Any, low: Sequence, high: Sequence, line: Sequence | None = None
     ) -> list[tuple[dict, Any]]:
-        """Return the rows [({pump: a}, M)], sum a u <= M [cm/s, or cm^0.5/s^2], for readings y.
-
-        Parameters
-        ----------
-        y : (n) readings [cm]
-        hold : longest time for which an input is held [s]
-        low, high : (m) limits of the pumps [V]
-        line : inputs under way, as of `apply`
+        """Return the rows [({pump: a}, M)], sum a u <= M [cm/s, or cm^0.5/s^2], for readings y and
+        limits `low`, `high` (m) of the pumps [V]; the rest as of `apply`.
         """
         n, r = self.least.tanks, rates_of(self.least, self.most, self.inflow, hold, self.draw)
         fastest = [self._fastest(r, i, high) for i in range(n)]
@@ -262,7 +170,7 @@ class SafetyFilter:
             for i in range(n)
         ]
         above = materialised(above)
-        rows, below = [], lowest(self, r, y, hold, low) if self.predicted else []
+        rows, below = [], self._lowest(r, y, hold, low) if self.predicted else []
         for i in self.held:
             if r.pumps[i]:
                 least, most = y[i] - self.band[i], y[i] + self.band[i]
@@ -289,7 +197,7 @@ class SafetyFilter:
         # sum_j c_j,max b_j,max S_j u_j <= M = max(0, D + k2 g_low - k1^2 (H - l))
         s = lambda h: smooth_sqrt(lower_clip(h, 0.0), r.knee)
         k1, k2, top, eps = self.slope[tank], self.rate[tank], self.limit[tank], self.band[tank]
-        a0 = FLOOR * s(top)
+        a0 = SHALLOW * s(top)
         sources = [(j, most) for j, sink, _, most in r.links if sink == tank]
         full = sum(most * s(self.reach[j]) for j, most in sources)
         drains, row = 0.0, {}
@@ -327,14 +235,40 @@ class SafetyFilter:
                 shared.append((row, m))
         return tuple(caps), shared
 
-    def floors(self, y: Sequence, hold: Any, low: Sequence, caps: Sequence) -> tuple:
-        """Return ((m) lower limits of the inputs [V], none above its cap, the rows [({pump: b}, f)]
-        of tanks with two pumps or more: sum b u >= f [cm/s]) that keep the low limits.
+    def least_inputs(self, y: Sequence, hold: Any, low: Sequence, caps: Sequence) -> tuple:
+        """Return ((m) lower limits of the inputs [V], none above its cap, the rows [({pump: b_min},
+        f)] of tanks with two pumps or more: sum b_min u >= f [cm/s]) that keep the low limits.
         """
+        # f = -Phi_min(y + band) - rate (y - band - low)
         if not self.kept:
             return tuple(low), []
         r = rates_of(self.least, self.most, self.inflow, hold, self.draw)
-        return floors_of(r, floor_rows(self, r, y, hold, low), low, caps)
+        below, least, shared = self._lowest(r, y, hold, low), list(low), []
+        for i in self.kept:
+            f = -fall(r, i, y[i] + self.band[i], below) - self.rate[i] * (
+                y[i] - self.band[i] - self.low[i]
+            )
+            gains = r.pumps[i]
+            if len(gains) > 1:
+                shared.append(({j: b for j, (b, _) in gains.items()}, f))
+                for j in gains:  # none of them draws
+                    least[j] = lower_clip(least[j], 0.0)
+                continue
+            ((j, ends),) = gains.items()
+            gain = jnp.where(f >= 0.0, *ends)
+            needed = jnp.where(gain > 0.0, f / jnp.where(gain > 0.0, gain, 1.0), low[j])
+            least[j] = lower_clip(least[j], needed)
+        return tuple(jnp.where(v < cap, v, cap) for v, cap in zip(least, caps)), shared
+
+    def _lowest(self, r, y, hold, low):
+        """(n) least that each level can be until the inputs of this sample end [cm]."""
+        below = []
+        for i in range(self.least.tanks):
+            drawn = sum(b * lower_clip(-low[j], 0.0) for j, (_, b) in r.pumps[i].items())
+            fastest = lower_clip(drawn - fall(r, i, self.reach[i], self.bottom), 0.0)
+            least = y[i] - self.band[i] - (hold + self.age) * fastest
+            below.append(lower_clip(least, self.bottom[i]))
+        return below
 
     def scaled(self, u: Sequence, shared: list, low: Sequence) -> tuple:
         """Return inputs u (m) [V] lowered so that rows of several pumps hold, all in proportion and
@@ -353,6 +287,18 @@ class SafetyFilter:
                 lowered = least[j] + v * share if j in least else v * share
                 u[j] = jnp.where(lowers, lowered, u[j])
         return tuple(u)
+
+
+def _raised(u, shared, caps):
+    """Inputs u (m) [V] raised towards their caps until the rows of several pumps hold."""
+    u = list(u)
+    for row, f in shared:
+        lacking = f - sum(b * u[j] for j, b in row.items())
+        rest = sum(b * lower_clip(caps[j] - u[j], 0.0) for j, b in row.items())
+        share = clip(lacking / jnp.where(rest > 0.0, rest, 1.0), 0.0, 1.0)
+        for j in row:
+            u[j] = u[j] + share * lower_clip(caps[j] - u[j], 0.0)
+    return tuple(u)
 
 
 def _divided(row, m, high):

@@ -10,6 +10,7 @@ import scipy  # its parts are imported when they are first used
 from numpy.typing import ArrayLike
 
 from jaxtank.core.errors import InputError
+from jaxtank.core.tree import split_index
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.safety.box import spread, widths_of
@@ -64,23 +65,25 @@ def design_for(
     Examples
     --------
     >>> from jaxtank import presets
-    >>> found, rows = design_for(presets.find("gouta2015/ngpc"))
-    >>> [round(float(k), 3) for k in found.slope[:2]], [row.certified for row in rows]
+    >>> safety_filter, rows = design_for(presets.find("gouta2015/ngpc"))
+    >>> [round(float(k), 3) for k in safety_filter.slope[:2]], [row.certified for row in rows]
     ([0.19, 0.19], [True, True, True, True])
     """
     loop = case.loop
     if not isinstance(loop.plant, TankNetwork) or not isinstance(loop.sensor, LevelSensor):
         raise InputError("safety_filter: needs a TankNetwork as the plant and a LevelSensor")
     box, more = _box(case, widths)
-    inflow, volume = _disturbances(loop, case.clock)
-    draw, drawn = _withdrawn(loop, case.clock)
+    draw, inflow, volume, draws = _disturbances(loop, case.clock)
+    rim, top = spread(loop.plant.rim, "plant.rim", box)[0], case.limits.get("max_level", "rim")
+    if limit is None:
+        limit = rim if isinstance(top, str) else np.minimum(rim, np.asarray(top, dtype=float))
     safety_filter, rows = design(
         loop.plant,
         loop.actuator,
         loop.sensor,
         case.clock.dt,
         widths=box,
-        limit=_level_limits(case, box) if limit is None else limit,
+        limit=limit,
         inflow=inflow * more,
         volume=volume * more,
         band=band,
@@ -89,7 +92,7 @@ def design_for(
         start=loop.x0,
         low=case.limits.get("min_level", 0.0) if low is None else low,
         draw=draw * more,
-        drawn=drawn,
+        draws=draws,
         predict=predict,
         faults=loop.faults,
     )
@@ -122,10 +125,10 @@ def _not_proved(row, reason):
 
 def _equal(first, second):
     """Whether two filters have the same structure and, to rounding, the same numbers."""
-    leaves = [jax.tree.flatten(one) for one in (first, second)]
-    return leaves[0][1] == leaves[1][1] and all(
-        np.shape(a) == np.shape(b) and np.allclose(a, b, rtol=1e-9, atol=0.0, equal_nan=True)
-        for a, b in zip(leaves[0][0], leaves[1][0])
+    (a, structure), (b, other) = jax.tree.flatten(first), jax.tree.flatten(second)
+    same = lambda x, y: np.allclose(x, y, rtol=1e-9, atol=0.0, equal_nan=True)
+    return structure == other and all(
+        np.shape(x) == np.shape(y) and same(x, y) for x, y in zip(a, b)
     )
 
 
@@ -137,11 +140,10 @@ def _box(case, widths):
     flows: dict[str, float] = {name: SPREAD for name in FLOWS}
     if case.covariance is not None:
         names, matrix = case.covariance
-        names = [n for n in names if not n.startswith(HARMLESS)]
-        at = [list(case.covariance[0]).index(n) for n in names]
+        at = [i for i, name in enumerate(names) if not name.startswith(HARMLESS)]
         sigma = np.sqrt(np.diag(np.asarray(matrix, dtype=float)))[at]
         reach = np.sqrt(2.0 * scipy.special.gammaincinv(0.5 * max(len(at), 1), PROBABILITY))
-        box = dict(zip(names, reach * sigma))
+        box = dict(zip([names[i] for i in at], reach * sigma))
         flows = {}  # what the covariance leaves out is exact, unless `uncertain` names it
     plant = {n: s for n, s in shares.items() if n.startswith("plant.")} or flows
     if widths is not None:
@@ -151,10 +153,11 @@ def _box(case, widths):
         box[name] = np.maximum(half, box.get(name, 0.0))
     more = 1.0
     for name, share in shares.items():
-        part, leaf = name.partition("[")[0].rpartition(".")[::2]
+        field, _ = split_index(name)
+        part = field.rpartition(".")[0]
         if name.startswith(("plant.", *HARMLESS)) or name in box:
             continue
-        if part == "disturbance" and leaf in ("level", "volume"):  # linear in both
+        if field in ("disturbance.level", "disturbance.volume"):  # linear in both
             more = max(more, 1.0 + share)
             continue
         owner = case.loop if name.startswith("x0") else getattr(case.loop, part, None)
@@ -162,52 +165,38 @@ def _box(case, widths):
     return box, more
 
 
-def _level_limits(case, box):
-    """(n,) upper limits on the levels of a case [cm]: of max_level, or the rims."""
-    rim = spread(case.loop.plant.rim, "plant.rim", box)[0]
-    limit = case.limits.get("max_level", "rim")
-    return rim if isinstance(limit, str) else np.minimum(rim, np.asarray(limit, dtype=float))
-
-
 def _disturbances(loop, clock):
-    """((n,) largest inflow [cm^3/s], (n,) volume that comes in pulses besides [cm^3])."""
+    """((n,) least inflow, 0 or negative, (n,) largest inflow [cm^3/s], (n,) volume that comes in
+    pulses besides [cm^3], whether pulses draw liquid).
+    """
     none = np.zeros(loop.plant.tanks)
     if loop.disturbance is None:
-        return none, none
+        return none, none, none, False
     if isinstance(loop.disturbance, InflowPulses):
-        volume = none.copy()
-        for added, (_, _, tank) in zip(loop.disturbance.volume, loop.disturbance.events):
-            volume[tank] += max(float(added), 0.0)
-        return none, volume
-    flows = loop.disturbance.sample(clock)[0]
-    return np.array([max(float(np.max(flow)), 0.0) for flow in flows]), none
-
-
-def _withdrawn(loop, clock):
-    """((n,) least inflow, 0 or negative [cm^3/s], whether inflow pulses draw liquid)."""
-    none = np.zeros(loop.plant.tanks)
-    if loop.disturbance is None:
-        return none, False
-    if isinstance(loop.disturbance, InflowPulses):
-        return none, bool(np.any(np.asarray(loop.disturbance.volume) < 0.0))
-    flows = loop.disturbance.sample(clock)[0]
-    return np.array([min(float(np.min(flow)), 0.0) for flow in flows]), False
+        volume, added = none.copy(), np.asarray(loop.disturbance.volume)
+        for entering, (_, _, tank) in zip(added, loop.disturbance.events):
+            volume[tank] += max(float(entering), 0.0)
+        return none, none, volume, bool(np.any(added < 0.0))
+    flows = [np.asarray(flow) for flow in loop.disturbance.sample(clock)[0]]
+    least = np.array([min(float(np.min(flow)), 0.0) for flow in flows])
+    return least, np.array([max(float(np.max(flow)), 0.0) for flow in flows]), none, False
 
 
 def _beyond(case, safety_filter):
     """Names of the plant's parameters that the case calls uncertain beyond the box of a filter."""
-    box, _ = _box(case, None)
-    stated = case.covariance is not None or any(n.startswith("plant.") for n in case.uncertain)
-    names = [name for name in box if name.startswith("plant.")] if stated else []
+    if case.covariance is None and not any(n.startswith("plant.") for n in case.uncertain):
+        return []
     beyond = []
-    for name in names:
-        field, _, entry = name.removeprefix("plant.").partition("[")
-        at = int(entry[:-1]) if entry else ...
+    for name, half in _box(case, None)[0].items():
+        part, _, leaf = name.partition(".")
+        if part != "plant":
+            continue
+        field, entry = split_index(leaf)
         value, least, most = (
-            np.asarray(getattr(plant, field), dtype=float)[at]
+            np.asarray(getattr(plant, field), dtype=float)[entry]
             for plant in (case.loop.plant, safety_filter.least, safety_filter.most)
         )
-        half = np.asarray(box[name]) * (1.0 - 1e-9)
+        half = np.asarray(half) * (1.0 - 1e-9)
         top = np.minimum(value + half, 1.0) if field in ("split", "caught") else value + half
         if np.any(value - half < least) or np.any(top > most):
             beyond.append(name)

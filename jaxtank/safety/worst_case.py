@@ -1,5 +1,6 @@
-"""The largest rates a level can have over a box of plants, tank by tank."""
+"""The largest and least rates that levels can have over a box of plants, tank by tank."""
 
+import math
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -29,10 +30,10 @@ def rates_of(
     n = least.tanks
     slow, fast = jnp.sqrt(2.0 * least.gravity), jnp.sqrt(2.0 * most.gravity)
     out, out_most = _free_outlets(least), _free_outlets(most)
-    everything = list(out_most)
+    outlets = list(out_most)
     for k, ends in enumerate(least.pipes):
         for i in ends:
-            everything[i] = everything[i] + most.pipe[k]
+            outlets[i] = outlets[i] + most.pipe[k]
     links = tuple(
         (i, j, least.orifice[k] * slow / most.area[j], most.orifice[k] * fast / least.area[j])
         for k, (i, j) in enumerate(least.links)
@@ -44,8 +45,7 @@ def rates_of(
     )
     # with `bottom`, outflow is limited below this level (see TankNetwork.limited)
     empty = [
-        (step * fast * everything[i] / least.area[i]) ** 2 if least.bottom else 0.0
-        for i in range(n)
+        (step * fast * outlets[i] / least.area[i]) ** 2 if least.bottom else 0.0 for i in range(n)
     ]
     return Rates(
         out=tuple(out[i] * slow / most.area[i] for i in range(n)),
@@ -88,45 +88,59 @@ def _feed(pumps, pump, least, most, tank, share_least, share_most):
     )
 
 
-def rise(rates: Rates, tank: int, level: Any, others: Any) -> Any:
+def rise(rates: Rates, tank: int, level: Any, others: Any, operations: Any = None) -> Any:
     """Return Phi_max [cm/s]: the largest rate of a tank's level when its pumps stand still."""
     # Phi_max(h) = -c_min s(h) + sum_in c_max s(h_k) + sum_pipes P(h_k - h) + d_max, P(z) = p_max
     # s(z) for z >= 0, p_min s(z) for z < 0
-    h = lower_clip(level, 0.0)
-    rate = rates.inflow[tank] - rates.out[tank] * smooth_sqrt(h, rates.knee)
+    root, signed_root, at_least, where = operations or _operations()
+    h = at_least(level, 0.0)
+    inflows = rates.inflow[tank]  # without outflow, where that may be limited
+    rate = inflows - rates.out[tank] * root(h, rates.knee)
     for i, j, least, most in rates.pipes:
         if i == tank:
-            s = smooth_signed_sqrt(others[j] - h, rates.knee)
-            rate = rate + jnp.where(s >= 0.0, most, least) * s
-    rate = jnp.where(h < rates.empty[tank], _inflows_only(rates, tank, h, others), rate)
+            s = signed_root(others[j] - h, rates.knee)
+            rate = rate + where(s >= 0.0, most, least) * s
+            inflows = inflows + most * at_least(s, 0.0)
+    rate = where(h < rates.empty[tank], inflows, rate)
     for source, sink, _, most in rates.links:
         if sink == tank:
-            rate = rate + most * smooth_sqrt(lower_clip(others[source], 0.0), rates.knee)
+            rate = rate + most * root(at_least(others[source], 0.0), rates.knee)
     return rate
 
 
-def _inflows_only(rates, tank, h, others):
-    """Phi_max [cm/s] without orifices of other tanks, where nothing may flow out."""
-    rate = rates.inflow[tank]
-    for i, j, _, most in rates.pipes:
-        if i == tank:
-            rate = rate + most * lower_clip(smooth_signed_sqrt(others[j] - h, rates.knee), 0.0)
-    return rate
-
-
-def fall(rates: Rates, tank: int, level: Any, others: Any) -> Any:
+def fall(rates: Rates, tank: int, level: Any, others: Any, operations: Any = None) -> Any:
     """Return Phi_min [cm/s]: the least rate of a tank's level when its pumps stand still."""
     # Phi_min(h) = -c_max s(h) + sum_in c_min s(h_k) + sum_pipes P(h_k - h) + d_min, P(z) = p_min
     # s(z) for z >= 0, p_max s(z) for z < 0
-    h = lower_clip(level, 0.0)
-    rate = rates.draw[tank] - rates.out_most[tank] * smooth_sqrt(h, rates.knee)
-    flow = lambda source, value: jnp.where(others[source] < rates.empty[source], 0.0, value)
+    root, signed_root, at_least, where = operations or _operations()
+    h = at_least(level, 0.0)
+    rate = rates.draw[tank] - rates.out_most[tank] * root(h, rates.knee)
+    flow = lambda source, value: where(others[source] < rates.empty[source], 0.0, value)
     for i, j, least, most in rates.pipes:
         if i == tank:
-            s = smooth_signed_sqrt(others[j] - h, rates.knee)
-            rate = rate + jnp.where(s >= 0.0, flow(j, least * s), most * s)
+            s = signed_root(others[j] - h, rates.knee)
+            rate = rate + where(s >= 0.0, flow(j, least * s), most * s)
     for source, sink, least, _ in rates.links:
         if sink == tank:
-            entering = least * smooth_sqrt(lower_clip(others[source], 0.0), rates.knee)
-            rate = rate + flow(source, entering)
+            rate = rate + flow(source, least * root(at_least(others[source], 0.0), rates.knee))
     return rate
+
+
+def _operations():
+    return smooth_sqrt, smooth_signed_sqrt, lower_clip, jnp.where
+
+
+def plain_root(h, knee):
+    """`smooth_sqrt` of a level h >= 0 in plain numbers."""
+    return math.sqrt(h) if h >= knee else math.sqrt(knee) * (1.5 * h / knee - 0.5 * (h / knee) ** 2)
+
+
+def _plain_signed_root(z, knee):
+    if math.isinf(z):
+        return z
+    exact = math.copysign(math.sqrt(abs(z)), z)
+    return z / (z * z + knee * knee) ** 0.25 if abs(z) < 1e6 else exact
+
+
+PLAIN = (plain_root, _plain_signed_root, max, lambda condition, a, b: a if condition else b)
+"""Operations on plain numbers, for `rise` and `fall` before a run."""

@@ -586,7 +586,7 @@ def attack_file(table, actuator, safety_filter, rows, seed, low, any_start, coun
     samples = int(np.clip(90.0 / hold, 200, 500))
     target = np.where(rng.random(count) < 0.6, rng.integers(0, shape.n, count), -1)
     p = plants_of(rng, box, shape, count, target)
-    anywhere = np.array([any_start or getattr(r, "starts", "").startswith("any") for r in rows])
+    anywhere = np.array([any_start or r.starts == "limits" for r in rows])
     elsewhere = np.arange(count) % 4 >= 2 if anywhere.any() else np.zeros(count, bool)
     start = starts(rng, table, rows, p["x0"], count, elsewhere)
     wanted, share = commands(rng, box, samples, count, low)
@@ -720,7 +720,7 @@ def attack(
     if pulses is not None:
         entering = np.broadcast_to(np.asarray(pulses)[:samples, None], (samples, count, n))
     limit, least = np.asarray(found.limit), np.asarray(found.low)
-    top = limit if start is None else np.minimum(start, limit)
+    top = limit if start is None else start
     x = rng.uniform(0.2, 1.0, (count, 1)) * rng.uniform(0.0, 1.0, (count, n)) ** 0.3
     x = least + (top - least) * x
     x[: count // 4] = top

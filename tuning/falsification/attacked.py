@@ -21,7 +21,7 @@ from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken
 from jaxtank.loop.step import step
 from jaxtank.plants.faults import Faults
 from jaxtank.safety.box import band_of, top_of
-from jaxtank.safety.filter import FLOOR
+from jaxtank.safety.filter import SHALLOW
 from jaxtank.safety.of_case import FLOWS
 from jaxtank.safety.worst_case import rates_of
 from jaxtank.xla.hoist import scan
@@ -302,7 +302,7 @@ class Attacked:
             if guard.slope[i] <= 0.0:
                 continue
             sources = [(j, most) for j, sink, _, most in rates.links if sink == i]
-            least = FLOOR * root(guard.limit[i])
+            least = SHALLOW * root(guard.limit[i])
             may = rates.out[i] * root(x[i]) + guard.slope[i] * (guard.limit[i] - x[i])
             does = sum(most * lower_clip(root(x[j]), least) for j, most in sources)
             share = jnp.where(does > may, may / does, 1.0) * (1.0 - 1e-9)

@@ -10,7 +10,7 @@ from jaxtank.core.tree import describe, get_value
 from jaxtank.core.units import local
 from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv
-from jaxtank.safety.checker import OWN
+from jaxtank.safety.checker import CASE
 from tuning.problem import provenance
 from tuning.problem.wording import count, numbered
 from tuning.report.document import Report, Text, figures_of
@@ -98,7 +98,7 @@ def remarks_of(attack):
         )
     if beyond := [one.tank + 1 for one in attack.found if _starts_elsewhere(attack, one)]:
         found.append(
-            f"Proved {start_of([OWN])} only: {numbered('tank', beyond)}. This attack starts"
+            f"Proved {start_of([CASE])} only: {numbered('tank', beyond)}. This attack starts"
             " anywhere below the limits; --start own keeps to the case's start."
         )
     if outside := _outside(attack):
@@ -119,7 +119,7 @@ def remarks_of(attack):
 
 def _starts_elsewhere(attack, one):
     """Whether a limit is proved from the case's start only, and the attack has others."""
-    return one.starts == OWN and attack.attacked.start == "any"
+    return one.starts == CASE and attack.attacked.start == "any"
 
 
 def _outside(attack):
@@ -233,7 +233,7 @@ def verdict(attack):
     words = ", ".join(
         f"tank {one.tank + 1} by {-one.margin:.3g} {unit}"
         + (f" ({one.reason})" if one.certified is False else "")
-        + (f" (proved {start_of([OWN])} only)" if _starts_elsewhere(attack, one) else "")
+        + (f" (proved {start_of([CASE])} only)" if _starts_elsewhere(attack, one) else "")
         for one in attack.passed
     )
     return f"Limits are passed: {words}."

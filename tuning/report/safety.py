@@ -4,13 +4,9 @@ import numpy as np
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.units import local
-from jaxtank.safety.checker import ANY, OWN
+from jaxtank.safety.checker import CASE, LIMITS
 from jaxtank.safety.of_case import certificates_of
 from tuning.report.tables import Table, Value, clean
-
-SHORT = {ANY: "limits", OWN: "case", "": "-"}
-"""Hypotheses on the start in a table."""
-
 
 PROMISE = (
     "on any plant with parameters in the case's intervals, under any controller, while each reading"
@@ -21,7 +17,7 @@ PROMISE = (
 
 def start_of(starts):
     """Return in words from which levels at t = 0 all of several limits are proved."""
-    highest = "the limits" if set(starts) == {ANY} else "the case's start"
+    highest = "the limits" if set(starts) == {LIMITS} else "the case's start"
     return f"from levels at or below {highest}"
 
 
@@ -58,13 +54,13 @@ def table_of(case, rows):
     """Return the Table of `certificates`, its numbers in the case's units."""
     length, cells = local("cm", case.loop.units), []
     for row in rows:
-        proved, start = "yes" if row["certified"] else "no", SHORT[row["starts"] or ""]
+        proved, start = "yes" if row["certified"] else "no", row["starts"] or "-"
         rates = [Value(row["rate"], 3), Value(row["rate_bound"], 3)]
         limit, gap = Value(row["limit"], 4), Value(row["gap"], 3)
         cells.append([row["tank"], limit, proved, start, *rates, gap, row["why"]])
     for row in rows:
         if low := row["low"]:
-            proved, start = "yes" if low["certified"] else "no", SHORT[OWN * low["certified"]]
+            proved, start = "yes" if low["certified"] else "no", CASE if low["certified"] else "-"
             limit = f"low {low['limit']:.4g}"
             rate = Value(row["rate"], 3)
             cells.append([row["tank"], limit, proved, start, rate, "-", "-", low["why"]])

@@ -1,48 +1,68 @@
-"""The safety filter through the command line, rig files and exported controllers."""
+"""The safety filter of a case: rig files, the command line, and what is claimed of its box."""
 
-import json
+import dataclasses
 
 import numpy as np
 import pytest
 from helpers import command
 
+import jaxtank
+import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
+from jaxtank.safety.of_case import certificates_of
+from tuning.report.safety import certificates
 
 RIG = """
 case = "cascaded/pi"
-[values]
-clock.duration = 2000.0
 [safety_filter]
 rate = 0.1
 limit = [9.5, 9.0]
 """
 
 
-def highest(*words):
-    code, out, err = command("simulate", *words, "--json", "--quiet")
-    assert code == 0, err
-    return np.array(json.loads(out)["measures"]["max_level"])
+def simulated(*words):
+    result = command("simulate", *words, "--json")
+    assert result.code == 0, result.err
+    return np.array(result.json["measures"]["max_level"]), result
 
 
-def test_the_option_keeps_levels_below_the_rims():
-    assert highest("cascaded/pi")[0] == 10.0  # and spills
-    assert highest("cascaded/pi", "--safety-filter")[0] < 9.7
-
-
-def test_simulate_says_that_the_filter_is_on():
-    for words, on in (([], False), (["--safety-filter"], True)):
-        code, out, _ = command("simulate", "cascaded/pi", *words)
-        assert code == 0 and ("The safety filter is on" in out) == on
-        assert ("filter_active_fraction" in out) == on
-
-
-def test_a_rig_file_turns_the_filter_on_and_an_option_turns_it_off(tmp_path):
+def test_options_and_rig_files_turn_the_filter_on_and_off(tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text(RIG)
-    limited = highest(str(path))
-    assert np.all(limited <= [9.5, 9.0]) and limited[0] > 8.0
-    assert highest(str(path), "--no-safety-filter")[0] == 10.0
+    highest, result = simulated("cascaded/pi")
+    assert highest[0] == 10.0 and result.json["measures"]["filter_active_fraction"] is None
+    highest, result = simulated("cascaded/pi", "--safety-filter")
+    assert highest[0] < 9.7 and result.json["measures"]["filter_active_fraction"] > 0.0
+    assert "not proved" not in result.err
+    highest, _ = simulated(str(path))
+    assert np.all(highest <= [9.5, 9.0]) and highest[0] > 8.0
+    assert simulated(str(path), "--no-safety-filter")[0][0] == 10.0
+    lower = ("--set", "safety_filter.limit=[9.0,9.0]")
+    highest, result = simulated("cascaded/pi", "--safety-filter", *lower)
+    assert np.all(highest <= 9.0)
+    # the share of samples with an input other than the command within the pumps' limits
+    case = presets.find("cascaded/pi").with_safety_filter(limit=[9.0, 9.0])
+    run = jaxtank.simulate(case.loop, case.clock)
+    free = np.clip(run.command, case.loop.actuator.low, case.loop.actuator.high)
+    share = np.mean(np.any(np.asarray(run.applied) != free, axis=1))
+    assert 0.01 < share < 0.5
+    assert result.json["measures"]["filter_active_fraction"] == pytest.approx(share, rel=1e-9)
+    fast = ("--set", "safety_filter.rate=0.3")
+    _, result = simulated("cascaded/pi", "--safety-filter", *fast)
+    assert "tank 1 is not proved: kappa 0.3 above its bound 0.25 1/s" in result.err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--set", "safety_filter.rate=0.1"], "--safety-filter turns it on"),
+        (["--safety-filter", "--set", "safety_filter.rat=0.1"], "nearest: rate"),
+    ],
+)
+def test_a_setting_of_a_filter_that_is_off_or_unknown_is_one_line(words, message):
+    result = command("simulate", "cascaded/pi", *words)
+    assert result.code == 2 and message in result.err
 
 
 def test_a_filtered_case_comes_back_from_its_rig_file():
@@ -52,58 +72,121 @@ def test_a_filtered_case_comes_back_from_its_rig_file():
         assert again.safety == {"rate": 0.1, "limit": pytest.approx([9.5, 9.0])}
         assert again.loop.safety_filter.limit.tolist() == case.loop.safety_filter.limit.tolist()
     assert rig.loads(rig.dump(case.without_safety_filter())).loop.safety_filter is None
-
-
-def test_the_filter_is_designed_for_the_values_that_are_set():
-    """A wider rim raises the limit; the box is that of [uncertain]."""
-    code, out, _ = command("show", "cascaded/pi", "--set", "plant.rim=[12,13]", "--json")
-    assert code == 0
-    assert [row["limit"] for row in json.loads(out)["safety_filter"]] == [12.0, 13.0]
-
-
-def test_show_prints_what_is_proved_and_the_condition_that_failed():
-    pulses = ["actuator.dead_zone=[1,1]", "actuator.dead_zone_kind=pulse"]
-    code, out, _ = command("show", "gouta2015/ngpc", *(w for p in pulses for w in ("--set", p)))
-    assert code == 0 and "pays out more than was commanded" in " ".join(out.split())
-    code, out, _ = command("show", "gouta2015/ngpc")
-    table = out.split("Limits on levels")[1].split("The safety filter")[0]
-    assert table.count("yes") == 4 and "Theorem 2" in table and "0.108" in table
+    by_hand = presets.find("cascaded/pi").with_safety_filter().replace(safety=None)
+    with pytest.raises(InputError, match="its safety filter is not that of"):
+        rig.dump(by_hand)
 
 
 @pytest.mark.parametrize(
     ("lines", "words"),
     [
-        ("rate = -1.0", "safety_filter.rate = -1"),
+        ("rate = -1.0", r"safety_filter\.rate = -1"),
         ("limits = [1.0, 2.0]", "nearest: limit"),
-        ("limit = [1.0]", "safety_filter.limit"),
-        ('widths = { "plant.drian" = 0.1 }', "plant.drian"),
+        ("limit = [1.0]", r"safety_filter\.limit"),
+        ('widths = { "plant.drian" = 0.1 }', r"plant\.drian"),
     ],
 )
-def test_a_wrong_setting_is_one_line(lines, words):
-    text = f'case = "cascaded/pi"\n[safety_filter]\n{lines}\n'
-    with pytest.raises(InputError, match=words.replace(".", r"\.")):
-        rig.loads(text)
+def test_a_wrong_setting_in_a_rig_file_is_one_line(lines, words):
+    with pytest.raises(InputError, match=words):
+        rig.loads(f'case = "cascaded/pi"\n[safety_filter]\n{lines}\n')
 
 
-def test_a_filter_made_by_hand_has_no_rig_file():
+def test_show_has_limits_hypotheses_and_reasons():
+    """The filter is designed for the values that are set; k1 of gouta2015 has a gap of 0.108 cm."""
+    wider = ("cascaded/pi", "--set", "plant.rim=[12,13]")
+    assert [row["limit"] for row in command("show", *wider, "--json").json["safety_filter"]] == [
+        12.0,
+        13.0,
+    ]
+    table = command("show", *wider).out.split("Limits on levels")[1]
+    assert "no fault takes a parameter out of its interval" in " ".join(table.split())
+    case = presets.find("gouta2015/ngpc")
+    rows = certificates(case)
+    assert [row["starts"] for row in rows] == ["case", "case", "limits", "limits"]
+    assert [row["why"] for row in rows] == ["Theorem 2"] * 2 + ["Theorem 1"] * 2
+    assert rows[2]["gap"] == pytest.approx(0.108, abs=5e-4)
+    pulses = {"actuator.dead_zone": [1.0, 1.0], "actuator.dead_zone_kind": "pulse"}
+    row = certificates(rig.set_values(case, pulses))[2]
+    assert not row["certified"] and "pays out more than was commanded" in row["why"]
+
+
+# --------------------------------------------------------------------------- the box of a case
+
+TANKS = """
+name = "two"
+tank = [
+    { area = 50.0, rim = 20.0, drain = 0.6, level = 5.0 },
+    { area = 50.0, rim = 20.0, drain = 0.6, level = 5.0 },
+]
+pump = [
+    { gain = 20.0, to = 1, low = 0.0, high = 20.0, initial = 0.0 },
+    { gain = 20.0, to = 2, low = 0.0, high = 20.0, initial = 0.0 },
+]
+plant = { outputs = [1, 2] }
+controller = { kind = "pid", Kc = [1.0, 1.0], Ti = [50.0, 50.0], Tt = [20.0, 20.0] }
+reference = { initial = [5.0, 5.0], changes = [[1.0, 1, 30.0], [1.0, 2, 30.0]], ramp = 0.0 }
+values = { "clock.dt" = 0.5, "clock.duration" = 100.0 }
+reachable = false
+"""
+COVARIANCE = """
+uncertain = { "plant.drain[1]" = 0.3, "plant.pump_gain" = 0.3 }
+covariance = { names = ["plant.drain[0]"], matrix = [[1e-8]] }
+safety_filter = {}
+"""
+FAULT = 'fault = [{ of = "drain[0]", start = 60.0, end = 80.0, factor = 0.5 }]\nsafety_filter = {}'
+NARROW = """
+uncertain = { "plant.drain" = 0.3, "plant.pump_gain" = 0.3, "controller.Kc" = 0.5 }
+safety_filter = { widths = { "plant.drain" = 0.001 } }
+"""
+
+
+def test_the_box_is_that_of_the_covariance_and_of_the_spreads_beside_it():
+    """With the extreme plant of the spreads in the loop, the level passes no proved limit."""
+    case = rig.loads(TANKS + COVARIANCE)
+    least, most = case.loop.safety_filter.least, case.loop.safety_filter.most
+    np.testing.assert_allclose(least.drain[1], 0.7 * 0.6)
+    np.testing.assert_allclose([least.pump_gain, most.pump_gain], [[14.0] * 2, [26.0] * 2])
+    assert 0.0 < 0.6 - least.drain[0] < 0.001
+    assert all(row["certified"] for row in certificates(case))
+    plant = dataclasses.replace(
+        case.loop.plant, drain=np.array([0.6, 0.45]), pump_gain=np.array([25.0, 25.0])
+    )
+    loop = dataclasses.replace(case.loop, plant=plant)
+    highest = jaxtank.evaluate(loop, case.clock, ["max_level"])["max_level"]
+    assert np.all(highest <= 20.0) and np.all(highest > 19.0)
+
+
+@pytest.mark.parametrize(
+    ("lines", "reason"),
+    [
+        (NARROW, "not covered: plant.drain, plant.pump_gain beyond the widths of the filter"),
+        (FAULT, "not covered: fault of plant.drain[0]"),
+    ],
+)
+def test_what_lies_outside_the_box_is_not_proved_and_noted(lines, reason, tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(TANKS + lines)
+    row = certificates(rig.loads(path.read_text()))[0]
+    assert not row["certified"] and row["starts"] is None and row["why"].startswith(reason)
+    result = command("show", str(path), "--json")
+    assert result.code == 0 and reason in result.err
+    assert not result.json["safety_filter"][0]["certified"]
+    path.write_text(TANKS + lines.replace("= 0.001", "= 0.3").replace("factor = 0.5", "factor = 1"))
+    assert reason not in command("show", str(path)).err
+
+
+@pytest.mark.parametrize(
+    "changes", [{"safety_filter.rate": np.array([30.0, 30.0])}, {"plant.pump_gain": [60.0, 60.0]}]
+)
+def test_a_filter_that_was_designed_for_another_rig_is_not_certified(changes):
+    case = rig.loads(TANKS + "safety_filter = {}")
+    assert all(row.certified for row in certificates_of(case))
+    changed = case.replace(loop=jaxtank.with_values(case.loop, changes))
+    assert not any(row.certified for row in certificates_of(changed))
+    assert all("not designed for this rig" in row["why"] for row in certificates(changed))
+
+
+def test_numbers_of_the_filter_are_not_tuned():
     case = presets.find("cascaded/pi").with_safety_filter()
-    with pytest.raises(InputError, match="its safety filter is not that of"):
-        rig.dump(case.replace(safety=None))
-
-
-def test_a_setting_of_the_filter_is_set_by_its_name():
-    tight = highest("cascaded/pi", "--safety-filter", "--set", "safety_filter.limit=[9.0,9.0]")
-    assert np.all(tight <= 9.0)
-    code, _, err = command("simulate", "cascaded/pi", "--set", "safety_filter.rate=0.1")
-    assert code == 2 and "the safety filter is off; --safety-filter turns it on" in err
-    words = ["cascaded/pi", "--safety-filter", "--set", "safety_filter.rat=0.1"]
-    code, _, err = command("simulate", *words)
-    assert code == 2 and "nearest: rate" in err
-
-
-def test_a_limit_that_is_not_proved_is_reported():
-    fast = ["cascaded/pi", "--safety-filter", "--set", "safety_filter.rate=0.3"]
-    code, _, err = command("simulate", *fast)
-    assert code == 0 and "tank 1 is not proved: kappa 0.3 above its bound 0.25 1/s" in err
-    code, _, err = command("simulate", *fast[:2])
-    assert code == 0 and "not proved" not in err
+    with pytest.raises(InputError, match=r"safety_filter\.rate: .* \[safety_filter\]"):
+        tuning.Problem(case, free={"safety_filter.rate": (0.1, 1.0)})

@@ -3,7 +3,6 @@ by 10 %.
 """
 
 import dataclasses
-import json
 import math
 
 import numpy as np
@@ -12,11 +11,12 @@ from helpers import command
 from safety_attacks import attack, of, sensor_of
 from scipy.integrate import solve_ivp
 
-from jaxtank import evaluate, presets, rig, simulate
+from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.plants import network
 from jaxtank.safety import design
+from tuning.report.safety import certificates
 
 W = math.sqrt(2 * 981.0)
 HOLD, LOW = 0.5, 4.0
@@ -34,7 +34,7 @@ def designed(plant, actuator, **given):
 
 
 def falls_below(plant, actuator, found, eps=0.0):
-    how = {"seconds": 200, "count": 60, "eps": eps, "down": True}
+    how = {"seconds": 100, "count": 24, "eps": eps, "down": True}
     _, lowest = attack(plant, actuator, found, HOLD, 0.1, **how)
     return lowest < LOW - 1e-6
 
@@ -45,7 +45,7 @@ def test_one_tank_with_scipy_and_the_floor_written_apart():
     found, _ = designed(plant, actuator)
     kappa, h = float(found.rate[0]), 12.0
     c_max, b_min = 0.33 * W / 20.0, 7.2 / 20.0
-    for _ in range(120):
+    for _ in range(80):
         floor = max(0.0, c_max * math.sqrt(h) - kappa * (h - LOW)) / b_min
         u, acts = found.apply(actuator, (0.0,), None, (h,), HOLD)
         assert float(u[0]) == pytest.approx(floor, rel=1e-12)
@@ -100,7 +100,7 @@ def test_reasons_name_the_condition_that_fails():
     assert reason(pumps(dead_zone=[1.0])) == "not proved with a dead zone"
     assert reason(actuator, start=[3.0]) == "start at 3 cm, below the low limit"
     assert reason(actuator, rate=2.2) == "kappa T = 1.1 above 1"
-    assert reason(actuator, drawn=True) == "not proved with inflow pulses that draw liquid"
+    assert reason(actuator, draws=True) == "not proved with inflow pulses that draw liquid"
     assert reason(actuator, low=[29.0], band=0.6, rate=2.0) == (
         "floor above cap: the upper limit is kept first"
     )
@@ -116,7 +116,7 @@ def test_where_floor_and_cap_exclude_each_other_the_upper_limit_is_kept():
     found, (row,) = designed(plant, actuator, **given)
     assert row.certified and not row.low_certified
     for down in (False, True):
-        how = {"seconds": 100, "eps": 0.6, "down": down, "count": 30}
+        how = {"seconds": 100, "eps": 0.6, "down": down, "count": 12}
         highest, _ = attack(plant, actuator, found, HOLD, 0.1, **how)
         assert highest[0] <= 30.0 + 1e-9
 
@@ -138,7 +138,7 @@ def test_a_tank_without_a_pump_is_kept_by_the_low_limit_above_it():
         low = [share * (0.9 / 1.1) ** 2 * above, above]
         found, rows = designed(plant, actuator, low=low, limit=[40.0, 20.0])
         assert [r.low_certified for r in rows] == [proved, True]
-        how = {"seconds": 300, "count": 60, "down": True}
+        how = {"seconds": 150, "count": 24, "down": True}
         _, lowest = attack(plant, actuator, found, HOLD, 0.1, **how)
         assert np.all(lowest >= np.array(low) - 1e-9) == proved
 
@@ -171,24 +171,10 @@ def test_a_rig_file_and_the_command_take_low_limits(tmp_path):
     assert rig.loads(rig.dump(case)).loop.safety_filter.low.tolist() == [0.1, 0.0]
     path = tmp_path / "rig.toml"
     path.write_text(RIG)
-    code, out, _ = command("show", str(path), "--json")
-    rows = json.loads(out)["safety_filter"]
-    assert code == 0 and rows[0]["low"]["limit"] == 0.1 and rows[1]["low"] is None
-    code, out, _ = command("show", str(path))
-    assert code == 0 and "low 0.1" in out.split("Limits on levels")[1]
+    rows = certificates(case)
+    assert rows[0]["low"]["limit"] == 0.1 and rows[1]["low"] is None
     words = [str(path), "--set", "safety_filter.low=[0.7,0]"]
     code, _, err = command("simulate", *words)
     assert code == 2 and "safety_filter.low[0] = 0.7 m: must be" in err.splitlines()[-1]
     limited = case.replace(limits={"min_level": 0.05}, safety=None).with_safety_filter()
     assert limited.loop.safety_filter.low.tolist() == [0.05, 0.05]
-
-
-def test_the_share_of_active_samples_is_counted_from_the_run():
-    """Of samples with an input other than the command within the pumps' limits (one pump)."""
-    case = presets.find("cascaded/pi").with_safety_filter(limit=[9.0, 9.0])
-    run = simulate(case.loop, case.clock)
-    free = np.clip(run.command, case.loop.actuator.low, case.loop.actuator.high)
-    share = np.mean(np.any(np.asarray(run.applied) != free, axis=1))
-    assert 0.01 < share < 0.5
-    found = evaluate(case.loop, case.clock, ["filter_active_fraction"])
-    assert found["filter_active_fraction"] == pytest.approx(share, rel=1e-12)

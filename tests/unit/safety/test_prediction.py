@@ -3,13 +3,12 @@ each condition broken by 10 %.
 """
 
 import dataclasses
-import json
 import math
 
 import jax
 import numpy as np
 import pytest
-from helpers import RIGS, command
+from helpers import RIGS
 from safety_attacks import attack, of, sensor_of
 from scipy.integrate import solve_ivp
 
@@ -20,6 +19,7 @@ from jaxtank.instruments.actuators import PumpBank
 from jaxtank.plants import network
 from jaxtank.safety import design
 from jaxtank.safety.box import box_of
+from jaxtank.safety.of_case import certificates_of
 from jaxtank.safety.prediction import brackets
 from jaxtank.safety.worst_case import rates_of
 from jaxtank.signals.base import Constant
@@ -41,7 +41,7 @@ def upper_tank():
     return plant, PumpBank(low=[0.0], high=[12.0])
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_levels_of_every_plant_lie_between_the_brackets(seed):
     """Plants of the box by scipy; without a box the brackets close in on the solution."""
     rng = np.random.default_rng(seed)
@@ -71,7 +71,7 @@ def test_levels_of_every_plant_lie_between_the_brackets(seed):
         assert low <= solution(a * drain, b * gain) <= high
     exact = solution(drain, gain)
     widths = []
-    for substeps in (4, 40):
+    for substeps in (3, 18):
         low, high = bracket(0.0, substeps)
         assert low - 0.011 <= exact <= high + 0.011  # scipy has no laminar threshold
         widths.append(high - low)
@@ -87,8 +87,13 @@ def test_pumps_at_full_rest_at_the_gap_worked_out_by_hand(delay, prototype):
     plant, actuator = upper_tank()
     actuator = dataclasses.replace(actuator, delay=0.1 * delay)
     spread = 0.1 * W * math.sqrt(30.0) * float(plant.drain[0] / plant.area[0])
-    given = {"widths": of(plant, 0.05), "substeps": 4, "start": [20.0]}
-    how = {"seconds": 300.0, "count": 1, "delay": delay, "start": np.array([20.0])}
+    given = {"widths": of(plant, 0.05), "substeps": 4, "start": [28.0]}
+    how = {
+        "seconds": 40.0 if delay == 10 else 100.0,
+        "count": 1,
+        "delay": delay,
+        "start": np.array([28.0]),
+    }
     gaps = []
     for predict, dead_time in ((True, 0.1 * delay), (False, 0.0)):
         found, (row,) = design(plant, actuator, sensor_of(plant), 0.1, predict=predict, **given)
@@ -108,17 +113,18 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("name", BROKEN)
-def test_what_the_prediction_counts_on_is_needed(name):
+def test_what_the_prediction_counts_on_is_needed():
     plant = network(area=[20.0], drain=[0.05], feeds=[(0, None)], pump_gain=[8.0], rim=[30.0])
     actuator = PumpBank(low=[0.0], high=[12.0], delay=5.0)
     given = {"widths": of(plant, 0.05), "rate": 2.0, "start": [15.0], "substeps": 4}
     found, (row,) = design(plant, actuator, sensor_of(plant), 0.5, **given)
-    how = {"seconds": 200, "count": 60, "delay": 10, "start": np.array([15.0])}
+    how = {"seconds": 60, "count": 16, "delay": 10, "start": np.array([15.0])}
     assert row.certified and row.reason == "Theorem 5"
-    assert attack(plant, actuator, found, 0.5, 0.05, **how)[0][0] <= 30.0 + 1e-9
-    wrong = BROKEN[name](found)
-    assert attack(plant, actuator, wrong, 0.5, 0.05, **how)[0][0] > 30.0 + 1e-6
+    highest = lambda f: attack(plant, actuator, f, 0.5, 0.05, **how)[0][0]
+    assert highest(found) <= 30.0 + 1e-9
+    assert {name: highest(wrong(found)) > 30.0 + 1e-6 for name, wrong in BROKEN.items()} == (
+        dict.fromkeys(BROKEN, True)
+    )
 
 
 def test_inputs_under_way_that_overfill_the_tank_are_reported():
@@ -155,15 +161,10 @@ def test_a_run_with_a_dead_time_keeps_the_limit_by_prediction():
     np.testing.assert_allclose(run.u[20:], run.applied[:-20], atol=1e-12)
 
 
-def test_the_prediction_is_turned_off_in_a_rig_file(tmp_path):
+def test_the_prediction_is_turned_off_in_a_rig_file():
     case = water_tank()
-    path = tmp_path / "rig.toml"
-    path.write_text(rig.dump(case) + "\n[safety_filter]\npredict = false\n")
-    for words, theorem in (
-        ([], "Theorem 3"),
-        (["--set", "safety_filter.predict=true"], "Theorem 5"),
-    ):
-        code, out, err = command("show", str(path), "--json", *words)
-        assert code == 0, err
-        (row,) = json.loads(out)["safety_filter"]
-        assert row["why"].startswith(theorem) or ("(N)" in row["why"] and theorem == "Theorem 3")
+    off = rig.loads(rig.dump(case) + "\n[safety_filter]\npredict = false\n")
+    (row,) = certificates_of(off)
+    assert row.reason == "Theorem 3" or "(N)" in row.reason
+    (row,) = certificates_of(case)
+    assert row.reason == "Theorem 5"

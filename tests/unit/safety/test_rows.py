@@ -16,7 +16,7 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants import network
 from jaxtank.safety import SafetyFilter, design
 from jaxtank.safety.box import narrow_band
-from jaxtank.safety.certificate import _share as least_share
+from jaxtank.safety.low_limits import certain_share
 
 W = math.sqrt(2 * 981.0)
 HOLD = 0.5
@@ -233,7 +233,7 @@ def test_a_floor_has_each_term():
     plant = cascade(pipes=[], pipe=[], feeds=[(1, None), (0, None)], split=[1.0, 1.0])
     draw = {"low": np.array([5.0, 0.0, 0.0]), "draw": np.array([-4.0, 0.0, 0.0])}
     safety_filter = filter_of(plant, kept=(0,), **draw)
-    floors, _ = safety_filter.floors((4.5, 12.0, 9.0), HOLD, LOW, HIGH)
+    floors, _ = safety_filter.least_inputs((4.5, 12.0, 9.0), HOLD, LOW, HIGH)
     fastest = 1.1 * (0.20 + 0.25) * W / 30.0 * math.sqrt(27.0)
     below = 12.0 - 0.3 - HOLD * fastest
     phi = -4.0 / 20.0 - 1.1 * 0.30 * W / 20.0 * math.sqrt(4.7)
@@ -370,4 +370,4 @@ def test_the_weakest_of_two_pumps_decides_whether_floor_and_cap_agree(share):
     low = 30.0 - 2.0 * band * 60.0 / 40.0 / share
     _, (row,) = designed(plant, actuator, widths=widths, band=band, rate=1.0, low=[low])
     assert row.low_certified == (share < 1.0)
-    assert least_share({0: (50.0, 50.0), 1: (40.0, 60.0)}) == pytest.approx(2.0 / 3.0)
+    assert certain_share({0: (50.0, 50.0), 1: (40.0, 60.0)}) == pytest.approx(2.0 / 3.0)

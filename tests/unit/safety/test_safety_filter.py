@@ -17,8 +17,7 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants import network
 from jaxtank.safety import design
 from jaxtank.safety.box import box_of
-from jaxtank.safety.setting import phi, phi_min
-from jaxtank.safety.worst_case import fall, rates_of, rise
+from jaxtank.safety.worst_case import PLAIN, fall, rates_of, rise
 
 PRESETS = {
     "gouta2015/backstepping": (0.05, 0.1, 80.0),
@@ -30,6 +29,7 @@ PRESETS = {
 }
 
 
+@pytest.mark.slow_for("mirakhorli/sfc", "gouta2022/enmpc", "calofir/backstepping", "khalid/gpc")
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_tank_of_a_preset_is_certified_and_holds(name):
     hold, eps, seconds = PRESETS[name]
@@ -41,7 +41,7 @@ def test_every_tank_of_a_preset_is_certified_and_holds(name):
     assert all(r.certified for r in rows)
     low, high = np.maximum(loop.actuator.low, 0.0), np.minimum(loop.actuator.high, 50.0)
     actuator = dataclasses.replace(loop.actuator, low=low, high=high)
-    how = {"seconds": seconds, "count": 30, "eps": eps, "start": start}
+    how = {"seconds": seconds, "count": 12, "eps": eps, "start": start}
     highest, _ = attack(loop.plant, actuator, found, hold, 0.05, **how)
     assert np.all(highest <= np.asarray(found.limit) + 1e-9)
     assert np.any(highest > 0.98 * np.asarray(found.limit))  # the attack is one
@@ -85,7 +85,7 @@ def one_tank(drain=0.0, inflow=None):
 
 
 def passes(plant, actuator, found, spread, **how):
-    highest, _ = attack(plant, actuator, found, 0.5, spread, seconds=200, count=60, **how)
+    highest, _ = attack(plant, actuator, found, 0.5, spread, seconds=150, count=24, **how)
     return highest > np.asarray(found.limit) + 1e-6
 
 
@@ -135,11 +135,9 @@ def test_a_dead_time_needs_a_smaller_rate(delay):
     assert passes(plant, delayed, forgotten, 0.0, delay=delay, start=start).any()
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_filter_and_certificate_reckon_with_the_same_rates(seed):
-    """`worst_case.rise` and `fall`, compiled into the loop, and `setting.phi` and `phi_min`, in
-    numbers before a run.
-    """
+    """Compiled into the loop, and in plain numbers before a run."""
     rng = np.random.default_rng(seed)
     plant, _ = random_rig(rng)
     plant = dataclasses.replace(plant, bottom=seed % 2 == 0)
@@ -149,9 +147,13 @@ def test_filter_and_certificate_reckon_with_the_same_rates(seed):
         others = rng.uniform(0.0, 40.0, plant.tanks)
         tank, level = int(rng.integers(plant.tanks)), float(rng.choice([0.0, 0.005, 0.1, 12.0]))
         expected = float(rise(rates, tank, level, tuple(others)))
-        assert phi(rates, tank, level, others) == pytest.approx(expected, rel=1e-12, abs=1e-12)
+        assert rise(rates, tank, level, others, PLAIN) == pytest.approx(
+            expected, rel=1e-12, abs=1e-12
+        )
         expected = float(fall(rates, tank, level, tuple(others)))
-        assert phi_min(rates, tank, level, others) == pytest.approx(expected, rel=1e-12, abs=1e-12)
+        assert fall(rates, tank, level, others, PLAIN) == pytest.approx(
+            expected, rel=1e-12, abs=1e-12
+        )
 
 
 @pytest.mark.parametrize("delay", [3, 20])
@@ -180,7 +182,7 @@ def test_the_default_rate_follows_from_the_noise_of_the_readings():
     assert rate(0.0)[1][0].rate == 2.0 and rate(sigma, rate=1.7)[1][0].rate == 1.7
     found, (row,) = rate(sigma)
     assert row.rate == pytest.approx(0.01 * 12.0 * b_max / (math.sqrt(2.0) * sigma), rel=1e-12)
-    y = 29.5 + sigma * np.random.default_rng(0).standard_normal(4000)
+    y = 29.5 + sigma * np.random.default_rng(0).standard_normal(2000)
     cap = jax.vmap(lambda y: found.limits((y,), 0.1, (0.0,), (12.0,))[0][0])(y)
     assert np.std(np.diff(cap)) / 12.0 == pytest.approx(0.01, rel=0.06)
     slowest = 0.27 * math.sqrt(2 * 981.0) / 20.0 / math.sqrt(30.0)
@@ -200,7 +202,7 @@ def test_one_tank_with_scipy_and_the_cap_written_apart():
     found, _ = design(plant, actuator, sensor_of(plant), 0.5, widths=of(plant, 0.1))
     w, kappa = math.sqrt(2 * 981.0), float(found.rate[0])
     c_min, b_max, h = 0.27 * w / 20.0, 8.8 / 20.0, 1.0
-    for _ in range(300):
+    for _ in range(150):
         cap = max(0.0, c_min * math.sqrt(h) + kappa * (30.0 - h)) / b_max
         caps, _ = found.limits((h,), 0.5, (0.0,), (12.0,))
         assert float(caps[0]) == pytest.approx(min(cap, 12.0), rel=1e-12)
@@ -220,7 +222,7 @@ ROWS = {
 }
 
 
-@pytest.mark.slow_for("gouta2015/ngpc")
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["gouta2015/ngpc", "cascaded/pi"])
 def test_the_filtered_loop_has_the_errors_of_an_independent_prototype(name):
     case = presets.find(name)
@@ -249,8 +251,8 @@ def test_the_filtered_loop_has_the_errors_of_an_independent_prototype(name):
 @pytest.mark.parametrize(
     ("name", "gain", "value", "duration"),
     [
-        ("gouta2015/ngpc", "controller.Tp", 9.0, 600.0),
-        ("cascaded/pi", "controller.Kc", 2.0, 4000.0),
+        pytest.param("gouta2015/ngpc", "controller.Tp", 9.0, 600.0, marks=pytest.mark.slow),
+        ("cascaded/pi", "controller.Kc", 2.0, 2000.0),
     ],
 )
 def test_gradients_through_the_filter_are_central_differences(name, gain, value, duration):
