@@ -25,20 +25,19 @@ import tempfile
 import time
 import warnings
 from pathlib import Path
+from typing import NamedTuple
 
-SHORT = ["cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400"]
+SHORT = ["cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400", "--quiet"]
+LOG = ["--data", "log/trajectory.csv", "--column", "t=t [s]", "--column", "pump1=u1 [V]"]
+LOG += ["--column", "h1=y1 [V]", "--column", "h2=y2 [V]"]
+FREE = ("plant.pump_gain[0]=0.02:0.1", "plant.orifice[0]=0.02:0.08", "plant.drain[1]=0.02:0.08")
+FIT = ["--start", "case", "--starts", "4", "--hold-back", "0", "--quiet"]
 COMMANDS = {
-    "tune": ["tune", *SHORT, "--starts", "2", "--screening", "4", "--validation", "4", "--quiet"],
-    "uncertainty": ["uncertainty", *SHORT, "--samples", "3000", "--quiet"],
-    "identify": [
-        *["identify", "cascaded/pi", "--data", "log/trajectory.csv", "--start", "case", "--starts",
-        "4", "--hold-back", "0", "--quiet"],
-        *["--column", "t=t [s]", "--column", "pump1=u1 [V]", "--column", "h1=y1 [V]", "--column",
-        "h2=y2 [V]"],
-        *["--free", "plant.pump_gain[0]=0.02:0.1", "--free", "plant.orifice[0]=0.02:0.08", "--free",
-        "plant.drain[1]=0.02:0.08"],
-    ],
-}  # fmt: skip
+    "tune": ["tune", *SHORT, "--starts", "2", "--screening", "4", "--validation", "4"],
+    "uncertainty": ["uncertainty", *SHORT, "--samples", "3000"],
+    "identify": ["identify", "cascaded/pi", *LOG, *FIT]
+    + [word for name in FREE for word in ("--free", name)],
+}
 AFRESH = re.compile(r"holds no checkpoint to continue|had ended")
 PATIENCE = 300.0  # s
 
@@ -136,7 +135,7 @@ def contents(folder):
     return found
 
 
-def drill(count, seed=0, commands=tuple(COMMANDS), tell=print):
+def drill(count, seed=0, commands=tuple(COMMANDS)):
     """{"kills", "trials", "afresh", "wrong"}: kills in all until there are `count`, runs begun once
     more, what did not come out right.
     """
@@ -144,72 +143,70 @@ def drill(count, seed=0, commands=tuple(COMMANDS), tell=print):
     cli, rng = prepare(str(home / "cache")), random.Random(seed)
     os.chdir(home)
     try:
-        log = ["simulate", *SHORT, "--set", "sensor.noise=0.02", "--out", "log", "--quiet"]
+        log = ["simulate", *SHORT, "--set", "sensor.noise=0.02", "--out", "log"]
         if ended(start(cli, log)) != 0:
             raise RuntimeError(Path("said.txt").read_text())
-        whole = {}
-        for name in commands:
-            undisturbed(cli, COMMANDS[name], Path("compiled") / name)
-            began = time.monotonic()
-            code, steps = undisturbed(cli, COMMANDS[name], Path("alone") / name)
-            whole[name] = code, steps, time.monotonic() - began, contents(Path("alone") / name)
-            tell(
-                f"{name}: exit code {code}, {steps} kept on the way, {whole[name][2]:.1f} s",
-                flush=True,
-            )
-        reported = {"kills": 0, "trials": 0, "afresh": 0, "wrong": []}
-        while reported["kills"] < count:
-            name = commands[reported["trials"] % len(commands)]
-            folder, again, first = Path("run"), False, reported["kills"]
-            reported["trials"] += 1
-            shutil.rmtree(folder, ignore_errors=True)
-            for attempt in range(12):
-                option = "--resume" if again else "--out"
-                child = start(cli, [*COMMANDS[name], option, str(folder)])
-                if (
-                    attempt < 4
-                    and (attempt == 0 or rng.random() < 0.5)
-                    and reported["kills"] < count
-                ):
-                    few = rng.randint(1, max(1, whole[name][1])) if rng.random() < 0.5 else None
-                    code = kill(
-                        child, folder, rng.uniform(0.0, 0.3 if few else 0.9 * whole[name][2]), few
-                    )
-                    if code is None:
-                        reported["kills"] += 1
-                        again = True
-                        continue
-                else:
-                    code = ended(child)
-                if again and code == 2 and AFRESH.search(Path("said.txt").read_text()):
-                    # nothing had been kept yet, or all was done and only the log went
-                    again = False
-                    reported["afresh"] += 1
-                    continue
-                break
-            if code != whole[name][0]:
-                reported["wrong"].append(
-                    f"{name}: exit code {code}: {Path('said.txt').read_text()[-500:]}"
-                )
-            elif contents(folder) != whole[name][3]:
-                mine, theirs = contents(folder), whole[name][3]
-                reported["wrong"].append(
-                    f"{name}: differs in"
-                    f" {sorted(n for n in mine | theirs if mine.get(n) != theirs.get(n))}"
-                )
-                if os.environ.get("KEEP"):
-                    shutil.copytree(
-                        folder, Path(os.environ["KEEP"]) / f"{name}{reported['trials']}"
-                    )
-            tell(
-                f"{name}: {reported['kills'] - first} killed, {reported['kills']} in all;"
-                f" {len(reported['wrong'])} wrong",
-                flush=True,
-            )
-        return reported
+        alone = {name: alone_run(cli, name) for name in commands}
+        total = {"kills": 0, "trials": 0, "afresh": 0, "wrong": []}
+        while total["kills"] < count:
+            name = commands[total["trials"] % len(commands)]
+            total["trials"] += 1
+            shutil.rmtree("run", ignore_errors=True)
+            code, kills, afresh = killed_run(cli, name, alone[name], count - total["kills"], rng)
+            total["kills"] += kills
+            total["afresh"] += afresh
+            files = contents(Path("run")) if Path("run").exists() else {}
+            differing = [n for n, data in alone[name].files.items() if files.get(n) != data]
+            if code != alone[name].code:
+                text = Path("said.txt").read_text()[-500:]
+                total["wrong"].append(f"{name}: exit code {code}: {text}")
+            elif differing or files.keys() - alone[name].files.keys():
+                total["wrong"].append(f"{name}: differs in {differing}; {sorted(files)}")
+            print(f"{name}: {kills} killed; {len(total['wrong'])} wrong", flush=True)
+        return total
     finally:
         os.chdir(here)
         shutil.rmtree(home, ignore_errors=True)
+
+
+class Alone(NamedTuple):
+    """A run left alone: exit code, most that was kept on the way, seconds, {name: bytes}."""
+
+    code: int
+    kept: int
+    seconds: float
+    files: dict
+
+
+def alone_run(cli, name):
+    """The Alone of a command, the second run of it: its programs are compiled."""
+    undisturbed(cli, COMMANDS[name], Path("compiled") / name)
+    began, folder = time.monotonic(), Path("alone") / name
+    code, most = undisturbed(cli, COMMANDS[name], folder)
+    seconds = time.monotonic() - began
+    print(f"{name}: exit code {code}, {most} kept on the way, {seconds:.1f} s", flush=True)
+    return Alone(code, most, seconds, contents(folder))
+
+
+def killed_run(cli, name, alone, most, rng):
+    """(exit code, kills, runs begun once more) of a command that is killed up to four times."""
+    folder, again, kills, afresh, code = Path("run"), False, 0, 0, None
+    for attempt in range(12):
+        child = start(cli, [*COMMANDS[name], "--resume" if again else "--out", str(folder)])
+        if attempt < 4 and kills < most and (attempt == 0 or rng.random() < 0.5):
+            few = rng.randint(1, max(1, alone.kept)) if rng.random() < 0.5 else None
+            seconds = rng.uniform(0.0, 0.3 if few else 0.9 * alone.seconds)
+            code = kill(child, folder, seconds, few)
+            if code is None:
+                kills, again = kills + 1, True
+                continue
+        else:
+            code = ended(child)
+        if not (again and code == 2 and AFRESH.search(Path("said.txt").read_text())):
+            break
+        # nothing had been kept yet, or all was done and only the log went
+        again, afresh = False, afresh + 1
+    return code, kills, afresh
 
 
 def undisturbed(cli, words, folder):
@@ -237,9 +234,6 @@ if __name__ == "__main__":
         from survived import record
 
         right = found["trials"] - len(found["wrong"])
-        record(
-            "kills",
-            found["kills"],
-            f"{right} of {found['trials']} runs ended with the bytes of a run left alone",
-        )
+        words = f"{right} of {found['trials']} runs ended with the bytes of a run left alone"
+        record("kills", found["kills"], words)
     sys.exit(1 if found["wrong"] else 0)

@@ -68,19 +68,13 @@ def duration(name, folder):
 
 def wrong(number, code, out, err, folder):
     """What is wrong with a run that got signal `number`, None where it ended as it should."""
-    lines = [
-        line for line in err.splitlines() if line.startswith("jaxtank: ") and "note: " not in line
-    ]
+    messages = [line for line in err.splitlines() if line.startswith("jaxtank: ")]
+    lines = [line for line in messages if "note: " not in line]
     word = "interrupted" if number == signal.SIGINT else "terminated"
     if code != 128 + number:
         return f"exit code {code}"
-    if (
-        "Traceback" in err
-        or "Exception" in err
-        or "Fatal" in err
-        or len(lines) != 1
-        or word not in lines[0]
-    ):
+    fatal = any(mark in err for mark in ("Traceback", "Exception", "Fatal"))
+    if fatal or len(lines) != 1 or word not in lines[0]:
         return "more or less than one line"
     if "best point so far" in lines[0] and not (folder / "result.json").exists():
         return "no result"
@@ -90,12 +84,11 @@ def wrong(number, code, out, err, folder):
     return None
 
 
-def drill(count, seed=0, commands=tuple(COMMANDS), takes=None, report=print):
-    """Send `count` signals; takes: {command: seconds it takes}, measured where None.
+def drill(count, seed=0, commands=tuple(COMMANDS)):
+    """Send `count` signals; return {"signals", "outside", "slowest", "wrong"}.
 
-    Returns {"signals", "outside", "slowest", "wrong"}: how many were sent, how many of them before
-    the first line of the program or after its last, the longest time until the end [s], and what
-    did not end as it should.
+    These are how many were sent, how many of them before the first line of the program or after its
+    last, the longest time until the end [s], and what did not end as it should.
     """
     rng, home, here = random.Random(seed), Path(tempfile.mkdtemp()), Path.cwd()
     # what is ignored here is ignored in a child
@@ -105,10 +98,10 @@ def drill(count, seed=0, commands=tuple(COMMANDS), takes=None, report=print):
         if "identify" in commands:
             log = ["simulate", *SHORT, "--set", "sensor.noise=0.02", "--out", "log", "--quiet"]
             subprocess.run([*JAXTANK, *log], check=True, capture_output=True)
-        takes = takes or {name: duration(name, home / "run") for name in commands}
-        found = {"signals": 0, "outside": 0, "slowest": 0.0, "wrong": []}
-        while found["signals"] < count:
-            name = commands[found["signals"] % len(commands)]
+        takes = {name: duration(name, home / "run") for name in commands}
+        total = {"signals": 0, "outside": 0, "slowest": 0.0, "wrong": []}
+        while total["signals"] < count:
+            name = commands[total["signals"] % len(commands)]
             number = rng.choice([signal.SIGINT, signal.SIGTERM])
             moment, folder = rng.uniform(0.0, takes[name]), home / "run"
             shutil.rmtree(folder, ignore_errors=True)
@@ -127,22 +120,17 @@ def drill(count, seed=0, commands=tuple(COMMANDS), takes=None, report=print):
             took, code = time.monotonic() - sent, process.returncode
             if code >= 0 and code != 128 + number and "jaxtank: " not in err and took < 0.1:
                 continue  # it ended by itself as the signal was sent
-            found["signals"] += 1
-            found["slowest"] = max(found["slowest"], took)
+            total["signals"] += 1
+            total["slowest"] = max(total["slowest"], took)
             outside = code == -number and "jaxtank: " not in err
-            found["outside"] += outside
+            total["outside"] += outside
             why = None if outside else wrong(number, code, out, err, folder)
-            row = (
-                f"{found['signals']} {name} {number.name} at {moment:.2f} s: {code} after"
-                f" {took:.2f} s"
-            )
+            row = f"{total['signals']} {name} {number.name} at {moment:.2f} s: {code}"
+            row += f" after {took:.2f} s{' (interpreter)' if outside else ''}"
             if why:
-                found["wrong"].append(f"{row}: {why}: {err[-1500:]}")
-            report(
-                row + (" (interpreter)" if outside else "") + (f" WRONG: {why}" if why else ""),
-                flush=True,
-            )
-        return found
+                total["wrong"].append(f"{row}: {why}: {err[-1500:]}")
+            print(row + (f" WRONG: {why}" if why else ""), flush=True)
+        return total
     finally:
         os.chdir(here)
         shutil.rmtree(home, ignore_errors=True)
@@ -150,17 +138,17 @@ def drill(count, seed=0, commands=tuple(COMMANDS), takes=None, report=print):
 
 if __name__ == "__main__":
     count = int(next((w for w in sys.argv[1:] if w.isdigit()), "200"))
-    found = drill(count, commands=tuple(n for n in COMMANDS if n in sys.argv) or tuple(COMMANDS))
-    print(json.dumps(found, indent=1))
+    total = drill(count, commands=tuple(n for n in COMMANDS if n in sys.argv) or tuple(COMMANDS))
+    print(json.dumps(total, indent=1))
     if "--record" in sys.argv:
         from survived import record
 
-        good = found["signals"] - len(found["wrong"]) - found["outside"]
+        good = total["signals"] - len(total["wrong"]) - total["outside"]
         record(
             "interrupts",
-            found["signals"],
-            f"{good} ended with 130 or 143 and one line, the slowest after {found['slowest']:.1f}"
-            f" s; {found['outside']} came before the first line of this program or after its last,"
-            f" where the interpreter answers; {len(found['wrong'])} ended otherwise",
+            total["signals"],
+            f"{good} ended with 130 or 143 and one line, the slowest after {total['slowest']:.1f}"
+            f" s; {total['outside']} came before the first line of this program or after its last,"
+            f" where the interpreter answers; {len(total['wrong'])} ended otherwise",
         )
-    sys.exit(1 if found["wrong"] else 0)
+    sys.exit(1 if total["wrong"] else 0)

@@ -98,7 +98,8 @@ def cluster_attack(folder):
     )
     try:
         while len(listeners) < 3 and begun.poll() is None and time.monotonic() < until:
-            for process in psutil.Process(begun.pid).children(recursive=True):
+            main = psutil.Process(begun.pid)
+            for process in (main, *main.children(recursive=True)):
                 connections = process.net_connections(kind="inet")
                 listeners |= {c.laddr for c in connections if c.status == psutil.CONN_LISTEN}
             time.sleep(0.3)
@@ -109,9 +110,8 @@ def cluster_attack(folder):
                 done = subprocess.run(attack, capture_output=True, text=True, timeout=15)
             except subprocess.TimeoutExpired:
                 continue
-            let_in += (
-                [f"{kind}://{ip}:{port}: {done.stdout.strip()}"] if "uid" in done.stdout else []
-            )
+            if "uid" in done.stdout:
+                let_in.append(f"{kind}://{ip}:{port}: {done.stdout.strip()}")
     finally:
         begun.kill()
         begun.wait()

@@ -30,19 +30,8 @@ from tuning.storage.store import NAME, Store
 HERE = Path(__file__).parent
 SHORT = ["cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400"]
 SIMULATE = ["simulate", *SHORT, "--quiet"]
-SEARCH = [
-    "tune",
-    *SHORT,
-    "--starts",
-    "1",
-    "--screening",
-    "2",
-    "--validation",
-    "0",
-    "--iterations",
-    "3",
-    "--quiet",
-]
+SEARCH = ["tune", *SHORT, "--quiet", "--starts", "1", "--screening", "2", "--validation", "0"]
+SEARCH += ["--iterations", "3"]
 SPREAD = ["uncertainty", *SHORT, "--samples", "20", "--quiet"]
 JAXTANK = [sys.executable, "-m", "tuning.cli.main"]
 WRITERS = {
@@ -66,6 +55,13 @@ def say(words, capsys):
     code = main.main([str(w) for w in words])
     printed = capsys.readouterr()
     return code, printed.out, printed.err.splitlines()
+
+
+def python(code, *words, **options):
+    """The end of a Python program in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=120, **options
+    )
 
 
 @contextlib.contextmanager
@@ -125,12 +121,13 @@ def test_a_log_on_a_disk_that_fills_up_is_good_to_go_on_from(tmp_path):
     with small_disk(90_000), pytest.raises(InputError, match="free disk space, then --resume"):
         for i in range(100):
             log.recall("x", [float(i)], lambda i=i: (float(i), 1 / 3))
-    again, made = evaluation_log.EvaluationLog(tmp_path, {"p": 1}, resume=True), []
-    assert [
-        again.recall("x", [float(i)], lambda i=i: made.append(i) or (float(i), 1 / 3))
+    again, missing = evaluation_log.EvaluationLog(tmp_path, {"p": 1}, resume=True), []
+    results = [
+        again.recall("x", [float(i)], lambda i=i: missing.append(i) or (float(i), 1 / 3))
         for i in range(20)
-    ] == [(float(i), 1 / 3) for i in range(20)]
-    assert made[0] > 5 and made == list(range(made[0], 20))
+    ]
+    assert results == [(float(i), 1 / 3) for i in range(20)]
+    assert missing[0] > 5 and missing == list(range(missing[0], 20))
 
 
 # The command on a full disk, and where nothing can be written.
@@ -148,14 +145,12 @@ def old_result(folder, words, capsys):
     return contents(folder)
 
 
-@pytest.mark.slow_for("uncertainty")
-@pytest.mark.parametrize(
-    "name",
-    [
-        n if n in ("simulate", "uncertainty", "show") else pytest.param(n, marks=pytest.mark.slow)
-        for n in WRITERS
-    ],
-)
+def slow_but(*names):
+    """The commands that write, all but some of them slow."""
+    return [n if n in names else pytest.param(n, marks=pytest.mark.slow) for n in WRITERS]
+
+
+@pytest.mark.parametrize("name", slow_but("simulate"))
 def test_a_full_disk_leaves_one_result_whole(name, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words, folder = WRITERS[name], tmp_path / "out"
@@ -166,34 +161,26 @@ def test_a_full_disk_leaves_one_result_whole(name, tmp_path, capsys, monkeypatch
     with small_disk(int(margin)):
         code, out, err = say([*words, *seed, "--out", folder], capsys)
     last = [line for line in err if line.startswith("jaxtank: ")]
-    assert code == 2 and len(last) == 1 and last[0] == err[-1] and "File too large" in last[0], err
+    assert code == 2 and last == err[-1:] and "File too large" in last[0], err
     assert "Traceback" not in "".join(err)
-    after, drawn = (
-        contents(folder),
-        {n for n in before if n.endswith((".png", ".svg", ".gif", ".html"))},
-    )
+    after = contents(folder)
+    drawn = {n for n in before if n.endswith((".png", ".svg", ".gif", ".html"))}
     # there was no room for the new one: all of the old is there
     if after.get("result.json") == before.get("result.json"):
         assert {n: data for n, data in after.items() if n in before} == before
     else:  # the new one, with no picture of the old
-        assert (
-            not drawn & after.keys()
-            and before.keys() - drawn <= after.keys()
-            and json.loads(after["result.json"])
-        )
+        assert not drawn & after.keys() and before.keys() - drawn <= after.keys()
+        assert json.loads(after["result.json"])
     # the old result of identify here is its result.json alone
-    left = after.keys() - before.keys() - ({"fit.csv", "rig.toml"} if name == "identify" else set())
-    assert all(n.startswith(NAME) for n in left), left
+    new = after.keys() - before.keys() - ({"fit.csv", "rig.toml"} if name == "identify" else set())
+    assert all(n.startswith(NAME) for n in new), new
     if name in ("tune", "uncertainty", "sensitivity", "identify"):
         assert out.strip()  # the answer is told all the same
 
 
 # identify, sensitivity and compare: test_page.py
-DRAWERS = [
-    "simulate",
-    "show",
-    *(pytest.param(n, marks=pytest.mark.slow) for n in ("tune", "uncertainty")),
-]
+DRAWERS = slow_but("simulate")
+DRAWERS = [d for d in DRAWERS if d == "simulate" or d.values[0] in ("show", "tune", "uncertainty")]
 
 
 @pytest.mark.parametrize("name", DRAWERS)
@@ -218,16 +205,13 @@ def test_a_picture_that_fails_costs_itself_and_not_the_answer(name, tmp_path, ca
         monkeypatch.setattr(plot, broken, fault)
         code, _, err = say([*words, "--out", folder], capsys)
         notes = [line for line in err if line.startswith("jaxtank: ")]
-        assert (
-            code in (0, 3)
-            and len(notes) >= 1
-            and all("note: " in n and "could not be drawn" in n for n in notes)
-        ), err
-        left = contents(folder)
-        missing = whole.keys() - left.keys()
+        assert code in (0, 3) and notes, err
+        assert all("note: " in n and "could not be drawn" in n for n in notes), err
+        rest = contents(folder)
+        missing = whole.keys() - rest.keys()
         assert missing and all(n.endswith((".png", ".svg")) for n in missing)
         if name != "show":
-            assert json.loads(left["result.json"]) and (name == "simulate" or "report.html" in left)
+            assert json.loads(rest["result.json"]) and (name == "simulate" or "report.html" in rest)
 
 
 @pytest.mark.parametrize("name", DRAWERS)
@@ -245,21 +229,17 @@ seed = 1
     words = [WRITERS[name][0], "rig.toml", *(w for w in WRITERS[name][1:] if w not in SHORT)]
     old_result(tmp_path / "out", WRITERS[name], capsys)
     code, _, err = say([*words, "--out", "new"], capsys)
-    assert code in (0, 3) and not [
-        line for line in err if "could not be drawn" in line or "internal error" in line
-    ], err
-    assert {n for n in contents(tmp_path / "out") if n.endswith(".png")} - {
-        "estimates.png"
-    } <= contents(tmp_path / "new").keys()
+    assert code in (0, 3), err
+    assert not [line for line in err if "not be drawn" in line or "internal error" in line], err
+    pictures = {n for n in contents(tmp_path / "out") if n.endswith(".png")} - {"estimates.png"}
+    assert pictures <= contents(tmp_path / "new").keys()
 
 
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_folder_that_cannot_be_written_to_is_refused_by_input_validation(name, frozen, capsys):
     for folder in (frozen, frozen / "in" / "it", frozen / "result.json" / "under"):
         code, out, err = say([*WRITERS[name], "--out", folder], capsys)
-        assert code == 2 and out == "" and len(err) == 1 and err[0].startswith("jaxtank: --out"), (
-            err
-        )
+        assert (code, out, len(err)) == (2, "", 1) and err[0].startswith("jaxtank: --out"), err
     assert contents(frozen) == {"result.json": b"old"}
 
 
@@ -267,13 +247,8 @@ def test_a_folder_that_cannot_be_is_refused_by_input_validation(tmp_path, capsys
     (tmp_path / "link").symlink_to(tmp_path / "nowhere")
     for folder, why in ((tmp_path / "link", "nowhere"), ("a\0b", "NUL")):
         code, out, err = say([*WRITERS["simulate"], "--out", folder], capsys)
-        assert (
-            code == 2
-            and out == ""
-            and len(err) == 1
-            and err[0].startswith("jaxtank: --out")
-            and why in err[0]
-        ), err
+        assert (code, out, len(err)) == (2, "", 1) and err[0].startswith("jaxtank: --out"), err
+        assert why in err[0]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["link"]
 
 
@@ -340,29 +315,14 @@ def test_a_folder_made_for_nothing_is_removed(tmp_path):
 @pytest.mark.slow
 def test_two_at_once(tmp_path):
     """Both may be right one after the other; neither is wrong."""
-    command = [
-        *JAXTANK,
-        "uncertainty",
-        *SHORT,
-        "--samples",
-        "3000",
-        "--quiet",
-        "--out",
-        str(tmp_path / "out"),
-    ]
-    alone = [
-        *JAXTANK,
-        "uncertainty",
-        *SHORT,
-        "--samples",
-        "3000",
-        "--quiet",
-        "--out",
-        str(tmp_path / "alone"),
-    ]
-    subprocess.run(alone, check=True, capture_output=True)
+
+    def words(folder):
+        command = [*JAXTANK, "uncertainty", *SHORT, "--samples", "3000", "--quiet", "--out"]
+        return [*command, str(tmp_path / folder)]
+
+    subprocess.run(words("alone"), check=True, capture_output=True)
     both = [
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        subprocess.Popen(words("out"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         for _ in range(2)
     ]
     printed = [(*p.communicate(), p.returncode) for p in both]
@@ -397,29 +357,29 @@ def interrupted(words, folder, lines, number=signal.SIGINT):
     return process.communicate(timeout=120)[1], process.returncode
 
 
-LONG = [
-    "tune",
-    "cascaded/pi",
-    "--set",
-    "clock.dt=1",
-    "--set",
-    "clock.duration=400",
-    "--screening",
-    "64",
-    "--validation",
-    "0",
-]
+LONG = ["tune", *SHORT, "--screening", "64", "--validation", "0"]
 
 
-@pytest.mark.slow_for("6")
-@pytest.mark.parametrize("lines", [6, *(pytest.param(n, marks=pytest.mark.slow) for n in (11, 25))])
-def test_ctrl_c_gives_the_best_point_so_far(lines, tmp_path):
-    printed, code = interrupted([*LONG, "--starts", "40", "--quiet"], tmp_path / "out", lines)
-    assert code == 130 and "interrupted" in printed and "Traceback" not in printed, printed
-    found = json.loads((tmp_path / "out" / "result.json").read_text())
-    assert found["status"] == "interrupted" and "best point so far" in found["message"]
-    assert 0 < kept(tmp_path / "out") < 200 and found["evaluations"]["simulations"] > 0
+def interrupted_search(tmp_path, lines, number=signal.SIGINT):
+    """Check that a search that gets a signal writes its best point so far."""
+    words = [*LONG, "--starts", "40", "--quiet"]
+    printed, code = interrupted(words, tmp_path / "out", lines, number)
+    assert code == 128 + number and "Traceback" not in printed, printed
+    page = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert page["status"] == "interrupted" and page["evaluations"]["simulations"] > 0
+    assert 0 < kept(tmp_path / "out") < 200
     assert (tmp_path / "out" / "rig.toml").exists() and not (tmp_path / "out" / files.LOCK).exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lines", [6, 11, 25])
+def test_ctrl_c_gives_the_best_point_so_far(lines, tmp_path):
+    interrupted_search(tmp_path, lines)
+
+
+@pytest.mark.slow
+def test_sigterm_gives_the_best_point_so_far(tmp_path):
+    interrupted_search(tmp_path, 6, signal.SIGTERM)
 
 
 @pytest.mark.parametrize(
@@ -436,8 +396,7 @@ def test_a_signal_before_anything_was_found_ends_the_program_and_frees_its_folde
 ):
     printed, code = interrupted([*LONG, "--quiet"], tmp_path / "out", lines, number)
     assert (printed, code) == (f"jaxtank: {word}\n", 128 + number)
-    left = {p.name for p in (tmp_path / "out").iterdir()} if (tmp_path / "out").exists() else set()
-    assert all(name.startswith(NAME) for name in left)
+    assert all(path.name.startswith(NAME) for path in tmp_path.glob("out/*"))
     with folder_lock.hold(tmp_path / "out"):
         pass
 
@@ -460,10 +419,10 @@ sys.exit(main())
 """
 
 
+@pytest.mark.slow_for("numpy", "jax")
 @pytest.mark.parametrize("module", ["tuning.cli.parser", "numpy", "jax"])
 def test_ctrl_c_in_an_import_ends_the_program_at_once(module):
-    command = [sys.executable, "-c", ENTRY.format(module=module), "simulate", *SHORT]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    done = python(ENTRY.format(module=module), "simulate", *SHORT)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "jaxtank: interrupted\n")
 
 
@@ -475,7 +434,7 @@ def test_a_signal_that_is_ignored_at_the_start_stays_ignored(number):
         "from tuning.cli import interrupts; interrupts.listen()\n"
         f"os.kill(os.getpid(), {int(number)}); time.sleep(0.5); print('went on')"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    done = python(code)
     assert (done.returncode, done.stdout, done.stderr) == (0, "went on\n", "")
 
 
@@ -489,20 +448,10 @@ def test_a_search_in_the_background_ignores_ctrl_c_and_ends_with_sigterm():
         "try: search.check()\n"
         "except KeyboardInterrupt: print('reports'); sys.exit(search.code)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    done = python(code)
     assert (done.returncode, done.stdout) == (143, "reports\n")
     assert done.stderr.startswith("jaxtank: terminated, finishing with the best point so far")
     assert done.stderr.count("\n") == 1
-
-
-@pytest.mark.slow
-def test_sigterm_gives_the_best_point_so_far(tmp_path):
-    words = [*LONG, "--starts", "40", "--quiet"]
-    printed, code = interrupted(words, tmp_path / "out", 6, signal.SIGTERM)
-    assert code == 143 and "terminated" in printed and "Traceback" not in printed, printed
-    found = json.loads((tmp_path / "out" / "result.json").read_text())
-    assert found["status"] == "interrupted" and "best point so far" in found["message"]
-    assert not (tmp_path / "out" / files.LOCK).exists()
 
 
 def test_a_second_ctrl_c_ends_a_search_at_once(tmp_path):
@@ -518,29 +467,23 @@ def test_a_second_ctrl_c_ends_a_search_at_once(tmp_path):
         "os.kill(os.getpid(), signal.SIGINT); time.sleep(1); print('went on', flush=True);"
         " os.kill(os.getpid(), signal.SIGINT); time.sleep(60); print('for ever')"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    done = python(code)
     first, second = done.stderr.splitlines()
     assert (done.returncode, done.stdout, second) == (130, "went on\n", "jaxtank: stopped at once")
     assert "best point so far" in first
 
 
 def test_importing_the_library_leaves_signals_alone():
-    code = (
-        "import signal; before = [signal.getsignal(n) for n in (signal.SIGINT,"
-        " signal.SIGTERM)]\nimport jaxtank, tuning, tuning.cli.main, tuning.cli.interrupts,"
-        " tuning.search.tuner, tuning.cli.commands.tuning\ntuning.cli.main.main(['list'])\nassert"
-        " before == [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]\nassert"
-        " signal.set_wakeup_fd(-1) == -1"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    code = """
+import signal
+handlers = lambda: [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+before = handlers()
+import jaxtank, tuning, tuning.cli.main, tuning.cli.interrupts, tuning.search.tuner
+tuning.cli.main.main(["list"])
+assert before == handlers() and signal.set_wakeup_fd(-1) == -1
+"""
+    done = python(code)
     assert done.returncode == 0, done.stderr
-
-
-def test_signals_at_random_moments():
-    found = interrupt_drill.drill(
-        4, seed=3, commands=("tune", "simulate"), takes={"tune": 4.0, "simulate": 2.0}
-    )
-    assert found["signals"] == 4 and not found["wrong"], found["wrong"]
 
 
 @pytest.mark.slow
@@ -555,40 +498,30 @@ def test_an_identification_goes_on_where_it_was_interrupted(tmp_path):
     bits; another problem's log is refused.
     """
     case, k = presets.find("cascaded/pi"), np.arange(80.0)
-    wave = 3 + np.sin(k / 9)
-    log = tuning.log(
-        t=4 * k,
-        u=wave[:, None],
-        y=np.stack([4 + 0.5 * np.sin(k / 9 - 1), 4 + 0.3 * np.sin(k / 9 - 2)], axis=1),
-    )
+    y = np.stack([4 + 0.5 * np.sin(k / 9 - 1), 4 + 0.3 * np.sin(k / 9 - 2)], axis=1)
+    log = tuning.log(t=4 * k, u=3 + np.sin(k / 9)[:, None], y=y)
     free = {"plant.pump_gain[0]": (0.02, 0.1), "plant.drain[1]": (0.02, 0.08)}
     options = {"start": "case", "starts": 3, "hold_back": 0, "noise": 0.05, "substeps": 2}
-    seen = []
+    fits = []
 
     def stop(fit):
-        seen.append(fit)
-        if len(seen) == 2:
+        fits.append(fit)
+        if len(fits) == 2:
             raise KeyboardInterrupt
 
-    whole = tuning.identify(case, log, free, **options)
-    assert (
-        tuning.identify(case, log, free, checkpoint=tmp_path, progress=stop, **options).status
-        == "interrupted"
-    )
+    def fitted(**more):
+        return tuning.identify(case, log, free, **{**options, **more})
+
+    whole = fitted()
+    assert fitted(checkpoint=tmp_path, progress=stop).status == "interrupted"
     assert kept(tmp_path) == 2
-    again = tuning.identify(
-        case, log, free, checkpoint=tmp_path, resume=True, progress=seen.append, **options
-    )
+    again = fitted(checkpoint=tmp_path, resume=True, progress=fits.append)
     # what is recalled has no slopes
-    assert [fit.jacobian.size > 0 for fit in seen[2:]] == [False, False, True]
-    reported = [
-        {k: v for k, v in found.to_json().items() if k != "wall_s"} for found in (whole, again)
-    ]
-    assert json.dumps(reported[0]) == json.dumps(reported[1])
+    assert [fit.jacobian.size > 0 for fit in fits[2:]] == [False, False, True]
+    first, second = ({**found.to_json(), "wall_s": 0} for found in (whole, again))
+    assert json.dumps(first) == json.dumps(second)
     with pytest.raises(InputError, match="of another problem; what differs: noise"):
-        tuning.identify(
-            case, log, free, checkpoint=tmp_path, resume=True, **{**options, "noise": 0.06}
-        )
+        fitted(checkpoint=tmp_path, resume=True, noise=0.06)
 
 
 # Kills.

@@ -41,10 +41,6 @@ IMPORTED = {
         "subprocess",
     ): "`jaxtank bench` compiles its own floor.c with gcc, where there is one",
     ("tuning.bench.bench", "ctypes"): "and calls it",
-    (
-        "tuning.cluster.local",
-        "subprocess",
-    ): "`--cluster local:N` starts Dask's own commands, of this Python, with constant words",
     ("tuning.cli.commands.explore", "webbrowser"): "`explore --open` shows the file it has written",
 }
 
@@ -113,9 +109,6 @@ READ = {
     ("jaxtank.xla.flags", "_text_of", "open"): "the file that XLA_FLAGS names, looked through only",
     ("tuning.identification.csv_log", "_text", "read_bytes"): "after `refusal`",
     ("tuning.storage.columns", "__getitem__", "memmap"): "a file without a name, its own",
-    ("tuning.cluster.local", "_process", "open"): "to write",
-    ("tuning.cluster.local", "_address", "read_text"): "in a new folder of its own, mode 700",
-    ("tuning.cluster.local", "_last_line", "read_text"): "of the same folder",
     ("tuning.cli.main", "_drop_output", "open"): "/dev/null, to write",
     ("tuning.cli.terminal", "guard", "open"): "/dev/null, in place of a stream that was closed",
     ("tuning.storage.folder_lock", "_locked", "open"): "its own lock, of which 20 bytes are read",

@@ -31,7 +31,6 @@ import jax
 
 import tuning
 from jaxtank import presets, rig
-from tuning.cluster.local import local_workers
 
 COMMAND = ["uncertainty", "gouta2015/backstepping", "--set", "clock.dt=0.1", "--set"]
 COMMAND += ["sensor.noise=0.02", "--samples", "4096", "--quiet", "--json"]
@@ -40,13 +39,21 @@ KINDS = ("worker", "scheduler", "command")
 
 @contextlib.contextmanager
 def cluster(count):
-    """A client of so many workers."""
-    with (
-        local_workers(count) as workers,
-        distributed.Client(workers.address, security=workers.security) as client,
-    ):
-        client.wait_for_workers(count, timeout=120)
-        yield client
+    """A client of so many workers, whose scheduler is a process of its own."""
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+        file = f"{folder}/scheduler.json"
+        options = ["--scheduler-file", file, "--host", "127.0.0.1", "--no-dashboard"]
+        worker = ["dask_worker", "--nthreads", "1", "--no-nanny", "--local-directory", folder]
+        for words in (["dask_scheduler", "--port", "0"], *[worker] * count):
+            command = [sys.executable, "-m", f"distributed.cli.{words[0]}", *words[1:], *options]
+            process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+            stack.callback(process.wait)
+            stack.callback(process.kill)
+        while not Path(file).exists():
+            time.sleep(0.1)
+        with distributed.Client(scheduler_file=file) as client:
+            client.wait_for_workers(count, timeout=120)
+            yield client
 
 
 def times(case, samples, rounds):

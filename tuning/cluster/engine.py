@@ -1,13 +1,14 @@
-"""Tasks on a Dask cluster: a scheduler at an address, or workers of this machine."""
+"""Tasks on any `concurrent.futures.Executor`; that of a Dask cluster, by an address or local."""
 
 import contextlib
+import importlib
 import itertools
 import logging
 import re
 import sys
-import time
+import types
 import warnings
-from concurrent.futures import FIRST_COMPLETED, CancelledError, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, wait
 from typing import Any
 
 from jaxtank.core.errors import InputError
@@ -16,15 +17,11 @@ from tuning.cluster.local import local_workers
 CONNECT = 8.0
 """Time within which a scheduler must answer [s]."""
 
-AHEAD, LEAST = 2, 64
-"""Tasks that wait for each thread of the workers, so that none is idle; and tasks sent at least, so
-that a cluster that grows with its work does."""
+AT_ONCE = 1024
+"""Tasks that are sent before the first of them is done, and workers of one machine, at most."""
 
 LOOK = 0.5
-"""Time between two looks at the connection and at the number of threads [s]."""
-
-MOST = 1024
-"""Workers of one machine, at most."""
+"""Time after which the workers are looked at, where no result has come [s]."""
 
 ENCRYPTED = ("tls://", "wss://")
 
@@ -37,7 +34,6 @@ class ClusterWarning(UserWarning):
 
 TASKS = {
     "batches": ("tuning.uncertainty.batches", "batches"),
-    "points": ("tuning.uncertainty.batches", "points"),
     "search": ("tuning.search.methods", "search_task"),
 }
 """{name of a task: module and function}; names, texts, numbers and arrays are sent to it."""
@@ -45,8 +41,6 @@ TASKS = {
 
 def call(task, x64, *arguments):
     """Run a task on a worker."""
-    import importlib
-
     import jax
 
     import jaxtank  # noqa: F401  it sets the options of the compiler, before jax starts
@@ -58,131 +52,138 @@ def call(task, x64, *arguments):
         return processor(), function(*arguments)
 
 
-# Dask sends a function of the main module as its code: a worker without this program then raises
-# an error of its own rather than end, and the scheduler needs no more than Dask
-call.__module__ = "__main__"
+# Dask sends a function of the main module as its code: a worker without this program then raises an
+# error of its own rather than end, and the scheduler needs no more than Dask
+call_by_code = types.FunctionType(call.__code__, {"TASKS": TASKS, "importlib": importlib})
+call_by_code.__module__ = "__main__"
 
 
 class Engine:
-    """Runs tasks on a Dask cluster, by its `concurrent.futures.Executor`; made by `connect`."""
+    """Runs tasks on an Executor; made by `connect`."""
 
-    def __init__(self, client, check=None):
-        self.client, self.address, self.check = client, client.scheduler.address, check
-        self.processors, self.threads, self.looked = set(), 0, 0.0
+    name, function = "cluster", staticmethod(call)
 
-    def run(self, task, given, waiting=None):
-        """Run a task many times on the workers and yield (number, result) as the results come."""
+    def __init__(self, executor):
+        self.executor, self.processors = executor, set()
+
+    def run(self, task, arguments, waiting=None):
+        """Run a task for every (number, arguments); yield (number, result) as the results come."""
         import jax
 
         config: Any = jax.config
-        x64, given, pending = bool(config.jax_enable_x64), iter(given), {}
-        executor = self.client.get_executor(pure=False)
+        x64, arguments, pending = bool(config.jax_enable_x64), iter(arguments), {}
         try:
             while True:
-                self._look(waiting)
-                room = max(LEAST, (1 + AHEAD) * self.threads) - len(pending)
-                for number, arguments in itertools.islice(given, room):
-                    pending[self._submit(executor, task, x64, *arguments)] = number
+                for number, values in itertools.islice(arguments, AT_ONCE - len(pending)):
+                    pending[self.submit(task, x64, *values)] = number
                 if not pending:
                     return
-                done = wait(pending, timeout=LOOK, return_when=FIRST_COMPLETED).done
+                wait(pending, timeout=LOOK, return_when=FIRST_COMPLETED)
+                done = [future for future in pending if future.done()]  # cancelled ones, too
                 for future in done:
                     yield pending.pop(future), self._result(future)
+                if waiting is not None:
+                    waiting()
+                if not done:
+                    self.look()
         finally:
-            with contextlib.suppress(Exception):  # the connection has gone
-                executor.shutdown(wait=False)
+            for future in pending:
+                future.cancel()
 
-    def _submit(self, executor, *arguments):
+    def submit(self, *arguments):
+        """Return the future of a task."""
         try:
-            return executor.submit(call, *arguments)
+            return self.executor.submit(self.function, *arguments)
         except Exception as error:
-            raise self._lost(error) from None
+            raise self.lost(error) from None
 
-    def _look(self, waiting):
-        """Look, now and then, whether the scheduler is there and how many threads it has."""
-        now = time.monotonic()
-        if now - self.looked < LOOK:
-            return
-        if waiting is not None:
-            waiting()
-        if self.client.status != "running":
-            raise self._lost()
-        try:
-            found = sum(self.client.nthreads().values())
-        except Exception as error:
-            raise self._lost(error) from None
-        if not found and self.check is not None:
-            self.check()
-        elif not found and (self.threads or not self.looked):
-            words = "no worker is left" if self.looked else "there is no worker yet"
-            warnings.warn(
-                f"cluster {self.address}: {words}, waiting for one", ClusterWarning, stacklevel=4
-            )
-        self.threads, self.looked = found, now
+    def look(self):
+        """Warn, or raise InputError, where there is no worker."""
 
     def _result(self, future):
         """Return what a task returned; raise what it raised, in one line."""
         try:
-            processor, found = future.result()
+            processor, result = future.result()
         except ImportError as error:
+            version = sys.modules["jaxtank"].__version__
+            raise InputError(f"{self.name}: a worker has no jaxtank {version} ({error})") from None
+        except (CancelledError, BrokenExecutor) as error:
+            raise self.lost(error) from None
+        except Exception as error:
+            if type(error).__name__ != "KilledWorker":
+                raise
             raise InputError(
-                f"cluster {self.address}: a worker has no jaxtank"
-                f" {sys.modules['jaxtank'].__version__} ({error})"
+                f"{self.name}: several workers ended while they ran the same task, probably out of"
+                " memory: start workers with more memory, and --resume DIR"
             ) from None
-        except (CancelledError, Exception) as error:
-            if type(error).__name__ == "KilledWorker":
-                raise InputError(
-                    f"cluster {self.address}: several workers ended while they ran the same task,"
-                    " probably out of memory: start workers with more memory, and --resume DIR"
-                ) from None
-            if self.client.status != "running" or isinstance(error, CancelledError):
-                raise self._lost(error) from None
-            raise
-        self._same(processor)
-        return found
-
-    def _same(self, processor):
-        """Warn once where workers have processors of two types."""
-        if len(self.processors) == 1 and processor not in self.processors:
+        if len(self.processors | {processor}) > len(self.processors) == 1:
             warnings.warn(
-                f"cluster {self.address}: workers have different types of processor: numbers may"
-                " differ in their last digits from those of one type",
+                f"{self.name}: workers have different types of processor: numbers may differ in"
+                " their last digits from those of one type",
                 ClusterWarning,
                 stacklevel=5,
             )
         self.processors.add(processor)
+        return result
 
-    def _lost(self, error=None):
-        why = f" ({type(error).__name__})" if error is not None else ""
+    def lost(self, error):
+        """Return the error for workers that are out of reach."""
         return InputError(
-            f"cluster {self.address}: the connection to the scheduler was lost{why}; finished"
-            " batches are kept if --out DIR was given: continue with --resume DIR"
+            f"{self.name}: the connection to the workers was lost ({type(error).__name__});"
+            " finished batches are kept if --out DIR was given: continue with --resume DIR"
         )
+
+
+class DaskEngine(Engine):
+    """Runs tasks on the workers of a Dask client; local: on this machine, where none is added."""
+
+    function = staticmethod(call_by_code)
+
+    def __init__(self, client, local=False):
+        super().__init__(client.get_executor(pure=False))
+        self.client, self.local, self.name = client, local, f"cluster {client.scheduler.address}"
+        self.idle = False
+
+    def look(self):
+        try:
+            idle = not self.client.nthreads()
+        except Exception as error:
+            raise self.lost(error) from None
+        if idle and self.local:
+            raise InputError(f"{self.name}: the workers on this machine have ended")
+        if idle and not self.idle:
+            message = f"{self.name}: there is no worker, waiting for one"
+            warnings.warn(message, ClusterWarning, stacklevel=4)
+        self.idle = idle
 
 
 @contextlib.contextmanager
 def connect(cluster):
-    """Give an Engine of a cluster, None for None."""
+    """Give an Engine of a cluster or an Executor, None for None."""
     if cluster is None or isinstance(cluster, Engine):
         yield cluster
         return
     check_cluster(cluster)
-    if not isinstance(cluster, str):
+    if isinstance(cluster, Executor):
         yield Engine(cluster)
+        return
+    if not isinstance(cluster, str):
+        yield DaskEngine(cluster)
         return
     with contextlib.ExitStack() as stack:
         stack.enter_context(_quiet())
-        check = security = None
-        if cluster.startswith("local:"):
-            count = int(cluster.removeprefix("local:"))
-            cluster, check, security, _ = stack.enter_context(local_workers(count))
-        client = stack.enter_context(_client(cluster, security))
-        engine = Engine(client, check)
-        if not engine.address.startswith(ENCRYPTED):
+        local = cluster.startswith("local:")
+        if local:
+            workers = stack.enter_context(local_workers(int(cluster.removeprefix("local:"))))
+            client = stack.enter_context(_client(workers, workers.security))
+        else:
+            client = stack.enter_context(_client(cluster))
+        engine = DaskEngine(client, local)
+        if not client.scheduler.address.startswith(ENCRYPTED):
             warnings.warn(
-                f"cluster {engine.address}: without TLS anybody who reaches this address"
-                " can run code as the user of its workers, and of this command: give all of them"
-                " certificates and the address as tls://HOST:PORT",
+                f"{engine.name}: without TLS anybody who reaches this address can run code as the"
+                " user of its workers, and of this command: give all of them certificates and the"
+                " address as tls://HOST:PORT",
                 ClusterWarning,
                 stacklevel=3,
             )
@@ -190,21 +191,22 @@ def connect(cluster):
 
 
 def check_cluster(cluster, devices=1):
-    """Raise InputError unless `cluster` is what `connect` takes, on one device, with Dask."""
+    """Raise InputError unless `cluster` is what `connect` takes, on one device."""
     if cluster is None or isinstance(cluster, Engine):
         return
     if devices > 1:
         raise InputError("cluster and devices: give one of them")
+    if isinstance(cluster, Executor):
+        return
     if isinstance(cluster, str):
         kind, _, count = cluster.partition(":")
+        good = ADDRESS.fullmatch(cluster) is not None
         if kind == "local":
-            good = count.isdecimal() and 1 <= int(count) <= MOST
-        else:
-            good = ADDRESS.fullmatch(cluster) is not None
+            good = count.isdecimal() and 1 <= int(count) <= AT_ONCE
         if not good:
             raise InputError(
                 f"cluster = {cluster!r}: must be HOST:PORT of a Dask scheduler, tls://HOST:PORT, or"
-                f" local:N for N workers on this machine, from 1 to {MOST}"
+                f" local:N for N workers on this machine, from 1 to {AT_ONCE}"
             )
     try:
         import distributed
@@ -212,12 +214,11 @@ def check_cluster(cluster, devices=1):
         raise InputError(
             'cluster: Dask is not installed: pip install distributed, or ".[cluster]"'
         ) from None
-    if not isinstance(cluster, str | distributed.Client) or (
-        isinstance(cluster, distributed.Client) and cluster.asynchronous
-    ):
+    synchronous = isinstance(cluster, distributed.Client) and not cluster.asynchronous
+    if not isinstance(cluster, str) and not synchronous:
         raise InputError(
-            f"cluster is a {type(cluster).__name__}: must be an address, local:N, or a"
-            " distributed.Client that is not asynchronous"
+            f"cluster is a {type(cluster).__name__}: must be an address, local:N, a"
+            " concurrent.futures.Executor, or a distributed.Client that is not asynchronous"
         )
 
 
@@ -246,8 +247,8 @@ def _quiet():
     """Leave out the log of Dask, which would repeat in many lines what `Engine` says in one."""
     import distributed  # noqa: F401  it sets levels of its own
 
-    known = [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]
-    levels = {log: log.level for log in map(logging.getLogger, known)}
+    names = [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]
+    levels = {log: log.level for log in map(logging.getLogger, names)}
     try:
         for log in levels:
             log.setLevel(logging.CRITICAL + 1)

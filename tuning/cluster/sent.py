@@ -1,6 +1,4 @@
-"""A case as text, and the case that a worker makes of it: the same loop, to the bit, or
-an error.
-"""
+"""A case as text, and the case that a worker makes of it: the same loop to the bit, or an error."""
 
 import functools
 import json
@@ -18,9 +16,9 @@ from tuning.storage.fingerprint import fingerprint
 
 def sent(case: Case, names: Sequence[str] = ()) -> str:
     """Return a case as JSON: its rig file, and the fingerprint of its loop, clock and versions."""
-    if own := ms.functions(names):
+    for name in ms.functions(names):
         raise InputError(
-            f"cluster: {next(iter(own))} is a function of your own, and workers are sent no code:"
+            f"cluster: {name} is a function of your own, and workers are sent no code:"
             " leave out the cluster, or use measures of the package"
         )
     try:
@@ -37,28 +35,26 @@ def sent(case: Case, names: Sequence[str] = ()) -> str:
 @functools.lru_cache(maxsize=8)
 def received(text: str) -> Case:
     """Return the case of `sent`, made anew; the same object for the same text."""
-    found = json.loads(text)
-    case = rig.loads(found["rig"], "rig file sent to this worker")
-    mine, theirs = _fingerprint(case), found["fingerprint"]
-    differs = [name for name in theirs if mine.get(name) != theirs[name]]
+    message = json.loads(text)
+    case = rig.loads(message["rig"], "rig file sent to this worker")
+    there, here = _fingerprint(case), message["fingerprint"]
+    differs = [name for name in here if there.get(name) != here[name]]
     if "xla_option" in differs:
         raise InputError(
             "cluster: jax had started on this worker before jaxtank, without its compiler options:"
             " start workers with --preload jaxtank, or with the XLA_FLAGS of this command"
         )
     if differs:
-        names = ", ".join(
-            f"{n} ({_short(mine.get(n))} there, {_short(theirs[n])} here)" for n in differs
-        )
-        raise InputError(f"cluster: a worker differs from this process: {names}")
+        words = [f"{n} ({_short(there.get(n))} there, {_short(here[n])} here)" for n in differs]
+        raise InputError(f"cluster: a worker differs from this process: {', '.join(words)}")
     return case
 
 
 def _fingerprint(case):
     """Return `fingerprint` with what decides precision and random numbers on a worker, too."""
     config: Any = jax.config
-    generator = config.jax_default_prng_impl, config.jax_threefry_partitionable
-    return fingerprint(case, x64=bool(config.jax_enable_x64), random=list(map(str, generator)))
+    generator = [str(config.jax_default_prng_impl), str(config.jax_threefry_partitionable)]
+    return fingerprint(case, x64=bool(config.jax_enable_x64), random=generator)
 
 
 def _short(value):

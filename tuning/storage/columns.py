@@ -1,6 +1,4 @@
-"""Arrays with a row for each draw, filled some rows at a time; large ones in a file, not
-in memory.
-"""
+"""Arrays with a row for each draw, filled some rows at a time; large ones in a file."""
 
 import os
 import tempfile
@@ -23,63 +21,53 @@ Array = NDArray[Any]
 
 
 class Columns(Mapping[str, Array]):
-    """{name: (rows, ...) array}, filled some rows at a time."""
+    """{name: (rows, ...) array}, filled some rows at a time; `put` of the first rows names them."""
 
     # Above IN_MEMORY bytes the arrays are in a file without a name, which ends with this object;
     # each look-up then maps the array anew, to be read, so that nothing stays in memory that is not
     # held. Pickled as a dict of arrays.
 
-    def __init__(self, like: Mapping[str, Array], rows: int, folder: Folder | None = None):
-        self.rows = rows
-        self.places: dict[str, tuple[int, Array]] = {}
-        end = 0
-        for name, one in like.items():
-            empty = np.zeros((0, *one.shape[1:]), one.dtype)
-            self.places[name] = end, empty
-            end += rows * _row_bytes(empty)
-        self.folder, self.size = folder, end
+    def __init__(self, rows: int, folder: Folder | None = None):
+        self.rows, self.folder = rows, folder
+        self.places: dict[str, tuple[int, Array]] = {}  # {name: (first byte, array without rows)}
         self.arrays: dict[str, Array] | None = None
         self.file: Any = None
-        if end <= IN_MEMORY:
-            self.arrays = {
-                n: np.zeros((rows, *one.shape[1:]), one.dtype)
-                for n, (_, one) in self.places.items()
-            }
+
+    def _allocate(self, like: Mapping[str, Array]) -> None:
+        size = 0
+        for name, block in like.items():
+            empty = np.zeros((0, *block.shape[1:]), block.dtype)
+            self.places[name] = size, empty
+            size += self.rows * _row_bytes(empty)
+        if size <= IN_MEMORY:
+            self.arrays = {n: np.zeros((self.rows, *v.shape[1:]), v.dtype) for n, v in like.items()}
+            return
+        self.file = tempfile.TemporaryFile(dir=self.folder)  # noqa: SIM115  ends with this
+        if hasattr(os, "posix_fallocate"):  # all of it, so that a full disk is known at once
+            os.posix_fallocate(self.file.fileno(), 0, size)
         else:
-            self._open()
-
-    def _open(self) -> None:
-        """Make the file, all of it, so that a full disk is known at once."""
-        try:
-            self.file = tempfile.TemporaryFile(dir=self.folder)  # noqa: SIM115  ends with this
-            if hasattr(os, "posix_fallocate"):
-                os.posix_fallocate(self.file.fileno(), 0, self.size)
-            else:
-                self.file.truncate(self.size)
-        except OSError as error:
-            raise self._no_space(error) from None
-
-    def _no_space(self, error: OSError) -> InputError:
-        where = tempfile.gettempdir() if self.folder is None else str(self.folder)
-        other = ", or set TMPDIR to another folder" if self.folder is None else ""
-        return InputError(
-            f"{where!r} cannot hold {self.rows} draws, {self.size >> 20} MiB ({error.strerror}):"
-            f" free disk space{other}"
-        )
+            self.file.truncate(size)
 
     def put(self, start: int, block: Mapping[str, Array]) -> None:
         """Set the rows from `start` on to those of `block`; rows beyond the last are dropped."""
-        for name, (place, empty) in self.places.items():
-            new = np.asarray(block[name], dtype=empty.dtype)[: self.rows - start]
-            if self.arrays is not None:
-                self.arrays[name][start : start + len(new)] = new
-                continue
-            try:
+        try:
+            if not self.places:
+                self._allocate(block)
+            for name, (place, empty) in self.places.items():
+                new = np.asarray(block[name], dtype=empty.dtype)[: self.rows - start]
+                if self.arrays is not None:
+                    self.arrays[name][start : start + len(new)] = new
+                    continue
                 self.file.seek(place + start * _row_bytes(empty))
                 self.file.write(np.ascontiguousarray(new).tobytes())
                 self.file.flush()
-            except OSError as error:
-                raise self._no_space(error) from None
+        except OSError as error:
+            folder = tempfile.gettempdir() if self.folder is None else str(self.folder)
+            remedy = ", or set TMPDIR to another folder" if self.folder is None else ""
+            raise InputError(
+                f"{folder!r} cannot hold {self.rows} draws ({error.strerror}): free disk"
+                f" space{remedy}"
+            ) from None
 
     def __getitem__(self, name: str) -> Array:
         place, empty = self.places[name]
@@ -105,19 +93,17 @@ def row_blocks(rows: int, size: int | None = None) -> Iterator[slice]:
 
 
 def column(
-    table: Mapping[str, Array], name: str, entry: int, kept: Array, out: Array | None = None
+    table: Mapping[str, Array], name: str, entry: int, where: Array, out: Array | None = None
 ) -> Array:
-    """Return one entry of an array over the rows where `kept` (rows,) is True, in `out`
-    if given.
-    """
-    found = np.empty(int(np.sum(kept)), table[name].dtype) if out is None else out
+    """Return one entry of an array over the rows where `where` (rows,) is True, in `out`."""
+    values = np.empty(int(np.sum(where)), table[name].dtype) if out is None else out
     end = 0
-    for rows in row_blocks(len(kept)):
+    for rows in row_blocks(len(where)):
         block = table[name][rows]  # looked up anew: what was read before need not stay in memory
-        mine = block.reshape(len(block), -1)[kept[rows], entry]
-        found[end : end + len(mine)] = mine
-        end += len(mine)
-    return found
+        part = block.reshape(len(block), -1)[where[rows], entry]
+        values[end : end + len(part)] = part
+        end += len(part)
+    return values
 
 
 def _row_bytes(empty: Array) -> int:

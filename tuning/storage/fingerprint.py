@@ -17,15 +17,15 @@ from jaxtank.xla.flags import KEY
 def digest(*parts: Any) -> str:
     """Return the hexadecimal SHA-256 digest of texts, bytes and arrays, in their order."""
     # An array counts with its type and shape, so that equal bytes of another shape differ.
-    found = hashlib.sha256()
+    sha = hashlib.sha256()
     for part in parts:
         if isinstance(part, str):
             part = part.encode()
         if not isinstance(part, bytes):
             array = np.asarray(part)
             part = f"{array.dtype.str}{array.shape}".encode() + array.tobytes()
-        found.update(len(part).to_bytes(8, "little") + part)
-    return found.hexdigest()
+        sha.update(len(part).to_bytes(8, "little") + part)
+    return sha.hexdigest()
 
 
 def fingerprint(case: Case, **what: Any) -> dict[str, Any]:

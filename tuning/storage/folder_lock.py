@@ -1,4 +1,4 @@
-"""One run writes to a folder at a time: a lock that dies with its process, and says whose it is."""
+"""One run writes to a folder at a time: a lock that ends with its process, and names it."""
 
 import contextlib
 import os
@@ -15,25 +15,22 @@ try:
 except ImportError:
     fcntl = None
 
-PATIENCE = 0.2
-"""How long a lock may be in the way before it is a refusal [s]: one that ends removes its file
-in less.
-"""
+PATIENCE = 0.2  # time for which a lock may be in the way [s]: a run that ends needs less
 
 
 @contextlib.contextmanager
 def hold(folder, leaving: Callable = contextlib.nullcontext):
-    """Hold `folder`, made if need be, against other runs."""
+    """Hold `folder`, made if need be, against other runs; None: nothing is held."""
     # The lock is the system's own (flock on a file with the process id in it): it ends with its
     # process however that ends, so that what a kill left behind is taken over, unfinished files
     # (`jaxtank.core.files.sweep`) included. A folder that was made for this and got nothing is
-    # removed again. folder None: nothing is held. Raises InputError where another run holds it.
+    # removed again. Raises InputError where another run holds it.
     if folder is None or fcntl is None:
         yield
         return
     check_folder(folder)
     folder = Path(folder)
-    made = [p for p in (folder, *folder.parents) if not p.exists()]
+    new = [p for p in (folder, *folder.parents) if not p.exists()]
     opened, file = [], None
 
     def release():
@@ -46,7 +43,7 @@ def hold(folder, leaving: Callable = contextlib.nullcontext):
         tidy()
 
     def tidy():
-        for path in made:  # the innermost first
+        for path in new:  # the innermost first
             with contextlib.suppress(OSError):  # not empty
                 path.rmdir()
 
@@ -64,9 +61,7 @@ def hold(folder, leaving: Callable = contextlib.nullcontext):
 
 
 def _locked(folder, opened):
-    """The open lock file of a folder, None where there are no locks; opened: list that holds what
-    is open meanwhile.
-    """
+    """The open lock file, None where there are no locks; `opened` holds what is open meanwhile."""
     assert fcntl is not None  # `hold` comes no further without it
     path, until = folder / LOCK, time.monotonic() + PATIENCE
     while True:
@@ -78,10 +73,10 @@ def _locked(folder, opened):
             owner = os.pread(file, 20, 0).decode("ascii", "replace").strip()
             os.close(file)
             if time.monotonic() > until:
+                process = f" (process {owner})" if owner.isdigit() else ""
                 raise InputError(
-                    f"{str(folder)!r}: another"
-                    f" run{f' (process {owner})' if owner.isdigit() else ''} writes there: wait for"
-                    " it, or give another folder"
+                    f"{str(folder)!r}: another run{process} writes there: wait for it, or give"
+                    " another folder"
                 ) from None
             time.sleep(0.02)
             continue
@@ -105,10 +100,7 @@ def _let_go(path, file):
     if file is None:
         return
     assert fcntl is not None  # there is a file
-    try:
+    with contextlib.suppress(OSError):
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         os.unlink(path)
-    except OSError:
-        pass
-    finally:
-        os.close(file)
+    os.close(file)

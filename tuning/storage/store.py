@@ -16,15 +16,12 @@ from tuning.storage.fingerprint import digest
 
 NAME = "checkpoint.sqlite3"
 
-FORMAT = 4
-"""Version of what is written; another one is refused."""
+FORMAT = 4  # version of what is written; another one is refused
 
-LARGEST_FILE, LARGEST = 1 << 40, 1 << 28
-"""Largest file and largest record that are read [bytes]."""
+LARGEST_FILE, LARGEST = 1 << 40, 1 << 28  # file and record that are read [bytes]
 
 SCHEMA = "CREATE TABLE record (key TEXT PRIMARY KEY, value TEXT, seal TEXT)"
-PROBLEM = "problem"
-"""Key of the record that says what the others are of."""
+PROBLEM = "problem"  # key of the record that says what the others are of
 
 TYPES = ("<f8", "<f4")
 
@@ -62,13 +59,34 @@ class Store:
                 self.path, timeout=60, isolation_level=None, check_same_thread=False
             )
         try:
-            self._open(resume, shared)
+            self._check_tables()
+            self._begin(shared)
+            self._check_problem()
+            if not (resume or shared) and self.finished():
+                raise InputError(
+                    f"{str(self.folder)!r} holds finished batches of this ensemble: --resume"
+                    " continues with them"
+                )
         except BaseException:
             self.close()
             raise
 
-    def _open(self, resume, shared):
-        """Check the file, and begin one that is empty."""
+    def _check_file(self, resume):
+        """Raise InputError for a path that is no file, and for one that is missing."""
+        try:
+            if why := refusal(self.path, LARGEST_FILE):
+                raise InputError(f"{str(self.path)!r} {why}, so it is no checkpoint")
+        except OSError:
+            if resume and not untouched(self.folder):
+                why = f"there is no {NAME}"
+                if (self.folder / "result.json").exists():
+                    why = "that run had ended, and its result is in result.json"
+                raise InputError(
+                    f"--resume: {str(self.folder)!r} holds no checkpoint to continue: {why}"
+                ) from None
+
+    def _check_tables(self):
+        """Raise InputError unless the file is a whole database of one table, or of none."""
         with self._reading():
             self.db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST)
             self.db.execute("PRAGMA trusted_schema = OFF")
@@ -76,32 +94,6 @@ class Store:
             (state,) = self.db.execute("PRAGMA quick_check(1)").fetchone()
             if state != "ok" or schema not in ([], [SCHEMA]):
                 raise sqlite3.DatabaseError("has other tables" if state == "ok" else state)
-        self._begin(shared)
-        self._check_same(self._problem())
-        if not (resume or shared) and self.finished():
-            raise InputError(
-                f"{str(self.folder)!r} holds finished batches of this ensemble: --resume continues"
-                " with them"
-            )
-
-    def _problem(self):
-        """Return what the records of the file are of, None for what is no JSON."""
-        with contextlib.suppress(ValueError, RecursionError):
-            return json.loads(self._text(PROBLEM))
-
-    def _check_file(self, resume):
-        """Raise InputError for a file that is none, and for one that is missing."""
-        try:
-            if why := refusal(self.path, LARGEST_FILE):
-                raise InputError(f"{str(self.path)!r} {why}, so it is no checkpoint")
-        except OSError:
-            if resume and not untouched(self.folder):
-                done = (self.folder / "result.json").exists()
-                why = "that run had ended, and its result is in result.json"
-                raise InputError(
-                    f"--resume: {str(self.folder)!r} holds no checkpoint to continue:"
-                    f" {why if done else f'there is no {NAME}'}"
-                ) from None
 
     def _begin(self, shared):
         """Make the table, unless there is one."""
@@ -116,8 +108,11 @@ class Store:
             self._insert(PROBLEM, self.head)
             self.db.execute("COMMIT")
 
-    def _check_same(self, theirs):
-        """Raise InputError, naming what differs, unless `theirs` is the same problem."""
+    def _check_problem(self):
+        """Raise InputError, naming what differs, unless the file is of the same problem."""
+        theirs = None
+        with contextlib.suppress(ValueError, RecursionError):
+            theirs = json.loads(self._text(PROBLEM))
         if not isinstance(theirs, dict) or theirs.get("format") != FORMAT:
             raise InputError(
                 f"--resume: the checkpoint in {str(self.folder)!r} was written by another version"

@@ -11,6 +11,10 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import is_real
 
+# In every class, `quantile` returns values (draws, ...) at probabilities p (draws, ...), where
+# nominal (...) is the parameter's own value; `check` raises InputError for fields that fit no
+# distribution.
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Uniform:
@@ -37,7 +41,7 @@ class Uniform:
     tied: bool = False
 
     def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
-        """Return values (draws, ...) at probabilities p (draws, ...); nominal: (...) own value."""
+        """Return the values at probabilities p."""
         if self.relative is not None:
             return nominal * (1.0 + self.relative * (2.0 * p - 1.0))
         assert self.low is not None and self.high is not None  # `check`
@@ -45,16 +49,12 @@ class Uniform:
 
     def check(self, name: str) -> None:
         """Raise InputError unless the range is one."""
-        _one_kind(self, name, ("low", "high"), "relative")
-        if self.relative is not None and not self.relative > 0:
+        _check_fields(self, name, ("low", "high"), "relative")
+        if self.relative is not None and self.relative <= 0:
             raise InputError(
                 f"{name}: uniform of relative width {self.relative:g} must be wider than 0"
             )
-        if self.low is not None and self.high is not None and not self.low < self.high:
-            raise InputError(
-                f"{name}: uniform from {self.low:g} to {self.high:g} must have its low end below"
-                " its high one"
-            )
+        _check_order(self, name, -math.inf)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -82,7 +82,7 @@ class LogUniform:
     tied: bool = False
 
     def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
-        """Return values (draws, ...) at probabilities p (draws, ...); nominal: (...) own value."""
+        """Return the values at probabilities p."""
         if self.factor is not None:
             return nominal * self.factor ** (2.0 * p - 1.0)
         assert self.low is not None and self.high is not None  # `check`
@@ -90,14 +90,10 @@ class LogUniform:
 
     def check(self, name: str) -> None:
         """Raise InputError unless the range is one, above 0."""
-        _one_kind(self, name, ("low", "high"), "factor")
-        if self.factor is not None and not self.factor > 1:
+        _check_fields(self, name, ("low", "high"), "factor")
+        if self.factor is not None and self.factor <= 1:
             raise InputError(f"{name}: log-uniform factor = {self.factor:g} must be above 1")
-        if self.low is not None and self.high is not None and not 0 < self.low < self.high:
-            raise InputError(
-                f"{name}: log-uniform from {self.low:g} to {self.high:g} must lie above 0, its low"
-                " end below its high one"
-            )
+        _check_order(self, name, 0.0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -128,17 +124,16 @@ class Normal:
     tied: bool = False
 
     def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
-        """Return values (draws, ...) at probabilities p (draws, ...); nominal: (...) own value."""
-        tail = scipy.special.ndtr(-self.cut)
+        """Return the values at probabilities p."""
         centre = nominal if self.mean is None else self.mean
         spread = self.sd if self.relative is None else self.relative * np.abs(centre)
-        return centre + spread * scipy.special.ndtri(tail + (1.0 - 2.0 * tail) * p)
+        return centre + spread * truncated_normal(p, self.cut)
 
     def check(self, name: str) -> None:
         """Raise InputError unless the width is one."""
-        _one_kind(self, name, ("sd",), "relative")
+        _check_fields(self, name, ("sd",), "relative")
         width = self.sd if self.relative is None else self.relative
-        assert width is not None  # `_one_kind`
+        assert width is not None  # `_check_fields`
         if not (width > 0 and self.cut > 0):
             raise InputError(
                 f"{name}: normal of width {width:g} cut at {self.cut:g} standard deviations: both"
@@ -170,20 +165,16 @@ class Discrete:
     tied: bool = False
 
     def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
-        """Return values (draws, ...) at probabilities p (draws, ...)."""
-        weights = (
-            np.ones(len(self.values))
-            if self.weights is None
-            else np.asarray(self.weights, dtype=float)
-        )
+        """Return the values at probabilities p."""
+        weights = np.asarray(self.weights or (1.0,) * len(self.values), dtype=float)
         edges = np.cumsum(weights / weights.sum())[:-1]
         return np.asarray(self.values, dtype=float)[np.searchsorted(edges, p, side="right")]
 
     def check(self, name: str) -> None:
         """Raise InputError unless there are values, and a weight of at least 0 for each."""
-        good = len(self.values) > 0 and all(math.isfinite(v) for v in self.values)
         weights = self.weights or (1.0,) * len(self.values)
-        if not good or len(weights) != len(self.values) or min(weights) < 0 or not sum(weights) > 0:
+        finite = len(self.values) > 0 and all(math.isfinite(v) for v in self.values)
+        if not finite or len(weights) != len(self.values) or min(weights) < 0 or sum(weights) <= 0:
             raise InputError(
                 f"{name}: a discrete distribution needs finite values and a weight of at least 0"
                 " for each"
@@ -224,6 +215,11 @@ class Correlated:
         """Return the (n, n) lower Cholesky factor of the covariance."""
         return np.linalg.cholesky(np.asarray(self.covariance, dtype=float))
 
+    def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
+        """Return the values (draws, n) at probabilities p (draws, n), before they are clipped."""
+        mean = nominal if self.mean is None else np.asarray(self.mean)
+        return mean + truncated_normal(p, self.cut) @ self.factor().T
+
     def check(self, name: str) -> None:
         """Raise InputError unless the covariance is symmetric, positive definite and (n, n)."""
         try:
@@ -240,54 +236,54 @@ class Correlated:
             raise InputError(f"{name}: covariance must be positive definite") from None
 
 
-def _one_kind(distribution, name, absolute, relative):
-    given = [getattr(distribution, a) is not None for a in absolute]
-    other = getattr(distribution, relative) is not None
-    if other == any(given) or any(given) != all(given):
+def truncated_normal(p, cut):
+    """Return quantiles of the standard normal distribution, truncated at +-cut."""
+    tail = scipy.special.ndtr(-cut)
+    return scipy.special.ndtri(tail + (1.0 - 2.0 * tail) * p)
+
+
+def _check_fields(distribution, name, absolute, relative):
+    """Raise InputError unless all of `absolute`, or `relative`, are given, as finite numbers."""
+    values = {field: getattr(distribution, field) for field in (*absolute, relative)}
+    present = [values[field] is not None for field in absolute]
+    if any(present) != all(present) or any(present) == (values[relative] is not None):
         raise InputError(f"{name}: give either {' and '.join(absolute)}, or {relative}")
-    for field in (*absolute, relative):
-        value = getattr(distribution, field)
+    for field, value in values.items():
         if value is not None and not (isinstance(value, (int, float)) and math.isfinite(value)):
             raise InputError(f"{name}: {field} = {value!r} must be a finite number")
+
+
+def _check_order(distribution, name, least):
+    low, high = distribution.low, distribution.high
+    if low is not None and not least < low < high:
+        kind, above = ("log-uniform", "above 0, ") if least == 0.0 else ("uniform", "")
+        raise InputError(
+            f"{name}: {kind} from {low:g} to {high:g} must have its low end {above}below its high"
+            " end"
+        )
 
 
 KINDS = {"uniform": Uniform, "loguniform": LogUniform, "normal": Normal, "discrete": Discrete}
 
 
 def stated(distributions):
-    """Return {name: distribution} of what a study was given."""
+    """Return {name: distribution}; a bare number is the share of a Uniform."""
     if not isinstance(distributions, Mapping):
         raise InputError(
             f"what varies is a {type(distributions).__name__}: must be {{name: distribution}}, as"
             " tuning.Normal(relative=0.05)"
         )
-    found = {}
-    for name, given in distributions.items():
-        if is_real(given) and np.ndim(given) == 0 and 0 < given < 1:
-            given = Uniform(relative=float(given))
-        if not isinstance(given, (*KINDS.values(), Correlated)):
+    checked = {}
+    for name, value in distributions.items():
+        if is_real(value) and np.ndim(value) == 0 and 0 < value < 1:
+            value = Uniform(relative=float(value))
+        if not isinstance(value, (*KINDS.values(), Correlated)):
             raise InputError(
-                f"uncertain {name} = {shortened(given)}: must be a distribution, as"
+                f"uncertain {name} = {shortened(value)}: must be a distribution, as"
                 " tuning.Normal(relative=0.05), or a share between 0 and 1"
             )
-        found[name] = given
-    return found
-
-
-def parse(name, text):
-    """Return the distribution of a text of the command line."""
-    kind, *parts = [p.strip() for p in text.split(":")]
-    tied = bool(parts) and parts[-1] == "tied"
-    fields = _fields(kind, parts[:-1] if tied else parts)
-    if fields is None:
-        raise InputError(
-            f"{name} = {text!r}: must be uniform:LOW:HIGH, uniform:5%, loguniform:LOW:HIGH,"
-            " loguniform:FACTOR, normal:5%, normal:MEAN:SD or discrete:V1:V2, with :tied for one"
-            " draw of a whole array"
-        )
-    found = KINDS[kind](**fields, tied=tied)
-    found.check(name)
-    return found
+        checked[name] = value
+    return checked
 
 
 FORMS = {
@@ -299,15 +295,24 @@ FORMS = {
 """{(kind, count of numbers): their fields}."""
 
 
-def _fields(kind, parts):
-    """{field: value} of the numbers after the kind of a distribution; None where they fit none."""
+def parse(name, text):
+    """Return the distribution of a text of the command line."""
+    kind, *parts = [p.strip() for p in text.split(":")]
+    tied = bool(parts) and parts[-1] == "tied"
+    parts = parts[:-1] if tied else parts
     try:
         if kind in ("uniform", "normal") and len(parts) == 1 and parts[0].endswith("%"):
-            return {"relative": float(parts[0][:-1]) / 100}
-        numbers = [float(p) for p in parts]
-    except ValueError:
-        return None
-    if kind == "discrete" and numbers:
-        return {"values": tuple(numbers)}
-    names = FORMS.get((kind, len(numbers)))
-    return None if names is None else dict(zip(names, numbers))
+            fields = {"relative": float(parts[0][:-1]) / 100}
+        elif kind == "discrete" and parts:
+            fields = {"values": tuple(map(float, parts))}
+        else:
+            fields = dict(zip(FORMS[kind, len(parts)], map(float, parts)))
+    except (ValueError, KeyError):
+        raise InputError(
+            f"{name} = {text!r}: must be uniform:LOW:HIGH, uniform:5%, loguniform:LOW:HIGH,"
+            " loguniform:FACTOR, normal:5%, normal:MEAN:SD or discrete:V1:V2, with :tied for one"
+            " draw of a whole array"
+        ) from None
+    distribution = KINDS[kind](**fields, tied=tied)
+    distribution.check(name)
+    return distribution

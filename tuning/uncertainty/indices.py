@@ -24,9 +24,8 @@ FLAT = 1e-10
 
 def sobol_points(dimensions, samples, seed):
     """Return the points that `sobol_indices` needs."""
-    base = stats.qmc.Sobol(2 * dimensions, scramble=True, rng=np.random.default_rng(seed)).random(
-        samples
-    )
+    sequence = stats.qmc.Sobol(2 * dimensions, scramble=True, rng=np.random.default_rng(seed))
+    base = sequence.random(samples)
     a, b = base[:, :dimensions], base[:, dimensions:]
     points = np.repeat(a[:, None], dimensions + 2, axis=1)
     points[:, -1] = b
@@ -41,23 +40,17 @@ def sobol_indices(y, seed=0):
     # over A and B. A row with an output that is not finite is left out whole, so that what remains
     # stays paired. Source: Saltelli et al. 2010, table 2 (b) and (f).
     y = np.asarray(y, dtype=float)
-    dimensions = y.shape[1] - 2
-    kept = y[np.isfinite(y).all(axis=1)]
-    unknown = np.full(dimensions, np.nan)
-    ends = np.full((dimensions, 2), np.nan)
-    nothing = {
-        "first": unknown,
-        "total": unknown,
-        "first_interval95": ends,
-        "total_interval95": ends,
-        "kept": len(kept),
-    }
-    if len(kept) < 2:
-        return {**nothing, "sd": np.nan}
-    size = np.abs(kept).max() or 1.0
-    kept = kept / size  # what is squared must not overflow
-    kept = kept - kept.mean()  # an output far from 0 would spoil the first-order products
-    a, mixed, b = kept[:, :1], kept[:, 1:-1], kept[:, -1:]
+    dimensions, rows = y.shape[1] - 2, y[np.isfinite(y).all(axis=1)]
+    indices = dict.fromkeys(("first", "total"), np.full(dimensions, np.nan))
+    for name in ("first", "total"):
+        indices[f"{name}_interval95"] = np.full((dimensions, 2), np.nan)
+    indices["kept"] = len(rows)
+    if len(rows) < 2:
+        return {**indices, "sd": np.nan}
+    size = np.abs(rows).max() or 1.0
+    rows = rows / size  # what is squared must not overflow
+    rows = rows - rows.mean()  # an output far from 0 would spoil the first-order products
+    a, mixed, b = rows[:, :1], rows[:, 1:-1], rows[:, -1:]
     terms = np.hstack(
         [b * (mixed - a), 0.5 * (a - mixed) ** 2, 0.5 * (a + b), 0.5 * (a * a + b * b)]
     )
@@ -68,28 +61,23 @@ def sobol_indices(y, seed=0):
 
     point, variance = shares(terms.mean(axis=0))
     if not variance[0] > FLAT**2:
-        return {**nothing, "sd": 0.0}
-    low, high = np.nanquantile(shares(bootstrap_means(terms, seed))[0], (0.025, 0.975), axis=0)
-    intervals = np.stack([low, high], axis=1)
-    return {
-        "first": point[:dimensions],
-        "total": point[dimensions:],
-        "first_interval95": intervals[:dimensions],
-        "total_interval95": intervals[dimensions:],
-        "kept": len(kept),
-        "sd": float(size * np.sqrt(variance[0])),
-    }
+        return {**indices, "sd": 0.0}
+    ends = np.nanquantile(shares(bootstrap_means(terms, seed))[0], (0.025, 0.975), axis=0).T
+    for name, entries in (("first", slice(dimensions)), ("total", slice(dimensions, None))):
+        indices |= {name: point[entries], f"{name}_interval95": ends[entries]}
+    return {**indices, "sd": float(size * np.sqrt(variance[0]))}
 
 
 def bootstrap_means(terms, seed, resamples=RESAMPLES):
     """Return (resamples, ...) means of `terms` (n, ...) over n rows drawn with replacement."""
-    n, rng, found = len(terms), np.random.default_rng(seed), []
+    n, rng, means = len(terms), np.random.default_rng(seed), []
     rows = max(1, BLOCK // n)
     for start in range(0, resamples, rows):
         count = min(rows, resamples - start)
-        drawn = rng.integers(n, size=(count, n)) + n * np.arange(count)[:, None]
-        found.append(np.bincount(drawn.ravel(), minlength=count * n).reshape(count, n) @ terms / n)
-    return np.concatenate(found)
+        picks = rng.integers(n, size=(count, n)) + n * np.arange(count)[:, None]
+        weights = np.bincount(picks.ravel(), minlength=count * n).reshape(count, n)
+        means.append(weights @ terms / n)
+    return np.concatenate(means)
 
 
 def morris_points(dimensions, trajectories, seed, levels=LEVELS):
@@ -117,25 +105,24 @@ def morris_effects(points, y):
     return effects
 
 
-# outputs near the largest number come out as not finite
 @np.errstate(over="ignore", invalid="ignore")
 def morris_indices(effects):
     """Return mean, mean size and standard deviation of the elementary effects of each input."""
     dimensions = effects.shape[1]
-    found = {k: np.full(dimensions, np.nan) for k in ("mu", "mu_star", "sigma")}
-    found |= {k: np.full((dimensions, 2), np.nan) for k in ("mu_interval95", "mu_star_interval95")}
-    found["kept"] = np.isfinite(effects).sum(axis=0)
-    for j in range(dimensions):
-        mine = effects[np.isfinite(effects[:, j]), j]
-        if len(mine) < 2:
+    indices = {k: np.full(dimensions, np.nan) for k in ("mu", "mu_star", "sigma")}
+    indices |= {
+        k: np.full((dimensions, 2), np.nan) for k in ("mu_interval95", "mu_star_interval95")
+    }
+    indices["kept"] = np.isfinite(effects).sum(axis=0)
+    for j, column in enumerate(effects.T):
+        finite = column[np.isfinite(column)]
+        if len(finite) < 2:
             continue
-        half = stats.t.ppf(0.975, len(mine) - 1) / np.sqrt(len(mine))
-        found["sigma"][j] = mine.std(ddof=1)
-        for name, values in (("mu", mine), ("mu_star", np.abs(mine))):
-            found[name][j] = mean = values.mean()
-            found[f"{name}_interval95"][j] = (
-                mean - half * values.std(ddof=1),
-                mean + half * values.std(ddof=1),
-            )
-    found["mu_star_interval95"] = np.maximum(found["mu_star_interval95"], 0.0)
-    return found
+        half = stats.t.ppf(0.975, len(finite) - 1) / np.sqrt(len(finite))
+        indices["sigma"][j] = finite.std(ddof=1)
+        for name, values in (("mu", finite), ("mu_star", np.abs(finite))):
+            mean, sd = values.mean(), values.std(ddof=1)
+            indices[name][j] = mean
+            indices[f"{name}_interval95"][j] = mean - half * sd, mean + half * sd
+    indices["mu_star_interval95"] = np.maximum(indices["mu_star_interval95"], 0.0)
+    return indices

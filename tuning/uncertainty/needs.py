@@ -1,6 +1,4 @@
-"""What the steady states of a reference need of many plants: levels and inputs, and which plants
-can give them.
-"""
+"""Levels and inputs of the steady states of a reference on many plants; which plants reach them."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -20,39 +18,31 @@ from jaxtank.signals.setpoints import Ramps
 class Plateau(NamedTuple):
     """Setpoints that are held for a while."""
 
-    time_s: float
-    """From when on [s]."""
-    names: tuple[str, ...]
-    """(outputs,) dotted name of each setpoint."""
-    values: tuple[float, ...]
-    """(outputs,) each setpoint [cm]."""
+    time_s: float  # its start [s]
+    names: tuple[str, ...]  # (outputs,) dotted name of each setpoint
+    values: tuple[float, ...]  # (outputs,) each setpoint [cm]
 
 
 def plateaus_of(case: Case) -> list[Plateau] | None:
     """Return the plateaus of a case in order of time, or None where its reference has none."""
     reference: Any = case.loop.reference
-    if isinstance(reference, Ramps):
-        return _of_ramps(reference, case.clock.duration)
     if isinstance(reference, Constant):
         names = tuple(f"reference.level[{i}]" for i in range(reference.channels))
         return [Plateau(0.0, names, tuple(map(float, reference.level)))]
-    return None
-
-
-def _of_ramps(reference, duration):
-    """The plateaus of Ramps."""
+    if not isinstance(reference, Ramps):
+        return None
     ramp = float(reference.ramp)
     names = [f"reference.initial[{i}]" for i in range(reference.channels)]
     values = [float(v) for v in reference.initial]
     starts = sorted({time for time, _ in reference.changes})
-    found = [] if starts and starts[0] <= 0.0 else [Plateau(0.0, tuple(names), tuple(values))]
+    plateaus = [] if starts and starts[0] <= 0.0 else [Plateau(0.0, tuple(names), tuple(values))]
     for start, following in zip(starts, [*starts[1:], np.inf]):
         for j, (time, i) in enumerate(reference.changes):
             if time == start:
                 names[i], values[i] = f"reference.targets[{j}]", float(reference.targets[j])
-        if start + ramp <= min(following, duration):
-            found.append(Plateau(start + ramp, tuple(names), tuple(values)))
-    return found
+        if start + ramp <= min(following, case.clock.duration):
+            plateaus.append(Plateau(start + ramp, tuple(names), tuple(values)))
+    return plateaus
 
 
 BLOCK = 1 << 14
@@ -76,24 +66,24 @@ class Needs:
                 " and setpoints that are held for a while (no sine)"
             )
         count = len(next(iter(values.values()))) if values else 1
-        drawn = lambda name: drawn_values(loop, name, values, count)
-        inflow = drawn("disturbance.level") if isinstance(loop.disturbance, Constant) else 0.0
+        of = lambda name: drawn_values(loop, name, values, count)
+        inflow = of("disturbance.level") if isinstance(loop.disturbance, Constant) else 0.0
         zoned = np.ndim(loop.actuator.offset) > 0
-        self.offset = drawn("actuator.dead_zone") if zoned else np.zeros((1, loop.plant.pumps))
-        flows = {name: drawn(f"plant.{name}") for name in FLOWS}
+        self.offset = of("actuator.dead_zone") if zoned else np.zeros((1, loop.plant.pumps))
         self.case, self.values, self.limits = case, dict(values), limits
         self.plateaus, self.count = plateaus, count
+        flows = {name: of(f"plant.{name}") for name in FLOWS}
         self.states = SteadyStates(loop.plant, flows, inflow)
         self.setpoints = np.stack(
-            [np.stack([drawn(name) for name in p.names], axis=-1) for p in plateaus], axis=1
+            [np.stack([of(name) for name in p.names], axis=-1) for p in plateaus], axis=1
         )
-        self.rim = drawn("plant.rim")
+        self.rim = of("plant.rim")
         self.at_rim, level = _limit_of(case, limits)
         top = np.where(self.at_rim, self.rim, level)
-        low = drawn("actuator.low")
+        low = of("actuator.low")
         low = np.maximum(low, self.offset) if zoned else low
         self.low = np.concatenate([np.zeros_like(top), low], axis=1)
-        self.high = np.concatenate([top, drawn("actuator.high")], axis=1)
+        self.high = np.concatenate([top, of("actuator.high")], axis=1)
 
     def first(self, count: int) -> "Needs":
         """Return the Needs of the first `count` plants."""
@@ -132,22 +122,20 @@ def drawn_values(loop: Any, name: str, values: Mapping[str, Any], count: int) ->
     """Return (count, ...) values of a leaf, or of an entry of it, over the draws."""
     base, index = split_index(name)
     whole = np.asarray(get_value(loop, base), dtype=float)
-    found = np.array(np.broadcast_to(whole, (count, *whole.shape)))
-    for other, drawn in values.items():
+    leaf = np.array(np.broadcast_to(whole, (count, *whole.shape)))
+    for other, column in values.items():
         owner, entry = split_index(other)
         if owner == base:
-            drawn = np.asarray(drawn, dtype=float)
-            found[(slice(None), *entry)] = drawn.reshape(
-                drawn.shape + (1,) * (found[(slice(None), *entry)].ndim - drawn.ndim)
-            )
-    return found[(slice(None), *index)]
+            part, column = leaf[(slice(None), *entry)], np.asarray(column, dtype=float)
+            part[...] = column.reshape(column.shape + (1,) * (part.ndim - column.ndim))
+    return leaf[(slice(None), *index)]
 
 
 def _limit_of(case, limits):
     """((n,) True where a tank's limit is its rim, (n,) limit [cm])."""
     plant = case.loop.plant
-    given = check_limits(case.loop, case.limits if limits is None else limits)
-    level, rim = given.get("max_level", "rim"), np.asarray(plant.rim, dtype=float)
+    limits = check_limits(case.loop, case.limits if limits is None else limits)
+    level, rim = limits.get("max_level", "rim"), np.asarray(plant.rim, dtype=float)
     if isinstance(level, str):
         return np.ones(plant.tanks, dtype=bool), rim
     level = np.broadcast_to(np.asarray(level, dtype=float), (plant.tanks,))
@@ -159,11 +147,6 @@ def infeasible(case: Case, values: Mapping[str, Any]) -> np.ndarray | None:
     """Return where a plateau of the reference has no steady state within rims and pump limits."""
     if getattr(case.loop.plant, "pipes", None) != () or not judges(case):
         return None
-    count = len(next(iter(values.values())))
-    rims = {"max_level": "rim"}
-    return np.concatenate(
-        [
-            ~Needs(case, {n: v[i : i + BLOCK] for n, v in values.items()}, rims).feasible()
-            for i in range(0, count, BLOCK)
-        ]
-    )
+    rims, blocks = {"max_level": "rim"}, range(0, len(next(iter(values.values()))), BLOCK)
+    parts = ({n: v[i : i + BLOCK] for n, v in values.items()} for i in blocks)
+    return np.concatenate([~Needs(case, part, rims).feasible() for part in parts])

@@ -1,7 +1,4 @@
-"""The result of an uncertainty study: every draw, and what is counted over them.
-
-Made by `study`; imported by whoever reads an Ensemble.
-"""
+"""The result of an uncertainty study: every draw, and what is counted over them."""
 
 import dataclasses
 import math
@@ -97,29 +94,24 @@ class Ensemble(Result):
         list of dict
             {name, limit, unit, count, probability, interval95}, intervals of Clopper and Pearson.
         """
-        rows = []
+        rows, n = [], self.samples
         for limit in self.limits:
-            broken = sum(
-                int(np.sum(self.failed[rows] | (limit.margins(values) < 0)))
-                for rows, values in self._of(limit)
-            )
+            count = 0
+            for block in row_blocks(n):
+                values = self.measures[limit.measure][block]
+                values = values.reshape(len(values), -1)[:, limit.index]
+                count += int(np.sum(self.failed[block] | (limit.margins(values) < 0)))
             rows.append(
                 {
                     "name": limit.label,
                     "limit": limit.value,
                     "unit": ms.unit(limit.measure, self.case.loop.units),
-                    "count": broken,
-                    "probability": broken / self.samples,
-                    "interval95": clopper_pearson(broken, self.samples),
+                    "count": count,
+                    "probability": count / n,
+                    "interval95": clopper_pearson(count, n),
                 }
             )
         return rows
-
-    def _of(self, limit):
-        """(rows, values of what a limit is on) of all draws, some at a time."""
-        for rows in row_blocks(self.samples):
-            block = self.measures[limit.measure][rows]
-            yield rows, block.reshape(len(block), -1)[:, limit.index]
 
 
 def _statistics(measures, name, finite):
@@ -128,18 +120,18 @@ def _statistics(measures, name, finite):
     if not count:
         return dict.fromkeys(QUANTITIES)
     shape = measures[name].shape[1:]
-    rows = [_of_entry(measures, name, finite, i) for i in range(math.prod(shape))]
-    found = {
+    rows = [_entry_statistics(measures, name, finite, i) for i in range(math.prod(shape))]
+    summary = {
         q: [np.reshape(ends, shape)[()] for ends in np.transpose(values)]
         if q == "mean_interval95"
         else np.reshape(values, shape)[()]
         for q, values in zip(QUANTITIES, zip(*rows))
     }
-    return found | ({"mean_interval95": None, "sd": None} if count == 1 else {})
+    return summary | ({"mean_interval95": None, "sd": None} if count == 1 else {})
 
 
 @np.errstate(invalid="ignore")
-def _of_entry(measures, name, finite, entry):
+def _entry_statistics(measures, name, finite, entry):
     """QUANTITIES of one entry of a measure, of which one column is in memory, and no copy of it."""
     several = measures[name].ndim > 1 and measures[name].shape[1] > 1
     total = _sum_of_rows if several else np.sum
@@ -162,10 +154,10 @@ def _of_entry(measures, name, finite, entry):
 
 def _sum_of_rows(values):
     """Sum of one column as numpy sums the rows of an array of several: one after the other."""
-    found = values[:0].sum()
+    total = values[:0].sum()
     for rows in row_blocks(len(values)):
-        found = np.cumsum(np.append(found, values[rows]))[-1]
-    return found
+        total = np.cumsum(np.append(total, values[rows]))[-1]
+    return total
 
 
 def _within(name, ends, end):

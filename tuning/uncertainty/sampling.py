@@ -1,6 +1,4 @@
-"""Points to draw at, default distributions, the interval of a counted share, checks of
-arguments.
-"""
+"""Points to draw at, default distributions, the interval of a counted share."""
 
 import numpy as np
 import scipy  # its parts are imported when they are first used
@@ -34,32 +32,29 @@ def probabilities(method, dimensions, samples, seed):
 
 
 class Points:
-    """The rows of `probabilities`, some at a time: the same bits without an array of all
-    of them.
-    """
+    """The rows of `probabilities`, some at a time: the same bits, and no array of all of them."""
 
     def __init__(self, method, dimensions, samples, seed):
         if method not in METHODS:
             raise InputError(f"draws = {method!r}: must be random, latin or sobol")
         self.method, self.dimensions, self.samples, self.seed = method, dimensions, samples, seed
-        qmc = None if method == "random" else scipy.stats.qmc
-        if qmc is not None and method == "latin":
-            hypercube = qmc.LatinHypercube(dimensions, rng=np.random.default_rng(seed))
-            self.all = hypercube.random(samples)
-        elif qmc is not None:
-            self.sobol = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
+        rng = np.random.default_rng(seed)
+        if method == "latin":
+            self.all = scipy.stats.qmc.LatinHypercube(dimensions, rng=rng).random(samples)
+        elif method == "sobol":
+            self.sobol = scipy.stats.qmc.Sobol(dimensions, scramble=True, rng=rng)
 
     def rows(self, start, stop):
         """Return (stop - start, dimensions) points: those of the draws from start to below stop."""
         if self.method == "latin":
             return self.all[start:stop]
-        found = self._random(start, stop) if self.method == "random" else self._sobol(start, stop)
-        return found.clip(1e-12, 1 - 1e-12)
-
-    def _random(self, start, stop):
-        generator = np.random.PCG64(self.seed)  # that of default_rng
-        generator.advance(start * self.dimensions)  # one step for each number before
-        return np.random.Generator(generator).random((stop - start, self.dimensions))
+        if self.method == "random":
+            generator = np.random.PCG64(self.seed)  # that of default_rng
+            generator.advance(start * self.dimensions)  # one step for each number before
+            points = np.random.Generator(generator).random((stop - start, self.dimensions))
+        else:
+            points = self._sobol(start, stop)
+        return points.clip(1e-12, 1 - 1e-12)
 
     def _sobol(self, start, stop):
         """Points of the sequence; from its beginning a power of 2 is drawn, else scipy warns."""
@@ -80,12 +75,11 @@ def spread_of(case, share=None):
             " (as plant.drain=uniform:10%), with a table [uncertain] in the rig file (as"
             ' "plant.drain" = 0.1), or in Python with distributions'
         )
-    found = {
-        name: Uniform(relative=own if share is None else share)
-        for name, own in case.uncertain.items()
-    }
+    width = lambda name: case.uncertain[name] if share is None else share
+    spread = {name: Uniform(relative=width(name)) for name in case.uncertain}
     if case.covariance is not None:
         names, matrix = case.covariance
-        together = {"identified": Correlated(names=names, covariance=matrix)}
-        found |= together if share is None else {name: Uniform(relative=share) for name in names}
-    return found
+        if share is None:
+            return spread | {"identified": Correlated(names=names, covariance=matrix)}
+        spread |= {name: Uniform(relative=share) for name in names}
+    return spread

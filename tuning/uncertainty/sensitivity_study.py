@@ -13,12 +13,11 @@ from jaxtank.case import Case
 from jaxtank.core.errors import InputError, NonFiniteError, unknown
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
-from tuning.cluster.engine import check_cluster, connect
-from tuning.problem import scenarios as sc
+from tuning.cluster.engine import check_cluster
 from tuning.problem.result import Result
 from tuning.problem.slopes import contradicted
 from tuning.uncertainty import indices
-from tuning.uncertainty.batches import Runs, check_devices, on_workers
+from tuning.uncertainty.batches import batch_runner, check_devices, seed_of
 from tuning.uncertainty.distributions import Correlated, Discrete, Normal, stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import check_whole, spread_of
@@ -100,9 +99,8 @@ def sensitivity(
         Runs at once.
     devices : int
         Of this process; each takes batches of its own, to the same bits.
-    cluster : str, distributed.Client or None
-        Run the batches of morris and sobol on a Dask cluster, to the same bits: "HOST:PORT" of its
-        scheduler, "local:N" for N workers on this machine, or a Client.
+    cluster : str, distributed.Client, concurrent.futures.Executor or None
+        Run the batches of morris and sobol on workers, to the same bits, as in `ensemble`.
     progress : callable or None
         Called with (runs done, runs in all).
 
@@ -129,54 +127,15 @@ def sensitivity(
     began, notes = time.perf_counter(), []
     if method not in METHODS:
         raise unknown("method", method, METHODS)
-    given = what_varies(case, distributions, spread)
-    draws = Draws(case.loop, given)
+    distributions = what_varies(case, distributions, spread)
+    draws = Draws(case.loop, distributions)
     if not draws.dimensions:
         raise InputError(
             "nothing varies: a relative spread leaves zeros alone, and all values are zero"
         )
     names = check_measures(case, measures, method)
     samples = check_samples(samples, method, notes)
-    _check_arguments(given, method, seed, batch)
-    check_devices(devices)
-    check_cluster(cluster, devices)
-    random = sc.noisy(case) or any(n.startswith("sensor.noise") for n in draws.labels)
-    # one key for all runs: differences are the parameters' alone
-    key = jax.random.key(seed) if random else None
-    lp.check(case.loop, case.clock, key)
-    half_width, runs, failed = {}, 1, 0
-    if method == "local":
-        columns, half_width = local_columns(case, draws, names, key, progress)
-        if cluster is not None:
-            notes.append("the local method takes one run: the cluster is not used")
-    else:
-        make = indices.morris_points if method == "morris" else indices.sobol_points
-        points = make(draws.dimensions, samples, seed)
-        with connect(cluster) as engine:
-            noise = seed if random else None
-            each = engine and on_workers(engine, "points", case, names, noise)
-            run = Runs(case, draws, names, key, batch, progress, devices, each)
-            columns = _columns(case, names, method, points, run, seed)
-        runs, failed = points.shape[0] * points.shape[1], run.failed
-    return SensitivityResult(
-        case=case,
-        method=method,
-        samples=samples,
-        runs=runs,
-        failed=failed,
-        seed=seed,
-        distributions=given,
-        parameters=draws.labels,
-        half_width=half_width,
-        columns=columns,
-        notes=notes,
-        wall_s=time.perf_counter() - began,
-    )
-
-
-def _check_arguments(given, method, seed, batch):
-    """Raise InputError for parameters that vary together, a seed or a batch that is none."""
-    for name, d in given.items():
+    for name, d in distributions.items():
         if isinstance(d, Correlated) and method != "local":
             raise InputError(
                 f"{name}: parameters that vary together have no effects of their own; take the"
@@ -185,13 +144,42 @@ def _check_arguments(given, method, seed, batch):
     check_whole("seed", seed, 0, 2**31 - 1)
     if batch is not None:
         check_whole("batch", batch, 1)
+    check_devices(devices)
+    check_cluster(cluster, devices)
+    noise = seed_of(case, draws.labels, seed)
+    half_width, runs, failed = {}, 1, 0
+    if method == "local":
+        # one key for all runs: differences are the parameters' alone
+        key = None if noise is None else jax.random.key(seed)
+        columns, half_width = local_columns(case, draws, names, key, progress)
+        if cluster is not None:
+            notes.append("the local method takes one run: the cluster is not used")
+    else:
+        make = indices.morris_points if method == "morris" else indices.sobol_points
+        points = make(draws.dimensions, samples, seed)
+        runs = points.shape[0] * points.shape[1]
+        with batch_runner(case, names, noise, devices, cluster) as run:
+            nominal, values, failed = _entries(case, draws, names, points, run, batch, progress)
+        columns = _columns(case, names, method, points, nominal, values, seed)
+    return SensitivityResult(
+        case=case,
+        method=method,
+        samples=samples,
+        runs=runs,
+        failed=failed,
+        seed=seed,
+        distributions=distributions,
+        parameters=draws.labels,
+        half_width=half_width,
+        columns=columns,
+        notes=notes,
+        wall_s=time.perf_counter() - began,
+    )
 
 
 def what_varies(case, distributions=None, spread=None):
     """Return {name: distribution} of a study."""
-    if spread is not None and (
-        isinstance(spread, bool) or not isinstance(spread, (int, float)) or not 0 < spread < 1
-    ):
+    if spread is not None and not (type(spread) in (int, float) and 0 < spread < 1):
         raise InputError(f"spread = {spread!r}: must be a share above 0 and below 1, as 0.05")
     if distributions is not None and spread is not None:
         raise InputError(
@@ -230,45 +218,70 @@ def check_measures(case, measures, method):
 
 def check_samples(samples, method, notes):
     """Return the number of samples, for Sobol a power of 2, None for the local method."""
-    # A note is added to `notes` where it is not what was asked for.
     if method == "local":
         if samples is not None:
             notes.append("the local method takes one run and its derivatives: samples are not used")
         return None
     samples = SAMPLES[method] if samples is None else samples
-    whole = isinstance(samples, int) and not isinstance(samples, bool)
-    if not whole or not LEAST[method] <= samples <= MOST:
-        raise InputError(
-            f"samples = {samples!r}: the method {method} takes a whole number from {LEAST[method]}"
-            f" to {MOST}"
-        )
+    check_whole(f"method {method}: samples", samples, LEAST[method], MOST)
     if method == "sobol" and samples & (samples - 1):
-        rounded = 1 << samples.bit_length()
+        power = 1 << samples.bit_length()
         notes.append(
-            f"samples: {samples} rounded up to {rounded}; Sobol points are evenly spread in powers"
+            f"samples: {samples} rounded up to {power}; Sobol points are evenly spread in powers"
             " of 2"
         )
-        return rounded
+        return power
     return samples
 
 
-def _columns(case, names, method, points, run, seed):
-    """The Columns of a study by runs at `points` (samples, runs of each, D)."""
-    found = run(points.reshape(-1, points.shape[-1])).reshape(*points.shape[:2], -1)
+def _entries(case, draws, names, points, run, batch, progress):
+    """Return the measures at `points` (samples, runs, D) of the unit cube, entry by entry.
+
+    (K,) of the case's own run, (samples, runs, K) NaN where a run is not finite, and the number of
+    these runs.
+    """
+    # batches have one size, so that one compiled program serves; the case's own run goes first
+    values = {
+        name: np.concatenate([np.asarray(get_value(case.loop, name))[None], v])
+        for name, v in draws.values(points.reshape(-1, points.shape[-1])).items()
+    }
+    total = points.shape[0] * points.shape[1] + 1
+    most = 1 << (max(1, SAMPLES_AT_ONCE // case.clock.samples).bit_length() - 1)
+    size = min(batch or max(8, min(RUNS_AT_ONCE, most)), total)
+    entries, broken = None, np.zeros(total, dtype=bool)
+
+    def inputs(start):
+        index = np.minimum(np.arange(start, start + size), total - 1)
+        return {name: v[index] for name, v in values.items()}, None
+
+    for done, (start, measures) in enumerate(run(range(0, total, size), inputs, size), 1):
+        rows = slice(start, min(start + size, total))
+        flat = np.concatenate([measures[m].reshape(size, -1) for m in names], axis=1)
+        entries = np.empty((total, flat.shape[1])) if entries is None else entries
+        entries[rows] = flat[: total - start]
+        broken[rows] = measures["failed"][: total - start] > 0
+        if progress is not None:
+            progress(min(size * done, total) - 1, total - 1)
+    entries[broken] = np.nan
+    return entries[0], entries[1:].reshape(*points.shape[:2], -1), int(broken[1:].sum())
+
+
+def _columns(case, names, method, points, nominal, values, seed):
+    """The Columns of a study by runs at `points`."""
     columns = []
     for k, (measure, label, unit) in enumerate(entries_of(case, names)):
-        y, nominal = found[..., k], float(run.nominal[k])
+        y, reason = values[..., k], ""
         if method == "sobol":
-            effects, ranking = indices.sobol_indices(y, seed), "total"
+            effects = indices.sobol_indices(y, seed)
         else:
             effects = indices.morris_indices(indices.morris_effects(points, y))
-            ranking = "mu_star"
-        known, reason = np.isfinite(effects[ranking]), ""
+        known = np.isfinite(effects[RANKED_BY[method]])
         if not known.all():
             few = np.min(effects["kept"]) < 2
             reason = "fewer than 2 samples in which it is finite" if few else "it does not vary"
-        bad = int(np.sum(~np.isfinite(y)))
-        columns.append(Column(measure, label, unit, nominal, bad, effects, reason, not known.any()))
+        bad, empty = int(np.sum(~np.isfinite(y))), not known.any()
+        own = float(nominal[k])
+        columns.append(Column(measure, label, unit, own, bad, effects, reason, empty))
     return columns
 
 
@@ -278,6 +291,8 @@ CHUNK = 16
 NORMAL_WIDTH = 2.0
 """Half-width of a normal distribution, in standard deviations [-]."""
 
+RUNS_AT_ONCE, SAMPLES_AT_ONCE = 64, 1 << 22
+"""Runs in a batch, and most samples of all of them: each holds its signals."""
 
 UNUSABLE = (
     "a derivative is not finite, or runs contradict it by orders of magnitude, as in a chaotic or"
@@ -300,51 +315,45 @@ class Column(NamedTuple):
 
 def entries_of(case, names):
     """Return [(measure, label, unit)] of every entry of the measures, counted from 1."""
-    found = []
+    rows = []
     for m in names:
-        per = ms.MEASURES[m].per
-        for i in range(ms.entries(m, case.loop.plant)):
-            found.append(
-                (m, m if per == "run" else f"{m} of {per} {i + 1}", ms.unit(m, case.loop.units))
-            )
-    return found
+        per, unit = ms.MEASURES[m].per, ms.unit(m, case.loop.units)
+        for i in range(1, ms.entries(m, case.loop.plant) + 1):
+            rows.append((m, m if per == "run" else f"{m} of {per} {i}", unit))
+    return rows
 
 
 def local_columns(case, draws, names, key, progress=None):
     """Return the Columns by derivatives at the case's own values, and {parameter: half-width}."""
     widths = half_widths(draws)
-    scalars = list(dict.fromkeys(name for width in widths for name in width))
+    steps = {name: width for group in widths for name, width in group.items()}
+    scalars = list(steps)
     nominal, derivatives = _derivatives(case, scalars, names, key, progress)
-    width = {name: w for width in widths for name, w in width.items()}
-    steps = np.array([width[name] for name in scalars])
-    derivatives = _borne_out(case, scalars, steps, names, key, nominal, derivatives)
-    where = {name: i for i, name in enumerate(scalars)}
-    effect = [sum(derivatives[:, where[n]] * w for n, w in width.items()) for width in widths]
-    effect = np.stack(effect, axis=1)
-    alone = [next(iter(width)) if len(width) == 1 else None for width in widths]
+    _drop_contradicted(case, steps, names, key, nominal, derivatives)
+    by_name = dict(zip(scalars, derivatives.T))
     absent = np.full(len(nominal), np.nan)
-    single = np.stack([derivatives[:, where[n]] if n else absent for n in alone], axis=1)
-    own = np.array([float(get_value(case.loop, n)) if n else np.nan for n in alone])
-    elasticity = single * own / np.where(nominal == 0, np.nan, nominal)[:, None]
-    effects = {"effect": effect, "derivative": single, "elasticity": elasticity}
-    half = [next(iter(w.values())) if len(w) == 1 else list(w.values()) for w in widths]
-    return _local_columns(case, names, nominal, effects), dict(zip(draws.labels, half))
-
-
-def _local_columns(case, names, nominal, effects):
-    """The Columns of (K,) nominal entries and {quantity: (K, D)}."""
+    effect, single, own, half_width = [], [], [], {}
+    for label, group in zip(draws.labels, widths):
+        name, *others = group
+        effect.append(sum(by_name[n] * width for n, width in group.items()))
+        single.append(absent if others else by_name[name])
+        own.append(np.nan if others else float(get_value(case.loop, name)))
+        half_width[label] = list(group.values()) if others else group[name]
+    single = np.stack(single, axis=1)
+    elasticity = single * np.array(own) / np.where(nominal == 0, np.nan, nominal)[:, None]
+    effects = {"effect": np.stack(effect, axis=1), "derivative": single, "elasticity": elasticity}
     columns = []
     for k, (measure, label, unit) in enumerate(entries_of(case, names)):
         row = {quantity: values[k] for quantity, values in effects.items()}
         good = bool(np.isfinite(row["effect"]).all())
         reason = "" if good else UNUSABLE
         columns.append(Column(measure, label, unit, float(nominal[k]), int(not good), row, reason))
-    return columns
+    return columns, half_width
 
 
 def _derivatives(case, scalars, names, key, progress):
     """(K,) entries of the measures and (K, scalars) their derivatives, CHUNK scalars at once."""
-    found, measures = [], {}
+    columns, measures = [], {}
     for start in range(0, len(scalars), CHUNK):
         chunk = scalars[start : start + CHUNK]
         values = {name: float(get_value(case.loop, name)) for name in chunk}
@@ -354,66 +363,58 @@ def _derivatives(case, scalars, names, key, progress):
                 f"{case.name}: a level stops being finite at the case's own values, so there are no"
                 " derivatives"
             )
-        rows = [np.asarray(rates[m]).reshape(-1, len(values)) for m in names]
-        found.append(np.concatenate(rows))
+        columns.append(np.concatenate([np.reshape(rates[m], (-1, len(chunk))) for m in names]))
         if progress is not None:
-            progress(min(start + CHUNK, len(scalars)), len(scalars))
-    nominal = np.concatenate([np.ravel(measures[m]) for m in names])
-    return nominal, np.concatenate(found, axis=1)
+            progress(start + len(chunk), len(scalars))
+    return _flat(measures, names), np.concatenate(columns, axis=1)
 
 
-def _borne_out(case, scalars, steps, names, key, nominal, derivatives):
-    """Return derivatives (K, scalars), NaN where runs contradict them."""
-    # Runs are made by a step to either side for each scalar by which some entry would change by
-    # more than itself.
+def _flat(measures, names):
+    return np.concatenate([np.ravel(measures[m]) for m in names])
+
+
+def _drop_contradicted(case, steps, names, key, nominal, derivatives):
+    """Set derivatives (K, scalars) to NaN where runs contradict them."""
+    # runs by a step to either side of each scalar by which some entry would change by more than
+    # itself
     sizes = np.abs(nominal)
-    large = ~(np.abs(derivatives * steps) <= sizes[:, None])
-    found = derivatives.copy()
-    for j in np.flatnonzero(large.any(axis=0)):
-        moves, value = np.array([1.0, -1.0]) * steps[j], float(get_value(case.loop, scalars[j]))
-        rows = []
-        for to in value + moves:
-            loop = with_values(case.loop, {scalars[j]: to})
+    for j, (name, step) in enumerate(steps.items()):
+        if np.all(np.abs(derivatives[:, j] * step) <= sizes):
+            continue
+        moves, rows = np.array([1.0, -1.0]) * step, []
+        for value in float(get_value(case.loop, name)) + moves:
+            loop = with_values(case.loop, {name: value})
             measures, broken = lp.evaluate_and_flag(loop, case.clock, names, key)
-            run = np.concatenate([np.ravel(measures[m]) for m in names])
-            rows.append(run * np.nan if broken else run)
+            rows.append(_flat(measures, names) * (np.nan if broken else 1.0))
         wrong = contradicted(moves[:, None] * derivatives[:, j], np.array(rows) - nominal, sizes)
-        found[wrong, j] = np.nan
-    return found
+        derivatives[wrong, j] = np.nan
 
 
 def half_widths(draws):
     """Return for each dimension {name of a scalar that it moves: half-width}."""
-    found = []
+    widths = []
     for name, d, nominal, _ in draws.parts:
         if isinstance(d, Correlated):
-            found += [
-                {one: NORMAL_WIDTH * float(np.sqrt(d.covariance[i][i]))}
-                for i, one in enumerate(d.names)
-            ]
+            sd = np.sqrt(np.diag(np.asarray(d.covariance, dtype=float)))
+            widths += [{n: float(NORMAL_WIDTH * s)} for n, s in zip(d.names, sd)]
             continue
         width = _half_width(d, nominal) + np.zeros(nominal.shape)
-        if nominal.ndim == 0:
-            found.append({name: abs(float(width))})
-            continue
         entries = {
-            f"{name}[{','.join(map(str, i))}]": float(width[i]) for i in np.ndindex(nominal.shape)
+            f"{name}[{','.join(map(str, i))}]" if i else name: float(width[i])
+            for i in np.ndindex(nominal.shape)
         }
-        found += (
-            [entries]
-            if d.tied
-            else [{one: abs(w)} for one, w in entries.items() if one in draws.labels]
-        )
-    return found
+        if nominal.ndim and d.tied:
+            widths.append(entries)
+        else:
+            widths += [{n: abs(w)} for n, w in entries.items() if n in draws.labels]
+    return widths
 
 
 def _half_width(d, nominal):
     if isinstance(d, Normal):
-        return min(NORMAL_WIDTH, d.cut) * (
-            cast(float, d.sd) if d.relative is None else d.relative * np.abs(nominal)
-        )
+        sd = d.sd if d.relative is None else d.relative * np.abs(nominal)
+        return min(NORMAL_WIDTH, d.cut) * cast(Any, sd)
     if isinstance(d, Discrete):
         return 0.5 * (max(d.values) - min(d.values))
-    return 0.5 * (
-        d.quantile(np.ones(nominal.shape), nominal) - d.quantile(np.zeros(nominal.shape), nominal)
-    )
+    ends = (d.quantile(np.full(nominal.shape, p), nominal) for p in (1.0, 0.0))
+    return 0.5 * np.subtract(*ends)

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 
 from jaxtank.core.tree import get_value, with_values
-from tuning.problem import scenarios as sc
+from tuning.problem.scenarios import ScenarioRun, groups_of, values_of
 from tuning.uncertainty.distributions import Correlated
 from tuning.uncertainty.draws import Draws
 
@@ -16,53 +16,44 @@ SIDES = ("before", "after")
 
 def perturbed(problem, samples, seed):
     """Return `samples` ScenarioRuns that the search does not use."""
-    rng, runs = np.random.default_rng([SEED_OFFSET, seed]), []
+    rng, case, runs = np.random.default_rng([SEED_OFFSET, seed]), problem.case, []
     for i in range(samples):
         run = problem.runs[i % len(problem.runs)]
-        loop = run.case.loop
-        for name, spread in problem.case.uncertain.items():
+        loop, key = run.case.loop, run.key
+        for name, spread in case.uncertain.items():
             value = np.asarray(get_value(loop, name))
-            loop = with_values(
-                loop, {name: value * (1.0 + spread * rng.uniform(-1.0, 1.0, value.shape))}
-            )
-        if problem.case.covariance is not None:
-            names, matrix = problem.case.covariance
-            drawn = Draws(loop, {"identified": Correlated(names=names, covariance=matrix)}).values(
-                rng.uniform(size=(1, len(names)))
-            )
-            loop = with_values(loop, {name: value[0] for name, value in drawn.items()})
-        key = None
-        if run.key is not None:
+            factor = 1.0 + spread * rng.uniform(-1.0, 1.0, value.shape)
+            loop = with_values(loop, {name: value * factor})
+        if case.covariance is not None:
+            names, matrix = case.covariance
+            draws = Draws(loop, {"identified": Correlated(names=names, covariance=matrix)})
+            values = draws.values(rng.uniform(size=(1, len(names))))
+            loop = with_values(loop, {name: value[0] for name, value in values.items()})
+        if key is not None:
             key = jax.random.fold_in(jax.random.key(SEED_OFFSET + seed), i)
-        runs.append(
-            run._replace(
-                case=run.case.replace(loop=loop),
-                key=key,
-                name=f"validation {i + 1}",
-                weight=1.0 / samples,
-            )
-        )
+        perturbed_case = run.case.replace(loop=loop)
+        runs.append(ScenarioRun(f"validation {i + 1}", perturbed_case, key, 1.0 / samples))
     return runs
 
 
 def validate(problem, before, after, samples, seed):
     """Run the values `before` and `after` on `samples` perturbed runs; returns as `summary_of`."""
-    runs = perturbed(problem, samples, seed)
+    runs, scenarios = perturbed(problem, samples, seed), len(problem.runs)
     points = {n: np.array([before[n], after[n]]) for n in problem.names}
     costs, held = np.zeros((samples, 2)), np.ones((samples, 2), dtype=bool)
     diverged = np.zeros(samples, dtype=bool)
     levels = np.zeros((samples, 2, problem.loop.plant.tanks))
     names = tuple(dict.fromkeys([*problem.needed, "max_level"]))
-    for group in sc.groups_of(runs):
-        measures, flags = sc.values_of(group, names, points)
+    for group in groups_of(runs):
+        measures, flags = values_of(group, names, points)
         measures, flags = {m: np.asarray(v) for m, v in measures.items()}, np.asarray(flags)
         for j, i in enumerate(group.runs):
-            mine = [limit for limit in problem.limits if limit.run == i % len(problem.runs)]
+            limits = [limit for limit in problem.limits if limit.run == i % scenarios]
             diverged[i] = flags[:, j].any()
             for side in (0, 1):
                 row = {m: v[side, j] for m, v in measures.items()}
                 costs[i, side], levels[i, side] = problem.cost(row), row["max_level"]
-                held[i, side] = all(limit.margin(row) >= 0 for limit in mine)
+                held[i, side] = all(limit.margin(row) >= 0 for limit in limits)
     noise = any(run.key is not None for run in runs)
     spread = {n: float(s) for n, s in problem.case.uncertain.items()}
     return summary_of(problem, costs, held, levels, diverged, spread, noise)
@@ -72,7 +63,7 @@ def summary_of(problem, costs, held, levels, diverged, spread, noise):
     """Return (summary, cloud) of runs before and after tuning, on the same draws."""
     good = ~diverged & np.isfinite(costs).all(axis=1)
     both = good & held.all(axis=1)
-    found = {
+    summary = {
         "samples": len(costs),
         "spread": spread,
         "noise": noise,
@@ -88,7 +79,7 @@ def summary_of(problem, costs, held, levels, diverged, spread, noise):
     differ = len(set(limits.values())) > 1
     if differ:  # tanks with limits of their own: how far above its limit the worst is
         levels = levels - np.array([limits[i] for i in sorted(limits)])
-    return found, {
+    return summary, {
         "objective": costs[good],
         "level": levels.max(axis=2) if levels.size else np.zeros((0, 2)),
         "limit": 0.0 if differ else next(iter(limits.values()), None),

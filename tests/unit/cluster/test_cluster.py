@@ -1,19 +1,18 @@
-"""Studies and searches on Dask workers: the bits of one process, whatever happens to the workers.
+"""Studies and searches on executors and Dask workers: the bits of one process, whatever happens.
 
-One cluster serves the file; workers are killed as it goes on, the scheduler last.
+One cluster serves the file; one of its workers is killed.
 """
 
 import asyncio
-import contextlib
 import dataclasses
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
 import urllib.request
-import warnings
-from pathlib import Path
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 
 import jax
 import numpy as np
@@ -25,12 +24,10 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from tuning.cluster import engine as engines
-from tuning.cluster import parent
-from tuning.cluster.engine import Engine
+from tuning.cluster.engine import connect
 from tuning.cluster.local import local_workers
 from tuning.cluster.sent import received, sent
 from tuning.problem.functions import as_measures
-from tuning.problem.problem import Problem
 from tuning.uncertainty import batches
 
 distributed = pytest.importorskip("distributed", reason="Dask is not installed")
@@ -54,22 +51,27 @@ def whole(case):
 
 @pytest.fixture(scope="module")
 def client():
-    """A client of two workers."""
-    with local_workers(2) as workers:
-        client = distributed.Client(workers.address, security=workers.security)
-        with client, warnings.catch_warnings():
-            client.workers = workers
-            client.wait_for_workers(2, timeout=60)
-            yield client
+    """The client of two workers of `local:2`."""
+    with connect("local:2") as engine:
+        yield engine.client
 
 
-class Refusing(Engine):
-    """A cluster to which nothing may be sent."""
+class Counting(ThreadPoolExecutor):
+    """Two threads; `sizes` are the numbers of batches of the tasks that were sent."""
 
     def __init__(self):
-        pass
+        super().__init__(2)
+        self.sizes = []
 
-    def run(self, *_):
+    def submit(self, function, *arguments):
+        self.sizes.append(len(arguments[-1]))
+        return super().submit(function, *arguments)
+
+
+class Refusing(Executor):
+    """An executor to which nothing may be sent."""
+
+    def submit(self, *_):
         raise AssertionError("something was sent")
 
 
@@ -79,155 +81,20 @@ def same(a, b):
     )
 
 
-def test_a_worker_killed_and_one_added_in_mid_run_change_no_bit(case, whole, client, tmp_path):
-    victim, pid = next(iter(client.run(os.getpid).items()))
-    added, seen = [], []
-
-    def progress(done):
-        seen.append(done)
-        if len(seen) == 3:
-            os.kill(pid, signal.SIGKILL)
-            words = [sys.executable, "-m", "distributed.cli.dask_worker", client.scheduler.address]
-            words += ["--no-nanny", "--nthreads", "1", "--no-dashboard", "--death-timeout", "30"]
-            words += client.workers.words
-            quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-            added.append(subprocess.Popen(words, cwd=tmp_path, **quiet))
-
-    folder = tmp_path / "run"
-    try:
-        found = tuning.ensemble(
-            case, SPREAD, **OPTIONS, cluster=client, checkpoint=folder, progress=progress
-        )
-        assert same(found, whole)
-        assert seen == sorted(seen) and seen[-1] == 400 and len(seen) == 25
-        assert kept(folder) == 25  # written by this process as they came
-        assert victim not in client.nthreads()
-    finally:
-        for process in added:
-            process.kill()
-            process.wait()
-
-
-def test_short_batches_share_a_task_and_change_no_bit(case, whole, client, monkeypatch):
-    sent_tasks, submit = [], Engine._submit
-    monkeypatch.setattr(Engine, "_submit", lambda *a: sent_tasks.append(len(a[-1])) or submit(*a))
+def test_short_batches_share_a_task_and_change_no_bit(case, whole, monkeypatch):
     monkeypatch.setattr(batches, "SHARES", 6)
-    assert same(tuning.ensemble(case, SPREAD, **OPTIONS, cluster=client), whole)
-    assert sent_tasks == [4] * 6 + [1]
-    monkeypatch.setattr(batches, "WORK", 2 * 16 * case.clock.samples)
-    assert same(tuning.ensemble(case, SPREAD, **OPTIONS, cluster=client), whole)
-    assert sent_tasks[7:] == [2] * 12 + [1]
-
-
-def test_sensitivity_on_workers_is_that_of_one_process(case, client):
-    options = {"method": "morris", "samples": 8, "measures": ["rms_error", "max_level"], "batch": 8}
-    here = tuning.sensitivity(case, {"plant.drain": 0.05, "plant.area": 0.05}, **options)
-    there = tuning.sensitivity(
-        case, {"plant.drain": 0.05, "plant.area": 0.05}, **options, cluster=client
-    )
-    assert (there.runs, there.failed, there.parameters) == (here.runs, 0, here.parameters)
-    assert repr(there.columns) == repr(here.columns)
-    assert client.status == "running"  # one that was given stays open
-
-
-def answer(result):
-    return result.parameters, result.objective, result.evaluations, result.starts, result.history
-
-
-@pytest.mark.parametrize("robust", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_searches_on_workers_lead_to_the_answer_of_one_process(case, client, monkeypatch, robust):
-    """And it is the workers that evaluate: what is left here is before and after the searches."""
-
-    def run(cluster):
-        evaluated, point = [], Problem._point
-        with monkeypatch.context() as patch:
-            patch.setattr(Problem, "_point", lambda *a: evaluated.append(len(a[2])) or point(*a))
-            if robust:
-                options = {**SEARCH, "samples": 4, "fresh": 16, "cluster": cluster}
-                del options["nominal"]
-                found = tuning.tune_robust(case, SPREAD, **options)
-            else:
-                found = tuning.tune(case, **SEARCH, cluster=cluster)
-        return found, len(evaluated)
-
-    (here, many), (there, few) = run(None), run(client)
-    assert repr(answer(there)) == repr(answer(here))
-    searched = sum(start["evaluations"] for start in here.starts[: SEARCH["starts"]])
-    assert searched > 5 and many - few >= searched - 2
-
-
-def test_what_is_known_is_not_sent_again(case, tmp_path):
-    """A search that is continued runs what its log lacks, and no more."""
-    whole = tuning.tune(case, **SEARCH, checkpoint=tmp_path)
-    again = tuning.tune(case, **SEARCH, checkpoint=tmp_path, resume=True, cluster=Refusing())
-    assert repr(answer(again)) == repr(answer(whole))
-    with pytest.raises(AssertionError, match="was sent"):
-        tuning.tune(case, **SEARCH, cluster=Refusing())
-
-
-def test_a_lost_scheduler_is_one_line_and_the_run_goes_on_from_its_folder(case, whole, tmp_path):
-    with (
-        local_workers(1) as workers,
-        distributed.Client(workers.address, security=workers.security) as client,
-    ):
-        pid = client.run_on_scheduler(os.getpid)
-
-        def progress(done):
-            if done == 64:
-                os.kill(pid, signal.SIGKILL)
-
-        with (
-            pytest.raises(InputError, match=r"^cluster tls://.*scheduler was lost.*--resume DIR$"),
-            warnings.catch_warnings(action="ignore", category=engines.ClusterWarning),
-        ):
-            tuning.ensemble(
-                case, SPREAD, **OPTIONS, cluster=client, checkpoint=tmp_path, progress=progress
-            )
-    assert 4 <= kept(tmp_path) < 25
-    assert same(tuning.ensemble(case, SPREAD, **OPTIONS, checkpoint=tmp_path, resume=True), whole)
-
-
-def test_a_process_of_local_ends_with_the_pipe_from_its_parent(tmp_path):
-    (tmp_path / "of" / "dask").mkdir(parents=True)
-    code = "import time; from tuning.cluster import parent; parent.dask_setup(None); time.sleep(60)"
-    begun = subprocess.Popen(
-        [sys.executable, "-c", code],
-        stdin=subprocess.PIPE,
-        env={**os.environ, parent.FOLDER: str(tmp_path / "of")},
-    )
-    time.sleep(0.2)
-    assert begun.poll() is None
-    begun.stdin.close()
-    assert begun.wait(timeout=20) == 0 and not any(tmp_path.iterdir())
+    with Counting() as pool:
+        assert same(tuning.ensemble(case, SPREAD, **OPTIONS, cluster=pool), whole)
+        assert pool.sizes == [4] * 6 + [1]
+        monkeypatch.setattr(batches, "WORK", 2 * 16 * case.clock.samples)
+        assert same(tuning.ensemble(case, SPREAD, **OPTIONS, cluster=pool), whole)
+        assert pool.sizes[7:] == [2] * 12 + [1]
 
 
 @pytest.mark.slow
-def test_processes_of_local_end_with_the_one_that_began_them(tmp_path):
-    code = (
-        "import time\nfrom tuning.cluster.local import local_workers\n"
-        "with local_workers(1) as workers:\n"
-        "    import distributed\n"
-        "    client = distributed.Client(workers.address, security=workers.security)\n"
-        "    client.wait_for_workers(1, timeout=60)\n"
-        "    import os\n"
-        "    print(client.run_on_scheduler(os.getpid), *client.run(os.getpid).values())\n"
-        "    print(flush=True)\n"
-        "    time.sleep(60)\n"
-    )
-    begun = subprocess.Popen(
-        [sys.executable, "-c", code],
-        stdout=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "TMPDIR": str(tmp_path)},
-    )
-    pids = list(map(int, begun.stdout.readline().split()))
-    assert len(pids) == 2 and len(list(tmp_path.glob("jaxtank-*"))) == 1
-    begun.kill()
-    begun.communicate()
-    deadline = time.monotonic() + 20
-    while (any(map(alive, pids)) or any(tmp_path.iterdir())) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert not any(map(alive, pids)) and not any(tmp_path.iterdir())
+def test_processes_give_the_bits_of_one(case, whole):
+    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+        assert same(tuning.ensemble(case, SPREAD, **OPTIONS, cluster=pool), whole)
 
 
 def listening(pid):
@@ -243,7 +110,7 @@ async def connected(address, keys):
 
 
 def test_local_workers_listen_on_this_machine_alone_and_to_their_own_client_alone(client):
-    pids = [client.run_on_scheduler(os.getpid), *client.run(os.getpid).values()]
+    pids = [os.getpid(), *client.run(os.getpid).values()]
     listeners = set().union(*map(listening, pids))
     assert len(listeners) >= 2 * len(pids) - 1
     assert {address.ip for address in listeners} == {"127.0.0.1"}
@@ -255,54 +122,134 @@ def test_local_workers_listen_on_this_machine_alone_and_to_their_own_client_alon
         for path in ("/json/identity.json", "/info/main/workers.html", "/health", "/"):
             with pytest.raises(OSError):  # refused, or no page of that name
                 urllib.request.urlopen(f"http://{ip}:{port}{path}", timeout=2)
-    folder = Path(client.workers.words[1]).parent
-    assert folder.stat().st_mode & 0o077 == 0
-    assert all(path.stat().st_mode & 0o077 == 0 for path in folder.glob("*.pem"))
 
 
-def test_the_command_with_local_workers_opens_nothing_to_others(case, tmp_path):
-    """Through the command: every socket of its processes, while it runs."""
-    rig.save(case, tmp_path / "rig.toml")
-    words = [sys.executable, "-m", "jaxtank", "uncertainty", str(tmp_path / "rig.toml")]
-    words += ["--samples", "200000", "--cluster", "local:1"]
-    begun = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    listeners, until = set(), time.monotonic() + 120
+def test_a_worker_killed_and_one_added_in_mid_run_change_no_bit(case, whole, client, tmp_path):
+    victim, pid = next(iter(client.run(os.getpid).items()))
+    counts, folder = [], tmp_path / "run"
+
+    def progress(done):
+        counts.append(done)
+        if len(counts) == 3:
+            os.kill(pid, signal.SIGKILL)
+            client.cluster.scale(3)
+
+    found = tuning.ensemble(
+        case, SPREAD, **OPTIONS, cluster=client, checkpoint=folder, progress=progress
+    )
+    assert same(found, whole)
+    assert counts == sorted(counts) and counts[-1] == 400 and len(counts) == 25
+    assert kept(folder) == 25  # written by this process as they came
+    assert victim not in client.nthreads()
+
+
+def test_sensitivity_on_workers_is_that_of_one_process(case):
+    options = {"method": "morris", "samples": 8, "measures": ["rms_error", "max_level"], "batch": 8}
+    spread = {"plant.drain": 0.05, "plant.area": 0.05}
+    here = tuning.sensitivity(case, spread, **options)
+    with Counting() as pool:
+        there = tuning.sensitivity(case, spread, **options, cluster=pool)
+        assert sum(pool.sizes) == -(-(8 * 4 + 1) // 8)
+    assert (there.runs, there.failed, there.parameters) == (here.runs, 0, here.parameters)
+    assert repr(there.columns) == repr(here.columns)
+
+
+def answer(result):
+    return result.parameters, result.objective, result.evaluations, result.starts, result.history
+
+
+@pytest.mark.parametrize("robust", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_searches_on_workers_lead_to_the_answer_of_one_process(case, robust):
+    def run(cluster):
+        if not robust:
+            return tuning.tune(case, **SEARCH, cluster=cluster)
+        options = {name: SEARCH[name] for name in ("starts", "screening", "validation")}
+        return tuning.tune_robust(case, SPREAD, **options, samples=4, fresh=16, cluster=cluster)
+
+    with Counting() as pool:
+        assert repr(answer(run(pool))) == repr(answer(run(None)))
+        assert len(pool.sizes) >= SEARCH["starts"]
+
+
+def test_what_is_known_is_not_sent_again(case, tmp_path):
+    """A search that is continued runs what its log lacks, and no more."""
+    whole = tuning.tune(case, **SEARCH, checkpoint=tmp_path)
+    again = tuning.tune(case, **SEARCH, checkpoint=tmp_path, resume=True, cluster=Refusing())
+    assert repr(answer(again)) == repr(answer(whole))
+    with pytest.raises(InputError, match="AssertionError"):
+        tuning.tune(case, **SEARCH, cluster=Refusing())
+
+
+def test_workers_that_are_lost_are_one_line_and_the_run_goes_on(case, whole, tmp_path):
+    pool = ThreadPoolExecutor(1)
+    options = {"checkpoint": tmp_path, "cluster": pool}
+    with pytest.raises(InputError, match=r"^cluster: the connection .* lost .*--resume DIR$"):
+        tuning.ensemble(
+            case,
+            SPREAD,
+            **OPTIONS,
+            **options,
+            progress=lambda done: done == 64 and pool.shutdown(cancel_futures=True),
+        )
+    assert 4 <= kept(tmp_path) < 25
+    assert same(tuning.ensemble(case, SPREAD, **OPTIONS, checkpoint=tmp_path, resume=True), whole)
+
+
+SCHEDULER = ["-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
+
+
+@pytest.mark.slow
+def test_a_lost_scheduler_is_one_line(case, tmp_path):
+    file = tmp_path / "scheduler.json"
+    words = [sys.executable, *SCHEDULER, "--scheduler-file", str(file), "--no-dashboard"]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    scheduler = subprocess.Popen(words, **quiet)
+    words = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(file)]
+    worker = subprocess.Popen([*words, "--no-nanny", "--death-timeout", "5"], **quiet)
     try:
-        while len(listeners) < 3 and begun.poll() is None and time.monotonic() < until:
-            for process in psutil.Process(begun.pid).children(recursive=True):
-                with contextlib.suppress(psutil.Error):
-                    listeners |= listening(process.pid)
-            time.sleep(0.2)
+        with (
+            distributed.Client(scheduler_file=str(file), timeout=60) as client,
+            pytest.raises(InputError, match=r"^cluster tcp://.* lost .*--resume DIR$"),
+        ):
+            tuning.ensemble(
+                case,
+                SPREAD,
+                **OPTIONS,
+                cluster=client,
+                progress=lambda done: done == 64 and scheduler.kill(),
+            )
     finally:
-        begun.kill()
-        begun.wait()
-    assert len(listeners) >= 3 and {address.ip for address in listeners} == {"127.0.0.1"}
+        for process in (scheduler, worker):
+            process.kill()
+            process.wait()
 
 
-def test_a_scheduler_without_certificates_is_a_warning(case, whole):
+@pytest.mark.slow
+def test_processes_of_local_end_with_the_one_that_began_them(tmp_path):
+    code = (
+        "import os, time\nfrom tuning.cluster.engine import connect\n"
+        "with connect('local:1') as engine:\n"
+        "    print(*engine.client.run(os.getpid).values(), flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    begun = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    (pid,) = map(int, begun.stdout.readline().split())
+    begun.kill()
+    begun.communicate()
+    deadline = time.monotonic() + 20
+    while psutil.pid_exists(pid) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not psutil.pid_exists(pid) or psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
+
+
+def test_a_scheduler_without_certificates_is_a_warning():
+    options = {"n_workers": 1, "processes": False, "protocol": "tcp", "dashboard_address": None}
     with (
-        distributed.LocalCluster(
-            n_workers=1, processes=False, protocol="tcp", dashboard_address=None
-        ) as cluster,
+        distributed.LocalCluster(**options) as cluster,
         pytest.warns(engines.ClusterWarning, match="can run code as the user of its workers"),
-        engines.connect(cluster.scheduler_address),
+        connect(cluster.scheduler_address),
     ):
         pass
-
-
-def test_without_cryptography_the_remedy_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "cryptography", None)
-    with pytest.raises(InputError, match="pip install cryptography"), local_workers(1):
-        pass
-
-
-def alive(pid):
-    """Whether a process runs; one that has ended and waits for its parent does not."""
-    try:
-        with open(f"/proc/{pid}/stat") as file:
-            return file.read().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
 
 
 # what is refused, before anything is run or written
@@ -325,7 +272,10 @@ def test_where_nobody_answers_is_an_error_in_time(case, monkeypatch, tmp_path):
     assert not any(tmp_path.iterdir())
 
 
-def test_without_dask_the_remedy_is_named(case, monkeypatch):
+def test_what_is_not_installed_is_named(case, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cryptography", None)
+    with pytest.raises(InputError, match="pip install cryptography"), local_workers(1):
+        pass
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"pip install distributed"):
         tuning.ensemble(case, SPREAD, cluster="local:2")
@@ -356,14 +306,10 @@ def test_a_worker_that_differs_is_refused(case, monkeypatch):
         received(text)
 
 
-@pytest.mark.parametrize(
-    "words", ["uncertainty", "sensitivity --method morris", "tune", "tune --robust cvar"]
-)
+@pytest.mark.parametrize("words", ["uncertainty", "sensitivity --method morris", "tune"])
 def test_the_command_refuses_what_is_no_cluster_in_one_line(words, tmp_path):
     name, *more = words.split()
-    found = command(
-        name, "cascaded/pi", *more, "--cluster", "local:x", "--out", str(tmp_path / "run")
-    )
+    options = ["--cluster", "local:x", "--out", str(tmp_path / "run")]
+    found = command(name, "cascaded/pi", *more, *options)
     assert found.code == 2 and found.out == "" and found.err.count("\n") == 1
-    assert "cluster = 'local:x': must be HOST:PORT" in found.err
-    assert not any(tmp_path.iterdir())
+    assert "local:x" in found.err and not any(tmp_path.iterdir())

@@ -21,19 +21,18 @@ import tuning
 from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
-from jaxtank.loop import run as lp
-from jaxtank.presets import Scenario
+from tuning.report.uncertainty import in_words
 from tuning.search import robust
 from tuning.storage.store import NAME, Store
 from tuning.uncertainty import validation
 from tuning.uncertainty.distributions import parse, stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import clopper_pearson, probabilities
-from tuning.uncertainty.sensitivity_study import what_varies
 
 SHORT = {"clock.dt": 0.1, "clock.duration": 60.0, "sensor.noise": 0.02}
 TWO = {"plant.drain": tuning.Uniform(relative=0.1), "controller.k1": tuning.Normal(relative=0.2)}
-OPTIONS = {"samples": 50, "key": 3, "batch": 16, "fan": False}
+MEASURES = ("rms_error_total", "rms_error", "max_level", "min_level")
+OPTIONS = {"samples": 50, "key": 3, "batch": 16, "fan": False, "measures": MEASURES}
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +46,8 @@ def whole(case):
 
 
 def same(a, b):
-    return (
-        all(np.array_equal(a.measures[m], b.measures[m], equal_nan=True) for m in a.measures)
-        and a.measures.keys() == b.measures.keys()
+    return a.measures.keys() == b.measures.keys() and all(
+        np.array_equal(a.measures[m], b.measures[m], equal_nan=True) for m in a.measures
     )
 
 
@@ -62,11 +60,8 @@ def test_a_draw_is_the_run_of_its_values_and_its_noise(case, whole):
         for m, values in whole.measures.items():
             np.testing.assert_allclose(values[i], found[m], rtol=1e-9, atol=1e-12)
     drains = whole.values["plant.drain"]
-    assert (
-        np.all(drains[:, 2:] == 0.0)
-        and len(np.unique(drains[:, 0])) == 50
-        and whole.labels[:2] == ["plant.drain[0]", "plant.drain[1]"]
-    )
+    assert np.all(drains[:, 2:] == 0.0) and len(np.unique(drains[:, 0])) == 50
+    assert whole.labels[:2] == ["plant.drain[0]", "plant.drain[1]"]
 
 
 def test_the_first_draws_do_not_depend_on_how_many_there_are(case, whole):
@@ -121,7 +116,8 @@ if process >= 0:
 values = {"clock.dt": 0.1, "clock.duration": 60.0, "sensor.noise": 0.02}
 case = rig.set_values(presets.find("gouta2015/backstepping"), values)
 two = {"plant.drain": tuning.Uniform(relative=0.1), "controller.k1": tuning.Normal(relative=0.2)}
-found = tuning.ensemble(case, two, samples=50, key=3, batch=16, fan=False, devices=devices)
+found = tuning.ensemble(case, two, samples=50, key=3, batch=16, fan=False, devices=devices,
+    measures=("rms_error_total", "rms_error", "max_level", "min_level"))
 np.savez(folder, **found.measures)
 """
 
@@ -238,22 +234,23 @@ def test_one_draw_claims_no_spread(case):
     )
 
 
-@pytest.mark.parametrize("change", ["value", "exchange", "problem"])
-def test_a_batch_that_was_changed_is_refused(case, tmp_path, change):
-    """A number in it, another batch in its place, or what it is said to be of."""
-    options = {"samples": 40, "batch": 16, "key": 5, "measures": ("max_level",), "fan": False}
-    cut_off(40, case, checkpoint=tmp_path, **options)
+FEW = {"measures": ("max_level", "rms_error_total"), "fan": False, "key": 5}
+CHANGES = {
+    "a value": "UPDATE record SET value = replace(value, 'A', 'B') WHERE key = '1'",
+    "the problem": "UPDATE record SET value = replace(value, '\"key\": 5', '\"key\": 6')",
+    "two batches exchanged": "UPDATE record SET key = iif(key = '1', '0x', key);"
+    "UPDATE record SET key = '1' WHERE key = '0'; UPDATE record SET key = '0' WHERE key = '0x'",
+}
+
+
+@pytest.mark.parametrize("words", CHANGES.values(), ids=CHANGES)
+def test_a_batch_that_was_changed_is_refused(case, tmp_path, words):
+    options = {**FEW, "samples": 12, "batch": 4}
+    cut_off(12, case, checkpoint=tmp_path, **options)
     with contextlib.closing(sqlite3.connect(tmp_path / NAME)) as file, file:
-        if change == "value":
-            file.execute("UPDATE record SET value = replace(value, '8A', '8B') WHERE key = '1'")
-        elif change == "exchange":
-            for old, new in (("0", "x"), ("1", "0"), ("x", "1")):
-                file.execute("UPDATE record SET key = ? WHERE key = ?", (new, old))
-        else:
-            words = "UPDATE record SET value = replace(value, '\"key\": 5', '\"key\": 6')"
-            file.execute(words)
-            options["key"] = 6
+        file.executescript(words)
         assert file.total_changes
+    options["key"] += words == CHANGES["the problem"]
     with pytest.raises(InputError, match=r"record \d of .* is not what was written"):
         tuning.ensemble(case, checkpoint=tmp_path, resume=True, **options)
     assert kept(tmp_path) == 3
@@ -271,7 +268,7 @@ FORGED = {
 @pytest.mark.parametrize("forged", FORGED.values(), ids=FORGED)
 def test_a_batch_whose_seal_is_right_is_not_trusted_either(case, name, forged, tmp_path):
     """Whoever has the program can seal a batch: its shapes are looked at, too."""
-    options = {"samples": 8, "batch": 4, "measures": ("max_level", "rms_error_total"), "fan": False}
+    options = {**FEW, "samples": 8, "batch": 4}
     cut_off(4, case, checkpoint=tmp_path, **options)
     with contextlib.closing(sqlite3.connect(tmp_path / NAME)) as file:
         rows = file.execute("SELECT value FROM record WHERE key = 'problem'").fetchone()
@@ -283,11 +280,6 @@ def test_a_batch_whose_seal_is_right_is_not_trusted_either(case, name, forged, t
         tuning.ensemble(case, checkpoint=tmp_path, resume=True, **options)
 
 
-def test_every_value_of_a_discrete_distribution_is_looked_at(case):
-    with pytest.raises(InputError, match="must be above 0"):
-        Draws(case.loop, {"plant.pump_gain": tuning.Discrete(values=(7.0, -5.0, 8.0))})
-
-
 def test_an_identified_covariance_stays_above_an_end_that_does_not_belong(case):
     """Pump gains must be above 0: a wide covariance is held just above it, whatever its
     correlation, and refused for nothing.
@@ -295,27 +287,9 @@ def test_an_identified_covariance_stays_above_an_end_that_does_not_belong(case):
     names = ("plant.pump_gain[0]", "plant.pump_gain[1]")
     for rho in (-0.95, 0.9):
         wide = tuning.Correlated(names=names, covariance=((6.25, 6.25 * rho), (6.25 * rho, 6.25)))
-        drawn = Draws(case.loop, {"identified": wide}).values(
-            np.random.default_rng(0).random((20_000, 2))
-        )
-        assert (
-            all(v.min() > 0 for v in drawn.values()) and min(v.min() for v in drawn.values()) < 1e-6
-        )
-
-
-@pytest.mark.parametrize(
-    "name, words", [("plant.pump_gain[00]", "given twice"), ("plant.drain", "wider than 0")]
-)
-def test_names_and_widths_are_read_as_numbers(case, name, words):
-    other = parse(name, "uniform:5%") if "[" in name else None
-    with pytest.raises(InputError, match=words):
-        Draws(
-            case.loop,
-            {
-                "plant.pump_gain[0]": tuning.Uniform(relative=0.05),
-                name: other or parse(name, "uniform:-5%"),
-            },
-        )
+        points = np.random.default_rng(0).random((20_000, 2))
+        least = [v.min() for v in Draws(case.loop, {"identified": wide}).values(points).values()]
+        assert min(least) > 0 and min(least) < 1e-6
 
 
 def test_clopper_pearson():
@@ -332,30 +306,23 @@ def test_runs_that_fail_are_counted_and_break_every_limit(case):
         "controller.k1": tuning.Discrete(values=(0.05, 1e200)),
         "actuator.high": tuning.Uniform(low=1e290, high=1e300),
     }
-    found = tuning.ensemble(
-        rig.set_values(case, {"sensor.noise": 0.0}), values, samples=16, fan=False
-    )
+    quiet = rig.set_values(case, {"sensor.noise": 0.0})
+    found = tuning.ensemble(quiet, values, samples=16, fan=False, measures=("rms_error",))
     bad = found.values["controller.k1"] > 1
     assert 0 < bad.sum() < 16 and np.array_equal(found.failed, bad)
     assert all(v["count"] >= bad.sum() for v in found.violations())
-    assert np.all(
-        np.isfinite(found.summary()["rms_error"]["mean"])
-    ) and f"{bad.sum()} runs diverged" in repr(found)
+    assert np.all(np.isfinite(found.summary()["rms_error"]["mean"]))
+    assert f"{bad.sum()} runs diverged" in repr(found)
 
 
 def test_plateaus_without_a_steady_state_are_counted(gouta):
     """gouta2015 notes S11: with c1 0.9 % above its value, (16, 10) cm needs more than 30 cm."""
     case = gouta("ngpc", {"clock.dt": 0.5})
-    found = tuning.ensemble(
-        case,
-        {"plant.drain": tuning.Discrete(values=(0.180956 * 1.008, 0.180956 * 1.010), tied=True)},
-        samples=32,
-        fan=False,
-    )
-    assert (
-        np.array_equal(found.infeasible, found.values["plant.drain"][:, 0] > 0.180956 * 1.009)
-        and found.infeasible.any()
-    )
+    drain = tuning.Discrete(values=(0.180956 * 1.008, 0.180956 * 1.010), tied=True)
+    options = {"samples": 32, "fan": False, "measures": ("max_level",), "limits": {}}
+    found = tuning.ensemble(case, {"plant.drain": drain}, **options)
+    expected = found.values["plant.drain"][:, 0] > 0.180956 * 1.009
+    assert np.array_equal(found.infeasible, expected) and expected.any()
 
 
 # distributions
@@ -407,57 +374,50 @@ def test_discrete_and_correlated_draws(case):
 @pytest.mark.parametrize("kind", ["random", "latin", "sobol"])
 def test_draws_fill_the_cube(kind):
     p = probabilities(kind, 3, 256, 1)
-    assert (
-        p.shape == (256, 3)
-        and np.all((p > 0) & (p < 1))
-        and np.array_equal(p, probabilities(kind, 3, 256, 1))
-    )
-    assert (
-        not np.array_equal(p, probabilities(kind, 3, 256, 2))
-        and np.abs(p.mean(axis=0) - 0.5).max() < 0.06
-    )
+    assert p.shape == (256, 3) and np.all((p > 0) & (p < 1))
+    assert np.array_equal(p, probabilities(kind, 3, 256, 1))
+    assert not np.array_equal(p, probabilities(kind, 3, 256, 2))
+    assert np.abs(p.mean(axis=0) - 0.5).max() < 0.06
+
+
+def correlated(*covariance, names=("plant.drain[0]", "plant.drain[1]")):
+    return tuning.Correlated(names=names, covariance=covariance)
+
+
+TENTH = tuning.Uniform(relative=0.1)
 
 
 @pytest.mark.parametrize(
     "vary, words",
     [
         ({}, "nothing is uncertain"),
-        ({"plant.drian": tuning.Uniform(relative=0.1)}, "plant.drain"),
-        ({"clock.dt": tuning.Uniform(relative=0.1)}, "clock.dt"),
-        (
-            {
-                "plant.drain": tuning.Uniform(relative=0.1),
-                "plant.drain[0]": tuning.Uniform(relative=0.1),
-            },
-            "given twice",
-        ),
+        ({"plant.drian": TENTH}, "plant.drain"),
+        ({"clock.dt": TENTH}, "clock.dt"),
+        ({"plant.drain": TENTH, "plant.drain[0]": TENTH}, "given twice"),
+        ({"plant.pump_gain[0]": TENTH, "plant.pump_gain[00]": TENTH}, "given twice"),
+        ({"plant.drain": tuning.Uniform(relative=-0.05)}, "wider than 0"),
         ({"plant.drain": tuning.Uniform(relative=1.5)}, "at least 0 cm"),
         ({"plant.drain": tuning.Uniform(low=1.0)}, "low and high"),
         ({"plant.drain": tuning.Uniform(low=1.0, high=0.5)}, "below its high"),
         ({"plant.drain": tuning.Normal(sd=-1.0)}, "above 0"),
         ({"plant.drain": tuning.LogUniform(low=-1.0, high=1.0)}, "above 0"),
         ({"plant.drain": tuning.Discrete(values=())}, "finite values"),
-        (
-            {
-                "f": tuning.Correlated(
-                    names=("plant.drain[0]", "plant.drain[1]"), covariance=((1.0, 2.0), (2.0, 1.0))
-                )
-            },
-            "positive definite",
-        ),
-        (
-            {
-                "f": tuning.Correlated(
-                    names=("plant.drain[0]",), covariance=((1.0, 2.0), (2.0, 1.0))
-                )
-            },
-            "1 by 1",
-        ),
+        ({"plant.pump_gain": tuning.Discrete(values=(7.0, -5.0, 8.0))}, "must be above 0"),
+        ({"f": correlated((1.0, 2.0), (2.0, 1.0))}, "positive definite"),
+        ({"f": correlated((1.0, 2.0), (2.0, 1.0), names=("plant.drain[0]",))}, "1 by 1"),
+        ({"plant.pump_gain": 5}, "must be a distribution"),
+        ({"plant.pump_gain": "5%"}, "must be a distribution"),
+        ({"plant.pump_gain": True}, "must be a distribution"),
+        (["plant.pump_gain"], "what varies is a list"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(case, vary, words):
     with pytest.raises(InputError, match=words):
         tuning.ensemble(case, vary, samples=4)
+
+
+def test_a_bare_number_is_a_share_as_in_what_a_case_calls_uncertain():
+    assert stated({"plant.pump_gain": 0.05}) == {"plant.pump_gain": tuning.Uniform(relative=0.05)}
 
 
 @pytest.mark.parametrize(
@@ -476,19 +436,10 @@ def test_distributions_of_the_command_line(text, expected):
     assert parse("p", text) == expected
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "uniform",
-        "uniform:1",
-        "uniform:a:b",
-        "beta:1:2",
-        "normal:0.1",
-        "uniform:2:1",
-        "normal:nan%",
-    ],
-)
+NONE = "|uniform|uniform:1|uniform:a:b|beta:1:2|normal:0.1|uniform:2:1|normal:nan%"
+
+
+@pytest.mark.parametrize("text", NONE.split("|"))
 def test_distributions_that_are_none(text):
     with pytest.raises(InputError):
         parse("p", text)
@@ -600,38 +551,6 @@ STUDY = {"mean_square_error": 1.0, "mean_square_travel": 20.0}
 PENALISED = {**STUDY, "mean_square_over_rim": 1.0, "saturation_excess": 1e-3}
 
 
-def ten(plant, rng, count, spread=0.05):
-    """{name: (count, ...)} of the plant with c1 to c10 off by ten factors of their own, uniform
-    within +-spread.
-
-    c7 and c9, what leaves the upper tanks, are free of c2 + c5 and c3 + c6, what arrives below, by
-    the areas of the upper tanks.
-    """
-    f = rng.uniform(1 - spread, 1 + spread, (10, count))
-    orifice = np.asarray(plant.orifice)[:, None] * f[[1, 4, 2, 5]]
-    upper = np.asarray(plant.area)[2:, None] * np.stack(
-        [
-            (orifice[0] + orifice[1]) / sum(plant.orifice[:2]) / f[6],
-            (orifice[2] + orifice[3]) / sum(plant.orifice[2:]) / f[8],
-        ]
-    )
-    return {
-        "plant.drain": (
-            np.concatenate([np.asarray(plant.drain)[:2, None] * f[[0, 3]], np.zeros((2, count))]).T
-        ),
-        "plant.orifice": orifice.T,
-        "plant.area": np.concatenate([np.tile(np.asarray(plant.area)[:2, None], count), upper]).T,
-        "plant.pump_gain": (
-            (
-                np.asarray(plant.pump_gain)[:, None]
-                * f[[7, 9]]
-                * upper
-                / np.asarray(plant.area)[2:, None]
-            ).T
-        ),
-    }
-
-
 @pytest.fixture(scope="module")
 def study(gouta):
     return gouta(
@@ -688,32 +607,6 @@ def test_a_limit_that_one_plant_holds_in_place_is_broken_by_one_fresh_plant_in_n
 
 
 @pytest.mark.slow
-def test_ten_coefficients_off_on_their_own(study):
-    """All ten c_i of the paper by factors of their own spread the levels wider: 5 % is kept off, 3
-    % would leave some past 33 cm.
-    """
-    rng = np.random.default_rng(64)
-    drawn = ten(study.loop.plant, rng, 64)
-    plants = tuple(
-        Scenario(f"plant {i + 1}", {n: v[i].tolist() for n, v in drawn.items()}) for i in range(64)
-    )
-    options = {"starts": 1, "screening": 1, "validation": 0, "tolerance": robust.TOLERANCE}
-    result = tuning.tune(
-        study, scenarios=plants, objective=STUDY, limits={"max_level": 0.95 * 33.0}, **options
-    )
-    assert result.success and result.evaluations["gradients"] <= 20 * 64
-    fresh = ten(study.loop.plant, rng, 4096)
-    levels = jax.jit(
-        jax.vmap(
-            lambda v: lp.evaluate_and_flag(
-                with_values(result.tuned.loop, v), study.clock, "max_level"
-            )[0]["max_level"]
-        )
-    )
-    assert int((np.asarray(levels(fresh)) > 33.0).any(axis=1).sum()) == 0
-
-
-@pytest.mark.slow
 def test_the_worst_of_scenarios_is_found_by_the_epigraph(gouta):
     """Against a grid of the true worst case."""
     case = gouta("ngpc", {"clock.dt": 0.2, "clock.duration": 300.0})
@@ -734,17 +627,8 @@ def test_the_worst_of_scenarios_is_found_by_the_epigraph(gouta):
 
 @pytest.mark.slow
 def test_sigkill_and_resume_of_the_command(tmp_path):
-    command = [
-        sys.executable,
-        "-m",
-        "tuning.cli.main",
-        "uncertainty",
-        "gouta2015/ngpc",
-        "--samples",
-        "3000",
-        "--quiet",
-        "--json",
-    ]
+    words = "-m tuning.cli.main uncertainty gouta2015/ngpc --samples 3000 --quiet --json"
+    command = [sys.executable, *words.split()]
     alone = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
     folder = tmp_path / "run"
     process = subprocess.Popen([*command, "--out", str(folder)], stdout=subprocess.DEVNULL)
@@ -763,34 +647,8 @@ def test_sigkill_and_resume_of_the_command(tmp_path):
 
 
 def test_distributions_are_put_into_words():
-    from tuning import Correlated, Normal, Uniform
-    from tuning.report.uncertainty import in_words
-
-    pair = Correlated(names=("a", "b"), covariance=((1.0, 0.0), (0.0, 1.0)))
-    assert in_words(Uniform(relative=0.1)) == "+-10 % (uniform)"
-    assert (
-        in_words(Uniform(low=0.0, high=0.05, tied=True))
-        == "0 to 0.05 (uniform, all entries together)"
-    )
-    assert in_words(Normal(relative=0.05)) == "5 % sd (normal, truncated at 3 sd)"
+    pair = tuning.Correlated(names=("a", "b"), covariance=((1.0, 0.0), (0.0, 1.0)))
+    assert in_words(tuning.Uniform(relative=0.1)) == "+-10 % (uniform)"
+    assert "all entries together" in in_words(tuning.Uniform(low=0.0, high=0.05, tied=True))
+    assert in_words(tuning.Normal(relative=0.05)) == "5 % sd (normal, truncated at 3 sd)"
     assert in_words(pair) == "2 parameters, correlated, with a covariance"
-
-
-def test_a_bare_number_is_a_share_as_in_what_a_case_calls_uncertain(case):
-    assert stated({"plant.pump_gain": 0.05, "plant.drain": 1e-3}) == {
-        "plant.pump_gain": tuning.Uniform(relative=0.05),
-        "plant.drain": tuning.Uniform(relative=1e-3),
-    }
-    for given in (5, "5%", -0.05, None, True, 0.05j):
-        with pytest.raises(
-            InputError,
-            match=(
-                r"uncertain plant\.pump_gain = .*: must be a distribution, .* or a share between 0"
-                r" and 1"
-            ),
-        ):
-            tuning.ensemble(case, {"plant.pump_gain": given}, samples=2)
-        with pytest.raises(InputError, match="must be a distribution"):
-            what_varies(case, {"plant.pump_gain": given})
-    with pytest.raises(InputError, match="what varies is a list"):
-        tuning.ensemble(case, ["plant.pump_gain"], samples=2)

@@ -3,7 +3,6 @@
 import csv
 import functools
 import json
-import re
 import subprocess
 import sys
 
@@ -64,18 +63,11 @@ def at_cube(case):
     assert draws.dimensions == D
 
     def f(p):
-        values = draws.values(np.asarray(p))
-        rows = [{n: v[i] for n, v in values.items()} for i in range(len(p))]
-        return np.array(
-            [
-                float(
-                    jaxtank.evaluate(with_values(case.loop, r), case.clock, "rms_error_total")[
-                        "rms_error_total"
-                    ]
-                )
-                for r in rows
-            ]
+        values, total = draws.values(np.asarray(p)), "rms_error_total"
+        loops = (
+            with_values(case.loop, {n: v[i] for n, v in values.items()}) for i in range(len(p))
         )
+        return np.array([float(jaxtank.evaluate(a, case.clock, total)[total]) for a in loops])
 
     return f
 
@@ -142,10 +134,8 @@ def test_morris_points():
 
 
 def test_sobol_agrees_with_salib():
-    sampler, analysis = (
-        pytest.importorskip("SALib.sample.sobol"),
-        pytest.importorskip("SALib.analyze.sobol"),
-    )
+    sampler = pytest.importorskip("SALib.sample.sobol")
+    analysis = pytest.importorskip("SALib.analyze.sobol")
     theirs = sampler.sample(ISHIGAMI, 512, calc_second_order=False, seed=np.random.default_rng(4))
     np.testing.assert_array_equal(theirs.reshape(512, 5, 3), indices.sobol_points(3, 512, seed=4))
     y = ishigami(theirs)
@@ -160,10 +150,8 @@ def test_sobol_agrees_with_salib():
 
 
 def test_morris_agrees_with_salib():
-    sampler, analysis = (
-        pytest.importorskip("SALib.sample.morris"),
-        pytest.importorskip("SALib.analyze.morris"),
-    )
+    sampler = pytest.importorskip("SALib.sample.morris")
+    analysis = pytest.importorskip("SALib.analyze.morris")
     theirs = sampler.sample(ISHIGAMI, 40, num_levels=4, seed=2)
     for points in (theirs.reshape(40, 4, 3), indices.morris_points(3, 40, seed=2)):
         y = ishigami(points)
@@ -181,31 +169,25 @@ def test_morris_agrees_with_salib():
 
 
 def test_a_closed_loop_agrees_with_salib(case, at_cube):
-    analyse_sobol, analyse_morris = (
-        pytest.importorskip("SALib.analyze.sobol"),
-        pytest.importorskip("SALib.analyze.morris"),
-    )
+    sobol = pytest.importorskip("SALib.analyze.sobol")
+    morris = pytest.importorskip("SALib.analyze.morris")
     sampler = pytest.importorskip("SALib.sample.sobol")
-    x = sampler.sample(CUBE, 32, calc_second_order=False, seed=np.random.default_rng(9))
-    other = analyse_sobol.analyze(CUBE, at_cube(x), calc_second_order=False, seed=1)
-    study = sensitivity(
-        case, VARIED, method="sobol", samples=32, seed=9, measures="rms_error_total"
-    )
+    options = {"seed": 9, "measures": "rms_error_total", "batch": 32}
+    x = sampler.sample(CUBE, 16, calc_second_order=False, seed=np.random.default_rng(9))
+    other = sobol.analyze(CUBE, at_cube(x), calc_second_order=False, seed=1)
+    study = sensitivity(case, VARIED, method="sobol", samples=16, **options)
     (column,) = study.columns
-    assert study.runs == len(x) == 32 * (D + 2)
+    assert study.runs == len(x) == 16 * (D + 2)
     np.testing.assert_allclose(column.effects["first"], other["S1"], atol=1e-9)
     np.testing.assert_allclose(column.effects["total"], other["ST"], atol=1e-9)
 
     points = indices.morris_points(D, 8, seed=9)
     y = at_cube(points.reshape(-1, D))
-    other = analyse_morris.analyze(CUBE, points.reshape(-1, D), y, num_levels=4, seed=1)
-    (column,) = sensitivity(
-        case, VARIED, method="morris", samples=8, seed=9, measures="rms_error_total"
-    ).columns
+    other = morris.analyze(CUBE, points.reshape(-1, D), y, num_levels=4, seed=1)
+    (column,) = sensitivity(case, VARIED, method="morris", samples=8, **options).columns
     for name in ("mu", "mu_star", "sigma"):
-        np.testing.assert_allclose(
-            column.effects[name], np.array(other[name], dtype=float), atol=1e-9
-        )
+        theirs = np.array(other[name], dtype=float)
+        np.testing.assert_allclose(column.effects[name], theirs, atol=1e-9)
     own = float(jaxtank.evaluate(case.loop, case.clock, "rms_error_total")["rms_error_total"])
     assert column.nominal == pytest.approx(own, rel=1e-12)
 
@@ -225,56 +207,41 @@ def test_local_against_central_differences(case, monkeypatch):
         "controller.k": Normal(mean=1.0, sd=0.004),
     }
     study = sensitivity(case, varied, measures=names)
-    drain, gain, orifice = (
-        np.asarray(get_value(loop, n))
-        for n in ("plant.drain", "plant.pump_gain", "plant.orifice[0]")
-    )
-    assert study.parameters == [
-        "plant.drain[0]",
-        "plant.drain[1]",
-        "plant.pump_gain",
-        "plant.orifice[0]",
-        "x0[1]",
-        "controller.k",
-    ]
-    moves = [
-        {"plant.drain[0]": 0.05 * drain[0]},
-        {"plant.drain[1]": 0.05 * drain[1]},
-        {"plant.pump_gain": 0.04 * gain},
-        {"plant.orifice[0]": orifice * (1.3 - 1 / 1.3) / 2},
-        {"x0[1]": 1.5},
-        {"controller.k": 0.008},
-    ]
-    step, seen = 1e-5, 0
-    for i, move in enumerate(moves):
-        ends = [
-            jaxtank.evaluate(
-                with_values(loop, {n: get_value(loop, n) + s * w for n, w in move.items()}),
-                case.clock,
-                names,
-            )
-            for s in (step, -step)
-        ]
-        want = np.concatenate([np.ravel(ends[0][m] - ends[1][m]) / (2 * step) for m in names])
-        got = np.array([c.effects["effect"][i] for c in study.columns])
-        np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-7)
-        seen += int((np.abs(got) > 1e-3).sum())
-    assert seen > 15
-    column = study.columns[0]
-    assert column.effects["derivative"][0] * 0.05 * drain[0] == pytest.approx(
-        column.effects["effect"][0]
-    )
-    assert column.effects["elasticity"][0] == pytest.approx(
-        column.effects["effect"][0] / 0.05 / column.nominal
-    )
-    assert np.isnan(column.effects["derivative"][2])
-    sizes = np.abs(column.effects["effect"])[study.order(column)]
+    own = {n: np.asarray(get_value(loop, n)) for n in varied}
+    drain = own["plant.drain"]
+    moves = {
+        "plant.drain[0]": 0.05 * drain[0],
+        "plant.drain[1]": 0.05 * drain[1],
+        "plant.pump_gain": 0.04 * own["plant.pump_gain"],
+        "plant.orifice[0]": own["plant.orifice[0]"] * (1.3 - 1 / 1.3) / 2,
+        "x0[1]": 1.5,
+        "controller.k": 0.008,
+    }
+    assert study.parameters == list(moves)
+    step, large = 1e-5, 0
+    for i, (name, width) in enumerate(moves.items()):
+        ends = [get_value(loop, name) + sign * step * width for sign in (1, -1)]
+        high, low = (
+            jaxtank.evaluate(with_values(loop, {name: end}), case.clock, names) for end in ends
+        )
+        slopes = np.concatenate([np.ravel(high[m] - low[m]) / (2 * step) for m in names])
+        effects = np.array([c.effects["effect"][i] for c in study.columns])
+        np.testing.assert_allclose(effects, slopes, rtol=1e-5, atol=1e-7)
+        large += int((np.abs(effects) > 1e-3).sum())
+    assert large > 15
+    effects = study.columns[0].effects
+    assert effects["derivative"][0] * 0.05 * drain[0] == pytest.approx(effects["effect"][0])
+    relative = effects["effect"][0] / 0.05 / study.columns[0].nominal
+    assert effects["elasticity"][0] == pytest.approx(relative)
+    assert np.isnan(effects["derivative"][2])
+    sizes = np.abs(effects["effect"])[study.order(study.columns[0])]
     assert (np.diff(sizes) <= 0).all()
-    shown = study.to_json()["parameters"]
-    assert (
-        shown["plant.pump_gain"]["half_width_is"] == "2 standard deviations"
-        and shown["x0[1]"]["half_width"] == 1.5
-    )
+    printed = study.to_json()
+    gain = printed["parameters"]["plant.pump_gain"]
+    assert gain["half_width_is"] == "2 standard deviations"
+    assert printed["parameters"]["x0[1]"]["half_width"] == 1.5
+    row = printed["measures"]["max_level of tank 1"]["parameters"]["plant.drain[0]"]
+    assert row["derivative_unit"] == "cm per cm^2" and "effect [cm]" in str(study)
 
 
 def test_batches_and_seeds(case):
@@ -282,79 +249,55 @@ def test_batches_and_seeds(case):
     another one others.
     """
     options = {"method": "sobol", "samples": 16, "measures": ("rms_error", "max_level")}
-    reported = []
-    first = sensitivity(
-        case, VARIED, seed=3, progress=lambda done, total: reported.append((done, total)), **options
-    )
-    assert reported[-1] == (96, 96)
-    other = sensitivity(case, VARIED, seed=3, batch=7, **options)
-    for a, b in zip(first.columns, other.columns):
+    counts = []
+    first = sensitivity(case, VARIED, seed=3, progress=lambda *n: counts.append(n), **options)
+    assert counts[-1] == (96, 96)
+    batched = sensitivity(case, VARIED, seed=3, batch=7, **options)
+    again, other = (sensitivity(case, VARIED, seed=seed, **options) for seed in (3, 4))
+    labels = ["rms_error of output 1", "rms_error of output 2", "max_level of tank 1"]
+    assert [c.label for c in first.columns][:3] == labels
+    for a, b, c, d in zip(first.columns, batched.columns, again.columns, other.columns):
         np.testing.assert_allclose(a.effects["total"], b.effects["total"], rtol=1e-9, atol=1e-12)
-    again, different = (
-        sensitivity(case, VARIED, seed=3, **options),
-        sensitivity(case, VARIED, seed=4, **options),
-    )
-    assert [c.label for c in first.columns][:3] == [
-        "rms_error of output 1",
-        "rms_error of output 2",
-        "max_level of tank 1",
-    ]
-    for a, b, c in zip(first.columns, again.columns, different.columns):
         for name, value in a.effects.items():
-            np.testing.assert_array_equal(value, b.effects[name])
-        assert not np.array_equal(a.effects["total"], c.effects["total"])
+            np.testing.assert_array_equal(value, c.effects[name])
+        assert not np.array_equal(a.effects["total"], d.effects["total"])
 
 
 def test_noise_is_the_same_in_every_run(case):
     """That of `evaluate` with the key of the seed. A parameter that does nothing has no effect at
     all, although every run is noisy.
     """
-    noisy = rig.set_values(case, {"sensor.noise": 0.1})
+    noisy, total = rig.set_values(case, {"sensor.noise": 0.1}), "rms_error_total"
     varied = {"plant.rim": Uniform(relative=0.01), "plant.drain": Uniform(relative=0.05, tied=True)}
-    (column,) = sensitivity(
-        noisy, varied, method="morris", samples=4, seed=6, measures="rms_error_total"
-    ).columns
+    options = {"method": "morris", "samples": 4, "seed": 6}
+    (column,) = sensitivity(noisy, varied, measures=total, **options).columns
     assert not column.effects["mu_star"][:4].any() and column.effects["mu_star"][4] > 0
-    own = jaxtank.evaluate(noisy.loop, noisy.clock, "rms_error_total", jax.random.key(6))[
-        "rms_error_total"
-    ]
+    own = jaxtank.evaluate(noisy.loop, noisy.clock, total, jax.random.key(6))[total]
     assert column.nominal == pytest.approx(float(own), rel=1e-12)
 
 
 def test_noise_may_vary_from_none(case):
     """Travel of the pumps grows with the noise, which the case itself has none of."""
     varied = {"sensor.noise": Uniform(low=0.0, high=0.2, tied=True)}
-    for column in sensitivity(
-        case, varied, method="morris", samples=4, measures="input_travel"
-    ).columns:
-        assert (
-            column.effects["mu"][0] > 0 and column.effects["mu"][0] == column.effects["mu_star"][0]
-        )
+    study = sensitivity(case, varied, method="morris", samples=4, measures="input_travel")
+    for column in study.columns:
+        assert 0 < column.effects["mu"][0] == column.effects["mu_star"][0]
 
 
 def test_runs_that_fail_are_counted_and_reported(case):
-    study = sensitivity(
-        case,
-        {
-            "plant.drain[0]": LogUniform(low=1e-3, high=1e300),
-            "plant.pump_gain": Uniform(relative=0.05),
-        },
-        method="sobol",
-        samples=32,
-        measures="max_level",
-    )
-    draws = Draws(case.loop, study.distributions)
-    points = indices.sobol_points(3, 32, 0)
+    wide = LogUniform(low=1e-3, high=1e300)
+    varied = {"plant.drain[0]": wide, "plant.pump_gain": Uniform(relative=0.05)}
+    study = sensitivity(case, varied, method="sobol", samples=32, measures="max_level")
+    values = Draws(case.loop, varied).values(indices.sobol_points(3, 32, 0).reshape(-1, 3))
     (group,) = groups_of([ScenarioRun("", case, None, 1.0)])
-    _, broken = values_of(group, ("max_level",), draws.values(points.reshape(-1, 3)))
+    broken = np.asarray(values_of(group, ("max_level",), values)[1])
     count = int(np.sum(broken))
     assert 0 < count < study.runs and study.failed == count
     printed = study.to_json()
-    assert printed["failed"] == count and f"{count} of {study.runs} runs diverged" in " ".join(
-        printed["notes"]
-    )
+    assert printed["failed"] == count
+    assert any(f"{count} of {study.runs} runs diverged" in note for note in printed["notes"])
     assert all(c.not_finite >= count for c in study.columns)
-    whole = int((~np.asarray(broken).reshape(32, 5).any(axis=1)).sum())
+    whole = int((~broken.reshape(32, 5).any(axis=1)).sum())
     assert [m["base_points_used"] for m in printed["measures"].values()] == [whole] * 4
     json.dumps(printed, allow_nan=False)
 
@@ -428,37 +371,21 @@ def test_defaults_are_the_cases_own(case):
 
 
 SHORT = ("cascaded/pi", "--set", "clock.duration=400")
+MORE = "--vary plant.drain=uniform:5% --vary plant.pump_gain=normal:2%:tied --measure max_level"
+MORE += " --measure ise --json --out"
 
 
-@pytest.mark.slow_for("local-5-tornado")
+@pytest.mark.slow_for("local-5-tornado", "morris-4-tornado")
 @pytest.mark.parametrize(
     ("method", "samples", "picture"),
     [("local", "5", "tornado"), ("morris", "4", "tornado"), ("sobol", "20", "sobol")],
 )
 def test_command(tmp_path, method, samples, picture):
-    code, out, err = say(
-        *SHORT,
-        "--method",
-        method,
-        "--samples",
-        samples,
-        "--vary",
-        "plant.drain=uniform:5%",
-        "--vary",
-        "plant.pump_gain=normal:2%:tied",
-        "--measure",
-        "max_level",
-        "--measure",
-        "ise",
-        "--json",
-        "--out",
-        str(tmp_path / "found"),
-    )
-    assert code == 0
-    printed = json.loads(out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
-    assert (
-        printed["case"] == "cascaded/pi" and printed["method"] == method and printed["failed"] == 0
-    )
+    folder = tmp_path / "found"
+    found = say(*SHORT, "--method", method, "--samples", samples, *MORE.split(), str(folder))
+    assert found.code == 0 and "run " in found.err and "written to" in found.err
+    printed = found.json
+    assert (printed["case"], printed["method"], printed["failed"]) == ("cascaded/pi", method, 0)
     assert list(printed["parameters"]) == ["plant.drain[1]", "plant.pump_gain"]
     assert printed["runs"] == {"local": 1, "morris": 4 * 3, "sobol": 32 * 4}[method]
     assert {m: v["unit"] for m, v in printed["measures"].items()} == {
@@ -469,32 +396,24 @@ def test_command(tmp_path, method, samples, picture):
     for measure in printed["measures"].values():
         assert set(measure["parameters"]) == {"plant.drain[1]", "plant.pump_gain"}
     assert any("rounded up to 32" in n for n in printed["notes"]) == (method == "sobol")
-    assert json.loads((tmp_path / "found" / "result.json").read_text()) == printed
-    rows = list(csv.DictReader((tmp_path / "found" / "sensitivity.csv").open()))
+    assert json.loads((folder / "result.json").read_text()) == printed
+    rows = list(csv.DictReader((folder / "sensitivity.csv").open()))
     assert len(rows) == 6 and {r["rank"] for r in rows} == {"1", "2"}
-    index = report.HEADS[method]
-    (key,) = [k for k in index if k in ("effect", "mu_star", "total")]
+    (key,) = [k for k in report.HEADS[method] if k in ("effect", "mu_star", "total")]
     for row in rows:
         value = printed["measures"][row["measure"]]["parameters"][row["parameter"]][key]
-        assert float(row[key] or "nan") == pytest.approx(
-            np.nan if value is None else value, rel=1e-9, nan_ok=True
-        )
-    assert matplotlib.image.imread(tmp_path / "found" / f"{picture}.png").shape[0] > 100
-    assert {p.name for p in (tmp_path / "found").iterdir()} == {
-        "result.json",
-        "sensitivity.csv",
-        "report.html",
-        f"{picture}.png",
-    }
-    assert ("run " in err) and "written to" in err
+        value = np.nan if value is None else value
+        assert float(row[key] or "nan") == pytest.approx(value, rel=1e-9, nan_ok=True)
+    assert matplotlib.image.imread(folder / f"{picture}.png").shape[0] > 100
+    files = {"result.json", "sensitivity.csv", "report.html", f"{picture}.png"}
+    assert {p.name for p in folder.iterdir()} == files
 
 
 def test_command_prints_tables():
-    code, out, err = say(
-        *SHORT, "--method", "sobol", "--samples", "16", "--spread", "0.02", "--quiet"
-    )
+    words = "--method sobol --samples 16 --spread 0.02 --measure max_level --quiet"
+    code, out, err = say(*SHORT, *words.split())
     assert code == 0 and err == ""
-    assert "rms_error_total [V]" in out and "max_level of tank 2 [V]" in out and "+-2 %" in out
+    assert "max_level of tank 2 [V]" in out and "+-2 %" in out
     assert "plant.pump_gain[0]" in out and "16 base points, 80 runs, 0 not finite" in out
 
 
@@ -578,30 +497,21 @@ def test_a_cloud_shows_who_broke_a_limit_and_when():
 
 def test_pictures():
     figure, axes = plt.subplots(1, 3)
-    names = [f"p{i}" for i in range(20)]
+    names, few = [f"p{i}" for i in range(20)], ["p0", "p1", "p2"]
     effect = np.linspace(1.0, 0.05, 20) * (-1.0) ** np.arange(20)
-    ends = np.stack([np.abs(effect) - 0.1, np.abs(effect) + 0.1], axis=1)
+    ends = np.abs(effect)[:, None] + [-0.1, 0.1]
     ax = responses.tornado(axes[0], names, effect, "cm", "x")
-    assert (
-        ax.get_xlabel() == "change [cm]"
-        and len(ax.patches) == 2 * responses.BARS
-        and "6 smaller ones not shown" in ax.get_title()
-    )
-    assert [p.get_width() for p in ax.patches[:2]] == list(effect[:2]) and ax.yaxis_inverted()
-    ax = responses.elementary(
-        axes[1], names[:3], np.abs(effect[:3]), ends[:3], np.ones(3), "cm", "x"
-    )
-    assert (
-        ax.get_xlabel() == "change over the range [cm]"
-        and [t.get_text() for t in ax.get_yticklabels()] == names[:3]
-    )
-    ax = responses.shares(axes[2], names[:3], np.ones(3), np.ones(3), ends[:3], ends[:3], "x")
+    assert ax.get_xlabel() == "change [cm]" and "6 smaller ones not shown" in ax.get_title()
+    assert len(ax.patches) == 2 * responses.BARS and ax.yaxis_inverted()
+    assert [p.get_width() for p in ax.patches[:2]] == list(effect[:2])
+    ax = responses.elementary(axes[1], few, np.abs(effect[:3]), ends[:3], np.ones(3), "cm", "x")
+    assert ax.get_xlabel() == "change over the range [cm]"
+    assert [t.get_text() for t in ax.get_yticklabels()] == few
+    ax = responses.shares(axes[2], few, np.ones(3), np.ones(3), ends[:3], ends[:3], "x")
     assert "[-]" in ax.get_xlabel() and len(ax.patches) == 6
-    segments = np.array(ax.collections[0].get_segments())
-    np.testing.assert_allclose(
-        np.sort(segments[:, :, 0], axis=1),
-        np.stack([np.minimum(ends[:3, 0], 1), np.maximum(ends[:3, 1], 1)], axis=1),
-    )
+    segments = np.sort(np.array(ax.collections[0].get_segments())[:, :, 0], axis=1)
+    ends = np.stack([np.minimum(ends[:3, 0], 1), np.maximum(ends[:3, 1], 1)], axis=1)
+    np.testing.assert_allclose(segments, ends)
     plt.close(figure)
 
 
@@ -617,38 +527,3 @@ def test_pictures():
 )
 def test_the_unit_of_a_derivative(unit, of, words):
     assert report.per(unit, of) == words
-
-
-def test_numbers_with_a_unit_say_it(tmp_path):
-    """Centimetres of error for a square centimetre of an outlet, or for a volt and second of a
-    pump: in table, JSON and CSV.
-    """
-    words = (
-        "mirakhorli/sfc",
-        "--vary",
-        "plant.drain=uniform:5%",
-        "--vary",
-        "plant.split=uniform:5%:tied",
-    )
-    words += ("--set", "clock.duration=20", "--measure", "max_level", "--measure", "ise")
-    code, out, err = say(*words, "--method", "local", "--out", str(tmp_path))
-    assert code == 0, err
-    assert (
-        "effect [cm]" in out
-        and "effect [cm^2 s]" in out
-        and re.search(r"\d cm per cm\^2\b", out)
-        and "cm^2 s per cm^2" in out
-    )
-    printed = json.loads((tmp_path / "result.json").read_text())["measures"]
-    assert (
-        printed["max_level of tank 1"]["parameters"]["plant.drain[0]"]["derivative_unit"]
-        == "cm per cm^2"
-    )
-    assert printed["ise of output 1"]["parameters"]["plant.split"]["derivative_unit"] == "cm^2 s"
-    rows = list(csv.DictReader((tmp_path / "sensitivity.csv").open()))
-    assert {r["derivative unit"] for r in rows if r["measure"].startswith("ise")} == {
-        "cm^2 s per cm^2",
-        "cm^2 s",
-    }
-    code, out, _ = say(*words, "--method", "morris", "--samples", "4", "--quiet")
-    assert code == 0 and "mu* [cm]" in out and "sigma [cm^2 s]" in out
