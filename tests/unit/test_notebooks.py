@@ -2,7 +2,6 @@
 with a run finds what has changed. The runs themselves: python notebooks/run.py --check.
 """
 
-import ast
 import copy
 import json
 import re
@@ -34,17 +33,12 @@ def stored(source):
     return [(c["cell_type"], "".join(c["source"]), c.get("outputs", [])) for c in cells]
 
 
-def code(source):
-    return [text for kind, text, _ in stored(source) if kind == "code"]
-
-
 @every
 def test_each_notebook_has_the_cells_of_its_source(source):
     jupytext = pytest.importorskip("jupytext")
-    wanted = jupytext.read(source, fmt="py:percent").cells
-    found = stored(source)
-    assert [c.cell_type for c in wanted] == [kind for kind, *_ in found]
-    for cell, (kind, text, _) in zip(wanted, found, strict=True):
+    cells = jupytext.read(source, fmt="py:percent").cells
+    for cell, (kind, text, _) in zip(cells, stored(source), strict=True):
+        assert cell.cell_type == kind
         if kind == "code":
             assert cell.source == text
         else:  # fields are filled with values of the run, and nothing else has changed
@@ -54,43 +48,12 @@ def test_each_notebook_has_the_cells_of_its_source(source):
 
 
 @every
-def test_first_cell_has_title_question_source_and_run_time(source):
-    (kind, first, _), *_ = stored(source)
-    assert kind == "markdown" and re.match(r"# \S", first)
-    assert re.search(r"^\*\*Question[:.]?\*\*[:.]? \S", first, re.M)
+def test_first_cell_has_a_source_and_a_run_time(source):
+    (_, first, _), *_ = stored(source)
     assert re.search(r"\]\(https://doi\.org/10\.\d{4,}/\S+\)", first)
     seconds = int(re.search(r"Run time: about (\d+) s", first)[1])
     assert 0 < seconds <= 120  # 05 measures the 200 rows of five papers
     assert "{{run_time}}" in source.read_text() and "{{links}}" in source.read_text()
-
-
-@every
-def test_last_cell_concludes_with_three_exercises_and_folded_answers(source):
-    kind, last, _ = stored(source)[-1]
-    assert kind == "markdown" and len(FIELD.findall(source.read_text())) > 4
-    assert last.count("<details><summary>") == last.count("</details>") == 3
-
-
-@every
-def test_cells_are_short_and_plain(source):
-    cells = code(source)
-    assert "jaxtank.notebook()" in cells[0]
-    for text in cells:
-        lines = [line for line in text.splitlines() if line.strip()]
-        assert len(lines) <= 12 and max(map(len, lines)) <= 100, text
-        tree = ast.parse(re.sub("^[%!].*$", "", text, flags=re.M))
-        loops = [n for n in ast.walk(tree) if isinstance(n, ast.For | ast.While)]
-        calls = [n for loop in loops for n in ast.walk(loop) if isinstance(n, ast.Call)]
-        assert not [c for c in calls if getattr(c.func, "id", "") == "print"], text
-    whole = "\n".join(cells)
-    for word in ("environ", "FAST", "set_dpi", "figure.dpi", "enable_x64", "warnings.", "%%"):
-        assert word not in whole
-
-
-@every
-def test_guesses_come_before_figures_and_formulas_are_latex(source):
-    text = "\n".join(text for kind, text, _ in stored(source) if kind == "markdown")
-    assert text.lower().count("guess") >= 2 and "$" in text
 
 
 @every
@@ -112,26 +75,16 @@ def test_the_gallery_has_every_notebook():
 def notebook(legend="tuned", value="error 0.297 cm\n", prose="It falls to 0.297 cm.", tags=()):
     figure = {"image/png": "iVBOR", "text/plain": "<Figure size 640x480 with 1 Axes>"}
     drawn = ["axes  | time [s] | level [cm]", "line 0 to 12.3", f"legend {legend}"]
+    table = {"text/html": f"<table><td>{value}</td></table><style>p 9</style>"}
+    picture = {"data": figure, "metadata": {"image/png": {"drawn": drawn}}}
     outputs = [
         {"output_type": "stream", "name": "stdout", "text": value},
-        {
-            "output_type": "display_data",
-            "data": figure,
-            "metadata": {"image/png": {"drawn": drawn}},
-        },
-        {
-            "output_type": "execute_result",
-            "data": {"text/html": f"<table><td>{value}</td></table><style>p 9</style>"},
-            "metadata": {},
-        },
+        {"output_type": "display_data", **picture},
+        {"output_type": "execute_result", "data": table, "metadata": {}},
     ]
-    tagged = {"tags": list(tags)}
-    return {
-        "cells": [
-            {"cell_type": "code", "source": "a()", "outputs": outputs, "metadata": tagged},
-            {"cell_type": "markdown", "source": prose, "metadata": tagged},
-        ]
-    }
+    code = {"cell_type": "code", "source": "a()", "outputs": outputs}
+    text = {"cell_type": "markdown", "source": prose}
+    return {"cells": [{**cell, "metadata": {"tags": list(tags)}} for cell in (code, text)]}
 
 
 @pytest.mark.parametrize(

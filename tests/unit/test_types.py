@@ -19,9 +19,8 @@ CODE = DATA / "type_checks"
 @pytest.fixture(scope="module")
 def reported(tmp_path_factory):
     """{file: lines of it with an error} of pyright's basic mode."""
-    pyright = shutil.which("pyright", path=str(Path(sys.executable).parent)) or shutil.which(
-        "pyright"
-    )
+    beside = shutil.which("pyright", path=str(Path(sys.executable).parent))
+    pyright = beside or shutil.which("pyright")
     if pyright is None:
         pytest.skip("pyright is not installed: pip install pyright")
     started = subprocess.run([pyright, "--version"], capture_output=True, text=True)
@@ -33,11 +32,11 @@ def reported(tmp_path_factory):
     files = sorted(shutil.copy(path, folder) for path in CODE.glob("*.py"))
     words = [pyright, "--pythonpath", sys.executable, "--project", str(folder), "--outputjson"]
     done = subprocess.run(words, capture_output=True, text=True, cwd=folder)
-    found = {Path(file).name: {} for file in files}
-    for one in json.loads(done.stdout)["generalDiagnostics"]:
-        if one["severity"] == "error":
-            found[Path(one["file"]).name][one["range"]["start"]["line"]] = one["message"]
-    return found
+    errors = {Path(file).name: {} for file in files}
+    for row in json.loads(done.stdout)["generalDiagnostics"]:
+        if row["severity"] == "error":
+            errors[Path(row["file"]).name][row["range"]["start"]["line"]] = row["message"]
+    return errors
 
 
 def test_typical_user_code_is_accepted(reported):
@@ -53,15 +52,9 @@ def test_mistyped_names_and_keywords_are_reported(reported):
 @pytest.mark.parametrize("package", [jaxtank, tuning])
 def test_a_type_checker_is_given_every_public_name_from_where_it_is(package):
     tree = ast.parse(Path(package.__file__).read_text())
-    (block,) = (
-        n for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING"
-    )
-    given = {
-        a.asname: (n.module, a.name)
-        for n in block.body
-        if isinstance(n, ast.ImportFrom)
-        for a in n.names
-    }
+    blocks = [n for n in tree.body if isinstance(n, ast.If) and "CHECK" in ast.unparse(n.test)]
+    (imports,) = ([n for n in b.body if isinstance(n, ast.ImportFrom)] for b in blocks)
+    given = {a.asname: (n.module, a.name) for n in imports for a in n.names}
     assert set(package.__all__) <= set(given)
     table = {name: (module, name) for name, module in package._NAMES.items()}
     assert {name: given[name] for name in table} == table

@@ -143,6 +143,7 @@ def test_a_worker_killed_and_one_added_in_mid_run_change_no_bit(case, whole, cli
     assert victim not in client.nthreads()
 
 
+@pytest.mark.slow
 def test_sensitivity_on_workers_is_that_of_one_process(case):
     options = {"method": "morris", "samples": 8, "measures": ["rms_error", "max_level"], "batch": 8}
     spread = {"plant.drain": 0.05, "plant.area": 0.05}
@@ -158,26 +159,24 @@ def answer(result):
     return result.parameters, result.objective, result.evaluations, result.starts, result.history
 
 
-@pytest.mark.parametrize("robust", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_searches_on_workers_lead_to_the_answer_of_one_process(case, robust):
-    def run(cluster):
-        if not robust:
-            return tuning.tune(case, **SEARCH, cluster=cluster)
-        options = {name: SEARCH[name] for name in ("starts", "screening", "validation")}
-        return tuning.tune_robust(case, SPREAD, **options, samples=4, fresh=16, cluster=cluster)
-
-    with Counting() as pool:
-        assert repr(answer(run(pool))) == repr(answer(run(None)))
-        assert len(pool.sizes) >= SEARCH["starts"]
-
-
-def test_what_is_known_is_not_sent_again(case, tmp_path):
-    """A search that is continued runs what its log lacks, and no more."""
-    whole = tuning.tune(case, **SEARCH, checkpoint=tmp_path)
-    again = tuning.tune(case, **SEARCH, checkpoint=tmp_path, resume=True, cluster=Refusing())
-    assert repr(answer(again)) == repr(answer(whole))
+def test_searches_on_workers_lead_to_the_answer_of_one_process(case, tmp_path):
+    """And a search that is continued sends what its log lacks, and no more."""
+    whole = repr(answer(tuning.tune(case, **SEARCH, checkpoint=tmp_path)))
+    options = {**SEARCH, "checkpoint": tmp_path, "resume": True}
+    assert repr(answer(tuning.tune(case, **options, cluster=Refusing()))) == whole
     with pytest.raises(InputError, match="AssertionError"):
         tuning.tune(case, **SEARCH, cluster=Refusing())
+    with Counting() as pool:
+        assert repr(answer(tuning.tune(case, **SEARCH, cluster=pool))) == whole
+        assert len(pool.sizes) == SEARCH["starts"]
+
+
+@pytest.mark.slow
+def test_robust_searches_on_workers_lead_to_the_answer_of_one_process(case):
+    options = {"starts": 2, "screening": 8, "validation": 0, "samples": 4, "fresh": 16}
+    with Counting() as pool:
+        there = tuning.tune_robust(case, SPREAD, **options, cluster=pool)
+    assert repr(answer(there)) == repr(answer(tuning.tune_robust(case, SPREAD, **options)))
 
 
 def test_workers_that_are_lost_are_one_line_and_the_run_goes_on(case, whole, tmp_path):
