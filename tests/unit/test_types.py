@@ -52,8 +52,8 @@ def test_mistyped_names_and_keywords_are_reported(reported):
 @pytest.mark.parametrize("package", [jaxtank, tuning])
 def test_a_type_checker_is_given_every_public_name_from_where_it_is(package):
     tree = ast.parse(Path(package.__file__).read_text())
-    blocks = [n for n in tree.body if isinstance(n, ast.If) and "CHECK" in ast.unparse(n.test)]
-    (imports,) = ([n for n in b.body if isinstance(n, ast.ImportFrom)] for b in blocks)
+    branches = {ast.unparse(n.test): n.body for n in tree.body if isinstance(n, ast.If)}
+    imports = [n for n in branches["TYPE_CHECKING"] if isinstance(n, ast.ImportFrom)]
     given = {a.asname: (n.module, a.name) for n in imports for a in n.names}
     assert set(package.__all__) <= set(given)
     table = {name: (module, name) for name, module in package._NAMES.items()}

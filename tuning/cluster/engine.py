@@ -141,8 +141,9 @@ class DaskEngine(Engine):
 
     def __init__(self, client, local=False):
         super().__init__(client.get_executor(pure=False))
-        self.client, self.local, self.name = client, local, f"cluster {client.scheduler.address}"
-        self.idle = False
+        self.client, self.local, self.idle = client, local, False
+        self.address = client.scheduler.address
+        self.name = f"cluster {self.address}"
 
     def look(self):
         try:
@@ -179,7 +180,7 @@ def connect(cluster):
         else:
             client = stack.enter_context(_client(cluster))
         engine = DaskEngine(client, local)
-        if not client.scheduler.address.startswith(ENCRYPTED):
+        if not engine.address.startswith(ENCRYPTED):
             warnings.warn(
                 f"{engine.name}: without TLS anybody who reaches this address can run code as the"
                 " user of its workers, and of this command: give all of them certificates and the"

@@ -21,9 +21,9 @@ SETTINGS = {
 @contextlib.contextmanager
 def local_workers(count):
     """Run a Dask scheduler, and `count` workers of one thread as processes of this machine."""
-    import dask
     import distributed
     import jax
+    from dask import config
 
     try:
         security = distributed.Security.temporary()
@@ -32,9 +32,9 @@ def local_workers(count):
             "cluster local: needs keys for its connections: pip install cryptography, or"
             ' ".[cluster]"'
         ) from None
-    config: Any = jax.config  # a worker uses the compiled programs that this process keeps
-    programs = {"JAX_COMPILATION_CACHE_DIR": config.jax_compilation_cache_dir}
-    with dask.config.set(SETTINGS), _without_script():
+    compiler: Any = jax.config  # a worker uses the compiled programs that this process keeps
+    programs = {"JAX_COMPILATION_CACHE_DIR": compiler.jax_compilation_cache_dir}
+    with config.set(SETTINGS), _without_script():
         cluster = distributed.LocalCluster(
             n_workers=count,
             threads_per_worker=1,

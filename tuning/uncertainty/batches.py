@@ -1,6 +1,7 @@
 """Batches of runs of one case on drawn parameters, on the devices of a process or on a cluster."""
 
 import contextlib
+import functools
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -74,10 +75,10 @@ def batch_runner(case, names, seed, devices, cluster):
         local, pool = jax.local_devices()[:devices], ThreadPoolExecutor(devices)
         for i in range(0, len(numbers), devices):
             group = numbers[i : i + devices]
-            task = lambda device, batch: run_batch(case, names, seed, *batch, device)
+            task = lambda device, batch: run_batch(case, names, seed, *batch, device=device)
             yield from zip(group, pool.map(task, local, map(inputs, group)))
 
-    def on_workers(numbers, inputs, size):
+    def on_workers(engine, numbers, inputs, size):
         text = sent(case, names)
         share = max(1, min(WORK // (size * case.clock.samples), len(numbers) // SHARES))
         groups = [tuple(numbers[i : i + share]) for i in range(0, len(numbers), share)]
@@ -86,7 +87,7 @@ def batch_runner(case, names, seed, devices, cluster):
             yield from zip(group, results, strict=True)
 
     with connect(cluster) as engine:
-        yield on_devices if engine is None else on_workers
+        yield on_devices if engine is None else functools.partial(on_workers, engine)
 
 
 def batches(text, names, seed, inputs):

@@ -41,9 +41,8 @@ def sobol_indices(y, seed=0):
     # stays paired. Source: Saltelli et al. 2010, table 2 (b) and (f).
     y = np.asarray(y, dtype=float)
     dimensions, rows = y.shape[1] - 2, y[np.isfinite(y).all(axis=1)]
-    indices = dict.fromkeys(("first", "total"), np.full(dimensions, np.nan))
-    for name in ("first", "total"):
-        indices[f"{name}_interval95"] = np.full((dimensions, 2), np.nan)
+    unknown = {"": np.full(dimensions, np.nan), "_interval95": np.full((dimensions, 2), np.nan)}
+    indices: dict = {f"{n}{part}": v for n in ("first", "total") for part, v in unknown.items()}
     indices["kept"] = len(rows)
     if len(rows) < 2:
         return {**indices, "sd": np.nan}

@@ -248,7 +248,8 @@ def _entries(case, draws, names, points, run, batch, progress):
     total = points.shape[0] * points.shape[1] + 1
     most = 1 << (max(1, SAMPLES_AT_ONCE // case.clock.samples).bit_length() - 1)
     size = min(batch or max(8, min(RUNS_AT_ONCE, most)), total)
-    entries, broken = None, np.zeros(total, dtype=bool)
+    sizes = [ms.entries(m, case.loop.plant) for m in names]
+    entries, broken = np.empty((total, sum(sizes))), np.zeros(total, dtype=bool)
 
     def inputs(start):
         index = np.minimum(np.arange(start, start + size), total - 1)
@@ -257,7 +258,6 @@ def _entries(case, draws, names, points, run, batch, progress):
     for done, (start, measures) in enumerate(run(range(0, total, size), inputs, size), 1):
         rows = slice(start, min(start + size, total))
         flat = np.concatenate([measures[m].reshape(size, -1) for m in names], axis=1)
-        entries = np.empty((total, flat.shape[1])) if entries is None else entries
         entries[rows] = flat[: total - start]
         broken[rows] = measures["failed"][: total - start] > 0
         if progress is not None:
