@@ -65,98 +65,12 @@ class Measure(NamedTuple):
         return (self.worst if value * self.sense > 0.0 else self.unlimited) or self.undefined
 
 
-UNSTABLE = "the linearised loop is unstable at a steady state"
-NONE_LEFT = (
-    "at no plateau of the reference is there a steady state at which the loop can be linearised;"
-    " jaxtank.stability_margins says why of each"
-)
-NOTHING_HELD = "the reference holds no setpoints at which the loop could be linearised"
-
-
-def _margin(
-    field: str, unit: str, doc: str, unlimited: str, shown: int, low: float, high: float | None
-) -> Measure:
-    """A margin of each pump: larger is better, infinite where nothing crosses."""
-
-    def read(run: Run, accumulated: dict[str, Any]) -> Any:
-        return getattr(run.margins, field)
-
-    return Measure(
-        unit,
-        "pump",
-        (),
-        read,
-        doc,
-        low=low,
-        high=high,
-        sense=-1.0,
-        shown=shown,
-        undefined=NONE_LEFT,
-        worst=UNSTABLE,
-        unlimited=unlimited,
-        unserved=NOTHING_HELD,
-        linear=True,
-    )
-
-
-MARGINS: dict[str, Measure] = {
-    "sensitivity_peak": Measure(
-        "-",
-        "run",
-        (),
-        lambda run, accumulated: run.margins.sensitivity_peak,
-        "Ms of the linearised loop: largest gain of 1/(1 + L), at the pumps",
-        low=1.0,  # the mean of log|S| over frequency is at least 0 (Bode), as L is strictly proper
-        shown=110,
-        undefined=NONE_LEFT,
-        worst=UNSTABLE,
-        unserved=NOTHING_HELD,
-        linear=True,
-    ),
-    "gain_margin": _margin(
-        "gain_margin",
-        "-",
-        "factor on the loop gain, up or down, that the linearised loop stands",
-        "the phase never reaches -180 deg",
-        120,
-        low=1.0,
-        high=None,
-    ),
-    "phase_margin": _margin(
-        "phase_margin",
-        "deg",
-        "change of the phase that the linearised loop stands",
-        "the gain never reaches 1",
-        130,
-        low=0.0,
-        high=180.0,
-    ),
-    "delay_margin": _margin(
-        "delay_margin",
-        "s",
-        "additional dead time that the linearised loop stands",
-        "the gain never reaches 1",
-        140,
-        low=0.0,
-        high=None,
-    ),
-}
-"""{name: Measure}, entries of the catalogue."""
-
-
-NO_CHANGES = "the reference has no changes that end"
-
-
 def _stacked(values) -> Any:
     return values if is_array(values) else jnp.stack([jnp.asarray(v) for v in values])
 
 
 def _means(run, values):
     return each(lambda v: v / run.samples, values)
-
-
-def _root_mean(name):
-    return lambda run, acc: root_of_mean(_stacked(_means(run, acc[name])))
 
 
 def _mean(run):
@@ -169,79 +83,88 @@ def _integral(run):
     return run.dt
 
 
-def _scaled(name, scale):
-    return lambda run, acc: _stacked(each(lambda s: s * scale(run), acc[name]))
-
-
-def _sum_of_squares(unit, per, name, scale, doc, read=None):
-    """Measure of the accumulator of squares `name`, times scale(run)."""
+def _measure(unit, per, accumulator, read, doc, **facts) -> Measure:
+    """A measure of one accumulator, whose state is what `read` takes."""
     return Measure(
-        unit,
-        per,
-        (name,),
-        read or _scaled(name, scale),
-        doc,
-        residual=name,
-        scale=scale,
-        by_input=True,
+        unit, per, (accumulator,), lambda run, acc: read(run, acc[accumulator]), doc, **facts
     )
 
 
-def _column(run, state, read) -> Any:
-    """The vector of read(*numbers) of a state of `rows`."""
-    return read(*state) if run.arrays else _stacked([read(*row) for row in state])
+def _root_mean(unit, per, accumulator, doc, **facts) -> Measure:
+    def read(run, sums):
+        return root_of_mean(_stacked(_means(run, sums)))
+
+    return _measure(unit, per, accumulator, read, doc, **facts)
 
 
-def _extremes(name, index=0):
-    return lambda run, acc: _column(run, acc[name], lambda *pair: pair[index])
+def _root_mean_total(accumulator, doc, **facts) -> Measure:
+    def read(run, sums):
+        return root_of_mean(total(_means(run, sums)))
+
+    return _measure("cm", "run", accumulator, read, doc, by_input=True, **facts)
 
 
-def _settling(run, acc):
-    worst = _column(
-        run,
-        acc["settling"],
-        lambda _, last, outside, worst: jnp.maximum(worst, settled(last, outside)),
+def _scaled(unit, per, accumulator, scale, doc, **facts) -> Measure:
+    def read(run, sums):
+        return _stacked(each(lambda s: s * scale(run), sums))
+
+    return _measure(unit, per, accumulator, read, doc, **facts)
+
+
+def _summed(accumulator, doc) -> Measure:
+    """A volume of each tank."""
+    return _measure(
+        "cm^3", "tank", accumulator, lambda run, sums: _stacked(sums), doc, by_input=True
     )
+
+
+def _sum_of_squares(unit, per, accumulator, scale, doc) -> Measure:
+    measure = _scaled(unit, per, accumulator, scale, doc, by_input=True)
+    return measure._replace(residual=accumulator, scale=scale)
+
+
+def _of_rows(unit, per, accumulator, entry, doc, **facts) -> Measure:
+    """A measure of a state of `rows`: entry(*numbers) of each row."""
+
+    def read(run, state):
+        return entry(*state) if run.arrays else _stacked([entry(*row) for row in state])
+
+    return _measure(unit, per, accumulator, read, doc, **facts)
+
+
+def _settling(_, last, outside, worst):
+    worst = jnp.maximum(worst, settled(last, outside))
     return jnp.where(worst < -1e8, jnp.nan, worst)
 
 
-def _rise(run, acc):
-    longest = _column(run, acc["rise"], lambda *state: state[3])
-    return jnp.where(longest > 0, longest, jnp.nan)
-
-
-def _recovery(run, acc):
-    return _column(
-        run,
-        acc["recovery"],
-        lambda last, outside, worst: jnp.maximum(worst, settled(last, outside)),
+def _margin(field, unit, doc, unlimited="", low=0.0, high=None, per="pump", sense=-1.0) -> Measure:
+    """A stability margin of the linearised loop: infinite where nothing crosses."""
+    return Measure(
+        unit,
+        per,
+        (),
+        lambda run, accumulated: getattr(run.margins, field),
+        doc,
+        low=low,
+        high=high,
+        sense=sense,
+        undefined=(
+            "at no plateau of the reference is there a steady state at which the loop can be"
+            " linearised; jaxtank.stability_margins says why of each"
+        ),
+        worst="the linearised loop is unstable at a steady state",
+        unlimited=unlimited,
+        unserved="the reference holds no setpoints at which the loop could be linearised",
+        linear=True,
     )
 
 
-def _overshoot_percent(run, acc):
-    return 100.0 * lower_clip(_extremes("overshoot")(run, acc), 0.0)
-
+NO_CHANGES = "the reference has no changes that end"
 
 _BUILT_IN: dict[str, Measure] = {
-    "rms_error": Measure(
-        "cm",
-        "output",
-        ("e2",),
-        _root_mean("e2"),
-        "root mean square tracking error",
-        by_input=True,
-        shown=10,
-        summary=10,
-    ),
-    "rms_error_total": Measure(
-        "cm",
-        "run",
-        ("e2",),
-        lambda run, acc: root_of_mean(total(_means(run, acc["e2"]))),
-        "root of the mean squared errors of all outputs, summed",
-        by_input=True,
-        shown=20,
-        summary=20,
+    "rms_error": _root_mean("cm", "output", "e2", "root mean square tracking error", by_input=True),
+    "rms_error_total": _root_mean_total(
+        "e2", "root of the mean squared errors of all outputs, summed"
     ),
     "mean_square_error": _sum_of_squares(
         "cm^2", "output", "e2", _mean, "mean square tracking error"
@@ -249,22 +172,11 @@ _BUILT_IN: dict[str, Measure] = {
     "ise": _sum_of_squares(
         "cm^2 s", "output", "lasting_e2", _integral, "integral of the squared error"
     ),
-    "iae": Measure(
-        "cm s",
-        "output",
-        ("abs_e",),
-        _scaled("abs_e", _integral),
-        "integral of the absolute error",
-        by_input=True,
+    "iae": _scaled(
+        "cm s", "output", "abs_e", _integral, "integral of the absolute error", by_input=True
     ),
-    "max_error": Measure(
-        "cm",
-        "output",
-        ("max_error",),
-        _extremes("max_error"),
-        "largest absolute tracking error",
-        shown=30,
-        summary=30,
+    "max_error": _of_rows(
+        "cm", "output", "max_error", lambda error, time: error, "largest absolute tracking error"
     ),
     "mean_square_overshoot": _sum_of_squares(
         "cm^2",
@@ -273,33 +185,24 @@ _BUILT_IN: dict[str, Measure] = {
         _mean,
         "mean square of the level past the target of a change, in its direction",
     ),
-    "rms_input": Measure(
+    "rms_input": _root_mean("V", "pump", "u2", "root mean square input", by_input=True),
+    "input_travel": _measure(
         "V",
         "pump",
-        ("u2",),
-        _root_mean("u2"),
-        "root mean square input",
-        by_input=True,
-        shown=80,
-        summary=90,
-    ),
-    "input_travel": Measure(
-        "V",
-        "pump",
-        ("travel",),
-        lambda run, acc: _stacked(acc["travel"][1]),
+        "travel",
+        lambda run, state: _stacked(state[1]),
         "sum of the absolute changes of the input",
         by_input=True,
-        shown=90,
-        summary=100,
     ),
-    "mean_square_travel": _sum_of_squares(
+    "mean_square_travel": _measure(
         "V^2",
         "pump",
         "changes2",
-        _mean,
+        lambda run, state: _stacked(state[1]) / run.samples,
         "mean of the squared changes of the input from sample to sample",
-        read=lambda run, acc: _stacked(acc["changes2"][1]) / run.samples,
+        residual="changes2",
+        scale=_mean,
+        by_input=True,
     ),
     "input_deviation": _sum_of_squares(
         "V^2 s",
@@ -308,157 +211,173 @@ _BUILT_IN: dict[str, Measure] = {
         _integral,
         "integral of the squared distance of the input from the one that holds the setpoint",
     ),
-    "saturated_fraction": Measure(
+    "saturated_fraction": _scaled(
         "-",
         "pump",
-        ("outside",),
-        _scaled("outside", _mean),
+        "outside",
+        _mean,
         "share of samples commanded outside the limits",
         high=1.0,
         counts=True,
-        shown=100,
-        summary=110,
     ),
-    "filter_active_fraction": Measure(
+    "filter_active_fraction": _measure(
         "-",
         "run",
-        ("filtered",),
-        lambda run, acc: acc["filtered"] / run.samples,
+        "filtered",
+        lambda run, count: count / run.samples,
         "share of samples in which the safety filter changed an input",
         high=1.0,
         counts=True,
         unserved="the safety filter is off",
     ),
-    "saturation_excess": Measure(
+    "saturation_excess": _measure(
         "-",
         "run",
-        ("saturation_excess",),
-        lambda run, acc: total(acc["saturation_excess"]) / (run.samples * run.pumps),
+        "saturation_excess",
+        lambda run, sums: total(sums) / (run.samples * run.pumps),
         "mean of x/(1+x), x = input commanded outside the limits over their span",
         high=1.0,
         by_input=True,
     ),
-    "max_level": Measure(
+    "max_level": _of_rows(
         "cm",
         "tank",
-        ("max_level",),
-        _extremes("max_level"),
+        "max_level",
+        lambda level, time: level,
         "highest level",
-        shown=40,
-        summary=60,
         reached="time_of_max_level",
     ),
-    "min_level": Measure(
+    "min_level": _of_rows(
         "cm",
         "tank",
-        ("min_level",),
-        _extremes("min_level"),
+        "min_level",
+        lambda level, time: level,
         "lowest level",
         sense=-1.0,
-        shown=50,
-        summary=70,
         reached="time_of_min_level",
     ),
-    "rms_over_rim": Measure(
-        "cm",
-        "run",
-        ("over_rim2",),
-        lambda run, acc: root_of_mean(total(_means(run, acc["over_rim2"]))),
-        "root of the mean squared rise past the rims, summed over tanks",
-        by_input=True,
+    "rms_over_rim": _root_mean_total(
+        "over_rim2", "root of the mean squared rise past the rims, summed over tanks"
     ),
     "mean_square_over_rim": _sum_of_squares(
         "cm^2", "tank", "over_rim2", _mean, "mean square of the rise past the rim"
     ),
-    "overflow_volume": Measure(
-        "cm^3",
-        "tank",
-        ("spilled",),
-        lambda run, acc: _stacked(acc["spilled"]),
-        "volume lost over the rim",
-        by_input=True,
-        summary=80,
+    "overflow_volume": _summed("spilled", "volume lost over the rim"),
+    "inflow_shortfall": _summed(
+        "shortfall", "volume that a negative inflow could not take from an empty tank"
     ),
-    "inflow_shortfall": Measure(
-        "cm^3",
-        "tank",
-        ("shortfall",),
-        lambda run, acc: _stacked(acc["shortfall"]),
-        "volume that a negative inflow could not take from an empty tank",
-        by_input=True,
-    ),
-    "overshoot_percent": Measure(
+    "overshoot_percent": _of_rows(
         "%",
         "output",
-        ("overshoot",),
-        _overshoot_percent,
+        "overshoot",
+        lambda share, time: 100.0 * lower_clip(share, 0.0),
         "worst overshoot of a change, in percent of it",
-        shown=60,
-        summary=40,
         undefined="the reference does not change",
         unserved=NO_CHANGES,
     ),
-    "rise_time": Measure(
+    "rise_time": _of_rows(
         "s",
         "output",
-        ("rise",),
-        _rise,
+        "rise",
+        lambda *state: jnp.where(state[3] > 0, state[3], jnp.nan),
         "longest time from 10 % to 90 % of a change, of those followed so far",
         counts=True,
         undefined="no change of the setpoint was followed to 90 % of its height",
         unserved=NO_CHANGES,
     ),
-    "settling_time": Measure(
+    "settling_time": _of_rows(
         "s",
         "output",
-        ("settling",),
+        "settling",
         _settling,
         "longest time from the end of a change to its last sample outside its band (+-5 % of it); "
         "negative: inside before the change ended; none: never settled",
         low=None,
         counts=True,
-        shown=70,
-        summary=50,
         undefined="the output was outside its band as the setpoint changed again or the run ended",
         unserved=NO_CHANGES,
         nan_holds="no change of its setpoint took the output out of its band",
     ),
-    "recovery_time": Measure(
+    "recovery_time": _of_rows(
         "s",
         "output",
-        ("recovery",),
-        _recovery,
+        "recovery",
+        lambda last, outside, worst: jnp.maximum(worst, settled(last, outside)),
         "longest time from the start of an inflow pulse to the last sample outside +-5 % of the"
         " setpoint; none: never recovered",
         counts=True,
         undefined="an output was still outside the band when it was watched no longer",
         unserved="this case has no disturbance to recover from",
     ),
-    "estimation_rms": Measure(
-        "cm",
-        "tank",
-        ("estimate2",),
-        _root_mean("estimate2"),
-        "root mean square error of the level estimate",
+    "estimation_rms": _root_mean(
+        "cm", "tank", "estimate2", "root mean square error of the level estimate"
     ),
-    "time_of_max_level": Measure(
+    "time_of_max_level": _of_rows(
         "s",
         "tank",
-        ("max_level",),
-        _extremes("max_level", 1),
+        "max_level",
+        lambda level, time: time,
         "when the highest level was reached",
         counts=True,
     ),
-    "time_of_min_level": Measure(
+    "time_of_min_level": _of_rows(
         "s",
         "tank",
-        ("min_level",),
-        _extremes("min_level", 1),
+        "min_level",
+        lambda level, time: time,
         "when the lowest level was reached",
         counts=True,
     ),
-    **MARGINS,
+    "sensitivity_peak": _margin(
+        "sensitivity_peak",
+        "-",
+        "Ms of the linearised loop: largest gain of 1/(1 + L), at the pumps",
+        low=1.0,  # the mean of log|S| over frequency is at least 0 (Bode), as L is strictly proper
+        per="run",
+        sense=1.0,
+    ),
+    "gain_margin": _margin(
+        "gain_margin",
+        "-",
+        "factor on the loop gain, up or down, that the linearised loop stands",
+        "the phase never reaches -180 deg",
+        low=1.0,
+    ),
+    "phase_margin": _margin(
+        "phase_margin",
+        "deg",
+        "change of the phase that the linearised loop stands",
+        "the gain never reaches 1",
+        high=180.0,
+    ),
+    "delay_margin": _margin(
+        "delay_margin",
+        "s",
+        "additional dead time that the linearised loop stands",
+        "the gain never reaches 1",
+    ),
 }
 
-MEASURES: dict[str, Measure] = {m: spec._replace(arrays=True) for m, spec in _BUILT_IN.items()}
+SHOWN = (
+    *("rms_error", "rms_error_total", "max_error", "max_level", "min_level", "overshoot_percent"),
+    *("settling_time", "rms_input", "input_travel", "saturated_fraction"),
+    *("sensitivity_peak", "gain_margin", "phase_margin", "delay_margin"),
+)
+"""Measures in the table of a tuning result, in order."""
+SUMMARY = (
+    *("rms_error", "rms_error_total", "max_error", "overshoot_percent", "settling_time"),
+    *("max_level", "min_level", "overflow_volume", "rms_input", "input_travel"),
+    "saturated_fraction",
+)
+"""Measures in an ensemble's summary unless others are named, in order."""
+
+
+def _place(name: str, names: tuple[str, ...]) -> int:
+    return 10 * (names.index(name) + 1) if name in names else 0
+
+
+MEASURES: dict[str, Measure] = {
+    m: spec._replace(arrays=True, shown=_place(m, SHOWN), summary=_place(m, SUMMARY))
+    for m, spec in _BUILT_IN.items()
+}
 """{name: Measure}; `register` adds those of a user's own."""
