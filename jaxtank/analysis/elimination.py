@@ -101,11 +101,11 @@ def _cholesky(A):
     ends = [round(n * k / STAGES) for k in range(STAGES + 1)]
     U = jnp.zeros((0, n), A.dtype)
     for first, end in itertools.pairwise(ends):
-        index, left = np.arange(n - first), A[first:, first:]
+        index, block = np.arange(n - first), A[first:, first:]
 
-        def row(j, rows, first=first, index=index, left=left):
+        def row(j, rows, first=first, index=index, block=block):
             column = _entry(rows, j, axis=1)
-            new = _entry(left, j) - column @ rows
+            new = _entry(block, j) - column @ rows
             new = jnp.where(index < j, 0.0, new * jax.lax.rsqrt(_entry(new, j)))
             return jax.lax.dynamic_update_index_in_dim(rows, new, first + j, 0)
 

@@ -88,8 +88,8 @@ def response(loop: OpenLoop, z: Any) -> tuple[Any, Any]:
     eye = jnp.eye(n, dtype=z.dtype)
 
     def row(k):
-        left = z[:, None] * eye[k] - H[k]
-        return jnp.concatenate([left, jnp.broadcast_to(B[k], (F, B.shape[1]))], axis=1)
+        shifted = z[:, None] * eye[k] - H[k]
+        return jnp.concatenate([shifted, jnp.broadcast_to(B[k], (F, B.shape[1]))], axis=1)
 
     def eliminate(state, k):
         now, det = state
@@ -137,13 +137,13 @@ def held(loop: OpenLoop, w: Any) -> Held:
     return jax.vmap(one)(w)
 
 
-def near(loop: OpenLoop, held: Held, w: Any) -> Any:
+def near(loop: OpenLoop, base: Held, w: Any) -> Any:
     """Return L (K, m, m) at frequencies w (K,) [rad/s] next to those of `held`, to second order,
     with first derivatives by the loop and w.
     """
     A, B, C, dead, dt = loop
     z = jnp.exp(1j * w * dt)
-    X, Y = held
-    left = B - z[:, None, None] * X + jnp.einsum("ij,kjm->kim", A, X)
-    L = jnp.einsum("ij,kjm->kim", C, X) + jnp.einsum("kin,knm->kim", Y, left)
+    X, Y = base
+    residual = B - z[:, None, None] * X + jnp.einsum("ij,kjm->kim", A, X)
+    L = jnp.einsum("ij,kjm->kim", C, X) + jnp.einsum("kin,knm->kim", Y, residual)
     return L * jnp.exp(-1j * w * dt * dead)[:, None, None]

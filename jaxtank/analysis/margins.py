@@ -59,8 +59,8 @@ def margins(loop: OpenLoop, slopes: bool = True) -> Margins:
         S, stable = _sensitivity(L), _is_stable(still, form)
         return _margins_of(brackets.exists, jnp.exp(log), S, _largest_gain(S[:1])[0], stable)
     stop = jax.lax.stop_gradient(brackets.low)
-    found = jnp.exp(jax.lax.stop_gradient(_narrowed(form, brackets, ZOOMS)[0]))
-    return _values(loop, still, brackets._replace(low=stop), found, _is_stable(still, form))
+    w_narrow = jnp.exp(jax.lax.stop_gradient(_narrowed(form, brackets, ZOOMS)[0]))
+    return _values(loop, still, brackets._replace(low=stop), w_narrow, _is_stable(still, form))
 
 
 def _is_stable(still: OpenLoop, form: OpenLoop) -> Any:
@@ -81,12 +81,12 @@ def _is_stable(still: OpenLoop, form: OpenLoop) -> Any:
 def _grid(loop: OpenLoop) -> Any:
     """Frequencies [rad/s] from LOWEST to the Nyquist frequency, in increasing order."""
     nyquist = np.pi / loop.dt
-    found = nyquist * jnp.exp(jnp.linspace(np.log(LOWEST), 0.0, POINTS))
+    grid = nyquist * jnp.exp(jnp.linspace(np.log(LOWEST), 0.0, POINTS))
     if not loop.dead:
-        return found
+        return grid
     most = min(TURN / (loop.dead * np.pi), 1.0)
     even = nyquist * jnp.linspace(0.0, most, DELAYED + 2)[1:-1]
-    return jnp.sort(jnp.concatenate([found, even]))
+    return jnp.sort(jnp.concatenate([grid, even]))
 
 
 def _det(M: Any) -> Any:
@@ -163,13 +163,15 @@ def _brackets(w: Any, L: Any) -> _Brackets:
     gain, alone = _largest_gain(S), _alone(S)
     k = jnp.argmax(gain)
     last = len(w) - 1
-    found = [(log[jnp.maximum(k - 1, 0)], log[jnp.minimum(k + 1, last)], jnp.array(True), last > 0)]
+    brackets = [
+        (log[jnp.maximum(k - 1, 0)], log[jnp.minimum(k + 1, last)], jnp.array(True), last > 0)
+    ]
     rows = ([], [], [])
     for i in range(L.shape[1]):
-        one = alone[:, i]
-        before, after = one[:-1], one[1:]
-        rows[0].append(_phase_crossover(log, one))
-        size = jnp.log(jnp.maximum(jnp.abs(one), 1e-300))
+        gain_of_input = alone[:, i]
+        before, after = gain_of_input[:-1], gain_of_input[1:]
+        rows[0].append(_phase_crossover(log, gain_of_input))
+        size = jnp.log(jnp.maximum(jnp.abs(gain_of_input), 1e-300))
         crosses = (size[:-1] < 0.0) != (size[1:] < 0.0)
         share = size[:-1] / jnp.where(crosses, size[:-1] - size[1:], 1.0)
         middle = before + share * (after - before)
@@ -180,13 +182,13 @@ def _brackets(w: Any, L: Any) -> _Brackets:
         ):
             j = jnp.argmin(jnp.where(crosses, worst, jnp.inf))
             rows[row].append((log[j], log[j + 1], jnp.any(crosses), True))
-    found += [bracket for row in rows for bracket in row]
-    return _Brackets(*(jnp.stack([jnp.asarray(v) for v in column]) for column in zip(*found)))
+    brackets += [bracket for row in rows for bracket in row]
+    return _Brackets(*(jnp.stack([jnp.asarray(v) for v in column]) for column in zip(*brackets)))
 
 
-def _phase_crossover(log: Any, one: Any) -> tuple[Any, Any, Any, Any]:
+def _phase_crossover(log: Any, L: Any) -> tuple[Any, Any, Any, Any]:
     """Bracket of the crossover of the phase of L (F,) whose gain is nearest to 1."""
-    up, re = jnp.imag(one), jnp.real(one)
+    up, re = jnp.imag(L), jnp.real(L)
     crosses = (up[:-1] < 0.0) != (up[1:] < 0.0)
     share = up[:-1] / jnp.where(crosses, up[:-1] - up[1:], 1.0)
     there = re[:-1] + share * (re[1:] - re[:-1])
@@ -227,9 +229,9 @@ def _narrowed(form: OpenLoop, brackets: _Brackets, zooms: int) -> tuple[Any, Any
         L = L.reshape(count, ZOOM, *L.shape[1:])
         k = jnp.argmax(values[0])
         first = jnp.argmax((values[:, :-1] < 0.0) != (values[:, 1:] < 0.0), axis=1)
-        left = first.at[0].set(jnp.maximum(k - 1, 0))
-        right = (first + 1).at[0].set(jnp.minimum(k + 1, ZOOM - 1))
-        return log[index, left], log[index, right], L[index, left]
+        lower = first.at[0].set(jnp.maximum(k - 1, 0))
+        upper = (first + 1).at[0].set(jnp.minimum(k + 1, ZOOM - 1))
+        return log[index, lower], log[index, upper], L[index, lower]
 
     m = form.B.shape[1]
     none = jnp.zeros((count, m, m), jnp.result_type(form.A, jnp.complex64))
@@ -243,19 +245,19 @@ def _values(loop: OpenLoop, still: OpenLoop, brackets: _Brackets, w: Any, stable
     which = np.concatenate([[0], np.tile(np.arange(m), 3)])
     index = np.arange(len(which))
 
-    held = fr.held(still, w)
+    base = fr.held(still, w)
 
     def zero(loop, w):
-        one = _alone(_sensitivity(fr.near(loop, held, w)))[index, which]
-        size = jnp.log(jnp.where(jnp.abs(one) > 0.0, jnp.abs(one), 1.0))
-        return jnp.where(index <= m, jnp.imag(one), size)
+        L = _alone(_sensitivity(fr.near(loop, base, w)))[index, which]
+        size = jnp.log(jnp.where(jnp.abs(L) > 0.0, jnp.abs(L), 1.0))
+        return jnp.where(index <= m, jnp.imag(L), size)
 
     steep = jax.jvp(lambda w: zero(still, w), (w,), (jnp.ones_like(w),))[1]
     steep = jax.lax.stop_gradient(steep)
     moves = brackets.exists & brackets.inside & (index > 0) & (steep != 0.0)
     w = w - jnp.where(moves, zero(loop, w) / jnp.where(steep != 0.0, steep, 1.0), 0.0)
 
-    every = _sensitivity(fr.near(loop, held, w))
+    every = _sensitivity(fr.near(loop, base, w))
     S = every[0]
     u, v, _ = _pair(jax.lax.stop_gradient(S))
     peak = jnp.real(jnp.conj(u) @ S @ v)
@@ -267,14 +269,14 @@ def _margins_of(exists: Any, w: Any, S: Any, peak: Any, stable: Any) -> Margins:
     m = S.shape[1]
     which = np.concatenate([[0], np.tile(np.arange(m), 3)])
     index = np.arange(len(which))
-    one = jnp.where(exists, _alone(S)[index, which], 1.0)  # no zero to divide by
-    size, angle = jnp.log(jnp.abs(one)), jnp.angle(one)
+    L = jnp.where(exists, _alone(S)[index, which], 1.0)  # no zero to divide by
+    size, angle = jnp.log(jnp.abs(L)), jnp.angle(L)
     wrapped = jnp.mod(angle + jnp.pi, 2.0 * jnp.pi)
-    found = jnp.where(
+    values = jnp.where(
         index <= m,
         jnp.exp(jnp.abs(size)),
         jnp.where(index <= 2 * m, jnp.degrees(jnp.pi - jnp.abs(angle)), wrapped / w),
     )
-    found = jnp.where(exists, found, jnp.inf)
+    values = jnp.where(exists, values, jnp.inf)
     parts = lambda v: (v[1 : m + 1], v[m + 1 : 2 * m + 1], v[2 * m + 1 :])
-    return Margins(stable, peak, *parts(found), w[0], *parts(w))
+    return Margins(stable, peak, *parts(values), w[0], *parts(w))

@@ -87,8 +87,8 @@ def _scaled(H, f, G, l, u):
 @solve.defjvp
 def _slope(iterations, primals, tangents):
     (unit, data), (_, moved) = jax.jvp(_scaled, primals, tangents)
-    found = _held(interior_point(*jax.lax.stop_gradient(data), iterations=iterations), *data)
-    return unit * found.x, unit * _implicit(found, data, moved)
+    point = _held(interior_point(*jax.lax.stop_gradient(data), iterations=iterations), *data)
+    return unit * point.x, unit * _implicit(point, data, moved)
 
 
 @jax.custom_jvp
@@ -103,13 +103,13 @@ def _held(point, H, f, G, l, u):
 def _held_slope(primals, tangents):
     point, *data = primals
     moved = tangents[1:]
-    found = _held(point, *data)
-    x, su, sl, lu, ll = found
-    dx = _implicit(found, data, moved)
+    solution = _held(point, *data)
+    x, su, sl, lu, ll = solution
+    dx = _implicit(solution, data, moved)
     dg = data[2] @ dx + moved[2] @ x
     dsu, dsl = moved[4] - dg, dg - moved[3]
     # along the path on which every product s lam stays
-    return found, Point(dx, dsu, dsl, -lu / su * dsu, -ll / sl * dsl)
+    return solution, Point(dx, dsu, dsl, -lu / su * dsu, -ll / sl * dsl)
 
 
 def _implicit(point, data, moved):
@@ -141,10 +141,10 @@ def _implicit(point, data, moved):
             lambda z: normal @ z, right, lambda _, z: substitute(factored, z), symmetric=True
         )
 
-    def corrected(found, _):
-        dx, v = found
-        left, over = a - H @ dx - A.T @ v, b - A @ dx + D * v
-        step = solved(left + A.T @ (over / D))
+    def corrected(solution, _):
+        dx, v = solution
+        rest, over = a - H @ dx - A.T @ v, b - A @ dx + D * v
+        step = solved(rest + A.T @ (over / D))
         return (dx + step, v + (A @ step - over) / D), None
 
     return jax.lax.scan(
@@ -155,9 +155,11 @@ def _implicit(point, data, moved):
 def interior_point(H, f, G, l, u, iterations=MOST):
     """Return the `Point` at which the iterates converge, or the last of `iterations`."""
     x = jnp.zeros_like(f)
-    one = jnp.full(G.shape[0], 0.1, f.dtype)
+    multipliers = jnp.full(G.shape[0], 0.1, f.dtype)
     rounding = 64.0 * jnp.finfo(f.dtype).eps * jnp.maximum(1.0, jnp.maximum(jnp.abs(u), jnp.abs(l)))
-    start = Point(x, jnp.maximum(u - G @ x, 0.1), jnp.maximum(G @ x - l, 0.1), one, one)
+    start = Point(
+        x, jnp.maximum(u - G @ x, 0.1), jnp.maximum(G @ x - l, 0.1), multipliers, multipliers
+    )
     data = H, f, G, l, u
 
     def under_way(state):

@@ -18,8 +18,8 @@ def zero_order_hold(A, B, dt):
     """Return (Ad, Bd) of x' = A x + B u sampled with u held: exp([[A, B], [0, 0]] dt)."""
     n, m = B.shape
     block = jnp.concatenate([jnp.concatenate([A, B], axis=1), jnp.zeros((m, n + m))], axis=0)
-    held = expm(block * dt)
-    return held[:n, :n], held[:n, n:]
+    exponential = expm(block * dt)
+    return exponential[:n, :n], exponential[:n, n:]
 
 
 def lyapunov(A, Q):
@@ -54,9 +54,9 @@ def _riccati_by_sign(A, B, Q, R):
 
     S = jax.lax.fori_loop(0, SIGN_STEPS, newton, Z)
     # the stable subspace [I; P] is the null space of sign + I
-    left = jnp.concatenate([S[:n, n:], S[n:, n:] + jnp.eye(n)])
-    right = -jnp.concatenate([S[:n, :n] + jnp.eye(n), S[n:, :n]])
-    P = _symmetric(jnp.linalg.solve(left.T @ left, left.T @ right))
+    lhs = jnp.concatenate([S[:n, n:], S[n:, n:] + jnp.eye(n)])
+    rhs = -jnp.concatenate([S[:n, :n] + jnp.eye(n), S[n:, :n]])
+    P = _symmetric(jnp.linalg.solve(lhs.T @ lhs, lhs.T @ rhs))
     # the normal equations square the condition number, and one Newton step mends it: the
     # derivatives are taken at the solution
     K = jnp.linalg.solve(R, B.T @ P)

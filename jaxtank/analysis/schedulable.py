@@ -88,9 +88,9 @@ def _outside_the_step(traced, on_setpoint):
 def _in_the_step(traced):
     """Return why a gain cannot be scheduled for what `step` and `track` compute, or None."""
     number, x, r = traced.number, traced.x, traced.r
-    plan, own, state = (found for _, found in traced.before.values())
+    plan, signals, state = (shapes for _, shapes in traced.before.values())
     row = lambda tree: jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape[1:], v.dtype), tree)
-    tick = Tick(t=number, r=r, dr=r, ddr=r, dt=number, plan=row(plan), own=row(own))
+    tick = Tick(t=number, r=r, dr=r, ddr=r, dt=number, plan=row(plan), own=row(signals))
     step, (command, state) = traced.method("step", state, tick, Estimate(x=x, d=x))
     track, _ = traced.method("track", state, tick, command, traced.u)
     absent = parameters(traced.empty).get(traced.gain.split("[")[0], 0.0)

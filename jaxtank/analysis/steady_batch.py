@@ -28,14 +28,14 @@ class SteadyStates:
                 f" {plant.pumps} and {len(plant.outputs)}"
             )
         count = max([1, *(np.shape(v)[0] for v in values.values())])
-        own = {}
+        leaves = {}
         for name in FLOWS:
             value = np.asarray(values.get(name, getattr(plant, name)), dtype=float)
             batched = value if name in values else value[None]
-            own[name] = np.broadcast_to(batched, (count, *batched.shape[1:]))
-        self.plant, self.own = plant, own
+            leaves[name] = np.broadcast_to(batched, (count, *batched.shape[1:]))
+        self.plant, self.own = plant, leaves
         self.inflow = np.broadcast_to(np.asarray(inflow, dtype=float), (count, plant.tanks))
-        self.out, self.efflux, self.pumps = _balance(plant, own)
+        self.out, self.efflux, self.pumps = _balance(plant, leaves)
         self.free = [i for i in range(plant.tanks) if i not in plant.outputs]
         if not plant.pipes:
             self.speeds, self.inputs, self.constant = self._affine()
@@ -128,32 +128,32 @@ class SteadyStates:
         root, steep = _root(x, plant.knee)
         flow = np.einsum("sij,spj->spi", self.efflux, root) * w[..., None] + self.inflow[:, None]
         slope = self.efflux[:, None] * steep[:, :, None] * w[..., None, None]
-        for k, (one, other) in enumerate(plant.pipes):
-            s, ds = _signed_root(x[..., one] - x[..., other], plant.knee)
+        for k, (upper, other) in enumerate(plant.pipes):
+            s, ds = _signed_root(x[..., upper] - x[..., other], plant.knee)
             size = self.own["pipe"][:, k, None] * w
-            for tank, sign in ((one, -1.0), (other, 1.0)):
+            for tank, sign in ((upper, -1.0), (other, 1.0)):
                 flow[..., tank] += sign * size * s
-                slope[..., tank, one] += sign * size * ds
+                slope[..., tank, upper] += sign * size * ds
                 slope[..., tank, other] -= sign * size * ds
         return flow, slope
 
 
-def _balance(plant, own):
+def _balance(plant, leaves):
     """(out (N, n) area of all outlets, efflux (N, n, n), pumps (N, n, m)): flow = efflux @ speeds +
     pumps @ inputs, without pipes.
     """
-    out = np.array(own["drain"])
+    out = np.array(leaves["drain"])
     count, n = out.shape
     efflux, pumps = np.zeros((count, n, n)), np.zeros((count, n, plant.pumps))
     for k, (source, sink) in enumerate(plant.links):
-        out[:, source] += own["orifice"][:, k]
-        efflux[:, sink, source] += own["orifice"][:, k]
+        out[:, source] += leaves["orifice"][:, k]
+        efflux[:, sink, source] += leaves["orifice"][:, k]
     efflux[:, range(n), range(n)] -= out
     for j, (first, second) in enumerate(plant.feeds):
-        share = 1.0 if second is None else own["split"][:, j]
-        pumps[:, first, j] += share * own["pump_gain"][:, j]
+        share = 1.0 if second is None else leaves["split"][:, j]
+        pumps[:, first, j] += share * leaves["pump_gain"][:, j]
         if second is not None:
-            pumps[:, second, j] += (1.0 - share) * own["pump_gain"][:, j]
+            pumps[:, second, j] += (1.0 - share) * leaves["pump_gain"][:, j]
     return out, efflux, pumps
 
 

@@ -93,27 +93,27 @@ def balanced(plant: Any, y: Any, enough: float = 1e-14, inflow: Any = None) -> t
         return x, z[len(free) :] / gain
 
     z = np.concatenate([np.full(len(free), 0.9), np.full(plant.pumps, 1e-3 * scale)])
-    left, damping = system.rates(*split(z)), 1e-4
+    rates, damping = system.rates(*split(z)), 1e-4
     for _ in range(STEPS):
-        if np.max(np.abs(left)) < enough:
+        if np.max(np.abs(rates)) < enough:
             break
         by_x, by_u = system.slopes(split(z)[0])
         by_z = by_x[:, free] @ scipy.sparse.diags_array(2.0 * scale * z[: len(free)])
         jacobian = scipy.sparse.hstack([by_z, by_u / gain], format="csc")
-        normal, slope = jacobian.T @ jacobian, jacobian.T @ left
+        normal, slope = jacobian.T @ jacobian, jacobian.T @ rates
         diagonal = normal.diagonal()
         weights = scipy.sparse.diags_array(np.maximum(diagonal, 1e-12 * diagonal.max()))
         while damping < 1e12:
             step = scipy.sparse.linalg.spsolve((normal + damping * weights).tocsc(), slope)
             moved = z - step
             now = system.rates(*split(moved))
-            if np.linalg.norm(now) < np.linalg.norm(left):
-                z, left, damping = moved, now, max(1e-16, 0.1 * damping)
+            if np.linalg.norm(now) < np.linalg.norm(rates):
+                z, rates, damping = moved, now, max(1e-16, 0.1 * damping)
                 break
             damping *= 10.0
         else:
             break
-    return (*split(z), left)
+    return (*split(z), rates)
 
 
 def responses(plant, xp, inflow=None):
@@ -289,7 +289,7 @@ def steady_along(
     if plant.tanks >= vectors.FROM:
         speeds, inputs = (part @ jnp.stack(roots) for part in responses(plant, jnp, inflow))
         return tuple((w * speeds) ** 2 / (2.0 * plant.gravity)), tuple(w * inputs)
-    parts: list[Any] = [_from_known_speeds(plant, w * one) for one in np.eye(len(r))]
+    parts: list[Any] = [_from_known_speeds(plant, w * root) for root in np.eye(len(r))]
     if inflow is not None:
         alone = _from_known_speeds(plant, jnp.zeros(len(r)), inflow=inflow)
         parts.append(tuple(w * part for part in alone))
@@ -435,14 +435,14 @@ def _balanced(plant, y, words, inflow):
         # an area of 1e-300, say, overflows on the way: the check below reports it
         with np.errstate(all="ignore"):
             many = plant.tanks >= vectors.FROM
-            x, u, left = (
+            x, u, rates = (
                 balanced(plant, y, 1e-5 * tolerance, inflow)
                 if many
                 else _by_dense(plant, y, inflow)
             )
     except (ValueError, np.linalg.LinAlgError):  # not finite where it starts, or on the way
         raise EquilibriumError(f"{words} have no steady state") from None
-    if not np.max(np.abs(left)) < tolerance:
+    if not np.max(np.abs(rates)) < tolerance:
         raise EquilibriumError(f"{words} have no steady state")
     return x, u
 
@@ -470,7 +470,7 @@ def _by_dense(plant, y, inflow):
         return np.concatenate([by_x[:, free] * (2.0 * scale * z[: len(free)]), by_u / gain], axis=1)
 
     start = np.concatenate([np.full(len(free), 0.9), np.full(plant.pumps, 1e-3 * scale)])
-    found = scipy.optimize.least_squares(
+    solution = scipy.optimize.least_squares(
         residual,
         start,
         jac=jacobian,
@@ -480,4 +480,4 @@ def _by_dense(plant, y, inflow):
         x_scale="jac",
         max_nfev=500,
     )
-    return (*split(found.x), found.fun)
+    return (*split(solution.x), solution.fun)

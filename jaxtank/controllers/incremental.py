@@ -207,16 +207,16 @@ class LinearPredictive(Controller):
             )
         )
         for i, (low, high, before, bottom, top) in enumerate(pumps):
-            own = f"controller.u_low = {low:g} {unit} to controller.u_high = {high:g} {unit}"
+            limits = f"controller.u_low = {low:g} {unit} to controller.u_high = {high:g} {unit}"
             if not low <= before <= high:
                 raise InputError(
                     f"actuator.initial[{i}] = {before:g} {unit}: must lie within the limits of a"
-                    f" constrained controller, {own}"
+                    f" constrained controller, {limits}"
                 )
             if bottom > high or top < low:
                 raise InputError(
                     f"actuator.low[{i}] = {bottom:g} {unit} to {top:g} {unit}: must meet the limits"
-                    f" of a constrained controller, {own}"
+                    f" of a constrained controller, {limits}"
                 )
 
     def check(self, reference: Signal) -> None:
@@ -227,8 +227,8 @@ class LinearPredictive(Controller):
                 f"controller.operating_point has shape {point.shape}: must be ({n},), one level per"
                 " tank"
             )
-        for one, other in self.model.pipes:
-            if not abs(point[one] - point[other]) > 10 * self.model.knee:
+        for first, second in self.model.pipes:
+            if not abs(point[first] - point[second]) > 10 * self.model.knee:
                 raise InputError(
                     f"controller.operating_point = {point} {length}: levels joined by a pipe must"
                     f" differ by more than {10 * self.model.knee:g} {length}, the model has no"

@@ -200,7 +200,7 @@ class PID(Controller):
         # of one loop an infinite Ti is None; of several, 1 s stands in and the integral stays 0
         several = np.shape(self.Ti)[-1:] != (1,)
         finite = lambda Ti: jnp.where(jnp.isinf(Ti), 1.0, Ti) if several else Ti
-        kept = lambda Ti, i: jnp.where(jnp.isinf(Ti), 0.0, i) if several else i
+        unless_infinite = lambda Ti, i: jnp.where(jnp.isinf(Ti), 0.0, i) if several else i
         w = each(
             lambda v, u, e, Ti, Tt, Kc: e + (finite(Ti) / (Tt * Kc)) * (u - v),
             command,
@@ -212,7 +212,7 @@ class PID(Controller):
         )
         if self.order is None:
             integral = each(
-                lambda w, i, Kc, Ti: kept(Ti, i + (tick.dt * Kc / finite(Ti)) * w),
+                lambda w, i, Kc, Ti: unless_infinite(Ti, i + (tick.dt * Kc / finite(Ti)) * w),
                 w,
                 state.integral,
                 self.Kc,

@@ -87,9 +87,9 @@ def pointwise(method: F) -> F:
 def is_pointwise(part: Any) -> bool:
     """Return whether a component, with all inside it, can be asked for its samples by chunks."""
     cls = cast(Any, type(part))
-    asked = [getattr(cls, name) for name in METHODS if hasattr(cls, name)]
+    methods = [getattr(cls, name) for name in METHODS if hasattr(cls, name)]
     inside = [getattr(part, field.name) for field in dataclasses.fields(part)]
-    return all(hasattr(method, "pointwise") for method in asked) and all(
+    return all(hasattr(method, "pointwise") for method in methods) and all(
         map(is_pointwise, filter(dataclasses.is_dataclass, inside))
     )
 
@@ -102,8 +102,8 @@ def _meta(
     strict: bool = False,
     choices: tuple[str, ...] | None = None,
 ) -> dict[str, Any]:
-    found = {"unit": unit, "doc": doc, "low": low, "high": high}
-    return {**found, "strict": strict, "choices": choices}
+    meta = {"unit": unit, "doc": doc, "low": low, "high": high}
+    return {**meta, "strict": strict, "choices": choices}
 
 
 CLOCK = {  # what each field is, as metadata of a component's fields

@@ -113,12 +113,12 @@ def check_folder(path: str | os.PathLike[str]) -> None:
 def refusal(path: str | os.PathLike[str], largest: int) -> str | None:
     """Return why a file is not to be read, or None."""
     # A folder, a device or a pipe, which may never end, is not read.
-    found = os.stat(path)
-    if not stat.S_ISREG(found.st_mode):
+    reason = os.stat(path)
+    if not stat.S_ISREG(reason.st_mode):
         return "is not a file"
     return (
-        f"has {found.st_size} bytes: at most {largest} are read"
-        if found.st_size > largest
+        f"has {reason.st_size} bytes: at most {largest} are read"
+        if reason.st_size > largest
         else None
     )
 

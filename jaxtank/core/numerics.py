@@ -64,8 +64,8 @@ def smooth_signed_sqrt_slope(x: Real, threshold: float = LAMINAR_THRESHOLD) -> j
 def limited_sqrt(h: Real, threshold: float, supply: Real) -> jax.Array:
     """Return the smaller of `smooth_sqrt(h, threshold)` and supply h; 0 below an empty tank."""
     # Slope `supply` at h = 0, the one from above: a level comes no lower.
-    held = lower_clip(h, 0.0)
-    q, most = cast(jax.Array, smooth_sqrt(held, threshold)), supply * held
+    level = lower_clip(h, 0.0)
+    q, most = cast(jax.Array, smooth_sqrt(level, threshold)), supply * level
     return jnp.where(most <= q, most, q)
 
 

@@ -19,9 +19,9 @@ def check_key(key: Any) -> None:
     ):
         return
     if key is not None:
-        given = f"has shape {key.shape}" if typed else f"is a {type(key).__name__}"
+        words = f"has shape {key.shape}" if typed else f"is a {type(key).__name__}"
         raise InputError(
-            f"key {given}: must be one random key, as jax.random.key(0), or None where there is no"
+            f"key {words}: must be one random key, as jax.random.key(0), or None where there is no"
             " noise"
         )
 

@@ -261,8 +261,8 @@ def walk(
         if is_component(value):
             yield from walk(value, f"{name}.", kind, units)
         elif field.metadata.get("kind") == kind:
-            own: Meta = tree.metadata_of(field.name) if hasattr(tree, "metadata_of") else {}
-            yield name, value, _localised({**field.metadata, **own}, units)
+            inside: Meta = tree.metadata_of(field.name) if hasattr(tree, "metadata_of") else {}
+            yield name, value, _localised({**field.metadata, **inside}, units)
 
 
 def parameters(tree: Any) -> dict[str, Any]:
@@ -426,12 +426,12 @@ def _fitted(old: Any, index: tuple[int, ...], value: Any, name: str) -> Any:
         return value
     if np.ndim(value) == 0:
         return jnp.broadcast_to(value, shape) if on_device else np.full(shape, value)
-    wanted = (
+    expected = (
         f"must be a number or shape {shape}"
         if shape
         else "must be one number, its decimals after a point"
     )
-    raise InputError(f"{name} has shape {np.shape(value)}: {wanted}")
+    raise InputError(f"{name} has shape {np.shape(value)}: {expected}")
 
 
 def _real(old: Any, value: Any, name: str, on_device: bool) -> Any:
@@ -445,5 +445,5 @@ def _real(old: Any, value: Any, name: str, on_device: bool) -> Any:
             )
     except (TypeError, ValueError, OverflowError):
         pass
-    wanted = "must be a real number" + ("" if np.ndim(old) == 0 else " or a list of real numbers")
-    raise InputError(f"{name} = {shortened(value)}: {wanted}")
+    expected = "must be a real number" + ("" if np.ndim(old) == 0 else " or a list of real numbers")
+    raise InputError(f"{name} = {shortened(value)}: {expected}")

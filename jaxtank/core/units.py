@@ -85,9 +85,9 @@ def check_unit(where: str, text: str) -> str:
     product = rf"{factor}(?:{joint}{factor})*"
     term = rf"(?:{factor}|\({product}\)(?:\^-?\d+)?)"
     if len(text) > LONGEST or not re.fullmatch(rf"-|{term}(?:{joint}{term})*", text):
-        shown = text if len(text) <= LONGEST else text[:LONGEST] + "..."
+        start = text if len(text) <= LONGEST else text[:LONGEST] + "..."
         raise InputError(
-            f"{where} = {shown!r}: must be a unit of at most {LONGEST} characters, such as cm,"
+            f"{where} = {start!r}: must be a unit of at most {LONGEST} characters, such as cm,"
             " L/min, m^3/s or cm^3/(s V): names joined by *, / or a space, ^ before an exponent"
         )
     return text

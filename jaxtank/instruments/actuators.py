@@ -214,8 +214,8 @@ class PumpBank(Actuator):
                 due = v + owed / dt
                 turning = v > least
                 paid = jnp.where(turning, v, jnp.where(due >= pulse, pulse, 0.0))
-                left = jax.lax.stop_gradient(jnp.where(turning, owed, (due - paid) * dt))
-                return v + jax.lax.stop_gradient(paid - v), left
+                remainder = jax.lax.stop_gradient(jnp.where(turning, owed, (due - paid) * dt))
+                return v + jax.lax.stop_gradient(paid - v), remainder
 
             paid, owed = unzipped(u, each(pay, u, state.owed, self.dead_zone, self.pulse))
             return paid, state._replace(owed=owed)

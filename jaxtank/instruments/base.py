@@ -90,8 +90,12 @@ class Sensor(abc.ABC):
         -------
         (n,) arrays (samples,); None without a key, and for a sensor without noise
         """
-        found = self.deviates(key, samples, piece)
-        return None if found is None else tuple(found[i] for i in range(np.shape(self.noise)[-1]))
+        deviates = self.deviates(key, samples, piece)
+        return (
+            None
+            if deviates is None
+            else tuple(deviates[i] for i in range(np.shape(self.noise)[-1]))
+        )
 
     def deviates(
         self, key: jax.Array | None, samples: int, piece: ArrayLike | None = None
@@ -102,20 +106,20 @@ class Sensor(abc.ABC):
         tanks = np.shape(self.noise)[-1]
         if jnp.issubdtype(key.dtype, jnp.floating):
             return key
-        drawn = lambda key, count: normal(key, (tanks, count))
+        normals = lambda key, count: normal(key, (tanks, count))
         if piece is not None:
-            return drawn(jax.random.fold_in(key, piece), samples)
+            return normals(jax.random.fold_in(key, piece), samples)
         if samples <= CHUNK:
-            return drawn(key, samples)
+            return normals(key, samples)
         whole, last = divmod(samples, CHUNK)
-        chunks = jax.vmap(lambda b: drawn(jax.random.fold_in(key, b), CHUNK))(jnp.arange(whole))
-        remainder = drawn(jax.random.fold_in(key, whole), last)
+        chunks = jax.vmap(lambda b: normals(jax.random.fold_in(key, b), CHUNK))(jnp.arange(whole))
+        remainder = normals(jax.random.fold_in(key, whole), last)
         return jnp.concatenate([jnp.moveaxis(chunks, 1, 0).reshape(tanks, -1), remainder], axis=1)
 
     def draws_in_loop(self, key: Any) -> bool:
         """Return whether `draw_sample` gives the deviates of `draw`, for a key of a run."""
-        own = type(self).draw is not Sensor.draw
-        return key is not None and np.ndim(self.noise) > 0 and not own and is_fast(key)
+        custom = type(self).draw is not Sensor.draw
+        return key is not None and np.ndim(self.noise) > 0 and not custom and is_fast(key)
 
     def draw_sample(self, key: Any, samples: int, k: Any, arrays: bool = False) -> Any:
         """Return the (n,) deviates that `draw` gives sample k of `samples`, and those alone, as a

@@ -12,10 +12,12 @@ from jaxtank.core.vectors import each
 from jaxtank.instruments.base import Sensor
 
 
-def _without_adc(own, value):
+def _without_adc(fields, value):
     """`value` for a leaf of an ADC that is left out. Raises InputError where there is an ADC."""
-    if own.get("bits", 0):
-        raise InputError(f"sensor.bits = {own['bits']}: an ADC needs its gain and its full_scale")
+    if fields.get("bits", 0):
+        raise InputError(
+            f"sensor.bits = {fields['bits']}: an ADC needs its gain and its full_scale"
+        )
     return value
 
 

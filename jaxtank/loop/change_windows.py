@@ -25,15 +25,15 @@ def windows(loop: Any, times: Any, arrays: bool = False) -> Any:
     reference: Any = loop.reference
     if arrays and serves_arrays(reference):
         return _array_windows(loop, times)
-    found = reference.windows(times)
+    channels = reference.windows(times)
     band = getattr(reference, "band", None)
-    if found is not None and band is not None:
+    if channels is not None and band is not None:
         moved, t = {channel for _, channel in reference.changes}, sample_times(times)
-        found = tuple(
+        channels = tuple(
             window if i in moved else _from_start(window, t, loop.x0[output], band)
-            for i, (output, window) in enumerate(zip(loop.plant.outputs, found))
+            for i, (output, window) in enumerate(zip(loop.plant.outputs, channels))
         )
-    return found if found is None or not arrays else tuple(columns(v) for v in zip(*found))
+    return channels if channels is None or not arrays else tuple(columns(v) for v in zip(*channels))
 
 
 def _array_windows(loop: Any, times: Any) -> Any:
@@ -41,12 +41,12 @@ def _array_windows(loop: Any, times: Any) -> Any:
     reference: Any = loop.reference
     if reference.changes is None:
         return None
-    found = reference.window_arrays(times)
+    channels = reference.window_arrays(times)
     still = np.ones(reference.channels, dtype=bool)
     still[[channel for _, channel in reference.changes]] = False
     level = take(jnp.asarray(loop.x0), loop.plant.outputs)
-    first = _from_start(found, sample_times(times)[:, None], level, reference.band)
-    return tuple(jnp.where(still, a, b) for a, b in zip(first, found))
+    first = _from_start(channels, sample_times(times)[:, None], level, reference.band)
+    return tuple(jnp.where(still, a, b) for a, b in zip(first, channels))
 
 
 def _from_start(window: Any, t: Any, level: Any, band: float) -> Any:

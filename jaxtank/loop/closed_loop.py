@@ -139,10 +139,10 @@ def _drawn(sensor: Sensor, key: Any, times: Any, batch: Any, arrays: bool) -> Gr
     if not arrays:
         return sensor.draw(key, times.samples, batch)
     if type(sensor).draw is Sensor.draw:
-        found = sensor.deviates(key, times.samples, batch)
-        return None if found is None else found.T
-    drawn = sensor.draw(key, times.samples, batch)
-    return None if drawn is None else columns(drawn)
+        deviates = sensor.deviates(key, times.samples, batch)
+        return None if deviates is None else deviates.T
+    deviates_of_channels = sensor.draw(key, times.samples, batch)
+    return None if deviates_of_channels is None else columns(deviates_of_channels)
 
 
 def inputs_at(
@@ -181,15 +181,15 @@ def _rows_of(signals: Group) -> tuple[Any, ...]:
 
 def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Group) -> ms.Context:
     """What the measures `names` refer to besides the sample, for setpoints `r`."""
-    wanted, window = ms.refers_to(names), None
-    if "window" in wanted:
+    fields, window = ms.refers_to(names), None
+    if "window" in fields:
         window = windows(loop, times, is_array(r))
         if window is None:
             raise InputError(
                 "overshoot, rise and settling need a reference that changes (signals.Ramps)"
             )
     since = None if loop.disturbance is None else loop.disturbance.since(times)
-    if since is None and "since" in wanted:
+    if since is None and "since" in fields:
         raise InputError(
             "recovery_time needs a disturbance with a beginning (signals.InflowPulses)"
         )
@@ -201,20 +201,20 @@ def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Group) -> 
             return jnp.where(recovering, 0.0, v)
 
         window = jax.tree.map(waiting, window)
-    steady = _steady_inputs(loop, r) if "steady" in wanted else None
+    steady = _steady_inputs(loop, r) if "steady" in fields else None
     return ms.Context(window=window, since=since, steady=steady)
 
 
 def _steady_inputs(loop: ClosedLoop, r: Group) -> Any:
     if not ms.serves("input_deviation", loop):
         raise InputError("input_deviation needs a rig without pipes, with as many pumps as outputs")
-    held, offset = (
+    inputs, offset = (
         steady_along(loop.plant, _rows_of(r), steady_inflow(loop))[1],
         loop.actuator.offset,
     )
     if np.ndim(offset):
-        held = tuple(u + offset[i] for i, u in enumerate(held))
-    return columns(held) if is_array(r) else held
+        inputs = tuple(u + offset[i] for i, u in enumerate(inputs))
+    return columns(inputs) if is_array(r) else inputs
 
 
 def initial(loop: ClosedLoop, clock: Clock, arrays: bool = False) -> State:
@@ -293,8 +293,8 @@ def zero_of(loop: ClosedLoop) -> jax.Array:
     """Return 0.0 of the type in which the run is done: that of the most precise of the loop's
     leaves. Warns of float32, and what it costs.
     """
-    found = [v for v in jax.tree.leaves(loop) if jnp.issubdtype(jnp.result_type(v), jnp.floating)]
-    dtype = jnp.result_type(*found) if found else jnp.result_type(float)
+    floats = [v for v in jax.tree.leaves(loop) if jnp.issubdtype(jnp.result_type(v), jnp.floating)]
+    dtype = jnp.result_type(*floats) if floats else jnp.result_type(float)
     if dtype == jnp.float32:
         _warn_float32()
     return jnp.zeros((), dtype)

@@ -76,20 +76,20 @@ def sensitivities_compiled(
         return _with_functions(loop, clock, names, order, values, key, squares, batched)
     flat, unflatten = ravel_pytree(values)
     arrays, axis, axes = _form_of(loop)
-    kept = tuple(dict.fromkeys([*names, *(m for m, _ in squares)]))
+    computed = tuple(dict.fromkeys([*names, *(m for m, _ in squares)]))
     basis = jnp.eye(flat.size, dtype=flat.dtype)
 
     def at(theta: Any) -> ClosedLoop:
         return with_values(loop, dict(zip(order, unflatten(theta))))
 
     def sampled(theta: Any) -> Any:
-        return inputs(at(theta), clock, kept, key, arrays=arrays)
+        return inputs(at(theta), clock, computed, key, arrays=arrays)
 
     known = _dependent(sampled, flat)
-    carried = _floats_of(jax.eval_shape(lambda: _start(loop, clock, kept, arrays)))
+    carried = _floats_of(jax.eval_shape(lambda: _start(loop, clock, computed, arrays)))
 
     def begin(theta: Any) -> Any:
-        floats, rest = carried.split(_start(keyed(at(theta), key), clock, kept, arrays))
+        floats, rest = carried.split(_start(keyed(at(theta), key), clock, computed, arrays))
         moving, fixed = known.split(sampled(theta))
         return (floats, moving), (rest, fixed)
 
@@ -101,10 +101,10 @@ def sensitivities_compiled(
         (floats, dfloats, rest, matrix), (moving, dmoving, fixed) = carry, now
 
         def advance(floats: Any, theta: Any, moving: Any) -> Any:
-            here = at(theta)
-            run, now = run_of(here, clock, arrays), known.join(moving, fixed)
+            loop_at = at(theta)
+            run, now = run_of(loop_at, clock, arrays), known.join(moving, fixed)
             state, acc = carried.join(floats, rest)
-            state, sample = step(here, clock, state, now)
+            state, sample = step(loop_at, clock, state, now)
             errors = ms.residuals(run, acc, sample, now.context, squares)
             floats, others = carried.split((state, ms.update(run, acc, sample, now.context)))
             return (floats, errors), others
@@ -142,16 +142,16 @@ def _with_functions(
     def at(theta: Any) -> ClosedLoop:
         return with_values(loop, dict(zip(order, unflatten(theta))))
 
-    kept = needed_by(at(flat), clock, names)
-    known = sensitivities_compiled(loop, clock, kept, order, values, key, squares, batched)
+    read_measures = needed_by(at(flat), clock, names)
+    known = sensitivities_compiled(loop, clock, read_measures, order, values, key, squares, batched)
     measures, slopes, matrix, broken = known
 
     def functions(measures: Any, theta: Any) -> Any:
         return values_of(at(theta), clock, names, key, measures), None
 
     basis = jnp.eye(flat.size, dtype=flat.dtype)
-    found, rates, _ = _pushed(functions, (measures, flat), slopes, basis)
-    return found, rates, matrix, broken
+    results, rates, _ = _pushed(functions, (measures, flat), slopes, basis)
+    return results, rates, matrix, broken
 
 
 def _form_of(loop: ClosedLoop) -> tuple[bool, int, tuple[int, int]]:

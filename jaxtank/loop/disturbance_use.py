@@ -32,9 +32,9 @@ def is_unused(loop: ClosedLoop) -> bool:
         return False
     along = tuple(jax.ShapeDtypeStruct((1,), number.dtype) for _ in r)
     plan: Any = jax.eval_shape(loop.controller.prepare, along, along, along)
-    own: Any = jax.eval_shape(lambda: loop.controller.inputs(Clock(dt=1.0, duration=0.0)))
-    plan, own = jax.tree.map(_row, (plan, own))
-    tick = Tick(t=number, r=r, dr=r, ddr=r, dt=number, plan=plan, own=own)
+    signals: Any = jax.eval_shape(lambda: loop.controller.inputs(Clock(dt=1.0, duration=0.0)))
+    plan, signals = jax.tree.map(_row, (plan, signals))
+    tick = Tick(t=number, r=r, dr=r, ddr=r, dt=number, plan=plan, own=signals)
 
     def decided(d: Any, x: Any, u: Any, tick: Any) -> Any:
         return loop.controller.step(loop.controller.init(x, u), tick, Estimate(x=x, d=d))

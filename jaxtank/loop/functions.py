@@ -52,9 +52,9 @@ def needed_by(loop: ClosedLoop, clock: Clock, names: tuple[str, ...]) -> tuple[s
     """Return those of `names` that are kept along with the run, and those that functions among
     `names` read.
     """
-    own = ms.functions(names)
-    read = (m for name, spec in own.items() for m in _read_by(loop, clock, name, spec))
-    return tuple(dict.fromkeys([*(n for n in names if n not in own), *read]))
+    functions = ms.functions(names)
+    read = (m for name, spec in functions.items() for m in _read_by(loop, clock, name, spec))
+    return tuple(dict.fromkeys([*(n for n in names if n not in functions), *read]))
 
 
 _PROGRAMS: dict[Any, str] = {}
@@ -88,17 +88,17 @@ def values_of(
     """Return {name: value} of `names`: those of `measures`, and functions of them and of
     the run.
     """
-    own, served, zero = ms.functions(names), _served(loop), zero_of(loop)
+    functions, served, zero = ms.functions(names), _served(loop), zero_of(loop)
     rows: dict[int, Any] = {}
-    for spec in own.values():
+    for spec in functions.values():
         if spec.trajectory and spec.save_every not in rows:
             every = min(spec.save_every, clock.samples)
             rows[spec.save_every] = simulate_compiled(loop, clock, key, every, checkpoint)[0]
-    found = {name: measures[name] for name in names if name not in own}
-    for name, spec in own.items():
+    results = {name: measures[name] for name in names if name not in functions}
+    for name, spec in functions.items():
         value = _called(name, spec, Measures(measures, served), rows.get(spec.save_every))
-        found[name] = jnp.asarray(value, zero.dtype)
-    return {name: found[name] for name in names}
+        results[name] = jnp.asarray(value, zero.dtype)
+    return {name: results[name] for name in names}
 
 
 def program_of(loop: ClosedLoop, clock: Clock, name: str) -> str:
@@ -167,8 +167,8 @@ def _refuse(name: str, why: str) -> NoReturn:
 
 def _served(loop: ClosedLoop) -> tuple[str, ...]:
     """The measures that are kept along with a run of the loop."""
-    own = ms.functions(ms.MEASURES)
-    return tuple(m for m in ms.MEASURES if m not in own and ms.serves(m, loop))
+    functions = ms.functions(ms.MEASURES)
+    return tuple(m for m in ms.MEASURES if m not in functions and ms.serves(m, loop))
 
 
 def _shapes(loop: ClosedLoop) -> dict[str, Any]:

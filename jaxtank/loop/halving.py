@@ -42,27 +42,28 @@ def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> l
     time = float(run.t[np.argmax(apart[:, tank])])
     if not errors[tank] > 1.0:
         return []
-    found = (
+    sentence = (
         f"with half the step, {0.5 * clock.dt / clock.substeps:g} s, the level of tank {tank + 1}"
         f" differs by {apart[:, tank].max():.3g} {length} at t = {time:g} s"
     )
     if errors[tank] > MAX_ERROR:
-        remedy = max(unstable, key=lambda one: one.height).remedy
+        remedy = max(unstable, key=lambda item: item.height).remedy
+        tanks = ", ".join(str(item.tank + 1) for item in unstable)
         raise InputError(
-            f"clock.dt = {clock.dt:g} s: steps too long to follow tank"
-            f" {', '.join(str(one.tank + 1) for one in unstable)}, near empty: {found}: {remedy}"
+            f"clock.dt = {clock.dt:g} s: steps too long to follow tank {tanks}, near empty:"
+            f" {sentence}: {remedy}"
         )
     inputs = np.abs(np.asarray(run.u) - np.asarray(half.u)).max(axis=0)
     pump = int(np.argmax(inputs))
-    found += f", the input of pump {pump + 1} by {inputs[pump]:.3g} {loop.units[1]}"
-    return [", ".join([found, *_changed(loop, clock, finer, key)])]
+    sentence += f", the input of pump {pump + 1} by {inputs[pump]:.3g} {loop.units[1]}"
+    return [", ".join([sentence, *_changed(loop, clock, finer, key)])]
 
 
 def _changed(loop: ClosedLoop, clock: Clock, finer: Clock, key: Any) -> list[str]:
     """Return up to MOST phrases, largest relative change first: "rms_error of output 1 is ..."."""
     names = tuple(m for m in ms.placed("summary") if ms.serves(m, loop))
     values, half = (evaluate_and_flag(loop, c, names, key)[0] for c in (clock, finer))
-    found: list[tuple[float, str]] = []
+    differences: list[tuple[float, str]] = []
     for name in names:
         pairs = np.column_stack([np.ravel(values[name]), np.ravel(half[name])])
         for i, (value, better) in enumerate(pairs):
@@ -72,5 +73,5 @@ def _changed(loop: ClosedLoop, clock: Clock, finer: Clock, key: Any) -> list[str
                 of = name if per == "run" else f"{name} of {per} {i + 1}"
                 unit = "" if unit == "-" else f" {unit}"
                 words = f"{of} is {better:.3g}{unit} in place of {value:.3g}{unit}"
-                found.append((abs(value - better) / size, words))
-    return [words for _, words in sorted(found, reverse=True)[:MOST]]
+                differences.append((abs(value - better) / size, words))
+    return [words for _, words in sorted(differences, reverse=True)[:MOST]]

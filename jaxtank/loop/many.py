@@ -110,8 +110,8 @@ def _count(loop: ClosedLoop, rows: Mapping[str, jax.Array], batch: Any) -> int:
             check_value(name, np.asarray(value), describe(loop, name))
     counts = {name: value.shape[0] for name, value in rows.items()}
     if len(set(counts.values())) > 1:
-        found = ", ".join(f"{n} of {name}" for name, n in counts.items())
-        raise InputError(f"values have rows for different numbers of runs: {found}")
+        lengths = ", ".join(f"{n} of {name}" for name, n in counts.items())
+        raise InputError(f"values have rows for different numbers of runs: {lengths}")
     return next(iter(counts.values()))
 
 

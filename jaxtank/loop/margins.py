@@ -76,8 +76,8 @@ def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
     # which a sample changes nothing, of a stable and of an unstable loop; derivatives are those of
     # the implicit function. Where a steady state cannot be used (`why`), A, B and C are 0.
     quiet, dead = _without_limits(loop, clock)
-    found, alone = _rest(clock, quiet, r), _plant_at_rest(quiet, r)
-    (closed, B, C, after, u), s, kink = found.slopes, found.s, found.kink
+    rest, alone = _rest(clock, quiet, r), _plant_at_rest(quiet, r)
+    (closed, B, C, after, u), s, kink = rest.slopes, rest.s, rest.kink
     x = s[: loop.plant.tanks]  # the first numbers of a State
     moved = jnp.abs(after - s) > 1e-8 * jnp.abs(s) + 1e-10 * jnp.max(jnp.abs(s))
     finite = [jnp.all(jnp.isfinite(v)) for v in (s, closed, B, C)]
@@ -92,7 +92,7 @@ def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
         jnp.any(volts >= jnp.asarray(bank.high)) | jnp.any(volts <= low),
         kink,
         lost,
-        found.counts,
+        rest.counts,
         jnp.all(C == 0.0),
     ]
     why = jnp.select(checks, list(range(1, len(REASONS))), 0)
@@ -130,8 +130,8 @@ def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
     where Newton's method of the loop starts. Levels that are not controlled start at the mean
     setpoint, and are at least halved by a step that would empty them.
     """
-    own, inflow, actuator = loop.plant, steady_inflow(loop), loop.actuator
-    plant, r, inflow, offset = jax.lax.stop_gradient((own, r, inflow, actuator.offset))
+    given_plant, inflow, actuator = loop.plant, steady_inflow(loop), loop.actuator
+    plant, r, inflow, offset = jax.lax.stop_gradient((given_plant, r, inflow, actuator.offset))
     outputs = np.array(plant.outputs)
     free = np.array([i for i in range(plant.tanks) if i not in plant.outputs], dtype=int)
     x = jnp.full(plant.tanks, jnp.mean(jnp.abs(r))).at[outputs].set(r)
@@ -166,10 +166,10 @@ class _Sample:
     def __init__(self, loop: ClosedLoop, clock: Clock, r: Any, guess: tuple[Any, Any]):
         x, u = guess
         actuator: Any = loop.actuator
-        here: Any = dataclasses.replace(actuator, initial=u)
+        started: Any = dataclasses.replace(actuator, initial=u)
         self.loop, self.clock = loop, clock
         self.now = _constant_inputs(loop, clock, r)
-        first = initial(dataclasses.replace(loop, x0=x, actuator=here), clock)
+        first = initial(dataclasses.replace(loop, x0=x, actuator=started), clock)
         leaves, self.structure = jax.tree.flatten(first)
         self.moving = [bool(jnp.issubdtype(v.dtype, jnp.floating)) for v in leaves]
         self.shapes = [v.shape for v, m in zip(leaves, self.moving) if m]
@@ -198,17 +198,17 @@ class _Sample:
         y, sensor = loop.sensor.step(state.sensor, state.x, None, self.clock.dt)
         t = jnp.zeros_like(state.x[0])
         tick = Tick(t, now.r, now.dr, now.ddr, self.clock.dt, now.plan, now.own)
-        made = decide(loop, state.observer, state.controller, tick, y)
-        parts = dict(observer=made.observer, controller=made.controller, sensor=sensor)
-        return state._replace(**parts), made.applied
+        decision = decide(loop, state.observer, state.controller, tick, y)
+        parts = dict(observer=decision.observer, controller=decision.controller, sensor=sensor)
+        return state._replace(**parts), decision.applied
 
     def after(self, s: Any, w: Any) -> tuple[Any, Any]:
         """(state after a sample, (m,) inputs that the loop applies) with w (m,) added to them on
         their way to the pumps.
         """
         state, applied = self.decided(s)
-        given = tuple(a + v for a, v in zip(applied, w))
-        moved = move(self.loop, self.clock, state, given, self.now)[0]
+        inputs = tuple(a + v for a, v in zip(applied, w))
+        moved = move(self.loop, self.clock, state, inputs, self.now)[0]
         leaves: list[Any] = jax.tree.leaves(moved._replace(k=state.k))
         rest = [v for v, m in zip(leaves, self.moving) if not m]
         self.counts = any(a is not b for a, b in zip(rest, self.still))
@@ -218,12 +218,12 @@ class _Sample:
         """What `after` returns, and its derivatives."""
 
         def both(s: Any, w: Any) -> Any:
-            found = self.after(s, w)
-            return found, found
+            results = self.after(s, w)
+            return results, results
 
         jacobian: Any = jax.jacfwd(both, argnums=(0, 1), has_aux=True)
-        found: Any = jacobian(s, jnp.zeros(self.loop.plant.pumps, s.dtype))
-        ((closed, B), (C, _)), (after, applied) = found
+        results: Any = jacobian(s, jnp.zeros(self.loop.plant.pumps, s.dtype))
+        ((closed, B), (C, _)), (after, applied) = results
         return _Slopes(closed, B, C, after, applied)
 
 
@@ -251,12 +251,12 @@ def _constant_inputs(loop: ClosedLoop, clock: Clock, r: Any) -> Inputs:
     columns = tuple(v[None] for v in r)
     zero = tuple(jnp.zeros_like(v) for v in columns)
     plan = loop.controller.prepare(columns, zero, zero)
-    own = loop.controller.inputs(dataclasses.replace(clock, duration=clock.dt))
-    rows: Any = (columns, zero, zero, plan, own)
-    r, dr, ddr, plan, own = jax.tree.map(_first, rows)
+    signals = loop.controller.inputs(dataclasses.replace(clock, duration=clock.dt))
+    rows: Any = (columns, zero, zero, plan, signals)
+    r, dr, ddr, plan, signals = jax.tree.map(_first, rows)
     inflow = steady_inflow(loop)
     d = None if inflow is None else tuple(inflow[i] for i in range(loop.plant.tanks))
-    return Inputs(r, dr, ddr, d, None, Context(), plan, own, None)
+    return Inputs(r, dr, ddr, d, None, Context(), plan, signals, None)
 
 
 def _first(a: Any) -> Any:
@@ -274,46 +274,46 @@ def _rest(clock: Clock, loop: ClosedLoop, r: Any) -> _Rest:
     share = jnp.finfo(eye.dtype).eps ** (1.0 / 3.0)
 
     def body(state: Any, k: Any) -> Any:
-        point, s, held, kink = state
-        found = sample.slopes(point)
-        kink = kink | ((k > LOOP_STEPS) & _differs(found, held, point - s))
+        point, s, reference, kink = state
+        sampled = sample.slopes(point)
+        kink = kink | ((k > LOOP_STEPS) & _differs(sampled, reference, point - s))
         searching = k <= LOOP_STEPS
-        held = jax.tree.map(lambda a, b: jnp.where(searching, a, b), found, held)
+        reference = jax.tree.map(lambda a, b: jnp.where(searching, a, b), sampled, reference)
         s = jnp.where(searching, point, s)
-        newton = s + solve(eye - found.closed, (found.after - s)[:, None])[:, 0]
+        newton = s + solve(eye - sampled.closed, (sampled.after - s)[:, None])[:, 0]
         size = jnp.maximum(jnp.abs(s), 1e-3 * jnp.max(jnp.abs(s)))
         probe = s + share * size * _direction(k, len(eye))
-        return (jnp.where(k < LOOP_STEPS, newton, probe), s, held, kink), None
+        return (jnp.where(k < LOOP_STEPS, newton, probe), s, reference, kink), None
 
     nothing = jax.tree.map(
         lambda v: jnp.zeros(v.shape, v.dtype), jax.eval_shape(sample.slopes, sample.start)
     )
     start = (sample.start, sample.start, nothing, jnp.array(False))
-    found: Any = jax.lax.scan(body, start, jnp.arange(LOOP_STEPS + 1 + 2 * PROBES))[0]
-    _, s, held, kink = found
-    return _Rest(held, s, kink, jnp.array(sample.counts))
+    sampled: Any = jax.lax.scan(body, start, jnp.arange(LOOP_STEPS + 1 + 2 * PROBES))[0]
+    _, s, reference, kink = sampled
+    return _Rest(reference, s, kink, jnp.array(sample.counts))
 
 
 @_rest.defjvp
 def _rest_jvp(clock: Clock, primals: Any, tangents: Any) -> Any:
     """Derivatives by the implicit function: (I - closed) ds = the change of `after` at s held."""
     loop, r = primals
-    found: Any = _rest(clock, loop, r)
+    rest: Any = _rest(clock, loop, r)
     guess = _plant_at_rest(loop, r)
-    none = jnp.zeros(loop.plant.pumps, found.s.dtype)
+    none = jnp.zeros(loop.plant.pumps, rest.s.dtype)
 
     def after(loop: ClosedLoop, r: Any) -> Any:
-        return _Sample(loop, clock, r, guess).after(found.s, none)[0]
+        return _Sample(loop, clock, r, guess).after(rest.s, none)[0]
 
     def slopes(s: Any, loop: ClosedLoop, r: Any) -> _Slopes:
         return _Sample(loop, clock, r, guess).slopes(s)
 
     pushed: Any = jax.jvp(after, primals, tangents)[1]
-    eye = jnp.eye(found.s.shape[0], dtype=found.s.dtype)
-    ds = solve(eye - found.slopes.closed, eye) @ pushed
-    moved: Any = jax.jvp(slopes, (found.s, loop, r), (ds, *tangents))[1]
+    eye = jnp.eye(rest.s.shape[0], dtype=rest.s.dtype)
+    ds = solve(eye - rest.slopes.closed, eye) @ pushed
+    moved: Any = jax.jvp(slopes, (rest.s, loop, r), (ds, *tangents))[1]
     no = np.zeros((), jax.dtypes.float0)
-    return found, _Rest(moved, ds, no, no)
+    return rest, _Rest(moved, ds, no, no)
 
 
 def _direction(k: Any, n: int) -> Any:
@@ -324,10 +324,10 @@ def _direction(k: Any, n: int) -> Any:
     return spread * signs * jnp.where(k % 2 == 0, 1.0, -1.0)
 
 
-def _differs(found: _Slopes, held: _Slopes, step: Any) -> Any:
+def _differs(probe: _Slopes, reference: _Slopes, step: Any) -> Any:
     """True where a sample at a distance `step` from the one held is not the tangent's."""
-    slope = jnp.concatenate([held.closed, held.C])
-    change = jnp.concatenate([found.after - held.after, found.applied - held.applied])
+    slope = jnp.concatenate([reference.closed, reference.C])
+    change = jnp.concatenate([probe.after - reference.after, probe.applied - reference.applied])
     return jnp.any(jnp.abs(change - slope @ step) > KINK * (jnp.abs(slope) @ jnp.abs(step)))
 
 
@@ -382,12 +382,12 @@ def stability_margins(loop: ClosedLoop, clock: Clock) -> tuple[Plateau, ...]:
     check(loop, clock, jax.random.key(0))
     if not serves(loop):
         return ()
-    r, linear, found = _of_plateaus(loop, clock)
+    r, linear, margins = _of_plateaus(loop, clock)
     rows: list[Plateau] = []
     for k in range(len(np.asarray(r))):
-        one = [np.asarray(v)[k] for v in found]
-        stable, why = bool(one[0]), REASONS[int(linear.why[k])]
-        values = [v if stable and not why else np.full(np.shape(v), np.nan) for v in one[1:]]
+        row = [np.asarray(v)[k] for v in margins]
+        stable, why = bool(row[0]), REASONS[int(linear.why[k])]
+        values = [v if stable and not why else np.full(np.shape(v), np.nan) for v in row[1:]]
         setpoints, x, u = (np.asarray(v[k]) for v in (r, linear.x, linear.u))
         rows.append(Plateau(setpoints, x, u, why, stable and not why, am.Margins(stable, *values)))
     return tuple(rows)
@@ -406,16 +406,16 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
             "stability margins need float64: call jax.config.update('jax_enable_x64', True) first,"
             " and give the loop's leaves as float64"
         )
-    held: Any = loop.reference.held()
-    if held is None:
+    setpoints: Any = loop.reference.held()
+    if setpoints is None:
         kind = type(loop.reference).__name__
         raise InputError(
             f"stability margins need a reference that holds setpoints: a {kind} has none"
             " (signals.Ramps and signals.Constant have)"
         )
-    traced = any(isinstance(v, Tracer) for v in jax.tree.leaves((loop, held)))
+    traced = any(isinstance(v, Tracer) for v in jax.tree.leaves((loop, setpoints)))
     xp: Any = jnp if traced else np
-    r: Any = xp.stack([xp.stack([xp.asarray(v, float) for v in row]) for row in held])
+    r: Any = xp.stack([xp.stack([xp.asarray(v, float) for v in row]) for row in setpoints])
     bare = dataclasses.replace(
         loop,
         reference=Constant(level=r[0]),
@@ -423,13 +423,13 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
         faults=None,
         safety_filter=None,
     )
-    one = functools.partial(
+    margins_at = functools.partial(
         _compiled, bare, dataclasses.replace(clock, duration=clock.dt), slopes=traced
     )
     if traced:
         # one after the other: a program for one of them is compiled in half the time
-        return (r, *cast(tuple[Any, ...], jax.lax.map(one, r)))
-    rows = [one(v) for v in r]  # by one program, however many there are
+        return (r, *cast(tuple[Any, ...], jax.lax.map(margins_at, r)))
+    rows = [margins_at(v) for v in r]  # by one program, however many there are
     return (r, *cast(tuple[Any, ...], jax.tree.map(_stacked, *rows)))
 
 
@@ -442,15 +442,15 @@ def _compiled(loop: ClosedLoop, clock: Clock, r: Any, slopes: bool) -> tuple[Any
     """(Linearised, Margins) of one plateau with setpoints r (outputs,); slopes: whether their
     derivatives may be asked for.
     """
-    found = linearised(loop, clock, r)
-    return found._replace(open_loop=found.open_loop[:3]), am.margins(found.open_loop, slopes)
+    linear = linearised(loop, clock, r)
+    return linear._replace(open_loop=linear.open_loop[:3]), am.margins(linear.open_loop, slopes)
 
 
 def worst(loop: ClosedLoop, clock: Clock) -> ms.Worst:
     """Return the worst margins of all plateaus, for the measures: differentiable, and vmaps."""
-    _, linear, found = _of_plateaus(loop, clock)
+    _, linear, margins = _of_plateaus(loop, clock)
     xp: Any = np if isinstance(linear.why, np.ndarray) else jnp  # by numpy nothing is compiled
-    good, unstable = linear.why == 0, (linear.why == 0) & ~found.stable
+    good, unstable = linear.why == 0, (linear.why == 0) & ~margins.stable
 
     def least(values: Any) -> Any:
         used = good.reshape(-1, *(1,) * (values.ndim - 1))
@@ -459,15 +459,15 @@ def worst(loop: ClosedLoop, clock: Clock) -> ms.Worst:
         return xp.where(xp.any(good), chosen, np.nan)
 
     return ms.Worst(
-        -least(-found.sensitivity_peak),
-        least(found.gain_margin),
-        least(found.phase_margin),
-        least(found.delay_margin),
+        -least(-margins.sensitivity_peak),
+        least(margins.gain_margin),
+        least(margins.phase_margin),
+        least(margins.delay_margin),
     )
 
 
 def run_with(loop: ClosedLoop, clock: Clock, names: Sequence[str], arrays: bool = False) -> ms.Run:
     """Return `run_of` with the margins that the measures `names` read."""
     run = run_of(loop, clock, arrays)
-    wanted = any(ms.MEASURES[name].linear for name in names)
-    return run._replace(margins=worst(loop, clock)) if wanted else run
+    linear = any(ms.MEASURES[name].linear for name in names)
+    return run._replace(margins=worst(loop, clock)) if linear else run

@@ -47,7 +47,7 @@ def rows_and_measures(
     loop, arrays = keyed(loop, key), takes_arrays(loop)
     run: Any = run_of(loop, clock, arrays)
     xs: Any = inputs(loop, clock, names, key, arrays=arrays)
-    whole, left = divmod(clock.samples, save_every)
+    whole, remainder = divmod(clock.samples, save_every)
 
     def one(carry: Any, now: Any) -> Any:
         state, acc = carry
@@ -70,7 +70,7 @@ def rows_and_measures(
     carry: Any = (initial(loop, clock, arrays), ms.start(run, names))
     carry, saved = scan(row, carry, jax.tree.map(in_rows, xs), length=whole)
     saved = jax.tree.map(jnp.asarray, saved)
-    if left:
+    if remainder:
         carry, last = row(carry, _cut(xs, slice(whole * save_every, None)))
         saved = jax.tree.map(_appended, saved, last)
     columns = {name: _column(getattr(saved, name)) for name in Rows._fields}

@@ -32,11 +32,11 @@ from jaxtank.loop.closed_loop import (
     takes_arrays,
 )
 from jaxtank.loop.derivatives import sensitivities_compiled
-from jaxtank.loop.floor import FloorWarning, floor_warnings
 from jaxtank.loop.functions import needed_by, values_of
 from jaxtank.loop.margins import run_with
 from jaxtank.loop.saved_rows import simulate_compiled
 from jaxtank.loop.step import step
+from jaxtank.loop.tank_bottom import TankBottomWarning, tank_bottom_warnings
 from jaxtank.loop.trajectory import Trajectory
 from jaxtank.loop.validation import check
 from jaxtank.xla.batching import in_batches
@@ -54,7 +54,7 @@ def simulate(
 ) -> Trajectory:
     """Run the loop and keep every `save_every`-th sample.
 
-    Warns (FloorWarning) where a level falls below an empty tank: liquid was drawn that was not
+    Warns (TankBottomWarning) where a level falls below an empty tank: liquid was drawn that was not
     there.
 
     Parameters
@@ -96,8 +96,8 @@ def simulate(
     trajectory, broken = simulate_compiled(loop, clock, key, min(save_every, clock.samples))
     _report_broken(broken, loop, clock, key)
     if not isinstance(trajectory.x, Tracer) and np.ndim(trajectory.x) == 2:
-        for line in floor_warnings(loop, trajectory):
-            warnings.warn(line, FloorWarning, stacklevel=2)
+        for line in tank_bottom_warnings(loop, trajectory):
+            warnings.warn(line, TankBottomWarning, stacklevel=2)
     return trajectory
 
 
@@ -293,21 +293,21 @@ def evaluate_compiled(
     loop, arrays = keyed(loop, key), takes_arrays(loop)
     run = run_of(loop, clock, arrays)
     pointwise = clock.samples > CHUNK and is_pointwise(loop)
-    drawn = not checkpoint and (clock.samples <= CHUNK or pointwise)
-    drawn = drawn and loop.sensor.draws_in_loop(key)  # else before the loop
+    in_loop = not checkpoint and (clock.samples <= CHUNK or pointwise)
+    in_loop = in_loop and loop.sensor.draws_in_loop(key)  # else before the loop
 
     def scanned(carry: Any, number: Any, samples: int, first: Any = 0) -> Any:
-        here = jax.random.fold_in(cast(Any, key), number) if drawn and pointwise else key
+        chunk_key = jax.random.fold_in(cast(Any, key), number) if in_loop and pointwise else key
 
         def body(carry: Any, now: Inputs) -> Any:
             state, acc = carry
-            if drawn:
-                drawn_now = loop.sensor.draw_sample(here, samples, state.k - first, arrays)
+            if in_loop:
+                drawn_now = loop.sensor.draw_sample(chunk_key, samples, state.k - first, arrays)
                 now = now._replace(xi=drawn_now)
             state, sample = step(loop, clock, state, now)
             return (state, ms.update(run, acc, sample, now.context)), None
 
-        xs = inputs(loop, clock, names, None if drawn else key, number, samples, arrays)
+        xs = inputs(loop, clock, names, None if in_loop else key, number, samples, arrays)
         if checkpoint:
             return checkpointed_scan(body, carry, xs, samples)
         return scan(body, carry, xs, samples)[0]
@@ -317,9 +317,9 @@ def evaluate_compiled(
 
     carry: Any = (initial(loop, clock, arrays), ms.start(run, names))
     if pointwise and not checkpoint:
-        whole, left = divmod(clock.samples, CHUNK)
+        whole, remainder = divmod(clock.samples, CHUNK)
         carry = jax.lax.scan(batch, carry, jnp.arange(whole))[0]
-        carry = batch(carry, whole, left)[0] if left else carry
+        carry = batch(carry, whole, remainder)[0] if remainder else carry
     else:
         carry = scanned(carry, None, clock.samples)
     state, acc = carry

@@ -61,8 +61,8 @@ def simulate_compiled(
     xs = jax.tree.map(in_rows, inputs(loop, clock, (), key, arrays=arrays))
     first = initial(loop, clock, arrays)
     start = (first, zeros(first.x) if arrays else (zero,) * loop.plant.tanks)
-    kept = cast(Any, jax.checkpoint)(row) if checkpoint else row
-    (state, _), saved = scan(kept, start, xs, length=rows)
+    row_of = cast(Any, jax.checkpoint)(row) if checkpoint else row
+    (state, _), saved = scan(row_of, start, xs, length=rows)
     columns: dict[str, Any] = {}
     for name in COLUMNS:
         value: Any = getattr(saved, name)

@@ -40,8 +40,8 @@ def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[Sta
     t = time_of(state, clock)
     tick = Tick(t=t, r=now.r, dr=now.dr, ddr=now.ddr, dt=clock.dt, plan=now.plan, own=now.own)
     y, sensor = readings(loop.sensor, state, now, clock)
-    made = decide(loop, state.observer, state.controller, tick, y)
-    estimate, command, applied = made.estimate, made.command, made.applied
+    decision = decide(loop, state.observer, state.controller, tick, y)
+    estimate, command, applied = decision.estimate, decision.command, decision.applied
     moved, u, spilled, shortfall = move(loop, clock, state, applied, now)
     e = each(operator.sub, loop.plant.output(state.x), now.r)
     sample = Sample(
@@ -57,9 +57,11 @@ def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[Sta
         u=u,
         spilled=spilled,
         shortfall=shortfall,
-        filtered=made.filtered,
+        filtered=decision.filtered,
     )
-    moved = moved._replace(observer=made.observer, controller=made.controller, sensor=sensor)
+    moved = moved._replace(
+        observer=decision.observer, controller=decision.controller, sensor=sensor
+    )
     return moved, sample
 
 
@@ -86,9 +88,9 @@ def decide(
     applied = materialised(like(applied, y)) if is_array(y) else like(applied, y)
     watched, acting = given(loop.observer, command), given(loop.observer, applied)
     observer = loop.observer.predict(observer, observed, watched, acting)
-    seen = _seen_by(loop.controller, tick)
-    asked, held = given(loop.controller, command), given(loop.controller, applied)
-    controller = loop.controller.track(controller, seen, asked, held)
+    as_controller = _seen_by(loop.controller, tick)
+    raw, limited = given(loop.controller, command), given(loop.controller, applied)
+    controller = loop.controller.track(controller, as_controller, raw, limited)
     if line is not None:
         controller = controller, moved_on(line, scalars(applied))
     return Decision(estimate, command, applied, observer, controller, filtered)
@@ -135,7 +137,7 @@ def move(
     driving, u = like(loop.actuator.driving(u), state.x), like(u, state.x)
     if not is_array(u):  # arrays have been so since `decide`
         driving = materialised(driving)
-    found = advance(
+    advanced = advance(
         plant,
         clock.integrator,
         t,
@@ -146,8 +148,8 @@ def move(
         clock.substeps,
         excess=state.excess,
     )
-    moved = state._replace(k=state.k + 1, x=found.x, actuator=actuator, excess=found.excess)
-    return moved, u, found.spilled, found.shortfall
+    moved = state._replace(k=state.k + 1, x=advanced.x, actuator=actuator, excess=advanced.excess)
+    return moved, u, advanced.spilled, advanced.shortfall
 
 
 def time_of(state: State, clock: Clock) -> Any:
@@ -162,8 +164,8 @@ def commanded(
     """Return the controller's ((m,) inputs before their limits, new state)."""
     # Raises InputError, while the loop is traced, for a number of inputs that is not that of the
     # pumps, and for an input that is no single real number.
-    seen = _seen_by(loop.controller, tick)
-    command, state = loop.controller.step(state, seen, _seen(loop, estimate))
+    observed = _seen_by(loop.controller, tick)
+    command, state = loop.controller.step(state, observed, _seen(loop, estimate))
     _check_command(command, loop.plant.pumps, type(loop.controller).__name__)
     return like(command, estimate.x), state
 
@@ -174,9 +176,9 @@ def _check_command(command: Any, pumps: int, name: str) -> None:
     entries: list[Any] = list(cast(Any, command)) if several else []
     count = (len(entries),) if several else np.shape(command)[:1]
     if count != (pumps,):
-        found = f"{count[0]} input{'' if count[0] == 1 else 's'}" if count else "one number"
+        words = f"{count[0]} input{'' if count[0] == 1 else 's'}" if count else "one number"
         raise InputError(
-            f"controller {name}: its step returns {found} for {pumps}"
+            f"controller {name}: its step returns {words} for {pumps}"
             f" pump{'' if pumps == 1 else 's'}: must return (inputs, state), a tuple with one input"
             " for each pump"
         )

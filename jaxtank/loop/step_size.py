@@ -104,15 +104,15 @@ def check_step(loop: ClosedLoop, clock: Clock) -> None:
     """
     plant, step = loop.plant, clock.dt / clock.substeps
     rates = emptying_rates(plant)
-    for found in unstable_tanks(loop, clock):
+    for unstable in unstable_tanks(loop, clock):
         # from a full tank: T = 2 A sqrt(h) / (sqrt(2 g) sum a), with the rate of laminar flow in
         # place of its factors
-        full = math.sqrt(plant.rim[found.tank] / _threshold(loop))
-        empty = 3.0 * full / rates[found.tank]
+        full = math.sqrt(plant.rim[unstable.tank] / _threshold(loop))
+        empty = 3.0 * full / rates[unstable.tank]
         if empty < step:
             raise InputError(
-                f"clock.dt = {clock.dt:g} s: tank {found.tank + 1} runs empty in {empty:.2g} s,"
-                f" within one step: {found.remedy}"
+                f"clock.dt = {clock.dt:g} s: tank {unstable.tank + 1} runs empty in {empty:.2g} s,"
+                f" within one step: {unstable.remedy}"
             )
     for line in step_warnings(loop, clock):
         warnings.warn(line, StepWarning, stacklevel=4)
@@ -122,11 +122,11 @@ def step_warnings(loop: ClosedLoop, clock: Clock) -> list[str]:
     """Return a sentence on the tanks whose levels would be wrong near empty by so much that it
     shows, or none; the worst is named.
     """
-    length, shown = loop.units[0], _visible(loop, clock)
-    if not shown:
+    length, visible = loop.units[0], _visible(loop, clock)
+    if not visible:
         return []
-    tank, height, remedy = max(shown, key=lambda one: one.height / loop.plant.rim[one.tank])
-    others = f" (and so do {len(shown) - 1} more)" if len(shown) > 1 else ""
+    tank, height, remedy = max(visible, key=lambda item: item.height / loop.plant.rim[item.tank])
+    others = f" (and so do {len(visible) - 1} more)" if len(visible) > 1 else ""
     amount = f"{height:.2g} {length}" if math.isfinite(height) else "no bound"
     wrong = f"the explicit step is unstable and its level rises to {amount} alone, further if fed"
     if getattr(loop.plant, "bottom", False):
@@ -143,14 +143,14 @@ def check_run(loop: ClosedLoop, clock: Clock, run: Trajectory) -> None:
     """Raise InputError if the explicit step was unstable near empty in `run`, the whole Trajectory
     of a loop that has `step_warnings`: the volume in a rig cannot rise by more than its inflow.
     """
-    shown = _visible(loop, clock)
-    if not shown or any(name.startswith("area") for name, _, _ in _fault_windows(loop)):
+    visible = _visible(loop, clock)
+    if not visible or any(name.startswith("area") for name, _, _ in _fault_windows(loop)):
         return  # a fault of an area changes what is stored
     plant: Any = loop.plant  # a network of tanks
     x, least = np.asarray(run.x), visible_heights(loop, np.asarray(run.x))
     area, inflow = np.asarray(plant.area), _largest_inflow(loop, clock, np.asarray(run.u))
     gained = np.diff(x @ area) - clock.dt * inflow[:-1]  # volume from nowhere
-    for tank, _, remedy in shown:
+    for tank, _, remedy in visible:
         bad = (gained > area[tank] * least[tank]) & (np.diff(x[:, tank]) > least[tank])
         if bad.any():
             raise InputError(
@@ -184,9 +184,9 @@ def _largest_inflow(loop: ClosedLoop, clock: Clock, u: Any) -> Any:
 
 def _visible(loop: ClosedLoop, clock: Clock) -> list[Unstable]:
     """Those of `unstable_tanks` whose height shows; none where the levels needed are traced."""
-    found = list(unstable_tanks(loop, clock))
-    least = visible_heights(loop) if found else None
-    return [] if least is None else [one for one in found if one.height > least[one.tank]]
+    unstable = list(unstable_tanks(loop, clock))
+    least = visible_heights(loop) if unstable else None
+    return [] if least is None else [item for item in unstable if item.height > least[item.tank]]
 
 
 def visible_heights(loop: ClosedLoop, x: Any = 0.0) -> Any:
@@ -243,8 +243,8 @@ def _height(plant: Any, tank: int, step: float, product: float, integrator: str)
     """How far off the level of a tank may be once it is empty, in thresholds."""
     if not plant.bottom:
         return unstable_height(float(f"{product:.3g}"), integrator)
-    held = float((step * emptying_rates(plant, 1.0, 1.0)[tank]) ** 2)
+    excess = float((step * emptying_rates(plant, 1.0, 1.0)[tank]) ** 2)
     pipes = step * emptying_rates(plant, 0.0, 2.0)[tank]
     if pipes <= LIMITS[integrator]:
-        return held
-    return max(held, unstable_height(float(f"{pipes:.3g}"), integrator))
+        return excess
+    return max(excess, unstable_height(float(f"{pipes:.3g}"), integrator))

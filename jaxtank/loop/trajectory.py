@@ -101,8 +101,8 @@ class Trajectory:
         units = {"t": "s", "e": local("cm", self.units), "applied": local("V", self.units)}
         units |= {field: local(unit, self.units) for _, field, unit in FIELDS}
         names = [*COLUMNS, *(["share"] if self.share is not None else [])]
-        found: dict[str, Any] = {"units": {name: units[name] for name in names}}
-        return found | {name: clean(getattr(self, name)) for name in names}
+        result: dict[str, Any] = {"units": {name: units[name] for name in names}}
+        return result | {name: clean(getattr(self, name)) for name in names}
 
     def plot(self) -> dict[str, Any]:
         """Return matplotlib figures {name: figure}: levels and setpoints, errors, inputs.
@@ -169,19 +169,19 @@ def columns(
     run: Trajectory, units: tuple[str, str] = DEFAULT, dimension: str | None = None
 ) -> dict[str, Any]:
     """Return the columns of a Trajectory, for pandas or xarray."""
-    found: dict[tuple[str, str], Any] = {("t", "s"): np.asarray(run.t)}
+    table: dict[tuple[str, str], Any] = {("t", "s"): np.asarray(run.t)}
     for name, field, unit in FIELDS:
         if getattr(run, field) is None:  # not of this controller
             continue
         values = np.asarray(getattr(run, field))
-        found |= {
+        table |= {
             (f"{name}{i + 1}", local(unit, units)): values[:, i] for i in range(values.shape[1])
         }
     if dimension is None:
-        return {f"{name} [{unit}]": values for (name, unit), values in found.items()}
+        return {f"{name} [{unit}]": values for (name, unit), values in table.items()}
     return {
         dimension if name == "t" else name: (dimension, values, {"units": unit})
-        for (name, unit), values in found.items()
+        for (name, unit), values in table.items()
     }
 
 
@@ -199,14 +199,14 @@ def csv(run: Trajectory, units: tuple[str, str] = DEFAULT) -> str:
     are any.
     """
     known = bool(np.asarray(run.d_hat).any())
-    kept = {
+    table = {
         n: v
         for n, v in columns(run, units).items()
         if not n.startswith("h_hat") and (known or not n.startswith("d_hat"))
     }
     out = io.StringIO()
-    out.write(",".join(kept) + "\n")
-    np.savetxt(out, np.column_stack(list(kept.values())), delimiter=",", fmt="%.10g")
+    out.write(",".join(table) + "\n")
+    np.savetxt(out, np.column_stack(list(table.values())), delimiter=",", fmt="%.10g")
     return out.getvalue()
 
 

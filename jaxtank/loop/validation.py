@@ -124,8 +124,8 @@ def _check_parts(
     check_shapes(loop)
     gains: tuple[str, ...] = getattr(loop.controller, "gains", ())
     check_leaves(loop, vacant=[f"controller.law.{gain}" for gain in gains])
-    for name, own in _plants(loop):
-        check_caught(own, name)
+    for name, model in _plants(loop):
+        check_caught(model, name)
     faults = loop.faults if isinstance(loop.faults, Faults) else None
     if faults and not _traced(faults, loop.plant) and (wrong := faults.problems(loop.plant, clock)):
         raise InputError("; ".join(wrong))
@@ -215,16 +215,16 @@ def _check_shapes(tree: Any, prefix: str, sizes: Mapping[str, int], batch: tuple
         if is_component(value):
             _check_shapes(value, f"{name}.", sizes, batch)
         elif field.metadata.get("kind") == "leaf" and value is not None:
-            wanted = sizes_of_shape(field.metadata["shape"], sizes)
-            if wanted is not None and np.shape(value) not in (wanted, batch + wanted):
-                raise InputError(_refused_shape(name, value, wanted, field.metadata["shape"]))
+            expected = sizes_of_shape(field.metadata["shape"], sizes)
+            if expected is not None and np.shape(value) not in (expected, batch + expected):
+                raise InputError(_refused_shape(name, value, expected, field.metadata["shape"]))
 
 
-def _refused_shape(name: str, value: Any, wanted: tuple[int, ...], shape: Any) -> str:
+def _refused_shape(name: str, value: Any, expected: tuple[int, ...], shape: Any) -> str:
     has = f"{name} has shape {np.shape(value)}: must be"
     if not shape:
         return f'{has} one number; of an array its class says so: leaf(..., shape=("pump",))'
-    return f"{has} {wanted}, one entry per {' and '.join(map(str, shape))}"
+    return f"{has} {expected}, one entry per {' and '.join(map(str, shape))}"
 
 
 def _sizes(plant: Plant) -> dict[str, int]:

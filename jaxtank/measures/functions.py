@@ -106,8 +106,8 @@ def functions(names: Iterable[str]) -> dict[str, RunFunction]:
     >>> functions(["rms_error"])
     {}
     """
-    found = {name: MEASURES[name].read for name in names}
-    return {name: read for name, read in found.items() if isinstance(read, RunFunction)}
+    readers = {name: MEASURES[name].read for name in names}
+    return {name: read for name, read in readers.items() if isinstance(read, RunFunction)}
 
 
 def name_of(function: Any, default: str = "a function of one's own") -> str:
@@ -131,13 +131,13 @@ def _takes_trajectory(function):
         signature = inspect.signature(function)
     except (TypeError, ValueError):
         raise InputError(f"{name}: its arguments are not known; wrap it in a def") from None
-    one, two = _binds(signature, 1), _binds(signature, 2)
-    if not one and not two:
+    alone, both = _binds(signature, 1), _binds(signature, 2)
+    if not alone and not both:
         raise InputError(
             f"{name}{signature}: must take (measures) or (measures, trajectory), and no other"
             " argument without a default"
         )
-    return two and (not one or list(signature.parameters)[1:2] == ["trajectory"])
+    return both and (not alone or list(signature.parameters)[1:2] == ["trajectory"])
 
 
 def _binds(signature, count):

@@ -82,18 +82,18 @@ def register(
     40.0
     >>> del jaxtank.measures.MEASURES["mean_absolute_error"]  # as it was before this example
     """
-    own = dict(accumulators or {})
+    added = dict(accumulators or {})
     _check_name("measure", name, BUILT_IN)
-    for a, accumulator in own.items():
+    for a, accumulator in added.items():
         _check_name("accumulator", a, _BUILT_IN_ACCUMULATORS)
         _check_accumulator(a, accumulator)
-    _check_measure(name, measure, {**ACCUMULATORS, **own})
+    _check_measure(name, measure, {**ACCUMULATORS, **added})
     replaced = _COMPILED.get(name, measure) != measure or any(
-        ACCUMULATORS.get(a, accumulator) is not accumulator for a, accumulator in own.items()
+        ACCUMULATORS.get(a, accumulator) is not accumulator for a, accumulator in added.items()
     )
     if replaced:
         jax.clear_caches()  # compiled runs know a measure by its name
-    ACCUMULATORS.update(own)
+    ACCUMULATORS.update(added)
     MEASURES[name] = _COMPILED[name] = measure
     OWN.add(name)
     return measure
@@ -156,16 +156,16 @@ def check_names(names: Iterable[str]) -> None:
         points = installed(GROUP)
         if name not in points:
             raise unknown("measure", name, [*MEASURES, *points])
-        found = imported(points[name])
-        register(name, found if isinstance(found, Measure) else from_function(found))
+        measure = imported(points[name])
+        register(name, measure if isinstance(measure, Measure) else from_function(measure))
 
 
 def unreadable(names: Iterable[str]) -> tuple[str, ...]:
     """Return those of `names` that a rig file cannot name: functions of this process alone, which
     no installed package has.
     """
-    own = functions(names)
-    return tuple(own.keys() - installed(GROUP).keys()) if own else ()
+    named = functions(names)
+    return tuple(named.keys() - installed(GROUP).keys()) if named else ()
 
 
 def squares() -> tuple[str, ...]:
@@ -195,8 +195,8 @@ def linear() -> tuple[str, ...]:
 
 def placed(field: str) -> tuple[str, ...]:
     """Return the names of the measures with a place in `field`, "shown" or "summary", in order."""
-    found = {m: getattr(spec, field) for m, spec in MEASURES.items()}
-    return tuple(sorted((m for m in found if found[m]), key=lambda m: found[m]))
+    places = {m: getattr(spec, field) for m, spec in MEASURES.items()}
+    return tuple(sorted((m for m in places if places[m]), key=lambda m: places[m]))
 
 
 def unit(name: str, units: tuple[str, str] = DEFAULT) -> str:
@@ -222,8 +222,8 @@ def refers_to(names: Iterable[str]) -> frozenset[str]:
     """Return the fields of `Context` that measures refer to: "window" (the changes of the
     setpoint), "since" (inflow pulses), "steady" (inputs that hold the setpoint).
     """
-    wanted = {a for name in names for a in MEASURES[name].needs}
-    return frozenset(ACCUMULATORS[a].refers_to for a in wanted) - {""}
+    accumulators = {a for name in names for a in MEASURES[name].needs}
+    return frozenset(ACCUMULATORS[a].refers_to for a in accumulators) - {""}
 
 
 def of_loop(loop: Any) -> tuple[str, ...]:
@@ -240,10 +240,10 @@ def serves(name: str, loop: Any) -> bool:
     holds setpoints, its tanks have inflow pulses, its steady inputs are known in closed form, its
     levels have a lower clip, it has a safety filter.
     """
-    wanted, plant = refers_to([name]), loop.plant
+    fields, plant = refers_to([name]), loop.plant
     if MEASURES[name].linear and loop.reference.held() is None:
         return False
-    if "steady" in wanted and (
+    if "steady" in fields and (
         getattr(plant, "pipes", None) != () or plant.pumps != len(plant.outputs)
     ):
         return False
@@ -251,7 +251,7 @@ def serves(name: str, loop: Any) -> bool:
         return False
     if "filtered" in MEASURES[name].needs and loop.safety_filter is None:
         return False
-    return not wanted & _missing(loop)
+    return not fields & _missing(loop)
 
 
 def _missing(loop: Any) -> frozenset[str]:

@@ -19,8 +19,8 @@ Weights = Sequence[tuple[str, float]]
 
 def needs(names: Sequence[str]) -> tuple[str, ...]:
     """Return the accumulators that `names` need, in a fixed order."""
-    wanted = {a for name in names for a in MEASURES[name].needs}
-    return tuple(a for a in ACCUMULATORS if a in wanted)
+    needed = {a for name in names for a in MEASURES[name].needs}
+    return tuple(a for a in ACCUMULATORS if a in needed)
 
 
 def start(run: Run, names: Sequence[str]) -> States:
@@ -30,14 +30,14 @@ def start(run: Run, names: Sequence[str]) -> States:
 
 def update(run: Run, states: States, sample: Sample, context: Context) -> States:
     """Return {accumulator: state} after `sample`."""
-    found: States = {}
+    updated: States = {}
     for a, s in states.items():
         accumulator = ACCUMULATORS[a]
         known = run, s, sample, context
         if run.arrays and not accumulator.arrays:
             known = _run_for(run, accumulator), s, *_in_scalars(sample, context)
-        found[a] = accumulator.update(*known)
-    return found
+        updated[a] = accumulator.update(*known)
+    return updated
 
 
 def residuals(
@@ -46,18 +46,18 @@ def residuals(
     """Return the residuals of one sample of the sums of squares in `squares`: a flat tuple, or a
     tuple of arrays, one for each of `squares`.
     """
-    found: list[Any] = []
+    values: list[Any] = []
     for measure, _ in squares:
         name = MEASURES[measure].residual
         of = cast(Callable[..., Any], ACCUMULATORS[name].residual)
         if run.arrays and not ACCUMULATORS[name].arrays:
-            here = _run_for(run, ACCUMULATORS[name])
-            found.append(jnp.stack(list(of(here, states[name], *_in_scalars(sample, context)))))
+            entries = of(_in_tuples(run), states[name], *_in_scalars(sample, context))
+            values.append(jnp.stack(list(entries)))
         elif run.arrays:
-            found.append(of(run, states[name], sample, context))
+            values.append(of(run, states[name], sample, context))
         else:
-            found.extend(of(run, states[name], sample, context))
-    return tuple(found)
+            values.extend(of(run, states[name], sample, context))
+    return tuple(values)
 
 
 def residual_weights(run: Run, squares: Weights) -> tuple[Any, ...]:
@@ -65,28 +65,28 @@ def residual_weights(run: Run, squares: Weights) -> tuple[Any, ...]:
     counts = {"output": run.outputs, "tank": run.tanks, "pump": run.pumps}
     if run.arrays:
         counts = dict.fromkeys(counts, 1)  # one array each
-    found: list[Any] = []
+    weights: list[Any] = []
     for measure, weight in squares:
         spec = MEASURES[measure]
         scale = cast(Callable[[Run], Any], spec.scale)  # of a sum of squares
-        found.extend(weight * scale(run) for _ in range(counts[spec.per]))
-    return tuple(found)
+        weights.extend(weight * scale(run) for _ in range(counts[spec.per]))
+    return tuple(weights)
 
 
 def read(run: Run, states: States, names: Sequence[str]) -> dict[str, Any]:
     """Return {measure: value} at the end of a run."""
     states = totals(states)
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for name in names:
         spec = MEASURES[name]
         if run.arrays and not spec.arrays:
             rows = {
                 a: _rows_of(states[a]) if ACCUMULATORS[a].rows else states[a] for a in spec.needs
             }
-            found[name] = spec.read(_in_tuples(run), rows)
+            values[name] = spec.read(_in_tuples(run), rows)
         else:
-            found[name] = spec.read(run, states)
-    return found
+            values[name] = spec.read(run, states)
+    return values
 
 
 def _rows_of(state: Any) -> tuple[Any, ...]:

@@ -91,13 +91,13 @@ class DisturbanceObserver(Observer):
         return tuple(0.0 * h for h in x0), x0
 
     def step(self, state: Any, tick: Tick, y: Sequence) -> tuple[Estimate, Any]:
-        held, expected = state
-        seen = [i in self.measured for i in range(len(held))]
+        disturbance, expected = state
+        is_measured = [i in self.measured for i in range(len(disturbance))]
         d = tuple(
-            held[i] + self.l[i] * (y[i] - expected[i]) if known else held[i]
-            for i, known in enumerate(seen)
+            disturbance[i] + self.l[i] * (y[i] - expected[i]) if known else disturbance[i]
+            for i, known in enumerate(is_measured)
         )
-        x = tuple(y[i] if known else expected[i] for i, known in enumerate(seen))
+        x = tuple(y[i] if known else expected[i] for i, known in enumerate(is_measured))
         return Estimate(x=x, d=d), (d, x)
 
     def predict(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
@@ -113,8 +113,8 @@ class DisturbanceObserver(Observer):
             inflow = None if area is None else tuple(area[i] * d[i] for i in n)
             moved = advance(self.model, "rk4", tick.t, x, u, inflow, tick.dt, 1).x
             expected = tuple(expected[i] if i in self.measured else moved[i] for i in n)
-        held = tuple((1.0 - self.l[i] * tick.dt) * d[i] if i in self.measured else d[i] for i in n)
-        return held, expected
+        d = tuple((1.0 - self.l[i] * tick.dt) * d[i] if i in self.measured else d[i] for i in n)
+        return d, expected
 
     def check(self, plant: Plant) -> None:
         check_model(self, plant)

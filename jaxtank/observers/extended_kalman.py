@@ -125,11 +125,11 @@ class ExtendedKalman(Observer):
 
     def _parts(self, x):
         """((n) levels [cm], (n) disturbances [cm/s], () without `disturbed`) of a state."""
-        levels, found = x[: self.model.tanks], x[self.model.tanks :]
+        levels, disturbances = x[: self.model.tanks], x[self.model.tanks :]
         if not self.disturbed:
             return levels, ()
         d = [0.0 * h for h in levels]
-        for i, value in zip(self.disturbed, found):
+        for i, value in zip(self.disturbed, disturbances):
             d[i] = value
         return levels, tuple(d)
 
@@ -144,10 +144,10 @@ class ExtendedKalman(Observer):
                 model, self.integrator, tick.t, levels, applied, inflow, tick.dt, self.substeps
             ).x
 
-        one, zero = jnp.ones_like(state.x[0]), jnp.zeros_like(state.x[0])
+        unit, zero = jnp.ones_like(state.x[0]), jnp.zeros_like(state.x[0])
         # columns[j][i] = F_ij of the levels i; the rows of random walks are those of the identity
         columns = [
-            jax.jvp(onward, (state.x,), (tuple(one if i == j else zero for i in N),))[1] for j in N
+            jax.jvp(onward, (state.x,), (tuple(unit if i == j else zero for i in N),))[1] for j in N
         ]
         FP = [
             [sum(columns[k][i] * state.P[k][j] for k in N) if i < n else state.P[i][j] for j in N]

@@ -99,14 +99,14 @@ class Kalman(Observer):
         A = jnp.pad(A, ((0, walks), (0, walks)))
         A = A.at[tanks, n + np.arange(walks)].set(1.0)
         inputs = jnp.pad(jnp.concatenate([B, rest[:, None]], axis=1), ((0, walks), (0, 0)))
-        Ad, held = zero_order_hold(A, inputs, dt)
+        Ad, sampled = zero_order_hold(A, inputs, dt)
         C = jnp.eye(n + walks)[np.array(self.measured)]
         R = jnp.diag(jnp.asarray(self.measurement)[np.array(self.measured)])
         Q = jnp.asarray(self.process)
         if self.disturbed:
             Q = jnp.concatenate([Q, jnp.asarray(self.walk)[tanks]])
         P = discrete_riccati(Ad.T, C.T, jnp.diag(Q * dt), R)
-        return Ad, held[:, :-1], held[:, -1], jnp.linalg.solve(C @ P @ C.T + R, C @ P).T
+        return Ad, sampled[:, :-1], sampled[:, -1], jnp.linalg.solve(C @ P @ C.T + R, C @ P).T
 
     def init(self, x0: tuple) -> Any:
         return (*x0, *(0.0 * x0[i] for i in self.disturbed))
@@ -128,10 +128,10 @@ class Kalman(Observer):
         # at the operating inputs, for the pumps act on the levels linearly
         inputs, n = tuple(jnp.asarray(self.inputs)), range(len(x))
         at = self.model.derivative(0.0, tuple(jnp.asarray(self.levels)), inputs, None)
-        here = self.model.derivative(0.0, tuple(x), inputs, None)
+        rates = self.model.derivative(0.0, tuple(x), inputs, None)
         d = [0.0 * h for h in x]
         for i, w in zip(self.disturbed, walks):
-            d[i] = w + ((at[i] + sum(A[i, j] * (x[j] - self.levels[j]) for j in n)) - here[i])
+            d[i] = w + ((at[i] + sum(A[i, j] * (x[j] - self.levels[j]) for j in n)) - rates[i])
         return tuple(d)
 
     def predict(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:

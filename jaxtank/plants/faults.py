@@ -60,7 +60,7 @@ class Faults:
         """Return a sentence for each fault that makes no physics of `plant`: an entry out of its
         range, volume from nowhere.
         """
-        found = []
+        texts = []
         for k, (name, start, end) in enumerate(self.windows):
             field, (index,) = split_index(name)
             what = f"fault {k + 1} of {name} from {start:g} s to {end:g} s"
@@ -72,17 +72,17 @@ class Faults:
             strict = field in ("area", "rim")  # a pump may stand still
             if low is not None and (value <= low if strict else value < low):
                 words = "above" if strict else "at least"
-                found.append(f"{what}: makes it {value:g}{unit}: must be {words} {low:g}{unit}")
+                texts.append(f"{what}: makes it {value:g}{unit}: must be {words} {low:g}{unit}")
             elif high is not None and largest > high:
-                found.append(f"{what}: makes it {largest:g}{unit}: must be at most {high:g}{unit}")
+                texts.append(f"{what}: makes it {largest:g}{unit}: must be at most {high:g}{unit}")
             elif field == "area" and not self._lasts(k, clock):
-                found.append(
+                texts.append(
                     f"{what}: volume would come from nowhere as the area changes: must last for the"
                     f" whole run, from 0 s to {clock.duration:g} s or later"
                 )
             elif field == "caught":
-                found += self._caught_twice(what, plant, index, start)
-        return found
+                texts += self._caught_twice(what, plant, index, start)
+        return texts
 
     def _value(self, plant, name, time):
         """The value of an entry of the plant at a time."""
@@ -103,8 +103,8 @@ class Faults:
         network: Any = plant
         spills = network.spills
         source = spills[index][0]
-        own = [i for i, spill in enumerate(spills) if spill[0] == source]
-        total = sum(self._value(plant, f"caught[{i}]", time) for i in own)
+        siblings = [i for i, spill in enumerate(spills) if spill[0] == source]
+        total = sum(self._value(plant, f"caught[{i}]", time) for i in siblings)
         if total <= 1.0 + 1e-9:
             return []
         return [

@@ -27,12 +27,12 @@ def check_caught(plant: Plant, name: str = "plant") -> None:
         return
     spills: tuple = getattr(plant, "spills", ())
     for tank in dict.fromkeys(source for source, _ in spills):
-        own = [float(share) for share, (source, _) in zip(shares, spills) if source == tank]
-        if sum(own) > 1.0 + SURPLUS:
+        parts = [float(share) for share, (source, _) in zip(shares, spills) if source == tank]
+        if sum(parts) > 1.0 + SURPLUS:
             raise InputError(
-                f"{name}.caught: the {len(own)} spills of tank {tank + 1} catch"
-                f" {' + '.join(f'{v:g}' for v in own)} = {sum(own):g} of what passes its rim: must"
-                " be from 0 to 1 in sum"
+                f"{name}.caught: the {len(parts)} spills of tank {tank + 1} catch"
+                f" {' + '.join(f'{v:g}' for v in parts)} = {sum(parts):g} of what passes its rim:"
+                " must be from 0 to 1 in sum"
             )
 
 

@@ -53,10 +53,10 @@ def advance(
     if rolled and not (isinstance(substeps, int) and substeps == 1):
         none = (jnp.zeros_like(x[0]),) * plant.tanks
         return jax.lax.fori_loop(0, substeps, substep, Advanced(tuple(x), excess, none, none))
-    found = Advanced(x, excess, zeros(x), zeros(x))
+    advanced = Advanced(x, excess, zeros(x), zeros(x))
     for j in range(substeps):
-        found = substep(j, found)
-    return found
+        advanced = substep(j, advanced)
+    return advanced
 
 
 def integrate(plant, integrator, t, x, u, d, h):

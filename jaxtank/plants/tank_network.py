@@ -38,17 +38,17 @@ def second_of(pairs: tuple[tuple[int, ...], ...]) -> tuple[int, ...]:
 
 def pumped(net: Any, u: Any) -> Any:
     """Return (n,) what the pumps bring to each tank [cm^3/s] for inputs u (m,)."""
-    one = [(j, first, second is not None) for j, (first, second) in enumerate(net.feeds)]
-    two = [(j, second) for j, (_, second) in enumerate(net.feeds) if second is not None]
+    firsts = [(j, first, second is not None) for j, (first, second) in enumerate(net.feeds)]
+    seconds = [(j, second) for j, (_, second) in enumerate(net.feeds) if second is not None]
     gain, split = jnp.asarray(net.pump_gain), jnp.asarray(net.split)
     # a pump without a second tank brings all to its first, whatever its split is
-    shared = np.array([s for *_, s in one])
+    shared = np.array([s for *_, s in firsts])
     shares = gain * jnp.where(shared, split, 1.0)
-    pumps, ends = [j for j, *_ in one], [tank for _, tank, _ in one]
-    if two:
-        at = np.array([j for j, _ in two])
+    pumps, ends = [j for j, *_ in firsts], [tank for _, tank, _ in firsts]
+    if seconds:
+        at = np.array([j for j, _ in seconds])
         shares = jnp.concatenate([shares, take(gain * (1.0 - split), at)])
-        pumps, ends = pumps + [j for j, _ in two], ends + [tank for _, tank in two]
+        pumps, ends = pumps + [j for j, _ in seconds], ends + [tank for _, tank in seconds]
     return gathered(shares, u, tuple(ends), net.tanks, of=pumps)
 
 
@@ -90,16 +90,16 @@ def flows(net: Any, x: Any, u: Any, d: Any, step: Any = None) -> Any:
 
 def piped(net: Any, x: Any, most: Any) -> Any:
     """Return (n,) what the pipes bring to each tank [cm^3/s]."""
-    one, other = first_of(net.pipes), second_of(net.pipes)
-    held = x if most is None else lower_clip(x, 0.0)
+    first, second = first_of(net.pipes), second_of(net.pipes)
+    levels = x if most is None else lower_clip(x, 0.0)
     root = with_one_slope(lambda h: smooth_signed_sqrt(h, net.knee))
-    s = root(take(held, one) - take(held, other))
+    s = root(take(levels, first) - take(levels, second))
     if most is not None:
-        s = limited_flow(s, take(most * held, one), take(most * held, other))
+        s = limited_flow(s, take(most * levels, first), take(most * levels, second))
     flow = materialised(jnp.asarray(net.pipe) * jnp.sqrt(2.0 * net.gravity) * s)
-    pipes = range(len(one))
-    signs = np.repeat([-1.0, 1.0], len(one))
-    return gathered(signs, flow, one + other, net.tanks, of=(*pipes, *pipes))
+    pipes = range(len(first))
+    signs = np.repeat([-1.0, 1.0], len(first))
+    return gathered(signs, flow, first + second, net.tanks, of=(*pipes, *pipes))
 
 
 UNROLLED = 4
@@ -161,7 +161,7 @@ def cascade(spills: Pairs, tanks: int) -> Cascade:
 def overflowed(net: Any, x: Any) -> tuple[Any, Any]:
     """Return (levels (n,) at or below the rims, volume lost over each rim (n,) [cm^3])."""
     area, rim, caught = (jnp.asarray(v) for v in (net.area, net.rim, net.caught))
-    found = cascade(net.spills, net.tanks)
+    order = cascade(net.spills, net.tanks)
 
     def over(levels: Any) -> Any:
         return materialised(area * (levels - clip(levels, -rim, rim)))
@@ -173,30 +173,30 @@ def overflowed(net: Any, x: Any) -> tuple[Any, Any]:
         return gathered(caught[which], volumes, sink, net.tanks, of=source) / area
 
     def further(volumes: Any, _: Any) -> Any:
-        return over(x + caught_of(volumes, found.forth)), None
+        return over(x + caught_of(volumes, order.forth)), None
 
     volumes = over(x)
-    if found.depth > UNROLLED:
+    if order.depth > UNROLLED:
 
         def all_of(volumes: Any) -> Any:
-            return jax.lax.scan(further, volumes, None, length=found.depth)[0]
+            return jax.lax.scan(further, volumes, None, length=order.depth)[0]
 
         # most samples have no overflow, and none then follows
         full = jnp.any(volumes != 0.0)
         volumes = jax.lax.cond(full, all_of, lambda volumes: volumes, volumes)
     else:
-        for _ in range(found.depth):
+        for _ in range(order.depth):
             volumes, _ = further(volumes, None)
-    if found.depth:
-        x = x + caught_of(volumes, found.forth)
+    if order.depth:
+        x = x + caught_of(volumes, order.forth)
     x, lost = clip(x, -rim, rim), volumes
     if net.spills:
-        kept = gathered(caught, None, tuple(a for a, _ in net.spills), net.tanks)
-        lost = volumes * (1.0 - kept)
-    if len(found.back):  # what has come back to a full tank leaves the rig there
-        x = x + caught_of(volumes, found.back)
-        held = jnp.where(found.ring, clip(x, -rim, rim), x)
-        lost, x = lost + area * (x - held), held
+        share = gathered(caught, None, tuple(a for a, _ in net.spills), net.tanks)
+        lost = volumes * (1.0 - share)
+    if len(order.back):  # what has come back to a full tank leaves the rig there
+        x = x + caught_of(volumes, order.back)
+        clipped = jnp.where(order.ring, clip(x, -rim, rim), x)
+        lost, x = lost + area * (x - clipped), clipped
     return x, lost
 
 
@@ -368,15 +368,15 @@ class TankNetwork(Plant):
             smooth_sqrt(h, self.knee) if step is None else limited_sqrt(h, self.knee, supply[i])
             for i, h in enumerate(x)
         ]
-        held = x if step is None else [lower_clip(h, 0.0) for h in x]
+        levels = x if step is None else [lower_clip(h, 0.0) for h in x]
         for k, (source, sink) in enumerate(self.links):
             rate[sink] = rate[sink] + (self.orifice[k] * w / self.area[sink]) * q[source]
-        for k, (one, other) in enumerate(self.pipes):
-            s = smooth_signed_sqrt(held[one] - held[other], self.knee)
+        for k, (first, second) in enumerate(self.pipes):
+            s = smooth_signed_sqrt(levels[first] - levels[second], self.knee)
             if step is not None:
-                s = limited_flow(s, supply[one] * held[one], supply[other] * held[other])
-            rate[one] = rate[one] - (self.pipe[k] * w / self.area[one]) * s
-            rate[other] = rate[other] + (self.pipe[k] * w / self.area[other]) * s
+                s = limited_flow(s, supply[first] * levels[first], supply[second] * levels[second])
+            rate[first] = rate[first] - (self.pipe[k] * w / self.area[first]) * s
+            rate[second] = rate[second] + (self.pipe[k] * w / self.area[second]) * s
         return tuple(rate[i] - (out[i] * w / self.area[i]) * q[i] for i in range(n))
 
     def rates(self, x: jax.Array, u: jax.Array) -> jax.Array:
@@ -389,11 +389,11 @@ class TankNetwork(Plant):
             *map(jnp.asarray, (self.orifice, self.pipe)),
         )
         ends = lambda pairs: tuple(np.array(pairs, dtype=int).reshape(-1, 2).T)
-        (source, sink), (one, other) = ends(self.links), ends(self.pipes)
+        (source, sink), (first, second) = ends(self.links), ends(self.pipes)
         q = smooth_sqrt(x, self.knee)
         discharged, piped = (
             orifice * w * q[source],
-            pipe * w * smooth_signed_sqrt(x[one] - x[other], self.knee),
+            pipe * w * smooth_signed_sqrt(x[first] - x[second], self.knee),
         )
         flow = -jnp.asarray(self.drain) * w * q
         flow = (
@@ -401,9 +401,9 @@ class TankNetwork(Plant):
             .add(-discharged)
             .at[sink]
             .add(discharged)
-            .at[one]
+            .at[first]
             .add(-piped)
-            .at[other]
+            .at[second]
             .add(piped)
         )
         pump, tank, gain = (list(column) for column in zip(*self.shares()))
@@ -435,14 +435,14 @@ class TankNetwork(Plant):
         x, overflow = list(x), [0.0] * self.tanks
         order, ring = downwards(self.spills, self.tanks)
         for i in order:
-            held = clip(x[i], -self.rim[i], self.rim[i])
-            over = self.area[i] * (x[i] - held)
-            overflow[i], x[i] = overflow[i] + over, held
+            clipped = clip(x[i], -self.rim[i], self.rim[i])
+            over = self.area[i] * (x[i] - clipped)
+            overflow[i], x[i] = overflow[i] + over, clipped
             for k, (source, sink) in enumerate(self.spills):
                 if source == i:
                     overflow[i] = overflow[i] - self.caught[k] * over
                     x[sink] = x[sink] + self.caught[k] * over / self.area[sink]
         for i in ring:  # what has come back to a full tank leaves the rig there
-            held = clip(x[i], -self.rim[i], self.rim[i])
-            overflow[i], x[i] = overflow[i] + self.area[i] * (x[i] - held), held
+            clipped = clip(x[i], -self.rim[i], self.rim[i])
+            overflow[i], x[i] = overflow[i] + self.area[i] * (x[i] - clipped), clipped
         return tuple(x), tuple(overflow)

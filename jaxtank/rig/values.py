@@ -23,8 +23,8 @@ from jaxtank.core.tree import (
     with_values,
 )
 from jaxtank.loop.closed_loop import ClosedLoop
-from jaxtank.loop.floor import draws
 from jaxtank.loop.steady import steady_state
+from jaxtank.loop.tank_bottom import can_withdraw
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.entry import is_numeric, plain, read_entry, sizes_of, static_value, unit
 from jaxtank.rig.schema import SECTIONS
@@ -239,20 +239,20 @@ def set_and_schedule(case: Case, values: Mapping[str, Any], table: Mapping[str, 
 def with_bottom(case: Case) -> Case:
     """Return the case with `plant.bottom` where liquid can be drawn out of its tanks."""
     plant: Any = case.loop.plant
-    if not isinstance(plant, TankNetwork) or plant.bottom or not _draws(case):
+    if not isinstance(plant, TankNetwork) or plant.bottom or not _can_withdraw(case):
         return case
     return set_values(case, with_models(case.loop, {"plant.bottom": True}))
 
 
-def _draws(case):
+def _can_withdraw(case):
     """Whether liquid can be drawn out in the case's own run, or in a scenario."""
     drawing = ("actuator.", "disturbance.")
     for s in case.scenarios:
         own = {name: value for name, value in s.values.items() if name.startswith(drawing)}
         steady = any(_is_steady(name, value) for name, value in own.items())
-        if own and not steady and draws(set_scenario(case, own).loop):
+        if own and not steady and can_withdraw(set_scenario(case, own).loop):
             return True
-    return draws(case.loop)
+    return can_withdraw(case.loop)
 
 
 def has(loop: ClosedLoop, name: str) -> bool:

@@ -155,11 +155,11 @@ class Table(Signal):
         index = np.minimum(np.floor(at + 5e-7), last).astype(int)
         after, past = np.minimum(index + 1, last), np.clip(at - index, 0.0, 1.0)
         table, still = jnp.asarray(self.values), jnp.zeros(clock.samples)
-        here = table[:, index]
+        values = table[:, index]
         if self.between == "hold":
-            return tuple(here), (still,) * self.channels, (still,) * self.channels
-        slope = table[:, after] - here
-        return tuple(here + slope * past), tuple(slope / self.period), (still,) * self.channels
+            return tuple(values), (still,) * self.channels, (still,) * self.channels
+        slope = table[:, after] - values
+        return tuple(values + slope * past), tuple(slope / self.period), (still,) * self.channels
 
 
 @component
@@ -187,8 +187,8 @@ class Sum(Signal):
     @pointwise
     def sample(self, clock: Clock) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
         value, rate, second = (
-            tuple(a + b for a, b in zip(one, two))
-            for one, two in zip(self.first.sample(clock), self.second.sample(clock))
+            tuple(a + b for a, b in zip(firsts, two))
+            for firsts, two in zip(self.first.sample(clock), self.second.sample(clock))
         )
         return value, rate, second
 
@@ -201,10 +201,10 @@ class Sum(Signal):
         sine, windows = cast(Any, self.second), self.first.windows(clock)
         if windows is None:
             return None
-        found = list(windows)
+        channels = list(windows)
         still = t < sine.start - 1e-7 * clock.dt
-        found[sine.channel] = tuple(jnp.where(still, a, 0.0) for a in found[sine.channel])
-        return tuple(found)
+        channels[sine.channel] = tuple(jnp.where(still, a, 0.0) for a in channels[sine.channel])
+        return tuple(channels)
 
     def held(self) -> tuple[tuple[Any, ...], ...] | None:
         """Return those of the first signal, about which the second one moves."""

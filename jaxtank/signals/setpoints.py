@@ -51,17 +51,17 @@ def _change(level, target, start, duration, shape, dt, k, t):
     # The rate of a linear change at its last sample is its mean over that sample, so that rates add
     # up to the step for any duration, and depend on it continuously. Where the change ends on a
     # sample, the derivatives by the duration are those from below.
-    left = (start + duration) / dt - k  # samples until the end
-    tolerance = TOLERANCE + 4.0 * jnp.finfo(jnp.result_type(left)).eps * jnp.abs(left + k)
-    moving = left > tolerance
+    to_go = (start + duration) / dt - k  # samples until the end
+    tolerance = TOLERANCE + 4.0 * jnp.finfo(jnp.result_type(to_go)).eps * jnp.abs(to_go + k)
+    moving = to_go > tolerance
     course = _linear if shape == "linear" else _quintic
     delta, whole = target - level, jnp.where(duration > 0, duration, 1.0)  # steps: never moving
     value, rate, second = course(level, delta, t - start, whole)
     if shape == "linear":
         # 1 at the last whole sample, with the slope of `left`
-        edge = 1.0 + (left - jax.lax.stop_gradient(left))
+        edge = 1.0 + (to_go - jax.lax.stop_gradient(to_go))
         share = jnp.where(
-            left > 1.0 + tolerance, 1.0, jnp.where(left > 1.0 - tolerance, edge, left)
+            to_go > 1.0 + tolerance, 1.0, jnp.where(to_go > 1.0 - tolerance, edge, to_go)
         )
         rate = rate * share
     ended = _flat(target, k, t)
@@ -107,11 +107,11 @@ def _lagged(level, state, target, start, duration, lag, t):
 
 def _decay(level, state, slope, s, lag):
     """(r, f, f', f'') a time s after f = `state`, with r = level + slope s."""
-    kept, gone = jnp.exp(-s / lag), jnp.expm1(-s / lag)
-    left = (state - level) * kept
-    value = level + left + slope * (s + lag * gone)
-    second = left / lag**2 + slope / lag * kept
-    return level + slope * s, value, -left / lag - slope * gone, second
+    decay, decayed = jnp.exp(-s / lag), jnp.expm1(-s / lag)
+    distance = (state - level) * decay
+    value = level + distance + slope * (s + lag * decayed)
+    second = distance / lag**2 + slope / lag * decay
+    return level + slope * s, value, -distance / lag - slope * decayed, second
 
 
 def _flat(level, k, t):
@@ -126,16 +126,16 @@ def _join(pieces, clock):
     k, t = indices(clock), sample_times(clock)
     if any(np.ndim(first) for first, _ in pieces):
         k, t = k[:, None], t[:, None]
-        found = pieces[0][1](k, t)
+        signal = pieces[0][1](k, t)
         for first, f in pieces[1:]:
-            found = tuple(jnp.where(k >= first, new, old) for new, old in zip(f(k, t), found))
-        return found
+            signal = tuple(jnp.where(k >= first, new, old) for new, old in zip(f(k, t), signal))
+        return signal
     if isinstance(clock, Chunk):
-        found = pieces[0][1](k, t)
+        signal = pieces[0][1](k, t)
         for (first, f), (after, _) in zip(pieces[1:], [*pieces[2:], (math.inf, None)]):
             if after > first:
-                found = tuple(jnp.where(k >= first, new, old) for new, old in zip(f(k, t), found))
-        return found
+                signal = tuple(jnp.where(k >= first, new, old) for new, old in zip(f(k, t), signal))
+        return signal
     starts = [min(first, clock.samples) for first, _ in pieces] + [clock.samples]
     parts = []
     for (_, f), a, b in zip(pieces, starts, starts[1:]):
@@ -203,9 +203,9 @@ class Ramps(Signal):
         self._check_filter()
         columns = []
         for i in range(self.channels):
-            own = [(t, self.targets[j]) for j, (t, c) in enumerate(self.changes) if c == i]
+            changes = [(t, self.targets[j]) for j, (t, c) in enumerate(self.changes) if c == i]
             lag = None if self.filter is None else self.filter[i]
-            columns.append(channel(clock, self.initial[i], own, self.ramp, self.shape, lag))
+            columns.append(channel(clock, self.initial[i], changes, self.ramp, self.shape, lag))
         value, rate, second = zip(*columns)
         return value, rate, second
 
@@ -219,11 +219,11 @@ class Ramps(Signal):
         arrays (samples,) each
         """
         t = sample_times(clock)
-        own = [[] for _ in range(self.channels)]
+        by_channel = [[] for _ in range(self.channels)]
         for j, (start, i) in enumerate(self.changes):
-            own[i].append((start, self.targets[j]))
+            by_channel[i].append((start, self.targets[j]))
         return tuple(
-            self._window(clock, t, self.initial[i], changes) for i, changes in enumerate(own)
+            self._window(clock, t, self.initial[i], changes) for i, changes in enumerate(by_channel)
         )
 
     def _window(self, clock, t, last, changes):
@@ -258,24 +258,24 @@ class Ramps(Signal):
         t = sample_times(clock)[:, None]
         return self._by_count(clock, lambda which, *own: self._window(clock, t, *own))
 
-    def _by_count(self, clock, made) -> Any:
+    def _by_count(self, clock, course) -> Any:
         """The arrays (samples, channels) of made(which, initial (g,), [(times (g,), targets (g,))])
         for the channels `which` that have as many changes.
         """
-        own = [[] for _ in range(self.channels)]
+        by_channel = [[] for _ in range(self.channels)]
         for j, (_, i) in enumerate(self.changes):
-            own[i].append(j)
+            by_channel[i].append(j)
         initial, targets = jnp.asarray(self.initial), jnp.asarray(self.targets)
         order, parts = [], []
-        for count in sorted({len(mine) for mine in own}):
-            which = np.array([i for i, mine in enumerate(own) if len(mine) == count])
-            places = np.array([own[i] for i in which], dtype=int).reshape(len(which), count)
+        for count in sorted({len(mine) for mine in by_channel}):
+            which = np.array([i for i, mine in enumerate(by_channel) if len(mine) == count])
+            places = np.array([by_channel[i] for i in which], dtype=int).reshape(len(which), count)
             changes = [
                 (np.array([self.changes[j][0] for j in column]), targets[column])
                 for column in places.T
             ]
-            found = made(which, initial[which], changes)
-            parts.append(tuple(jnp.broadcast_to(v, (clock.samples, len(which))) for v in found))
+            columns = course(which, initial[which], changes)
+            parts.append(tuple(jnp.broadcast_to(v, (clock.samples, len(which))) for v in columns))
             order += list(which)
         back = np.argsort(order)
         return tuple(jnp.concatenate(part, axis=1)[:, back] for part in zip(*parts))

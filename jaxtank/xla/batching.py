@@ -29,8 +29,8 @@ def in_batches(function: Callable[..., Any], batch: int) -> Callable[..., Any]:
         if closed.effects:
             return function(*arguments)
         constants = closed.consts  # also what the function closes over, traced or not
-        found = _call.bind(*constants, *arguments, jaxpr=closed.jaxpr, batch=batch)
-        return jax.tree.unflatten(jax.tree.structure(shapes), found)
+        results = _call.bind(*constants, *arguments, jaxpr=closed.jaxpr, batch=batch)
+        return jax.tree.unflatten(jax.tree.structure(shapes), results)
 
     return whole
 
@@ -45,34 +45,34 @@ def _mapped(operands: Any, axes: Any, *, jaxpr: Any, batch: int) -> Any:
     """Rule of `jax.vmap`: all results have their axis in front."""
     mapped = [axis is not None for axis in axes]
 
-    def one(*given: Any) -> list[Any]:
-        return _inlined(*given, jaxpr=jaxpr, batch=batch)
+    def one(*operands_of_one: Any) -> list[Any]:
+        return _inlined(*operands_of_one, jaxpr=jaxpr, batch=batch)
 
     size = next(v.shape[axis] for v, axis in zip(operands, axes) if axis is not None)
     if size <= batch or jax.default_backend() != "cpu":
-        found = jax.vmap(one, in_axes=axes)(*operands)
+        results = jax.vmap(one, in_axes=axes)(*operands)
     else:
         moving = [jax.numpy.moveaxis(v, a, 0) for v, a in zip(operands, axes) if a is not None]
 
         def of(row: Any) -> list[Any]:
-            own = iter(row)
-            return one(*(next(own) if m else v for v, m in zip(operands, mapped)))
+            entries = iter(row)
+            return one(*(next(entries) if m else v for v, m in zip(operands, mapped)))
 
-        found = jax.lax.map(of, moving, batch_size=batch)
-    return found, [0] * len(found)
+        results = jax.lax.map(of, moving, batch_size=batch)
+    return results, [0] * len(results)
 
 
 def _derived(primals: Any, tangents: Any, *, jaxpr: Any, batch: int) -> Any:
     """Rule of derivatives: those of the operations, by the operands that have a tangent."""
     moving = [not isinstance(v, ad.Zero) for v in tangents]
 
-    def of(*own: Any) -> list[Any]:
-        given = iter(own)
-        here = (next(given) if m else v for v, m in zip(primals, moving))
-        return _inlined(*here, jaxpr=jaxpr, batch=batch)
+    def of(*primals_of: Any) -> list[Any]:
+        entries = iter(primals_of)
+        operands = (next(entries) if m else v for v, m in zip(primals, moving))
+        return _inlined(*operands, jaxpr=jaxpr, batch=batch)
 
-    own, theirs = (tuple(itertools.compress(v, moving)) for v in (primals, tangents))
-    return jax.jvp(of, own, theirs)
+    primals_of, theirs = (tuple(itertools.compress(v, moving)) for v in (primals, tangents))
+    return jax.jvp(of, primals_of, theirs)
 
 
 _call.def_impl(_inlined)

@@ -42,17 +42,17 @@ def append_option(flags):
         return flags
     if VECTOR_WIDTH.split("=")[0] not in flags and jaxlib.version.__version_info__ < UNTRIED:
         flags = f"{VECTOR_WIDTH} {flags}".strip()
-    wanted = ",".join(option for option in OPTION.split(",") if option.split("=")[0] not in flags)
-    if not wanted:
+    missing = ",".join(option for option in OPTION.split(",") if option.split("=")[0] not in flags)
+    if not missing:
         return flags
     # XLA keeps the last of several such flags, so the options join that one
-    head, found, tail = flags.rpartition(_FLAG)
-    if not found:
-        return f"{flags} {_FLAG}{wanted}".strip()
+    head, flag, tail = flags.rpartition(_FLAG)
+    if not flag:
+        return f"{flags} {_FLAG}{missing}".strip()
     quote = tail[:1] if tail[:1] in ("'", '"') else ""
     tail = tail[len(quote) :]  # the options join inside of the user's quotes
     theirs = re.split(quote or r"\s", tail, maxsplit=1)[0]
-    joined = ",".join(filter(None, (theirs, wanted)))
+    joined = ",".join(filter(None, (theirs, missing)))
     return head + _FLAG + quote + joined + tail[len(theirs) :]
 
 
@@ -73,8 +73,8 @@ def backend_started():
 def _text_of(file):
     """What a file holds; nothing where it cannot be read."""
     try:
-        with open(file) as found:
-            return found.read()
+        with open(file) as text:
+            return text.read()
     except (OSError, ValueError):
         return ""
 

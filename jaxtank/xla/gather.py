@@ -56,20 +56,20 @@ def rounds(ends: tuple[int, ...], tanks: int) -> tuple[Round, ...]:
 
 def gathered(weights: Any, values: Any, ends: tuple[int, ...], tanks: int, of: Any = None) -> Any:
     """Return (n,) sums over what ends at each tank of weight times value; None without any."""
-    found: Any = None
+    sums: Any = None
     for level, (index, present) in enumerate(rounds(ends, tanks)):
         terms: list[Any] = []
-        found = materialised(found) if level else None
+        sums = materialised(sums) if level else None
         for column, there in zip(index.T, present.T):
             if level:
-                terms.append(_kept(there, take(found, column)))
+                terms.append(_kept(there, take(sums, column)))
                 continue
             known = isinstance(weights, np.ndarray)
             weight = _kept(there, weights[column] if known else take(weights, column))
             read = column if of is None else np.asarray(of)[column]
             terms.append(weight if values is None else weight * take(values, read))
-        found = functools.reduce(operator.add, terms)
-    return found
+        sums = functools.reduce(operator.add, terms)
+    return sums
 
 
 def _kept(present: np.ndarray[Any, Any], values: Any) -> Any:

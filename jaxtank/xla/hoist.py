@@ -58,22 +58,22 @@ def checkpointed_scan(body: Callable[[Any, Any], Any], carry: Any, xs: Any, leng
 
 def _split(jaxpr):
     """(operations to do once, operations of the loop, {variable: the one it equals})."""
-    once, inside, same, seen, fixed = [], [], {}, {}, set(jaxpr.constvars)
+    once, inside, same, first_of, fixed = [], [], {}, {}, set(jaxpr.constvars)
     for eqn in jaxpr.eqns:
         operands = [v if isinstance(v, Literal) else same.get(v, v) for v in eqn.invars]
         if eqn.effects or not all(isinstance(v, Literal) or v in fixed for v in operands):
             inside.append(eqn)
             continue
-        twin = seen.setdefault(_key(eqn, operands), eqn)
+        twin = first_of.setdefault(_key(eqn, operands), eqn)
         if twin is eqn:
             once.append(eqn)
             fixed.update(eqn.outvars)
         else:
             same.update(zip(eqn.outvars, twin.outvars))
     # a number broadcast over a batch is cheaper to broadcast again than to load
-    wanted = {same.get(v, v) for eqn in inside for v in eqn.invars if not isinstance(v, Literal)}
+    reads = {same.get(v, v) for eqn in inside for v in eqn.invars if not isinstance(v, Literal)}
     broadcast = [
-        eqn for eqn in once if eqn.primitive.name == "broadcast_in_dim" and eqn.outvars[0] in wanted
+        eqn for eqn in once if eqn.primitive.name == "broadcast_in_dim" and eqn.outvars[0] in reads
     ]
     return once, broadcast + inside, same
 

@@ -54,9 +54,9 @@ class Kept:
             return self.compiled(*args, **kwargs)
         static = {n: v for n, v in zip(self.names, args) if n in self.static}
         static |= {n: v for n, v in kwargs.items() if n in self.static}
-        given = tuple(v for n, v in zip(self.names, args) if n not in self.static)
+        arguments = tuple(v for n, v in zip(self.names, args) if n not in self.static)
         named = {n: v for n, v in kwargs.items() if n not in self.static}
-        leaves, tree = jax.tree.flatten((given, named))
+        leaves, tree = jax.tree.flatten((arguments, named))
         if any(isinstance(v, Tracer) for v in leaves) or not _simple():
             return self.compiled(*args, **kwargs)
         kinds = tuple(map(kind_of, leaves))
@@ -64,7 +64,7 @@ class Kept:
         if key not in self.programs:
             self.programs[key] = self._program(folder, tree, kinds, static, (args, kwargs))
         program = self.programs[key]
-        return program(*given, **named) if program else self.compiled(*args, **kwargs)
+        return program(*arguments, **named) if program else self.compiled(*args, **kwargs)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.compiled, name)
@@ -80,17 +80,17 @@ class Kept:
             return None
         name = signature(words)
         path = folder / f"{self.__name__}-{name}{ENDING}"
-        found = _read(path, tree)
-        if found is not None:
-            return Tried(found, path, functools.partial(self._traced, static))
+        program = _read(path, tree)
+        if program is not None:
+            return Tried(program, path, functools.partial(self._traced, static))
         lowered = self.compiled.lower(*call[0], **call[1])
         about = _about(lowered)
         return lowered.compile() if about is None else _compile(lowered, about, path)
 
-    def _traced(self, static, given, named):
+    def _traced(self, static, arguments, named):
         """What the function returns, by a program that is traced and compiled."""
         moving = (n for n in self.names if n not in self.static)
-        return self.compiled(**dict(zip(moving, given)), **named, **static)
+        return self.compiled(**dict(zip(moving, arguments)), **named, **static)
 
 
 class Tried:
@@ -104,14 +104,14 @@ class Tried:
         if self.ran:
             return self.program(*args, **kwargs)
         try:
-            found = jax.block_until_ready(self.program(*args, **kwargs))
+            results = jax.block_until_ready(self.program(*args, **kwargs))
         except jax.errors.JaxRuntimeError:
             self.path.unlink(missing_ok=True)
             self.program = lambda *args, **kwargs: self.traced(args, kwargs)
-            found = self.program(*args, **kwargs)
+            results = self.program(*args, **kwargs)
         self.ran = True
         _mark_of(self.path).unlink(missing_ok=True)
-        return found
+        return results
 
 
 _HITS: list[str] = []
@@ -151,11 +151,11 @@ def _read(path: Path, tree: Any) -> Any:
             return None
         if about["lapack"]:
             _load_lapack()
-        found = deserialize_and_load(
+        program = deserialize_and_load(
             data[SIZE + size :], tree, jax.tree.structure(_tree(about["out"]))
         )
         _mark_of(path).touch()
-        return found
+        return program
     except FileNotFoundError:
         return None
     except Exception:  # of another build of jax, damaged, or a disk that is full: it is compiled
@@ -229,10 +229,10 @@ def _tree(words: Any) -> Any:
     """The structure of `_words`."""
     if not isinstance(words, list):
         return words
-    kind, own = words
+    kind, content = words
     if kind == "dict":
-        return {name: _tree(value) for name, value in own.items()}
-    parts = [_tree(value) for value in own]
+        return {name: _tree(value) for name, value in content.items()}
+    parts = [_tree(value) for value in content]
     if kind in ("tuple", "list"):
         return tuple(parts) if kind == "tuple" else parts
     module, name = kind.split(":")
@@ -249,7 +249,7 @@ def compiled(*static: str, keep: bool = False) -> Callable[[F], F]:
 
     def decorate(function: F) -> F:
         jit: Any = jax.jit
-        made = jit(function, static_argnames=static)
-        return cast(F, Kept(function, made, static) if keep else made)
+        jitted = jit(function, static_argnames=static)
+        return cast(F, Kept(function, jitted, static) if keep else jitted)
 
     return decorate

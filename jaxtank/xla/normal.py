@@ -25,8 +25,8 @@ def normal(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
 
 def is_fast(key: Any) -> bool:
     """Return whether `normal_at` serves: a key of jax's default generator, float64, a CPU."""
-    here = jax.default_backend() == "cpu" and jnp.result_type(float) == jnp.float64
-    return here and _is_threefry(key)
+    cpu_float64 = jax.default_backend() == "cpu" and jnp.result_type(float) == jnp.float64
+    return cpu_float64 and _is_threefry(key)
 
 
 def normal_at(key: Any, index: jax.Array) -> jax.Array:

@@ -72,15 +72,15 @@ def cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
     config: Any = jax.config
     if config.jax_compilation_cache_dir:
         return Path(config.jax_compilation_cache_dir)
-    found, why = prepare(folder)
+    prepared, why = prepare(folder)
     if why:
         warnings.warn(f"compiled programs are not kept: {why}", stacklevel=2)
-    if found is not None:
-        config.update("jax_compilation_cache_dir", str(found))
+    if prepared is not None:
+        config.update("jax_compilation_cache_dir", str(prepared))
         for name, value in SETTINGS.items():
             config.update(name, value)
-        _remember(found)
-    return found
+        _remember(prepared)
+    return prepared
 
 
 def keep_for_this_process() -> str:
@@ -99,20 +99,20 @@ def keep_for_this_process() -> str:
     return why
 
 
-def _remember(found: Path) -> None:
+def _remember(prepared: Path) -> None:
     """Keep whole programs (`jit`) there too."""
     global folder
-    folder = found
+    folder = prepared
 
 
 def base_folder(folder: str | os.PathLike[str] | None = None) -> Path | None:
     """Return the folder of all versions; None where JAXTANK_CACHE=0, or there is no home."""
-    given = os.environ.get(SWITCH, "") if folder is None else os.fspath(folder)
-    if folder is None and given.lower() in OFF:
+    name = os.environ.get(SWITCH, "") if folder is None else os.fspath(folder)
+    if folder is None and name.lower() in OFF:
         return None
     try:
-        if given:
-            return Path(given).expanduser().absolute()
+        if name:
+            return Path(name).expanduser().absolute()
         home, of = Path.home(), os.environ.get
         if sys.platform == "darwin":
             return home / "Library" / "Caches" / "jaxtank"
@@ -205,11 +205,11 @@ def seal(folder: Path, since: float) -> None:
 
 def contents(base: Path) -> dict[str, tuple[int, int]]:
     """Return {folder of a version: (programs, their bytes)} below the folder of all versions."""
-    found: dict[str, tuple[int, int]] = {}
+    sizes_of: dict[str, tuple[int, int]] = {}
     for folder in _versions(base):
         sizes = [path.stat().st_size for path in _entries(folder)]
-        found[folder.name] = len(sizes), sum(sizes)
-    return found
+        sizes_of[folder.name] = len(sizes), sum(sizes)
+    return sizes_of
 
 
 def clear(base: Path) -> int:
@@ -261,15 +261,15 @@ def _check_entries(folder: Path) -> None:
     sound: list[tuple[float, int, Path]] = []
     for path in _entries(folder):
         try:
-            found = path.stat()
-            closed = not (found.st_mode | _digest_of(path).stat().st_mode) & 0o022
+            status = path.stat()
+            closed = not (status.st_mode | _digest_of(path).stat().st_mode) & 0o022
             good = closed and _digest_of(path).read_text() == _digest(path)
         except OSError:
-            good, found = False, None
-        if found is None or not good:
+            good, status = False, None
+        if status is None or not good:
             _remove(path)
         else:
-            sound.append((found.st_mtime, found.st_size, path))
+            sound.append((status.st_mtime, status.st_size, path))
     total = sum(size for _, size, _ in sound)
     for _, size, path in sorted(sound):
         if total <= LARGEST:
@@ -300,5 +300,5 @@ def _digest_of(path: Path) -> Path:
 
 
 def _remove(path: Path) -> None:
-    for one in (path, _digest_of(path)):
-        one.unlink(missing_ok=True)
+    for file in (path, _digest_of(path)):
+        file.unlink(missing_ok=True)

@@ -10,6 +10,7 @@ import functools
 import hashlib
 import importlib.metadata
 import importlib.util
+import itertools
 import json
 import os
 import sys
@@ -57,8 +58,8 @@ def _source() -> Iterator[str]:
         spec = importlib.util.find_spec(package)
         for root in (spec.submodule_search_locations or []) if spec else []:
             for path in sorted(Path(root).rglob("*.py")):
-                found = path.stat()
-                yield f"{path} {found.st_size} {found.st_mtime_ns}"
+                status = path.stat()
+                yield f"{path} {status.st_size} {status.st_mtime_ns}"
 
 
 def context() -> tuple[Any, ...]:
@@ -97,12 +98,12 @@ def words_of(value: Any) -> list[str]:
     if isinstance(value, type | types.FunctionType):
         return [name_of(value)]
     if isinstance(value, dict):
-        items = [word for pair in value.items() for one in pair for word in words_of(one)]
+        items = [word for pair in value.items() for entry in pair for word in words_of(entry)]
         return [f"dict {len(value)}", *items]
     if isinstance(value, tuple | list | frozenset):
-        parts = [words_of(one) for one in value]
+        parts = [words_of(v) for v in value]
         parts = sorted(parts) if isinstance(value, frozenset) else parts
-        return [f"{name_of(type(value))} {len(parts)}", *(word for one in parts for word in one)]
+        return [f"{name_of(type(value))} {len(parts)}", *itertools.chain(*parts)]
     if dataclasses.is_dataclass(value):
         fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
         return [name_of(type(value)), *words_of(fields)]

@@ -15,7 +15,7 @@ def open_case(args):
 
     jax.config.update("jax_enable_x64", True)
     from jaxtank import rig
-    from jaxtank.loop import floor
+    from jaxtank.loop import tank_bottom
 
     opened = rig.open_case(args.case)
     known = [] if args.quiet else rig.case_warnings(opened)
@@ -24,7 +24,7 @@ def open_case(args):
     values, of_filter = _apart(settings(args))
     case = rig.set_and_schedule(opened, values, schedule(args.schedule))
     case, replaced = rig.overridden(case, values)
-    if "plant.bottom" not in values and not floor.draws(opened.loop):
+    if "plant.bottom" not in values and not tank_bottom.can_withdraw(opened.loop):
         case = rig.with_bottom(case)
     case = rig.check(case)
     case = rig.filtered(case, args.safety_filter, of_filter)

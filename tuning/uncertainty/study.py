@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.case import Case
-from jaxtank.loop import floor
+from jaxtank.loop import tank_bottom
 from tuning.cluster.engine import check_cluster
 from tuning.problem.functions import as_measures, digests
 from tuning.problem.limits import Limit, resolve_limits
@@ -178,9 +178,9 @@ def ensemble(
 
 def _tank_bottoms(case):
     """Limits at the bottoms of tanks whose levels may fall below them."""
-    if not floor.is_open(case.loop):
+    if not tank_bottom.is_open(case.loop):
         return []
-    lowest = floor.lowest(case.loop.plant)
+    lowest = tank_bottom.lower_bounds(case.loop.plant)
     return [Limit("min_level", i, float(level)) for i, level in enumerate(lowest)]
 
 

@@ -190,14 +190,14 @@ def _of_run(case, values, key):
     """Sentences on levels that fell below 0 in the run of these measures, and on its estimates."""
     import numpy as np
 
-    from jaxtank.loop import estimate_notes, floor
+    from jaxtank.loop import estimate_notes, tank_bottom
     from jaxtank.loop.saved_rows import simulate_compiled
 
-    below = np.any(np.asarray(values["min_level"]) < floor.lowest(case.loop.plant))
+    below = np.any(np.asarray(values["min_level"]) < tank_bottom.lower_bounds(case.loop.plant))
     if not below and not estimate_notes.needs_run(case.loop):
         return []
     run, _ = simulate_compiled(case.loop, case.clock, key, 1)
-    return floor.floor_warnings(case.loop, run) + estimate_notes.estimate_notes(case.loop, run)
+    return tank_bottom.tank_bottom_warnings(case.loop, run) + estimate_notes.estimate_notes(case.loop, run)
 
 
 def _checked_columns(args):

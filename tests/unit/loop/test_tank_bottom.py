@@ -10,7 +10,7 @@ import pytest
 import jaxtank
 import tuning
 from jaxtank import component, leaf, presets, rig
-from jaxtank.loop import floor
+from jaxtank.loop import tank_bottom
 from jaxtank.plants import Plant, TankNetwork
 from tuning.cli.main import main
 
@@ -126,9 +126,9 @@ def test_a_plant_of_a_user_says_when_it_is_below_its_bottom():
     loop = dataclasses.replace(
         loop, plant=Leaky(rim=[5.0], area=[2.0]), sensor=loop.sensor, x0=np.array([1.0])
     )
-    assert floor.is_open(loop) and not isinstance(loop.plant, TankNetwork)
+    assert tank_bottom.is_open(loop) and not isinstance(loop.plant, TankNetwork)
     with pytest.warns(
-        floor.FloorWarning,
+        tank_bottom.TankBottomWarning,
         match=r"tank 1 falls below 0 at t = 101 s and reaches -1 m at t = 200 s, 2 m\^3",
     ):
         jaxtank.simulate(loop, jaxtank.Clock(dt=1.0, duration=200.0))

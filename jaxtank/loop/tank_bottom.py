@@ -12,11 +12,11 @@ from jaxtank.loop.trajectory import Trajectory
 from jaxtank.plants.tank_network import TankNetwork
 
 
-class FloorWarning(UserWarning):
+class TankBottomWarning(UserWarning):
     """A level fell below an empty tank. The command prints a note of its own."""
 
 
-def draws(loop: ClosedLoop) -> bool:
+def can_withdraw(loop: ClosedLoop) -> bool:
     """Return whether anything can take liquid out of a tank besides its outlets: an inflow below 0,
     or a pump that may run backwards.
     """
@@ -27,7 +27,7 @@ def draws(loop: ClosedLoop) -> bool:
     return any(np.any(np.asarray(v, dtype=float) < 0.0) for v in numbers if v is not None)
 
 
-def lowest(plant: Any) -> Any:
+def lower_bounds(plant: Any) -> Any:
     """Return (n,) levels [cm] below which a tank has given what it did not hold: rounding and the
     laminar zone aside.
     """
@@ -41,17 +41,17 @@ def is_open(loop: ClosedLoop) -> bool:
     """
     kind: Any = type(loop.plant)  # a subclass may have flows of its own
     network = kind.derivative is cast(Any, TankNetwork).derivative
-    return not loop.plant.bottom and (not network or draws(loop))
+    return not loop.plant.bottom and (not network or can_withdraw(loop))
 
 
-def floor_warnings(loop: ClosedLoop, run: Trajectory) -> list[str]:
+def tank_bottom_warnings(loop: ClosedLoop, run: Trajectory) -> list[str]:
     """Return a sentence for each tank whose level falls below 0 in a run: how far, when, and the
     volume that the tank has given without holding it.
     """
     plant: Any = loop.plant
     x, length = np.asarray(run.x), loop.units[0]
-    found: list[str] = []
-    for i, limit in enumerate(lowest(plant)):
+    sentences: list[str] = []
+    for i, limit in enumerate(lower_bounds(plant)):
         column = np.where(np.isfinite(x[:, i]), x[:, i], 0.0)
         if not column.min() < limit:
             continue
@@ -63,9 +63,9 @@ def floor_warnings(loop: ClosedLoop, run: Trajectory) -> list[str]:
             if isinstance(plant, TankNetwork)
             else "limit the outflow in its derivative"
         )
-        found.append(
+        sentences.append(
             f"the level of tank {i + 1} falls below 0 at t = {run.t[np.argmax(column < limit)]:g} s"
             f" and reaches {column.min():.4g} {length} at t = {run.t[np.argmin(column)]:g} s"
             f"{amount}: {remedy}"
         )
-    return found
+    return sentences
