@@ -143,11 +143,12 @@ def evaluate(
     """
     names = _names(measures)
     check(loop, clock, key)
-    leaves, tree = cast(tuple[list[Any], Any], jax.tree.flatten((loop, key)))
-    if any(isinstance(v, Tracer) for v in leaves):
-        values, broken = _in_batches(tree, clock, names)(*leaves)
-    else:
-        values, broken = evaluate_compiled(loop, clock, names, key, False)
+
+    def run(loop: ClosedLoop, key: Any) -> tuple[dict[str, jax.Array], jax.Array]:
+        return evaluate_compiled(loop, clock, names, key, checkpoint=False)
+
+    traced = any(isinstance(v, Tracer) for v in cast(Any, jax.tree.leaves((loop, key))))
+    values, broken = (in_batches(run, BATCH) if traced else run)(loop, key)
     _report_broken(broken, loop, clock, key)
     return {
         m: _without_slope(m, v, loop) if ms.MEASURES[m].counts else v for m, v in values.items()
@@ -173,23 +174,13 @@ def _no_slope(names: Sequence[str]) -> str:
     )
 
 
-def _in_batches(tree: Any, clock: Clock, names: tuple[str, ...]) -> Any:
-    """`evaluate_compiled` as a function of the leaves of (loop, key)."""
-
-    def run(*leaves: Any) -> tuple[dict[str, jax.Array], jax.Array]:
-        loop, key = jax.tree.unflatten(tree, leaves)
-        return evaluate_compiled(loop, clock, names, key, False)
-
-    return in_batches(run, BATCH)
-
-
 def evaluate_and_flag(
     loop: ClosedLoop, clock: Clock, measures: Sequence[str], key: jax.Array | None = None
 ) -> tuple[dict[str, jax.Array], jax.Array]:
     """Return (`evaluate`'s values, True if the run diverged); checks nothing, raises nothing: for
     batches and searches.
     """
-    return evaluate_compiled(loop, clock, _names(measures), key, False)
+    return evaluate_compiled(loop, clock, _names(measures), key, checkpoint=False)
 
 
 def evaluate_for_reverse(
@@ -202,7 +193,7 @@ def evaluate_for_reverse(
     # samples. Best above about ten parameters.
     names = _names(measures)
     check(loop, clock, key)
-    return evaluate_compiled(loop, clock, names, key, True)[0]
+    return evaluate_compiled(loop, clock, names, key, checkpoint=True)[0]
 
 
 def sensitivities(
@@ -286,9 +277,8 @@ def evaluate_compiled(
 ) -> tuple[dict[str, jax.Array], jax.Array]:
     """Return (measures, True if the run diverged), unchecked; checkpoint: for reverse mode."""
     if ms.functions(names):
-        values, broken = evaluate_compiled(
-            loop, clock, needed_by(loop, clock, names), key, checkpoint
-        )
+        needed = needed_by(loop, clock, names)
+        values, broken = evaluate_compiled(loop, clock, needed, key, checkpoint=checkpoint)
         return values_of(loop, clock, names, key, values, checkpoint), broken
     loop, arrays = keyed(loop, key), takes_arrays(loop)
     run = run_of(loop, clock, arrays)
@@ -349,15 +339,3 @@ def _report_broken(
     raise NonFiniteError(
         f"the level of tank {tanks} stopped being finite at t = {first * clock.dt:g} s with {text}"
     )
-
-
-__all__ = [
-    "Clock",
-    "ClosedLoop",
-    "Trajectory",
-    "check",
-    "evaluate",
-    "evaluate_for_reverse",
-    "sensitivities",
-    "simulate",
-]

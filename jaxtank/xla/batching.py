@@ -20,16 +20,15 @@ _call.multiple_results = True
 
 
 def in_batches(function: Callable[..., Any], batch: int) -> Callable[..., Any]:
-    """Return `function` of arrays; on a CPU `jax.vmap` of it runs at most `batch`
-    elements at once.
-    """
+    """Return `function` of trees, of which `jax.vmap` on a CPU runs `batch` elements at a time."""
 
     def whole(*arguments: Any) -> Any:
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
         if closed.effects:
             return function(*arguments)
-        constants = closed.consts  # also what the function closes over, traced or not
-        results = _call.bind(*constants, *arguments, jaxpr=closed.jaxpr, batch=batch)
+        # also what the function closes over, traced or not
+        leaves = *closed.consts, *jax.tree.leaves(arguments)
+        results = _call.bind(*leaves, jaxpr=closed.jaxpr, batch=batch)
         return jax.tree.unflatten(jax.tree.structure(shapes), results)
 
     return whole

@@ -1,14 +1,11 @@
 """What a user writes in Python: names for components, solver options, results that are read."""
 
 import abc
-import ast
 import contextlib
 import dataclasses
 import json
-import re
 import sqlite3
 from html.parser import HTMLParser
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -30,8 +27,6 @@ from jaxtank.plants.base import Plant
 from jaxtank.rig import components
 from tuning.cli.main import main
 from tuning.optimal_input.perfect_information import InputBound
-from tuning.search import messages
-from tuning.search.messages import messages_of
 from tuning.search.result import constraint_rows
 
 
@@ -251,6 +246,7 @@ def reported(result):
     return result.method, result.parameters, result.history, result.message
 
 
+@pytest.mark.slow
 def test_solver_options_are_the_keywords_they_stand_for(own, tuned):
     assert reported(tuning.tune(own, tuning.TRF(**FEW), validation=0)) == reported(tuned)
     problem = tuning.Problem(own, free=own.free, limits={})
@@ -343,43 +339,6 @@ def test_messages_have_codes_and_their_texts_are_the_message(tuned):
         tuned.messages[0].code = "other"
 
 
-def test_the_message_on_a_bound_names_value_unit_and_sensitivity(tuned):
-    (text,) = [m.text for m in tuned.messages if m.code == "parameter-at-bound"]
-    assert text.startswith("controller.Kc ended at its upper bound 10 V/V")
-    percent = tuned["controller.Kc"].sensitivity_percent
-    small = tuned.replace(
-        parameters={
-            "controller.Kc": tuned.parameters["controller.Kc"] | {"sensitivity_percent": 0.01}
-        }
-    )
-    (text,) = [m.text for m in messages_of(small) if m.code == "parameter-at-bound"]
-    assert percent > 0.5 and text == (
-        "controller.Kc ended at its upper bound 10 V/V; the objective is insensitive to it"
-        " (10 % changes it by 0.01 %)"
-    )
-
-
-def test_every_code_is_kebab_case_and_is_in_the_table_of_codes():
-    folder = Path(messages.__file__).parent
-    report = folder.parent / "report" / "tuned.py"
-    _check_codes([*folder.glob("*.py"), report], messages.__doc__)
-
-
-def _check_codes(paths, table, found=frozenset()):
-    """The codes of all Messages that the modules make are those of the table, each once."""
-    found = set(found)
-    for path in paths:
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Message":
-                found |= {
-                    n.value
-                    for n in ast.walk(node.args[0])
-                    if isinstance(n, ast.Constant) and isinstance(n.value, str)
-                }
-    listed = re.findall(r"^([a-z]+(?:-[a-z]+)*)  ", table, flags=re.M)[1:]  # the head
-    assert found == set(listed) and len(listed) == len(set(listed))
-
-
 def test_a_limit_is_a_typed_row_with_the_values_before_and_after(own, tuned):
     limits = {"max_level": [9.0, 9.5], "input_travel": 1e9}
     problem = tuning.Problem(own, limits=limits)
@@ -433,6 +392,7 @@ def test_every_result_has_the_same_ways_out(tuned):
     assert str(tuned).startswith("own: converged") and "controller.Kc" in str(tuned)
 
 
+@pytest.mark.slow
 def test_tune_keeps_its_log_in_the_checkpoint_and_goes_on_from_it(own, tuned, tmp_path):
     assert reported(tuning.tune(own, "trf", **QUICK, checkpoint=tmp_path)) == reported(tuned)
     count = kept(tmp_path)
@@ -442,14 +402,6 @@ def test_tune_keeps_its_log_in_the_checkpoint_and_goes_on_from_it(own, tuned, tm
     again = tuning.tune(own, tuning.TRF(**FEW), validation=0, checkpoint=tmp_path, resume=True)
     assert reported(again) == reported(tuned)
     assert kept(tmp_path) == count
-
-
-def test_an_ensemble_keeps_its_batches_in_the_checkpoint(own, tmp_path):
-    options = {"measures": ("max_level",), "limits": {}, "fan": False, "batch": 2}
-    spread = {"plant.pump_gain": tuning.Normal(relative=0.05)}
-    tuning.ensemble(own, spread, 4, checkpoint=tmp_path, **options)
-    with pytest.raises(InputError, match="--resume continues"):
-        tuning.ensemble(own, spread, 4, checkpoint=tmp_path, **options)
 
 
 @pytest.fixture(scope="module")
@@ -547,7 +499,7 @@ NASTY = "a<script>alert(1)</script>\"'&b"
 
 @pytest.fixture(scope="module")
 def results(own, tuned):
-    """{name: result of each kind}, of a case whose name is hostile, under a class of one's own."""
+    """{kind: () -> result}, of a case whose name is hostile, under a class of one's own."""
     with pytest.MonkeyPatch.context() as patch:  # a class that has no name in a file
         patch.setattr(components, "REGISTERED", {})
         for name, role in components.ROLES.items():
@@ -563,12 +515,14 @@ def results(own, tuned):
         numbers = dict(cost=1.0, measures={}, u=np.zeros((3, 1)), interval=2.0, slope=0.0)
         counts = dict(iterations=1, gradients=1, simulations=1, wall_s=0.1, interrupted=False)
         yield {
-            "tuning": tuned.replace(case=case, tuned=case),
-            "ensemble": tuning.ensemble(case, spread, 4, measures=("max_level",), limits={}),
-            "sensitivity": tuning.sensitivity(case, spread, measures=["max_level"]),
-            "identification": tuning.identify(case, [data], free, starts=1, iterations=2),
-            "certificate": tuning.Certificate(64, 3, 0.4, 1024, 12, [0.006, 0.02]),
-            "bound": InputBound(
+            "tuning": lambda: tuned.replace(case=case, tuned=case),
+            "ensemble": lambda: tuning.ensemble(
+                case, spread, 4, measures=("max_level",), limits={}
+            ),
+            "sensitivity": lambda: tuning.sensitivity(case, spread, measures=["max_level"]),
+            "identification": lambda: tuning.identify(case, [data], free, starts=1, iterations=2),
+            "certificate": lambda: tuning.Certificate(64, 3, 0.4, 1024, 12, [0.006, 0.02]),
+            "bound": lambda: InputBound(
                 case=case,
                 objective={NASTY: 1.0},
                 constraints=[cell],
@@ -583,11 +537,13 @@ def results(own, tuned):
 
 
 KINDS = ("tuning", "ensemble", "sensitivity", "identification", "certificate", "bound")
+SLOW_KINDS = KINDS[1:4]  # each is a study of its own
 
 
+@pytest.mark.slow_for(*SLOW_KINDS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_notebook_shows_a_result_as_tables_with_every_text_escaped(results, kind):
-    result = results[kind]
+    result = results[kind]()
     page = Page(result._repr_html_())
     assert {"table", "p"} & set(page.tags) and not {"script", "b"} & set(page.tags)
     rule = {w for w in str(result).split() if not w.strip("-")}  # under the heads of a table
@@ -597,6 +553,7 @@ def test_a_notebook_shows_a_result_as_tables_with_every_text_escaped(results, ki
     assert ("alert(1)" in joined) == (kind != "certificate")
 
 
+@pytest.mark.slow_for("identification")
 @pytest.mark.parametrize("kind", ("tuning", "identification"))
 def test_save_leaves_out_the_rig_file_of_a_class_without_a_name_with_a_note(
     results, kind, tmp_path, monkeypatch
@@ -604,7 +561,7 @@ def test_save_leaves_out_the_rig_file_of_a_class_without_a_name_with_a_note(
     module = {"tuning": "tuned"}.get(kind, kind)
     monkeypatch.setattr(f"tuning.report.{module}.figures", lambda *_: {})
     with pytest.warns(UserWarning, match=r"rig\.toml is not written .*no name in a rig file"):
-        names = {path.name for path in results[kind].save(tmp_path)}
+        names = {path.name for path in results[kind]().save(tmp_path)}
     assert {"result.json", "report.html"} <= names and "rig.toml" not in names
     assert names == {path.name for path in tmp_path.iterdir()}
     assert (

@@ -59,15 +59,15 @@ def enumerated(H, f, G, l, u):
 solve = jax.jit(qp.solve, static_argnames="iterations")
 
 
-@pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("n, rows", [(1, 1), (2, 4), (3, 6), (4, 7)])
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("n, rows", [(1, 1), (3, 6), (4, 7)])
 def test_equals_the_enumeration_of_active_sets(n, rows, seed):
     data = problem(n, rows, seed)
     exact, _ = enumerated(*data)
     np.testing.assert_allclose(solve(*data, iterations=20), exact, atol=1e-8)
 
 
-@pytest.mark.slow_for("22-30", "8-60")
+@pytest.mark.slow
 @pytest.mark.parametrize("n, rows", [(8, 60), (22, 30)])
 def test_equals_scipy(n, rows):
     H, f, G, l, u = problem(n, rows, 5, tight=1.0)
@@ -94,12 +94,12 @@ def test_inside_its_limits_it_is_the_linear_answer():
     np.testing.assert_allclose(solve(H, f, G, -wide, wide), -np.linalg.solve(H, f), rtol=1e-9)
 
 
-@pytest.mark.parametrize("size", [1e-12, 1e-6, 1e-3, 1e3, 1e9])
+@pytest.mark.parametrize("size", [1e-12, 1e9])
 def test_units_of_the_variables_do_not_matter(size):
     """Limits and answer in other units, as m^3/s beside ml/s: with plain numbers for slacks and
     complementarity the answer of small units was anywhere within the limits.
     """
-    for seed in range(8):
+    for seed in range(4):
         H, f, G, l, u = problem(4, 7, seed)
         np.testing.assert_allclose(
             solve(H, size * f, G, size * l, size * u) / size, solve(H, f, G, l, u), atol=1e-9
@@ -253,7 +253,7 @@ def test_limits_that_bind_over_the_whole_horizon(error, before, least_step):
     np.testing.assert_allclose(x, found.x, atol=1e-6)
 
 
-@pytest.mark.parametrize("gap", [1e-9, 1e-3, 1.0])
+@pytest.mark.parametrize("gap", [1e-9, 1.0])
 def test_without_a_feasible_point_it_ends_with_numbers(gap):
     """Two rows that exclude each other: a meaningless x, but a number, for the law that asks holds
     it within its limits.
@@ -380,6 +380,7 @@ def test_second_derivatives_of_a_large_programme_against_differences(outer, inne
     assert float(jax.jit(outer(inner(value)))(0.0)) == pytest.approx(float(central), rel=1e-4)
 
 
+@pytest.mark.slow_for(*(f"{way}-100" for way in ("run", "forward", "reverse")))
 @pytest.mark.parametrize("n", [48, 100])
 @pytest.mark.parametrize(
     "way", [lambda f: f, jax.jacfwd, jax.jacrev], ids=["run", "forward", "reverse"]

@@ -402,26 +402,6 @@ def test_levels_over_the_rim_and_when():
     assert (got["max_level"], got["min_level"], got["time_of_max_level"]) == (14, 9, 2)
 
 
-def test_the_names_of_the_contract_exist():
-    contract = {
-        "rms_error",
-        "rms_error_total",
-        "ise",
-        "iae",
-        "rms_input",
-        "input_travel",
-        "saturated_fraction",
-        "max_level",
-        "min_level",
-        "overflow_volume",
-        "overshoot_percent",
-        "rise_time",
-        "settling_time",
-        "estimation_rms",
-    }
-    assert contract <= set(ms.MEASURES)
-
-
 def test_an_unknown_measure_is_answered_with_the_nearest(gouta):
     case = gouta("ngpc")
     with pytest.raises(InputError, match="rms_error_total"):

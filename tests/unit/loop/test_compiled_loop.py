@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +27,7 @@ MEASURES = ("rms_error_total", "max_level")
 GAINS = {"controller.k": np.float64(0.03), "controller.k1": np.float64(0.088)}
 
 
-@pytest.mark.parametrize("name", ["ngpc", "backstepping", "backstepping-ff", "ngpc-boxqp"])
+@pytest.mark.parametrize("name", ["backstepping", "ngpc-boxqp"])
 def test_the_loop_compiles_to_one_function(gouta, name):
     case = gouta(name)
     assert (
@@ -104,6 +105,7 @@ def test_measures_do_not_make_memory_grow_with_the_samples(gouta):
     assert max(sizes) < 8 * 8  # bytes per sample: at most eight float64 arrays of inputs
 
 
+@pytest.mark.slow
 def test_a_gradient_of_two_gains_takes_less_than_ten_megabytes(gouta):
     case = gouta("backstepping")
     stats = (
@@ -155,18 +157,6 @@ def test_invariant_work_leaves_the_loop_and_nothing_else_changes():
         np.testing.assert_allclose(a, b, rtol=1e-14)
 
 
-def test_vmap_equals_a_python_loop(gouta):
-    case = gouta("ngpc", {"clock.dt": 0.1})
-    horizons = np.array([4.0, 11.0, 30.0])
-    run = lambda Tp: jaxtank.evaluate(
-        jaxtank.with_values(case.loop, {"controller.Tp": Tp}), case.clock, MEASURES
-    )
-    batch = jax.vmap(run)(horizons)
-    for i, Tp in enumerate(horizons):
-        for name, value in run(Tp).items():
-            np.testing.assert_allclose(batch[name][i], value, rtol=1e-12)
-
-
 @pytest.mark.slow
 def test_jit_equals_no_jit(gouta):
     case = gouta(
@@ -193,14 +183,14 @@ def test_a_run_repeats_bit_for_bit(gouta):
 
 
 def test_evaluate_simulate_and_sensitivities_tell_the_same(gouta):
-    case = gouta("backstepping", {"clock.duration": 400.0})
+    case = gouta("backstepping", {"clock.duration": 100.0, "clock.dt": 0.05})
     values = jaxtank.evaluate(
         case.loop, case.clock, ["rms_error", "max_level", "rms_input", "input_travel", "iae"]
     )
     run = jaxtank.simulate(case.loop, case.clock)
     e, u = np.asarray(run.e), np.asarray(run.u)
     np.testing.assert_allclose(values["rms_error"], np.sqrt((e**2).mean(axis=0)), rtol=1e-10)
-    np.testing.assert_allclose(values["iae"], np.abs(e[:-1]).sum(axis=0) * 0.01, rtol=1e-10)
+    np.testing.assert_allclose(values["iae"], np.abs(e[:-1]).sum(axis=0) * 0.05, rtol=1e-10)
     np.testing.assert_allclose(values["rms_input"], np.sqrt((u**2).mean(axis=0)), rtol=1e-10)
     np.testing.assert_allclose(
         values["input_travel"], np.abs(np.diff(u, axis=0)).sum(axis=0), rtol=1e-9
@@ -214,7 +204,7 @@ def test_evaluate_simulate_and_sensitivities_tell_the_same(gouta):
         np.testing.assert_allclose(carried[m], values[m], rtol=1e-12)
 
 
-@pytest.mark.parametrize("save_every", [1, 7, 100, 5000])
+@pytest.mark.parametrize("save_every", [7, 5000])
 def test_saved_rows_are_the_rows_of_the_run(gouta, save_every):
     case = gouta("ngpc", {"clock.duration": 30.0})
     every = jaxtank.simulate(case.loop, case.clock)
@@ -270,6 +260,34 @@ def test_a_flag_that_a_later_xla_may_not_know_is_left_out(monkeypatch):
     assert _xla.append_option("") == f"--xla_backend_extra_options={_xla.OPTION}"
 
 
+def test_the_options_are_set_before_jax_starts_or_missed_with_a_warning(monkeypatch, tmp_path):
+    monkeypatch.delenv(_xla.SWITCH, raising=False)
+    ours = f"{WIDTH} --xla_backend_extra_options={_xla.OPTION}"
+    file = tmp_path / "flags.txt"
+    cases = [  # started, XLA_FLAGS before, after, warning
+        (False, "", ours, None),
+        (False, ours, ours, None),
+        (True, "", "", "jax had started before jaxtank"),
+        (False, str(file), str(file), "names a file"),
+    ]
+    for started, before, after, words in cases:
+        monkeypatch.setattr(_xla, "backend_started", lambda started=started: started)
+        monkeypatch.setenv("XLA_FLAGS", before)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            _xla.enable_small_loop_compilation()
+        assert os.environ["XLA_FLAGS"] == after
+        assert [words in str(w.message) for w in caught] == ([True] if words else [])
+    file.write_text(ours)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        _xla.enable_small_loop_compilation()  # a file that holds the options
+        monkeypatch.setenv("XLA_FLAGS", "")
+        monkeypatch.setenv(_xla.SWITCH, "0")
+        _xla.enable_small_loop_compilation()
+    assert os.environ["XLA_FLAGS"] == ""
+
+
 def python(code, *words, **env):
     """Run code in a fresh process; (stdout, stderr)."""
     clean = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", _xla.SWITCH)}
@@ -281,29 +299,6 @@ def python(code, *words, **env):
         check=True,
     )
     return done.stdout.strip(), done.stderr
-
-
-def test_the_option_is_set_on_import_and_can_be_switched_off():
-    show = "import jaxtank, os; print(os.environ.get('XLA_FLAGS', ''))"
-    assert python(show)[0] == f"{_xla.VECTOR_WIDTH} --xla_backend_extra_options={_xla.OPTION}"
-    assert python(show, JAXTANK_XLA_OPTION="0")[0] == ""
-
-
-def test_a_file_of_flags_is_reported_unless_the_options_are_in_it(tmp_path):
-    file = tmp_path / "flags.txt"
-    file.write_text("--xla_cpu_enable_fast_math=false")
-    assert "names a file" in python("import jaxtank", XLA_FLAGS=str(file))[1]
-    file.write_text(f"{_xla.VECTOR_WIDTH} --xla_backend_extra_options={_xla.OPTION}")
-    assert "names a file" not in python("import jaxtank", XLA_FLAGS=str(file))[1]
-
-
-def test_a_late_import_warns_once():
-    late = (
-        "import jax; jax.numpy.zeros(1).block_until_ready(); import jaxtank, jaxtank.loop.run,"
-        " tuning"
-    )
-    assert python(late)[1].count("jax had started before jaxtank") == 1
-    assert "jax had started" not in python("import jax; import jaxtank")[1]
 
 
 @pytest.mark.slow
@@ -395,10 +390,8 @@ def test_materialised_values_pass_every_transformation():
         assert found == pytest.approx(slope, rel=1e-14)
 
 
-def test_bench_states_why_a_loop_is_slow(gouta):
-    """The reasons that `jaxtank bench CASE` prints, each from a program or a run that has the
-    fault.
-    """
+def test_bench_states_why_a_loop_is_slow():
+    """The reasons that `jaxtank bench CASE` prints, each from a program that has the fault."""
 
     def program(body):
         return (
@@ -417,10 +410,6 @@ def test_bench_states_why_a_loop_is_slow(gouta):
     assert "JAXTANK_XLA_OPTION" in bench.reasons(solving, 50, False, np.float64, 0)[0]
     assert "no faster" in bench.reasons(plain, 50, True, np.float32, 0)[0]
     assert "3 of 3" in bench.reasons(plain, 50, True, np.float64, 3)[0]
-    found = bench.measure_cases({"a": gouta("backstepping", {"clock.duration": 20.0})}, rounds=1)[
-        "a"
-    ]
-    assert found["one_function"] and found["reasons"] == []
 
 
 def test_compensated_sums_lose_nothing():
@@ -439,6 +428,7 @@ def test_compensated_sums_lose_nothing():
     assert nothing(np.float64(0.0)) == 0.0
 
 
+@pytest.mark.slow
 def test_the_older_code_generator_changes_the_program_and_not_its_numbers():
     code = (
         "import jax, jaxtank, numpy as np; jax.config.update('jax_enable_x64', True); from jaxtank"
@@ -457,6 +447,7 @@ def test_the_older_code_generator_changes_the_program_and_not_its_numbers():
     np.testing.assert_allclose(float.fromhex(ours[1]), float.fromhex(theirs[1]), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_loops_over_batches_stay_loops():
     """LLVM would unroll sixteen plants into sixteen single runs, 36 against 11 ns per step and
     plant: the program is longer.

@@ -59,7 +59,7 @@ def agree(case, names, measure="rms_error_total", rtol=1e-5, atol=1e-9, step=STE
     return forward
 
 
-@pytest.mark.slow_for("60.0-backstepping-ff-names2", "60.0-backstepping-names1", "60.0-ngpc-names0")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, names",
     [
@@ -68,7 +68,7 @@ def agree(case, names, measure="rms_error_total", rtol=1e-5, atol=1e-9, step=STE
         ("backstepping-ff", ["controller.k", "controller.k1"]),
     ],
 )
-@pytest.mark.parametrize("ramp", [60.0, pytest.param(30.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("ramp", [60.0, 30.0])
 def test_published_gains_in_plant_b(gouta, name, names, ramp):
     agree(gouta(name, {"reference.ramp": ramp}), names)
 
@@ -83,13 +83,15 @@ REFERENCE_SLOPES = [  # case, D, free, d RMS_tot / d ln p (gouta2015 notes S9.1)
 ]
 
 
-@pytest.mark.parametrize("name, ramp, values, slopes", REFERENCE_SLOPES)
+@pytest.mark.slow_for("1", "2", "3", "4")
+@pytest.mark.parametrize("name, ramp, values, slopes", REFERENCE_SLOPES, ids="012345")
 def test_slopes_of_the_prototype(gouta, name, ramp, values, slopes):
     case = gouta(name, {**values, "reference.ramp": ramp, "clock.dt": 0.05})
     f, z = sloped(case, list(values), "rms_error_total")
     np.testing.assert_allclose(np.ravel(jax.jacfwd(f)(z)), slopes, rtol=5e-3, atol=2e-4)
 
 
+@pytest.mark.slow
 def test_saturated_for_98_percent_of_the_samples(gouta):
     """Pumps held between 3.4 V and 3.5 V: the command is outside for 98 % of the run, and what is
     left still decides.
@@ -120,7 +122,7 @@ def test_starting_from_empty_tanks(gouta):
     agree(case, ["controller.Tp", "controller.level_floor"])
 
 
-@pytest.mark.slow_for("backstepping-names1", "ngpc-names0")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, names",
     [("ngpc", ["controller.Tp"]), ("backstepping", ["controller.k", "controller.k1"])],
@@ -144,12 +146,14 @@ def test_equal_levels(gouta):
     """All tanks at the same level throughout the first plateau: no difference of levels has a kink
     there.
     """
-    case = gouta("backstepping", {"clock.duration": 60.0, "x0": [3.0, 3.0, 3.0, 3.0]})
+    case = gouta(
+        "backstepping", {"clock.dt": 0.1, "clock.duration": 60.0, "x0": [3.0, 3.0, 3.0, 3.0]}
+    )
     agree(case, ["controller.k", "controller.k1"])
 
 
-@pytest.mark.slow_for("30.0")
-@pytest.mark.parametrize("ramp", [30.0, pytest.param(20.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("ramp", [30.0, 20.0])
 def test_through_the_box_qp(gouta, ramp):
     agree(gouta("ngpc-boxqp", {"reference.ramp": ramp, "clock.dt": 0.05}), ["controller.Tp"])
 
@@ -175,7 +179,7 @@ def test_through_plant_sensor_actuator_and_reference(gouta):
     agree(case, names, rtol=2e-5)
 
 
-@pytest.mark.slow_for("110", "121", "122")
+@pytest.mark.slow
 @pytest.mark.parametrize("samples", [110, 121, 122])
 def test_reverse_mode_for_every_number_of_samples(gouta, samples):
     """The run is cut into about sqrt(samples) pieces; squares leave no remainder."""

@@ -48,6 +48,7 @@ def levels(drain, integrator, samples=500):
         return case, clock, np.asarray(jaxtank.simulate(case.loop, clock).x)[:, 0]
 
 
+@pytest.mark.slow_for(*(f"{s}-{i}" for s in (1.05, 10.0) for i in step_size.LIMITS))
 @pytest.mark.parametrize("integrator", step_size.LIMITS)
 @pytest.mark.parametrize("share", [0.98, 1.05, 3.0, 10.0])
 def test_what_is_reported_is_what_happens(integrator, share):
@@ -73,6 +74,7 @@ def test_what_is_reported_is_what_happens(integrator, share):
         assert 0.3 * printed <= late <= 1.1 * printed
 
 
+@pytest.mark.slow
 def test_steps_as_the_papers_have_them_are_short_enough():
     for paper in presets.PAPERS:
         for case in presets.load(paper).cases.values():
@@ -98,36 +100,13 @@ def test_it_is_reported_and_where_a_full_tank_empties_in_a_step_refused(tmp_path
         InputError, match=r"clock.dt = 30 s: tank 1 runs empty in 2 s, within one step"
     ):
         jaxtank.check(fast, Clock(dt=30.0, duration=300.0))
-    file = tmp_path / "one.toml"
-    file.write_text(ONE.format(drain=0.1))
-    assert main.main(["simulate", str(file), "--set", "clock.duration=20"]) == 0
-    assert "runs empty" not in capsys.readouterr().err
+    file, out = tmp_path / "one.toml", tmp_path / "out"
+    file.write_text(ONE.format(drain=2.0))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", step_size.StepWarning)
-        out = tmp_path / "out"
-        assert (
-            main.main(
-                [
-                    "simulate",
-                    str(file),
-                    "--set",
-                    "clock.duration=20",
-                    "--set",
-                    "plant.drain=2",
-                    "--out",
-                    str(out),
-                ]
-            )
-            == 2
-        )
-        printed = capsys.readouterr().err
-        assert (
-            printed.count("note: tank 1 runs empty") == 1
-            and "rises by itself after t = 0 s: clock.dt of at most" in printed
-        )
-        assert not out.exists()
-        assert main.main(["simulate", str(file), "--set", "plant.drain=2", "--dt", "3"]) == 2
-    assert "tank 1 runs empty in 2 s, within one step" in capsys.readouterr().err
+        words = ["simulate", str(file), "--set", "clock.duration=20", "--out", str(out)]
+        assert main.main(words) == 2 and not out.exists()
+    assert capsys.readouterr().err.count("note: tank 1 runs empty") == 1
 
 
 DEEP = """
@@ -151,10 +130,8 @@ initial = [{setpoint}]
 """
 
 
-@pytest.mark.parametrize(
-    ("rim", "dt"), [(1e4, 0.1), (1e3, 0.06), (1e3, 0.07), (1e3, 0.08), (40.0, 0.06)]
-)
-def test_a_rim_far_above_all_levels_hides_nothing(rim, dt, tmp_path, capsys):
+@pytest.mark.parametrize(("rim", "dt"), [(1e4, 0.1), (40.0, 0.06)])
+def test_a_rim_far_above_all_levels_hides_nothing(rim, dt):
     """The tank empties from 20 cm and rises by centimetres in one unstable step, whether its rim is
     at 40 cm or, as a mere limit, at 100 m.
     """
@@ -167,9 +144,6 @@ def test_a_rim_far_above_all_levels_hides_nothing(rim, dt, tmp_path, capsys):
         assert "tank 1 runs empty faster than the steps follow" in sentence
         with pytest.raises(InputError, match=r"rises by itself after t = 0\.3"):
             step_size.check_run(case.loop, case.clock, run)
-        (tmp_path / "deep.toml").write_text(DEEP.format(rim=rim, dt=dt, setpoint=1.0))
-        assert main.main(["simulate", str(tmp_path / "deep.toml")]) == 2
-        assert "rises by itself" in capsys.readouterr().err
 
 
 def test_what_shows_is_a_share_of_the_levels_that_a_run_is_about():
@@ -192,8 +166,9 @@ def test_what_shows_is_a_share_of_the_levels_that_a_run_is_about():
         assert slope(low.loop.x0).shape == (1,)
 
 
-@pytest.mark.parametrize("rim", [20.0, 1e4])
-@pytest.mark.parametrize("case", ["fed", "empty", "fault", "pour"])
+@pytest.mark.parametrize(
+    "case, rim", [("fed", 1e4), ("empty", 20.0), ("fault", 20.0), ("pour", 1e4)]
+)
 def test_a_run_that_is_right_is_not_refused(case, rim):
     """The film is too fast for the steps, and yet no level rose: the tank is fed all the
     time, or starts empty and fills, or more comes in than its pump brings.
@@ -287,6 +262,7 @@ def test_an_answer_states_that_its_run_is_of_steps_too_long(last, substeps, word
         assert all(words in text.replace("&#x27;", "'") for text in reported)
 
 
+@pytest.mark.slow
 def test_an_answer_states_it_of_a_scenario_too():
     """The case's own setpoints stay above the bottom; those of its second scenario do not."""
     text = COLANDER.format(last=10.0, substeps=1)
@@ -298,6 +274,7 @@ def test_an_answer_states_it_of_a_scenario_too():
     assert result.message.startswith(f"scenario low: {WRONG}")
 
 
+@pytest.mark.slow_for("6")
 @pytest.mark.parametrize("substeps", [1, 6])
 def test_draws_of_steps_too_long_say_so(substeps, tmp_path):
     with warnings.catch_warnings():
@@ -311,6 +288,7 @@ def test_draws_of_steps_too_long_say_so(substeps, tmp_path):
     assert [DOUBT in text for text in reported] == [substeps == 1] * 3
 
 
+@pytest.mark.slow_for(*list(stiff_rigs.KINDS)[1:])
 @pytest.mark.parametrize("kind", stiff_rigs.KINDS)
 def test_a_random_stiff_rig_is_right_or_reported(kind):
     """No level is off by more than 5 % of its rim without a StepWarning (`python
@@ -384,6 +362,7 @@ def test_a_run_that_its_steps_spoil_is_refused_with_its_error(tmp_path, capsys):
     assert list(tmp_path.iterdir()) == [tmp_path / "chain.toml"]
 
 
+@pytest.mark.slow
 def test_the_note_on_the_step_reports_measured_errors(tmp_path, capsys):
     """Levels, inputs and measures, against the same run with half the step."""
     text = CHAIN.replace("KC", "2.3").replace("27.238", "4.0")

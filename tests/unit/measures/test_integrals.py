@@ -9,7 +9,6 @@ import pytest
 
 import jaxtank
 from jaxtank import rig
-from jaxtank.loop.rows_and_measures import rows_and_measures
 from tuning.cli.main import main
 from tuning.optimal_input.cost import Lagrangian, Terms, _search_cost, open_loop
 
@@ -99,7 +98,6 @@ def test_every_way_to_run_has_the_same_integrals(chain, sums):
     gains = {"controller.Kc": np.full((2, 1), 4.0)}
     found = {
         "evaluate": jaxtank.evaluate(loop, clock, ERRORS),
-        "rows": rows_and_measures(loop, clock, None, 7, ERRORS)[1],
         "many": {
             name: value[0]
             for name, value in jaxtank.evaluate_many(loop, clock, ERRORS, gains).items()

@@ -62,8 +62,6 @@ def test_the_command_says_that_the_estimate_contains_the_dead_zones(capsys):
     short = ["--set", "clock.duration=5"]
     assert main(["simulate", "gouta2022/chadpc", *short]) == 0
     assert "-0.425, -0.667 cm/s" in capsys.readouterr().err
-    assert main(["simulate", "gouta2022/pi", *short]) == 0
-    assert "d_hat" not in capsys.readouterr().err
 
 
 def test_the_distance_of_a_linear_filter_is_that_of_its_square_root():

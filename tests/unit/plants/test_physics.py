@@ -116,20 +116,7 @@ def test_order_of_convergence(integrator, order):
     assert abs(-slope - order) < 0.25
 
 
-def test_a_run_agrees_with_lsoda():
-    plant, x, u = state_coupled_four_tank(FAST_AREA), (8.0, 5.0, 12.0, 20.0), (3.0, 6.0)
-    exact = solve_ivp(
-        lambda t, x: plant.derivative(t, x, u, None),
-        (0, 30),
-        x,
-        method="LSODA",
-        rtol=1e-12,
-        atol=1e-12,
-    ).y[:, -1]
-    np.testing.assert_allclose(held(plant, x, u, 0.01, 3000), exact, atol=1e-9)
-
-
-@pytest.mark.slow_for("60.0-0.2-1e-12")
+@pytest.mark.slow
 @pytest.mark.parametrize("ramp, lowest, moved", [(60.0, 0.2, 1e-12), (30.0, 0.003, 3e-3)])
 def test_smooth_root_moves_the_benchmark_by_less_than_its_promise(gouta, ramp, lowest, moved):
     """Against a knee a thousand times smaller: nothing above the knee, 3e-3 cm where tank 3 comes
@@ -207,7 +194,7 @@ def caught_below(seed, inflow):
 
 
 @pytest.mark.parametrize("integrator", ["rk4", "midpoint"])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_volume_is_kept_in_steps_in_which_tanks_run_empty(seed, integrator):
     """What is stored is what was there, has been pumped and drawn, and could not be drawn; to
     rounding, rings and pipes included.
@@ -230,7 +217,7 @@ def test_volume_is_kept_in_steps_in_which_tanks_run_empty(seed, integrator):
     assert abs(area @ np.array(x) - (before + pumped + 60.0 * d.sum() + missing)) < 1e-12 * moved
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_without_a_negative_inflow_no_step_takes_a_level_below_zero(seed):
     plant, x, d = caught_below(seed, 1.0)
     step = jax.jit(lambda x: integrate(plant, "rk4", 0.0, x, (0.0,), tuple(d), 3.0))
