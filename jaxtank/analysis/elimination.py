@@ -90,9 +90,7 @@ def substitute(factor, b):
 
 @jax.jit
 def _cholesky(A):
-    """Return U (n, n) upper triangular, A = U'U, for A symmetric positive definite (NaN where it is
-    not).
-    """
+    """Return U (n, n) upper triangular, A = U'U, of A positive definite (else NaN)."""
     # One row of U at a time, from a product of the rows before it. The rows are done in STAGES
     # parts of fixed shape, so that little of a product is spent on entries that are zero.
     # `jaxtank.export.lowering` writes this function, `_cholesky_solve` and `_weighted` as loops of

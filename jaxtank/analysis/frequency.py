@@ -24,9 +24,7 @@ class OpenLoop(NamedTuple):
 
 
 def solve(M: Any, rhs: Any) -> Any:
-    """Return M^-1 rhs for M (n, n), real or complex, and rhs (n, k); Gauss with partial
-    pivoting.
-    """
+    """Return M^-1 rhs for M (n, n), real or complex: Gauss with partial pivoting."""
     n, index = M.shape[0], np.arange(M.shape[0])
 
     def eliminate(k, T):
@@ -138,9 +136,7 @@ def held(loop: OpenLoop, w: Any) -> Held:
 
 
 def near(loop: OpenLoop, base: Held, w: Any) -> Any:
-    """Return L (K, m, m) at frequencies w (K,) [rad/s] next to those of `held`, to second order,
-    with first derivatives by the loop and w.
-    """
+    """L (K, m, m) at w (K,) [rad/s] next to `base`, to second order, with first derivatives."""
     A, B, C, dead, dt = loop
     z = jnp.exp(1j * w * dt)
     X, Y = base

@@ -28,9 +28,7 @@ CLOSER = 10
 
 
 class Margins(NamedTuple):
-    """Margins of a loop with m inputs; inf where nothing crosses, and all of them only if
-    `stable`.
-    """
+    """Margins of a loop with m inputs; inf where nothing crosses, valid only if `stable`."""
 
     stable: Any  # True if the closed loop is stable
     sensitivity_peak: Any  # Ms: largest singular value of S = (I + L)^-1 over all frequencies [-]
@@ -118,9 +116,7 @@ def _alone(S: Any) -> Any:
 
 
 def _largest_gain(S: Any) -> Any:
-    """(F,) largest singular values: closed form up to two inputs, else 30 steps of the power
-    method, whose result is a lower bound.
-    """
+    """Largest singular values (F,): closed form up to m = 2, else a lower bound by powers."""
     m, square = S.shape[1], jnp.sum(jnp.abs(S) ** 2, axis=(1, 2))
     if m == 1:
         return jnp.sqrt(square)
@@ -147,9 +143,7 @@ def _pair(S: Any) -> tuple[Any, Any, Any]:
 
 
 class _Brackets(NamedTuple):
-    """Where to look, of the sensitivity peak, then of the m phase crossovers, the m gain crossovers
-    of the phase margins and those of the delay margins: (1 + 3 m,) each.
-    """
+    """Where the peak, m phase crossovers, m gain crossovers (phase, delay) are: (1 + 3 m,)."""
 
     low: Any  # logarithm of a frequency [rad/s]
     high: Any
@@ -215,9 +209,7 @@ def _crossing(L: Any) -> Any:
 
 
 def _narrowed(form: OpenLoop, brackets: _Brackets, zooms: int) -> tuple[Any, Any]:
-    """(logarithms of the frequencies in the brackets, narrowed `zooms` times, L (1 + 3 m, m, m) at
-    the lower ends of the last brackets); all in one call.
-    """
+    """(log frequencies in brackets narrowed `zooms` times, L (1 + 3 m, m, m) there)."""
     count = brackets.low.shape[0]
     index = np.arange(count)
 

@@ -43,9 +43,7 @@ BACK = 0.99  # share of the way to the nearest bound that a step may go
 
 
 class Point(NamedTuple):
-    """An iterate: x (n,); slack variables and multipliers of the upper and lower sides (rows,), all
-    positive.
-    """
+    """An iterate: x (n,); slacks and multipliers of upper and lower sides (rows,), positive."""
 
     x: jax.Array
     su: jax.Array
@@ -93,9 +91,7 @@ def _slope(iterations, primals, tangents):
 
 @jax.custom_jvp
 def _held(point, H, f, G, l, u):
-    """The solution `point` as it is, but knowing how it moves with the data: what derivatives of
-    derivatives ask for.
-    """
+    """The solution `point`, knowing how it moves with the data, for second derivatives."""
     return point
 
 
@@ -113,9 +109,7 @@ def _held_slope(primals, tangents):
 
 
 def _implicit(point, data, moved):
-    """How x moves when the `data` (H, f, G, l, u) do: one Newton step on the optimality conditions
-    at the solution,
-    """
+    """How x moves with the data: one Newton step on the optimality conditions."""
     # H dx + A' v = a, A dx - D v = b,
     # of x and of v, the change of lu - ll, with the slacks eliminated; each row is scaled so that
     # every entry is of the order of 1. The matrix H + A' D^-1 A that v leaves for dx (`_normal`)
@@ -205,9 +199,7 @@ def _iterate(p, H, f, G, l, u):
     factored = factor(_normal(H, G, p))
 
     def towards(cu, cl):
-        """The step that clears the residuals and brings s * lam to the values that leave cu and
-        cl.
-        """
+        """The step that clears the residuals, with s lam brought to what leaves cu and cl."""
         dx = -substitute(
             factored, dual + G.T @ ((p.lu * up - cu) / p.su - (p.ll * low - cl) / p.sl)
         )
@@ -238,9 +230,7 @@ def _normal(H, G, p):
 
 
 def _reach(p, step, back):
-    """The largest share, at most 1, of `step` that keeps slacks and multipliers positive, short of
-    the bound by `back`.
-    """
+    """The largest share <= 1 of `step` that keeps slacks and multipliers positive, by `back`."""
     shares = [
         jnp.min(jnp.where(d < 0, -back * v / jnp.where(d < 0, d, -1.0), 1.0))
         for v, d in zip(p[1:], step[1:])

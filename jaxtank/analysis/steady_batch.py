@@ -54,9 +54,7 @@ class SteadyStates:
         return speeds * np.abs(speeds) / weight, inputs
 
     def _affine(self):
-        """(N, n, m) speeds and (N, m, m) inputs of an efflux speed of 1 cm/s of each controlled
-        tank, and (N, n + m) those of the inflow alone.
-        """
+        """Speeds (N, n, m) and inputs (N, m, m) by controlled speeds, and of the inflow."""
         plant, outputs = self.plant, list(self.plant.outputs)
         columns = np.concatenate([self.efflux[:, :, self.free], self.pumps], axis=2)
         right = np.concatenate([self.efflux[:, :, outputs], self.inflow[:, :, None]], axis=2)
@@ -139,9 +137,7 @@ class SteadyStates:
 
 
 def _balance(plant, leaves):
-    """(out (N, n) area of all outlets, efflux (N, n, n), pumps (N, n, m)): flow = efflux @ speeds +
-    pumps @ inputs, without pipes.
-    """
+    """Efflux (n, n) [cm^2], pumps (n, m): A_i h_i' = efflux @ speeds + pumps @ inputs, no pipes."""
     out = np.array(leaves["drain"])
     count, n = out.shape
     efflux, pumps = np.zeros((count, n, n)), np.zeros((count, n, plant.pumps))

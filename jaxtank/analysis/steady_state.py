@@ -17,9 +17,7 @@ STEPS = 200
 
 
 class Balance:
-    """Rates and their Jacobian at levels x (n,) and inputs u (m,) of a network of tanks, with an
-    inflow (n,) [cm^3/s] that no pump brings.
-    """
+    """Rates and Jacobian of a network at levels x (n,), inputs u (m,), inflow (n,) [cm^3/s]."""
 
     def __init__(self, plant: Any, inflow: Any = None):
         self.inflow = inflow
@@ -154,9 +152,7 @@ def _filled(xp, matrix, places, values):
 
 
 def _balance(plant, xp=jnp):
-    """(efflux, pumps): A_i h_i' = efflux @ speeds + pumps @ inputs, of a network without pipes; (n,
-    n) [cm^2] and (n, m) [cm^3/(s V)].
-    """
+    """Efflux (n, n) [cm^2], pumps (n, m): A_i h_i' = efflux @ speeds + pumps @ inputs, no pipes."""
     n, m, eye = plant.tanks, plant.pumps, np.eye(plant.tanks)
     out = plant.drain
     for k, (source, _) in enumerate(plant.links):
@@ -231,9 +227,7 @@ def _from_known_speeds(plant, known, xp=jnp, inflow=None):
 
 
 def _unknowns(plant, xp=jnp):
-    """(tanks that are not controlled, columns of their speeds and of the inputs in the balance,
-    efflux) of a network without pipes.
-    """
+    """(free tanks, columns of their speeds and of the inputs in the balance, efflux)."""
     efflux, pumps = _balance(plant, xp)
     free = [i for i in range(plant.tanks) if i not in plant.outputs]
     return free, xp.concatenate([efflux[:, np.array(free, dtype=int)], pumps], axis=1), efflux
@@ -407,9 +401,7 @@ def _free_discharge(plant, y, words, inflow):
 
 @jax.jit
 def _rate(plant, x, u):
-    """Rates (n) [cm/s] at levels x (n) and inputs u (m); the plant is an argument, so that rigs of
-    one topology share a program.
-    """
+    """Rates (n) [cm/s]; the plant is an argument, so that rigs of one topology share a program."""
     return plant.rates(x, u)
 
 
@@ -417,9 +409,7 @@ _slope = jax.jit(jax.jacfwd(_rate, argnums=(1, 2)))
 
 
 def _balanced(plant, y, words, inflow):
-    """(levels, inputs) at which a network with pipes stands still, by damped Gauss-Newton in the
-    roots of the unknown levels.
-    """
+    """(levels, inputs) of a network with pipes at rest, by damped Gauss-Newton."""
     if plant.pumps != len(plant.outputs):
         raise InputError(
             f"equilibrium needs as many pumps as outputs: this rig has {plant.pumps} and"

@@ -59,9 +59,7 @@ class Coefficients(NamedTuple):
 
     @property
     def alpha(self):
-        """alpha = (c2 c6 - c3 c5) / 2 [cm/s^2], the determinant of the decoupling matrix without
-        its roots.
-        """
+        """(c2 c6 - c3 c5) / 2 [cm/s^2]: determinant of the decoupling matrix without its roots."""
         return 0.5 * (self.c2 * self.c6 - self.c3 * self.c5)
 
 
@@ -94,9 +92,7 @@ def floored_roots(levels, floor):
 
 
 def decouple(c, s3, s4, v1, v2, scale=1.0):
-    """Return the voltages that give the outputs the accelerations scale * v: b^-1 (v - g),
-    division-free (gouta2015 eqs. 28, 48).
-    """
+    """Return b^-1 (v - g) for accelerations scale * v, division-free (gouta2015 eqs. 28, 48)."""
     # u1 = [sqrt(h3) (c6 v1 - c3 v2)/alpha + c7 sqrt(h3)] / c8, u2 likewise
     # b is not formed: its entries grow as 1/sqrt(h) while its inverse stays finite.
     a8, a10 = c.alpha * c.c8, c.alpha * c.c10
@@ -106,9 +102,7 @@ def decouple(c, s3, s4, v1, v2, scale=1.0):
 
 
 def less_upper(c, u, d):
-    """Return the voltages (u1, u2) less what the disturbances of the upper tanks do
-    without them.
-    """
+    """Return the voltages (u1, u2) less the effect of the upper tanks' disturbances."""
     # h3' = -c7 sqrt(h3) + c8 u1 + d3, so that u1 - d3/c8 has the effect that u1 was meant to have;
     # u2 likewise
     return u[0] - d[2] / c.c8, u[1] - d[3] / c.c10

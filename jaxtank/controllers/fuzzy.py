@@ -22,9 +22,7 @@ PAIRINGS = {"cross": (1, 0), "same": (0, 1)}
 
 
 def membership(size, b, w):
-    """Return the membership of a size |e| in "high": 0 up to b - w, 1 from b + w, the C1 smoothstep
-    3x^2 - 2x^3 between.
-    """
+    """Return the membership of |e| in "high": C1 smoothstep from b - w (0) to b + w (1)."""
     # The membership in "low" is 1 minus this (mirakhorli notes S4.5).
     w = jnp.minimum(w, b)  # its slopes at a tie are halves: the mean of both sides
     x = clip((size - b + w) / (2.0 * w), 0.0, 1.0)

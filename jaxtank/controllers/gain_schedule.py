@@ -70,9 +70,7 @@ def check_knots(knots):
 
 
 class Memory(NamedTuple):
-    """State of the scheduled controller, and the operating variable of this sample [cm] where
-    `track` cannot take it from the tick (a level); else ().
-    """
+    """State of the scheduled controller, and its level [cm] where `track` needs one, else ()."""
 
     inner: Any
     at: Any

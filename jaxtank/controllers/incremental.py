@@ -36,9 +36,7 @@ class Memory(NamedTuple):
 
 
 def incremental_model(model, operating_point, dt):
-    """Return (A, B, C) of x = [dx_m; y], dx_m the change of the levels since the last sample
-    (khalid eqs. 16-17, khalid notes S4.1; C_m for C_m^T).
-    """
+    """Return (A, B, C) of x = [dx_m; y] (khalid eqs. 16-17, khalid notes S4.1)."""
     # A = [[Am, 0], [Cm Am, I]], B = [Bm; Cm Bm], C = [0, I]
     still = jnp.zeros(model.pumps)  # the rig is linear in its inputs, so any value serves
     Ac, Bc, Cm = linearise(dataclasses.replace(model, knee=EXACT), operating_point, still)
@@ -130,9 +128,7 @@ class LinearPredictive(Controller):
         return *quadratic_cost(A, B, C, jnp.asarray(self.q), self.r_w, basis), basis
 
     def gain(self, dt: float) -> jax.Array:
-        """Return K (m, n+q) [V/cm] of the linear control law du = -K [dx_m; y - r], at period `dt`
-        [s].
-        """
+        """Return K (m, n+q) [V/cm] of du = -K [dx_m; y - r], at period `dt` [s]."""
         Omega, Psi, basis = self.design(dt)
         return basis[0] @ jnp.linalg.solve(Omega, Psi)
 
@@ -177,9 +173,7 @@ class LinearPredictive(Controller):
         return [sum(W[i, j] * moving[j] for j in n) for i in n]
 
     def _constrained(self, before, error, dt):
-        """Return the first increments (m,) of the quadratic programme, for inputs `before` (m) and
-        error x_e (n+q,).
-        """
+        """First increments (m,) of the programme, for inputs `before` (m), error x_e (n+q,)."""
         Omega, Psi, basis = self.design(dt)
         steps = basis[: self.ahead]
         rows = jnp.concatenate([steps, jnp.cumsum(steps, axis=0)]).reshape(-1, Omega.shape[0])

@@ -12,9 +12,7 @@ from jaxtank.signals.base import Signal
 
 
 def laguerre_functions(a, N, samples):
-    """Return L(k)' of k = 0 .. samples-1: (samples, N), orthonormal over all k (khalid eq. 25,
-    khalid notes S4.3).
-    """
+    """L(k)', k = 0 .. samples-1: (samples, N), orthonormal (khalid eq. 25, S4.3)."""
     # L(0) = sqrt(1 - a^2) [1, -a, a^2, ...]', L(k+1) = A_l L(k)
     # A_l: lower triangular, a on its diagonal and (1 - a^2) (-a)^(i-j-1) below. With a = 0 they are
     # unit pulses at k = 0 .. N-1. As z-transforms, sqrt(1-a^2) z/(z-a) [(1-az)/(z-a)]^(i-1): the

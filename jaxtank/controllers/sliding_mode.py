@@ -79,9 +79,7 @@ def acceleration(tanks, damping):
 
 
 def slide(model, surface, ks, phi, switch, form, x, r, u0, previous, d=()) -> tuple[Any, Any]:
-    """Return the (2) voltages [V] of the sliding-mode control law, not limited; arguments as the
-    fields of `SlidingMode`.
-    """
+    """Return the (2) voltages [V] of the sliding-mode control law, not limited."""
     printed = form == "printed"
     tanks = lower_tanks(model, x)
     if d:

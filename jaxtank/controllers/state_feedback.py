@@ -23,9 +23,7 @@ from jaxtank.signals.base import Signal
 
 
 def feedback(K, x, h0, u0):
-    """Return u0 - K (h - h0): (m) voltages [V] for a gain K (m, n) [V/cm], levels x (n) [cm] and
-    the steady state h0 (n) [cm], u0 (m) [V].
-    """
+    """Return (m) u0 - K (h - h0) [V] for K (m, n) [V/cm] and the steady state h0 [cm], u0 [V]."""
     # mirakhorli eqs. (14)-(15) print u = -K'x with K = -R^-1 B'P: the literal sign is unstable, and
     # without u0 the pumps are off (mirakhorli notes E11).
     away = [h - h_s for h, h_s in zip(x, h0)]
@@ -39,9 +37,7 @@ def _steady(model, plan, d):
 
 
 def check_free_outlets(model):
-    """Raise InputError unless the steady state of every setpoint follows from `model` by a linear
-    balance.
-    """
+    """Raise InputError unless steady states of `model` follow from a linear balance."""
     if getattr(model, "pipes", None) != () or model.pumps != len(model.outputs):
         raise InputError(
             "controller.model must be a network without pipes and with as many pumps as outputs:"

@@ -59,9 +59,7 @@ class Clock:
 
 
 class Chunk(NamedTuple):
-    """Consecutive samples of a clock, given to a signal in place of the Clock; `first` is the index
-    of the first of them, and may be traced.
-    """
+    """Consecutive samples of a clock, in place of the Clock; `first` may be traced."""
 
     first: Any
     samples: int

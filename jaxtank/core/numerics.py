@@ -85,9 +85,7 @@ def _limited_flow_jvp(primals: Any, tangents: Any) -> Any:
 
 @jax.custom_jvp
 def clipped_sqrt(h: Real, lower: Real) -> jax.Array:
-    """Return sqrt(max(h, lower)): the root of a level that a controller multiplies or
-    divides by.
-    """
+    """Return sqrt(max(h, lower)), of a level that a controller multiplies or divides by."""
     return jnp.where(h >= lower, jnp.sqrt(h), jnp.sqrt(lower))
 
 

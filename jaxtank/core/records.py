@@ -27,9 +27,7 @@ def check_key(key: Any) -> None:
 
 
 class Tick(NamedTuple):
-    """What a controller and an observer know at sample k besides measurements: tuples of scalars,
-    one per output.
-    """
+    """What a controller and an observer know at sample k besides measurements."""
 
     t: Any  # time [s]
     r: tuple[Any, ...]  # setpoint r [cm]

@@ -23,9 +23,7 @@ def shortened(value: object) -> str:
 
 
 def printable(text: object) -> str:
-    """Return `text` with control characters, and those a terminal cannot print, as their
-    escapes.
-    """
+    """Return `text` with what a terminal obeys or cannot print as escapes."""
     return "".join(
         c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in str(text)
     )
@@ -57,9 +55,7 @@ PICTURES = [False]
 
 
 def with_picture(table: str, draw: Callable[[], bytes | None]) -> str:
-    """Return the HTML of a result, with a small picture below it once `jaxtank.notebook()` has been
-    called.
-    """
+    """Return the HTML of a result, with a picture after `jaxtank.notebook()`."""
     if not PICTURES[0]:
         return table
     try:

@@ -217,9 +217,7 @@ def _converted(value: Any) -> Any:
 
 
 def sizes_of_shape(shape: Shape, counts: Mapping[str, int]) -> tuple[int, ...] | None:
-    """Return the sizes of a leaf's shape for {name: count} of a plant; None where one of its names
-    is not in it.
-    """
+    """Sizes of a leaf's shape by {name: count} of a plant; None where a name is missing."""
     axes = [axis.split(" + ") if isinstance(axis, str) else [axis] for axis in shape]
     if any(isinstance(term, str) and term not in counts for axis in axes for term in axis):
         return None

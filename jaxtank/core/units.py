@@ -64,9 +64,7 @@ def check_units(where: str, units: tuple[str, str]) -> tuple[str, str]:
 
 
 def flow_per_input(units: tuple[str, str]) -> float | None:
-    """Return the flow [length^3/s] that one unit of the pump's input stands for; None where the
-    input is no flow, or the level no length.
-    """
+    """Flow [length^3/s] of one unit of the pump's input; None where it is no flow."""
     length, drive = map(canonical, units)
     if drive not in FLOWS or length not in LENGTHS:
         return None

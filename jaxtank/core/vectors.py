@@ -19,9 +19,7 @@ FROM = 10
 
 
 def serves_arrays(part: Any) -> bool:
-    """Return whether a component takes vectors as arrays: where its class itself says `arrays =
-    True`, or has a property `arrays`; a class derived from it may not.
-    """
+    """Whether a component's own class, not a base of it, takes vectors as arrays."""
     return "arrays" in vars(type(part)) and bool(part.arrays)
 
 

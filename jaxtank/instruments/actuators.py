@@ -174,9 +174,7 @@ class PumpBank(Actuator):
         return each(lambda v, least: lower_clip(v - least, 0.0), u, self.dead_zone)
 
     def _turning(self, u):
-        """Input of the lag: with an "offset" dead zone nothing below it, so that noise is rectified
-        before the lag and not after.
-        """
+        """Input of the lag: an "offset" dead zone rectifies noise before the lag, not after."""
         if not self._has_dead_zone("offset"):
             return u
         return each(lower_clip, u, self.dead_zone)

@@ -16,9 +16,7 @@ share of the setpoint [-]."""
 
 
 def windows(loop: Any, times: Any, arrays: bool = False) -> Any:
-    """Return what overshoot, rise and settling refer to, as `Signal.windows`; None without changes.
-    With `arrays`, a tuple of four arrays (samples, outputs).
-    """
+    """What overshoot, rise and settling refer to, as `Signal.windows`; or (samples, n) arrays."""
     # A start away from the setpoint counts as a change at t = 0 of an output whose setpoint has
     # none of its own: the step is the setpoint less the level in `loop.x0`, if it is more than AWAY
     # of the setpoint.

@@ -93,9 +93,7 @@ class State(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """What is known of every sample before the loop starts: tuples of arrays (samples,), or arrays
-    (samples, n).
-    """
+    """What is known of every sample before the loop: tuples of (samples,), or (samples, n)."""
 
     r: Group  # setpoints [cm]
     dr: Group  # their rates [cm/s]
@@ -109,9 +107,7 @@ class Inputs(NamedTuple):
 
 
 def takes_arrays(loop: ClosedLoop) -> bool:
-    """Return whether the vectors of a run of this loop are arrays: those of many tanks, of a plant
-    and faults that take them.
-    """
+    """Whether the vectors of a run are arrays: of many tanks, where plant and faults take them."""
     parts = [part for part in (loop.plant, loop.faults) if part is not None]
     return loop.plant.tanks >= vectors.FROM and all(map(serves_arrays, parts))
 
@@ -125,9 +121,7 @@ def inputs(
     samples: int = 0,
     arrays: bool = False,
 ) -> Inputs:
-    """Return the samples of references, disturbances and noise, and what the measures `names` refer
-    to; of a long run's `batch`, a number, its `samples` alone. arrays: the form of vectors.
-    """
+    """Return the samples of all signals of a run, or of `samples` of a long run's `batch`."""
     times: Any = clock
     if batch is not None:
         times = Chunk(first=batch * CHUNK, samples=samples, dt=clock.dt)
@@ -152,9 +146,7 @@ def inputs_at(
     xi: Group | None,
     arrays: bool = False,
 ) -> Inputs:
-    """Return `inputs` of a clock or of a chunk of one, with deviates xi of the sensor noise, (n,)
-    arrays (samples,), that were drawn before; None: none.
-    """
+    """Return `inputs` of a clock or Chunk, for deviates xi of the sensor noise or None."""
     moments: Any = times
     r, dr, ddr = sampled(loop.reference, moments, arrays)
     d = None if loop.disturbance is None else sampled(loop.disturbance, moments, arrays)[0]
@@ -244,9 +236,7 @@ def initial(loop: ClosedLoop, clock: Clock, arrays: bool = False) -> State:
 
 
 def control_state(loop: ClosedLoop, x0: Group, u0: Group) -> Any:
-    """Return the state of the controller before the first sample, from the levels x0 (n) [cm] and
-    the inputs u0 (m) [V]; a pair with the inputs under way where the safety filter predicts.
-    """
+    """State of the controller at t = 0; with the inputs under way where the filter predicts."""
     x0, u = given(loop.controller, x0), given(loop.controller, u0)
     state, guard = loop.controller.init(x0, u), loop.safety_filter
     if guard is None or not guard.predicted:
@@ -290,9 +280,7 @@ def run_of(loop: ClosedLoop, clock: Clock, arrays: bool = False) -> ms.Run:
 
 
 def zero_of(loop: ClosedLoop) -> jax.Array:
-    """Return 0.0 of the type in which the run is done: that of the most precise of the loop's
-    leaves. Warns of float32, and what it costs.
-    """
+    """Return 0.0 of the run's type, the most precise of the loop's leaves; warns of float32."""
     floats = [v for v in jax.tree.leaves(loop) if jnp.issubdtype(jnp.result_type(v), jnp.floating)]
     dtype = jnp.result_type(*floats) if floats else jnp.result_type(float)
     if dtype == jnp.float32:
@@ -313,7 +301,5 @@ def _warn_float32() -> None:
 
 
 def is_broken(state: State) -> Any:
-    """Return True if the run diverged: a level that is not finite stays so, so the last state is
-    enough.
-    """
+    """Return True if the run diverged: a level that is not finite stays so."""
     return ~jnp.isfinite(total(state.x))

@@ -69,9 +69,7 @@ def sensitivities_compiled(
     squares: tuple[tuple[str, float], ...] = (("mean_square_error", 1.0),),
     batched: bool = False,
 ) -> tuple[dict[str, jax.Array], dict[str, jax.Array], jax.Array, jax.Array]:
-    """Return what `loop.run.sensitivities` returns, unchecked, for parameters `order` at `values`;
-    batched: whether this will be one of several runs side by side.
-    """
+    """Unchecked `sensitivities`; batched: one of several runs side by side."""
     if ms.functions(names):
         return _with_functions(loop, clock, names, order, values, key, squares, batched)
     flat, unflatten = ravel_pytree(values)
@@ -134,9 +132,7 @@ def _with_functions(
     squares: tuple[tuple[str, float], ...],
     batched: bool,
 ) -> tuple[dict[str, jax.Array], dict[str, jax.Array], jax.Array, jax.Array]:
-    """`sensitivities_compiled` of functions of the run, by the chain rule: along the measures that
-    they read, and along the run that is kept for them.
-    """
+    """`sensitivities_compiled` of functions of the run, by the chain rule."""
     flat, unflatten = ravel_pytree(values)
 
     def at(theta: Any) -> ClosedLoop:
@@ -155,9 +151,7 @@ def _with_functions(
 
 
 def _form_of(loop: ClosedLoop) -> tuple[bool, int, tuple[int, int]]:
-    """(whether vectors are arrays, axis of the directions in the loop, that in (a state, samples)):
-    in front of arrays, whose entries then stay side by side.
-    """
+    """(whether vectors are arrays, axis of the directions in the loop, of state, samples)."""
     return (True, 0, (0, 1)) if takes_arrays(loop) else (False, -1, (-1, -1))
 
 
@@ -217,9 +211,7 @@ def _pushed_stored(
 
 
 def _with_squares(matrix: Any, derrors: Any, weights: Any) -> Any:
-    """`matrix` (P, P) with sum_k weight_k slope_k slope_k' added, of slopes (P,); or of arrays of
-    them (P, k), with one weight each.
-    """
+    """`matrix` (P, P) + sum_k weight_k slope_k slope_k', of slopes (P,) or arrays (P, k)."""
     if derrors and derrors[0].ndim > 1:
         for slopes, weight in zip(derrors, weights):
             matrix = matrix + weight * jnp.sum(slopes[:, None] * slopes[None, :], axis=-1)

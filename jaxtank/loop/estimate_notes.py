@@ -24,9 +24,7 @@ FAR = 0.1
 
 
 def withheld(loop: ClosedLoop) -> Any:
-    """Return (n,) rates [cm/s] that the offset dead zones of running pumps take from what the
-    observer expects: part of any estimate of a disturbance.
-    """
+    """Rates (n,) [cm/s] that offset dead zones of running pumps take from the observer's model."""
     plant, bank = loop.plant, loop.actuator
     x = tuple(np.asarray(loop.x0, dtype=float))
     offset = np.broadcast_to(np.asarray(bank.offset, dtype=float), (plant.pumps,))
@@ -35,10 +33,7 @@ def withheld(loop: ClosedLoop) -> Any:
 
 
 def linear_distance(observer: Kalman, x: Any, u: Any) -> tuple[Any, Any, Any]:
-    """Return (distances [cm], errors [cm/s], changes [cm/s]), each (rows, n): of levels x (rows, n)
-    from the operating levels, of the linear model's rates from the model's with inputs u (rows, m),
-    and the size of the linear model's own change.
-    """
+    """(distances of x [cm], errors [cm/s], changes [cm/s]) (rows, n) of the linear model."""
     A, B, _ = linearise(observer.model, observer.levels, observer.inputs)
 
     def rates(x: Any, u: Any) -> Any:
@@ -90,9 +85,7 @@ def estimate_notes(loop: ClosedLoop, run: Trajectory) -> list[str]:
 
 
 def design_notes(loop: ClosedLoop, setpoints: Any) -> list[str]:
-    """Return sentences on a Kalman filter at the steady states of setpoints (rows, outputs): those
-    farthest from its operating levels.
-    """
+    """Sentences on a Kalman filter at the setpoints farthest from its operating levels."""
     observer = loop.observer
     if not isinstance(observer, Kalman) or not len(setpoints):
         return []

@@ -49,9 +49,7 @@ class Measures(Mapping[str, Any]):
 
 
 def needed_by(loop: ClosedLoop, clock: Clock, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return those of `names` that are kept along with the run, and those that functions among
-    `names` read.
-    """
+    """Return the measures that `names` and the functions among them need."""
     functions = ms.functions(names)
     read = (m for name, spec in functions.items() for m in _read_by(loop, clock, name, spec))
     return tuple(dict.fromkeys([*(n for n in names if n not in functions), *read]))
@@ -62,9 +60,7 @@ _PROGRAMS: dict[Any, str] = {}
 
 
 def check_functions(loop: ClosedLoop, clock: Clock, names: tuple[str, ...]) -> None:
-    """Raise InputError for a function among `names` that jax cannot trace, that reads a measure
-    which this rig does not have, or that does not return one real number.
-    """
+    """Raise InputError for a function that jax cannot trace, or whose result is no number."""
     # A function whose program is another than at the last call, because a number that it closes
     # over or a global one has changed, is compiled again: jax would run the first one.
     needed_by(loop, clock, names)
@@ -85,9 +81,7 @@ def values_of(
     measures: Mapping[str, Any],
     checkpoint: bool = False,
 ) -> dict[str, Any]:
-    """Return {name: value} of `names`: those of `measures`, and functions of them and of
-    the run.
-    """
+    """Return {name: value} of `names`, measures and functions of them and of the run."""
     functions, served, zero = ms.functions(names), _served(loop), zero_of(loop)
     rows: dict[int, Any] = {}
     for spec in functions.values():
@@ -102,9 +96,7 @@ def values_of(
 
 
 def program_of(loop: ClosedLoop, clock: Clock, name: str) -> str:
-    """Return the program of a function as text: two functions with one text are the same, whatever
-    they close over.
-    """
+    """Return the program of a function as text: equal for two functions that do the same."""
     spec, served = ms.functions([name])[name], _served(loop)
 
     def function(values: Any, run: Any) -> Any:

@@ -25,9 +25,7 @@ MOST = 4
 
 
 def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> list[str]:
-    """Return one sentence on how levels, inputs and measures change with half the step; [] if the
-    step is stable for tanks that run empty, or no level changes by more than `step_size.SEEN`.
-    """
+    """One sentence on what half the step changes, or [] where nothing visible changes."""
     unstable = list(step_size.unstable_tanks(loop, clock))
     if not unstable:
         return []

@@ -101,9 +101,7 @@ def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
 
 
 def _without_limits(loop: ClosedLoop, clock: Clock) -> tuple[ClosedLoop, int]:
-    """(the loop without noise, ADC, limits, dead time, filter and disturbance, its dead time in
-    samples).
-    """
+    """(the loop without noise, limits, dead time, filter; its dead time in samples)."""
     sensor: Any = loop.sensor.without_noise()
     if getattr(sensor, "bits", 0):
         sensor = dataclasses.replace(sensor, bits=0)
@@ -191,9 +189,7 @@ class _Sample:
         return jax.tree.unflatten(self.structure, leaves)
 
     def decided(self, s: Any) -> Any:
-        """(State with observer, controller and sensor after the sample, (m,) inputs within their
-        limits).
-        """
+        """(State after observer, controller and sensor, (m,) inputs within their limits)."""
         state, now, loop = self.state(s), self.now, self.loop
         y, sensor = loop.sensor.step(state.sensor, state.x, None, self.clock.dt)
         t = jnp.zeros_like(state.x[0])
@@ -203,9 +199,7 @@ class _Sample:
         return state._replace(**parts), decision.applied
 
     def after(self, s: Any, w: Any) -> tuple[Any, Any]:
-        """(state after a sample, (m,) inputs that the loop applies) with w (m,) added to them on
-        their way to the pumps.
-        """
+        """(state after a sample, (m,) inputs of the loop) with w (m,) added at the pumps."""
         state, applied = self.decided(s)
         inputs = tuple(a + v for a, v in zip(applied, w))
         moved = move(self.loop, self.clock, state, inputs, self.now)[0]
@@ -439,9 +433,7 @@ def _stacked(*values: Any) -> Any:
 
 @compiled("clock", "slopes", keep=True)
 def _compiled(loop: ClosedLoop, clock: Clock, r: Any, slopes: bool) -> tuple[Any, am.Margins]:
-    """(Linearised, Margins) of one plateau with setpoints r (outputs,); slopes: whether their
-    derivatives may be asked for.
-    """
+    """(Linearised, Margins) of one plateau with setpoints r; slopes: derivatives wanted."""
     linear = linearised(loop, clock, r)
     return linear._replace(open_loop=linear.open_loop[:3]), am.margins(linear.open_loop, slopes)
 

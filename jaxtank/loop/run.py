@@ -177,18 +177,14 @@ def _no_slope(names: Sequence[str]) -> str:
 def evaluate_and_flag(
     loop: ClosedLoop, clock: Clock, measures: Sequence[str], key: jax.Array | None = None
 ) -> tuple[dict[str, jax.Array], jax.Array]:
-    """Return (`evaluate`'s values, True if the run diverged); checks nothing, raises nothing: for
-    batches and searches.
-    """
+    """Return (`evaluate`'s values, True if the run diverged), unchecked."""
     return evaluate_compiled(loop, clock, _names(measures), key, checkpoint=False)
 
 
 def evaluate_for_reverse(
     loop: ClosedLoop, clock: Clock, measures: Sequence[str], key: jax.Array | None = None
 ) -> dict[str, jax.Array]:
-    """Return `evaluate`'s values by a run cut into about sqrt(samples) chunks that are recomputed
-    on the way back, for reverse mode.
-    """
+    """Return `evaluate`'s values by sqrt(samples) chunks that reverse mode recomputes."""
     # Same values, but never NonFiniteError; memory of a gradient grows with the root of the
     # samples. Best above about ten parameters.
     names = _names(measures)

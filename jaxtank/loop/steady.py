@@ -12,9 +12,7 @@ from jaxtank.signals.base import Constant
 
 
 def steady_inflow(loop: Any) -> Any:
-    """Return (n,) inflow that no pump brings and that lasts [cm^3/s], None where there is none:
-    inflow pulses end.
-    """
+    """Steady inflow (n,) [cm^3/s] that no pump brings; None without any: pulses end."""
     disturbance = loop.disturbance
     if not isinstance(disturbance, Constant):
         return None

@@ -68,9 +68,7 @@ def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[Sta
 def decide(
     loop: ClosedLoop, observer: Any, controller: Any, tick: Tick, y: Sequence[Any]
 ) -> Decision:
-    """Return what observer and controller make of one sample: the order of a sample,
-    written once.
-    """
+    """Return what observer and controller make of one sample: its order, written once."""
     guard, line = loop.safety_filter, None
     if guard is not None and guard.predicted:
         controller, line = controller

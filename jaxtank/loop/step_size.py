@@ -49,9 +49,7 @@ class Unstable(NamedTuple):
 
 
 def emptying_rates(plant: Any, orifices: float = 1.5, pipes: float = 2.0) -> Any:
-    """Return (n,) lambda of each tank [1/s], with these slopes of the laminar flow of its orifices
-    and pipes; None of a plant of another kind, or one whose leaves are traced.
-    """
+    """Lambda (n,) of each tank [1/s]; None of traced leaves or another kind of plant."""
     try:
         out, joined = np.array(plant.drain, dtype=float), np.zeros(plant.tanks)
         orifice, pipe = np.asarray(plant.orifice), np.asarray(plant.pipe)
@@ -70,9 +68,7 @@ def emptying_rates(plant: Any, orifices: float = 1.5, pipes: float = 2.0) -> Any
 
 @functools.lru_cache(maxsize=256)
 def unstable_height(product: float, integrator: str) -> float:
-    """Return how high above an empty tank, in thresholds, a level rises in the long run, at
-    lambda h = `product` of any start.
-    """
+    """How high a level rises above empty at lambda h = `product`, in thresholds."""
 
     def rate(x: Any) -> Any:
         laminar = x * (1.5 - 0.5 * np.maximum(x, 0.0))
@@ -99,9 +95,7 @@ def unstable_height(product: float, integrator: str) -> float:
 
 
 def check_step(loop: ClosedLoop, clock: Clock) -> None:
-    """Raise InputError where a step would empty a full tank, and warn (StepWarning) where levels
-    near a bottom are wrong.
-    """
+    """Raise InputError where a step empties a full tank; warn where levels near 0 are wrong."""
     plant, step = loop.plant, clock.dt / clock.substeps
     rates = emptying_rates(plant)
     for unstable in unstable_tanks(loop, clock):
@@ -119,9 +113,7 @@ def check_step(loop: ClosedLoop, clock: Clock) -> None:
 
 
 def step_warnings(loop: ClosedLoop, clock: Clock) -> list[str]:
-    """Return a sentence on the tanks whose levels would be wrong near empty by so much that it
-    shows, or none; the worst is named.
-    """
+    """A sentence on tanks whose levels are visibly wrong near empty, the worst named; or none."""
     length, visible = loop.units[0], _visible(loop, clock)
     if not visible:
         return []
@@ -140,9 +132,7 @@ def step_warnings(loop: ClosedLoop, clock: Clock) -> list[str]:
 
 
 def check_run(loop: ClosedLoop, clock: Clock, run: Trajectory) -> None:
-    """Raise InputError if the explicit step was unstable near empty in `run`, the whole Trajectory
-    of a loop that has `step_warnings`: the volume in a rig cannot rise by more than its inflow.
-    """
+    """Raise InputError where volume appears in a run: the explicit step was unstable."""
     visible = _visible(loop, clock)
     if not visible or any(name.startswith("area") for name, _, _ in _fault_windows(loop)):
         return  # a fault of an area changes what is stored

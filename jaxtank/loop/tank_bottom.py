@@ -17,9 +17,7 @@ class TankBottomWarning(UserWarning):
 
 
 def can_withdraw(loop: ClosedLoop) -> bool:
-    """Return whether anything can take liquid out of a tank besides its outlets: an inflow below 0,
-    or a pump that may run backwards.
-    """
+    """Return whether an inflow below 0 or a pump that runs backwards can empty a tank."""
     actuator: Any = loop.actuator
     numbers = [getattr(actuator, name, 0.0) for name in ("low", "initial")]
     if is_component(loop.disturbance):
@@ -28,26 +26,20 @@ def can_withdraw(loop: ClosedLoop) -> bool:
 
 
 def lower_bounds(plant: Any) -> Any:
-    """Return (n,) levels [cm] below which a tank has given what it did not hold: rounding and the
-    laminar zone aside.
-    """
+    """Levels (n,) [cm] below which a tank has given what it did not hold, but for rounding."""
     rim = np.broadcast_to(np.asarray(plant.rim, dtype=float), (plant.tanks,))
     return -np.minimum(getattr(plant, "knee", np.inf), 1e-3 * np.where(np.isfinite(rim), rim, 1.0))
 
 
 def is_open(loop: ClosedLoop) -> bool:
-    """Return whether levels may fall below 0: liquid can be drawn from a network without `bottom`,
-    or the plant is of a user's class.
-    """
+    """Return whether levels may fall below 0: a network without `bottom`, or a user's plant."""
     kind: Any = type(loop.plant)  # a subclass may have flows of its own
     network = kind.derivative is cast(Any, TankNetwork).derivative
     return not loop.plant.bottom and (not network or can_withdraw(loop))
 
 
 def tank_bottom_warnings(loop: ClosedLoop, run: Trajectory) -> list[str]:
-    """Return a sentence for each tank whose level falls below 0 in a run: how far, when, and the
-    volume that the tank has given without holding it.
-    """
+    """A sentence for each tank whose level falls below 0: how far, when, which volume."""
     plant: Any = loop.plant
     x, length = np.asarray(run.x), loop.units[0]
     sentences: list[str] = []

@@ -195,9 +195,7 @@ def stride(samples: int, rows: int = 3000) -> int:
 
 
 def csv(run: Trajectory, units: tuple[str, str] = DEFAULT) -> str:
-    """Return a trajectory as CSV with units in the header; estimates of disturbances where there
-    are any.
-    """
+    """Return a trajectory as CSV with units in the header."""
     known = bool(np.asarray(run.d_hat).any())
     table = {
         n: v

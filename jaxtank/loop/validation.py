@@ -78,9 +78,7 @@ def check(
 
 
 def _signature(loop: ClosedLoop, clock: Clock, keyless: bool) -> Any:
-    """What the checks depend on, hashable: structure of the loop, clock, and a digest of shapes,
-    types and values of its leaves; None where it has none, as inside a trace.
-    """
+    """What the checks depend on, hashable; None inside a trace."""
     leaves, structure = cast(tuple[list[Any], Any], jax.tree.flatten(loop))
     digest = hashlib.blake2b(digest_size=16)
     for value in leaves:
@@ -239,9 +237,7 @@ def _sizes(plant: Plant) -> dict[str, int]:
 
 
 def _plants(tree: Any, prefix: str = "") -> Iterator[tuple[str, Plant]]:
-    """(dotted name, plant) of every plant below `tree`: that of the loop, and the models of
-    controller and observer.
-    """
+    """(dotted name, plant) of the loop's plant and of the models of controller and observer."""
     for field in dataclasses.fields(tree):
         value, name = getattr(tree, field.name), f"{prefix}{field.name}"
         if isinstance(value, Plant):

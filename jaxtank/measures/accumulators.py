@@ -107,9 +107,7 @@ def _sums(run, size):
 
 
 def _sum(size, term):
-    """Accumulator of sums over the run: `term(run, sample)` gives one number for each of `size`,
-    "outputs", "tanks" or "pumps".
-    """
+    """Accumulator of sums over the run of term(run, sample), for each output, tank or pump."""
 
     def update(run, state, sample, context):
         return each(lambda v, s: plus(s, v), term(run, sample), state)
@@ -139,9 +137,7 @@ def _lasting(term):
 
 
 def _extreme(size, pick, better, worst, refers_to=""):
-    """Accumulator of (extreme, time it was reached), one pair for each of `size`; the first sample
-    wins a tie.
-    """
+    """Accumulator of (extreme, time it was reached) for each; the first sample wins a tie."""
 
     def update(run, state, sample, context):
         def extreme(v, now):
@@ -181,9 +177,7 @@ def _outside(run, sample):
 
 
 def _overshoot(sample, context):
-    """Level past the target in the direction of the step, as a share of the step [-]; -1 where
-    there is no step yet.
-    """
+    """Level past the target as a share of the step [-]; -1 before the first step."""
 
     def share(r, e, window):
         target, step, _, _ = window
@@ -194,9 +188,7 @@ def _overshoot(sample, context):
 
 
 def _update_settling(run, state, sample, context):
-    """Per output (target now, time since its change ended at the last sample outside the band [s],
-    1 if still outside, worst so far).
-    """
+    """Per output (target, time since its change at the last sample outside, outside, worst)."""
 
     def update(r, e, window, before):
         (target, step, since, band), (old, last, outside, worst) = window, before
@@ -235,9 +227,7 @@ def _update_rise(run, state, sample, context):
 
 
 def _update_recovery(run, state, sample, context):
-    """Per output (time since the inflow pulse at the last sample outside the band [s], 1 if that
-    was the last one watched, worst so far).
-    """
+    """Per output (time since the pulse at the last sample outside, outside, worst)."""
     since = context.since
 
     def update(r, e, before):
@@ -258,9 +248,7 @@ def _deviation(run, sample, context):
 
 
 def _past(run, sample, context):
-    """Level past the target in the direction of the step [cm], one per output; 0 before the first
-    step.
-    """
+    """Level past the target [cm], in the direction of the step, one per output."""
 
     def past(r, e, window):
         target, step, _, _ = window

@@ -10,9 +10,7 @@ from jaxtank.core.errors import InputError
 
 
 def check_model(observer, plant):
-    """Raise InputError unless the observer's model has as many tanks and pumps as the plant, and
-    its leaves with an entry per tank have so many.
-    """
+    """Raise InputError unless the observer's model and its leaves fit the plant."""
     n, model = plant.tanks, observer.model
     if model.tanks != n or model.pumps != plant.pumps:
         raise InputError(
@@ -28,9 +26,7 @@ def check_model(observer, plant):
 
 
 def check_tanks(observer, name, plant, least=1):
-    """Raise InputError unless the field `name` of the observer holds tanks of the plant, counted
-    from 0, each once and at least `least` of them.
-    """
+    """Raise InputError unless the field `name` holds `least` tanks of the plant, each once."""
     tanks, n = getattr(observer, name), plant.tanks
     if (
         not len(tanks) >= least

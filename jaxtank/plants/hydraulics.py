@@ -28,9 +28,7 @@ def in_unit(centimetres, length):
 
 
 def default_gravity(length):
-    """Return the acceleration g [length/s^2] of a rig whose unit of length is `length`:
-    981 cm/s^2.
-    """
+    """Return the acceleration g [length/s^2], 981 cm/s^2 in a rig's unit of length."""
     if length not in PER_CENTIMETRE:
         raise InputError(
             f'plant.gravity: must be given for a rig whose length is "{length}" '

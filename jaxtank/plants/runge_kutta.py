@@ -60,9 +60,7 @@ def advance(
 
 
 def integrate(plant, integrator, t, x, u, d, h):
-    """Return the levels a step `h` [s] later, by one step of "rk4" or "midpoint" with u and d
-    held.
-    """
+    """Return the levels a step `h` [s] later, by "rk4" or "midpoint" with u and d held."""
     rates = _rates(plant, integrator, t, x, u, d, h)
     if integrator == "midpoint":
         return _along(x, rates, h)

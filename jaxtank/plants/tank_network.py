@@ -71,9 +71,7 @@ def supply(net: Any, step: Any) -> Any:
 
 
 def flows(net: Any, x: Any, u: Any, d: Any, step: Any = None) -> Any:
-    """Return the rates (n,) [cm/s] of levels x (n,), as `TankNetwork.derivative`; with `step`, of
-    the vector field of `TankNetwork.limited`.
-    """
+    """Rates (n,) [cm/s] of levels x (n,), as `derivative`; with `step`, as `limited`."""
     w, per_area = jnp.sqrt(2.0 * net.gravity), 1.0 / jnp.asarray(net.area)
     enters = pumped(net, u) if d is None else pumped(net, u) + d
     most: Any = None if step is None else supply(net, step)

@@ -95,9 +95,7 @@ def _filtered(initial, changes, duration, lag, clock):
 
 
 def _lagged(level, state, target, start, duration, lag, t):
-    """(r, f, f', f'') at times t of lag f' = r - f, where r changes from `level` from `start` on,
-    and f = `state` there.
-    """
+    """(r, f, f', f'') at times t of lag f' = r - f; r leaves `level` and f = `state` at `start`."""
     slope = jnp.where(duration > 0, (target - level) / jnp.where(duration > 0, duration, 1.0), 0.0)
     s = jnp.maximum(t - start, 0.0)
     ramp = _decay(level, state, slope, jnp.minimum(s, duration), lag)
@@ -259,9 +257,7 @@ class Ramps(Signal):
         return self._by_count(clock, lambda which, *own: self._window(clock, t, *own))
 
     def _by_count(self, clock, course) -> Any:
-        """The arrays (samples, channels) of made(which, initial (g,), [(times (g,), targets (g,))])
-        for the channels `which` that have as many changes.
-        """
+        """Arrays (samples, channels) of course(which, initial, changes), by number of changes."""
         by_channel = [[] for _ in range(self.channels)]
         for j, (_, i) in enumerate(self.changes):
             by_channel[i].append(j)

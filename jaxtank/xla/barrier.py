@@ -34,9 +34,7 @@ def materialised(tree: T) -> T:
 
 
 def with_one_slope(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return an elementwise function of an array whose slope is computed once, and not again for
-    each of the directions of a derivative.
-    """
+    """Return an elementwise function whose slope is computed once for all directions."""
     sloped: Any = jax.custom_jvp(function)
 
     @sloped.defjvp

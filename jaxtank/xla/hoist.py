@@ -36,9 +36,7 @@ def scan(body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> A
 
 
 def checkpointed_scan(body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-    """Return the carry of a scan over about sqrt(length) chunks, each recomputed in the reverse
-    pass.
-    """
+    """Return the carry of a scan over sqrt(length) chunks, recomputed in reverse."""
 
     def chunk(carry: Any, now: Any) -> Any:
         return scan(body, carry, now, length=inner)[0], None
@@ -79,9 +77,7 @@ def _split(jaxpr):
 
 
 def _key(eqn, operands):
-    """A key that is equal for two operations with the same result; operations that carry a program
-    are distinguished by identity.
-    """
+    """Equal for operations with the same result; operations with a program stay apart."""
     if any(hasattr(p, "eqns") or hasattr(p, "jaxpr") or callable(p) for p in eqn.params.values()):
         return id(eqn)
     read = tuple((str(v.aval), repr(v.val)) if isinstance(v, Literal) else id(v) for v in operands)

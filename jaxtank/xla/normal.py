@@ -30,9 +30,7 @@ def is_fast(key: Any) -> bool:
 
 
 def normal_at(key: Any, index: jax.Array) -> jax.Array:
-    """Return the numbers of jax.random.normal(key, shape).ravel() at the places `index`
-    (uint64).
-    """
+    """Return jax.random.normal(key, shape).ravel() at the places `index` (uint64)."""
     first, second = _blocks(jax.random.key_data(key), index)
     bits = first.astype(jnp.uint64) << 32 | second.astype(jnp.uint64)
     # 52 random bits after the point of a number in [1, 2)

@@ -237,9 +237,7 @@ def _version() -> str:
 
 
 def processor() -> str:
-    """Return what native code depends on, as 12 hexadecimal digits: programs for one processor may
-    end on another, which shares the home, by an illegal instruction.
-    """
+    """Digest of what native code depends on: a program of another processor may crash."""
     words = [platform.machine(), sys.platform]
     try:
         with open("/proc/cpuinfo") as lines:

@@ -14,9 +14,7 @@ LOOPS = ("scan", "while")
 
 
 class Use(NamedTuple):
-    """What was found: whether any result depends on the arguments in question, the entries of the
-    largest matrix on the way (0: none), and whether a loop is on the way.
-    """
+    """Whether a result depends on arguments, entries of the largest matrix, any loop on the way."""
 
     reached: bool
     largest: int
@@ -36,9 +34,7 @@ def reached(function: Callable[[Any], Any], watched: Any) -> list[bool]:
 
 
 def _follow(jaxpr, reached):
-    """(Use, [whether each result is reached]) from the variables in `reached`, a set that is added
-    to.
-    """
+    """(Use, [whether each result is reached]) from the variables in `reached`, added to."""
     largest, looped = 0, False
     for eqn in jaxpr.eqns:
         hit = [_in(v, reached) for v in eqn.invars]
