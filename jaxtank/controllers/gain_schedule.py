@@ -123,9 +123,7 @@ class Scheduled(Controller):
     """
 
     law: Controller
-    knots: np.ndarray = leaf(
-        "cm", "positions of the operating variable, increasing", shape=("knot",)
-    )
+    knots: np.ndarray = leaf("cm", "positions of the operating variable, increasing", shape="knot")
     values: np.ndarray = leaf("-", "each gain at each knot", shape=("gain", "knot"))
     gains: tuple = static(doc="leaves of the controller that are scheduled, one per row of values")
     variable: str = static(

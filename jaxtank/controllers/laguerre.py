@@ -48,22 +48,18 @@ class Laguerre(LinearPredictive):
 
     model: TankNetwork
     operating_point: np.ndarray = leaf(
-        "cm",
-        "levels at which the model is linearised (H1, H2)",
-        low=0.0,
-        strict=True,
-        shape=("tank",),
+        "cm", "levels at which the model is linearised (H1, H2)", low=0.0, strict=True, shape="tank"
     )
     r_w: np.ndarray = leaf("cm^2/V^2", "weight of the increments (rw)", low=0.0, strict=True)
     a: np.ndarray = leaf(
-        "-", "pole of each pump's Laguerre functions (a)", low=0.0, high=0.999, shape=("pump",)
+        "-", "pole of each pump's Laguerre functions (a)", low=0.0, high=0.999, shape="pump"
     )
-    q: np.ndarray = leaf("-", "weight of each output (Qy)", low=0.0, shape=("output",))
+    q: np.ndarray = leaf("-", "weight of each output (Qy)", low=0.0, shape="output")
     du_limit: np.ndarray = leaf(
-        "V", "largest change of each input in a sample", low=0.0, strict=True, shape=("pump",)
+        "V", "largest change of each input in a sample", low=0.0, strict=True, shape="pump"
     )
-    u_low: np.ndarray = leaf("V", "lower limit of each input in the constraints", shape=("pump",))
-    u_high: np.ndarray = leaf("V", "upper limit of each input in the constraints", shape=("pump",))
+    u_low: np.ndarray = leaf("V", "lower limit of each input in the constraints", shape="pump")
+    u_high: np.ndarray = leaf("V", "upper limit of each input in the constraints", shape="pump")
     N: int = static("-", "Laguerre functions per pump (N)", low=1, high=30, default=4)
     Np: int = static("-", "prediction horizon (Np)", low=1, high=1000, default=40)
     rows: int = static(

@@ -88,7 +88,7 @@ class PID(Controller):
 
     model: Plant
     Kc: np.ndarray = leaf(
-        "V/cm", "gain Kc, not 0; below 0 where a pump lowers its output", shape=("pump",)
+        "V/cm", "gain Kc, not 0; below 0 where a pump lowers its output", shape="pump"
     )
     Ti: np.ndarray | None = leaf(
         "s",
@@ -98,10 +98,10 @@ class PID(Controller):
         like="Kc",
         infinite=True,
         default=None,
-        shape=("pump",),
+        shape="pump",
     )
     Td: np.ndarray | None = leaf(
-        "s", "derivative time Td", low=0.0, strict=True, like="Kc", default=None, shape=("pump",)
+        "s", "derivative time Td", low=0.0, strict=True, like="Kc", default=None, shape="pump"
     )
     order: np.ndarray | None = leaf(
         "-",
@@ -111,7 +111,7 @@ class PID(Controller):
         strict=True,
         like="Kc",
         default=None,
-        shape=("pump",),
+        shape="pump",
     )
     Tt: np.ndarray | None = leaf(
         "s",
@@ -120,9 +120,9 @@ class PID(Controller):
         strict=True,
         like="Kc",
         default=None,
-        shape=("pump",),
+        shape="pump",
     )
-    bias: np.ndarray = leaf("V", "input added where there is no feed-forward", shape=("pump",))
+    bias: np.ndarray = leaf("V", "input added where there is no feed-forward", shape="pump")
     feed_forward: bool = static(
         "-", "add the model's input on the reference", choices=(False, True), default=False
     )

@@ -116,9 +116,9 @@ class LQI(Controller):
         low=0.0,
         shape=("tank + output",),
     )
-    R: np.ndarray = leaf("1/V^2", "weight of each input", low=0.0, strict=True, shape=("pump",))
+    R: np.ndarray = leaf("1/V^2", "weight of each input", low=0.0, strict=True, shape="pump")
     operating_point: np.ndarray = leaf(
-        "cm", "setpoint at which the model is linearised", low=0.0, strict=True, shape=("output",)
+        "cm", "setpoint at which the model is linearised", low=0.0, strict=True, shape="output"
     )
 
     @pointwise

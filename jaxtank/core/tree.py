@@ -38,7 +38,7 @@ def leaf(
     low: float | None = None,
     high: float | None = None,
     strict: bool = False,
-    shape: Shape = (),
+    shape: Shape | str = (),
     like: str | None = None,
     infinite: bool = False,
     default: Any = dataclasses.MISSING,
@@ -51,7 +51,8 @@ def leaf(
     doc : what it is
     low, high : allowed range, or None
     strict : whether the value `low` itself is excluded
-    shape : size of each axis, () for one number: a number, or a name of what the plant counts:
+    shape : size of each axis, () for one number; of one axis alone, or of several: a number, or a
+        name of what the plant counts:
         "tank", "pump", "output", "orifice", "pipe", "spill", or a sum, "tank + output". A size of
         another name ("knot") is for the component to check.
     like : name of a sibling field. Such a leaf may be absent (None), which costs the loop nothing,
@@ -80,7 +81,7 @@ def leaf(
         "low": low,
         "high": high,
         "strict": strict,
-        "shape": tuple(shape),
+        "shape": (shape,) if isinstance(shape, str) else tuple(shape),
         "like": like,
     }
     if infinite:

@@ -62,22 +62,22 @@ class PumpBank(Actuator):
     [0.0, 5.0, 12.0]
     """
 
-    low: np.ndarray = leaf("V", "lower limit of each pump", shape=("pump",))
-    high: np.ndarray = leaf("V", "upper limit of each pump", shape=("pump",))
+    low: np.ndarray = leaf("V", "lower limit of each pump", shape="pump")
+    high: np.ndarray = leaf("V", "upper limit of each pump", shape="pump")
     dead_zone: Any = leaf(
         "V",
         "input at or below which a pump stands still",
         low=0.0,
         like="low",
         default=None,
-        shape=("pump",),
+        shape="pump",
     )
     stop: np.ndarray = leaf(
         "V",
         "input below which a turning pump stops (hysteresis)",
         low=0.0,
         default=lambda own: np.zeros(np.shape(own["low"])),
-        shape=("pump",),
+        shape="pump",
     )
     pulse: np.ndarray = leaf(
         "V",
@@ -85,16 +85,16 @@ class PumpBank(Actuator):
         low=0.0,
         strict=True,
         default=lambda own: _largest(own["high"]),
-        shape=("pump",),
+        shape="pump",
     )
     lag: Any = leaf(
-        "s", "time constant of each pump", low=0.0, like="low", default=None, shape=("pump",)
+        "s", "time constant of each pump", low=0.0, like="low", default=None, shape="pump"
     )
     initial: np.ndarray = leaf(
         "V",
         "input at which the pumps ran before t = 0",
         default=lambda own: np.zeros(np.shape(own["low"])),
-        shape=("pump",),
+        shape="pump",
     )
     delay: float = static(
         "s", "transport delay from pump to tank", low=0.0, high=1000.0, default=0.0

@@ -157,9 +157,9 @@ class Actuator(abc.ABC):
     >>> from jaxtank import component, leaf
     >>> @component
     ... class RateLimited(Actuator):
-    ...     low: np.ndarray = leaf("V", "lower limit of each pump", shape=("pump",))
-    ...     high: np.ndarray = leaf("V", "upper limit of each pump", shape=("pump",))
-    ...     initial: np.ndarray = leaf("V", "input before t = 0", shape=("pump",))
+    ...     low: np.ndarray = leaf("V", "lower limit of each pump", shape="pump")
+    ...     high: np.ndarray = leaf("V", "upper limit of each pump", shape="pump")
+    ...     initial: np.ndarray = leaf("V", "input before t = 0", shape="pump")
     ...     rate: float = leaf("V/s", "largest rate of change", low=0.0, strict=True)
     ...
     ...     def init(self, clock):

@@ -44,13 +44,13 @@ class LevelSensor(Sensor):
         low=0.0,
         strict=True,
         default=lambda own: _without_adc(own, np.ones(np.shape(own["noise"]))),
-        shape=("tank",),
+        shape="tank",
     )
     noise: np.ndarray = leaf(
-        "cm", "standard deviation of the noise on each level", low=0.0, shape=("tank",)
+        "cm", "standard deviation of the noise on each level", low=0.0, shape="tank"
     )
     offset: np.ndarray | None = leaf(
-        "cm", "what each sensor reads of an empty tank", like="gain", default=None, shape=("tank",)
+        "cm", "what each sensor reads of an empty tank", like="gain", default=None, shape="tank"
     )
     full_scale: np.ndarray = leaf(
         "volt", "range of the ADC", low=0.0, strict=True, default=lambda own: _without_adc(own, 5.0)

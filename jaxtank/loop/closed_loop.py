@@ -1,6 +1,6 @@
 """The closed loop: its components, its state, and what is known of each sample beforehand."""
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
-# pyright: reportUnknownMemberType=false
+# pyright: reportUnknownMemberType=false, reportUnknownLambdaType=false
 
 import dataclasses
 import functools
@@ -72,7 +72,7 @@ class ClosedLoop:
     disturbance: Signal | None = None
     faults: Faults | None = None
     safety_filter: SafetyFilter | None = None
-    x0: np.ndarray[Any, Any] = leaf("cm", "levels at t = 0", low=0.0, shape=("tank",))
+    x0: np.ndarray[Any, Any] = leaf("cm", "levels at t = 0", low=0.0, shape="tank")
 
     @property
     def units(self) -> tuple[str, str]:
@@ -130,13 +130,11 @@ def inputs(
 
 def _drawn(sensor: Sensor, key: Any, times: Any, batch: Any, arrays: bool) -> Group | None:
     """The deviates of the sensor noise (`Sensor.draw`)."""
-    if not arrays:
-        return sensor.draw(key, times.samples, batch)
-    if type(sensor).draw is Sensor.draw:
+    if arrays and type(sensor).draw is Sensor.draw:
         deviates = sensor.deviates(key, times.samples, batch)
         return None if deviates is None else deviates.T
-    deviates_of_channels = sensor.draw(key, times.samples, batch)
-    return None if deviates_of_channels is None else columns(deviates_of_channels)
+    draws = sensor.draw(key, times.samples, batch)
+    return columns(draws) if arrays and draws is not None else draws
 
 
 def inputs_at(
@@ -188,11 +186,7 @@ def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Group) -> 
     if since is not None and window is not None:
         # while a tank recovers from an inflow pulse, it is not settling on its setpoint
         recovering = since[:, None] >= 0.0 if is_array(r) else since >= 0.0
-
-        def waiting(v: Any) -> Any:
-            return jnp.where(recovering, 0.0, v)
-
-        window = jax.tree.map(waiting, window)
+        window = jax.tree.map(lambda v: jnp.where(recovering, 0.0, v), window)
     steady = _steady_inputs(loop, r) if "steady" in fields else None
     return ms.Context(window=window, since=since, steady=steady)
 
@@ -200,10 +194,8 @@ def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Group) -> 
 def _steady_inputs(loop: ClosedLoop, r: Group) -> Any:
     if not ms.serves("input_deviation", loop):
         raise InputError("input_deviation needs a rig without pipes, with as many pumps as outputs")
-    inputs, offset = (
-        steady_along(loop.plant, _rows_of(r), steady_inflow(loop))[1],
-        loop.actuator.offset,
-    )
+    inputs = steady_along(loop.plant, _rows_of(r), steady_inflow(loop))[1]
+    offset = loop.actuator.offset
     if np.ndim(offset):
         inputs = tuple(u + offset[i] for i, u in enumerate(inputs))
     return columns(inputs) if is_array(r) else inputs
@@ -216,14 +208,12 @@ def initial(loop: ClosedLoop, clock: Clock, arrays: bool = False) -> State:
     def same_type(v: Any) -> Any:
         return v + zero if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v
 
-    x0 = tuple(loop.x0[i] + zero for i in range(loop.plant.tanks)) if not arrays else ()
-    u0 = tuple(actuator.initial[i] + zero for i in range(loop.plant.pumps)) if not arrays else ()
-    excess: Any = (zero,) * loop.plant.tanks
-    if arrays:
-        x0, u0 = jnp.asarray(loop.x0) + zero, jnp.asarray(actuator.initial) + zero
-        excess = jnp.zeros_like(x0)
-    whole = arrays and serves_arrays(actuator)
-    begin = actuator.init_arrays if whole else actuator.init
+    def vector(leaf: Any, size: int) -> Group:
+        return jnp.asarray(leaf) + zero if arrays else tuple(leaf[i] + zero for i in range(size))
+
+    x0, u0 = vector(loop.x0, loop.plant.tanks), vector(actuator.initial, loop.plant.pumps)
+    excess: Any = jnp.zeros_like(x0) if arrays else (zero,) * loop.plant.tanks
+    begin = actuator.init_arrays if arrays and serves_arrays(actuator) else actuator.init
     return State(
         k=jnp.int32(0),
         x=x0,
@@ -245,10 +235,8 @@ def control_state(loop: ClosedLoop, x0: Group, u0: Group) -> Any:
 
 
 def keyed(loop: ClosedLoop, key: jax.Array | None) -> ClosedLoop:
-    """Return `loop`, if its noise can be drawn: without a key its levels are NaN from the start
-    where `sensor.noise` is above 0. A traced noise is not seen by input validation, and a run
-    without it, whose derivative by it is 0, would look like an answer.
-    """
+    """Return `loop`; with noise and no key its levels are NaN from the start."""
+    # Input validation does not see a traced noise; a run without it would look like an answer.
     if key is not None:
         return loop
     noise = jnp.asarray(loop.sensor.noise)

@@ -38,6 +38,12 @@ not vectorised in a loop).
 """
 
 
+Names = tuple[str, ...]
+Arrays = dict[str, jax.Array]
+Squares = tuple[tuple[str, float], ...]
+"""((measure, weight), ...) of sums of squares"""
+
+
 class Partition(NamedTuple):
     """The leaves of a tree in two groups: those that have tangents, and the rest."""
 
@@ -62,32 +68,49 @@ class Partition(NamedTuple):
 def sensitivities_compiled(
     loop: ClosedLoop,
     clock: Clock,
-    names: tuple[str, ...],
-    order: tuple[str, ...],
+    names: Names,
+    order: Names,
     values: tuple[ArrayLike, ...],
     key: jax.Array | None,
-    squares: tuple[tuple[str, float], ...] = (("mean_square_error", 1.0),),
+    squares: Squares = (("mean_square_error", 1.0),),
     batched: bool = False,
-) -> tuple[dict[str, jax.Array], dict[str, jax.Array], jax.Array, jax.Array]:
+) -> tuple[Arrays, Arrays, jax.Array, jax.Array]:
     """Unchecked `sensitivities`; batched: one of several runs side by side."""
-    if ms.functions(names):
-        return _with_functions(loop, clock, names, order, values, key, squares, batched)
     flat, unflatten = ravel_pytree(values)
-    arrays, axis, axes = _form_of(loop)
-    computed = tuple(dict.fromkeys([*names, *(m for m, _ in squares)]))
     basis = jnp.eye(flat.size, dtype=flat.dtype)
 
     def at(theta: Any) -> ClosedLoop:
         return with_values(loop, dict(zip(order, unflatten(theta))))
 
+    if ms.functions(names):  # by the chain rule: along the measures that they read, and along rows
+        needed = needed_by(at(flat), clock, names)
+        measures, slopes, matrix, broken = sensitivities_compiled(
+            loop, clock, needed, order, values, key, squares, batched
+        )
+
+        def functions(measures: Any, theta: Any) -> Any:
+            return values_of(at(theta), clock, names, key, measures), None
+
+        results, rates, _ = _pushed(functions, (measures, flat), slopes, basis)
+        return results, rates, matrix, broken
+
+    arrays = takes_arrays(loop)
+    # the axis of the directions in the loop, and that in (a state, samples): in front of arrays,
+    # whose entries then stay side by side
+    axis, axes = (0, (0, 1)) if arrays else (-1, (-1, -1))
+    computed = tuple(dict.fromkeys([*names, *(m for m, _ in squares)]))
+
     def sampled(theta: Any) -> Any:
         return inputs(at(theta), clock, computed, key, arrays=arrays)
 
+    def start(loop: ClosedLoop) -> Any:
+        return initial(loop, clock, arrays), ms.start(run_of(loop, clock, arrays), computed)
+
     known = _dependent(sampled, flat)
-    carried = _floats_of(jax.eval_shape(lambda: _start(loop, clock, computed, arrays)))
+    carried = _floats_of(jax.eval_shape(lambda: start(loop)))
 
     def begin(theta: Any) -> Any:
-        floats, rest = carried.split(_start(keyed(at(theta), key), clock, computed, arrays))
+        floats, rest = carried.split(start(keyed(at(theta), key)))
         moving, fixed = known.split(sampled(theta))
         return (floats, moving), (rest, fixed)
 
@@ -116,55 +139,11 @@ def sensitivities_compiled(
     floats, dfloats, rest, matrix = scan(body, carry, (moving, dmoving, fixed), clock.samples)[0]
 
     def finish(floats: Any, theta: Any) -> Any:
-        return _measures(at(theta), clock, names, arrays, carried.join(floats, rest)), None
+        run = run_with(at(theta), clock, names, arrays)
+        return ms.read(run, carried.join(floats, rest)[1], names), None
 
     results, slopes, _ = _pushed(finish, (floats, flat), dfloats, basis, ins=axis)
     return results, slopes, 2.0 * matrix, is_broken(carried.join(floats, rest)[0])
-
-
-def _with_functions(
-    loop: ClosedLoop,
-    clock: Clock,
-    names: tuple[str, ...],
-    order: tuple[str, ...],
-    values: tuple[ArrayLike, ...],
-    key: jax.Array | None,
-    squares: tuple[tuple[str, float], ...],
-    batched: bool,
-) -> tuple[dict[str, jax.Array], dict[str, jax.Array], jax.Array, jax.Array]:
-    """`sensitivities_compiled` of functions of the run, by the chain rule."""
-    flat, unflatten = ravel_pytree(values)
-
-    def at(theta: Any) -> ClosedLoop:
-        return with_values(loop, dict(zip(order, unflatten(theta))))
-
-    read_measures = needed_by(at(flat), clock, names)
-    known = sensitivities_compiled(loop, clock, read_measures, order, values, key, squares, batched)
-    measures, slopes, matrix, broken = known
-
-    def functions(measures: Any, theta: Any) -> Any:
-        return values_of(at(theta), clock, names, key, measures), None
-
-    basis = jnp.eye(flat.size, dtype=flat.dtype)
-    results, rates, _ = _pushed(functions, (measures, flat), slopes, basis)
-    return results, rates, matrix, broken
-
-
-def _form_of(loop: ClosedLoop) -> tuple[bool, int, tuple[int, int]]:
-    """(whether vectors are arrays, axis of the directions in the loop, of state, samples)."""
-    return (True, 0, (0, 1)) if takes_arrays(loop) else (False, -1, (-1, -1))
-
-
-def _measures(
-    loop: ClosedLoop, clock: Clock, names: tuple[str, ...], arrays: bool, carried: Any
-) -> dict[str, Any]:
-    """The measures of a run that ended with (state, accumulators)."""
-    return ms.read(run_with(loop, clock, names, arrays), carried[1], names)
-
-
-def _start(loop: ClosedLoop, clock: Clock, names: tuple[str, ...], arrays: bool) -> Any:
-    """(state, accumulators of the measures) before the first sample."""
-    return initial(loop, clock, arrays), ms.start(run_of(loop, clock, arrays), names)
 
 
 def _floats_of(tree: Any) -> Partition:

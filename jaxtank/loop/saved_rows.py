@@ -2,7 +2,7 @@
 call.
 """
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
-# pyright: reportUnknownMemberType=false
+# pyright: reportUnknownMemberType=false, reportUnknownLambdaType=false
 
 import operator
 from typing import Any, cast
@@ -51,9 +51,9 @@ def simulate_compiled(
 
     def row(carry: Any, now: Any) -> Any:
         spilled = carry[1]
-        carry, sample = one(carry, jax.tree.map(_first, now))
+        carry, sample = one(carry, jax.tree.map(lambda a: a[0], now))
         if save_every > 1:
-            others = jax.tree.map(_but_first, now)
+            others = jax.tree.map(lambda a: a[1:], now)
             carry = scan(unsaved, carry, others, length=save_every - 1)[0]
         return carry, sample._replace(spilled=spilled)
 
@@ -70,11 +70,3 @@ def simulate_compiled(
     shares = loop.controller.shares(*(tuple(columns[name].T) for name in ("x_hat", "r")))
     share = None if shares is None else jnp.stack(shares, axis=-1)
     return Trajectory(**columns, units=loop.units, share=share), is_broken(state)
-
-
-def _first(a: Any) -> Any:
-    return a[0]
-
-
-def _but_first(a: Any) -> Any:
-    return a[1:]

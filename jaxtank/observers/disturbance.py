@@ -72,7 +72,7 @@ class DisturbanceObserver(Observer):
         "gain l of each tank; of unmeasured tanks not used",
         low=0.0,
         strict=True,
-        shape=("tank",),
+        shape="tank",
     )
     fed: str = static("-", "input that the observer uses", choices=FED, default="applied")
     before_compensation: bool = static(

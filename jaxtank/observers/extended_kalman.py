@@ -62,17 +62,17 @@ class ExtendedKalman(Observer):
         "cm^2/s",
         "variance that each level's own disturbance gains per second (Q)",
         low=0.0,
-        shape=("tank",),
+        shape="tank",
     )
     measurement: np.ndarray = leaf(
         "cm^2",
         "variance of each sensor's noise (r); of unmeasured tanks not used",
         low=0.0,
         strict=True,
-        shape=("tank",),
+        shape="tank",
     )
     spread: np.ndarray = leaf(
-        "cm^2", "variance of the initial estimate at t = 0", low=0.0, shape=("tank",)
+        "cm^2", "variance of the initial estimate at t = 0", low=0.0, shape="tank"
     )
     start: np.ndarray | None = leaf(
         "cm",
@@ -80,7 +80,7 @@ class ExtendedKalman(Observer):
         low=0.0,
         like="spread",
         default=None,
-        shape=("tank",),
+        shape="tank",
     )
     walk: np.ndarray | None = leaf(
         "cm^2/s^3",
@@ -90,7 +90,7 @@ class ExtendedKalman(Observer):
         strict=True,
         like="process",
         default=None,
-        shape=("tank",),
+        shape="tank",
     )
     measured: tuple = static(doc="tanks whose levels are measured, counted from 0")
     disturbed: tuple = static(

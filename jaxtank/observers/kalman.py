@@ -52,21 +52,21 @@ class Kalman(Observer):
     """
 
     model: Plant
-    levels: np.ndarray = leaf("cm", "operating levels xo", low=0.0, shape=("tank",))
-    inputs: np.ndarray = leaf("V", "operating inputs uo", shape=("pump",))
+    levels: np.ndarray = leaf("cm", "operating levels xo", low=0.0, shape="tank")
+    inputs: np.ndarray = leaf("V", "operating inputs uo", shape="pump")
     process: np.ndarray = leaf(
         "cm^2/s",
         "variance that each level's own disturbance gains per second",
         low=0.0,
         strict=True,
-        shape=("tank",),
+        shape="tank",
     )
     measurement: np.ndarray = leaf(
         "cm^2",
         "variance of each sensor's noise; of unmeasured tanks not used",
         low=0.0,
         strict=True,
-        shape=("tank",),
+        shape="tank",
     )
     walk: np.ndarray | None = leaf(
         "cm^2/s^3",
@@ -76,7 +76,7 @@ class Kalman(Observer):
         strict=True,
         like="process",
         default=None,
-        shape=("tank",),
+        shape="tank",
     )
     measured: tuple = static(doc="tanks whose levels are measured, counted from 0")
     disturbed: tuple = static(

@@ -26,7 +26,7 @@ class Plant(abc.ABC):
     ... class Integrator(Plant):
     ...     outputs = (0,)
     ...     tanks = pumps = 1
-    ...     rim: float = leaf("cm", "height", shape=("tank",))
+    ...     rim: float = leaf("cm", "height", shape="tank")
     ...
     ...     def derivative(self, t, x, u, d):
     ...         return (0.1 * u[0],)

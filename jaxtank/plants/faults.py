@@ -30,9 +30,9 @@ class Faults:
     """
 
     factor: np.ndarray = leaf(
-        "-", "what each entry is multiplied by while its fault lasts", low=0.0, shape=("fault",)
+        "-", "what each entry is multiplied by while its fault lasts", low=0.0, shape="fault"
     )
-    extra: np.ndarray = leaf("-", "what is added to it, in its own unit", shape=("fault",))
+    extra: np.ndarray = leaf("-", "what is added to it, in its own unit", shape="fault")
     windows: tuple[Any, ...] = static(
         doc='(("drain[1]", start [s], end [s]), ...) entry of the plant and when, one per fault'
     )

@@ -225,44 +225,40 @@ class TankNetwork(Plant):
     """
 
     area: np.ndarray = leaf(
-        "cm^2", "cross-section A of each tank", low=0.0, strict=True, shape=("tank",)
+        "cm^2", "cross-section A of each tank", low=0.0, strict=True, shape="tank"
     )
     drain: np.ndarray = leaf(
         "cm^2",
         "effective orifice area from each tank to the basin; 0: closed",
         low=0.0,
-        shape=("tank",),
+        shape="tank",
     )
     orifice: np.ndarray = leaf(
         "cm^2",
         "effective area of the orifices between tanks, in the order of `links`",
         low=0.0,
-        shape=("orifice",),
+        shape="orifice",
     )
     pipe: np.ndarray = leaf(
         "cm^2",
         "effective area of the pipes between tanks, in the order of `pipes`",
         low=0.0,
-        shape=("pipe",),
+        shape="pipe",
     )
     pump_gain: np.ndarray = leaf(
-        "cm^3/(s V)",
-        "flow per unit of each pump's input (Kp)",
-        low=0.0,
-        strict=True,
-        shape=("pump",),
+        "cm^3/(s V)", "flow per unit of each pump's input (Kp)", low=0.0, strict=True, shape="pump"
     )
     split: np.ndarray = leaf(
-        "-", "share of each pump that goes to its first tank", low=0.0, high=1.0, shape=("pump",)
+        "-", "share of each pump that goes to its first tank", low=0.0, high=1.0, shape="pump"
     )
     gravity: np.ndarray = leaf("cm/s^2", "acceleration g", low=0.0, strict=True)
-    rim: np.ndarray = leaf("cm", "height of each tank", low=0.0, strict=True, shape=("tank",))
+    rim: np.ndarray = leaf("cm", "height of each tank", low=0.0, strict=True, shape="tank")
     caught: np.ndarray = leaf(
         "-",
         "share of what passes a rim that falls into another tank",
         low=0.0,
         high=1.0,
-        shape=("spill",),
+        shape="spill",
     )
     links: tuple = static(doc="((from, to), ...) tanks joined by each orifice")
     pipes: tuple = static(doc="((one, other), ...) tanks joined by each pipe", default=())

@@ -99,7 +99,7 @@ class Constant(Signal):
     level: np.ndarray = leaf(
         "-",
         "value, in the unit of what it stands for: a level of a setpoint, a flow of a disturbance",
-        shape=("channel",),
+        shape="channel",
     )
 
     @property

@@ -29,7 +29,7 @@ class InflowPulses(Signal):
     """
 
     volume: np.ndarray = leaf(
-        "cm^3", "volume of each inflow pulse; negative: taken out", shape=("pulse",)
+        "cm^3", "volume of each inflow pulse; negative: taken out", shape="pulse"
     )
     events: tuple = static(doc="((time [s], duration [s], tank), ...) one per inflow pulse")
     width: int = static("-", "number of tanks", low=1, high=5000)

@@ -170,8 +170,8 @@ class Ramps(Signal):
     [3.0, 3.0, 5.5, 8.0, 8.0]
     """
 
-    initial: np.ndarray = leaf("cm", "value before the first change", shape=("channel",))
-    targets: np.ndarray = leaf("cm", "value after each change", shape=("change",))
+    initial: np.ndarray = leaf("cm", "value before the first change", shape="channel")
+    targets: np.ndarray = leaf("cm", "value after each change", shape="change")
     changes: tuple = static(doc="((time [s], channel), ...) in order of time")
     ramp: np.ndarray = leaf("s", "duration D of every change", low=0.0, default=lambda values: 60.0)
     filter: Any = leaf(
@@ -180,7 +180,7 @@ class Ramps(Signal):
         low=0.0,
         like="initial",
         default=None,
-        shape=("channel",),
+        shape="channel",
     )
     shape: str = static(doc="course of a change", choices=SHAPES, default="linear")
     band: float = static(
