@@ -106,6 +106,32 @@ class Inputs(NamedTuple):
     fault: Group | None  # 1 while a fault lasts
 
 
+class Partition(NamedTuple):
+    """The leaves of a tree in two groups: those that have tangents, and the rest."""
+
+    structure: Any
+    moving: tuple[bool, ...]  # of each leaf, whether it has tangents
+
+    def split(self, tree: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        """Return (leaves with tangents, the others)."""
+        leaves: list[Any] = jax.tree.leaves(tree)
+        with_tangents = tuple(v for v, m in zip(leaves, self.moving) if m)
+        return with_tangents, tuple(v for v, m in zip(leaves, self.moving) if not m)
+
+    def join(self, moving: Any, still: Any) -> Any:
+        """Return the tree of what `split` returned."""
+        moving, still = iter(moving), iter(still)
+        leaves: list[Any] = [next(moving) if m else next(still) for m in self.moving]
+        return jax.tree.unflatten(self.structure, leaves)
+
+
+def floats_of(tree: Any) -> Partition:
+    """Partition of `tree` by type: only floats have derivatives."""
+    leaves: list[Any] = jax.tree.leaves(tree)
+    structure = cast(Any, jax.tree.structure(tree))
+    return Partition(structure, tuple(bool(jnp.issubdtype(v.dtype, jnp.floating)) for v in leaves))
+
+
 def takes_arrays(loop: ClosedLoop) -> bool:
     """Whether the vectors of a run are arrays: of many tanks, where plant and faults take them."""
     parts = [part for part in (loop.plant, loop.faults) if part is not None]

@@ -3,7 +3,7 @@
 # pyright: reportUnknownMemberType=false
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,8 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.tree import with_values
 from jaxtank.loop.closed_loop import (
     ClosedLoop,
+    Partition,
+    floats_of,
     initial,
     inputs,
     is_broken,
@@ -42,25 +44,6 @@ Names = tuple[str, ...]
 Arrays = dict[str, jax.Array]
 Squares = tuple[tuple[str, float], ...]
 """((measure, weight), ...) of sums of squares"""
-
-
-class Partition(NamedTuple):
-    """The leaves of a tree in two groups: those that have tangents, and the rest."""
-
-    structure: Any
-    moving: tuple[bool, ...]  # of each leaf, whether it has tangents
-
-    def split(self, tree: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        """Return (leaves with tangents, the others)."""
-        leaves: list[Any] = jax.tree.leaves(tree)
-        with_tangents = tuple(v for v, m in zip(leaves, self.moving) if m)
-        return with_tangents, tuple(v for v, m in zip(leaves, self.moving) if not m)
-
-    def join(self, moving: Any, still: Any) -> Any:
-        """Return the tree of what `split` returned."""
-        moving, still = iter(moving), iter(still)
-        leaves: list[Any] = [next(moving) if m else next(still) for m in self.moving]
-        return jax.tree.unflatten(self.structure, leaves)
 
 
 # the values as a tuple: a dict would come back with its keys sorted
@@ -107,7 +90,7 @@ def sensitivities_compiled(
         return initial(loop, clock, arrays), ms.start(run_of(loop, clock, arrays), computed)
 
     known = _dependent(sampled, flat)
-    carried = _floats_of(jax.eval_shape(lambda: start(loop)))
+    carried = floats_of(jax.eval_shape(lambda: start(loop)))
 
     def begin(theta: Any) -> Any:
         floats, rest = carried.split(start(keyed(at(theta), key)))
@@ -144,13 +127,6 @@ def sensitivities_compiled(
 
     results, slopes, _ = _pushed(finish, (floats, flat), dfloats, basis, ins=axis)
     return results, slopes, 2.0 * matrix, is_broken(carried.join(floats, rest)[0])
-
-
-def _floats_of(tree: Any) -> Partition:
-    """Partition of `tree` by type: only floats have derivatives."""
-    leaves: list[Any] = jax.tree.leaves(tree)
-    structure = cast(Any, jax.tree.structure(tree))
-    return Partition(structure, tuple(bool(jnp.issubdtype(v.dtype, jnp.floating)) for v in leaves))
 
 
 def _dependent(f: Callable[[Any], Any], flat: jax.Array) -> Partition:

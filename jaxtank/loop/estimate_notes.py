@@ -1,6 +1,4 @@
-"""What the estimates of an observer contain besides inflows: offset dead zones, and the error of a
-model that is linearised once.
-"""
+"""Estimates of an observer: what they contain besides inflows, and whether they are used."""
 # jax leaves the types of asarray and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # pyright: reportUnknownVariableType=false
@@ -12,12 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.analysis.linear_model import linearise
+from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
+from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.units import local
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.steady import steady_state
 from jaxtank.loop.trajectory import Trajectory
 from jaxtank.observers import DisturbanceObserver, ExtendedKalman, Kalman
+from jaxtank.xla.reachability import use_of
 
 FAR = 0.1
 """Share of the linear model's own change of a rate by which it may be wrong without a note [-]."""
@@ -95,3 +96,32 @@ def design_notes(loop: ClosedLoop, setpoints: Any) -> list[str]:
     except (InputError, FloatingPointError):
         return []
     return _far(loop, x[None], u[None], "at rest at the setpoints")
+
+
+def is_unused(loop: ClosedLoop) -> bool:
+    """Return True if the observer estimates disturbances and the controller does not use them."""
+    # By tracing one sample, which serves custom controllers too; nothing is computed.
+    if loop.controller.ignores_disturbance:
+        return False
+    number = jax.ShapeDtypeStruct((), jnp.result_type(float))
+    x, u, r = ((number,) * n for n in (loop.plant.tanks, loop.plant.pumps, loop.reference.channels))
+
+    def estimated(x: Any, t: Any) -> Any:
+        tick = Tick(t=t, r=(), dr=(), ddr=(), dt=t)
+        return loop.observer.step(loop.observer.init(x), tick, x)[0].d
+
+    d = tuple(jax.eval_shape(estimated, x, number))
+    if not d:
+        return False
+    along = tuple(jax.ShapeDtypeStruct((1,), number.dtype) for _ in r)
+    plan: Any = jax.eval_shape(loop.controller.prepare, along, along, along)
+    signals: Any = jax.eval_shape(lambda: loop.controller.inputs(Clock(dt=1.0, duration=0.0)))
+    plan, signals = jax.tree.map(
+        lambda v: jax.ShapeDtypeStruct(v.shape[1:], v.dtype), (plan, signals)
+    )
+    tick = Tick(t=number, r=r, dr=r, ddr=r, dt=number, plan=plan, own=signals)
+
+    def decided(d: Any, x: Any, u: Any, tick: Any) -> Any:
+        return loop.controller.step(loop.controller.init(x, u), tick, Estimate(x=x, d=d))
+
+    return not use_of(decided, d, x, u, tick).reached

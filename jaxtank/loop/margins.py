@@ -4,6 +4,8 @@ of them.
 
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownVariableType=false, reportUnknownLambdaType=false
+# pyright: reportConstantRedefinition=false
 
 import dataclasses
 import functools
@@ -17,16 +19,11 @@ from jax.core import Tracer
 
 from jaxtank import measures as ms
 from jaxtank.analysis import margins as am
-
-# jax leaves the types of zeros, eval_shape, flatten and others partly open.
-# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
-# pyright: reportUnknownVariableType=false, reportUnknownLambdaType=false
-# pyright: reportConstantRedefinition=false
 from jaxtank.analysis.frequency import OpenLoop, solve
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Tick
-from jaxtank.loop.closed_loop import ClosedLoop, Inputs, State, initial, run_of, zero_of
+from jaxtank.loop.closed_loop import ClosedLoop, Inputs, State, floats_of, initial, run_of, zero_of
 from jaxtank.loop.steady import steady_inflow
 from jaxtank.loop.step import decide, move
 from jaxtank.loop.validation import check
@@ -168,25 +165,17 @@ class _Sample:
         self.loop, self.clock = loop, clock
         self.now = _constant_inputs(loop, clock, r)
         first = initial(dataclasses.replace(loop, x0=x, actuator=started), clock)
-        leaves, self.structure = jax.tree.flatten(first)
-        self.moving = [bool(jnp.issubdtype(v.dtype, jnp.floating)) for v in leaves]
-        self.shapes = [v.shape for v, m in zip(leaves, self.moving) if m]
-        self.still = [v for v, m in zip(leaves, self.moving) if not m]
-        self.start = jax.lax.stop_gradient(self.flat(leaves))
+        self.parts = floats_of(first)
+        floats, self.rest = self.parts.split(first)
+        self.shapes = [v.shape for v in floats]
+        self.start = jax.lax.stop_gradient(_flat(floats))
         self.counts = False  # True where a sample changes whole numbers of the state
-
-    def flat(self, leaves: Any) -> Any:
-        """The vector of the leaves that are real numbers."""
-        return jnp.concatenate([jnp.ravel(v) for v, m in zip(leaves, self.moving) if m])
 
     def state(self, s: Any) -> State:
         """The State of a vector."""
         ends = np.cumsum([int(np.prod(shape)) for shape in self.shapes])[:-1]
-        parts = jnp.split(s, ends)
-        floats = iter(v.reshape(shape) for v, shape in zip(parts, self.shapes))
-        rest = iter(self.still)
-        leaves: list[Any] = [next(floats) if m else next(rest) for m in self.moving]
-        return jax.tree.unflatten(self.structure, leaves)
+        floats = [v.reshape(shape) for v, shape in zip(jnp.split(s, ends), self.shapes)]
+        return self.parts.join(floats, self.rest)
 
     def decided(self, s: Any) -> Any:
         """(State after observer, controller and sensor, (m,) inputs within their limits)."""
@@ -203,10 +192,9 @@ class _Sample:
         state, applied = self.decided(s)
         inputs = tuple(a + v for a, v in zip(applied, w))
         moved = move(self.loop, self.clock, state, inputs, self.now)[0]
-        leaves: list[Any] = jax.tree.leaves(moved._replace(k=state.k))
-        rest = [v for v, m in zip(leaves, self.moving) if not m]
-        self.counts = any(a is not b for a, b in zip(rest, self.still))
-        return self.flat(leaves), jnp.stack(list(applied))
+        floats, rest = self.parts.split(moved._replace(k=state.k))
+        self.counts = any(a is not b for a, b in zip(rest, self.rest))
+        return _flat(floats), jnp.stack(list(applied))
 
     def slopes(self, s: Any) -> "_Slopes":
         """What `after` returns, and its derivatives."""
@@ -219,6 +207,10 @@ class _Sample:
         results: Any = jacobian(s, jnp.zeros(self.loop.plant.pumps, s.dtype))
         ((closed, B), (C, _)), (after, applied) = results
         return _Slopes(closed, B, C, after, applied)
+
+
+def _flat(values: Any) -> Any:
+    return jnp.concatenate([jnp.ravel(v) for v in values])
 
 
 class _Slopes(NamedTuple):
@@ -247,14 +239,10 @@ def _constant_inputs(loop: ClosedLoop, clock: Clock, r: Any) -> Inputs:
     plan = loop.controller.prepare(columns, zero, zero)
     signals = loop.controller.inputs(dataclasses.replace(clock, duration=clock.dt))
     rows: Any = (columns, zero, zero, plan, signals)
-    r, dr, ddr, plan, signals = jax.tree.map(_first, rows)
+    r, dr, ddr, plan, signals = jax.tree.map(lambda a: a[0], rows)
     inflow = steady_inflow(loop)
     d = None if inflow is None else tuple(inflow[i] for i in range(loop.plant.tanks))
     return Inputs(r, dr, ddr, d, None, Context(), plan, signals, None)
-
-
-def _first(a: Any) -> Any:
-    return a[0]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -424,11 +412,8 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
         # one after the other: a program for one of them is compiled in half the time
         return (r, *cast(tuple[Any, ...], jax.lax.map(margins_at, r)))
     rows = [margins_at(v) for v in r]  # by one program, however many there are
-    return (r, *cast(tuple[Any, ...], jax.tree.map(_stacked, *rows)))
-
-
-def _stacked(*values: Any) -> Any:
-    return np.stack([np.asarray(v) for v in values])
+    stack = lambda *values: np.stack([np.asarray(v) for v in values])
+    return (r, *cast(tuple[Any, ...], jax.tree.map(stack, *rows)))
 
 
 @compiled("clock", "slopes", keep=True)

@@ -72,7 +72,10 @@ def check(
     signature = _signature(loop, clock, key is None)
     if signature is None or signature not in _PASSED:
         _check_parts(loop, clock, key)
-        _remember(_PASSED, signature)
+        if signature is not None:
+            _PASSED[signature] = None
+            if len(_PASSED) > KEPT:
+                _PASSED.pop(next(iter(_PASSED)), None)  # the oldest
     if not _traced(loop.plant):
         check_step(loop, clock)  # it may warn, every time
 
@@ -84,7 +87,10 @@ def _signature(loop: ClosedLoop, clock: Clock, keyless: bool) -> Any:
     for value in leaves:
         if isinstance(value, Tracer) or not isinstance(value, np.ndarray | jax.Array | float):
             return None
-        array = np.asarray(value) if _plain(value) else np.zeros((), dtype=object)
+        # an array of random keys is no array of numbers
+        if jnp.issubdtype(getattr(value, "dtype", np.float64), jax.dtypes.extended):
+            return None
+        array = np.asarray(value)
         if array.dtype.hasobject:
             return None
         digest.update(f"{array.shape}{array.dtype.str}".encode())
@@ -97,27 +103,17 @@ def _signature(loop: ClosedLoop, clock: Clock, keyless: bool) -> Any:
     return signature
 
 
-def _plain(value: Any) -> bool:
-    """Return False for an array of random keys, which are no numbers."""
-    return not jnp.issubdtype(getattr(value, "dtype", np.float64), jax.dtypes.extended)
-
-
-def _remember(passed: dict[Any, None], signature: Any) -> None:
-    """Add a signature to those that have passed; the oldest goes."""
-    if signature is None:
-        return
-    passed[signature] = None
-    if len(passed) > KEPT:
-        passed.pop(next(iter(passed)), None)
-
-
 def _check_parts(
     loop: ClosedLoop, clock: Clock, key: jax.Array | jax.ShapeDtypeStruct | None
 ) -> None:
     """Every check that looks at the loop."""
     _check_sizes(loop)
     _check_units(loop.plant)
-    _check_saturation(loop)
+    if loop.actuator.allocates and (loop.plant.pumps != 2 or not loop.controller.allocates):
+        raise InputError(
+            "actuator.saturation = 'boxqp': needs two pumps and a controller with a cost to"
+            " allocate by (its input_metric)"
+        )
     _check_delay(loop.actuator, clock)
     check_shapes(loop)
     gains: tuple[str, ...] = getattr(loop.controller, "gains", ())
@@ -135,8 +131,12 @@ def _check_parts(
     loop.observer.check(loop.plant)
     if not _traced(loop.observer):
         loop.observer.check_clock(clock)
-    if key is None:
-        _check_noise(loop)
+    noise = loop.sensor.noise
+    if key is None and not _traced(noise) and np.any(np.asarray(noise) > 0):
+        raise InputError(
+            f"sensor.noise = {np.asarray(noise)} {loop.units[0]}: give a key (or --seed), or set it"
+            " to 0"
+        )
 
 
 def _check_sizes(loop: ClosedLoop) -> None:
@@ -172,29 +172,12 @@ def _check_units(plant: Plant) -> None:
         )
 
 
-def _check_saturation(loop: ClosedLoop) -> None:
-    if loop.actuator.allocates and (loop.plant.pumps != 2 or not loop.controller.allocates):
-        raise InputError(
-            "actuator.saturation = 'boxqp': needs two pumps and a controller with a cost to"
-            " allocate by (its input_metric)"
-        )
-
-
 def _check_delay(actuator: Actuator, clock: Clock) -> None:
     samples = actuator.delay / clock.dt
     if actuator.delay > clock.duration or abs(samples - round(samples)) > 1e-6 * max(1.0, samples):
         raise InputError(
             f"actuator.delay = {actuator.delay:g} s: must be a whole number of samples of"
             f" {clock.dt:g} s, at most {clock.duration:g} s"
-        )
-
-
-def _check_noise(loop: ClosedLoop) -> None:
-    noise = loop.sensor.noise
-    if not _traced(noise) and np.any(np.asarray(noise) > 0):
-        raise InputError(
-            f"sensor.noise = {np.asarray(noise)} {loop.units[0]}: give a key (or --seed), or set it"
-            " to 0"
         )
 
 
@@ -215,25 +198,18 @@ def _check_shapes(tree: Any, prefix: str, sizes: Mapping[str, int], batch: tuple
         elif field.metadata.get("kind") == "leaf" and value is not None:
             expected = sizes_of_shape(field.metadata["shape"], sizes)
             if expected is not None and np.shape(value) not in (expected, batch + expected):
-                raise InputError(_refused_shape(name, value, expected, field.metadata["shape"]))
-
-
-def _refused_shape(name: str, value: Any, expected: tuple[int, ...], shape: Any) -> str:
-    has = f"{name} has shape {np.shape(value)}: must be"
-    if not shape:
-        return f'{has} one number; of an array its class says so: leaf(..., shape=("pump",))'
-    return f"{has} {expected}, one entry per {' and '.join(map(str, shape))}"
+                shape = field.metadata["shape"]
+                words = f"{expected}, one entry per {' and '.join(map(str, shape))}"
+                if not shape:
+                    words = 'one number; of an array its class says so: leaf(..., shape=("pump",))'
+                raise InputError(f"{name} has shape {np.shape(value)}: must be {words}")
 
 
 def _sizes(plant: Plant) -> dict[str, int]:
     """{name in the shape of a leaf: count} of a plant."""
     parts = {"orifice": "links", "pipe": "pipes", "spill": "spills"}
-    return {
-        "tank": plant.tanks,
-        "pump": plant.pumps,
-        "output": len(plant.outputs),
-        **{name: len(getattr(plant, field, ())) for name, field in parts.items()},
-    }
+    counts = {name: len(getattr(plant, field, ())) for name, field in parts.items()}
+    return {"tank": plant.tanks, "pump": plant.pumps, "output": len(plant.outputs), **counts}
 
 
 def _plants(tree: Any, prefix: str = "") -> Iterator[tuple[str, Plant]]:

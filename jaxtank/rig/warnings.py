@@ -8,7 +8,7 @@ from jaxtank import presets
 from jaxtank.case import Case
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import get_value, is_component, split_index, walk
-from jaxtank.loop.disturbance_use import is_unused
+from jaxtank.loop.estimate_notes import is_unused
 from jaxtank.loop.tank_bottom import is_open
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.signals import steps

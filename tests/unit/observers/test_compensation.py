@@ -15,7 +15,7 @@ from jaxtank.analysis.steady_state import equilibrium, steady_along, steady_unde
 from jaxtank.controllers import StateFeedback
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import with_values
-from jaxtank.loop.disturbance_use import is_unused
+from jaxtank.loop.estimate_notes import is_unused
 from jaxtank.observers import DisturbanceObserver
 from jaxtank.plants import state_coupled_four_tank
 
