@@ -256,31 +256,6 @@ def test_solver_options_are_the_keywords_they_stand_for(own, tuned):
     assert by_name.method == "slsqp" and reported(by_name) != reported(tuned)
 
 
-def test_solver_options_name_a_method_and_keep_its_numbers():
-    for options, method, more in (
-        (tuning.SQP(tolerance=1e-3), "slsqp", {"tolerance": 1e-3}),
-        (tuning.TRF(), "trf", {}),
-        (tuning.TRF(coarse=True), "coarse-trf", {}),
-        (tuning.LBFGS(starts=2), "lbfgs", {"starts": 2}),
-        (tuning.Adam(batch=4), "adam", {"batch": 4}),
-    ):
-        assert options.name == method
-        assert (
-            options.options()
-            == {"starts": 8, "screening": 64, "iterations": 60}
-            | (
-                {"tolerance": None}
-                if method == "slsqp"
-                else {"batch": None}
-                if method == "adam"
-                else {}
-            )
-            | more
-        )
-        with pytest.raises(dataclasses.FrozenInstanceError):
-            options.starts = 3
-
-
 def test_solver_options_are_checked_when_they_are_made_and_against_keywords(own):
     for make, words in (
         (lambda: tuning.SQP(starts=0), "starts = 0: must be a whole number from 1"),

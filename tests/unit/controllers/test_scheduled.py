@@ -94,7 +94,6 @@ def test_portion_has_half_slopes_at_its_ends():
         ("gouta2015/backstepping-boxqp", ("k", "k1"), "h2", KNOTS),
         ("mirakhorli/smc-printed", ("surface", "ks", "phi"), "h4", (1.0, 3.0)),
         pytest.param("gouta2015/ngpc", ("Tp",), "r2", KNOTS, marks=pytest.mark.slow),
-        pytest.param("gouta2022/chadpc", ("Tp",), "h1", KNOTS, marks=pytest.mark.slow),
         pytest.param("gouta2022/pid", ("Kc", "Ti", "Td"), "h1", (5.0, 9.0), marks=pytest.mark.slow),
         pytest.param("gouta2022/fopi", ("Kc[1]",), "r2", (5.0, 9.0), marks=pytest.mark.slow),
         pytest.param("mirakhorli/sfc", ("K",), "r1", (11.0, 13.0), marks=pytest.mark.slow),
@@ -338,13 +337,9 @@ def test_what_is_free_follows(gouta):
             ["controller.reference_rates", "compiled program"],
         ),
         ({"controller.k": "r3"}, KNOTS, ["'r3'", "r1 to r2", "h1 to h4"]),
-        ({"controller.k": "h5"}, KNOTS, ["'h5'", "h1 to h4"]),
-        ({"controller.k": "h0"}, KNOTS, ["'h0'"]),
-        ({"controller.k": 1}, KNOTS, ["variable 1"]),
         ({"controller.k": "r1", "controller.k1": "r2"}, KNOTS, ["r1, r2", "one for all"]),
         ({"controller.k": "r1"}, (5.0, 5.0), ["knots [5.0, 5.0]", "above the one before"]),
         ({"controller.k": "r1"}, (5.0,), ["at least two"]),
-        ({"controller.k": "r1"}, (5.0, np.inf), ["finite"]),
         ({"controller.k[0]": "r1"}, KNOTS, ["k[0]", "shape ()"]),
         ({}, KNOTS, ["at least one gain"]),
         (
@@ -364,13 +359,9 @@ def test_a_bad_schedule_is_reported(gouta, gains, knots, words):
 @pytest.mark.parametrize(
     ("name", "gain", "words"),
     [
-        ("mirakhorli/smc", "model.pump_gain[0]", "before the loop starts (in its prepare)"),
         ("cascaded/open-loop", "signal.initial", "before the loop starts (in its inputs)"),
         ("gouta2015/backstepping", "level_floor", "input_metric"),
-        ("mirakhorli/lqi", "Q[0]", "designs with it"),
-        ("gouta2022/fopi", "order", "designs with it"),
         ("khalid/gpc", "r_w", "designs with it"),
-        ("khalid/laguerre-constrained", "a", "designs with it"),
         ("gouta2022/pi-ff", "bias", "does not use it"),
     ],
 )
@@ -463,12 +454,7 @@ def test_dependence_is_followed_into_calls_and_loops():
 
 @pytest.mark.parametrize(
     ("name", "gains", "variable"),
-    [
-        ("gouta2015/backstepping", ("k1", "k"), "r2"),
-        ("gouta2022/pid", ("Kc[1]", "Ti"), "h1"),
-        ("mirakhorli/sfc", ("K",), "h4"),
-        ("calofir/backstepping", ("K_y",), "r1"),
-    ],
+    [("gouta2022/pid", ("Kc[1]", "Ti"), "h1"), ("mirakhorli/sfc", ("K",), "h4")],
 )
 def test_a_rig_file_keeps_the_schedule(name, gains, variable, tmp_path):
     case = on(presets.find(name), gains, variable, (0.1, 0.25, 1 / 3))
@@ -502,16 +488,11 @@ def test_a_rig_file_may_set_gains_before_and_values_after(tmp_path):
     [
         (TABLE.replace("knots", "knot"), ["knot", "nearest: knots"]),
         (TABLE.replace('variable = "r1"\n', ""), ["needs variable"]),
-        (TABLE.replace("[5.0, 10.0]", "[10.0, 5.0]"), ["knots [10.0, 5.0]"]),
         (TABLE.replace("[5.0, 10.0]", '"5"'), ["knots = '5'"]),
-        (TABLE.replace("[5.0, 10.0]", "[5.0, true]"), ["knots"]),
         (TABLE.replace('"r1"', "1"), ["variable 1"]),
         (TABLE.replace('["controller.k1"]', '"controller.k1"'), ["schedule.gains", "list"]),
-        (TABLE.replace('["controller.k1"]', "[]"), ["schedule.gains"]),
-        (TABLE.replace("k1", "k2"), ["controller.k2", "nearest: controller.k"]),
         ("schedule = 3\n", ["schedule = 3", "table"]),
         (TABLE + '[values]\n"controller.law.k1" = 1.0\n', ["controller.law.k1 is scheduled"]),
-        (TABLE + '[values]\n"controller.variable" = "r9"\n', ["'r9'"]),
         (TABLE + '[values]\n"controller.variable" = 3\n', ["controller.variable = 3", "text"]),
         (
             TABLE + '[free]\n"controller.values[0,1]" = [0.0, 1.0]\n',

@@ -302,18 +302,6 @@ def python(code, *words, **env):
 
 
 @pytest.mark.slow
-def test_the_option_off_gives_the_same_numbers():
-    code = (
-        "import jaxtank, jax; jax.config.update('jax_enable_x64', True); from jaxtank import"
-        " presets, Clock\ncase ="
-        " presets.find('gouta2015/ngpc')\nprint(float(jaxtank.evaluate(case.loop, Clock(dt=0.1,"
-        " duration=300.0), 'rms_error_total')['rms_error_total']).hex())"
-    )
-    on, off = (float.fromhex(python(code, JAXTANK_XLA_OPTION=v)[0]) for v in "10")
-    np.testing.assert_allclose(on, off, rtol=1e-12)
-
-
-@pytest.mark.slow
 def test_float32_keeps_what_rounding_takes_and_states_what_is_lost():
     """Levels, error and its slope of a run in float32 beside float64. Plain float32 sums are 5e-3
     cm and 6e-5 off (methods 2.5).

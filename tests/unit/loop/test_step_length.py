@@ -195,17 +195,6 @@ def test_a_run_that_is_right_is_not_refused(case, rim):
     step_size.check_run(loop, clock, run)
 
 
-def test_many_tanks_are_one_sentence():
-    text = (
-        "".join(ONE.split("[[pump]]")[0].format(drain=d) for d in (0.1, 0.5, 2.0))
-        + "[[pump]]"
-        + ONE.split("[[pump]]")[1]
-    )
-    with pytest.warns(step_size.StepWarning, match=r"^tank 3 .* \(and so do 1 more\)") as printed:
-        rig.loads(text)
-    assert len([w for w in printed if w.category is step_size.StepWarning]) == 1
-
-
 COLANDER = """
 [[tank]]
 area = 2.0
@@ -274,7 +263,7 @@ def test_an_answer_states_it_of_a_scenario_too():
     assert result.message.startswith(f"scenario low: {WRONG}")
 
 
-@pytest.mark.slow_for("6")
+@pytest.mark.slow
 @pytest.mark.parametrize("substeps", [1, 6])
 def test_draws_of_steps_too_long_say_so(substeps, tmp_path):
     with warnings.catch_warnings():
