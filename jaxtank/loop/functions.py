@@ -2,7 +2,7 @@
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, NoReturn
 
 import jax
@@ -26,7 +26,7 @@ NOT_TRACEABLE = (
 class Measures(Mapping[str, Any]):
     """The measures of one run as a function of the user's reads them; it keeps what was read."""
 
-    def __init__(self, values: Mapping[str, Any], served: tuple[str, ...]):
+    def __init__(self, values: Mapping[str, Any], served: Collection[str]):
         self.values_of_run, self.served = values, served
         self.read: dict[str, None] = {}
 
@@ -82,7 +82,7 @@ def values_of(
     checkpoint: bool = False,
 ) -> dict[str, Any]:
     """Return {name: value} of `names`, measures and functions of them and of the run."""
-    functions, served, zero = ms.functions(names), _served(loop), zero_of(loop)
+    functions, served, zero = ms.functions(names), _shapes(loop), zero_of(loop)
     rows: dict[int, Any] = {}
     for spec in functions.values():
         if spec.trajectory and spec.save_every not in rows:
@@ -97,20 +97,19 @@ def values_of(
 
 def program_of(loop: ClosedLoop, clock: Clock, name: str) -> str:
     """Return the program of a function as text: equal for two functions that do the same."""
-    spec, served = ms.functions([name])[name], _served(loop)
+    spec, served = ms.functions([name])[name], _shapes(loop)
 
     def function(values: Any, run: Any) -> Any:
         return _called(name, spec, Measures(values, served), run)
 
-    shapes: Any = {m: v for m, v in _shapes(loop).items() if m in _read_by(loop, clock, name, spec)}
+    shapes: Any = {m: served[m] for m in served if m in _read_by(loop, clock, name, spec)}
     lowered: Any = jax.jit(function).lower(shapes, _rows(loop, clock, spec))
     return f"every {spec.save_every}: {lowered.as_text()}"
 
 
 def _read_by(loop: ClosedLoop, clock: Clock, name: str, spec: ms.RunFunction) -> tuple[str, ...]:
     """Return the measures that a function reads, found by tracing it without a run."""
-    served = _served(loop)
-    read: dict[str, None] = {}
+    served, read = _shapes(loop), dict[str, None]()
 
     def function(values: Any, run: Any) -> Any:
         measures = Measures(values, served)
@@ -119,7 +118,7 @@ def _read_by(loop: ClosedLoop, clock: Clock, name: str, spec: ms.RunFunction) ->
         return value
 
     try:
-        out: Any = jax.eval_shape(function, _shapes(loop), _rows(loop, clock, spec))
+        out: Any = jax.eval_shape(function, served, _rows(loop, clock, spec))
     except TypeError as error:  # of jax, for what is no array
         _refuse(name, f"must return one number ({one_line(str(error), 120)})")
     leaves: list[Any] = jax.tree.leaves(out)
@@ -157,19 +156,12 @@ def _refuse(name: str, why: str) -> NoReturn:
     raise InputError(f"function {name}: {why}") from None
 
 
-def _served(loop: ClosedLoop) -> tuple[str, ...]:
-    """The measures that are kept along with a run of the loop."""
-    functions = ms.functions(ms.MEASURES)
-    return tuple(m for m in ms.MEASURES if m not in functions and ms.serves(m, loop))
-
-
 def _shapes(loop: ClosedLoop) -> dict[str, Any]:
-    """{measure: its shape and type} of `_served`."""
+    """{measure: its shape and type} of the measures that are kept along with a run."""
     dtype: Any = zero_of(loop).dtype
-    sizes = {
-        m: () if ms.MEASURES[m].per == "run" else (ms.entries(m, loop.plant),)
-        for m in _served(loop)
-    }
+    functions = ms.functions(ms.MEASURES)
+    served = [m for m in ms.MEASURES if m not in functions and ms.serves(m, loop)]
+    sizes = {m: () if ms.MEASURES[m].per == "run" else (ms.entries(m, loop.plant),) for m in served}
     return {m: jax.ShapeDtypeStruct(shape, dtype) for m, shape in sizes.items()}
 
 
@@ -178,8 +170,4 @@ def _rows(loop: ClosedLoop, clock: Clock, spec: ms.RunFunction) -> Any:
     if not spec.trajectory:
         return None
     every = min(spec.save_every, clock.samples)
-
-    def run(loop: ClosedLoop) -> Any:
-        return simulate_compiled(loop, clock, None, every)[0]
-
-    return jax.eval_shape(run, loop)
+    return jax.eval_shape(lambda loop: simulate_compiled(loop, clock, None, every)[0], loop)

@@ -96,12 +96,13 @@ def unstable_height(product: float, integrator: str) -> float:
 
 def check_step(loop: ClosedLoop, clock: Clock) -> None:
     """Raise InputError where a step empties a full tank; warn where levels near 0 are wrong."""
-    plant, step = loop.plant, clock.dt / clock.substeps
+    plant: Any = loop.plant
+    step = clock.dt / clock.substeps
     rates = emptying_rates(plant)
     for unstable in unstable_tanks(loop, clock):
         # from a full tank: T = 2 A sqrt(h) / (sqrt(2 g) sum a), with the rate of laminar flow in
         # place of its factors
-        full = math.sqrt(plant.rim[unstable.tank] / _threshold(loop))
+        full = math.sqrt(plant.rim[unstable.tank] / plant.knee)
         empty = 3.0 * full / rates[unstable.tank]
         if empty < step:
             raise InputError(
@@ -180,52 +181,41 @@ def _visible(loop: ClosedLoop, clock: Clock) -> list[Unstable]:
 
 
 def visible_heights(loop: ClosedLoop, x: Any = 0.0) -> Any:
-    """(n,) heights from which an error shows: a share of the rim, or of the highest level of start,
-    setpoint and the run's levels `x` where that is lower, for a rim may be a limit far above all
-    that happens. Of a run from empty tanks to nowhere, of the rim. None of traced levels.
-    """
-    plant = loop.plant
+    """Heights (n,) from which an error shows; None of traced levels."""
+    # A share of the rim, or of the highest level of start, setpoint and run where that is lower: a
+    # rim may be a limit far above all that happens.
+    plant: Any = loop.plant
 
     def highest(v: Any) -> float:
         return float(np.max(v, initial=0.0, where=np.isfinite(v)))
 
     try:
-        levels = [
-            v
-            for _, v, meta in walk(loop.reference, units=plant.units)
-            if meta["unit"] in (plant.units[0], "-")
-        ]  # "-": as of a Table
-        about = max(
-            highest(np.abs(np.asarray(v, dtype=float))) for v in (loop.x0, *levels) if v is not None
-        )
+        fields = walk(loop.reference, units=plant.units)
+        # "-": as of a Table
+        levels = [v for _, v, meta in fields if meta["unit"] in (plant.units[0], "-")]
+        levels = [np.asarray(v, dtype=float) for v in (loop.x0, *levels) if v is not None]
+        about = max(highest(np.abs(v)) for v in levels)
         rim = np.asarray(plant.rim, dtype=float)
-        small = about <= _threshold(loop)
-        return SEEN * (rim if small else np.minimum(rim, max(about, highest(x))))
+        empty = about <= plant.knee
+        return SEEN * (rim if empty else np.minimum(rim, max(about, highest(x))))
     except TypeError:  # what jax raises for a traced number
         return None
 
 
-def _threshold(loop: ClosedLoop) -> Any:
-    """Level difference below which flow is laminar, of a network of tanks [cm]."""
-    network: Any = loop.plant
-    return network.knee
-
-
 def unstable_tanks(loop: ClosedLoop, clock: Clock) -> Iterator[Unstable]:
     """Yield every tank that empties faster than the steps are stable."""
-    rates = emptying_rates(loop.plant)
+    plant: Any = loop.plant
+    rates = emptying_rates(plant)
     if rates is None:
         return
     step, limit = clock.dt / clock.substeps, LIMITS[clock.integrator]
     for tank, product in enumerate(rates * step):
         if product > limit:
-            height = _height(loop.plant, tank, step, product, clock.integrator) * _threshold(loop)
+            height = _height(plant, tank, step, product, clock.integrator) * plant.knee
             substeps = math.ceil(clock.substeps * product / limit)
-            remedy = (
-                f"clock.substeps = {substeps}"
-                if substeps <= 10
-                else f"clock.dt of at most {step * limit / product:.2g} s"
-            )
+            remedy = f"clock.substeps = {substeps}"
+            if substeps > 10:
+                remedy = f"clock.dt of at most {step * limit / product:.2g} s"
             yield Unstable(tank, height, f"{remedy} is short enough")
 
 

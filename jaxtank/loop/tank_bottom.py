@@ -50,11 +50,9 @@ def tank_bottom_warnings(loop: ClosedLoop, run: Trajectory) -> list[str]:
         area = np.ravel(np.asarray(getattr(plant, "area", np.nan), dtype=float))
         volume = -column.min() * (area[i] if area.size == plant.tanks else np.nan)
         amount = f", {volume:.4g} {length}^3 that it did not hold" if np.isfinite(volume) else ""
-        remedy = (
-            "plant.bottom = true stops it at 0"
-            if isinstance(plant, TankNetwork)
-            else "limit the outflow in its derivative"
-        )
+        remedy = "limit the outflow in its derivative"
+        if isinstance(plant, TankNetwork):
+            remedy = "plant.bottom = true stops it at 0"
         sentences.append(
             f"the level of tank {i + 1} falls below 0 at t = {run.t[np.argmax(column < limit)]:g} s"
             f" and reaches {column.min():.4g} {length} at t = {run.t[np.argmin(column)]:g} s"

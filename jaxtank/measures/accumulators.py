@@ -121,12 +121,10 @@ def _sum_of_squares(size, term, refers_to=""):
     def update(run, state, sample, context):
         return each(lambda v, s: plus(s, v * v), term(run, sample, context), state)
 
-    return Accumulator(
-        lambda run: _sums(run, size),
-        update,
-        refers_to,
-        lambda run, state, sample, context: term(run, sample, context),
-    )
+    def residual(run, state, sample, context):
+        return term(run, sample, context)
+
+    return Accumulator(lambda run: _sums(run, size), update, refers_to, residual)
 
 
 def _lasting(term):
@@ -192,9 +190,8 @@ def _update_settling(run, state, sample, context):
 
     def update(r, e, window, before):
         (target, step, since, band), (old, last, outside, worst) = window, before
-        worst = jnp.where(
-            (target != old) & (settled(last, outside) > worst), settled(last, outside), worst
-        )
+        done = settled(last, outside)
+        worst = jnp.where((target != old) & (done > worst), done, worst)
         last = jnp.where(target != old, -1e9, last)
         out = (step != 0.0) & (jnp.abs(r + e - target) > band)
         return target, jnp.where(out, since, last), jnp.where(out, 1.0, 0.0), worst
@@ -273,26 +270,17 @@ def _changes(state, sample):
     return each(lambda v, p: jnp.where(first, 0.0, v - p), sample.u, previous)
 
 
-def _update_changes(run, state, sample, context):
-    changes = _changes(state, sample)
-    return (
-        sample.u,
-        each(lambda d, s: plus(s, d * d), changes, state[1]),
-        jnp.zeros_like(state[2]),
-    )
+def _sum_of_changes(term, residual=None):
+    """Accumulator of sums of term(change) over the changes of each input."""
 
+    def update(run, state, sample, context):
+        sums = each(lambda d, s: plus(s, term(d)), _changes(state, sample), state[1])
+        return sample.u, sums, jnp.zeros_like(state[2])
 
-def _start_travel(run):
-    return _filled(run, "pumps"), _sums(run, "pumps"), run.zero == 0.0
-
-
-def _update_travel(run, state, sample, context):
-    previous, total, first = state
-    step = each(lambda v, p: magnitude(v - p), sample.u, previous)
-    return (
-        sample.u,
-        each(lambda d, s: plus(s, jnp.where(first, 0.0, d)), step, total),
-        jnp.zeros_like(first),
+    return Accumulator(
+        lambda run: (_filled(run, "pumps"), _sums(run, "pumps"), run.zero == 0.0),
+        update,
+        residual=residual,
     )
 
 
@@ -335,11 +323,9 @@ _BUILT_IN: dict[str, Accumulator] = {
     ),
     "past2": _sum_of_squares("outputs", _past, "window"),
     "deviation2": _sum_of_squares("pumps", _lasting(_deviation), "steady"),
-    "travel": Accumulator(_start_travel, _update_travel),
-    "changes2": Accumulator(
-        _start_travel,
-        _update_changes,
-        residual=lambda run, state, sample, context: _changes(state, sample),
+    "travel": _sum_of_changes(magnitude),
+    "changes2": _sum_of_changes(
+        lambda d: d * d, residual=lambda run, state, sample, context: _changes(state, sample)
     ),
 }
 
