@@ -58,7 +58,7 @@ CONTINUOUS = [
 ]
 
 
-@pytest.mark.slow_for("1", "2", "5")
+@pytest.mark.slow_for("1", "2", "3", "5")
 @pytest.mark.parametrize("case", CONTINUOUS, ids=range(len(CONTINUOUS)))
 def test_riccati_against_scipy(case):
     A, B, Q, R = case
@@ -144,7 +144,7 @@ def test_they_work_in_batches_and_on_a_scalar_by_hand():
 
 def test_small_systems_are_solved_as_lapack_does_with_their_slopes():
     rng = np.random.default_rng(0)
-    for n in (1, 2, 5, 9):
+    for n in (2, 5):
         A, b, moved = rng.normal(size=(n, n)), rng.normal(size=n), rng.normal(size=(n, n))
         A[np.arange(n), np.arange(n)] *= rng.integers(2, size=n)  # pivots that are 0
         if np.linalg.cond(A) > 1e4:

@@ -301,7 +301,7 @@ def test_no_row_is_left_behind():
     assert products.max() < 4.0 * qp.MU_MIN
 
 
-@pytest.mark.slow_for("3.0")
+@pytest.mark.slow
 @pytest.mark.parametrize("t", [0.2, 3.0])  # inside, and with both rows at their limits
 def test_second_derivatives_against_differences_of_the_first(t):
     H, G, b = jnp.array([[2.0, 0.3], [0.3, 1.0]]), jnp.eye(2), 0.5 * jnp.ones(2)
