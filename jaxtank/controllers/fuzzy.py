@@ -11,7 +11,6 @@ from jaxtank.controllers.base import Controller
 from jaxtank.controllers.sliding_mode import FORMS, SWITCHES, check_quadruple, slide
 from jaxtank.controllers.state_feedback import feedback
 from jaxtank.core.clock import pointwise
-from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip, magnitude
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
@@ -118,8 +117,3 @@ class FuzzyBlend(Controller):
 
     def check(self, reference: Signal) -> None:
         check_quadruple(self.model)
-        for name, shape in (("K", (2, 4)), ("b", (2,)), ("w", (2,)), ("low", (2,)), ("high", (2,))):
-            if np.shape(getattr(self, name)) != shape:
-                raise InputError(
-                    f"controller.{name} has shape {np.shape(getattr(self, name))}: must be {shape}"
-                )

@@ -214,13 +214,7 @@ class LinearPredictive(Controller):
                 )
 
     def check(self, reference: Signal) -> None:
-        point, n, m = np.asarray(self.operating_point), self.model.tanks, self.model.pumps
-        length = self.model.units[0]
-        if point.shape != (n,):
-            raise InputError(
-                f"controller.operating_point has shape {point.shape}: must be ({n},), one level per"
-                " tank"
-            )
+        point, length = np.asarray(self.operating_point), self.model.units[0]
         for first, second in self.model.pipes:
             if not abs(point[first] - point[second]) > 10 * self.model.knee:
                 raise InputError(
@@ -228,22 +222,6 @@ class LinearPredictive(Controller):
                     f" differ by more than {10 * self.model.knee:g} {length}, the model has no"
                     " slope where they are equal (khalid notes H4)"
                 )
-        for name, size in (
-            ("du_limit", m),
-            ("u_low", m),
-            ("u_high", m),
-            ("q", len(self.model.outputs)),
-        ):
-            if np.shape(getattr(self, name)) != (size,):
-                raise InputError(
-                    f"controller.{name} has shape {np.shape(getattr(self, name))}: must be"
-                    f" ({size},)"
-                )
-        if np.ndim(self.r_w) != 0:
-            raise InputError(
-                f"controller.r_w = {np.asarray(self.r_w).tolist()}: must be one number, the weight"
-                " of the increments of all inputs"
-            )
         if not np.all(np.asarray(self.u_low) < np.asarray(self.u_high)):
             raise InputError(
                 f"controller.u_low = {self.u_low}: must be below controller.u_high = {self.u_high}"

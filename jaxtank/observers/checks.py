@@ -17,12 +17,6 @@ def check_model(observer, plant):
             f"observer.model has {model.tanks} tanks and {model.pumps} pumps, the plant {n} and"
             f" {plant.pumps}"
         )
-    for name in ("l", "levels", "process", "measurement", "walk"):
-        value = getattr(observer, name, None)
-        if value is not None and np.shape(value)[-1:] != (n,):
-            raise InputError(
-                f"observer.{name} has shape {np.shape(value)}: must be ({n},), one per tank"
-            )
 
 
 def check_tanks(observer, name, plant, least=1):

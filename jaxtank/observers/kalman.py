@@ -8,7 +8,6 @@ import numpy as np
 
 from jaxtank.analysis.linear_model import linearise
 from jaxtank.analysis.riccati import discrete_riccati, zero_order_hold
-from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.observers.base import Observer
@@ -150,9 +149,4 @@ class Kalman(Observer):
     def check(self, plant: Plant) -> None:
         check_model(self, plant)
         check_tanks(self, "measured", plant)
-        if np.shape(self.inputs) != (plant.pumps,):
-            raise InputError(
-                f"observer.inputs has shape {np.shape(self.inputs)}: must be ({plant.pumps},), one"
-                " per pump"
-            )
         check_disturbed(self, plant, self.levels)

@@ -213,7 +213,6 @@ def test_the_loop_still_compiles_to_one_function(gouta, make):
         ({"measured": ()}, "at least one"),
         ({"measured": (0, 0)}, "each once"),
         ({"measured": (4,)}, "of the 4 tanks"),
-        ({"process": np.ones(3)}, "observer.process has shape"),
     ],
 )
 @pytest.mark.parametrize("make", [kalman, extended])
