@@ -129,9 +129,9 @@ class Trajectory:
         if np.ndim(self.t) != 1 or isinstance(self.t, Tracer):
             return "Trajectory of several runs, or of a traced one"
         ends = f"run from {float(self.t[0]):g} to {float(self.t[-1]):g} s"
-        sizes = [_count(len(self.t), "row")]
-        sizes += [_count(np.shape(self.x)[1], "tank"), _count(np.shape(self.u)[1], "pump")]
-        lines = [f"{ends}: {', '.join(sizes)}"]
+        sizes = {"row": len(self.t), "tank": np.shape(self.x)[1], "pump": np.shape(self.u)[1]}
+        words = [f"{n} {word}{'' if n == 1 else 's'}" for word, n in sizes.items()]
+        lines = [f"{ends}: {', '.join(words)}"]
         for name, *numbers in self._summary():
             lines.append(f"  {name}: from {numbers[0]} to {numbers[1]}, at the end {numbers[2]}")
         return "\n".join(lines)
@@ -154,11 +154,9 @@ class Trajectory:
         """Rows (what and its unit, least, most, last) of levels, errors and inputs."""
         length, drive = self.units
         rows: list[list[str]] = []
-        for words, field, unit in (
-            ("level of tank", "x", length),
-            ("error of output", "e", length),
-            ("input of pump", "u", drive),
-        ):
+        fields = {"level of tank": "x", "error of output": "e", "input of pump": "u"}
+        for words, field in fields.items():
+            unit = drive if field == "u" else length
             for i, column in enumerate(np.asarray(getattr(self, field)).T):
                 numbers = (column.min(), column.max(), column[-1])
                 rows.append([f"{words} {i + 1} [{unit}]", *(f"{v:.5g}" for v in numbers)])
@@ -171,12 +169,9 @@ def columns(
     """Return the columns of a Trajectory, for pandas or xarray."""
     table: dict[tuple[str, str], Any] = {("t", "s"): np.asarray(run.t)}
     for name, field, unit in FIELDS:
-        if getattr(run, field) is None:  # not of this controller
-            continue
-        values = np.asarray(getattr(run, field))
-        table |= {
-            (f"{name}{i + 1}", local(unit, units)): values[:, i] for i in range(values.shape[1])
-        }
+        if getattr(run, field) is not None:  # the share is of some controllers alone
+            for i, column in enumerate(np.asarray(getattr(run, field)).T):
+                table[f"{name}{i + 1}", local(unit, units)] = column
     if dimension is None:
         return {f"{name} [{unit}]": values for (name, unit), values in table.items()}
     return {
@@ -206,7 +201,3 @@ def csv(run: Trajectory, units: tuple[str, str] = DEFAULT) -> str:
     out.write(",".join(table) + "\n")
     np.savetxt(out, np.column_stack(list(table.values())), delimiter=",", fmt="%.10g")
     return out.getvalue()
-
-
-def _count(number: int, word: str) -> str:
-    return f"{number} {word}{'' if number == 1 else 's'}"

@@ -2,10 +2,8 @@
 
 import math
 
-import jax.numpy as jnp
-
 from jaxtank.core.errors import InputError
-from jaxtank.core.numerics import LAMINAR_THRESHOLD, smooth_sqrt
+from jaxtank.core.numerics import LAMINAR_THRESHOLD
 
 GRAVITY = 981.0
 """Standard acceleration in the units of gouta2015, Table 1 [cm/s^2]."""
@@ -45,8 +43,3 @@ def default_threshold(length):
 def disc(diameter):
     """Return the area of a disc [cm^2] of `diameter` [cm]: s = pi d^2 / 4."""
     return math.pi * diameter**2 / 4
-
-
-def efflux(level, gravity, threshold):
-    """Return Torricelli's speed of efflux v = sqrt(2 g h), C1 through zero (`smooth_sqrt`)."""
-    return jnp.sqrt(2.0 * gravity) * smooth_sqrt(level, threshold)

@@ -21,7 +21,6 @@ from jaxtank.core.tree import component, leaf, static
 from jaxtank.core.units import DEFAULT
 from jaxtank.core.vectors import each, is_array, take, zeros
 from jaxtank.plants.base import Plant
-from jaxtank.plants.hydraulics import efflux
 from jaxtank.xla.barrier import materialised, with_one_slope
 from jaxtank.xla.gather import gathered
 
@@ -376,43 +375,19 @@ class TankNetwork(Plant):
     def rates(self, x: jax.Array, u: jax.Array) -> jax.Array:
         if type(self).derivative is not TankNetwork.derivative:
             return super().rates(x, u)
-        x, u, w, orifice, pipe = (
-            jnp.asarray(x),
-            jnp.asarray(u),
-            jnp.sqrt(2.0 * self.gravity),
-            *map(jnp.asarray, (self.orifice, self.pipe)),
-        )
+        x, u, orifice, pipe = map(jnp.asarray, (x, u, self.orifice, self.pipe))
+        w = jnp.sqrt(2.0 * self.gravity)
         ends = lambda pairs: tuple(np.array(pairs, dtype=int).reshape(-1, 2).T)
         (source, sink), (first, second) = ends(self.links), ends(self.pipes)
         q = smooth_sqrt(x, self.knee)
-        discharged, piped = (
-            orifice * w * q[source],
-            pipe * w * smooth_signed_sqrt(x[first] - x[second], self.knee),
-        )
+        discharged = orifice * w * q[source]
+        piped = pipe * w * smooth_signed_sqrt(x[first] - x[second], self.knee)
         flow = -jnp.asarray(self.drain) * w * q
-        flow = (
-            flow.at[source]
-            .add(-discharged)
-            .at[sink]
-            .add(discharged)
-            .at[first]
-            .add(-piped)
-            .at[second]
-            .add(piped)
-        )
+        flow = flow.at[source].add(-discharged).at[sink].add(discharged)
+        flow = flow.at[first].add(-piped).at[second].add(piped)
         pump, tank, gain = (list(column) for column in zip(*self.shares()))
-        return flow.at[np.array(tank)].add(jnp.stack(gain) * u[np.array(pump)]) / jnp.asarray(
-            self.area
-        )
-
-    def net_inflow(self, x: Sequence, u: Sequence, d: Sequence | None) -> Any:
-        """Return the rate of change of the stored volume [cm^3/s]: inflow less outflow to the
-        basin.
-        """
-        inflow = sum(gain * u[j] for j, _, gain in self.shares()) + (0.0 if d is None else sum(d))
-        return inflow - sum(
-            self.drain[i] * efflux(x[i], self.gravity, self.knee) for i in range(self.tanks)
-        )
+        flow = flow.at[np.array(tank)].add(jnp.stack(gain) * u[np.array(pump)])
+        return flow / jnp.asarray(self.area)
 
     def shortfall(self, x: Sequence[Any]) -> tuple[Any, ...]:
         if not self.bottom:

@@ -134,12 +134,9 @@ def _(rng):
     )
 
 
-@subject("hydraulics.efflux disc", quick=True, points=20)
+@subject("hydraulics.disc", quick=True, points=20)
 def _(rng):
-    return (10 ** rng.uniform(-3, 1.4), rng.uniform(900, 1000)), lambda p: (
-        hydraulics.efflux(*p, 0.01),
-        hydraulics.disc(p[0]),
-    )
+    return 10 ** rng.uniform(-3, 1.4), hydraulics.disc
 
 
 @subject("controllers.fuzzy.membership", quick=True, points=40)
@@ -178,11 +175,10 @@ def small_point(rng):
     return small_network(rng), x, rng.uniform(0, 10, 2), rng.uniform(-5, 50, 3)
 
 
-@subject("plants.derivative net_inflow", points=30)
+@subject("plants.derivative", points=30)
 def _(rng):
     return small_point(rng), lambda p: (
         p[0].derivative(0.0, tuple(p[1]), tuple(p[2]), tuple(p[3])),
-        p[0].net_inflow(tuple(p[1]), tuple(p[2]), tuple(p[3])),
         p[0].output(tuple(p[1])),
     )
 
