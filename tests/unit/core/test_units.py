@@ -1,6 +1,5 @@
 """Units as they are printed: those of the rig, with its powers."""
 
-import json
 import re
 
 import pytest
@@ -9,7 +8,6 @@ from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.units import flow_per_input, local
 from jaxtank.measures import MEASURES
-from jaxtank.measures import unit as measure_unit
 from tuning import read_log
 from tuning.cli import main
 
@@ -39,16 +37,6 @@ FLOW = ("m", "m^3/s")
 )
 def test_a_unit_in_those_of_a_rig(unit, units, printed):
     assert local(unit, units) == printed
-
-
-def test_squares_of_a_flow_are_printed_as_such(capsys):
-    assert main.main(["simulate", "calofir/backstepping", "--dt", "2", "--json"]) == 0
-    units = json.loads(capsys.readouterr().out)["units"]
-    assert units["mean_square_travel"] == "(m^3/s)^2" and units["input_travel"] == "m^3/s"
-    assert main.main(["show", "calofir/backstepping"]) == 0
-    shown = capsys.readouterr().out
-    assert "(m^3/s)^2" in shown and "m^3/s^2" not in shown
-    assert measure_unit("input_deviation", FLOW) == "(m^3/s)^2 s"
 
 
 @pytest.mark.slow

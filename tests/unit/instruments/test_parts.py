@@ -153,12 +153,6 @@ def test_the_adc_rounds_and_clips():
     np.testing.assert_allclose(s.read((-1.0, 99.0), None), (0.0, 3.3 * 3.0))
 
 
-def test_noise_without_a_key_is_refused(gouta):
-    case = gouta("ngpc", {"sensor.noise": 0.1})
-    with pytest.raises(InputError, match=r"sensor\.noise"):
-        jaxtank.evaluate(case.loop, case.clock, "rms_error")
-
-
 def test_noise_without_a_key_is_refused_inside_jit_and_by_sensitivities(gouta):
     case = gouta("ngpc", {"sensor.noise": 0.1})
     run = lambda Tp: jaxtank.evaluate(

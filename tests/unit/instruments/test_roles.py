@@ -1,6 +1,5 @@
 """Sensors and actuators of one's own in a run, a Gymnasium environment and a rig file."""
 
-import dataclasses
 import math
 
 import jax
@@ -290,22 +289,3 @@ def test_a_signal_without_changes_answers_none_and_with_them_gives_overshoot():
     own = jaxtank.evaluate(windowed, CLOCK, names)
     for name, value in jaxtank.evaluate(loop_of(), CLOCK, names).items():
         np.testing.assert_array_equal(own[name], value)
-
-
-def test_every_leaf_of_an_instrument_or_signal_converts_lists_and_numbers():
-    for part, leaves in (
-        (
-            PumpBank(low=[0], high=(12,), dead_zone=[3], lag=[1]),
-            ("low", "high", "dead_zone", "lag"),
-        ),
-        (LevelSensor(noise=[0], gain=[1], offset=[2], full_scale=5), ("noise", "gain", "offset")),
-        (Constant(level=[1]), ("level",)),
-        (jaxtank.signals.Table(values=[[1, 2]], period=1.0), ("values",)),
-        (jaxtank.signals.InflowPulses(volume=[5], events=((0.0, 1.0, 0),), width=1), ("volume",)),
-        (LIMITED, ("low", "high", "initial", "rate")),
-        (dataclasses.replace(ramps([1], []), initial=[3]), ("initial",)),
-        (dataclasses.replace(network(**TANK), area=[25], drain=[0]), ("area", "drain")),
-    ):
-        for name in leaves:
-            value = getattr(part, name)
-            assert isinstance(value, np.ndarray) and value.dtype == np.float64, name

@@ -114,6 +114,7 @@ def test_every_way_to_run_has_the_same_integrals(chain, sums):
         )
 
 
+@pytest.mark.slow
 def test_residuals_of_the_integral_are_those_of_its_samples(chain):
     loop, clock = chain.loop, chain.clock
     point = {"reference.targets": loop.reference.targets}
@@ -129,6 +130,7 @@ def test_residuals_of_the_integral_are_those_of_its_samples(chain):
     np.testing.assert_allclose(found[2][0, 0], 2.0 * 3.0 * dt * (slopes**2).sum(), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_search_for_the_best_inputs_minimises_the_same_integral(chain):
     inputs = np.full((1, 60), 3.0)
     loop = open_loop(chain.loop, inputs, chain.clock.dt)

@@ -367,16 +367,6 @@ def test_units_rescale():
     )
 
 
-def test_rims_as_physics_stop_the_level_and_count_the_loss(gouta):
-    case = gouta("ngpc", {"plant.overflow": True})
-    values = jaxtank.evaluate(case.loop, case.clock, ["max_level", "overflow_volume"])
-    run = jaxtank.simulate(case.loop, case.clock, save_every=10)
-    np.testing.assert_array_equal(values["max_level"][2:], (30.0, 30.0))
-    assert np.all(np.asarray(values["overflow_volume"])[2:] > 10.0)
-    np.testing.assert_allclose(run.spilled[-1], values["overflow_volume"], rtol=1e-12)
-    assert np.all(np.diff(run.spilled, axis=0) >= 0)
-
-
 @pytest.mark.parametrize(
     "change, words",
     [
