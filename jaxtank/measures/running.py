@@ -1,7 +1,7 @@
 """What the time loop calls: start, update and read the accumulators that some measures need."""
 
-from collections.abc import Callable, Sequence
-from typing import Any, cast
+from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 
@@ -25,38 +25,34 @@ def needs(names: Sequence[str]) -> tuple[str, ...]:
 
 def start(run: Run, names: Sequence[str]) -> States:
     """Return {accumulator: state} before the first sample."""
-    return {a: ACCUMULATORS[a].start(_run_for(run, ACCUMULATORS[a])) for a in needs(names)}
+    tuples = _in_tuples(run) if run.arrays else run
+    specs = {a: ACCUMULATORS[a] for a in needs(names)}
+    return {a: spec.start(run if spec.arrays else tuples) for a, spec in specs.items()}
 
 
 def update(run: Run, states: States, sample: Sample, context: Context) -> States:
     """Return {accumulator: state} after `sample`."""
     updated: States = {}
-    for a, s in states.items():
-        accumulator = ACCUMULATORS[a]
-        known = run, s, sample, context
-        if run.arrays and not accumulator.arrays:
-            known = _run_for(run, accumulator), s, *_in_scalars(sample, context)
-        updated[a] = accumulator.update(*known)
+    for name, state in states.items():
+        known, *signals = _in_form(ACCUMULATORS[name], run, sample, context)
+        updated[name] = ACCUMULATORS[name].update(known, state, *signals)
     return updated
 
 
 def residuals(
     run: Run, states: States, sample: Sample, context: Context, squares: Weights
 ) -> tuple[Any, ...]:
-    """Return the residuals of one sample of the sums of squares in `squares`: a flat tuple, or a
-    tuple of arrays, one for each of `squares`.
-    """
+    """Return a sample's residuals of `squares`: a flat tuple, or one array for each of them."""
     values: list[Any] = []
     for measure, _ in squares:
         name = MEASURES[measure].residual
-        of = cast(Callable[..., Any], ACCUMULATORS[name].residual)
-        if run.arrays and not ACCUMULATORS[name].arrays:
-            entries = of(_in_tuples(run), states[name], *_in_scalars(sample, context))
-            values.append(jnp.stack(list(entries)))
-        elif run.arrays:
-            values.append(of(run, states[name], sample, context))
+        accumulator: Any = ACCUMULATORS[name]
+        known, *signals = _in_form(accumulator, run, sample, context)
+        entries = accumulator.residual(known, states[name], *signals)
+        if run.arrays:
+            values.append(entries if accumulator.arrays else jnp.stack(list(entries)))
         else:
-            values.extend(of(run, states[name], sample, context))
+            values.extend(entries)
     return tuple(values)
 
 
@@ -67,9 +63,8 @@ def residual_weights(run: Run, squares: Weights) -> tuple[Any, ...]:
         counts = dict.fromkeys(counts, 1)  # one array each
     weights: list[Any] = []
     for measure, weight in squares:
-        spec = MEASURES[measure]
-        scale = cast(Callable[[Run], Any], spec.scale)  # of a sum of squares
-        weights.extend(weight * scale(run) for _ in range(counts[spec.per]))
+        spec: Any = MEASURES[measure]
+        weights.extend(weight * spec.scale(run) for _ in range(counts[spec.per]))
     return tuple(weights)
 
 
@@ -94,9 +89,11 @@ def _rows_of(state: Any) -> tuple[Any, ...]:
     return tuple(zip(*(scalars(column) for column in state)))
 
 
-def _run_for(run: Run, accumulator: Accumulator) -> Run:
-    """`run` in the form that an accumulator takes."""
-    return run if accumulator.arrays or not run.arrays else _in_tuples(run)
+def _in_form(accumulator: Accumulator, run: Run, sample: Sample, context: Context) -> Any:
+    """(run, sample, context) with vectors in the form that an accumulator takes."""
+    if accumulator.arrays or not run.arrays:
+        return run, sample, context
+    return _in_tuples(run), *_in_scalars(sample, context)
 
 
 def _in_tuples(run: Run) -> Run:

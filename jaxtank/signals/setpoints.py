@@ -347,15 +347,11 @@ class Sine(Signal):
     @pointwise
     def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
         t, omega = sample_times(clock), 2.0 * math.pi / self.period
-        inside, angle = (
-            (t >= self.start - 1e-7 * clock.dt) & (t < self.end - 1e-7 * clock.dt),
-            omega * (t - self.zero),
-        )
+        inside = (t >= self.start - 1e-7 * clock.dt) & (t < self.end - 1e-7 * clock.dt)
+        angle = omega * (t - self.zero)
         sine, cosine = self.amplitude * jnp.sin(angle), self.amplitude * jnp.cos(angle)
-        moving = [
-            jnp.where(inside, v, 0.0)
-            for v in (self.offset + sine, omega * cosine, -omega * omega * sine)
-        ]
+        course = (self.offset + sine, omega * cosine, -omega * omega * sine)
+        moving = [jnp.where(inside, v, 0.0) for v in course]
         still = jnp.zeros_like(t)
         value, rate, second = (
             tuple(v if i == self.channel else still for i in range(self.width)) for v in moving
