@@ -181,34 +181,13 @@ def test_the_environment_plays_a_case_with_instruments_of_ones_own():
 
 RIG = """
 units = ["cm", "V"]
-[[tank]]
-area = 25.0
-drain = 0.3
-rim = 30.0
-level = 3.3
-[[pump]]
-gain = 8.0
-to = 1
-low = 0.0
-high = 12.0
-initial = 2.0
-[controller]
-kind = "proportional"
-Kc = 2.0
-[reference]
-initial = [4.0]
-changes = [[10.0, 1, 9.0]]
-ramp = 0.0
-[sensor]
-kind = "quantised"
-resolution = 0.1
-[actuator]
-kind = "rate-limited"
-rate = 0.4
-[values]
-"clock.dt" = 0.5
-"clock.duration" = 60.0
-"clock.substeps" = 4
+tank = [{ area = 25.0, drain = 0.3, rim = 30.0, level = 3.3 }]
+pump = [{ gain = 8.0, to = 1, low = 0.0, high = 12.0, initial = 2.0 }]
+controller = { kind = "proportional", Kc = 2.0 }
+reference = { initial = [4.0], changes = [[10.0, 1, 9.0]], ramp = 0.0 }
+sensor = { kind = "quantised", resolution = 0.1 }
+actuator = { kind = "rate-limited", rate = 0.4 }
+values = { "clock.dt" = 0.5, "clock.duration" = 60.0, "clock.substeps" = 4 }
 """
 
 

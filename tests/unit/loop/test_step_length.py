@@ -24,18 +24,9 @@ from tuning.cli import main
 from tuning.report import tuned as report
 
 ONE = """
-[[tank]]
-area = 20.0
-rim = 20.0
-drain = {drain}
-level = 5.0
-[[pump]]
-gain = 8.0
-to = 1
-high = 12.0
-initial = 0.0
-[controller]
-kind = "open-loop"
+tank = [{{ area = 20.0, rim = 20.0, drain = {drain}, level = 5.0 }}]
+pump = [{{ gain = 8.0, to = 1, high = 12.0, initial = 0.0 }}]
+controller = {{ kind = "open-loop" }}
 """
 
 
@@ -110,23 +101,11 @@ def test_it_is_reported_and_where_a_full_tank_empties_in_a_step_refused(tmp_path
 
 
 DEEP = """
-[[tank]]
-area = 1.0
-rim = {rim}
-drain = 0.5
-level = 20.0
-[[pump]]
-gain = 1.0
-to = 1
-high = 10.0
-initial = 1.0
-[controller]
-kind = "open-loop"
-[reference]
-initial = [{setpoint}]
-[values]
-"clock.dt" = {dt}
-"clock.duration" = 20.0
+tank = [{{ area = 1.0, rim = {rim}, drain = 0.5, level = 20.0 }}]
+pump = [{{ gain = 1.0, to = 1, high = 10.0, initial = 1.0 }}]
+controller = {{ kind = "open-loop" }}
+reference = {{ initial = [{setpoint}] }}
+values = {{ "clock.dt" = {dt}, "clock.duration" = 20.0 }}
 """
 
 
@@ -196,30 +175,13 @@ def test_a_run_that_is_right_is_not_refused(case, rim):
 
 
 COLANDER = """
-[[tank]]
-area = 2.0
-rim = 20.0
-drain = 1.0
-level = 4.0
-[[pump]]
-gain = 60.0
-to = 1
-high = 12.0
-[controller]
-kind = "pid"
-Kc = 0.5
-Ti = 0.2
-[reference]
-initial = [4.0]
-changes = [[2.0, 1, 12.0], [8.0, 1, {last}]]
-[values]
-"clock.dt" = 0.05
-"clock.duration" = 15.0
-"clock.substeps" = {substeps}
-[free]
-"controller.Kc" = [0.4, 0.6]
-[uncertain]
-"plant.pump_gain" = 0.05
+tank = [{{ area = 2.0, rim = 20.0, drain = 1.0, level = 4.0 }}]
+pump = [{{ gain = 60.0, to = 1, high = 12.0 }}]
+controller = {{ kind = "pid", Kc = 0.5, Ti = 0.2 }}
+reference = {{ initial = [4.0], changes = [[2.0, 1, 12.0], [8.0, 1, {last}]] }}
+values = {{ "clock.dt" = 0.05, "clock.duration" = 15.0, "clock.substeps" = {substeps} }}
+free = {{ "controller.Kc" = [0.4, 0.6] }}
+uncertain = {{ "plant.pump_gain" = 0.05 }}
 """
 WRONG = (
     "this answer's run is wrong, and so are its numbers: clock.dt = 0.05 s: steps too long to"

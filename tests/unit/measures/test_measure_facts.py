@@ -113,15 +113,10 @@ ERROR = Measure(
 RIG = """
 case = "cascaded/pi"
 name = "own"
-[values]
-"clock.dt" = 0.5
-"clock.duration" = 450.0
-[objective]
-triple = 1.0
-[limits]
-input_rate = 40.0
-[uncertain]
-"plant.pump_gain" = 0.05
+values = { "clock.dt" = 0.5, "clock.duration" = 450.0 }
+objective = { triple = 1.0 }
+limits = { input_rate = 40.0 }
+uncertain = { "plant.pump_gain" = 0.05 }
 """
 
 
