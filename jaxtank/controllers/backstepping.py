@@ -10,7 +10,7 @@ from jaxtank.controllers.feedback_linearisation import (
     check_state_coupled,
     coefficients,
     decouple,
-    floored_roots,
+    clipped_roots,
     input_metric,
     less_upper,
 )
@@ -75,7 +75,7 @@ class Backstepping(Controller):
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         c = coefficients(self.model)
         (h1, h2, _, _), (r1, r2) = estimate.x, tick.r
-        _, _, s3, s4 = floored_roots(estimate.x, self.level_floor)
+        _, _, s3, s4 = clipped_roots(estimate.x, self.level_floor)
         q1, q2 = jnp.sqrt(r1), jnp.sqrt(r2)
         gain = self.k + self.k1
         # residual of the first step [cm/s]; the roots come last, they are the last to be ready
@@ -92,7 +92,7 @@ class Backstepping(Controller):
         return (less_upper(c, u, estimate.d) if estimate.d else u), state
 
     def input_metric(self, estimate: Estimate) -> tuple | None:
-        _, _, s3, s4 = floored_roots(estimate.x, self.level_floor)
+        _, _, s3, s4 = clipped_roots(estimate.x, self.level_floor)
         return input_metric(coefficients(self.model), s3, s4)
 
     def check(self, reference: Signal) -> None:

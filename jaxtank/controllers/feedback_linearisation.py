@@ -82,13 +82,13 @@ def coefficients(model):
     )
 
 
-def floored_roots(levels, floor):
-    """Return sqrt(max(h, floor)) of each level."""
+def clipped_roots(levels, lower):
+    """Return sqrt(max(h, lower)) of each level."""
     # The lower clip keeps roots and their inverses finite where a tank is dry or noise makes a
     # level negative. The command is proportional to the roots of the upper levels, so with a dry
     # tank it is zero and stays so; with a clip of about 1 cm the loop restarts (gouta2015 notes
     # H3).
-    return tuple(clipped_sqrt(h, floor) for h in levels)
+    return tuple(clipped_sqrt(h, lower) for h in levels)
 
 
 def decouple(c, s3, s4, v1, v2, scale=1.0):

@@ -8,7 +8,7 @@ from jaxtank.controllers.feedback_linearisation import (
     check_state_coupled,
     coefficients,
     decouple,
-    floored_roots,
+    clipped_roots,
     input_metric,
     less_upper,
 )
@@ -56,7 +56,7 @@ class NGPC(Controller):
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         c = coefficients(self.model)
         (h1, h2, _, _), (r1, r2) = estimate.x, tick.r
-        s1, s2, s3, s4 = floored_roots(estimate.x, self.level_floor)
+        s1, s2, s3, s4 = clipped_roots(estimate.x, self.level_floor)
         k1, k2 = (10.0 / 3.0) / (self.Tp * self.Tp), 2.5 / self.Tp  # K1 [1/s^2], K2 [1/s]
         z1 = c.c2 * s3 + c.c3 * s4 - c.c1 * s1  # modelled h1' [cm/s]
         z2 = c.c5 * s3 + c.c6 * s4 - c.c4 * s2  # modelled h2'
@@ -68,7 +68,7 @@ class NGPC(Controller):
         return (less_upper(c, u, estimate.d) if estimate.d else u), state
 
     def input_metric(self, estimate: Estimate) -> tuple | None:
-        _, _, s3, s4 = floored_roots(estimate.x, self.level_floor)
+        _, _, s3, s4 = clipped_roots(estimate.x, self.level_floor)
         return input_metric(coefficients(self.model), s3, s4)
 
     def check(self, reference: Signal) -> None:
