@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jaxtank.controllers.base import Controller
 from jaxtank.controllers.feedback_linearisation import (
     check_state_coupled,
+    clipped_roots,
     coefficients,
     decouple,
-    clipped_roots,
     input_metric,
     less_upper,
 )

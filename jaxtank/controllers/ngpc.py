@@ -6,9 +6,9 @@ from typing import Any
 from jaxtank.controllers.base import Controller
 from jaxtank.controllers.feedback_linearisation import (
     check_state_coupled,
+    clipped_roots,
     coefficients,
     decouple,
-    clipped_roots,
     input_metric,
     less_upper,
 )

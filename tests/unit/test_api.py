@@ -59,20 +59,15 @@ class Offset(Observer):
 RIG = """
 case = "cascaded/pi"
 name = "own"
+free = { "controller.Kc" = [0.1, 10.0] }
+values = { "clock.dt" = 0.5, "clock.duration" = 450.0 }
+observer = { kind = "offset", offset = [0.01, 0.02] }
+limits = {}
 [controller]
 kind = "proportional"
 Kc = 2.0
 bias = 4.0
 divisor = 2
-[observer]
-kind = "offset"
-offset = [0.01, 0.02]
-[free]
-"controller.Kc" = [0.1, 10.0]
-[values]
-"clock.dt" = 0.5
-"clock.duration" = 450.0
-[limits]
 """
 
 

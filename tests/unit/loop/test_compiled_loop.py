@@ -215,38 +215,19 @@ def test_saved_rows_are_the_rows_of_the_run(gouta, save_every):
         np.testing.assert_allclose(getattr(some, name), rows, rtol=1e-12, atol=1e-12)
 
 
-WIDTH = _xla.VECTOR_WIDTH
+WIDTH, OURS = _xla.VECTOR_WIDTH, _xla.OPTION
+EXTRA, REST = "--xla_backend_extra_options", f"{_xla.ROLLED},{_xla.OLD_EMITTERS}"
 
 
 @pytest.mark.parametrize(
     "flags, expected",
     [
-        ("", f"{WIDTH} --xla_backend_extra_options={_xla.OPTION}"),
-        ("--xla_foo=1", f"{WIDTH} --xla_foo=1 --xla_backend_extra_options={_xla.OPTION}"),
-        (
-            "--xla_backend_extra_options=a=1 --b",
-            f"{WIDTH} --xla_backend_extra_options=a=1,{_xla.OPTION} --b",
-        ),
-        (
-            f"--xla_backend_extra_options={_xla.KEY}=5",
-            f"{WIDTH} --xla_backend_extra_options={_xla.KEY}=5,{_xla.ROLLED},{_xla.OLD_EMITTERS}",
-        ),
-        (
-            f"--xla_cpu_prefer_vector_width=128 --xla_backend_extra_options={_xla.OPTION}",
-            f"--xla_cpu_prefer_vector_width=128 --xla_backend_extra_options={_xla.OPTION}",
-        ),
-        (
-            '--xla_dump_to="/a  b" --xla_backend_extra_options=a',
-            f'{WIDTH} --xla_dump_to="/a  b" --xla_backend_extra_options=a,{_xla.OPTION}',
-        ),
-        (
-            "--xla_backend_extra_options='a=1,b' --c",
-            f"{WIDTH} --xla_backend_extra_options='a=1,b,{_xla.OPTION}' --c",
-        ),
-        (
-            '--xla_backend_extra_options="a"',
-            f'{WIDTH} --xla_backend_extra_options="a,{_xla.OPTION}"',
-        ),
+        ("", f"{WIDTH} {EXTRA}={OURS}"),
+        (f"{EXTRA}=a=1 --b", f"{WIDTH} {EXTRA}=a=1,{OURS} --b"),
+        (f"{EXTRA}={_xla.KEY}=5", f"{WIDTH} {EXTRA}={_xla.KEY}=5,{REST}"),
+        (f"{WIDTH[:-3]}128 {EXTRA}={OURS}", f"{WIDTH[:-3]}128 {EXTRA}={OURS}"),
+        (f'--dump="/a  b" {EXTRA}=a', f'{WIDTH} --dump="/a  b" {EXTRA}=a,{OURS}'),
+        (f"{EXTRA}='a=1,b' --c", f"{WIDTH} {EXTRA}='a=1,b,{OURS}' --c"),
         ("/a/file/of/flags", "/a/file/of/flags"),
     ],
 )
