@@ -120,9 +120,7 @@ class Faults:
         for k, (name, _, _) in enumerate(self.windows):
             field, (index,) = split_index(name)
             entries = changed.get(field, jnp.asarray(getattr(plant, field)))
-            faulty = (
-                entries * (1.0 + (self.factor[k] - 1.0) * active[k]) + self.extra[k] * active[k]
-            )
+            faulty = self._faulty(k, entries, active)
             changed[field] = jnp.where(np.arange(entries.shape[0]) == index, faulty, entries)
         return dataclasses.replace(cast(Any, plant), **changed)
 
@@ -131,16 +129,17 @@ class Faults:
         changed = {}
         for k, (name, _, _) in enumerate(self.windows):
             field, (index,) = split_index(name)
-            entries = changed.setdefault(
-                field, [getattr(plant, field)[i] for i in range(np.shape(getattr(plant, field))[0])]
-            )
-            entries[index] = (
-                entries[index] * (1.0 + (self.factor[k] - 1.0) * active[k])
-                + self.extra[k] * active[k]
-            )
+            whole = getattr(plant, field)
+            entries = changed.setdefault(field, [whole[i] for i in range(np.shape(whole)[0])])
+            entries[index] = self._faulty(k, entries[index], active)
         return dataclasses.replace(
             cast(Any, plant), **{field: tuple(entries) for field, entries in changed.items()}
         )
+
+    def _faulty(self, k, value, active):
+        """`value` of an entry under fault k."""
+        share = 1.0 + (self.factor[k] - 1.0) * active[k]
+        return value * share + self.extra[k] * active[k]
 
 
 def faults(plant, entries):
