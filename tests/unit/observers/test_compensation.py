@@ -89,6 +89,7 @@ def test_the_steady_state_under_disturbances_is_one_of_the_rig():
     np.testing.assert_allclose(h[:2], r, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_change_of_the_levels_in_gpc_is_that_of_a_linear_plant():
     """On levels that follow the linear model exactly, the difference of two of them is W (f + g u +
     d): here of the rig near its operating point, to second order.

@@ -61,7 +61,7 @@ OWN = ['kind = "disturbance"', "l = 0.2"]
 WALKS = ['kind = "extended-kalman"', "process = 1e-6", "measurement = 1e-4", "walk = 1e-4"]
 
 
-@pytest.mark.slow_for("3", "4", "5")
+@pytest.mark.slow_for("2", "3", "4", "5")
 @pytest.mark.parametrize("n", [2, 3, 4, 5, 6], ids=str)
 def test_an_injected_inflow_is_found_within_2_percent(n):
     """Of a rig file with `kind = "disturbance"`: an inflow at one end, a leak at the other."""
@@ -148,7 +148,8 @@ def test_what_passes_a_rim_is_no_disturbance():
         assert float(estimate.d[0]) == pytest.approx(expected * rate, abs=1e-8)
 
 
-@pytest.mark.parametrize("kind", ["own", pytest.param("extended", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["own", "extended"])
 def test_slopes_through_the_observer_are_those_of_central_differences(kind):
     """Noise, a delay of the pumps, a wrong model, and an unmeasured tank."""
     case = rig.set_values(

@@ -190,7 +190,7 @@ def test_gradients_by_the_variances(gouta, make):
     np.testing.assert_allclose(jax.jacfwd(f)(z), differences, rtol=1e-5, atol=1e-8)
 
 
-@pytest.mark.slow_for("kalman")
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [kalman, extended])
 def test_the_loop_still_compiles_to_one_function(gouta, make):
 
