@@ -1,6 +1,7 @@
 """The closed loop: its components, its state, and what is known of each sample beforehand."""
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownLambdaType=false
+# pyright: reportUnknownArgumentType=false
 
 import dataclasses
 import functools

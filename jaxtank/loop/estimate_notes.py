@@ -1,7 +1,7 @@
 """Estimates of an observer: what they contain besides inflows, and whether they are used."""
 # jax leaves the types of asarray and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
-# pyright: reportUnknownVariableType=false
+# pyright: reportUnknownVariableType=false, reportUnknownLambdaType=false
 
 from typing import Any
 

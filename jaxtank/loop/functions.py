@@ -1,6 +1,7 @@
 """Measures that are a function of a whole run: which other measures they read, and their values."""
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
-# pyright: reportUnknownMemberType=false
+# pyright: reportUnknownMemberType=false, reportUnknownLambdaType=false
+# pyright: reportUnknownArgumentType=false
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, NoReturn

@@ -88,7 +88,7 @@ def _signature(loop: ClosedLoop, clock: Clock, keyless: bool) -> Any:
         if isinstance(value, Tracer) or not isinstance(value, np.ndarray | jax.Array | float):
             return None
         # an array of random keys is no array of numbers
-        if jnp.issubdtype(getattr(value, "dtype", np.float64), jax.dtypes.extended):
+        if jnp.issubdtype(getattr(cast(Any, value), "dtype", np.float64), jax.dtypes.extended):
             return None
         array = np.asarray(value)
         if array.dtype.hasobject:

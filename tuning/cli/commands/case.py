@@ -197,7 +197,8 @@ def _of_run(case, values, key):
     if not below and not estimate_notes.needs_run(case.loop):
         return []
     run, _ = simulate_compiled(case.loop, case.clock, key, 1)
-    return tank_bottom.tank_bottom_warnings(case.loop, run) + estimate_notes.estimate_notes(case.loop, run)
+    below = tank_bottom.tank_bottom_warnings(case.loop, run)
+    return below + estimate_notes.estimate_notes(case.loop, run)
 
 
 def _checked_columns(args):
