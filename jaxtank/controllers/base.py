@@ -15,7 +15,7 @@ class Controller(abc.ABC):
 
     Examples
     --------
-    A controller of one's own needs a `step` alone:
+    A custom controller needs a `step` alone:
 
     >>> from jaxtank.core.tree import component, leaf
     >>> @component

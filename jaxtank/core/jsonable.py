@@ -1,4 +1,4 @@
-"""Values as JSON takes them. May import nothing of ours."""
+"""Values as JSON takes them."""
 
 import math
 from typing import Any, cast

@@ -27,7 +27,7 @@ def check_key(key: Any) -> None:
 
 
 class Tick(NamedTuple):
-    """What a controller and an observer know at sample k besides measurements."""
+    """What a controller and an observer know at sample k, in addition to measurements."""
 
     t: Any  # time [s]
     r: tuple[Any, ...]  # setpoint r [cm]

@@ -208,7 +208,7 @@ def _register(cls: type[Any], data: tuple[str, ...], meta: tuple[str, ...]) -> N
 
 
 def _converted(value: Any) -> Any:
-    """`number(value)` of a Python number and of a list or tuple of numbers; any other as it is."""
+    """`number(value)` of a Python number and of a list or tuple of numbers; any other unchanged."""
     if type(value) in (int, float, list, tuple) and is_real(value):
         try:
             return number(value)

@@ -64,12 +64,12 @@ def zeros(vector: Any) -> Any:
 
 
 def scalars(vector: Any) -> Any:
-    """Return the tuple of the entries of an array; anything else as it is."""
+    """Return the tuple of the entries of an array; anything else unchanged."""
     return tuple(vector[i] for i in range(vector.shape[0])) if is_array(vector) else vector
 
 
 def like(vector: Any, other: Any) -> Any:
-    """Return a vector in the form of another one; an empty one, of what is not in use, as it is."""
+    """Return a vector in the form of another one; an empty one, of a part that is not in use, unchanged."""
     if is_array(other) and len(vector):
         return vector if is_array(vector) else jnp.stack([jnp.asarray(v) for v in vector])
     return scalars(vector)

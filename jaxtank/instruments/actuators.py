@@ -51,8 +51,8 @@ class PumpBank(Actuator):
        that of the lag itself, whatever the sampling period.
     4. Transport delay: `delay` [s], whole samples.
 
-    The slope of a dead zone is that of the branch taken: a gradient does not see the jump at its
-    edge, and through "pulse" it is that of the mean flow, 1.
+    At the edge of a dead zone the derivative is one-sided; through "pulse" it is that of the mean
+    flow, 1.
 
     Examples
     --------

@@ -23,7 +23,7 @@ from jaxtank.xla.normal import is_fast, normal, normal_at
 class Sensor(abc.ABC):
     """The level sensors of a rig, one per tank: readings of levels.
 
-    A sensor of one's own is a `component` with its own `step`. A sensor with noise has a leaf
+    A custom sensor is a `component` with its own `step`. A sensor with noise has a leaf
     `noise` (n,) and is given standard normal deviates, which are drawn before the time loop
     (`draw`); a sensor with memory, such as a lag, also has its own `init`.
 
@@ -148,7 +148,7 @@ class Actuator(abc.ABC):
     controller and observer are given its result. `step` then says what reaches the plant, and
     `driving` which part of that moves liquid.
 
-    An actuator of one's own is a `component` with leaves `low`, `high` and `initial`, (m,) each,
+    A custom actuator is a `component` with leaves `low`, `high` and `initial`, (m,) each,
     and its own `init` and `step`.
 
     Examples

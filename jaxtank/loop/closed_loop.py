@@ -192,12 +192,12 @@ def inputs_at(
 
 
 def _rows_of(signals: Group) -> tuple[Any, ...]:
-    """Arrays (samples,) of an array (samples, n); a tuple of them as it is."""
+    """Arrays (samples,) of an array (samples, n); a tuple of them unchanged."""
     return scalars(signals.T) if is_array(signals) else signals
 
 
 def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Group) -> ms.Context:
-    """What the measures `names` refer to besides the sample, for setpoints `r`."""
+    """What the measures `names` refer to in addition to the sample, for setpoints `r`."""
     fields, window = ms.refers_to(names), None
     if "window" in fields:
         window = windows(loop, times, is_array(r))

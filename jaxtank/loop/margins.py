@@ -67,8 +67,8 @@ class Linearised(NamedTuple):
 
 def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
     """Return one sample of the loop linearised at the steady state of constant setpoints."""
-    # The loop is broken between what the actuator is given and the pumps: its dead time and its lag
-    # belong to the open loop. Sensors without noise and ADC, pumps without limits, without safety
+    # The loop is opened between the actuator's input and the pumps: dead time and lag belong to the
+    # open loop. Sensors without noise and ADC, pumps without limits, without safety
     # filter, inflow pulses and faults; a steady inflow stays. Newton's method finds the state at
     # which a sample changes nothing, of a stable and of an unstable loop; derivatives are those of
     # the implicit function. Where a steady state cannot be used (`why`), A, B and C are 0.
@@ -307,7 +307,7 @@ def _direction(k: Any, n: int) -> Any:
 
 
 def _differs(probe: _Slopes, reference: _Slopes, step: Any) -> Any:
-    """True where a sample at a distance `step` from the one held is not the tangent's."""
+    """True where the change of a sample over `step` differs from its tangent."""
     slope = jnp.concatenate([reference.closed, reference.C])
     change = jnp.concatenate([probe.after - reference.after, probe.applied - reference.applied])
     return jnp.any(jnp.abs(change - slope @ step) > KINK * (jnp.abs(slope) @ jnp.abs(step)))
@@ -329,7 +329,7 @@ def stability_margins(loop: ClosedLoop, clock: Clock) -> tuple[Plateau, ...]:
 
     One sample of the loop (sensor without noise, observer, controller, pumps with lag and dead time
     but without limits, plant with its steady inflow) is linearised at the steady state of each
-    plateau, and broken at the pumps: exact for the sampled loop. With several pumps gain, phase and
+    plateau, with the loop opened at the plant input: exact for the sampled loop. With several pumps gain, phase and
     delay margin are of one pump at a time, the other loops closed, and the sensitivity peak is that
     of the largest singular value of (I + L)^-1.
 

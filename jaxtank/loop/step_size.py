@@ -220,7 +220,7 @@ def unstable_tanks(loop: ClosedLoop, clock: Clock) -> Iterator[Unstable]:
 
 
 def _height(plant: Any, tank: int, step: float, product: float, integrator: str) -> float:
-    """How far off the level of a tank may be once it is empty, in thresholds."""
+    """Largest error of the level of an empty tank, in thresholds."""
     if not plant.bottom:
         return unstable_height(float(f"{product:.3g}"), integrator)
     excess = float((step * emptying_rates(plant, 1.0, 1.0)[tank]) ** 2)

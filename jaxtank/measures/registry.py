@@ -35,7 +35,7 @@ _SIZES: dict[str, Callable[[Any], int]] = {
 def register(
     name: str, measure: Measure, accumulators: Mapping[str, Accumulator] | None = None
 ) -> Measure:
-    """Add a measure of one's own, known by `name` wherever measures are named from then on.
+    """Add a custom measure, known by `name` wherever measures are named from then on.
 
     `evaluate`, objectives, limits, ensembles, rig files, reports and the command (called from the
     same process) take it like any other.
@@ -46,7 +46,7 @@ def register(
         Letters, digits and "_"; a name that no built-in measure has.
     measure : Measure
     accumulators : {name: Accumulator}, optional
-        What it needs besides those of `jaxtank.measures.ACCUMULATORS`. What is registered under a
+        What it needs in addition to `jaxtank.measures.ACCUMULATORS`. What is registered under a
         name again replaces what was there.
 
     Returns

@@ -33,7 +33,7 @@ class DisturbanceObserver(Observer):
 
     so that a constant d is found without an error of discretisation. u is not what an offset dead
     zone leaves of it: d^ contains what the dead zones withhold, g times their width (gouta2022
-    notes S2.3), besides the inflow.
+    notes S2.3), in addition to the inflow.
 
     `measured`: tanks whose levels are read; left out, all. For these x_hat = y. The level of any
     other tank is predicted by the model from its level at t = 0, by a step of Runge-Kutta, and its

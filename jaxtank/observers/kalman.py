@@ -85,7 +85,7 @@ class Kalman(Observer):
     def design(self, dt: float) -> tuple:
         """Return (Ad, Bd, drift [cm], L) for period dt [s].
 
-        Shapes (n, n), (n, m), (n,) and (n, measured), with n + disturbed in the place of n where
+        Shapes (n, n), (n, m), (n,) and (n, measured), with n + disturbed for n where
         there are disturbances.
         """
         A, B, _ = linearise(self.model, self.levels, self.inputs)

@@ -16,7 +16,7 @@ from jaxtank.core.vectors import columns, serves_arrays
 class Signal(abc.ABC):
     """A signal of one or more channels: a reference, a disturbance or an input.
 
-    A signal of one's own is a `component` with its own `channels` and `sample`. One whose setpoints
+    A custom signal is a `component` with its own `channels` and `sample`. One whose setpoints
     change also gives `changes`, `windows` and `plateaus`; one that disturbs from time to time gives
     `onset` and `since`. All of them are None where a signal has no such thing.
     """
