@@ -14,7 +14,7 @@ SQUARINGS = 40
 
 
 class OpenLoop(NamedTuple):
-    """L(z) = C (z I - A)^-1 B z^-dead, the loop broken at its m inputs; closed with u = -L u."""
+    """L(z) = C (z I - A)^-1 B z^-dead, the loop opened at its m inputs; closed with u = -L u."""
 
     A: Any
     B: Any

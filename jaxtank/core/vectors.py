@@ -69,7 +69,7 @@ def scalars(vector: Any) -> Any:
 
 
 def like(vector: Any, other: Any) -> Any:
-    """Return a vector in the form of another one; an empty one, of a part that is not in use, unchanged."""
+    """Return a vector in the form of another one; an empty one, of an unused part, unchanged."""
     if is_array(other) and len(vector):
         return vector if is_array(vector) else jnp.stack([jnp.asarray(v) for v in vector])
     return scalars(vector)

@@ -329,9 +329,9 @@ def stability_margins(loop: ClosedLoop, clock: Clock) -> tuple[Plateau, ...]:
 
     One sample of the loop (sensor without noise, observer, controller, pumps with lag and dead time
     but without limits, plant with its steady inflow) is linearised at the steady state of each
-    plateau, with the loop opened at the plant input: exact for the sampled loop. With several pumps gain, phase and
-    delay margin are of one pump at a time, the other loops closed, and the sensitivity peak is that
-    of the largest singular value of (I + L)^-1.
+    plateau, with the loop opened at the plant input: exact for the sampled loop. With several pumps
+    gain, phase and delay margin are of one pump at a time, the other loops closed, and the
+    sensitivity peak is the largest singular value of (I + L)^-1.
 
     Parameters
     ----------

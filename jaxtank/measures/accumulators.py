@@ -48,7 +48,7 @@ class Worst(NamedTuple):
 
 
 class Context(NamedTuple):
-    """What an accumulator may refer to in addition to the sample; None where no measure of a run does."""
+    """What an accumulator may refer to in addition to the sample; None where no measure does."""
 
     # of the last setpoint change of each output: (target [cm], step [cm], time since its end [s],
     # half width of its band [cm]); step 0 before the first
