@@ -32,11 +32,6 @@ CASES = (
 SOURCE = Path(__file__).with_name("floor.c")
 
 
-def _compilations():
-    """How often `evaluate` has been compiled."""
-    return cast(Any, lp.evaluate_compiled)._cache_size()
-
-
 def c_loop(folder):
     """Return the C loop of floor.c, built by gcc -O3 in `folder`; None without gcc."""
     if shutil.which("gcc") is None:
@@ -55,41 +50,18 @@ def c_loop(folder):
 def c_runner(function, case, rk4=True):
     """Return a call of the C loop for a case: () -> (rms error [cm], highest levels [cm])."""
     plant, controller, clock = case.loop.plant, case.loop.controller, case.clock
-    numbers = np.concatenate(
-        [
-            plant.area,
-            plant.drain[:2],
-            plant.orifice,
-            plant.pump_gain,
-            [float(plant.gravity), plant.knee],
-        ]
-    )
+    hydraulics = (plant.area, plant.drain[:2], plant.orifice, plant.pump_gain)
+    numbers = np.concatenate([*hydraulics, [float(plant.gravity), plant.knee]])
     r = np.ascontiguousarray(np.array(case.loop.reference.sample(clock)[0]))
     x0, result = np.array(case.loop.x0, dtype=float), np.zeros(5)
-
-    def pointer(array):
-        return array.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
-
-    real = [
-        float(clock.dt),
-        float(controller.k),
-        float(controller.k1),
-        float(controller.level_floor),
-        float(case.loop.actuator.high[0]),
-    ]
-    dt, *rest = (ctypes.c_double(v) for v in real)
+    pointer = lambda array: array.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
+    gains = (controller.k, controller.k1, controller.level_floor, case.loop.actuator.high[0])
+    settings = [ctypes.c_double(float(v)) for v in gains]
+    samples, dt = ctypes.c_long(clock.samples), ctypes.c_double(float(clock.dt))
 
     def run():
-        rms = function(
-            pointer(numbers),
-            ctypes.c_long(clock.samples),
-            dt,
-            int(rk4),
-            *rest,
-            pointer(x0),
-            pointer(r),
-            pointer(result),
-        )
+        arrays = map(pointer, (x0, r, result))
+        rms = function(pointer(numbers), samples, dt, int(rk4), *settings, *arrays)
         return rms, result[1:].copy()
 
     return run
@@ -131,15 +103,30 @@ def measure(rounds=7):
         }
         for name, s in seconds.items()
     }
-    found = {
+    origin = provenance(first, None)
+    beside, notes = {}, [] if origin["xla_option"] else [OFF]
+    if function is None:
+        notes.append("no gcc here, so there is no C loop to compare with")
+    else:
+        rms, top = results[C_LOOP]
+        error = abs(rms - float(results[CASES[0]]["rms_error_total"]))
+        level = np.max(np.abs(top - np.asarray(results[CASES[0]]["max_level"])))
+        ratios = [a / b for a, b in zip(seconds[CASES[0]], seconds[C_LOOP])]
+        beside["ratio_to_c"] = statistics.median(ratios)
+        beside["difference_to_c_cm"] = float(max(error, level))
+    if origin["backend"] != "cpu":
+        notes.append(
+            f"these runs are on {origin['backend']}: a single loop is a chain of small steps and"
+            " belongs on a CPU"
+        )
+    return {
         "steps": first.clock.samples,
         "rounds": rounds,
         "rows": rows,
-        "provenance": provenance(first, None),
-        **_beside_c(seconds, results),
+        "provenance": origin,
+        **beside,
+        "notes": notes,
     }
-    found["notes"] = _notes(found, function)
-    return found
 
 
 C_LOOP = "C loop, backstepping"
@@ -154,90 +141,47 @@ def _calls(cases) -> dict[str, Callable[[], Any]]:
         measures = lp.evaluate(with_values(first.loop, values), first.clock, MEASURES)
         return measures["rms_error_total"]
 
-    derivative = jax.jit(jax.jacfwd(error))
-    calls: dict[str, Callable[[], Any]] = {
-        name: functools.partial(lp.evaluate, case.loop, case.clock, MEASURES)
-        for name, case in cases.items()
-    }
-    calls["jacfwd for 2 gains"] = functools.partial(derivative, gains)
-    calls["gradient, Gauss-Newton and maxima for 2 gains"] = functools.partial(
-        lp.sensitivities, first.loop, first.clock, MEASURES, gains
-    )
-    return calls
-
-
-def _beside_c(seconds, results):
-    """Time and numbers of the first case beside those of the C loop, where there is one."""
-    if C_LOOP not in seconds:
-        return {}
-    rms, top = results[C_LOOP]
-    ours = results[CASES[0]]
-    ratios = [a / b for a, b in zip(seconds[CASES[0]], seconds[C_LOOP])]
-    error = abs(rms - float(ours["rms_error_total"]))
-    level = np.max(np.abs(top - np.asarray(ours["max_level"])))
-    return {"ratio_to_c": statistics.median(ratios), "difference_to_c_cm": float(max(error, level))}
-
-
-def _notes(found, function):
-    notes = []
-    if not found["provenance"]["xla_option"]:
-        notes.append(OFF)
-    if function is None:
-        notes.append("no gcc here, so there is no C loop to compare with")
-    if found["provenance"]["backend"] != "cpu":
-        notes.append(
-            f"these runs are on {found['provenance']['backend']}: a single loop is a chain of small"
-            " steps and belongs on a CPU"
-        )
-    return notes
-
-
-def text(found):
-    """Return the page of `jaxtank bench`."""
-    rows = [
-        [
-            n,
-            f"{r['ns_per_step']:.0f}",
-            f"{r['ms']:.2f}",
-            f"{100 * r['spread']:.0f} %",
-            "-" if r["first_call_s"] is None else f"{r['first_call_s']:.2f}",
-            f"{r['times_the_run']:.2f}",
-        ]
-        for n, r in found["rows"].items()
-    ]
-    lines = [
-        (
-            f"one run of {found['steps']} steps, float64, {found['provenance']['integrator']};"
-            f" medians of {found['rounds']} interleaved rounds"
+    bind = functools.partial
+    return {
+        **{
+            name: bind(lp.evaluate, case.loop, case.clock, MEASURES) for name, case in cases.items()
+        },
+        "jacfwd for 2 gains": bind(jax.jit(jax.jacfwd(error)), gains),
+        "gradient, Gauss-Newton and maxima for 2 gains": bind(
+            lp.sensitivities, first.loop, first.clock, MEASURES, gains
         ),
+    }
+
+
+def text(figures):
+    """Return the page of `jaxtank bench`."""
+    rows = []
+    for name, r in figures["rows"].items():
+        first = "-" if r["first_call_s"] is None else f"{r['first_call_s']:.2f}"
+        times = [f"{r['ns_per_step']:.0f}", f"{r['ms']:.2f}", f"{100 * r['spread']:.0f} %", first]
+        rows.append([name, *times, f"{r['times_the_run']:.2f}"])
+    lines = [
+        f"one run of {figures['steps']} steps, float64, {figures['provenance']['integrator']};"
+        f" medians of {figures['rounds']} interleaved rounds",
         "",
         tables.table(rows, ["run", "ns/step", "ms", "spread", "first call s", "x backstepping"]),
     ]
-    if "ratio_to_c" in found:
-        lines += [
-            "",
-            (
-                "backstepping over the C loop of the same arithmetic (gcc -O3 -march=native):"
-                f" {found['ratio_to_c']:.2f}; the two agree to {found['difference_to_c_cm']:.1e} cm"
-            ),
-        ]
-    return "\n".join([*lines, *found["notes"]])
+    if "ratio_to_c" in figures:
+        lines.append(
+            "\nbackstepping over the C loop of the same arithmetic (gcc -O3 -march=native):"
+            f" {figures['ratio_to_c']:.2f}; the two agree to {figures['difference_to_c_cm']:.1e} cm"
+        )
+    return "\n".join([*lines, *figures["notes"]])
 
 
 def is_one_function(program, samples):
     """Return whether XLA runs the time loop of a compiled program as one function."""
-    small = set(
-        re.findall(r'to_apply=(%[\w.-]+), frontend_attributes={xla_cpu_small_call="true"', program)
-    )
-    inside = None
+    call = r'to_apply=(%[\w.-]+), frontend_attributes={xla_cpu_small_call="true"'
+    small, inside = set(re.findall(call, program)), None
     for line in program.splitlines():
         if line.startswith(("%", "ENTRY")):
             inside = line.split()[0]
-        elif (
-            " while(" in line
-            and f'"known_trip_count":{{"n":"{samples}"}}' in line
-            and inside in small
-        ):
+        elif " while(" in line and inside in small and f'_count":{{"n":"{samples}"}}' in line:
             return True
     return False
 
@@ -257,77 +201,60 @@ def reasons(program, samples, option, dtype, compiled):
     """Return why a run is slower or less exact than it could be, as sentences."""
     # program: text of the compiled run; samples: of its loop; option: whether the XLA options are
     # on; dtype: of the levels; compiled: how many programs three further runs compiled.
-    found = []
+    sentences = []
     if not is_one_function(program, samples):
-        named = [word for word in BLOCKING if f" {word}(" in program]
-        found.append(
-            OFF
-            if not option
-            else (
-                "the time loop is not one function: it holds"
-                f" {', '.join(named) or 'more than XLA takes for a small loop'}"
-            )
+        named = ", ".join(word for word in BLOCKING if f" {word}(" in program)
+        holds = named or "more than XLA takes for a small loop"
+        sentences.append(
+            OFF if not option else f"the time loop is not one function: it holds {holds}"
         )
     if dtype == np.float32:
-        found.append(
+        sentences.append(
             "float32: less exact, and no faster for one run; a batch of runs takes half the time"
         )
     if compiled:
-        found.append(
+        sentences.append(
             f"traced anew at every call: {compiled} of 3 further runs compiled a program (a static"
             " field changes between calls)"
         )
-    return found
+    return sentences
 
 
 def measure_cases(cases, rounds=3):
     """Return the time of a run with two measures of each of {name: Case}, median of `rounds`."""
-    found = {}
+    compilations = cast(Any, lp.evaluate_compiled)._cache_size
+    rows = {}
     for name, case in cases.items():
         key = jax.random.key(0) if noisy(case) else None
         program = lp.evaluate_compiled.lower(case.loop, case.clock, MEASURES, key, False)
         began = time.perf_counter()
-        text_of_program = program.compile().as_text()
+        program = program.compile().as_text()
         first = time.perf_counter() - began
-        seconds, results = timed(
-            {name: lambda case=case, key=key: lp.evaluate(case.loop, case.clock, MEASURES, key)},
-            rounds,
-        )
-        median = statistics.median(seconds[name])
-        before = _compilations()
+        run = functools.partial(lp.evaluate, case.loop, case.clock, MEASURES, key)
+        seconds, results = timed({name: run}, rounds)
+        median, before = statistics.median(seconds[name]), compilations()
         for _ in range(3):
-            lp.evaluate(case.loop, case.clock, MEASURES, key)
-        found[name] = {
-            "ns_per_step": 1e9 * median / case.clock.samples,
+            run()
+        option, samples = provenance(case, None)["xla_option"], case.clock.samples
+        dtype = results[name]["rms_error_total"].dtype
+        rows[name] = {
+            "ns_per_step": 1e9 * median / samples,
             "ms": 1e3 * median,
-            "samples": case.clock.samples,
-            "one_function": is_one_function(text_of_program, case.clock.samples),
+            "samples": samples,
+            "one_function": is_one_function(program, samples),
             "first_call_s": first,
-            "reasons": reasons(
-                text_of_program,
-                case.clock.samples,
-                provenance(case, None)["xla_option"],
-                results[name]["rms_error_total"].dtype,
-                _compilations() - before,
-            ),
+            "reasons": reasons(program, samples, option, dtype, compilations() - before),
         }
-    return found
+    return rows
 
 
-def text_of_cases(found):
+def text_of_cases(figures):
     """Return the page of `jaxtank bench CASE ...`."""
-    rows = [
-        [
-            name,
-            f"{r['ns_per_step']:.0f}",
-            r["samples"],
-            f"{r['ms']:.2f}",
-            "yes" if r["one_function"] else "no",
-            f"{r['first_call_s']:.1f}",
-        ]
-        for name, r in found.items()
-    ]
-    why = [f"{name}: {reason}" for name, r in found.items() for reason in r["reasons"]]
-    return "\n".join(
-        [tables.table(rows, ["case", "ns/step", "steps", "ms", "one function", "compile s"]), *why]
-    )
+    rows = []
+    for name, r in figures.items():
+        whole = "yes" if r["one_function"] else "no"
+        cells = [f"{r['ns_per_step']:.0f}", r["samples"], f"{r['ms']:.2f}", whole]
+        rows.append([name, *cells, f"{r['first_call_s']:.1f}"])
+    why = [f"{name}: {reason}" for name, r in figures.items() for reason in r["reasons"]]
+    heads = ["case", "ns/step", "steps", "ms", "one function", "compile s"]
+    return "\n".join([tables.table(rows, heads), *why])

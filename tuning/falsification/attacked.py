@@ -43,32 +43,36 @@ class Coefficient(NamedTuple):
 def coefficients_of(case: Any, distributions: Any = None) -> list[Coefficient]:
     """Return the coefficients of a case that lie in intervals, with their intervals."""
     loop = case.loop
-    if distributions is None:
-        ends = _ends_of_box(case)
-    else:
-        ends = _ends_of(loop, stated(distributions))
-    found = [c for name, (low, high) in ends.items() for c in _entries(loop, name, low, high)]
-    if not found:
+    ends = _ends_of_box(case) if distributions is None else _ends_of(loop, stated(distributions))
+    coefficients = [c for name, (a, b) in ends.items() for c in _entries(loop, name, a, b)]
+    if not coefficients:
         raise InputError(
             f"attack {case.name}: no interval is wider than 0: name what varies, as --spread 0.05"
             " or --vary plant.drain=uniform:5%"
         )
-    return found
+    return coefficients
 
 
 def _ends_of_box(case):
     """{name: (low, high)} of the filter's box, and of what else the case calls uncertain."""
-    guard = case.loop.safety_filter
-    if guard is None:
-        try:
-            guard, _ = case.safety_design()
-        except InputError:  # no network of tanks
-            return _ends_of(case.loop, spread_of(case))
-    least, most = guard.least, guard.most
+    safety_filter = filter_or_design(case)
+    if safety_filter is None:
+        return _ends_of(case.loop, spread_of(case))
+    least, most = safety_filter.least, safety_filter.most
     names = [f.name for f in dataclasses.fields(least) if f.metadata.get("kind") == "leaf"]
     ends = {f"plant.{name}": (getattr(least, name), getattr(most, name)) for name in names}
     others = {n: s for n, s in case.uncertain.items() if n.split(".")[0] not in NOT_OTHERS}
     return ends | (_ends_of(case.loop, stated(others)) if others else {})
+
+
+def filter_or_design(case: Any) -> Any:
+    """Return the safety filter of a case, or the one that fits it; None without a tank network."""
+    if case.loop.safety_filter is not None:
+        return case.loop.safety_filter
+    try:
+        return case.safety_design()[0]
+    except InputError:
+        return None
 
 
 NOT_OTHERS = ("plant", "sensor", "x0")
@@ -169,14 +173,14 @@ class Course:
         """Return (values (samples,) of each entry, samples of the faults that follow)."""
         value = jnp.asarray(self.value)
         window = _window(clock, self.length, value.shape[1])
-        own = tuple(value[i, window] for i in range(value.shape[0]))
-        return own, () if self.then is None else self.then.sample(clock)
+        now = tuple(value[i, window] for i in range(value.shape[0]))
+        return now, () if self.then is None else self.then.sample(clock)
 
     def apply(self, plant: Any, active: Sequence[Any]) -> Any:
         """Return the plant of a sample; active: a sample of `sample`."""
-        own, then = active
+        now, then = active
         changed = {}
-        for name, v in zip(self.names, own):
+        for name, v in zip(self.names, now):
             field, (index,) = split_index(name)
             value = getattr(plant, field)
             entries = changed.setdefault(field, [value[i] for i in range(np.shape(value)[0])])
@@ -219,33 +223,32 @@ class Attacked:
     noise: bool
     ceiling: np.ndarray
     band: np.ndarray = dataclasses.field(init=False)
-    shapes: dict[str, tuple[int, ...]] = dataclasses.field(init=False)
+    shapes: dict[str, tuple] = dataclasses.field(init=False)
     original: Case = dataclasses.field(init=False)
     physical_rims: bool = dataclasses.field(init=False)
 
     def __post_init__(self):
         case, loop = self.case, without_overflow(self.case.loop)
-        object.__setattr__(self, "original", case.replace(loop=loop))
-        object.__setattr__(self, "physical_rims", bool(case.loop.plant.overflow))
+        original, physical_rims = case.replace(loop=loop), bool(case.loop.plant.overflow)
         if self.pumps != "own":
             loop = _without_controller(loop, case.clock)
-        band = reading_band(loop)
+        band, tanks = reading_band(loop), loop.plant.tanks
         varying = [c for c in self.coefficients if c.varies]
-        shapes: dict[str, tuple[int, ...]] = {
+        constant = [c for c in self.coefficients if not c.varies]
+        read, noisy = np.any(band > 0.0), np.any(band > 0.0) and self.noise
+        shapes = {
             "varying": (len(varying), self.windows),
-            "constant": (len(self.coefficients) - len(varying),),
+            "constant": (len(constant),),
+            **({"start": (tanks,)} if self.start == "any" else {}),
+            **({"bias": (tanks,)} if read else {}),
+            **({"noise": (tanks, case.clock.samples)} if noisy else {}),
+            **({"command": (SWITCHES, loop.plant.pumps)} if self.pumps == "random" else {}),
         }
-        if self.start == "any":
-            shapes["start"] = (loop.plant.tanks,)
-        if np.any(band > 0.0):
-            shapes["bias"] = (loop.plant.tanks,)
-            if self.noise:
-                shapes["noise"] = (loop.plant.tanks, case.clock.samples)
-        if self.pumps == "random":
-            shapes["command"] = (SWITCHES, loop.plant.pumps)
         for name, value in {
+            "original": original,
+            "physical_rims": physical_rims,
             "case": case.replace(loop=loop),
-            "coefficients": [*varying, *(c for c in self.coefficients if not c.varies)],
+            "coefficients": [*varying, *constant],
             "band": band,
             "shapes": shapes,
         }.items():
@@ -253,57 +256,55 @@ class Attacked:
 
     def nominal(self) -> dict[str, np.ndarray]:
         """Return the values (see `values`) of the case as it is, without reading errors."""
-        own = np.array([c.nominal for c in self.coefficients])
-        varying = self.shapes["varying"][0]
+        nominal, varying = np.array([c.nominal for c in self.coefficients]), self.shapes["varying"]
         loop, clock = self.case.loop, self.case.clock
-        found = {
-            "varying": np.repeat(own[:varying, None], self.windows, axis=1),
-            "constant": own[varying:],
+        values = {
+            "varying": np.repeat(nominal[: varying[0], None], self.windows, axis=1),
+            "constant": nominal[varying[0] :],
             "x0": np.asarray(loop.x0, dtype=float),
         }
         if "bias" in self.shapes:
-            columns = clock.samples if self.noise else 1
-            found["error"] = np.zeros((loop.plant.tanks, columns))
+            values["error"] = np.zeros((loop.plant.tanks, clock.samples if self.noise else 1))
         if self.pumps != "own":
             high = np.asarray(loop.actuator.high, dtype=float)
-            found["command"] = np.repeat(high[None], SWITCHES, axis=0)
-        return found
+            values["command"] = np.repeat(high[None], SWITCHES, axis=0)
+        return values
 
     def values(self, z: Mapping[str, Any]) -> dict[str, Any]:
         """Return the values that variables z in the unit cube stand for."""
-        loop, found = self.case.loop, {}
+        loop, n = self.case.loop, self.shapes["varying"][0]
         low, high = (np.array([c[i] for c in self.coefficients]) for i in (2, 3))
-        n = self.shapes["varying"][0]
-        found["varying"] = low[:n, None] + (high - low)[:n, None] * z["varying"]
-        found["constant"] = low[n:] + (high - low)[n:] * z["constant"]
-        found["x0"] = self._start(z["start"]) if "start" in z else jnp.asarray(loop.x0)
+        values = {
+            "varying": low[:n, None] + (high - low)[:n, None] * z["varying"],
+            "constant": low[n:] + (high - low)[n:] * z["constant"],
+            "x0": self._start(z["start"]) if "start" in z else jnp.asarray(loop.x0),
+        }
         if "bias" in z:
             error = (2.0 * z["bias"] - 1.0)[:, None]
             if "noise" in z:
                 error = clip(error + (2.0 * z["noise"] - 1.0), -1.0, 1.0)
-            found["error"] = self.band[:, None] * error
+            values["error"] = self.band[:, None] * error
         if self.pumps != "own":
             low, high = np.asarray(loop.actuator.low), np.asarray(loop.actuator.high)
             share = z["command"] if "command" in z else np.ones((SWITCHES, 1))
-            found["command"] = low + (high - low) * share
-        return found
+            values["command"] = low + (high - low) * share
+        return values
 
     def _start(self, z):
         """Levels (n,) [cm] at t = 0. With a row of second order, the tanks above are lowered until
         g >= 0: no filter can stop what has already been let in.
         """
-        guard = self.case.loop.safety_filter
+        safety_filter = self.case.loop.safety_filter
         x = [top * share for top, share in zip(self.ceiling, z)]
-        if guard is None:
+        if safety_filter is None:
             return jnp.stack(x)
-        rates = rates_of(guard.least, guard.most, guard.inflow, 0.0)
+        rates = rates_of(safety_filter.least, safety_filter.most, safety_filter.inflow, 0.0)
         root = lambda h: smooth_sqrt(h, rates.knee)
-        for i in guard.held:
-            if guard.slope[i] <= 0.0:
-                continue
+        for i in (i for i in safety_filter.held if safety_filter.slope[i] > 0.0):
+            top, slope = safety_filter.limit[i], safety_filter.slope[i]
             sources = [(j, most) for j, sink, _, most in rates.links if sink == i]
-            least = SHALLOW * root(guard.limit[i])
-            may = rates.out[i] * root(x[i]) + guard.slope[i] * (guard.limit[i] - x[i])
+            least = SHALLOW * root(top)
+            may = rates.out[i] * root(x[i]) + slope * (top - x[i])
             does = sum(most * lower_clip(root(x[j]), least) for j, most in sources)
             share = jnp.where(does > may, may / does, 1.0) * (1.0 - 1e-9)
             for j, _ in sources:
@@ -361,8 +362,8 @@ class Attacked:
 
     def objective(self, z: Mapping[str, Any], tank: Any) -> tuple[Any, Levels]:
         """Return (highest level of one tank [cm], Levels) of a run with variables z."""
-        found = self.levels(self.values(z), checkpoint=True)
-        return found.highest[tank], found
+        levels = self.levels(self.values(z), checkpoint=True)
+        return levels.highest[tank], levels
 
 
 def of_plant(coefficient: Coefficient) -> bool:
@@ -386,10 +387,10 @@ def reading_band(loop: ClosedLoop) -> np.ndarray:
     """Return the (n,) largest error of readings [cm]: of the sensor's noise (6 standard
     deviations), ADC and offset, or the band of the safety filter where that is wider.
     """
-    n, sensor, guard = loop.plant.tanks, loop.sensor, loop.safety_filter
-    own = band_of(sensor) if isinstance(sensor, LevelSensor) else 6.0 * np.asarray(sensor.noise)
-    own = np.broadcast_to(own, (n,))
-    return own if guard is None else np.maximum(own, np.asarray(guard.band))
+    sensor, safety_filter = loop.sensor, loop.safety_filter
+    band = band_of(sensor) if isinstance(sensor, LevelSensor) else 6.0 * np.asarray(sensor.noise)
+    band = np.broadcast_to(band, (loop.plant.tanks,))
+    return band if safety_filter is None else np.maximum(band, np.asarray(safety_filter.band))
 
 
 def _tops(loop):

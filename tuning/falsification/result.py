@@ -79,44 +79,44 @@ class Attack(Result):
     @property
     def passed(self) -> list[Found]:
         """What passed its limit."""
-        return [one for one in self.found if one.passed]
+        return [run for run in self.found if run.passed]
 
     @property
     def worst(self) -> Found:
-        """What comes highest by its limit."""
-        return max(self.found, key=lambda one: one.level / one.limit)
+        """The run with the smallest margin to its limit, as a share of it."""
+        return max(self.found, key=lambda run: run.level / run.limit)
 
-    def parameters(self, one: Found) -> dict[str, Any]:
-        """Return {dotted name: value, or the list of its values in windows of equal length} of the
-        run that has the level `one`. "sensor.offset[i]" is the mean error of a reading [cm].
+    def parameters(self, run: Found) -> dict[str, Any]:
+        """Return {dotted name: value, or the list of its values in windows of equal length} of a
+        run. "sensor.offset[i]" is the mean error of a reading [cm].
         """
-        found = {}
-        for c, value in zip(self.attacked.coefficients, _rows(one)):
+        values: dict[str, Any] = {}
+        for c, value in zip(self.attacked.coefficients, _rows(run)):
             same = np.all(value == value[0])
-            found[c.name] = float(value[0]) if same else [float(v) for v in value]
-        found |= {f"x0[{i}]": float(h) for i, h in enumerate(one.values["x0"])}
-        if "error" in one.values:
-            mean = np.mean(one.values["error"], axis=1)
-            found |= {f"sensor.offset[{i}]": float(v) for i, v in enumerate(mean)}
-        return found
+            values[c.name] = float(value[0]) if same else [float(v) for v in value]
+        values |= {f"x0[{i}]": float(h) for i, h in enumerate(run.values["x0"])}
+        if "error" in run.values:
+            mean = np.mean(run.values["error"], axis=1)
+            values |= {f"sensor.offset[{i}]": float(v) for i, v in enumerate(mean)}
+        return values
 
-    def loop(self, one: Found) -> Any:
-        """Return the ClosedLoop of the run that has the level `one`."""
-        return self.attacked.loop_of(jax.tree.map(np.asarray, dict(one.values)))
+    def loop(self, run: Found) -> Any:
+        """Return the ClosedLoop of a run."""
+        return self.attacked.loop_of(jax.tree.map(np.asarray, dict(run.values)))
 
-    def rig(self, one: Found) -> Any:
-        """Return the run that has the level `one` as a Case that a rig file can describe: the
-        nominal plant with faults from t = 0, its start, and the mean error of each reading as the
-        sensor's offset. Errors that change from sample to sample, an ADC's range and commands in
-        place of the controller's have no place in a rig file (`not_in_rig`).
+    def rig(self, run: Found) -> Any:
+        """Return a run as a Case that a rig file can describe: the nominal plant with faults from
+        t = 0, its start, and the mean error of each reading as the sensor's offset. Errors that
+        change from sample to sample, an ADC's range and commands in place of the controller's have
+        no place in a rig file (`not_in_rig`).
         """
-        case, values = self.case, one.values
+        case, values = self.case, run.values
         if self.attacked.pumps != "own":
             case = self.attacked.original
         loop: Any = case.loop
-        constant = zip(self.attacked.coefficients, _rows(one))
+        constant = zip(self.attacked.coefficients, _rows(run))
         loop = with_values(loop, {c.name: v[0] for c, v in constant if not of_plant(c)})
-        changes: dict[str, Any] = {"x0": np.asarray(values["x0"]), "faults": self._faults(one)}
+        changes: dict[str, Any] = {"x0": np.asarray(values["x0"]), "faults": self._faults(run)}
         safety = case.safety
         if "error" in values and isinstance(loop.sensor, LevelSensor):
             changes["sensor"] = dataclasses.replace(
@@ -128,9 +128,9 @@ class Attack(Result):
                 safety = {**safety, "band": np.asarray(loop.safety_filter.band)}
         return case.replace(loop=dataclasses.replace(loop, **changes), safety=safety)
 
-    def not_in_rig(self, one: Found) -> list[str]:
-        """Return what of the run that has the level `one` no rig file can describe, in words."""
-        error, missing = one.values.get("error"), []
+    def not_in_rig(self, run: Found) -> list[str]:
+        """Return what of a run no rig file can describe, in words."""
+        error, missing = run.values.get("error"), []
         if error is not None and np.ptp(error, axis=1).max() > 0.0:
             missing.append("reading errors that change from sample to sample (their mean is)")
         if error is not None and getattr(self.case.loop.sensor, "bits", 0):
@@ -139,14 +139,12 @@ class Attack(Result):
             missing.append("commands in place of the controller's")
         return missing
 
-    def _faults(self, one):
-        """The Faults of the plant in the run of `one`, equal windows joined; the case's
-        own last.
-        """
-        clock, own = self.case.clock, self.case.loop.faults
+    def _faults(self, run):
+        """The Faults of the plant in a run, equal windows joined; those of the case last."""
+        clock, of_case = self.case.clock, self.case.loop.faults
         edges = np.linspace(0.0, clock.duration + clock.dt, self.attacked.windows + 1)
         windows, extra = [], []
-        for c, row in zip(self.attacked.coefficients, _rows(one)):
+        for c, row in zip(self.attacked.coefficients, _rows(run)):
             if not of_plant(c):
                 continue
             starts = [k for k in range(len(row)) if k == 0 or row[k] != row[k - 1]]
@@ -156,14 +154,14 @@ class Attack(Result):
                     windows.append((name, float(edges[k]), float(edges[end])))
                     extra.append(row[k] - c.nominal)
         factor = np.ones(len(extra))
-        if own is not None:
-            factor, extra = np.append(factor, own.factor), np.append(extra, own.extra)
-            windows += own.windows
+        if of_case is not None:
+            factor, extra = np.append(factor, of_case.factor), np.append(extra, of_case.extra)
+            windows += of_case.windows
         if not windows:
             return None
         return Faults(factor=factor, extra=np.asarray(extra), windows=tuple(windows))
 
 
-def _rows(one):
+def _rows(run):
     """Values in each window of every coefficient: (windows,) arrays, (1,) where constant."""
-    return [*np.asarray(one.values["varying"]), *np.asarray(one.values["constant"])[:, None]]
+    return [*np.asarray(run.values["varying"]), *np.asarray(run.values["constant"])[:, None]]

@@ -14,7 +14,13 @@ from jaxtank.loop.validation import check
 from jaxtank.safety.certificate import TankCertificate
 from jaxtank.safety.of_case import certificates_of
 from jaxtank.safety.worst_case import rates_of, rise
-from tuning.falsification.attacked import Attacked, batch_size, coefficients_of, programs
+from tuning.falsification.attacked import (
+    Attacked,
+    batch_size,
+    coefficients_of,
+    filter_or_design,
+    programs,
+)
 from tuning.falsification.result import Attack, Found
 from tuning.problem.scenarios import noisy
 from tuning.uncertainty.sampling import check_whole
@@ -86,13 +92,18 @@ def attack(
     >>> import tuning
     >>> from jaxtank import presets, rig
     >>> case = rig.set_values(presets.find("cascaded/pi"), {"clock.duration": 40.0})
-    >>> found = tuning.attack(case, starts=1, draws=2, iterations=0, windows=1)
-    >>> [one.tank for one in found.found]
+    >>> attack = tuning.attack(case, starts=1, draws=2, iterations=0, windows=1)
+    >>> [run.tank for run in attack.found]
     [0, 1]
     """
     began = time.perf_counter()
     counts = {"starts": starts, "iterations": iterations, "windows": windows, "draws": draws}
-    _check_arguments({**counts, "seed": seed}, pumps, start)
+    for name, value in {**counts, "seed": seed}.items():
+        low = 0 if name in ("seed", "iterations") else 1
+        check_whole(name, value, low, 2**31 - 1 if name == "seed" else 10**6)
+    for name, value, allowed in (("pumps", pumps, PUMPS), ("start", start, STARTS)):
+        if value not in allowed:
+            raise InputError(f"{name} = {value!r}: must be one of {', '.join(allowed)}")
     check(case.loop, case.clock, jax.random.key(0) if noisy(case) else None)
     limits = limits_of(case)
     attacked = Attacked(
@@ -105,47 +116,33 @@ def attack(
         ceiling=limits.ceiling,
     )
     search = _Search(attacked, draws, starts, iterations, seed, progress)
-    drawn, levels = search.screen()
-    climbed = search.climb(drawn, levels)
+    points, levels = search.screen()
+    climbed = search.climb(points, levels)
+    rises = _rises(case, np.maximum(limits.limit, climbed.level))
+    rows = limits.rows or (None,) * len(rises)
     return Attack(
         attacked=attacked,
-        found=_found(case, limits, levels, climbed),
+        found=tuple(
+            Found(
+                tank=i,
+                limit=float(limits.limit[i]),
+                certified=row and row.certified,
+                reason=row.reason if row else "",
+                starts=row.starts if row else "",
+                nominal=float(levels[0, i]),
+                drawn=float(levels[1:, i].max()),
+                level=float(climbed.level[i]),
+                time_s=float(climbed.time[i]),
+                rise=float(rises[i]),
+                values=climbed.values[i],
+            )
+            for i, row in enumerate(rows)
+        ),
         history=climbed.history,
         starts=starts,
         draws=draws,
         seed=seed,
         wall_s=time.perf_counter() - began,
-    )
-
-
-def _check_arguments(counts, pumps, start):
-    """Raise InputError for a number or a word that is none of those allowed."""
-    for name, value in counts.items():
-        low = 0 if name in ("seed", "iterations") else 1
-        check_whole(name, value, low, 2**31 - 1 if name == "seed" else 10**6)
-    for name, value, allowed in (("pumps", pumps, PUMPS), ("start", start, STARTS)):
-        if value not in allowed:
-            raise InputError(f"{name} = {value!r}: must be one of {', '.join(allowed)}")
-
-
-def _found(case, limits, levels, climbed):
-    """The Found of each tank. levels: (draws + 1, n), first those of the case as it is."""
-    rises = _rises(case, np.maximum(limits.limit, climbed.level))
-    return tuple(
-        Found(
-            tank=i,
-            limit=float(limits.limit[i]),
-            certified=None if limits.rows is None else limits.rows[i].certified,
-            reason="" if limits.rows is None else limits.rows[i].reason,
-            starts="" if limits.rows is None else limits.rows[i].starts,
-            nominal=float(levels[0, i]),
-            drawn=float(levels[1:, i].max()),
-            level=float(climbed.level[i]),
-            time_s=float(climbed.time[i]),
-            rise=float(rises[i]),
-            values=climbed.values[i],
-        )
-        for i in range(case.loop.plant.tanks)
     )
 
 
@@ -161,15 +158,14 @@ class Limits(NamedTuple):
 
 def limits_of(case: Case) -> Limits:
     """Return the level limits of a case: those of its safety filter, or max_level and the rims."""
-    loop, guard = case.loop, case.loop.safety_filter
-    if guard is None:
-        rim = np.asarray(loop.plant.rim, dtype=float)
-        given = case.limits.get("max_level", "rim")
-        limit = rim if isinstance(given, str) else np.minimum(rim, np.asarray(given, dtype=float))
+    loop, safety_filter = case.loop, case.loop.safety_filter
+    if safety_filter is None:
+        rim, top = np.asarray(loop.plant.rim, dtype=float), case.limits.get("max_level", "rim")
+        limit = rim if isinstance(top, str) else np.minimum(rim, np.asarray(top, dtype=float))
         return Limits(limit, limit, None)
-    limit = np.asarray(guard.limit, dtype=float)
+    limit = np.asarray(safety_filter.limit, dtype=float)
     if case.safety is None:  # made by hand
-        return Limits(limit + np.asarray(guard.spare), limit, None)
+        return Limits(limit + np.asarray(safety_filter.spare), limit, None)
     rows = certificates_of(case)
     return Limits(np.array([row.limit for row in rows]), limit, rows)
 
@@ -178,19 +174,16 @@ def _rises(case, reach):
     """(n,) what each level can rise by between two samples [cm] while no level passes `reach` (n,)
     [cm]: b_max u_max dt and what flows in; nan for a plant that is no network.
     """
-    guard = case.loop.safety_filter
-    if guard is None:
-        try:
-            guard, _ = case.safety_design()
-        except InputError:
-            return np.full(len(reach), np.nan)
-    rates = rates_of(guard.least, guard.most, guard.inflow, 0.0)
-    high, found = np.asarray(case.loop.actuator.high, dtype=float), []
+    safety_filter = filter_or_design(case)
+    if safety_filter is None:
+        return np.full(len(reach), np.nan)
+    rates = rates_of(safety_filter.least, safety_filter.most, safety_filter.inflow, 0.0)
+    high, rises = np.asarray(case.loop.actuator.high, dtype=float), []
     for i in range(len(reach)):
         pumped = sum(b * max(high[j], 0.0) for j, (_, b) in rates.pumps[i].items())
         fastest = pumped + float(lower_clip(rise(rates, i, 0.0, reach), 0.0))
-        found.append(float(fastest) * case.clock.dt)
-    return np.array(found)
+        rises.append(float(fastest) * case.clock.dt)
+    return np.array(rises)
 
 
 class _Climbed(NamedTuple):
@@ -208,97 +201,81 @@ class _Search:
 
     def __init__(self, attacked, draws, starts, iterations, seed, progress):
         self.attacked, self.draws, self.starts = attacked, draws, starts
-        self.iterations, self.progress = iterations, progress
-        self.rng = np.random.default_rng(seed)
-        self.tanks = attacked.case.loop.plant.tanks
+        self.iterations, self.rng = iterations, np.random.default_rng(seed)
         self.run, self.slopes = programs(attacked)
-        self.total = iterations + 2
+        progress = progress or (lambda done, total: None)
+        self.report = lambda done: progress(done, iterations + 2)
 
-    def report(self, done):
-        """Call `progress` with the steps done and their number."""
-        if self.progress is not None:
-            self.progress(done, self.total)
+    def values(self, z):
+        """Values (runs, ...) of variables (runs, ...) in the unit cube."""
+        return jax.tree.map(np.asarray, jax.jit(jax.vmap(self.attacked.values))(z))
 
     def levels(self, values):
         """((runs, n) highest levels [cm], (runs, n) their times [s]) of values (runs, ...)."""
-        runs = len(values["x0"])
         size = batch_size(self.attacked, min(64, self.draws + 1))
-        found = [self.run(part) for part in _batches(values, size)]
-        return tuple(np.concatenate([np.asarray(f[k]) for f in found])[:runs] for k in (0, 1))
+        return _in_batches(self.run, size, values)
 
     def screen(self):
         """(variables of the draws, levels (draws + 1, n), first those of the case as it is)."""
-        drawn = _drawn(self.attacked, self.draws, self.rng)
-        values = jax.tree.map(np.asarray, jax.jit(jax.vmap(self.attacked.values))(drawn))
-        own = self.attacked.nominal()
-        like = {k: np.broadcast_to(own[k], v.shape[1:])[None] for k, v in values.items()}
-        both = {k: np.concatenate([like[k], v]) for k, v in values.items()}
-        levels, _ = self.levels(both)
+        points = _points(self.attacked, self.draws, self.rng)
+        values, nominal = self.values(points), self.attacked.nominal()
+        first = {k: np.broadcast_to(nominal[k], v.shape[1:])[None] for k, v in values.items()}
+        levels = self.levels({k: np.concatenate([first[k], v]) for k, v in values.items()})[0]
         self.report(1)
-        return drawn, levels
+        return points, levels
 
-    def climb(self, drawn, levels):
+    def climb(self, points, levels):
         """Return the _Climbed of ascents from the best of the draws."""
-        starts, n = min(self.starts, self.draws), self.tanks
-        order = np.argsort(-levels[1:], axis=0, kind="stable")[:starts].T  # (n, starts)
-        z = {k: v[order.ravel()] for k, v in drawn.items()}
+        starts, n = min(self.starts, self.draws), levels.shape[1]
+        order = np.argsort(-levels[1:], axis=0, kind="stable")[:starts].T.ravel()  # (n starts,)
         tanks = np.repeat(np.arange(n), starts)
-        best, history = z, levels[1:][order.ravel(), tanks][None]
+        z, history = {k: v[order] for k, v in points.items()}, levels[1:][order, tanks][None]
         if self.iterations:
-            done = ascend(lambda at: self._sloped(at, tanks), z, self.iterations, self._stepped)
-            best, history = done.z, done.history
-        values = jax.tree.map(np.asarray, jax.jit(jax.vmap(self.attacked.values))(best))
-        found, times = self.levels(values)
-        own = found.argmax(axis=0)  # the ascent for one tank may serve another better
-        chosen = [{k: v[own[i]] for k, v in values.items()} for i in range(n)]
-        self.report(self.total)
-        at = (own, np.arange(n))
+            size = batch_size(self.attacked, len(tanks))
+
+            def slopes(at):
+                (value, _), slope = _in_batches(self.slopes, size, at, tanks)
+                return value, slope
+
+            z, _, history = ascend(slopes, z, self.iterations, lambda done: self.report(done + 2))
+        values = self.values(z)
+        highest, times = self.levels(values)
+        best = highest.argmax(axis=0)  # the ascent for one tank may serve another better
+        chosen = [{k: v[i] for k, v in values.items()} for i in best]
+        self.report(self.iterations + 2)
+        at = (best, np.arange(n))
         history = history.reshape(-1, n, starts).max(axis=2)
-        return _Climbed(chosen, found[at], times[at], history)
-
-    def _stepped(self, done):
-        self.report(done + 2)
-
-    def _sloped(self, z, tanks):
-        """(values (runs,), slopes) of variables (runs, ...) for the tanks (runs,)."""
-        runs = len(tanks)
-        size = batch_size(self.attacked, runs)
-        parts = [
-            self.slopes(one, at)
-            for one, at in zip(_batches(z, size), _batches({"tanks": tanks}, size))
-            for at in [at["tanks"]]
-        ]
-        value = np.concatenate([np.asarray(f[0][0]) for f in parts])[:runs]
-        slope = {k: np.concatenate([np.asarray(f[1][k]) for f in parts])[:runs] for k in z}
-        return value, slope
+        return _Climbed(chosen, highest[at], times[at], history)
 
 
-def _batches(arrays, size):
-    """[arrays (size, ...)] of arrays (runs, ...), the last row repeated to fill the last batch."""
-    runs = len(next(iter(arrays.values())))
+def _in_batches(function, size, *arrays):
+    """`function` of trees of arrays (runs, ...), `size` runs at a time; the last row is repeated to
+    fill the last batch.
+    """
+    runs = len(jax.tree.leaves(arrays)[0])
     rows = [np.minimum(np.arange(i, i + size), runs - 1) for i in range(0, runs, size)]
-    return [{k: v[r] for k, v in arrays.items()} for r in rows]
+    parts = [function(*jax.tree.map(lambda v, r=r: v[r], arrays)) for r in rows]
+    return jax.tree.map(lambda *v: np.concatenate([np.asarray(p) for p in v])[:runs], *parts)
 
 
-def _drawn(attacked, draws, rng):
+def _points(attacked, draws, rng):
     """{variable: (draws, ...)}: half of the draws at corners of the box, half inside; half of them
     with coefficients and reading errors that are constant in time.
     """
-    found, shapes = {}, attacked.shapes
+    points = {}
     corner, steady = np.arange(draws) % 2 == 0, np.arange(draws) // 2 % 2 == 0
-    for name, shape in shapes.items():
+    for name, shape in attacked.shapes.items():
         z = rng.random((draws, *shape))
-        wide = (-1, *([1] * len(shape)))
         if name == "start":
             z = np.sqrt(z)  # near the limits more often
         elif name == "noise":
-            z = np.where(steady.reshape(wide), 0.5, np.round(z))
+            z = np.where(_wide(steady, z), 0.5, np.round(z))
         else:
-            z = np.where(corner.reshape(wide), np.round(z), z)
+            z = np.where(_wide(corner, z), np.round(z), z)
         if name == "varying":
-            z = np.where(steady.reshape(wide), z[..., :1], z)
-        found[name] = z
-    return found
+            z = np.where(_wide(steady, z), z[..., :1], z)
+        points[name] = z
+    return points
 
 
 SHORTEST = 1 / 64
@@ -326,14 +303,16 @@ def ascend(
     for done in range(iterations):
         if report is not None:
             report(done)
-        tried = {k: _moved(z[k], slope[k], step) for k in z}
-        moves = [np.any(_flat(tried[k]) != _flat(z[k]), axis=1) for k in z]
+        # a slope that is not finite counts as 0
+        signs = {k: np.sign(np.where(np.isfinite(v), v, 0.0)) for k, v in slope.items()}
+        moved = {k: np.clip(v + _wide(step, v) * signs[k], 0.0, 1.0) for k, v in z.items()}
+        moves = [np.any(np.reshape(moved[k] != v, (len(v), -1)), axis=1) for k, v in z.items()]
         active = (step >= SHORTEST) & np.any(moves, axis=0)
         if not active.any():
             break
-        new, new_slope = slopes(tried)
+        new, new_slope = slopes(moved)
         better = active & (new > value)
-        z = {k: np.where(_wide(better, v), tried[k], v) for k, v in z.items()}
+        z = {k: np.where(_wide(better, v), moved[k], v) for k, v in z.items()}
         slope = {k: np.where(_wide(better, v), new_slope[k], v) for k, v in slope.items()}
         value = np.where(better, new, value)
         step = np.where(better, step, 0.5 * step)
@@ -344,13 +323,3 @@ def ascend(
 def _wide(row, like):
     """(runs,) as an array that is multiplied with `like` (runs, ...)."""
     return row.reshape(-1, *([1] * (np.ndim(like) - 1)))
-
-
-def _moved(z, slope, step):
-    """z + step sign(slope), cut to the unit cube; a slope that is not finite counts as 0."""
-    sign = np.sign(np.where(np.isfinite(slope), slope, 0.0))
-    return np.clip(z + _wide(step, z) * sign, 0.0, 1.0)
-
-
-def _flat(rows):
-    return np.reshape(rows, (len(rows), -1))

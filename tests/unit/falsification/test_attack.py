@@ -130,6 +130,7 @@ def test_a_rate_above_its_bound_is_found_out(filtered):
     assert one.passed and one.margin < -0.1
 
 
+@pytest.mark.slow
 def test_a_band_of_0_with_noise_is_found_out(filtered):
     """The limit is passed by the band that the noise needs, 0.06 cm, and no more."""
     found = filtered(noise=0.01, band=0.0)
