@@ -7,12 +7,10 @@ heavy is imported before the arguments are read.
 """
 
 import os
+import shlex
 import sys
 
 from tuning.cli import interrupts, terminal
-
-COMPILES_NOTHING = ("cache", "completion", "list")
-"""Commands that need no compiled programs."""
 
 
 def main(argv=None):
@@ -39,26 +37,23 @@ def main(argv=None):
 
 def _command(argv):
     """Read the arguments and run their command; returns its exit code."""
-    from jaxtank.core.errors import InputError
-    from tuning.cli.values import folder_of
+    from tuning.cli.parser import COMMANDS, arguments
     from tuning.storage.folder_lock import hold
 
-    args = _arguments(argv)
+    try:
+        args = arguments(argv)
+    except SystemExit:  # --help, which may wait in a buffer
+        sys.stdout.flush()
+        raise
     if args.version:
         import jaxtank
 
         print(jaxtank.__version__)
         return 0
-    if args.command is None:
-        raise InputError("no command: try jaxtank --help")
-    folder = folder_of(args)
-    if getattr(args, "resume", None) and not os.path.isdir(folder):
-        raise InputError(
-            f"--resume: {folder!r} cannot be read as a run to go on with: there is no such folder"
-        )
-    if argv is None and args.command not in COMPILES_NOTHING:
+    args.line = shlex.join(["jaxtank", *(sys.argv[1:] if argv is None else argv)])
+    if argv is None and COMMANDS[args.command].compiles:
         _keep_programs(args)
-    with hold(folder, leaving=interrupts.before_leaving):
+    with hold(args.out, leaving=interrupts.before_leaving):
         return args.run(args)
 
 
@@ -81,29 +76,6 @@ def _keep_programs(args):
     why = keep_for_this_process()
     if why and not getattr(args, "quiet", False):
         print(f"jaxtank: note: compiled programs are not kept: {why}", file=sys.stderr)
-
-
-def _arguments(argv):
-    """Parse the words of the command line; `line` keeps the line itself, `top` its parser."""
-    import shlex
-
-    from jaxtank.core.errors import InputError, nearest
-    from tuning.cli.parser import parser
-
-    top = parser()
-    try:
-        args, rest = top.parse_known_args(argv)
-    except SystemExit:  # --help, which may wait in a buffer
-        sys.stdout.flush()
-        raise
-    if rest and not rest[0].startswith("-"):
-        raise InputError(f"unknown argument {rest[0]!r}")
-    if rest:
-        close = nearest(rest[0].split("=")[0], top.options(args.command))
-        raise InputError(f"unknown option {rest[0]!r}{close}")
-    args.line = shlex.join(["jaxtank", *(sys.argv[1:] if argv is None else argv)])
-    args.top = top
-    return args
 
 
 def _failed(error):

@@ -1,7 +1,117 @@
-"""The parser of the command `jaxtank`: each module of commands adds its own."""
+"""The table of commands, and the parser that is made of it."""
 
-from tuning.cli.arguments import Parser, shared
+import argparse
+import sys
+
+from jaxtank.core.errors import InputError, nearest
 from tuning.cli.commands import case, explore, falsification, identification, studies, tools, tuning
+
+COMMANDS = {
+    **case.COMMANDS,
+    **explore.COMMANDS,
+    **tuning.COMMANDS,
+    **studies.COMMANDS,
+    **falsification.COMMANDS,
+    **identification.COMMANDS,
+    **tools.COMMANDS,
+}
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that collects what is wrong with the values, one sentence for each."""
+
+    problems: list[str] = []  # of all parsers
+
+    def error(self, message):
+        """Raise InputError with the message."""
+        raise InputError("; ".join([*self.problems, message]))
+
+    def _get_value(self, action, arg_string):
+        """Return the value of an option; argparse would reword the error of its type."""
+        if not callable(action.type):
+            return arg_string
+        try:
+            return action.type(arg_string)
+        except InputError as error:
+            self.problems.append(str(error))
+        except ValueError as error:
+            self.problems.append(f"{name_of(action)} {arg_string!r}: {error}")
+
+    def _check_value(self, action, value):
+        """Add to the problems a word that is not among the choices."""
+        if action.choices is None or value is None or value in action.choices:
+            return
+        if isinstance(action, argparse._SubParsersAction):
+            self.error(f"unknown command {value!r}{nearest(value, action.choices)}")
+        words = ", ".join(map(str, action.choices))
+        self.problems.append(f"{name_of(action)} {value!r}: must be one of {words}")
+
+    def _print_message(self, message, file=None):
+        """Print help; argparse would ignore an OSError."""
+        (sys.stderr if file is None else file).write(message)
+
+    @property
+    def commands(self):
+        """{name: Parser} of the commands."""
+        groups = (a for a in self._actions if isinstance(a, argparse._SubParsersAction))
+        return next(groups).choices
+
+    def options(self, command=None):
+        """Return {spelling: action} of the options of a command, or of those before any command."""
+        parser = self if command is None else self.commands[command]
+        return {spelling: a for a in parser._actions for spelling in a.option_strings}
+
+
+def name_of(action):
+    """Return the name of an argument in messages."""
+    return action.option_strings[0] if action.option_strings else action.metavar
+
+
+class Once(argparse.Action):
+    """Stores the value of an option that may be given once."""
+
+    def __call__(self, parser, namespace, values, option_string=None):
+        """Store the value; a second one is a problem."""
+        given = vars(namespace).setdefault("given", set())
+        if option_string is not None and self.dest in given:
+            parser.problems.append(f"{option_string} is given twice: give it once")
+        given.add(self.dest)
+        setattr(namespace, self.dest, values)
+
+
+class Pairs(argparse.Action):
+    """Collects (name, value) of an option that may be repeated as {name: value}."""
+
+    def __call__(self, parser, namespace, values, option_string=None):
+        """Add a pair; a name that is there is a problem."""
+        pairs = dict(getattr(namespace, self.dest))
+        name, value = values or (None, None)  # None: a problem of its type
+        if name in pairs:
+            parser.problems.append(f"{option_string} {name} is given twice: give it once")
+        setattr(namespace, self.dest, pairs | {name: value})
+
+
+ACTIONS = {"pairs": (Pairs, {}), "list": ("append", []), "flag": ("store_true", False)}
+ACTIONS |= {"switch": (argparse.BooleanOptionalAction, None), "once": (Once, None)}
+
+
+def add(parser, option):
+    """Add an Option to a parser."""
+    action, default = ACTIONS[option.kind]
+    default = default if option.default is None else option.default
+    text = option.help.replace("%", "%%")
+    if option.default is not None:
+        text += f" (default {option.default})"
+    if option.kind in ("pairs", "list"):
+        text += "; repeatable"
+    words = {"action": action, "help": text, "default": default}
+    if option.kind not in ("flag", "switch"):
+        words |= {"metavar": option.metavar, "type": option.type, "choices": option.choices}
+    if not option.flag.startswith("-"):
+        words |= {"nargs": option.nargs}
+    elif option.dest:
+        words |= {"dest": option.dest}
+    parser.add_argument(option.flag, **words)
 
 
 def parser():
@@ -15,10 +125,42 @@ def parser():
         epilog="Start with: jaxtank list; jaxtank tune gouta2015/backstepping --out tuned",
     )
     top.add_argument("--version", action="store_true", help="print the version and exit")
-    commands, parents = top.add_subparsers(dest="command", metavar="COMMAND"), shared()
-    for module in (case, explore, tuning, studies, falsification, identification, tools):
-        module.add(commands, parents)
-    for one in commands._choices_actions:  # what the list of commands says, where nothing else is
-        own, text = commands.choices[one.dest], one.help or one.dest
-        own.description = own.description or f"{text[0].upper()}{text[1:]}."
+    group = top.add_subparsers(dest="command", metavar="COMMAND")
+    for name, command in COMMANDS.items():
+        sub = group.add_parser(
+            name,
+            help=command.help,
+            description=command.description or f"{command.help[0].upper()}{command.help[1:]}.",
+            epilog=command.epilog,
+            formatter_class=argparse.RawDescriptionHelpFormatter
+            if "\n" in command.epilog
+            else argparse.HelpFormatter,
+        )
+        for option in command.options:
+            add(sub, option)
+        sub.set_defaults(run=command.run)
     return top
+
+
+def arguments(argv):
+    """Return the Namespace of the words of a command line; InputError with all that is wrong."""
+    top = parser()
+    Parser.problems = []
+    args, rest = top.parse_known_args(argv)
+    if rest and not rest[0].startswith("-"):
+        top.error(f"unknown argument {rest[0]!r}")
+    if rest:
+        close = nearest(rest[0].split("=")[0], top.options(args.command))
+        top.error(f"unknown option {rest[0]!r}{close}")
+    if args.command is None and not args.version:
+        top.error("no command: try jaxtank --help")
+    resume, out = getattr(args, "resume", None), getattr(args, "out", None)
+    if resume and out and resume != out:
+        Parser.problems.append(
+            "--resume and --out name different folders: a run is continued in its own"
+        )
+    if Parser.problems:
+        raise InputError("; ".join(Parser.problems))
+    args.out = resume or out
+    args.resumed = resume is not None
+    return args

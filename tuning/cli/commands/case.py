@@ -7,86 +7,9 @@ from pathlib import Path
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import write_folder
-from tuning.cli.arguments import option
-from tuning.cli.options import report_written
-from tuning.cli.values import open_case
-
-
-def add(commands, parents):
-    """Add the commands of this module to the parser's `commands`."""
-    common, case, run = parents
-    one = commands.add_parser("list", parents=[common], help="print every case")
-    one.set_defaults(run=list_cases)
-    one = commands.add_parser(
-        "show",
-        parents=[common, case],
-        help="one case: rig, controller, every parameter, published numbers, departures",
-    )
-    one.set_defaults(run=show)
-    option(one, "--out", "DIR", "folder for rig.png and rig.svg, the rig drawn from its topology")
-    one = commands.add_parser(
-        "simulate",
-        parents=[common, case, run],
-        help="one run: measures; with --out its trajectory, pictures and report.html",
-    )
-    one.set_defaults(run=simulate)
-    one.add_argument(
-        "others",
-        nargs="*",
-        metavar="CASE",
-        help="further cases, on one page and in one table with the first: under its disturbances,"
-        " faults and noise",
-    )
-    one.add_argument(
-        "--gif",
-        action="store_true",
-        help="with --out also run.gif, the tanks of the rig filling and emptying, and film.png with"
-        " four of its pictures",
-    )
-    option(
-        one,
-        "--against",
-        "CASE",
-        "with --gif: a second case or rig file, as it is, beside the first in the film",
-    )
-    text = "with --out also print.svg and print.png (300 dpi): the run in the width of one or two"
-    option(one, "--columns", "N", f"{text} columns of a journal: 1 or 2")
-    one.add_argument(
-        "--margins",
-        action="store_true",
-        help="also print the stability margins of the linearised loop at each plateau of the"
-        " reference",
-    )
-    _add_init(commands, [common, case])
-    _add_export(commands, [common, case])
-
-
-def _add_init(commands, parents):
-    one = commands.add_parser(
-        "init",
-        parents=parents,
-        help="print a complete rig file to edit: every key, its unit and range",
-    )
-    one.set_defaults(run=init)
-    one.add_argument(
-        "--short", action="store_true", help="only what differs from the preset, and what is tuned"
-    )
-    one.add_argument(
-        "--tanks", action="store_true", help="described tank by tank, without its preset"
-    )
-
-
-def _add_export(commands, parents):
-    one = commands.add_parser(
-        "export",
-        parents=parents,
-        help="the controller and its observer as one C99 or JavaScript file or MATLAB function",
-    )
-    one.set_defaults(run=export)
-    option(one, "--lang", "LANG", "c (default), m or js", "c")
-    option(one, "--precision", "TYPE", "double (default) or float, of C", "double")
-    option(one, "--name", "NAME", "of the functions (default: the case's)")
-    option(one, "--out", "DIR", "folder for the file (default: print it)")
+from tuning.cli import values
+from tuning.cli.options import CASE, COMMON, RUN, Command, Option
+from tuning.cli.steps import note, open_case, print_result, report_written
 
 
 def list_cases(args):
@@ -95,8 +18,7 @@ def list_cases(args):
     from tuning.report import tables
 
     cases = {f"{p}/{n}": c.title for p in presets.PAPERS for n, c in presets.load(p).cases.items()}
-    rows = [[name, title] for name, title in cases.items()]
-    print(tables.dumps(cases) if args.json else tables.table(rows, ["case", ""]))
+    print_result(args, cases, lambda: tables.table(cases.items(), ["case", ""]))
     return 0
 
 
@@ -105,10 +27,10 @@ def show(args):
     case = open_case(args)
     from tuning.report import case as manual
     from tuning.report.document import terminal
-    from tuning.report.tables import dumps
 
     written = _draw_rig(case, Path(args.out)) if args.out else []
-    print(dumps(manual.json_of(case)) if args.json else terminal(manual.report(case)))
+    payload = manual.json_of(case) if args.json else None
+    print_result(args, payload, lambda: terminal(manual.report(case)))
     report_written(written, args)
     return 0
 
@@ -121,23 +43,27 @@ def _draw_rig(case, folder):
     from tuning.report.folder import pngs
 
     try:
-        drawn = rig(case.loop.plant, None, case.name)
-        alone = {f"{name}.svg": html.alone(figure, name) for name, figure in drawn.items()}
+        figures = rig(case.loop.plant, None, case.name)
+        pages = {f"{name}.svg": html.alone(figure, name) for name, figure in figures.items()}
     except Exception as error:
         failed("rig", error)
         for name in ("rig.svg", "rig.png"):
             (folder / name).unlink(missing_ok=True)
         return []
-    return write_folder(folder, alone | pngs(drawn))
+    return write_folder(folder, pages | pngs(figures))
 
 
 def simulate(args):
     """Run a case once and print its measures; with --out write the run."""
+    needs = {"--gif": (args.gif, args.out, "--out DIR, where run.gif is written")}
+    needs["--columns"] = (args.columns, args.out, "--out DIR, where print.svg and .png are written")
+    needs["--against"] = (args.against, args.gif, "--gif, the film of both cases")
+    for flag, (value, other, what) in needs.items():
+        if value and not other:
+            raise InputError(f"{flag} needs {what}")
     if args.others:
-        return _together(args)
-    columns = _checked_columns(args)
-    seed, case = args.seed, open_case(args)
-    other = None if args.against is None else _other(args.against)
+        return _simulate_together(args)
+    case, second = open_case(args), None if args.against is None else _second_case(args.against)
     import jax
 
     from jaxtank.loop import run
@@ -148,52 +74,47 @@ def simulate(args):
     from tuning.report import simulated, tables
     from tuning.report.document import terminal
 
-    key = jax.random.key(seed) if noisy(case) else None
-    of_run = halving_warnings(case.loop, case.clock, key)
-    values = dict(reported.run_measures(case.loop, case.clock, key))
-    of_run += _of_run(case, values, key)
-    for sentence in [] if args.quiet else of_run:
-        print(f"jaxtank: note: {sentence}", file=sys.stderr)
+    key_of = lambda case: jax.random.key(args.seed) if noisy(case) else None
+    key = key_of(case)
+    sentences = halving_warnings(case.loop, case.clock, key)
+    measures = dict(reported.run_measures(case.loop, case.clock, key))
+    for sentence in [*sentences, *_notes_on_run(case, measures, key)]:
+        note(args, sentence)
     plateaus = stability_margins(case.loop, case.clock) if args.margins else None
-    values |= reported.margin_measures(case.loop, case.clock) if args.margins else {}
+    measures |= reported.margin_measures(case.loop, case.clock) if args.margins else {}
     payload = {
         "case": case.name,
-        "measures": tables.measures_json(values),
+        "measures": tables.measures_json(measures),
         "units": tables.units(case.loop.units),
-        "reasons": tables.reasons(values),
+        "reasons": tables.reasons(measures),
         "clock": dataclasses.asdict(case.clock),
         "parameters": tables.clean(run.parameters(case.loop)),
-        "provenance": provenance.provenance(case, seed),
+        "provenance": provenance.provenance(case, args.seed),
     }
     if plateaus is not None:
         payload["margins"] = simulated.margins_json(plateaus)
+    page = lambda *figures: simulated.report(case, measures, plateaus, *figures)
     written = []
     if args.out:
         trajectory = simulated.run_for_people(case, key)
-        page = lambda drawn: simulated.report(case, values, plateaus, drawn)
-        beside = None
-        if other is not None:
-            noise = jax.random.key(seed) if noisy(other) else None
-            beside = (other, simulated.run_for_people(other, noise))
+        beside = second and (second, simulated.run_for_people(second, key_of(second)))
+        columns = args.columns and int(args.columns)
         written = simulated.save(
             case, trajectory, payload, args.out, page, args.line, args.gif, beside, columns
         )
-    if args.json:
-        print(tables.dumps(payload))
-    else:
-        print(terminal(simulated.report(case, values, plateaus)))
+    print_result(args, payload, lambda: terminal(page()))
     report_written(written, args)
     return 0
 
 
-def _of_run(case, values, key):
+def _notes_on_run(case, measures, key):
     """Sentences on levels that fell below 0 in the run of these measures, and on its estimates."""
     import numpy as np
 
     from jaxtank.loop import estimate_notes, tank_bottom
     from jaxtank.loop.saved_rows import simulate_compiled
 
-    below = np.any(np.asarray(values["min_level"]) < tank_bottom.lower_bounds(case.loop.plant))
+    below = np.any(np.asarray(measures["min_level"]) < tank_bottom.lower_bounds(case.loop.plant))
     if not below and not estimate_notes.needs_run(case.loop):
         return []
     run, _ = simulate_compiled(case.loop, case.clock, key, 1)
@@ -201,42 +122,25 @@ def _of_run(case, values, key):
     return below + estimate_notes.estimate_notes(case.loop, run)
 
 
-def _checked_columns(args):
-    """The number of --columns, None without; InputError for options that do not fit together."""
-    if args.gif and not args.out:
-        raise InputError("--gif needs --out DIR, where run.gif is written")
-    if args.columns not in (None, "1", "2"):
-        raise InputError(f"--columns {args.columns}: must be 1 or 2")
-    if args.columns is not None and not args.out:
-        raise InputError("--columns needs --out DIR, where print.svg and print.png are written")
-    if args.against is not None and not args.gif:
-        raise InputError("--against needs --gif, the film in which the second case stands")
-    return None if args.columns is None else int(args.columns)
-
-
-def _together(args):
+def _simulate_together(args):
     """Run several cases under the same conditions; one table, and with --out one page."""
-    alone = {"--gif": args.gif, "--margins": args.margins, "--columns": args.columns}
-    alone["--against"] = args.against
-    for flag, given in alone.items():
-        if given:
-            raise InputError(f"{flag}: of one case alone, and {1 + len(args.others)} are given")
-    seed, names = args.seed, [args.case, *args.others]
+    names = [args.case, *args.others]
+    for flag in ("gif", "margins", "columns", "against"):
+        if getattr(args, flag):
+            raise InputError(f"--{flag}: of one case alone, and {len(names)} are given")
     cases = [open_case(argparse.Namespace(**{**vars(args), "case": name})) for name in names]
-    from tuning.report import tables, together
+    from tuning.report import together
     from tuning.report.document import terminal
 
-    runs = together.run_together(cases, seed)
-    written = together.save(runs, args.out, seed, args.line) if args.out else []
-    if args.json:
-        print(tables.dumps(together.json_of(runs, seed)))
-    else:
-        print(terminal(together.report(runs)))
+    runs = together.run_together(cases, args.seed)
+    written = together.save(runs, args.out, args.seed, args.line) if args.out else []
+    payload = together.json_of(runs, args.seed) if args.json else None
+    print_result(args, payload, lambda: terminal(together.report(runs)))
     report_written(written, args)
     return 0
 
 
-def _other(name):
+def _second_case(name):
     """The second case of a film; InputError where it is none, or cannot be drawn."""
     from jaxtank import rig
 
@@ -254,13 +158,9 @@ def init(args):
         )
     case = open_case(args)
     from jaxtank import rig
-    from tuning.report import tables
 
     text = rig.short(case) if args.short else rig.complete(case, tankwise=args.tanks)
-    if args.json:
-        print(tables.dumps({"case": case.name, "rig": text}))
-    else:
-        sys.stdout.write(text)
+    _print_source(args, {"case": case.name, "rig": text}, text)
     return 0
 
 
@@ -269,15 +169,74 @@ def export(args):
     case = open_case(args)
     from jaxtank.export import source
     from jaxtank.export.printer import function_name
-    from tuning.report import tables
 
     text = source.export(case, args.lang, args.precision, args.name)
     name = args.name or function_name(case)
-    if args.json:
-        print(tables.dumps({"case": case.name, "lang": args.lang, "name": name, "source": text}))
+    if args.json or not args.out:
+        payload = {"case": case.name, "lang": args.lang, "name": name, "source": text}
+        _print_source(args, payload, text)
     if args.out:
-        written = write_folder(Path(args.out), {f"{name}.{args.lang}": text})
-        report_written(written, args)
-    elif not args.json:
-        sys.stdout.write(text)
+        report_written(write_folder(Path(args.out), {f"{name}.{args.lang}": text}), args)
     return 0
+
+
+def _print_source(args, payload, text):
+    """Print a JSON object under --json, else the text as it is."""
+    if args.json:
+        print_result(args, payload, str)
+    else:
+        sys.stdout.write(text)
+
+
+# fmt: off
+COMMANDS = {
+    "list": Command(list_cases, "print every case", COMMON, compiles=False),
+    "show": Command(
+        show,
+        "one case: rig, controller, every parameter, published numbers, departures",
+        (
+            *COMMON, *CASE,
+            Option("--out", "DIR", "folder for rig.png and rig.svg, the rig drawn from its"
+                   " topology", values.folder),
+        ),
+    ),
+    "simulate": Command(
+        simulate,
+        "one run: measures; with --out its trajectory, pictures and report.html",
+        (
+            *COMMON, *CASE, *RUN,
+            Option("others", "CASE", "further cases, on one page and in one table with the first:"
+                   " under its disturbances, faults and noise", nargs="*"),
+            Option("--gif", help="with --out also run.gif, the tanks of the rig filling and"
+                   " emptying, and film.png with four of its pictures", kind="flag"),
+            Option("--against", "CASE", "with --gif: a second case or rig file, as it is, beside"
+                   " the first in the film"),
+            Option("--columns", "N", "with --out also print.svg and print.png (300 dpi): the run in"
+                   " the width of one or two columns of a journal: 1 or 2", choices=("1", "2")),
+            Option("--margins", help="also print the stability margins of the linearised loop at"
+                   " each plateau of the reference", kind="flag"),
+        ),
+    ),
+    "init": Command(
+        init,
+        "print a complete rig file to edit: every key, its unit and range",
+        (
+            *COMMON, *CASE,
+            Option("--short", help="only what differs from the preset, and what is tuned",
+                   kind="flag"),
+            Option("--tanks", help="described tank by tank, without its preset", kind="flag"),
+        ),
+    ),
+    "export": Command(
+        export,
+        "the controller and its observer as one C99 or JavaScript file or MATLAB function",
+        (
+            *COMMON, *CASE,
+            Option("--lang", "LANG", "c, m or js", default="c"),
+            Option("--precision", "TYPE", "double or float, of C", default="double"),
+            Option("--name", "NAME", "of the functions (default: the case's)"),
+            Option("--out", "DIR", "folder for the file (default: print it)", values.folder),
+        ),
+    ),
+}
+# fmt: on

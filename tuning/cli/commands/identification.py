@@ -7,232 +7,124 @@ import sys
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import printable
 from tuning.cli import values
-from tuning.cli.arguments import option, repeatable, whole
 from tuning.cli.interrupts import Interrupts, put_back
-from tuning.cli.options import finish, report_unreachable
+from tuning.cli.options import CASE, COMMON, RESUME, RUN, Command, Option
+from tuning.cli.steps import finish, open_case, print_result, report_unreachable
 from tuning.cli.terminal import Line
-from tuning.cli.values import number
 
 LONGEST = 1e7
 """Longest planned experiment [s]: four months."""
+PLANNED = 300.0
+"""Length of a planned experiment [s]."""
 
 STATUS = {"converged": 0, "not_converged": 3, "not_identifiable": 5, "interrupted": 130}
-PLANNED = ("duration", "voltage", "measure")
-"""Options of a planned experiment."""
-
-
-def add(commands, parents):
-    """Add the command to the parser's `commands`."""
-    one = commands.add_parser(
-        "identify",
-        parents=parents,
-        help="plant parameters from experiment data, with intervals; --out DIR writes a rig to"
-        " tune",
-    )
-    one.set_defaults(run=run)
-    _add_data(one)
-    _add_fit(one)
-    _add_plan(one)
-
-
-def _add_data(one):
-    """Options on the experiment data."""
-    text = "experiment data; repeatable: several experiments with first levels each"
-    one.add_argument("--data", action="append", default=[], metavar="CSV", help=text)
-    repeatable(
-        one,
-        "--column",
-        "SLOT=HEADER[;UNIT]",
-        "which column is t, pump1, .., h1, .., where its header is in other words; h3=none: leave"
-        " that level out",
-    )
-    option(one, "--decimal", "SIGN", "decimal sign of the data: . (default) or ,", ".")
-    option(
-        one,
-        "--gap",
-        "X",
-        "longest step between samples, in median steps (default 1.5)",
-        1.5,
-        number,
-    )
-    text = "inputs between samples: zero-order (each until the next row) or first-order (a line)"
-    option(one, "--hold", "HOW", text, "")
-    text = "end of the data that validates a first fit: share, or samples (default 0.25)"
-    option(one, "--hold-back", "SHARE", text, 0.25, number)
-    text = "standard deviation of the readings, one or one per channel (default: from the data)"
-    option(one, "--noise", "SD", text)
-
-
-def _add_fit(one):
-    """Options on what is estimated and how."""
-    repeatable(
-        one,
-        "--free",
-        "NAME=LOW:HIGH",
-        "what to estimate, of plant, sensor, actuator, disturbance (default: pump gains, splits,"
-        " orifices, pipes)",
-    )
-    option(one, "--start", "HOW", "first levels: free (default), measured, or case", "free")
-    option(one, "--starts", "N", "searches (default 8)", 8, whole(1, 1000))
-    text = "evaluations of each search (default 100)"
-    option(one, "--iterations", "N", text, 100, whole(1, 100_000))
-    option(one, "--loss", "NAME", "linear (default), soft_l1 or huber", "linear")
-    text = "write the rig under a controller to tune: pi, with gains from the identified model"
-    option(one, "--law", "KIND", text)
-    one.add_argument(
-        "--profile",
-        action="store_true",
-        help="also: profile likelihood of the least certain parameter",
-    )
-    text = "continue a killed run with --out DIR, to the same result"
-    option(one, "--resume", "DIR", text)
-
-
-def _add_plan(one):
-    """Options on a planned experiment."""
-    one.add_argument(
-        "--plan",
-        action="store_true",
-        help="no data: compare experiments by the standard deviations they would leave",
-    )
-    option(one, "--duration", "S", "of a planned experiment [s] (default 300)", None, number)
-    text = "inputs about which a planned experiment works (default: the case's own)"
-    option(one, "--voltage", "V1,V2", text)
-    option(one, "--measure", "H1,H2", "tanks measured in a planned experiment (default all)")
 
 
 def run(args):
     """Run the command; returns the exit code."""
+    _check_together(args)
     with put_back():
-        case = values.open_case(args)
-        pairs = [values.pair("--free", text, values.span) for text in args.free]
-        free = values.once("--free", pairs)
-        code = _plan(args, case, free) if args.plan else _identify(args, case, free)
+        case = open_case(args)
+        code = _plan(args, case) if args.plan else _identify(args, case)
         sys.stdout.flush()  # the result is out before Ctrl-C ends the program at once again
         return code
 
 
-def _identify(args, case, free):
+def _check_together(args):
+    """Raise InputError for options of a planned experiment beside those of experiment data."""
+    problems = []
+    if args.plan:
+        if args.data:
+            problems.append(
+                "--plan compares experiments before there are data: leave it out to fit --data"
+                f" {args.data[0]!r}"
+            )
+        if args.law:
+            problems.append(f"--plan identifies nothing: leave --law {args.law!r} out")
+        if args.out:
+            problems.append(
+                f"--plan writes no files: leave --out {args.out!r} out (--json prints the result)"
+            )
+    else:
+        for name in ("duration", "voltage", "measure"):
+            if getattr(args, name) is not None:
+                problems.append(f"--{name} belongs to a planned experiment, with --plan")
+        if not args.data:
+            problems.append(
+                "identify needs --data CSV, experiment data of the rig (or --plan, to compare"
+                " experiments before making one)"
+            )
+    if problems:
+        raise InputError("; ".join(problems))
+
+
+def _identify(args, case):
     """Identify, then write and print the result; returns the exit code."""
-    args.out = args.resume or args.out
-    _check_data_given(args)
+    from tuning.identification.csv_log import read_log
     from tuning.identification.fit import identify
 
-    logs = _read(args, case)
-    options = _options(args, logs)
+    columns = dict(case.log) | args.column
+    logs = [read_log(path, case.loop, columns, args.decimal, args.hold) for path in args.data]
+    shortest = min(log.samples for log in logs)
+    if args.hold_back >= shortest:
+        raise InputError(
+            f"--hold-back {args.hold_back}: must be fewer samples than the data have, {shortest}"
+        )
 
     def ready():  # not before: data that are refused get one line
         if not args.quiet:
-            names, samples = ", ".join(one.name for one in logs), sum(one.samples for one in logs)
+            names, samples = ", ".join(log.name for log in logs), sum(log.samples for log in logs)
             print(f"{names}: {samples} samples", file=sys.stderr, flush=True)
             line.compiling("the simulation and its derivatives", 10)
 
     line, interrupts = Line(args.quiet), Interrupts()
-    found = identify(case, logs, free, progress=interrupts.check, ready=ready, **options)
+    result = identify(
+        case,
+        logs,
+        args.free or None,
+        start=args.start,
+        starts=args.starts,
+        seed=args.seed,
+        hold_back=args.hold_back,
+        noise=args.noise,
+        loss=args.loss,
+        profile=args.profile,
+        iterations=args.iterations,
+        gap=args.gap,
+        checkpoint=args.out,
+        resume=args.resumed,
+        progress=interrupts.check,
+        ready=ready,
+        law=args.law,
+    )
     line.end()
-    _report_next(args, found, free, finish(found, args))
-    return interrupts.code if interrupts.stop else STATUS[found.status]
+    _report_next(args, result, finish(result, args))
+    return interrupts.code if interrupts.stop else STATUS[result.status]
 
 
-def _check_data_given(args):
-    """Raise InputError for options of a planned experiment, and without experiment data."""
-    for name in PLANNED:
-        if getattr(args, name) is not None:
-            raise InputError(
-                f"--{name} {getattr(args, name)}: belongs to a planned experiment, with --plan"
-            )
-    if not args.data:
-        raise InputError(
-            "identify needs --data CSV, experiment data of the rig (or --plan, to compare"
-            " experiments before making one)"
-        )
-
-
-def _read(args, case):
-    """Return the Logs of --data."""
-    from tuning.identification.csv_log import read_log
-
-    pairs = [values.pair("--column", text, _column) for text in args.column]
-    columns = dict(case.log) | (values.once("--column", pairs) or {})
-    return [read_log(path, case.loop, columns, args.decimal, args.hold) for path in args.data]
-
-
-def _column(text):
-    """Return HEADER, or (HEADER, UNIT) of HEADER;UNIT."""
-    header, semicolon, unit = text.rpartition(";")
-    return (header.strip(), unit.strip()) if semicolon else text
-
-
-def _options(args, logs):
-    """Return the keyword arguments of `identify`."""
-    if not args.gap >= 1:
-        raise InputError(f"--gap {args.gap:g}: must be at least 1")
-    return {
-        "start": args.start,
-        "starts": args.starts,
-        "seed": args.seed,
-        "hold_back": _hold_back(args, logs),
-        "noise": _noise(args),
-        "loss": args.loss,
-        "profile": args.profile,
-        "iterations": args.iterations,
-        "gap": args.gap,
-        "checkpoint": args.out,
-        "resume": args.resume is not None,
-        "law": args.law,
-    }
-
-
-def _hold_back(args, logs):
-    """Return the share, or number of samples, of the validation set."""
-    hold = args.hold_back
-    if not 0 <= hold < min(one.samples for one in logs) or (hold >= 1 and hold != int(hold)):
-        raise InputError(
-            f"--hold-back {hold:g}: must be a share from 0 to below 1, or a whole number"
-            " of samples, fewer than the data have"
-        )
-    return hold if hold < 1 else int(hold)
-
-
-def _noise(args):
-    """Return --noise: a standard deviation, a list of them, or None."""
-    if args.noise is None:
-        return None
-    noise = values.parse_value(args.noise, "--noise")
-    entries = noise if isinstance(noise, list) else [noise]
-    if not entries or any(isinstance(v, (str, bool)) or not v > 0 for v in entries):
-        raise InputError(
-            f"--noise {args.noise!r}: must be a number above 0, or [SD1,SD2,...], one per channel"
-        )
-    return noise
-
-
-def _report_next(args, found, free, written):
+def _report_next(args, result, written):
     """Print on stderr why no rig is written, or what to do with the one that is."""
     from tuning.report.identification import not_identifiable
 
     if written:
-        report_unreachable(found.identified, written, args)
-    if found.directions and not found.identifiable:
-        names = "; ".join(not_identifiable(d) for d in found.directions)
+        report_unreachable(result.identified, written, args)
+    rig_written = any(path.name == "rig.toml" for path in written)
+    if result.directions and not result.identifiable:
+        names = "; ".join(not_identifiable(d) for d in result.directions)
         print(
             f"jaxtank: {printable(', '.join(args.data))}: not identifiable from these data:"
-            f" {names}: no rig is written; {_advice(found, free)}",
+            f" {names}: no rig is written; {_advice(result, args.free)}",
             file=sys.stderr,
         )
-    elif (
-        any(path.name == "rig.toml" for path in written)
-        and found.status == "converged"
-        and not args.quiet
-    ):
-        print(_next_command(found, f"{printable(args.out.rstrip('/'))}/rig.toml"), file=sys.stderr)
+    elif rig_written and result.status == "converged" and not args.quiet:
+        print(_next_command(result, f"{printable(args.out.rstrip('/'))}/rig.toml"), file=sys.stderr)
 
 
-def _next_command(found, file):
+def _next_command(result, file):
     """Return what to do with the rig that was written to `file`."""
-    case, why = found.proposed
+    case, why = result.proposed
     if why:
-        return f"jaxtank: {file}: note: --law {found.law}: {why}"
+        return f"jaxtank: {file}: note: --law {result.law}: {why}"
     if case.free:
         return f"go on with: jaxtank tune {file} --robust cvar"
     return (
@@ -241,11 +133,11 @@ def _next_command(found, file):
     )
 
 
-def _advice(found, free):
+def _advice(result, free):
     """Return what to do about parameters that are not identifiable from the data."""
-    directions = [list(d["parameters"]) for d in found.directions]
-    alone = [names[0] for names in directions if len(names) == 1 and names[0] in found.parameters]
-    if free is None:
+    directions = [list(d["parameters"]) for d in result.directions]
+    alone = [names[0] for names in directions if len(names) == 1 and names[0] in result.parameters]
+    if not free:
         which = f"all but {', '.join(alone)}" if alone else "fewer than by default"
         return (
             f"choose with --free NAME=LOW:HIGH what to estimate ({which}), or use data that excite"
@@ -256,48 +148,28 @@ def _advice(found, free):
     return "free fewer, or use data that excite them"
 
 
-def _plan(args, case, free):
+def _plan(args, case):
     """Compare experiments and print the result; returns the exit code."""
-    _check_plan(args)
+    levels, voltage, noise = _measured(args, case), _voltage(args, case), args.noise
     from tuning.identification.design import compare_experiments, most_informative
     from tuning.report import tables
     from tuning.report.document import terminal
     from tuning.report.identification import plan_report
 
-    duration = 300.0 if args.duration is None else args.duration
-    if not 0 < duration <= LONGEST:
-        raise InputError(f"--duration {duration:g}: must be above 0 s and at most {LONGEST:g} s")
-    plan = {
-        "duration": duration,
-        "dt": duration / 300,
-        "levels": _measured(args, case),
-        "voltage": _voltage(args, case),
-        "noise": _planned_noise(args, case),
-    }
-    found = compare_experiments(case, free, start="known", **plan)
-    best = most_informative(found)
-    if not args.json:
-        print(terminal(plan_report(case, found, best, plan)))
-        return 0
-    given = {n: plan[n] for n in ("noise", "duration", "dt")}
-    result = {"case": case.name, **given, "experiments": found, "most_informative": best}
-    print(tables.dumps(tables.clean(result)))
+    if isinstance(noise, list):
+        raise InputError(f"--noise {noise}: must be one number with --plan")
+    if noise is None:  # the case's, or 0.5 % of the rim
+        largest = max(map(float, case.loop.sensor.noise))
+        noise = largest or 0.005 * max(map(float, case.loop.plant.rim))
+    duration = args.duration or PLANNED
+    plan = {"noise": float(noise), "duration": duration, "dt": duration / 300}
+    settings = plan | {"levels": levels, "voltage": voltage}
+    experiments = compare_experiments(case, args.free or None, start="known", **settings)
+    best = most_informative(experiments)
+    payload = {"case": case.name, **plan, "experiments": experiments, "most_informative": best}
+    text = lambda: terminal(plan_report(case, experiments, best, settings))
+    print_result(args, tables.clean(payload), text)
     return 0
-
-
-def _check_plan(args):
-    """Raise InputError for options that are not of a planned experiment."""
-    if args.data:
-        raise InputError(
-            "--plan compares experiments before there are data: leave it out to fit --data"
-            f" {args.data[0]!r}"
-        )
-    if args.law:
-        raise InputError(f"--plan identifies nothing: leave --law {args.law!r} out")
-    if args.out:
-        raise InputError(
-            f"--plan writes no files: leave --out {args.out!r} out (--json prints what it found)"
-        )
 
 
 def _measured(args, case):
@@ -305,35 +177,76 @@ def _measured(args, case):
     if not args.measure:
         return None
     names = [f"h{i + 1}" for i in range(case.loop.plant.tanks)]
-    words = [word.strip() for word in args.measure.split(",")]
-    for word in words:
-        if word not in names:
-            raise InputError(f"--measure {word!r}: must be among {', '.join(names)}")
-    return sorted({names.index(word) for word in words})
+    for name in args.measure:
+        if name not in names:
+            raise InputError(f"--measure {name!r}: must be among {', '.join(names)}")
+    return sorted({names.index(name) for name in args.measure})
 
 
 def _voltage(args, case):
     """Return the inputs of --voltage, or None for the case's own."""
     if args.voltage is None:
         return None
-    voltage = [number("--voltage", text) for text in args.voltage.split(",")]
     high = [float(v) for v in case.loop.actuator.high]
-    if len(voltage) != len(high) or not all(0 < v <= top for v, top in zip(voltage, high)):
+    inside = len(args.voltage) == len(high) and all(
+        0 < v <= top for v, top in zip(args.voltage, high)
+    )
+    if not inside:
         raise InputError(
-            f"--voltage {args.voltage!r}: must be {len(high)} numbers above 0 and at most"
+            f"--voltage {args.voltage}: must be {len(high)} numbers above 0 and at most"
             f" {', '.join(f'{v:g}' for v in high)} {case.loop.units[1]}"
         )
-    return voltage
+    return args.voltage
 
 
-def _planned_noise(args, case):
-    """Return the standard deviation of the readings: given, the case's, or 0.5 % of the rim."""
-    if args.noise:
-        noise = number("--noise", args.noise)
-    else:
-        noise = max(map(float, case.loop.sensor.noise)) or 0.005 * max(
-            map(float, case.loop.plant.rim)
-        )
-    if not noise > 0:
-        raise InputError(f"--noise {args.noise!r}: must be above 0")
-    return noise
+# fmt: off
+DATA = (
+    Option("--data", "CSV", "experiment data; several experiments have first levels each",
+           kind="list"),
+    Option("--column", "SLOT=HEADER[;UNIT]", "which column is t, pump1, .., h1, .., where its"
+           " header is in other words; h3=none: leave that level out", values.pair(values.column),
+           kind="pairs"),
+    Option("--decimal", "SIGN", "decimal sign of the data: . or ,", default=".", choices=".,"),
+    Option("--gap", "X", "longest step between samples, in median steps",
+           values.above(1, including=True), 1.5),
+    Option("--hold", "HOW", "inputs between samples: zero-order (each until the next row) or"
+           " first-order (a line)", default=""),
+    Option("--hold-back", "SHARE", "end of the data that validates a first fit: share, or samples",
+           values.held_back, 0.25),
+    Option("--noise", "SD", "standard deviation of the readings, one or one per channel (default:"
+           " from the data)", values.deviations),
+)
+FIT = (
+    Option("--free", "NAME=LOW:HIGH", "what to estimate, of plant, sensor, actuator, disturbance"
+           " (default: pump gains, splits, orifices, pipes)", values.pair(values.span),
+           kind="pairs"),
+    Option("--start", "HOW", "first levels: free, measured, or case", default="free",
+           choices=("free", "measured", "case")),
+    Option("--starts", "N", "searches", values.whole(1, 1000), 8),
+    Option("--iterations", "N", "evaluations of each search", values.whole(1, 100000), 100),
+    Option("--loss", "NAME", "linear, soft_l1 or huber", default="linear",
+           choices=("linear", "soft_l1", "huber")),
+    Option("--law", "KIND", "write the rig under a controller to tune: pi, with gains from the"
+           " identified model", choices=("pi",)),
+    Option("--profile", help="also: profile likelihood of the least certain parameter",
+           kind="flag"),
+    RESUME,
+)
+PLAN = (
+    Option("--plan", help="no data: compare experiments by the standard deviations they would"
+           " leave", kind="flag"),
+    Option("--duration", "S", f"of a planned experiment [s] (default {PLANNED:g})",
+           values.above(0, LONGEST)),
+    Option("--voltage", "V1,V2", "inputs about which a planned experiment works (default: the"
+           " case's own)", values.numbers),
+    Option("--measure", "H1,H2", "tanks measured in a planned experiment (default all)",
+           values.names),
+)
+# fmt: on
+COMMANDS = {
+    "identify": Command(
+        run,
+        "plant parameters from experiment data, with intervals; --out DIR writes a rig to tune",
+        (*COMMON, *CASE, *RUN, *DATA, *FIT, *PLAN),
+    )
+}

@@ -1,24 +1,22 @@
 """`jaxtank tune`: gains under limits, for the scenarios of the case or for many drawn plants."""
 
-import argparse
 import contextlib
 import sys
 from typing import Any
 
 from jaxtank.core.errors import InputError
-from tuning.cli.arguments import on_cluster, option, repeatable, uncertain, whole
+from tuning.cli import values
 from tuning.cli.interrupts import Interrupts, put_back
-from tuning.cli.options import (
-    choices_of,
+from tuning.cli.options import CASE, CLUSTER, COMMON, RESUME, RUN, UNCERTAIN, Command, Option
+from tuning.cli.steps import (
     distributions_of,
     finish,
     limits_of,
+    open_case,
     report_unreachable,
     scenarios_of,
-    tradeoff_of,
 )
 from tuning.cli.terminal import Line
-from tuning.cli.values import number, once, open_case, pair, span
 
 
 class Progress(Interrupts):
@@ -62,95 +60,6 @@ CODES = """exit codes:
 EXIT = {"converged": 0, "not_converged": 3, "infeasible": 4, "interrupted": 130}
 
 
-def add(commands, parents):
-    """Add the command to the parser's `commands`."""
-    one = commands.add_parser(
-        "tune",
-        parents=[*parents, uncertain(), on_cluster()],
-        help="tune the gains of a case under its limits",
-        epilog=CODES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    one.set_defaults(run=tune)
-    _add_problem(one)
-    _add_search(one)
-    _add_robust(one)
-
-
-def _add_problem(one):
-    """Options on what is tuned, under which limits, and judged by which runs."""
-    text = "a parameter to tune; replaces those of the case"
-    repeatable(one, "--free", "NAME=LOW:HIGH", text)
-    text = "a hard limit; MEASURE=none drops one, none drops all"
-    repeatable(one, "--limit", "MEASURE=VALUE", text)
-    text = (
-        "a term of the objective, which is minimised (default: that of a rig file's [objective],"
-        " else squared error + a price on changes of the inputs; --nominal: that of the case)"
-    )
-    repeatable(one, "--objective", "MEASURE=WEIGHT", text)
-    repeatable(
-        one,
-        "--scenario",
-        "NAME=VALUE[;NAME=VALUE]",
-        'a run to tune for, as "sensor.noise=0.05;plant.pump_gain=x0.8" (x0.8: 0.8 times the value'
-        " of the case); replaces those of the case; none: the case's own run",
-    )
-    text = (
-        "a static number or text to try the values of; controller.kind=pid,lqi: the controllers"
-        " that a rig file may name, each with gains and ranges of its own"
-    )
-    repeatable(one, "--choose", "NAME=V1,V2", text)
-    text = "validation plants (default 256; --nominal: 64, 0 for none)"
-    option(one, "--validation", "N", text, None, whole(0, 100_000))
-    text = (
-        "first make the smallest design change of one kind (setpoints, rims, orifices, pumps or"
-        " ramps) with which 95 % of the plants can hold the setpoints (ramps: with which the"
-        " nominal run keeps its limits)"
-    )
-    option(one, "--mend", "KIND", text.replace("%", "%%"))
-    one.add_argument(
-        "--nominal",
-        action="store_true",
-        help="the optimum of the case as it is, with its own objective: its own run or scenarios,"
-        " without adding noise, plants or a filter; implied by"
-        " --scenario, --method, --screening, --batch, --choose, --tradeoff, --bound",
-    )
-    text = "also: the best objective for N (6) values of one limit"
-    option(one, "--tradeoff", "MEASURE=LOW:HIGH[:N]", text)
-    one.add_argument(
-        "--bound",
-        action="store_true",
-        help="also: the best open-loop inputs found, with perfect information",
-    )
-
-
-def _add_search(one):
-    """Options on how the search runs."""
-    text = "auto (default), trf, coarse-trf, slsqp, lbfgs or adam"
-    option(one, "--method", "NAME", text, "auto")
-    text = "local searches at most, until two agree (default 4; --nominal: 8)"
-    option(one, "--starts", "N", text, None, whole(1, 1000))
-    text = "Sobol points of --nominal (default 64)"
-    option(one, "--screening", "N", text, None, whole(1, 65536))
-    text = "iterations of each local search (default 40; --nominal: 60)"
-    option(one, "--iterations", "N", text, None, whole(1, 100_000))
-    text = "scenarios drawn for each step of method adam (default all)"
-    option(one, "--batch", "N", text, None, whole(1, 100_000))
-    text = "go on where a killed run with --out DIR ended, to the same answer"
-    option(one, "--resume", "DIR", text)
-
-
-def _add_robust(one):
-    """Options on many plants at once."""
-    text = "many drawn plants at once: mean, cvar or worst of their costs, limits kept on every one"
-    option(one, "--robust", "RISK", text)
-    option(one, "--samples", "N", "plants of --robust (default 64)", None, whole(2, 100_000))
-    text = "validation plants of --robust (default 1024)"
-    option(one, "--fresh", "N", text, None, whole(1, 100_000))
-    text = "constraint tightening of --robust, as a share of each limit; validation is without it"
-    option(one, "--back-off", "SHARE", text, None, number)
-
-
 def tune(args):
     """`_tune`, with the handler of SIGINT put back afterwards."""
     with put_back():
@@ -164,7 +73,7 @@ def _tune(args):
     seed, case = args.seed, open_case(args)
     from tuning.report import tables
 
-    task, sweep = _task(args, case, seed), tradeoff_of(args)
+    task, sweep = _task(args, case, seed), args.tradeoff
     if sweep:  # before the search, which would be in vain
         _check_tradeoff(case, task, sweep)
     finder, case, own = _finder(args, case, task)
@@ -196,12 +105,9 @@ def _task(args, case, seed) -> dict[str, Any]:
     """What is tuned, under which limits, for which runs: keywords of `tuning.tune`."""
     from jaxtank.rig import check_objective
 
-    free = once("--free", [pair("--free", text, span) for text in args.free])
-    weights = [pair("--objective", t, lambda v: number("--objective", v)) for t in args.objective]
-    objective = once("--objective", weights)
     return {
-        "free": free,
-        "objective": check_objective(objective) if objective else objective,
+        "free": args.free or None,
+        "objective": check_objective(args.objective) if args.objective else None,
         "limits": limits_of(args, case),
         "scenarios": scenarios_of(args),
         "seed": seed,
@@ -221,7 +127,7 @@ def _check_tradeoff(case, task, sweep):
 
 def _finder(args, case, task):
     """(function that tunes, case, its own keywords): `tune`, or `tune_robust` under --robust."""
-    choices, varied = choices_of(args), _varied(args, case)
+    choices, varied = args.choose or None, _varied(args, case)
     if args.robust is None:
         if any(value is not None for value in (args.samples, args.fresh, args.back_off)):
             raise InputError("--samples, --fresh and --back-off of tune belong to --robust")
@@ -319,3 +225,63 @@ def _besides(args, case, result, task, sweep, progress):
         found = bound(result.tuned, task["objective"], task["limits"], progress=progress.check)
         result = result.replace(bound=found)
     return result
+
+
+# fmt: off
+PROBLEM = (
+    Option("--free", "NAME=LOW:HIGH", "a parameter to tune; replaces those of the case",
+           values.pair(values.span), kind="pairs"),
+    Option("--limit", "MEASURE=VALUE", "a hard limit; MEASURE=none drops one, none drops all",
+           values.limit, kind="pairs"),
+    Option("--objective", "MEASURE=WEIGHT", "a term of the objective, which is minimised (default:"
+           " that of a rig file's [objective], else squared error + a price on changes of the"
+           " inputs; --nominal: that of the case)", values.pair(values.number), kind="pairs"),
+    Option("--scenario", "NAME=VALUE[;NAME=VALUE]", "a run to tune for, as"
+           ' "sensor.noise=0.05;plant.pump_gain=x0.8" (x0.8: 0.8 times the value of the case);'
+           " replaces those of the case; none: the case's own run", values.scenario, kind="list"),
+    Option("--choose", "NAME=V1,V2", "a static number or text to try the values of;"
+           " controller.kind=pid,lqi: the controllers that a rig file may name, each with gains and"
+           " ranges of its own", values.pair(values.candidates), kind="pairs"),
+    Option("--validation", "N", "validation plants (default 256; --nominal: 64, 0 for none)",
+           values.whole(0, 100000)),
+    Option("--mend", "KIND", "first make the smallest design change of one kind (setpoints, rims,"
+           " orifices, pumps or ramps) with which 95 % of the plants can hold the setpoints (ramps:"
+           " with which the nominal run keeps its limits)",
+           choices=("setpoints", "rims", "orifices", "pumps", "ramps")),
+    Option("--nominal", help="the optimum of the case as it is, with its own objective: its own run"
+           " or scenarios, without adding noise, plants or a filter; implied by --scenario,"
+           " --method, --screening, --batch, --choose, --tradeoff, --bound", kind="flag"),
+    Option("--tradeoff", "MEASURE=LOW:HIGH[:N]", "also: the best objective for N (6) values of one"
+           " limit", values.tradeoff),
+    Option("--bound", help="also: the best open-loop inputs found, with perfect information",
+           kind="flag"),
+)
+SEARCH = (
+    Option("--method", "NAME", "auto, trf, coarse-trf, slsqp, lbfgs or adam", default="auto",
+           choices=("auto", "trf", "coarse-trf", "slsqp", "lbfgs", "adam")),
+    Option("--starts", "N", "most local searches, until two agree (default 4; --nominal: 8)",
+           values.whole(1, 1000)),
+    Option("--screening", "N", "Sobol points of --nominal (default 64)", values.whole(1, 65536)),
+    Option("--iterations", "N", "iterations of each local search (default 40; --nominal: 60)",
+           values.whole(1, 100000)),
+    Option("--batch", "N", "scenarios drawn for each step of method adam (default all)",
+           values.whole(1, 100000)),
+    RESUME,
+)
+ROBUST = (
+    Option("--robust", "RISK", "many drawn plants at once: mean, cvar or worst of their costs,"
+           " limits kept on every one", choices=("mean", "cvar", "worst")),
+    Option("--samples", "N", "plants of --robust (default 64)", values.whole(2, 100000)),
+    Option("--fresh", "N", "validation plants of --robust (default 1024)", values.whole(1, 100000)),
+    Option("--back-off", "SHARE", "constraint tightening of --robust, as a share of each limit;"
+           " validation is without it", values.number),
+)
+# fmt: on
+COMMANDS = {
+    "tune": Command(
+        tune,
+        "tune the gains of a case under its limits",
+        (*COMMON, *CASE, *RUN, *UNCERTAIN, *CLUSTER, *PROBLEM, *SEARCH, *ROBUST),
+        epilog=CODES,
+    )
+}
