@@ -40,6 +40,7 @@ def test_an_ensemble_is_two_programs(compiled):
     assert found == {"_run": 1, "_trajectories": 1}
 
 
+@pytest.mark.slow
 def test_the_nominal_optimum_needs_four_large_programs(compiled):
     """Measures to report, derivatives, values of a block of points, values of validation plants. At
     10,241 samples no coarse step is used, and no Jacobian is compiled to judge it.

@@ -19,7 +19,7 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import walk
 from jaxtank.measures import MEASURES, times
-from tuning.cli import main, options
+from tuning.cli import main, steps
 
 HEAD = 'case = "gouta2015/backstepping"\n'
 EIGHT = [
@@ -103,7 +103,7 @@ def test_a_written_rig_that_states_unreachable_is_reported(name, quiet, reported
         presets.find("gouta2015/backstepping"), {"reference.initial": [16.0, 3.0]}
     )
     args = types.SimpleNamespace(out="found/", quiet=quiet)
-    options.report_unreachable(case, [pathlib.Path("found") / name], args)
+    steps.report_unreachable(case, [pathlib.Path("found") / name], args)
     printed = capsys.readouterr().err
     assert (
         printed
@@ -111,7 +111,7 @@ def test_a_written_rig_that_states_unreachable_is_reported(name, quiet, reported
         * f"jaxtank: found/rig.toml: note: {rig.unreachable(case)}; the file says reachable = false"
         " for it\n"
     )
-    options.report_unreachable(
+    steps.report_unreachable(
         presets.find("gouta2015/backstepping"), [pathlib.Path("found") / name], args
     )
     assert capsys.readouterr().err == ""
