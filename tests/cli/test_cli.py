@@ -495,8 +495,7 @@ def test_a_limit_that_cannot_be_met_ends_with_4_and_the_best_of_it(folder):
 
 
 def test_too_few_iterations_end_with_3():
-    words = ("gouta2015/ngpc", *SHORT, *QUICK, *setting("controller.Tp=50"), "--nominal")
-    printed = say("tune", *words, "--json", "--quiet")
+    printed = say("tune", CASE, *SHORT, *QUICK, "--nominal", "--json", "--quiet")
     assert printed.code == 3 and "--iterations" in printed.json["message"]
     assert (printed.json["success"], printed.json["status"]) == (False, "not_converged")
 

@@ -161,6 +161,5 @@ def arguments(argv):
         )
     if Parser.problems:
         raise InputError("; ".join(Parser.problems))
-    args.out = resume or out
-    args.resumed = resume is not None
+    args.out, args.resumed, args.parser = resume or out, resume is not None, top
     return args

@@ -115,10 +115,9 @@ def cache(args):
 def completion(args):
     """Print the completion script of a shell, or the words that complete a line for it."""
     from tuning.cli import completion as shells
-    from tuning.cli.parser import parser
 
     if args.shell == "words":
-        print("\n".join(shells.candidates(parser(), args.words)))
+        print("\n".join(shells.candidates(args.parser, args.words)))
     else:
         sys.stdout.write(shells.script(args.shell))
     return 0
