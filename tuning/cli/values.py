@@ -122,6 +122,10 @@ def span(text):
     return low, high, scale or ("log" if low > 0 else "linear")
 
 
+free_range = pair(span, "NAME=LOW:HIGH")
+"""What reads (name, range) of --free."""
+
+
 def limit(text):
     """Return (measure, limit) of MEASURE=VALUE; ("none", None) of "none"."""
     if text == "none":

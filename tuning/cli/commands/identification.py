@@ -218,7 +218,7 @@ DATA = (
 )
 FIT = (
     Option("--free", "NAME=LOW:HIGH", "what to estimate, of plant, sensor, actuator, disturbance"
-           " (default: pump gains, splits, orifices, pipes)", values.pair(values.span),
+           " (default: pump gains, splits, orifices, pipes)", values.free_range,
            kind="pairs"),
     Option("--start", "HOW", "first levels: free, measured, or case", default="free",
            choices=("free", "measured", "case")),

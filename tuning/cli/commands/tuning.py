@@ -230,7 +230,7 @@ def _besides(args, case, result, task, sweep, progress):
 # fmt: off
 PROBLEM = (
     Option("--free", "NAME=LOW:HIGH", "a parameter to tune; replaces those of the case",
-           values.pair(values.span), kind="pairs"),
+           values.free_range, kind="pairs"),
     Option("--limit", "MEASURE=VALUE", "a hard limit; MEASURE=none drops one, none drops all",
            values.limit, kind="pairs"),
     Option("--objective", "MEASURE=WEIGHT", "a term of the objective, which is minimised (default:"
