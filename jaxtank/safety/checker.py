@@ -842,8 +842,8 @@ def _caps_of_others(rig, i, needed):
     for k in sorted((fed - {i}) & rig.held):
         edges = np.linspace(0.0, rig.limit[k] + rig.band[k], PARTS + 1)
         common = set(rig.gains[k]) & set(gains)
-        asked = sum(rig.gains[k][j][1] / max(gains[j][0], 1e-300) for j in common) * needed
+        total = sum(rig.gains[k][j][1] / max(gains[j][0], 1e-300) for j in common) * needed
         alone = len(gains) == len(rig.gains[k]) == 1
-        yield alone and asked <= _caps(rig, k, edges).min(), f"the cap for tank {k + 1} {stops}"
+        yield alone and total <= _caps(rig, k, edges).min(), f"the cap for tank {k + 1} {stops}"
     for k in sorted({k for f in fed for k in rig.below[f]} & rig.held):
         yield not rig.slope[k] > 0.0, f"the cap for tank {k + 1} {stops}"

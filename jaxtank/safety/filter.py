@@ -264,8 +264,8 @@ class SafetyFilter:
         """(n) least that each level can be until the inputs of this sample end [cm]."""
         below = []
         for i in range(self.least.tanks):
-            drawn = sum(b * lower_clip(-low[j], 0.0) for j, (_, b) in r.pumps[i].items())
-            fastest = lower_clip(drawn - fall(r, i, self.reach[i], self.bottom), 0.0)
+            leaving = sum(b * lower_clip(-low[j], 0.0) for j, (_, b) in r.pumps[i].items())
+            fastest = lower_clip(leaving - fall(r, i, self.reach[i], self.bottom), 0.0)
             least = y[i] - self.band[i] - (hold + self.age) * fastest
             below.append(lower_clip(least, self.bottom[i]))
         return below

@@ -72,10 +72,10 @@ def feasibility(
     --------
     >>> import tuning
     >>> from jaxtank import presets
-    >>> found = tuning.feasibility(presets.find("gouta2015/backstepping"), samples=256)
-    >>> round(found.infeasible_for_any_controller, 1), [p.tank for p in found.plateaus][-1]
+    >>> study = tuning.feasibility(presets.find("gouta2015/backstepping"), samples=256)
+    >>> round(study.infeasible_for_any_controller, 1), [p.tank for p in study.plateaus][-1]
     (0.8, 3)
-    >>> [mend.what for mend in found.mends]
+    >>> [mend.what for mend in study.mends]
     ['setpoints', 'rims', 'orifices']
     """
     check_whole("samples", samples, 2, 2**20)
@@ -83,22 +83,22 @@ def feasibility(
     began = time.perf_counter()
     distributions = spread_of(case) if distributions is None else stated(distributions)
     draws = Draws(case.loop, distributions)
-    drawn = lambda count: Needs(
+    needs_of = lambda count: Needs(
         case, draws.values(probabilities("sobol", draws.dimensions, count, seed)), limits
     )
-    needs = drawn(samples)
+    needs = needs_of(samples)
     excess = needs.excess()
     infeasible = np.any(excess > 0, axis=(1, 2))
     rows = _rows(needs, Needs(case, {}, limits).at()[0], excess)
     middle = time.perf_counter()
-    wanted = mends and np.mean(infeasible) > 1.0 - TARGET
-    found = find_mends(drawn(DESIGN * samples)) if wanted else ()
+    mend = mends and np.mean(infeasible) > 1.0 - TARGET
+    changes = find_mends(needs_of(DESIGN * samples)) if mend else ()
     return Feasibility(
         case=case,
         distributions=distributions,
         infeasible=infeasible,
         plateaus=rows,
-        mends=found,
+        mends=changes,
         seed=seed,
         wall_s=middle - began,
         mends_s=time.perf_counter() - middle,
@@ -107,13 +107,13 @@ def feasibility(
 
 def _rows(needs, nominal, excess):
     """The PlateauNeeds: every level and input that some plant cannot have."""
-    needed, found, tanks = needs.at(), [], needs.rim.shape[1]
+    needed, rows, tanks = needs.at(), [], needs.rim.shape[1]
     for k, plateau in enumerate(needs.plateaus):
         for q in np.flatnonzero((excess[:, k] > 0).any(axis=0)):
             values, wrong = needed[:, k, q], excess[:, k, q] > 0
             upper = np.sum(wrong & (values > needs.high[:, q])) >= 0.5 * np.sum(wrong)
             limit = (needs.high if upper else needs.low)[:, q]
-            found.append(
+            rows.append(
                 PlateauNeed(
                     time_s=plateau.time_s,
                     setpoints=plateau.values,
@@ -126,7 +126,7 @@ def _rows(needs, nominal, excess):
                     unit=needs.case.loop.units[0 if q < tanks else 1],
                 )
             )
-    return tuple(found)
+    return tuple(rows)
 
 
 def can_judge(case: Case) -> bool:
@@ -235,28 +235,23 @@ def apply_mend(
         raise InputError(f"unknown mend {str(kind)!r}: must be one of {', '.join(KINDS)}")
     if kind == "ramps":
         mend = mended_ramp(case if limits is None else case.replace(limits=limits))
-        needed = ""
+        remark = ""
     else:
-        found = feasibility(case, distributions, samples, seed, limits)
-        mend = next((m for m in found.mends if m.what == kind), None)
-        needed = f": {100 * found.infeasible_for_any_controller:.3g} % of the plants are infeasible"
-        if np.mean(found.infeasible) <= 1.0 - TARGET:
+        study = feasibility(case, distributions, samples, seed, limits)
+        mend = next((m for m in study.mends if m.what == kind), None)
+        share, others = study.infeasible_for_any_controller, ", ".join(m.what for m in study.mends)
+        remark = f": {100 * share:.3g} % of the plants are infeasible"
+        remark += f"; what is: {others}" if others else ""
+        if share <= 1.0 - TARGET:
             mend = Mend(what=kind, set={}, share=None, words=f"the {kind} need no change")
     if mend is None:
-        others = "" if kind == "ramps" else _others(found)
         raise InputError(
-            f"{case.name}: no change of its {kind} alone was found to be enough{needed}{others}"
+            f"{case.name}: no change of its {kind} alone was found to be enough{remark}"
         )
-    found = rig.set_values(case, with_models(case.loop, mend.set))
-    if found.loop.safety_filter is not None:  # designed anew for what has changed
-        found = found.without_safety_filter().with_safety_filter(**dict(case.safety or {}))
-    return found, mend
-
-
-def _others(found):
-    """What else would be enough, for a message."""
-    kinds = ", ".join(m.what for m in found.mends)
-    return f"; what is: {kinds}" if kinds else ""
+    mended = rig.set_values(case, with_models(case.loop, mend.set))
+    if mended.loop.safety_filter is not None:  # designed anew for what has changed
+        mended = mended.without_safety_filter().with_safety_filter(**dict(case.safety or {}))
+    return mended, mend
 
 
 ROUNDS = 12
@@ -278,41 +273,37 @@ def least_offsets(needs: Needs) -> np.ndarray:
     r = np.broadcast_to(needs.setpoints, (needs.count, *needs.setpoints.shape[1:]))
     size = np.maximum(np.abs(needs.high), np.abs(needs.low))[:, None]
     wrong = needs.excess() > 0
-    found = np.zeros(r.shape[:2])
+    offsets = np.zeros(r.shape[:2])
     plants = np.flatnonzero(wrong.any(axis=(1, 2)))
     if not len(plants):
-        return found
+        return offsets
     few = Needs(needs.case, {n: v[plants] for n, v in needs.values.items()}, needs.limits)
     few_r, size = r[plants], size[plants]
     low, high = few.low[:, None] / size, few.high[:, None] / size
     y, best = few_r.copy(), np.full(few_r.shape[:2], np.inf)
     step = 1e-5 * np.maximum(few_r, 1e-2 * few_r.max())
-    for _ in range(ROUNDS):
+    for round_ in range(ROUNDS + 1):
         needed = few.at(y) / size
+        over = np.nan_to_num(np.maximum(needed - high, low - needed), nan=np.inf).max(axis=2)
+        distance = np.where(over <= REACHED, np.linalg.norm(y - few_r, axis=2), np.inf)
+        best = np.minimum(best, distance)
+        if round_ == ROUNDS:
+            break
         slopes = np.stack(
             [
-                (few.at(y + step * one) - few.at(y - step * one))
+                (few.at(y + step * axis) - few.at(y - step * axis))
                 / size
-                / (2.0 * step * one).sum(-1)[..., None]
-                for one in np.eye(r.shape[2])
+                / (2.0 * step * axis).sum(-1)[..., None]
+                for axis in np.eye(r.shape[2])
             ],
             axis=-1,
         )
-        best = _kept(best, y, few_r, np.maximum(needed - high, low - needed))
         rows = np.concatenate([slopes, -slopes], axis=2)
         ends = np.concatenate([high - needed, needed - low], axis=2)
         ends = ends + np.einsum("spqm,spm->spq", rows, y)
         y = np.maximum(_projected(few_r, rows, ends), 1e-3 * few_r.max())
-    needed = few.at(y) / size
-    best = _kept(best, y, few_r, np.maximum(needed - high, low - needed))
-    found[plants] = np.where(np.isfinite(best), best, np.nan)
-    return found
-
-
-def _kept(best, y, r, over):
-    """The smaller of `best` and the distance of y from r, where y is within the limits."""
-    good = np.nan_to_num(over, nan=np.inf).max(axis=2) <= REACHED
-    return np.minimum(best, np.where(good, np.linalg.norm(y - r, axis=2), np.inf))
+    offsets[plants] = np.where(np.isfinite(best), best, np.nan)
+    return offsets
 
 
 def _projected(r, rows, ends):
@@ -356,7 +347,8 @@ def mended_ramp(case: Case) -> Mend | None:
     for _ in range(STEPS):
         middle = 0.5 * (bad + good)
         bad, good = (bad, middle) if _holds(case, middle) else (middle, good)
-    rounded = _up(good)
+    scale = 10.0 ** (2 - math.floor(math.log10(good)))
+    rounded = math.ceil(good * scale - 1e-9) / scale  # up to three digits
     good = rounded if rounded <= most and _holds(case, rounded) else good
     words = f"ramps of {good:g} s"
     return Mend(what="ramps", set={"reference.ramp": good}, share=None, words=words)
@@ -369,12 +361,6 @@ def _longest(reference, duration):
         times = [t for t, i in reference.changes if i == channel]
         gaps += [b - a for a, b in zip(times, [*times[1:], duration])]
     return min(gap for gap in gaps if gap > 0)
-
-
-def _up(value):
-    """`value` [s] rounded up to three digits."""
-    scale = 10.0 ** (2 - math.floor(math.log10(value)))
-    return math.ceil(value * scale - 1e-9) / scale
 
 
 def _holds(case, ramp):
@@ -442,8 +428,7 @@ def _rounded(value: float, old: float, digits: int = 2) -> float:
     places = digits - math.floor(math.log10(change))
     scale = 10.0**places
     away = math.ceil if value > old else math.floor
-    found = away(round(value * scale, 6)) / scale
-    return round(found, max(places, 0))
+    return round(away(round(value * scale, 6)) / scale, max(places, 0))
 
 
 # setpoints
@@ -457,13 +442,13 @@ def _setpoints(needs: Needs) -> Mend | None:
     share = lambda change: needs.feasible(needs.at(moved(change))).mean()
     old = {n: v for p in needs.plateaus for n, v in zip(p.names, p.values)}
     values = np.array([old[name] for name in names])
-    found, quantile, coarse = np.zeros(len(names)), AIM, needs.first(COARSE)
+    change, quantile, coarse = np.zeros(len(names)), AIM, needs.first(COARSE)
     low, high = AIM, 1.0 - (1.0 - AIM) / 8.0
     best = None
     for _ in range(5):  # the quantile of each need at which they hold together
-        found = _least_move(coarse, where, values, quantile, found)
-        enough = share(found) >= AIM
-        best = found if enough else best
+        change = _least_move(coarse, where, values, quantile, change)
+        enough = share(change) >= AIM
+        best = change if enough else best
         low, high = (low, quantile) if enough else (quantile, high)
         quantile = 0.5 * (low + high)
     if best is None:
@@ -476,14 +461,14 @@ def _rounded_setpoints(names, values, change, share):
     """The Mend of a change, rounded away from the case; a little more where rounding lost some."""
     digits = 10.0 ** (math.floor(math.log10(np.max(np.abs(change)))) - 2)
     for more in 1.0 + 0.005 * np.arange(20):
-        kept = np.where(np.abs(change) < digits, 0.0, more * change)
-        away = np.sign(kept) * np.ceil(np.abs(kept) / digits - 1e-9) * digits
+        large = np.where(np.abs(change) < digits, 0.0, more * change)
+        away = np.sign(large) * np.ceil(np.abs(large) / digits - 1e-9) * digits
         places = max(0, -round(math.log10(digits)))
         new = {n: round(float(v + c), places) for n, v, c in zip(names, values, away) if c != 0.0}
         exact = np.array([new.get(n, v) for n, v in zip(names, values)]) - values
-        if (found := share(exact)) >= AIM:
+        if (feasible := share(exact)) >= AIM:
             pairs = [f"{n} {v:g} -> {new[n]:g}" for n, v in zip(names, values) if n in new]
-            return Mend(what="setpoints", set=new, share=float(found), words=", ".join(pairs))
+            return Mend(what="setpoints", set=new, share=float(feasible), words=", ".join(pairs))
     return None
 
 
@@ -493,8 +478,8 @@ def _least_move(needs, where, values, quantile, start):
     outputs = where.shape[1]
 
     def over(change):
-        found = needs.excess(needs.at(np.maximum(needs.setpoints + change, 1e-6))) / size
-        return np.minimum(found, LARGEST)
+        excess = needs.excess(needs.at(np.maximum(needs.setpoints + change, 1e-6))) / size
+        return np.minimum(excess, LARGEST)
 
     rank = min(needs.count, math.ceil(quantile * needs.count)) - 1
     # what is far from its limit is left out; the share at the end counts all
@@ -508,10 +493,10 @@ def _least_move(needs, where, values, quantile, start):
         matrix = np.zeros((*near.shape, len(values)))
         for j in range(outputs):
             step = h * np.eye(outputs)[j]
-            found = np.zeros(near.shape)
-            found[near] = -(needed(base + step) - needed(base - step)) / (2.0 * h)
+            slope = np.zeros(near.shape)
+            slope[near] = -(needed(base + step) - needed(base - step)) / (2.0 * h)
             for k, name in enumerate(where[:, j]):
-                matrix[k, :, name] += found[k]
+                matrix[k, :, name] += slope[k]
         return matrix[near]
 
     return scipy.optimize.minimize(
@@ -570,17 +555,17 @@ def _raised(needs, what, leaf, first, columns, end) -> Mend | None:
     if len(changed) > 1 and len({old[i] for i in changed}) == 1:
         bound = max(new.values())
         level = lambda top: np.where(np.isin(np.arange(len(old)), changed), top, needs.high)
-        one = _least(lambda top: share(level(top)) >= AIM, float(old[changed[0]]), bound)
-        new = dict.fromkeys(changed, _rounded(one, float(old[changed[0]])))
+        first_top = float(old[changed[0]])
+        least = _least(lambda top: share(level(top)) >= AIM, first_top, bound)
+        new = dict.fromkeys(changed, _rounded(least, first_top))
     top = needs.high.copy()
     top[:, changed] = [new[i] for i in changed]
     which = ", ".join(str(i - first + 1) for i in changed)
-    unit = needs.case.loop.units[0 if first == 0 else 1]
+    several, unit = "s" * (len(changed) > 1), needs.case.loop.units[0 if first == 0 else 1]
     heights = ", ".join(dict.fromkeys(f"{v:g}" for v in new.values()))
-    noun = ("rim" if what == "rims" else "pump") + "s" * (len(changed) > 1)
-    words = f"{noun} of tank{'s' * (len(changed) > 1)} {which} at {heights} {unit}"
+    words = f"rim{several} of tank{several} {which} at {heights} {unit}"
     if what == "pumps":
-        words = f"{noun} {which} up to {heights} {unit}"
+        words = f"pump{several} {which} up to {heights} {unit}"
     values = {f"{leaf}[{i - first}]": v for i, v in new.items()}
     return Mend(what=what, set=values, share=float(share(top)), words=words)
 
@@ -595,26 +580,22 @@ def _orifices(needs: Needs) -> Mend | None:
         return None
 
     def share(factor):
-        own = {n: v * (factor if n in leaves else 1.0) for n, v in needs.states.own.items()}
-        states = SteadyStates(needs.states.plant, own, needs.states.inflow)
-        needed = np.concatenate(states.at(needs.setpoints), axis=2)
-        return needs.feasible(needed).mean()
+        leaves_of = needs.states.own
+        scaled = {n: v * (factor if n in leaves else 1.0) for n, v in leaves_of.items()}
+        states = SteadyStates(needs.states.plant, scaled, needs.states.inflow)
+        return needs.feasible(np.concatenate(states.at(needs.setpoints), axis=2)).mean()
 
     good = lambda factor: share(factor) >= AIM
     for before, after in zip((1.0, *FACTORS), FACTORS):
         ways = [way for way in (1.0, -1.0) if good(after**way)]
-        if ways:
-            found = [_least(lambda f, w=w: good(f**w), before, after, 9) ** w for w in ways]
-            return _scaled(needs, leaves, min(found, key=lambda f: abs(math.log(f))), share)
+        if not ways:
+            continue
+        factors = [_least(lambda f, w=w: good(f**w), before, after, 9) ** w for w in ways]
+        factor = _rounded(min(factors, key=lambda f: abs(math.log(f))), 1.0, 2)
+        new, loop = {}, needs.case.loop
+        for name in leaves:
+            values = np.asarray(get_value(loop, f"plant.{name}"), dtype=float)
+            new[f"plant.{name}"] = [float(f"{v * factor:.6g}") for v in values]
+        words = f"{' and '.join(f'{n}s' for n in leaves)} x {factor:g}"
+        return Mend(what="orifices", set=new, share=float(share(factor)), words=words)
     return None
-
-
-def _scaled(needs, leaves, factor, share):
-    factor = _rounded(factor, 1.0, 2)
-    loop: Any = needs.case.loop
-    new = {}
-    for name in leaves:
-        values = np.asarray(get_value(loop, f"plant.{name}"), dtype=float)
-        new[f"plant.{name}"] = [float(f"{v * factor:.6g}") for v in values]
-    words = f"{' and '.join(f'{n}s' for n in leaves)} x {factor:g}"
-    return Mend(what="orifices", set=new, share=float(share(factor)), words=words)

@@ -46,30 +46,36 @@ class Lagrangian(NamedTuple):
     smoothing: Any  # (input [V], error [cm]) below which an absolute value is a parabola
 
 
+def scaled(lagrangian, ratio):
+    """Return a Lagrangian with its multipliers times a ratio."""
+    return lagrangian._replace(
+        multipliers=tuple(f * ratio for f in lagrangian.multipliers),
+        integral_multipliers=lagrangian.integral_multipliers * ratio,
+    )
+
+
 def open_loop(loop, u, interval):
     """Return `loop` with the inputs u (pumps, intervals) in place of its controller."""
+    actuator = loop.actuator
+    if actuator.allocates:  # inputs within the limits need no allocation
+        actuator = dataclasses.replace(actuator, saturation="clip")
     return dataclasses.replace(
         loop,
         controller=OpenLoop(signal=Table(values=u, period=interval)),
         observer=Direct(),
         sensor=LevelSensor(noise=np.zeros(loop.plant.tanks)),
-        # inputs within the limits need no allocation
-        actuator=(
-            dataclasses.replace(loop.actuator, saturation="clip")
-            if loop.actuator.allocates
-            else loop.actuator
-        ),
+        actuator=actuator,
     )
 
 
 def _pointwise_excess(terms, lagrangian, sample):
     """Return the excess over each pointwise limit at a sample, as a share of its size [-]."""
-    found = []
+    excesses = []
     for j, (measure, i) in enumerate(terms.pointwise):
         quantity = magnitude(sample.e[i]) if measure == "max_error" else sample.x[i]
         excess = quantity - lagrangian.pointwise[j]
-        found.append(POINTWISE[measure] * excess / lagrangian.sizes[0][j])
-    return found
+        excesses.append(POINTWISE[measure] * excess / lagrangian.sizes[0][j])
+    return excesses
 
 
 def _integral_excess(terms, lagrangian, measures):

@@ -17,9 +17,10 @@ from jaxtank.core.errors import InputError, NonFiniteError
 from jaxtank.loop import run as lp
 from jaxtank.loop.steady import steady_state
 from jaxtank.loop.trajectory import Trajectory
-from tuning.optimal_input.cost import POINTWISE, open_loop
+from tuning.optimal_input.cost import POINTWISE, open_loop, scaled
 from tuning.optimal_input.problem import TOLERANCE, InputProblem
 from tuning.problem.result import Result
+from tuning.uncertainty.sampling import check_whole
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
@@ -49,14 +50,10 @@ class InputBound(Result):
     @property
     def gain_percent(self) -> float | None:
         """Most that another controller could save [% of the cost of the case's own]."""
-        if (
-            self.closed_loop is None
-            or not self.closed_loop["holds"]
-            or not self.holds
-            or self.closed_loop["cost"] <= 0
-        ):
+        closed = self.closed_loop
+        if closed is None or not (closed["holds"] and self.holds and closed["cost"] > 0):
             return None
-        return 100.0 * (1.0 - self.cost / self.closed_loop["cost"])
+        return 100.0 * (1.0 - self.cost / closed["cost"])
 
     @property
     def worst(self) -> dict[str, Any] | None:
@@ -140,22 +137,19 @@ def bound(
         search.run()
     except KeyboardInterrupt:
         interrupted = True
-    found, source, closed = search.best, "search", search.closed
-    if closed is not None and (
-        found is None
-        or (closed["holds"] and (not found["holds"] or closed["cost"] < found["cost"]))
-    ):
-        found, source = closed, "closed loop"
-    if found is None:
-        raise NonFiniteError(
-            "neither the case's own inputs nor those of steady state give a run that stays finite"
-        )
+    best, source, closed = search.best, "search", search.closed
+    if closed is not None and (best is None or _better(closed, best, strictly=True)):
+        best, source = closed, "closed loop"
+    if best is None:
+        raise NonFiniteError(DIVERGED)
+    loop = open_loop(case.loop, best["u"].T, best["interval"])
+    names = tuple(m for m in ms.reported() if ms.serves(m, loop) and m != "estimation_rms")
     shared = ("cost", "holds", "constraints")
     return InputBound(
         case=case,
         objective=problem.objective,
-        **{name: found[name] for name in (*shared, "u", "interval")},
-        measures=_measures(case, found),
+        **{name: best[name] for name in (*shared, "u", "interval")},
+        measures={m: np.asarray(v) for m, v in lp.evaluate(loop, case.clock, names).items()},
         closed_loop=None if closed is None else {name: closed[name] for name in shared},
         source=source,
         grids=search.grids,
@@ -168,12 +162,7 @@ def bound(
     )
 
 
-def _measures(case, found):
-    """Return {name: value} of the measures that are defined for the run with the inputs found."""
-    loop = open_loop(case.loop, found["u"].T, found["interval"])
-    names = tuple(m for m in ms.reported() if ms.serves(m, loop) and m != "estimation_rms")
-    return {m: np.asarray(v) for m, v in lp.evaluate(loop, case.clock, names).items()}
-
+DIVERGED = "neither the case's own inputs nor those of steady state give a run that stays finite"
 
 GRIDS = (16, 4, 1)
 """Intervals that share an input, coarse to fine: slow changes are found with few unknowns."""
@@ -191,14 +180,7 @@ class InputSearch:
     def __init__(self, problem: InputProblem, iterations=200, progress=None):
         if jax.numpy.result_type(float) != np.float64:
             raise InputError("bound needs float64: jax.config.update('jax_enable_x64', True)")
-        if (
-            not isinstance(iterations, int)
-            or isinstance(iterations, bool)
-            or not 1 <= iterations <= 100_000
-        ):
-            raise InputError(
-                f"iterations = {iterations!r}: must be a whole number from 1 to 100000"
-            )
+        check_whole("iterations", iterations, 1, 100_000)
         self.problem, self.most, self.progress = problem, iterations, progress
         self.lagrangian = problem.start
         self.best, self.closed, self.grids, self.slope = None, None, [], np.nan
@@ -216,28 +198,20 @@ class InputSearch:
             width = width * group * group / GRIDS[0]
             self.lagrangian = self.lagrangian._replace(smoothing=(width, error))
             self._rescale(u)
-            u, found = self._settle(u, group, 5 if group == 1 else 2)
+            u, check = self._settle(u, group, 5 if group == 1 else 2)
             if group == 1:
-                found = self._repair(u, found)
-            self.grids.append(
-                {
-                    "interval_s": problem.interval * group,
-                    "cost": found["cost"],
-                    "excess": found["excess"],
-                }
-            )
+                check = self._repair(u, check)
+            grid = {name: check[name] for name in ("cost", "excess")}
+            self.grids.append({"interval_s": problem.interval * group, **grid})
 
     def _start(self, group):
         """Return the better of two searches with the coarsest intervals."""
         starts = [s for s in (self._closed_loop(), self._steady()) if s is not None]
         self._rescale(starts[0])
-        found = [self._descend(u, group) for u in starts]
-        if not any(np.isfinite(cost) for _, cost in found):
-            raise NonFiniteError(
-                "neither the case's own inputs nor those of steady state give a run that stays"
-                " finite"
-            )
-        return min(found, key=lambda pair: pair[1] if np.isfinite(pair[1]) else np.inf)[0]
+        ends = [self._descend(u, group) for u in starts]
+        if not any(np.isfinite(cost) for _, cost in ends):
+            raise NonFiniteError(DIVERGED)
+        return min(ends, key=lambda pair: pair[1] if np.isfinite(pair[1]) else np.inf)[0]
 
     def _closed_loop(self):
         """Return the means over each interval of the case's own inputs, None if the run
@@ -251,16 +225,13 @@ class InputSearch:
         except NonFiniteError:
             return None
         self.simulations += 1
-        self.closed = self.check(applied, clock.dt)
-        if not np.isfinite(self.closed["cost"]):
-            self.closed = None
-        at = np.minimum(
-            np.arange(clock.samples) * clock.dt / problem.interval + 1e-6, problem.count - 1
-        ).astype(int)
+        check = self.check(applied, clock.dt)
+        self.closed = check if np.isfinite(check["cost"]) else None
+        at = np.arange(clock.samples) * clock.dt / problem.interval + 1e-6
+        at = np.minimum(at, problem.count - 1).astype(int)
         samples = np.bincount(at, minlength=problem.count)
-        return problem.project(
-            np.stack([np.bincount(at, row, problem.count) / samples for row in applied])
-        )
+        means = [np.bincount(at, row, problem.count) / samples for row in applied]
+        return problem.project(np.stack(means))
 
     def _steady(self):
         """Return steady-state inputs of the nearest of a few setpoints."""
@@ -279,23 +250,13 @@ class InputSearch:
 
     def _rescale(self, u):
         """Scale the cost of u to 1, and keep the multipliers relative to the cost."""
-        held = self.lagrangian
-        bare = held._replace(
-            weight=np.float64(1e-30),
-            multipliers=tuple(0.0 * f for f in held.multipliers),
-            scale=np.float64(1.0),
-            integral_multipliers=0.0 * held.integral_multipliers,
-        )
+        before = self.lagrangian
+        bare = scaled(before, 0.0)._replace(weight=np.float64(1e-30), scale=np.float64(1.0))
         cost = float(self.problem.value_and_gradient(u, bare)[0])
         self.gradients += 1
-        if not np.isfinite(cost) or cost <= 1e-12:
-            return
-        ratio = float(held.scale) / cost
-        self.lagrangian = held._replace(
-            scale=np.float64(cost),
-            multipliers=tuple(f * ratio for f in held.multipliers),
-            integral_multipliers=held.integral_multipliers * ratio,
-        )
+        if np.isfinite(cost) and cost > 1e-12:
+            ratio = float(before.scale) / cost
+            self.lagrangian = scaled(before, ratio)._replace(scale=np.float64(cost))
 
     def _descend(self, u, group):
         """Return (inputs, search cost) of L-BFGS from u, with `group` intervals as one."""
@@ -303,9 +264,7 @@ class InputSearch:
         low, span = problem.low[:, None], (problem.high - problem.low)[:, None]
         edges = np.arange(0, problem.count, group)
         sizes = np.diff(np.append(edges, problem.count))
-
-        def inputs(z):
-            return low + span * np.repeat(z.reshape(len(low), -1), sizes, axis=1)
+        inputs = lambda z: low + span * np.repeat(z.reshape(len(low), -1), sizes, axis=1)
 
         def cost(z):
             self.gradients += 1
@@ -324,98 +283,83 @@ class InputSearch:
     def _settle(self, u, group, rounds):
         """Return (inputs, their check) after rounds of descent and new multipliers."""
         # The weight is raised where an excess does not shrink.
-        last, before, found = np.inf, np.inf, {}
+        last, before, check = np.inf, np.inf, {}
         for _ in range(rounds):
-            u, _ = self._descend(u, group)
-            found = self.check(u, self.problem.interval)
-            self._report(found, group)
-            small = abs(found["cost"] - before) <= 2e-3 * abs(found["cost"])
-            if found["excess"] <= 30 * TOLERANCE and small:
+            u, check = self._round(u, group)
+            small = abs(check["cost"] - before) <= 2e-3 * abs(check["cost"])
+            if check["excess"] <= 30 * TOLERANCE and small:
                 break
-            before = found["cost"]
+            before = check["cost"]
             if not self.problem.limits:
                 continue
             self._update_multipliers(u)
-            if found["excess"] > max(0.5 * last, TOLERANCE):
+            if check["excess"] > max(0.5 * last, TOLERANCE):
                 self.lagrangian = self.lagrangian._replace(weight=self.lagrangian.weight * 3.0)
-            last = found["excess"]
-        return u, found
+            last = check["excess"]
+        return u, check
+
+    def _round(self, u, group):
+        """Return (inputs, their check) of a descent from u, and report it."""
+        u, _ = self._descend(u, group)
+        check = self.check(u, self.problem.interval)
+        if self.progress is not None:
+            state = {"stage": "bound", "interval_s": self.problem.interval * group}
+            state |= {"cost": check["cost"], "excess": check["excess"]}
+            self.progress(state | {"gradients": self.gradients})
+        return u, check
 
     def _update_multipliers(self, u):
         """Set multipliers to multiplier + weight * excess, not below 0."""
-        held = self.lagrangian
+        before, problem = self.lagrangian, self.problem
         self.simulations += 1
-        over, integral, _ = self.problem.excesses(
-            u, self.problem.interval, self.problem.coarse, held
-        )
-        self.lagrangian = held._replace(
-            multipliers=tuple(
-                np.maximum(0.0, np.asarray(f) + held.weight * np.asarray(g))
-                for f, g in zip(held.multipliers, over)
-            ),
-            integral_multipliers=(
-                np.maximum(
-                    0.0, np.asarray(held.integral_multipliers) + held.weight * np.asarray(integral)
-                )
-                if len(integral)
-                else held.integral_multipliers
-            ),
+        over, integral, _ = problem.excesses(u, problem.interval, problem.coarse, before)
+        raised = lambda f, g: np.maximum(0.0, np.asarray(f) + before.weight * np.asarray(g))
+        sums = before.integral_multipliers
+        self.lagrangian = before._replace(
+            multipliers=tuple(map(raised, before.multipliers, over)),
+            integral_multipliers=raised(sums, integral) if len(integral) else sums,
         )
 
-    def _repair(self, u, found):
+    def _repair(self, u, check):
         """Return the check of inputs that hold the limits at the case's own step, if any
         are found.
         """
         for k in range(ROUNDS):
-            if found["excess"] <= TOLERANCE:
+            if check["excess"] <= TOLERANCE:
                 break
             self._update_multipliers(u)
-            held = self.lagrangian
-            if found["excess"] > 10 * TOLERANCE and k < ROUNDS - 3:
-                self.lagrangian = held._replace(weight=held.weight * 3.0)
+            before = self.lagrangian
+            if check["excess"] > 10 * TOLERANCE and k < ROUNDS - 3:
+                self.lagrangian = before._replace(weight=before.weight * 3.0)
             else:
                 sign = np.array([POINTWISE[m] for m, _ in self.problem.terms.pointwise])
-                peaks, integral = (np.maximum(np.array(v), 0.0) for v in found["beyond"])
-                self.lagrangian = held._replace(
-                    pointwise=held.pointwise - sign * peaks * held.sizes[0],
-                    integral=held.integral - integral * held.sizes[1],
+                peaks, integral = (np.maximum(np.array(v), 0.0) for v in check["beyond"])
+                self.lagrangian = before._replace(
+                    pointwise=before.pointwise - sign * peaks * before.sizes[0],
+                    integral=before.integral - integral * before.sizes[1],
                 )
-            u, _ = self._descend(u, 1)
-            found = self.check(u, self.problem.interval)
-            self._report(found, 1)
-        return found
+            u, check = self._round(u, 1)
+        return check
 
     def check(self, u, interval):
         """Return `problem.check` of the inputs; keep it in `best` if it is the best so far."""
         self.simulations += 1
-        found = self.problem.check(u, interval)
-        if (
-            np.isfinite(found["cost"])
-            and (self.best is None or _better(found, self.best))
-            and u.shape[1] == self.problem.count
-        ):
-            self.best = found
-        return found
-
-    def _report(self, found, group):
-        """Call `progress` with the state of the search."""
-        if self.progress is not None:
-            self.progress(
-                {
-                    "stage": "bound",
-                    "interval_s": self.problem.interval * group,
-                    "cost": found["cost"],
-                    "excess": found["excess"],
-                    "gradients": self.gradients,
-                }
-            )
+        check = self.problem.check(u, interval)
+        full = u.shape[1] == self.problem.count
+        if full and np.isfinite(check["cost"]) and (not self.best or _better(check, self.best)):
+            self.best = check
+        return check
 
 
-def _better(a, b):
-    """Return whether a is preferred: limits that hold, then the smaller excess, then the cost."""
+def _better(a, b, strictly=False):
+    """Return whether a is preferred: limits that hold, then the smaller excess, then the cost;
+    strictly: never where its limits do not hold.
+    """
     if a["holds"] != b["holds"]:
         return a["holds"]
-    return a["cost"] < b["cost"] if a["holds"] else a["excess"] < b["excess"]
+    if not a["holds"]:
+        return not strictly and a["excess"] < b["excess"]
+    return a["cost"] < b["cost"]
 
 
 MEMORY = 12

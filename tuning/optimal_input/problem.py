@@ -114,9 +114,8 @@ class InputProblem:
 
     def excesses(self, u, interval, clock, lagrangian):
         """Return what `cost.evaluate` gives for u, sampled: one program for any interval."""
-        at = np.minimum(
-            np.arange(clock.samples) * (clock.dt / interval) + 1e-6, u.shape[1] - 1
-        ).astype(int)
+        at = np.arange(clock.samples) * (clock.dt / interval) + 1e-6
+        at = np.minimum(at, u.shape[1] - 1).astype(int)
         loop = dataclasses.replace(open_loop(self.case.loop, u[:, at], clock.dt), plant=self.plant)
         return evaluate(loop, clock, self.terms, u[:, at], lagrangian)
 
@@ -138,45 +137,37 @@ class InputProblem:
 
     def _constraints(self, over, integral):
         """Return a dict for each limit: name, measure, limit, value, margin, tank, time_s."""
-        rows = []
-        for j, (m, i) in enumerate(self.terms.pointwise):
-            at, limit = int(np.argmax(over[j])), float(self.start.pointwise[j])
-            excess = over[j][at] * float(self.start.sizes[0][j])
-            rows.append((m, i, limit, POINTWISE[m] * excess, excess, at * self.case.clock.dt))
-        for j, (m, i) in enumerate(self.terms.integral):
-            excess = integral[j] * float(self.start.sizes[1][j])
-            rows.append((m, i, float(self.start.integral[j]), excess, excess, None))
-        return [
-            {
-                "name": (
-                    m if ms.MEASURES[m].per == "run" else f"{m} of {ms.MEASURES[m].per} {i + 1}"
-                ),
-                "measure": m,
-                "limit": limit,
-                "value": float(limit + change),
-                "margin": float(-excess),
-                "tank": i + 1 if ms.MEASURES[m].per == "tank" else None,
-                "time_s": when,
-            }
-            for m, i, limit, change, excess, when in rows
+        start, dt, rows = self.start, self.case.clock.dt, []
+        peaks = [(int(np.argmax(o)), o) for o in over]
+        cells = [
+            *zip(self.terms.pointwise, start.pointwise, start.sizes[0], peaks),
+            *zip(self.terms.integral, start.integral, start.sizes[1], integral),
         ]
+        for (m, i), limit, size, peak in cells:
+            at, excess = (peak[0], peak[1][peak[0]]) if m in POINTWISE else (None, peak)
+            per, excess = ms.MEASURES[m].per, excess * float(size)
+            row = {
+                "name": m if per == "run" else f"{m} of {per} {i + 1}",
+                "measure": m,
+                "limit": float(limit),
+                "value": float(float(limit) + POINTWISE.get(m, 1) * excess),
+                "margin": float(-excess),
+                "tank": i + 1 if per == "tank" else None,
+                "time_s": None if at is None else at * dt,
+            }
+            rows.append(row)
+        return rows
 
 
 def _check_measures(objective, limits):
     """Raise InputError for measures without a derivative by every input."""
     good = [m for m, spec in ms.MEASURES.items() if spec.by_input]
-    for m in objective:
-        if m not in good:
-            raise InputError(
-                f"bound of {m}: has no derivative by every input; can be minimised:"
-                f" {', '.join(good)}"
-            )
-    for limit in limits:
-        if limit.measure not in (*good, *POINTWISE):
-            raise InputError(
-                f"bound under a limit on {limit.measure}: has no derivative; can be limited:"
-                f" {', '.join([*POINTWISE, *good])}"
-            )
+    for m in (m for m in objective if m not in good):
+        reason = f"bound of {m}: has no derivative by every input"
+        raise InputError(f"{reason}; can be minimised: {', '.join(good)}")
+    for limit in (v for v in limits if v.measure not in (*good, *POINTWISE)):
+        reason = f"bound under a limit on {limit.measure}: has no derivative"
+        raise InputError(f"{reason}; can be limited: {', '.join([*POINTWISE, *good])}")
 
 
 def _box(actuator, pumps, needs):
@@ -214,27 +205,19 @@ def _interval(clock, interval):
     if interval is None:
         least = max(clock.duration / INTERVALS, clock.dt)
         round_numbers = [a * 10.0**b for b in range(-6, 7) for a in (1, 2, 5)]
-        fits = [
-            v
-            for v in round_numbers
-            if (1 - 1e-9) * least <= v <= 2.5 * least and _whole_number(v / clock.dt)
-        ]
+        inside = [v for v in round_numbers if (1 - 1e-9) * least <= v <= 2.5 * least]
+        fits = [v for v in inside if _whole_number(v / clock.dt)]
         return float(fits[0] if fits else clock.dt * np.ceil(least / clock.dt - 1e-6))
-    good = (
-        isinstance(interval, (int, float))
-        and not isinstance(interval, bool)
-        and clock.dt * (1 - 1e-9) <= interval <= clock.duration
-    )
+    good = isinstance(interval, (int, float)) and not isinstance(interval, bool)
+    good = good and clock.dt * (1 - 1e-9) <= interval <= clock.duration
     if not good or not _whole_number(interval / clock.dt):
         raise InputError(
             f"interval = {interval!r} s: must be a whole number of samples of {clock.dt:g} s, at"
             f" most {clock.duration:g} s"
         )
-    if clock.duration / interval > MOST_INTERVALS:
-        raise InputError(
-            f"interval = {interval:g} s: {clock.duration / interval:.0f} intervals; must be at most"
-            f" {MOST_INTERVALS}"
-        )
+    if (count := clock.duration / interval) > MOST_INTERVALS:
+        most = f"{count:.0f} intervals; must be at most {MOST_INTERVALS}"
+        raise InputError(f"interval = {interval:g} s: {most}")
     return float(interval)
 
 
