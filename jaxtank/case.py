@@ -1,22 +1,19 @@
 """A case: one rig, one controller, one reference, one clock, and what may be tuned on it."""
 
 import dataclasses
-import importlib
-import json
-import warnings
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from jaxtank.core.clock import CLOCK_UNITS, Clock
-from jaxtank.core.errors import InputError
-from jaxtank.core.files import write_folder
 from jaxtank.core.jsonable import clean
-from jaxtank.core.text import html_table, with_picture
-from jaxtank.core.tree import describe, get_value, walk
+from jaxtank.core.tree import describe, get_value, parameters, walk
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.measures import MEASURES, unit
 from jaxtank.safety import SafetyFilter, TankCertificate, design_for
+from jaxtank.safety.of_case import FLOWS, SPREAD
+from jaxtank.views import CaseViews
 
 
 class Free(NamedTuple):
@@ -73,7 +70,7 @@ class Symmetry(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Case:
+class Case(CaseViews):
     """One rig, one controller, one reference, one clock, with the gains its paper prints.
 
     Parameters
@@ -190,59 +187,9 @@ class Case:
             "uncertain": clean(dict(self.uncertain)),
         }
 
-    def plot(self) -> dict[str, Any]:
-        """Return matplotlib figures {"rig": the schematic}; {} for a plant that is no network of
-        tanks. The figures of a run are those of its Trajectory.
-        """
-        from jaxtank.plots.run import rig
-
-        return rig(self.loop.plant, title=self.name)
-
-    def explore(self, free: Mapping[str, Any] | None = None, plants: int | None = None) -> Any:
-        """Return the live page, in which the loop runs while sliders move: a notebook shows it, and
-        `.save(path)` writes it. Opens `tuning.live`.
-
-        `free` {dotted name: (low, high)} replaces the free parameters of the case and their ranges.
-        With `plants` the page shows a band of that many drawn plants (1 to 2000).
-
-        Raises InputError for a case that cannot be run in a browser, and for names and values that
-        cannot be used.
-        """
-        case = self if free is None else self.replace(free={n: Free(*v) for n, v in free.items()})
-        return importlib.import_module("tuning.live.shown").of_case(case, plants=plants)
-
-    def save(self, folder: str | Path) -> list[Path]:
-        """Write case.json, rig.toml and the pictures of `plot` to a folder, made if need be; return
-        the paths.
-
-        A case that no rig file can describe (with a plant or a controller class of one's own that
-        has no name in a file) has no rig.toml: a UserWarning gives the reason. Raises InputError
-        for a folder that cannot be written to.
-        """
-        from jaxtank.plots.run import pngs
-        from jaxtank.rig.write import dump
-
-        files: dict[str, Any] = {
-            "case.json": json.dumps(self.to_json(), indent=2, allow_nan=False) + "\n"
-        }
-        try:
-            files["rig.toml"] = dump(self)
-        except InputError as error:
-            warnings.warn(f"rig.toml is not written ({error})", stacklevel=2)
-        return write_folder(folder, files | pngs(self.plot()))
-
     def __str__(self) -> str:
         heading, *lines = (f"{what}: {text}" if what else text for what, text in self._summary())
         return "\n".join([heading, *(f"  {line}" for line in lines)])
-
-    def _repr_html_(self) -> str:
-        def draw() -> bytes | None:
-            from jaxtank.plots.run import small
-
-            return small(self.plot())
-
-        (_, caption), *rows = self._summary()
-        return with_picture(html_table(rows, caption=caption), draw)
 
     def _summary(self) -> list[tuple[str, str]]:
         """(what, text) of each line for people."""
@@ -268,6 +215,17 @@ class Case:
             rows.append(("limit", f"{measure} {side} {clean(limit)}{of}"))
         weights = " + ".join(f"{w:g} {m}" for m, w in self.objective.items())
         return [*rows, ("objective", weights)]
+
+
+def uncertain_shares(case: Case) -> dict[str, float]:
+    """Return {name: share} of what a case calls uncertain, of every flow where it says nothing."""
+    if case.uncertain or case.covariance is not None:
+        return dict(case.uncertain)
+    values = parameters(case.loop)
+    shares = {f"plant.{n}": SPREAD for n in FLOWS if np.size(values.get(f"plant.{n}", ()))}
+    if np.max(np.asarray(values.get("plant.split", 0.0)), initial=0.0) * (1.0 + SPREAD) > 1.0:
+        shares.pop("plant.split")
+    return shares or {"sensor.noise": SPREAD}
 
 
 def _count(number: int, word: str) -> str:

@@ -93,3 +93,11 @@ def check_order(name: str, part: Any, lower: str, upper: str, equal: bool = Fals
             raise InputError(
                 f"{name}.{lower}[{i}] = {low:g} V: must be {most} {name}.{upper}[{i}] = {high:g} V"
             )
+
+
+def check_whole(name: str, value: Any, low: int, high: int | None = None) -> None:
+    """Raise InputError unless `value` is a whole number from `low` to `high`."""
+    good = isinstance(value, int) and not isinstance(value, bool) and value >= low
+    if not good or (high is not None and value > high):
+        ends = f"of at least {low}" if high is None else f"from {low} to {high}"
+        raise InputError(f"{name} = {value!r}: must be a whole number {ends}")

@@ -5,17 +5,15 @@ pictures.
 import dataclasses
 import functools
 import io
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 from jax.core import Tracer
 
-from jaxtank.core.files import write_folder
 from jaxtank.core.jsonable import clean
-from jaxtank.core.text import html_table, with_picture
 from jaxtank.core.units import DEFAULT, local
+from jaxtank.views import TrajectoryViews
 
 FIELDS = (
     ("h", "x", "cm"),
@@ -38,7 +36,7 @@ COLUMNS = (*("t", "x", "y", "x_hat", "d_hat", "r", "e"), *("command", "applied",
     jax.tree_util.register_dataclass, data_fields=(*COLUMNS, "share"), meta_fields=("units",)
 )
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class Trajectory:
+class Trajectory(TrajectoryViews):
     """A run for people: row k is the state at t_k, before the plant moves on.
 
     Lengths are in the first of `units`, inputs in the second; "cm" and "V" stand for them here.
@@ -104,27 +102,6 @@ class Trajectory:
         result: dict[str, Any] = {"units": {name: units[name] for name in names}}
         return result | {name: clean(getattr(self, name)) for name in names}
 
-    def plot(self) -> dict[str, Any]:
-        """Return matplotlib figures {name: figure}: levels and setpoints, errors, inputs.
-
-        `jaxtank.plots.responses.responses` draws runs over each other, with rims and limits.
-        """
-        from jaxtank.plots.run import figures
-
-        return figures(self)
-
-    def save(self, folder: str | Path) -> list[Path]:
-        """Write trajectory.csv and the pictures of `plot` to a folder, made if need be; return the
-        paths.
-
-        Raises InputError for a folder that cannot be written to.
-        """
-        from jaxtank.plots.run import figures, pngs
-
-        return write_folder(
-            folder, {"trajectory.csv": csv(self, self.units), **pngs(figures(self))}
-        )
-
     def __str__(self) -> str:
         if np.ndim(self.t) != 1 or isinstance(self.t, Tracer):
             return "Trajectory of several runs, or of a traced one"
@@ -138,17 +115,6 @@ class Trajectory:
 
     def __repr__(self) -> str:
         return str(self)
-
-    def _repr_html_(self) -> str:
-        def draw() -> bytes | None:
-            from jaxtank.plots.run import small
-
-            return small(self.plot()) if lines else None
-
-        caption, *lines = str(self).splitlines()
-        rows = self._summary() if lines else []
-        head = ("", "least", "most", "at the end") if rows else ()
-        return with_picture(html_table(rows, head, caption), draw)
 
     def _summary(self) -> list[list[str]]:
         """Rows (what and its unit, least, most, last) of levels, errors and inputs."""

@@ -17,6 +17,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from jaxtank.core import VERSION
+
 SWITCH = "JAXTANK_CACHE"
 OFF = ("0", "off", "false", "no")
 
@@ -139,7 +141,7 @@ def prepare(folder: str | os.PathLike[str] | None = None) -> tuple[Path | None, 
         why = refused(base)
         if why:
             return None, why
-        mine = base.resolve() / f"{_version()}-{processor()}"
+        mine = base.resolve() / f"{VERSION}-{processor()}"
         mine.mkdir(mode=0o700, exist_ok=True)
         why = refused(mine) or _planted(mine)
         if why:
@@ -230,10 +232,6 @@ def _may_make(base: Path) -> bool:
         return True
     above = next(path for path in base.parents if path.exists())
     return above.stat().st_uid == 0
-
-
-def _version() -> str:
-    return sys.modules["jaxtank"].__version__
 
 
 def processor() -> str:

@@ -73,13 +73,9 @@ READS = {
     "CDLL",
 }
 MADE = {
-    ("tuning.search.judged", "_report", "import_module"): "its own report, by a constant name",
-    ("jaxtank", "__getattr__", "import_module"): "names of its own table, in its own package",
+    ("jaxtank.core.lazy", "get", "import_module"): "names of the stub of its own package",
+    ("jaxtank.core.lazy", "home", "import_module"): "modules that the two `__init__` name",
     ("jaxtank.xla.jit", "_tree", "import_module"): "of a named tuple of ours, of an entry",
-    ("tuning", "__getattr__", "import_module"): "names of its own table, in its own package",
-    ("tuning.problem.result", "_report", "import_module"): "the report of its own class",
-    ("tuning.problem.result", "explore", "import_module"): "the live page, by a constant name",
-    ("jaxtank.case", "explore", "import_module"): "the live page, by a constant name",
     ("jaxtank.plots.style", "notebook", "import_module"): "matplotlib_inline, by a constant name",
     (
         "tuning.cluster.engine",
@@ -89,6 +85,7 @@ MADE = {
     ("jaxtank.presets", "_load", "import_module"): "names of presets.PAPERS, checked before",
 }
 READ = {
+    ("jaxtank.core.lazy", "attach", "read_text"): "the stub of its own package",
     ("jaxtank.core.installed", "imported", "load"): "an entry point of an installed package that a"
     " rig file names as the kind of a component; nothing from a path",
     ("jaxtank.core.files", "read_text", "read_text"): "after `refusal`: a file of at most 4 MiB",
@@ -97,8 +94,8 @@ READ = {
     ("tuning.bench.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",
     ("tuning.figures.figure", "_figures", "read_text"): "figures.toml of the package",
     ("tuning.report.html", "_style", "read_text"): "page.css of the package",
-    ("tuning.live.page", "_read", "read_text"): "a part of the page, of the package",
-    ("tuning.live.engine", "engine", "read_text"): "engine.js of the package",
+    ("jaxtank.live.page", "_read", "read_text"): "a part of the page, of the package",
+    ("jaxtank.live.engine", "engine", "read_text"): "engine.js of the package",
     ("tuning.cli.completion", "names", "read_text"): "names.txt of the package",
     ("jaxtank.xla.program_cache", "_digest", "read_bytes"): "an entry that jax has just written, or"
     " one of a folder of mode 700 and the user's own, to compare its digest",
@@ -264,7 +261,7 @@ def test_the_wheel_holds_the_two_packages_and_nothing_else(built):
         "tuning/README.md",
     } <= packed
     assert {n.rsplit(".", 1)[1] for n in packed} == {
-        *("py", "c", "css", "html", "js", "md", "toml", "txt", "typed")
+        *("py", "pyi", "c", "css", "html", "js", "md", "toml", "txt", "typed")
     }
     assert license_there and "METADATA" in info and "jaxtank = tuning.cli.main:main" in entry
 

@@ -16,7 +16,7 @@ import jax
 import jaxtank
 from jaxtank import presets
 from jaxtank.export.whole import served
-from tuning.live.engine import engine
+from jaxtank.live.engine import engine
 
 SCRIPT = """
 const e = makeEngine(), n = e.info.samples, free = e.info.free;

@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 
 from jaxtank import presets
-from tuning.live.page import page
+from jaxtank.live.page import page
 
 DRAG = """async () => {
   const own = document.querySelector("#groups input[type=range]"), frame = () =>

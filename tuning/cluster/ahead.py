@@ -13,10 +13,10 @@ import jax
 import numpy as np
 
 from jaxtank.core.clock import Clock
+from jaxtank.limits import Limit, limit_scale
 from tuning.cluster.engine import Engine
 from tuning.cluster.sent import received, sent
 from tuning.problem import scenarios as sc
-from tuning.problem.limits import Limit, limit_scale
 from tuning.problem.problem import Problem
 from tuning.storage.evaluation_log import EvaluationCache
 from tuning.storage.fingerprint import digest

@@ -11,7 +11,7 @@ from jaxtank.core.tree import with_values
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants.faults import Faults
 from tuning.falsification.attacked import Attacked, of_plant
-from tuning.problem.result import Result
+from tuning.views import Result
 
 TOLERANCE = 1e-9
 """Share of a limit by which rounding may pass it."""
@@ -60,8 +60,6 @@ class Attack(Result):
     wall_s : float
         [s].
     """
-
-    REPORT = "tuning.report.falsification"
 
     attacked: Attacked
     found: tuple[Found, ...]

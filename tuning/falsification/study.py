@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from jaxtank.case import Case
+from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import lower_clip
 from jaxtank.loop.validation import check
@@ -23,7 +24,6 @@ from tuning.falsification.attacked import (
 )
 from tuning.falsification.result import Attack, Found
 from tuning.problem.scenarios import noisy
-from tuning.uncertainty.sampling import check_whole
 
 PUMPS, STARTS = ("own", "full", "random"), ("any", "own")
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from tuning.problem.result import Result
 from tuning.uncertainty.sampling import clopper_pearson
+from tuning.views import Result
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -85,8 +85,6 @@ class Feasibility(Result):
         Run time, of the share and the plateaus [s]; of the mends in `mends_s`.
     mends_s : float
     """
-
-    REPORT = "tuning.report.feasible"
 
     case: Any
     distributions: Mapping[str, Any]

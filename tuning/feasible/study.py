@@ -14,18 +14,19 @@ import scipy  # its parts are imported when they are first used
 from jaxtank import rig
 from jaxtank.analysis.steady_batch import SteadyStates
 from jaxtank.case import Case
+from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value
+from jaxtank.limits import resolve_limits
 from jaxtank.loop import run as lp
 from jaxtank.rig.values import with_models
 from jaxtank.signals.setpoints import Ramps
 from tuning.feasible.result import Feasibility, Mend, PlateauNeed
-from tuning.problem.limits import resolve_limits
 from tuning.problem.scenarios import runs_of
 from tuning.uncertainty.distributions import stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.needs import Needs, judges
-from tuning.uncertainty.sampling import check_whole, probabilities, spread_of
+from tuning.uncertainty.sampling import probabilities, spread_of
 
 
 def feasibility(

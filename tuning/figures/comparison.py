@@ -13,8 +13,8 @@ from jaxtank.core.errors import unknown
 from jaxtank.core.text import html_table
 from tuning.figures import drawing
 from tuning.figures.figure import find
-from tuning.problem.result import Shown
 from tuning.report import papers, tables
+from tuning.views import Shown
 
 COLOURS = {
     papers.REPRODUCED: "#0072B2",

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
+from jaxtank.bounds import bounds
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, split_index
 from jaxtank.signals.base import Constant
-from tuning.problem.bounds import bounds
 
 ESTIMATED = ("plant.", "sensor.", "actuator.", "disturbance.")
 WITHOUT_EFFECT = {
@@ -137,7 +137,7 @@ class Coordinates:
 
 
 def coordinates_of(bounds, branches=True):
-    """Return the Coordinates of a list of tuning.problem.bounds.Bound."""
+    """Return the Coordinates of a list of jaxtank.bounds.Bound."""
     by_name = {b.name: b for b in bounds}
     items = {}
     for b in bounds:

@@ -12,8 +12,8 @@ from jaxtank.core.tree import get_value
 from tuning.identification.identified_case import proposed
 from tuning.identification.least_squares import Fit
 from tuning.identification.problem import Estimation
-from tuning.problem.result import Result
 from tuning.problem.status import Status
+from tuning.views import Result
 
 
 class Experiments(dict[str, dict[str, Any]]):
@@ -86,8 +86,6 @@ class Identification(Result):
     law : str or None
         Kind of controller that is proposed for the identified rig.
     """
-
-    REPORT = "tuning.report.identification"
 
     case: Any
     estimation: Estimation
@@ -179,8 +177,6 @@ class Identifications(Result):
     wall_s : float
         Run time [s].
     """
-
-    REPORT = "tuning.report.identifications"
 
     case: Case
     logs: tuple[str, ...]

@@ -13,21 +13,19 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.case import Case
+from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError, NonFiniteError
 from jaxtank.loop import run as lp
 from jaxtank.loop.steady import steady_state
 from jaxtank.loop.trajectory import Trajectory
 from tuning.optimal_input.cost import POINTWISE, open_loop, scaled
 from tuning.optimal_input.problem import TOLERANCE, InputProblem
-from tuning.problem.result import Result
-from tuning.uncertainty.sampling import check_whole
+from tuning.views import Result
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
 class InputBound(Result):
     """Result of `tuning.bound`; costs and measures are exact, at the case's own step."""
-
-    REPORT = "tuning.report.optimal_input"
 
     case: Any
     objective: dict

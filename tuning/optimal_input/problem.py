@@ -10,6 +10,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import number
+from jaxtank.limits import resolve_limits
 from jaxtank.loop import run as lp
 from jaxtank.rig import check_objective
 from tuning.optimal_input.cost import (
@@ -20,7 +21,6 @@ from tuning.optimal_input.cost import (
     open_loop,
     value_and_gradient,
 )
-from tuning.problem.limits import resolve_limits
 
 TOLERANCE = 3e-5
 """Share of a limit by which it may be exceeded and still counts as held [-]: 1e-3 cm of 30 cm."""

@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxtank import measures as ms
+from jaxtank.bounds import bounds
 from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
+from jaxtank.limits import UNDEFINED_MARGIN, Limit, limit_scale, resolve_in
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.functions import check_functions
 from jaxtank.rig import check_objective
 from tuning.problem import scenarios as sc
-from tuning.problem.bounds import bounds
 from tuning.problem.functions import as_measures
-from tuning.problem.limits import UNDEFINED_MARGIN, Limit, limit_scale, resolve_in
 from tuning.storage.evaluation_log import EvaluationCache
 
 Floats = NDArray[np.float64]
@@ -178,7 +178,7 @@ class Problem:
             self.groups = [sc.with_noise_drawn(group) for group in self.groups]
         self.given["limits"] = limits
         _, named = as_measures(None, limits, self.objective)
-        self.limits: list[Limit] = resolve_in(self.runs, named)
+        self.limits: list[Limit] = resolve_in([(run.name, run.case) for run in self.runs], named)
         self.limit_scales: Floats = np.array([limit_scale(x, self.loop) for x in self.limits])
         self.needed = tuple(
             dict.fromkeys([*self.objective, *(limit.measure for limit in self.limits)])

@@ -87,11 +87,12 @@ def fragment(sections) -> str:
 
 def _frame(result):
     """The live page of a result or a Case in a frame; "" where it cannot be run in a browser."""
-    from tuning.live import shown
+    from jaxtank.live.page import frame, live_page
+    from tuning.report.live import live_page_of
 
     try:
-        make = shown.of_result if hasattr(result, "case") else shown.of_case
-        return Markup(shown.frame(make(result)))
+        make = live_page_of if hasattr(result, "case") else live_page
+        return Markup(frame(make(result)))
     except InputError:
         return ""
     except Exception as error:

@@ -9,9 +9,9 @@ from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder, write_folder
 from jaxtank.core.units import local
+from jaxtank.limits import resolve_limits
 from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv, stride
-from tuning.problem.limits import resolve_limits
 from tuning.report.document import Live, Report, Text, failed, figures_of
 from tuning.report.folder import save as save_all
 from tuning.report.tables import (

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.case import Case, Scenario
 from jaxtank.core.tree import with_values
-from tuning.problem.limits import UNDEFINED_MARGIN
+from jaxtank.limits import UNDEFINED_MARGIN
 from tuning.problem.problem import Problem
 from tuning.problem.reported import in_force
 from tuning.problem.scenarios import ScenarioRun, runs_of

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxtank import rig
+from jaxtank.bounds import bounds
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import split_index
 from jaxtank.rig.components import ROLES
-from tuning.problem.bounds import bounds
 from tuning.problem.controllers import NAMES, with_kind
 from tuning.problem.status import Status
 from tuning.search.result import Message, TuningResult

@@ -1,7 +1,6 @@
 """How a set of gains does on plants that no search has used, at the case's own step."""
 
 import dataclasses
-import importlib
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -12,11 +11,10 @@ from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.jsonable import clean
 from jaxtank.core.tree import get_value
+from jaxtank.limits import resolve_limits
 from jaxtank.loop import run as lp
 from tuning.feasible.study import can_follow, can_judge
 from tuning.problem.functions import as_measures
-from tuning.problem.limits import resolve_limits
-from tuning.problem.result import Shown
 from tuning.problem.scenarios import noisy
 from tuning.search.options import check_options, check_precision
 from tuning.search.setting import Setting, limited_levels, measured, setting_of
@@ -24,6 +22,7 @@ from tuning.uncertainty.batches import batch_size, run_batch
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import Points, clopper_pearson
 from tuning.uncertainty.validation import SEED_OFFSET
+from tuning.views import Shown
 
 LANES = 8  # runs in a batch are a multiple of this: numbers in a vector register
 
@@ -364,9 +363,6 @@ class Answer(Shown):
     def held(self) -> bool:
         """True if every limit holds on every plant that judged the answer."""
         return self.after is not None and bool(self.after.held.all())
-
-    def _report(self) -> Any:
-        return importlib.import_module("tuning.report.tuned")
 
     def _sections(self) -> list[Any]:
         return self._report().of_answer(self)

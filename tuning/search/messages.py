@@ -52,6 +52,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.tree import parameters
+from jaxtank.safety.of_case import SPREAD
 from tuning.problem.problem import DIVERGED
 from tuning.problem.slopes import unusable_words
 from tuning.problem.status import Status
@@ -59,7 +60,6 @@ from tuning.problem.wording import count, numbered
 from tuning.search.diagnostics import direction_words, symmetry_words
 from tuning.search.driver import SLOPING, UNSTABLE
 from tuning.search.result import ConstraintRow, Message, TuningResult, constraint_rows
-from tuning.search.setting import SPREAD
 from tuning.search.stages import AGREE, RENEWED
 
 LISTED = 4  # limits that one message names at most

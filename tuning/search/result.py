@@ -11,12 +11,12 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.errors import unknown
+from jaxtank.limits import Limit
 from jaxtank.plants.base import Plant
-from tuning.problem.limits import Limit
 from tuning.problem.problem import Problem
-from tuning.problem.result import Result
 from tuning.problem.slopes import SlopeCheck
 from tuning.problem.status import Status
+from tuning.views import Result
 
 ACTIVE = 1e-3  # margin, as a share of its limit, below which a limit counts as active [-]
 
@@ -192,8 +192,6 @@ class TuningResult(Result):
     >>> result = tuning.tune(presets.find("cascaded/pi"), starts=2)  # doctest: +SKIP
     >>> result["controller.Kc[0]"].after, result.status  # doctest: +SKIP
     """
-
-    REPORT = "tuning.report.tuned"
 
     case: Any
     tuned: Any

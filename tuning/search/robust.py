@@ -14,7 +14,6 @@ from jaxtank.rig import check_limits
 from tuning.cluster.engine import connect
 from tuning.problem.functions import as_measures
 from tuning.problem.problem import Problem
-from tuning.problem.result import Shown
 from tuning.search.result import Message, TuningResult
 from tuning.search.setting import scenarios_of
 from tuning.search.tuner import tune
@@ -22,6 +21,7 @@ from tuning.uncertainty.distributions import stated
 from tuning.uncertainty.sampling import clopper_pearson, spread_of
 from tuning.uncertainty.study import ensemble
 from tuning.uncertainty.validation import SEED_OFFSET, summary_of, validate
+from tuning.views import Shown
 
 CONFIDENCE = 1e-6  # probability beta with which the scenario bound may fail [-]
 

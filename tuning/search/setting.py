@@ -12,10 +12,10 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank import rig
-from jaxtank.case import Case, Scenario
+from jaxtank.case import Case, Scenario, uncertain_shares
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import parameters, split_index, with_values
+from jaxtank.core.tree import split_index, with_values
 from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import takes_arrays
 from jaxtank.loop.step_size import unstable_tanks
@@ -71,8 +71,6 @@ PRICE = (5e-3, 1e-2)
 of the second share of its range [-].
 """
 
-FLOWS = ("drain", "orifice", "pipe", "pump_gain", "split")
-SPREAD = 0.05  # share by which every flow may be off where a case does not say what is uncertain
 NEAR = 0.9  # share of its limit that a level must reach on some plant for the limit to matter
 FREE = 10.0  # limit of a tank that a safety filter leaves alone, in heights of the rig
 PLANTS = 32  # plants that the search runs on
@@ -333,14 +331,7 @@ def is_stated(case: Case) -> bool:
 
 def plants_of(case: Case) -> dict[str, Any]:
     """Return {name: distribution} of what a case calls uncertain."""
-    if is_stated(case):
-        return spread_of(case)
-    names = parameters(case.loop)
-    found = {f"plant.{n}": SPREAD for n in FLOWS if np.size(names.get(f"plant.{n}", ()))}
-    split = np.asarray(names.get("plant.split", 0.0))
-    if np.max(split, initial=0.0) * (1.0 + SPREAD) > 1.0:
-        found.pop("plant.split")
-    return spread_of(case.replace(uncertain=found or {"sensor.noise": SPREAD}))
+    return spread_of(case.replace(uncertain=uncertain_shares(case)))
 
 
 def limited_levels(case: Case) -> np.ndarray:

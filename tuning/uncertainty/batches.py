@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
@@ -15,7 +16,6 @@ from jaxtank.xla.jit import compiled
 from tuning.cluster.engine import connect
 from tuning.cluster.sent import received, sent
 from tuning.problem.scenarios import noisy
-from tuning.uncertainty.sampling import check_whole
 
 BATCH = 256
 """Draws in a batch, on each device: enough to fill the vector units, few enough for the cache."""

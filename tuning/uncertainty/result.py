@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from jaxtank import measures as ms
-from tuning.problem.result import Result
 from tuning.storage.columns import column, row_blocks
 from tuning.uncertainty.sampling import clopper_pearson
+from tuning.views import Result
 
 TAIL = 0.05
 """Share of the draws that the conditional value at risk is the mean of [-]."""
@@ -52,8 +52,6 @@ class Ensemble(Result):
     method : str
         "random", "latin" or "sobol".
     """
-
-    REPORT = "tuning.report.uncertainty"
 
     case: Any
     distributions: dict

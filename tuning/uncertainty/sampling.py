@@ -10,14 +10,6 @@ METHODS = ("random", "latin", "sobol")
 """Ways to draw points."""
 
 
-def check_whole(name, value, low, high=None):
-    """Raise InputError unless `value` is a whole number from `low` to `high`."""
-    good = isinstance(value, int) and not isinstance(value, bool) and value >= low
-    if not good or (high is not None and value > high):
-        ends = f"of at least {low}" if high is None else f"from {low} to {high}"
-        raise InputError(f"{name} = {value!r}: must be a whole number {ends}")
-
-
 def clopper_pearson(count, samples, level=0.95):
     """Return [low, high], the exact interval of a probability by Clopper and Pearson."""
     tail, beta = (1.0 - level) / 2, scipy.special.betaincinv  # quantile of the beta distribution

@@ -10,17 +10,18 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.case import Case
+from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError, NonFiniteError, unknown
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
 from tuning.cluster.engine import check_cluster
-from tuning.problem.result import Result
 from tuning.problem.slopes import contradicted
 from tuning.uncertainty import indices
 from tuning.uncertainty.batches import batch_runner, check_devices, seed_of
 from tuning.uncertainty.distributions import Correlated, Discrete, Normal, stated
 from tuning.uncertainty.draws import Draws
-from tuning.uncertainty.sampling import check_whole, spread_of
+from tuning.uncertainty.sampling import spread_of
+from tuning.views import Result
 
 METHODS = ("local", "morris", "sobol")
 
@@ -36,8 +37,6 @@ RANKED_BY = {"local": "effect", "morris": "mu_star", "sobol": "total"}
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
 class SensitivityResult(Result):
     """How sensitive measures of a case are to its parameters; made by `tuning.sensitivity`."""
-
-    REPORT = "tuning.report.effects"
 
     case: Any
     method: str

@@ -10,10 +10,11 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.case import Case
+from jaxtank.core.checks import check_whole
+from jaxtank.limits import Limit, resolve_limits
 from jaxtank.loop import tank_bottom
 from tuning.cluster.engine import check_cluster
 from tuning.problem.functions import as_measures, digests
-from tuning.problem.limits import Limit, resolve_limits
 from tuning.storage.columns import Columns, row_blocks
 from tuning.storage.fingerprint import fingerprint
 from tuning.storage.store import Store
@@ -29,7 +30,7 @@ from tuning.uncertainty.distributions import stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.needs import BLOCK, infeasible
 from tuning.uncertainty.result import Ensemble
-from tuning.uncertainty.sampling import Points, check_whole, spread_of
+from tuning.uncertainty.sampling import Points, spread_of
 
 FAN_DRAWS = 512
 """Draws of a fan chart."""

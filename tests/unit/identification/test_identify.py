@@ -16,13 +16,13 @@ from scipy.optimize import least_squares
 import jaxtank
 import tuning
 from jaxtank import presets, rig
+from jaxtank.bounds import bounds
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tree import get_value, with_values
 from tuning.identification import residuals, simulation
 from tuning.identification.coordinates import coordinates_of
 from tuning.identification.design import candidates, compare_experiments, settled
 from tuning.identification.identified_case import with_pi
-from tuning.problem.bounds import bounds
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import spread_of
 

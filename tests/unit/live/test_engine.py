@@ -13,7 +13,7 @@ from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value
 from jaxtank.export.whole import served
-from tuning.live.engine import data, describe, engine, squares_of
+from jaxtank.live.engine import data, engine, facts_of, squares_of
 
 pytestmark = pytest.mark.skipif(NODE is None, reason="no node on this machine")
 # {case: what makes it short}
@@ -69,7 +69,7 @@ def short(name):
 def settings_of(case, count=1, leaves=10, seed=0):
     """Random settings of `leaves` sliders: within 5 %, between their ends, and at their ends."""
     rng, found = np.random.default_rng(seed), []
-    sliders = [s for s in describe(case)["leaves"] if s["value"] and s["group"] != "model"]
+    sliders = [s for s in facts_of(case)["leaves"] if s["value"] and s["group"] != "model"]
     for _ in range(count):
         chosen = rng.choice(len(sliders), min(leaves, len(sliders)), replace=False)
         own = [sliders[i] for i in chosen]
@@ -176,7 +176,7 @@ def test_noise_is_that_of_a_seed():
 
 
 def test_deviates_are_those_of_jax():
-    text = resources.files("tuning.live").joinpath("engine.js").read_text("utf-8")
+    text = resources.files("jaxtank.live").joinpath("engine.js").read_text("utf-8")
     script = "const info = {leaves: []}, programs = [];\n" + text
     found = node(script + "console.log(JSON.stringify(deviates(5, 2, 400).map((v) => [...v])))")
     expected = jax.random.normal(jax.random.key(5), (2, 400), dtype=float)
@@ -209,7 +209,7 @@ def test_derivatives_are_those_of_the_library(name):
 
 
 def test_of_runs_asked_for_meanwhile_the_newest_is_sent_and_without_a_worker_it_runs_here():
-    runner = resources.files("tuning.live").joinpath("runner.js").read_text("utf-8")
+    runner = resources.files("jaxtank.live").joinpath("runner.js").read_text("utf-8")
     found = node(runner + RUNNER)
     assert found["sent"] == [1, 3, 4] and found["quiet"]
     assert found["shown"] == [["a", 1], ["b", 3], [-4, 4], [-5, 5], "x"]

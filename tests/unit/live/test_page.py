@@ -16,9 +16,9 @@ import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
+from jaxtank.live.page import LivePage, live_page, page
 from jaxtank.signals.base import Constant
-from tuning.live import shown
-from tuning.live.page import page
+from tuning.report.live import live_page_of
 
 SETTINGS = {
     "controller.Kc[0]": 1.7,
@@ -236,7 +236,7 @@ def test_what_a_page_says_first_is_of_the_last_state(browser, tmp_path):
     """A result that keeps its limits never reads "exceeded", which the state before it does."""
     case = presets.find("cascaded/pi").replace(limits={"max_level": 9.9})
     states = [("before", {"controller.Kc": 3.0}, False), ("after", {"controller.Kc": 0.4}, False)]
-    shown.of_case(case, states).save(tmp_path / "page.html")
+    live_page(case, states).save(tmp_path / "page.html")
     context = browser.new_context(offline=True)
     try:
         tab, said = context.new_page(), []
@@ -259,10 +259,10 @@ def test_what_a_page_says_first_is_of_the_last_state(browser, tmp_path):
 def test_states_of_a_result_are_compared(browser, tmp_path):
     case = presets.find("cascaded/pi")
     states = [("before", {}, False), ("after", {"controller.Kc": 0.4}, False)]
-    live_page = shown.of_case(case, states)
-    live_page.save(tmp_path / "page.html")
+    stated = live_page(case, states)
+    stated.save(tmp_path / "page.html")
     inside = tmp_path / "report.html"
-    inside.write_text(f"<!DOCTYPE html><title>r</title>{shown.frame(live_page)}", encoding="utf-8")
+    inside.write_text(f"<!DOCTYPE html><title>r</title>{stated._repr_html_()}", encoding="utf-8")
     with opened(browser, tmp_path / "page.html") as live:
         assert live("jaxtank.state().values") == {"controller.Kc[0]": 0.4}
         assert "before" in live.text("#legend") and "before" in live.text("#measures")
@@ -328,9 +328,9 @@ def test_a_filtered_case_is_repeated_with_its_settings(browser, tmp_path):
 
 def test_a_result_without_a_case_has_no_page():
     with pytest.raises(InputError, match="has no case of its own"):
-        shown.of_result(object())
+        live_page_of(object())
     live = presets.find("cascaded/pi").explore()
-    assert isinstance(live, shown.LivePage) and "srcdoc=" in live._repr_html_()
+    assert isinstance(live, LivePage) and "srcdoc=" in live._repr_html_()
     assert json.dumps(live.name) in repr(live).replace("'", '"')
 
 

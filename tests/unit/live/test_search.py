@@ -8,8 +8,8 @@ from helpers import NODE, node
 
 import jaxtank
 from jaxtank import presets, rig
-from tuning.live.engine import engine
-from tuning.problem.limits import limit_scale, resolve_limits
+from jaxtank.limits import limit_scale, resolve_limits
+from jaxtank.live.engine import engine
 
 pytestmark = pytest.mark.skipif(NODE is None, reason="no node on this machine")
 SEARCH = """
@@ -23,7 +23,7 @@ def test_a_search_ends_where_a_scan_has_its_minimum():
     """Of one gain, within 0.5 % of the cost of the best of 60 values."""
     case = presets.find("cascaded/pi").replace(limits={})
     case = case.replace(free={"controller.Kc": (0.05, 3.3, "log")})
-    search = resources.files("tuning.live").joinpath("tune.js").read_text("utf-8")
+    search = resources.files("jaxtank.live").joinpath("tune.js").read_text("utf-8")
     found = node(engine(case) + search + SEARCH)
     scan = []
     for gain in np.geomspace(0.05, 3.3, 60):
@@ -40,7 +40,7 @@ def test_a_search_keeps_the_limits():
     case = rig.set_values(
         presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 300.0}
     ).replace(limits={"max_level": 17.0})
-    search = resources.files("tuning.live").joinpath("tune.js").read_text("utf-8")
+    search = resources.files("jaxtank.live").joinpath("tune.js").read_text("utf-8")
     found = node(engine(case) + search + SEARCH)
     loop = jaxtank.with_values(case.loop, found["values"])
     levels = jaxtank.evaluate(loop, case.clock, ["max_level"])["max_level"]
@@ -52,7 +52,7 @@ def test_a_search_without_a_way_ends_at_the_least_violation():
     """Of one gain, against the least of the largest violation on a scan of 60 values."""
     case = presets.find("cascaded/pi").replace(limits={"max_level": [6.0, 5.0]})
     case = case.replace(free={"controller.Kc": (0.05, 3.3, "log")})
-    search = resources.files("tuning.live").joinpath("tune.js").read_text("utf-8")
+    search = resources.files("jaxtank.live").joinpath("tune.js").read_text("utf-8")
     found = node(engine(case) + search + SEARCH)
     scan = []
     for gain in np.geomspace(0.05, 3.3, 60):
@@ -72,7 +72,7 @@ def ends_like_the_command(name):
     import tuning
 
     case = presets.find(name).replace(scenarios=())
-    search = resources.files("tuning.live").joinpath("tune.js").read_text("utf-8")
+    search = resources.files("jaxtank.live").joinpath("tune.js").read_text("utf-8")
     found = node(engine(case) + search + SEARCH)
     wanted = tuning.tune(case, nominal=True, validation=0)
     loop = jaxtank.with_values(case.loop, found["values"])

@@ -18,6 +18,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.limits import Limit
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.margins import worst
 from jaxtank.observers import Direct
@@ -25,7 +26,6 @@ from jaxtank.plants.network import network
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
 from tuning.cli.main import main
-from tuning.problem.limits import Limit
 
 control = pytest.importorskip("control", reason="python-control is the independent answer")
 

@@ -14,9 +14,9 @@ import tuning
 from jaxtank import measures as ms
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
+from jaxtank.limits import Limit
 from jaxtank.measures import Accumulator, Measure
 from tuning.cli.main import main
-from tuning.problem.limits import Limit
 from tuning.report.tables import reasons
 from tuning.uncertainty.sensitivity_study import check_measures
 

@@ -13,8 +13,8 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
+from jaxtank.limits import Limit
 from jaxtank.presets import Scenario, Symmetry
-from tuning.problem.limits import Limit
 from tuning.problem.problem import Point, Problem
 from tuning.search import diagnostics, methods
 from tuning.search.driver import Search

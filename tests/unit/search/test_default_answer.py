@@ -18,8 +18,8 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
+from jaxtank.live import page
 from jaxtank.xla import jit
-from tuning.live import shown
 from tuning.problem.problem import Problem
 from tuning.search import diagnostics
 from tuning.search.judged import judge
@@ -327,7 +327,7 @@ def test_the_json_has_the_keys_of_the_contract(result):
 
 def test_the_page_of_an_answer_judges_the_limits_that_the_filter_keeps(result, monkeypatch):
     """The search itself has none of them: they are proved."""
-    monkeypatch.setattr(shown, "page", lambda case, *_: str(dict(case.limits)))
+    monkeypatch.setattr(page, "page", lambda case, *_: str(dict(case.limits)))
     assert not result.problem.limits
     assert result.explore().text == "{'max_level': 2.7}"
 

@@ -10,10 +10,10 @@ from helpers import RIGS
 import jaxtank
 import tuning
 from jaxtank import rig
+from jaxtank.bounds import Bound
 from jaxtank.core.clock import Clock
+from jaxtank.limits import Limit, resolve_limits, undefined
 from jaxtank.signals.setpoints import ramps
-from tuning.problem.bounds import Bound
-from tuning.problem.limits import Limit, resolve_limits, undefined
 from tuning.problem.problem import Point
 from tuning.problem.reported import table_of
 from tuning.search import diagnostics

@@ -10,8 +10,8 @@ import tuning
 from jaxtank import rig
 from jaxtank.case import Free
 from jaxtank.core.errors import InputError
+from jaxtank.limits import Limit
 from tuning.problem import problem as objective
-from tuning.problem.limits import Limit
 from tuning.problem.problem import ROOT, Point, Problem
 from tuning.problem.reported import run_measures
 from tuning.problem.scenarios import screening_clock

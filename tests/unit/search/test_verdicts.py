@@ -12,9 +12,9 @@ from helpers import RIGS
 import jaxtank
 import tuning
 from jaxtank import presets, rig
+from jaxtank.limits import Limit, limit_scale, resolve_limits
 from jaxtank.signals.setpoints import ramps
 from tuning.cli import main
-from tuning.problem.limits import Limit, limit_scale, resolve_limits
 from tuning.problem.problem import Point
 from tuning.search.driver import Search, downhill
 from tuning.search.methods import slsqp

@@ -23,9 +23,9 @@ def explore(args):
         raise InputError(f"--out {str(path)!r} is a folder: give a file, as {path}/page.html")
     check_folder(path.parent)
     case = open_case(args)
-    from tuning.live import shown
+    from jaxtank.live.page import live_page
 
-    live = shown.of_case(case, source=args.case if args.case.endswith(".toml") else None)
+    live = live_page(case, source=args.case if args.case.endswith(".toml") else None)
     live.save(path)
     size = len(live.text.encode())
     if args.json:

@@ -116,13 +116,13 @@ def _task(args, case, seed) -> dict[str, Any]:
 
 def _check_tradeoff(case, task, sweep):
     """Raise InputError where the limit of --tradeoff is undefined in every run."""
-    from tuning.problem.limits import resolve_in
+    from jaxtank.limits import resolve_in
     from tuning.problem.scenarios import check_scenarios, runs_of
 
     scenarios = case.scenarios if task["scenarios"] is None else task["scenarios"]
     measure, values = sweep
     runs = runs_of(case, check_scenarios(case, scenarios), task["seed"])
-    resolve_in(runs, {measure: values[0]})
+    resolve_in([(run.name, run.case) for run in runs], {measure: values[0]})
 
 
 def _finder(args, case, task):

@@ -1,17 +1,14 @@
-"""What every result offers: text, HTML for a notebook, JSON, pictures and files.
+"""What every result offers: text, HTML for a notebook, JSON, pictures, files and a live page.
 
-The base classes of the results of `tuning`; their reports are opened when they are asked for.
+Made by `tuning.report`, which is registered in `tuning/__init__`.
 """
 
-# `report`, which is opened when it is asked for, is not strict
-# pyright: reportUnknownVariableType=false
-
-import importlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from jaxtank.core.files import check_folder
+from jaxtank.core.lazy import HOMES, call, home
 from jaxtank.core.text import with_picture
 
 
@@ -22,15 +19,14 @@ class Shown:
         """Return the texts and tables of the result as a fragment of HTML, with a small picture
         once `jaxtank.notebook()` has been called.
         """
-        from tuning.report.html import fragment
+        return with_picture(call("fragment", self._sections()), lambda: _first_picture(self))
 
-        return with_picture(fragment(self._sections()), lambda: _first_picture(self))
+    def _report(self) -> Any:
+        return home(next(c.__name__ for c in type(self).__mro__ if c.__name__ in HOMES))
 
     def _sections(self) -> Sequence[Any]:
         """Return the sections of the result's Report."""
-        from tuning.report.tables import Table
-
-        return [Table(list(self._rows().items()))]
+        return [call("Table", list(self._rows().items()))]
 
     def _rows(self) -> Mapping[str, Any]:
         """Return {name: value} of a result without a report."""
@@ -43,11 +39,6 @@ class Shown:
 class Result(Shown):
     """A result with a report: `print(result)`, `.to_json()`, `.plot()`, `.save(folder)`."""
 
-    REPORT: ClassVar[str]
-
-    def _report(self) -> Any:
-        return importlib.import_module(self.REPORT)
-
     def _sections(self) -> Sequence[Any]:
         return self._report().report(self).sections
 
@@ -55,9 +46,7 @@ class Result(Shown):
         return repr(self)
 
     def __repr__(self) -> str:
-        from tuning.report.document import terminal
-
-        return terminal(self._report().report(self))
+        return call("terminal", self._report().report(self))
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON object that the command prints with --json: plain numbers, no NaN."""
@@ -68,11 +57,11 @@ class Result(Shown):
         return self._report().figures(self)
 
     def explore(self, plants: int | None = None) -> Any:
-        """Return the live page of the result's case, a `tuning.live.shown.LivePage`: of a tuned one
-        with its values before and after. A notebook shows it, and `.save(path)` writes it.
+        """Return the live page of the result's case: of a tuned one with its values before and
+        after. A notebook shows it, and `.save(path)` writes it.
         """
-        # Raises InputError for a case that cannot be run in a browser.
-        return importlib.import_module("tuning.live.shown").of_result(self, plants)
+        # Raises InputError for a result without a case, and a case that a browser cannot run.
+        return call("live_page_of", self, plants)
 
     def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
         """Write result.json, tables, pictures and report.html to `folder`; return their paths."""
@@ -82,7 +71,7 @@ class Result(Shown):
 
 def _first_picture(result: Any) -> bytes | None:
     """The first picture of a result as PNG bytes, None where it has none."""
-    from jaxtank.plots.run import small
+    from jaxtank.plots.run import small  # matplotlib, only where pictures are asked for
 
     plot: Any = getattr(result, "plot", None)
     return None if plot is None else small(plot())

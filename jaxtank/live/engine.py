@@ -4,6 +4,7 @@ The text needs no page: node runs it too.
 """
 
 import json
+import math
 import re
 from collections.abc import Callable, Mapping
 from importlib import resources
@@ -13,14 +14,13 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.case import Case
+from jaxtank.bounds import bounds
+from jaxtank.case import Case, Free
 from jaxtank.controllers import OpenLoop
+from jaxtank.core.tree import describe, get_value
 from jaxtank.export.whole import WholeLoop, library, whole_loop
-from tuning.live.printed import Printed, maths
-from tuning.live.sliders import leaf_of
-from tuning.problem.bounds import bounds
-from tuning.problem.limits import limit_scale, resolve_limits
-from tuning.problem.problem import ROOT
+from jaxtank.limits import limit_scale, resolve_limits
+from jaxtank.live.printed import Printed, maths
 
 ROWS = 3000
 """Rows of a run for people, about: those of `jaxtank simulate --out`."""
@@ -28,6 +28,27 @@ ALWAYS = ("rms_error_total", "max_level")
 """Measures of a search whatever a case minimises and limits."""
 SHARED = ("unit", "doc", "group")
 """What the entries of one array have in common."""
+
+GROUPS = {
+    "controller": "controller",
+    "observer": "observer",
+    "sensor": "sensor",
+    "actuator": "pumps",
+    "plant": "plant",
+    "reference": "reference",
+    "disturbance": "disturbance",
+    "faults": "disturbance",
+    "safety_filter": "safety filter",
+    "x0": "initial",
+}
+"""{first part of a dotted name: group of its slider}."""
+
+WIDE = {"controller": (0.2, 5.0), "observer": (0.2, 5.0), "plant": (0.5, 1.5), "pumps": (0.5, 1.5)}
+"""{group: ends of a slider as multiples of a value that has no bounds}; (0, 2) of the others."""
+ABOVE = 1e-3
+"""Lower end of a slider above a lower bound that is excluded, as a share of the range [-]."""
+NOISE = 0.02
+"""Upper end of the sliders of noise, as a share of the height of the tanks [-]."""
 
 
 def program_of(case: Case) -> tuple[WholeLoop, str]:
@@ -69,7 +90,7 @@ def engine(
         programs = ",\n".join(text for _, text in parts)
         functions = "\n".join(map(bare, library(programs)))
     programs = f"(()=>{{{maths(functions + programs)}\n{functions}\nreturn[{programs}];}})()"
-    driver = resources.files("tuning.live").joinpath("engine.js").read_text(encoding="utf-8")
+    driver = resources.files("jaxtank.live").joinpath("engine.js").read_text(encoding="utf-8")
     return "\n".join(
         [
             "const makeEngine=(()=>{",
@@ -83,13 +104,13 @@ def engine(
     )
 
 
-def describe(case: Case, filtered: Case | None = None) -> dict[str, Any]:
+def facts_of(case: Case, filtered: Case | None = None) -> dict[str, Any]:
     """Return what is known of the loop of a case beside its code, as a JSON object.
 
     Examples
     --------
     >>> from jaxtank import presets
-    >>> describe(presets.find("cascaded/pi"))["pumps"][0]["upper"]
+    >>> facts_of(presets.find("cascaded/pi"))["pumps"][0]["upper"]
     10.0
     """
     with jax.enable_x64(True):
@@ -124,7 +145,7 @@ def squares_of(objective: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
     `tune` has it.
     """
     own = tuple((m, w) for m, w in objective.items() if m in ms.squares())
-    return (("mean_square_error", 1.0),) if ROOT in objective or not own else own
+    return (("mean_square_error", 1.0),) if "rms_error_total" in objective or not own else own
 
 
 def _lean(case: Case) -> WholeLoop:
@@ -242,3 +263,49 @@ def _limits(case):
             }
         )
     return found
+
+
+def leaf_of(case: Case, name: str, index: tuple[int, ...]) -> dict[str, Any]:
+    """Return the slider of one number of a loop, as a JSON object."""
+    full = f"{name}[{','.join(map(str, index))}]" if index else name
+    meta = describe(case.loop, full)
+    value = float(np.asarray(get_value(case.loop, full)))
+    group = GROUPS.get(name.split(".")[0], name.split(".")[0])
+    if ".model." in name:
+        group = "model"
+    lower, upper = _ends(case, name, full, value, meta, group)
+    return {
+        "name": full,
+        "unit": meta["unit"],
+        "doc": meta["doc"],
+        "value": value if math.isfinite(value) else None,
+        "lower": lower,
+        "upper": upper,
+        "group": group,
+    }
+
+
+def _ends(case, name, full, value, meta, group):
+    """(lower, upper) of a slider: the bounds of a search, else around the value."""
+    for key in (full, name):
+        if key in case.free:
+            low, high, _ = Free(*case.free[key])
+            return min(low, value), max(high, value)
+    rim = np.asarray(case.loop.plant.rim, dtype=float)
+    height = float(np.max(rim[np.isfinite(rim)], initial=0.0)) or 1.0
+    if name == "sensor.noise":
+        low, high = 0.0, max(NOISE * height, 2.0 * value)
+    elif group in ("reference", "initial") and meta["unit"] == case.loop.units[0]:
+        low, high = 0.0, max(height, value)
+    elif value == 0.0:
+        low, high = 0.0, 1.0
+    else:
+        least, most = WIDE.get(group, (0.0, 2.0))
+        low, high = sorted((least * value, most * value))
+    if meta["low"] is not None:
+        low = max(low, float(meta["low"]))
+        if meta.get("strict") and low <= float(meta["low"]):  # an end that is not allowed itself
+            low = float(meta["low"]) + ABOVE * (high - float(meta["low"]))
+    if meta["high"] is not None:
+        high = min(high, float(meta["high"]))
+    return min(low, value), max(high, value)

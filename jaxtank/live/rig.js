@@ -13,7 +13,7 @@ function draw(tag, attributes, text) {
 // a name as long as a tank is wide
 const shortened = (name) => (name.length > 12 ? `${name.slice(0, 11)}…` : name);
 
-// rig: data of tuning/live/drawing.py; returns {update({h, r, u, spills})}
+// rig: data of jaxtank/live/page.py; returns {update({h, r, u, spills})}
 function makeRig(svg, rig, info) {
   const { left, right, bottom, top } = rig;
   const X = (x) => (x - left) * UNIT, Y = (y) => (top - y) * UNIT;

@@ -16,7 +16,6 @@ from jaxtank.core.errors import InputError
 from jaxtank.loop.change_windows import windows
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.rig import check_limits
-from tuning.problem.scenarios import ScenarioRun
 
 UNDEFINED_MARGIN = 1e6
 """Amount by which a measure that is infinite (never settled) or undefined (never reached 90 % of
@@ -95,21 +94,21 @@ def resolve_limits(
     # overflow volume. An entry that is undefined on the case's run (see `undefined`) has no Limit.
     # Raises InputError for an unknown measure, a value that is no number, and a measure all of
     # whose entries are undefined.
-    return resolve_in([ScenarioRun(scenario, case, None, 1.0)], limits, run)
+    return resolve_in([(scenario, case)], limits, run)
 
 
 def resolve_in(
-    runs: Sequence[ScenarioRun], limits: Mapping[str, Any] | None = None, first: int = 0
+    runs: Sequence[tuple[str, Case]], limits: Mapping[str, Any] | None = None, first: int = 0
 ) -> list[Limit]:
-    """Return the Limits of `resolve_limits` in each of `runs`, numbered from `first`."""
+    """Return the Limits of `resolve_limits` in each (scenario, case), numbered from `first`."""
     found: list[Limit] = []
     why: dict[str, tuple[Any, str]] = {}
-    for i, run in enumerate(runs, first):
-        loop = run.case.loop
-        given = check_limits(loop, run.case.limits if limits is None else limits)
-        for measure, value in given.items():
+    for i, (scenario, case) in enumerate(runs, first):
+        loop = case.loop
+        checked = check_limits(loop, case.limits if limits is None else limits)
+        for measure, value in checked.items():
             value = np.asarray(loop.plant.rim) if isinstance(value, str) else value
-            reason, missing = undefined(measure, run.case)
+            reason, missing = undefined(measure, case)
             if all(missing):
                 why.setdefault(measure, (value, reason))
                 continue
@@ -117,13 +116,13 @@ def resolve_in(
             for j, v in enumerate(values):
                 if not missing[j]:
                     measured, at = _without_overflow(measure, j, float(v), loop.plant)
-                    found.append(Limit(measured, j, at, i, run.name))
+                    found.append(Limit(measured, j, at, i, scenario))
     for measure, (value, reason) in why.items():
         if not any(limit.measure == measure for limit in found):
             text = ", ".join(f"{v:g}" for v in np.ravel(value))
             where = "in every scenario" if len(runs) > 1 else "on this run"
             raise InputError(
-                f"limit {measure} = {text} {ms.unit(measure, runs[0].case.loop.units)}: undefined"
+                f"limit {measure} = {text} {ms.unit(measure, runs[0][1].loop.units)}: undefined"
                 f" {where}: {reason}, or drop the limit (--limit {measure}=none)"
             )
     return found

@@ -1,65 +1,18 @@
-"""The live page of a case or a result: saved as a file, shown by a notebook, put into a report."""
+"""The live page of a result: of its case, or of the tuned one with both states to start from."""
 
 import dataclasses
-import html
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
-from jaxtank.core.files import write_folder
 from jaxtank.core.tree import parameters
-from tuning.live.page import page
+from jaxtank.live.page import LivePage, live_page
 from tuning.problem.functions import as_measures
 
-HEIGHT = 900
-"""Height of the page inside another one [px]."""
 
-
-@dataclasses.dataclass(frozen=True)
-class LivePage:
-    """The live page of a case, which a notebook shows."""
-
-    name: str
-    text: str
-
-    def save(self, path: str | Path) -> Path:
-        """Write the page to a file, whole or not at all; return its path."""
-        path = Path(path)
-        if path.is_dir():
-            raise InputError(f"--out {str(path)!r} is a folder: give a file, as {path}/page.html")
-        return write_folder(path.parent, {path.name: self.text})[0]
-
-    def _repr_html_(self) -> str:
-        return frame(self)
-
-    def __repr__(self) -> str:
-        return f"LivePage({self.name!r}, {len(self.text)} characters): .save(path) writes it"
-
-
-def frame(live: LivePage, height: int = HEIGHT) -> str:
-    """Return an element that shows a live page inside another page, without access to that one."""
-    title = html.escape(f"{live.name}, live")
-    # in an attribute between double quotes; "<" also, for readers that look for elements
-    inside = live.text.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
-    return (
-        f'<iframe class="live" title="{title}" width="100%" height="{height}"'
-        ' sandbox="allow-scripts allow-downloads" allow="clipboard-write" loading="lazy"'
-        f' srcdoc="{inside}"></iframe>'
-    )
-
-
-def of_case(
-    case: Any, presets: Any = (), source: str | None = None, plants: int | None = None
-) -> LivePage:
-    """Return the LivePage of a case; the arguments are those of `tuning.live.page.page`."""
-    # Raises InputError for a case that cannot be run in a browser.
-    return LivePage(case.name, page(case, presets, source, plants))
-
-
-def of_result(result: Any, plants: int | None = None) -> LivePage:
+def live_page_of(result: Any, plants: int | None = None) -> LivePage:
     """Return the LivePage of a result of `tuning`: of its case, or of the tuned one with the values
     before and after as states to start from.
     """
@@ -80,7 +33,7 @@ def of_result(result: Any, plants: int | None = None) -> LivePage:
         own = set(ms.functions(limits))  # a user's functions do not run in a browser
         limits = {m: value for m, value in limits.items() if m not in own}
         case = case.replace(limits=limits)  # those of the search, with --limit
-    return of_case(case, states_of(result), plants=plants)
+    return live_page(case, states_of(result), plants=plants)
 
 
 def states_of(result: Any) -> list[tuple[str, dict[str, Any], bool]]:

@@ -6,6 +6,7 @@ in vendor/.
 """
 
 import base64
+import dataclasses
 import hashlib
 import html
 import json
@@ -13,22 +14,24 @@ import re
 import zlib
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-import jaxtank
 from jaxtank import rig
+from jaxtank.bounds import bounds
+from jaxtank.case import uncertain_shares
+from jaxtank.core import VERSION
+from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError
+from jaxtank.core.files import write_folder
 from jaxtank.core.tree import get_value, parameters
 from jaxtank.export.whole import check_pointwise
+from jaxtank.live.engine import engine, program_of
+from jaxtank.live.origin import both, entries, origin_of
 from jaxtank.loop.closed_loop import takes_arrays
 from jaxtank.loop.trajectory import stride
-from tuning.live.drawing import drawing
-from tuning.live.engine import engine, program_of
-from tuning.live.origin import both, entries, origin_of
-from tuning.problem.bounds import bounds
-from tuning.search.setting import plants_of
-from tuning.uncertainty.sampling import check_whole
+from jaxtank.plots.layout import jets, overflows, pipes, place
 
 HERE = Path(__file__).parent
 SCRIPTS = ("charts", "rig", "runner", "page")
@@ -108,7 +111,7 @@ def data_of(case, presets=(), source=None, plants=None):
         toml = f"# no rig file describes this case ({error})\n"
     origin = origin_of(case, source)
     return {
-        "version": jaxtank.__version__,
+        "version": VERSION,
         "origin": origin._asdict(),
         "filter": case.loop.safety_filter is not None,
         "every": stride(case.clock.samples),
@@ -160,16 +163,13 @@ def _breaks(case):
 
 def _uncertain(case):
     """{dotted name: half-width as a share} of what varies from plant to plant."""
-    found = {}
-    for name, one in plants_of(case).items():
-        if getattr(one, "relative", None) is not None:
-            found[name] = float(one.relative)
-        elif hasattr(one, "covariance"):
-            for own, variance in zip(one.names, np.diagonal(np.asarray(one.covariance))):
-                value = float(np.ravel(get_value(case.loop, own))[0])
-                if value:
-                    found[own] = float(np.sqrt(3.0 * variance) / abs(value))
-    return found
+    shares = {name: float(share) for name, share in uncertain_shares(case).items()}
+    names, covariance = case.covariance or ((), np.empty((0, 0)))
+    for name, variance in zip(names, np.diagonal(np.asarray(covariance))):
+        value = float(np.ravel(get_value(case.loop, name))[0])
+        if value:
+            shares[name] = float(np.sqrt(3.0 * variance) / abs(value))
+    return shares
 
 
 def assemble(engine_text, name, data):
@@ -251,3 +251,72 @@ def _loader():
     terms = _read("vendor/uPlot-LICENSE.txt").partition("\n\n")[2]
     parts = [licence, terms, '*/\n(() => {"use strict";', _script("inflate"), _script("loader")]
     return "\n".join([*parts, "})();"])
+
+
+def drawing(plant):
+    """Return the positions of all parts of a rig, in heights of its tallest tank."""
+    if not hasattr(plant, "links"):
+        return None
+    where = place(plant)
+    return {
+        "boxes": [_rounded(box) for box in where.boxes],
+        "pumps": [_rounded(p) for p in where.pumps],
+        "risers": [[pump, tank, _path(path)] for pump, tank, path in where.risers],
+        "pipes": [_rounded(p) for p in pipes(plant, where)],
+        "jets": [[tank, _path(path)] for tank, path in jets(plant, where)],
+        "overflows": [[tank, _path(path)] for tank, path in overflows(plant, where)],
+        **{end: round(float(getattr(where, end)), 4) for end in ("left", "right", "bottom", "top")},
+    }
+
+
+def _rounded(values):
+    return [round(float(v), 4) for v in values]
+
+
+def _path(path):
+    return [_rounded(point) for point in path]
+
+
+HEIGHT = 900
+"""Height of the page inside another one [px]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LivePage:
+    """The live page of a case, which a notebook shows."""
+
+    name: str
+    text: str
+
+    def save(self, path: str | Path) -> Path:
+        """Write the page to a file, whole or not at all; return its path."""
+        path = Path(path)
+        if path.is_dir():
+            raise InputError(f"--out {str(path)!r} is a folder: give a file, as {path}/page.html")
+        return write_folder(path.parent, {path.name: self.text})[0]
+
+    def _repr_html_(self) -> str:
+        return frame(self)
+
+    def __repr__(self) -> str:
+        return f"LivePage({self.name!r}, {len(self.text)} characters): .save(path) writes it"
+
+
+def frame(live: LivePage, height: int = HEIGHT) -> str:
+    """Return an element that shows a live page inside another page, without access to that one."""
+    title = html.escape(f"{live.name}, live")
+    # in an attribute between double quotes; "<" also, for readers that look for elements
+    inside = live.text.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
+    return (
+        f'<iframe class="live" title="{title}" width="100%" height="{height}"'
+        ' sandbox="allow-scripts allow-downloads" allow="clipboard-write" loading="lazy"'
+        f' srcdoc="{inside}"></iframe>'
+    )
+
+
+def live_page(
+    case: Any, presets: Any = (), source: str | None = None, plants: int | None = None
+) -> LivePage:
+    """Return the LivePage of a case; the arguments are those of `jaxtank.live.page.page`."""
+    # Raises InputError for a case that cannot be run in a browser.
+    return LivePage(case.name, page(case, presets, source, plants))
