@@ -1,12 +1,9 @@
-"""Ensembles: time per closed-loop step and lane beside the C loop, what many draws cost, what they
-hold in memory, what a second device gives.
+"""Ensembles: what many draws cost, and what a second device gives.
 
     python tests/benchmarks/ensemble.py [--rounds 3]
 
-Every figure is of this machine in this run; compilation is apart. The C loop in vector lanes is
-floor_lanes.c (gcc -O3 -march=native
--mprefer-vector-width=512, no -ffast-math) on the same plants, its time taken in turn with ours, one
-core each; the other one runs one plant at a time (tuning/floor.c).
+Also the C loop in vector lanes for `speed.py`: floor_lanes.c (gcc -O3 -march=native
+-mprefer-vector-width=512, no -ffast-math) on the same plants, one core.
 """
 
 import argparse
@@ -15,42 +12,23 @@ import shutil
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 
 import jax
 import numpy as np
+from measuring import core_times
 
 import tuning
 from jaxtank import presets, rig
-from tuning.bench import bench
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import probabilities, spread_of
 
 SOURCE = Path(__file__).with_name("floor_lanes.c")
-FLAGS = (
-    "-O3",
-    "-march=native",
-    "-mprefer-vector-width=512",
-    "-fno-math-errno",
-    "-fno-trapping-math",
-    "-shared",
-    "-fPIC",
-)
+FLAGS = ["-O3", "-march=native", "-mprefer-vector-width=512", "-fno-math-errno"]
+FLAGS += ["-fno-trapping-math", "-shared", "-fPIC"]
 BLOCK = 32  # lanes that the C loop holds in registers and L1; 8 to 64 differ by a tenth
 NAMES = ("rms_error_total", "max_level")
-
-
-def seconds(call, rounds):
-    """Median wall time [s] of `call` over rounds, after one that compiles."""
-    call()
-    times = []
-    for _ in range(rounds):
-        began = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - began)
-    return statistics.median(times)
 
 
 def draw(case, samples, **options):
@@ -66,22 +44,11 @@ def c_batch(folder, single=False):
     """The C loop of floor_lanes.c, None where there is no gcc."""
     if shutil.which("gcc") is None:
         return None
-    library = Path(folder) / "lanes.so"
-    subprocess.run(
-        [
-            "gcc",
-            *FLAGS,
-            *(SINGLE if single else ()),
-            f"-DLANES={BLOCK}",
-            "-o",
-            str(library),
-            str(SOURCE),
-            "-lm",
-        ],
-        check=True,
-        capture_output=True,
-    )
-    function = ctypes.CDLL(str(library)).four_tanks
+    library = str(Path(folder) / "lanes.so")
+    flags = [*FLAGS, *(SINGLE if single else ()), f"-DLANES={BLOCK}"]
+    command = ["gcc", *flags, "-o", library, str(SOURCE), "-lm"]
+    subprocess.run(command, check=True, capture_output=True)
+    function = ctypes.CDLL(library).four_tanks
     function.restype = None
     return function
 
@@ -154,24 +121,17 @@ def beside_batch(function, case, samples, rounds, single=False):
     core time, the two in turn.
     """
     ours, theirs = (lambda: draw(case, samples)), c_run(function, case, samples, single)
-    seen, (rms, top), times = ours(), theirs(), {ours: [], theirs: []}
-    apart = max(
-        abs(rms - seen.measures["rms_error_total"]).max(),
-        abs(top - seen.measures["max_level"]).max(),
-    )
-    for _ in range(rounds):
-        for call, spent in times.items():
-            began = time.process_time()
-            call()
-            spent.append(time.process_time() - began)
-    a, b = (
-        1e9 * statistics.median(spent) / (samples * case.clock.samples) for spent in times.values()
-    )
+    measures, (rms, top) = ours().measures, theirs()
+    apart = abs(rms - measures["rms_error_total"]).max()
+    apart = max(apart, abs(top - measures["max_level"]).max())
+    times = core_times({"ours": ours, "theirs": theirs}, rounds)
+    steps = samples * case.clock.samples
+    a, b = (1e9 * statistics.median(spent) / steps for spent in times.values())
     return a, b, statistics.median(p / q for p, q in zip(*times.values())), apart
 
 
 CHILD = """
-import re, sys, jax, tuning, time
+import sys, jax, tuning, time
 devices, samples, dt = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", devices)
@@ -182,20 +142,14 @@ run = lambda n: tuning.ensemble(case, samples=n, measures=names, fan=False, devi
 run(512)
 began = time.perf_counter()
 run(samples)
-peak = int(re.search(r"VmHWM:\\s*(\\d+)", open("/proc/self/status").read())[1])
-print(time.perf_counter() - began, peak / 1024)
+print(time.perf_counter() - began)
 """
 
 
 def child(devices, samples, dt):
-    """(wall time [s], peak memory [MiB]) of an ensemble in a process of its own."""
-    out = subprocess.run(
-        [sys.executable, "-c", CHILD, str(devices), str(samples), str(dt)],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return tuple(float(v) for v in out.stdout.split())
+    """Wall time [s] of an ensemble in a process of its own."""
+    words = [sys.executable, "-c", CHILD, str(devices), str(samples), str(dt)]
+    return float(subprocess.run(words, capture_output=True, text=True, check=True).stdout)
 
 
 def main():
@@ -205,46 +159,15 @@ def main():
     parser.add_argument("--rounds", type=int, default=3)
     rounds = parser.parse_args().rounds
     jax.config.update("jax_enable_x64", True)
-    fine = presets.find("gouta2015/backstepping")
-    coarse = rig.set_values(fine, {"clock.dt": 0.1})
-    with tempfile.TemporaryDirectory() as folder:
-        function = bench.c_loop(folder)
-        c = (
-            None
-            if function is None
-            else seconds(bench.c_runner(function, fine), rounds) / fine.clock.samples
-        )
-    ns = seconds(lambda: draw(fine, 1024), rounds) / (1024 * fine.clock.samples) * 1e9
-    beside = (
-        "no gcc" if c is None else f"{ns / (1e9 * c):.2f} x the scalar C loop ({1e9 * c:.1f} ns)"
-    )
-    print(f"1,024 plants x {fine.clock.samples} samples: {ns:.1f} ns per step and plant, {beside}")
-    halves = {"clock.integrator": "midpoint"}
-    with tempfile.TemporaryDirectory() as folder:
-        function = c_batch(folder)
-        for words, case in (
-            (("RK4", fine), ("midpoint", rig.set_values(fine, halves))) if function else ()
-        ):
-            a, b, ratio, apart = beside_batch(function, case, 1000, rounds)
-            print(
-                f"1,000 plants x {case.clock.samples} samples, {words}: {a:.1f} ns of one core per"
-                f" step and plant, {b:.1f} the C loop in lanes, {ratio:.2f} x; they agree to"
-                f" {apart:.0e} cm"
-            )
-    for words, case in (("RK4", coarse), ("midpoint", rig.set_values(coarse, halves))):
+    coarse = rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.1})
+    for words, values in (("RK4", {}), ("midpoint", {"clock.integrator": "midpoint"})):
+        case = rig.set_values(coarse, values)
         draw(case, 1024)
         began = time.process_time()
         draw(case, 10_000)
-        print(
-            f"10,000 plants x {case.clock.samples} samples, {words}:"
-            f" {time.process_time() - began:.2f} core-seconds"
-        )
-    few, many = child(1, 1_000, 1.0)[1], child(1, 100_000, 1.0)[1]
-    print(
-        f"peak memory: 1,000 plants {few:.0f} MiB, 100,000 plants {many:.0f} MiB"
-        f" ({many - few:+.0f})"
-    )
-    one, two = (np.median([child(n, 4096, 0.1)[0] for _ in range(rounds)]) for n in (1, 2))
+        spent = time.process_time() - began
+        print(f"10,000 plants x {case.clock.samples} samples, {words}: {spent:.2f} core-seconds")
+    one, two = (np.median([child(n, 4096, 0.1) for _ in range(rounds)]) for n in (1, 2))
     print(f"4,096 plants: one device {one:.2f} s, two devices {two:.2f} s, {one / two:.2f} times")
 
 

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from measuring import core_times
 
 import jaxtank
 from jaxtank import rig
@@ -120,13 +121,8 @@ def row(tanks, libraries, rounds):
     many, to_derive = compiled(gradient, loop, GAINS)
     calls = {"run": lambda: one(loop, GAINS), "gradient": lambda: many(loop, GAINS)}
     calls |= {name: c_runner(library, loop, clock) for name, library in libraries.items()}
-    seconds = {name: [] for name in calls}
     results = {name: jax.block_until_ready(call()) for name, call in calls.items()}
-    for _ in range(rounds):
-        for name, call in calls.items():
-            began = time.process_time()
-            jax.block_until_ready(call())
-            seconds[name].append(time.process_time() - began)
+    seconds = core_times(calls, rounds)
     median = {name: float(np.median(s)) for name, s in seconds.items()}
     each = 1e9 / (clock.samples * tanks)
     top = np.max(np.abs(results["run"]["max_level"] - results["gcc -O3"][1]))

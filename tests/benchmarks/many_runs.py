@@ -8,11 +8,11 @@ with samples of 1 s, and the 701 samples of cascaded/pi.
 
 import dataclasses
 import sys
-import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from measuring import core_times, first_number
 
 import jaxtank
 from jaxtank import presets
@@ -25,14 +25,7 @@ NAMES = ("rms_error_total", "max_level")
 
 def least(call, rounds, calls=1):
     """Least core time of a call [s]."""
-    jax.block_until_ready(call())
-    spent = []
-    for _ in range(rounds):
-        began = time.process_time()
-        for _ in range(calls):
-            jax.block_until_ready(call())
-        spent.append((time.process_time() - began) / calls)
-    return min(spent)
+    return min(core_times({"": call}, rounds, calls)[""])
 
 
 def many(rounds):
@@ -83,7 +76,7 @@ def short(rounds):
 
 def main(words):
     jax.config.update("jax_enable_x64", True)
-    rounds = next((int(w) for w in words if w.isdigit()), 3)
+    rounds = first_number(words, 3)
     heads = ["runs", "one jax.vmap, ns per step and run", "evaluate_many, ns", "ratio"]
     print(tables.table(many(rounds), heads))
     print(tables.table(short(rounds), ["701 samples", "ms a call"]))

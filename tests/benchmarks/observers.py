@@ -11,17 +11,16 @@ state of the wrong plants, is left out. No noise.
 """
 
 import dataclasses
-import re
 import sys
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
+import measuring
 import numpy as np
+from measuring import store
 
 import tuning
 from jaxtank import presets, rig
-from jaxtank.core.files import write_atomic
 from jaxtank.core.tree import number, with_values
 from jaxtank.loop import run as lp
 from jaxtank.observers import DisturbanceObserver
@@ -37,7 +36,6 @@ CASES = (
     "mirakhorli/smc",
     "mirakhorli/hybrid",
 )
-README = Path(__file__).with_name("README.md")
 BEGIN, END = "<!-- tests/benchmarks/observers.py -->", "<!-- end of observers -->"
 
 
@@ -109,22 +107,19 @@ def markdown(rows):
         *("case", "off by", "plants that can follow", "error without, all (follow)"),
         *("with, all (follow)", "largest of those that can follow", "share"),
     )
-    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    lines = []
     for r in rows:
         cells = [r.case, f"{100 * r.spread:g} %", f"{r.follow} of {N}"]
         cells += [f"{a:.3g} ({b:.3g}) cm" for a, b, _ in (r.without, r.observed)]
-        cells += [f"{r.observed[2]:.1g} cm", f"{r.share:.1g}"]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        lines.append([*cells, f"{r.observed[2]:.1g} cm", f"{r.share:.1g}"])
+    return measuring.markdown(heads, lines)
 
 
 def main(words):
     jax.config.update("jax_enable_x64", True)
     text = markdown(everything())
     if "--markdown" in words:
-        page = README.read_text()
-        put = lambda _: f"{BEGIN}\n{text}\n{END}"
-        write_atomic(README, re.sub(f"{BEGIN}.*?{END}", put, page, flags=re.DOTALL))
+        store(BEGIN, END, text)
         return
     print(text)
 

@@ -48,6 +48,7 @@ from tuning.search.screening import distinct_starts, screen
 NEAR = 1e-3
 """A search has arrived within this share above the best cost found [-]."""
 
+STUDY = {"mean_square_error": 1.0, "mean_square_travel": 100.0}
 OURS = ("trf", "coarse-trf", "slsqp")
 BUDGET = {2: 500, 8: 2000, 20: 4000}
 """Evaluations that a derivative-free search may spend from one start."""
@@ -64,9 +65,7 @@ def two_gains():
         clock=dataclasses.replace(case.clock, dt=0.1),
         free={"controller.k": Free(1e-3, 5.0), "controller.k1": Free(1e-3, 1.0)},
     )
-    return Problem(
-        case, objective={"mean_square_error": 1.0, "mean_square_travel": 100.0}, limits={}
-    )
+    return Problem(case, objective=STUDY, limits={})
 
 
 def eight_gains():
@@ -78,9 +77,8 @@ def eight_gains():
     are of one size at the best gains.
     """
     case = presets.find("mirakhorli/sfc")
-    return Problem(
-        case, objective={"ise": 1.0, "input_deviation": 3.0, "mean_square_travel": 100.0}, limits={}
-    )
+    objective = {"ise": 1.0, "input_deviation": 3.0, "mean_square_travel": 100.0}
+    return Problem(case, objective=objective, limits={})
 
 
 def twenty_values(knots=20):
@@ -103,9 +101,7 @@ def twenty_values(knots=20):
         free={"controller.k1": Free(1e-3, 1.0)},
     )
     case = schedule(case, {"controller.k1": "r1"}, np.linspace(3.0, 16.0, knots))
-    return Problem(
-        case, objective={"mean_square_error": 1.0, "mean_square_travel": 100.0}, limits={}
-    )
+    return Problem(case, objective=STUDY, limits={})
 
 
 PROBLEMS = {2: two_gains, 8: eight_gains, 20: twenty_values}
@@ -166,19 +162,14 @@ def prices(problem, z, batch, rounds=7):
 def ours(problem, method, z, reference, price, iterations):
     """Trace of a local search of tuning.solvers."""
     trace, search = Trace(), None
-    unit, tenth = (
-        price["simulation"][1],
-        coarse_clock(problem.clock).samples / problem.clock.samples,
-    )
+    unit = price["simulation"][1]
+    tenth = coarse_clock(problem.clock).samples / problem.clock.samples
 
     def seen(search):
         coarse = len(search.history) == seen.known
         seen.known = len(search.history)
-        spent = (
-            (1, tenth, price["rough pass"][1] / unit)
-            if coarse
-            else (1, 1.0, price["pass"][1] / unit)
-        )
+        what = "rough pass" if coarse else "pass"
+        spent = (1, tenth if coarse else 1.0, price[what][1] / unit)
         trace.add(np.inf if coarse else search.history[-1][1], *spent)
 
     seen.known = 0
@@ -331,11 +322,8 @@ def summary(traces, target):
     columns = {}
     for i, name in enumerate(("seconds", "evaluations", "runs", "work")):
         values = [np.inf if r is None else r[i] for r in reached]
-        columns[name] = {
-            "median": statistics.median(values),
-            "low": min(values),
-            "high": max(values),
-        }
+        middle = statistics.median(values)
+        columns[name] = {"median": middle, "low": min(values), "high": max(values)}
     return {"starts": len(traces), "successes": sum(r is not None for r in reached), **columns}
 
 
@@ -350,23 +338,14 @@ def race(problem, traces, starts, target):
     for k, z in enumerate(starts):
         theirs = rival(problem, "CMA-ES", z, k, -np.inf, 10**9, limit)
         for method in ("trf", "coarse-trf"):
-            mine = traces[method][k]
-            near = mine.until(target) or mine.rows[-1]
-            for when, seconds, passes in (("arrived", *near[:2]), ("ended", *mine.rows[-1][:2])):
-                rows.append(
-                    {
-                        "method": method,
-                        "start": k,
-                        "when": when,
-                        "seconds": seconds,
-                        "evaluations": passes,
-                        "ours": mine.within(seconds),
-                        "cma": theirs.within(5 * seconds),
-                        "cma_evaluations": max(
-                            (row[1] for row in theirs.rows if row[0] <= 5 * seconds), default=0
-                        ),
-                    }
-                )
+            ours = traces[method][k]
+            near = ours.until(target) or ours.rows[-1]
+            for when, (seconds, passes, *_) in (("arrived", near), ("ended", ours.rows[-1])):
+                until = [row[1] for row in theirs.rows if row[0] <= 5 * seconds]
+                row = {"method": method, "start": k, "when": when, "seconds": seconds}
+                row |= {"evaluations": passes, "ours": ours.within(seconds)}
+                row |= {"cma": theirs.within(5 * seconds)}
+                rows.append(row | {"cma_evaluations": max(until, default=0)})
     return rows
 
 
@@ -449,45 +428,24 @@ def plain(value):
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
+COUNTS = {
+    "starts": (8, "local searches of each method"),
+    "race-starts": (3, "starts of the problem of 20 parameters"),
+    "slow-starts": (3, "searches of TPE"),
+    "budget": (0, "evaluations of a derivative-free search; 0: 500 or 2000"),
+    "trials": (300, "evaluations of a TPE search"),
+    "iterations": (100, "evaluations of a local search of ours"),
+}
+
+
 def main(arguments=None):
     """Run the problems asked for and print a table of each."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument(
-        "--problem",
-        type=int,
-        nargs="+",
-        choices=list(PROBLEMS),
-        default=list(PROBLEMS),
-        help="by number of parameters",
-    )
-    parser.add_argument(
-        "--quick", action="store_true", help="three starts, small budgets: a minute or two"
-    )
-    parser.add_argument(
-        "--starts", type=int, default=8, help="local searches of each method (default 8)"
-    )
-    parser.add_argument(
-        "--race-starts",
-        type=int,
-        default=3,
-        help="starts of the problem of 20 parameters (default 3)",
-    )
-    parser.add_argument("--slow-starts", type=int, default=3, help="searches of TPE (default 3)")
-    parser.add_argument(
-        "--budget",
-        type=int,
-        default=0,
-        help="evaluations of a derivative-free search (default 500, 2000)",
-    )
-    parser.add_argument(
-        "--trials", type=int, default=300, help="evaluations of a TPE search (default 300)"
-    )
-    parser.add_argument(
-        "--iterations",
-        type=int,
-        default=100,
-        help="evaluations of a local search of ours (default 100)",
-    )
+    sizes = list(PROBLEMS)
+    parser.add_argument("--problem", type=int, nargs="+", choices=sizes, default=sizes)
+    parser.add_argument("--quick", action="store_true", help="three starts, small budgets")
+    for name, (default, words) in COUNTS.items():
+        parser.add_argument(f"--{name}", type=int, default=default, help=f"{words} ({default})")
     parser.add_argument("--json", metavar="FILE", help="write the numbers to a file as well")
     options = parser.parse_args(arguments)
     if options.quick:

@@ -2,12 +2,10 @@
 a minute).
 """
 
-import re
-from pathlib import Path
+from measuring import store
 
 import jaxtank  # noqa: F401  (before jax starts)
 
-README = Path(__file__).with_name("README.md")
 BEGIN, END = "<!-- jaxtank compare all --markdown -->", "<!-- end -->"
 
 
@@ -23,7 +21,4 @@ def table():
 
 
 if __name__ == "__main__":
-    text = README.read_text()
-    README.write_text(
-        re.sub(f"{BEGIN}.*?{END}", lambda _: f"{BEGIN}\n{table()}\n{END}", text, flags=re.DOTALL)
-    )
+    store(BEGIN, END, table())

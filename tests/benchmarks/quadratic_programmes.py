@@ -3,10 +3,9 @@
 python tests/benchmarks/quadratic_programmes.py    # two minutes; with nothing else on the machine
 """
 
-import time
-
 import jax
 import numpy as np
+from measuring import core_times
 
 from jaxtank.analysis import elimination, qp
 
@@ -33,14 +32,7 @@ def core_us(n, batch, slope):
     one = jax.jacfwd(one) if slope else one
     run = jax.jit(jax.vmap(one) if batch > 1 else one)
     size = np.linspace(0.05, 0.5, batch) if batch > 1 else 0.3
-    run(size).block_until_ready()
-    found = []
-    for _ in range(ROUNDS):
-        began = time.process_time()
-        for _ in range(CALLS):
-            run(size).block_until_ready()
-        found.append((time.process_time() - began) / CALLS / batch)
-    return 1e6 * min(found)
+    return 1e6 * min(core_times({"": lambda: run(size)}, ROUNDS, CALLS)[""]) / batch
 
 
 def main():

@@ -15,7 +15,6 @@ step. Rivals that are not installed are named. Nothing is asserted: machines dif
 import atexit
 import dataclasses
 import os
-import re
 import statistics
 import subprocess
 import sys
@@ -26,14 +25,13 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from measuring import first_number, markdown, store, with_range
 
 import jaxtank
 from jaxtank import presets
-from jaxtank.core.files import write_atomic
 from tuning.bench import bench
 from tuning.report import tables
 
-README = Path(__file__).with_name("README.md")
 BEGIN, END = "<!-- tests/benchmarks/rivals.py -->", "<!-- end of rivals -->"
 # samples of the slow ones, from the beginning of the first ramp on, until when the rig rests
 FEW = 6000
@@ -326,12 +324,10 @@ def main(words):
 
         return simulators.main(words)
     jax.config.update("jax_enable_x64", True)
-    rounds = next((int(w) for w in words if w.isdigit()), 7)
+    rounds = first_number(words, 7)
     case = presets.find("gouta2015/backstepping")
-    r, x0 = (
-        np.array([np.asarray(v) for v in case.loop.reference.sample(case.clock)[0]]),
-        tuple(map(float, case.loop.x0)),
-    )
+    r = np.array([np.asarray(v) for v in case.loop.reference.sample(case.clock)[0]])
+    x0 = tuple(map(float, case.loop.x0))
     resting = int(np.argmax(np.any(r != r[:, :1], axis=0)))
     names = ("rms_error_total",)
     ours = lambda: jaxtank.evaluate(case.loop, case.clock, names)["rms_error_total"]
@@ -342,10 +338,8 @@ def main(words):
             missing.append("C loop (no gcc)")
         else:
             run = bench.c_runner(function, case)
-            calls["C, gcc -O3 -march=native"], steps["C, gcc -O3 -march=native"] = (
-                (lambda: run()[0]),
-                case.clock.samples,
-            )
+            name = "C, gcc -O3 -march=native"
+            calls[name], steps[name] = (lambda: run()[0]), case.clock.samples
         for name, make in RIVALS.items():
             try:
                 calls[name], steps[name] = make(case, r if make in WHOLE else r[:, resting:], x0)
@@ -361,25 +355,16 @@ def main(words):
     for name, spent in seconds.items():
         per = [1e9 * s / steps[name] for s in spent]
         ratio = [a / (1e9 * b / steps["jaxtank"]) for a, b in zip(per, seconds["jaxtank"])]
-        part = steps[name] < case.clock.samples
         until = resting + steps[name]
         clock = dataclasses.replace(case.clock, duration=(until - 1) * case.clock.dt)
-        same = (
-            whole
-            if not part
-            else float(jaxtank.evaluate(case.loop, clock, names)["rms_error_total"])
-            * (until / steps[name]) ** 0.5
-        )
-        rows.append(
-            [
-                name,
-                f"{statistics.median(per):,.0f}",
-                f"{statistics.median(ratio):.3g} ({min(ratio):.3g} to {max(ratio):.3g})",
-                f"{max(first[name] - statistics.median(spent), 0.0):.2g}",
-                f"{abs(float(results[name]) - same):.1e}",
-                f"{steps[name]:,}",
-            ]
-        )
+        same = whole
+        if steps[name] < case.clock.samples:
+            error = float(jaxtank.evaluate(case.loop, clock, names)["rms_error_total"])
+            same = error * (until / steps[name]) ** 0.5
+        cells = [f"{statistics.median(per):,.0f}", with_range(ratio)]
+        cells += [f"{max(first[name] - statistics.median(spent), 0.0):.2g}"]
+        cells += [f"{abs(float(results[name]) - same):.1e}", f"{steps[name]:,}"]
+        rows.append([name, *cells])
     heads = [
         "one run in float64",
         "ns per step",
@@ -392,20 +377,8 @@ def main(words):
     if missing:
         print(f"not here: {', '.join(missing)}")
     if "--markdown" in words:
-        store(BEGIN, END, heads, rows)
+        store(BEGIN, END, markdown(heads, rows))
     return None
-
-
-def store(begin, end, heads, rows):
-    """Write a table to README.md, between its marks."""
-    lines = [
-        f"| {' | '.join(heads)} |",
-        "|---" * len(heads) + "|",
-        *(f"| {' | '.join(row)} |" for row in rows),
-    ]
-    text, table = README.read_text(), "\n".join(lines)
-    found = re.sub(f"{begin}.*?{end}", lambda _: f"{begin}\n{table}\n{end}", text, flags=re.DOTALL)
-    write_atomic(README, found)
 
 
 if __name__ == "__main__":

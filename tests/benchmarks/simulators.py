@@ -13,12 +13,12 @@ import os
 import statistics
 import subprocess
 import sys
-import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import rivals
+from measuring import core_times, first_number, markdown, store, with_range
 
 from jaxtank import presets
 from jaxtank.core.tree import get_value
@@ -157,12 +157,8 @@ def measure(name):
     *calls, samples = SIMULATORS[name](case, r, tuple(map(float, case.loop.x0)))
     found = []
     for call in calls:
-        spent = []
-        for _ in range(CALLS + 1):
-            began = time.process_time()
-            value = jax.block_until_ready(call())
-            spent.append((time.process_time() - began) / samples)
-        found.append({"s": min(spent[1:]), "value": np.ravel(value).tolist()})
+        seconds = min(core_times({"": call}, CALLS)[""]) / samples
+        found.append({"s": seconds, "value": np.ravel(call()).tolist()})
     print("JSON" + json.dumps(found))
 
 
@@ -193,7 +189,7 @@ HEADS = [
 def main(words):
     if "--one" in words:
         return measure(words[words.index("--one") + 1])
-    rounds = next((int(w) for w in words if w.isdigit()), 5)
+    rounds = first_number(words, 5)
     kinds = [(n, o) for n in SIMULATORS for o in ("1", "0") if (n, o) != ("jaxtank", "0")]
     found = {kind: [] for kind in kinds}
     for _ in range(rounds):
@@ -208,26 +204,17 @@ def main(words):
         per = [1e9 * one[0]["s"] for one in all_rounds]
         ratios = [[one[i]["s"] / own[i]["s"] for one, own in zip(all_rounds, ours)] for i in (0, 1)]
         of_run = statistics.median(one[1]["s"] / one[0]["s"] for one in all_rounds)
-        words_of = [f"{statistics.median(x):.3g} ({min(x):.3g} to {max(x):.3g})" for x in ratios]
+        run, gradient = map(with_range, ratios)
         (error, slopes), (own, own_slopes) = (
             [np.array(part["value"]) for part in side[0]] for side in (all_rounds, ours)
         )
         apart = [abs(error - own).max(), (abs(slopes - own_slopes) / abs(own_slopes)).max()]
-        rows.append(
-            [
-                name,
-                "ours" if option == "1" else "as they come",
-                f"{statistics.median(per):,.0f}",
-                words_of[0],
-                f"{of_run:.3g}",
-                words_of[1],
-                f"{apart[0]:.1e}",
-                f"{100 * apart[1]:.1g} %",
-            ]
-        )
+        options = "ours" if option == "1" else "as they come"
+        cells = [options, f"{statistics.median(per):,.0f}", run, f"{of_run:.3g}", gradient]
+        rows.append([name, *cells, f"{apart[0]:.1e}", f"{100 * apart[1]:.1g} %"])
     print(tables.table(rows, HEADS))
     if "--markdown" in words:
-        rivals.store(BEGIN, END, HEADS, rows)
+        store(BEGIN, END, markdown(HEADS, rows))
     return None
 
 

@@ -11,7 +11,6 @@ causes are pinned in tests/unit/loop/test_compiled_loop.py.
 
 import dataclasses
 import os
-import re
 import statistics
 import subprocess
 import sys
@@ -21,10 +20,11 @@ from pathlib import Path
 
 import ensemble
 import jax
+import measuring
 import numpy as np
+from measuring import core_times, ratio
 
 from jaxtank import presets
-from jaxtank.core.files import write_atomic
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as loop
 from jaxtank.loop.derivatives import sensitivities_compiled
@@ -32,7 +32,6 @@ from tuning.bench import bench
 from tuning.problem.scenarios import noisy
 from tuning.report import tables
 
-README = Path(__file__).with_name("README.md")
 BEGIN, END = "<!-- tests/benchmarks/speed.py -->", "<!-- end of speed -->"
 HEADS = ["what", "measured", "ratio (range)", "to", "at most"]
 NAMES = bench.MEASURES
@@ -40,38 +39,13 @@ COST = ("rms_error_total",)
 BATCHES = 16
 
 
-def timed(calls, rounds):
-    """{name: [core time of each round, s]}: every call once a round, in turn, after one that
-    compiles.
-    """
-    for call in calls.values():
-        jax.block_until_ready(call())
-    seconds = {name: [] for name in calls}
-    for _ in range(rounds):
-        for name, call in calls.items():
-            began = time.process_time()
-            jax.block_until_ready(call())
-            seconds[name].append(time.process_time() - began)
-    return seconds
-
-
-def ratio(seconds, name, rival):
-    """Words: median of the ratio in the same round, and its range."""
-    of = [a / b for a, b in zip(seconds[name], seconds[rival])]
-    return f"{statistics.median(of):.2f} ({min(of):.2f} to {max(of):.2f})"
-
-
 def parameters(case):
     """Values of 2, 8 and 30 parameters of the four-tank: gains; areas and pumps; every coefficient
     of the plant and of the law's model.
     """
     controller, plant = case.loop.controller, case.loop.plant
-    two = {"controller.k": np.float64(controller.k), "controller.k1": np.float64(controller.k1)}
-    eight = {
-        **two,
-        "plant.area": np.array(plant.area),
-        "plant.pump_gain": np.array(plant.pump_gain),
-    }
+    two = {f"controller.{n}": np.float64(getattr(controller, n)) for n in ("k", "k1")}
+    eight = {**two, **{f"plant.{n}": np.array(getattr(plant, n)) for n in ("area", "pump_gain")}}
     of = {"plant": plant, "controller.model": controller.model}
     every = {
         f"{where}.{n}": np.array(getattr(part, n))
@@ -83,16 +57,13 @@ def parameters(case):
 
 def gradient(case, values):
     """(call, MB of temporary memory) of the gradient of the RMS error by `values`, forward mode."""
-    call = (
-        jax.jit(
-            jax.jacfwd(
-                lambda v: loop.evaluate(with_values(case.loop, v), case.clock, COST)[COST[0]]
-            )
-        )
-        .lower(values)
-        .compile()
-    )
+    cost = lambda v: loop.evaluate(with_values(case.loop, v), case.clock, COST)[COST[0]]
+    call = jax.jit(jax.jacfwd(cost)).lower(values).compile()
     return (lambda: call(values)), call.memory_analysis().temp_size_in_bytes / 1e6
+
+
+def of_step(dt):
+    return f"{1e9 * dt:.0f} ns per step"
 
 
 def one_run(rounds):
@@ -111,54 +82,25 @@ def one_run(rounds):
     with tempfile.TemporaryDirectory() as folder:
         function = bench.c_loop(folder)
         if function is not None:
-            calls["C"], calls["C midpoint"] = (
-                bench.c_runner(function, case),
-                bench.c_runner(function, case, rk4=False),
-            )
-        seconds = timed(calls, rounds)
+            calls["C"] = bench.c_runner(function, case)
+        seconds = core_times(calls, rounds)
         if function is not None:
-            rms, top = calls["C"]()
-            ours = calls["run"]()
-            apart = max(
-                abs(rms - float(ours[COST[0]])),
-                float(np.max(np.abs(top - np.asarray(ours["max_level"])))),
-            )
-            print(
-                f"jaxtank and the C loop agree to {apart:.1e} cm on the error and the highest"
-                " levels"
-            )
-    per = {
-        name: f"{1e9 * statistics.median(spent) / case.clock.samples:.0f} ns per step"
-        for name, spent in seconds.items()
-    }
+            (rms, top), ours = calls["C"](), calls["run"]()
+            apart = max(abs(rms - ours[COST[0]]), np.max(np.abs(top - ours["max_level"])))
+            print(f"jaxtank and the C loop agree to {apart:.1e} cm on error and highest levels")
+    per = {n: of_step(statistics.median(s) / case.clock.samples) for n, s in seconds.items()}
     rows = []
     if function is None:
         print("no gcc here: no C loop")
     else:
+        run, half = (ratio(seconds, name, "C") for name in ("run", "midpoint"))
         c = f"C loop, {per['C']}"
-        rows.append(
-            ["one run, 120,001 steps, RK4", per["run"], ratio(seconds, "run", "C"), c, "1.25"]
-        )
-        rows.append(
-            [
-                "the same, midpoint",
-                per["midpoint"],
-                ratio(seconds, "midpoint", "C"),
-                "RK4 C loop",
-                "0.85",
-            ]
-        )
+        rows.append(["one run, 120,001 steps, RK4", per["run"], run, c, "1.25"])
+        rows.append(["the same, midpoint", per["midpoint"], half, "RK4 C loop", "0.85"])
     for count, most in ((2, "3.0"), (8, "4.5"), (30, "6")):
         spent = f"{1e3 * statistics.median(seconds[count]):.0f} ms, {memory[count]:.1f} MB"
-        rows.append(
-            [
-                f"gradient, {count} parameters",
-                spent,
-                ratio(seconds, count, "cost"),
-                "the run",
-                f"{most}, 10 MB",
-            ]
-        )
+        of_run, limit = ratio(seconds, count, "cost"), f"{most}, 10 MB"
+        rows.append([f"gradient, {count} parameters", spent, of_run, "the run", limit])
     return rows
 
 
@@ -166,48 +108,30 @@ def batch(rounds):
     """Rows of many plants in one compiled loop, beside a C loop in vector lanes."""
     case = presets.find("gouta2015/backstepping")
     halves = case.replace(clock=dataclasses.replace(case.clock, integrator="midpoint"))
-    rows = []
+    fewer = case.replace(clock=dataclasses.replace(case.clock, duration=200.0))
+    rows, rounds = [], max(rounds // 4, 3)
+
+    def row(words, ours, theirs, between, rival, most):
+        measured = f"{ours:.1f} ns per step and plant"
+        rows.append([words, measured, f"{between:.2f}", f"{rival}, {theirs:.1f} ns", most])
+
     with tempfile.TemporaryDirectory() as folder:
         function = ensemble.c_batch(folder)
         if function is None:
             return rows
         for words, which, plants in (
             ("RK4", case, 256),
-            ("RK4", case, 4096),
+            ("RK4", fewer, 4096),
             ("midpoint", halves, 256),
         ):
-            few = (
-                which.replace(clock=dataclasses.replace(which.clock, duration=200.0))
-                if plants > 256
-                else which
-            )
-            a, b, between, apart = ensemble.beside_batch(function, few, plants, max(rounds // 4, 3))
+            *times, apart = ensemble.beside_batch(function, which, plants, rounds)
             assert apart < 1e-10, f"{words}: jaxtank and the C loop are {apart:.1e} cm apart"
-            rival = f"vectorised C loop, {b:.1f} ns"
-            rows.append(
-                [
-                    f"batch of {plants:,}, {words}",
-                    f"{a:.1f} ns per step and plant",
-                    f"{between:.2f}",
-                    rival,
-                    "1.5",
-                ]
-            )
-    program = [sys.executable, "-W", "ignore", "-c", SINGLE, str(max(rounds // 4, 3))]
-    reported = subprocess.run(
-        program, check=True, capture_output=True, text=True, cwd=Path(__file__).parent
-    ).stdout.split()
-    a, b, between = map(float, reported)
-    rival = f"vectorised C loop, float32 not compensated, {b:.1f} ns"
-    rows.append(
-        [
-            "batch of 256, RK4, float32 with compensated sums",
-            f"{a:.1f} ns per step and plant",
-            f"{between:.2f}",
-            rival,
-            "2.0",
-        ]
-    )
+            row(f"batch of {plants:,}, {words}", *times, "vectorised C loop", "1.5")
+    program = [sys.executable, "-W", "ignore", "-c", SINGLE, str(rounds)]
+    options = {"capture_output": True, "text": True, "cwd": Path(__file__).parent}
+    times = map(float, subprocess.run(program, check=True, **options).stdout.split())
+    rival = "vectorised C loop, float32 not compensated"
+    row("batch of 256, RK4, float32 with compensated sums", *times, rival, "2.0")
     return rows
 
 
@@ -228,9 +152,8 @@ def gauss_newton(rounds):
     """
     case = presets.find("gouta2015/backstepping")
     values = parameters(case)[8]
-    orifice = np.random.default_rng(0).uniform(0.95, 1.05, (BATCHES, 4)) * np.asarray(
-        case.loop.plant.orifice
-    )
+    factors = np.random.default_rng(0).uniform(0.95, 1.05, (BATCHES, 4))
+    orifice = factors * np.asarray(case.loop.plant.orifice)
     names, point = tuple(values), tuple(values.values())
 
     def compiled(one):
@@ -238,25 +161,14 @@ def gauss_newton(rounds):
         return lambda: call(orifice)
 
     at = lambda o: with_values(case.loop, {"plant.orifice": o})
-    calls = {
-        "run": compiled(lambda o: loop.evaluate_and_flag(at(o), case.clock, COST)),
-        "pass": compiled(
-            lambda o: sensitivities_compiled(
-                at(o), case.clock, COST, names, point, None, batched=True
-            )
-        ),
-    }
-    seconds = timed(calls, max(rounds // 3, 3))
+    slopes = lambda o: sensitivities_compiled(
+        at(o), case.clock, COST, names, point, None, batched=True
+    )
+    run = compiled(lambda o: loop.evaluate_and_flag(at(o), case.clock, COST))
+    seconds = core_times({"run": run, "pass": compiled(slopes)}, max(rounds // 3, 3))
     spent = f"{1e3 * statistics.median(seconds['pass']):.0f} ms"
-    return [
-        [
-            "Gauss-Newton pass, 8 parameters, 16 scenarios",
-            spent,
-            ratio(seconds, "pass", "run"),
-            "the run of the same batch",
-            "8",
-        ]
-    ]
+    of_run, words = ratio(seconds, "pass", "run"), "Gauss-Newton pass, 8 parameters, 16 scenarios"
+    return [[words, spent, of_run, "the run of the same batch", "8"]]
 
 
 def controllers(rounds):
@@ -265,58 +177,31 @@ def controllers(rounds):
     for name in ("gouta2022/chadpc", "mirakhorli/hybrid", "mirakhorli/sfc", "calofir/backstepping"):
         case = presets.find(name)
         key = jax.random.key(0) if noisy(case) else None
-        once, tenfold = (
-            case.clock,
-            dataclasses.replace(case.clock, duration=10 * case.clock.duration),
-        )
+        once = case.clock
+        tenfold = dataclasses.replace(once, duration=10 * once.duration)
 
         def run(clock, case=case, key=key):
             return lambda: loop.evaluate(case.loop, clock, COST, key)
 
+        runs = {"once": run(once), "tenfold": run(tenfold)}
         # a run of microseconds is mostly the call: what ten times the samples take longer tells the
         # sample
-        seconds = timed({"once": run(once), "tenfold": run(tenfold)}, rounds)
-        short, long = (statistics.median(seconds[word]) for word in ("once", "tenfold"))
-        step = 1e9 * (long - short) / ((tenfold.samples - once.samples) * once.substeps)
-        words = f"{name}, {once.integrator}" + (
-            f", {once.substeps} steps to a sample" if once.substeps > 1 else ""
-        )
-        rows.append(
-            [
-                words,
-                (
-                    f"{step:.0f} ns per step ({1e3 * short:.1f} ms the run of {once.samples:,}"
-                    " samples)"
-                ),
-                "",
-                "",
-                "150 ns",
-            ]
-        )
+        short, long = map(statistics.median, core_times(runs, rounds).values())
+        step = of_step((long - short) / ((tenfold.samples - once.samples) * once.substeps))
+        words = f"{name}, {once.integrator}"
+        words += f", {once.substeps} steps to a sample" if once.substeps > 1 else ""
+        run = f" ({1e3 * short:.1f} ms the run of {once.samples:,} samples)"
+        rows.append([words, step + run, "", "", "150 ns"])
     case = presets.find("khalid/laguerre-constrained")
     case = case.replace(clock=dataclasses.replace(case.clock, duration=600 * case.clock.dt))
     cost = lambda v: loop.evaluate(with_values(case.loop, v), case.clock, COST)[COST[0]]
     point = {"controller.r_w": np.asarray(case.loop.controller.r_w, dtype=float)}
     run, slope = jax.jit(cost), jax.jit(jax.jacfwd(cost))
-    seconds = timed({"run": lambda: run(point), "slope": lambda: slope(point)}, rounds)
-    rows.append(
-        [
-            f"khalid/laguerre-constrained, {case.clock.samples} samples",
-            f"{1e3 * statistics.median(seconds['run']):.1f} ms",
-            "",
-            "",
-            "20 ms",
-        ]
-    )
-    rows.append(
-        [
-            "its gradient",
-            f"{1e3 * statistics.median(seconds['slope']):.1f} ms",
-            ratio(seconds, "slope", "run"),
-            "the run",
-            "3",
-        ]
-    )
+    seconds = core_times({"run": lambda: run(point), "slope": lambda: slope(point)}, rounds)
+    run, slope = (f"{1e3 * statistics.median(s):.1f} ms" for s in seconds.values())
+    words = f"khalid/laguerre-constrained, {case.clock.samples} samples"
+    rows.append([words, run, "", "", "20 ms"])
+    rows.append(["its gradient", slope, ratio(seconds, "slope", "run"), "the run", "3"])
     return rows
 
 
@@ -358,17 +243,14 @@ def cold():
     ]
     first = [[float(word) for word in words] for words in reported]
     run, slope = (f"{statistics.median(v):.2f} s" for v in zip(*first))
+    simulated, helped = wall("jaxtank", "simulate", "gouta2015/ngpc", "--json"), "`jaxtank --help`"
+    words = "`jaxtank simulate gouta2015/ngpc --json`, a new process, wall time"
+    slopes = "first call of a gradient with Gauss-Newton, less the second"
     return [
-        [
-            "`jaxtank simulate gouta2015/ngpc --json`, a new process, wall time",
-            wall("jaxtank", "simulate", "gouta2015/ngpc", "--json"),
-            "",
-            "",
-            "3.5 s",
-        ],
-        ["`jaxtank --help`", wall("jaxtank", "--help"), "", "", "0.3 s"],
+        [words, simulated, "", "", "3.5 s"],
+        [helped, wall("jaxtank", "--help"), "", "", "0.3 s"],
         ["first call of a run less the second", run, "", "", "0.5 s"],
-        ["first call of a gradient with Gauss-Newton, less the second", slope, "", "", "1.5 s"],
+        [slopes, slope, "", "", "1.5 s"],
     ]
 
 
@@ -377,25 +259,14 @@ def main(words):
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
     if cores:
         os.sched_setaffinity(0, {max(cores)})  # before jax starts its threads
-    rounds = next((int(w) for w in words if w.isdigit()), 15)
+    rounds = measuring.first_number(words, 15)
     rows = [*one_run(rounds), *batch(rounds), *gauss_newton(rounds), *controllers(rounds)]
     if cores:
         os.sched_setaffinity(0, cores)
     rows += cold()
     print(tables.table(rows, HEADS))
     if "--markdown" in words:
-        table = "\n".join(
-            [
-                f"| {' | '.join(HEADS)} |",
-                "|---" * len(HEADS) + "|",
-                *(f"| {' | '.join(row)} |" for row in rows),
-            ]
-        )
-        text = README.read_text()
-        write_atomic(
-            README,
-            re.sub(f"{BEGIN}.*?{END}", lambda _: f"{BEGIN}\n{table}\n{END}", text, flags=re.DOTALL),
-        )
+        measuring.store(BEGIN, END, measuring.markdown(HEADS, rows))
 
 
 if __name__ == "__main__":
