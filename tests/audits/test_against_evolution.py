@@ -5,7 +5,7 @@ import pytest
 from against_evolution import AGREES, PROBLEMS
 
 
-@pytest.mark.slow_for("tanks in series")
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["water tank", "tanks in series"])
 def test_one_start_of_a_quick_problem_ends_at_the_optimum(name):
     case = PROBLEMS[name]()

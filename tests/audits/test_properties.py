@@ -218,9 +218,9 @@ def test_a_plant_with_a_vector_field_of_its_own_keeps_it():
         def derivative(self, t, x, u, d):
             return tuple(rate - 1.0 for rate in super().derivative(t, x, u, d))
 
-    plant = random_rig(0, 3, "series")[0]
+    plant = spilling([10.0] * 2, (), ())
     leaky = Leaky(**{f.name: getattr(plant, f.name) for f in dataclasses.fields(plant)})
-    x, u = np.full(SIZE, 5.0), np.ones(plant.pumps)
+    x, u = np.full(2, 5.0), np.ones(plant.pumps)
     np.testing.assert_allclose(leaky.rates(x, u), plant.rates(x, u) - 1.0, rtol=1e-12)
 
 

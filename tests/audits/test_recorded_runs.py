@@ -8,7 +8,7 @@ import recorded_runs
 from jaxtank import presets
 
 RECORD = json.loads(recorded_runs.FILE.read_text())
-QUICK = ("calofir/backstepping-perturbed", "cascaded/pi")
+QUICK = ("cascaded/pi",)
 
 
 def test_every_case_is_recorded():
