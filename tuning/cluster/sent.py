@@ -37,15 +37,15 @@ def received(text: str) -> Case:
     """Return the case of `sent`, made anew; the same object for the same text."""
     message = json.loads(text)
     case = rig.loads(message["rig"], "rig file sent to this worker")
-    there, here = _fingerprint(case), message["fingerprint"]
-    differs = [name for name in here if there.get(name) != here[name]]
+    there, sender = _fingerprint(case), message["fingerprint"]
+    differs = [name for name in sender if there.get(name) != sender[name]]
     if "xla_option" in differs:
         raise InputError(
             "cluster: jax had started on this worker before jaxtank, without its compiler options:"
             " start workers with --preload jaxtank, or with the XLA_FLAGS of this command"
         )
     if differs:
-        words = [f"{n} ({_short(there.get(n))} there, {_short(here[n])} here)" for n in differs]
+        words = [f"{n} ({_short(there.get(n))} there, {_short(sender[n])} here)" for n in differs]
         raise InputError(f"cluster: a worker differs from this process: {', '.join(words)}")
     return case
 

@@ -25,6 +25,11 @@ PROBLEM = "problem"  # key of the record that says what the others are of
 
 TYPES = ("<f8", "<f4")
 
+UNREADABLE = (
+    "is not a checkpoint of this program, or was changed ({}): delete it and run without --resume"
+)
+UNWRITABLE = "cannot be written ({}): free disk space, then --resume"
+
 Folder = str | Path
 
 
@@ -53,7 +58,7 @@ class Store:
         if afresh and not resume:
             discard(folder)
         self._check_file(resume)
-        with self._writing():
+        with self._one_line(UNWRITABLE):
             self.folder.mkdir(parents=True, exist_ok=True)
             self.db = sqlite3.connect(
                 self.path, timeout=60, isolation_level=None, check_same_thread=False
@@ -87,7 +92,7 @@ class Store:
 
     def _check_tables(self):
         """Raise InputError unless the file is a whole database of one table, or of none."""
-        with self._reading():
+        with self._one_line(UNREADABLE):
             self.db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST)
             self.db.execute("PRAGMA trusted_schema = OFF")
             schema = [sql for (sql,) in self.db.execute("SELECT sql FROM sqlite_master") if sql]
@@ -97,7 +102,7 @@ class Store:
 
     def _begin(self, shared):
         """Make the table, unless there is one."""
-        with self._writing():
+        with self._one_line(UNWRITABLE):
             # a commit need not wait for the disk where one process writes: what a kill leaves is
             # whole, and a power failure costs the last records alone
             self.db.execute(f"PRAGMA journal_mode = {'DELETE' if shared else 'WAL'}")
@@ -129,14 +134,14 @@ class Store:
 
     def finished(self) -> list[str]:
         """Return the keys of all values, as they were entered."""
-        with self._reading():
+        with self._one_line(UNREADABLE):
             rows = self.db.execute("SELECT key FROM record ORDER BY rowid")
             return [key for (key,) in rows if key != PROBLEM]
 
     def put(self, key: str, value: Any) -> Any:
         """Enter a value; return it as it is read back."""
         text = json.dumps(_to_json(value))
-        with self._writing():
+        with self._one_line(UNWRITABLE):
             self._insert(key, text)
         return _from_json(json.loads(text))
 
@@ -164,7 +169,7 @@ class Store:
 
     def _text(self, key):
         """Return the text of a record; its seal is checked."""
-        with self._reading():
+        with self._one_line(UNREADABLE):
             rows = self.db.execute("SELECT value, seal FROM record WHERE key = ?", (key,))
             text, seal = rows.fetchone() or (None, None)
         # of the problem itself, what differs is told by name
@@ -173,26 +178,13 @@ class Store:
         return text
 
     @contextlib.contextmanager
-    def _reading(self) -> Iterator[None]:
-        """Turn what SQLite raises for a file that it cannot read into an InputError."""
+    def _one_line(self, words: str) -> Iterator[None]:
+        """Turn an error of the disk or of SQLite into an InputError."""
         try:
             yield
-        except (sqlite3.Error, UnicodeDecodeError) as error:
-            raise InputError(
-                f"{str(self.path)!r} is not a checkpoint of this program, or was changed"
-                f" ({error}): delete it and run without --resume"
-            ) from None
-
-    @contextlib.contextmanager
-    def _writing(self) -> Iterator[None]:
-        """Turn an error of the disk into an InputError that names the remedy."""
-        try:
-            yield
-        except (OSError, sqlite3.Error) as error:
+        except (OSError, sqlite3.Error, UnicodeDecodeError) as error:
             why = getattr(error, "strerror", None) or error
-            raise InputError(
-                f"{str(self.path)!r} cannot be written ({why}): free disk space, then --resume"
-            ) from None
+            raise InputError(f"{str(self.path)!r} {words.format(why)}") from None
 
 
 def discard(folder: Folder) -> None:

@@ -54,8 +54,8 @@ class Draws:
         for name, distribution, nominal, columns in self.parts:
             part = p[:, columns]
             if isinstance(distribution, Correlated):
-                drawn = distribution.quantile(part, nominal).T
-                for label, column, ends in zip(distribution.names, drawn, self.ends[name]):
+                rows = distribution.quantile(part, nominal).T
+                for label, column, ends in zip(distribution.names, rows, self.ends[name]):
                     values[label] = np.clip(column, *ends)
                 continue
             if nominal.ndim == 0 or distribution.tied:

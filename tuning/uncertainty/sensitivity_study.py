@@ -279,8 +279,8 @@ def _columns(case, names, method, points, nominal, values, seed):
             few = np.min(effects["kept"]) < 2
             reason = "fewer than 2 samples in which it is finite" if few else "it does not vary"
         bad, empty = int(np.sum(~np.isfinite(y))), not known.any()
-        own = float(nominal[k])
-        columns.append(Column(measure, label, unit, own, bad, effects, reason, empty))
+        value = float(nominal[k])
+        columns.append(Column(measure, label, unit, value, bad, effects, reason, empty))
     return columns
 
 
@@ -331,19 +331,19 @@ def local_columns(case, draws, names, key, progress=None):
     _drop_contradicted(case, steps, names, key, nominal, derivatives)
     by_name = dict(zip(scalars, derivatives.T))
     absent = np.full(len(nominal), np.nan)
-    effect, single, own, half_width = [], [], [], {}
+    effect, single, values, half_width = [], [], [], {}
     for label, group in zip(draws.labels, widths):
         name, *others = group
         effect.append(sum(by_name[n] * width for n, width in group.items()))
         single.append(absent if others else by_name[name])
-        own.append(np.nan if others else float(get_value(case.loop, name)))
+        values.append(np.nan if others else float(get_value(case.loop, name)))
         half_width[label] = list(group.values()) if others else group[name]
     single = np.stack(single, axis=1)
-    elasticity = single * np.array(own) / np.where(nominal == 0, np.nan, nominal)[:, None]
+    elasticity = single * np.array(values) / np.where(nominal == 0, np.nan, nominal)[:, None]
     effects = {"effect": np.stack(effect, axis=1), "derivative": single, "elasticity": elasticity}
     columns = []
     for k, (measure, label, unit) in enumerate(entries_of(case, names)):
-        row = {quantity: values[k] for quantity, values in effects.items()}
+        row = {quantity: column[k] for quantity, column in effects.items()}
         good = bool(np.isfinite(row["effect"]).all())
         reason = "" if good else UNUSABLE
         columns.append(Column(measure, label, unit, float(nominal[k]), int(not good), row, reason))

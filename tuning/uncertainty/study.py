@@ -124,7 +124,7 @@ def ensemble(
     batch = batch or batch_size(case, seed is not None, samples)
     points = Points(draws, space.dimensions, samples, key)
     count, processes = -(-samples // batch), jax.process_count()
-    table, failed, own = Columns(samples, checkpoint), np.zeros(samples, dtype=bool), {}
+    table, failed, batches = Columns(samples, checkpoint), np.zeros(samples, dtype=bool), {}
 
     def inputs(k):
         """Values and indices of the draws of batch k, the last draw repeated to fill it."""
@@ -154,10 +154,10 @@ def ensemble(
         mine = range(jax.process_index(), count, processes)
         results = _results(store, mine, _shapes(case, names, batch), run, inputs, batch)
         for done, (k, result) in enumerate(results, 1):
-            (enter if processes == 1 else own.__setitem__)(k, result)
+            (enter if processes == 1 else batches.__setitem__)(k, result)
             if progress is not None:
                 progress(min(samples, batch * done))
-    for k, result in gather(own, count).items() if processes > 1 else ():
+    for k, result in gather(batches, count).items() if processes > 1 else ():
         enter(k, result)
     values, beyond = _values(case, space, points, checkpoint)
     first = {n: np.array(v[:FAN_DRAWS]) for n, v in values.items()}
