@@ -28,11 +28,8 @@ class Parts:
         self.area = np.r_[rng.uniform(50, 400, tanks), np.full(SIZE - tanks, 50.0)]
         # padded tanks have an outlet too, so that a linear balance has one solution
         self.drain = np.r_[rng.uniform(0.05, 0.3, tanks), np.full(SIZE - tanks, 0.1)]
-        self.orifice, self.pipe, self.caught = (
-            np.zeros(len(LINKS)),
-            np.zeros(len(PIPES)),
-            np.zeros(len(SPILLS)),
-        )
+        self.orifice, self.pipe = np.zeros(len(LINKS)), np.zeros(len(PIPES))
+        self.caught = np.zeros(len(SPILLS))
         self.split = np.ones(len(FEEDS))
         self.pumps = []
 
@@ -162,18 +159,10 @@ def relabelled(plant, order):
     links = [LINKS.index((order[a], order[b])) for a, b in LINKS]
     pairs = [PIPES.index((min(order[a], order[b]), max(order[a], order[b]))) for a, b in PIPES]
     turned = np.array([order[a] > order[b] for a, b in PIPES])
-    changed = {
-        name: np.asarray(getattr(plant, name))[list(order)] for name in ("area", "drain", "rim")
-    }
+    leaves = {name: np.asarray(getattr(plant, name)) for name in ("area", "drain", "rim")}
+    changed = {name: value[list(order)] for name, value in leaves.items()}
     split = np.asarray(plant.split)[pairs]
-    changed |= {
-        "orifice": plant.orifice[links],
-        "pipe": plant.pipe[pairs],
-        "pump_gain": plant.pump_gain[pairs],
-    }
-    return (
-        dataclasses.replace(
-            plant, **changed, split=np.where(turned, 1.0 - split, split), caught=0.0 * plant.caught
-        ),
-        pairs,
-    )
+    changed |= {"orifice": plant.orifice[links], "pipe": plant.pipe[pairs]}
+    changed |= {"pump_gain": plant.pump_gain[pairs]}
+    changed |= {"split": np.where(turned, 1.0 - split, split), "caught": 0.0 * plant.caught}
+    return dataclasses.replace(plant, **changed), pairs

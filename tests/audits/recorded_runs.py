@@ -54,17 +54,8 @@ def run(name):
 
 
 MEASURES = (
-    "rms_error",
-    "rms_error_total",
-    "iae",
-    "ise",
-    "rms_input",
-    "input_travel",
-    "max_level",
-    "min_level",
-    "overflow_volume",
-    "saturated_fraction",
-    "estimation_rms",
+    *("rms_error", "rms_error_total", "iae", "ise", "rms_input", "input_travel", "max_level"),
+    *("min_level", "overflow_volume", "saturated_fraction", "estimation_rms"),
 )
 
 
@@ -80,17 +71,11 @@ def differences(name, found, recorded, exact):
             continue
         for key, value in recorded[group].items():
             a, b = np.asarray(found[group][key], float), np.asarray(value, float)
-            if a.shape != b.shape or not np.allclose(
-                a,
-                b,
-                rtol=rtol,
-                atol=rtol * max(1.0, np.nanmax(np.abs(b), initial=0.0)),
-                equal_nan=True,
-            ):
-                lines.append(
-                    f"{name}: {key} differs by"
-                    f" {np.max(np.abs(a - b)) if a.shape == b.shape else 'shape'}"
-                )
+            atol = rtol * max(1.0, np.nanmax(np.abs(b), initial=0.0))
+            if a.shape != b.shape:
+                lines.append(f"{name}: {key} has another shape")
+            elif not np.allclose(a, b, rtol=rtol, atol=atol, equal_nan=True):
+                lines.append(f"{name}: {key} differs by {np.max(np.abs(a - b))}")
     return lines
 
 
@@ -104,16 +89,9 @@ def main():
         return 0
     record = json.loads(FILE.read_text())
     exact = record["machine"] == machine()
-    lines = [
-        line
-        for name in presets.names()
-        for line in differences(
-            name,
-            run(name),
-            record["cases"].get(name, {"bits": "", "points": {}, "measures": {}}),
-            exact,
-        )
-    ]
+    new, lines = {"bits": "", "points": {}, "measures": {}}, []
+    for name in presets.names():
+        lines += differences(name, run(name), record["cases"].get(name, new), exact)
     print(
         "\n".join(lines)
         or f"{len(record['cases'])} cases as recorded, {'to the last bit' if exact else 'to 1e-12'}"

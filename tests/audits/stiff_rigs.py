@@ -90,17 +90,15 @@ def other(kind, rng):
     m, each = len(feeds), np.ones(len(feeds))
     drawn = np.zeros(n)
     drawn[rng.integers(n)] = -rng.uniform(0.0, 0.3)
-    changes = [(80.0, j, 0.0) for j in range(m)] + [
-        (160.0, j, float(rng.uniform(0.5, 5.0))) for j in range(m)
-    ]
+    changes = [(80.0, j, 0.0) for j in range(m)]
+    changes += [(160.0, j, float(rng.uniform(0.5, 5.0))) for j in range(m)]
+    pumps = PumpBank(low=0 * each, high=10 * each, stop=0 * each, pulse=10 * each, initial=0 * each)
     loop = ClosedLoop(
         plant=plant,
         sensor=LevelSensor(gain=np.ones(n), noise=np.zeros(n), full_scale=np.asarray(RIM)),
         observer=Direct(),
         controller=OpenLoop(signal=ramps(list(rng.uniform(0.5, 5.0, m)), changes, ramp=0.0)),
-        actuator=PumpBank(
-            low=0 * each, high=10 * each, stop=0 * each, pulse=10 * each, initial=0 * each
-        ),
+        actuator=pumps,
         reference=ramps([1.0], [(80.0, 0, 2.0)], ramp=0.0),
         disturbance=Constant(level=drawn * area),
         x0=rng.uniform(0.0, RIM, n),
@@ -122,14 +120,9 @@ def reference(loops, inputs, dt):
     """
     plant = loops[0].plant
     stack = lambda read: np.array([np.asarray(read(loop), dtype=float) for loop in loops])
-    area, drain, orifice, pipe = (
-        stack(lambda loop, k=k: getattr(loop.plant, k))
-        for k in ("area", "drain", "orifice", "pipe")
-    )
-    gain, split, rim, caught = (
-        stack(lambda loop, k=k: getattr(loop.plant, k))
-        for k in ("pump_gain", "split", "rim", "caught")
-    )
+    leaf = lambda name: stack(lambda loop: getattr(loop.plant, name))
+    area, drain, orifice, pipe = map(leaf, ("area", "drain", "orifice", "pipe"))
+    gain, split, rim, caught = map(leaf, ("pump_gain", "split", "rim", "caught"))
     x, d, knee = stack(lambda loop: loop.x0), stack(lambda loop: loop.disturbance.level), plant.knee
     fastest = max(step_size.emptying_rates(loop.plant).max() for loop in loops)
     parts = int(np.ceil(dt * fastest / FINE))
@@ -143,22 +136,21 @@ def reference(loops, inputs, dt):
             if second is not None:
                 into[:, second] += gain[:, j] * (1.0 - share) * inputs[:, k, j]
         for _ in range(parts):
-            q = np.where(
-                x >= knee, np.sqrt(x), knee**0.5 * (1.5 * x / knee - 0.5 * (x / knee) ** 2)
-            )
+            film = knee**0.5 * (1.5 * x / knee - 0.5 * (x / knee) ** 2)
+            q = np.where(x >= knee, np.sqrt(x), film)
             flow = into - drain * q
             for i, (a, b) in enumerate(plant.links):
                 flow[:, a] -= orifice[:, i] * q[:, a]
                 flow[:, b] += orifice[:, i] * q[:, a]
             for i, (a, b) in enumerate(plant.pipes):
                 apart = x[:, a] - x[:, b]
-                flow[:, a] -= pipe[:, i] * apart / (apart**2 + knee**2) ** 0.25
-                flow[:, b] += pipe[:, i] * apart / (apart**2 + knee**2) ** 0.25
+                through = pipe[:, i] * apart / (apart**2 + knee**2) ** 0.25
+                flow[:, a] -= through
+                flow[:, b] += through
             x = np.maximum(x + dt / parts * flow / area, 0.0)
             for i, (a, b) in enumerate(plant.spills):
-                x[:, b] += (
-                    caught[:, i] * area[:, a] * np.maximum(x[:, a] - rim[:, a], 0.0) / area[:, b]
-                )
+                spilt = caught[:, i] * area[:, a] * np.maximum(x[:, a] - rim[:, a], 0.0)
+                x[:, b] += spilt / area[:, b]
             x = np.minimum(x, rim)
     return np.stack(path, axis=1)
 
@@ -178,11 +170,9 @@ def tried(kind, seeds):
             except InputError:
                 continue
             loops.append(loop)
-            runs.append(run)
+            runs.append((run.x, run.u))
             reported.append(bool(step_size.step_warnings(loop, clock)))
-    levels, inputs = (
-        np.stack([np.asarray(getattr(run, name)) for run in runs]) for name in ("x", "u")
-    )
+    levels, inputs = (np.stack([np.asarray(run[i]) for run in runs]) for i in (0, 1))
     error = np.abs(levels - reference(loops, inputs, clock.dt)).max(axis=(1, 2)) / RIM
     return list(zip(error, reported))
 

@@ -64,13 +64,23 @@ def test_a_docstring_without_sections_is_reported():
     assert lacking(f) == ["Examples", "Returns"]
 
 
+# seconds of compilation: what these examples show has tests of its own
+LONG = {
+    *("jaxtank.loop.margins", "tuning.live.engine", "tuning.figures.comparison"),
+    *("tuning.search.judged", "tuning.identification.design", "tuning.falsification.study"),
+    *("tuning.uncertainty.study", "tuning.uncertainty.sensitivity_study"),
+    *("jaxtank.analysis.linear_model", "jaxtank.analysis.steady_state"),
+}
+
+
 def modules_with_examples():
     for package in (jaxtank, tuning):
         root = Path(package.__file__).parent
         for path in sorted(root.rglob("*.py")):
             if ">>> " in path.read_text():
                 parts = path.relative_to(root.parent).with_suffix("").parts
-                yield ".".join(parts).removesuffix(".__init__")
+                name = ".".join(parts).removesuffix(".__init__")
+                yield pytest.param(name, marks=[pytest.mark.slow] if name in LONG else [])
 
 
 @pytest.mark.parametrize("name", list(modules_with_examples()))

@@ -146,6 +146,7 @@ def test_the_controller_of_ones_own_runs(capsys, monkeypatch):
     assert "0.809" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_objective_of_ones_own_runs(monkeypatch):
     """Its last line evaluates the problem once, at a longer step, in place of a search."""
     (example,) = blocks("python", "tuning/README.md")
