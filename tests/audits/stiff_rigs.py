@@ -187,10 +187,11 @@ def main(words):
         quiet = [error for error, reported in found if not reported]
         off += (here := sum(error > OFF for error, _ in found))
         silent += (unsaid := sum(error > OFF for error in quiet))
-        worst = max(worst, *quiet)
+        largest = max(quiet, default=0.0)
+        worst = max(worst, largest)
         print(
             f"{kind}: {count - len(found)} refused, {len(found) - len(quiet)} reported,"
-            f" {here} off, {unsaid} in silence, worst in silence {100 * max(quiet):.2g} %"
+            f" {here} off, {unsaid} in silence, worst in silence {100 * largest:.2g} %"
         )
     if "--record" in words:
         from survived import record
