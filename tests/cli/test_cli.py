@@ -175,9 +175,9 @@ def test_simulate_json_has_the_keys_of_the_contract_and_the_values_of_the_librar
 def test_what_is_not_a_number_is_null_with_a_reason():
     # nothing changes in 8 s
     printed = done("simulate", "cascaded/pi", *setting("clock.duration=8"), "--dt", "1", "--json")
-    found = printed.json["measures"]
-    assert found["settling_time"] == [None] and found["recovery_time"] is None
-    nothing = {m for m, v in found.items() if v is None or (isinstance(v, list) and None in v)}
+    result = printed.json["measures"]
+    assert result["settling_time"] == [None] and result["recovery_time"] is None
+    nothing = {m for m, v in result.items() if v is None or (isinstance(v, list) and None in v)}
     assert nothing == set(printed.json["reasons"]) and all(printed.json["reasons"].values())
 
 
@@ -219,13 +219,13 @@ def test_simulate_writes_the_run(folder, gouta):
 
 @pytest.mark.slow
 def test_a_long_run_is_thinned_in_the_file_alone(folder, gouta):
-    found = done("simulate", CASE, "--dt", "0.1", "--out", "out", "--json").json
+    result = done("simulate", CASE, "--dt", "0.1", "--out", "out", "--json").json
     _, rows = read_csv(folder / "out" / "trajectory.csv")
     case = gouta("backstepping", {"clock.dt": 0.1})
     assert 1000 < len(rows) < 4000 < case.clock.samples
     x = jaxtank.simulate(case.loop, case.clock).x[:: round(rows[1, 0] / 0.1)]
     np.testing.assert_allclose(rows[:, 1:5], x, rtol=1e-9)
-    assert_close(found["measures"], measured(case))
+    assert_close(result["measures"], measured(case))
 
 
 @pytest.mark.slow_for(
@@ -246,9 +246,9 @@ def test_a_long_run_is_thinned_in_the_file_alone(folder, gouta):
 def test_set_reaches_leaves_entries_and_static_fields(simulated, gouta, changes):
     word = lambda v: str(v).lower() if isinstance(v, bool) else str(v).replace(" ", "")
     words = setting(*(f"{n}={word(v)}" for n, v in changes.items()))
-    found = done("simulate", CASE, *SHORT, *words, "--json").json["measures"]
-    assert_close(found, measured(gouta("backstepping", {**OVERRIDES, **changes})))
-    assert found["rms_error_total"] != simulated["measures"]["rms_error_total"]
+    result = done("simulate", CASE, *SHORT, *words, "--json").json["measures"]
+    assert_close(result, measured(gouta("backstepping", {**OVERRIDES, **changes})))
+    assert result["rms_error_total"] != simulated["measures"]["rms_error_total"]
 
 
 def test_dt_is_short_for_the_clock_and_order_does_not_matter():
@@ -293,36 +293,36 @@ def tuned(tmp_path_factory):
 def test_tune_json_has_the_keys_of_the_contract(tuned):
     printed, _ = tuned
     assert printed.code == 0, printed.err
-    found = printed.json
-    assert set(found) >= TUNE_KEYS
-    ended = (found["case"], found["success"], found["status"])
+    result = printed.json
+    assert set(result) >= TUNE_KEYS
+    ended = (result["case"], result["success"], result["status"])
     assert ended == ("gouta2015/ngpc", True, "converged")
-    assert set(found["parameters"]) == {"controller.Tp"}
-    p = found["parameters"]["controller.Tp"]
+    assert set(result["parameters"]) == {"controller.Tp"}
+    p = result["parameters"]["controller.Tp"]
     assert set(p) >= {"before", "after", "unit", "lower", "upper", "at_bound", "interval"}
     assert (p["before"], p["unit"], p["lower"], p["upper"]) == (11.0, "s", 1.0, 60.0)
     assert p["lower"] <= p["after"] <= p["upper"]
-    assert all(found["measures"][when].keys() >= MEASURES for when in ("before", "after"))
-    assert len(found["constraints"]) == 4
-    for i, c in enumerate(found["constraints"]):
-        level = found["measures"]["after"]["max_level"][i]
+    assert all(result["measures"][when].keys() >= MEASURES for when in ("before", "after"))
+    assert len(result["constraints"]) == 4
+    for i, c in enumerate(result["constraints"]):
+        level = result["measures"]["after"]["max_level"][i]
         assert (c["name"], c["tank"]) == (f"max_level of tank {i + 1}", i + 1)
         assert (c["limit"], c["value"], c["margin"]) == (30.0, level, c["limit"] - level)
         assert c["margin"] >= 0 and 0 <= c["time_s"] <= 200
-    assert found["evaluations"]["simulations"] >= found["evaluations"]["gradients"] > 0
-    assert found["bound"] is None and found["wall_s"] > 0 and found["validation"]["samples"] == 8
-    assert set(found["validation"]["objective"]["after"]) == {"mean", "p05", "p50", "p95"}
-    assert found["scenarios"] == [] and found["choices"] == [] and found["tradeoff"] is None
+    assert result["evaluations"]["simulations"] >= result["evaluations"]["gradients"] > 0
+    assert result["bound"] is None and result["wall_s"] > 0 and result["validation"]["samples"] == 8
+    assert set(result["validation"]["objective"]["after"]) == {"mean", "p05", "p50", "p95"}
+    assert result["scenarios"] == [] and result["choices"] == [] and result["tradeoff"] is None
 
 
 def test_tune_is_no_worse_than_its_start_and_its_numbers_are_of_its_runs(tuned, gouta):
-    found = tuned[0].json
+    result = tuned[0].json
     # Tp = 11 s, the paper's, is not the best of this run
-    assert found["objective"]["after"] < found["objective"]["before"]
+    assert result["objective"]["after"] < result["objective"]["before"]
     for when in ("before", "after"):
-        gain = {"controller.Tp": found["parameters"]["controller.Tp"][when]}
-        assert_close(found["measures"][when], measured(gouta("ngpc", OVERRIDES | gain)))
-        assert found["objective"][when] == found["measures"][when]["rms_error_total"]
+        gain = {"controller.Tp": result["parameters"]["controller.Tp"][when]}
+        assert_close(result["measures"][when], measured(gouta("ngpc", OVERRIDES | gain)))
+        assert result["objective"][when] == result["measures"][when]["rms_error_total"]
 
 
 def test_tune_reports_its_progress_on_stderr_and_quiet_does_not(tuned):
@@ -347,12 +347,12 @@ def test_tune_writes_result_rig_trajectory_and_pictures(tuned):
 
 def test_the_tuned_rig_runs_to_the_measures_of_the_result(tuned):
     printed, folder = tuned
-    found = done("simulate", str(folder / "rig.toml"), "--json").json
-    assert found["case"] == "gouta2015/ngpc"
+    result = done("simulate", str(folder / "rig.toml"), "--json").json
+    assert result["case"] == "gouta2015/ngpc"
     margins = ("sensitivity_peak", "gain_margin", "phase_margin", "delay_margin")  # of `--margins`
     undefined = ("recovery_time", *margins)
     after = {m: v for m, v in printed.json["measures"]["after"].items() if m not in undefined}
-    assert_close(found["measures"], {m: np.array(v, dtype=float) for m, v in after.items()})
+    assert_close(result["measures"], {m: np.array(v, dtype=float) for m, v in after.items()})
     case = rig.load(folder / "rig.toml")
     head, rows = read_csv(folder / "trajectory.csv")
     assert head[:2] == ["t [s]", "h1 [cm]"]
@@ -370,19 +370,19 @@ def test_tune_takes_what_is_free_limited_and_minimised_from_its_options():
     limits = ("--limit", "none", "--limit", "max_level=29.5", "--limit", "min_level=0.5")
     objective = ("--objective", "iae=1", "--objective", "input_travel=0.5")
     words = ("--free", "controller.k1=0.02:1", *limits, *objective)
-    found = done("tune", CASE, *SHORT, *SEARCH, "--json", *words).json
-    ((name, p),) = found["parameters"].items()
+    result = done("tune", CASE, *SHORT, *SEARCH, "--json", *words).json
+    ((name, p),) = result["parameters"].items()
     assert (name, p["lower"], p["upper"]) == ("controller.k1", 0.02, 1.0)
     expected = [
         (f"{m} of tank {i}", v)
         for m, v in (("max_level", 29.5), ("min_level", 0.5))
         for i in (1, 2, 3, 4)
     ]
-    assert [(c["name"], c["limit"]) for c in found["constraints"]] == expected
-    assert all(c["margin"] >= 0 for c in found["constraints"])
-    after = found["measures"]["after"]
+    assert [(c["name"], c["limit"]) for c in result["constraints"]] == expected
+    assert all(c["margin"] >= 0 for c in result["constraints"])
+    after = result["measures"]["after"]
     cost = sum(after["iae"]) + 0.5 * sum(after["input_travel"])
-    assert math.isclose(found["objective"]["after"], cost, rel_tol=1e-12)
+    assert math.isclose(result["objective"]["after"], cost, rel_tol=1e-12)
 
 
 @pytest.mark.slow
@@ -392,10 +392,12 @@ def test_every_method_runs_without_limits_and_without_a_word_on_stderr(method):
     more = ("--limit", "none", "--iterations", "20", "--validation", "0")
     printed = say("tune", *short, *more, "--method", method)
     assert printed.code in (0, 3) and printed.err == "", printed.err
-    found = printed.json
-    assert (printed.code == 0) == found["success"] == (found["status"] == "converged")
-    assert found["method"] == ("trf" if method == "auto" else method) and found["constraints"] == []
-    assert found["objective"]["after"] <= found["objective"]["before"]
+    result = printed.json
+    assert (printed.code == 0) == result["success"] == (result["status"] == "converged")
+    assert (
+        result["method"] == ("trf" if method == "auto" else method) and result["constraints"] == []
+    )
+    assert result["objective"]["after"] <= result["objective"]["before"]
 
 
 @pytest.mark.slow
@@ -405,15 +407,15 @@ def test_scenarios_choices_trade_off_and_bound_from_the_command_line(folder):
         " --choose controller.reference_rates=false,true --tradeoff max_level=24:28:2 --bound"
         " --validation 4 --json --quiet --out out"
     )
-    found = done("tune", CASE, *SHORT, *ONE, *words).json
-    weights = [(s["name"], round(s["weight"], 6)) for s in found["scenarios"]]
+    result = done("tune", CASE, *SHORT, *ONE, *words).json
+    weights = [(s["name"], round(s["weight"], 6)) for s in result["scenarios"]]
     assert weights == [("noise", 0.666667), ("reference.ramp=40;seed=5", 0.333333)]
-    rates = [row["values"]["controller.reference_rates"] for row in found["choices"]]
+    rates = [row["values"]["controller.reference_rates"] for row in result["choices"]]
     assert rates == [False, True]
-    assert [p["limit"] for p in found["tradeoff"]["points"]] == [28.0, 24.0]
-    assert found["validation"]["samples"] == 4
-    assert 0 < found["bound"]["cost"] < found["objective"]["after"]
-    assert json.loads((folder / "out" / "result.json").read_text(encoding="utf-8")) == found
+    assert [p["limit"] for p in result["tradeoff"]["points"]] == [28.0, 24.0]
+    assert result["validation"]["samples"] == 4
+    assert 0 < result["bound"]["cost"] < result["objective"]["after"]
+    assert json.loads((folder / "out" / "result.json").read_text(encoding="utf-8")) == result
 
 
 NOISY = ("tune", "calofir/backstepping", "--free", "controller.K_phi=0.001:1", "--limit", "none")
@@ -426,8 +428,8 @@ def test_what_is_set_holds_in_the_scenarios_of_the_case():
     changes = {"clock.duration": 60.0, "sensor.noise": 0.005}
     case = rig.set_values(presets.find("calofir/backstepping"), changes)
     key = jax.random.fold_in(jax.random.key(0), 1)
-    found = jaxtank.evaluate(case.loop, case.clock, list(case.objective), key)
-    cost = sum(w * float(np.sum(found[m])) for m, w in case.objective.items())
+    result = jaxtank.evaluate(case.loop, case.clock, list(case.objective), key)
+    cost = sum(w * float(np.sum(result[m])) for m, w in case.objective.items())
     assert printed.json["scenarios"][0]["objective"]["before"] == pytest.approx(cost, rel=1e-9)
     assert "also replaces the value of sensor.noise in 1 scenario ('noise')" in printed.err
 
@@ -486,11 +488,11 @@ def test_a_limit_that_cannot_be_met_ends_with_4_and_the_best_of_it(folder):
         words = (*clock, *SEARCH, "--limit", f"max_level={limit}", "--json", "--quiet")
         printed = say("tune", CASE, *words)
         assert printed.code == 4, printed.err
-        found = printed.json
-        assert (found["success"], found["status"]) == (False, "infeasible")
-        broken = min(found["constraints"], key=lambda c: c["margin"])
+        result = printed.json
+        assert (result["success"], result["status"]) == (False, "infeasible")
+        broken = min(result["constraints"], key=lambda c: c["margin"])
         assert broken["margin"] < 0 and broken["limit"] == limit < broken["value"]
-    assert json.loads((folder / "out" / "result.json").read_text(encoding="utf-8")) == found
+    assert json.loads((folder / "out" / "result.json").read_text(encoding="utf-8")) == result
     assert rig.load(folder / "out" / "rig.toml").clock == Clock(dt=0.1, duration=200.0)
 
 
@@ -509,10 +511,10 @@ def test_an_interrupted_search_ends_with_130_and_its_best_point_is_written(folde
     monkeypatch.setattr(tune_command, "Progress", Impatient)
     printed = say("tune", "gouta2015/ngpc", *SHORT, *SEARCH, "--json", "--out", "out")
     assert printed.code == 130 and printed.json["status"] == "interrupted"
-    found = printed.json
-    assert found["objective"]["after"] <= found["objective"]["before"]
+    result = printed.json
+    assert result["objective"]["after"] <= result["objective"]["before"]
     Tp = rig.load(folder / "out" / "rig.toml").loop.controller.Tp
-    assert Tp == found["parameters"]["controller.Tp"]["after"]
+    assert Tp == result["parameters"]["controller.Tp"]["after"]
 
 
 @pytest.mark.slow
@@ -544,11 +546,11 @@ def test_an_objective_that_no_run_can_give_is_reported():
 
 @pytest.mark.slow
 def test_bench_reports_what_a_step_costs():
-    found = done("bench", "--rounds", "1", "--json").json
-    assert found["steps"] == 120_001 and CASE in found["rows"]
-    assert all(row["ns_per_step"] > 0 for row in found["rows"].values())
+    result = done("bench", "--rounds", "1", "--json").json
+    assert result["steps"] == 120_001 and CASE in result["rows"]
+    assert all(row["ns_per_step"] > 0 for row in result["rows"].values())
     # the same arithmetic in another language
-    assert found.get("difference_to_c_cm", 0.0) < 1e-9
+    assert result.get("difference_to_c_cm", 0.0) < 1e-9
 
 
 # bad input
@@ -776,16 +778,16 @@ def test_uncertainty_json_has_the_keys_of_the_contract_and_the_numbers_of_the_li
     }
     words = ("--vary", "plant.drain=uniform:5%", "--vary", "plant.rim=normal:10:0.1")
     more = ("--dt", "8", "--samples", "24", "--seed", "2", "--json", "--quiet")
-    found = done("uncertainty", "cascaded/pi", *words, *more).json
-    assert set(found) >= {"case", "samples", "failed", "measures", "violations", "provenance"}
-    assert found["samples"] == 24
+    result = done("uncertainty", "cascaded/pi", *words, *more).json
+    assert set(result) >= {"case", "samples", "failed", "measures", "violations", "provenance"}
+    assert result["samples"] == 24
     keys = {"mean", "sd", "p05", "p50", "p95", "cvar95", "max"}
-    assert all(set(summary) >= keys for summary in found["measures"].values())
+    assert all(set(summary) >= keys for summary in result["measures"].values())
     keys = {"name", "limit", "count", "probability", "interval95"}
-    assert all(set(v) >= keys for v in found["violations"])
+    assert all(set(v) >= keys for v in result["violations"])
     summary = tuning.ensemble(case, vary, samples=24, key=2).summary()
-    assert found["measures"]["rms_error_total"]["p95"] == summary["rms_error_total"]["p95"]
-    assert found["measures"]["max_level"]["max"] == summary["max_level"]["max"].tolist()
+    assert result["measures"]["rms_error_total"]["p95"] == summary["rms_error_total"]["p95"]
+    assert result["measures"]["max_level"]["max"] == summary["max_level"]["max"].tolist()
 
 
 @pytest.mark.slow
@@ -805,7 +807,7 @@ def test_robust_tuning_from_the_command_line():
         "--robust worst --samples 4 --spread 0.02 --limit max_level=33"
         " --free controller.k1=0.01:1 --validation 0 --json --quiet"
     )
-    found = done("tune", CASE, *SHORT, *words, *ONE).json
-    assert found["certificate"]["scenarios"] == 4 == len(found["scenarios"])
-    assert found["certificate"]["fresh"] == 1024
-    assert all(c["margin"] >= 0 for c in found["constraints"]) and len(found["constraints"]) == 16
+    result = done("tune", CASE, *SHORT, *words, *ONE).json
+    assert result["certificate"]["scenarios"] == 4 == len(result["scenarios"])
+    assert result["certificate"]["fresh"] == 1024
+    assert all(c["margin"] >= 0 for c in result["constraints"]) and len(result["constraints"]) == 16

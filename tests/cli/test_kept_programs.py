@@ -190,8 +190,8 @@ def test_root_makes_no_folder_in_the_home_of_another(tmp_path, monkeypatch):
     real = kept.Path.stat
 
     def of_alice(path, **options):
-        found = real(path, **options)
-        return os.stat_result((*found[:4], 1234, *found[5:])) if path == home else found
+        result = real(path, **options)
+        return os.stat_result((*result[:4], 1234, *result[5:])) if path == home else result
 
     monkeypatch.setattr(kept.Path, "stat", of_alice)
     monkeypatch.setattr(kept.os, "geteuid", lambda: 0)
@@ -214,8 +214,8 @@ def test_the_command_prints_and_clears_what_is_kept(entry, monkeypatch, capsys):
     other.write_text("not a program")
     monkeypatch.setenv(kept.SWITCH, str(base))
     assert main(["cache", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert (found["folder"], found["programs"], found["bytes"]) == (str(base), 1, 11)
+    result = json.loads(capsys.readouterr().out)
+    assert (result["folder"], result["programs"], result["bytes"]) == (str(base), 1, 11)
     assert main(["cache", "clear"]) == 0 and "1 programs removed" in capsys.readouterr().out
     assert not path.exists() and other.exists()
     assert main(["cache", "clera"]) == 2 and "nearest: clear" in capsys.readouterr().err

@@ -24,8 +24,8 @@ def compiled(caplog, capsys):
         finally:
             jax.config.update("jax_log_compiles", False)
         capsys.readouterr()
-        found = (LISTED.match(record.getMessage()) for record in caplog.records)
-        return collections.Counter(match[1] for match in found if match)
+        result = (LISTED.match(record.getMessage()) for record in caplog.records)
+        return collections.Counter(match[1] for match in result if match)
 
     return run
 
@@ -36,8 +36,8 @@ def test_a_run_is_one_program(compiled):
 
 def test_an_ensemble_is_two_programs(compiled):
     """The measures of a batch, and the trajectories of the fan chart."""
-    found = compiled("uncertainty", "cascaded/pi", "--dt", "8", "--samples", "8")
-    assert found == {"_run": 1, "_trajectories": 1}
+    result = compiled("uncertainty", "cascaded/pi", "--dt", "8", "--samples", "8")
+    assert result == {"_run": 1, "_trajectories": 1}
 
 
 @pytest.mark.slow
@@ -46,16 +46,16 @@ def test_the_nominal_optimum_needs_four_large_programs(compiled):
     10,241 samples no coarse step is used, and no Jacobian is compiled to judge it.
     """
     words = ["tune", "cascaded/pi", "--nominal", "--starts", "2", "--screening", "8"]
-    found = compiled(*words, "--dt", "0.4", "--free", "controller.Kc[0]=0.5:3")
-    small = {name: n for name, n in found.items() if name in ("simulate_compiled", "_followed")}
+    result = compiled(*words, "--dt", "0.4", "--free", "controller.Kc[0]=0.5:3")
+    small = {name: n for name, n in result.items() if name in ("simulate_compiled", "_followed")}
     large = {"evaluate_compiled": 1, "_slopes": 1, "_values": 2}
-    assert found == large | small and all(n == 1 for n in small.values())
+    assert result == large | small and all(n == 1 for n in small.values())
 
 
 @pytest.mark.slow
 def test_the_default_answer_needs_six_large_programs(compiled):
     """Judged and reported with and without a safety filter; derivatives and values of a block."""
-    found = compiled("tune", "gouta2015/backstepping", "--dt", "0.5", "--starts", "2")
+    result = compiled("tune", "gouta2015/backstepping", "--dt", "0.5", "--starts", "2")
     large = {"_run": 2, "evaluate_compiled": 2, "_slopes": 1, "_values": 1}
-    assert {name: n for name, n in found.items() if name in large} == large
-    assert sum(found.values()) - sum(large.values()) < 12 and "_one_step_jacobians" not in found
+    assert {name: n for name, n in result.items() if name in large} == large
+    assert sum(result.values()) - sum(large.values()) < 12 and "_one_step_jacobians" not in result

@@ -1,10 +1,10 @@
-"""SIGINT (Ctrl-C) and SIGTERM of the program `jaxtank`. It is imported before all else, so it
-imports only what is part of the interpreter; any module of `tuning` may import it.
+"""SIGINT (Ctrl-C) and SIGTERM of the program `jaxtank`.
 
 The program ends at once, with exit code 130 or 143 and one line, wherever it is: in an import, in a
 compilation, in a run. Only a search that has found something (`Interrupts`) goes on after the first
 signal, to report the best point so far. SIGINT that is ignored at the start, as of a job that a
-script runs with &, stays ignored; SIGTERM ends such a job.
+script runs with &, stays ignored; SIGTERM ends such a job. Imported before all else, so only what
+is part of the interpreter is imported here.
 """
 
 # `signal` adds enumerations, whose import takes longer than all of this; _signal has no stubs
@@ -91,7 +91,7 @@ def leave(number=_signal.SIGINT, words=None):
         time.sleep(5.0)
         os._exit(128 + number)
     for release in reversed(_before):
-        try:  # noqa: SIM105  (contextlib takes long to import)
+        try:  # noqa: SIM105
             release()
         except Exception:
             pass  # a folder that has gone
@@ -108,7 +108,7 @@ def say(words):
         pass
 
 
-class before_leaving:
+class before_leaving:  # contextlib takes long to import
     """Context in which `release` is called should a signal end the process."""
 
     def __init__(self, release):
@@ -155,8 +155,8 @@ class Interrupts:
             raise KeyboardInterrupt
 
 
-class put_back:
-    """Context after which SIGINT is handled as it was before."""
+class restored:
+    """Context after which SIGINT is handled as before: the searches in it have ended."""
 
     def __enter__(self):
         self.handler, self.count = _signal.getsignal(_signal.SIGINT), len(_searches)

@@ -53,8 +53,10 @@ def _command(argv):
     args.line = shlex.join(["jaxtank", *(sys.argv[1:] if argv is None else argv)])
     if argv is None and COMMANDS[args.command].compiles:
         _keep_programs(args)
-    with hold(args.out, leaving=interrupts.before_leaving):
-        return args.run(args)
+    with hold(args.out, leaving=interrupts.before_leaving), interrupts.restored():
+        code = args.run(args)
+        sys.stdout.flush()  # the answer is out before Ctrl-C ends the program at once again
+        return code
 
 
 def _shown(other):

@@ -1,5 +1,6 @@
 """Types of options: functions that read the text of a value, or raise ValueError."""
 
+import os
 import re
 
 from jaxtank.core.errors import InputError
@@ -73,12 +74,12 @@ def value(text):
         return text.lower() == "true"
     bracketed = text.startswith("[") and text.endswith("]")
     inner = text[1:-1] if bracketed else text
-    entries = [entry.strip() for entry in inner.split(",")] if inner.strip() else []
+    parts = entries()(inner) if inner.strip() else []
     try:
-        numbers = [plain_number(entry) for entry in entries if entry]
+        numbers = [plain_number(part) for part in parts if part]
     except ValueError:
         return text
-    if len(numbers) < len(entries):
+    if len(numbers) < len(parts):
         raise ValueError("an entry of the list is empty: leave out the comma, or give its number")
     if comma := DECIMAL_COMMA.fullmatch(text):
         sign, whole_part, digits = comma.groups()
@@ -87,8 +88,8 @@ def value(text):
             f"the comma may be a decimal one: write {point}, with a point, for a number, or"
             f" [{', '.join(map(str, numbers))}] for a list"
         )
-    zero = next(filter(LEADING_ZERO.match, entries), None)
-    if len(entries) > 1 and zero:
+    zero = next(filter(LEADING_ZERO.match, parts), None)
+    if len(parts) > 1 and zero:
         raise ValueError(
             f"entry {zero} begins with a zero, as the digits after a decimal comma do: write"
             " decimals with a point, as 0.05"
@@ -157,10 +158,10 @@ def scenario(text):
 
 def candidates(text):
     """Return the values of V1,V2,.."""
-    entries = [entry.strip() for entry in text.split(",")]
-    if "" in entries or any(map(LEADING_ZERO.match, entries)):
+    parts = entries()(text)
+    if "" in parts or any(map(LEADING_ZERO.match, parts)):
         raise ValueError("must be values with commas between them, decimals with a point: 0.5,1.5")
-    return [value(entry) for entry in entries]
+    return [value(part) for part in parts]
 
 
 def tradeoff(text):
@@ -196,8 +197,8 @@ def column(text):
 def deviations(text):
     """Return a standard deviation, or a list of them."""
     noise = value(text)
-    entries = noise if isinstance(noise, list) else [noise]
-    if not entries or any(isinstance(v, str | bool) or not v > 0 for v in entries):
+    each = noise if isinstance(noise, list) else [noise]
+    if not each or any(isinstance(v, str | bool) or not v > 0 for v in each):
         raise ValueError("must be a number above 0, or [SD1,SD2,...], one per channel")
     return noise
 
@@ -210,14 +211,9 @@ def held_back(text):
     return last if last < 1 else int(last)
 
 
-def numbers(text):
-    """Return the numbers of V1,V2,.."""
-    return [number(entry) for entry in text.split(",")]
-
-
-def names(text):
-    """Return the names of H1,H2,.."""
-    return [name.strip() for name in text.split(",")]
+def entries(read=str.strip):
+    """Return what reads a list of V1,V2,.."""
+    return lambda text: [read(entry) for entry in text.split(",")]
 
 
 def folder(text):
@@ -232,8 +228,6 @@ def folder(text):
 
 def earlier_folder(text):
     """Return the name of the folder of an earlier run."""
-    import os
-
     if not os.path.isdir(folder(text)):
         raise ValueError("cannot be read as a run to go on with: there is no such folder")
     return text

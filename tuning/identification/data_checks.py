@@ -1,6 +1,6 @@
 """Checks of experiment data against a rig: what each finds, and what it says."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import jax
@@ -175,7 +175,7 @@ class Check(NamedTuple):
     """A check: its code, what it finds, and the message."""
 
     code: str
-    find: Callable[..., Sequence]  # of (log, loop, gap): (sample or None, column or None, values)
+    find: Callable[..., Iterable]  # of (log, loop, gap): (sample or None, column or None, values)
     message: str
     ends: bool = False  # the checks after it need what it checks
 

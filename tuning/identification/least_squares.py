@@ -135,7 +135,7 @@ def profile_likelihood(estimation, fit, spread, loss="linear", points=11, reach=
             start = estimation.unknowns(near)
             rise[j] = max(2 * (near.cost - fit.cost) / inflate, 0.0)
             values[j] = float(estimation.coordinates.values(near.p)[name])
-    ends = [_crossing(values[side], rise[side]) for side in (downward, upward)]
+    ends: list[Any] = [_crossing(values[side], rise[side]) for side in (downward, upward)]
     return {
         "name": name,
         "unit": next(b.unit for b in estimation.bounds if b.name == name),

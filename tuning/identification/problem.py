@@ -99,9 +99,10 @@ class Estimation:
         self.noise = noise_of(self.data) if noise is None else given_noise(noise, channels)
         self.mask = np.isfinite(self.data.y)
         if self.mask.sum() <= self.size:
+            names = ", ".join(log.name for log in logs)
             raise DataError(
-                f"{self.mask.sum()} readings cannot determine {self.size} unknowns: give longer"
-                " data, or free fewer"
+                f"{names}: {self.mask.sum()} readings cannot determine {self.size} unknowns: give"
+                " longer data, or free fewer"
             )
         self.evaluations = 0  # of residual and Jacobian
         self.substeps = self._substeps() if substeps is None else int(substeps)
@@ -109,8 +110,10 @@ class Estimation:
     def _initial_levels(self, start):
         """Return (logs, tanks) levels of the case or, where measured, of the first reading."""
         x0 = np.tile(np.asarray(self.case.loop.x0, dtype=float), (len(self.logs), 1))
+        if start == "case":
+            return x0
         sensor = self.rig.sensor
-        for c, (tank, in_volts) in enumerate(self.data.channels if start != "case" else ()):
+        for c, (tank, in_volts) in enumerate(self.data.channels):
             scale = float(sensor.gain[tank]) if in_volts else 1.0
             offset = 0.0 if sensor.offset is None else float(sensor.offset[tank])
             for e, readings in enumerate(self.data.y[..., c]):

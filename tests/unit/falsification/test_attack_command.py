@@ -66,7 +66,7 @@ def test_errors_that_change_in_time_are_named_where_the_rig_file_lacks_them(tmp_
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--pumps", "ful"], "pumps = 'ful'"),
+        (["--pumps", "ful"], "--pumps 'ful': must be one of own, full, random"),
         (["--starts", "0"], "--starts '0'"),
         (["--spread", "2"], "--spread '2'"),
         (["--vary", "plant.drian=uniform:5%"], "plant.drain"),

@@ -7,7 +7,7 @@ import sys
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import printable
 from tuning.cli import values
-from tuning.cli.interrupts import Interrupts, put_back
+from tuning.cli.interrupts import Interrupts
 from tuning.cli.options import CASE, COMMON, RESUME, RUN, Command, Option
 from tuning.cli.steps import finish, open_case, print_result, report_unreachable
 from tuning.cli.terminal import Line
@@ -23,11 +23,8 @@ STATUS = {"converged": 0, "not_converged": 3, "not_identifiable": 5, "interrupte
 def run(args):
     """Run the command; returns the exit code."""
     _check_together(args)
-    with put_back():
-        case = open_case(args)
-        code = _plan(args, case) if args.plan else _identify(args, case)
-        sys.stdout.flush()  # the result is out before Ctrl-C ends the program at once again
-        return code
+    case = open_case(args)
+    return _plan(args, case) if args.plan else _identify(args, case)
 
 
 def _check_together(args):
@@ -238,9 +235,9 @@ PLAN = (
     Option("--duration", "S", f"of a planned experiment [s] (default {PLANNED:g})",
            values.above(0, LONGEST)),
     Option("--voltage", "V1,V2", "inputs about which a planned experiment works (default: the"
-           " case's own)", values.numbers),
+           " case's own)", values.entries(values.number)),
     Option("--measure", "H1,H2", "tanks measured in a planned experiment (default all)",
-           values.names),
+           values.entries()),
 )
 # fmt: on
 COMMANDS = {

@@ -6,7 +6,7 @@ from typing import Any
 
 from jaxtank.core.errors import InputError
 from tuning.cli import values
-from tuning.cli.interrupts import Interrupts, put_back
+from tuning.cli.interrupts import Interrupts
 from tuning.cli.options import CASE, CLUSTER, COMMON, RESUME, RUN, UNCERTAIN, Command, Option
 from tuning.cli.steps import (
     distributions_of,
@@ -58,14 +58,6 @@ CODES = """exit codes:
        Ctrl-C. A second signal stops at once; --resume DIR goes on where either stopped"""
 
 EXIT = {"converged": 0, "not_converged": 3, "infeasible": 4, "interrupted": 130}
-
-
-def tune(args):
-    """`_tune`, with the handler of SIGINT put back afterwards."""
-    with put_back():
-        code = _tune(args)
-        sys.stdout.flush()  # the answer is out before Ctrl-C ends the program at once again
-        return code
 
 
 def _tune(args):
@@ -279,7 +271,7 @@ ROBUST = (
 # fmt: on
 COMMANDS = {
     "tune": Command(
-        tune,
+        _tune,
         "tune the gains of a case under its limits",
         (*COMMON, *CASE, *RUN, *UNCERTAIN, *CLUSTER, *PROBLEM, *SEARCH, *ROBUST),
         epilog=CODES,
