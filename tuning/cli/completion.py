@@ -86,7 +86,7 @@ def _values(action, word):
     """Return the words that the value of an option, or an argument, may be."""
     if action.choices:
         return action.choices
-    metavar, equals, _ = (action.metavar or "").partition("=")
+    metavar, equals, _ = str(action.metavar or "").partition("=")
     kind = "parameters" if equals and metavar == "NAME" else KINDS.get(metavar)
     if kind is None and "--measure" in action.option_strings:
         kind = "measures"
@@ -95,7 +95,7 @@ def _values(action, word):
         ends = {"folders": "/", "files": "", "cases": ("/", ".toml")}[kind]
         paths = [p for p in paths if p.endswith(ends)]
         return paths if kind != "cases" else [*paths, *names()["cases"]]
-    return [f"{name}{equals}" for name in names().get(kind, [])]
+    return [f"{name}{equals}" for name in names().get(kind or "", [])]
 
 
 def names():

@@ -74,7 +74,7 @@ class Once(argparse.Action):
         """Store the value; a second one is a problem."""
         given = vars(namespace).setdefault("given", set())
         if option_string is not None and self.dest in given:
-            parser.problems.append(f"{option_string} is given twice: give it once")
+            Parser.problems.append(f"{option_string} is given twice: give it once")
         given.add(self.dest)
         setattr(namespace, self.dest, values)
 
@@ -84,10 +84,11 @@ class Pairs(argparse.Action):
 
     def __call__(self, parser, namespace, values, option_string=None):
         """Add a pair; a name that is there is a problem."""
-        pairs = dict(getattr(namespace, self.dest))
-        name, value = values or (None, None)  # None: a problem of its type
+        if not isinstance(values, tuple):  # a problem of its type
+            return
+        pairs, (name, value) = dict(getattr(namespace, self.dest)), values
         if name in pairs:
-            parser.problems.append(f"{option_string} {name} is given twice: give it once")
+            Parser.problems.append(f"{option_string} {name} is given twice: give it once")
         setattr(namespace, self.dest, pairs | {name: value})
 
 

@@ -138,9 +138,10 @@ class Spread:
 
     def _covariance_of_values(self):
         """Return (unknowns, unknowns) covariance in the rig's units, zero where one is fixed."""
-        est, full = self.estimation, np.zeros((self.estimation.size, self.estimation.size))
+        est = self.estimation
+        full = np.zeros((est.size, est.size))
         full[np.ix_(self.moving, self.moving)] = self.covariance
-        slopes = block_diag(est.coordinates.slopes(self.fit.p), np.diag(est.level_scale))
+        slopes: Any = block_diag(est.coordinates.slopes(self.fit.p), np.diag(est.level_scale))
         return slopes @ full @ slopes.T
 
     def _with_branches(self, chosen):

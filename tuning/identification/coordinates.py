@@ -131,7 +131,7 @@ class Coordinates:
         p = [q for item in self.items for q in item.point(*(values[n] for n in item.names))]
         return np.clip(np.array(p, dtype=float), *self.box)
 
-    def slopes(self, p):
+    def slopes(self, p) -> Any:
         """Return (size, size) derivatives of the values, ordered as `names`, by the coordinates."""
         return block_diag(*(item.slopes(entries) for item, entries in self._items(p)))
 
@@ -168,7 +168,7 @@ def free_bounds(loop, free):
             raise InputError(f"free {name}: no reading depends on it in a way that could be fitted")
     spec = {n: (*v, "log" if v[0] > 0 else "linear")[:3] for n, v in free.items()}
     ranges = bounds(loop, spec)
-    feeds = getattr(loop.plant, "feeds", ())
+    feeds: Any = getattr(loop.plant, "feeds", ())
     idle = {f"plant.split[{j}]" for j, (_, second) in enumerate(feeds) if second is None}
     for name in idle & set(free):
         raise InputError(f"free {name}: this pump feeds one tank alone, its split changes nothing")
