@@ -101,6 +101,7 @@ class Case(CaseViews):
         Where a rig gives them.
 
     safety : settings of `with_safety_filter`, optional
+    origin : "paper/case" of the preset that it was made from, "" for none
 
     Examples
     --------
@@ -127,6 +128,7 @@ class Case(CaseViews):
     log: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     names: Mapping[str, tuple] = dataclasses.field(default_factory=dict)
     safety: Mapping[str, Any] | None = None
+    origin: str = ""
 
     def replace(self, **changes: Any) -> "Case":
         """Return a copy with the named fields changed."""

@@ -12,15 +12,10 @@ from jaxtank.case import Case, Free, Scenario, Symmetry
 from jaxtank.controllers import OpenLoop
 from jaxtank.controllers.two_tank_backstepping import TwoTankBackstepping
 from jaxtank.core.clock import Clock
-from jaxtank.core.tree import number
-from jaxtank.instruments.actuators import PumpBank
-from jaxtank.instruments.sensors import LevelSensor
-from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.run import simulate
-from jaxtank.observers import Direct
 from jaxtank.plants.faults import faults
 from jaxtank.plants.rigs import coupled_tanks
-from jaxtank.presets.paper import Claim, Preset, printed
+from jaxtank.presets.paper import Claim, Preset, closed_loop, printed
 from jaxtank.signals.setpoints import ramps
 
 GAINS = ((0.01, 0.01), (0.02, 0.02), (0.02, 0.1), (0.1, 0.1))  # K_phi, K_y of notes S7.1 [1/s]
@@ -119,29 +114,16 @@ def build(perturbed=False):
     """Return the closed loop, with the faults of notes S3 if `perturbed`."""
     plant = rig()
     events = [("drain[1]", 300, 450, 0.75, 0.0), ("drain[0]", 900, 1050, 1.0, 0.2 * C1 / SPEED)]
-    return ClosedLoop(
-        plant=plant,
-        sensor=LevelSensor(
-            gain=number([0.06, 0.06]), noise=number([0.0, 0.0]), full_scale=number(10.0)
-        ),  # 10 V at 0.6 m; not printed
-        observer=Direct(),
-        controller=TwoTankBackstepping(
-            model=plant,
-            K_phi=number(0.02),
-            K_y=number(0.1),
-            level_floor=number(1e-4),
-            difference_floor=number(1e-4),
+    return closed_loop(
+        plant,
+        TwoTankBackstepping(
+            model=plant, K_phi=0.02, K_y=0.1, level_floor=1e-4, difference_floor=1e-4
         ),
-        actuator=PumpBank(
-            low=number([0.0]),
-            high=number([Q0]),
-            stop=number([0.0]),
-            pulse=number([Q0]),
-            initial=number([0.0]),
-        ),
-        reference=ramps([START], [(0.0, 0, 0.8 * H0), (600.0, 0, 0.5 * H0)], ramp=0.0, band=0.02),
+        ramps([START], [(0.0, 0, 0.8 * H0), (600.0, 0, 0.5 * H0)], ramp=0.0, band=0.02),
+        [START, START * KAPPA],
+        sensor=(0.06, 10.0),  # 10 V at 0.6 m; not printed
+        pumps={"low": 0.0, "high": Q0},
         faults=faults(plant, events) if perturbed else None,
-        x0=number([START, START * KAPPA]),
     )
 
 

@@ -9,12 +9,8 @@ from jaxtank.case import Case, Free
 from jaxtank.controllers import PID, OpenLoop
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
-from jaxtank.instruments.actuators import PumpBank
-from jaxtank.instruments.sensors import LevelSensor
-from jaxtank.loop.closed_loop import ClosedLoop
-from jaxtank.observers import Direct
 from jaxtank.plants.network import network
-from jaxtank.presets.paper import Preset, printed
+from jaxtank.presets.paper import Preset, closed_loop, printed
 from jaxtank.signals.base import Constant, Table
 from jaxtank.signals.setpoints import ramps
 
@@ -31,6 +27,7 @@ K_UPPER, K_LOWER, K_PUMP = 0.038642, 0.040808, 0.046202
 CAUGHT = 0.92814  # share of the upper tank's overflow that falls into the lower one
 OFFSET = -0.73380  # added to the pump's voltage [V]
 START = (5.38786, 5.23862)  # levels at t = 0 of the record [V]
+STEPS = [(400.0, 0, 7.0), (1200.0, 0, 3.0), (2000.0, 0, 5.0)]  # of the setpoint, ours
 
 TUNABLE = {
     "controller.Kc": Free(0.01, 5.0),
@@ -64,23 +61,14 @@ def rig():
 
 def loop(controller, reference, x0, u0=0.0):
     """Return the closed loop of a controller; x0: (2,) levels [V], u0: pump before t = 0 [V]."""
-    return ClosedLoop(
-        plant=rig(),
-        sensor=LevelSensor(
-            gain=number([1.0, 1.0]), noise=number([0.0, 0.0]), full_scale=number(RIM)
-        ),
-        observer=Direct(),
-        controller=controller,
-        actuator=PumpBank(
-            low=number([0.0]),
-            high=number([10.0]),
-            stop=number([0.0]),
-            pulse=number([10.0]),
-            initial=number([u0]),
-        ),
-        reference=reference,
-        disturbance=Constant(level=number([K_PUMP * OFFSET, 0.0])),
-        x0=number(x0),
+    return closed_loop(
+        rig(),
+        controller,
+        reference,
+        x0,
+        sensor=(1.0, RIM),
+        pumps={"low": 0.0, "high": 10.0, "initial": u0},
+        disturbance=Constant(level=[K_PUMP * OFFSET, 0.0]),
     )
 
 
@@ -114,19 +102,9 @@ def measured(run):
 def preset():
     """Return the Preset of this rig."""
     x0, u0 = steady_state(4.0)
-    reference = ramps([4.0], [(400.0, 0, 7.0), (1200.0, 0, 3.0), (2000.0, 0, 5.0)], ramp=0.0)
-    pi = PID(
-        model=rig(), Kc=number([1.0]), Ti=number([200.0]), Tt=number([100.0]), bias=number([u0])
-    )
-    pump = ramps(
-        [u0],
-        [
-            (400.0, 0, steady_state(7.0)[1]),
-            (1200.0, 0, steady_state(3.0)[1]),
-            (2000.0, 0, steady_state(5.0)[1]),
-        ],
-        ramp=0.0,
-    )
+    reference = ramps([4.0], STEPS, ramp=0.0)
+    pi = PID(model=rig(), Kc=[1.0], Ti=[200.0], Tt=[100.0], bias=[u0])
+    pump = ramps([u0], [(t, 0, steady_state(level)[1]) for t, _, level in STEPS], ramp=0.0)
     controllers = {
         "pi": ("PI", pi, ("controller.Kc", "controller.Ti")),
         "open-loop": (

@@ -12,14 +12,9 @@ from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Case, Free
 from jaxtank.controllers import PID
 from jaxtank.core.clock import Clock
-from jaxtank.core.tree import number
-from jaxtank.instruments.actuators import PumpBank
-from jaxtank.instruments.sensors import LevelSensor
-from jaxtank.loop.closed_loop import ClosedLoop
-from jaxtank.observers import Direct
 from jaxtank.plants.faults import faults
 from jaxtank.plants.network import network
-from jaxtank.presets.paper import Claim, Preset, printed
+from jaxtank.presets.paper import Claim, Preset, closed_loop, printed
 from jaxtank.signals.setpoints import ramps
 
 AREA, PIPE, HEIGHT, FLOW = 154.0, 0.5, 62.0, 150.0  # [cm^2], [cm^2], [cm], [cm^3/s]
@@ -61,28 +56,13 @@ def loop(faulty=False):
     plant = rig()
     x0, u0 = equilibrium(plant, np.array([40.0, 15.0]))
     events = [("drain[2]", 500.0, 700.0, 1.0, LEAK), ("pipe[0]", 1300.0, 1500.0, PLUGGED, 0.0)]
-    return ClosedLoop(
-        plant=plant,
-        sensor=LevelSensor(
-            gain=number([1.0] * 3), noise=number([0.0] * 3), full_scale=number(70.0)
-        ),
-        observer=Direct(),
-        controller=PID(
-            model=plant,
-            Kc=number([KC, KC]),
-            Ti=number([TI, TI]),
-            Tt=number([TI, TI]),
-            bias=number(u0),
-        ),
-        actuator=PumpBank(
-            low=number([0.0, 0.0]),
-            high=number([FLOW, FLOW]),
-            stop=number([0.0, 0.0]),
-            pulse=number([FLOW, FLOW]),
-            initial=number(u0),
-        ),
-        reference=ramps([40.0, 15.0], STEPS, ramp=0.0),
-        x0=number(x0),
+    return closed_loop(
+        plant,
+        PID(model=plant, Kc=[KC, KC], Ti=[TI, TI], Tt=[TI, TI], bias=u0),
+        ramps([40.0, 15.0], STEPS, ramp=0.0),
+        x0,
+        sensor=(1.0, 70.0),
+        pumps={"low": 0.0, "high": FLOW, "initial": u0},
         faults=faults(plant, events) if faulty else None,
     )
 

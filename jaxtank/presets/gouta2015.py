@@ -13,16 +13,12 @@ from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Case, Free
 from jaxtank.controllers import NGPC, Backstepping
 from jaxtank.core.clock import Clock
-from jaxtank.core.tree import number
-from jaxtank.instruments.actuators import PumpBank
-from jaxtank.instruments.sensors import LevelSensor
-from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.margins import stability_margins
 from jaxtank.loop.run import simulate
 from jaxtank.observers import Direct, DisturbanceObserver
 from jaxtank.plants import state_coupled_four_tank
 from jaxtank.plants.hydraulics import disc
-from jaxtank.presets.paper import Claim, Preset, printed
+from jaxtank.presets.paper import Claim, Preset, closed_loop, printed
 from jaxtank.presets.rows import robustness
 from jaxtank.signals.inflows import inflow_pulses
 from jaxtank.signals.setpoints import ramps
@@ -293,6 +289,8 @@ OBSERVED = {
         ("controller.k", "controller.k1", "observer.l"),
     ),
 }
+# a1 .. a4, sec. 5.2 [cm/V]; full scale of the STM32 board's converter, not in the paper [V]
+SENSOR = ((9.4458, 8.7106, 8.5106, 9.3458), 3.3)
 GAIN = 0.5  # l of every tank in OBSERVED (notes A10) [1/s]
 VARIANTS = {
     "-table1": "plant A: areas as printed in Table 1",
@@ -304,46 +302,25 @@ VARIANTS = {
 def controller_of(kind, model):
     """Return a controller with the gains of sec. 5.1 and `model` as its model of the plant."""
     if kind == "ngpc":
-        return NGPC(model=model, Tp=number(11.0), level_floor=number(0.01))
-    return Backstepping(
-        model=model,
-        k=number(0.03),
-        k1=number(0.088),
-        level_floor=number(0.01),
-        reference_rates=kind == "backstepping-ff",
-    )
-
-
-def observer_of(kind, model):
-    """Return the observer of a case: none but for those of OBSERVED."""
-    if kind not in OBSERVED:
-        return Direct()
-    return DisturbanceObserver(model=model, l=number([GAIN] * 4))
+        return NGPC(model=model, Tp=11.0, level_floor=0.01)
+    rates = kind == "backstepping-ff"
+    return Backstepping(model=model, k=0.03, k1=0.088, level_floor=0.01, reference_rates=rates)
 
 
 def build(kind, area=FAST_AREA, saturation="clip", ramp=60.0):
     """Return the closed loop of a controller; area of the tanks [cm^2], ramp [s]."""
     plant = state_coupled_four_tank(area)
     x0, u0 = _steady(area)
-    return ClosedLoop(
-        plant=plant,
-        sensor=LevelSensor(
-            gain=number([9.4458, 8.7106, 8.5106, 9.3458]),  # a1 .. a4, sec. 5.2 [cm/V]
-            noise=number([0.0] * 4),
-            full_scale=number(3.3),  # of the STM32 board's converter; not in the paper
-        ),
-        observer=observer_of(kind, plant),
-        controller=controller_of(kind.removesuffix("-observer"), plant),
-        actuator=PumpBank(
-            low=number([0.0, 0.0]),
-            high=number([12.0, 12.0]),
-            stop=number([1.5, 1.5]),
-            pulse=number([3.3, 3.3]),
-            initial=u0,
-            saturation=saturation,
-        ),
-        reference=ramps(START, BENCHMARK, ramp=ramp),
-        x0=x0,
+    pumps = {"low": 0.0, "high": 12.0, "stop": 1.5, "pulse": 3.3, "initial": u0}
+    observed = kind in OBSERVED
+    return closed_loop(
+        plant,
+        controller_of(kind.removesuffix("-observer"), plant),
+        ramps(START, BENCHMARK, ramp=ramp),
+        x0,
+        sensor=SENSOR,
+        observer=DisturbanceObserver(model=plant, l=[GAIN] * 4) if observed else Direct(),
+        pumps=pumps | {"saturation": saturation},
     )
 
 

@@ -12,12 +12,9 @@ from jaxtank.case import Case, Free, Scenario, Symmetry
 from jaxtank.controllers import ENMPC, PID
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import get_value, number, with_values
-from jaxtank.instruments.actuators import PumpBank
-from jaxtank.instruments.sensors import LevelSensor
-from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct, DisturbanceObserver
 from jaxtank.plants import coupled_tanks
-from jaxtank.presets.paper import Claim, Preset, Sample, printed
+from jaxtank.presets.paper import Claim, Preset, Sample, closed_loop, printed
 from jaxtank.presets.rows.operations import sample_operations
 from jaxtank.signals.base import Sum
 from jaxtank.signals.inflows import inflow_pulses
@@ -89,16 +86,9 @@ def benchmark(band=0.05):
     """Return the reference of benchmark 1 (sec. 5.1; notes S3.1)."""
     # r1 = 8 from 10 s on, plus a raised sine with a period of 250 s from 50 to 800 s; r2 = 10.
     steps = ramps((0.0, 0.0), [(0.0, 1, 10.0), (10.0, 0, 8.0)], ramp=0.0, band=band)
-    sine = Sine(
-        amplitude=number(3.0),
-        offset=number(3.0),
-        period=250.0,
-        zero=112.5,
-        start=50.0,
-        end=800.0,
-        channel=0,
-        width=2,
-    )  # in phase with its limits: it begins and ends at 0 with no rate
+    # in phase with its limits: it begins and ends at 0 with no rate
+    limits = {"period": 250.0, "zero": 112.5, "start": 50.0, "end": 800.0}
+    sine = Sine(amplitude=3.0, offset=3.0, **limits, channel=0, width=2)
     return Sum(first=steps, second=sine)
 
 
@@ -134,24 +124,24 @@ def controller_of(name, model):
         return (
             ENMPC(
                 model=model,
-                Tp=number(0.13),
+                Tp=0.13,
                 compensation=("double" if printed else "single") if compensated else "none",
                 drift="printed" if printed else "derived",
             ),
             DisturbanceObserver(
-                model=model, l=number([10.0, 10.0]), before_compensation=printed and compensated
+                model=model, l=[10.0, 10.0], before_compensation=printed and compensated
             ),
         )
     kind = name.removesuffix("-ff")
     return (
         PID(
             model=model,
-            Kc=number([4.32, 4.32]),
-            Ti=number([6.0, 6.0]),
-            Td=number([0.25, 0.25]) if kind == "pid" else None,
-            order=number([0.85, 0.85]) if kind == "fopi" else None,
-            Tt=number([36.0, 36.0]),
-            bias=number([6.34, 7.17]),  # mean voltages of the benchmark (notes S4.5)
+            Kc=[4.32, 4.32],
+            Ti=[6.0, 6.0],
+            Td=[0.25, 0.25] if kind == "pid" else None,
+            order=[0.85, 0.85] if kind == "fopi" else None,
+            Tt=[36.0, 36.0],
+            bias=[6.34, 7.17],  # mean voltages of the benchmark (notes S4.5)
             feed_forward=name.endswith("-ff"),
         ),
         Direct(),
@@ -163,9 +153,8 @@ def fitted(loop):
     pumps with delay and lag, noise; fitted to Table 3, not unique (notes S2.4; its inflow pulse of
     0.7 s is left at 1.1 s). Controller and observer keep their model.
     """
-    bank = dataclasses.replace(
-        loop.actuator, dead_zone=number([1.5, 4.3]), delay=0.98, lag=number([0.93] * 2)
-    )
+    lag = {"delay": 0.98, "lag": number([0.93] * 2)}
+    bank = dataclasses.replace(loop.actuator, dead_zone=number([1.5, 4.3]), **lag)
     changed = {
         "plant.pump_gain": [16.7] * 2,
         "plant.drain": [0.66 * 0.7854] * 2,
@@ -180,25 +169,16 @@ def build(name):
     """Return the closed loop of a case of CONTROLLERS."""
     plant, trapezoid = rig(), name.endswith("-trapezoid")
     controller, observer = controller_of(name, plant)
-    loop = ClosedLoop(
-        plant=plant,
-        sensor=LevelSensor(
-            gain=number([SENSOR] * 2), noise=number([0.0] * 2), full_scale=number(5.0)
-        ),
+    pumps = {"low": 0.0, "high": 12.0, "pulse": 5.0, "dead_zone": DEAD_ZONE}
+    loop = closed_loop(
+        plant,
+        controller,
+        trapezoids() if trapezoid else benchmark(),
+        [1.0, 1.0],
+        sensor=(SENSOR, 5.0),
         observer=observer,
-        controller=controller,
-        actuator=PumpBank(
-            low=number([0.0] * 2),
-            high=number([12.0] * 2),
-            dead_zone=number(DEAD_ZONE),
-            dead_zone_kind="offset",
-            stop=number([0.0] * 2),
-            pulse=number([5.0] * 2),
-            initial=number([0.0] * 2),
-        ),
-        reference=trapezoids() if trapezoid else benchmark(),
+        pumps=pumps | {"dead_zone_kind": "offset"},
         disturbance=None if trapezoid else inflow_pulses(2, PULSES),
-        x0=number([1.0, 1.0]),
     )
     return fitted(loop) if name.endswith("-fitted") else loop
 

@@ -12,13 +12,8 @@ from jaxtank.analysis.steady_state import steady_levels
 from jaxtank.case import Case, Free
 from jaxtank.controllers import PID
 from jaxtank.core.clock import Clock
-from jaxtank.core.tree import number
-from jaxtank.instruments.actuators import PumpBank
-from jaxtank.instruments.sensors import LevelSensor
-from jaxtank.loop.closed_loop import ClosedLoop
-from jaxtank.observers import Direct
 from jaxtank.plants.rigs import JOHANSSON, johansson
-from jaxtank.presets.paper import Claim, Preset, printed
+from jaxtank.presets.paper import Claim, Preset, closed_loop, printed
 from jaxtank.signals.setpoints import ramps
 
 VOLTS_PER_CM = 0.5  # kc, Table I: the gains are printed for levels in volts
@@ -63,28 +58,13 @@ def loop(phase):
     first, second, _ = TIMES[phase]
     start = [float(h) for h in levels[:2]]
     steps = [(first, 0, start[0] + STEP), (second, 1, start[1] + STEP)]
-    return ClosedLoop(
-        plant=rig,
-        sensor=LevelSensor(
-            gain=number([1.0 / VOLTS_PER_CM] * 4), noise=number([0.0] * 4), full_scale=number(10.0)
-        ),
-        observer=Direct(),
-        controller=PID(
-            model=rig,
-            Kc=number([VOLTS_PER_CM * k for k in K]),
-            Ti=number(Ti),
-            Tt=number(Ti),
-            bias=number(volts),
-        ),
-        actuator=PumpBank(
-            low=number([0.0, 0.0]),
-            high=number([10.0, 10.0]),
-            stop=number([0.0, 0.0]),
-            pulse=number([10.0, 10.0]),
-            initial=number(volts),
-        ),
-        reference=ramps(start, steps, ramp=0.0),
-        x0=number(levels),
+    return closed_loop(
+        rig,
+        PID(model=rig, Kc=[VOLTS_PER_CM * k for k in K], Ti=Ti, Tt=Ti, bias=volts),
+        ramps(start, steps, ramp=0.0),
+        levels,
+        sensor=(1.0 / VOLTS_PER_CM, 10.0),
+        pumps={"low": 0.0, "high": 10.0, "initial": volts},
     )
 
 

@@ -15,12 +15,8 @@ from jaxtank.case import Case, Free
 from jaxtank.controllers import GPC, Laguerre
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
-from jaxtank.instruments.actuators import PumpBank
-from jaxtank.instruments.sensors import LevelSensor
-from jaxtank.loop.closed_loop import ClosedLoop
-from jaxtank.observers import Direct
 from jaxtank.plants import coupled_tanks
-from jaxtank.presets.paper import Claim, Preset, printed
+from jaxtank.presets.paper import Claim, Preset, closed_loop, printed
 from jaxtank.presets.rows.operations import operations
 from jaxtank.signals.setpoints import ramps
 
@@ -123,34 +119,26 @@ def build(kind, where=None, mode="unconstrained"):
     reference, x0, u0 = scenario(where or default)
     pumps = len(u0)
     plant, free = tanks(pumps), mode == "unconstrained"
-    poles = {"a": number([0.4] * pumps)} if controller is Laguerre else {}  # sec. V.A
-    return ClosedLoop(
-        plant=plant,
-        sensor=LevelSensor(
-            gain=number([0.1] * 2), noise=number([0.0] * 2), full_scale=number(10.0)
-        ),
-        observer=Direct(),
-        controller=controller(
+    poles = {"a": [0.4] * pumps} if controller is Laguerre else {}  # sec. V.A
+    low, high = (-WIDE, WIDE) if free else (0.0, 3.0)
+    return closed_loop(
+        plant,
+        controller(
             model=plant,
-            operating_point=number(MIDDLE[pumps]),
-            r_w=number(1e-2),
-            q=number([1.0] * pumps),
-            du_limit=number([0.5] * pumps),
-            u_low=number([0.0] * pumps),
-            u_high=number([3.0] * pumps),
+            operating_point=MIDDLE[pumps],
+            r_w=1e-2,
+            q=[1.0] * pumps,
+            du_limit=[0.5] * pumps,
+            u_low=[0.0] * pumps,
+            u_high=[3.0] * pumps,
             mode=mode,
             **poles,
             **sizes,
         ),
-        actuator=PumpBank(
-            low=number([-WIDE if free else 0.0] * pumps),
-            high=number([WIDE if free else 3.0] * pumps),
-            stop=number([0.0] * pumps),
-            pulse=number([1.0] * pumps),
-            initial=u0,
-        ),
-        reference=reference,
-        x0=x0,
+        reference,
+        x0,
+        sensor=(0.1, 10.0),
+        pumps={"low": low, "high": high, "pulse": 1.0, "initial": u0},
     )
 
 

@@ -15,13 +15,9 @@ from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Case, Free, Scenario
 from jaxtank.controllers import LQI, FuzzyBlend, SlidingMode, StateFeedback
 from jaxtank.core.clock import Clock
-from jaxtank.core.tree import number, with_values
-from jaxtank.instruments.actuators import PumpBank
-from jaxtank.instruments.sensors import LevelSensor
-from jaxtank.loop.closed_loop import ClosedLoop
-from jaxtank.observers import Direct
+from jaxtank.core.tree import with_values
 from jaxtank.plants import quadruple_tank
-from jaxtank.presets.paper import Claim, Preset, printed
+from jaxtank.presets.paper import Claim, Preset, closed_loop, printed
 from jaxtank.signals.setpoints import ramps
 
 SETPOINT = (12.0, 12.0)  # Fig. 6 [cm]
@@ -47,35 +43,24 @@ def plant(split=SPLIT):
 
 def sliding(model, printed=False):
     """Return the sliding-mode controller: as printed (sec. 6), or corrected (notes S4.4)."""
-    values = (10.0, 1.0, 0.1) if printed else (0.05, 0.03, 0.1)
-    surface, ks, phi = (number(v) for v in values)
-    form, switch = ("printed", "sign") if printed else ("corrected", "tanh")
-    return SlidingMode(model=model, surface=surface, ks=ks, phi=phi, form=form, switch=switch)
+    if printed:
+        return SlidingMode(
+            model=model, surface=10.0, ks=1.0, phi=0.1, form="printed", switch="sign"
+        )
+    return SlidingMode(model=model, surface=0.05, ks=0.03, phi=0.1, form="corrected", switch="tanh")
 
 
 def blend(model):
     """Return the fuzzy blend of the corrected sliding mode and the state feedback (notes S4.5)."""
-    return FuzzyBlend(
-        model=model,
-        K=number(GAIN),
-        surface=number(0.05),
-        ks=number(0.03),
-        phi=number(0.1),
-        b=number([1.0, 1.0]),
-        w=number([0.5, 0.5]),
-        low=number([0.0, 0.0]),
-        high=number([HIGH, HIGH]),
-    )
+    slide = {"surface": 0.05, "ks": 0.03, "phi": 0.1}
+    span = {"b": [1.0, 1.0], "w": [0.5, 0.5], "low": [0.0, 0.0], "high": [HIGH, HIGH]}
+    return FuzzyBlend(model=model, K=GAIN, **slide, **span)
 
 
 def integral(model):
     """Return the state feedback with integral action (notes S4.6)."""
-    return LQI(
-        model=model,
-        Q=number([1.0, 1.0, 0.0, 0.0, 1e-3, 1e-3]),
-        R=number([3.0, 3.0]),
-        operating_point=number(SETPOINT),
-    )
+    Q = [1.0, 1.0, 0.0, 0.0, 1e-3, 1e-3]
+    return LQI(model=model, Q=Q, R=[3.0, 3.0], operating_point=SETPOINT)
 
 
 # the printed controller as a relay: ks 100 hides its chatter
@@ -103,7 +88,7 @@ TUNABLE = {
 
 
 CONTROLLERS = {  # title, controller for a model, what `tune` changes
-    "sfc": ("state feedback", lambda m: StateFeedback(model=m, K=number(GAIN)), ("controller.K",)),
+    "sfc": ("state feedback", lambda m: StateFeedback(model=m, K=GAIN), ("controller.K",)),
     "smc": ("sliding mode, corrected", sliding, SLIDING),
     "hybrid": (
         "fuzzy blend of sliding mode and state feedback",
@@ -171,24 +156,14 @@ def build(kind, warm=False):
     """Return the closed loop of a controller, from empty tanks or the steady state at WARM."""
     rig = plant()
     x0, u0 = equilibrium(rig, WARM) if warm else ((0.0,) * 4, (0.0,) * 2)
-    return ClosedLoop(
-        plant=rig,
-        sensor=LevelSensor(gain=number([6.0] * 4), noise=number([0.0] * 4), full_scale=number(5.0)),
-        observer=Direct(),
-        controller=CONTROLLERS[kind][1](rig),
-        actuator=PumpBank(
-            low=number([0.0] * 2),
-            high=number([HIGH] * 2),
-            stop=number([0.0] * 2),
-            pulse=number([HIGH] * 2),
-            initial=number(u0),
-        ),
-        reference=ramps(
-            WARM if warm else (0.0, 0.0),
-            [(0.0, i, level) for i, level in enumerate(SETPOINT)],
-            ramp=0.0,
-        ),
-        x0=number(x0),
+    steps = [(0.0, i, level) for i, level in enumerate(SETPOINT)]
+    return closed_loop(
+        rig,
+        CONTROLLERS[kind][1](rig),
+        ramps(WARM if warm else (0.0, 0.0), steps, ramp=0.0),
+        x0,
+        sensor=(6.0, 5.0),
+        pumps={"low": 0.0, "high": HIGH, "initial": u0},
     )
 
 

@@ -10,6 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxtank.case import Case, Free
+from jaxtank.core.tree import number
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.observers import Direct
 
 
 class Published(NamedTuple):
@@ -138,6 +143,28 @@ class Preset:
         It is notes/<paper>.md beside the file that defines `measured`. Messages name its sections.
         """
         return Path(inspect.getfile(self.measured)).with_name("notes") / f"{self.paper}.md"
+
+
+def closed_loop(plant: Any, controller: Any, reference: Any, x0: Any, **parts: Any) -> ClosedLoop:
+    """Return the loop of a paper, with sensors without noise."""
+    # sensor: (level per volt, full scale [V]); pumps: {field of PumpBank: one number, or one for
+    # each pump}; the other parts are those of ClosedLoop.
+    scale, full_scale = parts.pop("sensor")
+    each = lambda count, value: np.array(np.broadcast_to(number(value), (count,)))
+    pumps = {
+        name: value if isinstance(value, str) else each(plant.pumps, value)
+        for name, value in parts.pop("pumps").items()
+    }
+    gain = each(plant.tanks, scale)
+    return ClosedLoop(
+        plant=plant,
+        sensor=LevelSensor(gain=gain, noise=np.zeros(plant.tanks), full_scale=full_scale),
+        controller=controller,
+        actuator=PumpBank(**pumps),
+        reference=reference,
+        x0=number(x0),
+        **{"observer": Direct(), **parts},
+    )
 
 
 def printed(paper: str) -> dict[str, Any]:

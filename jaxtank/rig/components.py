@@ -18,15 +18,16 @@ from jaxtank.loop.steady import steady_state
 from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman, Observer
 from jaxtank.plants.hydraulics import in_unit
 from jaxtank.rig.entry import read_entry, sizes_of
-from jaxtank.rig.schema import KIND, NEEDED, OPEN_LOOP, Key, Section, type_of
+from jaxtank.rig.schema import NEEDED, OPEN_LOOP, Key, Section, type_of
 from jaxtank.rig.signals import ramp_values, ramps_of
 from jaxtank.signals.setpoints import Ramps, ramps
 
 
 class Role(NamedTuple):
-    """A section: field of the loop, abstract class, {kind: class}, fields it may leave out."""
+    """A part of the loop: abstract class, {kind: class}, fields that its section may leave out, and
+    the class that needs no section.
+    """
 
-    field: str
     base: type
     classes: dict
     kept: tuple = ()
@@ -35,7 +36,6 @@ class Role(NamedTuple):
 
 ROLES = {
     "controller": Role(
-        "controller",
         controllers.Controller,
         {
             "pid": controllers.PID,
@@ -53,7 +53,6 @@ ROLES = {
         },
     ),
     "observer": Role(
-        "observer",
         Observer,
         {
             "direct": Direct,
@@ -62,12 +61,10 @@ ROLES = {
             "extended-kalman": ExtendedKalman,
         },
     ),
-    "sensor": Role("sensor", Sensor, {"level": LevelSensor}, ("noise",), LevelSensor),
-    "actuator": Role(
-        "actuator", Actuator, {"pumps": PumpBank}, ("low", "high", "initial"), PumpBank
-    ),
+    "sensor": Role(Sensor, {"level": LevelSensor}, ("noise",), LevelSensor),
+    "actuator": Role(Actuator, {"pumps": PumpBank}, ("low", "high", "initial"), PumpBank),
 }
-"""{section: Role}; `register` adds classes."""
+"""{section, which is also the field of the loop: Role}; `register` adds classes."""
 
 REGISTERED: set[str] = set()
 """Kinds that were added by `register`."""
@@ -80,7 +77,7 @@ _FIELDS = (bool, int, float, str, tuple)
 
 
 def register(kind: str, cls: type) -> type:
-    """Give a controller, observer, sensor or actuator of one's own a name in rig files.
+    """Give a controller, observer, sensor or actuator of yours a name in rig files.
 
     `kind = "..."` of [controller] (a controller), [observer], [sensor] or [actuator] then makes a
     component of the class. Its leaves and static fields are keys of the table; a field `model` is
@@ -125,7 +122,7 @@ def register(kind: str, cls: type) -> type:
     if not (isinstance(kind, str) and _KIND.fullmatch(kind)):
         allowed = 'a text of letters, digits, "-", "_" and "."'
         raise InputError(f"kind = {shortened(kind)}: must be {allowed}")
-    known = _checked(cls)
+    known = _classes_of(cls)
     taken = next((r.classes[kind] for r in ROLES.values() if kind in r.classes), None)
     if taken not in (None, cls):
         raise InputError(f"kind {kind!r} is taken, by {taken.__name__}: choose another name")
@@ -146,28 +143,19 @@ def _kinds(role, kind):
     return role.classes | points
 
 
-def _checked(cls):
+def _classes_of(cls):
     """The {kind: class} of the role of `cls`; InputError for what a rig file cannot describe."""
     name = getattr(cls, "__name__", shortened(cls))
-    known = _table_of(cls)
-    if known is None or "__dataclass_fields__" not in vars(cls) or inspect.isabstract(cls):
-        wanted = (
-            "a class of Controller, Observer, Sensor or Actuator with its own step, made by"
-            " jaxtank.component"
+    roles = [r for r in ROLES.values() if isinstance(cls, type) and issubclass(cls, r.base)]
+    if not roles or "__dataclass_fields__" not in vars(cls) or inspect.isabstract(cls):
+        raise InputError(
+            f"{name} is no component: it must be a class of Controller, Observer, Sensor or"
+            " Actuator with its own step, made by jaxtank.component"
         )
-        raise InputError(f"{name} is no component: it must be {wanted}")
     for field in dataclasses.fields(cls):
-        why = _unwritable(field)
-        if why:
+        if why := _unwritable(field):
             raise InputError(f"{name}.{field.name}: {why}")
-    return known
-
-
-def _table_of(cls):
-    """The {kind: class} of the role of `cls`; None of what has no role."""
-    if not isinstance(cls, type):
-        return None
-    return next((r.classes for r in ROLES.values() if issubclass(cls, r.base)), None)
+    return roles[0].classes
 
 
 def _unwritable(field):
@@ -186,46 +174,41 @@ def _unwritable(field):
 USUAL = {"Tt": 30.0, "spread": 0.0}
 """Defaults of fields that a rig file may leave out."""
 
-FLOORS = {"level_floor": 0.01, "difference_floor": 0.01}
-"""Defaults in centimetres [cm], converted to the rig's unit of length."""
+LOWER_LIMITS = {"level_floor": 0.01, "difference_floor": 0.01}
+"""Such defaults in centimetres [cm], converted to the rig's unit of length."""
 
 
 def section_of(name, kind, units=DEFAULT):
     """Return the Section of a kind of component: the leaves and static fields of its class."""
-    known = ROLES[name].classes
-    first = dataclasses.replace(KIND, doc=f"one of {', '.join(known)}")
-    if known[kind] is controllers.OpenLoop:
+    classes = ROLES[name].classes
+    cls, first = classes[kind], Key("kind", f"one of {', '.join(classes)}", "any")
+    if cls is controllers.OpenLoop:
         return Section(name, (first, *OPEN_LOOP[1:]))
-    keys = [_key(known[kind], f, kind in REGISTERED, units) for f in _settable(known[kind])]
-    return Section(name, (first, *keys))
+    settable = (f for f in dataclasses.fields(cls) if f.metadata.get("kind") in ("leaf", "static"))
+    return Section(name, (first, *(_key(cls, f, kind, units) for f in settable)))
 
 
-def _settable(cls):
-    return [f for f in dataclasses.fields(cls) if f.metadata.get("kind") in ("leaf", "static")]
-
-
-def _key(cls, field, own, units):
-    """The Key of a field; own: a class of the user's, without defaults of ours."""
+def _key(cls, field, kind, units):
+    """The Key of a field of a class; a registered class has no defaults of ours."""
     default = NEEDED if field.default is dataclasses.MISSING else None
-    if field.name in USUAL and not own:
-        default = USUAL[field.name]
-    if field.name in FLOORS and not own:
-        default = in_unit(FLOORS[field.name], units[0])
+    if kind not in REGISTERED:
+        default = USUAL.get(field.name, default)
+        if field.name in LOWER_LIMITS:
+            default = in_unit(LOWER_LIMITS[field.name], units[0])
     changes = {}
     if field.metadata["kind"] == "leaf":
         changes["kind"] = "array" if field.metadata["shape"] else "scalar"
     doc = field.metadata["doc"].replace("counted from 0", "counted from 1")  # as a file has tanks
-    return Key.of(cls, field.name, doc, default=default, **changes)
+    return Key.of(cls, field.name, doc=doc, default=default, **changes)
 
 
 def controller_of(table, loop, bias=None):
     """Return the controller of a [controller] table."""
     if isinstance(table, dict) and table.get("kind") == "open-loop":
         start = ramps(np.asarray(loop.actuator.initial).tolist(), [], ramp=0.0)
-        section = section_of("controller", "open-loop")
-        return controllers.OpenLoop(
-            signal=ramps_of(section, table, start, ("pump", "input"), sizes_of(loop.plant))
-        )
+        section, sizes = section_of("controller", "open-loop"), sizes_of(loop.plant)
+        signal = ramps_of(section, table, start, ("pump", "input"), sizes)
+        return controllers.OpenLoop(signal=signal)
     bias = steady_bias(loop) if bias is None else bias
     return component("controller", table, model_of(loop), {"bias": bias})
 
@@ -250,12 +233,12 @@ def model_of(loop):
 def instrument_of(name, table, loop):
     """Return the sensor or actuator of a table; `kept` fields that it leaves out are the loop's."""
     role = ROLES[name]
-    own = {key: getattr(getattr(loop, role.field), key) for key in role.kept}
-    return component(name, table, loop.plant, own)
+    offered = {key: getattr(getattr(loop, name), key) for key in role.kept}
+    return component(name, table, loop.plant, offered)
 
 
 def component(name, table, plant, offered):
-    """Return the component of a table: kind, then the fields of its class."""
+    """Return the component of a table: kind, then the fields of its class, by default `offered`."""
     role = ROLES[name]
     if not isinstance(table, dict):
         raise InputError(f"[{name}]: must be a table")
@@ -265,15 +248,12 @@ def component(name, table, plant, offered):
     kinds = _kinds(role, kind) if isinstance(kind, str) else role.classes
     if not isinstance(kind, str) or kind not in role.classes:
         raise unknown(f"{name} kind", str(kind), kinds)
-    section = section_of(name, kind, plant.units)
-    offered = {} if kind in REGISTERED and not role.kept else offered
-    usual = {key: value for key, value in offered.items() if key in section.names}
-    title = f"{section.title} {kind}"
-    values = read_entry(section, {**usual, **table}, sizes_of(plant), title=title)
+    section, cls = section_of(name, kind, plant.units), role.classes[kind]
+    if kind not in REGISTERED or role.kept:
+        table = {**{k: v for k, v in offered.items() if k in section.names}, **table}
+    values = read_entry(section, table, sizes_of(plant), title=f"{section.title} {kind}")
     del values["kind"]
-    if "model" in {field.name for field in dataclasses.fields(role.classes[kind])}:
-        values["model"] = plant
-    return role.classes[kind](**values)
+    return cls(**values, **({"model": plant} if "model" in cls.__dataclass_fields__ else {}))
 
 
 def steady_bias(loop, known: bool | list[bool] = False):
@@ -300,12 +280,7 @@ def kind_of(name, part):
 
 def has_section(name, part):
     """Whether a part needs a section: [values] set the fields of LevelSensor and PumpBank."""
-    return ROLES[name].default is None or type(part) is not ROLES[name].default
-
-
-def is_written(name, part):
-    """Whether a section of a rig file can describe a part of the loop."""
-    return has_section(name, part) and kind_of(name, part) is not None
+    return type(part) is not ROLES[name].default
 
 
 def values_of(name, part):
@@ -320,7 +295,7 @@ def values_of(name, part):
         return section, {"kind": kind, **ramp_values(part.signal)}
     values = {key.name: getattr(part, key.name) for key in section.keys[1:]}
     for key in section.keys:
-        value = values.get(key.name)
-        if key.kind == "tanks" and not all(type(i) is int for i in value or ()):
-            raise InputError(f"its {cls}.{key.name} = {shortened(value)} is no list of tanks")
+        tanks = values.get(key.name)
+        if key.kind == "tanks" and not all(type(i) is int for i in tanks or ()):
+            raise InputError(f"its {cls}.{key.name} = {shortened(tanks)} is no list of tanks")
     return section, {"kind": kind, **values}

@@ -10,7 +10,7 @@ from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import number, sizes_of_shape
 from jaxtank.core.units import DEFAULT
-from jaxtank.rig.schema import NEEDED, Section
+from jaxtank.rig.schema import NEEDED, PARTS, Section
 
 LARGEST = 1e300
 """Magnitude of a number of a rig file: products of two stay finite for most."""
@@ -42,20 +42,20 @@ def read_entry(
     """Return the values of a table of a rig file, checked key by key against its section."""
     where = section.name if index is None else f"{section.name} {index + 1}"
     if not isinstance(table, Mapping):
-        raise InputError(f"{where} = {shortened(table)}: must be a table")
+        raise refusal(where, table, "be a table")
     for key in table:
         if key not in section.names:
             raise _unknown(section, where, key)
-    found = {}
+    values = {}
     for key in section.keys:
         value = table.get(key.name, None if key.default is NEEDED else key.default)
         if key.name in table or value is not None:
             label = f"{where}: {key.name}" if section.many else f"{where}.{key.name}"
-            found[key.name] = read_value(key, label, value, sizes)
+            values[key.name] = read_value(key, label, value, sizes)
         elif key.default is NEEDED:
             label = where if section.many else title or section.title
             raise InputError(f"{label} needs {key.name}{unit(key.meta(sizes.units))}: {key.doc}")
-    return found
+    return values
 
 
 def read_entries(section, table: Mapping[str, Any], sizes: Sizes) -> list[dict[str, Any]]:
@@ -65,71 +65,64 @@ def read_entries(section, table: Mapping[str, Any], sizes: Sizes) -> list[dict[s
 
 def _unknown(section, where, key):
     """The InputError for a key that a section does not have."""
-    part, owner = section.elsewhere or ("", None)
+    owner = PARTS.get(section.elsewhere)
     if key in getattr(owner, "__dataclass_fields__", ()):
         return InputError(
-            f'{where}: {key} is not a key of {section.title}: it is "{part}.{key}" in [values],'
-            " for all of them at once"
+            f"{where}: {key} is not a key of {section.title}: it is"
+            f' "{section.elsewhere}.{key}" in [values], for all of them at once'
         )
     return unknown(f"key of {section.title}", key, section.names)
 
 
+def refusal(label: str, value: Any, must: str) -> InputError:
+    """Return the InputError for a value that must be something else."""
+    return InputError(f"{label} = {shortened(value)}: must {must}")
+
+
 def read_value(key, label: str, value: Any, sizes: Sizes) -> Any:
-    """Return the value of a key, as `READ` of its kind has it; `label` names it in errors."""
+    """Return the value of a key, checked by its kind; `label` names it in errors."""
     return READ[key.kind](key, label, value, sizes)
 
 
-def written(key, value: Any) -> Any:
-    """Return a value as a rig file has it: tanks counted from 1, arrays as lists."""
-    if value is None or isinstance(value, (str, dict)):
-        return value
-    return WRITTEN.get(key.kind, lambda v: np.asarray(v).tolist())(value)
-
-
 def _number(key, label, value, sizes):
-    good = isinstance(value, (int, float)) and not isinstance(value, bool)
     meta = key.meta(sizes.units)
-    if not good or not is_numeric(value):
-        wanted = f"a finite number{unit(meta)}"
-        raise InputError(f"{label} = {shortened(value)}: must be {_within(wanted, meta)}")
+    if not is_plain(value):
+        raise refusal(label, value, f"be {_within(f'a finite number{unit(meta)}', meta)}")
     if LARGEST < abs(value) < float("inf"):
         raise InputError(f"{label} = {shortened(value)}{unit(meta)}: must be within +-{LARGEST:g}")
     check_value(label, float(value), meta)
     return float(value)
 
 
-def _within(wanted, meta):
-    return ", ".join(filter(None, [wanted, allowed({**meta, "choices": None})]))
+def _within(what, meta):
+    return ", ".join(filter(None, [what, allowed({**meta, "choices": None})]))
 
 
 def _integer(key, label, value, sizes):
-    number = isinstance(value, (int, float)) and not isinstance(value, bool) and is_numeric(value)
-    inside = number and (key.low is None or value >= key.low)
+    inside = is_plain(value) and (key.low is None or value >= key.low)
     inside = inside and (key.high is None or value <= key.high)
     if not (inside and float(value).is_integer()):
-        wanted = _within("a whole number", key.meta(sizes.units))
-        raise InputError(f"{label} = {shortened(value)}: must be {wanted}")
+        raise refusal(label, value, f"be {_within('a whole number', key.meta(sizes.units))}")
     return int(value)
 
 
 def _flag(key, label, value, sizes):
     if not isinstance(value, bool):
-        raise InputError(f"{label} = {shortened(value)}: must be true or false")
+        raise refusal(label, value, "be true or false")
     return value
 
 
 def _texts(key, label, value, sizes):
     if not (isinstance(value, list) and value and all(isinstance(v, str) for v in value)):
-        raise InputError(f"{label} = {shortened(value)}: must be a list of texts: {key.doc}")
+        raise refusal(label, value, f"be a list of texts: {key.doc}")
     return [name_of(label, text) for text in value]
 
 
 def _list(key, label, value, sizes):
-    wanted = sizes_of_shape(key.shape, sizes.counts) or ()
-    if not (is_finite(value) and np.shape(value) == wanted):
-        size = wanted[0] if wanted else 1
-        numbers = f"{size} finite numbers{unit(key.meta(sizes.units))}, one per {key.shape[0]}"
-        raise InputError(f"{label} = {shortened(value)}: must be a list of {numbers}")
+    shape = sizes_of_shape(key.shape, sizes.counts) or ()
+    if not (is_finite(value) and np.shape(value) == shape):
+        numbers = f"{shape[0] if shape else 1} finite numbers{unit(key.meta(sizes.units))}"
+        raise refusal(label, value, f"be a list of {numbers}, one per {key.shape[0]}")
     return number(value)
 
 
@@ -137,16 +130,15 @@ def _array(key, label, value, sizes):
     """An array; one number for an array of one entry per pump, tank or output fills it."""
     if not is_numeric(value):
         numbers = f"a number or a list of numbers{unit(key.meta(sizes.units))}"
-        raise InputError(f"{label} = {shortened(value)}: must be {numbers}")
-    array, wanted = number(value), sizes_of_shape(key.shape, sizes.counts) or ()
-    return np.full(wanted, array) if len(wanted) == 1 and array.ndim == 0 else array
+        raise refusal(label, value, f"be {numbers}")
+    array, shape = number(value), sizes_of_shape(key.shape, sizes.counts) or ()
+    return np.full(shape, array) if len(shape) == 1 and array.ndim == 0 else array
 
 
 def _scalar(key, label, value, sizes):
     array = _array(key, label, value, sizes)
     if array.ndim:
-        one = f"one number{unit(key.meta(sizes.units))}"
-        raise InputError(f"{label} = {shortened(value)}: must be {one}")
+        raise refusal(label, value, f"be one number{unit(key.meta(sizes.units))}")
     return array
 
 
@@ -157,47 +149,42 @@ def _tank(key, label, value, sizes):
             raise unknown(f"tank of {label}", value, sizes.names or ["1"])
         return sizes.names[value]
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= sizes.tanks:
-        raise InputError(
-            f"{label} = {shortened(value)}: must be a tank, by its name or its number, counted"
-            f" from 1 to {sizes.tanks}"
-        )
+        of = f"by its name or its number, counted from 1 to {sizes.tanks}"
+        raise refusal(label, value, f"be a tank, {of}")
     return value - 1
 
 
 def _tanks(key, label, value, sizes):
     if not isinstance(value, list):
-        raise InputError(
-            f"{label} = {shortened(value)}: must be a list of tanks, counted from 1 to"
-            f" {sizes.tanks}"
-        )
+        raise refusal(label, value, f"be a list of tanks, counted from 1 to {sizes.tanks}")
     return tuple(_tank(key, label, tank, sizes) for tank in value)
 
 
 def _pair(key, label, value, sizes):
     if not isinstance(value, list) or len(value) != 2:
-        raise InputError(f"{label} = {shortened(value)}: must name two tanks")
+        raise refusal(label, value, "name two tanks")
     return different(label, value, _tanks(key, label, value, sizes))
 
 
 def _feed(key, label, value, sizes):
-    """The one or two tanks that a pump fills, None in the place of a second."""
+    """(first, second) of the tanks that a pump fills, None for a second that is left out."""
     tanks = value if isinstance(value, list) else [value]
     if not 1 <= len(tanks) <= 2:
-        raise InputError(f"{label} = {shortened(value)}: must name one tank, or two")
-    found = different(label, value, _tanks(key, label, tanks, sizes))
-    return (*found, None) if len(found) == 1 else found
+        raise refusal(label, value, "name one tank, or two")
+    first, *second = different(label, value, _tanks(key, label, tanks, sizes))
+    return first, second[0] if second else None
 
 
 def different(label, value, tanks):
     """Return `tanks`; InputError, with `value` as the file has it, where one is given twice."""
     if len(set(tanks)) < len(tanks):
-        raise InputError(f"{label} = {shortened(value)}: must be two different tanks")
+        raise refusal(label, value, "be two different tanks")
     return tanks
 
 
 def _table(key, label, value, sizes):
     if not isinstance(value, dict):
-        raise InputError(f"{label} = {shortened(value)}: must be a table: {key.doc}")
+        raise refusal(label, value, f"be a table: {key.doc}")
     return value
 
 
@@ -220,23 +207,24 @@ READ = {
 }
 """{kind: function (key, label, value, sizes)} that reads and checks a value of a rig file."""
 
-_numbers = lambda tanks: [i + 1 for i in tanks if i is not None]
-WRITTEN = {
-    "any": lambda value: value,
-    "tank": lambda i: i + 1,
-    "tanks": _numbers,
-    "pair": _numbers,
-    "feed": lambda pair: pair[0] + 1 if pair[1] is None else _numbers(pair),
-}
-"""{kind: function of a value} that writes it as a rig file has it, where that is different."""
+
+def written(key, value: Any) -> Any:
+    """Return a value as a rig file has it: tanks counted from 1, arrays as lists."""
+    if value is None or isinstance(value, (str, dict)) or key.kind == "any":
+        return value
+    if key.kind == "tank":
+        return value + 1
+    if key.kind in ("tanks", "pair", "feed"):
+        tanks = [i + 1 for i in value if i is not None]
+        return tanks[0] if key.kind == "feed" and len(tanks) == 1 else tanks
+    return np.asarray(value).tolist()
 
 
 def name_of(where, value):
     """`value` if it can be a name: a text of one line without control characters."""
     if not isinstance(value, str) or not value.isprintable():
-        raise InputError(
-            f"{where} = {shortened(value)}: must be a text"
-            + " of printable characters" * isinstance(value, str)
+        raise refusal(
+            where, value, "be a text" + " of printable characters" * isinstance(value, str)
         )
     return value
 
@@ -262,25 +250,29 @@ def is_finite(value, ndim=None):
     return finite and ndim in (None, np.ndim(value))
 
 
+def is_plain(value):
+    """Whether a value is one number of Python that a float can hold."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and is_numeric(value)
+
+
 def plain(name, value):
     """`value` as a float; InputError, naming it `name`, unless it is a number."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not is_numeric(value):
-        raise InputError(f"{name} = {shortened(value)}: must be a number")
+    if not is_plain(value):
+        raise refusal(name, value, "be a number")
     return float(value)
 
 
 def static_value(name, value, meta, kind):
     """Return `value` for a static field of type `kind`; InputError for another, or out of range."""
-    if meta["choices"] is not None:
-        choices = meta["choices"]
+    if (choices := meta["choices"]) is not None:
         good = not isinstance(value, (list, dict)) and value in choices
         if not good or isinstance(value, bool) != (kind is bool):
-            named = ", ".join(str(c).lower() if isinstance(c, bool) else c for c in choices)
-            raise InputError(f"{name} = {shortened(value)}: must be one of {named}")
+            names = ", ".join(str(c).lower() if isinstance(c, bool) else c for c in choices)
+            raise refusal(name, value, f"be one of {names}")
         return value
     if kind is str:  # a text of which the component itself knows what it may be
         if not isinstance(value, str):
-            raise InputError(f"{name} = {shortened(value)}: must be a text")
+            raise refusal(name, value, "be a text")
         return value
     value = plain(name, value)
     check_value(name, value, meta)
@@ -344,8 +336,8 @@ def block_of(section: Section, values: Mapping[str, Any], units=DEFAULT) -> Bloc
 
 def suggestion(section: Section, values: Mapping[str, Any], units=DEFAULT) -> Block:
     """Return the Block of a section that could be in a file, commented out."""
-    given = {k.name: k.default for k in section.keys if isinstance(k.default, (int, float, str))}
-    lines = lines_of(section, {**given, **values}, units)
+    usual = {k.name: k.default for k in section.keys if isinstance(k.default, (int, float, str))}
+    lines = lines_of(section, {**usual, **values}, units)
     return Block(section.title, lines, (section.prose,), False)
 
 

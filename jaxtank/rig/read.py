@@ -1,7 +1,6 @@
 """From a rig file to a Case."""
 
 import dataclasses
-import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,7 +12,7 @@ from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.files import read_text
 from jaxtank.core.text import shortened
 from jaxtank.rig import components, network, signals, validation
-from jaxtank.rig.entry import Sizes, read_entry, read_value, sizes_of
+from jaxtank.rig.entry import Sizes, read_entry, read_value, refusal, sizes_of
 from jaxtank.rig.schema import SECTIONS, TANKWISE
 from jaxtank.rig.values import (
     by_dotted_name,
@@ -23,48 +22,6 @@ from jaxtank.rig.values import (
     with_bottom,
     with_models,
 )
-
-MOST = 100
-"""Parts of a dotted key; the names of a rig have four."""
-
-MOST_WORDS = 250_000
-"""Keys (each part of one), numbers (those with a point twice), texts, lists and tables of a file:
-it is parsed and checked in seconds.
-"""
-
-_PART = r"""(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]|\\[^\n])*+"|'[^'\n]*+')"""
-# Every alternative is possessive: nothing is read twice, whatever is left open. A value has two
-# such parts at most, those of a float.
-_TOKEN = re.compile(
-    r'''(?P<text>"""(?:[^"\\]|\\.|"{1,2}(?!"))*+"{3,5}|\'\'\'(?:[^']|'{1,2}(?!'))*+'{3,5})'''
-    rf"""|(?P<open>\"\"\"|''')|(?P<key>{_PART}(?:[ \t]*+\.[ \t]*+{_PART})*+)"""
-    r"""|(?P<quote>["'])|[\[{]|(?:\#[^\n]*+\s*+)++""",
-    re.DOTALL,
-)
-_ONE = re.compile(_PART)
-
-
-def check_keys(text):
-    """Raise InputError for a key of more than `MOST` dotted parts, and for a file of more than
-    `MOST_WORDS` words. Dots of numbers, texts and comments are none of a key's.
-    """
-    words = 0
-    for token in _TOKEN.finditer(text):
-        if token.lastgroup in ("open", "quote"):
-            return  # a text without an end: the parser gets no further either
-        parts = (
-            sum(1 for _ in _ONE.finditer(token.group()))
-            if token.lastgroup == "key" and "." in token.group()
-            else 1
-        )
-        if parts > MOST:
-            line = text.count("\n", 0, token.start()) + 1
-            raise InputError(
-                f"line {line}: a key of {parts} parts joined by dots: must be at most {MOST}"
-            )
-        words += parts
-        if words > MOST_WORDS:
-            raise InputError(f"has more than {MOST_WORDS} keys and values")
 
 
 def open_case(name: str) -> Case:
@@ -128,10 +85,6 @@ def loads(text: str, words: str = "rig file") -> Case:
     400.0
     """
     try:
-        check_keys(text)
-    except InputError as error:
-        raise InputError(f"{words}: {error}") from None
-    try:
         # a byte-order mark, as some editors write
         table = tomllib.loads(text.removeprefix("\ufeff"))
     except tomllib.TOMLDecodeError as error:
@@ -155,15 +108,14 @@ def from_table(table: Mapping[str, Any]) -> Case:
     """Return the Case of a table of the form of a rig file, {key or section: value}, checked."""
     table = renamed(table)
     case = start_of(table)
-    dotted = ("values", "free", "uncertain")
-    named = {key: by_dotted_name(table[key], key) for key in dotted if key in table}
-    table = {**table, **named}
+    dotted = [key for key in ("values", "free", "uncertain") if key in table]
+    table = {**table, **{key: by_dotted_name(table[key], key) for key in dotted}}
     values = with_models(case.loop, table.get("values", {}))
     case, values = _with_bias(case, values, table)
     case = set_and_schedule(case, values, table.get("schedule", {}))
-    for name, read in TUNING.items():
+    for name, (field, read) in TUNING.items():
         if name in table:
-            case = case.replace(**{FIELDS.get(name, name): read(case, table[name])})
+            case = case.replace(**{field: read(case, table[name])})
     if "bottom" not in table.get("plant", {}) and "plant.bottom" not in values:
         case = with_bottom(case)
     return filtered(validation.check(case))
@@ -194,49 +146,44 @@ def filtered(case: Case, on: bool | None = None, changes: Mapping[str, Any] | No
     return case.with_safety_filter(**{**(case.safety or {}), **changes})
 
 
-TUNING = {
-    "limits": lambda case, table: validation.check_limits(case.loop, table),
-    "objective": lambda case, table: validation.check_objective(table),
-    "free": lambda case, table: validation.free_of(case.loop, table),
-    "uncertain": lambda case, table: validation.check_uncertain(case.loop, table),
-    "covariance": lambda case, table: validation.check_covariance(case.loop, table),
-    "log": lambda case, table: validation.check_log(case.loop.plant, table),
-    "safety_filter": lambda case, table: read_entry(
-        SECTIONS["safety_filter"], table, sizes_of(case.loop.plant)
-    ),
-    "scenario": lambda case, table: tuple(
-        validation.scenario(case, entry, i) for i, entry in enumerate(table)
-    ),
-}
-"""{section: function (case, its table)} of what is read after the values are set."""
+def _filter_settings(case, table):
+    return read_entry(SECTIONS["safety_filter"], table, sizes_of(case.loop.plant))
 
-FIELDS = {"scenario": "scenarios", "safety_filter": "safety"}
-"""{section: field of Case}, where it has another name."""
+
+TUNING = {
+    "limits": ("limits", lambda case, table: validation.check_limits(case.loop, table)),
+    "objective": ("objective", lambda case, table: validation.check_objective(table)),
+    "free": ("free", lambda case, table: validation.free_of(case.loop, table)),
+    "uncertain": ("uncertain", lambda case, table: validation.check_uncertain(case.loop, table)),
+    "covariance": ("covariance", lambda case, table: validation.check_covariance(case.loop, table)),
+    "log": ("log", lambda case, table: validation.check_log(case.loop.plant, table)),
+    "safety_filter": ("safety", _filter_settings),
+    "scenario": ("scenarios", validation.scenarios_of),
+}
+"""{section: (field of Case, function of a case and the section's table)}, read after the values."""
 
 
 def _check_twice(table):
     """Raise InputError for numbers of tanks and pumps that their own tables and the section of what
     they belong to, [disturbance], [sensor] or [actuator], give differently; all at once.
     """
-    wrong = []
+    problems = []
     for name in ("tank", "pump"):
         entries = table.get(name, [])
         for key in SECTIONS[name].keys:
             section, _, field = key.target.partition(".")
             field = "inflow" if section == "disturbance" else field
-            if field not in table.get(section, {}):
-                continue
-            whole = table[section][field]
-            each = isinstance(whole, list) and len(whole) == len(entries)
-            for i, entry in enumerate(entries):
-                other = whole[i] if each else whole
+            whole = table.get(section, {}).get(field)
+            each = whole if isinstance(whole, list) and len(whole) == len(entries) else None
+            for i, entry in enumerate(entries if whole is not None else ()):
+                other = whole if each is None else each[i]
                 if key.name in entry and entry[key.name] != other:
-                    wrong.append(
+                    problems.append(
                         f"{name} {i + 1}: {key.name} = {shortened(entry[key.name])}, and"
                         f" [{section}] {field} has {shortened(other)} for it: give one of them"
                     )
-    if wrong:
-        raise InputError("; ".join(wrong))
+    if problems:
+        raise InputError("; ".join(problems))
 
 
 def start_of(table):
@@ -244,43 +191,46 @@ def start_of(table):
     instruments, reference, disturbance and faults; before any value is set.
     """
     top = _top(table)
-    case = (
-        _with_parts(presets.find(table["case"]), table) if "case" in table else network.build(table)
-    )
-    loop, changed = case.loop, {}
+    if "case" in top:
+        case = _with_parts(presets.find(top.pop("case")), table)
+    else:
+        case = network.build(table)
+    loop, changes = case.loop, {}
     _check_twice(table)
     for name in ("sensor", "actuator"):
         if name in table:
-            changed[name] = components.instrument_of(name, table[name], loop)
+            changes[name] = components.instrument_of(name, table[name], loop)
     if "reference" in table:
-        changed["reference"] = signals.reference_of(table["reference"], loop.reference, loop.plant)
+        changes["reference"] = signals.reference_of(table["reference"], loop.reference, loop.plant)
     if "disturbance" in table or "inflow" in table:
-        names = network.names_in(table)
-        changed["disturbance"] = signals.disturbance_of(table, loop, names)
+        changes["disturbance"] = signals.disturbance_of(table, loop, network.names_in(table))
     if "fault" in table:
-        changed["faults"] = signals.faults_of(table["fault"], loop.plant)
-    if changed:
-        case = case.replace(loop=dataclasses.replace(loop, **changed))
-    own = {key: top[key] for key in top if key not in ("case", "units")}
-    return case.replace(**own)
+        changes["faults"] = signals.faults_of(table["fault"], loop.plant)
+    top.pop("units", None)
+    return case.replace(loop=dataclasses.replace(loop, **changes), **top)
 
 
 def _top(table):
     """The values at the top of a rig file; InputError for a section or key that is unknown or of
     another kind, and unless there is either a case or a tank.
     """
-    _check_sections(table)
     first = SECTIONS[""]
-    top = {
-        k.name: read_value(k, k.name, table[k.name], Sizes(0))
-        for k in first.keys
-        if k.name in table
-    }
-    given = [name for name in TANKWISE if name in table]
-    if "case" in table and given:
+    sections = {n: section for n, section in SECTIONS.items() if n and "." not in n}
+    for name, value in table.items():
+        if name in first.names:
+            continue
+        if name not in sections:
+            raise unknown("key", name, [*first.names, *sections])
+        many = sections[name].many
+        if not isinstance(value, list if many else dict):
+            raise refusal(name, value, f"be a list of tables, [[{name}]]" if many else "be a table")
+    keys = [key for key in first.keys if key.name in table]
+    top = {key.name: read_value(key, key.name, table[key.name], Sizes(0)) for key in keys}
+    tables = [name for name in TANKWISE if name in table]
+    if "case" in table and tables:
         raise InputError(
-            f"{given[0]}: a rig file is either a case or a rig described tank by tank: leave out"
-            f" case, or [{given[0]}]"
+            f"{tables[0]}: a rig file is either a case or a rig described tank by tank: leave out"
+            f" case, or [{tables[0]}]"
         )
     if "case" not in table and "tank" not in table:
         raise InputError(
@@ -290,35 +240,21 @@ def _top(table):
     return top
 
 
-def _check_sections(table):
-    """Raise InputError for a key at the top that is unknown, and for one that is no table."""
-    sections = {name: section for name, section in SECTIONS.items() if name and "." not in name}
-    for key, value in table.items():
-        if key in SECTIONS[""].names:
-            continue
-        if key not in sections:
-            raise unknown("key", key, [*SECTIONS[""].names, *sections])
-        many = sections[key].many
-        if not isinstance(value, list if many else dict):
-            words = f"a list of tables, [[{key}]]" if many else "a table"
-            raise InputError(f"{key} = {shortened(value)}: must be {words}")
-
-
 def _with_parts(case, table):
     """A case whose controller or observer is replaced by that of a table."""
-    loop, changed = case.loop, []
+    loop, replaced = case.loop, []
     if "controller" in table:
         controller = components.controller_of(table["controller"], loop, loop.actuator.initial)
         if type(controller) is not type(loop.controller):
             case = case.replace(symmetry=None)
         loop = dataclasses.replace(loop, controller=controller)
-        changed.append("controller.")
+        replaced.append("controller.")
     if "observer" in table:
         observer = components.observer_of(table["observer"], loop)
         loop = dataclasses.replace(loop, observer=observer)
-        changed.append("observer.")
-    kept = lambda name: not name.startswith(tuple(changed)) or has(loop, name)
-    return case.replace(loop=loop, free={n: f for n, f in case.free.items() if kept(n)})
+        replaced.append("observer.")
+    free = {n: f for n, f in case.free.items() if not n.startswith(tuple(replaced)) or has(loop, n)}
+    return case.replace(loop=loop, free=free)
 
 
 def _with_bias(case, values, table):
@@ -331,9 +267,7 @@ def _with_bias(case, values, table):
     name, pumps = "actuator.initial", table.get("pump", [{}] * case.loop.plant.pumps)
     whole = "initial" in table.get("actuator", {}) or name in values
     known = [whole or "initial" in pump or f"{name}[{j}]" in values for j, pump in enumerate(pumps)]
-    bias = components.steady_bias(case.loop, known)
     controller: Any = case.loop.controller
-    controller = dataclasses.replace(controller, bias=bias)
-    loop = dataclasses.replace(case.loop, controller=controller)
+    controller = dataclasses.replace(controller, bias=components.steady_bias(case.loop, known))
     later = {n: v for n, v in values.items() if not n.startswith(parts)}
-    return case.replace(loop=loop), later
+    return case.replace(loop=dataclasses.replace(case.loop, controller=controller)), later

@@ -10,7 +10,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import number
 from jaxtank.plants.faults import faults
-from jaxtank.rig.entry import is_finite, read_entries, read_entry, sizes_of, written
+from jaxtank.rig.entry import is_finite, read_entries, read_entry, refusal, sizes_of, written
 from jaxtank.rig.schema import SECTIONS
 from jaxtank.signals.base import Constant, Sum
 from jaxtank.signals.inflows import InflowPulses, inflow_pulses
@@ -21,12 +21,8 @@ COURSE = ("ramp", "shape", "band", "filter")
 
 def steps(reference):
     """Return the `Ramps` of a reference that [reference] can describe; None of another."""
-    if (
-        isinstance(reference, Sum)
-        and isinstance(reference.first, Ramps)
-        and isinstance(reference.second, Sine)
-    ):
-        return reference.first
+    if isinstance(reference, Sum) and isinstance(reference.second, Sine):
+        reference = reference.first
     return reference if isinstance(reference, Ramps) else None
 
 
@@ -35,19 +31,22 @@ def reference_of(table, old, plant):
     start, sizes = steps(old), sizes_of(plant)
     if start is None:
         raise InputError("[reference] is for cases whose reference is made of ramps")
-    found = ramps_of(SECTIONS["reference"], table, start, ("output", "level"), sizes)
+    first = ramps_of(SECTIONS["reference"], table, start, ("output", "level"), sizes)
     sine = old.second if isinstance(old, Sum) else None
     if "sine" in table:
         sine = _sine(table["sine"], sine, sizes)
-    return found if sine is None else Sum(first=found, second=sine)
+    return first if sine is None else Sum(first=first, second=sine)
+
+
+def _over(section, values, table):
+    """A table with what it leaves out from {key: value}."""
+    old = {k.name: written(k, values[k.name]) for k in section.keys if k.name in values}
+    return {**{name: value for name, value in old.items() if value is not None}, **table}
 
 
 def ramps_of(section, table, old, words, sizes):
     """Return the Ramps of a table; what it leaves out is as in `old`. words: channel and value."""
-    own, known = {k.name: k for k in section.keys}, ramp_values(old)
-    given = {name: v for name, v in known.items() if name in own and v is not None}
-    start = {name: written(own[name], value) for name, value in given.items()}
-    values = read_entry(section, {**start, **table}, sizes)
+    values = read_entry(section, _over(section, ramp_values(old), table), sizes)
     changes = _changes(f"{section.name}.changes", values["changes"], words, np.size(old.initial))
     course = {name: values.get(name, getattr(old, name)) for name in COURSE}
     return ramps(values["initial"].tolist(), changes, **course)
@@ -57,48 +56,46 @@ def _changes(label, changes, words, channels):
     """[(time [s], channel from 0, value)] of a list as in a file, in order of time."""
     form = f"[time [s], {words[0]} from 1 to {channels}, {words[1]}]"
     if not isinstance(changes, list):
-        raise InputError(f"{label} = {shortened(changes)}: must be a list of {form}")
+        raise refusal(label, changes, f"be a list of {form}")
     for change in changes:
         good = isinstance(change, list) and len(change) == 3
         good = good and all(np.ndim(v) == 0 and is_finite(v) for v in change)
         if not (good and isinstance(change[1], int) and 1 <= change[1] <= channels):
             raise InputError(f"{label} has {shortened(change)}: must be {form}, finite numbers")
-    for before, after in zip(changes, changes[1:]):
-        if after[0] < before[0]:
+    known = set()
+    for i, (time, channel, _) in enumerate(changes):
+        if i and time < changes[i - 1][0]:
             raise InputError(
-                f"{label} has {shortened(after)} after {shortened(before)}: must be in order of"
-                " time"
+                f"{label} has {shortened(changes[i])} after {shortened(changes[i - 1])}: must be in"
+                " order of time"
             )
-    taken = set()
-    for time, channel, _ in changes:
-        if (time, channel) in taken:
+        if (time, channel) in known:
             raise InputError(
                 f"{label} has two changes of {words[0]} {channel} at {time:g} s: must be one"
             )
-        taken.add((time, channel))
+        known.add((time, channel))
     return [(float(t), i - 1, float(v)) for t, i, v in changes]
 
 
 def ramp_values(signal):
     """{key: value} of a Ramps; changes as in a file, [[time [s], channel from 1, value], ...]."""
     changes = zip(signal.changes, np.asarray(signal.targets))
-    own = {name: getattr(signal, name) for name in ("initial", *COURSE)}
-    own["ramp"] = float(signal.ramp)
-    return {**own, "changes": [[t, i + 1, float(v)] for (t, i), v in changes]}
+    values = {name: getattr(signal, name) for name in ("initial", *COURSE)}
+    values["ramp"] = float(signal.ramp)
+    return {**values, "changes": [[t, i + 1, float(v)] for (t, i), v in changes]}
 
 
 def _sine(table, old, sizes):
     """The Sine of a [reference.sine] table, None of an empty one."""
     section = SECTIONS["reference.sine"]
-    if isinstance(table, dict) and not table:
-        return None
-    own = {k.name: written(k, sine_values(old)[k.name]) for k in section.keys} if old else {}
-    values = read_entry(section, {**own, **table} if isinstance(table, dict) else table, sizes)
+    if isinstance(table, dict):
+        if not table:
+            return None
+        table = _over(section, sine_values(old) if old else {}, table)
+    values = read_entry(section, table, sizes)
     output = values.pop("output")
     if output > sizes.outputs:
-        raise InputError(
-            f"reference.sine.output = {output}: must be an output, from 1 to {sizes.outputs}"
-        )
+        raise refusal("reference.sine.output", output, f"be an output, from 1 to {sizes.outputs}")
     leaves = {key: number(values.pop(key)) for key in ("amplitude", "offset")}
     return Sine(**leaves, **values, channel=output - 1, width=sizes.outputs)
 
@@ -112,22 +109,23 @@ def sine_values(sine):
 
 def disturbance_of(table, loop, names):
     """What [disturbance] and [[inflow]] of a rig file make of a loop's disturbance."""
-    old, sizes = loop.disturbance, sizes_of(loop.plant, names)
-    more = read_entry(SECTIONS["disturbance"], table.get("disturbance", {}), sizes)
-    if "inflow" in more:
+    disturbance, sizes = loop.disturbance, sizes_of(loop.plant, names)
+    values = read_entry(SECTIONS["disturbance"], table.get("disturbance", {}), sizes)
+    if "inflow" in values:
         if table.get("inflow"):
             raise InputError("[disturbance] inflow and [[inflow]]: give one of them")
-        old = Constant(level=more["inflow"])
+        disturbance = Constant(level=values["inflow"])
     if "inflow" in table:
-        old = _pulses(read_entries(SECTIONS["inflow"], table, sizes), old, loop.plant.tanks)
-    if "window" in more:
-        if not isinstance(old, InflowPulses):
+        entries = read_entries(SECTIONS["inflow"], table, sizes)
+        disturbance = _pulses(entries, disturbance, loop.plant.tanks)
+    if "window" in values:
+        if not isinstance(disturbance, InflowPulses):
             raise InputError(
-                f"disturbance.window = {more['window']:g} s: is how long tanks are watched after a"
-                " [[inflow]], and there is none: leave it out"
+                f"disturbance.window = {values['window']:g} s: is how long tanks are watched after"
+                " a [[inflow]], and there is none: leave it out"
             )
-        old = dataclasses.replace(old, window=more["window"])
-    return old
+        disturbance = dataclasses.replace(disturbance, window=values["window"])
+    return disturbance
 
 
 def _pulses(entries, old, tanks):
@@ -145,41 +143,38 @@ def _pulses(entries, old, tanks):
 
 def faults_of(entries, plant):
     """The Faults of the [[fault]] tables; None of none."""
-    found = []
+    events = []
     for i, e in enumerate(read_entries(SECTIONS["fault"], {"fault": entries}, sizes_of(plant))):
         values = (e[name] for name in ("start", "end", "factor", "extra"))
-        found.append((e["of"].removeprefix("plant."), *values))
+        events.append((e["of"].removeprefix("plant."), *values))
         try:
-            faults(plant, found[-1:])
+            faults(plant, events[-1:])
         except InputError as error:
             raise type(error)(f"fault {i + 1}: {error}") from None
-    return faults(plant, found) if found else None
+    return faults(plant, events) if events else None
 
 
 def disturbance_tables(disturbance):
     """[(section, {key: value})] of a disturbance that a rig file can describe, None of another."""
     if disturbance is None:
         return []
-    steady = SECTIONS["disturbance"]
+    steady, pulse = SECTIONS["disturbance"], SECTIONS["inflow"]
     if isinstance(disturbance, Constant):
         return [(steady, {"inflow": disturbance.level})]
     if not isinstance(disturbance, InflowPulses):
         return None
-    volumes = np.asarray(disturbance.volume).tolist()
-    rows = [(*event, volume) for event, volume in zip(disturbance.events, volumes)]
-    pulses = [dict(zip(("time", "duration", "tank", "volume"), row)) for row in rows]
-    return [(steady, {"window": disturbance.window}), *((SECTIONS["inflow"], p) for p in pulses)]
+    rows = zip(disturbance.events, np.asarray(disturbance.volume).tolist())
+    pulses = [dict(zip(pulse.names, (*event, volume))) for event, volume in rows]
+    return [(steady, {"window": disturbance.window}), *((pulse, values) for values in pulses)]
 
 
-def fault_tables(found):
+def fault_tables(part):
     """[(section, {key: value})] of a Faults."""
-    if found is None:
+    if part is None:
         return []
-    rows = zip(found.windows, np.asarray(found.factor).tolist(), np.asarray(found.extra).tolist())
+    section = SECTIONS["fault"]
+    rows = zip(part.windows, np.asarray(part.factor).tolist(), np.asarray(part.extra).tolist())
     return [
-        (
-            SECTIONS["fault"],
-            {"of": of, "start": start, "end": end, "factor": factor, "extra": extra},
-        )
-        for (of, start, end), factor, extra in rows
+        (section, dict(zip(section.names, (*window, factor, extra))))
+        for window, factor, extra in rows
     ]

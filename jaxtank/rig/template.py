@@ -1,5 +1,5 @@
-"""Suggestions of a complete rig file, commented out: what could be set besides, each line of which
-can be used as it stands.
+"""Suggestions of a complete rig file, commented out: what else could be set, each line of which can
+be used unchanged.
 """
 
 import numpy as np
@@ -20,17 +20,13 @@ from jaxtank.signals.setpoints import Ramps
 
 def absent(loop, name, meta):
     """Return the least allowed value of an absent optional leaf, in its shape."""
-    *path, _ = name.split(".")
-    owner = loop
-    for step in path:
-        owner = getattr(owner, step)
-    shape = np.shape(getattr(owner, meta["like"]))
+    sibling = get_value(loop, f"{name.rpartition('.')[0]}.{meta['like']}")
     low, high = meta["low"], meta["high"]
     if low is None or (low <= 0.0 and not meta["strict"]):
         value = 0.0
     else:
         value = 1.0 if high is None or high >= 1.0 else 0.5 * (low + high)
-    return np.full(shape, value).tolist()
+    return np.full(np.shape(sibling), value).tolist()
 
 
 def of_measure(case, name):
@@ -40,53 +36,39 @@ def of_measure(case, name):
     rim = '; "rim": that of each tank' if name == "max_level" else ""
     # where overflow is simulated no level passes a rim (tuning.objective)
     if rim and case.loop.plant.overflow:
-        rim += ", which beside overflow = true is a limit on overflow_volume: none may overflow"
-    unit = measure_unit(name, case.loop.units)
-    return {"unit": unit, "doc": f"{MEASURES[name].doc}{each}{rim}"}
+        rim += ", which with overflow = true is a limit on overflow_volume: none may overflow"
+    return {"unit": measure_unit(name, case.loop.units), "doc": f"{MEASURES[name].doc}{each}{rim}"}
 
 
 def of_free(case, name):
-    """What a parameter is that is free, as metadata."""
+    """What a free parameter is, as metadata."""
     meta = describe(case.loop, name)
     return {**meta, "doc": f"[low, high, scale] of: {meta['doc']}"}
 
 
 def of_uncertain(case, name):
-    """What a share of a parameter is, as metadata."""
-    entry = SHARE.meta()
-    return {**entry, "doc": f"{entry['doc']}, of: {describe(case.loop, name)['doc']}"}
+    """What the spread of a parameter is, as metadata."""
+    meta = SHARE.meta()
+    return {**meta, "doc": f"{meta['doc']}, of: {describe(case.loop, name)['doc']}"}
 
 
-def _measures(case, but):
-    """Suggested lines of the measures that a run of the case has, without those in `but`."""
-    return [
-        Line(name, WEIGHT.default, of_measure(case, name), False)
-        for name in of_loop(case.loop)
-        if name not in but
-    ]
-
-
-def limits(case):
-    """Lines of the measures that are not limited."""
-    return _measures(case, case.limits)
-
-
-def objective(case):
-    """Lines of the measures that are not in the objective."""
-    return _measures(case, case.objective)
+def measures(case, known):
+    """Suggested lines of the measures that a run of the case has, without those in `known`."""
+    names = [name for name in of_loop(case.loop) if name not in known]
+    return [Line(name, WEIGHT.default, of_measure(case, name), False) for name in names]
 
 
 def free(case):
     """Lines of gains of controller and observer that could be free, over a decade each way."""
-    found, taken = [], {name.split("[")[0] for name in case.free} | {"controller.knots"}
+    lines, known = [], {name.split("[")[0] for name in case.free} | {"controller.knots"}
     for name, value, meta in walk(case.loop):
         part, _, rest = name.partition(".")
-        if part not in ("controller", "observer") or "model." in rest or name in taken:
+        if part not in ("controller", "observer") or "model." in rest or name in known:
             continue
         span = None if value is None or meta.get("rows") else around(value, meta)
         if span is not None:
-            found.append(Line(toml(name), list(span), of_free(case, name), False))
-    return found
+            lines.append(Line(toml(name), list(span), of_free(case, name), False))
+    return lines
 
 
 def around(value, meta):
@@ -98,9 +80,8 @@ def around(value, meta):
     if value.min() <= 0:
         high = 1.0 + 2 * np.abs(value).max()
         low = -high
-    low = low if meta["low"] is None else max(low, meta["low"])
-    high = high if meta["high"] is None else min(high, meta["high"])
-    low, high = _rounded(low), _rounded(high)
+    low = _rounded(low if meta["low"] is None else max(low, meta["low"]))
+    high = _rounded(high if meta["high"] is None else min(high, meta["high"]))
     return Free(low, high, "log" if low > 0 else "linear") if low < high else None
 
 
@@ -110,51 +91,82 @@ def _rounded(value):
 
 def uncertain(case):
     """Lines of the plant's parameters whose spread is not given."""
-    taken, share = {n.split("[")[0] for n in case.uncertain}, SHARE.default
+    known = {n.split("[")[0] for n in case.uncertain}
     return [
-        Line(toml(name), share, of_uncertain(case, name), False)
+        Line(toml(name), SHARE.default, of_uncertain(case, name), False)
         for name, value in parameters(case.loop).items()
-        if name.startswith("plant.") and name not in taken and np.any(np.asarray(value) != 0)
+        if name.startswith("plant.") and name not in known and np.any(np.asarray(value) != 0)
     ]
 
 
-def suggestions(case, have):
-    """Return the Blocks of tables that a case does not have, as they could be."""
-    given = have - {section.title for section in SECTIONS.values() if section.many}
-    found = []
-    for name, example in EXAMPLES.items():
-        if SECTIONS[name].title in given or (SECTIONS[name].many and name in given):
+def suggestions(case, titles):
+    """Return the Blocks of tables that a case does not have, as they could be; titles: of those
+    that it has, and names of lists that it has emptied.
+    """
+    titles = titles - {section.title for section in SECTIONS.values() if section.many}
+    blocks = []
+    for name, values in _examples(case).items():
+        section = SECTIONS[name]
+        if values is None or section.title in titles or (section.many and name in titles):
             continue
-        values = example(case)
-        if isinstance(values, Block):
-            found.append(values)
-        elif values is not None:
-            section = values.pop("section", SECTIONS[name])
-            found.append(suggestion(section, values, case.loop.units))
-    return found
+        section = values.pop("section", section)
+        blocks.append(suggestion(section, values, case.loop.units))
+    return blocks if "[log]" in titles else [*blocks, _log(case)]
 
 
-def _seconds(case, share):
-    """A share of a run, rounded [s]."""
-    return _rounded(share * case.clock.duration)
+def _examples(case):
+    """{section: {key: value} that could be in a file, None where it cannot}."""
+    loop, plant, disturbance = case.loop, case.loop.plant, case.loop.disturbance
+    instant = lambda share: _rounded(share * case.clock.duration)  # [s]
+    steady = isinstance(disturbance, Constant) and np.any(np.asarray(disturbance.level))
+    # a sine changes the names of the reference, which a scenario may have
+    named = any(name.startswith("reference.") for s in case.scenarios for name in s.values)
+    volume = float(np.asarray(plant.area)[0] * np.asarray(plant.rim)[0]) if not steady else 0.0
+    return {
+        "controller": _controller(loop),
+        "schedule": _schedule(case),
+        "observer": _observer(loop),
+        "reference.sine": {"amplitude": 0.0, "period": instant(0.1), "end": instant(1), "output": 1}
+        if isinstance(loop.reference, Ramps) and not named
+        else None,
+        "disturbance": {"inflow": np.zeros(plant.tanks)} if disturbance is None else None,
+        "inflow": {
+            "time": instant(0.5),
+            "duration": instant(0.01),
+            "tank": 0,
+            "volume": _rounded(0.01 * volume),
+        }
+        if not steady
+        else None,
+        "fault": {"of": "pump_gain[0]", "start": instant(0.5), "end": instant(0.7), "factor": 0.6},
+        "covariance": None if case.covariance else _covariance(case),
+        "safety_filter": {"limit": np.asarray(plant.rim)}
+        if case.safety is None and isinstance(plant, TankNetwork)
+        else None,
+        "scenario": {"name": "noisy", "seed": 1, "values": {"sensor.noise": 0.0}},
+    }
 
 
-def _controller(case):
-    """The case's own controller, as a start for another."""
-    part = case.loop.controller
-    known = components.kind_of("controller", part) is not None
-    if not known or not is_component(getattr(part, "model", None)):
-        return None  # also of a controller with a schedule, whose class has no name
-    return _component("controller", part)
+def _controller(loop):
+    """The loop's own controller, as a start for another."""
+    part = loop.controller
+    known = components.kind_of("controller", part) is not None  # no Scheduled
+    model = is_component(getattr(part, "model", None))
+    return _component("controller", part) if known and model else None
 
 
 def _component(name, part):
     """{key: value} of a controller or observer, and its section."""
     section, values = components.values_of(name, part)
+    return {"section": _another(name, section.keys), **values}
+
+
+def _another(name, keys):
+    """The Section of a controller or observer instead of the preset's."""
     prose = f"Another {name} than the preset's: {', '.join(components.ROLES[name].classes)}."
     if name == "controller":
         prose += " [values] above then has the names of that controller."
-    return {"section": Section(name, section.keys, prose=prose), **values}
+    return Section(name, keys, prose=prose)
 
 
 def _schedule(case):
@@ -167,120 +179,46 @@ def _schedule(case):
         if name.startswith("controller.") and "model" not in name:
             for variable in ("r1", "h1"):
                 try:
-                    found = schedule(case, {name: variable}, knots)
-                    found.loop.controller.check(found.loop.reference)
+                    scheduled = schedule(case, {name: variable}, knots)
+                    scheduled.loop.controller.check(scheduled.loop.reference)
                 except (InputError, LookupError, TypeError, ValueError):
                     continue
                 return {"gains": [name], "variable": variable, "knots": knots}
     return None
 
 
-def _observer(case):
+def _observer(loop):
     """The loop's own observer, or an extended Kalman filter where it has none."""
-    part = case.loop.observer
+    part, kind = loop.observer, "extended-kalman"
     if components.kind_of("observer", part) not in (None, "direct"):
         return _component("observer", part)
-    rim = float(np.asarray(case.loop.plant.rim)[0])
+    rim = float(np.asarray(loop.plant.rim)[0])
     small, large = (_rounded((share * rim) ** 2) for share in (1e-3, 1e-2))
-    kind = "extended-kalman"
-    keys = components.section_of("observer", kind).keys
-    prose = (
-        f"Another observer than the preset's: {', '.join(components.ROLES['observer'].classes)}."
-    )
     return {
-        "section": Section("observer", keys, prose=prose),
+        "section": _another("observer", components.section_of("observer", kind).keys),
         "kind": kind,
         "process": small,
         "measurement": small,
         "spread": large,
-        "measured": range(case.loop.plant.tanks),
+        "measured": range(loop.plant.tanks),
     }
-
-
-def _sine(case):
-    """A sine of amplitude 0 on a reference of ramps, whose names no scenario has."""
-    named = any(name.startswith("reference.") for s in case.scenarios for name in s.values)
-    if not isinstance(case.loop.reference, Ramps) or named:
-        return None
-    return {"amplitude": 0.0, "period": _seconds(case, 0.1), "end": _seconds(case, 1), "output": 1}
-
-
-def _disturbance(case):
-    """No inflow, of every tank."""
-    tanks = case.loop.plant.tanks
-    return {"inflow": np.zeros(tanks)} if case.loop.disturbance is None else None
-
-
-def _inflow(case):
-    """A pulse of 1 % of the first tank, where there is no steady inflow."""
-    steady, plant = case.loop.disturbance, case.loop.plant
-    if isinstance(steady, Constant) and np.any(np.asarray(steady.level)):
-        return None
-    volume = float(np.asarray(plant.area)[0] * np.asarray(plant.rim)[0])
-    times = {"time": _seconds(case, 0.5), "duration": _seconds(case, 0.01)}
-    return {**times, "tank": 0, "volume": _rounded(0.01 * volume)}
-
-
-def _fault(case):
-    """A weaker first pump for a while."""
-    times = {"start": _seconds(case, 0.5), "end": _seconds(case, 0.7)}
-    return {"of": "pump_gain[0]", **times, "factor": 0.6}
 
 
 def _covariance(case):
     """5 % of the first uncertain parameter."""
-    if case.covariance:
-        return None
-    loop, name = case.loop, "plant.pump_gain"
-    for other in case.uncertain:
-        if np.size(get_value(loop, other)) and np.ravel(get_value(loop, other))[0] != 0:
-            name = other
-            break
-    value = np.ravel(np.asarray(get_value(loop, name)))[0]
-    scalar = "[" in name or np.ndim(get_value(loop, name)) == 0
-    return {
-        "names": [name if scalar else f"{name}[0]"],
-        "matrix": [[_rounded((0.05 * value) ** 2)]],
-    }
-
-
-def _safety_filter(case):
-    """Limits at the rims."""
-    plant = case.loop.plant
-    if case.safety is not None or not isinstance(plant, TankNetwork):
-        return None
-    return {"limit": np.asarray(plant.rim)}
-
-
-def _scenario(case):
-    """A run with sensor noise of its own."""
-    return {"name": "noisy", "seed": 1, "values": {"sensor.noise": 0.0}}
+    value_of = lambda name: np.ravel(np.asarray(get_value(case.loop, name)))
+    nonzero = (n for n in case.uncertain if value_of(n).size and value_of(n)[0] != 0)
+    name = next(nonzero, "plant.pump_gain")
+    scalar = "[" in name or np.ndim(get_value(case.loop, name)) == 0
+    variance = _rounded((0.05 * value_of(name)[0]) ** 2)
+    return {"names": [name if scalar else f"{name}[0]"], "matrix": [[variance]]}
 
 
 def _log(case):
     """The columns of experiment data of the rig."""
-    if case.log:
-        return None
     plant, (length, drive) = case.loop.plant, case.loop.units
     columns = {"t": ["time", "s"]}
     columns |= {f"pump{j + 1}": [f"u{j + 1}", drive] for j in range(plant.pumps)}
     columns |= {f"h{i + 1}": [f"level {i + 1}", length] for i in range(plant.tanks)}
-    section = SECTIONS["log"]
     lines = [Line(name, value, {"unit": "-", "doc": ""}) for name, value in columns.items()]
-    return Block(section.title, lines, (section.prose,), False)
-
-
-EXAMPLES = {
-    "controller": _controller,
-    "schedule": _schedule,
-    "observer": _observer,
-    "reference.sine": _sine,
-    "disturbance": _disturbance,
-    "inflow": _inflow,
-    "fault": _fault,
-    "covariance": _covariance,
-    "safety_filter": _safety_filter,
-    "scenario": _scenario,
-    "log": _log,
-}
-"""{section: function of a case} that gives the values suggested for it, None where it has none."""
+    return Block(SECTIONS["log"].title, lines, (SECTIONS["log"].prose,), False)

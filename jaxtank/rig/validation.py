@@ -20,7 +20,7 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.steady import steady_state
 from jaxtank.measures import MEASURES, check_names, entries
 from jaxtank.measures import unit as measure_unit
-from jaxtank.rig.entry import is_finite, is_numeric, read_entry, sizes_of
+from jaxtank.rig.entry import is_finite, is_numeric, read_entry, refusal, sizes_of
 from jaxtank.rig.schema import SECTIONS
 from jaxtank.rig.values import by_dotted_name, check_not_scheduled, scheduled_names, set_scenario
 from jaxtank.signals.setpoints import Ramps
@@ -73,9 +73,7 @@ def check_uncertain(loop: ClosedLoop, uncertain: Mapping[str, Any]) -> dict[str,
     for name, share in uncertain.items():
         get_value(loop, name)
         if not (is_finite(share, 0) and 0 < share < 1):
-            raise InputError(
-                f"uncertain {name} = {shortened(share)}: must be a share between 0 and 1"
-            )
+            raise refusal(f"uncertain {name}", share, "be a share between 0 and 1")
     return {name: float(share) for name, share in uncertain.items()}
 
 
@@ -103,9 +101,7 @@ def check_limits(loop: ClosedLoop, limits: Mapping[str, Any]) -> dict[str, Any]:
         if not (is_finite(value) and np.shape(value) in ((), (count,))):
             many = f", or {count} of them" if count > 1 else ""
             rim = ', or "rim"' if measure == "max_level" else ""
-            raise InputError(
-                f"limit {measure} = {shortened(value)}: must be a finite number [{unit}]{many}{rim}"
-            )
+            raise refusal(f"limit {measure}", value, f"be a finite number [{unit}]{many}{rim}")
         of = "" if unit == "-" else f" {unit}"
         for sign, words in ((1.0, "least"), (-1.0, "most")):
             end = MEASURES[measure].low if sign > 0 else MEASURES[measure].high
@@ -122,9 +118,7 @@ def check_objective(objective: Mapping[str, Any]) -> dict[str, float]:
     check_names(objective)
     for measure, weight in objective.items():
         if not (is_finite(weight, 0) and weight >= 0):
-            raise InputError(
-                f"objective {measure} = {shortened(weight)}: must be a finite weight at or above 0"
-            )
+            raise refusal(f"objective {measure}", weight, "be a finite weight at or above 0")
     if not any(objective.values()):
         raise InputError("the objective has no measure with a weight above 0")
     return {measure: float(weight) for measure, weight in objective.items()}
@@ -156,69 +150,68 @@ def check_free(loop: ClosedLoop, name: str, low: Any, high: Any, scale: str = "l
 
 def free_of(loop, table):
     """{name: Free} of a [free] table."""
-    found = {}
+    free = {}
     for name, spec in table.items():
         good = isinstance(spec, list) and len(spec) in (2, 3)
         good = good and all(is_numeric(v) and np.ndim(v) == 0 for v in spec[:2])
-        if not good or (len(spec) == 3 and spec[2] not in ("log", "linear")):
-            raise InputError(
-                f'free {name} = {shortened(spec)}: must be [low, high] or [low, high, "log" or'
-                ' "linear"]'
-            )
-        for own in scheduled_names(loop, name):
-            found[own] = check_free(loop, own, *spec)
-    return found
+        if not good or spec[2:] not in ([], ["log"], ["linear"]):
+            form = '[low, high] or [low, high, "log" or "linear"]'
+            raise refusal(f"free {name}", spec, f"be {form}")
+        for each in scheduled_names(loop, name):
+            free[each] = check_free(loop, each, *spec)
+    return free
 
 
-def scenario(case, entry, index):
-    """The Scenario of one [[scenario]] table, if it can be run."""
-    own = read_entry(SECTIONS["scenario"], entry, sizes_of(case.loop.plant), index)
-    name = own.pop("name", f"scenario {index + 1}")
+def scenarios_of(case, tables):
+    """The Scenarios of the [[scenario]] tables, each of which can be run."""
+    return tuple(_scenario(case, table, i) for i, table in enumerate(tables))
+
+
+def _scenario(case, table, index):
+    entry = read_entry(SECTIONS["scenario"], table, sizes_of(case.loop.plant), index)
+    name = entry.pop("name", f"scenario {index + 1}")
     try:
-        values = by_dotted_name(own.pop("values"), "scenario.values")
+        values = by_dotted_name(entry.pop("values"), "scenario.values")
         set_scenario(case, values)
     except EquilibriumError:
         pass  # `check` names the plateau without one; where that is allowed, `tune` refuses
     except InputError as error:
         raise type(error)(f"scenario {name!r}: {error}") from None
     values = {n: tuple(v) if isinstance(v, list) else v for n, v in values.items()}
-    return Scenario(name, values, **own)
+    return Scenario(name, values, **entry)
 
 
 def check_log(plant, table):
     """Return {slot: header or (header, unit)} of a [log] table after input validation."""
     pumps = (f"pump{j + 1}" for j in range(plant.pumps))
     slots = ["t", *pumps, *(f"h{i + 1}" for i in range(plant.tanks))]
-    found = {}
+    columns, headers = {}, {}
     for slot, spec in table.items():
         if slot not in slots:
             raise unknown("key of [log]", slot, slots)
         pair = [spec] if isinstance(spec, str) else spec
         good = isinstance(pair, (list, tuple)) and 1 <= len(pair) <= 2
         if not (good and all(isinstance(v, str) and v.strip() for v in pair)):
-            raise InputError(
-                f"log {slot} = {shortened(spec)}: must be a column's header, or [header, unit]"
-            )
+            raise refusal(f"log {slot}", spec, "be a column's header, or [header, unit]")
         header = pair[0].strip()
-        for other, taken in found.items():
-            if (taken if isinstance(taken, str) else taken[0]).strip() == header != "none":
-                raise InputError(
-                    f"log {slot} = {shortened(pair[0])}: that column is {other} already"
-                )
-        found[slot] = pair[0] if len(pair) == 1 else tuple(pair)
-    return found
+        if header in headers and header != "none":
+            raise InputError(
+                f"log {slot} = {shortened(pair[0])}: that column is {headers[header]} already"
+            )
+        headers[header] = slot
+        columns[slot] = pair[0] if len(pair) == 1 else tuple(pair)
+    return columns
 
 
 def check_covariance(loop, table):
     """Return (names, rows) of a [covariance] table after input validation."""
     values = read_entry(SECTIONS["covariance"], table, sizes_of(loop.plant))
-    names, size = values["names"], len(values["names"])
+    names, rows, size = values["names"], values["matrix"], len(values["names"])
     if len(set(names)) < size:
         raise InputError("covariance.names: one is given twice")
     for name in names:
         if describe(loop, name)["kind"] == "static" or np.ndim(get_value(loop, name)) != 0:
             raise InputError(f"covariance {name}: must be a number, an array's entry by name[i]")
-    rows = values["matrix"]
     if not (is_finite(rows) and np.shape(rows) == (size, size) and _is_covariance(rows)):
         raise InputError(
             f"covariance.matrix: must be a symmetric, positive definite {size} by {size} matrix of"

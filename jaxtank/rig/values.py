@@ -12,7 +12,6 @@ from jaxtank.controllers.gain_schedule import Scheduled, check_gains, check_knot
 from jaxtank.core.checks import check_value
 from jaxtank.core.clock import CLOCK_UNITS, check_clock
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
-from jaxtank.core.text import shortened
 from jaxtank.core.tree import (
     describe,
     get_value,
@@ -26,7 +25,7 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.steady import steady_state
 from jaxtank.loop.tank_bottom import can_withdraw
 from jaxtank.plants.tank_network import TankNetwork
-from jaxtank.rig.entry import is_numeric, plain, read_entry, sizes_of, static_value, unit
+from jaxtank.rig.entry import is_numeric, plain, read_entry, refusal, sizes_of, static_value, unit
 from jaxtank.rig.schema import SECTIONS
 
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
@@ -43,20 +42,17 @@ _RELATIVE = re.compile(
 
 def by_dotted_name(table, where):
     """Return {dotted name: value} of a table in which names may be written without quotes."""
-    found = {}
+    values = {}
     for key, value in table.items():
         # a name that is quoted is whole: its value is no table
         nested = isinstance(value, dict) and value and "." not in key
-        inner = (
-            {f"{key}.{k}": v for k, v in by_dotted_name(value, where).items()}
-            if nested
-            else {key: value}
-        )
-        for name in inner:
-            if name in found:
+        inner = by_dotted_name(value, where) if nested else {"": value}
+        for name, each in inner.items():
+            name = f"{key}.{name}" if name else key
+            if name in values:
                 raise InputError(f"[{where}] {name} is given twice")
-        found |= inner
-    return found
+            values[name] = each
+    return values
 
 
 def set_values(case: Case, values: Mapping[str, Any]) -> Case:
@@ -96,9 +92,7 @@ def set_values(case: Case, values: Mapping[str, Any]) -> Case:
             case = case.replace(loop=_set_static(case.loop, name, name.split("."), value, meta))
             continue
         if not is_numeric(value):
-            raise InputError(
-                f"{name} = {shortened(value)}: must be a number or a list of numbers{unit(meta)}"
-            )
+            raise refusal(name, value, f"be a number or a list of numbers{unit(meta)}")
         check_not_scheduled(case.loop, name)
         loop = with_values(case.loop, {name: value})
         if parameters(loop).get(split_index(name)[0]) is not None:  # an infinite Ti is none
@@ -110,16 +104,17 @@ def set_values(case: Case, values: Mapping[str, Any]) -> Case:
 def with_models(loop, values):
     """Return `values` with those of the plant for the models that follow it."""
     names = {name for kind in ("leaf", "static") for name, _, _ in walk(loop, kind=kind)}
-    found = {}
-    for owner, models in (("plant.", MODELS), *((model, MODELS[-1:]) for model in MODELS[:-1])):
+    followers = {"plant.": MODELS, **dict.fromkeys(MODELS[:-1], MODELS[-1:])}
+    copies = {}
+    for owner, models in followers.items():
         for name, value in values.items():
             inner = name.removeprefix(owner)
             for model in models if inner != name else ():
                 base = (model + inner).split("[")[0]
                 if base in names and base not in values:
-                    found[model + inner] = value
+                    copies[model + inner] = value
     plants = {name: value for name, value in values.items() if name.startswith("plant.")}
-    return {**plants, **{n: v for n, v in found.items() if n not in values}, **values}
+    return {**plants, **{n: v for n, v in copies.items() if n not in values}, **values}
 
 
 def set_scenario(case: Case, values: Mapping[str, Any]) -> Case:
@@ -144,46 +139,46 @@ def set_scenario(case: Case, values: Mapping[str, Any]) -> Case:
     >>> rig.set_scenario(case, {"plant.split[0]": "x0.5"}).loop.plant.split.tolist()
     [0.21, 0.34]
     """
-    found = {name: _absolute(case, name, value) for name, value in values.items()}
-    steady = [name for name in found if _is_steady(name, found[name])]
+    numbers = {name: _absolute(case, name, value) for name, value in values.items()}
+    steady = [name for name in numbers if _is_steady(name, numbers[name])]
     if steady:
-        here = set_values(case, {n: v for n, v in found.items() if n not in steady})
-        short = dataclasses.replace(here.clock, duration=here.clock.dt)
-        setpoints = [float(np.asarray(v)[0]) for v in here.loop.reference.sample(short)[0]]
+        start = set_values(case, {n: v for n, v in numbers.items() if n not in steady})
+        first = dataclasses.replace(start.clock, duration=start.clock.dt)
+        setpoints = [float(np.asarray(v)[0]) for v in start.loop.reference.sample(first)[0]]
         try:
-            levels, inputs = steady_state(here.loop, setpoints, case.loop.plant)
+            levels, inputs = steady_state(start.loop, setpoints, case.loop.plant)
         except EquilibriumError as error:
             raise EquilibriumError(f'{steady[0]} = "steady": {error}') from None
-        known: dict[str, Any] = dict(zip(STEADY, (levels.tolist(), inputs.tolist(), setpoints)))
-        found |= {name: known[name] for name in steady}
-    return set_values(case, found)
+        rest: dict[str, Any] = dict(zip(STEADY, (levels.tolist(), inputs.tolist(), setpoints)))
+        numbers |= {name: rest[name] for name in steady}
+    return set_values(case, numbers)
 
 
 def overridden(case: Case, values: Mapping[str, Any]) -> tuple[Case, dict[str, list[str]]]:
     """Return (case with `values` in place of its scenarios' own, {name: scenarios that had it})."""
     scenarios, replaced = [], {}
     for s in case.scenarios:
-        kept = {}
+        changes = {}
         for name, value in s.values.items():
             over = [n for n in values if overlap(n, name)] if not is_change(value) else []
             for n in over:
                 replaced.setdefault(n, []).append(s.name)
             if not any(n in (name, split_index(name)[0]) for n in over):
                 # an entry of an array that the scenario sets whole: after it
-                kept |= {name: value, **{n: values[n] for n in over}}
-        scenarios.append(s._replace(values=kept))
+                changes |= {name: value, **{n: values[n] for n in over}}
+        scenarios.append(s._replace(values=changes))
     return case.replace(scenarios=tuple(scenarios)), replaced
 
 
-def overlap(one: str, other: str) -> bool:
+def overlap(name: str, other: str) -> bool:
     """Return whether two dotted names, of leaves or of entries, have an entry in common."""
-    return one == other or split_index(one)[0] == other or one == split_index(other)[0]
+    return name == other or split_index(name)[0] == other or name == split_index(other)[0]
 
 
 def is_change(value: Any) -> bool:
     """Return whether the value of a scenario is a factor or an offset on the case's own."""
-    found = _RELATIVE.fullmatch(value.strip()) if isinstance(value, str) else None
-    return found is not None and found["default"] is None
+    match = _RELATIVE.fullmatch(value.strip()) if isinstance(value, str) else None
+    return match is not None and match["default"] is None
 
 
 def _is_steady(name, value):
@@ -191,24 +186,22 @@ def _is_steady(name, value):
 
 
 def _absolute(case, name, value):
-    """The number that a value relative to the case comes to; any other, and "steady", as it is."""
-    own = _number_of(case, name) if isinstance(value, str) else None
-    if own is None or _is_steady(name, value):
+    """The number that a value relative to the case comes to; any other, and "steady", unchanged."""
+    current = _number_of(case, name) if isinstance(value, str) else None
+    if current is None or _is_steady(name, value):
         return value
-    found = _RELATIVE.fullmatch(value.strip())
-    if found is None:
+    match = _RELATIVE.fullmatch(value.strip())
+    if match is None:
         more = ', or "steady"' if name in STEADY else ""
         numbers = f"a number or a list of numbers{unit(_meta(case, name))}"
-        raise InputError(
-            f"{name} = {shortened(value)}: must be {numbers}, or relative to the case's own: "
-            f'"x1.3" (times), "by -0.5" (less), "0.02 if zero"{more}'
-        )
-    own = np.asarray(own, dtype=float)
-    if found["factor"] is not None:
-        return (float(found["factor"]) * own).tolist()
-    if found["offset"] is not None:
-        return (own + float(found["offset"])).tolist()
-    return own.tolist() if np.any(own) else float(found["default"])
+        relative = f'"x1.3" (times), "by -0.5" (less), "0.02 if zero"{more}'
+        raise refusal(name, value, f"be {numbers}, or relative to the case's own: {relative}")
+    current = np.asarray(current, dtype=float)
+    if match["factor"] is not None:
+        return (float(match["factor"]) * current).tolist()
+    if match["offset"] is not None:
+        return (current + float(match["offset"])).tolist()
+    return current.tolist() if np.any(current) else float(match["default"])
 
 
 def _number_of(case, name):
@@ -231,8 +224,11 @@ def _meta(case, name):
 def set_and_schedule(case: Case, values: Mapping[str, Any], table: Mapping[str, Any]) -> Case:
     """Return `set_values` of a case with the schedule of a [schedule] table; {}: none."""
     if table:
-        before, values = _known(case.loop, values)
-        case = _with_schedule(set_values(case, before), table)
+        # names of the schedule exist only after it
+        names = {name for kind in ("leaf", "static") for name, _, _ in walk(case.loop, kind=kind)}
+        first = [n for n in values if n.split("[")[0] in names or n.startswith("clock.")]
+        case = _with_schedule(set_values(case, {n: values[n] for n in first}), table)
+        values = {n: v for n, v in values.items() if n not in first}
     return set_values(case, values)
 
 
@@ -248,9 +244,9 @@ def _can_withdraw(case):
     """Whether liquid can be drawn out in the case's own run, or in a scenario."""
     drawing = ("actuator.", "disturbance.")
     for s in case.scenarios:
-        own = {name: value for name, value in s.values.items() if name.startswith(drawing)}
-        steady = any(_is_steady(name, value) for name, value in own.items())
-        if own and not steady and can_withdraw(set_scenario(case, own).loop):
+        changes = {name: value for name, value in s.values.items() if name.startswith(drawing)}
+        steady = any(_is_steady(name, value) for name, value in changes.items())
+        if changes and not steady and can_withdraw(set_scenario(case, changes).loop):
             return True
     return can_withdraw(case.loop)
 
@@ -281,39 +277,42 @@ def _set_clock(clock, values):
 
 
 def _set_static(tree, name, path, value, meta):
-    if len(path) > 1:
-        return dataclasses.replace(
-            tree, **{path[0]: _set_static(getattr(tree, path[0]), name, path[1:], value, meta)}
-        )
     old = getattr(tree, path[0])
-    if isinstance(old, tuple):
+    if len(path) > 1:
+        new = _set_static(old, name, path[1:], value, meta)
+    elif isinstance(old, tuple):
         raise InputError(
             f"{name} is the topology of the rig and cannot be set: choose another case"
         )
-    return dataclasses.replace(tree, **{path[0]: static_value(name, value, meta, type(old))})
+    else:
+        new = static_value(name, value, meta, type(old))
+    return dataclasses.replace(tree, **{path[0]: new})
 
 
 CONTROLLER = "controller."
 
 
 def schedule(case, gains, knots):
-    """Return a copy of `case` with scheduled gains: the same run, until values at knots change."""
+    """Return a copy of `case` with scheduled gains {name: variable}: the same run, until values at
+    knots change.
+    """
     loop, part = case.loop, case.loop.controller
     if isinstance(part, Scheduled):
         raise InputError("the controller has a schedule already: name all its gains in one")
     names = [entry for name in gains for entry in _entries(loop, name)]
     check_gains(part, tuple(names))
-    if len(set(gains.values())) != 1:
+    variable, *others = dict.fromkeys(gains.values())
+    if others:
         raise InputError(
             f"schedule variables {', '.join(map(str, gains.values()))}: must be one for all gains"
         )
-    variable = next(iter(gains.values()))
     check_variable(variable, len(loop.plant.outputs), loop.plant.tanks)
     check_knots(knots)
     knots = number(knots)
     values = number([[float(get_value(part, name))] * knots.size for name in names])
-    numbers = [name for name in names if not split_index(name)[1]]
-    part = _emptied(part, numbers)
+    for name in names:
+        if not split_index(name)[1]:
+            part = _without(part, name.split("."))
     controller = Scheduled(
         law=part, knots=knots, values=values, gains=tuple(names), variable=variable
     )
@@ -334,7 +333,7 @@ def unscheduled(loop):
 def check_not_scheduled(loop, name):
     """Raise InputError if `name` is a gain that a schedule gives, and not the controller's own."""
     part, inner = loop.controller, name.removeprefix(f"{CONTROLLER}law.")
-    if isinstance(part, Scheduled) and name.startswith(f"{CONTROLLER}law.") and inner in part.gains:
+    if isinstance(part, Scheduled) and inner != name and inner in part.gains:
         raise InputError(
             f"{name} is scheduled: it is controller.values[{part.gains.index(inner)},j] at knot j,"
             " counted from 0"
@@ -344,13 +343,10 @@ def check_not_scheduled(loop, name):
 def scheduled_names(loop, name):
     """Return the names in `loop` of what an unscheduled controller calls `name`."""
     part, inner = loop.controller, name.removeprefix(CONTROLLER)
-    if (
-        not isinstance(part, Scheduled)
-        or not name.startswith(CONTROLLER)
-        or inner.split("[")[0].split(".")[0] in ("law", "values", "knots")
-    ):
+    of_schedule = inner.split("[")[0].split(".")[0] in ("law", "values", "knots")
+    if not isinstance(part, Scheduled) or inner == name or of_schedule:
         return [name]
-    rows = [i for i, gain in enumerate(part.gains) if gain == inner or gain.split("[")[0] == inner]
+    rows = [i for i, gain in enumerate(part.gains) if inner in (gain, gain.split("[")[0])]
     if rows:
         return [f"{CONTROLLER}values[{i},{j}]" for i in rows for j in range(np.size(part.knots))]
     return [f"{CONTROLLER}law.{inner}"]
@@ -370,35 +366,26 @@ def schedule_table(loop):
 
 def _with_schedule(case, table):
     """Return `schedule` of a table as `schedule_table` makes it."""
-    values = read_entry(SECTIONS["schedule"], table, sizes_of(case.loop.plant))
-    gains, knots = values["gains"], table["knots"]
+    gains = read_entry(SECTIONS["schedule"], table, sizes_of(case.loop.plant))["gains"]
     for gain in gains:
         if gains.count(gain) > 1:
             raise InputError(f"schedule.gains: {gain} is scheduled twice: name it once")
-    if not isinstance(knots, list):
-        raise InputError(f"schedule.knots = {knots!r}: must be a list of numbers")
-    return schedule(case, dict.fromkeys(gains, table["variable"]), knots)
-
-
-def _known(loop, values):
-    """Return (values of names that `loop` or a clock has, the others)."""
-    names = {name for kind in ("leaf", "static") for name, _, _ in walk(loop, kind=kind)}
-    before = {n: v for n, v in values.items() if n.split("[")[0] in names or n.startswith("clock.")}
-    return before, {n: v for n, v in values.items() if n not in before}
+    if not isinstance(table["knots"], list):
+        raise InputError(f"schedule.knots = {table['knots']!r}: must be a list of numbers")
+    return schedule(case, dict.fromkeys(gains, table["variable"]), table["knots"])
 
 
 def _entries(loop, name):
     """The scalars that a name stands for, without the "controller."."""
-    if not name.startswith(CONTROLLER):
-        raise unknown("gain", name, [n for n in parameters(loop) if n.startswith(CONTROLLER)])
-    inner = name.removeprefix(CONTROLLER)
+    names = [n for n in parameters(loop) if n.startswith(CONTROLLER)]
     try:
-        found = describe(loop, name)
+        kind = describe(loop, name)["kind"] if name.startswith(CONTROLLER) else None
     except InputError:
-        raise unknown(
-            "gain", name, [n for n in parameters(loop) if n.startswith(CONTROLLER)]
-        ) from None
-    if found["kind"] == "static" or split_index(name)[1]:
+        kind = None
+    if kind is None:
+        raise unknown("gain", name, names)
+    inner = name.removeprefix(CONTROLLER)
+    if kind == "static" or split_index(name)[1]:
         return [inner]
     return [
         inner + (f"[{','.join(map(str, i))}]" if i else "")
@@ -406,17 +393,10 @@ def _entries(loop, name):
     ]
 
 
-def _emptied(part, names):
-    """`part` without the leaves `names`."""
-    for name in names:
-        part = _without(part, name.split("."))
-    return part
-
-
 def _without(tree, path):
-    return dataclasses.replace(
-        tree, **{path[0]: _without(getattr(tree, path[0]), path[1:]) if path[1:] else None}
-    )
+    """A component without the leaf at a path."""
+    inner = _without(getattr(tree, path[0]), path[1:]) if path[1:] else None
+    return dataclasses.replace(tree, **{path[0]: inner})
 
 
 def _free(case, gains, knots):

@@ -17,7 +17,7 @@ from jaxtank.signals.setpoints import Sine, index
 
 
 def case_warnings(case: Case) -> list[str]:
-    """Return sentences on what of a case is hardly meant.
+    """Return sentences on what in a case is hardly meant.
 
     A run that does not end at a sample, changes, inflow pulses and faults after its end, changes
     that overlap, what no sample sees, levels and setpoints above a rim, pumps that start outside
@@ -65,20 +65,25 @@ def clock_warnings(clock: Clock) -> list[str]:
 
 def _late(case):
     """On changes of the reference and inflow pulses after the end of the run."""
-    reference, disturbance, end = (
-        steps(case.loop.reference),
-        case.loop.disturbance,
-        case.clock.duration,
-    )
-    changes = () if reference is None else reference.changes
-    pulses = disturbance.events if isinstance(disturbance, InflowPulses) else ()
-    faults = () if case.loop.faults is None else case.loop.faults.windows
-    faults = tuple((start, of) for of, start, _ in faults)
-    kinds = {"changes of the reference": changes, "changes of the inputs": _of_inputs(case)}
-    for name, events in {**kinds, "inflow pulses": pulses, "faults": faults}.items():
-        late = sum(time >= end for time, *_ in events)
+    loop, end = case.loop, case.clock.duration
+    pulses = loop.disturbance.onset if isinstance(loop.disturbance, InflowPulses) else ()
+    faults = () if loop.faults is None else [start for _, start, _ in loop.faults.windows]
+    times = {
+        "changes of the reference": _change_times(loop.reference),
+        "changes of the inputs": _change_times(getattr(loop.controller, "signal", None)),
+        "inflow pulses": pulses,
+        "faults": faults,
+    }
+    for name, events in times.items():
+        late = sum(time >= end for time in events)
         if late:
             yield f"{late} of {len(events)} {name} come after the end of the run at {end:g} s"
+
+
+def _change_times(signal):
+    """Times of the changes of a signal of ramps [s]."""
+    signal = steps(signal)
+    return () if signal is None else [time for time, _ in signal.changes]
 
 
 def _overlapping(case):
@@ -97,12 +102,6 @@ def _overlapping(case):
             f" before is over (ramp {reference.ramp:g} s), the first of output {early[0][0] + 1} at"
             f" {early[0][1]:g} s: each starts from where that one has got to"
         )
-
-
-def _of_inputs(case):
-    """The changes of the inputs of an open loop."""
-    signal = steps(getattr(case.loop.controller, "signal", None))
-    return () if signal is None else signal.changes
 
 
 def _unseen(case):
@@ -154,32 +153,27 @@ def _replaced(name, signal, clock):
 
 def _above_rims(case):
     """On levels at t = 0 and setpoints above a rim."""
-    plant, length = case.loop.plant, case.loop.units[0]
-    rim, reference = np.asarray(plant.rim), steps(case.loop.reference)
+    plant, length, reference = case.loop.plant, case.loop.units[0], steps(case.loop.reference)
+    rim, names = np.asarray(plant.rim), case.names.get("tank", ("",) * plant.tanks)
+    tanks = [
+        f"tank {i + 1} ({name!r})" if name else f"tank {i + 1}" for i, name in enumerate(names)
+    ]
     limits = "rims are limits here and not physics"
     for i, level in enumerate(np.asarray(case.loop.x0)):
         if level > rim[i]:
             yield (
-                f"{_tank(case, i)} starts at {level:g} {length}, above its rim at {rim[i]:g}"
-                f" {length}: "
+                f"{tanks[i]} starts at {level:g} {length}, above its rim at {rim[i]:g} {length}: "
                 + ("what is above it overflows at once" if plant.overflow else limits)
             )
-    if reference is None:
-        return
-    for i, tank in enumerate(plant.outputs):
+    for i, tank in enumerate(plant.outputs if reference is not None else ()):
         targets = zip(reference.changes, np.asarray(reference.targets))
         highest = max([reference.initial[i], *(v for (_, j), v in targets if j == i)])
         if highest > rim[tank]:
             yield (
                 f"reference: output {i + 1} is asked for {highest:g} {length}, above the rim of"
-                f" {_tank(case, tank)} at {rim[tank]:g} {length}: "
+                f" {tanks[tank]} at {rim[tank]:g} {length}: "
                 + ("a level cannot get there" if plant.overflow else limits)
             )
-
-
-def _tank(case, i):
-    name = case.names.get("tank", {i: ""})[i]
-    return f"tank {i + 1} ({name!r})" if name else f"tank {i + 1}"
 
 
 def _pumps(case):
@@ -216,15 +210,15 @@ def _unused(case):
 
 def model_warnings(case: Case) -> list[str]:
     """Return a sentence for each parameter of a model that is off by more than its uncertainty."""
-    found = []
+    sentences = []
     for holder in ("controller", "observer"):
         part = getattr(case.loop, holder)
         inner = f"{holder}.law." if is_component(getattr(part, "law", None)) else f"{holder}."
         part = getattr(part, "law", part)
         model = getattr(part, "model", None)
         if model is not None and getattr(part, "reads_model", True):
-            found += _differences(case, holder, model, f"{inner}model.")
-    return found
+            sentences += _differences(case, holder, model, f"{inner}model.")
+    return sentences
 
 
 def _differences(case, holder, model, prefix):
@@ -232,31 +226,24 @@ def _differences(case, holder, model, prefix):
     # no level depends on rims that are no physics
     vacant = () if getattr(model, "overflow", False) else ("rim", "caught")
     theirs = {name: value for name, value, _ in walk(model) if name not in vacant}
-    preset = _preset_of(case)
+    preset = presets.find(case.origin).loop if case.origin else None
     for name, value, meta in walk(case.loop.plant):
         other = theirs.get(name)
-        if preset and _has(preset, f"plant.{name}", value) and _has(preset, prefix + name, other):
+        pairs = {f"plant.{name}": value, prefix + name: other}
+        if preset and all(_has(preset, n, v) for n, v in pairs.items()):
             continue  # a difference that the preset itself has is meant
         if value is None or other is None or np.shape(other) != np.shape(value):
             continue
-        own, other = np.asarray(value, dtype=float), np.asarray(other, dtype=float)
-        allowed, words = _uncertainty(case, f"plant.{name}", own)
-        if np.any(np.abs(other - own) > np.maximum(allowed, 1e-9 * np.abs(own))):
+        plant, other = np.asarray(value, dtype=float), np.asarray(other, dtype=float)
+        allowed, words = _uncertainty(case, f"plant.{name}", plant)
+        if np.any(np.abs(other - plant) > np.maximum(allowed, 1e-9 * np.abs(plant))):
             unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
-            here = f"{prefix}{name}"
             yield (
-                f"{here} = {_listed(other)}{unit}, and plant.{name} = {_listed(own)}{unit}: the"
-                f" model of the {holder} differs from the plant{words}; unless that is meant, set"
-                f" {here} = {_listed(own)} too (in a rig file a model that is left out follows the"
-                " plant)"
+                f"{prefix}{name} = {_listed(other)}{unit}, and plant.{name} ="
+                f" {_listed(plant)}{unit}: the model of the {holder} differs from the plant{words};"
+                f" unless that is meant, set {prefix}{name} = {_listed(plant)} too (in a rig file a"
+                " model that is left out follows the plant)"
             )
-
-
-def _preset_of(case):
-    """The loop of the preset with the case's name, None where there is none."""
-    paper, _, name = case.name.partition("/")
-    cases = presets.load(paper).cases if paper in presets.PAPERS else {}
-    return cases[name].loop if name in cases else None
 
 
 def _has(loop, name, value):

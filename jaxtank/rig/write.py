@@ -18,92 +18,62 @@ from jaxtank.measures import unreadable
 from jaxtank.rig import components, network, signals, template
 from jaxtank.rig.entry import Block, Line, allowed, block_of, lines_of, terse, toml, unit
 from jaxtank.rig.read import start_of
-from jaxtank.rig.schema import SECTIONS, targets
+from jaxtank.rig.schema import LISTS, SECTIONS, targets
 from jaxtank.rig.validation import unreachable
 from jaxtank.rig.values import MODELS, schedule_table, unscheduled
 from jaxtank.signals.base import Sum
 
 
 def origin_of(case):
-    """Return the preset that a case came from."""
-    if case.names:
-        return None, ()
-    loop = unscheduled(case.loop)
-    mine, statics = structures(loop), _statics(loop)
-    best, found = None, (None, ())
-    for paper in presets.PAPERS:
-        for other in presets.load(paper).cases.values():
-            same = _same_parts(loop, mine, other.loop)
-            if same is None:
-                continue
-            common = sum(a == b for a, b in zip(statics, _statics(other.loop)))
-            score = ("controller" in same, "observer" in same, other.name == case.name, common)
-            if best is None or score > best:
-                best, found = score, (other, same)
-    return found
+    """Return the preset that a case was made from, None without one."""
+    return None if case.names or not case.origin else presets.find(case.origin)
 
 
-def _same_parts(loop, mine, other):
-    """Sections in which `other` is like `loop`; None where no file makes one of the other."""
-    theirs = structures(other)
-    if mine["rest"] != theirs["rest"] or not _has_optional(other, "plant", loop):
-        return None
-    same = tuple(
-        name
-        for name, role in components.ROLES.items()
-        if mine[role.field] == theirs[role.field] and _has_optional(other, role.field, loop)
-    )
-    for name, role in components.ROLES.items():
-        if name not in same and not components.is_written(name, getattr(loop, role.field)):
-            return None
-    return same
-
-
-def _has_optional(other, field, loop):
-    """Whether the optional leaves that a part of `other` uses are in use in `loop`."""
-    return {name for name in _optional(other) if name.startswith(f"{field}.")} <= _optional(loop)
-
-
-def _statics(loop):
-    return [value for _, value, _ in walk(loop, kind="static")] + [
-        np.asarray(getattr(loop.plant, "area", ())).tolist()
-    ]
-
-
-def _optional(loop):
-    """Names of the optional leaves that are in use."""
-    return {name for name, value, meta in walk(loop) if meta.get("like") and value is not None}
-
-
-def structures(loop):
-    """Return pytree structures of the parts of a loop, with what a rig file can set made alike."""
+def structure(tree):
+    """Return the pytree structure of a component, with what a rig file can set made alike."""
 
     def settle(tree):
-        changed = {}
+        changes = {}
         for field in dataclasses.fields(tree):
             value = getattr(tree, field.name)
             if is_component(value):
-                changed[field.name] = settle(value)
+                changes[field.name] = settle(value)
             elif field.metadata.get("kind") == "static" and not isinstance(value, tuple):
-                changed[field.name] = type(value)()
+                changes[field.name] = type(value)()
             elif field.metadata.get("like"):
-                changed[field.name] = None
-        return dataclasses.replace(tree, **changed)
+                changes[field.name] = None
+        return dataclasses.replace(tree, **changes)
 
-    described = {"faults": None}
+    return jax.tree.structure(settle(tree))
+
+
+def _without_tables(loop):
+    """A loop without the parts that have tables of their own."""
+    parts = {"faults": None}
     if signals.steps(loop.reference) is not None:
-        described["reference"] = None
+        parts["reference"] = None
     if signals.disturbance_tables(loop.disturbance) is not None:
-        described["disturbance"] = None
-    plain = settle(dataclasses.replace(loop, **described))
-    fields = [role.field for role in components.ROLES.values()]
-    rest = dataclasses.replace(plain, **dict.fromkeys(fields))
-    parts = {field: jax.tree.structure(getattr(plain, field)) for field in fields}
-    return {"rest": jax.tree.structure(rest), **parts}
+        parts["disturbance"] = None
+    return dataclasses.replace(loop, **parts)
+
+
+def _in_use(tree):
+    """Names of the optional leaves that are in use, which no file can take away."""
+    return {name for name, value, meta in walk(tree) if meta.get("like") and value is not None}
+
+
+def _same_parts(loop, other):
+    """Names of the components that `other` has in the same structure as `loop`."""
+    pairs = [(name, getattr(loop, name), getattr(other, name)) for name in components.ROLES]
+    return [
+        name
+        for name, part, theirs in pairs
+        if structure(part) == structure(theirs) and _in_use(theirs) <= _in_use(part)
+    ]
 
 
 PARTS = {
-    "plant": "plant: the rig as it is",
+    "plant": "plant: the rig",
     "sensor": "sensor: how levels are measured",
     "observer": (
         "observer: estimated levels; observer.model.* follows controller.model.*, else plant.*,"
@@ -121,44 +91,44 @@ PARTS = {
 
 
 def sections(case, tankwise=False):
-    """Return the Blocks of a case."""
+    """Return the Blocks of a case: as its preset with changes where that describes it, else tank by
+    tank.
+    """
     if case.loop.safety_filter is not None and case.safety is None:
         raise InputError(
             f"{case.name}: cannot be written as a rig file: its safety filter is not that of"
             " Case.with_safety_filter"
         )
     case = case.replace(loop=dataclasses.replace(case.loop, safety_filter=None))
-    origin, same = (None, ()) if tankwise else origin_of(case)
+    origin = None if tankwise else origin_of(case)
+    if origin is not None:
+        try:
+            return _sections(case, origin)
+        except InputError:  # no table makes the preset's parts those of the case
+            pass
     try:
-        top, *built = _building(case, origin, same)
-        text = "\n".join(line for b in (top, *built) for line in terse(b))
-        base = start_of(tomllib.loads(text))
+        return _sections(case, None)
     except InputError as error:
         raise InputError(f"{case.name}: cannot be written as a rig file: {error}") from None
-    if structures(unscheduled(case.loop)) != structures(base.loop):
-        raise InputError(
-            f"{case.name}: cannot be written as a rig file: its controller or observer has another"
-            " model than its rig"
-        )
+
+
+def _sections(case, origin):
+    """`sections` of a case as a preset with changes; tank by tank where `origin` is None."""
+    loop = unscheduled(case.loop)
+    same = _same_parts(loop, origin.loop) if origin else ()
+    top, *built = _building(case, loop, origin, same)
+    text = "\n".join(line for block in (top, *built) for line in terse(block))
+    base = start_of(tomllib.loads(text))
+    alike = structure(_without_tables(loop)) == structure(_without_tables(base.loop))
+    if not alike or not _in_use(base.loop) <= _in_use(loop):
+        raise InputError("its controller or observer has another model than its rig")
     top.lines.extend(_reachable(case, base))
     if base.scenarios and not case.scenarios:
         top.lines.append(_none("scenario", "none of the preset's runs"))
     table = schedule_table(case.loop)
-    found = [
-        top,
-        *built,
-        *([block_of(SECTIONS["schedule"], table, case.loop.units)] if table else []),
-    ]
-    found += [*_values(case, base, origin is None, same), *_tuning(case)]
-    return [*found, *template.suggestions(case, _titles(found))]
-
-
-def _titles(found):
-    """The titles of the tables of these Blocks, and the names of the lines above the first."""
-    titles = {b.title for b in found} | {line.name for line in found[0].lines}
-    if any(line.name == "sine" for b in found for line in b.lines):
-        titles.add("[reference.sine]")
-    return titles
+    if table:
+        built.append(block_of(SECTIONS["schedule"], table, case.loop.units))
+    return [top, *built, *_values(case, base, origin is None, same), *_tuning(case)]
 
 
 def _none(name, doc="none"):
@@ -168,70 +138,66 @@ def _none(name, doc="none"):
 
 def _reachable(case, base):
     """The line `reachable` where it is not as in `base`."""
-    why, section = unreachable(case) if case.reachable else None, SECTIONS[""]
+    why = unreachable(case) if case.reachable else None
     if why:
         return [Line("reachable", False, {"unit": "-", "doc": why})]
     values = {"reachable": case.reachable} if case.reachable != base.reachable else {}
-    return lines_of(section, values)
+    return lines_of(SECTIONS[""], values)
 
 
-def _building(case, origin, same):
+def _building(case, loop, origin, same):
     """The Blocks that build a case before any value is set."""
-    loop, units = unscheduled(case.loop), case.loop.units
-    start = None if origin is None else origin.loop
+    start, units = (None if origin is None else origin.loop), case.loop.units
     if origin is None:
         top = {"name": case.name, "units": units}
-        entries = network.entries_of(loop, case.names)
-        found = [_of_rig(section, own, i, units) for section, i, own in entries]
+        blocks = [_of_rig(*entry, units) for entry in network.entries_of(loop, case.names)]
     else:
-        top, found = {"case": origin.name, "name": case.name}, []
-    for name, role in components.ROLES.items():
-        part = getattr(loop, role.field)
+        top, blocks = {"case": origin.name, "name": case.name}, []
+    for name in components.ROLES:
+        part = getattr(loop, name)
         if name not in same and components.has_section(name, part):
-            found.append(block_of(*components.values_of(name, part), units))
-    found += _reference(loop, start)
+            blocks.append(block_of(*components.values_of(name, part), units))
+    blocks += _reference(loop, start)
     disturbing = signals.disturbance_tables(loop.disturbance)
     if disturbing is None:
         raise InputError("its disturbance has no table")
     if origin is None and disturbing and "inflow" in disturbing[0][1]:
         disturbing = []  # it is a key of the tanks
     tables = [*disturbing, *signals.fault_tables(loop.faults)]
-    none = [
+    emptied = [
         _none(name)
         for name, field in (("inflow", "disturbance"), ("fault", "faults"))
         if getattr(loop, field) is None and getattr(start, field, None) is not None
     ]
-    first = Block("", [*lines_of(SECTIONS[""], top, units), *none])
-    return [first, *found, *(block_of(section, own, units) for section, own in tables)]
+    first = Block("", [*lines_of(SECTIONS[""], top, units), *emptied])
+    return [first, *blocks, *(block_of(section, values, units) for section, values in tables)]
 
 
-def _of_rig(section, own, number, units):
+def _of_rig(section, number, values, units):
     """The Block of a table of a rig; a tank or a pump without a name has a suggestion of one."""
-    found = block_of(section, own, units)
-    if own.get("name") == "":
-        text = f"{section.name} {number}"
-        found.lines[0] = found.lines[0]._replace(value=text, on=False)
-    return found
+    block = block_of(section, values, units)
+    if values.get("name") == "":
+        block.lines[0] = block.lines[0]._replace(value=f"{section.name} {number}", on=False)
+    return block
 
 
 def _reference(loop, start):
     """The Blocks of a reference; none of one that only a preset has."""
-    reference, units = signals.steps(loop.reference), loop.units
+    reference, units, section = signals.steps(loop.reference), loop.units, SECTIONS["reference"]
     if reference is None:
         if start is None:
             raise InputError("its reference has no table")
         return []
-    found = block_of(SECTIONS["reference"], signals.ramp_values(reference), units)
+    block = block_of(section, signals.ramp_values(reference), units)
     if reference.filter is None:
-        key = next(k for k in SECTIONS["reference"].keys if k.name == "filter")
         none = [0.0] * reference.channels
-        found.lines.append(Line(key.name, none, key.meta(units), False))
+        block.lines.append(Line("filter", none, section["filter"].meta(units), False))
     if isinstance(loop.reference, Sum):
         values = signals.sine_values(loop.reference.second)
-        return [found, block_of(SECTIONS["reference.sine"], values, units)]
+        return [block, block_of(SECTIONS["reference.sine"], values, units)]
     if start is not None and isinstance(start.reference, Sum):
-        found.lines.append(_none("sine"))
-    return [found]
+        block.lines.append(_none("sine"))
+    return [block]
 
 
 def _values(case, base, tankwise, same):
@@ -245,8 +211,10 @@ def _values(case, base, tankwise, same):
     groups["clock"] = [
         Line(toml(f"clock.{name}"), getattr(case.clock, name), meta) for name, meta in CLOCK.items()
     ]
-    parts = [Block("", lines, (PARTS[part],)) for part, lines in groups.items()]
-    return [Block("[values]", []), *parts]
+    return [
+        Block("[values]", []),
+        *(Block("", lines, (PARTS[part],)) for part, lines in groups.items()),
+    ]
 
 
 def _settable(case):
@@ -265,12 +233,11 @@ def _settable(case):
 def _is_built(case, name, tankwise, same):
     """Whether the tables that build a case set the field `name` of its loop."""
     part = name.partition(".")[0]
-    built = tankwise and (part == "plant" or name in targets(*network.LISTS))
-    return built or any(
-        part == role.field and section not in same and components.has_section(section, own)
-        for section, role in components.ROLES.items()
-        for own in (getattr(case.loop, role.field),)
-    )
+    if tankwise and (part == "plant" or name in targets(*LISTS)):
+        return True
+    if part not in components.ROLES or part in same:
+        return False
+    return components.has_section(part, getattr(case.loop, part))
 
 
 def _line(case, name, value, meta, built, base):
@@ -298,9 +265,8 @@ def _followed(loop, name):
     """The text of the value that `name` of a model follows; None of another name."""
     for model in MODELS:
         if name.startswith(model):
-            inner = name.removeprefix(model)
-            owners = ("plant.",) if model != MODELS[-1] else (*MODELS[:-1], "plant.")
-            texts = (_text_of(loop, owner + inner) for owner in owners)
+            owners = (*MODELS[:-1], "plant.") if model == MODELS[-1] else ("plant.",)
+            texts = (_text_of(loop, owner + name.removeprefix(model)) for owner in owners)
             return next((text for text in texts if text is not None), None)
     return None
 
@@ -308,33 +274,35 @@ def _followed(loop, name):
 def _tuning(case):
     """[limits] to [[scenario]]: what is tuned, by what, and what is uncertain."""
     plain = lambda value: value if isinstance(value, str) else np.asarray(value).tolist()
+    weights = template.measures(case, case.objective)
     tables = (
-        ("limits", case.limits, plain, template.of_measure, str, template.limits),
-        ("free", case.free, lambda spec: list(Free(*spec)), template.of_free, toml, template.free),
-        ("objective", case.objective, float, template.of_measure, str, template.objective),
-        ("uncertain", case.uncertain, float, template.of_uncertain, toml, template.uncertain),
+        ("limits", case.limits, plain, template.of_measure, template.measures(case, case.limits)),
+        ("free", case.free, lambda f: list(Free(*f)), template.of_free, template.free(case)),
+        ("objective", case.objective, float, template.of_measure, weights),
+        ("uncertain", case.uncertain, float, template.of_uncertain, template.uncertain(case)),
     )
-    found = []
-    for title, own, text, about, key, more in tables:
-        # functions of Python stay behind, commented out
-        off = unreadable(own) if title in ("limits", "objective") else ()
+    blocks = []
+    for title, values, text, about, more in tables:
+        of_measures = about is template.of_measure
+        # functions of Python are left out of the file, commented out
+        off, key = (unreadable(values), str) if of_measures else ((), toml)
         lines = [
             Line(key(name), text(value), about(case, name), name not in off)
-            for name, value in own.items()
+            for name, value in values.items()
         ]
         on = title != "objective" or any(line.on for line in lines)
-        found.append(Block(SECTIONS[title].title, [*lines, *more(case)], on=on))
+        blocks.append(Block(SECTIONS[title].title, [*lines, *more], on=on))
     if case.covariance is not None:
         names, rows = case.covariance
         values = {"names": names, "matrix": [list(map(float, row)) for row in rows]}
-        found.append(block_of(SECTIONS["covariance"], values))
+        blocks.append(block_of(SECTIONS["covariance"], values))
     if case.safety is not None:
-        found.append(block_of(SECTIONS["safety_filter"], dict(case.safety), case.loop.units))
+        blocks.append(block_of(SECTIONS["safety_filter"], dict(case.safety), case.loop.units))
     if case.log:
         bare = {"unit": "-", "doc": ""}
         columns = [Line(slot, plain(spec), bare) for slot, spec in case.log.items()]
-        found.append(Block(SECTIONS["log"].title, columns))
-    return found + [block_of(SECTIONS["scenario"], s._asdict()) for s in case.scenarios]
+        blocks.append(Block(SECTIONS["log"].title, columns))
+    return blocks + [block_of(SECTIONS["scenario"], s._asdict()) for s in case.scenarios]
 
 
 WIDTH = 110
@@ -349,7 +317,7 @@ def dump(case: Case, tankwise: bool = False) -> str:
     Parameters
     ----------
     case : Case
-    tankwise : whether to describe it tank by tank even where a preset has the same rig
+    tankwise : whether to describe it tank by tank even where it comes from a preset
 
     Returns
     -------
@@ -402,7 +370,7 @@ def complete(case: Case, tankwise: bool = False) -> str:
     Parameters
     ----------
     case : Case
-    tankwise : whether to describe it tank by tank even where a preset has the same rig
+    tankwise : as in `dump`
 
     Returns
     -------
@@ -418,7 +386,12 @@ def complete(case: Case, tankwise: bool = False) -> str:
     >>> "#[[fault]]" in rig.complete(presets.find("cascaded/pi"))
     True
     """
-    return _text([HEAD.splitlines()] + [_commented(block) for block in sections(case, tankwise)])
+    blocks = sections(case, tankwise)
+    titles = {b.title for b in blocks} | {line.name for line in blocks[0].lines}
+    if any(line.name == "sine" for block in blocks for line in block.lines):
+        titles.add("[reference.sine]")
+    blocks += template.suggestions(case, titles)
+    return _text([HEAD.splitlines()] + [_commented(block) for block in blocks])
 
 
 def short(case: Case) -> str:
@@ -443,56 +416,48 @@ def short(case: Case) -> str:
     >>> "reference.sine" in rig.short(presets.find("cascaded/pi"))
     False
     """
-    origin, _ = origin_of(case)
-    if origin is None:
+    origin, blocks = origin_of(case), sections(case)
+    if origin is None or blocks[0].lines[0].name != "case":
         return complete(case)
-    theirs, mine = sections(presets.find(origin.name)), sections(case)
     head = f"# {origin.title}; `jaxtank init {origin.name}` without --short prints every key"
-    kept = _kept(mine, theirs, _tuned(case))
-    return _text([[head], *(_commented(block._replace(prose=())) for block in kept)])
+    different = _different(blocks, sections(origin), case)
+    return _text([[head], *(_commented(block._replace(prose=())) for block in different)])
 
 
-def _tuned(case):
-    """Names of [values] that a short file has as suggestions: what is free, clock and noise."""
-    free = {name.split("[")[0] for name in case.free}
-    return free | {"clock.dt", "clock.duration", "sensor.noise"}
-
-
-def _kept(mine, theirs, suggested):
-    """The Blocks of a file that differ from its preset's, or that SHORT or `suggested` names."""
-    known = {line for block in theirs for line in terse(block)}
-    same, in_values, kept = _same_tables(mine, theirs), False, []
-    for block in mine:
+def _different(blocks, preset, case):
+    """The Blocks of a file that differ from its preset's, and those that SHORT names; of [values]
+    also, as suggestions, what is free, the clock and the noise.
+    """
+    suggested = {name.split("[")[0] for name in case.free}
+    suggested |= {"clock.dt", "clock.duration", "sensor.noise"}
+    known = {line for block in preset for line in terse(block)}
+    tables, same, in_values, different = _by_title(blocks), _by_title(preset), False, []
+    for block in blocks:
         in_values = block.title == "[values]" or (in_values and not block.title)
         if in_values:
-            found = (_differing(line, known, suggested) for line in block.lines)
-            lines = sorted(filter(None, found), key=lambda line: not line.on)
-        elif block.on and (block.title in ("", *SHORT) or block.title not in same):
+            lines = [line for line in block.lines if line.on]
+            new = [line for line in lines if not set(terse(Block("", [line]))) <= known]
+            old = [line for line in lines if line not in new]
+            old = [line._replace(on=False) for line in old if line.name.strip('"') in suggested]
+            lines = new + old
+        elif block.on and (
+            block.title in ("", *SHORT) or tables[block.title] != same.get(block.title)
+        ):
             lines = [line for line in block.lines if line.on]
         else:
             continue
         if lines or block.title:
-            kept.append(block._replace(lines=lines))
-    return kept
+            different.append(block._replace(lines=lines))
+    return different
 
 
-def _differing(line, known, suggested):
-    """A line of [values] that the preset lacks, commented out if it is suggested; else None."""
-    if not line.on:
-        return None
-    if not set(terse(Block("", [line]))) <= known:
-        return line
-    return line._replace(on=False) if line.name.strip('"') in suggested else None
-
-
-def _same_tables(mine, theirs):
-    """Titles of the tables that two files have alike, those of a list in the same number."""
-    tables = [{}, {}]
-    for found, blocks in zip(tables, (mine, theirs)):
-        for block in blocks:
-            if block.on:
-                found.setdefault(block.title, []).append(terse(block))
-    return {title for title, lines in tables[0].items() if tables[1].get(title) == lines}
+def _by_title(blocks):
+    """{title: [lines of each table of that title]}."""
+    tables = {}
+    for block in blocks:
+        if block.on:
+            tables.setdefault(block.title, []).append(terse(block))
+    return tables
 
 
 def _text(blocks):
@@ -511,15 +476,10 @@ def _commented(block):
     lines += [line for sentence in block.prose for line in _wrapped(sentence)]
     lines += [("" if block.on else "#") + block.title] * bool(block.title)
     for line in block.lines:
-        lines += _wrapped(_about(line))
+        about = f"{line.meta['doc']}{unit(line.meta)}", allowed(line.meta, line.value)
+        lines += _wrapped(", ".join(filter(None, about)))
         lines.append(("" if block.on and line.on else "#") + f"{line.name} = {toml(line.value)}")
     return lines
-
-
-def _about(line):
-    """What a key is, its unit and its range."""
-    own = f"{line.meta['doc']}{unit(line.meta)}"
-    return ", ".join(filter(None, [own, allowed(line.meta, line.value)]))
 
 
 def _wrapped(sentence):

@@ -9,8 +9,7 @@ from jaxtank import presets, rig
 from jaxtank.core.tree import parameters, split_index
 from tuning.problem.problem import Problem
 
-# the others compile for long
-QUICK = ("gouta2022/pi", "mirakhorli/sfc", "calofir/backstepping", "cascaded/pi")
+QUICK = ("cascaded/pi",)  # the others compile for long
 COARSE = {
     # why the slope is only good to this share of the largest one
     "mirakhorli/smc-printed": (
@@ -49,7 +48,6 @@ def cases():
                 yield pytest.param(full, marks=() if full in QUICK else pytest.mark.slow)
 
 
-@pytest.mark.slow_for("calofir/backstepping", "gouta2022/pi", "mirakhorli/sfc")
 @pytest.mark.parametrize("name", list(cases()))
 def test_slopes_of_the_default_cost(name):
     paper = presets.load(name.split("/")[0])

@@ -44,6 +44,7 @@ def test_rest_by_algebra():
     np.testing.assert_allclose(flows, [through, flow(C2, 15.0) - through], rtol=1e-6)
 
 
+@pytest.mark.slow_for("1250.0")
 @pytest.mark.parametrize("start", [450.0, 1250.0])
 def test_the_faults_are_those_of_scipy(start):
     """The equations with a leak, and with a half plugged pipe, under the inputs of the run."""

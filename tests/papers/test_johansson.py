@@ -45,6 +45,7 @@ def test_what_is_printed_is_reproduced(name):
         assert verdicts[f"{what}, {PHASES[name]} phase"] == "reproduced", verdicts
 
 
+@pytest.mark.slow_for("pi-nonminimum")
 @pytest.mark.parametrize("name", CASES)
 def test_the_run_is_that_of_scipy(name):
     """The equations and the PI written out, integrated from sample to sample."""

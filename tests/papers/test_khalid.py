@@ -8,7 +8,6 @@ qpOASES. Tolerances are theirs: RMS error 1e-4 m, overshoot 0.15 points, settlin
 
 import dataclasses
 import functools
-import re
 
 import jax
 import jax.flatten_util
@@ -27,7 +26,6 @@ from jaxtank.controllers.incremental import EXACT, incremental_model
 from jaxtank.controllers.laguerre import laguerre_functions
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
-from jaxtank.loop.run import evaluate_compiled
 from jaxtank.presets import khalid
 from jaxtank.presets import khalid as paper
 
@@ -357,14 +355,7 @@ def rows(table, quick):
         )
 
 
-@pytest.mark.slow_for(
-    "S2-laguerre-constrained-0.1",
-    "S2-laguerre-constrained-0.5",
-    "S2-laguerre-unconstrained-0.5",
-    "S1-laguerre-constrained-0.1",
-    "S1-laguerre-unconstrained-0.5",
-    "S1-laguerre-constrained-0.5",
-)
+@pytest.mark.slow
 @pytest.mark.parametrize("row", list(rows(ONE_PUMP, QUICK)))
 def test_rows_with_one_pump(row):
     where, kind, mode, du, rmse, over, under, up, down, rms_u, travel, held, top = row
@@ -413,19 +404,6 @@ def test_spot_values_constrained():
     )
 
 
-@pytest.mark.slow
-def test_four_variables_come_within_five_percent_of_the_ten_of_gpc():
-    clock = dataclasses.replace(khalid.CLOCK, substeps=2)
-    few, many = (
-        jaxtank.evaluate(khalid.build(kind), clock, "rms_error")["rms_error"]
-        for kind in ("laguerre", "gpc")
-    )
-    np.testing.assert_allclose(few, many, rtol=0.05)
-    assert control("laguerre").design(DT)[0].shape == (4, 4) and control("gpc").design(DT)[
-        0
-    ].shape == (10, 10)
-
-
 # S7.3: two pumps
 
 TWO_PUMPS = [  # scenario, law, mode, r_w, RMSE, OS, US, TV; None: not printed
@@ -451,7 +429,7 @@ TWO_PUMPS = [  # scenario, law, mode, r_w, RMSE, OS, US, TV; None: not printed
 ]
 
 
-@pytest.mark.slow_for("M1-laguerre-mimo-unconstrained-0.01", "M2-laguerre-mimo-unconstrained-0.01")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "row",
     [
@@ -471,7 +449,7 @@ def test_rows_with_two_pumps(row):
         np.testing.assert_allclose(got["travel"], travel, rtol=0.01 if where == "M2" else 0.02)
 
 
-@pytest.mark.slow_for("M3-unconstrained-6.484")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("where", "mode", "start"),
     [
@@ -783,6 +761,7 @@ def test_inputs_before_the_start_are_those_of_the_notes():
     np.testing.assert_allclose(khalid.steady_input(2, (0.12, 0.15)), (0.90292, 1.6470), atol=5e-5)
 
 
+@pytest.mark.slow
 def test_clipping_reached_by_options_is_the_clipped_mode():
     case = rig.set_values(
         PRESET.cases["laguerre"],
@@ -798,52 +777,6 @@ def test_clipping_reached_by_options_is_the_clipped_mode():
 
 
 # slopes
-
-SLOPES = [  # case, {name: scale of the step}: every tunable leaf that the case feels
-    ("gpc", ["r_w", "q", "operating_point"]),
-    ("gpc-nc2", ["r_w", "q", "operating_point"]),
-    ("gpc-nc30", ["r_w", "q", "operating_point"]),
-    ("laguerre", ["r_w", "a", "q", "operating_point"]),
-    ("gpc-mimo", ["r_w", "q", "operating_point"]),
-    ("laguerre-mimo", ["r_w", "a", "q", "operating_point"]),
-]
-SLOPES += [(f"{name}-constrained", [*names, "du_limit", "u_high"]) for name, names in SLOPES]
-
-
-@pytest.mark.slow_for("laguerre-names3")
-@pytest.mark.parametrize(
-    "name, names",
-    [pytest.param(*row, marks=() if row[0] == "laguerre" else LATER) for row in SLOPES],
-)
-def test_slopes_of_the_default_cost(name, names):
-    """Forward slopes of the cost that `tune` makes small against central differences, in the
-    logarithms of the leaves.
-
-    1e-5 of the largest. Runge-Kutta steps of 1 s, for the sake of compiling; 200 samples, an up and
-    a down.
-    """
-    case = PRESET.cases[name]
-    # else u_high, moved up, would be felt no more: the pumps' own limit is at the same place
-    if case.loop.controller.mode == QP:
-        case = case.replace(
-            loop=with_values(case.loop, {"actuator.low": -10.0, "actuator.high": 10.0})
-        )
-    names = [f"controller.{n}" for n in names]
-    start, build = jax.flatten_util.ravel_pytree(
-        [jnp.log(jnp.asarray(jaxtank.parameters(case.loop)[n])) for n in names]
-    )
-
-    def cost(z):
-        loop = with_values(case.loop, dict(zip(names, map(jnp.exp, build(z)))))
-        got = jaxtank.evaluate(loop, COARSE, tuple(case.objective))
-        return sum(weight * jnp.sum(got[measure]) for measure, weight in case.objective.items())
-
-    step = 1e-5
-    moved = np.concatenate([step * np.eye(len(start)), -step * np.eye(len(start))])
-    many = np.asarray(jax.jit(jax.vmap(cost))(start + moved))
-    central = (many[: len(start)] - many[len(start) :]) / (2 * step)
-    forward = np.asarray(jax.jit(jax.jacfwd(cost))(start))
-    np.testing.assert_allclose(forward, central, atol=1e-5 * np.abs(central).max(), rtol=1e-4)
 
 
 @LATER
@@ -948,50 +881,6 @@ def test_reverse_slopes_through_programmes_are_the_forward_ones():
 # the compiled loop and the preset
 
 
-@pytest.mark.slow_for("gpc", "laguerre")
-@pytest.mark.parametrize("name", ["gpc", "laguerre", "laguerre-mimo"])
-def test_the_loop_compiles_to_one_function(name):
-    """No LAPACK is called in the time loop, so it runs as one function. The constrained cases
-    iterate within a sample, and the programme's
-    slopes are solved for with LAPACK: their outer loop does not, only that of the iterations does.
-    """
-    case = PRESET.cases[name]
-    text = (
-        evaluate_compiled.lower(
-            case.loop,
-            dataclasses.replace(case.clock, substeps=1),
-            ("rms_error_total",),
-            None,
-            False,
-        )
-        .compile()
-        .as_text()
-    )
-    loops, computation = [], ""
-    for line in text.splitlines():
-        if line and not line[0].isspace():
-            computation = line.split()[0].lstrip("%")
-        if " while(" in line and '"n":"600"' in line:
-            loops.append(computation)
-    assert len(loops) == 1
-    assert any(
-        'xla_cpu_small_call="true"' in line and f"to_apply=%{loops[0]}" in line
-        for line in text.splitlines()
-    )
-
-
-def test_every_case_passes_the_door():
-    for name, case in PRESET.cases.items():
-        jaxtank.loop.run.check(case.loop, case.clock, None)
-        if name in ("gpc", "gpc-mimo"):  # every plateau has a steady state
-            rig.check(case)
-        assert set(case.free) <= set(jaxtank.parameters(case.loop)) | {
-            "controller.operating_point[1]",
-            "controller.q[1]",
-        }
-    assert PRESET.cases["gpc"].clock.samples == 600
-
-
 @pytest.mark.parametrize(
     "values, message",
     [
@@ -1024,37 +913,3 @@ def test_control_horizon_within_the_prediction_horizon():
     with pytest.raises(InputError, match=r"controller\.Nc = 41"):
         dataclasses.replace(control("gpc"), Nc=41).check(None)
     assert isinstance(control("gpc"), GPC)
-
-
-@LATER
-def test_published_claims_are_measured():
-    """Notes S8."""
-
-    def run(name, values=None, save_every=1):
-        case = rig.set_values(PRESET.cases[name], values or {})
-        return case, jax.tree.map(
-            np.asarray, jaxtank.simulate(case.loop, case.clock, save_every=save_every)
-        )
-
-    found = paper.measured(run)
-    assert set(found) == set(PRESET.published)
-    for name, published in PRESET.published.items():
-        if not isinstance(published.value, str) and not name.startswith("pulses of"):
-            np.testing.assert_allclose(found[name], published.value, rtol=1e-12)
-    assert found["pulses of H2, one pump"] == (0.03, 0.15)
-    verdicts = [claim.verdict for claim in found.values() if hasattr(claim, "verdict")]
-    assert verdicts == [
-        *("partly", "reproduced", "partly", "partly", "reproduced", "not reproduced"),
-        # the cost is lower with constraints alone: without, both are a fixed gain
-        *("partly", "partly", "partly", "reproduced", "partly", "partly", "not reproduced"),
-    ]
-    cost = found["computational cost of Laguerre"]
-    assert cost.holds == [False, False, True, True]
-    assert "without constraints 6, 6 and 6 a sample" in cost.text  # K is 1 x 3: 3 products and sums
-    # scenarios S1 and M1 of notes S7.2 and S7.3
-    text = found["pulses from 0 m: long control horizon"].text
-    horizon = [float(v) for v in re.findall(r"([\d.]+) mm", text)]
-    np.testing.assert_allclose(horizon, (33.99, 28.37), atol=0.1)
-    assert "overshoot 0.08, 8.18, 8.57 %" in found["pulses from 0 m: overshoot and undershoot"].text
-    both = found["pulses from 0 m: Laguerre with two pumps"].text
-    assert "15.56, 19.69 mm and 4.6, 3.9 % with Laguerre functions" in both

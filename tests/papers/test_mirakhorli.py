@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import in_metres, loops_in
+from helpers import in_metres
 from scipy.integrate import solve_ivp
 
 import jaxtank
@@ -38,21 +38,17 @@ from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, number, with_values
 from jaxtank.plants import state_coupled_four_tank
 from jaxtank.plants.network import TankNetwork
-from jaxtank.plants.rigs import johansson
 from jaxtank.plants.runge_kutta import integrate
 from jaxtank.presets import load
-from jaxtank.presets import mirakhorli as rows
 from jaxtank.presets.mirakhorli import (
     GAIN,
     RELAY,
     SETPOINT,
     UNROUNDED_SPLIT,
-    measured,
     plant,
     response,
     sliding,
 )
-from tuning.report import papers
 
 PLANT = plant()
 SHARP = dataclasses.replace(PLANT, knee=1e-9)  # with the roots of plant and surface both exact
@@ -172,42 +168,6 @@ def test_zeros_directions_and_relative_gains(split, at_set_point, zeros, gain, d
     np.testing.assert_allclose(
         (1 + found * T3) * (1 + found * T4), (1 - a) * (1 - b) / (a * b), rtol=1e-9
     )
-
-
-@pytest.mark.parametrize(
-    "phase, levels, printed, times, zeros, gain",
-    [
-        (
-            "minimum",
-            (12.26, 12.78, 1.63, 1.41),
-            (12.4, 12.7, 1.8, 1.4),
-            (62.7, 90.3, 23.9, 30.0),
-            (-0.0172, -0.0580),
-            1.40,
-        ),
-        (
-            "non-minimum",
-            (12.44, 13.17, 4.73, 4.99),
-            (12.6, 13.0, 4.8, 4.9),
-            (63.2, 91.4, 39.0, 56.1),
-            (0.0128, -0.0562),
-            -0.636,
-        ),
-    ],
-)
-def test_johansson(phase, levels, printed, times, zeros, gain):
-    """Time constants and zeros of the minimum phase are those at the printed levels, which are
-    rounded; its own equilibrium is 1.5 % off.
-    """
-    rig_, u = johansson(phase)
-    np.testing.assert_allclose(steady_levels(rig_, u), levels, atol=5e-3)
-    model = linearise(rig_, printed, u)
-    np.testing.assert_allclose(-1 / np.diag(model[0]), times, atol=0.05)
-    np.testing.assert_allclose(relative_gain_array(*model)[0, 0], gain, atol=5e-4)
-    at = printed if phase == "minimum" else steady_levels(rig_, u)
-    np.testing.assert_allclose(transmission_zeros(*linearise(rig_, at, u)), zeros, atol=6e-5)
-    with pytest.raises(InputError, match="phase"):
-        johansson("maximum")
 
 
 @pytest.mark.parametrize(
@@ -384,6 +344,7 @@ def test_steady_states_along_a_reference_are_those_of_every_sample():
 # S4.3: where a sliding mode exists
 
 
+@pytest.mark.slow
 def test_the_bounds_of_the_sliding_surface():
     T1, _, T3, T4 = -1 / np.diag(linearise(SHARP, X0, U0)[0])
     (a, b), tanks = SHARP.split, lower_tanks(SHARP, X0)
@@ -577,6 +538,7 @@ def exact(start, seconds):
     ).y[:, -1]
 
 
+@pytest.mark.slow
 def test_error_of_the_integrator():
     """RK4 from empty tanks loses its order to the root; the error at 100 s of the prototype's root
     is the prototype's, to its two digits.
@@ -785,6 +747,7 @@ def test_the_printed_controller_never_arrives():
     np.testing.assert_allclose(settled.mean(axis=0), 2.5, atol=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "values",
     [
@@ -801,6 +764,7 @@ def test_neither_sampling_nor_a_boundary_layer_cures_the_printed_controller(valu
     assert np.mean(np.abs(np.diff(late, axis=0)) > 4.9) > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slope, chatters", [(0.040, False), (0.050, True)])
 def test_when_the_printed_controller_chatters(slope, chatters):
     """One-sample gain (lambda + ks/phi) rho(G^-1 D) below 1: lambda + ks/phi < 0.0418 1/s, rho =
@@ -924,6 +888,7 @@ def test_chatter_of_the_corrected_controller_with_a_sign(dt, travel):
     np.testing.assert_allclose(np.ptp(trajectory.x[late:, 0]), 0.058 * dt / 0.1, rtol=0.07)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "values, cross, same",
     [
@@ -1090,6 +1055,7 @@ def test_steady_errors_once_an_outlet_has_changed(reading, high, controller, err
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "reading, high, rms",
     [("k1 x 1.3", 5.0, (3.6, 1.1)), ("direct branch x 0.7", 5.0, (1.65, 1.20))],
@@ -1126,9 +1092,6 @@ def test_the_integrator_stands_while_a_pump_is_at_its_limit():
 # what must hold of any law here
 
 
-CASES = ("sfc", "smc", "hybrid", "smc-printed", "lqi")
-
-
 def cost_of(case):
     """The case's own cost as a function of {leaf: value}."""
 
@@ -1144,43 +1107,7 @@ def leaves_of(case):
     return {n: v for n, v in jaxtank.parameters(case.loop).items() if n in tunable}
 
 
-@pytest.mark.slow_for("hybrid", "lqi", "smc-warm")
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("sfc", "smc-warm", "hybrid", "lqi"),
-        *(
-            pytest.param(name, marks=pytest.mark.slow)
-            for name in ("sfc-warm", "smc", "hybrid-warm", "lqi-warm")
-        ),
-    ],
-)
-def test_slopes_of_the_default_cost_against_differences(name):
-    """Along every tunable leaf, in every entry: forward equals central differences to 1e-5 of the
-    largest slope of the leaf.
-    """
-    case = load("mirakhorli").cases[name]
-    cost, point = cost_of(case), leaves_of(case)
-    slopes = jax.jit(jax.jacfwd(cost))({n: jnp.asarray(v) for n, v in point.items()})
-    value = jax.jit(cost)
-    for leaf, at in point.items():
-        for index in np.ndindex(np.shape(at)):
-            # each entry is moved by a share of itself, or of its leaf where it is 0; a weight
-            # cannot be moved below 0
-            size = max(abs(float(np.asarray(at)[index])), 1e-3 * float(np.abs(at).max()))
-            bump = np.zeros(np.shape(at))
-            bump[index] = 2e-5 * size
-            found = np.asarray(slopes[leaf])[index]
-            ends = [float(value({**point, leaf: at + k * bump})) for k in (-1, 1)]
-            difference = (ends[1] - ends[0]) / (2 * bump[index])
-            np.testing.assert_allclose(
-                found,
-                difference,
-                rtol=1e-5,
-                atol=1e-5 * np.abs(slopes[leaf]).max() + 2e-11 / bump[index],
-            )
-
-
+@pytest.mark.slow
 def test_the_printed_controller_has_no_useful_slopes():
     """Every voltage is a limit, 0 or 5 V, and jumps as the surface crosses zero: the derivative of
     a sign is 0, so every slope is 0, while the cost itself moves in steps.
@@ -1197,20 +1124,7 @@ def test_the_printed_controller_has_no_useful_slopes():
     assert np.ptp(moved) > 1e-2
 
 
-@pytest.mark.slow_for("sfc", "smc", "smc-printed")
-@pytest.mark.parametrize("name", CASES)
-def test_each_case_compiles_to_one_loop(name):
-
-    from jaxtank.loop.run import evaluate_compiled
-
-    case = load("mirakhorli").cases[name]
-    compiled = evaluate_compiled.lower(
-        case.loop, case.clock, ("rms_error_total", "max_level"), None, False
-    ).compile()
-    assert loops_in(compiled) >= 1
-
-
-@pytest.mark.slow_for("lqi")
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sfc", "hybrid", "lqi"])
 def test_tanks_in_another_order_give_the_same_run(name):
     """Left and right exchanged (tank 1 with 2, 3 with 4, pump 1 with 2) everywhere: the answers are
@@ -1323,72 +1237,3 @@ def test_a_controller_that_does_not_fit_is_refused_by_input_validation(control, 
     case = load("mirakhorli").cases["sfc"]
     with pytest.raises(InputError, match=words):
         jaxtank.simulate(dataclasses.replace(case.loop, controller=control), case.clock)
-
-
-def test_names_of_the_contract():
-    cases = load("mirakhorli").cases
-    fitted = {f"{kind}-fitted" for kind in ("smc", "sfc", "hybrid")}
-    assert set(cases) == {n + suffix for n in CASES for suffix in ("", "-warm")} | fitted
-    names = jaxtank.parameters(cases["hybrid"].loop)
-    assert np.shape(names["controller.K"]) == (2, 4)
-    assert {f"controller.{n}" for n in ("surface", "ks", "phi", "b", "w")} <= set(names)
-    assert (
-        rig.set_values(cases["hybrid"], {"controller.pairing": "same"}).loop.controller.pairing
-        == "same"
-    )
-    assert {"controller.Q", "controller.R"} <= set(jaxtank.parameters(cases["lqi"].loop))
-
-
-def test_every_published_number_that_can_be_measured_is():
-    found = measured(papers.runner("mirakhorli"))
-    published = load("mirakhorli").published
-    assert set(found) <= set(published)
-    verdicts = {name: claim.verdict for name, claim in found.items() if hasattr(claim, "verdict")}
-    assert verdicts["chattering of the SMC"] == "reproduced"
-    # on the rig that was fitted to Table 3, and not with the cases as they are
-    assert verdicts["SFC rises more slowly"] == "partly"
-    assert "SMC 49.3 s, SFC 42.4 s, hybrid 47.9 s" in found["SFC rises more slowly"].text
-    # by the printed gains, and not once both are tuned
-    assert verdicts["hybrid against SMC and SFC"] == "partly"
-    assert verdicts["Table 3 with the cases as they are"] == "partly"
-    assert "1 of 16 are within 10 %" in found["Table 3 with the cases as they are"].text
-    numbers = lambda name: [found[f"{name}, {which}"] for which in ("SMC", "SFC", "hybrid")]
-    np.testing.assert_allclose(numbers("overshoot"), (43.7, 9.0, 13.5), atol=0.1)
-    np.testing.assert_allclose(numbers("rise time"), (27.5, 34.7, 28.4), atol=0.1)
-    assert verdicts["settling time, SMC"] == "reproduced" and found["relative degree"] == (1, 1)
-    assert verdicts["sign of the SFC"] == verdicts["settling of the hybrid"] == "not reproduced"
-    for name in ("non-minimum phase", "hybrid: steady-state error"):
-        assert verdicts[name] == "reproduced", found[name]
-    assert "-0.1072 and +0.0247 1/s" in found["non-minimum phase"].text
-    assert verdicts["SFC is an optimal gain"] == "reproduced"  # by a choice of Q, R and gamma
-    assert verdicts["hybrid switches between the controllers"] == "reproduced"
-    assert (
-        verdicts["30 % change of an outlet"]
-        == verdicts["zero steady-state error of the SFC"]
-        == "partly"
-    )
-
-
-def test_the_verdict_on_zero_error_follows_the_numbers(monkeypatch):
-    """With LQI in the place of SFC the claim holds; with a pump that is weaker than the model in
-    every run it does not.
-    """
-    swapped = {"sfc": "lqi", "sfc-warm": "lqi-warm"}
-
-    def reported(instead, always):
-        def other(name, values=None, save_every=1):
-            own = "controller." if name in instead else None  # gains that the other has not
-            values = {k: v for k, v in (values or {}).items() if not own or own not in k}
-            values = {**{k.replace(".", "__"): _hash(v) for k, v in values.items()}, **always}
-            return run(instead.get(name, name), **values)
-
-        other.cost = lambda *_: 1.0  # of another row
-        monkeypatch.setattr(rows, "_linear", lambda _: {})  # of others
-        return measured(other)["zero steady-state error of the SFC"].verdict
-
-    assert reported(swapped, {}) == "reproduced"
-    assert reported({}, {"plant__pump_gain": (0.9 * 27.43, 19.55)}) == "not reproduced"
-
-
-def _hash(value):
-    return tuple(map(_hash, value)) if isinstance(value, list) else value

@@ -11,7 +11,6 @@ from helpers import assert_same_case as assert_same
 
 from jaxtank import presets, rig
 from jaxtank.case import Free
-from jaxtank.core.clock import Clock
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.files import LARGEST_TEXT
 from jaxtank.core.tree import parameters
@@ -60,18 +59,6 @@ def round_trip(case, folder):
 def test_overrides_are_read_back(gouta, values, tmp_path):
     case = gouta("backstepping-ff", values)
     assert_same(round_trip(case, tmp_path), case)
-
-
-def test_a_clock_finer_than_its_preset_allows_is_read_back(gouta, tmp_path):
-    # each of the two is out of range beside the preset's other one: only together do they describe
-    # a run
-    for clock in (
-        Clock(dt=1e-5, duration=1.0),
-        Clock(dt=20.0, duration=10_000.0),
-        Clock(dt=0.001, duration=0.005),
-    ):
-        case = gouta("ngpc").replace(clock=clock)
-        assert round_trip(case, tmp_path).clock == clock
 
 
 def test_another_reference_limits_free_and_objective_are_read_back(gouta, tmp_path):
@@ -125,21 +112,6 @@ def test_a_case_that_no_file_can_describe_is_not_written(gouta):
     # no preset has such a reference, and [reference] makes ramps
     with pytest.raises(InputError, match="cannot be written"):
         rig.dump(case)
-
-
-def test_nothing_is_limited_or_free_if_the_tables_are_empty(gouta, tmp_path):
-    again = round_trip(gouta("ngpc").replace(limits={}, free={}), tmp_path)
-    assert again.limits == {} and again.free == {}
-
-
-def test_numbers_of_numpy_are_written_as_numbers(gouta, tmp_path):
-    case = gouta("ngpc").replace(
-        clock=Clock(dt=np.float64(0.1), duration=np.float64(100.0)),
-        free={"controller.Tp": Free(*np.array([1.0, 9.0]))},
-    )
-    again = round_trip(case, tmp_path)
-    assert again.clock == Clock(dt=0.1, duration=100.0)
-    assert Free(*again.free["controller.Tp"]) == Free(1.0, 9.0)
 
 
 def test_a_file_that_names_a_case_alone_is_that_case(tmp_path):
@@ -236,147 +208,134 @@ def test_values_relative_to_the_case_are_written_as_they_are():
     assert rig.loads(rig.complete(case)).scenarios == case.scenarios
 
 
-def values(line):
-    return f"{HEAD}[values]\n{line}\n"
-
-
-def reference(line):
-    return f"{HEAD}[reference]\n{line}\n"
-
-
-def limits(line):
-    return f"{HEAD}[limits]\n{line}\n"
-
-
-def free(line):
-    return f"{HEAD}[free]\n{line}\n"
-
-
-def objective(line):
-    return f"{HEAD}[objective]\n{line}\n"
-
-
 BIG = "9" * 400  # a whole number that no float holds
+LARGE = 10**20  # a whole number that a float holds and no integer of numpy does
 
-BAD = {  # text of a file: words its message must have
+WHOLE = {  # text of a file: words its message must have
     "case = = 3": ["not TOML", "line 1"],
-    HEAD + HEAD: ["not TOML"],
     "\0": ["not TOML"],
     f"case = {'9' * 5000}": ["more digits than can be read"],
     "a = " + "[" * 90_000: ["nested too deeply"],
-    values('"controller.k" = ' + "{a = " * 45_000): ["nested too deeply"],
-    values('"plant.area" = ' + "[" * 400 + "1" + "]" * 400): [],
     "": ["case"],
-    'name = "x"': ["case"],
     "case = 3": ["case = 3"],
     'case = "gouta2015/backsteping"': ["gouta2015/backsteping", "nearest: gouta2015/backstepping"],
     'case = "a\\nb"': ["unknown case"],
+    HEAD + HEAD: ["not TOML"],
     HEAD + "[valeus]": ["valeus", "nearest: values"],
     HEAD + "values = 3": ["values = 3", "table"],
-    values('"controller.kk" = 1'): ["controller.kk", "nearest: controller.k"],
-    # without its quotation marks TOML reads a table
-    values("controller.kk = 1"): ["controller.kk", "nearest: controller.k"],
-    values('controller.k = 1\n"controller.k" = 2'): ["[values] controller.k is given twice"],
-    values('"plant.area[9]" = 1'): ["plant.area[9]", "(4,)"],
-    values('"plant.area[x]" = 1'): ["plant.area[x]"],
-    values('"clock.dtt" = 1'): ["clock.dtt", "nearest: clock.dt"],
-    values('"plant.links" = [1]'): ["plant.links", "topology"],
-    values('"controller.k" = "a"'): ["controller.k = 'a'", "number"],
-    values('"controller.k" = true'): ["controller.k = True", "number"],
-    values('"controller.k" = 2020-01-01'): ["controller.k", "number"],
-    values('"controller.k" = {a = 1}'): ["controller.k", "number"],
-    values('"controller.k" = nan'): ["controller.k = nan", "finite"],
-    values('"controller.k" = 0'): ["controller.k = 0 1/s", "above 0"],
-    values('"controller.k" = -1'): ["controller.k = -1 1/s", "above 0"],
-    values(f'"controller.k" = {BIG}'): ["controller.k"],
     HEAD + '[log]\nh1 = "level"\nh2 = ["level", "cm"]': ["log h2 = 'level'", "h1 already"],
-    values('"controller.k" = [1.0]'): ["controller.k", "(1,)"],
-    values('"plant.area" = [1, 2, 3]'): ["plant.area", "(3,)", "(4,)"],
-    values('"plant.area" = [[1, 2], [3]]'): ["plant.area"],
-    values('"plant.area" = [1, inf, 1, 1]'): ["plant.area[1] = inf cm^2", "finite"],
-    values('"plant.area" = [1, 1, -1, 1]'): ["plant.area[2] = -1 cm^2", "above 0"],
-    values('"actuator.low" = 13'): ["actuator.low[0] = 13 V", "actuator.high[0] = 12 V"],
-    values('"actuator.saturation" = "clipp"'): ["actuator.saturation = 'clipp'", "clip, boxqp"],
-    values('"actuator.saturation" = ["clip"]'): ["actuator.saturation", "clip, boxqp"],
-    values('"actuator.saturation[0]" = "clip"'): ["actuator.saturation[0]"],
-    values('"plant.overflow" = 1'): ["plant.overflow = 1", "true"],
-    values('"plant.knee" = 0'): ["plant.knee = 0 cm", "at least 1e-15 cm"],
-    values('"plant.knee" = 1e-300'): ["plant.knee = 1e-300 cm", "at least 1e-15 cm"],
-    values('"controller.model.knee" = 1e-300'): [
-        "controller.model.knee = 1e-300 cm",
-        "at least 1e-15 cm",
-    ],
-    values('"sensor.bits" = 2.5'): ["sensor.bits = 2.5", "whole"],
-    values('"sensor.bits" = nan'): ["sensor.bits = nan"],
-    values('"sensor.bits" = inf'): ["sensor.bits = inf"],
-    values('"reference.ramp" = inf'): ["reference.ramp = inf"],
-    values(f'"reference.ramp" = {BIG}'): ["reference.ramp"],
-    values('"clock.dt" = nan'): ["clock.dt = nan"],
-    values('"clock.dt" = "x"'): ["clock.dt = 'x'", "number"],
-    values('"clock.duration" = 0'): ["clock.duration = 0"],
-    values(f'"clock.duration" = {BIG}'): ["clock.duration"],
-    values('"clock.substeps" = nan'): ["clock.substeps = nan"],
-    values('"clock.substeps" = inf'): ["clock.substeps = inf"],
-    values('"clock.substeps" = true'): ["clock.substeps = True"],
-    values('"clock.integrator" = "euler"'): ["clock.integrator = 'euler'", "rk4"],
-    reference("inital = [3, 3]"): ["inital", "nearest: initial"],
-    reference("initial = 3"): ["reference.initial = 3"],
-    reference("initial = [3, 3, 3]"): ["reference.initial = [3, 3, 3]"],
-    reference("initial = [[3], [3, 4]]"): ["reference.initial"],
-    reference("initial = [-1.0, 3.0]"): ["reference.initial[0] = -1 cm", "above 0"],
-    reference("initial = [nan, 3.0]"): ["reference.initial = [nan, 3.0]", "finite"],
-    reference('changes = "x"'): ["reference.changes = 'x'"],
-    reference("changes = [[20.0, 1, 0.0]]"): ["reference.targets[0] = 0 cm", "above 0"],
-    reference("changes = [[20.0, 1, nan]]"): ["reference.changes has [20.0, 1, nan]", "finite"],
-    reference("changes = [[20.0, 3, 5.0]]"): ["[20.0, 3, 5.0]", "from 1 to 2"],
-    reference("changes = [[20.0, 0, 5.0]]"): ["[20.0, 0, 5.0]", "from 1 to 2"],
-    reference("changes = [[20.0, 1.0, 5.0]]"): ["[20.0, 1.0, 5.0]"],
-    reference("changes = [[20.0, 1]]"): ["[20.0, 1]"],
-    reference('changes = [["a", 1, 5]]'): ["'a'"],
-    reference("changes = [[[20.0], 1, 5.0]]"): ["reference.changes", "[[20.0], 1, 5.0]"],
-    reference("changes = [[20.0, [1], 5.0]]"): ["reference.changes", "[20.0, [1], 5.0]"],
-    reference("changes = [[-1.0, 1, 5.0]]"): ["-1", "0 s"],
-    reference("changes = [[nan, 1, 5.0]]"): ["nan"],
-    reference("changes = [[inf, 1, 5.0]]"): ["inf"],
-    reference(f"changes = [[20.0, 1, {BIG}]]"): ["reference"],
-    reference("changes = [[30.0, 1, 5.0], [20.0, 2, 5.0]]"): [
-        "[20.0, 2, 5.0] after [30.0, 1, 5.0]",
-        "order of time",
-    ],
-    reference("changes = [[30.0, 1, 5.0], [30.0, 1, 6.0]]"): ["two changes of output 1 at 30 s"],
-    reference("ramp = -1"): ["reference.ramp = -1 s"],
-    reference("ramp = nan"): ["reference.ramp = nan"],
-    reference('ramp = "x"'): ["reference.ramp = 'x'"],
-    reference('shape = "cubic"'): ["reference.shape = 'cubic'", "quintic"],
-    limits("max_levl = 3"): ["max_levl", "nearest: max_level"],
-    limits("max_level = nan"): ["max_level", "nan"],
-    limits("max_level = inf"): ["max_level", "inf"],
-    limits("max_level = -1.0"): ["limit max_level = -1.0 cm", "at least 0 cm"],
-    limits("max_level = true"): ["max_level"],
-    limits('max_level = "high"'): ["max_level", "high"],
-    limits('rms_error = "rim"'): ["rms_error", "rim"],
-    limits("max_level = [1, 2]"): ["max_level", "4"],
-    limits("max_level = [[1], [2, 3]]"): ["max_level"],
-    limits('max_level = ["a", "b", "c", "d"]'): ["max_level"],
-    limits("max_level = {a = 1}"): ["max_level"],
-    limits("max_level = 2020-01-01"): ["max_level"],
-    free('"controller.kk" = [1, 2]'): ["controller.kk", "nearest: controller.k"],
-    free('"controller.k" = "a"'): ["controller.k", "'a'"],
-    free('"controller.k" = [1]'): ["controller.k", "[low, high]"],
-    free('"controller.k" = [[1], [2]]'): ["controller.k", "[low, high]"],
-    free('"controller.k" = [0.1, 1.0, "cubic"]'): ["controller.k", "cubic"],
-    free('"controller.k" = [5.0, 1.0]'): ["controller.k"],
-    free('"controller.k" = [nan, 1.0]'): ["controller.k", "nan"],
-    free('"controller.k" = [0.01, inf]'): ["controller.k", "inf"],
-    free('"controller.k" = [-1.0, 1.0]'): ["controller.k", "-1"],
-    free('"reference.band" = [0.1, 0.9]'): ["reference.band"],
-    free('"plant.area[9]" = [1.0, 30.0]'): ["plant.area[9]"],
-    free('"plant.area[x]" = [1.0, 30.0]'): ["plant.area[x]"],
-    objective("rms = 1"): ["rms", "nearest: "],
-    objective('rms_error = "a"'): ["objective rms_error = 'a'", "weight"],
-    objective("rms_error = -1"): ["rms_error", "-1"],
-    objective("rms_error = nan"): ["rms_error", "nan"],
-    objective("rms_error = 0"): ["objective"],
+    HEAD + '[values]\n"controller.k" = ' + "{a = " * 45_000: ["nested too deeply"],
+    HEAD + 'scenario = "x"': ["scenario = 'x': must be a list of tables"],
+    HEAD + "scenario = [3]": ["scenario 1 = 3: must be a table"],
+}
+LINES = {  # table: {line: words its message must have}
+    "values": {
+        '"plant.area" = ' + "[" * 400 + "1" + "]" * 400: [],
+        '"controller.kk" = 1': ["controller.kk", "nearest: controller.k"],
+        # without its quotation marks TOML reads a table
+        "controller.kk = 1": ["controller.kk", "nearest: controller.k"],
+        'controller.k = 1\n"controller.k" = 2': ["[values] controller.k is given twice"],
+        '"plant.area[9]" = 1': ["plant.area[9]", "(4,)"],
+        '"plant.area[x]" = 1': ["plant.area[x]"],
+        '"plant.links" = [1]': ["plant.links", "topology"],
+        '"controller.k" = "a"': ["controller.k = 'a'", "number"],
+        '"controller.k" = true': ["controller.k = True", "number"],
+        '"controller.k" = 2020-01-01': ["controller.k", "number"],
+        '"controller.k" = {a = 1}': ["controller.k", "number"],
+        '"controller.k" = nan': ["controller.k = nan", "finite"],
+        '"controller.k" = 0': ["controller.k = 0 1/s", "above 0"],
+        f'"controller.k" = {BIG}': ["controller.k"],
+        '"controller.k" = [1.0]': ["controller.k", "(1,)"],
+        '"plant.area" = [1, 2, 3]': ["plant.area", "(3,)", "(4,)"],
+        '"plant.area" = [[1, 2], [3]]': ["plant.area"],
+        '"plant.area" = [1, inf, 1, 1]': ["plant.area[1] = inf cm^2", "finite"],
+        '"plant.area" = [1, 1, -1, 1]': ["plant.area[2] = -1 cm^2", "above 0"],
+        '"actuator.low" = 13': ["actuator.low[0] = 13 V", "actuator.high[0] = 12 V"],
+        '"actuator.saturation" = "clipp"': ["actuator.saturation = 'clipp'", "clip, boxqp"],
+        '"actuator.saturation" = ["clip"]': ["actuator.saturation", "clip, boxqp"],
+        '"actuator.saturation[0]" = "clip"': ["actuator.saturation[0]"],
+        '"plant.overflow" = 1': ["plant.overflow = 1", "true"],
+        '"controller.model.knee" = 1e-300': ["controller.model.knee = 1e-300 cm", "1e-15 cm"],
+        '"sensor.bits" = 2.5': ["sensor.bits = 2.5", "whole"],
+        '"sensor.bits" = nan': ["sensor.bits = nan"],
+        '"clock.dtt" = 1': ["clock.dtt", "nearest: clock.dt"],
+        '"clock.dt" = nan': ["clock.dt = nan"],
+        '"clock.dt" = "x"': ["clock.dt = 'x'", "number"],
+        '"clock.dt" = 5e-324': ["samples"],
+        '"clock.duration" = 0': ["clock.duration = 0"],
+        '"clock.duration" = 1e308': ["samples"],
+        f'"clock.duration" = {BIG}': ["clock.duration"],
+        '"clock.substeps" = inf': ["clock.substeps = inf"],
+        '"clock.substeps" = true': ["clock.substeps = True"],
+        '"clock.integrator" = "euler"': ["clock.integrator = 'euler'", "rk4"],
+    },
+    "reference": {
+        "inital = [3, 3]": ["inital", "nearest: initial"],
+        "initial = 3": ["reference.initial = 3"],
+        "initial = [3, 3, 3]": ["reference.initial = [3, 3, 3]"],
+        "initial = [[3], [3, 4]]": ["reference.initial"],
+        "initial = [-1.0, 3.0]": ["reference.initial[0] = -1 cm", "above 0"],
+        "initial = [nan, 3.0]": ["reference.initial = [nan, 3.0]", "finite"],
+        'changes = "x"': ["reference.changes = 'x'"],
+        "changes = [[20.0, 1, 0.0]]": ["reference.targets[0] = 0 cm", "above 0"],
+        "changes = [[20.0, 1, nan]]": ["reference.changes has [20.0, 1, nan]", "finite"],
+        "changes = [[20.0, 3, 5.0]]": ["[20.0, 3, 5.0]", "from 1 to 2"],
+        "changes = [[20.0, 1.0, 5.0]]": ["[20.0, 1.0, 5.0]"],
+        "changes = [[20.0, 1]]": ["[20.0, 1]"],
+        'changes = [["a", 1, 5]]': ["'a'"],
+        "changes = [[[20.0], 1, 5.0]]": ["reference.changes", "[[20.0], 1, 5.0]"],
+        "changes = [[-1.0, 1, 5.0]]": ["-1", "0 s"],
+        f"changes = [[20.0, 1, {BIG}]]": ["reference"],
+        "changes = [[30.0, 1, 5.0], [20.0, 2, 5.0]]": ["[20.0, 2, 5.0] after [30.0, 1, 5.0]"],
+        "changes = [[30.0, 1, 5.0], [30.0, 1, 6.0]]": ["two changes of output 1 at 30 s"],
+        "ramp = -1": ["reference.ramp = -1 s"],
+        'shape = "cubic"': ["reference.shape = 'cubic'", "quintic"],
+    },
+    "limits": {
+        "max_levl = 3": ["max_levl", "nearest: max_level"],
+        "max_level = nan": ["max_level", "nan"],
+        "max_level = -1.0": ["limit max_level = -1.0 cm", "at least 0 cm"],
+        "max_level = true": ["max_level"],
+        'max_level = "high"': ["max_level", "high"],
+        'rms_error = "rim"': ["rms_error", "rim"],
+        "max_level = [1, 2]": ["max_level", "4"],
+        'max_level = ["a", "b", "c", "d"]': ["max_level"],
+        "max_level = {a = 1}": ["max_level"],
+    },
+    "free": {
+        '"controller.kk" = [1, 2]': ["controller.kk", "nearest: controller.k"],
+        '"controller.k" = "a"': ["controller.k", "'a'"],
+        '"controller.k" = [1]': ["controller.k", "[low, high]"],
+        '"controller.k" = [[1], [2]]': ["controller.k", "[low, high]"],
+        '"controller.k" = [0.1, 1.0, "cubic"]': ["controller.k", "cubic"],
+        '"controller.k" = [5.0, 1.0]': ["controller.k"],
+        '"controller.k" = [0.01, inf]': ["controller.k", "inf"],
+        '"controller.k" = [-1.0, 1.0]': ["controller.k", "-1"],
+        '"reference.band" = [0.1, 0.9]': ["reference.band"],
+        '"plant.area[9]" = [1.0, 30.0]': ["plant.area[9]"],
+    },
+    "objective": {
+        "rms = 1": ["rms", "nearest: "],
+        'rms_error = "a"': ["objective rms_error = 'a'", "weight"],
+        "rms_error = -1": ["rms_error", "-1"],
+        "rms_error = 0": ["objective"],
+    },
+    "uncertain": {
+        '"plant.drain" = 2.0': ["uncertain plant.drain = 2.0", "a share between 0 and 1"],
+        '"plant.drian" = 0.1': ["unknown parameter 'plant.drian'"],
+    },
+    "[scenario]": {
+        "value = 3": ["unknown key of [[scenario]] 'value'; nearest: values"],
+        'values = { "plant.drian" = 1.0 }': ["'plant.drian'; nearest: plant.drain"],
+        'name = "a"\nvalues = { "sensor.noise" = -1.0 }': ["scenario 'a': sensor.noise[0] = -1 cm"],
+        "seed = 1.5": ["seed = 1.5: must be a whole number, at least 0, at most 2147483647"],
+        "weight = 0.0": ["scenario 1: weight = 0: must be above 0"],
+    },
+}
+BAD = WHOLE | {
+    f"{HEAD}[{table}]\n{line}\n": words
+    for table, lines in LINES.items()
+    for line, words in lines.items()
 }
 
 
@@ -397,26 +356,13 @@ def test_a_bad_file_is_reported_in_one_line_that_names_it(text, words, tmp_path)
         assert word in message
 
 
-def test_a_reference_without_a_steady_state_names_outputs_and_tank(tmp_path):
-    path = tmp_path / "rig.toml"
-    path.write_text(
-        reference("initial = [3.0, 3.0]\nchanges = [[20.0, 1, 16.0]]"), encoding="utf-8"
-    )
-    with pytest.raises(EquilibriumError) as caught:
-        rig.load(path)
-    message = str(caught.value)
-    # tank 3 feeds both lower tanks: what keeps tank 1 at 16 cm is already too much for tank 2 at 3
-    # cm, so tank 4 would have to take
-    assert all(word in message for word in (repr(str(path)), "reference", "(16, 3) cm", "tank 4"))
-    assert len(message.splitlines()) == 1
-
-
-def test_a_change_that_has_an_equilibrium_only_with_its_pair_is_read_if_both_come_at_once(tmp_path):
-    path = tmp_path / "rig.toml"
-    path.write_text(reference("changes = [[20.0, 1, 16.0], [20.0, 2, 16.0]]"), encoding="utf-8")
-    np.testing.assert_array_equal(
-        rig.load(path).loop.reference.plateaus(), [[3.0, 3.0], [16.0, 16.0]]
-    )
+def test_a_reference_without_a_steady_state_names_outputs_and_tank():
+    """Tank 3 feeds both lower tanks: what keeps tank 1 at 16 cm is too much for tank 2 at 3 cm."""
+    text = HEAD + "[reference]\ninitial = [3.0, 3.0]\nchanges = [[20.0, 1, 16.0]]"
+    with pytest.raises(EquilibriumError, match=r"^rig file: reference: .*\(16, 3\) cm.*tank 4"):
+        rig.loads(text)
+    both = rig.loads(text.replace("]]", "], [20.0, 2, 16.0]]"))
+    np.testing.assert_array_equal(both.loop.reference.plateaus(), [[3.0, 3.0], [16.0, 16.0]])
 
 
 def unreadable(path, prepare):
@@ -447,13 +393,6 @@ def test_a_file_of_4_mib_is_read_and_a_longer_one_is_not(tmp_path):
     assert str(LARGEST_TEXT) in message and str(4 * 2**20 + 1) in message
 
 
-def test_setting_names_the_value_that_is_wrong(gouta):
-    with pytest.raises(InputError, match=r"plant\.area\[3\] = -1 cm\^2: must be above 0 cm\^2"):
-        gouta("ngpc", {"plant.area[3]": -1.0})
-    with pytest.raises(InputError, match=r"unknown parameter 'controller\.k1'; nearest: "):
-        gouta("ngpc", {"controller.k1": 1.0})  # the predictive law has no such gain
-
-
 def test_a_file_is_replaced_whole_and_leaves_no_other(gouta, tmp_path):
     path = tmp_path / "rig.toml"
     rig.save(gouta("ngpc"), path)
@@ -472,43 +411,7 @@ def test_scenarios_and_what_is_uncertain_go_through_a_file(tmp_path):
     assert back.scenarios == () and back.uncertain == {"plant.drain": 0.3}
 
 
-@pytest.mark.parametrize(
-    "text, words",
-    [
-        ('scenario = "x"', "scenario = 'x': must be a list of tables"),
-        ("scenario = [3]", "scenario 1 = 3: must be a table"),
-        ("[[scenario]]\nvalue = 3", "unknown key of [[scenario]] 'value'; nearest: values"),
-        (
-            '[[scenario]]\nvalues = { "plant.drian" = 1.0 }',
-            "unknown parameter 'plant.drian'; nearest: plant.drain",
-        ),
-        (
-            '[[scenario]]\nname = "a"\nvalues = { "sensor.noise" = -1.0 }',
-            "scenario 'a': sensor.noise[0] = -1 cm",
-        ),
-        (
-            "[[scenario]]\nseed = 1.5",
-            "seed = 1.5: must be a whole number, at least 0, at most 2147483647",
-        ),
-        ("[[scenario]]\nweight = 0.0", "scenario 1: weight = 0: must be above 0"),
-        (
-            '[uncertain]\n"plant.drain" = 2.0',
-            "uncertain plant.drain = 2.0: must be a share between 0 and 1",
-        ),
-        ('[uncertain]\n"plant.drian" = 0.1', "unknown parameter 'plant.drian'"),
-    ],
-)
-def test_scenarios_and_spreads_that_cannot_be_used(text, words, tmp_path):
-    path = tmp_path / "rig.toml"
-    path.write_text(HEAD + text + "\n", encoding="utf-8")
-    with pytest.raises(InputError, match=re.escape(words)):
-        rig.load(path)
-
-
-LARGE = 10**20  # a whole number that a float holds and no integer of numpy does
-
-
-@pytest.mark.parametrize("big", [2**63, 2**64, LARGE])
+@pytest.mark.parametrize("big", [2**63, LARGE])
 @pytest.mark.parametrize(
     "line",
     [
@@ -528,17 +431,6 @@ def test_a_large_whole_number_is_the_float_next_to_it(line, big):
     )
     assert_same(whole, real)
     assert [s.weight for s in whole.scenarios] == [s.weight for s in real.scenarios]
-
-
-def test_a_large_setpoint_is_reported_as_the_float_next_to_it():
-    """No steady state has it: the answer is that, whole number or not."""
-    for form in ("initial = [BIG, 3.0]", "changes = [[20.0, 1, BIG]]"):
-        reported = []
-        for text in (str(LARGE), repr(float(LARGE))):
-            with pytest.raises(EquilibriumError) as caught:
-                rig.loads(reference(form.replace("BIG", text)))
-            reported.append(str(caught.value))
-        assert reported[0] == reported[1]
 
 
 def test_names_without_quotation_marks_are_dotted_names(gouta):
@@ -567,21 +459,12 @@ def test_names_without_quotation_marks_are_dotted_names(gouta):
     assert dict(case.scenarios[0].values) == {"sensor.noise": 0.1}
 
 
-@pytest.mark.parametrize(
-    "lines, words", [('"clock.duration" = 1e308', "samples"), ('"clock.dt" = 5e-324', "samples")]
-)
-def test_a_run_longer_than_any_whole_number_is_refused(lines, words):
-    with pytest.raises(InputError, match=words):
-        rig.loads(f'case = "gouta2015/ngpc"\n[values]\n{lines}\n')
-
-
 def test_a_byte_order_mark_is_read_over():
     assert rig.loads('\ufeffcase = "gouta2015/ngpc"\n').name == "gouta2015/ngpc"
 
 
-def test_more_tanks_than_a_loop_can_hold_are_refused_at_once():
-    with pytest.raises(InputError, match="at most 5000"):
-        rig.loads(
-            "[[tank]]\narea = 1.0\nrim = 1.0\n" * 5001
-            + "[[pump]]\ngain = 1.0\nto = 1\nlow = 0.0\nhigh = 1.0\n"
-        )
+@pytest.mark.parametrize("kind", ["tank", "pipe", "orifice", "spill", "pump"])
+def test_more_of_a_kind_than_a_loop_can_hold_are_refused(kind):
+    text = "[[tank]]\narea = 1.0\nrim = 9.0\n" * 2 + "[[pump]]\ngain = 1.0\nto = 1\nhigh = 1.0\n"
+    with pytest.raises(InputError, match=rf"\[\[{kind}\]\]: \d+ {kind}s: must be at most 5000"):
+        rig.loads(text + f"[[{kind}]]\n" * 5001)

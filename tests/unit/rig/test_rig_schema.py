@@ -184,14 +184,14 @@ Ti = 9.0
     [
         (
             "pump",
-            Key.of(PumpBank, "stop", "input below which it stops", target="actuator.stop"),
+            Key.of(PumpBank, "stop", doc="input below which it stops", target="actuator.stop"),
             "stop = 0.25",
             "actuator.stop",
             ("stop = -1.0", "pump 1: stop = -1 V: must be at least 0 V"),
         ),
         (
             "tank",
-            Key.of(LevelSensor, "gain", "level per volt", default=1.0, target="sensor.gain"),
+            Key.of(LevelSensor, "gain", doc="level per volt", default=1.0, target="sensor.gain"),
             "gain = 2.5",
             "sensor.gain",
             ("gain = 'x'", "tank 1: gain = 'x': must be a finite number [cm/V], above 0"),
