@@ -166,8 +166,8 @@ def measured(run):
     # the effect of the faults on h1 at their ends, with the controller and with a constant flow,
     # and the change of the flow by the controller
     shift, push = (hurt.e - plain.e)[ends, 0], (hurt.u - plain.u)[ends, 0]
-    left = constant_flow(hurt_case)
-    open_shift = (left - constant_flow(case))[ends]
+    constant = constant_flow(hurt_case)
+    open_shift = (constant - constant_flow(case))[ends]
     reacts = (np.abs(shift) < 0.5 * np.abs(open_shift)) & (push * open_shift < 0.0)
     offsets = hurt.e[ends, 0]
     unlimited, limited = (
@@ -195,7 +195,7 @@ def measured(run):
         "some steady state errors": Claim(
             bool(np.abs(offsets).max() > ACCURATE),
             f"{offsets[0]:.5f} and {offsets[1]:.5f} m at the ends of the faults (a constant flow:"
-            f" {left[449]:.4f} and {left[1049]:.4f} m)",
+            f" {constant[449]:.4f} and {constant[1049]:.4f} m)",
         ),
         "same performance in any operating point": Claim(
             (unlimited < SAME, limited < SAME),

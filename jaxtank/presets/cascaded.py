@@ -4,6 +4,7 @@ Two tanks, one pump, all in volts. The derivation is in `notes/cascaded.md`.
 """
 
 import functools
+from typing import Any
 
 from jaxtank.case import Case, Free
 from jaxtank.controllers import PID, OpenLoop
@@ -68,7 +69,7 @@ def loop(controller, reference, x0, u0=0.0):
         x0,
         sensor=(1.0, RIM),
         pumps={"low": 0.0, "high": 10.0, "initial": u0},
-        disturbance=Constant(level=[K_PUMP * OFFSET, 0.0]),
+        disturbance=Constant(level=number([K_PUMP * OFFSET, 0.0])),
     )
 
 
@@ -103,7 +104,8 @@ def preset():
     """Return the Preset of this rig."""
     x0, u0 = steady_state(4.0)
     reference = ramps([4.0], STEPS, ramp=0.0)
-    pi = PID(model=rig(), Kc=[1.0], Ti=[200.0], Tt=[100.0], bias=[u0])
+    gains: Any = {"Kc": [1.0], "Ti": [200.0], "Tt": [100.0], "bias": [u0]}
+    pi = PID(model=rig(), **gains)
     pump = ramps([u0], [(t, 0, steady_state(level)[1]) for t, _, level in STEPS], ramp=0.0)
     controllers = {
         "pi": ("PI", pi, ("controller.Kc", "controller.Ti")),

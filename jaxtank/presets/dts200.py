@@ -4,6 +4,7 @@ The derivation is in `notes/dts200.md`.
 """
 
 import functools
+from typing import Any
 
 import numpy as np
 
@@ -56,9 +57,10 @@ def loop(faulty=False):
     plant = rig()
     x0, u0 = equilibrium(plant, np.array([40.0, 15.0]))
     events = [("drain[2]", 500.0, 700.0, 1.0, LEAK), ("pipe[0]", 1300.0, 1500.0, PLUGGED, 0.0)]
+    gains: Any = {"Kc": [KC, KC], "Ti": [TI, TI], "Tt": [TI, TI], "bias": u0}
     return closed_loop(
         plant,
-        PID(model=plant, Kc=[KC, KC], Ti=[TI, TI], Tt=[TI, TI], bias=u0),
+        PID(model=plant, **gains),
         ramps([40.0, 15.0], STEPS, ramp=0.0),
         x0,
         sensor=(1.0, 70.0),
@@ -76,13 +78,14 @@ def measured(run):
         c * PIPE * speed * np.sqrt(d) for c, d in zip(COEFFICIENTS, (15.0, 15.0, 15.0))
     )
     A, B, _ = linearise(plant, levels, np.array([through, out - back]))
-    own, flows = equilibrium(plant, levels[:2])
+    rest, flows = equilibrium(plant, levels[:2])
     return {
         "linear model, A": tuple(map(float, np.ravel(A))),
         "linear model, B": float(B[0, 0]),
         "rest at the operating point": Claim(
-            abs(float(own[2]) - POINT[2]) < 0.5,
-            f"with tanks 1 and 2 at 45 and 15 cm tank 3 rests at {float(own[2]):.2f} cm, with pumps"
+            abs(float(rest[2]) - POINT[2]) < 0.5,
+            f"with tanks 1 and 2 at 45 and 15 cm tank 3 rests"
+            f" at {float(rest[2]):.2f} cm, with pumps"
             f" at {float(flows[0]):.1f} and {float(flows[1]):.1f} cm^3/s",
         ),
     }

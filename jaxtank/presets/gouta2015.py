@@ -13,6 +13,7 @@ from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Case, Free
 from jaxtank.controllers import NGPC, Backstepping
 from jaxtank.core.clock import Clock
+from jaxtank.core.tree import number
 from jaxtank.loop.margins import stability_margins
 from jaxtank.loop.run import simulate
 from jaxtank.observers import Direct, DisturbanceObserver
@@ -133,14 +134,14 @@ def _claims(run, ramp):
 def _responses(pair, ramp):
     """The responses to the first change, and to those of one setpoint alone."""
     t = pair[0].t
-    first = [float(np.abs(one.e[(t >= 20.0) & (t < 270.0)]).max()) for one in pair]
+    first = [float(np.abs(run.e[(t >= 20.0) & (t < 270.0)]).max()) for run in pair]
     rest = max(900.0, 760.0 + ramp + 60.0)  # when the ramp of r2 is over
     late = [
         max(
-            float(np.abs(one.e[(t >= begin) & (t < end), other]).max())
+            float(np.abs(run.e[(t >= begin) & (t < end), other]).max())
             for begin, end, other in ((760.0, 900.0, 0), (rest, 1200.0, 1))
         )
-        for one in pair
+        for run in pair
     ]
     return {
         "first change of both setpoints": Claim(
@@ -180,7 +181,7 @@ def _fluctuations(run, far):
     def ripple(trajectory):  # standard deviation of the levels at the ends of two plateaus [cm]
         t = trajectory.t
         plateaus = [(t > 650.0) & (t < 760.0), (t > 1050.0) & (t <= 1200.0)]
-        return max(float(trajectory.x[held, :2].std(axis=0).max()) for held in plateaus)
+        return max(float(trajectory.x[plateau, :2].std(axis=0).max()) for plateau in plateaus)
 
     noisy = [run(name, {"sensor.noise": 0.05})[1] for name in ("backstepping", "ngpc")]
     still, rough, other = ripple(far), *map(ripple, noisy)
@@ -194,13 +195,13 @@ def _fluctuations(run, far):
 def _theorem(run, far):
     """Constant setpoints from three starts, and the error while a setpoint moves."""
     changes = run("backstepping")[0].loop.reference.changes
-    held = {
+    constant = {
         "reference.initial": [12.0, 10.0],
         "reference.targets": [(12.0, 10.0)[output] for _, output in changes],
     }
     starts = ([3.0, 3.0, 3.0, 3.0], [20.0, 2.0, 1.0, 25.0], [1.0, 18.0, 28.0, 1.0])
     ends = [
-        float(np.abs(run("backstepping", {**held, "x0": list(x0)}, 100)[1].e[-1]).max())
+        float(np.abs(run("backstepping", {**constant, "x0": list(x0)}, 100)[1].e[-1]).max())
         for x0 in starts
     ]
     moving = float(np.abs(far.e).max())
@@ -235,11 +236,11 @@ def _margins(run):
     worst = []
     for name in ("ngpc", "backstepping"):
         case = run(name)[0]
-        found = [p.margins for p in stability_margins(case.loop, case.clock) if p.margins]
+        margins = [p.margins for p in stability_margins(case.loop, case.clock) if p.margins]
         worst.append(
             (
-                max(float(m.sensitivity_peak) for m in found),
-                min(float(np.min(m.delay_margin)) for m in found),
+                max(float(m.sensitivity_peak) for m in margins),
+                min(float(np.min(m.delay_margin)) for m in margins),
             )
         )
     (peak, delay), (peak_b, delay_b) = worst
@@ -319,7 +320,7 @@ def build(kind, area=FAST_AREA, saturation="clip", ramp=60.0):
         ramps(START, BENCHMARK, ramp=ramp),
         x0,
         sensor=SENSOR,
-        observer=DisturbanceObserver(model=plant, l=[GAIN] * 4) if observed else Direct(),
+        observer=DisturbanceObserver(model=plant, l=number([GAIN] * 4)) if observed else Direct(),
         pumps=pumps | {"saturation": saturation},
     )
 

@@ -40,33 +40,32 @@ TUNABLE = {
 }
 
 
-CONTROLLERS = {  # title, what `tune` changes
-    "enmpc": ("ENMPC", ("controller.Tp",)),
-    "chadpc": (
-        "CHADPC: ENMPC and disturbance observer, single compensation",
-        ("controller.Tp", "observer.l"),
-    ),
-    "pi": ("PI", ("controller.Kc", "controller.Ti")),
-    "pi-ff": ("PI with feed-forward", ("controller.Kc", "controller.Ti")),
-    "pid": ("PID", ("controller.Kc", "controller.Ti", "controller.Td")),
-    "pid-ff": ("PID with feed-forward", ("controller.Kc", "controller.Ti", "controller.Td")),
-    "fopi": ("fractional PI", ("controller.Kc", "controller.Ti", "controller.order")),
-    "fopi-ff": (
-        "fractional PI with feed-forward",
-        ("controller.Kc", "controller.Ti", "controller.order"),
-    ),
-    "enmpc-printed": ("ENMPC with the sign of f as printed in eq. (12)", ("controller.Tp",)),
+CONTROLLERS = {
+    "enmpc": "ENMPC",
+    "chadpc": "CHADPC: ENMPC and disturbance observer, single compensation",
+    "pi": "PI",
+    "pi-ff": "PI with feed-forward",
+    "pid": "PID",
+    "pid-ff": "PID with feed-forward",
+    "fopi": "fractional PI",
+    "fopi-ff": "fractional PI with feed-forward",
+    "enmpc-printed": "ENMPC with the sign of f as printed in eq. (12)",
     "chadpc-printed": (
-        "CHADPC as printed: sign of f, double compensation, observer before eq. (28)",
-        ("controller.Tp", "observer.l"),
+        "CHADPC as printed: sign of f, double compensation, observer before eq. (28)"
     ),
-    "enmpc-fitted": ("ENMPC on a rig fitted to Table 3", ("controller.Tp",)),
-    "chadpc-fitted": ("CHADPC on a rig fitted to Table 3", ("controller.Tp", "observer.l")),
-    "chadpc-trapezoid": (
-        "CHADPC on the trapezoids of benchmark 2",
-        ("controller.Tp", "observer.l"),
-    ),
+    "enmpc-fitted": "ENMPC on a rig fitted to Table 3",
+    "chadpc-fitted": "CHADPC on a rig fitted to Table 3",
+    "chadpc-trapezoid": "CHADPC on the trapezoids of benchmark 2",
 }
+"""{case: title}."""
+FREE = {
+    "enmpc": ("controller.Tp",),
+    "chadpc": ("controller.Tp", "observer.l"),
+    "pi": ("controller.Kc", "controller.Ti"),
+    "pid": ("controller.Kc", "controller.Ti", "controller.Td"),
+    "fopi": ("controller.Kc", "controller.Ti", "controller.order"),
+}
+"""{case without its suffix: what `tune` changes}."""
 
 
 def rig(pump_gain=RECONCILED_GAIN):
@@ -88,7 +87,7 @@ def benchmark(band=0.05):
     steps = ramps((0.0, 0.0), [(0.0, 1, 10.0), (10.0, 0, 8.0)], ramp=0.0, band=band)
     # in phase with its limits: it begins and ends at 0 with no rate
     limits = {"period": 250.0, "zero": 112.5, "start": 50.0, "end": 800.0}
-    sine = Sine(amplitude=3.0, offset=3.0, **limits, channel=0, width=2)
+    sine = Sine(amplitude=number(3.0), offset=number(3.0), **limits, channel=0, width=2)
     return Sum(first=steps, second=sine)
 
 
@@ -129,19 +128,19 @@ def controller_of(name, model):
                 drift="printed" if printed else "derived",
             ),
             DisturbanceObserver(
-                model=model, l=[10.0, 10.0], before_compensation=printed and compensated
+                model=model, l=number([10.0, 10.0]), before_compensation=printed and compensated
             ),
         )
     kind = name.removesuffix("-ff")
     return (
         PID(
             model=model,
-            Kc=[4.32, 4.32],
-            Ti=[6.0, 6.0],
-            Td=[0.25, 0.25] if kind == "pid" else None,
-            order=[0.85, 0.85] if kind == "fopi" else None,
-            Tt=[36.0, 36.0],
-            bias=[6.34, 7.17],  # mean voltages of the benchmark (notes S4.5)
+            Kc=number([4.32, 4.32]),
+            Ti=number([6.0, 6.0]),
+            Td=number([0.25, 0.25]) if kind == "pid" else None,
+            order=number([0.85, 0.85]) if kind == "fopi" else None,
+            Tt=number([36.0, 36.0]),
+            bias=number([6.34, 7.17]),  # mean voltages of the benchmark (notes S4.5)
             feed_forward=name.endswith("-ff"),
         ),
         Direct(),
@@ -257,7 +256,8 @@ def measured_rows(run):
         "levels between 1 and 30 cm": _levels(enmpc, chadpc),
         "computation of CHADPC": _operations(plain, case),
         "parameters to tune, ENMPC and CHADPC": tuple(
-            sum(np.size(get_value(one.loop, name)) for name in one.free) for one in (plain, case)
+            sum(np.size(get_value(other.loop, name)) for name in other.free)
+            for other in (plain, case)
         ),
         **_others(run),
     }
@@ -296,12 +296,12 @@ def _pulses(enmpc, chadpc):
     """What an inflow pulse does to the other tank, and to the level itself."""
 
     def kick(t):  # largest change of the other tank's error within 30 s [cm]
-        found = []
+        kicks = []
         for begin, other in ((500.0, 0), (700.0, 1)):
             before = t.e[(t.t >= begin - 10.0) & (t.t < begin), other].mean()
             after = t.e[(t.t >= begin) & (t.t < begin + 30.0), other]
-            found.append(float(np.abs(after - before).max()))
-        return max(found)
+            kicks.append(float(np.abs(after - before).max()))
+        return max(kicks)
 
     over = [max(0.0, 100.0 * float(t.e[t.t < 100.0, 1].max()) / 10.0) for t in (enmpc, chadpc)]
     a, b = kick(enmpc), kick(chadpc)
@@ -379,12 +379,12 @@ def _decay(run, enmpc):
     rate = -float(np.polyfit(t.t[part], np.log(np.abs(t.e[part, 1])), 1)[0])
     k = 1.5 / float(case.loop.controller.Tp)
     sampled = -np.log(1.0 - k * case.clock.dt) / case.clock.dt
-    left = np.abs(enmpc.e[quiet(enmpc.t)].mean(axis=0))
+    offset = np.abs(enmpc.e[quiet(enmpc.t)].mean(axis=0))
     return Claim(
-        (bool(abs(rate / sampled - 1.0) < 0.05), bool(left.max() < 0.01)),
+        (bool(abs(rate / sampled - 1.0) < 0.05), bool(offset.max() < 0.01)),
         f"without limits the error decays at {rate:.2f} 1/s; k is {k:.2f} 1/s, {sampled:.2f} 1/s"
-        f" with inputs held over a sample; with the pumps as they are {_cm(left)} are left (counts"
-        " if below 0.01 cm)",
+        f" with inputs held over a sample; with the pumps as they are {_cm(offset)} are left"
+        " (counts if below 0.01 cm)",
     )
 
 
@@ -398,7 +398,7 @@ def _observer(run, case, chadpc):
     gain = float(case.loop.observer.l[tank])
     wrong = run("chadpc", {"observer.fed": "command"})[1]
     calm = (t > 30.0) & (t < begin)
-    errors = [float(np.abs(one.e[calm]).max()) for one in (wrong, chadpc)]
+    errors = [float(np.abs(trajectory.e[calm]).max()) for trajectory in (wrong, chadpc)]
     return {
         "decay of the estimation error": Claim(
             abs(rate / gain - 1.0) < 0.1,
@@ -428,7 +428,7 @@ def _levels(enmpc, chadpc):
 
 def _operations(plain, case):
     """Arithmetic operations of a sample: the observer's estimate is not used without it."""
-    counts = [sample_operations(one.loop, one.clock) for one in (plain, case)]
+    counts = [sample_operations(other.loop, other.clock) for other in (plain, case)]
     bare = sample_operations(dataclasses.replace(plain.loop, observer=Direct()), plain.clock)
     return Claim(
         counts[1] > bare,
@@ -442,16 +442,16 @@ def _others(run):
     names = {"ENMPC": "enmpc", "CHADPC": "chadpc", "PI": "pi", "PID": "pid"}
     names |= {"fractional PI with feed-forward": "fopi-ff"}
     late, soon = (
-        {shown: total(run(name, {"actuator.delay": delay})[1]) for shown, name in names.items()}
+        {label: total(run(name, {"actuator.delay": delay})[1]) for label, name in names.items()}
         for delay in (0.5, 0.0)
     )
 
     def best(errors):
         ours = max(errors["ENMPC"], errors["CHADPC"])
-        return ours < min(v for shown, v in errors.items() if shown not in ("ENMPC", "CHADPC"))
+        return ours < min(v for label, v in errors.items() if label not in ("ENMPC", "CHADPC"))
 
     def listed(errors):
-        return ", ".join(f"{v:.4f} cm with {shown}" for shown, v in errors.items())
+        return ", ".join(f"{v:.4f} cm with {label}" for label, v in errors.items())
 
     order = ("fractional PI with feed-forward", "PI", "PID")
     each = [errors_of(run(names[n], {"actuator.delay": 0.5})[1]) for n in order]
@@ -544,7 +544,7 @@ def _claims(run):
     late = run("chadpc", {**slow, "actuator.delay": 0.2, "actuator.dead_zone": 0.0})[1]
     bias = figures(late)["d"]
     wrong = run("enmpc-printed", {"actuator.dead_zone": 0.0})[1]
-    left = wrong.e[quiet(wrong.t)].mean(axis=0)
+    offset = wrong.e[quiet(wrong.t)].mean(axis=0)
     noisy = [run(name, {"sensor.noise": 0.005})[1] for name in ("enmpc", "chadpc")]
     spread = [float(np.diff(r.command[(r.t > 200) & (r.t < 490), 1]).std()) for r in noisy]
     return {
@@ -558,8 +558,8 @@ def _claims(run):
             "mean d^ {:.4f}, {:.4f} cm/s with a delay of 0.2 s and no dead zone".format(*bias),
         ),
         "eq. (12) tracks without offset": Claim(
-            bool(np.abs(left).max() < 0.01),
-            "mean error {:.3f}, {:.3f} cm (counts if below 0.01 cm)".format(*left),
+            bool(np.abs(offset).max() < 0.01),
+            "mean error {:.3f}, {:.3f} cm (counts if below 0.01 cm)".format(*offset),
         ),
         "the observer spares the pumps": Claim(
             spread[1] < spread[0],
@@ -581,7 +581,7 @@ def preset():
                 loop=build(name),
                 clock=Clock(dt=0.01, duration=1500.0 if name.endswith("-trapezoid") else 900.0),
                 limits={"max_level": "rim"},
-                free={p: TUNABLE[p] for p in free},
+                free={p: TUNABLE[p] for p in FREE[name.partition("-")[0]]},
                 # without noise, delay or a weight on the input the run is insensitive to the
                 # gains (notes S10): 0.1 V from sample to sample counts as 0.02 cm
                 objective={"mean_square_error": 1.0, "mean_square_travel": 0.04},
@@ -589,7 +589,7 @@ def preset():
                 symmetry=SYMMETRY if "chadpc" in name else None,
                 reachable=not name.endswith("-trapezoid"),
             )
-            for name, (title, free) in CONTROLLERS.items()
+            for name, title in CONTROLLERS.items()
         },
         measured=measured,
         tunable=TUNABLE,

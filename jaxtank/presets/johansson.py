@@ -4,6 +4,7 @@ The derivation is in `notes/johansson.md`.
 """
 
 import functools
+from typing import Any
 
 import numpy as np
 
@@ -58,9 +59,10 @@ def loop(phase):
     first, second, _ = TIMES[phase]
     start = [float(h) for h in levels[:2]]
     steps = [(first, 0, start[0] + STEP), (second, 1, start[1] + STEP)]
+    gains: Any = {"Kc": [VOLTS_PER_CM * k for k in K], "Ti": Ti, "Tt": Ti, "bias": volts}
     return closed_loop(
         rig,
-        PID(model=rig, Kc=[VOLTS_PER_CM * k for k in K], Ti=Ti, Tt=Ti, bias=volts),
+        PID(model=rig, **gains),
         ramps(start, steps, ramp=0.0),
         levels,
         sensor=(1.0 / VOLTS_PER_CM, 10.0),
@@ -70,7 +72,7 @@ def loop(phase):
 
 def measured(run):
     """Return what is found of the published rows (see `paper.Preset`)."""
-    found, slowest = {}, {}
+    rows, slowest = {}, {}
     for phase, (levels, *_) in POINTS.items():
         plant, volts = run(NAMES[phase])[0].loop.plant, JOHANSSON[phase][2]
         at = np.asarray(steady_levels(plant, volts))
@@ -79,7 +81,7 @@ def measured(run):
         zeros = sorted(float(z.real) for z in transmission_zeros(*linearise(plant, point, volts)))
         slowest[phase] = zeros[-1]
         controller = run(NAMES[phase])[0].loop.controller
-        found |= {
+        rows |= {
             f"pump gains, {phase} phase": tuple(map(float, plant.pump_gain)),
             f"splits, {phase} phase": tuple(map(float, plant.split)),
             f"voltages, {phase} phase": tuple(map(float, controller.bias)),
@@ -91,7 +93,7 @@ def measured(run):
             f"relative gain, {phase} phase": float(relative_gain_array(A, B, C)[0, 0]),
         }
     return {
-        **found,
+        **rows,
         "the zero's half-plane": Claim(
             (slowest["minimum"] < 0.0, slowest["non-minimum"] > 0.0),
             f"{slowest['minimum']:.3f} 1/s with splits of 0.70 and 0.60,"

@@ -125,12 +125,12 @@ def build(kind, where=None, mode="unconstrained"):
         plant,
         controller(
             model=plant,
-            operating_point=MIDDLE[pumps],
-            r_w=1e-2,
-            q=[1.0] * pumps,
-            du_limit=[0.5] * pumps,
-            u_low=[0.0] * pumps,
-            u_high=[3.0] * pumps,
+            operating_point=number(MIDDLE[pumps]),
+            r_w=number(1e-2),
+            q=number([1.0] * pumps),
+            du_limit=number([0.5] * pumps),
+            u_low=number([0.0] * pumps),
+            u_high=number([3.0] * pumps),
             mode=mode,
             **poles,
             **sizes,
@@ -157,19 +157,6 @@ def from_empty(name):
     }
 
 
-def measured_rows(run, edges):
-    """Return {quantity: what was measured}; edges: of `jaxtank.presets.khalid`."""
-    error, over, under = {}, {}, {}  # RMS [mm], overshoot and undershoot [%] of each output
-    for names, start in ((SISO, "S1"), (MIMO, "M1")):
-        for name in names:
-            case, t = run(name, from_empty(start))
-            found = edges(case.loop.reference, t)
-            error[name] = 1e3 * np.sqrt((t.e**2).mean(axis=0))
-            over[name] = [channel["overshoot"][0] for channel in found]
-            under[name] = [channel["overshoot"][1] for channel in found]
-    return {**_sizes(run), **_undershoot(run, edges), **_from_empty(error, over, under)}
-
-
 def _pulses(case):
     """(low, high) of each output's pulses [m]."""
     reference = case.loop.reference
@@ -177,42 +164,35 @@ def _pulses(case):
         [float(v) for (_, i), v in zip(reference.changes, reference.targets) if i == output]
         for output in range(reference.channels)
     ]
-    return tuple(v for one in levels for v in (min(one), max(one)))
+    return tuple(end for each in levels for end in (min(each), max(each)))
 
 
-def _sizes(run):
-    """The pulses of our cases, and the variables of the programmes."""
-    loops = {name: run(name, {"clock.substeps": 2})[0].loop for name in (*SISO, *MIMO)}
+def _cost(loops):
+    """The claim on the computational cost of Laguerre functions; loops: by case."""
     count = {
         name: loop.plant.pumps * getattr(loop.controller, "N", getattr(loop.controller, "Nc", 0))
         for name, loop in loops.items()
     }
+    gains = {name: np.asarray(loop.controller.gain(CLOCK.dt)) for name, loop in loops.items()}
     fixed = {  # du = -K x_e
-        name: operations(jax.make_jaxpr(jnp.matmul)(K, K[0]).jaxpr)
-        for name, loop in loops.items()
-        for K in [np.asarray(loop.controller.gain(CLOCK.dt))]
+        name: operations(jax.make_jaxpr(jnp.matmul)(K, K[0]).jaxpr) for name, K in gains.items()
     }
     programme = {name: _programme(loop) for name, loop in loops.items()}
     order = ("laguerre", "gpc", "gpc-nc30")
-    return {
-        "pulses of H2, one pump": _pulses(run("gpc", {"clock.substeps": 2})[0]),
-        "pulses of H1 and H2, two pumps": _pulses(run("gpc-mimo", {"clock.substeps": 2})[0]),
-        "controller.N, two pumps": loops["laguerre-mimo"].controller.N,
-        "computational cost of Laguerre": Claim(
-            [
-                cost[laguerre] < cost[gpc]
-                for cost in (fixed, programme)
-                for laguerre, gpc in (("laguerre", "gpc"), ("laguerre-mimo", "gpc-mimo"))
-            ],
-            "arithmetic operations, counted and not timed, with Laguerre functions, GPC 10 and GPC"
-            " 30: without constraints {}, {} and {} a sample; with constraints {}, {} and {} an"
-            " iteration of the programme, of {}, {} and {} variables; with two pumps {} for {} of"
-            " GPC without and {} for {} with constraints".format(
-                *(cost[n] for cost in (fixed, programme, count) for n in order),
-                *(cost[n] for cost in (fixed, programme) for n in reversed(MIMO)),
-            ),
+    return Claim(
+        [
+            cost[laguerre] < cost[gpc]
+            for cost in (fixed, programme)
+            for laguerre, gpc in (("laguerre", "gpc"), ("laguerre-mimo", "gpc-mimo"))
+        ],
+        "arithmetic operations, counted and not timed, with Laguerre functions, GPC 10 and GPC"
+        " 30: without constraints {}, {} and {} a sample; with constraints {}, {} and {} an"
+        " iteration of the programme, of {}, {} and {} variables; with two pumps {} for {} of"
+        " GPC without and {} for {} with constraints".format(
+            *(cost[n] for cost in (fixed, programme, count) for n in order),
+            *(cost[n] for cost in (fixed, programme) for n in reversed(MIMO)),
         ),
-    }
+    )
 
 
 def _programme(loop):
@@ -225,157 +205,127 @@ def _programme(loop):
     return operations(jax.make_jaxpr(qp.solve)(Omega, Psi[:, 0], rows, -ends, ends).jaxpr)
 
 
-def _undershoot(run, edges):
-    """The undershoot at falling edges of the cases' own pulses [%]."""
-    under = {}
-    for name in SISO[:3]:
-        case, t = run(name, {"clock.substeps": 2})
-        under[name] = edges(case.loop.reference, t)[0]["overshoot"][1]
-    return {
-        "undershoot against control horizon": Claim(
-            [value > 1.0 for value in under.values()],
-            "below the lower level with Nc 2, 10, 30: "
-            + ", ".join(f"{value:.2f} %" for value in under.values())
-            + " of the step (counts if above 1 %)",
-        )
-    }
-
-
-def _from_empty(error, over, under):
-    """The claims on pulses from 0 m."""
-    one = [error[name][0] for name in SISO]
-    top = [over[name][0] for name in SISO]
-    low = [under[name][0] for name in SISO]
-    gain = 1.0 - top[3] / top[2]
-    both = "; ".join(
-        "{:.2f}, {:.2f} mm and {:.1f}, {:.1f} % with {}".format(*error[n], *over[n], shown)
-        for n, shown in zip(MIMO, ("GPC", "Laguerre functions"))
-    )
-    return {
-        "pulses from 0 m: long control horizon": Claim(
-            (one[1] < one[0], top[1] <= top[0]),
-            f"RMS error {one[0]:.2f} mm with Nc 2, {one[1]:.2f} mm with Nc 10; overshoot"
-            f" {top[0]:.2f} and {top[1]:.2f} %",
-        ),
-        "pulses from 0 m: control horizon beyond 10": Claim(
-            one[2] > 0.95 * one[1],
-            f"RMS error {one[1]:.2f} mm with Nc 10, {one[2]:.2f} mm with Nc 30",
-        ),
-        "pulses from 0 m: overshoot and undershoot": Claim(
-            [value > 1.0 for value in (*top[:3], *low[:3])],
-            f"overshoot {top[0]:.2f}, {top[1]:.2f}, {top[2]:.2f} % with Nc 2, 10, 30; undershoot at"
-            f" most {max(low[:3]):.2g} % (lots: above 1 %)",
-        ),
-        "pulses from 0 m: overshoot of Laguerre": Claim(
-            (gain > 0.0, gain >= 0.2),
-            f"{top[3]:.2f} % against {top[2]:.2f} %: {100 * gain:.0f} % less at the same r_w",
-        ),
-        "pulses from 0 m: Laguerre with two pumps": Claim(
-            error["laguerre-mimo"] < 0.98 * error["gpc-mimo"],
-            f"RMS errors and overshoots {both} (counts if 2 % less)",
-        ),
-    }
-
-
 def edges(reference, run, dt=2.0):
-    """Return the response of each output to the edges of its pulses."""
-    found = []
-    levels, samples = np.asarray(run.r) + np.asarray(run.e), len(run.t)
+    """Return the response of each output to the edges of its pulses, (rising, falling)."""
+    responses, levels = [], np.asarray(run.r) + np.asarray(run.e)
     for channel in range(reference.channels):
-        mine = [
+        steps = [
             (round(t / dt), float(v))
             for (t, i), v in zip(reference.changes, reference.targets)
             if i == channel
         ]
-        before, ends = (
-            [float(reference.initial[channel]), *(v for _, v in mine)],
-            [*(k for k, _ in mine[1:]), samples],
-        )
+        before = [float(reference.initial[channel]), *(v for _, v in steps)]
+        ends = [*(k for k, _ in steps[1:]), len(run.t)]
         past, slow = {1: [], -1: []}, {1: [], -1: []}
-        for (start, target), old, end in zip(mine, before, ends):
+        for (start, target), old, end in zip(steps, before, ends):
             share = (levels[start:end, channel] - target) / (target - old)
             sign = 1 if target > old else -1
             outside = np.flatnonzero(np.abs(share) > 0.05)
             past[sign].append(100.0 * max(share.max(), 0.0))
             slow[sign].append(dt * (outside[-1] + 1 if outside.size else 0))
-        found.append(
-            {"overshoot": (max(past[1]), max(past[-1])), "settling": (max(slow[1]), max(slow[-1]))}
-        )
-    return found
+        worst = {"overshoot": past, "settling": slow}
+        responses.append({name: (max(v[1]), max(v[-1])) for name, v in worst.items()})
+    return responses
+
+
+def _responses(run, values_of):
+    """({case: RMS error [mm]}, {case: overshoot}, {case: undershoot} [%]), each by output."""
+    error, over, under = {}, {}, {}
+    for name in (*SISO, *MIMO):
+        case, trajectory = run(name, values_of(name))
+        error[name] = 1e3 * np.sqrt((trajectory.e**2).mean(axis=0))
+        past = [channel["overshoot"] for channel in edges(case.loop.reference, trajectory)]
+        over[name], under[name] = zip(*past)
+    return error, over, under
 
 
 def measured(run):
     """Return what can be measured of the published rows (see `jaxtank.presets.paper.Preset`)."""
     # The claims are decided at the reference point, r_w = 0.01 in S2 and M2, with Runge-Kutta steps
     # of 1 s instead of 0.25 s, which compile faster and change no RMS error by more than 2e-7 m.
-    error, over, loops = {}, {}, {}  # RMS [m] and overshoot [%] of each output, by case
-    for kind in CONTROLLERS:
-        case, trajectory = run(kind, {"clock.substeps": 2})
-        error[kind] = np.sqrt(np.mean(np.asarray(trajectory.e) ** 2, axis=0))
-        over[kind] = [channel["overshoot"][0] for channel in edges(case.loop.reference, trajectory)]
-        loops[kind] = case.loop
+    short = {"clock.substeps": 2}
+    loops = {name: run(name, short)[0].loop for name in CONTROLLERS}
+    error, over, under = _responses(run, lambda name: short)
+    empty = _responses(run, lambda name: from_empty("M1" if name in MIMO else "S1"))
     plant, laguerre = loops["gpc-mimo"].plant, loops["laguerre"].controller
+    falls = [under[name][0] for name in SISO[:3]]
     return {
         "plant.area": float(plant.area[0]),
         "plant.drain": float(plant.drain[0]),
         "plant.pipe": float(plant.pipe[0]),
         "plant.gravity": float(plant.gravity),
         "controller.Np": laguerre.Np,
-        "controller.Nc": tuple(loops[k].controller.Nc for k in ("gpc-nc2", "gpc", "gpc-nc30")),
+        "controller.Nc": tuple(loops[k].controller.Nc for k in SISO[:3]),
         "controller.a": float(laguerre.a[0]),
         "controller.N": laguerre.N,
-        **_horizon_claims({k: 1e3 * v[0] for k, v in error.items()}, over),
-        **_laguerre_claims(error, over),
-        **measured_rows(run, edges),
-    }
-
-
-def _horizon_claims(one, over):
-    """The claims on the control horizon; one: RMS error of the first output [mm]."""
-    worst = "; ".join(
-        f"Nc {n}: {over[k][0]:.2f} %" for n, k in ((2, "gpc-nc2"), (10, "gpc"), (30, "gpc-nc30"))
-    )
-    return {
-        "a long control horizon improves performance": Claim(
-            (one["gpc"] < one["gpc-nc2"], over["gpc"][0] <= over["gpc-nc2"][0]),
-            f"RMS error {one['gpc-nc2']:.2f} mm with Nc 2, {one['gpc']:.2f} mm with Nc 10;"
-            f" overshoot {worst}",
-        ),
-        "control horizon beyond 10": Claim(
-            one["gpc-nc30"] > 0.95 * one["gpc"],
-            f"RMS error {one['gpc']:.2f} mm with Nc 10, {one['gpc-nc30']:.2f} mm with Nc 30",
-        ),
-        "overshoot against control horizon": Claim(
-            [over[k][0] > 1.0 for k in ("gpc-nc2", "gpc", "gpc-nc30")],
-            f"{worst} (counts if above 1 %)",
-        ),
-    }
-
-
-def _laguerre_claims(error, over):
-    """The claims on Laguerre functions against GPC; error [m] and over [%] by output."""
-
-    def both(kind):
-        (e1, e2), (o1, o2) = 1e3 * error[kind], over[kind]
-        return f"{e1:.2f}, {e2:.2f} mm and {o1:.1f}, {o2:.1f} %"
-
-    gain = 1.0 - over["laguerre"][0] / over["gpc-nc30"][0]
-    laguerre, gpc = 1e3 * error["laguerre"][0], 1e3 * error["gpc"][0]
-    better = error["laguerre-mimo"] < 0.98 * error["gpc-mimo"]
-    return {
-        "overshoot of Laguerre against GPC 30": Claim(
-            (gain > 0.0, gain >= 0.2),
-            f"{over['laguerre'][0]:.2f} % against {over['gpc-nc30'][0]:.2f} %: {100 * gain:.0f} %"
-            " less at the same r_w (considerable: 20 %)",
+        **_claims(
+            (error, over, None),
+            "a long control horizon improves performance",
+            "control horizon beyond 10",
+            "overshoot against control horizon",
+            "overshoot of Laguerre against GPC 30",
+            "Laguerre against GPC with two pumps",
         ),
         "parameters of Laguerre": Claim(
-            abs(laguerre / gpc - 1.0) < 0.05,
-            f"RMS error {laguerre:.2f} mm with 4 variables, {gpc:.2f} mm with the 10 of GPC",
+            abs(error["laguerre"][0] / error["gpc"][0] - 1.0) < 0.05,
+            f"RMS error {error['laguerre'][0]:.2f} mm with 4 variables, {error['gpc'][0]:.2f} mm"
+            " with the 10 of GPC",
         ),
-        "Laguerre against GPC with two pumps": Claim(
-            better,
-            f"RMS errors and overshoots {both('laguerre-mimo')}; GPC {both('gpc-mimo')} (counts if"
-            " 2 % less)",
+        "pulses of H2, one pump": _pulses(run("gpc", short)[0]),
+        "pulses of H1 and H2, two pumps": _pulses(run("gpc-mimo", short)[0]),
+        "controller.N, two pumps": loops["laguerre-mimo"].controller.N,
+        "computational cost of Laguerre": _cost(loops),
+        "undershoot against control horizon": Claim(
+            [value > 1.0 for value in falls],
+            "below the lower level with Nc 2, 10, 30: "
+            + ", ".join(f"{value:.2f} %" for value in falls)
+            + " of the step (counts if above 1 %)",
+        ),
+        **_claims(
+            empty,
+            "pulses from 0 m: long control horizon",
+            "pulses from 0 m: control horizon beyond 10",
+            "pulses from 0 m: overshoot and undershoot",
+            "pulses from 0 m: overshoot of Laguerre",
+            "pulses from 0 m: Laguerre with two pumps",
+        ),
+    }
+
+
+def _claims(responses, long, beyond, shoot, laguerre, two):
+    """{quantity: Claim} on control horizon and Laguerre functions, of runs from one start."""
+    error, over, under = responses
+    rms, top = ([values[name][0] for name in SISO] for values in (error, over))
+    low = [] if under is None else [under[name][0] for name in SISO[:3]]
+    gain = 1.0 - top[3] / top[2]
+    fall = f"; undershoot at most {max(low):.2g} %" if low else ""
+    both = "; ".join(
+        "{:.2f}, {:.2f} mm and {:.1f}, {:.1f} % with {}".format(*error[n], *over[n], words)
+        for n, words in zip(MIMO, ("GPC", "Laguerre functions"))
+    )
+    return {
+        long: Claim(
+            (rms[1] < rms[0], top[1] <= top[0]),
+            f"RMS error {rms[0]:.2f} mm with Nc 2, {rms[1]:.2f} mm with Nc 10; overshoot"
+            f" {top[0]:.2f} and {top[1]:.2f} %",
+        ),
+        beyond: Claim(
+            rms[2] > 0.95 * rms[1],
+            f"RMS error {rms[1]:.2f} mm with Nc 10, {rms[2]:.2f} mm with Nc 30",
+        ),
+        shoot: Claim(
+            [value > 1.0 for value in (*top[:3], *low)],
+            f"overshoot {top[0]:.2f}, {top[1]:.2f}, {top[2]:.2f} % with Nc 2, 10, 30{fall} (counts"
+            " if above 1 %)",
+        ),
+        laguerre: Claim(
+            (gain > 0.0, gain >= 0.2),
+            f"{top[3]:.2f} % against {top[2]:.2f} %: {100 * gain:.0f} % less at the same r_w"
+            " (considerable: 20 %)",
+        ),
+        two: Claim(
+            error["laguerre-mimo"] < 0.98 * error["gpc-mimo"],
+            f"RMS errors and overshoots {both} (counts if 2 % less)",
         ),
     }
 

@@ -15,7 +15,7 @@ from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Case, Free, Scenario
 from jaxtank.controllers import LQI, FuzzyBlend, SlidingMode, StateFeedback
 from jaxtank.core.clock import Clock
-from jaxtank.core.tree import with_values
+from jaxtank.core.tree import number, with_values
 from jaxtank.plants import quadruple_tank
 from jaxtank.presets.paper import Claim, Preset, closed_loop, printed
 from jaxtank.signals.setpoints import ramps
@@ -52,15 +52,15 @@ def sliding(model, printed=False):
 
 def blend(model):
     """Return the fuzzy blend of the corrected sliding mode and the state feedback (notes S4.5)."""
-    slide = {"surface": 0.05, "ks": 0.03, "phi": 0.1}
-    span = {"b": [1.0, 1.0], "w": [0.5, 0.5], "low": [0.0, 0.0], "high": [HIGH, HIGH]}
-    return FuzzyBlend(model=model, K=GAIN, **slide, **span)
+    slide: Any = {"surface": 0.05, "ks": 0.03, "phi": 0.1}
+    span: Any = {"b": [1.0, 1.0], "w": [0.5, 0.5], "low": [0.0, 0.0], "high": [HIGH, HIGH]}
+    return FuzzyBlend(model=model, K=number(GAIN), **slide, **span)
 
 
 def integral(model):
     """Return the state feedback with integral action (notes S4.6)."""
-    Q = [1.0, 1.0, 0.0, 0.0, 1e-3, 1e-3]
-    return LQI(model=model, Q=Q, R=[3.0, 3.0], operating_point=SETPOINT)
+    weights: Any = {"Q": [1.0, 1.0, 0.0, 0.0, 1e-3, 1e-3], "R": [3.0, 3.0]}
+    return LQI(model=model, **weights, operating_point=number(SETPOINT))
 
 
 # the printed controller as a relay: ks 100 hides its chatter
@@ -88,7 +88,7 @@ TUNABLE = {
 
 
 CONTROLLERS = {  # title, controller for a model, what `tune` changes
-    "sfc": ("state feedback", lambda m: StateFeedback(model=m, K=GAIN), ("controller.K",)),
+    "sfc": ("state feedback", lambda m: StateFeedback(model=m, K=number(GAIN)), ("controller.K",)),
     "smc": ("sliding mode, corrected", sliding, SLIDING),
     "hybrid": (
         "fuzzy blend of sliding mode and state feedback",
@@ -147,7 +147,7 @@ def tuning_scenarios():
     noise = {"sensor.noise": "0.05 if zero"}
     runs = [
         ("own start", noise),
-        *((name, {**steady, **one, **noise}) for name, one in off.items()),
+        *((name, {**steady, **change, **noise}) for name, change in off.items()),
     ]
     return tuple(Scenario(name, values, seed=11 + i) for i, (name, values) in enumerate(runs))
 
@@ -204,15 +204,15 @@ SAME_CONTROLLER = {"SMC": ("smc", "smc-printed"), "SFC": ("sfc",), "hybrid": ("h
 def measured_rows(run, assumed):
     """Return {quantity: what was measured} of the rows that can be measured."""
     # assumed : {controller of Table 3: its `response` with what notes S7.2 assumes}
-    rise = {name: found["arrival"] for name, found in assumed.items()}
+    rise = {name: values["arrival"] for name, values in assumed.items()}
     settled = [assumed[name]["settling"] for name in ("SFC", "hybrid")]
-    own = {name: response(run(cases[0])[1])["arrival"] for name, cases in SAME_CONTROLLER.items()}
-    left = float(np.abs(run("hybrid")[1].e[-1]).max())
+    cases = {name: response(run(cases[0])[1])["arrival"] for name, cases in SAME_CONTROLLER.items()}
+    error = float(np.abs(run("hybrid")[1].e[-1]).max())
     return {
         **_table_3(run, assumed),
         "SFC rises more slowly": Claim(
-            [_slowest(times) for times in (rise, own)],
-            f"first at 12 cm: {_times(rise)} under the assumptions of notes S7.2; {_times(own)}"
+            [_slowest(times) for times in (rise, cases)],
+            f"first at 12 cm: {_times(rise)} under the assumptions of notes S7.2; {_times(cases)}"
             " with the cases as they are",
         ),
         "settling of the hybrid": Claim(
@@ -221,7 +221,7 @@ def measured_rows(run, assumed):
             " notes S7.2 (counts if 10 % sooner)",
         ),
         "hybrid: steady-state error": Claim(
-            left < 0.01, f"{left:.1e} cm after 400 s (counts if below 0.01 cm)"
+            error < 0.01, f"{error:.1e} cm after 400 s (counts if below 0.01 cm)"
         ),
         "hybrid against SMC and SFC": _once_tuned(run),
         **_linear(run("sfc")[0].loop),
@@ -262,13 +262,13 @@ TUNED = {
 
 def _once_tuned(run):
     """The cost of the hybrid beside those of its parts, with the given gains and once tuned."""
-    given = {kind: run.cost(kind) for kind in ("hybrid", "smc", "sfc", "lqi")}
+    before = {kind: run.cost(kind) for kind in ("hybrid", "smc", "sfc", "lqi")}
     tuned = {kind: run.cost(kind, values) for kind, values in TUNED.items()}
     return Claim(
-        (given["hybrid"] < min(given["smc"], given["sfc"]), tuned["hybrid"] < tuned["sfc"]),
+        (before["hybrid"] < min(before["smc"], before["sfc"]), tuned["hybrid"] < tuned["sfc"]),
         "mean J of notes S10: hybrid {:.0f}, SMC {:.0f}, SFC {:.0f}, lqi {:.0f} with the given"
         " gains; hybrid {:.0f}, SFC {:.0f}, lqi {:.0f} once tuned for it".format(
-            *given.values(), *(tuned[kind] for kind in ("hybrid", "sfc", "lqi"))
+            *before.values(), *(tuned[kind] for kind in ("hybrid", "sfc", "lqi"))
         ),
     )
 
@@ -279,7 +279,7 @@ def _text(value, unit):
 
 def _table_3(run, assumed):
     """The numbers of Table 3 under the assumptions of notes S7.2, and as the cases are."""
-    own, found = {kind: response(run(kind)[1]) for kind in CONTROLLERS}, {}
+    responses, rows = {kind: response(run(kind)[1]) for kind in CONTROLLERS}, {}
     near, words, published = [], [], printed("mirakhorli")["published"]
     for quantity, (name, unit) in QUANTITIES.items():
         for controller in SAME_CONTROLLER:
@@ -288,13 +288,15 @@ def _table_3(run, assumed):
             if value is None or isinstance(target, str):  # it never settles
                 never = value is None and isinstance(target, str)
                 value = Claim(never, _text(value, unit))
-            found[f"{name}, {controller}"] = value
-            near += [_near(own[case][quantity], target) for case in SAME_CONTROLLER[controller]]
+            rows[f"{name}, {controller}"] = value
+            near += [
+                _near(responses[case][quantity], target) for case in SAME_CONTROLLER[controller]
+            ]
         cases = [case for cases in SAME_CONTROLLER.values() for case in cases]
-        each = ", ".join(f"{_text(own[case][quantity], unit)} in {case}" for case in cases)
+        each = ", ".join(f"{_text(responses[case][quantity], unit)} in {case}" for case in cases)
         words.append(f"{name} {each}")
     words.append(f"{sum(near)} of {len(near)} are within 10 % of Table 3")
-    return found | {"Table 3 with the cases as they are": Claim(near, "; ".join(words))}
+    return rows | {"Table 3 with the cases as they are": Claim(near, "; ".join(words))}
 
 
 def _near(value, target):
@@ -319,7 +321,7 @@ def _linear(loop):
     optimal = np.asarray(lqr(A_fit, B_fit, C.T @ C, 3.0 * np.eye(2)))
     near = float(np.abs(optimal - K).max())
     return {
-        "relative degree": tuple(1 if one else 2 for one in direct),
+        "relative degree": tuple(1 if acts else 2 for acts in direct),
         "non-minimum phase": Claim(
             bool(zeros[-1] > 0.0), f"zeros at {zeros[0]:+.4f} and {zeros[-1]:+.4f} 1/s"
         ),

@@ -151,7 +151,7 @@ def closed_loop(plant: Any, controller: Any, reference: Any, x0: Any, **parts: A
     # each pump}; the other parts are those of ClosedLoop.
     scale, full_scale = parts.pop("sensor")
     each = lambda count, value: np.array(np.broadcast_to(number(value), (count,)))
-    pumps = {
+    pumps: dict[str, Any] = {
         name: value if isinstance(value, str) else each(plant.pumps, value)
         for name, value in parts.pop("pumps").items()
     }

@@ -98,7 +98,9 @@ def type_of(field: dataclasses.Field[Any]) -> Any:
 
 def _key(name: str, row: dict[str, Any]) -> Key:
     """The Key of a row of schema.toml."""
-    values = {k: tuple(v) if k in ("shape", "choices") else v for k, v in row.items()}
+    values: dict[str, Any] = {
+        k: tuple(v) if k in ("shape", "choices") else v for k, v in row.items()
+    }
     if values.pop("optional", False):
         values["default"] = None
     if "of" not in values:

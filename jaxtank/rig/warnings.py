@@ -165,7 +165,9 @@ def _above_rims(case):
                 f"{tanks[i]} starts at {level:g} {length}, above its rim at {rim[i]:g} {length}: "
                 + ("what is above it overflows at once" if plant.overflow else limits)
             )
-    for i, tank in enumerate(plant.outputs if reference is not None else ()):
+    if reference is None:
+        return
+    for i, tank in enumerate(plant.outputs):
         targets = zip(reference.changes, np.asarray(reference.targets))
         highest = max([reference.initial[i], *(v for (_, j), v in targets if j == i)])
         if highest > rim[tank]:

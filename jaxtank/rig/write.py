@@ -150,7 +150,8 @@ def _building(case, loop, origin, same):
     start, units = (None if origin is None else origin.loop), case.loop.units
     if origin is None:
         top = {"name": case.name, "units": units}
-        blocks = [_of_rig(*entry, units) for entry in network.entries_of(loop, case.names)]
+        entries = network.entries_of(loop, case.names)
+        blocks = [_of_rig(section, i, values, units) for section, i, values in entries]
     else:
         top, blocks = {"case": origin.name, "name": case.name}, []
     for name in components.ROLES:

@@ -21,7 +21,6 @@ from jaxtank.controllers import OpenLoop
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import with_values
-from jaxtank.plants.network import network
 from jaxtank.plants.runge_kutta import integrate
 from jaxtank.presets import calofir
 from jaxtank.signals.setpoints import ramps
@@ -149,31 +148,11 @@ TABLE = [  # notes S7.1: run, gains, RMSE, OS, US, ts up, ts down, RMS Q, satura
     ("backstepping", (0.02, 0.1), 0.07718, 0.0, 0.0, 139, 146, 5.953e-5, 0.1250, 1.480e-4),
     ("backstepping", (0.1, 0.1), 0.07786, 15.35, 27.36, 193, 116, 6.057e-5, 0.1875, 2.651e-4),
     ("backstepping-perturbed", (0.01, 0.01), 0.12005, 0.0, 55.8, None, None, 5.456e-5, 0.0, None),
-    (
-        "backstepping-perturbed",
-        (0.02, 0.02),
-        0.08243,
-        0.12,
-        23.3,
-        None,
-        None,
-        5.899e-5,
-        0.0592,
-        None,
-    ),
-    (
-        "backstepping-perturbed",
-        (0.02, 0.1),
-        0.07727,
-        0.33,
-        5.26,
-        139,
-        465,
-        6.008e-5,
-        0.1250,
-        1.782e-4,
-    ),
-]
+    ("backstepping-perturbed", (0.02, 0.02),
+     0.08243, 0.12, 23.3, None, None, 5.899e-5, 0.0592, None),
+    ("backstepping-perturbed", (0.02, 0.1),
+     0.07727, 0.33, 5.26, 139, 465, 6.008e-5, 0.125, 1.782e-4),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("name, K, rmse, over, under, up, down, rms_q, saturated, travel", TABLE)
@@ -326,20 +305,6 @@ def test_slopes_of_the_mean_square_error():
     )
 
 
-@pytest.mark.slow
-def test_the_landscape_is_symmetric():
-    """Notes S10: J(K_phi, K_y) = J(K_y, K_phi) over a grid of gains, and it is not flat."""
-    case = CASES["backstepping"]
-    grid = jnp.logspace(-2, 0, 5)
-    f = lambda K_phi, K_y: jaxtank.evaluate(
-        with_values(case.loop, gains(K_phi, K_y)), case.clock, "rms_error"
-    )["rms_error"][0]
-    found = np.asarray(jax.jit(jax.vmap(jax.vmap(f, (None, 0)), (0, None)))(grid, grid))
-    np.testing.assert_allclose(found, found.T, atol=1e-10)
-    # the prototype's bound of every gain (notes S7.1)
-    assert np.ptp(found) > 0.02 and found.min() > 0.07705
-
-
 def test_exchanging_the_gains_changes_nothing():
     a, b = (run("backstepping-perturbed", gains(*K))[1].x for K in ((0.02, 0.3), (0.3, 0.02)))
     np.testing.assert_allclose(a, b, atol=1e-12)
@@ -380,71 +345,10 @@ def test_empty_tanks_fill_with_floors_and_never_without():
     assert abs(np.sqrt(np.mean(dead.e**2)) - 0.400) <= 5e-4
 
 
-@pytest.mark.slow
-def test_the_rig_in_centimetres():
-    """The plant is the same; the law is too where its a^2, which carries a length, is taken out of
-    K_phi K_y (notes S4.2).
-    """
-    case = CASES["backstepping"]
-    m = case.loop.plant
-    cm = dataclasses.replace(
-        m,
-        area=m.area * 1e4,
-        drain=m.drain * 1e4,
-        pipe=m.pipe * 1e4,
-        gravity=m.gravity * 100,
-        rim=m.rim * 100,
-        units=("cm", "cm^3/s"),
-        knee=m.knee * 100,
-    )
-    control = case.loop.controller
-    # same sum; product less the difference of the two a^2
-    K = np.sort(np.roots([1.0, -0.4, 0.1 * 0.3 + A**2 * (1 - 100)]))
-    controller_cm = dataclasses.replace(
-        control,
-        model=cm,
-        K_phi=K[0],
-        K_y=K[1],
-        level_floor=control.level_floor * 100,
-        difference_floor=control.difference_floor * 100,
-    )
-    bank, ref = case.loop.actuator, case.loop.reference
-    in_cm = dataclasses.replace(
-        case.loop,
-        plant=cm,
-        controller=controller_cm,
-        x0=case.loop.x0 * 100,
-        actuator=dataclasses.replace(bank, high=bank.high * 1e6),
-        reference=dataclasses.replace(ref, initial=ref.initial * 100, targets=ref.targets * 100),
-    )
-    a = jaxtank.simulate(with_values(case.loop, gains(0.1, 0.3)), case.clock)
-    b = jaxtank.simulate(in_cm, case.clock)
-    np.testing.assert_allclose(b.x, 100 * a.x, atol=1e-9)
-    np.testing.assert_allclose(b.u, 1e6 * a.u, atol=1e-7)
-
-
-def test_the_tanks_in_the_other_order():
+def test_the_controller_refuses_another_rig():
     m = calofir.rig()
-    turned = network(
-        area=m.area[::-1],
-        drain=m.drain[::-1],
-        pipes=((0, 1),),
-        pipe=m.pipe,
-        pump_gain=m.pump_gain,
-        feeds=[(1, None)],
-        gravity=m.gravity,
-        rim=m.rim[::-1],
-        outputs=(1,),
-        overflow=True,
-        bottom=True,
-        units=m.units,
-        knee=m.knee,
-    )
-    one, other = (
-        np.array(p.derivative(0.0, x, (5e-5,), None))
-        for p, x in ((m, (0.3, 0.1)), (turned, (0.1, 0.3)))
-    )
-    np.testing.assert_array_equal(one, other[::-1])
+    lengths = {n: getattr(m, n)[::-1] for n in ("area", "drain", "rim")}
+    turned = dataclasses.replace(m, **lengths, feeds=((1, None),), outputs=(1,))
     controller = dataclasses.replace(CASES["backstepping"].loop.controller, model=turned)
     with pytest.raises(InputError, match="two coupled tanks"):
         controller.check(CASES["backstepping"].loop.reference)

@@ -15,7 +15,7 @@ from jaxtank.loop.run import evaluate_compiled
 from jaxtank.presets.paper import Claim, Published
 from tuning.bench.bench import is_one_function
 from tuning.cli import main
-from tuning.report.papers import VERDICTS, measure, overview, verdict
+from tuning.report.papers import VERDICTS, measure, overview, runner, verdict
 
 NAMES = presets.names()
 NEW = [name for name in NAMES if not name.startswith("gouta2015")]
@@ -124,9 +124,7 @@ def test_a_fitted_case_is_another_one_with_what_the_notes_list(name):
 @pytest.mark.parametrize("name", NEW)
 def test_a_case_is_checked_and_its_rig_file_is_itself(name):
     case = rig.check(presets.find(name))
-    import tomllib
-
-    again = rig.from_table(tomllib.loads(rig.dump(case)))
+    again = rig.loads(rig.dump(case))
     assert jax.tree.structure(again.loop) == jax.tree.structure(case.loop)
     for a, b in zip(jax.tree.leaves(again.loop), jax.tree.leaves(case.loop)):
         np.testing.assert_array_equal(a, b)
@@ -142,14 +140,6 @@ def test_what_a_case_frees_is_a_leaf_within_its_range(name):
         rig.check_free(case.loop, parameter, *free)
     for parameter, free in preset.tunable.items():
         assert free.low < free.high, parameter
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", NEW)
-def test_a_case_is_printed(name, capsys):
-    assert main.main(["show", name]) == 0
-    printed = capsys.readouterr().out
-    assert "departures from the paper" in printed and "controller." in printed
 
 
 @pytest.mark.slow
@@ -184,24 +174,101 @@ def test_no_row_of_a_paper_is_missing():
     assert {paper: len(presets.load(paper).published) for paper in presets.PAPERS} == ROWS
 
 
-@pytest.mark.slow
+PART, NOT = "partly", "not reproduced"
+CLAIMS = {  # claims of a paper that hold in part, or not; every other one that is listed holds
+    "calofir": {
+        "same performance in any operating point": PART,
+        "globally asymptotically stabilises": NOT,
+        "larger gains settle sooner": PART,
+        "reacts rapidly to faults": "reproduced",
+        "some steady state errors": "reproduced",
+    },
+    "gouta2015": {
+        "uncertain plants: size of the error": NOT,
+        "uncertain plants: steady error": NOT,
+        "uncertain plants: feasible trajectories": NOT,
+        "uncertain plants: growth of the error": "reproduced",
+    },
+    "gouta2022": {
+        "pump constant as printed": NOT,
+        "a delay makes d^ negative": NOT,
+        "eq. (12) tracks without offset": NOT,
+        "the observer spares the pumps": NOT,
+        "rise of tank 2 and 1 by an inflow pulse": PART,
+    },
+    "khalid": {
+        "a long control horizon improves performance": PART,
+        "control horizon beyond 10": "reproduced",
+        "overshoot against control horizon": PART,
+        "overshoot of Laguerre against GPC 30": PART,
+        "parameters of Laguerre": "reproduced",
+        "Laguerre against GPC with two pumps": NOT,
+        # lower with constraints alone: without, both are a fixed gain
+        "computational cost of Laguerre": PART,
+        "undershoot against control horizon": PART,
+        "pulses from 0 m: long control horizon": PART,
+        "pulses from 0 m: control horizon beyond 10": "reproduced",
+        "pulses from 0 m: overshoot and undershoot": PART,
+        "pulses from 0 m: overshoot of Laguerre": PART,
+        "pulses from 0 m: Laguerre with two pumps": NOT,
+    },
+    "mirakhorli": {
+        "chattering of the SMC": "reproduced",
+        # on the rig that was fitted to Table 3, and not with the cases as they are
+        "SFC rises more slowly": PART,
+        "Table 3 with the cases as they are": PART,
+        "hybrid against SMC and SFC": PART,  # by the printed gains, and not once both are tuned
+        "settling time, SMC": "reproduced",
+        "sign of the SFC": NOT,
+        "settling of the hybrid": NOT,
+        "non-minimum phase": "reproduced",
+        "hybrid: steady-state error": "reproduced",
+        "SFC is an optimal gain": "reproduced",  # by a choice of Q, R and gamma
+        "hybrid switches between the controllers": "reproduced",
+        "30 % change of an outlet": PART,
+        "zero steady-state error of the SFC": PART,
+    },
+}
+NUMBERS = {  # measured numbers that are not the printed ones, and what they are
+    "mirakhorli": {
+        "overshoot, SMC": (43.7, 0.1),
+        "overshoot, SFC": (9.0, 0.1),
+        "overshoot, hybrid": (13.5, 0.1),
+        "rise time, SMC": (27.5, 0.1),
+        "rise time, SFC": (34.7, 0.1),
+        "rise time, hybrid": (28.4, 0.1),
+    },
+    "khalid": {"pulses of H2, one pump": ((0.03, 0.15), 0.0)},
+}
+
+
+@pytest.mark.slow_for("dts200", "gouta2015", "gouta2022", "johansson", "khalid", "mirakhorli")
 @pytest.mark.parametrize("paper", presets.PAPERS)
-def test_a_paper_is_compared_and_every_difference_has_a_reason(paper):
-    page = measure(paper)
-    rows = page["rows"]
-    assert any(r["verdict"] in ("reproduced", "input") for r in rows)
-    assert len(rows) == ROWS[paper]
+def test_rows_of_a_paper_are_measured(paper):
+    """Every number and claim of a paper: what holds of it, and why where it does not."""
+    preset = presets.load(paper)
+    measured = preset.measured(runner(paper))
+    assert set(measured) <= set(preset.published)
+    words = {}
+    for name, printed in preset.published.items():
+        word, value, reason = verdict(printed, measured.get(name))
+        words[name] = word
+        assert word in VERDICTS and (reason or isinstance(value, str)), name
+        assert (word == "fitted") <= bool(printed.fitted)
+        assert not (printed.fitted and word == "reproduced")
+    assert {"reproduced", "input"} & set(words.values())
+    claims = {name: v.verdict for name, v in measured.items() if isinstance(v, Claim)}
+    assert claims.items() >= CLAIMS.get(paper, {}).items()
+    for name, (value, within) in NUMBERS.get(paper, {}).items():
+        np.testing.assert_allclose(measured[name], value, atol=within)
+
+
+def test_a_comparison_counts_its_rows():
+    page = measure("cascaded")
+    assert len(page["rows"]) == ROWS["cascaded"]
     counts = [page["headline"][kind]["of"] for kind in ("numbers", "claims")]
     counts += [page["headline"][word] for word in ("input", "not reproducible")]
-    assert sum(counts) == len(rows)
-    for r in rows:
-        assert r["verdict"] in VERDICTS
-        # of a claim that holds the measured text has the numbers
-        assert r["reason"] or isinstance(r["measured"], str), r["quantity"]
-    for name, printed in presets.load(paper).published.items():
-        (row,) = (r for r in rows if r["quantity"] == name)
-        assert (row["verdict"] == "fitted") <= bool(printed.fitted)
-        assert not (printed.fitted and row["verdict"] == "reproduced")
+    assert sum(counts) == len(page["rows"])
 
 
 def test_each_verdict_is_given_where_it_belongs():

@@ -14,8 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import in_metres
-from scipy.integrate import solve_ivp
 
 import jaxtank
 from jaxtank import rig
@@ -31,7 +29,6 @@ from jaxtank.analysis.steady_state import equilibrium, steady_along, steady_flow
 from jaxtank.controllers import LQI, SlidingMode, StateFeedback
 from jaxtank.controllers.fuzzy import membership
 from jaxtank.controllers.sliding_mode import acceleration, lower_tanks
-from jaxtank.core.clock import Clock
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.numerics import smooth_signed_sqrt, smooth_signed_sqrt_slope
 from jaxtank.core.records import Estimate, Tick
@@ -120,11 +117,6 @@ def test_set_points_that_have_a_steady_state(ratio, exists):
     else:
         with pytest.raises(EquilibriumError):
             equilibrium(PLANT, (10.0, 10.0 * ratio))
-
-
-def test_the_highest_equal_set_point_of_5_volts():
-    low, high = (max(equilibrium(PLANT, (r, r))[1]) for r in (21.33, 21.35))
-    assert low < 5.0 < high
 
 
 def test_linear_model_at_the_set_point():
@@ -216,15 +208,6 @@ def test_f_and_g_of_equation_4_against_derivatives():
     np.testing.assert_allclose(f[0], printed, rtol=1e-12)
 
 
-def test_f_and_g_of_the_printed_controller_at_the_set_point():
-    f, (m11, m22), (m12, m21) = acceleration(lower_tanks(PLANT, X0), 0.0)
-    np.testing.assert_allclose(f, (-0.005653, -0.009935), atol=1e-6)
-    np.testing.assert_allclose(
-        [[m11, m12], [m21, m22]], [[-0.0019190, 0.0048846], [0.0034267, -0.0011072]], atol=1e-7
-    )
-    np.testing.assert_allclose((m11 * m22 - m12 * m21) / (m12 * m21), -0.873, atol=5e-4)
-
-
 @pytest.mark.parametrize("surface", [0.01, 0.05, 3.0])
 def test_the_rate_of_the_corrected_surface_is_exact(surface):
     """s' = f + M u along the plant, and M = G + surface diag(gamma k / A) (notes S4.3), with
@@ -245,16 +228,10 @@ def test_the_rate_of_the_corrected_surface_is_exact(surface):
     np.testing.assert_allclose(plain.across, (m12, m21), rtol=1e-14)
 
 
-def test_the_drift_at_the_set_point():
-    np.testing.assert_allclose(lower_tanks(PLANT, X0).drift, (-0.31095, -0.12586), atol=6e-6)
-
-
 def test_signed_root_slope_is_the_slope():
     x = np.array([-2.0, -1e-3, 0.0, 3e-3, 0.01, 5.0])
-    np.testing.assert_allclose(
-        smooth_signed_sqrt_slope(x), jax.vmap(jax.grad(smooth_signed_sqrt))(x), rtol=1e-12
-    )
-    np.testing.assert_allclose(smooth_signed_sqrt_slope(0.0), 10.0, rtol=1e-12)
+    slopes = jax.vmap(jax.grad(smooth_signed_sqrt))(x)
+    np.testing.assert_allclose(smooth_signed_sqrt_slope(x), slopes, rtol=1e-12)
 
 
 # S4.1: state feedback
@@ -280,53 +257,12 @@ def test_the_printed_gain_is_linear_quadratic():
     np.testing.assert_allclose(np.abs(rounded - np.array(GAIN)).max(), 0.0034, atol=5e-5)
 
 
-@pytest.mark.slow
-def test_no_other_split_of_four_digits_gives_the_printed_gain():
-    """Notes S4.1: among its neighbours on a grid of 1e-4 (0.4165, 0.3414) is the only node within
-    the rounding of all eight entries.
-    """
-    nodes = [(0.4165 + 1e-4 * i, 0.3414 + 1e-4 * j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    near = [n for n in nodes if np.abs(designed(n) - np.array(GAIN)).max() <= 5e-5]
-    np.testing.assert_allclose(near, [UNROUNDED_SPLIT], rtol=1e-12)
-
-
 @pytest.mark.parametrize("r, worst", [(2.5, 0.0325), (2.8, 0.0133), (3.2, 0.0101), (3.5, 0.0212)])
 def test_other_weights_miss_the_printed_gain(r, worst):
     A, B, C = linearise(PLANT, X0, U0)
     np.testing.assert_allclose(
         np.abs(lqr(A, B, C.T @ C, r * np.eye(2)) - np.array(GAIN)).max(), worst, atol=6e-5
     )
-
-
-def test_equal_weights_of_all_levels_miss_it_by_a_tenth():
-    A, B, _ = linearise(PLANT, X0, U0)
-    miss = jax.jit(
-        jax.vmap(lambda q: jnp.abs(lqr(A, B, q * jnp.eye(4), jnp.eye(2)) - jnp.array(GAIN)).max())
-    )
-    assert abs(float(miss(np.geomspace(0.01, 3, 200)).min()) - 0.11) < 5e-3
-
-
-def test_poles_of_the_closed_loop_and_of_the_literal_sign():
-    A, B, _ = linearise(PLANT, X0, U0)
-    poles = np.sort_complex(np.linalg.eigvals(A - B @ np.array(GAIN)))
-    np.testing.assert_allclose(
-        poles, [-0.05607 - 0.03053j, -0.05607 + 0.03053j, -0.05255, -0.02411], atol=1e-5
-    )
-    np.testing.assert_allclose(
-        np.linalg.eigvals(A + B @ np.array(GAIN)).real.max(), 0.0387, atol=5e-5
-    )
-    # u = -K h without u0: the pumps stand
-    np.testing.assert_allclose(-np.array(GAIN) @ X0, (-6.5, -4.3), atol=0.06)
-
-
-def test_the_return_difference_of_the_optimal_gain():
-    A, B, C = (np.asarray(a) for a in linearise(PLANT, X0, U0))
-    K = np.asarray(lqr(A, B, C.T @ C, 3.0 * np.eye(2)))
-    least = [
-        np.linalg.svd(np.eye(2) + K @ np.linalg.solve(1j * w * np.eye(4) - A, B))[1].min()
-        for w in np.geomspace(1e-4, 10, 200)
-    ]
-    assert 1.0 - 1e-9 < min(least) < 1.001
 
 
 def test_steady_states_along_a_reference_are_those_of_every_sample():
@@ -525,155 +461,44 @@ def test_open_loop(start, t, levels):
     np.testing.assert_allclose(open_loop(start, 0.1, t, True), levels, atol=3e-4)
 
 
-def exact(start, seconds):
-    rig_ = smooth(PLANT)
-    field = jax.jit(lambda x: jnp.stack(rig_.derivative(0.0, tuple(x), OPEN_LOOP, None)))
-    return solve_ivp(
-        lambda t, x: np.asarray(field(x)),
-        (0, seconds),
-        [start] * 4,
-        method="DOP853",
-        rtol=1e-12,
-        atol=1e-12,
-    ).y[:, -1]
-
-
-@pytest.mark.slow
-def test_error_of_the_integrator():
-    """RK4 from empty tanks loses its order to the root; the error at 100 s of the prototype's root
-    is the prototype's, to its two digits.
-    """
-    end = exact(0.0, 100.0)
-    for dt, error in ((0.1, 3.3e-7), (0.5, 4.2e-5), (1.0, 1.5e-4), (2.0, 4.6e-4), (5.0, 2.2e-3)):
-        found = np.abs(open_loop(0.0, dt, 100.0, True) - end).max()
-        np.testing.assert_allclose(found, error, rtol=0.04)  # two digits: half a unit of the last
-        # our root, which differs by 2e-4 itself
-        assert np.abs(open_loop(0.0, dt, 100.0) - end).max() < max(1.6 * error, 3e-4)
-    np.testing.assert_allclose(
-        np.abs(open_loop(15.0, 1.0, 100.0, True) - exact(15.0, 100.0)).max(), 2.9e-8, rtol=0.05
-    )
-
-
-# case, values, OS1 %, rise1, arrival1, settling1, ISE1, OS2, rise2, settling2, ISE2, IUE, TV
+# case, values, (overshoot %, rise, arrival, settling, ISE) of tank 1, the same of tank 2 without
+# arrival, effort, travel
 NOMINAL = [
-    ("sfc", {}, 7.046, 30.80, 42.34, 88.6, 1586.07, -0.003, 63.10, 89.4, 2415.25, 170.80, 3.906),
-    (
-        "smc",
-        {"phi": 0.02},
-        4.314,
-        32.26,
-        45.71,
-        40.0,
-        1616.57,
-        0,
-        62.73,
-        80.2,
-        2613.50,
-        217.11,
-        15.92,
-    ),
-    ("smc", {}, 0.896, 34.63, 49.23, 43.2, 1635.45, 0, 62.68, 80.1, 2684.11, 187.38, 15.48),
-    (
-        "smc",
-        {"surface": 0.04},
-        0.000,
-        34.93,
-        None,
-        43.0,
-        1647.25,
-        0,
-        66.78,
-        88.4,
-        2702.53,
-        151.48,
-        13.68,
-    ),
-    (
-        "hybrid",
-        {"phi": 0.02},
-        6.618,
-        32.26,
-        44.43,
-        58.9,
-        1623.40,
-        0.042,
-        60.30,
-        77.2,
-        2564.46,
-        211.46,
-        17.47,
-    ),
-    ("hybrid", {}, 2.892, 34.62, 47.86, 42.9, 1635.73, 0.136, 59.75, 76.0, 2647.98, 188.52, 16.42),
-    (
-        "hybrid",
-        {"b": 2.0, "w": 1.0},
-        5.753,
-        33.98,
-        45.49,
-        66.0,
-        1643.86,
-        0.009,
-        58.24,
-        74.3,
-        2598.91,
-        185.29,
-        16.40,
-    ),
-]
+    ("sfc", {}, (7.046, 30.8, 42.34, 88.6, 1586.07), (-0.003, 63.1, 89.4, 2415.25), 170.8, 3.906),
+    ("smc", {"phi": 0.02}, (4.314, 32.26, 45.71, 40.0, 1616.57), (0, 62.73, 80.2, 2613.5),
+     217.11, 15.92),
+    ("smc", {}, (0.896, 34.63, 49.23, 43.2, 1635.45), (0, 62.68, 80.1, 2684.11), 187.38, 15.48),
+    ("smc", {"surface": 0.04}, (0.0, 34.93, None, 43.0, 1647.25), (0, 66.78, 88.4, 2702.53),
+     151.48, 13.68),
+    ("hybrid", {"phi": 0.02}, (6.618, 32.26, 44.43, 58.9, 1623.4), (0.042, 60.3, 77.2, 2564.46),
+     211.46, 17.47),
+    ("hybrid", {}, (2.892, 34.62, 47.86, 42.9, 1635.73), (0.136, 59.75, 76.0, 2647.98),
+     188.52, 16.42),
+    ("hybrid", {"b": 2.0, "w": 1.0}, (5.753, 33.98, 45.49, 66.0, 1643.86),
+     (0.009, 58.24, 74.3, 2598.91), 185.29, 16.4),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(
     "row", NOMINAL, ids=lambda row: "-".join([row[0], *map(str, row[1].values())])
 )
 def test_rows_of_the_reference_table(row):
-    (
-        name,
-        values,
-        os1,
-        rise1,
-        arrival1,
-        settling1,
-        ise1,
-        os2,
-        rise2,
-        settling2,
-        ise2,
-        effort,
-        travel,
-    ) = row
+    name, values, (os1, rise1, arrival, settled1, ise1), second, effort, travel = row
+    os2, rise2, settled2, ise2 = second
     _, trajectory = run(name, **{f"controller__{k}": v for k, v in values.items()})
     one, two = response(trajectory, 0), response(trajectory, 1)
     np.testing.assert_allclose((one["overshoot"], two["overshoot"]), (os1, os2), atol=0.05)
-    for found, times in ((one, (rise1, settling1)), (two, (rise2, settling2))):
-        np.testing.assert_allclose((found["rise"], found["settling"]), times, atol=0.2)
-    if arrival1 is not None:
-        np.testing.assert_allclose(one["arrival"], arrival1, atol=0.2)
-        np.testing.assert_allclose(
-            crossing(trajectory.t, trajectory.x[:, 0], 12.0), arrival1, atol=0.05
-        )
+    for got, times in ((one, (rise1, settled1)), (two, (rise2, settled2))):
+        np.testing.assert_allclose((got["rise"], got["settling"]), times, atol=0.2)
+    if arrival is not None:
+        np.testing.assert_allclose(one["arrival"], arrival, atol=0.2)
+        between = crossing(trajectory.t, trajectory.x[:, 0], 12.0)
+        np.testing.assert_allclose(between, arrival, atol=0.05)
     np.testing.assert_allclose(ise(trajectory), (ise1, ise2), rtol=3e-3)
     u = trajectory.u[:-1]
     # as in J: left Riemann sum
     np.testing.assert_allclose(0.1 * np.sum((u - U0) ** 2), effort, rtol=5e-3)
     np.testing.assert_allclose(np.abs(np.diff(trajectory.u, axis=0)).sum(), travel, atol=0.01)
-
-
-def test_measures_of_the_library_are_those_of_the_tables():
-    case, trajectory = run("hybrid")
-    found = jaxtank.evaluate(
-        case.loop,
-        case.clock,
-        ["overshoot_percent", "rise_time", "settling_time", "ise", "input_travel"],
-    )
-    reported = [response(trajectory, i) for i in range(2)]
-    np.testing.assert_allclose(
-        found["overshoot_percent"], [r["overshoot"] for r in reported], atol=1e-9
-    )
-    np.testing.assert_allclose(found["rise_time"], [r["rise"] for r in reported], atol=1e-9)
-    np.testing.assert_allclose(found["settling_time"], [r["settling"] for r in reported], atol=1e-9)
-    np.testing.assert_allclose(
-        np.asarray(found["ise"]) - ise(trajectory), 7.2, atol=1e-3
-    )  # the measure is a left sum: Ts/2 e(0)^2 more
 
 
 COSTS = {  # J = ISE + 3 |u - u*|^2, left Riemann sums over 400 s, phi 0.02: value and slopes
@@ -748,23 +573,6 @@ def test_the_printed_controller_never_arrives():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"clock__dt": 0.01},
-        {"clock__dt": 1.0},
-        {"controller__switch": "tanh", "controller__phi": 300.0},
-    ],
-)
-def test_neither_sampling_nor_a_boundary_layer_cures_the_printed_controller(values):
-    _, trajectory = run("smc-printed", **values)
-    assert np.all(trajectory.x[-1, :2] < 9.0)
-    late = trajectory.u[len(trajectory.u) // 2 :]
-    # nearly every sample is a jump of 5 V
-    assert np.mean(np.abs(np.diff(late, axis=0)) > 4.9) > 0.9
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("slope, chatters", [(0.040, False), (0.050, True)])
 def test_when_the_printed_controller_chatters(slope, chatters):
     """One-sample gain (lambda + ks/phi) rho(G^-1 D) below 1: lambda + ks/phi < 0.0418 1/s, rho =
@@ -804,39 +612,15 @@ def relay(b, w, high):
 # u_max, factor of the pump gains, b and w of the hybrid, rows SMC-R, SFC, HYB-R of (OS %, t100,
 # settling or None, ISE of tank 1 as nMSE)
 TABLE_3 = [
-    (
-        5.0,
-        1.0,
-        (3.0, 1.0),
-        (18.8, 36.6, None, 0.062),
-        (7.05, 42.3, 88.5, 0.028),
-        (9.35, 38.2, 90.8, 0.028),
-    ),
-    (
-        6.0,
-        1.0,
-        (3.0, 1.0),
-        (41.6, 28.0, None, 0.097),
-        (6.4, 37.7, 77.9, 0.0226),
-        (13.4, 28.8, 80.6, 0.0230),
-    ),
-    (
-        5.8,
-        1.05,
-        (3.25, 1.5),
-        (43.7, 27.5, None, 0.104),
-        (9.0, 34.7, 101.6, 0.0230),
-        (13.5, 28.4, 99.6, 0.0235),
-    ),
-    (
-        3.85,
-        1.0,
-        (3.0, 1.0),
-        (3.2, 61.7, 376.0, 0.0415),
-        (6.4, 67.3, 119.0, 0.0392),
-        (6.5, 66.9, 119.3, 0.0392),
-    ),
-]
+    (5.0, 1.0, (3.0, 1.0),
+     (18.8, 36.6, None, 0.062), (7.05, 42.3, 88.5, 0.028), (9.35, 38.2, 90.8, 0.028)),
+    (6.0, 1.0, (3.0, 1.0),
+     (41.6, 28.0, None, 0.097), (6.4, 37.7, 77.9, 0.0226), (13.4, 28.8, 80.6, 0.0230)),
+    (5.8, 1.05, (3.25, 1.5),
+     (43.7, 27.5, None, 0.104), (9.0, 34.7, 101.6, 0.0230), (13.5, 28.4, 99.6, 0.0235)),
+    (3.85, 1.0, (3.0, 1.0),
+     (3.2, 61.7, 376.0, 0.0415), (6.4, 67.3, 119.0, 0.0392), (6.5, 66.9, 119.3, 0.0392)),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("row", TABLE_3, ids=lambda row: str(row[0]))
@@ -867,25 +651,6 @@ def test_rows_beside_table_3_of_the_paper(row):
 
 
 # S4.4, S4.5 and S10: switching, pairing, and what the laws cost from other starts
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dt, travel", [(0.01, 693.0), (0.1, 69.0), (1.0, 7.0)])
-def test_chatter_of_the_corrected_controller_with_a_sign(dt, travel):
-    """Volts per second at rest at 12/12, inversely as the sample; the ripple of tank 1 is 0.058 cm
-    at
-    0.1 s. 4 and 7 %: a limit cycle that is cut anywhere.
-    """
-    start = {"x0": tuple(X0), "actuator__initial": tuple(U0), "reference__initial": 12.0}
-    _, trajectory = run(
-        "smc", controller__switch="sign", clock__dt=dt, clock__duration=60.0, **start
-    )
-    late = len(trajectory.t) // 2
-    seconds = trajectory.t[-1] - trajectory.t[late]
-    np.testing.assert_allclose(
-        np.abs(np.diff(trajectory.u[late:], axis=0)).sum() / seconds, travel, rtol=0.04
-    )
-    np.testing.assert_allclose(np.ptp(trajectory.x[late:, 0]), 0.058 * dt / 0.1, rtol=0.07)
 
 
 @pytest.mark.slow
@@ -1079,160 +844,28 @@ def test_integral_action_from_empty_tanks():
 
 def test_the_integrator_stands_while_a_pump_is_at_its_limit():
     controller = load("mirakhorli").cases["lqi"].loop.controller
-    tick, state = (
-        Tick(t=0.0, r=SETPOINT, dr=(0.0, 0.0), ddr=(0.0, 0.0), dt=0.1),
-        ((1.0, 2.0), (-3.0, 0.5)),
-    )
-    np.testing.assert_allclose(
-        controller.track(state, tick, (4.0, 2.0), (4.0, 2.0))[0], (0.7, 2.05)
-    )
-    np.testing.assert_allclose(controller.track(state, tick, (6.0, 2.0), (5.0, 2.0))[0], (1.0, 2.0))
+    tick = Tick(t=0.0, r=SETPOINT, dr=(0.0, 0.0), ddr=(0.0, 0.0), dt=0.1)
+    state = ((1.0, 2.0), (-3.0, 0.5))
+    for command, first in (((4.0, 2.0), 0.7), ((6.0, 2.0), 1.0)):
+        integral = controller.track(state, tick, command, tuple(np.clip(command, 0, 5)))[0]
+        np.testing.assert_allclose(integral, (first, 2.05 if first < 1 else 2.0))
 
 
-# what must hold of any law here
+# what must hold of any controller here
 
 
-def cost_of(case):
-    """The case's own cost as a function of {leaf: value}."""
-
-    def cost(values):
-        found = jaxtank.evaluate(with_values(case.loop, values), case.clock, tuple(case.objective))
-        return sum(weight * jnp.sum(found[m]) for m, weight in case.objective.items())
-
-    return cost
-
-
-def leaves_of(case):
-    tunable = {n.split("[")[0] for n in load("mirakhorli").tunable}
-    return {n: v for n, v in jaxtank.parameters(case.loop).items() if n in tunable}
+FOUR, ONES = state_coupled_four_tank(20.0), {"surface": 1.0, "ks": 1.0, "phi": 1.0}
+UNFIT = [
+    (SlidingMode(model=FOUR, **ONES), "must be a quadruple tank"),
+    (StateFeedback(model=PLANT, K=[[1.0, 2.0]]), r"controller.K has shape \(1, 2\)"),
+    (
+        LQI(model=PLANT, Q=[1.0] * 4, R=[1.0] * 2, operating_point=SETPOINT),
+        "controller.Q has shape",
+    ),
+]
 
 
-@pytest.mark.slow
-def test_the_printed_controller_has_no_useful_slopes():
-    """Every voltage is a limit, 0 or 5 V, and jumps as the surface crosses zero: the derivative of
-    a sign is 0, so every slope is 0, while the cost itself moves in steps.
-    """
-    case = load("mirakhorli").cases["smc-printed"]
-    cost, point = cost_of(case), leaves_of(case)
-    slopes = jax.jit(jax.jacfwd(cost))({n: jnp.asarray(v) for n, v in point.items()})
-    assert all(np.all(s == 0.0) for s in slopes.values()), slopes
-    assert set(point) == {"controller.surface", "controller.ks", "controller.phi"}
-    value = jax.jit(cost)
-    moved = [
-        float(value({**point, "controller.ks": number(k)})) for k in (0.5, 1.0, 2.0, 5.0, 50.0)
-    ]
-    assert np.ptp(moved) > 1e-2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["sfc", "hybrid", "lqi"])
-def test_tanks_in_another_order_give_the_same_run(name):
-    """Left and right exchanged (tank 1 with 2, 3 with 4, pump 1 with 2) everywhere: the answers are
-    exchanged.
-    """
-    case = load("mirakhorli").cases[name]
-    tanks, pumps = [1, 0, 3, 2], [1, 0]
-
-    def permuted(rig_):
-        order = {
-            "area": tanks,
-            "rim": tanks,
-            "drain": tanks,
-            "orifice": pumps,
-            "pump_gain": pumps,
-            "split": pumps,
-        }
-        return dataclasses.replace(
-            rig_, **{n: np.asarray(getattr(rig_, n))[o] for n, o in order.items()}
-        )
-
-    control, more = case.loop.controller, {}
-    if hasattr(control, "K"):
-        more["K"] = np.asarray(control.K)[np.ix_(pumps, tanks)]
-    if name == "lqi":
-        more["Q"] = np.array([1.0, 0.7, 0.1, 0.2, 1e-3, 2e-3])[[1, 0, 3, 2, 5, 4]]
-        control = dataclasses.replace(control, Q=more["Q"][[1, 0, 3, 2, 5, 4]])
-    area = number([120.0, 140.0, 150.0, 130.0])
-    rig_ = dataclasses.replace(case.loop.plant, area=area)
-    control = dataclasses.replace(control, model=rig_)
-    here = dataclasses.replace(case.loop, plant=rig_, controller=control)
-    there = dataclasses.replace(
-        here,
-        plant=permuted(rig_),
-        controller=dataclasses.replace(control, model=permuted(rig_), **more),
-    )
-    one, other = (jaxtank.simulate(loop, Clock(dt=0.1, duration=100.0)) for loop in (here, there))
-    np.testing.assert_allclose(np.asarray(other.x)[:, tanks], one.x, rtol=1e-9, atol=1e-11)
-    np.testing.assert_allclose(
-        np.asarray(other.command)[:, pumps], one.command, rtol=1e-9, atol=1e-9
-    )
-
-
-POWERS = {"surface": 0, "ks": 1, "phi": 1, "b": 1, "w": 1, "K": -1, "operating_point": 1}
-
-
-@pytest.mark.slow_for("hybrid", "lqi", "smc-printed")
-@pytest.mark.parametrize(
-    "name", [pytest.param("sfc", marks=pytest.mark.slow), "smc", "hybrid", "smc-printed", "lqi"]
-)
-def test_the_rig_in_metres_runs_as_in_centimetres(name):
-
-    case = load("mirakhorli").cases[name]
-    m, control = in_metres(case.loop.plant), case.loop.controller
-    scaled = {n: getattr(control, n) * 1e-2**p for n, p in POWERS.items() if hasattr(control, n)}
-    if name == "lqi":
-        scaled["Q"] = control.Q * 1e4
-    reference = dataclasses.replace(
-        case.loop.reference,
-        initial=case.loop.reference.initial / 100,
-        targets=case.loop.reference.targets / 100,
-    )
-    loop = dataclasses.replace(
-        case.loop,
-        plant=m,
-        controller=dataclasses.replace(control, model=m, **scaled),
-        reference=reference,
-        x0=case.loop.x0 / 100,
-    )
-    clock = Clock(dt=0.1, duration=20.0 if name == "smc-printed" else 100.0)
-    a, b = (jaxtank.simulate(loop_, clock) for loop_ in (loop, case.loop))
-    np.testing.assert_allclose(100 * np.asarray(a.x), b.x, rtol=1e-8, atol=1e-10)
-    np.testing.assert_allclose(a.command, b.command, rtol=1e-7, atol=1e-8)
-
-
-@pytest.mark.slow
-def test_batches_and_reverse_through_the_design_of_a_gain():
-    case, rms = load("mirakhorli").cases["lqi-warm"], "rms_error_total"
-    cost = lambda q, evaluate=jaxtank.evaluate: evaluate(
-        with_values(case.loop, {"controller.Q[4]": q}), case.clock, rms
-    )[rms]
-    batch = jax.jit(jax.vmap(cost))(np.array([3e-4, 1e-3]))
-    np.testing.assert_allclose(batch, [cost(3e-4), cost(1e-3)], rtol=1e-12)
-    reverse = jax.jit(jax.grad(lambda q: cost(q, jaxtank.loop.run.evaluate_for_reverse)))(1e-3)
-    np.testing.assert_allclose(reverse, jax.jit(jax.jacfwd(cost))(1e-3), rtol=1e-9)
-
-
-@pytest.mark.parametrize(
-    "control, words",
-    [
-        (
-            SlidingMode(
-                model=state_coupled_four_tank(20.0), surface=number(1), ks=number(1), phi=number(1)
-            ),
-            "must be a quadruple tank",
-        ),
-        (StateFeedback(model=PLANT, K=number([[1.0, 2.0]])), r"controller.K has shape \(1, 2\)"),
-        (
-            LQI(
-                model=PLANT,
-                Q=number([1.0] * 4),
-                R=number([1.0] * 2),
-                operating_point=number(SETPOINT),
-            ),
-            "controller.Q has shape",
-        ),
-    ],
-)
+@pytest.mark.parametrize("control, words", UNFIT)
 def test_a_controller_that_does_not_fit_is_refused_by_input_validation(control, words):
     case = load("mirakhorli").cases["sfc"]
     with pytest.raises(InputError, match=words):

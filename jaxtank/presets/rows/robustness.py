@@ -30,7 +30,7 @@ MEASURES = (
 )
 
 
-class Found(NamedTuple):
+class Study(NamedTuple):
     """One controller on N plants."""
 
     measures: dict
@@ -64,25 +64,25 @@ def _runs(loop, values, clock, every):
 
 
 def of_plants(case, spread):
-    """Return the Found of a case's controller."""
+    """Return the Study of a case's controller."""
     values = coefficients(case.loop.plant, spread)
     measures, errors, failed = _runs(case.loop, values, case.clock, round(EVERY / case.clock.dt))
-    return Found(
+    return Study(
         {m: np.asarray(v) for m, v in measures.items()}, np.asarray(errors), np.asarray(failed)
     )
 
 
 def everything(run):
-    """Return ({(controller, spread): Found}, {controller: total RMS error of the nominal plant
+    """Return ({(controller, spread): Study}, {controller: total RMS error of the nominal plant
     [cm]}); run: as of `jaxtank.presets.paper.Preset`.
     """
-    found, nominal = {}, {}
+    studies, nominal = {}, {}
     for controller in CONTROLLERS:
         case, trajectory = run(controller, SETTING)
         nominal[controller] = float(np.sqrt((trajectory.e**2).mean(axis=0).sum()))
         for spread in SPREADS:
-            found[controller, spread] = of_plants(case, spread)
-    return found, nominal
+            studies[controller, spread] = of_plants(case, spread)
+    return studies, nominal
 
 
 def interval(values, of=np.mean, draws=2000):
@@ -114,9 +114,9 @@ def printed(triple, unit):
     return f"{estimate:+.3g}{' ' + unit if unit else ''} ({low:+.3g} to {high:+.3g})"
 
 
-def window(found, output, start, end):
+def window(study, output, start, end):
     """Return (N,) largest absolute error of an output between two times [cm]."""
-    return np.abs(found.errors[:, round(start / EVERY) : round(end / EVERY), output]).max(axis=1)
+    return np.abs(study.errors[:, round(start / EVERY) : round(end / EVERY), output]).max(axis=1)
 
 
 def _each_spread(texts):
@@ -140,9 +140,9 @@ def _growth(nominal):
     )
 
 
-def claims(found, nominal):
+def claims(studies, nominal):
     """Return {quantity: Claim} of the published rows."""
-    pairs = list(zip(*([found[controller, s] for s in SPREADS] for controller in CONTROLLERS)))
+    pairs = list(zip(*([studies[controller, s] for s in SPREADS] for controller in CONTROLLERS)))
 
     def compared(triples, unit, words="NGPC less backstepping "):
         text = _each_spread(words + printed(t, unit) for t in triples)
