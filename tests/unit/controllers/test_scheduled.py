@@ -123,6 +123,7 @@ def test_with_equal_values_it_is_the_plain_controller(name, gains, variable, kno
         )
 
 
+@pytest.mark.slow_for("h2")
 @pytest.mark.parametrize("variable", ["r1", "h2"])
 def test_at_every_sample_the_controller_has_the_gains_of_that_sample(gouta, variable):
     case = on(

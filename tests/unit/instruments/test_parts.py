@@ -20,6 +20,7 @@ from jaxtank.signals.setpoints import ramps
 # signals
 
 
+@pytest.mark.slow_for("0.01-linear", "0.01-quintic")
 @pytest.mark.parametrize("shape", ["linear", "quintic"])
 @pytest.mark.parametrize("dt", [0.01, 0.7])
 def test_a_ramp_against_its_definition(shape, dt):

@@ -41,8 +41,9 @@ def test_the_list_is_that_of_the_catalogue_and_the_values_have_steps(case):
     assert a["rms_error_total"] != b["rms_error_total"]
 
 
-@pytest.mark.parametrize("transform", [jax.jacfwd, jax.jacrev])
-@pytest.mark.parametrize("name", ["settling_time", "time_of_max_level"])
+@pytest.mark.parametrize(
+    "transform, name", [(jax.jacfwd, "settling_time"), (jax.jacrev, "time_of_max_level")]
+)
 def test_a_derivative_of_a_count_of_samples_is_refused(case, transform, name):
     def measured(Kc):
         return jaxtank.evaluate(at(case, Kc), case.clock, [name])[name]

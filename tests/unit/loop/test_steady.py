@@ -176,6 +176,7 @@ def test_feasibility_counts_the_inflow_and_the_dead_zone(inflow, follows):
     assert needs.feasible().tolist() == [follows]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change, reason",
     [

@@ -95,6 +95,7 @@ def test_a_linear_filter_far_from_its_operating_point_is_named(capsys, tmp_path)
         assert "observer.levels:" not in printed.err + printed.out
 
 
+@pytest.mark.slow
 def test_an_observer_of_a_file_compensates_as_one_of_the_preset_does():
     """Coefficients of the plant 10 % off the model of the controller, at the end of a plateau."""
     plant = presets.find("gouta2015/ngpc").loop.plant
