@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from helpers import assert_same_case as assert_same
 from helpers import command as say
-from scipy.optimize import minimize, minimize_scalar
 
 import jaxtank
 from jaxtank import presets, rig
@@ -21,7 +20,6 @@ from jaxtank.controllers.gain_schedule import interpolate
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import portion
 from jaxtank.core.tree import component, describe, get_value, leaf, with_values
-from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.loop.run import evaluate_and_flag, evaluate_compiled, evaluate_for_reverse
 from jaxtank.rig.values import schedule
 from jaxtank.xla.reachability import use_of
@@ -176,17 +174,6 @@ def test_the_loop_is_still_one_function(name, gains, variable):
     assert 'xla_cpu_small_call="true"' in text
 
 
-@pytest.mark.slow
-def test_so_is_that_of_ten_derivatives(gouta):
-    case = on(gouta("backstepping"), ("k", "k1"), "r1", (3.0, 6.0, 9.0, 12.0, 16.0))
-    names = tuple(case.free)
-    point = tuple(np.float64(get_value(case.loop, n)) for n in names)
-    compiled = sensitivities_compiled.lower(
-        case.loop, case.clock, MEASURES, names, point, None
-    ).compile()
-    assert len(names) == 10 and 'xla_cpu_small_call="true"' in compiled.as_text()
-
-
 def test_other_values_and_knots_do_not_recompile(gouta):
     case = on(gouta("backstepping", {"clock.duration": 20.0}), ("k",), "r1")
     jaxtank.evaluate(case.loop, case.clock, MEASURES)
@@ -234,41 +221,6 @@ def test_slopes_of_a_run_for_every_knot(gouta, variable, plateau):
     if variable == "h1":  # the one that goes through the state
         reverse = jax.jit(jax.grad(lambda v: cost(v, evaluate_for_reverse)))(point)
         np.testing.assert_allclose(reverse, slopes, rtol=1e-8)
-
-
-@pytest.mark.slow
-def test_a_schedule_beats_the_best_constant_gain(gouta):
-    """k1 on the setpoint of tank 1, limits off: 0.0344 cm against 0.0459 cm, the least of any
-    constant k1 (k as published).
-    """
-    case = gouta("backstepping")
-    total = lambda z: float(
-        jaxtank.evaluate(
-            with_values(case.loop, {"controller.k1": np.exp(z)}), case.clock, MEASURES[:1]
-        )[MEASURES[0]]
-    )
-    grid = np.linspace(np.log(1e-2), np.log(5.0), 25)
-    best = grid[np.argmin([total(z) for z in grid])]
-    constant = minimize_scalar(total, bounds=(best - 0.3, best + 0.3), method="bounded")
-    case = case.replace(
-        loop=with_values(case.loop, {"controller.k1": np.exp(constant.x)}),
-        free={"controller.k1": Free(1e-3, 5.0)},
-    )
-    case = on(case, ("k1",), "r1", (3.0, 6.0, 9.0, 12.0, 16.0))
-    names, point = list(case.free), np.log([float(get_value(case.loop, n)) for n in case.free])
-
-    def cost(z):
-        values, slopes, _, _ = jaxtank.sensitivities(
-            case.loop, case.clock, MEASURES[:1], dict(zip(names, np.exp(z)))
-        )
-        return float(values[MEASURES[0]]), np.ravel(slopes[MEASURES[0]]) * np.exp(z)
-
-    limits = [(np.log(1e-3), np.log(5.0))] * len(names)
-    tuned = minimize(
-        cost, point, jac=True, method="L-BFGS-B", bounds=limits, options={"maxiter": 15}
-    )
-    assert cost(point)[0] == pytest.approx(constant.fun, rel=1e-9)
-    assert tuned.fun < 0.8 * constant.fun
 
 
 # names, units, ranges
