@@ -75,7 +75,7 @@ def like(vector: Any, other: Any) -> Any:
     return scalars(vector)
 
 
-def given(part: Any, vector: Any) -> Any:
+def form_for(part: Any, vector: Any) -> Any:
     """Return a vector in the form that a component takes: scalars, unless it `serves_arrays`."""
     return vector if serves_arrays(part) else scalars(vector)
 

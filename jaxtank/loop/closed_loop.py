@@ -19,7 +19,7 @@ from jaxtank.core import vectors
 from jaxtank.core.clock import CHUNK, Chunk, Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf
-from jaxtank.core.vectors import columns, given, is_array, scalars, serves_arrays, total
+from jaxtank.core.vectors import columns, form_for, is_array, scalars, serves_arrays, total
 from jaxtank.instruments.base import Actuator, Sensor
 from jaxtank.loop.change_windows import windows
 from jaxtank.loop.steady import steady_inflow
@@ -30,7 +30,7 @@ from jaxtank.safety.filter import SafetyFilter
 from jaxtank.safety.prediction import line_of
 from jaxtank.signals.base import Signal, sampled
 
-Group = Any
+Vector = Any
 """Vector: a tuple of numbers, one per tank, pump or output, or an array (jaxtank.core.vectors)."""
 
 
@@ -85,26 +85,26 @@ class State(NamedTuple):
     """What one sample hands to the next."""
 
     k: Any  # index of the sample
-    x: Group  # levels [cm]
+    x: Vector  # levels [cm]
     observer: Any
     controller: Any
     actuator: Any
     sensor: Any = ()
-    excess: Group = ()  # in float32, what rounding has added to each level too much [cm]
+    excess: Vector = ()  # in float32, what rounding has added to each level too much [cm]
 
 
 class Inputs(NamedTuple):
     """What is known of every sample before the loop: tuples of (samples,), or (samples, n)."""
 
-    r: Group  # setpoints [cm]
-    dr: Group  # their rates [cm/s]
-    ddr: Group  # their second derivatives [cm/s^2]
-    d: Group | None  # inflow disturbances [cm^3/s]
-    xi: Group | None  # draws of the sensor noise [-]
+    r: Vector  # setpoints [cm]
+    dr: Vector  # their rates [cm/s]
+    ddr: Vector  # their second derivatives [cm/s^2]
+    d: Vector | None  # inflow disturbances [cm^3/s]
+    xi: Vector | None  # draws of the sensor noise [-]
     context: ms.Context  # what the measures refer to
     plan: Any  # what the controller has prepared
     own: Any  # signals of the controller's own
-    fault: Group | None  # 1 while a fault lasts
+    fault: Vector | None  # 1 while a fault lasts
 
 
 class Partition(NamedTuple):
@@ -155,7 +155,7 @@ def inputs(
     return inputs_at(loop, times, names, _drawn(loop.sensor, key, times, batch, arrays), arrays)
 
 
-def _drawn(sensor: Sensor, key: Any, times: Any, batch: Any, arrays: bool) -> Group | None:
+def _drawn(sensor: Sensor, key: Any, times: Any, batch: Any, arrays: bool) -> Vector | None:
     """The deviates of the sensor noise (`Sensor.draw`)."""
     if arrays and type(sensor).draw is Sensor.draw:
         deviates = sensor.deviates(key, times.samples, batch)
@@ -168,7 +168,7 @@ def inputs_at(
     loop: ClosedLoop,
     times: Clock | Chunk,
     names: tuple[str, ...],
-    xi: Group | None,
+    xi: Vector | None,
     arrays: bool = False,
 ) -> Inputs:
     """Return `inputs` of a clock or Chunk, for deviates xi of the sensor noise or None."""
@@ -191,12 +191,12 @@ def inputs_at(
     )
 
 
-def _rows_of(signals: Group) -> tuple[Any, ...]:
+def _rows_of(signals: Vector) -> tuple[Any, ...]:
     """Arrays (samples,) of an array (samples, n); a tuple of them unchanged."""
     return scalars(signals.T) if is_array(signals) else signals
 
 
-def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Group) -> ms.Context:
+def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Vector) -> ms.Context:
     """What the measures `names` refer to in addition to the sample, for setpoints `r`."""
     fields, window = ms.refers_to(names), None
     if "window" in fields:
@@ -218,7 +218,7 @@ def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Group) -> 
     return ms.Context(window=window, since=since, steady=steady)
 
 
-def _steady_inputs(loop: ClosedLoop, r: Group) -> Any:
+def _steady_inputs(loop: ClosedLoop, r: Vector) -> Any:
     if not ms.serves("input_deviation", loop):
         raise InputError("input_deviation needs a rig without pipes, with as many pumps as outputs")
     inputs = steady_along(loop.plant, _rows_of(r), steady_inflow(loop))[1]
@@ -235,7 +235,7 @@ def initial(loop: ClosedLoop, clock: Clock, arrays: bool = False) -> State:
     def same_type(v: Any) -> Any:
         return v + zero if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v
 
-    def vector(leaf: Any, size: int) -> Group:
+    def vector(leaf: Any, size: int) -> Vector:
         return jnp.asarray(leaf) + zero if arrays else tuple(leaf[i] + zero for i in range(size))
 
     x0, u0 = vector(loop.x0, loop.plant.tanks), vector(actuator.initial, loop.plant.pumps)
@@ -244,21 +244,21 @@ def initial(loop: ClosedLoop, clock: Clock, arrays: bool = False) -> State:
     return State(
         k=jnp.int32(0),
         x=x0,
-        observer=jax.tree.map(same_type, loop.observer.init(given(loop.observer, x0))),
+        observer=jax.tree.map(same_type, loop.observer.init(form_for(loop.observer, x0))),
         controller=jax.tree.map(same_type, control_state(loop, x0, u0)),
         actuator=jax.tree.map(same_type, begin(clock)),
-        sensor=jax.tree.map(same_type, loop.sensor.init(given(loop.sensor, x0))),
+        sensor=jax.tree.map(same_type, loop.sensor.init(form_for(loop.sensor, x0))),
         excess=excess if zero.dtype == jnp.float32 else (),
     )
 
 
-def control_state(loop: ClosedLoop, x0: Group, u0: Group) -> Any:
+def control_state(loop: ClosedLoop, x0: Vector, u0: Vector) -> Any:
     """State of the controller at t = 0; with the inputs under way where the filter predicts."""
-    x0, u = given(loop.controller, x0), given(loop.controller, u0)
-    state, guard = loop.controller.init(x0, u), loop.safety_filter
-    if guard is None or not guard.predicted:
+    x0, u = form_for(loop.controller, x0), form_for(loop.controller, u0)
+    state, safety_filter = loop.controller.init(x0, u), loop.safety_filter
+    if safety_filter is None or not safety_filter.predicted:
         return state
-    return state, line_of(scalars(u0), guard.predicted)
+    return state, line_of(scalars(u0), safety_filter.predicted)
 
 
 def keyed(loop: ClosedLoop, key: jax.Array | None) -> ClosedLoop:
@@ -277,7 +277,7 @@ def run_of(loop: ClosedLoop, clock: Clock, arrays: bool = False) -> ms.Run:
     """Return sizes and constants of a run, for its measures. arrays: the form of vectors."""
     plant, actuator = loop.plant, loop.actuator
 
-    def vector(leaf: Any, size: int) -> Group:
+    def vector(leaf: Any, size: int) -> Vector:
         return jnp.asarray(leaf) if arrays else tuple(leaf[i] for i in range(size))
 
     return ms.Run(

@@ -16,9 +16,9 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Sample, Tick
 from jaxtank.core.tree import is_real
-from jaxtank.core.vectors import each, given, is_array, like, scalars, zeros
+from jaxtank.core.vectors import each, form_for, is_array, like, scalars, zeros
 from jaxtank.instruments.base import Sensor
-from jaxtank.loop.closed_loop import ClosedLoop, Group, Inputs, State
+from jaxtank.loop.closed_loop import ClosedLoop, Inputs, State, Vector
 from jaxtank.plants.runge_kutta import advance
 from jaxtank.safety.prediction import moved_on
 from jaxtank.xla.barrier import materialised
@@ -29,7 +29,7 @@ class Decision(NamedTuple):
 
     estimate: Estimate
     command: Sequence[Any]  # (m) inputs before their limits [V]
-    applied: Group  # (m) inputs within them [V]
+    applied: Vector  # (m) inputs within them [V]
     observer: Any  # its state after the sample
     controller: Any  # its state after the sample
     filtered: Any = 0.0  # 1 where the safety filter changed an input, else 0
@@ -69,64 +69,66 @@ def decide(
     loop: ClosedLoop, observer: Any, controller: Any, tick: Tick, y: Sequence[Any]
 ) -> Decision:
     """Return what observer and controller make of one sample: its order, written once."""
-    guard, line = loop.safety_filter, None
-    if guard is not None and guard.predicted:
-        controller, line = controller
-    observed = _seen_by(loop.observer, tick)
-    estimate, observer = loop.observer.step(observer, observed, given(loop.observer, y))
+    safety_filter, under_way = loop.safety_filter, None
+    if safety_filter is not None and safety_filter.predicted:
+        controller, under_way = controller
+    tick_of_observer = _tick_for(loop.observer, tick)
+    estimate, observer = loop.observer.step(observer, tick_of_observer, form_for(loop.observer, y))
     estimate = estimate._replace(x=like(estimate.x, y), d=like(estimate.d, y))
     command, controller = commanded(loop, controller, tick, estimate)
-    allocates = loop.actuator.allocates or guard is not None
-    metric = loop.controller.input_metric(_seen(loop, estimate)) if allocates else None
-    if guard is None:
-        applied, filtered = loop.actuator.limit(given(loop.actuator, command), metric), 0.0
+    allocates = loop.actuator.allocates or safety_filter is not None
+    metric = loop.controller.input_metric(_estimate_for(loop, estimate)) if allocates else None
+    if safety_filter is None:
+        applied, filtered = loop.actuator.limit(form_for(loop.actuator, command), metric), 0.0
     else:
         entries = scalars(command)
-        applied, filtered = guard.apply(loop.actuator, entries, metric, scalars(y), tick.dt, line)
+        applied, filtered = safety_filter.apply(
+            loop.actuator, entries, metric, scalars(y), tick.dt, under_way
+        )
     applied = materialised(like(applied, y)) if is_array(y) else like(applied, y)
-    watched, acting = given(loop.observer, command), given(loop.observer, applied)
-    observer = loop.observer.predict(observer, observed, watched, acting)
-    as_controller = _seen_by(loop.controller, tick)
-    raw, limited = given(loop.controller, command), given(loop.controller, applied)
-    controller = loop.controller.track(controller, as_controller, raw, limited)
-    if line is not None:
-        controller = controller, moved_on(line, scalars(applied))
+    watched, acting = form_for(loop.observer, command), form_for(loop.observer, applied)
+    observer = loop.observer.predict(observer, tick_of_observer, watched, acting)
+    tick_of_controller = _tick_for(loop.controller, tick)
+    raw, limited = form_for(loop.controller, command), form_for(loop.controller, applied)
+    controller = loop.controller.track(controller, tick_of_controller, raw, limited)
+    if under_way is not None:
+        controller = controller, moved_on(under_way, scalars(applied))
     return Decision(estimate, command, applied, observer, controller, filtered)
 
 
-def readings(sensor: Sensor, state: State, now: Inputs, clock: Clock) -> tuple[Group, Any]:
+def readings(sensor: Sensor, state: State, now: Inputs, clock: Clock) -> tuple[Vector, Any]:
     """Return ((n,) readings of a state [cm], the sensor's state after them)."""
-    x, xi = given(sensor, state.x), given(sensor, now.xi)
+    x, xi = form_for(sensor, state.x), form_for(sensor, now.xi)
     y, after = sensor.step(state.sensor, x, xi, clock.dt)
     return like(y, state.x), after
 
 
-def _seen_by(part: Any, tick: Tick) -> Tick:
+def _tick_for(part: Any, tick: Tick) -> Tick:
     """`tick` with setpoints in the form that a component takes."""
-    r, dr, ddr = (given(part, v) for v in (tick.r, tick.dr, tick.ddr))
+    r, dr, ddr = (form_for(part, v) for v in (tick.r, tick.dr, tick.ddr))
     return tick._replace(r=r, dr=dr, ddr=ddr)
 
 
-def _seen(loop: ClosedLoop, estimate: Estimate) -> Estimate:
+def _estimate_for(loop: ClosedLoop, estimate: Estimate) -> Estimate:
     """`estimate` in the form that the controller takes."""
-    return Estimate(given(loop.controller, estimate.x), given(loop.controller, estimate.d))
+    return Estimate(form_for(loop.controller, estimate.x), form_for(loop.controller, estimate.d))
 
 
-def _nothing(x: Group) -> Group:
+def _nothing(x: Vector) -> Vector:
     """Zeros of the type of the levels."""
     return zeros(x) if is_array(x) else (jnp.zeros_like(x[0]),) * len(x)
 
 
 def move(
-    loop: ClosedLoop, clock: Clock, state: State, applied: Group, now: Inputs
-) -> tuple[State, Group, Group, Group]:
+    loop: ClosedLoop, clock: Clock, state: State, applied: Vector, now: Inputs
+) -> tuple[State, Vector, Vector, Vector]:
     """Return (state after a sample, (m) inputs at the plant [V], (n) volume lost over each rim
     [cm^3], (n) volume that a negative inflow could not take [cm^3]) for inputs `applied` (m) [V]
     within the limits: pumps, faults and plant. Observer and controller of the state stay as they
     are.
     """
     t = time_of(state, clock)
-    u, actuator = loop.actuator.step(state.actuator, given(loop.actuator, applied), clock.dt)
+    u, actuator = loop.actuator.step(state.actuator, form_for(loop.actuator, applied), clock.dt)
     plant = loop.plant
     if loop.faults is not None and now.fault is not None:
         faults: Any = loop.faults
@@ -162,8 +164,8 @@ def commanded(
     """Return the controller's ((m,) inputs before their limits, new state)."""
     # Raises InputError, while the loop is traced, for a number of inputs that is not that of the
     # pumps, and for an input that is no single real number.
-    observed = _seen_by(loop.controller, tick)
-    command, state = loop.controller.step(state, observed, _seen(loop, estimate))
+    tick_of_controller = _tick_for(loop.controller, tick)
+    command, state = loop.controller.step(state, tick_of_controller, _estimate_for(loop, estimate))
     _check_command(command, loop.plant.pumps, type(loop.controller).__name__)
     return like(command, estimate.x), state
 
