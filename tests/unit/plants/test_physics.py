@@ -76,13 +76,6 @@ def test_second_derivatives_of_the_roots_are_finite_below_zero():
             )
 
 
-def test_a_tank_runs_dry_and_stays():
-    plant = one_tank()
-    levels = [held(plant, (0.05,), (0.0,), 0.05, n)[0] for n in (20, 100, 400)]
-    assert levels[0] > levels[1] > levels[2] >= 0.0
-    assert levels[2] < 1e-9
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("ramp, lowest, moved", [(60.0, 0.2, 1e-12), (30.0, 0.003, 3e-3)])
 def test_smooth_root_moves_the_benchmark_by_less_than_its_promise(gouta, ramp, lowest, moved):
