@@ -132,6 +132,14 @@ def _of_rows(unit, per, accumulator, entry, doc, **facts) -> Measure:
     return _measure(unit, per, accumulator, read, doc, **facts)
 
 
+def _first(extreme, time):
+    return extreme
+
+
+def _second(extreme, time):
+    return time
+
+
 def _settling(_, last, outside, worst):
     worst = jnp.maximum(worst, settled(last, outside))
     return jnp.where(worst < -1e8, jnp.nan, worst)
@@ -175,9 +183,7 @@ _BUILT_IN: dict[str, Measure] = {
     "iae": _scaled(
         "cm s", "output", "abs_e", _integral, "integral of the absolute error", by_input=True
     ),
-    "max_error": _of_rows(
-        "cm", "output", "max_error", lambda error, time: error, "largest absolute tracking error"
-    ),
+    "max_error": _of_rows("cm", "output", "max_error", _first, "largest absolute tracking error"),
     "mean_square_overshoot": _sum_of_squares(
         "cm^2",
         "output",
@@ -240,21 +246,10 @@ _BUILT_IN: dict[str, Measure] = {
         by_input=True,
     ),
     "max_level": _of_rows(
-        "cm",
-        "tank",
-        "max_level",
-        lambda level, time: level,
-        "highest level",
-        reached="time_of_max_level",
+        "cm", "tank", "max_level", _first, "highest level", reached="time_of_max_level"
     ),
     "min_level": _of_rows(
-        "cm",
-        "tank",
-        "min_level",
-        lambda level, time: level,
-        "lowest level",
-        sense=-1.0,
-        reached="time_of_min_level",
+        "cm", "tank", "min_level", _first, "lowest level", sense=-1.0, reached="time_of_min_level"
     ),
     "rms_over_rim": _root_mean_total(
         "over_rim2", "root of the mean squared rise past the rims, summed over tanks"
@@ -313,20 +308,10 @@ _BUILT_IN: dict[str, Measure] = {
         "cm", "tank", "estimate2", "root mean square error of the level estimate"
     ),
     "time_of_max_level": _of_rows(
-        "s",
-        "tank",
-        "max_level",
-        lambda level, time: time,
-        "when the highest level was reached",
-        counts=True,
+        "s", "tank", "max_level", _second, "when the highest level was reached", counts=True
     ),
     "time_of_min_level": _of_rows(
-        "s",
-        "tank",
-        "min_level",
-        lambda level, time: time,
-        "when the lowest level was reached",
-        counts=True,
+        "s", "tank", "min_level", _second, "when the lowest level was reached", counts=True
     ),
     "sensitivity_peak": _margin(
         "sensitivity_peak",
