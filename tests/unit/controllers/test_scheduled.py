@@ -341,26 +341,16 @@ class Odd(Controller):
 @pytest.mark.parametrize(("gain", "words"), [("start", "in its init"), ("branch", "Python's if")])
 def test_a_controller_of_ones_own_is_looked_at_too(gouta, gain, words):
     case = gouta("backstepping")
-    case = case.replace(
-        loop=dataclasses.replace(
-            case.loop, controller=Odd(start=np.float64(1.0), branch=np.float64(1.0))
-        ),
-        free={},
-    )
+    loop = dataclasses.replace(case.loop, controller=Odd(start=1.0, branch=1.0))
+    case = case.replace(loop=loop, free={})
     with pytest.raises(InputError, match=words):
         on(case, (gain,), "r1")
 
 
 def test_where_nothing_is_checked_a_gain_used_before_the_loop_gives_nan():
     case = presets.find("mirakhorli/smc")
-    law = case.loop.controller
-    law = Scheduled(
-        law=law,
-        knots=np.array([1.0, 2.0]),
-        values=np.full((1, 2), 3.0),
-        gains=("model.drain[0]",),
-        variable="r1",
-    )
+    table = dict(knots=[1.0, 2.0], values=[[3.0, 3.0]], gains=("model.drain[0]",), variable="r1")
+    law = Scheduled(law=case.loop.controller, **table)
     loop = dataclasses.replace(case.loop, controller=law)
     with pytest.raises(InputError, match="in its prepare"):
         jaxtank.evaluate(loop, case.clock, MEASURES)
@@ -385,11 +375,8 @@ def test_a_scheduled_loop_is_checked_before_it_runs(gouta):
     with pytest.raises(InputError, match=r"controller.law.Kc\[0\] is scheduled"):
         rig.check_free(entry, "controller.law.Kc[0]", 1.0, 2.0)
     with pytest.raises(InputError, match="input_metric"):
-        rig.check(
-            rig.set_values(
-                on(presets.find("gouta2022/pi"), ("Kc",), "h1"), {"actuator.saturation": "boxqp"}
-            )
-        )
+        case = on(presets.find("gouta2022/pi"), ("Kc",), "h1")
+        rig.check(rig.set_values(case, {"actuator.saturation": "boxqp"}))
 
 
 def test_dependence_is_followed_into_calls_and_loops():

@@ -10,11 +10,9 @@ import jaxtank
 from jaxtank import measures as ms
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
-from jaxtank.core.numerics import clip, lower_clip, quantise
 from jaxtank.core.tree import number
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
-from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
 
 # signals
@@ -87,41 +85,10 @@ def test_gradient_of_a_reference_by_its_targets():
     np.testing.assert_allclose(slope, np.clip((np.arange(101) - 20) / 60, 0, 1), atol=1e-12)
 
 
-def test_a_constant_is_constant():
-    r, dr, ddr = Constant(level=np.array([2.0, 5.0])).sample(Clock(dt=1.0, duration=10.0))
-    np.testing.assert_array_equal(r, np.array([[2.0] * 11, [5.0] * 11]))
-    assert not np.any(dr) and not np.any(ddr)
-
-
 @pytest.mark.parametrize("change", [(-1.0, 0, 4.0), (1.0, 2, 4.0)])
 def test_a_change_at_a_bad_time_or_channel_is_refused(change):
     with pytest.raises(InputError):
         ramps([1.0, 1.0], [change])
-
-
-# kinks
-
-
-@pytest.mark.parametrize(
-    "x, value, slope",
-    [(-1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (5.0, 5.0, 1.0), (12.0, 12.0, 1.0), (13.0, 12.0, 0.0)],
-)
-def test_clip(x, value, slope):
-    f = lambda x: clip(x, 0.0, 12.0)
-    assert (f(x), jax.grad(f)(x)) == (value, slope)
-
-
-def test_clip_gives_its_slope_to_the_bound_that_holds():
-    assert jax.grad(lambda high: clip(13.0, 0.0, high))(12.0) == 1.0
-    assert jax.grad(lambda low: clip(-1.0, low, 12.0))(0.0) == 1.0
-    assert jax.grad(lambda high: clip(5.0, 0.0, high))(12.0) == 0.0
-
-
-def test_at_least_and_quantise():
-    assert (lower_clip(2.0, 1.0), lower_clip(0.5, 1.0)) == (2.0, 1.0)
-    assert jax.grad(lambda x: lower_clip(x, 1.0))(1.0) == 1.0
-    assert quantise(0.26, 0.1) == pytest.approx(0.3)
-    assert jax.grad(lambda x: quantise(x, 0.1))(0.26) == 1.0
 
 
 # sensor
@@ -130,10 +97,6 @@ def test_at_least_and_quantise():
 def sensor(**more):
     plain = {"gain": number([2.0, 3.0]), "noise": number([0.0, 0.0]), "full_scale": number(3.3)}
     return LevelSensor(**{**plain, **more})
-
-
-def test_a_sensor_without_noise_and_adc_is_transparent():
-    assert sensor().read((1.234, 5.678), None) == (1.234, 5.678)
 
 
 def test_noise_has_its_standard_deviation_and_its_own_stream_per_tank():
