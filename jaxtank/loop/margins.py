@@ -125,8 +125,8 @@ def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
     where Newton's method of the loop starts. Levels that are not controlled start at the mean
     setpoint, and are at least halved by a step that would empty them.
     """
-    given_plant, inflow, actuator = loop.plant, steady_inflow(loop), loop.actuator
-    plant, r, inflow, offset = jax.lax.stop_gradient((given_plant, r, inflow, actuator.offset))
+    fixed = loop.plant, r, steady_inflow(loop), loop.actuator.offset
+    plant, r, inflow, offset = jax.lax.stop_gradient(fixed)
     outputs = np.array(plant.outputs)
     free = np.array([i for i in range(plant.tanks) if i not in plant.outputs], dtype=int)
     x = jnp.full(plant.tanks, jnp.mean(jnp.abs(r))).at[outputs].set(r)

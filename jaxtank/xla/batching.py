@@ -3,6 +3,7 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 # pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
 
+import functools
 import itertools
 from collections.abc import Callable
 from typing import Any
@@ -40,38 +41,35 @@ def _inlined(*operands: Any, jaxpr: Any, batch: int) -> list[Any]:
     return jaxpr_as_fun(ClosedJaxpr(jaxpr, operands[:count]))(*operands[count:])
 
 
+def _join(moving: Any, flags: list[bool], operands: Any) -> list[Any]:
+    """`operands`, of which those with a flag are replaced by the entries of `moving`, in order."""
+    entries = iter(moving)
+    return [next(entries) if flag else v for flag, v in zip(flags, operands)]
+
+
 def _mapped(operands: Any, axes: Any, *, jaxpr: Any, batch: int) -> Any:
     """Rule of `jax.vmap`: all results have their axis in front."""
-    mapped = [axis is not None for axis in axes]
-
-    def one(*operands_of_one: Any) -> list[Any]:
-        return _inlined(*operands_of_one, jaxpr=jaxpr, batch=batch)
-
+    flags = [axis is not None for axis in axes]
+    run = functools.partial(_inlined, jaxpr=jaxpr, batch=batch)
     size = next(v.shape[axis] for v, axis in zip(operands, axes) if axis is not None)
     if size <= batch or jax.default_backend() != "cpu":
-        results = jax.vmap(one, in_axes=axes)(*operands)
+        results = jax.vmap(run, in_axes=axes)(*operands)
     else:
         moving = [jax.numpy.moveaxis(v, a, 0) for v, a in zip(operands, axes) if a is not None]
-
-        def of(row: Any) -> list[Any]:
-            entries = iter(row)
-            return one(*(next(entries) if m else v for v, m in zip(operands, mapped)))
-
-        results = jax.lax.map(of, moving, batch_size=batch)
+        row_of = lambda row: run(*_join(row, flags, operands))
+        results = jax.lax.map(row_of, moving, batch_size=batch)
     return results, [0] * len(results)
 
 
 def _derived(primals: Any, tangents: Any, *, jaxpr: Any, batch: int) -> Any:
     """Rule of derivatives: those of the operations, by the operands that have a tangent."""
-    moving = [not isinstance(v, ad.Zero) for v in tangents]
+    flags = [not isinstance(v, ad.Zero) for v in tangents]
 
-    def of(*primals_of: Any) -> list[Any]:
-        entries = iter(primals_of)
-        operands = (next(entries) if m else v for v, m in zip(primals, moving))
-        return _inlined(*operands, jaxpr=jaxpr, batch=batch)
+    def run(*moving: Any) -> list[Any]:
+        return _inlined(*_join(moving, flags, primals), jaxpr=jaxpr, batch=batch)
 
-    primals_of, theirs = (tuple(itertools.compress(v, moving)) for v in (primals, tangents))
-    return jax.jvp(of, primals_of, theirs)
+    moving, slopes = (tuple(itertools.compress(v, flags)) for v in (primals, tangents))
+    return jax.jvp(run, moving, slopes)
 
 
 _call.def_impl(_inlined)

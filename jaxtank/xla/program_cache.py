@@ -207,11 +207,11 @@ def seal(folder: Path, since: float) -> None:
 
 def contents(base: Path) -> dict[str, tuple[int, int]]:
     """Return {folder of a version: (programs, their bytes)} below the folder of all versions."""
-    sizes_of: dict[str, tuple[int, int]] = {}
+    counts: dict[str, tuple[int, int]] = {}
     for folder in _versions(base):
         sizes = [path.stat().st_size for path in _entries(folder)]
-        sizes_of[folder.name] = len(sizes), sum(sizes)
-    return sizes_of
+        counts[folder.name] = len(sizes), sum(sizes)
+    return counts
 
 
 def clear(base: Path) -> int:
