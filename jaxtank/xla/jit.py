@@ -52,24 +52,23 @@ class Kept:
         folder = program_cache.folder
         if folder is None:
             return self.compiled(*args, **kwargs)
-        static = {n: v for n, v in zip(self.names, args) if n in self.static}
-        static |= {n: v for n, v in kwargs.items() if n in self.static}
-        arguments = tuple(v for n, v in zip(self.names, args) if n not in self.static)
-        named = {n: v for n, v in kwargs.items() if n not in self.static}
-        leaves, tree = jax.tree.flatten((arguments, named))
+        values = dict(zip(self.names, args)) | kwargs
+        static = {n: v for n, v in values.items() if n in self.static}
+        moving = {n: v for n, v in values.items() if n not in self.static}
+        leaves, tree = jax.tree.flatten(((), moving))
         if any(isinstance(v, Tracer) for v in leaves) or not _simple():
             return self.compiled(*args, **kwargs)
         kinds = tuple(map(kind_of, leaves))
         key = tree, kinds, tuple(sorted(static.items())), context()
         if key not in self.programs:
-            self.programs[key] = self._program(folder, tree, kinds, static, (args, kwargs))
+            self.programs[key] = self._program(folder, tree, kinds, static, moving)
         program = self.programs[key]
-        return program(*arguments, **named) if program else self.compiled(*args, **kwargs)
+        return program(**moving) if program else self.compiled(*args, **kwargs)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.compiled, name)
 
-    def _program(self, folder, tree, kinds, static, call):
+    def _program(self, folder, tree, kinds, static, moving):
         """The program of these arguments, read or compiled and written; None if it has no name."""
         if None in kinds:
             return None
@@ -82,33 +81,28 @@ class Kept:
         path = folder / f"{self.__name__}-{name}{ENDING}"
         program = _read(path, tree)
         if program is not None:
-            return Tried(program, path, functools.partial(self._traced, static))
-        lowered = self.compiled.lower(*call[0], **call[1])
+            return Tried(program, path, functools.partial(self.compiled, **static))
+        lowered = self.compiled.lower(**moving, **static)
         about = _about(lowered)
         return lowered.compile() if about is None else _compile(lowered, about, path)
-
-    def _traced(self, static, arguments, named):
-        """What the function returns, by a program that is traced and compiled."""
-        moving = (n for n in self.names if n not in self.static)
-        return self.compiled(**dict(zip(moving, arguments)), **named, **static)
 
 
 class Tried:
     """A program that was read, with a mark beside its entry until it has run once."""
 
-    def __init__(self, program: Any, path: Path, traced: Callable[[Any, Any], Any]):
+    def __init__(self, program: Any, path: Path, traced: Callable[..., Any]):
         self.program, self.path, self.traced, self.ran = program, path, traced, False
 
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+    def __call__(self, **moving: Any) -> Any:
         """Return what the program returns."""
         if self.ran:
-            return self.program(*args, **kwargs)
+            return self.program(**moving)
         try:
-            results = jax.block_until_ready(self.program(*args, **kwargs))
+            results = jax.block_until_ready(self.program(**moving))
         except jax.errors.JaxRuntimeError:
             self.path.unlink(missing_ok=True)
-            self.program = lambda *args, **kwargs: self.traced(args, kwargs)
-            results = self.program(*args, **kwargs)
+            self.program = self.traced
+            results = self.program(**moving)
         self.ran = True
         _mark_of(self.path).unlink(missing_ok=True)
         return results
