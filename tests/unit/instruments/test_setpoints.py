@@ -106,6 +106,7 @@ def test_where_a_ramp_ends_on_a_sample_its_slope_is_the_one_from_below(ramp):
     assert not np.allclose(above, below, rtol=1e-2)  # it is a kink
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, signal", [("ramp", reference(0.0)), ("filter", reference(0.0, (0.0, 0.0)))]
 )

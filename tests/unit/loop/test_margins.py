@@ -205,6 +205,7 @@ def test_an_unstable_loop_has_no_margins_and_breaks_every_limit():
     assert "unstable" in spec.cause(-np.inf) and "never reaches 1" in spec.cause(np.inf)
 
 
+@pytest.mark.slow
 def test_a_switching_controller_is_undefined_and_float32_is_refused():
     case = presets.find("mirakhorli/smc")
     switch = dataclasses.replace(case.loop.controller, switch="sign")

@@ -112,6 +112,7 @@ def test_the_steady_gain_is_scipys(measured):
     np.testing.assert_allclose(L, P @ C.T @ np.linalg.inv(C @ P @ C.T + N), rtol=1e-8, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_near_the_steady_state_both_filters_agree_once_settled():
     """Small moves about the operating point: what differs is the curvature of the roots and RK4,
     both of second order.
