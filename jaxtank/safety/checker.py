@@ -192,6 +192,10 @@ def _pipe_root(z, knee):
 class _Rig:
     """The final numbers: coefficients per tank of the filter's plants, limits, pumps, readings."""
 
+    limit: np.ndarray
+    spare: np.ndarray
+    low: np.ndarray
+
     def __init__(self, safety_filter, plant, actuator, sensor, hold, substeps, box, faults):
         self.filter, self.plant, self.hold = safety_filter, plant, float(hold)
         self.unit, self.knee = plant.units[0], float(plant.knee)

@@ -83,65 +83,52 @@ def near(rng, tree, by=0.05):
 # numerics: levels from far below zero to a full tank, most of them about the knee
 
 
-@subject("numerics.smooth_sqrt", quick=True, points=60)
-def _(rng):
-    return rng.choice([-1, 1], p=[0.2, 0.8]) * 10 ** rng.uniform(-4, 1.5), numerics.smooth_sqrt
-
-
-@subject("numerics.smooth_signed_sqrt", quick=True, points=60)
-def _(rng):
-    return rng.choice([-1, 0, 1]) * 10 ** rng.uniform(-4, 1.5), numerics.smooth_signed_sqrt
-
-
-@subject("numerics.smooth_signed_sqrt_slope", quick=True, points=60)
-def _(rng):
-    return rng.choice([-1, 0, 1]) * 10 ** rng.uniform(-4, 1.5), numerics.smooth_signed_sqrt_slope
-
-
-@subject("numerics.clipped_sqrt", quick=True, points=40)
-def _(rng):
-    return 10 ** rng.uniform(-4, 1, 2), lambda p: numerics.clipped_sqrt(p[0], p[1])
-
-
-@subject("numerics.limited_sqrt limited_flow", quick=True, points=60)
-def _(rng):
-    """Levels from empty up, the limit and the flow holding in about half of the points each."""
-    h, supply, s = (
-        10 ** rng.uniform(-4, 1, 2),
-        10 ** rng.uniform(-1, 1.1),
-        rng.choice([-1, 0, 1]) * 10 ** rng.uniform(-4, 1),
+power = lambda rng, low, high, size=None: 10 ** rng.uniform(low, high, size)
+signed = lambda rng, *of, **how: rng.choice(*of, **how) * power(rng, -4, 1.5)
+ELEMENTARY = {  # {name: (points, draw, function)}
+    "numerics.smooth_sqrt": (
+        60, lambda rng: signed(rng, [-1, 1], p=[0.2, 0.8]), numerics.smooth_sqrt
+    ),
+    "numerics.smooth_signed_sqrt": (
+        60, lambda rng: signed(rng, [-1, 0, 1]), numerics.smooth_signed_sqrt
+    ),
+    "numerics.smooth_signed_sqrt_slope": (
+        60, lambda rng: signed(rng, [-1, 0, 1]), numerics.smooth_signed_sqrt_slope
+    ),
+    "numerics.clipped_sqrt": (
+        40, lambda rng: power(rng, -4, 1, 2), lambda p: numerics.clipped_sqrt(p[0], p[1])
+    ),
+    "numerics.limited_sqrt limited_flow": (
+        60,  # the limit and the flow hold in about half of the points each
+        lambda rng: (
+            *power(rng, -4, 1, 2), power(rng, -1, 1.1), rng.choice([-1, 0, 1]) * power(rng, -4, 1)
+        ),
+        lambda p: (
+            numerics.limited_sqrt(p[0], 0.01, p[2]),
+            numerics.limited_sqrt(-p[0], 0.01, p[2]),
+            numerics.limited_flow(p[3], p[0], p[1]),
+        ),
+    ),
+    "numerics.root_of_mean": (20, lambda rng: power(rng, -6, 3), numerics.root_of_mean),
+    "numerics.lower_clip clip portion magnitude": (
+        40,
+        lambda rng: (lambda ends: (rng.normal(), *ends))(np.sort(rng.normal(size=2))),
+        lambda p: (
+            numerics.lower_clip(p[0], p[1]),
+            numerics.clip(*p),
+            numerics.portion(*p),
+            numerics.magnitude(p[0]),
+        ),
+    ),
+    "hydraulics.disc": (20, lambda rng: power(rng, -3, 1.4), lambda h: hydraulics.disc(h)),
+    "controllers.fuzzy.membership": (
+        40, lambda rng: rng.uniform(0.1, 3, 3), lambda p: membership(*p)
+    ),
+}  # fmt: skip
+for _name, (_points, _draw, _function) in ELEMENTARY.items():
+    subject(_name, quick=True, points=_points)(
+        lambda rng, draw=_draw, function=_function: (draw(rng), function)
     )
-    return (*h, supply, s), lambda p: (
-        numerics.limited_sqrt(p[0], 0.01, p[2]),
-        numerics.limited_sqrt(-p[0], 0.01, p[2]),
-        numerics.limited_flow(p[3], p[0], p[1]),
-    )
-
-
-@subject("numerics.root_of_mean", quick=True, points=20)
-def _(rng):
-    return 10 ** rng.uniform(-6, 3), numerics.root_of_mean
-
-
-@subject("numerics.lower_clip clip portion magnitude", quick=True, points=40)
-def _(rng):
-    low, high = np.sort(rng.normal(size=2))
-    return (rng.normal(), low, high), lambda p: (
-        numerics.lower_clip(p[0], p[1]),
-        numerics.clip(*p),
-        numerics.portion(*p),
-        numerics.magnitude(p[0]),
-    )
-
-
-@subject("hydraulics.disc", quick=True, points=20)
-def _(rng):
-    return 10 ** rng.uniform(-3, 1.4), hydraulics.disc
-
-
-@subject("controllers.fuzzy.membership", quick=True, points=40)
-def _(rng):
-    return rng.uniform(0.1, 3, 3), lambda p: membership(*p)
 
 
 # plants
@@ -404,32 +391,23 @@ def weights(p):
     return p[2] @ p[2].T + 0.1 * jnp.eye(3), p[3] @ p[3].T + jnp.eye(2)
 
 
-@subject("linear.zero_order_hold")
-def _(rng):
-    return matrices(rng)[:2], lambda p: riccati.zero_order_hold(*p, 0.5)
-
-
-@subject("linear.lyapunov discrete_lyapunov")
-def _(rng):
-    return matrices(rng), lambda p: (
+LINEAR = {
+    "linear.zero_order_hold": lambda p: riccati.zero_order_hold(*p[:2], 0.5),
+    "linear.lyapunov discrete_lyapunov": lambda p: (
         riccati.lyapunov(p[0], weights(p)[0]),
         riccati.discrete_lyapunov(0.1 * p[0], weights(p)[0]),
-    )
-
-
-@subject("linear.riccati lqr")
-def _(rng):
-    return matrices(rng), lambda p: (
+    ),
+    "linear.riccati lqr": lambda p: (
         riccati.riccati(p[0], p[1], *weights(p)),
         riccati.lqr(p[0], p[1], *weights(p)),
-    )
-
-
-@subject("linear.discrete_riccati")
-def _(rng):
-    return matrices(rng), lambda p: riccati.discrete_riccati(
+    ),
+    "linear.discrete_riccati": lambda p: riccati.discrete_riccati(
         *riccati.zero_order_hold(p[0], p[1], 0.5), *weights(p)
-    )
+    ),
+}
+for _name, _function in LINEAR.items():
+    _count = 2 if _name == "linear.zero_order_hold" else 4
+    subject(_name)(lambda rng, count=_count, function=_function: (matrices(rng)[:count], function))
 
 
 @subject(

@@ -544,6 +544,12 @@ def test_full_pumps_that_cannot_fill_a_tank_need_no_row():
     assert proved.check()[0].starts == LIMITS
     assert "start at" in proved.reason(known={"start": [1.01 * limit]})
     assert "rim" in proved.reason(actuator=bank(delay=5.0, initial=[13.0]))
+    # from anywhere below a higher limit it falls; a tank below counts on what the filter has
+    assert proved.check(known={"limits": [25.0]})[0].starts == LIMITS
+    below = Proved(chain(drain=[0.3, 1.5], orifice=[0.1]), bank(2), start=[1.0, 1.0])
+    verdicts = below.check(known={"limits": [30.0, 30.0]})
+    assert below.filter.held == (0,) and all(v.holds for v in verdicts)
+    assert [v.starts for v in verdicts] == [CASE, LIMITS]
 
 
 def test_a_tank_that_is_not_proved_counts_with_a_reach_that_is_checked():
