@@ -28,8 +28,9 @@ complete -F _jaxtank jaxtank
 # jaxtank completion for zsh: eval "$(jaxtank completion zsh)" after compinit, or a file _jaxtank\
  in $fpath
 _jaxtank() {
-    local -a found=("${(@f)$(jaxtank completion words "${(@)words[2,CURRENT]}" 2>/dev/null)}")
-    if [[ ${found[1]} == *[=/] ]]; then compadd -S '' -- $found; else compadd -- $found; fi
+    local out="$(jaxtank completion words "${(@)words[2,CURRENT]}" 2>/dev/null)"
+    [[ -z $out ]] && return
+    if [[ $out == *[=/] ]]; then compadd -S '' -- "${(@f)out}"; else compadd -- "${(@f)out}"; fi
 }
 if [[ "${funcstack[1]}" == _jaxtank ]]; then _jaxtank "$@"; else compdef _jaxtank jaxtank; fi
 """,
@@ -68,18 +69,18 @@ def candidates(parser, words):
         return []
     command = next((w for w in before if not w.startswith("-")), None)
     if command not in parser.commands:
-        found = [*parser.commands, *parser.options()]
+        choices = [*parser.commands, *parser.options()]
     else:
         options = parser.options(command)
         action = options.get(before[-1])
         if action is not None and action.nargs != 0:
-            found = _values(action, word)
+            choices = _values(action, word)
         elif word.startswith("-"):
-            found = list(options)
+            choices = list(options)
         else:
             places = [a for a in parser.commands[command]._actions if not a.option_strings]
-            found = _values(places[0], word) if places else []
-    return sorted(w for w in found if w.startswith(word))
+            choices = _values(places[0], word) if places else []
+    return sorted(w for w in choices if w.startswith(word))
 
 
 def _values(action, word):

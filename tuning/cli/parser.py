@@ -101,7 +101,7 @@ def add(parser, option):
     action, default = ACTIONS[option.kind]
     default = default if option.default is None else option.default
     text = option.help.replace("%", "%%")
-    if option.default is not None:
+    if option.default not in (None, ""):
         text += f" (default {option.default})"
     if option.kind in ("pairs", "list"):
         text += "; repeatable"

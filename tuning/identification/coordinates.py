@@ -188,12 +188,11 @@ def default_free(loop):
     free = {}
     for name in ("pump_gain", "drain", "orifice", "pipe"):
         values = np.ravel(np.asarray(getattr(plant, name, ()), dtype=float))
-        open_ = [(i, float(v)) for i, v in enumerate(values) if v > 0]
-        free |= {f"plant.{name}[{i}]": (v / 10, v * 10) for i, v in open_}
-    feeds = enumerate(getattr(plant, "feeds", ()))
-    free |= {
-        f"plant.split[{j}]": (0.02, 0.98, "linear") for j, (_, tank) in feeds if tank is not None
-    }
+        positive = [(i, float(v)) for i, v in enumerate(values) if v > 0]
+        free |= {f"plant.{name}[{i}]": (v / 10, v * 10) for i, v in positive}
+    feeds: Any = getattr(plant, "feeds", ())
+    divided = [j for j, (_, second) in enumerate(feeds) if second is not None]
+    free |= {f"plant.split[{j}]": (0.02, 0.98, "linear") for j in divided}
     if getattr(plant, "overflow", False):
         free |= {f"plant.caught[{k}]": (0.0, 1.0) for k in range(len(plant.spills))}
     if isinstance(loop.disturbance, Constant):

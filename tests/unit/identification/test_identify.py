@@ -32,18 +32,8 @@ recorded = pytest.mark.skipif(
     reason="the record is not beside the tests (data/cascaded_tanks.csv)",
 )
 SPLITS = ("plant.split[0]", "plant.split[1]", "plant.pump_gain[0]", "plant.pump_gain[1]")
-FREE = {
-    SPLITS[0]: (0.1, 0.9),
-    SPLITS[1]: (0.1, 0.9),
-    SPLITS[2]: (5.0, 80.0),
-    SPLITS[3]: (5.0, 80.0),
-}
-WIDE = {
-    SPLITS[0]: (0.02, 0.98),
-    SPLITS[1]: (0.02, 0.98),
-    SPLITS[2]: (2.0, 200.0),
-    SPLITS[3]: (2.0, 200.0),
-}
+FREE = dict(zip(SPLITS, [(0.1, 0.9)] * 2 + [(5.0, 80.0)] * 2))
+WIDE = dict(zip(SPLITS, [(0.02, 0.98)] * 2 + [(2.0, 200.0)] * 2))
 VOLTAGE = np.array([3.0, 2.8])
 T = np.arange(301.0)
 
