@@ -19,7 +19,7 @@ from jaxtank.plots.layout import place
 from jaxtank.plots.overview import LARGEST as MOST_TANKS
 from jaxtank.plots.schematic import HALO, depth, mark, mark_height, schematic
 from jaxtank.plots.spills import Stack, headroom, spilled
-from jaxtank.plots.style import PUMPS, TUNED, WATER, plain, styled
+from jaxtank.plots.style import PUMPS, TUNED, WATER, box, plain, styled
 
 RATE = 12
 """Pictures per second: enough for liquid, which moves slowly."""
@@ -60,13 +60,8 @@ def to_html(loop, trajectory, seconds=8, against=None, titles=()):
     # `animate`.
     with styled({"animation.embed_limit": 20.0, "figure.dpi": 80, "savefig.dpi": 80}):
         scene = _scene(loop, trajectory, seconds, against, titles)
-        animation = FuncAnimation(
-            scene.figure,
-            scene.draw,
-            frames=scene.times,
-            interval=1000 / RATE,
-            cache_frame_data=False,
-        )
+        options = {"frames": scene.times, "interval": 1000 / RATE, "cache_frame_data": False}
+        animation = FuncAnimation(scene.figure, scene.draw, **options)
         page = animation.to_jshtml(fps=RATE)
         plt.close(scene.figure)
     # matplotlib takes the pictures on its buttons from the network
@@ -76,9 +71,8 @@ def to_html(loop, trajectory, seconds=8, against=None, titles=()):
     # ids from the content instead of random ones, so that the same run gives the same page
     for chance in sorted(set(re.findall(r"[0-9a-f]{32}", page))):
         if f"anim{chance}" in page:
-            page = page.replace(
-                chance, hashlib.sha256(page.replace(chance, "").encode()).hexdigest()[:32]
-            )
+            content = hashlib.sha256(page.replace(chance, "").encode())
+            page = page.replace(chance, content.hexdigest()[:32])
     return page
 
 
@@ -106,7 +100,7 @@ def gif(pictures):
     colours = np.reshape(np.array(palette.getpalette() or ()), (-1, 3))
     colours[colours.min(axis=1) >= 248] = 255  # paper stays white
     palette.putpalette(colours.ravel().tolist())
-    first, *others = (one.quantize(palette=palette, dither=Image.Dither.NONE) for one in pictures)
+    first, *others = (p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures)
     options = {"save_all": True, "duration": round(1000 / RATE), "loop": 0, "optimize": True}
     first.save(out, "GIF", append_images=others, **options)
     return out.getvalue()
@@ -120,8 +114,8 @@ def still(pictures):
     columns = len(chosen) if width < 1.3 * height else min(2, len(chosen))
     rows = -(-len(chosen) // columns)
     strip, out = Image.new("RGB", (columns * width, rows * height), "white"), io.BytesIO()
-    for k, one in enumerate(chosen):
-        strip.paste(one, (k % columns * width, k // columns * height))
+    for k, picture in enumerate(chosen):
+        strip.paste(picture, (k % columns * width, k // columns * height))
     strip.save(out, format="PNG", optimize=True)
     return out.getvalue()
 
@@ -139,19 +133,18 @@ def _scene(loop, trajectory, seconds, against, titles):
     if not (isinstance(seconds, (int, float)) and 1 <= seconds <= LONGEST):
         raise InputError(f"seconds = {seconds!r}: an animation may last 1 to {LONGEST:g} s")
     pairs = [(loop, trajectory), *([] if against is None else [against])]
-    for one, run in pairs:
-        _check(one, run)
-    runs = [run for _, run in pairs]
-    end = max(float(run.t[-1]) for run in runs)
-    times = np.linspace(0.0, end, min(max(len(run.t) for run in runs), round(seconds * RATE)))
-    places = [place(one.plant) for one, _ in pairs]
-    shapes = [(where.top - where.bottom) / (where.right - where.left) for where in places]
+    for pair in pairs:
+        _check(*pair)
+    end = max(float(run.t[-1]) for _, run in pairs)
+    frames = min(max(len(run.t) for _, run in pairs), round(seconds * RATE))
+    places = [place(loop.plant) for loop, _ in pairs]
+    shape = max((where.top - where.bottom) / (where.right - where.left) for where in places)
     width = 4.6 if len(pairs) == 1 else 3.9
-    figure = plt.figure(figsize=(width * len(pairs), min(6.0, width * max(shapes) + 0.8)), dpi=80)
-    names = [*titles, *[""] * len(pairs)][: len(pairs)]
+    figure = plt.figure(figsize=(width * len(pairs), min(6.0, width * shape + 0.8)), dpi=80)
+    names = [*titles, *[""] * len(pairs)]
     stages = [
-        _Stage(figure, k, len(pairs), one, run, name)
-        for k, ((one, run), name) in enumerate(zip(pairs, names))
+        _Stage(figure, (k, len(pairs)), rig, run, name)
+        for k, ((rig, run), name) in enumerate(zip(pairs, names))
     ]
     raised = max(stage.ax.get_ylim()[1] - stage.where.top for stage in stages)
     for stage in stages:  # to one scale
@@ -167,7 +160,7 @@ def _scene(loop, trajectory, seconds, against, titles):
         for stage in stages:
             stage.draw(t)
 
-    return _Scene(figure, times, draw)
+    return _Scene(figure, np.linspace(0.0, end, frames), draw)
 
 
 def _check(loop, run):
@@ -189,14 +182,15 @@ BAR = 0.6
 class _Stage:
     """One rig of a film: the artists that move, and what they follow."""
 
-    def __init__(self, figure, number, of, loop, run, title):
+    def __init__(self, figure, place_of, loop, run, title):
+        number, of = place_of  # of the rig in the figure, and how many there are
         self.loop, self.where = loop, place(loop.plant)
         self.t, self.x, self.r, self.u = (np.asarray(v) for v in (run.t, run.x, run.r, run.u))
-        self.area = np.asarray(loop.plant.area, dtype=float)
+        area = np.asarray(loop.plant.area, dtype=float)
         self.low, self.high = (
             np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high)
         )
-        self.found = spilled(loop.plant, run)
+        self.spilled = spilled(loop.plant, run)
         inch = 1.0 / figure.get_size_inches()[1]  # as a share of the height
         high = 1.0 - (0.78 if title else 0.56) * inch
         self.ax = ax = figure.add_axes((number / of + 0.005, 0.31 * inch, 1.0 / of - 0.01, high))
@@ -209,20 +203,17 @@ class _Stage:
         figure.text(middle, 1.0 - 0.25 * inch, name, va="top", fontweight="bold", **words)
         self.words = figure.text(middle, 0.1 * inch, "", va="bottom", **words)
         self.water, self.marks, self.bars = _moving(ax, loop, self.where)
-        self.stacks = {
-            i: Stack(ax, box, self.area[i])
-            for i, box in enumerate(self.where.boxes)
-            if self.found.most[i] > 0
-        }
-        headroom(ax, [(one, self.found.most[i]) for i, one in self.stacks.items()])
+        most, tanks = self.spilled.most, self.where.boxes
+        self.stacks = {i: Stack(ax, tanks[i], area[i]) for i in np.flatnonzero(most > 0)}
+        headroom(ax, [(stack, most[i]) for i, stack in self.stacks.items()])
 
     def draw(self, t):
         """Move everything to the time t [s], or to the end of a run that ends before."""
         k = max(0, int(np.searchsorted(self.t, t * (1 + 1e-9) + 1e-9, side="right")) - 1)
-        for i, box in enumerate(self.where.boxes):
-            self.water[i].set_height(depth(box, self.x[k, i]))
-        for i, one in self.stacks.items():
-            one.set(self.found.volume[k, i])
+        for i, tank in enumerate(self.where.boxes):
+            self.water[i].set_height(depth(tank, self.x[k, i]))
+        for i, stack in self.stacks.items():
+            stack.set(self.spilled.volume[k, i])
         for n, (line, triangle) in enumerate(self.marks):
             y = mark_height(self.where.boxes[self.loop.plant.outputs[n]], float(self.r[k, n]))
             line.set_ydata([y, y])
@@ -230,37 +221,20 @@ class _Stage:
         for j, bar in enumerate(self.bars):
             share = (self.u[k, j] - self.low[j]) / (self.high[j] - self.low[j])
             bar.set_height(BAR * float(np.clip(share, 0.0, 1.0)))
-        self.words.set_text(self.found.words(k))
+        self.words.set_text(self.spilled.words(k))
 
 
 def _moving(ax, loop, where):
     """The artists that move: water in each tank, marks of setpoints, a bar for each pump."""
-    water, bars = [], []
-    for box in where.boxes:
-        water.append(
-            ax.add_patch(
-                Rectangle(
-                    (box.x, box.y), box.width, 0.0, facecolor=WATER, edgecolor="none", zorder=1.6
-                )
-            )
-        )
-    marks = [mark(ax, where.boxes[i], 0.0) for i in loop.plant.outputs]
+    water = [
+        box(ax, (tank.x, tank.y), (tank.width, 0.0), facecolor=WATER, zorder=1.6)
+        for tank in where.boxes
+    ]
+    marks, bars = [mark(ax, where.boxes[i], 0.0) for i in loop.plant.outputs], []
+    frame = {"facecolor": "white", "edgecolor": "0.5", "linewidth": 0.8, "zorder": 3}
     for j, (x, y) in enumerate(where.pumps):
-        left = x + (0.08 if x < 0 else -0.2)
-        ax.add_patch(
-            Rectangle(
-                (left, y + 0.3),
-                0.12,
-                BAR,
-                facecolor="white",
-                edgecolor="0.5",
-                linewidth=0.8,
-                zorder=3,
-            )
-        )
-        bars.append(
-            ax.add_patch(
-                Rectangle((left, y + 0.3), 0.12, 0.0, facecolor=PUMPS[j % len(PUMPS)], zorder=4)
-            )
-        )
+        corner = (x + (0.08 if x < 0 else -0.2), y + 0.3)
+        box(ax, corner, (0.12, BAR), **frame)
+        look = {"facecolor": PUMPS[j % len(PUMPS)], "zorder": 4}
+        bars.append(box(ax, corner, (0.12, 0.0), **look))
     return water, marks, bars

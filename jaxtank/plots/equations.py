@@ -55,10 +55,10 @@ def _terms(plant, i) -> Iterator[tuple[str, str, float, str]]:
         if sink == i:
             letters = f"s{source + 1}{sink + 1} q(h{source + 1})"
             yield "+", letters, float(plant.orifice[k]) * root, f"sqrt(h{source + 1})"
-    for k, (one, other) in enumerate(plant.pipes):
-        if i in (one, other):
-            difference = f"h{i + 1} - h{(other if one == i else one) + 1}"
-            letters = f"p{one + 1}{other + 1} w({difference})"
+    for k, (a, b) in enumerate(plant.pipes):
+        if i in (a, b):
+            difference = f"h{i + 1} - h{(b if a == i else a) + 1}"
+            letters = f"p{a + 1}{b + 1} w({difference})"
             variable = f"sgn({difference}) sqrt|{difference}|"
             yield "-", letters, float(plant.pipe[k]) * root, variable
     yield from _outlets(plant, i, root)
@@ -97,30 +97,25 @@ def _sum(terms):
 def physics(plant):
     """Return sentences on rims, empty tanks, overflow and laminar flow."""
     length = plant.units[0]
-    rims = ", ".join(f"{v:g}" for v in np.asarray(plant.rim))
-    found = [
-        (
-            f"Rims at {rims} {length} are physics: a level stops there, and what would rise past it"
-            " is lost."
-            if plant.overflow
-            else (
-                f"Rims at {rims} {length} are a limit and not physics: a level may rise past its"
-                " rim, so that a tuner can tell how far."
-            )
-        )
-    ]
+    rims = f"{', '.join(f'{v:g}' for v in np.asarray(plant.rim))} {length}"
+    words = (
+        "not simulated: a rim ({rims}) is a limit that a level may pass, so that a tuner can tell"
+        " how far."
+    )
+    if plant.overflow:
+        words = "simulated: a level stops at its rim ({rims}), and the liquid above it is lost."
+    sentences = [f"Overflow is {words.format(rims=rims)}"]
     for (source, sink), share in zip(plant.spills, np.asarray(plant.caught)):
-        found.append(
-            f"{100 * share:.4g} % of what passes the rim of tank {source + 1} falls into tank"
-            f" {sink + 1}."
+        sentences.append(
+            f"{100 * share:.4g} % of the overflow of tank {source + 1} falls into tank {sink + 1}."
         )
     if plant.bottom:
-        found.append(
+        sentences.append(
             "A level stops at zero whatever is drawn from it; in one step no tank gives more than"
             " it holds."
         )
-    found.append(
+    sentences.append(
         f"Flow turns laminar (linear in the level) below {plant.knee:g} {length}, of a level or of"
         " a difference of levels."
     )
-    return found
+    return sentences

@@ -3,9 +3,11 @@
 Each function draws on given matplotlib axes and returns them.
 """
 
+import itertools
+
 import numpy as np
 
-from jaxtank.plots.style import AFTER, BEFORE, FORBIDDEN, OTHER, REFERENCE
+from jaxtank.plots.style import AFTER, BEFORE, FORBIDDEN, OTHER, REFERENCE, write
 
 
 def measured(ax, t, y, simulated, name, unit, validation_from=None):
@@ -21,15 +23,9 @@ def measured(ax, t, y, simulated, name, unit, validation_from=None):
 
 def inputs(ax, t, u, unit):
     """Draw the inputs of the pumps."""
-    for j in range(u.shape[1]):
-        ax.step(
-            t,
-            u[:, j],
-            where="post",
-            linewidth=1.0,
-            label=f"pump {j + 1}",
-            color=(AFTER, BEFORE, OTHER)[j % 3],
-        )
+    for j, colour in zip(range(u.shape[1]), itertools.cycle((AFTER, BEFORE, OTHER))):
+        label = f"pump {j + 1}"
+        ax.step(t, u[:, j], where="post", linewidth=1.0, label=label, color=colour)
     ax.margins(y=0.1)
     ax.set(ylabel=f"input [{unit}]", xlabel="time [s]", xlim=(t[0], t[-1]))
     return ax
@@ -40,14 +36,8 @@ def residual(ax, t, r, name, unit, noise=None):
     ax.plot(t, r, color=AFTER, linewidth=0.8)
     ax.axhline(0.0, color=REFERENCE, linewidth=0.8, linestyle=":")
     if noise is not None:
-        ax.axhspan(
-            -2 * noise,
-            2 * noise,
-            color=OTHER,
-            alpha=0.2,
-            linewidth=0,
-            label="2 sd of the noise in the data",
-        )
+        band = {"color": OTHER, "alpha": 0.2, "linewidth": 0}
+        ax.axhspan(-2 * noise, 2 * noise, label="2 sd of the noise in the data", **band)
     ax.margins(y=0.15)
     ax.set(ylabel=f"{name}: residual [{unit}]", xlabel="time [s]", xlim=(t[0], t[-1]))
     return ax
@@ -55,8 +45,7 @@ def residual(ax, t, r, name, unit, noise=None):
 
 def autocorrelation(ax, acf, samples, name):
     """Draw the autocorrelation of a residual, with the 95 % band of white noise."""
-    lags = np.arange(1, len(acf))
-    ax.vlines(lags, 0.0, acf[1:], color=AFTER, linewidth=1.4)
+    ax.vlines(np.arange(1, len(acf)), 0.0, acf[1:], color=AFTER, linewidth=1.4)
     bound = 1.96 / np.sqrt(max(samples, 1))
     ax.axhspan(-bound, bound, color=OTHER, alpha=0.25, linewidth=0, label="white noise, 95 %")
     ax.axhline(0.0, color=REFERENCE, linewidth=0.8)
@@ -71,41 +60,23 @@ def correlation(ax, names, matrix):
     ax.set_yticks(range(len(names)), names)
     ax.grid(False)
     if len(names) <= 14:
-        for i in range(len(names)):
-            for j in range(len(names)):
-                ax.text(
-                    j,
-                    i,
-                    f"{round(float(matrix[i, j]), 2) + 0.0:.2f}",
-                    ha="center",
-                    va="center",
-                    fontsize=6.5,
-                    color="w" if abs(matrix[i, j]) > 0.7 else "k",
-                )
+        for (i, j), value in np.ndenumerate(matrix):
+            colour = "w" if abs(value) > 0.7 else "k"
+            write(ax, j, i, f"{round(float(value), 2) + 0.0:.2f}", 6.5, colour=colour)
     ax.figure.colorbar(image, ax=ax, label="correlation [-]", shrink=0.85)
     return ax
 
 
-def profile(ax, found):
+def profile(ax, likelihood):
     """Draw the profile likelihood of a parameter, with its 95 % line and interval."""
-    values, rise = np.array(found["values"]), np.array(found["rise"])
-    ax.plot(
-        values,
-        rise,
-        "o-",
-        color=AFTER,
-        markersize=3.5,
-        linewidth=1.3,
-        label="all others fitted again",
-    )
+    values, rise = np.array(likelihood["values"]), np.array(likelihood["rise"])
+    dots = {"color": AFTER, "markersize": 3.5, "linewidth": 1.3}
+    ax.plot(values, rise, "o-", label="all others fitted again", **dots)
     ax.axhline(3.841, color=FORBIDDEN, linewidth=1.0, label="95 %")
-    for end in found["interval95"]:
+    for end in likelihood["interval95"]:
         if end is not None:
             ax.axvline(end, color=OTHER, linewidth=0.9, linestyle="--")
-    ax.set(
-        xlabel=f"{found['name']} [{found['unit']}]",
-        ylabel="rise of -2 log likelihood [-]",
-        ylim=(-0.03 * max(rise.max(), 5.0), None),
-    )
+    ax.set(xlabel=f"{likelihood['name']} [{likelihood['unit']}]")
+    ax.set(ylabel="rise of -2 log likelihood [-]", ylim=(-0.03 * max(rise.max(), 5.0), None))
     ax.legend()
     return ax

@@ -8,7 +8,7 @@ PITCH = 1.7
 """From the middle of one tank to that of the next in its row, in heights of the tallest tank."""
 
 STOREY = 1.75
-"""From the floor of one row of tanks to that of the next."""
+"""From the bottom of one row of tanks to the bottom of the next."""
 
 
 class Box(NamedTuple):
@@ -45,8 +45,8 @@ def storeys(plant):
     for _ in range(plant.tanks):
         for source, sink in (*plant.links, *plant.spills):
             row[source] = min(max(row[source], row[sink] + 1), plant.tanks - 1)
-        for one, other in plant.pipes:
-            row[one] = row[other] = max(row[one], row[other])
+        for a, b in plant.pipes:
+            row[a] = row[b] = max(row[a], row[b])
     used = sorted(set(row))
     return tuple(used.index(r) for r in row)
 
@@ -63,72 +63,54 @@ def place(plant):
         tanks = [i for i in range(plant.tanks) if rows[i] == row]
         for k, i in enumerate(tanks):
             x = PITCH * (k + (wide - len(tanks)) / 2) + PITCH / 2
-            boxes[i] = Box(
-                x - widths[i] / 2,
-                row * STOREY,
-                float(widths[i]),
-                float(heights[i]),
-                float(heights[i] / rims[i]),
-            )
+            sizes = (widths[i], heights[i], heights[i] / rims[i])
+            boxes[i] = Box(x - widths[i] / 2, row * STOREY, *map(float, sizes))
     return _with_pumps(plant, boxes, rows, wide * PITCH)
 
 
 def jets(plant, where):
-    """Return [(tank, path ((x, y), ...))] of the free jets from the floors of the tanks: into the
+    """Return [(tank, path ((x, y), ...))] of the free jets from the bottoms of the tanks: into the
     tanks below, and into the basin. A closed orifice (area 0) has none.
     """
-    found = []
+    paths, orifices = [], np.asarray(plant.orifice, dtype=float)
     for i, box in enumerate(where.boxes):
-        sinks = [
-            where.boxes[sink]
-            for k, (source, sink) in enumerate(plant.links)
-            if source == i and float(np.asarray(plant.orifice)[k]) > 0
-        ]
+        links = [(sink, k) for k, (source, sink) in enumerate(plant.links) if source == i]
+        sinks = [where.boxes[sink] for sink, k in links if orifices[k] > 0]
         sinks.sort(key=lambda below: below.middle)
         for k, below in enumerate(sinks):
             x = box.x + box.width * (k + 1) / (len(sinks) + 1)
             end = min(max(x, below.x + 0.35 * below.width), below.x + 0.65 * below.width)
             path = ((x, box.y - 0.06), (x, box.y - 0.12), (end, below.y + 0.97 * below.height))
-            found.append((i, path))
-        if float(np.asarray(plant.drain)[i]) <= 0:
-            continue
-        if sinks:  # past the tanks below
+            paths.append((i, path))
+        if float(np.asarray(plant.drain)[i]) > 0:
             side = box.x + box.width
-            x = side + 0.16
-            found.append((i, ((side, box.y + 0.05), (x, box.y + 0.05), (x, -0.93))))
-        else:
-            found.append((i, ((box.middle, box.y - 0.06), (box.middle, -0.93))))
-    return found
+            path = ((box.middle, box.y - 0.06), (box.middle, -0.93))
+            if sinks:  # past the tanks below
+                path = ((side, box.y + 0.05), (side + 0.16, box.y + 0.05), (side + 0.16, -0.93))
+            paths.append((i, path))
+    return paths
 
 
 def pipes(plant, where):
     """Return [(left end, right end, height)] of the pipes that are open, below the surface."""
-    found = []
-    for k, (one, other) in enumerate(plant.pipes):
-        if float(np.asarray(plant.pipe)[k]) > 0:
-            left, right = sorted((where.boxes[one], where.boxes[other]), key=lambda b: b.x)
-            found.append((left.x + left.width, right.x, max(left.y, right.y) + 0.08))
-    return found
+    lines = []
+    for pair, area in zip(plant.pipes, np.asarray(plant.pipe, dtype=float)):
+        if area > 0:
+            west, east = sorted((where.boxes[tank] for tank in pair), key=lambda b: b.x)
+            lines.append((west.x + west.width, east.x, max(west.y, east.y) + 0.08))
+    return lines
 
 
 def overflows(plant, where):
     """Return [(tank, path ((x, y), ...))] of what runs over a rim into another tank."""
-    found = []
+    paths = []
     for tank, into in plant.spills:
         source, sink = where.boxes[tank], where.boxes[into]
         x, rim = source.x - 0.13, source.y + source.height
-        found.append(
-            (
-                tank,
-                (
-                    (source.x, rim),
-                    (x, rim - 0.05),
-                    (x, sink.y + sink.height + 0.25),
-                    (sink.x + 0.12 * sink.width, sink.y + sink.height * 0.97),
-                ),
-            )
-        )
-    return found
+        end = (sink.x + 0.12 * sink.width, sink.y + sink.height * 0.97)
+        start = ((source.x, rim), (x, rim - 0.05), (x, sink.y + sink.height + 0.25))
+        paths.append((tank, (*start, end)))
+    return paths
 
 
 def _with_pumps(plant, boxes, rows, width):
@@ -147,9 +129,8 @@ def _with_pumps(plant, boxes, rows, width):
             # jets of different pumps into one tank side by side, on the side that they come from
             share = 0.2 + 0.15 * min(order, 1) if sides[j] == "left" else 0.8 - 0.15 * min(order, 1)
             end = boxes[i].x + boxes[i].width * share
-            risers.append(
-                (j, i, ((x, -0.78), (x, y), (end, y), (end, boxes[i].y + boxes[i].height * 0.93)))
-            )
+            path = ((x, -0.78), (x, y), (end, y), (end, boxes[i].y + boxes[i].height * 0.93))
+            risers.append((j, i, path))
     most = max((len([s for s in sides if s == side]) for side in ("left", "right")), default=0)
     edge = 0.75 + 0.5 * max(0, most - 1)
     top = max([b.y + b.height for b in boxes] + [p[1][1] for _, _, p in risers]) + 0.3

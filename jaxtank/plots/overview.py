@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.patches import Rectangle
 
-from jaxtank.plots.style import AFTER, FORBIDDEN, GLASS, PUMPS, WATER
+from jaxtank.plots.style import AFTER, FORBIDDEN, GLASS, PUMPS, WATER, write
 
 LARGEST = 24
 """Tanks up to which a rig is drawn part by part."""
@@ -45,50 +45,36 @@ def overview(ax, plant, levels=None):
     """
     n, columns = plant.tanks, per_line(plant.tanks)
     corners = np.array([(i % columns, -(i // columns)) for i in range(n)], dtype=float) * PITCH
-    centres = corners + 0.5 * CELL
-    for pairs, colour, style in (
-        (plant.pipes, GLASS, "-"),
-        (plant.links, AFTER, "-"),
-        (plant.spills, AFTER, ":"),
-    ):
+    centres, full = corners + 0.5 * CELL, np.ones(n)
+    flows = ((plant.pipes, GLASS, "-"), (plant.links, AFTER, "-"), (plant.spills, AFTER, ":"))
+    for pairs, colour, style in flows:
         lines = [(centres[a], centres[b]) for a, b in pairs]
-        ax.add_collection(
-            LineCollection(lines, colors=colour, linestyles=style, linewidths=0.8, zorder=1)
-        )
+        look = {"colors": colour, "linestyles": style, "linewidths": 0.8, "zorder": 1}
+        ax.add_collection(LineCollection(lines, **look))
     shares = np.zeros(n)
     if levels is not None:
         shares = np.clip(np.asarray(levels, dtype=float) / np.asarray(plant.rim), 0.0, 1.0)
-    _cells(ax, corners, np.ones(n), facecolors="white", zorder=2)
+    _cells(ax, corners, full, facecolors="white", zorder=2)
     _cells(ax, corners, shares, facecolors=WATER, zorder=3)
-    widths = np.where(np.isin(np.arange(n), plant.outputs), 1.8, 0.6)
-    _cells(
-        ax, corners, np.ones(n), facecolors="none", edgecolors=GLASS, linewidths=widths, zorder=4
-    )
-    for j, (first, second) in enumerate(plant.feeds):
-        for i in (i for i in (first, second) if i is not None):
+    outline = {"facecolors": "none", "edgecolors": GLASS, "zorder": 4}
+    outline["linewidths"] = np.where(np.isin(np.arange(n), plant.outputs), 1.8, 0.6)
+    _cells(ax, corners, full, **outline)
+    for j, feed in enumerate(plant.feeds):
+        for i in (i for i in feed if i is not None):
             x, y = corners[i] + (0.5 * CELL, CELL + 0.08)
             ax.plot(x, y, marker="v", color=PUMPS[j % len(PUMPS)], markersize=4, zorder=5)
     if levels is not None:
         fullest = worst(shares)
-        _cells(
-            ax,
-            corners[fullest],
-            np.ones(len(fullest)),
-            facecolors="none",
-            edgecolors=FORBIDDEN,
-            linewidths=1.6,
-            zorder=6,
-        )
+        outline |= {"edgecolors": FORBIDDEN, "linewidths": 1.6, "zorder": 6}
+        _cells(ax, corners[fullest], full[fullest], **outline)
         for i in fullest:
             x, y = centres[i]
-            style = {"ha": "center", "va": "center", "fontsize": 7, "zorder": 7}
-            ax.text(x, y, str(i + 1), gid="fullest", **style)
+            write(ax, x, y, str(i + 1), colour="black", gid="fullest", zorder=7)
     for line in range(math.ceil(n / columns)):
         y = -line * PITCH + 0.5 * CELL
-        ax.text(-0.2, y, str(line * columns + 1), ha="right", va="center", fontsize=6, color="0.3")
-    ax.set(
-        xlim=(-0.9, columns * PITCH - 0.2), ylim=(corners[:, 1].min() - 0.3, 1.0), aspect="equal"
-    )
+        write(ax, -0.2, y, str(line * columns + 1), 6, "right center", "0.3")
+    ax.set(xlim=(-0.9, columns * PITCH - 0.2), ylim=(corners[:, 1].min() - 0.3, 1.0))
+    ax.set_aspect("equal")
     ax.axis("off")
     return ax
 

@@ -1,7 +1,7 @@
 """Pictures of runs over time, of a search and its objective, and of sensitivities.
 
 Each function draws on given matplotlib axes and returns them; `responses` and `panels` make whole
-figures. The pictures of many runs can be taken from here too, as notebooks do.
+figures.
 """
 
 import itertools
@@ -18,57 +18,24 @@ from jaxtank.plots.spills import above_rim, spill_note, spilled
 from jaxtank.plots.style import (
     AFTER,
     BEFORE,
+    BEYOND,
     FORBIDDEN,
-    OTHER,
-    PUMPS,
     REFERENCE,
     RUNS,
-    STYLE,
     add_legend,
     beside,
-    for_print,
     grid,
     height,
     hide,
+    lines,
     plain,
     printing,
     styled,
     width,
 )
-from jaxtank.plots.uncertainty import cloud, fan, violations
-
-__all__ = [
-    "AFTER",
-    "BARS",
-    "BEFORE",
-    "FORBIDDEN",
-    "OTHER",
-    "PUMPS",
-    "REFERENCE",
-    "RUNS",
-    "STYLE",
-    "cloud",
-    "contours",
-    "convergence",
-    "curve",
-    "elementary",
-    "error",
-    "fan",
-    "for_print",
-    "level",
-    "panels",
-    "plain",
-    "responses",
-    "shares",
-    "styled",
-    "tornado",
-    "violations",
-    "voltage",
-]
 
 BARS = 14
 """Bars in a picture at most; the smallest are left out, and the title gives their number."""
-
 
 COLUMNS = 4
 """Panels beside each other."""
@@ -77,61 +44,45 @@ SHOWN = 16
 """Tanks between, outputs and pumps that are drawn each; of more, those that matter."""
 
 
-def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm", spills=None):
+def level(ax, runs, tank, output=None, rim=None, limit=None, unit="cm", spills=None):
     """Draw the level of one tank, with its setpoint, rim and limit."""
-    for name, (run, colour, style) in trajectories.items():
-        ax.plot(
-            run.t, run.x[:, tank], color=colour, linestyle=style, linewidth=1.4, label=plain(name)
-        )
-    last = next(iter(trajectories.values()))[0]
+    lines(ax, runs, "x", tank, linewidth=1.4)
     if output is not None:
-        ax.plot(
-            last.t,
-            last.r[:, output],
-            color=REFERENCE,
-            linestyle=":",
-            linewidth=1.2,
-            label="setpoint",
-        )
-    highest = max(float(np.max(run.x[:, tank])) for run, _, _ in trajectories.values())
+        last = next(iter(runs.values()))[0]
+        dots = {"color": REFERENCE, "linestyle": ":", "linewidth": 1.2, "label": "setpoint"}
+        ax.plot(last.t, last.r[:, output], **dots)
+    highest = max(float(np.max(run.x[:, tank])) for run, _, _ in runs.values())
     # a rim far above all levels would only compress the picture
     for bound, name in ((rim, "rim"), (limit if limit != rim else None, "limit")):
         if bound is not None and (highest > 0.6 * bound):
             top = max(highest * 1.03, bound * 1.05)
-            ax.axhspan(bound, top, color=FORBIDDEN, alpha=0.18, linewidth=0)
+            ax.axhspan(bound, top, **BEYOND)
             ax.axhline(bound, color=FORBIDDEN, linewidth=1.0, label=f"{name} {bound:g} {unit}")
             ax.set_ylim(top=top)
     ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]) if output is None else None)
-    ax.set(title=f"tank {tank + 1}{above_rim(ax, trajectories, tank, rim, spills)}")
+    ax.set(title=f"tank {tank + 1}{above_rim(ax, runs, tank, rim, spills)}")
     ax.set_ylabel(f"level [{unit}]")
     return ax
 
 
-def voltage(ax, trajectories, pump, low, high, unit="V"):
+def voltage(ax, runs, pump, low, high, unit="V"):
     """Draw the input of one pump; what lies outside its limits is shaded."""
-    for name, (run, colour, style) in trajectories.items():
-        ax.plot(
-            run.t, run.u[:, pump], color=colour, linestyle=style, linewidth=1.2, label=plain(name)
-        )
+    lines(ax, runs, "u", pump)
     ax.set(title=f"pump {pump + 1}", ylabel=f"input [{unit}]" if unit != "V" else "voltage [V]")
     lowest, highest = (
-        f([f(run.u[:, pump]) for run, _, _ in trajectories.values()]) for f in (np.min, np.max)
+        f([f(run.u[:, pump]) for run, _, _ in runs.values()]) for f in (np.min, np.max)
     )
-    if highest - lowest < 0.1 * (high - low):  # limits far away are not shown
-        return ax
-    margin = 0.06 * (high - low)
-    ax.axhspan(low - margin, low, color=FORBIDDEN, alpha=0.18, linewidth=0)
-    ax.axhspan(high, high + margin, color=FORBIDDEN, alpha=0.18, linewidth=0)
-    ax.set_ylim(low - margin, high + margin)
+    if highest - lowest >= 0.1 * (high - low):  # limits far away are not shown
+        margin = 0.06 * (high - low)
+        ax.axhspan(low - margin, low, **BEYOND)
+        ax.axhspan(high, high + margin, **BEYOND)
+        ax.set_ylim(low - margin, high + margin)
     return ax
 
 
-def error(ax, trajectories, output, tank, unit="cm"):
+def error(ax, runs, output, tank, unit="cm"):
     """Draw the tracking error of one output."""
-    for name, (run, colour, style) in trajectories.items():
-        ax.plot(
-            run.t, run.e[:, output], color=colour, linestyle=style, linewidth=1.2, label=plain(name)
-        )
+    lines(ax, runs, "e", output)
     ax.axhline(0.0, color=REFERENCE, linewidth=0.8, linestyle=":")
     ax.set(title=f"tracking error of tank {tank + 1}", ylabel=f"h - r [{unit}]")
     return ax
@@ -141,14 +92,12 @@ def responses(loop, trajectories, title="", limits=None):
     """Return a figure of a run, or of several in the same panels."""
     if not trajectories:
         raise InputError("trajectories = {}: there is no run to draw")
-    drawn = {
-        name: (run, *style)
-        for (name, run), style in zip(trajectories.items(), styles_of(trajectories))
-    }
+    looks = zip(trajectories.items(), styles_of(trajectories))
+    runs = {name: (run, *look) for (name, run), look in looks}
     others, note = _other_tanks(loop, trajectories)
     outputs, pumps, more = _worst_outputs(loop, trajectories)
-    rows, note = _rows(loop, drawn, (outputs, pumps, others), limits), note + more
-    note += spill_note(loop.plant, trajectories)
+    rows = _rows(loop, runs, (outputs, pumps, others), limits)
+    note += more + spill_note(loop.plant, trajectories)
     columns = max(len(row) for row in rows)
     wide = width(max(4.6 * columns, 6.4))
     with styled():
@@ -158,21 +107,22 @@ def responses(loop, trajectories, title="", limits=None):
             for draw, ax in zip(row, line):
                 draw(ax)
             hide(line[len(row) :])
-        for column in axes.T:
-            last = [ax for ax in column if ax.get_visible()][-1]
-            last.set_xlabel("time [s]")
-            last.tick_params(labelbottom=True)
+        label_time(axes)
         most = max(2, round(wide))
         few = lambda labels: labels if labels <= 6 else max(4, round(wide / 2))
         add_legend(figure, lambda labels: min(few(labels), most))
-        lines = ("" if printing() else title) + note  # a journal has captions
-        figure.suptitle(
-            "\n".join(
-                plain(textwrap.fill(line, int(12 * wide))) for line in lines.strip().splitlines()
-            ),
-            fontsize=None if printing() else 10,
-        )
+        text = ("" if printing() else title) + note  # a journal has captions
+        text = [plain(textwrap.fill(line, int(12 * wide))) for line in text.strip().splitlines()]
+        figure.suptitle("\n".join(text), fontsize=None if printing() else 10)
     return figure
+
+
+def label_time(axes):
+    """Label the time axis of the lowest visible panel of each column."""
+    for column in axes.T:
+        last = [ax for ax in column if ax.get_visible()][-1]
+        last.set_xlabel("time [s]")
+        last.tick_params(labelbottom=True)
 
 
 def styles_of(trajectories):
@@ -214,20 +164,20 @@ def _worst_outputs(loop, trajectories):
     return outputs, pumps, note
 
 
-def _rows(loop, drawn, which, limits):
+def _rows(loop, runs, which, limits):
     """Rows of functions that draw one panel each, of (outputs, pumps, other tanks)."""
     (outputs, pumps, others), (length, drive) = which, loop.units
     rims, low, high = loop.plant.rim, loop.actuator.low, loop.actuator.high
-    lost = {name: spilled(loop.plant, run) for name, (run, *_) in drawn.items()}
+    lost = {name: spilled(loop.plant, run) for name, (run, *_) in runs.items()}
 
     def level_of(i, k=None):
-        return lambda ax: level(ax, drawn, i, k, _at(rims, i), _at(limits, i), length, lost)
+        return lambda ax: level(ax, runs, i, k, _at(rims, i), _at(limits, i), length, lost)
 
     def error_of(i, k):
-        return lambda ax: error(ax, drawn, k, i, length)
+        return lambda ax: error(ax, runs, k, i, length)
 
     def voltage_of(j):
-        return lambda ax: voltage(ax, drawn, j, float(low[j]), float(high[j]), drive)
+        return lambda ax: voltage(ax, runs, j, float(low[j]), float(high[j]), drive)
 
     kinds = [
         [level_of(i, k) for k, i in outputs],
@@ -248,28 +198,21 @@ def convergence(ax, history, unit, limited):
     start, cost, violation = (np.array([h[k] for h in history]) for k in range(3))
     broken, index = violation > 0, np.arange(1, len(history) + 1)
     for s in np.unique(start):
-        here, colour = start == s, plt.get_cmap("cividis")(0.1 + 0.8 * s / max(1, start.max()))
-        ax.plot(index[here & ~broken], cost[here & ~broken], "o", color=colour, markersize=3.5)
-        ax.plot(index[here & broken], cost[here & broken], "x", color=colour, markersize=4)
+        colour = plt.get_cmap("cividis")(0.1 + 0.8 * s / max(1, start.max()))
+        for mask, marker, size in ((~broken, "o", 3.5), (broken, "x", 4)):
+            rows = (start == s) & mask
+            ax.plot(index[rows], cost[rows], marker, color=colour, markersize=size)
     best = np.minimum.accumulate(np.where(broken, np.inf, cost))
-    shown = np.isfinite(best)
-    ax.plot(
-        index[shown],
-        best[shown],
-        color=AFTER,
-        linewidth=1.4,
-        drawstyle="steps-post",
-        label="best that holds every limit" if limited else "best",
-    )
+    finite = np.isfinite(best)
+    step: dict[str, Any] = {"color": AFTER, "linewidth": 1.4, "drawstyle": "steps-post"}
+    step["label"] = "best that holds every limit" if limited else "best"
+    ax.plot(index[finite], best[finite], **step)
     if broken.any():
         ax.plot([], [], "x", color="0.4", label="violates a limit")
     for s in np.unique(start)[1:]:
         ax.axvline(index[start == s][0] - 0.5, color="0.85", linewidth=0.8, zorder=0)
-    ax.set(
-        xlabel="evaluation (grey lines: next start)",
-        ylabel=f"objective [{unit}]",
-        title="convergence",
-    )
+    ax.set(xlabel="evaluation (grey lines: next start)", ylabel=f"objective [{unit}]")
+    ax.set_title("convergence")
     _limit_height(ax, cost[np.isfinite(cost)])
     ax.legend(loc="best", framealpha=0.8, frameon=True, edgecolor="none")
     return ax
@@ -287,73 +230,47 @@ def _limit_height(ax, cost):
         ax.set_title(f"convergence ({int((cost > high).sum())} evaluations above the picture)")
 
 
-def curve(ax, values, cost, violation, name, unit, cost_unit, before, after, logarithmic):
+def curve(ax, values, cost, violation, bound, unit, before, after):
     """Draw the objective along one parameter; the part that violates a limit is shaded."""
+    # bound: has the name, unit and scale ("log" or "linear") of the parameter
     ax.plot(values, cost, color="0.3", linewidth=1.3)
     broken = np.asarray(violation) > 0
     if broken.any():
         low, high = ax.get_ylim()
-        ax.fill_between(
-            values,
-            low,
-            high,
-            where=broken,
-            color=FORBIDDEN,
-            alpha=0.18,
-            linewidth=0,
-            label="a limit is violated",
-        )
+        style = {**BEYOND, "label": "a limit is violated"}
+        ax.fill_between(values, low, high, where=broken, **style)
         ax.set_ylim(low, high)
     ax.plot(*before, "s", color=BEFORE, label="before")
     ax.plot(*after, "o", color=AFTER, label="after")
-    ax.set(
-        xlabel=plain(f"{name} [{unit}]"),
-        ylabel=f"objective [{cost_unit}]",
-        title="landscape",
-        xscale="log" if logarithmic else "linear",
-    )
+    ax.set(xlabel=plain(f"{bound.name} [{bound.unit}]"), ylabel=f"objective [{unit}]")
+    ax.set(title="landscape", xscale=bound.scale)
     ax.legend()
     return ax
 
 
-def contours(ax, x, y, cost, violation, names, units, cost_unit, before, after, logarithmic):
+def contours(ax, grid, cost, violation, bounds, unit, before, after):
     """Draw the objective over two parameters; beyond the pink line a limit is violated."""
+    x, y = grid
     finite = np.where(np.isfinite(cost), cost, np.nan)
     low, high = np.nanmin(finite), np.nanquantile(finite, 0.98)
     # a colour for each factor in the distance from the minimum, so that its surroundings are seen
     levels = np.unique(np.append(low, low + max(high - low, 1e-12) * np.geomspace(1e-3, 1.0, 16)))
-    filled = ax.contourf(
-        x,
-        y,
-        finite,
-        levels=levels,
-        cmap="cividis_r",
-        extend="both",
-        norm=BoundaryNorm(levels, 256, extend="both"),
-    )
-    ax.figure.colorbar(
-        filled, ax=ax, label=f"objective [{cost_unit}]", format="%.4g", ticks=levels[::3]
-    )
+    norm = BoundaryNorm(levels, 256, extend="both")
+    colours = {"cmap": "cividis_r", "extend": "both", "norm": norm}
+    filled = ax.contourf(x, y, finite, levels=levels, **colours)
+    label = f"objective [{unit}]"
+    ax.figure.colorbar(filled, ax=ax, label=label, format="%.4g", ticks=levels[::3])
     if np.nanmax(violation) > 0 and np.nanmin(violation) <= 0:
+        line = {"color": FORBIDDEN, "linewidth": 2.0}
         ax.contour(x, y, violation, levels=[0.0], colors=[FORBIDDEN], linewidths=2.0)
         ax.contourf(x, y, violation, levels=[0.0, np.inf], colors="none", hatches=["///"])
-        ax.plot(
-            [],
-            [],
-            color=FORBIDDEN,
-            linewidth=2.0,
-            label="a limit is reached; violated where hatched",
-        )
+        ax.plot([], [], label="a limit is reached; violated where hatched", **line)
     point = {"markeredgecolor": "white", "clip_on": False, "zorder": 5}
     ax.plot(*before, "s", color=BEFORE, markersize=8, label="before", **point)
     ax.plot(*after, "o", color=AFTER, markersize=9, label="after", **point)
-    ax.set(
-        xlabel=plain(f"{names[0]} [{units[0]}]"),
-        ylabel=plain(f"{names[1]} [{units[1]}]"),
-        title="landscape",
-    )
-    ax.set_xscale("log" if logarithmic[0] else "linear")
-    ax.set_yscale("log" if logarithmic[1] else "linear")
+    across, up = bounds
+    ax.set(xlabel=plain(f"{across.name} [{across.unit}]"), xscale=across.scale)
+    ax.set(ylabel=plain(f"{up.name} [{up.unit}]"), yscale=up.scale, title="landscape")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
     return ax
 
@@ -375,26 +292,21 @@ def elementary(ax, names, size, intervals, spread, unit, title):
     size, intervals, spread = (np.asarray(v)[: len(y)] for v in (size, intervals, spread))
     ax.barh(y, size, color=AFTER, height=0.62, label="mean size, mu*")
     _whiskers(ax, y, size, intervals)
-    ax.plot(
-        spread,
-        y,
-        "D",
-        color=BEFORE,
-        markeredgecolor="white",
-        markersize=6,
-        label="standard deviation, sigma",
-    )
+    point = {"color": BEFORE, "markeredgecolor": "white", "markersize": 6}
+    ax.plot(spread, y, "D", label="standard deviation, sigma", **point)
     ax.set_xlim(left=0.0)
     ax.set_xlabel(f"change over the range [{unit}]")
     return ax
 
 
-def shares(ax, names, first, total, first_intervals, total_intervals, title):
-    """Draw the first-order and total shares of the variance of a measure (Sobol)."""
+def shares(ax, names, first, total, title):
+    """Draw the first-order and total shares of the variance of a measure (Sobol), each as (values,
+    intervals).
+    """
     y = _bars(ax, names, title)
-    for values, ends, side, colour, label in (
-        (first, first_intervals, -0.2, BEFORE, "first order: alone"),
-        (total, total_intervals, 0.2, AFTER, "total: with interactions"),
+    for (values, ends), side, colour, label in (
+        (first, -0.2, BEFORE, "first order: alone"),
+        (total, 0.2, AFTER, "total: with interactions"),
     ):
         values, ends = np.asarray(values)[: len(y)], np.asarray(ends)[: len(y)]
         ax.barh(y + side, values, color=colour, height=0.36, label=label)
@@ -411,31 +323,27 @@ def panels(draw, title, rows):
     with styled():
         size = (4.3 * columns, (0.9 + 0.26 * rows) * lines + 0.7)
         figure, axes = grid(lines, columns, size)
-        for one, ax in zip(draw, axes.flat):
-            one(ax)
+        for panel, ax in zip(draw, axes.flat):
+            panel(ax)
         hide(axes.flat[len(draw) :])
-        handles, labels = axes.flat[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
+        add_legend(figure, lambda labels: labels)
         figure.suptitle(plain(title), fontsize=10)
     return figure
 
 
 def _bars(ax, names, title):
     """Positions of the bars, the first at the top, with the names beside them."""
-    y = np.arange(min(len(names), BARS))
+    y, more = np.arange(min(len(names), BARS)), len(names) - BARS
     ax.set_yticks(y, names[:BARS])
     ax.invert_yaxis()
     ax.grid(False, axis="y")
     ax.set_axisbelow(True)
-    ax.set_title(
-        title + (f"; {len(names) - BARS} smaller ones not shown" if len(names) > BARS else "")
-    )
+    ax.set_title(title + (f"; {more} smaller ones not shown" if more > 0 else ""))
     return y
 
 
 def _whiskers(ax, y, values, ends):
     """Intervals (D, 2) around values (D,)."""
     low, high = np.maximum(0.0, values - ends[:, 0]), np.maximum(0.0, ends[:, 1] - values)
-    ax.errorbar(
-        values, y, xerr=[low, high], fmt="none", ecolor=REFERENCE, elinewidth=1.0, capsize=2.5
-    )
+    style = {"fmt": "none", "ecolor": REFERENCE, "elinewidth": 1.0, "capsize": 2.5}
+    ax.errorbar(values, y, xerr=[low, high], **style)

@@ -10,12 +10,12 @@ import numpy as np
 
 from jaxtank.core.files import write_folder
 from jaxtank.core.units import local
-from jaxtank.plots import responses
 from jaxtank.plots.layout import place
 from jaxtank.plots.overview import LARGEST, size, worst
+from jaxtank.plots.responses import SHOWN
 from jaxtank.plots.schematic import schematic
 from jaxtank.plots.spills import amount, spilled
-from jaxtank.plots.style import TALLEST, WIDTHS, for_print, styled
+from jaxtank.plots.style import RUNS, TALLEST, WIDTHS, for_print, picture, plain, styled
 
 SOFTWARE = {"Software": None}
 """Metadata of a PNG file: nothing that differs from machine to machine."""
@@ -29,37 +29,34 @@ def figures(run: Any) -> dict[str, Any]:
     time.
     """
     length, drive = run.units
-    colours = [colour for colour, _ in responses.RUNS]
+    colours = [colour for colour, _ in RUNS]
     lost = float(np.sum(np.asarray(run.spilled)[-1]))
-    floor = f", {amount(lost, local('cm^3', run.units))} over the rims" if lost > 0 else ""
+    spilled = f", {amount(lost, local('cm^3', run.units))} over the rims" if lost > 0 else ""
     groups = [
-        (f"levels{floor}", "h", run.x, length),
+        (f"levels{spilled}", "h", run.x, length),
         ("setpoints", "r", run.r, length),
         ("tracking errors", "e", run.e, length),
         ("inputs", "u", run.u, drive),
     ]
-    with responses.styled():
-        figure, axes = plt.subplots(
-            len(groups), figsize=(6.4, 7.5), sharex=True, layout="constrained"
-        )
+
+    def draw(axes):
         for ax, (title, symbol, values, unit) in zip(axes, groups):
-            named, note = range(values.shape[1]), ""
-            if len(named) > responses.SHOWN:  # the range of all, and those that go highest
-                named = worst(np.max(np.abs(values), axis=0))
-                note = f": range of {values.shape[1]}, and the {len(named)} largest"
+            columns, note = range(values.shape[1]), ""
+            if len(columns) > SHOWN:  # the range of all, and those that go highest
+                columns = worst(np.max(np.abs(values), axis=0))
+                note = f": range of {values.shape[1]}, and the {len(columns)} largest"
                 low, high = values.min(axis=1), values.max(axis=1)
                 ax.fill_between(run.t, low, high, color="0.85", linewidth=0)
-            for k, i in enumerate(named):
+            for k, i in enumerate(columns):
                 colour, style = colours[k % len(colours)], "-" if k < len(colours) else "--"
-                ax.plot(
-                    run.t, values[:, i], color=colour, linestyle=style, label=f"{symbol}{i + 1}"
-                )
+                ax.plot(run.t, values[:, i], style, color=colour, label=f"{symbol}{i + 1}")
             ax.set(title=title + note, ylabel=f"[{unit}]")
-            columns = 1 + (len(named) > 6)
             # beside the lines
-            ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), ncols=columns)
+            place = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
+            ax.legend(ncols=1 + (len(columns) > 6), **place)
         axes[-1].set_xlabel("time [s]")
-    return {"run": figure}
+
+    return {"run": picture(draw, (6.4, 7.5), len(groups), sharex=True)}
 
 
 def rig(plant: Any, run: Any = None, title: str = "") -> dict[str, Any]:
@@ -74,17 +71,17 @@ def rig(plant: Any, run: Any = None, title: str = "") -> dict[str, Any]:
         where = place(plant)
         wide, high = where.right - where.left, where.top - where.bottom
         extent = (4.8, min(7.0, 4.8 * high / wide + 0.35))
-    with responses.styled():
+    with styled():
         figure = plt.figure(figsize=extent)
         ax = figure.add_axes((0.01, 0.01, 0.98, 0.89))
         if run is not None and np.all(np.isfinite(run.x[-1])):
             lost = run.spilled[-1] if plant.overflow else None
             schematic(ax, plant, run.x[-1], run.r[-1], lost)
-            found = spilled(plant, run)
-            title = f"{title}\n{found.words()}" if found.any else title
+            above = spilled(plant, run)
+            title = f"{title}\n{above.words()}" if above.any else title
         else:
             schematic(ax, plant)
-        ax.set_title(responses.plain(title))
+        ax.set_title(plain(title))
     return {"rig": figure}
 
 
@@ -96,13 +93,13 @@ def png(figure: Any) -> bytes:
     return out.getvalue()
 
 
-def for_journal(drawn: Mapping[str, Any], columns: int = 1) -> dict[str, bytes]:
+def for_journal(drawings: Mapping[str, Any], columns: int = 1) -> dict[str, bytes]:
     """Return {file name: bytes} of {name: figure} as SVG and as PNG of 300 dpi, in the width of one
     or two columns of a journal; the figures are closed.
     """
     # Figures that `style.for_print` has not made are scaled to that width.
-    found: dict[str, bytes] = {}
-    for name, figure in drawn.items():
+    files: dict[str, bytes] = {}
+    for name, figure in drawings.items():
         wide, high = figure.get_size_inches()
         scale = WIDTHS[columns] / wide
         figure.set_size_inches(WIDTHS[columns], min(high * max(scale, 0.6), TALLEST))
@@ -111,31 +108,31 @@ def for_journal(drawn: Mapping[str, Any], columns: int = 1) -> dict[str, bytes]:
             # the same bytes for the same figure
             with for_print(columns), styled({"svg.hashsalt": name}):
                 figure.savefig(out, format=kind, metadata=metadata)
-            found[f"{name}.{kind}"] = out.getvalue()
+            files[f"{name}.{kind}"] = out.getvalue()
         plt.close(figure)
-    return found
+    return files
 
 
-def save_for_print(drawn: Mapping[str, Any], folder: str | Path, columns: int = 1) -> list[Path]:
+def save_for_print(drawings: Mapping[str, Any], folder: str | Path, columns: int = 1) -> list[Path]:
     """Write {name: figure} to a folder, made if need be, as `for_journal` makes them: all of them
     or none; return the paths. `result.plot()` inside `style.for_print(columns)` makes the figures.
     """
     # Raises InputError for a number of columns that is none, and a folder that cannot be written
     # to.
     with for_print(columns):  # which refuses other numbers
-        return write_folder(folder, for_journal(drawn, columns))
+        return write_folder(folder, for_journal(drawings, columns))
 
 
-def small(drawn: Mapping[str, Any]) -> bytes | None:
+def small(drawings: Mapping[str, Any]) -> bytes | None:
     """Return the first of {name: figure} as PNG bytes of about half its size; all are closed."""
-    out, first = io.BytesIO(), next(iter(drawn.values()), None)
+    out, first = io.BytesIO(), next(iter(drawings.values()), None)
     if first is not None:
         first.savefig(out, format="png", dpi=SMALL, metadata=SOFTWARE)
-    for figure in drawn.values():
+    for figure in drawings.values():
         plt.close(figure)
     return None if first is None else out.getvalue()
 
 
-def pngs(drawn: Mapping[str, Any]) -> dict[str, bytes]:
+def pngs(drawings: Mapping[str, Any]) -> dict[str, bytes]:
     """Return {file name: PNG bytes} of {name: figure}; the figures are closed."""
-    return {f"{name}.png": png(figure) for name, figure in drawn.items()}
+    return {f"{name}.png": png(figure) for name, figure in drawings.items()}

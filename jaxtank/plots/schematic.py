@@ -3,15 +3,17 @@
 Draws on given matplotlib axes.
 """
 
+from typing import Any
+
 import numpy as np
-from matplotlib.patches import Circle, Polygon, Rectangle
+from matplotlib.patches import Circle, Polygon
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 
 from jaxtank.core.units import local
 from jaxtank.plots.layout import jets, overflows, pipes, place
 from jaxtank.plots.overview import LARGEST, overview
 from jaxtank.plots.spills import Stack, amount, headroom
-from jaxtank.plots.style import AFTER, GLASS, PUMPS, REFERENCE, WATER
+from jaxtank.plots.style import AFTER, GLASS, PUMPS, REFERENCE, WATER, box, write
 
 JET = {"color": AFTER, "linewidth": 1.1, "linestyle": (0, (3, 1.5)), "zorder": 2}
 """Style of water in free fall."""
@@ -28,50 +30,23 @@ def schematic(ax, plant, levels=None, setpoints=None, lost=None):
     # than 24 tanks is drawn by `overview.overview`.
     if plant.tanks > LARGEST:
         return overview(ax, plant, levels)
-    where, unit = place(plant), plant.units[0]
+    where = place(plant)
     _basin(ax, where)
     for pump, _, path in where.risers:
-        ax.plot(
-            *np.array(path).T, color=_colour(pump), linewidth=1.6, solid_joinstyle="round", zorder=1
-        )
+        line = {"color": _colour(pump), "solid_joinstyle": "round", "zorder": 1}
+        ax.plot(*np.array(path).T, linewidth=1.6, **line)
         ax.plot(*path[-1], marker="v", color=_colour(pump), markersize=5, zorder=4)
-    for pipe in pipes(plant, where):
-        _pipe(ax, *pipe)
+    for left, right, y in pipes(plant, where):
+        for wide, colour, layer in ((6.5, GLASS, 1.7), (3.5, WATER, 1.8)):
+            line = {"color": colour, "linewidth": wide, "zorder": layer}
+            ax.plot([left, right], [y, y], solid_capstyle="butt", **line)
     _jets(ax, plant, where)
     for _, path in overflows(plant, where):
-        _overflow(ax, path)
-    for i, box in enumerate(where.boxes):
-        controlled = i in plant.outputs
-        ax.add_patch(
-            Rectangle(
-                (box.x, box.y),
-                box.width,
-                box.height,
-                facecolor="white",
-                edgecolor="none",
-                zorder=1.5,
-            )
-        )
-        if levels is not None:
-            ax.add_patch(
-                Rectangle(
-                    (box.x, box.y),
-                    box.width,
-                    depth(box, levels[i]),
-                    facecolor=WATER,
-                    edgecolor="none",
-                    zorder=1.6,
-                )
-            )
-        x, y = box.x + box.width, box.y + box.height
-        ax.plot(
-            [box.x, box.x, x, x],
-            [y, box.y, box.y, y],
-            color=REFERENCE if controlled else GLASS,
-            linewidth=2.2 if controlled else 1.4,
-            zorder=3,
-        )
-        _label(ax, plant, i, box, None if levels is None else float(levels[i]), unit)
+        ax.plot(*np.array(path).T, color=AFTER, linewidth=1.3, linestyle=(0, (1, 1.2)), zorder=2)
+        x, y = path[1][0] - 0.04, (path[1][1] + path[2][1]) / 2
+        write(ax, x, y, "overflow", 6.5, "right center", rotation=90)
+    for i in range(plant.tanks):
+        _tank(ax, plant, i, where.boxes[i], None if levels is None else float(levels[i]))
     if setpoints is not None:
         for k, i in enumerate(plant.outputs):
             mark(ax, where.boxes[i], float(setpoints[k]))
@@ -86,41 +61,41 @@ def schematic(ax, plant, levels=None, setpoints=None, lost=None):
     return ax
 
 
-def mark(ax, box, setpoint):
+def mark(ax, tank, setpoint):
     """Mark a setpoint [cm] with a line and a triangle at the right of a tank; return both
     artists.
     """
-    y, x = mark_height(box, setpoint), box.x + box.width
-    (line,) = ax.plot([x - 0.1 * box.width, x], [y, y], color=REFERENCE, linewidth=1.3, zorder=4)
+    y, x = mark_height(tank, setpoint), tank.x + tank.width
+    (line,) = ax.plot([x - 0.1 * tank.width, x], [y, y], color=REFERENCE, linewidth=1.3, zorder=4)
     (triangle,) = ax.plot([x + 0.07], [y], marker="<", color=REFERENCE, markersize=5, zorder=4)
     return line, triangle
 
 
-def mark_height(box, setpoint):
+def mark_height(tank, setpoint):
     """Return the height of the mark of a setpoint [cm], at most 5 % above the rim."""
-    return box.y + min(max(setpoint, 0.0) * box.scale, 1.05 * box.height)
+    return tank.y + min(max(setpoint, 0.0) * tank.scale, 1.05 * tank.height)
 
 
-def depth(box, level):
+def depth(tank, level):
     """Return the drawn depth of a level [cm], at most up to the rim; `spills` draws the rest."""
-    return min(max(float(level), 0.0) * box.scale, box.height)
+    return min(max(float(level), 0.0) * tank.scale, tank.height)
 
 
 def _above(ax, plant, where, levels, lost):
     """What is above the rims, hatched and counted: lost volumes, or what the tanks cannot hold."""
     area, rim = (np.asarray(v, dtype=float) for v in (plant.area, plant.rim))
-    volumes, what = area * (levels - rim), "above"
+    volumes, words = area * (levels - rim), "above"
     if lost is not None:
-        volumes, what = np.asarray(lost, dtype=float), "spilled"
+        volumes, words = np.asarray(lost, dtype=float), "spilled"
     for i in np.flatnonzero(volumes > 1e-9 * area * rim):
-        box, volume = where.boxes[i], float(volumes[i])
-        found = Stack(ax, box, float(area[i]))
-        found.set(volume)
-        headroom(ax, [(found, volume)])
-        y = box.y + box.height + min(0.5 * found.height(volume), 0.2)
-        style = {"ha": "center", "va": "center", "fontsize": 7, "zorder": 6, "gid": "above"}
-        text = f"{amount(volume, local('cm^3', plant.units))} {what}"
-        ax.text(box.middle, y, text, path_effects=HALO, **style)
+        tank, volume = where.boxes[i], float(volumes[i])
+        stack = Stack(ax, tank, float(area[i]))
+        stack.set(volume)
+        headroom(ax, [(stack, volume)])
+        y = tank.y + tank.height + min(0.5 * stack.height(volume), 0.2)
+        text = f"{amount(volume, local('cm^3', plant.units))} {words}"
+        look = {"colour": "black", "path_effects": HALO, "zorder": 6, "gid": "above"}
+        write(ax, tank.middle, y, text, **look)
 
 
 def _colour(pump):
@@ -128,48 +103,40 @@ def _colour(pump):
 
 
 def _basin(ax, where):
-    low, high = where.left + 0.06, where.right - 0.06
-    ax.add_patch(
-        Rectangle(
-            (low, where.bottom + 0.06),
-            high - low,
-            0.14,
-            facecolor=WATER,
-            alpha=0.5,
-            edgecolor="none",
-            zorder=0,
-        )
-    )
-    ax.plot(
-        [low, low, high, high],
-        [-0.82, where.bottom + 0.06, where.bottom + 0.06, -0.82],
-        color=GLASS,
-        linewidth=1.4,
-    )
-    ax.text(
-        (low + high) / 2,
-        where.bottom + 0.13,
-        "basin",
-        ha="center",
-        va="center",
-        fontsize=7,
-        color="0.25",
-    )
+    low, high, bottom = where.left + 0.06, where.right - 0.06, where.bottom + 0.06
+    box(ax, (low, bottom), (high - low, 0.14), facecolor=WATER, alpha=0.5, zorder=0)
+    walls = [low, low, high, high], [-0.82, bottom, bottom, -0.82]
+    ax.plot(*walls, color=GLASS, linewidth=1.4)
+    write(ax, (low + high) / 2, bottom + 0.07, "basin")
+
+
+def _tank(ax, plant, i, tank, level):
+    """A tank with its walls, its liquid, its number and its rim."""
+    unit, controlled = plant.units[0], i in plant.outputs
+    x, y = tank.x + tank.width, tank.y + tank.height
+    box(ax, (tank.x, tank.y), (tank.width, tank.height), facecolor="white", zorder=1.5)
+    text = "controlled" if controlled else ""
+    if level is not None:
+        size, text = (tank.width, depth(tank, level)), f"{level:.3g} {unit}"
+        box(ax, (tank.x, tank.y), size, facecolor=WATER, zorder=1.6)
+    wall = {"color": REFERENCE, "linewidth": 2.2} if controlled else {"color": GLASS}
+    ax.plot([tank.x, tank.x, x, x], [y, tank.y, tank.y, y], **{"linewidth": 1.4, **wall}, zorder=3)
+    halo: dict[str, Any] = {} if level is None else {"path_effects": HALO}
+    label, size = f"tank {i + 1}\n{text}".strip(), 7 if tank.width < 0.7 else 8
+    middle = tank.y + 0.5 * tank.height
+    write(ax, tank.middle, middle, label, size, colour="black", zorder=5, **halo)
+    rim = f"{float(np.asarray(plant.rim)[i]):g} {unit}"
+    write(ax, x + 0.05, y, rim, 6.5, "left center", zorder=5)
 
 
 def _pump(ax, x, y, pump, label):
-    ax.add_patch(
-        Circle((x, y), 0.17, facecolor="white", edgecolor=_colour(pump), linewidth=1.8, zorder=4)
-    )
-    ax.add_patch(
-        Polygon(
-            [(x - 0.1, y - 0.08), (x + 0.1, y - 0.08), (x, y + 0.13)],
-            facecolor=_colour(pump),
-            zorder=5,
-        )
-    )
+    colour = _colour(pump)
+    circle = {"facecolor": "white", "edgecolor": colour, "linewidth": 1.8, "zorder": 4}
+    ax.add_patch(Circle((x, y), 0.17, **circle))
+    arrow = [(x - 0.1, y - 0.08), (x + 0.1, y - 0.08), (x, y + 0.13)]
+    ax.add_patch(Polygon(arrow, facecolor=colour, zorder=5))
     away, side = (-0.23, "right") if x > 0 else (0.23, "left")
-    ax.text(x + away, y + 0.12, label, fontsize=8, ha=side, va="center", zorder=5)
+    write(ax, x + away, y + 0.12, label, 8, f"{side} center", "black", zorder=5)
 
 
 def _shares(ax, plant, where):
@@ -182,83 +149,15 @@ def _shares(ax, plant, where):
         share = float(np.asarray(plant.split)[pump])
         share = share if tank == first else 1.0 - share
         (x, y), (end, _) = path[1], path[2]
-        ax.text(
-            x + (0.06 if end > x else -0.06),
-            y + 0.02,
-            f"{100 * share:.3g} %",
-            fontsize=7,
-            ha="left" if end > x else "right",
-            va="bottom",
-            color="0.15",
-        )
-
-
-def _label(ax, plant, tank, box, level, unit):
-    rim = float(np.asarray(plant.rim)[tank])
-    what = (
-        f"{level:.3g} {unit}"
-        if level is not None
-        else ("controlled" if tank in plant.outputs else "")
-    )
-    label = "\n".join(line for line in (f"tank {tank + 1}", what) if line)
-    small = box.width < 0.7
-    text = ax.text(
-        box.middle,
-        box.y + 0.5 * box.height,
-        label,
-        ha="center",
-        va="center",
-        fontsize=7 if small else 8,
-        zorder=5,
-    )
-    if level is not None:
-        text.set_path_effects(HALO)
-    ax.text(
-        box.x + box.width + 0.05,
-        box.y + box.height,
-        f"{rim:g} {unit}",
-        ha="left",
-        va="center",
-        fontsize=6.5,
-        color="0.25",
-        zorder=5,
-    )
+        away, side = (0.06, "left") if end > x else (-0.06, "right")
+        write(ax, x + away, y + 0.02, f"{100 * share:.3g} %", 7, f"{side} bottom", "0.15")
 
 
 def _jets(ax, plant, where):
-    """Free jets from the floor of each tank: into the tanks below it, and into the basin."""
+    """Free jets from the bottom of each tank: into the tanks below it, and into the basin."""
     for tank, path in jets(plant, where):
         ax.plot(*np.array(path).T, **JET)
-        if path[0][1] < where.boxes[tank].y:  # from an orifice in the floor
-            _spout(ax, path[0][0], where.boxes[tank].y)
-
-
-def _spout(ax, x, y):
-    ax.add_patch(
-        Polygon(
-            [(x - 0.06, y), (x + 0.06, y), (x + 0.025, y - 0.07), (x - 0.025, y - 0.07)],
-            facecolor=GLASS,
-            zorder=3,
-        )
-    )
-
-
-def _pipe(ax, left, right, y):
-    for wide, colour, layer in ((6.5, GLASS, 1.7), (3.5, WATER, 1.8)):
-        ax.plot(
-            [left, right], [y, y], color=colour, linewidth=wide, solid_capstyle="butt", zorder=layer
-        )
-
-
-def _overflow(ax, path):
-    ax.plot(*np.array(path).T, color=AFTER, linewidth=1.3, linestyle=(0, (1, 1.2)), zorder=2)
-    ax.text(
-        path[1][0] - 0.04,
-        (path[1][1] + path[2][1]) / 2,
-        "overflow",
-        fontsize=6.5,
-        color="0.25",
-        rotation=90,
-        ha="right",
-        va="center",
-    )
+        (x, start), y = path[0], where.boxes[tank].y
+        if start < y:  # from an orifice in the bottom
+            spout = [(x - 0.06, y), (x + 0.06, y), (x + 0.025, y - 0.07), (x - 0.025, y - 0.07)]
+            ax.add_patch(Polygon(spout, facecolor=GLASS, zorder=3))

@@ -103,46 +103,45 @@ class Stack:
 
 def headroom(ax: Any, stacks: Any) -> None:
     """Make room in a drawing for [(Stack, largest volume)]."""
-    tops = [
-        one.box.y + one.box.height + min(one.height(most), HIGHEST + 0.05) + 0.05
-        for one, most in stacks
-    ]
-    ax.set_ylim(top=max([ax.get_ylim()[1], *tops]))
+    top = ax.get_ylim()[1]
+    for stack, volume in stacks:
+        rim = stack.box.y + stack.box.height
+        top = max(top, rim + min(stack.height(volume), HIGHEST + 0.05) + 0.05)
+    ax.set_ylim(top=top)
 
 
 def above_rim(ax: Any, trajectories: Any, tank: int, rim: Any, spills: Any) -> str:
     """Hatch what is above the rim of a tank in a picture of its level over time; return ": 774 cm^3
     above the rim" for the title, "" where nothing is.
     """
-    wet = {n: found for n, found in (spills or {}).items() if found.most[tank] > 0}
-    for name, found in wet.items():
-        _hatch(ax, trajectories[name][0], tank, rim, found)
+    wet = {name: spill for name, spill in (spills or {}).items() if spill.most[tank] > 0}
+    amounts = []
+    for name, spill in wet.items():
+        _hatch(ax, trajectories[name][0], tank, rim, spill)
+        run = f" ({plain(one_line(name, 24))})" if len(trajectories) > 1 else ""
+        amounts.append(amount(spill.most[tank], spill.unit) + run)
     if not wet:
         return ""
-    what = "over the rim" if next(iter(wet.values())).simulated else "above the rim"
-    named = len(trajectories) > 1
-    amounts = [
-        amount(found.most[tank], found.unit) + (f" ({plain(one_line(name, 24))})" if named else "")
-        for name, found in list(wet.items())[:2]
-    ]
-    return f": {', '.join(amounts)}{' and more' if len(wet) > 2 else ''} {what}"
+    where = "over the rim" if next(iter(wet.values())).simulated else "above the rim"
+    return f": {', '.join(amounts[:2])}{' and more' if len(wet) > 2 else ''} {where}"
 
 
 def spill_note(plant: Any, trajectories: Any) -> str:
     """Return lines of a title, each after a line break, of the runs with a level above its rim:
     how much, and whether overflow is simulated.
     """
-    found = {name: spilled(plant, run) for name, run in trajectories.items()}
-    wet = [(name, one.words()) for name, one in found.items() if one.any]
-    lines = [words if len(found) == 1 else f"{name}: {words}" for name, words in wet]
+    lines = []
+    for name, run in trajectories.items():
+        if (spill := spilled(plant, run)).any:
+            lines.append(spill.words() if len(trajectories) == 1 else f"{name}: {spill.words()}")
     return "".join(f"\n{line}" for line in lines[:3])
 
 
-def _hatch(ax: Any, run: Any, tank: int, rim: float, found: Spilled) -> None:
+def _hatch(ax: Any, run: Any, tank: int, rim: float, spill: Spilled) -> None:
     """Hatch between rim and level, or all that is above the rim while a rig loses liquid."""
     t, style = np.asarray(run.t), {**LIQUID, "linewidth": 0.0}
-    if found.simulated:
-        rises = np.diff(found.volume[:, tank], append=found.volume[-1, tank]) > 0
+    if spill.simulated:
+        rises = np.diff(spill.volume[:, tank], append=spill.volume[-1, tank]) > 0
         where = rises | np.concatenate([[False], rises[:-1]])
         top = max(ax.get_ylim()[1], 1.12 * rim)
         ax.fill_between(t, rim, top, where=where, **style)

@@ -7,6 +7,7 @@ import sys
 from typing import Any
 
 import matplotlib.pyplot as plt
+from matplotlib.patches import Rectangle
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import PICTURES
@@ -23,6 +24,9 @@ REFERENCE, RIM = "#000000", "#CC79A7"
 
 BEFORE, AFTER, OTHER, FORBIDDEN = PUBLISHED, TUNED, FILTERED, RIM
 """The same by their places in a comparison."""
+
+BEYOND: dict[str, Any] = {"color": FORBIDDEN, "alpha": 0.18, "linewidth": 0}
+"""Style of the part of a picture that is beyond a limit."""
 
 RUNS = (
     (BEFORE, "--"),
@@ -221,3 +225,23 @@ def hide(axes):
     """Hide axes that have no picture."""
     for ax in axes:
         ax.set_visible(False)
+
+
+def lines(ax, runs, quantity, column, linewidth=1.2):
+    """Draw one column of a quantity of {name: (run, colour, line style)} over time."""
+    for name, (run, colour, style) in runs.items():
+        look = {"color": colour, "linestyle": style, "linewidth": linewidth, "label": plain(name)}
+        ax.plot(run.t, getattr(run, quantity)[:, column], **look)
+
+
+def box(ax, corner, size, **look):
+    """Draw a rectangle without an edge, unless `look` has one; return it."""
+    patch = Rectangle(corner, *size, **{"edgecolor": "none", **look})
+    return ax.add_patch(patch)
+
+
+def write(ax, x, y, text, size=7.0, at="center center", colour="0.25", **look):
+    """Write a text of `size` [points] with the horizontal and vertical alignment `at`."""
+    across, up = at.split()
+    look = {"fontsize": size, "ha": across, "va": up, "color": colour, **look}
+    return ax.text(x, y, text, **look)

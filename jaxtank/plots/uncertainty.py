@@ -1,6 +1,5 @@
 """Pictures of many runs: quantiles of levels, runs before and after tuning, limits violated."""
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
@@ -17,6 +16,7 @@ from jaxtank.plots.style import (
     grid,
     height,
     hide,
+    picture,
     plain,
     printing,
     styled,
@@ -75,16 +75,10 @@ def cloud(ax, pairs, held, name, unit, limit=None):
     )
     for chosen, marker, colour, size, label in sorts:
         if chosen.any():
-            ax.scatter(
-                *pairs[chosen].T,
-                s=size,
-                marker=marker,
-                color=colour,
-                alpha=1.0 if marker == "x" else 0.55,
-                linewidths=0.9,
-                label=f"{label} ({chosen.sum()} of {len(pairs)})",
-                rasterized=True,
-            )
+            points = {"s": size, "marker": marker, "color": colour, "linewidths": 0.9}
+            points |= {"alpha": 1.0 if marker == "x" else 0.55, "rasterized": True}
+            label = f"{label} ({chosen.sum()} of {len(pairs)})"
+            ax.scatter(*pairs[chosen].T, label=label, **points)
     # a limit far above all runs would only move them into a corner
     limit = limit if limit is not None and (limit <= 0 or np.max(pairs) > 0.6 * limit) else None
     low, high = _square(ax, pairs if limit is None else np.append(pairs.ravel(), limit))
@@ -116,30 +110,20 @@ def _square(ax, values):
 
 def violations(rows, samples):
     """Return a figure of the probability that each limit is violated, with its 95 % interval."""
-    with styled():
-        figure, ax = plt.subplots(figsize=(6.4, 0.9 + 0.35 * len(rows)), layout="constrained")
-        y, p = np.arange(len(rows)), np.array([r["probability"] for r in rows])
-        ends = np.array([r["interval95"] for r in rows])
+    y, p = np.arange(len(rows)), np.array([r["probability"] for r in rows])
+    low, high = np.array([r["interval95"] for r in rows]).T
+    names = [f"{r['name']} ({r['limit']:g} {r.get('unit', '')})".replace(" )", ")") for r in rows]
+
+    def draw(ax):
         ax.barh(y, p, color=SHARE, height=0.6)
-        ax.errorbar(
-            p,
-            y,
-            xerr=np.maximum(0.0, [p - ends[:, 0], ends[:, 1] - p]),
-            fmt="none",
-            ecolor=REFERENCE,
-            capsize=3,
-        )
-        ax.set_yticks(
-            y,
-            [
-                plain(f"{r['name']} ({r['limit']:g} {r.get('unit', '')})".replace(" )", ")"))
-                for r in rows
-            ],
-        )
+        ends = np.maximum(0.0, [p - low, high - p])
+        ax.errorbar(p, y, xerr=ends, fmt="none", ecolor=REFERENCE, capsize=3)
+        ax.set_yticks(y, map(plain, names))
         ax.invert_yaxis()
-        ax.set_xlim(0.0, max(0.05, min(1.0, 1.15 * ends[:, 1].max())))
+        ax.set_xlim(0.0, max(0.05, min(1.0, 1.15 * high.max())))
         ax.set_xlabel(f"probability of violating the limit [-], {samples} draws")
-    return figure
+
+    return picture(draw, (6.4, 0.9 + 0.35 * len(rows)))
 
 
 def plants(sides, limits, unit):
@@ -147,26 +131,28 @@ def plants(sides, limits, unit):
     levels.
     """
     colours = [TUNED] if len(sides) == 1 else [PUBLISHED, TUNED]
-    with styled():
-        figure, axes = grid(1, 2, (width(8.0), height(2.8, 2)))
-        left, right = axes[0]
-        every = np.concatenate([error for error, _ in sides.values()])
-        bins = np.linspace(every.min(), max(every.max(), every.min() * 1.01 + 1e-12), 25)
+    every = np.concatenate([error for error, _ in sides.values()])
+    bins = np.linspace(every.min(), max(every.max(), every.min() * 1.01 + 1e-12), 25)
+    tanks = np.arange(len(limits)) + 1
+
+    def draw(axes):
+        errors, highest = axes
         for k, (colour, (name, (error, levels))) in enumerate(zip(colours, sides.items())):
-            left.hist(error, bins, color=colour, alpha=0.55, label=name)
-            left.axvline(error.mean(), color=colour, linewidth=1.2)
-            x = np.arange(levels.shape[1]) + 1 + (k - 0.5 * (len(sides) - 1)) * 0.25
+            errors.hist(error, bins, color=colour, alpha=0.55, label=name)
+            errors.axvline(error.mean(), color=colour, linewidth=1.2)
+            x = tanks + (k - 0.5 * (len(sides) - 1)) * 0.25
             low, high = np.quantile(levels, (CUT, 1.0 - CUT), axis=0)
-            right.vlines(x, low, high, color=colour, linewidth=5, alpha=0.55)
-            right.plot(x, levels.max(axis=0), "o", color=colour, markersize=4)
-        for tank, limit in enumerate(limits):
+            highest.vlines(x, low, high, color=colour, linewidth=5, alpha=0.55)
+            highest.plot(x, levels.max(axis=0), "o", color=colour, markersize=4)
+            errors.set_ylabel(f"plants of {len(error)}")
+        for tank, limit in zip(tanks, limits):
             if np.isfinite(limit):
-                right.hlines(limit, tank + 0.6, tank + 1.4, color=RIM, linewidth=1.6)
-        left.set(xlabel=f"total rms error [{unit}]", ylabel=f"plants of {len(error)}")
-        right.set(xlabel="tank", ylabel=f"highest level [{unit}]")
-        right.set_xticks(np.arange(len(limits)) + 1)
-        right.set_title("5 to 95 % of plants, highest of all, limit", loc="left")
-        left.set_title("line: mean", loc="left")
+                highest.hlines(limit, tank - 0.4, tank + 0.4, color=RIM, linewidth=1.6)
+        errors.set_xlabel(f"total rms error [{unit}]")
+        errors.set_title("line: mean", loc="left")
+        highest.set(xlabel="tank", ylabel=f"highest level [{unit}]", xticks=tanks)
+        highest.set_title("5 to 95 % of plants, highest of all, limit", loc="left")
         if len(sides) > 1:
-            left.legend()
-    return figure
+            errors.legend()
+
+    return picture(draw, (width(8.0), height(2.8, 2)), 1, 2)

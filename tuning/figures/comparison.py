@@ -127,8 +127,8 @@ def compare(*names: str) -> Comparison:
     with warnings.catch_warnings(record=True) as noted, ThreadPoolExecutor(2) as pool:
         warnings.simplefilter("always")
         pages = dict(zip(chosen, pool.map(papers.measure, chosen)))
-    kept = dict.fromkeys(str(note.message) for note in noted)
-    return Comparison(pages, tuple(kept))
+    notes = dict.fromkeys(str(note.message) for note in noted)
+    return Comparison(pages, tuple(notes))
 
 
 def redraw(name: str) -> Any:

@@ -94,7 +94,8 @@ def draw(figure: Figure, drawn: Drawn) -> Any:
     """Return the matplotlib figure, with its caption below."""
     from matplotlib.figure import Figure as Blank
 
-    from jaxtank.plots import responses
+    from jaxtank.plots.responses import label_time
+    from jaxtank.plots.style import add_legend, hide, styled
 
     panels = [panel for kind in figure.kind.split() for panel in _panels(kind, figure, drawn)]
     columns = min(2, len(panels))
@@ -102,7 +103,7 @@ def draw(figure: Figure, drawn: Drawn) -> Any:
     width = WIDTH[columns - 1]
     lines = [line for text in caption(figure, drawn.ours) for line in textwrap.wrap(text, width)]
     high, low = 2.3 * rows + 0.5, LINE * len(lines) + 0.15
-    with responses.styled():
+    with styled():
         whole = Blank(figsize=(4.2 * columns if columns > 1 else 6.4, high + low))
         parts: Any = whole.subfigures(2, 1, height_ratios=[high, low])
         upper, lower = parts
@@ -112,17 +113,10 @@ def draw(figure: Figure, drawn: Drawn) -> Any:
             panel(ax)
             if figure.window:
                 ax.set_xlim(*figure.window)
-        for ax in axes.flat[len(panels) :]:
-            ax.set_visible(False)
+        hide(axes.flat[len(panels) :])
         if "memberships" not in figure.kind:
-            for column in axes.T:
-                last = [ax for ax in column if ax.get_visible()][-1]
-                last.tick_params(labelbottom=True)
-                last.set_xlabel("time [s]")
-        handles = {}
-        for ax in axes.flat[: len(panels)]:
-            handles |= dict(zip(*ax.get_legend_handles_labels()[::-1]))
-        upper.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4)
+            label_time(axes)
+        add_legend(upper, lambda _: 4)
         lower.text(0.02, 1.0, "\n".join(lines), va="top", ha="left", fontsize=8, linespacing=1.35)
     return whole
 

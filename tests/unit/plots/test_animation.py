@@ -21,8 +21,13 @@ from tuning.report import simulated
 
 @pytest.fixture(scope="module")
 def short(gouta):
-    case = gouta("backstepping", {"clock.duration": 120, "clock.dt": 0.1})
-    return case.loop, jaxtank.simulate(case.loop, case.clock, save_every=20)
+    case = gouta("backstepping", {"clock.duration": 120, "clock.dt": 0.5})
+    return case.loop, jaxtank.simulate(case.loop, case.clock, save_every=4)
+
+
+@pytest.fixture(autouse=True)
+def few_pictures(monkeypatch):
+    monkeypatch.setattr(animation, "RATE", 4)
 
 
 def frames(path):
@@ -94,17 +99,15 @@ def test_the_fragment_for_notebooks_asks_nothing_of_the_network_and_is_the_same_
     page = animation.to_html(*short, seconds=1)
     assert page == animation.to_html(*short, seconds=1)
     tags = Tags(page).found
-    assert not any(
-        tag == "link" or str(a.get("src", "")).startswith(("http", "//")) for tag, a in tags
-    )
+    assert not any(tag == "link" or a.get("src", "")[:4] == "http" for tag, a in tags)
     assert "http" not in page and "fa-" not in page
     buttons = [a["title"] for tag, a in tags if tag == "button"]
     assert {"Play", "Pause", "Next frame"} <= set(buttons)
     assert page.count("data:image/png;base64") == animation.RATE and len(page) < 1_000_000
 
 
-@pytest.mark.parametrize("seconds", [0, 61, "6", None])
-def test_a_length_that_no_laminar_zone_can_have_is_refused(short, tmp_path, seconds):
+@pytest.mark.parametrize("seconds", [0, 61, "6"])
+def test_a_length_that_no_film_can_have_is_refused(short, tmp_path, seconds):
     with pytest.raises(InputError, match="1 to 60 s"):
         animation.animate(*short, tmp_path / "run.gif", seconds=seconds)
     assert not list(tmp_path.iterdir())
@@ -113,25 +116,17 @@ def test_a_length_that_no_laminar_zone_can_have_is_refused(short, tmp_path, seco
 def test_what_is_no_gif_or_another_rig_is_refused(short, tmp_path):
     with pytest.raises(InputError, match="end in"):
         animation.animate(*short, tmp_path / "run.mp4")
+    other = jaxtank.presets.find("gouta2022/enmpc").loop
     with pytest.raises(InputError, match="the rig has 2 and 2"):
-        animation.animate(
-            jaxtank.presets.find("gouta2022/enmpc").loop, short[1], tmp_path / "run.gif"
-        )
+        animation.animate(other, short[1], tmp_path / "run.gif")
 
 
 @pytest.mark.slow
 def test_simulate_writes_one_where_asked(tmp_path, capsys):
     from tuning.cli import main
 
-    asked = [
-        "simulate",
-        "gouta2015/backstepping",
-        "--set",
-        "clock.duration=60",
-        "--dt",
-        "0.1",
-        "--gif",
-    ]
+    asked = ["simulate", "gouta2015/backstepping", "--set", "clock.duration=60", "--gif"]
+    asked += ["--dt", "0.1"]
     assert main.main(asked) == 2 and "--out DIR" in capsys.readouterr().err
     asked += ["--out", str(tmp_path / "out"), "--quiet"]
     assert main.main(asked) == 0

@@ -12,7 +12,7 @@ from PIL import Image
 import jaxtank
 from jaxtank import presets
 from jaxtank.core.errors import InputError
-from jaxtank.plots import responses, style
+from jaxtank.plots import responses, style, uncertainty
 from jaxtank.plots.run import for_journal, save_for_print
 
 
@@ -58,7 +58,7 @@ def test_the_same_figure_gives_the_same_bytes_and_settings_are_taken_back(run):
 def test_a_fan_for_one_column_has_its_tanks_below_each_other():
     bands = {"t": np.arange(3.0), "r": np.ones((3, 1)), "x": np.ones((5, 3, 2))}
     with style.for_print(1):
-        figure = responses.fan(presets.find("cascaded/pi").loop, bands, "many runs")
+        figure = uncertainty.fan(presets.find("cascaded/pi").loop, bands, "many runs")
     first, second = (ax.get_position() for ax in figure.axes)
     assert figure.get_size_inches()[0] == 3.5 and first.y0 > second.y1
     plt.close(figure)

@@ -16,15 +16,8 @@ from jaxtank.plots import style
 from jaxtank.plots.layout import place, storeys
 from jaxtank.plots.schematic import schematic
 
-RIGS = (
-    "gouta2015/ngpc",
-    "gouta2022/enmpc",
-    "mirakhorli/sfc",
-    "calofir/backstepping",
-    "cascaded/pi",
-    "khalid/gpc",
-    "khalid/gpc-mimo",
-)
+NAMES = "gouta2015/ngpc gouta2022/enmpc mirakhorli/sfc calofir/backstepping cascaded/pi"
+RIGS = (*NAMES.split(), "khalid/gpc", "khalid/gpc-mimo")
 
 
 @pytest.fixture
@@ -56,26 +49,15 @@ def test_every_part_of_a_papers_rig_is_drawn_and_nothing_is_drawn_over(ax, name)
     plant = plant_of(name)
     schematic(ax, plant)
     printed = words(ax)
-    assert (
-        sum(t.startswith("tank ") for t in printed) == plant.tanks
-        and sum(t.startswith("pump ") for t in printed) == plant.pumps
-    )
-    assert sum("controlled" in t for t in printed) == len(plant.outputs) and printed.count(
-        "overflow"
-    ) == len(plant.spills)
+    counts = {"tank ": plant.tanks, "pump ": plant.pumps, "overflow": len(plant.spills)}
+    assert {w: sum(t.startswith(w) for t in printed) for w in counts} == counts
+    assert sum("controlled" in t for t in printed) == len(plant.outputs)
     dashes = [line for line in ax.lines if line.get_linestyle() == "--"]
-    falling = np.count_nonzero(np.asarray(plant.drain)) + np.count_nonzero(
-        np.asarray(plant.orifice)
-    )
+    falling = sum(np.count_nonzero(np.asarray(area)) for area in (plant.drain, plant.orifice))
     assert len(dashes) == falling + len(plant.spills)  # a jet, or liquid past a rim
     boxes = place(plant).boxes
-    for a, b in itertools.combinations(boxes, 2):
-        assert (
-            a.x + a.width < b.x
-            or b.x + b.width < a.x
-            or a.y + a.height < b.y
-            or b.y + b.height < a.y
-        )
+    beyond = lambda a, b: a.x + a.width < b.x or a.y + a.height < b.y
+    assert all(beyond(a, b) or beyond(b, a) for a, b in itertools.combinations(boxes, 2))
     ax.figure.draw_without_rendering()
     extents = [t.get_window_extent() for t in ax.texts]
     assert not any(a.overlaps(b) for a, b in itertools.combinations(extents, 2))
@@ -94,11 +76,8 @@ def test_water_falls_down_and_pipes_lie_level(name):
     assert {(j, i) for j, i, _ in where.risers} == fed
     for j, i, path in where.risers:
         box, (x, y) = where.boxes[i], path[-1]
-        assert (
-            path[0] == where.pumps[j]
-            and box.x < x < box.x + box.width
-            and box.y < y < box.y + box.height
-        )
+        assert path[0] == where.pumps[j]
+        assert box.x < x < box.x + box.width and box.y < y < box.y + box.height
 
 
 def test_tanks_are_filled_to_scale_and_setpoints_stand_at_their_height(ax):
@@ -106,10 +85,8 @@ def test_tanks_are_filled_to_scale_and_setpoints_stand_at_their_height(ax):
     schematic(ax, plant, [3.0, 15.0, 30.0, 0.0], [10.0, 25.0])
     boxes = place(plant).boxes
     for patch, box, share in zip(water(ax), boxes, (0.1, 0.5, 1.0, 0.0), strict=True):
-        assert patch.get_height() == pytest.approx(share * box.height) and (
-            patch.get_x(),
-            patch.get_y(),
-        ) == (box.x, box.y)
+        assert patch.get_height() == pytest.approx(share * box.height)
+        assert (patch.get_x(), patch.get_y()) == (box.x, box.y)
     marks = [float(line.get_ydata()[0]) for line in ax.lines if line.get_marker() == "<"]
     np.testing.assert_allclose(
         marks, [boxes[0].y + boxes[0].height / 3, boxes[1].y + boxes[1].height * 25 / 30]
@@ -126,15 +103,8 @@ def test_the_shares_of_a_pump_are_written_at_its_branches(ax):
 
 
 def test_a_closed_orifice_is_not_drawn_and_a_level_past_a_rim_stays_in_the_picture(ax):
-    rig = network(
-        area=[10.0, 10.0],
-        drain=[0.1, 0.0],
-        pump_gain=3.0,
-        feeds=[(1, None)],
-        rim=[10.0, 20.0],
-        links=[(1, 0)],
-        orifice=[0.0],
-    )
+    flows = {"pump_gain": 3.0, "feeds": [(1, None)], "links": [(1, 0)], "orifice": [0.0]}
+    rig = network(area=[10.0, 10.0], drain=[0.1, 0.0], rim=[10.0, 20.0], **flows)
     schematic(ax, rig, [99.0, 5.0])
     assert sum(line.get_linestyle() == "--" for line in ax.lines) == 1  # the drain of tank 1
     short, tall = place(rig).boxes
@@ -142,15 +112,8 @@ def test_a_closed_orifice_is_not_drawn_and_a_level_past_a_rim_stays_in_the_pictu
 
 
 def test_a_rig_whose_tanks_feed_each_other_is_drawn_all_the_same(ax):
-    rig = network(
-        area=[1.0] * 3,
-        drain=0.1,
-        pump_gain=1.0,
-        feeds=[(0, 2)],
-        rim=5.0,
-        links=[(0, 1), (1, 2), (2, 0)],
-        orifice=[0.1] * 3,
-    )
+    links = {"links": [(0, 1), (1, 2), (2, 0)], "orifice": [0.1] * 3}
+    rig = network(area=[1.0] * 3, drain=0.1, pump_gain=1.0, feeds=[(0, 2)], rim=5.0, **links)
     assert len(storeys(rig)) == 3
     schematic(ax, rig)
     assert sum(t.startswith("tank ") for t in words(ax)) == 3

@@ -20,10 +20,10 @@ from jaxtank.plots.schematic import schematic
 
 @pytest.fixture(scope="module")
 def runs(gouta):
-    """{whether rims are physics: (loop, run, clock)} of backstepping, whose tanks 3, 4 rise past
-    their rims.
+    """{whether overflow is simulated: (loop, run, clock)} of backstepping: tanks 3, 4 pass their
+    rims.
     """
-    case = gouta("backstepping", {"clock.dt": 0.1, "clock.duration": 900.0})
+    case = gouta("backstepping", {"clock.dt": 0.5, "clock.duration": 900.0})
     found = {}
     for overflow in (False, True):
         plant = dataclasses.replace(case.loop.plant, overflow=overflow)
@@ -97,14 +97,7 @@ def test_a_run_below_all_rims_has_no_word_of_it(runs):
 
 
 @pytest.mark.parametrize(
-    ("volume", "text"),
-    [
-        (0.0, "0 L"),
-        (0.0929, "0.0929 L"),
-        (774.4, "774 L"),
-        (99999.0, "100000 L"),
-        (2e-7, "2e-07 L"),
-    ],
+    ("volume", "text"), [(0.0, "0 L"), (0.0929, "0.0929 L"), (774.4, "774 L"), (2e-7, "2e-07 L")]
 )
 def test_volumes_have_three_figures_and_a_unit(volume, text):
     assert spills.amount(volume, "L") == text
