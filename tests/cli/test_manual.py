@@ -131,7 +131,7 @@ def test_what_is_set_is_what_is_reported():
     faulty = " ".join(text_of(presets.find("calofir/backstepping-perturbed")).split())
     assert (
         "plant.drain[1] times 0.75 from 300 to 450 s" in faulty
-        and "Rims at 0.6, 0.6 m are physics" in faulty
+        and "a level stops at its rim (0.6, 0.6 m)" in faulty
     )
     loop = dataclasses.replace(case.loop, disturbance=None)
     assert "No disturbance." in text_of(case.replace(loop=loop))

@@ -2,17 +2,15 @@
 with one tank.
 """
 
-from pathlib import Path
-
 import pytest
 from helpers import RIGS
 
 import tuning
 from jaxtank import rig
 from tuning.cli import main
+from tuning.search.result import ConstraintRow
 
 ONE_TANK = str(RIGS / "watertank.toml")
-QUICK = {"starts": 1, "screening": 1, "iterations": 1, "validation": 2}
 
 
 @pytest.mark.parametrize(
@@ -25,41 +23,31 @@ def test_a_rig_with_nothing_uncertain_is_answered_with_how_to_vary(words, capsys
     assert reported.count("\n") == 1 and "--vary NAME=" in reported and "[uncertain]" in reported
 
 
-def test_the_advice_is_taken(tmp_path, capsys):
-    """Both ways that the refusal names."""
+@pytest.mark.slow
+def test_the_advice_is_taken(capsys):
     assert main.main(["sensitivity", ONE_TANK, "--vary", "plant.drain=uniform:10%", "--quiet"]) == 0
-    file = tmp_path / "rig.toml"
-    file.write_text(Path(ONE_TANK).read_text() + '\n[uncertain]\n"plant.drain" = 0.1\n')
-    assert main.main(["sensitivity", str(file), "--quiet"]) == 0
 
 
-LEVELS = {
-    "none": ({"nominal": True, "limits": {}}, ("a level above its rim is not reported",)),
-    "rims": (
-        {"nominal": True, "limits": {"max_level": "rim"}},
-        ("all limits held", "rims are limits only"),
-    ),
-    "filter": ({}, ("a safety filter caps the pumps",)),
-}
-
-
-@pytest.mark.slow_for("rims", "filter")
-@pytest.mark.parametrize("kind", LEVELS)
-def test_without_limits_nothing_is_reported_to_hold(kind):
+def test_without_limits_nothing_is_reported_to_hold():
     case = rig.load(ONE_TANK).replace(uncertain={"plant.drain": 0.1})
-    if kind == "filter":  # the rims are left to it
-        case = case.replace(limits={"max_level": "rim"}).with_safety_filter()
-    options, words = LEVELS[kind]
-    page = repr(tuning.tune(case, **options, **QUICK))
-    assert all(word in page for word in words)
-    assert ("is not reported" in page) == (kind == "none") != ("all limits held" in page) or (
-        kind == "filter"
-    )
+    quick = {"starts": 1, "screening": 1, "iterations": 1, "validation": 2}
+    result = tuning.tune(case, nominal=True, limits={}, **quick)
+    page = repr(result)
+    assert "validation runs" in page and "all limits held" not in page
+    assert "rims are limits" not in page and "a level above its rim is not reported" in page
+    limit = {"limit": 1.0, "value": 0.5, "margin": 0.5}
+    row = ConstraintRow(name="rim", measure="max_level", unit="m", **limit)
+    limited = result.replace(constraints=[row])
+    assert "rims are limits only" in repr(limited) and "every limit holds" in repr(limited)
+    filtered = repr(limited.replace(tuned=case.with_safety_filter()))
+    assert "a safety filter limits the pump inputs" in filtered
 
 
 def test_one_tank_is_one_tank(capsys):
     assert main.main(["show", ONE_TANK]) == 0
     assert "The rig: 1 tank, 1 pump; " in capsys.readouterr().out
+    assert main.main(["show", "cascaded/pi"]) == 0
+    assert "The rig: 2 tanks, 1 pump; " in capsys.readouterr().out
 
 
 @pytest.mark.slow

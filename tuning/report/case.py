@@ -1,4 +1,4 @@
-"""`jaxtank show`: one case as the manual of it, 100 columns wide."""
+"""`jaxtank show`: the manual of one case, 100 columns wide."""
 
 import inspect
 import re
@@ -94,75 +94,68 @@ def _parameters(case, preset):
 def report(case):
     """Return the Report of a case: its rig, its loop, what is tuned, and every parameter."""
     page, preset, loop = json_of(case), _preset(case), case.loop
-    outputs = ", ".join(f"h{i + 1}{_own_name(case, 'tank', i)}" for i in loop.plant.outputs)
+    title = f"{page['case']}: {page['title']}"
+    head = [title, *([preset.citation, f"notes: {page['notes']}"] if preset else [])]
+    outputs = ", ".join(f"h{i + 1}{_name_in_file(case, 'tank', i)}" for i in loop.plant.outputs)
     size = f"{count(loop.plant.tanks, 'tank')}, {count(loop.plant.pumps, 'pump')}"
     indents: dict[str, Any] = {"initial_indent": "  ", "subsequent_indent": "      "}
     rows = [line for row in page["equations"] for line in textwrap.wrap(row, WIDTH, **indents)]
-    measured = [_sensor(loop), _actuator(loop), *_signals(loop), _sampled(case)]
+    words = [_sensor(loop), _actuator(loop), *_signals(loop), _sampled(case)]
+    inner = getattr(loop.controller, "law", None)
+    described = [(inner or loop.controller, f"The controller: {page['law']}")]
+    described += [(loop.controller, "")] if inner is not None else []
+    described += [(loop.observer, f"The observer: {page['observer']}")]
     setpoints = np.stack(loop.reference.sample(case.clock)[0], axis=-1)
     sections = [
+        Text(head),
         Text(rows, heading=f"The rig: {size}; controlled: {outputs}", layout=True),
         Text([*_called(case), *physics(loop.plant)], items=True, gap=True),
-        Text(measured, items=True, heading="The loop"),
-        _docstring(
-            getattr(loop.controller, "law", loop.controller), loop, f"The controller: {page['law']}"
-        ),
-        *([_docstring(loop.controller, loop)] if hasattr(loop.controller, "law") else []),
-        _docstring(loop.observer, loop, f"The observer: {page['observer']}"),
+        Text(words, items=True, heading="The loop"),
+        *(_docstring(part, loop, heading) for part, heading in described),
         Text(design_notes(loop, setpoints), items=True),
         *_tuning(case, preset, page),
     ]
     if page["safety_filter"] is not None:
         sections.append(safety.table_of(case, page["safety_filter"]))
         sections.append(Text(safety.sentences(case), items=True, gap=True))
-    measures = [
-        [m, measure_unit(m, loop.units), "" if s.per == "run" else s.per, s.doc]
-        for m, s in ((m, MEASURES[m]) for m in of_loop(loop))
-    ]
     sections += [
-        Table(
-            _every(page),
-            ["parameter", "value", "unit", "tunable in", "what it is"],
-            heading="Every parameter",
-            widths=(30, 18, 11, 13),
-        ),
+        _every(page),
         Text(NOTES, items=True, gap=True),
-        Table(
-            measures,
-            ["measure", "unit", "of each", "what it is"],
-            heading="What is measured",
-            widths=(22, 9, 8),
-        ),
+        _measures(loop),
         *_paper(case, preset, page),
     ]
-    title = f"{page['case']}: {page['title']}"
-    head = [title, *([preset.citation, f"notes: {page['notes']}"] if preset else [])]
-    return Report(title, "", (), [Text(head), *sections], width=WIDTH)
+    return Report(title, "", (), sections, width=WIDTH)
 
 
 def _tuning(case, preset, page):
     """What is tuned: gains, limits, objective, scenarios."""
-    limited = (
+    limits = ", ".join(
         f"{m} at {'least' if MEASURES[m].sense < 0 else 'most'} {v}"
         for m, v in page["limits"].items()
     )
-    weighed = " + ".join(f"{w:g} {m}" for m, w in page["objective"].items())
-    lines = ["limits of tune: " + (", ".join(limited) or "none"), f"objective of tune: {weighed}"]
+    weighted = " + ".join(f"{w:g} {m}" for m, w in page["objective"].items())
+    lines = [f"limits of tune: {limits or 'none'}", f"objective of tune: {weighted}"]
     if case.scenarios:
         lines.append(f"scenarios of tune: {'; '.join(s.name for s in case.scenarios)}")
-    heads = ["parameter", "value", "published", "unit", "range", "what it is"]
-    rows, widths = _tuned(case, preset, page["parameters"]), (26, 18, 12, 8, 14)
-    return [Table(rows, heads, heading="What is tuned", widths=widths), Text(lines, gap=True)]
+    return [_tuned(case, preset, page["parameters"]), Text(lines, gap=True)]
+
+
+def _measures(loop):
+    """The table of what is measured of a run."""
+    rows = []
+    for m in of_loop(loop):
+        spec = MEASURES[m]
+        per = "" if spec.per == "run" else spec.per
+        rows.append([m, measure_unit(m, loop.units), per, spec.doc])
+    heads = ["measure", "unit", "of each", "what it is"]
+    return Table(rows, heads, heading="What is measured", widths=(22, 9, 8))
 
 
 def _paper(case, preset, page):
     """What the paper prints, what is uncertain, and departures from the paper."""
-    sections = []
+    sections: list[Any] = []
     if preset and preset.published:
-        heading = f"What the paper prints (`jaxtank compare {preset.paper}` measures it again)"
-        rows = _published(preset, page["parameters"])
-        heads = ["published", "value", "here", "where"]
-        sections.append(Table(rows, heads, heading=heading, widths=(34, 22, 16)))
+        sections.append(_published(preset, page["parameters"]))
     if preset and (preset.uncertain or case.uncertain):
         uncertain = preset.uncertain.items()
         words = [f"{n}, +-{100 * share:g} %: {why}" for n, (share, why) in uncertain]
@@ -198,11 +191,11 @@ def _class_of(controller):
 
 
 def _tuned(case, preset, parameters):
-    """What the case tunes, then what else could be: value, published, unit, range, what it is."""
-    ranges, rows = dict(case.free), []
-    for name, spec in (preset.tunable if preset else {}).items():
-        if name in parameters:
-            ranges.setdefault(name, spec)
+    """The table of what the case tunes, then of what else could be."""
+    others = preset.tunable if preset else {}
+    ranges = {n: spec for n, spec in others.items() if n in parameters and n not in case.free}
+    ranges = {**case.free, **ranges}
+    rows = []
     for name, spec in ranges.items():
         free, parameter = Free(*spec), parameters.get(name.split("[")[0])
         if parameter is None or parameter["value"] is None:
@@ -211,34 +204,40 @@ def _tuned(case, preset, parameters):
         printed = "" if published is None else _plain(published.value)
         about = parameter["about"] + ("" if name in case.free else " (not by this case)")
         span = f"{free.low:g} : {free.high:g}"
-        value = _shown(parameter["value"], False)
+        value = _value(parameter["value"], False)
         rows.append([name, value, printed, parameter["unit"], span, about])
-    return rows or [["none", "", "", "", "", ""]]
+    heads, widths = ["parameter", "value", "published", "unit", "range"], (26, 18, 12, 8, 14)
+    rows = rows or [["none", "", "", "", "", ""]]
+    return Table(rows, [*heads, "what it is"], heading="What is tuned", widths=widths)
 
 
 def _every(page):
+    """The table of every parameter."""
     rows = []
     for name, p in page["parameters"].items():
         # topology is in the equations, and a rig without pipes has none to set
         hidden = isinstance(p["value"], (list, tuple)) and (p["static"] or not p["value"])
         if not hidden and not name.startswith(MODELS):
             span = f"{p['low']:g} : {p['high']:g}" if p["low"] is not None else ""
-            value = _shown(p["value"], p["static"])
+            value = _value(p["value"], p["static"])
             rows.append([name + "*" * p["static"], value, p["unit"], span, p["about"]])
-    return rows
+    heads = ["parameter", "value", "unit", "tunable in", "what it is"]
+    return Table(rows, heads, heading="Every parameter", widths=(30, 18, 11, 13))
 
 
 def _published(preset, parameters):
-    """What the paper prints, and beside it what this case has where it is a parameter."""
+    """The table of what the paper prints, and what this case has where it is a parameter."""
     rows = []
     for name, p in preset.published.items():
         parameter, value = parameters.get(name), ""
         if parameter is not None and parameter["value"] is not None:
             value = parameter["value"]
-            value = str(value if parameter["static"] else _shown(value, False)) or str(value)
+            value = str(value if parameter["static"] else Value(value, 6, between=" ")) or value
         printed = f"{_plain(p.value)} {p.unit if p.unit != '-' else ''}".strip()
         rows.append([name, printed, value, p.where + (f"; {p.reason}" if p.reason else "")])
-    return rows
+    heading = f"What the paper prints (`jaxtank compare {preset.paper}` measures it again)"
+    heads = ["published", "value", "here", "where"]
+    return Table(rows, heads, heading=heading, widths=(34, 22, 16))
 
 
 def _plain(value):
@@ -248,7 +247,7 @@ def _plain(value):
     return str(Value(value, 6)) if number else str(value)
 
 
-def _shown(value, is_static):
+def _value(value, is_static):
     if value is None:
         return "not in use"
     if is_static:
@@ -256,7 +255,7 @@ def _shown(value, is_static):
     return Value(value, 6, between=" ")
 
 
-def _own_name(case, kind, i):
+def _name_in_file(case, kind, i):
     """Return " (left)" for the tank or pump `i` that its rig file calls left, else ""."""
     name = case.names.get(kind, {i: ""})[i]
     return f" ({name})" if name else ""
@@ -315,21 +314,22 @@ def _signals(loop):
         levels = ", ".join(f"{float(v):g}" for v in signal.level)
         words = f"Constant inflow disturbance: {levels} {length}^3/s, by tank."
     elif isinstance(signal, InflowPulses):
-        each = (
+        pulses = (
             f"{float(v):g} {length}^3 into tank {tank + 1} at {t:g} s over {s:g} s"
             for (t, s, tank), v in zip(signal.events, signal.volume)
         )
-        words = f"Inflow disturbance: {'; '.join(each)}."
+        words = f"Inflow disturbance: {'; '.join(pulses)}."
     else:
         words = f"Disturbance: {type(signal).__name__}."
     sentences = [_reference(loop.reference, length), words]
     if loop.faults is not None:
-        each = (
+        windows = zip(loop.faults.windows, loop.faults.factor, loop.faults.extra)
+        faults = (
             f"plant.{n} times {float(f):g}{f' plus {float(e):g}' if float(e) else ''} from {a:g} to"
             f" {b:g} s"
-            for (n, a, b), f, e in zip(loop.faults.windows, loop.faults.factor, loop.faults.extra)
+            for (n, a, b), f, e in windows
         )
-        sentences.append(f"Faults, unknown to the controller: {'; '.join(each)}.")
+        sentences.append(f"Faults, unknown to the controller: {'; '.join(faults)}.")
     return sentences
 
 

@@ -76,11 +76,6 @@ def terminal(report: Report) -> str:
     return "\n".join(lines)
 
 
-def figures_of(drawn: Mapping[str, Any], captions: Mapping[str, str]) -> list[Figure]:
-    """Return the Figures of {name: matplotlib figure}."""
-    return [Figure(name, captions[name], drawing) for name, drawing in drawn.items()]
-
-
 def failed(name: str, error: Exception, *drawings: Any) -> None:
     """Report on stderr that the picture `name` could not be drawn, and close its figures."""
     import matplotlib.pyplot as plt

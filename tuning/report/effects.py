@@ -2,18 +2,18 @@
 
 import csv
 import dataclasses
-import functools
 import io
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxtank.core.tree import describe, get_value
 from tuning.problem import provenance
 from tuning.problem.wording import count
-from tuning.report.document import Report, Text, figures_of
+from tuning.report.document import Report, Text
 from tuning.report.folder import earlier
 from tuning.report.folder import save as save_all
-from tuning.report.tables import Table, Value, clean, number
+from tuning.report.tables import Table, Value, clean, fields, number
 from tuning.report.uncertainty import in_words
 from tuning.uncertainty.distributions import Correlated, Normal
 from tuning.uncertainty.sensitivity_study import NORMAL_WIDTH
@@ -21,54 +21,55 @@ from tuning.uncertainty.sensitivity_study import NORMAL_WIDTH
 PANELS = 12
 """Measures in the picture."""
 
-SHOWN = 8
+LISTED = 8
 """Parameters in the table of a measure."""
 
 WIDE = 0.2
 """Width of an interval of a share of the variance above which more samples are advised [-]."""
 
-HEADS = {
-    "local": {"effect": "effect", "derivative": "derivative", "elasticity": "% per %"},
-    "morris": {
-        "mu_star": "mu*",
-        "mu_star_interval95": "95 % interval",
-        "mu": "mu",
-        "sigma": "sigma",
-    },
-    "sobol": {
-        "first": "first",
-        "first_interval95": "95 % interval",
-        "total": "total",
-        "total_interval95": "95 % interval",
-    },
-}
-TITLES = {
-    "local": "change of each measure for the half-width of each parameter, by derivatives",
-    "morris": "elementary effects of each parameter on each measure (Morris)",
-    "sobol": "shares of the variance of each measure (Sobol)",
-}
-WORDS = {
-    "local": (
+
+class Method(NamedTuple):
+    """How the results of a method are reported; heads: {quantity: column of its table}."""
+
+    title: str
+    words: str
+    heads: dict[str, str]
+    left_out: str = ""
+    samples: str = ""
+
+
+METHODS = {
+    "local": Method(
+        "change of each measure for the half-width of each parameter, by derivatives",
         "effect: derivative at the case's own values times the half-width of the distribution"
         f" (half its range; {NORMAL_WIDTH:g} standard deviations of a normal one); tied entries"
         " have one effect together and no derivative each; there is no percentage of a measure that"
         " is 0; where a measure is not differentiable (total variation of a constant input, a"
-        " maximum reached twice) the derivative is one-sided"
+        " maximum reached twice) the derivative is one-sided",
+        {"effect": "effect", "derivative": "derivative", "elasticity": "% per %"},
     ),
-    "morris": (
+    "morris": Method(
+        "elementary effects of each parameter on each measure (Morris)",
         "mu: mean change of the measure over the whole range of the parameter, at random values of"
         " the others; mu*: mean size of it; sigma: its standard deviation (large where it interacts"
-        " or the response is curved); intervals of Student"
+        " or the response is curved); intervals of Student",
+        {"mu_star": "mu*", "mu_star_interval95": "95 % interval", "mu": "mu", "sigma": "sigma"},
+        "steps that begin or end there are left out",
+        "trajectories",
     ),
-    "sobol": (
+    "sobol": Method(
+        "shares of the variance of each measure (Sobol)",
         "first: share of the variance that the parameter has alone; total: with all its"
-        " interactions; intervals by bootstrap"
+        " interactions; intervals by bootstrap",
+        {
+            "first": "first",
+            "first_interval95": "95 % interval",
+            "total": "total",
+            "total_interval95": "95 % interval",
+        },
+        "their base points are left out, so shares are those among the others",
+        "base points",
     ),
-}
-LEFT_OUT = {
-    "local": "",
-    "morris": "steps that begin or end there are left out",
-    "sobol": "their base points are left out, so shares are those among the others",
 }
 
 
@@ -82,96 +83,66 @@ def derivative_unit(result, c, name):
     return per(c.unit, describe(result.case.loop, name)["unit"])
 
 
-def _heads(method, unit):
-    """Headings of the table of a measure in `unit`: what is in that unit says so."""
-    shares = {"elasticity", "derivative"} if method == "local" else set(HEADS["sobol"])
-    return [head if q in shares else f"{head} [{unit}]" for q, head in HEADS[method].items()]
-
-
 def notes_of(result):
     """Return sentences on the numbers: what they are, what was left out, where samples are few."""
-    found = [WORDS[result.method], *result.notes]
+    method, columns = METHODS[result.method], result.columns
+    notes = [method.words, *result.notes]
     if result.failed:
-        found.append(f"{result.failed} of {count(result.runs, 'run')} diverged")
-    if result.method != "local":
-        found += _left_out(result)
-    else:
-        reasons = dict.fromkeys(c.reason for c in result.columns if c.reason)
-        found += [f"-: {reason}" for reason in reasons]
+        notes.append(f"{result.failed} of {count(result.runs, 'run')} diverged")
+    if result.method == "local":
+        return notes + [f"-: {why}" for why in dict.fromkeys(c.reason for c in columns) if why]
+    if bad := [f"{c.label} {c.not_finite}" for c in columns if c.not_finite]:
+        listed = ", ".join(bad)
+        notes.append(f"runs in which a measure is not finite: {listed}; {method.left_out}")
+        if short := [c.label for c in columns if not c.empty and c.reason]:
+            notes.append(f"too few finite steps for some parameters: {', '.join(short)}")
     if result.method == "sobol":
-        found += _precision(result)
-    return found
+        fewest = min((c.effects["kept"] for c in columns), default=result.samples)
+        if fewest < result.samples:
+            where = "base points used, at the measure with fewest"
+            notes.append(f"{where}: {fewest} of {result.samples}")
+        intervals = [c.effects["total_interval95"] for c in columns if not c.empty]
+        widest = max((np.ptp(v, axis=1).max() for v in intervals), default=0.0)
+        if widest > WIDE:
+            words = f"the widest interval of a total share is {widest:.2g}"
+            notes.append(f"{words}: more --samples narrow it")
+    return notes
 
 
-def _left_out(result):
-    """Sentences on runs in which a measure is not finite."""
-    bad = [f"{c.label} {c.not_finite}" for c in result.columns if c.not_finite]
-    if not bad:
-        return []
-    listed = ", ".join(bad)
-    found = [f"runs in which a measure is not finite: {listed}; {LEFT_OUT[result.method]}"]
-    short = [c.label for c in result.columns if not c.empty and c.reason]
-    if short:
-        found.append(f"too few finite steps for some parameters: {', '.join(short)}")
-    return found
-
-
-def _precision(result):
-    """Sentences on the base points of Sobol's method and the widest interval."""
-    found = []
-    fewest = min((c.effects["kept"] for c in result.columns), default=result.samples)
-    if fewest < result.samples:
-        found.append(f"base points used, at the measure with fewest: {fewest} of {result.samples}")
-    intervals = [c.effects["total_interval95"] for c in result.columns if not c.empty]
-    widest = max((np.ptp(v, axis=1).max() for v in intervals), default=0.0)
-    if widest > WIDE:
-        found.append(
-            f"the widest interval of a total share is {widest:.2g}: more --samples narrow it"
-        )
-    return found
-
-
-def report(result, drawn=None):
+def report(result):
     """Return the Report of a SensitivityResult."""
     varied = ", ".join(f"{n} {in_words(d)}" for n, d in result.distributions.items())
+    samples, runs = METHODS[result.method].samples, count(result.runs, "run")
+    samples = f", {result.samples} {samples}" if samples else ""
+    derivatives = " with derivatives" if result.method == "local" else ""
+    head = (
+        f"{result.case.name}: sensitivity, {result.method}{samples}, {runs}{derivatives},"
+        f" {result.failed} not finite, seed {result.seed}, {result.wall_s:.1f} s"
+    )
     facts = [
+        (f"{c.label} is most sensitive to", result.parameters[result.order(c)[0]])
+        for c in result.columns
+        if not c.empty
+    ]
+    facts = [
+        *facts[:1],
         ("parameters", len(result.parameters)),
         ("runs", result.runs),
         ("time", f"{result.wall_s:.1f} s"),
     ]
-    first = next((c for c in result.columns if not c.empty), None)
-    if first is not None:
-        most = result.parameters[result.order(first)[0]]
-        facts.insert(0, (f"{first.label} is most sensitive to", most))
     diverged = f"{count(result.failed, 'run')} diverged"
-    title = TITLES[result.method]
-    captions = dict.fromkeys(drawn or {}, f"{title[0].upper()}{title[1:]}.")
     return Report(
         f"{result.case.name}: sensitivity",
         f"{result.method}: {diverged if result.failed else 'every run is finite'}",
         facts,
         [
-            Text([_headline(result)], on="terminal"),
+            Text([head], on="terminal"),
             Text([f"varied: {varied}"]),
             *(section for c in result.columns for section in _column(result, c)),
             Text(notes_of(result), items=True, gap=True),
-            *figures_of(drawn or {}, captions),
         ],
         not result.failed,
         result.case.title,
-    )
-
-
-def _headline(result):
-    """The case, the method, and what it took."""
-    samples = ""
-    if result.samples is not None:
-        kind = "trajectories" if result.method == "morris" else "base points"
-        samples = f", {result.samples} {kind}"
-    runs = count(result.runs, "run") + (" with derivatives" if result.method == "local" else "")
-    return (
-        f"{result.case.name}: sensitivity, {result.method}{samples}, {runs}, {result.failed} not"
-        f" finite, seed {result.seed}, {result.wall_s:.1f} s"
     )
 
 
@@ -180,22 +151,23 @@ def _column(result, c):
     title = f"{c.label} [{c.unit}], {number(c.nominal)} in the case's own run"
     if c.empty:
         return [Text([f"{title}: no indices, {c.reason}"], gap=True)]
-    rows = [[result.parameters[i], *_cells(result, c, i)] for i in result.order(c)[:SHOWN]]
+    rows = [[result.parameters[i], *_cells(result, c, i)] for i in result.order(c)[:LISTED]]
     notes, more = [], len(result.parameters) - len(rows)
     if more > 0:
         notes.append(f"and {count(more, 'more parameter')}, each of less influence")
+    shares = {"elasticity", "derivative"}  # quantities that are not in the unit of the measure
     if result.method == "sobol":
-        total = np.sum(c.effects["first"])
+        total, shares = np.sum(c.effects["first"]), {*METHODS["sobol"].heads}
         notes.append(f"first-order shares sum to {total:.3f} (1 without interactions)")
-    heads = ["parameter", *_heads(result.method, c.unit)]
-    return [Text([title], gap=True), Table(rows, heads), Text(notes)]
+    heads = METHODS[result.method].heads.items()
+    heads = [head if q in shares else f"{head} [{c.unit}]" for q, head in heads]
+    return [Text([title], gap=True), Table(rows, ["parameter", *heads]), Text(notes)]
 
 
 def _cells(result, c, i):
     """The cells of parameter `i`; a derivative with its unit, which differs from row to row."""
-    unit = derivative_unit(result, c, result.parameters[i])
-    units = {"derivative": unit} if result.method == "local" else {}
-    effects = {q: c.effects[q][i] for q in HEADS[result.method]}
+    units = {"derivative": derivative_unit(result, c, result.parameters[i])}
+    effects = {q: c.effects[q][i] for q in METHODS[result.method].heads}
     return [
         Value(v, 3, between=" : ") if np.ndim(v) else Value(v, 4, units.get(q, ""))
         for q, v in effects.items()
@@ -204,112 +176,89 @@ def _cells(result, c, i):
 
 def json_of(result):
     """Return the JSON object of `jaxtank sensitivity --json`."""
+    distributions = {}
+    for name, d in result.distributions.items():
+        known = {k: v for k, v in dataclasses.asdict(d).items() if v is not None}
+        distributions[name] = {"kind": type(d).__name__, **known}
     return {
         "case": result.case.name,
-        "method": result.method,
-        "samples": result.samples,
-        "runs": result.runs,
-        "failed": result.failed,
-        "distributions": {
-            n: {
-                "kind": type(d).__name__,
-                **{k: v for k, v in dataclasses.asdict(d).items() if v is not None},
-            }
-            for n, d in result.distributions.items()
-        },
+        **fields(result, "method samples runs failed wall_s"),
+        "distributions": distributions,
         "parameters": {n: _parameter_json(result, n) for n in result.parameters},
         "measures": {c.label: _column_json(result, c) for c in result.columns},
         "notes": notes_of(result),
-        "wall_s": result.wall_s,
         "provenance": provenance.provenance(result.case, result.seed),
     }
 
 
 def _parameter_json(result, name):
-    found = {
-        "value": clean(np.asarray(get_value(result.case.loop, name))),
-        "unit": describe(result.case.loop, name)["unit"],
-    }
+    value, unit = get_value(result.case.loop, name), describe(result.case.loop, name)["unit"]
+    row = {"value": clean(np.asarray(value)), "unit": unit}
     if result.half_width:
-        words = _width_in_words(result, name)
-        found |= {"half_width": result.half_width[name], "half_width_is": words}
-    return found
+        row |= {"half_width": result.half_width[name], "half_width_is": _width(result, name)}
+    return row
 
 
-def _width_in_words(result, label):
+def _width(result, label):
+    """What the half-width of a parameter is, in words."""
     for name, d in result.distributions.items():
         if label in getattr(d, "names", (name,)) or label.split("[")[0] == name:
-            normal = isinstance(d, (Normal, Correlated))
-            width = f"{min(NORMAL_WIDTH, d.cut):g} standard deviations" if normal else ""
-            return width or "half the range"
+            if isinstance(d, (Normal, Correlated)):
+                return f"{min(NORMAL_WIDTH, d.cut):g} standard deviations"
+            return "half the range"
     return ""
 
 
 def _column_json(result, c):
-    extra, rows = {}, {}
+    entry, rows = {**fields(c, "measure unit nominal not_finite"), "reason": c.reason or None}, {}
     if result.method == "sobol":
-        extra = {
-            "sd": clean(float(c.effects["sd"])),
-            "sum_of_first": clean(float(np.sum(c.effects["first"]))),
-            "base_points_used": int(c.effects["kept"]),
-        }
+        entry |= {"sd": clean(float(c.effects["sd"])), "base_points_used": int(c.effects["kept"])}
+        entry["sum_of_first"] = clean(float(np.sum(c.effects["first"])))
     for i in result.order(c):
         name = result.parameters[i]
-        rows[name] = row = {q: clean(c.effects[q][i]) for q in HEADS[result.method]}
+        rows[name] = row = {q: clean(c.effects[q][i]) for q in METHODS[result.method].heads}
         if result.method == "local":
             row["derivative_unit"] = derivative_unit(result, c, name)
         if result.method == "morris":
             row["mu_interval95"] = clean(c.effects["mu_interval95"][i])
             row["effects_used"] = int(c.effects["kept"][i])
-    return {
-        "measure": c.measure,
-        "unit": c.unit,
-        "nominal": clean(c.nominal),
-        "not_finite": c.not_finite,
-        "reason": c.reason or None,
-        **extra,
-        "parameters": rows,
-    }
+    return {**entry, "parameters": rows}
 
 
 def figures(result):
     """Return {"tornado" or "sobol": Figure} with a panel for each measure, at most PANELS."""
-    from jaxtank.plots import responses as plotting
+    from jaxtank.plots import responses as plots
 
-    shown = [c for c in result.columns if not c.empty][:PANELS]
-    if not shown:
+    columns = [c for c in result.columns if not c.empty][:PANELS]
+    if not columns:
         return {}
-    draws = [functools.partial(_panel, plotting, result, c) for c in shown]
+
+    def panel(ax, c):
+        order, title = result.order(c), f"{c.label} ({number(c.nominal, 4)} {c.unit})"
+        names = [result.parameters[i] for i in order]
+        effects = {q: np.asarray(c.effects[q])[order] for q in METHODS[result.method].heads}
+        if result.method == "local":
+            return plots.tornado(ax, names, effects["effect"], c.unit, title)
+        if result.method == "morris":
+            size, ends, spread = (effects[q] for q in ("mu_star", "mu_star_interval95", "sigma"))
+            return plots.elementary(ax, names, size, ends, spread, c.unit, title)
+        first, total = ((effects[q], effects[f"{q}_interval95"]) for q in ("first", "total"))
+        return plots.shares(ax, names, first, total, title)
+
     name = "sobol" if result.method == "sobol" else "tornado"
-    rows = min(len(result.parameters), plotting.BARS)
-    title = f"{result.case.name}: {TITLES[result.method]}"
-    return {name: plotting.panels(draws, title, rows)}
-
-
-def _panel(plotting, result, c, ax):
-    """Draw the sensitivities of one Column."""
-    order, method, unit = result.order(c), result.method, c.unit
-    names = [result.parameters[i] for i in order]
-    effects = {q: np.asarray(c.effects[q])[order] for q in HEADS[method]}
-    title = f"{c.label} ({number(c.nominal, 4)} {unit})"
-    if method == "local":
-        return plotting.tornado(ax, names, effects["effect"], unit, title)
-    if method == "morris":
-        size, spread = effects["mu_star"], effects["sigma"]
-        interval = effects["mu_star_interval95"]
-        return plotting.elementary(ax, names, size, interval, spread, unit, title)
-    shares = [effects[q] for q in ("first", "total", "first_interval95", "total_interval95")]
-    return plotting.shares(ax, names, *shares, title)
+    rows = min(len(result.parameters), plots.BARS)
+    title = f"{result.case.name}: {METHODS[result.method].title}"
+    draws = [lambda ax, c=c: panel(ax, c) for c in columns]
+    return {name: plots.panels(draws, title, rows)}
 
 
 def table_csv(result):
     """Return every measure and parameter as CSV, one row each; empty where there is no number."""
-    quantities, heads = list(HEADS[result.method]), []
+    quantities, heads = list(METHODS[result.method].heads), []
     for q in quantities:
-        ends = ("low", "high") if "interval95" in q else ()
-        heads += [q.replace("interval95", end) for end in ends] or [q]
-    local = ["derivative unit"] if result.method == "local" else []
-    out = io.StringIO()
+        ends = ("low", "high") if "interval95" in q else ("interval95",)
+        heads += [q.replace("interval95", end) for end in ends]
+    local, out = ["derivative unit"] if result.method == "local" else [], io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(["measure", "unit", "parameter", "parameter unit", "rank", *heads, *local])
     for c in result.columns:
@@ -325,6 +274,11 @@ def table_csv(result):
 
 def save(result, folder, command=None):
     """Write result.json, sensitivity.csv, tornado.png or sobol.png, and report.html to `folder`."""
-    files, stale = {"sensitivity.csv": table_csv(result)}, earlier(folder, ["tornado", "sobol"])
-    draw, page = lambda: figures(result), lambda drawn: report(result, drawn)
-    return save_all(folder, json_of(result), files, draw, page, command, stale)
+    files, names, title = (
+        {"sensitivity.csv": table_csv(result)},
+        ["tornado", "sobol"],
+        METHODS[result.method].title,
+    )
+    captions = dict.fromkeys(names, f"{title[0].upper()}{title[1:]}.")
+    draw, page, stale = lambda: figures(result), lambda: report(result), earlier(folder, names)
+    return save_all(folder, json_of(result), files, draw, page, captions, command, stale)

@@ -7,18 +7,17 @@ import numpy as np
 
 from jaxtank import rig as rigs
 from jaxtank.core.tree import describe, get_value
-from jaxtank.core.units import local
 from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv
 from jaxtank.safety.checker import CASE
 from tuning.problem import provenance
 from tuning.problem.wording import count, numbered
-from tuning.report.document import Report, Text, figures_of
+from tuning.report.document import Report, Text
 from tuning.report.folder import earlier, rig_text
 from tuning.report.folder import save as save_all
 from tuning.report.safety import start_of
 from tuning.report.simulated import run_for_people
-from tuning.report.tables import Table, Value, clean
+from tuning.report.tables import Table, Value, clean, fields
 
 REPRODUCED = 1e-9
 """Share of a level to which the rig file must give it again."""
@@ -28,11 +27,16 @@ CAPTIONS = {
     "ascent": "The highest level of each tank after each step of the ascent, over its limit.",
 }
 
-
 BOUND = (
     "What an attack finds is a lower bound of the worst: a limit that is not passed here may be"
     " passed by a plant that was not tried, unless it is proved (jaxtank show)."
 )
+
+PUMPS = {
+    "own": "the case's controller",
+    "full": "pumps at full command",
+    "random": "pumps that switch",
+}
 
 
 def json_of(attack):
@@ -41,106 +45,91 @@ def json_of(attack):
     return {
         "case": case.name,
         "passed": bool(attack.passed),
-        "worst": [_row(attack, one) for one in attack.found],
+        "worst": [_row(attack, tank) for tank in attack.found],
         "unit": case.loop.units[0],
         "safety_filter": case.loop.safety_filter is not None,
         "coefficients": {
-            c.name: {"nominal": c.nominal, "low": c.low, "high": c.high, "varies": c.varies}
-            for c in attacked.coefficients
+            c.name: fields(c, "nominal low high varies") for c in attacked.coefficients
         },
-        "windows": attacked.windows,
+        **fields(attacked, "windows pumps start"),
         "reading_band": clean(attacked.band),
-        "pumps": attacked.pumps,
-        "start": attacked.start,
-        "starts": attack.starts,
-        "draws": attack.draws,
-        "history": clean(attack.history),
+        **fields(attack, "starts draws history wall_s"),
         "remarks": remarks_of(attack),
-        "wall_s": attack.wall_s,
         "provenance": provenance.provenance(case, attack.seed),
     }
 
 
-def _row(attack, one):
+def _row(attack, tank):
     """The JSON object of one tank."""
-    return clean(
-        {
-            "tank": one.tank + 1,
-            "level": one.level,
-            "limit": one.limit,
-            "time_s": one.time_s,
-            "parameters": attack.parameters(one),
-            "margin": one.margin,
-            "passed": one.passed,
-            "certified": one.certified,
-            "why": one.reason or None,
-            "starts": one.starts or None,
-            "nominal": one.nominal,
-            "drawn": one.drawn,
-            "rise_between_samples": one.rise,
-        }
-    )
+    return {
+        "tank": tank.tank + 1,
+        **fields(tank, "level limit time_s margin passed certified nominal drawn"),
+        "parameters": clean(attack.parameters(tank)),
+        "why": tank.reason or None,
+        "starts": tank.starts or None,
+        "rise_between_samples": clean(tank.rise),
+    }
 
 
 def remarks_of(attack):
     """Return sentences that the figures need."""
-    unit = attack.case.loop.units[0]
-    found, rises = [], [one.rise for one in attack.found if np.isfinite(one.rise)]
+    unit, attacked = attack.case.loop.units[0], attack.attacked
+    remarks, rises = [], [tank.rise for tank in attack.found if np.isfinite(tank.rise)]
     if rises:
-        found.append(
+        remarks.append(
             f"Levels are those at the samples; between two samples a level can rise by at most"
             f" {max(rises):.3g} {unit} (b_max u_max dt, and what flows in from other tanks)."
         )
-    if attack.attacked.physical_rims:
-        found.append(
-            "The rims of this rig are physics: no level passes them, and the rest overflows. The"
-            " attack is on the same rig without overflow, whose levels show what would overflow."
+    if attacked.physical_rims:
+        remarks.append(
+            "Overflow is simulated in this rig: no level passes a rim. The attack is on the same"
+            " rig without overflow, whose levels show what would overflow."
         )
-    if beyond := [one.tank + 1 for one in attack.found if _starts_elsewhere(attack, one)]:
-        found.append(
+    if beyond := [tank.tank + 1 for tank in attack.found if _starts_elsewhere(attack, tank)]:
+        remarks.append(
             f"Proved {start_of([CASE])} only: {numbered('tank', beyond)}. This attack starts"
             " anywhere below the limits; --start own keeps to the case's start."
         )
     if outside := _outside(attack):
-        found.append(
+        remarks.append(
             f"The intervals of {', '.join(outside)} are wider than those that the safety filter"
             " was designed for: nothing is proved there."
         )
-    guard = attack.case.loop.safety_filter
-    if guard is not None and np.any(attack.attacked.band > np.asarray(guard.band) * (1.0 + 1e-12)):
-        bands = (attack.attacked.band, np.asarray(guard.band))
-        wide, band = (", ".join(f"{v:.3g}" for v in values) for values in bands)
-        found.append(
-            f"Readings may be off by ({wide}) {unit}, more than the band ({band}) {unit} of the"
-            " safety filter: nothing is proved of such readings."
-        )
-    return [*found, BOUND]
+    safety_filter = attack.case.loop.safety_filter
+    if safety_filter is not None:
+        bands = (attacked.band, np.asarray(safety_filter.band))
+        if np.any(bands[0] > bands[1] * (1.0 + 1e-12)):
+            wide, band = (", ".join(f"{v:.3g}" for v in values) for values in bands)
+            remarks.append(
+                f"Readings may be off by ({wide}) {unit}, more than the band ({band}) {unit} of the"
+                " safety filter: nothing is proved of such readings."
+            )
+    return [*remarks, BOUND]
 
 
-def _starts_elsewhere(attack, one):
+def _starts_elsewhere(attack, tank):
     """Whether a limit is proved from the case's start only, and the attack has others."""
-    return one.starts == CASE and attack.attacked.start == "any"
+    return tank.starts == CASE and attack.attacked.start == "any"
 
 
 def _outside(attack):
     """Names of coefficients of the plant whose interval reaches beyond the filter's box."""
-    guard = attack.case.loop.safety_filter
-    if guard is None:
-        return []
-    found = []
+    safety_filter, names = attack.case.loop.safety_filter, []
+    if safety_filter is None:
+        return names
     for c in attack.attacked.coefficients:
         if c.name.startswith("plant."):
-            name = c.name.removeprefix("plant.")
-            least, most = (float(get_value(p, name)) for p in (guard.least, guard.most))
-            slack = 1e-12 * abs(c.nominal)
+            name, slack = c.name.removeprefix("plant."), 1e-12 * abs(c.nominal)
+            box = (safety_filter.least, safety_filter.most)
+            least, most = (float(get_value(plant, name)) for plant in box)
             if c.low < least - slack or c.high > most + slack:
-                found.append(c.name)
-    return found
+                names.append(c.name)
+    return names
 
 
-def report(attack, drawn=None):
+def report(attack):
     """Return the Report of an Attack."""
-    worst, case = attack.worst, attack.case
+    worst, case, unit = attack.worst, attack.case, attack.case.loop.units[0]
     head = (
         f"{case.name}: attack from {count(attack.draws, 'draw')}, ascent of"
         f" {count(attack.starts, 'start')} for each tank in {len(attack.history) - 1} steps (seed"
@@ -156,22 +145,18 @@ def report(attack, drawn=None):
         f"{case.name}: attack",
         verdict(attack),
         [
-            ("highest level", f"{worst.level:.5g} {case.loop.units[0]} (tank {worst.tank + 1})"),
-            ("its limit", Value(worst.limit, unit=case.loop.units[0])),
+            ("highest level", f"{worst.level:.5g} {unit} (tank {worst.tank + 1})"),
+            ("its limit", Value(worst.limit, unit=unit)),
             ("time", f"{attack.wall_s:.1f} s"),
         ],
         [
             Text([head, *_scope(attack)]),
             _levels(attack),
             Text([verdict(attack)], gap=True),
-            Text(
-                [f"The run with the smallest margin to its limit, in tank {worst.tank + 1}:"],
-                gap=True,
-            ),
+            Text([f"The run with the least margin to a limit, tank {worst.tank + 1}:"], gap=True),
             _parameters(attack, worst),
             Text(options, gap=True),
             Text(remarks_of(attack), items=True, gap=True),
-            *figures_of(drawn or {}, CAPTIONS),
         ],
         not attack.passed,
         case.title,
@@ -185,24 +170,19 @@ def _scope(attack):
     words = [f"{count(len(attacked.coefficients), 'coefficient')} in their intervals"]
     if attacked.windows > 1 and varying:
         words.append(
-            f"{varying} of them with a value of its own in each of {attacked.windows} windows of"
+            f"{varying} of them with a separate value in each of {attacked.windows} windows of"
             f" {(clock.duration + clock.dt) / attacked.windows:.4g} s"
         )
-    kept = "any start up to the limits"
-    if loop.safety_filter is not None:
-        kept = "any start from which the filter can keep the limits"
-    words.append(kept if attacked.start == "any" else "the case's start")
+    safe = loop.safety_filter is not None
+    limits = "any start from which the filter can keep the limits"
+    start = limits if safe else "any start up to the limits"
+    words.append(start if attacked.start == "any" else "the case's start")
     if "bias" in attacked.shapes:
         band = ", ".join(f"{b:.3g}" for b in attacked.band)
         kind = "at each sample" if "noise" in attacked.shapes else "constant"
         words.append(f"reading errors ({kind}) within +-({band}) {loop.units[0]}")
-    pumps = {
-        "own": "the case's controller",
-        "full": "pumps at full command",
-        "random": "pumps that switch",
-    }[attacked.pumps]
-    guard = "with the safety filter" if loop.safety_filter is not None else "no safety filter"
-    return [f"over: {', '.join(words)}", f"commands: {pumps}, {guard}"]
+    filtered = "with the safety filter" if safe else "no safety filter"
+    return [f"over: {', '.join(words)}", f"commands: {PUMPS[attacked.pumps]}, {filtered}"]
 
 
 def _levels(attack):
@@ -210,112 +190,112 @@ def _levels(attack):
     unit, proved = attack.case.loop.units[0], {None: "-", True: "yes", False: "no"}
     rows = [
         [
-            one.tank + 1,
-            Value(one.limit, 6),
-            proved[one.certified],
-            *(Value(v, 6) for v in (one.nominal, one.drawn, one.level)),
-            Value(one.margin, 3),
-            Value(one.time_s),
-            "passed" if one.passed else "holds",
+            tank.tank + 1,
+            Value(tank.limit, 6),
+            proved[tank.certified],
+            *(Value(v, 6) for v in (tank.nominal, tank.drawn, tank.level)),
+            Value(tank.margin, 3),
+            Value(tank.time_s),
+            "passed" if tank.passed else "holds",
         ]
-        for one in attack.found
+        for tank in attack.found
     ]
-    heads = ["tank", f"limit [{unit}]", "proved", f"nominal [{unit}]", f"draws [{unit}]"]
-    heads += [f"highest [{unit}]", f"margin [{unit}]", "at [s]", ""]
-    return Table(rows, heads, gap=True)
+    levels = [f"{name} [{unit}]" for name in ("nominal", "draws", "highest", "margin")]
+    return Table(rows, ["tank", f"limit [{unit}]", "proved", *levels, "at [s]", ""], gap=True)
 
 
 def verdict(attack):
     """Return one sentence on the limits."""
-    unit = attack.case.loop.units[0]
     if not attack.passed:
         return "No limit was passed."
-    words = ", ".join(
-        f"tank {one.tank + 1} by {-one.margin:.3g} {unit}"
-        + (f" ({one.reason})" if one.certified is False else "")
-        + (f" (proved {start_of([CASE])} only)" if _starts_elsewhere(attack, one) else "")
-        for one in attack.passed
-    )
-    return f"Limits are passed: {words}."
+    words = []
+    for tank in attack.passed:
+        words.append(f"tank {tank.tank + 1} by {-tank.margin:.3g} {attack.case.loop.units[0]}")
+        if tank.certified is False:
+            words[-1] += f" ({tank.reason})"
+        if _starts_elsewhere(attack, tank):
+            words[-1] += f" (proved {start_of([CASE])} only)"
+    return f"Limits are passed: {', '.join(words)}."
 
 
-def _parameters(attack, one):
+def _parameters(attack, tank):
     """The table of the coefficients, start and mean reading errors of one run."""
-    attacked, loop, rows = attack.attacked, attack.case.loop, []
+    attacked, loop, length = attack.attacked, attack.case.loop, attack.case.loop.units[0]
     entries = {}  # {name: (nominal, ends, unit)}
     for i, (start, top, band) in enumerate(zip(loop.x0, attacked.ceiling, attacked.band)):
         ends = None if attacked.start == "own" else (0.0, top)
-        entries[f"x0[{i}]"] = (float(start), ends, local("cm", loop.units))
-        entries[f"sensor.offset[{i}]"] = (0.0, (-band, band), local("cm", loop.units))
+        entries[f"x0[{i}]"] = (float(start), ends, length)
+        entries[f"sensor.offset[{i}]"] = (0.0, (-band, band), length)
     for c in attacked.coefficients:
         unit = describe(attacked.original.loop, c.name)["unit"]
         entries[c.name] = (c.nominal, (c.low, c.high), unit)
-    for name, value in attack.parameters(one).items():
+    rows = []
+    for name, value in attack.parameters(tank).items():
         nominal, ends, unit = entries[name]
         rows.append([name, unit, Value(nominal), Value(ends, 4, between=" : "), Value(value)])
     return Table(rows, ["", "unit", "nominal", "interval", "value (in each window)"])
 
 
-def settings(attack, one):
-    """Return the run of `one` as --set options, coefficients as in the window of its peak."""
+def settings(attack, tank):
+    """Return the run of `tank` as --set options, coefficients as in the window of its peak."""
     clock, windows = attack.case.clock, attack.attacked.windows
-    at = min(int(one.time_s * windows / (clock.duration + clock.dt)), windows - 1)
-    words = []
-    for name, value in attack.parameters(one).items():
-        if not name.startswith("sensor."):
-            number = value[at] if isinstance(value, list) else value
-            words.append(shlex.quote(f"{name}={number:.6g}"))
-    return " ".join(f"--set {word}" for word in words)
+    at = min(int(tank.time_s * windows / (clock.duration + clock.dt)), windows - 1)
+    values = {
+        name: value[at] if isinstance(value, list) else value
+        for name, value in attack.parameters(tank).items()
+        if not name.startswith("sensor.")
+    }
+    return " ".join(f"--set {shlex.quote(f'{name}={value:.6g}')}" for name, value in values.items())
 
 
 def runs_of(attack):
     """Return {"nominal": Trajectory, "worst": Trajectory}, of about 3000 rows each."""
-    case, original = attack.case, attack.attacked.original
+    original = attack.attacked.original
     sensor = original.loop.sensor.without_noise()
     quiet = original.replace(loop=dataclasses.replace(original.loop, sensor=sensor))
-    worst = case.replace(loop=attack.loop(attack.worst))
+    worst = attack.case.replace(loop=attack.loop(attack.worst))
     return {"nominal": run_for_people(quiet), "worst": run_for_people(worst)}
 
 
 def figures(attack, runs=None):
     """Return matplotlib figures {name: Figure}: "worst" run beside the nominal one, "ascent"."""
-    import matplotlib.pyplot as plt
-
     from jaxtank.plots import responses
+    from jaxtank.plots.style import FORBIDDEN, picture
 
-    runs, worst = runs or runs_of(attack), attack.worst
-    limits = np.array([one.limit for one in attack.found])
+    worst, loop = attack.worst, attack.case.loop
+    limits = np.array([tank.limit for tank in attack.found])
     title = (
-        f"{attack.case.name}: tank {worst.tank + 1} reaches {worst.level:.4g}"
-        f" {attack.case.loop.units[0]}, limit {worst.limit:.4g}"
+        f"{attack.case.name}: tank {worst.tank + 1} reaches {worst.level:.4g} {loop.units[0]},"
+        f" limit {worst.limit:.4g}"
     )
-    drawn = {"worst": responses.responses(attack.case.loop, runs, title, limits)}
-    with responses.styled():
-        figure, ax = plt.subplots(figsize=(6.0, 3.4), layout="constrained")
+
+    def ascent(ax):
         for i, limit in enumerate(limits):
             ax.plot(attack.history[:, i] / limit, marker=".", label=f"tank {i + 1}")
-        ax.axhline(1.0, color=responses.FORBIDDEN, linewidth=1.0, label="limit")
+        ax.axhline(1.0, color=FORBIDDEN, linewidth=1.0, label="limit")
         ax.set(xlabel="step of the ascent", ylabel="highest level / limit [-]")
         ax.legend()
-    return drawn | {"ascent": figure}
+
+    runs = responses.responses(loop, runs or runs_of(attack), title, limits)
+    return {"worst": runs, "ascent": picture(ascent, (6.0, 3.4))}
 
 
 def rig_of(attack):
     """Return (text of worst.toml or None, {"level" of its run [cm], "difference" to the level that
     was found [cm], "same": within REPRODUCED of it, "missing": what no rig file can describe}).
     """
-    one = attack.worst
-    text, why = rig_text(attack.rig(one))
-    missing = attack.not_in_rig(one)
+    worst = attack.worst
+    text, why = rig_text(attack.rig(worst))
+    missing = attack.not_in_rig(worst)
     if text is None:
         return None, {"level": None, "difference": None, "same": False, "missing": [why, *missing]}
     case = rigs.loads(text)
     run, _ = lp.simulate_compiled(case.loop, case.clock, None, 1)
-    level = np.asarray(run.x)[:, one.tank]
+    level = np.asarray(run.x)[:, worst.tank]
     rising = level[1:][level[1:] > level[:-1]]
     highest = float(rising.max()) if rising.size else float(level[-1])
-    difference = highest - one.level
-    same = abs(difference) <= REPRODUCED * one.limit
+    difference = highest - worst.level
+    same = abs(difference) <= REPRODUCED * worst.limit
     if not same and not missing:
         missing = ["the safety filter, which is designed anew for this start"]
     return text, {"level": highest, "difference": difference, "same": same, "missing": missing}
@@ -324,22 +304,14 @@ def rig_of(attack):
 def save(attack, folder, command=None):
     """Write result.json, worst.toml, trajectory.csv of the worst run, pictures and report.html."""
     text, checked = rig_of(attack)
-    runs = runs_of(attack)
+    runs, worst, unit = runs_of(attack), attack.worst, attack.case.loop.units[0]
     files = {"trajectory.csv": csv(runs["worst"], attack.case.loop.units)}
     if text is not None:
-        files["worst.toml"] = f"# {_head(attack, checked)}\n{text}"
+        rest = f"; this file gives {checked['level'] or 0:.10g} {unit}: it lacks"
+        rest = f"{rest} {', '.join(checked['missing'])}"
+        rest = ", which `jaxtank simulate` of this file gives again" if checked["same"] else rest
+        head = f"the worst found by jaxtank attack: tank {worst.tank + 1} at {worst.level:.10g}"
+        files["worst.toml"] = f"# {head} {unit}{rest}\n{text}"
     payload, stale = {**json_of(attack), "rig": checked}, earlier(folder, CAPTIONS)
-    draw, page = lambda: figures(attack, runs), lambda drawn: report(attack, drawn)
-    return save_all(folder, payload, files, draw, page, command, stale)
-
-
-def _head(attack, checked):
-    """The comment of worst.toml."""
-    one, unit = attack.worst, attack.case.loop.units[0]
-    words = f"the worst found by jaxtank attack: tank {one.tank + 1} at {one.level:.10g} {unit}"
-    if checked["same"]:
-        return f"{words}, which `jaxtank simulate` of this file gives again"
-    return (
-        f"{words}; this file gives {checked['level']:.10g} {unit}: it lacks"
-        f" {', '.join(checked['missing'])}"
-    )
+    draw, page = lambda: figures(attack, runs), lambda: report(attack)
+    return save_all(folder, payload, files, draw, page, CAPTIONS, command, stale)

@@ -1,16 +1,17 @@
 """The report of a feasibility study: text, JSON, a picture, page and folder."""
 
+import dataclasses
+
 from tuning.problem import provenance
-from tuning.problem.wording import count
-from tuning.report.document import Report, Text, figures_of
+from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
-from tuning.report.tables import Table, Value, clean
+from tuning.report.tables import Table, Value, clean, fields, number
 
-SHOWN = 0.005
-"""Share of the plants from which on a need is a row of the table; JSON has all [-]."""
+LISTED = 0.005
+"""Share of the plants from which on a need is a row of the study's table; JSON has all [-]."""
 
-ACCEPTED = 0.05
-"""Share of the plants up to which unreachable setpoints need no change of the design [-]."""
+MATTERS = 0.05
+"""The same for a default answer, and the share of unreachable setpoints that needs no mend [-]."""
 
 CAPTIONS = {
     "needs": "What the steady states at the plateaus need: of the nominal plant, and exceeded by"
@@ -21,95 +22,91 @@ CAPTIONS = {
 def json_of(study):
     """Return the object `feasibility` of `jaxtank tune --json`."""
     return {
-        "infeasible_for_any_controller": study.infeasible_for_any_controller,
-        "interval95": study.interval95,
-        "samples": study.samples,
-        "plateaus": [
-            {
-                "time_s": row.time_s,
-                "setpoints": list(row.setpoints),
-                "tank": row.tank,
-                "pump": row.pump,
-                "needed": clean(row.needed),
-                "needed_p95": clean(row.needed_p95),
-                "limit": clean(row.limit),
-                "share": row.share,
-                "unit": row.unit,
-            }
-            for row in study.plateaus
-        ],
+        **fields(study, "infeasible_for_any_controller interval95 samples wall_s mends_s"),
+        "plateaus": [clean(dataclasses.asdict(row)) for row in study.plateaus],
         "mends": [
-            {"what": m.what, "set": clean(dict(m.set)), "share": m.share, "words": m.words}
-            for m in study.mends
+            {**fields(m, "what share words"), "set": clean(dict(m.set))} for m in study.mends
         ],
-        "wall_s": study.wall_s,
-        "mends_s": study.mends_s,
     }
 
 
-def report(study, drawn=None):
-    """Return the Report of a Feasibility."""
-    bad, plants = int(study.infeasible.sum()), count(study.samples, "plant")
-    share, name = Value(100 * study.infeasible_for_any_controller, 2, "%"), study.case.name
-    sections = [Text([f"{name}: each of {plants} has a steady state at every plateau"])]
-    if bad:
-        percent = Value(100 * bad / study.samples, 2, "%")
-        words = f"{name}: {percent} of {plants} cannot hold every setpoint within their limits,"
-        sections = [Text([f"{words} whatever the controller"]), *_table(study), *_mends(study)]
-    return Report(
-        f"{name}: feasibility of the setpoints",
-        f"{share} of the plants cannot hold every setpoint",
-        [("plants", study.samples), ("infeasible", share)],
-        [*sections, *figures_of(drawn or {}, CAPTIONS)],
-        study.infeasible_for_any_controller <= ACCEPTED,
-        study.case.title,
+def verdict(study):
+    """Return the sentence on the share of plants with an unreachable setpoint."""
+    if not study.infeasible.any():
+        return f"Each of {study.samples} sampled plants has a steady state at every plateau."
+    share = number(100 * study.infeasible_for_any_controller, 2)
+    return (
+        f"On {share} % of {study.samples} sampled plants at least one setpoint is unreachable"
+        " within the limits, whatever the controller."
     )
 
 
-def _table(study):
-    """What plateaus need, where a need is passed by SHOWN of the plants."""
+def needs(study, least=LISTED):
+    """Return the Table of what the plateaus need, where `least` of the plants exceed a limit."""
     rows = [
         [
             Value(row.setpoints, 6, study.case.loop.units[0], ", "),
-            f"tank {row.tank}" if row.pump is None else f"pump {row.pump}",
+            row.tank if row.pump is None else f"pump {row.pump}",
             *(Value(v, 3, row.unit) for v in (row.needed, row.needed_p95)),
             Value(row.limit, 6, row.unit),
             Value(100 * row.share, 2, "%"),
         ]
         for row in study.plateaus
-        if row.share >= SHOWN
+        if row.share >= least
     ]
-    heads = ["setpoints", "", "needs, nominal", "needs, 95 % of plants", "limit"]
-    return [Table(rows, [*heads, "plants that cannot"])] if rows else []
+    heads = ["setpoints", "tank", "needed", "needed, 95 %", "limit", "not reachable"]
+    return [Table(rows, heads)] if rows else []
 
 
-def _mends(study):
-    """The changes of the design that are enough, with the options that make them."""
-    if study.mends:
-        options = [f"  {m.what}: {' '.join(m.options)}" for m in study.mends]
-        return [Text(["for 95 % of plants, one of:", *options])]
-    if study.infeasible_for_any_controller <= ACCEPTED:
-        return []
-    words = "no change of setpoints, rims, orifices or pumps alone was found that is enough for"
-    return [Text([f"{words} 95 % of plants"])]
+def unreachable(study):
+    """Return the sections of a default answer: lost setpoints, and options that mend them."""
+    sections = [Text([verdict(study)]), *needs(study, MATTERS)]
+    if study.mends:  # that of the setpoints is long: JSON and the study's own report have it
+        kinds = [
+            f"--mend {m.what}" + (f" ({m.words})" if m.what != "setpoints" else "")
+            for m in study.mends
+        ]
+        words = f"Every setpoint is reachable on 95 % of the plants with {' or '.join(kinds)}"
+        sections.append(Text([words]))
+    return sections
+
+
+def report(study):
+    """Return the Report of a Feasibility."""
+    share, good = (
+        study.infeasible_for_any_controller,
+        study.infeasible_for_any_controller <= MATTERS,
+    )
+    mends = [f"  {m.what}: {' '.join(m.options)}" for m in study.mends]
+    if mends:
+        mends = ["Every setpoint is reachable on 95 % of the plants with one of:", *mends]
+    elif not good:
+        mends = ["No change of setpoints, rims, orifices or pumps alone is enough for 95 %."]
+    return Report(
+        f"{study.case.name}: feasibility of the setpoints",
+        verdict(study),
+        [("plants", study.samples), ("infeasible", Value(100 * share, 2, "%"))],
+        [Text([f"{study.case.name}: {verdict(study)}"], on="terminal"), *needs(study), Text(mends)],
+        good,
+        study.case.title,
+    )
 
 
 def figures(study):
-    """Return {"needs": matplotlib Figure}; {} where every plant can follow."""
+    """Return {"needs": matplotlib Figure}; {} where every setpoint is reachable."""
     from jaxtank.plots.style import AFTER, BEFORE, FORBIDDEN, picture, plain
 
-    rows = [row for row in study.plateaus if row.share >= SHOWN]
+    rows = [row for row in study.plateaus if row.share >= LISTED]
+    part = lambda row: f"tank {row.tank}" if row.pump is None else f"pump {row.pump}"
 
     def draw(ax):
-        for k, row in enumerate(rows):
-            ax.plot([row.needed, row.needed_p95], [k, k], color="0.8", zorder=1)
-            first, second = ("nominal plant", "95 % of plants") if k == 0 else (None, None)
-            ax.plot(row.needed, k, "o", color=AFTER, label=first)
-            ax.plot(row.needed_p95, k, "s", color=BEFORE, label=second)
-            ax.plot([row.limit] * 2, [k - 0.3, k + 0.3], color=FORBIDDEN, linewidth=2)
-        parts = (f"tank {r.tank}" if r.pump is None else f"pump {r.pump}" for r in rows)
-        labels = [f"{Value(r.setpoints, 6, '', ', ')}: {part}" for r, part in zip(rows, parts)]
-        ax.set_yticks(range(len(rows)), labels)
+        nominal, high, limit = zip(*((r.needed, r.needed_p95, r.limit) for r in rows))
+        y = range(len(rows))
+        ax.hlines(y, nominal, high, color="0.8", zorder=1)
+        ax.plot(nominal, y, "o", color=AFTER, label="nominal plant")
+        ax.plot(high, y, "s", color=BEFORE, label="95 % of plants")
+        ax.plot(limit, y, "|", color=FORBIDDEN, markersize=18, markeredgewidth=2, label="limit")
+        ax.set_yticks(y, [f"{Value(r.setpoints, 6, '', ', ')}: {part(r)}" for r in rows])
         ax.invert_yaxis()
         ax.set_xlabel(f"needed [{' or '.join(dict.fromkeys(row.unit for row in rows))}]")
         ax.set_title(plain(study.case.name))
@@ -120,6 +117,6 @@ def figures(study):
 
 def save(study, folder, command=None):
     """Write result.json, needs.png and report.html to `folder`; return their paths."""
-    draw, page = lambda: figures(study), lambda drawn: report(study, drawn)
-    made = provenance.provenance(study.case, study.seed)
-    return save_all(folder, json_of(study), {}, draw, page, command, provenance=made)
+    draw, page = lambda: figures(study), lambda: report(study)
+    of = provenance.provenance(study.case, study.seed)
+    return save_all(folder, json_of(study), {}, draw, page, CAPTIONS, command, provenance=of)

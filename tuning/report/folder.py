@@ -1,5 +1,6 @@
 """The folder of a result: result.json, data, pictures and report.html, all of them or none."""
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import write_folder
-from tuning.report.document import Report, failed
+from tuning.report.document import Figure, Report, failed
 from tuning.report.tables import dumps
 
 
@@ -20,37 +21,32 @@ def rig_text(case: Any) -> tuple[str | None, str | None]:
         return None, f"rig.toml is not written ({error})"
 
 
-def pngs(drawn: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return {file name: bytes} of {name: figure}; the figures are closed."""
-    # One that cannot be drawn is left out, with a note on stderr.
+def pngs(drawings: Mapping[str, Any]) -> dict[str, bytes]:
+    """Return {file name: bytes} of {name: figure} that can be drawn; the figures are closed."""
     from jaxtank.plots.run import png
 
-    files = {}
-    for name, drawing in drawn.items():
-        try:
-            files[f"{name}.png"] = png(drawing)
-        except Exception as error:
-            failed(name, error, drawing)
-    return files
+    return {f"{n}.png": data for n, (_, data) in _drawable(drawings, png).items()}
 
 
-def _laid_out(drawn: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the figures whose texts can be set, their layout as it then is."""
+def _drawable(drawings, render):
+    """{name: (figure, render(figure))}; those that raise are closed, with a note on stderr."""
     good = {}
-    for name, drawing in drawn.items():
+    for name, drawing in drawings.items():
         try:
-            drawing.draw_without_rendering()
-            drawing.set_layout_engine("none")
-            good[name] = drawing
+            good[name] = drawing, render(drawing)
         except Exception as error:
             failed(name, error, drawing)
     return good
 
 
+def _lay_out(drawing):
+    """Set the texts of a figure, and keep its layout as it then is."""
+    drawing.draw_without_rendering()
+    drawing.set_layout_engine("none")
+
+
 def earlier(folder: str | Path, names: Any) -> list[Path]:
-    """Return report.html and the pictures `names` of an earlier result in `folder`; none where
-    there is no report.
-    """
+    """Return report.html and the pictures `names` of an earlier result in `folder`."""
     page = Path(folder) / "report.html"
     return [page, *(page.with_name(f"{name}.png") for name in names)] if page.is_file() else []
 
@@ -60,37 +56,40 @@ def save(
     payload: Any,
     files: Mapping[str, Any],
     draw: Callable[[], dict[str, Any]],
-    report: Callable[[dict[str, Any]], Report] | None,
+    report: Callable[[], Report],
+    captions: Mapping[str, str],
     command: str | None = None,
     stale: Sequence[Path] = (),
     provenance: Mapping[str, Any] | None = None,
 ) -> list[Path]:
-    """Write result.json and `files` {name: content} of a result to `folder`, all or none, then its
-    pictures and report.html, all or none; return the paths.
+    """Write result.json and `files` {name: content} to `folder`, all or none, then the pictures of
+    `draw` with `captions` {first word of their names: text} and report.html; return the paths.
     """
-    # draw is called once the files are written, so that they outlive a fault in a picture; stale:
-    # paths of an earlier result, removed between the two; provenance: where the payload has none.
-    # What cannot be drawn is left out, with a note on stderr.
+    # The files are written before anything is drawn, so that they outlive a fault in a picture;
+    # `stale` files of an earlier result are removed between the two. `provenance` stands in for a
+    # payload without one.
     import matplotlib.pyplot as plt
 
-    folder, made = Path(folder), provenance or payload.get("provenance", {})
+    folder, provenance = Path(folder), provenance or payload.get("provenance", {})
     written = write_folder(folder, {"result.json": dumps(payload) + "\n", **files})
     for path in stale:
         path.unlink(missing_ok=True)
-    drawn: dict[str, Any] = {}
+    drawings: dict[str, Any] = {}
     pages: dict[str, str] = {}
     open_before = plt.get_fignums()
     try:
-        drawn = draw()
+        drawings = draw()
     except Exception as error:
-        new = [plt.figure(n) for n in plt.get_fignums() if n not in open_before]
-        failed("the pictures", error, *new)
-    if report is not None:
+        failed("the pictures", error, *set(plt.get_fignums()).difference(open_before))
+    try:
         from tuning.report.html import document  # and jinja2, only where a page is written
 
-        try:
-            drawn = _laid_out(drawn)
-            pages["report.html"] = document(report(drawn), command, made)
-        except Exception as error:
-            failed("report.html", error)
-    return written + write_folder(folder, pages | pngs(drawn))
+        drawings = {n: drawing for n, (drawing, _) in _drawable(drawings, _lay_out).items()}
+        caption = lambda name: captions.get(name) or captions[name.partition("_")[0]]
+        figures = [Figure(name, caption(name), drawing) for name, drawing in drawings.items()]
+        page = report()
+        page = dataclasses.replace(page, sections=[*page.sections, *figures])
+        pages["report.html"] = document(page, command, provenance)
+    except Exception as error:
+        failed("report.html", error)
+    return written + write_folder(folder, pages | pngs(drawings))

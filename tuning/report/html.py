@@ -60,9 +60,10 @@ def _templates():
 def document(report: Report, command: str | None = None, provenance: Any = ()) -> str:
     """Return the whole page of a Report; the same report gives the same bytes."""
     # command, provenance: the line that made the result, and versions, machine and seed
-    shown = [s for s in report.sections if getattr(s, "on", "") != "terminal"]
-    frames = [frame for s in shown if isinstance(s, Live) and (frame := _frame(s.result))]
-    texts = [s for s in shown if isinstance(s, (Text, Table))]
+    sections = [s for s in report.sections if getattr(s, "on", "") != "terminal"]
+    frames = [frame for s in sections if isinstance(s, Live) and (frame := _frame(s.result))]
+    body = [s for s in sections if not isinstance(s, Figure)]
+    texts = [s for s in body if not isinstance(s, Live)]
     words = [s for s in texts if isinstance(s, Text) and s.items and s.sentences]
     template = _templates().get_template("page.html")
     return template.render(
@@ -71,9 +72,9 @@ def document(report: Report, command: str | None = None, provenance: Any = ()) -
         provenance=dict(provenance),
         style=_style(),
         frames=frames,
-        last=bool(shown) and isinstance(shown[-1], Live),
+        last=bool(body) and isinstance(body[-1], Live),
         words=words,
-        pictures=[_picture(s) for s in shown if isinstance(s, Figure)],
+        pictures=[_picture(s) for s in sections if isinstance(s, Figure)],
         numbers=[s for s in texts if s not in words],
     )
 
@@ -81,8 +82,8 @@ def document(report: Report, command: str | None = None, provenance: Any = ()) -
 def fragment(sections) -> str:
     """Return Texts and Tables as HTML for a notebook."""
     part = _templates().get_template("parts.html").module.__dict__["part"]
-    shown = [s for s in sections if isinstance(s, (Text, Table)) and s.on != "page"]
-    return f"<div>{''.join(map(part, shown))}</div>"
+    texts = [s for s in sections if isinstance(s, (Text, Table)) and s.on != "page"]
+    return f"<div>{''.join(map(part, texts))}</div>"
 
 
 def _frame(result):
@@ -116,7 +117,7 @@ def svg(figure, name, caption=""):
     # A picture of more than LARGEST characters has its dense lines rasterised.
     text = _saved(figure, name)
     if len(text) > LARGEST:
-        for line in (one for ax in figure.axes for one in (*ax.lines, *ax.collections)):
+        for line in (part for ax in figure.axes for part in (*ax.lines, *ax.collections)):
             points = line.get_xydata() if hasattr(line, "get_xydata") else None
             if points is None or len(points) > DENSE:
                 line.set_rasterized(True)
@@ -133,8 +134,8 @@ def svg(figure, name, caption=""):
 def _with_prefix(text, prefix):
     """An <svg> element whose ids begin with `prefix`; those that nothing refers to are removed."""
     used = {a or b for a, b in re.findall(r'url\(#([^)]+)\)|href="#([^"]+)"', text)}
-    kept = lambda m: f' id="{prefix}-{m[1]}"' if m[1] in used else ""
-    text = re.sub(r' id="([^"]*)"', kept, text)
+    renamed = lambda m: f' id="{prefix}-{m[1]}"' if m[1] in used else ""
+    text = re.sub(r' id="([^"]*)"', renamed, text)
     text = re.sub(r"url\(#([^)]+)\)", rf"url(#{prefix}-\1)", text)
     text = re.sub(r'href="#([^"]+)"', rf'href="#{prefix}-\1"', text)
     return re.sub(r"<g>\s*</g>|<defs>\s*</defs>", "", text)

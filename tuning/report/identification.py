@@ -13,12 +13,10 @@ from tuning.identification import residuals
 from tuning.identification.confidence import at_search_bounds
 from tuning.problem import provenance
 from tuning.problem.wording import count
-from tuning.report.document import Report, Text, figures_of
+from tuning.report.document import Report, Text
 from tuning.report.folder import earlier, rig_text
 from tuning.report.folder import save as save_all
-from tuning.report.tables import Table, Value, clean
-
-__all__ = ["figures", "json_of", "report", "save"]
+from tuning.report.tables import Table, Value, clean, fields
 
 CAPTIONS = {
     "fit": "Measured readings (dots), the fitted rig (line), and the inputs of the pumps.",
@@ -41,18 +39,28 @@ def not_identifiable(direction):
 def sentences_of(fit):
     """Return sentences: how an identification ended, and what it needs next."""
     agree = sum(s["agrees"] for s in fit.starts)
-    return [
-        *_ending(fit),
-        f"{agree} of {len(fit.starts)} starts ended in the same place",
-        *_residuals(fit),
-        *_prior(fit),
-        *(
-            f"{n} ends at its bound, {p['value']:.4g} {p['unit']}: no interval"
-            for n, p in fit.parameters.items()
-            if p["at_bound"]
-        ),
-        *_next_step(fit),
+    words = [*_ending(fit), f"{agree} of {len(fit.starts)} starts ended in the same place"]
+    words += _residuals(fit)
+    if fit.case.covariance is not None:
+        parameters = count(len(fit.case.covariance[0]), "parameter")
+        words.append(
+            f"the [covariance] of {parameters} of an earlier identification, in {fit.case.name!r},"
+            " is not used: values and intervals are those of these data alone; give the earlier log"
+            " too, with another --data"
+        )
+    words += [
+        f"{n} ends at its bound, {p['value']:.4g} {p['unit']}: no interval"
+        for n, p in fit.parameters.items()
+        if p["at_bound"]
     ]
+    if fit.identifiable:
+        if fit.case.reachable and (why := rigs.unreachable(fit.identified)):
+            words.append(
+                f"{why}; rig.toml has reachable = false for it: choose other setpoints before"
+                " tuning"
+            )
+        words += [_proposal(fit)] if fit.law else []
+    return words
 
 
 def _ending(fit):
@@ -60,18 +68,18 @@ def _ending(fit):
     words = []
     if fit.status == "interrupted":
         words.append("interrupted: the best of the searches that had ended")
-    ended = at_search_bounds(fit.case.loop, fit.parameters)
-    if fit.status == "not_converged" and ended:
-        words.append(
-            f"{', '.join(ended)} {'ends' if len(ended) == 1 else 'end'} at the bound of the search:"
-            " check the ranges (--free), and units and columns of the data"
-        )
-    if fit.status == "not_converged" and fit.fit.status <= 0:
-        words.append("the best search did not converge in its iterations: raise --iterations")
+    if fit.status == "not_converged":
+        if ended := at_search_bounds(fit.case.loop, fit.parameters):
+            words.append(
+                f"{', '.join(ended)} {'ends' if len(ended) == 1 else 'end'} at the bound of the"
+                " search: check the ranges (--free), and units and columns of the data"
+            )
+        if fit.fit.status <= 0:
+            words.append("the best search did not converge in its iterations: raise --iterations")
     for d in fit.directions:
         alone = len(d["parameters"]) == 1
-        what = f"{not_identifiable(d)} is not" if alone else "not separately"
-        words.append(f"{what} identifiable: {d['words']} changes no reading noticeably")
+        name = f"{not_identifiable(d)} is not" if alone else "not separately"
+        words.append(f"{name} identifiable: {d['words']} changes no reading noticeably")
     if fit.status == "not_identifiable":
         words.append("of the values that fit equally well, some near the case's own are printed")
     return words
@@ -84,41 +92,13 @@ def _residuals(fit):
         fit.channels, q["rmse"], q["nrmse_percent"], q["residual_autocorrelation"]
     ):
         percent = "" if share is None else f", fit {share:.1f} %"
-        words.append(
-            f"{name}: residual {rmse:.3g} {unit} RMS{percent}, correlation from sample to sample"
-            f" {rho:.2f}"
-        )
+        correlation = f"correlation from sample to sample {rho:.2f}"
+        words.append(f"{name}: residual {rmse:.3g} {unit} RMS{percent}, {correlation}")
     if q["widened"] > 1.05:
         words.append(
             "residuals are correlated, so that the model and not the noise limits the fit:"
             f" intervals are widened {q['widened']:.1f} times for it"
         )
-    return words
-
-
-def _prior(fit):
-    """Return a sentence: the covariance that the case brings is not used."""
-    if fit.case.covariance is None:
-        return []
-    parameters = count(len(fit.case.covariance[0]), "parameter")
-    return [
-        f"the [covariance] of {parameters} of an earlier identification, in {fit.case.name!r}, is"
-        " not used: values and intervals are those of these data alone; give the earlier log too,"
-        " with another --data"
-    ]
-
-
-def _next_step(fit):
-    """Return sentences: what the identified rig needs before it is tuned."""
-    words = []
-    if not fit.identifiable:
-        return words
-    if fit.case.reachable and (why := rigs.unreachable(fit.identified)):
-        words.append(
-            f"{why}; rig.toml has reachable = false for it: choose other setpoints before tuning"
-        )
-    if fit.law:
-        words.append(_proposal(fit))
     return words
 
 
@@ -136,21 +116,18 @@ def _proposal(fit):
     )
 
 
-def report(fit, drawn=None):
-    """Return the Report of an Identification."""
+def report(fit, page=False):
+    """Return the Report of an Identification; `page`: with the rig file."""
     certain = sum(p["interval95"] is not None for p in fit.parameters.values())
-    samples = sum(log.samples for log in fit.estimation.logs)
     facts: list[tuple[str, Any]] = [
-        ("parameters with an interval", f"{certain} of {len(fit.parameters)}")
+        ("parameters with an interval", f"{certain} of {len(fit.parameters)}"),
+        ("samples", sum(log.samples for log in fit.estimation.logs)),
     ]
-    facts.append(("samples", samples))
     quality = zip(fit.channels, fit.quality["rmse"], fit.quality["nrmse_percent"])
     for (name, unit), rmse, share in quality:
         percent = "" if share is None else f" ({share:.1f} %)"
         facts.append((f"residual of {name}", f"{rmse:.3g} {unit}{percent}"))
-    rig, why = (None, None)
-    if drawn is not None and fit.status != "not_identifiable":
-        rig, why = rig_text(fit.identified)
+    rig, why = rig_text(fit.identified) if page and fit.identifiable else (None, None)
     simulations = sum(s["evaluations"] for s in fit.starts)
     status = fit.status.replace("_", " ")
     return Report(
@@ -167,7 +144,6 @@ def report(fit, drawn=None):
             *_remedies(fit),
             *_profile(fit.profile),
             Text([f"{fit.wall_s:.1f} s, {simulations} simulations with sensitivities"], gap=True),
-            *figures_of(drawn or {}, {n: CAPTIONS[n.split("_")[0]] for n in drawn or {}}),
         ],
         fit.status == "converged",
         ", ".join(log.name for log in fit.estimation.logs),
@@ -185,8 +161,8 @@ def _data(est):
     missing = sum(log.y.size for log in est.logs) - readings
     return (
         f"{', '.join(log.name for log in est.logs)}: {sum(log.samples for log in est.logs)} samples"
-        f" {pace}, {readings} readings" + (f" ({missing} missing)" if missing else "") + ","
-        f" {est.size} unknowns, {count(est.substeps, 'Runge-Kutta step')} a sample"
+        f" {pace}, {readings} readings{f' ({missing} missing)' if missing else ''}, {est.size}"
+        f" unknowns, {count(est.substeps, 'Runge-Kutta step')} a sample"
     )
 
 
@@ -206,28 +182,34 @@ def _parameters(fit):
 
 def _levels(fit):
     """Return lines: the levels at the first sample of each log."""
-    unit, rows = fit.case.loop.units[0], []
+    rows = []
     for e, row in enumerate(fit.levels):
+        which = f" of log {e + 1}" if len(fit.levels) > 1 else ""
         levels = []
         for i, level in enumerate(row):
             ends = level["interval95"]
             interval = f" ({ends[0]:.4g} .. {ends[1]:.4g})" if ends else ""
             levels.append(f"h{i + 1} {level['value']:.4g}{interval}")
-        which = f" of log {e + 1}" if len(fit.levels) > 1 else ""
-        rows.append(f"levels at the first sample{which} [{unit}]: " + ", ".join(levels))
+        head = f"levels at the first sample{which} [{fit.case.loop.units[0]}]"
+        rows.append(f"{head}: {', '.join(levels)}")
     return rows
 
 
 def _validation(fit):
     """Return sections: prediction of the validation set."""
-    v, rows = fit.validation, []
+    v = fit.validation
     if not v:
         return []
-    for c, (name, unit) in enumerate(fit.channels):
-        for side, words in (("fitted", "fitted"), ("held_back", "validation")):
-            share = v[side]["nrmse_percent"][c]
-            percent = "-" if share is None else f"{share:.1f} %"
-            rows.append([name, words, Value(v[side]["rmse"][c], 4, unit), percent])
+    rows = [
+        [
+            name,
+            words,
+            Value(v[side]["rmse"][c], 4, unit),
+            Value(v[side]["nrmse_percent"][c], 3, "%"),
+        ]
+        for c, (name, unit) in enumerate(fit.channels)
+        for side, words in (("fitted", "fitted"), ("held_back", "validation"))
+    ]
     head = (
         f"fit to the first {', '.join(map(str, v['samples']))} samples, validated on the rest by"
         " one simulation from the same start"
@@ -237,20 +219,18 @@ def _validation(fit):
 
 def _remedies(fit):
     """Return sections: which experiments would identify what is not identifiable."""
-    if not fit.remedies:
-        return []
     alone = all(len(d["parameters"]) == 1 for d in fit.directions)
-    what = "it" if alone and len(fit.directions) == 1 else "them" if alone else "them separately"
-    return [Text([f"What would identify {what}:"], gap=True), Text(fit.remedies, items=True)]
+    names = "it" if alone and len(fit.directions) == 1 else "them" + " separately" * (not alone)
+    head = Text([f"What would identify {names}:"], gap=True)
+    return [head, Text(fit.remedies, items=True)] if fit.remedies else []
 
 
 def _profile(p):
     """Return a section: the interval of the profile likelihood."""
     if not p:
         return []
-    unit = "" if p["unit"] == "-" else f" {p['unit']}"
     ends = [
-        f"{e:.5g}{unit}" if e is not None else f"beyond the {side} one tried"
+        f"beyond the {side} one tried" if e is None else str(Value(e, 5, p["unit"].strip("-")))
         for e, side in zip(p["interval95"], ("lowest", "highest"))
     ]
     words = f"profile likelihood of {p['name']}: 95 % from {ends[0]} to {ends[1]}"
@@ -260,13 +240,13 @@ def _profile(p):
 def json_of(fit):
     """Return the JSON object of `jaxtank identify --json`."""
     names, correlation = fit.correlation
-    quality, est = fit.quality, fit.estimation
+    quality, est, free = fit.quality, fit.estimation, fit.covariance
     return {
         "case": fit.case.name,
         "status": str(fit.status),
         "success": fit.status == "converged",
         "message": "; ".join(sentences_of(fit)),
-        "parameters": {n: clean(p) for n, p in fit.parameters.items()},
+        **fields(fit, "parameters remedies validation profile starts wall_s"),
         "fit": clean(
             {k: quality[k] for k in ("rmse", "nrmse_percent", "residual_autocorrelation")}
         ),
@@ -274,23 +254,15 @@ def json_of(fit):
             {"name": n, "unit": u, "noise": s} for (n, u), s in zip(fit.channels, quality["noise"])
         ],
         "intervals_widened": quality["widened"],
-        "initial_levels": [[clean(v) for v in row] for row in fit.levels],
-        "covariance": {
-            "names": list(fit.covariance[0]),
-            "matrix": np.asarray(fit.covariance[1]).tolist(),
-        },
+        "initial_levels": clean(fit.levels),
+        "covariance": {"names": list(free[0]), "matrix": np.asarray(free[1]).tolist()},
         "correlation": {"names": list(names), "matrix": correlation.tolist()},
         "free_combinations": clean(fit.directions),
-        "remedies": fit.remedies,
-        "validation": clean(fit.validation),
-        "profile": clean(fit.profile),
-        "starts": clean(fit.starts),
         "data": [
             {"name": log.name, "samples": log.samples, "readings": int(np.isfinite(log.y).sum())}
             for log in est.logs
         ],
         "substeps": est.substeps,
-        "wall_s": fit.wall_s,
         "provenance": provenance.provenance(fit.case, fit.seed),
     }
 
@@ -313,79 +285,70 @@ def fit_csv(fit):
 
 def save(fit, folder, command=None):
     """Write result.json, fit.csv, figures, report.html and, if identifiable, rig.toml."""
+    from jaxtank.plots import run as plots
+
     rig, why = rig_text(fit.identified) if fit.identifiable else (None, None)
     payload = json_of(fit)
     if why:
         warnings.warn(why, stacklevel=3)  # the line that called fit.save
         payload["message"] += f"; {why}"
     files = {"fit.csv": fit_csv(fit), **({"rig.toml": rig} if rig else {})}
-    stale = [*_left_over(Path(folder), files), *earlier(folder, ["residuals", "rig"])]
-
-    def draw():
-        from jaxtank.plots import run as plots
-
-        return figures(fit) | plots.rig(fit.identified.loop.plant, None, fit.case.name)
-
-    page = lambda drawn: report(fit, drawn)
-    return save_all(folder, payload, files, draw, page, command, stale)
-
-
-def _left_over(folder, files):
-    """Return files of an earlier identification in the folder that this one does not write."""
-    # A rig file of the earlier one must not be taken for that of this one.
-    if not (folder / "fit.csv").exists():
-        return []
-    names = ["rig.toml", "fit.png", "correlation.png", "profile.png"]
-    paths = [*(folder / name for name in names), *sorted(folder.glob("fit_[0-9]*.png"))]
-    return [path for path in paths if path.name not in files and path.is_file()]
+    stale, old = earlier(folder, ["residuals", "rig"]), Path(folder)
+    if (old / "fit.csv").exists():  # an earlier rig file must not be taken for that of this result
+        names = ["rig.toml", "fit.png", "correlation.png", "profile.png"]
+        paths = [*(old / name for name in names), *old.glob("fit_[0-9]*.png")]
+        stale += [path for path in paths if path.name not in files and path.is_file()]
+    draw = lambda: figures(fit) | plots.rig(fit.identified.loop.plant, None, fit.case.name)
+    page = lambda: report(fit, page=True)
+    return save_all(folder, payload, files, draw, page, CAPTIONS, command, stale)
 
 
 def figures(fit):
     """Return {name: matplotlib Figure}: "fit" (or "fit_1", ..), "residuals", "correlation", .."""
     from jaxtank.plots import fit as plots
-    from jaxtank.plots import style
+    from jaxtank.plots.style import picture
 
-    est = fit.estimation
+    est, rows, drawings = fit.estimation, len(fit.channels), {}
     simulated = est.predicted(est.unknowns(fit.fit))
-    several = len(est.logs) > 1
-    rows = len(fit.channels)
     title = lambda words: f"{fit.case.name}: {words}"
-    drawn = {}
     for e, log in enumerate(est.logs):
         draw = lambda axes, e=e: _fit(axes, fit, e, simulated[e])
         words = title(f"{log.name}, measured and simulated with the fitted rig")
         size = (7.0, 1.0 + 1.7 * (rows + 1))
-        name = f"fit_{e + 1}" if several else "fit"
-        drawn[name] = style.picture(draw, size, rows + 1, title=words, sharex=True)
-    of = f" (the first of {len(est.logs)} logs; correlations of all)" if several else ""
+        name = f"fit_{e + 1}" if len(est.logs) > 1 else "fit"
+        drawings[name] = picture(draw, size, rows + 1, title=words, sharex=True)
+    of = f" (the first of {len(est.logs)} logs; correlations of all)" if len(est.logs) > 1 else ""
     words, size = title(f"measured less simulated{of}"), (8.4, 0.9 + 1.9 * rows)
     draw = lambda axes: _residual_axes(axes, fit)
-    drawn["residuals"] = style.picture(draw, size, rows, 2, title=words, squeeze=False)
+    drawings["residuals"] = picture(draw, size, rows, 2, title=words, squeeze=False)
     names, matrix = fit.correlation
     if len(names) > 1:
         side, words = 2.6 + 0.42 * len(names), title("correlation of the estimates")
         draw = lambda ax: plots.correlation(ax, names, matrix)
-        drawn["correlation"] = style.picture(draw, (side + 1.0, side), title=words)
+        drawings["correlation"] = picture(draw, (side + 1.0, side), title=words)
     if fit.profile:
         draw, words = lambda ax: plots.profile(ax, fit.profile), title("profile likelihood")
-        drawn["profile"] = style.picture(draw, (5.2, 3.4), title=words)
-    return drawn
+        drawings["profile"] = picture(draw, (5.2, 3.4), title=words)
+    return drawings
+
+
+LEGEND: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.98)}
+"""Place of a legend: above the axes."""
 
 
 def _fit(axes, fit, e, simulated):
     """Draw log e: readings, simulated (samples, channels), and inputs."""
     from jaxtank.plots import fit as plots
 
-    est, log, legend = fit.estimation, fit.estimation.logs[e], {"loc": "lower right"}
-    legend |= {"bbox_to_anchor": (1.0, 0.98)}
+    est, log = fit.estimation, fit.estimation.logs[e]
     n, validated = log.samples, fit.validation and fit.validation["samples"][e]
     begin = log.t[validated] if fit.validation and validated < n else None
     for c, (name, unit) in enumerate(fit.channels):
         plots.measured(axes[c], log.t, est.data.y[e, :n, c], simulated[:n, c], name, unit, begin)
-    axes[0].legend(ncols=3, **legend)
+    axes[0].legend(ncols=3, **LEGEND)
     plots.inputs(axes[-1], log.t, log.u, fit.case.loop.units[1])
     if log.u.shape[1] > 1:
-        axes[-1].legend(ncols=log.u.shape[1], **legend)
+        axes[-1].legend(ncols=log.u.shape[1], **LEGEND)
     axes[0].figure.align_ylabels(axes)
 
 
@@ -402,7 +365,7 @@ def _residual_axes(axes, fit):
         for ax in axes[c] if c < len(axes) - 1 else ():
             ax.set_xlabel("")
     for ax in axes[0]:
-        ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98))
+        ax.legend(**LEGEND)
     axes[0, 0].figure.align_ylabels(axes)
 
 
@@ -412,9 +375,9 @@ def plan_report(case, experiments, best, plan):
     letters, rows = dict(zip("ABCDEFGH", experiments)), []
     for name in next(iter(experiments.values()))["sd"]:
         value = float(np.asarray(get_value(case.loop, name)))
-        shares = [_share(experiments[one]["sd"][name], value) for one in letters.values()]
-        rows.append([name, Value(value), *shares])
-    conditions = (experiments[one]["condition"] for one in letters.values())
+        deviations = [experiment["sd"][name] for experiment in experiments.values()]
+        rows.append([name, Value(value), *(_share(sd, value) for sd in deviations)])
+    conditions = [experiment["condition"] for experiment in experiments.values()]
     known = [None if c is None or c > 1e15 else c for c in conditions]
     rows.append(["condition of J'J", "", *(Value(c, 3) for c in known)])
     levels = plan["levels"]
@@ -427,7 +390,7 @@ def plan_report(case, experiments, best, plan):
     sections = [
         Text([head]),
         Table(rows, ["parameter", "value", *letters], gap=True),
-        Text([f"{letter}  {one}" for letter, one in letters.items()], gap=True),
+        Text([f"{letter}  {name}" for letter, name in letters.items()], gap=True),
         Text([last], gap=True),
     ]
     return Report(f"{case.name}: planned experiments", last, (), sections)

@@ -7,7 +7,7 @@ import numpy as np
 
 from tuning.problem import provenance
 from tuning.problem.wording import count
-from tuning.report.document import Report, Text, figures_of
+from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
 from tuning.report.tables import Table, Value, clean
 
@@ -26,12 +26,12 @@ def labels(fits):
     return [f"{name} {e + 1}" for e, name in enumerate(fits.logs)]
 
 
-def report(fits, drawn=None):
+def report(fits):
     """Return the Report of Identifications."""
     converged, records = int(fits.converged.sum()), count(len(fits), "record")
     head = (
-        f"{fits.case.name}: {records}, each fitted separately; {converged} converged,"
-        f" {fits.iterations} iterations at most"
+        f"{fits.case.name}: {records}, each fitted separately; {converged} converged, at most"
+        f" {fits.iterations} iterations"
     )
     good = converged == len(fits)
     return Report(
@@ -44,7 +44,6 @@ def report(fits, drawn=None):
             *([_records(fits)] if len(fits) <= LISTED else []),
             Text(_residuals(fits), gap=True),
             Text([f"{fits.wall_s:.1f} s"], gap=True),
-            *figures_of(drawn or {}, CAPTIONS),
         ],
         good,
     )
@@ -53,8 +52,8 @@ def report(fits, drawn=None):
 def _summary(fits):
     """Return the table of the parameters over all records."""
     rows = []
-    for i, (name, unit) in enumerate(zip(fits.names, fits.units)):
-        values, certain = fits.values[:, i], fits.sd[:, i][np.isfinite(fits.sd[:, i])]
+    for name, unit, values, sd in zip(fits.names, fits.units, fits.values.T, fits.sd.T):
+        certain = sd[np.isfinite(sd)]
         spread = values.std(ddof=1) if len(values) > 1 else None
         mean = certain.mean() if certain.size else None
         cells = [Value(values.mean()), Value(spread, 2), Value(mean, 2)]
@@ -65,13 +64,12 @@ def _summary(fits):
 
 def _records(fits):
     """Return the table of the estimates of each record, with their standard deviations."""
-    heads = [f"{n} [{u}]" for n, u in zip(fits.names, fits.units)]
     rows = []
     for e, name in enumerate(labels(fits)):
-        pairs = zip(fits.values[e], fits.sd[e])
-        deviations = ((v, f"sd {sd:.2g}" if np.isfinite(sd) else "no interval") for v, sd in pairs)
-        estimates = [f"{value:.5g} ({sd})" for value, sd in deviations]
+        sd = [f"sd {v:.2g}" if np.isfinite(v) else "no interval" for v in fits.sd[e]]
+        estimates = [f"{value:.5g} ({v})" for value, v in zip(fits.values[e], sd)]
         rows.append([name, "yes" if fits.converged[e] else "NO", *estimates])
+    heads = [f"{n} [{u}]" for n, u in zip(fits.names, fits.units)]
     return Table(rows, ["record", "converged", *heads], gap=True)
 
 
@@ -103,28 +101,24 @@ def json_of(fits):
 def _record(fits, e, name):
     """Return the JSON object of record e."""
     interval = np.isfinite(fits.interval95[e]).all(axis=-1)
+    parameters = {
+        parameter: {
+            "value": fits.values[e, i],
+            "unit": fits.units[i],
+            "sd": fits.sd[e, i],
+            "interval95": fits.interval95[e, i] if interval[i] else None,
+        }
+        for i, parameter in enumerate(fits.names)
+    }
+    levels = zip(fits.levels[e], fits.levels_sd[e])
     return clean(
         {
             "name": name,
-            "converged": bool(fits.converged[e]),
-            "parameters": {
-                parameter: {
-                    "value": float(fits.values[e, i]),
-                    "unit": fits.units[i],
-                    "sd": float(fits.sd[e, i]),
-                    "interval95": fits.interval95[e, i].tolist() if interval[i] else None,
-                }
-                for i, parameter in enumerate(fits.names)
-            },
-            "covariance": fits.covariance[e].tolist(),
-            "initial_levels": [
-                {"value": float(value), "sd": float(sd)}
-                for value, sd in zip(fits.levels[e], fits.levels_sd[e])
-            ],
-            "fit": {
-                "rmse": fits.rmse[e].tolist(),
-                "residual_autocorrelation": fits.autocorrelation[e].tolist(),
-            },
+            "converged": fits.converged[e],
+            "parameters": parameters,
+            "covariance": fits.covariance[e],
+            "initial_levels": [{"value": value, "sd": sd} for value, sd in levels],
+            "fit": {"rmse": fits.rmse[e], "residual_autocorrelation": fits.autocorrelation[e]},
         }
     )
 
@@ -135,15 +129,14 @@ def figures(fits):
 
     columns = min(3, len(fits.names))
     rows = -(-len(fits.names) // columns)
+    record = np.arange(1, len(fits) + 1)
 
     def draw(axes):
-        for i, ax in enumerate(axes.flat):
-            if i >= len(fits.names):
-                ax.set_axis_off()
-                continue
-            record, values = np.arange(1, len(fits) + 1), fits.values[:, i]
-            certain = np.isfinite(fits.interval95[:, i]).all(axis=-1)
-            ax.vlines(record[certain], *fits.interval95[certain, i].T, lw=1.0, color=style.AFTER)
+        style.hide(axes.flat[len(fits.names) :])
+        for i, ax in zip(range(len(fits.names)), axes.flat):
+            values, ends = fits.values[:, i], fits.interval95[:, i]
+            certain = np.isfinite(ends).all(axis=-1)
+            ax.vlines(record[certain], *ends[certain].T, lw=1.0, color=style.AFTER)
             ax.plot(record[certain], values[certain], ".", ms=4, color=style.AFTER)
             ax.plot(record[~certain], values[~certain], "x", ms=4, color=style.BEFORE)
             label = style.plain(f"{fits.names[i]} [{fits.units[i]}]")
@@ -155,10 +148,10 @@ def figures(fits):
 
 def estimates_csv(fits):
     """Return CSV text, a row a record: name, convergence, estimates, deviations, levels."""
-    length = fits.case.loop.units[0]
     heads = ["record", "converged"]
     for name, unit in zip(fits.names, fits.units):
         heads += [f"{name} [{unit}]", f"sd of {name} [{unit}]"]
+    length = fits.case.loop.units[0]
     heads += [f"h{i + 1} at the first sample [{length}]" for i in range(fits.levels.shape[1])]
     heads += [f"RMS residual of {name} [{unit}]" for name, unit in fits.channels]
     out = io.StringIO()
@@ -174,5 +167,9 @@ def estimates_csv(fits):
 
 def save(fits, folder, command=None):
     """Write result.json, estimates.csv, estimates.png and report.html; return their paths."""
-    files, page = {"estimates.csv": estimates_csv(fits)}, lambda drawn: report(fits, drawn)
-    return save_all(folder, json_of(fits), files, lambda: figures(fits), page, command)
+    files, draw, page = (
+        {"estimates.csv": estimates_csv(fits)},
+        lambda: figures(fits),
+        lambda: report(fits),
+    )
+    return save_all(folder, json_of(fits), files, draw, page, CAPTIONS, command)

@@ -16,7 +16,7 @@ from jaxtank.plants.network import TankNetwork
 from jaxtank.presets.paper import Claim, Sample
 from jaxtank.presets.paper import verdict as verdict_of
 from tuning.problem.scenarios import noisy
-from tuning.report.document import Live, Report, Text, figures_of
+from tuning.report.document import Live, Report, Text
 from tuning.report.folder import earlier
 from tuning.report.folder import save as save_all
 from tuning.report.tables import Table, Value, clean
@@ -40,19 +40,18 @@ def runner(paper):
     """Return run(case name, values={}, save_every=1, seed=0) of a paper; each run is made once."""
     # It returns (Case with `values` set, Trajectory as host arrays); `seed` draws the sensor noise.
     # run.cost(name, values={}) is the `cost` of such a case.
-    preset, known = presets.load(paper), {}
+    cases, runs = presets.load(paper).cases, {}
 
     def run(name, values=None, save_every=1, seed=0):
         key = (name, repr(values), save_every, seed)
-        if key not in known:
-            case = rig.set_values(preset.cases[name], values or {})
-            found = lp.simulate(
-                case.loop, case.clock, jax.random.key(seed) if noisy(case) else None, save_every
-            )
-            known[key] = case, jax.tree.map(np.asarray, found)
-        return known[key]
+        if key not in runs:
+            case = rig.set_values(cases[name], values or {})
+            noise = jax.random.key(seed) if noisy(case) else None
+            trajectory = lp.simulate(case.loop, case.clock, noise, save_every)
+            runs[key] = case, jax.tree.map(np.asarray, trajectory)
+        return runs[key]
 
-    run.cost = lambda name, values=None: cost(rig.set_values(preset.cases[name], values or {}))
+    run.cost = lambda name, values=None: cost(rig.set_values(cases[name], values or {}))
     return run
 
 
@@ -68,40 +67,37 @@ def cost(case):
 
 
 def verdict(published, measured):
-    """Return (verdict, measured value or text, reason) of one published quantity."""
-    # measured: number, tuple, Sample, Claim or None. The verdict is one of VERDICTS. A number that
-    # equals the printed one is an input, where no closed form is named: no simulation agrees with a
-    # rounded number to 1e-9.
-    reason = published.reason
-    if isinstance(measured, Claim):
-        near = measured.verdict != "not reproduced"
-        if near and published.fitted:
-            return FITTED, measured.text, f"{published.fitted}; {reason}".rstrip("; ")
-        if measured.verdict == REPRODUCED:
-            return REPRODUCED, measured.text, ""  # the text has the numbers
-        return DIFFERS, measured.text, f"in part: {reason}" if near else reason
+    """Return (one of VERDICTS, measured value or text, reason) of one published quantity, for which
+    a number, a tuple, a Sample, a Claim or None was measured.
+    """
+    reason, fitted = published.reason, published.fitted
     if measured is None:
         return IMPOSSIBLE, None, reason
-    seeds = len(measured.values) if isinstance(measured, Sample) else 0
-    measured = measured.mean if isinstance(measured, Sample) else measured
-    same = isinstance(published.value, str) or _same(published.value, measured)
-    if same and not published.closed_form:
-        return INPUT, measured, VERDICTS[INPUT]
+    if isinstance(measured, Claim):
+        if measured.verdict == "not reproduced":
+            return DIFFERS, measured.text, reason
+        if fitted:
+            return FITTED, measured.text, f"{fitted}; {reason}".rstrip("; ")
+        if measured.verdict == REPRODUCED:
+            return REPRODUCED, measured.text, ""  # the text has the numbers
+        return DIFFERS, measured.text, f"in part: {reason}"
+    value = measured.mean if isinstance(measured, Sample) else measured
+    if isinstance(published.value, str):
+        return INPUT, value, VERDICTS[INPUT]
+    printed, values = (np.ravel(v).astype(float) for v in (published.value, value))
+    # No simulation agrees with a rounded number to 1e-9: it was set, unless a closed form is named.
+    if not published.closed_form and _same(printed, values):
+        return INPUT, value, VERDICTS[INPUT]
+    apart = np.abs(values - printed) if values.shape == printed.shape else np.inf
+    if not np.all(apart <= (published.tolerance or 0.0) * np.abs(printed)):
+        return DIFFERS, value, reason
     if published.tolerance is None:
-        return DIFFERS, measured, reason
-    printed, values = np.ravel(published.value).astype(float), np.ravel(measured).astype(float)
-    if printed.shape != values.shape:
-        return DIFFERS, measured, reason
-    apart = np.abs(values - printed)
-    if not np.all(apart <= published.tolerance * np.abs(printed)):
-        return DIFFERS, measured, reason
-    apart = max((a / abs(v) for a, v in zip(apart, printed) if v), default=0.0)
+        return DIFFERS, value, reason
+    apart = max((abs(v / p - 1.0) for v, p in zip(values, printed) if p), default=0.0)
     within = f"within {100 * published.tolerance:g} %: largest difference {100 * apart:.1f} %"
-    if seeds:
-        within += f" (mean of {seeds} seeds of the noise)"
-    if published.fitted:
-        return FITTED, measured, f"{published.fitted}; {within}"
-    return REPRODUCED, measured, within
+    if isinstance(measured, Sample):
+        within += f" (mean of {len(measured.values)} seeds of the noise)"
+    return (FITTED, value, f"{fitted}; {within}") if fitted else (REPRODUCED, value, within)
 
 
 def measure(paper):
@@ -116,16 +112,14 @@ def measure(paper):
     # has it. Raises InputError for an unknown paper, and KeyError if the preset measures something
     # that it does not list as published.
     preset = presets.load(paper)
-    found = preset.measured(runner(paper))
-    stray = set(found) - set(preset.published)
-    if stray:
-        raise KeyError(
-            f"{paper} measures what is not in its published quantities: {', '.join(sorted(stray))}"
-        )
+    measured = preset.measured(runner(paper))
+    if stray := set(measured) - set(preset.published):
+        names = ", ".join(sorted(stray))
+        raise KeyError(f"{paper} measures what is not in its published quantities: {names}")
     rows = []
     for name, printed in preset.published.items():
-        value = found.get(name)
-        word, shown, reason = verdict(printed, _set_in(preset, name) if value is None else value)
+        value = measured.get(name)
+        word, number, reason = verdict(printed, _set_in(preset, name) if value is None else value)
         by_ramp = value.by_ramp if isinstance(value, Claim) else {}
         rows.append(
             {
@@ -134,7 +128,7 @@ def measure(paper):
                 "unit": printed.unit,
                 "where": printed.where,
                 "published": clean(printed.value),
-                "measured": clean(shown),
+                "measured": clean(number),
                 "deviation": clean(value.deviation) if isinstance(value, Sample) else None,
                 "verdict": word,
                 "reason": reason,
@@ -152,13 +146,11 @@ def headline(rows):
     {"numbers" and "claims": {"reproduced", "fitted", "differs", "of"}, "input", "not
     reproducible"}: numbers of rows, where "of" is the sum of the three before it.
     """
-    counts = {}
+    counts, tally = {}, Counter((row["kind"], row["verdict"]) for row in rows)
     for name, kind in (("numbers", NUMBER), ("claims", CLAIM)):
-        tally = Counter(row["verdict"] for row in rows if row["kind"] == kind)
-        counts[name] = {word: tally[word] for word in (REPRODUCED, FITTED, DIFFERS)}
+        counts[name] = {word: tally[kind, word] for word in (REPRODUCED, FITTED, DIFFERS)}
         counts[name]["of"] = sum(counts[name].values())
-    tally = Counter(row["verdict"] for row in rows)
-    return counts | {word: tally[word] for word in (INPUT, IMPOSSIBLE)}
+    return counts | {w: tally[NUMBER, w] + tally[CLAIM, w] for w in (INPUT, IMPOSSIBLE)}
 
 
 def headline_text(rows):
@@ -191,9 +183,9 @@ def ramps(rows):
 def ramps_text(rows):
     """Return `ramps` as lines."""
     return [
-        f"with setpoint ramps of {one['ramp_s']:g} s: {one['reproduced']} of {one['of']} claims"
-        f" that depend on them hold, not {', '.join(one['differs']) or 'one fails'}"
-        for one in ramps(rows)
+        f"with setpoint ramps of {row['ramp_s']:g} s: {row['reproduced']} of {row['of']} claims"
+        f" that depend on them hold, not {', '.join(row['differs']) or 'one fails'}"
+        for row in ramps(rows)
     ]
 
 
@@ -212,10 +204,10 @@ def _set_in(preset, name):
     return None
 
 
-def _same(printed, found):
-    """Return whether the value is the printed one (equal entries count as one number)."""
-    a, b = np.ravel(printed).astype(float), np.ravel(found).astype(float)
-    return a.size in (1, b.size) and bool(np.all(np.abs(b - a) <= SAME * np.abs(a)))
+def _same(printed, values):
+    """Return whether the values are the printed ones (equal entries count as one number)."""
+    fits = printed.size in (1, values.size)
+    return fits and bool(np.all(np.abs(values - printed) <= SAME * np.abs(printed)))
 
 
 def _cell(value):
@@ -237,22 +229,20 @@ def _reason(row):
     return "; ".join(filter(None, [row["reason"], f"ramps of {ramp:g} s" if ramp else ""]))
 
 
-def report(pages, drawn=None, captions=None):
+def report(pages):
     """Return the Report of {paper: page}."""
     rows = [row for page in pages.values() for row in page["rows"]]
     tally = Counter(row["verdict"] for row in rows)
     verdicts = [word for word in VERDICTS if tally[word]]
     head = [Text([f"all papers: {headline_text(rows)}"], on="terminal")] if len(pages) > 1 else []
-    meanings = Text([f"{word}: {VERDICTS[word]}" for word in verdicts], items=True, on="page")
     return Report(
         f"{', '.join(pages)}: published and measured",
         headline_text(rows),
         [(word, tally[word]) for word in verdicts],
         [
             *head,
-            meanings,
+            Text([f"{word}: {VERDICTS[word]}" for word in verdicts], items=True, on="page"),
             *(section for page in pages.values() for section in _sections(page)),
-            *figures_of(drawn or {}, captions or {}),
             *(Live(next(iter(presets.load(p).cases.values()))) for p in pages),
         ],
         subtitle="Published numbers, those of the same rigs and controllers here, and why they"
@@ -262,16 +252,18 @@ def report(pages, drawn=None, captions=None):
 
 def _sections(page):
     """The sections of one paper: on a terminal long texts stand below the table."""
-    rows, ramped, notes = [], ramps_text(page["rows"]), []
+    brief, full, notes, ramped = [], [], [], ramps_text(page["rows"])
+    shorten = lambda cell: textwrap.shorten(str(cell), 60, placeholder=" ...")
     for r in page["rows"]:
-        published, measured = _cell(r["published"]), _measured(r)
-        rows.append([r["quantity"], r["unit"], published, measured, r["verdict"]])
+        published, measured, reason = _cell(r["published"]), _measured(r), _reason(r)
+        brief.append(
+            [r["quantity"], r["unit"], shorten(published), shorten(measured), r["verdict"]]
+        )
+        cells = [r["quantity"], r["unit"], published, measured, r["verdict"], r["where"], reason]
+        full.append(cells)
         claim = r["measured"] if isinstance(r["measured"], str) else ""
-        if note := "; ".join(filter(None, [claim, _reason(r)])):
+        if note := "; ".join(filter(None, [claim, reason])):
             notes.append(f"{r['quantity']} ({r['where']}): {note}")
-    short = lambda cell: textwrap.shorten(str(cell), 60, placeholder=" ...")
-    brief = [[q, unit, short(a), short(b), word] for q, unit, a, b, word in rows]
-    full = [[*row, r["where"], _reason(r)] for row, r in zip(rows, page["rows"])]
     heads = ["quantity", "unit", "published", "measured", "verdict"]
     head = [page["citation"], f"notes: {presets.load(page['paper']).notes}"]
     return [
@@ -285,30 +277,33 @@ def _sections(page):
 
 def save(pages, folder, command=None):
     """Write result.json, report.html and the rigs of {paper: page}; return their paths."""
+    captions = {"published": OVERVIEW}
+    draw, page = lambda: overview(pages) | _rigs(pages, captions), lambda: report(pages)
+    old = [path.stem for paper in presets.PAPERS for path in Path(folder).glob(f"rig-{paper}*.png")]
+    payload, stale = pages, earlier(folder, [*old, "published"])
+    if len(pages) == 1:
+        (payload,) = pages.values()
+    versions = {"jaxtank": jaxtank.__version__, "jax": jax.__version__, "numpy": np.__version__}
+    return save_all(folder, payload, {}, draw, page, captions, command, stale, versions)
+
+
+def _rigs(pages, captions):
+    """{name: drawing} of each different rig of the papers; their captions are added to a dict."""
     from jaxtank.plots import run as plots
 
-    captions = {"published": OVERVIEW}
-
-    def draw():
-        drawn = overview(pages)
-        for paper, page in pages.items():
-            topologies = []
-            for name, case in presets.load(paper).cases.items():
-                plant = cast(TankNetwork, case.loop.plant)  # as every preset's
-                parts = (plant.links, plant.pipes, plant.feeds, plant.spills, plant.outputs)
-                topology = (*parts, np.asarray(plant.rim).tolist())
-                if topology not in topologies:  # cases of one paper share their rig, but for some
-                    topologies.append(topology)
-                    of = f"rig-{paper}" + f"-{len(topologies)}" * (len(topologies) > 1)
-                    drawn[of] = plots.rig(plant, None, f"{paper}/{name}")["rig"]
-                    captions[of] = f"The rig of {paper}/{name}. {page['citation']}"
-        return drawn
-
-    old = [path.stem for paper in presets.PAPERS for path in Path(folder).glob(f"rig-{paper}*.png")]
-    payload = pages if len(pages) > 1 else next(iter(pages.values()))
-    made = {"jaxtank": jaxtank.__version__, "jax": jax.__version__, "numpy": np.__version__}
-    page, stale = lambda drawn: report(pages, drawn, captions), earlier(folder, [*old, "published"])
-    return save_all(folder, payload, {}, draw, page, command, stale, made)
+    drawings = {}
+    for paper, page in pages.items():
+        topologies = []
+        for name, case in presets.load(paper).cases.items():
+            plant = cast(TankNetwork, case.loop.plant)  # as every preset's
+            parts = (plant.links, plant.pipes, plant.feeds, plant.spills, plant.outputs)
+            topology = (*parts, np.asarray(plant.rim).tolist())
+            if topology not in topologies:  # cases of one paper share their rig, but for some
+                topologies.append(topology)
+                of = f"rig-{paper}" + f"-{len(topologies)}" * (len(topologies) > 1)
+                drawings[of] = plots.rig(plant, None, f"{paper}/{name}")["rig"]
+                captions[of] = f"The rig of {paper}/{name}. {page['citation']}"
+    return drawings
 
 
 OVERVIEW = (
@@ -322,23 +317,20 @@ def overview(pages):
     from jaxtank.plots import style
 
     rows = [(paper, row, _ratios(row)) for paper, page in pages.items() for row in page["rows"]]
-    rows = [one for one in rows if one[2].size]
-    verdicts = {row["verdict"] for _, row, _ in rows}
+    rows = [row for row in rows if row[2].size]
     looks = {REPRODUCED: (style.AFTER, "o"), FITTED: ("#E69F00", "s"), DIFFERS: (style.BEFORE, "X")}
 
     def draw(ax):
         for k, (_, row, ratios) in enumerate(rows):
             colour, marker = looks[row["verdict"]]
-            ax.plot(ratios, [k] * len(ratios), marker, color=colour, markersize=5, alpha=0.8)
+            points = {"color": colour, "markersize": 5, "alpha": 0.8, "label": row["verdict"]}
+            ax.plot(ratios, [k] * len(ratios), marker, **points)
         ax.axvline(1.0, color=style.REFERENCE, linewidth=1.0)
         ax.set_xscale("log")
         ax.set(xlabel="measured / published [-]", ylim=(len(rows) - 0.4, -0.6))
         start = (lambda paper: f"{paper}: ") if len(pages) > 1 else (lambda paper: "")
         names = [start(paper) + style.plain(row["quantity"]) for paper, row, _ in rows]
         ax.set_yticks(range(len(rows)), names, fontsize=7)
-        for word, (colour, marker) in looks.items():
-            if word in verdicts:
-                ax.plot([], [], marker, color=colour, label=word)
 
     size = (7.2 if len(pages) > 1 else 6.0, 0.8 + 0.2 * len(rows))
     return {"published": style.picture(draw, size, legend=3)} if rows else {}
@@ -368,12 +360,10 @@ def markdown(pages):
         lines += [f"  - {line}" for line in ramps_text(page["rows"])]
     lines += ["", "| paper | quantity | published | measured | verdict |", "|---|---|---|---|---|"]
     for paper, r in ((paper, r) for paper, page in pages.items() for r in page["rows"]):
-        if r["verdict"] in (INPUT, IMPOSSIBLE):
-            continue
-        unit = f" {r['unit']}" if r["unit"] else ""
-        mine = f"{_measured(r)}" + ("" if isinstance(r["measured"], str) else unit)
-        theirs = f"{_cell(r['published'])}" + ("" if isinstance(r["published"], str) else unit)
-        why = f": {_reason(r)}" if _reason(r) else ""
-        cells = (paper, r["quantity"], theirs, mine, r["verdict"] + why)
-        lines.append(f"| {' | '.join(c.replace('|', chr(92) + '|') for c in cells)} |")
+        if r["verdict"] not in (INPUT, IMPOSSIBLE):
+            sides = (("published", _cell(r["published"])), ("measured", _measured(r)))
+            cells = [f"{v} {r['unit'] if not isinstance(r[k], str) else ''}" for k, v in sides]
+            why = f": {_reason(r)}" if _reason(r) else ""
+            cells = [paper, r["quantity"], *map(str.rstrip, cells), r["verdict"] + why]
+            lines.append(f"| {' | '.join(c.replace('|', chr(92) + '|') for c in cells)} |")
     return "\n".join(lines)

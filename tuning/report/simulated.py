@@ -1,5 +1,6 @@
 """The report of a simulated run: text, stability margins, pictures, page, film and folder."""
 
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -12,7 +13,8 @@ from jaxtank.core.units import local
 from jaxtank.limits import resolve_limits
 from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv, stride
-from tuning.report.document import Live, Report, Text, failed, figures_of
+from tuning.problem import provenance
+from tuning.report.document import Live, Report, Text, failed
 from tuning.report.folder import save as save_all
 from tuning.report.tables import (
     MANY,
@@ -20,9 +22,13 @@ from tuning.report.tables import (
     Value,
     clean,
     entries,
+    limit_table,
     measure_table,
+    measures_json,
     number,
+    reasons,
     undefined,
+    units,
 )
 
 CAPTIONS = {
@@ -44,51 +50,73 @@ def run_for_people(case, key=None, rows=3000):
     return jax.tree.map(np.asarray, lp.simulate(case.loop, case.clock, key, save_every=every))
 
 
-def report(case, values, plateaus=None, drawn=None):
+def json_of_run(case, values, seed, plateaus=None):
+    """Return the JSON object of `jaxtank simulate --json`."""
+    payload = {
+        "case": case.name,
+        "measures": measures_json(values),
+        "units": units(case.loop.units),
+        "reasons": reasons(values),
+        "clock": dataclasses.asdict(case.clock),
+        "parameters": clean(lp.parameters(case.loop)),
+        "provenance": provenance.provenance(case, seed),
+    }
+    return payload if plateaus is None else {**payload, "margins": margins_json(plateaus)}
+
+
+def report(case, values, plateaus=None):
     """Return the Report of a run with the measures `values`."""
-    rows, loop = _limits(case, values), case.loop
-    broken = [words for words, margin in rows if not margin >= 0.0]
+    loop, limits = case.loop, _limits(case, values)
+    broken = [limit for limit in limits if not limit["margin"] >= 0.0]
     facts = [
         (name, f"{entries(name, values[name])} {ms.unit(name, loop.units)}".strip())
         for name in case.objective
         if name in values
     ]
     facts += [("length", f"{case.clock.duration:g} s"), ("sampled every", f"{case.clock.dt:g} s")]
-    sections = [
-        Live(case),
-        Text([f"{case.name}: {case.title}"], on="terminal"),
+    sections = [Live(case), Text([f"{case.name}: {case.title}"], on="terminal")]
+    if limits:
+        table = limit_table(limits if len(limits) <= MANY else limits[:WORST])
+        more = len(limits) - len(table.rows)
+        sections.append(dataclasses.replace(table, on="page"))
+        sections.append(Text([f"{more} further limits have larger margins"][:more], on="page"))
+    sections += [
         measure_table(values, loop.units, gap=True),
         Text(undefined(values)),
         *(_margins(loop, plateaus) if plateaus is not None else ()),
-        Text([words for words, _ in rows], items=True, on="page"),
-        *figures_of(drawn or {}, CAPTIONS),
     ]
     if loop.safety_filter is not None:
         words = "The safety filter is on: jaxtank show prints what is proved of each tank."
         sections.append(Text([words], gap=True, on="terminal"))
-    verdict = "; ".join(broken) if broken else "every limit holds" if rows else "no limits"
+    verdict = "every limit holds" if limits else "no limits"
+    if broken:
+        verdict = "; ".join(map(_passed, broken[:WORST]))
     return Report(case.name, verdict, facts, sections, not broken, case.title)
 
 
+def _passed(limit):
+    """A sentence on a limit that does not hold."""
+    value, most = (f"{number(limit[k])} {limit['unit']}" for k in ("value", "limit"))
+    return f"{limit['name']}: {value}, the limit of {most} is passed"
+
+
 def _limits(case, values):
-    """[(sentence, margin)] of the limits that the measures show."""
-    rows = []
-    for limit in resolve_limits(case):
-        if limit.measure in values:
-            margin = limit.margin(values)
-            value = float(np.ravel(values[limit.measure])[limit.index])
-            side = "holds" if margin >= 0.0 else "is passed"
-            unit = ms.unit(limit.measure, case.loop.units)
-            most = f"{number(float(limit.value))} {unit}"
-            words = f"{limit.label}: {number(value)} {unit}, the limit of {most} {side}"
-            rows.append((words, margin))
-    if len(rows) > MANY:  # the tightest ones
-        rows = sorted(rows, key=lambda row: row[1])
-        rows, rest = rows[:WORST], rows[WORST:]
-        passed = sum(not margin >= 0.0 for _, margin in rest)
-        words = f"{len(rest)} further limits have larger margins"
-        rows.append((words + (f", and {passed} of them are passed" if passed else ""), rest[0][1]))
-    return rows
+    """The rows of `limit_table` of a run, the tightest first."""
+    rows = [
+        {
+            "name": limit.label,
+            "measure": limit.measure,
+            "unit": ms.unit(limit.measure, case.loop.units),
+            "limit": float(limit.value),
+            "value": float(np.ravel(values[limit.measure])[limit.index]),
+            "margin": limit.margin(values),
+            "reason": None if np.isfinite(limit.margin(values)) else "undefined",
+            "time_s": None,
+        }
+        for limit in resolve_limits(case)
+        if limit.measure in values
+    ]
+    return sorted(rows, key=lambda row: row["margin"])
 
 
 def margins_json(plateaus):
@@ -124,15 +152,13 @@ def _margins(loop, plateaus):
     return [Text([title], gap=True), *([Table(rows, heads)] if rows else []), Text(notes)]
 
 
-def save(
-    case, run, payload, folder, page=None, command=None, gif=False, against=None, columns=None
-):
+def save(case, run, payload, folder, page, command=None, gif=False, against=None, columns=None):
     """Write result.json, trajectory.csv, pictures and report.html of one simulation to `folder`,
     from which those of an earlier one are removed; if asked, a film and the responses for a
     journal of `columns`.
     """
-    # page: function of the pictures that returns the Report; against: (Case, Trajectory) of a rig
-    # that the film, run.gif, and its still, film.png, show beside it.
+    # page: function that returns the Report; against: (Case, Trajectory) of a rig that the film,
+    # run.gif, and its still, film.png, show beside it.
     from jaxtank.plots import responses
 
     check_folder(folder)
@@ -149,7 +175,7 @@ def save(
         }
 
     files = {"trajectory.csv": csv(run, case.loop.units)}
-    written = save_all(folder, payload, files, draw, page, command, stale)
+    written = save_all(folder, payload, files, draw, page, CAPTIONS, command, stale)
     if columns is not None:
         written += _for_journal(case, run, folder, columns)
     if gif:
@@ -177,9 +203,10 @@ def _for_journal(case, run, folder, columns):
     """Write the responses of a run for a journal; returns the paths."""
     from jaxtank.plots import responses
     from jaxtank.plots.run import save_for_print
+    from jaxtank.plots.style import for_print
 
     try:
-        with responses.for_print(columns):
+        with for_print(columns):
             figure = responses.responses(case.loop, {case.name: run})
         return save_for_print({"print": figure}, folder, columns)
     except InputError:

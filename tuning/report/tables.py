@@ -44,15 +44,14 @@ class Value:
 
     def __str__(self):
         values = np.ravel(np.asarray(self.value, dtype=float))
-        shown = [number(v, self.digits) if math.isfinite(v) else self.missing for v in values]
-        text = self.between.join(shown)
+        texts = [number(v, self.digits) if math.isfinite(v) else self.missing for v in values]
+        text = self.between.join(texts)
         return f"{text} {self.unit}" if self.unit and np.isfinite(values).any() else text
 
 
 def numbers(value, digits=5):
-    """Return the entries of a measure; "none" for one that is undefined."""
-    # A dash would read as the sign of the entry after it.
-    return Value(value, digits, missing="none")
+    """Return the entries of a measure; "none", not a dash, for one that is undefined."""
+    return Value(value, digits, missing="none")  # a dash reads as the sign of the next entry
 
 
 def entries(measure, value):
@@ -118,6 +117,26 @@ def measure_table(values, rig_units=DEFAULT, gap=False):
     return Table(rows, ["measure", "unit", "value", ""], gap)
 
 
+def limit_table(rows, gap=False):
+    """Return the Table of limits, rows of {"name", "measure", "unit", "limit", "value", "margin",
+    "reason", "time_s"}.
+    """
+    timed = any(row["time_s"] is not None for row in rows)
+    cells = [
+        [
+            row["name"],
+            row["unit"],
+            (">= " if ms.MEASURES[row["measure"]].sense < 0 else "<= ") + number(row["limit"], 7),
+            Value(row["value"], 7),
+            Value(row["margin"], 3) if row["reason"] is None else "undefined",
+            *(["-" if row["time_s"] is None else f"{row['time_s']:.2f} s"] if timed else []),
+        ]
+        for row in rows
+    ]
+    heads = ["limit", "unit", "limit", "value", "margin", *(["reached at"] if timed else [])]
+    return Table(cells, heads, gap)
+
+
 def undefined(measures):
     """Return sentences: why entries of {measure: value} are printed as "none"."""
     return [
@@ -156,6 +175,11 @@ def measures_json(measures):
     return {**dict.fromkeys(_unserved()), **clean(known)}
 
 
+def fields(result, names):
+    """Return {name: value of that attribute, as JSON takes it} of several names in one text."""
+    return {name: clean(getattr(result, name)) for name in names.split()}
+
+
 def dumps(table):
     """Return one JSON object as text; ValueError for NaN."""
     return json.dumps(table, indent=2, allow_nan=False)
@@ -170,10 +194,3 @@ def objective_unit(terms, rig_units=DEFAULT):
     """Return the unit of a weighted sum: that of its measures where they share one, else "-"."""
     shared = {ms.unit(m, rig_units) for m in terms}
     return shared.pop() if len(shared) == 1 else "-"
-
-
-def cost_unit(result):
-    """Return the unit of the objective of a TuningResult."""
-    # Of a default answer: that of the squared error, which the price on input changes has too.
-    unit = result.answer and result.answer.setting.cost_unit
-    return unit or objective_unit(result.objective["terms"], result.tuned.loop.units)

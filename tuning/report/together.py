@@ -16,25 +16,19 @@ from jaxtank.loop.trajectory import csv
 from tuning.problem import provenance, reported
 from tuning.problem.scenarios import noisy
 from tuning.problem.wording import count, numbered
-from tuning.report.document import Report, Text, figures_of
+from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
-from tuning.report.simulated import run_for_people
-from tuning.report.tables import (
-    Table,
-    Value,
-    clean,
-    entries,
-    measures_json,
-    reasons,
-    undefined,
-    units,
-)
+from tuning.report.simulated import json_of_run, run_for_people
+from tuning.report.tables import Table, Value, entries, undefined
 
 MOST = 6
 """Cases in one picture: as many as have a colour of their own."""
 
 PARTS = {"plant": "plant", "reference": "setpoints", "actuator": "pumps", "x0": "start"}
 """{part of a loop in which cases may differ: what it is called}."""
+
+SHARED = {"disturbance": "disturbances", "faults": "faults", "sensor": "sensor"}
+"""The same of the parts that all cases have from the first."""
 
 CAPTIONS = {"responses": "The runs over each other, on the rims and limits of the first case."}
 
@@ -49,24 +43,19 @@ class Run(NamedTuple):
 
 def run_together(cases: list[Case], seed: int = 0) -> list[Run]:
     """Return the runs of cases under the disturbances, faults and noise of the first."""
-    first = _checked(cases)[0]
-    found = []
+    _check(cases)
+    first, runs = cases[0], []
     for case in cases:
-        loop = dataclasses.replace(
-            case.loop,
-            disturbance=first.loop.disturbance,
-            faults=first.loop.faults,
-            sensor=first.loop.sensor,
-        )
-        same = case.replace(loop=loop)
+        shared = {part: getattr(first.loop, part) for part in SHARED}
+        same = case.replace(loop=dataclasses.replace(case.loop, **shared))
         key = jax.random.key(seed) if noisy(same) else None
-        values = dict(reported.run_measures(loop, case.clock, key))
-        found.append(Run(same, values, _differences(first, case)))
-    return found
+        values = dict(reported.run_measures(same.loop, case.clock, key))
+        runs.append(Run(same, values, _differences(first, case)))
+    return runs
 
 
-def _checked(cases):
-    """The cases; InputError where they cannot be drawn over each other."""
+def _check(cases):
+    """Raise InputError where cases cannot be drawn over each other."""
     names = [case.name for case in cases]
     for name in names:
         if names.count(name) > 1:
@@ -74,13 +63,12 @@ def _checked(cases):
     if len(cases) > MOST:
         raise InputError(f"{len(cases)} cases: at most {MOST} can be told apart in one picture")
     for case in cases[1:]:
-        for mine, own in zip(_sizes(case), _sizes(cases[0])):
-            if mine != own:
+        for size, first in zip(_sizes(case), _sizes(cases[0])):
+            if size != first:
                 raise InputError(
-                    f"{case.name} has {mine} and {names[0]} has {own}: cases on one page must have"
-                    " the same tanks, outputs, pumps, units and length"
+                    f"{case.name} has {size} and {names[0]} has {first}: cases on one page must"
+                    " have the same tanks, outputs, pumps, units and length"
                 )
-    return cases
 
 
 def _sizes(case):
@@ -96,43 +84,35 @@ def _sizes(case):
 
 
 def _differences(first, case):
-    """Words for the parts in which a case differs from the first, besides its controller."""
-    words = [
-        word
-        for part, word in PARTS.items()
-        if not _equal(getattr(first.loop, part), getattr(case.loop, part))
-    ]
+    """Words for the parts in which a case differs from the first, other than its controller."""
+    differ = lambda part: not _equal(getattr(first.loop, part), getattr(case.loop, part))
+    words = [word for part, word in PARTS.items() if differ(part)]
     if first.clock.dt != case.clock.dt:
         words.append(f"sampling period ({case.clock.dt:g} s for {first.clock.dt:g} s)")
-    for part, word in (("disturbance", "disturbances"), ("faults", "faults"), ("sensor", "sensor")):
-        if not _equal(getattr(first.loop, part), getattr(case.loop, part)):
-            words.append(f"{word} (those of {first.name} are used)")
-    return tuple(words)
+    used = f"(those of {first.name} are used)"
+    return (*words, *(f"{word} {used}" for part, word in SHARED.items() if differ(part)))
 
 
-def _equal(one, other):
+def _equal(a, b):
     """Whether two parts of a loop have the same structure and numbers."""
-    if jax.tree.structure(one) != jax.tree.structure(other):
+    if jax.tree.structure(a) != jax.tree.structure(b):
         return False
-    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other))
-    return all(np.shape(a) == np.shape(b) and np.array_equal(a, b) for a, b in pairs)
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b))
+    return all(np.shape(x) == np.shape(y) and np.array_equal(x, y) for x, y in pairs)
 
 
-def report(runs: list[Run], drawn: Any = None) -> Report:
+def report(runs: list[Run]) -> Report:
     """Return the Report of several runs: measures, a column for each case, and what differs."""
-    of_rig = runs[0].case.loop.units
-    shown = [m for m in ms.MEASURES if all(m in r.measures for r in runs) and m not in ms.times()]
-    rows = [[m, ms.unit(m, of_rig), *(entries(m, run.measures[m]) for run in runs)] for m in shown]
-    words = []
+    units, words, errors = runs[0].case.loop.units, [], []
+    listed = [m for m in ms.MEASURES if all(m in r.measures for r in runs) and m not in ms.times()]
+    rows = [[m, ms.unit(m, units), *(entries(m, r.measures[m]) for r in runs)] for m in listed]
     for run in runs:
         words += [f"{run.case.name}: {line}" for line in undefined(run.measures)]
         if run.differs:
             words.append(f"{run.case.name} has its own {', '.join(run.differs)}")
-    errors = [
-        (run.case.name, f"{Value(run.measures['rms_error_total'], 4, of_rig[0])} rms error")
-        for run in runs
-        if "rms_error_total" in run.measures
-    ]
+        if "rms_error_total" in run.measures:
+            error = Value(run.measures["rms_error_total"], 4, units[0])
+            errors.append((run.case.name, f"{error} rms error"))
     return Report(
         f"{len(runs)} cases",
         "the disturbances, faults and sensor noise of the first case for all",
@@ -141,7 +121,6 @@ def report(runs: list[Run], drawn: Any = None) -> Report:
             Table(rows, ["measure", "unit", *(r.case.name for r in runs)]),
             Text(words, on="terminal"),
             Text(words, items=True, on="page"),
-            *figures_of(drawn or {}, CAPTIONS),
         ],
         subtitle=", ".join(run.case.name for run in runs),
     )
@@ -149,21 +128,9 @@ def report(runs: list[Run], drawn: Any = None) -> Report:
 
 def json_of(runs: list[Run], seed: int) -> dict[str, Any]:
     """Return {"cases": one object for each, as of a single run, with "differs"}."""
-    rows = []
-    for run in runs:
-        loop = run.case.loop
-        rows.append(
-            {
-                "case": run.case.name,
-                "measures": measures_json(run.measures),
-                "units": units(loop.units),
-                "reasons": reasons(run.measures),
-                "clock": dataclasses.asdict(run.case.clock),
-                "parameters": clean(reported.lp.parameters(loop)),
-                "differs": list(run.differs),
-                "provenance": provenance.provenance(run.case, seed),
-            }
-        )
+    rows = [
+        {**json_of_run(run.case, run.measures, seed), "differs": list(run.differs)} for run in runs
+    ]
     return {"cases": rows}
 
 
@@ -173,14 +140,15 @@ def save(runs: list[Run], folder: str | Path, seed: int, command: str | None = N
 
     check_folder(folder)
     keys = [jax.random.key(seed) if noisy(run.case) else None for run in runs]
-    drawn = {r.case.name: run_for_people(r.case, key) for r, key in zip(runs, keys)}
-    loop, title, payload = runs[0].case.loop, ", ".join(drawn), json_of(runs, seed)
-    files = {_file_of(name): csv(run, loop.units) for name, run in drawn.items()}
-    draw = lambda: {"responses": responses.responses(loop, drawn, title)}
-    page, made = lambda pictures: report(runs, pictures), payload["cases"][0]["provenance"]
-    return save_all(folder, payload, files, draw, page, command, provenance=made)
-
-
-def _file_of(name: str) -> str:
-    """The CSV file of a case: its name without what a file name cannot hold."""
-    return f"{re.sub(r'[^A-Za-z0-9._-]+', '-', name).strip('.-') or 'case'}.csv"
+    trajectories = {r.case.name: run_for_people(r.case, key) for r, key in zip(runs, keys)}
+    loop, title, of = (
+        runs[0].case.loop,
+        ", ".join(trajectories),
+        provenance.provenance(runs[0].case, seed),
+    )
+    # without what a file name cannot hold
+    file = lambda name: re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip(".-") or "case"
+    files = {f"{file(name)}.csv": csv(run, loop.units) for name, run in trajectories.items()}
+    draw = lambda: {"responses": responses.responses(loop, trajectories, title)}
+    payload, page = json_of(runs, seed), lambda: report(runs)
+    return save_all(folder, payload, files, draw, page, CAPTIONS, command, provenance=of)

@@ -12,8 +12,8 @@ from jaxtank import measures as ms
 from jaxtank.loop.trajectory import csv
 from tuning.problem.problem import TAIL
 from tuning.problem.wording import numbered
-from tuning.report import optimal_input
-from tuning.report.document import Live, Report, Text, figures_of, terminal
+from tuning.report import feasible, optimal_input
+from tuning.report.document import Live, Report, Text, terminal
 from tuning.report.folder import earlier, rig_text
 from tuning.report.folder import save as save_all
 from tuning.report.safety import PROMISE, start_of
@@ -22,7 +22,8 @@ from tuning.report.tables import (
     Table,
     Value,
     clean,
-    cost_unit,
+    fields,
+    limit_table,
     measures_json,
     number,
     numbers,
@@ -36,9 +37,6 @@ from tuning.search.setting import limited_levels
 
 COSTLIEST, MANY = 5, 12
 """Scenarios in a table that would have more than MANY rows."""
-
-MATTERS = 0.05
-"""Share of the plants that a need must concern to be a row [-]."""
 
 SIDES = ("before", "after")
 
@@ -63,61 +61,73 @@ CAPTIONS = {
 
 def json_of(result):
     """The JSON object of `jaxtank tune --json`."""
-    answer = result.answer
-    parts: dict[str, Any] = dict.fromkeys(("holds", "feasibility", "answer"))
-    if answer is not None:
-        feasibility = None if answer.feasibility is None else answer.feasibility.to_json()
-        parts = {"holds": answer.holds(), "feasibility": feasibility, "answer": answer.to_json()}
+    answer, measures = result.answer, result.measures
+    feasibility = None if answer is None else answer.feasibility
     return {
         "case": result.tuned.name,
-        "method": result.method,
-        "success": result.success,
         "status": str(result.status),
-        "headline": result.headline,
-        "message": result.message,
+        "verdict": {"good": result.success, "sentence": verdict(result)},
+        **fields(result, "method success headline message evaluations wall_s starts symmetry"),
+        **fields(result, "choices optimality curvature tradeoff validation provenance"),
         "messages": [{"code": m.code, "text": m.text} for m in result.messages],
         "parameters": {n: {**clean(p), "interval": None} for n, p in result.parameters.items()},
         "interval_reason": "no measurements were fitted, so there is no confidence interval",
         "objective": {k: clean(result.objective[k]) for k in ("before", "after", "terms")},
-        "measures": {side: measures_json(result.measures[side]) for side in SIDES},
-        "reasons": {**reasons(result.measures["before"]), **reasons(result.measures["after"])},
+        "measures": {side: measures_json(measures[side]) for side in SIDES},
+        "reasons": {**reasons(measures["before"]), **reasons(measures["after"])},
         "units": units(result.tuned.loop.units),
         "constraints": clean([c.to_json() for c in result.constraints]),
-        "evaluations": result.evaluations,
         "scenarios": scenario_rows(result),
-        "starts": clean(result.starts),
-        "symmetry": clean(result.symmetry),
-        "choices": clean(result.choices),
-        "optimality": clean(result.optimality),
         "slopes": {where: check.to_json() for where, check in result.slopes.items()},
-        "curvature": clean(result.curvature),
-        "tradeoff": clean(result.tradeoff),
         "certificate": None if result.certificate is None else result.certificate._asdict(),
-        "wall_s": result.wall_s,
-        **parts,
+        "holds": None if answer is None else answer.holds(),
+        "feasibility": None if feasibility is None else feasibility.to_json(),
+        "answer": None if answer is None else answer.to_json(),
         "bound": None if result.bound is None else clean(result.bound.to_json()),
-        "validation": clean(result.validation),
-        "provenance": result.provenance,
     }
 
 
-def report(result, drawn=None):
-    """Return the Report of a TuningResult, with its pictures {name: figure}."""
-    answer, rig = result.answer, None if drawn is None else rig_of(result)[0]
-    broken = [c for c in result.constraints if c["margin"] < 0]
-    holds = "; every limit holds" if result.constraints and not broken else ""
+def verdict(result):
+    """Return the sentence on the outcome: the status, and where the limits hold."""
+    words, answer = [result.headline.replace("_", " ")], result.answer
     if answer is None:
-        sections = sections_of(result)
-    else:
-        sections = [Text([_headline(result)], on="terminal"), *of_answer(answer, result)]
-        if drawn is not None:  # measures that a terminal does not show are computed for the page
-            sections += [dataclasses.replace(s, on="page") for s in sections_of(result)[1:]]
-    notes = Text([m.text for m in result.messages], items=True)
+        broken = sum(c["margin"] < 0 for c in result.constraints)
+        if result.constraints:
+            hold = len(result.constraints) - broken
+            words += [f"{hold} of {hold + broken} limits hold" if broken else "every limit holds"]
+        return "; ".join(words)
+    if answer.after is None:
+        return f"{words[0]}; no validation plants"
+    if answer.after.limits:
+        hold, samples = int(answer.after.held.sum()), answer.after.samples
+        words.append(f"limits hold on {hold} of {samples} {answer.setting.runs}")
+        if proved := [row.tank + 1 for row in answer.setting.certificates if row.certified]:
+            words[-1] += f", proved for {numbered('tank', proved)}"
+    if answer.kept:
+        changed = sum(not stays for stays in answer.kept.values())
+        words.append(f"{changed} of {len(answer.kept)} gains changed")
+    return "; ".join(words)
+
+
+def report(result, page=False):
+    """Return the Report of a TuningResult; `page`: with what a terminal does not show."""
+    answer, notes = result.answer, [m.text for m in result.messages]
+    head = f"{result.tuned.name}: {verdict(result)} ({_effort(result)})"
+    sections = sections_of(result) if answer is None else of_answer(answer, result)
+    if page and answer is not None:
+        sections += [dataclasses.replace(s, on="page") for s in sections_of(result)]
+    rig = rig_of(result)[0] if page else None
     return Report(
         f"{result.tuned.name}: tuned",
-        result.headline.replace("_", " ") + holds,
-        _facts(result, len(broken)),
-        [Live(result), *sections, notes, *figures_of(drawn or {}, CAPTIONS)],
+        verdict(result),
+        _facts(result),
+        [
+            Live(result),
+            Text([head], on="terminal"),
+            *sections,
+            Text(["notes"] if notes else [], gap=True, on="terminal"),
+            Text(notes, items=True),
+        ],
         result.success,
         result.case.title,
         0 if answer is None else 80,
@@ -125,51 +135,66 @@ def report(result, drawn=None):
     )
 
 
-def _facts(result, broken):
-    """(name, value) of what stands at the top of the page; broken: limits that are violated."""
-    # Of a default answer the errors in the unit of the levels, unless the user has minimised
-    # something else.
-    unit, answer = cost_unit(result).replace("-", ""), result.answer
-    before, after = result.objective["before"], result.objective["after"]
-    held = f"{len(result.constraints) - broken} of {len(result.constraints)} hold"
-    facts: list[Any] = [
+def _effort(result):
+    """What a search took, in words."""
+    counts, time = result.evaluations, f"{result.wall_s:.1f} s"
+    if result.answer is not None:
+        return time
+    runs = f"{counts['simulations']} simulations, {counts['gradients']} of them with gradients"
+    return f"{result.method}, {runs}, {time}"
+
+
+def cost_unit(result):
+    """Return the unit of the objective of a TuningResult."""
+    # Of a default answer: that of the squared error, which the price on input changes has too.
+    unit = result.answer and result.answer.setting.cost_unit
+    return unit or objective_unit(result.objective["terms"], result.tuned.loop.units)
+
+
+def _facts(result):
+    """(name, value) of what stands at the top of the page."""
+    unit, answer, limits = cost_unit(result).replace("-", ""), result.answer, result.constraints
+    before, after = (result.objective[side] for side in SIDES)
+    broken = sum(c["margin"] < 0 for c in limits)
+    costs: list[Any] = [
         (f"objective {side}", Value(result.objective[side], unit=unit)) for side in SIDES
     ]
+    # Of a default answer the errors in the unit of the levels, unless the user has minimised
+    # something else.
     if answer and not answer.setting.own_objective and answer.after is not None:
-        length, sides = answer.setting.case.loop.units[0], (answer.before, answer.after)
-        joined = {"digits": 3, "unit": length, "between": " -> "}
-        means = [_mean(s.error, s).value for s in sides]
-        facts = [
-            (f"error, mean of {answer.after.samples} plants", Value(means, **joined)),
-            ("error, nominal plant", Value(list(answer.nominal.values()), **joined)),
+        join = {"digits": 3, "unit": answer.setting.case.loop.units[0], "between": " -> "}
+        means = [_mean(s.error, s).value for s in (answer.before, answer.after)]
+        costs = [
+            (f"error, mean of {answer.after.samples} plants", Value(means, **join)),
+            ("error, nominal plant", Value(list(answer.nominal.values()), **join)),
         ]
-    facts += [
-        ("limits", held if result.constraints else "none"),
+    hold = ("limits", f"{len(limits) - broken} of {len(limits)} hold" if limits else "none")
+    shares = list(result.validation["limits_held"].values()) if result.validation else []
+    if answer and limits and None not in shares:
+        shares = Value([100 * share for share in shares], 3, "%", " % -> ")
+        hold = ("plants that keep every limit", shares)
+    elif np.isfinite(before) and before and not broken:
+        costs.append(("change", f"{100 * (after / before - 1):+.3g} %"))
+    return [
+        *costs,
+        hold,
         ("gains tuned", sum(p["exercised"] for p in result.parameters.values())),
         ("simulations", result.evaluations["simulations"]),
         ("time", f"{result.wall_s:.1f} s"),
     ]
-    kept = result.validation["limits_held"] if result.validation else {}
-    if answer and result.constraints and None not in kept.values():
-        shares = Value([100 * share for share in kept.values()], 3, "%", " % -> ")
-        facts[2] = ("plants that keep every limit", shares)
-    elif np.isfinite(before) and before and not broken:
-        facts.insert(2, ("change", f"{100 * (after / before - 1):+.3g} %"))
-    return facts
 
 
 def of_answer(answer, result=None):
     """Return the sections on an Answer; with the values to set of its result, where given."""
-    sections = []
+    sections: list[Any] = []
     if answer.mended is not None:
         sections.append(Text([f"mended first: {answer.mended.words}"]))
     if answer.feasibility is not None and answer.feasibility.infeasible_for_any_controller > 0:
-        sections += _beyond(answer.feasibility)
+        sections += feasible.unreachable(answer.feasibility)
     if result is not None:
         sections.append(_values(result, answer))
     sections.append(_effects(answer, gap=result is not None))
-    proved = [row.starts for row in answer.setting.certificates if row.certified]
-    if proved:
+    if proved := [row.starts for row in answer.setting.certificates if row.certified]:
         sections.append(Text([f"proved: {PROMISE}, {start_of(proved)}"], gap=True))
     return sections
 
@@ -179,57 +204,15 @@ def answer_text(answer):
     return terminal(Report("default answer", "", (), of_answer(answer), width=80))
 
 
-def _beyond(feasibility):
-    """What no gain can change: the needs of MATTERS of the plants at least, and what would."""
-    unit = feasibility.case.loop.units[0]
-    rows = [
-        [
-            Value(row.setpoints, 6, unit, ", "),
-            f"tank {row.tank}" if row.pump is None else f"pump {row.pump}",
-            *(Value(v, 3, row.unit) for v in (row.needed, row.needed_p95, row.limit)),
-            f"{100 * row.share:.0f} %",
-        ]
-        for row in feasibility.plateaus
-        if row.share >= MATTERS
-    ]
-    share = number(100 * feasibility.infeasible_for_any_controller, 2)
-    text = f"No controller can hold every setpoint on {share} % of {feasibility.samples} plants"
-    sections: list[Any] = [Text([text + " within the limits" + (":" if rows else ".")])]
-    if rows:
-        heads = ["setpoints", "", "needs", "95 % need", "limit", "plants that cannot"]
-        sections.append(Table(rows, heads))
-    if feasibility.mends:  # that of the setpoints is long: JSON and feasibility page have it
-        kinds = [
-            f"--mend {m.what}" + (f" ({m.words})" if m.what != "setpoints" else "")
-            for m in feasibility.mends
-        ]
-        sections.append(Text([f"95 % of the plants can follow with {' or '.join(kinds)}"]))
-    return sections
-
-
-def _headline(result):
-    """One sentence on the outcome."""
-    answer, status = result.answer, result.headline.replace("_", " ")
-    start = f"{result.tuned.name}: {status}"
-    if answer.after is None:
-        return f"{start}; no validation plants ({result.wall_s:.1f} s)"
-    held, samples = int(answer.after.held.sum()), answer.after.samples
-    on = f"; limits hold on {held} of {samples} {answer.setting.runs}"
-    limited = on if answer.after.limits else ""
-    tanks = [r.tank + 1 for r in answer.setting.certificates if r.certified]
-    proved = f", proved for {numbered('tank', tanks)}" if tanks and limited else ""
-    changed = sum(not stays for stays in answer.kept.values())
-    gains = f"; {changed} of {len(answer.kept)} gains changed" if answer.kept else ""
-    return f"{start}{limited}{proved}{gains} ({result.wall_s:.1f} s)"
-
-
 def _values(result, answer):
     """The table of what to set."""
     rows = []
     for name, p in result.parameters.items():
-        remark = "kept (a change gains little)" if answer.kept.get(name, False) else ""
-        remark = remark if p["exercised"] else "kept: no effect in any run"
-        remark = f"at its {p['at_bound']} bound" if p["at_bound"] and not remark else remark
+        remark = f"at its {p['at_bound']} bound" if p["at_bound"] else ""
+        if answer.kept.get(name, False):
+            remark = "unchanged (a change gains little)"
+        if not p["exercised"]:
+            remark = "unchanged: no effect in any run"
         rows.append([f"{name} [{p['unit']}]", *(Value(p[s], 4) for s in SIDES), remark])
     loop = result.case.loop
     row = ["safety filter", "off" if loop.safety_filter is None else "on", "off", ""]
@@ -242,19 +225,19 @@ def _values(result, answer):
 
 def _effects(answer, gap):
     """The table of what the answer gives, before and after, on the plants that judged it."""
-    unit, terms = answer.setting.case.loop.units[0], answer.setting.objective
+    loop, terms = answer.setting.case.loop, answer.setting.objective
     sides = [side for side in (answer.before, answer.after) if side is not None]
-    n, rows = answer.before.samples, []
+    unit, n, rows = loop.units[0], answer.before.samples, []
     if answer.setting.own_objective:
-        of = objective_unit(terms, answer.setting.case.loop.units)
+        of = objective_unit(terms, loop.units)
         name = f"objective{f' {next(iter(terms))}' if len(terms) == 1 else ''}, mean of {n} plants"
         name += "" if of == "-" else f" [{of}]"
         rows.append([name, *(_mean(s.cost, s) for s in sides)])
     rows.append([f"error, mean of {n} plants [{unit}]", *(_mean(s.error, s) for s in sides)])
-    cannot = answer.before.infeasible
-    if cannot is not None and cannot.any() and not cannot.all():
-        able = f"  on those that can follow ({100 * np.mean(~cannot):.0f} %)"
-        rows.append([able, *(_mean(s.error[~cannot], s, of=~cannot) for s in sides)])
+    lost = answer.before.infeasible
+    if lost is not None and lost.any() and not lost.all():
+        name = f"  plants where every setpoint is reachable ({100 * np.mean(~lost):.0f} %)"
+        rows.append([name, *(_mean(s.error[~lost], s, of=~lost) for s in sides)])
     rows.append([f"error, nominal plant [{unit}]", *(Value(e, 3) for e in answer.nominal.values())])
     rows += _margins(answer)
     if answer.before.limits:
@@ -273,49 +256,53 @@ def _effects(answer, gap):
 def _margins(answer):
     """The rows of the sensitivity peak and the delay margin of the linearised nominal loop."""
     sides = [m for m in answer.measures.values() if "sensitivity_peak" in m]
-    if not sides or not any(np.isfinite(m["sensitivity_peak"]) for m in sides):
-        return []
-    peaks = [float(m["sensitivity_peak"]) for m in sides]
-    delays = [float(np.min(m["delay_margin"])) for m in sides]
-    cells = [Value(p, 3, missing="unstable" if p == np.inf else "-") for p in peaks]
-    rows = [["sensitivity peak Ms, nominal plant [-]", *cells]]
-    if any(np.isfinite(delays)):
-        cells = [Value(d, 3, missing="any" if d == np.inf else "-") for d in delays]
-        rows.append(["delay margin, nominal plant [s]", *cells])
+    peaks = np.array([float(m["sensitivity_peak"]) for m in sides])
+    delays = np.array([float(np.min(m["delay_margin"])) for m in sides])
+    cells = lambda values, word: [Value(v, 3, missing=word if v == np.inf else "-") for v in values]
+    rows = []
+    if np.isfinite(peaks).any():
+        rows.append(["sensitivity peak Ms, nominal plant [-]", *cells(peaks, "unstable")])
+        if np.isfinite(delays).any():
+            rows.append(["delay margin, nominal plant [s]", *cells(delays, "any")])
     return rows
 
 
-def _mean(values, judged, digits=3, of=slice(None)):
+def _mean(values, side, digits=3, of=slice(None)):
     """The mean over the plants, or those `of` them, whose run is finite."""
-    good = values[~judged.failed[of]]
+    good = values[~side.failed[of]]
     return Value(good.mean() if good.size else np.nan, digits)
 
 
 def sections_of(result):
-    """Return every table of a TuningResult, but for its messages."""
-    counts, loop = result.evaluations, result.tuned.loop
-    head = (
-        f"{result.tuned.name}: {result.headline} ({result.method}, {counts['simulations']}"
-        f" simulations, {counts['gradients']} of them with gradients, {result.wall_s:.1f} s)"
-    )
-    sections = [Text([head], on="terminal"), _parameter_table(result), *_measure_table(result)]
-    sections += _limit_table(result) + _scenario_table(result) + _validation_table(result)
-    sections += _choice_table(result) + _tradeoff_table(result)
+    """Return every table of a TuningResult."""
+    sections = [
+        _parameter_table(result),
+        *_measure_table(result),
+        *_limit_table(result),
+        *_scenario_table(result),
+        *_validation_table(result),
+        *_choice_table(result),
+        *_tradeoff_table(result),
+    ]
     if result.bound is not None:
         first, *others = optimal_input.report(result.bound).sections
         sections += [dataclasses.replace(first, gap=True), *others]
-    if loop.plant.overflow:
-        rims = "overflow is simulated: liquid above a rim leaves its tank"
-    elif not any(limit["measure"] == "max_level" for limit in result.constraints):
-        rims = (
+    step = f"evaluated at dt = {result.tuned.clock.dt:g} s"
+    return [*sections, Text([f"{_rims(result)}; {step}"], gap=True)]
+
+
+def _rims(result):
+    """What happens at the rims, in words."""
+    if result.tuned.loop.plant.overflow:
+        return "overflow is simulated: liquid above a rim leaves its tank"
+    if not any(limit["measure"] == "max_level" for limit in result.constraints):
+        return (
             "overflow is not simulated and no level limit is set: a level above its rim is not"
             " reported"
         )
-    elif loop.safety_filter is not None:
-        rims = "rims are limits, for which a safety filter caps the pumps"
-    else:
-        rims = "rims are limits only: overflow is not simulated, and a level may rise above its rim"
-    return [*sections, Text([f"{rims}; evaluated at dt = {result.tuned.clock.dt:g} s"], gap=True)]
+    if result.tuned.loop.safety_filter is not None:
+        return "rims are limits, for which a safety filter limits the pump inputs"
+    return "rims are limits only: overflow is not simulated, and a level may rise above its rim"
 
 
 def _parameter_table(result):
@@ -325,7 +312,7 @@ def _parameter_table(result):
         remark = f"at {p['at_bound']} bound" if p["at_bound"] else ""
         ends = Value([p["lower"], p["upper"]], between=" : ")
         change = Value(p["sensitivity_percent"], 2, "%")
-        remark = remark if p["exercised"] else "without effect, kept"
+        remark = remark if p["exercised"] else "without effect, unchanged"
         rows.append([name, p["unit"], Value(p["before"]), Value(p["after"]), ends, change, remark])
     heads = ["parameter", "unit", "before", "after", "range", "10 % of it changes the objective by"]
     return Table(rows, [*heads, ""], gap=True)
@@ -334,18 +321,20 @@ def _parameter_table(result):
 def _measure_table(result):
     """The objective and the measures of the case's own run, and a line on which run they are of."""
     units, objective, measures = result.tuned.loop.units, result.objective, result.measures
+    terms = objective["terms"]
+    listed = [
+        m
+        for m in (*ms.placed("shown"), *ms.functions(measures["after"]))
+        if m in measures["after"] and not (m == "rms_error_total" and {*terms} == {m})
+    ]
     rows = [["objective", cost_unit(result), *(Value(objective[side]) for side in SIDES)]]
-    shown = []
-    for m in (*ms.placed("shown"), *ms.functions(measures["after"])):
-        if m not in measures["after"] or (m == "rms_error_total" and {*objective["terms"]} == {m}):
-            continue
-        shown.append(m)
+    for m in listed:
         after = numbers(measures["after"][m], 5 if "level" in m else 4)
         rows.append([m, ms.unit(m, units), numbers(measures["before"][m], 4), after])
-    terms = " + ".join(m if w == 1 else f"{w:g} {m}" for m, w in objective["terms"].items())
-    runs = _runs_of(result, len(rows) > 1)
-    before, after = ({m: measures[side][m] for m in shown} for side in SIDES)
-    lines = ["; ".join([f"objective: {terms}", *runs]), *_notes(before, after, units)]
+    weighted = " + ".join(m if w == 1 else f"{w:g} {m}" for m, w in terms.items())
+    before, after = ({m: measures[side][m] for m in listed} for side in SIDES)
+    lines = [f"objective: {weighted}{_runs_of(result, bool(listed))}"]
+    lines += _notes(before, after, units)
     return [Table(rows, ["measure", "unit", "before", "after"], gap=True), Text(lines)]
 
 
@@ -364,29 +353,12 @@ def _notes(before, after, units):
     return words
 
 
-def _limit_table(result):
-    """Every limit in its worst scenario: value, margin, and when it was reached."""
-    rows = [
-        [
-            c["name"],
-            c["unit"],
-            (">= " if ms.MEASURES[c["measure"]].sense < 0 else "<= ") + number(c["limit"], 7),
-            Value(c["value"], 7),
-            Value(c["margin"], 3) if c["reason"] is None else "undefined",
-            f"{c['time_s']:.2f} s" if c["time_s"] is not None else "-",
-        ]
-        for c in worst_of_scenarios(result.constraints)
-    ]
-    heads = ["limit", "unit", "limit", "value", "margin", "reached at"]
-    return [Table(rows, heads, gap=True)] if rows else []
-
-
 def _runs_of(result, others):
-    """Return a line on the runs that the objective is of, where these are scenarios."""
+    """The runs that the objective is of, where these are scenarios; others: rows beside it."""
     problem = result.problem
     if not problem.scenarios:
-        return []
-    what = "plants" if result.certificate is not None else "scenarios"
+        return ""
+    runs = "plants" if result.certificate is not None else "scenarios"
     weighted = len({run.weight for run in problem.runs}) > 1
     of = {
         "mean": "the weighted mean" if weighted else "the mean",
@@ -394,7 +366,7 @@ def _runs_of(result, others):
         "worst": "the worst",
     }
     rest = "; the other rows: the case's own run, on its own plant" if others else ""
-    return [f"{of[problem.risk]} of {len(problem.runs)} {what}{rest}"]
+    return f"; {of[problem.risk]} of {len(problem.runs)} {runs}{rest}"
 
 
 def worst_of_scenarios(constraints):
@@ -407,20 +379,21 @@ def worst_of_scenarios(constraints):
     return list(worst.values())
 
 
+def _limit_table(result):
+    rows = worst_of_scenarios(result.constraints)
+    return [limit_table(rows, gap=True)] if rows else []
+
+
 def scenario_rows(result):
     """Return one dict for each scenario of a TuningResult, [] for the case's own run alone."""
-    problem = result.problem
-    if not problem.scenarios:
-        return []
-    rows = []
-    for i, run in enumerate(problem.runs):
-        limits = [limit for limit in problem.limits if limit.run == i]
+    problem, rows = result.problem, []
+    for i, run in enumerate(problem.runs if problem.scenarios else ()):
         sides = {side: tables[i] for side, tables in result.tables.items()}
-        held = {s: all(limit.margin(t) >= 0 for limit in limits) for s, t in sides.items()}
+        limits = [limit for limit in problem.limits if limit.run == i]
+        hold = {s: all(limit.margin(t) >= 0 for limit in limits) for s, t in sides.items()}
         costs = clean({side: problem.cost(table) for side, table in sides.items()})
-        rows.append(
-            {"name": run.name, "weight": run.weight, "objective": costs, "limits_held": held}
-        )
+        row = {"name": run.name, "weight": run.weight, "objective": costs, "limits_held": hold}
+        rows.append(row)
     return rows
 
 
@@ -430,21 +403,18 @@ def _scenario_table(result):
     if not scenarios:
         return []
     cost = lambda s, side="after": np.inf if (v := s["objective"][side]) is None else v
-    many = len(scenarios) > MANY
-    rows = [
-        [
-            s["name"],
-            Value(s["weight"], 3),
-            *(Value(cost(s, side)) for side in SIDES),
-            ("yes" if s["limits_held"]["after"] else "no") if limited else "-",
-        ]
-        for s in (sorted(scenarios, key=lambda s: -cost(s))[:COSTLIEST] if many else scenarios)
-    ]
+    listed, notes = scenarios, []
+    if len(scenarios) > MANY:
+        listed = sorted(scenarios, key=lambda s: -cost(s))[:COSTLIEST]
+        held = sum(s["limits_held"]["after"] for s in scenarios)
+        rest = f"; limits held after in {held}" if limited else ""
+        notes = [f"the {COSTLIEST} costliest of {len(scenarios)} scenarios{rest}"]
+    rows = []
+    for s in listed:
+        held = ("yes" if s["limits_held"]["after"] else "no") if limited else "-"
+        rows.append([s["name"], Value(s["weight"], 3), *(Value(cost(s, x)) for x in SIDES), held])
     heads = ["scenario", "weight", "objective before", "after", "limits held after"]
-    held = sum(s["limits_held"]["after"] for s in scenarios)
-    kept = f"; limits held after in {held}" if limited else ""
-    note = Text([f"the {COSTLIEST} costliest of {len(scenarios)} scenarios{kept}"])
-    return [Table(rows, heads, gap=True), *([note] if many else [])]
+    return [Table(rows, heads, gap=True), Text(notes)]
 
 
 def _validation_table(result):
@@ -452,30 +422,23 @@ def _validation_table(result):
     checked, case = result.validation, result.case
     if not checked:
         noise = any(run.key is not None for run in result.problem.runs)
-        if case.uncertain or case.covariance or noise:
-            return []
         why = (
             "no validation on other plants: the rig names nothing that is uncertain. An [uncertain]"
             ' table in its file ("plant.drain" = 0.05 for +-5 %) makes tune validate the answer'
         )
-        return [Text([why], gap=True)]
-    limited = bool(result.problem.limits)
-    rows = [
-        [
-            side,
-            *(Value(checked["objective"][side][k]) for k in ("mean", "p05", "p50", "p95")),
-            *([f"{100 * checked['limits_held'][side]:.0f} %"] if limited else []),
-        ]
-        for side in SIDES
-        if checked["limits_held"][side] is not None
-    ]
+        stated = case.uncertain or case.covariance or noise
+        return [] if stated else [Text([why], gap=True)]
+    rows, limited = [], bool(result.problem.limits)
+    for side in SIDES:
+        if (share := checked["limits_held"][side]) is not None:
+            costs = [Value(checked["objective"][side][k]) for k in ("mean", "p05", "p50", "p95")]
+            rows.append([side, *costs, *([f"{100 * share:.0f} %"] if limited else [])])
     if not rows:
         return [Text([f"validation runs: all {checked['samples']} failed"], gap=True)]
     heads = [f"on {checked['samples']} validation runs", "mean objective", "5 %", "median", "95 %"]
     heads += ["all limits held in"] if limited else []
-    perturbed = (
-        n if share is None else f"{n} +-{100 * share:g} %" for n, share in checked["spread"].items()
-    )
+    spread = checked["spread"].items()
+    perturbed = [n if share is None else f"{n} +-{100 * share:g} %" for n, share in spread]
     perturbed = ", ".join(perturbed) or "nothing of the plant"
     noise = ", new sensor noise" if checked["noise"] else ""
     failed = f"; {checked['failed']} runs failed and are left out" if checked["failed"] else ""
@@ -502,31 +465,21 @@ def _improved(checked):
 
 
 def _choice_table(result):
-    rows = [
-        [
-            ", ".join(f"{n} = {v}" for n, v in c["values"].items()),
-            c["status"],
-            *map(Value, c["objective"].values()),
-        ]
-        for c in result.choices
-    ]
-    sides = [f"objective {side} [{cost_unit(result)}]" for side in SIDES]
-    return [Table(rows, ["choice", "status", *sides], gap=True)] if rows else []
+    rows = []
+    for c in result.choices:
+        values = ", ".join(f"{n} = {v}" for n, v in c["values"].items())
+        rows.append([values, c["status"], *map(Value, c["objective"].values())])
+    heads = [f"objective {side} [{cost_unit(result)}]" for side in SIDES]
+    return [Table(rows, ["choice", "status", *heads], gap=True)] if rows else []
 
 
 def _tradeoff_table(result):
     if not result.tradeoff:
         return []
-    measure = result.tradeoff["measure"]
-    rows = [
-        [
-            Value(p["limit"]),
-            p["status"],
-            Value(p["objective"]),
-            ", ".join(f"{n} {number(v, 4)}" for n, v in p["parameters"].items()),
-        ]
-        for p in result.tradeoff["points"]
-    ]
+    rows, measure = [], result.tradeoff["measure"]
+    for p in result.tradeoff["points"]:
+        gains = ", ".join(f"{n} {number(v, 4)}" for n, v in p["parameters"].items())
+        rows.append([Value(p["limit"]), p["status"], Value(p["objective"]), gains])
     head = f"limit of {measure} [{ms.unit(measure, result.tuned.loop.units)}]"
     return [Table(rows, [head, "status", "objective", "at"], gap=True)]
 
@@ -556,8 +509,8 @@ def save(result, folder, command=None):
     if not rig and (Path(folder) / "result.json").is_file():
         # of another result: its gains must not be taken for these
         stale.append(Path(folder) / "rig.toml")
-    draw, page = lambda: figures(result, runs), lambda drawn: report(result, drawn)
-    return save_all(folder, json_of(result), files, draw, page, command, stale)
+    draw, page = lambda: figures(result, runs), lambda: report(result, page=True)
+    return save_all(folder, json_of(result), files, draw, page, CAPTIONS, command, stale)
 
 
 def _runs(result):
@@ -569,91 +522,81 @@ def _runs(result):
 
 def figures(result, runs=None):
     """Return {name: figure} of a TuningResult: those of CAPTIONS that have something to show."""
-    from jaxtank.plots import diagnostics, responses, style
+    from jaxtank.plots import diagnostics, responses
     from jaxtank.plots import run as plots
+    from jaxtank.plots.style import picture
 
     runs = runs or _runs(result)
     loop, name, unit = result.tuned.loop, result.tuned.name, cost_unit(result)
-    drawn = {
+    drawings = {
         "responses": responses.responses(loop, runs, _title(result), _level_limits(result)),
         **plots.rig(loop.plant, runs["after"], f"{name} at the end of the tuned run"),
     }
     if rows := worst_of_scenarios(result.constraints):
         size = (6.4, 0.9 + 0.42 * min(len(rows), diagnostics.MANY))
-        drawn["margins"] = style.picture(lambda ax: diagnostics.margins(ax, rows), size)
+        drawings["margins"] = picture(lambda ax: diagnostics.margins(ax, rows), size)
     between = [i for i in range(loop.plant.tanks) if i not in loop.plant.outputs][:2]
     if len(between) == 2:
-        looks = zip(runs.items(), ((style.BEFORE, "--"), (style.AFTER, "-")))
+        looks = zip(runs.items(), responses.RUNS)
         lines = {side: (run, *look) for (side, run), look in looks}
         rims = np.asarray(loop.plant.rim)
         phase = lambda ax: diagnostics.phase(ax, lines, between, rims, loop.units[0])
-        drawn["inner"] = style.picture(phase, (5.0, 4.0), legend=3)
+        drawings["inner"] = picture(phase, (5.0, 4.0), legend=3)
     low, high = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
     if any(np.any(run.command > high) or np.any(run.command < low) for run in runs.values()):
         size = (6.4, 1.4 + 0.62 * len(runs) * loop.plant.pumps)
         strips = lambda ax: diagnostics.saturation(ax, runs, low, high)
-        drawn["saturation"] = style.picture(strips, size, legend=2)
+        drawings["saturation"] = picture(strips, size, legend=2)
     observed = f"{name}, tuned: what its observer estimated"
-    drawn |= estimates(loop, result.tuned.clock, runs["after"], observed)
+    drawings |= estimates(loop, result.tuned.clock, runs["after"], observed)
     if result.cloud is not None and len(result.cloud["objective"]):
-        drawn["clouds"] = _clouds(result, unit)
+        drawings["clouds"] = _clouds(result, unit)
     if result.history:
         limited = bool(result.problem.limits)
         course = lambda ax: responses.convergence(ax, result.history, unit, limited)
-        drawn["convergence"] = style.picture(course, (6.4, 3.8))
+        drawings["convergence"] = picture(course, (6.4, 3.8))
     around = _curve if len(result.parameters) == 1 else _contours
-    drawn["landscape"] = style.picture(lambda ax: around(ax, result, unit), (6.4, 4.8))
+    drawings["landscape"] = picture(lambda ax: around(ax, result, unit), (6.4, 4.8))
     if result.tradeoff:
         measure, points = result.tradeoff["measure"], result.tradeoff["points"]
         of = (measure, ms.unit(measure, loop.units), unit)
-        draw = lambda ax: diagnostics.tradeoff(ax, points, *of)
-        drawn["tradeoff"] = style.picture(draw, (6.0, 3.6))
-    return drawn
+        drawings["tradeoff"] = picture(lambda ax: diagnostics.tradeoff(ax, points, *of), (6.0, 3.6))
+    return drawings
 
 
 def _level_limits(result):
     """The highest allowed level of each tank: its limit, or else its rim."""
-    limits = {
-        limit.index: limit.value
-        for limit in result.problem.limits
-        if limit.measure == "max_level" and limit.run == 0
-    }
-    rims = np.asarray(result.tuned.loop.plant.rim)
-    return [limits.get(i, rims[i]) for i in range(result.tuned.loop.plant.tanks)]
+    levels = np.array(result.tuned.loop.plant.rim, dtype=float)
+    for limit in result.problem.limits:
+        if limit.measure == "max_level" and limit.run == 0:
+            levels[limit.index] = limit.value
+    return levels
 
 
 def _title(result):
-    """The objective and the first gains before and after, as the title of the responses."""
-    held = dict.fromkeys(SIDES, "")
-    if result.problem.limits:
-        for side, table in result.tables.items():
-            broken = (result.problem.margins(table) < 0).any()
-            held[side] = ", breaks a limit" if broken else ", holds all limits"
-    unit = cost_unit(result)
-    unit = "" if unit == "-" else f" {unit}"
-    before, after = (number(result.objective[side], 4) for side in SIDES)
+    """The verdict and the first gains before and after, as the title of the responses."""
     gains = ", ".join(
         f"{n.removeprefix('controller.')} {number(p['before'], 4)} -> {number(p['after'], 4)}"
         f" {p['unit']}"
         for n, p in list(result.parameters.items())[:4]
     )
-    first = f"{before}{held['before']} -> {after}{unit}{held['after']}"
-    return f"{result.tuned.name}: objective {first}\n({gains})"
+    return f"{result.tuned.name}: {verdict(result)}\n({gains})"
 
 
 def _clouds(result, unit):
     """Validation runs before against after: the objective, and the level nearest to its limit."""
-    from jaxtank.plots import responses, style
+    from jaxtank.plots.style import picture
+    from jaxtank.plots.uncertainty import cloud
 
     runs, length = result.cloud, result.tuned.loop.units[0]
     level = "highest level over its limit" if runs["past"] else "highest level"
 
     def draw(axes):
-        responses.cloud(axes[0], runs["objective"], runs["held"], "objective", unit)
-        responses.cloud(axes[1], runs["level"], runs["held"], level, length, runs["limit"])
+        cloud(axes[0], runs["objective"], runs["held"], "objective", unit)
+        cloud(axes[1], runs["level"], runs["held"], level, length, runs["limit"])
 
     title = f"{result.tuned.name}: {len(runs['objective'])} validation runs"
-    return style.picture(draw, (8.6, 4.9), 1, 2, legend=3, title=title)
+    return picture(draw, (8.6, 4.9), 1, 2, legend=3, title=title)
 
 
 def _curve(ax, result, unit):
@@ -663,9 +606,8 @@ def _curve(ax, result, unit):
     grid, b = np.linspace(0.0, 1.0, 128), result.problem.bounds[0]
     costs, margins = result.problem.screen(grid[:, None])
     violation = np.maximum(0.0, -margins).max(axis=1, initial=0.0)
-    before, after = ((result.parameters[b.name][s], result.objective[s]) for s in SIDES)
-    axis, log = (b.name, b.unit, unit), b.scale == "log"
-    responses.curve(ax, b.from_unit(grid), costs, violation, *axis, before, after, log)
+    points = [(result.parameters[b.name][s], result.objective[s]) for s in SIDES]
+    responses.curve(ax, b.from_unit(grid), costs, violation, b, unit, *points)
 
 
 def _contours(ax, result, unit):
@@ -682,20 +624,10 @@ def _contours(ax, result, unit):
     points[:, pair[0]], points[:, pair[1]] = across.ravel(), up.ravel()
     costs, margins = problem.screen(points)
     worst = -margins.min(axis=1) if margins.size else np.zeros(len(costs))
-    x, y = (problem.bounds[i] for i in pair)
-    place = lambda z: (x.from_unit(z[pair[0]]), y.from_unit(z[pair[1]]))
-    responses.contours(
-        ax,
-        x.from_unit(across),
-        y.from_unit(up),
-        costs.reshape(across.shape),
-        worst.reshape(across.shape),
-        (x.name, y.name),
-        (x.unit, y.unit),
-        unit,
-        place(start),
-        place(tuned),
-        (x.scale == "log", y.scale == "log"),
-    )
+    costs, worst = costs.reshape(across.shape), worst.reshape(across.shape)
+    bounds = [problem.bounds[i] for i in pair]
+    scaled = lambda z: [b.from_unit(v) for b, v in zip(bounds, z)]
+    before, after, grid = (scaled(z) for z in (start[pair], tuned[pair], (across, up)))
+    responses.contours(ax, grid, costs, worst, bounds, unit, before, after)
     if len(tuned) > 2:
         ax.set_title("landscape (the other parameters as tuned)")

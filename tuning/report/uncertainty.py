@@ -11,10 +11,10 @@ from jaxtank import measures as ms
 from jaxtank.loop import step_size
 from tuning.problem import provenance
 from tuning.problem.wording import count
-from tuning.report.document import Live, Report, Text, figures_of
+from tuning.report.document import Live, Report, Text
 from tuning.report.folder import earlier
 from tuning.report.folder import save as save_all
-from tuning.report.tables import Table, Value, clean, number
+from tuning.report.tables import Table, Value, clean, fields
 from tuning.storage.columns import row_blocks
 from tuning.storage.store import discard
 from tuning.uncertainty.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
@@ -42,7 +42,6 @@ def json_of(ensemble):
     summary, feasible = clean(ensemble.summary()), ensemble.infeasible
     payload = {
         "case": ensemble.case.name,
-        "samples": ensemble.samples,
         "failed": int(ensemble.failed.sum()),
         "infeasible": None if feasible is None else int(feasible.sum()),
         "draws": ensemble.method,
@@ -53,7 +52,7 @@ def json_of(ensemble):
         "measures": summary,
         "units": {m: ms.unit(m, ensemble.case.loop.units) for m in ensemble.measures},
         "violations": clean(ensemble.violations()),
-        "wall_s": ensemble.wall_s,
+        **fields(ensemble, "samples wall_s"),
         "provenance": provenance.provenance(ensemble.case, ensemble.seed),
     }
     if ensemble.method != "random":
@@ -73,68 +72,62 @@ def json_of(ensemble):
 def remarks_of(ensemble):
     """Return warnings on the draws: that the steps are too long for the rig before any is drawn."""
     return [
-        f"of the rig as it is, and of draws like it: {line}"
+        f"of the rig before any draw: {line}"
         for line in step_size.step_warnings(ensemble.case.loop, ensemble.case.clock)
     ]
 
 
-def report(ensemble, drawn=None):
+def report(ensemble):
     """Return the Report of an Ensemble."""
     varied = ", ".join(f"{n} {in_words(d)}" for n, d in ensemble.distributions.items())
-    broken = ensemble.violations() if ensemble.limits else []
+    violations = ensemble.violations() if ensemble.limits else []
     remarks, diverged = remarks_of(ensemble), int(ensemble.failed.sum())
-    finite = ensemble.samples - diverged
-    head = (
-        f"{ensemble.case.name}: {count(ensemble.samples, 'draw')} ({ensemble.method}, seed"
-        f" {ensemble.seed}), {ensemble.wall_s:.1f} s"
-    )
+    draws, time = count(ensemble.samples, "draw"), f"{ensemble.wall_s:.1f} s"
+    head = f"{ensemble.case.name}: {draws} ({ensemble.method}, seed {ensemble.seed}), {time}"
     sections = [Live(ensemble), Text([head, f"uncertain: {varied}"]), _measure_table(ensemble)]
-    if finite < 2:
+    if (finite := ensemble.samples - diverged) < 2:
         words = f"{count(finite, 'run')} finite: a standard deviation and an interval of the mean"
         sections.append(Text([f"{words} need two finite runs"], gap=True))
-    if broken:
-        rows = [
-            [
-                v["name"],
-                Value(v["limit"], unit=v["unit"]),
-                v["count"],
-                Value(v["probability"], 4),
-                Value(v["interval95"], 4, between=" : "),
-            ]
-            for v in broken
-        ]
-        heads = ["limit", "value", "broken in", "probability", "95 % interval"]
-        sections.append(Table(rows, heads, gap=True))
+    if violations:
+        sections.append(_violation_table(violations))
     lines = [f"{INTERVALS} (these draws are {ensemble.method})"] * (ensemble.method != "random")
     lines.append(
         f"{count(diverged, 'run')} diverged: counted as breaking every limit, left out of all"
         " other figures"
     )
-    sections += [Text(lines, gap=True), Text(remarks, on="terminal")]
+    sections += [Text(lines, gap=True), Text(remarks)]
     if ensemble.infeasible is not None:
         words = (
             f"{count(int(ensemble.infeasible.sum()), 'draw')} without a steady state within rims"
             " and pump limits at some plateau of the reference: included in all figures"
         )
         sections.append(Text([words]))
-    facts = [
-        ("draws", ensemble.samples),
-        ("runs that diverged", diverged),
-        ("time", f"{ensemble.wall_s:.1f} s"),
-    ]
-    sentences = list(remarks)
-    for fact, sentence in (_worst_limit(ensemble, broken), _typical_error(ensemble)):
-        facts[1:1] = fact
-        sentences += sentence
-    verdict = "no limit was broken in any draw" if broken else "no limits were given"
+    good, verdict = not diverged, "no limits were given"
+    if violations:
+        good = good and not any(v["count"] for v in violations)
+        verdict = "no limit was broken in any draw" if good else "some draws break a limit"
     if diverged:
         verdict = f"{diverged} of {count(ensemble.samples, 'run')} diverged"
-    elif any(v["count"] for v in broken):
-        verdict = "some draws break a limit"
-    good = not diverged and not any(v["count"] for v in broken)
-    sections += [Text(sentences, items=True, on="page"), *figures_of(drawn or {}, CAPTIONS)]
-    title = f"{ensemble.case.name}: uncertainty"
-    return Report(title, verdict, facts, sections, good, ensemble.case.title)
+    return Report(
+        f"{ensemble.case.name}: uncertainty",
+        verdict,
+        [*_facts(ensemble, violations), ("runs that diverged", diverged), ("time", time)],
+        sections,
+        good,
+        ensemble.case.title,
+    )
+
+
+def _facts(ensemble, violations):
+    """(name, value) of what stands at the top of the page."""
+    facts, error = [("draws", ensemble.samples)], ensemble.summary().get("rms_error_total")
+    if violations:
+        worst = max(v["probability"] for v in violations)
+        facts.append(("the limit most often broken", Value(100 * worst, 3, "%")))
+    if error is not None and error["p50"] is not None:
+        unit = ms.unit("rms_error_total", ensemble.case.loop.units)
+        facts.append(("median rms_error_total", Value(error["p50"], 4, unit)))
+    return facts
 
 
 def _measure_table(ensemble):
@@ -156,10 +149,25 @@ def _measure_table(ensemble):
     return Table(rows, [*heads, "mean of worst 5 %", "highest"], gap=True)
 
 
+def _violation_table(violations):
+    rows = [
+        [
+            v["name"],
+            Value(v["limit"], unit=v["unit"]),
+            v["count"],
+            Value(v["probability"], 4),
+            Value(v["interval95"], 4, between=" : "),
+        ]
+        for v in violations
+    ]
+    heads = ["limit", "value", "broken in", "probability", "95 % interval"]
+    return Table(rows, heads, gap=True)
+
+
 def in_words(d):
     """Return a distribution in words, in the unit of its parameter."""
     if isinstance(d, Correlated):
-        means = "" if d.mean is None else " and means of their own"
+        means = "" if d.mean is None else " and custom means"
         return f"{count(len(d.names), 'parameter')}, correlated, with a covariance{means}"
     if isinstance(d, Discrete):
         weights = "" if d.weights is None else ", ".join(f"{w:g}" for w in d.weights)
@@ -189,83 +197,49 @@ def draws_csv(ensemble):
     """Return every draw as CSV, some lines at a time: number, whether it diverged, parameters,
     measures.
     """
-    sources = ((ensemble.values, None), (ensemble.measures, ms.unit))
+    units = {m: f" [{ms.unit(m, ensemble.case.loop.units)}]" for m in ensemble.measures}
+    columns = [(table, name) for table in (ensemble.values, ensemble.measures) for name in table]
     heads = ["draw", "failed"]
-    for source, unit in sources:
-        for name in source:
-            units = "" if unit is None else f" [{unit(name, ensemble.case.loop.units)}]"
-            entries = math.prod(source[name].shape[1:])
-            heads += [name + (f"[{i}]" if entries > 1 else "") + units for i in range(entries)]
+    for table, name in columns:
+        entries = math.prod(table[name].shape[1:])
+        index = [f"[{i}]" if entries > 1 else "" for i in range(entries)]
+        heads += [f"{name}{i}{units.get(name, '')}" for i in index]
     yield ",".join(f'"{head}"' for head in heads) + "\n"
     for rows in row_blocks(ensemble.samples, LINES):
-        columns = [np.arange(rows.start, rows.stop), ensemble.failed[rows]]
-        for source, _ in sources:
-            columns += [source[name][rows].reshape(len(columns[0]), -1) for name in source]
+        numbers = [np.arange(rows.start, rows.stop), ensemble.failed[rows]]
+        numbers += [table[name][rows].reshape(len(numbers[0]), -1) for table, name in columns]
         out = io.StringIO()
-        np.savetxt(out, np.column_stack(columns), delimiter=",", fmt="%.10g")
+        np.savetxt(out, np.column_stack(numbers), delimiter=",", fmt="%.10g")
         yield out.getvalue()
 
 
 def figures(ensemble):
     """Return matplotlib figures {name: Figure}: "fan" of the levels, "violations", "rig"."""
-    from jaxtank.plots import responses
     from jaxtank.plots import run as plots
+    from jaxtank.plots.uncertainty import fan, violations
 
-    drawn, loop = {}, ensemble.case.loop
+    drawings, loop = {}, ensemble.case.loop
     if ensemble.fan is not None:
         title = f"{ensemble.case.name}: {_draws_of_fan(ensemble)}"
-        drawn["fan"] = responses.fan(loop, ensemble.fan, title)
+        drawings["fan"] = fan(loop, ensemble.fan, title)
     if ensemble.limits:
-        drawn["violations"] = responses.violations(ensemble.violations(), ensemble.samples)
-    return drawn | plots.rig(loop.plant, None, ensemble.case.name)
+        drawings["violations"] = violations(ensemble.violations(), ensemble.samples)
+    return drawings | plots.rig(loop.plant, None, ensemble.case.name)
 
 
 def _draws_of_fan(ensemble):
     """Which draws the fan is of, in words: of the first ones those that are finite."""
-    first, kept = ensemble.fan["of"], ensemble.fan["draws"]
+    first, finite = ensemble.fan["of"], ensemble.fan["draws"]
     of = count(first, "draw")
     if first < ensemble.samples:
         of = f"the first {first} of {ensemble.samples} draws"
-    return of if kept == first else f"{kept} of {of}, the others diverged"
-
-
-def _worst_limit(ensemble, broken):
-    """(facts, sentences) on the limit that is broken most often."""
-    if not broken:
-        return [], []
-    worst = max(broken, key=lambda v: v["probability"])
-    low, high = worst["interval95"]
-    which = f"{worst['name']} ({number(worst['limit'])} {worst['unit']})"
-    sentence = (
-        f"{which} is the limit most often broken: in {worst['count']} of {ensemble.samples} draws,"
-        f" a probability between {low:.3g} and {high:.3g} with 95 % confidence"
-    )
-    if not worst["count"]:
-        sentence = (
-            f"none of {count(ensemble.samples, 'draw')} breaks a limit: the probability of breaking"
-            f" a given one is at most {high:.3g}, with 95 % confidence"
-        )
-    return [("the limit most often broken", Value(100 * worst["probability"], 3, "%"))], [sentence]
-
-
-def _typical_error(ensemble):
-    """(facts, sentences) on the total RMS error."""
-    summary = ensemble.summary().get("rms_error_total")
-    if summary is None or summary["p50"] is None:
-        return [], []
-    unit = ms.unit("rms_error_total", ensemble.case.loop.units)
-    median, low, high = (number(np.ravel(summary[k])[0], 4) for k in ("p50", "p05", "p95"))
-    sentence = (
-        f"rms_error_total: half of the draws lie below {median} {unit}, 9 in 10 between {low} and"
-        f" {high} {unit}"
-    )
-    return [("median rms_error_total", f"{median} {unit}")], [sentence]
+    return of if finite == first else f"{finite} of {of}, the others diverged"
 
 
 def save(ensemble, folder, command=None):
     """Write result.json, draws.csv, pictures and report.html to `folder`; return their paths."""
     files, stale = {"draws.csv": draws_csv(ensemble)}, earlier(folder, CAPTIONS)
-    draw, page = lambda: figures(ensemble), lambda drawn: report(ensemble, drawn)
-    written = save_all(folder, json_of(ensemble), files, draw, page, command, stale)
+    draw, page = lambda: figures(ensemble), lambda: report(ensemble)
+    written = save_all(folder, json_of(ensemble), files, draw, page, CAPTIONS, command, stale)
     discard(Path(folder))
     return written

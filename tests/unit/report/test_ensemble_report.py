@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from scipy import stats
@@ -10,14 +11,27 @@ from scipy import stats
 import tuning
 from jaxtank import measures as measured
 from jaxtank import presets, rig
+from tuning.report import uncertainty
 
-SHORT = {"clock.dt": 1.0, "clock.duration": 200.0}
-OPTIONS = {"key": 0, "fan": False}
+MEASURES = ("max_level", "overflow_volume", "saturated_fraction", "settling_time", "iae")
 
 
 @pytest.fixture(scope="module")
-def case():
-    return rig.set_values(presets.load("cascaded").cases["pi"], SHORT)
+def five():
+    """Five draws of a rig of two tanks, with a fan of the first three."""
+    short = {"clock.dt": 4.0, "clock.duration": 200.0}
+    case = rig.set_values(presets.find("cascaded/pi"), short)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(importlib.import_module("tuning.uncertainty.study"), "FAN_DRAWS", 3)
+        return tuning.ensemble(case, samples=5, measures=MEASURES, key=0)
+
+
+def first(ensemble, samples):
+    """The first draws of an ensemble, as an ensemble."""
+    cut = lambda table: {name: values[:samples] for name, values in table.items()}
+    parts = {"values": cut(ensemble.values), "measures": cut(ensemble.measures)}
+    parts |= {"failed": ensemble.failed[:samples], "infeasible": None}
+    return dataclasses.replace(ensemble, **parts)
 
 
 def row(page, label):
@@ -26,45 +40,32 @@ def row(page, label):
     return [cell.strip() for cell in line.removeprefix(label).split("  ") if cell.strip()]
 
 
-def test_a_single_draw_is_reported_without_a_spread(case):
+def test_a_single_draw_is_reported_without_a_spread(five):
     """The rig has two tanks: a measure of several entries has no spread either."""
-    one = tuning.ensemble(case, samples=1, **OPTIONS)
+    one = first(five, 1)
     page = repr(one)
     for tank in (0, 1):
         unit, mean, interval, sd, *others = row(page, f"max_level of tank {tank + 1}")
-        assert (
-            interval == sd == "-"
-            and {mean, *others} == {f"{one.measures['max_level'][0, tank]:.4g}"}
-            and unit == "V"
-        )
+        assert interval == sd == "-" and unit == "V"
+        assert {mean, *others} == {f"{one.measures['max_level'][0, tank]:.4g}"}
     assert "1 run finite: a standard deviation" in page
+    assert "a standard deviation and" not in repr(first(five, 2))
 
 
 @pytest.mark.parametrize(
-    "failed, words",
-    [
-        ([True, False], "1 run finite: a standard deviation"),
-        ([True, True], "0 runs finite: a standard deviation"),
-    ],
+    ("failed", "words"), [([True, False], "1 run finite"), ([True, True], "0 runs finite")]
 )
-def test_runs_that_left_the_numbers_leave_no_spread(case, failed, words):
-    two = dataclasses.replace(tuning.ensemble(case, samples=2, **OPTIONS), failed=np.array(failed))
-    page = repr(two)
-    assert words in page
+def test_runs_that_left_the_numbers_leave_no_spread(five, failed, words):
+    page = repr(dataclasses.replace(first(five, 2), failed=np.array(failed)))
+    assert f"{words}: a standard deviation" in page
     for tank in (1, 2):
         assert row(page, f"max_level of tank {tank}")[2:4] == ["-", "-"]
 
 
-def test_an_interval_of_a_mean_ends_where_the_measure_does(case):
+def test_an_interval_of_a_mean_ends_where_the_measure_does(five):
     """Skew draws, whose mean and 1.96 standard errors reach past what the measure can be; the
     settling time alone may be negative.
     """
-    four = tuning.ensemble(
-        case,
-        samples=4,
-        measures=("overflow_volume", "saturated_fraction", "settling_time", "iae"),
-        **OPTIONS,
-    )
     skew, share = np.array([0.0, 0.0, 0.0, 3.0]), np.array([1.0, 1.0, 1.0, 0.2])
     measures = {
         "overflow_volume": np.stack([skew, skew + 10], axis=1),
@@ -72,7 +73,7 @@ def test_an_interval_of_a_mean_ends_where_the_measure_does(case):
         "settling_time": skew[:, None],
         "iae": skew[:, None],
     }
-    found = dataclasses.replace(four, measures=measures, limits=[]).summary()
+    found = dataclasses.replace(first(five, 4), measures=measures, limits=[]).summary()
 
     def plain(values):
         half = stats.norm.ppf(0.975) * np.std(values, ddof=1) / np.sqrt(len(values))
@@ -89,18 +90,8 @@ def test_an_interval_of_a_mean_ends_where_the_measure_does(case):
     assert endless - set(measured.functions(measured.MEASURES)) == {"settling_time"}
 
 
-def test_two_draws_have_a_spread(case):
-    assert "spread:" not in repr(tuning.ensemble(case, samples=2, **OPTIONS))
-
-
-def test_a_fan_of_some_draws_states_of_which(case, monkeypatch):
-    from tuning.report import uncertainty
-
-    monkeypatch.setattr(importlib.import_module("tuning.uncertainty.study"), "FAN_DRAWS", 3)
-    for samples, words in ((5, "the first 3 of 5 draws"), (3, "3 draws")):
-        found = tuning.ensemble(case, samples=samples, key=0)
-        drawn = uncertainty.figures(found)
-        title = drawn["fan"].get_suptitle() or drawn["fan"].axes[0].get_title()
-        assert title == f"{case.name}: {words}"
-        for figure in drawn.values():
-            figure.clf()
+@pytest.mark.parametrize(("samples", "words"), [(5, "the first 3 of 5 draws"), (3, "3 draws")])
+def test_a_fan_of_some_draws_states_of_which(five, samples, words):
+    figure = uncertainty.figures(first(five, samples))["fan"]
+    assert figure.get_suptitle() == f"{five.case.name}: {words}"
+    plt.close("all")

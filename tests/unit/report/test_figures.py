@@ -27,9 +27,6 @@ def test_every_figure_of_every_paper_is_listed_once_and_in_order():
 def test_the_cases_kinds_and_parameters_of_all_figures_exist():
     for figure in FIGURES.values():
         assert set(figure.kind.split()) <= set(KINDS) and bool(figure.kind) == bool(figure.runs)
-        assert not figure.shows.endswith(".") and figure.shows[0].isupper()
-        for sentence in filter(None, (figure.states, figure.remark)):
-            assert sentence.endswith(".") and "  " not in sentence
         for run in figure.runs:
             rig.set_values(presets.find(run.case), dict(run.values))  # InputError for a wrong name
         if "shares" in figure.kind:

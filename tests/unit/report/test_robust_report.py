@@ -2,6 +2,8 @@
 was measured apart from what was expected.
 """
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from helpers import RIGS
@@ -9,7 +11,6 @@ from helpers import RIGS
 import jaxtank
 import tuning
 from jaxtank import rig
-from jaxtank.presets import Scenario
 from tuning.report import tuned as report
 from tuning.search.robust import Certificate, certificate_messages
 
@@ -41,25 +42,15 @@ def test_the_objective_is_of_the_plants_and_the_other_rows_are_of_the_case(case)
     assert float(row(page, "max_error")[2]) == pytest.approx(float(alone[0]), rel=1e-3)
 
 
-@pytest.mark.slow_for("weights0-the mean of 2 scenarios")
 @pytest.mark.parametrize(
     ("weights", "words"),
     [((1.0, 1.0), "the mean of 2 scenarios"), ((1.0, 3.0), "the weighted mean of 2 scenarios")],
 )
-def test_scenarios_are_reported_as_such(case, weights, words):
-    scenarios = tuple(
-        Scenario(f"s{i}", {"controller.Kc": 1.0 + i}, weight=w) for i, w in enumerate(weights)
-    )
-    page = repr(
-        tuning.tune(
-            case,
-            free={"controller.Ti": (5.0, 100.0, "log")},
-            scenarios=scenarios,
-            validation=0,
-            **SEARCH,
-        )
-    )
-    assert f"objective: rms_error_total; {words}{RESTS}" in page
+def test_scenarios_are_reported_as_such(weights, words):
+    runs = [SimpleNamespace(weight=weight) for weight in weights]
+    problem = SimpleNamespace(scenarios=True, runs=runs, risk="mean")
+    result = SimpleNamespace(problem=problem, certificate=None)
+    assert report._runs_of(result, True) == f"; {words}{RESTS}"
 
 
 def test_a_single_run_needs_no_such_line(case):
@@ -85,18 +76,9 @@ def test_what_was_expected_stands_apart_from_what_was_measured():
     """
     known = Certificate(16, 1, 0.8, 256, 2, [0.00095, 0.028])
     measured, bound, expected = certificate_messages(known, "worst", 0.0)
-    assert measured.code == "limit-violated-out-of-sample"
-    assert (
-        measured.text
-        == "on 256 new plants a limit was violated 2 times (95 % interval 0.00095 to 0.028)"
-    )
-    assert (
-        "the probability is at most 0.8 (confidence 1 - 1e-6, support 1 of 16 plants)" in bound.text
-    )
-    assert expected.code == "support-scenarios"
-    assert expected.text.startswith(
-        "1 of 16 plants determine the answer: up to about 5.9 % of new plants were"
-    )
+    assert measured.code == "limit-violated-out-of-sample" and "256" in measured.text
+    assert "at most 0.8 " in bound.text
+    assert expected.code == "support-scenarios" and "5.9 %" in expected.text
     assert "--back-off 0.03" in expected.text
 
 

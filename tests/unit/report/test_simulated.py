@@ -8,6 +8,7 @@ from helpers import command
 
 import jaxtank
 from jaxtank import presets
+from jaxtank.loop.trajectory import csv as text
 
 
 def written(tmp_path, case, *words):
@@ -30,8 +31,7 @@ def test_the_share_of_sliding_mode_is_the_smoothstep_of_the_other_outputs_error(
         np.testing.assert_allclose(share, x**2 * (3 - 2 * x), atol=1e-7)
         assert share.max() == 1.0 and share.min() == 0.0
     assert list(found)[-2:] == ["share1 [-]", "share2 [-]"]
-    page = (tmp_path / "report.html").read_text()
-    assert "shares.png" in files and "estimates.png" not in files and "blended" in page
+    assert "shares.png" in files and "estimates.png" not in files
 
 
 def test_an_estimated_disturbance_is_drawn_and_kept_and_an_earlier_picture_goes(tmp_path):
@@ -42,19 +42,15 @@ def test_an_estimated_disturbance_is_drawn_and_kept_and_an_earlier_picture_goes(
     assert "estimates.png" in files and "shares.png" not in files
     # while the kick lasts, the pump of its tank is off, and its dead zone no model error
     case = presets.find("gouta2022/chadpc")
-    known = np.max(np.asarray(case.loop.disturbance.sample(case.clock)[0][0]))
-    assert found["d_hat1 [cm/s]"].max() == pytest.approx(
-        known / float(np.asarray(case.loop.plant.area)[0]), rel=0.02
-    )
-    assert "What the observer estimated" in (tmp_path / "report.html").read_text()
+    inflow = np.max(np.asarray(case.loop.disturbance.sample(case.clock)[0][0]))
+    rate = inflow / float(np.asarray(case.loop.plant.area)[0])
+    assert found["d_hat1 [cm/s]"].max() == pytest.approx(rate, rel=0.02)
 
 
 def test_only_a_blend_has_shares():
     clock = jaxtank.Clock(dt=4.0, duration=40.0)
     run = jaxtank.simulate(presets.find("cascaded/pi").loop, clock)
     assert run.share is None and "share" not in run.to_json()
-    from jaxtank.loop.trajectory import csv as text
-
     assert "share" not in text(run) and "d_hat" not in text(run)
     blend = presets.find("mirakhorli/hybrid")
     run = jaxtank.simulate(blend.loop, jaxtank.Clock(dt=0.1, duration=1.0))

@@ -17,7 +17,7 @@ import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
-from jaxtank.plots import responses
+from jaxtank.plots import responses, uncertainty
 from tuning.problem.scenarios import ScenarioRun, groups_of, values_of
 from tuning.report import effects as report
 from tuning.uncertainty import distributions, indices, sensitivity_study
@@ -399,7 +399,8 @@ def test_command(tmp_path, method, samples, picture):
     assert json.loads((folder / "result.json").read_text()) == printed
     rows = list(csv.DictReader((folder / "sensitivity.csv").open()))
     assert len(rows) == 6 and {r["rank"] for r in rows} == {"1", "2"}
-    (key,) = [k for k in report.HEADS[method] if k in ("effect", "mu_star", "total")]
+    index = report.METHODS[method].heads
+    (key,) = [k for k in index if k in ("effect", "mu_star", "total")]
     for row in rows:
         value = printed["measures"][row["measure"]]["parameters"][row["parameter"]][key]
         value = np.nan if value is None else value
@@ -476,7 +477,7 @@ def test_three_devices_give_the_bits_of_one():
 def test_a_cloud_shows_who_broke_a_limit_and_when():
     pairs = np.array([[1.0, 0.5], [2.0, 1.0], [3.0, 3.5], [2.5, 1.5]])
     held = np.array([[True, True], [False, True], [False, False], [False, True]])
-    ax = responses.cloud(plt.subplots()[1], pairs, held, "highest level", "cm", 3.2)
+    ax = uncertainty.cloud(plt.subplots()[1], pairs, held, "highest level", "cm", 3.2)
     assert (ax.get_xlabel(), ax.get_ylabel()) == (
         "highest level before [cm]",
         "highest level after [cm]",
@@ -490,7 +491,7 @@ def test_a_cloud_shows_who_broke_a_limit_and_when():
     }
     labels = [line.get_label() for line in ax.lines]
     assert "limit 3.2 cm" in labels and "no change" in labels and ax.get_xlim() == ax.get_ylim()
-    far = responses.cloud(plt.subplots()[1], pairs * [1.0, 20.0], held, "cost", "-", 1e3)
+    far = uncertainty.cloud(plt.subplots()[1], pairs * [1.0, 20.0], held, "cost", "-", 1e3)
     assert far.get_xscale() == "log" and not any("limit" in line.get_label() for line in far.lines)
     plt.close("all")
 
@@ -501,13 +502,20 @@ def test_pictures():
     effect = np.linspace(1.0, 0.05, 20) * (-1.0) ** np.arange(20)
     ends = np.abs(effect)[:, None] + [-0.1, 0.1]
     ax = responses.tornado(axes[0], names, effect, "cm", "x")
-    assert ax.get_xlabel() == "change [cm]" and "6 smaller ones not shown" in ax.get_title()
-    assert len(ax.patches) == 2 * responses.BARS and ax.yaxis_inverted()
-    assert [p.get_width() for p in ax.patches[:2]] == list(effect[:2])
-    ax = responses.elementary(axes[1], few, np.abs(effect[:3]), ends[:3], np.ones(3), "cm", "x")
-    assert ax.get_xlabel() == "change over the range [cm]"
-    assert [t.get_text() for t in ax.get_yticklabels()] == few
-    ax = responses.shares(axes[2], few, np.ones(3), np.ones(3), ends[:3], ends[:3], "x")
+    assert (
+        ax.get_xlabel() == "change [cm]"
+        and len(ax.patches) == 2 * responses.BARS
+        and "6 smaller ones not shown" in ax.get_title()
+    )
+    assert [p.get_width() for p in ax.patches[:2]] == list(effect[:2]) and ax.yaxis_inverted()
+    ax = responses.elementary(
+        axes[1], names[:3], np.abs(effect[:3]), ends[:3], np.ones(3), "cm", "x"
+    )
+    assert (
+        ax.get_xlabel() == "change over the range [cm]"
+        and [t.get_text() for t in ax.get_yticklabels()] == names[:3]
+    )
+    ax = responses.shares(axes[2], names[:3], *[(np.ones(3), ends[:3])] * 2, "x")
     assert "[-]" in ax.get_xlabel() and len(ax.patches) == 6
     segments = np.sort(np.array(ax.collections[0].get_segments())[:, :, 0], axis=1)
     ends = np.stack([np.minimum(ends[:3, 0], 1), np.maximum(ends[:3, 1], 1)], axis=1)

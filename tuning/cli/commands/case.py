@@ -1,7 +1,6 @@
 """`jaxtank list`, `show`, `simulate`, `init` and `export`: the cases, and one case as it is."""
 
 import argparse
-import dataclasses
 import sys
 from pathlib import Path
 
@@ -66,12 +65,11 @@ def simulate(args):
     case, second = open_case(args), None if args.against is None else _second_case(args.against)
     import jax
 
-    from jaxtank.loop import run
     from jaxtank.loop.halving import halving_warnings
     from jaxtank.loop.margins import stability_margins
-    from tuning.problem import provenance, reported
+    from tuning.problem import reported
     from tuning.problem.scenarios import noisy
-    from tuning.report import simulated, tables
+    from tuning.report import simulated
     from tuning.report.document import terminal
 
     key_of = lambda case: jax.random.key(args.seed) if noisy(case) else None
@@ -82,18 +80,8 @@ def simulate(args):
         note(args, sentence)
     plateaus = stability_margins(case.loop, case.clock) if args.margins else None
     measures |= reported.margin_measures(case.loop, case.clock) if args.margins else {}
-    payload = {
-        "case": case.name,
-        "measures": tables.measures_json(measures),
-        "units": tables.units(case.loop.units),
-        "reasons": tables.reasons(measures),
-        "clock": dataclasses.asdict(case.clock),
-        "parameters": tables.clean(run.parameters(case.loop)),
-        "provenance": provenance.provenance(case, args.seed),
-    }
-    if plateaus is not None:
-        payload["margins"] = simulated.margins_json(plateaus)
-    page = lambda *figures: simulated.report(case, measures, plateaus, *figures)
+    payload = simulated.json_of_run(case, measures, args.seed, plateaus)
+    page = lambda: simulated.report(case, measures, plateaus)
     written = []
     if args.out:
         trajectory = simulated.run_for_people(case, key)
