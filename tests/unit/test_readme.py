@@ -21,16 +21,9 @@ from tuning.cli.parser import parser
 from tuning.problem.problem import Problem
 
 RIG = RIGS / "watertank.toml"
-PAGES = {
-    name: (ROOT / name).read_text() if (ROOT / name).exists() else ""
-    for name in (
-        "README.md",
-        "notebooks/README.md",
-        "jaxtank/README.md",
-        "tuning/README.md",
-        "tests/benchmarks/README.md",
-    )
-}
+FOLDERS = ("", "notebooks/", "jaxtank/", "tuning/", "tests/benchmarks/")
+FILES = {f"{folder}README.md": ROOT / folder / "README.md" for folder in FOLDERS}
+PAGES = {name: path.read_text() if path.exists() else "" for name, path in FILES.items()}
 pytestmark = pytest.mark.skipif(
     not all(PAGES.values()), reason="the pages are not beside the tests"
 )
@@ -38,11 +31,13 @@ pytestmark = pytest.mark.skipif(
 
 def blocks(language, *pages):
     """The code blocks of the pages, of all pages where none is named."""
-    return [
-        b
-        for p in pages or PAGES
-        for b in re.findall(rf"```{language}\n(.*?)```", PAGES[p], re.DOTALL)
-    ]
+    pattern = rf"```{language}\n(.*?)```"
+    return [b for p in pages or PAGES for b in re.findall(pattern, PAGES[p], re.DOTALL)]
+
+
+def prose(page):
+    """A page without its code blocks."""
+    return re.sub(r"```.*?```", "", page, flags=re.DOTALL)
 
 
 def words(line):
@@ -50,24 +45,14 @@ def words(line):
     return tuple(shlex.split(command, comments=True)[1:])
 
 
-COMMANDS = list(
-    dict.fromkeys(
-        words(part)
-        for block in blocks("sh")
-        for line in block.splitlines()
-        for part in line.split("&&")
-        if part.strip().startswith("jaxtank")
-    )
-)
+LINES = [line for block in blocks("sh") for line in block.replace("&&", "\n").splitlines()]
+COMMANDS = list(dict.fromkeys(words(line) for line in LINES if line.strip()[:7] == "jaxtank"))
 
 
 def anchors(page):
     """The anchors of a page's headings, as GitHub makes them."""
-    text = re.sub(r"```.*?```", "", page, flags=re.DOTALL)
-    return {
-        re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-")
-        for h in re.findall(r"^#+ (.*)$", text, re.M)
-    }
+    headings = re.findall(r"^#+ (.*)$", prose(page), re.M)
+    return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
 
 
 def test_the_front_page_is_at_most_10_kb():
@@ -76,8 +61,7 @@ def test_the_front_page_is_at_most_10_kb():
 
 @pytest.mark.parametrize("name", PAGES)
 def test_links_lead_to_files_and_headings_that_exist(name):
-    text = re.sub(r"```.*?```", "", PAGES[name], flags=re.DOTALL)
-    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+    for link in re.findall(r"\]\(([^)\s]+)\)", prose(PAGES[name])):
         if link.startswith("http"):
             continue
         path, _, anchor = link.partition("#")
@@ -97,7 +81,7 @@ def test_a_folder_map_names_every_folder_in_the_order_of_imports(package):
 @pytest.mark.parametrize("name", PAGES)
 def test_paths_in_texts_exist(name):
     """Paths of files or folders, and dotted names of modules, in code spans."""
-    for span in re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", PAGES[name], flags=re.DOTALL)):
+    for span in re.findall(r"`([^`\n]+)`", prose(PAGES[name])):
         for path in re.findall(r"\b(?:jaxtank|tuning|tests|notebooks)/[\w/]+\.\w+", span):
             assert (ROOT / path).exists(), path
 
@@ -129,25 +113,23 @@ def test_the_python_example_is_tuned(capsys):
     assert "converged" in printed and "0.03987" in printed
 
 
-def own_controller():
-    """The front page's example of a controller of one's own; there are no other examples in Python
-    than its two, and that of `tuning`.
-    """
+def custom_controller():
+    """The front page's example of a custom controller, the second of three examples in Python."""
     _, example = blocks("python", "README.md")
     assert len(blocks("python")) == 3
     return compile(example, "README", "exec")
 
 
-def test_the_controller_of_ones_own_runs(capsys, monkeypatch):
+def test_the_custom_controller_runs(capsys, monkeypatch):
     """Its last line simulates once in place of a search."""
     run = lambda case, free, **_: jaxtank.evaluate(case.loop, case.clock, ["rms_error_total"])
     monkeypatch.setattr(package, "tune", run)
-    exec(own_controller(), {"__name__": "README"})
+    exec(custom_controller(), {"__name__": "README"})
     assert "0.809" in capsys.readouterr().out
 
 
 @pytest.mark.slow
-def test_the_objective_of_ones_own_runs(monkeypatch):
+def test_the_custom_objective_runs(monkeypatch):
     """Its last line evaluates the problem once, at a longer step, in place of a search."""
     (example,) = blocks("python", "tuning/README.md")
 
@@ -156,9 +138,9 @@ def test_the_objective_of_ones_own_runs(monkeypatch):
         return problem, problem.point(problem.start())
 
     monkeypatch.setattr(package, "tune", once)
-    known, here = set(MEASURES), {}
-    exec(compile(example, "tuning/README", "exec"), here)
-    problem, point = here["result"]
+    known, names = set(MEASURES), {}
+    exec(compile(example, "tuning/README", "exec"), names)
+    problem, point = names["result"]
     assert list(problem.objective) == ["absolute_error"] and point.finite
     assert [limit.label for limit in problem.limits][-1] == "fastest_change"
     for name in set(MEASURES) - known:
@@ -166,8 +148,8 @@ def test_the_objective_of_ones_own_runs(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_controller_of_ones_own_is_tuned(capsys):
-    exec(own_controller(), {"__name__": "README"})
+def test_the_custom_controller_is_tuned(capsys):
+    exec(custom_controller(), {"__name__": "README"})
     printed = capsys.readouterr().out
     assert "controller.Kc" in printed and "converged" in printed
 
@@ -204,16 +186,16 @@ def test_what_the_page_states_of_outputs_holds():
 def test_commands_parse():
     inline = [words(span) for span in re.findall(r"`(jaxtank [^`\n]+)`", PAGES["README.md"])]
     assert len(COMMANDS) >= 30 and len(inline) >= 10
-    for given in [*COMMANDS, *inline]:
-        args, rest = parser().parse_known_args(given)
+    for line in [*COMMANDS, *inline]:
+        args, rest = parser().parse_known_args(line)
         assert not rest and callable(args.run)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("given", COMMANDS, ids=" ".join)
-def test_commands_run(given, tmp_path_factory, monkeypatch, capsys):
+@pytest.mark.parametrize("line", COMMANDS, ids=" ".join)
+def test_commands_run(line, tmp_path_factory, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path_factory.getbasetemp())
-    assert main.main(list(given)) == 0, capsys.readouterr().err
+    assert main.main(list(line)) == 0, capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", PAGES)

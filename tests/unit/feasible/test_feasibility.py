@@ -104,7 +104,7 @@ def test_the_json_object_is_that_of_the_interface(found):
         assert {"time_s", "tank", "needed", "needed_p95", "limit"} <= set(row)
     assert [m["what"] for m in page["mends"]] == ["setpoints", "rims", "orifices"]
     assert page["mends"][1]["set"].keys() == {"plant.rim[2]", "plant.rim[3]"}
-    assert "needs" in found._repr_html_() and set(found.plot()) == {"needs"}
+    assert "not reachable" in found._repr_html_() and set(found.plot()) == {"needs"}
 
 
 def test_a_limit_of_its_own_takes_the_place_of_the_rim():

@@ -515,7 +515,7 @@ def test_pictures():
         ax.get_xlabel() == "change over the range [cm]"
         and [t.get_text() for t in ax.get_yticklabels()] == names[:3]
     )
-    ax = responses.shares(axes[2], names[:3], *[(np.ones(3), ends[:3])] * 2, "x")
+    ax = responses.shares(axes[2], few, *[(np.ones(3), ends[:3])] * 2, "x")
     assert "[-]" in ax.get_xlabel() and len(ax.patches) == 6
     segments = np.sort(np.array(ax.collections[0].get_segments())[:, :, 0], axis=1)
     ends = np.stack([np.minimum(ends[:3, 0], 1), np.maximum(ends[:3, 1], 1)], axis=1)
