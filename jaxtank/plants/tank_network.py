@@ -266,7 +266,7 @@ class TankNetwork(Plant):
     outputs: tuple = static(doc="tanks whose levels are controlled")
     units: tuple = static(doc="(length, pump input): the units of this rig", default=DEFAULT)
     overflow: bool = static(
-        doc="rims are physics: a level stops there and the liquid overflows",
+        doc="overflow is simulated: a level stops at the rim, the rest is lost",
         choices=(False, True),
         default=False,
     )

@@ -505,9 +505,12 @@ def _assumed(result: TuningResult) -> Found:
 def _idle(result: TuningResult) -> Found:
     if result.answer.idle:
         tanks = numbered("tank", result.answer.idle)
-        yield Message(
-            "limit-idle", f"no plant comes within 10 % of the limit on the level of {tanks}"
-        )
+        if len(result.answer.idle) == 2:
+            tanks = tanks.replace(", ", " and ")
+        words = f"limits of {tanks} are not active: no plant comes within 10 % of them"
+        if len(result.answer.idle) == 1:
+            words = f"the limit of {tanks} is not active: no plant comes within 10 % of it"
+        yield Message("limit-idle", words)
 
 
 def _screened_again(result: TuningResult) -> Found:
