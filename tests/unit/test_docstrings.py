@@ -66,7 +66,7 @@ def test_a_docstring_without_sections_is_reported():
 
 # seconds of compilation: what these examples show has tests of its own
 LONG = {
-    *("jaxtank.loop.margins", "tuning.live.engine", "tuning.figures.comparison"),
+    *("jaxtank.loop.margins", "jaxtank.live.engine", "tuning.figures.comparison"),
     *("tuning.search.judged", "tuning.identification.design", "tuning.falsification.study"),
     *("tuning.uncertainty.study", "tuning.uncertainty.sensitivity_study"),
     *("jaxtank.analysis.linear_model", "jaxtank.analysis.steady_state"),

@@ -20,7 +20,7 @@ from jaxtank.core.errors import InputError
 from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
 from tuning.storage.store import NAME, SCHEMA, Store
 
-OPTIONS = {"starts": 2, "screening": 8, "validation": 8}
+OPTIONS = {"starts": 2, "screening": 8, "validation": 0}
 SAME = ["parameters", "objective", "measures", "constraints", "evaluations", "starts", "optimality"]
 SAME += ["curvature", "validation", "message"]
 

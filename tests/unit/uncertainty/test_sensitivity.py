@@ -410,6 +410,7 @@ def test_command(tmp_path, method, samples, picture):
     assert {p.name for p in folder.iterdir()} == files
 
 
+@pytest.mark.slow
 def test_command_prints_tables():
     words = "--method sobol --samples 16 --spread 0.02 --measure max_level --quiet"
     code, out, err = say(*SHORT, *words.split())
