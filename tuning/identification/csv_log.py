@@ -300,10 +300,9 @@ def _slot(stem, slots):
     """Return the slot ("t", "pump1", "h2") that a column's name means, or None."""
     # no rig has a tank of seven digits
     word = re.fullmatch(r"([a-z]+)[ _]?(\d{0,6})", stem.strip().lower())
-    kind = word and WORDS.get(word[1])
-    if not kind:
+    if not word or word[1] not in WORDS:
         return None
-    number = word[2] and str(int(word[2]))
+    kind, number = WORDS[word[1]], word[2] and str(int(word[2]))
     alone = kind != "t" and not number and f"{kind}2" not in slots  # "level" of a single tank
     slot = f"{kind}1" if alone else f"{kind}{number}"
     return slot if slot in slots else None
