@@ -4,6 +4,7 @@ that is checked (`jaxtank.xla.program_cache`), and tasks of Dask workers by Dask
 """
 
 import ast
+import functools
 import importlib.util
 import os
 import subprocess
@@ -113,14 +114,15 @@ READ = {
 }
 
 
+@functools.cache
 def sources():
-    """(module, syntax tree) of every file of the packages."""
+    """[(module, syntax tree) of every file of the packages]."""
+    trees = []
     for package, root in PACKAGES.items():
         for path in sorted(root.rglob("*.py")):
-            name = ".".join([package, *path.relative_to(root).with_suffix("").parts]).removesuffix(
-                ".__init__"
-            )
-            yield name, ast.parse(path.read_text())
+            name = ".".join([package, *path.relative_to(root).with_suffix("").parts])
+            trees.append((name.removesuffix(".__init__"), ast.parse(path.read_text())))
+    return trees
 
 
 def called(tree):

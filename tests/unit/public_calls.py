@@ -48,7 +48,6 @@ CALLS = {
     "Case.plot": case.plot,
     "Case.explore": lambda: case.explore(plants=3).save(folder / "page.html"),
     "Case.save": lambda: saved(case, "case.json", "rig.toml", "rig.png"),
-    "Case.safety": lambda: case.with_safety_filter().without_safety_filter(),
     "ClosedLoop": lambda: loop.units,
     "Clock": lambda: clock.samples,
     "Trajectory": lambda: (str(run), run.to_json(), run._repr_html_()),
@@ -75,8 +74,8 @@ CALLS = {
     "stability_margins": lambda: jaxtank.stability_margins(loop, clock),
     "with_values": lambda: jaxtank.with_values(loop, {"x0[0]": 1.0}),
     "presets": lambda: [presets.load(paper) for paper in presets.PAPERS],
-    "rig": lambda: rig.loads(rig.complete(rig.filtered(case, on=True))),
-    "export": lambda: [jaxtank.export.export(case, language) for language in ("c", "m", "js")],
+    "rig": lambda: rig.loads(rig.complete(case)),
+    "export": lambda: jaxtank.export.export(case, "c"),
     "interop": interop,
 }
 """{name, with a method, or of a folder: call}."""

@@ -25,14 +25,23 @@ from jaxtank.core.tree import component
 from jaxtank.export.c import C
 from jaxtank.export.javascript import JavaScript
 from jaxtank.export.matlab import Matlab
-from jaxtank.export.source import export
+from jaxtank.export.program import program
+from jaxtank.export.source import LANGUAGES, export
 from jaxtank.export.statements import Matrix
 from jaxtank.plants.network import network
-from jaxtank.rig import entry as rig_lines
 from tuning.cli import main
 
 SAMPLES = 10_000
 GCC = shutil.which("gcc")
+FLAGS = [
+    "-pedantic",
+    "-O1",
+    "-Wall",
+    "-Wextra",
+    "-Werror",
+    "-Wno-unused-function",
+    "-Wno-unused-variable",
+]
 needs_gcc = pytest.mark.skipif(GCC is None, reason="no gcc on this machine")
 
 # one case of every law, observer and way of saturating; the rest differ in numbers alone
@@ -83,22 +92,9 @@ class Compiled:
         text = export(case, "c", precision, name="law")
         source, library = folder / "law.c", folder / "law.so"
         source.write_text(text)
-        flags = [
-            "-std=c99",
-            "-pedantic",
-            "-O1",
-            "-Wall",
-            "-Wextra",
-            "-Werror",
-            "-Wno-unused-function",
-            "-Wno-unused-variable",
-        ]
-        made = subprocess.run(
-            [GCC, *flags, "-shared", "-fPIC", "-o", library, source, "-lm"],
-            capture_output=True,
-            text=True,
-        )
-        assert made.returncode == 0, made.stderr
+        words = [GCC, *FLAGS, "-std=c99", "-shared", "-fPIC", "-o", library, source, "-lm"]
+        compiled = subprocess.run(words, capture_output=True, text=True)
+        assert compiled.returncode == 0, compiled.stderr
         self.library = ctypes.CDLL(str(library))
         self.real = ctypes.c_double if precision == "double" else ctypes.c_float
         self.type = np.float64 if precision == "double" else np.float32
@@ -123,7 +119,11 @@ class Compiled:
 
 
 @pytest.mark.slow_for(
-    "gouta2015/ngpc", "mirakhorli/smc", "calofir/backstepping", "mirakhorli/hybrid"
+    "gouta2015/ngpc",
+    "gouta2022/fopi",
+    "mirakhorli/smc",
+    "calofir/backstepping",
+    "mirakhorli/hybrid",
 )
 @needs_gcc
 @pytest.mark.parametrize("name", EVERY)
@@ -190,7 +190,12 @@ def test_a_programme_of_many_variables_gives_the_inputs_of_the_loop(tmp_path, mo
 TUNED = (("controller.Tp", 1.63), ("observer.l", (0.257, 0.115)))  # gouta2022 notes S10
 
 
-@pytest.mark.slow_for("gouta2015/backstepping-values0-0.0001")
+@pytest.mark.slow_for(
+    "gouta2015/backstepping-values0-0.0001",
+    "gouta2022/chadpc-values1-0.0001",
+    "gouta2022/chadpc-values2-0.0002",
+    "mirakhorli/hybrid-values3-0.0001",
+)
 @needs_gcc
 @pytest.mark.parametrize(
     ("name", "values", "share"),
@@ -346,49 +351,23 @@ def matlab(text):
         opens = line.startswith(("if ", "for "))
         lines.append("    " * depth + line + (":" if opens else ""))
         depth += opens
-    known = {f: getattr(math, f) for f in ("sqrt", "exp", "log", "tanh", "sin", "cos", "floor")}
-    known |= {
+    same = "sqrt exp log tanh sin cos floor erf erfc log1p expm1 tan asin acos atan atan2 sinh cosh"
+    same += " asinh acosh atanh ceil isfinite"
+    known = {name: getattr(math, name) for name in same.split()} | {
         "pick": lambda c, yes, no: yes if c else no,
-        "abs": abs,
-        "max": max,
-        "min": min,
-        "double": float,
-        "true": True,
-        "false": False,
-    }
-    known |= {
-        f: getattr(math, f)
-        for f in (
-            "erf",
-            "erfc",
-            "log1p",
-            "expm1",
-            "tan",
-            "asin",
-            "acos",
-            "atan",
-            "atan2",
-            "sinh",
-            "cosh",
-        )
-    }
-    known |= {f: getattr(math, f) for f in ("asinh", "acosh", "atanh", "ceil", "isfinite")}
-    known |= {
-        "rem": math.fmod,
-        "fix": math.trunc,
-        "round": round,
+        **{"abs": abs, "max": max, "min": min, "round": round, "double": float},
+        **{"true": True, "false": False, "Inf": math.inf, "NaN": math.nan},
+        **{"rem": math.fmod, "fix": math.trunc, "sign": np.sign},
         "nthroot": lambda v, n: math.copysign(abs(v) ** (1 / n), v),
-    }
-    known |= {
         "sqrt": lambda v: math.sqrt(v) if v >= 0 else math.nan,
-        "sign": np.sign,
-        "Inf": math.inf,
-        "NaN": math.nan,
     }
     exec("def law(s, t, y, r, dr, ddr, u):\n" + "\n".join(lines) + "\n    return u, s", known)
     return known["law"]
 
 
+@pytest.mark.slow_for(
+    "gouta2015/backstepping-values0", "mirakhorli/hybrid-values2", "cascaded/pi-values4"
+)
 @pytest.mark.parametrize(
     ("name", "values"),
     [
@@ -623,90 +602,55 @@ HOSTILE = [
 ]
 
 
-def exported(folder, name, language):
-    """The text that `jaxtank export` writes of a rig with a hostile name."""
-    (folder / "rig.toml").write_text(HOSTILE_RIG.format(name=rig_lines.toml(name)))
-    words = [
-        "export",
-        str(folder / "rig.toml"),
-        "--lang",
-        language,
-        "--name",
-        "law",
-        "--out",
-        str(folder / "out"),
-        "--quiet",
-    ]
-    assert main.main(words) == 0
-    return (folder / "out" / f"law.{language}").read_text()
+@pytest.fixture(scope="module")
+def traced():
+    """The Program of a rig whose tank and pump have hostile names."""
+    return program(rig.loads(HOSTILE_RIG.format(name='"r"')))
+
+
+def printed(traced, name, language, title="r"):
+    """The text of an export of the same case with other words."""
+    case = dataclasses.replace(traced.case, name=name, title=title)
+    written = dataclasses.replace(traced, case=case)
+    return LANGUAGES[language].write(written, "law", "double")
 
 
 @needs_gcc
 @pytest.mark.parametrize("standard", ["c99", "gnu99"])  # with trigraphs and without
 @pytest.mark.parametrize("name", HOSTILE)
-def test_a_name_stays_within_the_comment_of_c(name, standard, tmp_path):
-    text = exported(tmp_path, name, "c")
-    flags = [
-        f"-std={standard}",
-        "-pedantic",
-        "-O1",
-        "-Wall",
-        "-Wextra",
-        "-Werror",
-        "-Wno-unused-function",
-        "-Wno-unused-variable",
-    ]
-    (tmp_path / "law.c").write_text(text)
-    made = subprocess.run(
-        [GCC, *flags, "-c", "-o", tmp_path / "law.o", tmp_path / "law.c"],
-        capture_output=True,
-        text=True,
-    )
-    assert made.returncode == 0, made.stderr
-    symbols = subprocess.run(
-        ["nm", "-g", "--defined-only", tmp_path / "law.o"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+def test_a_name_stays_within_the_comment_of_c(traced, name, standard, tmp_path):
+    source, code = tmp_path / "law.c", tmp_path / "law.o"
+    source.write_text(printed(traced, name, "c"))
+    words = [GCC, *FLAGS, f"-std={standard}", "-c", "-o", code, source]
+    compiled = subprocess.run(words, capture_output=True, text=True)
+    assert compiled.returncode == 0, compiled.stderr
+    words = ["nm", "-g", "--defined-only", code]
+    symbols = subprocess.run(words, capture_output=True, text=True, check=True)
     assert {line.split()[-1] for line in symbols.stdout.splitlines()} == {"law_init", "law_step"}
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_a_name_stays_within_the_comments_of_matlab_and_of_c(name, tmp_path):
-    """One comment, which ends in its last line, in C; every line before the first statement begins
-    with % in MATLAB.
-    """
-    text = exported(tmp_path, name, "c")
+def test_a_name_stays_within_the_comments_of_matlab_and_of_c(traced, name):
+    """One comment in C; every line before the first statement begins with % in MATLAB."""
+    text = printed(traced, name, "c")
     head, after = text.split("*/", 1)
-    assert (
-        head.startswith("/*")
-        and "/*" not in head[2:]
-        and after.startswith("\n#include <math.h>")
-        and "taken" not in after
-    )
-    assert not re.search(r"\\|\?\?", text)
-    text = exported(tmp_path, name, "m")
-    body = [line for line in text.splitlines()[1:] if not line.startswith("% ") and line != "%"]
+    assert head.startswith("/*") and "/*" not in head[2:] and "taken" not in after
+    assert after.startswith("\n#include <math.h>") and not re.search(r"\\|\?\?", text)
+    lines = printed(traced, name, "m").splitlines()[1:]
+    body = [line for line in lines if not line.startswith("% ") and line != "%"]
     assert "taken" not in "\n".join(body) and body[0].strip() == "if isempty(s)"
 
 
 @pytest.mark.parametrize(
     "separator", ["\n", "\r", "\v", "\f", "\x1c", "\x85", "\u2028", "\u2029", "\0", "\ud800"]
 )
-def test_a_line_break_in_the_name_of_a_case_ends_no_comment(separator):
+def test_a_line_break_in_the_name_of_a_case_ends_no_comment(traced, separator):
     """A rig file may not hold one; a Case made in Python may."""
-    case = dataclasses.replace(
-        presets.find("cascaded/pi"),
-        name=f"t{separator}taken = 1;",
-        title=f"t{separator}taken = 1; */",
-    )
+    name = f"t{separator}taken = 1;"
     for language, marks in (("c", (" *", "/*")), ("m", ("%",))):
-        lines = export(case, language, name="controller").split("\n")
+        lines = printed(traced, name, language, f"{name} */").split("\n")
         assert all(line.startswith(marks) for line in lines if "taken" in line)
-        assert len(lines) == len(
-            export(presets.find("cascaded/pi"), language, name="law").split("\n")
-        )
+        assert len(lines) == len(printed(traced, "r", language).split("\n"))
         "\n".join(lines).encode()
 
 

@@ -163,6 +163,7 @@ def pumps_and_sensors(case):
 
 
 @pytest.mark.slow_for(
+    "calofir/backstepping-perturbed-own",
     "calofir/backstepping-perturbed-lag-delay-noise-offset-adc",
     "cascaded/pi-lag-delay-noise-offset-adc",
     "gouta2015/backstepping-boxqp-lag-delay-noise-offset-adc",

@@ -139,6 +139,7 @@ def agrees(case, settings, tolerance, seed=0, filtered=None):
     return compared
 
 
+@pytest.mark.slow_for("gouta2015/backstepping")
 @pytest.mark.parametrize("name", SHORT)
 def test_runs_are_those_of_the_library(name):
     case = short(name)
@@ -171,6 +172,7 @@ def test_where_a_run_differs_much_so_does_that_of_a_plant_as_good_as_equal():
     assert 3 < sum(differ) < 0.5 * len(differ)
 
 
+@pytest.mark.slow
 def test_noise_is_that_of_a_seed():
     agrees(short("cascaded/pi"), [{"sensor.noise[0]": 0.05, "sensor.noise[1]": 0.02}], 1e-9, 7)
 
@@ -190,7 +192,12 @@ def test_the_safety_filter_is_switched_on():
 
 
 @pytest.mark.parametrize(
-    "name", ["cascaded/pi", "gouta2022/pi", pytest.param("khalid/gpc", marks=pytest.mark.slow)]
+    "name",
+    [
+        "cascaded/pi",
+        pytest.param("gouta2022/pi", marks=pytest.mark.slow),
+        pytest.param("khalid/gpc", marks=pytest.mark.slow),
+    ],
 )
 def test_derivatives_are_those_of_the_library(name):
     case = short(name)

@@ -74,6 +74,7 @@ def test_the_page_is_one_small_file_that_asks_for_nothing(browser, written):
         assert len(live("jaxtank.names")) >= 30
 
 
+@pytest.mark.slow_for("1400-dark", "390-light", "390-dark")
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1400, 390])
 def test_axe_finds_nothing_serious(browser, written, scheme, width):
@@ -159,6 +160,7 @@ def test_a_link_brings_back_the_state_and_a_false_one_is_refused(browser, writte
         assert "another version" in live.text("#message")
 
 
+@pytest.mark.slow
 def test_names_of_a_rig_stay_text(browser, tmp_path):
     evil = "</script><img src=x onerror=alert(1)>\u2028${alert(2)}"
     case = presets.find("cascaded/pi").replace(
@@ -184,6 +186,7 @@ def test_what_is_broken_changes_the_plant_alone(browser, written):
         assert live("jaxtank.state().values") == {}
 
 
+@pytest.mark.slow
 def test_64_plants_are_those_that_the_page_says(browser, written):
     """The share that keeps the limits against the library's own draws of the same spread."""
     case = presets.find("cascaded/pi")
@@ -201,6 +204,7 @@ def test_64_plants_are_those_that_the_page_says(browser, written):
     assert abs(kept - held) <= 16  # two samples of 64
 
 
+@pytest.mark.slow
 def test_runs_are_pinned_zoomed_and_played_by_keyboard(browser, written):
     with opened(browser, written) as live:
         live.page.focus("#pin")
@@ -219,6 +223,7 @@ def test_runs_are_pinned_zoomed_and_played_by_keyboard(browser, written):
         assert "run 1" not in live.text("#legend")
 
 
+@pytest.mark.slow
 def test_a_drag_over_a_chart_zooms_all_and_a_double_click_shows_the_whole_run(browser, written):
     with opened(browser, written) as live:
         box = live.page.locator(".u-over").first.bounding_box()
@@ -232,6 +237,7 @@ def test_a_drag_over_a_chart_zooms_all_and_a_double_click_shows_the_whole_run(br
         assert live("jaxtank.state().shown") == [0, 2800]
 
 
+@pytest.mark.slow
 def test_what_a_page_says_first_is_of_the_last_state(browser, tmp_path):
     """A result that keeps its limits never reads "exceeded", which the state before it does."""
     case = presets.find("cascaded/pi").replace(limits={"max_level": 9.9})
@@ -256,6 +262,7 @@ def test_what_a_page_says_first_is_of_the_last_state(browser, tmp_path):
         context.close()
 
 
+@pytest.mark.slow
 def test_states_of_a_result_are_compared(browser, tmp_path):
     case = presets.find("cascaded/pi")
     states = [("before", {}, False), ("after", {"controller.Kc": 0.4}, False)]
@@ -297,6 +304,7 @@ def test_the_command_writes_one_file_or_none(tmp_path):
     assert sorted(p.name for p in tmp_path.rglob("*.html")) == ["page.html"]
 
 
+@pytest.mark.slow
 def test_a_changed_case_keeps_the_words_that_make_it(browser, tmp_path):
     case = rig.set_values(
         presets.find("cascaded/pi"), {"clock.duration": 800.0, "controller.Kc": 2.0}
@@ -310,6 +318,7 @@ def test_a_changed_case_keeps_the_words_that_make_it(browser, tmp_path):
         ]
 
 
+@pytest.mark.slow
 def test_a_filtered_case_is_repeated_with_its_settings(browser, tmp_path):
     path = tmp_path / "page.html"
     words = ["--safety-filter", "--set", "safety_filter.rate=0.1", "--set", "clock.duration=800"]
@@ -371,6 +380,7 @@ def test_the_search_of_the_page_ends_where_that_of_the_command_ends(browser, wri
     assert found["objective"] == pytest.approx(wanted["after"], rel=5e-3)
 
 
+@pytest.mark.slow
 def test_sliders_do_not_wait_for_a_run_and_a_pin_is_of_the_sliders(browser, written):
     with opened(browser, written) as live:
         assert not live.page.is_visible("#run") and not live.page.is_visible("#slow-note")
@@ -393,6 +403,7 @@ def test_a_search_that_is_stopped_keeps_the_best_so_far(browser, written):
         live.wait("document.querySelector('#tune').textContent === 'Tune'")
 
 
+@pytest.mark.slow_for("reset", "plants")
 @pytest.mark.parametrize("change", ["slider", "reset", "plants"])
 def test_whatever_changes_the_loop_ends_a_search(browser, written, change):
     """Else its next point would be put on a loop that it was not found for."""
@@ -415,6 +426,7 @@ def test_whatever_changes_the_loop_ends_a_search(browser, written, change):
             assert live("jaxtank.state().values") == {} and text == "Reset to the case."
 
 
+@pytest.mark.slow
 def test_a_link_replaces_what_is_broken(browser, written):
     with opened(browser, written) as live:
         live.page.click("#breaks summary")
@@ -455,6 +467,7 @@ def test_pages_of_other_papers_repeat_the_command(browser, tmp_path, name):
     np.testing.assert_allclose(numbers, expected, rtol=2e-9, atol=2e-9)
 
 
+@pytest.mark.slow
 def test_faults_of_a_link_are_switches_and_an_empty_address_is_the_case(browser, tmp_path):
     """A fault beyond the end of its slider comes back, and can be switched off."""
     path = tmp_path / "page.html"
@@ -477,6 +490,7 @@ def test_faults_of_a_link_are_switches_and_an_empty_address_is_the_case(browser,
         assert live("jaxtank.state().values") == {}
 
 
+@pytest.mark.slow
 def test_reset_ticks_what_is_tuned_and_plants_leave_the_message_of_a_search(browser, written):
     with opened(browser, written) as live:
         tick = "document.querySelector('#groups .free input')"
@@ -492,6 +506,7 @@ def test_reset_ticks_what_is_tuned_and_plants_leave_the_message_of_a_search(brow
         assert live.text("#message").startswith("Tuned in")
 
 
+@pytest.mark.slow
 def test_a_constant_reference_runs_and_limits_are_ranked_by_their_shares(browser, tmp_path):
     """An error of twice its limit goes before a level that is 4 V, but 80 %, above its own."""
     case = rig.set_values(presets.find("cascaded/pi"), {"clock.duration": 400.0})
@@ -548,6 +563,7 @@ def test_limits_and_verdict_follow_the_slider_of_a_rim(browser, four_tanks):
         assert heights[3] / heights[2] == pytest.approx(20.0 / 36.0, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_level_far_from_its_setpoint_is_no_check_mark(browser, four_tanks):
     """Tank 1 with a leak, safety filter on: every level limit holds, and 12 cm is not reached."""
     with opened(browser, four_tanks) as live:
@@ -557,6 +573,7 @@ def test_a_level_far_from_its_setpoint_is_no_check_mark(browser, four_tanks):
         assert verdict(live, "tank 1 is ", "from its setpoint of", "Every limit holds") == "bad"
 
 
+@pytest.mark.slow
 def test_sliders_without_effect_are_folded_and_come_back_with_it(browser, four_tanks):
     with opened(browser, four_tanks) as live:
         live.page.wait_for_selector("#idle", state="attached", timeout=120_000)
@@ -583,6 +600,7 @@ def test_sliders_without_effect_are_folded_and_come_back_with_it(browser, four_t
         assert names - idle >= {"controller.k", "plant.orifice[0]", "sensor.noise[0]"}
 
 
+@pytest.mark.slow
 def test_the_frame_of_a_report_has_the_limits_of_the_command(browser, tmp_path):
     """33 cm for rims of 30: the banner and the frame on one page agree."""
     words = ["tune", "gouta2015/backstepping", "--nominal", "--dt", "0.1", "--starts", "1"]

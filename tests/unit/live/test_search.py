@@ -48,6 +48,7 @@ def test_a_search_keeps_the_limits():
     assert np.max(start) > 17.0 >= np.max(levels) > 16.9
 
 
+@pytest.mark.slow
 def test_a_search_without_a_way_ends_at_the_least_violation():
     """Of one gain, against the least of the largest violation on a scan of 60 values."""
     case = presets.find("cascaded/pi").replace(limits={"max_level": [6.0, 5.0]})
