@@ -61,7 +61,7 @@ def bounds(loop: ClosedLoop, free: Mapping[str, Any]) -> list[Bound]:
     # parameter allows.
     if not free:
         raise InputError("nothing to tune: name at least one parameter with --free NAME=LOW:HIGH")
-    found: list[Bound] = []
+    entries: list[Bound] = []
     for name, spec in free.items():
         if name.startswith("safety_filter."):
             raise InputError(
@@ -77,9 +77,9 @@ def bounds(loop: ClosedLoop, free: Mapping[str, Any]) -> list[Bound]:
             if np.ndim(value) == 0
             else [f"{base}[{','.join(map(str, i))}]" for i in np.ndindex(np.shape(value))]
         )
-        found += [Bound(n, float(low), float(high), scale, unit) for n in names]
-    names = [b.name for b in found]
+        entries += [Bound(n, float(low), float(high), scale, unit) for n in names]
+    names = [b.name for b in entries]
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"free {name} is given twice")
-    return found
+    return entries

@@ -157,8 +157,8 @@ class Case(CaseViews):
         >>> presets.find("cascaded/pi").with_safety_filter().loop.safety_filter.held
         (0, 1)
         """
-        found, _ = self.safety_design(**settings)
-        loop = dataclasses.replace(self.loop, safety_filter=found)
+        safety_filter, _ = self.safety_design(**settings)
+        loop = dataclasses.replace(self.loop, safety_filter=safety_filter)
         return self.replace(loop=loop, safety=settings)
 
     def without_safety_filter(self) -> "Case":

@@ -64,8 +64,8 @@ class Limit:
         # output never left its band.
         undefined = UNDEFINED_MARGIN if ms.MEASURES[self.measure].nan_holds else -UNDEFINED_MARGIN
         distance = self.sign * (self.value - np.asarray(values))
-        found = np.clip(distance, -UNDEFINED_MARGIN, UNDEFINED_MARGIN)
-        return np.where(np.isnan(values), undefined, found)
+        clipped = np.clip(distance, -UNDEFINED_MARGIN, UNDEFINED_MARGIN)
+        return np.where(np.isnan(values), undefined, clipped)
 
 
 def limit_scale(limit: Limit, loop: ClosedLoop) -> float:
@@ -101,7 +101,7 @@ def resolve_in(
     runs: Sequence[tuple[str, Case]], limits: Mapping[str, Any] | None = None, first: int = 0
 ) -> list[Limit]:
     """Return the Limits of `resolve_limits` in each (scenario, case), numbered from `first`."""
-    found: list[Limit] = []
+    resolved: list[Limit] = []
     why: dict[str, tuple[Any, str]] = {}
     for i, (scenario, case) in enumerate(runs, first):
         loop = case.loop
@@ -116,16 +116,16 @@ def resolve_in(
             for j, v in enumerate(values):
                 if not missing[j]:
                     measured, at = _without_overflow(measure, j, float(v), loop.plant)
-                    found.append(Limit(measured, j, at, i, scenario))
+                    resolved.append(Limit(measured, j, at, i, scenario))
     for measure, (value, reason) in why.items():
-        if not any(limit.measure == measure for limit in found):
+        if not any(limit.measure == measure for limit in resolved):
             text = ", ".join(f"{v:g}" for v in np.ravel(value))
             where = "in every scenario" if len(runs) > 1 else "on this run"
             raise InputError(
                 f"limit {measure} = {text} {ms.unit(measure, runs[0][1].loop.units)}: undefined"
                 f" {where}: {reason}, or drop the limit (--limit {measure}=none)"
             )
-    return found
+    return resolved
 
 
 def _without_overflow(measure: str, index: int, value: float, plant: Any) -> tuple[str, float]:
@@ -137,15 +137,15 @@ def _without_overflow(measure: str, index: int, value: float, plant: Any) -> tup
 
 def undefined(measure: str, case: Case) -> tuple[str, list[bool]]:
     """Return (reason and remedy, (entries,) True where `measure` has no value on the run)."""
-    wanted, clock, loop = ms.refers_to([measure]), case.clock, case.loop
+    references, clock, loop = ms.refers_to([measure]), case.clock, case.loop
     onset = None if loop.disturbance is None else loop.disturbance.since(clock)
     since = np.full(1, -1.0) if onset is None else np.asarray(onset)
-    if "since" in wanted and onset is not None:
+    if "since" in references and onset is not None:
         why = f"no inflow disturbance begins within its {clock.duration:g} s; add one ([[inflow]])"
         return why, [not np.any(since >= 0.0)] * ms.entries(measure, loop.plant)
-    found = windows(loop, clock) if "window" in wanted else None
-    if found is not None:
-        steps = [np.asarray(window[1]) for window in found]
+    all_windows = windows(loop, clock) if "window" in references else None
+    if all_windows is not None:
+        steps = [np.asarray(window[1]) for window in all_windows]
         why = (
             f"no setpoint has a step within its {clock.duration:g} s, and no level starts away from"
             " a constant setpoint; add one (reference.changes, or x0)"

@@ -146,8 +146,8 @@ def _definitions(program, prefix, precision):
 def _matrix_functions(program):
     """The functions that the step calls for its matrix operations."""
     used = matrix_operations(program.step)
-    found = MATRICES.strip("\n").split("\n\n")
-    return [f for f in found if re.findall(r"void (\w+)", f)[0] in used]
+    functions = MATRICES.strip("\n").split("\n\n")
+    return [f for f in functions if re.findall(r"void (\w+)", f)[0] in used]
 
 
 def _init(program, name):

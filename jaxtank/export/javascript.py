@@ -189,11 +189,11 @@ def print_javascript(program, name, precision):
 
 def _step(printer, program):
     # a state that is returned as it was must be read before it is written
-    kept = [(i, e) for i, e in enumerate(program.after) if e != Ref("s", i)]
+    changing = [(i, e) for i, e in enumerate(program.after) if e != Ref("s", i)]
     inputs = ", ".join(printer.value(e) for e in program.u)
     return [
         *printer.lines(program.step),
-        *(f"    const next{i} = {printer.as_real(e)};" for i, e in kept),
-        *(f"    s[{i}] = next{i};" for i, _ in kept),
+        *(f"    const next{i} = {printer.as_real(e)};" for i, e in changing),
+        *(f"    s[{i}] = next{i};" for i, _ in changing),
         f"    return [{inputs}];",
     ]

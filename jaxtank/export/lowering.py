@@ -11,13 +11,18 @@ import jax
 import numpy as np
 from jax.extend.core import Literal
 
-from jaxtank.export import lines, loops, matrices, primitives
-from jaxtank.export.primitives import constant, elements, kind_of, no_code
+from jaxtank.export.primitives import (
+    NAMED,
+    RULES,
+    constant,
+    elements,
+    elements_of,
+    kind_of,
+    no_code,
+    written,
+)
 from jaxtank.export.simplify import is_number, simplified
 from jaxtank.export.statements import REAL, Array, Define, Matrix, Ref, names, used
-
-RULES = {**primitives.RULES, **matrices.RULES, **loops.RULES, **lines.RULES}
-"""{primitive of jax: function (writer, equation, operands) -> list of arrays of elements}."""
 
 
 class Writer:
@@ -84,8 +89,8 @@ class Writer:
     def equation(self, eqn, operands):
         """Return the outputs of one equation of a jaxpr, arrays of elements."""
         name = eqn.primitive.name
-        if name in ("jit", "pjit") and eqn.params["name"] in matrices.NAMED:
-            return [matrices.NAMED[eqn.params["name"]](self, *operands)]
+        if name in ("jit", "pjit") and eqn.params["name"] in NAMED:
+            return [NAMED[eqn.params["name"]](self, *operands)]
         inner = None if name in RULES else _called(eqn)
         if inner is not None:
             return self.run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), operands)
@@ -104,9 +109,9 @@ def _called(eqn):
 
 def lower(f, arguments):
     """Return (statements, outputs) of a function."""
-    made = lower_all(f, arguments)
-    outputs = [np.asarray(v, dtype=object) for v in jax.tree.leaves(made.outputs)]
-    return made.statements, outputs
+    lowered = lower_all(f, arguments)
+    outputs = [np.asarray(v, dtype=object) for v in jax.tree.leaves(lowered.outputs)]
+    return lowered.statements, outputs
 
 
 class Lowered(NamedTuple):
@@ -122,18 +127,18 @@ class Lowered(NamedTuple):
 def lower_all(f, arguments, writer=None):
     """Return the Lowered form of a function: `lower`, with the outputs as the tree they are."""
     closed, shape = jax.make_jaxpr(f, return_shape=True)(*arguments.values())
-    writer, moved = writer or Writer(), lines.written(closed.jaxpr)
-    inputs, found = [], {}
+    writer, moved = writer or Writer(), written(closed.jaxpr)
+    inputs, starts = [], {}
     for name, tree in arguments.items():
         for start, array in _inputs(writer, name, tree):
             if closed.jaxpr.invars[len(inputs)] in moved:
-                found[start] = f"{name}_{start.index}"
-                array = lines.elements_of(found[start], array.size)
+                starts[start] = f"{name}_{start.index}"
+                array = elements_of(starts[start], array.size)
             inputs.append(array)
     outputs = writer.run(closed.jaxpr, closed.consts, inputs)
-    wanted = names(e for out in outputs for e in out.ravel())
-    kept = used(writer.scopes[0], wanted)
-    return Lowered(kept, jax.tree.unflatten(jax.tree.structure(shape), outputs), found)
+    read = names(e for out in outputs for e in out.ravel())
+    statements = used(writer.scopes[0], read)
+    return Lowered(statements, jax.tree.unflatten(jax.tree.structure(shape), outputs), starts)
 
 
 def _inputs(writer, name, tree):

@@ -1,15 +1,17 @@
 """Operations of a traced function on arrays, each as operations on the elements of the arrays.
 
-RULES holds one function for each primitive of jax; `jaxtank.export.lowering` looks it up there.
+Loops stay loops, branches become selections, products of small matrices are written in scalars. An
+array of the state that is read and written at an index, a transport delay, stays an array: a line.
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Literal
 
 from jaxtank.core.errors import InputError
 from jaxtank.export.simplify import FUNCTIONS, OPERATORS, is_number
-from jaxtank.export.statements import REAL, TRUTH, WHOLE
+from jaxtank.export.statements import REAL, TRUTH, WHOLE, Loop, Ref, Store, Until
 
 REDUCTIONS = {"sum": "add", "prod": "mul", "max": "max", "min": "min", "and": "and", "or": "or"}
 """{what reduces an array: the operation on two of its elements}."""
@@ -167,8 +169,8 @@ def _reduce(op):
 
     def rule(writer, eqn, operands):
         (array,), axes, kind = operands, eqn.params["axes"], _out_kind(eqn)
-        kept = [i for i in range(array.ndim) if i not in axes]
-        rows = array.transpose(*kept, *axes).reshape(*(array.shape[i] for i in kept), -1)
+        others = [i for i in range(array.ndim) if i not in axes]
+        rows = array.transpose(*others, *axes).reshape(*(array.shape[i] for i in others), -1)
         out = np.empty(rows.shape[:-1], dtype=object)
         for i in np.ndindex(out.shape):
             total = rows[i][0]
@@ -220,6 +222,300 @@ def _position(largest):
     return rule
 
 
+def product(writer, a, b, dimensions):
+    """Return the elements of a product of two arrays."""
+    (contracted, right), batches = dimensions
+    if any(batches):
+        raise no_code("it multiplies stacks of matrices")
+    rows = [i for i in range(a.ndim) if i not in contracted]
+    columns = [i for i in range(b.ndim) if i not in right]
+    A = a.transpose(*rows, *contracted).reshape(int(np.prod([a.shape[i] for i in rows])), -1)
+    B = b.transpose(*right, *columns).reshape(A.shape[1], -1)
+    shape = tuple(a.shape[i] for i in rows) + tuple(b.shape[i] for i in columns)
+    if A.shape[0] * A.shape[1] * B.shape[1] > writer.large:
+        return writer.matrix("product", (A, B), (*A.shape, B.shape[1]), shape)
+    out = np.empty((A.shape[0], B.shape[1]), dtype=object)
+    for i, j in np.ndindex(out.shape):
+        out[i, j] = _inner_product(writer, A[i], B[:, j])
+    return out.reshape(shape)
+
+
+def _inner_product(writer, row, column):
+    total = writer.define(REAL, "mul", row[0], column[0])
+    for a, b in zip(row[1:], column[1:]):
+        total = writer.define(REAL, "add", total, writer.define(REAL, "mul", a, b))
+    return total
+
+
+def _product(writer, eqn, operands):
+    return [product(writer, *operands, dimensions=eqn.params["dimension_numbers"])]
+
+
+def _factorise(writer, eqn, operands):
+    n = operands[0].shape[-1]
+    return [writer.matrix("cholesky", operands, (n,), (n, n))]
+
+
+def _triangular(writer, eqn, operands):
+    (a, b), params = operands, eqn.params
+    if params["unit_diagonal"] or params["conjugate_a"]:
+        raise no_code("a triangular solve of an unusual kind")
+    transposed = params["transpose_a"]
+    if not params["left_side"]:  # x A = b is A' x' = b'
+        b, transposed = b.T, not transposed
+    operation = "forward" if params["lower"] != transposed else "backward"
+    x = writer.matrix(operation, (a if params["lower"] else a.T, b), b.shape, b.shape)
+    return [x if params["left_side"] else x.T]
+
+
+def _linear_solve(writer, eqn, operands):
+    """Solves with the matrix of a linear function, found by applying it to unit vectors."""
+    # Numbers that do not meet in it (several right sides) are solved for apart.
+    lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
+    right = operands[sum(lengths) :]
+    if len(right) != 1:
+        raise no_code("it solves for several arrays at once")
+    b, shape = right[0].ravel(), right[0].shape
+    if all(is_number(e) and e == 0 for e in b):
+        return right
+    closed, consts = jaxprs.matvec, operands[: lengths.matvec]
+    columns = []
+    for i in range(b.size):
+        unit = np.zeros(b.size, dtype=object)
+        unit[:] = [float(i == j) for j in range(b.size)]
+        (column,) = writer.run(closed.jaxpr, closed.consts, [*consts, unit.reshape(shape)])
+        columns.append(column.ravel())
+    a, x = np.stack(columns, axis=1), np.empty(b.size, dtype=object)
+    for matrix, places in _blocks(a):
+        n, k = places.shape
+        x[places] = writer.matrix("solve", (matrix, b[places]), (n, k), (n, k))
+    return [x.reshape(shape)]
+
+
+def _blocks(a):
+    """Yield (matrix (n, n), places (n, k) in the vector) of each group of equal diagonal blocks."""
+    size = len(a)
+    meet = np.array([[not (is_number(e) and e == 0) for e in row] for row in a]) | np.eye(
+        size, dtype=bool
+    )
+    meet = meet | meet.T
+    for _ in range(size.bit_length()):
+        meet = meet @ meet
+    groups = {}
+    for first in range(size):
+        group = np.flatnonzero(meet[first])
+        if group[0] == first:
+            block = a[np.ix_(group, group)]
+            groups.setdefault(tuple(block.ravel()), (block, []))[1].append(group)
+    for block, places in groups.values():
+        yield block, np.stack(places, axis=1)
+
+
+def _lu(writer, eqn, operands):
+    """The factors of a matrix, which `_linear_solve` does not read."""
+    return [operands[0], *(np.zeros(v.aval.shape, dtype=object) for v in eqn.outvars[1:])]
+
+
+def _cholesky(writer, a):
+    n = a.shape[0]
+    return writer.matrix("cholesky", (a,), (n,), (n, n)).T
+
+
+def _cholesky_solve(writer, upper, b):
+    n = len(b)
+    y = writer.matrix("forward", (upper.T, b), (n, 1), (n,))
+    return writer.matrix("backward", (upper.T, y), (n, 1), (n,))
+
+
+def _weighted(writer, g, weight):
+    scaled = each(lambda a, w: writer.define(REAL, "mul", a, w), g, weight[:, None])
+    return product(writer, scaled.T, g, (((1,), (0,)), ((), ())))
+
+
+def _cond(writer, eqn, operands):
+    """All branches are computed, because none has an effect, and one is chosen."""
+    branches = [writer.run(b.jaxpr, b.consts, operands[1:]) for b in eqn.params["branches"]]
+    out = []
+    for variable, *values in zip(eqn.outvars, *branches):
+        index = np.broadcast_to(operands[0], values[0].shape)
+        out.append(chosen(writer, index, values, kind_of(variable.aval.dtype)))
+    return out
+
+
+def _scan(writer, eqn, operands):
+    p = eqn.params
+    first, last = p["num_consts"], p["num_consts"] + p["num_carry"]
+    closed, sequences = p["jaxpr"], operands[last:]
+    if len(eqn.outvars) > p["num_carry"]:
+        return _unrolled(writer, p, operands[:first], operands[first:last], sequences)
+    starts, read = operands[first:last], lambda *counter: []
+    if sequences:
+        starts = [*starts, np.array(0, dtype=object)]
+        read = _reader(writer, sequences, eqn.invars[last:], p["reverse"])
+
+    def body(carried):
+        carry, counter = (carried[:-1], carried[-1:]) if sequences else (carried, [])
+        out = writer.run(closed.jaxpr, closed.consts, [*operands[:first], *carry, *read(*counter)])
+        if sequences:
+            after = np.empty((), dtype=object)
+            after[()] = writer.define(WHOLE, "add", counter[0].item(), 1)
+            out = [*out, after]
+        return out
+
+    kinds = [kind_of(v.aval.dtype) for v in eqn.outvars] + [WHOLE] * bool(sequences)
+    return _loop(writer, kinds, starts, p["length"], body)[: len(eqn.outvars)]
+
+
+def _unrolled(writer, p, consts, carry, sequences):
+    """The results of a loop that writes sequences, pass by pass."""
+    passes, rows = range(p["length"]), []
+    for i in reversed(passes) if p["reverse"] else passes:
+        inputs = [*consts, *carry, *(s[i] for s in sequences)]
+        out = writer.run(p["jaxpr"].jaxpr, p["jaxpr"].consts, inputs)
+        carry = out[: p["num_carry"]]
+        rows.append(out[p["num_carry"] :])
+    rows = rows[::-1] if p["reverse"] else rows
+    return [*carry, *(np.stack(column) for column in zip(*rows))]
+
+
+def _reader(writer, sequences, variables, backwards):
+    """Return a function of the counter of a loop that gives what its pass reads of the sequences:
+    each of their elements is an array of its own, indexed by the counter.
+    """
+    arrays = []
+    for rows, v in zip(sequences, variables):
+        rows, names = rows[::-1] if backwards else rows, np.empty(rows.shape[1:], dtype=object)
+        for i in np.ndindex(names.shape):
+            names[i] = writer.array(rows[(slice(None), *i)])
+        arrays.append((kind_of(v.aval.dtype), names))
+
+    def read(counter):
+        row = []
+        for kind, names in arrays:
+            entries = np.empty(names.shape, dtype=object)
+            for i in np.ndindex(names.shape):
+                entry = Ref(names[i], counter.item())
+                entries[i] = entry if kind == REAL else writer.define(kind, kind, entry)
+            row.append(entries)
+        return row
+
+    return read
+
+
+def _while(writer, eqn, operands):
+    p = eqn.params
+    test, body = p["cond_jaxpr"], p["body_jaxpr"]
+    first, last = p["cond_nconsts"], p["cond_nconsts"] + p["body_nconsts"]
+
+    def tested_body(carried):
+        (on,) = writer.run(test.jaxpr, test.consts, [*operands[:first], *carried])
+        writer.scopes[-1].append(Until(on.item()))
+        return writer.run(body.jaxpr, body.consts, [*operands[first:last], *carried])
+
+    kinds = [kind_of(v.aval.dtype) for v in eqn.outvars]
+    return _loop(writer, kinds, operands[last:], None, tested_body)
+
+
+def _loop(writer, kinds, starts, count, body):
+    """The carried variables after a loop; body: function of them that returns the next ones."""
+    carried, variables = [], []
+    for kind, start in zip(kinds, starts):
+        refs = np.empty(start.shape, dtype=object)
+        for i in np.ndindex(start.shape):
+            ref = refs[i] = Ref(writer.fresh("c"))
+            carried.append((kind, ref.name, start[i]))
+        variables.append(refs)
+    writer.scopes.append([])
+    writer.known.append({})
+    out = body(variables)
+    statements = writer.scopes.pop()
+    writer.known.pop()
+    new = tuple(e for o in out for e in o.ravel())
+    writer.scopes[-1].append(Loop(count, tuple(carried), statements, new))
+    return variables
+
+
+SMALL = 64
+"""Number of entries up to which an array that is read at a computed index is a choice of values."""
+
+
+def written(jaxpr):
+    """Return the inputs of a jaxpr that it writes to at an index that it computes."""
+    inputs, variables = set(jaxpr.invars), set()
+    for eqn in jaxpr.eqns:
+        operands = [None if isinstance(v, Literal) else v for v in eqn.invars]
+        if eqn.primitive.name == "dynamic_update_slice" and len(eqn.invars[0].aval.shape) == 1:
+            variables.add(operands[0])
+        elif eqn.primitive.name in ("jit", "pjit"):
+            inner = eqn.params["jaxpr"].jaxpr
+            inside = written(inner)
+            variables |= {v for v, variable in zip(operands, inner.invars) if variable in inside}
+    return variables & inputs
+
+
+def elements_of(name, size):
+    """Return the elements of the line `name`."""
+    out = np.empty(size, dtype=object)
+    out[:] = [Ref(name, i) for i in range(size)]
+    return out
+
+
+def line_of(array):
+    """Return the name of the line whose elements are those of an array; None of another array."""
+    whole = array.ndim == 1 and all(
+        isinstance(e, Ref) and e.index == i for i, e in enumerate(array)
+    )
+    same = {e.name for e in array.ravel()} if whole else set()
+    return same.pop() if len(same) == 1 else None
+
+
+def _read(writer, eqn, operands):
+    array, *index = operands
+    if all(is_number(i.item()) for i in index):
+        return RULES["slice"](writer, eqn, operands)
+    name = line_of(array)
+    if name is None or eqn.params["slice_sizes"] != (1,):
+        return [_chosen_slice(writer, eqn, array, [i.item() for i in index])]
+    out = np.empty(1, dtype=object)
+    out[0] = writer.define(REAL, "item", Ref(name), index[0].item())
+    return [out]
+
+
+def _chosen_slice(writer, eqn, array, index):
+    """A slice of a small array whose place along one axis is computed: one of all there are."""
+    sizes = eqn.params["slice_sizes"]
+    moving = [d for d, i in enumerate(index) if not is_number(i) and array.shape[d] > sizes[d]]
+    if len(moving) > 1 or array.size > SMALL:
+        raise no_code("it reads an array at an index that it computes")
+    starts = [
+        0 if not is_number(i) else min(max(i, 0), n - m)
+        for i, n, m in zip(index, array.shape, sizes)
+    ]
+    ranges = [slice(i, i + m) for i, m in zip(starts, sizes)]
+    if not moving:
+        return array[tuple(ranges)]
+    (d,) = moving
+    choices = []
+    for i in range(array.shape[d] - sizes[d] + 1):
+        ranges[d] = slice(i, i + sizes[d])
+        choices.append(array[tuple(ranges)])
+    at = np.empty(choices[0].shape, dtype=object)
+    for i in np.ndindex(at.shape):
+        at[i] = index[d]
+    kind = kind_of(eqn.outvars[0].aval.dtype)
+    return chosen(writer, at, choices, kind)
+
+
+def _write(writer, eqn, operands):
+    array, update, index = operands
+    name = line_of(array)
+    if name is None or update.shape != (1,):
+        raise no_code("it writes to an array at an index")
+    new = writer.fresh("l")
+    writer.scopes[-1].append(Store(new, name, index.item(), update[0]))
+    return [elements_of(new, array.size)]
+
+
 INDICES = {"gather": slice(1, 2), "dynamic_slice": slice(1, None), "scatter": slice(1, 2)}
 """{primitive that reads or writes at indices: its operands that are indices}."""
 
@@ -253,5 +549,18 @@ RULES = {
     "rem": _whole_or_real("remainder", "rem"),
     "select_n": _select,
     "xor": _xor,
+    "cond": _cond,
+    "scan": _scan,
+    "while": _while,
+    "dynamic_slice": _read,
+    "dynamic_update_slice": _write,
+    "dot_general": _product,
+    "cholesky": _factorise,
+    "triangular_solve": _triangular,
+    "custom_linear_solve": _linear_solve,
+    "lu": _lu,
 }
 """{primitive of jax: function (writer, equation, operands) -> list of arrays of elements}."""
+
+NAMED = {f.__name__: f for f in (_cholesky, _cholesky_solve, _weighted)}
+"""{function of `jaxtank.analysis.qp`: function (writer, *operands) -> array of elements}."""

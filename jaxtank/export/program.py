@@ -37,8 +37,8 @@ def functions(case):
         samples = [tuple(v[None] for v in signal) for signal in (r, dr, ddr)]
         plan = jax.tree.map(lambda a: a[0], loop.controller.prepare(*samples))
         tick = Tick(t=t, r=r, dr=dr, ddr=ddr, dt=dt, plan=plan, own=())
-        made = decide(loop, observer, controller, tick, scalars(y))
-        return jnp.stack(list(made.applied)), (made.observer, made.controller)
+        decision = decide(loop, observer, controller, tick, scalars(y))
+        return jnp.stack(list(decision.applied)), (decision.observer, decision.controller)
 
     return step, begin
 
@@ -93,13 +93,13 @@ def program(case: Case) -> Program:
     done, (inputs, *after) = lower(
         step, {"s": state, "t": real(()), "y": y, "r": r, "dr": r, "ddr": r}
     )
-    found = Program(case, size, begun, _entries(first), done, list(inputs), _entries(after))
-    if not len(found.first) == len(found.after) == size:
+    result = Program(case, size, begun, _entries(first), done, list(inputs), _entries(after))
+    if not len(result.first) == len(result.after) == size:
         raise InputError(
-            f"{case.name}: the first state of its controller has {len(found.first)} numbers, the"
-            f" next one {len(found.after)}; a controller to export keeps its size"
+            f"{case.name}: the first state of its controller has {len(result.first)} numbers, the"
+            f" next one {len(result.after)}; a controller to export keeps its size"
         )
-    return found
+    return result
 
 
 def _entries(arrays):

@@ -7,65 +7,35 @@ import numpy as np
 
 from jaxtank.export.statements import Ref
 
+_SAME = "log1p expm1 exp2 cbrt ceil tan sinh cosh sqrt exp log tanh sin cos floor round sign"
 FUNCTIONS = {
+    **{name: getattr(np, name) for name in _SAME.split()},
+    **{
+        f"a{name}": getattr(np, f"arc{name}")
+        for name in ["sin", "cos", "tan", "sinh", "cosh", "tanh", "tan2"]
+    },
     "logistic": lambda a: 1.0 / (1.0 + np.exp(-a)),
     "erf": math.erf,
     "erfc": math.erfc,
-    "log1p": np.log1p,
-    "expm1": np.expm1,
-    "exp2": np.exp2,
-    "cbrt": np.cbrt,
-    "ceil": np.ceil,
     "rem": np.fmod,
-    "tan": np.tan,
-    "asin": np.arcsin,
-    "acos": np.arccos,
-    "atan": np.arctan,
-    "atan2": np.arctan2,
-    "sinh": np.sinh,
-    "cosh": np.cosh,
-    "asinh": np.arcsinh,
-    "acosh": np.arccosh,
-    "atanh": np.arctanh,
     "div": np.divide,
-    "sqrt": np.sqrt,
     "rsqrt": lambda a: 1 / np.sqrt(a),
-    "exp": np.exp,
-    "log": np.log,
-    "tanh": np.tanh,
-    "sin": np.sin,
-    "cos": np.cos,
-    "floor": np.floor,
-    "round": np.round,
-    "sign": np.sign,
 }
 """Functions of real numbers; the result is made a float."""
 
 OPERATORS = {
-    "add": operator.add,
-    "sub": operator.sub,
-    "mul": operator.mul,
-    "neg": operator.neg,
-    "abs": abs,
-    "max": max,
-    "min": min,
-    "pow": operator.pow,
+    **{
+        name: getattr(operator, name)
+        for name in ["add", "sub", "mul", "neg", "pow", "lt", "le", "gt", "ge", "eq", "ne"]
+    },
+    **{"abs": abs, "max": max, "min": min, "real": float, "whole": int, "truth": bool},
     "square": lambda a: a * a,
-    "lt": operator.lt,
-    "le": operator.le,
-    "gt": operator.gt,
-    "ge": operator.ge,
-    "eq": operator.eq,
-    "ne": operator.ne,
     "and": lambda a, b: a and b,
     "or": lambda a, b: a or b,
     "not": operator.not_,
     "is_finite": np.isfinite,
     "quotient": lambda a, b: int(a / b),  # of whole numbers, rounded towards zero
     "remainder": math.fmod,
-    "real": float,
-    "whole": int,
-    "truth": bool,
 }
 """Operations whose result keeps its own type."""
 

@@ -126,13 +126,13 @@ def export(
     return target.write(program(case), name, precision)
 
 
-def _checked_name(case, given, reserved):
+def _checked_name(case, option, reserved):
     """The name of the functions. Raises InputError for one that the language does not allow."""
-    name = given or function_name(case)
+    name = option or function_name(case)
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,50}", name):
         source = (
-            f"--name {given!r}"
-            if given
+            f"--name {option!r}"
+            if option
             else f"{case.name!r} gives no name for the function; --name NAME"
         )
         raise InputError(

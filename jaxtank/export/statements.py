@@ -101,8 +101,10 @@ Statement = Define | Array | Matrix | Store | Until | Loop
 
 def names(entries: Iterable) -> set[str]:
     """Return the names of the variables among numbers and Refs."""
-    found = [e for e in entries if isinstance(e, Ref)]
-    return {e.name for e in found} | {e.index.name for e in found if isinstance(e.index, Ref)}
+    variables = [e for e in entries if isinstance(e, Ref)]
+    return {e.name for e in variables} | {
+        e.index.name for e in variables if isinstance(e.index, Ref)
+    }
 
 
 def every(statements: Iterable[Statement]) -> Iterator[Statement]:
@@ -118,16 +120,16 @@ def matrix_operations(statements: Iterable[Statement]) -> set[str]:
     return {s.op for s in every(statements) if isinstance(s, Matrix)}
 
 
-def used(statements: list[Statement], wanted: set[str]) -> list[Statement]:
+def used(statements: list[Statement], read: set[str]) -> list[Statement]:
     """Return the statements that the variables named in `wanted` depend on, in order."""
-    kept, wanted = [], set(wanted)
+    needed, read = [], set(read)
     for s in reversed(statements):
         if isinstance(s, Loop):
-            if not wanted & {name for _, name, _ in s.carried}:
+            if not read & {name for _, name, _ in s.carried}:
                 continue
             s = s._replace(body=used(s.body, names(s.new)))
-        elif not isinstance(s, Until) and s.name not in wanted:
+        elif not isinstance(s, Until) and s.name not in read:
             continue
-        wanted |= s.reads
-        kept.append(s)
-    return kept[::-1]
+        read |= s.reads
+        needed.append(s)
+    return needed[::-1]

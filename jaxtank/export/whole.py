@@ -71,8 +71,8 @@ class WholeLoop:
 
 def traced_leaves(case: Case, largest: int = 64) -> dict[str, np.ndarray]:
     """Return {dotted name: value} of the numbers of a loop that are inputs of its statements."""
-    found = {n: np.asarray(v, dtype=float) for n, v in parameters(case.loop).items()}
-    return {n: v for n, v in found.items() if 0 < v.size <= largest}
+    values = {n: np.asarray(v, dtype=float) for n, v in parameters(case.loop).items()}
+    return {n: v for n, v in values.items() if 0 < v.size <= largest}
 
 
 def served(case: Case) -> tuple[str, ...]:
@@ -102,8 +102,8 @@ def sample_of(case: Case, names: Sequence[str], squares: Sequence[tuple[str, flo
         total = tuple(a + b for a, b in zip(spilled, sample.spilled))
         start = initial(loop, clock)._replace(k=())
         before = (start, ms.start(run, names), (zero_of(loop),) * loop.plant.tanks)
-        found = ms.read(run, acc, names)
-        return before, (after._replace(k=()), update, total), saved, found, errors
+        values = ms.read(run, acc, names)
+        return before, (after._replace(k=()), update, total), saved, values, errors
 
     return whole
 
@@ -117,21 +117,21 @@ def whole_loop(
     """
     check_pointwise(case)
     names = served(case) if names is None else tuple(names)
-    kept = tuple(dict.fromkeys([*names, *(m for m, _ in squares)]))
-    shapes = arguments(case, kept)
+    carried_names = tuple(dict.fromkeys([*names, *(m for m, _ in squares)]))
+    shapes = arguments(case, carried_names)
     with rolled():
-        made = lower_all(sample_of(case, kept, squares), shapes, WholeWriter())
-    before, after, saved, found, errors = made.outputs
+        lowered = lower_all(sample_of(case, carried_names, squares), shapes, WholeWriter())
+    before, after, saved, values, errors = lowered.outputs
     return WholeLoop(
         case=case,
         leaves=entries_of(shapes["p"]),
-        statements=made.statements,
+        statements=lowered.statements,
         first=flat(before),
         after=flat(after),
         saved={"errors": flat(errors)} if squares else {f: flat(saved[f]) for f in SAVED},
         weights=[float(w) for w in ms.residual_weights(run_of(case.loop, case.clock), squares)],
-        measures={m: flat(found[m]) for m in names},
-        lines={start.index: name for start, name in made.lines.items()},
+        measures={m: flat(values[m]) for m in names},
+        lines={start.index: name for start, name in lowered.lines.items()},
     )
 
 
@@ -228,15 +228,15 @@ def hoisted(statements: Iterable[Statement]) -> list[Statement]:
         if not isinstance(s, Loop):
             out.append(s)
             continue
-        inside, own = {name for _, name, _ in s.carried}, []
-        for one in hoisted(s.body):
-            free = isinstance(one, Define | Array) and not one.reads & inside
+        inside, body = {name for _, name, _ in s.carried}, []
+        for inner in hoisted(s.body):
+            free = isinstance(inner, Define | Array) and not inner.reads & inside
             if free:
-                out.append(one)
+                out.append(inner)
                 continue
-            own.append(one)
-            inside |= defined(one)
-        out.append(s._replace(body=own))
+            body.append(inner)
+            inside |= defined(inner)
+        out.append(s._replace(body=body))
     return out
 
 
@@ -247,16 +247,16 @@ def defined(statement: Statement) -> set[str]:
     return set() if isinstance(statement, Until) else {statement.name}
 
 
-def ranks(statements: Iterable[Statement], given: Mapping[str, int]) -> dict[str, int]:
+def ranks(statements: Iterable[Statement], inputs: Mapping[str, int]) -> dict[str, int]:
     """Return {name: rank} of every variable: the largest rank of what it depends on."""
-    found = dict(given)
+    rank_of = dict(inputs)
     for s in statements:
-        own = s.reads if not isinstance(s, Loop) else s.reads - local(s)
-        rank = max((found[n] for n in own), default=0)
+        read = s.reads if not isinstance(s, Loop) else s.reads - local(s)
+        rank = max((rank_of[n] for n in read), default=0)
         if isinstance(s, Store):
-            rank = max(rank, found[s.array])
-        found.update(dict.fromkeys(defined(s), rank))
-    return found
+            rank = max(rank, rank_of[s.array])
+        rank_of.update(dict.fromkeys(defined(s), rank))
+    return rank_of
 
 
 def local(loop: Loop) -> set[str]:
@@ -268,26 +268,26 @@ def local(loop: Loop) -> set[str]:
 
 
 def of_rank(
-    statements: Iterable[Statement], rank: Mapping[str, int], wanted: int
+    statements: Iterable[Statement], rank: Mapping[str, int], level: int
 ) -> list[Statement]:
     """Return the statements of one rank, in order."""
-    return [s for s in statements if any(rank[n] == wanted for n in defined(s))]
+    return [s for s in statements if any(rank[n] == level for n in defined(s))]
 
 
 def refs(statements: Iterable[Statement], entries: Iterable = ()) -> set[Ref]:
     """Return every Ref that statements and entries read, without those that a loop has inside; of
     an array that is read at a variable index, the array and the index.
     """
-    found = {e for e in entries if isinstance(e, Ref)}
+    read = {e for e in entries if isinstance(e, Ref)}
     for s in statements:
         if isinstance(s, Loop):
             inside = refs(s.body, [*s.new, *(start for *_, start in s.carried)])
-            own = local(s)
-            found |= {e for e in inside if e.name not in own}
+            private = local(s)
+            read |= {e for e in inside if e.name not in private}
         else:
-            found |= {e for e in entries_read(s) if isinstance(e, Ref)}
-    moving = {e for e in found if isinstance(e.index, Ref)}
-    return (found - moving) | {r for e in moving for r in (Ref(e.name), cast(Ref, e.index))}
+            read |= {e for e in entries_read(s) if isinstance(e, Ref)}
+    moving = {e for e in read if isinstance(e.index, Ref)}
+    return (read - moving) | {r for e in moving for r in (Ref(e.name), cast(Ref, e.index))}
 
 
 def entries_read(s: Statement) -> tuple:
@@ -302,32 +302,32 @@ def entries_read(s: Statement) -> tuple:
 
 
 def kept_in_time(
-    timed: list[Statement], wanted: set[Ref], rank: Mapping[str, int]
+    timed: list[Statement], needed: set[Ref], rank: Mapping[str, int]
 ) -> tuple[set[Ref], list[Statement]]:
     """Return (values of rank 1 to keep for every sample, statements that follow from them)."""
-    made = {s.name: s for s in timed if isinstance(s, Define)}
-    kept, again = set(wanted), set()
+    definitions = {s.name: s for s in timed if isinstance(s, Define)}
+    stored, again = set(needed), set()
 
     def free(ref: Ref, depth: int) -> bool:
         """Whether a value needs nothing to be kept that is not."""
-        if rank[ref.name] == 0 or ref in kept or ref.name == "k":
+        if rank[ref.name] == 0 or ref in stored or ref.name == "k":
             return True
-        s = made.get(ref.name)
+        s = definitions.get(ref.name)
         if s is None or s.op not in CHEAP or depth == 0:
             return False
         return all(free(a, depth - 1) for a in s.args if isinstance(a, Ref))
 
-    for ref in sorted(wanted, key=lambda r: order(timed, r), reverse=True):
-        s = made.get(ref.name)
+    for ref in sorted(needed, key=lambda r: order(timed, r), reverse=True):
+        s = definitions.get(ref.name)
         if s is None or s.op not in CHEAP:
             continue
-        kept.discard(ref)
+        stored.discard(ref)
         if all(free(a, 1) for a in s.args if isinstance(a, Ref)):
             again.add(ref)
         else:
-            kept.add(ref)
-    rest = [s for s in timed if not isinstance(s, Define) or Ref(s.name) not in kept]
-    return kept, used(rest, names(again))
+            stored.add(ref)
+    rest = [s for s in timed if not isinstance(s, Define) or Ref(s.name) not in stored]
+    return stored, used(rest, names(again))
 
 
 def order(statements: list[Statement], ref: Ref) -> int:
@@ -455,9 +455,9 @@ class Text:
         """(text, how tightly it binds) of an operation."""
         if op in BINARY:
             sign, tight = BINARY[op]
-            left, right = self._bound(args[0], tight), self._bound(args[1], tight + 1)
+            first, right = self._bound(args[0], tight), self._bound(args[1], tight + 1)
             clash = right[0] in "+-" and sign == right[0]
-            return f"{left}{sign}{f'({right})' if clash else right}", tight
+            return f"{first}{sign}{f'({right})' if clash else right}", tight
         if op in UNARY:
             inner = self._bound(args[0], 14)
             return UNARY[op] + (f"({inner})" if inner[0] in "+-" else inner), 14
@@ -526,11 +526,11 @@ class Text:
 
 def _uses(statements, outputs):
     """{name: how often it is read}; what a loop reads of outside counts as often."""
-    found: Counter = Counter()
+    counts: Counter = Counter()
 
     def read(e, times=1):
         if isinstance(e, Ref):
-            found[e.name] += times
+            counts[e.name] += times
             read(e.index, 2)
 
     for e in outputs:
@@ -548,12 +548,12 @@ def _uses(statements, outputs):
         elif isinstance(s, Until):
             read(s.test)
         elif isinstance(s, Loop):
-            inside = {one.name for one in s.body if isinstance(one, Define)}
+            inside = {inner.name for inner in s.body if isinstance(inner, Define)}
             for name, count in _uses(s.body, s.new).items():
-                found[name] += count if name in inside else 2
+                counts[name] += count if name in inside else 2
             for *_, start in s.carried:
                 read(start)
-    return found
+    return counts
 
 
 def library(text: str) -> list[str]:

@@ -72,11 +72,11 @@ class TankEnv(gymnasium.Env):
     def step(self, action):
         """Return (observation, reward, terminated, truncated, info) a sample later."""
         loop = self.case.loop
-        wanted = self.low + 0.5 * (np.clip(np.asarray(action, dtype=float), -1.0, 1.0) + 1.0) * (
+        command = self.low + 0.5 * (np.clip(np.asarray(action, dtype=float), -1.0, 1.0) + 1.0) * (
             self.high - self.low
         )
         self.state, y, u, spilled, filtered = _advance(
-            loop, self.clock, self.inputs, self.state, tuple(wanted), tuple(self.y)
+            loop, self.clock, self.inputs, self.state, tuple(command), tuple(self.y)
         )
         self.x, self.y, self.u = map(_array, (self.state.x, y, u))
         self.spilled, self.filtered = self.spilled + _array(spilled), float(filtered)
@@ -94,8 +94,13 @@ class TankEnv(gymnasium.Env):
         return np.concatenate([self.y, self.r[self.k], 100.0 * self.rate[self.k]]) / self.size
 
     def _info(self):
-        found = {name: getattr(self, name).copy() for name in ("x", "y", "u", "spilled")}
-        return {"t": self.k * self.clock.dt, "e": self._error(), "filtered": self.filtered, **found}
+        arrays = {name: getattr(self, name).copy() for name in ("x", "y", "u", "spilled")}
+        return {
+            "t": self.k * self.clock.dt,
+            "e": self._error(),
+            "filtered": self.filtered,
+            **arrays,
+        }
 
 
 def _array(values):
@@ -115,12 +120,12 @@ def _readings(loop, clock, samples, state):
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _advance(loop, clock, samples, state, wanted, y):
+def _advance(loop, clock, samples, state, command, y):
     """(state, readings, inputs at the plant, volumes that overflowed, 1.0 where the safety filter
     changed the inputs `wanted`) a sample after the readings `y`.
     """
     kind, filtered = state.x[0].dtype, 0.0
-    applied = tuple(jnp.asarray(v, dtype=kind) for v in wanted)
+    applied = tuple(jnp.asarray(v, dtype=kind) for v in command)
     if loop.safety_filter is not None:
         guard, line = loop.safety_filter, None
         if guard.predicted:

@@ -85,7 +85,7 @@ def engine(
     True
     """
     with jax.enable_x64(True):
-        parts = [printed(one) for one in (case, filtered) if one is not None]
+        parts = [printed(variant) for variant in (case, filtered) if variant is not None]
         facts = _facts(case, [loop for loop, _ in parts])
         programs = ",\n".join(text for _, text in parts)
         functions = "\n".join(map(bare, library(programs)))
@@ -114,7 +114,9 @@ def facts_of(case: Case, filtered: Case | None = None) -> dict[str, Any]:
     10.0
     """
     with jax.enable_x64(True):
-        return _facts(case, [whole_loop(one) for one in (case, filtered) if one is not None])
+        return _facts(
+            case, [whole_loop(variant) for variant in (case, filtered) if variant is not None]
+        )
 
 
 def _packed(facts: dict[str, Any]) -> dict[str, Any]:
@@ -122,8 +124,8 @@ def _packed(facts: dict[str, Any]) -> dict[str, Any]:
     groups: dict[tuple[Any, ...], list[Any]] = {}
     for leaf in facts["leaves"]:
         shared = tuple(leaf[key] for key in SHARED)
-        own = [leaf["name"], *(leaf[key] for key in ("value", "lower", "upper"))]
-        groups.setdefault((leaf["name"].split("[")[0], *shared), []).append(own)
+        entry = [leaf["name"], *(leaf[key] for key in ("value", "lower", "upper"))]
+        groups.setdefault((leaf["name"].split("[")[0], *shared), []).append(entry)
     packed = [[*shared, entries] for (_, *shared), entries in groups.items()]
     return {**facts, "leaves": packed}
 
@@ -144,8 +146,10 @@ def squares_of(objective: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
     """Return ((measure, weight), ...) of the Gauss-Newton matrix of an objective, as
     `tune` has it.
     """
-    own = tuple((m, w) for m, w in objective.items() if m in ms.squares())
-    return (("mean_square_error", 1.0),) if "rms_error_total" in objective or not own else own
+    squares = tuple((m, w) for m, w in objective.items() if m in ms.squares())
+    return (
+        (("mean_square_error", 1.0),) if "rms_error_total" in objective or not squares else squares
+    )
 
 
 def _lean(case: Case) -> WholeLoop:
@@ -184,8 +188,8 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
     loop, clock, plant = case.loop, case.clock, case.loop.plant
     free = bounds(loop, case.free) if case.free else []
     length, drive = loop.units
-    own = {leaf: one.case for one in reversed(loops) for leaf in one.leaves}
-    leaves = [leaf_of(own[leaf], *leaf) for leaf in sorted(own, key=lambda leaf: leaf[0])]
+    homes = {leaf: variant.case for variant in reversed(loops) for leaf in variant.leaves}
+    leaves = [leaf_of(homes[leaf], *leaf) for leaf in sorted(homes, key=lambda leaf: leaf[0])]
     tanks = list((case.names or {}).get("tank", ())) or [""] * plant.tanks
     pumps = list((case.names or {}).get("pump", ())) or [""] * plant.pumps
     rims = [float(v) for v in np.broadcast_to(np.asarray(plant.rim), (plant.tanks,))]
@@ -211,7 +215,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
             for j in range(plant.pumps)
         ],
         "leaves": leaves,
-        "measures": [_measure(case, m, found) for m, found in loops[-1].measures.items()],
+        "measures": [_measure(case, m, entries) for m, entries in loops[-1].measures.items()],
         "limits": _limits(case),
         "free": [b.name for b in free],
         "logarithmic": [b.name for b in free if b.scale == "log"],
@@ -241,15 +245,15 @@ def _measure(case, name, entries):
 
 
 def _limits(case):
-    found, rims = [], isinstance(case.limits.get("max_level"), str)
+    rows, rims = [], isinstance(case.limits.get("max_level"), str)
     rim = "plant.rim[{}]" if np.ndim(case.loop.plant.rim) else "plant.rim"
     for limit in resolve_limits(case):
-        one = ms.MEASURES[limit.measure].per == "run"
+        single = ms.MEASURES[limit.measure].per == "run"
         side = "upper" if limit.sign > 0 else "lower"
-        found.append(
+        rows.append(
             {
                 "measure": limit.measure,
-                "entry": None if one else limit.index,
+                "entry": None if single else limit.index,
                 "upper": None,
                 "lower": None,
                 "unit": ms.unit(limit.measure, case.loop.units),
@@ -262,7 +266,7 @@ def _limits(case):
                 side: float(limit.value),
             }
         )
-    return found
+    return rows
 
 
 def leaf_of(case: Case, name: str, index: tuple[int, ...]) -> dict[str, Any]:

@@ -37,9 +37,9 @@ def origin_of(case, source=None):
             words = _static(case, known)
     if source is None or known is None or words is None:
         return Origin(shlex.quote(source or NEW), {}, case.safety is not None, "")
-    differing, own = {}, entries(case.loop, parameters(case.loop))
+    differing, current = {}, entries(case.loop, parameters(case.loop))
     for name, value in entries(known.loop, parameters(known.loop)).items():
-        if own[name] != value:
+        if current[name] != value:
             differing[name] = value
     words = " ".join([shlex.quote(source), *words])
     return Origin(words, differing, known.safety is not None, _guard(case, known))
@@ -48,17 +48,17 @@ def origin_of(case, source=None):
 def _guard(case, known):
     """--set of the settings of the safety filter of a case that its origin does not have."""
     before: dict[str, Any] = dict(known.safety or {})
-    found = []
+    words = []
     for key, value in (case.safety or {}).items():
         if key not in before or not np.array_equal(before[key], value):
             text = f"[{','.join(map(str, value))}]" if np.ndim(value) else str(value)
-            found += ["--set", shlex.quote(f"safety_filter.{key}={text}")]
-    return " ".join(found)
+            words += ["--set", shlex.quote(f"safety_filter.{key}={text}")]
+    return " ".join(words)
 
 
 def _static(case, known):
     """--set of the static fields and the clock that differ; None where the structure does."""
-    found = []
+    changes = []
     shapes = [
         {n: np.shape(v) for n, v in parameters(c.loop).items() if not n.startswith(GUARD)}
         for c in (case, known)
@@ -70,11 +70,11 @@ def _static(case, known):
         if value != theirs[name]:
             if isinstance(value, tuple) or value is None:
                 return None
-            found.append((name, str(value).lower() if isinstance(value, bool) else value))
+            changes.append((name, str(value).lower() if isinstance(value, bool) else value))
     for name in CLOCK_UNITS:
         if getattr(case.clock, name) != getattr(known.clock, name):
-            found.append((f"clock.{name}", getattr(case.clock, name)))
-    return [word for name, value in found for word in ("--set", shlex.quote(f"{name}={value}"))]
+            changes.append((f"clock.{name}", getattr(case.clock, name)))
+    return [word for name, value in changes for word in ("--set", shlex.quote(f"{name}={value}"))]
 
 
 def _fields(loop):
@@ -85,18 +85,18 @@ def _fields(loop):
 
 def entries(loop, values):
     """Return {name of one entry: number} of {dotted name: number or array}."""
-    found, own = {}, parameters(loop)
+    numbers, leaves = {}, parameters(loop)
     for name, value in values.items():
         if name.startswith(GUARD):
             continue
-        shape = np.shape(own[name]) if name in own else ()
+        shape = np.shape(leaves[name]) if name in leaves else ()
         if not shape:
-            found[name] = float(np.ravel(value)[0])
+            numbers[name] = float(np.ravel(value)[0])
         else:
             array = np.broadcast_to(np.asarray(value, dtype=float), shape)
             for index, entry in np.ndenumerate(array):
-                found[f"{name}[{','.join(map(str, index))}]"] = float(entry)
-    return found
+                numbers[f"{name}[{','.join(map(str, index))}]"] = float(entry)
+    return numbers
 
 
 def both(case):

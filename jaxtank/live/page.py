@@ -76,10 +76,10 @@ def _smallest(off, on, filtered, assembled):
     """The page; without a safety filter to switch on where that of a large loop is not on."""
     texts = {}
 
-    def printed(one):
-        if id(one) not in texts:
-            texts[id(one)] = program_of(one)
-        return texts[id(one)]
+    def printed(variant):
+        if id(variant) not in texts:
+            texts[id(variant)] = program_of(variant)
+        return texts[id(variant)]
 
     if filtered or on is None:
         return assembled(_engine(off, on, printed))
@@ -90,7 +90,7 @@ def _smallest(off, on, filtered, assembled):
 def _engine(off, on, printed):
     """The engine of a case and of the same with a safety filter or None."""
     try:
-        texts = [rig.dump(one) for one in (off, on) if one is not None]
+        texts = [rig.dump(variant) for variant in (off, on) if variant is not None]
     except InputError:  # a class of the user's own
         return engine(off, on, printed)
     key = repr((texts, off.title, off.names))
@@ -132,10 +132,10 @@ def data_of(case, presets=(), source=None, plants=None):
 
 def _breaks(case):
     """Faults of the plant that last the whole run: [{name, text, leaf, factor or value}]."""
-    plant, found = case.loop.plant, []
+    plant, faults = case.loop.plant, []
 
     def add(name, leaf, factor, text):
-        found.append({"name": name, "leaf": leaf, "factor": factor, "value": None, "text": text})
+        faults.append({"name": name, "leaf": leaf, "factor": factor, "value": None, "text": text})
 
     values = {n: np.ravel(v) for n, v in parameters(case.loop).items()}
     for j in range(np.size(values.get("plant.pump_gain", ()))):
@@ -151,14 +151,14 @@ def _breaks(case):
             add(f"stuck valve {source} to {sink}", f"plant.orifice[{k}]", 0.4, text)
     for k, area in enumerate(values.get("plant.pipe", ())):
         if area > 0:
-            one, other = (tank + 1 for tank in plant.pipes[k])
-            text = f"the pipe between tanks {one} and {other} is blocked, 40 % open"
-            add(f"blocked pipe {one} to {other}", f"plant.pipe[{k}]", 0.4, text)
+            first, other = (tank + 1 for tank in plant.pipes[k])
+            text = f"the pipe between tanks {first} and {other} is blocked, 40 % open"
+            add(f"blocked pipe {first} to {other}", f"plant.pipe[{k}]", 0.4, text)
     for k, volume in enumerate(values.get("disturbance.volume", ())):
         if volume:
             text = "three times the volume of this inflow disturbance"
             add(f"inflow pulse {k + 1} times 3", f"disturbance.volume[{k}]", 3.0, text)
-    return found
+    return faults
 
 
 def _uncertain(case):
@@ -174,9 +174,9 @@ def _uncertain(case):
 
 def assemble(engine_text, name, data):
     """Return the page as text."""
-    uplot, core, own = _read("vendor/uPlot.iife.min.js"), _script("core"), _own()
+    uplot, core, scripts = _read("vendor/uPlot.iife.min.js"), _script("core"), _own()
     # the scripts of the page are one function, as loader.js joins them
-    run = [engine_text, uplot, f'(() => {{"use strict";\n{core}\n{own}\n}})();', _loader()]
+    run = [engine_text, uplot, f'(() => {{"use strict";\n{core}\n{scripts}\n}})();', _loader()]
     policy = "; ".join(
         [
             "default-src 'none'",
@@ -190,7 +190,7 @@ def assemble(engine_text, name, data):
     )
     search = f"const tune=(()=>{{\n{_script('tune')}\nreturn tune;\n}})();"
     facts = json.dumps(data, allow_nan=False, separators=(",", ":"))
-    parts = [uplot, own, core, f"{search}\n{_script('worker')}", facts, engine_text]
+    parts = [uplot, scripts, core, f"{search}\n{_script('worker')}", facts, engine_text]
     return "\n".join(
         [
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
@@ -209,8 +209,8 @@ def assemble(engine_text, name, data):
 def _packed(text):
     """A text, deflated, in base 85: half as long, and nothing in it can end a script element."""
     deflate = zlib.compressobj(9, zlib.DEFLATED, -15)
-    found = base64.b85encode(deflate.compress(text.encode()) + deflate.flush()).decode()
-    return found.translate(DIGITS)
+    digits = base64.b85encode(deflate.compress(text.encode()) + deflate.flush()).decode()
+    return digits.translate(DIGITS)
 
 
 def source_of(text):

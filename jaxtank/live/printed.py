@@ -64,13 +64,13 @@ class Printed:
 
     def _live(self):
         """The entries of c, without delay lines, that what is saved or measured depends on."""
-        wanted = [*self._saved(), *self._measures(), *(self.loop.after[i] for i in self._levels())]
+        results = [*self._saved(), *self._measures(), *(self.loop.after[i] for i in self._levels())]
         lines = [self.loop.after[i] for i in self.loop.lines]
         every, live = self._ranked(MOVING), []
         while True:
-            after = [*wanted, *lines, *(self.loop.after[i] for i in live)]
-            found = refs(used(every, names(after)), after)
-            new = sorted(cast(int, e.index) for e in found if e.name == "c")
+            after = [*results, *lines, *(self.loop.after[i] for i in live)]
+            read = refs(used(every, names(after)), after)
+            new = sorted(cast(int, e.index) for e in read if e.name == "c")
             if new == live:
                 return live
             live = new
@@ -103,18 +103,18 @@ class Printed:
 
     def _kept(self):
         """What is kept of every sample, and what is computed again of it."""
-        wanted = refs(self.moving, self._outputs())
-        wanted = {e for e in wanted if self.rank[e.name] == TIMED and e.name != "k"}
+        needed = refs(self.moving, self._outputs())
+        needed = {e for e in needed if self.rank[e.name] == TIMED and e.name != "k"}
         timed = self._ranked(TIMED)
-        kept, again = kept_in_time(timed, wanted, self.rank)
-        return kept, again
+        stored, again = kept_in_time(timed, needed, self.rank)
+        return stored, again
 
     def _alone(self, statements: list[Statement], outputs: Iterable[Any]) -> list[Ref]:
         """What of rank ALONE is read: numbers, then whole arrays as Refs without an index."""
-        found = {e for e in refs(statements, outputs) if self.rank[e.name] == ALONE}
+        numbers = {e for e in refs(statements, outputs) if self.rank[e.name] == ALONE}
         read = {o for s in every(statements) if isinstance(s, Matrix) for o in s.operands}
         whole = {Ref(name) for name in read if self.rank.get(name) == ALONE}
-        return [*sorted(found, key=place), *sorted(whole)]
+        return [*sorted(numbers, key=place), *sorted(whole)]
 
     def _is_array(self, e):
         return e.index is None and e.name in self.arrays
@@ -122,8 +122,8 @@ class Printed:
     def _lead(self):
         outputs = [self.loop.first[i] for i in self.state]
         outputs += [self.loop.first[i] for i in self.loop.lines]
-        for found in self.crossing.values():
-            outputs += found
+        for group_read in self.crossing.values():
+            outputs += group_read
         alone = used(self._ranked(ALONE), names(outputs))
         text = Text({"p": "p"}, short_names(FIXED))
         lines = text.write(alone, outputs, hold=outputs)
@@ -160,25 +160,25 @@ class Printed:
     def _unpacked(self, text, group, source):
         """Lines that give names to what `_numbers` has put together."""
         lines, numbers = [], [e for e in group if not self._is_array(e)]
-        for found, where in (
+        for entries, where in (
             (numbers, source),
             ([e for e in group if self._is_array(e)], f"{source}.A"),
         ):
-            own = [next(text.names) for _ in found]
-            text.given.update(zip([e.name if self._is_array(e) else e for e in found], own))
-            lines += [f"const[{','.join(own)}]={where};"] if own else []
+            variables = [next(text.names) for _ in entries]
+            text.given.update(zip([e.name if self._is_array(e) else e for e in entries], variables))
+            lines += [f"const[{','.join(variables)}]={where};"] if variables else []
         return lines
 
     def _signals(self):
         text, lines = self._begin("signals", {Ref("k"): "k"})
         streams = self.streams()
-        own = [next(text.names) for _ in streams]
-        if own:
-            lines.append(f"const[{','.join(own)}]=S;")
+        variables = [next(text.names) for _ in streams]
+        if variables:
+            lines.append(f"const[{','.join(variables)}]=S;")
         body = text.write(self._timed(), streams)
         values = (text.of(e) for e in streams)
-        body += [f"{a}[k]={v if v[0] == '+' else f'+{v}'};" for a, v in zip(own, values)]
-        lines += ["for(;k<K;++k){", *body, "}"] if own else []
+        body += [f"{a}[k]={v if v[0] == '+' else f'+{v}'};" for a, v in zip(variables, values)]
+        lines += ["for(;k<K;++k){", *body, "}"] if variables else []
         return function("signals", "q,k,K,S", lines)
 
     def _run(self):
@@ -186,34 +186,40 @@ class Printed:
         rows = [f"R[o++]={self._real(e)}{text.of(e)};" for e in self._saved()]
         body += ["if(k%every===0){", *rows, "}", *self._next(text)]
         lines += ["let o=0;", "for(;k<K;++k){", *body, "}"]
-        lines += [f"c[{j}]={own};" for j, own in enumerate(state)]
+        lines += [f"c[{j}]={variable};" for j, variable in enumerate(state)]
         return function("run", "q,c,L,S,N,k,K,every,R", [*lines, "return o;"])
 
     def _sample(self):
         """Return (Text, lines in front of the loop, lines of a sample, variables of the state)."""
         text, lines = self._begin("run", {Ref("k"): "k"})
         streams = self.streams()
-        kept = [next(text.names) for _ in streams]
+        streams_read = [next(text.names) for _ in streams]
         noise = [next(text.names) for _ in range(self.loop.case.loop.plant.tanks)]
-        if kept:
-            lines.append(f"const[{','.join(kept)}]=S;")
+        if streams_read:
+            lines.append(f"const[{','.join(streams_read)}]=S;")
         lines.append(f"const[{','.join(noise)}]=N;")
         state = [next(text.names) for _ in self.state]
-        text.given |= {Ref("c", i): own for i, own in zip(self.state, state)}
+        text.given |= {Ref("c", i): variable for i, variable in zip(self.state, state)}
         delays = [next(text.names) for _ in self.loop.lines]
         text.given |= dict(zip(self.loop.lines.values(), delays))
         lines.append(f"let[{','.join(state)}]=c;")
         lines += [f"const[{','.join(delays)}]=L;"] if delays else []
-        body = [f"const {own}={array}[k];" for own, array in self._given(text, streams, kept)]
+        body = [
+            f"const {variable}={array}[k];"
+            for variable, array in self._given(text, streams, streams_read)
+        ]
         deviates = [Ref("n", i) for i in range(len(noise))]
-        body += [f"const {own}={array}[k];" for own, array in self._given(text, deviates, noise)]
+        body += [
+            f"const {variable}={array}[k];"
+            for variable, array in self._given(text, deviates, noise)
+        ]
         outputs = self._outputs()
         body += text.write([*self.again, *self.moving], outputs, hold=outputs)
         return text, lines, body, state
 
-    def _given(self, text, found, arrays):
+    def _given(self, text, entries, arrays):
         """Yield (variable, array) of what is read at each sample."""
-        for e, array in zip(found, arrays):
+        for e, array in zip(entries, arrays):
             text.given[e] = next(text.names)
             yield text.given[e], array
 
@@ -236,7 +242,7 @@ class Printed:
     def _read(self):
         text, lines = self._begin("read", {})
         state = [next(text.names) for _ in self.state]
-        text.given |= {Ref("c", i): own for i, own in zip(self.state, state)}
+        text.given |= {Ref("c", i): variable for i, variable in zip(self.state, state)}
         lines.append(f"const[{','.join(state)}]=c;")
         outputs = self._measures()
         lines += text.write(self.measured, outputs, hold=outputs)

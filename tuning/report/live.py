@@ -30,8 +30,8 @@ def live_page_of(result: Any, plants: int | None = None) -> LivePage:
         stated = result.tuned.limits  # its search leaves out limits that the safety filter keeps
     if stated is not None:
         _, limits = as_measures(None, stated)
-        own = set(ms.functions(limits))  # a user's functions do not run in a browser
-        limits = {m: value for m, value in limits.items() if m not in own}
+        functions = set(ms.functions(limits))  # a user's functions do not run in a browser
+        limits = {m: value for m, value in limits.items() if m not in functions}
         case = case.replace(limits=limits)  # those of the search, with --limit
     return live_page(case, states_of(result), plants=plants)
 
