@@ -1,4 +1,4 @@
-"""Where a value may lie, and the scale on which it is searched; imported by `problem`."""
+"""The range of a parameter, and the scale on which it is searched."""
 
 import math
 from collections.abc import Mapping

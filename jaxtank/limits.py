@@ -53,6 +53,11 @@ class Limit:
             self.measure if per == "run" else f"{self.measure} of {per} {self.index + 1}"
         ) + where
 
+    @property
+    def key(self) -> tuple[str, int]:
+        """The limited measure and its entry, in whatever run."""
+        return self.measure, self.index
+
     def margin(self, measures: Mapping[str, Any]) -> float:
         """Return the distance to the limit, positive where it holds; see `margins`."""
         return float(self.margins(np.ravel(measures[self.measure])[self.index]))
@@ -66,6 +71,27 @@ class Limit:
         distance = self.sign * (self.value - np.asarray(values))
         clipped = np.clip(distance, -UNDEFINED_MARGIN, UNDEFINED_MARGIN)
         return np.where(np.isnan(values), undefined, clipped)
+
+
+def limited_levels(case: Case) -> NDArray[np.float64]:
+    """Return the (tanks,) limits on the highest levels; inf where there is none."""
+    limit = case.limits.get("max_level", np.inf)
+    limit = case.loop.plant.rim if isinstance(limit, str) else limit
+    return np.broadcast_to(np.asarray(limit, dtype=float), (case.loop.plant.tanks,))
+
+
+def tightened(
+    plant: Any, limits: Mapping[str, Any], amounts: Mapping[tuple[str, int], float]
+) -> dict[str, Any]:
+    """Return {measure: value} of `limits`, entries moved inward by {(measure, entry): amount}."""
+    tighter = dict(limits)
+    for (measure, index), amount in amounts.items():
+        if amount:
+            value = plant.rim if isinstance(tighter[measure], str) else tighter[measure]
+            values = np.array(np.broadcast_to(np.asarray(value, float), ms.entries(measure, plant)))
+            values[index] -= ms.MEASURES[measure].sense * amount
+            tighter[measure] = values.tolist()
+    return tighter
 
 
 def limit_scale(limit: Limit, loop: ClosedLoop) -> float:

@@ -24,6 +24,7 @@ from tuning.problem.functions import Constraint as Constraint
 from tuning.problem.functions import Objective as Objective
 from tuning.problem.problem import Problem as Problem
 from tuning.problem.status import Status as Status
+from tuning.search.discrete import tune_choices as tune_choices
 from tuning.search.judged import Answer as Answer
 from tuning.search.judged import Judged as Judged
 from tuning.search.judged import validate as validate
@@ -31,6 +32,7 @@ from tuning.search.options import LBFGS as LBFGS
 from tuning.search.options import SQP as SQP
 from tuning.search.options import TRF as TRF
 from tuning.search.options import Adam as Adam
+from tuning.search.options import Options as Options
 from tuning.search.pareto import tradeoff as tradeoff
 from tuning.search.result import ConstraintRow as ConstraintRow
 from tuning.search.result import Message as Message

@@ -83,7 +83,7 @@ def evolved(case, seeds=3, generations=300):
 
 def tuned(case, seed):
     """The TuningResult of one start."""
-    return tuning.tune(case, nominal=True, starts=1, seed=seed, validation=0)
+    return tuning.tune(case, tuning.Options(starts=1, validation=0), nominal=True, seed=seed)
 
 
 def main(words=None):

@@ -25,10 +25,10 @@ import tuning
 from jaxtank import rig
 from jaxtank.case import Scenario
 from jaxtank.core.tree import get_value, with_values
+from jaxtank.limits import limited_levels
 from tuning.feasible.study import least_offsets
 from tuning.problem.scenarios import groups_of, runs_of, values_of
 from tuning.search.judged import judge
-from tuning.search.setting import limited_levels
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.needs import Needs, plateaus_of
 from tuning.uncertainty.sampling import probabilities

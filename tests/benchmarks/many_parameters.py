@@ -71,12 +71,14 @@ def searches(knots=60):
     from optimisers import twenty_values
 
     asked = twenty_values(knots)
-    options = {"objective": dict(asked.objective), "limits": {}, "validation": 0}
+    options = {"objective": dict(asked.objective), "limits": {}}
     found = []
     for limit in (knots, knots - 1):
         jax.clear_caches()
         problem.FORWARD_LIMIT, began = limit, time.process_time()
-        result = tuning.tune(asked.case, nominal=True, starts=1, seed=0, **options)
+        result = tuning.tune(
+            asked.case, tuning.Options(starts=1, validation=0), nominal=True, **options
+        )
         took = time.process_time() - began
         counts, cost = result.evaluations, result.objective["after"]
         found.append([result.method, f"{counts['gradients']}", f"{cost:.6g}", f"{took:.0f} s"])

@@ -38,6 +38,7 @@ from jaxtank import presets
 from jaxtank.case import Free
 from jaxtank.rig.values import schedule
 from jaxtank.signals.setpoints import ramps
+from tuning.problem.evaluator import Evaluator
 from tuning.problem.problem import Problem
 from tuning.problem.scenarios import coarse_clock
 from tuning.report import tables
@@ -173,8 +174,7 @@ def ours(problem, method, z, reference, price, iterations):
         trace.add(np.inf if coarse else search.history[-1][1], *spent)
 
     seen.known = 0
-    problem.cache = type(problem.cache)()
-    search = Search(problem, reference, seen)
+    search = Search(Evaluator(problem), reference, seen)
     METHODS[method](search, z, iterations)
     return trace
 
@@ -183,7 +183,6 @@ def rival(problem, method, z, seed, stop, budget, seconds=np.inf):
     """Trace of a derivative-free optimiser, ended at the cost `stop`, after `budget` evaluations or
     some seconds.
     """
-    problem.cache = type(problem.cache)()
     trace, count = Trace(), len(z)
 
     def costs(zs):
@@ -268,8 +267,8 @@ def starts_of(problem, count):
     """The starts that `tune` would take: the case's own values and the best distinct ones of 64
     Sobol points, z of the unit cube.
     """
-    zs, costs, _, _ = screen(problem, 64, 0)
-    return distinct_starts(zs, costs, count, problem.start())
+    screened, _ = screen(Evaluator(problem), 64, 0)
+    return distinct_starts(screened.zs, screened.costs, count, problem.start())
 
 
 def compare(parameters, options):

@@ -42,9 +42,11 @@ def tuned(name):
         "objective": row.objective,
         "limits": row.limits,
         "scenarios": row.scenarios,
-        "choices": row.choices,
     }
-    return tuning.tune(case_of(row), nominal=True, **given, **row.options)
+    case, options = case_of(row), tuning.Options(**row.options)
+    if row.choices:
+        return tuning.tune_choices(case, row.choices, options, **given)
+    return tuning.tune(tuning.Problem(case, **given), options)
 
 
 def held_out(row, result):

@@ -30,8 +30,8 @@ def test_the_advice_is_taken(capsys):
 
 def test_without_limits_nothing_is_reported_to_hold():
     case = rig.load(ONE_TANK).replace(uncertain={"plant.drain": 0.1})
-    quick = {"starts": 1, "screening": 1, "iterations": 1, "validation": 2}
-    result = tuning.tune(case, nominal=True, limits={}, **quick)
+    quick = tuning.Options(starts=1, screening=1, iterations=1, validation=2)
+    result = tuning.tune(case, quick, limits={})
     page = repr(result)
     assert "validation runs" in page and "all limits held" not in page
     assert "rims are limits" not in page and "a level above its rim is not reported" in page

@@ -3,6 +3,7 @@
 import abc
 import contextlib
 import dataclasses
+import inspect
 import json
 import sqlite3
 from html.parser import HTMLParser
@@ -27,6 +28,7 @@ from jaxtank.plants.base import Plant
 from jaxtank.rig import components
 from tuning.cli.main import main
 from tuning.optimal_input.perfect_information import InputBound
+from tuning.search.options import options_of
 from tuning.search.result import constraint_rows
 
 
@@ -71,8 +73,7 @@ divisor = 2
 """
 
 
-FEW = dict(starts=1, screening=2, iterations=3)
-QUICK = FEW | dict(validation=0)
+QUICK = dict(starts=1, screening=2, iterations=3, validation=0)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -89,7 +90,7 @@ def own():
 
 @pytest.fixture(scope="module")
 def tuned(own):
-    return tuning.tune(own, nominal=True, **QUICK)
+    return tuning.tune(own, tuning.Options(**QUICK))
 
 
 def test_a_registered_controller_and_observer_are_read_and_written(own):
@@ -243,11 +244,11 @@ def reported(result):
 
 @pytest.mark.slow
 def test_solver_options_are_the_keywords_they_stand_for(own, tuned):
-    assert reported(tuning.tune(own, tuning.TRF(**FEW), validation=0)) == reported(tuned)
+    assert reported(tuning.tune(own, tuning.TRF(**QUICK))) == reported(tuned)
     problem = tuning.Problem(own, free=own.free, limits={})
-    assert reported(tuning.tune(problem, tuning.TRF(**FEW), validation=0)) == reported(tuned)
-    by_name = tuning.tune(own, method="slsqp", **QUICK)
-    assert reported(tuning.tune(own, tuning.SQP(**FEW), validation=0)) == reported(by_name)
+    assert reported(tuning.tune(problem, tuning.TRF(**QUICK))) == reported(tuned)
+    by_name = tuning.tune(own, options_of("slsqp", **QUICK))
+    assert options_of("slsqp") == tuning.SQP()
     assert by_name.method == "slsqp" and reported(by_name) != reported(tuned)
 
 
@@ -257,28 +258,24 @@ def test_solver_options_are_checked_when_they_are_made_and_against_keywords(own)
         (lambda: tuning.SQP(tolerance=2.0), "tolerance = 2.0: must be"),
         (lambda: tuning.Adam(batch=True), "batch = True: must be"),
         (lambda: tuning.TRF(coarse=1), "coarse = 1: must be True or False"),
-        (
-            lambda: tuning.tune(own, tuning.SQP(starts=4), starts=2),
-            "starts = 2: SQP has starts = 4",
-        ),
         (lambda: tuning.tune(tuning.Problem(own), limits={}), "limits: the Problem has it already"),
-        (lambda: tuning.tune(tuning.Problem(own), risk="worst"), "risk: the Problem has it"),
+        (lambda: tuning.tune(own, "newton"), "method = 'newton': must be one of auto, trf"),
     ):
         with pytest.raises(InputError, match=words):
             make()
-    with pytest.raises(TypeError, match="tolerance"):
-        tuning.TRF(tolerance=1e-3)
+    with pytest.raises(TypeError, match="batch"):
+        tuning.TRF(batch=2)
+    keywords = inspect.signature(tuning.tune).parameters
+    assert len(keywords) <= 13  # the case, and twelve more
 
 
 def test_a_problem_keeps_its_seed_and_its_limits(own):
-    from tuning.search.options import spelled_out
-
-    plain = dict(free=None, objective=None, limits=None, scenarios=None, risk="mean", seed=0)
     problem = tuning.Problem(own, limits={"max_level": 9.0}, seed=3)
-    case, method, options = spelled_out(problem, "auto", plain)
-    assert case is own and method == "auto"
-    assert options == plain | {"limits": {"max_level": 9.0}, "seed": 3}
-    assert spelled_out(problem, "auto", plain | {"seed": 5})[2]["seed"] == 5
+    few = tuning.SQP(**QUICK)
+    kept, other = tuning.tune(problem, few), tuning.tune(problem, few, seed=5)
+    assert kept.problem is problem and kept.provenance["seed"] == 3
+    assert other.problem.limits == problem.limits and other.problem.seed == 5
+    assert problem.seed == 3
 
 
 def test_a_parameter_of_a_result_is_read_by_name(tuned):
@@ -364,12 +361,13 @@ def test_every_result_has_the_same_ways_out(tuned):
 
 @pytest.mark.slow
 def test_tune_keeps_its_log_in_the_checkpoint_and_goes_on_from_it(own, tuned, tmp_path):
-    assert reported(tuning.tune(own, "trf", **QUICK, checkpoint=tmp_path)) == reported(tuned)
+    few = tuning.TRF(**QUICK)
+    assert reported(tuning.tune(own, few, checkpoint=tmp_path)) == reported(tuned)
     count = kept(tmp_path)
     with contextlib.closing(sqlite3.connect(tmp_path / "checkpoint.sqlite3")) as file, file:
         file.execute("DELETE FROM record WHERE rowid > 4")
     assert kept(tmp_path) == 3 < count
-    again = tuning.tune(own, tuning.TRF(**FEW), validation=0, checkpoint=tmp_path, resume=True)
+    again = tuning.tune(own, few, checkpoint=tmp_path, resume=True)
     assert reported(again) == reported(tuned)
     assert kept(tmp_path) == count
 

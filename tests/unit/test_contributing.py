@@ -155,13 +155,10 @@ def test_a_measure_from_outside_is_evaluated_limited_and_minimised(added, capsys
     np.testing.assert_allclose(values[names[0]], np.abs(run.e[:-1]).mean(axis=0), rtol=1e-12)
     assert float(values[names[1]]) == np.asarray(run.u).sum(axis=1).max()
     result = tuning.tune(
-        case,
+        case.replace(scenarios=()),
+        tuning.SQP(starts=1, screening=2, validation=0),
         objective={"mean_absolute_error": 1.0},
         limits={"largest_total_input": 9.0},
-        scenarios=(),
-        starts=1,
-        screening=2,
-        validation=0,
     )
     row = next(r for r in result.constraints if r["name"].startswith("largest_total_input"))
     assert row["value"] <= 9.0 * (1 + 1e-6) and row["unit"] == "V"

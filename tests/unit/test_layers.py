@@ -209,7 +209,7 @@ def test_an_import_of_tuning_is_seen_however_it_is_written(graph, name):
 @pytest.mark.parametrize(
     ("module", "line"),
     [
-        ("tuning.search.discrete", "from tuning.search.tuner import tune"),
+        ("tuning.search.tuner", "from tuning.search.discrete import tune_choices"),
         ("tuning.identification.design", "def f():\n    import tuning.identification.fit"),
         ("jaxtank.case", "def f():\n    import jaxtank"),
         ("tuning.views", "import tuning"),

@@ -117,7 +117,8 @@ def test_slopes_by_controller_and_plant_are_those_of_differences(case):
 
 @pytest.fixture(scope="module")
 def result(case):
-    return tuning.tune(case, nominal=True, starts=1, screening=4, iterations=12, validation=4)
+    few = tuning.Options(starts=1, screening=4, iterations=12, validation=4)
+    return tuning.tune(case, few)
 
 
 def test_it_is_tuned_under_limits_drawn_and_validated(case, result):
@@ -268,13 +269,13 @@ def test_a_plant_whose_levels_are_not_in_its_units_is_refused(case):
 def test_nothing_is_claimed_on_plants_where_nothing_varies(case):
     """One plant with 8 draws of noise is no 8 plants; named in `uncertain`, there are 8."""
     one = metres(case)
-    options = {"starts": 1, "iterations": 1, "validation": 8, "safety_filter": False}
-    printed = " ".join(str(tuning.tune(one, **options)).split())
+    few = tuning.Options(starts=1, iterations=1, validation=8)
+    printed = " ".join(str(tuning.tune(one, few, safety_filter=False)).split())
     assert "validation plants" not in printed and "every flow" not in printed
     assert "of 8 runs of one plant, with new noise" in printed
     assert "nothing of this plant is known to vary" in printed and '"plant.valve"' in printed
     assert "[m]" in printed and not re.search(r"\bcm\b|\bV\b", printed)
     stated = one.replace(uncertain={"plant.valve": 0.05})
-    printed = " ".join(str(tuning.tune(stated, **options)).split())
+    printed = " ".join(str(tuning.tune(stated, few, safety_filter=False)).split())
     assert "of 8 validation plants" in printed
     assert "8 runs of one plant" in str(tuning.validate(one, samples=8))

@@ -4,7 +4,6 @@ The search itself then runs as without a cluster, and finds its evaluations in t
 is the same to the bit.
 """
 
-import copy
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -13,10 +12,11 @@ import jax
 import numpy as np
 
 from jaxtank.core.clock import Clock
-from jaxtank.limits import Limit, limit_scale
+from jaxtank.limits import Limit
 from tuning.cluster.engine import Engine
 from tuning.cluster.sent import received, sent
 from tuning.problem import scenarios as sc
+from tuning.problem.evaluator import Evaluator
 from tuning.problem.problem import Problem
 from tuning.storage.evaluation_log import EvaluationCache
 from tuning.storage.fingerprint import digest
@@ -24,29 +24,29 @@ from tuning.storage.fingerprint import digest
 
 def evaluate_ahead(
     engine: Engine | None,
-    problem: Problem,
+    evaluator: Evaluator,
     searches: Sequence[tuple],
     run: Callable[..., Any],
     waiting: Callable[[], Any],
 ) -> None:
-    """Make searches on the workers, and enter what they evaluate into the cache of the problem."""
+    """Make searches on the workers, and enter what they evaluate into the cache."""
     # What the cache holds already, of a run that is continued, is not evaluated again.
     if engine is None:
         return
-    given = []
+    unfinished = []
     for number, arguments in enumerate(searches):
-        known = _Known(problem.cache)
+        known = _Known(evaluator.cache)
         try:
-            run(with_cache(problem, known), *arguments)
+            run(Evaluator(evaluator.problem, known), *arguments)
         except _Missing:
-            given.append((number, (arguments, list(known.used.values()))))
-    if not given:
+            unfinished.append((number, (arguments, list(known.used.values()))))
+    if not unfinished:
         return
-    text, arrays = sent_problem(problem)
-    tasks = ((number, (text, arrays, *more)) for number, more in given)
+    text, arrays = sent_problem(evaluator.problem)
+    tasks = ((number, (text, arrays, *more)) for number, more in unfinished)
     for _, entries in engine.run("search", tasks, waiting):
         for entry in entries:
-            problem.cache.enter(*entry)
+            evaluator.cache.enter(*entry)
 
 
 def recorded(
@@ -57,15 +57,8 @@ def recorded(
     for entry in known:
         cache.enter(*entry)
     cache.entries.clear()
-    run(with_cache(received_problem(text, arrays), cache), *arguments)
+    run(Evaluator(received_problem(text, arrays), cache), *arguments)
     return cache.entries
-
-
-def with_cache(problem: Problem, cache: EvaluationCache) -> Problem:
-    """Return a problem with another cache and counts of its own."""
-    found = copy.copy(problem)
-    found.cache = cache
-    return found
 
 
 class _Missing(Exception):
@@ -135,13 +128,8 @@ def sent_problem(problem: Problem) -> tuple[tuple, list]:
 def received_problem(text: tuple, arrays: list) -> Problem:
     """Return the problem of `sent_problem`, for local searches: its runs have no case."""
     case, free, objective, limits, runs, risk = text
-    found = Problem(received(case), dict(free), dict(objective), {}, (), risk=risk)
-    found.runs = [sc.ScenarioRun(name, found.case, None, weight) for name, weight in runs]
-    found.limits = [Limit(*limit) for limit in limits]
-    found.limit_scales = np.array([limit_scale(limit, found.loop) for limit in found.limits])
-    measures = (*found.objective, *(limit.measure for limit in found.limits))
-    found.needed = tuple(dict.fromkeys(measures))
-    found.groups = [
+    problem = Problem(received(case), dict(free), dict(objective), {}, (), risk=risk)
+    groups = [
         sc.Group(
             tuple(mine),
             Clock(**clock),
@@ -153,4 +141,8 @@ def received_problem(text: tuple, arrays: list) -> Problem:
         )
         for rig, mine, clock, leaves, apart, keys, noise in arrays
     ]
-    return found
+    return problem.replace(
+        runs=[sc.ScenarioRun(name, problem.case, None, weight) for name, weight in runs],
+        limits=[Limit(*limit) for limit in limits],
+        groups=groups,
+    )

@@ -47,6 +47,11 @@ class Rig(NamedTuple):
     effort: np.ndarray  # (m,) ... as much as an input off by this much
     slowest: float  # largest time constant, at most the length of the run [s]
 
+    @property
+    def weights(self) -> tuple[np.ndarray, np.ndarray]:
+        """Weights (n,) of the levels and (m,) of the inputs by Bryson's rule."""
+        return np.full(len(self.A), self.off**-2.0), self.effort**-2.0
+
 
 def with_kind(case: Case, kind: str) -> Case:
     """Return a case whose controller is replaced by one of another kind."""
@@ -59,11 +64,11 @@ def with_kind(case: Case, kind: str) -> Case:
         raise InputError(
             f"controller kind {kind}: has no gains to start from; tune a rig file that has them"
         )
-    controller, own = _published(case, kind) or _computed(case, kind)
+    controller, gains = _published(case, kind) or _computed(case, kind)
     loop = dataclasses.replace(case.loop, controller=controller)
-    kept = {n: f for n, f in case.free.items() if not n.startswith("controller.")}
-    found = case.replace(loop=loop, free={**own, **kept}, symmetry=None)
-    return rig.check(rig.filtered(found))
+    others = {n: f for n, f in case.free.items() if not n.startswith("controller.")}
+    changed = case.replace(loop=loop, free={**gains, **others}, symmetry=None)
+    return rig.check(rig.filtered(changed))
 
 
 def _published(case: Case, kind: str) -> tuple[Any, dict[str, Any]] | None:
@@ -81,11 +86,11 @@ def _published(case: Case, kind: str) -> tuple[Any, dict[str, Any]] | None:
     return None
 
 
-def _same(one: Case, other: Case) -> bool:
+def _same(*cases: Case) -> bool:
     """Return whether two cases have the same plant and pumps."""
-    trees = [(case.loop.plant, case.loop.actuator) for case in (one, other)]
-    (mine, form), (theirs, others) = (jax.tree.flatten(tree) for tree in trees)
-    return form == others and all(np.array_equal(a, b) for a, b in zip(mine, theirs))
+    trees = [jax.tree.flatten((case.loop.plant, case.loop.actuator)) for case in cases]
+    (leaves, form), (others, other_form) = trees
+    return form == other_form and all(np.array_equal(a, b) for a, b in zip(leaves, others))
 
 
 def _computed(case: Case, kind: str) -> tuple[Any, dict[str, Any]]:
@@ -154,24 +159,19 @@ def _pid(known: Rig) -> Any:
     n, T = len(known.A), known.slowest
     # a rig that integrates has the gain of its first T seconds
     gain = known.C @ np.linalg.solve(np.eye(n) * (1e-3 / T) - known.A, known.B)
-    own, direct = np.diag(gain), np.diag(known.C @ known.B)
-    if np.any(np.abs(own) < 1e-9 * np.abs(gain).max()):
+    steady, direct = np.diag(gain), np.diag(known.C @ known.B)
+    if np.any(np.abs(steady) < 1e-9 * np.abs(gain).max()):
         raise InputError("controller kind pid: a pump does not change its output")
     rates = np.sort(np.abs(np.linalg.eigvals(known.A).real))
     others = float(np.sum(1.0 / rates[1:][rates[1:] > 0.0])) if n > 1 else 0.0
     theta = np.where(np.abs(direct) > 0.0, 0.0, 0.5 * others)
-    wanted = T / FASTER + theta
-    return {"Kc": T / (np.abs(own) * wanted), "Ti": np.minimum(T, 4.0 * wanted)}, ("Kc", "Ti")
-
-
-def _weights(known: Rig) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (n,) of the levels and (m,) of the inputs by Bryson's rule."""
-    return np.full(len(known.A), known.off**-2.0), known.effort**-2.0
+    lag = T / FASTER + theta
+    return {"Kc": T / (np.abs(steady) * lag), "Ti": np.minimum(T, 4.0 * lag)}, ("Kc", "Ti")
 
 
 def _feedback(known: Rig) -> np.ndarray:
     """(m, n) linear-quadratic gain of the weights of Bryson's rule."""
-    Q, R = _weights(known)
+    Q, R = known.weights
     gain = np.asarray(lqr(known.A, known.B, np.diag(Q), np.diag(R)), dtype=float)
     if not np.all(np.isfinite(gain)):
         raise InputError("the linear model of the rig has no linear-quadratic gain")
@@ -183,7 +183,7 @@ def _state_feedback(known: Rig) -> Any:
 
 
 def _lqi(known: Rig) -> Any:
-    Q, R = _weights(known)
+    Q, R = known.weights
     n, p = len(Q), len(known.C)
     integrals = np.full(p, (known.off * known.slowest / FASTER) ** -2.0)
     table = {"Q": np.concatenate([Q, integrals]), "R": R, "operating_point": known.setpoint}

@@ -1,4 +1,4 @@
-"""Objectives and constraints that are functions of a user's own: each becomes a named measure."""
+"""Objectives and constraints that are custom functions: each becomes a named measure."""
 
 # functions of jax and of `measures` whose types are not complete
 # pyright: reportUnknownMemberType=false
@@ -22,7 +22,7 @@ UNNAMED = "own_objective"  # name of an objective that is a function without one
 
 @dataclasses.dataclass(frozen=True)
 class Objective:
-    """An objective of one's own: a function of the measures of a run, and of its trajectory.
+    """A custom objective: a function of the measures of a run, and of its trajectory.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class Objective:
 
 @dataclasses.dataclass(frozen=True)
 class Constraint:
-    """A constraint of one's own: a function of a run whose value has an upper or a lower limit.
+    """A custom constraint: a function of a run whose value has an upper or a lower limit.
 
     Parameters
     ----------
@@ -111,25 +111,24 @@ class Constraint:
 
 def as_measures(objective: Any, limits: Any, taken: Iterable[str] = ()) -> tuple[Any, Any]:
     """Return ({measure: weight}, {measure: limit}) of an objective and limits, None where None."""
-    found: dict[str, ms.Measure] = {name: ms.MEASURES[name] for name in ms.functions(taken)}
-    weights = None if objective is None else _weights(objective, found)
-    limited = None if limits is None else _limited(limits, found)
-    for name, measure in found.items():
+    functions: dict[str, ms.Measure] = {name: ms.MEASURES[name] for name in ms.functions(taken)}
+    weights = None if objective is None else _weights(objective, functions)
+    limited = None if limits is None else _limited(limits, functions)
+    for name, measure in functions.items():
         ms.register(name, measure)
     return weights, limited
 
 
-def _weights(objective: Any, found: dict[str, ms.Measure]) -> dict[str, Any]:
-    """Return {measure: weight} of an objective, its functions entered in `found`."""
+def _weights(objective: Any, functions: dict[str, ms.Measure]) -> dict[str, Any]:
+    """Return {measure: weight} of an objective, its functions entered in `functions`."""
     table = isinstance(objective, Mapping)
     terms: Any = cast(Any, objective).items() if table else [(objective, 1.0)]
     weights: dict[str, Any] = {}
     for term, weight in terms:
-        if isinstance(term, str) and table:
-            name = term
-        else:
-            own = term if isinstance(term, Objective) else _of_function(term)
-            name = _enter(own.name, own.measure, found)
+        name = term
+        if not (isinstance(term, str) and table):
+            custom = term if isinstance(term, Objective) else _of_function(term)
+            name = _enter(custom, functions)
         if name in weights:
             raise InputError(f"objective {name} is given twice")
         weights[name] = weight
@@ -146,8 +145,8 @@ def _of_function(term: Any) -> Objective:
     return Objective(ms.name_of(term, UNNAMED), term)
 
 
-def _limited(limits: Any, found: dict[str, ms.Measure]) -> dict[str, Any]:
-    """Return {measure: limit} of limits, their functions entered in `found`."""
+def _limited(limits: Any, functions: dict[str, ms.Measure]) -> dict[str, Any]:
+    """Return {measure: limit} of limits, their functions entered in `functions`."""
     if isinstance(limits, Mapping):
         return dict(cast(Any, limits))
     if not isinstance(limits, list | tuple | Constraint):
@@ -156,25 +155,26 @@ def _limited(limits: Any, found: dict[str, ms.Measure]) -> dict[str, Any]:
             " list of both"
         )
     limited: dict[str, Any] = {}
-    several = cast(Any, [limits] if isinstance(limits, Constraint) else limits)
-    for one in several:
-        entry: Any = one
-        if isinstance(one, Constraint):
-            entry = {_enter(one.name, one.measure, found): one.limit}
-        elif not isinstance(one, Mapping):
+    entries = cast(Any, [limits] if isinstance(limits, Constraint) else limits)
+    for entry in entries:
+        table = {entry.name: entry.limit} if isinstance(entry, Constraint) else entry
+        if not isinstance(table, Mapping):
             raise InputError(
                 f"limits: {shortened(entry)} must be {{measure: value}} or a tuning.Constraint"
             )
-        for name, value in entry.items():
+        if isinstance(entry, Constraint):
+            _enter(entry, functions)
+        for name, value in cast(Any, table).items():
             if name in limited:
                 raise InputError(f"limit {name} is given twice")
             limited[name] = value
     return limited
 
 
-def _enter(name: str, measure: ms.Measure, found: dict[str, ms.Measure]) -> str:
-    """Return the name of a measure after it was entered in `found`."""
-    if found.get(name, measure) != measure:
+def _enter(custom: Objective | Constraint, functions: dict[str, ms.Measure]) -> str:
+    """Return the name of a custom function after its measure was entered in `functions`."""
+    name, measure = custom.name, custom.measure
+    if functions.get(name, measure) != measure:
         if name == UNNAMED:
             raise InputError(
                 "objective: two functions without a name, as lambdas; give each one:"
@@ -184,12 +184,11 @@ def _enter(name: str, measure: ms.Measure, found: dict[str, ms.Measure]) -> str:
             f"{name} is the name of two functions (or of one with two units, limits or save_every):"
             " give each a name of its own"
         )
-    found[name] = measure
+    functions[name] = measure
     return name
 
 
 def digests(loop: ClosedLoop, clock: Any, names: Iterable[str]) -> dict[str, Any]:
     """Return {"functions": {name: digest of its program}} for a fingerprint, {} without any."""
-    own = ms.functions(names)
-    found = {name: digest(program_of(loop, clock, name)) for name in own}
-    return {"functions": found} if found else {}
+    programs = {n: digest(program_of(loop, clock, n)) for n in ms.functions(names)}
+    return {"functions": programs} if programs else {}

@@ -31,13 +31,13 @@ def in_force(loop: ClosedLoop, values: Mapping[str, float]) -> dict[str, float]:
     controller: Any = with_values(loop, values).controller
     # a class of the user's may have none
     clipped: dict[str, Any] = getattr(controller, "in_force", dict)()
-    found = dict(values)
+    acting = dict(values)
     for leaf, value in clipped.items():
         for index in np.ndindex(np.shape(value)):
             entry = f"controller.{leaf}" + (f"[{','.join(map(str, index))}]" if index else "")
-            if entry in found:
-                found[entry] = float(np.asarray(value)[index])
-    return found
+            if entry in acting:
+                acting[entry] = float(np.asarray(value)[index])
+    return acting
 
 
 class Deferred(Mapping[str, Any]):
@@ -75,8 +75,8 @@ def margin_measures(loop: ClosedLoop, clock: Clock) -> dict[str, np.ndarray]:
     names = tuple(m for m in ms.linear() if ms.serves(m, loop))
     if not names or zero_of(loop).dtype != np.float64:
         return {}
-    found = worst(loop, clock)
-    return {m: np.asarray(getattr(found, m)) for m in names}
+    margins = worst(loop, clock)
+    return {m: np.asarray(getattr(margins, m)) for m in names}
 
 
 def table_of(problem: Problem, values: dict[str, float]) -> list[dict[str, Any]]:

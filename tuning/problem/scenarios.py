@@ -44,11 +44,9 @@ def screening_clock(clock: Clock) -> Clock:
 
 def coarse_clock(clock: Clock) -> Clock:
     """Return the clock of a first local search: ten times the step."""
-    return (
-        clock
-        if clock.samples < FEWEST * COARSE
-        else dataclasses.replace(clock, dt=clock.dt * COARSE)
-    )
+    if clock.samples < FEWEST * COARSE:
+        return clock
+    return dataclasses.replace(clock, dt=clock.dt * COARSE)
 
 
 class ScenarioRun(NamedTuple):
@@ -95,14 +93,14 @@ def check_scenarios(
     case: Case, scenarios: Sequence[Any], free: Sequence[str] = ()
 ) -> tuple[Scenario, ...]:
     """Return `scenarios` as a tuple of Scenario, if each can be run and none sets what is free."""
-    found = tuple(s if isinstance(s, Scenario) else Scenario(**s) for s in scenarios)
-    if len(found) > MANY:
-        raise InputError(f"scenarios: {len(found)} of them, must be at most {MANY}")
-    for s in found:
+    checked = tuple(s if isinstance(s, Scenario) else Scenario(**s) for s in scenarios)
+    if len(checked) > MANY:
+        raise InputError(f"scenarios: {len(checked)} of them, must be at most {MANY}")
+    for s in checked:
         _check_scenario(s, free)
-    if [s.name for s in found] != list(dict.fromkeys(s.name for s in found)):
+    if len({s.name for s in checked}) < len(checked):
         raise InputError("scenarios: two have the same name")
-    return found
+    return checked
 
 
 def _check_scenario(s: Scenario, free: Sequence[str]) -> None:
@@ -128,40 +126,40 @@ def runs_of(case: Case, scenarios: Sequence[Scenario], seed: int) -> list[Scenar
         key = jax.random.key(seed) if noisy(case) else None
         return [ScenarioRun("", case, key, 1.0)]
     total = sum(s.weight for s in scenarios)
-    found: list[ScenarioRun] = []
+    runs: list[ScenarioRun] = []
     for s in scenarios:
         try:
-            here = rig.set_scenario(case, s.values)
-            lp.check(here.loop, here.clock, jax.random.key(0))
+            changed = rig.set_scenario(case, s.values)
+            lp.check(changed.loop, changed.clock, jax.random.key(0))
         except EquilibriumError as error:
             remedy = "give numbers in its place, or leave the scenario out"
             raise InputError(f"scenario {s.name!r}: {error}; {remedy}") from None
         except InputError as error:
             raise InputError(f"scenario {s.name!r}: {error}") from None
-        key = jax.random.fold_in(jax.random.key(seed), s.seed) if noisy(here) else None
-        found.append(ScenarioRun(s.name, here, key, s.weight / total))
-    return found
+        key = jax.random.fold_in(jax.random.key(seed), s.seed) if noisy(changed) else None
+        runs.append(ScenarioRun(s.name, changed, key, s.weight / total))
+    return runs
 
 
 def groups_of(runs: Sequence[ScenarioRun]) -> list[Group]:
     """Return the Groups of runs that share a compiled loop, in the order of their first run."""
-    sorts: dict[Any, list[tuple[int, list[Any]]]] = {}
+    kinds: dict[Any, list[tuple[int, list[Any]]]] = {}
     for i, run in enumerate(runs):
         leaves: list[Any]
         structure: Any
         leaves, structure = jax.tree.flatten(run.case.loop)
-        sort: Any = (structure, tuple(np.shape(v) for v in leaves), run.case.clock, run.key is None)
-        sorts.setdefault(sort, []).append((i, leaves))
-    found: list[Group] = []
-    for (structure, _, clock, quiet), members in sorts.items():
+        kind: Any = (structure, tuple(np.shape(v) for v in leaves), run.case.clock, run.key is None)
+        kinds.setdefault(kind, []).append((i, leaves))
+    groups: list[Group] = []
+    for (structure, _, clock, quiet), members in kinds.items():
         columns = list(zip(*(leaves for _, leaves in members)))
         apart = tuple(any(not np.array_equal(c[0], v) for v in c[1:]) for c in columns)
         stacked = tuple(
             np.stack([np.asarray(v) for v in c]) if a else c[0] for c, a in zip(columns, apart)
         )
         keys = None if quiet else jnp.stack([runs[i].key for i, _ in members])
-        found.append(Group(tuple(i for i, _ in members), clock, structure, stacked, apart, keys))
-    return found
+        groups.append(Group(tuple(i for i, _ in members), clock, structure, stacked, apart, keys))
+    return groups
 
 
 def take(group: Group, picked: Any) -> Group:
@@ -183,8 +181,7 @@ def with_noise_drawn(group: Group) -> Group:
     def draw(key: Any) -> Any:
         return jnp.stack(sensor.draw(key, samples))
 
-    drawn: Any = jax.jit(jax.vmap(draw))(group.keys)
-    return group._replace(noise=drawn)
+    return group._replace(noise=jax.jit(jax.vmap(draw))(group.keys))
 
 
 def values_of(
@@ -228,8 +225,8 @@ def _mapped(function: Callable[..., Any], leaves: Any, keys: Any, shape: Shape) 
 
     if count == 1:
         mine = leaves if not any(apart) else [v[0] if a else v for v, a in zip(leaves, apart)]
-        found: Any = one(mine, None if keys is None else keys[0])
-        return jax.tree.map(_first_axis, found)
+        result: Any = one(mine, None if keys is None else keys[0])
+        return jax.tree.map(_first_axis, result)
     axes = (tuple(0 if a else None for a in apart), None if keys is None else 0)
     return jax.vmap(one, in_axes=axes, axis_size=count)(leaves, keys)
 
@@ -283,8 +280,8 @@ def _reverse(
 ) -> Any:
     def one(loop: ClosedLoop, key: Any) -> Any:
         def run(theta: Any) -> Any:
-            here = with_values(loop, dict(zip(order, theta)))
-            measures: Any = lp.evaluate_for_reverse(here, clock, names, key)
+            changed = with_values(loop, dict(zip(order, theta)))
+            measures: Any = lp.evaluate_for_reverse(changed, clock, names, key)
             return measures, measures
 
         derivative: Any = jax.jacrev(run, has_aux=True)

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
+from tuning.problem.evaluator import Evaluator
 from tuning.problem.problem import Point, Problem
 
 STEPS = (1e-3, 3e-4)  # lengths of the two secants, as shares of a range [-]
@@ -40,12 +41,12 @@ def contradicted(predicted: Any, actual: Any, size: Any) -> Any:
     actual = np.where(np.isfinite(actual), np.abs(actual), np.inf)
     borne_out = np.abs(predicted) <= 10.0**ORDERS * (actual + ROUNDING * np.abs(size))
     still = predicted == 0.0
-    found = np.any(~still, axis=0) & np.all(still | ~borne_out, axis=0)
-    return bool(found) if np.ndim(found) == 0 else found
+    exceeded = np.any(~still, axis=0) & np.all(still | ~borne_out, axis=0)
+    return bool(exceeded) if np.ndim(exceeded) == 0 else exceeded
 
 
 @np.errstate(all="ignore")  # derivatives may be infinite here
-def check_slope(problem: Problem, point: Point) -> SlopeCheck:
+def check_slope(evaluator: Evaluator, point: Point) -> SlopeCheck:
     """Return the SlopeCheck of a Point, by the cost and the limits of four runs beside it."""
     # As many points as `diagnostics.neighbours` has, so that one compiled program serves both.
     z, count = point.z, len(point.z)
@@ -53,7 +54,7 @@ def check_slope(problem: Problem, point: Point) -> SlopeCheck:
     along = point.gradient / norm if 0.0 < norm < np.inf else np.full(count, count**-0.5)
     moves = [np.clip(z + sign * h * along, 0.0, 1.0) - z for h in STEPS for sign in (1.0, -1.0)]
     zs = np.concatenate([z[None], z + moves, np.repeat(z[None], max(0, 2 * count - 4), axis=0)])
-    costs, margins = (v[:5] for v in problem.screen(zs))
+    costs, margins = (v[:5] for v in evaluator.screen(zs))
     changes, steps = costs[1:] - costs[0], np.linalg.norm(moves, axis=1)
     predicted = np.array(moves) @ point.gradient
     unusable = contradicted(predicted, changes, costs[0]) or np.any(
@@ -78,10 +79,3 @@ def check_slopes(problem: Problem, point: Point) -> None:
             f"function {name}: its derivative by {', '.join(problem.names)} is not a number at the"
             " starting values, as of a root or a quotient at 0"
         )
-
-
-def unusable_words(check: SlopeCheck) -> str:
-    """Return how far a slope is from what runs show, in words."""
-    shown = f"{check.secants[0]:.2g} per range of a parameter"
-    by = "is not finite" if check.orders is None else f"is 1e{check.orders:.0f} times as large"
-    return f"runs beside it show a slope of {shown}, the exact derivative {by}"

@@ -25,7 +25,7 @@ def live_page_of(result: Any, plants: int | None = None) -> LivePage:
         loop = dataclasses.replace(case.loop, safety_filter=tuned.loop.safety_filter)
         case = case.replace(loop=loop, safety=tuned.safety)
     problem = getattr(result, "problem", None)
-    stated = None if problem is None else problem.given["limits"]
+    stated = None if problem is None else problem.stated_limits
     if getattr(result, "answer", None) is not None:
         stated = result.tuned.limits  # its search leaves out limits that the safety filter keeps
     if stated is not None:

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.limits import limited_levels
 from jaxtank.loop.trajectory import csv
 from tuning.problem.problem import TAIL
 from tuning.problem.wording import numbered
@@ -33,7 +34,6 @@ from tuning.report.tables import (
     units,
 )
 from tuning.search.result import Message
-from tuning.search.setting import limited_levels
 
 COSTLIEST, MANY = 5, 12
 """Scenarios in a table that would have more than MANY rows."""
@@ -79,7 +79,7 @@ def json_of(result):
         "constraints": clean([c.to_json() for c in result.constraints]),
         "scenarios": scenario_rows(result),
         "slopes": {where: check.to_json() for where, check in result.slopes.items()},
-        "certificate": None if result.certificate is None else result.certificate._asdict(),
+        "certificate": None if result.certificate is None else result.certificate.to_json(),
         "holds": None if answer is None else answer.holds(),
         "feasibility": None if feasibility is None else feasibility.to_json(),
         "answer": None if answer is None else answer.to_json(),

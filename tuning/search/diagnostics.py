@@ -15,8 +15,8 @@ from jaxtank.loop import run as lp
 from jaxtank.loop import step_size
 from jaxtank.loop.change_windows import windows
 from jaxtank.loop.halving import halving_warnings
-from tuning.problem.problem import Problem
 from tuning.problem.reported import table_of
+from tuning.problem.scenarios import ScenarioRun
 from tuning.search.result import Lost
 
 CHECKED_RUNS = 16  # scenarios that are run, at most, to look for a step that is too long
@@ -38,31 +38,25 @@ overshoot [%] above which a run points to a fragile loop: an Ms above 2.5 oversh
 LARGEST_CURVATURE = 24  # number of parameters up to which the second derivative is computed
 
 
-def step_warnings(problem, tuned, values, key=None):
+def step_warnings(tuned, values, key=None, scenarios=()):
     """Return [] where the steps of the tuned case and of its scenarios are short enough."""
     # Else one sentence: which run is wrong, because an explicit step was unstable near an empty
     # tank, or what would happen to a tank that runs empty. Runs are made only where there is a
     # warning.
     runs = [("", tuned.loop, tuned.clock, key)]
-    for run in problem.runs[:CHECKED_RUNS] if problem.scenarios else ():
+    for run in scenarios[:CHECKED_RUNS]:
         loop = with_values(run.case.loop, values)
         runs.append((f"scenario {run.name}: ", loop, run.case.clock, run.key))
     sentences = []
-    for name, loop, clock, own in runs:
-        found = step_size.step_warnings(loop, clock)
-        if found and (why := _unstable_step(loop, clock, own)):
-            return [f"{name}this answer's run is wrong, and so are its numbers: {why}"]
-        sentences += [f"{name}{sentence}" for sentence in found]
+    for name, loop, clock, noise_key in runs:
+        warnings = step_size.step_warnings(loop, clock)
+        try:
+            if warnings:
+                halving_warnings(loop, clock, noise_key)
+        except InputError as error:
+            return [f"{name}this answer's run is wrong, and so are its numbers: {error}"]
+        sentences += [f"{name}{sentence}" for sentence in warnings]
     return sentences[:1]
-
-
-def _unstable_step(loop, clock, key):
-    """Return why the run of a loop is wrong, None where `halving_warnings` does not refuse it."""
-    try:
-        halving_warnings(loop, clock, key)
-    except InputError as error:
-        return str(error)
-    return None
 
 
 def neighbours(problem, z):
@@ -84,25 +78,23 @@ def sensitivities(costs):
     return [float(c) if np.isfinite(c) else None for c in change]
 
 
-def unexercised(problem, search, first):
+def unexercised(search, first):
     """Return (P,) True for each parameter that no run exercises at the best point of a Search."""
-    point = search.best
+    problem, point = search.problem, search.best
     flat = ~np.any(np.vstack([point.gradient, point.margin_slopes, point.run_slopes]), axis=0)
     idle = np.zeros(len(first), dtype=bool)
     if not flat.any():
         return idle
-    here = table_of(problem, problem.values(point.z))
+    table = table_of(problem, problem.values(point.z))
+    away = np.where(point.z < 0.5, point.z + 0.4, point.z - 0.4)
 
     def same(which):
         """Return True if no measure changes with the parameters `which`."""
-        away = np.where(point.z < 0.5, point.z + 0.4, point.z - 0.4)
-        tables = [
-            table_of(problem, problem.values(np.where(which, z, point.z))) for z in (first, away)
-        ]
+        moved = [np.where(which, z, point.z) for z in (first, away)]
         return all(
             np.allclose(row[m], old[m], rtol=1e-9, atol=1e-12, equal_nan=True)
-            for table in tables
-            for row, old in zip(table, here)
+            for z in moved
+            for row, old in zip(table_of(problem, problem.values(z)), table)
             for m in ms.reported()
             if m in row
         )
@@ -111,16 +103,16 @@ def unexercised(problem, search, first):
         idle = flat
     elif flat.sum() > 1:
         idle = np.array([bool(f) and same(np.arange(len(first)) == i) for i, f in enumerate(flat)])
-    kept = search.point(np.where(idle, first, point.z))
-    if kept.finite and search.violation(kept) <= search.violation(point) * (1 + 1e-9):
-        search.best = kept
+    at_start = search.point(np.where(idle, first, point.z))
+    if at_start.finite and search.violation(at_start) <= search.violation(point) * (1 + 1e-9):
+        search.best = at_start
         return idle
     return np.zeros(len(first), dtype=bool)
 
 
-def curvature(problem, search, point, idle=None):
+def curvature(search, point, idle=None):
     """Return the second derivative of the scaled cost along the free directions."""
-    z, count = point.z, len(point.z)
+    problem, z, count = search.problem, point.z, len(point.z)
     # nothing is a share of an objective of 0
     if count < 2 or count > LARGEST_CURVATURE or point.cost == 0.0:
         return None
@@ -131,17 +123,16 @@ def curvature(problem, search, point, idle=None):
     values, vectors = np.linalg.eigh(basis.T @ matrix @ basis)
     directions = (basis @ vectors).T
     there = _step_of_ten_percent(problem.bounds, z, directions[0])
-    factors, rounded = _short_factors(
-        problem.bounds, z, there, point.gradient / search.scale, matrix
-    )
-    costs, margins = problem.screen(np.array([z, rounded]))
+    gradient = point.gradient / search.scale
+    factors, rounded = _short_factors(problem.bounds, z, there, gradient, matrix)
+    costs, margins = search.evaluator.screen(np.array([z, rounded]))
     if np.all(margins[1] >= 0) and costs[1] < costs[0]:
         search.point(rounded)
     return {
         "eigenvalues": values.tolist(),
         "directions": [dict(zip(problem.names, map(float, d))) for d in directions],
         "least_sensitive": {
-            "factors": dict(zip((b.name for b in problem.bounds), factors)),
+            "factors": dict(zip(problem.names, factors)),
             "changes_percent": float(100 * abs(costs[1] / costs[0] - 1)),
         },
     }
@@ -162,7 +153,7 @@ def _second_derivative(search, z):
 def _free_directions(search, point, idle):
     """Return an orthonormal basis (P, free) of the directions no active limit or bound fixes."""
     z, count = point.z, len(point.z)
-    active = point.margins / search.limit_scale - search.tightening < 1e-4
+    active = search.scaled_margins(point)[0] < 1e-4
     fixed = list(point.margin_slopes[active])
     still = np.zeros(count, dtype=bool) if idle is None else idle
     fixed += [np.eye(count)[i] for i in range(count) if z[i] < 1e-6 or z[i] > 1 - 1e-6 or still[i]]
@@ -194,12 +185,9 @@ def _short_factors(bounds, z, there, gradient, matrix):
 
     factors, rounded = [], z
     for decimals in range(2, 9):
-        factors = [
-            _rounded(b, float(old), float(new), decimals) for b, old, new in zip(bounds, z, there)
-        ]
-        rounded = np.array(
-            [_moved(b, float(old), factor) for b, old, factor in zip(bounds, z, factors)]
-        )
+        ends = zip(bounds, z.tolist(), there.tolist())
+        factors = [_rounded(b, old, new, decimals) for b, old, new in ends]
+        rounded = np.array([_moved(b, old, f) for b, old, f in zip(bounds, z.tolist(), factors)])
         if abs(model(rounded) - model(there)) <= 0.05 * abs(model(there)):
             break
     return factors, rounded
@@ -211,8 +199,8 @@ def _rounded(b, old, new, decimals):
     exact = after / before if b.scale == "log" else after - before
     size = min(exact, 1.0) if b.scale == "log" else b.high - b.low
     places = decimals - math.floor(math.log10(size))
-    factor, one = round(exact, places), 10.0**-places
-    for other in (round(factor - one, places), round(factor + one, places)):
+    factor, step = round(exact, places), 10.0**-places
+    for other in (round(factor - step, places), round(factor + step, places)):
         if not 0 <= _moved(b, old, factor) <= 1 and 0 <= _moved(b, old, other) <= 1:
             return other
     return factor
@@ -226,25 +214,9 @@ def _moved(b, old, factor):
     return float(b.to_unit(before * factor if b.scale == "log" else before + factor))
 
 
-def direction_words(problem, found):
-    """Return the least sensitive direction of `curvature` as a sentence."""
-    parts = []
-    for b, factor in zip(problem.bounds, found["least_sensitive"]["factors"].values()):
-        if b.scale == "log" and factor != 1:
-            parts.append(f"{b.name} x {factor:.10g}")
-        elif b.scale != "log" and factor != 0:
-            parts.append(f"{b.name} {factor:+.10g}{'' if b.unit == '-' else f' {b.unit}'}")
-    if not parts:
-        return ""
-    together = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} with {parts[-1]}"
-    return (
-        f"least sensitive direction: {together} changes the objective by"
-        f" {found['least_sensitive']['changes_percent']:.2g} %"
-    )
-
-
-def symmetric(problem, outcomes, values):
+def symmetric(evaluator, starts, values):
     """Return the answer with the gains exchanged that the case names as a permutation symmetry."""
+    problem = evaluator.problem
     if problem.case.symmetry is None:
         return None
     image = problem.case.symmetry.image(values)
@@ -259,52 +231,32 @@ def symmetric(problem, outcomes, values):
         return max(abs(np.log(a[n] / b[n])) for n in image)
 
     half = 0.5 * apart(values, there)
-    starts = [
-        i
-        for i, o in enumerate(outcomes)
-        if o["violation"] == 0.0 and half > 0 and apart(o["to"], there) < half
-    ]
-    cost = float(problem.screen(z[None])[0][0])
+    close = lambda s: s["violation"] == 0.0 and half > 0 and apart(s["to"], there) < half
     return {
         "words": problem.case.symmetry.words,
         "values": there,
-        "objective": cost,
-        "starts": starts,
+        "objective": float(evaluator.screen(z[None])[0][0]),
+        "starts": [i for i, start in enumerate(starts) if close(start)],
     }
 
 
-def symmetry_words(image, objective):
-    """Return the gains of `symmetric` as a sentence; objective: that of the answer."""
-    at = ", ".join(f"{n} {v:.3g}" for n, v in image["values"].items())
-    above = 100 * (image["objective"] / objective - 1)
-    same = (
-        "the same objective"
-        if abs(above) < 1e-3
-        else f"an objective {abs(above):.2g} % {'above' if above > 0 else 'below'}"
-    )
-    searches = len(image["starts"])
-    ended = f", {searches} of the searches ended there and count as this answer" * (searches > 0)
-    return f"permutation symmetry: {image['words']}: {at} gives {same}{ended}"
-
-
 def lost_outputs(
-    problem: Problem, tables: Mapping[str, Sequence[Any]], values: Mapping[str, float]
+    runs: Sequence[ScenarioRun], tables: Mapping[str, Sequence[Any]], values: Mapping[str, float]
 ) -> tuple[Lost, ...]:
     """Return the outputs that follow their setpoints before tuning, and no longer afterwards."""
-    suspects = [_suspect(run, *rows) for run, *rows in zip(problem.runs, *tables.values())]
-    weights = np.array([run.weight for run in problem.runs])
+    suspects = [_suspect(run, *rows) for run, *rows in zip(runs, *tables.values())]
+    weights = np.array([run.weight for run in runs])
+    loop = runs[0].case.loop
     lost: list[Lost] = []
-    for i in range(len(problem.loop.plant.outputs)):
-        runs = [k for k, outputs in enumerate(suspects) if i in outputs]
-        if weights[runs].sum() <= 0.5 * weights.sum():
+    for i in range(len(loop.plant.outputs)):
+        doubtful = [k for k, outputs in enumerate(suspects) if i in outputs]
+        if weights[doubtful].sum() <= 0.5 * weights.sum():
             continue
-        runs = runs[:COMPARED_RUNS]
-        pairs = [_distances(problem.runs[k], values, i) for k in runs]
+        pairs = [_distances(runs[k], values, i) for k in doubtful[:COMPARED_RUNS]]
         bad = [after for before, after in pairs if after[0] > max(OFF, WORSE * before[0])]
-        if len(bad) > 0.5 * len(runs):
-            worst = max(range(len(pairs)), key=lambda k: pairs[k][1][0])
-            (_, before), (share, after) = pairs[worst]
-            unit = problem.loop.units[0]
+        if len(bad) > 0.5 * len(pairs):
+            (_, before), (share, after) = max(pairs, key=lambda pair: pair[1][0])
+            unit = loop.units[0]
             lost.append(Lost(output=i + 1, share=share, before=before, after=after, unit=unit))
     return tuple(lost)
 
@@ -313,7 +265,7 @@ def _suspect(run, before, after) -> set[int]:
     """Return the outputs (from 0) whose measures give a reason to compare their trajectories."""
     suspect = np.asarray(after["rms_error"]) > WORSE * np.asarray(before["rms_error"])
     if suspect.any():
-        setpoints, _ = _followed(run.case.loop, run.case.clock)
+        setpoints, _ = _setpoints(run.case.loop, run.case.clock)
         size = np.array([float(np.max(np.abs(v))) for v in setpoints])
         suspect &= np.asarray(after["rms_error"]) > 0.5 * OFF * size
     for measure in ("settling_time", "recovery_time"):
@@ -323,34 +275,32 @@ def _suspect(run, before, after) -> set[int]:
 
 
 @functools.partial(jax.jit, static_argnames="clock")
-def _followed(loop: Any, clock: Any) -> Any:
+def _setpoints(loop: Any, clock: Any) -> Any:
     """Return (setpoints of all samples, windows of their changes) by one program."""
     return loop.reference.sample(clock)[0], windows(loop, clock)
 
 
 def _distances(run, values, i) -> list[tuple[float, float]]:
     """Return [(share of the change, in the unit of level)] of output i, before and after."""
-    loop = run.case.loop
-    return [
-        _farthest(here, run.case.clock, run.key, i) for here in (loop, with_values(loop, values))
-    ]
+    loops = (run.case.loop, with_values(run.case.loop, values))
+    return [_farthest(loop, run.case.clock, run.key, i) for loop in loops]
 
 
 def _farthest(loop, clock, key, i) -> tuple[float, float]:
     """Return the largest distance of output i from its setpoint at the end of a plateau."""
     every = max(1, clock.samples // SAVED)
     errors = np.asarray(lp.simulate(loop, clock, key, save_every=every).e)[:, i]
-    setpoints, found = _followed(loop, clock)
+    setpoints, changes = _setpoints(loop, clock)
     setpoint = np.asarray(setpoints[i])[::every][: len(errors)]
     target, step = (
         (setpoint, 0 * setpoint)
-        if found is None
+        if changes is None
         else (
             np.broadcast_to(np.asarray(v), (clock.samples,))[::every][: len(errors)]
-            for v in found[i][:2]
+            for v in changes[i][:2]
         )
     )
-    ends = [*np.flatnonzero(np.diff(target)), len(errors) - 1] if found else [len(errors) - 1]
+    ends = [*np.flatnonzero(np.diff(target)), len(errors) - 1] if changes else [len(errors) - 1]
     worst = (0.0, 0.0)
     for first, last in zip([-1, *ends], ends):
         tail = slice(last + 1 - max(1, int(LATE * (last - first))), last + 1)
@@ -365,8 +315,8 @@ def points_to_fragile(loop: Any, before: Mapping[str, Any], after: Mapping[str, 
     """Return True if the run of an answer rings: else its margins are not worth a program."""
     old, new = (np.asarray(m["input_travel"]) for m in (before, after))
     ranges = np.asarray(loop.actuator.high) - np.asarray(loop.actuator.low)
-    held = loop.reference.held()
-    excursions = EXCURSIONS * ranges * (1 if held is None else len(held))
+    plateaus = loop.reference.held()
+    excursions = EXCURSIONS * ranges * (1 if plateaus is None else len(plateaus))
     overshoot = np.asarray(after.get("overshoot_percent", 0.0), dtype=float)
     busy = (new > BUSY * old) | (new > excursions)
     return bool(np.any(busy) or np.any(overshoot > RINGING))

@@ -1,66 +1,29 @@
-"""Discrete choices (a number of Laguerre terms, a pairing, the controller) by enumeration: the best
-is taken.
-"""
+"""Discrete choices (a number of Laguerre terms, a pairing, the controller) by enumeration."""
 
+import dataclasses
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxtank import rig
 from jaxtank.bounds import bounds
+from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import split_index
 from jaxtank.rig.components import ROLES
+from tuning.cluster.engine import connect
 from tuning.problem.controllers import NAMES, with_kind
+from tuning.problem.problem import Problem
 from tuning.problem.status import Status
+from tuning.search.options import Options, check_precision, options_of
 from tuning.search.result import Message, TuningResult
+from tuning.search.tuner import tune
 from tuning.storage.store import NAME
 
 MANY = 64  # combinations that are tried at most
 UNFIT = "does not fit"  # status of a combination that the rig cannot have
-
-
-def tune_choices(
-    tune: Callable[..., TuningResult],
-    case: Any,
-    method: str,
-    choices: Mapping[str, Sequence[Any]],
-    *,
-    checkpoint: Any = None,
-    resume: bool = False,
-    **options: Any,
-) -> TuningResult:
-    """Return the best TuningResult of all combinations, with `choices` a row for each."""
-    # One that holds every limit is preferred to one that does not, then the smaller violation, then
-    # the lower objective.
-    variants = _variants(case, choices, options.get("free"))
-    if resume and not any(_folder(checkpoint, i).is_dir() for i in range(len(variants))):
-        raise InputError(
-            f"--resume: {str(checkpoint)!r} holds no checkpoint to continue: there is no choice_1"
-        )
-    results: list[tuple[dict[str, Any], TuningResult]] = []
-    rows: list[dict[str, Any]] = []
-    for i, variant in enumerate(variants):
-        if variant.case is None:
-            rows.append(_row(variant, UNFIT, None, None, reason=variant.why))
-            continue
-        folder = None if checkpoint is None else _folder(checkpoint, i)
-        old = resume and folder is not None and (folder / NAME).exists()
-        own = options | {"free": variant.free}
-        result = tune(variant.case, method, checkpoint=folder, resume=old, **own)
-        results.append((variant.values, result))
-        after = {n: p["after"] for n, p in result.parameters.items()}
-        before, now = (result.objective[side] for side in ("before", "after"))
-        rows.append(_row(variant, str(result.status), before, now, after))
-        if result.status == Status.INTERRUPTED:
-            break
-    chosen, best = min(results, key=lambda found: _rank(found[1]))
-    text = ", ".join(f"{n} = {v}" for n, v in chosen.items())
-    first = Message("best-of-choices", f"best of {len(results)} choices: {text}")
-    unfit = [Message("choice-does-not-fit", f"{_words(v)}: {v.why}") for v in variants if v.why]
-    return best.replace(choices=rows, messages=(first, *best.messages, *unfit))
 
 
 class Variant(NamedTuple):
@@ -71,19 +34,96 @@ class Variant(NamedTuple):
     free: Any
     why: str = ""
 
+    @property
+    def words(self) -> str:
+        return ", ".join(f"{n} = {v}" for n, v in self.values.items())
 
-def _words(variant):
-    return ", ".join(f"{n} = {v}" for n, v in variant.values.items())
+
+def tune_choices(
+    case: Case,
+    choices: Mapping[str, Sequence[Any]],
+    method: str | Options = "auto",
+    *,
+    free: Mapping[str, Any] | None = None,
+    objective: Any = None,
+    limits: Any = None,
+    scenarios: Sequence[Scenario] | None = None,
+    risk: str = "mean",
+    seed: int = 0,
+    checkpoint: str | Path | None = None,
+    resume: bool = False,
+    **options: Any,
+) -> TuningResult:
+    """Return the best nominal optimum of all combinations of choices.
+
+    One that keeps every limit is preferred to one that does not, then the smaller violation, then
+    the lower objective.
+
+    Parameters
+    ----------
+    case, objective, limits, scenarios, risk, seed : as in `Problem`.
+    choices : {static name: [values]}; {"controller.kind": ["pid", "lqi"]} tunes each of these
+        controllers with gains and ranges of its own.
+    free : as in `Problem`; of controllers that differ, each has what it has a parameter for.
+    method, checkpoint, resume, options : as in `tune`.
+
+    Returns
+    -------
+    TuningResult, with a dict for each combination as `choices`.
+
+    Raises
+    ------
+    InputError : for a choice that cannot be made, and as `tune`.
+
+    Examples
+    --------
+    >>> import tuning
+    >>> from jaxtank import presets
+    >>> case = presets.find("cascaded/pi")
+    >>> tuning.tune_choices(case, {"clock.substeps": [1, 2]}).choices  # doctest: +SKIP
+    """
+    check_precision()
+    variants = _variants(case, choices, free)
+    folders = [Path(checkpoint or ".") / f"choice_{i + 1}" for i in range(len(variants))]
+    if resume and not any(folder.is_dir() for folder in folders):
+        raise InputError(
+            f"--resume: {str(checkpoint)!r} holds no checkpoint to continue: there is no choice_1"
+        )
+    results: list[tuple[Variant, TuningResult]] = []
+    rows: list[dict[str, Any]] = []
+    chosen = options_of(method)
+    with connect(chosen.cluster) as engine:
+        chosen = dataclasses.replace(chosen, cluster=engine)
+        for variant, folder in zip(variants, folders):
+            if variant.case is None:
+                rows.append(_row(variant, None))
+                continue
+            parts = variant.free, objective, limits, scenarios, seed, risk
+            resumed = resume and (folder / NAME).exists()
+            keep: Any = {"checkpoint": None if checkpoint is None else folder, "resume": resumed}
+            result = tune(Problem(variant.case, *parts), chosen, **keep, **options)
+            results.append((variant, result))
+            rows.append(_row(variant, result))
+            if result.status == Status.INTERRUPTED:
+                break
+    variant, best = min(results, key=lambda pair: _rank(pair[1]))
+    first = Message("best-of-choices", f"best of {len(results)} choices: {variant.words}")
+    unfit = [Message("choice-does-not-fit", f"{v.words}: {v.why}") for v in variants if v.why]
+    return best.replace(choices=rows, messages=(first, *best.messages, *unfit))
 
 
-def _row(variant, status, before, after, parameters=None, reason=None):
-    """Return the row of one combination in a result."""
+def _row(variant, result):
+    """Return the row of one combination; result : None where it does not fit."""
+    objective, after = {"before": None, "after": None}, {}
+    if result is not None:
+        objective = {side: result.objective[side] for side in objective}
+        after = {n: p["after"] for n, p in result.parameters.items()}
     return {
         "values": variant.values,
-        "status": status,
-        "objective": {"before": before, "after": after},
-        "parameters": parameters or {},
-        "reason": reason,
+        "status": UNFIT if result is None else str(result.status),
+        "objective": objective,
+        "parameters": after,
+        "reason": variant.why if result is None else None,
     }
 
 
@@ -103,14 +143,14 @@ def _variants(case, choices, free):
     kinds = [name for name in choices if name in NAMES]
     if len(kinds) > 1:
         raise InputError(f"choices {kinds[1]}: is {kinds[0]} by another name; leave one out")
-    found = [_variant(case, dict(zip(choices, c)), kinds, free) for c in combinations]
-    if all(variant.case is None for variant in found):
-        raise InputError(f"choices: none fits the rig; {_words(found[0])}: {found[0].why}")
-    fitting = [variant.case for variant in found if variant.case is not None]
+    variants = [_variant(case, dict(zip(choices, c)), kinds, free) for c in combinations]
+    fitting = [variant.case for variant in variants if variant.case is not None]
+    if not fitting:
+        raise InputError(f"choices: none fits the rig; {variants[0].words}: {variants[0].why}")
     for name in free or {}:
         if kinds and not any(rig.has(variant.loop, name) for variant in fitting):
             bounds(fitting[0].loop, {name: free[name]})  # raises, with the nearest name
-    return found
+    return variants
 
 
 def _variant(case, values, kinds, free):
@@ -124,7 +164,7 @@ def _variant(case, values, kinds, free):
             case = with_kind(case, kind)
         except InputError as error:
             return Variant(values, None, None, str(error))
-        free = _free_of(case, free)
+        free = None if free is None else _free_of(case, free)
     taken = {split_index(b.name)[0] for b in bounds(case.loop, case.free if free is None else free)}
     for name in rest:
         if split_index(name)[0] in taken:
@@ -137,17 +177,10 @@ def _variant(case, values, kinds, free):
 
 def _free_of(case, free):
     """Return what is free with another controller: of `free` what it has, else its own gains."""
-    if free is None:
-        return None
-    found = {name: spec for name, spec in free.items() if rig.has(case.loop, name)}
-    if any(name.startswith("controller.") for name in found):
-        return found
-    return {n: f for n, f in case.free.items() if n.startswith("controller.")} | found
-
-
-def _folder(checkpoint, i):
-    """Return the folder of the log of combination i."""
-    return Path(checkpoint) / f"choice_{i + 1}"
+    present = {name: spec for name, spec in free.items() if rig.has(case.loop, name)}
+    if any(name.startswith("controller.") for name in present):
+        return present
+    return {n: f for n, f in case.free.items() if n.startswith("controller.")} | present
 
 
 def _rank(result):

@@ -1,14 +1,13 @@
 """A search as a solver uses it: scaled cost and margins, cached points, the best point so far."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import scipy
 
-from jaxtank import measures as ms
-from tuning.problem.problem import DIVERGED, Point, Problem
+from tuning.problem.evaluator import Evaluator
+from tuning.problem.problem import DIVERGED, Point
 from tuning.problem.slopes import SlopeCheck, check_slope
 
 TIGHTENING = 1e-6
@@ -21,26 +20,45 @@ SETTLED = 0.02
 converged.
 """
 
+SLOPING = 0.05
+"""KKT residual, of the scaled cost per unit of z, above which `downhill` looks for a lower
+point.
+"""
+
+STRIDES = (3e-2, 1e-2, 3e-3, 1e-3, 1e-4)
+"""Steps along the gradient that is left, in the unit cube, at which `downhill` looks for a lower
+point.
+"""
+
+UNSTABLE = 1.0 / STRIDES[-1]
+"""KKT residual, of the scaled cost per unit of z, by which the cost would fall below 0 within the
+least of STRIDES: the derivative of an unstable or chaotic run, exact, and of no use for a step.
+"""
+
+LOWER_BY = 1e-4
+"""Share by which the cost must fall for a point to count as lower than one at a kink [-]."""
+
 
 class Search:
     """A problem as a solver uses it."""
 
     def __init__(
         self,
-        problem: Problem,
+        evaluator: Evaluator,
         reference: Point,
-        report: Callable[["Search"], Any],
-        tolerance: float = 1e-8,
+        report: Callable[["Search"], Any] = lambda search: None,
+        tolerance: float | None = None,
     ):
-        self.problem, self.report, self.tolerance = problem, report, tolerance
+        self.evaluator, self.problem = evaluator, evaluator.problem
+        self.report, self.tolerance = report, 1e-8 if tolerance is None else tolerance
         self.reference = reference
         # a cost can be a scale where its slopes are not to be used
         self.scale = reference.cost if 0 < reference.cost < DIVERGED else 1.0
-        self.limit_scale = problem.limit_scales
+        self.limit_scale = self.problem.limit_scales
         # a limit of exactly zero is often the least a measure can be, and cannot be tightened; a
         # search ends within its tolerance of a limit, on either side
-        self.tightening = max(TIGHTENING, tolerance) * np.array(
-            [limit.value != 0 for limit in problem.limits], dtype=float
+        self.tightening = max(TIGHTENING, self.tolerance) * np.array(
+            [limit.value != 0 for limit in self.problem.limits], dtype=float
         )
         self.start = 0  # number of the local search
         self.exhausted = False  # whether the last local search used up its iterations
@@ -56,7 +74,7 @@ class Search:
         z = np.clip(z, 0.0, 1.0)
         key = z.tobytes()
         if key not in self.memory:
-            self.take(self.problem.point(z))
+            self.take(self.evaluator.point(z))
         return self.memory[key]
 
     def take(self, point: Point) -> None:
@@ -74,12 +92,16 @@ class Search:
         """Return whether runs beside a Point bear its slopes out; cached."""
         key = point.z.tobytes()
         if key not in self.slopes:
-            self.slopes[key] = check_slope(self.problem, point)
+            self.slopes[key] = check_slope(self.evaluator, point)
         return self.slopes[key]
 
     def violation(self, point: Point) -> float:
         """Return the largest violation as a share of its `limit_scale` [-]; 0 where all hold."""
-        return float(max(0.0, *(-point.margins / self.limit_scale))) if len(point.margins) else 0.0
+        return float(self.violations(point.margins))
+
+    def violations(self, margins: Any) -> Any:
+        """Return (...,) the largest violation of margins (..., limits), as `violation`."""
+        return np.max(-margins / self.limit_scale, axis=-1, initial=0.0)
 
     def return_to_start(self) -> bool:
         """Return True if the best point is now the start, whose derivatives are not finite."""
@@ -108,95 +130,53 @@ class Search:
     def margins(self, z: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return (limits,) scaled margins less the tightening, and their (limits, P) slopes."""
         point = self.point(z)
-        good = point if point.finite else self.last_finite
-        slopes = good.margin_slopes / self.limit_scale[:, None]
-        return good.margins / self.limit_scale - self.tightening, slopes
+        return self.scaled_margins(point if point.finite else self.last_finite)
 
-
-def event_of(search: Search, starts: int, **more: Any) -> dict[str, Any]:
-    """Return what `progress` is called with after an evaluation, and `more`."""
-    best, last = search.best, search.history[-1]
-    return {
-        "start": search.start,
-        "starts": starts,
-        "evaluations": len(search.history),
-        "cost": last[1],
-        "violation": last[2],
-        "best": None if best is None else best.cost,
-        "best_violation": None if best is None else search.violation(best),
-        "values": None if best is None else search.problem.values(best.z),
-        "details": lambda: details_of(search.problem, best),
-        **more,
-    }
-
-
-def details_of(problem: Problem, best: Point | None) -> dict[str, Any]:
-    """Return the parameters and the limits of a problem at a point, as JSON objects."""
-    now: dict[str, float] = {} if best is None else problem.values(best.z)
-    parameters = [
-        {
-            "name": b.name,
-            "unit": b.unit,
-            "low": b.low,
-            "high": b.high,
-            "before": before,
-            "now": now.get(b.name),
-        }
-        for b, before in zip(problem.bounds, problem.own_values().values())
-    ]
-    limits: dict[Any, dict[str, Any]] = {}
-    for limit, margin in zip(problem.limits, () if best is None else best.margins):
-        key = limit.measure, limit.index, limit.value
-        unit = ms.unit(limit.measure, problem.loop.units)
-        one = limits.setdefault(
-            key,
-            {
-                "name": dataclasses.replace(limit, scenario="").label,
-                "unit": unit,
-                "value": limit.value,
-                "sense": limit.sign,
-                "margin": float(margin),
-            },
-        )
-        one["margin"] = min(one["margin"], float(margin))
-    return {"parameters": parameters, "limits": list(limits.values())}
+    def scaled_margins(self, point: Point) -> tuple[np.ndarray, np.ndarray]:
+        """Return `margins` of a finite Point."""
+        slopes = point.margin_slopes / self.limit_scale[:, None]
+        return point.margins / self.limit_scale - self.tightening, slopes
 
 
 class CoarseSearch(Search):
     """The same problem at a tenth of the samples, on the same scale."""
 
     def __init__(self, search: Search):
-        super().__init__(search.problem, search.last_finite, search.report)
+        super().__init__(search.evaluator, search.last_finite, search.report)
         self.scale, self.owner = search.scale, search
 
     def point(self, z: Any) -> Point:
         """Return the coarse Point at z, clipped into the unit cube; cached."""
         z = np.clip(z, 0.0, 1.0)
         if z.tobytes() not in self.memory:
-            found = self.memory[z.tobytes()] = self.problem.coarse_point(z)
-            if found.finite and (self.best is None or found.cost < self.best.cost):
-                self.best = found
+            point = self.memory[z.tobytes()] = self.evaluator.coarse_point(z)
+            if point.finite and (self.best is None or point.cost < self.best.cost):
+                self.best = point
             self.owner.report(self.owner)
         return self.memory[z.tobytes()]
 
 
-SLOPING = 0.05
-"""KKT residual, of the scaled cost per unit of z, above which `downhill` looks for a lower
-point.
-"""
+def reporter(progress: Callable | None, starts: int, unit: str | None = None) -> Callable:
+    """Return what a Search calls after every evaluation: `progress` with a dict."""
 
-STRIDES = (3e-2, 1e-2, 3e-3, 1e-3, 1e-4)
-"""Steps along the gradient that is left, in the unit cube, at which `downhill` looks for a lower
-point.
-"""
+    def report(search: Search) -> None:
+        if progress is None or not search.history:
+            return
+        best, last = search.best, search.history[-1]
+        event = {
+            "start": search.start,
+            "starts": starts,
+            "evaluations": len(search.history),
+            "cost": last[1],
+            "violation": last[2],
+            "best": None if best is None else best.cost,
+            "best_violation": None if best is None else search.violation(best),
+            "values": None if best is None else search.problem.values(best.z),
+            "unit": unit,  # of the cost, None: the usual one of the case
+        }
+        progress(event)
 
-UNSTABLE = 1.0 / STRIDES[-1]
-"""KKT residual, of the scaled cost per unit of z, by which the cost would fall below 0 within the
-least of STRIDES: the derivative of an unstable or chaotic run, exact, and of no use for a step.
-"""
-
-LOWER_BY = 1e-4
-"""Share by which the cost must fall for a point to count as lower than one at a kink [-]."""
+    return report
 
 
 def optimality(search, point):
@@ -207,11 +187,8 @@ def optimality(search, point):
     if not point.finite:
         return np.inf, np.inf, np.zeros(len(point.margins))
     residual, multipliers = _residual(search, point)
-    return (
-        float(np.linalg.norm(point.gradient / search.scale)),
-        float(np.linalg.norm(residual)),
-        multipliers,
-    )
+    gradient = float(np.linalg.norm(point.gradient / search.scale))
+    return gradient, float(np.linalg.norm(residual)), multipliers
 
 
 def named_optimality(search, point):
@@ -225,28 +202,17 @@ def named_optimality(search, point):
 
 def _residual(search, point):
     """Return (what is left of the gradient (P,), multipliers (limits,)); see `optimality`."""
-    g = point.gradient / search.scale
-    columns, owners = [], []
-    margins = point.margins / search.limit_scale - search.tightening
-    slopes = point.margin_slopes / search.limit_scale[:, None]
-    for i, (margin, slope) in enumerate(zip(margins, slopes)):
-        if margin < 1e-4:
-            columns.append(slope)
-            owners.append(i)
-    for p, z in enumerate(point.z):
-        if z < 1e-6 or z > 1 - 1e-6:
-            columns.append(np.eye(len(g))[p] * (1.0 if z < 0.5 else -1.0))
-            owners.append(None)
-    multipliers = np.zeros(len(point.margins))
-    residual = g
-    if columns:
-        matrix = np.array(columns).T
-        found, _ = scipy.optimize.nnls(matrix, g)
-        residual = g - matrix @ found
-        for owner, value in zip(owners, found):
-            if owner is not None:
-                multipliers[owner] = value
-    return residual, multipliers
+    gradient, multipliers = point.gradient / search.scale, np.zeros(len(point.margins))
+    margins, slopes = search.scaled_margins(point)
+    active = np.flatnonzero(margins < 1e-4)
+    ends = np.flatnonzero((point.z < 1e-6) | (point.z > 1 - 1e-6))
+    inward = np.where(point.z[ends] < 0.5, 1.0, -1.0)
+    columns = np.vstack([slopes[active], inward[:, None] * np.eye(len(gradient))[ends]])
+    if not len(columns):
+        return gradient, multipliers
+    weights, _ = scipy.optimize.nnls(columns.T, gradient)
+    multipliers[active] = weights[: len(active)]
+    return gradient - columns.T @ weights, multipliers
 
 
 def downhill(search, point):
@@ -254,14 +220,12 @@ def downhill(search, point):
     if not point.finite:
         return None
     residual, _ = _residual(search, point)
-    if np.linalg.norm(residual) <= SLOPING:
+    size = np.linalg.norm(residual)
+    if size <= SLOPING:
         return None
     for stride in STRIDES:
-        other = search.point(point.z - stride * residual / np.linalg.norm(residual))
-        if (
-            other.finite
-            and search.violation(other) == 0.0
-            and other.cost < point.cost - LOWER_BY * abs(point.cost)
-        ):
+        other = search.point(point.z - stride * residual / size)
+        lower = other.cost < point.cost - LOWER_BY * abs(point.cost)
+        if other.finite and search.violation(other) == 0.0 and lower:
             return other
     return None

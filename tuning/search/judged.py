@@ -11,13 +11,13 @@ from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.jsonable import clean
 from jaxtank.core.tree import get_value
-from jaxtank.limits import resolve_limits
+from jaxtank.limits import limited_levels, resolve_limits
 from jaxtank.loop import run as lp
 from tuning.feasible.study import can_follow, can_judge
 from tuning.problem.functions import as_measures
 from tuning.problem.scenarios import noisy
-from tuning.search.options import check_options, check_precision
-from tuning.search.setting import Setting, limited_levels, measured, setting_of
+from tuning.search.options import check_numbers, check_precision
+from tuning.search.setting import COST, Setting, setting_of
 from tuning.uncertainty.batches import batch_size, run_batch
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import Points, clopper_pearson
@@ -51,22 +51,31 @@ def run_plants(
     space = Draws(case.loop, distributions)
     random = noisy(case) or any(n.startswith(NOISE) for n in space.labels)
     lp.check(case.loop, case.clock, jax.random.key(0) if random else None)
-    drawn = space.values(Points("random", space.dimensions, samples, seed).rows(0, samples))
-    last = _nominal(case, drawn) if quiet else None
-    count = samples + (last is not None)
+    plants = space.values(Points("random", space.dimensions, samples, seed).rows(0, samples))
+    values, noise = dict(plants), np.asarray(case.loop.sensor.noise, dtype=float)
+    # the last run is of the nominal plant without noise, unless entries of the noise are drawn
+    quiet = quiet and noise.ndim > 0 and not any(n.startswith(f"{NOISE}[") for n in plants)
+    if quiet:
+        last = {n: get_value(case.loop, n) for n in plants} | {NOISE: 0.0 * noise}
+        values = {NOISE: np.broadcast_to(noise, (samples, *noise.shape))} | values
+        values = {
+            n: np.concatenate([np.asarray(v), np.asarray(last[n], dtype=float)[None]])
+            for n, v in values.items()
+        }
+    count = samples + quiet
     size = _batch(batch_size(case, random, count), count)
     rows = np.minimum(np.arange(-(-count // size) * size), count - 1)  # the last one repeated
-    values = dict(drawn) if last is None else _with_row(drawn, last, case)
     numbers, key = np.arange(len(rows)), seed if random else None
     batches: list[Any] = []
-    for one in np.split(numbers, len(rows) // size):
-        here = {n: np.asarray(v)[rows[one]] for n, v in values.items()}
-        batches.append(run_batch(case, tuple(names), key, here, one))
-    found = {n: np.concatenate([b[n] for b in batches]) for n in batches[0]}
-    failed, own = found.pop("failed") > 0, None
-    if last is not None and not failed[samples]:
-        own = {n: v[samples] for n, v in found.items()}
-    return PlantRuns(drawn, {n: v[:samples] for n, v in found.items()}, failed[:samples], own)
+    for batch in np.split(numbers, len(rows) // size):
+        block = {n: np.asarray(v)[rows[batch]] for n, v in values.items()}
+        batches.append(run_batch(case, tuple(names), key, block, batch))
+    measures = {n: np.concatenate([b[n] for b in batches]) for n in batches[0]}
+    failed, nominal = measures.pop("failed") > 0, None
+    if quiet and not failed[samples]:
+        nominal = {n: v[samples] for n, v in measures.items()}
+    measures = {n: v[:samples] for n, v in measures.items()}
+    return PlantRuns(plants, measures, failed[:samples], nominal)
 
 
 def _batch(most: int, count: int) -> int:
@@ -75,23 +84,6 @@ def _batch(most: int, count: int) -> int:
         return most
     sizes = range(max(LANES, most // 2), most + most // 8 + 1, LANES)
     return min(sizes, key=lambda size: (-(-count // size) * size, -size))
-
-
-def _nominal(case: Case, drawn: Mapping[str, Any]) -> dict[str, Any] | None:
-    """{name: value} of the nominal plant without noise; None where noise is a number or drawn."""
-    entries = any(n.startswith(f"{NOISE}[") for n in drawn)
-    if entries or np.ndim(case.loop.sensor.noise) == 0:
-        return None
-    own = {n: np.asarray(get_value(case.loop, n), dtype=float) for n in drawn}
-    return own | {NOISE: np.zeros(np.shape(case.loop.sensor.noise))}
-
-
-def _with_row(drawn: Mapping[str, Any], last: Mapping[str, Any], case: Case) -> dict[str, Any]:
-    """{name: (N + 1, ...)} of the drawn values and those of the last run."""
-    count = len(next(iter(drawn.values())))
-    noise = np.asarray(case.loop.sensor.noise, dtype=float)
-    every = {NOISE: np.broadcast_to(noise, (count, *noise.shape))} | dict(drawn)
-    return {n: np.concatenate([np.asarray(v), last[n][None]]) for n, v in every.items()}
 
 
 FRESH = 256  # plants on which an answer is judged
@@ -137,14 +129,14 @@ class Judged(Shown):
 
     def share_held(self) -> dict[str, Any]:
         """Return {"share", "interval95", "samples"} of the plants on which every limit holds."""
-        held, n = int(self.held.sum()), self.samples
-        return {"share": held / n, "interval95": clopper_pearson(held, n), "samples": n}
+        count, n = int(self.held.sum()), self.samples
+        return {"share": count / n, "interval95": clopper_pearson(count, n), "samples": n}
 
     def to_json(self) -> dict[str, Any]:
         """Return means over the plants whose run is finite, as plain numbers."""
         good = ~self.failed
         mean = lambda values: float(np.mean(values[good])) if good.any() else None
-        held = self.share_held()
+        share = self.share_held()
         return {
             "samples": self.samples,
             "failed": int(self.failed.sum()),
@@ -152,27 +144,27 @@ class Judged(Shown):
             "error": mean(self.error),
             "highest_level": self.level[good].max(axis=0).tolist() if good.any() else None,
             "travel_percent": mean(100.0 * self.travel),
-            "limits_held": held["share"],
-            "interval95": held["interval95"],
+            "limits_held": share["share"],
+            "interval95": share["interval95"],
         }
 
     def _rows(self) -> dict[str, str]:
-        found = self.to_json()
-        low, high = (100.0 * end for end in found["interval95"])
-        numbers = {
-            "limits held": f"{100 * found['limits_held']:.3g} % of {self.samples} {self.runs}"
+        means = self.to_json()
+        low, high = (100.0 * end for end in means["interval95"])
+        rows = {
+            "limits held": f"{100 * means['limits_held']:.3g} % of {self.samples} {self.runs}"
             f" (95 % interval {low:.3g} to {high:.3g} %)"
         }
-        if found["error"] is not None:
-            levels = ", ".join(f"{v:.4g}" for v in found["highest_level"])
-            numbers |= {
-                "mean total rms error": f"{found['error']:.4g} {self.unit}",
+        if means["error"] is not None:
+            levels = ", ".join(f"{v:.4g}" for v in means["highest_level"])
+            rows |= {
+                "mean total rms error": f"{means['error']:.4g} {self.unit}",
                 "highest levels": f"{levels} {self.unit}",
-                "rms change of input per sample": f"{found['travel_percent']:.3g} % of their range",
+                "rms change of input per sample": f"{means['travel_percent']:.3g} % of their range",
             }
-        if found["failed"]:
-            numbers["diverged"] = f"{found['failed']} plants"
-        return numbers
+        if means["failed"]:
+            rows["diverged"] = f"{means['failed']} plants"
+        return rows
 
     def plot(self) -> dict[str, Any]:
         """Return matplotlib figures {"plants": errors and highest levels}; {} where every run
@@ -188,31 +180,24 @@ class Judged(Shown):
             values = self.measures[limit.measure].reshape(self.samples, -1)[:, limit.index]
             margins = limit.margins(values)
             i = int(np.argmin(margins))
-            rows.append(
-                {
-                    "limit": limit,
-                    "value": float(values[i]),
-                    "margin": float(margins[i]),
-                    "plant": i,
-                    "broken": int((margins < 0).sum()),
-                }
-            )
+            row = {"limit": limit, "value": float(values[i]), "margin": float(margins[i])}
+            rows.append(row | {"plant": i, "broken": int((margins < 0).sum())})
         return rows
 
 
 def drawn(sides: Mapping[str, Judged]) -> dict[str, Any]:
     """Return {"plants": figure} of {name: Judged}; {} where every run of one diverged."""
-    if any(one.failed.all() for one in sides.values()):
+    if any(side.failed.all() for side in sides.values()):
         return {}
     from jaxtank.plots.uncertainty import plants
 
-    found = {name: (one.error[~one.failed], one.level[~one.failed]) for name, one in sides.items()}
+    clouds = {name: (s.error[~s.failed], s.level[~s.failed]) for name, s in sides.items()}
     last = list(sides.values())[-1]
     limits = np.full(last.level.shape[1], np.inf)
     for limit in last.limits:
         if limit.measure == "max_level":
             limits[limit.index] = limit.value
-    return {"plants": plants(found, limits, last.unit)}
+    return {"plants": plants(clouds, limits, last.unit)}
 
 
 def validate(
@@ -252,32 +237,33 @@ def validate(
     >>> import jax, tuning
     >>> from jaxtank import presets
     >>> jax.config.update("jax_enable_x64", True)
-    >>> found = tuning.validate(presets.find("cascaded/pi"), samples=8)
-    >>> found.share_held()["share"]
+    >>> tuning.validate(presets.find("cascaded/pi"), samples=8).share_held()["share"]
     0.0
     """
     check_precision()
-    check_options(samples=samples)
+    check_numbers(samples=samples)
     objective, limits = as_measures(objective, limits)
     return judge(setting_of(case, objective, limits, distributions), samples, seed)
 
 
 def judge(setting: Setting, samples: int, seed: int, round_: int = 0) -> Judged:
     """Return how the searched case of a setting does on `samples` plants."""
-    case, names = setting.searched, measured(setting)
+    case = setting.searched
     limits = resolve_limits(case, setting.case.limits)
-    wanted = (*names, *(limit.measure for limit in limits))
-    own = tuple(m for m in NOMINAL if ms.serves(m, case.loop)) if not noisy(setting.case) else ()
-    found = run_plants(
+    names = [*setting.objective, *COST, "rms_error_total", "max_level", "mean_square_travel"]
+    names = [m for m in dict.fromkeys(names) if ms.serves(m, case.loop)]
+    names += [limit.measure for limit in limits]
+    quiet = [m for m in NOMINAL if ms.serves(m, case.loop)] if not noisy(setting.case) else []
+    plants = run_plants(
         case,
         setting.distributions,
         samples,
         (SEED_OFFSET + seed + 104_729 * round_) % 2**31,
-        tuple(dict.fromkeys((*wanted, *own))),
-        bool(own),
+        tuple(dict.fromkeys([*names, *quiet])),
+        bool(quiet),
     )
-    by = {m: found.measures[m] for m in dict.fromkeys(wanted)}
-    rows = {m: v.reshape(samples, -1) for m, v in by.items()}
+    measures = {m: plants.measures[m] for m in dict.fromkeys(names)}
+    rows = {m: v.reshape(samples, -1) for m, v in measures.items()}
     cost = sum(w * rows[m].sum(axis=1) for m, w in setting.objective.items())
     past = [limit.margins(rows[limit.measure][:, limit.index]) < 0 for limit in limits]
     changes = np.sqrt(rows["mean_square_travel"]) / setting.span
@@ -286,33 +272,28 @@ def judge(setting: Setting, samples: int, seed: int, round_: int = 0) -> Judged:
         error=rows["rms_error_total"][:, 0],
         level=rows["max_level"],
         travel=np.sqrt(np.mean(changes**2, axis=1)),
-        held=~(found.failed | np.any(past, axis=0)) if past else ~found.failed,
-        failed=found.failed,
-        infeasible=_unreachable(setting.case, found.values),
+        held=~(plants.failed | np.any(past, axis=0)) if past else ~plants.failed,
+        failed=plants.failed,
+        infeasible=_infeasible(setting.case, plants.values),
         limits=limits,
-        measures=by,
-        nominal=found.nominal,
-        unit=unit_of(setting),
+        measures=measures,
+        nominal=plants.nominal,
+        unit=setting.case.loop.units[0],
         runs="plants" if setting.plants_vary else setting.runs,
     )
 
 
-def _unreachable(case, values):
+def _infeasible(case, values):
     """Return (N,) True where no controller can hold a setpoint; None where that is not known."""
     return ~can_follow(case, values, case.limits) if can_judge(case) else None
 
 
-def matters(setting: Setting, judged: Judged, near: float) -> np.ndarray:
+def matters(setting: Setting, plants: Judged, near: float) -> np.ndarray:
     """Return (tanks,) True where some plant comes within `near` of the limit on its level."""
     limit = limited_levels(setting.case)
     with np.errstate(invalid="ignore"):
-        highest = np.where(judged.failed[:, None], np.inf, judged.level).max(axis=0)
+        highest = np.where(plants.failed[:, None], np.inf, plants.level).max(axis=0)
         return np.isfinite(limit) & (highest >= near * limit)
-
-
-def unit_of(setting: Setting) -> str:
-    """Return the unit of length of the rig."""
-    return ms.unit("max_level", setting.case.loop.units)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
@@ -372,17 +353,23 @@ class Answer(Shown):
 
     def plot(self) -> dict[str, Any]:
         """Return matplotlib figures {"plants": errors and highest levels before and after}."""
+        return drawn(self.sides)
+
+    @property
+    def sides(self) -> dict[str, Judged]:
+        """What was judged, {"before", "after"}."""
         sides = {"before": self.before, "after": self.after}
-        return drawn({name: one for name, one in sides.items() if one is not None})
+        return {name: side for name, side in sides.items() if side is not None}
 
     def holds(self) -> dict[str, Any]:
         """Return the object `holds` of the JSON: share of plants, interval, certificates."""
-        known = self.after is not None and bool(self.after.limits)
-        found = self.after.share_held() if self.after is not None and known else None
+        share: dict[str, Any] = {"share": None, "interval95": None, "samples": 0}
+        if self.after is not None and self.after.limits:
+            share = self.after.share_held()
         return {
-            "limits_on_validation": found["share"] if found else None,
-            "interval95": found["interval95"] if found else None,
-            "samples": found["samples"] if found else 0,
+            "limits_on_validation": share["share"],
+            "interval95": share["interval95"],
+            "samples": share["samples"],
             "certified": [
                 {"tank": row.tank + 1, "certified": bool(row.certified), "why": row.reason}
                 | {"starts": row.starts or None}
@@ -392,7 +379,6 @@ class Answer(Shown):
 
     def to_json(self) -> dict[str, Any]:
         """Return what the JSON of a result says of its plants, its noise and its safety filter."""
-        sides = {"before": self.before, "after": self.after}
         return clean(
             {
                 "noise": self.setting.noise,
@@ -403,7 +389,7 @@ class Answer(Shown):
                 "nominal_error": {  # of the run whose measures the JSON has, to the last digit
                     side: float(dict(m)["rms_error_total"]) for side, m in self.measures.items()
                 },
-                "plants": {name: j.to_json() for name, j in sides.items() if j is not None},
+                "plants": {name: side.to_json() for name, side in self.sides.items()},
                 "kept": [name for name, stays in self.kept.items() if stays],
                 "idle_limits_of_tanks": list(self.idle),
                 "limits_tightened": self.tightened,

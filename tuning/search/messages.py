@@ -46,7 +46,8 @@ no-rig-file                      no rig file describes the case (`save`)
 ===============================  =============================================================
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
@@ -54,13 +55,11 @@ from jaxtank import measures as ms
 from jaxtank.core.tree import parameters
 from jaxtank.safety.of_case import SPREAD
 from tuning.problem.problem import DIVERGED
-from tuning.problem.slopes import unusable_words
 from tuning.problem.status import Status
 from tuning.problem.wording import count, numbered
-from tuning.search.diagnostics import direction_words, symmetry_words
 from tuning.search.driver import SLOPING, UNSTABLE
 from tuning.search.result import ConstraintRow, Message, TuningResult, constraint_rows
-from tuning.search.stages import AGREE, RENEWED
+from tuning.search.solve import AGREE, RENEWED
 
 LISTED = 4  # limits that one message names at most
 
@@ -77,12 +76,12 @@ CHATTER = 10.0
 """Growth of the total variation of the inputs, or of their rms change per sample, above which it is
 reported [-]."""
 
-Found = Iterator[Message]
+Messages = Iterator[Message]
 
 
-def messages_of(result: TuningResult, steps: Iterable[str] = ()) -> tuple[Message, ...]:
-    """Return the findings about a result, most important first."""
-    first = [Message("step-too-long", text) for text in steps]
+def messages_of(result: TuningResult) -> tuple[Message, ...]:
+    """Return the findings about a result, most important first; those on its step stay first."""
+    first = [m for m in result.messages if m.code == "step-too-long"]
     rules = [r for r, of in RULES if of in (ANY, OPTIMUM if result.answer is None else ANSWER)]
     return (*first, *(message for rule in rules for message in rule(result)))
 
@@ -91,13 +90,53 @@ def violated(result: TuningResult) -> list[ConstraintRow]:
     return [c for c in result.constraints if c.margin < 0]
 
 
-def first_of(parts: list[str], joint: str = ", ") -> str:
+def first_of(parts: list[str]) -> str:
     """Return the first LISTED parts, and how many more there are."""
     more = len(parts) - LISTED
-    return joint.join(parts[:LISTED]) + (f" (and {more} more)" if more > 0 else "")
+    return ", ".join(parts[:LISTED]) + (f" (and {more} more)" if more > 0 else "")
 
 
-def _near_the_edge(result: TuningResult) -> Found:
+def against_limit(c: ConstraintRow, digits: int = 6) -> str:
+    """Return a value and its limit in words."""
+    return f"{c.name} is {c.amount()}, limit {c.limit:.{digits}g} {c.unit}"
+
+
+def _on_new_plants(result: TuningResult) -> Messages:
+    known = result.certificate
+    if known is None:
+        return
+    (low, high), risk = known.interval95, result.problem.risk
+    yield Message(
+        "limit-violated-out-of-sample" if known.broken else "limits-hold-out-of-sample",
+        f"on {known.fresh} new plants a limit was violated {known.broken} times (95 % interval"
+        f" {low:.2g} to {high:.2g})",
+    )
+    indication = (
+        f", an indication: plants at no limit change the {risk} too, and are not counted in it"
+    )
+    yield Message(
+        "scenario-bound",
+        f"by scenario theory, the probability is at most {known.bound:.2g} (confidence 1 -"
+        f" 1e-6, support {known.support} of {known.scenarios} plants"
+        f"{'' if risk == 'worst' else indication})",
+    )
+    if known.back_off:
+        yield Message(
+            "constraints-tightened",
+            f"the search tightened every limit by {100 * known.back_off:g} %, new plants are judged"
+            " by the limits themselves",
+        )
+    elif known.broken and known.support:
+        expected = 100 * known.support / (known.scenarios + 1)
+        yield Message(
+            "support-scenarios",
+            f"{known.support} of {known.scenarios} plants determine the answer: up to about"
+            f" {expected:.2g} % of new plants were to be expected past a limit (more plants or"
+            " a constraint tightening, --back-off 0.03, reduce both)",
+        )
+
+
+def _near_the_edge(result: TuningResult) -> Messages:
     """The answer's linearised loop is unstable, or nearly so."""
     sides = (result.measures[side] for side in ("before", "after"))
     before, after = (float(m.get("sensitivity_peak", np.nan)) for m in sides)
@@ -115,7 +154,7 @@ def _near_the_edge(result: TuningResult) -> Found:
     )
 
 
-def _less_robust(result: TuningResult) -> Found:
+def _less_robust(result: TuningResult) -> Messages:
     peaks = [float(m.get("sensitivity_peak", np.nan)) for m in result.measures.values()]
     if len(peaks) == 2 and max(PEAK, 1.05 * peaks[0]) < peaks[1] <= FRAGILE:
         yield Message(
@@ -125,7 +164,7 @@ def _less_robust(result: TuningResult) -> Found:
         )
 
 
-def _total_variation(result: TuningResult) -> Found:
+def _total_variation(result: TuningResult) -> Messages:
     before, after = (float(result.measures[k]["input_travel"].sum()) for k in ("before", "after"))
     if after > CHATTER * before > 0:
         times = f"{after / before:.0f} times that before"
@@ -139,11 +178,11 @@ def _total_variation(result: TuningResult) -> Found:
         )
 
 
-def _busier(result: TuningResult) -> Found:
-    answer = result.answer
-    if answer.after is None or answer.after.failed.all():
+def _busier(result: TuningResult) -> Messages:
+    before, after = result.answer.before, result.answer.after
+    if after is None or after.failed.all():
         return
-    old, new = (float(np.nanmean(side.travel)) for side in (answer.before, answer.after))
+    old, new = float(np.nanmean(before.travel)), float(np.nanmean(after.travel))
     if new > CHATTER * old > 0:
         yield Message(
             "input-total-variation",
@@ -153,57 +192,51 @@ def _busier(result: TuningResult) -> Found:
         )
 
 
-def _no_feasible_point(result: TuningResult) -> Found:
+def _no_feasible_point(result: TuningResult) -> Messages:
     missed = violated(result)
     if result.status == Status.NOT_CONVERGED and missed:
-        c = missed[0]
         yield Message(
             "no-feasible-point-found",
             "no point that meets every limit was found before the search ended"
-            f" ({c.name} is {c.amount()}, limit {c.limit:.6g} {c.unit}): more --iterations,"
+            f" ({against_limit(missed[0])}): more --iterations,"
             " --starts or --screening may find one",
         )
 
 
-def _infeasible(result: TuningResult) -> Found:
+def _infeasible(result: TuningResult) -> Messages:
     if result.status != Status.INFEASIBLE:
         return
     scales = result.problem.limit_scales
-    shares = [c.margin / scale for c, scale in zip(result.constraints, scales)]
-    order = [i for i in np.argsort(shares, kind="stable") if shares[i] < 0]
-    worst = [result.constraints[i] for i in order]
+    shares = [(c.margin / scale, c) for c, scale in zip(result.constraints, scales)]
+    shares = sorted((pair for pair in shares if pair[0] < 0), key=lambda pair: pair[0])
     missed = [
-        f"{c.name} is {c.amount()}, limit {c.limit:.6g} {c.unit}"
-        + ("" if c.reason else f", missed by {-c.margin:.3g} {c.unit}")
-        for c in worst
+        against_limit(c) + ("" if c.reason else f", missed by {-c.margin:.3g} {c.unit}")
+        for _, c in shares
     ]
+    share, worst = shares[0]
+    text = f"no point was found that meets every limit: {first_of(missed)}"
     least = (
-        ""
-        if worst[0].reason
-        else f"; the largest violation, {-100 * shares[order[0]]:.3g} % of its limit, is the least"
-        " that was found"
+        f"; the largest violation, {-100 * share:.3g} % of its limit, is the least that was found"
     )
-    yield Message(
-        "infeasible", f"no point was found that meets every limit: {first_of(missed)}{least}"
-    )
+    yield Message("infeasible", text if worst.reason else text + least)
 
 
-def _interrupted(result: TuningResult) -> Found:
+def _interrupted(result: TuningResult) -> Messages:
     if result.status == Status.INTERRUPTED:
         words = "this is the best point so far"
         if result.answer is not None:
-            judged = result.answer.after is not None
-            words = "of the search before this one" if judged else "not yet validated"
+            validated = result.answer.after is not None
+            words = "of the search before this one" if validated else "not yet validated"
             words = f"these are the best gains so far, {words}"
         yield Message("interrupted", f"interrupted: {words}")
 
 
-def _violated_on_plants(result: TuningResult) -> Found:
+def _violated_on_plants(result: TuningResult) -> Messages:
     answer = result.answer
     if answer.after is None or answer.held:
         return
     worst = violated(result)
-    parts = [f"{c.name} is {c.amount()}, limit {c.limit:.4g} {c.unit}" for c in worst[:4]]
+    parts = [against_limit(c, 4) for c in worst[:LISTED]]
     if answer.after.failed.any():
         parts.append(f"{int(answer.after.failed.sum())} runs diverged")
     remedy = (
@@ -215,12 +248,11 @@ def _violated_on_plants(result: TuningResult) -> Found:
     yield Message(
         "limit-violated-out-of-sample",
         f"limits hold on {int(answer.after.held.sum())} of {answer.after.samples}"
-        f" {answer.setting.runs}"
-        f" ({'; '.join(parts)}): {remedy}",
+        f" {answer.setting.runs} ({'; '.join(parts)}): {remedy}",
     )
 
 
-def _no_longer_follows(result: TuningResult) -> Found:
+def _no_longer_follows(result: TuningResult) -> Messages:
     forced = any(c.active for c in result.constraints)
     remedy = (
         "the active limits force it: loosen them or change the setpoints (--limit, --set)"
@@ -236,7 +268,7 @@ def _no_longer_follows(result: TuningResult) -> Found:
         )
 
 
-def _not_agreed(result: TuningResult) -> Found:
+def _not_agreed(result: TuningResult) -> Messages:
     if result.status != Status.INTERRUPTED and not result.answer.agreed:
         yield Message(
             "not-converged",
@@ -246,7 +278,7 @@ def _not_agreed(result: TuningResult) -> Found:
         )
 
 
-def _slope_not_usable(result: TuningResult) -> Found:
+def _slope_not_usable(result: TuningResult) -> Messages:
     """At the answer and at the values before tuning; once where these are the same."""
     places = {"answer": "the answer", "start": "the values before tuning"}
     same = all(p["before"] == p["after"] for p in result.parameters.values())
@@ -255,11 +287,14 @@ def _slope_not_usable(result: TuningResult) -> Found:
         if check is None or check.usable or (same and where == "start"):
             continue
         role = "judged the answer" if where == "answer" else "searched on"
+        times = (
+            "is not finite" if check.orders is None else f"is 1e{check.orders:.0f} times as large"
+        )
         yield Message(
             "slope-not-usable",
-            f"the slope of the objective at {words} is that of a chaotic or exploding loop:"
-            f" {unusable_words(check)}; it was not used: other starts and differential evolution"
-            f" {role}",
+            f"the slope of the objective at {words} is that of a chaotic or exploding loop: runs"
+            f" beside it show a slope of {check.secants[0]:.2g} per range of a parameter, the exact"
+            f" derivative {times}; it was not used: other starts and differential evolution {role}",
         )
 
 
@@ -268,7 +303,7 @@ def _flat(result: TuningResult) -> bool:
     return result.optimality["gradient_norm"] == 0.0 and result.objective["after"] != 0.0
 
 
-def _without_slope(result: TuningResult) -> Found:
+def _without_slope(result: TuningResult) -> Messages:
     if result.status != Status.INFEASIBLE and _flat(result):
         yield Message(
             "objective-without-slope",
@@ -278,70 +313,64 @@ def _without_slope(result: TuningResult) -> Found:
         )
 
 
-def _gradient_left(result: TuningResult) -> Found:
-    residual = result.optimality["kkt_residual"]
-    if (
-        _flat(result)
-        or result.status not in (Status.CONVERGED, Status.NOT_CONVERGED)
-        or violated(result)
-    ):
+def _gradient_left(result: TuningResult) -> Messages:
+    residual, kink = result.optimality["kkt_residual"], result.status == Status.CONVERGED
+    ended = kink or result.status == Status.NOT_CONVERGED
+    if _flat(result) or not ended or violated(result):
         return
     if residual is not None and residual > SLOPING:
-        kink = result.status == Status.CONVERGED
+        why = "a kink, because no lower value was found along it within the limits"
         yield Message(
             "kink" if kink else "gradient-not-zero",
             "the objective has a slope in a direction that no active limit blocks (KKT residual"
-            f" {residual:.2g} of the objective per range of a parameter): "
-            + (
-                "a kink, because no lower value was found along it within the limits"
-                if kink
-                else "not yet an optimum"
-            ),
+            f" {residual:.2g} of the objective per range of a parameter):"
+            f" {why if kink else 'not yet an optimum'}",
         )
 
 
-def _not_converged(result: TuningResult) -> Found:
-    zero = result.optimality["gradient_norm"] == 0.0
+def _not_converged(result: TuningResult) -> Messages:
+    """Why a search that violates no limit did not converge, and the remedy."""
+    zero, probe = result.optimality["gradient_norm"] == 0.0, result.probe or {"lower": 0}
     ended = result.status != Status.NOT_CONVERGED or bool(result.lost)
-    if not ended and not violated(result) and not zero:
-        yield Message("not-converged", _why_not_converged(result))
-
-
-def _why_not_converged(result: TuningResult) -> str:
-    """Return why a search that violates no limit did not converge, and the remedy."""
-    if all(not np.isfinite(violation) for _, _, violation, _ in result.history):
-        return (
-            f"no search could begin: the objective, a limit or a derivative exceeds {DIVERGED:.0e}"
-            " at every point that was tried, as where noise and delay make the loop unstable;"
-            " start from other values (--set) or narrow the ranges (--free)"
-        )
+    if ended or violated(result) or zero:
+        return
     check = result.slopes.get("answer")
     useless = check is not None and not check.usable
-    if useless or (result.optimality["kkt_residual"] or 0.0) >= UNSTABLE:
-        return (
+    reasons = (
+        (
+            all(not np.isfinite(violation) for _, _, violation, _ in result.history),
+            f"no search could begin: the objective, a limit or a derivative exceeds {DIVERGED:.0e}"
+            " at every point that was tried, as where noise and delay make the loop unstable;"
+            " start from other values (--set) or narrow the ranges (--free)",
+        ),
+        (
+            useless or (result.optimality["kkt_residual"] or 0.0) >= UNSTABLE,
             "the gradient at this point is that of an unstable or chaotic run (noise and delay at"
             " a high gain give one), and points along it are not lower; try more --starts, or"
-            " other ranges (--free)"
-        )
-    if any(o["exhausted"] for o in result.starts):
-        return (
+            " other ranges (--free)",
+        ),
+        (
+            any(start["exhausted"] for start in result.starts),
             "no search met the conditions of an optimum before its iterations were used up: raise"
-            " --iterations, or try other starts"
-        )
-    if result.probe and result.probe["lower"] >= RENEWED:
-        return (
-            f"{result.probe['lower']} searches from points of differential evolution each ended"
+            " --iterations, or try other starts",
+        ),
+        (
+            probe["lower"] >= RENEWED,
+            f"{probe['lower']} searches from points of differential evolution each ended"
             " lower than what was found before, and there may be better points still: raise"
-            " --starts and --screening"
-        )
-    return (
-        "the searches stopped before their iterations were used up, at a kink or in the noise of"
-        " the objective: no line search found a lower point, and the conditions of an optimum do"
-        " not hold there; try more --starts or other starting values"
+            " --starts and --screening",
+        ),
+        (
+            True,
+            "the searches stopped before their iterations were used up, at a kink or in the noise"
+            " of the objective: no line search found a lower point, and the conditions of an"
+            " optimum do not hold there; try more --starts or other starting values",
+        ),
     )
+    yield Message("not-converged", next(text for holds, text in reasons if holds))
 
 
-def _nothing_better(result: TuningResult) -> Found:
+def _nothing_better(result: TuningResult) -> Messages:
     if result.status == Status.CONVERGED and result.probe:
         yield Message(
             "nothing-better-found",
@@ -349,14 +378,11 @@ def _nothing_better(result: TuningResult) -> Found:
         )
 
 
-def _start_violates(result: TuningResult) -> Found:
-    over = constraint_rows(result.problem, result.tables["before"])
+def _start_violates(result: TuningResult) -> Messages:
+    rows = [c for c in constraint_rows(result.problem, result.tables["before"]) if c.margin < 0]
     parts = [
-        f"{c.name} {c.amount()}"
-        if c.reason
-        else f"{c.name} {c.value:.4g} of {c.limit:.4g} {c.unit}"
-        for c in over
-        if c.margin < 0
+        f"{c.name} " + (c.amount() if c.reason else f"{c.value:.4g} of {c.limit:.4g} {c.unit}")
+        for c in rows
     ]
     if parts and not violated(result):
         yield Message(
@@ -366,21 +392,22 @@ def _start_violates(result: TuningResult) -> Found:
         )
 
 
-def _not_applicable(result: TuningResult) -> Found:
+def _not_applicable(result: TuningResult) -> Messages:
     """Entries of a limited measure that are undefined in every run."""
-    limits, plant = result.problem.limits, result.problem.loop.plant
-    for measure in dict.fromkeys(
-        x.measure for x in limits if "window" in ms.refers_to([x.measure])
-    ):
-        limited = {limit.index for limit in limits if limit.measure == measure}
-        for i in sorted(set(range(ms.entries(measure, plant))) - limited):
+    keys, plant = {limit.key for limit in result.problem.limits}, result.problem.loop.plant
+    for measure in dict.fromkeys(limit.measure for limit in result.problem.limits):
+        if "window" not in ms.refers_to([measure]):
+            continue
+        for i in range(ms.entries(measure, plant)):
+            if (measure, i) in keys:
+                continue
             yield Message(
                 "limit-not-applicable",
                 f"{measure} of output {i + 1} is not limited: the setpoint has no step",
             )
 
 
-def _active(result: TuningResult) -> Found:
+def _active(result: TuningResult) -> Messages:
     for c in result.constraints:
         if c.active:
             when = f" at {c.time_s:.2f} s" if c.time_s is not None else ""
@@ -392,7 +419,7 @@ def _active(result: TuningResult) -> Found:
         yield Message("no-limit-active", "no limit is active")
 
 
-def _certificates(result: TuningResult) -> Found:
+def _certificates(result: TuningResult) -> Messages:
     for row in result.answer.setting.certificates:
         if not row.certified:
             yield Message(
@@ -401,18 +428,18 @@ def _certificates(result: TuningResult) -> Found:
             )
 
 
-def _not_exercised(result: TuningResult) -> Found:
+def _not_exercised(result: TuningResult) -> Messages:
     idle = [n for n in result if not result[n].exercised]
     if idle:
-        kept = ", ".join(f"{n} {result[n].after:g} {result[n].unit}" for n in idle)
+        values = ", ".join(f"{n} {result[n].after:g} {result[n].unit}" for n in idle)
         yield Message(
             "parameter-not-exercised",
-            f"{kept} {'has' if len(idle) == 1 else 'have'} no effect in any run: any value in the"
+            f"{values} {'has' if len(idle) == 1 else 'have'} no effect in any run: any value in the"
             " range gives the same run, so the start value is kept",
         )
 
 
-def _at_bound_or_insensitive(result: TuningResult) -> Found:
+def _at_bound_or_insensitive(result: TuningResult) -> Messages:
     for name in result:
         p = result[name]
         change = p.sensitivity_percent
@@ -433,13 +460,24 @@ def _at_bound_or_insensitive(result: TuningResult) -> Found:
             )
 
 
-def _least_sensitive(result: TuningResult) -> Found:
-    words = direction_words(result.problem, result.curvature) if result.curvature else ""
-    if words:
-        yield Message("least-sensitive-direction", words)
+def _least_sensitive(result: TuningResult) -> Messages:
+    parts: list[str] = []
+    least = result.curvature["least_sensitive"] if result.curvature else {"factors": {}}
+    for b, factor in zip(result.problem.bounds, least["factors"].values()):
+        if b.scale == "log" and factor != 1:
+            parts.append(f"{b.name} x {factor:.10g}")
+        elif b.scale != "log" and factor != 0:
+            parts.append(f"{b.name} {factor:+.10g}{'' if b.unit == '-' else f' {b.unit}'}")
+    if parts:
+        together = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} with {parts[-1]}"
+        yield Message(
+            "least-sensitive-direction",
+            f"least sensitive direction: {together} changes the objective by"
+            f" {least['changes_percent']:.2g} %",
+        )
 
 
-def _agreement(result: TuningResult) -> Found:
+def _agreement(result: TuningResult) -> Messages:
     feasible = [o["cost"] for o in result.starts if o["violation"] == 0.0]
     if not feasible:  # nothing to agree on
         return
@@ -449,17 +487,31 @@ def _agreement(result: TuningResult) -> Found:
         "starts-agree", f"{alike} of {searches} ended within 0.1 % of the best objective found"
     )
     if result.symmetry and result.symmetry["objective"] is not None:
-        words = symmetry_words(result.symmetry, result.objective["after"])
-        yield Message("permutation-symmetry", words)
+        yield Message("permutation-symmetry", _symmetry(result))
 
 
-def _out_of_sample(result: TuningResult) -> Found:
-    found = result.validation
-    share = found["limits_held"]["after"] if found else None
-    if found and share is not None and share < 1.0 and result.problem.limits:
-        wanted = {x.measure for x in result.problem.limits if not result.problem.loop.safety_filter}
-        caps = "--safety-filter keeps levels below their limits, " if "max_level" in wanted else ""
-        runs = found["samples"] - found["failed"]
+def _symmetry(result: TuningResult) -> str:
+    """Return the equivalent answer in words."""
+    image: Any = result.symmetry
+    gains = ", ".join(f"{n} {v:.3g}" for n, v in image["values"].items())
+    above = 100 * (image["objective"] / result.objective["after"] - 1)
+    side = f"an objective {abs(above):.2g} % {'above' if above > 0 else 'below'}"
+    same = "the same objective" if abs(above) < 1e-3 else side
+    searches = len(image["starts"])
+    ended = f", {searches} of the searches ended there and count as this answer" * (searches > 0)
+    return f"permutation symmetry: {image['words']}: {gains} gives {same}{ended}"
+
+
+def _out_of_sample(result: TuningResult) -> Messages:
+    summary = result.validation if result.certificate is None else None
+    share = summary["limits_held"]["after"] if summary else None
+    problem = result.problem
+    if summary and share is not None and share < 1.0 and problem.limits:
+        plain = not problem.loop.safety_filter and "max_level" in {
+            x.measure for x in problem.limits
+        }
+        caps = "--safety-filter keeps levels below their limits, " if plain else ""
+        runs = summary["samples"] - summary["failed"]
         yield Message(
             "limit-violated-out-of-sample",
             f"limits hold on {round(share * runs)} of {runs} validation plants:"
@@ -467,7 +519,7 @@ def _out_of_sample(result: TuningResult) -> Found:
         )
 
 
-def _tightened(result: TuningResult) -> Found:
+def _tightened(result: TuningResult) -> Messages:
     answer = result.answer
     if answer.tightened and not all(answer.kept.values()):
         yield Message(
@@ -477,7 +529,7 @@ def _tightened(result: TuningResult) -> Found:
         )
 
 
-def _assumed(result: TuningResult) -> Found:
+def _assumed(result: TuningResult) -> Messages:
     setting = result.answer.setting
     if setting.assumed:
         unit = setting.case.loop.units[0]
@@ -502,7 +554,7 @@ def _assumed(result: TuningResult) -> Found:
         )
 
 
-def _idle(result: TuningResult) -> Found:
+def _idle(result: TuningResult) -> Messages:
     if result.answer.idle:
         tanks = numbered("tank", result.answer.idle)
         if len(result.answer.idle) == 2:
@@ -513,7 +565,7 @@ def _idle(result: TuningResult) -> Found:
         yield Message("limit-idle", words)
 
 
-def _screened_again(result: TuningResult) -> Found:
+def _screened_again(result: TuningResult) -> Messages:
     redone = result.evaluations["redone_at_true_step"]
     if redone:
         yield Message(
@@ -524,7 +576,7 @@ def _screened_again(result: TuningResult) -> Found:
         )
 
 
-def _non_finite(result: TuningResult) -> Found:
+def _non_finite(result: TuningResult) -> Messages:
     points = result.evaluations["non_finite"]
     if points:
         yield Message(
@@ -535,7 +587,8 @@ def _non_finite(result: TuningResult) -> Found:
 ANY, OPTIMUM, ANSWER = "any", "optimum", "answer"
 """Results that a rule is about: all, those of `--nominal` and `--robust`, default answers."""
 
-RULES: tuple[tuple[Callable[[TuningResult], Found], str], ...] = (
+RULES: tuple[tuple[Callable[[TuningResult], Messages], str], ...] = (
+    (_on_new_plants, OPTIMUM),
     (_near_the_edge, ANY),
     (_less_robust, ANSWER),
     (_total_variation, OPTIMUM),

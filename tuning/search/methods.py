@@ -1,4 +1,4 @@
-"""Local searches from one start: each takes a Search, may stop early, and may not fail."""
+"""Local searches from one start: each takes a Search, may stop early, and must not raise."""
 
 from typing import NamedTuple
 
@@ -40,7 +40,7 @@ def minibatches(search, z, iterations, batch, rng):
     optimiser = optax.adam(optax.cosine_decay_schedule(0.05, steps, 0.002))
     state, every = optimiser.init(z), max(1, steps // 10)
     for k in range(steps):
-        point = search.problem.batch_point(z, batch, rng)
+        point = search.evaluator.batch_point(z, batch, rng)
         search.report(search)
         if not point.finite:
             z = 0.5 * (z + search.last_finite.z)
@@ -116,7 +116,6 @@ NEAR, HALVINGS = 0.1, 10
 """Largest violation of a point that `approach` moves towards [-], and number of halvings."""
 
 MANY = 4  # number of parameters from which "auto" tries Gauss-Newton before it considers limits
-OFFERED = ("trf", "coarse-trf", "slsqp", "lbfgs", "adam")  # methods that can be asked for by name
 UNCONSTRAINED = ("trf", "coarse-trf")  # those that ignore limits
 
 
@@ -125,15 +124,12 @@ def slsqp(search, z, iterations, tolerance=None):
     tolerance = search.tolerance if tolerance is None else tolerance
     if search.problem.risk == "worst" and len(search.problem.runs) > 1:
         return _epigraph(search, z, iterations, tolerance)
-    constraints = []
-    if search.problem.limits:
-        constraints = [
-            {
-                "type": "ineq",
-                "fun": lambda z: search.margins(z)[0],
-                "jac": lambda z: search.margins(z)[1],
-            }
-        ]
+    rows = {
+        "type": "ineq",
+        "fun": lambda z: search.margins(z)[0],
+        "jac": lambda z: search.margins(z)[1],
+    }
+    constraints = [rows] if search.problem.limits else []
     try:
         return _minimise(search, _Watch(search), z, [], constraints, iterations, tolerance)
     except _NoProgress:
@@ -173,18 +169,16 @@ class _Watch:
         self.search, self.least, self.since = search, np.inf, 0
 
     def __call__(self, z):
-        found = self.search.cost(z)
+        cost, gradient = self.search.cost(z)
         point = self.search.point(z)
         if point.finite:
-            held = self.search.violation(point) == 0
-            better = held and found[0] < self.least - PROGRESS * abs(
-                self.least if np.isfinite(self.least) else 0.0
-            )
-            self.since = 0 if better or not np.isfinite(self.least) else self.since + 1
-            self.least = min(self.least, found[0]) if held else self.least
+            feasible, begun = self.search.violation(point) == 0, np.isfinite(self.least)
+            better = feasible and (not begun or cost < self.least - PROGRESS * abs(self.least))
+            self.since = 0 if better or not begun else self.since + 1
+            self.least = min(self.least, cost) if feasible else self.least
         if self.since > PATIENCE:
             raise _NoProgress
-        return found
+        return cost, gradient
 
 
 def _epigraph(search, z, iterations, tolerance):
@@ -224,21 +218,15 @@ def trf(search, z, iterations, tolerance=1e-10):
         if squared:
             value, slope = cost**2, cost * point.gradient / search.scale
             normal = 0.5 * weight**2 * point.gauss_newton / search.scale**2
-        # the residuals' squares sum to the cost and one more, so that a steep cost near 0 fits too
-        else:
-            value, slope, normal = (
-                cost + 1.0,
-                0.5 * point.gradient / search.scale,
-                0.5 * point.gauss_newton / search.scale,
-            )
+        else:  # the squares sum to the cost and 1, so that a steep cost near 0 fits too
+            value, slope = cost + 1.0, 0.5 * point.gradient / search.scale
+            normal = 0.5 * point.gauss_newton / search.scale
         root = np.linalg.cholesky(normal + 1e-12 * (np.trace(normal) + 1e-12) * np.eye(len(z)))
         head = np.linalg.solve(root, slope)
-        excess = max(
-            1.0, float(head @ head) / max(value, 1e-300)
-        )  # terms without squares may slope more than the model's curvature allows
-        return np.append(
-            head / excess**0.5, max(value - head @ head / excess, 0.0) ** 0.5
-        ), np.vstack([root.T * excess**0.5, 0 * z])
+        # terms without squares may slope more than the model's curvature allows
+        excess = max(1.0, float(head @ head) / max(value, 1e-300))
+        rest = max(value - head @ head / excess, 0.0) ** 0.5
+        return np.append(head / excess**0.5, rest), np.vstack([root.T * excess**0.5, 0 * z])
 
     done = scipy.optimize.least_squares(
         lambda z: model(z)[0],
@@ -376,14 +364,13 @@ def run_local(search, z, how):
     return minibatches(search, z, how.iterations, how.batch, rng)
 
 
-def search_alone(problem, z, number, how):
+def search_alone(evaluator, z, number, how):
     """Run the local search of this number from z (P,) as the first search of a problem."""
-    reference = problem.point(problem.start())
-    tolerance = {} if how[2] is None else {"tolerance": how[2]}
-    search = Search(problem, reference, lambda search: None, **tolerance)
+    how, reference = Local(*how), evaluator.point(evaluator.problem.start())
+    search = Search(evaluator, reference, tolerance=how.tolerance)
     search.take(reference)
     search.start = number
-    run_local(search, z, Local(*how))
+    run_local(search, z, how)
 
 
 def search_task(text, arrays, arguments, known):

@@ -1,65 +1,84 @@
-"""How `tune` searches, as frozen dataclasses: SQP, TRF, LBFGS, Adam."""
+"""How `tune` searches, as frozen dataclasses: Options, and SQP, TRF, LBFGS, Adam of one method."""
 
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import numpy as np
 
 from jaxtank.core.errors import InputError
-from tuning.problem.problem import Problem
 
-PROBLEM = ("free", "objective", "limits", "scenarios", "risk")
-"""Keywords of `tune` that a Problem has of its own."""
-
-DEFAULTS = {"starts": 8, "screening": 64, "iterations": 60, "batch": None, "tolerance": None}
-"""Defaults of the keywords of `tune` that solver options have too."""
+LARGEST = 100_000  # searches, points, iterations or runs that can be asked for
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Solver:
-    """What every method has."""
-
-    method: ClassVar[str]
-    starts: int = DEFAULTS["starts"]
-    screening: int = DEFAULTS["screening"]
-    iterations: int = DEFAULTS["iterations"]
-
-    def __post_init__(self):
-        check_options(**self.options())
-
-    def options(self):
-        """Return {keyword of `tune`: value}."""
-        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return {name: value for name, value in fields.items() if name in DEFAULTS}
-
-    @property
-    def name(self):
-        """The method, as `tune(case, method=...)` and `--method` have it."""
-        return self.method
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class SQP(Solver):
-    """Sequential quadratic programming, which holds limits ("slsqp").
+class Options:
+    """How `tune` searches, by the method that suits the problem ("auto").
 
     Parameters
     ----------
-    tolerance : change of the objective, as a share of its first value, below which a search has
-        converged; None for 1e-8 and a last search to 1e-12.
+    starts : local searches at most, until two agree; None for 4 (8 if nominal).
+    screening : Sobol points; None for 32 (64 if nominal). Implies the nominal optimum.
+    iterations : of each local search; None for 40 (60 if nominal).
+    tolerance : change of the objective, as a share of its first value, below which a search under
+        limits has converged; None for 1e-8 and a last search to 1e-12. Implies the nominal optimum.
+    validation : validation plants; None for 256 (64 if nominal; 0 for none).
+    cluster : Dask cluster on which the local searches run side by side, to the same answer:
+        "HOST:PORT" of its scheduler, "local:N" for N workers on this machine, or a
+        `distributed.Client`.
+
+    Raises
+    ------
+    InputError : for a number out of range.
 
     Examples
     --------
-    >>> SQP(starts=4).options()["starts"]
-    4
+    >>> Options(starts=2).method
+    'auto'
     """
 
-    method: ClassVar[str] = "slsqp"
+    method: ClassVar[str] = "auto"
+    starts: int | None = None
+    screening: int | None = None
+    iterations: int | None = None
     tolerance: float | None = None
+    validation: int | None = None
+    cluster: Any = None
+
+    def __post_init__(self):
+        names = ("starts", "screening", "iterations", "validation", "batch")
+        numbers = {name: getattr(self, name, None) for name in names}
+        check_numbers(**{name: value for name, value in numbers.items() if value is not None})
+        low = self.tolerance
+        if low is not None and not (isinstance(low, float) and 0.0 < low < 1.0):
+            raise InputError(f"tolerance = {low!r}: must be a number between 0 and 1")
+
+    @property
+    def name(self) -> str:
+        """The method, as `tune(case, method=...)` and `--method` have it."""
+        return self.method
+
+    def filled(self, **usual: float) -> Any:
+        """Return the options with `usual` numbers where none are given."""
+        missing = {n: v for n, v in usual.items() if getattr(self, n) is None}
+        return dataclasses.replace(self, **missing)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class TRF(Solver):
+class SQP(Options):
+    """Sequential quadratic programming, which holds limits ("slsqp").
+
+    Examples
+    --------
+    >>> SQP(starts=4).name
+    'slsqp'
+    """
+
+    method: ClassVar[str] = "slsqp"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TRF(Options):
     """Bounded Gauss-Newton trust region on squares, without limits ("trf").
 
     Parameters
@@ -81,12 +100,12 @@ class TRF(Solver):
             raise InputError(f"coarse = {self.coarse!r}: must be True or False")
 
     @property
-    def name(self):
+    def name(self) -> str:
         return "coarse-trf" if self.coarse else "trf"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class LBFGS(Solver):
+class LBFGS(Options):
     """Limited-memory BFGS on an augmented Lagrangian ("lbfgs").
 
     Examples
@@ -99,7 +118,7 @@ class LBFGS(Solver):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Adam(Solver):
+class Adam(Options):
     """Adam on an augmented Lagrangian ("adam").
 
     Parameters
@@ -108,12 +127,21 @@ class Adam(Solver):
 
     Examples
     --------
-    >>> Adam(batch=4).options()["batch"]
+    >>> Adam(batch=4).batch
     4
     """
 
     method: ClassVar[str] = "adam"
     batch: int | None = None
+
+
+def options_of(method: str | Options, **changes: Any) -> Options:
+    """Return the options of a method, with what of `changes` is not None."""
+    if not isinstance(method, Options):
+        if method not in METHODS:
+            raise InputError(f"method = {method!r}: must be one of {', '.join(METHODS)}")
+        method = METHODS[method]
+    return dataclasses.replace(method, **{n: v for n, v in changes.items() if v is not None})
 
 
 def check_precision() -> None:
@@ -125,33 +153,22 @@ def check_precision() -> None:
         )
 
 
-def check_options(*, tolerance=None, **counts):
+def check_numbers(low: int = 1, **numbers: Any) -> None:
     """Raise InputError for a number of searches, points, iterations or runs out of range."""
-    for name, value in counts.items():
-        low = 0 if name == "validation" else 1
-        if name == "batch" and value is None:
-            continue
-        if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= 100_000:
-            raise InputError(f"{name} = {value!r}: must be a whole number from {low} to 100000")
-    if tolerance is not None and not (isinstance(tolerance, float) and 0.0 < tolerance < 1.0):
-        raise InputError(f"tolerance = {tolerance!r}: must be a number between 0 and 1")
+    for name, value in numbers.items():
+        least = 0 if name == "validation" else low
+        if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= LARGEST:
+            raise InputError(
+                f"{name} = {value!r}: must be a whole number from {least} to {LARGEST}"
+            )
 
 
-def spelled_out(case, method, options):
-    """Return (Case, name of the method, keywords of `tune`) of a Problem or a Solver."""
-    options = dict(options)
-    if isinstance(case, Problem):
-        own = case.given
-        for name in PROBLEM:
-            if options[name] != ("mean" if name == "risk" else None):
-                raise InputError(f"{name}: the Problem has it already, leave it out of tune")
-        options |= own | {"seed": options["seed"] or case.seed}
-        case = case.case
-    if isinstance(method, Solver):
-        for name, value in method.options().items():
-            kind = type(method).__name__
-            if value is not None and options[name] not in (DEFAULTS[name], value):
-                raise InputError(f"{name} = {options[name]!r}: {kind} has {name} = {value!r}")
-            options[name] = options[name] if value is None else value
-        method = method.name
-    return case, method, options
+METHODS: dict[str, Options] = {
+    "auto": Options(),
+    "trf": TRF(),
+    "coarse-trf": TRF(coarse=True),
+    "slsqp": SQP(),
+    "lbfgs": LBFGS(),
+    "adam": Adam(),
+}
+"""Options by the name of their method."""

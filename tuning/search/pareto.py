@@ -9,6 +9,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
+from tuning.problem.evaluator import Evaluator
 from tuning.problem.functions import as_measures
 from tuning.problem.problem import Problem
 from tuning.search.driver import Search
@@ -74,19 +75,15 @@ def tradeoff(
     others = {m: v for m, v in (case.limits if limits is None else limits).items() if m != measure}
     values = sorted(values, reverse=ms.MEASURES[measure].sense > 0)
     steps = [{**others, measure: value} for value in values]
-    problem = Problem(
-        case, free=free, objective=objective, limits=steps[0], scenarios=scenarios, seed=seed
-    )
+    problem = Problem(case, free, objective, steps[0], scenarios, seed)
     z = problem.start()
     if start is not None:
         z = np.clip([float(b.to_unit(start[b.name])) for b in problem.bounds], 0.0, 1.0)
     sweep = _Sweep(problem, steps, iterations, progress or (lambda search: None))
     z = sweep.tighten(z)
     sweep.loosen(screening, seed)
-    return {
-        "measure": measure,
-        "points": [_row(problem, value, answer, z) for value, answer in zip(values, sweep.found)],
-    }
+    points = [_row(problem, *pair, z) for pair in zip(values, sweep.answers)]
+    return {"measure": measure, "points": points}
 
 
 class _Answer(NamedTuple):
@@ -94,6 +91,12 @@ class _Answer(NamedTuple):
 
     search: Search
     converged: bool
+
+    @classmethod
+    def of(cls, search, converged):
+        """Return the answer of a search; not converged where no slope is of use."""
+        best = search.best
+        return cls(search, bool(converged) and best is not None and search.slope(best).usable)
 
     @property
     def best(self):
@@ -105,89 +108,84 @@ class _Answer(NamedTuple):
         """Largest violation as a share of its limit; infinite where nothing finite was found."""
         return np.inf if self.best is None else self.search.violation(self.best)
 
+    def better(self, other):
+        """Return the better of two answers for the same limits."""
+        if self.best is None or other.best is None:
+            return other if self.best is None else self
+        return other if self.search.better(other.best, self.best) else self
+
 
 class _Sweep:
     """The problem solved for a row of limits, first from loose to tight, then back."""
 
     def __init__(self, problem, steps, iterations, progress):
-        self.problem, self.steps, self.iterations = problem, steps, iterations
-        self.progress = progress
-        self.found: list[_Answer] = []
+        self.problems = [problem.with_limits(limits) for limits in steps]
+        self.iterations, self.progress = iterations, progress
+        self.answers: list[_Answer] = []
         self.known = {}  # every Point that was evaluated
 
     def tighten(self, begin):
         """Solve each step from the answer before it, the first from `begin` (P,)."""
         z = begin
-        for limits in self.steps:
-            answer = self._solve(limits, z)
+        for problem in self.problems:
+            answer = self._solve(problem, z)
             if answer.violation and z is not begin:
-                answer = _better(answer, self._solve(limits, begin))
-            self.found.append(answer)
+                answer = answer.better(self._solve(problem, begin))
+            self.answers.append(answer)
             z = z if answer.best is None else answer.best.z
         return z
 
     def loosen(self, screening, seed):
         """Solve each step again from the answer of the tighter one and from better known points."""
-        for k in reversed(range(len(self.steps))):
-            if k + 1 < len(self.steps) and not self.found[k + 1].violation:
-                nearby = self._solve(self.steps[k], self.found[k + 1].best.z)
-                self.found[k] = _better(self.found[k], nearby)
-            search = self.found[k].search
-            screened = self._candidates(search.problem, screening, seed)
+        answers = self.answers
+        for k in reversed(range(len(answers))):
+            if k + 1 < len(answers) and not answers[k + 1].violation:
+                nearby = self._solve(self.problems[k], answers[k + 1].best.z)
+                answers[k] = answers[k].better(nearby)
+            search = answers[k].search
+            screened = self._candidates(search, screening, seed)
             other = best_screened(search, screened)
             if other is not None:
-                self.found[k] = _answer(search, slsqp(search, other, self.iterations))
-            if self.found[k].violation and search.best is not None:
+                answers[k] = _Answer.of(search, slsqp(search, other, self.iterations))
+            if answers[k].violation and search.best is not None:
                 find_feasible(search, screened, self.iterations, seed)
                 done = slsqp(search, search.best.z, self.iterations)
-                self.found[k] = _answer(search, done)
+                answers[k] = _Answer.of(search, done)
             approach(search)
             self.known.update(search.memory)
 
-    def _solve(self, limits, z):
-        """Return the _Answer under `limits` {measure: value}, searched from z (P,)."""
-        problem = self.problem.with_limits(limits)
-        search = Search(problem, problem.point(problem.start()), self.progress)
+    def _solve(self, problem, z):
+        """Return the _Answer of a problem, searched from z (P,)."""
+        evaluator = Evaluator(problem)
+        search = Search(evaluator, evaluator.point(problem.start()), self.progress)
         converged = slsqp(search, z, self.iterations)
         if search.best is not None and search.violation(search.best) > 0:
             restore(search, search.best.z, self.iterations)
             converged = slsqp(search, search.best.z, self.iterations)
         self.known.update(search.memory)
-        return _answer(search, converged)
+        return _Answer.of(search, converged)
 
-    def _candidates(self, problem, screening, seed):
+    def _candidates(self, search, screening, seed):
         """Return the Population of screened and of known points, under the present limits."""
-        zs, costs, margins, _ = screen(problem, screening, seed)
+        screened, _ = screen(search.evaluator, screening, seed)
         points = [p for p in self.known.values() if p.finite]
-        old = [problem.margins(p.measures) for p in points]
+        margins = [search.problem.margins(p.measures) for p in points]
         return Population(
-            np.concatenate([zs, [p.z for p in points]]),
-            np.concatenate([costs, [p.cost for p in points]]),
-            np.concatenate([margins, np.reshape(old, (len(points), margins.shape[1]))]),
+            np.concatenate([screened.zs, [p.z for p in points]]),
+            np.concatenate([screened.costs, [p.cost for p in points]]),
+            np.concatenate(
+                [screened.margins, np.reshape(margins, (len(points), screened.margins.shape[1]))]
+            ),
         )
-
-
-def _answer(search, converged):
-    """Return the _Answer of a search; not converged where no slope is of use."""
-    best = search.best
-    return _Answer(search, bool(converged) and best is not None and search.slope(best).usable)
-
-
-def _better(one, other):
-    """Return the _Answer to keep of two for the same limits."""
-    if one.best is None or other.best is None:
-        return other if one.best is None else one
-    return other if one.search.better(other.best, one.best) else one
 
 
 def _row(problem, value, answer, z):
     """Return one row of `tradeoff`; z (P,): what to name where nothing finite was found."""
     best, violation = answer.best, answer.violation
+    done = "converged" if answer.converged else "not_converged"
     return {
         "limit": value,
-        "status": (
-            "infeasible" if violation > 0 else "converged" if answer.converged else "not_converged"
-        ),
+        "status": "infeasible" if violation > 0 else done,
         "objective": np.nan if best is None else float(best.cost),
         "violation": float(violation),
         "parameters": problem.values(z if best is None else best.z),

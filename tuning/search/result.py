@@ -1,7 +1,4 @@
-"""What `tune` found, as typed data; imported by the modules of `search` and by `report`.
-
-Words about it are made in `messages`, tables and files in `report`.
-"""
+"""The result of `tune`, as typed data: words about it are made in `messages`."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,7 +9,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.core.errors import unknown
 from jaxtank.limits import Limit
-from jaxtank.plants.base import Plant
+from jaxtank.loop.closed_loop import ClosedLoop
 from tuning.problem.problem import Problem
 from tuning.problem.slopes import SlopeCheck
 from tuning.problem.status import Status
@@ -262,17 +259,19 @@ def constraint_rows(
     multipliers: Mapping[str, float] | None = None,
 ) -> list[ConstraintRow]:
     """Return a ConstraintRow for each limit of the problem."""
-    multipliers = multipliers or {}
-    rows = []
+    rows, multipliers = [], multipliers or {}
     for limit in problem.limits:
+        entry = lambda table, name, limit=limit: float(
+            np.ravel(table[limit.run][name])[limit.index]
+        )
         reached = ms.MEASURES[limit.measure].reached
         rows.append(
             row_of(
                 limit,
-                problem,
-                _value(limit, after),
-                before=None if before is None else _value(limit, before),
-                time_s=float(after[limit.run][reached][limit.index]) if reached else None,
+                problem.runs[limit.run].case.loop,
+                entry(after, limit.measure),
+                before=None if before is None else entry(before, limit.measure),
+                time_s=entry(after, reached) if reached else None,
                 scenario=limit.scenario or None,
                 multiplier=multipliers.get(limit.label, 0.0),
             )
@@ -280,52 +279,29 @@ def constraint_rows(
     return rows
 
 
+def _entry(table: Sequence[Mapping[str, Any]], limit: Limit, measure: str) -> float:
+    """Return the entry of a measure that a limit is of, in its scenario."""
+    return float(np.ravel(table[limit.run][measure])[limit.index])
+
+
 def row_of(
-    limit: Limit,
-    problem: Problem,
-    value: float,
-    *,
-    before: float | None = None,
-    time_s: float | None = None,
-    scenario: str | None = None,
-    multiplier: float = 0.0,
+    limit: Limit, loop: ClosedLoop, value: float, *, multiplier: float = 0.0, **more: Any
 ) -> ConstraintRow:
-    """Return the ConstraintRow of a limit whose measure has this value; see its fields."""
-    spec, plant = ms.MEASURES[limit.measure], problem.runs[limit.run].case.loop.plant
-    margin = float(limit.margins(value))
+    """Return the ConstraintRow of a limit whose measure has this value; more : other fields."""
+    measure, margin = ms.MEASURES[limit.measure], float(limit.margins(value))
+    plant: Any = loop.plant
+    tanks = {"tank": limit.index, "output": plant.outputs[limit.index % len(plant.outputs)]}
     return ConstraintRow(
         name=limit.label,
         measure=limit.measure,
-        unit=ms.unit(limit.measure, problem.loop.units),
+        unit=ms.unit(limit.measure, loop.units),
         limit=limit.value,
         value=value,
-        before=before,
         margin=margin,
-        tank=_tank(limit, plant),
-        pump=limit.index + 1 if spec.per == "pump" else None,
-        time_s=time_s,
-        scenario=scenario,
-        reason=_reason(limit, value),
+        tank=int(tanks[measure.per]) + 1 if measure.per in tanks else None,
+        pump=limit.index + 1 if measure.per == "pump" else None,
+        reason=None if np.isfinite(value) else measure.cause(value),
         active=margin >= 0 and (margin < ACTIVE * abs(limit.value) or multiplier > 0),
         multiplier=multiplier,
+        **more,
     )
-
-
-def _value(limit: Limit, table: Sequence[Mapping[str, Any]]) -> float:
-    """Return the limited entry of a measure in its scenario."""
-    return float(np.ravel(table[limit.run][limit.measure])[limit.index])
-
-
-def _tank(limit: Limit, plant: Plant) -> int | None:
-    """Return the number, from 1, of the tank that a limit is of; None for another kind."""
-    per = ms.MEASURES[limit.measure].per
-    if per not in ("tank", "output"):
-        return None
-    return 1 + (limit.index if per == "tank" else int(plant.outputs[limit.index]))
-
-
-def _reason(limit: Limit, value: float) -> str | None:
-    """Return why the value of a limited measure is not a finite number; None where it is."""
-    if np.isfinite(value):
-        return None
-    return ms.MEASURES[limit.measure].cause(value)

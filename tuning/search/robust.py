@@ -1,5 +1,6 @@
 """Robust tuning: gains for many plants at once, and the violation probability on new plants."""
 
+import dataclasses
 import functools
 import math
 from collections.abc import Mapping
@@ -10,13 +11,16 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
+from jaxtank.limits import tightened
 from jaxtank.rig import check_limits
 from tuning.cluster.engine import connect
 from tuning.problem.functions import as_measures
 from tuning.problem.problem import Problem
-from tuning.search.result import Message, TuningResult
+from tuning.search.messages import messages_of
+from tuning.search.options import Options, check_numbers, check_precision, options_of
+from tuning.search.result import TuningResult
 from tuning.search.setting import scenarios_of
-from tuning.search.tuner import tune
+from tuning.search.tuner import TOLERANCE, tune
 from tuning.uncertainty.distributions import stated
 from tuning.uncertainty.sampling import clopper_pearson, spread_of
 from tuning.uncertainty.study import ensemble
@@ -24,11 +28,6 @@ from tuning.uncertainty.validation import SEED_OFFSET, summary_of, validate
 from tuning.views import Shown
 
 CONFIDENCE = 1e-6  # probability beta with which the scenario bound may fail [-]
-
-TOLERANCE = 1e-4
-"""Change of the objective, as a share of its first value, at which a search over drawn plants has
-converged: their mean is itself known to a few percent only [-].
-"""
 
 
 class Certificate(NamedTuple):
@@ -49,10 +48,15 @@ class Certificate(NamedTuple):
     fresh: int  # new plants run afterwards
     broken: int  # of those, how many violated a limit
     interval95: list  # Clopper and Pearson
+    back_off: float = 0.0  # constraint tightening of the search, as a share of each limit
 
     _repr_html_ = Shown._repr_html_
     _sections = Shown._sections
     __str__ = Shown.__str__
+
+    def to_json(self):
+        """Return the numbers on plants."""
+        return {n: v for n, v in self._asdict().items() if n != "back_off"}
 
     def _rows(self):
         low, high = self.interval95
@@ -100,16 +104,18 @@ def tune_robust(
     fresh: int = 1024,
     seed: int = 0,
     back_off: float = 0.0,
-    tolerance: float = TOLERANCE,
-    validation: int = 64,
-    cluster: Any = None,
+    method: str | Options = "auto",
+    *,
+    free: Mapping[str, Any] | None = None,
+    objective: Any = None,
+    limits: Any = None,
     **options: Any,
 ) -> TuningResult:
     """Return the result of `tune` on `samples` drawn plants, every limit held on every plant.
 
     Parameters
     ----------
-    case : the Case.
+    case, free, objective, limits : as in `tune`.
     distributions : {name: distribution or share}; the case's own spread where None.
     risk : "mean", "cvar" or "worst" of the costs of the plants.
     samples : plants in the search.
@@ -119,10 +125,9 @@ def tune_robust(
     back_off : constraint tightening, as a share of each limit [-]: the search keeps that far inside
         each limit, while new plants are judged by the limit itself. A limit that is active on one
         of N plants is violated on about one new plant in N + 1.
-    tolerance, options : as in `tune`.
-    validation : runs of a case that has scenarios of its own, 0 for none (any other is validated on
-        the new plants).
-    cluster : Dask cluster on which the local searches and the new plants run, as in `tune`.
+    method : as in `tune`; tolerance is 1e-4 where Options have none. Their `validation` are runs of
+        a case that has scenarios of its own (any other is validated on the new plants).
+    options : starts, checkpoint, resume and progress of `tune`.
 
     Returns
     -------
@@ -139,108 +144,56 @@ def tune_robust(
     >>> case = presets.find("gouta2015/backstepping")
     >>> tuning.tune_robust(case, samples=16, back_off=0.03).certificate  # doctest: +SKIP
     """
-    _check(samples, fresh, back_off)
-    objective, limits = as_measures(options.get("objective"), options.get("limits"))
-    options |= {"objective": objective, "limits": limits}
-    distributions = spread_of(case) if distributions is None else stated(distributions)
-    limits = check_limits(case.loop, case.limits if limits is None else limits)
-    options["limits"] = _tightened(case, limits, back_off)
-    plants = scenarios_of(case, distributions, samples, seed)
-    with connect(cluster) as engine:
-        options |= {"seed": seed, "tolerance": tolerance, "validation": 0, "cluster": engine}
-        result = tune(case, scenarios=plants, risk=risk, **options)
-        judge = Problem(case, options.get("free"), objective, limits, None, seed)
-        run = functools.partial(_run, distributions, limits, fresh, seed, engine)
-        # what is certified is the case's own run, what the answer is judged by is its scenarios
-        if case.scenarios:
-            broken = int(run(result.tuned, ())[1].sum())
-        else:
-            *found, broken = _on_new_plants(result, judge, run, distributions)
-    if case.scenarios:
-        found = (None, None)
-        if validation and result.status != "interrupted":
-            values = {n: p["after"] for n, p in result.parameters.items()}
-            found = validate(judge, judge.own_values(), values, validation, seed)
-    support = _support(result)
-    interval = clopper_pearson(broken, fresh)
-    certificate = Certificate(
-        samples, support, scenario_bound(samples, support), fresh, broken, interval
-    )
-    return result.replace(
-        certificate=certificate,
-        validation=found[0],
-        cloud=found[1],
-        messages=(*certificate_messages(certificate, risk, back_off), *result.messages),
-    )
-
-
-def _check(samples, fresh, back_off):
-    """Raise InputError for a number of plants or a tightening that is out of range."""
-    for name, value, low in (("samples", samples, 2), ("fresh", fresh, 1)):
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= 100_000:
-            raise InputError(f"{name} = {value!r}: must be a whole number from {low} to 100000")
+    check_numbers(low=2, samples=samples)
+    check_numbers(fresh=fresh)
     number = isinstance(back_off, (int, float)) and not isinstance(back_off, bool)
     if not number or not 0.0 <= back_off < 1.0:
         raise InputError(
             f"back_off = {back_off!r}: must be a share of each limit, from 0 to below 1"
         )
-
-
-def certificate_messages(known: Certificate, risk: str, back_off: float) -> tuple[Message, ...]:
-    """Return the Messages of a Certificate: what was measured, and what was to be expected."""
-    low, high = known.interval95
-    indication = (
-        ""
-        if risk == "worst"
-        else f", an indication: plants at no limit change the {risk} too, and are not counted in it"
-    )
-    found = [
-        Message(
-            "limit-violated-out-of-sample" if known.broken else "limits-hold-out-of-sample",
-            f"on {known.fresh} new plants a limit was violated {known.broken} times (95 % interval"
-            f" {low:.2g} to {high:.2g})",
-        ),
-        Message(
-            "scenario-bound",
-            f"by scenario theory, the probability is at most {known.bound:.2g} (confidence 1 -"
-            f" 1e-6, support {known.support} of {known.scenarios} plants{indication})",
-        ),
-    ]
-    if back_off:
-        found.append(
-            Message(
-                "constraints-tightened",
-                f"the search tightened every limit by {100 * back_off:g} %, new plants are judged"
-                " by the limits themselves",
-            )
-        )
-    elif known.broken and known.support:
-        expected = 100 * known.support / (known.scenarios + 1)
-        found.append(
-            Message(
-                "support-scenarios",
-                f"{known.support} of {known.scenarios} plants determine the answer: up to about"
-                f" {expected:.2g} % of new plants were to be expected past a limit (more plants or"
-                " a constraint tightening, --back-off 0.03, reduce both)",
-            )
-        )
-    return tuple(found)
+    check_precision()
+    chosen = options_of(method).filled(tolerance=TOLERANCE, validation=64)
+    objective, limits = as_measures(objective, limits)
+    distributions = spread_of(case) if distributions is None else stated(distributions)
+    limits = check_limits(case.loop, case.limits if limits is None else limits)
+    plants = scenarios_of(case, distributions, samples, seed)
+    with connect(chosen.cluster) as engine:
+        inside = _tightened(case, limits, back_off)
+        problem = Problem(case, free, objective, inside, plants, seed, risk)
+        inner = dataclasses.replace(chosen, validation=0, cluster=engine)
+        result = tune(problem, inner, **options)
+        judge = Problem(case, free, objective, limits, None, seed)
+        run = functools.partial(_run, distributions, limits, fresh, seed, engine)
+        # what is certified is the case's own run, what the answer is judged by is its scenarios
+        summary = cloud = None
+        if case.scenarios:
+            broken = int(run(result.tuned, ())[1].sum())
+        else:
+            summary, cloud, broken = _on_new_plants(result, judge, run, distributions)
+    if case.scenarios and chosen.validation and result.status != "interrupted":
+        values = {n: p["after"] for n, p in result.parameters.items()}
+        summary, cloud = validate(judge, judge.own_values(), values, chosen.validation, seed)
+    support, interval = _support(result), clopper_pearson(broken, fresh)
+    bound = scenario_bound(samples, support)
+    certificate = Certificate(samples, support, bound, fresh, broken, interval, float(back_off))
+    result = result.replace(certificate=certificate, validation=summary, cloud=cloud)
+    return result.replace(messages=messages_of(result))
 
 
 def _tightened(case, limits, share):
     """Return `limits` tightened by `share` of each, the rim being that of the plant."""
-    if not share:
-        return limits
-    rim = np.asarray(case.loop.plant.rim).tolist()
-    values = {
-        m: np.asarray(rim if isinstance(v, str) else v, dtype=float) for m, v in limits.items()
-    }
-    return {m: (v - share * ms.MEASURES[m].sense * np.abs(v)).tolist() for m, v in values.items()}
+    amounts = {}
+    for measure, value in limits.items():
+        value = case.loop.plant.rim if isinstance(value, str) else value
+        entries = ms.entries(measure, case.loop.plant)
+        sizes = share * np.abs(np.broadcast_to(np.asarray(value, dtype=float), (entries,)))
+        amounts |= {(measure, i): float(size) for i, size in enumerate(sizes)}
+    return tightened(case.loop.plant, limits, amounts)
 
 
 def _run(distributions, limits, fresh, seed, cluster, case, names):
     """Return (Ensemble of new plants, (fresh,) True where one violates a limit or diverges)."""
-    found = ensemble(
+    plants = ensemble(
         case,
         distributions,
         samples=fresh,
@@ -251,10 +204,10 @@ def _run(distributions, limits, fresh, seed, cluster, case, names):
         cluster=cluster,
     )
     past = [
-        limit.margins(found.measures[limit.measure].reshape(fresh, -1)[:, limit.index]) < 0
-        for limit in found.limits
+        limit.margins(plants.measures[limit.measure].reshape(fresh, -1)[:, limit.index]) < 0
+        for limit in plants.limits
     ]
-    return found, found.failed | np.any(past, axis=0) if past else found.failed
+    return plants, plants.failed | np.any(past, axis=0) if past else plants.failed
 
 
 def _on_new_plants(result, judge, run, distributions):
@@ -263,21 +216,22 @@ def _on_new_plants(result, judge, run, distributions):
     sides = [run(case, names) for case in (result.case, result.tuned)]
     weights = judge.objective.items()
     costs = [
-        sum(w * found.measures[m].reshape(found.samples, -1).sum(axis=1) for m, w in weights)
-        for found, _ in sides
+        sum(w * plants.measures[m].reshape(plants.samples, -1).sum(axis=1) for m, w in weights)
+        for plants, _ in sides
     ]
-    held = np.stack([~past for _, past in sides], axis=1)
-    levels = np.stack([found.measures["max_level"] for found, _ in sides], axis=1)
+    holds = np.stack([~past for _, past in sides], axis=1)
+    levels = np.stack([plants.measures["max_level"] for plants, _ in sides], axis=1)
     failed = sides[0][0].failed | sides[1][0].failed
     spread = {n: getattr(d, "relative", None) for n, d in distributions.items()}
     noise = judge.runs[0].key is not None
-    found = summary_of(judge, np.stack(costs, axis=1), held, levels, failed, spread, noise)
-    return *found, int((~held[:, 1]).sum())
+    costs = np.stack(costs, axis=1)
+    summary = summary_of(judge.limits, costs, holds, levels, failed, spread, noise)
+    return *summary, int((~holds[:, 1]).sum())
 
 
 def _support(result):
     """Return how many plants determine the answer: at a limit or, by risk, at the largest cost."""
-    held = {
+    support = {
         c.scenario
         for c, scale in zip(result.constraints, result.problem.limit_scales)
         if c.margin < 1e-3 * scale
@@ -286,5 +240,5 @@ def _support(result):
         costs = np.array([result.problem.cost(row) for row in result.tables["after"]])
         share = result.problem.shares(costs, range(len(costs)))
         at = costs >= costs[share > 0].min() * (1 - 1e-4)
-        held |= {result.problem.runs[i].name for i in np.flatnonzero(at)}
-    return len(held)
+        support |= {result.problem.runs[i].name for i in np.flatnonzero(at)}
+    return len(support)

@@ -2,6 +2,7 @@
 unstable.
 """
 
+import contextlib
 import functools
 from typing import NamedTuple
 
@@ -55,24 +56,20 @@ def spectral_radius(problem, zs, clock):
     steady = []
     plateaus = problem.loop.reference.plateaus()
     for r in () if plateaus is None else plateaus:
-        try:
+        with contextlib.suppress(InputError):
             steady.append((r, *steady_state(problem.loop, r)))
-        except InputError:
-            continue
-    if not steady:
+    if not steady or state_size(problem.loop, clock) > LARGEST_STATE:
         return np.full(len(zs), np.nan)
     r, x, u = (jnp.asarray(np.array(column)) for column in zip(*steady))
-    if (
-        sum(
-            np.size(v)
-            for v in jax.tree.leaves(jax.eval_shape(lambda: initial(problem.loop, clock)))
-        )
-        > LARGEST_STATE
-    ):
-        return np.full(len(zs), np.nan)
     values = {b.name: jnp.asarray(b.from_unit(zs[:, i])) for i, b in enumerate(problem.bounds)}
     steps = np.asarray(_one_step_jacobians(problem.loop, clock, values, r, x, u))
     return np.abs(np.linalg.eigvals(steps)).max(axis=(1, 2))
+
+
+def state_size(loop, clock):
+    """Return how many numbers the state of a loop has."""
+    state = jax.eval_shape(lambda: initial(loop, clock))
+    return sum(np.size(v) for v in jax.tree.leaves(state))
 
 
 @functools.partial(jax.jit, static_argnames=("clock",))
@@ -80,15 +77,15 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
     """Return (points, plateaus, n, n) derivative of the loop's state by that a sample before."""
 
     def jacobian(values, r, x, u):
-        here = with_values(loop, {**values, "x0": x, "actuator.initial": u})
-        state = initial(here, clock)
+        changed = with_values(loop, {**values, "x0": x, "actuator.initial": u})
+        state = initial(changed, clock)
         leaves, structure = jax.tree.flatten(state)
         moves = [jnp.issubdtype(jnp.result_type(v), jnp.floating) for v in leaves]
         zero = jnp.zeros_like(r)
         inflow = steady_inflow(loop)
         d = None if loop.disturbance is None else tuple(jnp.zeros(loop.plant.tanks))
         d = d if inflow is None else tuple(jnp.asarray(inflow))
-        plan = here.controller.prepare(
+        plan = changed.controller.prepare(
             tuple(r[:, None]), tuple(zero[:, None]), tuple(zero[:, None])
         )
         now = Inputs(
@@ -99,7 +96,7 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
             xi=None,
             context=ms.Context(),
             plan=jax.tree.map(lambda a: a[0], plan),
-            own=jax.tree.map(lambda a: a[0], here.controller.inputs(clock)),
+            own=jax.tree.map(lambda a: a[0], changed.controller.inputs(clock)),
             fault=None if loop.faults is None else (0.0,) * len(loop.faults.windows),
         )
 
@@ -108,7 +105,7 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
             state = jax.tree.unflatten(
                 structure, [next(floats) if m else next(rest) for m in moves]
             )
-            out = jax.tree.leaves(step(here, clock, state, now)[0])
+            out = jax.tree.leaves(step(changed, clock, state, now)[0])
             return jnp.concatenate([jnp.ravel(v) for v, m in zip(out, moves) if m])
 
         flat, unravel = ravel_pytree([v for v, m in zip(leaves, moves) if m])
@@ -117,26 +114,26 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
     return jax.vmap(lambda v: jax.vmap(lambda *at: jacobian(v, *at))(r, x, u))(values)
 
 
-def screen(problem, count, seed, coarse=True):
-    """Return (zs, costs, margins, redone) of `count` Sobol points."""
-    # zs (points, P), costs (points,), margins (points, limits). At the true step where all runs
-    # have few samples, or not `coarse`. Else at a coarse step: points that this step alone makes
-    # unstable, or whose coarse run is not finite, are run again at the true step; `redone` counts
-    # the first.
+def screen(evaluator, count, seed, coarse=True):
+    """Return (Population of `count` Sobol points, how many the coarse step makes unstable)."""
+    # At the true step where all runs have few samples, or not `coarse`. Else at a coarse step:
+    # points that this step alone makes unstable, or whose coarse run is not finite, are run again
+    # at the true step.
+    problem = evaluator.problem
     zs = sobol(count, len(problem.bounds), seed)
     unstable = np.zeros(count, dtype=bool)
     coarse = coarse and count * len(problem.runs) * problem.clock.samples > AFFORDED
     clock = screening_clock(problem.clock) if coarse else None
     coarse = coarse and clock != problem.clock
-    costs, margins = problem.screen(zs, coarse)
+    costs, margins = evaluator.screen(zs, coarse)
     if coarse:
         unstable = (spectral_radius(problem, zs, clock) > 1.0) & ~(
             spectral_radius(problem, zs, problem.clock) > 1.0
         )
         suspect = unstable | ~np.isfinite(costs)
         if suspect.any():
-            costs[suspect], margins[suspect] = problem.screen(zs[suspect])
-    return zs, costs, margins, int(unstable.sum())
+            costs[suspect], margins[suspect] = evaluator.screen(zs[suspect])
+    return Population(zs, costs, margins), int(unstable.sum())
 
 
 def distinct_starts(zs, merits, count, first):
@@ -155,9 +152,9 @@ def distinct_starts(zs, merits, count, first):
 def best_screened(search, screened):
     """Return the feasible screened point (P,) better than the best of a Search, or None."""
     zs, costs, margins = screened
-    held = np.isfinite(costs) & np.all(margins >= 0, axis=1)
+    feasible = np.isfinite(costs) & np.all(margins >= 0, axis=1)
     for i in np.argsort(costs, kind="stable"):
-        if not held[i] or zs[i].tobytes() in search.memory:
+        if not feasible[i] or zs[i].tobytes() in search.memory:
             continue
         best = search.best
         if best is not None and search.violation(best) == 0 and costs[i] >= best.cost:
@@ -176,7 +173,7 @@ class Population(NamedTuple):
 
     def merits(self, search):
         """Return (points,) costs where limits hold, else far above by violation, or infinite."""
-        short = np.maximum(0.0, -self.margins / search.limit_scale).max(axis=1, initial=0.0)
+        short = search.violations(self.margins)
         merits = np.where(short > 0, MUCH * (1.0 + short), self.costs)
         return np.where(np.isfinite(self.costs) & np.isfinite(merits), merits, np.inf)
 
@@ -191,7 +188,7 @@ def evolution_size(search, screened):
 def evolve(search, zs, generations, seed, coarse=True):
     """Return the Population after differential evolution of points zs, and that of zs itself."""
     rng, count = np.random.default_rng([seed, 1997]), len(zs)
-    first = now = Population(zs, *search.problem.screen(zs, coarse))
+    first = now = Population(zs, *search.evaluator.screen(zs, coarse))
     merits = now.merits(search)
     for _ in range(generations):
         a, b, c = (rng.permutation(count) for _ in range(3))
@@ -200,7 +197,7 @@ def evolve(search, zs, generations, seed, coarse=True):
         base = np.where(rng.random((count, 1)) < 0.5, towards, now.zs[a])
         moved = np.clip(base + factor * (now.zs[b] - now.zs[c]), 0.0, 1.0)
         trial = np.where(rng.random(moved.shape) < CROSSED, moved, now.zs)
-        new = Population(trial, *search.problem.screen(trial, coarse))
+        new = Population(trial, *search.evaluator.screen(trial, coarse))
         ranks = new.merits(search)
         better = ranks < merits
         merits = np.where(better, ranks, merits)

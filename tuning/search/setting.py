@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank import measures as ms
 from jaxtank import rig
 from jaxtank.case import Case, Scenario, uncertain_shares
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index, with_values
+from jaxtank.limits import limited_levels
 from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import takes_arrays
 from jaxtank.loop.step_size import unstable_tanks
@@ -51,11 +51,10 @@ def midpoint_error(case: Case, clock: Clock, height: float, span: np.ndarray) ->
 
     def changes(x: Any, u: Any) -> Any:
         start, inputs = (x, u) if arrays else (tuple(x), tuple(u))
-        found = (
-            advance(plant, rule, 0.0, start, inputs, None, clock.dt, clock.substeps).x
+        midpoint, rk4 = (
+            jnp.asarray(advance(plant, rule, 0.0, start, inputs, None, clock.dt, clock.substeps).x)
             for rule in ("midpoint", "rk4")
         )
-        midpoint, rk4 = (jnp.asarray(levels) for levels in found)
         return jnp.sum((midpoint - rk4) ** 2), jnp.sum((rk4 - x) ** 2)
 
     off, moved = (float(jnp.sum(v)) for v in jax.jit(jax.vmap(changes))(x, u))
@@ -67,9 +66,8 @@ NOISE = 1e-3
 """Standard deviation of the sensor noise where the case states none, as a share of the rim [-]."""
 
 PRICE = (5e-3, 1e-2)
-"""An error of the first share of the rim is worth a change of a pump's input from sample to sample
-of the second share of its range [-].
-"""
+"""The cost weighs an RMS error of the first share of the height equal to an RMS change of the
+inputs per sample of the second share of their range [-]."""
 
 NEAR = 0.9  # share of its limit that a level must reach on some plant for the limit to matter
 FREE = 10.0  # limit of a tank that a safety filter leaves alone, in heights of the rig
@@ -128,11 +126,9 @@ class Setting:
         if midpoint_error(self.searched, clock, height(self.case), self.span) <= LARGEST_ERROR:
             clock = dataclasses.replace(clock, integrator="midpoint")
         try:
-            found = self.searched.replace(clock=clock)
-            lp.check(found.loop, clock, jax.random.key(0))
-            if self.filter is not None:
-                found = found.without_safety_filter().with_safety_filter(**self.filter)
-            return found
+            coarse = self.searched.replace(clock=clock)
+            lp.check(coarse.loop, clock, jax.random.key(0))
+            return coarse if self.filter is None else self._filtered(coarse, self.filter)
         except InputError:  # a dead time that is no multiple of the longer step, for one
             return self.searched
 
@@ -142,21 +138,33 @@ class Setting:
 
     def with_filter(self, near: np.ndarray | None = None) -> "Setting":
         """Return the setting with a safety filter; itself where the plant can have none."""
-        given = dict(self.case.safety or {})
+        settings = dict(self.case.safety or {})
+        plain, limits = self.searched.without_safety_filter(), limited_levels(self.case)
         try:
-            found, rows = self.searched.without_safety_filter().safety_design(**given)
-            if near is not None and not np.all(near) and _lowered(self.case, rows, near):
-                limit = np.where(near, limited_levels(self.case), FREE * height(self.case))
-                given = {"limit": limit.tolist()} | given
-                found, rows = self.searched.without_safety_filter().safety_design(**given)
-                rows = tuple(row for row in rows if near[row.tank])
+            safety_filter, rows = plain.safety_design(**settings)
+            # a level that matters may be kept below its limit for the sake of another one
+            reached = np.ones(len(limits), dtype=bool) if near is None else near
+            lowered = any(
+                reached[row.tank] and row.limit < 0.999 * limits[row.tank] for row in rows
+            )
+            if lowered and not np.all(reached):
+                limit = np.where(reached, limits, FREE * height(self.case))
+                settings = {"limit": limit.tolist()} | settings
+                safety_filter, rows = plain.safety_design(**settings)
+                rows = tuple(row for row in rows if reached[row.tank])
         except InputError:
             return self
         # both follow from the noise, which the case as given may not state
-        own = {"band": np.asarray(found.band).tolist(), "rate": float(np.max(found.rate))}
-        searched = self.searched.without_safety_filter().with_safety_filter(**given)
-        rows = tuple(_for_these_plants(self, row) for row in rows)
-        return self.replace(searched=searched, filter=own | given, certificates=rows)
+        band, rate = np.asarray(safety_filter.band).tolist(), float(np.max(safety_filter.rate))
+        return self.replace(
+            searched=plain.with_safety_filter(**settings),
+            filter={"band": band, "rate": rate} | settings,
+            certificates=tuple(_for_these_plants(self, row) for row in rows),
+        )
+
+    @staticmethod
+    def _filtered(case: Case, settings: Mapping[str, Any]) -> Case:
+        return case.without_safety_filter().with_safety_filter(**settings)
 
     def without_filter(self) -> "Setting":
         """Return the setting without a safety filter."""
@@ -165,12 +173,13 @@ class Setting:
 
     def tuned(self, values: Mapping[str, float]) -> Case:
         """Return the case as given with `values`, the filter, and the objective of the search."""
-        found = self.case.replace(
-            loop=with_values(self.case.loop, values), objective=dict(self.objective)
+        loop = with_values(self.case.loop, values)
+        case = self.case.replace(loop=loop, objective=dict(self.objective))
+        return (
+            case.without_safety_filter()
+            if self.filter is None
+            else self._filtered(case, self.filter)
         )
-        if self.filter is None:
-            return found.without_safety_filter()
-        return found.without_safety_filter().with_safety_filter(**self.filter)
 
 
 def scenarios_of(case, distributions=None, samples=64, seed=0):
@@ -180,21 +189,15 @@ def scenarios_of(case, distributions=None, samples=64, seed=0):
     distributions = spread_of(case) if distributions is None else stated_of(distributions)
     space = Draws(case.loop, distributions)
     values = space.values(probabilities("latin", space.dimensions, samples, seed))
-    base, found = case.scenarios or (Scenario("run"),), []
+    base, plants = case.scenarios or (Scenario("run"),), []
     for i in range(samples):
-        own = base[i % len(base)]
-        drawn = {n: v[i].tolist() for n, v in values.items()}
-        set_here = {split_index(n)[0] for n in own.values}
-        kept = {n: v for n, v in drawn.items() if split_index(n)[0] not in set_here}
-        found.append(
-            Scenario(
-                f"plant {i + 1}",
-                {**own.values, **kept},
-                seed=(own.seed + 7919 * (i + 1)) % 2**31,
-                weight=own.weight,
-            )
-        )
-    return tuple(found)
+        scenario = base[i % len(base)]
+        stated = {split_index(n)[0] for n in scenario.values}
+        plant = {n: v[i].tolist() for n, v in values.items() if split_index(n)[0] not in stated}
+        seed = (scenario.seed + 7919 * (i + 1)) % 2**31
+        values_of_plant = {**scenario.values, **plant}
+        plants.append(Scenario(f"plant {i + 1}", values_of_plant, seed, scenario.weight))
+    return tuple(plants)
 
 
 def _for_these_plants(setting, row):
@@ -214,16 +217,9 @@ def _in_box(setting):
         return False
     if not is_stated(setting.case):
         return True  # 5 % of every flow, here and there
-    found = setting.distributions
     return setting.case.covariance is None and all(
-        isinstance(d, Uniform) and d.relative is not None for d in found.values()
+        isinstance(d, Uniform) and d.relative is not None for d in setting.distributions.values()
     )
-
-
-def _lowered(case, rows, near):
-    """Return True if a level that matters is kept below its limit for the sake of another one."""
-    limit = limited_levels(case)
-    return any(near[row.tank] and row.limit < 0.999 * limit[row.tank] for row in rows)
 
 
 def setting_of(
@@ -239,22 +235,23 @@ def setting_of(
     if distributions is not None:
         distributions = stated_of(distributions)
         case = _with_box(case, distributions)
-    size, (noise, assumed), span = height(case), _noise(case), input_range(case)
-    stated = is_stated(case)
-    found = Setting(
+    (noise, assumed), span = _noise(case), input_range(case)
+    if objective is not None:
+        objective = rig.check_objective(objective)
+    elif _has_own_objective(case):
+        objective = dict(case.objective)
+    setting = Setting(
         case=case,
         searched=_noisy(case, noise) if assumed or noise else case,
-        objective=_price(case, size, span) if objective is None else rig.check_objective(objective),
+        objective=_default_cost(case, span) if objective is None else objective,
         own_objective=objective is not None,
         distributions=distributions or plants_of(case),
-        stated=stated or distributions is not None,
+        stated=is_stated(case) or distributions is not None,
         noise=noise,
         assumed=assumed,
         span=span,
     )
-    if objective is None and _has_own_objective(case):
-        found = found.replace(objective=dict(case.objective), own_objective=True)
-    return found.with_filter() if case.loop.safety_filter is not None else found
+    return setting.with_filter() if case.loop.safety_filter is not None else setting
 
 
 def _with_box(case, distributions):
@@ -290,38 +287,38 @@ def input_range(case: Case) -> np.ndarray:
     return np.where((low >= 0.0) & np.isfinite(high), high - low, used)
 
 
-def _price(case, size, span):
+def _default_cost(case, span):
     """The default cost: the mean square error, and the priced mean square change of the input."""
     pumps, span = case.loop.plant.pumps, float(np.mean(span))
-    weight = (PRICE[0] * size) ** 2 / (pumps * (PRICE[1] * span) ** 2)
+    weight = (PRICE[0] * height(case)) ** 2 / (pumps * (PRICE[1] * span) ** 2)
     return {COST[0]: 1.0, COST[1]: weight}
 
 
 def _has_own_objective(case):
     """Return True if the objective is the user's: not the default, and not that of a preset."""
-    given = dict(case.objective)
-    if given == {"rms_error_total": 1.0}:
+    objective = dict(case.objective)
+    if objective == {"rms_error_total": 1.0}:
         return False
     try:
-        return given != dict(find(case.name).objective)
+        return objective != dict(find(case.name).objective)
     except InputError:
         return True
 
 
 def _noise(case):
     """Return (standard deviation of the sensor noise, True if neither case nor scenario has it)."""
-    own = float(np.max(np.asarray(case.loop.sensor.noise)))
+    noise = float(np.max(np.asarray(case.loop.sensor.noise)))
     loops = [rig.set_scenario(case, s.values).loop for s in case.scenarios]
-    stated = max([own, *(float(np.max(np.asarray(loop.sensor.noise))) for loop in loops)])
+    stated = max([noise, *(float(np.max(np.asarray(loop.sensor.noise))) for loop in loops)])
     return (stated, False) if stated > 0.0 else (NOISE * height(case), True)
 
 
 def _noisy(case, noise):
     """Return the case with sensor noise where it has none."""
-    own = np.asarray(case.loop.sensor.noise, dtype=float)
-    if np.any(own > 0.0):
+    stated = np.asarray(case.loop.sensor.noise, dtype=float)
+    if np.any(stated > 0.0):
         return case
-    return case.replace(loop=with_values(case.loop, {"sensor.noise": np.full(own.shape, noise)}))
+    return case.replace(loop=with_values(case.loop, {"sensor.noise": np.full(stated.shape, noise)}))
 
 
 def is_stated(case: Case) -> bool:
@@ -332,19 +329,3 @@ def is_stated(case: Case) -> bool:
 def plants_of(case: Case) -> dict[str, Any]:
     """Return {name: distribution} of what a case calls uncertain."""
     return spread_of(case.replace(uncertain=uncertain_shares(case)))
-
-
-def limited_levels(case: Case) -> np.ndarray:
-    """Return the (tanks,) limits on the highest levels; inf where there is none."""
-    tanks = case.loop.plant.tanks
-    if "max_level" not in case.limits:
-        return np.full(tanks, np.inf)
-    limit = case.limits["max_level"]
-    rims = np.asarray(case.loop.plant.rim, dtype=float)
-    return rims if isinstance(limit, str) else np.broadcast_to(np.asarray(limit, float), (tanks,))
-
-
-def measured(setting: Setting) -> tuple[str, ...]:
-    """Return the measures of every judged plant."""
-    own = [*setting.objective, *COST, "rms_error_total", "max_level", "mean_square_travel"]
-    return tuple(m for m in dict.fromkeys(own) if ms.serves(m, setting.searched.loop))

@@ -10,7 +10,7 @@ from tuning.problem.reported import margin_measures
 from tuning.search.driver import Search
 from tuning.search.methods import METHODS, automatic
 from tuning.search.setting import Setting
-from tuning.search.stages import Outcome
+from tuning.search.solve import Solution
 
 WORTH = 0.01  # a gain is changed only where that lowers the cost by this share [-]
 
@@ -31,28 +31,29 @@ class Subspace(Search):
     def __init__(self, owner: Search, z: np.ndarray, free: np.ndarray):
         # its owner reports every evaluation already
         tolerance = max(owner.tolerance, FINE * WORTH)
-        super().__init__(owner.problem, owner.last_finite, lambda search: None, tolerance)
+        super().__init__(owner.evaluator, owner.last_finite, tolerance=tolerance)
         self.scale, self.owner, self.fixed = owner.scale, owner, z
         self.free: np.ndarray = np.asarray(free)
 
     def full(self, z: Any) -> np.ndarray:
         """Return (P,) the point of the owner at z, values of the free parameters."""
-        found = self.fixed.copy()
-        found[self.free] = np.clip(z, 0.0, 1.0)
-        return found
+        z_all = self.fixed.copy()
+        z_all[self.free] = np.clip(z, 0.0, 1.0)
+        return z_all
 
     def point(self, z: Any) -> Any:
         """Return the Point at z, derivatives by the free parameters alone; cached."""
         z = np.clip(z, 0.0, 1.0)
         if z.tobytes() not in self.memory:
-            found, free = self.owner.point(self.full(z)), self.free
+            point, free = self.owner.point(self.full(z)), self.free
+            slopes = point.run_slopes
             self.take(
-                found._replace(
+                point._replace(
                     z=z,
-                    gradient=found.gradient[free],
-                    gauss_newton=found.gauss_newton[free][:, free],
-                    margin_slopes=found.margin_slopes[:, free],
-                    run_slopes=found.run_slopes[:, free] if found.run_slopes.size else np.zeros(0),
+                    gradient=point.gradient[free],
+                    gauss_newton=point.gauss_newton[free][:, free],
+                    margin_slopes=point.margin_slopes[:, free],
+                    run_slopes=slopes[:, free] if slopes.size else np.zeros(0),
                 )
             )
         return self.memory[z.tobytes()]
@@ -66,33 +67,29 @@ def stay_put(
     # stays there (kept) if the cost is within WORTH of the best found, and no limit that the best
     # point keeps is violated. A gain that cannot is moved back as far as it can.
     best = search.best
-    kept, z = np.zeros(len(first), dtype=bool), best.z
+    fixed, z = np.zeros(len(first), dtype=bool), best.z
     ceiling = best.cost + WORTH * abs(best.cost)
     allowed = search.violation(best)
 
     def good(point):
         return point.finite and point.cost <= ceiling and search.violation(point) <= allowed
 
-    if _all_stay(search, search.point(first), allowed, slack):
-        return first.copy(), ~kept
+    start = search.point(first)
+    loose = start if slack is None else start._replace(margins=start.margins + slack)
+    dearest = best.cost + AGAIN * WORTH * abs(best.cost)
+    if start.finite and start.cost <= dearest and search.violation(loose) <= allowed:
+        return first.copy(), ~fixed
     # first those whose value costs least by the curvature at the best point
     order = np.argsort(np.diag(best.gauss_newton) * (best.z - first) ** 2, kind="stable")
     for i in order:
-        trial = kept.copy()
+        trial = fixed.copy()
         trial[i] = True
         reached = _without(search, trial, first, z, iterations)
         if reached is not None and good(search.point(reached)):
-            kept, z = trial, reached
+            fixed, z = trial, reached
         else:
             z = _towards(search, i, first, z, ceiling, allowed, good)
-    return z, kept
-
-
-def _all_stay(search, start, allowed, slack):
-    """Return True if all first values may stay (AGAIN), limits being looser by `slack`."""
-    given = start if slack is None else start._replace(margins=start.margins + slack)
-    dearest = search.best.cost + AGAIN * WORTH * abs(search.best.cost)
-    return start.finite and start.cost <= dearest and search.violation(given) <= allowed
+    return z, fixed
 
 
 def _without(search, trial, first, z, iterations):
@@ -114,8 +111,8 @@ def _towards(search, i, first, z, ceiling, allowed, good):
     line[:, i] = z[i] + shares * (first[i] - z[i])
     count = 0
     for some in np.split(line, LINE // STRIDE):
-        costs, margins = search.problem.screen(some)
-        shortfall = np.max(-margins / search.limit_scale, axis=1, initial=0.0)
+        costs, margins = search.evaluator.screen(some)
+        shortfall = search.violations(margins)
         fits = np.isfinite(costs) & (costs <= ceiling) & (shortfall <= allowed)
         count += STRIDE if fits.all() else int(np.argmin(fits))
         if not fits.all():
@@ -137,20 +134,23 @@ SPAN, ROUNDS = 0.01, 16
 steps are taken along one direction, at most."""
 
 
-def move_back(setting: Setting, problem: Any, found: Outcome) -> None:
-    """Move the answer in `found` to a point whose Ms is at most PEAK."""
-    search, first = found.search, problem.start()
-    if search is None or found.point is None or np.array_equal(found.point.z, first):
+def move_back(setting: Setting, solution: Solution) -> None:
+    """Move the answer of a Solution to a point whose Ms is at most PEAK."""
+    search, point = solution.search, solution.point
+    if search is None or point is None:
         return
-    z, point = found.point.z, found.point
+    problem, z = search.problem, point.z
+    first = problem.start()
+    if np.array_equal(z, first):
+        return
     highest = _peak(setting, problem, z)
     if not highest > PEAK:  # NaN: it has none
         return
     before = _peak(setting, problem, first)
     allowed = max(PEAK, before)
     if before > PEAK:
-        calmer, highest = _descended(setting, problem, found, highest)
-        found.z, found.kept = calmer, calmer == first
+        calmer, highest = _descended(setting, solution, highest)
+        solution.z, solution.kept = calmer, calmer == first
     if not highest > allowed:
         return
     line = z + np.arange(1, LINE + 1)[:, None] / LINE * (first - z)
@@ -159,23 +159,24 @@ def move_back(setting: Setting, problem: Any, found: Outcome) -> None:
         low = np.array([_peak(setting, problem, each) <= allowed for each in some])
         if not low.any():
             continue
-        costs, _ = problem.screen(some)
+        costs, _ = search.evaluator.screen(some)
         for each in some[low & (costs <= ceiling)]:
             there = search.point(each)
             if search.violation(there) <= violation:
                 dearest = min(ceiling, there.cost + WORTH * abs(there.cost))
-                here = search.point(first)
-                if here.cost <= dearest and search.violation(here) <= violation:
+                start = search.point(first)
+                if start.cost <= dearest and search.violation(start) <= violation:
                     each = first.copy()
-                found.z, found.kept = each, each == first
+                solution.z, solution.kept = each, each == first
                 return
 
 
-def _descended(setting, problem, found, highest):
+def _descended(setting, solution, highest):
     """Return (point of the lowest peak within PRICE along the steepest descent, that peak)."""
-    search, z, point = found.search, found.point.z, found.point
+    search, point = solution.search, solution.point
+    problem, z = search.problem, point.z
     ceiling, violation = point.cost + PRICE * abs(point.cost), search.violation(point)
-    free, calmer, lowest = ~np.asarray(found.kept), z, highest
+    free, calmer, lowest = ~np.asarray(solution.kept), z, highest
     for _ in range(ROUNDS):
         slope = _peak_slope(setting, problem, z) * free
         norm = float(np.linalg.norm(slope))
@@ -183,9 +184,9 @@ def _descended(setting, problem, found, highest):
             break
         steps = np.arange(1, STRIDE + 1)[:, None] * SPAN
         line = np.clip(z - steps * slope / norm, 0.0, 1.0)
-        costs, margins = problem.screen(line)
-        beyond = np.max(-margins / search.limit_scale, axis=1, initial=0.0)
-        for each, fits in zip(line, (costs <= ceiling) & (beyond <= violation)):
+        costs, margins = search.evaluator.screen(line)
+        fit = (costs <= ceiling) & (search.violations(margins) <= violation)
+        for each, fits in zip(line, fit):
             if not fits:
                 return calmer, lowest
             peak = _peak(setting, problem, each)
@@ -211,5 +212,4 @@ def _peak_slope(setting, problem, z):
 def _peak(setting, problem, z):
     """Return the sensitivity peak at z (P,); NaN where the loop has none."""
     case = setting.tuned(problem.values(z))
-    found = margin_measures(case.loop, case.clock)
-    return float(found.get("sensitivity_peak", np.nan))
+    return float(margin_measures(case.loop, case.clock).get("sensitivity_peak", np.nan))

@@ -1,7 +1,7 @@
 """tune: the default answer, or the optimum of a problem as it is stated."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,14 +9,15 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.case import Case, Scenario
+from jaxtank.case import Case
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
+from jaxtank.limits import limited_levels, resolve_limits
 from jaxtank.loop import run as lp
-from jaxtank.loop.closed_loop import initial
 from tuning.cluster.ahead import check_sent
-from tuning.cluster.engine import connect
-from tuning.feasible.study import apply_mend, can_judge, feasibility
+from tuning.cluster.engine import Engine, connect
+from tuning.feasible.study import can_judge, feasibility
+from tuning.problem.evaluator import Evaluator
 from tuning.problem.functions import as_measures, digests
 from tuning.problem.problem import Problem
 from tuning.problem.provenance import provenance
@@ -27,42 +28,39 @@ from tuning.problem.reported import (
     run_measures,
     table_of,
 )
-from tuning.problem.scenarios import noisy
+from tuning.problem.scenarios import noisy, runs_of
 from tuning.problem.slopes import check_slopes
 from tuning.search import diagnostics
-from tuning.search.attempts import Task, attempts, values_of
-from tuning.search.diagnostics import lost_outputs, points_to_fragile
-from tuning.search.discrete import tune_choices
+from tuning.search.default import Attempt, Task, attempts, values_of
 from tuning.search.driver import named_optimality
 from tuning.search.judged import FRESH, Answer, Judged, judge, matters
 from tuning.search.messages import messages_of
-from tuning.search.methods import OFFERED, UNCONSTRAINED, automatic
-from tuning.search.options import Solver, check_options, check_precision, spelled_out
-from tuning.search.result import ConstraintRow, TuningResult, constraint_rows, row_of
-from tuning.search.screening import LARGEST_STATE
-from tuning.search.setting import NEAR, limited_levels, plants_of, setting_of
-from tuning.search.stages import Outcome, Plan, solve, status_of
-from tuning.storage.evaluation_log import EvaluationLog
+from tuning.search.methods import UNCONSTRAINED, automatic
+from tuning.search.options import Options, check_precision, options_of
+from tuning.search.result import Message, TuningResult, constraint_rows, row_of
+from tuning.search.screening import LARGEST_STATE, state_size
+from tuning.search.setting import NEAR, Setting, setting_of
+from tuning.search.solve import Plan, Solution, solve
+from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
 from tuning.storage.fingerprint import fingerprint
 from tuning.uncertainty.validation import summary_of, validate
 
-SCREENED = 32  # Sobol points of the search of a default answer
-
 TOLERANCE = 1e-4
-"""Change of the cost, as a share of its first value, at which a search has converged [-]."""
+"""Change of the cost, as a share of its first value, at which a search on drawn plants has
+converged: their mean is itself known to a few percent only [-]."""
 
 AGREE = 0.01
 """Two searches whose costs differ by less than this share agree [-]: the mean of 32 plants is known
 to a few percent."""
 
-DEFAULT = {"starts": 4, "screening": SCREENED, "iterations": 40, "validation": FRESH}
+DEFAULT = {"starts": 4, "screening": 32, "iterations": 40, "validation": FRESH}
 NOMINAL = {"starts": 8, "screening": 64, "iterations": 60, "validation": 64}
 """Numbers of the default answer, and of the optimum of a problem as it is stated."""
 
 
 def tune(
     case: Case | Problem,
-    method: str | Solver = "auto",
+    method: str | Options = "auto",
     *,
     nominal: bool | None = None,
     free: Mapping[str, Any] | None = None,
@@ -70,21 +68,11 @@ def tune(
     limits: Any = None,
     distributions: Mapping[str, Any] | None = None,
     safety_filter: bool | None = None,
-    mend: str | None = None,
-    scenarios: Sequence[Scenario] | None = None,
-    risk: str = "mean",
-    choices: Mapping[str, Sequence] | None = None,
     starts: int | None = None,
     seed: int = 0,
-    screening: int | None = None,
-    iterations: int | None = None,
-    batch: int | None = None,
-    validation: int | None = None,
-    tolerance: float | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
     progress: Callable | None = None,
-    cluster: Any = None,
 ) -> TuningResult:
     """Return better values for the free parameters of a case, under its limits.
 
@@ -96,8 +84,8 @@ def tune(
     validation plants at the case's own step (`result.answer`).
 
     With nominal=True the optimum of the case as it is: its own run or scenarios alone, its own
-    objective, without adding noise, plants or a filter. Implied by a Problem, a method, scenarios,
-    risk, choices, batch, screening or tolerance.
+    objective, without adding noise, plants or a filter. Implied by a Problem, a method, and by
+    `screening` and `tolerance` of Options.
 
     Converged: two searches ended within 1 % of each other (nominal: 0.1 %), or differential
     evolution found nothing better.
@@ -106,12 +94,11 @@ def tune(
     ----------
     case : Case, or a Problem of one, which has free, objective, limits, scenarios and risk of its
         own (and its seed, unless another is given).
-    method : solver options (SQP, TRF, LBFGS, Adam), or "auto" (trf where the cost is a sum of
-        squares and no limit is active, else slsqp), "slsqp", "trf", "coarse-trf" (trf at a tenth
-        of the samples, then at all), "lbfgs" or "adam".
+    method : "auto" (trf where the cost is a sum of squares and no limit is active, else slsqp),
+        "slsqp", "trf", "coarse-trf" (trf at a tenth of the samples, then at all), "lbfgs", "adam",
+        or Options (SQP, TRF, LBFGS, Adam) with the numbers of the search.
     nominal : True for the optimum of the case as it is, False for the default answer, None for the
-        default answer unless method, scenarios, risk, choices, batch, screening or tolerance are
-        given.
+        default answer unless the optimum is implied.
     free : {name: (low, high) or Free}; the case's own where None.
     objective : {measure: weight}, or a custom function, (measures) or (measures, trajectory)
         -> number, alone or in the place of a measure (`Objective` gives it a name and a unit);
@@ -121,29 +108,12 @@ def tune(
     distributions : {name: distribution or share}, the plants of the default answer; what the case
         calls uncertain where None, 5 % of every flow where that is nothing.
     safety_filter : of the default answer; None: where a level comes near its limit.
-    mend : "setpoints", "rims", "orifices", "pumps" or "ramps": make the smallest such change that
-        lets 95 % of the plants hold the setpoints (of ramps: the nominal run keep its limits), then
-        tune.
-    scenarios : tuple of Scenario, () for the case's own run alone.
-    risk : "mean", "cvar" (the mean of the worst 5 %) or "worst" of the costs of the scenarios.
-    choices : {static name: [values]}, each combination of which is tuned, the best taken;
-        {"controller.kind": ["pid", "lqi"]} tunes each of these controllers with gains and ranges of
-        its own.
-    starts : local searches at most, until two agree (4; 8 if nominal).
+    starts : local searches at most, until two agree (4; 8 if nominal); as in Options.
     seed : of the Sobol points, the plants and the sensor noise.
-    screening : number of Sobol points (64); nominal only.
-    iterations : of each local search (60; 40 of the default answer).
-    batch : scenarios drawn for each step of adam, None for all.
-    validation : validation plants (256; nominal: 64, 0 for none).
-    tolerance : change of the objective, as a share of its first value, below which a search under
-        limits has converged; None for 1e-8 and a last search to 1e-12; nominal only.
     checkpoint : folder for the log of evaluations, with which a killed search is continued by
         resume=True, to the same bits.
     progress : called with a dict after every evaluation. Ctrl-C ends the search with the best
         point so far.
-    cluster : Dask cluster on which the local searches run side by side, to the same answer:
-        "HOST:PORT" of its scheduler, "local:N" for N workers on this machine, or a
-        `distributed.Client`.
 
     Returns
     -------
@@ -161,207 +131,231 @@ def tune(
     >>> result = tuning.tune(presets.find("gouta2015/backstepping"))  # doctest: +SKIP
     >>> result["controller.k1"].after, result.answer.held  # doctest: +SKIP
     """
-    objective, limits = as_measures(objective, limits)
-    stated: dict[str, Any] = dict(free=free, objective=objective, limits=limits, seed=seed)
-    more = {"scenarios": scenarios, "choices": choices, "batch": batch, "tolerance": tolerance}
-    asked = [n for n, v in {**more, "screening": screening}.items() if v is not None]
-    asked += ["risk"] * (risk != "mean") + ["method"] * (method != "auto")
-    if nominal is False and (asked or isinstance(case, Problem)):
-        what = asked[0] if asked else "a Problem"
-        raise InputError(f"{what}: belongs to the nominal optimum (nominal=True, --nominal)")
-    nominal = nominal or bool(asked) or isinstance(case, Problem)
-    numbers = {"starts": starts, "screening": screening, "iterations": iterations}
-    numbers["validation"] = validation
-    usual = NOMINAL if nominal else DEFAULT
-    filled = {n: usual[n] if v is None else v for n, v in numbers.items()}
-    options: dict[str, Any] = {**stated, **filled}
-    options["progress"] = progress
-    keep: dict[str, Any] = dict(checkpoint=checkpoint, resume=resume)
-    own = {"distributions": distributions, "safety_filter": safety_filter, "mend": mend}
+    options = options_of(method, starts=starts)
+    implied = _implies_nominal(case, options)
+    if nominal is False and implied:
+        raise InputError(f"{implied}: belongs to the nominal optimum (nominal=True, --nominal)")
+    nominal = nominal or bool(implied)
     check_precision()
-    if not nominal:
-        assert isinstance(case, Case)
-        with connect(cluster) as engine:
-            return _recommend(case, engine, **own, **keep, **options)
-    for name, value in own.items():
+    stated = {"free": free, "objective": objective, "limits": limits}
+    options = options.filled(**(NOMINAL if nominal else DEFAULT))
+    with connect(options.cluster) as engine:
+        keep = {"checkpoint": checkpoint, "resume": resume, "progress": progress}
+        if not nominal:
+            assert isinstance(case, Case)
+            stated["objective"], stated["limits"] = as_measures(objective, limits)
+            box = {"distributions": distributions, "safety_filter": safety_filter}
+            return _default_answer(case, options, engine, seed=seed, **box, **stated, **keep)
+        for name, value in (("distributions", distributions), ("safety_filter", safety_filter)):
+            if value is not None:
+                raise InputError(
+                    f"{name}: belongs to the default answer, not to the nominal optimum"
+                )
+        return _optimum(_stated(case, seed, **stated), options, engine, **keep)
+
+
+def _implies_nominal(case: Case | Problem, options: Options) -> str | None:
+    """Return what asks for the optimum of the case as it is; None without."""
+    reasons = {
+        "a Problem": isinstance(case, Problem),
+        "method": options.name != "auto",
+        "screening": options.screening is not None,
+        "tolerance": options.tolerance is not None,
+    }
+    return next((name for name, value in reasons.items() if value), None)
+
+
+def _stated(case: Case | Problem, seed: int, **stated: Any) -> Problem:
+    """Return the Problem of a case, or the Problem itself, under another seed if one is given."""
+    if not isinstance(case, Problem):
+        return Problem(case, seed=seed, **stated)
+    for name, value in stated.items():
         if value is not None:
-            raise InputError(f"{name}: belongs to the default answer, not to the nominal optimum")
-    options |= {"scenarios": scenarios, "risk": risk, "batch": batch, "tolerance": tolerance}
-    if isinstance(case, Problem) or isinstance(method, Solver):
-        case, method, options = spelled_out(case, method, options)
-    with connect(cluster) as engine:
-        if choices:
-            return tune_choices(_optimum, case, method, choices, engine=engine, **keep, **options)
-        return _optimum(case, method, engine=engine, **keep, **options)
+            raise InputError(f"{name}: the Problem has it already, leave it out of tune")
+    return case.with_seed(seed) if seed else case
 
 
-def _optimum(case, method, *, engine, checkpoint, resume, validation, progress, **options):
+def _optimum(
+    problem: Problem,
+    options: Options,
+    engine: Engine | None,
+    checkpoint: str | Path | None,
+    resume: bool,
+    progress: Callable | None,
+) -> TuningResult:
     """Return the optimum of a problem as it is stated."""
-    began = time.perf_counter()
-    numbers = ("starts", "screening", "iterations", "batch", "tolerance")
-    check_options(validation=validation, **{n: options[n] for n in numbers})
-    stated = ("free", "objective", "limits", "scenarios", "seed", "risk")
-    problem = Problem(case, **{n: options[n] for n in stated})
-    key = jax.random.key(options["seed"]) if noisy(case) else None
+    began, case = time.perf_counter(), problem.case
+    key = jax.random.key(problem.seed) if noisy(case) else None
     lp.check(case.loop, case.clock, key)
-    plan = Plan(
-        method=_method(method, problem, options["batch"]),
-        seed=options["seed"],
-        engine=engine,
-        **{n: options[n] for n in numbers},
-    )
-    first = problem.start()
+    plan = Plan.of(options, _method(options, problem), problem.seed, engine=engine)
+    first, start = problem.start(), problem.own_values()
     # a start that is not finite is an input error, reported by evaluate
     before = run_measures(case.loop, case.clock, key, problem.needed)
     _check_start(problem, before, first)
     check_sent(engine, problem)
+    evaluator = Evaluator(problem)
     if checkpoint is not None:
-        what = _what(problem, validation, "tune", vars(plan))
-        problem.cache = EvaluationLog(checkpoint, what, resume)
-    outcome = solve(problem, first, plan, progress)
-    values = values_of(problem, outcome)
+        what = _what(problem, options.validation, "tune", vars(plan))
+        evaluator.cache = EvaluationLog(checkpoint, what, resume)
+    solution = solve(evaluator, first, plan, progress)
+    values = values_of(problem, solution)
     tuned = case.replace(loop=with_values(case.loop, values))
     after = run_measures(tuned.loop, tuned.clock, key, problem.needed)
     tables = {"before": [before], "after": [after]}
     if problem.scenarios:
-        own = problem.own_values()
-        tables = {"before": table_of(problem, own), "after": table_of(problem, values)}
-    complete = outcome.best is not None and not outcome.interrupted
-    lost = lost_outputs(problem, tables, values) if complete else ()
-    multipliers = named_optimality(outcome.search, outcome.best)["multipliers"]
+        tables = {"before": table_of(problem, start), "after": table_of(problem, values)}
+    lost, symmetry = (), None
+    if solution.best is not None and not solution.interrupted:
+        lost = diagnostics.lost_outputs(problem.runs, tables, values)
+        symmetry = diagnostics.symmetric(evaluator, solution.starts, values)
+    multipliers = named_optimality(solution.search, solution.best)["multipliers"]
     rows = constraint_rows(problem, tables["after"], tables["before"], multipliers)
-    sides = {"before": (case, before), "after": (tuned, after)}
-    if points_to_fragile(case.loop, before, after):
-        sides = {n: (side, m | _margins(side.loop, side.clock)) for n, (side, m) in sides.items()}
+    measures = {"before": before, "after": after}
+    fragile = diagnostics.points_to_fragile(case.loop, before, after)
+    if fragile and state_size(case.loop, case.clock) <= LARGEST_STATE:
+        for side, loop in (("before", case.loop), ("after", tuned.loop)):
+            measures[side] = measures[side] | margin_measures(loop, case.clock)
     summary, cloud = None, None
-    if validation and not outcome.interrupted and _varies(problem):
-        summary, cloud = validate(problem, problem.own_values(), values, validation, plan.seed)
+    varies = case.uncertain or case.covariance or any(run.key is not None for run in problem.runs)
+    if options.validation and not solution.interrupted and varies:
+        summary, cloud = validate(problem, start, values, options.validation, plan.seed)
+    scenarios = problem.runs if problem.scenarios else ()
+    objective = {side: problem.total(table) for side, table in tables.items()}
     result = _result(
-        problem,
-        outcome,
+        evaluator,
+        solution,
         values,
+        began,
+        diagnostics.step_warnings(tuned, values, key, scenarios),
         case=case,
         tuned=tuned,
         method=plan.method,
-        status=status_of(outcome, all(row.margin >= 0 for row in rows), lost),
-        objective={side: problem.total(table) for side, table in tables.items()}
-        | {"terms": problem.objective},
-        measures={side: measures for side, (_, measures) in sides.items()},
+        status=solution.status(all(row.margin >= 0 for row in rows), lost),
+        objective=objective | {"terms": problem.objective},
+        measures=measures,
         tables=tables,
         constraints=rows,
-        symmetry=diagnostics.symmetric(problem, outcome.starts, values) if complete else None,
+        symmetry=symmetry,
         validation=summary,
         cloud=cloud,
         lost=lost,
     )
-    return _with_messages(result, diagnostics.step_warnings(problem, tuned, values, key), began)
+    evaluator.cache.close()
+    return result
 
 
-def _recommend(
-    case,
-    engine,
+def _default_answer(
+    case: Case,
+    options: Options,
+    engine: Engine | None,
     *,
-    free,
-    objective,
-    limits,
-    distributions,
-    safety_filter,
-    mend,
-    starts,
-    screening,
-    iterations,
-    seed,
-    validation,
-    checkpoint,
-    resume,
-    progress,
-):
+    free: Mapping[str, Any] | None,
+    objective: Any,
+    limits: Any,
+    distributions: Mapping[str, Any] | None,
+    safety_filter: bool | None,
+    seed: int,
+    checkpoint: str | Path | None,
+    resume: bool,
+    progress: Callable | None,
+) -> TuningResult:
     """Return the default answer."""
-    began = time.perf_counter()
-    check_options(starts=starts, iterations=iterations, validation=validation)
-    if validation == 0:
+    began, samples = time.perf_counter(), options.validation
+    if not samples:
         raise InputError(
             "validation = 0: the default answer is judged on at least 1 plant (the nominal optimum"
             " needs none)"
         )
-    mended = None
-    if mend is not None:
-        box = distributions or plants_of(case)
-        case, mended = apply_mend(case, mend, box, seed=seed, limits=limits)
     if safety_filter and not case.safety:  # asked for here: the case as given has none
         case = case.without_safety_filter()
     setting = setting_of(case, objective, limits, distributions)
     if safety_filter is False:
         setting = setting.without_filter()
-    plan = Plan(
-        method="auto",
-        starts=starts,
-        screening=screening,
-        iterations=iterations,
-        seed=seed,
-        tolerance=TOLERANCE,
-        engine=engine,
-        polish=False,
-        coarse=False,
-        agree=AGREE,
-        lower_by=AGREE,
-    )
-    task = Task(free, plan, validation, progress)
+    few = {"tolerance": TOLERANCE, "agree": AGREE, "lower_by": AGREE}
+    plan = Plan.of(options, "auto", seed, engine=engine, polish=False, coarse=False, **few)
     stated = Problem(setting.searched, free, setting.objective, setting.case.limits, None, seed)
     stated.start()
     _check_functions(setting, stated.needed)
     check_sent(engine, stated)
+    log = EvaluationCache()
     if checkpoint is not None:
         box = {n: repr(d) for n, d in setting.distributions.items()}
         more = {"distributions": box, "safety_filter": safety_filter, **vars(plan)}
-        task.cache = EvaluationLog(checkpoint, _what(stated, validation, "answer", more), resume)
-    task.may_filter = safety_filter is not False
-    before = judge(setting.replace(searched=_as_given(setting)), validation, seed)
+        log = EvaluationLog(checkpoint, _what(stated, samples, "answer", more), resume)
+    task = Task(free, plan, samples, progress, safety_filter is not False, log)
+    before = judge(_unfiltered(setting), samples, seed)
     near = matters(setting, before, NEAR)
     if safety_filter or (safety_filter is None and near.any()):
         setting = setting.with_filter(near)
     attempt = attempts(task, setting, near)
-    setting, outcome, problem = attempt.setting, attempt.outcome, attempt.problem
+    setting, solution = attempt.setting, attempt.solution
     if attempt.number:  # the plants that asked for another search do not judge it
-        as_given = setting.replace(searched=_as_given(setting))
-        before = judge(as_given, validation, seed, round_=attempt.number)
-    values = values_of(problem, outcome)
-    answer = _answer(attempt, before, values, mended)
-    outcome.least = True  # of the limits on plants that judged
-    first = outcome.search.point(problem.start()) if outcome.search is not None else None
-    summary, cloud = _validation(answer, problem)
+        before = judge(_unfiltered(setting), samples, seed, round_=attempt.number)
+    # Ctrl-C before the first search
+    evaluator = attempt.evaluator or Evaluator(stated)
+    problem = evaluator.problem
+    values = values_of(problem, solution)
+    answer = _answer(attempt, problem, before, values)
+    solution.least = True  # of the limits on plants that judged
+    first = solution.search.point(problem.start()) if solution.search is not None else None
+    summary, cloud = _validation(answer)
+    sides = {"before": first, "after": solution.point}
     result = _result(
-        problem,
-        outcome,
+        evaluator,
+        solution,
         values,
+        began,
+        diagnostics.step_warnings(setting.tuned(values), values),
         case=setting.case,
         tuned=setting.tuned(values),
         method="default answer",
-        status=status_of(outcome, answer.held, answer.lost),
+        status=solution.status(answer.held, answer.lost),
         objective={"before": _mean(before), "after": _mean(answer.after)}
         | {"terms": dict(setting.objective)},
         measures=dict(answer.measures),
-        tables={
-            side: [] if p is None else list(p.measures)
-            for side, p in {"before": first, "after": outcome.point}.items()
-        },
-        constraints=_rows(answer, problem),
+        tables={side: [] if p is None else list(p.measures) for side, p in sides.items()},
+        constraints=_rows(answer),
         symmetry=None,
         validation=summary,
         cloud=cloud,
         lost=answer.lost,
         answer=answer,
     )
-    return _with_messages(
-        result, diagnostics.step_warnings(_own(problem), result.tuned, values), began
+    log.close()
+    return result
+
+
+def _result(
+    evaluator: Evaluator,
+    solution: Solution,
+    values: Mapping[str, float],
+    began: float,
+    steps: list[str],
+    **parts: Any,
+) -> TuningResult:
+    """Return the TuningResult of a search; steps : what is wrong with the step of the answer."""
+    result = TuningResult(
+        parameters=_parameters(evaluator, solution, values),
+        evaluations={
+            "simulations": evaluator.simulations,
+            "gradients": evaluator.gradients,
+            "non_finite": evaluator.non_finite,
+            "redone_at_true_step": solution.redone,
+        },
+        wall_s=0.0,
+        history=solution.search.history if solution.search else [],
+        starts=solution.starts,
+        optimality=named_optimality(solution.search, solution.point),
+        curvature=solution.curvature,
+        provenance=provenance(parts["case"], evaluator.problem.seed),
+        problem=evaluator.problem,
+        probe=solution.probe,
+        slopes=solution.slopes,
+        messages=tuple(Message("step-too-long", text) for text in steps),
+        **parts,
     )
-
-
-def _with_messages(result, steps, began):
-    """Return a result with its messages and its duration; its problem needs no log any more."""
-    result.problem.cache = result.problem.cache.in_memory()
-    messages = messages_of(result, steps)
-    return result.replace(messages=messages, wall_s=time.perf_counter() - began)
+    wall_s = time.perf_counter() - began
+    return result.replace(messages=messages_of(result), wall_s=wall_s)
 
 
 def _what(problem, validation, command, more):
@@ -380,47 +374,19 @@ def _what(problem, validation, command, more):
     )
 
 
-def _varies(problem):
-    """Return True if a validation set differs from the runs of the search."""
-    case = problem.case
-    return case.uncertain or case.covariance or any(run.key is not None for run in problem.runs)
-
-
-def _result(problem: Problem, outcome: Outcome, values: Mapping[str, float], **parts: Any):
-    """Return the TuningResult of a search, without messages; parts : fields of their own."""
-    return TuningResult(
-        parameters=_parameters(problem, outcome, values),
-        evaluations={
-            "simulations": problem.simulations,
-            "gradients": problem.gradients,
-            "non_finite": problem.non_finite,
-            "redone_at_true_step": outcome.redone,
-        },
-        wall_s=0.0,
-        history=outcome.search.history if outcome.search else [],
-        starts=outcome.starts,
-        optimality=named_optimality(outcome.search, outcome.point),
-        curvature=outcome.curvature,
-        provenance=provenance(parts["case"], problem.seed),
-        problem=problem,
-        probe=outcome.probe,
-        slopes=outcome.slopes,
-        **parts,
-    )
-
-
-def _parameters(problem, outcome, values):
+def _parameters(evaluator, solution, values):
     """Return {name: values before and after, range, sensitivity} of the parameters."""
-    own, point, change = problem.own_values(), outcome.point, outcome.change
-    if point is None or outcome.interrupted:
-        change = [None] * len(own)
+    problem, point, change = evaluator.problem, solution.point, solution.change
+    start = problem.own_values()
+    if point is None or solution.interrupted:
+        change = [None] * len(start)
     elif change is None:
-        costs, _ = problem.screen(diagnostics.neighbours(problem, point.z))
+        costs, _ = evaluator.screen(diagnostics.neighbours(problem, point.z))
         change = diagnostics.sensitivities(costs)
-    idle = np.zeros(len(own), dtype=bool) if outcome.idle is None else outcome.idle
+    idle = np.zeros(len(start), dtype=bool) if solution.idle is None else solution.idle
     return {
         b.name: {
-            "before": own[b.name],
+            "before": start[b.name],
             "after": values[b.name],
             "unit": b.unit,
             "lower": b.low,
@@ -434,32 +400,25 @@ def _parameters(problem, outcome, values):
     }
 
 
-def _margins(loop, clock):
-    """Return the margins of the linearised loop; {} for a loop with a long state."""
-    small = sum(map(np.size, jax.tree.leaves(initial(loop, clock)))) <= LARGEST_STATE
-    return margin_measures(loop, clock) if small else {}
-
-
 def _check_start(problem, before, first):
     """Raise InputError for an objective, and functions of the user's, without value or slope."""
-    for measure in (*problem.objective, *ms.functions(problem.needed)):
+    functions = ms.functions(problem.needed)
+    for measure in (*problem.objective, *functions):
         if measure not in before or not np.all(np.isfinite(before[measure])):
             raise InputError(
                 f"{'objective' if measure in problem.objective else 'constraint'} {measure} is not"
                 " a number at the starting values (it cannot be measured on this run), so it cannot"
                 " be tuned"
             )
-    if ms.functions(problem.needed):  # before anything is written
-        cache = problem.cache
+    if functions:  # before anything is written
         check_slopes(problem, problem.point(first))
-        problem.cache, problem.simulations, problem.gradients = cache, 0, 0
 
 
 def _check_functions(setting, needed):
     """Raise InputError for a function of the user's that has no value at the starting values."""
-    own, case = tuple(ms.functions(needed)), setting.searched
+    functions, case = tuple(ms.functions(needed)), setting.searched
     key = jax.random.key(0) if noisy(case) else None
-    values = lp.evaluate(case.loop, case.clock, own, key) if own else {}
+    values = lp.evaluate(case.loop, case.clock, functions, key) if functions else {}
     for name, value in values.items():
         if not np.isfinite(value):
             raise InputError(
@@ -468,16 +427,11 @@ def _check_functions(setting, needed):
             )
 
 
-def _method(method, problem, batch):
-    """Return the method to use. Raises InputError for one that is unknown or does not apply."""
-    if batch is not None:
-        if method not in ("auto", "adam"):
-            raise InputError(f"batch = {batch}: only method adam draws scenarios, not {method}")
-        return "adam"
+def _method(options, problem):
+    """Return the method to use. Raises InputError for one that does not apply."""
+    method = options.name
     if method == "auto":
         return automatic(problem)
-    if method not in OFFERED:
-        raise InputError(f"method = {method!r}: must be one of auto, {', '.join(OFFERED)}")
     if method in UNCONSTRAINED and problem.limits:
         raise InputError(
             f"method {method} cannot hold limits: use slsqp (or auto), or drop them with --limit"
@@ -491,65 +445,50 @@ def _method(method, problem, batch):
     return method
 
 
-def _feasibility(setting):
-    """Return what no gain can mend; None where levels have no limits, or that is not known."""
-    case = setting.case
-    if not np.isfinite(limited_levels(case)).any() or not can_judge(case):
-        return None
-    return feasibility(case, setting.distributions, limits=case.limits)
-
-
-def _as_given(setting):
-    """Return the searched case without a filter, unless the case as given has one."""
+def _unfiltered(setting: Setting) -> Setting:
+    """Return the setting without a filter, unless the case as given has one."""
     if setting.case.loop.safety_filter is not None:
-        return setting.searched
-    return setting.searched.without_safety_filter()
+        return setting
+    return setting.replace(searched=setting.searched.without_safety_filter())
 
 
-def _own(problem):
-    """Return a Problem whose only run is the case's own: what step warnings are of."""
-    return Problem(problem.case, problem.given["free"], problem.objective, {}, ())
-
-
-def _answer(attempt, before, values, mended):
+def _answer(
+    attempt: Attempt, problem: Problem, before: Judged, values: Mapping[str, float]
+) -> Answer:
     """Return the Answer: what was judged, on which plants, and the case's own run."""
-    setting, outcome, problem, after = (
-        attempt.setting,
-        attempt.outcome,
-        attempt.problem,
-        attempt.after,
-    )
-    own = problem.own_values()
-    sides = {"before": (setting.case, before), "after": (setting.tuned(values), after)}
-    nominal = {side: _nominal(*both, problem.needed) for side, both in sides.items()}
-    errors = {side: float(m["rms_error_total"]) for side, m in nominal.items()}
-    stays = {n: bool(k) for n, k in zip(own, outcome.kept)} if outcome.kept is not None else {}
+    setting, solution, after = attempt.setting, attempt.solution, attempt.after
+    start, case = problem.own_values(), setting.case
+    nominal = {
+        "before": _nominal(case, before, problem.needed),
+        "after": _nominal(setting.tuned(values), after, problem.needed),
+    }
+    runs = runs_of(setting.tuned(start), (), 0)
+    near = matters(setting, before, NEAR)
+    if after is not None:
+        near = near | matters(setting, after, NEAR)
+    levels = limited_levels(case)
+    fixed = np.zeros(len(start), dtype=bool) if solution.kept is None else solution.kept
+    feasible = None  # where levels have no limits, or it is not known
+    if np.isfinite(levels).any() and can_judge(case):
+        feasible = feasibility(case, setting.distributions, limits=case.limits)
     return Answer(
         setting=setting,
         before=before,
         after=after,
-        nominal=errors,
-        kept=stays or dict.fromkeys(own, False),
-        agreed=outcome.confirmed,
-        lost=_lost(setting, problem, nominal, values),
-        idle=tuple(int(i) + 1 for i in _idle(setting, before, after)),
+        nominal={side: float(m["rms_error_total"]) for side, m in nominal.items()},
+        kept=dict(zip(start, np.asarray(fixed).tolist())),
+        agreed=solution.confirmed,
+        lost=diagnostics.lost_outputs(runs, {side: [m] for side, m in nominal.items()}, values),
+        idle=tuple(int(i) + 1 for i in np.flatnonzero(np.isfinite(levels) & ~near)),
         tightened=attempt.tightened,
-        coarse_dt=problem.case.clock.dt,
-        integrator=problem.case.clock.integrator,
+        coarse_dt=problem.clock.dt,
+        integrator=problem.clock.integrator,
         measures=nominal,
-        feasibility=_feasibility(setting),
-        mended=mended,
+        feasibility=feasible,
     )
 
 
-def _lost(setting, problem, nominal, values):
-    """Return the outputs of the case's own run that no longer follow their setpoints."""
-    case = setting.tuned(problem.own_values())
-    own = Problem(case, problem.given["free"], setting.objective, {}, ())
-    return lost_outputs(own, {side: [table] for side, table in nominal.items()}, values)
-
-
-def _nominal(case, judged, needed):
+def _nominal(case, plants, needed):
     """Return the measures and margins of the case's own run; run now if not judged already."""
     margins = margin_measures(case.loop, case.clock)
     of_run = [m for m in needed if m not in ms.linear()]
@@ -558,54 +497,39 @@ def _nominal(case, judged, needed):
         key = jax.random.key(0) if noisy(case) else None
         return run_measures(case.loop, case.clock, key, of_run) | margins
 
-    if judged is None or not judged.nominal:
+    if plants is None or not plants.nominal:
         return make()
     names = (*reported_names(case.loop, of_run), *margins)
-    return Deferred(names, judged.nominal | margins, make)
+    return Deferred(names, plants.nominal | margins, make)
 
 
-def _idle(setting, before, after):
-    """Return the indices of the tanks that have a limit which no plant comes near."""
-    limited = np.isfinite(limited_levels(setting.case))
-    near = matters(setting, before, NEAR)
-    if after is not None:
-        near = near | matters(setting, after, NEAR)
-    return np.flatnonzero(limited & ~near)
-
-
-def _mean(judged: Judged | None) -> float:
+def _mean(plants: Judged | None) -> float:
     """Return the mean cost of the plants whose run is finite; NaN where there is none."""
-    if judged is None or judged.failed.all():
+    if plants is None or plants.failed.all():
         return float("nan")
-    return float(np.mean(judged.cost[~judged.failed]))
+    return float(np.mean(plants.cost[~plants.failed]))
 
 
-def _rows(answer: Answer, problem: Problem) -> list[ConstraintRow]:
+def _rows(answer):
     """Return a ConstraintRow for each limit: its worst value on the plants that judged."""
     if answer.after is None:
         return []
-    before, samples = answer.before.worst(), answer.after.samples
+    loop, scenario = answer.setting.case.loop, f"the worst of {answer.after.samples} plants"
     return [
-        row_of(
-            row["limit"],
-            problem,
-            row["value"],
-            before=old["value"],
-            scenario=f"the worst of {samples} plants",
-        )
-        for row, old in zip(answer.after.worst(), before)
+        row_of(row["limit"], loop, row["value"], before=old["value"], scenario=scenario)
+        for row, old in zip(answer.after.worst(), answer.before.worst())
     ]
 
 
-def _validation(answer, problem):
+def _validation(answer):
     """Return (summary, cloud) of the plants that judged, as `validation.summary_of`."""
     if answer.after is None:
         return None, None
     sides, setting = (answer.before, answer.after), answer.setting
-    cost, held, level = (
+    cost, holds, level = (
         np.stack([getattr(s, n) for s in sides], axis=1) for n in ("cost", "held", "level")
     )
     failed = sides[0].failed | sides[1].failed
     spread = {n: getattr(d, "relative", None) for n, d in setting.distributions.items()}
-    judged = Problem(setting.case, problem.given["free"], setting.objective, None, ())
-    return summary_of(judged, cost, held, level, failed, spread, True)
+    limits = resolve_limits(setting.case)
+    return summary_of(limits, cost, holds, level, failed, spread, True)

@@ -29,11 +29,8 @@ class EvaluationCache:
         """Return `result`, entered wherever it is to be kept."""
         return result
 
-    def in_memory(self) -> "EvaluationCache":
-        """Return a cache of the same results that writes nothing."""
-        cache = EvaluationCache()
-        cache.found = self.found
-        return cache
+    def close(self) -> None:
+        """Write nothing more."""
 
 
 class EvaluationLog(EvaluationCache):
@@ -48,7 +45,5 @@ class EvaluationLog(EvaluationCache):
         """Return `result` as it is read back from its record."""
         return self.store.put(key, tuple(result))
 
-    def in_memory(self) -> EvaluationCache:
-        """Return a cache of the same results that writes nothing; close the file of this one."""
+    def close(self) -> None:
         self.store.close()
-        return super().in_memory()

@@ -56,10 +56,10 @@ def validate(problem, before, after, samples, seed):
                 held[i, side] = all(limit.margin(row) >= 0 for limit in limits)
     noise = any(run.key is not None for run in runs)
     spread = {n: float(s) for n, s in problem.case.uncertain.items()}
-    return summary_of(problem, costs, held, levels, diverged, spread, noise)
+    return summary_of(problem.limits, costs, held, levels, diverged, spread, noise)
 
 
-def summary_of(problem, costs, held, levels, diverged, spread, noise):
+def summary_of(limits, costs, held, levels, diverged, spread, noise):
     """Return (summary, cloud) of runs before and after tuning, on the same draws."""
     good = ~diverged & np.isfinite(costs).all(axis=1)
     both = good & held.all(axis=1)
@@ -74,7 +74,7 @@ def summary_of(problem, costs, held, levels, diverged, spread, noise):
         "comparable": _share(both[good]),
         "better_share_of_comparable": _share(costs[both, 1] < costs[both, 0]),
     }
-    limits = {limit.index: limit.value for limit in problem.limits if limit.measure == "max_level"}
+    limits = {limit.index: limit.value for limit in limits if limit.measure == "max_level"}
     levels = levels[good][:, :, sorted(limits) if limits else slice(None)]
     differ = len(set(limits.values())) > 1
     if differ:  # tanks with limits of their own: how far above its limit the worst is

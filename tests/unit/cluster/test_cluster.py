@@ -35,7 +35,7 @@ psutil = pytest.importorskip("psutil", reason="Dask is not installed")
 
 SPREAD = {"plant.drain": 0.05, "plant.pump_gain": tuning.Normal(relative=0.05)}
 OPTIONS = {"samples": 400, "key": 3, "batch": 16, "fan": False}  # 25 batches
-SEARCH = {"nominal": True, "starts": 2, "screening": 8, "validation": 0}
+SEARCH = tuning.Options(starts=2, screening=8, validation=0)
 
 
 @pytest.fixture(scope="module")
@@ -160,22 +160,23 @@ def answer(result):
 
 def test_searches_on_workers_lead_to_the_answer_of_one_process(case, tmp_path):
     """And a search that is continued sends what its log lacks, and no more."""
-    whole = repr(answer(tuning.tune(case, **SEARCH, checkpoint=tmp_path)))
-    options = {**SEARCH, "checkpoint": tmp_path, "resume": True}
-    assert repr(answer(tuning.tune(case, **options, cluster=Refusing()))) == whole
+    whole = repr(answer(tuning.tune(case, SEARCH, checkpoint=tmp_path)))
+    on = lambda cluster: dataclasses.replace(SEARCH, cluster=cluster)
+    again = tuning.tune(case, on(Refusing()), checkpoint=tmp_path, resume=True)
+    assert repr(answer(again)) == whole
     with pytest.raises(InputError, match="AssertionError"):
-        tuning.tune(case, **SEARCH, cluster=Refusing())
+        tuning.tune(case, on(Refusing()))
     with Counting() as pool:
-        assert repr(answer(tuning.tune(case, **SEARCH, cluster=pool))) == whole
-        assert len(pool.sizes) == SEARCH["starts"]
+        assert repr(answer(tuning.tune(case, on(pool)))) == whole
+        assert len(pool.sizes) == SEARCH.starts
 
 
 @pytest.mark.slow
 def test_robust_searches_on_workers_lead_to_the_answer_of_one_process(case):
-    options = {"starts": 2, "screening": 8, "validation": 0, "samples": 4, "fresh": 16}
+    robust = lambda method: tuning.tune_robust(case, SPREAD, samples=4, fresh=16, method=method)
     with Counting() as pool:
-        there = tuning.tune_robust(case, SPREAD, **options, cluster=pool)
-    assert repr(answer(there)) == repr(answer(tuning.tune_robust(case, SPREAD, **options)))
+        there = robust(dataclasses.replace(SEARCH, cluster=pool))
+    assert repr(answer(there)) == repr(answer(robust(SEARCH)))
 
 
 def test_workers_that_are_lost_are_one_line_and_the_run_goes_on(case, whole, tmp_path):
@@ -264,9 +265,14 @@ def test_what_is_no_cluster_is_refused(case, cluster):
 def test_where_nobody_answers_is_an_error_in_time(case, monkeypatch, tmp_path):
     assert engines.CONNECT <= 9.0
     monkeypatch.setattr(engines, "CONNECT", 0.5)
-    for run in (tuning.ensemble, tuning.tune, tuning.tune_robust):
+    nobody = tuning.Options(cluster="127.0.0.1:1")
+    for run, options in (
+        (tuning.ensemble, {"cluster": "127.0.0.1:1"}),
+        (tuning.tune, {"method": nobody}),
+        (tuning.tune_robust, {"method": nobody}),
+    ):
         with pytest.raises(InputError, match=r"^cluster 127.0.0.1:1: no Dask scheduler answers"):
-            run(case, cluster="127.0.0.1:1", checkpoint=tmp_path / "run")
+            run(case, **options, checkpoint=tmp_path / "run")
     assert not any(tmp_path.iterdir())
 
 

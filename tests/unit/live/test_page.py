@@ -368,7 +368,7 @@ def test_the_search_of_the_page_ends_where_that_of_the_command_ends(browser, wri
     import tuning
 
     case = presets.find("cascaded/pi")
-    wanted = tuning.tune(case, nominal=True, starts=1, screening=16).objective
+    wanted = tuning.tune(case, tuning.Options(starts=1, screening=16)).objective
     with opened(browser, written) as live:
         found = live("jaxtank.tune()")
         assert found["violation"] == 0.0

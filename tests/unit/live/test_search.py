@@ -75,7 +75,7 @@ def ends_like_the_command(name):
     case = presets.find(name).replace(scenarios=())
     search = resources.files("jaxtank.live").joinpath("tune.js").read_text("utf-8")
     found = node(engine(case) + search + SEARCH)
-    wanted = tuning.tune(case, nominal=True, validation=0)
+    wanted = tuning.tune(case, tuning.Options(validation=0), nominal=True)
     loop = jaxtank.with_values(case.loop, found["values"])
     measures = [*case.objective, *(limit.measure for limit in resolve_limits(case))]
     own = jaxtank.evaluate(loop, case.clock, list(dict.fromkeys(measures)))

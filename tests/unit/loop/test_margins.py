@@ -230,8 +230,8 @@ def test_a_limit_on_the_sensitivity_peak_is_kept_by_a_search_and_costs_error():
         free={"controller.Kc": (0.5, 30.0)},
         objective={"mean_square_error": 1.0},
     )
-    given = dict(nominal=True, starts=1, screening=4, validation=0, iterations=15)
-    result = tuning.tune(case, **given)
+    few = tuning.Options(starts=1, screening=4, validation=0, iterations=15)
+    result = tuning.tune(case, few)
     (row,) = result.constraints
     assert row.value == pytest.approx(1.4, rel=1e-3) and row.margin >= -1e-6
     gain = result["controller.Kc[0]"].after

@@ -23,6 +23,8 @@ from jaxtank.signals.inflows import inflow_pulses
 from tuning.cli import main
 from tuning.report import tuned as report
 
+FEW = tuning.Options(starts=1, screening=2, iterations=2, validation=0)
+
 ONE = """
 tank = [{{ area = 20.0, rim = 20.0, drain = {drain}, level = 5.0 }}]
 pump = [{{ gain = 8.0, to = 1, high = 12.0, initial = 0.0 }}]
@@ -201,7 +203,7 @@ def test_an_answer_states_that_its_run_is_of_steps_too_long(last, substeps, word
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", step_size.StepWarning)
         case = rig.loads(COLANDER.format(last=last, substeps=substeps))
-        result = tuning.tune(case, nominal=True, starts=1, screening=2, iterations=2, validation=0)
+        result = tuning.tune(case, FEW)
         reported = [repr(result), json.dumps(report.json_of(result), ensure_ascii=False)]
         if words == WRONG:  # the page as well: its pictures take longer than the search
             result.save(tmp_path)
@@ -221,7 +223,7 @@ def test_an_answer_states_it_of_a_scenario_too():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", step_size.StepWarning)
         case = rig.from_table({**tomllib.loads(text), "scenario": [{"name": "high"}, low]})
-        result = tuning.tune(case, nominal=True, starts=1, screening=2, iterations=2, validation=0)
+        result = tuning.tune(case, FEW)
     assert result.message.startswith(f"scenario low: {WRONG}")
 
 

@@ -152,7 +152,7 @@ def test_a_registered_measure_is_evaluated_with_its_derivative(registered):
 def test_a_registered_measure_is_tuned_by_limited_and_drawn(registered):
     case = rig.loads(RIG)
     assert rig.loads(rig.dump(case)).objective == {"triple": 1.0}
-    result = tuning.tune(case, tuning.SQP(starts=1, screening=2, iterations=5), validation=0)
+    result = tuning.tune(case, tuning.SQP(starts=1, screening=2, iterations=5, validation=0))
     assert result.objective["after"] <= result.objective["before"]
     assert result.measures["after"]["triple"] == pytest.approx([result.objective["after"]])
     assert [row["name"] for row in result.constraints] == ["input_rate"]

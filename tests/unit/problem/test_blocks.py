@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from jaxtank import presets, rig
-from tuning.problem.problem import IDLE, LANES, Blocks, Problem
+from tuning.problem.evaluator import IDLE, Blocks, Evaluator
+from tuning.problem.problem import LANES, Problem
 
 
 @pytest.mark.parametrize("runs", [1, 3, 32, 1024])
@@ -25,13 +26,12 @@ def test_a_program_of_its_own_serves_where_filling_up_would_cost_more():
 
 def test_each_point_has_the_cost_that_it_has_alone(monkeypatch):
     case = rig.set_values(presets.find("cascaded/pi"), {"clock.dt": 8.0})
-    problem = Problem(case, limits={"max_level": 9.0})
-    zs = np.random.default_rng(0).uniform(0.2, 0.8, (7, len(problem.bounds)))
+    problem = Evaluator(Problem(case, limits={"max_level": 9.0}))
+    zs = np.random.default_rng(0).uniform(0.2, 0.8, (7, len(problem.problem.bounds)))
     costs, margins = problem.screen(zs)
-    sizes, screen = [], problem._screen
-    monkeypatch.setattr(
-        problem, "_screen", lambda some, c: sizes.append(len(some)) or screen(some, c)
-    )
+    sizes, screen = [], Problem._screen
+    record = lambda self, some, coarse: sizes.append(len(some)) or screen(self, some, coarse)
+    monkeypatch.setattr(Problem, "_screen", record)
     for i in (0, 3, 6):
         alone = problem.screen(zs[i : i + 1])
         np.testing.assert_allclose(alone[0], costs[i : i + 1], rtol=1e-12)

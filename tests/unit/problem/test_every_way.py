@@ -1,19 +1,25 @@
 """Problems of the nominal optimum, of many plants and of the default answer: one interface."""
 
 import dataclasses
-import inspect
 
 import numpy as np
 import pytest
 
 from jaxtank import presets
+from tuning.problem.evaluator import Evaluator
 from tuning.problem.problem import Problem
-from tuning.search.attempts import Checks, Task
+from tuning.search.default import Checks, problem_of
 from tuning.search.setting import scenarios_of, setting_of
-from tuning.search.stages import Plan
 
-FREE = {"controller.Kc": (0.2, 4.0), "controller.Ti": (20.0, 400.0)}
+FREE = {"controller.Kc": (0.2, 4.0)}
 LIMITS = {"max_level": 9.0}
+
+
+@pytest.fixture(scope="module")
+def case():
+    """Its clock leaves a coarse step."""
+    case = presets.find("cascaded/pi")
+    return case.replace(clock=dataclasses.replace(case.clock, dt=0.4, duration=4000.0, substeps=1))
 
 
 def nominal(case):
@@ -24,72 +30,62 @@ def robust(case):
     return Problem(case, FREE, limits=LIMITS, scenarios=scenarios_of(case, samples=4), risk="cvar")
 
 
-def default(case, checked=False):
+def default(case, checks=None):
     setting = setting_of(case, limits=LIMITS)
-    plan = Plan(method="slsqp", starts=1, screening=1, iterations=1, seed=0)
-    task = Task(FREE, plan, 4, None)
-    checks = Checks(setting, setting.searched, FREE, setting.limits, {}) if checked else None
-    if checks:
-        checks.look(checks.problem.start())
-    return task.problem(setting, setting.searched, checks)
+    return problem_of(setting, setting.searched, FREE, 0, checks)
 
 
 def default_with_checks(case):
-    return default(case, checked=True)
+    setting = setting_of(case, limits=LIMITS)
+    checks = Checks(setting, setting.searched, FREE, setting.limits, {})
+    checks.look(checks.problem.start())
+    return default(case, checks)
 
 
-def points(problem):
-    """What each public name of a Problem gives at one point; the names are checked to be all."""
-    limits, z = problem.with_limits(LIMITS), problem.start()
-    point = problem.point(z)
-    coarse = problem.coarse_point(z)
-    batch = problem.batch_point(z, 3, np.random.default_rng(0))
-    return {
-        "with_limits": limits,
-        "names": problem.names,
-        "model": problem.model,
-        "start": z,
-        "own_values": problem.own_values(),
-        "values": problem.values(z),
-        "loop_at": problem.loop_at(z),
-        "cost": [problem.cost(row) for row in point.measures],
-        "total": problem.total(point.measures),
-        "shares": problem.shares(point.run_costs, range(len(problem.runs))),
-        "margins": problem.margins(point.measures),
-        "screen": [problem.screen(z[None], coarse=way) for way in (False, True)],
-        "point": point,
-        "coarse_point": coarse,
-        "batch_point": batch,
-    }
+EVERY = [nominal, robust, default, default_with_checks]
 
 
-@pytest.mark.parametrize("make", [nominal, robust, default, default_with_checks])
-def test_every_public_method_serves_every_problem(make):
-    """The clock leaves a coarse step, and the noise of the default answer is drawn beforehand."""
-    case = presets.find("cascaded/pi")
-    case = case.replace(clock=dataclasses.replace(case.clock, dt=0.4, duration=4000.0, substeps=1))
+@pytest.mark.parametrize("make", EVERY)
+def test_every_problem_is_run_at_every_step(case, make):
+    """The noise of the default answer is drawn beforehand, and not for the coarse step."""
     problem = make(case)
-    found = points(problem)
-    assert set(found) == {n for n, _ in inspect.getmembers(Problem) if not n.startswith("_")}
-    (true, margins), (coarse, _) = found["screen"]
-    assert true[0] == pytest.approx(found["point"].cost, rel=1e-9)
-    assert coarse[0] == pytest.approx(found["coarse_point"].cost, rel=1e-9)
-    assert coarse[0] != true[0] and coarse[0] == pytest.approx(true[0], rel=0.5)
-    assert found["total"] == pytest.approx(found["point"].cost, rel=1e-9)
+    z = problem.start()
+    (cost,), margins = problem.screen(z[None])
+    (rough,), _ = problem.screen(z[None], coarse=True)
+    assert rough != cost and rough == pytest.approx(cost, rel=0.5)
     assert margins.shape == (1, len(problem.limits))
-    for point in (found["point"], found["coarse_point"], found["batch_point"]):
-        assert point.finite and point.gradient.shape == (2,)
 
 
-def test_noise_that_is_drawn_beforehand_changes_no_coarse_run():
+@pytest.mark.slow
+@pytest.mark.parametrize("make", EVERY)
+def test_every_problem_has_derivatives_at_every_step(case, make):
+    problem = make(case)
+    z = problem.start()
+    point, coarse = problem.point(z), problem.coarse_point(z)
+    assert problem.screen(z[None])[0][0] == pytest.approx(point.cost, rel=1e-9)
+    assert problem.screen(z[None], coarse=True)[0][0] == pytest.approx(coarse.cost, rel=1e-9)
+    assert problem.total(point.measures) == pytest.approx(point.cost, rel=1e-9)
+    batch = problem.batch_point(z, problem.batch(3, np.random.default_rng(0)))
+    for one in (point, coarse, batch):
+        assert one.finite and one.gradient.shape == (1,)
+
+
+def test_a_problem_is_frozen_and_its_evaluator_counts(case, monkeypatch):
+    problem = Problem(case.replace(clock=dataclasses.replace(case.clock, dt=8.0)), FREE, limits={})
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        problem.limits = []
+    calls = []
+    monkeypatch.setattr(Problem, "_screen", lambda *a: calls.append(a) or (np.ones(2), a[1][:, :0]))
+    evaluator, zs = Evaluator(problem), np.array([[0.2], [0.4]])
+    first, again = evaluator.screen(zs), evaluator.screen(zs)
+    assert first[0].tolist() == again[0].tolist() and len(calls) == 1  # known the second time
+    assert evaluator.simulations == 4 and evaluator.gradients == 0
+
+
+def test_noise_that_is_drawn_beforehand_changes_no_coarse_run(case):
     """As the same group without: the coarse clock draws its own numbers from the same keys."""
-    case = presets.find("cascaded/pi")
-    drawn = default(
-        case.replace(clock=dataclasses.replace(case.clock, dt=0.4, duration=4000.0, substeps=1))
-    )
-    z = drawn.start()
+    drawn = default(case)
     assert all(group.noise is not None for group in drawn.groups)
-    costs = drawn.screen(z[None], coarse=True)[0], drawn.coarse_point(z).cost
-    drawn.groups = [group._replace(noise=None) for group in drawn.groups]
-    drawn.cache = type(drawn.cache)()
-    assert (drawn.screen(z[None], coarse=True)[0], drawn.coarse_point(z).cost) == costs
+    plain = drawn.replace(groups=[group._replace(noise=None) for group in drawn.groups])
+    z = drawn.start()[None]
+    assert drawn.screen(z, coarse=True)[0] == plain.screen(z, coarse=True)[0]

@@ -99,10 +99,11 @@ def saves(gouta, tmp_path_factory):
         log, free = read_log(path, case.loop, {}, "."), {"plant.pump_gain[0]": (1.0, 20.0)}
         return tuning.identify(case, [log], free, start="measured", starts=1, iterations=3)
 
-    limits, search = {"max_level": 30.0}, {"starts": 1, "screening": 2, "iterations": 3}
+    limits = {"max_level": 30.0}
+    search = tuning.Options(starts=1, screening=2, iterations=3, validation=4)
     area = {"plant.drain[0]": tuning.Uniform(relative=0.05)}
     makers = {
-        "tune": lambda: tuning.tune(case, nominal=True, validation=4, limits=limits, **search),
+        "tune": lambda: tuning.tune(case, search, limits=limits),
         "uncertainty": lambda: tuning.ensemble(case, samples=4, limits={"max_level": 9.0}),
         "sensitivity": lambda: tuning.sensitivity(case, area, measures=["rms_error_total"]),
         "identify": identified,

@@ -12,9 +12,10 @@ import jaxtank
 import tuning
 from jaxtank import rig
 from tuning.report import tuned as report
-from tuning.search.robust import Certificate, certificate_messages
+from tuning.search import messages
+from tuning.search.robust import Certificate
 
-SEARCH = {"starts": 1, "screening": 1, "iterations": 2, "limits": {}}
+SEARCH = tuning.Options(starts=1, screening=1, iterations=2, validation=0)
 RESTS = "; the other rows: the case's own run, on its own plant"
 
 
@@ -27,13 +28,19 @@ def case():
     return rig.set_values(one, {"clock.dt": 0.5, "clock.duration": 40.0})
 
 
+def of_certificate(certificate, risk):
+    """The messages about a certificate."""
+    result = SimpleNamespace(certificate=certificate, problem=SimpleNamespace(risk=risk))
+    return list(messages._on_new_plants(result))
+
+
 def row(page, name):
     """The cells of the first row of that name: unit, before, after."""
     return next(line for line in page.splitlines() if line.startswith(f"{name} ")).split()[1:]
 
 
 def test_the_objective_is_of_the_plants_and_the_other_rows_are_of_the_case(case):
-    result = tuning.tune_robust(case, samples=3, fresh=4, **SEARCH)
+    result = tuning.tune_robust(case, samples=3, fresh=4, limits={}, method=SEARCH)
     page = repr(result)
     assert f"objective: rms_error_total; the mean of 3 plants{RESTS}" in page
     costs = [s["objective"]["after"] for s in report.scenario_rows(result)]
@@ -55,7 +62,7 @@ def test_scenarios_are_reported_as_such(weights, words):
 
 def test_a_single_run_needs_no_such_line(case):
     """What is not a number is explained, and so is a rig without validation runs."""
-    result = tuning.tune(case, nominal=True, validation=0, **SEARCH)
+    result = tuning.tune(case, SEARCH, limits={})
     page = repr(result)
     assert "other rows" not in page and "\nobjective: rms_error_total\n" in page
     assert "none, because" not in page and "no validation" not in page
@@ -75,7 +82,7 @@ def test_what_was_expected_stands_apart_from_what_was_measured():
     found.
     """
     known = Certificate(16, 1, 0.8, 256, 2, [0.00095, 0.028])
-    measured, bound, expected = certificate_messages(known, "worst", 0.0)
+    measured, bound, expected = of_certificate(known, "worst")
     assert measured.code == "limit-violated-out-of-sample" and "256" in measured.text
     assert "at most 0.8 " in bound.text
     assert expected.code == "support-scenarios" and "5.9 %" in expected.text
@@ -87,7 +94,7 @@ def test_nothing_is_expected_where_nothing_was_violated_or_limits_were_tightened
         (0, 0.0, "limits-hold-out-of-sample"),
         (2, 0.03, "limit-violated-out-of-sample"),
     ):
-        known = Certificate(16, 1, 0.8, 256, broken, [0.0, 0.028])
-        codes = [m.code for m in certificate_messages(known, "mean", back_off)]
+        known = Certificate(16, 1, 0.8, 256, broken, [0.0, 0.028], back_off)
+        codes = [m.code for m in of_certificate(known, "mean")]
         assert codes[0] == code and "support-scenarios" not in codes
         assert ("constraints-tightened" in codes) == (back_off > 0)

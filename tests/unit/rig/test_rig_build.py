@@ -148,7 +148,7 @@ def test_read_back_as_written(source, tmp_path):
 def test_the_step_task_of_the_watertank_is_met(tmp_path):
     """Rise below 2.5 s, settling below 20 s, overshoot below 5 %, which the starting gains miss."""
     case = rig.load(RIGS / "watertank.toml")
-    result = tuning.tune(case, nominal=True, starts=2, screening=32, validation=0)
+    result = tuning.tune(case, tuning.Options(starts=2, screening=32, validation=0))
     measures = result.measures
     assert (
         result.success

@@ -7,7 +7,7 @@ import jaxtank
 import tuning
 from jaxtank import rig
 from jaxtank.core.tree import with_values
-from tuning.search.attempts import LARGEST, SHARE, Checks
+from tuning.search.default import LARGEST, SHARE, Checks
 from tuning.search.setting import setting_of
 
 TANK = """
@@ -72,13 +72,21 @@ def test_plants_do_not_follow_the_seed_and_a_violation_tightens_more(looked, cas
     assert more.tightening[key] == 0.7 > checks.tightening[key]
 
 
-def test_the_answer_keeps_its_limits_and_is_left_alone_when_tuned_again(case):
-    result = tuning.tune(case, validation=64)
+@pytest.fixture(scope="module")
+def result(case):
+    return tuning.tune(case, tuning.Options(validation=64))
+
+
+def test_the_answer_keeps_its_limits(result):
     answer = result.answer
     assert result.status == "converged" and answer.held and 0.0 < answer.tightened <= LARGEST
     assert answer.before.held.mean() < 0.5  # the limit is one that the start violates
     worst = answer.after.measures["overshoot_percent"].max()
     assert 3.0 < worst <= 4.0  # near its limit
-    again = tuning.tune(result.tuned, validation=64)
+
+
+@pytest.mark.slow
+def test_the_answer_is_left_alone_when_tuned_again(result):
+    again = tuning.tune(result.tuned, tuning.Options(validation=64))
     assert all(again.answer.kept.values()) and again.answer.held
     assert again["controller.Ti[0]"].after == result["controller.Ti[0]"].after

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from helpers import RIGS
 
+import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from tuning.cli import main
 from tuning.problem.controllers import START, with_kind
-from tuning.search import tuner
 
-QUICK = dict(starts=1, screening=8, validation=0, iterations=40)
+QUICK = tuning.Options(starts=1, screening=8, validation=0, iterations=40)
 
 
 @pytest.fixture(scope="module")
@@ -85,11 +85,11 @@ def test_every_kind_has_first_gains_for_a_rig_that_it_fits(kind):
 def test_the_best_kind_is_that_of_searches_of_each_kind_alone(watertank):
     """Each described in a rig file, with the gains and ranges that the choice begins with."""
     kinds, watertank = ["pid", "lqi"], rig.set_values(watertank, {"clock.dt": 0.2})
-    chosen = tuner.tune(watertank, choices={"controller.kind": kinds}, **QUICK)
+    chosen = tuning.tune_choices(watertank, {"controller.kind": kinds}, QUICK)
     alone = {}
     for kind in kinds:
         case = rig.loads(rig.dump(with_kind(watertank, kind)))
-        alone[kind] = tuner.tune(case, **QUICK)
+        alone[kind] = tuning.tune(case, QUICK)
     after = {kind: found.objective["after"] for kind, found in alone.items()}
     rows = {row["values"]["controller.kind"]: row for row in chosen.choices}
     for kind in kinds:
@@ -141,22 +141,19 @@ def test_a_kind_that_does_not_fit_is_a_row_with_the_reason(watertank, capsys):
 )
 def test_a_choice_that_cannot_be_made_is_refused_in_one_line(watertank, choices, free, words):
     with pytest.raises(InputError, match=words) as error:
-        tuner.tune(watertank, choices=choices, free=free, **QUICK)
+        tuning.tune_choices(watertank, choices, QUICK, free=free)
     assert "\n" not in str(error.value)
 
 
 def test_what_is_named_free_counts_for_the_kinds_that_have_it(watertank):
     free = {"controller.Kc": (1.0, 10.0)}
-    result = tuner.tune(
-        watertank,
-        choices={"controller.kind": ["pid", "enmpc"]},
-        free=free,
-        **QUICK | {"iterations": 3, "screening": 4},
-    )
+    few = tuning.Options(starts=1, screening=4, validation=0, iterations=3)
+    kinds = {"controller.kind": ["pid", "enmpc"]}
+    result = tuning.tune_choices(watertank, kinds, few, free=free)
     pid, other = (set(row["parameters"]) for row in result.choices)
     assert pid == {"controller.Kc[0]"} and other == {"controller.Tp"}
 
 
 def test_choices_that_are_no_mapping_are_refused(watertank):
     with pytest.raises(InputError, match=r"choices = \['controller.kind'\]: must be \{name:"):
-        tuner.tune(watertank, choices=["controller.kind"], **QUICK)
+        tuning.tune_choices(watertank, ["controller.kind"], QUICK)

@@ -9,6 +9,7 @@ import tuning
 from jaxtank import presets, rig
 from tuning.problem.reported import in_force
 from tuning.search.messages import messages_of
+from tuning.uncertainty.sensitivity_study import UNUSABLE
 
 WORDS = ["--nominal", "--starts", "1", "--screening", "1", "--validation", "0", "--quiet"]
 
@@ -55,6 +56,7 @@ def fragile(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_a_nominal_answer_with_a_high_sensitivity_peak_is_news_of_the_headline(fragile):
     fixed = [f"--free=controller.Kc[{i}]=10:3000" for i in range(2)]
     found = command("tune", str(fragile), *fixed, *WORDS, "--json").json
@@ -63,6 +65,7 @@ def test_a_nominal_answer_with_a_high_sensitivity_peak_is_news_of_the_headline(f
     assert "at the edge of sampled stability (Ms = " in found["headline"]
 
 
+@pytest.mark.slow
 def test_the_default_answer_of_a_fragile_start_prefers_a_lower_sensitivity_peak(fragile):
     """The search alone ends at 3.45, below the start's 6.56."""
     found = tuning.tune(rig.load(fragile))
@@ -70,27 +73,10 @@ def test_the_default_answer_of_a_fragile_start_prefers_a_lower_sensitivity_peak(
     assert before > 6.0 and after < 2.8
 
 
-@pytest.mark.slow
-def test_a_calm_nominal_answer_costs_no_program_of_margins():
-    """Gains move by large factors, and the pumps less than before."""
-    found = command("tune", "gouta2015/backstepping", *WORDS, "--json").json
-    travel = [np.max(found["measures"][side]["input_travel"]) for side in ("before", "after")]
-    assert travel[1] < 1.1 * travel[0]
-    ratios = [p["after"] / p["before"] for p in found["parameters"].values()]
-    assert max(abs(np.log10(ratios))) > 1.0
-    assert "sensitivity_peak" not in found["measures"]["after"]
-    assert found["headline"] == found["status"]
-
-
-@pytest.mark.slow
 def test_a_sensitivity_peak_of_four_is_news_and_one_of_two_is_none():
     result = tuning.tune(
-        presets.find("cascaded/pi"),
-        nominal=True,
-        starts=1,
-        screening=1,
-        iterations=1,
-        validation=0,
+        rig.set_values(presets.find("cascaded/pi"), {"clock.dt": 20.0}),
+        tuning.Options(starts=1, screening=1, iterations=1, validation=0),
         limits={},
     )
 
@@ -127,13 +113,40 @@ def test_a_tuned_width_is_at_most_its_size():
     clock = jaxtank.Clock(dt=case.clock.dt, duration=100.0)
     found = tuning.tune(
         case.replace(clock=clock),
-        nominal=True,
+        tuning.Options(starts=2, screening=8, iterations=8, validation=0),
         free={"controller.b": (0.3, 12.0), "controller.w": (0.05, 12.0)},
-        starts=2,
-        screening=8,
-        iterations=8,
-        validation=0,
     )
     for i in range(2):
         b, w = (found[f"controller.{n}[{i}]"].after for n in "bw")
         assert w <= b or w == found[f"controller.w[{i}]"].before
+
+
+@pytest.mark.slow
+def test_a_search_without_a_slope_has_not_converged():
+    """calofir far from its gains: a limit cycle, exact slope 1e12 times that of runs beside it."""
+    gains = ["--set", "controller.K_phi=0.9", "--set", "controller.K_y=0.9"]
+    words = ["--nominal", "--starts", "1", "--screening", "1", "--validation", "0", "--json"]
+    done = command("tune", "calofir/backstepping", *gains, *words, "--quiet")
+    found = done.json
+    first = found["starts"][0]
+    assert (first["evaluations"], first["converged"], first["slope_usable"]) == (0, False, False)
+    assert not found["slopes"]["start"]["usable"] and found["slopes"]["start"]["orders_above"] > 2
+    (text,) = (m["text"] for m in found["messages"] if m["code"] == "slope-not-usable")
+    assert "the values before tuning" in text and "differential evolution" in text
+    # the derivative-free stages went on: 0.0213 and 0.139 (or exchanged) are the optimum
+    assert done.code == 0 and found["slopes"]["answer"]["usable"]
+    assert found["objective"]["after"] == pytest.approx(0.005951265, rel=1e-5)
+
+
+@pytest.fixture(scope="module")
+def exploding():
+    """k dt = 3: the sampled loop doubles its error in each sample until the pumps saturate."""
+    settings = {"clock.dt": 0.1, "clock.duration": 60.0, "controller.k": 30.0}
+    return rig.set_values(presets.find("gouta2015/backstepping"), settings)
+
+
+def test_the_local_table_has_no_slope_that_runs_contradict(exploding):
+    found = tuning.sensitivity(exploding, {"controller.k": 0.1}, method="local")
+    error = next(c for c in found.columns if c.measure == "rms_error_total")
+    assert np.isnan(error.effects["effect"]).all()
+    assert error.reason == UNUSABLE and UNUSABLE in str(found)

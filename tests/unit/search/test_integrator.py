@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from jaxtank import Clock, presets, rig
-from jaxtank.loop.closed_loop import takes_arrays
-from tuning.search.setting import LARGEST_ERROR, height, input_range, midpoint_error, setting_of
+from tuning.search.setting import LARGEST_ERROR, midpoint_error, setting_of
 
 TANK = """
 name = "one tank"
@@ -44,13 +43,6 @@ def test_the_error_is_that_of_the_rule_written_out(dt):
     assert found == pytest.approx(by_hand(dt), rel=0.3)
 
 
-def test_half_the_step_has_a_fourth_of_the_error():
-    case = presets.find("gouta2015/ngpc")
-    size, span = height(case), input_range(case)
-    errors = [midpoint_error(case, Clock(dt=dt), size, span) for dt in (0.1, 0.05)]
-    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.05)
-
-
 def test_searches_at_a_longer_step_use_it_where_its_error_is_small():
     setting = setting_of(presets.find("gouta2015/backstepping"))
     coarse = setting.coarse()
@@ -71,18 +63,3 @@ def test_the_midpoint_rule_is_refused_where_a_tank_empties_too_fast():
     assert midpoint_error(own, clock, 3.0, np.array([2.0])) == np.inf
     clock = Clock(dt=1.9 / rate, duration=100.0)
     assert midpoint_error(own, clock, 3.0, np.array([2.0])) < np.inf
-
-
-def row(tanks):
-    """A rig of equal tanks without connections; the pump feeds the first."""
-    one = "{ area = 20.0, rim = 20.0, drain = 2.0, level = 1.0 }"
-    head, _, tail = TANK.replace("DRAIN", "2.0").partition("tank = ")
-    return rig.loads(f"{head}tank = [{', '.join([one] * tanks)}]\n{tail.partition(chr(10))[2]}")
-
-
-def test_arrays_and_scalars_give_about_the_same_error():
-    clock, span = Clock(dt=1.0, duration=100.0), np.array([2.0])
-    nine, ten = row(9), row(10)
-    assert [takes_arrays(case.loop) for case in (nine, ten)] == [False, True]
-    errors = [midpoint_error(case, clock, 20.0, span) for case in (nine, ten)]
-    assert errors[0] == pytest.approx(errors[1], rel=0.3)

@@ -13,6 +13,7 @@ from jaxtank.loop import run
 from jaxtank.loop.derivatives import OUTER
 from jaxtank.rig.values import schedule
 from jaxtank.signals.setpoints import ramps
+from tuning.problem.evaluator import Evaluator
 from tuning.problem.problem import Problem
 from tuning.problem.scenarios import coarse_clock
 from tuning.search.driver import Search
@@ -30,7 +31,8 @@ def eight():
 def searched(problem, method, iterations=60):
     """(Search after a local search from the case's values, passes at a tenth of the samples)."""
     rough, z = [], problem.start()
-    search = Search(problem, problem.point(z), lambda search: rough.append(len(search.history)))
+    report = lambda search: rough.append(len(search.history))
+    search = Search(Evaluator(problem), problem.point(z), report)
     METHODS[method](search, z, iterations)
     return search, len(rough) - len(search.history)
 
@@ -70,6 +72,7 @@ def test_a_short_run_has_no_rough_one(gouta):
     assert coarse_clock(longer).dt == 10 * clock.dt and coarse_clock(longer).duration == 400.0
 
 
+@pytest.mark.slow
 def test_rough_search_starts_the_true_one(gouta):
     case = quick(gouta, objective={"mean_square_error": 1.0, "mean_square_travel": 100.0})
     case = case.replace(clock=dataclasses.replace(case.clock, duration=400.0))

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from jaxtank import presets, rig
+from tuning.problem.evaluator import Evaluator
 from tuning.problem.problem import Problem
 from tuning.search import small_changes as robustness
 from tuning.search.driver import Search
 from tuning.search.setting import setting_of
 from tuning.search.small_changes import LINE
-from tuning.search.stages import Outcome
+from tuning.search.solve import Solution
 
 
 @pytest.fixture(scope="module")
@@ -18,8 +19,9 @@ def answered():
     case = rig.set_values(presets.find("cascaded/pi"), {"clock.duration": 800.0})
     setting = setting_of(case)
     problem = Problem(setting.searched, None, setting.objective, {}, None, 0)
-    reference = problem.point(problem.start())
-    search = Search(problem, reference, lambda search: None, 1e-4)
+    evaluator = Evaluator(problem)
+    reference = evaluator.point(problem.start())
+    search = Search(evaluator, reference, tolerance=1e-4)
     search.take(reference)
     return setting, problem, search
 
@@ -29,7 +31,7 @@ def found_at(problem, search, Kc):
     low, high = problem.case.free["controller.Kc"][:2]
     z = np.array([np.log(Kc / low) / np.log(high / low), problem.start()[1]])
     search.take(search.point(z))
-    return Outcome(search=search, z=z, kept=np.array([False, True]))
+    return Solution(search=search, z=z, kept=np.array([False, True]))
 
 
 def peak(setting, problem, z):
@@ -46,7 +48,7 @@ def test_a_fragile_answer_moves_back_as_far_as_its_sensitivity_peak_asks(answere
     monkeypatch.setattr(robustness, "PRICE", 1.0)
     allowed = max(robustness.PEAK, peak(setting, problem, first))
     assert peak(setting, problem, before) > allowed == 2.5
-    robustness.move_back(setting, problem, found)
+    robustness.move_back(setting, found)
     assert peak(setting, problem, found.z) <= allowed
     assert peak(setting, problem, found.z - (first - before) / LINE) > allowed
     assert found.kept.tolist() == [False, True]
@@ -60,9 +62,9 @@ def test_tuned_again_the_answer_stays(answered, monkeypatch):
     case = rig.set_values(setting.case, {"controller.Kc": [earlier]})
     again = setting_of(case)
     problem = Problem(again.searched, None, again.objective, {}, None, 0)
-    search = Search(problem, problem.point(problem.start()), lambda search: None, 1e-4)
+    search = Search(Evaluator(problem), problem.point(problem.start()), tolerance=1e-4)
     found = found_at(problem, search, 1.6)
-    robustness.move_back(again, problem, found)
+    robustness.move_back(again, found)
     assert np.array_equal(found.z, problem.start()) and found.kept.all()
 
 
@@ -74,5 +76,5 @@ def test_an_answer_stays_that_is_robust_enough_or_for_which_it_costs_too_much(
     found = found_at(problem, search, Kc)
     before = found.z
     monkeypatch.setattr(robustness, "PRICE", price)
-    robustness.move_back(setting, problem, found)
+    robustness.move_back(setting, found)
     assert found.z is before

@@ -20,7 +20,7 @@ from jaxtank.core.errors import InputError
 from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
 from tuning.storage.store import NAME, SCHEMA, Store
 
-OPTIONS = {"starts": 2, "screening": 8, "validation": 0}
+OPTIONS = tuning.Options(starts=2, screening=8, validation=0)
 SAME = ["parameters", "objective", "measures", "constraints", "evaluations", "starts", "optimality"]
 SAME += ["curvature", "validation", "message"]
 
@@ -39,7 +39,7 @@ def reported(result):
 def whole(tmp_path_factory):
     """The result of a search, and its records."""
     folder = tmp_path_factory.mktemp("whole")
-    result = tuning.tune(case(), nominal=True, checkpoint=folder, **OPTIONS)
+    result = tuning.tune(case(), OPTIONS, checkpoint=folder)
     return result, folder
 
 
@@ -63,7 +63,7 @@ def change(folder, words, *values):
 
 @pytest.mark.slow
 def test_with_and_without_a_log_alike(whole):
-    assert reported(tuning.tune(case(), nominal=True, **OPTIONS)) == reported(whole[0])
+    assert reported(tuning.tune(case(), OPTIONS)) == reported(whole[0])
 
 
 @pytest.mark.parametrize("share", [0.02, 0.4, 0.97])
@@ -71,7 +71,7 @@ def test_a_log_that_ends_anywhere_is_gone_on_with(whole, tmp_path, share):
     copied(whole, tmp_path)
     count = len(rows(tmp_path))
     change(tmp_path, "DELETE FROM record WHERE rowid > ?", 1 + int(share * count))
-    result = tuning.tune(case(), nominal=True, checkpoint=tmp_path, resume=True, **OPTIONS)
+    result = tuning.tune(case(), OPTIONS, checkpoint=tmp_path, resume=True)
     assert reported(result) == reported(whole[0])
     assert rows(tmp_path) == rows(whole[1])
 
@@ -79,13 +79,13 @@ def test_a_log_that_ends_anywhere_is_gone_on_with(whole, tmp_path, share):
 def test_what_is_in_the_log_is_not_run_again(whole, tmp_path, monkeypatch):
     copied(whole, tmp_path)
     monkeypatch.setattr(EvaluationLog, "keep", lambda *_: pytest.fail("something was evaluated"))
-    result = tuning.tune(case(), nominal=True, checkpoint=tmp_path, resume=True, **OPTIONS)
+    result = tuning.tune(case(), OPTIONS, checkpoint=tmp_path, resume=True)
     assert reported(result) == reported(whole[0])
 
 
 def test_a_log_of_another_problem_is_refused_and_kept(whole, tmp_path):
     copied(whole, tmp_path)
-    options = {"nominal": True, "checkpoint": tmp_path, "resume": True, **OPTIONS}
+    options = {"method": OPTIONS, "checkpoint": tmp_path, "resume": True}
     with pytest.raises(InputError, match="of another problem; what differs: seed"):
         tuning.tune(case(), seed=1, **options)
     with pytest.raises(InputError, match="what differs: loop"):

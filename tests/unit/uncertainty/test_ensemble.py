@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import json
 import os
 import signal
@@ -477,9 +478,7 @@ def test_robust_gains_hold_the_limit_on_every_plant_and_the_certificate_is_of_fr
         fresh=64,
         free=free,
         limits={"max_level": 33.0},
-        starts=1,
-        screening=8,
-        validation=0,
+        method=tuning.Options(starts=1, screening=8, validation=0),
     )
     assert all(c["margin"] >= 0 for c in result.constraints) and len(result.constraints) == 48
     costs = []
@@ -509,8 +508,7 @@ def test_a_back_off_is_kept_in_the_search_and_fresh_plants_are_judged_without(go
         "samples": 6,
         "fresh": 48,
         "limits": {"max_level": [33.0, 33.0, 32.0, 33.0]},
-        "starts": 1,
-        "screening": 1,
+        "method": tuning.Options(starts=1, screening=1),
     }
     result = tuning.tune_robust(case, **options, back_off=0.05)
     assert [c["limit"] for c in result.constraints[:4]] == pytest.approx(
@@ -580,8 +578,7 @@ def test_64_plants_a_back_off_and_no_violation_among_4096(study, objective):
         fresh=4096,
         objective=objective,
         limits={"max_level": 33.0},
-        starts=1,
-        screening=1,
+        method=tuning.Options(starts=1, screening=1),
         back_off=0.03,
     )
     known = result.certificate
@@ -596,7 +593,11 @@ def test_a_limit_that_one_plant_holds_in_place_is_broken_by_one_fresh_plant_in_n
     beta law, 0.04 to 5.6 %).
     """
     result = tuning.tune_robust(
-        study, fresh=4096, objective=STUDY, limits={"max_level": 33.0}, starts=1, screening=1
+        study,
+        fresh=4096,
+        objective=STUDY,
+        limits={"max_level": 33.0},
+        method=tuning.Options(starts=1, screening=1),
     )
     known = result.certificate
     controller = stats.beta(1, 64)
@@ -611,13 +612,13 @@ def test_the_worst_of_scenarios_is_found_by_the_epigraph(gouta):
     """Against a grid of the true worst case."""
     case = gouta("ngpc", {"clock.dt": 0.2, "clock.duration": 300.0})
     plants = robust.scenarios_of(case, samples=6, seed=1)
-    result = tuning.tune(
-        case, scenarios=plants, risk="worst", limits={}, starts=2, screening=8, validation=0
-    )
+    make = functools.partial(tuning.Problem, case, limits={}, scenarios=plants)
+    few = tuning.Options(starts=2, screening=8, validation=0)
+    result = tuning.tune(make(risk="worst"), few)
     grid = np.linspace(0.0, 1.0, 400)[:, None]
     costs, _ = result.problem.screen(grid)
     assert result.objective["after"] <= costs.min() * (1 + 1e-6)
-    mean = tuning.tune(case, scenarios=plants, limits={}, starts=2, screening=8, validation=0)
+    mean = tuning.tune(make(), few)
     assert mean.problem.total(mean.tables["after"]) < result.problem.total(
         result.tables["after"]
     ) or mean.objective["after"] <= np.mean(

@@ -1,6 +1,7 @@
 """`jaxtank tune`: gains under limits, for the scenarios of the case or for many drawn plants."""
 
 import contextlib
+import dataclasses
 import sys
 from typing import Any
 
@@ -68,21 +69,15 @@ def _tune(args):
     task, sweep = _task(args, case, seed), args.tradeoff
     if sweep:  # before the search, which would be in vain
         _check_tradeoff(case, task, sweep)
-    finder, case, own = _finder(args, case, task)
+    finder, case, own, mended = _finder(args, case, task)
     folder = args.resume or args.out
     unit = tables.objective_unit(task["objective"] or case.objective, case.loop.units)
     option = None if args.robust or args.nominal or args.quiet else _goes_with_nominal(args)
     progress = Progress(unit, args.quiet, option)
-    result = finder(
-        case,
-        **{k: v for k, v in task.items() if k != "scenarios"},
-        **own,
-        **_numbers(args),
-        checkpoint=folder,
-        resume=args.resume is not None,
-        progress=progress,
-        cluster=args.cluster,
-    )
+    keep = {"checkpoint": folder, "resume": args.resume is not None, "progress": progress}
+    result = finder(case, method=_options(args), **own, **keep)
+    if mended is not None:
+        result = result.replace(answer=dataclasses.replace(result.answer, mended=mended))
     progress.line.end()
     result = _besides(args, case, result, task, sweep, progress)
     args.out = folder
@@ -117,8 +112,8 @@ def _check_tradeoff(case, task, sweep):
     resolve_in([(run.name, run.case) for run in runs], {measure: values[0]})
 
 
-def _finder(args, case, task):
-    """(function that tunes, case, its own keywords): `tune`, or `tune_robust` under --robust."""
+def _finder(args, case, task) -> Any:
+    """(function that tunes, case or Problem, its keywords, the Mend that was made first)."""
     choices, varied = args.choose or None, _varied(args, case)
     if args.robust is None:
         if any(value is not None for value in (args.samples, args.fresh, args.back_off)):
@@ -136,17 +131,14 @@ def _finder(args, case, task):
     if task["scenarios"] == ():  # --scenario none: plants of the case's own run alone
         case = case.replace(scenarios=())
     task["scenarios"] = None
-    return (
-        tune_robust,
-        case,
-        {
-            "distributions": varied,
-            "risk": args.robust,
-            "samples": args.samples or 64,
-            "fresh": args.fresh or 1024,
-            "back_off": args.back_off or 0.0,
-        },
-    )
+    own = {
+        "distributions": varied,
+        "risk": args.robust,
+        "samples": args.samples or 64,
+        "fresh": args.fresh or 1024,
+        "back_off": args.back_off or 0.0,
+    }
+    return tune_robust, case, _stated(task) | own, None
 
 
 def _varied(args, case):
@@ -165,12 +157,32 @@ def _not_robust(args, case, task, choices, varied):
     from tuning.search.tuner import tune as finder
 
     if not _is_nominal(args):
-        own = {"distributions": varied, "safety_filter": args.safety_filter, "mend": args.mend}
-        return finder, case, own
+        own, mended = {"distributions": varied, "safety_filter": args.safety_filter}, None
+        if args.mend is not None:
+            from tuning.feasible.study import apply_mend
+            from tuning.search.setting import plants_of
+
+            box = varied or plants_of(case)
+            case, mended = apply_mend(
+                case, args.mend, box, seed=task["seed"], limits=task["limits"]
+            )
+        return finder, case, _stated(task) | own, mended
     if args.mend is not None:
         raise InputError("--mend belongs to the default answer, not to --nominal")
-    own = {"nominal": True, "choices": choices, "scenarios": task["scenarios"]}
-    return finder, case, own
+    if choices:
+        from tuning.search.discrete import tune_choices
+
+        return tune_choices, case, {"choices": choices, **task}, None
+    if task["scenarios"] is None:
+        return finder, case, _stated(task) | {"nominal": True}, None
+    from tuning.problem.problem import Problem
+
+    return finder, Problem(case, **task), {}, None
+
+
+def _stated(task):
+    """`task` without scenarios."""
+    return {name: value for name, value in task.items() if name != "scenarios"}
 
 
 def _goes_with_nominal(args):
@@ -192,11 +204,20 @@ def _is_nominal(args):
     return args.nominal or _goes_with_nominal(args) is not None
 
 
-def _numbers(args) -> dict[str, Any]:
-    """Method and numbers of the search that are given: keywords of the finder."""
-    names = ("batch", "validation", "starts", "screening", "iterations")
-    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
-    return given | ({} if args.method == "auto" else {"method": args.method})
+def _options(args):
+    """Return the Options of the search: its method and its numbers."""
+    from tuning.search.options import options_of
+
+    method = args.method
+    if args.batch is not None:
+        if method not in ("auto", "adam"):
+            raise InputError(
+                f"batch = {args.batch}: only method adam draws scenarios, not {method}"
+            )
+        method = "adam"
+    names = ("validation", "starts", "screening", "iterations", "cluster")
+    numbers = {name: getattr(args, name) for name in names}
+    return options_of(method, **numbers, **({} if args.batch is None else {"batch": args.batch}))
 
 
 def _besides(args, case, result, task, sweep, progress):

@@ -1,0 +1,295 @@
+"""The search of the default answer, from the problem to gains that hold on validation plants."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from jaxtank.case import Case, Scenario
+from jaxtank.core.tree import with_values
+from jaxtank.limits import UNDEFINED_MARGIN, tightened
+from tuning.problem.evaluator import Evaluator
+from tuning.problem.problem import Problem
+from tuning.problem.reported import in_force
+from tuning.problem.scenarios import ScenarioRun, runs_of
+from tuning.search.driver import reporter
+from tuning.search.judged import Judged, judge, matters
+from tuning.search.methods import automatic
+from tuning.search.setting import NEAR, PLANTS, Setting
+from tuning.search.small_changes import move_back, stay_put
+from tuning.search.solve import Plan, Solution, Stages
+
+CHECKED = 256  # plants that are looked at
+
+SEED = 20_011
+"""Of these plants and their noise, whatever the seed of a search, so that limits bind alike."""
+
+ADDED = 8  # plants that join those of the search
+WORST = 2  # of each limit, the plants that come nearest to it are added, as many as this
+
+SHARE = 0.4
+"""Tightening of a limit, as a share of the distance from the 90 % quantile over the plants to their
+worst: other plants are worse than all of them now and then [-]."""
+
+LARGEST = 0.25  # largest tightening, as a share of the limit [-]
+LIGHT = 1e-9  # weight of an added plant in the cost [-]: it serves the limits alone
+
+ATTEMPTS = 4
+"""Answers that are judged, at most: with a filter, at the true step, with tighter limits."""
+
+ROUNDS = 4
+"""Searches for an answer, at most, until it holds the limits on the plants that are looked at."""
+
+MISLED = 1.5
+"""Ratio of the costs at the true and at the coarse step above which the coarse one misleads [-]."""
+
+TIGHTER = 1.2
+"""Factor on the violation of a limit by which it is tightened further for the next search [-]."""
+
+LEVELS = ("max_level", "overflow_volume")
+"""Measures that a safety filter on levels keeps within their limits."""
+
+Key = tuple[str, int]  # (measure, entry) of a limit
+
+
+class Checks:
+    """Limits on CHECKED plants: how much each is tightened, and which plants a search needs."""
+
+    def __init__(
+        self,
+        setting: Setting,
+        case: Case,
+        free: Any,
+        limits: Mapping[str, Any],
+        least: Mapping[Key, float],
+    ):
+        plants = [s._replace(name=f"added {s.name}") for s in setting.plants(case, CHECKED, SEED)]
+        self.problem = Problem(case, free, setting.objective, limits, plants, SEED)
+        self.stated, self.least = limits, least
+        self.rows: dict[Key, list[int]] = {}
+        for i, limit in enumerate(self.problem.limits):
+            self.rows.setdefault(limit.key, []).append(i)
+        self.tightening: dict[Key, float] = {}
+        self.margins: dict[Key, np.ndarray] = {}
+        self.added: list[int] = []
+
+    def look(self, z: np.ndarray) -> None:
+        """Run every plant at z (P,): its margins set the tightening, the worst plants are added."""
+        _, margins = self.problem.screen(np.asarray(z)[None])
+        worst: list[int] = []
+        for key, rows in self.rows.items():
+            values = self.margins[key] = margins[0, rows]
+            self.tightening[key] = self._tightening(key, values)
+            order = np.argsort(values, kind="stable")
+            worst += [self.problem.limits[rows[i]].run for i in order[:WORST]]
+        self.added = list(dict.fromkeys([*worst, *self.added, *range(ADDED)]))[:ADDED]
+
+    def _tightening(self, key: Key, margins: np.ndarray) -> float:
+        limit = self.problem.limits[self.rows[key][0]]
+        size = abs(limit.value)
+        known = margins[np.abs(margins) < UNDEFINED_MARGIN]
+        if size == 0.0 or key[0] not in self.stated or not len(known):
+            return 0.0
+        spread = float(np.quantile(known, 0.1) - known.min())
+        # far past its limit, a measure spreads more than at it
+        reached = abs(limit.value - limit.sign * known.min())
+        amount = SHARE * spread * min(1.0, size / reached)
+        return min(max(amount, self.least.get(key, 0.0)), LARGEST * size)
+
+    def hold(self, share: float = 0.5) -> bool:
+        """Return True if all plants keep all limits, with this share of the tightening left."""
+        return all(m.min() >= share * self.tightening[k] for k, m in self.margins.items())
+
+    def slack(self, problem: Problem) -> np.ndarray:
+        """Return (limits,) by how much the limits of a problem are tighter than stated."""
+        return np.array([self.tightening.get(limit.key, 0.0) for limit in problem.limits])
+
+    @property
+    def share(self) -> float:
+        """Largest tightening as a share of its limit [-]."""
+        sizes = {key: abs(self.problem.limits[rows[0]].value) for key, rows in self.rows.items()}
+        return max((v / sizes[k] for k, v in self.tightening.items() if v > 0.0), default=0.0)
+
+    def limits(self) -> dict[str, Any]:
+        """Return {measure: value} tightened."""
+        return tightened(self.problem.loop.plant, self.stated, self.tightening)
+
+    def scenarios(self) -> list[Scenario]:
+        """Return the added plants."""
+        return [self.problem.scenarios[i]._replace(weight=LIGHT) for i in self.added]
+
+    def runs(self, share: float) -> list[ScenarioRun]:
+        """Return the added plants as runs with their own noise; share : of the cost."""
+        return [self.problem.runs[i]._replace(weight=share) for i in self.added]
+
+
+def problem_of(
+    setting: Setting, case: Case, free: Any, seed: int, checks: Checks | None
+) -> Problem:
+    """Return the problem of the search on the plants of a case, and on those of `checks`."""
+    plants = setting.plants(case, PLANTS, seed)
+    stated = case, free, setting.objective
+    if checks is None:
+        return Problem(*stated, {}, plants, seed, draw_noise=True)
+    scenarios = (*plants, *checks.scenarios())
+    runs = runs_of(case, scenarios, seed)
+    runs[PLANTS:] = checks.runs(runs[-1].weight)
+    return Problem(*stated, checks.limits(), scenarios, seed, runs=runs, draw_noise=True)
+
+
+@dataclasses.dataclass
+class Task:
+    """What was asked for, and what stays the same from one search to the next."""
+
+    free: Any
+    plan: Plan
+    samples: int  # validation plants
+    progress: Any  # a callable, or None
+    may_filter: bool = True
+    cache: Any = None  # of the first search
+    stage: str = ""
+    last: dict[str, Any] | None = None
+
+    def report(self, unit: str | None) -> Callable:
+        """Return what a Search calls after every evaluation; unit : of the cost, None: unknown."""
+
+        def progress(event):
+            self.last = event | {"stage": self.stage}
+            self.progress(self.last)
+
+        return reporter(progress if self.progress else None, self.plan.starts, unit)
+
+    def enter(self, stage: str) -> None:
+        """Report what is done next, where no evaluation reports it; not before the first one."""
+        self.stage = stage
+        if self.progress is not None and self.last is not None:
+            self.progress(self.last | {"stage": stage})
+
+
+@dataclasses.dataclass
+class Attempt:
+    """A search on plants, and how its answer does on validation plants."""
+
+    setting: Setting
+    solution: Solution = dataclasses.field(default_factory=Solution)
+    evaluator: Any = None
+    after: Judged | None = None
+    tightened: float = 0.0
+    number: int = 0
+
+
+def attempts(task: Task, setting: Setting, near: np.ndarray) -> Attempt:
+    """Return the Attempt whose answer holds on validation plants, the last where none does."""
+    coarse, limits, least = True, dict(setting.limits), {}
+    if not near.any():  # levels stay far below
+        limits.pop("max_level", None)
+    last: Any = None
+    for number in range(ATTEMPTS):
+        case = setting.coarse() if coarse else setting.searched
+        attempt = Attempt(setting, number=number)
+        try:
+            filtered = " with a safety filter" if setting.filter is not None else ""
+            task.stage = f"search on {PLANTS} plants{filtered}, step {case.clock.dt:g} s"
+            checks = _search(task, attempt, case, limits, least)
+            if attempt.solution.point is None:
+                return dataclasses.replace(attempt, number=0)
+            move_back(setting, attempt.solution)
+            values = values_of(attempt.evaluator.problem, attempt.solution)
+            loop = with_values(setting.searched.loop, values)
+            task.enter(f"judging the answer on {task.samples} validation plants")
+            tuned = setting.replace(searched=setting.searched.replace(loop=loop))
+            attempt.after = judge(tuned, task.samples, task.plan.seed, round_=number)
+        except KeyboardInterrupt:
+            last = dataclasses.replace(attempt, number=0) if last is None else last
+            last.solution.interrupted = True
+            return last
+        last, point, search = attempt, attempt.solution.point, attempt.solution.search
+        if coarse and case is not setting.searched and _misled(point.cost, attempt.after):
+            coarse = False
+        elif attempt.after.held.all():
+            break
+        elif task.may_filter and setting.filter is None and _levels_broken(attempt.after):
+            filtered = setting.with_filter(matters(setting, attempt.after, NEAR))
+            limits = dict(setting.case.limits if filtered is setting else filtered.limits)
+            setting = filtered
+        elif checks and search and search.violation(point) == 0:
+            least = _tighter(attempt.after, checks)
+        else:
+            break
+    return last
+
+
+def _search(
+    task: Task, attempt: Attempt, case: Case, limits: Mapping[str, Any], least: Mapping[Key, float]
+) -> Checks | None:
+    """Search, and again on more plants until the limits hold on those that are looked at."""
+    setting = attempt.setting
+
+    def search(checks: Checks | None = None, stays: bool = False) -> None:
+        problem = problem_of(setting, case, task.free, task.plan.seed, checks)
+        attempt.evaluator, task.cache = Evaluator(problem, task.cache), None
+        plan, first = dataclasses.replace(task.plan, method=automatic(problem)), problem.start()
+        stages = Stages(attempt.evaluator, plan, task.report(setting.cost_unit))
+        if attempt.solution.point is None:  # else Ctrl-C leaves the answer of the search before
+            attempt.solution = stages.solution
+        stages.run(first)
+        solution = attempt.solution = stages.solution
+        if solution.search is not None and solution.best is not None:
+            # a start that holds the limits as they are stated may stay where they are tighter
+            slack = checks.slack(problem) if checks and stays else None
+            solution.z, solution.kept = stay_put(solution.search, first, plan.iterations, slack)
+            solution.slopes["answer"] = solution.search.slope(solution.point)
+
+    if not limits:
+        search()
+        return None
+    checks = Checks(setting, case, task.free, limits, least)
+    checks.look(checks.problem.start())
+    stays = not least and checks.hold(share=0.0)
+    for _ in range(ROUNDS):
+        attempt.tightened = checks.share
+        search(checks, stays)
+        if attempt.solution.point is None:
+            break
+        checks.look(attempt.solution.point.z)
+        if checks.hold() or attempt.solution.kept.all():
+            break
+    return checks
+
+
+def _tighter(after: Judged, checks: Checks) -> dict[Key, float]:
+    """Return {key: least tightening} after limits were violated on validation plants."""
+    least = dict(checks.tightening)
+    for row in after.worst():
+        key = row["limit"].key
+        if row["broken"] and key in least:
+            least[key] += TIGHTER * min(-row["margin"], LARGEST * abs(row["limit"].value))
+    return least
+
+
+def values_of(problem: Problem, solution: Solution) -> dict[str, float]:
+    """Return {name: value} of the answer; exactly the first value of a gain that stays."""
+    start, point = problem.own_values(), solution.point
+    if point is None or np.array_equal(point.z, problem.start()):
+        return start
+    values = problem.values(point.z)
+    stays = np.zeros(len(start), dtype=bool)
+    for flags in (solution.idle, solution.kept):
+        stays = stays if flags is None else stays | flags
+    values |= {n: start[n] for n, same in zip(start, stays) if same}
+    acting = in_force(problem.loop, values)
+    return {n: v if v == start[n] else acting[n] for n, v in values.items()}
+
+
+def _misled(cost: float, after: Judged) -> bool:
+    """Return True if the cost at the true step is another than at the coarse one."""
+    good = ~after.failed
+    if not good.any():
+        return True
+    ratio = float(np.mean(after.cost[good])) / cost if cost > 0 else 1.0
+    return not 1.0 / MISLED < ratio < MISLED
+
+
+def _levels_broken(after: Judged) -> bool:
+    return any(row["broken"] and row["limit"].measure in LEVELS for row in after.worst())
