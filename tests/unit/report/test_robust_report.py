@@ -39,6 +39,7 @@ def row(page, name):
     return next(line for line in page.splitlines() if line.startswith(f"{name} ")).split()[1:]
 
 
+@pytest.mark.slow
 def test_the_objective_is_of_the_plants_and_the_other_rows_are_of_the_case(case):
     result = tuning.tune_robust(case, samples=3, fresh=4, limits={}, method=SEARCH)
     page = repr(result)

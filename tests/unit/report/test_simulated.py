@@ -19,6 +19,7 @@ def written(tmp_path, case, *words):
     return dict(zip(head, np.array(rows, dtype=float).T)), {p.name for p in tmp_path.iterdir()}
 
 
+@pytest.mark.slow
 def test_the_share_of_sliding_mode_is_the_smoothstep_of_the_other_outputs_error(tmp_path):
     """Eqs. (16)-(17) of mirakhorli with the pairing of the text: input i by output 3 - i."""
     found, files = written(tmp_path, "mirakhorli/hybrid", "--set", "sensor.noise=0")

@@ -42,6 +42,7 @@ def test_each_run_is_that_of_its_case_alone(tmp_path):
     assert json.loads((tmp_path / "result.json").read_text()) == json.loads(both.out)
 
 
+@pytest.mark.slow
 def test_all_have_the_disturbances_of_the_first_and_what_differs_is_said():
     short = {"clock.duration": 40.0, "clock.dt": 0.2}
     first, other = (rig.set_values(presets.find(name), short) for name in PAIR)
