@@ -206,7 +206,7 @@ def measured_rows(run, assumed):
     # assumed : {controller of Table 3: its `response` with what notes S7.2 assumes}
     rise = {name: values["arrival"] for name, values in assumed.items()}
     settled = [assumed[name]["settling"] for name in ("SFC", "hybrid")]
-    cases = {name: response(run(cases[0])[1])["arrival"] for name, cases in SAME_CONTROLLER.items()}
+    cases = {name: response(run(kinds[0])[1])["arrival"] for name, kinds in SAME_CONTROLLER.items()}
     error = float(np.abs(run("hybrid")[1].e[-1]).max())
     return {
         **_table_3(run, assumed),

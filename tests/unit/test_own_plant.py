@@ -266,6 +266,11 @@ def test_a_plant_whose_levels_are_not_in_its_units_is_refused(case):
         jaxtank.check(metres(case, Unsaid).loop, case.clock)
 
 
+def test_runs_of_a_plant_that_does_not_vary_are_no_plants(case):
+    assert "8 runs of one plant" in str(tuning.validate(metres(case), samples=8))
+
+
+@pytest.mark.slow
 def test_nothing_is_claimed_on_plants_where_nothing_varies(case):
     """One plant with 8 draws of noise is no 8 plants; named in `uncertain`, there are 8."""
     one = metres(case)
@@ -278,4 +283,3 @@ def test_nothing_is_claimed_on_plants_where_nothing_varies(case):
     stated = one.replace(uncertain={"plant.valve": 0.05})
     printed = " ".join(str(tuning.tune(stated, few, safety_filter=False)).split())
     assert "of 8 validation plants" in printed
-    assert "8 runs of one plant" in str(tuning.validate(one, samples=8))
