@@ -61,7 +61,7 @@ CODES = """exit codes:
 EXIT = {"converged": 0, "not_converged": 3, "infeasible": 4, "interrupted": 130}
 
 
-def _tune(args):
+def tune(args):
     """Tune, then what was asked for besides; write and print the result."""
     seed, case = args.seed, open_case(args)
     from tuning.report import tables
@@ -70,17 +70,15 @@ def _tune(args):
     if sweep:  # before the search, which would be in vain
         _check_tradeoff(case, task, sweep)
     finder, case, own, mended = _finder(args, case, task)
-    folder = args.resume or args.out
     unit = tables.objective_unit(task["objective"] or case.objective, case.loop.units)
     option = None if args.robust or args.nominal or args.quiet else _goes_with_nominal(args)
     progress = Progress(unit, args.quiet, option)
-    keep = {"checkpoint": folder, "resume": args.resume is not None, "progress": progress}
-    result = finder(case, method=_options(args), **own, **keep)
+    folder = {"checkpoint": args.out, "resume": args.resumed}
+    result = finder(case, method=_options(args), **own, **folder, progress=progress)
     if mended is not None:
         result = result.replace(answer=dataclasses.replace(result.answer, mended=mended))
     progress.line.end()
     result = _besides(args, case, result, task, sweep, progress)
-    args.out = folder
     written = finish(result, args)
     report_unreachable(result.tuned, written, args)
     if not args.out and not args.json and not args.quiet:
@@ -119,8 +117,8 @@ def _finder(args, case, task) -> Any:
         if any(value is not None for value in (args.samples, args.fresh, args.back_off)):
             raise InputError("--samples, --fresh and --back-off of tune belong to --robust")
         return _not_robust(args, case, task, choices, varied)
-    for name, given in (("--nominal", args.nominal), ("--mend", args.mend is not None)):
-        if given:
+    for name, value in (("--nominal", args.nominal), ("--mend", args.mend)):
+        if value:
             raise InputError(f"{name} and --robust: give one of them")
     if choices or task["scenarios"]:
         raise InputError(
@@ -187,7 +185,7 @@ def _stated(task):
 
 def _goes_with_nominal(args):
     """Return the first option given that goes with --nominal alone; None without."""
-    given = {
+    options = {
         "--scenario": args.scenario,
         "--method": args.method != "auto",
         "--screening": args.screening is not None,
@@ -196,7 +194,7 @@ def _goes_with_nominal(args):
         "--tradeoff": args.tradeoff is not None,
         "--bound": args.bound,
     }
-    return next((name for name, value in given.items() if value), None)
+    return next((name for name, value in options.items() if value), None)
 
 
 def _is_nominal(args):
@@ -228,15 +226,15 @@ def _besides(args, case, result, task, sweep, progress):
         start = {n: p["after"] for n, p in result.parameters.items()}
         screening = args.screening or 64
         with contextlib.suppress(KeyboardInterrupt):  # the answer is given without it
-            found = tradeoff(
+            points = tradeoff(
                 case, *sweep, start=start, screening=screening, progress=progress.check, **task
             )
-            result = result.replace(tradeoff=found)
+            result = result.replace(tradeoff=points)
     if args.bound and not progress.stop and result.status != "interrupted":
         from tuning.optimal_input.perfect_information import bound
 
-        found = bound(result.tuned, task["objective"], task["limits"], progress=progress.check)
-        result = result.replace(bound=found)
+        best = bound(result.tuned, task["objective"], task["limits"], progress=progress.check)
+        result = result.replace(bound=best)
     return result
 
 
@@ -292,7 +290,7 @@ ROBUST = (
 # fmt: on
 COMMANDS = {
     "tune": Command(
-        _tune,
+        tune,
         "tune the gains of a case under its limits",
         (*COMMON, *CASE, *RUN, *UNCERTAIN, *CLUSTER, *PROBLEM, *SEARCH, *ROBUST),
         epilog=CODES,
