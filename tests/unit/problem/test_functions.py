@@ -180,6 +180,7 @@ def test_an_own_constraint_is_active_at_the_least_cost_of_a_grid_that_keeps_it(w
     assert row.value <= limit
 
 
+@pytest.mark.slow
 def test_results_name_it_with_its_unit(watertank):
     objective = tuning.Objective("own_root", root_mean_square, unit="cm")
     constraint = tuning.Constraint("fastest", fastest_change, lower=1.0, unit="V/s")

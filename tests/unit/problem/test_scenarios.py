@@ -119,6 +119,7 @@ def test_the_gauss_newton_matrix_is_that_of_the_trajectory(case):
         jaxtank.sensitivities(case.loop, case.clock, ["iae"], values, squares={"iae": 1.0})
 
 
+@pytest.mark.slow
 def test_slopes_by_what_a_controller_prepares_beforehand():
     """State feedback computes its steady states before the loop: a parameter of its model acts
     through them too.

@@ -145,6 +145,7 @@ def test_a_choice_that_cannot_be_made_is_refused_in_one_line(watertank, choices,
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_what_is_named_free_counts_for_the_kinds_that_have_it(watertank):
     free = {"controller.Kc": (1.0, 10.0)}
     few = tuning.Options(starts=1, screening=4, validation=0, iterations=3)
