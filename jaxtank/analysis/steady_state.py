@@ -363,7 +363,8 @@ def equilibrium(plant: Any, y: Any, inflow: Any = None, low: Any = 0.0) -> tuple
     if inflow is not None:
         inflow = np.asarray(inflow, dtype=float)
         words += " with inflow (" + ", ".join(f"{v:g}" for v in inflow) + f") {length}^3/s"
-    x, u = (_balanced if plant.pipes else _free_discharge)(plant, y, words, inflow)
+    linear = plant.plain and not plant.pipes
+    x, u = (_free_discharge if linear else _balanced)(plant, y, words, inflow)
     low = np.minimum(np.broadcast_to(np.asarray(low, dtype=float), u.shape), 0.0)
     for j, volts in enumerate(u):
         if volts < low[j] - 1e-9 * max(1.0, float(np.max(np.abs(u)))):
@@ -409,14 +410,15 @@ _slope = jax.jit(jax.jacfwd(_rate, argnums=(1, 2)))
 
 
 def _balanced(plant, y, words, inflow):
-    """(levels, inputs) of a network with pipes at rest, by damped Gauss-Newton."""
+    """(levels, inputs) at rest of a network with pipes, or not plain, by damped Gauss-Newton."""
     if plant.pumps != len(plant.outputs):
         raise InputError(
             f"equilibrium needs as many pumps as outputs: this rig has {plant.pumps} and"
             f" {len(plant.outputs)}"
         )
+    openings = np.concatenate([plant.drain, plant.orifice if not plant.plain else (), plant.valve])
     speed = (
-        float(np.max(np.abs(plant.drain)))
+        float(np.max(np.abs(openings)))
         / float(np.min(plant.area))
         * np.sqrt(2.0 * float(plant.gravity) * (float(np.max(y)) or 1.0))
     )
@@ -424,7 +426,7 @@ def _balanced(plant, y, words, inflow):
     try:
         # an area of 1e-300, say, overflows on the way: the check below reports it
         with np.errstate(all="ignore"):
-            many = plant.tanks >= vectors.FROM
+            many = plant.tanks >= vectors.FROM and plant.plain
             x, u, rates = (
                 balanced(plant, y, 1e-5 * tolerance, inflow)
                 if many
@@ -441,8 +443,9 @@ def _by_dense(plant, y, inflow):
     """(levels, inputs, rates left) of a network of few tanks, by a dense Jacobian."""
     free = [i for i in range(plant.tanks) if i not in plant.outputs]
     scale = float(np.max(y)) or 1.0
-    # level rate per unit of input
-    gain = float(np.min(plant.pump_gain)) / float(np.max(plant.area))
+    # level rate per unit of input; a valve's opening is of the order of 1
+    gain = np.min(plant.pump_gain, initial=np.inf) / float(np.max(plant.area))
+    gain = np.repeat([gain, 1.0], [len(plant.feeds), len(plant.valves)])
 
     def split(z):
         x = np.zeros(plant.tanks)
@@ -450,16 +453,18 @@ def _by_dense(plant, y, inflow):
         return x, z[len(free) :] / gain
 
     def residual(z):
+        x, u = split(z)
         with jax.enable_x64(True):
-            rate = np.asarray(_rate(plant, *split(z)))
-        return rate if inflow is None else rate + inflow / np.asarray(plant.area)
+            rate = np.asarray(_rate(plant, x, u))
+        return rate if inflow is None else rate + inflow / np.asarray(plant.sections(x))
 
     def jacobian(z):
         with jax.enable_x64(True):
             by_x, by_u = (np.asarray(a) for a in _slope(plant, *split(z)))
         return np.concatenate([by_x[:, free] * (2.0 * scale * z[: len(free)]), by_u / gain], axis=1)
 
-    start = np.concatenate([np.full(len(free), 0.9), np.full(plant.pumps, 1e-3 * scale)])
+    inputs = np.repeat([1e-3 * scale, 0.5], [len(plant.feeds), len(plant.valves)])
+    start = np.concatenate([np.full(len(free), 0.9), inputs])
     solution = scipy.optimize.least_squares(
         residual,
         start,

@@ -50,6 +50,8 @@ class Unstable(NamedTuple):
 
 def emptying_rates(plant: Any, orifices: float = 1.5, pipes: float = 2.0) -> Any:
     """Lambda (n,) of each tank [1/s]; None of traced leaves or another kind of plant."""
+    if not getattr(plant, "plain", True):
+        return None
     try:
         out, joined = np.array(plant.drain, dtype=float), np.zeros(plant.tanks)
         orifice, pipe = np.asarray(plant.orifice), np.asarray(plant.pipe)

@@ -208,6 +208,7 @@ def _check_shapes(tree: Any, prefix: str, sizes: Mapping[str, int], batch: tuple
 def _sizes(plant: Plant) -> dict[str, int]:
     """{name in the shape of a leaf: count} of a plant."""
     parts = {"orifice": "links", "pipe": "pipes", "spill": "spills"}
+    parts |= {"feed": "feeds", "valve": "valves"}
     counts = {name: len(getattr(plant, field, ())) for name, field in parts.items()}
     return {"tank": plant.tanks, "pump": plant.pumps, "output": len(plant.outputs), **counts}
 

@@ -49,6 +49,10 @@ class Plant(abc.ABC):
     bottom: bool = False
     """True where a level stops at zero whatever is drawn from it."""
 
+    by_volume: bool = False
+    """True where the cross-section of a tank changes with its level: the volumes are integrated, by
+    the methods `stored`, `levels` and `net_flows` of the class."""
+
     @property
     @abc.abstractmethod
     def tanks(self) -> int:

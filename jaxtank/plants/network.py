@@ -1,7 +1,8 @@
 """Building a `TankNetwork` from plain numbers, and checking its topology."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,19 @@ def network(
     spills: Sequence = (),
     caught: ArrayLike = (),
     split: ArrayLike | None = None,
+    sources: Sequence = (),
+    curves: Sequence = (),
+    lift_curves: Sequence = (),
+    valves: Sequence = (),
+    valve: ArrayLike = (),
+    characteristics: Sequence | str = "linear",
+    rangeability: ArrayLike = 50.0,
+    one_way: Sequence[bool] | bool = False,
+    shapes: Sequence = (),
+    extent: ArrayLike | None = None,
+    ports: Mapping[str, ArrayLike] = MappingProxyType({}),
+    exponents: Mapping[str, ArrayLike] = MappingProxyType({}),
+    resistances: Mapping[str, ArrayLike] = MappingProxyType({}),
     gravity: float | None = None,
     outputs: Sequence[int] = (0,),
     overflow: bool = False,
@@ -67,6 +81,21 @@ def network(
     links, orifice : pairs (from, to) of tanks, and the area of the orifice of each [cm^2]
     pipes, pipe : pairs (one, other) of tanks, and the area of the pipe of each [cm^2]
     spills, caught : pairs (from, to), and the share of the overflow that falls into `to` [-]
+    sources : the tank from which each pump draws, None for the basin
+    curves : of each pump None, or ((input, flow), ...): its flow is pump_gain times the curve
+    lift_curves : of each pump None, or ((lift [cm], share of the flow), ...): lift is the level
+        that it pumps to less the level that it draws from
+    valves, valve : pairs (from, to or None), and the area full open [cm^2]; valves are the inputs
+        after those of the pumps
+    characteristics, rangeability : of each valve "linear", "equal-percentage" or ((opening, share),
+        ...), and the ratio of flows full open and closed of an equal-percentage one [-]
+    one_way : whether a valve lets nothing back
+    shapes, extent : of each tank "prism" or another shape of `jaxtank.plants.vessels`, and the
+        level at which it ends [cm]; area is then the largest cross-section
+    ports : heights of openings above the bottom [cm], {"drain", "orifice", "pipe", "valve",
+        "spill": an entry each}
+    exponents : of the head in the flow of "drain" and "orifice" [-]; 0.5 is Torricelli's
+    resistances : R of a flow head/R in parallel to "drain" and "orifice" [s/cm^2]
     gravity : acceleration [cm/s^2]; 981 cm/s^2 in the length of `units` where None
     outputs : tanks whose levels are controlled, counted from 0
     overflow, bottom : as in `TankNetwork`
@@ -100,10 +129,24 @@ def network(
     links, pipes, spills = (
         tuple((int(a), int(b)) for a, b in pairs) for pairs in (links, pipes, spills)
     )
-    joined = {"links": links, "pipes": pipes, "spills": spills, "feeds": feeds}
+    valves = tuple((int(a), None if b is None else int(b)) for a, b in valves)
+    sources = tuple(None if a is None else int(a) for a in sources)
+    joined = {"links": links, "pipes": pipes, "spills": spills, "feeds": feeds, "valves": valves}
+    joined["sources"] = [(source,) for source in sources]
     n = np.size(area) if np.ndim(area) else 1 + _last_tank(joined)
     _check_tanks({**joined, "outputs": [outputs]}, n)
-    m = len(feeds)
+    m, sizes = len(feeds), {"drain": n, "orifice": len(links), "pipe": len(pipes)}
+    sizes |= {"spill": len(spills), "valve": len(valves)}
+    options = {
+        f"{name}_{option}": _fitted(f"plant.{name}_{option}", value, sizes[name])
+        for option, values in (
+            ("port", ports),
+            ("exponent", exponents),
+            ("resistance", resistances),
+        )
+        for name, value in values.items()
+    }
+    each_valve = lambda value: (value,) * len(valves) if isinstance(value, str | bool) else value
     plant = TankNetwork(
         area=_fitted("plant.area", area, n),
         drain=_fitted("plant.drain", drain, n),
@@ -114,9 +157,23 @@ def network(
         gravity=number(default_gravity(units[0]) if gravity is None else gravity),
         rim=_fitted("plant.rim", rim, n),
         caught=_fitted("plant.caught", caught, len(spills)),
+        valve=_fitted("plant.valve", valve, len(valves)),
+        rangeability=_fitted("plant.rangeability", rangeability, len(valves)),
+        extent=None if extent is None else _fitted("plant.extent", extent, n),
+        **options,
         links=links,
         pipes=pipes,
         feeds=feeds,
+        sources=sources if any(a is not None for a in sources) else (),
+        curves=_points(curves),
+        lift_curves=_points(lift_curves),
+        valves=valves,
+        characteristics=tuple(
+            kind if isinstance(kind, str) else _points([kind])[0]
+            for kind in each_valve(characteristics)
+        ),
+        one_way=tuple(bool(v) for v in each_valve(one_way)),
+        shapes=tuple(v if isinstance(v, str) else _points([v])[0] for v in shapes),
         spills=spills,
         outputs=tuple(int(i) for i in outputs),
         overflow=bool(overflow),
@@ -152,6 +209,14 @@ def _fitted(name: str, value: ArrayLike, size: int) -> np.ndarray:
             f"{name} has {array.size} entries for {size}; give one each, or one number for all"
         )
     return array
+
+
+def _points(curves: Sequence) -> tuple:
+    """Curves as hashable tuples of points; () where there is none."""
+    points = tuple(
+        None if curve is None else tuple((float(a), float(b)) for a, b in curve) for curve in curves
+    )
+    return points if any(curve is not None for curve in points) else ()
 
 
 def _threshold(value: float | None, length: str) -> float:

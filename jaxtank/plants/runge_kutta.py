@@ -61,7 +61,15 @@ def advance(
 
 def integrate(plant, integrator, t, x, u, d, h):
     """Return the levels a step `h` [s] later, by "rk4" or "midpoint" with u and d held."""
-    rates = _rates(plant, integrator, t, x, u, d, h)
+    if plant.by_volume:  # so that no volume is lost where the cross-section changes
+        flows = plant.net_flows(h)
+        rate = lambda t, volumes, u, d: flows(t, plant.levels(volumes), u, d)
+        return plant.levels(_step(rate, integrator, t, plant.stored(x), u, d, h))
+    return _step(plant.limited(h), integrator, t, x, u, d, h)
+
+
+def _step(rate, integrator, t, x, u, d, h):
+    rates = _rates(rate, integrator, t, x, u, d, h)
     if integrator == "midpoint":
         return _along(x, rates, h)
     # k4 is ready last, so it is added last
@@ -77,7 +85,9 @@ def euler(plant: Plant, x: Sequence[Any], rates: Sequence[Any], h: Any) -> tuple
 
 def change(plant, integrator, t, x, u, d, h):
     """Return the change of the levels in that step, for compensated sums (`jaxtank.core.kahan`)."""
-    rates = _rates(plant, integrator, t, x, u, d, h)
+    if plant.by_volume:
+        return each(operator.sub, integrate(plant, integrator, t, x, u, d, h), x)
+    rates = _rates(plant.limited(h), integrator, t, x, u, d, h)
     if integrator == "midpoint":
         return each(lambda k: h * k, rates)
     return each(lambda p, q, r, s: (h / 6.0) * (p + 2.0 * (q + r) + s), *rates)
@@ -87,9 +97,8 @@ def _along(x, rates, by):
     return each(lambda a, b: a + by * b, x, rates)
 
 
-def _rates(plant, integrator, t, x, u, d, h):
+def _rates(rate, integrator, t, x, u, d, h):
     """Rates of the midpoint, or of the four stages."""
-    rate = plant.limited(h)
     if integrator == "midpoint":
         return rate(t + 0.5 * h, _along(x, rate(t, x, u, d), 0.5 * h), u, d)
     # each rate is read by the next stage and by the sum. The two of the midpoint rule are read

@@ -20,6 +20,7 @@ from jaxtank.core.numerics import (
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.core.units import DEFAULT
 from jaxtank.core.vectors import each, is_array, take, zeros
+from jaxtank.plants import elements
 from jaxtank.plants.base import Plant
 from jaxtank.xla.barrier import materialised, with_one_slope
 from jaxtank.xla.gather import gathered
@@ -197,6 +198,14 @@ def overflowed(net: Any, x: Any) -> tuple[Any, Any]:
     return x, lost
 
 
+OPTIONS = ("extent", "spill_port", "valve_port", "pipe_port") + tuple(
+    f"{opening}_{option}"
+    for opening in ("drain", "orifice")
+    for option in ("port", "exponent", "resistance")
+)
+"""Leaves of a `TankNetwork` that are absent from a plain one."""
+
+
 @component
 class TankNetwork(Plant):
     """n tanks joined by orifices that discharge from one tank into another or into the basin, and
@@ -245,10 +254,116 @@ class TankNetwork(Plant):
         shape="pipe",
     )
     pump_gain: np.ndarray = leaf(
-        "cm^3/(s V)", "flow per unit of each pump's input (Kp)", low=0.0, strict=True, shape="pump"
+        "cm^3/(s V)", "flow per unit of each pump's input (Kp)", low=0.0, strict=True, shape="feed"
     )
     split: np.ndarray = leaf(
-        "-", "share of each pump that goes to its first tank", low=0.0, high=1.0, shape="pump"
+        "-", "share of each pump that goes to its first tank", low=0.0, high=1.0, shape="feed"
+    )
+    valve: np.ndarray = leaf(
+        "cm^2",
+        "effective area of each valve, full open, in the order of `valves`",
+        low=0.0,
+        strict=True,
+        shape="valve",
+        default=lambda values: np.zeros(0),
+    )
+    rangeability: np.ndarray = leaf(
+        "-",
+        "flow of an equal-percentage valve full open, in flows at opening 0",
+        low=1.0,
+        strict=True,
+        shape="valve",
+        default=lambda values: np.full(np.shape(values.get("valve", ())), 50.0),
+    )
+    extent: Any = leaf(
+        "cm",
+        "level at which the shape of each tank ends: height of a cone, diameter of a sphere",
+        low=0.0,
+        strict=True,
+        like="area",
+        default=None,
+        shape="tank",
+    )
+    drain_port: Any = leaf(
+        "cm",
+        "height of each drain above the bottom",
+        low=0.0,
+        like="drain",
+        default=None,
+        shape="tank",
+    )
+    orifice_port: Any = leaf(
+        "cm",
+        "height of each orifice above the bottom",
+        low=0.0,
+        like="orifice",
+        default=None,
+        shape="orifice",
+    )
+    pipe_port: Any = leaf(
+        "cm",
+        "height of the two ends of each pipe above the bottoms",
+        low=0.0,
+        like="pipe",
+        default=None,
+        shape="pipe",
+    )
+    valve_port: Any = leaf(
+        "cm",
+        "height of each valve above the bottom",
+        low=0.0,
+        like="valve",
+        default=None,
+        shape="valve",
+    )
+    spill_port: Any = leaf(
+        "cm",
+        "height of the overflow opening of each spill, where below the rim",
+        low=0.0,
+        strict=True,
+        like="caught",
+        default=None,
+        shape="spill",
+    )
+    drain_exponent: Any = leaf(
+        "-",
+        "exponent of the head in the flow of each drain; 0.5: Torricelli",
+        low=0.0,
+        high=4.0,
+        strict=True,
+        like="drain",
+        default=None,
+        shape="tank",
+    )
+    orifice_exponent: Any = leaf(
+        "-",
+        "exponent of the head in the flow of each orifice; 0.5: Torricelli",
+        low=0.0,
+        high=4.0,
+        strict=True,
+        like="orifice",
+        default=None,
+        shape="orifice",
+    )
+    drain_resistance: Any = leaf(
+        "s/cm^2",
+        "resistance R of a drain in parallel, whose flow is head/R; inf: none",
+        low=0.0,
+        strict=True,
+        like="drain",
+        infinite=True,
+        default=None,
+        shape="tank",
+    )
+    orifice_resistance: Any = leaf(
+        "s/cm^2",
+        "resistance R of an orifice in parallel, whose flow is head/R; inf: none",
+        low=0.0,
+        strict=True,
+        like="orifice",
+        infinite=True,
+        default=None,
+        shape="orifice",
     )
     gravity: np.ndarray = leaf("cm/s^2", "acceleration g", low=0.0, strict=True)
     rim: np.ndarray = leaf("cm", "height of each tank", low=0.0, strict=True, shape="tank")
@@ -262,6 +377,24 @@ class TankNetwork(Plant):
     links: tuple = static(doc="((from, to), ...) tanks joined by each orifice")
     pipes: tuple = static(doc="((one, other), ...) tanks joined by each pipe", default=())
     feeds: tuple = static(doc="((first tank, second tank or None), ...) one per pump")
+    sources: tuple = static(
+        doc="the tank from which each pump draws, or None: the basin; () where all do", default=()
+    )
+    curves: tuple = static(
+        doc="((input, flow), ...) of each pump, or None: as its input; () where all do", default=()
+    )
+    lift_curves: tuple = static(
+        doc="((lift, share of the flow), ...) of each pump, or None; () where all do", default=()
+    )
+    valves: tuple = static(doc="((from, to or None), ...) tanks of each valve", default=())
+    characteristics: tuple = static(
+        doc='"linear", "equal-percentage" or ((opening, share), ...) of each valve', default=()
+    )
+    one_way: tuple = static(doc="whether each valve lets nothing back", default=())
+    shapes: tuple = static(
+        doc='"prism" or another shape of `vessels` of each tank; () where all are prisms',
+        default=(),
+    )
     spills: tuple = static(doc="((from, to), ...) where what passes a rim falls", default=())
     outputs: tuple = static(doc="tanks whose levels are controlled")
     units: tuple = static(doc="(length, pump input): the units of this rig", default=DEFAULT)
@@ -279,7 +412,19 @@ class TankNetwork(Plant):
         "cm", "level, or difference of levels, below which flow turns laminar", low=1e-15
     )
 
-    arrays = True
+    @property
+    def plain(self) -> bool:
+        """Whether drains, orifices, pipes and pumps are as in the equations above, and the rig has
+        nothing else.
+        """
+        absent = (getattr(self, name) is None for name in OPTIONS)
+        return all(absent) and not (
+            self.sources or self.curves or self.lift_curves or self.valves or self.shapes
+        )
+
+    @property
+    def arrays(self) -> bool:
+        return self.plain
 
     @property
     def tanks(self) -> int:
@@ -288,7 +433,7 @@ class TankNetwork(Plant):
 
     @property
     def pumps(self) -> int:
-        return len(self.feeds)
+        return len(self.feeds) + len(self.valves)
 
     def shares(self):
         """Return [(pump, tank, gain [cm^3/(s V)])]: where each pump's flow goes."""
@@ -305,6 +450,24 @@ class TankNetwork(Plant):
 
     def derivative(self, t: ArrayLike, x: Sequence, u: Sequence, d: Sequence | None) -> tuple:
         return self._flows(t, x, u, d)
+
+    @property
+    def by_volume(self) -> bool:
+        return bool(self.shapes)
+
+    def stored(self, x: Sequence) -> tuple:
+        return elements.stored(self, x)
+
+    def levels(self, volumes: Sequence) -> tuple:
+        return elements.levels(self, volumes)
+
+    def sections(self, x: Sequence) -> tuple:
+        """Return the cross-section (n,) [cm^2] of each tank at its level."""
+        return elements.sections(self, x)
+
+    def net_flows(self, step: ArrayLike) -> Callable:
+        limit = step if self.bottom else None
+        return lambda t, x, u, d: elements.net_flows(self, x, u, d, limit)
 
     def limited(self, step: ArrayLike) -> Callable:
         """Return the vector field of one integration step of `step` [s]: `derivative`; with
@@ -344,6 +507,9 @@ class TankNetwork(Plant):
         ]
 
     def _flows(self, t, x, u, d, step=None):
+        if not self.plain:
+            rates = elements.net_flows(self, x, u, d, step)
+            return tuple(r / a for r, a in zip(rates, elements.sections(self, x)))
         if is_array(x):
             return flows(self, x, u, d, step)
         # Coefficients that do not depend on the state (the c_i of gouta2015 eq. 7) are computed
@@ -373,7 +539,7 @@ class TankNetwork(Plant):
         return tuple(rate[i] - (out[i] * w / self.area[i]) * q[i] for i in range(n))
 
     def rates(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        if type(self).derivative is not TankNetwork.derivative:
+        if type(self).derivative is not TankNetwork.derivative or not self.plain:
             return super().rates(x, u)
         x, u, orifice, pipe = map(jnp.asarray, (x, u, self.orifice, self.pipe))
         w = jnp.sqrt(2.0 * self.gravity)
@@ -392,6 +558,8 @@ class TankNetwork(Plant):
     def shortfall(self, x: Sequence[Any]) -> tuple[Any, ...]:
         if not self.bottom:
             return super().shortfall(x)
+        if self.shapes:
+            return tuple(lower_clip(-v, 0.0) for v in elements.stored(self, x))
         return each(lambda h, area: area * (lower_clip(h, 0.0) - h), x, self.area)
 
     def spill(self, x: Sequence) -> tuple[Sequence, Sequence]:
@@ -399,6 +567,8 @@ class TankNetwork(Plant):
             x = each(lambda h: lower_clip(h, 0.0), x)
         if not self.overflow:
             return x, zeros(x)
+        if not self.plain:
+            return elements.overflowed(self, x, downwards(self.spills, self.tanks))
         if is_array(x):
             return overflowed(self, x)
         x, overflow = list(x), [0.0] * self.tanks

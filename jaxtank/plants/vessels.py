@@ -1,103 +1,49 @@
-"""Shapes of tanks: volume, cross-section and level of each, exact inverses of each other.
+"""Shapes of tanks: volume, cross-section and level, exact inverses of each other.
 
-Levels are lengths above the bottom. Above its height a sphere or a horizontal cylinder goes on as a
-narrow neck, a table as a prism of its last area, a cone as a cone.
+A shape is given by its largest cross-section and its extent, the level at which it ends: the height
+of a cone that stands on its tip, the diameter of a sphere or of a lying cylinder, the last level of
+a table. Above that a closed vessel goes on as a narrow neck, a cone or a table as a prism.
 """
 
 import functools
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 NECK = 0.01
 """Cross-section of the neck above a closed vessel, as a share of the largest."""
 
 TIP = 1e-6
-"""Share of the largest cross-section below which a slope uses this instead: the slope dh/dV of a
-cone or a sphere is infinite at the bottom."""
+"""Least cross-section of a slope, as a share of the largest: dh/dV is infinite at a tip."""
+
+SHAPES = ("prism", "cone", "sphere", "horizontal-cylinder")
+"""Shapes by name; a table is ((level, area), ...), shares of the extent and of the largest area."""
+
+Shape = str | tuple[tuple[float, float], ...]
 
 
-class Vessel(NamedTuple):
-    """A shape, as functions of its dimensions p."""
+class Share(NamedTuple):
+    """A shape of unit cross-section and unit extent below y = 1."""
 
-    dimensions: tuple[str, ...]  # names of the entries of p
-    volume: Callable[..., Any]  # (p, level) -> volume
-    area: Callable[..., Any]  # (p, level) -> cross-section
-    level: Callable[..., Any]  # (p, volume) -> level, not differentiated
-    largest: Callable[..., Any]  # p -> largest cross-section up to the height
-
-
-def _prism() -> Vessel:
-    return Vessel(
-        ("area",),
-        lambda p, h: p[0] * h,
-        lambda p, h: p[0] + 0.0 * h,
-        lambda p, volume: volume / p[0],
-        lambda p: p[0],
-    )
+    volume: Any  # y -> volume
+    area: Any  # y -> cross-section
+    level: Any  # volume -> y
+    full: float  # volume at y = 1
+    above: float  # cross-section above y = 1
 
 
-def _cone() -> Vessel:
-    def top(p: Any) -> Any:
-        return math.pi * p[1] ** 2 / 4.0
-
-    return Vessel(
-        ("height", "diameter"),
-        lambda p, h: top(p) * h * (h / p[0]) ** 2 / 3.0,
-        lambda p, h: top(p) * (h / p[0]) ** 2,
-        lambda p, volume: p[0] * jnp.cbrt(3.0 * volume / (top(p) * p[0])),
-        top,
-    )
-
-
-def _necked(diameter: Callable, full: Callable, largest: Callable, inside: Vessel) -> Vessel:
-    """Return a vessel that is closed at the level diameter(p) with its neck above."""
-
-    def volume(p: Any, h: Any) -> Any:
-        d = diameter(p)
-        within = inside.volume(p, jnp.minimum(h, d))
-        return within + NECK * largest(p) * jnp.maximum(h - d, 0.0)
-
-    def area(p: Any, h: Any) -> Any:
-        d = diameter(p)
-        return jnp.where(h < d, inside.area(p, jnp.minimum(h, d)), NECK * largest(p))
-
-    def level(p: Any, v: Any) -> Any:
-        within = inside.level(p, jnp.minimum(v, full(p)))
-        return within + jnp.maximum(v - full(p), 0.0) / (NECK * largest(p))
-
-    return Vessel(inside.dimensions, volume, area, level, largest)
-
-
-def _sphere() -> Vessel:
-    def full(p: Any) -> Any:
-        return math.pi * p[0] ** 3 / 6.0
-
-    def share(p: Any, h: Any) -> Any:  # of the volume: y^2 (3 - 2 y), y = h / d
-        y = h / p[0]
-        return y * y * (3.0 - 2.0 * y)
-
-    def level(p: Any, volume: Any) -> Any:
-        # y = 1/2 - sin(asin(1 - 2 w) / 3) inverts w = y^2 (3 - 2 y)
-        w = jnp.clip(volume / full(p), 0.0, 1.0)
-        y = 0.5 - jnp.sin(jnp.arcsin(1.0 - 2.0 * w) / 3.0)
-        # near the bottom that difference has few digits left: two steps of Newton restore them
-        low = jnp.maximum(jnp.where(w < 1e-6, jnp.sqrt(w / 3.0), y), 1e-150)
-        for _ in range(2):
-            low = low - (low * low * (3.0 - 2.0 * low) - w) / (6.0 * low * (1.0 - low))
-        return p[0] * jnp.where(w < 0.25, jnp.where(w > 0.0, low, 0.0), y)
-
-    inside = Vessel(
-        ("diameter",),
-        lambda p, h: full(p) * share(p, h),
-        lambda p, h: math.pi * h * (p[0] - h),
-        level,
-        full,
-    )
-    return _necked(lambda p: p[0], full, lambda p: math.pi * p[0] ** 2 / 4.0, inside)
+def _sphere_level(volume: Any) -> Any:
+    # y = 1/2 - sin(asin(1 - 2 w) / 3) inverts w = y^2 (3 - 2 y). Near the bottom that difference
+    # has few digits left, which two steps of Newton restore.
+    w = 1.5 * volume
+    y = 0.5 - jnp.sin(jnp.arcsin(1.0 - 2.0 * w) / 3.0)
+    low = jnp.maximum(jnp.where(w < 1e-6, jnp.sqrt(w / 3.0), y), 1e-150)
+    for _ in range(2):
+        low = low - (low * low * (3.0 - 2.0 * low) - w) / (6.0 * low * (1.0 - low))
+    return jnp.where(w < 0.25, jnp.where(w > 0.0, low, 0.0), y)
 
 
 def _angle(y: Any) -> Any:
@@ -105,7 +51,7 @@ def _angle(y: Any) -> Any:
     turned = jnp.where(y > math.pi, 2.0 * math.pi - y, y)
     s = jnp.cbrt(6.0 * jnp.maximum(turned, 0.0))
     z = s * s
-    # series of the inverse; exact to rounding below s = 0.3, a start for Newton above
+    # series of the inverse: exact to rounding below s = 0.3, the start of Newton above
     terms = (1.0, 1 / 60, 1 / 1400, 1 / 25200, 43 / 17248000, 1213 / 7207200000)
     series = s * functools.reduce(lambda total, term: total * z + term, reversed(terms))
     t = jnp.maximum(series, 0.3)
@@ -115,115 +61,120 @@ def _angle(y: Any) -> Any:
     return jnp.where(y > math.pi, 2.0 * math.pi - t, t)
 
 
-def _horizontal_cylinder() -> Vessel:
-    def angle_at(p: Any, h: Any) -> Any:
-        return 4.0 * jnp.arcsin(jnp.sqrt(jnp.clip(h / p[0], 0.0, 1.0)))
-
-    def volume(p: Any, h: Any) -> Any:
-        t = angle_at(p, h)
-        return p[1] * p[0] ** 2 / 8.0 * (t - jnp.sin(t))
-
-    def area(p: Any, h: Any) -> Any:
-        return 2.0 * p[1] * jnp.sqrt(jnp.maximum(h * (p[0] - h), 0.0))
-
-    def level(p: Any, v: Any) -> Any:
-        half = jnp.sin(_angle(8.0 * v / (p[1] * p[0] ** 2)) / 4.0)
-        return p[0] * half * half
-
-    return _necked(
-        lambda p: p[0],
-        lambda p: math.pi * p[0] ** 2 / 4.0 * p[1],
-        lambda p: p[0] * p[1],
-        Vessel(("diameter", "length"), volume, area, level, lambda p: p[0] * p[1]),
-    )
+def _segment_volume(y: Any) -> Any:
+    t = 4.0 * jnp.arcsin(jnp.sqrt(y))
+    return (t - jnp.sin(t)) / 8.0
 
 
-def _table() -> Vessel:
-    """Return a vessel of cross-sections at levels, linear between them: p is (levels, areas)."""
-
-    def below(p: Any) -> Any:
-        z, a = jnp.asarray(p[0]), jnp.asarray(p[1])
-        rises = 0.5 * (a[1:] + a[:-1]) * (z[1:] - z[:-1])
-        return jnp.concatenate([jnp.zeros_like(z[:1]), jnp.cumsum(rises)])
-
-    def segment(p: Any, where: Any, knots: Any) -> tuple[Any, ...]:
-        z, a = jnp.asarray(p[0]), jnp.asarray(p[1])
-        i = jnp.clip(jnp.searchsorted(knots, where, side="right") - 1, 0, z.size - 1)
-        after = jnp.minimum(i + 1, z.size - 1)
-        width = jnp.where(after > i, z[after] - z[i], 1.0)
-        return i, z[i], a[i], (a[after] - a[i]) / width
-
-    def volume(p: Any, h: Any) -> Any:
-        i, z, a, slope = segment(p, h, jnp.asarray(p[0]))
-        return below(p)[i] + (h - z) * (a + 0.5 * slope * (h - z))
-
-    def area(p: Any, h: Any) -> Any:
-        _, z, a, slope = segment(p, h, jnp.asarray(p[0]))
-        return a + slope * jnp.maximum(h - z, 0.0)
-
-    def level(p: Any, v: Any) -> Any:
-        knots = below(p)
-        i, z, a, slope = segment(p, v, knots)
-        rest = v - knots[i]
-        root = jnp.sqrt(jnp.maximum(a * a + 2.0 * slope * rest, 0.0))
-        return z + 2.0 * rest / jnp.maximum(a + root, 1e-300)
-
-    return Vessel(("levels", "areas"), volume, area, level, lambda p: jnp.max(jnp.asarray(p[1])))
+def _segment_level(volume: Any) -> Any:
+    half = jnp.sin(_angle(8.0 * volume) / 4.0)
+    return half * half
 
 
-VESSELS = {
-    "prism": _prism(),
-    "cone": _cone(),
-    "sphere": _sphere(),
-    "horizontal-cylinder": _horizontal_cylinder(),
-    "table": _table(),
+SHARES = {
+    "cone": Share(
+        lambda y: y * y * y / 3.0,
+        lambda y: y * y,
+        lambda volume: jnp.cbrt(3.0 * volume),
+        1.0 / 3.0,
+        1.0,
+    ),
+    "sphere": Share(
+        lambda y: y * y * (2.0 - 4.0 / 3.0 * y),
+        lambda y: 4.0 * y * (1.0 - y),
+        _sphere_level,
+        2.0 / 3.0,
+        NECK,
+    ),
+    "horizontal-cylinder": Share(
+        _segment_volume,
+        lambda y: 2.0 * jnp.sqrt(y * (1.0 - y)),
+        _segment_level,
+        math.pi / 4.0,
+        NECK,
+    ),
 }
 
 
+@functools.lru_cache(maxsize=256)
+def _table_share(points: tuple[tuple[float, float], ...]) -> Share:
+    """Return the Share of cross-sections at levels, linear between them."""
+    y, area = (np.array(column, dtype=float) for column in zip(*points))
+    slope = np.diff(area) / np.diff(y)
+    below = np.concatenate([[0.0], np.cumsum(0.5 * (area[1:] + area[:-1]) * np.diff(y))])
+
+    def segment(knots: np.ndarray, at: Any) -> Any:
+        inner = jnp.searchsorted(knots[1:-1], at, side="right")
+        return inner, *(jnp.asarray(v)[inner] for v in (y[:-1], area[:-1], slope, below[:-1]))
+
+    def volume(at: Any) -> Any:
+        _, start, first, rise, before = segment(y, at)
+        return before + (at - start) * (first + 0.5 * rise * (at - start))
+
+    def area_at(at: Any) -> Any:
+        _, start, first, rise, _ = segment(y, at)
+        return first + rise * (at - start)
+
+    def level(at: Any) -> Any:
+        _, start, first, rise, before = segment(below, at)
+        rest = at - before
+        root = jnp.sqrt(jnp.maximum(first * first + 2.0 * rise * rest, 0.0))
+        return start + 2.0 * rest / jnp.maximum(first + root, 1e-300)
+
+    return Share(volume, area_at, level, float(below[-1]), float(area[-1]))
+
+
+def _share(shape: Shape) -> Share:
+    return SHARES[shape] if isinstance(shape, str) else _table_share(shape)
+
+
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def volume_of(shape: str, dimensions: tuple, level: Any) -> Any:
-    """Return the volume below a level; a level below the bottom is in a neck as above a sphere."""
-    vessel = VESSELS[shape]
-    below = NECK * vessel.largest(dimensions) * jnp.minimum(level, 0.0)
-    return vessel.volume(dimensions, jnp.maximum(level, 0.0)) + below
+def volume_of(shape: Shape, area: Any, extent: Any, level: Any) -> Any:
+    """Return the volume below a level; a level below the bottom stands in a neck."""
+    if shape == "prism":
+        return area * level
+    share, y = _share(shape), level / extent
+    within = share.volume(jnp.clip(y, 0.0, 1.0))
+    outside = share.above * jnp.maximum(y - 1.0, 0.0) + NECK * jnp.minimum(y, 0.0)
+    return area * extent * (within + outside)
 
 
 @volume_of.defjvp
-def _volume_jvp(shape: str, primals: Any, tangents: Any) -> Any:
-    (dimensions, level), (dimension_rates, rate) = primals, tangents
-    by_dimensions = _volume_rate(shape, dimensions, level, dimension_rates)
-    return volume_of(shape, dimensions, level), area_of(
-        shape, dimensions, level
-    ) * rate + by_dimensions
+def _volume_jvp(shape: Shape, primals: Any, tangents: Any) -> Any:
+    area, extent, level = primals
+    by_area, by_extent, by_level = tangents
+    volume = volume_of(shape, area, extent, level)
+    section = area_of(shape, area, extent, level)
+    # V = area extent v(level / extent)
+    rate = volume / area * by_area + (volume - section * level) / extent * by_extent
+    return volume, rate + section * by_level
 
 
-def _volume_rate(shape: str, dimensions: tuple, level: Any, rates: tuple) -> Any:
-    """Return the rate of the volume below a fixed level as the dimensions change."""
-    vessel = VESSELS[shape]
-    # the root in a horizontal cylinder has no slope at its bottom and top
-    inside = jnp.maximum(level, TIP * vessel.largest(dimensions) ** 0.5)
-    return jax.jvp(lambda p: vessel.volume(p, inside), (dimensions,), (rates,))[1]
-
-
-def area_of(shape: str, dimensions: tuple, level: Any) -> Any:
+def area_of(shape: Shape, area: Any, extent: Any, level: Any) -> Any:
     """Return the cross-section at a level, at least TIP of the largest."""
-    vessel = VESSELS[shape]
-    largest = vessel.largest(dimensions)
-    area = jnp.maximum(vessel.area(dimensions, jnp.maximum(level, 0.0)), TIP * largest)
-    return jnp.where(level < 0.0, NECK * largest, area)
+    if shape == "prism":
+        return area + 0.0 * level
+    share, y = _share(shape), level / extent
+    within = jnp.maximum(share.area(jnp.clip(y, 0.0, 1.0)), TIP)
+    return area * jnp.where(y < 0.0, NECK, jnp.where(y > 1.0, share.above, within))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def level_of(shape: str, dimensions: tuple, volume: Any) -> Any:
+def level_of(shape: Shape, area: Any, extent: Any, volume: Any) -> Any:
     """Return the level of a volume, the inverse of `volume_of`."""
-    vessel = VESSELS[shape]
-    below = jnp.minimum(volume, 0.0) / (NECK * vessel.largest(dimensions))
-    return vessel.level(dimensions, jnp.maximum(volume, 0.0)) + below
+    if shape == "prism":
+        return volume / area
+    share, v = _share(shape), volume / (area * extent)
+    within = share.level(jnp.clip(v, 0.0, share.full))
+    outside = jnp.maximum(v - share.full, 0.0) / share.above + jnp.minimum(v, 0.0) / NECK
+    return extent * (within + outside)
 
 
 @level_of.defjvp
-def _level_jvp(shape: str, primals: Any, tangents: Any) -> Any:
-    (dimensions, volume), (dimension_rates, rate) = primals, tangents
-    level = level_of(shape, dimensions, volume)
-    rate = rate - _volume_rate(shape, dimensions, level, dimension_rates)
-    return level, rate / area_of(shape, dimensions, level)
+def _level_jvp(shape: Shape, primals: Any, tangents: Any) -> Any:
+    area, extent, volume = primals
+    by_area, by_extent, by_volume = tangents
+    level = level_of(shape, area, extent, volume)
+    section = area_of(shape, area, extent, level)
+    by_size = volume / area * by_area + (volume - section * level) / extent * by_extent
+    return level, (by_volume - by_size) / section

@@ -1,0 +1,195 @@
+"""Flows of a network with valves, pumps between tanks, curves, ports or shaped tanks.
+
+A `TankNetwork` without any of these has its own straight-line formulas; one with them adds up the
+streams below, one for each opening and each input.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from jaxtank.core.curves import monotone_curve
+from jaxtank.core.numerics import lower_clip, smooth_signed_sqrt, smooth_sqrt
+from jaxtank.plants.vessels import area_of, level_of, volume_of
+
+
+class Stream(NamedTuple):
+    """A flow from one tank to another; None is the basin."""
+
+    source: int | None
+    sink: int | None
+    flow: Any  # [cm^3/s], negative where it runs from sink to source
+
+
+def power_law(head: Any, exponent: Any, knee: Any) -> Any:
+    """Return head^exponent for a head >= 0, with a finite slope at 0, C1 at `knee`."""
+    y = lower_clip(head, 0.0) / knee
+    laminar = lower_clip(y * ((2.0 - exponent) + (exponent - 1.0) * y), 0.0)
+    deep = jnp.exp(exponent * jnp.log(jnp.where(y >= 1.0, y, 1.0)))
+    return knee**exponent * jnp.where(y >= 1.0, deep, laminar)
+
+
+def opening_flow(net: Any, area: Any, head: Any, exponent: Any, resistance: Any) -> Any:
+    """Return the flow out of an opening under a head: area sqrt(2 g) head^exponent, and
+    head / resistance beside it.
+    """
+    root = smooth_sqrt(head, net.knee) if exponent is None else power_law(head, exponent, net.knee)
+    flow = area * jnp.sqrt(2.0 * net.gravity) * root
+    return flow if resistance is None else flow + lower_clip(head, 0.0) / resistance
+
+
+def valve_share(characteristic: Any, rangeability: Any, opening: Any) -> Any:
+    """Return the share of a valve's full area that is open (IEC 60534-2-4)."""
+    if characteristic == "linear":
+        return opening
+    if characteristic == "equal-percentage":
+        return jnp.exp(jnp.log(rangeability) * (opening - 1.0))
+    return monotone_curve(characteristic, opening)
+
+
+def _joined_flow(net: Any, area: Any, x: Any, ends: tuple[int, int], port: Any) -> Any:
+    """Return the flow through an opening below the surface of two tanks, in both directions."""
+    heads = [x[i] if port is None else lower_clip(x[i] - port, 0.0) for i in ends]
+    root = smooth_signed_sqrt(heads[0] - heads[1], net.knee)
+    return area * jnp.sqrt(2.0 * net.gravity) * root
+
+
+def streams(net: Any, x: Any, u: Any) -> list[Stream]:
+    """Return the flow of each drain, orifice, pipe, pump and valve at levels x (n,) and inputs
+    u (m,).
+    """
+    flows = []
+
+    def head(source: int, ports: Any, k: int) -> Any:
+        return x[source] if ports is None else x[source] - ports[k]
+
+    outlets = [(i, None) for i in range(net.tanks)]
+    for kind, pairs in (("drain", outlets), ("orifice", net.links)):
+        area, ports, exponents, resistances = (
+            getattr(net, name)
+            for name in (kind, f"{kind}_port", f"{kind}_exponent", f"{kind}_resistance")
+        )
+        for k, (source, sink) in enumerate(pairs):
+            exponent = None if exponents is None else exponents[k]
+            resistance = None if resistances is None else resistances[k]
+            flow = opening_flow(net, area[k], head(source, ports, k), exponent, resistance)
+            flows.append(Stream(source, sink, flow))
+    for k, ends in enumerate(net.pipes):
+        port = None if net.pipe_port is None else net.pipe_port[k]
+        flows.append(Stream(*ends, _joined_flow(net, net.pipe[k], x, ends, port)))
+    for j, (first, second) in enumerate(net.feeds):
+        source = net.sources[j] if net.sources else None
+        flow = net.pump_gain[j] * _driven(net, j, x, u[j], source, first)
+        if second is None:
+            flows.append(Stream(source, first, flow))
+        else:
+            flows.append(Stream(source, first, net.split[j] * flow))
+            flows.append(Stream(source, second, (1.0 - net.split[j]) * flow))
+    for k, (source, sink) in enumerate(net.valves):
+        opening = u[len(net.feeds) + k]
+        area = net.valve[k] * valve_share(net.characteristics[k], net.rangeability[k], opening)
+        port = None if net.valve_port is None else net.valve_port[k]
+        if sink is None:
+            flow = opening_flow(net, area, head(source, net.valve_port, k), None, None)
+        else:
+            flow = _joined_flow(net, area, x, (source, sink), port)
+        flows.append(Stream(source, sink, lower_clip(flow, 0.0) if net.one_way[k] else flow))
+    return flows
+
+
+def _driven(net: Any, j: int, x: Any, u: Any, source: int | None, sink: int | None) -> Any:
+    """Return what pump j's input asks for, by its curve, less what the lift takes away."""
+    curve = net.curves[j] if net.curves else None
+    asked = u if curve is None else monotone_curve(curve, u)
+    by_lift = net.lift_curves[j] if net.lift_curves else None
+    if by_lift is None:
+        return asked
+    lift = (0.0 if sink is None else x[sink]) - (0.0 if source is None else x[source])
+    return asked * lower_clip(monotone_curve(by_lift, lift), 0.0)
+
+
+def net_flows(net: Any, x: Any, u: Any, d: Any, step: Any = None) -> tuple[Any, ...]:
+    """Return the net inflow of each tank (n,) [cm^3/s]; with `step`, at most what a tank holds
+    leaves it in that time.
+    """
+    flows = streams(net, x, u)
+    shares: list[Any] = [1.0] * net.tanks
+    if step is not None:
+        leaving: list[Any] = [0.0] * net.tanks
+        for source, sink, flow in flows:
+            if source is not None:
+                leaving[source] = leaving[source] + lower_clip(flow, 0.0)
+            if sink is not None:
+                leaving[sink] = leaving[sink] + lower_clip(-flow, 0.0)
+        held = [lower_clip(v, 0.0) / step for v in stored(net, x)]
+        shares = [
+            jnp.where(out > most, most / jnp.where(out > most, out, 1.0), 1.0)
+            for out, most in zip(leaving, held)
+        ]
+    rates = [0.0 if d is None else d[i] for i in range(net.tanks)]
+    for source, sink, flow in flows:
+        forward = lower_clip(flow, 0.0) * (1.0 if source is None else shares[source])
+        backward = lower_clip(-flow, 0.0) * (1.0 if sink is None else shares[sink])
+        if source is not None:
+            rates[source] = rates[source] - (forward - backward)
+        if sink is not None:
+            rates[sink] = rates[sink] + (forward - backward)
+    return tuple(rates)
+
+
+def _by_tank(net: Any, function: Any, values: Any) -> tuple[Any, ...]:
+    shapes = net.shapes or ("prism",) * net.tanks
+    return tuple(
+        function(shape, net.area[i], 1.0 if net.extent is None else net.extent[i], values[i])
+        for i, shape in enumerate(shapes)
+    )
+
+
+def stored(net: Any, x: Any) -> tuple[Any, ...]:
+    """Return the volume (n,) [cm^3] in each tank at levels x (n,)."""
+    return _by_tank(net, volume_of, x)
+
+
+def levels(net: Any, volumes: Any) -> tuple[Any, ...]:
+    """Return the level (n,) [cm] of each volume."""
+    return _by_tank(net, level_of, volumes)
+
+
+def sections(net: Any, x: Any) -> tuple[Any, ...]:
+    """Return the cross-section (n,) [cm^2] of each tank at its level."""
+    return _by_tank(net, area_of, x)
+
+
+def brims(net: Any) -> list[Any]:
+    """Return the level (n,) [cm] at which each tank overflows: its rim, or a port below."""
+    heights = [net.rim[i] for i in range(net.tanks)]
+    for k, (source, _) in enumerate(net.spills):
+        if net.spill_port is not None:
+            heights[source] = jnp.minimum(heights[source], net.spill_port[k])
+    return heights
+
+
+def overflowed(net: Any, x: Any, order: tuple[list[int], list[int]]) -> tuple[Any, Any]:
+    """Return (levels (n,) at or below the brims, volume lost over each (n,) [cm^3])."""
+    heights, volumes, lost = brims(net), list(stored(net, x)), [0.0] * net.tanks
+    brim = stored(net, heights)
+    full = [False] * net.tanks
+
+    def over(i: int) -> Any:
+        excess = lower_clip(volumes[i] - brim[i], 0.0)
+        lost[i], volumes[i] = lost[i] + excess, volumes[i] - excess
+        full[i] = excess > 0.0
+        return excess
+
+    placed, ring = order
+    for i in placed:
+        excess = over(i)
+        for k, (source, sink) in enumerate(net.spills):
+            if source == i:
+                lost[i] = lost[i] - net.caught[k] * excess
+                volumes[sink] = volumes[sink] + net.caught[k] * excess
+    for i in ring:  # what has come back to a full tank leaves the rig there
+        over(i)
+    # a tank that overflows stands at its brim exactly, and others keep their level to the bit
+    moved = levels(net, volumes)
+    return tuple(jnp.where(full[i], heights[i], moved[i]) for i in range(net.tanks)), tuple(lost)
