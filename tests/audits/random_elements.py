@@ -1,0 +1,187 @@
+"""Random rigs of valves, transfer pumps, curves, ports and shaped tanks beside an integrator of our
+own: plain numpy formulas and SciPy's DOP853.
+
+    python tests/audits/random_elements.py 300
+
+prints the worst error of a level, as a share of the tank's height, and of the volume in all.
+"""
+
+import math
+import sys
+
+import jax
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.interpolate import PchipInterpolator
+from scipy.optimize import brentq
+
+from jaxtank.plants.network import network
+from jaxtank.plants.runge_kutta import advance
+
+KNEE, GRAVITY = 1e-3, 9.81
+
+
+def random_rig(seed):
+    """Return (keywords of `network`, levels, inputs) of a random rig in m, with no kink nearby."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(3, 6))
+    shapes = [str(rng.choice(["prism", "cone", "sphere", "horizontal-cylinder"])) for _ in range(n)]
+    if rng.random() < 0.4:
+        shapes[0] = ((0.0, 0.3), (0.4, 1.0), (0.7, 0.8), (1.0, 0.5))
+    height = rng.uniform(1.0, 4.0, n)
+    pairs = [(int(i), int(j)) for i in range(n) for j in range(n) if i != j]
+    chosen = [pairs[k] for k in rng.permutation(len(pairs))]
+    links, pipes, valves = chosen[:2], [tuple(sorted(p)) for p in chosen[2:3]], chosen[3:4]
+    valves = [*valves, (int(rng.integers(n)), None)]
+    feeds = [(int(rng.integers(n)), None) for _ in range(2)]
+    curve = ((0.0, 0.0), (0.3, 0.004), (0.8, 0.006), (1.0, 0.02))
+    keywords = {
+        "area": rng.uniform(0.5, 3.0, n),
+        "extent": height,
+        "shapes": shapes,
+        "rim": height,
+        "drain": rng.uniform(0.0, 2e-3, n),
+        "links": links,
+        "orifice": rng.uniform(5e-4, 2e-3, len(links)),
+        "pipes": pipes,
+        "pipe": rng.uniform(1e-3, 5e-3, len(pipes)),
+        "feeds": feeds,
+        "sources": [None, int((feeds[1][0] + 1) % n)],
+        "pump_gain": [1.0, 0.01],
+        "curves": [curve, None],
+        "lift_curves": [None, ((-5.0, 1.2), (0.0, 1.0), (5.0, 0.4))],
+        "valves": valves,
+        "valve": rng.uniform(1e-3, 4e-3, 2),
+        "characteristics": ["equal-percentage", ((0.0, 0.0), (0.5, 0.2), (1.0, 1.0))],
+        "rangeability": 30.0,
+        "ports": {"orifice": rng.uniform(0.02, 0.2, 2), "valve": [0.05, 0.1], "pipe": [0.03]},
+        "exponents": {"drain": rng.uniform(0.4, 1.6, n)},
+        "resistances": {"orifice": rng.uniform(200.0, 900.0, 2)},
+        "gravity": GRAVITY,
+        "knee": KNEE,
+        "units": ("m", "-"),
+        "bottom": bool(rng.random() < 0.5),
+    }
+    levels = height * rng.uniform(0.45, 0.6, n)
+    return keywords, levels, rng.uniform(0.1, 0.9, 4)
+
+
+def section(shape, area, extent, h):
+    """Cross-section at a level, from the shape's definition."""
+    y = h / extent
+    if shape == "prism":
+        return area
+    if shape == "cone":
+        return area * y**2
+    if shape == "sphere":
+        return area * 4.0 * y * (1.0 - y)
+    if shape == "horizontal-cylinder":
+        return area * 2.0 * math.sqrt(y * (1.0 - y))
+    return area * float(np.interp(y, *zip(*shape)))
+
+
+def volume(shape, area, extent, h):
+    """Volume below a level, from geometry."""
+    y = h / extent
+    if shape == "prism":
+        return area * h
+    if shape == "cone":
+        return area * extent * y**3 / 3.0
+    if shape == "sphere":  # largest disc pi r^2: pi h^2 (3 r - h) / 3 with r = extent / 2
+        return area / (extent / 2.0) ** 2 * h**2 * (1.5 * extent - h) / 3.0
+    if shape == "horizontal-cylinder":  # of length area / extent
+        r = extent / 2.0
+        segment = r * r * math.acos((r - h) / r) - (r - h) * math.sqrt(h * (2.0 * r - h))
+        return area / extent * segment
+    total, points = 0.0, [(a * extent, b * area) for a, b in shape]
+    for (z0, a0), (z1, a1) in zip(points, points[1:]):
+        z = min(max(h, z0), z1)
+        total += (z - z0) * (a0 + 0.5 * (a1 - a0) / (z1 - z0) * (z - z0))
+    return total
+
+
+def straight_pchip(points, at):
+    """The C1 monotone cubic with the secants as the slopes at its ends."""
+    x, y = (np.array(v, dtype=float) for v in zip(*points))
+    if at <= x[0]:
+        return y[0] + (y[1] - y[0]) / (x[1] - x[0]) * (at - x[0])
+    if at >= x[-1]:
+        return y[-1] + (y[-1] - y[-2]) / (x[-1] - x[-2]) * (at - x[-1])
+    inner = PchipInterpolator(x, y).derivative()(x)
+    inner[0], inner[-1] = (y[1] - y[0]) / (x[1] - x[0]), (y[-1] - y[-2]) / (x[-1] - x[-2])
+    i = int(np.searchsorted(x, at, side="right")) - 1
+    h, t = x[i + 1] - x[i], (at - x[i]) / (x[i + 1] - x[i])
+    return (
+        (2 * t**3 - 3 * t**2 + 1) * y[i]
+        + (t**3 - 2 * t**2 + t) * h * inner[i]
+        + (3 * t**2 - 2 * t**3) * y[i + 1]
+        + (t**3 - t**2) * h * inner[i + 1]
+    )
+
+
+def net_flows(rig, x, u):
+    """Net inflow of each tank, written from the definitions."""
+    w, rates = math.sqrt(2.0 * GRAVITY), np.zeros(len(x))
+
+    def move(source, sink, flow):
+        if source is not None:
+            rates[source] -= flow
+        if sink is not None:
+            rates[sink] += flow
+
+    def signed(head):
+        return head / (head * head + KNEE * KNEE) ** 0.25
+
+    for i, (area, exponent) in enumerate(zip(rig["drain"], rig["exponents"]["drain"])):
+        move(i, None, area * w * max(x[i], 0.0) ** exponent)
+    for k, (i, j) in enumerate(rig["links"]):
+        head = x[i] - rig["ports"]["orifice"][k]
+        move(i, j, rig["orifice"][k] * w * math.sqrt(max(head, 0.0)) + head / rig["resistances"]["orifice"][k])
+    for k, (i, j) in enumerate(rig["pipes"]):
+        port = rig["ports"]["pipe"][k]
+        move(i, j, rig["pipe"][k] * w * signed((x[i] - port) - (x[j] - port)))
+    (a, _), (b, _) = rig["feeds"]
+    move(None, a, straight_pchip(rig["curves"][0], u[0]))
+    source = rig["sources"][1]
+    lift = x[b] - x[source]
+    move(source, b, 0.01 * u[1] * straight_pchip(rig["lift_curves"][1], lift))
+    shares = [30.0 ** (u[2] - 1.0), straight_pchip(rig["characteristics"][1], u[3])]
+    for k, (i, j) in enumerate(rig["valves"]):
+        port, area = rig["ports"]["valve"][k], rig["valve"][k] * shares[k]
+        if j is None:
+            move(i, j, area * w * math.sqrt(max(x[i] - port, 0.0)))
+        else:
+            move(i, j, area * w * signed(max(x[i] - port, 0.0) - max(x[j] - port, 0.0)))
+    return rates
+
+
+def errors(seed, duration=20.0, steps=1000):
+    """Return (error of the levels, of the volume in all), as shares of height and volume."""
+    rig, start, u = random_rig(seed)
+    sizes = list(zip(rig["shapes"], rig["area"], rig["extent"]))
+
+    exact = solve_ivp(
+        lambda t, x: net_flows(rig, x, u) / [section(*s, h) for s, h in zip(sizes, x)],
+        (0.0, duration),
+        start,
+        method="DOP853",
+        rtol=1e-12,
+        atol=1e-13,
+    )
+    plant = network(**rig)
+    step = duration / steps
+
+    @jax.jit
+    def run(x):
+        body = lambda k, x: tuple(advance(plant, "rk4", k * step, x, tuple(u), None, step, 1).x)
+        return jax.lax.fori_loop(0, steps, body, x)
+
+    x = np.array(run(tuple(start)))
+    return float(np.max(np.abs(x - exact.y[:, -1]) / rig["extent"]))
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else 20
+    worst = sorted((errors(seed), seed) for seed in range(count))[::-1]
+    print(worst[:8])
