@@ -22,6 +22,11 @@ TOLERANCE = 5e-7
 """Part of a sample that is forgiven: 20 s is sample 2000 at 0.01 s."""
 
 
+MANY = 60
+"""Changes of one channel above which they are looked up in arrays, so that the program does not
+grow with them; below, each is a piece of its own, which is faster."""
+
+
 def index(time, clock):
     """Return the first sample at or after `time` [s]; of an array of times, an array."""
     if np.ndim(time):
@@ -32,6 +37,8 @@ def index(time, clock):
 
 def channel(clock, initial, changes, duration, shape, lag=None):
     """Return (value, rate, second derivative) of one channel at the samples of a clock."""
+    if len(changes) > MANY:
+        return _many(clock, initial, changes, duration, shape, lag)
     pieces: list[Any] = [(0, functools.partial(_flat, initial))]
     for start, target in changes:
         first = index(start, clock)
@@ -44,6 +51,44 @@ def channel(clock, initial, changes, duration, shape, lag=None):
     plain = materialised(plain)  # its bits are those without a filter
     filtered = _join(_filtered(initial, changes, duration, lag, clock), clock)
     return tuple(jnp.where(lag > 0, new, old) for new, old in zip(filtered, plain))
+
+
+def _many(clock, initial, changes, duration, shape, lag):
+    """`channel` of many changes: what is reached before each by a scan, then one lookup."""
+    starts, targets = np.array([t for t, _ in changes]), jnp.stack([v for _, v in changes])
+    first = index(starts, clock)
+
+    def look_up(begin, course):
+        def follow(before, change):
+            start, target, k, t = change
+            return (after := course(before, start, target, k, t)[0]), after
+
+        between = (starts[:-1], targets[:-1], first[1:], starts[1:])
+        _, reached = jax.lax.scan(follow, begin, between)
+        before = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), begin, reached)
+        k, t = indices(clock), sample_times(clock)
+        which = jnp.searchsorted(first, k, side="right") - 1
+        place = jnp.maximum(which, 0)
+        at = jax.tree.map(lambda v: v[place], (before, jnp.asarray(starts), targets))
+        courses = course(*at, k, t)[1]
+        return tuple(jnp.where(which < 0, a, b) for a, b in zip(_flat(initial, k, t), courses))
+
+    def plain(level, start, target, k, t):
+        course = _change(level, target, start, duration, shape, clock.dt, k, t)
+        return course[0], course
+
+    start = jnp.asarray(initial, jnp.result_type(targets))
+    value = look_up(start, plain)
+    if lag is None:
+        return value
+
+    def filtered(before, start, target, k, t):
+        level, state = before
+        course = _lagged(level, state, target, start, duration, jnp.where(lag > 0, lag, 1.0), t)
+        return course[:2], course[1:]
+
+    behind = look_up((start, start), filtered)
+    return tuple(jnp.where(lag > 0, new, old) for new, old in zip(behind, value))
 
 
 def _change(level, target, start, duration, shape, dt, k, t):
@@ -228,6 +273,15 @@ class Ramps(Signal):
         """(target, step, time since, band) at times t of one channel, or of several: arrays."""
         still = jnp.zeros_like(t)
         target, step, since = last + still, still, still
+        if len(changes) > MANY:
+            starts = np.array([start for start, _ in changes])
+            levels = jnp.stack([jnp.asarray(last), *(level for _, level in changes)])
+            after = jnp.searchsorted(starts - 1e-7 * clock.dt, t, side="right")
+            before = jnp.maximum(after - 1, 0)
+            target, moved = levels[after], after > 0
+            step = jnp.where(moved, target - levels[before], 0.0)
+            since = jnp.where(moved, t - (jnp.asarray(starts)[before] + self.ramp), 0.0)
+            return target, step, since, self.band * jnp.abs(step)
         for start, level in changes:
             after = t >= start - 1e-7 * clock.dt
             target = jnp.where(after, level, target)
@@ -241,6 +295,8 @@ class Ramps(Signal):
     def sample_arrays(self, clock: Clock) -> tuple[Any, Any, Any]:
         """Return `sample` as three arrays (samples, channels)."""
         self._check_filter()
+        if self._many():
+            return tuple(jnp.stack(column, axis=1) for column in self.sample(clock))
 
         def course(which, initial, changes):
             if not changes:
@@ -253,8 +309,15 @@ class Ramps(Signal):
 
     def window_arrays(self, clock: Clock) -> tuple[Any, Any, Any, Any]:
         """Return `windows` as four arrays (samples, channels)."""
+        if self._many():
+            return tuple(jnp.stack(column, axis=1) for column in zip(*self.windows(clock)))
         t = sample_times(clock)[:, None]
         return self._by_count(clock, lambda which, *own: self._window(clock, t, *own))
+
+    def _many(self):
+        """Whether a channel has more changes than the program has pieces for."""
+        counts = np.bincount([i for _, i in self.changes], minlength=1)
+        return counts.max() > MANY
 
     def _by_count(self, clock, course) -> Any:
         """Arrays (samples, channels) of course(which, initial, changes), by number of changes."""
