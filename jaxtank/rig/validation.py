@@ -60,7 +60,9 @@ def unreachable(case: Case) -> str | None:
     """Return why a plateau of the reference has no steady state, None where all have one."""
     plant, reference = case.loop.plant, case.loop.reference
     if isinstance(reference, Ramps) and plant.pumps == len(plant.outputs):
-        for values in reference.plateaus(case.clock.duration):
+        plateaus = reference.plateaus(case.clock.duration)
+        _, first = np.unique(plateaus, axis=0, return_index=True)
+        for values in plateaus[np.sort(first)]:
             try:
                 steady_state(case.loop, values)
             except EquilibriumError as error:

@@ -6,7 +6,7 @@ Their samples are inputs of the loop: interpolating inside it would cost more th
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,13 @@ MANY = 60
 grow with them; below, each is a piece of its own, which is faster."""
 
 
+class Many(NamedTuple):
+    """The changes of a channel that has more than MANY."""
+
+    starts: np.ndarray  # [s]
+    targets: Any
+
+
 def index(time, clock):
     """Return the first sample at or after `time` [s]; of an array of times, an array."""
     if np.ndim(time):
@@ -37,7 +44,7 @@ def index(time, clock):
 
 def channel(clock, initial, changes, duration, shape, lag=None):
     """Return (value, rate, second derivative) of one channel at the samples of a clock."""
-    if len(changes) > MANY:
+    if isinstance(changes, Many):
         return _many(clock, initial, changes, duration, shape, lag)
     pieces: list[Any] = [(0, functools.partial(_flat, initial))]
     for start, target in changes:
@@ -55,7 +62,7 @@ def channel(clock, initial, changes, duration, shape, lag=None):
 
 def _many(clock, initial, changes, duration, shape, lag):
     """`channel` of many changes: what is reached before each by a scan, then one lookup."""
-    starts, targets = np.array([t for t, _ in changes]), jnp.stack([v for _, v in changes])
+    starts, targets = changes
     first = index(starts, clock)
 
     def look_up(begin, course):
@@ -246,8 +253,8 @@ class Ramps(Signal):
         self._check_filter()
         columns = []
         for i in range(self.channels):
-            changes = [(t, self.targets[j]) for j, (t, c) in enumerate(self.changes) if c == i]
             lag = None if self.filter is None else self.filter[i]
+            changes = self._changes_of(i)
             columns.append(channel(clock, self.initial[i], changes, self.ramp, self.shape, lag))
         value, rate, second = zip(*columns)
         return value, rate, second
@@ -262,20 +269,26 @@ class Ramps(Signal):
         arrays (samples,) each
         """
         t = sample_times(clock)
-        by_channel = [[] for _ in range(self.channels)]
-        for j, (start, i) in enumerate(self.changes):
-            by_channel[i].append((start, self.targets[j]))
         return tuple(
-            self._window(clock, t, self.initial[i], changes) for i, changes in enumerate(by_channel)
+            self._window(clock, t, self.initial[i], self._changes_of(i))
+            for i in range(self.channels)
         )
+
+    def _changes_of(self, i):
+        """The changes of a channel: [(time, target)], or Many."""
+        places = [j for j, (_, channel) in enumerate(self.changes) if channel == i]
+        if len(places) > MANY:
+            starts = np.array([self.changes[j][0] for j in places])
+            return Many(starts, jnp.asarray(self.targets)[np.array(places)])
+        return [(self.changes[j][0], self.targets[j]) for j in places]
 
     def _window(self, clock, t, last, changes):
         """(target, step, time since, band) at times t of one channel, or of several: arrays."""
         still = jnp.zeros_like(t)
         target, step, since = last + still, still, still
-        if len(changes) > MANY:
-            starts = np.array([start for start, _ in changes])
-            levels = jnp.stack([jnp.asarray(last), *(level for _, level in changes)])
+        if isinstance(changes, Many):
+            starts = changes.starts
+            levels = jnp.concatenate([jnp.asarray(last)[None], changes.targets])
             after = jnp.searchsorted(starts - 1e-7 * clock.dt, t, side="right")
             before = jnp.maximum(after - 1, 0)
             target, moved = levels[after], after > 0
