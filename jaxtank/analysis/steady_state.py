@@ -416,7 +416,8 @@ def _balanced(plant, y, words, inflow):
             f"equilibrium needs as many pumps as outputs: this rig has {plant.pumps} and"
             f" {len(plant.outputs)}"
         )
-    openings = np.concatenate([plant.drain, plant.orifice if not plant.plain else (), plant.valve])
+    openings = [plant.drain] if plant.plain else [plant.drain, plant.orifice, plant.valve]
+    openings = np.concatenate([v for v in openings if v is not None])
     speed = (
         float(np.max(np.abs(openings)))
         / float(np.min(plant.area))

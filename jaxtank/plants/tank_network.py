@@ -259,21 +259,23 @@ class TankNetwork(Plant):
     split: np.ndarray = leaf(
         "-", "share of each pump that goes to its first tank", low=0.0, high=1.0, shape="feed"
     )
-    valve: np.ndarray = leaf(
+    valve: Any = leaf(
         "cm^2",
         "effective area of each valve, full open, in the order of `valves`",
         low=0.0,
         strict=True,
+        like="area",
+        default=None,
         shape="valve",
-        default=lambda values: np.zeros(0),
     )
-    rangeability: np.ndarray = leaf(
+    rangeability: Any = leaf(
         "-",
         "flow of an equal-percentage valve full open, in flows at opening 0",
         low=1.0,
         strict=True,
+        like="valve",
+        default=None,
         shape="valve",
-        default=lambda values: np.full(np.shape(values.get("valve", ())), 50.0),
     )
     extent: Any = leaf(
         "cm",

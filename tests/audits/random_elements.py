@@ -13,7 +13,6 @@ import jax
 import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.interpolate import PchipInterpolator
-from scipy.optimize import brentq
 
 from jaxtank.plants.network import network
 from jaxtank.plants.runge_kutta import advance
@@ -136,7 +135,12 @@ def net_flows(rig, x, u):
         move(i, None, area * w * max(x[i], 0.0) ** exponent)
     for k, (i, j) in enumerate(rig["links"]):
         head = x[i] - rig["ports"]["orifice"][k]
-        move(i, j, rig["orifice"][k] * w * math.sqrt(max(head, 0.0)) + head / rig["resistances"]["orifice"][k])
+        move(
+            i,
+            j,
+            rig["orifice"][k] * w * math.sqrt(max(head, 0.0))
+            + head / rig["resistances"]["orifice"][k],
+        )
     for k, (i, j) in enumerate(rig["pipes"]):
         port = rig["ports"]["pipe"][k]
         move(i, j, rig["pipe"][k] * w * signed((x[i] - port) - (x[j] - port)))
