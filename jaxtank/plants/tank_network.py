@@ -273,7 +273,7 @@ class TankNetwork(Plant):
         "flow of an equal-percentage valve full open, in flows at opening 0",
         low=1.0,
         strict=True,
-        like="valve",
+        like="area",
         default=None,
         shape="valve",
     )
@@ -314,7 +314,7 @@ class TankNetwork(Plant):
         "cm",
         "height of each valve above the bottom",
         low=0.0,
-        like="valve",
+        like="area",
         default=None,
         shape="valve",
     )

@@ -227,6 +227,8 @@ def _settable(case):
     for name, value, meta in [*walk(loop), *walk(loop, kind="static")]:
         # a tuple is the topology of the rig; an array of a rig without pipes, say, is empty
         empty = isinstance(value, tuple) or (value is not None and np.size(value) == 0)
+        # what a rig does not have is added by its tables, not by a value
+        empty = empty or (value is None and name.rpartition(".")[0].endswith(("plant", "model")))
         if not empty and not name.startswith(tables) and name not in scheduled:
             yield name, None if value is None else np.asarray(value).tolist(), meta
 
