@@ -1,6 +1,7 @@
 """What an editor sees: names, keywords and types of user code, checked by pyright."""
 
 import ast
+import importlib
 import json
 import shutil
 import subprocess
@@ -51,11 +52,12 @@ def test_mistyped_names_and_keywords_are_reported(reported):
 
 @pytest.mark.parametrize("package", [jaxtank, tuning])
 def test_a_type_checker_is_given_every_public_name_from_where_it_is(package):
-    tree = ast.parse(Path(package.__file__).read_text())
-    branches = {ast.unparse(n.test): n.body for n in tree.body if isinstance(n, ast.If)}
-    imports = [n for n in branches["TYPE_CHECKING"] if isinstance(n, ast.ImportFrom)]
-    given = {a.asname: (n.module, a.name) for n in imports for a in n.names}
-    assert set(package.__all__) <= set(given)
-    table = {name: (module, name) for name, module in package._NAMES.items()}
-    assert {name: given[name] for name in table} == table
+    tree = ast.parse(Path(package.__file__).with_suffix(".pyi").read_text())
+    imports = [n for n in tree.body if isinstance(n, ast.ImportFrom)]
+    homes = {a.asname: (n.module, a.name) for n in imports for a in n.names}
+    assert set(package.__all__) == set(homes)
+    for name, (module, attribute) in homes.items():
+        whole = module == package.__name__  # a folder of the package
+        home = importlib.import_module(f"{module}.{attribute}" if whole else module)
+        assert getattr(package, name) is (home if whole else getattr(home, attribute))
     assert (Path(package.__file__).parent / "py.typed").exists()

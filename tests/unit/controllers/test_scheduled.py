@@ -429,7 +429,7 @@ def test_a_rig_file_may_set_gains_before_and_values_after(tmp_path):
         (TABLE.replace("knots", "knot"), ["knot", "nearest: knots"]),
         (TABLE.replace('variable = "r1"\n', ""), ["needs variable"]),
         (TABLE.replace("[5.0, 10.0]", '"5"'), ["knots = '5'"]),
-        (TABLE.replace('"r1"', "1"), ["variable 1"]),
+        (TABLE.replace('"r1"', "1"), ["schedule.variable = 1", "text"]),
         (TABLE.replace('["controller.k1"]', '"controller.k1"'), ["schedule.gains", "list"]),
         ("schedule = 3\n", ["schedule = 3", "table"]),
         (TABLE + '[values]\n"controller.law.k1" = 1.0\n', ["controller.law.k1 is scheduled"]),

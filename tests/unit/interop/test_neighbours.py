@@ -264,9 +264,9 @@ def test_modules_are_reached_from_the_package_when_they_are_used():
 import sys
 sys.modules["gymnasium"] = sys.modules["control"] = None  # as if they were not installed
 import jaxtank
-from jaxtank import *
 opened = {"jaxtank.interop.python_control", "jaxtank.interop.gymnasium", "jaxtank.export"}
 assert not opened & set(sys.modules)
+from jaxtank import *
 assert {"interop", "export"} <= set(dir(jaxtank)) and callable(jaxtank.export.export)
 import jaxtank.interop.python_control
 try:

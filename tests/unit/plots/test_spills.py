@@ -113,7 +113,7 @@ def test_no_two_roles_share_a_colour_and_the_live_page_has_the_same():
         **{f"pump{j}": colour for j, colour in enumerate(style.PUMPS)},
     }
     assert len({to_rgba(c) for c in (*roles.values(), style.REFERENCE)}) == len(roles) + 1
-    sheet = (ROOT / "tuning" / "live" / "page.css").read_text().split("@media")[0]
+    sheet = (ROOT / "jaxtank" / "live" / "page.css").read_text().split("@media")[0]
     for role, colour in roles.items():
         assert re.search(rf"--{role}: {colour.lower()};", sheet), role
 

@@ -70,9 +70,8 @@ def test_backstepping_under_the_rims(gouta):
 
 @pytest.fixture(scope="module")
 def limited(gouta):
-    """At ten times the step of the case."""
     few = tuning.Options(starts=2, screening=32, validation=0)
-    return tuning.tune(gouta("backstepping", COARSE), few)
+    return tuning.tune(gouta("backstepping"), few)
 
 
 def test_the_answer_names_the_tank_with_an_active_limit_and_when(limited):
@@ -98,7 +97,7 @@ def test_the_answer_names_the_gain_that_the_objective_is_insensitive_to(gouta, l
     """
     k = limited.parameters["controller.k"]
     less = rig.set_values(
-        gouta("backstepping", COARSE),
+        gouta("backstepping"),
         {
             "controller.k": 0.9 * k["after"],
             "controller.k1": limited.parameters["controller.k1"]["after"],

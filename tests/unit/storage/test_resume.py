@@ -141,7 +141,7 @@ def test_a_record_that_was_changed_is_refused(tmp_path, words):
     log = EvaluationLog(tmp_path, {"p": 1})
     for i in range(3):
         log.recall("x", [np.array(float(i))], lambda i=i: (1.0 + i, np.arange(2.0)))
-    log.in_memory()
+    log.close()
     change(tmp_path, words)
     before = rows(tmp_path)
     with pytest.raises(InputError, match=r"^--resume: record .* is not what was written"):
@@ -155,7 +155,7 @@ def test_a_record_of_another_problem_is_refused(tmp_path):
     for name in ("one", "other"):
         log = EvaluationLog(tmp_path / name, {"p": name})
         log.recall("x", [np.array(1.0)], lambda: (9.0,))
-        log.in_memory()
+        log.close()
     change(tmp_path / "one", "DELETE FROM record WHERE rowid = 2")
     change(tmp_path / "one", "INSERT INTO record VALUES (?, ?, ?)", *rows(tmp_path / "other")[1])
     with pytest.raises(InputError, match="is not what was written"):
