@@ -150,6 +150,7 @@ def slow_but(*names):
     return [n if n in names else pytest.param(n, marks=pytest.mark.slow) for n in WRITERS]
 
 
+@pytest.mark.slow_for("simulate")
 @pytest.mark.parametrize("name", slow_but("simulate"))
 def test_a_full_disk_leaves_one_result_whole(name, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)

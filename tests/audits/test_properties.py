@@ -147,6 +147,7 @@ def test_mass_is_kept_with_what_is_lost_over_the_rims(seed, tanks, kind):
     assert np.all(path >= 0) and np.all(path[:, tanks:] == 0)
 
 
+@pytest.mark.slow_for("4")
 @of_every_rig()
 def test_tanks_run_dry_and_never_below(seed, tanks, kind):
     """From low levels with the pumps off, in steps that resolve the film (the fastest here falls by

@@ -496,6 +496,7 @@ def test_a_limit_that_cannot_be_met_ends_with_4_and_the_best_of_it(folder):
     assert rig.load(folder / "out" / "rig.toml").clock == Clock(dt=0.1, duration=200.0)
 
 
+@pytest.mark.slow
 def test_too_few_iterations_end_with_3():
     printed = say("tune", CASE, *SHORT, *QUICK, "--nominal", "--json", "--quiet")
     assert printed.code == 3 and "--iterations" in printed.json["message"]

@@ -35,6 +35,7 @@ def entries(folder):
     return sorted(folder.glob(f"*/*{kept.ENTRY}"))
 
 
+@pytest.mark.slow
 def test_kept_damaged_and_absent_programs_give_the_same_bits(tmp_path, capsys):
     """A damaged entry is compiled again, and replaced, without a word."""
     folder = tmp_path / "kept"

@@ -150,6 +150,7 @@ def test_a_rig_of_a_file_is_printed(capsys):
     assert "departures" not in page and "The rig: 2 tanks, 1 pump; " in page
 
 
+@pytest.mark.slow
 def test_the_page_prints_the_description_of_a_class_without_its_sections():
     case = presets.find("gouta2015/backstepping")
     page = text_of(case)

@@ -34,6 +34,7 @@ def test_a_run_is_one_program(compiled):
     assert compiled("simulate", "cascaded/pi", "--dt", "8") == {"evaluate_compiled": 1}
 
 
+@pytest.mark.slow
 def test_an_ensemble_is_two_programs(compiled):
     """The measures of a batch, and the trajectories of the fan chart."""
     result = compiled("uncertainty", "cascaded/pi", "--dt", "8", "--samples", "8")

@@ -97,6 +97,7 @@ def test_a_fit_from_elsewhere_comes_back():
     np.testing.assert_allclose(found.x, there, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_the_pi_reaches_its_setpoints_and_open_loop_stays_at_its_own():
     for name, within in (("pi", 0.02), ("open-loop", 0.06)):
         e = np.asarray(jaxtank.simulate(CASES[name].loop, CASES[name].clock).e[:, 0])

@@ -346,6 +346,7 @@ def test_spot_values_to_their_last_digit_with_the_roots_of_the_prototype():
     np.testing.assert_allclose(levels[20], (0.9121953, 0.14468663), atol=1e-7)
 
 
+@pytest.mark.slow
 def test_spot_values_constrained():
     _, tight = closed("laguerre", mode=QP, du=0.1)
     np.testing.assert_allclose(tight.u[:8, 0], 0.70194709 + 0.1 * np.arange(8), atol=1e-8)

@@ -269,6 +269,7 @@ def test_solver_options_are_checked_when_they_are_made_and_against_keywords(own)
     assert len(keywords) <= 13  # the case, and twelve more
 
 
+@pytest.mark.slow
 def test_a_problem_keeps_its_seed_and_its_limits(own):
     problem = tuning.Problem(own, limits={"max_level": 9.0}, seed=3)
     few = tuning.SQP(**QUICK)

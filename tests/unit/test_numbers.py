@@ -170,6 +170,7 @@ def test_leaves_of_a_batch_have_its_axis_in_front():
     np.testing.assert_allclose(found[0], evaluate(case.loop, clock, ("iae",))["iae"], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_noise_that_no_key_draws_is_no_answer():
     """Outside a trace it is refused; inside one the noise is not known, and a run without it looked
     like an answer.

@@ -55,7 +55,7 @@ def of_all(systems, dead, dt):
     return with_slopes
 
 
-@pytest.mark.slow_for("0")
+@pytest.mark.slow_for("0", "4")
 @pytest.mark.parametrize("dead", [0, 4])
 def test_margins_of_two_lags_under_pi_are_those_of_python_control(dead):
     rng = np.random.default_rng(3)

@@ -109,6 +109,7 @@ async def connected(address, keys):
     await comm.close()
 
 
+@pytest.mark.slow
 def test_local_workers_listen_on_this_machine_alone_and_to_their_own_client_alone(client):
     pids = [os.getpid(), *client.run(os.getpid).values()]
     listeners = set().union(*map(listening, pids))
@@ -158,6 +159,7 @@ def answer(result):
     return result.parameters, result.objective, result.evaluations, result.starts, result.history
 
 
+@pytest.mark.slow
 def test_searches_on_workers_lead_to_the_answer_of_one_process(case, tmp_path):
     """And a search that is continued sends what its log lacks, and no more."""
     whole = repr(answer(tuning.tune(case, SEARCH, checkpoint=tmp_path)))

@@ -53,6 +53,7 @@ def test_a_long_line_keeps_both_its_ends():
     assert one_line("a\n  b ") == "a b" and one_line("x" * MOST) == "x" * MOST
 
 
+@pytest.mark.slow_for("words0-None")
 @pytest.mark.parametrize(
     ("words", "end"),
     [

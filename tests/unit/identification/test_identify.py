@@ -274,6 +274,7 @@ def rungekutta(theta, x0, u, h=0.25, steps=4):
     return np.stack(out)
 
 
+@pytest.mark.slow
 def test_against_a_fit_written_without_the_library(case, away):
     """Plain parameters, plain numpy, differences for slopes, scipy: same estimates, same standard
     deviations, levels at the start free.

@@ -139,7 +139,7 @@ def agrees(case, settings, tolerance, seed=0, filtered=None):
     return compared
 
 
-@pytest.mark.slow_for("gouta2015/backstepping")
+@pytest.mark.slow_for("gouta2015/backstepping", "gouta2022/pi")
 @pytest.mark.parametrize("name", SHORT)
 def test_runs_are_those_of_the_library(name):
     case = short(name)

@@ -171,6 +171,7 @@ def test_reverse_mode_for_every_number_of_samples(gouta, samples):
     agree(case, ["controller.Tp"])
 
 
+@pytest.mark.slow
 def test_a_measure_that_is_zero_throughout_has_slope_zero(gouta):
     case = gouta("ngpc", {"clock.dt": 0.1, "actuator.dead_zone": 11.0, "clock.duration": 20.0})
     f, z = sloped(case, ["controller.Tp"], "rms_input")

@@ -49,6 +49,7 @@ def test_batches_give_what_single_runs_give(batch):
         np.testing.assert_allclose(found[name], expected, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_each_run_has_noise_of_its_own():
     loop, clock = short("cascaded/pi")
     loop = jaxtank.with_values(loop, {"sensor.noise": [0.1, 0.1]})

@@ -175,6 +175,7 @@ def test_the_simulated_loop_stands_the_delay_margin_and_no_more():
     assert swings(above)[0] > 1.5 and not swings(above)[1]
 
 
+@pytest.mark.slow
 def test_what_cannot_be_linearised_is_named_and_left_out():
     loop, clock = one_tank(high=6.0)
     steps = ramps([9.0], [(10.0, 0, 4.0), (20.0, 0, 25.0), (30.0, 0, 0.0)], ramp=0.0)
@@ -190,6 +191,7 @@ def test_what_cannot_be_linearised_is_named_and_left_out():
     assert "rim" in jaxtank.stability_margins(brim, clock)[0].why
 
 
+@pytest.mark.slow
 def test_an_unstable_loop_has_no_margins_and_breaks_every_limit():
     loop, clock = one_tank(delay=25.0)
     (row,) = jaxtank.stability_margins(loop, clock)

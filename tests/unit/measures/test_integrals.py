@@ -93,6 +93,7 @@ def test_initial_and_inflow_less_overflow_are_the_final_volume(chain, run):
     np.testing.assert_allclose(left, area @ np.asarray(run.x)[-1], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_every_way_to_run_has_the_same_integrals(chain, sums):
     loop, clock = chain.loop, chain.clock
     gains = {"controller.Kc": np.full((2, 1), 4.0)}

@@ -169,6 +169,7 @@ def test_the_command_reports_a_registered_measure_of_a_rig_file(registered, tmp_
     assert found["measures"]["input_rate"] > 0.0 and found["units"]["input_rate"] == "V/s"
 
 
+@pytest.mark.slow
 def test_a_measure_registered_anew_replaces_the_compiled_one(registered):
     case = rig.loads(RIG)
     one = jaxtank.evaluate(case.loop, case.clock, ["input_rate"])["input_rate"]

@@ -37,6 +37,7 @@ def climbed(climb):
     return bound(climb, interval=1.0, iterations=60)
 
 
+@pytest.mark.slow
 def test_gradient_is_that_of_central_differences(climb):
     """Of cost and multipliers together, at inputs that break the limit; the tolerance is that of
     differences of step 1e-5 V.
@@ -134,6 +135,7 @@ def test_what_is_reported_of_it(climbed):
     assert climbed.trajectory(save_every=10).x.shape == (41, 4)
 
 
+@pytest.mark.slow
 def test_a_bound_is_saved_with_its_inputs_and_a_picture(climbed, tmp_path):
     written = {path.name for path in climbed.save(tmp_path)}
     assert written == {"result.json", "inputs.csv", "responses.png", "report.html"}

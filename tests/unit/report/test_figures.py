@@ -68,6 +68,7 @@ def test_curves_of_all_figures_are_those_of_the_cases(name):
     same_curves(name)
 
 
+@pytest.mark.slow
 def test_the_command_lists_states_and_draws(tmp_path):
     listed = json.loads(command("figure", "--json").out)
     assert [name for name, row in listed.items() if row["result"]] == RESULTS

@@ -135,6 +135,7 @@ LIVE = re.compile(
 )
 
 
+@pytest.mark.slow_for("tune")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_page_is_well_formed_and_asks_nothing_of_the_network(folder_of, kind):
     whole = (folder_of(kind) / "report.html").read_text(encoding="utf-8")

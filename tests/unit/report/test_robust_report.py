@@ -61,6 +61,7 @@ def test_scenarios_are_reported_as_such(weights, words):
     assert report._runs_of(result, True) == f"; {words}{RESTS}"
 
 
+@pytest.mark.slow
 def test_a_single_run_needs_no_such_line(case):
     """What is not a number is explained, and so is a rig without validation runs."""
     result = tuning.tune(case, SEARCH, limits={})

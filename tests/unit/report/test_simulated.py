@@ -35,6 +35,7 @@ def test_the_share_of_sliding_mode_is_the_smoothstep_of_the_other_outputs_error(
     assert "shares.png" in files and "estimates.png" not in files
 
 
+@pytest.mark.slow
 def test_an_estimated_disturbance_is_drawn_and_kept_and_an_earlier_picture_goes(tmp_path):
     (tmp_path / "trajectory.csv").write_text("of an earlier run")
     (tmp_path / "shares.png").write_bytes(b"of an earlier run")

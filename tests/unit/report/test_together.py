@@ -18,6 +18,7 @@ SHORT = ["--set", "clock.duration=40", "--dt", "0.2"]
 PAIR = ["gouta2022/pi", "gouta2022/pid"]
 
 
+@pytest.mark.slow
 def test_each_run_is_that_of_its_case_alone(tmp_path):
     """The same disturbances and the same noise, as both cases have them; numbers and trajectory."""
     noise = ["--set", "sensor.noise=0.05", "--seed", "3"]

@@ -102,6 +102,7 @@ def test_the_best_kind_is_that_of_searches_of_each_kind_alone(watertank):
     assert f"controller.kind = {best}" in str(chosen)
 
 
+@pytest.mark.slow
 def test_a_kind_that_does_not_fit_is_a_row_with_the_reason(watertank, capsys):
     """On the command line, by the name of the table of a rig file."""
     options = ["--starts", "1", "--screening", "4", "--validation", "0", "--iterations", "5"]

@@ -187,6 +187,7 @@ def test_noise_that_a_case_states_is_in_its_own_run():
     assert judge(setting_of(noisy), 2, 0).nominal is None
 
 
+@pytest.mark.slow
 def test_what_only_a_report_shows_is_run_when_it_is_asked_for(case):
     result = tuning.tune(case, tuning.Options(validation=8, starts=1, iterations=2))
     str(result)

@@ -73,6 +73,7 @@ def test_the_default_answer_of_a_fragile_start_prefers_a_lower_sensitivity_peak(
     assert before > 6.0 and after < 2.8
 
 
+@pytest.mark.slow
 def test_a_sensitivity_peak_of_four_is_news_and_one_of_two_is_none():
     result = tuning.tune(
         rig.set_values(presets.find("cascaded/pi"), {"clock.dt": 20.0}),

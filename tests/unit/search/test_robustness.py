@@ -40,6 +40,7 @@ def peak(setting, problem, z):
     return float(found["sensitivity_peak"])
 
 
+@pytest.mark.slow
 def test_a_fragile_answer_moves_back_as_far_as_its_sensitivity_peak_asks(answered, monkeypatch):
     setting, problem, search = answered
     first = problem.start()

@@ -96,6 +96,7 @@ def test_points_some_at_a_time_are_those_drawn_at_once(method):
     np.testing.assert_array_equal(points.rows(3, 5), whole[3:5])
 
 
+@pytest.mark.slow
 def test_a_draw_takes_a_few_bytes_of_memory(case, monkeypatch):
     """Its measures and values take 136 bytes, of which one column, two flags remain."""
     streamed(monkeypatch)
