@@ -17,7 +17,11 @@ class TankBottomWarning(UserWarning):
 
 
 def can_withdraw(loop: ClosedLoop) -> bool:
-    """Return whether an inflow below 0 or a pump that runs backwards can empty a tank."""
+    """Return whether an inflow below 0, a pump that runs backwards, one that draws from a tank or a
+    valve can empty a tank, or one that has a shape.
+    """
+    if any(getattr(loop.plant, name, ()) for name in ("sources", "valves", "shapes")):
+        return True
     actuator: Any = loop.actuator
     numbers = [getattr(actuator, name, 0.0) for name in ("low", "initial")]
     if is_component(loop.disturbance):

@@ -38,6 +38,11 @@ def opening_flow(net: Any, area: Any, head: Any, exponent: Any, resistance: Any)
     return flow if resistance is None else flow + lower_clip(head, 0.0) / resistance
 
 
+def full_open(units: tuple[str, str]) -> float:
+    """Return the input of a valve that is full open: 1, or 100 where inputs are in %."""
+    return 100.0 if units[1].strip() == "%" else 1.0
+
+
 def valve_share(characteristic: Any, rangeability: Any, opening: Any) -> Any:
     """Return the share of a valve's full area that is open (IEC 60534-2-4)."""
     if characteristic == "linear":
@@ -76,7 +81,7 @@ def streams(net: Any, x: Any, u: Any) -> list[Stream]:
             flows.append(Stream(source, sink, flow))
     for k, ends in enumerate(net.pipes):
         port = None if net.pipe_port is None else net.pipe_port[k]
-        flows.append(Stream(*ends, _joined_flow(net, net.pipe[k], x, ends, port)))
+        flows.append(Stream(ends[0], ends[1], _joined_flow(net, net.pipe[k], x, ends, port)))
     for j, (first, second) in enumerate(net.feeds):
         source = net.sources[j] if net.sources else None
         flow = net.pump_gain[j] * _driven(net, j, x, u[j], source, first)
@@ -86,7 +91,7 @@ def streams(net: Any, x: Any, u: Any) -> list[Stream]:
             flows.append(Stream(source, first, net.split[j] * flow))
             flows.append(Stream(source, second, (1.0 - net.split[j]) * flow))
     for k, (source, sink) in enumerate(net.valves):
-        opening = u[len(net.feeds) + k]
+        opening = u[len(net.feeds) + k] / full_open(net.units)
         area = net.valve[k] * valve_share(net.characteristics[k], net.rangeability[k], opening)
         port = None if net.valve_port is None else net.valve_port[k]
         if sink is None:

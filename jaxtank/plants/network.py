@@ -77,7 +77,8 @@ def network(
     ----------
     area, drain, rim : (n,) cross-section [cm^2], outlet to the basin [cm^2] and height [cm]
     pump_gain, split : (m,) flow per unit of input [cm^3/(s V)], and its share to the first tank [-]
-    feeds : m pairs (first tank, second tank or None), tanks counted from 0
+    feeds : m pairs (first tank, second tank or None), tanks counted from 0; (None, None) for a pump
+        that only takes out
     links, orifice : pairs (from, to) of tanks, and the area of the orifice of each [cm^2]
     pipes, pipe : pairs (one, other) of tanks, and the area of the pipe of each [cm^2]
     spills, caught : pairs (from, to), and the share of the overflow that falls into `to` [-]
@@ -125,7 +126,7 @@ def network(
     (2, array([15., 15.]))
     """
     units = check_units("plant.units", units)
-    feeds = tuple((int(a), None if b is None else int(b)) for a, b in feeds)
+    feeds = tuple(tuple(None if i is None else int(i) for i in pair) for pair in feeds)
     links, pipes, spills = (
         tuple((int(a), int(b)) for a, b in pairs) for pairs in (links, pipes, spills)
     )
@@ -135,6 +136,7 @@ def network(
     joined["sources"] = [(source,) for source in sources]
     n = np.size(area) if np.ndim(area) else 1 + _last_tank(joined)
     _check_tanks({**joined, "outputs": [outputs]}, n)
+    _check_feeds(feeds, sources)
     m, sizes = len(feeds), {"drain": n, "orifice": len(links), "pipe": len(pipes)}
     sizes |= {"spill": len(spills), "valve": len(valves)}
     options = {
@@ -197,6 +199,14 @@ def _check_tanks(named: dict[str, Sequence], n: int) -> None:
         for i in (i for group in groups for i in group if i is not None):
             if not 0 <= i < n:
                 raise InputError(f"plant.{name} names tank {i}: there are {n}, counted from 0")
+
+
+def _check_feeds(feeds: Sequence, sources: Sequence) -> None:
+    """Raise InputError for a pump that neither fills a tank nor draws from one."""
+    for j, (first, second) in enumerate(feeds):
+        source = sources[j] if j < len(sources) else None
+        if first is None and (source is None or second is not None):
+            raise InputError(f"plant.feeds: pump {j + 1} joins no tank: give it a source or a tank")
 
 
 def _fitted(name: str, value: ArrayLike, size: int) -> np.ndarray:

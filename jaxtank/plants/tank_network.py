@@ -314,7 +314,7 @@ class TankNetwork(Plant):
         "cm",
         "height of each valve above the bottom",
         low=0.0,
-        like="area",
+        like="valve",
         default=None,
         shape="valve",
     )
@@ -378,7 +378,9 @@ class TankNetwork(Plant):
     )
     links: tuple = static(doc="((from, to), ...) tanks joined by each orifice")
     pipes: tuple = static(doc="((one, other), ...) tanks joined by each pipe", default=())
-    feeds: tuple = static(doc="((first tank, second tank or None), ...) one per pump")
+    feeds: tuple = static(
+        doc="((first tank, second tank or None), ...) one per pump; (None, None): the basin"
+    )
     sources: tuple = static(
         doc="the tank from which each pump draws, or None: the basin; () where all do", default=()
     )
@@ -441,9 +443,9 @@ class TankNetwork(Plant):
         """Return [(pump, tank, gain [cm^3/(s V)])]: where each pump's flow goes."""
         shares = []
         for j, (first, second) in enumerate(self.feeds):
-            if second is None:
+            if second is None and first is not None:  # else it only takes out
                 shares.append((j, first, self.pump_gain[j]))
-            else:
+            elif second is not None:
                 shares += [
                     (j, first, self.pump_gain[j] * self.split[j]),
                     (j, second, self.pump_gain[j] * (1.0 - self.split[j])),

@@ -1,16 +1,17 @@
 """Values of a rig file, read and written by their Key: kinds, ranges, units, lines of TOML."""
 
+import contextlib
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxtank.core.checks import check_value
-from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.errors import InputError, nearest, unknown
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import number, sizes_of_shape
 from jaxtank.core.units import DEFAULT
-from jaxtank.rig.schema import NEEDED, PARTS, Section
+from jaxtank.rig.schema import NEEDED, PARTS, SECTIONS, Key, Section
 
 LARGEST = 1e300
 """Magnitude of a number of a rig file: products of two stay finite for most."""
@@ -43,24 +44,49 @@ def read_entry(
     where = section.name if index is None else f"{section.name} {index + 1}"
     if not isinstance(table, Mapping):
         raise refusal(where, table, "be a table")
-    for key in table:
-        if key not in section.names:
-            raise _unknown(section, where, key)
+    problems = Problems(_unknown(section, where, key) for key in table if key not in section.names)
     values = {}
     for key in section.keys:
         value = table.get(key.name, None if key.default is NEEDED else key.default)
         if key.name in table or value is not None:
             label = f"{where}: {key.name}" if section.many else f"{where}.{key.name}"
-            values[key.name] = read_value(key, label, value, sizes)
+            with problems.collect():
+                values[key.name] = read_value(key, label, value, sizes)
         elif key.default is NEEDED:
             label = where if section.many else title or section.title
-            raise InputError(f"{label} needs {key.name}{unit(key.meta(sizes.units))}: {key.doc}")
+            needed = f"{label} needs {key.name}{unit(key.meta(sizes.units))}: {key.doc}"
+            problems.append(InputError(needed))
+    problems.check()
     return values
 
 
 def read_entries(section, table: Mapping[str, Any], sizes: Sizes) -> list[dict[str, Any]]:
     """Return `read_entry` of each table of a list in a rig file, [] where there is none."""
-    return [read_entry(section, entry, sizes, i) for i, entry in enumerate(table[section.name])]
+    problems, entries = Problems(), []
+    for i, entry in enumerate(table[section.name]):
+        with problems.collect():
+            entries.append(read_entry(section, entry, sizes, i))
+    problems.check()
+    return entries
+
+
+class Problems(list[InputError]):
+    """What is wrong in a file, so that one answer has all of it."""
+
+    @contextlib.contextmanager
+    def collect(self):
+        """Keep an InputError of the block, and go on after it."""
+        try:
+            yield
+        except InputError as error:
+            self.append(error)
+
+    def check(self) -> None:
+        """Raise the InputError of what was collected."""
+        if len(self) == 1:
+            raise self[0]
+        if self:
+            raise InputError("; ".join(dict.fromkeys(str(error) for error in self)))
 
 
 def _unknown(section, where, key):
@@ -71,7 +97,42 @@ def _unknown(section, where, key):
             f"{where}: {key} is not a key of {section.title}: it is"
             f' "{section.elsewhere}.{key}" in [values], for all of them at once'
         )
-    return unknown(f"key of {section.title}", key, section.names)
+    titles = [s.title for s in SECTIONS.values() if key in s.names and s.name]
+    if key in SECTIONS:
+        hint = f"; {SECTIONS[key].title} is a table of its own"
+    elif titles:
+        hint = f"; it is a key of {', '.join(titles)}"
+    else:
+        hint = f"; write {WORDS[key]}" if key in WORDS else nearest(key, section.names)
+    return InputError(f"unknown key of {section.title} {key!r}{hint}")
+
+
+WORDS = {
+    "cone": '[[tank]] shape = "cone" with height and diameter',
+    "sphere": '[[tank]] shape = "sphere" with diameter',
+    "cylinder": "[[tank]] diameter and rim",
+    "radius": "diameter",
+    "volume": "area and rim",
+    "initial_level": "level",
+    "setpoint": "[reference] initial and changes",
+    "outlet": "drain of [[tank]], or a [[valve]] where its opening is an input",
+    "leak": "inflow of [[tank]], below 0",
+    "demand": "inflow of [[tank]], below 0",
+    "weir": "[[spill]] with port",
+    "opening": "initial of [[valve]]",
+    "cv": "area of [[valve]]: flow = area sqrt(2 g head)",
+    "kv": "area of [[valve]]: flow = area sqrt(2 g head)",
+    "resistance": "linear of [[orifice]], drain_linear of [[tank]]",
+    "power": "exponent of [[orifice]], drain_exponent of [[tank]]",
+    "head": "curve_head of [[pump]]: [[lift, share of the flow], ...]",
+    "reservoir": "[[tank]] with a large area",
+    "source": "from",
+    "sink": "to",
+    "flow": "curve of [[pump]]: [[input, flow], ...]",
+    "max": "high",
+    "min": "low",
+}
+"""{word of the field that is no key: what to write}."""
 
 
 def refusal(label: str, value: Any, must: str) -> InputError:
@@ -122,7 +183,8 @@ def _list(key, label, value, sizes):
     shape = sizes_of_shape(key.shape, sizes.counts) or ()
     if not (is_finite(value) and np.shape(value) == shape):
         numbers = f"{shape[0] if shape else 1} finite numbers{unit(key.meta(sizes.units))}"
-        raise refusal(label, value, f"be a list of {numbers}, one per {key.shape[0]}")
+        each = {"pump": "input (pumps, then valves)"}.get(key.shape[0], key.shape[0])
+        raise refusal(label, value, f"be a list of {numbers}, one per {each}")
     return number(value)
 
 
@@ -170,7 +232,7 @@ def _feed(key, label, value, sizes):
     """(first, second) of the tanks that a pump fills, None for a second that is left out."""
     tanks = value if isinstance(value, list) else [value]
     if not 1 <= len(tanks) <= 2:
-        raise refusal(label, value, "name one tank, or two")
+        raise refusal(label, value, "name one tank, or two; left out: the basin")
     first, *second = different(label, value, _tanks(key, label, tanks, sizes))
     return first, second[0] if second else None
 
@@ -180,6 +242,25 @@ def different(label, value, tanks):
     if len(set(tanks)) < len(tanks):
         raise refusal(label, value, "be two different tanks")
     return tanks
+
+
+def _curve(key, label, value, sizes):
+    """Points ((x, y), ...) with increasing x, or the name of one of the key's choices."""
+    if isinstance(value, str) and value in (key.choices or ()):
+        return value
+    names = "".join(f'"{choice}", ' for choice in key.choices or ())
+    pairs = isinstance(value, list) and len(value) > 1
+    if not (pairs and all(isinstance(point, list) and len(point) == 2 for point in value)):
+        columns = key.local_unit(sizes.units)
+        raise refusal(label, value, f"be {names}or a list of points [{columns}]: {key.doc}")
+    columns = [Key(key.name, unit=unit) for unit in key.unit.split(", ")]
+    points = tuple(
+        tuple(_number(c, f"{label} point {k + 1}", v, sizes) for c, v in zip(columns, point))
+        for k, point in enumerate(value)
+    )
+    if any(after[0] <= before[0] for before, after in zip(points, points[1:])):
+        raise refusal(label, value, "have points whose first numbers increase")
+    return points
 
 
 def _table(key, label, value, sizes):
@@ -202,6 +283,7 @@ READ = {
     "tanks": _tanks,
     "pair": _pair,
     "feed": _feed,
+    "curve": _curve,
     "table": _table,
     "any": lambda key, label, value, sizes: value,
 }
@@ -323,10 +405,16 @@ class Block(NamedTuple):
 def lines_of(section: Section, values: Mapping[str, Any], units=DEFAULT) -> list[Line]:
     """Return the lines of a section's keys that have a value, in the order of its schema."""
     return [
-        Line(k.name, written(k, values[k.name]), k.meta(units))
+        Line(k.name, written(k, values[k.name]), _meta_of(k, values[k.name], units))
         for k in section.keys
         if values.get(k.name) is not None
     ]
+
+
+def _meta_of(key, value, units):
+    """The metadata of a value; a name in the place of a curve has no unit."""
+    meta = key.meta(units)
+    return {**meta, "unit": "-"} if key.kind == "curve" and isinstance(value, str) else meta
 
 
 def block_of(section: Section, values: Mapping[str, Any], units=DEFAULT) -> Block:

@@ -1,9 +1,10 @@
-"""A rig described tank by tank in a rig file: [[tank]], [[orifice]], [[pipe]], [[spill]], [[pump]]
-and [plant]; read to a Case and written from a loop.
+"""A rig described tank by tank in a rig file: [[tank]], [[orifice]], [[pipe]], [[spill]], [[pump]],
+[[valve]] and [plant]; read to a Case and written from a loop.
 """
 
 import dataclasses
 import functools
+import math
 from typing import Any
 
 import numpy as np
@@ -17,15 +18,25 @@ from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
+from jaxtank.plants.elements import full_open
 from jaxtank.plants.network import SURPLUS, TankNetwork, network
 from jaxtank.rig.components import controller_of, observer_of
-from jaxtank.rig.entry import Sizes, different, name_of, read_entries, read_entry, refusal
-from jaxtank.rig.schema import LISTS, SECTIONS
+from jaxtank.rig.entry import (
+    Problems,
+    Sizes,
+    different,
+    name_of,
+    read_entries,
+    read_entry,
+    refusal,
+    unit,
+)
+from jaxtank.rig.schema import INPUTS, LISTS, SECTIONS
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
 
 MOST = 5000
-"""Tanks that a rig file may have; as many pumps, orifices, pipes and spills."""
+"""Tanks that a rig file may have; as many pumps, valves, orifices, pipes and spills."""
 
 
 def names_in(table):
@@ -42,17 +53,18 @@ def build(table):
     table = {**table, **{name: _list(table, name) for name in LISTS}}
     units = _units(table.get("units", list(DEFAULT)))
     sizes = Sizes(len(table["tank"]), units=units, names=names_in(table))
-    entries = {name: read_entries(SECTIONS[name], table, sizes) for name in LISTS}
-    more = read_entry(SECTIONS["plant"], table.get("plant", {}), sizes)
-    names = {kind: tuple(entry["name"] for entry in entries[kind]) for kind in ("tank", "pump")}
-    _check_names(names["tank"])
-    _check_links(table, entries)
-    _check_pumps(table["pump"], entries["pump"], units)
+    entries, more = _read(table, sizes)
+    names = {
+        "tank": tuple(entry["name"] for entry in entries["tank"]),
+        "pump": tuple(entry["name"] for kind in INPUTS for entry in entries[kind]),
+    }
     columns = _columns(entries)
-    outputs = more.pop("outputs", tuple(first for first, _ in columns["plant.feeds"]))
+    outputs = more.pop("outputs") if "outputs" in more else _usual_outputs(entries)
     if not outputs:
         raise InputError("plant.outputs = []: must be a list of at least one tank")
-    plant = network(**_fields(columns, "plant"), **more, outputs=outputs, units=units)
+    if any("port" in row for row in table["spill"]):  # else such an opening would do nothing
+        more = {"overflow": True, **more}
+    plant = network(**_keywords(columns), **more, outputs=outputs, units=units)
     control = table.get("controller", {})
     return Case(
         name="my rig",
@@ -66,11 +78,101 @@ def build(table):
     )
 
 
+def _read(table, sizes):
+    """({list: [values of each table]}, values of [plant]), with all problems in one answer."""
+    problems, more = Problems(), {}
+    entries: dict[str, list[dict[str, Any]]] = {name: [] for name in LISTS}
+    for name in LISTS:
+        with problems.collect():
+            entries[name] = read_entries(SECTIONS[name], table, sizes)
+    with problems.collect():
+        more = read_entry(SECTIONS["plant"], table.get("plant", {}), sizes)
+    for i, tank in enumerate(entries["tank"]):
+        with problems.collect():
+            tank |= _vessel(f"tank {i + 1}", tank, sizes.units)
+    rows = {name: table[name] if entries[name] else () for name in LISTS}
+    checks = [
+        lambda: _check_names([entry["name"] for entry in entries["tank"]]),
+        lambda: _check_links(rows, entries, sizes.units),
+        lambda: _check_pumps(rows["pump"], entries["pump"], sizes.units),
+        lambda: _check_valves(entries["valve"], sizes.units),
+    ]
+    for check in checks:
+        with problems.collect():
+            check()
+    problems.check()
+    return entries, more
+
+
+FORMS: dict[str, tuple[tuple[str, ...], ...]] = {
+    "prism": (("area",), ("diameter",)),
+    "cone": (("diameter", "height"), ("area", "height")),
+    "sphere": (("diameter",), ("area", "height")),
+    "horizontal-cylinder": (("diameter", "length"), ("area", "height")),
+    "table": ((), ("area", "height")),
+}
+"""{shape: sets of keys by which a [[tank]] gives its size}."""
+
+
+def _vessel(where, tank, units):
+    """{key: value} of area, shape, height and rim of a [[tank]]; an upright one is a prism."""
+    shape, tank = tank.get("shape", "prism"), dict(tank)
+    kind, title = (shape, f'shape = "{shape}"') if isinstance(shape, str) else ("table", "shape")
+    if kind == "prism":
+        title = "an upright tank"
+        if "height" in tank and "rim" in tank:
+            raise InputError(f"{where}: height and rim are the same of {title}: give one of them")
+        if "height" in tank:
+            tank["rim"] = tank.pop("height")
+        if "rim" not in tank:
+            raise InputError(f"{where} needs rim [{units[0]}]: height")
+    sizes = {key: tank[key] for key in ("area", "diameter", "height", "length") if key in tank}
+    if tuple(sorted(sizes)) not in FORMS[kind]:
+        if kind == "prism" and not sizes:
+            area = unit(SECTIONS["tank"]["area"].meta(units))
+            raise InputError(f"{where} needs area{area}: cross-section A; or diameter, or shape")
+        forms = ", or ".join(" and ".join(form) or "no other" for form in FORMS[kind])
+        raise InputError(
+            f"{where}: {title} needs {forms} of area, diameter, height, length, not"
+            f" {', '.join(sizes) or 'none'}"
+        )
+    extent = sizes.get("height", sizes.get("diameter"))
+    extent, area = tank["rim"] if kind == "prism" else extent, sizes.get("area", 0.0)
+    if kind == "table":
+        levels, areas = zip(*shape)
+        if levels[0] != 0.0 or min(areas) < 0.0 or min(areas[1:]) == 0.0:
+            raise refusal(
+                f"{where}: shape", shape, "be [[level, area], ...] from level 0, areas above 0"
+            )
+        extent, area = sizes.get("height", levels[-1]), sizes.get("area", max(areas))
+        shape = tuple((h / levels[-1], a / max(areas)) for h, a in shape)
+    elif "length" in sizes:
+        area = sizes["diameter"] * sizes["length"]
+    elif "diameter" in sizes:
+        area = _disc(sizes["diameter"])
+    return {"area": area, "shape": shape, "height": extent, "rim": tank.get("rim", extent)}
+
+
+def _disc(diameter):
+    """Area of a disc [cm^2]."""
+    return math.pi / 4.0 * diameter**2
+
+
+def _usual_outputs(entries):
+    """The tanks that the pumps fill first, or which they empty; without pumps, the valves."""
+    ends: list[Any] = [
+        pump.get("from") if pump["to"][0] is None else pump["to"][0] for pump in entries["pump"]
+    ]
+    return tuple(dict.fromkeys(ends or [valve["from"] for valve in entries["valve"]]))
+
+
 def _list(table, name):
-    """The tables of a list in a rig file; InputError for too many, and for no tank or pump."""
+    """The tables of a list in a rig file; InputError for too many, and for no tank or input."""
     entries = table.get(name, [])
-    if not entries and name in ("tank", "pump"):
-        raise InputError(f"a rig needs at least one [[{name}]]")
+    if not entries and name == "tank":
+        raise InputError("a rig needs at least one [[tank]]")
+    if not entries and not any(table.get(kind) for kind in INPUTS):
+        raise InputError("a rig needs at least one [[pump]] or [[valve]]")
     if len(entries) > MOST:
         raise InputError(f"[[{name}]]: {len(entries)} {name}s: must be at most {MOST}")
     return entries
@@ -78,15 +180,38 @@ def _list(table, name):
 
 def _columns(entries) -> dict[str, Any]:
     """{target: [value of each table]} of the lists of a rig; of parts of an entry, pairs."""
-    columns = {
-        key.target: [entry[key.name] for entry in entries[name]]
-        for name in LISTS
-        for key in SECTIONS[name].keys
-        if key.target
-    }
-    for name in ("plant.links", "plant.spills"):
+    columns: dict[str, Any] = {}
+    for name in LISTS:
+        for key in (key for key in SECTIONS[name].keys if key.target):
+            column = columns.setdefault(key.target, [])
+            column += [entry.get(key.name) for entry in entries[name]]
+    for key in (key for name in LISTS for key in SECTIONS[name].keys if key.like):
+        if all(value == key.default for value in columns.get(key.target, [0.0])):
+            columns.pop(key.target, None)  # what no table has is absent
+    for name in ("plant.links", "plant.spills", "plant.valves"):
         columns[name] = list(zip(columns.pop(f"{name}.0"), columns.pop(f"{name}.1")))
+    if all(shape == "prism" for shape in columns["plant.shapes"]):
+        del columns["plant.shapes"], columns["plant.extent"]
+    if "plant.spill_port" in columns:  # an opening that is left out is the rim
+        rims = [columns["plant.rim"][source] for source, _ in columns["plant.spills"]]
+        ports = columns["plant.spill_port"]
+        columns["plant.spill_port"] = [r if p is None else p for r, p in zip(rims, ports)]
+    gains = columns["plant.pump_gain"]
+    columns["plant.pump_gain"] = [1.0 if gain is None else gain for gain in gains]
     return columns
+
+
+def _keywords(columns):
+    """Keywords of `network` of the columns of a plant."""
+    keywords = _fields(columns, "plant")
+    for option, group in (
+        ("port", "ports"),
+        ("exponent", "exponents"),
+        ("resistance", "resistances"),
+    ):
+        names = [name for name in keywords if name.endswith(f"_{option}")]
+        keywords[group] = {name.removesuffix(f"_{option}"): keywords.pop(name) for name in names}
+    return keywords
 
 
 def _fields(columns, part):
@@ -97,24 +222,24 @@ def _fields(columns, part):
 
 def _loop(plant, columns, control, observer):
     """The ClosedLoop of a plant and of the columns of its tables."""
-    pumps, levels = _fields(columns, "actuator"), number(columns["x0"])
+    inputs, levels = _fields(columns, "actuator"), number(columns["x0"])
     inflow = columns["disturbance.level"]
     unset: Any = None  # the controller needs the loop
     sensor = {"gain": np.ones(plant.tanks), "full_scale": np.max(plant.rim)}
     # the pulse is of use only above 0, beside a dead zone
-    pulse = [high if high > 0 else 1.0 for high in pumps["high"]]
+    pulse = [high if high > 0 else 1.0 for high in inputs["high"]]
     loop = ClosedLoop(
         plant=plant,
         sensor=LevelSensor(**_numbers(sensor | _fields(columns, "sensor"))),
         observer=Direct(),
         controller=unset,
-        actuator=PumpBank(**_numbers({"stop": np.zeros(plant.pumps), "pulse": pulse, **pumps})),
+        actuator=PumpBank(**_numbers({"stop": np.zeros(plant.pumps), "pulse": pulse, **inputs})),
         reference=ramps([float(levels[i]) for i in plant.outputs], [], ramp=0.0),
         disturbance=Constant(level=number(inflow)) if any(inflow) else None,
         x0=levels,
     )
     # a bias that is left out is computed once all values are set (rig/read.py)
-    controller = controller_of(control, loop, number(pumps["initial"]))
+    controller = controller_of(control, loop, number(inputs["initial"]))
     loop = dataclasses.replace(loop, controller=controller)
     return (
         loop
@@ -142,12 +267,18 @@ def _check_names(names):
             raise InputError(f"two tanks have the same name, {name!r}: give each its own")
 
 
-def _check_links(table, entries):
+def _check_links(table, entries, units):
     """Raise InputError for a link of a tank to itself, and for spills of more than 1 in sum."""
-    for name in ("orifice", "spill"):
+    for name in ("orifice", "spill", "pump", "valve"):
         for i, (entry, row) in enumerate(zip(entries[name], table[name])):
-            ends = [row["from"], row["to"]]
-            different(f"{name} {i + 1}: [from, to]", ends, (entry["from"], entry["to"]))
+            if "from" in row and "to" in row:
+                ends = entry["to"] if name == "pump" else (entry["to"],)
+                tanks = (entry["from"], *(tank for tank in ends if tank is not None))
+                different(f"{name} {i + 1}: [from, to]", [row["from"], row["to"]], tanks)
+    for i, row in enumerate(table["orifice"]):
+        if "area" not in row and "linear" not in row:
+            area = unit(SECTIONS["orifice"]["area"].meta(units))
+            raise InputError(f"orifice {i + 1} needs area{area}: effective area; or linear")
     spills, rows = entries["spill"], table["spill"]
     for source in dict.fromkeys(spill["from"] for spill in spills):
         same = [k for k, spill in enumerate(spills) if spill["from"] == source]
@@ -166,11 +297,28 @@ FLOW_MARGIN = 2.0
 
 
 def _check_pumps(rows, pumps, units):
-    """Raise InputError for limits in the wrong order, for a split without two tanks, and for a gain
-    that is not near the flow of a unit of the input.
+    """Raise InputError for limits in the wrong order, for a split without two tanks, for a pump
+    that joins no tank, for curves that turn, and for a gain that is not near the flow of a unit of
+    the input.
     """
     length, drive = units
     for i, (pump, row) in enumerate(zip(pumps, rows)):
+        pump.setdefault("to", (None, None))
+        if pump["to"][0] is None and "from" not in pump:
+            raise InputError(
+                f"pump {i + 1} needs to: the tank that it fills, or [first, second]; or from: the"
+                " tank that it empties"
+            )
+        if ("gain" in pump) == ("curve" in pump):
+            gain = unit(SECTIONS["pump"]["gain"].meta(units))
+            raise InputError(
+                f"pump {i + 1}: gain and curve both give its flow: give one of them"
+                if "gain" in pump
+                else f"pump {i + 1} needs gain{gain}: flow per unit of the pump's input (Kp); or"
+                " curve = [[input, flow], ...]"
+            )
+        for key, least in (("curve", None), ("curve_head", 0.0)):
+            _check_monotone(f"pump {i + 1}: {key}", pump.get(key), least)
         if not pump["high"] > pump["low"]:
             raise InputError(
                 f"pump {i + 1}: high = {pump['high']:g} {drive}: must be above its low,"
@@ -182,13 +330,44 @@ def _check_pumps(rows, pumps, units):
                 " [first, second], and only there"
             )
     flow = flow_per_input(units)
-    for i, gain in enumerate(pump["gain"] for pump in pumps):
+    for i, gain in enumerate(pump.get("gain", 0.0) for pump in pumps):
         if flow and gain > 0 and not 1 / FLOW_MARGIN <= gain / flow <= FLOW_MARGIN:
             raise InputError(
                 f"pump {i + 1}: gain = {gain:g} {length}^3/s per {drive}: an input of 1 {drive} is"
                 f" a flow of {flow:.6g} {length}^3/s: must be {flow:.6g} times the share that the"
                 f" pump delivers, from {flow / FLOW_MARGIN:.4g} to {flow * FLOW_MARGIN:.4g}"
             )
+
+
+def _check_monotone(label, points, least=None):
+    """Raise InputError for points of a curve that rise and fall, or lie below `least`."""
+    heights = [y for _, y in points or ()]
+    if heights not in (sorted(heights), sorted(heights, reverse=True)):
+        raise refusal(
+            label, [list(p) for p in points], "rise or fall all along: a curve that turns"
+        )
+    if least is not None and min(heights, default=least) < least:
+        raise refusal(label, [list(p) for p in points], f"be at least {least:g}")
+
+
+def _check_valves(valves, units):
+    """Raise InputError for a valve whose stops or characteristic are none; the upper stop of one
+    that has none is full open.
+    """
+    full, drive = full_open(units), unit(SECTIONS["valve"]["high"].meta(units))
+    for i, valve in enumerate(valves):
+        high = valve.setdefault("high", full)
+        if not valve["low"] < high <= full:
+            raise InputError(
+                f"valve {i + 1}: low, high = {valve['low']:g}, {high:g}{drive}: openings must"
+                f" increase, up to {full:g}, full open"
+            )
+        shares = valve["characteristic"]
+        if not isinstance(shares, str):
+            label = f"valve {i + 1}: characteristic"
+            _check_monotone(label, shares, 0.0)
+            if (shares[0][0], shares[-1][0]) != (0.0, 1.0):
+                raise refusal(label, [list(p) for p in shares], "have openings from 0 to 1")
 
 
 def entries_of(loop, names):
@@ -200,13 +379,26 @@ def entries_of(loop, names):
     for name in LISTS:
         section = SECTIONS[name]
         for i in range(len(getattr(plant, section.per))):
+            # valves are the inputs after the pumps
+            j = i + len(plant.feeds) * (name == "valve")
             values = {
-                key.name: _entry_of(loop, key.target, i) for key in section.keys if key.target
+                key.name: _entry_of(loop, key.target, i if key.target.startswith("plant.") else j)
+                for key in section.keys
+                if key.target
             }
+            usual = {key.name: key.default for key in section.keys if key.like}
+            values = {k: v for k, v in values.items() if k not in usual or v != usual[k]}
+            if name in ("tank", *INPUTS):
+                kind = "tank" if name == "tank" else "pump"
+                values["name"] = names[kind][j] if kind in names else ""
+            if name == "tank":
+                values |= _sizes_of(values)
             if name == "pump" and plant.feeds[i][1] is None:
                 del values["split"]
-            if name in ("tank", "pump"):
-                values["name"] = names[name][i] if name in names else ""
+            if values.get("to") == (None, None):
+                del values["to"]
+            if values.get("curve") is not None:
+                del values["gain"]  # 1, or one of [values]
             entries.append((section, i + 1, values))
     more = {key.name: getattr(plant, key.name) for key in SECTIONS["plant"].keys}
     return [*entries, (SECTIONS["plant"], 1, more)]
@@ -219,6 +411,42 @@ def _entry_of(loop, target, i):
     path = target.split(".")
     part = int(path.pop()) if path[-1].isdigit() else None
     value = functools.reduce(getattr, path, loop)
+    if value is None or (isinstance(value, tuple) and not value):  # not in use
+        return None
     if not isinstance(value, tuple) and np.ndim(value) == 0:  # one number for all tanks
         return value
     return value[i] if part is None else value[i][part]
+
+
+def _sizes_of(tank):
+    """{key: value} of the size of a [[tank]] as people give it, where that is the same numbers."""
+    shape, area, extent = tank["shape"], float(tank["area"]), tank.get("height")
+    if shape in (None, "prism"):
+        return {"shape": None, "height": None}
+    extent = float(extent)
+    if not isinstance(shape, str):
+        points = tuple((_factor(y, extent), _factor(share, area)) for y, share in shape)
+        same = points[-1][0] == extent and max(a for _, a in points) == area
+        return {"shape": points} | ({"area": None, "height": None} if same else {})
+    if shape == "horizontal-cylinder":
+        length = _nearby(area / extent, lambda length: extent * length == area)
+        sizes = {"diameter": extent, "length": length}
+    else:
+        diameter = _nearby(math.sqrt(4.0 * area / math.pi), lambda d: _disc(d) == area)
+        sizes = {"diameter": diameter, "height": extent}
+        if shape == "sphere":
+            sizes = {"diameter": diameter if diameter == extent else None}
+    return {} if None in sizes.values() else {"area": None, "height": None, **sizes}
+
+
+def _nearby(value, is_exact):
+    """The shortest of the numbers beside `value` that is exact, None without one."""
+    rounded = [float(f"{value:.{digits}g}") for digits in (9, 12, 15)]
+    near = [value, *(math.nextafter(value, end) for end in (0.0, math.inf))]
+    return next((v for v in [*rounded, *near] if is_exact(v)), None)
+
+
+def _factor(share, whole):
+    """The number whose share of `whole` is `share` to the bit, if there is one."""
+    exact = _nearby(share * whole, lambda value: value / whole == share)
+    return share * whole if exact is None else exact

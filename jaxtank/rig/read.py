@@ -13,7 +13,7 @@ from jaxtank.core.files import read_text
 from jaxtank.core.text import shortened
 from jaxtank.rig import components, network, signals, validation
 from jaxtank.rig.entry import Sizes, read_entry, read_value, refusal, sizes_of
-from jaxtank.rig.schema import SECTIONS, TANKWISE
+from jaxtank.rig.schema import INPUTS, SECTIONS, TANKWISE
 from jaxtank.rig.values import (
     by_dotted_name,
     has,
@@ -168,13 +168,16 @@ def _check_twice(table):
     they belong to, [disturbance], [sensor] or [actuator], give differently; all at once.
     """
     problems = []
-    for name in ("tank", "pump"):
+    for name in ("tank", *INPUTS):
         entries = table.get(name, [])
+        before = len(table.get("pump", [])) if name == "valve" else 0
+        inputs = sum(len(table.get(kind, [])) for kind in INPUTS)
         for key in SECTIONS[name].keys:
             section, _, field = key.target.partition(".")
             field = "inflow" if section == "disturbance" else field
             whole = table.get(section, {}).get(field)
-            each = whole if isinstance(whole, list) and len(whole) == len(entries) else None
+            count = inputs if section == "actuator" else len(entries)
+            each = whole[before:] if isinstance(whole, list) and len(whole) == count else None
             for i, entry in enumerate(entries if whole is not None else ()):
                 other = whole if each is None else each[i]
                 if key.name in entry and entry[key.name] != other:
@@ -264,9 +267,10 @@ def _with_bias(case, values, table):
         return case, values
     parts = ("plant.", "actuator.", "disturbance.", "x0")
     case = set_values(case, {n: v for n, v in values.items() if n.startswith(parts)})
-    name, pumps = "actuator.initial", table.get("pump", [{}] * case.loop.plant.pumps)
+    name, rows = "actuator.initial", [row for kind in INPUTS for row in table.get(kind, [])]
+    rows = rows or [{}] * case.loop.plant.pumps
     whole = "initial" in table.get("actuator", {}) or name in values
-    known = [whole or "initial" in pump or f"{name}[{j}]" in values for j, pump in enumerate(pumps)]
+    known = [whole or "initial" in row or f"{name}[{j}]" in values for j, row in enumerate(rows)]
     controller: Any = case.loop.controller
     controller = dataclasses.replace(controller, bias=components.steady_bias(case.loop, known))
     later = {n: v for n, v in values.items() if not n.startswith(parts)}

@@ -12,6 +12,7 @@ from jaxtank.core.units import DEFAULT, local
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.plants.elements import full_open
 from jaxtank.plants.faults import Faults
 from jaxtank.plants.network import TankNetwork
 from jaxtank.signals.inflows import InflowPulses
@@ -45,6 +46,8 @@ class Key:
     default: Any = NEEDED
     shape: tuple[Any, ...] = ()
     target: str = ""
+    like: str | None = None
+    infinite: bool = False
 
     @classmethod
     def of(cls, owner: type, field: str, **changes: Any) -> "Key":
@@ -52,7 +55,7 @@ class Key:
         the field's.
         """
         spec = next(f for f in dataclasses.fields(owner) if f.name == field)
-        names = ("unit", "doc", "low", "high", "strict", "shape")
+        names = ("unit", "doc", "low", "high", "strict", "shape", "like", "infinite")
         meta: dict[str, Any] = {k: spec.metadata[k] for k in names if k in spec.metadata}
         if spec.metadata["kind"] == "static":
             meta["kind"] = _KINDS.get(type_of(spec), "number")
@@ -61,8 +64,15 @@ class Key:
 
     def meta(self, units: tuple[str, str] = DEFAULT) -> dict[str, Any]:
         """Return the metadata of a value, as of a leaf, in the units of a rig."""
-        names = ("kind", "doc", "low", "high", "strict", "choices")
-        return {**{k: getattr(self, k) for k in names}, "unit": local(self.unit, units)}
+        names = ("kind", "doc", "low", "high", "strict", "choices", "infinite")
+        return {**{k: getattr(self, k) for k in names}, "unit": self.local_unit(units)}
+
+    def local_unit(self, units: tuple[str, str]) -> str:
+        """Return its unit in the units of a rig; of a curve, those of its two columns."""
+        if self.unit == "opening":  # of a valve, a share
+            return "%" if full_open(units) > 1.0 else "-"
+        columns = [local(unit, units) for unit in self.unit.split(", ")]
+        return ", ".join(columns) if set(columns) != {"-"} else "-"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,7 +141,10 @@ WEIGHT = Key("weight", "weight in the sum that is minimised", low=0.0, default=1
 SHARE = Key("share", "share", low=0.0, high=1.0, strict=True, default=0.05)
 
 LISTS = tuple(name for name, section in SECTIONS.items() if section.per)
-"""Sections with a table for each tank, orifice, pipe, spill and pump."""
+"""Sections with a table for each tank, orifice, pipe, spill, pump and valve."""
+
+INPUTS = ("pump", "valve")
+"""Lists whose tables are the inputs of a rig, in this order."""
 
 TANKWISE = (*LISTS, "plant", "units")
 """What describes a rig tank by tank, and is not given beside `case`."""

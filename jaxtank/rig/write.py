@@ -175,11 +175,18 @@ def _building(case, loop, origin, same):
 
 
 def _of_rig(section, number, values, units):
-    """The Block of a table of a rig; a tank or a pump without a name has a suggestion of one."""
+    """The Block of a table of a rig; one without a name has a suggestion of one, and the first of
+    a list what it could have beside.
+    """
     block = block_of(section, values, units)
     if values.get("name") == "":
         block.lines[0] = block.lines[0]._replace(value=f"{section.name} {number}", on=False)
-    return block
+    if number > 1 or not section.many:
+        return block
+    usual = {k.name: k.default for k in section.keys if k.like and k.default is not None}
+    usual = {name: value for name, value in usual.items() if name not in values}
+    more = [line._replace(on=False) for line in lines_of(section, usual, units)]
+    return block._replace(lines=block.lines + more, prose=(section.prose,) * bool(section.prose))
 
 
 def _reference(loop, start):
@@ -492,5 +499,6 @@ def _wrapped(sentence):
 HEAD = """\
 # A complete rig file: delete what you do not change. Lines that begin with "#" and no space are
 # suggestions: take the sign away to use one (those of a table together). Shapes: (n,) one per tank,
-# (m,) one per pump, (outputs,) one per controlled tank, all in order from 1. Where a name ends in
-# [i], as in "plant.drain[0]", entries are counted from 0. `jaxtank show CASE` is the manual."""
+# (m,) one per input, pumps and then valves, (outputs,) one per controlled tank, all in order from
+# 1. Where a name ends in [i], as in "plant.drain[0]", entries are counted from 0. `jaxtank show
+# CASE` is the manual."""
