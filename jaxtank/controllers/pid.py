@@ -15,6 +15,7 @@ from jaxtank.controllers.base import Controller
 from jaxtank.controllers.feedback_linearisation import authority, check_own_pumps, drift
 from jaxtank.core.clock import pointwise
 from jaxtank.core.errors import InputError
+from jaxtank.core.numerics import clip
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.core.vectors import each, is_array, take
@@ -63,10 +64,14 @@ class PID(Controller):
         v = base + Kc (r - y) + I - Kc Td y'_f,    I' = Kc/Ti^order D^(1-order) [(r - y) + Ti (u -
         v)/(Tt Kc)]
 
-    (gouta2022 Table 4; gouta2022 notes S4.5) with r, y [cm], v [V], u the input v after the limits
-    (back-calculation, tracking time Tt), and the derivative of the measurement filtered by a lag of
-    Td/8. Without Ti, or with Ti infinite, there is no integral action and nothing to wind up; an
-    infinite entry does so to its loop alone. Without Td there is no derivative; without `order` the
+    (gouta2022 Table 4; gouta2022 notes S4.5) with r, y [cm], v [V], u the input v after the limits,
+    and the derivative of the measurement filtered by a lag of Td/8. `anti_windup`: with
+    "back-calculation" the tracking time is Tt, with "conditioned" it is Ti (Hanus 1987), and with
+    "clamping" the integral stops while v is beyond a limit and the error drives it further. Without
+    Ti, or with Ti infinite, there is no integral action and nothing to wind up; an infinite entry
+    does so to its loop alone. With `b` the proportional part is Kc (b r - y), from an integral that
+    starts without a bump where y = r; errors within `deadband` count as 0, and larger ones by what
+    is beyond it. Without Td there is no derivative; without `order` the
     integral is of order one, with it s^-order = (1/s) s^(1-order), where the second factor is
     Oustaloup's filter: a true integrator is kept. base = bias, or with `feed_forward` the
     steady-state input of the model on the reference, (r' - f(r))/c2, less d/c2 for a disturbance d
@@ -115,9 +120,25 @@ class PID(Controller):
     )
     Tt: np.ndarray | None = leaf(
         "s",
-        "tracking time of the anti-windup; needed with Ti",
+        "tracking time of back-calculation; needed with Ti",
         low=0.0,
         strict=True,
+        like="Kc",
+        default=None,
+        shape="pump",
+    )
+    b: np.ndarray | None = leaf(
+        "-",
+        "weight of the setpoint in the proportional part; left out: 1",
+        low=0.0,
+        like="Kc",
+        default=None,
+        shape="pump",
+    )
+    deadband: np.ndarray | None = leaf(
+        "cm",
+        "errors up to it, of either sign, count as 0",
+        low=0.0,
         like="Kc",
         default=None,
         shape="pump",
@@ -125,6 +146,12 @@ class PID(Controller):
     bias: np.ndarray = leaf("V", "input added where there is no feed-forward", shape="pump")
     feed_forward: bool = static(
         "-", "add the model's input on the reference", choices=(False, True), default=False
+    )
+    anti_windup: str = static(
+        "-",
+        "what the integral does while an input is at a limit",
+        choices=("back-calculation", "clamping", "conditioned"),
+        default="back-calculation",
     )
 
     def __post_init__(self) -> None:
@@ -149,6 +176,15 @@ class PID(Controller):
         """Vectors of many tanks may be arrays, but with feed-forward and of fractional order."""
         return not self.feed_forward and self.order is None
 
+    def inputs_of(self, output: int) -> tuple[int, ...]:
+        """Return the inputs that the loop of an output moves."""
+        return (output,)
+
+    @property
+    def reversed_inputs(self) -> tuple[int, ...]:
+        """The inputs that fall where the loop's output rises."""
+        return ()
+
     @pointwise
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
         if not self.feed_forward:
@@ -163,8 +199,12 @@ class PID(Controller):
 
     def init(self, x0: tuple, u0: tuple) -> Any:
         none: Any = each(lambda u: 0.0 * u, u0) if is_array(u0) else (0.0 * u0[0],) * len(u0)
+        integral: Any = () if self.Ti is None else none
+        if self.b is not None and self.Ti is not None:  # no bump where y = r
+            y = take(x0, self.model.outputs)
+            integral = each(lambda y, k, b: k * (1.0 - b) * y, y, self.Kc, self._weight())
         return Memory(
-            integral=() if self.Ti is None else none,
+            integral=integral,
             slow=() if self.Td is None else take(x0, self.model.outputs),
             sections=() if self.order is None else tuple((z,) * (2 * SECTIONS + 1) for z in none),
             error=none,
@@ -177,10 +217,15 @@ class PID(Controller):
             base = tuple(u - d / c for u, d, c in pushed)
         y = take(estimate.x, self.model.outputs)
         e = each(operator.sub, tick.r, y)
+        if self.deadband is not None:
+            e = each(lambda e, d: e - clip(e, -d, d), e, self.deadband)
         if self.Ti is None:
             v = each(lambda e, b, k: b + k * e, e, base, self.Kc)
         else:
             v = each(lambda e, b, k, i: b + k * e + i, e, base, self.Kc, state.integral)
+        if self.b is not None and self.Ti is not None:
+            weight = self._weight()
+            v = each(lambda v, r, k, b: v - k * (1.0 - b) * r, v, tick.r, self.Kc, weight)
         slow = state.slow
         if self.Td is not None:
             # (y - slow)/Tf is the filtered derivative; the lag is exact for a level held over the
@@ -201,15 +246,22 @@ class PID(Controller):
         several = np.shape(self.Ti)[-1:] != (1,)
         finite = lambda Ti: jnp.where(jnp.isinf(Ti), 1.0, Ti) if several else Ti
         unless_infinite = lambda Ti, i: jnp.where(jnp.isinf(Ti), 0.0, i) if several else i
-        w = each(
-            lambda v, u, e, Ti, Tt, Kc: e + (finite(Ti) / (Tt * Kc)) * (u - v),
-            command,
-            applied,
-            state.error,
-            self.Ti,
-            self.Tt,
-            self.Kc,
-        )
+        if self.anti_windup == "back-calculation":
+            w = each(
+                lambda v, u, e, Ti, Tt, Kc: e + (finite(Ti) / (Tt * Kc)) * (u - v),
+                command,
+                applied,
+                state.error,
+                self.Ti,
+                self.Tt,
+                self.Kc,
+            )
+        elif self.anti_windup == "conditioned":
+            conditioned = lambda v, u, e, Kc: e + (u - v) / Kc
+            w = each(conditioned, command, applied, state.error, self.Kc)
+        else:
+            clamped = lambda v, u, e, Kc: jnp.where(Kc * e * (v - u) > 0.0, 0.0, e)
+            w = each(clamped, command, applied, state.error, self.Kc)
         if self.order is None:
             integral = each(
                 lambda w, i, Kc, Ti: unless_infinite(Ti, i + (tick.dt * Kc / finite(Ti)) * w),
@@ -220,6 +272,11 @@ class PID(Controller):
             )
             return state._replace(integral=integral)
         return self._fractional(state, tick, w)
+
+    def _weight(self) -> Any:
+        """Setpoint weights; 1 of a loop whose integral time is infinite."""
+        several = np.shape(self.Ti)[-1:] != (1,)
+        return jnp.where(jnp.isinf(cast(Any, self.Ti)), 1.0, self.b) if several else self.b
 
     def _fractional(self, state, tick, w):
         """The state after errors w (m,) at the input of fractional integrals."""
@@ -248,7 +305,12 @@ class PID(Controller):
             )
         if self.Ti is None and self.order is not None:
             raise InputError("controller.order: needs an integral time, controller.Ti [s]")
-        if self.Ti is not None and self.Tt is None:
+        if self.b is not None and self.Ti is None:
+            raise InputError(
+                "controller.b: needs an integral time, controller.Ti [s]: without one a weight of"
+                " the setpoint is an error that stays"
+            )
+        if self.anti_windup == "back-calculation" and self.Ti is not None and self.Tt is None:
             raise InputError("controller.Tt: needs a tracking time [s] where Ti is given")
         if self.feed_forward:
             check_own_pumps(self.model)

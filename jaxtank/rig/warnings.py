@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxtank import presets
 from jaxtank.case import Case
+from jaxtank.controllers.pid import PID
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import get_value, is_component, split_index, walk
 from jaxtank.loop.estimate_notes import is_unused
@@ -21,8 +22,8 @@ def case_warnings(case: Case) -> list[str]:
 
     A run that does not end at a sample, changes, inflow pulses and faults after its end, changes
     that overlap, what no sample sees, levels and setpoints above a rim, pumps that start outside
-    their limits, levels that may fall below 0, models that differ from the plant, estimates of
-    disturbances that the controller does not use. (Steps that are too long: `loop.step_size`.)
+    their limits, gains of the wrong sign, levels that may fall below 0, models that differ from the
+    plant, estimates of disturbances that the controller does not use. (Steps that are too long: `loop.step_size`.)
 
     Parameters
     ----------
@@ -46,6 +47,7 @@ def case_warnings(case: Case) -> list[str]:
         *_unseen(case),
         *_above_rims(case),
         *_pumps(case),
+        *_signs(case),
         *_open_bottoms(case),
         *model_warnings(case),
         *_unused(case),
@@ -188,6 +190,49 @@ def _pumps(case):
                 f"pump {j + 1} runs at {volts:g} {drive} before t = 0, outside its limits of"
                 f" {low:g} and {high:g} {drive}"
             )
+
+
+def _signs(case):
+    """On gains of a PID that drive a level away from its setpoint."""
+    part, plant = getattr(case.loop.controller, "law", case.loop.controller), case.loop.plant
+    if not isinstance(part, PID) or not isinstance(plant, TankNetwork):
+        return
+    ends = [(None, *feed) for feed in plant.feeds]
+    if plant.sources:
+        ends = [(source, *feed) for source, feed in zip(plant.sources, plant.feeds)]
+    ends += [(source, sink) for source, sink in plant.valves]
+    reached = [_downstream(plant, (i for i in tanks if i is not None)) for tanks in ends]
+    for i, tank in enumerate(plant.outputs):
+        own = part.inputs_of(i)
+        # through another input the sign of a loop alone decides nothing
+        if any(tank in reached[j] for j in range(len(ends)) if j not in own):
+            continue
+        for j in own:
+            source, *sinks = ends[j]
+            acts = (tank in sinks) - (tank == source)
+            gain = float(np.asarray(part.Kc)[i])
+            sign = -acts if j in part.reversed_inputs else acts
+            if sign * gain < 0.0:
+                pumps = len(plant.feeds)
+                name = f"pump {j + 1}" if j < pumps else f"valve {j - pumps + 1}"
+                yield (
+                    f"controller.Kc of output {i + 1} = {gain:g}: {name}"
+                    f" {'fills' if acts > 0 else 'empties'} tank {tank + 1}, and this sign drives"
+                    " its level away from the setpoint: change the sign"
+                )
+
+
+def _downstream(plant, tanks):
+    """The tanks whose levels depend on flows into or out of `tanks`."""
+    pairs = [*plant.links, *plant.spills, *plant.valves]
+    pairs += [pair for one, other in plant.pipes for pair in ((one, other), (other, one))]
+    reached, queue = set(), list(tanks)
+    while queue:
+        tank = queue.pop()
+        if tank not in reached:
+            reached.add(tank)
+            queue += [sink for source, sink in pairs if source == tank and sink is not None]
+    return reached
 
 
 def _open_bottoms(case):
