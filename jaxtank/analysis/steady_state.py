@@ -322,7 +322,9 @@ def steady_levels(plant, u):
     return speeds * speeds / (2.0 * plant.gravity)
 
 
-def equilibrium(plant: Any, y: Any, inflow: Any = None, low: Any = 0.0) -> tuple[Any, Any]:
+def equilibrium(
+    plant: Any, y: Any, inflow: Any = None, low: Any = 0.0, shared: Any = None
+) -> tuple[Any, Any]:
     """Return levels and inputs of the steady state with outputs y (gouta2015 notes S2.3).
 
     Of the plant alone: `loop.steady.steady_state` takes inflow, dead zone and limits of a loop.
@@ -333,6 +335,8 @@ def equilibrium(plant: Any, y: Any, inflow: Any = None, low: Any = 0.0) -> tuple
     y : (outputs,) levels [cm]
     inflow : (n,) steady inflow of each tank that no pump brings [cm^3/s], or None
     low : (m,) least input of each pump [V]; above 0 it counts as 0
+    shared : where there are more inputs than outputs, (outputs,) numbers -> (m,) inputs, each of
+        which rises or falls with the number of its output
 
     Returns
     -------
@@ -363,8 +367,10 @@ def equilibrium(plant: Any, y: Any, inflow: Any = None, low: Any = 0.0) -> tuple
     if inflow is not None:
         inflow = np.asarray(inflow, dtype=float)
         words += " with inflow (" + ", ".join(f"{v:g}" for v in inflow) + f") {length}^3/s"
-    linear = plant.plain and not plant.pipes
-    x, u = (_free_discharge if linear else _balanced)(plant, y, words, inflow)
+    if plant.plain and not plant.pipes and shared is None:
+        x, u = _free_discharge(plant, y, words, inflow)
+    else:
+        x, u = _balanced(plant, y, words, inflow, shared)
     low = np.minimum(np.broadcast_to(np.asarray(low, dtype=float), u.shape), 0.0)
     for j, volts in enumerate(u):
         if volts < low[j] - 1e-9 * max(1.0, float(np.max(np.abs(u)))):
@@ -409,9 +415,9 @@ def _rate(plant, x, u):
 _slope = jax.jit(jax.jacfwd(_rate, argnums=(1, 2)))
 
 
-def _balanced(plant, y, words, inflow):
+def _balanced(plant, y, words, inflow, shared=None):
     """(levels, inputs) at rest of a network with pipes, or not plain, by damped Gauss-Newton."""
-    if plant.pumps != len(plant.outputs):
+    if shared is None and plant.pumps != len(plant.outputs):
         raise InputError(
             f"equilibrium needs as many pumps as outputs: this rig has {plant.pumps} and"
             f" {len(plant.outputs)}"
@@ -427,11 +433,11 @@ def _balanced(plant, y, words, inflow):
     try:
         # an area of 1e-300, say, overflows on the way: the check below reports it
         with np.errstate(all="ignore"):
-            many = plant.tanks >= vectors.FROM and plant.plain
+            many = plant.tanks >= vectors.FROM and plant.plain and shared is None
             x, u, rates = (
                 balanced(plant, y, 1e-5 * tolerance, inflow)
                 if many
-                else _by_dense(plant, y, inflow)
+                else _by_dense(plant, y, inflow, shared)
             )
     except (ValueError, np.linalg.LinAlgError):  # not finite where it starts, or on the way
         raise EquilibriumError(f"{words} have no steady state") from None
@@ -440,18 +446,21 @@ def _balanced(plant, y, words, inflow):
     return x, u
 
 
-def _by_dense(plant, y, inflow):
+def _by_dense(plant, y, inflow, shared=None):
     """(levels, inputs, rates left) of a network of few tanks, by a dense Jacobian."""
     free = [i for i in range(plant.tanks) if i not in plant.outputs]
     scale = float(np.max(y)) or 1.0
     # level rate per unit of input; a valve's opening is of the order of 1
     gain = np.min(plant.pump_gain, initial=np.inf) / float(np.max(plant.area))
     gain = np.repeat([gain, 1.0], [len(plant.feeds), len(plant.valves)])
+    start = np.repeat([1e-3 * scale, 0.5], [len(plant.feeds), len(plant.valves)])
+    if shared is not None:
+        gain, start = np.ones(len(y)), np.zeros(len(y))
 
     def split(z):
-        x = np.zeros(plant.tanks)
+        x, v = np.zeros(plant.tanks), z[len(free) :] / gain
         x[list(plant.outputs)], x[free] = y, scale * z[: len(free)] ** 2
-        return x, z[len(free) :] / gain
+        return x, v if shared is None else np.stack([np.asarray(u) for u in shared(v)])
 
     def residual(z):
         x, u = split(z)
@@ -462,10 +471,12 @@ def _by_dense(plant, y, inflow):
     def jacobian(z):
         with jax.enable_x64(True):
             by_x, by_u = (np.asarray(a) for a in _slope(plant, *split(z)))
+            if shared is not None:
+                rows = jax.jacfwd(lambda v: jnp.stack(shared(v)))(z[len(free) :])
+                by_u = by_u @ np.asarray(rows)
         return np.concatenate([by_x[:, free] * (2.0 * scale * z[: len(free)]), by_u / gain], axis=1)
 
-    inputs = np.repeat([1e-3 * scale, 0.5], [len(plant.feeds), len(plant.valves)])
-    start = np.concatenate([np.full(len(free), 0.9), inputs])
+    start = np.concatenate([np.full(len(free), 0.9), start])
     solution = scipy.optimize.least_squares(
         residual,
         start,

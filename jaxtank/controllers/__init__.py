@@ -8,9 +8,11 @@ from jaxtank.controllers.gain_schedule import Scheduled
 from jaxtank.controllers.gpc import GPC
 from jaxtank.controllers.laguerre import Laguerre
 from jaxtank.controllers.ngpc import NGPC
+from jaxtank.controllers.on_off import OnOff
 from jaxtank.controllers.open_loop import OpenLoop
 from jaxtank.controllers.pid import PID
 from jaxtank.controllers.sliding_mode import SlidingMode
+from jaxtank.controllers.split_range import SplitRange
 from jaxtank.controllers.state_feedback import LQI, StateFeedback
 from jaxtank.controllers.two_tank_backstepping import TwoTankBackstepping
 
@@ -24,9 +26,11 @@ __all__ = [
     "Controller",
     "FuzzyBlend",
     "Laguerre",
+    "OnOff",
     "OpenLoop",
     "Scheduled",
     "SlidingMode",
+    "SplitRange",
     "StateFeedback",
     "TwoTankBackstepping",
 ]

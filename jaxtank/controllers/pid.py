@@ -93,7 +93,7 @@ class PID(Controller):
 
     model: Plant
     Kc: np.ndarray = leaf(
-        "V/cm", "gain Kc, not 0; below 0 where a pump lowers its output", shape="pump"
+        "V/cm", "gain Kc, not 0; below 0 where a pump lowers its output", shape="output"
     )
     Ti: np.ndarray | None = leaf(
         "s",
@@ -103,10 +103,10 @@ class PID(Controller):
         like="Kc",
         infinite=True,
         default=None,
-        shape="pump",
+        shape="output",
     )
     Td: np.ndarray | None = leaf(
-        "s", "derivative time Td", low=0.0, strict=True, like="Kc", default=None, shape="pump"
+        "s", "derivative time Td", low=0.0, strict=True, like="Kc", default=None, shape="output"
     )
     order: np.ndarray | None = leaf(
         "-",
@@ -116,7 +116,7 @@ class PID(Controller):
         strict=True,
         like="Kc",
         default=None,
-        shape="pump",
+        shape="output",
     )
     Tt: np.ndarray | None = leaf(
         "s",
@@ -125,7 +125,7 @@ class PID(Controller):
         strict=True,
         like="Kc",
         default=None,
-        shape="pump",
+        shape="output",
     )
     b: np.ndarray | None = leaf(
         "-",
@@ -133,7 +133,7 @@ class PID(Controller):
         low=0.0,
         like="Kc",
         default=None,
-        shape="pump",
+        shape="output",
     )
     deadband: np.ndarray | None = leaf(
         "cm",
@@ -141,9 +141,9 @@ class PID(Controller):
         low=0.0,
         like="Kc",
         default=None,
-        shape="pump",
+        shape="output",
     )
-    bias: np.ndarray = leaf("V", "input added where there is no feed-forward", shape="pump")
+    bias: np.ndarray = leaf("V", "input added where there is no feed-forward", shape="output")
     feed_forward: bool = static(
         "-", "add the model's input on the reference", choices=(False, True), default=False
     )
@@ -293,11 +293,25 @@ class PID(Controller):
         return state._replace(integral=tuple(integral), sections=tuple(sections))
 
     def check(self, reference: Signal) -> None:
-        if len(self.model.outputs) != self.model.pumps:
-            raise InputError(
-                f"PID needs one pump per output: the model has {self.model.pumps} and"
-                f" {len(self.model.outputs)}"
+        self.check_inputs()
+        self.check_gains()
+
+    def check_inputs(self) -> None:
+        """Raise InputError unless there is an input for each output."""
+        outputs, pumps = len(self.model.outputs), self.model.pumps
+        if outputs != pumps:
+            more = (
+                ': several inputs that share one level are kind = "split-range", with sequence ='
+                " [the first, the second, ...]"
+                if pumps > outputs
+                else ": name as many of its tanks in plant.outputs"
             )
+            raise InputError(
+                f"PID needs one pump per output: the model has {pumps} and {outputs}{more}"
+            )
+
+    def check_gains(self) -> None:
+        """Raise InputError for gains that do not go together."""
         if isinstance(self.Kc, np.ndarray) and not np.all(self.Kc):
             raise InputError(
                 f"controller.Kc = {self.Kc}: must not be 0; a negative gain is for a pump that"

@@ -24,7 +24,13 @@ def steady_inflow(loop: Any) -> Any:
 def steady_state(loop: Any, y: Any, plant: Any = None) -> tuple[Any, Any]:
     """Return levels and inputs at which a loop stands still with outputs y."""
     low = loop.actuator.driving(tuple(np.asarray(loop.actuator.low, dtype=float)))
+    # a controller that shares its output between inputs knows which of them runs
+    controller = getattr(loop.controller, "law", loop.controller)
     x, u = equilibrium(
-        loop.plant if plant is None else plant, y, steady_inflow(loop), np.asarray(low, dtype=float)
+        loop.plant if plant is None else plant,
+        y,
+        steady_inflow(loop),
+        np.asarray(low, dtype=float),
+        getattr(controller, "shared", None),
     )
     return x, u + np.asarray(loop.actuator.offset)

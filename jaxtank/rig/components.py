@@ -39,6 +39,10 @@ ROLES = {
         controllers.Controller,
         {
             "pid": controllers.PID,
+            "pi": controllers.PID,
+            "p": controllers.PID,
+            "split-range": controllers.SplitRange,
+            "on-off": controllers.OnOff,
             "state-feedback": controllers.StateFeedback,
             "lqi": controllers.LQI,
             "ngpc": controllers.NGPC,
@@ -126,8 +130,8 @@ def register(kind: str, cls: type) -> type:
     taken = next((r.classes[kind] for r in ROLES.values() if kind in r.classes), None)
     if taken not in (None, cls):
         raise InputError(f"kind {kind!r} is taken, by {taken.__name__}: choose another name")
-    other = next((k for k, c in known.items() if c is cls and k != kind), None)
-    if other is not None:
+    other = next((k for k, c in known.items() if c is cls), None)
+    if other is not None and taken is None:
         raise InputError(f"{cls.__name__} has a name in rig files already: {other!r}")
     if taken is None:
         known[kind] = cls
@@ -171,8 +175,17 @@ def _unwritable(field):
     return ""
 
 
-USUAL = {"Tt": 30.0, "spread": 0.0}
+USUAL = {"spread": 0.0}
 """Defaults of fields that a rig file may leave out."""
+
+TRACKING = 30.0
+"""Tracking time of a PID of a rig file that has none [s]; of a PI it is its integral time."""
+
+WITHOUT = {"p": ("Ti", "Td", "order", "Tt", "b", "anti_windup"), "pi": ("Td", "order")}
+"""Fields of a PID that it has not under a name of its own."""
+
+LIMITED = ("on-off", "split-range")
+"""Kinds whose `low` and `high` are by default the limits of the actuator."""
 
 LOWER_LIMITS = {"level_floor": 0.01, "difference_floor": 0.01}
 """Such defaults in centimetres [cm], converted to the rig's unit of length."""
@@ -184,7 +197,8 @@ def section_of(name, kind, units=DEFAULT):
     cls, first = classes[kind], Key("kind", f"one of {', '.join(classes)}", "any")
     if cls is controllers.OpenLoop:
         return Section(name, (first, *OPEN_LOOP[1:]))
-    settable = (f for f in dataclasses.fields(cls) if f.metadata.get("kind") in ("leaf", "static"))
+    settable = [f for f in dataclasses.fields(cls) if f.metadata.get("kind") in ("leaf", "static")]
+    settable = [f for f in settable if f.name not in WITHOUT.get(kind, ())]
     return Section(name, (first, *(_key(cls, f, kind, units) for f in settable)))
 
 
@@ -195,7 +209,11 @@ def _key(cls, field, kind, units):
         default = USUAL.get(field.name, default)
         if field.name in LOWER_LIMITS:
             default = in_unit(LOWER_LIMITS[field.name], units[0])
+    if kind == "pi" and field.name == "Ti":
+        default = NEEDED
     changes = {}
+    if cls is controllers.SplitRange and field.name in ("sequence", "reverse"):
+        changes["kind"] = field.name
     if field.metadata["kind"] == "leaf":
         changes["kind"] = "array" if field.metadata["shape"] else "scalar"
     doc = field.metadata["doc"].replace("counted from 0", "counted from 1")  # as a file has tanks
@@ -209,8 +227,25 @@ def controller_of(table, loop, bias=None):
         section, sizes = section_of("controller", "open-loop"), sizes_of(loop.plant)
         signal = ramps_of(section, table, start, ("pump", "input"), sizes)
         return controllers.OpenLoop(signal=signal)
-    bias = steady_bias(loop) if bias is None else bias
-    return component("controller", table, model_of(loop), {"bias": bias})
+    offered = {"bias": steady_bias(loop) if bias is None else bias}
+    kind = table.get("kind") if isinstance(table, dict) else None
+    if kind in LIMITED:
+        offered |= {"low": loop.actuator.low, "high": loop.actuator.high}
+    if kind == "split-range":  # of its inputs, which are not known yet
+        offered["bias"] = np.zeros(len(loop.plant.outputs))
+    controller = component("controller", table, model_of(loop), offered)
+    if isinstance(controller, controllers.PID):  # before the shape of its bias is
+        controller.check_inputs()
+    if kind == "split-range" and "bias" not in table:
+        return with_bias(controller, steady_bias(loop) if bias is None else bias)
+    return controller
+
+
+def with_bias(controller, inputs):
+    """Return a controller whose bias is that of steady inputs (m,)."""
+    if isinstance(controller, controllers.SplitRange):
+        inputs = number(controller.total(inputs))
+    return dataclasses.replace(controller, bias=inputs)
 
 
 def observer_of(table, loop):
@@ -253,7 +288,19 @@ def component(name, table, plant, offered):
         table = {**{k: v for k, v in offered.items() if k in section.names}, **table}
     values = read_entry(section, table, sizes_of(plant), title=f"{section.title} {kind}")
     del values["kind"]
+    if issubclass(cls, controllers.PID):
+        _track(kind, values)
     return cls(**values, **({"model": plant} if "model" in cls.__dataclass_fields__ else {}))
+
+
+def _track(kind, values):
+    """Add the tracking time of a PID of a rig file that leaves it out."""
+    Ti = values.get("Ti")
+    if Ti is None or "Tt" in values or values.get("anti_windup") in ("clamping", "conditioned"):
+        return
+    values["Tt"] = np.full(np.shape(Ti), TRACKING)
+    if kind != "pid":
+        values["Tt"] = np.where(np.isinf(Ti), TRACKING, Ti)
 
 
 def steady_bias(loop, known: bool | list[bool] = False):
@@ -275,6 +322,10 @@ def leaves_bias(table):
 
 def kind_of(name, part):
     """The kind of a component in a section of a rig file, None where it has none."""
+    if type(part) is controllers.PID:
+        if part.Td is not None or part.order is not None:
+            return "pid"
+        return "pi" if part.Ti is not None else "p" if part.Tt is None else "pid"
     return next((kind for kind, cls in ROLES[name].classes.items() if cls is type(part)), None)
 
 

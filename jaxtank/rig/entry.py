@@ -222,6 +222,28 @@ def _tanks(key, label, value, sizes):
     return tuple(_tank(key, label, tank, sizes) for tank in value)
 
 
+def _input(label, value, sizes):
+    """Index of an input given by its number from 1: pumps, then valves."""
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= sizes.pumps:
+        raise refusal(label, value, f"be an input, counted from 1 to {sizes.pumps}")
+    return value - 1
+
+
+def _sequence(key, label, value, sizes):
+    """The inputs of each output; of one output, its inputs alone are enough."""
+    nested = isinstance(value, list) and value and all(isinstance(v, list) for v in value)
+    if not isinstance(value, list) or not value:
+        raise refusal(label, value, "be a list of inputs for each output, as [[1, 2], [3]]")
+    rows = value if nested else [value]
+    return tuple(tuple(_input(label, v, sizes) for v in row) for row in rows)
+
+
+def _reverse(key, label, value, sizes):
+    if not isinstance(value, list):
+        raise refusal(label, value, "be a list of inputs")
+    return tuple(_input(label, v, sizes) for v in value)
+
+
 def _pair(key, label, value, sizes):
     if not isinstance(value, list) or len(value) != 2:
         raise refusal(label, value, "name two tanks")
@@ -281,6 +303,8 @@ READ = {
     "scalar": _scalar,
     "tank": _tank,
     "tanks": _tanks,
+    "sequence": _sequence,
+    "reverse": _reverse,
     "pair": _pair,
     "feed": _feed,
     "curve": _curve,
@@ -296,7 +320,9 @@ def written(key, value: Any) -> Any:
         return value
     if key.kind == "tank":
         return value + 1
-    if key.kind in ("tanks", "pair", "feed"):
+    if key.kind == "sequence":
+        return [[j + 1 for j in row] for row in value]
+    if key.kind in ("tanks", "pair", "feed", "reverse"):
         tanks = [i + 1 for i in value if i is not None]
         return tanks[0] if key.kind == "feed" and len(tanks) == 1 else tanks
     return np.asarray(value).tolist()

@@ -272,6 +272,6 @@ def _with_bias(case, values, table):
     whole = "initial" in table.get("actuator", {}) or name in values
     known = [whole or "initial" in row or f"{name}[{j}]" in values for j, row in enumerate(rows)]
     controller: Any = case.loop.controller
-    controller = dataclasses.replace(controller, bias=components.steady_bias(case.loop, known))
+    controller = components.with_bias(controller, components.steady_bias(case.loop, known))
     later = {n: v for n, v in values.items() if not n.startswith(parts)}
     return case.replace(loop=dataclasses.replace(case.loop, controller=controller)), later

@@ -59,7 +59,9 @@ def check(case: Case) -> Case:
 def unreachable(case: Case) -> str | None:
     """Return why a plateau of the reference has no steady state, None where all have one."""
     plant, reference = case.loop.plant, case.loop.reference
-    if isinstance(reference, Ramps) and plant.pumps == len(plant.outputs):
+    controller = getattr(case.loop.controller, "law", case.loop.controller)
+    square = plant.pumps == len(plant.outputs) or hasattr(controller, "shared")
+    if isinstance(reference, Ramps) and square:
         plateaus = reference.plateaus(case.clock.duration)
         _, first = np.unique(plateaus, axis=0, return_index=True)
         for values in plateaus[np.sort(first)]:

@@ -58,7 +58,7 @@ def with_kind(case: Case, kind: str) -> Case:
     known = ROLES["controller"].classes
     if kind not in known:
         raise unknown("controller kind", str(kind), known)
-    if kind_of("controller", case.loop.controller) == kind:
+    if _is_kind(case.loop.controller, kind):
         return case
     if kind in REGISTERED or kind not in START:
         raise InputError(
@@ -71,13 +71,19 @@ def with_kind(case: Case, kind: str) -> Case:
     return rig.check(rig.filtered(changed))
 
 
+def _is_kind(controller: Any, kind: str) -> bool:
+    """Whether a controller is of a kind: every PID is a "pid"."""
+    other = kind_of("controller", controller)
+    return other == kind or (kind == "pid" and other in ("pi", "p"))
+
+
 def _published(case: Case, kind: str) -> tuple[Any, dict[str, Any]] | None:
     """Return (controller, ranges) of a case of the same paper on the same plant, None without."""
     paper = case.name.partition("/")[0]
     if paper not in presets.PAPERS:
         return None
     for other in presets.load(paper).cases.values():
-        if kind_of("controller", other.loop.controller) == kind and _same(other, case):
+        if _is_kind(other.loop.controller, kind) and _same(other, case):
             free = {n: f for n, f in other.free.items() if n.startswith("controller.")}
             controller: Any = other.loop.controller
             if hasattr(controller, "model"):
@@ -243,6 +249,7 @@ def _laguerre(known: Rig) -> Any:
 
 START: dict[str, Callable[[Rig], Any]] = {
     "pid": _pid,
+    "pi": _pid,
     "state-feedback": _state_feedback,
     "lqi": _lqi,
     "ngpc": _horizon,
