@@ -124,7 +124,7 @@ def test_a_kind_that_does_not_fit_is_a_row_with_the_reason(watertank, capsys):
 @pytest.mark.parametrize(
     ("choices", "free", "words"),
     [
-        ({"controller.kind": ["pdi"]}, None, "unknown controller kind 'pdi'; nearest: pid"),
+        ({"controller.kind": ["pdi"]}, None, "unknown controller kind 'pdi'; nearest: pi, pid"),
         ({"controller.kind": ["ngpc", "fuzzy"]}, None, "none fits the rig; controller.kind = ngpc"),
         ({"controller.kind": ["open-loop"]}, None, "has no gains to start from"),
         ({"controller.kind": "pid"}, None, "must be a list of values to try"),
