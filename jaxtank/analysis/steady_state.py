@@ -472,8 +472,9 @@ def _by_dense(plant, y, inflow, shared=None):
         with jax.enable_x64(True):
             by_x, by_u = (np.asarray(a) for a in _slope(plant, *split(z)))
             if shared is not None:
-                rows = jax.jacfwd(lambda v: jnp.stack(shared(v)))(z[len(free) :])
-                by_u = by_u @ np.asarray(rows)
+                share: Any = shared
+                by_v = jax.jacfwd(lambda v: jnp.stack(share(v)))(z[len(free) :])
+                by_u = by_u @ np.asarray(by_v)
         return np.concatenate([by_x[:, free] * (2.0 * scale * z[: len(free)]), by_u / gain], axis=1)
 
     start = np.concatenate([np.full(len(free), 0.9), start])

@@ -275,8 +275,8 @@ class PID(Controller):
 
     def _weight(self) -> Any:
         """Setpoint weights; 1 of a loop whose integral time is infinite."""
-        several = np.shape(self.Ti)[-1:] != (1,)
-        return jnp.where(jnp.isinf(cast(Any, self.Ti)), 1.0, self.b) if several else self.b
+        Ti, b = cast(Any, self.Ti), cast(Any, self.b)
+        return jnp.where(jnp.isinf(Ti), 1.0, b) if np.shape(Ti)[-1:] != (1,) else b
 
     def _fractional(self, state, tick, w):
         """The state after errors w (m,) at the input of fractional integrals."""
