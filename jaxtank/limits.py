@@ -157,7 +157,8 @@ def resolve_in(
 def _without_overflow(measure: str, index: int, value: float, plant: Any) -> tuple[str, float]:
     """Return (measure, value) of a limit; one at a rim that is physics limits the overflow."""
     if plant.overflow and measure == "max_level" and value >= np.asarray(plant.rim)[index]:
-        return "overflow_volume", NO_OVERFLOW * float(plant.area[index] * plant.rim[index])
+        full = plant.stored(plant.rim) if plant.by_volume else plant.area * plant.rim
+        return "overflow_volume", NO_OVERFLOW * float(full[index])
     return measure, value
 
 

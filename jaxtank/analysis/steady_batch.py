@@ -1,15 +1,28 @@
-"""Steady states of many plants of one topology at once, on the host: no compilation."""
+"""Steady states of many plants of one topology at once, on the host."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxtank.analysis.steady_state import at_rest, check_rest
 from jaxtank.core.errors import InputError
+from jaxtank.plants import elements
+from jaxtank.plants.tank_network import OPTIONS
 
 FLOWS = ("drain", "orifice", "pipe", "pump_gain", "split", "gravity")
 """Leaves of a TankNetwork that its steady states depend on."""
+
+
+def flow_leaves(plant: Any) -> tuple[str, ...]:
+    """Return the leaves of a network that its steady states depend on, without absent ones."""
+    more = ("valve", "rangeability", *OPTIONS)
+    return FLOWS + tuple(name for name in more if getattr(plant, name) is not None)
+
 
 ITERATIONS = 60
 """Newton steps at most, for networks with pipes."""
@@ -19,7 +32,8 @@ class SteadyStates:
     """The steady states of N plants that differ in numbers, as a function of their outputs."""
 
     # Without pipes, efflux speeds and inputs are affine in the roots of the outputs and are solved
-    # for once; with pipes, by Newton's method in the levels that are not controlled.
+    # for once; with pipes, by Newton's method in the levels that are not controlled; of a network
+    # that is not plain, one by one in a compiled program.
 
     def __init__(self, plant: Any, values: Mapping[str, ArrayLike], inflow: ArrayLike = 0.0):
         if plant.pumps != len(plant.outputs):
@@ -29,12 +43,15 @@ class SteadyStates:
             )
         count = max([1, *(np.shape(v)[0] for v in values.values())])
         leaves = {}
-        for name in FLOWS:
+        for name in flow_leaves(plant):
             value = np.asarray(values.get(name, getattr(plant, name)), dtype=float)
             batched = value if name in values else value[None]
             leaves[name] = np.broadcast_to(batched, (count, *batched.shape[1:]))
         self.plant, self.own = plant, leaves
         self.inflow = np.broadcast_to(np.asarray(inflow, dtype=float), (count, plant.tanks))
+        if not plant.plain:
+            check_rest(plant, "feasibility")
+            return
         self.out, self.efflux, self.pumps = _balance(plant, leaves)
         self.free = [i for i in range(plant.tanks) if i not in plant.outputs]
         if not plant.pipes:
@@ -45,6 +62,8 @@ class SteadyStates:
         # A level below zero stands for an efflux that would have to flow backwards: no steady state
         # exists. NaN where none was found.
         y = np.asarray(outputs, dtype=float)
+        if not self.plant.plain:
+            return self._of_elements(np.broadcast_to(y, (len(self.inflow), *y.shape[-2:])))
         if self.plant.pipes:
             return self._with_pipes(np.broadcast_to(y, (len(self.out), *y.shape[-2:])))
         weight = 2.0 * self.own["gravity"][:, None, None]
@@ -52,6 +71,12 @@ class SteadyStates:
         speeds = known @ self.speeds.swapaxes(1, 2) + self.constant[:, None, : self.plant.tanks]
         inputs = known @ self.inputs.swapaxes(1, 2) + self.constant[:, None, self.plant.tanks :]
         return speeds * np.abs(speeds) / weight, inputs
+
+    def _of_elements(self, y):
+        with jax.enable_x64(True):
+            x, u, left, size = _many_at_rest(self.plant, self.own, self.inflow, y)
+        at_rest = np.asarray(left <= 1e-9 * size)[..., None]
+        return tuple(np.where(at_rest, np.stack(v, axis=-1), np.nan) for v in (x, u))
 
     def _affine(self):
         """Speeds (N, n, m) and inputs (N, m, m) by controlled speeds, and of the inflow."""
@@ -134,6 +159,19 @@ class SteadyStates:
                 slope[..., tank, upper] += sign * size * ds
                 slope[..., tank, other] -= sign * size * ds
         return flow, slope
+
+
+@jax.jit
+def _many_at_rest(plant, leaves, inflow, outputs):
+    """(levels, inputs, net inflow left, largest flow) of plants and outputs, (N, P) each."""
+
+    def at(leaves, inflow, y):
+        net = dataclasses.replace(plant, **leaves)
+        x, u, left = at_rest(net, y, inflow)
+        flows = [jnp.abs(s.flow) for s in elements.streams(net, x, u)]
+        return x, u, left, jnp.max(jnp.stack(flows))
+
+    return jax.vmap(jax.vmap(at, in_axes=(None, None, 0)))(leaves, inflow, outputs)
 
 
 def _balance(plant, leaves):

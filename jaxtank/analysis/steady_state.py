@@ -1,5 +1,6 @@
 """Steady states of a rig."""
 
+import functools
 from typing import Any
 
 import jax
@@ -11,6 +12,7 @@ from jaxtank.analysis import elimination
 from jaxtank.core import vectors
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.numerics import lower_clip, smooth_signed_sqrt, smooth_sqrt
+from jaxtank.plants import elements
 
 STEPS = 200
 """Steps at most; ten to thirty suffice where there is a steady state."""
@@ -142,6 +144,88 @@ def responses(plant, xp, inflow=None):
     return speeds, solution[len(free) :]
 
 
+def at_rest(plant, y, inflow=None, start=None, shared=None):
+    """Return (levels (n,), inputs (m,), largest net inflow left) of a network of any elements where
+    it stands still with outputs y (m,); differentiable, and as near to rest as was found.
+
+    inflow : (n,) [cm^3/s] or None. start : (levels, inputs) to begin at, or None. shared : as in
+    `equilibrium`
+    """
+    # Levenberg-Marquardt in the roots of the free levels and in the inputs; the derivatives are
+    # those of the implicit function.
+    free = [i for i in range(plant.tanks) if i not in plant.outputs]
+    y, m = jnp.stack([jnp.asarray(v, dtype=float) for v in y]), len(free)
+    scale = jax.lax.stop_gradient(jnp.max(y)) + plant.knee
+    if start is None:
+        inputs = _middle(plant) if shared is None else np.zeros(len(y))
+        z = jnp.concatenate([jnp.full(m, 0.9), inputs]).astype(y.dtype)
+    else:
+        levels = jnp.stack([start[0][i] for i in free]) if free else jnp.zeros(0)
+        z = jnp.concatenate([jnp.sqrt(jnp.maximum(levels / scale, 0.0)), jnp.stack([*start[1]])])
+
+    def split(z):
+        x = [0.0] * plant.tanks
+        for value, i in [*zip(y, plant.outputs), *zip(scale * z[:m] * z[:m], free)]:
+            x[i] = value
+        return tuple(x), tuple(z[m:] if shared is None else shared(z[m:]))
+
+    def left(z):
+        x, u = split(z)
+        return jnp.stack(elements.net_flows(plant, x, u, inflow))
+
+    def solve(residual, z):
+        eps = float(jnp.finfo(z.dtype).eps)
+
+        def on(carry):
+            _, rates, damping, k, size = carry
+            return (jnp.max(jnp.abs(rates)) > 4.0 * eps * size) & (k < STEPS) & (damping < 1e12)
+
+        def step(carry):
+            z, rates, damping, k, size = carry
+            J = jax.jacfwd(residual)(z)
+            normal = J.T @ J
+            weights = jnp.maximum(jnp.diag(normal), 1e-12 * jnp.max(jnp.diag(normal)))
+            moved = z - elimination.solve(normal + damping * jnp.diag(weights), J.T @ rates)
+            now = residual(moved)
+            better = jnp.sum(now * now) < jnp.sum(rates * rates)
+            z, rates = jnp.where(better, moved, z), jnp.where(better, now, rates)
+            damping = jnp.where(better, jnp.maximum(eps, 0.1 * damping), 10.0 * damping)
+            return z, rates, damping, k + 1, size
+
+        rates = residual(z)
+        x, u = split(z)
+        size = jnp.max(jnp.stack([jnp.abs(s.flow) for s in elements.streams(plant, x, u)]))
+        return jax.lax.while_loop(on, step, (z, rates, 1e-4 + 0.0 * size, 0, size))[0]
+
+    def tangent(linear, b):
+        return elimination.solve(jax.jacfwd(linear)(b), b)
+
+    z = jax.lax.custom_root(left, jax.lax.stop_gradient(z), solve, tangent)
+    return *split(z), jnp.max(jnp.abs(left(z)))
+
+
+def _middle(plant):
+    """Inputs (m,) to begin with: pumps off, or in the middle of their curve; valves half open."""
+    curves = plant.curves or (None,) * len(plant.feeds)
+    pumps = [0.0 if c is None else 0.5 * (c[0][0] + c[-1][0]) for c in curves]
+    return np.array([*pumps, *[0.5 * elements.full_open(plant.units)] * len(plant.valves)])
+
+
+def check_rest(plant, name):
+    """Raise InputError for a network whose steady states are not unique."""
+    if tanks := elements.closed_circuit(plant):
+        raise EquilibriumError(
+            f"{name}: tanks {', '.join(str(i + 1) for i in tanks)} exchange nothing with the basin,"
+            " so that their steady levels depend on what they hold at the start"
+        )
+    if plant.pumps != len(plant.outputs):
+        inputs = "pumps and valves" if plant.valves else "pumps"
+        raise InputError(
+            f"{name} needs as many {inputs} as outputs: this rig has {plant.pumps} and"
+            f" {len(plant.outputs)}"
+        )
+
+
 def _filled(xp, matrix, places, values):
     """`matrix` with values added at places, some of which may be the same."""
     if xp is jnp:
@@ -176,7 +260,7 @@ def steady_flows(plant, y):
 
     Parameters
     ----------
-    plant : TankNetwork without pipes, with as many pumps as outputs
+    plant : TankNetwork without pipes or with valves and the like, with as many inputs as outputs
     y : (outputs,) levels [cm]
 
     Returns
@@ -194,6 +278,10 @@ def steady_flows(plant, y):
     >>> [round(float(u), 3) for u in inputs]
     [2.949, 2.949]
     """
+    if not plant.plain:
+        check_rest(plant, "steady_flows")
+        x, u, _ = at_rest(plant, y)
+        return jnp.sqrt(2.0 * plant.gravity * jnp.stack(x)), jnp.stack(u)
     return _from_known_speeds(plant, jnp.sqrt(2.0 * plant.gravity) * jnp.sqrt(jnp.asarray(y)))
 
 
@@ -235,6 +323,9 @@ def _unknowns(plant, xp=jnp):
 
 def steady_under(plant: Any, h0: Any, u0: Any, d: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     """Return the steady state with the same outputs under disturbances of the level rates."""
+    if not plant.plain:
+        inflow = tuple(a * v for a, v in zip(plant.sections(h0), d))
+        return at_rest(plant, [h0[i] for i in plant.outputs], inflow, (h0, u0))[:2]
     # 0 = efflux v + pumps u + A d, v_outputs as before: the balance is linear in v, u and d
     # so the matrix of d is solved once, in front of the time loop. A tank that would have to flow
     # backwards is empty.
@@ -277,6 +368,9 @@ def steady_along(
     >>> [round(float(v), 3) for v in u[0]]
     [2.949, 3.297]
     """
+    if not plant.plain:
+        check_rest(plant, "steady_along")
+        return jax.vmap(lambda *y: at_rest(plant, y, inflow)[:2])(*r)
     roots, w = [smooth_sqrt(v, plant.knee) for v in r], jnp.sqrt(2.0 * plant.gravity)
     if inflow is not None:  # one more column: what it does alone
         roots.append(jnp.ones_like(roots[0]) / w)
@@ -317,6 +411,7 @@ def steady_levels(plant, u):
     """
     if plant.pipes:
         raise InputError("steady_levels is for networks whose orifices discharge freely")
+    elements.check_plain(plant, "steady_levels", "equilibrium finds its steady states")
     efflux, pumps = _balance(plant)
     speeds = jnp.linalg.solve(efflux, -pumps @ jnp.asarray(u, dtype=float))
     return speeds * speeds / (2.0 * plant.gravity)
@@ -375,9 +470,13 @@ def equilibrium(
     for j, volts in enumerate(u):
         if volts < low[j] - 1e-9 * max(1.0, float(np.max(np.abs(u)))):
             least = f", below its low limit of {low[j]:g} {drive}" if low[j] < 0.0 else ""
+            name = elements.input_name(plant, j)
+            needs, unit = "run at", f" {drive}"
+            if name.startswith("valve"):
+                needs, unit = "open to", "" if elements.full_open(plant.units) == 1.0 else " %"
             raise EquilibriumError(
-                f"{words} have no steady state: pump {j + 1} would have to run at"
-                f" {volts:.3g} {drive}{least}"
+                f"{words} have no steady state: {name} would have to {needs}"
+                f" {volts:.3g}{unit}{least}"
             )
     return x, np.maximum(u, low)
 
@@ -415,17 +514,13 @@ def _rate(plant, x, u):
 _slope = jax.jit(jax.jacfwd(_rate, argnums=(1, 2)))
 
 
-def _balanced(plant, y, words, inflow, shared=None):
-    """(levels, inputs) at rest of a network with pipes, or not plain, by damped Gauss-Newton."""
-    if shared is None and plant.pumps != len(plant.outputs):
-        raise InputError(
-            f"equilibrium needs as many pumps as outputs: this rig has {plant.pumps} and"
-            f" {len(plant.outputs)}"
-        )
-    openings = [plant.drain] if plant.plain else [plant.drain, plant.orifice, plant.valve]
-    openings = np.concatenate([v for v in openings if v is not None])
+def _balanced(plant, y, words, inflow, shared):
+    """(levels, inputs) at rest of a network with pipes or other elements, by damped Newton."""
+    if not plant.plain or shared is not None:
+        return _rest_of_elements(plant, y, words, inflow, shared)
+    check_rest(plant, "equilibrium")
     speed = (
-        float(np.max(np.abs(openings)))
+        float(np.max(np.abs(plant.drain)))
         / float(np.min(plant.area))
         * np.sqrt(2.0 * float(plant.gravity) * (float(np.max(y)) or 1.0))
     )
@@ -433,11 +528,11 @@ def _balanced(plant, y, words, inflow, shared=None):
     try:
         # an area of 1e-300, say, overflows on the way: the check below reports it
         with np.errstate(all="ignore"):
-            many = plant.tanks >= vectors.FROM and plant.plain and shared is None
+            many = plant.tanks >= vectors.FROM
             x, u, rates = (
                 balanced(plant, y, 1e-5 * tolerance, inflow)
                 if many
-                else _by_dense(plant, y, inflow, shared)
+                else _by_dense(plant, y, inflow)
             )
     except (ValueError, np.linalg.LinAlgError):  # not finite where it starts, or on the way
         raise EquilibriumError(f"{words} have no steady state") from None
@@ -446,38 +541,46 @@ def _balanced(plant, y, words, inflow, shared=None):
     return x, u
 
 
-def _by_dense(plant, y, inflow, shared=None):
+_at_rest = jax.jit(at_rest)
+
+
+def _rest_of_elements(plant, y, words, inflow, shared):
+    """(levels, inputs) at rest of a network of any elements; an input may be below its limit."""
+    if shared is None and not plant.plain:
+        check_rest(plant, "steady state")
+    solve = _at_rest if shared is None else jax.jit(functools.partial(at_rest, shared=shared))
+    with jax.enable_x64(True):
+        exact = jax.tree.map(lambda v: np.asarray(v, dtype=float), (plant, y, inflow))
+        x, u, left = jax.tree.map(np.asarray, solve(*exact))
+        flows = [float(np.abs(s.flow)) for s in elements.streams(exact[0], x, u)]
+    if not left <= 1e-9 * max(flows):
+        raise EquilibriumError(f"{words} have no steady state")
+    return np.array(x), np.array(u)
+
+
+def _by_dense(plant, y, inflow):
     """(levels, inputs, rates left) of a network of few tanks, by a dense Jacobian."""
     free = [i for i in range(plant.tanks) if i not in plant.outputs]
     scale = float(np.max(y)) or 1.0
-    # level rate per unit of input; a valve's opening is of the order of 1
-    gain = np.min(plant.pump_gain, initial=np.inf) / float(np.max(plant.area))
-    gain = np.repeat([gain, 1.0], [len(plant.feeds), len(plant.valves)])
-    start = np.repeat([1e-3 * scale, 0.5], [len(plant.feeds), len(plant.valves)])
-    if shared is not None:
-        gain, start = np.ones(len(y)), np.zeros(len(y))
+    gain = float(np.min(plant.pump_gain)) / float(np.max(plant.area))
 
     def split(z):
-        x, v = np.zeros(plant.tanks), z[len(free) :] / gain
+        x = np.zeros(plant.tanks)
         x[list(plant.outputs)], x[free] = y, scale * z[: len(free)] ** 2
-        return x, v if shared is None else np.stack([np.asarray(u) for u in shared(v)])
+        return x, z[len(free) :] / gain
 
     def residual(z):
         x, u = split(z)
         with jax.enable_x64(True):
             rate = np.asarray(_rate(plant, x, u))
-        return rate if inflow is None else rate + inflow / np.asarray(plant.sections(x))
+        return rate if inflow is None else rate + inflow / np.asarray(plant.area)
 
     def jacobian(z):
         with jax.enable_x64(True):
             by_x, by_u = (np.asarray(a) for a in _slope(plant, *split(z)))
-            if shared is not None:
-                share: Any = shared
-                by_v = jax.jacfwd(lambda v: jnp.stack(share(v)))(z[len(free) :])
-                by_u = by_u @ np.asarray(by_v)
         return np.concatenate([by_x[:, free] * (2.0 * scale * z[: len(free)]), by_u / gain], axis=1)
 
-    start = np.concatenate([np.full(len(free), 0.9), start])
+    start = np.concatenate([np.full(len(free), 0.9), np.full(plant.pumps, 1e-3 * scale)])
     solution = scipy.optimize.least_squares(
         residual,
         start,

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clipped_sqrt
+from jaxtank.plants.elements import check_plain
 from jaxtank.plants.rigs import STATE_COUPLED_FEEDS, STATE_COUPLED_LINKS
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps
@@ -25,8 +26,16 @@ def authority(model):
     return tuple(model.pump_gain[j] / model.area[first] for j, (first, _) in enumerate(model.feeds))
 
 
+def check_inverted(model, holder="controller"):
+    """Raise InputError for a model with elements that the formulas of a controller have not."""
+    others = 'kind = "pid", "lqi", "gpc" or "laguerre" serves such a rig'
+    others = "the Kalman filters serve such a rig" if holder == "observer" else others
+    check_plain(model, f"{holder}.model", f"this {holder} inverts a plain network: {others}")
+
+
 def check_own_pumps(model, every=True, holder="controller"):
     """Check that pump j fills the j-th controlled tank alone."""
+    check_inverted(model, holder)
     if tuple(first for first, _ in model.feeds) != model.outputs or any(
         second is not None for _, second in model.feeds
     ):
@@ -122,6 +131,7 @@ def input_metric(c, s3, s4):
 
 def check_state_coupled(model, reference):
     """Check the model and the reference of a controller of gouta2015."""
+    check_inverted(model)
     if (
         model.links != STATE_COUPLED_LINKS
         or model.feeds != STATE_COUPLED_FEEDS

@@ -35,11 +35,12 @@ class Memory(NamedTuple):
     u: Sequence
 
 
-def incremental_model(model, operating_point, dt):
+def incremental_model(model, operating_point, dt, inputs=None):
     """Return (A, B, C) of x = [dx_m; y] (khalid eqs. 16-17, khalid notes S4.1)."""
     # A = [[Am, 0], [Cm Am, I]], B = [Bm; Cm Bm], C = [0, I]
-    still = jnp.zeros(model.pumps)  # the rig is linear in its inputs, so any value serves
-    Ac, Bc, Cm = linearise(dataclasses.replace(model, knee=EXACT), operating_point, still)
+    # a plain rig is linear in its inputs, so any value serves
+    inputs = jnp.zeros(model.pumps) if inputs is None else inputs
+    Ac, Bc, Cm = linearise(dataclasses.replace(model, knee=EXACT), operating_point, inputs)
     Am, Bm = zero_order_hold(Ac, Bc, dt)
     n, q = Am.shape[0], Cm.shape[0]
     A = jnp.block([[Am, jnp.zeros((n, q))], [Cm @ Am, jnp.eye(q)]])
@@ -124,7 +125,7 @@ class LinearPredictive(Controller):
         `dt` [s]; see `quadratic_cost`.
         """
         basis = self.basis()
-        A, B, C = incremental_model(self.model, self.operating_point, dt)
+        A, B, C = incremental_model(self.model, self.operating_point, dt, self._inputs())
         return *quadratic_cost(A, B, C, jnp.asarray(self.q), self.r_w, basis), basis
 
     def gain(self, dt: float) -> jax.Array:
@@ -157,14 +158,19 @@ class LinearPredictive(Controller):
             u = [clip(u[i], self.u_low[i], self.u_high[i]) for i in pumps]
         return tuple(u), Memory(x=x, u=state.u)
 
+    def _inputs(self):
+        """Inputs (m,) of the linear model [V]: the middle of their range where these matter."""
+        if getattr(self.model, "plain", True):
+            return jnp.zeros(self.model.pumps)
+        middle = 0.5 * (jnp.asarray(self.u_low) + jnp.asarray(self.u_high))
+        return jnp.where(jnp.isfinite(middle), middle, 0.5)
+
     def _change(self, state, tick, estimate):
         """[change of each level since the last sample, dx_m] [cm]."""
         if not estimate.d:
             return [a - b for a, b in zip(estimate.x, state.x)]
         A, _, _ = linearise(
-            dataclasses.replace(self.model, knee=EXACT),
-            self.operating_point,
-            jnp.zeros(self.model.pumps),
+            dataclasses.replace(self.model, knee=EXACT), self.operating_point, self._inputs()
         )
         n = range(self.model.tanks)
         W = zero_order_hold(-A, jnp.eye(len(n)), tick.dt)[1]

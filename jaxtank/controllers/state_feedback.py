@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxtank.analysis.linear_model import linearise
 from jaxtank.analysis.riccati import lqr
-from jaxtank.analysis.steady_state import steady_along, steady_flows, steady_under
+from jaxtank.analysis.steady_state import check_rest, steady_along, steady_flows, steady_under
 from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import pointwise
 from jaxtank.core.errors import InputError
@@ -40,9 +40,11 @@ def check_free_outlets(model):
     """Raise InputError unless steady states of `model` follow from a linear balance."""
     if getattr(model, "pipes", None) != () or model.pumps != len(model.outputs):
         raise InputError(
-            "controller.model must be a network without pipes and with as many pumps as outputs:"
-            " this controller needs its steady states"
+            "controller.model must be a network without pipes and with as many pumps and valves as"
+            " outputs: this controller needs its steady states"
         )
+    if not model.plain:
+        check_rest(model, "controller.model")
 
 
 @component

@@ -220,7 +220,9 @@ def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Vector) ->
 
 def _steady_inputs(loop: ClosedLoop, r: Vector) -> Any:
     if not ms.serves("input_deviation", loop):
-        raise InputError("input_deviation needs a rig without pipes, with as many pumps as outputs")
+        raise InputError(
+            "input_deviation needs a plain rig without pipes, with as many pumps as outputs"
+        )
     inputs = steady_along(loop.plant, _rows_of(r), steady_inflow(loop))[1]
     offset = loop.actuator.offset
     if np.ndim(offset):

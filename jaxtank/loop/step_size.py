@@ -14,14 +14,22 @@ In a rig with `bottom` a tank gives no more in one step than it holds (`TankNetw
 no volume appears, but a level below (h sqrt(2 g) (sum a_j + sum p_k) / A)^2 stands too high, by at
 most that. Beyond lambda h = 2.785 of the pipes alone, levels that a pipe has made equal still
 oscillate.
+
+Of a network that is not plain, lambda is the slope of the flows over the cross-section, its largest
+where a level stands at the bottom or at a port (in a shaped tank at 1 % of its rim at least: at a
+tip it is infinite), and the level that may be too high is the highest at which a tank would give
+more in a step than it holds; without `bottom` no bound is known.
 """
 
+import dataclasses
 import functools
 import math
 import warnings
 from collections.abc import Iterator
 from typing import Any, NamedTuple, cast
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.core.clock import Clock
@@ -29,6 +37,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index, walk
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.trajectory import Trajectory
+from jaxtank.plants import elements
 
 LIMITS = {"rk4": 2.785, "midpoint": 2.0}
 """Largest stable lambda h of each integrator [-]."""
@@ -50,9 +59,10 @@ class Unstable(NamedTuple):
 
 def emptying_rates(plant: Any, orifices: float = 1.5, pipes: float = 2.0) -> Any:
     """Lambda (n,) of each tank [1/s]; None of traced leaves or another kind of plant."""
-    if not getattr(plant, "plain", True):
-        return None
     try:
+        if not getattr(plant, "plain", True):
+            own, joined = _slopes_of_elements(plant)
+            return orifices / 1.5 * own + pipes / 2.0 * joined
         out, joined = np.array(plant.drain, dtype=float), np.zeros(plant.tanks)
         orifice, pipe = np.asarray(plant.orifice), np.asarray(plant.pipe)
         for k, (source, _) in enumerate(plant.links):
@@ -66,6 +76,66 @@ def emptying_rates(plant: Any, orifices: float = 1.5, pipes: float = 2.0) -> Any
         return np.minimum(rates, 1e200)
     except (AttributeError, TypeError):  # what jax raises for a traced number is a TypeError
         return None
+
+
+def _slopes_of_elements(plant: Any) -> tuple[Any, Any]:
+    """((n,) slope of the flows that leave each tank by its own level alone, (n,) of those that
+    depend on two levels, twice: each over the smallest cross-section that matters [1/s]).
+    """
+    n, knee = plant.tanks, plant.knee
+    ports = [v for name in elements.PORTS if (v := getattr(plant, name)) is not None]
+    heads = np.unique([0.0, *(float(v) + 1e-3 * knee for v in np.concatenate([*ports, []]))])
+    x = np.broadcast_to(heads[:, None], (len(heads), n))
+    with jax.enable_x64(True):
+        slopes, joined = (np.asarray(v) for v in _flow_slopes(plant, x))
+        height = np.maximum(x, SEEN * np.asarray(plant.rim, dtype=float) if plant.shapes else 0.0)
+        section = np.stack([np.broadcast_to(v, len(heads)) for v in plant.sections(height.T)], 1)
+    return np.max(slopes / section, axis=0), np.max(joined / section, axis=0)
+
+
+@jax.jit
+def _flow_slopes(plant: Any, x: Any) -> Any:
+    """((rows, n) slopes of the flows that leave a tank, by its own level; of those between two
+    levels, by both) at levels x (rows, n), valves open.
+    """
+
+    def flows(x: Any) -> Any:
+        streams = elements.streams(plant, tuple(x), elements.valves_open(plant))
+        return jnp.stack([s.flow for s in streams])
+
+    ends = elements.streams(plant, (0.0,) * plant.tanks, elements.valves_open(plant))
+    slopes = jax.vmap(jax.jacfwd(flows))(x)
+    own, joined = [0.0] * plant.tanks, [0.0] * plant.tanks
+    for k, (source, sink, _) in enumerate(ends):
+        for i in (i for i in (source, sink) if i is not None):
+            others = jnp.sum(jnp.abs(slopes[:, k]), axis=1) - jnp.abs(slopes[:, k, i])
+            joined[i] = joined[i] + 2.0 * jnp.where(others > 0.0, jnp.abs(slopes[:, k, i]), 0.0)
+            own[i] = own[i] + jnp.where(others > 0.0, 0.0, jnp.abs(slopes[:, k, i])) * (i == source)
+    rows = lambda columns: jnp.stack([jnp.broadcast_to(v, x.shape[0]) for v in columns], axis=1)
+    return rows(own), rows(joined)
+
+
+@jax.jit
+def _outflows(plant: Any, x: Any) -> Any:
+    """(rows, n) flow that leaves each tank and (rows, n) its volume, at levels x (rows, n)."""
+
+    def at(x: Any) -> Any:
+        leaving: list[Any] = [0.0] * plant.tanks
+        for source, _, flow in elements.streams(plant, tuple(x), elements.valves_open(plant)):
+            if source is not None:
+                leaving[source] = leaving[source] + jnp.maximum(flow, 0.0)
+        return jnp.stack([v + 0.0 * x[0] for v in leaving]), jnp.stack(plant.stored(tuple(x)))
+
+    return jax.vmap(at)(x)
+
+
+def _overdrawn(plant: Any, step: float) -> Any:
+    """(n,) highest level at which a tank would give more in a step than it holds."""
+    rim = np.asarray(plant.rim, dtype=float)
+    x = np.minimum(rim, 1e6 * plant.knee) * np.geomspace(1e-7, 1.0, 400)[:, None]
+    with jax.enable_x64(True):
+        leaving, stored = (np.asarray(v) for v in _outflows(plant, x))
+    return np.max(np.where(stored < step * leaving, x, 0.0), axis=0)
 
 
 @functools.lru_cache(maxsize=256)
@@ -104,8 +174,12 @@ def check_step(loop: ClosedLoop, clock: Clock) -> None:
     for unstable in unstable_tanks(loop, clock):
         # from a full tank: T = 2 A sqrt(h) / (sqrt(2 g) sum a), with the rate of laminar flow in
         # place of its factors
-        full = math.sqrt(plant.rim[unstable.tank] / plant.knee)
-        empty = 3.0 * full / rates[unstable.tank]
+        if plant.plain:
+            full = math.sqrt(plant.rim[unstable.tank] / plant.knee)
+            empty = 3.0 * full / rates[unstable.tank]
+        else:
+            leaving, stored = _outflows(plant, np.asarray(plant.rim, dtype=float)[None])
+            empty = float(stored[0, unstable.tank] / leaving[0, unstable.tank])
         if empty < step:
             raise InputError(
                 f"clock.dt = {clock.dt:g} s: tank {unstable.tank + 1} runs empty in {empty:.2g} s,"
@@ -142,7 +216,8 @@ def check_run(loop: ClosedLoop, clock: Clock, run: Trajectory) -> None:
     plant: Any = loop.plant  # a network of tanks
     x, least = np.asarray(run.x), visible_heights(loop, np.asarray(run.x))
     area, inflow = np.asarray(plant.area), _largest_inflow(loop, clock, np.asarray(run.u))
-    gained = np.diff(x @ area) - clock.dt * inflow[:-1]  # volume from nowhere
+    volume = sum(np.asarray(v) for v in plant.stored(x.T)) if plant.shapes else x @ area
+    gained = np.diff(volume) - clock.dt * inflow[:-1]  # volume from nowhere
     for tank, _, remedy in visible:
         bad = (gained > area[tank] * least[tank]) & (np.diff(x[:, tank]) > least[tank])
         if bad.any():
@@ -168,7 +243,10 @@ def _largest_inflow(loop: ClosedLoop, clock: Clock, u: Any) -> Any:
             entry = index[0]
             faulty = gain[entry] * faults.factor[k] + faults.extra[k]
             gain[entry] = max(gain[entry], faulty)
-    inflow = np.maximum(u, 0.0) @ gain
+    if plant.plain:
+        inflow = np.maximum(u, 0.0) @ gain
+    else:
+        inflow = elements.largest_supply(dataclasses.replace(plant, pump_gain=gain), u)
     if loop.disturbance is not None:
         disturbance: Any = loop.disturbance
         inflow = inflow + sum(np.maximum(np.asarray(d), 0.0) for d in disturbance.sample(clock)[0])
@@ -223,6 +301,10 @@ def unstable_tanks(loop: ClosedLoop, clock: Clock) -> Iterator[Unstable]:
 
 def _height(plant: Any, tank: int, step: float, product: float, integrator: str) -> float:
     """Largest error of the level of an empty tank, in thresholds."""
+    if not plant.plain:
+        joined = step * emptying_rates(plant, 0.0, 2.0)[tank]
+        bounded = plant.bottom and joined <= LIMITS[integrator]
+        return float(_overdrawn(plant, step)[tank]) / plant.knee if bounded else math.inf
     if not plant.bottom:
         return unstable_height(float(f"{product:.3g}"), integrator)
     excess = float((step * emptying_rates(plant, 1.0, 1.0)[tank]) ** 2)

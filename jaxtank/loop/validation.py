@@ -21,6 +21,7 @@ from jaxtank.instruments.base import Actuator
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.step_size import check_step
 from jaxtank.plants.base import Plant
+from jaxtank.plants.elements import check_plain
 from jaxtank.plants.faults import Faults
 from jaxtank.plants.network import check_caught
 
@@ -120,6 +121,8 @@ def _check_parts(
     check_leaves(loop, vacant=[f"controller.law.{gain}" for gain in gains])
     for name, model in _plants(loop):
         check_caught(model, name)
+    if loop.safety_filter is not None:
+        check_plain(loop.plant, "safety_filter", "run without the filter")
     faults = loop.faults if isinstance(loop.faults, Faults) else None
     if faults and not _traced(faults, loop.plant) and (wrong := faults.problems(loop.plant, clock)):
         raise InputError("; ".join(wrong))

@@ -13,6 +13,7 @@ from jaxtank.core.tree import component, leaf, static
 from jaxtank.observers.base import Observer
 from jaxtank.observers.checks import check_model, check_tanks
 from jaxtank.plants.base import Plant
+from jaxtank.plants.elements import sections
 from jaxtank.plants.runge_kutta import advance, euler
 
 FED = ("applied", "command")
@@ -109,7 +110,7 @@ class DisturbanceObserver(Observer):
             rate = tuple(rate[i] + d[i] for i in n)
         expected = euler(self.model, x, rate, tick.dt)
         if len(self.measured) < len(x):
-            area = getattr(self.model, "area", None)
+            area = sections(self.model, x)
             inflow = None if area is None else tuple(area[i] * d[i] for i in n)
             moved = advance(self.model, "rk4", tick.t, x, u, inflow, tick.dt, 1).x
             expected = tuple(expected[i] if i in self.measured else moved[i] for i in n)
@@ -134,7 +135,7 @@ class DisturbanceObserver(Observer):
 def level_rates(model, x, u):
     """Return f(h) + g u of every tank: the level rates of the model."""
     shares = getattr(model, "shares", None)
-    if shares is None:
+    if shares is None or not model.plain:
         return tuple(model.derivative(0.0, tuple(x), tuple(u), None))
     rate = list(model.derivative(0.0, tuple(x), (0.0,) * model.pumps, None))
     for j, tank, gain in shares():

@@ -12,6 +12,7 @@ from jaxtank.core.tree import component, leaf, static
 from jaxtank.observers.base import Observer
 from jaxtank.observers.checks import check_disturbed, check_model, check_tanks
 from jaxtank.plants.base import Plant
+from jaxtank.plants.elements import sections
 from jaxtank.plants.runge_kutta import advance
 
 
@@ -135,11 +136,11 @@ class ExtendedKalman(Observer):
 
     def predict(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         model, N, n = self.model, range(len(state.x)), self.model.tanks
-        area, walk = cast(Any, model).area if self.disturbed else (), cast(Any, self.walk)
+        walk = cast(Any, self.walk)
 
         def onward(x):  # the levels alone: a random walk stays where it is
             levels, d = self._parts(x)
-            inflow = tuple(area[i] * v for i, v in enumerate(d)) or None
+            inflow = tuple(a * v for a, v in zip(sections(model, levels), d)) if d else None
             return advance(
                 model, self.integrator, tick.t, levels, applied, inflow, tick.dt, self.substeps
             ).x

@@ -6,9 +6,13 @@ streams below, one for each opening and each input.
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 
 from jaxtank.core.curves import monotone_curve
+from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import lower_clip, smooth_signed_sqrt, smooth_sqrt
 from jaxtank.plants.vessels import area_of, level_of, volume_of
 
@@ -19,6 +23,61 @@ class Stream(NamedTuple):
     source: int | None
     sink: int | None
     flow: Any  # [cm^3/s], negative where it runs from sink to source
+
+
+FEATURES = {
+    "valve": ("valves",),
+    "pump that draws from a tank": ("sources",),
+    "pump curve": ("curves",),
+    "head loss of a pump": ("lift_curves",),
+    "tank with a shape": ("shapes", "extent"),
+    "port above the bottom": ("drain_port", "orifice_port", "pipe_port", "valve_port"),
+    "overflow below the rim": ("spill_port",),
+    "exponent of an outlet": ("drain_exponent", "orifice_exponent"),
+    "linear outlet": ("drain_resistance", "orifice_resistance"),
+}
+"""Elements that a plain network has not, and the fields of a `TankNetwork` where they are."""
+
+PORTS = ("drain_port", "orifice_port", "pipe_port", "valve_port")
+
+
+def features(net: Any) -> list[str]:
+    """Return the elements of a plant that a plain network has not; [] of one, and of no network."""
+    absent = lambda value: value is None or (isinstance(value, tuple) and not value)
+    parts = lambda names: (getattr(net, name, None) for name in names)
+    return [word for word, names in FEATURES.items() if not all(map(absent, parts(names)))]
+
+
+def check_plain(net: Any, what: str, remedy: str) -> None:
+    """Raise InputError for a network that is not plain."""
+    if elements := features(net):
+        raise InputError(f"{what}: not covered: {', '.join(elements)}; {remedy}")
+
+
+def closed_circuit(net: Any) -> list[int]:
+    """Return tanks that exchange nothing with the basin, so that their volume stays what it is; []
+    of traced areas.
+    """
+    if any(isinstance(v, Tracer) for v in jax.tree.leaves((net.drain, net.drain_resistance))):
+        return []
+    open_tanks, joined = set(np.flatnonzero(np.asarray(net.drain) > 0.0)), [*net.links, *net.pipes]
+    if net.drain_resistance is not None:
+        open_tanks |= set(np.flatnonzero(np.isfinite(np.asarray(net.drain_resistance))))
+    pumps = zip(net.sources or (None,) * len(net.feeds), net.feeds)
+    joined += [(source, sink) for source, sinks in pumps for sink in sinks[: 2 - (None in sinks)]]
+    joined += net.valves
+    for a, b in joined:
+        open_tanks |= {b} if a is None else {a} if b is None else set()
+    within = [pair for pair in joined if None not in pair]
+    for _ in range(net.tanks):
+        open_tanks |= {i for pair in within if open_tanks & set(pair) for i in pair}
+    return [i for i in range(net.tanks) if i not in open_tanks]
+
+
+def input_name(net: Any, j: int) -> str:
+    """Return "pump 1" or "valve 1": what the entry j of the inputs drives."""
+    pumps = len(net.feeds) if hasattr(net, "feeds") else net.pumps
+    return f"pump {j + 1}" if j < pumps else f"valve {j - pumps + 1}"
 
 
 def power_law(head: Any, exponent: Any, knee: Any) -> Any:
@@ -113,6 +172,24 @@ def _driven(net: Any, j: int, x: Any, u: Any, source: int | None, sink: int | No
     return asked * lower_clip(monotone_curve(by_lift, lift), 0.0)
 
 
+def valves_open(net: Any) -> tuple[float, ...]:
+    """Return inputs (m,) with the pumps off and the valves open."""
+    return (0.0,) * len(net.feeds) + (full_open(net.units),) * len(net.valves)
+
+
+def largest_supply(net: Any, u: np.ndarray) -> Any:
+    """Return (samples,) what the pumps bring from the basin at most, for inputs (samples, m)."""
+    total = np.zeros(len(u))
+    for j in range(len(net.feeds)):
+        if net.sources and net.sources[j] is not None:
+            continue
+        curve, by_lift = (c[j] if c else None for c in (net.curves, net.lift_curves))
+        asked = u[:, j] if curve is None else np.asarray(monotone_curve(curve, u[:, j]))
+        most = 1.0 if by_lift is None else max(1.0, *(share for _, share in by_lift))
+        total += np.maximum(float(net.pump_gain[j]) * asked * most, 0.0)
+    return total
+
+
 def net_flows(net: Any, x: Any, u: Any, d: Any, step: Any = None) -> tuple[Any, ...]:
     """Return the net inflow of each tank (n,) [cm^3/s]; with `step`, at most what a tank holds
     leaves it in that time.
@@ -160,8 +237,10 @@ def levels(net: Any, volumes: Any) -> tuple[Any, ...]:
     return _by_tank(net, level_of, volumes)
 
 
-def sections(net: Any, x: Any) -> tuple[Any, ...]:
-    """Return the cross-section (n,) [cm^2] of each tank at its level."""
+def sections(net: Any, x: Any) -> Any:
+    """Return the cross-section (n,) [cm^2] of each tank at its level; None of a plant without."""
+    if not getattr(net, "shapes", ()):
+        return getattr(net, "area", None)
     return _by_tank(net, area_of, x)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from jaxtank.core.errors import InputError
+from jaxtank.plants import elements
 from jaxtank.plants.hydraulics import disc
 from jaxtank.plants.network import TankNetwork, network
 
@@ -155,6 +156,7 @@ def coupled_tanks(
 
 def check_topology(model, like, **wanted):
     """Check that the model of a controller is the rig that it inverts."""
+    elements.check_plain(model, "controller.model", f"this controller inverts {like}")
     for name, value in wanted.items():
         if getattr(model, name, None) != value:
             raise InputError(

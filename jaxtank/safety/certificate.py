@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from jaxtank.core.errors import InputError
 from jaxtank.instruments.base import Actuator
 from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.plants import elements
 from jaxtank.plants.faults import Faults
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.safety.box import (
@@ -117,6 +118,7 @@ def design(
     """
     if not isinstance(plant, TankNetwork):
         raise InputError("safety_filter: is for tank networks (plants.network) only")
+    elements.check_plain(plant, "safety_filter", "it is for rigs without: run without the filter")
     n, (least, most) = plant.tanks, box_of(plant, widths)
     tankwise = lambda v: np.broadcast_to(np.asarray(v, float), (n,))
     inflow, draw, low, volume = map(tankwise, (inflow, draw, low, volume))

@@ -12,13 +12,14 @@ from numpy.typing import ArrayLike
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index
 from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.plants.elements import features
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.safety.box import spread, widths_of
 from jaxtank.safety.certificate import TankCertificate, design
 from jaxtank.safety.filter import SafetyFilter
 from jaxtank.signals.inflows import InflowPulses
 
-FLOWS = ("drain", "orifice", "pipe", "pump_gain", "split")
+FLOWS = ("drain", "orifice", "pipe", "pump_gain", "split", "valve", "extent")
 HARMLESS = ("controller.", "observer.", "reference.")
 """What may be uncertain without a change of the box: limits hold under any controller."""
 SPREAD = 0.05
@@ -106,8 +107,16 @@ def design_for(
 def certificates_of(case: Any) -> tuple[TankCertificate, ...]:
     """Return the certificates of the filter in the loop; without one, of the filter that fits it.
 
-    A filter whose numbers were changed after its design is not certified.
+    A filter whose numbers were changed after its design is not certified, and no rig that is not
+    plain.
     """
+    if reason := ", ".join(features(case.loop.plant)):
+        rim, nan = np.asarray(case.loop.plant.rim, dtype=float), float("nan")
+        numbers = {"rate": nan, "rate_bound": nan, "gap": nan, "reach": float("inf")}
+        return tuple(
+            TankCertificate(i, float(top), False, f"not covered: {reason}", **numbers)
+            for i, top in enumerate(rim)
+        )
     safety_filter, rows = design_for(case, **(case.safety or {}))
     present = case.loop.safety_filter
     if present is None or _equal(present, safety_filter):
@@ -137,7 +146,8 @@ def _box(case, widths):
     the plant's, the factor by which inflow disturbances may be larger than they are).
     """
     shares, box = dict(case.uncertain), {}
-    flows: dict[str, float] = {name: SPREAD for name in FLOWS}
+    present = (name for name in FLOWS if getattr(case.loop.plant, name) is not None)
+    flows: dict[str, float] = {name: SPREAD for name in present}
     if case.covariance is not None:
         names, matrix = case.covariance
         at = [i for i, name in enumerate(names) if not name.startswith(HARMLESS)]

@@ -182,12 +182,13 @@ def free_bounds(loop, free):
 
 def default_free(loop):
     """Return {name: (low, high)}: the default unknowns of an identification."""
-    # Pump gains, splits between two tanks, open orifices, pipes, the captured share of an overflow
-    # and a constant disturbance; not areas, which are measured with a ruler.
+    # Pump gains, splits between two tanks, open orifices, pipes, valves, the captured share of an
+    # overflow and a constant disturbance; not areas, which are measured with a ruler.
     plant: Any = loop.plant
     free = {}
-    for name in ("pump_gain", "drain", "orifice", "pipe"):
-        values = np.ravel(np.asarray(getattr(plant, name, ()), dtype=float))
+    for name in ("pump_gain", "drain", "orifice", "pipe", "valve"):
+        values = getattr(plant, name, None)
+        values = np.ravel(np.asarray(() if values is None else values, dtype=float))
         positive = [(i, float(v)) for i, v in enumerate(values) if v > 0]
         free |= {f"plant.{name}[{i}]": (v / 10, v * 10) for i, v in positive}
     feeds: Any = getattr(plant, "feeds", ())

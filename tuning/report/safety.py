@@ -4,6 +4,7 @@ import numpy as np
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.units import local
+from jaxtank.plants.elements import features
 from jaxtank.safety.checker import CASE, LIMITS
 from jaxtank.safety.of_case import certificates_of
 from tuning.report.tables import Table, Value, clean
@@ -38,8 +39,8 @@ def certificates(case):
             "certified": row.certified,
             "why": row.reason,
             "starts": row.starts or None,
-            "rate": row.rate,
-            "rate_bound": row.rate_bound,
+            "rate": clean(row.rate),
+            "rate_bound": clean(row.rate_bound),
             "gap": clean(row.gap),
             "reach": clean(row.reach),
             "low": {"limit": row.low, "certified": row.low_certified, "why": row.low_reason}
@@ -75,6 +76,8 @@ def sentences(case):
     length = local("cm", case.loop.units)
     start = ", ".join(f"{h:.4g}" for h in np.asarray(case.loop.x0, dtype=float))
     on = "on" if case.loop.safety_filter is not None else "off: --safety-filter turns it on"
+    if elements := features(case.loop.plant):
+        return [f"The safety filter does not cover this rig: {', '.join(elements)}."]
     return [
         f"The safety filter is {on}.",
         f"proved: no level passes its limit {PROMISE}, from the levels at t = 0 in the column"

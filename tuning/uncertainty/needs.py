@@ -5,10 +5,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxtank.analysis.steady_batch import FLOWS, SteadyStates
+from jaxtank.analysis.steady_batch import SteadyStates, flow_leaves
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, split_index
+from jaxtank.plants.elements import closed_circuit
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig import check_limits
 from jaxtank.signals.base import Constant
@@ -62,8 +63,9 @@ class Needs:
         plateaus = plateaus_of(case)
         if not judges(case) or not plateaus:
             raise InputError(
-                f"{case.name}: feasibility is for networks of tanks with as many pumps as outputs,"
-                " and setpoints that are held for a while (no sine)"
+                f"{case.name}: feasibility is for networks of tanks with as many pumps and valves"
+                " as outputs and an exchange with the basin, and setpoints that are held for a"
+                " while (no sine)"
             )
         count = len(next(iter(values.values()))) if values else 1
         of = lambda name: drawn_values(loop, name, values, count)
@@ -72,7 +74,7 @@ class Needs:
         self.offset = of("actuator.dead_zone") if zoned else np.zeros((1, loop.plant.pumps))
         self.case, self.values, self.limits = case, dict(values), limits
         self.plateaus, self.count = plateaus, count
-        flows = {name: of(f"plant.{name}") for name in FLOWS}
+        flows = {name: of(f"plant.{name}") for name in flow_leaves(loop.plant)}
         self.states = SteadyStates(loop.plant, flows, inflow)
         self.setpoints = np.stack(
             [np.stack([of(name) for name in p.names], axis=-1) for p in plateaus], axis=1
@@ -113,6 +115,7 @@ def judges(case: Case) -> bool:
     plant = case.loop.plant
     return (
         isinstance(plant, TankNetwork)
+        and (plant.plain or not closed_circuit(plant))
         and plant.pumps == len(plant.outputs)
         and bool(plateaus_of(case))
     )
