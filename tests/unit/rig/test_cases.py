@@ -1,0 +1,377 @@
+"""Rigs of bug threads, textbooks and forums (tests/data/cases): the value in each file's head."""
+
+import math
+import pathlib
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import jaxtank
+import tuning
+from jaxtank import rig
+from jaxtank.core.errors import InputError
+from jaxtank.safety.of_case import certificates_of
+from tuning.identification.csv_log import read_log
+
+CASES = pathlib.Path(__file__).parents[2] / "data" / "cases"
+ROOT_2G = math.sqrt(2.0 * 9.81)
+
+
+def file_of(number):
+    """The file of a case by its number."""
+    return next(CASES.glob(f"case{number}_*.toml"))
+
+
+def simulated(case):
+    run = jaxtank.simulate(case.loop, case.clock)
+    return np.asarray(run.t), np.asarray(run.x), run
+
+
+def at(t, x, time):
+    return x[np.argmin(np.abs(t - time)), 0]
+
+
+def signs_turned(t, x, run):
+    assert x.max() == pytest.approx(0.468712, abs=2e-6)
+    for time, level in ((100.0, 0.255050), (200.0, 0.214734), (250.0, 0.252153)):
+        assert at(t, x, time) == pytest.approx(level, abs=2e-6)
+
+
+def outflow_pump(t, x, run):
+    assert x.min() >= 0.0
+    assert x[-1, 0] == pytest.approx(0.0, abs=1e-9)
+
+
+def p_only(t, x, run):
+    after = t >= 100.0
+    right = 2.4 - 0.4 * np.exp(-0.05 * (t[after] - 100.0))
+    np.testing.assert_allclose(x[after, 0], right, atol=2e-3)
+    assert x[-1, 0] == pytest.approx(2.4, abs=1e-6)
+
+
+def reservoir(t, x, run):
+    full = 2 * 78.53981633974483 * math.sqrt(11.0) / (0.07068583470577035 * ROOT_2G)
+    root = np.sqrt(11.0) * (1.0 - t / full)
+    filling = t < 0.95 * full
+    np.testing.assert_allclose(np.sqrt(11.0 - x[filling, 1]), root[filling], atol=1e-4)
+    assert np.all(np.diff(x[:, 1]) >= 0.0) and x[-1, 1] == pytest.approx(11.0, abs=1e-3)
+
+
+def one_tank(t, x, run):
+    spilled = np.asarray(run.spilled)[-1, 0]
+    assert (x.max(), spilled) == (1.0, pytest.approx(0.11868, abs=1e-3))
+    assert t[np.argmax(x[:, 0] >= 1.0)] == pytest.approx(127.23, abs=0.11)
+    assert at(t, x, 300.0) == pytest.approx(0.083184, abs=1e-5)
+    assert x[-1, 0] == pytest.approx(0.0, abs=1e-6) and x.min() >= 0.0
+
+
+def full_tank(t, x, run):
+    spilled = np.asarray(run.spilled)[:, 0]
+    np.testing.assert_allclose(x, 10.0, atol=1e-12)
+    np.testing.assert_allclose(spilled[t >= 1800.0], 36.0, rtol=1e-12)
+
+
+def relay(t, x, run):
+    late = x[t > 100.0, 0]
+    assert late.max() - 1.0 == pytest.approx(0.05, abs=2e-3)
+    assert 1.0 - late.min() == pytest.approx(0.05, abs=2e-3)
+    rises = t[1:][(x[1:, 0] >= 1.0) & (x[:-1, 0] < 1.0)]
+    np.testing.assert_allclose(np.diff(rises)[2:], 20.0, atol=0.3)
+
+
+def p_only_after_saturation(t, x, run):
+    assert x[-1, 0] == pytest.approx(1.0, abs=1e-6)
+    right = np.clip(0.5 + 10.0 * (1.0 - x[:, 0]), 0.0, 1.0)
+    np.testing.assert_allclose(np.asarray(run.u)[:-1, 0], right[:-1], atol=1e-5)
+
+
+def measured_inflows(t, x, run):
+    extremes = (x[-1, 0], x.min(), x.max())
+    assert extremes == pytest.approx((13.214751, 13.207825, 13.377), abs=1e-6)
+
+
+def linear_plant(t, x, run):
+    assert x[-1, 0] == pytest.approx(4.0, abs=1e-3)
+    for time, level in ((5.0, 2.52848), (10.0, 3.45866)):
+        assert at(t, x, time) == pytest.approx(level, abs=4e-3)
+
+
+def recycle(t, x, run):
+    np.testing.assert_allclose(x[:, 0] + 2.0 * x[:, 1], 3.0, rtol=1e-12)
+    upper = (0.02 / (0.01 * ROOT_2G)) ** 2
+    np.testing.assert_allclose(x[-1], [upper, (3.0 - upper) / 2.0], atol=1e-5)
+
+
+def ultrasonic(t, x, run):
+    np.testing.assert_allclose(np.asarray(run.y), np.floor(x + 0.5), atol=1e-9)
+    late = x[t >= t[-1] - 100.0, 0]
+    assert (late.min(), late.max()) == pytest.approx((25.451, 25.550), abs=2e-3)
+
+
+def side_stream(t, x, run):
+    before = t < 50.0
+    np.testing.assert_allclose(x[before, 0], 20.0, atol=1e-5)
+    np.testing.assert_allclose(np.asarray(run.u)[before, 0], 5.90454, atol=1e-5)
+
+
+RIGHT = {
+    "05": signs_turned,
+    "07": outflow_pump,
+    "08": p_only,
+    "09": reservoir,
+    "11": one_tank,
+    "12": full_tank,
+    "14": relay,
+    "17": p_only_after_saturation,
+    "18": measured_inflows,
+    "23": linear_plant,
+    "24": recycle,
+    "35": ultrasonic,
+    "37": side_stream,
+}
+
+
+@pytest.mark.slow_for("05", "08", "09", "14", "17", "18", "35")
+@pytest.mark.parametrize("number", RIGHT)
+def test_a_case_of_people_has_the_value_in_its_head(number):
+    RIGHT[number](*simulated(rig.load(file_of(number))))
+
+
+@pytest.mark.slow
+def test_margins_of_simc_are_the_published_ones():
+    case = rig.load(file_of(13))
+    names = ["sensitivity_peak", "gain_margin", "phase_margin", "delay_margin"]
+    values = jaxtank.evaluate(case.loop, case.clock, names)
+    numbers = [float(np.ravel(values[name])[0]) for name in names]
+    assert numbers == pytest.approx([1.70, 2.96, 46.9, 1.59 * 60.0], rel=0.01)
+
+
+@pytest.mark.slow
+def test_the_water_tower_is_identified_with_and_without_its_pump():
+    case = rig.load(file_of(19))
+    log = read_log(CASES / "case19b_water_tower_log_pump.csv", case.loop)
+    fit = tuning.identify(case, log)
+    values = fit.to_json()["parameters"]
+    assert values["plant.pump_gain[0]"]["value"] == pytest.approx(3.5300, rel=1e-4)
+    assert values["disturbance.level[0]"]["value"] == pytest.approx(-0.30406, rel=1e-4)
+
+
+@pytest.mark.slow
+def test_a_year_of_setpoints_is_followed():
+    """case27: 8,760 hourly setpoints."""
+    day = 2 * math.pi / 24
+    setpoint = lambda k: 2 + 0.5 * math.sin(day * k) + 0.3 * math.sin(day * k / 365)
+    table = {
+        "units": ["m", "m^3/s"],
+        "tank": [{"area": 500.0, "rim": 5.0, "drain": 0.02, "level": 2.0}],
+        "pump": [{"gain": 1.0, "to": 1, "high": 1.0, "initial": 0.1}],
+        "plant": {"gravity": 9.81},
+        "controller": {"kind": "pid", "Kc": 0.5, "Ti": 7200.0, "Tt": 3600.0},
+        "reference": {
+            "initial": [2.0],
+            "changes": [[3600.0 * k, 1, setpoint(k)] for k in range(8760)],
+            "ramp": 0.0,
+        },
+        "values": {"clock.dt": 600.0, "clock.duration": 3600.0 * 8760},
+    }
+    _, x, run = simulated(rig.from_table(table))
+    assert float(np.asarray(run.r)[-1, 0]) == pytest.approx(setpoint(8759), abs=1e-12)
+    assert abs(x[-1, 0] - setpoint(8759)) < 0.3
+
+
+def test_two_pumps_on_one_level_are_refused_with_what_to_write():
+    with pytest.raises(InputError, match=r"one pump per output.*split-range"):
+        rig.load(file_of(30))
+
+
+@pytest.mark.slow
+def test_a_filter_on_an_outflow_pump_claims_nothing_that_it_does_not_hold():
+    (row,) = certificates_of(rig.load(file_of(31)))
+    assert not row.certified and not row.low_certified
+
+
+def test_a_valve_beside_a_controller_of_one_pump_is_refused_with_what_is_missing():
+    with pytest.raises(InputError, match=r"list of 2 finite numbers, one per input \(pumps, then"):
+        rig.load(file_of(33))
+
+
+OUTLET = """
+reachable = false
+units = ["m", "-"]
+tank = [{ name = "LT101", area = 1.0, rim = 0.6, level = 0.3, inflow = 0.02 }]
+valve = [{ name = "FV101", from = "LT101", area = 0.01 }]
+plant = { gravity = 9.81 }
+controller = { kind = "p", Kc = -19.68503937007874, bias = 0.0 }
+reference = { initial = [0.3556] }
+values = { "clock.dt" = 0.1, "clock.duration" = 600.0 }
+"""
+
+
+def test_a_valve_in_the_outlet_is_manipulated():
+    """case33, by P only: open by (h - 14 in) / 2 in."""
+    case = rig.loads(OUTLET)
+    assert case.names == {"tank": ("LT101",), "pump": ("FV101",)} and case.loop.plant.bottom
+    _, x, _ = simulated(case)
+    balance = lambda h: 0.01 * (h - 0.3556) / 0.0508 * ROOT_2G * math.sqrt(h) - 0.02
+    root = brentq(balance, 0.36, 0.6)
+    assert root == pytest.approx(0.392225, abs=1e-6)
+    assert x[-1, 0] == pytest.approx(root, abs=1e-6)
+
+
+def test_a_linear_outlet_of_a_file_cancels_the_integral_action():
+    """case23 without its derivative, by drain_linear: y = 4 (1 - exp(-0.2 t))."""
+    text = """
+    units = ["m", "-"]
+    tank = [{ area = 10.0, rim = 100.0, drain_linear = 1.0 }]
+    pump = [{ gain = 1.0, to = 1, high = 100.0 }]
+    plant = { gravity = 9.81 }
+    controller = { kind = "pid", Kc = 2.0, Ti = 10.0, Tt = 10.0 }
+    reference = { initial = [0.0], changes = [[0.0, 1, 4.0]], ramp = 0.0 }
+    values = { "clock.dt" = 0.01, "clock.duration" = 20.0 }
+    """
+    t, x, _ = simulated(rig.loads(text))
+    np.testing.assert_allclose(x[:, 0], 4.0 * (1.0 - np.exp(-0.2 * t)), atol=2e-3)
+
+
+VESSEL = """
+reachable = false
+units = ["m", "m^3/s"]
+tank = [{{ level = 1.6, {tank} }}]
+{inputs}
+plant = {{ gravity = 9.81 }}
+controller = {{ kind = "open-loop", initial = [{initial}] }}
+values = {{ "clock.dt" = 0.25, "clock.duration" = 100.0 }}
+"""
+TAP = "valve = [{ from = 1, area = 0.01 }]"
+
+
+def vessel(tank, inputs=TAP, initial=0.0):
+    return simulated(rig.loads(VESSEL.format(tank=tank, inputs=inputs, initial=initial)))
+
+
+def test_a_cone_runs_out_by_its_closed_form_and_stays_empty():
+    """h^2.5 falls linearly: A = A0 (h / H)^2, outflow a sqrt(2 g h)."""
+    t, x, _ = vessel('shape = "cone", height = 2.0, diameter = 1.5, drain = 0.01')
+    slope = 2.5 * 0.01 * ROOT_2G * 4.0 / (math.pi / 4.0 * 1.5**2)
+    right = np.maximum(1.6**2.5 - slope * t, 0.0) ** 0.4
+    full = right > 0.3
+    np.testing.assert_allclose(x[full, 0], right[full], atol=1e-5)
+    assert right[-1] == 0.0 and x.min() >= 0.0 and x[-1, 0] < 1e-2
+
+
+@pytest.mark.parametrize(
+    ("tank", "volume"),
+    [
+        ("diameter = 2.0, height = 3.0", lambda h: math.pi * h),
+        ('shape = "sphere", diameter = 2.0', lambda h: math.pi / 3.0 * h**2 * (3.0 - h)),
+        (
+            "shape = [[0.0, 1.0], [1.0, 3.0], [4.0, 3.0]]",
+            lambda h: np.where(h < 1.0, h + h**2, 3.0 * h - 1.0),
+        ),
+        (
+            'shape = "horizontal-cylinder", diameter = 2.0, length = 2.0',
+            lambda h: 2.0 * (np.arccos(1.0 - h) - (1.0 - h) * np.sqrt(h * (2.0 - h))),
+        ),
+    ],
+    ids=["upright", "sphere", "table", "lying"],
+)
+def test_a_pump_that_takes_out_takes_its_flow_from_a_vessel_of_any_shape(tank, volume):
+    t, x, _ = vessel(tank, "pump = [{ from = 1, gain = 1.0, high = 1.0 }]", 0.01)
+    taken = volume(x[0, 0]) - volume(x[:, 0])
+    np.testing.assert_allclose(taken, 0.01 * t, atol=1e-10)
+
+
+def test_a_port_ends_the_outflow_and_a_check_valve_lets_nothing_back():
+    _, x, _ = vessel("area = 1.0, rim = 3.0", TAP.replace("area", "port = 1.5, area"), 1.0)
+    assert x[-1, 0] == pytest.approx(1.5, abs=1e-3) and x.min() >= 1.5
+    two = """
+    units = ["m", "-"]
+    reachable = false
+    tank = [{ area = 1.0, rim = 3.0, level = 1.0 }, { area = 1.0, rim = 3.0, level = 2.0 }]
+    valve = [{ from = 1, to = 2, area = 0.01, check = CHECK, initial = 1.0 }]
+    plant = { gravity = 9.81 }
+    controller = { kind = "open-loop", initial = [1.0] }
+    """
+    for check, levels in (("true", [1.0, 2.0]), ("false", [1.5, 1.5])):
+        _, x, _ = simulated(rig.loads(two.replace("CHECK", check)))
+        np.testing.assert_allclose(x[-1], levels, atol=1e-3)
+
+
+def test_an_equal_percentage_valve_is_open_by_its_rangeability_also_in_percent():
+    tap = 'valve = [{ from = 1, area = 0.02, characteristic = "equal-percentage" }]'
+    tank = "area = 1.0, rim = 9.0, inflow = 0.01"
+    _, x, _ = vessel(tank, tap, 0.7)
+    text = VESSEL.format(tank=tank, inputs=tap, initial=70.0).replace("m^3/s", "%")
+    case = rig.loads(text)
+    assert float(case.loop.actuator.high[0]) == 100.0
+    np.testing.assert_allclose(simulated(case)[1], x, rtol=1e-12)
+    share = 50.0 ** (0.7 - 1.0)
+    rate = (x[-1, 0] - x[-2, 0]) / 0.25
+    mean = x[-2:, 0].mean()
+    assert rate == pytest.approx(0.01 - 0.02 * share * ROOT_2G * math.sqrt(mean), abs=1e-7)
+
+
+def test_a_pump_follows_its_curve_and_loses_flow_to_the_lift():
+    curves = "curve = [[0.0, 0.0], [0.5, 0.02], [1.0, 0.02]], curve_head = [[0.0, 1.0], [4.0, 0.0]]"
+    pump = f"pump = [{{ to = 1, high = 1.0, {curves} }}]"
+    t, x, _ = vessel("area = 1.0, rim = 9.0", pump, 0.75)
+    right = 4.0 - 2.4 * np.exp(-0.02 / 4.0 * t)
+    np.testing.assert_allclose(x[:, 0], right, atol=1e-6)
+
+
+WRONG = """
+units = ["m", "-"]
+tank = [{ area = 1.0, cone = true }, { shape = "cone", height = 2.0 }, { rim = 1.0, port = 2.0 }]
+valve = [{ from = 1, area = 0.1, opening = 0.5, check = 1 }, { to = 2, area = 0.1, high = 2.0 }]
+pump = [{ to = 7, gain = 1.0, curve = [[0.0, 1.0], [0.0, 2.0]] }]
+controller = { kind = "p", Kc = 1.0 }
+"""
+
+
+def test_all_that_is_wrong_in_the_tables_of_a_rig_is_in_one_answer():
+    with pytest.raises(InputError) as refused:
+        rig.loads(WRONG)
+    message = str(refused.value)
+    for words in (
+        "unknown key of [[tank]] 'cone'; write [[tank]] shape",
+        "unknown key of [[tank]] 'port'; it is a key of [[orifice]]",
+        "unknown key of [[valve]] 'opening'; write initial",
+        "valve 1: check = 1: must be true or false",
+        "valve 2 needs from",
+        "pump 1: to = 7: must be a tank",
+        "pump 1: curve = ",
+        "pump 1 needs high",
+    ):
+        assert words in message, words
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"tank": [{"shape": "cone", "height": 2.0}]}, "diameter and height"),
+        ({"tank": [{"shape": "cube", "height": 2.0}]}, '"cone", "sphere"'),
+        ({"tank": [{"area": 1.0}]}, r"tank 1 needs rim \[m\]"),
+        ({"tank": [{"rim": 1.0}]}, r"tank 1 needs area \[m\^2\].*diameter"),
+        ({"tank": [{"area": 1.0, "rim": 1.0, "height": 1.0}]}, "give one of them"),
+        ({"tank": [{"shape": [[0.5, 1.0], [1.0, 1.0]]}]}, "from level 0"),
+        ({"valve": [{"from": 1, "area": 0.1, "high": 2.0}]}, "up to 1, full open"),
+        ({"valve": [{"from": 1, "to": 1, "area": 0.1}]}, "two different tanks"),
+        ({"valve": [{"from": 1, "area": 0.1, "characteristic": "quick"}]}, '"equal-percentage"'),
+        ({"pump": [{"gain": 1.0, "high": 1.0}]}, "needs to"),
+        ({"pump": [{"to": 1, "high": 1.0}]}, "needs gain .* or curve"),
+        ({"pump": [{"to": 1, "high": 1.0, "curve": [[0, 0], [1, 2], [2, 1]]}]}, "that turns"),
+        ({"valve": []}, r"at least one \[\[pump\]\] or \[\[valve\]\]"),
+        ({"valve": [{"from": 1, "area": 0.1, "kv": 3.0}]}, "write area"),
+    ],
+)
+def test_an_element_that_cannot_be_is_refused_with_what_to_write(changes, words):
+    table = {
+        "units": ["m", "-"],
+        "tank": [{"area": 1.0, "rim": 1.0}],
+        "valve": [{"from": 1, "area": 0.1}],
+        "plant": {"gravity": 9.81},
+        "controller": {"kind": "open-loop", "initial": [0.0]},
+    }
+    with pytest.raises(InputError, match=words):
+        rig.from_table(table | changes)
