@@ -97,9 +97,6 @@ class Case(CaseViews):
         Of parameters that were identified together.
     log : {"t", "pump1", "h1", ..: column of a data file, its unit in its header}
         Where a data file of this rig names them otherwise.
-    names : {"tank" or "pump": a name of each, "" for none}
-        Where a rig gives them.
-
     safety : settings of `with_safety_filter`, optional
     origin : "paper/case" of the preset that it was made from, "" for none
 
@@ -126,9 +123,13 @@ class Case(CaseViews):
     uncertain: Mapping[str, float] = dataclasses.field(default_factory=dict)
     covariance: tuple | None = None
     log: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    names: Mapping[str, tuple] = dataclasses.field(default_factory=dict)
     safety: Mapping[str, Any] | None = None
     origin: str = ""
+
+    @property
+    def names(self) -> dict[str, tuple[str, ...]]:
+        """{"tank", "pump" or "valve": a name of each, "" for none}, where the rig gives them."""
+        return dict(self.loop.plant.names)
 
     def replace(self, **changes: Any) -> "Case":
         """Return a copy with the named fields changed."""

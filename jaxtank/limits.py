@@ -140,7 +140,7 @@ def resolve_in(
                 continue
             values = np.broadcast_to(np.asarray(value, dtype=float), (len(missing),))
             for j, v in enumerate(values):
-                if not missing[j]:
+                if not missing[j] and np.isfinite(v):
                     measured, at = _without_overflow(measure, j, float(v), loop.plant)
                     resolved.append(Limit(measured, j, at, i, scenario))
     for measure, (value, reason) in why.items():

@@ -1,11 +1,15 @@
-"""Numbers with a unit, such as "2500 cm^2", "5 min" or "36 m3/h", converted to a rig's unit."""
+"""The units that are known, and numbers with a unit, such as "2500 cm^2", "5 min" or "36 m3/h",
+converted to a rig's unit.
+"""
 
 import difflib
 import functools
 import re
+from collections.abc import Iterable
+from typing import Any, cast
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.units import DRIVES, LENGTHS, SHARES, TIMES, VOLTS
+from jaxtank.core.text import shortened
 
 WATER = 9806.65
 """Specific weight of water at 4 C [N/m^3]: a pressure stands for the height of such a column."""
@@ -13,11 +17,19 @@ WATER = 9806.65
 GALLON = 231 * 0.0254**3
 """Gallon of the United States [m^3]."""
 
+LENGTHS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 1e-3, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
+TIMES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
+VOLTS = {"V": 1.0, "mV": 1e-3}
+SHARES = {"-": 1.0, "1": 1.0, "%": 0.01}
+DRIVES = ({"A": 1.0, "mA": 1e-3}, {"W": 1.0, "kW": 1e3}, {"Hz": 1.0, "rpm": 1 / 60}, {"U0": 1.0})
+"""Current, power, speed, and the input at rest (khalid2015)."""
+
 TABLES: tuple[tuple[str, dict[str, float]], ...] = (
     ("m", {**LENGTHS, "km": 1000.0, "yd": 0.9144}),
     ("m", {"bar": 1e5 / WATER, "mbar": 1e2 / WATER, "Pa": 1 / WATER, "kPa": 1e3 / WATER}),
     ("m", {"psi": 6894.757293168 / WATER}),
-    ("m^3", {"l": 1e-3, "L": 1e-3, "ml": 1e-6, "mL": 1e-6, "hl": 0.1, "gal": GALLON}),
+    ("m^3", {"l": 1e-3, "L": 1e-3, "ml": 1e-6, "mL": 1e-6, "cc": 1e-6}),
+    ("m^3", {"hl": 0.1, "gal": GALLON}),
     ("m^3/s", {"gpm": GALLON / 60, "cfm": 0.3048**3 / 60}),
     ("s", {**TIMES, "hr": 3600.0, "d": 86400.0}),
     ("V", VOLTS),
@@ -25,6 +37,17 @@ TABLES: tuple[tuple[str, dict[str, float]], ...] = (
     *((next(iter(table)), table) for table in DRIVES),
 )
 """(dimension, {unit: size}): sizes in the dimension's own unit."""
+
+LEVEL_UNITS = (*LENGTHS, *VOLTS, *SHARES)
+FLOW_UNITS = (
+    *(f"{length}^3/s" for length in LENGTHS),
+    *(f"{v}/{t}" for v in ("m^3", "cm^3", "l", "ml") for t in ("s", "min", "h")),
+    "gpm",
+)
+INPUT_UNITS = (*VOLTS, *dict.fromkeys(FLOW_UNITS), *SHARES, *(n for t in DRIVES for n in t))
+"""Usual units of levels, flows and pump inputs, for hints; others of the same dimension are
+read too.
+"""
 
 RAISED = str.maketrans("²³⁻¹", "23-1")
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -39,7 +62,8 @@ Size = tuple[float, dict[str, int]]
 def _product(a: Size, b: Size, power: int) -> Size:
     """Return a times b to a power."""
     exponents = {k: a[1].get(k, 0) + power * b[1].get(k, 0) for k in {**a[1], **b[1]}}
-    return a[0] * b[0] ** power, {k: v for k, v in exponents.items() if v}
+    size = a[0] * b[0] ** power if power > 0 else a[0] / b[0] ** -power  # exact for 1e-3/60
+    return size, {k: v for k, v in exponents.items() if v}
 
 
 @functools.cache
@@ -85,34 +109,54 @@ def size_of(unit: str) -> Size:
     return stack[0][0]
 
 
+def factor(unit: str, base: str) -> float | None:
+    """Return the number of `base` that one `unit` is; None where one is unknown, and of units of
+    different dimensions.
+    """
+    if unit == base:  # also a unit that is a mere label, such as U0
+        return 1.0
+    try:
+        (size, dimension), (base_size, base_dimension) = size_of(unit), size_of(base)
+    except KeyError:
+        return None
+    return size / base_size if dimension == base_dimension else None
+
+
 def quantity(where: str, text: str, unit: str) -> float:
     """Return the number of `unit` that a text such as "36 m3/h" stands for.
 
     Raises InputError for a text that is not a number with a unit, a unit that is unknown, and a
     unit of another dimension.
     """
+    bracketed = "" if unit == "-" else f" [{unit}]"
     number = NUMBER.match(text.strip())
     name = text.strip()[number.end() :] if number else ""
     if number is None or not name.strip() or re.match(r"[.,\d]", name):
+        example = f'"2.5 {unit}"' if unit != "-" else '"80 %"'
         raise InputError(
-            f'{where} = "{text}": must be a number [{unit}], or a number with a unit such as'
-            f' "2.5 {unit}", with a point as the decimal sign'
+            f"{where} = {shortened(text)}: must be a number{bracketed}, or one with a unit such as"
+            f" {example}, with a point as the decimal sign"
         )
     value, name = float(number[0]), name.strip()
-    if name == unit:  # also a unit that is a mere label, such as U0
-        return value
+    size = factor(name, unit)
+    if size is not None:
+        return value * size
+    needed = "%, or have no unit" if unit == "-" else f"{unit}, or in a unit that converts to it"
     try:
-        size, dimension = size_of(name)
+        size_of(name)
     except KeyError as error:
         nearest = difflib.get_close_matches(str(error.args[0]), list(_sizes()), 3, 0.5)
         hint = f"; nearest: {', '.join(nearest)}" if nearest else ""
         raise InputError(
-            f'{where} = "{text}": the unit {name} is unknown{hint}; [{unit}] is needed'
+            f"{where} = {shortened(text)}: the unit {name} is unknown{hint}; must be in {needed}"
         ) from None
-    try:
-        unit_size, unit_dimension = size_of(unit)
-    except KeyError:
-        unit_size, unit_dimension = 1.0, {unit: 1}
-    if dimension != unit_dimension:
-        raise InputError(f'{where} = "{text}": must be in {unit}, or in a unit that converts to it')
-    return value * (size / unit_size)
+    raise InputError(f"{where} = {shortened(text)}: must be in {needed}")
+
+
+def converted(where: str, value: Any, unit: str) -> Any:
+    """Return `value` with each text in it that begins with a number as a number of `unit`."""
+    if isinstance(value, str):
+        return quantity(where, value, unit) if NUMBER.match(value.strip()) else value
+    if isinstance(value, (list, tuple)):
+        return [converted(where, each, unit) for each in cast(Iterable[Any], value)]
+    return value

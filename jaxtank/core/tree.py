@@ -134,8 +134,16 @@ def static(
     return dataclasses.field(metadata=meta, default=default)
 
 
+def note(default: Any) -> Any:
+    """Return a field of a component that no computation reads, such as names; hashable."""
+    return dataclasses.field(metadata={"kind": "note"}, default=default)
+
+
 @dataclass_transform(
-    kw_only_default=True, frozen_default=True, eq_default=False, field_specifiers=(leaf, static)
+    kw_only_default=True,
+    frozen_default=True,
+    eq_default=False,
+    field_specifiers=(leaf, static, note),
 )
 def component(cls: type[T]) -> type[T]:
     """Make a class a frozen keyword-only dataclass and a pytree of JAX.
@@ -177,8 +185,8 @@ def component(cls: type[T]) -> type[T]:
     cast(Any, cls).__init__ = __init__
     _register(
         cls,
-        tuple(f.name for f in fields if f.metadata.get("kind") != "static"),
-        tuple(f.name for f in fields if f.metadata.get("kind") == "static"),
+        tuple(f.name for f in fields if f.metadata.get("kind") not in ("static", "note")),
+        tuple(f.name for f in fields if f.metadata.get("kind") in ("static", "note")),
     )
     return cls
 

@@ -43,6 +43,9 @@ class Plant(abc.ABC):
     units: tuple[str, str] = DEFAULT
     """(length, pump input): the units that this plant counts in."""
 
+    names: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    """(("tank", names), ("pump", names), ("valve", names)), "" for none: see `core.labels`."""
+
     overflow: bool = False
     """True where a level stops at its rim and the rest overflows."""
 

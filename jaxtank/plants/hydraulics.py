@@ -4,19 +4,12 @@ import math
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import LAMINAR_THRESHOLD
+from jaxtank.core.quantities import LENGTHS
 
 GRAVITY = 981.0
 """Standard acceleration in the units of gouta2015, Table 1 [cm/s^2]."""
 
-PER_CENTIMETRE = {
-    "mm": 10.0,
-    "cm": 1.0,
-    "dm": 0.1,
-    "m": 0.01,
-    "in": 1 / 2.54,
-    "inch": 1 / 2.54,
-    "ft": 1 / 30.48,
-}
+PER_CENTIMETRE = {unit: 1 / (100 * size) for unit, size in LENGTHS.items()}
 """Units of length: how many are one centimetre."""
 
 

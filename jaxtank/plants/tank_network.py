@@ -17,7 +17,7 @@ from jaxtank.core.numerics import (
     smooth_signed_sqrt,
     smooth_sqrt,
 )
-from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.tree import component, leaf, note, static
 from jaxtank.core.units import DEFAULT
 from jaxtank.core.vectors import each, is_array, take, zeros
 from jaxtank.plants import elements
@@ -401,6 +401,7 @@ class TankNetwork(Plant):
     )
     spills: tuple = static(doc="((from, to), ...) where what passes a rim falls", default=())
     outputs: tuple = static(doc="tanks whose levels are controlled")
+    names: tuple = note(())
     units: tuple = static(doc="(length, pump input): the units of this rig", default=DEFAULT)
     overflow: bool = static(
         doc="overflow is simulated: a level stops at the rim, the rest is lost",

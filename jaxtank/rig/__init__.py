@@ -89,6 +89,8 @@ from jaxtank.rig.validation import check_objective as check_objective
 from jaxtank.rig.validation import check_uncertain as check_uncertain
 from jaxtank.rig.validation import uncovered as uncovered
 from jaxtank.rig.validation import unreachable as unreachable
+from jaxtank.rig.values import by_rig_name as by_rig_name
+from jaxtank.rig.values import dotted_name as dotted_name
 from jaxtank.rig.values import has as has
 from jaxtank.rig.values import is_change as is_change
 from jaxtank.rig.values import overlap as overlap

@@ -1,13 +1,15 @@
 """Values of a rig file, read and written by their Key: kinds, ranges, units, lines of TOML."""
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxtank.core.checks import check_value
 from jaxtank.core.errors import InputError, nearest, unknown
+from jaxtank.core.labels import names_of
+from jaxtank.core.quantities import converted
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import number, sizes_of_shape
 from jaxtank.core.units import DEFAULT
@@ -25,6 +27,7 @@ class Sizes(NamedTuple):
     outputs: int = 0
     units: tuple = DEFAULT
     names: Mapping[str, int] = {}
+    plant: Any = None
 
     @property
     def counts(self) -> dict[str, int]:
@@ -32,9 +35,10 @@ class Sizes(NamedTuple):
         return {"tank": self.tanks, "pump": self.pumps, "output": self.outputs}
 
 
-def sizes_of(plant, names: Mapping[str, int] = {}) -> Sizes:
-    """Return the Sizes of a plant; names: those of its tanks."""
-    return Sizes(plant.tanks, plant.pumps, len(plant.outputs), plant.units, names)
+def sizes_of(plant) -> Sizes:
+    """Return the Sizes of a plant."""
+    names = {name: i for i, name in enumerate(names_of(plant, "tank")) if name}
+    return Sizes(plant.tanks, plant.pumps, len(plant.outputs), plant.units, names, plant)
 
 
 def read_entry(
@@ -147,6 +151,7 @@ def read_value(key, label: str, value: Any, sizes: Sizes) -> Any:
 
 def _number(key, label, value, sizes):
     meta = key.meta(sizes.units)
+    value = converted(label, value, meta["unit"])
     if not is_plain(value):
         raise refusal(label, value, f"be {_within(f'a finite number{unit(meta)}', meta)}")
     if LARGEST < abs(value) < float("inf"):
@@ -181,6 +186,7 @@ def _texts(key, label, value, sizes):
 
 def _list(key, label, value, sizes):
     shape = sizes_of_shape(key.shape, sizes.counts) or ()
+    value = converted(label, value, key.meta(sizes.units)["unit"])
     if not (is_finite(value) and np.shape(value) == shape):
         numbers = f"{shape[0] if shape else 1} finite numbers{unit(key.meta(sizes.units))}"
         each = {"pump": "input (pumps, then valves)"}.get(key.shape[0], key.shape[0])
@@ -190,6 +196,7 @@ def _list(key, label, value, sizes):
 
 def _array(key, label, value, sizes):
     """An array; one number for an array of one entry per pump, tank or output fills it."""
+    value = converted(label, value, key.meta(sizes.units)["unit"])
     if not is_numeric(value):
         numbers = f"a number or a list of numbers{unit(key.meta(sizes.units))}"
         raise refusal(label, value, f"be {numbers}")
@@ -314,16 +321,19 @@ READ = {
 """{kind: function (key, label, value, sizes)} that reads and checks a value of a rig file."""
 
 
-def written(key, value: Any) -> Any:
-    """Return a value as a rig file has it: tanks counted from 1, arrays as lists."""
+def written(key, value: Any, names: Sequence[str] = ()) -> Any:
+    """Return a value as a rig file has it: tanks by their names or from 1, arrays as lists."""
+    tank = lambda i: (names[i] if names else "") or i + 1
     if value is None or isinstance(value, (str, dict)) or key.kind == "any":
         return value
     if key.kind == "tank":
-        return value + 1
+        return tank(value)
     if key.kind == "sequence":
         return [[j + 1 for j in row] for row in value]
-    if key.kind in ("tanks", "pair", "feed", "reverse"):
-        tanks = [i + 1 for i in value if i is not None]
+    if key.kind == "reverse":
+        return [i + 1 for i in value]
+    if key.kind in ("tanks", "pair", "feed"):
+        tanks = [tank(i) for i in value if i is not None]
         return tanks[0] if key.kind == "feed" and len(tanks) == 1 else tanks
     return np.asarray(value).tolist()
 
@@ -428,10 +438,14 @@ class Block(NamedTuple):
     on: bool = True
 
 
-def lines_of(section: Section, values: Mapping[str, Any], units=DEFAULT) -> list[Line]:
-    """Return the lines of a section's keys that have a value, in the order of its schema."""
+def lines_of(
+    section: Section, values: Mapping[str, Any], units=DEFAULT, names: Sequence[str] = ()
+) -> list[Line]:
+    """Return the lines of a section's keys that have a value, in the order of its schema; names:
+    those of the tanks.
+    """
     return [
-        Line(k.name, written(k, values[k.name]), _meta_of(k, values[k.name], units))
+        Line(k.name, written(k, values[k.name], names), _meta_of(k, values[k.name], units))
         for k in section.keys
         if values.get(k.name) is not None
     ]
@@ -443,9 +457,11 @@ def _meta_of(key, value, units):
     return {**meta, "unit": "-"} if key.kind == "curve" and isinstance(value, str) else meta
 
 
-def block_of(section: Section, values: Mapping[str, Any], units=DEFAULT) -> Block:
+def block_of(
+    section: Section, values: Mapping[str, Any], units=DEFAULT, names: Sequence[str] = ()
+) -> Block:
     """Return the Block of a section with `lines_of` its values."""
-    return Block(section.title, lines_of(section, values, units))
+    return Block(section.title, lines_of(section, values, units, names))
 
 
 def suggestion(section: Section, values: Mapping[str, Any], units=DEFAULT) -> Block:

@@ -5,6 +5,7 @@
 import dataclasses
 import functools
 import math
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import numpy as np
 from jaxtank.case import Case
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import name_of as name_of_part
 from jaxtank.core.tree import number
 from jaxtank.core.units import DEFAULT, check_units, flow_per_input
 from jaxtank.instruments.actuators import PumpBank
@@ -53,11 +55,8 @@ def build(table):
     table = {**table, **{name: _list(table, name) for name in LISTS}}
     units = _units(table.get("units", list(DEFAULT)))
     sizes = Sizes(len(table["tank"]), units=units, names=names_in(table))
+    table["pump"] = [_with_gain(row, units) for row in table["pump"]]
     entries, more = _read(table, sizes)
-    names = {
-        "tank": tuple(entry["name"] for entry in entries["tank"]),
-        "pump": tuple(entry["name"] for kind in INPUTS for entry in entries[kind]),
-    }
     columns = _columns(entries)
     outputs = more.pop("outputs") if "outputs" in more else _usual_outputs(entries)
     if not outputs:
@@ -65,6 +64,7 @@ def build(table):
     if any("port" in row for row in table["spill"]):  # else such an opening would do nothing
         more = {"overflow": True, **more}
     plant = network(**_keywords(columns), **more, outputs=outputs, units=units)
+    plant = dataclasses.replace(plant, names=_names(entries))
     control = table.get("controller", {})
     return Case(
         name="my rig",
@@ -74,7 +74,6 @@ def build(table):
         limits={"max_level": "rim"},
         free={},
         objective={"rms_error_total": 1.0},
-        names={kind: each for kind, each in names.items() if any(each)},
     )
 
 
@@ -92,7 +91,7 @@ def _read(table, sizes):
             tank |= _vessel(f"tank {i + 1}", tank, sizes.units)
     rows = {name: table[name] if entries[name] else () for name in LISTS}
     checks = [
-        lambda: _check_names([entry["name"] for entry in entries["tank"]]),
+        lambda: _check_names(entries),
         lambda: _check_links(rows, entries, sizes.units),
         lambda: _check_pumps(rows["pump"], entries["pump"], sizes.units),
         lambda: _check_valves(entries["valve"], sizes.units),
@@ -260,11 +259,20 @@ def _units(value):
     return check_units("units", (length, drive))
 
 
-def _check_names(names):
-    """Raise InputError where two tanks have the same name."""
-    for i, name in enumerate(names):
-        if name and name in names[:i]:
-            raise InputError(f"two tanks have the same name, {name!r}: give each its own")
+def _names(entries):
+    """((kind, names), ...) of the kinds of which one has a name."""
+    names = ((kind, tuple(entry["name"] for entry in entries[kind])) for kind in ("tank", *INPUTS))
+    return tuple((kind, each) for kind, each in names if any(each))
+
+
+def _check_names(entries):
+    """Raise InputError where two tanks, or two pumps and valves, have the same name."""
+    for kinds in (("tank",), INPUTS):
+        each = [entry["name"] for kind in kinds for entry in entries[kind] if entry["name"]]
+        for name, count in Counter(each).items():
+            if count > 1:
+                words = " or ".join(f"{kind}s" for kind in kinds)
+                raise InputError(f"{count} {words} are called {name!r}: give each its own name")
 
 
 def _check_links(table, entries, units):
@@ -296,12 +304,36 @@ FLOW_MARGIN = 2.0
 """Factor by which a pump may deliver more or less than the flow that its input asks for."""
 
 
+def _with_gain(row, units):
+    """A row of [[pump]] with gain = 1 where its input is a flow and it says nothing of its own."""
+    bare = isinstance(row, dict) and not {"gain", "curve"} & row.keys()
+    return {**row, "gain": 1.0} if bare and flow_per_input(units) else row
+
+
+def _flow_gain(where, gain, units):
+    """The flow per unit of an input that is a flow itself, of a gain that is either that (within
+    FLOW_MARGIN) or the share of the flow that the pump delivers.
+    """
+    flow, (length, drive) = flow_per_input(units), units
+    near = lambda size: 1 / FLOW_MARGIN <= size <= FLOW_MARGIN
+    if gain <= 0.0 or (gain != 1.0 and near(gain / flow)):
+        return gain
+    if near(gain):
+        return gain * flow
+    raise InputError(
+        f"{where}: gain = {gain:g}: an input of 1 {drive} is a flow of {flow:.6g} {length}^3/s:"
+        f" must be the share of it that the pump delivers, 1, from {1 / FLOW_MARGIN:g} to"
+        f" {FLOW_MARGIN:g}, or the flow itself, from {flow / FLOW_MARGIN:.4g} to"
+        f" {flow * FLOW_MARGIN:.4g} {length}^3/s per {drive}"
+    )
+
+
 def _check_pumps(rows, pumps, units):
     """Raise InputError for limits in the wrong order, for a split without two tanks, for a pump
-    that joins no tank, for curves that turn, and for a gain that is not near the flow of a unit of
-    the input.
+    that joins no tank, and for curves that turn; gains of inputs that are flows become those of the
+    rig.
     """
-    length, drive = units
+    drive = units[1]
     for i, (pump, row) in enumerate(zip(pumps, rows)):
         pump.setdefault("to", (None, None))
         if pump["to"][0] is None and "from" not in pump:
@@ -329,14 +361,8 @@ def _check_pumps(rows, pumps, units):
                 f"pump {i + 1}: split is the share of the first of two tanks: give it where to ="
                 " [first, second], and only there"
             )
-    flow = flow_per_input(units)
-    for i, gain in enumerate(pump.get("gain", 0.0) for pump in pumps):
-        if flow and gain > 0 and not 1 / FLOW_MARGIN <= gain / flow <= FLOW_MARGIN:
-            raise InputError(
-                f"pump {i + 1}: gain = {gain:g} {length}^3/s per {drive}: an input of 1 {drive} is"
-                f" a flow of {flow:.6g} {length}^3/s: must be {flow:.6g} times the share that the"
-                f" pump delivers, from {flow / FLOW_MARGIN:.4g} to {flow * FLOW_MARGIN:.4g}"
-            )
+        if flow_per_input(units) and "gain" in pump:
+            pump["gain"] = _flow_gain(f"pump {i + 1}", pump["gain"], units)
 
 
 def _check_monotone(label, points, least=None):
@@ -370,7 +396,7 @@ def _check_valves(valves, units):
                 raise refusal(label, [list(p) for p in shares], "have openings from 0 to 1")
 
 
-def entries_of(loop, names):
+def entries_of(loop):
     """Return [(section, number from 1, {key: value})] that describe a loop's rig tank by tank."""
     plant = loop.plant
     if not isinstance(plant, TankNetwork):
@@ -389,8 +415,7 @@ def entries_of(loop, names):
             usual = {key.name: key.default for key in section.keys if key.like}
             values = {k: v for k, v in values.items() if k not in usual or v != usual[k]}
             if name in ("tank", *INPUTS):
-                kind = "tank" if name == "tank" else "pump"
-                values["name"] = names[kind][j] if kind in names else ""
+                values["name"] = name_of_part(plant, name, i)
             if name == "tank":
                 values |= _sizes_of(values)
             if name == "pump" and plant.feeds[i][1] is None:

@@ -16,6 +16,7 @@ from jaxtank.rig.entry import Sizes, read_entry, read_value, refusal, sizes_of
 from jaxtank.rig.schema import INPUTS, SECTIONS, TANKWISE
 from jaxtank.rig.values import (
     by_dotted_name,
+    by_rig_name,
     has,
     set_and_schedule,
     set_values,
@@ -109,7 +110,8 @@ def from_table(table: Mapping[str, Any]) -> Case:
     table = renamed(table)
     case = start_of(table)
     dotted = [key for key in ("values", "free", "uncertain") if key in table]
-    table = {**table, **{key: by_dotted_name(table[key], key) for key in dotted}}
+    names = {key: by_rig_name(case.loop, by_dotted_name(table[key], key)) for key in dotted}
+    table = {**table, **names}
     values = with_models(case.loop, table.get("values", {}))
     case, values = _with_bias(case, values, table)
     case = set_and_schedule(case, values, table.get("schedule", {}))
@@ -151,7 +153,10 @@ def _filter_settings(case, table):
 
 
 TUNING = {
-    "limits": ("limits", lambda case, table: validation.check_limits(case.loop, table)),
+    "limits": (
+        "limits",
+        lambda case, table: validation.check_limits(case.loop, table, case.limits),
+    ),
     "objective": ("objective", lambda case, table: validation.check_objective(table)),
     "free": ("free", lambda case, table: validation.free_of(case.loop, table)),
     "uncertain": ("uncertain", lambda case, table: validation.check_uncertain(case.loop, table)),
@@ -206,7 +211,7 @@ def start_of(table):
     if "reference" in table:
         changes["reference"] = signals.reference_of(table["reference"], loop.reference, loop.plant)
     if "disturbance" in table or "inflow" in table:
-        changes["disturbance"] = signals.disturbance_of(table, loop, network.names_in(table))
+        changes["disturbance"] = signals.disturbance_of(table, loop)
     if "fault" in table:
         changes["faults"] = signals.faults_of(table["fault"], loop.plant)
     top.pop("units", None)

@@ -7,6 +7,8 @@ import dataclasses
 import numpy as np
 
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import index_of
+from jaxtank.core.quantities import converted
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import number
 from jaxtank.plants.faults import faults
@@ -47,9 +49,26 @@ def _over(section, values, table):
 def ramps_of(section, table, old, words, sizes):
     """Return the Ramps of a table; what it leaves out is as in `old`. words: channel and value."""
     values = read_entry(section, _over(section, ramp_values(old), table), sizes)
-    changes = _changes(f"{section.name}.changes", values["changes"], words, np.size(old.initial))
+    label, of = f"{section.name}.changes", section["changes"].meta(sizes.units)["unit"]
+    changes = _named(label, values["changes"], words[0], sizes.plant, of)
+    changes = _changes(label, changes, words, np.size(old.initial))
     course = {name: values.get(name, getattr(old, name)) for name in COURSE}
     return ramps(values["initial"].tolist(), changes, **course)
+
+
+def _named(label, changes, kind, plant, unit):
+    """Changes with the numbers of outputs or pumps for their names, and of times and values with a
+    unit.
+    """
+    rows = []
+    for change in changes if isinstance(changes, list) else ():
+        if isinstance(change, list) and len(change) == 3 and str in map(type, change):
+            time, channel, value = change
+            if isinstance(channel, str):
+                channel = index_of(label, plant, kind, channel) + 1
+            change = [converted(label, time, "s"), channel, converted(label, value, unit)]
+        rows.append(change)
+    return rows if isinstance(changes, list) else changes
 
 
 def _changes(label, changes, words, channels):
@@ -107,9 +126,9 @@ def sine_values(sine):
     return {**values, "output": sine.channel + 1}
 
 
-def disturbance_of(table, loop, names):
+def disturbance_of(table, loop):
     """What [disturbance] and [[inflow]] of a rig file make of a loop's disturbance."""
-    disturbance, sizes = loop.disturbance, sizes_of(loop.plant, names)
+    disturbance, sizes = loop.disturbance, sizes_of(loop.plant)
     values = read_entry(SECTIONS["disturbance"], table.get("disturbance", {}), sizes)
     if "inflow" in values:
         if table.get("inflow"):

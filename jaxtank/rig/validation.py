@@ -3,6 +3,7 @@ uncertain, covariance, scenarios, columns of experiment data.
 """
 
 import math
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -13,6 +14,8 @@ from jaxtank.case import Case, Free, Scenario
 from jaxtank.core.checks import check_value
 from jaxtank.core.clock import CLOCK_UNITS
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
+from jaxtank.core.labels import index_of
+from jaxtank.core.quantities import NUMBER, converted
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import describe, get_value, split_index
 from jaxtank.loop import run
@@ -74,11 +77,12 @@ def unreachable(case: Case) -> str | None:
 
 def check_uncertain(loop: ClosedLoop, uncertain: Mapping[str, Any]) -> dict[str, float]:
     """Return {dotted name: spread as a share} after input validation."""
-    for name, share in uncertain.items():
+    shares = {name: converted(f"uncertain {name}", v, "-") for name, v in uncertain.items()}
+    for name, share in shares.items():
         get_value(loop, name)
         if not (is_finite(share, 0) and 0 < share < 1):
             raise refusal(f"uncertain {name}", share, "be a share between 0 and 1")
-    return {name: float(share) for name, share in uncertain.items()}
+    return {name: float(share) for name, share in shares.items()}
 
 
 def uncovered(
@@ -95,14 +99,28 @@ def uncovered(
     return {n: share for n in names if n not in covered}
 
 
-def check_limits(loop: ClosedLoop, limits: Mapping[str, Any]) -> dict[str, Any]:
-    """Return {measure: upper limit, one or one per entry} after input validation."""
+def check_limits(
+    loop: ClosedLoop, limits: Mapping[str, Any], usual: Mapping[str, Any] = {}
+) -> dict[str, Any]:
+    """Return {measure: limit, one or one per entry} after input validation.
+
+    A limit may be a text with a unit, of levels also in % of each rim, and {name or number from 1:
+    limit} of some tanks, pumps or outputs; the others keep the limit of `usual`, or have none.
+    """
     check_names(limits)
+    checked = {}
     for measure, value in limits.items():
+        if isinstance(value, dict):
+            value = _of_entries(loop, measure, value, usual.get(measure))
+        checked[measure] = value = _limit(loop, measure, f"limit {measure}", value)
         if isinstance(value, str) and value == "rim" and measure == "max_level":
             continue
         count, unit = entries(measure, loop.plant), measure_unit(measure, loop.units)
-        if not (is_finite(value) and np.shape(value) in ((), (count,))):
+        none = MEASURES[measure].sense * np.inf  # of a tank that has no limit
+        known = value
+        if is_numeric(value) and np.ndim(value) == 1 and np.any(np.asarray(value) != none):
+            known = np.where(np.asarray(value) == none, 0.0, value)
+        if not (is_finite(known) and np.shape(value) in ((), (count,))):
             many = f", or {count} of them" if count > 1 else ""
             rim = ', or "rim"' if measure == "max_level" else ""
             raise refusal(f"limit {measure}", value, f"be a finite number [{unit}]{many}{rim}")
@@ -114,18 +132,60 @@ def check_limits(loop: ClosedLoop, limits: Mapping[str, Any]) -> dict[str, Any]:
                     f"limit {measure} = {shortened(value)}{of}: must be at {words} {end:g}{of}; no"
                     " run has a value beyond"
                 )
-    return dict(limits)
+    return checked
+
+
+def _limit(loop, measure, label, value, rims=None):
+    """A limit with its texts converted: numbers with a unit, levels also in % of each rim."""
+    of = measure_unit(measure, loop.units)
+    texts = value if isinstance(value, list) else [value]
+    if not any(map(_is_share, texts)) or of == "%" or measure not in ("max_level", "min_level"):
+        return converted(label, value, of)
+    rims = np.asarray(loop.plant.rim).tolist() if rims is None else rims
+    texts = texts * len(rims) if len(texts) == 1 else texts
+    if len(texts) != len(rims):
+        raise refusal(label, value, f"be a limit, or {len(rims)} of them")
+    return [
+        converted(label, v, "-") * rim if _is_share(v) else converted(label, v, of)
+        for v, rim in zip(texts, rims)
+    ]
+
+
+def _is_share(value):
+    """Whether a value is a text such as "90 %"."""
+    return isinstance(value, str) and re.fullmatch(rf"{NUMBER.pattern}\s*%", value.strip())
+
+
+def _of_entries(loop, measure, table, usual):
+    """The limits of all entries of a measure, from {name or number from 1: limit} of some."""
+    kind, plant = MEASURES[measure].per, loop.plant
+    if kind == "run":
+        raise InputError(f"limit {measure}: has no entries: must be one number")
+    rims, none = np.asarray(plant.rim).tolist(), MEASURES[measure].sense * np.inf
+    usual = none if usual is None else rims if isinstance(usual, str) else usual
+    values = np.array(np.broadcast_to(usual, entries(measure, plant)), dtype=float)
+    for name, value in table.items():
+        i, label = index_of(f"limit {measure}", plant, kind, name), f"limit {measure}.{name}"
+        if value is not None:
+            rim = rims[i : i + 1] if kind == "tank" else rims
+            value = _limit(loop, measure, label, value, rim)
+            value = rim[0] if isinstance(value, str) and value == "rim" else value
+            if not is_finite(value) or np.size(value) != 1:
+                raise refusal(label, value, "be one finite number")
+        values[i] = none if value is None else np.ravel(value)[0]
+    return values.tolist()
 
 
 def check_objective(objective: Mapping[str, Any]) -> dict[str, float]:
     """Return {measure: weight} after input validation."""
     check_names(objective)
-    for measure, weight in objective.items():
+    weights = {m: converted(f"objective {m}", w, "-") for m, w in objective.items()}
+    for measure, weight in weights.items():
         if not (is_finite(weight, 0) and weight >= 0):
             raise refusal(f"objective {measure}", weight, "be a finite weight at or above 0")
-    if not any(objective.values()):
+    if not any(weights.values()):
         raise InputError("the objective has no measure with a weight above 0")
-    return {measure: float(weight) for measure, weight in objective.items()}
+    return {measure: float(weight) for measure, weight in weights.items()}
 
 
 def check_free(loop: ClosedLoop, name: str, low: Any, high: Any, scale: str = "log") -> Free:
@@ -156,6 +216,9 @@ def free_of(loop, table):
     """{name: Free} of a [free] table."""
     free = {}
     for name, spec in table.items():
+        if isinstance(spec, list):
+            of = describe(loop, scheduled_names(loop, name)[0])["unit"]
+            spec = [*converted(f"free {name}", spec[:2], of), *spec[2:]]
         good = isinstance(spec, list) and len(spec) in (2, 3)
         good = good and all(is_numeric(v) and np.ndim(v) == 0 for v in spec[:2])
         if not good or spec[2:] not in ([], ["log"], ["linear"]):

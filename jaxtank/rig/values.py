@@ -12,6 +12,8 @@ from jaxtank.controllers.gain_schedule import Scheduled, check_gains, check_knot
 from jaxtank.core.checks import check_value
 from jaxtank.core.clock import CLOCK_UNITS, check_clock
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
+from jaxtank.core.labels import index_of, names_of
+from jaxtank.core.quantities import NUMBER, converted
 from jaxtank.core.tree import (
     describe,
     get_value,
@@ -25,7 +27,16 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.steady import steady_state
 from jaxtank.loop.tank_bottom import can_withdraw
 from jaxtank.plants.tank_network import TankNetwork
-from jaxtank.rig.entry import is_numeric, plain, read_entry, refusal, sizes_of, static_value, unit
+from jaxtank.rig.entry import (
+    is_numeric,
+    is_plain,
+    plain,
+    read_entry,
+    refusal,
+    sizes_of,
+    static_value,
+    unit,
+)
 from jaxtank.rig.schema import SECTIONS
 
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
@@ -55,6 +66,57 @@ def by_dotted_name(table, where):
     return values
 
 
+def dotted_name(loop: ClosedLoop, name: str) -> str:
+    """Return the name of a parameter that is given by the rig's own: "x0[0]" for "LT101.level"
+    (a key of its table in a rig file), "plant.drain[1]" for "plant.drain[LT102]".
+    """
+    plant: Any = loop.plant
+    if not plant.names:
+        return name
+    base, bracket, inner = name.partition("[")
+    if bracket and inner.endswith("]") and not re.fullmatch(r"[\d,]*", inner[:-1]):
+        axes = describe(loop, base).get("shape", ())
+        entries = [
+            entry if entry.isdigit() else _index_of(name, plant, axis, entry)
+            for entry, axis in zip(inner[:-1].split(","), axes)
+            if axis in ("tank", "pump", "output")
+        ]
+        return f"{base}[{','.join(map(str, entries))}]" if len(entries) == len(axes) else name
+    part, _, key = name.rpartition(".")
+    for kind, names in plant.names:
+        if part and part in names:
+            section, i = SECTIONS[kind], names.index(part)
+            if key not in section.names:
+                raise unknown(f"key of {kind} {part}", key, section.names)
+            target = section[key].target
+            if not target or section[key].kind != "number":
+                raise InputError(f"{name} is the topology of the rig and cannot be set")
+            # limits of valves come after those of the pumps
+            i += len(plant.feeds) if kind == "valve" and target.startswith("actuator.") else 0
+            return f"{target}[{i}]"
+    return name
+
+
+def _index_of(name, plant, axis, entry):
+    """Index of a named entry; a gain of an output is also called by the pump that moves it."""
+    paired = axis == "output" and plant.pumps == len(plant.outputs)
+    axis = "pump" if paired and entry not in names_of(plant, axis) else axis
+    return index_of(name, plant, axis, entry)
+
+
+def by_rig_name(loop: ClosedLoop, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return {`dotted_name`: value}, numbers with a unit of what has another name converted."""
+    renamed = {}
+    for name, value in values.items():
+        dotted = dotted_name(loop, name)
+        if dotted in renamed:
+            raise InputError(f"{name} is given twice, as {dotted} too: give it once")
+        if name != dotted and not (isinstance(value, str) and _RELATIVE.fullmatch(value.strip())):
+            value = converted(name, value, describe(loop, dotted)["unit"])
+        renamed[dotted] = value
+    return renamed
+
+
 def set_values(case: Case, values: Mapping[str, Any]) -> Case:
     """Return a copy of `case` with leaves, static fields and clock fields set by dotted name.
 
@@ -79,6 +141,7 @@ def set_values(case: Case, values: Mapping[str, Any]) -> Case:
     >>> case.clock.duration, case.loop.x0[1].item()
     (400.0, 3.0)
     """
+    values = by_rig_name(case.loop, values)
     clock = {name: value for name, value in values.items() if name.startswith("clock.")}
     if clock:
         case = case.replace(clock=_set_clock(case.clock, clock))
@@ -87,10 +150,13 @@ def set_values(case: Case, values: Mapping[str, Any]) -> Case:
             continue
         meta = describe(case.loop, name)
         if meta["kind"] == "static":
+            if is_plain(_static_of(case.loop, name)):
+                value = converted(name, value, meta["unit"])
             if "[" in name:
                 raise InputError(f"{name}: {name.split('[')[0]} has no entries, set it whole")
             case = case.replace(loop=_set_static(case.loop, name, name.split("."), value, meta))
             continue
+        value = converted(name, value, meta["unit"])
         if not is_numeric(value):
             raise refusal(name, value, f"be a number or a list of numbers{unit(meta)}")
         check_not_scheduled(case.loop, name)
@@ -139,6 +205,7 @@ def set_scenario(case: Case, values: Mapping[str, Any]) -> Case:
     >>> rig.set_scenario(case, {"plant.split[0]": "x0.5"}).loop.plant.split.tolist()
     [0.21, 0.34]
     """
+    values = by_rig_name(case.loop, values)
     numbers = {name: _absolute(case, name, value) for name, value in values.items()}
     steady = [name for name in numbers if _is_steady(name, numbers[name])]
     if steady:
@@ -191,6 +258,8 @@ def _absolute(case, name, value):
     if current is None or _is_steady(name, value):
         return value
     match = _RELATIVE.fullmatch(value.strip())
+    if match is None and NUMBER.match(value.strip()):
+        return converted(name, value, _meta(case, name)["unit"])
     if match is None:
         more = ', or "steady"' if name in STEADY else ""
         numbers = f"a number or a list of numbers{unit(_meta(case, name))}"
@@ -211,8 +280,13 @@ def _number_of(case, name):
     elif _meta(case, name)["kind"] == "leaf":
         return get_value(case.loop, name)
     else:
-        value = next(v for n, v, _ in walk(case.loop, kind="static") if n == name.split("[")[0])
+        value = _static_of(case.loop, name)
     return value if is_numeric(value) and np.ndim(value) == 0 else None
+
+
+def _static_of(loop, name):
+    """The value of a static field."""
+    return next(v for n, v, _ in walk(loop, kind="static") if n == name.split("[")[0])
 
 
 def _meta(case, name):
@@ -267,7 +341,7 @@ def _set_clock(clock, values):
         if field not in CLOCK_UNITS:
             raise unknown("parameter", name, [f"clock.{f}" for f in CLOCK_UNITS])
         if field in ("dt", "duration"):
-            value = plain(name, value)
+            value = plain(name, converted(name, value, CLOCK_UNITS[field]))
         elif field == "substeps" and isinstance(value, float) and value.is_integer():
             value = int(value)
         fields[field] = value

@@ -13,6 +13,7 @@ from jaxtank.case import Case, Free
 from jaxtank.core.clock import CLOCK
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import write_atomic
+from jaxtank.core.labels import names_of
 from jaxtank.core.tree import is_component, walk
 from jaxtank.measures import unreadable
 from jaxtank.rig import components, network, signals, template
@@ -148,16 +149,17 @@ def _reachable(case, base):
 def _building(case, loop, origin, same):
     """The Blocks that build a case before any value is set."""
     start, units = (None if origin is None else origin.loop), case.loop.units
+    names = names_of(loop.plant, "tank")
     if origin is None:
         top = {"name": case.name, "units": units}
-        entries = network.entries_of(loop, case.names)
-        blocks = [_of_rig(section, i, values, units) for section, i, values in entries]
+        entries = network.entries_of(loop)
+        blocks = [_of_rig(section, i, values, units, names) for section, i, values in entries]
     else:
         top, blocks = {"case": origin.name, "name": case.name}, []
     for name in components.ROLES:
         part = getattr(loop, name)
         if name not in same and components.has_section(name, part):
-            blocks.append(block_of(*components.values_of(name, part), units))
+            blocks.append(block_of(*components.values_of(name, part), units, names))
     blocks += _reference(loop, start)
     disturbing = signals.disturbance_tables(loop.disturbance)
     if disturbing is None:
@@ -171,14 +173,18 @@ def _building(case, loop, origin, same):
         if getattr(loop, field) is None and getattr(start, field, None) is not None
     ]
     first = Block("", [*lines_of(SECTIONS[""], top, units), *emptied])
-    return [first, *blocks, *(block_of(section, values, units) for section, values in tables)]
+    return [
+        first,
+        *blocks,
+        *(block_of(section, values, units, names) for section, values in tables),
+    ]
 
 
-def _of_rig(section, number, values, units):
+def _of_rig(section, number, values, units, names):
     """The Block of a table of a rig; one without a name has a suggestion of one, and the first of
     a list what it could have beside.
     """
-    block = block_of(section, values, units)
+    block = block_of(section, values, units, names)
     if values.get("name") == "":
         block.lines[0] = block.lines[0]._replace(value=f"{section.name} {number}", on=False)
     if number > 1 or not section.many:

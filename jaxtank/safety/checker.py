@@ -30,7 +30,7 @@ ROUNDING = 1e-9
 FLOWS = ("area", "drain", "orifice", "pipe", "pump_gain", "split", "gravity")
 SHAPE = ("links", "pipes", "feeds", "spills", "overflow", "bottom", "knee")
 KNOWN = {
-    "plant": {*FLOWS, *SHAPE, "rim", "caught", "outputs", "units"},
+    "plant": {*FLOWS, *SHAPE, "rim", "caught", "outputs", "units", "names"},
     "actuator": {"low", "high", "dead_zone", "stop", "pulse", "lag", "initial", "delay"}
     | {"saturation", "dead_zone_kind"},
     "sensor": {"gain", "noise", "offset", "full_scale", "bits"},

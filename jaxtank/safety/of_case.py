@@ -91,7 +91,7 @@ def design_for(
         rate=rate,
         substeps=case.clock.substeps,
         start=loop.x0,
-        low=case.limits.get("min_level", 0.0) if low is None else low,
+        low=np.maximum(case.limits.get("min_level", 0.0), 0.0) if low is None else low,
         draw=draw * more,
         draws=draws,
         predict=predict,

@@ -43,7 +43,7 @@ CASE = (
     Option("--schedule", "NAME=VARIABLE:K1,K2,...", "a gain that follows a setpoint (r1, ..) or a"
            " level (h1, ..), linear between knots; the same variable and knots for all gains",
            values.pair(values.knots), kind="pairs"),
-    Option("--dt", "S", "sampling period [s], short for --set clock.dt=S", values.number),
+    Option("--dt", "S", "sampling period [s], short for --set clock.dt=S", values.seconds("--dt")),
     Option("--safety-filter", help="caps on the pumps under which no level passes its limit on any"
            " plant that the case calls uncertain (see jaxtank show); tune: automatic where a level"
            " comes near its limit; --no-safety-filter: none", kind="switch"),

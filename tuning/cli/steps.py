@@ -27,8 +27,13 @@ def open_case(args):
     from jaxtank import rig
     from jaxtank.loop import step_size, tank_bottom
 
-    values = settings(args)
     opened = rig.open_case(args.case)
+    args.values = rig.by_rig_name(opened.loop, args.values)
+    for option in ("free", "vary"):
+        if pairs := getattr(args, option, None):
+            named = {rig.dotted_name(opened.loop, name): value for name, value in pairs.items()}
+            setattr(args, option, named)
+    values = settings(args)
     known = [] if args.quiet else rig.case_warnings(opened)
     for sentence in known if args.case.endswith(".toml") else ():
         print(f"jaxtank: {printable(args.case)}: note: {sentence}", file=sys.stderr)
@@ -102,9 +107,20 @@ def _schedule(gains):
 
 
 def limits_of(args, case):
-    """Return the limits of a case as --limit changes them."""
-    limits = ({} if "none" in args.limit else dict(case.limits)) | args.limit
-    return {measure: limit for measure, limit in limits.items() if limit is not None}
+    """Return the limits of a case as --limit changes them, numbers in its units."""
+    from jaxtank import rig
+
+    limits = {} if "none" in args.limit else dict(case.limits)
+    limits |= {name: limit for name, limit in args.limit.items() if "." not in name}
+    limits = rig.check_limits(
+        case.loop, {m: limit for m, limit in limits.items() if limit is not None}
+    )
+    entries = {}
+    for name, limit in args.limit.items():
+        measure, dot, entry = name.partition(".")
+        if dot:
+            entries.setdefault(measure, {})[entry] = limit
+    return limits | rig.check_limits(case.loop, entries, limits)
 
 
 def scenarios_of(args):

@@ -27,22 +27,36 @@ def plain_number(text):
         raise ValueError("must be a number") from None
 
 
+def seconds(name):
+    """Return what reads a time [s], also with another unit of time: "5 min"."""
+
+    def read(text):
+        try:
+            return number(text)
+        except ValueError:
+            from jaxtank.core.quantities import quantity
+
+            return quantity(name, text, "s")
+
+    return read
+
+
 def number(text):
     """Return a float."""
     return float(plain_number(text))
 
 
-def above(low, high=float("inf"), including=False):
+def above(low, high=float("inf"), including=False, read=None):
     """Return what reads a number above `low`, or from `low` on, and up to `high`."""
 
-    def read(text):
-        value = number(text)
+    def read_above(text):
+        value = (read or number)(text)
         if not (low <= value if including else low < value) or not value <= high:
             upper = f" and at most {high:g}" if high < float("inf") else ""
             raise ValueError(f"must be {'at least' if including else 'above'} {low:g}{upper}")
         return value
 
-    return read
+    return read_above
 
 
 def share(text):
@@ -78,7 +92,8 @@ def value(text):
     try:
         numbers = [plain_number(part) for part in parts if part]
     except ValueError:
-        return text
+        # a list with units is converted where the unit of the value is known
+        return [_number_or_text(part) for part in parts] if bracketed else text
     if len(numbers) < len(parts):
         raise ValueError("an entry of the list is empty: leave out the comma, or give its number")
     if comma := DECIMAL_COMMA.fullmatch(text):
@@ -97,6 +112,13 @@ def value(text):
     if bracketed or len(numbers) > 1:
         return numbers
     return numbers[0] if numbers else text
+
+
+def _number_or_text(part):
+    try:
+        return plain_number(part)
+    except ValueError:
+        return part
 
 
 def pair(read=value, form="NAME=VALUE"):
@@ -131,8 +153,12 @@ def limit(text):
     """Return (measure, limit) of MEASURE=VALUE; ("none", None) of "none"."""
     if text == "none":
         return "none", None
-    measure, bound = pair()(text)
-    return checked_measure(measure), None if bound == "none" else bound
+    name, bound = pair(form="MEASURE=VALUE or MEASURE.NAME=VALUE")(text)
+    measure, dot, entry = name.partition(".")
+    if not dot and (brackets := re.fullmatch(r"(\w+)\[(.*\D.*)\]", name)):  # max_level[LT101]
+        measure, entry = brackets.groups()
+    name = f"{checked_measure(measure)}.{entry}" if entry else checked_measure(measure)
+    return name, None if bound == "none" else bound
 
 
 def checked_measure(name):

@@ -12,8 +12,9 @@ import numpy as np
 
 from jaxtank.core.errors import DataError, InputError, nearest
 from jaxtank.core.files import refusal
+from jaxtank.core.quantities import INPUT_UNITS, LEVEL_UNITS, TIMES, VOLTS, factor
 from jaxtank.core.text import printable
-from jaxtank.core.units import INPUTS, LEVELS, TIMES, VOLTS, canonical
+from jaxtank.core.units import canonical
 from jaxtank.loop.closed_loop import ClosedLoop
 from tuning.identification.experiment import Log, check_hold, log
 
@@ -21,7 +22,7 @@ LARGEST = 512 * 1024 * 1024  # bytes
 MOST_ROWS = 20_000_000
 LONGEST_CELL = 200  # characters
 MISSING = {"", "nan", "na", "null", "-"}
-KNOWN = {unit for table in (TIMES, *LEVELS, *INPUTS) for unit in table}
+KNOWN = {*TIMES, *LEVEL_UNITS, *INPUT_UNITS}
 WORDS = {
     **dict.fromkeys(("t", "time", "zeit"), "t"),
     **dict.fromkeys(("pump", "u", "voltage", "input"), "pump"),
@@ -319,11 +320,12 @@ def _factor(kind, slot, unit, units, where):
     name, base = canonical(unit), canonical(base)
     if kind == "h" and name in VOLTS and length not in VOLTS:
         return VOLTS[name], True
-    choices = {"t": (TIMES,), "pump": INPUTS, "h": LEVELS}[kind]
-    table = next((t for t in choices if base in t), {base: 1.0})
-    if name not in table:
+    size = factor(name, base)
+    if size is None:
+        usual = {"t": tuple(TIMES), "pump": INPUT_UNITS, "h": LEVEL_UNITS}[kind]
+        names = [other for other in usual if factor(other, base)] or [base]
         raise DataError(
             f"{where}: unit {unit!r} cannot be that of a {KINDS[kind]}: must be one of"
-            f" {', '.join(table)}"
+            f" {', '.join(names)}"
         )
-    return table[name] / table[base], False
+    return size, False

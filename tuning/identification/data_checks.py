@@ -7,7 +7,8 @@ import jax
 import numpy as np
 
 from jaxtank.core.errors import DataError, InputError
-from jaxtank.core.units import FLOWS, LENGTHS, VOLTS, canonical
+from jaxtank.core.quantities import FLOW_UNITS, LENGTHS, VOLTS, factor
+from jaxtank.core.units import canonical
 from tuning.identification.experiment import Log
 from tuning.identification.simulation import changes_of
 
@@ -116,7 +117,7 @@ def _out_of_range(log, loop, gap):
 
 def _faint_inputs(log, loop, gap):
     drive = loop.units[1]
-    if canonical(drive) not in {**VOLTS, **FLOWS}:  # limits in other units are often nominal
+    if canonical(drive) not in (*VOLTS, *FLOW_UNITS):  # limits in other units are often nominal
         return
     for j, (u, _, top) in enumerate(_pumps(log, loop)):
         most = np.max(np.abs(u))
@@ -158,15 +159,16 @@ def _pumps(log, loop):
 def _other_units(log, column, values, unit, ends):
     """Return a hint: the units in which values, held in `unit`, would lie within `ends`."""
     unit = canonical(unit)
-    table = next((t for t in (LENGTHS, VOLTS, FLOWS) if unit in t), {unit: 1.0})
     header = unit if log.units is None else canonical(log.units[column])
-    cells, slot = values * (table[unit] / table.get(header, table[unit])), log.slot(column)
+    cells, slot = values / (factor(header, unit) or 1.0), log.slot(column)
+    sizes = {name: factor(name, unit) for name in (*LENGTHS, *VOLTS, *dict.fromkeys(FLOW_UNITS))}
     fits = [
         f"'{slot} [{name}]'"
-        for name, size in table.items()
-        if name != header
-        and np.nanmin(cells) * size >= ends[0] * table[unit]
-        and np.nanmax(cells) * size <= ends[1] * table[unit]
+        for name, size in sizes.items()
+        if size
+        and name != header
+        and np.nanmin(cells) * size >= ends[0]
+        and np.nanmax(cells) * size <= ends[1]
     ]
     return f" Write it in the header, as {' or '.join(fits[:2])}" if fits else ""
 

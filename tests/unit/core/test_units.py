@@ -104,9 +104,10 @@ def test_a_flow_in_any_spelling_is_the_same_flow(tmp_path, spellings, size):
         case = rig.loads(PUMPED.format(f'"m", "{spelling}"', size))
         assert rig.loads(rig.dump(case)).loop.units == case.loop.units
         assert flow_per_input(case.loop.units) == pytest.approx(size, rel=1e-12)
-        if size < 1:
-            with pytest.raises(InputError, match=r"pump 1: gain = 1 m\^3/s per .* must be"):
-                rig.loads(PUMPED.format(f'"m", "{spelling}"', 1.0))
+        for share in (1.0, 0.9, "'90 %'"):  # of the flow that the input asks for
+            case = rig.loads(PUMPED.format(f'"m", "{spelling}"', share))
+            gain = size * (share if isinstance(share, float) else 0.9)
+            assert case.loop.plant.pump_gain[0] == pytest.approx(gain, rel=1e-12)
         (tmp_path / "log.csv").write_text(f"t [s],pump1 [{spelling}],h1 [m]\n0,3,0.4\n1,6,0.4\n")
         read = read_log(tmp_path / "log.csv", other)
         assert read.u[1, 0] == pytest.approx(6 * size / 1e-3, rel=1e-12)
@@ -129,10 +130,19 @@ def test_a_unit_that_is_unknown_or_of_another_dimension_is_refused(tmp_path, cap
     assert why in err and not out and err.count("\n") == 1
 
 
-def test_a_gain_that_pumps_3600_times_too_much_is_refused(tmp_path, capsys):
-    (tmp_path / "rig.toml").write_text(PUMPED.format('"m", "m^3/h"', 1.0))
+def test_a_gain_that_is_neither_a_share_nor_the_flow_is_refused(tmp_path, capsys):
+    (tmp_path / "rig.toml").write_text(PUMPED.format('"m", "m^3/h"', 0.01))
     assert main.main(["simulate", str(tmp_path / "rig.toml")]) == 2
-    assert "must be 0.000277778 times the share that the pump delivers" in capsys.readouterr().err
+    assert "must be the share of it that the pump delivers" in capsys.readouterr().err
+
+
+def test_a_pump_whose_input_is_a_flow_needs_no_gain():
+    text = PUMPED.format('"m", "m3/h"', 1.0).replace("gain = 1.0\n", "")
+    case = rig.loads(text)
+    assert case.loop.plant.pump_gain[0] == pytest.approx(1 / 3600, rel=1e-15)
+    assert rig.loads(rig.dump(case)).loop.plant.pump_gain[0] == case.loop.plant.pump_gain[0]
+    with pytest.raises(InputError, match="pump 1 needs gain"):
+        rig.loads(text.replace("m3/h", "%"))
 
 
 FLOW_RIG = PUMPED.format('"m", "m^3/h"', 1 / 3600).replace("100.0\n[plant]", "5.0\n[plant]") + (

@@ -185,7 +185,7 @@ WRONG = [
     ({"plant": {"outputs": [1]}}, "split-range"),
     ({"plant": {"outputs": [1, 9]}}, "from 1 to 4"),
     ({"plant": {"overflow": 1}}, "true or false"),
-    ({"units": ["yd", "V"]}, "'yd' is unknown"),
+    ({"units": ["yd", "V"]}, "'yd' is no unit of a level"),
     ({"units": ["cm", "V\x1b[31m\n"]}, "units: entry = .*: must be a text of printable characters"),
     ({"case": "gouta2015/ngpc"}, "leave out case"),
     ({"observer": {"kind": "luenberger"}}, "unknown observer kind"),

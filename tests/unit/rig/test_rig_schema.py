@@ -35,26 +35,26 @@ drain = 0.3
 level = 4.0
 noise = 0.02
 [[orifice]]
-from = 1
-to = 2
+from = "left"
+to = "right"
 area = 0.1
 [[pipe]]
-between = [1, 2]
+between = ["left", "right"]
 area = 0.15
 [[spill]]
-from = 1
-to = 2
+from = "left"
+to = "right"
 caught = 0.5
 [[pump]]
 name = "P-101"
 gain = 5.0
-to = [1, 2]
+to = ["left", "right"]
 split = 0.4
 low = 0.5
 high = 12.0
 initial = 2.0
 [plant]
-outputs = [2]
+outputs = ["right"]
 gravity = 98.0
 overflow = true
 bottom = true
@@ -68,7 +68,7 @@ kind = "extended-kalman"
 process = [0.1, 0.1]
 measurement = [0.2, 0.2]
 spread = [0.3, 0.3]
-measured = [2]
+measured = ["right"]
 [reference]
 initial = [4.5]
 changes = [[20.0, 1, 5.0]]
@@ -89,7 +89,7 @@ window = 50.0
 [[inflow]]
 time = 100.0
 duration = 2.0
-tank = 2
+tank = "right"
 volume = 10.0
 [[fault]]
 of = "drain[0]"
@@ -185,7 +185,7 @@ high = 1.0
 initial = 0.1
 [[valve]]
 name = "FV1"
-from = 2
+from = "LT2"
 area = 0.004
 characteristic = "equal-percentage"
 rangeability = 30.0

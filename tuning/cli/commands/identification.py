@@ -233,7 +233,7 @@ PLAN = (
     Option("--plan", help="no data: compare experiments by the standard deviations they would"
            " leave", kind="flag"),
     Option("--duration", "S", f"of a planned experiment [s] (default {PLANNED:g})",
-           values.above(0, LONGEST)),
+           values.above(0, LONGEST, read=values.seconds("--duration"))),
     Option("--voltage", "V1,V2", "inputs about which a planned experiment works (default: the"
            " case's own)", values.entries(values.number)),
     Option("--measure", "H1,H2", "tanks measured in a planned experiment (default all)",

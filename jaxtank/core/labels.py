@@ -1,0 +1,92 @@
+"""Names of tanks, pumps and valves, which a person reads and writes in place of their numbers.
+
+A plant has them in `names`; without them a label is "tank 1", counted from 1.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from jaxtank.core.errors import unknown
+
+
+def names_of(plant: Any, kind: str) -> tuple[str, ...]:
+    """Return the names of all of a kind, "" for none: of "tank", "pump" (the inputs: pumps, then
+    valves), "output" (the tanks whose levels are controlled), "valve".
+    """
+    named: Mapping[str, tuple[str, ...]] = dict(getattr(plant, "names", ()))
+    if not named:
+        return ()
+    if kind == "pump":
+        feeds = len(getattr(plant, "feeds", ()))
+        pumps, valves = named.get("pump", ()), named.get("valve", ())
+        names = (*pumps, *("",) * (feeds - len(pumps)), *valves)
+        return (*names, *("",) * (plant.pumps - len(names)))
+    tanks = named.get("tank", ())
+    if kind == "output":
+        return tuple(tanks[i] for i in plant.outputs) if tanks else ()
+    return named.get(kind, ())
+
+
+def name_of(plant: Any, kind: str, index: int) -> str:
+    """Return the name of entry `index` (from 0) of a kind, "" where it has none."""
+    names = names_of(plant, kind)
+    return names[index] if names else ""
+
+
+def label(plant: Any, kind: str, index: int) -> str:
+    """Return what a person reads for entry `index` (from 0) of a kind: its name, or "tank 1"."""
+    return name_of(plant, kind, index) or _numbered(plant, kind, index)
+
+
+def _numbered(plant: Any, kind: str, index: int) -> str:
+    pumps = plant.pumps - len(getattr(plant, "valves", ())) if kind == "pump" else index + 1
+    return f"{kind} {index + 1}" if index < pumps else f"valve {index - pumps + 1}"
+
+
+def labels(plant: Any, kind: str, indices: Iterable[int]) -> str:
+    """Return the labels of several entries: "LT101, LT103", "tank 3", "tanks 1, 3" or
+    "tanks 1 to 4".
+    """
+    indices = list(indices)
+    valves = kind == "pump" and len(getattr(plant, "valves", ())) > 0
+    if valves or any(name_of(plant, kind, i) for i in indices):
+        return ", ".join(label(plant, kind, i) for i in indices)
+    return numbered(kind, [i + 1 for i in indices])
+
+
+def numbered(word: str, numbers: list[int]) -> str:
+    """Return "tank 3", "tanks 1, 3" or "tanks 1 to 4"."""
+    if len(numbers) == 1:
+        return f"{word} {numbers[0]}"
+    if len(numbers) > 2 and numbers[-1] - numbers[0] == len(numbers) - 1:
+        return f"{word}s {numbers[0]} to {numbers[-1]}"
+    return f"{word}s {', '.join(map(str, numbers))}"
+
+
+def symbol(plant: Any, letter: str, kind: str, index: int) -> str:
+    """Return the variable of an entry, as of a column: "h1", or "h_LT101" where it has a name."""
+    name = name_of(plant, kind, index)
+    return f"{letter}_{name}" if name else f"{letter}{index + 1}"
+
+
+def short(plant: Any, kind: str, index: int) -> Any:
+    """Return the name of an entry, or its number from 1: what a column headed "tank" shows."""
+    return name_of(plant, kind, index) or index + 1
+
+
+def index_of(where: str, plant: Any, kind: str, text: Any) -> int:
+    """Return the index (from 0) of what a person calls by its name or its number from 1."""
+    names, count = names_of(plant, kind), _count(plant, kind)
+    if text in names and text:
+        return names.index(text)
+    number = int(text) if str(text).isascii() and str(text).isdigit() else 0
+    if not 1 <= number <= count:
+        known = [name or str(i + 1) for i, name in enumerate(names or [""] * min(count, 100))]
+        raise unknown(f"{kind} of {where}", str(text), known)
+    return number - 1
+
+
+def _count(plant: Any, kind: str) -> int:
+    counts = {"tank": "tanks", "pump": "pumps", "output": "outputs", "valve": "valves"}
+    value = getattr(plant, counts[kind])
+    return value if isinstance(value, int) else len(value)
