@@ -15,6 +15,7 @@ import numpy as np
 from jaxtank.core.clock import Chunk, Clock, indices, pointwise, sample_times
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf, number, static
+from jaxtank.core.vectors import columns
 from jaxtank.signals.base import Signal
 from jaxtank.xla.barrier import materialised
 
@@ -63,7 +64,7 @@ def channel(clock, initial, changes, duration, shape, lag=None):
 def _many(clock, initial, changes, duration, shape, lag):
     """`channel` of many changes: what is reached before each by a scan, then one lookup."""
     starts, targets = changes
-    first = index(starts, clock)
+    first: Any = index(starts, clock)
 
     def look_up(begin, course):
         def follow(before, change):
@@ -251,12 +252,12 @@ class Ramps(Signal):
     @pointwise
     def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
         self._check_filter()
-        columns = []
+        courses = []
         for i in range(self.channels):
             lag = None if self.filter is None else self.filter[i]
             changes = self._changes_of(i)
-            columns.append(channel(clock, self.initial[i], changes, self.ramp, self.shape, lag))
-        value, rate, second = zip(*columns)
+            courses.append(channel(clock, self.initial[i], changes, self.ramp, self.shape, lag))
+        value, rate, second = zip(*courses)
         return value, rate, second
 
     @pointwise
@@ -309,7 +310,8 @@ class Ramps(Signal):
         """Return `sample` as three arrays (samples, channels)."""
         self._check_filter()
         if self._many():
-            return tuple(jnp.stack(column, axis=1) for column in self.sample(clock))
+            value, rate, second = self.sample(clock)
+            return columns(value), columns(rate), columns(second)
 
         def course(which, initial, changes):
             if not changes:
@@ -323,7 +325,8 @@ class Ramps(Signal):
     def window_arrays(self, clock: Clock) -> tuple[Any, Any, Any, Any]:
         """Return `windows` as four arrays (samples, channels)."""
         if self._many():
-            return tuple(jnp.stack(column, axis=1) for column in zip(*self.windows(clock)))
+            target, step, since, band = zip(*self.windows(clock))
+            return columns(target), columns(step), columns(since), columns(band)
         t = sample_times(clock)[:, None]
         return self._by_count(clock, lambda which, *own: self._window(clock, t, *own))
 
@@ -346,8 +349,8 @@ class Ramps(Signal):
                 (np.array([self.changes[j][0] for j in column]), targets[column])
                 for column in places.T
             ]
-            columns = course(which, initial[which], changes)
-            parts.append(tuple(jnp.broadcast_to(v, (clock.samples, len(which))) for v in columns))
+            values = course(which, initial[which], changes)
+            parts.append(tuple(jnp.broadcast_to(v, (clock.samples, len(which))) for v in values))
             order += list(which)
         back = np.argsort(order)
         return tuple(jnp.concatenate(part, axis=1)[:, back] for part in zip(*parts))

@@ -11,6 +11,7 @@ from jaxtank import presets, rig
 from jaxtank.core.clock import Chunk, Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
+from jaxtank.signals import setpoints
 from jaxtank.signals.setpoints import ramps
 
 CLOCK = Clock(dt=0.1, duration=60.0)
@@ -119,3 +120,19 @@ def test_a_filter_is_for_ramps():
     curves = ramps([3.0], [(20.0, 0, 8.0)], shape="quintic", filter=[1.0])
     with pytest.raises(InputError, match=r"reference\.filter.*'quintic'"):
         curves.sample(CLOCK)
+
+
+@pytest.mark.parametrize(
+    "course", [{"ramp": 0.0}, {"ramp": 9.3}, {"ramp": 5.0, "shape": "quintic"}, {"filter": [3.0]}]
+)
+def test_many_changes_give_what_as_many_pieces_give(course, monkeypatch):
+    rng = np.random.default_rng(0)
+    times = np.sort(rng.choice(np.arange(1, 4000), 150, replace=False)) * 0.25
+    changes = [(float(t), 0, float(v)) for t, v in zip(times, rng.uniform(1.0, 3.0, 150))]
+    reference = ramps([2.0], changes, **{"ramp": 4.0, **course})
+    clock = Clock(dt=0.5, duration=900.0)
+    looked_up = reference.sample(clock), reference.windows(clock)
+    monkeypatch.setattr(setpoints, "MANY", 1000)
+    pieces = reference.sample(clock), reference.windows(clock)
+    for values, expected in zip(jax.tree.leaves(looked_up), jax.tree.leaves(pieces)):
+        np.testing.assert_allclose(values, expected, rtol=1e-13, atol=1e-13)

@@ -1,0 +1,117 @@
+"""Shapes of tanks and flows through valves, curves and ports, beside geometry and SciPy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import random_elements
+from scipy.integrate import quad
+from scipy.interpolate import PchipInterpolator
+
+from jaxtank.core.curves import monotone_curve
+from jaxtank.plants import network
+from jaxtank.plants.runge_kutta import advance
+from jaxtank.plants.vessels import area_of, level_of, volume_of
+
+TABLE = ((0.0, 0.5), (0.25, 1.0), (0.5, 0.75), (1.0, 0.25))
+SIZES = {
+    "prism": (2.0, 3.0),
+    "cone": (3.0, 2.0),
+    "sphere": (2.5, 2.0),
+    "horizontal-cylinder": (8.0, 2.0),
+    TABLE: (2.0, 2.0),
+}
+vessels = pytest.mark.parametrize(
+    "shape", SIZES, ids=lambda s: s if isinstance(s, str) else "table"
+)
+
+
+@vessels
+def test_volume_is_the_geometry_and_level_its_inverse(shape):
+    area, extent = SIZES[shape]
+    inside = np.linspace(0.01, 0.99, 40) * extent
+    volumes = [random_elements.volume(shape, area, extent, h) for h in inside]
+    volume = lambda h: volume_of(shape, area, extent, h)
+    np.testing.assert_allclose(jax.vmap(volume)(inside), volumes, rtol=1e-13)
+    levels = np.concatenate([[-0.1, 0.0, 1e-9, 1e-6], inside, [extent, 1.2 * extent]])
+    back = jax.vmap(lambda v: level_of(shape, area, extent, v))(jax.vmap(volume)(levels))
+    np.testing.assert_allclose(back, levels, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(jax.vmap(volume)(back), jax.vmap(volume)(levels), atol=1e-14)
+    low, high = 0.05 * extent, 0.2 * extent  # at the tip itself the cross-section has a lower bound
+    exact = quad(lambda h: float(area_of(shape, area, extent, h)), low, high)[0]
+    assert float(volume(high) - volume(low)) == pytest.approx(exact, rel=1e-9)
+
+
+@vessels
+@pytest.mark.parametrize("function", [volume_of, level_of])
+def test_slopes_by_size_and_level_are_differences(shape, function):
+    at = np.array([*SIZES[shape], 0.3 * SIZES[shape][1]])
+    if function is level_of:
+        at[2] = volume_of(shape, *at)
+    value = lambda v: function(shape, v[0], v[1], v[2])
+    steps = 1e-6 * np.eye(3)
+    differences = [(value(at + step) - value(at - step)) / 2e-6 for step in steps]
+    np.testing.assert_allclose(jax.grad(value)(jnp.array(at)), differences, rtol=1e-7, atol=1e-8)
+
+
+def test_a_curve_is_scipys_monotone_cubic_inside_and_straight_beyond():
+    points = ((0.0, 0.0), (20.0, 1.0), (50.0, 7.0), (80.0, 8.0), (100.0, 8.5))
+    middle = np.linspace(20.0, 80.0, 61)
+    curve = jax.vmap(lambda u: monotone_curve(points, u))
+    np.testing.assert_allclose(curve(middle), PchipInterpolator(*zip(*points))(middle), rtol=1e-13)
+    np.testing.assert_allclose(curve(np.array([-10.0, 110.0])), [-0.5, 8.75])
+    slope = jax.vmap(jax.grad(lambda u: monotone_curve(points, u)))
+    knots = np.array([x for x, _ in points])
+    np.testing.assert_allclose(slope(knots - 1e-7), slope(knots + 1e-7), rtol=1e-5)
+    assert np.all(np.diff(curve(np.linspace(-5.0, 105.0, 400))) > 0)
+
+
+@pytest.mark.parametrize(
+    "seed", [2, *(pytest.param(s, marks=pytest.mark.slow) for s in range(20, 50))]
+)
+def test_a_random_rig_follows_an_integrator_of_the_tests(seed):
+    assert random_elements.errors(seed) < 1e-8
+
+
+@pytest.mark.parametrize("shape", ["cone", "sphere"])
+def test_volume_is_kept_while_a_tank_of_changing_section_drains_into_another(shape):
+    plant = network(
+        area=[1.0, 2.0],
+        drain=0.0,
+        links=[(0, 1)],
+        orifice=0.02,
+        pump_gain=1.0,
+        feeds=[(0, None)],
+        sources=[1],
+        rim=3.0,
+        shapes=[shape, "prism"],
+        extent=2.0,
+        units=("m", "m^3/s"),
+        bottom=True,
+    )
+
+    @jax.jit
+    def run(x):
+        step = lambda _, x: tuple(advance(plant, "rk4", 0.0, x, (0.01,), None, 1.0, 1).x)
+        return jax.lax.fori_loop(0, 2000, step, x)
+
+    start = (1.5, 0.1)
+    kept = [sum(map(float, plant.stored(x))) for x in (start, run(start))]
+    assert kept[1] == pytest.approx(kept[0], rel=1e-12)
+
+
+def test_a_pump_that_draws_takes_no_more_than_the_tank_holds():
+    plant = network(
+        area=1.0,
+        drain=0.0,
+        pump_gain=1.0,
+        feeds=[(1, None)],
+        sources=[0],
+        rim=[2.0, 9.0],
+        units=("m", "m^3/s"),
+        bottom=True,
+    )
+    x = (0.5, 0.0)
+    for _ in range(30):
+        x = advance(plant, "rk4", 0.0, x, (0.05,), None, 1.0, 1).x
+    np.testing.assert_allclose(x, [0.0, 0.5], atol=1e-9)
