@@ -55,7 +55,7 @@ def check(case: Case) -> Case:
     # a key will be given where there is noise
     run.check(case.loop, case.clock, key=jax.ShapeDtypeStruct((), np.uint32))
     if case.reachable and (why := unreachable(case)):
-        raise EquilibriumError(why)
+        raise EquilibriumError(f"{why}; with reachable = false the file is run without this check")
     return case
 
 
