@@ -138,10 +138,15 @@ def _examples(case):
         }
         if not steady
         else None,
-        "fault": {"of": "pump_gain[0]", "start": instant(0.5), "end": instant(0.7), "factor": 0.6},
+        "fault": {
+            "of": f"{_first_input(plant)}[0]",
+            "start": instant(0.5),
+            "end": instant(0.7),
+            "factor": 0.6,
+        },
         "covariance": None if case.covariance else _covariance(case),
         "safety_filter": {"limit": np.asarray(plant.rim)}
-        if case.safety is None and isinstance(plant, TankNetwork)
+        if case.safety is None and isinstance(plant, TankNetwork) and plant.plain
         else None,
         "scenario": {"name": "noisy", "seed": 1, "values": {"sensor.noise": 0.0}},
     }
@@ -204,11 +209,16 @@ def _observer(loop):
     }
 
 
+def _first_input(plant):
+    """The leaf of the first input: a valve where there is no pump."""
+    return "pump_gain" if np.size(getattr(plant, "pump_gain", 1.0)) else "valve"
+
+
 def _covariance(case):
     """5 % of the first uncertain parameter."""
     value_of = lambda name: np.ravel(np.asarray(get_value(case.loop, name)))
     nonzero = (n for n in case.uncertain if value_of(n).size and value_of(n)[0] != 0)
-    name = next(nonzero, "plant.pump_gain")
+    name = next(nonzero, f"plant.{_first_input(case.loop.plant)}")
     scalar = "[" in name or np.ndim(get_value(case.loop, name)) == 0
     variance = _rounded((0.05 * value_of(name)[0]) ** 2)
     return {"names": [name if scalar else f"{name}[0]"], "matrix": [[variance]]}

@@ -190,7 +190,7 @@ def _of_rig(section, number, values, units, names):
     if number > 1 or not section.many:
         return block
     usual = {k.name: k.default for k in section.keys if k.like and k.default is not None}
-    usual = {name: value for name, value in usual.items() if name not in values}
+    usual = {name: value for name, value in usual.items() if values.get(name) is None}
     more = [line._replace(on=False) for line in lines_of(section, usual, units)]
     return block._replace(lines=block.lines + more, prose=(section.prose,) * bool(section.prose))
 

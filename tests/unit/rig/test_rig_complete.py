@@ -83,6 +83,24 @@ def test_every_suggestion_can_be_used(name):
     assert len(tried) > 60
 
 
+def test_every_suggestion_for_a_rig_with_a_valve_can_be_used():
+    text = """
+    reachable = false
+    units = ["m", "-"]
+    tank = [{ area = 1.0, rim = 0.6, level = 0.3, inflow = 0.02 }]
+    valve = [{ from = 1, area = 0.01 }]
+    plant = { gravity = 9.81 }
+    controller = { kind = "pid", Kc = -20.0, Ti = 100.0, bias = 0.0 }
+    """
+    case = rig.loads(text)
+    blocks = rig.complete(case).split("\n\n")
+    assert rig.complete(rig.loads("\n\n".join(blocks))) == "\n\n".join(blocks)
+    assert any("#drain_linear = inf" in block for block in blocks)
+    for i, block in enumerate(blocks):
+        if used(block) != block:
+            rig.loads("\n\n".join([*blocks[:i], used(block), *blocks[i + 1 :]]))
+
+
 @pytest.mark.parametrize("tankwise", [False, True])
 def test_what_is_written_is_read_where_the_plant_has_lost_a_steady_state(tankwise):
     case = rig.set_values(
