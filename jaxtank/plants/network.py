@@ -139,7 +139,7 @@ def network(
     _check_feeds(feeds, sources)
     m, sizes = len(feeds), {"drain": n, "orifice": len(links), "pipe": len(pipes)}
     sizes |= {"spill": len(spills), "valve": len(valves)}
-    options = {
+    options: dict[str, Any] = {
         f"{name}_{option}": _fitted(f"plant.{name}_{option}", value, sizes[name])
         for option, values in (
             ("port", ports),

@@ -48,7 +48,9 @@ def read_entry(
     where = section.name if index is None else f"{section.name} {index + 1}"
     if not isinstance(table, Mapping):
         raise refusal(where, table, "be a table")
-    problems = Problems(_unknown(section, where, key) for key in table if key not in section.names)
+    problems = Problems(
+        unknown_key(section, key, where) for key in table if key not in section.names
+    )
     values = {}
     for key in section.keys:
         value = table.get(key.name, None if key.default is NEEDED else key.default)
@@ -93,8 +95,8 @@ class Problems(list[InputError]):
             raise InputError("; ".join(dict.fromkeys(str(error) for error in self)))
 
 
-def _unknown(section, where, key):
-    """The InputError for a key that a section does not have."""
+def unknown_key(section, key: str, where: str = "") -> InputError:
+    """Return the InputError for a key that a section does not have, with what to write."""
     owner = PARTS.get(section.elsewhere)
     if key in getattr(owner, "__dataclass_fields__", ()):
         return InputError(
@@ -102,13 +104,15 @@ def _unknown(section, where, key):
             f' "{section.elsewhere}.{key}" in [values], for all of them at once'
         )
     titles = [s.title for s in SECTIONS.values() if key in s.names and s.name]
-    if key in SECTIONS:
+    names = section.names if section.name else [*section.names, *SECTIONS]
+    if section.name and key in SECTIONS:
         hint = f"; {SECTIONS[key].title} is a table of its own"
     elif titles:
         hint = f"; it is a key of {', '.join(titles)}"
     else:
-        hint = f"; write {WORDS[key]}" if key in WORDS else nearest(key, section.names)
-    return InputError(f"unknown key of {section.title} {key!r}{hint}")
+        hint = f"; write {WORDS[key]}" if key in WORDS else nearest(key, names)
+    of = f" of {section.title}" if section.name else ""
+    return InputError(f"unknown key{of} {key!r}{hint}")
 
 
 WORDS = {

@@ -310,11 +310,11 @@ def _with_gain(row, units):
     return {**row, "gain": 1.0} if bare and flow_per_input(units) else row
 
 
-def _flow_gain(where, gain, units):
+def _flow_gain(where, gain, flow, units):
     """The flow per unit of an input that is a flow itself, of a gain that is either that (within
     FLOW_MARGIN) or the share of the flow that the pump delivers.
     """
-    flow, (length, drive) = flow_per_input(units), units
+    length, drive = units
     near = lambda size: 1 / FLOW_MARGIN <= size <= FLOW_MARGIN
     if gain <= 0.0 or (gain != 1.0 and near(gain / flow)):
         return gain
@@ -333,7 +333,7 @@ def _check_pumps(rows, pumps, units):
     that joins no tank, and for curves that turn; gains of inputs that are flows become those of the
     rig.
     """
-    drive = units[1]
+    drive, flow = units[1], flow_per_input(units)
     for i, (pump, row) in enumerate(zip(pumps, rows)):
         pump.setdefault("to", (None, None))
         if pump["to"][0] is None and "from" not in pump:
@@ -361,8 +361,8 @@ def _check_pumps(rows, pumps, units):
                 f"pump {i + 1}: split is the share of the first of two tanks: give it where to ="
                 " [first, second], and only there"
             )
-        if flow_per_input(units) and "gain" in pump:
-            pump["gain"] = _flow_gain(f"pump {i + 1}", pump["gain"], units)
+        if flow and "gain" in pump:
+            pump["gain"] = _flow_gain(f"pump {i + 1}", pump["gain"], flow, units)
 
 
 def _check_monotone(label, points, least=None):

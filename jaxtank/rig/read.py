@@ -8,12 +8,20 @@ from typing import Any
 
 from jaxtank import presets
 from jaxtank.case import Case
-from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.errors import InputError
 from jaxtank.core.files import read_text
 from jaxtank.core.text import shortened
 from jaxtank.rig import components, network, signals, validation
-from jaxtank.rig.entry import Sizes, read_entry, read_value, refusal, sizes_of
-from jaxtank.rig.schema import INPUTS, SECTIONS, TANKWISE
+from jaxtank.rig.entry import (
+    Problems,
+    Sizes,
+    read_entry,
+    read_value,
+    refusal,
+    sizes_of,
+    unknown_key,
+)
+from jaxtank.rig.schema import INPUTS, LISTS, SECTIONS, TANKWISE
 from jaxtank.rig.values import (
     by_dotted_name,
     by_rig_name,
@@ -115,9 +123,12 @@ def from_table(table: Mapping[str, Any]) -> Case:
     values = with_models(case.loop, table.get("values", {}))
     case, values = _with_bias(case, values, table)
     case = set_and_schedule(case, values, table.get("schedule", {}))
+    problems = Problems()
     for name, (field, read) in TUNING.items():
         if name in table:
-            case = case.replace(**{field: read(case, table[name])})
+            with problems.collect():
+                case = case.replace(**{field: read(case, table[name])})
+    problems.check()
     if "bottom" not in table.get("plant", {}) and "plant.bottom" not in values:
         case = with_bottom(case)
     return filtered(validation.check(case))
@@ -198,22 +209,37 @@ def start_of(table):
     """Return the Case of the tables that build: case or tanks, controller, observer,
     instruments, reference, disturbance and faults; before any value is set.
     """
-    top = _top(table)
+    problems, top = Problems(), {}
+    with problems.collect():
+        top = _top(table)
+    lists = all(isinstance(table.get(name, []), list) for name in LISTS)
+    if problems and lists and "tank" in table and "case" not in table:
+        with problems.collect():
+            network.build(table)
+    problems.check()
     if "case" in top:
         case = _with_parts(presets.find(top.pop("case")), table)
     else:
         case = network.build(table)
     loop, changes = case.loop, {}
-    _check_twice(table)
+    with problems.collect():
+        _check_twice(table)
     for name in ("sensor", "actuator"):
         if name in table:
-            changes[name] = components.instrument_of(name, table[name], loop)
+            with problems.collect():
+                changes[name] = components.instrument_of(name, table[name], loop)
     if "reference" in table:
-        changes["reference"] = signals.reference_of(table["reference"], loop.reference, loop.plant)
+        with problems.collect():
+            changes["reference"] = signals.reference_of(
+                table["reference"], loop.reference, loop.plant
+            )
     if "disturbance" in table or "inflow" in table:
-        changes["disturbance"] = signals.disturbance_of(table, loop)
+        with problems.collect():
+            changes["disturbance"] = signals.disturbance_of(table, loop)
     if "fault" in table:
-        changes["faults"] = signals.faults_of(table["fault"], loop.plant)
+        with problems.collect():
+            changes["faults"] = signals.faults_of(table["fault"], loop.plant)
+    problems.check()
     top.pop("units", None)
     return case.replace(loop=dataclasses.replace(loop, **changes), **top)
 
@@ -224,16 +250,17 @@ def _top(table):
     """
     first = SECTIONS[""]
     sections = {n: section for n, section in SECTIONS.items() if n and "." not in n}
+    problems, top = Problems(), {}
     for name, value in table.items():
         if name in first.names:
-            continue
-        if name not in sections:
-            raise unknown("key", name, [*first.names, *sections])
-        many = sections[name].many
-        if not isinstance(value, list if many else dict):
-            raise refusal(name, value, f"be a list of tables, [[{name}]]" if many else "be a table")
-    keys = [key for key in first.keys if key.name in table]
-    top = {key.name: read_value(key, key.name, table[key.name], Sizes(0)) for key in keys}
+            with problems.collect():
+                top[name] = read_value(first[name], name, value, Sizes(0))
+        elif name not in sections:
+            problems.append(unknown_key(first, name))
+        elif not isinstance(value, list if sections[name].many else dict):
+            tables = f"a list of tables, [[{name}]]" if sections[name].many else "a table"
+            problems.append(refusal(name, value, f"be {tables}"))
+    problems.check()
     tables = [name for name in TANKWISE if name in table]
     if "case" in table and tables:
         raise InputError(

@@ -211,7 +211,7 @@ values = { "clock.dt" = 0.1, "clock.duration" = 600.0 }
 def test_a_valve_in_the_outlet_is_manipulated():
     """case33, by P only: open by (h - 14 in) / 2 in."""
     case = rig.loads(OUTLET)
-    assert case.names == {"tank": ("LT101",), "pump": ("FV101",)} and case.loop.plant.bottom
+    assert case.names == {"tank": ("LT101",), "valve": ("FV101",)} and case.loop.plant.bottom
     _, x, _ = simulated(case)
     balance = lambda h: 0.01 * (h - 0.3556) / 0.0508 * ROOT_2G * math.sqrt(h) - 0.02
     root = brentq(balance, 0.36, 0.6)
@@ -322,6 +322,8 @@ def test_a_pump_follows_its_curve_and_loses_flow_to_the_lift():
 
 WRONG = """
 units = ["m", "-"]
+gravity = 9.81
+tower = 1
 tank = [{ area = 1.0, cone = true }, { shape = "cone", height = 2.0 }, { rim = 1.0, port = 2.0 }]
 valve = [{ from = 1, area = 0.1, opening = 0.5, check = 1 }, { to = 2, area = 0.1, high = 2.0 }]
 pump = [{ to = 7, gain = 1.0, curve = [[0.0, 1.0], [0.0, 2.0]] }]
@@ -341,6 +343,8 @@ def test_all_that_is_wrong_in_the_tables_of_a_rig_is_in_one_answer():
         "valve 2 needs from",
         "pump 1: to = 7: must be a tank",
         "pump 1: curve = ",
+        "unknown key 'gravity'; it is a key of [plant]",
+        "unknown key 'tower'; nearest: ",
         "pump 1 needs high",
     ):
         assert words in message, words
