@@ -78,8 +78,6 @@ def joined():
         rangeability=30.0,
         ports={"valve": [0.5, 0.0]},
         rim=[40.0, 40.0],
-        links=[(0, 1)],
-        orifice=[0.05],
         outputs=(0, 1),
     )
     more = {"level": [20.0, 12.0], "high": [12.0, 1.0, 1.0]}

@@ -21,6 +21,7 @@ from jaxtank.core.tree import describe, get_value
 from jaxtank.export.whole import WholeLoop, library, whole_loop
 from jaxtank.limits import limit_scale, resolve_limits
 from jaxtank.live.printed import Printed, maths
+from jaxtank.plants.elements import input_name
 
 ROWS = 3000
 """Rows of a run for people, about: those of `jaxtank simulate --out`."""
@@ -208,7 +209,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         "outputs": [int(i) for i in plant.outputs],
         "pumps": [
             {
-                "name": pumps[j] or f"pump {j + 1}",
+                "name": pumps[j] or input_name(plant, j),
                 "lower": float(loop.actuator.low[j]),
                 "upper": float(loop.actuator.high[j]),
             }

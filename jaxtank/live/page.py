@@ -31,7 +31,8 @@ from jaxtank.live.engine import engine, program_of
 from jaxtank.live.origin import both, entries, origin_of
 from jaxtank.loop.closed_loop import takes_arrays
 from jaxtank.loop.trajectory import stride
-from jaxtank.plots.layout import jets, overflows, pipes, place
+from jaxtank.plants.vessels import shape_name
+from jaxtank.plots.layout import jets, overflows, pipes, place, valves
 
 HERE = Path(__file__).parent
 SCRIPTS = ("charts", "rig", "runner", "page")
@@ -154,6 +155,9 @@ def _breaks(case):
             first, other = (tank + 1 for tank in plant.pipes[k])
             text = f"the pipe between tanks {first} and {other} is blocked, 40 % open"
             add(f"blocked pipe {first} to {other}", f"plant.pipe[{k}]", 0.4, text)
+    for k in range(np.size(values.get("plant.valve", ()))):
+        text = f"valve {k + 1} passes 40 % of what it should"
+        add(f"clogged valve {k + 1}", f"plant.valve[{k}]", 0.4, text)
     for k, volume in enumerate(values.get("disturbance.volume", ())):
         if volume:
             text = "three times the volume of this inflow disturbance"
@@ -263,6 +267,9 @@ def drawing(plant):
         "pumps": [_rounded(p) for p in where.pumps],
         "risers": [[pump, tank, _path(path)] for pump, tank, path in where.risers],
         "pipes": [_rounded(p) for p in pipes(plant, where)],
+        "suctions": [[pump, tank, _path(path)] for pump, tank, path in where.suctions],
+        "valves": [[tank, _path(path), _rounded(at)] for tank, path, at in valves(plant, where)],
+        "shapes": [shape_name(plant, i) for i in range(plant.tanks)],
         "jets": [[tank, _path(path)] for tank, path in jets(plant, where)],
         "overflows": [[tank, _path(path)] for tank, path in overflows(plant, where)],
         **{end: round(float(getattr(where, end)), 4) for end in ("left", "right", "bottom", "top")},

@@ -27,6 +27,17 @@ function makeRig(svg, rig, info) {
   line([[left + 0.06, -0.82], [left + 0.06, bottom + 0.06], [right - 0.06, bottom + 0.06],
     [right - 0.06, -0.82]], "glass");
   const risers = rig.risers.map(([pump, , path]) => [pump, line(path, `riser pump${pump % 4}`)]);
+  rig.suctions.forEach(([pump, , path]) => line(path, `riser suction pump${pump % 4}`));
+  const valves = rig.valves.map(([, path, [x, y]], k) => {
+    const across = path[0][1] === path[1][1] && path[0][1] === y;
+    const node = line(path, "jet");
+    const wings = [-1, 1].map((s) => across ? [[x, y], [x + s * 0.1, y + 0.07], [x + s * 0.1, y - 0.07]]
+      : [[x, y], [x + 0.07, y + s * 0.1], [x - 0.07, y + s * 0.1]]);
+    wings.forEach((wing) => add("polygon", { points: points(wing), class: "valve" }));
+    add("text", { x: X(x) + (across ? 0 : 12), y: Y(y) - (across ? 12 : -4), class: "halo small",
+      "text-anchor": across ? "middle" : "start" }, info.pumps[rig.pumps.length + k].name);
+    return [rig.pumps.length + k, node];
+  });
   const jets = rig.jets.map(([tank, path]) => [tank, line(path, "jet")]);
   const spills = rig.overflows.map(([tank, path]) => [tank, line(path, "spill")]);
   const tanks = rig.boxes.map(([x, y, width, height, scale], i) => {
@@ -46,6 +57,7 @@ function makeRig(svg, rig, info) {
     const middle = { x: X(x + width / 2), "text-anchor": "middle" };
     const small = width < 0.7 ? " small" : "";
     add("text", { ...middle, y: Y(y + height / 2) - 4, class: `halo${small}` }, shortened(info.tanks[i].name));
+    if (rig.shapes[i]) add("text", { ...middle, y: Y(y) - 6, class: "halo small" }, rig.shapes[i]);
     tank.text = add("text", { ...middle, y: Y(y + height / 2) + 11, class: `halo value${small}` });
     if (tank.controlled) tank.mark = line([[0, 0], [0, 0]], "setpoint");
   });
@@ -79,6 +91,7 @@ function makeRig(svg, rig, info) {
         tank.mark.setAttribute("points", points(arrow));
       });
       risers.forEach(([pump, node]) => node.setAttribute("stroke-opacity", 0.25 + 0.75 * now.share[pump]));
+      valves.forEach(([j, node]) => node.setAttribute("stroke-opacity", 0.2 + 0.8 * clamp(now.share[j], 0, 1)));
       jets.forEach(([tank, node]) => {
         const part = now.h[tank] / now.rims[tank] || 0;
         node.setAttribute("stroke-opacity", clamp(0.15 + Math.sqrt(Math.max(part, 0)), 0, 1));

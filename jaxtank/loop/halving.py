@@ -15,6 +15,7 @@ from jaxtank.loop import step_size
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.run import evaluate_and_flag
 from jaxtank.loop.saved_rows import simulate_compiled
+from jaxtank.plants.elements import input_name
 
 MAX_ERROR = 5.0
 """Error of a level above which a run is refused, in `step_size.visible_heights` (1 %) [-]."""
@@ -53,7 +54,8 @@ def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> l
         )
     inputs = np.abs(np.asarray(run.u) - np.asarray(half.u)).max(axis=0)
     pump = int(np.argmax(inputs))
-    sentence += f", the input of pump {pump + 1} by {inputs[pump]:.3g} {loop.units[1]}"
+    name = input_name(loop.plant, pump)
+    sentence += f", the input of {name} by {inputs[pump]:.3g} {loop.units[1]}"
     return [", ".join([sentence, *_changed(loop, clock, finer, key)])]
 
 

@@ -22,6 +22,15 @@ TIP = 1e-6
 SHAPES = ("prism", "cone", "sphere", "horizontal-cylinder")
 """Shapes by name; a table is ((level, area), ...), shares of the extent and of the largest area."""
 
+
+def shape_name(plant: Any, tank: int) -> str:
+    """Return "cone", "sphere", "lying cylinder", "table" or, of an upright tank, ""."""
+    shape = plant.shapes[tank] if getattr(plant, "shapes", ()) else "prism"
+    if not isinstance(shape, str):
+        return "table"
+    return {"prism": "", "horizontal-cylinder": "lying cylinder"}.get(shape, shape)
+
+
 Shape = str | tuple[tuple[float, float], ...]
 
 

@@ -5,10 +5,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxtank.core.units import local
+from jaxtank.plants.elements import full_open
+from jaxtank.plants.vessels import shape_name
 
 
 def equations(plant, disturbed=False):
     """Return the lines of a rig's equations."""
+    if not plant.plain:
+        return _of_elements(plant, disturbed)
     letters, numbers = [], []
     for i in range(plant.tanks):
         area, terms = float(plant.area[i]), list(_terms(plant, i))
@@ -28,6 +32,91 @@ def equations(plant, disturbed=False):
         f"in numbers [{rate}]:",
         *numbers,
     ]
+
+
+def _of_elements(plant, disturbed):
+    """Lines of the equations of a network that is not plain, in numbers."""
+    terms: list[list[tuple[str, str]]] = [[] for _ in range(plant.tanks)]
+    for source, sink, text in _streams(plant):
+        for tank, sign in ((source, "-"), (sink, "+")):
+            if tank is not None:
+                terms[tank].append((sign, text))
+    rows, (length, drive) = [], plant.units
+    for i, flows in enumerate(terms):
+        flows += [("+", f"d{i + 1}")] if disturbed else []
+        kept = "V" if plant.shapes else f"{float(plant.area[i]):.4g} h"
+        rows.append(f"{kept}{i + 1}' = {_sum(flows)}")
+    lines = ["q(x) = sqrt(x) for x > 0, else 0", "w(x) = sgn(x) sqrt|x|"]
+    lines = [f"  {line}" for line in lines if any(f" {line[0]}(" in row for row in rows)]
+    for name in ("curves", "lift_curves", "characteristics"):
+        for j, points in enumerate(getattr(plant, name)):
+            letter = {"curves": "f", "lift_curves": "e", "characteristics": "c"}[name]
+            if isinstance(points, tuple):
+                pairs = ", ".join(f"({a:g}, {b:g})" for a, b in points)
+                lines.append(f"  {letter}{j + 1} through {pairs}")
+    for i in range(plant.tanks):
+        if shape := shape_name(plant, i):
+            sizes = (
+                f"area {float(plant.area[i]):g} {length}^2, to {float(plant.extent[i]):g} {length}"
+            )
+            lines.append(f"  V{i + 1}(h{i + 1}): volume of a {shape} ({sizes})")
+        elif plant.shapes:
+            lines.append(f"  V{i + 1} = {float(plant.area[i]):.4g} h{i + 1}")
+    meaning = f"h levels [{length}], u inputs [{drive}] of the pumps, then of the valves"
+    return [f"in numbers [{local('cm^3/s', plant.units)}]:", *rows, *lines, f"  {meaning}"]
+
+
+def _streams(plant):
+    """(from, to, flow in numbers) of each opening, pump and valve, closed ones left out."""
+    root = float(np.sqrt(2.0 * float(plant.gravity)))
+    of = lambda name, k: None if getattr(plant, name) is None else float(getattr(plant, name)[k])
+
+    def head(kind, k, i):
+        port = of(f"{kind}_port", k)
+        return f"h{i + 1} - {port:g}" if port else f"h{i + 1}"
+
+    def apart(kind, k, a, b):
+        port = of(f"{kind}_port", k)
+        ends = (f"max(h{i + 1}, {port:g})" if port else f"h{i + 1}" for i in (a, b))
+        return f"w({' - '.join(ends)})"
+
+    outlets = [(i, None) for i in range(plant.tanks)]
+    for kind, pairs in (("drain", outlets), ("orifice", plant.links)):
+        for k, (source, sink) in enumerate(pairs):
+            exponent, resistance = of(f"{kind}_exponent", k), of(f"{kind}_resistance", k)
+            above, size = head(kind, k, source), of(kind, k) * root
+            power = f"({above})^{exponent:g}" if exponent else f"q({above})"
+            if size > 0.0:
+                yield source, sink, f"{size:.4g} {power}"
+            if resistance and np.isfinite(resistance):
+                yield source, sink, f"({above})/{resistance:g}"
+    for k, (a, b) in enumerate(plant.pipes):
+        yield a, b, f"{of('pipe', k) * root:.4g} {apart('pipe', k, a, b)}"
+    for j, (first, second) in enumerate(plant.feeds):
+        source = plant.sources[j] if plant.sources else None
+        text = f"u{j + 1}"
+        if plant.curves and plant.curves[j]:
+            text = f"f{j + 1}({text})"
+        if plant.lift_curves and plant.lift_curves[j]:
+            ends = ["0" if i is None else f"h{i + 1}" for i in (first, source)]
+            text += f" e{j + 1}({' - '.join(ends)})"
+        shares = [(first, 1.0)]
+        if second is not None:
+            share = float(plant.split[j])
+            shares = [(first, share), (second, 1.0 - share)]
+        for sink, share in shares:
+            yield source, sink, f"{share * float(plant.pump_gain[j]):.4g} {text}"
+    for k, (source, sink) in enumerate(plant.valves):
+        u = f"u{len(plant.feeds) + k + 1}"
+        u = f"{u}/100" if full_open(plant.units) == 100.0 else u
+        share = {
+            "linear": u,
+            "equal-percentage": f"{float(plant.rangeability[k]):g}^({u} - 1)",
+        }.get(plant.characteristics[k], f"c{k + 1}({u})")
+        above = head("valve", k, source)
+        flow = f"q({above})" if sink is None else apart("valve", k, source, sink)
+        one = " one way" if plant.one_way[k] and sink is not None else ""
+        yield source, sink, f"{of('valve', k) * root:.4g} {share} {flow}{one}"
 
 
 def _meanings(plant, disturbed):

@@ -31,6 +31,7 @@ class Layout(NamedTuple):
     boxes: tuple
     pumps: tuple
     risers: tuple  # (pump, tank, path)
+    suctions: tuple  # (pump, tank that it draws from, path)
     left: float
     right: float
     bottom: float
@@ -42,10 +43,11 @@ def storeys(plant):
     # A tank is above every tank that it flows into, and level with those that a pipe joins to it.
     # Tanks that flow in a circle, which gravity does not allow, have the rows that they reach.
     row = [0] * plant.tanks
+    joined = [(v, one) for v, one in zip(plant.valves, plant.one_way) if v[1] is not None]
     for _ in range(plant.tanks):
-        for source, sink in (*plant.links, *plant.spills):
+        for source, sink in (*plant.links, *plant.spills, *(v for v, one in joined if one)):
             row[source] = min(max(row[source], row[sink] + 1), plant.tanks - 1)
-        for a, b in plant.pipes:
+        for a, b in (*plant.pipes, *(v for v, one in joined if not one)):
             row[a] = row[b] = max(row[a], row[b])
     used = sorted(set(row))
     return tuple(used.index(r) for r in row)
@@ -101,6 +103,30 @@ def pipes(plant, where):
     return lines
 
 
+def valves(plant, where):
+    """Return [(tank, path ((x, y), ...), (x, y) of the symbol)] of each valve."""
+    lines, number = [], [0] * plant.tanks
+    for source, sink in plant.valves:
+        box, order = where.boxes[source], number[source]
+        number[source] += 1
+        side = box.x + box.width
+        if sink is None:
+            x, y = side + 0.24 + 0.14 * order, box.y + 0.05 + 0.1 * order
+            lines.append((source, ((side, y), (x, y), (x, -0.93)), (x, min(y - 0.3, -0.3))))
+            continue
+        other = where.boxes[sink]
+        if box.y == other.y:
+            west, east = sorted((box, other), key=lambda b: b.x)
+            ends = west.x + west.width, east.x
+            y = box.y + 0.22 + 0.14 * order
+            lines.append((source, ((ends[0], y), (ends[1], y)), (sum(ends) / 2, y)))
+        else:
+            x, end = box.x + box.width * 0.15, other.y + 0.97 * other.height
+            path = ((x, box.y), (x, box.y - 0.3), (other.middle, end))
+            lines.append((source, path, (x, box.y - 0.15)))
+    return lines
+
+
 def overflows(plant, where):
     """Return [(tank, path ((x, y), ...))] of what runs over a rim into another tank."""
     paths = []
@@ -115,13 +141,20 @@ def overflows(plant, where):
 
 def _with_pumps(plant, boxes, rows, width):
     """The Layout with pumps in the basin, at the nearer side of the first tank that they fill."""
-    sides = [_side(plant, boxes, width, j) for j in range(plant.pumps)]
-    pumps, risers, above = [], [], {}
+    sides = [_side(plant, boxes, width, j) for j in range(len(plant.feeds))]
+    pumps, risers, suctions, above = [], [], [], {}
     for j, feed in enumerate(plant.feeds):
         order = sides[:j].count(sides[j])  # its number on this side
         x = -0.35 - 0.5 * order if sides[j] == "left" else width + 0.35 + 0.5 * order
-        pumps.append((x, -0.78))
+        source, level = plant.sources[j] if plant.sources else None, -0.78
+        if source is not None:  # above the basin
+            level, box = -0.45, boxes[source]
+            start = box.x + box.width * (0.1 if sides[j] == "left" else 0.9)
+            suctions.append((j, source, ((start, box.y), (start, level), (x, level))))
+        pumps.append((x, level))
         targets = [i for i in feed if i is not None]
+        if not targets:
+            risers.append((j, source, ((x, level), (x, -0.9))))
         for i in targets:
             row = rows[i]
             above[row] = above.get(row, 0) + 1
@@ -129,17 +162,18 @@ def _with_pumps(plant, boxes, rows, width):
             # jets of different pumps into one tank side by side, on the side that they come from
             share = 0.2 + 0.15 * min(order, 1) if sides[j] == "left" else 0.8 - 0.15 * min(order, 1)
             end = boxes[i].x + boxes[i].width * share
-            path = ((x, -0.78), (x, y), (end, y), (end, boxes[i].y + boxes[i].height * 0.93))
+            path = ((x, level), (x, y), (end, y), (end, boxes[i].y + boxes[i].height * 0.93))
             risers.append((j, i, path))
     most = max((len([s for s in sides if s == side]) for side in ("left", "right")), default=0)
     edge = 0.75 + 0.5 * max(0, most - 1)
     top = max([b.y + b.height for b in boxes] + [p[1][1] for _, _, p in risers]) + 0.3
-    return Layout(tuple(boxes), tuple(pumps), tuple(risers), -edge, width + edge, -1.12, top)
+    parts = (tuple(part) for part in (boxes, pumps, risers, suctions))
+    return Layout(*parts, -edge, width + edge, -1.12, top)
 
 
 def _side(plant, boxes, width, j):
-    first = plant.feeds[j][0]
-    middle = boxes[first].middle - width / 2
+    first, source = plant.feeds[j][0], plant.sources[j] if plant.sources else None
+    middle = boxes[source if first is None else first].middle - width / 2
     if abs(middle) > 1e-9:
         return "left" if middle < 0 else "right"
     return "left" if j % 2 == 0 else "right"

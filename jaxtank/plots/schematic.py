@@ -10,9 +10,10 @@ from matplotlib.patches import Circle, Polygon
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 
 from jaxtank.core.units import local
-from jaxtank.plots.layout import jets, overflows, pipes, place
+from jaxtank.plants.vessels import shape_name
+from jaxtank.plots.layout import jets, overflows, pipes, place, valves
 from jaxtank.plots.overview import LARGEST, overview
-from jaxtank.plots.spills import Stack, amount, headroom
+from jaxtank.plots.spills import Stack, amount, headroom, volume_above
 from jaxtank.plots.style import AFTER, GLASS, PUMPS, REFERENCE, WATER, box, write
 
 JET = {"color": AFTER, "linewidth": 1.1, "linestyle": (0, (3, 1.5)), "zorder": 2}
@@ -36,6 +37,10 @@ def schematic(ax, plant, levels=None, setpoints=None, lost=None):
         line = {"color": _colour(pump), "solid_joinstyle": "round", "zorder": 1}
         ax.plot(*np.array(path).T, linewidth=1.6, **line)
         ax.plot(*path[-1], marker="v", color=_colour(pump), markersize=5, zorder=4)
+    for pump, _, path in where.suctions:
+        ax.plot(*np.array(path).T, color=_colour(pump), linewidth=1.6, linestyle="--", zorder=1)
+    for k, (_, path, at) in enumerate(valves(plant, where)):
+        _valve(ax, path, at, _colour(len(plant.feeds) + k), f"valve {k + 1}")
     for left, right, y in pipes(plant, where):
         for wide, colour, layer in ((6.5, GLASS, 1.7), (3.5, WATER, 1.8)):
             line = {"color": colour, "linewidth": wide, "zorder": layer}
@@ -84,7 +89,7 @@ def depth(tank, level):
 def _above(ax, plant, where, levels, lost):
     """What is above the rims, hatched and counted: lost volumes, or what the tanks cannot hold."""
     area, rim = (np.asarray(v, dtype=float) for v in (plant.area, plant.rim))
-    volumes, words = area * (levels - rim), "above"
+    volumes, words = volume_above(plant, levels), "above"
     if lost is not None:
         volumes, words = np.asarray(lost, dtype=float), "spilled"
     for i in np.flatnonzero(volumes > 1e-9 * area * rim):
@@ -122,7 +127,9 @@ def _tank(ax, plant, i, tank, level):
     wall = {"color": REFERENCE, "linewidth": 2.2} if controlled else {"color": GLASS}
     ax.plot([tank.x, tank.x, x, x], [y, tank.y, tank.y, y], **{"linewidth": 1.4, **wall}, zorder=3)
     halo: dict[str, Any] = {} if level is None else {"path_effects": HALO}
-    label, size = f"tank {i + 1}\n{text}".strip(), 7 if tank.width < 0.7 else 8
+    shape = shape_name(plant, i)
+    label = "\n".join(part for part in (f"tank {i + 1}", shape, text) if part)
+    size = 7 if tank.width < 0.7 else 8
     middle = tank.y + 0.5 * tank.height
     write(ax, tank.middle, middle, label, size, colour="black", zorder=5, **halo)
     rim = f"{float(np.asarray(plant.rim)[i]):g} {unit}"
@@ -139,11 +146,25 @@ def _pump(ax, x, y, pump, label):
     write(ax, x + away, y + 0.12, label, 8, f"{side} center", "black", zorder=5)
 
 
+def _valve(ax, path, at, colour, label):
+    """A pipe with a valve: two triangles, tip to tip."""
+    ax.plot(*np.array(path).T, color=AFTER, linewidth=1.6, solid_joinstyle="round", zorder=2)
+    x, y = at
+    across = path[0][1] == path[1][1] == y
+    for sign in (-1, 1):
+        wide = [(x, y), (x + sign * 0.1, y + 0.07), (x + sign * 0.1, y - 0.07)]
+        tall = [(x, y), (x + 0.07, y + sign * 0.1), (x - 0.07, y + sign * 0.1)]
+        face = {"facecolor": "white", "edgecolor": colour, "linewidth": 1.4, "zorder": 4}
+        ax.add_patch(Polygon(wide if across else tall, **face))
+    place = (x, y + 0.16, "center center") if across else (x + 0.14, y, "left center")
+    write(ax, place[0], place[1], label, 7, place[2], "black", zorder=5)
+
+
 def _shares(ax, plant, where):
     """The share of a pump beside each of its two branches."""
     for pump, tank, path in where.risers:
         first, second = plant.feeds[pump]
-        if second is None:
+        if second is None or len(path) < 3:
             continue
         ax.plot(*path[1], marker="o", color=_colour(pump), markersize=3.5, zorder=2)
         share = float(np.asarray(plant.split)[pump])

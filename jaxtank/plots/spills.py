@@ -59,12 +59,20 @@ def spilled(plant: Any, run: Any) -> Spilled:
     elif callable(getattr(plant, "area", callable)):  # a plant of the user's own, as a cone
         volume = np.zeros_like(x)
     else:
-        rim, area = (np.asarray(v, dtype=float) for v in (plant.rim, plant.area))
-        past = x - rim
-        volume = area * np.where(past > 1e-9 * np.abs(rim), past, 0.0)
+        rim = np.asarray(plant.rim, dtype=float)
+        volume = np.where(x - rim > 1e-9 * np.abs(rim), volume_above(plant, x), 0.0)
     simulated = bool(getattr(plant, "overflow", False))
     unit = local("cm^3", getattr(plant, "units", DEFAULT))
     return Spilled(simulated, volume, volume.max(axis=0), unit)
+
+
+def volume_above(plant: Any, x: Any) -> Any:
+    """Return the volumes (..., n) above the rims at levels x (..., n), below 0 under them."""
+    rim = np.asarray(plant.rim, dtype=float)
+    if not getattr(plant, "shapes", ()):
+        return np.asarray(plant.area, dtype=float) * (x - rim)
+    stored = lambda levels: np.stack([np.asarray(v) for v in plant.stored(tuple(levels.T))], -1)
+    return stored(np.asarray(x, dtype=float)) - stored(np.broadcast_to(rim, np.shape(x)))
 
 
 def amount(volume: float, unit: str) -> str:

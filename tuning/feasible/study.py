@@ -527,7 +527,8 @@ def _pumps(needs: Needs) -> Mend | None:
     tanks, whole = needs.rim.shape[1], needs.high.shape[1]
     if np.ptp(needs.high[:, tanks:], axis=0).any():
         return None
-    return _raised(needs, "pumps", "actuator.high", tanks, np.arange(tanks, whole), whole)
+    pumps = np.arange(tanks, tanks + len(needs.case.loop.plant.feeds))  # a valve opens to 1 at most
+    return _raised(needs, "pumps", "actuator.high", tanks, pumps, whole)
 
 
 def _raised(needs, what, leaf, first, columns, end) -> Mend | None:

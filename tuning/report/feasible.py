@@ -2,6 +2,7 @@
 
 import dataclasses
 
+from jaxtank.plants.elements import input_name
 from tuning.problem import provenance
 from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
@@ -46,7 +47,7 @@ def needs(study, least=LISTED):
     rows = [
         [
             Value(row.setpoints, 6, study.case.loop.units[0], ", "),
-            row.tank if row.pump is None else f"pump {row.pump}",
+            row.tank if row.pump is None else input_name(study.case.loop.plant, row.pump - 1),
             *(Value(v, 3, row.unit) for v in (row.needed, row.needed_p95)),
             Value(row.limit, 6, row.unit),
             Value(100 * row.share, 2, "%"),
@@ -97,7 +98,9 @@ def figures(study):
     from jaxtank.plots.style import AFTER, BEFORE, FORBIDDEN, picture, plain
 
     rows = [row for row in study.plateaus if row.share >= LISTED]
-    part = lambda row: f"tank {row.tank}" if row.pump is None else f"pump {row.pump}"
+    plant = study.case.loop.plant
+    name = lambda row: input_name(plant, row.pump - 1)
+    part = lambda row: f"tank {row.tank}" if row.pump is None else name(row)
 
     def draw(ax):
         nominal, high, limit = zip(*((r.needed, r.needed_p95, r.limit) for r in rows))
