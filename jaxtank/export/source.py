@@ -5,10 +5,10 @@ The file is made from the step function that is simulated.
 
 import re
 from collections.abc import Callable, Collection
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jaxtank.case import Case
-from jaxtank.controllers import OpenLoop
+from jaxtank.controllers import LQI, OpenLoop, StateFeedback
 from jaxtank.core.errors import InputError
 from jaxtank.export.c import print_c
 from jaxtank.export.javascript import RESERVED as JAVASCRIPT_NAMES
@@ -16,6 +16,7 @@ from jaxtank.export.javascript import print_javascript
 from jaxtank.export.matlab import RESERVED, print_matlab
 from jaxtank.export.printer import function_name
 from jaxtank.export.program import Program, program
+from jaxtank.plants.elements import check_plain
 
 PRECISIONS = ("double", "float")
 
@@ -122,8 +123,17 @@ def export(
         raise InputError(
             f"{case.name}: its controller plays a signal back, and exported code holds no signals"
         )
+    check_prepared(controller)
     name = _checked_name(case, name, target.reserved)
     return target.write(program(case), name, precision)
+
+
+def check_prepared(controller: Any) -> None:
+    """Raise InputError for a controller whose steady states need iterations."""
+    controller = getattr(controller, "law", controller)
+    if isinstance(controller, StateFeedback | LQI):
+        remedy = "its steady states need iterations, which exported code has not; export kind pid"
+        check_plain(controller.model, f"{type(controller).__name__} as code", f"{remedy} or gpc")
 
 
 def _checked_name(case, option, reserved):

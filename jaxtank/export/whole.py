@@ -24,6 +24,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import parameters, with_values
 from jaxtank.export.javascript import MATRICES, ROUND
 from jaxtank.export.lowering import Writer, lower_all
+from jaxtank.export.source import check_prepared
 from jaxtank.export.statements import (
     Array,
     Define,
@@ -149,6 +150,7 @@ def check_pointwise(case: Case) -> None:
             f"{case.name}: its signals are recorded samples, or its controller looks ahead; its"
             " loop has no code of single samples"
         )
+    check_prepared(case.loop.controller)
 
 
 def arguments(case: Case, names: Sequence[str]) -> dict[str, Any]:

@@ -72,12 +72,16 @@ def free(case):
 
 
 def around(value, meta):
-    """Return Free of a tenth to ten times a value within its range, None of an empty one."""
+    """Return Free of a tenth to ten times a value within its range, None of an empty one; on both
+    sides of 0 where entries are not of one sign.
+    """
     value = np.asarray(value, dtype=float)
     if value.size == 0:
         return None
     low, high = 0.1 * value.min(), 10.0 * value.max()
-    if value.min() <= 0:
+    if value.max() < 0:
+        low, high = 10.0 * value.min(), 0.1 * value.max()
+    elif value.min() <= 0:
         high = 1.0 + 2 * np.abs(value).max()
         low = -high
     low = _rounded(low if meta["low"] is None else max(low, meta["low"]))

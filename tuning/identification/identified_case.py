@@ -19,6 +19,7 @@ from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
+from jaxtank.plants.elements import input_name
 from jaxtank.rig.components import controller_of
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps, ramps
@@ -146,7 +147,11 @@ def with_pi(case, inputs):
     controller = controller_of(table, open_loop)
     ours = lambda name: name.startswith("controller.")
     free = {n: f for n, f in case.free.items() if not ours(n)} | {
-        "controller.Kc": Free(float(Kc.min() / 30), float(Kc.max() * 30)),
+        "controller.Kc": Free(float(Kc.min() / 30), float(Kc.max() * 30))
+        if Kc.min() > 0  # else a valve in an outlet
+        else Free(
+            float(Kc.min() * 30), float(Kc.max() * (30 if Kc.max() > 0 else 1 / 30)), "linear"
+        ),
         "controller.Ti": Free(float(Ti.min() / 10), float(Ti.max() * 10)),
     }
     case = case.replace(
@@ -167,10 +172,13 @@ def _gain_and_time(loop, model, inputs):
         gain, area = -np.diag(C @ once), np.diag(C @ np.linalg.solve(A, once))
     except np.linalg.LinAlgError:
         gain = area = np.zeros(loop.plant.pumps)
-    for j in np.flatnonzero(~((gain > 0) & (area > 0) & np.isfinite(area)))[:1]:
+    settles = (gain * area > 0) & np.isfinite(area)
+    if loop.plant.plain:
+        settles &= gain > 0
+    for j in np.flatnonzero(~settles)[:1]:
         at = ", ".join(f"{v:g}" for v in inputs)
         raise InputError(
-            f"pump {j + 1} does not settle tank {loop.plant.outputs[j] + 1} at inputs ({at})"
+            f"{input_name(loop.plant, j)} does not settle tank {loop.plant.outputs[j] + 1} at inputs ({at})"
             f" {loop.units[1]}: no PI of its own, use another [controller]"
         )
     return gain, area / gain + loop.actuator.delay

@@ -172,7 +172,7 @@ def _pid(known: Rig) -> Any:
     others = float(np.sum(1.0 / rates[1:][rates[1:] > 0.0])) if n > 1 else 0.0
     theta = np.where(np.abs(direct) > 0.0, 0.0, 0.5 * others)
     lag = T / FASTER + theta
-    return {"Kc": T / (np.abs(steady) * lag), "Ti": np.minimum(T, 4.0 * lag)}, ("Kc", "Ti")
+    return {"Kc": T / (steady * lag), "Ti": np.minimum(T, 4.0 * lag)}, ("Kc", "Ti")
 
 
 def _feedback(known: Rig) -> np.ndarray:
