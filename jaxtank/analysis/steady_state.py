@@ -198,7 +198,9 @@ def at_rest(plant, y, inflow=None, start=None, shared=None):
         return jax.lax.while_loop(on, step, (z, rates, 1e-4 + 0.0 * size, 0, size))[0]
 
     def tangent(linear, b):
-        return elimination.solve(jax.jacfwd(linear)(b), b)
+        A, eye = jax.jacfwd(linear)(jnp.zeros_like(b)), jnp.eye(b.shape[0], dtype=b.dtype)
+        # a product with the inverse is linear in b, as its transpose in reverse mode must be
+        return jax.vmap(elimination.solve, in_axes=(None, 0))(A, eye).T @ b
 
     z = jax.lax.custom_root(left, jax.lax.stop_gradient(z), solve, tangent)
     return *split(z), jnp.max(jnp.abs(left(z)))

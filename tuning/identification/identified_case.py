@@ -164,6 +164,14 @@ def with_pi(case, inputs):
     return _with_changes(case, x, start, inputs, total.max()) if still else rigs.check(case)
 
 
+def _around(Kc):
+    """Free of a thirtieth to thirty times gains; below 0 of a valve in an outlet."""
+    if Kc.min() > 0:
+        return Free(float(Kc.min() / 30), float(Kc.max() * 30))
+    high = 30 * Kc.max() if Kc.max() > 0 else Kc.max() / 30
+    return Free(float(30 * Kc.min()), float(high), "linear")
+
+
 def _gain_and_time(loop, model, inputs):
     """Return (K (m,) [cm/V], T (m,) [s]) of each output's response to its own pump."""
     A, B, C = model
@@ -176,9 +184,9 @@ def _gain_and_time(loop, model, inputs):
     if loop.plant.plain:
         settles &= gain > 0
     for j in np.flatnonzero(~settles)[:1]:
-        at = ", ".join(f"{v:g}" for v in inputs)
+        at, name = ", ".join(f"{v:g}" for v in inputs), input_name(loop.plant, j)
         raise InputError(
-            f"{input_name(loop.plant, j)} does not settle tank {loop.plant.outputs[j] + 1} at inputs ({at})"
+            f"{name} does not settle tank {loop.plant.outputs[j] + 1} at inputs ({at})"
             f" {loop.units[1]}: no PI of its own, use another [controller]"
         )
     return gain, area / gain + loop.actuator.delay
