@@ -23,13 +23,13 @@ from jaxtank.plants.network import TankNetwork
 from jaxtank.signals.base import Signal
 
 MODES = ("unconstrained", "clipped", "constrained")
-# laminar threshold of the roots in the linearisation, in the rig's length unit: the roots of the
-# paper are exact
-EXACT = 1e-9
+# laminar threshold in the linearisation, in the rig's unit of length: the paper's square roots have
+# none
+THRESHOLD = 1e-9
 
 
-class Memory(NamedTuple):
-    """What is kept of the last sample: levels measured (n) [cm], inputs applied (m) [V]."""
+class LastSample(NamedTuple):
+    """State of the controller: measured levels (n) [cm] and applied inputs (m) [V]."""
 
     x: Sequence
     u: Sequence
@@ -38,9 +38,9 @@ class Memory(NamedTuple):
 def incremental_model(model, operating_point, dt, inputs=None):
     """Return (A, B, C) of x = [dx_m; y] (khalid eqs. 16-17, khalid notes S4.1)."""
     # A = [[Am, 0], [Cm Am, I]], B = [Bm; Cm Bm], C = [0, I]
-    # a plain rig is linear in its inputs, so any value serves
+    # a plain rig is linear in its inputs: their value has no effect
     inputs = jnp.zeros(model.pumps) if inputs is None else inputs
-    Ac, Bc, Cm = linearise(dataclasses.replace(model, knee=EXACT), operating_point, inputs)
+    Ac, Bc, Cm = linearise(dataclasses.replace(model, knee=THRESHOLD), operating_point, inputs)
     Am, Bm = zero_order_hold(Ac, Bc, dt)
     n, q = Am.shape[0], Cm.shape[0]
     A = jnp.block([[Am, jnp.zeros((n, q))], [Cm @ Am, jnp.eye(q)]])
@@ -52,47 +52,50 @@ def incremental_model(model, operating_point, dt, inputs=None):
 
 
 def quadratic_cost(A, B, C, q, r_w, basis):
-    """Return (Omega, Psi) of J = eta' Omega eta + 2 eta' Psi x_e + const, for increments du(k+m) =
-    basis(m) eta (khalid eqs. 29-31, khalid notes S4.3).
+    """Return (Omega, Psi) of J = eta' Omega eta + 2 eta' Psi x_e + const (khalid eqs. 29-31).
+
+    The increments are du(k+m) = basis(m) eta (khalid notes S4.3).
     """
-    # phi(m)' = A phi(m-1)' + B basis(m-1), Omega = sum_m phi(m) Q phi(m)' + r_w I, Psi = sum_m
-    # phi(m) Q A^m, m = 1 .. Np
-    # with Q = C' diag(q) C and x_e = [dx_m; y - r]. The sums go to Np, not to the number of terms
-    # as printed (khalid notes E10).
+    # with Q = C' diag(q) C, x_e = [dx_m; y - r], and sums over m = 1 .. Np:
+    #   phi(m)' = A phi(m-1)' + B basis(m-1)
+    #   Omega = sum phi(m) Q phi(m)' + r_w I,   Psi = sum phi(m) Q A^m
+    # The paper prints sums over the number of terms instead of Np (khalid notes E10).
     n, variables = A.shape[0], basis.shape[2]
 
-    def ahead(carry, now):
+    def next_sample(carry, increments):
         phi, power = carry
-        phi, power = A @ phi + B @ now, A @ power
+        phi, power = A @ phi + B @ increments, A @ power
         outputs = C @ phi
         return (phi, power), (
             outputs.T @ (q[:, None] * outputs),
             outputs.T @ (q[:, None] * (C @ power)),
         )
 
-    _, (squares, products) = jax.lax.scan(ahead, (jnp.zeros((n, variables)), jnp.eye(n)), basis)
+    start = jnp.zeros((n, variables)), jnp.eye(n)
+    _, (squares, products) = jax.lax.scan(next_sample, start, basis)
     return squares.sum(axis=0) + r_w * jnp.eye(variables), products.sum(axis=0)
 
 
 class LinearPredictive(Controller):
-    """A sampled controller u(k) = u(k-1) + du(k) [V] whose du minimises a quadratic cost over a
-    horizon, on the incremental model (khalid section III).
+    """Predictive control u(k) = u(k-1) + du(k) [V] on the incremental model (khalid section III).
 
-    Fields of every such controller: model, operating_point, r_w, q, du_limit, u_low, u_high, Np,
-    mode. `mode`: "unconstrained" is the linear control law du = -K x_e, without limits; "clipped"
-    holds its du within du_limit and then u within [u_low, u_high]; "constrained" solves the
-    quadratic programme with these limits on the first `rows` samples ahead (khalid eq. 32, khalid
-    notes S4.4). u(k-1) is the input after the pumps' limits, which is the only anti-windup.
+    du minimises a quadratic cost over the horizon. u(k-1) is the input after the limits of the
+    pumps; there is no other anti-windup. Three modes:
 
-    dx_m is the change of the levels since the last sample. With an observer that estimates
-    disturbances d of the level rates [cm/s] it is that of the model at the estimate, instead of the
-    difference of two readings,
+    - "unconstrained": du = -K x_e, without limits.
+    - "clipped": the same du clipped to +-du_limit, then u clipped to [u_low, u_high].
+    - "constrained": the quadratic programme with these limits on the first `ahead` samples (khalid
+      eq. 32, khalid notes S4.4).
+
+    dx_m is the change of the levels since the last sample. Without an estimate of disturbances it
+    is the difference of two readings. If the observer estimates disturbances d of the level rates
+    [cm/s], dx_m is computed from the model:
 
         dx_m = W (f(x_hat) + g u(k-1) + d),   W = int_0^dt exp(-A s) ds
 
-    with A, the rig linearised at the operating point, and f + g u, the rates of the rig itself. The
-    noise of two readings over a short sample then does not enter, a change of d acts at once, and
-    where levels rest dx_m is 0 as before, so that the steady error stays 0.
+    A is the rig linearised at the operating point, f + g u the rates of the nonlinear rig. Then the
+    noise of two readings does not enter, and a change of d acts at once. At constant levels dx_m is
+    0 in both cases, so that the steady error stays 0.
 
     Examples
     --------
@@ -118,23 +121,24 @@ class LinearPredictive(Controller):
 
     @abc.abstractmethod
     def basis(self) -> jax.Array:
-        """Return (Np, m, variables): increments of the pumps over Np samples, by variable."""
+        """Return (Np, m, variables): increments of m pumps over Np samples for each variable."""
 
     def design(self, dt: float) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return (Omega (v, v), Psi (v, n+q), basis (Np, m, v)) for v variables, at sampling period
-        `dt` [s]; see `quadratic_cost`.
+        """Return (Omega (v, v), Psi (v, n+q), basis (Np, m, v)) of `quadratic_cost`.
+
+        v is the number of variables, `dt` the sampling period [s].
         """
         basis = self.basis()
         A, B, C = incremental_model(self.model, self.operating_point, dt, self._inputs())
         return *quadratic_cost(A, B, C, jnp.asarray(self.q), self.r_w, basis), basis
 
     def gain(self, dt: float) -> jax.Array:
-        """Return K (m, n+q) [V/cm] of du = -K [dx_m; y - r], at period `dt` [s]."""
+        """Return K (m, n+q) [V/cm] in du = -K [dx_m; y - r] at the sampling period `dt` [s]."""
         Omega, Psi, basis = self.design(dt)
         return basis[0] @ jnp.linalg.solve(Omega, Psi)
 
     def init(self, x0: tuple, u0: tuple) -> Any:
-        return Memory(x=x0, u=u0)
+        return LastSample(x=x0, u=u0)
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         x = estimate.x
@@ -150,36 +154,33 @@ class LinearPredictive(Controller):
         if self.mode == "clipped":
             du = [clip(du[i], -self.du_limit[i], self.du_limit[i]) for i in pumps]
         u = [state.u[i] + du[i] for i in pumps]
-        if (
-            self.mode != "unconstrained"
-            # with constraints this removes the residual of the interior point, some 1e-9 of the
-            # range
-        ):
+        # after the quadratic programme: the interior point may pass a limit by 1e-9 of the range
+        if self.mode != "unconstrained":
             u = [clip(u[i], self.u_low[i], self.u_high[i]) for i in pumps]
-        return tuple(u), Memory(x=x, u=state.u)
+        return tuple(u), LastSample(x=x, u=state.u)
 
     def _inputs(self):
-        """Inputs (m,) of the linear model [V]: the middle of their range where these matter."""
+        """Return inputs (m,) for the linear model [V]: 0 if linear in them, else the middle of the range."""
         if getattr(self.model, "plain", True):
             return jnp.zeros(self.model.pumps)
         middle = 0.5 * (jnp.asarray(self.u_low) + jnp.asarray(self.u_high))
         return jnp.where(jnp.isfinite(middle), middle, 0.5)
 
     def _change(self, state, tick, estimate):
-        """[change of each level since the last sample, dx_m] [cm]."""
+        """Return dx_m (n): the change of each level since the last sample [cm]."""
         if not estimate.d:
             return [a - b for a, b in zip(estimate.x, state.x)]
         A, _, _ = linearise(
-            dataclasses.replace(self.model, knee=EXACT), self.operating_point, self._inputs()
+            dataclasses.replace(self.model, knee=THRESHOLD), self.operating_point, self._inputs()
         )
-        n = range(self.model.tanks)
-        W = zero_order_hold(-A, jnp.eye(len(n)), tick.dt)[1]
+        tanks = range(self.model.tanks)
+        W = zero_order_hold(-A, jnp.eye(len(tanks)), tick.dt)[1]
         rates = self.model.derivative(tick.t, tuple(estimate.x), tuple(state.u), None)
-        moving = [rate + d for rate, d in zip(rates, estimate.d)]
-        return [sum(W[i, j] * moving[j] for j in n) for i in n]
+        rates = [rate + d for rate, d in zip(rates, estimate.d)]
+        return [sum(W[i, j] * rates[j] for j in tanks) for i in tanks]
 
-    def _constrained(self, before, error, dt):
-        """First increments (m,) of the programme, for inputs `before` (m), error x_e (n+q,)."""
+    def _constrained(self, last_inputs, error, dt):
+        """Return du (m,) from the quadratic programme; error: x_e (n+q,)."""
         Omega, Psi, basis = self.design(dt)
         steps = basis[: self.ahead]
         rows = jnp.concatenate([steps, jnp.cumsum(steps, axis=0)]).reshape(-1, Omega.shape[0])
@@ -187,16 +188,16 @@ class LinearPredictive(Controller):
             jnp.stack([v[i] for i in range(self.model.pumps)])
             for v in (self.du_limit, self.u_low, self.u_high)
         )
-        u = jnp.stack(before)
-        least = jnp.concatenate([jnp.tile(-limit, self.ahead), jnp.tile(low - u, self.ahead)])
-        most = jnp.concatenate([jnp.tile(limit, self.ahead), jnp.tile(high - u, self.ahead)])
-        return basis[0] @ qp.solve(2.0 * Omega, 2.0 * (Psi @ error), rows, least, most)
+        u = jnp.stack(last_inputs)
+        lower = jnp.concatenate([jnp.tile(-limit, self.ahead), jnp.tile(low - u, self.ahead)])
+        upper = jnp.concatenate([jnp.tile(limit, self.ahead), jnp.tile(high - u, self.ahead)])
+        return basis[0] @ qp.solve(2.0 * Omega, 2.0 * (Psi @ error), rows, lower, upper)
 
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return state._replace(u=applied)
 
     def check_pumps(self, actuator: Actuator) -> None:
-        """A quadratic programme that begins outside its range may be infeasible."""
+        """Raise InputError if the quadratic programme may be infeasible at the first sample."""
         if self.mode != "constrained":
             return
         unit = self.model.units[1]
@@ -206,17 +207,18 @@ class LinearPredictive(Controller):
                 for v in (self.u_low, self.u_high, actuator.initial, actuator.low, actuator.high)
             )
         )
-        for i, (low, high, before, bottom, top) in enumerate(pumps):
+        for i, (low, high, initial, pump_low, pump_high) in enumerate(pumps):
             limits = f"controller.u_low = {low:g} {unit} to controller.u_high = {high:g} {unit}"
-            if not low <= before <= high:
+            if not low <= initial <= high:
                 raise InputError(
-                    f"actuator.initial[{i}] = {before:g} {unit}: must lie within the limits of a"
+                    f"actuator.initial[{i}] = {initial:g} {unit}: must lie within the limits of a"
                     f" constrained controller, {limits}"
                 )
-            if bottom > high or top < low:
+            if pump_low > high or pump_high < low:
                 raise InputError(
-                    f"actuator.low[{i}] = {bottom:g} {unit} to {top:g} {unit}: must meet the limits"
-                    f" of a constrained controller, {limits}"
+                    f"actuator.low[{i}] = {pump_low:g} {unit}, actuator.high[{i}] = {pump_high:g}"
+                    f" {unit}: the range must overlap the limits of a constrained controller,"
+                    f" {limits}"
                 )
 
     def check(self, reference: Signal) -> None:
@@ -225,8 +227,8 @@ class LinearPredictive(Controller):
             if not abs(point[first] - point[second]) > 10 * self.model.knee:
                 raise InputError(
                     f"controller.operating_point = {point} {length}: levels joined by a pipe must"
-                    f" differ by more than {10 * self.model.knee:g} {length}, the model has no"
-                    " slope where they are equal (khalid notes H4)"
+                    f" differ by more than {10 * self.model.knee:g} {length}: at equal levels the"
+                    " model has no derivative (khalid notes H4)"
                 )
         if not np.all(np.asarray(self.u_low) < np.asarray(self.u_high)):
             raise InputError(

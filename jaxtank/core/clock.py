@@ -1,9 +1,9 @@
 """The clock of a run, and its samples: all at once, or chunk by chunk in a long run.
 
-What is known of every sample before the time loop starts (setpoints, noise) is then known of one
-chunk at a time, so that memory does not grow. A chunk can be asked for where every sample follows
-from its time alone; methods of which that is so are marked `pointwise`. A run with any other, such
-as recorded samples or a controller that looks ahead, is made in one chunk.
+Setpoints and noise are computed before the time loop. A long run computes them for one chunk at a
+time, so that memory does not grow. This needs methods whose samples depend on their own time alone;
+they are marked `pointwise`. A loop with another method (recorded samples, a controller with
+preview) runs in one chunk.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtank.core.errors import InputError
 
 CHUNK = 2**18  # samples
-# what is asked before the loop starts
+# methods of components that are called before the time loop
 METHODS = ("sample", "windows", "since", "prepare", "inputs")
 INTEGRATORS = ("rk4", "midpoint")
 LARGEST_RUN = 100_000_000  # samples
@@ -29,8 +29,8 @@ F = TypeVar("F")
 class Clock:
     """Sampling of the controller, and integration of the plant between samples.
 
-    Sample k is at t_k = k dt, k = 0 .. duration/dt rounded to a whole number: a run is made of
-    whole samples, and ends at (samples - 1) dt.
+    Sample k is at t_k = k dt, with k from 0 to duration/dt rounded to a whole number. A run ends at
+    its last sample, (samples - 1) dt.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class Clock:
 
 
 class Chunk(NamedTuple):
-    """Consecutive samples of a clock, in place of the Clock; `first` may be traced."""
+    """Consecutive samples of a clock, used instead of a Clock; `first` may be traced."""
 
     first: Any
     samples: int
@@ -83,12 +83,12 @@ def pointwise(method: F) -> F:
 
 
 def is_pointwise(part: Any) -> bool:
-    """Return whether a component, with all inside it, can be asked for its samples by chunks."""
+    """Return True if a component and its parts can compute their samples chunk by chunk."""
     cls = cast(Any, type(part))
     methods = [getattr(cls, name) for name in METHODS if hasattr(cls, name)]
-    inside = [getattr(part, field.name) for field in dataclasses.fields(part)]
+    values = [getattr(part, field.name) for field in dataclasses.fields(part)]
     return all(hasattr(method, "pointwise") for method in methods) and all(
-        map(is_pointwise, filter(dataclasses.is_dataclass, inside))
+        map(is_pointwise, filter(dataclasses.is_dataclass, values))
     )
 
 
@@ -104,11 +104,11 @@ def _meta(
     return {**meta, "strict": strict, "choices": choices}
 
 
-CLOCK = {  # what each field is, as metadata of a component's fields
+CLOCK = {  # metadata of each field, as for the fields of a component
     "dt": _meta("s", "sampling period of the controller (Ts)", low=0.0, strict=True),
     "duration": _meta("s", "length of the run", low=0.0, strict=True),
     "substeps": _meta("-", "integrator steps per sample", low=1, high=10),
-    "integrator": _meta("-", "fourth order, or second", choices=INTEGRATORS),
+    "integrator": _meta("-", "integrator, of fourth or second order", choices=INTEGRATORS),
 }
 
 CLOCK_UNITS: dict[str, str] = {name: meta["unit"] for name, meta in CLOCK.items()}
@@ -118,8 +118,8 @@ def check_clock(clock: Any) -> None:
     """Check that a clock describes a run."""
     if not isinstance(clock, Clock):
         raise InputError(
-            f"clock is a {type(clock).__name__}: must be a jaxtank.Clock, as case.clock (first the"
-            " loop, then the clock)"
+            f"clock is a {type(clock).__name__}: must be a jaxtank.Clock, such as case.clock (the"
+            " arguments are loop, clock, in this order)"
         )
     _check_duration(clock)
     substeps: Any = clock.substeps
@@ -132,7 +132,7 @@ def check_clock(clock: Any) -> None:
 
 
 def _check_duration(clock: Clock) -> None:
-    """Raise InputError for a sampling period or duration that gives no run, or too long a one."""
+    """Raise InputError if sampling period and duration give no run, or one that is too long."""
     for name in ("dt", "duration"):
         value = getattr(clock, name)
         real = isinstance(value, int | float) and not isinstance(value, bool)
@@ -142,7 +142,7 @@ def _check_duration(clock: Clock) -> None:
         raise InputError(
             f"clock.dt = {clock.dt:g} s: must be at most clock.duration = {clock.duration:g} s"
         )
-    # before it is rounded: it may be more than any whole number
+    # compared before rounding: the ratio may be inf, which round() refuses
     if not clock.duration / clock.dt < LARGEST_RUN:
         raise InputError(
             f"clock.duration / clock.dt = {clock.duration / clock.dt:.9g} samples: must be below"

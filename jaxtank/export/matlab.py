@@ -36,7 +36,7 @@ class Matlab(Printer):
     until = "if ~({0}), break; end"
 
 
-# arrays are written row by row, MATLAB keeps them column by column
+# the statements store arrays by rows, MATLAB by columns: reshape gives the transpose
 MATRICES = {
     "product": """
 function out = product_(m, k, n, a, b)
@@ -75,20 +75,20 @@ persistent return spmd switch try while isempty zeros reshape chol double true f
 nthroot isfinite fix abs max min sign rem round atan2 s t y r dr ddr u pick
 """
 RESERVED = frozenset(_RESERVED.split()) | set(FUNCTIONS)
-"""Names that the function may not have: keywords, functions that it calls, and its variables."""
+"""Names that the exported function must not have: keywords, called functions, its variables."""
 
 
 def print_matlab(program, name, precision):
     """Return a Program as the text of a MATLAB file with one function."""
     printer = Matlab()
-    begin = "s: state; give [] in the first period, and u, the inputs before it."
+    first_call = "s: state; [] in the first period, when u must be the inputs before it."
     first, after, u = (map(printer.value, e) for e in (program.first, program.after, program.u))
-    used = matrix_operations(program.step)
-    both = every([*program.step, *program.begin])
-    selects = any(isinstance(s, Define) and s.op == "select" for s in both)
+    operations = matrix_operations(program.step)
+    statements = every([*program.step, *program.begin])
+    selects = any(isinstance(s, Define) and s.op == "select" for s in statements)
     lines = [
         f"function [u, s] = {name}(s, t, y, r, dr, ddr, u)",
-        *header(program, "%", name, begin),
+        *header(program, "%", name, first_call),
         "    if isempty(s)",
         *printer.lines(program.begin, "        "),
         f"        s = zeros(1, {max(program.state, 1)});",
@@ -100,7 +100,7 @@ def print_matlab(program, name, precision):
         *(f"    u({j + 1}) = {e};" for j, e in enumerate(u)),
         *(f"    s({i + 1}) = next{i + 1};" for i in range(program.state)),
         "end",
-        *(text for op, text in MATRICES.items() if op in used),
+        *(text for op, text in MATRICES.items() if op in operations),
         *([PICK] if selects else []),
     ]
     return "\n".join(lines) + "\n"

@@ -1,6 +1,4 @@
-"""The bottom of a tank: whether liquid can be drawn out of a rig, and runs in which a level fell
-below it.
-"""
+"""Tank bottom: rigs from which liquid can be withdrawn, and runs with a level below 0."""
 
 from typing import Any, cast
 
@@ -13,12 +11,12 @@ from jaxtank.plants.tank_network import TankNetwork
 
 
 class TankBottomWarning(UserWarning):
-    """A level fell below an empty tank. The command prints a note of its own."""
+    """A level fell below 0. The command prints a note instead."""
 
 
 def can_withdraw(loop: ClosedLoop) -> bool:
-    """Return whether an inflow below 0, a pump that runs backwards, one that draws from a tank or a
-    valve can empty a tank, or one that has a shape.
+    """Return True if a negative inflow, a pump (backwards, or between tanks), a valve or the shape of
+    a tank can take a level below 0.
     """
     if any(getattr(loop.plant, name, ()) for name in ("sources", "valves", "shapes")):
         return True
@@ -30,20 +28,20 @@ def can_withdraw(loop: ClosedLoop) -> bool:
 
 
 def lower_bounds(plant: Any) -> Any:
-    """Levels (n,) [cm] below which a tank has given what it did not hold, but for rounding."""
+    """Return (n,) levels [cm] that are below 0 by more than rounding."""
     rim = np.broadcast_to(np.asarray(plant.rim, dtype=float), (plant.tanks,))
     return -np.minimum(getattr(plant, "knee", np.inf), 1e-3 * np.where(np.isfinite(rim), rim, 1.0))
 
 
 def is_open(loop: ClosedLoop) -> bool:
-    """Return whether levels may fall below 0: a network without `bottom`, or a user's plant."""
-    kind: Any = type(loop.plant)  # a subclass may have flows of its own
+    """Return True if levels may fall below 0: a network without `bottom`, or a custom plant."""
+    kind: Any = type(loop.plant)  # a subclass may define other flows
     network = kind.derivative is cast(Any, TankNetwork).derivative
     return not loop.plant.bottom and (not network or can_withdraw(loop))
 
 
 def tank_bottom_warnings(loop: ClosedLoop, run: Trajectory) -> list[str]:
-    """A sentence for each tank whose level falls below 0: how far, when, which volume."""
+    """Return a sentence for each tank whose level falls below 0: level, time and volume."""
     plant: Any = loop.plant
     x, length = np.asarray(run.x), loop.units[0]
     sentences: list[str] = []
@@ -53,8 +51,8 @@ def tank_bottom_warnings(loop: ClosedLoop, run: Trajectory) -> list[str]:
             continue
         area = np.ravel(np.asarray(getattr(plant, "area", np.nan), dtype=float))
         volume = -column.min() * (area[i] if area.size == plant.tanks else np.nan)
-        amount = f", {volume:.4g} {length}^3 that it did not hold" if np.isfinite(volume) else ""
-        remedy = "limit the outflow in its derivative"
+        amount = f", {volume:.4g} {length}^3 more than the tank held" if np.isfinite(volume) else ""
+        remedy = "limit the outflow in the derivative of the plant"
         if isinstance(plant, TankNetwork):
             remedy = "plant.bottom = true stops it at 0"
         sentences.append(

@@ -65,8 +65,8 @@ def check(
     """
     if not hasattr(loop, "plant"):
         raise InputError(
-            f"loop is a {type(loop).__name__}: must be a ClosedLoop, as case.loop (first the loop,"
-            " then the clock)"
+            f"loop is a {type(loop).__name__}: must be a ClosedLoop, such as case.loop (the"
+            " arguments are loop, clock, in this order)"
         )
     check_clock(clock)
     check_key(key)

@@ -13,7 +13,7 @@ from jaxtank.core.units import DEFAULT, local
 from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context
 from jaxtank.measures.catalogue import MEASURES, Measure
 from jaxtank.measures.functions import from_function, functions
-from jaxtank.xla.signatures import OWN
+from jaxtank.xla.signatures import CUSTOM_MEASURES
 
 BUILT_IN = frozenset(MEASURES)
 GROUP = "jaxtank.measures"
@@ -95,7 +95,7 @@ def register(
         jax.clear_caches()  # compiled runs know a measure by its name
     ACCUMULATORS.update(added)
     MEASURES[name] = _COMPILED[name] = measure
-    OWN.add(name)
+    CUSTOM_MEASURES.add(name)
     return measure
 
 

@@ -1,7 +1,7 @@
-"""What a compiled program depends on, written down: equal words mean an equal program.
+"""The key of a compiled program in the cache: equal words mean an equal program.
 
-Types, shapes and static values of the arguments, the source of this package, jax and its settings.
-What cannot be written down exactly, as a class of a user's own, is `Unknown`.
+The words hold types, shapes and static values of the arguments, the source of both packages, the
+version of jax and its settings. A value without exact words, such as a user's class, is `Unknown`.
 """
 
 import dataclasses
@@ -23,27 +23,27 @@ import jax
 import numpy as np
 
 OURS = ("jaxtank", "tuning")
-"""Packages whose classes and functions are known by name, and by the digest of their source."""
+"""Packages whose classes and functions are identified by name; the key has their source files."""
 
 IGNORED = ("cache", "log", "dump", "traceback", "debug")
-"""Parts of names of settings of jax that no program depends on."""
+"""Settings of jax with one of these words in their name have no effect on a program."""
 
-OWN: set[str] = set()
-"""Names of measures of a user's own: what they compute is not known by name."""
+CUSTOM_MEASURES: set[str] = set()
+"""Names of measures that a user has registered: the name does not determine the function."""
 
 
 class Unknown(Exception):
-    """What is not known by name and value: the program is traced."""
+    """A value has no exact words: its program is not kept, and is traced in each process."""
 
 
 def signature(words: list[str]) -> str:
-    """Return the digest of a program: of `words` and of all that holds for this process."""
+    """Return the digest of `words` and of the words of this process."""
     return hashlib.sha256("\0".join([*_process(), *words]).encode()).hexdigest()
 
 
 @functools.cache
 def _process() -> list[str]:
-    """What every program of this process depends on."""
+    """Return words for versions, settings, devices and source files: the same for all programs."""
     config: Any = jax.config
     settings = {n: repr(v) for n, v in config.values.items() if not any(i in n for i in IGNORED)}
     versions = [sys.version, *(importlib.metadata.version(n) for n in ("jax", "jaxlib", "numpy"))]
@@ -53,7 +53,7 @@ def _process() -> list[str]:
 
 
 def _source() -> Iterator[str]:
-    """Names, sizes and times of the files of our packages, which change with every edit."""
+    """Yield path, size and time of each source file of both packages: an edit changes them."""
     for package in OURS:
         spec = importlib.util.find_spec(package)
         for root in (spec.submodule_search_locations or []) if spec else []:
@@ -63,13 +63,13 @@ def _source() -> Iterator[str]:
 
 
 def context() -> tuple[Any, ...]:
-    """The settings of jax that may differ from one call to the next."""
+    """Return the settings of jax that may change between two calls."""
     config: Any = jax.config
     return config.jax_enable_x64, config.jax_debug_nans, config.jax_default_matmul_precision
 
 
 def kind_of(leaf: Any) -> Any:
-    """Shape, type and weakness of an array or a number; None for anything else."""
+    """Return shape, dtype, weak_type and committed of an array; None for anything else."""
     if isinstance(leaf, bool | int | float):
         return type(leaf).__name__
     if isinstance(leaf, jax.Array):
@@ -81,11 +81,11 @@ def kind_of(leaf: Any) -> Any:
 
 
 def words_of(value: Any) -> list[str]:
-    """Words that are the same for equal static values alone; Unknown where there are none."""
-    plain = (bool, int, float, str, bytes, type(None))
-    if isinstance(value, str) and value in OWN:
+    """Return words that are equal only for equal static values; raise Unknown if there are none."""
+    scalars = (bool, int, float, str, bytes, type(None))
+    if isinstance(value, str) and value in CUSTOM_MEASURES:
         raise Unknown
-    if type(value) in plain or isinstance(value, np.dtype):
+    if type(value) in scalars or isinstance(value, np.dtype):
         return [f"{type(value).__name__} {value!r}"]
     if isinstance(value, np.generic):
         return [f"{value.dtype} {value.item()!r}"]
@@ -111,19 +111,19 @@ def words_of(value: Any) -> list[str]:
 
 
 def words_of_tree(tree: Any) -> list[str]:
-    """The same of a structure of arguments."""
+    """Return `words_of` for the tree structure of the arguments."""
     node = tree.node_data()
     if node is None:
         return [f"leaf {tree.num_leaves}"]
     kind, static = node
     children = tree.children()
-    below = [word for child in children for word in words_of_tree(child)]
-    return [f"{name_of(kind)} {len(children)}", *words_of(static), *below]
+    child_words = [word for child in children for word in words_of_tree(child)]
+    return [f"{name_of(kind)} {len(children)}", *words_of(static), *child_words]
 
 
-def name_of(thing: Any) -> str:
-    """Module and name of a class or function of ours, of jax or of Python itself."""
-    module, name = thing.__module__, thing.__qualname__
+def name_of(definition: Any) -> str:
+    """Return module and name of a class or function; raise Unknown for a user's definition."""
+    module, name = definition.__module__, definition.__qualname__
     if module.split(".")[0] not in (*OURS, "builtins", "jax", "jaxlib") or "<" in name:
         raise Unknown
     return f"{module}:{name}"

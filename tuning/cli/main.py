@@ -1,9 +1,8 @@
 """The command `jaxtank`. Results on stdout, progress and errors on stderr.
 
-Exit codes: 0 done (and every limit holds), 1 internal error, 2 bad input (one line, nothing
-written), 3 not converged, 4 a limit is violated (`attack`: passed), 5 bad data file,
-130 interrupted, 143 terminated (the best point so far of a search is written and printed). Nothing
-heavy is imported before the arguments are read.
+Exit codes: 0 done and every limit holds, 1 internal error, 2 bad input (one line on stderr, no file
+written), 3 not converged, 4 a limit is violated, 5 bad data file, 130 interrupted, 143 terminated
+(a search still writes and prints its best point). Slow imports follow after the arguments are read.
 """
 
 import os
@@ -17,13 +16,13 @@ def main(argv=None):
     """Run the command and return its exit code."""
     if argv is None:
         terminal.guard()
-        interrupts.listen()  # before anything that takes time is imported
+        interrupts.listen()  # before the slow imports
         import warnings
 
-        # the note is printed once, where the case is opened
+        # a note says the same, printed once when the case is opened
         warnings.filterwarnings("ignore", message=".* runs empty faster than the steps follow")
         warnings.filterwarnings("ignore", message="the level of tank .* falls below 0")
-        warnings.showwarning = _shown(warnings.showwarning)
+        warnings.showwarning = _with_cluster_notes(warnings.showwarning)
     try:
         code = _command(argv)
         sys.stdout.flush()
@@ -36,13 +35,13 @@ def main(argv=None):
 
 
 def _command(argv):
-    """Read the arguments and run their command; returns its exit code."""
+    """Parse the arguments, run the command and return its exit code."""
     from tuning.cli.parser import COMMANDS, arguments
     from tuning.storage.folder_lock import hold
 
     try:
         args = arguments(argv)
-    except SystemExit:  # --help, which may wait in a buffer
+    except SystemExit:  # after --help, whose text may still be in the buffer
         sys.stdout.flush()
         raise
     if args.version:
@@ -55,24 +54,24 @@ def _command(argv):
         _keep_programs(args)
     with hold(args.out, leaving=interrupts.before_leaving), interrupts.restored():
         code = args.run(args)
-        sys.stdout.flush()  # the answer is out before Ctrl-C ends the program at once again
+        sys.stdout.flush()  # print the answer before Ctrl-C is again allowed to end the program
         return code
 
 
-def _shown(other):
-    """Return what shows a warning: one on a cluster as a note, `other` any other one."""
+def _with_cluster_notes(show_other):
+    """Return a `warnings.showwarning` that prints a ClusterWarning as a note."""
 
     def show(message, category, *where):
         if category.__name__ == "ClusterWarning":
             print(f"jaxtank: note: {message}", file=sys.stderr)
         else:
-            other(message, category, *where)
+            show_other(message, category, *where)
 
     return show
 
 
 def _keep_programs(args):
-    """Use the programs that earlier calls have compiled, and keep those of this one."""
+    """Read compiled programs from the cache, and write new ones to it."""
     from jaxtank.xla.program_cache import keep_for_this_process
 
     why = keep_for_this_process()
@@ -81,13 +80,13 @@ def _keep_programs(args):
 
 
 def _failed(error):
-    """Print an exception in one line; returns the exit code."""
+    """Print an exception in one line and return the exit code."""
     from jaxtank.core.errors import DataError, InputError, NonFiniteError
     from jaxtank.core.text import one_line
 
     if isinstance(error, (InputError, NonFiniteError)):
         words, code = one_line(error), 5 if isinstance(error, DataError) else 2
-    elif isinstance(error, BrokenPipeError):  # the reader of our output has closed it
+    elif isinstance(error, BrokenPipeError):  # the reader of stdout has closed the pipe
         _drop_output()
         return 0
     elif isinstance(error, OSError):
@@ -98,7 +97,7 @@ def _failed(error):
     else:
         words = (
             f"internal error: {type(error).__name__}: {one_line(error)}"
-            " (JAXTANK_TRACEBACK=1 shows where)"
+            " (JAXTANK_TRACEBACK=1 prints the traceback)"
         )
         code = 1
     print(f"jaxtank: {words}", file=sys.stderr)
@@ -108,7 +107,7 @@ def _failed(error):
 
 
 def _drop_output():
-    """Discard what stdout cannot take (a closed pipe, a full disk) so that the end is quiet."""
+    """Discard unwritten output after a closed pipe or a full disk: no second error at exit."""
     try:
         sys.stdout.flush()
     except OSError:

@@ -133,7 +133,8 @@ def _estimates(problem, e, z, residual, jacobian):
     )
     spread, values = Spread(alone, fit), coordinates.values(p)
     covariance = spread.values_covariance
-    covariance[spread.hidden], covariance[:, spread.hidden] = np.nan, np.nan
+    absent = spread.without_interval
+    covariance[absent], covariance[:, absent] = np.nan, np.nan
     half = spread.quantile * np.sqrt(np.diag(covariance))[: coordinates.size]
     return (
         np.array([values[n] for n in coordinates.names]),

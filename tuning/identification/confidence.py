@@ -1,4 +1,4 @@
-"""Confidence in a fit: standard deviations, 95 % intervals, and what is not identifiable."""
+"""Confidence in a fit: standard deviations, 95 % intervals, unidentifiable directions."""
 
 import math
 from collections.abc import Sequence
@@ -14,12 +14,12 @@ from tuning.identification.least_squares import Fit
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import autocorrelation, pseudo
 
-VAGUE = 0.5
+LARGEST_DEVIATION = 0.5
 """Standard deviation of a direction, in units of its coordinates (logarithms, shares of a range),
-above which it is not identifiable.
+above which the direction is not identifiable.
 """
 ROUND_OFF = 1e-9
-"""Singular value, as a share of the largest, below which a direction is one of round-off."""
+"""Singular value, as a share of the largest, below which a direction is only round-off."""
 SHARE = 0.1
 """Share of a direction's largest entry above which a parameter is named as part of it."""
 
@@ -27,12 +27,12 @@ SHARE = 0.1
 class Spread:
     """Covariance of the estimates from J'J, without the directions that are not identifiable."""
 
-    # Where residuals are correlated from sample to sample, as those of a model that differs from
-    # the rig, the covariance is the sandwich (J'J)^-1 S (J'J)^-1, with S of Newey and West
-    # (Econometrica 55, 1987, 703) or S = J' C J with C that of first-order noise with the
-    # residuals' autocorrelation, whichever is wider: the first is too narrow for slow noise, the
-    # second for slow noise under fast noise. `widened` is the factor by which this widens the
-    # intervals.
+    # A model that differs from the rig leaves residuals that are correlated from sample to sample.
+    # The covariance is then the sandwich (J'J)^-1 S (J'J)^-1. Two estimates of S are computed and
+    # the wider one is used: Newey and West (Econometrica 55, 1987, 703), too narrow for slow noise;
+    # and S = J' C J, too narrow for slow noise under fast noise, where C is the correlation of
+    # first-order noise with the autocorrelation of the residuals. `widened` is the ratio of the
+    # intervals to those of white noise.
 
     def __init__(self, estimation: Estimation, fit: Fit, correlation: Sequence[float] = ()):
         self.estimation, self.fit, self.residual = estimation, fit, pseudo(fit)
@@ -43,42 +43,46 @@ class Spread:
         inside = np.flatnonzero(~self.at_bound)
         self._decompose(inside)
         # a search along an insensitive direction may end at a bound that the data do not determine
-        if self.open.any():
-            count = self.open.sum()
+        if self.open_axes.any():
+            count = self.open_axes.sum()
             self._decompose(np.arange(z.size))
-            if self.open.sum() == count:
+            if self.open_axes.sum() == count:
                 self._decompose(inside)
         self._set_covariance(correlation)
-        # an unknown is vague if an open direction moves it further than its own deviation
+        # an open direction that changes an unknown by more than half of the unknown's deviation
         sd = np.sqrt(np.maximum(np.diag(self.covariance), 0))
-        self.vague = np.zeros(estimation.size, dtype=bool)
-        for axis, reach in zip(self.axes[self.open], np.minimum(self.sd_of_axes[self.open], 1.0)):
-            self.vague[self.moving[np.abs(axis) * reach > np.maximum(0.5 * sd, 1e-6)]] = True
-        self.at_bound &= ~self.vague
-        self.hidden = self._with_branches(self.vague | self.at_bound)  # without an interval
+        self.unidentifiable = np.zeros(estimation.size, dtype=bool)
+        reaches = np.minimum(self.sd_of_axes[self.open_axes], 1.0)
+        for axis, reach in zip(self.axes[self.open_axes], reaches):
+            exceeded = np.abs(axis) * reach > np.maximum(0.5 * sd, 1e-6)
+            self.unidentifiable[self.estimated[exceeded]] = True
+        self.at_bound &= ~self.unidentifiable
+        self.without_interval = self._with_partners(self.unidentifiable | self.at_bound)
         self.quantile = float(student.ppf(0.975, self.freedom))  # 95 %, two-sided
         self.values_covariance = self._covariance_of_values()
         self.sd = np.sqrt(np.diag(self.values_covariance))
 
-    def _decompose(self, moving):
-        """Set singular values and axes of the Jacobian by the unknowns `moving`."""
-        # `open`: which axes are not identifiable.
-        self.moving, residual = moving, self.residual
-        self.freedom = max(residual.size - moving.size, 1)
+    def _decompose(self, estimated):
+        """Set the singular values and axes of the Jacobian with respect to `estimated` unknowns."""
+        # `open_axes`: True for an axis that is not identifiable.
+        self.estimated, residual = estimated, self.residual
+        self.freedom = max(residual.size - estimated.size, 1)
         self.scale = float(residual @ residual) / self.freedom
-        slopes = self.fit.jacobian[:, moving]
+        slopes = self.fit.jacobian[:, estimated]
         _, self.singular, self.axes = np.linalg.svd(slopes, full_matrices=False)
         with np.errstate(divide="ignore", invalid="ignore"):
             sd = np.where(self.singular > 0, np.sqrt(self.scale) / self.singular, np.inf)
         self.sd_of_axes = sd
-        self.open = (sd > VAGUE) | (self.singular < ROUND_OFF * self.singular.max(initial=0.0))
+        round_off = self.singular < ROUND_OFF * self.singular.max(initial=0.0)
+        self.open_axes = (sd > LARGEST_DEVIATION) | round_off
 
     def _set_covariance(self, correlation):
-        """Set `covariance` of the unknowns `moving` and `widened`, for residuals with this
-        correlation from sample to sample in each channel.
+        """Set `covariance` of the `estimated` unknowns, and `widened`.
+
+        correlation : autocorrelation of the residuals at lag 1, for each channel.
         """
         n = self.fit.residual.size
-        s, vt = self.singular[~self.open], self.axes[~self.open]
+        s, vt = self.singular[~self.open_axes], self.axes[~self.open_axes]
         inverse = (vt.T / s**2) @ vt
         white = inverse * self.scale
         self.covariance, self.widened = white, 1.0
@@ -101,23 +105,23 @@ class Spread:
             [np.abs(autocorrelation(residual[..., c], longest)) for c in range(shape[-1])], axis=0
         )
         lags = int(min([longest, *2 * np.flatnonzero(acf < 0.1)[:1]]))
-        score = np.zeros((*shape, self.moving.size))
-        score[estimation.mask] = self.fit.jacobian[:, self.moving] * self.residual[:, None]
-        # Bartlett's weights 1 - lag / (lags + 1) are those of sums over windows of lags + 1 samples
+        score = np.zeros((*shape, self.estimated.size))
+        score[estimation.mask] = self.fit.jacobian[:, self.estimated] * self.residual[:, None]
+        # sums over windows of lags + 1 samples have Bartlett's weights 1 - lag / (lags + 1)
         score = np.concatenate(
-            [score.sum(axis=2), np.zeros((shape[0], lags, self.moving.size))], axis=1
+            [score.sum(axis=2), np.zeros((shape[0], lags, self.estimated.size))], axis=1
         )
         window = np.cumsum(score, axis=1)
         window[:, lags + 1 :] -= window[:, : -lags - 1].copy()
         return np.einsum("eki,ekj->ij", window, window) / (lags + 1)
 
     def _first_order(self):
-        """Return J' C J with C of noise correlated as rho^(time / median step) in a channel."""
-        estimation, size = self.estimation, self.moving.size
+        """Return J' C J; within a channel C is rho^(time difference / median step)."""
+        estimation, size = self.estimation, self.estimated.size
         shape, dt = estimation.mask.shape, estimation.data.steps
         residual, slopes = np.full(shape, np.nan), np.zeros((*shape, size))
         residual[estimation.mask] = self.residual
-        slopes[estimation.mask] = self.fit.jacobian[:, self.moving]
+        slopes[estimation.mask] = self.fit.jacobian[:, self.estimated]
         samples = np.mean([log.samples for log in estimation.logs])
         steps, total = dt / np.median(dt[dt > 0]), np.zeros((size, size))
         for c in range(shape[-1]):
@@ -125,7 +129,7 @@ class Spread:
             rho = float(np.clip(rho + (1 + 4 * rho) / samples, 0.0, 0.999))
             variance = np.nanmean(residual[..., c] ** 2) * self.fit.residual.size / self.freedom
             J = slopes[:, :, c]
-            # the sum of rho^(time since) J of all earlier samples
+            # sum over all earlier samples of rho^(time difference / median step) J
             if np.ptp(steps[dt > 0]) < 1e-6:
                 before = lfilter([0.0, rho], [1.0, -rho], J, axis=1)
             else:
@@ -137,19 +141,19 @@ class Spread:
         return total
 
     def _covariance_of_values(self):
-        """Return (unknowns, unknowns) covariance in the rig's units, zero where one is fixed."""
+        """Return (unknowns, unknowns) covariance in the rig's units, zero for fixed unknowns."""
         est = self.estimation
         full = np.zeros((est.size, est.size))
-        full[np.ix_(self.moving, self.moving)] = self.covariance
+        full[np.ix_(self.estimated, self.estimated)] = self.covariance
         slopes: Any = block_diag(est.coordinates.slopes(self.fit.p), np.diag(est.level_scale))
         return slopes @ full @ slopes.T
 
-    def _with_branches(self, chosen):
-        """Return (unknowns,) bool: `chosen`, of a branch pair both."""
-        chosen = chosen.copy()
+    def _with_partners(self, flags):
+        """Return `flags` (unknowns,); if one gain of a branch pair has the flag, both have it."""
+        flags = flags.copy()
         for pair in self.estimation.coordinates.pairs:
-            chosen[pair] = chosen[pair].any()
-        return chosen
+            flags[pair] = flags[pair].any()
+        return flags
 
     def parameters(self):
         """Return {name: {"before", "value", "unit", "lower", "upper", "sd", "interval95", ...}}."""
@@ -165,10 +169,11 @@ class Spread:
                 "unit": b.unit,
                 "lower": b.low,
                 "upper": b.high,
-                "sd": None if self.hidden[i] else float(self.sd[i]),
-                "interval95": None if self.hidden[i] else interval,
+                "sd": None if self.without_interval[i] else float(self.sd[i]),
+                "interval95": None if self.without_interval[i] else interval,
                 "identifiable": bool(
-                    not self.vague[i] and (self.at_bound[i] or not self.hidden[i])
+                    not self.unidentifiable[i]
+                    and (self.at_bound[i] or not self.without_interval[i])
                 ),
                 "at_bound": bool(self.at_bound[i]),
             }
@@ -183,36 +188,36 @@ class Spread:
         free = [(e, tank) for e in range(len(est.logs)) for tank in est.tanks]
         for i, (e, tank) in enumerate(free, est.coordinates.size):
             value, half = float(levels[e, tank]), self.quantile * float(self.sd[i])
-            if not self.hidden[i]:
+            if not self.without_interval[i]:
                 rows[e][tank]["interval95"] = [max(value - half, 0.0), value + half]
         return rows
 
     def covariance_of_parameters(self):
-        """Return (names, (n, n)) of the parameters that have an interval, in their own units."""
+        """Return (names, (n, n) covariance) of the parameters with an interval, in their units."""
         names = self.estimation.coordinates.names
-        present = np.flatnonzero(~self.hidden[: len(names)])
+        present = np.flatnonzero(~self.without_interval[: len(names)])
         return tuple(names[i] for i in present), self.values_covariance[np.ix_(present, present)]
 
     def directions(self):
-        """Return what is not identifiable, the least certain direction first."""
+        """Return the directions that are not identifiable, the least certain first."""
         est, rows = self.estimation, []
         z, shared, units = est.unknowns(self.fit), est.coordinates.size, self._units()
         for axis, sd in zip(*self._open_directions()):
             step = np.zeros(est.size)
-            step[self.moving] = axis
+            step[self.estimated] = axis
             size = np.abs(step)
             largest = np.argmax(size)
             step *= math.log(1.1) / max(size[largest], 1e-300) * (-1 if step[largest] < 0 else 1)
-            now, then = (est.coordinates.values(v[:shared]) for v in (z, z + step))
+            start, end = (est.coordinates.values(v[:shared]) for v in (z, z + step))
             factors, words = {}, []
-            for i in np.flatnonzero(self._with_branches(size > SHARE * size.max())):
+            for i in np.flatnonzero(self._with_partners(size > SHARE * size.max())):
                 name = est.names[i]
-                if now.get(name):
-                    factors[name] = float(then[name] / now[name])
+                if start.get(name):
+                    factors[name] = float(end[name] / start[name])
                     words.append(f"{name} x {factors[name]:.3g}")
                     continue
-                # of a level, or of a value that is 0: by how much it changes
-                change = then[name] - now[name] if name in now else step[i] * units[name][0]
+                # a level, or a parameter with value 0: the change, not a factor
+                change = end[name] - start[name] if name in start else step[i] * units[name][0]
                 factors[name] = float(change)
                 words.append(f"{name} {factors[name]:+.2g} {units[name][1]}".rstrip(" -"))
             deviation = float(sd) if np.isfinite(sd) else None
@@ -228,42 +233,42 @@ class Spread:
 
     def _open_directions(self):
         """Return (axes, standard deviations) of the open directions, the least certain first."""
-        axes, sd = self.axes[self.open][::-1], self.sd_of_axes[self.open][::-1]
+        axes, sd = self.axes[self.open_axes][::-1], self.sd_of_axes[self.open_axes][::-1]
         if len(axes) < 2:
             return axes, sd
         _, order = cast(Any, qr(axes, pivoting=True, mode="r"))
-        lead = order[: len(axes)]
-        plain = np.linalg.solve(axes[:, lead], axes)
-        # of the unknown that leads each combination
-        reach = np.sqrt(np.square(np.minimum(sd, 1e150)) @ np.square(axes[:, lead]))
-        order = np.argsort(-reach, kind="stable")
-        return plain[order], np.where(reach < 1e100, reach, np.inf)[order]
+        pivots = order[: len(axes)]
+        combinations = np.linalg.solve(axes[:, pivots], axes)
+        # standard deviation of the pivot unknown of each combination
+        pivot_sd = np.sqrt(np.square(np.minimum(sd, 1e150)) @ np.square(axes[:, pivots]))
+        order = np.argsort(-pivot_sd, kind="stable")
+        return combinations[order], np.where(pivot_sd < 1e100, pivot_sd, np.inf)[order]
 
     def worst(self):
         """Return (name, standard deviation of its coordinate) of the least certain parameter."""
-        # None for the standard deviation of one that is not identifiable.
+        # The standard deviation is None if the parameter is not identifiable.
         coordinates, shared = self.estimation.coordinates, self.estimation.coordinates.size
-        if self.vague[:shared].any():
+        if self.unidentifiable[:shared].any():
             part = np.zeros(self.estimation.size)
-            part[self.moving] = np.abs(self._open_directions()[0][0])
-            largest = np.argmax(np.where(self.vague[:shared], part[:shared], -1.0))
+            part[self.estimated] = np.abs(self._open_directions()[0][0])
+            largest = np.argmax(np.where(self.unidentifiable[:shared], part[:shared], -1.0))
             return coordinates.names[int(largest)], None
-        plain = self.estimation.without_branch_gains().coordinates
-        slopes = np.diag(plain.slopes(plain.point(coordinates.values(self.fit.p))))
+        separate = self.estimation.without_branch_gains().coordinates
+        slopes = np.diag(separate.slopes(separate.point(coordinates.values(self.fit.p))))
         sd = dict(zip(coordinates.names, self.sd))
-        relative = {n: sd[n] / abs(slope) for n, slope in zip(plain.names, slopes)}
+        relative = {n: sd[n] / abs(slope) for n, slope in zip(separate.names, slopes)}
         name = max(relative, key=relative.__getitem__)
         return name, float(relative[name])
 
 
 def _within(meta, low, high):
-    """Return [low, high] within the parameter's own range."""
+    """Return [low, high] clipped to the physical range of the parameter."""
     least, most = meta["low"], meta["high"]
     return [low if least is None else max(low, least), high if most is None else min(high, most)]
 
 
 def at_search_bounds(loop, parameters):
-    """Return names of the parameters at a bound of their search that is not one of their range."""
+    """Return the parameters at a bound of the search that is no bound of their physical range."""
     names = []
     for name, p in parameters.items():
         meta = describe(loop, name)

@@ -1,5 +1,5 @@
-"""Experiment design: candidate inputs, the standard deviations that each would leave, and which
-experiment would identify what the data do not.
+"""Experiment design: candidate inputs, the standard deviations that each would give, and
+experiments for the parameters that the data do not determine.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.loop.steady import steady_state
 from jaxtank.plants.runge_kutta import advance
 from tuning.identification import simulation
-from tuning.identification.confidence import VAGUE
+from tuning.identification.confidence import LARGEST_DEVIATION
 from tuning.identification.coordinates import coordinates_of, free_bounds, nominal
 from tuning.identification.result import Experiments
 
@@ -31,61 +31,61 @@ REGISTER = 7
 
 
 def prbs(bits, channel):
-    """Return (bits,) of +-1: a maximum-length sequence of x^7 + x^6 + 1."""
-    state, out = [1] * REGISTER, []
+    """Return (bits,) of +-1: the maximum-length sequence of x^7 + x^6 + 1, shifted by channel."""
+    state, sequence = [1] * REGISTER, []
     for _ in range(2**REGISTER - 1):
-        out.append(state[-1])
+        sequence.append(state[-1])
         state = [state[-1] ^ state[-2], *state[:-1]]
-    shift = channel * (len(out) // 3)
-    return np.array([2 * out[(i + shift) % len(out)] - 1 for i in range(bits)], dtype=float)
+    period = len(sequence)
+    shift = channel * (period // 3)
+    return np.array([2 * sequence[(i + shift) % period] - 1 for i in range(bits)], dtype=float)
 
 
 def candidates(loop, *, duration, dt, size=None, voltage=None, bit=None):
-    """Return inputs to compare, {description: (t (samples,) [s], u (samples, pumps), x0
-    (tanks,))}.
-    """
+    """Return {description: (t (samples,) [s], u (samples, pumps), x0 (tanks,))} to compare."""
     pumps = loop.plant.pumps
     t = np.arange(round(duration / dt) + 1) * dt
     low, high = np.asarray(loop.actuator.low), np.asarray(loop.actuator.high)
     voltage = _operating_point(loop) if voltage is None else voltage
     voltage = np.broadcast_to(np.asarray(voltage, dtype=float), (pumps,))
     size = 0.1 * voltage if size is None else np.broadcast_to(np.asarray(size, float), (pumps,))
-    steady, empty = np.asarray(settled(loop.plant, voltage), float), np.zeros(loop.plant.tanks)
+    steady = np.asarray(settled_levels(loop.plant, voltage), float)
+    empty = np.zeros(loop.plant.tanks)
     bit = duration / 20 if bit is None else bit
     bits = int(duration / bit)
-    at = np.minimum((t / bit + 1e-9).astype(int), bits)
-    signs = np.stack([prbs(bits + 1, j)[at] for j in range(pumps)], axis=1)
-    j, past, third = np.arange(pumps), t[:, None] + 1e-9, duration / (pumps + 1)
-    later = (past >= j * duration / max(pumps, 1)).astype(float)
-    up = (past >= j * third) & (past < (j + pumps) * third)
+    current_bit = np.minimum((t / bit + 1e-9).astype(int), bits)
+    signs = np.stack([prbs(bits + 1, j)[current_bit] for j in range(pumps)], axis=1)
+    pump, time, part = np.arange(pumps), t[:, None] + 1e-9, duration / (pumps + 1)
+    in_turn = (time >= pump * duration / max(pumps, 1)).astype(float)
+    staggered = (time >= pump * part) & (time < (pump + pumps) * part)
     constant = np.ones((len(t), 1))
     inputs = {
         AT_ONCE: (voltage * constant, empty),
-        IN_TURN: (voltage * later, empty),
+        IN_TURN: (voltage * in_turn, empty),
         SMALL: ((voltage + size) * constant, steady),
-        STAGGERED: (voltage + size * up, steady),
+        STAGGERED: (voltage + size * staggered, steady),
         BINARY: (voltage + size * signs, steady),
     }
     return {name: (t, np.clip(u, low, high), x0) for name, (u, x0) in inputs.items()}
 
 
-def settled(plant, voltage):
-    """Return (n,) steady levels at constant inputs, by simulation until nothing moves."""
+def settled_levels(plant, voltage):
+    """Return (n,) levels after a long simulation with constant inputs: the steady levels."""
     x = tuple(jnp.zeros(()) + 1.0 for _ in range(plant.tanks))
     u = tuple(jnp.asarray(v) for v in voltage)
-    size = float(np.max(np.asarray(plant.rim)))
-    half = tuple(jnp.asarray(0.5 * size) for _ in range(plant.tanks))
+    height = float(np.max(np.asarray(plant.rim)))
+    half = tuple(jnp.asarray(0.5 * height) for _ in range(plant.tanks))
     rate = max(abs(float(v)) for v in plant.derivative(0.0, half, u, None))
-    h = 0.02 * size / max(rate, 1e-12)
+    h = 0.02 * height / max(rate, 1e-12)
     step = lambda x, _: (advance(plant, "rk4", 0.0, x, u, None, h, 1).x, None)
     x, _ = jax.lax.scan(step, x, None, length=20_000)
     return np.array([max(float(v), 0.0) for v in x])
 
 
 def _operating_point(loop):
-    """Return (pumps,) inputs at which the case's pumps run before it starts."""
-    # Where they stand, those of its first setpoint, else half of their range; less where a tank
-    # would come near its rim.
+    """Return (pumps,) inputs about which a candidate experiment varies the pumps."""
+    # The initial inputs of the case; if one is about 0, the steady inputs of the first setpoint; if
+    # there are none, half of the range. Reduced while a steady level is above 80 % of its rim.
     plant, high = loop.plant, np.asarray(loop.actuator.high, dtype=float)
     high = np.where(np.isfinite(high), high, 2.0)
     inputs = np.asarray(loop.actuator.initial, dtype=float)
@@ -95,7 +95,7 @@ def _operating_point(loop):
     if not (np.all(np.isfinite(inputs)) and np.all(inputs > 0.02 * high)):
         inputs = 0.5 * high
     for _ in range(20):
-        if np.max(settled(plant, inputs) / np.asarray(plant.rim)) < 0.8:
+        if np.max(settled_levels(plant, inputs) / np.asarray(plant.rim)) < 0.8:
             break
         inputs = 0.8 * inputs
     return inputs
@@ -115,7 +115,7 @@ def compare_experiments(
     bit: float | None = None,
     inputs: Mapping[str, Any] | None = None,
 ) -> Experiments:
-    """Predict the standard deviations of the free parameters that each candidate experiment leaves.
+    """Predict the standard deviations of the free parameters after each candidate experiment.
 
         covariance = (J' J / noise^2)^-1,   J the sensitivities of the readings (Fisher information)
 
@@ -134,7 +134,7 @@ def compare_experiments(
     start : {"known", "free"}
         Levels at the first sample: known, or estimated too.
     voltage : (pumps,) array, optional
-        Inputs of the operating point; the case's own by default.
+        Inputs of the operating point; the inputs of the case by default.
     size : (pumps,) array, optional
         Small changes of the inputs; a tenth of `voltage` by default.
     bit : float, optional
@@ -146,13 +146,14 @@ def compare_experiments(
     Returns
     -------
     Experiments
-        A dict {description: {"sd" {name: value or None}, "condition", "open": names that are not
-        identifiable}}, the condition number of J'J for parameters relative to their values.
+        A dict {description: {"sd": {name: value or None}, "condition", "open"}}. "condition" is
+        the condition number of J'J for parameters relative to their values, "open" lists the
+        parameters that are not identifiable.
 
     Raises
     ------
     InputError
-        For unknown parameters, and where the simulation diverges.
+        If a parameter is unknown, or the simulation diverges.
 
     Examples
     --------
@@ -162,10 +163,10 @@ def compare_experiments(
     >>> case = presets.load("cascaded").cases["open-loop"]
     >>> t = np.arange(0.0, 60.0, 4.0)
     >>> step = {"step": (t, np.full((15, 1), 3.0), np.zeros(2))}
-    >>> found = tuning.compare_experiments(
+    >>> experiments = tuning.compare_experiments(
     ...     case, {"plant.pump_gain": (0.01, 0.2)}, noise=0.05, duration=56, dt=4, inputs=step
     ... )
-    >>> found["step"]["open"], found["step"]["sd"]["plant.pump_gain[0]"] < 0.1
+    >>> experiments["step"]["open"], experiments["step"]["sd"]["plant.pump_gain[0]"] < 0.1
     ([], True)
     """
     loop, count = case.loop, 1
@@ -219,43 +220,43 @@ def _jacobian(rig, coordinates, p, data, x0, substeps):
 
 
 def _precision(coordinates, p, values, jacobian):
-    """Return {"sd", "condition", "open"} of the weighted sensitivities of one experiment."""
+    """Return {"sd", "condition", "open"} from the weighted sensitivities of one experiment."""
     size, names = coordinates.size, coordinates.names
     _, s, vt = np.linalg.svd(jacobian, full_matrices=False)
     slopes = coordinates.slopes(p)
-    good = s > 1e-9 * s.max()
-    inverse = (vt[good].T / s[good] ** 2) @ vt[good]
+    determined = s > 1e-9 * s.max()
+    inverse = (vt[determined].T / s[determined] ** 2) @ vt[determined]
     sd = np.sqrt(np.diag(slopes @ inverse[:size, :size] @ slopes.T))
-    vague = np.abs(vt[~good]).max(axis=0, initial=0.0)[:size] > 0.1
+    unidentifiable = np.abs(vt[~determined]).max(axis=0, initial=0.0)[:size] > 0.1
     scaled = jacobian[:, :size] @ np.linalg.inv(slopes) * [values[n] for n in names]
     singular = np.linalg.svd(scaled, compute_uv=False)
     return {
-        "sd": {n: None if open_ else float(v) for n, v, open_ in zip(names, sd, vague)},
+        "sd": {n: None if u else float(v) for n, v, u in zip(names, sd, unidentifiable)},
         "condition": float((singular[0] / singular[-1]) ** 2) if singular[-1] > 0 else None,
-        "open": [n for n, open_ in zip(names, vague) if open_],
+        "open": [n for n, u in zip(names, unidentifiable) if u],
     }
 
 
 def most_informative(experiments):
-    """Return the experiment of `compare_experiments` with the least product of deviations."""
+    """Return the experiment with the least product of deviations; None if none identifies all."""
     sd = {name: list(row["sd"].values()) for name, row in experiments.items()}
-    whole = {name: np.sum(np.log(values)) for name, values in sd.items() if None not in values}
-    return min(whole, key=whole.__getitem__) if whole else None
+    complete = {name: np.sum(np.log(values)) for name, values in sd.items() if None not in values}
+    return min(complete, key=complete.__getitem__) if complete else None
 
 
 def remedies(estimation, fit, spread):
-    """Return sentences: which experiments would identify what these data leave open."""
+    """Return sentences: experiments that would identify the directions that `spread` has open."""
     z, sentences = estimation.unknowns(fit), []
     noise = np.sqrt(max(spread.scale, 1e-12))
     for name, experiment in _alternatives(estimation, z):
         sd = _largest_deviation(estimation, z, experiment, noise)
-        if sd is not None and sd < VAGUE:
+        if sd is not None and sd < LARGEST_DEVIATION:
             sentences.append(f"{name} (largest standard deviation of a direction {100 * sd:.2g} %)")
     directions = spread.directions()
     names = [n for n in estimation.coordinates.names for d in directions if n in d["parameters"]]
     if names:
-        which = names[0] if len(set(names)) == 1 else f"one of them by itself, as {names[0]},"
-        sentences.append(f"measure {which} and leave it out of --free")
+        which = names[0] if len(set(names)) == 1 else f"one of them directly, such as {names[0]},"
+        sentences.append(f"measure {which} and remove it from --free")
     return sentences
 
 
@@ -263,11 +264,11 @@ def _alternatives(estimation, z):
     """Yield (description, (t, u, x0, tanks)) of other experiments as long as the first log."""
     log, loop = estimation.logs[0], estimation.case.loop
     measured = tuple(sorted({tank for tank, _ in estimation.data.channels}))
-    every = tuple(range(loop.plant.tanks))
-    others = ", ".join(f"h{i + 1}" for i in every if i not in measured)
+    tanks = tuple(range(loop.plant.tanks))
+    others = ", ".join(f"h{i + 1}" for i in tanks if i not in measured)
     if others:
         x0 = estimation.first_levels(z)[0]
-        yield f"measure {others} as well", (log.t, log.u, x0, every)
+        yield f"measure {others} as well", (log.t, log.u, x0, tanks)
     duration = log.t[-1] - log.t[0]
     dt = max(float(np.median(np.diff(log.t))), duration / 2000)
     mean = log.u.mean(axis=0)
@@ -279,7 +280,7 @@ def _alternatives(estimation, z):
 
 
 def _largest_deviation(estimation, z, experiment, scale):
-    """Return the largest standard deviation of a direction of the coordinates."""
+    """Return the largest standard deviation of a direction; None if one is not identifiable."""
     t, u, x0, tanks = experiment
     noise = dict.fromkeys(tanks, float(np.mean(estimation.noise)))
     channels = zip(estimation.data.channels, estimation.noise)

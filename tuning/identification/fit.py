@@ -166,7 +166,7 @@ def identify(
             " all of them"
         )
     spread, fit_quality = _spread(estimation, best)
-    if spread.open.any():
+    if spread.open_axes.any():
         best = _nearest(estimation, best, spread.scale, settings)
         spread, fit_quality = _spread(estimation, best)
     parameters = spread.parameters()

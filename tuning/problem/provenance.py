@@ -1,4 +1,4 @@
-"""What a result was made with: versions, settings and seed; imported by every command."""
+"""Provenance of a result: versions, settings and seed."""
 
 # scipy has no type stubs
 # pyright: reportMissingTypeStubs=false

@@ -22,7 +22,13 @@ from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tree import get_value, with_values
 from tuning.identification import residuals, simulation
 from tuning.identification.coordinates import coordinates_of
-from tuning.identification.design import AT_ONCE, IN_TURN, candidates, compare_experiments, settled
+from tuning.identification.design import (
+    AT_ONCE,
+    IN_TURN,
+    candidates,
+    compare_experiments,
+    settled_levels,
+)
 from tuning.identification.identified_case import with_pi
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import spread_of
@@ -96,7 +102,7 @@ def experiments(case):
     default_rng(3).choice([-1, 1], (20, 2)). Both were found by trying: the prototype's table has
     only "staggered +-0.5 V" and "PRBS +-0.5 V, 15 s bits".
     """
-    empty, rest = np.zeros(4), settled(case.loop.plant, VOLTAGE)
+    empty, rest = np.zeros(4), settled_levels(case.loop.plant, VOLTAGE)
     bits = np.random.default_rng(3).choice([-1, 1], (20, 2))[np.minimum(T / 15, 19).astype(int)]
     up = np.stack([T < 200, T >= 100], axis=1)
     return {
@@ -315,7 +321,7 @@ def test_against_a_fit_written_without_the_library(case, away):
 @pytest.fixture(scope="module")
 def resting(case):
     """A log of h1 and h2 alone, at one steady state."""
-    rest = settled(case.loop.plant, VOLTAGE)
+    rest = settled_levels(case.loop.plant, VOLTAGE)
     y = rest[:2] + 0.1 * np.random.default_rng(3).standard_normal((301, 2))
     warm = rig.set_values(case, {"x0": [float(v) for v in rest]})
     return warm, tuning.log(t=T, u=np.tile(VOLTAGE, (301, 1)), y=y, tanks=(0, 1))

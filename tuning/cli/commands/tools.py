@@ -1,5 +1,5 @@
-"""`jaxtank compare`, `figure`, `completion`, `bench` and `cache`: the papers and their figures, the
-shell, the speed of this machine, the programs that are kept."""
+"""`jaxtank compare`, `figure`, `completion`, `bench` and `cache`: papers and their figures, shell
+completion, speed of this machine, compiled programs in the cache."""
 
 import os
 import sys
@@ -22,36 +22,36 @@ def figure(args):
 
     if args.figure is None:
         if args.picture:
-            raise InputError("--out needs a figure, as gouta2015/6: jaxtank figure lists them")
+            raise InputError("--out needs a figure such as gouta2015/6: jaxtank figure lists them")
         rows = [[f.name, "" if f.runs else "no result", f.shows] for f in FIGURES.values()]
         payload = {f.name: {"shows": f.shows, "result": bool(f.runs)} for f in FIGURES.values()}
         print_result(args, payload, lambda: tables.table(rows, ["figure", "", "it shows"]))
         return 0
-    printed = find(args.figure)
+    selected = find(args.figure)
     from tuning.figures import drawing
 
     if args.picture:
         drawing.check_name(args.picture)
         check_folder(Path(args.picture).parent)
-    result = drawing.run(printed)
+    result = drawing.run(selected)
     if args.picture:
         picture = Path(args.picture)
-        data = drawing.rendered(drawing.draw(printed, result), args.picture)
+        data = drawing.rendered(drawing.draw(selected, result), args.picture)
         write_folder(picture.parent, {picture.name: data})
     if args.json:
-        cases = [{"label": r.label, "case": r.case, "values": dict(r.values)} for r in printed.runs]
-        texts = {"shows": printed.shows, "states": printed.states, "here": list(result.ours)}
-        payload = {"figure": printed.name, **texts, "remark": printed.remark, "cases": cases}
+        runs = [{"label": r.label, "case": r.case, "values": dict(r.values)} for r in selected.runs]
+        texts = {"shows": selected.shows, "states": selected.states, "here": list(result.ours)}
+        payload = {"figure": selected.name, **texts, "remark": selected.remark, "cases": runs}
         print_result(args, tables.clean(payload), str)
     elif not args.quiet or not args.picture:
-        print("\n".join(textwrap.fill(p, 80) for p in drawing.caption(printed, result.ours)))
+        print("\n".join(textwrap.fill(p, 80) for p in drawing.caption(selected, result.ours)))
     if args.picture and not args.quiet:
         print(f"written to {printable(args.picture)}", file=sys.stderr)
     return 0
 
 
 def compare(args):
-    """Print what a paper publishes beside what is measured here."""
+    """Print the published numbers of a paper next to the numbers of our runs."""
     use_float64()
     from jaxtank import presets
     from tuning.report import papers as report
@@ -59,7 +59,7 @@ def compare(args):
 
     papers = presets.PAPERS if args.paper == "all" else (args.paper,)
     for paper in papers:
-        presets.load(paper)  # an unknown one is refused before anything runs
+        presets.load(paper)  # an unknown paper is refused before the first run
     rows = {}
     for paper in papers:
         if not args.quiet:
@@ -94,7 +94,7 @@ def cache(args):
 
     if args.what not in (None, "clear"):
         close = nearest(args.what, ["clear"])
-        raise InputError(f"cache: unknown action {args.what!r}{close}: must be clear, or left out")
+        raise InputError(f"cache: unknown action {args.what!r}{close}: must be clear, or omitted")
     base = programs.base_folder()
     if base is None:
         why = "JAXTANK_CACHE=0" if os.environ.get(programs.SWITCH) else "there is no home folder"
@@ -127,7 +127,7 @@ def completion(args):
 COMMANDS = {
     "compare": Command(
         compare,
-        "published numbers beside measured ones, and why they differ; PAPER or all",
+        "published and measured numbers side by side, and why they differ; PAPER or all",
         (
             *COMMON,
             Option("paper", "PAPER", 'a paper (see jaxtank list), or "all"'),
@@ -137,7 +137,7 @@ COMMANDS = {
     ),
     "figure": Command(
         figure,
-        "a figure of a paper redrawn by our runs, as gouta2015/6; without one the list of all",
+        "a figure of a paper redrawn from our runs, such as gouta2015/6; default: list all figures",
         (
             *COMMON,
             Option("figure", "PAPER/N", "the figure (default: list all)", nargs="?"),
@@ -150,26 +150,26 @@ COMMANDS = {
         "a script that completes commands, options, cases and parameters: bash, zsh or fish",
         (
             Option("shell", "SHELL", 'as in: eval "$(jaxtank completion bash)"'),
-            Option("words", "...", "of a line to complete, for these scripts", nargs="..."),
+            Option("words", "...", "words of the command line, passed by the script", nargs="..."),
         ),
         compiles=False,
     ),
     "cache": Command(
         cache,
-        "where compiled programs are kept, and their size; cache clear removes them"
-        " (JAXTANK_CACHE=0: none are kept; JAXTANK_CACHE=DIR: there)",
+        "folder and size of the cache of compiled programs; cache clear empties it"
+        " (JAXTANK_CACHE=0: no cache; JAXTANK_CACHE=DIR: another folder)",
         (*COMMON, Option("what", "clear", "remove the programs of all versions", nargs="?")),
-        "Print where the programs that XLA has compiled are kept for the next call, and their"
-        " size. With JAXTANK_CACHE=0 none are kept, with JAXTANK_CACHE=DIR they are kept in DIR.",
+        "Print the folder in which programs compiled by XLA are kept for the next call, and its"
+        " size. JAXTANK_CACHE=0 turns the cache off, JAXTANK_CACHE=DIR chooses the folder.",
         compiles=False,
     ),
     "bench": Command(
         bench,
-        "ns per closed-loop step here, beside a C loop",
+        "time of a closed-loop step on this machine [ns], compared with a C loop",
         (
             *COMMON,
             Option("cases", "CASE", 'cases to time instead, or "all"', nargs="*"),
-            Option("--rounds", "N", "interleaved rounds to take the median of", whole(1, 1000), 7),
+            Option("--rounds", "N", "interleaved rounds; the median is printed", whole(1, 1000), 7),
         ),
     ),
 }
