@@ -160,7 +160,7 @@ class LinearPredictive(Controller):
         return tuple(u), LastSample(x=x, u=state.u)
 
     def _inputs(self):
-        """Return inputs (m,) for the linear model [V]: 0 if linear in them, else the middle of the range."""
+        """Return inputs (m,) [V] at which the model is linearised; any value for a plain rig."""
         if getattr(self.model, "plain", True):
             return jnp.zeros(self.model.pumps)
         middle = 0.5 * (jnp.asarray(self.u_low) + jnp.asarray(self.u_high))

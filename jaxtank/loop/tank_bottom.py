@@ -15,8 +15,8 @@ class TankBottomWarning(UserWarning):
 
 
 def can_withdraw(loop: ClosedLoop) -> bool:
-    """Return True if a negative inflow, a pump (backwards, or between tanks), a valve or the shape of
-    a tank can take a level below 0.
+    """Return True if a level may fall below 0: by a negative inflow, a pump that runs backwards or
+    draws from a tank, a valve, or the shape of a tank.
     """
     if any(getattr(loop.plant, name, ()) for name in ("sources", "valves", "shapes")):
         return True
