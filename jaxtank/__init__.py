@@ -16,7 +16,7 @@ it is compiled to one function (about sixteen times faster in float64).
 instructions. ``xla_cpu_disable_new_fusion_emitters`` selects the older code generator for what is
 outside the loop, which compiles faster, and ``xla_cpu_prefer_vector_width`` the width of an AVX-512
 unit. They are added to ``XLA_FLAGS``; options that are there already are not changed. Set
-``JAXTANK_XLA_OPTION=0`` before the import to leave XLA as it is.
+``JAXTANK_XLA_OPTION=0`` before the import to leave the options of XLA unchanged.
 """
 
 from jaxtank.core import VERSION, lazy

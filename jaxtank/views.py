@@ -20,7 +20,7 @@ class CaseViews:
 
     def plot(self: Any) -> dict[str, Any]:
         """Return matplotlib figures {"rig": the schematic}; {} for a plant that is no network of
-        tanks. The figures of a run are those of its Trajectory.
+        tanks. A Trajectory has the figures of a run.
         """
         return call("rig", self.loop.plant, title=self.name)
 
@@ -41,9 +41,9 @@ class CaseViews:
         """Write case.json, rig.toml and the pictures of `plot` to a folder, made if need be; return
         the paths.
 
-        A case that no rig file can describe (with a plant or a controller class of one's own that
-        has no name in a file) has no rig.toml: a UserWarning gives the reason. Raises InputError
-        for a folder that cannot be written to.
+        If no rig file can describe the case (with a custom plant or controller class that has no
+        name in rig files), no rig.toml is written, and a UserWarning gives the reason. Raises
+        InputError for a folder that cannot be written to.
         """
         files = {"case.json": json.dumps(self.to_json(), indent=2, allow_nan=False) + "\n"}
         try:

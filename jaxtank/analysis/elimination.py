@@ -37,7 +37,7 @@ def solve(A, b):
     for j in range(A.shape[0]):
         best = index == j + jnp.argmax(jnp.abs(rows[j:, j]))
         pivot = jnp.sum(jnp.where(best, rows, 0.0), axis=0)
-        rows = jnp.where(best, rows[j], rows)  # rows j and that of the pivot are exchanged
+        rows = jnp.where(best, rows[j], rows)  # exchange row j and the pivot row
         pivot = pivot / pivot[j]
         rows = jnp.where(index == j, pivot, rows - rows[:, j, None] * pivot)
     return rows[:, -1]
@@ -51,8 +51,8 @@ def normal_matrix(H, G, weight):
 @jax.jit
 def _weighted(G, weight):
     """Return G' diag(weight) G (n, n) for G (rows, n), row by row."""
-    # Inside a loop that is one compiled function XLA writes the product of a vector and a matrix
-    # for the processor's vector unit, and that of two matrices as three plain loops.
+    # Inside a loop that is one compiled function, XLA vectorises the product of a vector and a
+    # matrix, but writes the product of two matrices as three plain loops.
     product = jnp.zeros((G.shape[1], G.shape[1]), G.dtype)
 
     def row(j, product):

@@ -25,16 +25,16 @@ closed loop by percents, 1e-13 loses digits in the normal matrix (khalid notes S
 
 OFF = 1e-4
 """How far, in MU_MIN, the complementarity of a row may be from MU_MIN at a solution. Every row, not
-their mean: the derivatives are those of the central path, and a row that ends elsewhere, as it will
-at a corner, bends the slope that differences see by percents.
+their mean: derivatives are taken along the central path. A row that ends elsewhere, as happens at a
+corner, changes the derivative by percents against finite differences.
 """
 # largest complementarity, in MU_MIN, from which on plain Newton steps go straight to the central
 # path
 NEAR = 100.0
 RESIDUAL = 1e-9  # largest residual, in the scaled problem, of a solution that is left alone
 MOST = 40
-"""Iterations at most. Most programmes of a closed loop take 6, those at the edge of a limit up to
-20 (8 leave 3e-7 of the answer in easy ones, khalid notes S4.5; 15 left a pump at 0.003 V that
+"""Largest number of iterations. Most programmes of a closed loop take 6, at the edge of a limit up
+to 20 (8 leave 3e-7 of the answer in easy ones, khalid notes S4.5; 15 left a pump at 0.003 V that
 belonged at 0).
 """
 
@@ -114,8 +114,8 @@ def _implicit(point, data, moved):
     # of x and of v, the change of lu - ll, with the slacks eliminated; each row is scaled so that
     # every entry is of the order of 1. The matrix H + A' D^-1 A that v leaves for dx (`_normal`)
     # loses four to ten digits of H in the shadow of binding rows; corrections by what the two
-    # equations above leave bring them back. The elimination itself is not differentiated: second
-    # derivatives are those of a linear system.
+    # equations above leave bring them back. The elimination is not differentiated: second
+    # derivatives follow from the linear system.
     H, _, G, _, _ = data
     x, su, sl, lu, ll = point
     up, low = lu / su, ll / sl

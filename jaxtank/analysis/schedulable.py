@@ -97,7 +97,7 @@ def _in_the_step(traced):
     own_size = int(np.prod(np.shape(absent), dtype=int))
     if step.looped or track.looped or max(step.largest, track.largest) > own_size:
         return (
-            "the controller designs with it (matrices, or a loop of its own), which would be"
+            "the controller uses it in its design (matrices, or a loop), which would then be"
             " repeated at every sample"
         )
     if not (step.reached or track.reached):

@@ -151,8 +151,8 @@ def at_rest(plant, y, inflow=None, start=None, shared=None):
     inflow : (n,) [cm^3/s] or None. start : (levels, inputs) to begin at, or None. shared : as in
     `equilibrium`
     """
-    # Levenberg-Marquardt in the roots of the free levels and in the inputs; the derivatives are
-    # those of the implicit function.
+    # Levenberg-Marquardt in the roots of the free levels and in the inputs; the derivatives
+    # follow from the implicit function theorem.
     free = [i for i in range(plant.tanks) if i not in plant.outputs]
     y, m = jnp.stack([jnp.asarray(v, dtype=float) for v in y]), len(free)
     scale = jax.lax.stop_gradient(jnp.max(y)) + plant.knee

@@ -1,4 +1,4 @@
-"""No feedback: the inputs are those of a signal."""
+"""No feedback: a signal gives the inputs."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,7 +12,7 @@ from jaxtank.signals.base import Signal
 
 @component
 class OpenLoop(Controller):
-    """u(t_k) = s(t_k): the inputs are those of a signal, independent of the levels (a recorded
+    """u(t_k) = s(t_k): a signal gives the inputs, independent of the levels (a recorded
     experiment, a constant flow).
 
     Nothing that an observer estimates is used.

@@ -13,7 +13,7 @@ from jaxtank.core.text import shortened
 from jaxtank.core.tree import is_real, number, walk
 
 SMALL = 16
-"""Entries of an array that is checked number by number, at most."""
+"""Largest size of an array that is checked number by number."""
 
 
 def check_leaves(
@@ -82,7 +82,7 @@ def _out_of_range(name: str, entry: Any, index: tuple[int, ...], meta: Mapping[s
 
 
 def check_order(name: str, part: Any, lower: str, upper: str, equal: bool = False) -> None:
-    """Check that each entry of one leaf is below that of another; traced ones are passed over."""
+    """Check that each entry of a leaf is below the entry of another; traced leaves are skipped."""
     a, b = getattr(part, lower), getattr(part, upper)
     if any(isinstance(v, Tracer) for v in jax.tree.leaves((a, b))):
         return

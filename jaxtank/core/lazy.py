@@ -8,9 +8,9 @@ from types import ModuleType
 from typing import Any
 
 HOMES: dict[str, str] = {}
-"""{function that draws, writes or explores: its module; class of results: that of its report}.
+"""{function that draws, writes or explores: its module; class of results: module of its report}.
 
-The two `__init__` fill it, so that a data class offers `plot` without an import of what is above.
+The two `__init__` fill it, so that a data class has `plot` without importing the module above it.
 """
 
 

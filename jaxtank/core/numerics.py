@@ -30,9 +30,9 @@ def smooth_sqrt(h: Real, threshold: float = LAMINAR_THRESHOLD) -> jax.Array:
     # Exact at and above the laminar threshold. Between, it is below the square root by at most
     # 0.175 sqrt(h0) (at x = 0.13): at small depth the outflow is laminar, slower than Torricelli's.
     # Value and slope are continuous; the slope at 0 is 1.5/sqrt(h0) = 15 cm^-0.5 for the default.
-    # Negative levels are drawn back to 0. A run whose levels stay above the threshold is that of
-    # the exact root; with ramps of 30 s, where NGPC brings tank 3 of the benchmark down to 0.004
-    # cm, no level changes by more than 3e-3 cm.
+    # Negative levels are drawn back to 0. A run whose levels stay above the threshold equals the
+    # run with the exact root. With ramps of 30 s, where NGPC brings tank 3 of the benchmark down to
+    # 0.004 cm, no level changes by more than 3e-3 cm.
     # sqrt(h) of a negative level is NaN and not taken; the rule below keeps it out of the
     # derivatives, which spares the select in front of every root of the time loop
     laminar = h * (1.5 * threshold**-0.5 - (0.5 * threshold**-1.5) * jnp.where(h > 0.0, h, 0.0))

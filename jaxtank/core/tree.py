@@ -374,7 +374,7 @@ def split_index(name: str) -> tuple[str, tuple[int, ...]]:
 
 
 def _localised(meta: Meta, units: tuple[str, str]) -> Meta:
-    """`meta` with its unit, and those of its rows, in the units of a rig."""
+    """Return `meta` with its unit and the units of its rows in the units of a rig."""
     rows = {"rows": tuple(_localised(row, units) for row in meta["rows"])} if "rows" in meta else {}
     return {**meta, "unit": local(meta["unit"], units), **rows}
 

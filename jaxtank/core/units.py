@@ -48,7 +48,7 @@ def flow_per_input(units: tuple[str, str]) -> float | None:
 
 
 LONGEST = 40
-"""Characters of a unit at most."""
+"""Largest number of characters of a unit."""
 
 
 def check_unit(where: str, text: str) -> str:

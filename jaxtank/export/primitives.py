@@ -379,8 +379,9 @@ def _unrolled(writer, p, consts, carry, sequences):
 
 
 def _reader(writer, sequences, variables, backwards):
-    """Return a function of the counter of a loop that gives what its pass reads of the sequences:
-    each of their elements is an array of its own, indexed by the counter.
+    """Return a function of the loop counter that gives the elements of the sequences in that pass.
+
+    Each element of a sequence becomes one array over the passes, indexed by the counter.
     """
     arrays = []
     for rows, v in zip(sequences, variables):
@@ -461,7 +462,7 @@ def elements_of(name, size):
 
 
 def line_of(array):
-    """Return the name of the line whose elements are those of an array; None of another array."""
+    """Return the name of the line that holds exactly the elements of an array, else None."""
     whole = array.ndim == 1 and all(
         isinstance(e, Ref) and e.index == i for i, e in enumerate(array)
     )

@@ -22,7 +22,7 @@ def functions(case):
     # step(state, t, y, r, dr, ddr) -> (u, state), with t [s], y (tanks,) measured levels, r, dr,
     # ddr (outputs,) setpoints with their first and second time derivatives, and u (pumps,) inputs
     # within the limits of the pumps. begin(y, u) -> state, from the levels and inputs before the
-    # first sample. The order of one sample is that of `jaxtank.loop.step.decide`, which is called.
+    # first sample. `jaxtank.loop.step.decide`, which is called, has the order of one sample.
     loop, dt = case.loop, case.clock.dt
 
     def scalars(array):

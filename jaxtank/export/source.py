@@ -26,7 +26,7 @@ class Language(NamedTuple):
 
     write : function (program, name, precision) -> text of one file, where program is a
         `jaxtank.export.program.Program`
-    precisions : those of "double" and "float" that it has
+    precisions : "double", "float" or both
     reserved : names that the function may not have
 
     Examples
@@ -49,7 +49,7 @@ LANGUAGES = {
 
 
 def register(name: str, language: Language) -> Language:
-    """Add a language to those of `export` and of `jaxtank export --lang`.
+    """Add a language to `export` and to `jaxtank export --lang`.
 
     Parameters
     ----------

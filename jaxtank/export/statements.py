@@ -108,7 +108,7 @@ def names(entries: Iterable) -> set[str]:
 
 
 def every(statements: Iterable[Statement]) -> Iterator[Statement]:
-    """Yield each statement, and those of a loop's body after the loop."""
+    """Yield each statement; the statements in a loop's body follow the loop."""
     for s in statements:
         yield s
         if isinstance(s, Loop):

@@ -77,7 +77,7 @@ def traced_leaves(case: Case, largest: int = 64) -> dict[str, np.ndarray]:
 
 
 def served(case: Case) -> tuple[str, ...]:
-    """Return the names of the measures that mean something for a case, those of times included."""
+    """Return the names of the measures that are defined for a case, including times."""
     return (*(m for m in ms.reported() if ms.serves(m, case.loop)), *ms.times())
 
 
@@ -224,7 +224,7 @@ CHEAP = frozenset(_CHEAP.split())
 
 
 def hoisted(statements: Iterable[Statement]) -> list[Statement]:
-    """Return statements with those of a loop's body that no pass changes moved in front of it."""
+    """Return statements with the loop-invariant ones moved in front of their loop."""
     out: list[Statement] = []
     for s in statements:
         if not isinstance(s, Loop):

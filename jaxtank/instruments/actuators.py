@@ -42,17 +42,17 @@ class PumpBank(Actuator):
        voltages in the box that are best by the controller's own cost (see `allocate`), which
        removes the wrong-way latch-up of clipping a decoupling controller.
     2. Dead zone, if given: no flow at or below `dead_zone` (gouta2015, Remark 4: 3 V). "offset":
-       the flow grows from zero at the dead zone, as that of u - dead_zone (gouta2022 notes S2.3).
+       the flow is proportional to u - dead_zone above the dead zone (gouta2022 notes S2.3).
        "hysteresis": a pump that turns stops below `stop`, and starts again above `dead_zone`.
        "pulse": voltages that would not turn the pump are saved up as volt-seconds and paid out in
        samples at `pulse` volts, so that the mean flow is the one asked for (sigma-delta).
-    3. Lag, if given: first order with time constant `lag` [s], lag v' = u - v, solved exactly. What
-       the plant is given over a sample is the mean of v over it, so that the volume delivered is
-       that of the lag itself, whatever the sampling period.
+    3. Lag, if given: first order with time constant `lag` [s], lag v' = u - v, solved exactly. The
+       plant receives the mean of v over each sample, so that the delivered volume is exact for any
+       sampling period.
     4. Transport delay: `delay` [s], whole samples.
 
-    At the edge of a dead zone the derivative is one-sided; through "pulse" it is that of the mean
-    flow, 1.
+    At the edge of a dead zone the derivative is one-sided; through "pulse" it is the
+    derivative of the mean flow, 1.
 
     Examples
     --------

@@ -83,8 +83,8 @@ class Sensor(abc.ABC):
         ----------
         key : random key of jax, or None; or (n, samples) deviates that were drawn before
         samples : number of samples [-]
-        piece : number of the chunk of a long run to which the samples belong. Each chunk has a key
-            of its own, and the deviates of a run are those of its chunks, end to end.
+        piece : number of the chunk of a long run to which the samples belong. Each chunk has a
+            different key, and the deviates of a run are its chunks in sequence.
 
         Returns
         -------

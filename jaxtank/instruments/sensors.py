@@ -29,7 +29,7 @@ class LevelSensor(Sensor):
         y = h + offset + noise * xi,  xi ~ N(0, 1);  volts = y / gain, clipped to [0, full_scale],
         rounded to full_scale / 2^bits
 
-    The ADC's slope is that of the line through its staircase (numerics.quantise).
+    The derivative of the ADC is the slope of the line through its staircase (numerics.quantise).
 
     Examples
     --------

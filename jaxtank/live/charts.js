@@ -4,7 +4,7 @@ const PINS = 3;
 
 const colours = new Map(); // of the style sheet, until the scheme changes
 
-// a colour of the style sheet, as it is now (light or dark)
+// a colour of the style sheet in the current mode (light or dark)
 function colour(name) {
   if (!colours.has(name))
     colours.set(name, getComputedStyle(document.documentElement).getPropertyValue(name).trim());

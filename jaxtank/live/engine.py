@@ -24,7 +24,7 @@ from jaxtank.live.printed import Printed, maths
 from jaxtank.plants.elements import input_name
 
 ROWS = 3000
-"""Rows of a run for people, about: those of `jaxtank simulate --out`."""
+"""Approximate number of rows of a plotted run, as in `jaxtank simulate --out`."""
 ALWAYS = ("rms_error_total", "max_level")
 """Measures of a search whatever a case minimises and limits."""
 SHARED = ("unit", "doc", "group")
@@ -53,7 +53,7 @@ NOISE = 0.02
 
 
 def program_of(case: Case) -> tuple[WholeLoop, str]:
-    """Return the loop of a case, and its functions as JavaScript with those of a search."""
+    """Return the loop of a case, and its functions as JavaScript, with functions for a search."""
     with jax.enable_x64(True):
         loop = whole_loop(case)
         return loop, _program(loop, f"search:{_program(_lean(case))}")
@@ -106,7 +106,7 @@ def engine(
 
 
 def facts_of(case: Case, filtered: Case | None = None) -> dict[str, Any]:
-    """Return what is known of the loop of a case beside its code, as a JSON object.
+    """Return the data of the loop of a case without its code, as a JSON object.
 
     Examples
     --------
@@ -121,7 +121,7 @@ def facts_of(case: Case, filtered: Case | None = None) -> dict[str, Any]:
 
 
 def _packed(facts: dict[str, Any]) -> dict[str, Any]:
-    """The same with the leaves of an array together: what they share, and [name, what differs]."""
+    """Return `facts` with grouped leaves: common fields once, then [name, value, range]."""
     groups: dict[tuple[Any, ...], list[Any]] = {}
     for leaf in facts["leaves"]:
         shared = tuple(leaf[key] for key in SHARED)
@@ -132,7 +132,7 @@ def _packed(facts: dict[str, Any]) -> dict[str, Any]:
 
 
 def bare(script: str) -> str:
-    """Return a script of ours without comments in blocks, indentation and empty lines."""
+    """Return a script of this package without block comments, indentation and empty lines."""
     lines = (line.strip() for line in re.sub(r"/\*.*?\*/", "", script, flags=re.S).splitlines())
     return "\n".join(filter(None, lines))
 
@@ -260,7 +260,7 @@ def _limits(case):
                 "unit": ms.unit(limit.measure, case.loop.units),
                 "scale": float(limit_scale(limit, case.loop)),
                 "nan_holds": bool(ms.MEASURES[limit.measure].nan_holds),
-                # the parameter that this limit is, where it is no number of its own
+                # the name of the parameter, where the limit is a parameter and not a number
                 "follows": rim.format(limit.index)
                 if rims and limit.measure == "max_level"
                 else None,

@@ -15,7 +15,7 @@ GUARD = "safety_filter."
 """What the names of a safety filter begin with."""
 
 NEW = "rig.toml"
-"""Name of the rig file that a case without a name of its own is copied to."""
+"""Name of the rig file to which a case without a name is copied."""
 
 
 class Origin(NamedTuple):

@@ -114,7 +114,7 @@ const runner = makeRunner(newWorker, runOf, {
   },
 });
 
-// whether the picture is that of the sliders, and the button that makes it so
+// whether the picture shows the values of the sliders, and the button that updates it
 function mark() {
   $("run").hidden = !slow;
   $("run").disabled = runner.busy;
@@ -415,7 +415,7 @@ function makeSliders() {
   folded.addEventListener("toggle", () => folded.open && fold());
 }
 
-// sliders that change nothing in the run as it is are folded away; told by a worker of its own
+// sliders without effect on the current run are folded away; a second worker finds them
 const folded = make("details", { class: "group", id: "idle" }, make("summary", {}, "no effect on this run",
   make("span", { class: "unit" })), make("p", { class: "hint" },
   "The run is the same at both ends of these sliders. Opening this group tries them again."));

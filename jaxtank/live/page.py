@@ -49,7 +49,7 @@ KEPT = 8
 """Engines that are kept in memory."""
 
 PLANTS, MOST_PLANTS = 64, 2000
-"""Plants of the band of a page: where it is not said how many, and at most."""
+"""Number of plants in the band of a page: by default, and at most."""
 
 LEAK = 1.5
 """Factor of an outlet that leaks [-]."""
@@ -74,7 +74,7 @@ def page(case, presets=(), source=None, plants=None):
 
 
 def _smallest(off, on, filtered, assembled):
-    """The page; without a safety filter to switch on where that of a large loop is not on."""
+    """Return the page; a large loop whose filter is off gets no switch for it."""
     texts = {}
 
     def printed(variant):
@@ -92,7 +92,7 @@ def _engine(off, on, printed):
     """The engine of a case and of the same with a safety filter or None."""
     try:
         texts = [rig.dump(variant) for variant in (off, on) if variant is not None]
-    except InputError:  # a class of the user's own
+    except InputError:  # a custom class
         return engine(off, on, printed)
     key = repr((texts, off.title, off.names))
     if key not in _KEPT:
@@ -103,12 +103,12 @@ def _engine(off, on, printed):
 
 
 def data_of(case, presets=(), source=None, plants=None):
-    """Return what the page knows of a case besides the engine, a JSON object."""
+    """Return the data of a case for the page, without the engine: a JSON object."""
     if plants is not None:
         check_whole("plants", plants, 1, MOST_PLANTS)
     try:
         toml = rig.dump(case)
-    except InputError as error:  # a class of the user's own without a name
+    except InputError as error:  # a custom class without a name
         toml = f"# no rig file describes this case ({error})\n"
     origin = origin_of(case, source)
     return {
@@ -237,7 +237,7 @@ def _style():
 
 @cache
 def _script(name):
-    """One script of ours without indentation, blank lines and lines of comments."""
+    """Return a script of this package without indentation, blank lines and comment lines."""
     lines = (line.strip() for line in _read(f"{name}.js").splitlines())
     return "\n".join(line for line in lines if line and not line.startswith("//"))
 
@@ -324,6 +324,6 @@ def frame(live: LivePage, height: int = HEIGHT) -> str:
 def live_page(
     case: Any, presets: Any = (), source: str | None = None, plants: int | None = None
 ) -> LivePage:
-    """Return the LivePage of a case; the arguments are those of `jaxtank.live.page.page`."""
+    """Return the LivePage of a case; arguments as in `jaxtank.live.page.page`."""
     # Raises InputError for a case that cannot be run in a browser.
     return LivePage(case.name, page(case, presets, source, plants))

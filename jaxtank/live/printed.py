@@ -86,7 +86,7 @@ class Printed:
         return [e for entries in self.loop.measures.values() for e in entries]
 
     def _levels(self):
-        """The entries of c that are levels: those whose sum tells a run that diverged."""
+        """Indices of the levels in c: their sum is not finite if the run has diverged."""
         return range(self.loop.case.loop.plant.tanks)
 
     def _ranked(self, rank):
@@ -224,7 +224,7 @@ class Printed:
             yield text.given[e], array
 
     def _next(self, text):
-        """Lines that put the next state in the place of the last one."""
+        """Lines that replace the last state by the next one."""
         moved = []
         for i in self.state:
             e, name = self.loop.after[i], text.given[Ref("c", i)]

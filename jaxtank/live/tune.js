@@ -305,7 +305,7 @@ function inverseOf(H, n) {
   return out;
 }
 
-/* Starts besides the first: the best of points spread over the box (Halton's), one for each. */
+/* Starts after the first: the best of points spread over the box (Halton's), one for each. */
 function others(search, starts, stop) {
   const points = [], primes = [2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37];
   const count = starts > 1 ? 8 * (starts - 1) : 0;

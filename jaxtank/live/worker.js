@@ -3,7 +3,7 @@
 const engine = makeEngine();
 
 // values of `count` plants about `values`: each leaf of `spread` {name: share} times 1 +- share
-// the controller's and observer's models are leaves of their own, and stay
+// the models of controller and observer are separate leaves and do not change
 function plantsOf(message) {
   const next = uniform(message.seed + 1);
   return Array.from({ length: message.count }, () => {

@@ -16,10 +16,9 @@ share of the setpoint [-]."""
 
 
 def windows(loop: Any, times: Any, arrays: bool = False) -> Any:
-    """What overshoot, rise and settling refer to, as `Signal.windows`; or (samples, n) arrays."""
-    # A start away from the setpoint counts as a change at t = 0 of an output whose setpoint has
-    # none of its own: the step is the setpoint less the level in `loop.x0`, if it is more than AWAY
-    # of the setpoint.
+    """Return the windows that overshoot, rise and settling refer to; or (samples, n) arrays."""
+    # If the setpoint of an output does not change, a start away from it counts as a change at
+    # t = 0: the step is setpoint minus level in `loop.x0`, if it is more than AWAY of the setpoint.
     reference: Any = loop.reference
     if arrays and serves_arrays(reference):
         return _array_windows(loop, times)

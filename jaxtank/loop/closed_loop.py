@@ -45,7 +45,7 @@ class ClosedLoop:
     sensor : Sensor
     observer : Observer
     controller : Controller
-        With a model of its own, which may differ from the plant.
+        Its model may differ from the plant.
     actuator : Actuator
     reference : Signal
         Setpoints, one channel per output [cm].
@@ -108,7 +108,7 @@ class Inputs(NamedTuple):
 
 
 class Partition(NamedTuple):
-    """The leaves of a tree in two groups: those that have tangents, and the rest."""
+    """The leaves of a tree in two groups: leaves with tangents, and the rest."""
 
     structure: Any
     moving: tuple[bool, ...]  # of each leaf, whether it has tangents

@@ -78,8 +78,8 @@ def estimate_notes(loop: ClosedLoop, run: Trajectory) -> list[str]:
     if np.any(parts):
         values = ", ".join(f"{v:.3g}" for v in parts)
         sentences.append(
-            "d_hat is all that the observer's model does not explain: besides inflows it contains"
-            f" what the offset dead zones withhold while the pumps run, {values}"
+            "d_hat is the part of the level rates that the observer's model does not explain: it"
+            f" contains inflows, and the flow lost in offset dead zones while pumps run, {values}"
             f" {local('cm/s', loop.units)} of the tanks in order"
         )
     return sentences

@@ -47,7 +47,7 @@ def evaluate_many(
     values : {dotted name: (N, ...) array}
         What differs from run to run, in the units of its leaf.
     key : jax random key, optional
-        For the sensor noise; run i has that of jax.random.fold_in(key, i).
+        For the sensor noise; run i uses jax.random.fold_in(key, i).
     batch : int
         Runs side by side.
 

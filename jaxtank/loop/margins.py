@@ -32,7 +32,7 @@ from jaxtank.signals.base import Constant
 from jaxtank.xla.jit import compiled
 
 PLANT_STEPS, LOOP_STEPS = 40, 10
-"""Newton steps to the steady state of the plant, and from there to that of the loop."""
+"""Newton steps to the steady state of the plant, and from it to the steady state of the loop."""
 
 FAR = 1e6
 """Limits of pumps that are inactive, in ranges of the pump."""
@@ -41,7 +41,7 @@ PROBES = 2
 """Directions in which differences on both sides of a steady state are compared with slopes."""
 
 KINK = 1e-3
-"""Share of a slope by which it may differ from that of a finite difference [-]."""
+"""Largest relative difference of a derivative from a finite difference [-]."""
 
 REASONS = (
     "",
@@ -69,9 +69,9 @@ def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
     """Return one sample of the loop linearised at the steady state of constant setpoints."""
     # The loop is opened between the actuator's input and the pumps: dead time and lag belong to the
     # open loop. Sensors without noise and ADC, pumps without limits, without safety
-    # filter, inflow pulses and faults; a steady inflow stays. Newton's method finds the state at
-    # which a sample changes nothing, of a stable and of an unstable loop; derivatives are those of
-    # the implicit function. Where a steady state cannot be used (`why`), A, B and C are 0.
+    # filter, inflow pulses and faults; a steady inflow stays. Newton's method finds the fixed
+    # point of one sample, also of an unstable loop; derivatives follow from the implicit function
+    # theorem. Where a steady state cannot be used (`why`), A, B and C are 0.
     quiet, dead = _without_limits(loop, clock)
     rest, alone = _rest(clock, quiet, r), _plant_at_rest(quiet, r)
     (closed, B, C, after, u), s, kink = rest.slopes, rest.s, rest.kink

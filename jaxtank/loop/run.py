@@ -120,8 +120,8 @@ def evaluate(
     Returns
     -------
     {name: scalar, or array with one entry per output, tank or pump}
-        In the units of `jaxtank.measures.unit`. Inside a trace, those of a run that diverges are
-        NaN, and so are those of a run with noise and no key.
+        In the units of `jaxtank.measures.unit`. Inside a trace, a run that diverges gives NaN,
+        and so does a run with noise and no key.
 
     Raises
     ------

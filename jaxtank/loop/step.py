@@ -162,8 +162,8 @@ def commanded(
     loop: ClosedLoop, state: Any, tick: Tick, estimate: Estimate
 ) -> tuple[Sequence[Any], Any]:
     """Return the controller's ((m,) inputs before their limits, new state)."""
-    # Raises InputError, while the loop is traced, for a number of inputs that is not that of the
-    # pumps, and for an input that is no single real number.
+    # Raises InputError, while the loop is traced, if the number of inputs is not the number of
+    # pumps, or an input is no single real number.
     tick_of_controller = _tick_for(loop.controller, tick)
     command, state = loop.controller.step(state, tick_of_controller, _estimate_for(loop, estimate))
     _check_command(command, loop.plant.pumps, type(loop.controller).__name__)

@@ -46,7 +46,7 @@ SEEN = 0.01
 
 
 class StepWarning(UserWarning):
-    """Steps too long for a tank that runs empty. The command prints a note of its own."""
+    """Steps too long for a tank that runs empty. The command prints a note instead."""
 
 
 class Unstable(NamedTuple):
@@ -233,7 +233,7 @@ def _fault_windows(loop: ClosedLoop) -> tuple[tuple[str, float, float], ...]:
 
 
 def _largest_inflow(loop: ClosedLoop, clock: Clock, u: Any) -> Any:
-    """(samples,) inflow of all tanks [cm^3/s] for inputs `u` of all samples, at most."""
+    """Return the (samples,) largest total inflow [cm^3/s] for inputs `u` of all samples."""
     plant: Any = loop.plant  # a network of tanks
     gain: Any = np.array(plant.pump_gain, dtype=float)
     faults: Any = loop.faults

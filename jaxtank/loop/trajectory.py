@@ -59,8 +59,8 @@ class Trajectory(TrajectoryViews):
         Volume lost over each rim since the start [cm^3].
     units : (length, pump input)
     share : (rows, pumps) array or None
-        Of a controller that blends two, the share of the first in each input [-]: of sliding mode
-        in that of `FuzzyBlend`.
+        If the controller blends two, the share of the first one in each input [-]; the share of
+        sliding mode for `FuzzyBlend`.
 
     Examples
     --------

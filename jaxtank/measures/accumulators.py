@@ -205,7 +205,7 @@ def settled(last, outside):
 
 
 def _update_rise(run, state, sample, context):
-    """Per output (target now, time of the first 10 %, that of the first 90 %, longest rise)."""
+    """Per output (target, times of the first 10 % and of the first 90 %, longest rise)."""
 
     def update(r, e, window, before):
         (target, step, _, _), (old, t10, t90, longest) = window, before
@@ -330,4 +330,4 @@ _BUILT_IN: dict[str, Accumulator] = {
 }
 
 ACCUMULATORS: dict[str, Accumulator] = {a: v._replace(arrays=True) for a, v in _BUILT_IN.items()}
-"""{name: Accumulator}; `jaxtank.measures.register` adds those of a user's own."""
+"""{name: Accumulator}; `jaxtank.measures.register` adds custom ones."""

@@ -19,7 +19,7 @@ from jaxtank.measures.accumulators import Run, settled
 class Measure(NamedTuple):
     """A named number or list, and all that reports, limits and searches need to know of it.
 
-    `jaxtank.measures.register` adds one of a user's own.
+    `jaxtank.measures.register` adds a custom one.
 
     Examples
     --------
@@ -28,7 +28,7 @@ class Measure(NamedTuple):
     ('cm', 'tank', -1.0)
     """
 
-    unit: str  # with "cm" standing for the rig's length unit and "V" for that of its inputs
+    unit: str  # "cm" stands for the rig's unit of length, "V" for the unit of its inputs
     per: str  # "run", "output", "tank" or "pump"
     needs: tuple[str, ...]  # names of accumulators
     read: Callable[[Run, dict[str, Any]], Any]  # (run, {accumulator: state}) -> scalar or array
@@ -365,4 +365,4 @@ MEASURES: dict[str, Measure] = {
     m: spec._replace(arrays=True, shown=_place(m, SHOWN), summary=_place(m, SUMMARY))
     for m, spec in _BUILT_IN.items()
 }
-"""{name: Measure}; `register` adds those of a user's own."""
+"""{name: Measure}; `register` adds custom ones."""

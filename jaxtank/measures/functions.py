@@ -1,4 +1,4 @@
-"""Measures of a user's own that are a function of other measures and of the trajectory."""
+"""Custom measures: functions of other measures and of the trajectory."""
 
 import dataclasses
 import inspect
@@ -44,17 +44,16 @@ def from_function(
     function : callable
         f(measures) or f(measures, trajectory), made of functions of `jax.numpy`, that returns one
         number. measures: {name: number, or array with one entry per output, tank or pump}, of which
-        only those are computed that it reads. trajectory: what `jaxtank.simulate` returns. A search
-        runs it at other steps too: use `trajectory.t`, and means rather than sums over rows.
+        only the ones that it reads are computed. trajectory: the result of `jaxtank.simulate`. A
+        search runs it at other steps too: use `trajectory.t`, and means rather than sums over rows.
     unit : str
-        Of the value, with "cm" standing for the rig's unit of length and "V" for that of its
-        inputs.
+        Of the value; "cm" stands for the rig's unit of length, "V" for the unit of its inputs.
     lower : bool
         True where a limit on it is a lower one.
     save_every : int
         Distance of the rows of the trajectory [samples].
     doc : str, optional
-        One line that says what it is; that of the function where left out.
+        One line that describes it; by default the first line of the function's docstring.
 
     Returns
     -------
@@ -93,13 +92,13 @@ def from_function(
     if not isinstance(unit, str):
         raise InputError(f"{name_of(function)}: unit = {shortened(unit)}: must be a text")
     read = RunFunction(function, _takes_trajectory(function), save_every)
-    words = doc or (inspect.getdoc(function) or "").partition("\n")[0] or "a function of one's own"
+    words = doc or (inspect.getdoc(function) or "").partition("\n")[0] or "a custom function"
     sense = -1.0 if lower else 1.0
     return Measure(unit, "run", (), read, words, low=None, sense=sense)
 
 
 def functions(names: Iterable[str]) -> dict[str, RunFunction]:
-    """Return {name: RunFunction} of those of `names` that are functions of a whole run.
+    """Return {name: RunFunction} of the `names` that are functions of a whole run.
 
     Examples
     --------
@@ -110,7 +109,7 @@ def functions(names: Iterable[str]) -> dict[str, RunFunction]:
     return {name: read for name, read in readers.items() if isinstance(read, RunFunction)}
 
 
-def name_of(function: Any, default: str = "a function of one's own") -> str:
+def name_of(function: Any, default: str = "a custom function") -> str:
     """Return the name of a function, `default` where it has none, as a lambda.
 
     Examples

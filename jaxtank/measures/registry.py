@@ -1,4 +1,4 @@
-"""Which measures there are and what is known of them by name; a user's own are registered here."""
+"""The measures by name, and their properties; custom measures are registered here."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -21,7 +21,7 @@ GROUP = "jaxtank.measures"
 Measure, or a function as in `from_function`.
 """
 _COMPILED: dict[str, Measure] = {}
-"""What was last registered by each name, also of measures that were deleted since."""
+"""The last Measure registered under each name, also if the measure was deleted later."""
 
 _NAME = re.compile(r"[A-Za-z]\w*")
 _SIZES: dict[str, Callable[[Any], int]] = {
@@ -161,9 +161,7 @@ def check_names(names: Iterable[str]) -> None:
 
 
 def unreadable(names: Iterable[str]) -> tuple[str, ...]:
-    """Return those of `names` that a rig file cannot name: functions of this process alone, which
-    no installed package has.
-    """
+    """Return the `names` of functions that no installed package has: no rig file can name them."""
     named = functions(names)
     return tuple(named.keys() - installed(GROUP).keys()) if named else ()
 
@@ -182,7 +180,7 @@ def times() -> tuple[str, ...]:
 
 def reported() -> tuple[str, ...]:
     """Return the names of the measures in every result: all but `times()`, functions of a whole
-    run and those of the linearised loop, which are computed where they are named.
+    run and measures of the linearised loop, which are computed only on request.
     """
     left_out = {*times(), *functions(MEASURES), *linear()}
     return tuple(m for m in MEASURES if m not in left_out)

@@ -45,8 +45,8 @@ class DisturbanceObserver(Observer):
     u [V] is the command after the pumps' limits: with `fed` = "command", the unlimited command,
     the observer winds up while a pump is saturated (gouta2022 notes S4.2). `before_compensation`
     uses the input before eq. (28) subtracts the estimate again, u + d^/c2, as eq. (23) prints
-    it (gouta2022 notes S4.3): the loop is then that of a single compensation with 2 l, and d^ is
-    half the disturbance.
+    it (gouta2022 notes S4.3): the loop then behaves as with a single compensation with 2 l, and
+    d^ is half the disturbance.
 
     Examples
     --------

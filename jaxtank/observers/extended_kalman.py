@@ -146,7 +146,7 @@ class ExtendedKalman(Observer):
             ).x
 
         unit, zero = jnp.ones_like(state.x[0]), jnp.zeros_like(state.x[0])
-        # columns[j][i] = F_ij of the levels i; the rows of random walks are those of the identity
+        # columns[j][i] = F_ij of the levels i; random walks have the rows of the identity
         columns = [
             jax.jvp(onward, (state.x,), (tuple(unit if i == j else zero for i in N),))[1] for j in N
         ]

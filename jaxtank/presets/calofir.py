@@ -186,7 +186,7 @@ def measured(run):
         ),
         "reacts rapidly to faults": Claim(
             bool(reacts.all()),
-            "faults of ours (notes A3): by its end, the partly closed outlet has moved h1 by"
+            "assumed faults (notes A3): by its end, the partly closed outlet has moved h1 by"
             f" {shift[0]:.5f} m and the leak by {shift[1]:.5f} m; with a constant flow"
             f" {open_shift[0]:.4f} and {open_shift[1]:.4f} m. The controller has changed the flow"
             f" by {push[0]:.1e} and {push[1]:.1e} m^3/s"

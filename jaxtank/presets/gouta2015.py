@@ -25,9 +25,9 @@ from jaxtank.signals.inflows import inflow_pulses
 from jaxtank.signals.setpoints import ramps
 
 RAMPS = (20.0, 30.0, 60.0, 200.0)  # durations of the setpoint ramps, not printed [s]
-OWN = 60.0  # that of the cases [s]
+OWN = 60.0  # sampling period of the cases [s]
 EVERY = 10  # samples between those that are kept of these runs: 0.1 s
-POUR = (620.0, 1.0, 0, 100.0)  # disturbance of ours: time, duration [s], tank, volume [cm^3]
+POUR = (620.0, 1.0, 0, 100.0)  # assumed disturbance: time, duration [s], tank, volume [cm^3]
 
 
 def total(trajectory):
@@ -132,7 +132,7 @@ def _claims(run, ramp):
 
 
 def _responses(pair, ramp):
-    """The responses to the first change, and to those of one setpoint alone."""
+    """Responses to the first change, and to changes of one setpoint alone."""
     t = pair[0].t
     first = [float(np.abs(run.e[(t >= 20.0) & (t < 270.0)]).max()) for run in pair]
     rest = max(900.0, 760.0 + ramp + 60.0)  # when the ramp of r2 is over
@@ -158,7 +158,7 @@ def _responses(pair, ramp):
 
 
 def _pour(run):
-    """What a volume poured into tank 1 does to both levels, beside the undisturbed run."""
+    """Effect on both levels of a volume that flows into tank 1: difference to the calm run."""
     area, peak = [], []
     for name in PAIR:
         case, calm = run(name, {"reference.ramp": OWN}, EVERY)

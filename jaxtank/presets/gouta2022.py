@@ -102,7 +102,7 @@ def trapezoids():
 
 
 def _exchanged(values):
-    # 1.5/Tp is the gain of the error, l that of its integral's observer: the loop knows their sum
+    # 1.5/Tp is the gain of the error, l the gain of the observer: the loop depends on their sum
     # and product (notes S4.4)
     rates = [v for n, v in values.items() if n.startswith("observer.l")]
     if "controller.Tp" not in values or not rates:

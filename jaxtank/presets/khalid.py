@@ -339,7 +339,7 @@ def preset():
             loop = build(kind, mode=mode)
             free = ["controller.r_w"] + (["controller.a"] if controller is Laguerre else [])
             # the parameter with the largest effect for one pump (notes S10): overshoot falls where
-            # the model is that of a high level
+            # the model is linearised at a high level
             free += (
                 ["controller.operating_point[1]"] if loop.plant.pumps == 1 else ["controller.q[1]"]
             )

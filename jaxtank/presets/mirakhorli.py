@@ -103,7 +103,7 @@ CONTROLLERS = {  # title, controller for a model, what `tune` changes
     ),
 }
 
-# cases of notes S7.2: what Table 3 needs besides what is printed
+# cases of notes S7.2: data for Table 3 that the paper does not print
 FITTED = {"smc-fitted": "smc-printed", "sfc-fitted": "sfc", "hybrid-fitted": "hybrid"}
 
 
@@ -261,7 +261,7 @@ TUNED = {
 
 
 def _once_tuned(run):
-    """The cost of the hybrid beside those of its parts, with the given gains and once tuned."""
+    """Costs of the hybrid and of its two parts, with the printed gains and with tuned gains."""
     before = {kind: run.cost(kind) for kind in ("hybrid", "smc", "sfc", "lqi")}
     tuned = {kind: run.cost(kind, values) for kind, values in TUNED.items()}
     return Claim(
@@ -300,7 +300,7 @@ def _table_3(run, assumed):
 
 
 def _near(value, target):
-    """Whether a value of ours, None for never, is within 10 % of the printed one."""
+    """Return True if a measured value (None: never) is within 10 % of the printed one."""
     if value is None or isinstance(target, str):
         return value is None and isinstance(target, str)
     return abs(value / target - 1.0) <= 0.1

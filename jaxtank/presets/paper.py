@@ -26,7 +26,7 @@ class Published(NamedTuple):
     tolerance : share of the printed number by which the measured one may differ and still count as
         reproduced; None for a number that is only quoted (a gain, a limit) and for a claim
     reason : why the measured number differs, or why it cannot be measured
-    fitted : the assumption of ours that was chosen to come near this number, which is then no
+    fitted : the assumption that was chosen so that this number is matched; it is then no
         evidence for the paper; "" for none
     closed_form : the formula by which the printed number follows from other printed ones, so that
         a measured one may equal it; "" for none, and a number that equals it is an input
@@ -148,7 +148,7 @@ class Preset:
 def closed_loop(plant: Any, controller: Any, reference: Any, x0: Any, **parts: Any) -> ClosedLoop:
     """Return the loop of a paper, with sensors without noise."""
     # sensor: (level per volt, full scale [V]); pumps: {field of PumpBank: one number, or one for
-    # each pump}; the other parts are those of ClosedLoop.
+    # each pump}; other parts: fields of ClosedLoop.
     scale, full_scale = parts.pop("sensor")
     each = lambda count, value: np.array(np.broadcast_to(number(value), (count,)))
     pumps: dict[str, Any] = {

@@ -194,8 +194,9 @@ class Sum(Signal):
 
     @pointwise
     def windows(self, clock: Clock) -> tuple[Any, ...] | None:
-        """Return those of the first signal (`Ramps`); a channel that the second (`Sine`) moves has
-        no step from its start on.
+        """Return the windows of the first signal (`Ramps`).
+
+        A channel has no step after the second signal (`Sine`) has started to move it.
         """
         t = sample_times(clock)
         sine, windows = cast(Any, self.second), self.first.windows(clock)
@@ -207,5 +208,5 @@ class Sum(Signal):
         return tuple(channels)
 
     def held(self) -> tuple[tuple[Any, ...], ...] | None:
-        """Return those of the first signal, about which the second one moves."""
+        """Return the plateaus of the first signal; the second one oscillates about them."""
         return self.first.held()

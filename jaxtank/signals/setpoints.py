@@ -24,8 +24,8 @@ TOLERANCE = 5e-7
 
 
 MANY = 60
-"""Changes of one channel above which they are looked up in arrays, so that the program does not
-grow with them; below, each is a piece of its own, which is faster."""
+"""Number of changes of one channel above which an array is searched, so that the program does not
+grow with it; with fewer changes each one is a separate term, which is faster."""
 
 
 class Many(NamedTuple):
@@ -398,8 +398,8 @@ class Sine(Signal):
 
         s(t) = offset + amplitude sin(2 pi (t - zero) / period)   for start <= t < end, else 0
 
-    One channel of several moves, the others stay at 0. Its rate is that of the sine; jumps at the
-    two ends have no impulse.
+    One channel of several moves, the others stay at 0. The rate is the derivative of the
+    sine; jumps at the two ends have no impulse.
 
     Examples
     --------

@@ -62,7 +62,7 @@ def _mapped(operands: Any, axes: Any, *, jaxpr: Any, batch: int) -> Any:
 
 
 def _derived(primals: Any, tangents: Any, *, jaxpr: Any, batch: int) -> Any:
-    """Rule of derivatives: those of the operations, by the operands that have a tangent."""
+    """Derivative rule: differentiate the operations by the operands that have a tangent."""
     flags = [not isinstance(v, ad.Zero) for v in tangents]
 
     def run(*moving: Any) -> list[Any]:

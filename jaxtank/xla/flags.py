@@ -36,7 +36,7 @@ in XLA_FLAGS. Unknown extra options are ignored.
 
 def append_option(flags):
     """Return `flags`, the text of XLA_FLAGS, with the options added."""
-    # What the user set, these options included, stays as it is. A text that does not begin with
+    # Options that the user has set, also these, stay unchanged. A text that does not begin with
     # "--" names a file of flags, to which nothing can be appended.
     if flags.strip() and not flags.lstrip().startswith("--"):
         return flags

@@ -3,12 +3,12 @@
 jax's own cache, which `program_cache` sets up, saves the compiler; tracing and lowering a closed
 loop takes as long as its run again. An entry is found by everything that a trace depends on
 (`signature`): types, shapes and static values of the arguments, the source of this package, jax and
-its settings, the processor. What cannot be written down exactly, as a class of a user's own, is
-traced as ever.
+its settings, the processor. A value without exact words, such as a
+custom class, is traced in each process.
 
-jax reads an entry by unpickling, and it holds native code: the folder is the user's own, checked by
-`program_cache.prepare`, entries are checked by their digests, and each holds its own name, which is
-that of all it depends on, and the processor that it was compiled for.
+jax reads an entry by unpickling, and an entry holds native code. `program_cache.prepare` therefore
+checks that the folder belongs to the user; the digest of each entry is checked too. An entry holds
+its name (the signature) and the processor for which it was compiled.
 """
 
 import functools
@@ -28,7 +28,7 @@ from jaxtank.xla import program_cache
 from jaxtank.xla.signatures import OURS, Unknown, context, kind_of, name_of, signature, words_of
 
 ENDING = f"-whole{program_cache.ENTRY}"
-"""End of the name of an entry: it counts, is checked and is removed as those of jax."""
+"""Suffix of an entry, which is counted, checked and removed like an entry of jax."""
 
 NEVER = 1e9
 """Time to compile from which jax keeps a program, where none is to be kept [s]."""
@@ -171,7 +171,7 @@ def _about(lowered: Any) -> dict[str, Any] | None:
 
 
 def _compile(lowered: Any, about: dict[str, Any], path: Path) -> Any:
-    """The program, compiled, and kept as an entry that replaces that of jax."""
+    """Compile a program and store it as an entry that replaces the entry of jax."""
     # A program that jax has read from its cache cannot be written again (XLA leaves out functions).
     config: Any = jax.config
     least = config.jax_persistent_cache_min_compile_time_secs
@@ -207,7 +207,7 @@ def _load_lapack() -> None:
 
 
 def _words(tree: Any) -> Any:
-    """A structure of results as JSON: dicts, lists, tuples and named tuples of ours."""
+    """A structure of results as JSON: dicts, lists, tuples and named tuples of this package."""
     if isinstance(tree, dict):
         return ["dict", {name: _words(value) for name, value in tree.items()}]
     if hasattr(tree, "_fields"):

@@ -43,7 +43,7 @@ def normal_at(key: Any, index: jax.Array) -> jax.Array:
 
 
 def _is_threefry(key: Any) -> bool:
-    """Return whether the bits of a key are those of `_blocks`."""
+    """Return True if a key gives the bits of `_blocks`."""
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     config: Any = jax.config
     partitionable = bool(config.jax_threefry_partitionable)

@@ -1,4 +1,4 @@
-"""Compiled programs kept between processes, by jax's own cache, in a folder of the user's own.
+"""Compiled programs kept between processes by the cache of jax, in a folder of the user.
 
 Entries hold native code and are unpickled by jax, so every folder above them and every entry is
 checked before it is used: its owner and mode, and its digest, which holds its own name too.
@@ -31,7 +31,7 @@ HALF_WRITTEN = 600.0
 ENTRY, DIGEST = "-cache", ".sha256"
 """Ends of the names of an entry, as jax writes it, and of the digest beside it."""
 
-ELSEWHERE = "name a folder of your own by JAXTANK_CACHE=DIR"
+ELSEWHERE = "choose another folder by JAXTANK_CACHE=DIR"
 REMEDY = f"remove it, or {ELSEWHERE}"
 
 folder: Path | None = None
@@ -165,7 +165,7 @@ def refused(folder: Path) -> str:
     if status.st_uid != os.geteuid():
         return f"{name} belongs to another user: {REMEDY}"
     if mode := stat.S_IMODE(status.st_mode) & 0o077:
-        # what others may have put there cannot be told from what is the user's own: no chmod
+        # chmod is no remedy: files that others may have put there cannot be recognised
         return f"{name} is open to other users (mode {0o700 | mode:o}, not 700): {REMEDY}"
     way = dict.fromkeys((*folder.absolute().parents, *folder.resolve().parents))  # of a link, both
     return next((why for above in way if (why := _open_above(above))), "")
@@ -183,7 +183,7 @@ def _open_above(folder: Path) -> str:
 
 
 def _planted(folder: Path) -> str:
-    """Return why the entries of a folder are not all the user's own files; "" where they are."""
+    """Return why the entries of a folder may be the files of another user, or ""."""
     if sys.platform == "win32":
         return ""
     for path in folder.iterdir():

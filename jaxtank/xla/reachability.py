@@ -40,7 +40,7 @@ def _follow(jaxpr, reached):
         hit = [_in(v, reached) for v in eqn.invars]
         if not any(hit):
             continue
-        # operations with a program of their own are taken whole, but for plain calls
+        # an operation that contains a program counts as a whole, unless it is a plain call
         results = [True] * len(eqn.outvars)
         inner = eqn.params.get("jaxpr") if eqn.primitive.name in ("jit", "pjit") else None
         if inner is not None:

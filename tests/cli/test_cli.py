@@ -670,7 +670,7 @@ BAD = {
     "tune C --samples 8": "belong to --robust",
     "tune C --robust mean --back-off 2": "from 0 to below 1",
     "tune C --robust best": "--robust 'best': must be one of mean, cvar, worst",
-    "tune C --robust mean --scenario sensor.noise=0.1": "scenarios of its own",
+    "tune C --robust mean --scenario sensor.noise=0.1": "omit --choose",
     "tune C --starts 0 --seed x --limit max_levl=3": "--starts '0'; --seed 'x'; unknown measure",
     "uncertainty C --samples 0": "--samples '0'",
     "uncertainty C --vary plant.drian=uniform:5%": "plant.drain",

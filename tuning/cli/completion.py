@@ -125,7 +125,7 @@ def gather():
     kinds = {
         "cases": presets.names(),
         "parameters": sorted(parameters | {f"clock.{k}" for k in CLOCK}),
-        # without a user's own functions
+        # without custom functions
         "measures": [m for m in MEASURES if m not in functions(MEASURES)],
         "figures": [name for name, figure in FIGURES.items() if figure.runs],
     }

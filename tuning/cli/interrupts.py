@@ -28,7 +28,7 @@ _held = []  # True once the main thread waits for its end
 
 
 def listen():
-    """Answer SIGINT and SIGTERM from now on: for a program of its own, never in a caller's process.
+    """Handle SIGINT and SIGTERM; only in the process of the command, never in a caller's.
 
     A thread answers them. The main thread cannot while it is in native code, which may compile for
     minutes, and an exception raised in an import would leave a module half made.

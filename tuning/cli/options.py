@@ -57,8 +57,8 @@ RUN = (
 UNCERTAIN = (
     Option("--spread", "FRACTION", "one relative half-width for all parameters that the case calls"
            " uncertain, as 0.1 for +-10 % (tune: not with --nominal)", values.share),
-    Option("--vary", "NAME=DISTRIBUTION", "an uncertain parameter, in place of those of the case,"
-           " as plant.drain=uniform:5% or normal:MEAN:SD (tune: not with --nominal)",
+    Option("--vary", "NAME=DISTRIBUTION", "an uncertain parameter; replaces the ones of the case;"
+           " plant.drain=uniform:5% or normal:MEAN:SD (tune: not with --nominal)",
            values.pair(str), kind="pairs"),
 )
 CLUSTER = (

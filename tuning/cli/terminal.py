@@ -36,7 +36,7 @@ class Forgiving(io.RawIOBase):
 
 
 def guard():
-    """Replace closed standard streams: for a program of its own, never in a caller's process."""
+    """Replace closed standard streams; only in the process of the command, never in a caller's."""
     # Descriptors that were closed (`>&-`) are taken first: the next file to be opened would get
     # their number. A stdout that was closed raises OSError once it is written to. stderr is
     # `Forgiving`.

@@ -1,4 +1,4 @@
-"""Tasks on any `concurrent.futures.Executor`; that of a Dask cluster, by an address or local."""
+"""Tasks on any `concurrent.futures.Executor`, or on a Dask cluster (an address, or local)."""
 
 import contextlib
 import importlib
@@ -18,7 +18,7 @@ CONNECT = 8.0
 """Time within which a scheduler must answer [s]."""
 
 AT_ONCE = 1024
-"""Tasks that are sent before the first of them is done, and workers of one machine, at most."""
+"""Largest number of tasks under way at once, and of workers on one machine."""
 
 LOOK = 0.5
 """Time after which the workers are looked at, where no result has come [s]."""
@@ -53,7 +53,7 @@ def call(task, x64, *arguments):
 
 
 # Dask sends a function of the main module as its code: a worker without this program then raises an
-# error of its own rather than end, and the scheduler needs no more than Dask
+# error but continues to run, and the scheduler needs no more than Dask
 call_by_code = types.FunctionType(call.__code__, {"TASKS": TASKS, "importlib": importlib})
 call_by_code.__module__ = "__main__"
 
@@ -119,7 +119,7 @@ class Engine:
         if len(self.processors | {processor}) > len(self.processors) == 1:
             warnings.warn(
                 f"{self.name}: workers have different types of processor: numbers may differ in"
-                " their last digits from those of one type",
+                " their last digits",
                 ClusterWarning,
                 stacklevel=5,
             )

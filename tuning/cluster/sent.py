@@ -18,8 +18,8 @@ def sent(case: Case, names: Sequence[str] = ()) -> str:
     """Return a case as JSON: its rig file, and the fingerprint of its loop, clock and versions."""
     for name in ms.functions(names):
         raise InputError(
-            f"cluster: {name} is a function of your own, and workers are sent no code:"
-            " leave out the cluster, or use measures of the package"
+            f"cluster: {name} is a custom function, and no code is sent to workers:"
+            " omit the cluster, or use measures of the package"
         )
     try:
         text = rig.dump(case)

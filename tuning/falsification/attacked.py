@@ -255,7 +255,7 @@ class Attacked:
             object.__setattr__(self, name, value)
 
     def nominal(self) -> dict[str, np.ndarray]:
-        """Return the values (see `values`) of the case as it is, without reading errors."""
+        """Return the values (see `values`) of the unchanged case, without reading errors."""
         nominal, varying = np.array([c.nominal for c in self.coefficients]), self.shapes["varying"]
         loop, clock = self.case.loop, self.case.clock
         values = {
@@ -401,7 +401,7 @@ def _tops(loop):
 
 
 def _without_controller(loop, clock):
-    """A loop whose commands are those of a PumpPlan, limited by its filter and its pumps."""
+    """A loop with the commands of a PumpPlan, limited by its filter and its pumps."""
     low, high = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
     if not np.all(np.isfinite([low, high])):
         raise InputError("attack: pumps other than the case's own need finite limits of the pumps")

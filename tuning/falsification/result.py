@@ -122,7 +122,7 @@ class Attack(Result):
                 noise=np.zeros(loop.plant.tanks),
                 offset=np.mean(values["error"], axis=1),
             )
-            if safety is not None:  # that of the case, not that of a sensor with this offset
+            if safety is not None:  # the band of the case, not of a sensor with this offset
                 safety = {**safety, "band": np.asarray(loop.safety_filter.band)}
         return case.replace(loop=dataclasses.replace(loop, **changes), safety=safety)
 
@@ -138,7 +138,7 @@ class Attack(Result):
         return missing
 
     def _faults(self, run):
-        """The Faults of the plant in a run, equal windows joined; those of the case last."""
+        """Return the Faults of the plant in a run, equal windows joined, then those of the case."""
         clock, of_case = self.case.clock, self.case.loop.faults
         edges = np.linspace(0.0, clock.duration + clock.dt, self.attacked.windows + 1)
         windows, extra = [], []

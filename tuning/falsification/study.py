@@ -157,7 +157,7 @@ class Limits(NamedTuple):
 
 
 def limits_of(case: Case) -> Limits:
-    """Return the level limits of a case: those of its safety filter, or max_level and the rims."""
+    """Return the level limits of a case: from its safety filter, else max_level and the rims."""
     loop, safety_filter = case.loop, case.loop.safety_filter
     if safety_filter is None:
         rim, top = np.asarray(loop.plant.rim, dtype=float), case.limits.get("max_level", "rim")
@@ -216,7 +216,7 @@ class _Search:
         return _in_batches(self.run, size, values)
 
     def screen(self):
-        """(variables of the draws, levels (draws + 1, n), first those of the case as it is)."""
+        """Return (variables of the draws, levels (draws + 1, n)); row 0 is the unchanged case."""
         points = _points(self.attacked, self.draws, self.rng)
         values, nominal = self.values(points), self.attacked.nominal()
         first = {k: np.broadcast_to(nominal[k], v.shape[1:])[None] for k, v in values.items()}
@@ -294,7 +294,7 @@ class Ascent(NamedTuple):
 def ascend(
     slopes: Callable, z: dict[str, np.ndarray], iterations: int, report: Callable | None = None
 ) -> Ascent:
-    """Return points with higher values than those of `z`, in the unit cube."""
+    """Return points in the unit cube with higher values than at `z`."""
     # Each point moves by its own step along the signs of its slopes, z + step sign(dz) cut to the
     # cube: a step of 1 goes to the corner that a linear function is highest at. A point that does
     # not rise stays, and its step is halved.

@@ -48,13 +48,13 @@ def feasibility(
     ----------
     case : Case
     distributions : dict or None
-        {dotted name: distribution, or a relative half-width}; those of the case where None.
+        {dotted name: distribution, or a relative half-width}; default: of the case.
     samples : int
         Number of plants (scrambled Sobol points).
     seed : int
     limits : dict or None
-        {measure: limit} as in `tune`, of which `max_level` counts; those of the case where None. A
-        tank without a limit has its rim.
+        {measure: limit} as in `tune`, of which `max_level` counts; default: of the case. The limit
+        of any other tank is its rim.
     mends : bool
         Look for the smallest changes that make 95 % of the plants feasible, with twice as many
         plants.
@@ -215,7 +215,7 @@ def apply_mend(
     Returns
     -------
     (Case, Mend)
-        The case as it is, and a Mend with nothing to set, where it needs none. Models of controller
+        The unchanged case and an empty Mend, if no change is needed. Models of controller
         and observer follow a changed plant.
 
     Raises
@@ -387,7 +387,7 @@ others above TARGET [-].
 """
 
 DESIGN = 2
-"""Draws that mends are found with, for each one that is counted: less scatter of their own."""
+"""Draws in the design of a change per draw that is counted: more draws, less scatter."""
 
 COARSE = 1024
 """Draws with which the direction of a move of setpoints is found; its size is found with all."""
@@ -396,7 +396,7 @@ FACTORS = (1.02, 1.05, 1.1, 1.2, 1.35, 1.6, 2.0, 3.0)
 """Factors on the areas of orifices among which the smallest is looked for."""
 
 FAR = 0.4
-"""Margin, as a share of a limit, of what a move of setpoints does not look at."""
+"""Margin, as a share of a limit, above which a change of setpoints ignores the limit."""
 
 ROUNDING = 1e-4
 """Margin, as a share of a limit, that a search of setpoints keeps."""
@@ -515,7 +515,7 @@ def _least_move(needs, where, values, quantile, start):
 
 
 def _rims(needs: Needs) -> Mend | None:
-    """Rims raised; none where a limit of its own is below."""
+    """Return raised rims; None if rims differ from plant to plant. Limits below a rim stay."""
     if np.ptp(needs.rim, axis=0).any():
         return None
     tanks = needs.rim.shape[1]
@@ -523,7 +523,7 @@ def _rims(needs: Needs) -> Mend | None:
 
 
 def _pumps(needs: Needs) -> Mend | None:
-    """Upper limits of the pumps raised."""
+    """Return raised upper limits of the pumps; None if they differ from plant to plant."""
     tanks, whole = needs.rim.shape[1], needs.high.shape[1]
     if np.ptp(needs.high[:, tanks:], axis=0).any():
         return None
@@ -532,8 +532,9 @@ def _pumps(needs: Needs) -> Mend | None:
 
 
 def _raised(needs, what, leaf, first, columns, end) -> Mend | None:
-    """The Mend that raises those of the limits `columns` that are passed; one height for all whose
-    limits are the same.
+    """Return the Mend that raises the violated limits among `columns`.
+
+    Limits that are equal before are equal after.
     """
     needed = needs.at()
     most = np.nan_to_num(needed, nan=np.inf).max(axis=1)

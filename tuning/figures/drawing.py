@@ -36,7 +36,7 @@ class Drawn(NamedTuple):
 
 
 def run(figure: Figure) -> Drawn:
-    """Return the runs of a figure; noise is that of seed 0."""
+    """Return the runs of a figure; the noise has seed 0."""
     runs = {}
     for one in figure.runs:
         case = rig.set_values(presets.find(one.case), dict(one.values))

@@ -31,8 +31,8 @@ class Spread:
     # The covariance is then the sandwich (J'J)^-1 S (J'J)^-1. Two estimates of S are computed and
     # the wider one is used: Newey and West (Econometrica 55, 1987, 703), too narrow for slow noise;
     # and S = J' C J, too narrow for slow noise under fast noise, where C is the correlation of
-    # first-order noise with the autocorrelation of the residuals. `widened` is the ratio of the
-    # intervals to those of white noise.
+    # first-order noise with the autocorrelation of the residuals. `widened` is the ratio to the
+    # intervals for white noise.
 
     def __init__(self, estimation: Estimation, fit: Fit, correlation: Sequence[float] = ()):
         self.estimation, self.fit, self.residual = estimation, fit, pseudo(fit)

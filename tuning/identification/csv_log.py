@@ -325,7 +325,6 @@ def _factor(kind, slot, unit, units, where):
         usual = {"t": tuple(TIMES), "pump": INPUT_UNITS, "h": LEVEL_UNITS}[kind]
         names = [other for other in usual if factor(other, base)] or [base]
         raise DataError(
-            f"{where}: unit {unit!r} cannot be that of a {KINDS[kind]}: must be one of"
-            f" {', '.join(names)}"
+            f"{where}: {unit!r} is no unit of a {KINDS[kind]}: must be one of {', '.join(names)}"
         )
     return size, False

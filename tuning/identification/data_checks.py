@@ -19,8 +19,8 @@ DRIVE_MARGIN = 2.0
 FAINT = 0.015
 """Share of its range below which a pump's input, or every level, is taken to be in another unit."""
 IRREGULAR = 1.25
-"""Ratio of a long to a short step between samples (90th and 10th percentile) above which they are
-no longer those of a controller's own clock, at which its outputs change."""
+"""Ratio of a long to a short step between samples (90th and 10th percentile) above which
+they do not follow the clock of a controller, which changes its outputs at its samples."""
 FEWEST = 3
 """Fewest samples of a run that can be fitted: residuals have an autocorrelation from three on."""
 

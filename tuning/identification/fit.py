@@ -67,7 +67,7 @@ def identify(
         {name: (low, high)} or {name: (low, high, "log" or "linear")} of plant, sensor, actuator or
         a constant disturbance; by default pump gains, splits, orifices and pipes.
     start : {"free", "measured", "case"}
-        Levels at the first sample: estimated, as measured, or those of the case.
+        Levels at the first sample: estimated, measured, or from the case.
     starts : int
         Number of searches: the first from the case's values, others from Sobol points of the box.
     seed : int

@@ -187,7 +187,7 @@ def _gain_and_time(loop, model, inputs):
         at, name = ", ".join(f"{v:g}" for v in inputs), input_name(loop.plant, j)
         raise InputError(
             f"{name} does not settle tank {loop.plant.outputs[j] + 1} at inputs ({at})"
-            f" {loop.units[1]}: no PI of its own, use another [controller]"
+            f" {loop.units[1]}: a PI controller does not fit, use another [controller]"
         )
     return gain, area / gain + loop.actuator.delay
 

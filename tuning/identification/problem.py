@@ -43,7 +43,7 @@ class Estimation:
     free : mapping, optional
         {name: (low, high)} or {name: (low, high, "log" or "linear")}; `default_free` if omitted.
     start : {"free", "measured", "case"}
-        Levels at the first sample: estimated, as measured, or those of the case. Tanks that are not
+        Levels at the first sample: estimated, measured, or from the case. Tanks that are not
         measured start from the case's levels unless they are free.
     noise : (channels,) array, optional
         Standard deviation that weights each channel; estimated from the data if omitted.

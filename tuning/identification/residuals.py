@@ -26,7 +26,7 @@ def noise_of(data):
     """Return (channels,) standard deviation of the noise in PaddedData."""
     # From second differences, for a level is smooth, by their median absolute deviation, which
     # steps do not affect. At least a thousandth of the range of the channel: with less, weights
-    # would be those of round-off.
+    # would follow from round-off.
     present = np.isfinite(data.y)
     top = np.max(data.y, axis=1, where=present, initial=-np.inf)
     span = top - np.min(data.y, axis=1, where=present, initial=np.inf)

@@ -57,8 +57,8 @@ def rig_of(loop):
 class PaddedData(NamedTuple):
     """Experiment data of several runs as arrays, padded to the longest."""
 
-    # The padding has steps of length zero and no readings. Where inputs change between samples, dt
-    # and u have an axis of pieces behind that of the samples, those not in use of length zero.
+    # The padding has steps of length zero and no readings. If inputs change between samples, dt and
+    # u have a third axis, pieces of a sample; unused pieces have length zero.
 
     dt: np.ndarray  # (logs, samples) time to the next sample [s], 0 at the last one and after
     u: np.ndarray  # (logs, samples, pumps)

@@ -25,7 +25,7 @@ POINTWISE = {m: ms.MEASURES[m].sense for m in ("max_level", "min_level", "max_er
 
 
 class Terms(NamedTuple):
-    """What is minimised and what is limited: the part that is compiled in."""
+    """Terms of the cost and of the limits: static, part of the compiled program."""
 
     objective: tuple  # ((measure, weight), ...)
     squared: bool  # whether the square of the cost is minimised: smooth where the cost is a root

@@ -80,15 +80,15 @@ def bound(
         min over u_1 .. u_K in [low, high] of  sum_m weight_m measure_m(run with u)   under the
         limits, at every sample
 
-    The search starts from the inputs of the case's own controller and from those of steady state,
+    The search starts from the inputs of the case's controller and from the steady-state inputs,
     with exact gradients by reverse mode at a coarser clock, and holds limits on levels by one
     multiplier per sample (augmented Lagrangian). The result is checked, and its limits tightened
     until they hold, at the case's own step.
 
     It is a numerical optimum of a non-convex problem, not a certificate. A controller that samples
-    faster than the interval may have a lower cost; if the case's own has, its inputs are the
-    result. Dead zone, lag and delay act on the inputs as on those of a controller; sensor noise is
-    left out. Ctrl-C ends the search with the best inputs so far.
+    faster than the interval may have a lower cost; if the case's controller has one, its inputs
+    are the result. Dead zone, lag and delay act on the inputs; there is no sensor noise. Ctrl-C
+    ends the search with the best inputs so far.
 
     Parameters
     ----------
@@ -160,7 +160,9 @@ def bound(
     )
 
 
-DIVERGED = "neither the case's own inputs nor those of steady state give a run that stays finite"
+DIVERGED = (
+    "neither the inputs of the case's controller nor the steady-state inputs give a finite run"
+)
 
 GRIDS = (16, 4, 1)
 """Intervals that share an input, coarse to fine: slow changes are found with few unknowns."""
@@ -185,7 +187,7 @@ class InputSearch:
         self.iterations, self.gradients, self.simulations = 0, 0, 0
 
     def run(self):
-        """Search with coarse to fine intervals, on the finest until the limits hold."""
+        """Search with coarse, then finer intervals; repeat the finest until the limits hold."""
         problem = self.problem
         grids = [g for g in GRIDS if g == 1 or problem.count >= 20 * g]
         u = self._start(grids[0])

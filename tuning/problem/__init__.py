@@ -1,1 +1,1 @@
-"""What a search minimises and what must hold: bounds, limits, scenarios."""
+"""The optimisation problem of a search: cost, constraints, bounds, scenarios."""

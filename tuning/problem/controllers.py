@@ -26,7 +26,7 @@ from jaxtank.rig.template import around
 NAMES = ("controller.kind", "law.kind")
 """Names by which a choice of the controller is known: in Python, and of the table of a rig file."""
 
-FASTER = 10.0  # ratio of the time constant of the rig to that of the first closed loop [-]
+FASTER = 10.0  # time constant of the rig / time constant of the first closed loop [-]
 
 DEVIATION, EFFORT = 0.05, 0.25
 """A level off by the first share of the tanks' height counts as much as an input off by the second
@@ -230,7 +230,7 @@ def _fuzzy(known: Rig) -> Any:
 
 
 def _predictive(known: Rig) -> Any:
-    """Levels that differ where pipes join them; limits of the inputs as those of the pumps."""
+    """Levels that differ where pipes join them; the input limits of the pumps."""
     span = known.high - known.low
     return {
         "operating_point": known.levels,

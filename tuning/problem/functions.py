@@ -182,7 +182,7 @@ def _enter(custom: Objective | Constraint, functions: dict[str, ms.Measure]) -> 
             )
         raise InputError(
             f"{name} is the name of two functions (or of one with two units, limits or save_every):"
-            " give each a name of its own"
+            " give each a different name"
         )
     functions[name] = measure
     return name

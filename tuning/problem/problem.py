@@ -1,4 +1,4 @@
-"""What is minimised and what must hold, as numbers with exact derivatives."""
+"""The optimisation problem: cost, and margins to the limits, with exact derivatives."""
 
 # functions of jax and of `measures` whose types are not complete
 # pyright: reportUnknownMemberType=false
@@ -92,12 +92,12 @@ class Problem:
     case : the Case.
     free : {name: (low, high) or Free}; the case's own where None, as for the next three.
     objective : {measure: weight}; a measure with several entries counts with their sum. Also a
-        custom function, or a `tuning.Objective`, alone or in the place of a measure.
+        custom function, or a `tuning.Objective`, alone or instead of a measure.
     limits : as in `resolve_limits`, or a list with `tuning.Constraint`s; of every scenario.
     scenarios : tuple of Scenario, () for the case's own run alone.
     seed : of the sensor noise, which is the same for every evaluation (common random numbers).
     risk : how the costs of the scenarios are combined, one of RISKS.
-    runs : the runs of the scenarios, where their noise or weights are not those of the seed.
+    runs : the runs of the scenarios, if noise or weights do not follow from the seed.
     draw_noise : draw the noise once, for a problem that is evaluated many times.
 
     Raises
@@ -116,7 +116,7 @@ class Problem:
     bounds: list[Bound]
     objective: Mapping[str, float]
     limits: list[Limit]
-    stated_limits: Mapping[str, Any] | None  # {measure: value}; None: those of each run's case
+    stated_limits: Mapping[str, Any] | None  # {measure: value}; None: limits of each run's case
     scenarios: tuple[Scenario, ...]
     seed: int
     risk: str
@@ -204,7 +204,7 @@ class Problem:
 
     @property
     def model(self) -> str | None:
-        """What the Gauss-Newton matrix is the second derivative of.
+        """The function whose second derivative the Gauss-Newton matrix approximates.
 
         "square" (the cost is one root mean square: its square), "cost", or None where no term of
         the cost is a sum of squares, or the parameters are too many to carry derivatives of.

@@ -50,12 +50,12 @@ def coarse_clock(clock: Clock) -> Clock:
 
 
 class ScenarioRun(NamedTuple):
-    """One scenario as it is run."""
+    """One scenario with its case, noise and weight."""
 
     name: str
     case: Case  # with the scenario's values set
     key: Any  # of the sensor noise, None where there is none
-    weight: float  # share of the mean [-]; those of all runs sum to 1
+    weight: float  # share of the mean [-]; the weights of all runs sum to 1
 
 
 class Group(NamedTuple):

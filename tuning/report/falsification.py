@@ -77,7 +77,7 @@ def remarks_of(attack):
     remarks, rises = [], [tank.rise for tank in attack.found if np.isfinite(tank.rise)]
     if rises:
         remarks.append(
-            f"Levels are those at the samples; between two samples a level can rise by at most"
+            f"Levels are taken at the samples; between two samples a level can rise by at most"
             f" {max(rises):.3g} {unit} (b_max u_max dt, and what flows in from other tanks)."
         )
     if attacked.physical_rims:

@@ -62,7 +62,8 @@ def needs(study, least=LISTED):
 def unreachable(study):
     """Return the sections of a default answer: lost setpoints, and options that mend them."""
     sections = [Text([verdict(study)]), *needs(study, MATTERS)]
-    if study.mends:  # that of the setpoints is long: JSON and the study's own report have it
+    # without the change of setpoints, which is long: see the JSON and the report of the study
+    if study.mends:
         kinds = [
             f"--mend {m.what}" + (f" ({m.words})" if m.what != "setpoints" else "")
             for m in study.mends

@@ -1,7 +1,7 @@
 """One HTML page of a Report, and the HTML that a notebook shows.
 
 A page is self-contained: pictures are inside as SVG, nothing is fetched from the network, there is
-no script but that of the live page in its frame, and jinja2 escapes every text.
+no script except in the frame of the live page, and jinja2 escapes every text.
 """
 
 import io

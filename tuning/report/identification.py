@@ -45,7 +45,7 @@ def sentences_of(fit):
         parameters = count(len(fit.case.covariance[0]), "parameter")
         words.append(
             f"the [covariance] of {parameters} of an earlier identification, in {fit.case.name!r},"
-            " is not used: values and intervals are those of these data alone; give the earlier log"
+            " is not used: values and intervals follow from these data alone; give the earlier log"
             " too, with another --data"
         )
     words += [
@@ -294,7 +294,7 @@ def save(fit, folder, command=None):
         payload["message"] += f"; {why}"
     files = {"fit.csv": fit_csv(fit), **({"rig.toml": rig} if rig else {})}
     stale, old = earlier(folder, ["residuals", "rig"]), Path(folder)
-    if (old / "fit.csv").exists():  # an earlier rig file must not be taken for that of this result
+    if (old / "fit.csv").exists():  # the rig file of an earlier result must not remain
         names = ["rig.toml", "fit.png", "correlation.png", "profile.png"]
         paths = [*(old / name for name in names), *old.glob("fit_[0-9]*.png")]
         stale += [path for path in paths if path.name not in files and path.is_file()]

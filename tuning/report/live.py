@@ -19,7 +19,7 @@ def live_page_of(result: Any, plants: int | None = None) -> LivePage:
     # Raises InputError for a result without a case, and a case that cannot be run in a browser.
     case, tuned = getattr(result, "case", None), getattr(result, "tuned", None)
     if case is None:
-        raise InputError(f"{type(result).__name__} has no case of its own to explore")
+        raise InputError(f"{type(result).__name__} has no case to explore")
     if tuned is not None and tuned.loop.safety_filter is not None:
         # designed for the plant, which is the same
         loop = dataclasses.replace(case.loop, safety_filter=tuned.loop.safety_filter)
@@ -32,7 +32,7 @@ def live_page_of(result: Any, plants: int | None = None) -> LivePage:
         _, limits = as_measures(None, stated)
         functions = set(ms.functions(limits))  # a user's functions do not run in a browser
         limits = {m: value for m, value in limits.items() if m not in functions}
-        case = case.replace(limits=limits)  # those of the search, with --limit
+        case = case.replace(limits=limits)  # the limits of the search, with --limit
     return live_page(case, states_of(result), plants=plants)
 
 

@@ -26,7 +26,7 @@ REPRODUCED, FITTED, DIFFERS = "reproduced", "fitted", "differs"
 IMPOSSIBLE, INPUT = "not reproducible", "input"
 VERDICTS = {
     REPRODUCED: "within the tolerance of its row, or a claim that holds",
-    FITTED: "near the printed number, for which an assumption of ours was chosen: no evidence",
+    FITTED: "near the printed number because an assumption was chosen for it: no evidence",
     DIFFERS: "measured, and different or true in part only: the row says why",
     IMPOSSIBLE: "cannot be measured: the row says what is missing",
     INPUT: "a number that our case has from the paper: no evidence",
@@ -245,8 +245,8 @@ def report(pages):
             *(section for page in pages.values() for section in _sections(page)),
             *(Live(next(iter(presets.load(p).cases.values()))) for p in pages),
         ],
-        subtitle="Published numbers, those of the same rigs and controllers here, and why they"
-        " differ.",
+        subtitle="Published numbers, numbers of our runs of the same rigs and controllers, and why"
+        " they differ.",
     )
 
 

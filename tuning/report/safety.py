@@ -89,5 +89,5 @@ def sentences(case):
         "kappa: a level may rise by at most kappa x its distance to the limit; at most: the largest"
         " kappa that is proved.",
         "gap: with its pumps at full command the nominal rig settles this far below the limit, or"
-        " below where it would settle without the filter; -: no pump of its own.",
+        " below where it would settle without the filter; -: no pump feeds the tank.",
     ]

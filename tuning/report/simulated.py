@@ -153,16 +153,17 @@ def _margins(loop, plateaus):
 
 
 def save(case, run, payload, folder, page, command=None, gif=False, against=None, columns=None):
-    """Write result.json, trajectory.csv, pictures and report.html of one simulation to `folder`,
-    from which those of an earlier one are removed; if asked, a film and the responses for a
-    journal of `columns`.
+    """Write result.json, trajectory.csv, pictures and report.html of one simulation to `folder`.
+
+    Files of an earlier simulation are removed. Optionally a film (`gif`) and pictures for print
+    (`columns`).
     """
-    # page: function that returns the Report; against: (Case, Trajectory) of a rig that the film,
-    # run.gif, and its still, film.png, show beside it.
+    # page: function that returns the Report; against: (Case, Trajectory) of a second rig in the
+    # film, run.gif, and in its still, film.png.
     from jaxtank.plots import responses
 
     check_folder(folder)
-    # of an earlier run, known by its trajectory: its tanks must not be taken for those of this one
+    # trajectory.csv shows an earlier run: its pictures must not remain next to the new ones
     old = (Path(folder) / "trajectory.csv").exists()
     names = "responses.png estimates.png shares.png run.gif film.png report.html print.svg"
     stale = [Path(folder) / name for name in f"{names} print.png".split()] if old else []

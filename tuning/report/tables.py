@@ -162,8 +162,9 @@ def _why(measure, values):
 
 
 def _unserved():
-    """{measure: why a case has none} of those that are reported where they are not computed; not
-    those of the linearised loop, which are computed only where they are named.
+    """Return {measure: why a case has no value}.
+
+    Without measures of the linearised loop, which are computed only on request.
     """
     named = ms.linear()
     return {m: s.unserved for m, s in ms.MEASURES.items() if s.unserved and m not in named}
@@ -191,6 +192,6 @@ def units(rig_units):
 
 
 def objective_unit(terms, rig_units=DEFAULT):
-    """Return the unit of a weighted sum: that of its measures where they share one, else "-"."""
+    """Return the unit of a weighted sum: the common unit of its measures, else "-"."""
     shared = {ms.unit(m, rig_units) for m in terms}
     return shared.pop() if len(shared) == 1 else "-"

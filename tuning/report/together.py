@@ -22,7 +22,7 @@ from tuning.report.simulated import json_of_run, run_for_people
 from tuning.report.tables import Table, Value, entries, undefined
 
 MOST = 6
-"""Cases in one picture: as many as have a colour of their own."""
+"""Number of cases in one picture: each has a different colour."""
 
 PARTS = {"plant": "plant", "reference": "setpoints", "actuator": "pumps", "x0": "start"}
 """{part of a loop in which cases may differ: what it is called}."""

@@ -146,7 +146,7 @@ def _effort(result):
 
 def cost_unit(result):
     """Return the unit of the objective of a TuningResult."""
-    # Of a default answer: that of the squared error, which the price on input changes has too.
+    # default answer: unit of the squared error, and of the price on input changes
     unit = result.answer and result.answer.setting.cost_unit
     return unit or objective_unit(result.objective["terms"], result.tuned.loop.units)
 
@@ -521,7 +521,7 @@ def _runs(result):
 
 
 def figures(result, runs=None):
-    """Return {name: figure} of a TuningResult: those of CAPTIONS that have something to show."""
+    """Return {name: figure} of a TuningResult: the figures of CAPTIONS that are not empty."""
     from jaxtank.plots import diagnostics, responses
     from jaxtank.plots import run as plots
     from jaxtank.plots.style import picture

@@ -24,7 +24,7 @@ LINES = 1 << 12
 """Draws that are written as CSV at once."""
 
 INTERVALS = (
-    "intervals are those of independent draws: exact for random draws, mostly too wide for latin"
+    "intervals assume independent draws: exact for random draws, mostly too wide for latin"
     " and sobol ones"
 )
 

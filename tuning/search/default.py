@@ -25,18 +25,18 @@ CHECKED = 256  # plants that are looked at
 SEED = 20_011
 """Of these plants and their noise, whatever the seed of a search, so that limits bind alike."""
 
-ADDED = 8  # plants that join those of the search
+ADDED = 8  # validation plants that are added to the plants of the search
 WORST = 2  # of each limit, the plants that come nearest to it are added, as many as this
 
 SHARE = 0.4
 """Tightening of a limit, as a share of the distance from the 90 % quantile over the plants to their
-worst: other plants are worse than all of them now and then [-]."""
+worst [-]: a new plant may be worse than all of these."""
 
 LARGEST = 0.25  # largest tightening, as a share of the limit [-]
 LIGHT = 1e-9  # weight of an added plant in the cost [-]: it serves the limits alone
 
 ATTEMPTS = 4
-"""Answers that are judged, at most: with a filter, at the true step, with tighter limits."""
+"""Largest number of answers that are judged: with a filter, at the true step, tighter limits."""
 
 ROUNDS = 4
 """Searches for an answer, at most, until it holds the limits on the plants that are looked at."""
@@ -127,7 +127,7 @@ class Checks:
 def problem_of(
     setting: Setting, case: Case, free: Any, seed: int, checks: Checks | None
 ) -> Problem:
-    """Return the problem of the search on the plants of a case, and on those of `checks`."""
+    """Return the problem of the search on the plants of a case and on the plants of `checks`."""
     plants = setting.plants(case, PLANTS, seed)
     stated = case, free, setting.objective
     if checks is None:
@@ -223,7 +223,7 @@ def attempts(task: Task, setting: Setting, near: np.ndarray) -> Attempt:
 def _search(
     task: Task, attempt: Attempt, case: Case, limits: Mapping[str, Any], least: Mapping[Key, float]
 ) -> Checks | None:
-    """Search, and again on more plants until the limits hold on those that are looked at."""
+    """Search, then again on more plants until the limits hold on the plants of `Checks`."""
     setting = attempt.setting
 
     def search(checks: Checks | None = None, stays: bool = False) -> None:

@@ -63,7 +63,7 @@ def tune_choices(
     ----------
     case, objective, limits, scenarios, risk, seed : as in `Problem`.
     choices : {static name: [values]}; {"controller.kind": ["pid", "lqi"]} tunes each of these
-        controllers with gains and ranges of its own.
+        controllers with its gains and ranges.
     free : as in `Problem`; of controllers that differ, each has what it has a parameter for.
     method, checkpoint, resume, options : as in `tune`.
 

@@ -89,7 +89,7 @@ def _batch(most: int, count: int) -> int:
 FRESH = 256  # plants on which an answer is judged
 
 NOMINAL = ("rms_error_total", "rms_error", "settling_time", "recovery_time")
-"""Measures of the nominal plant, which runs beside them, besides those of every plant."""
+"""Measures of the nominal plant, which runs in addition to the plants."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
@@ -209,20 +209,20 @@ def validate(
     objective: Any = None,
     limits: Any = None,
 ) -> Judged:
-    """Return how a case does on plants that are not exactly known, with noise in the readings.
+    """Return the performance of a case on uncertain plants with noise in the readings.
 
-    The noise is that of the case or its scenarios, else 0.1 % of the height of its tanks. The same
-    plants and noise for the same seed, and the plants of `tune` for its seed.
+    The noise is taken from the case or its scenarios, else 0.1 % of the height of its tanks. The
+    same seed gives the same plants and noise, and the plants of `tune` with this seed.
 
     Parameters
     ----------
     case : the Case, with the gains and the safety filter that it has.
     samples : number of plants.
     seed : of plants and noise.
-    distributions : {name: distribution or share}; what the case calls uncertain where None, 5 % of
-        every flow where that is nothing.
+    distributions : {name: distribution or share}; by default the tolerances of the case, else 5 %
+        of every flow.
     objective : {measure: weight} or a custom function, as in `tuning.tune`.
-    limits : {measure: value}, and `Constraint`s, as in `tuning.tune`; those of the case where None.
+    limits : {measure: value}, and `Constraint`s, as in `tuning.tune`; default: of the case.
 
     Returns
     -------

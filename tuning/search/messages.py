@@ -292,9 +292,10 @@ def _slope_not_usable(result: TuningResult) -> Messages:
         )
         yield Message(
             "slope-not-usable",
-            f"the slope of the objective at {words} is that of a chaotic or exploding loop: runs"
-            f" beside it show a slope of {check.secants[0]:.2g} per range of a parameter, the exact"
-            f" derivative {times}; it was not used: other starts and differential evolution {role}",
+            f"at {words} the loop is chaotic or unstable: runs near this point give"
+            f" a slope of the objective of {check.secants[0]:.2g} per range of a parameter, the"
+            f" exact derivative {times}; it was not used: other starts and differential evolution"
+            f" {role}",
         )
 
 
@@ -345,8 +346,8 @@ def _not_converged(result: TuningResult) -> Messages:
         ),
         (
             useless or (result.optimality["kkt_residual"] or 0.0) >= UNSTABLE,
-            "the gradient at this point is that of an unstable or chaotic run (noise and delay at"
-            " a high gain give one), and points along it are not lower; try more --starts, or"
+            "the run at this point is unstable or chaotic (noise and delay with a high gain can"
+            " cause this), and the objective is not lower along its gradient; try more --starts, or"
             " other ranges (--free)",
         ),
         (
@@ -585,7 +586,7 @@ def _non_finite(result: TuningResult) -> Messages:
 
 
 ANY, OPTIMUM, ANSWER = "any", "optimum", "answer"
-"""Results that a rule is about: all, those of `--nominal` and `--robust`, default answers."""
+"""Results to which a rule applies: all; `--nominal` and `--robust`; default answers."""
 
 RULES: tuple[tuple[Callable[[TuningResult], Messages], str], ...] = (
     (_on_new_plants, OPTIMUM),

@@ -351,7 +351,7 @@ class Local(NamedTuple):
 
     method: str
     iterations: int
-    tolerance: float | None = None  # that of a Search where None
+    tolerance: float | None = None  # None: the tolerance of the Search
     batch: int | None = None  # scenarios drawn for each step of adam
     seed: int = 0  # of these
 

@@ -119,14 +119,14 @@ def tune_robust(
     distributions : {name: distribution or share}; the case's own spread where None.
     risk : "mean", "cvar" or "worst" of the costs of the plants.
     samples : plants in the search.
-    fresh : new plants drawn afterwards, with seeds of their own, on which the values before and
+    fresh : new plants drawn afterwards, with other seeds, on which the values before and
         after are run.
     seed : of the draws, the Sobol points and the sensor noise.
     back_off : constraint tightening, as a share of each limit [-]: the search keeps that far inside
         each limit, while new plants are judged by the limit itself. A limit that is active on one
         of N plants is violated on about one new plant in N + 1.
     method : as in `tune`; tolerance is 1e-4 where Options have none. Their `validation` are runs of
-        a case that has scenarios of its own (any other is validated on the new plants).
+        a case with scenarios (any other is validated on the new plants).
     options : starts, checkpoint, resume and progress of `tune`.
 
     Returns
@@ -181,7 +181,7 @@ def tune_robust(
 
 
 def _tightened(case, limits, share):
-    """Return `limits` tightened by `share` of each, the rim being that of the plant."""
+    """Return `limits` tightened by `share` of each; "rim" is the rim of the plant."""
     amounts = {}
     for measure, value in limits.items():
         value = case.loop.plant.rim if isinstance(value, str) else value

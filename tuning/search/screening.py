@@ -137,7 +137,7 @@ def screen(evaluator, count, seed, coarse=True):
 
 
 def distinct_starts(zs, merits, count, first):
-    """Return up to `count` points: `first`, then those of lowest merit at a distance from these."""
+    """Return up to `count` points: `first`, then points of low merit, at a distance from others."""
     taken = [np.asarray(first, dtype=float)]
     apart = 0.5 / max(2, count) * np.sqrt(len(first))
     order = [i for i in np.argsort(merits, kind="stable") if np.isfinite(merits[i])]
@@ -172,7 +172,7 @@ class Population(NamedTuple):
     margins: np.ndarray  # (points, limits)
 
     def merits(self, search):
-        """Return (points,) costs where limits hold, else far above by violation, or infinite."""
+        """Return (points,) costs where limits hold, else large values that grow with violation."""
         short = search.violations(self.margins)
         merits = np.where(short > 0, MUCH * (1.0 + short), self.costs)
         return np.where(np.isfinite(self.costs) & np.isfinite(merits), merits, np.inf)
@@ -186,7 +186,7 @@ def evolution_size(search, screened):
 
 
 def evolve(search, zs, generations, seed, coarse=True):
-    """Return the Population after differential evolution of points zs, and that of zs itself."""
+    """Return the Populations after and before differential evolution of the points zs."""
     rng, count = np.random.default_rng([seed, 1997]), len(zs)
     first = now = Population(zs, *search.evaluator.screen(zs, coarse))
     merits = now.merits(search)

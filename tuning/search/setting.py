@@ -1,6 +1,4 @@
-"""What the default answer is searched on: noise, plants, cost, safety filter, and a
-coarser clock.
-"""
+"""The setting of a default answer: plants, noise, cost, safety filter, and a coarser clock."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -78,7 +76,7 @@ COST = ("mean_square_error", "mean_square_travel")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Setting:
-    """The case as given, and what is searched and judged in its place."""
+    """The case of the user, and the changed case that is searched and judged."""
 
     case: Case
     searched: Case
@@ -104,17 +102,17 @@ class Setting:
 
     @property
     def plants_vary(self) -> bool:
-        """True if more varies from run to run than what the sensors read."""
+        """True if parameters other than those of the sensors vary from run to run."""
         return any(not name.startswith("sensor.") for name in self.distributions)
 
     @property
     def runs(self) -> str:
-        """What the answer is judged on, in the plural."""
+        """Name of the runs on which the answer is judged, in the plural."""
         return "validation plants" if self.plants_vary else "runs of one plant, with new noise"
 
     @property
     def cost_unit(self) -> str | None:
-        """Unit of the default cost, whose price has one of its own; None for a user's objective."""
+        """Unit of the default cost; None for a custom objective."""
         return None if self.own_objective else f"{self.case.loop.units[0]}^2"
 
     def coarse(self) -> Case:
@@ -184,8 +182,8 @@ class Setting:
 
 def scenarios_of(case, distributions=None, samples=64, seed=0):
     """Return `samples` Scenarios of a case, each on a plant drawn from `distributions`."""
-    # The case's own scenarios in turn (its own run, where it has none), each with noise of its own.
-    # Latin hypercube draws. Raises InputError for what cannot be drawn.
+    # The scenarios of the case in turn (its single run, if it has none), each with different noise.
+    # Latin hypercube draws. Raises InputError if a distribution cannot be drawn.
     distributions = spread_of(case) if distributions is None else stated_of(distributions)
     space = Draws(case.loop, distributions)
     values = space.values(probabilities("latin", space.dimensions, samples, seed))
@@ -273,8 +271,8 @@ def height(case: Case) -> float:
 
 def input_range(case: Case) -> np.ndarray:
     """Return the (pumps,) range of each pump's input."""
-    # Limits below 0 or without end are those of a model, not of a pump: its range is then taken as
-    # twice the rms input of the case's own run.
+    # A pump has no negative or infinite limits, only a model has: the range is then twice the rms
+    # input of the case's run.
     actuator = case.loop.actuator
     shape = (case.loop.plant.pumps,)
     low, high = (
@@ -295,7 +293,7 @@ def _default_cost(case, span):
 
 
 def _has_own_objective(case):
-    """Return True if the objective is the user's: not the default, and not that of a preset."""
+    """Return True for a custom objective: neither the default nor the objective of a preset."""
     objective = dict(case.objective)
     if objective == {"rms_error_total": 1.0}:
         return False
@@ -322,10 +320,10 @@ def _noisy(case, noise):
 
 
 def is_stated(case: Case) -> bool:
-    """Return True if a case says what is uncertain."""
+    """Return True if a case states its uncertain parameters."""
     return bool(case.uncertain) or case.covariance is not None
 
 
 def plants_of(case: Case) -> dict[str, Any]:
-    """Return {name: distribution} of what a case calls uncertain."""
+    """Return {name: distribution} of the uncertain parameters of a case."""
     return spread_of(case.replace(uncertain=uncertain_shares(case)))

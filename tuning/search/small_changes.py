@@ -15,8 +15,8 @@ from tuning.search.solve import Solution
 WORTH = 0.01  # a gain is changed only where that lowers the cost by this share [-]
 
 AGAIN = 1.25
-"""All gains stay at their first values where that costs less than this many times WORTH: those of
-an earlier answer, which may cost WORTH already, on plants and limits that differ a little [-]."""
+"""All gains stay at their first values if that costs less than this many times WORTH [-]. The first
+values may be an earlier answer, which may cost WORTH already, with slightly different plants."""
 
 FINE = 0.1  # share of WORTH to which the cost with some gains at their first values is searched [-]
 
@@ -130,8 +130,8 @@ Textbooks recommend 1.4 to 2: above 2 a rise is reported, above this it is taken
 PRICE = 0.05  # share of the cost that a lower Ms may cost: half of it as a share of the error [-]
 
 SPAN, ROUNDS = 0.01, 16
-"""A step of the descent of Ms and of its differences, as a share of a range [-]; how often STRIDE
-steps are taken along one direction, at most."""
+"""A step of the descent of Ms and of its differences, as a share of a range [-]; largest number of
+times that STRIDE steps are taken along one direction."""
 
 
 def move_back(setting: Setting, solution: Solution) -> None:

@@ -85,7 +85,7 @@ class Plan:
 
 @dataclasses.dataclass
 class Solution:
-    """What the stages found so far; Ctrl-C leaves it as it is."""
+    """Result of the stages so far; Ctrl-C does not change it."""
 
     search: Search | None = None
     starts: list[dict[str, Any]] = dataclasses.field(default_factory=list)

@@ -1,4 +1,4 @@
-"""tune: the default answer, or the optimum of a problem as it is stated."""
+"""tune: the default answer, or the optimum of a stated problem."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -55,7 +55,7 @@ to a few percent."""
 
 DEFAULT = {"starts": 4, "screening": 32, "iterations": 40, "validation": FRESH}
 NOMINAL = {"starts": 8, "screening": 64, "iterations": 60, "validation": 64}
-"""Numbers of the default answer, and of the optimum of a problem as it is stated."""
+"""Numbers of the default answer, and of the optimum of a stated problem."""
 
 
 def tune(
@@ -76,15 +76,15 @@ def tune(
 ) -> TuningResult:
     """Return better values for the free parameters of a case, under its limits.
 
-    By default, values for a rig that is not exactly known: the mean over 32 plants (sets of
-    coefficients) drawn from what the case calls uncertain, with sensor noise, of the squared error
-    plus a price on changes of the inputs per sample. A safety filter keeps levels below their
-    limits where they come near them. Each parameter goes back to its start, or as near to it as
-    that allows, if all these changes together cost less than 1 %. The answer is judged on 256
-    validation plants at the case's own step (`result.answer`).
+    The default answer is for an uncertain rig with sensor noise. It minimises the squared error
+    plus a price on changes of the inputs per sample, as a mean over 32 plants (sets of
+    coefficients) drawn from the tolerances of the case. Where levels come near their limits, a
+    safety filter keeps them below. Each parameter returns to its start, or moves towards it as far
+    as possible, while all these changes together cost less than 1 %. The answer is judged on 256
+    validation plants at the step of the case (`result.answer`).
 
-    With nominal=True the optimum of the case as it is: its own run or scenarios alone, its own
-    objective, without adding noise, plants or a filter. Implied by a Problem, a method, and by
+    With nominal=True: the optimum of the unchanged case, with its run or scenarios and its
+    objective; no noise, plants or filter are added. Implied by a Problem, a method, and by
     `screening` and `tolerance` of Options.
 
     Converged: two searches ended within 1 % of each other (nominal: 0.1 %), or differential
@@ -97,11 +97,11 @@ def tune(
     method : "auto" (trf where the cost is a sum of squares and no limit is active, else slsqp),
         "slsqp", "trf", "coarse-trf" (trf at a tenth of the samples, then at all), "lbfgs", "adam",
         or Options (SQP, TRF, LBFGS, Adam) with the numbers of the search.
-    nominal : True for the optimum of the case as it is, False for the default answer, None for the
+    nominal : True for the optimum of the unchanged case, False for the default answer, None for the
         default answer unless the optimum is implied.
     free : {name: (low, high) or Free}; the case's own where None.
     objective : {measure: weight}, or a custom function, (measures) or (measures, trajectory)
-        -> number, alone or in the place of a measure (`Objective` gives it a name and a unit);
+        -> number, alone or instead of a measure (`Objective` gives it a name and a unit);
         where None the case's own (of a preset, the default cost, unless nominal).
     limits : {measure: value}, {} for none, the case's own where None. A list of such and of
         `Constraint`, [case.limits, Constraint("name", function, upper=1.0)].
@@ -155,7 +155,7 @@ def tune(
 
 
 def _implies_nominal(case: Case | Problem, options: Options) -> str | None:
-    """Return what asks for the optimum of the case as it is; None without."""
+    """Return the argument that implies `nominal`; None if there is none."""
     reasons = {
         "a Problem": isinstance(case, Problem),
         "method": options.name != "auto",
@@ -183,7 +183,7 @@ def _optimum(
     resume: bool,
     progress: Callable | None,
 ) -> TuningResult:
-    """Return the optimum of a problem as it is stated."""
+    """Return the optimum of a stated problem."""
     began, case = time.perf_counter(), problem.case
     key = jax.random.key(problem.seed) if noisy(case) else None
     lp.check(case.loop, case.clock, key)

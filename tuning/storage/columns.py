@@ -49,7 +49,7 @@ class Columns(Mapping[str, Array]):
             self.file.truncate(size)
 
     def put(self, start: int, block: Mapping[str, Array]) -> None:
-        """Set the rows from `start` on to those of `block`; rows beyond the last are dropped."""
+        """Set the rows from `start` on to the rows of `block`; rows beyond the last are dropped."""
         try:
             if not self.places:
                 self._allocate(block)

@@ -42,7 +42,7 @@ class EvaluationLog(EvaluationCache):
         self.found = {key: self.store.get(key) for key in self.store.finished()}
 
     def keep(self, kind: str, key: str, result: Any) -> Any:
-        """Return `result` as it is read back from its record."""
+        """Return the value that is read back from the record of `result`."""
         return self.store.put(key, tuple(result))
 
     def close(self) -> None:

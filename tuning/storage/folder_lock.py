@@ -11,7 +11,7 @@ from jaxtank.core.files import LOCK, check_folder, sweep
 
 try:
     import fcntl
-# no such locks on this system: two runs in one folder are then the user's own care
+# no such locks on this system: the user must not start two runs in one folder
 except ImportError:
     fcntl = None
 
@@ -21,10 +21,10 @@ PATIENCE = 0.2  # time for which a lock may be in the way [s]: a run that ends n
 @contextlib.contextmanager
 def hold(folder, leaving: Callable = contextlib.nullcontext):
     """Hold `folder`, made if need be, against other runs; None: nothing is held."""
-    # The lock is the system's own (flock on a file with the process id in it): it ends with its
-    # process however that ends, so that what a kill left behind is taken over, unfinished files
-    # (`jaxtank.core.files.sweep`) included. A folder that was made for this and got nothing is
-    # removed again. Raises InputError where another run holds it.
+    # flock, on a file that holds the process id: the lock ends with its process, also after a kill.
+    # The next run then takes over the folder and removes unfinished files
+    # (`jaxtank.core.files.sweep`). A new folder that stays empty is removed. Raises InputError if
+    # another run holds the folder.
     if folder is None or fcntl is None:
         yield
         return

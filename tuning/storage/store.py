@@ -139,7 +139,7 @@ class Store:
             return [key for (key,) in rows if key != PROBLEM]
 
     def put(self, key: str, value: Any) -> Any:
-        """Enter a value; return it as it is read back."""
+        """Store a value and return the value that will be read back."""
         text = json.dumps(_to_json(value))
         with self._one_line(UNWRITABLE):
             self._insert(key, text)
@@ -188,7 +188,7 @@ class Store:
 
 
 def discard(folder: Folder) -> None:
-    """Remove the records of a folder, and those of a search over choices: the result is whole."""
+    """Remove the records of a folder, also of a search over choices: the result is complete."""
     folder = Path(folder)
     for path in sorted((*folder.glob(f"{NAME}*"), *folder.glob(f"choice_*/{NAME}*"))):
         with contextlib.suppress(FileNotFoundError):

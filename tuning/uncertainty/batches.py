@@ -27,7 +27,7 @@ FAN_BATCH, FAN_ROWS = 64, 240
 """Draws simulated at once, and time stamps, of a fan chart."""
 
 WORK = 1 << 24
-"""Samples of all runs of a batch from which it is a task of its own [-]: 0.1 s of work, while the
+"""Samples of all runs of a batch from which it is a separate task [-]: 0.1 s of work, while the
 command and the scheduler need 5 ms for a task.
 """
 
@@ -98,7 +98,7 @@ def batches(text, names, seed, inputs):
 def run_batch(case, names, seed, values, indices, device=None):
     """Return {measure: (batch, ...), "failed": (batch,)} of a case at `values`.
 
-    The noise of draw i is that of fold_in(seed, i); indices None: all have the noise of the seed.
+    Draw i has the noise of fold_in(seed, i); indices None: all have the noise of the seed.
     """
     indices = None if indices is None else indices.astype(np.uint32)
     values, indices = jax.device_put((values, indices), device)

@@ -68,7 +68,7 @@ class Draws:
 
 
 def _check_names(loop, name, distribution, taken):
-    """Raise InputError where a parameter cannot vary or is in `taken`; add those of this one."""
+    """Raise InputError if a parameter cannot vary or is in `taken`; add its entries to `taken`."""
     for label in distribution.names if isinstance(distribution, Correlated) else (name,):
         base, index = split_index(label)
         entry = base, index  # "a[00]" is "a[0]"

@@ -37,11 +37,11 @@ class Points:
             self.sobol = scipy.stats.qmc.Sobol(dimensions, scramble=True, rng=rng)
 
     def rows(self, start, stop):
-        """Return (stop - start, dimensions) points: those of the draws from start to below stop."""
+        """Return the (stop - start, dimensions) points of the draws start to stop - 1."""
         if self.method == "latin":
             return self.all[start:stop]
         if self.method == "random":
-            generator = np.random.PCG64(self.seed)  # that of default_rng
+            generator = np.random.PCG64(self.seed)  # the generator of default_rng
             generator.advance(start * self.dimensions)  # one step for each number before
             points = np.random.Generator(generator).random((stop - start, self.dimensions))
         else:

@@ -97,7 +97,7 @@ def sensitivity(
     batch : int or None
         Runs at once.
     devices : int
-        Of this process; each takes batches of its own, to the same bits.
+        Of this process; they share the batches, and the results have the same bits.
     cluster : str, distributed.Client, concurrent.futures.Executor or None
         Run the batches of morris and sobol on workers, to the same bits, as in `ensemble`.
     progress : callable or None
@@ -137,8 +137,8 @@ def sensitivity(
     for name, d in distributions.items():
         if isinstance(d, Correlated) and method != "local":
             raise InputError(
-                f"{name}: parameters that vary together have no effects of their own; take the"
-                " local method"
+                f"{name}: the effects of parameters that vary together cannot be separated; use"
+                " the local method"
             )
     check_whole("seed", seed, 0, 2**31 - 1)
     if batch is not None:

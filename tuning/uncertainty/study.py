@@ -62,17 +62,17 @@ def ensemble(
     ----------
     case : Case
     distributions : dict or None
-        {dotted name: distribution, or a relative half-width as in a case's `uncertain`}; those of
-        the case where None.
+        {dotted name: distribution, or a relative half-width as in a case's `uncertain`}; by
+        default the case's `uncertain`.
     samples : int
         Number of draws.
     key : int
         Seed of draws and sensor noise; draw i has the noise of fold_in(key, i).
     draws : {"random", "latin", "sobol"}
     measures : sequence of str or None
-        Names; those of a summary where None.
+        Names; by default the measures of a summary.
     limits : dict or None
-        {measure: limit} as in `tune`; those of the case where None.
+        {measure: limit} as in `tune`; by default the limits of the case.
     fan : bool
         Keep quantiles of the trajectories of the first draws.
     batch : int or None

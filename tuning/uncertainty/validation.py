@@ -9,7 +9,7 @@ from tuning.uncertainty.distributions import Correlated
 from tuning.uncertainty.draws import Draws
 
 SEED_OFFSET = 1_000_003
-"""Offset of the seeds of the validation set from those of the search."""
+"""Offset between the seeds of the validation set and the seeds of the search."""
 
 SIDES = ("before", "after")
 
@@ -77,7 +77,7 @@ def summary_of(limits, costs, held, levels, diverged, spread, noise):
     limits = {limit.index: limit.value for limit in limits if limit.measure == "max_level"}
     levels = levels[good][:, :, sorted(limits) if limits else slice(None)]
     differ = len(set(limits.values())) > 1
-    if differ:  # tanks with limits of their own: how far above its limit the worst is
+    if differ:  # tanks with different limits: the largest excess over a limit
         levels = levels - np.array([limits[i] for i in sorted(limits)])
     return summary, {
         "objective": costs[good],

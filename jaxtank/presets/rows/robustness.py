@@ -39,8 +39,9 @@ class Study(NamedTuple):
 
 
 def coefficients(plant, spread):
-    """Return {name: (N, ...)} of the plant with c1, c2, c3, c7, c8 (and their twins) off by factors
-    of their own, uniform within +-spread.
+    """Return {name: (N, ...)}: c1, c2, c3, c7, c8 (and their twins) times independent factors.
+
+    The factors are uniform within 1 +-spread.
     """
     f1, f2, f3, f7, f8 = np.random.default_rng(2015).uniform(1 - spread, 1 + spread, (5, N))
     inner, outer = np.asarray(plant.orifice)[:2]

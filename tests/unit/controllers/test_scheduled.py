@@ -314,7 +314,7 @@ def test_a_bad_schedule_is_reported(gouta, gains, knots, words):
     [
         ("cascaded/open-loop", "signal.initial", "before the loop starts (in its inputs)"),
         ("gouta2015/backstepping", "level_floor", "input_metric"),
-        ("khalid/gpc", "r_w", "designs with it"),
+        ("khalid/gpc", "r_w", "repeated at every sample"),
         ("gouta2022/pi-ff", "bias", "does not use it"),
     ],
 )

@@ -1,4 +1,4 @@
-"""`jaxtank list`, `show`, `simulate`, `init` and `export`: the cases, and one case as it is."""
+"""`jaxtank list`, `show`, `simulate`, `init` and `export`: the cases, and one unchanged case."""
 
 import argparse
 import sys
@@ -35,7 +35,7 @@ def show(args):
 
 
 def _draw_rig(case, folder):
-    """Write rig.svg and rig.png; where the rig cannot be drawn, remove those of another one."""
+    """Write rig.svg and rig.png; if the rig cannot be drawn, remove the pictures of another one."""
     from jaxtank.plots.run import rig
     from tuning.report import html
     from tuning.report.document import failed
@@ -169,7 +169,7 @@ def export(args):
 
 
 def _print_source(args, payload, text):
-    """Print a JSON object under --json, else the text as it is."""
+    """Print a JSON object with --json, else the text unchanged."""
     if args.json:
         print_result(args, payload, str)
     else:
@@ -197,7 +197,7 @@ COMMANDS = {
                    " under its disturbances, faults and noise", nargs="*"),
             Option("--gif", help="with --out also run.gif, the tanks of the rig filling and"
                    " emptying, and film.png with four of its pictures", kind="flag"),
-            Option("--against", "CASE", "with --gif: a second case or rig file, as it is, beside"
+            Option("--against", "CASE", "with --gif: a second case or rig file, unchanged, next to"
                    " the first in the film"),
             Option("--columns", "N", "with --out also print.svg and print.png (300 dpi): the run in"
                    " the width of one or two columns of a journal: 1 or 2", choices=("1", "2")),

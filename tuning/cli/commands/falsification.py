@@ -51,8 +51,8 @@ COMMANDS = {
                    " own value", whole(1, 1000), 4),
             Option("--pumps", "KIND", "what commands the pumps: own (the controller), full, or"
                    " random switching", default="own", choices=("own", "full", "random")),
-            Option("--start", "KIND", "levels at t = 0: any up to the limits, or own: those of the"
-                   " case", default="any", choices=("any", "own")),
+            Option("--start", "KIND", "levels at t = 0: any up to the limits, or own: the levels of"
+                   " the case", default="any", choices=("any", "own")),
             Option("--constant-errors", help="reading errors that do not change in time (default:"
                    " any sequence in the band)", kind="flag"),
         ),

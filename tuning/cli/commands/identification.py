@@ -28,7 +28,7 @@ def run(args):
 
 
 def _check_together(args):
-    """Raise InputError for options of a planned experiment beside those of experiment data."""
+    """Raise InputError if options of a planned experiment and of experiment data are both given."""
     problems = []
     if args.plan:
         if args.data:

@@ -87,8 +87,8 @@ COMMANDS = {
                    default="local", choices=("local", "morris", "sobol")),
             Option("--samples", "N", "trajectories of morris (default 32), base points of sobol"
                    " (default 512, a power of 2)", values.whole(1, 1 << 20)),
-            Option("--measure", "NAME", "a measure to look at (default: those of the objective,"
-                   " rms_error_total, max_level)", values.checked_measure, kind="list"),
+            Option("--measure", "NAME", "a measure to study (default: measures of the"
+                   " objective, rms_error_total, max_level)", values.checked_measure, kind="list"),
         ),
     ),
 }

@@ -26,7 +26,7 @@ class Progress(Interrupts):
     def __init__(self, unit, quiet, option=None):
         super().__init__()
         self.unit, self.last, self.line = unit, None, Line(quiet)
-        self.note = option and f"{option} implies --nominal: the optimum of the case as it is"
+        self.note = option and f"{option} implies --nominal: the optimum of the unchanged case"
         self.line.compiling("the simulation and its derivatives", 15)
 
     def __call__(self, event):
@@ -62,12 +62,12 @@ EXIT = {"converged": 0, "not_converged": 3, "infeasible": 4, "interrupted": 130}
 
 
 def tune(args):
-    """Tune, then what was asked for besides; write and print the result."""
+    """Tune, add trade-off and bound if requested, write and print the result."""
     seed, case = args.seed, open_case(args)
     from tuning.report import tables
 
     task, sweep = _task(args, case, seed), args.tradeoff
-    if sweep:  # before the search, which would be in vain
+    if sweep:  # before the long search
         _check_tradeoff(case, task, sweep)
     finder, case, own, mended = _finder(args, case, task)
     unit = tables.objective_unit(task["objective"] or case.objective, case.loop.units)
@@ -78,7 +78,7 @@ def tune(args):
     if mended is not None:
         result = result.replace(answer=dataclasses.replace(result.answer, mended=mended))
     progress.line.end()
-    result = _besides(args, case, result, task, sweep, progress)
+    result = _with_studies(args, case, result, task, sweep, progress)
     written = finish(result, args)
     report_unreachable(result.tuned, written, args)
     if not args.out and not args.json and not args.quiet:
@@ -122,7 +122,7 @@ def _finder(args, case, task) -> Any:
             raise InputError(f"{name} and --robust: give one of them")
     if choices or task["scenarios"]:
         raise InputError(
-            "--robust makes scenarios of its own: no --choose and no --scenario but none beside it"
+            "--robust draws its scenarios: omit --choose, and --scenario unless it is none"
         )
     from tuning.search.robust import tune_robust
 
@@ -151,7 +151,7 @@ def _varied(args, case):
 
 
 def _not_robust(args, case, task, choices, varied):
-    """`_finder` without --robust: the default answer, or the optimum of the case as it is."""
+    """`_finder` without --robust: the default answer, or the optimum of the unchanged case."""
     from tuning.search.tuner import tune as finder
 
     if not _is_nominal(args):
@@ -198,7 +198,7 @@ def _goes_with_nominal(args):
 
 
 def _is_nominal(args):
-    """Return True if the optimum of the case as it is was asked for."""
+    """Return True if --nominal is given or implied."""
     return args.nominal or _goes_with_nominal(args) is not None
 
 
@@ -218,8 +218,8 @@ def _options(args):
     return options_of(method, **numbers, **({} if args.batch is None else {"batch": args.batch}))
 
 
-def _besides(args, case, result, task, sweep, progress):
-    """`result` with the trade-off and the bound, where asked for and not interrupted."""
+def _with_studies(args, case, result, task, sweep, progress):
+    """Return `result` with trade-off and bound, if requested and not interrupted."""
     if sweep and not progress.stop and result.status != "interrupted":
         from tuning.search.pareto import tradeoff
 
@@ -240,27 +240,27 @@ def _besides(args, case, result, task, sweep, progress):
 
 # fmt: off
 PROBLEM = (
-    Option("--free", "NAME=LOW:HIGH", "a parameter to tune; replaces those of the case",
+    Option("--free", "NAME=LOW:HIGH", "a parameter to tune; replaces the parameters of the case",
            values.free_range, kind="pairs"),
     Option("--limit", "MEASURE=VALUE", "a hard limit; MEASURE=none drops one, none drops all",
            values.limit, kind="pairs"),
     Option("--objective", "MEASURE=WEIGHT", "a term of the objective, which is minimised (default:"
-           " that of a rig file's [objective], else squared error + a price on changes of the"
-           " inputs; --nominal: that of the case)", values.pair(values.number), kind="pairs"),
+           " [objective] of a rig file, else squared error + a price on changes of the inputs;"
+           " --nominal: the objective of the case)", values.pair(values.number), kind="pairs"),
     Option("--scenario", "NAME=VALUE[;NAME=VALUE]", "a run to tune for, as"
            ' "sensor.noise=0.05;plant.pump_gain=x0.8" (x0.8: 0.8 times the value of the case);'
-           " replaces those of the case; none: the case's own run", values.scenario, kind="list"),
+           " replaces the scenarios of the case; none: its run", values.scenario, kind="list"),
     Option("--choose", "NAME=V1,V2", "a static number or text to try the values of;"
-           " controller.kind=pid,lqi: the controllers that a rig file may name, each with gains and"
-           " ranges of its own", values.pair(values.candidates), kind="pairs"),
+           " controller.kind=pid,lqi: the controllers that a rig file may name, each with its gains"
+           " and ranges", values.pair(values.candidates), kind="pairs"),
     Option("--validation", "N", "validation plants (default 256; --nominal: 64, 0 for none)",
            values.whole(0, 100000)),
     Option("--mend", "KIND", "first make the smallest design change of one kind (setpoints, rims,"
            " orifices, pumps or ramps) with which 95 % of the plants can hold the setpoints (ramps:"
            " with which the nominal run keeps its limits)",
            choices=("setpoints", "rims", "orifices", "pumps", "ramps")),
-    Option("--nominal", help="the optimum of the case as it is, with its own objective: its own run"
-           " or scenarios, without adding noise, plants or a filter; implied by --scenario,"
+    Option("--nominal", help="the optimum of the unchanged case: its objective, its run or"
+           " scenarios; no noise, plants or filter are added; implied by --scenario,"
            " --method, --screening, --batch, --choose, --tradeoff, --bound", kind="flag"),
     Option("--tradeoff", "MEASURE=LOW:HIGH[:N]", "also: the best objective for N (6) values of one"
            " limit", values.tradeoff),
