@@ -1,4 +1,4 @@
-"""A case: one rig, one controller, one reference, one clock, and what may be tuned on it."""
+"""A case: one rig, one controller, one reference, one clock, and the free parameters."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -221,7 +221,7 @@ class Case(CaseViews):
 
 
 def uncertain_shares(case: Case) -> dict[str, float]:
-    """Return {name: share} of what a case calls uncertain, of every flow where it says nothing."""
+    """Return {name: share} of the uncertain parameters of a case; every flow if it states none."""
     if case.uncertain or case.covariance is not None:
         return dict(case.uncertain)
     values = parameters(case.loop)

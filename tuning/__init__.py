@@ -1,4 +1,4 @@
-"""What one does with a loop: tune its gains through the simulation, under limits.
+"""Tuning and analysis of a closed loop: gains through the simulation, under limits.
 
 import tuning
 from jaxtank import presets

@@ -1,4 +1,4 @@
-"""What every result offers: text, HTML for a notebook, JSON, pictures, files and a live page.
+"""Methods of every result: text, HTML for a notebook, JSON, pictures, files, a live page.
 
 Made by `tuning.report`, which is registered in `tuning/__init__`.
 """
@@ -53,7 +53,7 @@ class Result(Shown):
         return self._report().json_of(self)
 
     def plot(self) -> dict[str, Any]:
-        """Return matplotlib figures {name: Figure} of what there is to show."""
+        """Return matplotlib figures {name: Figure} of the result."""
         return self._report().figures(self)
 
     def explore(self, plants: int | None = None) -> Any:

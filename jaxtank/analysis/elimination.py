@@ -20,7 +20,7 @@ STAGES = 4  # parts of a larger one: 1 takes twice the time of 4 at 100 variable
 
 @contextlib.contextmanager
 def rolled() -> Iterator[None]:
-    """Trace eliminations of any size as loops: what is written out fills pages of exported code."""
+    """Trace eliminations of any size as loops: unrolled, they would fill pages of exported code."""
     global UNROLLED
     before, UNROLLED = UNROLLED, STAGES - 1
     try:

@@ -121,7 +121,7 @@ class Held(NamedTuple):
 
 
 def held(loop: OpenLoop, w: Any) -> Held:
-    """Return what `near` needs at frequencies w (K,) [rad/s]."""
+    """Return the data for `near` at frequencies w (K,) [rad/s]."""
     (A, B, C), w = jax.lax.stop_gradient((loop[:3], w))
 
     def one(w):

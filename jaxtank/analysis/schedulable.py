@@ -1,4 +1,4 @@
-"""Which gains of a controller may follow a schedule: what its traced methods use them for."""
+"""Gains of a controller that may follow a schedule, from their use in its traced methods."""
 
 import functools
 
@@ -46,7 +46,7 @@ class _Traced:
         self.before = self._before()
 
     def method(self, name, *args, **fixed):
-        """Return the use of the gain in one method, and the shapes of what it returns."""
+        """Return the use of the gain in one method, and the shapes of its results."""
 
         def f(value, rest, leaves, *args):
             values = {self.gain: value, **dict(zip(self.others, rest))}

@@ -32,7 +32,7 @@ class Controller(abc.ABC):
 
     @pointwise
     def prepare(self, r: tuple[Any, ...], dr: tuple[Any, ...], ddr: tuple[Any, ...]) -> Any:
-        """Return what depends on the reference alone, computed before the loop starts.
+        """Return the part that depends on the reference alone, computed before the time loop.
 
         Parameters
         ----------

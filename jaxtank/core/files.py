@@ -16,7 +16,7 @@ LOCK = ".jaxtank.lock"
 """File that a run keeps in its folder while it lasts, and that stays after a kill."""
 
 Content = str | bytes | Iterable[str]
-"""What a file is written from."""
+"""Content from which a file is written."""
 
 ASIDE = ".jaxtank"
 """Suffix of files that are not yet complete."""

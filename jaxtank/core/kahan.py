@@ -31,7 +31,7 @@ def plus(sum: Any, term: Real) -> Any:
 
 
 def added(value: Any, excess: Any, term: Any) -> tuple[Any, Any]:
-    """Return (value + term - excess, what rounding has added to that too much)."""
+    """Return (value + term - excess, rounding error of that sum)."""
     owed = term - excess
     new = value + owed
     return new, (new - value) - owed

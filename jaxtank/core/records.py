@@ -27,19 +27,19 @@ def check_key(key: Any) -> None:
 
 
 class Tick(NamedTuple):
-    """What a controller and an observer know at sample k, in addition to measurements."""
+    """Inputs of controller and observer at sample k in addition to measurements."""
 
     t: Any  # time [s]
     r: tuple[Any, ...]  # setpoint r [cm]
     dr: tuple[Any, ...]  # its rate r' [cm/s]
     ddr: tuple[Any, ...]  # its second derivative r'' [cm/s^2]
     dt: Any = 0.0  # sampling period Ts [s]
-    plan: Any = ()  # what the controller prepared for this sample before the loop started
+    plan: Any = ()  # entry of the controller's `prepare` for this sample
     own: Any = ()  # this sample of the controller's own signals (`Controller.inputs`)
 
 
 class Estimate(NamedTuple):
-    """What an observer gives to a controller: tuples of scalars."""
+    """Output of an observer to a controller: tuples of scalars."""
 
     x: Sequence[Any]  # level estimate, one per tank [cm]
     # estimated disturbance of each level rate, what the model of the observer does not explain:
@@ -58,7 +58,7 @@ class Sample(NamedTuple):
     d_hat: Sequence[Any]
     r: tuple[Any, ...]  # setpoint, one per output [cm]
     e: tuple[Any, ...]  # tracking error of the true output, x - r, one per output [cm]
-    command: Sequence[Any]  # what the controller commanded, one per pump [V]
+    command: Sequence[Any]  # commands of the controller, one per pump [V]
     applied: Sequence[Any]  # the command within the pumps' limits, one per pump [V]
     u: Sequence[Any]  # inputs at the plant over [t_k, t_k + dt), one per pump [V]
     spilled: Sequence[Any]  # overflow over each rim during [t_k, t_k + dt) [cm^3]

@@ -23,7 +23,7 @@ def shortened(value: object) -> str:
 
 
 def printable(text: object) -> str:
-    """Return `text` with what a terminal obeys or cannot print as escapes."""
+    """Return `text` with control and unprintable characters as escapes."""
     return "".join(
         c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in str(text)
     )

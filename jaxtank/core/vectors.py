@@ -36,7 +36,7 @@ def each(function: Callable[..., Any], vector: Any, *others: Any) -> Any:
 
 
 def unzipped(vector: Any, results: Any) -> tuple[Any, ...]:
-    """Return the vectors of what `each` returned for a function with several results."""
+    """Return the vectors of the results of `each` for a function with several results."""
     return results if is_array(vector) else tuple(zip(*results))
 
 

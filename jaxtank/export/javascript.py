@@ -140,7 +140,7 @@ undefined var void while with yield Math Number NaN Infinity Float64Array rint p
 forward backward solve s t y r dr ddr u
 """
 RESERVED = frozenset(_RESERVED.split())
-"""Names that the functions may not have: keywords, what they call, and their variables."""
+"""Names that the functions must not have: keywords, called functions, their variables."""
 
 
 def helpers(statements):

@@ -115,11 +115,11 @@ def lower(f, arguments):
 
 
 class Lowered(NamedTuple):
-    """What `lower_all` returns."""
+    """Result of `lower_all`."""
 
     statements: list
     outputs: Any
-    """What the function returns, with arrays of Refs and numbers in place of arrays."""
+    """Results of the function, with arrays of Refs and numbers instead of arrays."""
     lines: dict
     """{Ref of the first entry of a Line, an array that is read or written at an index: name}."""
 

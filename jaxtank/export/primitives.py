@@ -52,7 +52,7 @@ def each(f, *arrays):
 
 
 def constant(eqn, operands):
-    """Return what an operation on numbers gives, computed by jax."""
+    """Return the result of an operation on numbers, computed by jax."""
     values = [_numbers(o, v) for o, v in zip(operands, eqn.invars)]
     bound = eqn.primitive.get_bind_params(eqn.params)
     functions, params = bound if isinstance(bound, tuple) else ((), bound)

@@ -42,7 +42,7 @@ class Printer:
     operations: Mapping[str, str] = OPERATIONS
     kinds: Mapping[str, str] = {REAL: "", WHOLE: "", TRUTH: ""}
     rename: Mapping[str, str] = {}
-    """{argument of the program (s, t, y, r, dr, ddr, u): what it is called}."""
+    """{argument of the program (s, t, y, r, dr, ddr, u): its name in the language}."""
     first = 0
     """Index of the first entry of an array."""
     entry = "{0}[{1}]"

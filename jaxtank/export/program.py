@@ -1,4 +1,4 @@
-"""A controller and its observer as statements: what every language prints."""
+"""A controller and its observer as statements, the input of every language."""
 
 import dataclasses
 import functools

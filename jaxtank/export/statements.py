@@ -1,4 +1,4 @@
-"""The statements of exported code, on scalars: what lowering makes and the printers print."""
+"""The statements of exported code, on scalars: output of lowering, input of the printers."""
 
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple

@@ -41,7 +41,7 @@ from jaxtank.loop.closed_loop import initial, inputs_at, run_of, zero_of
 from jaxtank.loop.step import step
 
 SAVED = ("x", "y", "r", "u", "command", "spilled", "d_hat")
-"""What is kept of a sample: fields of a Trajectory."""
+"""Fields of a Trajectory that are stored at each sample."""
 
 
 LARGEST = 24
@@ -170,7 +170,7 @@ def entries_of(shapes: dict[str, Any]) -> tuple[tuple[str, tuple[int, ...]], ...
 
 
 def carried(case: Case, names: Sequence[str]) -> Any:
-    """Return the shapes and types of what one sample hands to the next, with measures `names`."""
+    """Return shapes and types of the loop state, with the accumulators of measures `names`."""
 
     def start() -> Any:
         run = run_of(case.loop, case.clock)
@@ -250,7 +250,7 @@ def defined(statement: Statement) -> set[str]:
 
 
 def ranks(statements: Iterable[Statement], inputs: Mapping[str, int]) -> dict[str, int]:
-    """Return {name: rank} of every variable: the largest rank of what it depends on."""
+    """Return {name: rank} of every variable: the largest rank of its operands."""
     rank_of = dict(inputs)
     for s in statements:
         read = s.reads if not isinstance(s, Loop) else s.reads - local(s)
@@ -527,7 +527,7 @@ class Text:
 
 
 def _uses(statements, outputs):
-    """{name: how often it is read}; what a loop reads of outside counts as often."""
+    """{name: number of reads}; a read by a loop, of a variable outside it, counts twice."""
     counts: Counter = Counter()
 
     def read(e, times=1):

@@ -36,7 +36,7 @@ def _largest(high):
 
 @component
 class PumpBank(Actuator):
-    """m pumps: what reaches the plant for a command u. `PumpBank(low=[0.0], high=[12.0])` suffices.
+    """m pumps, such as `PumpBank(low=[0.0], high=[12.0])`: from a command u to the plant's input.
 
     1. Saturation (gouta2015 eq. 9): "clip" holds each voltage in [low, high]; "boxqp" takes the
        voltages in the box that are best by the controller's own cost (see `allocate`), which

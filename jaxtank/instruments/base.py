@@ -1,4 +1,4 @@
-"""The roles Sensor and Actuator: what a closed loop asks of the instruments of a rig.
+"""The roles Sensor and Actuator: the interface of the instruments to the closed loop.
 
 Holds abstract classes only; imports core, and may be imported by every folder above.
 """
@@ -100,7 +100,7 @@ class Sensor(abc.ABC):
     def deviates(
         self, key: jax.Array | None, samples: int, piece: ArrayLike | None = None
     ) -> jax.Array | None:
-        """Return what `draw` returns, as one array (n, samples)."""
+        """Return the result of `draw` as one array (n, samples)."""
         if key is None or np.ndim(self.noise) == 0:
             return None
         tanks = np.shape(self.noise)[-1]
@@ -142,7 +142,7 @@ class Sensor(abc.ABC):
 
 
 class Actuator(abc.ABC):
-    """The pumps of a rig: what reaches the plant for the inputs that a controller commands.
+    """The pumps of a rig: from the commands of a controller to the inputs of the plant.
 
     In one sample `limit` first holds the command within the limits, which needs no memory:
     controller and observer are given its result. `step` then says what reaches the plant, and
@@ -227,7 +227,7 @@ class Actuator(abc.ABC):
 
     @abc.abstractmethod
     def step(self, state: Any, applied: tuple[Any, ...], dt: Any) -> tuple[tuple[Any, ...], Any]:
-        """Return what the plant is given over a sample, and the state after it.
+        """Return the input of the plant over a sample, and the state after it.
 
         Parameters
         ----------

@@ -28,7 +28,7 @@ ROWS = 3000
 ALWAYS = ("rms_error_total", "max_level")
 """Measures of a search whatever a case minimises and limits."""
 SHARED = ("unit", "doc", "group")
-"""What the entries of one array have in common."""
+"""Fields that all entries of one array share."""
 
 GROUPS = {
     "controller": "controller",
@@ -161,7 +161,7 @@ def _lean(case: Case) -> WholeLoop:
 
 
 def _program(loop: WholeLoop, search: str = "") -> str:
-    """One loop as an object of its functions and of what their numbers are."""
+    """One loop as an object of its functions and the meaning of their numbers."""
     printed = Printed(loop)
     facts = {
         "streams": len(printed.streams()),

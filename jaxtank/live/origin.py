@@ -12,7 +12,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import parameters, walk
 
 GUARD = "safety_filter."
-"""What the names of a safety filter begin with."""
+"""Prefix of the names of a safety filter."""
 
 NEW = "rig.toml"
 """Name of the rig file to which a case without a name is copied."""

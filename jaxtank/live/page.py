@@ -43,7 +43,7 @@ DIGITS = str.maketrans("&<>`", ",.:[")
 """Digits of base 85 that HTML reads as something else, and what stands for them (inflate.js)."""
 
 END = "\0"
-"""What stands between the parts of a page that are packed; JSON escapes it."""
+"""Separator between the packed parts of a page; JSON escapes it."""
 
 KEPT = 8
 """Engines that are kept in memory."""
@@ -166,7 +166,7 @@ def _breaks(case):
 
 
 def _uncertain(case):
-    """{dotted name: half-width as a share} of what varies from plant to plant."""
+    """{dotted name: half-width as a share} of the uncertain parameters."""
     shares = {name: float(share) for name, share in uncertain_shares(case).items()}
     names, covariance = case.covariance or ((), np.empty((0, 0)))
     for name, variance in zip(names, np.diagonal(np.asarray(covariance))):
@@ -250,7 +250,7 @@ def _own():
 
 @cache
 def _loader():
-    """The script that unpacks the others, with the licence of what is not ours."""
+    """The script that unpacks the others, with the licence of third-party code."""
     licence = "/* Packed in this page: uPlot 1.6.32, copyright (c) 2022 Leon Sorokin, MIT licence:"
     terms = _read("vendor/uPlot-LICENSE.txt").partition("\n\n")[2]
     parts = [licence, terms, '*/\n(() => {"use strict";', _script("inflate"), _script("loader")]

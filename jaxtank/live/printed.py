@@ -1,4 +1,4 @@
-"""The functions of one case as JavaScript: what depends on its numbers alone, signals, the run."""
+"""The functions of one case as JavaScript: constants of the loop, signals, the run."""
 
 from collections.abc import Iterable
 from typing import Any, cast
@@ -27,7 +27,7 @@ from jaxtank.export.whole import (
 )
 
 ALONE, TIMED, MOVING = 0, 1, 2
-"""Ranks: what depends on the numbers of the loop alone, on time too, on the state too."""
+"""Ranks of values: from the numbers of the loop alone, also from time, also from the state."""
 FIXED = frozenset({"every", *"pkcqoSNLRK"})
 """Names of arguments of the printed functions."""
 
@@ -59,7 +59,7 @@ class Printed:
         return "\n".join(functions)
 
     def streams(self) -> list[Ref]:
-        """Return what is known of each sample, in the order of S."""
+        """Return the precomputed data of each sample, in the order of S."""
         return sorted(self.kept)
 
     def _live(self):
@@ -102,7 +102,7 @@ class Printed:
         return used(self._ranked(MOVING), names(self._measures()))
 
     def _kept(self):
-        """What is kept of every sample, and what is computed again of it."""
+        """Data that is stored for every sample, and data that is computed again from it."""
         needed = refs(self.moving, self._outputs())
         needed = {e for e in needed if self.rank[e.name] == TIMED and e.name != "k"}
         timed = self._ranked(TIMED)
@@ -110,7 +110,7 @@ class Printed:
         return stored, again
 
     def _alone(self, statements: list[Statement], outputs: Iterable[Any]) -> list[Ref]:
-        """What of rank ALONE is read: numbers, then whole arrays as Refs without an index."""
+        """Values of rank ALONE that are read: numbers, then whole arrays as Refs without index."""
         numbers = {e for e in refs(statements, outputs) if self.rank[e.name] == ALONE}
         read = {o for s in every(statements) if isinstance(s, Matrix) for o in s.operands}
         whole = {Ref(name) for name in read if self.rank.get(name) == ALONE}
@@ -218,7 +218,7 @@ class Printed:
         return text, lines, body, state
 
     def _given(self, text, entries, arrays):
-        """Yield (variable, array) of what is read at each sample."""
+        """Yield (variable, array) of the data that is read at each sample."""
         for e, array in zip(entries, arrays):
             text.given[e] = next(text.names)
             yield text.given[e], array
@@ -236,7 +236,7 @@ class Printed:
         return first + [f"{n}={sign}{temporary.get(v, v)};" for n, v, sign in moved]
 
     def _real(self, e):
-        """What makes a number of a value that may be true or false."""
+        """Prefix that converts a truth value to a number; "" for a number."""
         return "+" if isinstance(e, Ref) and e.name in self.truths else ""
 
     def _read(self):
@@ -250,7 +250,7 @@ class Printed:
 
 
 def place(e: Ref) -> tuple[str, Any]:
-    """Return what Refs are sorted by."""
+    """Return the sort key of Refs."""
     return e.name, -1 if e.index is None else e.index
 
 

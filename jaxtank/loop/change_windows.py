@@ -1,4 +1,4 @@
-"""What overshoot, rise and settling of a run refer to: the last change of each setpoint."""
+"""Windows for overshoot, rise and settling: the last change of each setpoint."""
 # jax leaves the types of its functions partly open.
 # pyright: reportUnknownMemberType=false
 

@@ -82,7 +82,7 @@ class ClosedLoop:
 
 
 class State(NamedTuple):
-    """What one sample hands to the next."""
+    """State of the loop between two samples."""
 
     k: Any  # index of the sample
     x: Vector  # levels [cm]
@@ -90,19 +90,19 @@ class State(NamedTuple):
     controller: Any
     actuator: Any
     sensor: Any = ()
-    excess: Vector = ()  # in float32, what rounding has added to each level too much [cm]
+    excess: Vector = ()  # in float32, the rounding error of each level [cm]
 
 
 class Inputs(NamedTuple):
-    """What is known of every sample before the loop: tuples of (samples,), or (samples, n)."""
+    """Data of every sample, computed before the loop: tuples of (samples,), or (samples, n)."""
 
     r: Vector  # setpoints [cm]
     dr: Vector  # their rates [cm/s]
     ddr: Vector  # their second derivatives [cm/s^2]
     d: Vector | None  # inflow disturbances [cm^3/s]
     xi: Vector | None  # draws of the sensor noise [-]
-    context: ms.Context  # what the measures refer to
-    plan: Any  # what the controller has prepared
+    context: ms.Context  # reference data of the measures
+    plan: Any  # result of the controller's `prepare`
     own: Any  # signals of the controller's own
     fault: Vector | None  # 1 while a fault lasts
 
@@ -120,7 +120,7 @@ class Partition(NamedTuple):
         return with_tangents, tuple(v for v, m in zip(leaves, self.moving) if not m)
 
     def join(self, moving: Any, still: Any) -> Any:
-        """Return the tree of what `split` returned."""
+        """Return the tree from the results of `split`."""
         moving, still = iter(moving), iter(still)
         leaves: list[Any] = [next(moving) if m else next(still) for m in self.moving]
         return jax.tree.unflatten(self.structure, leaves)
@@ -197,7 +197,7 @@ def _rows_of(signals: Vector) -> tuple[Any, ...]:
 
 
 def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Vector) -> ms.Context:
-    """What the measures `names` refer to in addition to the sample, for setpoints `r`."""
+    """Return the Context of the measures `names` for setpoints `r`."""
     fields, window = ms.refers_to(names), None
     if "window" in fields:
         window = windows(loop, times, is_array(r))

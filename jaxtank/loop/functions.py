@@ -21,7 +21,7 @@ NOT_TRACEABLE = (
     jax.errors.TracerArrayConversionError,
     jax.errors.TracerIntegerConversionError,
 )
-"""What jax raises where a program asks for the number behind a traced value."""
+"""Errors of jax if a program uses the number of a traced value."""
 
 
 class Measures(Mapping[str, Any]):

@@ -79,7 +79,7 @@ def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
     moved = jnp.abs(after - s) > 1e-8 * jnp.abs(s) + 1e-10 * jnp.max(jnp.abs(s))
     finite = [jnp.all(jnp.isfinite(v)) for v in (s, closed, B, C)]
     lost = jnp.any(moved) | ~jnp.all(jnp.stack(finite))
-    # where the loop does not rest, what the plant alone would need tells why
+    # if the loop has no steady state, the steady inputs of the plant give the reason
     levels, volts = (jnp.where(lost, a, b) for a, b in zip(alone, (x, u)))
     bank, least = loop.actuator, loop.actuator.driving(tuple(jnp.asarray(loop.actuator.low)))
     low = jnp.where(lost, jnp.stack(list(least)) + jnp.asarray(bank.offset), jnp.asarray(bank.low))
@@ -197,7 +197,7 @@ class _Sample:
         return _flat(floats), jnp.stack(list(applied))
 
     def slopes(self, s: Any) -> "_Slopes":
-        """What `after` returns, and its derivatives."""
+        """Result of `after`, and its derivatives."""
 
         def both(s: Any, w: Any) -> Any:
             results = self.after(s, w)
@@ -218,7 +218,7 @@ class _Slopes(NamedTuple):
 
     closed: Any  # (N, N) of the state after a sample by the state
     B: Any  # (N, m) of it by inputs added at the pumps
-    C: Any  # (m, N) of what the loop applies by the state
+    C: Any  # (m, N) derivative of the applied inputs by the state
     after: Any  # (N,) state after the sample
     applied: Any  # (m,) what the loop applies [V]
 

@@ -25,7 +25,7 @@ from jaxtank.xla.barrier import materialised
 
 
 class Decision(NamedTuple):
-    """What observer and controller make of one sample."""
+    """Results of observer and controller at one sample."""
 
     estimate: Estimate
     command: Sequence[Any]  # (m) inputs before their limits [V]
@@ -68,7 +68,7 @@ def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[Sta
 def decide(
     loop: ClosedLoop, observer: Any, controller: Any, tick: Tick, y: Sequence[Any]
 ) -> Decision:
-    """Return what observer and controller make of one sample: its order, written once."""
+    """Run observer and controller for one sample; every simulation and export uses this order."""
     safety_filter, under_way = loop.safety_filter, None
     if safety_filter is not None and safety_filter.predicted:
         controller, under_way = controller

@@ -54,7 +54,7 @@ class Unstable(NamedTuple):
 
     tank: int  # counted from 0
     height: float  # how far off its level may be [length of the rig]
-    remedy: str  # what is short enough
+    remedy: str  # a setting that is short enough
 
 
 def emptying_rates(plant: Any, orifices: float = 1.5, pipes: float = 2.0) -> Any:
@@ -74,7 +74,7 @@ def emptying_rates(plant: Any, orifices: float = 1.5, pipes: float = 2.0) -> Any
             speed = np.sqrt(2.0 * np.asarray(plant.gravity, dtype=float) / plant.knee)
             rates = speed * (orifices * out + pipes * joined) / np.asarray(plant.area, dtype=float)
         return np.minimum(rates, 1e200)
-    except (AttributeError, TypeError):  # what jax raises for a traced number is a TypeError
+    except (AttributeError, TypeError):  # jax raises a TypeError for a traced number
         return None
 
 
@@ -278,7 +278,7 @@ def visible_heights(loop: ClosedLoop, x: Any = 0.0) -> Any:
         rim = np.asarray(plant.rim, dtype=float)
         empty = about <= plant.knee
         return SEEN * (rim if empty else np.minimum(rim, max(about, highest(x))))
-    except TypeError:  # what jax raises for a traced number
+    except TypeError:  # raised by jax for a traced number
         return None
 
 

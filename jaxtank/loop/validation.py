@@ -82,7 +82,7 @@ def check(
 
 
 def _signature(loop: ClosedLoop, clock: Clock, keyless: bool) -> Any:
-    """What the checks depend on, hashable; None inside a trace."""
+    """Return a hashable key of everything that the checks use; None inside a trace."""
     leaves, structure = cast(tuple[list[Any], Any], jax.tree.flatten(loop))
     digest = hashlib.blake2b(digest_size=16)
     for value in leaves:

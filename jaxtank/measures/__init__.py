@@ -1,6 +1,6 @@
 """Numbers that describe a run, accumulated in the time loop: memory does not grow with its length.
 
-`catalogue` holds the measures, `accumulators` what the loop carries for them, `registry` what is
+`catalogue` holds the measures, `accumulators` their state in the time loop, `registry` what is
 known of them by name, `running` what the loop calls, `functions` those that are a function of a
 whole run.
 """

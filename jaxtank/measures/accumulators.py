@@ -1,4 +1,4 @@
-"""What the time loop carries for each measure: running sums, extremes and times.
+"""State of the measures in the time loop: running sums, extremes and times.
 
 `measures.catalogue` names what it reads of them.
 """
@@ -48,7 +48,7 @@ class Worst(NamedTuple):
 
 
 class Context(NamedTuple):
-    """What an accumulator may refer to in addition to the sample; None where no measure does."""
+    """Data for accumulators in addition to the sample; None if no measure uses them."""
 
     # of the last setpoint change of each output: (target [cm], step [cm], time since its end [s],
     # half width of its band [cm]); step 0 before the first

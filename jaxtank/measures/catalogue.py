@@ -47,7 +47,7 @@ class Measure(NamedTuple):
     worst: str = ""  # why it is infinite on the side that is worse; "": as `undefined`
     unlimited: str = ""  # why it is infinite on the side that is better; "": as `undefined`
     unserved: str = ""  # why a case has none, reported where it is not computed
-    nan_holds: str = ""  # what NaN means where a limit holds with it; "": NaN breaks a limit
+    nan_holds: str = ""  # meaning of NaN if NaN satisfies a limit; "": NaN violates it
     linear: bool = False  # of the linearised loop (`Run.margins`): computed where it is named only
     arrays: bool = False  # whether `read` takes states of either form; else of tuples of scalars
 

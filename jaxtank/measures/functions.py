@@ -12,7 +12,7 @@ from jaxtank.measures.catalogue import MEASURES, Measure
 
 @dataclasses.dataclass(frozen=True)
 class RunFunction:
-    """What takes the place of `Measure.read` where a value is a function of a whole run.
+    """Replaces `Measure.read` if the measure is a function of a whole run.
 
     function : (measures) or (measures, trajectory) -> scalar.  trajectory : True for the second.
     save_every : distance of the rows of the trajectory [samples].

@@ -1,4 +1,4 @@
-"""What the time loop calls: start, update and read the accumulators that some measures need."""
+"""Accumulators in the time loop: start, update and read them for some measures."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -57,7 +57,7 @@ def residuals(
 
 
 def residual_weights(run: Run, squares: Weights) -> tuple[Any, ...]:
-    """Return what the square of each of `residuals` counts in the weighted sum of the measures."""
+    """Return the weight of the square of each of `residuals` in the sum of the measures."""
     counts = {"output": run.outputs, "tank": run.tanks, "pump": run.pumps}
     if run.arrays:
         counts = dict.fromkeys(counts, 1)  # one array each

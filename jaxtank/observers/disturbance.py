@@ -40,7 +40,7 @@ class DisturbanceObserver(Observer):
     other tank is predicted by the model from its level at t = 0, by a step of Runge-Kutta, and its
     d^ is 0: what the model misses there appears in the measured tanks that it feeds. (To estimate
     such a level too: `ExtendedKalman` with `disturbed`.) A rim that is physics in the model is so
-    here: what overflows is no disturbance.
+    here: an overflow is no disturbance.
 
     u [V] is the command after the pumps' limits: with `fed` = "command", the unlimited command,
     the observer winds up while a pump is saturated (gouta2022 notes S4.2). `before_compensation`

@@ -157,7 +157,7 @@ def same_everywhere(run, values):
 
 
 def measured(run):
-    """Return what can be measured of the published rows (see `jaxtank.presets.paper.Preset`)."""
+    """Return measured values of the published rows (see `jaxtank.presets.paper.Preset`)."""
     case, plain = run("backstepping")
     hurt_case, hurt = run("backstepping-perturbed")
     plant, ends, e = case.loop.plant, [449, 1049], plain.e[:, 0]

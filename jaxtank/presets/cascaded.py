@@ -92,7 +92,7 @@ def steady_state(level):
 
 
 def measured(run):
-    """Return what can be measured of the published rows without a record (see `paper.Preset`)."""
+    """Return measured values of the published rows without a record (see `paper.Preset`)."""
     case, flood = run(
         "open-loop", {"controller.signal.initial": 10.0, "controller.signal.targets": 10.0}
     )

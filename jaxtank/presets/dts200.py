@@ -70,7 +70,7 @@ def loop(faulty=False):
 
 
 def measured(run):
-    """Return what is found of the published rows (see `paper.Preset`)."""
+    """Return measured values of the published rows (see `paper.Preset`)."""
     plant = run("pi")[0].loop.plant
     levels = np.array(POINT)
     speed = np.sqrt(2 * 981.0)

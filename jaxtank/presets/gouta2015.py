@@ -27,7 +27,7 @@ from jaxtank.signals.setpoints import ramps
 RAMPS = (20.0, 30.0, 60.0, 200.0)  # durations of the setpoint ramps, not printed [s]
 OWN = 60.0  # sampling period of the cases [s]
 EVERY = 10  # samples between those that are kept of these runs: 0.1 s
-POUR = (620.0, 1.0, 0, 100.0)  # assumed disturbance: time, duration [s], tank, volume [cm^3]
+INFLOW = (620.0, 1.0, 0, 100.0)  # assumed disturbance: time, duration [s], tank, volume [cm^3]
 
 
 def total(trajectory):
@@ -41,11 +41,11 @@ def outside(trajectory):
 
 
 def measured_rows(run):
-    """Return {quantity: what was measured} of the rows that can be measured."""
+    """Return {quantity: measured value} of the rows that can be measured."""
     far = run("backstepping")[1]
     return {
         **_by_ramp(run),
-        "disturbance rejection": _pour(run),
+        "disturbance rejection": _inflow(run),
         "fluctuations with backstepping": _fluctuations(run, far),
         "Theorem 1": _theorem(run, far),
         "relative stability": _margins(run),
@@ -157,20 +157,20 @@ def _responses(pair, ramp):
     }
 
 
-def _pour(run):
+def _inflow(run):
     """Effect on both levels of a volume that flows into tank 1: difference to the calm run."""
     area, peak = [], []
     for name in PAIR:
         case, calm = run(name, {"reference.ramp": OWN}, EVERY)
-        loop = dataclasses.replace(case.loop, disturbance=inflow_pulses(4, [POUR]))
+        loop = dataclasses.replace(case.loop, disturbance=inflow_pulses(4, [INFLOW]))
         e = np.abs(np.asarray(simulate(loop, case.clock, None, EVERY).e) - calm.e)
         part = e[calm.t < 760.0]
         area.append(float(part[:, 0].sum()) * EVERY * case.clock.dt)
         peak.append(float(part[:, 1].max()))
     return Claim(
         (area[1] < area[0], peak[1] < peak[0]),
-        f"{POUR[3]:g} cm^3 into tank 1 at {POUR[0]:g} s (ours): integral of the absolute change of"
-        f" h1 {area[0]:.1f} cm s (NGPC), {area[1]:.1f} cm s (backstepping); h2 moves by"
+        f"{INFLOW[3]:g} cm^3 into tank 1 at {INFLOW[0]:g} s (ours): integral of the absolute change"
+        f" of h1 {area[0]:.1f} cm s (NGPC), {area[1]:.1f} cm s (backstepping); h2 moves by"
         f" {peak[0]:.3f} cm, {peak[1]:.3f} cm",
     )
 
@@ -355,7 +355,7 @@ def _setpoints(reference):
 
 
 def measured(run):
-    """Return what can be measured of the published rows (see `jaxtank.presets.paper.Preset`)."""
+    """Return measured values of the published rows (see `jaxtank.presets.paper.Preset`)."""
     case, near = run("ngpc")
     slow = total(run("ngpc-table1")[1])
     still = run("ngpc", {"actuator.dead_zone": 3.0})[1]

@@ -23,7 +23,7 @@ from jaxtank.signals.setpoints import Sine, ramps
 # Kp of Table 1, and ten times that (notes S2.2) [cm^3/(s V)]
 PRINTED_GAIN, RECONCILED_GAIN = 3.4717, 34.717
 
-# what the reported mean of d^ amounts to at the reconciled Kp (notes S2.3) [V]
+# the reported mean of d^, converted with the reconciled Kp (notes S2.3) [V]
 DEAD_ZONE = (2.7538, 4.3248)
 
 SENSOR = 1 / 0.04413  # MPX5010DP: 450 mV/kPa [cm/V]
@@ -65,7 +65,7 @@ FREE = {
     "pid": ("controller.Kc", "controller.Ti", "controller.Td"),
     "fopi": ("controller.Kc", "controller.Ti", "controller.order"),
 }
-"""{case without its suffix: what `tune` changes}."""
+"""{case without its suffix: free parameters}."""
 
 
 def rig(pump_gain=RECONCILED_GAIN):
@@ -242,7 +242,7 @@ def total(trajectory):
 
 
 def measured_rows(run):
-    """Return {quantity: what was measured} of the published rows."""
+    """Return {quantity: measured value} of the published rows."""
     (plain, enmpc), (case, chadpc) = run("enmpc"), run("chadpc")
     return {
         **_third(run("chadpc-trapezoid")[1]),
@@ -293,7 +293,7 @@ def _third(t):
 
 
 def _pulses(enmpc, chadpc):
-    """What an inflow pulse does to the other tank, and to the level itself."""
+    """Effect of an inflow pulse on its tank and on the other tank."""
 
     def kick(t):  # largest change of the other tank's error within 30 s [cm]
         kicks = []
@@ -490,7 +490,7 @@ def _rises(case, run):
 
 
 def measured(run):
-    """Return what can be measured of the published rows (see `jaxtank.presets.paper.Preset`)."""
+    """Return measured values of the published rows (see `jaxtank.presets.paper.Preset`)."""
     enmpc, (case, chadpc) = run("enmpc")[1], run("chadpc")
     return {
         **_tables(run, enmpc, chadpc),

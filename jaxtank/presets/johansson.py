@@ -71,7 +71,7 @@ def loop(phase):
 
 
 def measured(run):
-    """Return what is found of the published rows (see `paper.Preset`)."""
+    """Return measured values of the published rows (see `paper.Preset`)."""
     rows, slowest = {}, {}
     for phase, (levels, *_) in POINTS.items():
         plant, volts = run(NAMES[phase])[0].loop.plant, JOHANSSON[phase][2]

@@ -240,7 +240,7 @@ def _responses(run, values_of):
 
 
 def measured(run):
-    """Return what can be measured of the published rows (see `jaxtank.presets.paper.Preset`)."""
+    """Return measured values of the published rows (see `jaxtank.presets.paper.Preset`)."""
     # The claims are decided at the reference point, r_w = 0.01 in S2 and M2, with Runge-Kutta steps
     # of 1 s instead of 0.25 s, which compile faster and change no RMS error by more than 2e-7 m.
     short = {"clock.substeps": 2}

@@ -87,7 +87,7 @@ TUNABLE = {
 }
 
 
-CONTROLLERS = {  # title, controller for a model, what `tune` changes
+CONTROLLERS = {  # title, controller for a model, free parameters
     "sfc": ("state feedback", lambda m: StateFeedback(model=m, K=number(GAIN)), ("controller.K",)),
     "smc": ("sliding mode, corrected", sliding, SLIDING),
     "hybrid": (
@@ -191,7 +191,7 @@ def response(trajectory, output=0):
     }
 
 
-QUANTITIES = {  # of `response`: what Table 3 calls it, and its unit
+QUANTITIES = {  # {quantity of `response`: (name in Table 3, unit)}
     "overshoot": ("overshoot", " %"),
     "arrival": ("rise time", " s"),
     "settling": ("settling time", " s"),
@@ -202,7 +202,7 @@ SAME_CONTROLLER = {"SMC": ("smc", "smc-printed"), "SFC": ("sfc",), "hybrid": ("h
 
 
 def measured_rows(run, assumed):
-    """Return {quantity: what was measured} of the rows that can be measured."""
+    """Return {quantity: measured value} of the rows that can be measured."""
     # assumed : {controller of Table 3: its `response` with what notes S7.2 assumes}
     rise = {name: values["arrival"] for name, values in assumed.items()}
     settled = [assumed[name]["settling"] for name in ("SFC", "hybrid")]
@@ -307,7 +307,7 @@ def _near(value, target):
 
 
 def _linear(loop):
-    """What follows from the linear model at the setpoint."""
+    """Rows that follow from the linear model at the setpoint."""
 
     def model(tanks):
         return tuple(np.asarray(part) for part in linearise(tanks, *equilibrium(tanks, SETPOINT)))
@@ -356,7 +356,7 @@ def steady_error(run, kind, values):
 
 
 def measured(run):
-    """Return what can be measured of the published rows (see `jaxtank.presets.paper.Preset`)."""
+    """Return measured values of the published rows (see `jaxtank.presets.paper.Preset`)."""
     assumed = {name: response(run(case)[1]) for name, case in zip(("SMC", "SFC", "hybrid"), FITTED)}
     return {
         **measured_rows(run, assumed),

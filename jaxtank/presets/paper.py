@@ -1,4 +1,4 @@
-"""What a paper is made of: its cases, what it prints, and what is found of that."""
+"""A paper: its cases, its published numbers, and the measured ones."""
 
 import dataclasses
 import inspect
@@ -51,7 +51,7 @@ class Published(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Claim:
-    """What was measured of a claim in words.
+    """Measured evidence for a claim in words.
 
     holds : whether the claim holds, or one boolean for each part of it: comparisons of what was
         measured, never constants

@@ -50,7 +50,7 @@ class Signal(abc.ABC):
 
     @pointwise
     def windows(self, clock: Clock) -> tuple[Any, ...] | None:
-        """Return what overshoot and settling refer to, or None without `changes`.
+        """Return the windows for overshoot and settling, or None without `changes`.
 
         Returns
         -------

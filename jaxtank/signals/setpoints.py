@@ -62,7 +62,7 @@ def channel(clock, initial, changes, duration, shape, lag=None):
 
 
 def _many(clock, initial, changes, duration, shape, lag):
-    """`channel` of many changes: what is reached before each by a scan, then one lookup."""
+    """`channel` with many changes: a scan gives the value before each, then one lookup."""
     starts, targets = changes
     first: Any = index(starts, clock)
 
@@ -262,7 +262,7 @@ class Ramps(Signal):
 
     @pointwise
     def windows(self, clock: Clock) -> tuple:
-        """Return what overshoot and settling refer to; the step is 0 before the first change.
+        """Return the windows for overshoot and settling; the step is 0 before the first change.
 
         Returns
         -------

@@ -71,7 +71,7 @@ def backend_started():
 
 
 def _text_of(file):
-    """What a file holds; nothing where it cannot be read."""
+    """The content of a file; empty if it cannot be read."""
     try:
         with open(file) as text:
             return text.read()

@@ -28,7 +28,7 @@ class Round(NamedTuple):
 
 @functools.lru_cache(maxsize=256)
 def rounds(ends: tuple[int, ...], tanks: int) -> tuple[Round, ...]:
-    """Return what sums values, each of which ends at a tank, over the values of each tank."""
+    """Return the Rounds that add up the values of each tank; value i belongs to tank ends[i]."""
     if not ends:
         return ()
     groups: list[list[int]] = [[] for _ in range(tanks)]

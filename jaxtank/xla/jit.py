@@ -48,7 +48,7 @@ class Kept:
         self.programs: dict[Any, Any] = {}
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """Return what the function returns."""
+        """Return the result of the function."""
         folder = program_cache.folder
         if folder is None:
             return self.compiled(*args, **kwargs)
@@ -94,7 +94,7 @@ class Tried:
         self.program, self.path, self.traced, self.ran = program, path, traced, False
 
     def __call__(self, **moving: Any) -> Any:
-        """Return what the program returns."""
+        """Return the result of the program."""
         if self.ran:
             return self.program(**moving)
         try:
@@ -157,7 +157,7 @@ def _read(path: Path, tree: Any) -> Any:
 
 
 def _about(lowered: Any) -> dict[str, Any] | None:
-    """What is written in front of a program; None for one that cannot be kept."""
+    """The header of a stored program; None if the program cannot be stored."""
     calls = set(re.findall(r"custom_call @(\w+)", lowered.as_text()))
     lapack = {name for name in calls if name.startswith("lapack_")}
     if calls - lapack:  # functions that a new process may not have

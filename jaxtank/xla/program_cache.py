@@ -235,7 +235,7 @@ def _may_make(base: Path) -> bool:
 
 
 def processor() -> str:
-    """Digest of what native code depends on: a program of another processor may crash."""
+    """Digest of the processor: native code for another processor may crash."""
     words = [platform.machine(), sys.platform]
     try:
         with open("/proc/cpuinfo") as lines:

@@ -133,7 +133,7 @@ C_LOOP = "C loop, backstepping"
 
 
 def _calls(cases) -> dict[str, Callable[[], Any]]:
-    """{name: call} of what is timed: the cases, and two derivatives of the first one."""
+    """{name: call} of the timed programs: the cases, and two derivatives of the first one."""
     first = cases[CASES[0]]
     gains = {"controller.k": np.float64(0.03), "controller.k1": np.float64(0.088)}
 

@@ -52,7 +52,7 @@ KINDS = {
     "TYPE": "precisions",
     "MEASURE": "measures",
 }
-"""What the values of an option are, by its metavar up to "="."""
+"""Kind of the values of an option, by its metavar up to "="."""
 
 
 def script(shell):
@@ -63,7 +63,7 @@ def script(shell):
 
 
 def candidates(parser, words):
-    """Return what the last of the words after "jaxtank" may become."""
+    """Return the completions of the last of the words after "jaxtank"."""
     *before, word = words or [""]
     if "=" in (word, *before[-1:]):  # a value after NAME=, which bash splits off
         return []

@@ -21,7 +21,7 @@ SAME = 0.3
 its group."""
 
 _searches = []  # the Interrupts that takes the signals, if any
-_before = []  # what is called before the process ends
+_before = []  # functions that are called before the process ends
 _leaving = _thread.allocate_lock()
 _watched = []  # True once a thread answers signals
 _held = []  # True once the main thread waits for its end
@@ -100,7 +100,7 @@ def leave(number=_signal.SIGINT, words=None):
 
 
 def say(words):
-    """Write a line to stderr; what it cannot take is discarded."""
+    """Write a line to stderr; a failed write is ignored."""
     try:
         fresh = b"\n" if os.isatty(2) else b""  # after ^C, or a line of progress
         os.write(2, fresh + b"jaxtank: " + words + b"\n")

@@ -50,7 +50,7 @@ CASE = (
     Option("case", "CASE", '"paper/case" (see jaxtank list) or a rig file ending in .toml'),
 )
 RUN = (
-    Option("--seed", "N", "seed of what is drawn: noise, plants, search points", SEEDS, 0),
+    Option("--seed", "N", "seed of noise, plants and search points", SEEDS, 0),
     Option("--out", "DIR", "folder for result.json, report.html, CSV, pictures and the rig (attack:"
            " worst.toml)", values.folder),
 )

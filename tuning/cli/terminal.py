@@ -10,7 +10,7 @@ import sys
 
 
 class Forgiving(io.RawIOBase):
-    """A file descriptor for progress and errors; what it cannot take is discarded."""
+    """A file descriptor for progress and errors; failed writes are ignored."""
 
     def __init__(self, descriptor):
         self.descriptor = descriptor

@@ -101,7 +101,7 @@ class Engine:
         """Warn, or raise InputError, where there is no worker."""
 
     def _result(self, future):
-        """Return what a task returned; raise what it raised, in one line."""
+        """Return the result of a task, or raise its error in one line."""
         try:
             processor, result = future.result()
         except ImportError as error:

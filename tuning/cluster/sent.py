@@ -51,7 +51,7 @@ def received(text: str) -> Case:
 
 
 def _fingerprint(case):
-    """Return `fingerprint` with what decides precision and random numbers on a worker, too."""
+    """Return `fingerprint` with the settings for precision and random numbers on a worker."""
     config: Any = jax.config
     generator = [str(config.jax_default_prng_impl), str(config.jax_threefry_partitionable)]
     return fingerprint(case, x64=bool(config.jax_enable_x64), random=generator)

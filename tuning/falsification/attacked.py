@@ -54,7 +54,7 @@ def coefficients_of(case: Any, distributions: Any = None) -> list[Coefficient]:
 
 
 def _ends_of_box(case):
-    """{name: (low, high)} of the filter's box, and of what else the case calls uncertain."""
+    """{name: (low, high)} of the filter's box, and of other uncertain parameters of the case."""
     safety_filter = filter_or_design(case)
     if safety_filter is None:
         return _ends_of(case.loop, spread_of(case))

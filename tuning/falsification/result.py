@@ -51,7 +51,7 @@ class Attack(Result):
     Attributes
     ----------
     attacked : Attacked
-        The case as a function of what the attack may change.
+        The case as a function of the variables of the attack.
     found : tuple of Found
         One for each tank.
     history : (iterations + 1, tanks) array
@@ -76,7 +76,7 @@ class Attack(Result):
 
     @property
     def passed(self) -> list[Found]:
-        """What passed its limit."""
+        """The runs in which a level passed its limit."""
         return [run for run in self.found if run.passed]
 
     @property
@@ -127,7 +127,7 @@ class Attack(Result):
         return case.replace(loop=dataclasses.replace(loop, **changes), safety=safety)
 
     def not_in_rig(self, run: Found) -> list[str]:
-        """Return what of a run no rig file can describe, in words."""
+        """Return, in words, the parts of a run that no rig file can describe."""
         error, missing = run.values.get("error"), []
         if error is not None and np.ptp(error, axis=1).max() > 0.0:
             missing.append("reading errors that change from sample to sample (their mean is)")

@@ -1,4 +1,4 @@
-"""The result of a feasibility study: what each plateau needs, and the smallest mends.
+"""The result of a feasibility study: levels needed at each plateau, and the smallest mends.
 
 Made by `study`; imported by whoever reads a Feasibility.
 """
@@ -74,7 +74,7 @@ class Feasibility(Result):
     ----------
     case : Case
     distributions : dict
-        {dotted name: distribution} of what varies.
+        {dotted name: distribution} of the uncertain parameters.
     infeasible : (samples,) array of bool
         True where the steady state of some plateau needs a level or an input outside its limits.
     plateaus : tuple of PlateauNeed

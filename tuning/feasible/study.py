@@ -483,7 +483,7 @@ def _least_move(needs, where, values, quantile, start):
         return np.minimum(excess, LARGEST)
 
     rank = min(needs.count, math.ceil(quantile * needs.count)) - 1
-    # what is far from its limit is left out; the share at the end counts all
+    # levels far from their limit are ignored here; the final share counts all
     near = np.partition(over(0.0), rank, axis=0)[rank] > -FAR
 
     def needed(change):

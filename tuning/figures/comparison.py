@@ -96,7 +96,7 @@ class Comparison(Shown):
 
 
 def compare(*names: str) -> Comparison:
-    """Return what papers print beside what is measured here, a verdict for each number.
+    """Return published and measured numbers of papers, with a verdict for each.
 
     The runs take 3 to 20 s a paper; two papers run at a time.
 

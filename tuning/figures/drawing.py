@@ -19,7 +19,7 @@ from tuning.report.simulated import run_for_people
 from tuning.report.tables import number
 
 FORMATS = ("svg", "png", "pdf")
-"""What a figure can be written as."""
+"""File formats of a figure."""
 
 WIDTH, LINE = (92, 122), 0.17
 """Characters in a line of the caption below one and two columns, height of a line [inch]."""
@@ -29,7 +29,7 @@ SHARE = 0.5
 
 
 class Drawn(NamedTuple):
-    """The runs of a figure: {label: (case, trajectory)}, and sentences on what they show."""
+    """The runs of a figure: {label: (case, trajectory)}, and sentences on their results."""
 
     runs: dict[str, tuple[Case, Trajectory]]
     ours: tuple[str, ...]
@@ -49,7 +49,7 @@ def run(figure: Figure) -> Drawn:
 
 
 def _facts(kinds, case, trajectory, figure):
-    """What a run shows of what is drawn, in numbers."""
+    """The drawn quantities of a run, in numbers."""
     length, drive = case.loop.units
     facts = []
     if "levels" in kinds or "errors" in kinds:
@@ -83,7 +83,7 @@ def _several(values, digits=3):
 
 
 def caption(figure: Figure, ours: tuple[str, ...]) -> list[str]:
-    """Return the paragraphs below a figure: what the paper shows and says, what ours shows."""
+    """Return the paragraphs below a figure: content and statements of the paper, our results."""
     texts = [f"{figure.paper}, figure {figure.number}. {figure.shows}."]
     texts += [f"The paper: {figure.states}"] if figure.states else []
     texts += [f"Here: {'; '.join(ours)}."] if ours else []

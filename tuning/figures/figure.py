@@ -1,4 +1,4 @@
-"""The figures of the papers: what each shows, and which of our runs draw it (figures.toml)."""
+"""The figures of the papers: content, and the runs that redraw them (figures.toml)."""
 
 import tomllib
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from jaxtank.core.errors import InputError, unknown
 
 KINDS = ("levels", "errors", "inputs", "estimates", "shares", "setpoints", "memberships")
-"""What the panels of a figure can show."""
+"""Quantities that the panels of a figure can show."""
 
 
 class Run(NamedTuple):

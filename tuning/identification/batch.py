@@ -225,7 +225,7 @@ def _minimise(batch, iterations):
 
 
 def _step(batch, z, normal, damping):
-    """Return the damped Gauss-Newton step (logs, unknowns) of what no bound holds."""
+    """Return the damped Gauss-Newton step (logs, unknowns); 0 for unknowns at a bound."""
     edge, i = 1e-12 * (batch.high - batch.low), range(z.shape[1])
     fixed = (z <= batch.low + edge) & (normal.gradient > 0)
     fixed |= (z >= batch.high - edge) & (normal.gradient < 0)

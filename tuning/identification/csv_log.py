@@ -28,12 +28,12 @@ WORDS = {
     **dict.fromkeys(("pump", "u", "voltage", "input"), "pump"),
     **dict.fromkeys(("h", "level", "y", "tank", "x"), "h"),
 }
-"""What a column's header may call time, a pump's input and a level."""
+"""Names of time, pump input and level in the header of a column."""
 KINDS = {"t": "time", "pump": "pump", "h": "level"}
 
 
 class _Column(NamedTuple):
-    """A column of the file: its index, what it holds, and the factor to the rig's unit."""
+    """A column of the file: its index, its quantity, and the factor to the rig's unit."""
 
     index: int
     kind: str  # "t", "pump" or "h"

@@ -1,4 +1,4 @@
-"""Checks of experiment data against a rig: what each finds, and what it says."""
+"""Checks of experiment data against a rig: conditions and messages."""
 
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
@@ -174,7 +174,7 @@ def _other_units(log, column, values, unit, ends):
 
 
 class Check(NamedTuple):
-    """A check: its code, what it finds, and the message."""
+    """A check: its code, its condition, and the message."""
 
     code: str
     find: Callable[..., Iterable]  # of (log, loop, gap): (sample or None, column or None, values)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from jaxtank.core.errors import DataError, InputError
 
 HOLDS = ("", "zero-order", "first-order")
-"""What inputs do between samples; "": not known, zero-order where samples are regular."""
+"""Inputs between samples; "": unknown, zero-order hold if samples are regular."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)

@@ -113,7 +113,7 @@ class InputProblem:
         return value_and_gradient(self.loop(), self.coarse, self.terms, u, lagrangian)
 
     def excesses(self, u, interval, clock, lagrangian):
-        """Return what `cost.evaluate` gives for u, sampled: one program for any interval."""
+        """Return the result of `cost.evaluate` for u, sampled: one program for any interval."""
         at = np.arange(clock.samples) * (clock.dt / interval) + 1e-6
         at = np.minimum(at, u.shape[1] - 1).astype(int)
         loop = dataclasses.replace(open_loop(self.case.loop, u[:, at], clock.dt), plant=self.plant)

@@ -34,7 +34,7 @@ share of its range (Bryson's rule) [-]."""
 
 
 class Rig(NamedTuple):
-    """What the first gains are computed from: a linear model at a steady state, and sizes."""
+    """Data for the first gains: a linear model at a steady state, and sizes."""
 
     A: np.ndarray  # (n, n) [1/s]
     B: np.ndarray  # (n, m)
@@ -119,7 +119,7 @@ def _computed(case: Case, kind: str) -> tuple[Any, dict[str, Any]]:
 
 
 def _rig_of(case: Case) -> Rig:
-    """Return what the first gains are computed from."""
+    """Return the data for the first gains."""
     plant: Any = model_of(case.loop)
     pumps = (plant.pumps,)
     if plant.pumps != len(plant.outputs):

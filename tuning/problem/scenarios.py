@@ -59,7 +59,7 @@ class ScenarioRun(NamedTuple):
 
 
 class Group(NamedTuple):
-    """Runs with one structure and one clock: what differs is stacked, what is shared is not."""
+    """Runs with one structure and one clock: only values that differ are stacked."""
 
     runs: tuple[int, ...]  # their indices
     clock: Clock
@@ -71,12 +71,12 @@ class Group(NamedTuple):
 
     @property
     def shape(self) -> Shape:
-        """What the compiled functions are specialised to."""
+        """Static key of the compiled functions."""
         return self.structure, self.apart, len(self.runs)
 
     @property
     def draws(self) -> Any:
-        """What a run takes its noise from: drawn numbers where there are some, else the keys."""
+        """Source of the noise of a run: drawn numbers if present, else the keys."""
         return self.keys if self.noise is None else self.noise
 
     def at(self, clock: Clock) -> "Group":

@@ -92,7 +92,7 @@ def _parameters(case, preset):
 
 
 def report(case):
-    """Return the Report of a case: its rig, its loop, what is tuned, and every parameter."""
+    """Return the Report of a case: its rig, its loop, free parameters, and every parameter."""
     page, preset, loop = json_of(case), _preset(case), case.loop
     title = f"{page['case']}: {page['title']}"
     head = [title, *([preset.citation, f"notes: {page['notes']}"] if preset else [])]
@@ -128,7 +128,7 @@ def report(case):
 
 
 def _tuning(case, preset, page):
-    """What is tuned: gains, limits, objective, scenarios."""
+    """The tuning problem: gains, limits, objective, scenarios."""
     limits = ", ".join(
         f"{m} at {'least' if MEASURES[m].sense < 0 else 'most'} {v}"
         for m, v in page["limits"].items()
@@ -141,7 +141,7 @@ def _tuning(case, preset, page):
 
 
 def _measures(loop):
-    """The table of what is measured of a run."""
+    """The table of the measures of a run."""
     rows = []
     for m in of_loop(loop):
         spec = MEASURES[m]
@@ -152,7 +152,7 @@ def _measures(loop):
 
 
 def _paper(case, preset, page):
-    """What the paper prints, what is uncertain, and departures from the paper."""
+    """Published numbers, uncertain parameters, and departures from the paper."""
     sections: list[Any] = []
     if preset and preset.published:
         sections.append(_published(preset, page["parameters"]))
@@ -191,7 +191,7 @@ def _class_of(controller):
 
 
 def _tuned(case, preset, parameters):
-    """The table of what the case tunes, then of what else could be."""
+    """The table of the free parameters, then of others that could be free."""
     others = preset.tunable if preset else {}
     ranges = {n: spec for n, spec in others.items() if n in parameters and n not in case.free}
     ranges = {**case.free, **ranges}
@@ -226,7 +226,7 @@ def _every(page):
 
 
 def _published(preset, parameters):
-    """The table of what the paper prints, and what this case has where it is a parameter."""
+    """The table of published numbers, with the value of this case for parameters."""
     rows = []
     for name, p in preset.published.items():
         parameter, value = parameters.get(name), ""

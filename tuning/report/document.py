@@ -49,7 +49,7 @@ class Live:
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """What is printed and shown of a result, as data."""
+    """A result as data for printing and display."""
 
     title: str
     verdict: str

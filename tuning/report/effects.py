@@ -84,7 +84,7 @@ def derivative_unit(result, c, name):
 
 
 def notes_of(result):
-    """Return sentences on the numbers: what they are, what was left out, where samples are few."""
+    """Return sentences on the numbers: meaning, omitted parameters, too few samples."""
     method, columns = METHODS[result.method], result.columns
     notes = [method.words, *result.notes]
     if result.failed:
@@ -200,7 +200,7 @@ def _parameter_json(result, name):
 
 
 def _width(result, label):
-    """What the half-width of a parameter is, in words."""
+    """The half-width of a parameter, in words."""
     for name, d in result.distributions.items():
         if label in getattr(d, "names", (name,)) or label.split("[")[0] == name:
             if isinstance(d, (Normal, Correlated)):

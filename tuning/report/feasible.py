@@ -43,7 +43,7 @@ def verdict(study):
 
 
 def needs(study, least=LISTED):
-    """Return the Table of what the plateaus need, where `least` of the plants exceed a limit."""
+    """Return the Table of needed levels that at least `least` of the plants cannot reach."""
     rows = [
         [
             Value(row.setpoints, 6, study.case.loop.units[0], ", "),

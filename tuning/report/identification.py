@@ -31,7 +31,7 @@ CAPTIONS = {
 
 
 def not_identifiable(direction):
-    """Return what a direction leaves open: a parameter's name, or a step of several together."""
+    """Return an unidentifiable direction: the name of a parameter, or a step of several."""
     names = list(direction["parameters"])
     return names[0] if len(names) == 1 else direction["words"]
 

@@ -1,4 +1,4 @@
-"""`jaxtank compare`: what a paper prints beside what is measured here, with a verdict."""
+"""`jaxtank compare`: published and measured numbers side by side, with a verdict."""
 
 import textwrap
 from collections import Counter
@@ -31,7 +31,7 @@ VERDICTS = {
     IMPOSSIBLE: "cannot be measured: the row says what is missing",
     INPUT: "a number that our case has from the paper: no evidence",
 }
-"""{verdict of a row: what it means}."""
+"""{verdict of a row: its meaning}."""
 SAME = 1e-9
 """Relative difference [-] below which a number was not measured: it is the printed one, set."""
 

@@ -1,4 +1,4 @@
-"""What is proved of the levels of a case: the tables of its safety filter."""
+"""Proved limits on the levels of a case: the tables of its safety filter."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ PROMISE = (
     "on any plant with parameters in the case's intervals, under any controller, while each reading"
     " is within its noise band and no fault takes a parameter out of its interval"
 )
-"""Hypotheses of what is proved, but for the start."""
+"""Hypotheses of the proofs, without the start."""
 
 
 def start_of(starts):
@@ -72,7 +72,7 @@ def table_of(case, rows):
 
 
 def sentences(case):
-    """Return what the table of `certificates` is about."""
+    """Return sentences that explain the table of `certificates`."""
     length = local("cm", case.loop.units)
     start = ", ".join(f"{h:.4g}" for h in np.asarray(case.loop.x0, dtype=float))
     on = "on" if case.loop.safety_filter is not None else "off: --safety-filter turns it on"

@@ -61,7 +61,7 @@ def entries(measure, value):
         return numbers(values)
     if np.all(values == values[0]):
         return f"{numbers(values[0])} (each of {len(values)})"
-    # what is undefined first
+    # undefined values first
     worse = spec.sense * np.where(np.isnan(values), spec.sense * np.inf, values)
     order = np.argsort(-worse, kind="stable")
     worst = ", ".join(f"{numbers(values[i])} ({spec.per} {i + 1})" for i in order[:4])

@@ -25,7 +25,7 @@ MOST = 6
 """Number of cases in one picture: each has a different colour."""
 
 PARTS = {"plant": "plant", "reference": "setpoints", "actuator": "pumps", "x0": "start"}
-"""{part of a loop in which cases may differ: what it is called}."""
+"""{part of a loop in which cases may differ: its name}."""
 
 SHARED = {"disturbance": "disturbances", "faults": "faults", "sensor": "sensor"}
 """The same of the parts that all cases have from the first."""
@@ -72,7 +72,7 @@ def _check(cases):
 
 
 def _sizes(case):
-    """What must be the same in all cases, in words."""
+    """Conditions that are the same in all cases, in words."""
     plant, (length, drive) = case.loop.plant, case.loop.units
     return [
         count(plant.tanks, "tank"),

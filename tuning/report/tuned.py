@@ -110,7 +110,7 @@ def verdict(result):
 
 
 def report(result, page=False):
-    """Return the Report of a TuningResult; `page`: with what a terminal does not show."""
+    """Return the Report of a TuningResult; `page`: with the sections of an HTML page."""
     answer, notes = result.answer, [m.text for m in result.messages]
     head = f"{result.tuned.name}: {verdict(result)} ({_effort(result)})"
     sections = sections_of(result) if answer is None else of_answer(answer, result)
@@ -136,7 +136,7 @@ def report(result, page=False):
 
 
 def _effort(result):
-    """What a search took, in words."""
+    """The effort of a search, in words."""
     counts, time = result.evaluations, f"{result.wall_s:.1f} s"
     if result.answer is not None:
         return time
@@ -152,7 +152,7 @@ def cost_unit(result):
 
 
 def _facts(result):
-    """(name, value) of what stands at the top of the page."""
+    """Return (name, value) of the facts at the top of the page."""
     unit, answer, limits = cost_unit(result).replace("-", ""), result.answer, result.constraints
     before, after = (result.objective[side] for side in SIDES)
     broken = sum(c["margin"] < 0 for c in limits)
@@ -205,7 +205,7 @@ def answer_text(answer):
 
 
 def _values(result, answer):
-    """The table of what to set."""
+    """The table of the new values: gains and safety filter."""
     rows = []
     for name, p in result.parameters.items():
         remark = f"at its {p['at_bound']} bound" if p["at_bound"] else ""
@@ -224,7 +224,7 @@ def _values(result, answer):
 
 
 def _effects(answer, gap):
-    """The table of what the answer gives, before and after, on the plants that judged it."""
+    """The table of the performance before and after, on the validation plants."""
     loop, terms = answer.setting.case.loop, answer.setting.objective
     sides = [side for side in (answer.before, answer.after) if side is not None]
     unit, n, rows = loop.units[0], answer.before.samples, []
@@ -292,7 +292,7 @@ def sections_of(result):
 
 
 def _rims(result):
-    """What happens at the rims, in words."""
+    """Treatment of overflow in the simulation, in words."""
     if result.tuned.loop.plant.overflow:
         return "overflow is simulated: liquid above a rim leaves its tank"
     if not any(limit["measure"] == "max_level" for limit in result.constraints):
@@ -547,7 +547,7 @@ def figures(result, runs=None):
         size = (6.4, 1.4 + 0.62 * len(runs) * loop.plant.pumps)
         strips = lambda ax: diagnostics.saturation(ax, runs, low, high)
         drawings["saturation"] = picture(strips, size, legend=2)
-    observed = f"{name}, tuned: what its observer estimated"
+    observed = f"{name}, tuned: estimates of the observer"
     drawings |= estimates(loop, result.tuned.clock, runs["after"], observed)
     if result.cloud is not None and len(result.cloud["objective"]):
         drawings["clouds"] = _clouds(result, unit)

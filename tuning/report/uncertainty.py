@@ -119,7 +119,7 @@ def report(ensemble):
 
 
 def _facts(ensemble, violations):
-    """(name, value) of what stands at the top of the page."""
+    """Return (name, value) of the facts at the top of the page."""
     facts, error = [("draws", ensemble.samples)], ensemble.summary().get("rms_error_total")
     if violations:
         worst = max(v["probability"] for v in violations)

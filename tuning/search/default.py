@@ -23,7 +23,7 @@ from tuning.search.solve import Plan, Solution, Stages
 CHECKED = 256  # plants that are looked at
 
 SEED = 20_011
-"""Of these plants and their noise, whatever the seed of a search, so that limits bind alike."""
+"""Seed of these plants and their noise, for any seed of a search: the same limits are active."""
 
 ADDED = 8  # validation plants that are added to the plants of the search
 WORST = 2  # of each limit, the plants that come nearest to it are added, as many as this
@@ -140,7 +140,7 @@ def problem_of(
 
 @dataclasses.dataclass
 class Task:
-    """What was asked for, and what stays the same from one search to the next."""
+    """The request of the user, and data that all searches share."""
 
     free: Any
     plan: Plan
@@ -152,7 +152,7 @@ class Task:
     last: dict[str, Any] | None = None
 
     def report(self, unit: str | None) -> Callable:
-        """Return what a Search calls after every evaluation; unit : of the cost, None: unknown."""
+        """Return the callback of a Search after each evaluation; unit : of the cost, or None."""
 
         def progress(event):
             self.last = event | {"stage": self.stage}
@@ -161,7 +161,7 @@ class Task:
         return reporter(progress if self.progress else None, self.plan.starts, unit)
 
     def enter(self, stage: str) -> None:
-        """Report what is done next, where no evaluation reports it; not before the first one."""
+        """Report the next stage before its first evaluation; nothing before the first stage."""
         self.stage = stage
         if self.progress is not None and self.last is not None:
             self.progress(self.last | {"stage": stage})
@@ -169,7 +169,7 @@ class Task:
 
 @dataclasses.dataclass
 class Attempt:
-    """A search on plants, and how its answer does on validation plants."""
+    """A search on plants, and the result on validation plants."""
 
     setting: Setting
     solution: Solution = dataclasses.field(default_factory=Solution)

@@ -1,4 +1,4 @@
-"""What is computed about an answer: sensitivity, curvature, symmetry, length of the steps."""
+"""Diagnostics of an answer: sensitivity, curvature, symmetry, length of the steps."""
 
 import functools
 import math

@@ -176,7 +176,7 @@ def _variant(case, values, kinds, free):
 
 
 def _free_of(case, free):
-    """Return what is free with another controller: of `free` what it has, else its own gains."""
+    """Return the free parameters of a new controller: the ones in `free`, else its gains."""
     present = {name: spec for name, spec in free.items() if rig.has(case.loop, name)}
     if any(name.startswith("controller.") for name in present):
         return present

@@ -157,7 +157,7 @@ class CoarseSearch(Search):
 
 
 def reporter(progress: Callable | None, starts: int, unit: str | None = None) -> Callable:
-    """Return what a Search calls after every evaluation: `progress` with a dict."""
+    """Return the callback of a Search after each evaluation: `progress` with a dict."""
 
     def report(search: Search) -> None:
         if progress is None or not search.history:

@@ -1,4 +1,4 @@
-"""How a set of gains does on plants that no search has used, at the case's own step."""
+"""Performance of a set of gains on validation plants, at the step of the case."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -106,7 +106,7 @@ class Judged(Shown):
     limits : the Limits; measures : {name: (N, ...)}.  unit : of length.
     nominal : {name: value} of the nominal plant without noise: the measures above and NOMINAL; None
         where the case states noise, or that run diverged.
-    runs : what the N runs are, in words: plants, or one plant with new noise.
+    runs : name of the N runs: plants, or one plant with new noise.
     """
 
     cost: np.ndarray
@@ -302,7 +302,7 @@ class Answer(Shown):
 
     Parameters
     ----------
-    setting : what was searched: noise, plants, cost, safety filter.
+    setting : plants, noise, cost and safety filter of the search.
     before, after : the case as given and the tuned case on the same validation plants.
     nominal : {"before", "after": total rms error of the case's own run, without noise}.
     kept : {parameter: True where it stays at its start}.
@@ -357,7 +357,7 @@ class Answer(Shown):
 
     @property
     def sides(self) -> dict[str, Judged]:
-        """What was judged, {"before", "after"}."""
+        """{"before", "after": Judged}, without those that are None."""
         sides = {"before": self.before, "after": self.after}
         return {name: side for name, side in sides.items() if side is not None}
 
@@ -378,7 +378,7 @@ class Answer(Shown):
         }
 
     def to_json(self) -> dict[str, Any]:
-        """Return what the JSON of a result says of its plants, its noise and its safety filter."""
+        """Return the JSON entries for plants, noise and safety filter."""
         return clean(
             {
                 "noise": self.setting.noise,

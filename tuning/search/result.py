@@ -27,7 +27,7 @@ class Message:
     code : kebab-case word that does not change between versions; `tuning.search.messages` lists
         them all, for example "parameter-at-bound", "not-converged", "limit-active".
     text : the sentence that is printed.
-    headline : a few words beside the status, where the finding changes what the status is worth.
+    headline : a few words instead of the status, if the finding changes its meaning.
 
     Examples
     --------
@@ -145,7 +145,7 @@ class Lost:
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
 class TuningResult(Result):
-    """What `tune` found: print it for tables, `.plot()` for pictures, `.save(dir)` for files.
+    """The result of `tune`: print it for tables, `.plot()` for pictures, `.save(dir)` for files.
 
     Parameters
     ----------
@@ -227,7 +227,7 @@ class TuningResult(Result):
 
     @property
     def headline(self) -> str:
-        """The status, with the findings that change what it is worth."""
+        """The status, with the findings that change its meaning."""
         return ", ".join([self.status, *(m.headline for m in self.messages if m.headline)])
 
     @property

@@ -164,7 +164,7 @@ def tune_robust(
         result = tune(problem, inner, **options)
         judge = Problem(case, free, objective, limits, None, seed)
         run = functools.partial(_run, distributions, limits, fresh, seed, engine)
-        # what is certified is the case's own run, what the answer is judged by is its scenarios
+        # the certificate is for the run of the case, the answer is judged on its scenarios
         summary = cloud = None
         if case.scenarios:
             broken = int(run(result.tuned, ())[1].sum())

@@ -1,5 +1,5 @@
-"""What follows the search of a default answer: every gain that may stays where it was, and gains
-that make the linearised loop fragile are moved back.
+"""After the search of a default answer: gains return to their start where the cost allows it, and
+gains with too high a sensitivity peak of the linearised loop move back.
 """
 
 from typing import Any

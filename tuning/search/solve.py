@@ -53,7 +53,7 @@ POLISHED = 1e-12  # tolerance of the last search, from the best point [-]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What `solve` does."""
+    """Plan of `solve`: numbers of starts, points and iterations."""
 
     method: str
     starts: int
@@ -94,7 +94,7 @@ class Solution:
     least: bool = False  # whether the search for the least violation came to its end
     ended: bool = False  # whether the search that gave the answer converged, and so it stayed
     confirmed: bool = False  # whether it converged, and two agree or evolution found nothing better
-    probe: dict[str, int] | None = None  # what evolution found, see TuningResult
+    probe: dict[str, int] | None = None  # result of differential evolution, see TuningResult
     change: Any = None  # (P,) percent of the cost by 10 % of each parameter
     idle: Any = None  # (P,) True for parameters that no run exercises
     curvature: dict[str, Any] | None = None

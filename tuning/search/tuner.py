@@ -333,7 +333,7 @@ def _result(
     steps: list[str],
     **parts: Any,
 ) -> TuningResult:
-    """Return the TuningResult of a search; steps : what is wrong with the step of the answer."""
+    """Return the TuningResult of a search; steps : problems with the step size of the answer."""
     result = TuningResult(
         parameters=_parameters(evaluator, solution, values),
         evaluations={
@@ -455,7 +455,7 @@ def _unfiltered(setting: Setting) -> Setting:
 def _answer(
     attempt: Attempt, problem: Problem, before: Judged, values: Mapping[str, float]
 ) -> Answer:
-    """Return the Answer: what was judged, on which plants, and the case's own run."""
+    """Return the Answer: the judged cases, the validation plants, and the run of the case."""
     setting, solution, after = attempt.setting, attempt.solution, attempt.after
     start, case = problem.own_values(), setting.case
     nominal = {

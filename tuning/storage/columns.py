@@ -99,7 +99,7 @@ def column(
     values = np.empty(int(np.sum(where)), table[name].dtype) if out is None else out
     end = 0
     for rows in row_blocks(len(where)):
-        block = table[name][rows]  # looked up anew: what was read before need not stay in memory
+        block = table[name][rows]  # a new lookup, so that earlier rows need not stay in memory
         part = block.reshape(len(block), -1)[where[rows], entry]
         values[end : end + len(part)] = part
         end += len(part)

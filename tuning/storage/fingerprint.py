@@ -1,4 +1,4 @@
-"""What two runs must share for one to continue the other, as plain JSON; and digests of data."""
+"""Fingerprint of a run as plain JSON: equal for runs that may continue each other; digests."""
 
 import dataclasses
 import hashlib
@@ -29,7 +29,7 @@ def digest(*parts: Any) -> str:
 
 
 def fingerprint(case: Case, **what: Any) -> dict[str, Any]:
-    """Return what two runs must share for one to continue the other, to the same bits."""
+    """Return the fingerprint: equal if one run may continue the other to the same bits."""
     leaves, structure = jax.tree.flatten(case.loop)
     return {
         "case": case.name,

@@ -34,7 +34,7 @@ def hold(folder, leaving: Callable = contextlib.nullcontext):
     opened, file = [], None
 
     def release():
-        """What is done where a signal ends the process."""
+        """Release the folder if a signal ends the process."""
         if file is not None:
             sweep(folder)
         # without one of ours, a file that was made and not yet locked

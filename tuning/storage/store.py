@@ -16,7 +16,7 @@ from tuning.storage.fingerprint import digest
 
 NAME = "checkpoint.sqlite3"
 
-FORMAT = 4  # version of what is written; another one is refused
+FORMAT = 4  # version of the file format; other versions are refused
 
 LARGEST_FILE, LARGEST = 1 << 40, 1 << 28  # file and record that are read [bytes]
 
@@ -212,7 +212,7 @@ def _to_json(value: Any) -> dict[str, Any]:
 
 
 def _from_json(entry: Any) -> Any:
-    """Return what `_to_json` was given."""
+    """Inverse of `_to_json`."""
     if "of" in entry:
         return {k: _from_json(v) for k, v in entry["of"].items()}
     if "all" in entry:

@@ -91,7 +91,7 @@ def batch_runner(case, names, seed, devices, cluster):
 
 
 def batches(text, names, seed, inputs):
-    """Return what `run_batch` gives for the case of `sent` and each of `inputs`; a task."""
+    """Return the results of `run_batch` for the case of `sent` and each of `inputs`; a task."""
     return [run_batch(received(text), names, seed, *batch) for batch in inputs]
 
 

@@ -84,7 +84,7 @@ def _check_names(loop, name, distribution, taken):
 
 
 def _labels(name, distribution, nominal):
-    """What the probabilities of a distribution move: a parameter, or entries of it."""
+    """Target of a distribution: a parameter, or entries of it."""
     if nominal.ndim == 0 or distribution.tied:
         return [name]
     return [f"{name}[{','.join(map(str, i))}]" for i in np.argwhere(_moves(distribution, nominal))]

@@ -23,7 +23,7 @@ QUANTITIES = ("mean", "mean_interval95", "sd", "p05", "p50", "p95", "cvar95", "m
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
 class Ensemble(Result):
-    """N draws of what is uncertain in a case, and the measures of each; made by `tuning.ensemble`.
+    """Result of `tuning.ensemble`: N draws of the uncertain parameters, and the measures of each.
 
     Attributes
     ----------

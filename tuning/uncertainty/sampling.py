@@ -60,7 +60,7 @@ class Points:
 
 
 def spread_of(case, share=None):
-    """Return {name: distribution} of what a case calls uncertain."""
+    """Return {name: distribution} of the uncertain parameters of a case."""
     if not case.uncertain and case.covariance is None:
         raise InputError(
             f"{case.name} names nothing uncertain: say what varies with --vary NAME=DISTRIBUTION"

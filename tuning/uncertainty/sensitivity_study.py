@@ -80,7 +80,7 @@ def sensitivity(
     ----------
     case : Case
     distributions : dict or None
-        {dotted name: distribution}; what the case calls uncertain where None.
+        {dotted name: distribution}; by default the uncertain parameters of the case.
     method : {"local", "morris", "sobol"}
         "local": derivative at the case's own values times half-width of the distribution;
         "morris": elementary effects over `samples` (32) trajectories, samples (D + 1) runs;

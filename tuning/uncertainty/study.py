@@ -1,4 +1,4 @@
-"""Run a case on many draws of what is uncertain: fixed-size batches, running measures only."""
+"""Run a case on many draws of uncertain parameters: fixed-size batches, running measures."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -53,7 +53,7 @@ def ensemble(
     resume: bool = False,
     progress: Callable | None = None,
 ) -> Ensemble:
-    """Run a case on `samples` draws of what is uncertain.
+    """Run a case on `samples` draws of its uncertain parameters.
 
     The numbers of a draw do not depend on batches, devices or processes. Under `jax.distributed`
     every process runs its share of the batches and all get the whole.
@@ -186,7 +186,7 @@ def _tank_bottoms(case):
 
 
 def _shapes(case, names, batch):
-    """{name: shape} of what a batch holds."""
+    """{name: shape} of the arrays of a batch."""
     entries = lambda m: ms.entries(m, case.loop.plant)
     shapes = {m: () if ms.MEASURES[m].per == "run" else (entries(m),) for m in names}
     return {name: (batch, *shape) for name, shape in shapes.items()} | {"failed": (batch,)}

@@ -49,7 +49,7 @@ COMMANDS = {
         ),
         "Write the closed loop of a case as one HTML file that needs no network: in a browser it"
         " runs again whenever a slider moves, it is tuned there, and it gives the command, the rig"
-        " file and the CSV file of what it shows.",
+        " file and the CSV file of the run.",
     )
 }
 # fmt: on

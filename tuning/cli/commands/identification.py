@@ -118,7 +118,7 @@ def _report_next(args, result, written):
 
 
 def _next_command(result, file):
-    """Return what to do with the rig that was written to `file`."""
+    """Return the next step for the rig that was written to `file`."""
     case, why = result.proposed
     if why:
         return f"jaxtank: {file}: note: --law {result.law}: {why}"
@@ -131,7 +131,7 @@ def _next_command(result, file):
 
 
 def _advice(result, free):
-    """Return what to do about parameters that are not identifiable from the data."""
+    """Return remedies for parameters that are not identifiable from the data."""
     directions = [list(d["parameters"]) for d in result.directions]
     alone = [names[0] for names in directions if len(names) == 1 and names[0] in result.parameters]
     if not free:

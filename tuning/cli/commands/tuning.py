@@ -87,7 +87,7 @@ def tune(args):
 
 
 def _task(args, case, seed) -> dict[str, Any]:
-    """What is tuned, under which limits, for which runs: keywords of `tuning.tune`."""
+    """Keywords of `tuning.tune`: free parameters, limits, objective, scenarios."""
     from jaxtank.rig import check_objective
 
     return {
