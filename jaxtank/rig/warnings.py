@@ -8,6 +8,7 @@ from jaxtank import presets
 from jaxtank.case import Case
 from jaxtank.controllers.pid import PID
 from jaxtank.core.clock import Clock
+from jaxtank.core.labels import label
 from jaxtank.core.tree import get_value, is_component, split_index, walk
 from jaxtank.loop.estimate_notes import is_unused
 from jaxtank.loop.tank_bottom import is_open
@@ -188,8 +189,8 @@ def _pumps(case):
     for j, (low, volts, high) in enumerate(rows):
         if not low <= volts <= high:
             yield (
-                f"pump {j + 1} runs at {volts:g} {drive} before t = 0, outside its limits of"
-                f" {low:g} and {high:g} {drive}"
+                f"{label(case.loop.plant, 'pump', j)} runs at {volts:g} {drive} before t = 0,"
+                f" outside its limits of {low:g} and {high:g} {drive}"
             )
 
 
@@ -214,12 +215,10 @@ def _signs(case):
             gain = float(np.asarray(part.Kc)[i])
             sign = -acts if j in part.reversed_inputs else acts
             if sign * gain < 0.0:
-                pumps = len(plant.feeds)
-                name = f"pump {j + 1}" if j < pumps else f"valve {j - pumps + 1}"
                 yield (
-                    f"controller.Kc of output {i + 1} = {gain:g}: {name}"
-                    f" {'fills' if acts > 0 else 'empties'} tank {tank + 1}, and this sign drives"
-                    " its level away from the setpoint: change the sign"
+                    f"controller.Kc of output {i + 1} = {gain:g}: {label(plant, 'pump', j)}"
+                    f" {'fills' if acts > 0 else 'empties'} {label(plant, 'tank', tank)},"
+                    " and this sign drives its level away from the setpoint: change the sign"
                 )
 
 
