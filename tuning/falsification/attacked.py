@@ -59,7 +59,8 @@ def _ends_of_box(case):
     if safety_filter is None:
         return _ends_of(case.loop, spread_of(case))
     least, most = safety_filter.least, safety_filter.most
-    names = [f.name for f in dataclasses.fields(least) if f.metadata.get("kind") == "leaf"]
+    leaves = [f.name for f in dataclasses.fields(least) if f.metadata.get("kind") == "leaf"]
+    names = [name for name in leaves if getattr(least, name) is not None]
     ends = {f"plant.{name}": (getattr(least, name), getattr(most, name)) for name in names}
     others = {n: s for n, s in case.uncertain.items() if n.split(".")[0] not in NOT_OTHERS}
     return ends | (_ends_of(case.loop, stated(others)) if others else {})

@@ -79,6 +79,8 @@ def _parameters(case, preset):
     rows += [("static", f"clock.{n}", getattr(case.clock, n), meta) for n, meta in CLOCK.items()]
     parameters = {}
     for kind, name, value, meta in rows:
+        if value is None and name.rpartition(".")[0].endswith(("plant", "model")):
+            continue  # parts that this rig does not have
         low, high = list(Free(*ranges[name]))[:2] if name in ranges else (None, None)
         parameters[name] = {
             "value": clean(value),
