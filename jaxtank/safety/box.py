@@ -32,7 +32,8 @@ NONE: Widths = MappingProxyType({})
 def box_of(plant: TankNetwork, widths: Widths) -> tuple[TankNetwork, TankNetwork]:
     """Return the plants at the lower and the upper end of a box."""
     ends: tuple[dict, dict] = ({}, {})
-    leaves = {f.name for f in dataclasses.fields(plant) if f.metadata.get("kind") == "leaf"}
+    fields = [f.name for f in dataclasses.fields(plant) if f.metadata.get("kind") == "leaf"]
+    leaves = {name for name in fields if getattr(plant, name) is not None}
     for name, width in widths.items():
         field, entry = split_index(name.removeprefix("plant."))
         if "." in field or field == "x0":
