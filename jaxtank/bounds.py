@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxtank import controllers
+from jaxtank.case import Case, Free
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import describe, get_value, split_index
 from jaxtank.loop.closed_loop import ClosedLoop
@@ -53,6 +55,58 @@ class Bound(NamedTuple):
             if self.scale == "log"
             else np.full_like(value, self.high - self.low)
         )
+
+
+WIDE = 30.0
+"""Factor by which a gain may change either way where a case names no range [-]."""
+
+GAINS: dict[type, tuple[str, ...]] = {
+    controllers.PID: ("Kc", "Ti", "Td"),
+    controllers.SplitRange: ("Kc", "Ti", "Td"),
+    controllers.StateFeedback: ("K",),
+    controllers.LQI: ("Q", "R"),
+    controllers.NGPC: ("Tp",),
+    controllers.ENMPC: ("Tp",),
+    controllers.Backstepping: ("k", "k1"),
+    controllers.TwoTankBackstepping: ("K_phi", "K_y"),
+    controllers.SlidingMode: ("surface", "ks", "phi"),
+    controllers.GPC: ("r_w",),
+    controllers.Laguerre: ("r_w", "a"),
+}
+"""Gains of a controller, which are tuned where a case does not say what is free."""
+
+
+def free_of(case: Case) -> Mapping[str, Any]:
+    """Return what is free in a case: what it names, else the gains of its controller."""
+    return case.free or gain_ranges(case.loop)
+
+
+def gain_ranges(loop: ClosedLoop) -> dict[str, Free]:
+    """Return {name: Free} of the gains of a controller, a factor WIDE either side of their values;
+    the entries of a matrix, which may have either sign, within four times the largest.
+    """
+    ranges: dict[str, Free] = {}
+    for gain in GAINS.get(type(loop.controller), ()):
+        name, value = f"controller.{gain}", getattr(loop.controller, gain)
+        if value is None:
+            continue
+        array, meta = np.asarray(value, dtype=float), describe(loop, name)
+        for index in np.ndindex(array.shape):
+            entry = f"{name}[{','.join(map(str, index))}]" if index else name
+            number = float(array[index])
+            low, high = sorted((number / WIDE, number * WIDE))
+            if array.ndim > 1:
+                high = 4.0 * float(np.abs(array).max())
+                low = -high
+            low = _rounded(low if meta["low"] is None else max(low, meta["low"]))
+            high = _rounded(high if meta["high"] is None else min(high, meta["high"]))
+            if low < high < math.inf:
+                ranges[entry] = Free(low, high, "log" if low > 0 else "linear")
+    return ranges
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.3g}")
 
 
 def bounds(loop: ClosedLoop, free: Mapping[str, Any]) -> list[Bound]:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from jaxtank import rig
-from jaxtank.bounds import bounds
+from jaxtank.bounds import bounds, free_of
 from jaxtank.case import uncertain_shares
 from jaxtank.core import VERSION
 from jaxtank.core.checks import check_whole
@@ -60,6 +60,7 @@ _KEPT = {}
 def page(case, presets=(), source=None, plants=None):
     """Return the live page of a case as the text of an HTML file; `plants` plants shown at once."""
     check_pointwise(case)
+    case = case.replace(free=dict(free_of(case)))
     bounds(case.loop, case.free)
     off, on, filtered = both(case)
     data = data_of(case, presets, source, plants)

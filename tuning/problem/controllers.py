@@ -127,7 +127,7 @@ def _rig_of(case: Case) -> Rig:
             f"controllers are chosen on rigs with as many pumps as outputs: this one has"
             f" {plant.pumps} and {len(plant.outputs)}"
         )
-    setpoint, levels, inputs = _steady(case, plant)
+    setpoint, levels, inputs = operating_point(case, plant)
     A, B, C = (np.asarray(v, dtype=float) for v in linearise(plant, levels, inputs))
     actuator: Any = case.loop.actuator
     low, high = (
@@ -141,7 +141,7 @@ def _rig_of(case: Case) -> Rig:
     return Rig(A, B, C, levels, setpoint, low, high, DEVIATION * height, EFFORT * span, slowest)
 
 
-def _steady(case: Case, plant: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def operating_point(case: Case, plant: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (setpoints, levels, inputs) of the last plateau with a steady state, or the mean."""
     plateaus = case.loop.reference.plateaus()
     if plateaus is None:

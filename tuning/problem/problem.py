@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxtank import measures as ms
-from jaxtank.bounds import Bound, bounds
+from jaxtank.bounds import Bound, bounds, free_of
 from jaxtank.case import Case, Scenario
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
@@ -139,7 +139,7 @@ class Problem:
         if risk not in RISKS:
             raise InputError(f"risk = {risk!r}: must be one of {', '.join(RISKS)}")
         objective, limits = as_measures(objective, limits)
-        parameters = bounds(case.loop, case.free if free is None else free)
+        parameters = bounds(case.loop, free_of(case) if free is None else free)
         weights = check_objective(case.objective if objective is None else objective)
         scenarios = case.scenarios if scenarios is None else scenarios
         scenarios = sc.check_scenarios(case, scenarios, [b.name for b in parameters])

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.core.tree import describe, get_value
 from jaxtank.limits import limited_levels
 from jaxtank.loop.trajectory import csv
 from tuning.problem.problem import TAIL
@@ -34,6 +35,7 @@ from tuning.report.tables import (
     units,
 )
 from tuning.search.result import Message
+from tuning.search.tuner import rule_row
 
 COSTLIEST, MANY = 5, 12
 """Scenarios in a table that would have more than MANY rows."""
@@ -70,6 +72,7 @@ def json_of(result):
         **fields(result, "method success headline message evaluations wall_s starts symmetry"),
         **fields(result, "choices optimality curvature tradeoff validation provenance"),
         "messages": [{"code": m.code, "text": m.text} for m in result.messages],
+        "rules": [{name: clean(value) for name, value in row.items()} for row in result.rules],
         "parameters": {n: {**clean(p), "interval": None} for n, p in result.parameters.items()},
         "interval_reason": "no measurements were fitted, so there is no confidence interval",
         "objective": {k: clean(result.objective[k]) for k in ("before", "after", "terms")},
@@ -194,6 +197,8 @@ def of_answer(answer, result=None):
     if result is not None:
         sections.append(_values(result, answer))
     sections.append(_effects(answer, gap=result is not None))
+    if result is not None and result.rules:
+        sections.append(_rules(result))
     if proved := [row.starts for row in answer.setting.certificates if row.certified]:
         sections.append(Text([f"proved: {PROMISE}, {start_of(proved)}"], gap=True))
     return sections
@@ -221,6 +226,32 @@ def _values(result, answer):
         rate, band = float(np.max(chosen.rate)), float(np.max(chosen.band))
         row[2:] = ["on", f"rate {rate:.3g} 1/s, noise band {band:.3g} {loop.units[0]}"]
     return Table([*rows, row], ["what to set", "was", "now", ""])
+
+
+def _rules(result):
+    """The table of tuning rules beside the answer."""
+    of = lambda values, gain: [v for n, v in values.items() if n.startswith(f"controller.{gain}[")]
+    names = [g for g in ("Kc", "Ti", "Td") if any(of(r["parameters"], g) for r in result.rules)]
+    units = {g: describe(result.case.loop, f"controller.{g}")["unit"] for g in names}
+    after, loop = result.answer.after, result.tuned.loop
+    gains = {
+        f"controller.{g}[{i}]": v
+        for g in names
+        for i, v in enumerate(np.ravel(get_value(loop, f"controller.{g}")).tolist())
+    }
+    own = rule_row("this answer", gains, after)
+    words = {True: "yes", False: "no", None: "-"}
+    rows = [
+        [
+            row["rule"],
+            *(Value(of(row["parameters"], g) or np.nan, 4) for g in names),
+            *(Value(np.nan if row[k] is None else row[k], 3) for k in ("error", "travel_percent")),
+            words[row["holds"]],
+        ]
+        for row in (own, *result.rules)
+    ]
+    head = ["tuning rules", *(f"{g} [{units[g]}]" for g in names)]
+    return Table(rows, [*head, f"error [{loop.units[0]}]", "input change [%]", "limits hold"], True)
 
 
 def _effects(answer, gap):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxtank import rig
-from jaxtank.bounds import bounds
+from jaxtank.bounds import bounds, free_of
 from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.text import shortened
@@ -165,7 +165,9 @@ def _variant(case, values, kinds, free):
         except InputError as error:
             return Variant(values, None, None, str(error))
         free = None if free is None else _free_of(case, free)
-    taken = {split_index(b.name)[0] for b in bounds(case.loop, case.free if free is None else free)}
+    taken = {
+        split_index(b.name)[0] for b in bounds(case.loop, free_of(case) if free is None else free)
+    }
     for name in rest:
         if split_index(name)[0] in taken:
             raise InputError(

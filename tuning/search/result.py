@@ -180,6 +180,8 @@ class TuningResult(Result):
     certificate : violation probability on new plants (`tune_robust`), where asked.
     slopes : {"start", "answer": SlopeCheck} whether runs beside these points bear the exact slopes
         out; an answer whose slope they contradict is not converged.
+    rules : of a PI or PID controller, what tuning rules give on the plants of the answer: one dict
+        for each rule, {"rule", "parameters": {name: value}, "error" [unit of length], "holds"}.
     answer : the `tuning.Answer` of a default answer: its plants, noise and safety filter.
 
     Examples
@@ -215,6 +217,7 @@ class TuningResult(Result):
     tradeoff: Any = None
     certificate: Any = None
     answer: Any = None
+    rules: tuple[dict[str, Any], ...] = ()
     lost: tuple[Lost, ...] = ()
     probe: dict[str, int] | None = None
     slopes: Mapping[str, SlopeCheck] = dataclasses.field(default_factory=dict)

@@ -1,5 +1,6 @@
 """tune: the default answer, or the optimum of a stated problem."""
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -9,9 +10,10 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.case import Case
+from jaxtank.bounds import WIDE
+from jaxtank.case import Case, Free
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import with_values
+from jaxtank.core.tree import get_value, with_values
 from jaxtank.limits import limited_levels, resolve_limits
 from jaxtank.loop import run as lp
 from tuning.cluster.ahead import check_sent
@@ -28,8 +30,10 @@ from tuning.problem.reported import (
     run_measures,
     table_of,
 )
+from tuning.problem.rules import RULES, rule_gains, serves
 from tuning.problem.scenarios import noisy, runs_of
 from tuning.problem.slopes import check_slopes
+from tuning.problem.status import Status
 from tuning.search import diagnostics
 from tuning.search.default import Attempt, Task, attempts, values_of
 from tuning.search.driver import named_optimality
@@ -298,6 +302,9 @@ def _default_answer(
     answer = _answer(attempt, problem, before, values)
     solution.least = True  # of the limits on plants that judged
     first = solution.search.point(problem.start()) if solution.search is not None else None
+    rules = ()
+    if not solution.interrupted:
+        rules = rule_rows(setting, samples, seed, round_=attempt.number)
     summary, cloud = _validation(answer)
     sides = {"before": first, "after": solution.point}
     result = _result(
@@ -320,9 +327,140 @@ def _default_answer(
         cloud=cloud,
         lost=answer.lost,
         answer=answer,
+        rules=rules,
     )
     log.close()
     return result
+
+
+def rule_rows(
+    setting: Setting, samples: int, seed: int, round_: int = 0
+) -> tuple[dict[str, Any], ...]:
+    """Return what each tuning rule gives on validation plants, () of another controller."""
+    rows: list[dict[str, Any]] = []
+    for rule in RULES if serves(setting.case) else ():
+        why, judged = "", None
+        gains: dict[str, float] = {}
+        try:
+            gains = rule_gains(setting.case, rule)
+            judged = judge(_with_gains(setting, gains), samples, seed, round_)
+        except InputError as error:
+            why = str(error)
+        rows.append(rule_row(rule, gains, judged) | {"why": why})
+    return tuple(rows)
+
+
+def rule_row(rule: str, gains: Mapping[str, float], judged: Judged | None) -> dict[str, Any]:
+    """Return a row of `TuningResult.rules`; judged : None where a rule has no gains."""
+    means = {} if judged is None else judged.to_json()
+    return {
+        "rule": rule,
+        "parameters": gains,
+        "error": means.get("error"),
+        "holds": None if judged is None else bool(judged.held.all()),
+        "objective": means.get("objective"),
+        "travel_percent": means.get("travel_percent"),
+    }
+
+
+def _with_gains(setting: Setting, gains: Mapping[str, float]) -> Setting:
+    loop = with_values(setting.searched.loop, gains)
+    return setting.replace(searched=setting.searched.replace(loop=loop))
+
+
+def tune_by_rule(
+    case: Case,
+    rule: str,
+    *,
+    objective: Any = None,
+    limits: Any = None,
+    distributions: Mapping[str, Any] | None = None,
+    safety_filter: bool | None = None,
+    validation: int = FRESH,
+    seed: int = 0,
+) -> TuningResult:
+    """Return the gains of a tuning rule for a PI or PID controller, judged like an answer.
+
+    Parameters
+    ----------
+    case : Case with a controller of kind p, pi, pid or split-range.
+    rule : "simc", "lambda", "ziegler-nichols", "amigo" or "relay", from the plant linearised at
+        the last setpoint (or a simulated relay experiment) with the dead time of its actuator.
+    objective, limits, distributions, safety_filter, seed : as in `tune`.
+    validation : plants that judge the gains.
+
+    Returns
+    -------
+    TuningResult
+
+    Raises
+    ------
+    InputError : for another controller or rule, and a plant for which the rule has no gains.
+
+    Examples
+    --------
+    >>> import jax
+    >>> from jaxtank import presets
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> result = tune_by_rule(presets.find("cascaded/pi"), "simc", validation=8)
+    >>> round(result["controller.Kc[0]"].after, 2)
+    0.31
+    """
+    began = time.perf_counter()
+    check_precision()
+    objective, limits = as_measures(objective, limits)
+    if safety_filter and not case.safety:
+        case = case.without_safety_filter()
+    setting = setting_of(case, objective, limits, distributions)
+    if safety_filter is False:
+        setting = setting.without_filter()
+    gains = rule_gains(case, rule)
+    ranges = {
+        name: Free(*_around(get_value(case.loop, name), gain)) for name, gain in gains.items()
+    }
+    stated = setting.searched, ranges, setting.objective, setting.case.limits
+    evaluator = Evaluator(Problem(*stated, None, seed))
+    before = judge(_unfiltered(setting), validation, seed)
+    after = judge(_with_gains(setting, gains), validation, seed)
+    near = matters(setting, after, NEAR)
+    if safety_filter or (safety_filter is None and near.any()):
+        setting = setting.with_filter(near)
+        after = judge(_with_gains(setting, gains), validation, seed)
+    attempt = Attempt(setting, evaluator=evaluator, after=after)
+    answer = _answer(attempt, evaluator.problem, before, gains)
+    status = Status.CONVERGED if answer.held else Status.INFEASIBLE
+    summary, cloud = _validation(answer)
+    return _result(
+        evaluator,
+        attempt.solution,
+        gains,
+        began,
+        diagnostics.step_warnings(setting.tuned(gains), gains),
+        case=setting.case,
+        tuned=setting.tuned(gains),
+        method=f"rule {rule}",
+        status=Status.NOT_CONVERGED if answer.held and answer.lost else status,
+        objective={"before": _mean(before), "after": _mean(after)}
+        | {"terms": dict(setting.objective)},
+        measures=dict(answer.measures),
+        tables={"before": [], "after": []},
+        constraints=_rows(answer),
+        symmetry=None,
+        validation=summary,
+        cloud=cloud,
+        lost=answer.lost,
+        answer=answer,
+    )
+
+
+def _around(*values: Any) -> tuple[float, float, str]:
+    """A range, as of `Free`, that holds two gains of either sign."""
+    sizes = [abs(float(v)) for v in values if float(v)]
+    low, high = min(sizes) / WIDE, max(sizes) * WIDE
+    signs = {math.copysign(1.0, float(v)) for v in values if float(v)}
+    if len(signs) == 2:
+        return -high, high, "linear"
+    return (low, high, "log") if signs == {1.0} else (-high, -low, "linear")
 
 
 def _result(

@@ -11,7 +11,7 @@ from jaxtank import controllers, rig
 from jaxtank.core.errors import InputError
 from jaxtank.loop.steady import steady_state
 from jaxtank.plants import network
-from tests.helpers import assert_same_case, command
+from helpers import assert_same_case, command
 
 ONE = """
 units = ["m", "-"]

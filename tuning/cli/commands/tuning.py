@@ -67,6 +67,11 @@ def tune(args):
     from tuning.report import tables
 
     task, sweep = _task(args, case, seed), args.tradeoff
+    if args.rule is not None:
+        result = _ruled(args, case, task)
+        written = finish(result, args)
+        report_unreachable(result.tuned, written, args)
+        return EXIT[result.status]
     if sweep:  # before the long search
         _check_tradeoff(case, task, sweep)
     finder, case, own, mended = _finder(args, case, task)
@@ -84,6 +89,37 @@ def tune(args):
     if not args.out and not args.json and not args.quiet:
         print("Add --out DIR for the tuned rig, the trajectory and pictures.", file=sys.stderr)
     return progress.code if progress.stop else EXIT[result.status]
+
+
+def _ruled(args, case, task):
+    """The gains of a tuning rule, judged like an answer."""
+    others = {
+        "--nominal": args.nominal,
+        "--robust": args.robust,
+        "--mend": args.mend,
+        "--free": args.free,
+        "--starts": args.starts,
+        "--iterations": args.iterations,
+        "--resume": args.resumed,
+    }
+    option = _goes_with_nominal(args) or next((n for n, v in others.items() if v), None)
+    if option:
+        raise InputError(
+            f"--rule {args.rule}: computes gains and searches none: leave out {option}"
+        )
+    from tuning.search.judged import FRESH
+    from tuning.search.tuner import tune_by_rule
+
+    return tune_by_rule(
+        case,
+        args.rule,
+        objective=task["objective"],
+        limits=task["limits"],
+        distributions=_varied(args, case),
+        safety_filter=args.safety_filter,
+        validation=FRESH if args.validation is None else args.validation,
+        seed=task["seed"],
+    )
 
 
 def _task(args, case, seed) -> dict[str, Any]:
@@ -262,6 +298,9 @@ PROBLEM = (
     Option("--nominal", help="the optimum of the unchanged case: its objective, its run or"
            " scenarios; no noise, plants or filter are added; implied by --scenario,"
            " --method, --screening, --batch, --choose, --tradeoff, --bound", kind="flag"),
+    Option("--rule", "NAME", "no search: the gains of a tuning rule for a PI or PID controller,"
+           " judged like an answer (simc, lambda, ziegler-nichols, amigo, relay)",
+           choices=("simc", "lambda", "ziegler-nichols", "amigo", "relay")),
     Option("--tradeoff", "MEASURE=LOW:HIGH[:N]", "also: the best objective for N (6) values of one"
            " limit", values.tradeoff),
     Option("--bound", help="also: the best open-loop inputs found, with perfect information",

@@ -1,0 +1,372 @@
+"""Tuning rules of PI and PID controllers, from the linearised plant or a relay experiment.
+
+SIMC: Skogestad, J. Process Control 13 (2003). AMIGO: Astrom and Hagglund, Advanced PID Control
+(2006), ch. 7. Lambda: Dahlin (1968), integrating form by Chien and Fruehauf (1990). Ziegler and
+Nichols (1942), ultimate cycle. Relay: Astrom and Hagglund, Automatica 20 (1984), with the gains of
+Tyreus and Luyben (1992), made for levels.
+"""
+
+# the linear models of jaxtank.analysis have no types
+# pyright: reportUnknownMemberType=false
+# pyright: reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy  # its parts are imported when they are first used
+
+import jaxtank
+from jaxtank.analysis.frequency import OpenLoop
+from jaxtank.analysis.linear_model import linearise, transmission_zeros
+from jaxtank.analysis.margins import Margins, margins
+from jaxtank.case import Case
+from jaxtank.controllers import PID, Controller, SplitRange
+from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.records import Estimate, Tick
+from jaxtank.core.tree import component, leaf, static
+from jaxtank.signals.setpoints import ramps
+from tuning.problem.controllers import operating_point
+
+CYCLES = 12
+"""Periods of the ultimate cycle that a relay experiment runs for; the last half of them counts."""
+
+EXCURSION = 0.2
+"""Amplitude of the level in a relay experiment, as a share of its distance to bottom and rim."""
+
+REFERENCE_GAIN = 0.02
+"""Gain of a loop, in 1/(initial slope times dead time), at which its margins are computed: far
+below the ultimate gain, so that the loop is stable [-]."""
+
+
+class Process(NamedTuple):
+    """A loop's process as gain exp(-delay s)/((s + 1/lag) (second s + 1)); lag is inf where it
+    integrates.
+    """
+
+    gain: float  # initial slope of the level for a unit of the input [cm/(s V)]
+    lag: float  # [s]
+    second: float  # [s]
+    delay: float  # [s]
+
+
+class Ultimate(NamedTuple):
+    """Where a proportional controller brings a loop to the edge of its stability."""
+
+    gain: float  # Ku [V/cm]
+    period: float  # Pu [s]
+
+
+class Loop(NamedTuple):
+    """The linear model of one loop of a PID: x' = A x + b v, level c x, with all dead time."""
+
+    A: np.ndarray
+    b: np.ndarray
+    c: np.ndarray
+    lag: float  # of its actuator [s]
+    delay: float  # of its actuator [s]
+    dt: float
+
+
+def loop_of(case: Case, output: int) -> Loop:
+    """Return the linear model of the loop of an output at the last plateau, other loops open."""
+    controller, bank, plant = case.loop.controller, case.loop.actuator, case.loop.plant
+    assert isinstance(controller, PID)
+    _, levels, inputs = operating_point(case, plant)
+    A, B, C = (np.asarray(v, dtype=float) for v in linearise(plant, levels, inputs))
+    b, own = B[:, output] if not isinstance(controller, SplitRange) else None, (output,)
+    if isinstance(controller, SplitRange):
+        own, v = controller.inputs_of(output), jnp.asarray(controller.total(inputs))
+        share: Callable[..., Any] = controller.shared
+        b = B @ np.asarray(jax.jacfwd(lambda v: jnp.stack(share(v)))(v))[:, output]
+    lags = np.broadcast_to(0.0 if bank.lag is None else np.asarray(bank.lag), plant.pumps)
+    lag = float(max(lags[j] for j in own))
+    return Loop(A, np.asarray(b), C[output], lag, float(bank.delay), case.clock.dt)
+
+
+def process_of(loop: Loop, order: int) -> Process:
+    """Return the Process of a loop with one time constant (order 1) or two, by the half rule."""
+    zeros, poles = _reduced(loop)
+    gain = _initial_slope(loop)
+    for zero in zeros:
+        gain *= abs(zero)
+    # the slowest pole is the process's own lag; it stays in the initial slope
+    lags = sorted((math.inf if p == 0.0 else 1.0 / abs(p) for p in poles), reverse=True)
+    for lag in lags[1:]:
+        gain *= lag if math.isfinite(lag) else 1.0
+    delay = loop.delay + 0.5 * loop.dt
+    for zero in zeros:
+        time = 1.0 / abs(zero)
+        if zero > 0.0:  # an inverse response counts as dead time
+            delay += time
+            continue
+        near = min(range(len(lags)), key=lambda k: abs(math.log(min(lags[k], 1e9 * time) / time)))
+        slow = lags.pop(near)
+        if near == 0:  # what is left responds with the next lag
+            gain *= time / (lags[0] if math.isfinite(slow) else 1.0)
+        else:
+            gain *= time / slow
+    lags = sorted([*lags, *([loop.lag] if loop.lag else [])], reverse=True)
+    kept, rest = lags[:order], lags[order:]
+    if rest:
+        half = 0.5 * rest[0]
+        if math.isfinite(kept[-1]):
+            if order == 1:  # the steady gain stays
+                gain *= kept[0] / (kept[0] + half)
+            kept[-1] += half
+        delay += half + sum(rest[1:])
+    return Process(gain, kept[0], kept[1] if order == 2 and len(kept) == 2 else 0.0, delay)
+
+
+def _reduced(loop: Loop) -> tuple[list[float], list[float]]:
+    """(zeros, poles) [1/s] of the transfer function, without those that cancel; real parts."""
+    poles = [complex(p) for p in np.linalg.eigvals(loop.A)]
+    zeros = [complex(z) for z in transmission_zeros(loop.A, loop.b[:, None], loop.c[None])]
+    fastest = max([abs(p) for p in poles], default=0.0) or 1.0
+    left: list[complex] = []
+    for zero in zeros:
+        near = min(poles, key=lambda p: abs(p - zero), default=None)
+        if near is not None and abs(near - zero) < 1e-6 * max(abs(zero), 1e-6 * fastest):
+            poles.remove(near)
+        else:
+            left.append(zero)
+    size = lambda z: math.copysign(abs(z), z.real or -1.0)
+    small = 1e-9 * fastest
+    return [size(z) for z in left if abs(z) > small], [
+        0.0 if abs(p) <= small else size(p) for p in poles
+    ]
+
+
+def _initial_slope(loop: Loop) -> float:
+    """The first Markov parameter c A^r b that is not 0."""
+    vector, scale = loop.b, float(np.abs(loop.b).max(initial=0.0))
+    for _ in range(len(loop.A)):
+        value = float(loop.c @ vector)
+        if abs(value) > 1e-12 * scale and scale > 0.0:
+            return value
+        vector = loop.A @ vector
+        scale = float(np.abs(vector).max())
+    raise InputError("an input of the controller does not move its level")
+
+
+def ultimate_of(loop: Loop) -> Ultimate:
+    """Return the ultimate gain and period of the sampled loop, from its gain margin."""
+    process, n = process_of(loop, 1), len(loop.A)
+    block = np.zeros((n + 2, n + 2))
+    block[:n, :n], block[:n, n if loop.lag else n + 1] = loop.A, loop.b
+    if loop.lag:
+        block[n, n], block[n, n + 1] = -1.0 / loop.lag, 1.0 / loop.lag
+    held = scipy.linalg.expm(block * loop.dt)
+    size = n + bool(loop.lag)
+    gain = REFERENCE_GAIN / (process.gain * process.delay)
+    with jax.enable_x64(True):
+        edge = _margins(
+            jnp.asarray(held[:size, :size]),
+            jnp.asarray(held[:size, n + 1 :] * gain),
+            jnp.asarray(np.append(loop.c, np.zeros(size - n))[None]),
+            round(loop.delay / loop.dt),
+            loop.dt,
+        )
+    factor, frequency = float(edge.gain_margin[0]), float(edge.gain_frequency[0])
+    if not (bool(edge.stable) and 0.0 < factor < math.inf and frequency > 0.0):
+        raise InputError("the loop has no ultimate gain")
+    return Ultimate(gain * factor, 2.0 * math.pi / frequency)
+
+
+@functools.partial(jax.jit, static_argnums=(3, 4))
+def _margins(A: Any, B: Any, C: Any, dead: int, dt: float) -> Margins:
+    return margins(OpenLoop(A, B, C, dead, dt), False)
+
+
+@component
+class Relay(Controller):
+    """One input between two values by the sign of its level's error, the others constant."""
+
+    base: np.ndarray = leaf("V", "inputs at the operating point", shape="pump")
+    step_up: np.ndarray = leaf("V", "inputs added where the level is too low", shape="pump")
+    level: np.ndarray = leaf("cm", "level at which it switches")
+    tank: int = static("-", "the tank whose level it reads")
+
+    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence[Any], Any]:
+        side = jnp.where(estimate.x[self.tank] < self.level, 1.0, -1.0)
+        return tuple(b + side * s for b, s in zip(self.base, self.step_up)), state
+
+
+def relay_experiment(case: Case, output: int) -> Ultimate:
+    """Return Ku = 4 d/(pi a) and Pu of a simulated relay experiment on one loop, others open:
+    d is the amplitude of the input, a that of the level.
+    """
+    loop, plant = case.loop, case.loop.plant
+    linear = loop_of(case, output)
+    expected = ultimate_of(linear)
+    setpoint, levels, inputs = operating_point(case, plant)
+    bank: Any = loop.actuator
+    low, high = (np.broadcast_to(np.asarray(v, float), inputs.shape) for v in (bank.low, bank.high))
+    controller: Any = loop.controller
+    tank, amplitude = plant.outputs[output], np.zeros(len(inputs))
+    near = min(setpoint[output], max(float(np.asarray(plant.rim)[tank]) - setpoint[output], 0.0))
+    # with the describing function: the level then moves by EXCURSION of the way
+    most = EXCURSION * (near or setpoint[output]) * math.pi * abs(expected.gain) / 4.0
+    if isinstance(controller, SplitRange):
+        v = np.asarray(controller.total(inputs), dtype=float)
+        share: Callable[..., Any] = controller.shared
+        by_v = np.asarray(jax.jacfwd(lambda v: jnp.stack(share(v)))(jnp.asarray(v)))[:, output]
+        own = int(np.argmax(np.abs(by_v)))
+        room = 0.5 * min(high[own] - inputs[own], inputs[own] - low[own])
+        amplitude[own] = math.copysign(room, by_v[own] * expected.gain)
+        size = room / abs(by_v[own])
+        amplitude[own] *= min(1.0, most / size) if size > 0.0 else 0.0
+    else:
+        size = 0.5 * min(high[output] - inputs[output], inputs[output] - low[output])
+        amplitude[output] = math.copysign(min(size, most), expected.gain)
+    size = min(size, most)
+    if not 0.0 < size < math.inf:
+        raise InputError("a relay has no room: the input is at a limit in the steady state")
+    dt = case.clock.dt
+    duration = math.ceil(CYCLES * max(expected.period, 4.0 * dt) / dt) * dt
+    relay = Relay(base=inputs, step_up=amplitude, level=np.asarray(setpoint[output]), tank=tank)
+    quiet = dataclasses.replace(
+        loop,
+        controller=relay,
+        observer=jaxtank.observers.Direct(),
+        sensor=loop.sensor.without_noise(),
+        reference=ramps([float(v) for v in setpoint], [], ramp=0.0),
+        faults=None,
+        safety_filter=None,
+        x0=levels,
+        actuator=dataclasses.replace(bank, initial=inputs),
+    )
+    run = jaxtank.simulate(quiet, dataclasses.replace(case.clock, duration=duration))
+    level, t = np.asarray(run.x)[:, tank], np.asarray(run.t)
+    late = t >= 0.5 * duration
+    below = level < setpoint[output]
+    rising = t[1:][late[1:] & ~below[:-1] & below[1:]]
+    amplitude_of_level = 0.5 * float(np.ptp(level[late]))
+    if len(rising) < 2 or not amplitude_of_level > 0.0:
+        raise InputError("the relay makes no cycle")
+    period = float(np.mean(np.diff(rising)))
+    gain = 4.0 * size / (math.pi * amplitude_of_level)
+    return Ultimate(math.copysign(gain, expected.gain), period)
+
+
+class Gains(NamedTuple):
+    """Gains of one loop; inf and 0 where a controller has no such part."""
+
+    Kc: float
+    Ti: float = math.inf
+    Td: float = 0.0
+
+
+def simc(case: Case, output: int, parts: str) -> Gains:
+    """SIMC with tau_c = the dead time (improved SIMC, Td = theta/3, without a second lag)."""
+    process = process_of(loop_of(case, output), 2 if "d" in parts else 1)
+    theta = process.delay
+    closed = 2.0 * theta
+    Kc, Ti = 1.0 / (process.gain * closed), min(process.lag, 4.0 * closed)
+    if "d" not in parts:
+        return Gains(Kc, Ti)
+    Td = process.second or theta / 3.0
+    series = 1.0 + Td / Ti  # from the series form to the parallel one
+    return Gains(Kc * series, Ti * series, Td / series)
+
+
+def lambda_rule(case: Case, output: int, parts: str) -> Gains:
+    """A closed loop as fast as the open one; three dead times of a process that integrates."""
+    process = process_of(loop_of(case, output), 1)
+    theta, Td = process.delay, 0.5 * process.delay
+    if math.isinf(process.lag):
+        time = 3.0 * theta
+        Ti = 2.0 * time + theta
+        return Gains(Ti / (process.gain * (time + theta) ** 2), Ti, Td)
+    time = max(process.lag, 3.0 * theta)
+    return Gains(1.0 / (process.gain * (time + theta)), process.lag, Td)
+
+
+def ziegler_nichols(case: Case, output: int, parts: str) -> Gains:
+    """Of the ultimate gain and period of the linearised loop."""
+    gain, period = ultimate_of(loop_of(case, output))
+    if parts == "p":
+        return Gains(0.5 * gain)
+    if "d" in parts:
+        return Gains(0.6 * gain, 0.5 * period, 0.125 * period)
+    return Gains(0.45 * gain, period / 1.2)
+
+
+def amigo(case: Case, output: int, parts: str) -> Gains:
+    """Astrom and Hagglund's approximate M-constrained integral gain optimisation."""
+    process = process_of(loop_of(case, output), 1)
+    theta, lag = process.delay, process.lag
+    if math.isinf(lag):
+        if "d" in parts:
+            return Gains(0.45 / (process.gain * theta), 8.0 * theta, 0.5 * theta)
+        return Gains(0.35 / (process.gain * theta), 13.4 * theta)
+    steady = process.gain * lag
+    if "d" in parts:
+        return Gains(
+            (0.2 + 0.45 * lag / theta) / steady,
+            theta * (0.4 * theta + 0.8 * lag) / (theta + 0.1 * lag),
+            0.5 * theta * lag / (0.3 * theta + lag),
+        )
+    return Gains(
+        (0.15 + (0.35 - theta * lag / (theta + lag) ** 2) * lag / theta) / steady,
+        0.35 * theta + 13.0 * theta * lag**2 / (lag**2 + 12.0 * theta * lag + 7.0 * theta**2),
+    )
+
+
+def relay(case: Case, output: int, parts: str) -> Gains:
+    """Tyreus and Luyben's gains of the cycle of a simulated relay experiment."""
+    gain, period = relay_experiment(case, output)
+    if "d" in parts:
+        return Gains(gain / 2.2, 2.2 * period, period / 6.3)
+    return Gains(gain / 3.2, 2.2 * period)
+
+
+RULES: dict[str, Callable[[Case, int, str], Gains]] = {
+    "simc": simc,
+    "lambda": lambda_rule,
+    "ziegler-nichols": ziegler_nichols,
+    "amigo": amigo,
+    "relay": relay,
+}
+"""{name: rule (case, output, parts of the controller: "p", "pi" or "pid") -> Gains}."""
+
+
+def serves(case: Case) -> bool:
+    """Return whether the rules have gains for the controller of a case."""
+    controller = case.loop.controller
+    plain = isinstance(controller, PID) and controller.order is None
+    return plain and np.all(np.isfinite(1.0 if controller.Ti is None else controller.Ti))
+
+
+def rule_gains(case: Case, rule: str) -> dict[str, float]:
+    """Return {dotted name of an entry: value} of a rule for every loop of a PID."""
+    if rule not in RULES:
+        raise unknown("tuning rule", rule, RULES)
+    controller: Any = case.loop.controller
+    if not serves(case):
+        raise InputError(
+            f"rule {rule}: is for controllers p, pi, pid and split-range, and not for"
+            f" {type(controller).__name__}"
+        )
+    parts = "p" + "i" * (controller.Ti is not None) + "d" * (controller.Td is not None)
+    values: dict[str, float] = {}
+    for i in range(len(case.loop.plant.outputs)):
+        try:
+            gains = RULES[rule](case, i, parts)
+        except InputError as error:
+            raise InputError(f"rule {rule}, output {i + 1}: {error}") from None
+        numbers = {"Kc": gains.Kc, "Ti": gains.Ti, "Td": gains.Td}
+        if controller.Tt is not None and controller.Ti is not None:
+            numbers["Tt"] = math.sqrt(gains.Ti * gains.Td) if "d" in parts else gains.Ti
+        values |= {
+            f"controller.{name}[{i}]": value
+            for name, value in numbers.items()
+            if getattr(controller, name) is not None and 0.0 < abs(value) < math.inf
+        }
+    return dict(sorted(values.items(), key=lambda item: "Kc Ti Td Tt".index(item[0][11:13])))
