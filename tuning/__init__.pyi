@@ -41,6 +41,7 @@ from tuning.search.result import TuningResult as TuningResult
 from tuning.search.robust import Certificate as Certificate
 from tuning.search.robust import tune_robust as tune_robust
 from tuning.search.tuner import tune as tune
+from tuning.search.tuner import tune_by_rule as tune_by_rule
 from tuning.uncertainty.distributions import Correlated as Correlated
 from tuning.uncertainty.distributions import Discrete as Discrete
 from tuning.uncertainty.distributions import LogUniform as LogUniform

@@ -10,12 +10,13 @@ Tyreus and Luyben (1992), made for levels.
 # pyright: reportUnknownMemberType=false
 # pyright: reportUnknownVariableType=false
 # pyright: reportUnknownArgumentType=false
+# pyright: reportMissingTypeStubs=false
 
 import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -76,28 +77,38 @@ class Loop(NamedTuple):
 
 def loop_of(case: Case, output: int) -> Loop:
     """Return the linear model of the loop of an output at the last plateau, other loops open."""
-    controller, bank, plant = case.loop.controller, case.loop.actuator, case.loop.plant
-    assert isinstance(controller, PID)
+    bank, plant = cast(Any, case.loop.actuator), case.loop.plant
     _, levels, inputs = operating_point(case, plant)
     A, B, C = (np.asarray(v, dtype=float) for v in linearise(plant, levels, inputs))
-    b, own = B[:, output] if not isinstance(controller, SplitRange) else None, (output,)
-    if isinstance(controller, SplitRange):
-        own, v = controller.inputs_of(output), jnp.asarray(controller.total(inputs))
-        share: Callable[..., Any] = controller.shared
-        b = B @ np.asarray(jax.jacfwd(lambda v: jnp.stack(share(v)))(v))[:, output]
-    lags = np.broadcast_to(0.0 if bank.lag is None else np.asarray(bank.lag), plant.pumps)
-    lag = float(max(lags[j] for j in own))
-    return Loop(A, np.asarray(b), C[output], lag, float(bank.delay), case.clock.dt)
+    slopes = _slopes(case, inputs, output)
+    lags = np.broadcast_to(0.0 if bank.lag is None else np.asarray(bank.lag), slopes.shape)
+    lag = float(np.max(lags[slopes != 0.0]))
+    return Loop(A, B @ slopes, C[output], lag, float(bank.delay), case.clock.dt)
+
+
+def _slopes(case: Case, inputs: np.ndarray, output: int) -> np.ndarray:
+    """Change of the inputs (m,) for a unit of the controller's output, at inputs (m,)."""
+    controller = case.loop.controller
+    if not isinstance(controller, SplitRange):
+        return np.eye(len(inputs))[output]
+
+    def inputs_of(v: Any) -> Any:
+        return jnp.stack(controller.shared(v))
+
+    v = jnp.stack([jnp.asarray(total) for total in controller.total(inputs)])
+    return np.asarray(jax.jacfwd(inputs_of)(v))[:, output]
 
 
 def process_of(loop: Loop, order: int) -> Process:
     """Return the Process of a loop with one time constant (order 1) or two, by the half rule."""
     zeros, poles = _reduced(loop)
     gain = _initial_slope(loop)
-    for zero in zeros:
-        gain *= abs(zero)
+    for zero in zeros:  # one in the right half plane turns the sign
+        gain *= -zero
     # the slowest pole is the process's own lag; it stays in the initial slope
-    lags = sorted((math.inf if p == 0.0 else 1.0 / abs(p) for p in poles), reverse=True)
+    lags: list[float] = sorted(
+        (math.inf if p == 0.0 else 1.0 / abs(p) for p in poles), reverse=True
+    )
     for lag in lags[1:]:
         gain *= lag if math.isfinite(lag) else 1.0
     delay = loop.delay + 0.5 * loop.dt
@@ -108,10 +119,7 @@ def process_of(loop: Loop, order: int) -> Process:
             continue
         near = min(range(len(lags)), key=lambda k: abs(math.log(min(lags[k], 1e9 * time) / time)))
         slow = lags.pop(near)
-        if near == 0:  # what is left responds with the next lag
-            gain *= time / (lags[0] if math.isfinite(slow) else 1.0)
-        else:
-            gain *= time / slow
+        gain *= time / (lags[0] if near == 0 else slow)  # without the slowest, by the next lag
     lags = sorted([*lags, *([loop.lag] if loop.lag else [])], reverse=True)
     kept, rest = lags[:order], lags[order:]
     if rest:
@@ -136,7 +144,10 @@ def _reduced(loop: Loop) -> tuple[list[float], list[float]]:
             poles.remove(near)
         else:
             left.append(zero)
-    size = lambda z: math.copysign(abs(z), z.real or -1.0)
+
+    def size(z: complex) -> float:
+        return math.copysign(abs(z), z.real or -1.0)
+
     small = 1e-9 * fastest
     return [size(z) for z in left if abs(z) > small], [
         0.0 if abs(p) <= small else size(p) for p in poles
@@ -208,26 +219,16 @@ def relay_experiment(case: Case, output: int) -> Ultimate:
     setpoint, levels, inputs = operating_point(case, plant)
     bank: Any = loop.actuator
     low, high = (np.broadcast_to(np.asarray(v, float), inputs.shape) for v in (bank.low, bank.high))
-    controller: Any = loop.controller
-    tank, amplitude = plant.outputs[output], np.zeros(len(inputs))
+    slopes, tank = _slopes(case, inputs, output), plant.outputs[output]
+    acting = slopes != 0.0
+    room = 0.5 * np.min(np.minimum(high - inputs, inputs - low)[acting] / np.abs(slopes[acting]))
     near = min(setpoint[output], max(float(np.asarray(plant.rim)[tank]) - setpoint[output], 0.0))
-    # with the describing function: the level then moves by EXCURSION of the way
+    # by the describing function the level then moves by EXCURSION of the way
     most = EXCURSION * (near or setpoint[output]) * math.pi * abs(expected.gain) / 4.0
-    if isinstance(controller, SplitRange):
-        v = np.asarray(controller.total(inputs), dtype=float)
-        share: Callable[..., Any] = controller.shared
-        by_v = np.asarray(jax.jacfwd(lambda v: jnp.stack(share(v)))(jnp.asarray(v)))[:, output]
-        own = int(np.argmax(np.abs(by_v)))
-        room = 0.5 * min(high[own] - inputs[own], inputs[own] - low[own])
-        amplitude[own] = math.copysign(room, by_v[own] * expected.gain)
-        size = room / abs(by_v[own])
-        amplitude[own] *= min(1.0, most / size) if size > 0.0 else 0.0
-    else:
-        size = 0.5 * min(high[output] - inputs[output], inputs[output] - low[output])
-        amplitude[output] = math.copysign(min(size, most), expected.gain)
-    size = min(size, most)
+    size = float(min(room, most))
     if not 0.0 < size < math.inf:
         raise InputError("a relay has no room: the input is at a limit in the steady state")
+    amplitude = slopes * math.copysign(size, expected.gain)
     dt = case.clock.dt
     duration = math.ceil(CYCLES * max(expected.period, 4.0 * dt) / dt) * dt
     relay = Relay(base=inputs, step_up=amplitude, level=np.asarray(setpoint[output]), tank=tank)
@@ -340,8 +341,9 @@ RULES: dict[str, Callable[[Case, int, str], Gains]] = {
 def serves(case: Case) -> bool:
     """Return whether the rules have gains for the controller of a case."""
     controller = case.loop.controller
-    plain = isinstance(controller, PID) and controller.order is None
-    return plain and np.all(np.isfinite(1.0 if controller.Ti is None else controller.Ti))
+    if not isinstance(controller, PID) or controller.order is not None:
+        return False
+    return controller.Ti is None or bool(np.all(np.isfinite(controller.Ti)))
 
 
 def rule_gains(case: Case, rule: str) -> dict[str, float]:

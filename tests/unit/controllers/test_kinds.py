@@ -5,13 +5,13 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from helpers import assert_same_case, command
 
 import jaxtank
 from jaxtank import controllers, rig
 from jaxtank.core.errors import InputError
 from jaxtank.loop.steady import steady_state
 from jaxtank.plants import network
-from helpers import assert_same_case, command
 
 ONE = """
 units = ["m", "-"]

@@ -42,7 +42,10 @@ values = { "clock.dt" = 0.05, "clock.duration" = 50.0, "actuator.delay" = 5.0 }
 # two tanks in series, each of time constant 2 A h/q at level h with flow q
 SERIES = """
 units = ["m", "-"]
-tank = [{ area = 1.0, rim = 3.0, level = 1.0 }, { area = 0.5, rim = 3.0, level = 1.0, drain = 0.01 }]
+tank = [
+    { area = 1.0, rim = 3.0, level = 1.0 },
+    { area = 0.5, rim = 3.0, level = 1.0, drain = 0.01 },
+]
 orifice = [{ from = 1, to = 2, area = 0.01 }]
 pump = [{ gain = 0.1, to = 1, high = 1.0, initial = 0.4 }]
 plant = { gravity = 9.81, outputs = [2] }
