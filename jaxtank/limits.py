@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import label_of
 from jaxtank.loop.change_windows import windows
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.rig import check_limits
@@ -38,6 +39,7 @@ class Limit:
     value: float
     run: int = 0
     scenario: str = ""
+    name: str = ""  # of the entry's tank, pump or valve
 
     @property
     def sign(self) -> float:
@@ -46,12 +48,11 @@ class Limit:
 
     @property
     def label(self) -> str:
-        """Name with the entry, counted from 1: "max_level of tank 3", and its scenario."""
+        """Name with the entry, by name or from 1: "max_level of tank 3", and its scenario."""
         per = ms.MEASURES[self.measure].per
         where = f" in {self.scenario}" if self.scenario else ""
-        return (
-            self.measure if per == "run" else f"{self.measure} of {per} {self.index + 1}"
-        ) + where
+        entry = self.name or f"{per} {self.index + 1}"
+        return (self.measure if per == "run" else f"{self.measure} of {entry}") + where
 
     @property
     def key(self) -> tuple[str, int]:
@@ -135,6 +136,7 @@ def resolve_in(
         for measure, value in checked.items():
             value = np.asarray(loop.plant.rim) if isinstance(value, str) else value
             reason, missing = undefined(measure, case)
+            per = ms.MEASURES[measure].per
             if all(missing):
                 why.setdefault(measure, (value, reason))
                 continue
@@ -142,7 +144,8 @@ def resolve_in(
             for j, v in enumerate(values):
                 if not missing[j] and np.isfinite(v):
                     measured, at = _without_overflow(measure, j, float(v), loop.plant)
-                    resolved.append(Limit(measured, j, at, i, scenario))
+                    name = "" if per == "run" else label_of(loop.plant, per, j)
+                    resolved.append(Limit(measured, j, at, i, scenario, name))
     for measure, (value, reason) in why.items():
         if not any(limit.measure == measure for limit in resolved):
             text = ", ".join(f"{v:g}" for v in np.ravel(value))

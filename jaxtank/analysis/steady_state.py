@@ -11,6 +11,7 @@ import scipy  # its parts are imported when they are first used
 from jaxtank.analysis import elimination
 from jaxtank.core import vectors
 from jaxtank.core.errors import EquilibriumError, InputError
+from jaxtank.core.labels import label_of, labels_of
 from jaxtank.core.numerics import lower_clip, smooth_signed_sqrt, smooth_sqrt
 from jaxtank.plants import elements
 
@@ -217,7 +218,7 @@ def check_rest(plant, name):
     """Raise InputError for a network whose steady states are not unique."""
     if tanks := elements.closed_circuit(plant):
         raise EquilibriumError(
-            f"{name}: tanks {', '.join(str(i + 1) for i in tanks)} exchange nothing with the basin,"
+            f"{name}: {labels_of(plant, 'tank', tanks)} exchange nothing with the basin,"
             " so that their steady levels depend on what they hold at the start"
         )
     if plant.pumps != len(plant.outputs):
@@ -456,8 +457,8 @@ def equilibrium(
     for i, level in zip(plant.outputs, y):
         if not (np.isfinite(level) and level >= 0):
             raise InputError(
-                f"setpoint of tank {i + 1} = {level} {length}: must be a finite level at or above 0"
-                f" {length}"
+                f"setpoint of {label_of(plant, 'tank', i)} = {level} {length}: must be a finite"
+                f" level at or above 0 {length}"
             )
     at = ", ".join(f"{v:g}" for v in y)
     words = f"outputs ({at}) {length}"
@@ -472,9 +473,9 @@ def equilibrium(
     for j, volts in enumerate(u):
         if volts < low[j] - 1e-9 * max(1.0, float(np.max(np.abs(u)))):
             least = f", below its low limit of {low[j]:g} {drive}" if low[j] < 0.0 else ""
-            name = elements.input_name(plant, j)
+            name = label_of(plant, "pump", j)
             needs, unit = "run at", f" {drive}"
-            if name.startswith("valve"):
+            if j >= plant.pumps - len(plant.valves):
                 needs, unit = "open to", "" if elements.full_open(plant.units) == 1.0 else " %"
             raise EquilibriumError(
                 f"{words} have no steady state: {name} would have to {needs}"
@@ -501,7 +502,8 @@ def _free_discharge(plant, y, words, inflow):
     for i, v in enumerate(speeds):
         if v < -tolerance:
             raise EquilibriumError(
-                f"{words} have no steady state: the outflow of tank {i + 1} would be"
+                f"{words} have no steady state: the outflow of"
+                f" {label_of(plant, 'tank', i)} would be"
                 f" {-v:.3g} {plant.units[0]}/s backwards (below empty)"
             )
     return x, u

@@ -23,7 +23,8 @@ def names_of(plant: Any, kind: str) -> tuple[str, ...]:
         return (*names, *("",) * (plant.pumps - len(names)))
     tanks = named.get("tank", ())
     if kind == "output":
-        return tuple(tanks[i] for i in plant.outputs) if tanks else ()
+        outputs: tuple[int, ...] = plant.outputs
+        return tuple(tanks[i] for i in outputs) if tanks else ()
     return named.get(kind, ())
 
 
@@ -33,25 +34,39 @@ def name_of(plant: Any, kind: str, index: int) -> str:
     return names[index] if names else ""
 
 
-def label(plant: Any, kind: str, index: int) -> str:
+def label_of(plant: Any, kind: str, index: int) -> str:
     """Return what a person reads for entry `index` (from 0) of a kind: its name, or "tank 1"."""
     return name_of(plant, kind, index) or _numbered(plant, kind, index)
 
 
+def entry_label(plant: Any, name: str, per: str, index: int) -> str:
+    """Return the name of an entry of a measure: "max_level of LT101"; `name` of one of the run."""
+    return name if per == "run" else f"{name} of {label_of(plant, per, index)}"
+
+
 def _numbered(plant: Any, kind: str, index: int) -> str:
-    pumps = plant.pumps - len(getattr(plant, "valves", ())) if kind == "pump" else index + 1
+    valves = len(getattr(plant, "valves", ())) if kind == "pump" else 0
+    pumps = plant.pumps - valves if valves else index + 1
     return f"{kind} {index + 1}" if index < pumps else f"valve {index - pumps + 1}"
 
 
-def labels(plant: Any, kind: str, indices: Iterable[int]) -> str:
+def labels_of(plant: Any, kind: str, indices: Iterable[int]) -> str:
     """Return the labels of several entries: "LT101, LT103", "tank 3", "tanks 1, 3" or
     "tanks 1 to 4".
     """
     indices = list(indices)
     valves = kind == "pump" and len(getattr(plant, "valves", ())) > 0
     if valves or any(name_of(plant, kind, i) for i in indices):
-        return ", ".join(label(plant, kind, i) for i in indices)
+        return ", ".join(label_of(plant, kind, i) for i in indices)
     return numbered(kind, [i + 1 for i in indices])
+
+
+def join_labels(plant: Any, kind: str, indices: Iterable[int]) -> str:
+    """Return "tank 1, 3", or the names "LT101, LT103"."""
+    indices = list(indices)
+    if any(name_of(plant, kind, i) for i in indices):
+        return ", ".join(label_of(plant, kind, i) for i in indices)
+    return f"{kind} {', '.join(str(i + 1) for i in indices)}"
 
 
 def numbered(word: str, numbers: list[int]) -> str:

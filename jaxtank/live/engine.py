@@ -17,11 +17,11 @@ from jaxtank import measures as ms
 from jaxtank.bounds import bounds
 from jaxtank.case import Case, Free
 from jaxtank.controllers import OpenLoop
+from jaxtank.core.labels import label_of
 from jaxtank.core.tree import describe, get_value
 from jaxtank.export.whole import WholeLoop, library, whole_loop
 from jaxtank.limits import limit_scale, resolve_limits
 from jaxtank.live.printed import Printed, maths
-from jaxtank.plants.elements import input_name
 
 ROWS = 3000
 """Approximate number of rows of a plotted run, as in `jaxtank simulate --out`."""
@@ -191,8 +191,6 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
     length, drive = loop.units
     homes = {leaf: variant.case for variant in reversed(loops) for leaf in variant.leaves}
     leaves = [leaf_of(homes[leaf], *leaf) for leaf in sorted(homes, key=lambda leaf: leaf[0])]
-    tanks = list((case.names or {}).get("tank", ())) or [""] * plant.tanks
-    pumps = list((case.names or {}).get("pump", ())) or [""] * plant.pumps
     rims = [float(v) for v in np.broadcast_to(np.asarray(plant.rim), (plant.tanks,))]
     return {
         "case": case.name,
@@ -203,13 +201,13 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         "samples": clock.samples,
         "save_every_default": max(1, clock.samples // ROWS),
         "tanks": [
-            {"name": tanks[i] or f"tank {i + 1}", "rim": v if np.isfinite(v) else None}
+            {"name": label_of(plant, "tank", i), "rim": v if np.isfinite(v) else None}
             for i, v in enumerate(rims)
         ],
         "outputs": [int(i) for i in plant.outputs],
         "pumps": [
             {
-                "name": pumps[j] or input_name(plant, j),
+                "name": label_of(plant, "pump", j),
                 "lower": float(loop.actuator.low[j]),
                 "upper": float(loop.actuator.high[j]),
             }

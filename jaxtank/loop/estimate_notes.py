@@ -12,6 +12,7 @@ import numpy as np
 from jaxtank.analysis.linear_model import linearise
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import label_of
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.units import local
 from jaxtank.loop.closed_loop import ClosedLoop
@@ -57,9 +58,11 @@ def _far(loop: ClosedLoop, x: Any, u: Any, when: str) -> list[str]:
     i, j = (int(np.argmax(v.max(axis=0))) for v in (distance, error))
     length, rate = (local(unit, loop.units) for unit in ("cm", "cm/s"))
     return [
-        f"observer.levels: {when} the level of tank {i + 1} is up to {distance.max():.3g} {length}"
+        f"observer.levels: {when} the level of {label_of(loop.plant, 'tank', i)} is up to"
+        f" {distance.max():.3g} {length}"
         f" from the operating level {float(np.asarray(observer.levels)[i]):g} {length}, and the"
-        f" linear model is wrong by up to {error.max():.3g} {rate} in the rate of tank {j + 1}:"
+        f" linear model is wrong by up to {error.max():.3g} {rate} in the rate of"
+        f" {label_of(loop.plant, 'tank', j)}:"
         " the filter's estimates have that error in them; choose operating levels nearer by, or the"
         " extended filter"
     ]

@@ -11,11 +11,11 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import entry_label, join_labels, label_of
 from jaxtank.loop import step_size
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.run import evaluate_and_flag
 from jaxtank.loop.saved_rows import simulate_compiled
-from jaxtank.plants.elements import input_name
 
 MAX_ERROR = 5.0
 """Error of a level above which a run is refused, in `step_size.visible_heights` (1 %) [-]."""
@@ -42,20 +42,22 @@ def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> l
     if not errors[tank] > 1.0:
         return []
     sentence = (
-        f"with half the step, {0.5 * clock.dt / clock.substeps:g} s, the level of tank {tank + 1}"
+        f"with half the step, {0.5 * clock.dt / clock.substeps:g} s, the level of"
+        f" {label_of(loop.plant, 'tank', tank)}"
         f" differs by {apart[:, tank].max():.3g} {length} at t = {time:g} s"
     )
     if errors[tank] > MAX_ERROR:
         remedy = max(unstable, key=lambda item: item.height).remedy
-        tanks = ", ".join(str(item.tank + 1) for item in unstable)
+        tanks = join_labels(loop.plant, "tank", [item.tank for item in unstable])
         raise InputError(
-            f"clock.dt = {clock.dt:g} s: steps too long to follow tank {tanks}, near empty:"
+            f"clock.dt = {clock.dt:g} s: steps too long to follow {tanks}, near empty:"
             f" {sentence}: {remedy}"
         )
     inputs = np.abs(np.asarray(run.u) - np.asarray(half.u)).max(axis=0)
     pump = int(np.argmax(inputs))
-    name = input_name(loop.plant, pump)
-    sentence += f", the input of {name} by {inputs[pump]:.3g} {loop.units[1]}"
+    sentence += (
+        f", the input of {label_of(loop.plant, 'pump', pump)} by {inputs[pump]:.3g} {loop.units[1]}"
+    )
     return [", ".join([sentence, *_changed(loop, clock, finer, key)])]
 
 
@@ -70,7 +72,7 @@ def _changed(loop: ClosedLoop, clock: Clock, finer: Clock, key: Any) -> list[str
             size = max(abs(value), abs(better))
             if np.isfinite(size) and size > 0.0 and abs(value - better) > LISTED * size:
                 per, unit = ms.MEASURES[name].per, ms.unit(name, loop.units)
-                of = name if per == "run" else f"{name} of {per} {i + 1}"
+                of = entry_label(loop.plant, name, per, i)
                 unit = "" if unit == "-" else f" {unit}"
                 words = f"{of} is {better:.3g}{unit} in place of {value:.3g}{unit}"
                 differences.append((abs(value - better) / size, words))

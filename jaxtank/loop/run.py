@@ -20,6 +20,7 @@ from jax.typing import ArrayLike
 from jaxtank import measures as ms
 from jaxtank.core.clock import CHUNK, Clock, is_pointwise
 from jaxtank.core.errors import InputError, NonFiniteError
+from jaxtank.core.labels import join_labels
 from jaxtank.core.tree import parameters, with_values
 from jaxtank.loop.closed_loop import (
     ClosedLoop,
@@ -326,12 +327,12 @@ def _report_broken(
     first = int(np.argmax(bad.any(axis=1)))
     if first == 0 and key is None:  # the NaN of `keyed`
         raise InputError("sensor.noise is above 0: give a key, or set it to 0")
-    tanks = ", ".join(str(i + 1) for i in np.flatnonzero(bad[first]))
+    tanks = join_labels(loop.plant, "tank", np.flatnonzero(bad[first]).tolist())
     text = ", ".join(
         f"{name} = {np.asarray(value)}"
         for name, value in parameters(loop).items()
         if name.startswith("controller.") and not name.startswith("controller.model.")
     )
     raise NonFiniteError(
-        f"the level of tank {tanks} stopped being finite at t = {first * clock.dt:g} s with {text}"
+        f"the level of {tanks} stopped being finite at t = {first * clock.dt:g} s with {text}"
     )

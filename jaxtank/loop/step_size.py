@@ -34,6 +34,7 @@ import numpy as np
 
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import label_of
 from jaxtank.core.tree import split_index, walk
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.trajectory import Trajectory
@@ -182,7 +183,8 @@ def check_step(loop: ClosedLoop, clock: Clock) -> None:
             empty = float(stored[0, unstable.tank] / leaving[0, unstable.tank])
         if empty < step:
             raise InputError(
-                f"clock.dt = {clock.dt:g} s: tank {unstable.tank + 1} runs empty in {empty:.2g} s,"
+                f"clock.dt = {clock.dt:g} s: {label_of(plant, 'tank', unstable.tank)} runs empty in"
+                f" {empty:.2g} s,"
                 f" within one step: {unstable.remedy}"
             )
     for line in step_warnings(loop, clock):
@@ -203,8 +205,8 @@ def step_warnings(loop: ClosedLoop, clock: Clock) -> list[str]:
         if math.isfinite(height):
             wrong = f"its level is up to {amount} too high"
     return [
-        f"tank {tank + 1} runs empty faster than the steps follow{others}: once it is, {wrong}"
-        f" ({remedy})"
+        f"{label_of(loop.plant, 'tank', tank)} runs empty faster than the steps follow{others}:"
+        f" once it is, {wrong} ({remedy})"
     ]
 
 
@@ -222,8 +224,8 @@ def check_run(loop: ClosedLoop, clock: Clock, run: Trajectory) -> None:
         bad = (gained > area[tank] * least[tank]) & (np.diff(x[:, tank]) > least[tank])
         if bad.any():
             raise InputError(
-                f"clock.dt = {clock.dt:g} s: steps too long to follow tank {tank + 1}, which runs"
-                " empty: near empty the explicit step is unstable and its level rises by itself"
+                f"clock.dt = {clock.dt:g} s: steps too long to follow"
+                f" {label_of(plant, 'tank', tank)}, which runs empty: near empty the explicit step is unstable and its level rises by itself"
                 f" after t = {np.argmax(bad) * clock.dt:g} s: {remedy}"
             )
 

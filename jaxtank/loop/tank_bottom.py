@@ -4,6 +4,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from jaxtank.core.labels import label_of
 from jaxtank.core.tree import is_component, walk
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.trajectory import Trajectory
@@ -56,7 +57,8 @@ def tank_bottom_warnings(loop: ClosedLoop, run: Trajectory) -> list[str]:
         if isinstance(plant, TankNetwork):
             remedy = "plant.bottom = true stops it at 0"
         sentences.append(
-            f"the level of tank {i + 1} falls below 0 at t = {run.t[np.argmax(column < limit)]:g} s"
+            f"the level of {label_of(plant, 'tank', i)} falls below 0 at"
+            f" t = {run.t[np.argmax(column < limit)]:g} s"
             f" and reaches {column.min():.4g} {length} at t = {run.t[np.argmin(column)]:g} s"
             f"{amount}: {remedy}"
         )

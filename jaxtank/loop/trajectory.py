@@ -12,6 +12,7 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxtank.core.jsonable import clean
+from jaxtank.core.labels import symbol
 from jaxtank.core.units import DEFAULT, local
 from jaxtank.views import TrajectoryViews
 
@@ -130,14 +131,21 @@ class Trajectory(TrajectoryViews):
 
 
 def columns(
-    run: Trajectory, units: tuple[str, str] = DEFAULT, dimension: str | None = None
+    run: Trajectory,
+    units: tuple[str, str] = DEFAULT,
+    dimension: str | None = None,
+    plant: Any = None,
 ) -> dict[str, Any]:
-    """Return the columns of a Trajectory, for pandas or xarray."""
+    """Return the columns of a Trajectory, for pandas or xarray; "h1", or "h_LT101" of a plant whose
+    tanks have names.
+    """
     table: dict[tuple[str, str], Any] = {("t", "s"): np.asarray(run.t)}
     for name, field, unit in FIELDS:
         if getattr(run, field) is not None:  # the share is of some controllers alone
             for i, column in enumerate(np.asarray(getattr(run, field)).T):
-                table[f"{name}{i + 1}", local(unit, units)] = column
+                kind = {"r": "output", "u": "pump", "command": "pump", "share": "pump"}
+                key = symbol(plant, name, kind.get(name, "tank"), i)
+                table[key, local(unit, units)] = column
     if dimension is None:
         return {f"{name} [{unit}]": values for (name, unit), values in table.items()}
     return {
@@ -155,12 +163,12 @@ def stride(samples: int, rows: int = 3000) -> int:
     return next((k for k in range(least, 2 * least + 1) if k % 2 and steps % k == 0), least | 1)
 
 
-def csv(run: Trajectory, units: tuple[str, str] = DEFAULT) -> str:
+def csv(run: Trajectory, units: tuple[str, str] = DEFAULT, plant: Any = None) -> str:
     """Return a trajectory as CSV with units in the header."""
     known = bool(np.asarray(run.d_hat).any())
     table = {
         n: v
-        for n, v in columns(run, units).items()
+        for n, v in columns(run, units, plant=plant).items()
         if not n.startswith("h_hat") and (known or not n.startswith("d_hat"))
     }
     out = io.StringIO()

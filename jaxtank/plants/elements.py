@@ -74,12 +74,6 @@ def closed_circuit(net: Any) -> list[int]:
     return [i for i in range(net.tanks) if i not in open_tanks]
 
 
-def input_name(net: Any, j: int) -> str:
-    """Return "pump 1" or "valve 1": what the entry j of the inputs drives."""
-    pumps = len(net.feeds) if hasattr(net, "feeds") else net.pumps
-    return f"pump {j + 1}" if j < pumps else f"valve {j - pumps + 1}"
-
-
 def power_law(head: Any, exponent: Any, knee: Any) -> Any:
     """Return head^exponent for a head >= 0, with a finite slope at 0, C1 at `knee`."""
     y = lower_clip(head, 0.0) / knee

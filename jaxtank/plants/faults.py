@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxtank.core.clock import Clock, pointwise, sample_times
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import label_of
 from jaxtank.core.tree import component, describe, get_value, leaf, number, split_index, static
 from jaxtank.plants.base import Plant
 
@@ -108,8 +109,8 @@ class Faults:
         if total <= 1.0 + 1e-9:
             return []
         return [
-            f"{what}: {total:g} of what passes the rim of tank {source + 1} is then caught: must be"
-            " at most 1"
+            f"{what}: {total:g} of what passes the rim of {label_of(plant, 'tank', source)} is then"
+            " caught: must be at most 1"
         ]
 
     arrays = True

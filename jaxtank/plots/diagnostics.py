@@ -5,13 +5,14 @@ Each function draws on given matplotlib axes and returns them.
 
 import numpy as np
 
+from jaxtank.core.labels import label_of, labels_of
 from jaxtank.plots.style import AFTER, BEFORE, BEYOND, FORBIDDEN, OTHER, REFERENCE, plain
 
 SLICES = 240
 """Intervals of time in a strip of `saturation`."""
 
 
-def phase(ax, runs, tanks, rims=None, unit="cm"):
+def phase(ax, runs, tanks, rims=None, unit="cm", plant=None):
     """Draw the level of one tank over that of another; dots at the start, squares at the end."""
     across, up = tanks
     for name, (run, colour, style) in runs.items():
@@ -25,12 +26,13 @@ def phase(ax, runs, tanks, rims=None, unit="cm"):
             end = max(1.05 * float(rims[tank]), 1.03 * top)
             span(float(rims[tank]), end, **BEYOND, label="past a rim")
             limit(None, end)
-    ax.set(xlabel=f"level of tank {across + 1} [{unit}]", ylabel=f"level of tank {up + 1} [{unit}]")
-    ax.set_title(f"tanks {across + 1} and {up + 1}")
+    names = [plain(label_of(plant, "tank", tank)) for tank in tanks]
+    ax.set(xlabel=f"level of {names[0]} [{unit}]", ylabel=f"level of {names[1]} [{unit}]")
+    ax.set_title(plain(labels_of(plant, "tank", tanks)).replace(", ", " and "))
     return ax
 
 
-def saturation(ax, runs, low, high):
+def saturation(ax, runs, low, high, plant=None):
     """Draw when each pump was commanded past its limits, in a strip per pump and run."""
     names, heights = [], []
     colours = (("past the upper limit", AFTER, 1), ("past the lower limit", BEFORE, -1))
@@ -42,7 +44,7 @@ def saturation(ax, runs, low, high):
             masks = command > float(high[j]), command < float(low[j])
             up, down = (f"{100 * mask.mean():.3g} %" for mask in masks)
             of = f", {plain(name)}" if len(runs) > 1 else ""
-            names.append(f"pump {j + 1}{of}\n{up} up, {down} down")
+            names.append(f"{plain(label_of(plant, 'pump', j))}{of}\n{up} up, {down} down")
             ax.axhline(y, color="0.7", linewidth=0.8)
             for mask, (_, colour, sign) in zip(masks, colours):
                 edges, share = _slices(t, mask)
@@ -66,34 +68,38 @@ def _slices(t, mask):
     return edges, np.bincount(index, mask, count) / samples
 
 
-def estimate(ax, run, tank, unit="cm"):
+def estimate(ax, run, tank, unit="cm", plant=None):
     """Draw the estimate of one level, with the measured and the true one."""
     if np.any(run.y[:, tank] != run.x[:, tank]):
         dots = {"color": "0.75", "markersize": 1.5, "rasterized": True, "label": "measured"}
         ax.plot(run.t, run.y[:, tank], ".", **dots)
     ax.plot(run.t, run.x[:, tank], color=REFERENCE, linewidth=1.3, label="true")
     ax.plot(run.t, run.x_hat[:, tank], "--", color=AFTER, linewidth=1.2, label="estimated")
-    ax.set(title=f"tank {tank + 1}", ylabel=f"level [{unit}]")
+    ax.set(title=plain(label_of(plant, "tank", tank)), ylabel=f"level [{unit}]")
     return ax
 
 
-def disturbance(ax, run, tank, inflow=None, unit="cm/s"):
+def disturbance(ax, run, tank, inflow=None, unit="cm/s", plant=None):
     """Draw the estimated disturbance of one level's rate, which holds all model errors."""
     if inflow is not None:
         ax.plot(run.t, inflow, color=REFERENCE, linewidth=1.3, label="inflow disturbance")
     style = "-" if inflow is None else "--"
     ax.plot(run.t, run.d_hat[:, tank], style, color=AFTER, linewidth=1.1, label="estimated")
     ax.axhline(0.0, color="0.6", linewidth=0.8, linestyle=":")
-    ax.set(title=f"disturbance of tank {tank + 1}", ylabel=f"d_hat [{unit}]")
+    ax.set(title=f"disturbance of {plain(label_of(plant, 'tank', tank))}", ylabel=f"d_hat [{unit}]")
     return ax
 
 
-def share(ax, run, pump, of=("sliding mode", "state feedback")):
+def share(ax, run, pump, of=("sliding mode", "state feedback"), plant=None):
     """Draw the share of two blended controllers, named in `of`, in one input; returns the axes."""
     first = run.share[:, pump]
     ax.fill_between(run.t, 0.0, first, color=BEFORE, alpha=0.55, linewidth=0, label=of[0])
     ax.fill_between(run.t, first, 1.0, color=AFTER, alpha=0.35, linewidth=0, label=of[1])
-    ax.set(title=f"input of pump {pump + 1}", ylabel="share [-]", ylim=(0.0, 1.0))
+    ax.set(
+        title=f"input of {plain(label_of(plant, 'pump', pump))}",
+        ylabel="share [-]",
+        ylim=(0.0, 1.0),
+    )
     ax.margins(x=0.0)
     return ax
 

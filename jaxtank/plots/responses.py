@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.colors import BoundaryNorm
 
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import label_of
 from jaxtank.plots.overview import NAMED, worst
 from jaxtank.plots.spills import above_rim, spill_note, spilled
 from jaxtank.plots.style import (
@@ -44,7 +45,7 @@ SHOWN = 16
 """Tanks between, outputs and pumps that are drawn each; of more, those that matter."""
 
 
-def level(ax, runs, tank, output=None, rim=None, limit=None, unit="cm", spills=None):
+def level(ax, runs, tank, output=None, rim=None, limit=None, unit="cm", spills=None, plant=None):
     """Draw the level of one tank, with its setpoint, rim and limit."""
     lines(ax, runs, "x", tank, linewidth=1.4)
     if output is not None:
@@ -60,15 +61,16 @@ def level(ax, runs, tank, output=None, rim=None, limit=None, unit="cm", spills=N
             ax.axhline(bound, color=FORBIDDEN, linewidth=1.0, label=f"{name} {bound:g} {unit}")
             ax.set_ylim(top=top)
     ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]) if output is None else None)
-    ax.set(title=f"tank {tank + 1}{above_rim(ax, runs, tank, rim, spills)}")
+    ax.set(title=f"{label_of(plant, 'tank', tank)}{above_rim(ax, runs, tank, rim, spills)}")
     ax.set_ylabel(f"level [{unit}]")
     return ax
 
 
-def voltage(ax, runs, pump, low, high, unit="V"):
+def voltage(ax, runs, pump, low, high, unit="V", plant=None):
     """Draw the input of one pump; what lies outside its limits is shaded."""
     lines(ax, runs, "u", pump)
-    ax.set(title=f"pump {pump + 1}", ylabel=f"input [{unit}]" if unit != "V" else "voltage [V]")
+    ax.set(title=plain(label_of(plant, "pump", pump)))
+    ax.set(ylabel=f"input [{unit}]" if unit != "V" else "voltage [V]")
     lowest, highest = (
         f([f(run.u[:, pump]) for run, _, _ in runs.values()]) for f in (np.min, np.max)
     )
@@ -80,11 +82,11 @@ def voltage(ax, runs, pump, low, high, unit="V"):
     return ax
 
 
-def error(ax, runs, output, tank, unit="cm"):
+def error(ax, runs, output, tank, unit="cm", plant=None):
     """Draw the tracking error of one output."""
     lines(ax, runs, "e", output)
     ax.axhline(0.0, color=REFERENCE, linewidth=0.8, linestyle=":")
-    ax.set(title=f"tracking error of tank {tank + 1}", ylabel=f"h - r [{unit}]")
+    ax.set(title=f"tracking error of {label_of(plant, 'tank', tank)}", ylabel=f"h - r [{unit}]")
     return ax
 
 

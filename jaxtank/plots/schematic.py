@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.patches import Circle, Polygon
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 
+from jaxtank.core.labels import label_of, name_of
 from jaxtank.core.units import local
 from jaxtank.plants.vessels import shape_name
 from jaxtank.plots.layout import jets, overflows, pipes, place, valves
@@ -57,7 +58,13 @@ def schematic(ax, plant, levels=None, setpoints=None, lost=None):
             mark(ax, where.boxes[i], float(setpoints[k]))
     for j, (x, y) in enumerate(where.pumps):
         crowded = sum((other > 0) == (x > 0) for other, _ in where.pumps) > 1
-        _pump(ax, x, y, j, str(j + 1) if crowded else f"pump {j + 1}")
+        _pump(
+            ax,
+            x,
+            y,
+            j,
+            (name_of(plant, "pump", j) or str(j + 1)) if crowded else label_of(plant, "pump", j),
+        )
     _shares(ax, plant, where)
     ax.set(xlim=(where.left, where.right), ylim=(where.bottom, where.top), aspect="equal")
     if levels is not None:
@@ -127,8 +134,8 @@ def _tank(ax, plant, i, tank, level):
     wall = {"color": REFERENCE, "linewidth": 2.2} if controlled else {"color": GLASS}
     ax.plot([tank.x, tank.x, x, x], [y, tank.y, tank.y, y], **{"linewidth": 1.4, **wall}, zorder=3)
     halo: dict[str, Any] = {} if level is None else {"path_effects": HALO}
-    shape = shape_name(plant, i)
-    label = "\n".join(part for part in (f"tank {i + 1}", shape, text) if part)
+    shape, name = shape_name(plant, i), label_of(plant, "tank", i)
+    label = "\n".join(part for part in (name, shape, text) if part)
     size = 7 if tank.width < 0.7 else 8
     middle = tank.y + 0.5 * tank.height
     write(ax, tank.middle, middle, label, size, colour="black", zorder=5, **halo)

@@ -61,7 +61,7 @@ def _band(ax, loop, bands, i):
     else:  # a rim far above all levels would only compress the picture
         label = f"rim {rim:g} {unit}, above the picture"
         ax.plot([], [], color=RIM, linewidth=1.2, label=label)
-    ax.set(title=f"tank {i + 1}", ylabel=f"level [{unit}]")
+    ax.set(title=plain(label_of(loop.plant, "tank", i)), ylabel=f"level [{unit}]")
     ax.legend(loc="best", fontsize="x-small")
 
 

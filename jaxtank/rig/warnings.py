@@ -8,7 +8,7 @@ from jaxtank import presets
 from jaxtank.case import Case
 from jaxtank.controllers.pid import PID
 from jaxtank.core.clock import Clock
-from jaxtank.core.labels import label
+from jaxtank.core.labels import label_of
 from jaxtank.core.tree import get_value, is_component, split_index, walk
 from jaxtank.loop.estimate_notes import is_unused
 from jaxtank.loop.tank_bottom import is_open
@@ -158,10 +158,7 @@ def _replaced(name, signal, clock):
 def _above_rims(case):
     """On levels at t = 0 and setpoints above a rim."""
     plant, length, reference = case.loop.plant, case.loop.units[0], steps(case.loop.reference)
-    rim, names = np.asarray(plant.rim), case.names.get("tank", ("",) * plant.tanks)
-    tanks = [
-        f"tank {i + 1} ({name!r})" if name else f"tank {i + 1}" for i, name in enumerate(names)
-    ]
+    rim, tanks = np.asarray(plant.rim), [label_of(plant, "tank", i) for i in range(plant.tanks)]
     limits = "rims are limits here and not physics"
     for i, level in enumerate(np.asarray(case.loop.x0)):
         if level > rim[i]:
@@ -176,8 +173,8 @@ def _above_rims(case):
         highest = max([reference.initial[i], *(v for (_, j), v in targets if j == i)])
         if highest > rim[tank]:
             yield (
-                f"reference: output {i + 1} is asked for {highest:g} {length}, above the rim of"
-                f" {tanks[tank]} at {rim[tank]:g} {length}: "
+                f"reference: {label_of(plant, 'output', i)} is asked for {highest:g} {length},"
+                f" above the rim of {tanks[tank]} at {rim[tank]:g} {length}: "
                 + ("a level cannot get there" if plant.overflow else limits)
             )
 
@@ -189,7 +186,7 @@ def _pumps(case):
     for j, (low, volts, high) in enumerate(rows):
         if not low <= volts <= high:
             yield (
-                f"{label(case.loop.plant, 'pump', j)} runs at {volts:g} {drive} before t = 0,"
+                f"{label_of(case.loop.plant, 'pump', j)} runs at {volts:g} {drive} before t = 0,"
                 f" outside its limits of {low:g} and {high:g} {drive}"
             )
 
@@ -216,9 +213,10 @@ def _signs(case):
             sign = -acts if j in part.reversed_inputs else acts
             if sign * gain < 0.0:
                 yield (
-                    f"controller.Kc of output {i + 1} = {gain:g}: {label(plant, 'pump', j)}"
-                    f" {'fills' if acts > 0 else 'empties'} {label(plant, 'tank', tank)},"
-                    " and this sign drives its level away from the setpoint: change the sign"
+                    f"controller.Kc of {label_of(plant, 'output', i)} = {gain:g}:"
+                    f" {label_of(plant, 'pump', j)} {'fills' if acts > 0 else 'empties'}"
+                    f" {label_of(plant, 'tank', tank)}, and this sign drives its level away"
+                    " from the setpoint: change the sign"
                 )
 
 

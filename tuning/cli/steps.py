@@ -81,6 +81,7 @@ def _not_proved(case):
     """Sentences on tanks whose limits the safety filter of the case is not proved to keep."""
     if case.loop.safety_filter is None:
         return []
+    from jaxtank.core.labels import label_of
     from jaxtank.safety.of_case import certificates_of
 
     rows = certificates_of(case)
@@ -91,7 +92,8 @@ def _not_proved(case):
         if row.low > 0.0 and not row.low_certified
     ]
     return [
-        f"safety filter: the {limit} of tank {tank + 1} is not proved: {reason}"
+        f"safety filter: the {limit} of {label_of(case.loop.plant, 'tank', tank)} is not proved:"
+        f" {reason}"
         for limit, tank, reason in high + low
     ]
 

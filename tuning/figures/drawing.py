@@ -11,6 +11,7 @@ from jaxtank import presets, rig
 from jaxtank.case import Case
 from jaxtank.controllers.fuzzy import membership
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import label_of
 from jaxtank.core.units import local
 from jaxtank.loop.trajectory import Trajectory
 from tuning.figures.figure import Figure
@@ -134,26 +135,32 @@ def _panels(kind, figure, drawn):
     rims = [float(v) if np.isfinite(v) else None for v in rims]
     if kind == "levels":
         return [
-            lambda ax, i=i: responses.level(ax, lines, i, outputs.get(i), rims[i], unit=length)
+            lambda ax, i=i: responses.level(
+                ax, lines, i, outputs.get(i), rims[i], unit=length, plant=plant
+            )
             for i in figure.tanks or range(plant.tanks)
         ]
     if kind == "errors":
         pairs = outputs.items()
-        return [lambda ax, i=i, j=j: responses.error(ax, lines, j, i, length) for i, j in pairs]
+        return [
+            lambda ax, i=i, j=j: responses.error(ax, lines, j, i, length, plant) for i, j in pairs
+        ]
     if kind == "inputs":
         low, high = (np.asarray(getattr(case.loop.actuator, n), float) for n in ("low", "high"))
         return [
-            lambda ax, j=j: responses.voltage(ax, lines, j, low[j], high[j], drive)
+            lambda ax, j=j: responses.voltage(ax, lines, j, low[j], high[j], drive, plant)
             for j in range(plant.pumps)
         ]
     if kind == "estimates":
         rate = local("cm/s", case.loop.units)
         return [
-            lambda ax, i=i: diagnostics.disturbance(ax, first, i, None, rate)
+            lambda ax, i=i: diagnostics.disturbance(ax, first, i, None, rate, plant)
             for i in range(plant.tanks)
         ]
     if kind == "shares":
-        return [lambda ax, j=j: diagnostics.share(ax, first, j) for j in range(plant.pumps)]
+        return [
+            lambda ax, j=j: diagnostics.share(ax, first, j, plant=plant) for j in range(plant.pumps)
+        ]
     if kind == "setpoints":
         return [lambda ax: _setpoints(ax, case, first)]
     return [lambda ax, i=i: _memberships(ax, case.loop.controller, i, length) for i in range(2)]
@@ -161,9 +168,8 @@ def _panels(kind, figure, drawn):
 
 def _setpoints(ax, case, trajectory):
     for j, tank in enumerate(case.loop.plant.outputs):
-        ax.plot(
-            trajectory.t, trajectory.r[:, j], linewidth=1.4, label=f"setpoint of tank {tank + 1}"
-        )
+        name = f"setpoint of {label_of(case.loop.plant, 'tank', tank)}"
+        ax.plot(trajectory.t, trajectory.r[:, j], linewidth=1.4, label=name)
     ax.set(ylabel=f"level [{case.loop.units[0]}]", title="setpoints")
 
 

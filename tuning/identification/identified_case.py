@@ -14,12 +14,12 @@ from jaxtank.case import Case, Free
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import label_of
 from jaxtank.core.tree import number, with_values
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
-from jaxtank.plants.elements import input_name
 from jaxtank.rig.components import controller_of
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps, ramps
@@ -184,7 +184,7 @@ def _gain_and_time(loop, model, inputs):
     if loop.plant.plain:
         settles &= gain > 0
     for j in np.flatnonzero(~settles)[:1]:
-        at, name = ", ".join(f"{v:g}" for v in inputs), input_name(loop.plant, j)
+        at, name = ", ".join(f"{v:g}" for v in inputs), label_of(loop.plant, "pump", j)
         raise InputError(
             f"{name} does not settle tank {loop.plant.outputs[j] + 1} at inputs ({at})"
             f" {loop.units[1]}: a PI controller does not fit, use another [controller]"

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import entry_label
 from jaxtank.core.tree import number
 from jaxtank.limits import resolve_limits
 from jaxtank.loop import run as lp
@@ -147,7 +148,7 @@ class InputProblem:
             at, excess = (peak[0], peak[1][peak[0]]) if m in POINTWISE else (None, peak)
             per, excess = ms.MEASURES[m].per, excess * float(size)
             row = {
-                "name": m if per == "run" else f"{m} of {per} {i + 1}",
+                "name": entry_label(self.case.loop.plant, m, per, i),
                 "measure": m,
                 "limit": float(limit),
                 "value": float(float(limit) + POINTWISE.get(m, 1) * excess),

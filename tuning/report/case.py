@@ -10,6 +10,7 @@ import numpy as np
 from jaxtank import presets
 from jaxtank.case import Free
 from jaxtank.core.clock import CLOCK
+from jaxtank.core.labels import label_of
 from jaxtank.core.tree import walk
 from jaxtank.core.units import local
 from jaxtank.instruments import LevelSensor, PumpBank
@@ -317,7 +318,8 @@ def _signals(loop):
         words = f"Constant inflow disturbance: {levels} {length}^3/s, by tank."
     elif isinstance(signal, InflowPulses):
         pulses = (
-            f"{float(v):g} {length}^3 into tank {tank + 1} at {t:g} s over {s:g} s"
+            f"{float(v):g} {length}^3 into {label_of(loop.plant, 'tank', tank)}"
+            f" at {t:g} s over {s:g} s"
             for (t, s, tank), v in zip(signal.events, signal.volume)
         )
         words = f"Inflow disturbance: {'; '.join(pulses)}."

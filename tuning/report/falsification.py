@@ -6,12 +6,13 @@ import shlex
 import numpy as np
 
 from jaxtank import rig as rigs
+from jaxtank.core.labels import label_of, labels_of
 from jaxtank.core.tree import describe, get_value
 from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv
 from jaxtank.safety.checker import CASE
 from tuning.problem import provenance
-from tuning.problem.wording import count, numbered
+from tuning.problem.wording import count
 from tuning.report.document import Report, Text
 from tuning.report.folder import earlier, rig_text
 from tuning.report.folder import save as save_all
@@ -85,9 +86,10 @@ def remarks_of(attack):
             "Overflow is simulated in this rig: no level passes a rim. The attack is on the same"
             " rig without overflow, whose levels show what would overflow."
         )
-    if beyond := [tank.tank + 1 for tank in attack.found if _starts_elsewhere(attack, tank)]:
+    if beyond := [tank.tank for tank in attack.found if _starts_elsewhere(attack, tank)]:
         remarks.append(
-            f"Proved {start_of([CASE])} only: {numbered('tank', beyond)}. This attack starts"
+            f"Proved {start_of([CASE])} only: {labels_of(attack.case.loop.plant, 'tank', beyond)}."
+            " This attack starts"
             " anywhere below the limits; --start own keeps to the case's start."
         )
     if outside := _outside(attack):
@@ -141,11 +143,12 @@ def report(attack):
             "(--set also moves the intervals that the safety filter is designed for; worst.toml of"
             " --out keeps them, as faults of the nominal plant)"
         )
+    name = label_of(case.loop.plant, "tank", worst.tank)
     return Report(
         f"{case.name}: attack",
         verdict(attack),
         [
-            ("highest level", f"{worst.level:.5g} {unit} (tank {worst.tank + 1})"),
+            ("highest level", f"{worst.level:.5g} {unit} ({name})"),
             ("its limit", Value(worst.limit, unit=unit)),
             ("time", f"{attack.wall_s:.1f} s"),
         ],
@@ -153,7 +156,7 @@ def report(attack):
             Text([head, *_scope(attack)]),
             _levels(attack),
             Text([verdict(attack)], gap=True),
-            Text([f"The run with the least margin to a limit, tank {worst.tank + 1}:"], gap=True),
+            Text([f"The run with the least margin to a limit, {name}:"], gap=True),
             _parameters(attack, worst),
             Text(options, gap=True),
             Text(remarks_of(attack), items=True, gap=True),
@@ -190,7 +193,7 @@ def _levels(attack):
     unit, proved = attack.case.loop.units[0], {None: "-", True: "yes", False: "no"}
     rows = [
         [
-            tank.tank + 1,
+            short(attack.case.loop.plant, "tank", tank.tank),
             Value(tank.limit, 6),
             proved[tank.certified],
             *(Value(v, 6) for v in (tank.nominal, tank.drawn, tank.level)),
@@ -210,7 +213,9 @@ def verdict(attack):
         return "No limit was passed."
     words = []
     for tank in attack.passed:
-        words.append(f"tank {tank.tank + 1} by {-tank.margin:.3g} {attack.case.loop.units[0]}")
+        loop = attack.case.loop
+        name = label_of(loop.plant, "tank", tank.tank)
+        words.append(f"{name} by {-tank.margin:.3g} {loop.units[0]}")
         if tank.certified is False:
             words[-1] += f" ({tank.reason})"
         if _starts_elsewhere(attack, tank):
@@ -265,13 +270,13 @@ def figures(attack, runs=None):
     worst, loop = attack.worst, attack.case.loop
     limits = np.array([tank.limit for tank in attack.found])
     title = (
-        f"{attack.case.name}: tank {worst.tank + 1} reaches {worst.level:.4g} {loop.units[0]},"
-        f" limit {worst.limit:.4g}"
+        f"{attack.case.name}: {label_of(loop.plant, 'tank', worst.tank)} reaches {worst.level:.4g}"
+        f" {loop.units[0]}, limit {worst.limit:.4g}"
     )
 
     def ascent(ax):
         for i, limit in enumerate(limits):
-            ax.plot(attack.history[:, i] / limit, marker=".", label=f"tank {i + 1}")
+            ax.plot(attack.history[:, i] / limit, marker=".", label=label_of(loop.plant, "tank", i))
         ax.axhline(1.0, color=FORBIDDEN, linewidth=1.0, label="limit")
         ax.set(xlabel="step of the ascent", ylabel="highest level / limit [-]")
         ax.legend()
@@ -305,12 +310,14 @@ def save(attack, folder, command=None):
     """Write result.json, worst.toml, trajectory.csv of the worst run, pictures and report.html."""
     text, checked = rig_of(attack)
     runs, worst, unit = runs_of(attack), attack.worst, attack.case.loop.units[0]
-    files = {"trajectory.csv": csv(runs["worst"], attack.case.loop.units)}
+    plant = attack.case.loop.plant
+    files = {"trajectory.csv": csv(runs["worst"], attack.case.loop.units, plant)}
     if text is not None:
         rest = f"; this file gives {checked['level'] or 0:.10g} {unit}: it lacks"
         rest = f"{rest} {', '.join(checked['missing'])}"
         rest = ", which `jaxtank simulate` of this file gives again" if checked["same"] else rest
-        head = f"the worst found by jaxtank attack: tank {worst.tank + 1} at {worst.level:.10g}"
+        name = label_of(plant, "tank", worst.tank)
+        head = f"the worst found by jaxtank attack: {name} at {worst.level:.10g}"
         files["worst.toml"] = f"# {head} {unit}{rest}\n{text}"
     payload, stale = {**json_of(attack), "rig": checked}, earlier(folder, CAPTIONS)
     draw, page = lambda: figures(attack, runs), lambda: report(attack)

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from jaxtank.plants.elements import input_name
+from jaxtank.core.labels import label_of, short
 from tuning.problem import provenance
 from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
@@ -42,12 +42,20 @@ def verdict(study):
     )
 
 
+def _part(case, row):
+    """The label of the tank or pump of a row."""
+    kind, number = ("tank", row.tank) if row.pump is None else ("pump", row.pump)
+    return label_of(case.loop.plant, kind, number - 1)
+
+
 def needs(study, least=LISTED):
     """Return the Table of needed levels that at least `least` of the plants cannot reach."""
     rows = [
         [
             Value(row.setpoints, 6, study.case.loop.units[0], ", "),
-            row.tank if row.pump is None else input_name(study.case.loop.plant, row.pump - 1),
+            short(study.case.loop.plant, "tank", row.tank - 1)
+            if row.pump is None
+            else _part(study.case, row),
             *(Value(v, 3, row.unit) for v in (row.needed, row.needed_p95)),
             Value(row.limit, 6, row.unit),
             Value(100 * row.share, 2, "%"),
@@ -99,9 +107,7 @@ def figures(study):
     from jaxtank.plots.style import AFTER, BEFORE, FORBIDDEN, picture, plain
 
     rows = [row for row in study.plateaus if row.share >= LISTED]
-    plant = study.case.loop.plant
-    name = lambda row: input_name(plant, row.pump - 1)
-    part = lambda row: f"tank {row.tank}" if row.pump is None else name(row)
+    part = lambda row: _part(study.case, row)
 
     def draw(ax):
         nominal, high, limit = zip(*((r.needed, r.needed_p95, r.limit) for r in rows))

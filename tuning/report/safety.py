@@ -3,6 +3,7 @@
 import numpy as np
 
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import short
 from jaxtank.core.units import local
 from jaxtank.plants.elements import features
 from jaxtank.safety.checker import CASE, LIMITS
@@ -54,17 +55,18 @@ def certificates(case):
 def table_of(case, rows):
     """Return the Table of `certificates`, its numbers in the case's units."""
     length, cells = local("cm", case.loop.units), []
+    tank = lambda row: short(case.loop.plant, "tank", row["tank"] - 1)
     for row in rows:
         proved, start = "yes" if row["certified"] else "no", row["starts"] or "-"
         rates = [Value(row["rate"], 3), Value(row["rate_bound"], 3)]
         limit, gap = Value(row["limit"], 4), Value(row["gap"], 3)
-        cells.append([row["tank"], limit, proved, start, *rates, gap, row["why"]])
+        cells.append([tank(row), limit, proved, start, *rates, gap, row["why"]])
     for row in rows:
         if low := row["low"]:
             proved, start = "yes" if low["certified"] else "no", CASE if low["certified"] else "-"
             limit = f"low {low['limit']:.4g}"
             rate = Value(row["rate"], 3)
-            cells.append([row["tank"], limit, proved, start, rate, "-", "-", low["why"]])
+            cells.append([tank(row), limit, proved, start, rate, "-", "-", low["why"]])
     heads = ["tank", f"limit [{length}]", "proved", "start", "kappa [1/s]", "at most [1/s]"]
     heads += [f"gap [{length}]", "by, or why not"]
     widths = (4, 12, 6, 6, 11, 13, 10)

@@ -69,7 +69,7 @@ def report(case, values, plateaus=None):
     loop, limits = case.loop, _limits(case, values)
     broken = [limit for limit in limits if not limit["margin"] >= 0.0]
     facts = [
-        (name, f"{entries(name, values[name])} {ms.unit(name, loop.units)}".strip())
+        (name, f"{entries(name, values[name], loop.plant)} {ms.unit(name, loop.units)}".strip())
         for name in case.objective
         if name in values
     ]
@@ -81,8 +81,8 @@ def report(case, values, plateaus=None):
         sections.append(dataclasses.replace(table, on="page"))
         sections.append(Text([f"{more} further limits have larger margins"][:more], on="page"))
     sections += [
-        measure_table(values, loop.units, gap=True),
-        Text(undefined(values)),
+        measure_table(values, loop.units, gap=True, plant=loop.plant),
+        Text(undefined(values, loop.plant)),
         *(_margins(loop, plateaus) if plateaus is not None else ()),
     ]
     if loop.safety_filter is not None:
@@ -172,10 +172,10 @@ def save(case, run, payload, folder, page, command=None, gif=False, against=None
         return {
             "responses": responses.responses(case.loop, {case.name: run}, case.title),
             **estimates(case.loop, case.clock, run, f"{case.name}: estimates"),
-            **shares(run, f"{case.name}: shares of the blended controllers"),
+            **shares(run, f"{case.name}: shares of the blended controllers", case.loop.plant),
         }
 
-    files = {"trajectory.csv": csv(run, case.loop.units)}
+    files = {"trajectory.csv": csv(run, case.loop.units, case.loop.plant)}
     written = save_all(folder, payload, files, draw, page, CAPTIONS, command, stale)
     if columns is not None:
         written += _for_journal(case, run, folder, columns)
@@ -233,9 +233,10 @@ def estimates(loop, clock, run, title=""):
 
     def draw(axes):
         for i in range(tanks):
-            diagnostics.estimate(axes[0, i], run, i, loop.units[0])
+            diagnostics.estimate(axes[0, i], run, i, loop.units[0], loop.plant)
             if disturbed:
-                diagnostics.disturbance(axes[1, i], run, i, inflow[i], local("cm/s", loop.units))
+                rate = local("cm/s", loop.units)
+                diagnostics.disturbance(axes[1, i], run, i, inflow[i], rate, loop.plant)
             axes[-1, i].set_xlabel("time [s]")
 
     rows = 2 if disturbed else 1
@@ -244,7 +245,7 @@ def estimates(loop, clock, run, title=""):
     return {"estimates": style.picture(draw, size, rows, tanks, **of)}
 
 
-def shares(run, title=""):
+def shares(run, title="", plant=None):
     """Return {"shares": share of two blended controllers in each input}; {} without any."""
     from jaxtank.plots import diagnostics, style
 
@@ -254,7 +255,7 @@ def shares(run, title=""):
 
     def draw(axes):
         for j, ax in enumerate(axes[0]):
-            diagnostics.share(ax, run, j)
+            diagnostics.share(ax, run, j, plant=plant)
             ax.set_xlabel("time [s]")
 
     size, of = (max(6.4, 3.2 * pumps), 2.9), {"legend": 2, "title": title, "squeeze": False}

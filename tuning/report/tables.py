@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.jsonable import clean as clean
+from jaxtank.core.labels import label_of
 from jaxtank.core.units import DEFAULT
 
 LONGEST = 100
@@ -54,7 +55,7 @@ def numbers(value, digits=5):
     return Value(value, digits, missing="none")  # a dash reads as the sign of the next entry
 
 
-def entries(measure, value):
+def entries(measure, value, plant=None):
     """Return the entries of a measure; of more than 16, the four worst with their numbers."""
     values, spec = np.ravel(np.asarray(value, dtype=float)), ms.MEASURES[measure]
     if len(values) <= MANY:
@@ -64,7 +65,7 @@ def entries(measure, value):
     # undefined values first
     worse = spec.sense * np.where(np.isnan(values), spec.sense * np.inf, values)
     order = np.argsort(-worse, kind="stable")
-    worst = ", ".join(f"{numbers(values[i])} ({spec.per} {i + 1})" for i in order[:4])
+    worst = ", ".join(f"{numbers(values[i])} ({label_of(plant, spec.per, i)})" for i in order[:4])
     return f"worst of {len(values)}: {worst}"
 
 
@@ -107,10 +108,10 @@ def table(rows, head=()):
     return str(Table(rows, head))
 
 
-def measure_table(values, rig_units=DEFAULT, gap=False):
+def measure_table(values, rig_units=DEFAULT, gap=False, plant=None):
     """Return the Table of {measure: value}: unit, entries and what the measure is."""
     rows = [
-        [m, ms.unit(m, rig_units), entries(m, values[m]), spec.doc]
+        [m, ms.unit(m, rig_units), entries(m, values[m], plant), spec.doc]
         for m, spec in ms.MEASURES.items()
         if m in values and m not in ms.times()
     ]
@@ -137,12 +138,12 @@ def limit_table(rows, gap=False):
     return Table(cells, heads, gap)
 
 
-def undefined(measures):
+def undefined(measures, plant=None):
     """Return sentences: why entries of {measure: value} are printed as "none"."""
     return [
         f"{m}: none, because {why}"
         for m, v in measures.items()
-        if (why := _why(m, v)) and not np.isfinite(np.asarray(v, dtype=float)).all()
+        if (why := _why(m, v, plant)) and not np.isfinite(np.asarray(v, dtype=float)).all()
     ]
 
 
@@ -152,13 +153,13 @@ def reasons(measures):
     return {**causes, **{m: why for m, why in _unserved().items() if m not in measures}}
 
 
-def _why(measure, values):
+def _why(measure, values, plant=None):
     """Why entries of a measure are not finite, each cause once; "" where all are finite."""
     spec, values = ms.MEASURES[measure], np.ravel(np.asarray(values, dtype=float))
     causes = {i: spec.cause(float(v)) for i, v in enumerate(values) if not np.isfinite(v)}
     if len(set(causes.values())) < 2:
         return next(iter(causes.values()), "")
-    return ", ".join(f"{spec.per} {i + 1}: {why}" for i, why in causes.items())
+    return ", ".join(f"{label_of(plant, spec.per, i)}: {why}" for i, why in causes.items())
 
 
 def _unserved():

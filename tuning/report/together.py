@@ -105,9 +105,14 @@ def report(runs: list[Run]) -> Report:
     """Return the Report of several runs: measures, a column for each case, and what differs."""
     units, words, errors = runs[0].case.loop.units, [], []
     listed = [m for m in ms.MEASURES if all(m in r.measures for r in runs) and m not in ms.times()]
-    rows = [[m, ms.unit(m, units), *(entries(m, r.measures[m]) for r in runs)] for m in listed]
+    rows = [
+        [m, ms.unit(m, units), *(entries(m, r.measures[m], r.case.loop.plant) for r in runs)]
+        for m in listed
+    ]
     for run in runs:
-        words += [f"{run.case.name}: {line}" for line in undefined(run.measures)]
+        words += [
+            f"{run.case.name}: {line}" for line in undefined(run.measures, run.case.loop.plant)
+        ]
         if run.differs:
             words.append(f"{run.case.name} has its own {', '.join(run.differs)}")
         if "rms_error_total" in run.measures:

@@ -9,11 +9,11 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.core.labels import labels_of
 from jaxtank.core.tree import describe, get_value
 from jaxtank.limits import limited_levels
 from jaxtank.loop.trajectory import csv
 from tuning.problem.problem import TAIL
-from tuning.problem.wording import numbered
 from tuning.report import feasible, optimal_input
 from tuning.report.document import Live, Report, Text, terminal
 from tuning.report.folder import earlier, rig_text
@@ -104,8 +104,8 @@ def verdict(result):
     if answer.after.limits:
         hold, samples = int(answer.after.held.sum()), answer.after.samples
         words.append(f"limits hold on {hold} of {samples} {answer.setting.runs}")
-        if proved := [row.tank + 1 for row in answer.setting.certificates if row.certified]:
-            words[-1] += f", proved for {numbered('tank', proved)}"
+        if proved := [row.tank for row in answer.setting.certificates if row.certified]:
+            words[-1] += f", proved for {labels_of(result.tuned.loop.plant, 'tank', proved)}"
     if answer.kept:
         changed = sum(not stays for stays in answer.kept.values())
         words.append(f"{changed} of {len(answer.kept)} gains changed")
@@ -571,12 +571,12 @@ def figures(result, runs=None):
         looks = zip(runs.items(), responses.RUNS)
         lines = {side: (run, *look) for (side, run), look in looks}
         rims = np.asarray(loop.plant.rim)
-        phase = lambda ax: diagnostics.phase(ax, lines, between, rims, loop.units[0])
+        phase = lambda ax: diagnostics.phase(ax, lines, between, rims, loop.units[0], loop.plant)
         drawings["inner"] = picture(phase, (5.0, 4.0), legend=3)
     low, high = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
     if any(np.any(run.command > high) or np.any(run.command < low) for run in runs.values()):
         size = (6.4, 1.4 + 0.62 * len(runs) * loop.plant.pumps)
-        strips = lambda ax: diagnostics.saturation(ax, runs, low, high)
+        strips = lambda ax: diagnostics.saturation(ax, runs, low, high, loop.plant)
         drawings["saturation"] = picture(strips, size, legend=2)
     observed = f"{name}, tuned: estimates of the observer"
     drawings |= estimates(loop, result.tuned.clock, runs["after"], observed)

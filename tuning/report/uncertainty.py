@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.core.labels import entry_label
 from jaxtank.loop import step_size
 from tuning.problem import provenance
 from tuning.problem.wording import count
@@ -139,7 +140,7 @@ def _measure_table(ensemble):
         columns = [np.broadcast_to(values, shape).ravel() for values in columns]
         ends = summary["mean_interval95"]
         for i in range(len(columns[0])):
-            label = name if per == "run" else f"{name} of {per} {i + 1}"
+            label = entry_label(ensemble.case.loop.plant, name, per, i)
             mean, *others = (Value(values[i], 4) for values in columns)
             interval = "-"
             if ends is not None:

@@ -52,11 +52,12 @@ from typing import Any
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.core.labels import entry_label, label_of, labels_of
 from jaxtank.core.tree import parameters
 from jaxtank.safety.of_case import SPREAD
 from tuning.problem.problem import DIVERGED
 from tuning.problem.status import Status
-from tuning.problem.wording import count, numbered
+from tuning.problem.wording import count
 from tuning.search.driver import SLOPING, UNSTABLE
 from tuning.search.result import ConstraintRow, Message, TuningResult, constraint_rows
 from tuning.search.solve import AGREE, RENEWED
@@ -405,7 +406,8 @@ def _not_applicable(result: TuningResult) -> Messages:
                 continue
             yield Message(
                 "limit-not-applicable",
-                f"{measure} of output {i + 1} is not limited: the setpoint has no step",
+                f"{entry_label(plant, measure, 'output', i)} is not limited: the setpoint has no"
+                " step",
             )
 
 
@@ -426,7 +428,8 @@ def _certificates(result: TuningResult) -> Messages:
         if not row.certified:
             yield Message(
                 "limit-not-certified",
-                f"the limit of tank {row.tank + 1} is not proved: {row.reason}",
+                f"the limit of {label_of(result.problem.loop.plant, 'tank', row.tank)} is not"
+                f" proved: {row.reason}",
             )
 
 
@@ -558,7 +561,8 @@ def _assumed(result: TuningResult) -> Messages:
 
 def _idle(result: TuningResult) -> Messages:
     if result.answer.idle:
-        tanks = numbered("tank", result.answer.idle)
+        idle = [number - 1 for number in result.answer.idle]
+        tanks = labels_of(result.problem.loop.plant, "tank", idle)
         if len(result.answer.idle) == 2:
             tanks = tanks.replace(", ", " and ")
         words = f"limits of {tanks} are not active: no plant comes within 10 % of them"

@@ -12,6 +12,7 @@ from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError, NonFiniteError, unknown
+from jaxtank.core.labels import entry_label
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
 from tuning.cluster.engine import check_cluster
@@ -317,8 +318,8 @@ def entries_of(case, names):
     rows = []
     for m in names:
         per, unit = ms.MEASURES[m].per, ms.unit(m, case.loop.units)
-        for i in range(1, ms.entries(m, case.loop.plant) + 1):
-            rows.append((m, m if per == "run" else f"{m} of {per} {i}", unit))
+        for i in range(ms.entries(m, case.loop.plant)):
+            rows.append((m, entry_label(case.loop.plant, m, per, i), unit))
     return rows
 
 
