@@ -225,7 +225,8 @@ def check_run(loop: ClosedLoop, clock: Clock, run: Trajectory) -> None:
         if bad.any():
             raise InputError(
                 f"clock.dt = {clock.dt:g} s: steps too long to follow"
-                f" {label_of(plant, 'tank', tank)}, which runs empty: near empty the explicit step is unstable and its level rises by itself"
+                f" {label_of(plant, 'tank', tank)}, which runs empty: near empty the"
+                " explicit step is unstable and its level rises by itself"
                 f" after t = {np.argmax(bad) * clock.dt:g} s: {remedy}"
             )
 

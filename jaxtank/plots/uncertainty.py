@@ -3,6 +3,7 @@
 import numpy as np
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from jaxtank.core.labels import label_of
 from jaxtank.plots.style import (
     AFTER,
     BEFORE,

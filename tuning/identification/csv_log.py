@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxtank.core.errors import DataError, InputError, nearest
 from jaxtank.core.files import refusal
+from jaxtank.core.labels import name_of
 from jaxtank.core.quantities import INPUT_UNITS, LEVEL_UNITS, TIMES, VOLTS, factor
 from jaxtank.core.text import printable
 from jaxtank.core.units import canonical
@@ -229,7 +230,7 @@ def _columns(header, where, loop, named):
     slots = {"t": ("t", 0), **{f"pump{j + 1}": ("pump", j) for j in range(plant.pumps)}}
     slots |= {f"h{i + 1}": ("h", i) for i in range(plant.tanks)}
     taken = _named_columns(header, where, slots, named)
-    taken |= _recognised_columns(header, where, slots, taken, named)
+    taken |= _recognised_columns(header, where, slots, taken, named, _own(plant, slots))
     columns, names = [], ", ".join(map(repr, header[:20]))
     names += f" and {len(header) - 20} more" if len(header) > 20 else ""
     for slot, (kind, number) in slots.items():
@@ -280,12 +281,12 @@ def _named_columns(header, where, slots, named):
     return taken
 
 
-def _recognised_columns(header, where, slots, taken, named):
+def _recognised_columns(header, where, slots, taken, named, own):
     """Return {slot: (index, unit)} of the other columns whose headers name a slot themselves."""
     used, columns = {index for index, _ in taken.values()}, {}
     for index, cell in enumerate(header):
         stem, unit = split_header(cell)
-        slot = _slot(stem, slots)
+        slot = own.get(stem) or _slot(stem, slots)
         if index in used or slot is None or slot in named:
             continue
         if slot in columns:
@@ -295,6 +296,16 @@ def _recognised_columns(header, where, slots, taken, named):
             )
         columns[slot] = (index, unit)
     return columns
+
+
+def _own(plant, slots):
+    """{"LT101", "h_LT101", "u_P101", ..: slot} of what a rig's own names call its columns."""
+    own = {}
+    for slot, (kind, number) in slots.items():
+        name = "" if kind == "t" else name_of(plant, "tank" if kind == "h" else kind, number)
+        letter = "h" if kind == "h" else "u"
+        own |= {name: slot, f"{letter}_{name}": slot} if name else {}
+    return own
 
 
 def _slot(stem, slots):

@@ -6,7 +6,7 @@ import shlex
 import numpy as np
 
 from jaxtank import rig as rigs
-from jaxtank.core.labels import label_of, labels_of
+from jaxtank.core.labels import label_of, labels_of, short
 from jaxtank.core.tree import describe, get_value
 from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.jsonable import clean as clean
-from jaxtank.core.labels import label_of
+from jaxtank.core.labels import label_of, name_of
 from jaxtank.core.units import DEFAULT
 
 LONGEST = 100
@@ -59,6 +59,9 @@ def entries(measure, value, plant=None):
     """Return the entries of a measure; of more than 16, the four worst with their numbers."""
     values, spec = np.ravel(np.asarray(value, dtype=float)), ms.MEASURES[measure]
     if len(values) <= MANY:
+        names = [name_of(plant, spec.per, i) for i in range(len(values)) if spec.per != "run"]
+        if any(names):
+            return "  ".join(f"{name} {numbers(v)}".strip() for name, v in zip(names, values))
         return numbers(values)
     if np.all(values == values[0]):
         return f"{numbers(values[0])} (each of {len(values)})"
