@@ -61,7 +61,7 @@ def level(ax, runs, tank, output=None, rim=None, limit=None, unit="cm", spills=N
             ax.axhline(bound, color=FORBIDDEN, linewidth=1.0, label=f"{name} {bound:g} {unit}")
             ax.set_ylim(top=top)
     ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]) if output is None else None)
-    ax.set(title=f"{label_of(plant, 'tank', tank)}{above_rim(ax, runs, tank, rim, spills)}")
+    ax.set(title=f"{plain(label_of(plant, 'tank', tank))}{above_rim(ax, runs, tank, rim, spills)}")
     ax.set_ylabel(f"level [{unit}]")
     return ax
 
@@ -86,7 +86,9 @@ def error(ax, runs, output, tank, unit="cm", plant=None):
     """Draw the tracking error of one output."""
     lines(ax, runs, "e", output)
     ax.axhline(0.0, color=REFERENCE, linewidth=0.8, linestyle=":")
-    ax.set(title=f"tracking error of {label_of(plant, 'tank', tank)}", ylabel=f"h - r [{unit}]")
+    ax.set(
+        title=f"tracking error of {plain(label_of(plant, 'tank', tank))}", ylabel=f"h - r [{unit}]"
+    )
     return ax
 
 
@@ -173,13 +175,15 @@ def _rows(loop, runs, which, limits):
     lost = {name: spilled(loop.plant, run) for name, (run, *_) in runs.items()}
 
     def level_of(i, k=None):
-        return lambda ax: level(ax, runs, i, k, _at(rims, i), _at(limits, i), length, lost)
+        bounds = _at(rims, i), _at(limits, i)
+        return lambda ax: level(ax, runs, i, k, *bounds, length, lost, loop.plant)
 
     def error_of(i, k):
-        return lambda ax: error(ax, runs, k, i, length)
+        return lambda ax: error(ax, runs, k, i, length, loop.plant)
 
     def voltage_of(j):
-        return lambda ax: voltage(ax, runs, j, float(low[j]), float(high[j]), drive)
+        ends = float(low[j]), float(high[j])
+        return lambda ax: voltage(ax, runs, j, *ends, drive, loop.plant)
 
     kinds = [
         [level_of(i, k) for k, i in outputs],

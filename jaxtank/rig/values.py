@@ -1,5 +1,6 @@
 """What a case has by dotted name, set: leaves, static fields, the clock; scenarios; schedules."""
 
+import contextlib
 import dataclasses
 import re
 from collections.abc import Mapping
@@ -259,7 +260,8 @@ def _absolute(case, name, value):
         return value
     match = _RELATIVE.fullmatch(value.strip())
     if match is None and NUMBER.match(value.strip()):
-        return converted(name, value, _meta(case, name)["unit"])
+        with contextlib.suppress(InputError):  # the refusal below names relative changes too
+            return converted(name, value, _meta(case, name)["unit"])
     if match is None:
         more = ', or "steady"' if name in STEADY else ""
         numbers = f"a number or a list of numbers{unit(_meta(case, name))}"
