@@ -12,7 +12,7 @@ from jaxtank.core.tree import describe, get_value, parameters, walk
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.measures import MEASURES, unit
 from jaxtank.safety import SafetyFilter, TankCertificate, design_for
-from jaxtank.safety.of_case import FLOWS, SPREAD
+from jaxtank.safety.of_case import SPREAD, UNKNOWN
 from jaxtank.views import CaseViews
 
 
@@ -225,7 +225,7 @@ def uncertain_shares(case: Case) -> dict[str, float]:
     if case.uncertain or case.covariance is not None:
         return dict(case.uncertain)
     values = parameters(case.loop)
-    shares = {f"plant.{n}": SPREAD for n in FLOWS if np.size(values.get(f"plant.{n}", ()))}
+    shares = {f"plant.{n}": SPREAD for n in UNKNOWN if np.size(values.get(f"plant.{n}", ()))}
     if np.max(np.asarray(values.get("plant.split", 0.0)), initial=0.0) * (1.0 + SPREAD) > 1.0:
         shares.pop("plant.split")
     return shares or {"sensor.noise": SPREAD}

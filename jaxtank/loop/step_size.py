@@ -212,8 +212,8 @@ def step_warnings(loop: ClosedLoop, clock: Clock) -> list[str]:
 
 def check_run(loop: ClosedLoop, clock: Clock, run: Trajectory) -> None:
     """Raise InputError where volume appears in a run: the explicit step was unstable."""
-    visible = _visible(loop, clock)
-    if not visible or any(name.startswith("area") for name, _, _ in _fault_windows(loop)):
+    visible, names = _visible(loop, clock), [name for name, *_ in _fault_windows(loop)]
+    if not visible or any(name.startswith(("area", "extent")) for name in names):
         return  # a fault of an area changes what is stored
     plant: Any = loop.plant  # a network of tanks
     x, least = np.asarray(run.x), visible_heights(loop, np.asarray(run.x))

@@ -70,16 +70,16 @@ class Faults:
             ends = [e for other, _, e in self.windows if other == name and start < e < end]
             values = [self._value(plant, name, time) for time in (start, *ends)]
             value, largest, low, high = min(values), max(values), meta["low"], meta["high"]
-            strict = field in ("area", "rim")  # a pump may stand still
+            strict = field in ("area", "rim", "extent", "rangeability")  # a pump may stand still
             if low is not None and (value <= low if strict else value < low):
                 words = "above" if strict else "at least"
                 texts.append(f"{what}: makes it {value:g}{unit}: must be {words} {low:g}{unit}")
             elif high is not None and largest > high:
                 texts.append(f"{what}: makes it {largest:g}{unit}: must be at most {high:g}{unit}")
-            elif field == "area" and not self._lasts(k, clock):
+            elif field in ("area", "extent") and not self._lasts(k, clock):
                 texts.append(
-                    f"{what}: volume would come from nowhere as the area changes: must last for the"
-                    f" whole run, from 0 s to {clock.duration:g} s or later"
+                    f"{what}: volume would come from nowhere as the {field} changes: must last for"
+                    f" the whole run, from 0 s to {clock.duration:g} s or later"
                 )
             elif field == "caught":
                 texts += self._caught_twice(what, plant, index, start)

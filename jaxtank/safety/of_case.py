@@ -19,7 +19,10 @@ from jaxtank.safety.certificate import TankCertificate, design
 from jaxtank.safety.filter import SafetyFilter
 from jaxtank.signals.inflows import InflowPulses
 
-FLOWS = ("drain", "orifice", "pipe", "pump_gain", "split", "valve", "extent")
+FLOWS = ("drain", "orifice", "pipe", "pump_gain", "split", "valve")
+"""Leaves of a plant that may change in time: the volume in a tank does not depend on them."""
+UNKNOWN = (*FLOWS, "extent")
+"""Leaves that are uncertain by SPREAD where a case names none."""
 HARMLESS = ("controller.", "observer.", "reference.")
 """What may be uncertain without a change of the box: limits hold under any controller."""
 SPREAD = 0.05
@@ -146,7 +149,7 @@ def _box(case, widths):
     the plant's, the factor by which inflow disturbances may be larger than they are).
     """
     shares, box = dict(case.uncertain), {}
-    present = (name for name in FLOWS if getattr(case.loop.plant, name) is not None)
+    present = (name for name in UNKNOWN if getattr(case.loop.plant, name) is not None)
     flows: dict[str, float] = {name: SPREAD for name in present}
     if case.covariance is not None:
         names, matrix = case.covariance

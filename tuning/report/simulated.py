@@ -13,6 +13,7 @@ from jaxtank.core.units import local
 from jaxtank.limits import resolve_limits
 from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv, stride
+from jaxtank.plants.elements import sections
 from tuning.problem import provenance
 from tuning.report.document import Live, Report, Text, failed
 from tuning.report.folder import save as save_all
@@ -229,7 +230,8 @@ def estimates(loop, clock, run, title=""):
     if loop.disturbance is not None and not callable(loop.plant.area):
         index = np.clip(np.rint(np.asarray(run.t) / clock.dt).astype(int), 0, clock.samples - 1)
         flows = loop.disturbance.sample(clock)[0]
-        inflow = [np.asarray(d)[index] / a for d, a in zip(flows, np.asarray(loop.plant.area))]
+        areas = sections(loop.plant, np.asarray(run.x).T)
+        inflow = [np.asarray(d)[index] / np.asarray(a) for d, a in zip(flows, areas)]
 
     def draw(axes):
         for i in range(tanks):
