@@ -359,3 +359,23 @@ def test_the_linear_model_of_a_valve_is_its_slope():
     A, B, _ = linearise(plant, (15.0,), (0.4,))
     flow = 0.8 * np.sqrt(2.0 * 981.0 * 15.0)
     assert np.isclose(B[0, 0], -flow / 50.0) and np.isclose(A[0, 0], -0.4 * flow / 2 / 15.0 / 50.0)
+
+
+@pytest.mark.slow_for("valve-off0")
+@pytest.mark.parametrize(
+    ("rig", "off"),
+    [
+        ("valve", {"plant.valve[0]": 0.7}),
+        ("cone", {"plant.drain[0]": 0.17, "plant.drain_exponent[0]": 0.66}),
+    ],
+)
+def test_parameters_of_elements_are_identified(rig, off):
+    case = er.case(rig, step=1.3)
+    run = jaxtank.simulate(case.loop, case.clock)
+    data = tuning.log(t=run.t, u=run.u, y=run.y, tanks=[0])
+    start = case.replace(loop=jaxtank.with_values(case.loop, off))
+    free = {name: (0.5 * value, 2.0 * value) for name, value in off.items()}
+    fit = tuning.identify(start, data, free, start="case", starts=1, noise=0.01)
+    for name in off:
+        right = float(jaxtank.parameters(case.loop)[name.split("[")[0]][0])
+        assert np.isclose(fit.parameters[name]["value"], right, rtol=1e-4)
