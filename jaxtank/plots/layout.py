@@ -167,8 +167,16 @@ def _with_pumps(plant, boxes, rows, width):
     most = max((len([s for s in sides if s == side]) for side in ("left", "right")), default=0)
     edge = 0.75 + 0.5 * max(0, most - 1)
     top = max([b.y + b.height for b in boxes] + [p[1][1] for _, _, p in risers]) + 0.3
-    parts = (tuple(part) for part in (boxes, pumps, risers, suctions))
-    return Layout(*parts, -edge, width + edge, -1.12, top)
+    return Layout(
+        boxes=tuple(boxes),
+        pumps=tuple(pumps),
+        risers=tuple(risers),
+        suctions=tuple(suctions),
+        left=-edge,
+        right=width + edge,
+        bottom=-1.12,
+        top=top,
+    )
 
 
 def _side(plant, boxes, width, j):

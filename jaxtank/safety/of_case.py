@@ -115,9 +115,9 @@ def certificates_of(case: Any) -> tuple[TankCertificate, ...]:
     """
     if reason := ", ".join(features(case.loop.plant)):
         rim, nan = np.asarray(case.loop.plant.rim, dtype=float), float("nan")
-        numbers = {"rate": nan, "rate_bound": nan, "gap": nan, "reach": float("inf")}
+        why = f"not covered: {reason}"
         return tuple(
-            TankCertificate(i, float(top), False, f"not covered: {reason}", **numbers)
+            TankCertificate(i, float(top), False, why, nan, nan, nan, reach=float("inf"))
             for i, top in enumerate(rim)
         )
     safety_filter, rows = design_for(case, **(case.safety or {}))
