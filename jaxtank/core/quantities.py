@@ -131,7 +131,7 @@ def quantity(where: str, text: str, unit: str) -> float:
     bracketed = "" if unit == "-" else f" [{unit}]"
     number = NUMBER.match(text.strip())
     name = text.strip()[number.end() :] if number else ""
-    if number is None or not name.strip() or re.match(r"[.,\d]", name):
+    if number is None or not name.strip() or re.match(r"[.,_\d]", name):
         example = f'"2.5 {unit}"' if unit != "-" else '"80 %"'
         raise InputError(
             f"{where} = {shortened(text)}: must be a number{bracketed}, or one with a unit such as"

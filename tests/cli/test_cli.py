@@ -612,7 +612,7 @@ BAD = {
     "S sensor.noise=,": "an entry of the list is empty",
     "S sensor.noise=0,05,0,05": "entry 05 begins with a zero",
     "simulate C --dt 0": "clock.dt = 0",
-    "simulate C --dt soon": "--dt 'soon': must be a number",
+    "simulate C --dt soon": "--dt = 'soon': must be a number",
     "simulate C --dt 1e9": "clock.duration",
     "simulate C --dt 1e-9": "samples",
     "simulate C --seed x": "--seed 'x'",

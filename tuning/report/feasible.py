@@ -35,11 +35,16 @@ def verdict(study):
     """Return the sentence on the share of plants with an unreachable setpoint."""
     if not study.infeasible.any():
         return f"Each of {study.samples} sampled plants has a steady state at every plateau."
-    share = number(100 * study.infeasible_for_any_controller, 2)
+    share = number(*_percent(study.infeasible_for_any_controller))
     return (
         f"On {share} % of {study.samples} sampled plants at least one setpoint is unreachable"
         " within the limits, whatever the controller."
     )
+
+
+def _percent(share):
+    """A share in percent, and its digits: 38 %, 99 %, 100 %."""
+    return 100 * share, 2 if share < 0.995 else 3
 
 
 def _part(case, row):
@@ -58,7 +63,7 @@ def needs(study, least=LISTED):
             else _part(study.case, row),
             *(Value(v, 3, row.unit) for v in (row.needed, row.needed_p95)),
             Value(row.limit, 6, row.unit),
-            Value(100 * row.share, 2, "%"),
+            Value(*_percent(row.share), "%"),
         ]
         for row in study.plateaus
         if row.share >= least
@@ -69,6 +74,8 @@ def needs(study, least=LISTED):
 
 def unreachable(study):
     """Return the sections of a default answer: lost setpoints, and options that mend them."""
+    if not study.case.reachable and study.infeasible.all():
+        return []  # the file says so: a tank that nothing holds level, say
     sections = [Text([verdict(study)]), *needs(study, MATTERS)]
     # without the change of setpoints, which is long: see the JSON and the report of the study
     if study.mends:
