@@ -119,10 +119,11 @@ def design(
     if not isinstance(plant, TankNetwork):
         raise InputError("safety_filter: is for tank networks (plants.network) only")
     elements.check_plain(plant, "safety_filter", "it is for rigs without: run without the filter")
-    n, (least, most) = plant.tanks, box_of(plant, widths)
+    n, ends = plant.tanks, box_of(plant, widths)
+    least, most = ends
     tankwise = lambda v: np.broadcast_to(np.asarray(v, float), (n,))
     inflow, draw, low, volume = map(tankwise, (inflow, draw, low, volume))
-    dead = _dead_zone(actuator, widths) if offset is None else np.asarray(offset, dtype=float)
+    dead = _dead_zone(actuator, widths, offset)
     band = tankwise(band_of(sensor, widths=widths) if band is None else band)
     begin, start = (None, None) if start is None else spread(tankwise(start), "x0", widths)
     rates = lambda entering: _rates(least, most, entering, hold / substeps, draw)
@@ -141,26 +142,13 @@ def design(
         predicted=predict * _predicted(setting, widths), divided=_divided(setting, actuator, widths)
     )
     bound = rate_bound(hold, 0.0 if setting.predicted else setting.delay, setting.lag)
-    requested = np.asarray(least.rim if limit is None else limit, dtype=float)
-    requested = np.minimum(tankwise(requested), setting.top) - setting.spare
-    if np.any(requested <= 0.0):
-        raise InputError("safety_filter: inflow disturbances alone fill a tank to its limit")
+    requested = _requested_limits(setting, least.rim if limit is None else limit)
     check_low(low, requested, setting.unit)
     noise = np.asarray(sensor.noise, dtype=float)
-    falls, at = np.zeros(n), lambda s: choose(s, noise, most, requested, rate, bound, start)
-    for _ in range(3 * n + 3):
-        chosen = at(setting)
-        more, reasons = spills(setting, (least, most), chosen, start)
-        if np.all(more <= falls) and reasons == setting.uncovered:
-            break
-        falls = np.maximum(falls, more)
-        setting = setting._replace(rates=rates(inflow + falls), uncovered=reasons)
-    else:
-        sinks = {sink for _, sink in least.spills}
-        ring = [r or "not covered: a ring of spills" * (i in sinks) for i, r in enumerate(reasons)]
-        setting = setting._replace(uncovered=tuple(ring))
-        chosen = at(setting)
+    at = lambda s: choose(s, noise, most, requested, rate, bound, start)
+    setting, chosen, falls = _with_spills(setting, ends, at, rates, inflow, start)
     low_reasons, bottom = failed_low(setting, low, chosen, begin)
+    held, kept = _tanks_with_rows(setting, chosen, low)
     safety_filter = SafetyFilter(
         least=least,
         most=most,
@@ -179,15 +167,11 @@ def design(
         # of a lagged input every older reading is a part: neighbours count with their `reach`; and
         # where inputs beyond the limits of the pumps are under way
         age=UNKNOWN if setting.lag > 0.0 or setting.beyond else setting.delay,
-        held=tuple(
-            i
-            for i, gains in enumerate(setting.rates.pumps)
-            if not chosen.idle[i] and (gains or chosen.slopes[i] > 0.0)
-        ),
+        held=held,
         predicted=setting.predicted,
         low=np.array(low),
         bottom=bottom,
-        kept=tuple(i for i, gains in enumerate(setting.rates.pumps) if low[i] > 0.0 and gains),
+        kept=kept,
     )
     limits = np.where(chosen.idle, requested, chosen.heights)
     verdicts = check(
@@ -208,27 +192,67 @@ def design(
     )
     nominal = _rates(plant, plant, inflow + falls, 0.0, None)
     narrow = narrow_band(sensor, band, setting.unit, widths)
+    gap = lambda i: gap_of(setting, nominal, i, chosen.rate, limits[i], chosen.reach)
     rows = []
     for i, verdict in enumerate(verdicts):
-        idle, reason = chosen.idle[i], chosen.reasons[i] or narrow[i]
-        proved = not reason and verdict.holds
-        low_designed = low[i] > 0.0 and not low_reasons[i]
-        row = TankCertificate(
-            tank=i,
-            limit=float(limits[i] + setting.spare[i]),
-            certified=proved,
-            reason=reason or verdict.reason,
-            rate=chosen.rate,
-            rate_bound=bound,
-            gap=0.0 if idle else gap_of(setting, nominal, i, chosen.rate, limits[i], chosen.reach),
-            reach=float(chosen.reach[i] + setting.spare[i]),
-            low=float(low[i]),
-            low_certified=bool(low_designed and verdict.low_holds),
-            low_reason=verdict.low_reason if low_designed else low_reasons[i],
-            starts=verdict.starts if proved else "",
-        )
-        rows.append(row)
+        numbers = {
+            "limit": float(limits[i] + setting.spare[i]),
+            "rate": chosen.rate,
+            "rate_bound": bound,
+            "gap": 0.0 if chosen.idle[i] else gap(i),
+            "reach": float(chosen.reach[i] + setting.spare[i]),
+            "low": float(low[i]),
+        }
+        reason = chosen.reasons[i] or narrow[i]
+        rows.append(_certificate(verdict, numbers, reason, low_reasons[i]))
     return safety_filter, tuple(rows)
+
+
+def _requested_limits(setting, limit):
+    """(n,) limits [cm] that the sensors can read, before volumes that enter besides."""
+    requested = np.broadcast_to(np.asarray(limit, dtype=float), setting.spare.shape)
+    requested = np.minimum(requested, setting.top) - setting.spare
+    if np.any(requested <= 0.0):
+        raise InputError("safety_filter: inflow disturbances alone fill a tank to its limit")
+    return requested
+
+
+def _with_spills(setting, ends, at, rates, inflow, start):
+    """(Setting with what overflows from other tanks, Chosen at it, (n,) that flow [cm^3/s])."""
+    n, falls = len(setting.spare), np.zeros(len(setting.spare))
+    for _ in range(3 * n + 3):
+        chosen = at(setting)
+        more, reasons = spills(setting, ends, chosen, start)
+        if np.all(more <= falls) and reasons == setting.uncovered:
+            return setting, chosen, falls
+        falls = np.maximum(falls, more)
+        setting = setting._replace(rates=rates(inflow + falls), uncovered=reasons)
+    sinks = {sink for _, sink in ends[0].spills}
+    ring = [r or "not covered: a ring of spills" * (i in sinks) for i, r in enumerate(reasons)]
+    setting = setting._replace(uncovered=tuple(ring))
+    return setting, at(setting), falls
+
+
+def _tanks_with_rows(setting, chosen, low):
+    """(Tanks whose limits a row of the filter keeps, tanks whose low limits one keeps)."""
+    fed = np.array([bool(gains) for gains in setting.rates.pumps])
+    held = (fed | (chosen.slopes > 0.0)) & ~chosen.idle
+    return tuple(tuple(map(int, np.flatnonzero(rows))) for rows in (held, fed & (low > 0.0)))
+
+
+def _certificate(verdict, numbers, reason, low_reason):
+    """The certificate of a tank; `reason`, `low_reason`: the condition of the design that fails."""
+    proved = not reason and verdict.holds
+    low_designed = numbers["low"] > 0.0 and not low_reason
+    return TankCertificate(
+        tank=verdict.tank,
+        certified=proved,
+        reason=reason or verdict.reason,
+        low_certified=bool(low_designed and verdict.low_holds),
+        low_reason=verdict.low_reason if low_designed else low_reason,
+        starts=verdict.starts if proved else "",
+        **numbers,
+    )
 
 
 def _rates(least, most, inflow, step, draw):
@@ -237,8 +261,10 @@ def _rates(least, most, inflow, step, draw):
     return jax.tree.map(plain, rates_of(least, most, inflow, step, draw))
 
 
-def _dead_zone(actuator, widths):
-    """The least offset dead zone [V] of each pump, 0 without one."""
+def _dead_zone(actuator, widths, offset):
+    """`offset`, or the least offset dead zone [V] of each pump, 0 without one."""
+    if offset is not None:
+        return np.asarray(offset, dtype=float)
     offset = np.asarray(actuator.offset, dtype=float)
     return interval(actuator, "actuator.dead_zone", widths)[0] if offset.ndim else offset
 

@@ -91,25 +91,32 @@ def check(
         return not_proved(why)
     rig = _Rig(safety_filter, plant, actuator, sensor, hold, substeps, box, faults)
     rig.disturbed(inflow, volume, draws)
-    least = start
-    if start is not None and "x0" in box:
-        least, start = (np.asarray(v, dtype=float) for v in box["x0"])
+    least, start = _span_of_start(start, box)
     claimed = rig.limit + rig.spare if limits is None else np.asarray(limits, float)
     if why := rig.uncovered():
         return not_proved(why)
     from_any = _joint(rig, None, claimed)
     upper = from_any if start is None else _joint(rig, np.asarray(start, float), claimed)
     lows = _joint_low(rig, least, upper)
-    return tuple(
-        Verdict(
-            tank=i,
-            holds=not upper.reasons[i],
-            reason=upper.reasons[i] or upper.theorems[i],
-            starts=CASE if from_any.reasons[i] else LIMITS,
-            low_holds=bool(rig.low[i] > 0.0 and not lows[i]),
-            low_reason=lows[i] or ("Low limits" if rig.low[i] > 0.0 else ""),
-        )
-        for i in range(tanks)
+    return tuple(_verdict(rig, i, from_any, upper, lows[i]) for i in range(tanks))
+
+
+def _span_of_start(start, box):
+    """(least, largest) levels at t = 0 (n,) [cm], or (None, None)."""
+    if start is None or "x0" not in box:
+        return start, start
+    return tuple(np.asarray(v, dtype=float) for v in box["x0"])
+
+
+def _verdict(rig, i, from_any, upper, low_reason):
+    limited = rig.low[i] > 0.0
+    return Verdict(
+        tank=i,
+        holds=not upper.reasons[i],
+        reason=upper.reasons[i] or upper.theorems[i],
+        starts=CASE if from_any.reasons[i] else LIMITS,
+        low_holds=bool(limited and not low_reason),
+        low_reason=low_reason or ("Low limits" if limited else ""),
     )
 
 
@@ -415,37 +422,52 @@ def _joint(rig, start, claimed):
     """The largest set of tanks whose limits are kept together, from `start` or (None) from any
     levels at or below the claimed limits (n,) [cm].
     """
-    n, alone = rig.tanks, None
     level = np.array(rig.limit)  # before volumes that enter besides
     if start is None:
-        free = [i for i in range(n) if i not in rig.held]
+        free = [i for i in range(rig.tanks) if i not in rig.held]
         level[free] = (claimed - rig.spare)[free]
     begin = claimed if start is None else start
-    inside, bounded = set(range(n)), set(range(n))
-    dry = np.ones(n, dtype=bool)
+    inside, bounded = set(range(rig.tanks)), set(range(rig.tanks))
+    dry, alone = np.ones(rig.tanks, dtype=bool), None
     while True:
-        bounds = np.full(n, np.inf)
-        for i in bounded | inside:
-            bounds[i] = level[i] + rig.spare[i] if i in inside else rig.reach[i]
+        bounds = _bounds(rig, level, inside, bounded)
         still = dry & (bounds <= rig.rim * (1.0 + 1e-12))
         at = _Hypotheses(bounds, still, begin, start is not None)
-        upper = [_upper(rig, i, level[i], at) for i in range(n)]
-        alone = upper if alone is None else alone
+        upper = [_upper(rig, i, level[i], at) for i in range(rig.tanks)]
+        alone = alone or upper
         outside = {i for i in inside if upper[i][0]}
-        stays = {i: _stays(rig, i, at) for i in bounded - inside}
-        loose = {i for i, how in stays.items() if not how}
-        wet = {i for i in range(n) if dry[i] and (i in loose or stays.get(i) == "rim")}
+        loose, wet = _loose_and_wet(rig, bounded - inside, at, dry)
         if not (outside or loose or wet):
             break
         inside, bounded, dry = inside - outside, bounded - loose, dry.copy()
         dry[list(wet)] = False
-    reasons = [upper[i][0] if i not in inside else "" for i in range(n)]
-    for i in (i for i in range(n) if reasons[i] and not alone[i][0]):
-        lost = sorted(k for k in range(n) if k not in inside and k != i)
-        near = [k for k in lost if k in rig.neighbours(i)] or lost
-        reasons[i] = f"relies on tank {', '.join(str(k + 1) for k in near)}, not proved"
-    reasons = [alone[i][0] or reasons[i] for i in range(n)]
+    lost = set(range(rig.tanks)) - inside
+    reasons = [_reason(rig, i, alone[i][0], upper[i][0], lost) for i in range(rig.tanks)]
     return _JointResult(reasons, [theorem for _, theorem in upper], bounds)
+
+
+def _bounds(rig, level, inside, bounded):
+    """(n,) upper bounds of the levels [cm] where the tanks `inside` keep their limits."""
+    bounds = np.full(rig.tanks, np.inf)
+    for i in bounded | inside:
+        bounds[i] = level[i] + rig.spare[i] if i in inside else rig.reach[i]
+    return bounds
+
+
+def _loose_and_wet(rig, tanks, at, dry):
+    """Those of `tanks` without a bound, and those that may overflow though counted as `dry`."""
+    stays = {i: _stays(rig, i, at) for i in tanks}
+    loose = {i for i, how in stays.items() if not how}
+    return loose, {i for i, how in stays.items() if how != "flows" and dry[i]}
+
+
+def _reason(rig, i, alone, together, lost):
+    """Why the limit of a tank is not proved: `alone`, or because of the tanks `lost`; or ""."""
+    if alone or not together:
+        return alone
+    others = sorted(lost - {i})
+    near = [k for k in others if k in rig.neighbours(i)] or others
+    return f"relies on tank {', '.join(str(k + 1) for k in near)}, not proved"
 
 
 def _stays(rig, i, at):
@@ -499,11 +521,16 @@ def _upper(rig, i, level, at):
     """
     if why := _first_failure(_begins(rig, i, level, at)):
         return why, ""
-    if i not in rig.held:
-        theorem = "full pumps stay below" if rig.gains[i] else ""
-        theorem = theorem or "no pump, and its inflow cannot pass the limit"
-        why = _rim(rig, i, level, rig.rise(i, level, at.bounds) + rig.pumped(i, rig.most))
-        return why, "" if why else theorem
+    if i in rig.held:
+        return _upper_of_row(rig, i, level, at)
+    theorem = "full pumps stay below" if rig.gains[i] else ""
+    theorem = theorem or "no pump, and its inflow cannot pass the limit"
+    why = _rim(rig, i, level, rig.rise(i, level, at.bounds) + rig.pumped(i, rig.most))
+    return why, "" if why else theorem
+
+
+def _upper_of_row(rig, i, level, at):
+    """The same of a tank whose limit a row of the filter keeps."""
     if why := _first_failure(_readable(rig, i, at.bounds)):
         return why, ""
     if rig.pulsed:
@@ -590,10 +617,8 @@ def _readable(rig, i, bounds):
     yield age >= 1e5 or not beyond, reason
 
 
-def _second_order(rig, i, at):
-    """(holds, reason) of Theorem 2 for tank i."""
-    k1, top, knee, unit = rig.slope[i], rig.limit[i], rig.knee, rig.unit
-    sources = {j: most for j, (_, most) in rig.into[i].items()}
+def _second_order_covered(rig, i, sources):
+    """(holds, reason): tank i and those above it are of the kind of Theorem 2."""
     ring = {i, *sources}
     row = "second-order row"
     alone = not rig.gains[i] and sources
@@ -605,10 +630,17 @@ def _second_order(rig, i, at):
     yield not fed, f"not covered: {row}s where the tanks above are fed by others"
     still = all(rig.inflow[k] <= 0.0 and rig.spare[k] <= 0.0 for k in ring)
     yield still, f"not covered: {row}s with inflow disturbances"
+
+
+def _second_order(rig, i, at):
+    """(holds, reason) of Theorem 2 for tank i."""
+    k1, top, knee, unit = rig.slope[i], rig.limit[i], rig.knee, rig.unit
+    sources = {j: most for j, (_, most) in rig.into[i].items()}
+    yield from _second_order_covered(rig, i, sources)
     for j in sources:
         yield from _entering(rig, j, at)
     stop = all(rig.lowest[p] <= 0.0 for j in sources for p in rig.gains[j])
-    yield stop, f"not covered: {row}s on pumps that cannot stop"
+    yield stop, "not covered: second-order rows on pumps that cannot stop"
     yield _rate_of_hold(rig, i, "k2 T")
     s, a0 = (lambda h: _root(h, knee)), SHALLOW * _root(top, knee)
     flows = {j: most * s(rig.reach[j]) for j, most in sources.items()}

@@ -140,8 +140,13 @@ def _conditions(setting, tank, limits, bound, start, reach):
         readable = reach[j] + setting.spare[j] <= setting.top[j] * (1.0 + 1e-12)
         only = f"up to {setting.top[j]:.4g} {unit} only"
         yield readable, f"relies on tank {j + 1}, whose ADC reads {only}"
-    if setting.delay == 0.0 and setting.lag == 0.0:
-        return
+    if setting.delay != 0.0 or setting.lag != 0.0:
+        yield from _late_conditions(setting, tank, limits, start, reach)
+
+
+def _late_conditions(setting, tank, limits, start, reach):
+    """(holds, reason) of Theorems 3 to 5 for the row of a tank's own pumps."""
+    rates, top, kappa, unit = setting.rates, limits.heights[tank], limits.rate, setting.unit
     begin = limits.heights if start is None else start
     if setting.predicted:
         stays = not _filled_under_way(setting, tank, top, begin, reach)
@@ -159,7 +164,12 @@ def _conditions(setting, tank, limits, bound, start, reach):
         filled = entering * (2.0 * setting.lag + setting.delay + setting.hold)
         reason = f"(F) {filled:.3g} {unit} may be filled within the lag: above 3/4 of the limit"
         yield filled <= 0.75 * top, reason
-    # (S): the inputs under way obey the row of levels up to the start
+    yield _start_allowed(setting, tank, limits, begin, reach)
+
+
+def _start_allowed(setting, tank, limits, begin, reach):
+    """(holds, reason) of (S): the inputs under way obey the row of levels up to the start."""
+    top, kappa = limits.heights[tank], limits.rate
     age, others = setting.delay + setting.hold, np.array(reach)
     for k in range(len(reach)) if setting.lag == 0.0 else ():
         fastest = setting.full_pumps(k) + max(setting.rise(k, 0.0, reach), 0.0)
@@ -168,12 +178,11 @@ def _conditions(setting, tank, limits, bound, start, reach):
     # what is allowed is concave in the level, but for the step at `empty`
     allowed = min(
         kappa * (top - h) - setting.rise(tank, h, others),
-        kappa * (top - min(h, rates.empty[tank])) - setting.rise(tank, 0.0, others),
+        kappa * (top - min(h, setting.rates.empty[tank])) - setting.rise(tank, 0.0, others),
     )
-    yield (
-        entering <= max(allowed * (1.0 + 1e-9), setting.unstoppable(tank)),
-        f"(S) start: {entering:.3g} {unit}/s under way, {max(allowed, 0.0):.3g} allowed",
-    )
+    reason = f"{entering:.3g} {setting.unit}/s under way, {max(allowed, 0.0):.3g} allowed"
+    holds = entering <= max(allowed * (1.0 + 1e-9), setting.unstoppable(tank))
+    return holds, f"(S) start: {reason}"
 
 
 def steepest(setting, tank, top):

@@ -123,11 +123,7 @@ class SafetyFilter:
             least = tuple(jnp.where(f > v, f + z, v) for f, v, z in zip(least, low, dead))
         most = tuple(cap + zone for cap, zone in zip(caps, dead))
         least, most = materialised((least, most))
-        if self.allocate and actuator.pumps == 2:
-            u = allocate(command, materialised(metric or self._metric(y)), least, most)
-        else:
-            u = tuple(clip(command[j], least[j], most[j]) for j in pumps)
-        u = materialised(u)
+        u = materialised(self._between(command, metric, y, least, most))
         free = [clip(command[j], low[j], actuator.high[j]) for j in pumps]
         acts = _any((free[j] > most[j]) | (free[j] < least[j]) for j in pumps)
         if not shared and not raising:
@@ -136,6 +132,12 @@ class SafetyFilter:
         scaled = self.scaled(_raised(moving, raising, caps), shared, low)
         acts = acts | _any(a != b for a, b in zip(scaled, moving))
         return tuple(v + zone for v, zone in zip(scaled, dead)), jnp.where(acts, 1.0, 0.0)
+
+    def _between(self, command, metric, y, least, most):
+        """(m) inputs between `least` and `most` (m) that replace the command [V]."""
+        if self.allocate and len(command) == 2:
+            return allocate(command, materialised(metric or self._metric(y)), least, most)
+        return tuple(map(clip, command, least, most))
 
     def _metric(self, y):
         """(g11, g12, g22) of G = J'J, J_oj the effect of pump j on output o: on its rate, or on its

@@ -161,11 +161,8 @@ def _box(case, widths):
     plant = {n: s for n, s in shares.items() if n.startswith("plant.")} or flows
     if widths is not None:
         box = {n: w for n, w in box.items() if not n.startswith("plant.")} | dict(widths)
-        plant = {}
-    for name, half in widths_of(case.loop.plant, plant).items():
-        box[name] = np.maximum(half, box.get(name, 0.0))
     more = 1.0
-    for name, share in shares.items():
+    for name, share in dict(case.uncertain).items():
         field, _ = split_index(name)
         part = field.rpartition(".")[0]
         if name.startswith(("plant.", *HARMLESS)) or name in box:
@@ -176,6 +173,22 @@ def _box(case, widths):
         owner = case.loop if name.startswith("x0") else getattr(case.loop, part, None)
         box |= widths_of(owner, {name: share})
     return box, more
+
+
+def _box_of_covariance(names, matrix):
+    """{parameter: half width} of the ellipsoid of estimates that holds with PROBABILITY."""
+    at = [i for i, name in enumerate(names) if not name.startswith(HARMLESS)]
+    sigma = np.sqrt(np.diag(np.asarray(matrix, dtype=float)))[at]
+    reach = np.sqrt(2.0 * scipy.special.gammaincinv(0.5 * max(len(at), 1), PROBABILITY))
+    return dict(zip([names[i] for i in at], reach * sigma))
+
+
+def _plant_shares(case):
+    """{parameter of the plant: share by which it is uncertain}."""
+    shares = {n: s for n, s in dict(case.uncertain).items() if n.startswith("plant.")}
+    if shares or case.covariance is not None:  # what a covariance leaves out is exact
+        return shares
+    return {name: SPREAD for name in FLOWS if getattr(case.loop.plant, name) is not None}
 
 
 def _disturbances(loop, clock):
