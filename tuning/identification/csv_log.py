@@ -106,14 +106,7 @@ def read_log(
         raise DataError(f"{name}: is empty: a header line and samples are needed")
     header = [cell.strip() for cell in header]
     used = _columns(header, f"{name}, line {line}", loop, columns or {})
-    table, lines = [], []
-    for line, cells in rows:
-        table.append(_numbers(cells, header, used, decimal, f"{name}, line {line}"))
-        lines.append(line)
-        if len(table) > MOST_ROWS:
-            raise DataError(f"{name}: more than {MOST_ROWS} samples")
-    if not table:
-        raise DataError(f"{name}: has a header, but no samples")
+    table, lines = _samples(rows, header, used, decimal, name)
     data = np.array(table) * [c.factor for c in used]
     kinds = np.array([c.kind for c in used])
     levels = [c for c in used if c.kind == "h"]
@@ -129,6 +122,19 @@ def read_log(
         units=tuple(c.unit for c in used),
         hold=hold,
     )
+
+
+def _samples(rows, header, used, decimal, name):
+    """(Numbers of each sample, its line in the file)."""
+    table, lines = [], []
+    for line, cells in rows:
+        table.append(_numbers(cells, header, used, decimal, f"{name}, line {line}"))
+        lines.append(line)
+        if len(table) > MOST_ROWS:
+            raise DataError(f"{name}: more than {MOST_ROWS} samples")
+    if not table:
+        raise DataError(f"{name}: has a header, but no samples")
+    return table, lines
 
 
 def _text(path):

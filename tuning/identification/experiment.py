@@ -148,16 +148,7 @@ def log(
     jaxtank.core.errors.DataError: log, sample 2: time 0 s is that of the sample before: times ...
     """
     check_hold(hold)
-    try:
-        t, u, y = (np.asarray(v, dtype=float) for v in (t, u, y))
-    except (TypeError, ValueError):
-        raise DataError(f"{name}: t, u and y must be arrays of numbers") from None
-    u, y = (v[:, None] if v.ndim == 1 else v for v in (u, y))
-    if t.ndim != 1 or u.ndim != 2 or y.ndim != 2 or not len(t) == len(u) == len(y) > 0:
-        raise DataError(
-            f"{name}: t, u and y have shapes {t.shape}, {u.shape}, {y.shape}: must share their"
-            " first dimension, the number of samples"
-        )
+    t, u, y = _arrays(t, u, y, name)
     tanks = tuple(range(y.shape[1])) if tanks is None else tuple(int(i) for i in tanks)
     in_volts = (False,) * len(tanks) if in_volts is None else tuple(bool(v) for v in in_volts)
     if not len(tanks) == len(in_volts) == y.shape[1]:
@@ -172,6 +163,28 @@ def log(
         t=t, u=u, y=y, tanks=tanks, in_volts=in_volts, name=name, lines=lines, headers=headers,
         units=units, hold=hold,
     )  # fmt: skip
+    _check_samples(data)
+    return data
+
+
+def _arrays(t, u, y, name):
+    """((samples,), (samples, pumps), (samples, channels)) arrays of the data."""
+    try:
+        t, u, y = (np.asarray(v, dtype=float) for v in (t, u, y))
+    except (TypeError, ValueError):
+        raise DataError(f"{name}: t, u and y must be arrays of numbers") from None
+    u, y = (v[:, None] if v.ndim == 1 else v for v in (u, y))
+    if t.ndim != 1 or u.ndim != 2 or y.ndim != 2 or not len(t) == len(u) == len(y) > 0:
+        raise DataError(
+            f"{name}: t, u and y have shapes {t.shape}, {u.shape}, {y.shape}: must share their"
+            " first dimension, the number of samples"
+        )
+    return t, u, y
+
+
+def _check_samples(data):
+    """Raise DataError at the first number that is not finite, or time that does not increase."""
+    t, u, y = data.t, data.u, data.y
     table = np.concatenate([t[:, None], u, y], axis=1)
     wrong = ~np.isfinite(table)
     wrong[:, 1 + u.shape[1] :] = np.isinf(y)  # a reading may be missing
@@ -187,7 +200,6 @@ def log(
             f"{data.where(k, 0)}: time {t[k]:.10g} s is {before} the sample before: times must"
             " increase from sample to sample"
         )
-    return data
 
 
 def check_hold(hold: str) -> None:

@@ -125,21 +125,15 @@ def identify(
     (<Status.CONVERGED: 'converged'>, ['plant.pump_gain[0]'])
     """
     began = time.perf_counter()
-    if loss not in LOSSES:
-        raise InputError(f"loss = {loss!r}: must be one of {', '.join(LOSSES)}")
-    for name, count in (("starts", starts), ("iterations", iterations)):
-        if not isinstance(count, int) or isinstance(count, bool) or count < 1:
-            raise InputError(f"{name} = {count!r}: must be a whole number above 0")
+    _check_settings(loss, starts=starts, iterations=iterations)
     case = bare(case) if isinstance(case, Plant) else case
     check_kind(law, case)
     logs = checked(log, case.loop, gap)
-    counts = [first_samples(log, hold_back) for log in logs]
+    counts, parts = _first_parts(logs, hold_back)
     options: dict[str, Any] = {"start": start, "noise": noise, "substeps": substeps}
     options |= {"free": free, "samples": max(log.samples for log in logs)}
-    parts = [log.part(0, count) for log, count in zip(logs, counts)]
-    longest, fitted = (max(np.diff(log.t).max() for log in side) for side in (logs, parts))
-    if substeps is None and longest > 1.01 * fitted:  # the validation set needs more
-        options["substeps"] = Estimation(case, logs, **options).substeps
+    if substeps is None and _longest_step(logs) > 1.01 * _longest_step(parts):
+        options["substeps"] = Estimation(case, logs, **options).substeps  # of the validation set
     partial = Estimation(case, parts, **options)
     settings = {"loss": loss, "iterations": iterations}
     cache = EvaluationCache()
@@ -149,9 +143,7 @@ def identify(
     if ready is not None:
         ready()
     fits, interrupted = _searches(cache, partial, starts, seed, settings, progress)
-    first = min(fits, key=lambda f: f.cost if np.isfinite(f.cost) else np.inf)
-    if not np.isfinite(first.cost):
-        raise DataError(f"{logs[0].name}: no search ended with finite readings")
+    first = _best(fits, logs[0].name)
     best, validation = solve(partial, partial.unknowns(first), **settings), None
     estimation = partial
     if any(count < log.samples for count, log in zip(counts, logs)):
@@ -184,14 +176,7 @@ def identify(
         remedies=remedies(estimation, best, spread) if unclear else [],
         quality=fit_quality
         | {"widened": spread.widened, "noise": [float(v) for v in estimation.noise]},
-        starts=[
-            {
-                "cost": fit.cost,
-                "evaluations": fit.evaluations,
-                "agrees": bool(fit.cost <= first.cost * AGREE + 1e-12),
-            }
-            for fit in fits
-        ],
+        starts=_starts(fits, first),
         validation=validation,
         profile=profile_likelihood(estimation, best, spread, loss)
         if profile and not interrupted
@@ -200,6 +185,44 @@ def identify(
         seed=seed,
         law=law,
     )
+
+
+def _check_settings(loss, **counts):
+    if loss not in LOSSES:
+        raise InputError(f"loss = {loss!r}: must be one of {', '.join(LOSSES)}")
+    for name, count in counts.items():
+        if not isinstance(count, int) or isinstance(count, bool) or count < 1:
+            raise InputError(f"{name} = {count!r}: must be a whole number above 0")
+
+
+def _first_parts(logs, hold_back):
+    """(Number of samples of each log that are fitted first, the log up to there)."""
+    counts = [first_samples(log, hold_back) for log in logs]
+    return counts, [log.part(0, count) for log, count in zip(logs, counts)]
+
+
+def _longest_step(logs):
+    return max(np.diff(log.t).max() for log in logs)
+
+
+def _best(fits, name):
+    """The Fit of the least cost."""
+    best = min(fits, key=lambda f: f.cost if np.isfinite(f.cost) else np.inf)
+    if not np.isfinite(best.cost):
+        raise DataError(f"{name}: no search ended with finite readings")
+    return best
+
+
+def _starts(fits, best):
+    """Cost and effort of each search, and whether it has found the minimum of the `best`."""
+    return [
+        {
+            "cost": fit.cost,
+            "evaluations": fit.evaluations,
+            "agrees": bool(fit.cost <= best.cost * AGREE + 1e-12),
+        }
+        for fit in fits
+    ]
 
 
 def _what(case, logs, partial, **options):

@@ -140,16 +140,8 @@ def ensemble(
     with batch_runner(case, names, seed, devices, cluster) as run:
         store = None
         if checkpoint is not None:
-            problem = fingerprint(
-                case,
-                distributions={name: [type(d).__name__, d] for name, d in distributions.items()},
-                samples=samples,
-                key=key,
-                draws=draws,
-                measures=names,
-                batch=batch,
-                **digests(case.loop, case.clock, names),
-            )
+            numbers = {"samples": samples, "key": key, "draws": draws, "batch": batch}
+            problem = _fingerprint(case, distributions, names, numbers)
             store = Store(checkpoint, problem, resume=resume, shared=processes > 1)
         mine = range(jax.process_index(), count, processes)
         results = _results(store, mine, _shapes(case, names, batch), run, inputs, batch)
@@ -174,6 +166,17 @@ def ensemble(
         wall_s=time.perf_counter() - began,
         seed=key,
         method=draws,
+    )
+
+
+def _fingerprint(case, distributions, names, numbers):
+    """What decides the numbers of a batch."""
+    return fingerprint(
+        case,
+        distributions={name: [type(d).__name__, d] for name, d in distributions.items()},
+        measures=names,
+        **numbers,
+        **digests(case.loop, case.clock, names),
     )
 
 
