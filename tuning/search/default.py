@@ -204,20 +204,33 @@ def attempts(task: Task, setting: Setting, near: np.ndarray) -> Attempt:
             last = dataclasses.replace(attempt, number=0) if last is None else last
             last.solution.interrupted = True
             return last
-        last, point, search = attempt, attempt.solution.point, attempt.solution.search
-        if coarse and case is not setting.searched and _misled(point.cost, attempt.after):
-            coarse = False
-        elif attempt.after.held.all():
+        last = attempt
+        remedy = _remedy(task, attempt, checks, coarse and case is not setting.searched)
+        if not remedy:
             break
-        elif task.may_filter and setting.filter is None and _levels_broken(attempt.after):
+        if remedy == "fine step":
+            coarse = False
+        elif remedy == "safety filter":
             filtered = setting.with_filter(matters(setting, attempt.after, NEAR))
             limits = dict(setting.case.limits if filtered is setting else filtered.limits)
             setting = filtered
-        elif checks and search and search.violation(point) == 0:
+        elif checks is not None:
             least = _tighter(attempt.after, checks)
-        else:
-            break
     return last
+
+
+def _remedy(task: Task, attempt: Attempt, checks: Checks | None, coarse: bool) -> str:
+    """What the next attempt has to change; "" where the answer holds, or nothing helps."""
+    setting, after, solution = attempt.setting, attempt.after, attempt.solution
+    assert after is not None
+    if coarse and _misled(solution.point.cost, after):
+        return "fine step"
+    if after.held.all():
+        return ""
+    if task.may_filter and setting.filter is None and _levels_broken(after):
+        return "safety filter"
+    search = solution.search
+    return "tighter limits" if checks and search and search.violation(solution.point) == 0 else ""
 
 
 def _search(

@@ -52,30 +52,41 @@ def run_plants(
     random = noisy(case) or any(n.startswith(NOISE) for n in space.labels)
     lp.check(case.loop, case.clock, jax.random.key(0) if random else None)
     plants = space.values(Points("random", space.dimensions, samples, seed).rows(0, samples))
-    values, noise = dict(plants), np.asarray(case.loop.sensor.noise, dtype=float)
     # the last run is of the nominal plant without noise, unless entries of the noise are drawn
-    quiet = quiet and noise.ndim > 0 and not any(n.startswith(f"{NOISE}[") for n in plants)
-    if quiet:
-        last = {n: get_value(case.loop, n) for n in plants} | {NOISE: 0.0 * noise}
-        values = {NOISE: np.broadcast_to(noise, (samples, *noise.shape))} | values
-        values = {
-            n: np.concatenate([np.asarray(v), np.asarray(last[n], dtype=float)[None]])
-            for n, v in values.items()
-        }
+    quiet = quiet and np.ndim(case.loop.sensor.noise) > 0
+    quiet = quiet and not any(n.startswith(f"{NOISE}[") for n in plants)
+    values = _with_nominal(case.loop, plants, samples) if quiet else dict(plants)
     count = samples + quiet
     size = _batch(batch_size(case, random, count), count)
-    rows = np.minimum(np.arange(-(-count // size) * size), count - 1)  # the last one repeated
-    numbers, key = np.arange(len(rows)), seed if random else None
-    batches: list[Any] = []
-    for batch in np.split(numbers, len(rows) // size):
-        block = {n: np.asarray(v)[rows[batch]] for n, v in values.items()}
-        batches.append(run_batch(case, tuple(names), key, block, batch))
-    measures = {n: np.concatenate([b[n] for b in batches]) for n in batches[0]}
+    measures = _run_batches(case, tuple(names), seed if random else None, values, count, size)
     failed, nominal = measures.pop("failed") > 0, None
     if quiet and not failed[samples]:
         nominal = {n: v[samples] for n, v in measures.items()}
     measures = {n: v[:samples] for n, v in measures.items()}
     return PlantRuns(plants, measures, failed[:samples], nominal)
+
+
+def _run_batches(
+    case: Case, names: tuple, key: int | None, values: Mapping[str, Any], count: int, size: int
+) -> dict[str, np.ndarray]:
+    """Measures of `count` runs in batches of `size`, of which the last one repeats its last run."""
+    rows = np.minimum(np.arange(-(-count // size) * size), count - 1)
+    batches: list[Any] = []
+    for batch in np.split(np.arange(len(rows)), len(rows) // size):
+        block = {n: np.asarray(v)[rows[batch]] for n, v in values.items()}
+        batches.append(run_batch(case, names, key, block, batch))
+    return {n: np.concatenate([b[n] for b in batches]) for n in batches[0]}
+
+
+def _with_nominal(loop: Any, plants: Mapping[str, Any], samples: int) -> dict[str, Any]:
+    """Values of the plants and, last, those of the nominal plant without noise."""
+    noise = np.asarray(loop.sensor.noise, dtype=float)
+    last = {n: get_value(loop, n) for n in plants} | {NOISE: 0.0 * noise}
+    values = {NOISE: np.broadcast_to(noise, (samples, *noise.shape))} | dict(plants)
+    return {
+        n: np.concatenate([np.asarray(v), np.asarray(last[n], dtype=float)[None]])
+        for n, v in values.items()
+    }
 
 
 def _batch(most: int, count: int) -> int:

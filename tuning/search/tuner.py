@@ -220,8 +220,7 @@ def _optimum(
         for side, loop in (("before", case.loop), ("after", tuned.loop)):
             measures[side] = measures[side] | margin_measures(loop, case.clock)
     summary, cloud = None, None
-    varies = case.uncertain or case.covariance or any(run.key is not None for run in problem.runs)
-    if options.validation and not solution.interrupted and varies:
+    if options.validation and not solution.interrupted and _varies(problem):
         summary, cloud = validate(problem, start, values, options.validation, plan.seed)
     scenarios = problem.runs if problem.scenarios else ()
     objective = {side: problem.total(table) for side, table in tables.items()}
@@ -246,6 +245,13 @@ def _optimum(
     )
     evaluator.cache.close()
     return result
+
+
+def _varies(problem: Problem) -> bool:
+    """Return True if a validation run can differ from the nominal one."""
+    case = problem.case
+    stated = bool(case.uncertain or case.covariance)
+    return stated or any(run.key is not None for run in problem.runs)
 
 
 def _default_answer(
