@@ -25,7 +25,7 @@ def open_case(args):
     """Return the checked case of the command line, in float64; warnings go to stderr."""
     use_float64()
     from jaxtank import rig
-    from jaxtank.loop import step_size, tank_bottom
+    from jaxtank.loop import tank_bottom
 
     opened = rig.open_case(args.case)
     args.values = rig.by_rig_name(opened.loop, args.values)
@@ -44,8 +44,16 @@ def open_case(args):
     if "plant.bottom" not in values and not tank_bottom.can_withdraw(opened.loop):
         case = rig.with_bottom(case)
     case = rig.filtered(rig.check(case), args.safety_filter, of_filter)
-    if args.quiet:
-        return case
+    if not args.quiet:
+        _note_warnings(args, case, replaced, known)
+    return case
+
+
+def _note_warnings(args, case, replaced, known):
+    """Print what is noted of a case, but for the sentences that are `known` of its file."""
+    from jaxtank import rig
+    from jaxtank.loop import step_size
+
     sentences = rig.case_warnings(case) + _not_proved(case)
     sentences += step_size.step_warnings(case.loop, case.clock)
     if args.command == "tune" and not args.scenario:
@@ -53,7 +61,6 @@ def open_case(args):
     for sentence in sentences:
         if sentence not in known:
             note(args, sentence)
-    return case
 
 
 def settings(args):

@@ -124,46 +124,84 @@ def draw(figure: Figure, drawn: Drawn) -> Any:
 
 def _panels(kind, figure, drawn):
     """Functions that draw one panel each on an axis."""
-    from jaxtank.plots import diagnostics, responses
-
     case, first = next(iter(drawn.runs.values()))
-    plant, (length, drive) = case.loop.plant, case.loop.units
+    if kind in OF_ALL_RUNS:
+        return OF_ALL_RUNS[kind](case, _lines(drawn.runs), figure.tanks)
+    return OF_FIRST_RUN[kind](case, first)
+
+
+def _lines(runs):
+    """{label: (trajectory, *style of its line)}."""
+    from jaxtank.plots import responses
+
+    styles = responses.styles_of([trajectory for _, trajectory in runs.values()])
+    return {n: (trajectory, *s) for (n, (_, trajectory)), s in zip(runs.items(), styles)}
+
+
+def _level_panels(case, lines, tanks):
+    from jaxtank.plots.responses import level
+
+    plant, unit = case.loop.plant, case.loop.units[0]
     outputs = {tank: j for j, tank in enumerate(plant.outputs)}
-    styles = responses.styles_of([trajectory for _, trajectory in drawn.runs.values()])
-    lines = {n: (trajectory, *s) for (n, (_, trajectory)), s in zip(drawn.runs.items(), styles)}
     rims = np.broadcast_to(np.asarray(plant.rim, dtype=float), (plant.tanks,))
     rims = [float(v) if np.isfinite(v) else None for v in rims]
-    if kind == "levels":
-        return [
-            lambda ax, i=i: responses.level(
-                ax, lines, i, outputs.get(i), rims[i], unit=length, plant=plant
-            )
-            for i in figure.tanks or range(plant.tanks)
-        ]
-    if kind == "errors":
-        pairs = outputs.items()
-        return [
-            lambda ax, i=i, j=j: responses.error(ax, lines, j, i, length, plant) for i, j in pairs
-        ]
-    if kind == "inputs":
-        low, high = (np.asarray(getattr(case.loop.actuator, n), float) for n in ("low", "high"))
-        return [
-            lambda ax, j=j: responses.voltage(ax, lines, j, low[j], high[j], drive, plant)
-            for j in range(plant.pumps)
-        ]
-    if kind == "estimates":
-        rate = local("cm/s", case.loop.units)
-        return [
-            lambda ax, i=i: diagnostics.disturbance(ax, first, i, None, rate, plant)
-            for i in range(plant.tanks)
-        ]
-    if kind == "shares":
-        return [
-            lambda ax, j=j: diagnostics.share(ax, first, j, plant=plant) for j in range(plant.pumps)
-        ]
-    if kind == "setpoints":
-        return [lambda ax: _setpoints(ax, case, first)]
-    return [lambda ax, i=i: _memberships(ax, case.loop.controller, i, length) for i in range(2)]
+    return [
+        lambda ax, i=i: level(ax, lines, i, outputs.get(i), rims[i], unit=unit, plant=plant)
+        for i in tanks or range(plant.tanks)
+    ]
+
+
+def _error_panels(case, lines, _):
+    from jaxtank.plots.responses import error
+
+    plant, unit = case.loop.plant, case.loop.units[0]
+    outputs = enumerate(plant.outputs)
+    return [lambda ax, i=i, j=j: error(ax, lines, j, i, unit, plant) for j, i in outputs]
+
+
+def _input_panels(case, lines, _):
+    from jaxtank.plots.responses import voltage
+
+    plant, pumps, unit = case.loop.plant, case.loop.actuator, case.loop.units[1]
+    low, high = np.asarray(pumps.low, float), np.asarray(pumps.high, float)
+    return [
+        lambda ax, j=j: voltage(ax, lines, j, low[j], high[j], unit, plant)
+        for j in range(plant.pumps)
+    ]
+
+
+def _estimate_panels(case, trajectory):
+    from jaxtank.plots.diagnostics import disturbance
+
+    rate, plant = local("cm/s", case.loop.units), case.loop.plant
+    tanks = range(plant.tanks)
+    return [lambda ax, i=i: disturbance(ax, trajectory, i, None, rate, plant) for i in tanks]
+
+
+def _share_panels(case, trajectory):
+    from jaxtank.plots.diagnostics import share
+
+    plant = case.loop.plant
+    return [lambda ax, j=j: share(ax, trajectory, j, plant=plant) for j in range(plant.pumps)]
+
+
+def _setpoint_panels(case, trajectory):
+    return [lambda ax: _setpoints(ax, case, trajectory)]
+
+
+def _membership_panels(case, _):
+    controller, unit = case.loop.controller, case.loop.units[0]
+    return [lambda ax, i=i: _memberships(ax, controller, i, unit) for i in range(2)]
+
+
+OF_ALL_RUNS = {"levels": _level_panels, "errors": _error_panels, "inputs": _input_panels}
+OF_FIRST_RUN = {
+    "estimates": _estimate_panels,
+    "shares": _share_panels,
+    "setpoints": _setpoint_panels,
+    "memberships": _membership_panels,
+}
+"""{kind of panel: its drawings}."""
 
 
 def _setpoints(ax, case, trajectory):

@@ -96,16 +96,20 @@ def notes_of(result):
         notes.append(f"runs in which a measure is not finite: {listed}; {method.left_out}")
         if short := [c.label for c in columns if not c.empty and c.reason]:
             notes.append(f"too few finite steps for some parameters: {', '.join(short)}")
-    if result.method == "sobol":
-        fewest = min((c.effects["kept"] for c in columns), default=result.samples)
-        if fewest < result.samples:
-            where = "base points used, at the measure with fewest"
-            notes.append(f"{where}: {fewest} of {result.samples}")
-        intervals = [c.effects["total_interval95"] for c in columns if not c.empty]
-        widest = max((np.ptp(v, axis=1).max() for v in intervals), default=0.0)
-        if widest > WIDE:
-            words = f"the widest interval of a total share is {widest:.2g}"
-            notes.append(f"{words}: more --samples narrow it")
+    return notes + (_sobol_notes(result) if result.method == "sobol" else [])
+
+
+def _sobol_notes(result):
+    notes, columns = [], result.columns
+    fewest = min((c.effects["kept"] for c in columns), default=result.samples)
+    if fewest < result.samples:
+        where = "base points used, at the measure with fewest"
+        notes.append(f"{where}: {fewest} of {result.samples}")
+    intervals = [c.effects["total_interval95"] for c in columns if not c.empty]
+    widest = max((np.ptp(v, axis=1).max() for v in intervals), default=0.0)
+    if widest > WIDE:
+        words = f"the widest interval of a total share is {widest:.2g}"
+        notes.append(f"{words}: more --samples narrow it")
     return notes
 
 

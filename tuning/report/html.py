@@ -61,22 +61,30 @@ def document(report: Report, command: str | None = None, provenance: Any = ()) -
     """Return the whole page of a Report; the same report gives the same bytes."""
     # command, provenance: the line that made the result, and versions, machine and seed
     sections = [s for s in report.sections if getattr(s, "on", "") != "terminal"]
-    frames = [frame for s in sections if isinstance(s, Live) and (frame := _frame(s.result))]
     body = [s for s in sections if not isinstance(s, Figure)]
     texts = [s for s in body if not isinstance(s, Live)]
-    words = [s for s in texts if isinstance(s, Text) and s.items and s.sentences]
+    words = [s for s in texts if _is_list(s)]
     template = _templates().get_template("page.html")
     return template.render(
         report=report,
         command=command,
         provenance=dict(provenance),
         style=_style(),
-        frames=frames,
+        frames=_frames(sections),
         last=bool(body) and isinstance(body[-1], Live),
         words=words,
         pictures=[_picture(s) for s in sections if isinstance(s, Figure)],
         numbers=[s for s in texts if s not in words],
     )
+
+
+def _frames(sections):
+    frames = [_frame(s.result) for s in sections if isinstance(s, Live)]
+    return [frame for frame in frames if frame]
+
+
+def _is_list(section):
+    return isinstance(section, Text) and section.items and bool(section.sentences)
 
 
 def fragment(sections) -> str:

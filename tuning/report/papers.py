@@ -70,17 +70,26 @@ def verdict(published, measured):
     """Return (one of VERDICTS, measured value or text, reason) of one published quantity, for which
     a number, a tuple, a Sample, a Claim or None was measured.
     """
-    reason, fitted = published.reason, published.fitted
     if measured is None:
-        return IMPOSSIBLE, None, reason
+        return IMPOSSIBLE, None, published.reason
     if isinstance(measured, Claim):
-        if measured.verdict == "not reproduced":
-            return DIFFERS, measured.text, reason
-        if fitted:
-            return FITTED, measured.text, f"{fitted}; {reason}".rstrip("; ")
-        if measured.verdict == REPRODUCED:
-            return REPRODUCED, measured.text, ""  # the text has the numbers
-        return DIFFERS, measured.text, f"in part: {reason}"
+        return _verdict_on_claim(published, measured)
+    return _verdict_on_number(published, measured)
+
+
+def _verdict_on_claim(published, measured):
+    reason, fitted = published.reason, published.fitted
+    if measured.verdict == "not reproduced":
+        return DIFFERS, measured.text, reason
+    if fitted:
+        return FITTED, measured.text, f"{fitted}; {reason}".rstrip("; ")
+    if measured.verdict == REPRODUCED:
+        return REPRODUCED, measured.text, ""  # the text has the numbers
+    return DIFFERS, measured.text, f"in part: {reason}"
+
+
+def _verdict_on_number(published, measured):
+    reason, fitted = published.reason, published.fitted
     value = measured.mean if isinstance(measured, Sample) else measured
     if isinstance(published.value, str):
         return INPUT, value, VERDICTS[INPUT]

@@ -93,14 +93,15 @@ class Table:
             widths.append(width - sum(widths) - 2 * len(widths))
         lines = []
         for row in rows:
-            cells = [[c] for c in row]
-            if self.widths:
-                cells = [textwrap.wrap(c, w) or [""] for c, w in zip(row, widths)]
+            cells = [self._wrapped(c, w) for c, w in zip(row, widths)]
             for parts in itertools.zip_longest(*cells, fillvalue=""):
                 lines.append("  ".join(c.ljust(w) for c, w in zip(parts, widths)).rstrip())
         if self.head:
             lines[1:1] = ["-" * (width if self.widths else min(LONGEST, len(max(lines, key=len))))]
         return lines
+
+    def _wrapped(self, cell, width):
+        return (textwrap.wrap(cell, width) or [""]) if self.widths else [cell]
 
     def __str__(self):
         return "\n".join(self.lines())

@@ -156,21 +156,9 @@ def cost_unit(result):
 
 def _facts(result):
     """Return (name, value) of the facts at the top of the page."""
-    unit, answer, limits = cost_unit(result).replace("-", ""), result.answer, result.constraints
+    answer, limits, costs = result.answer, result.constraints, _costs(result)
     before, after = (result.objective[side] for side in SIDES)
     broken = sum(c["margin"] < 0 for c in limits)
-    costs: list[Any] = [
-        (f"objective {side}", Value(result.objective[side], unit=unit)) for side in SIDES
-    ]
-    # Of a default answer the errors in the unit of the levels, unless the user has minimised
-    # something else.
-    if answer and not answer.setting.own_objective and answer.after is not None:
-        join = {"digits": 3, "unit": answer.setting.case.loop.units[0], "between": " -> "}
-        means = [_mean(s.error, s).value for s in (answer.before, answer.after)]
-        costs = [
-            (f"error, mean of {answer.after.samples} plants", Value(means, **join)),
-            ("error, nominal plant", Value(list(answer.nominal.values()), **join)),
-        ]
     hold = ("limits", f"{len(limits) - broken} of {len(limits)} hold" if limits else "none")
     shares = list(result.validation["limits_held"].values()) if result.validation else []
     if answer and limits and None not in shares:
@@ -185,6 +173,20 @@ def _facts(result):
         ("simulations", result.evaluations["simulations"]),
         ("time", f"{result.wall_s:.1f} s"),
     ]
+
+
+def _costs(result) -> list[Any]:
+    """[(name, Value)] of the objective, or of a default answer the errors in the levels' unit."""
+    answer = result.answer
+    if answer and not answer.setting.own_objective and answer.after is not None:
+        join = {"digits": 3, "unit": answer.setting.case.loop.units[0], "between": " -> "}
+        means = [_mean(s.error, s).value for s in (answer.before, answer.after)]
+        return [
+            (f"error, mean of {answer.after.samples} plants", Value(means, **join)),
+            ("error, nominal plant", Value(list(answer.nominal.values()), **join)),
+        ]
+    unit = cost_unit(result).replace("-", "")
+    return [(f"objective {side}", Value(result.objective[side], unit=unit)) for side in SIDES]
 
 
 def of_answer(answer, result=None):
@@ -264,13 +266,7 @@ def _effects(answer, gap):
         name = f"objective{f' {next(iter(terms))}' if len(terms) == 1 else ''}, mean of {n} plants"
         name += "" if of == "-" else f" [{of}]"
         rows.append([name, *(_mean(s.cost, s) for s in sides)])
-    rows.append([f"error, mean of {n} plants [{unit}]", *(_mean(s.error, s) for s in sides)])
-    lost = answer.before.infeasible
-    if lost is not None and lost.any() and not lost.all():
-        name = f"  plants where every setpoint is reachable ({100 * np.mean(~lost):.0f} %)"
-        rows.append([name, *(_mean(s.error[~lost], s, of=~lost) for s in sides)])
-    rows.append([f"error, nominal plant [{unit}]", *(Value(e, 3) for e in answer.nominal.values())])
-    rows += _margins(answer)
+    rows += _errors(answer, sides, unit) + _margins(answer)
     if answer.before.limits:
         broken = [f"{100 * (1 - s.held.mean()):.3g} %" for s in sides]
         rows.append(["plants that violate a limit", *broken])
@@ -282,6 +278,18 @@ def _effects(answer, gap):
     changes = [_mean(100 * s.travel, s, 2) for s in sides]
     rows.append(["rms change of input per sample [% of range]", *changes])
     return Table(rows, ["what it gives", "before", "now"][: 1 + len(sides)], gap)
+
+
+def _errors(answer, sides, unit):
+    """The rows of the error on the plants that judged the answer, and on the nominal one."""
+    name = f"error, mean of {answer.before.samples} plants [{unit}]"
+    rows = [[name, *(_mean(s.error, s) for s in sides)]]
+    lost = answer.before.infeasible
+    if lost is not None and lost.any() and not lost.all():
+        name = f"  plants where every setpoint is reachable ({100 * np.mean(~lost):.0f} %)"
+        rows.append([name, *(_mean(s.error[~lost], s, of=~lost) for s in sides)])
+    nominal = [Value(error, 3) for error in answer.nominal.values()]
+    return [*rows, [f"error, nominal plant [{unit}]", *nominal]]
 
 
 def _margins(answer):
@@ -450,15 +458,9 @@ def _scenario_table(result):
 
 def _validation_table(result):
     """The objective and the limits on the validation set, before and after."""
-    checked, case = result.validation, result.case
+    checked = result.validation
     if not checked:
-        noise = any(run.key is not None for run in result.problem.runs)
-        why = (
-            "no validation on other plants: the rig names nothing that is uncertain. An [uncertain]"
-            ' table in its file ("plant.drain" = 0.05 for +-5 %) makes tune validate the answer'
-        )
-        stated = case.uncertain or case.covariance or noise
-        return [] if stated else [Text([why], gap=True)]
+        return _no_validation(result)
     rows, limited = [], bool(result.problem.limits)
     for side in SIDES:
         if (share := checked["limits_held"][side]) is not None:
@@ -475,6 +477,17 @@ def _validation_table(result):
     failed = f"; {checked['failed']} runs failed and are left out" if checked["failed"] else ""
     note = f"{_improved(checked)}; perturbed: {perturbed}{noise}{failed}"
     return [Table(rows, heads, gap=True), Text([note])]
+
+
+def _no_validation(result):
+    noise = any(run.key is not None for run in result.problem.runs)
+    if result.case.uncertain or result.case.covariance or noise:
+        return []
+    why = (
+        "no validation on other plants: the rig names nothing that is uncertain. An [uncertain]"
+        ' table in its file ("plant.drain" = 0.05 for +-5 %) makes tune validate the answer'
+    )
+    return [Text([why], gap=True)]
 
 
 def _improved(checked):
@@ -573,11 +586,15 @@ def figures(result, runs=None):
         rims = np.asarray(loop.plant.rim)
         phase = lambda ax: diagnostics.phase(ax, lines, between, rims, loop.units[0], loop.plant)
         drawings["inner"] = picture(phase, (5.0, 4.0), legend=3)
+<<<<<<< HEAD
     low, high = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
     if any(np.any(run.command > high) or np.any(run.command < low) for run in runs.values()):
         size = (6.4, 1.4 + 0.62 * len(runs) * loop.plant.pumps)
         strips = lambda ax: diagnostics.saturation(ax, runs, low, high, loop.plant)
         drawings["saturation"] = picture(strips, size, legend=2)
+=======
+    drawings |= _saturation(loop, runs)
+>>>>>>> 52223d1 (report, figures, cli: tables, panels and notes in named steps)
     observed = f"{name}, tuned: estimates of the observer"
     drawings |= estimates(loop, result.tuned.clock, runs["after"], observed)
     if result.cloud is not None and len(result.cloud["objective"]):
@@ -593,6 +610,19 @@ def figures(result, runs=None):
         of = (measure, ms.unit(measure, loop.units), unit)
         drawings["tradeoff"] = picture(lambda ax: diagnostics.tradeoff(ax, points, *of), (6.0, 3.6))
     return drawings
+
+
+def _saturation(loop, runs):
+    """{"saturation": when commands are beyond the limits of the pumps}; {} where none is."""
+    from jaxtank.plots import diagnostics
+    from jaxtank.plots.style import picture
+
+    low, high = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
+    if not any(np.any(run.command > high) or np.any(run.command < low) for run in runs.values()):
+        return {}
+    size = (6.4, 1.4 + 0.62 * len(runs) * loop.plant.pumps)
+    strips = lambda ax: diagnostics.saturation(ax, runs, low, high)
+    return {"saturation": picture(strips, size, legend=2)}
 
 
 def _level_limits(result):
