@@ -538,24 +538,27 @@ def _uses(statements, outputs):
     for e in outputs:
         read(e)
     for s in statements:
-        if isinstance(s, Define):
-            for i, e in enumerate(s.args):
-                read(e, 2 if s.op == "square" or i >= LAZY.get(s.op, 9) else 1)
-        elif isinstance(s, Array):
-            for e in s.entries:
-                read(e)
-        elif isinstance(s, Store):
-            read(s.index)
-            read(s.value)
-        elif isinstance(s, Until):
-            read(s.test)
-        elif isinstance(s, Loop):
+        if isinstance(s, Loop):
             inside = {inner.name for inner in s.body if isinstance(inner, Define)}
             for name, count in _uses(s.body, s.new).items():
                 counts[name] += count if name in inside else 2
-            for *_, start in s.carried:
-                read(start)
+        for e, times in _reads(s):
+            read(e, times)
     return counts
+
+
+def _reads(s):
+    """[(expression, how often it is read)] of a statement, without the body of a loop."""
+    if isinstance(s, Define):
+        twice = lambda i: s.op == "square" or i >= LAZY.get(s.op, 9)
+        return [(e, 2 if twice(i) else 1) for i, e in enumerate(s.args)]
+    if isinstance(s, Array):
+        return [(e, 1) for e in s.entries]
+    if isinstance(s, Store):
+        return [(s.index, 1), (s.value, 1)]
+    if isinstance(s, Until):
+        return [(s.test, 1)]
+    return [(start, 1) for *_, start in s.carried] if isinstance(s, Loop) else []
 
 
 def library(text: str) -> list[str]:

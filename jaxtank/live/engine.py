@@ -189,9 +189,6 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
     loop, clock, plant = case.loop, case.clock, case.loop.plant
     free = bounds(loop, case.free) if case.free else []
     length, drive = loop.units
-    homes = {leaf: variant.case for variant in reversed(loops) for leaf in variant.leaves}
-    leaves = [leaf_of(homes[leaf], *leaf) for leaf in sorted(homes, key=lambda leaf: leaf[0])]
-    rims = [float(v) for v in np.broadcast_to(np.asarray(plant.rim), (plant.tanks,))]
     return {
         "case": case.name,
         "title": case.title,
@@ -200,10 +197,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         "duration": clock.duration,
         "samples": clock.samples,
         "save_every_default": max(1, clock.samples // ROWS),
-        "tanks": [
-            {"name": label_of(plant, "tank", i), "rim": v if np.isfinite(v) else None}
-            for i, v in enumerate(rims)
-        ],
+        "tanks": _tanks(case),
         "outputs": [int(i) for i in plant.outputs],
         "pumps": [
             {
@@ -213,7 +207,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
             }
             for j in range(plant.pumps)
         ],
-        "leaves": leaves,
+        "leaves": _leaves(loops),
         "measures": [_measure(case, m, entries) for m, entries in loops[-1].measures.items()],
         "limits": _limits(case),
         "free": [b.name for b in free],
@@ -230,6 +224,21 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         "noise": bool(np.any(np.asarray(loop.sensor.noise) > 0)),
         "tracks": not isinstance(loop.controller, OpenLoop),
     }
+
+
+def _tanks(case):
+    plant = case.loop.plant
+    rims = [float(v) for v in np.broadcast_to(np.asarray(plant.rim), (plant.tanks,))]
+    return [
+        {"name": label_of(plant, "tank", i), "rim": rim if np.isfinite(rim) else None}
+        for i, rim in enumerate(rims)
+    ]
+
+
+def _leaves(loops):
+    """The sliders of all loops, those of the first where several have one."""
+    homes = {leaf: variant.case for variant in reversed(loops) for leaf in variant.leaves}
+    return [leaf_of(homes[leaf], *leaf) for leaf in sorted(homes, key=lambda leaf: leaf[0])]
 
 
 def _measure(case, name, entries):

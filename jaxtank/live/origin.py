@@ -58,23 +58,24 @@ def _guard(case, known):
 
 def _static(case, known):
     """--set of the static fields and the clock that differ; None where the structure does."""
-    changes = []
-    shapes = [
-        {n: np.shape(v) for n, v in parameters(c.loop).items() if not n.startswith(GUARD)}
-        for c in (case, known)
-    ]
     mine, theirs = (dict(_fields(c.loop)) for c in (case, known))
-    if shapes[0] != shapes[1] or mine.keys() != theirs.keys():
+    if _shapes(case.loop) != _shapes(known.loop) or mine.keys() != theirs.keys():
         return None
-    for name, value in mine.items():
-        if value != theirs[name]:
-            if isinstance(value, tuple) or value is None:
-                return None
-            changes.append((name, str(value).lower() if isinstance(value, bool) else value))
+    changes = {name: value for name, value in mine.items() if value != theirs[name]}
+    if any(value is None or isinstance(value, tuple) for value in changes.values()):
+        return None
     for name in CLOCK_UNITS:
         if getattr(case.clock, name) != getattr(known.clock, name):
-            changes.append((f"clock.{name}", getattr(case.clock, name)))
-    return [word for name, value in changes for word in ("--set", shlex.quote(f"{name}={value}"))]
+            changes[f"clock.{name}"] = getattr(case.clock, name)
+    words = []
+    for name, value in changes.items():
+        text = str(value).lower() if isinstance(value, bool) else value
+        words += ["--set", shlex.quote(f"{name}={text}")]
+    return words
+
+
+def _shapes(loop):
+    return {n: np.shape(v) for n, v in parameters(loop).items() if not n.startswith(GUARD)}
 
 
 def _fields(loop):

@@ -123,9 +123,7 @@ def _check_parts(
         check_caught(model, name)
     if loop.safety_filter is not None:
         check_plain(loop.plant, "safety_filter", "run without the filter")
-    faults = loop.faults if isinstance(loop.faults, Faults) else None
-    if faults and not _traced(faults, loop.plant) and (wrong := faults.problems(loop.plant, clock)):
-        raise InputError("; ".join(wrong))
+    _check_faults(loop, clock)
     loop.actuator.check()
     if not _traced(loop.controller, loop.reference):
         loop.controller.check(loop.reference)
@@ -134,8 +132,20 @@ def _check_parts(
     loop.observer.check(loop.plant)
     if not _traced(loop.observer):
         loop.observer.check_clock(clock)
+    if key is None:
+        _check_noise(loop)
+
+
+def _check_faults(loop: ClosedLoop, clock: Clock) -> None:
+    faults = loop.faults if isinstance(loop.faults, Faults) else None
+    if faults and not _traced(faults, loop.plant) and (wrong := faults.problems(loop.plant, clock)):
+        raise InputError("; ".join(wrong))
+
+
+def _check_noise(loop: ClosedLoop) -> None:
+    """Raise InputError for a noisy sensor, of a run without a key."""
     noise = loop.sensor.noise
-    if key is None and not _traced(noise) and np.any(np.asarray(noise) > 0):
+    if not _traced(noise) and np.any(np.asarray(noise) > 0):
         raise InputError(
             f"sensor.noise = {np.asarray(noise)} {loop.units[0]}: give a key (or --seed), or set it"
             " to 0"

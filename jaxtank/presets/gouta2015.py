@@ -76,21 +76,15 @@ def _claims(run, ramp):
     lowest, highest = float(np.min(actuator.low)), float(np.max(actuator.high))
     near, far = map(total, pair)
     errors = f"total RMS error {near:.4f} cm (NGPC), {far:.3f} cm (backstepping)"
-    growth = [100.0 * (total(t) / total(free) - 1.0) for t, free in zip(pair, unlimited)]
     travel = [float(np.abs(np.diff(t.u, axis=0)).sum()) for t in pair]
     effort = [np.sqrt((t.u**2).mean(axis=0)) for t in pair]
     commands = [(float(t.command.min()), float(t.command.max())) for t in pair]
-    top = [float(t.x.max()) for t in pair]
-    low = [100.0 * float((t.x < 3.0).any(axis=1).mean()) for t in pair]
-    bottom = [float(t.x.min()) for t in pair]
     weak = [100.0 * (t.u <= 3.0).mean(axis=0) for t in pair]
-    beyond = [outside(t) for t in unlimited]
-    words = "{:.2f} {unit} (NGPC), {:.2f} {unit} (backstepping)".format
     return {
         "tracking error": Claim((near < 0.1, far > near), f"{errors} (negligible: below 0.1 cm)"),
         "which tracks better": Claim(far < near, errors),
         "which moves the pumps less": Claim(
-            travel[1] < travel[0], f"total variation of both inputs {words(*travel, unit='V')}"
+            travel[1] < travel[0], f"total variation of both inputs {_pair(travel, 'V')}"
         ),
         "inputs within the limits of the pumps": Claim(
             [lowest < least and most < highest for least, most in commands],
@@ -98,14 +92,7 @@ def _claims(run, ramp):
                 *commands[0], *commands[1]
             ),
         ),
-        "levels below the rims": Claim(
-            [h <= 30.0 for h in top], f"the highest level is {words(*top, unit='cm')}"
-        ),
-        "levels above 3 cm": Claim(
-            [share == 0.0 for share in low],
-            f"a level is below 3 cm for {words(*low, unit='%')} of the time; the lowest is"
-            f" {words(*bottom, unit='cm')}",
-        ),
+        **_levels(pair),
         "voltages of 3 V and less": Claim(
             [bool(np.all(share > 10.0)) for share in weak],
             "pumps 1 and 2 are there for {:.1f} and {:.1f} % (NGPC), {:.1f} and {:.1f} %"
@@ -117,17 +104,46 @@ def _claims(run, ramp):
                 *effort[0], *effort[1]
             ),
         ),
+        **_without_limits(pair, unlimited),
+        **_responses(pair, ramp),
+        "NGPC follows the setpoint's rate": _ise(run, pair[0]),
+    }
+
+
+def _pair(values, unit):
+    return f"{values[0]:.2f} {unit} (NGPC), {values[1]:.2f} {unit} (backstepping)"
+
+
+def _levels(pair):
+    top = [float(t.x.max()) for t in pair]
+    low = [100.0 * float((t.x < 3.0).any(axis=1).mean()) for t in pair]
+    bottom = [float(t.x.min()) for t in pair]
+    return {
+        "levels below the rims": Claim(
+            [h <= 30.0 for h in top], f"the highest level is {_pair(top, 'cm')}"
+        ),
+        "levels above 3 cm": Claim(
+            [share == 0.0 for share in low],
+            f"a level is below 3 cm for {_pair(low, '%')} of the time; the lowest is"
+            f" {_pair(bottom, 'cm')}",
+        ),
+    }
+
+
+def _without_limits(pair, unlimited):
+    """The same runs with pumps that have no limits."""
+    beyond = [outside(t) for t in unlimited]
+    growth = [100.0 * (total(t) / total(free) - 1.0) for t, free in zip(pair, unlimited)]
+    return {
         "commands outside the range without limits": Claim(
             [share > 10.0 for share in beyond],
-            f"{words(*beyond, unit='%')} of the samples (counts if more than 10 %)",
+            f"{_pair(beyond, '%')} of the samples (counts if more than 10 %)",
         ),
         "effect of the limits on the error": Claim(
             (growth[0] > 10.0, abs(growth[1]) < 1.0),
-            f"total RMS error grows by {words(*growth, unit='%')} (counts if NGPC's grows by more"
+            f"total RMS error grows by {_pair(growth, '%')} (counts if NGPC's grows by more"
             " than 10 %, that of backstepping by less than 1 %)",
         ),
-        **_responses(pair, ramp),
-        "NGPC follows the setpoint's rate": _ise(run, pair[0]),
     }
 
 

@@ -93,6 +93,11 @@ def words_of(value: Any) -> list[str]:
         return [f"{value.dtype} {value.shape}", hashlib.sha256(value.tobytes()).hexdigest()]
     if isinstance(value, jax.tree_util.PyTreeDef):
         return words_of_tree(value)
+    return _words_of_structure(value)
+
+
+def _words_of_structure(value: Any) -> list[str]:
+    """The same of names, containers and data classes."""
     if isinstance(value, enum.Enum):
         return [name_of(type(value)), value.name]
     if isinstance(value, type | types.FunctionType):

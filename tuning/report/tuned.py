@@ -586,15 +586,7 @@ def figures(result, runs=None):
         rims = np.asarray(loop.plant.rim)
         phase = lambda ax: diagnostics.phase(ax, lines, between, rims, loop.units[0], loop.plant)
         drawings["inner"] = picture(phase, (5.0, 4.0), legend=3)
-<<<<<<< HEAD
-    low, high = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
-    if any(np.any(run.command > high) or np.any(run.command < low) for run in runs.values()):
-        size = (6.4, 1.4 + 0.62 * len(runs) * loop.plant.pumps)
-        strips = lambda ax: diagnostics.saturation(ax, runs, low, high, loop.plant)
-        drawings["saturation"] = picture(strips, size, legend=2)
-=======
     drawings |= _saturation(loop, runs)
->>>>>>> 52223d1 (report, figures, cli: tables, panels and notes in named steps)
     observed = f"{name}, tuned: estimates of the observer"
     drawings |= estimates(loop, result.tuned.clock, runs["after"], observed)
     if result.cloud is not None and len(result.cloud["objective"]):
@@ -621,7 +613,7 @@ def _saturation(loop, runs):
     if not any(np.any(run.command > high) or np.any(run.command < low) for run in runs.values()):
         return {}
     size = (6.4, 1.4 + 0.62 * len(runs) * loop.plant.pumps)
-    strips = lambda ax: diagnostics.saturation(ax, runs, low, high)
+    strips = lambda ax: diagnostics.saturation(ax, runs, low, high, loop.plant)
     return {"saturation": picture(strips, size, legend=2)}
 
 
