@@ -17,7 +17,7 @@ LARGER = {
     "jaxtank/plots/equations.py": {"_of_elements": 18, "_streams": 25},
     "jaxtank/plots/layout.py": {"_with_pumps": 18},
     "jaxtank/plots/overview.py": {"overview": 16},
-    "jaxtank/plots/schematic.py": {"schematic": 16},
+    "jaxtank/plots/schematic.py": {"schematic": 17},
     "jaxtank/rig/entry.py": {"_curve": 16, "written": 17},
     "jaxtank/rig/network.py": {"_check_links": 21, "_columns": 21, "_vessel": 23, "entries_of": 19},
     "jaxtank/rig/read.py": {"_top": 16},
