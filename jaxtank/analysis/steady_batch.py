@@ -75,8 +75,9 @@ class SteadyStates:
     def _of_elements(self, y):
         with jax.enable_x64(True):
             x, u, left, size = _many_at_rest(self.plant, self.own, self.inflow, y)
-        at_rest = np.asarray(left <= 1e-9 * size)[..., None]
-        return tuple(np.where(at_rest, np.stack(v, axis=-1), np.nan) for v in (x, u))
+        still = np.asarray(left <= 1e-9 * size)[..., None]
+        x, u = (np.where(still, np.stack(v, axis=-1), np.nan) for v in (x, u))
+        return x, u
 
     def _affine(self):
         """Speeds (N, n, m) and inputs (N, m, m) by controlled speeds, and of the inflow."""
