@@ -148,18 +148,11 @@ def _box(case, widths):
     """({parameter: half width} of the box that the case describes, with `widths` in the place of
     the plant's, the factor by which inflow disturbances may be larger than they are).
     """
-    shares, box = dict(case.uncertain), {}
-    present = (name for name in UNKNOWN if getattr(case.loop.plant, name) is not None)
-    flows: dict[str, float] = {name: SPREAD for name in present}
-    if case.covariance is not None:
-        names, matrix = case.covariance
-        at = [i for i, name in enumerate(names) if not name.startswith(HARMLESS)]
-        sigma = np.sqrt(np.diag(np.asarray(matrix, dtype=float)))[at]
-        reach = np.sqrt(2.0 * scipy.special.gammaincinv(0.5 * max(len(at), 1), PROBABILITY))
-        box = dict(zip([names[i] for i in at], reach * sigma))
-        flows = {}  # what the covariance leaves out is exact, unless `uncertain` names it
-    plant = {n: s for n, s in shares.items() if n.startswith("plant.")} or flows
-    if widths is not None:
+    box = {} if case.covariance is None else _box_of_covariance(*case.covariance)
+    if widths is None:
+        for name, half in widths_of(case.loop.plant, _plant_shares(case)).items():
+            box[name] = np.maximum(half, box.get(name, 0.0))
+    else:
         box = {n: w for n, w in box.items() if not n.startswith("plant.")} | dict(widths)
     more = 1.0
     for name, share in dict(case.uncertain).items():
@@ -188,7 +181,7 @@ def _plant_shares(case):
     shares = {n: s for n, s in dict(case.uncertain).items() if n.startswith("plant.")}
     if shares or case.covariance is not None:  # what a covariance leaves out is exact
         return shares
-    return {name: SPREAD for name in FLOWS if getattr(case.loop.plant, name) is not None}
+    return {name: SPREAD for name in UNKNOWN if getattr(case.loop.plant, name) is not None}
 
 
 def _disturbances(loop, clock):
