@@ -84,6 +84,12 @@ def symbol(plant: Any, letter: str, kind: str, index: int) -> str:
     return f"{letter}_{name}" if name else f"{letter}{index + 1}"
 
 
+def input_unit(plant: Any, index: int, drive: str) -> str:
+    """Return the unit of an input: a valve's is its opening, in % where the rig's inputs are."""
+    is_valve = getattr(plant, "valves", ()) and index >= len(plant.feeds)
+    return "-" if is_valve and drive != "%" else drive
+
+
 def short(plant: Any, kind: str, index: int) -> Any:
     """Return the name of an entry, or its number from 1: what a column headed "tank" shows."""
     return name_of(plant, kind, index) or index + 1

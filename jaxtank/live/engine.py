@@ -17,7 +17,7 @@ from jaxtank import measures as ms
 from jaxtank.bounds import bounds
 from jaxtank.case import Case, Free
 from jaxtank.controllers import OpenLoop
-from jaxtank.core.labels import label_of
+from jaxtank.core.labels import input_unit, label_of
 from jaxtank.core.tree import describe, get_value
 from jaxtank.export.whole import WholeLoop, library, whole_loop
 from jaxtank.limits import limit_scale, resolve_limits
@@ -202,6 +202,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         "pumps": [
             {
                 "name": label_of(plant, "pump", j),
+                "unit": input_unit(plant, j, drive),
                 "lower": float(loop.actuator.low[j]),
                 "upper": float(loop.actuator.high[j]),
             }

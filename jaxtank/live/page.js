@@ -724,7 +724,7 @@ function makeCharts() {
     setTimeout(() => (drawn = false));
   };
   const on = { cursor: atTime, zoom: once, whole: () => zoom(0, info.duration) };
-  const { length, drive } = info.units;
+  const { length } = info.units;
   info.tanks.forEach((tank, i) => {
     const rim = rimOf(i), output = info.outputs.indexOf(i);
     const limits = rim === null || rim === undefined ? [] : [{
@@ -744,10 +744,10 @@ function makeCharts() {
   info.pumps.forEach((pump, j) => {
     const ends = ["lower", "upper"].map((end) => ({
       get value() { return pumpOf(j)[end]; },
-      get words() { return end === "upper" ? `at most ${shown(pumpOf(j).upper)} ${drive}` : ""; },
+      get words() { return end === "upper" ? `at most ${shown(pumpOf(j).upper)} ${pump.unit}` : ""; },
     }));
     charts.push(makeChart($("panels"), {
-      kind: "input", what: "u", index: j, unit: drive, zero: true, title: `${pump.name} [${drive}]`,
+      kind: "input", what: "u", index: j, unit: pump.unit, zero: true, title: `${pump.name} [${pump.unit}]`,
       limits: ends.filter(({ value }) => Number.isFinite(value) && Math.abs(value) < 100 * (1 + Math.abs(info.pumps[j].typical ?? 1))),
     }, view, on));
   });

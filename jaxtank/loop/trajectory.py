@@ -12,7 +12,7 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxtank.core.jsonable import clean
-from jaxtank.core.labels import symbol
+from jaxtank.core.labels import input_unit, symbol
 from jaxtank.core.units import DEFAULT, local
 from jaxtank.views import TrajectoryViews
 
@@ -145,7 +145,9 @@ def columns(
             for i, column in enumerate(np.asarray(getattr(run, field)).T):
                 kind = {"r": "output", "u": "pump", "command": "pump", "share": "pump"}
                 key = symbol(plant, name, kind.get(name, "tank"), i)
-                table[key, local(unit, units)] = column
+                drives = name in ("u", "command")
+                unit_of_entry = input_unit(plant, i, units[1]) if drives else local(unit, units)
+                table[key, unit_of_entry] = column
     if dimension is None:
         return {f"{name} [{unit}]": values for (name, unit), values in table.items()}
     return {

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.colors import BoundaryNorm
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.labels import label_of
+from jaxtank.core.labels import input_unit, label_of
 from jaxtank.plots.overview import NAMED, worst
 from jaxtank.plots.spills import above_rim, spill_note, spilled
 from jaxtank.plots.style import (
@@ -183,7 +183,8 @@ def _rows(loop, runs, which, limits):
 
     def voltage_of(j):
         ends = float(low[j]), float(high[j])
-        return lambda ax: voltage(ax, runs, j, *ends, drive, loop.plant)
+        unit = input_unit(loop.plant, j, drive)
+        return lambda ax: voltage(ax, runs, j, *ends, unit, loop.plant)
 
     kinds = [
         [level_of(i, k) for k, i in outputs],
