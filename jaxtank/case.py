@@ -11,6 +11,7 @@ from jaxtank.core.jsonable import clean
 from jaxtank.core.tree import describe, get_value, parameters, walk
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.measures import MEASURES, unit
+from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.safety import SafetyFilter, TankCertificate, design_for
 from jaxtank.safety.of_case import SPREAD, UNKNOWN
 from jaxtank.views import CaseViews
@@ -225,7 +226,10 @@ def uncertain_shares(case: Case) -> dict[str, float]:
     if case.uncertain or case.covariance is not None:
         return dict(case.uncertain)
     values = parameters(case.loop)
-    shares = {f"plant.{n}": SPREAD for n in UNKNOWN if np.size(values.get(f"plant.{n}", ()))}
+    # of a custom plant, a leaf named "valve" may be anything
+    elements = isinstance(case.loop.plant, TankNetwork)
+    names = UNKNOWN if elements else [n for n in UNKNOWN if n not in ("valve", "extent")]
+    shares = {f"plant.{n}": SPREAD for n in names if np.size(values.get(f"plant.{n}", ()))}
     if np.max(np.asarray(values.get("plant.split", 0.0)), initial=0.0) * (1.0 + SPREAD) > 1.0:
         shares.pop("plant.split")
     return shares or {"sensor.noise": SPREAD}

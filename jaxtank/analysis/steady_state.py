@@ -454,6 +454,9 @@ def equilibrium(
     """
     y = np.asarray(y, dtype=float)
     length, drive = plant.units
+    if not hasattr(plant, "links"):
+        kind = type(plant).__name__
+        raise EquilibriumError(f"a {kind} is no TankNetwork: its steady states are not known")
     for i, level in zip(plant.outputs, y):
         if not (np.isfinite(level) and level >= 0):
             raise InputError(

@@ -52,6 +52,9 @@ class Plant(abc.ABC):
     bottom: bool = False
     """True where a level stops at zero whatever is drawn from it."""
 
+    plain: bool = False
+    """True of a `TankNetwork` without valves, transfer pumps, curves, ports and shaped tanks."""
+
     by_volume: bool = False
     """True where the cross-section of a tank changes with its level: the volumes are integrated, by
     the methods `stored`, `levels` and `net_flows` of the class."""

@@ -435,7 +435,8 @@ def _entry_of(loop, target, i):
         return 0.0
     path = target.split(".")
     part = int(path.pop()) if path[-1].isdigit() else None
-    value = functools.reduce(getattr, path, loop)
+    # a custom actuator or sensor need not have what the tables of a rig may give
+    value = functools.reduce(lambda part, name: getattr(part, name, None), path, loop)
     if value is None or (isinstance(value, tuple) and not value):  # not in use
         return None
     if not isinstance(value, tuple) and np.ndim(value) == 0:  # one number for all tanks

@@ -654,7 +654,7 @@ def test_slopes_of_the_prototype_through_150_programmes(samples):
                 "actuator.initial": 3.6,
                 "actuator.high": 2.0,
             },
-            r"actuator.low\[0\] = 0 U0 to 2 U0: must meet",
+            r"actuator.low\[0\] = 0 U0, actuator.high\[0\] = 2 U0: the range must overlap",
         ),
     ],
 )

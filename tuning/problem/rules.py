@@ -32,6 +32,7 @@ from jaxtank.controllers import PID, Controller, SplitRange
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
+from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.signals.setpoints import ramps
 from tuning.problem.controllers import operating_point
 
@@ -343,6 +344,8 @@ def serves(case: Case) -> bool:
     controller = case.loop.controller
     if not isinstance(controller, PID) or controller.order is not None:
         return False
+    if not isinstance(case.loop.plant, TankNetwork):  # its steady states are not known
+        return False
     return controller.Ti is None or bool(np.all(np.isfinite(controller.Ti)))
 
 
@@ -353,8 +356,8 @@ def rule_gains(case: Case, rule: str) -> dict[str, float]:
     controller: Any = case.loop.controller
     if not serves(case):
         raise InputError(
-            f"rule {rule}: is for controllers p, pi, pid and split-range, and not for"
-            f" {type(controller).__name__}"
+            f"rule {rule}: is for controllers p, pi, pid and split-range of a TankNetwork, and not"
+            f" for {type(controller).__name__} of {type(case.loop.plant).__name__}"
         )
     parts = "p" + "i" * (controller.Ti is not None) + "d" * (controller.Td is not None)
     values: dict[str, float] = {}

@@ -367,8 +367,8 @@ def test_tanks_and_pumps_are_called_by_their_names(tmp_path, capsys):
     path = tmp_path / "rig.toml"
     path.write_text(text.replace("[[pump]]", '[[pump]]\nname = "P-101"').replace("5.0", "90.0"))
     sentences = rig.case_warnings(rig.load(path))
-    assert sentences[0].startswith("tank 1 ('left') starts at 31 cm")
-    assert "above the rim of tank 1 ('left')" in sentences[1]
+    assert sentences[0].startswith("left starts at 31 cm")
+    assert "above the rim of left" in sentences[1]
     assert main.main(["show", str(path)]) == 0
     printed, notes = capsys.readouterr()
     assert "h1 (left)" in printed and "pump 1 is 'P-101'" in printed

@@ -81,7 +81,7 @@ def test_a_filtered_case_comes_back_from_its_rig_file():
     ("lines", "words"),
     [
         ("rate = -1.0", r"safety_filter\.rate = -1"),
-        ("limits = [1.0, 2.0]", "nearest: limit"),
+        ("limits = [1.0, 2.0]", r"\[limits\] is a table of its own"),
         ("limit = [1.0]", r"safety_filter\.limit"),
         ('widths = { "plant.drian" = 0.1 }', r"plant\.drian"),
     ],
