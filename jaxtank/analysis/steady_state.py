@@ -420,6 +420,20 @@ def steady_levels(plant, u):
     return speeds * speeds / (2.0 * plant.gravity)
 
 
+def _check_setpoints(plant: Any, y: Any) -> None:
+    """Raise unless the plant is a network of tanks, and its setpoints y (outputs,) are levels."""
+    if not hasattr(plant, "links"):
+        kind = type(plant).__name__
+        raise EquilibriumError(f"a {kind} is no TankNetwork: its steady states are not known")
+    length = plant.units[0]
+    for i, level in zip(plant.outputs, y):
+        if not (np.isfinite(level) and level >= 0):
+            raise InputError(
+                f"setpoint of {label_of(plant, 'tank', i)} = {level} {length}: must be a finite"
+                f" level at or above 0 {length}"
+            )
+
+
 def equilibrium(
     plant: Any, y: Any, inflow: Any = None, low: Any = 0.0, shared: Any = None
 ) -> tuple[Any, Any]:
@@ -454,15 +468,7 @@ def equilibrium(
     """
     y = np.asarray(y, dtype=float)
     length, drive = plant.units
-    if not hasattr(plant, "links"):
-        kind = type(plant).__name__
-        raise EquilibriumError(f"a {kind} is no TankNetwork: its steady states are not known")
-    for i, level in zip(plant.outputs, y):
-        if not (np.isfinite(level) and level >= 0):
-            raise InputError(
-                f"setpoint of {label_of(plant, 'tank', i)} = {level} {length}: must be a finite"
-                f" level at or above 0 {length}"
-            )
+    _check_setpoints(plant, y)
     at = ", ".join(f"{v:g}" for v in y)
     words = f"outputs ({at}) {length}"
     if inflow is not None:

@@ -1,6 +1,7 @@
 """The equations of a rig in plain text, read from its topology: with letters, and in numbers."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -69,7 +70,10 @@ def _of_elements(plant, disturbed):
 def _streams(plant):
     """(from, to, flow in numbers) of each opening, pump and valve, closed ones left out."""
     root = float(np.sqrt(2.0 * float(plant.gravity)))
-    of = lambda name, k: None if getattr(plant, name) is None else float(getattr(plant, name)[k])
+
+    def of(name: str, k: int) -> Any:
+        value = getattr(plant, name)
+        return None if value is None else float(value[k])
 
     def head(kind, k, i):
         port = of(f"{kind}_port", k)

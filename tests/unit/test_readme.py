@@ -156,7 +156,7 @@ def test_the_custom_controller_is_tuned(capsys):
 
 def test_the_rigs_shown_are_the_one_that_is_tested():
     (short,), rigs = blocks("toml", "README.md"), blocks("toml", "jaxtank/README.md")
-    full, plant, watched = rigs
+    full, plant, elements, watched = rigs
     assert full == RIG.read_text()
     assert tomllib.loads(short) == tomllib.loads(full)
     assert len([line for line in short.splitlines() if line.strip()]) <= 15
@@ -168,6 +168,10 @@ def test_the_rigs_shown_are_the_one_that_is_tested():
     assert jax.tree.structure(built.loop) == jax.tree.structure(preset.loop)
     assert built.loop.observer.l.tolist() == preset.loop.observer.l.tolist()
     assert built.free.keys() < preset.free.keys()
+    more = 'reachable = false\ncontroller = { kind = "open-loop", initial = [6.0, 0.5] }\n'
+    process = rig.loads(more + elements).loop.plant
+    assert dict(process.names)["tank"] == ("T100", "LT101") and process.sources == (0,)
+    assert process.valves == ((1, None),) and process.shapes == ("prism", "cone")
 
 
 def test_what_the_page_states_of_outputs_holds():

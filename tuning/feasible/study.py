@@ -527,7 +527,8 @@ def _pumps(needs: Needs) -> Mend | None:
     tanks, whole = needs.rim.shape[1], needs.high.shape[1]
     if np.ptp(needs.high[:, tanks:], axis=0).any():
         return None
-    pumps = np.arange(tanks, tanks + len(needs.case.loop.plant.feeds))  # a valve opens to 1 at most
+    plant: Any = needs.case.loop.plant
+    pumps = np.arange(tanks, tanks + len(plant.feeds))  # a valve opens to 1 at most
     return _raised(needs, "pumps", "actuator.high", tanks, pumps, whole)
 
 
