@@ -119,7 +119,8 @@ def streams(net: Any, x: Any, u: Any) -> list[Stream]:
     flows = []
 
     def head(source: int, ports: Any, k: int) -> Any:
-        return x[source] if ports is None else x[source] - ports[k]
+        # an opening above the level is dry: no flow, in either direction
+        return x[source] if ports is None else lower_clip(x[source] - ports[k], 0.0)
 
     outlets = [(i, None) for i in range(net.tanks)]
     for kind, pairs in (("drain", outlets), ("orifice", net.links)):

@@ -115,3 +115,27 @@ def test_a_pump_that_draws_takes_no_more_than_the_tank_holds():
     for _ in range(30):
         x = advance(plant, "rk4", 0.0, x, (0.05,), None, 1.0, 1).x
     np.testing.assert_allclose(x, [0.0, 0.5], atol=1e-9)
+
+
+@pytest.mark.parametrize("opening", ["drain", "orifice", "pipe", "valve"])
+def test_an_opening_above_the_level_is_dry(opening):
+    sizes = {"drain": 0.0, "orifice": 0.0, "pipe": 0.0, "valve": 1e-9} | {opening: 0.01}
+    plant = network(
+        area=[1.0, 1.0],
+        drain=[sizes["drain"], 0.0],
+        links=[(0, 1)],
+        orifice=sizes["orifice"],
+        pipes=[(0, 1)],
+        pipe=sizes["pipe"],
+        valves=[(0, None)],
+        valve=sizes["valve"],
+        pump_gain=1.0,
+        feeds=[(0, None)],
+        rim=5.0,
+        ports={opening: 0.5},
+        units=("m", "m^3/s"),
+    )
+    rates = lambda level: plant.derivative(0.0, (level, 0.2), (0.0, 1.0), None)
+    np.testing.assert_allclose(rates(0.3), 0.0, atol=1e-8)
+    speed = np.sqrt(2.0 * 9.81 * 0.25)
+    assert float(rates(0.75)[0]) == pytest.approx(-0.01 * speed, rel=1e-3)
