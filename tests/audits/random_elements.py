@@ -53,7 +53,11 @@ def random_rig(seed):
         "valve": rng.uniform(1e-3, 4e-3, 2),
         "characteristics": ["equal-percentage", ((0.0, 0.0), (0.5, 0.2), (1.0, 1.0))],
         "rangeability": 30.0,
-        "ports": {"orifice": rng.uniform(0.02, 0.2, 2), "valve": [0.05, 0.1], "pipe": [0.03]},
+        "ports": {  # the second orifice is above all levels, and dry
+            "orifice": [float(rng.uniform(0.02, 0.2)), 0.97 * height[links[1][0]]],
+            "valve": [0.05, 0.1],
+            "pipe": [0.03],
+        },
         "exponents": {"drain": rng.uniform(0.4, 1.6, n)},
         "resistances": {"orifice": rng.uniform(200.0, 900.0, 2)},
         "gravity": GRAVITY,
@@ -134,12 +138,9 @@ def net_flows(rig, x, u):
     for i, (area, exponent) in enumerate(zip(rig["drain"], rig["exponents"]["drain"])):
         move(i, None, area * w * max(x[i], 0.0) ** exponent)
     for k, (i, j) in enumerate(rig["links"]):
-        head = x[i] - rig["ports"]["orifice"][k]
+        head = max(x[i] - rig["ports"]["orifice"][k], 0.0)
         move(
-            i,
-            j,
-            rig["orifice"][k] * w * math.sqrt(max(head, 0.0))
-            + head / rig["resistances"]["orifice"][k],
+            i, j, rig["orifice"][k] * w * math.sqrt(head) + head / rig["resistances"]["orifice"][k]
         )
     for k, (i, j) in enumerate(rig["pipes"]):
         port = rig["ports"]["pipe"][k]
