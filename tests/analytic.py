@@ -1,4 +1,4 @@
-"""Problems with a closed form, in the place of a Problem and of its Evaluator."""
+"""Problems with a closed form, instead of a Problem and its Evaluator."""
 
 from types import SimpleNamespace
 

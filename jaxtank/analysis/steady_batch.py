@@ -74,8 +74,8 @@ class SteadyStates:
 
     def _of_elements(self, y):
         with jax.enable_x64(True):
-            x, u, left, size = _many_at_rest(self.plant, self.own, self.inflow, y)
-        still = np.asarray(left <= 1e-9 * size)[..., None]
+            x, u, imbalance, size = _many_at_rest(self.plant, self.own, self.inflow, y)
+        still = np.asarray(imbalance <= 1e-9 * size)[..., None]
         x, u = (np.where(still, np.stack(v, axis=-1), np.nan) for v in (x, u))
         return x, u
 
@@ -168,9 +168,9 @@ def _many_at_rest(plant, leaves, inflow, outputs):
 
     def at(leaves, inflow, y):
         net = dataclasses.replace(plant, **leaves)
-        x, u, left = at_rest(net, y, inflow)
+        x, u, imbalance = at_rest(net, y, inflow)
         flows = [jnp.abs(s.flow) for s in elements.streams(net, x, u)]
-        return x, u, left, jnp.max(jnp.stack(flows))
+        return x, u, imbalance, jnp.max(jnp.stack(flows))
 
     return jax.vmap(jax.vmap(at, in_axes=(None, None, 0)))(leaves, inflow, outputs)
 

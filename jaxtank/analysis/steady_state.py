@@ -170,7 +170,7 @@ def at_rest(plant, y, inflow=None, start=None, shared=None):
             x[i] = value
         return tuple(x), tuple(z[m:] if shared is None else shared(z[m:]))
 
-    def left(z):
+    def imbalance(z):
         x, u = split(z)
         return jnp.stack(elements.net_flows(plant, x, u, inflow))
 
@@ -203,8 +203,8 @@ def at_rest(plant, y, inflow=None, start=None, shared=None):
         # a product with the inverse is linear in b, as its transpose in reverse mode must be
         return jax.vmap(elimination.solve, in_axes=(None, 0))(A, eye).T @ b
 
-    z = jax.lax.custom_root(left, jax.lax.stop_gradient(z), solve, tangent)
-    return *split(z), jnp.max(jnp.abs(left(z)))
+    z = jax.lax.custom_root(imbalance, jax.lax.stop_gradient(z), solve, tangent)
+    return *split(z), jnp.max(jnp.abs(imbalance(z)))
 
 
 def _middle(plant):
@@ -564,9 +564,9 @@ def _rest_of_elements(plant, y, words, inflow, shared):
     solve = _at_rest if shared is None else jax.jit(functools.partial(at_rest, shared=shared))
     with jax.enable_x64(True):
         exact = jax.tree.map(lambda v: np.asarray(v, dtype=float), (plant, y, inflow))
-        x, u, left = jax.tree.map(np.asarray, solve(*exact))
+        x, u, imbalance = jax.tree.map(np.asarray, solve(*exact))
         flows = [float(np.abs(s.flow)) for s in elements.streams(exact[0], x, u)]
-    if not left <= 1e-9 * max(flows):
+    if not imbalance <= 1e-9 * max(flows):
         raise EquilibriumError(f"{words} have no steady state")
     return np.array(x), np.array(u)
 

@@ -73,11 +73,11 @@ class SplitRange(PID):
         go on beyond their ranges, so that `total` is v.
         """
         spans, inputs = self._spans(), [0.0] * self.model.pumps
-        for i, own in enumerate(self.sequence):
+        for i, members in enumerate(self.sequence):
             rest = v[i]
-            for k, j in enumerate(own):
+            for k, j in enumerate(members):
                 part = rest if k == 0 else lower_clip(rest, 0.0)
-                if k < len(own) - 1:
+                if k < len(members) - 1:
                     part = part - lower_clip(part - spans[j], 0.0)
                 rest = rest - spans[j]
                 if self.span is not None:
@@ -93,7 +93,7 @@ class SplitRange(PID):
             above = self.high[j] - u[j] if j in self.reverse else u[j] - self.low[j]
             return above if self.span is None else above * (spans[j] / (self.high[j] - self.low[j]))
 
-        return tuple(total(tuple(part(j) for j in own)) for own in self.sequence)
+        return tuple(total(tuple(part(j) for j in members)) for members in self.sequence)
 
     def init(self, x0: tuple, u0: tuple) -> Any:
         return PID.init(self, x0, u0[: len(self.sequence)])
@@ -107,7 +107,7 @@ class SplitRange(PID):
 
     def check_inputs(self) -> None:
         outputs, pumps = len(self.model.outputs), self.model.pumps
-        entries = [j for own in self.sequence for j in own]
+        entries = [j for members in self.sequence for j in members]
         if len(self.sequence) != outputs or sorted(entries) != list(range(pumps)):
             raise InputError(
                 f"controller.sequence: must have a list for each of {outputs} outputs, and in them"

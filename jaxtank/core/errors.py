@@ -1,4 +1,4 @@
-"""Errors of input validation: one line that names the thing, its value, what is allowed, and the
+"""Errors of input validation: one line that names the thing, its value, its allowed range, and the
 nearest valid name.
 """
 

@@ -507,8 +507,8 @@ class Text:
 
     def _loop(self, s):
         starts = [self.of(start) for *_, start in s.carried]
-        own = [self._named(name) for _, name, _ in s.carried]
-        lines = [f"let {n}={v};" for n, v in zip(own, starts)]
+        carried = [self._named(name) for _, name, _ in s.carried]
+        lines = [f"let {n}={v};" for n, v in zip(carried, starts)]
         counter = next(self.names)
         lines.append(
             "for(;;){"
@@ -518,7 +518,7 @@ class Text:
         lines += self._block(s.body)
         new = [
             (n, self.of(e))
-            for n, e in zip(own, s.new)
+            for n, e in zip(carried, s.new)
             if self.given.get(getattr(e, "name", "")) != n
         ]
         temporary = [next(self.names) for _ in new]

@@ -66,8 +66,8 @@ def emptying_rates(plant: Any, orifices: float = 1.5, pipes: float = 2.0) -> Any
     """Lambda (n,) of each tank [1/s]; None of traced leaves or another kind of plant."""
     try:
         if not getattr(plant, "plain", True):
-            own, joined = _slopes_of_elements(plant)
-            return orifices / 1.5 * own + pipes / 2.0 * joined
+            alone, joined = _slopes_of_elements(plant)
+            return orifices / 1.5 * alone + pipes / 2.0 * joined
         out, joined = np.array(plant.drain, dtype=float), np.zeros(plant.tanks)
         orifice, pipe = np.asarray(plant.orifice), np.asarray(plant.pipe)
         for k, (source, _) in enumerate(plant.links):
@@ -113,14 +113,16 @@ def _flow_slopes(plant: Any, x: Any) -> Any:
 
     ends = elements.streams(plant, (0.0,) * plant.tanks, elements.valves_open(plant))
     slopes = jax.vmap(jax.jacfwd(flows))(x)
-    own, joined = [0.0] * plant.tanks, [0.0] * plant.tanks
+    alone, joined = [0.0] * plant.tanks, [0.0] * plant.tanks
     for k, (source, sink, _) in enumerate(ends):
         for i in (i for i in (source, sink) if i is not None):
             others = jnp.sum(jnp.abs(slopes[:, k]), axis=1) - jnp.abs(slopes[:, k, i])
             joined[i] = joined[i] + 2.0 * jnp.where(others > 0.0, jnp.abs(slopes[:, k, i]), 0.0)
-            own[i] = own[i] + jnp.where(others > 0.0, 0.0, jnp.abs(slopes[:, k, i])) * (i == source)
+            alone[i] = alone[i] + jnp.where(others > 0.0, 0.0, jnp.abs(slopes[:, k, i])) * (
+                i == source
+            )
     rows = lambda columns: jnp.stack([jnp.broadcast_to(v, x.shape[0]) for v in columns], axis=1)
-    return rows(own), rows(joined)
+    return rows(alone), rows(joined)
 
 
 @jax.jit

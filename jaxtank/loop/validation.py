@@ -51,7 +51,7 @@ def check(
     Raises
     ------
     InputError
-        With a message of one line that names the leaf, its value, its unit and what is allowed.
+        With a message of one line that names the leaf, its value, its unit and its allowed range.
 
     Examples
     --------

@@ -159,12 +159,12 @@ def streams(net: Any, x: Any, u: Any) -> list[Stream]:
 def _driven(net: Any, j: int, x: Any, u: Any, source: int | None, sink: int | None) -> Any:
     """Return what pump j's input asks for, by its curve, less what the lift takes away."""
     curve = net.curves[j] if net.curves else None
-    asked = u if curve is None else monotone_curve(curve, u)
+    demand = u if curve is None else monotone_curve(curve, u)
     by_lift = net.lift_curves[j] if net.lift_curves else None
     if by_lift is None:
-        return asked
+        return demand
     lift = (0.0 if sink is None else x[sink]) - (0.0 if source is None else x[source])
-    return asked * lower_clip(monotone_curve(by_lift, lift), 0.0)
+    return demand * lower_clip(monotone_curve(by_lift, lift), 0.0)
 
 
 def valves_open(net: Any) -> tuple[float, ...]:
@@ -179,9 +179,9 @@ def largest_supply(net: Any, u: np.ndarray) -> Any:
         if net.sources and net.sources[j] is not None:
             continue
         curve, by_lift = (c[j] if c else None for c in (net.curves, net.lift_curves))
-        asked = u[:, j] if curve is None else np.asarray(monotone_curve(curve, u[:, j]))
+        demand = u[:, j] if curve is None else np.asarray(monotone_curve(curve, u[:, j]))
         most = 1.0 if by_lift is None else max(1.0, *(share for _, share in by_lift))
-        total += np.maximum(float(net.pump_gain[j]) * asked * most, 0.0)
+        total += np.maximum(float(net.pump_gain[j]) * demand * most, 0.0)
     return total
 
 
@@ -198,10 +198,10 @@ def net_flows(net: Any, x: Any, u: Any, d: Any, step: Any = None) -> tuple[Any, 
                 leaving[source] = leaving[source] + lower_clip(flow, 0.0)
             if sink is not None:
                 leaving[sink] = leaving[sink] + lower_clip(-flow, 0.0)
-        held = [lower_clip(v, 0.0) / step for v in stored(net, x)]
+        available = [lower_clip(v, 0.0) / step for v in stored(net, x)]
         shares = [
             jnp.where(out > most, most / jnp.where(out > most, out, 1.0), 1.0)
-            for out, most in zip(leaving, held)
+            for out, most in zip(leaving, available)
         ]
     rates = [0.0 if d is None else d[i] for i in range(net.tanks)]
     for source, sink, flow in flows:

@@ -45,8 +45,8 @@ def _of_elements(plant, disturbed):
     rows, (length, drive) = [], plant.units
     for i, flows in enumerate(terms):
         flows += [("+", f"d{i + 1}")] if disturbed else []
-        kept = "V" if plant.shapes else f"{float(plant.area[i]):.4g} h"
-        rows.append(f"{kept}{i + 1}' = {_sum(flows)}")
+        content = "V" if plant.shapes else f"{float(plant.area[i]):.4g} h"
+        rows.append(f"{content}{i + 1}' = {_sum(flows)}")
     lines = ["q(x) = sqrt(x) for x > 0, else 0", "w(x) = sgn(x) sqrt|x|"]
     lines = [f"  {line}" for line in lines if any(f" {line[0]}(" in row for row in rows)]
     for name in ("curves", "lift_curves", "characteristics"):
@@ -119,8 +119,8 @@ def _streams(plant):
         }.get(plant.characteristics[k], f"c{k + 1}({u})")
         above = head("valve", k, source)
         flow = f"q({above})" if sink is None else apart("valve", k, source, sink)
-        one = " one way" if plant.one_way[k] and sink is not None else ""
-        yield source, sink, f"{of('valve', k) * root:.4g} {share} {flow}{one}"
+        direction = " one way" if plant.one_way[k] and sink is not None else ""
+        yield source, sink, f"{of('valve', k) * root:.4g} {share} {flow}{direction}"
 
 
 def _meanings(plant, disturbed):

@@ -43,11 +43,11 @@ def storeys(plant):
     # A tank is above every tank that it flows into, and level with those that a pipe joins to it.
     # Tanks that flow in a circle, which gravity does not allow, have the rows that they reach.
     row = [0] * plant.tanks
-    joined = [(v, one) for v, one in zip(plant.valves, plant.one_way) if v[1] is not None]
+    joined = [(v, one_way) for v, one_way in zip(plant.valves, plant.one_way) if v[1] is not None]
     for _ in range(plant.tanks):
-        for source, sink in (*plant.links, *plant.spills, *(v for v, one in joined if one)):
+        for source, sink in (*plant.links, *plant.spills, *(v for v, one_way in joined if one_way)):
             row[source] = min(max(row[source], row[sink] + 1), plant.tanks - 1)
-        for a, b in (*plant.pipes, *(v for v, one in joined if not one)):
+        for a, b in (*plant.pipes, *(v for v, one_way in joined if not one_way)):
             row[a] = row[b] = max(row[a], row[b])
     used = sorted(set(row))
     return tuple(used.index(r) for r in row)

@@ -42,10 +42,10 @@ def schematic(ax, plant, levels=None, setpoints=None, lost=None):
         ax.plot(*np.array(path).T, color=_colour(pump), linewidth=1.6, linestyle="--", zorder=1)
     for k, (_, path, at) in enumerate(valves(plant, where)):
         _valve(ax, path, at, _colour(len(plant.feeds) + k), f"valve {k + 1}")
-    for left, right, y in pipes(plant, where):
+    for start, end, y in pipes(plant, where):
         for wide, colour, layer in ((6.5, GLASS, 1.7), (3.5, WATER, 1.8)):
             line = {"color": colour, "linewidth": wide, "zorder": layer}
-            ax.plot([left, right], [y, y], solid_capstyle="butt", **line)
+            ax.plot([start, end], [y, y], solid_capstyle="butt", **line)
     _jets(ax, plant, where)
     for _, path in overflows(plant, where):
         ax.plot(*np.array(path).T, color=AFTER, linewidth=1.3, linestyle=(0, (1, 1.2)), zorder=2)

@@ -66,13 +66,13 @@ def _band(ax, loop, bands, i):
     ax.legend(loc="best", fontsize="x-small")
 
 
-def cloud(ax, pairs, held, name, unit, limit=None):
+def cloud(ax, pairs, feasible, name, unit, limit=None):
     """Draw one point for each run: a measure before tuning across, after tuning up."""
-    pairs, held = np.asarray(pairs, dtype=float), np.asarray(held)
+    pairs, feasible = np.asarray(pairs, dtype=float), np.asarray(feasible)
     sorts = (
-        (held[:, 1] & ~held[:, 0], "s", BEFORE, 7, "violated a limit before, none after"),
-        (held[:, 0] & held[:, 1], "o", AFTER, 7, "holds every limit, before and after"),
-        (~held[:, 1], "x", FORBIDDEN, 22, "violates a limit after"),
+        (feasible[:, 1] & ~feasible[:, 0], "s", BEFORE, 7, "violated a limit before, none after"),
+        (feasible[:, 0] & feasible[:, 1], "o", AFTER, 7, "holds every limit, before and after"),
+        (~feasible[:, 1], "x", FORBIDDEN, 22, "violates a limit after"),
     )
     for chosen, marker, colour, size, label in sorts:
         if chosen.any():

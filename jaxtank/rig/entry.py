@@ -456,7 +456,7 @@ def lines_of(
 
 
 def _meta_of(key, value, units):
-    """The metadata of a value; a name in the place of a curve has no unit."""
+    """The metadata of a value; a name instead of a curve has no unit."""
     meta = key.meta(units)
     return {**meta, "unit": "-"} if key.kind == "curve" and isinstance(value, str) else meta
 

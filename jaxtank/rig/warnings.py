@@ -202,11 +202,11 @@ def _signs(case):
     ends += [(source, sink) for source, sink in plant.valves]
     reached = [_downstream(plant, (i for i in tanks if i is not None)) for tanks in ends]
     for i, tank in enumerate(plant.outputs):
-        own = part.inputs_of(i)
+        members = part.inputs_of(i)
         # through another input the sign of a loop alone decides nothing
-        if any(tank in reached[j] for j in range(len(ends)) if j not in own):
+        if any(tank in reached[j] for j in range(len(ends)) if j not in members):
             continue
-        for j in own:
+        for j in members:
             source, *sinks = ends[j]
             acts = (tank in sinks) - (tank == source)
             gain = float(np.asarray(part.Kc)[i])
@@ -223,7 +223,7 @@ def _signs(case):
 def _downstream(plant, tanks):
     """The tanks whose levels depend on flows into or out of `tanks`."""
     pairs = [*plant.links, *plant.spills, *plant.valves]
-    pairs += [pair for one, other in plant.pipes for pair in ((one, other), (other, one))]
+    pairs += [pair for a, b in plant.pipes for pair in ((a, b), (b, a))]
     reached, queue = set(), list(tanks)
     while queue:
         tank = queue.pop()

@@ -148,7 +148,7 @@ def design(
     at = lambda s: choose(s, noise, most, requested, rate, bound, start)
     setting, chosen, falls = _with_spills(setting, ends, at, rates, inflow, start)
     low_reasons, bottom = failed_low(setting, low, chosen, begin)
-    held, kept = _tanks_with_rows(setting, chosen, low)
+    capped, raised = _tanks_with_rows(setting, chosen, low)
     safety_filter = SafetyFilter(
         least=least,
         most=most,
@@ -167,11 +167,11 @@ def design(
         # of a lagged input every older reading is a part: neighbours count with their `reach`; and
         # where inputs beyond the limits of the pumps are under way
         age=UNKNOWN if setting.lag > 0.0 or setting.beyond else setting.delay,
-        held=held,
+        held=capped,
         predicted=setting.predicted,
         low=np.array(low),
         bottom=bottom,
-        kept=kept,
+        kept=raised,
     )
     limits = np.where(chosen.idle, requested, chosen.heights)
     verdicts = check(
@@ -236,8 +236,8 @@ def _with_spills(setting, ends, at, rates, inflow, start):
 def _tanks_with_rows(setting, chosen, low):
     """(Tanks whose limits a row of the filter keeps, tanks whose low limits one keeps)."""
     fed = np.array([bool(gains) for gains in setting.rates.pumps])
-    held = (fed | (chosen.slopes > 0.0)) & ~chosen.idle
-    return tuple(tuple(map(int, np.flatnonzero(rows))) for rows in (held, fed & (low > 0.0)))
+    capped = (fed | (chosen.slopes > 0.0)) & ~chosen.idle
+    return tuple(tuple(map(int, np.flatnonzero(rows))) for rows in (capped, fed & (low > 0.0)))
 
 
 def _certificate(verdict, numbers, reason, low_reason):

@@ -175,7 +175,7 @@ def _start_allowed(setting, tank, limits, begin, reach):
         fastest = setting.full_pumps(k) + max(setting.rise(k, 0.0, reach), 0.0)
         others[k] = min(reach[k], begin[k] + age * fastest)
     entering, h = setting.under_way(tank), begin[tank]
-    # what is allowed is concave in the level, but for the step at `empty`
+    # the allowed inflow is concave in the level, except for the step at `empty`
     allowed = min(
         kappa * (top - h) - setting.rise(tank, h, others),
         kappa * (top - min(h, setting.rates.empty[tank])) - setting.rise(tank, 0.0, others),

@@ -41,7 +41,7 @@ def run(cache, *words):
 
 
 def planted(entry, mark):
-    """The bytes of an entry with a program of ours in the place of the compiled one."""
+    """The bytes of an entry with a program of ours instead of the compiled one."""
     data = entry.read_bytes()
     size = jit.SIZE + int.from_bytes(data[: jit.SIZE], "little")
     json.loads(data[jit.SIZE : size])

@@ -235,7 +235,7 @@ def test_slopes_through_chunks():
 
 
 def test_what_looks_ahead_is_not_cut():
-    """A recorded table knows its samples from the host; a law of one's own may look ahead."""
+    """A recorded table knows its samples from the host; a custom controller may look ahead."""
 
     @component
     class Ahead(OpenLoop):

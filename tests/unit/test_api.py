@@ -468,7 +468,7 @@ NASTY = "a<script>alert(1)</script>\"'&b"
 
 @pytest.fixture(scope="module")
 def results(own, tuned):
-    """{kind: () -> result}, of a case whose name is hostile, under a class of one's own."""
+    """{kind: () -> result}, of a case whose name is hostile, under a custom class."""
     with pytest.MonkeyPatch.context() as patch:  # a class that has no name in a file
         patch.setattr(components, "REGISTERED", {})
         for name, role in components.ROLES.items():

@@ -72,10 +72,10 @@ class Once(argparse.Action):
 
     def __call__(self, parser, namespace, values, option_string=None):
         """Store the value; a second one is a problem."""
-        given = vars(namespace).setdefault("given", set())
-        if option_string is not None and self.dest in given:
+        stored = vars(namespace).setdefault("given", set())
+        if option_string is not None and self.dest in stored:
             Parser.problems.append(f"{option_string} is given twice: give it once")
-        given.add(self.dest)
+        stored.add(self.dest)
         setattr(namespace, self.dest, values)
 
 

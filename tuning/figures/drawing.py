@@ -39,13 +39,13 @@ class Drawn(NamedTuple):
 def run(figure: Figure) -> Drawn:
     """Return the runs of a figure; the noise has seed 0."""
     runs = {}
-    for one in figure.runs:
-        case = rig.set_values(presets.find(one.case), dict(one.values))
+    for variant in figure.runs:
+        case = rig.set_values(presets.find(variant.case), dict(variant.values))
         key = jax.random.key(0) if noisy(case) else None
-        runs[one.label] = case, run_for_people(case, key)
+        runs[variant.label] = case, run_for_people(case, key)
     kinds = figure.kind.split()
     facts = {n: _facts(kinds, case, trajectory, figure) for n, (case, trajectory) in runs.items()}
-    ours = [f"{label}: {'; '.join(shown)}" for label, shown in facts.items() if shown]
+    ours = [f"{label}: {'; '.join(texts)}" for label, texts in facts.items() if texts]
     return Drawn(runs, tuple(ours))
 
 
@@ -55,12 +55,12 @@ def _facts(kinds, case, trajectory, figure):
     facts = []
     if "levels" in kinds or "errors" in kinds:
         errors = np.sqrt(np.mean(np.asarray(trajectory.e) ** 2, axis=0))
-        drawn = figure.tanks or range(case.loop.plant.tanks)
-        shown = [j for j, tank in enumerate(case.loop.plant.outputs) if tank in drawn]
-        facts.append(f"RMS error {_several(errors[shown])} {length}")
+        tanks_drawn = figure.tanks or range(case.loop.plant.tanks)
+        outputs = [j for j, tank in enumerate(case.loop.plant.outputs) if tank in tanks_drawn]
+        facts.append(f"RMS error {_several(errors[outputs])} {length}")
         if "levels" in kinds:
             facts.append(
-                f"error at the end {_several(np.asarray(trajectory.e)[-1][shown])} {length}"
+                f"error at the end {_several(np.asarray(trajectory.e)[-1][outputs])} {length}"
             )
     if "levels" in kinds:
         tanks = list(figure.tanks) or list(range(case.loop.plant.tanks))
@@ -91,18 +91,18 @@ def caption(figure: Figure, ours: tuple[str, ...]) -> list[str]:
     return [*texts, *([figure.remark] if figure.remark else [])]
 
 
-def draw(figure: Figure, drawn: Drawn) -> Any:
+def draw(figure: Figure, content: Drawn) -> Any:
     """Return the matplotlib figure, with its caption below."""
     from matplotlib.figure import Figure as Blank
 
     from jaxtank.plots.responses import label_time
     from jaxtank.plots.style import add_legend, hide, styled
 
-    panels = [panel for kind in figure.kind.split() for panel in _panels(kind, figure, drawn)]
+    panels = [panel for kind in figure.kind.split() for panel in _panels(kind, figure, content)]
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)
     width = WIDTH[columns - 1]
-    lines = [line for text in caption(figure, drawn.ours) for line in textwrap.wrap(text, width)]
+    lines = [line for text in caption(figure, content.ours) for line in textwrap.wrap(text, width)]
     high, low = 2.3 * rows + 0.5, LINE * len(lines) + 0.15
     with styled():
         whole = Blank(figsize=(4.2 * columns if columns > 1 else 6.4, high + low))
@@ -122,11 +122,11 @@ def draw(figure: Figure, drawn: Drawn) -> Any:
     return whole
 
 
-def _panels(kind, figure, drawn):
+def _panels(kind, figure, content):
     """Functions that draw one panel each on an axis."""
-    case, first = next(iter(drawn.runs.values()))
+    case, first = next(iter(content.runs.values()))
     if kind in OF_ALL_RUNS:
-        return OF_ALL_RUNS[kind](case, _lines(drawn.runs), figure.tanks)
+        return OF_ALL_RUNS[kind](case, _lines(content.runs), figure.tanks)
     return OF_FIRST_RUN[kind](case, first)
 
 

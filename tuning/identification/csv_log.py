@@ -287,12 +287,12 @@ def _named_columns(header, where, slots, named):
     return taken
 
 
-def _recognised_columns(header, where, slots, taken, named, own):
+def _recognised_columns(header, where, slots, taken, named, by_name):
     """Return {slot: (index, unit)} of the other columns whose headers name a slot themselves."""
     used, columns = {index for index, _ in taken.values()}, {}
     for index, cell in enumerate(header):
         stem, unit = split_header(cell)
-        slot = own.get(stem) or _slot(stem, slots)
+        slot = by_name.get(stem) or _slot(stem, slots)
         if index in used or slot is None or slot in named:
             continue
         if slot in columns:
@@ -306,12 +306,12 @@ def _recognised_columns(header, where, slots, taken, named, own):
 
 def _own(plant, slots):
     """{"LT101", "h_LT101", "u_P101", ..: slot} of what a rig's own names call its columns."""
-    own = {}
+    by_name = {}
     for slot, (kind, number) in slots.items():
         name = "" if kind == "t" else name_of(plant, "tank" if kind == "h" else kind, number)
         letter = "h" if kind == "h" else "u"
-        own |= {name: slot, f"{letter}_{name}": slot} if name else {}
-    return own
+        by_name |= {name: slot, f"{letter}_{name}": slot} if name else {}
+    return by_name
 
 
 def _slot(stem, slots):

@@ -122,15 +122,17 @@ def process_of(loop: Loop, order: int) -> Process:
         slow = lags.pop(near)
         gain *= time / (lags[0] if near == 0 else slow)  # without the slowest, by the next lag
     lags = sorted([*lags, *([loop.lag] if loop.lag else [])], reverse=True)
-    kept, rest = lags[:order], lags[order:]
+    dominant, rest = lags[:order], lags[order:]
     if rest:
         half = 0.5 * rest[0]
-        if math.isfinite(kept[-1]):
+        if math.isfinite(dominant[-1]):
             if order == 1:  # the steady gain stays
-                gain *= kept[0] / (kept[0] + half)
-            kept[-1] += half
+                gain *= dominant[0] / (dominant[0] + half)
+            dominant[-1] += half
         delay += half + sum(rest[1:])
-    return Process(gain, kept[0], kept[1] if order == 2 and len(kept) == 2 else 0.0, delay)
+    return Process(
+        gain, dominant[0], dominant[1] if order == 2 and len(dominant) == 2 else 0.0, delay
+    )
 
 
 def _reduced(loop: Loop) -> tuple[list[float], list[float]]:
@@ -138,19 +140,19 @@ def _reduced(loop: Loop) -> tuple[list[float], list[float]]:
     poles = [complex(p) for p in np.linalg.eigvals(loop.A)]
     zeros = [complex(z) for z in transmission_zeros(loop.A, loop.b[:, None], loop.c[None])]
     fastest = max([abs(p) for p in poles], default=0.0) or 1.0
-    left: list[complex] = []
+    remaining: list[complex] = []
     for zero in zeros:
         near = min(poles, key=lambda p: abs(p - zero), default=None)
         if near is not None and abs(near - zero) < 1e-6 * max(abs(zero), 1e-6 * fastest):
             poles.remove(near)
         else:
-            left.append(zero)
+            remaining.append(zero)
 
     def size(z: complex) -> float:
         return math.copysign(abs(z), z.real or -1.0)
 
     small = 1e-9 * fastest
-    return [size(z) for z in left if abs(z) > small], [
+    return [size(z) for z in remaining if abs(z) > small], [
         0.0 if abs(p) <= small else size(p) for p in poles
     ]
 
@@ -174,13 +176,13 @@ def ultimate_of(loop: Loop) -> Ultimate:
     block[:n, :n], block[:n, n if loop.lag else n + 1] = loop.A, loop.b
     if loop.lag:
         block[n, n], block[n, n + 1] = -1.0 / loop.lag, 1.0 / loop.lag
-    held = scipy.linalg.expm(block * loop.dt)
+    transition = scipy.linalg.expm(block * loop.dt)
     size = n + bool(loop.lag)
     gain = REFERENCE_GAIN / (process.gain * process.delay)
     with jax.enable_x64(True):
         edge = _margins(
-            jnp.asarray(held[:size, :size]),
-            jnp.asarray(held[:size, n + 1 :] * gain),
+            jnp.asarray(transition[:size, :size]),
+            jnp.asarray(transition[:size, n + 1 :] * gain),
             jnp.asarray(np.append(loop.c, np.zeros(size - n))[None]),
             round(loop.delay / loop.dt),
             loop.dt,

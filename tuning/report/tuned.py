@@ -241,7 +241,7 @@ def _rules(result):
         for g in names
         for i, v in enumerate(np.ravel(get_value(loop, f"controller.{g}")).tolist())
     }
-    own = rule_row("this answer", gains, after)
+    answer = rule_row("this answer", gains, after)
     words = {True: "yes", False: "no", None: "-"}
     rows = [
         [
@@ -250,7 +250,7 @@ def _rules(result):
             *(Value(np.nan if row[k] is None else row[k], 3) for k in ("error", "travel_percent")),
             words[row["holds"]],
         ]
-        for row in (own, *result.rules)
+        for row in (answer, *result.rules)
     ]
     head = ["tuning rules", *(f"{g} [{units[g]}]" for g in names)]
     return Table(rows, [*head, f"error [{loop.units[0]}]", "input change [%]", "limits hold"], True)
@@ -445,13 +445,15 @@ def _scenario_table(result):
     listed, notes = scenarios, []
     if len(scenarios) > MANY:
         listed = sorted(scenarios, key=lambda s: -cost(s))[:COSTLIEST]
-        held = sum(s["limits_held"]["after"] for s in scenarios)
-        rest = f"; limits held after in {held}" if limited else ""
+        limits_hold = sum(s["limits_held"]["after"] for s in scenarios)
+        rest = f"; limits held after in {limits_hold}" if limited else ""
         notes = [f"the {COSTLIEST} costliest of {len(scenarios)} scenarios{rest}"]
     rows = []
     for s in listed:
-        held = ("yes" if s["limits_held"]["after"] else "no") if limited else "-"
-        rows.append([s["name"], Value(s["weight"], 3), *(Value(cost(s, x)) for x in SIDES), held])
+        limits_hold = ("yes" if s["limits_held"]["after"] else "no") if limited else "-"
+        rows.append(
+            [s["name"], Value(s["weight"], 3), *(Value(cost(s, x)) for x in SIDES), limits_hold]
+        )
     heads = ["scenario", "weight", "objective before", "after", "limits held after"]
     return [Table(rows, heads, gap=True), Text(notes)]
 

@@ -345,14 +345,14 @@ def rule_rows(
     """Return what each tuning rule gives on validation plants, () of another controller."""
     rows: list[dict[str, Any]] = []
     for rule in RULES if serves(setting.case) else ():
-        why, judged = "", None
+        why, judgement = "", None
         gains: dict[str, float] = {}
         try:
             gains = rule_gains(setting.case, rule)
-            judged = judge(_with_gains(setting, gains), samples, seed, round_)
+            judgement = judge(_with_gains(setting, gains), samples, seed, round_)
         except InputError as error:
             why = str(error)
-        rows.append(rule_row(rule, gains, judged) | {"why": why})
+        rows.append(rule_row(rule, gains, judgement) | {"why": why})
     return tuple(rows)
 
 

@@ -40,7 +40,7 @@ def validate(problem, before, after, samples, seed):
     """Run the values `before` and `after` on `samples` perturbed runs; returns as `summary_of`."""
     runs, scenarios = perturbed(problem, samples, seed), len(problem.runs)
     points = {n: np.array([before[n], after[n]]) for n in problem.names}
-    costs, held = np.zeros((samples, 2)), np.ones((samples, 2), dtype=bool)
+    costs, feasible = np.zeros((samples, 2)), np.ones((samples, 2), dtype=bool)
     diverged = np.zeros(samples, dtype=bool)
     levels = np.zeros((samples, 2, problem.loop.plant.tanks))
     names = tuple(dict.fromkeys([*problem.needed, "max_level"]))
@@ -53,16 +53,16 @@ def validate(problem, before, after, samples, seed):
             for side in (0, 1):
                 row = {m: v[side, j] for m, v in measures.items()}
                 costs[i, side], levels[i, side] = problem.cost(row), row["max_level"]
-                held[i, side] = all(limit.margin(row) >= 0 for limit in limits)
+                feasible[i, side] = all(limit.margin(row) >= 0 for limit in limits)
     noise = any(run.key is not None for run in runs)
     spread = {n: float(s) for n, s in problem.case.uncertain.items()}
-    return summary_of(problem.limits, costs, held, levels, diverged, spread, noise)
+    return summary_of(problem.limits, costs, feasible, levels, diverged, spread, noise)
 
 
-def summary_of(limits, costs, held, levels, diverged, spread, noise):
+def summary_of(limits, costs, feasible, levels, diverged, spread, noise):
     """Return (summary, cloud) of runs before and after tuning, on the same draws."""
     good = ~diverged & np.isfinite(costs).all(axis=1)
-    both = good & held.all(axis=1)
+    both = good & feasible.all(axis=1)
     summary = {
         "samples": len(costs),
         "spread": spread,
@@ -70,7 +70,7 @@ def summary_of(limits, costs, held, levels, diverged, spread, noise):
         "failed": int((~good).sum()),
         "objective": {name: _quantiles(costs[good, side]) for side, name in enumerate(SIDES)},
         "better_share": _share(costs[good, 1] < costs[good, 0]),
-        "limits_held": {name: _share(held[good, side]) for side, name in enumerate(SIDES)},
+        "limits_held": {name: _share(feasible[good, side]) for side, name in enumerate(SIDES)},
         "comparable": _share(both[good]),
         "better_share_of_comparable": _share(costs[both, 1] < costs[both, 0]),
     }
@@ -84,7 +84,7 @@ def summary_of(limits, costs, held, levels, diverged, spread, noise):
         "level": levels.max(axis=2) if levels.size else np.zeros((0, 2)),
         "limit": 0.0 if differ else next(iter(limits.values()), None),
         "past": differ,
-        "held": held[good],
+        "held": feasible[good],
     }
 
 

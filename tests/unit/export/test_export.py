@@ -469,7 +469,7 @@ FUNCTIONS = (
     )[0],
     lambda x: jax.lax.switch((x > 0.0).astype(int) + (x > 1.0), [jnp.sin, jnp.cos, jnp.square], x),
 )
-"""Of one number: what a controller of one's own may use."""
+"""Functions of one number that a custom controller may use."""
 
 
 @component

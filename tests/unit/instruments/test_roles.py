@@ -1,4 +1,4 @@
-"""Sensors and actuators of one's own in a run, a Gymnasium environment and a rig file."""
+"""Custom sensors and actuators in a run, a Gymnasium environment and a rig file."""
 
 import math
 
@@ -234,7 +234,7 @@ def test_roles_without_their_own_step_are_refused():
 
 @component
 class Steps(Signal):
-    """A setpoint of one's own that jumps, without windows."""
+    """A custom setpoint that jumps, without windows."""
 
     @property
     def channels(self):

@@ -235,7 +235,7 @@ def test_no_responses_of_no_run(gouta):
 
 
 def test_units_of_parameters_are_never_set_as_mathematics(ax):
-    """Those of a controller of one's own may be any text."""
+    """Texts of a custom controller may be anything."""
     odd = r"$\x{$"
     x = np.linspace(1.0, 2.0, 5)
     K, L = (SimpleNamespace(name=name, unit=odd, scale="linear") for name in "KL")

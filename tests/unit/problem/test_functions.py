@@ -1,4 +1,4 @@
-"""Objectives and constraints that are functions of one's own, against built-in measures, NumPy on a
+"""Objectives and constraints that are custom functions, against built-in measures, NumPy on a
 trajectory, differences, and a grid."""
 
 import functools

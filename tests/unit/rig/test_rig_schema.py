@@ -117,7 +117,7 @@ seed = 7
 weight = 2.0
 values = { "sensor.noise" = 0.1 }
 """
-# what is given in the place of a key of EVERY
+# values that replace a key of EVERY
 ELEMENTS = """
 reachable = false
 units = ["m", "-"]

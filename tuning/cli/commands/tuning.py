@@ -74,12 +74,12 @@ def tune(args):
         return EXIT[result.status]
     if sweep:  # before the long search
         _check_tradeoff(case, task, sweep)
-    finder, case, own, mended = _finder(args, case, task)
+    finder, case, keywords, mended = _finder(args, case, task)
     unit = tables.objective_unit(task["objective"] or case.objective, case.loop.units)
     option = None if args.robust or args.nominal or args.quiet else _goes_with_nominal(args)
     progress = Progress(unit, args.quiet, option)
     folder = {"checkpoint": args.out, "resume": args.resumed}
-    result = finder(case, method=_options(args), **own, **folder, progress=progress)
+    result = finder(case, method=_options(args), **keywords, **folder, progress=progress)
     if mended is not None:
         result = result.replace(answer=dataclasses.replace(result.answer, mended=mended))
     progress.line.end()
@@ -165,14 +165,14 @@ def _finder(args, case, task) -> Any:
     if task["scenarios"] == ():  # --scenario none: plants of the case's own run alone
         case = case.replace(scenarios=())
     task["scenarios"] = None
-    own = {
+    keywords = {
         "distributions": varied,
         "risk": args.robust,
         "samples": args.samples or 64,
         "fresh": args.fresh or 1024,
         "back_off": args.back_off or 0.0,
     }
-    return tune_robust, case, _stated(task) | own, None
+    return tune_robust, case, _stated(task) | keywords, None
 
 
 def _varied(args, case):
@@ -191,7 +191,7 @@ def _not_robust(args, case, task, choices, varied):
     from tuning.search.tuner import tune as finder
 
     if not _is_nominal(args):
-        own, mended = {"distributions": varied, "safety_filter": args.safety_filter}, None
+        keywords, mended = {"distributions": varied, "safety_filter": args.safety_filter}, None
         if args.mend is not None:
             from tuning.feasible.study import apply_mend
             from tuning.search.setting import plants_of
@@ -200,7 +200,7 @@ def _not_robust(args, case, task, choices, varied):
             case, mended = apply_mend(
                 case, args.mend, box, seed=task["seed"], limits=task["limits"]
             )
-        return finder, case, _stated(task) | own, mended
+        return finder, case, _stated(task) | keywords, mended
     if args.mend is not None:
         raise InputError("--mend belongs to the default answer, not to --nominal")
     if choices:
