@@ -206,6 +206,16 @@ OPTIONS = ("extent", "spill_port", "valve_port", "pipe_port") + tuple(
 """Leaves of a `TankNetwork` that are absent from a plain one."""
 
 
+EXPONENT = "exponent of the head in the flow of each {}; 0.5: Torricelli"
+RESISTANCE = "resistance R of a linear outlet beside each {}, whose flow is head/R; inf: none"
+
+
+def _option(unit: str, doc: str, *, of: str, shape: str = "", low: float = 0.0, **more: Any) -> Any:
+    """A leaf of an element that a plain network does not have; `of` is the leaf beside it."""
+    shape = shape or {"drain": "tank"}.get(of, of)
+    return leaf(unit, doc, low=low, like=of, default=None, shape=shape, **more)
+
+
 @component
 class TankNetwork(Plant):
     """n tanks joined by orifices that discharge from one tank into another or into the basin, and
@@ -259,113 +269,48 @@ class TankNetwork(Plant):
     split: np.ndarray = leaf(
         "-", "share of each pump that goes to its first tank", low=0.0, high=1.0, shape="feed"
     )
-    valve: Any = leaf(
+    valve: Any = _option(
         "cm^2",
         "effective area of each valve, full open, in the order of `valves`",
-        low=0.0,
-        strict=True,
-        like="area",
-        default=None,
+        of="area",
         shape="valve",
+        strict=True,
     )
-    rangeability: Any = leaf(
+    rangeability: Any = _option(
         "-",
         "flow of an equal-percentage valve full open, in flows at opening 0",
+        of="area",
+        shape="valve",
         low=1.0,
         strict=True,
-        like="area",
-        default=None,
-        shape="valve",
     )
-    extent: Any = leaf(
+    extent: Any = _option(
         "cm",
         "level at which the shape of each tank ends: height of a cone, diameter of a sphere",
-        low=0.0,
+        of="area",
+        shape="tank",
         strict=True,
-        like="area",
-        default=None,
-        shape="tank",
     )
-    drain_port: Any = leaf(
-        "cm",
-        "height of each drain above the bottom",
-        low=0.0,
-        like="drain",
-        default=None,
-        shape="tank",
-    )
-    orifice_port: Any = leaf(
-        "cm",
-        "height of each orifice above the bottom",
-        low=0.0,
-        like="orifice",
-        default=None,
-        shape="orifice",
-    )
-    pipe_port: Any = leaf(
-        "cm",
-        "height of the two ends of each pipe above the bottoms",
-        low=0.0,
-        like="pipe",
-        default=None,
-        shape="pipe",
-    )
-    valve_port: Any = leaf(
-        "cm",
-        "height of each valve above the bottom",
-        low=0.0,
-        like="valve",
-        default=None,
-        shape="valve",
-    )
-    spill_port: Any = leaf(
+    drain_port: Any = _option("cm", "height of each drain above the bottom", of="drain")
+    orifice_port: Any = _option("cm", "height of each orifice above the bottom", of="orifice")
+    pipe_port: Any = _option("cm", "height of the ends of each pipe above the bottoms", of="pipe")
+    valve_port: Any = _option("cm", "height of each valve above the bottom", of="valve")
+    spill_port: Any = _option(
         "cm",
         "height of the overflow opening of each spill, where below the rim",
-        low=0.0,
-        strict=True,
-        like="caught",
-        default=None,
+        of="caught",
         shape="spill",
-    )
-    drain_exponent: Any = leaf(
-        "-",
-        "exponent of the head in the flow of each drain; 0.5: Torricelli",
-        low=0.0,
-        high=4.0,
         strict=True,
-        like="drain",
-        default=None,
-        shape="tank",
     )
-    orifice_exponent: Any = leaf(
-        "-",
-        "exponent of the head in the flow of each orifice; 0.5: Torricelli",
-        low=0.0,
-        high=4.0,
-        strict=True,
-        like="orifice",
-        default=None,
-        shape="orifice",
+    drain_exponent: Any = _option("-", EXPONENT.format("drain"), of="drain", high=4.0, strict=True)
+    orifice_exponent: Any = _option(
+        "-", EXPONENT.format("orifice"), of="orifice", high=4.0, strict=True
     )
-    drain_resistance: Any = leaf(
-        "s/cm^2",
-        "resistance R of a drain in parallel, whose flow is head/R; inf: none",
-        low=0.0,
-        strict=True,
-        like="drain",
-        infinite=True,
-        default=None,
-        shape="tank",
+    drain_resistance: Any = _option(
+        "s/cm^2", RESISTANCE.format("drain"), of="drain", strict=True, infinite=True
     )
-    orifice_resistance: Any = leaf(
-        "s/cm^2",
-        "resistance R of an orifice in parallel, whose flow is head/R; inf: none",
-        low=0.0,
-        strict=True,
-        like="orifice",
-        infinite=True,
-        default=None,
-        shape="orifice",
+    orifice_resistance: Any = _option(
+        "s/cm^2", RESISTANCE.format("orifice"), of="orifice", strict=True, infinite=True
     )
     gravity: np.ndarray = leaf("cm/s^2", "acceleration g", low=0.0, strict=True)
     rim: np.ndarray = leaf("cm", "height of each tank", low=0.0, strict=True, shape="tank")

@@ -148,14 +148,19 @@ def volume_of(shape: Shape, area: Any, extent: Any, level: Any) -> Any:
     return area * extent * (within + outside)
 
 
+def _rate_of_size(at: Any, volume: Any, section: Any, by_area: Any, by_extent: Any) -> Any:
+    """Return the rate of V = area extent v(level / extent) at a fixed level."""
+    area, extent, level = at
+    return volume / area * by_area + (volume - section * level) / extent * by_extent
+
+
 @volume_of.defjvp
 def _volume_jvp(shape: Shape, primals: Any, tangents: Any) -> Any:
     area, extent, level = primals
     by_area, by_extent, by_level = tangents
     volume = volume_of(shape, area, extent, level)
     section = area_of(shape, area, extent, level)
-    # V = area extent v(level / extent)
-    rate = volume / area * by_area + (volume - section * level) / extent * by_extent
+    rate = _rate_of_size((area, extent, level), volume, section, by_area, by_extent)
     return volume, rate + section * by_level
 
 
@@ -185,5 +190,5 @@ def _level_jvp(shape: Shape, primals: Any, tangents: Any) -> Any:
     by_area, by_extent, by_volume = tangents
     level = level_of(shape, area, extent, volume)
     section = area_of(shape, area, extent, level)
-    by_size = volume / area * by_area + (volume - section * level) / extent * by_extent
-    return level, (by_volume - by_size) / section
+    rate = _rate_of_size((area, extent, level), volume, section, by_area, by_extent)
+    return level, (by_volume - rate) / section

@@ -1,21 +1,16 @@
 """An independent check of a finished safety filter: for which tanks it keeps the limits.
 
-Works on the final numbers alone, with formulas of its own, and knows a closed list of features:
-README.md of this folder, "What the checker covers".
+It works on the final numbers, with its own formulas; README.md: "What the checker covers".
 """
 # Conditions are generators of (holds, reason), holds written so that a NaN fails it.
 
-import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxtank.instruments.actuators import PumpBank
-from jaxtank.instruments.sensors import LevelSensor
-from jaxtank.plants.faults import Faults
-from jaxtank.plants.tank_network import TankNetwork
+from jaxtank.safety.known_features import FLOWS, SHAPE, first_failure, unknown_feature
 
 LIMITS, CASE = "limits", "case"
 """Levels at t = 0 for which a verdict holds: any at or below the limits, or the case's start."""
@@ -26,29 +21,6 @@ SHALLOW = 0.05
 PARTS = 1000
 """Intervals of readings on which least inputs and caps are compared."""
 ROUNDING = 1e-9
-
-FLOWS = ("area", "drain", "orifice", "pipe", "pump_gain", "split", "gravity")
-SHAPE = ("links", "pipes", "feeds", "spills", "overflow", "bottom", "knee")
-KNOWN = {
-    "plant": {*FLOWS, *SHAPE, "rim", "caught", "outputs", "units", "names"},
-    "actuator": {"low", "high", "dead_zone", "stop", "pulse", "lag", "initial", "delay"}
-    | {"saturation", "dead_zone_kind"},
-    "sensor": {"gain", "noise", "offset", "full_scale", "bits"},
-    "faults": {"factor", "extra", "windows"},
-    "safety_filter": {"least", "most", "limit", "reach", "rate", "band", "inflow", "slope"}
-    | {"spare", "age", "offset", "low", "bottom", "draw", "held", "kept", "predicted", "substeps"}
-    | {"allocate", "divided", "running"},
-}
-"""{part: fields that the checker knows}; a field that is not listed must be None, False or ()."""
-CLASSES = {"plant": TankNetwork, "actuator": PumpBank, "sensor": LevelSensor, "faults": Faults}
-UNCERTAIN = {
-    *(f"plant.{name}" for name in (*FLOWS, "rim", "caught")),
-    *(f"actuator.{name}" for name in ("low", "high", "dead_zone", "stop", "pulse", "lag")),
-    *("actuator.initial", "actuator.delay", "x0"),
-    *("sensor.noise", "sensor.offset", "sensor.gain", "sensor.full_scale"),
-}
-HARMLESS = ("controller.", "observer.", "reference.")
-"""Uncertain parameters of what may be anything: beginnings of their names."""
 
 
 class Verdict(NamedTuple):
@@ -87,7 +59,7 @@ def check(
     parts |= {} if faults is None else {"faults": faults}
     tanks = len(np.atleast_1d(safety_filter.limit))
     not_proved = lambda why: tuple(Verdict(i, False, why, CASE, False, why) for i in range(tanks))
-    if why := _not_known(parts, box):
+    if why := unknown_feature(parts, box):
         return not_proved(why)
     rig = _Rig(safety_filter, plant, actuator, sensor, hold, substeps, box, faults)
     rig.disturbed(inflow, volume, draws)
@@ -118,63 +90,6 @@ def _verdict(rig, i, from_any, upper, low_reason):
         low_holds=bool(limited and not low_reason),
         low_reason=low_reason or ("Low limits" if limited else ""),
     )
-
-
-def _first_failure(conditions):
-    """The reason of the first of [(holds, reason)] that does not hold, or ""."""
-    return next((why for holds, why in conditions if not holds), "")
-
-
-def _not_known(parts, box):
-    """The first feature that is not on the closed list, or a number that is none; or ""."""
-    why = _first_failure(_known_classes(parts)) or _first_failure(_known_fields(parts))
-    return why or _first_failure(_known_names(box))
-
-
-def _known_classes(parts):
-    for part, kind in CLASSES.items():
-        value = parts.get(part)
-        if part in parts:
-            yield type(value) is kind, f"not covered: {part} of class {type(value).__name__}"
-    kind = type(parts["safety_filter"])
-    same = (kind.__module__, kind.__name__) == ("jaxtank.safety.filter", "SafetyFilter")
-    yield same, f"not covered: safety filter of class {kind.__name__}"
-    for end in ("least", "most"):
-        kind = type(getattr(parts["safety_filter"], end))
-        known = kind is TankNetwork
-        yield known, f"not covered: safety_filter.{end} of class {kind.__name__}"
-
-
-def _known_fields(parts):
-    safety_filter = parts["safety_filter"]
-    ends = {f"safety_filter.{end}": getattr(safety_filter, end) for end in ("least", "most")}
-    for part, value in {**parts, **ends}.items():
-        known = KNOWN["plant" if part in ends else part]
-        for name in (field.name for field in dataclasses.fields(value)):
-            entry = getattr(value, name)
-            yield name in known or _neutral(entry), f"not covered: {part}.{name}"
-            number = name not in known or not _has_nan(entry)
-            yield number, f"not covered: {part}.{name} is no number"
-
-
-def _known_names(box):
-    for name, ends in box.items():
-        known = name.partition("[")[0] in UNCERTAIN or name.startswith(HARMLESS)
-        yield known, f"not covered: uncertain {name}"
-        yield not any(map(_has_nan, ends)), f"not covered: uncertain {name} is no number"
-
-
-def _neutral(entry):
-    return entry is None or entry is False or (isinstance(entry, tuple) and not entry)
-
-
-def _has_nan(entry):
-    if entry is None or isinstance(entry, tuple):  # left out; pairs of tanks
-        return False
-    try:
-        return bool(np.isnan(np.asarray(entry, dtype=float)).any())
-    except (TypeError, ValueError):  # names, another component
-        return False
 
 
 def _at(name):
@@ -345,7 +260,7 @@ class _Rig:
     def uncovered(self):
         """What the filter does not count on, of the whole rig; or ""."""
         self.faults_lower_levels = False  # outside the box, but only lowering levels
-        return _first_failure(self._covered())
+        return first_failure(self._covered())
 
     def _covered(self):
         """(holds, reason): the plant, its box and its faults are in the filter's box."""
@@ -477,7 +392,7 @@ def _stays(rig, i, at):
     top = rig.reach[i] - rig.spare[i]
     if not (at.begin[i] <= top * (1.0 + 1e-12) and math.isfinite(top) and top > 0.0):
         return ""
-    if _first_failure(_entering(rig, i, at)):
+    if first_failure(_entering(rig, i, at)):
         return ""
     if rig.rise(i, top, at.bounds) + rig.pumped(i, rig.most) <= rig.rounding(i, top):
         return "flows"
@@ -519,7 +434,7 @@ def _upper(rig, i, level, at):
     """(why the limit of a tank is not proved with the others at their bounds, or ""; the
     theorem).
     """
-    if why := _first_failure(_begins(rig, i, level, at)):
+    if why := first_failure(_begins(rig, i, level, at)):
         return why, ""
     if i in rig.held:
         return _upper_of_row(rig, i, level, at)
@@ -531,22 +446,22 @@ def _upper(rig, i, level, at):
 
 def _upper_of_row(rig, i, level, at):
     """The same of a tank whose limit a row of the filter keeps."""
-    if why := _first_failure(_readable(rig, i, at.bounds)):
+    if why := first_failure(_readable(rig, i, at.bounds)):
         return why, ""
     if rig.pulsed:
         return "not covered: a pulse dead zone pays out more than was commanded", ""
     if rig.slope[i] > 0.0:
-        return _first_failure(_second_order(rig, i, at)), "Theorem 2"
-    if why := _first_failure(_row(rig, i, level, at)):
+        return first_failure(_second_order(rig, i, at)), "Theorem 2"
+    if why := first_failure(_row(rig, i, level, at)):
         return why, ""
     lag = max(rig.lag[1][j] for j in rig.gains[i])
     if rig.delay[1] == 0.0 and lag == 0.0:
-        why = _first_failure([_rate_of_hold(rig, i, "kappa T")])
+        why = first_failure([_rate_of_hold(rig, i, "kappa T")])
         return why, "" if why else "Theorem 1"
     if rig.predicted:
-        return _first_failure(_predicted(rig, i, level, at)), "Theorem 5"
+        return first_failure(_predicted(rig, i, level, at)), "Theorem 5"
     theorem = "Theorem 4" if lag > 0.0 else "Theorem 3"
-    return _first_failure(_late(rig, i, level, lag, at)), theorem
+    return first_failure(_late(rig, i, level, lag, at)), theorem
 
 
 def _begins(rig, i, level, at):
@@ -813,7 +728,7 @@ def _joint_low(rig, start, upper):
         proved = np.where([bool(why) for why in reasons], 0.0, np.maximum(rig.low, 0.0))
         before, reasons = reasons, list(reasons)
         for i in (i for i in range(rig.tanks) if rig.low[i] > 0.0 and not before[i]):
-            reasons[i] = _first_failure(_lower(rig, i, proved, begin, upper))
+            reasons[i] = first_failure(_lower(rig, i, proved, begin, upper))
         if reasons == before:
             return reasons
 

@@ -145,7 +145,7 @@ def _equal(first, second):
 
 
 def _box(case, widths):
-    """({parameter: half width} of the box that the case describes, with `widths` in the place of
+    """({parameter: half width} of the box that the case describes, with `widths` instead of
     the plant's, the factor by which inflow disturbances may be larger than they are).
     """
     box = {} if case.covariance is None else _box_of_covariance(*case.covariance)

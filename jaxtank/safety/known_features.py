@@ -1,0 +1,92 @@
+"""The closed list of features of a loop that the independent checker knows."""
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.plants.faults import Faults
+from jaxtank.plants.tank_network import TankNetwork
+
+FLOWS = ("area", "drain", "orifice", "pipe", "pump_gain", "split", "gravity")
+SHAPE = ("links", "pipes", "feeds", "spills", "overflow", "bottom", "knee")
+KNOWN = {
+    "plant": {*FLOWS, *SHAPE, "rim", "caught", "outputs", "units", "names"},
+    "actuator": {"low", "high", "dead_zone", "stop", "pulse", "lag", "initial", "delay"}
+    | {"saturation", "dead_zone_kind"},
+    "sensor": {"gain", "noise", "offset", "full_scale", "bits"},
+    "faults": {"factor", "extra", "windows"},
+    "safety_filter": {"least", "most", "limit", "reach", "rate", "band", "inflow", "slope"}
+    | {"spare", "age", "offset", "low", "bottom", "draw", "held", "kept", "predicted", "substeps"}
+    | {"allocate", "divided", "running"},
+}
+"""{part: fields that the checker knows}; a field that is not listed must be None, False or ()."""
+CLASSES = {"plant": TankNetwork, "actuator": PumpBank, "sensor": LevelSensor, "faults": Faults}
+UNCERTAIN = {
+    *(f"plant.{name}" for name in (*FLOWS, "rim", "caught")),
+    *(f"actuator.{name}" for name in ("low", "high", "dead_zone", "stop", "pulse", "lag")),
+    *("actuator.initial", "actuator.delay", "x0"),
+    *("sensor.noise", "sensor.offset", "sensor.gain", "sensor.full_scale"),
+}
+HARMLESS = ("controller.", "observer.", "reference.")
+"""Uncertain parameters of what may be anything: beginnings of their names."""
+
+
+def first_failure(conditions: Iterable[tuple[Any, str]]) -> str:
+    """The reason of the first of [(holds, reason)] that does not hold, or ""."""
+    return next((why for holds, why in conditions if not holds), "")
+
+
+def unknown_feature(parts: Mapping[str, Any], box: Mapping[str, Any]) -> str:
+    """The first feature that is not on the closed list, or a number that is none; or ""."""
+    why = first_failure(_known_classes(parts)) or first_failure(_known_fields(parts))
+    return why or first_failure(_known_names(box))
+
+
+def _known_classes(parts):
+    for part, kind in CLASSES.items():
+        value = parts.get(part)
+        if part in parts:
+            yield type(value) is kind, f"not covered: {part} of class {type(value).__name__}"
+    kind = type(parts["safety_filter"])
+    same = (kind.__module__, kind.__name__) == ("jaxtank.safety.filter", "SafetyFilter")
+    yield same, f"not covered: safety filter of class {kind.__name__}"
+    for end in ("least", "most"):
+        kind = type(getattr(parts["safety_filter"], end))
+        known = kind is TankNetwork
+        yield known, f"not covered: safety_filter.{end} of class {kind.__name__}"
+
+
+def _known_fields(parts):
+    safety_filter = parts["safety_filter"]
+    ends = {f"safety_filter.{end}": getattr(safety_filter, end) for end in ("least", "most")}
+    for part, value in {**parts, **ends}.items():
+        known = KNOWN["plant" if part in ends else part]
+        for name in (field.name for field in dataclasses.fields(value)):
+            entry = getattr(value, name)
+            yield name in known or _neutral(entry), f"not covered: {part}.{name}"
+            number = name not in known or not _has_nan(entry)
+            yield number, f"not covered: {part}.{name} is no number"
+
+
+def _known_names(box):
+    for name, ends in box.items():
+        known = name.partition("[")[0] in UNCERTAIN or name.startswith(HARMLESS)
+        yield known, f"not covered: uncertain {name}"
+        yield not any(map(_has_nan, ends)), f"not covered: uncertain {name} is no number"
+
+
+def _neutral(entry):
+    return entry is None or entry is False or (isinstance(entry, tuple) and not entry)
+
+
+def _has_nan(entry):
+    if entry is None or isinstance(entry, tuple):  # left out; pairs of tanks
+        return False
+    try:
+        return bool(np.isnan(np.asarray(entry, dtype=float)).any())
+    except (TypeError, ValueError):  # names, another component
+        return False
