@@ -25,6 +25,7 @@ from jaxtank.core import VERSION
 from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import write_folder
+from jaxtank.core.labels import label_of
 from jaxtank.core.tree import get_value, parameters
 from jaxtank.export.whole import check_pointwise
 from jaxtank.live.engine import engine, program_of
@@ -157,8 +158,9 @@ def _breaks(case):
             text = f"the pipe between tanks {first} and {other} is blocked, 40 % open"
             add(f"blocked pipe {first} to {other}", f"plant.pipe[{k}]", 0.4, text)
     for k in range(np.size(values.get("plant.valve", ()))):
-        text = f"valve {k + 1} passes 40 % of what it should"
-        add(f"clogged valve {k + 1}", f"plant.valve[{k}]", 0.4, text)
+        valve = label_of(plant, "pump", len(plant.feeds) + k)
+        text = f"{valve} passes 40 % of the flow of its opening"
+        add(f"clogged {valve}", f"plant.valve[{k}]", 0.4, text)
     for k, volume in enumerate(values.get("disturbance.volume", ())):
         if volume:
             text = "three times the volume of this inflow disturbance"

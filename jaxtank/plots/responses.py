@@ -53,10 +53,12 @@ def level(ax, runs, tank, output=None, rim=None, limit=None, unit="cm", spills=N
         dots = {"color": REFERENCE, "linestyle": ":", "linewidth": 1.2, "label": "setpoint"}
         ax.plot(last.t, last.r[:, output], **dots)
     highest = max(float(np.max(run.x[:, tank])) for run, _, _ in runs.values())
+    highest_bound = 0.0
     # a rim far above all levels would only compress the picture
     for bound, name in ((rim, "rim"), (limit if limit != rim else None, "limit")):
         if bound is not None and (highest > 0.6 * bound):
-            top = max(highest * 1.03, bound * 1.05)
+            highest_bound = max(highest_bound, bound)
+            top = max(highest * 1.03, highest_bound * 1.05)
             ax.axhspan(bound, top, **BEYOND)
             ax.axhline(bound, color=FORBIDDEN, linewidth=1.0, label=f"{name} {bound:g} {unit}")
             ax.set_ylim(top=top)

@@ -41,7 +41,8 @@ def schematic(ax, plant, levels=None, setpoints=None, lost=None):
     for pump, _, path in where.suctions:
         ax.plot(*np.array(path).T, color=_colour(pump), linewidth=1.6, linestyle="--", zorder=1)
     for k, (_, path, at) in enumerate(valves(plant, where)):
-        _valve(ax, path, at, _colour(len(plant.feeds) + k), f"valve {k + 1}")
+        j = len(plant.feeds) + k
+        _valve(ax, path, at, _colour(j), label_of(plant, "pump", j))
     for start, end, y in pipes(plant, where):
         for wide, colour, layer in ((6.5, GLASS, 1.7), (3.5, WATER, 1.8)):
             line = {"color": colour, "linewidth": wide, "zorder": layer}

@@ -622,9 +622,10 @@ def _saturation(loop, runs):
 def _level_limits(result):
     """The highest allowed level of each tank: its limit, or else its rim."""
     levels = np.array(result.tuned.loop.plant.rim, dtype=float)
-    for limit in result.problem.limits:
-        if limit.measure == "max_level" and limit.run == 0:
-            levels[limit.index] = limit.value
+    # the problem of a default answer has tightened limits, and none that no plant comes near
+    rows = [c for c in result.constraints if c["measure"] == "max_level" and c["tank"]]
+    for tank in {c["tank"] for c in rows}:
+        levels[tank - 1] = min(c["limit"] for c in rows if c["tank"] == tank)
     return levels
 
 
