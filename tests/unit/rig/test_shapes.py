@@ -25,10 +25,10 @@ class Reword(ast.NodeTransformer):
             if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
                 if isinstance(first.value.value, str):
                     first.value.value = "x"
-        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("leaf", "static"):
-            texts = [*node.args[1:2], *(k.value for k in node.keywords if k.arg == "doc")]
-            for text in texts:
-                text.value = "x"
+        if isinstance(node, ast.Dict):  # the metadata that `leaf` and `static` make
+            for at, key in enumerate(node.keys):
+                if getattr(key, "value", None) == "doc":
+                    node.values[at] = ast.copy_location(ast.Constant("x"), node)
         return node
 
 def source_to_code(self, data, path, *, _optimization=-1):
