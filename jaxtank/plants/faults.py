@@ -66,16 +66,8 @@ class Faults:
             field, (index,) = split_index(name)
             what = f"fault {k + 1} of {name} from {start:g} s to {end:g} s"
             meta = describe(plant, field)
-            unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
-            ends = [e for other, _, e in self.windows if other == name and start < e < end]
-            values = [self._value(plant, name, time) for time in (start, *ends)]
-            value, largest, low, high = min(values), max(values), meta["low"], meta["high"]
-            strict = field in ("area", "rim", "extent", "rangeability")  # a pump may stand still
-            if low is not None and (value <= low if strict else value < low):
-                words = "above" if strict else "at least"
-                texts.append(f"{what}: makes it {value:g}{unit}: must be {words} {low:g}{unit}")
-            elif high is not None and largest > high:
-                texts.append(f"{what}: makes it {largest:g}{unit}: must be at most {high:g}{unit}")
+            if outside := self._out_of_range(plant, k, meta):
+                texts.append(f"{what}: {outside}")
             elif field in ("area", "extent") and not self._lasts(k, clock):
                 texts.append(
                     f"{what}: volume would come from nowhere as the {field} changes: must last for"
@@ -84,6 +76,22 @@ class Faults:
             elif field == "caught":
                 texts += self._caught_twice(what, plant, index, start)
         return texts
+
+    def _out_of_range(self, plant, k, meta):
+        """The range of an entry that fault k leaves, in words; None where it stays inside."""
+        name, start, end = self.windows[k]
+        unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
+        ends = [e for other, _, e in self.windows if other == name and start < e < end]
+        values = [self._value(plant, name, time) for time in (start, *ends)]
+        value, largest, low, high = min(values), max(values), meta["low"], meta["high"]
+        # a pump may stand still
+        strict = split_index(name)[0] in ("area", "rim", "extent", "rangeability")
+        if low is not None and (value <= low if strict else value < low):
+            words = "above" if strict else "at least"
+            return f"makes it {value:g}{unit}: must be {words} {low:g}{unit}"
+        if high is not None and largest > high:
+            return f"makes it {largest:g}{unit}: must be at most {high:g}{unit}"
+        return None
 
     def _value(self, plant, name, time):
         """The value of an entry of the plant at a time."""

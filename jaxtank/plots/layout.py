@@ -155,16 +155,15 @@ def _with_pumps(plant, boxes, rows, width):
         targets = [i for i in feed if i is not None]
         if not targets:
             risers.append((j, source, ((x, level), (x, -0.9))))
+        # jets of different pumps into one tank side by side, on the side that they come from
+        share = 0.2 + 0.15 * min(order, 1) if sides[j] == "left" else 0.8 - 0.15 * min(order, 1)
         for i in targets:
-            row = rows[i]
-            above[row] = above.get(row, 0) + 1
-            y = row * STOREY + 1.0 + 0.12 + 0.14 * (above[row] - 1)
-            # jets of different pumps into one tank side by side, on the side that they come from
-            share = 0.2 + 0.15 * min(order, 1) if sides[j] == "left" else 0.8 - 0.15 * min(order, 1)
+            above[rows[i]] = above.get(rows[i], 0) + 1
+            y = rows[i] * STOREY + 1.0 + 0.12 + 0.14 * (above[rows[i]] - 1)
             end = boxes[i].x + boxes[i].width * share
             path = ((x, level), (x, y), (end, y), (end, boxes[i].y + boxes[i].height * 0.93))
             risers.append((j, i, path))
-    most = max((len([s for s in sides if s == side]) for side in ("left", "right")), default=0)
+    most = max(sides.count("left"), sides.count("right"))
     edge = 0.75 + 0.5 * max(0, most - 1)
     top = max([b.y + b.height for b in boxes] + [p[1][1] for _, _, p in risers]) + 0.3
     return Layout(

@@ -46,14 +46,7 @@ def overview(ax, plant, levels=None):
     n, columns = plant.tanks, per_line(plant.tanks)
     corners = np.array([(i % columns, -(i // columns)) for i in range(n)], dtype=float) * PITCH
     centres, full = corners + 0.5 * CELL, np.ones(n)
-    transfers = [(a, b) for a, (b, _) in zip(plant.sources, plant.feeds) if None not in (a, b)]
-    valves = [pair for pair in plant.valves if None not in pair]
-    flows = ((plant.pipes, GLASS, "-"), (plant.links, AFTER, "-"), (plant.spills, AFTER, ":"))
-    flows = (*flows, (valves, GLASS, "-"), (transfers, AFTER, "--"))
-    for pairs, colour, style in flows:
-        lines = [(centres[a], centres[b]) for a, b in pairs]
-        look = {"colors": colour, "linestyles": style, "linewidths": 0.8, "zorder": 1}
-        ax.add_collection(LineCollection(lines, **look))
+    _flows(ax, plant, centres)
     shares = np.zeros(n)
     if levels is not None:
         shares = np.clip(np.asarray(levels, dtype=float) / np.asarray(plant.rim), 0.0, 1.0)
@@ -80,6 +73,18 @@ def overview(ax, plant, levels=None):
     ax.set_aspect("equal")
     ax.axis("off")
     return ax
+
+
+def _flows(ax, plant, centres):
+    """Draw a line for each stream between two tanks."""
+    transfers = [(a, b) for a, (b, _) in zip(plant.sources, plant.feeds) if None not in (a, b)]
+    valves = [pair for pair in plant.valves if None not in pair]
+    flows = ((plant.pipes, GLASS, "-"), (plant.links, AFTER, "-"), (plant.spills, AFTER, ":"))
+    flows = (*flows, (valves, GLASS, "-"), (transfers, AFTER, "--"))
+    for pairs, colour, style in flows:
+        lines = [(centres[a], centres[b]) for a, b in pairs]
+        look = {"colors": colour, "linestyles": style, "linewidths": 0.8, "zorder": 1}
+        ax.add_collection(LineCollection(lines, **look))
 
 
 def _cells(ax, corners, heights, **style):

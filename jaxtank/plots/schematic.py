@@ -32,17 +32,10 @@ def schematic(ax, plant, levels=None, setpoints=None, lost=None):
     # than 24 tanks is drawn by `overview.overview`.
     if plant.tanks > LARGEST:
         return overview(ax, plant, levels)
+        return overview(ax, plant, levels)
     where = place(plant)
     _basin(ax, where)
-    for pump, _, path in where.risers:
-        line = {"color": _colour(pump), "solid_joinstyle": "round", "zorder": 1}
-        ax.plot(*np.array(path).T, linewidth=1.6, **line)
-        ax.plot(*path[-1], marker="v", color=_colour(pump), markersize=5, zorder=4)
-    for pump, _, path in where.suctions:
-        ax.plot(*np.array(path).T, color=_colour(pump), linewidth=1.6, linestyle="--", zorder=1)
-    for k, (_, path, at) in enumerate(valves(plant, where)):
-        j = len(plant.feeds) + k
-        _valve(ax, path, at, _colour(j), label_of(plant, "pump", j))
+    _pipework(ax, plant, where)
     for start, end, y in pipes(plant, where):
         for wide, colour, layer in ((6.5, GLASS, 1.7), (3.5, WATER, 1.8)):
             line = {"color": colour, "linewidth": wide, "zorder": layer}
@@ -57,21 +50,35 @@ def schematic(ax, plant, levels=None, setpoints=None, lost=None):
     if setpoints is not None:
         for k, i in enumerate(plant.outputs):
             mark(ax, where.boxes[i], float(setpoints[k]))
-    for j, (x, y) in enumerate(where.pumps):
-        crowded = sum((other > 0) == (x > 0) for other, _ in where.pumps) > 1
-        _pump(
-            ax,
-            x,
-            y,
-            j,
-            (name_of(plant, "pump", j) or str(j + 1)) if crowded else label_of(plant, "pump", j),
-        )
+    _pumps(ax, plant, where)
     _shares(ax, plant, where)
     ax.set(xlim=(where.left, where.right), ylim=(where.bottom, where.top), aspect="equal")
     if levels is not None:
         _above(ax, plant, where, np.asarray(levels, dtype=float), lost)
     ax.axis("off")
     return ax
+
+
+def _pipework(ax, plant, where):
+    """Lines of the pumps and of the valves, each in the colour of its input."""
+    for pump, _, path in where.risers:
+        line = {"color": _colour(pump), "solid_joinstyle": "round", "zorder": 1}
+        ax.plot(*np.array(path).T, linewidth=1.6, **line)
+        ax.plot(*path[-1], marker="v", color=_colour(pump), markersize=5, zorder=4)
+    for pump, _, path in where.suctions:
+        ax.plot(*np.array(path).T, color=_colour(pump), linewidth=1.6, linestyle="--", zorder=1)
+    for k, (_, path, at) in enumerate(valves(plant, where)):
+        j = len(plant.feeds) + k
+        _valve(ax, path, at, _colour(j), label_of(plant, "pump", j))
+
+
+def _pumps(ax, plant, where):
+    """Pumps with their names; by number alone where several stand on one side."""
+    for j, (x, y) in enumerate(where.pumps):
+        label = label_of(plant, "pump", j)
+        if sum((other > 0) == (x > 0) for other, _ in where.pumps) > 1:
+            label = name_of(plant, "pump", j) or str(j + 1)
+        _pump(ax, x, y, j, label)
 
 
 def mark(ax, tank, setpoint):

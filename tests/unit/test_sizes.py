@@ -11,13 +11,9 @@ MOST = 15
 """Largest cyclomatic complexity, as radon counts it."""
 LARGER = {
     "jaxtank/plants/elements.py": {"closed_circuit": 18, "streams": 16},
-    "jaxtank/plants/faults.py": {"problems": 16},
     "jaxtank/plants/network.py": {"network": 28},
     "jaxtank/plants/tank_network.py": {"_flows": 18},
     "jaxtank/plots/equations.py": {"_of_elements": 18, "_streams": 25},
-    "jaxtank/plots/layout.py": {"_with_pumps": 18},
-    "jaxtank/plots/overview.py": {"overview": 16},
-    "jaxtank/plots/schematic.py": {"schematic": 17},
     "jaxtank/rig/entry.py": {"_curve": 16, "written": 17},
     "jaxtank/rig/network.py": {"_check_links": 21, "_columns": 21, "_vessel": 23, "entries_of": 19},
     "jaxtank/rig/read.py": {"_top": 16},
@@ -25,7 +21,6 @@ LARGER = {
     "jaxtank/rig/values.py": {"dotted_name": 17},
     "jaxtank/rig/warnings.py": {"_signs": 18},
     "jaxtank/rig/write.py": {"_different": 23},
-    "tuning/cli/values.py": {"value": 17},
     "tuning/search/tuner.py": {"_default_answer": 16},
 }
 """{file: {function: its complexity}} of those that are still to be divided; none may be added."""

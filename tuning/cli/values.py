@@ -96,6 +96,14 @@ def value(text):
         return [_number_or_text(part) for part in parts] if bracketed else text
     if len(numbers) < len(parts):
         raise ValueError("an entry of the list is empty: leave out the comma, or give its number")
+    _check_decimal_comma(text, parts, numbers)
+    if bracketed or len(numbers) > 1:
+        return numbers
+    return numbers[0] if numbers else text
+
+
+def _check_decimal_comma(text, parts, numbers):
+    """Refuse a comma that may separate decimals."""
     if comma := DECIMAL_COMMA.fullmatch(text):
         sign, whole_part, digits = comma.groups()
         point = f"{sign}{whole_part.replace('.', '')}.{digits}"
@@ -109,9 +117,6 @@ def value(text):
             f"entry {zero} begins with a zero, as the digits after a decimal comma do: write"
             " decimals with a point, as 0.05"
         )
-    if bracketed or len(numbers) > 1:
-        return numbers
-    return numbers[0] if numbers else text
 
 
 def _number_or_text(part):
