@@ -145,6 +145,17 @@ def check_pointwise(case: Case) -> None:
             f"{case.name}: its rig has {case.loop.plant.tanks} tanks: a loop as code may have at"
             f" most {LARGEST}"
         )
+    signals = {
+        "setpoints": case.loop.reference,
+        "inputs": getattr(case.loop.controller, "signal", None),
+        "inflows": case.loop.disturbance,
+    }
+    tables = [name for name, signal in signals.items() if signal is not None and signal.is_table]
+    if tables:
+        raise InputError(
+            f"{case.name}: its {' and '.join(tables)} are tables of many rows, which code of single"
+            " samples does not hold: give up to 60 changes (reference, inputs), or pulses (inflow)"
+        )
     if not is_pointwise(case.loop):
         raise InputError(
             f"{case.name}: its signals are recorded samples, or its controller looks ahead; its"

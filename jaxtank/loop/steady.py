@@ -8,17 +8,19 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxtank.analysis.steady_state import equilibrium
-from jaxtank.signals.base import Constant
 
 
 def steady_inflow(loop: Any) -> Any:
-    """Steady inflow (n,) [cm^3/s] that no pump brings; None without any: pulses end."""
-    disturbance = loop.disturbance
-    if not isinstance(disturbance, Constant):
-        return None
-    level: Any = disturbance.level
-    unknown: bool = isinstance(disturbance.level, Tracer)
-    return level if unknown or np.any(np.asarray(level)) else None
+    """Steady inflow (n,) [cm^3/s] that no pump brings, of a table its mean; None without any:
+    pulses end.
+    """
+    level: Any = None if loop.disturbance is None else loop.disturbance.steady()
+    return level if level is not None and _lasts(level) else None
+
+
+def _lasts(level: Any) -> bool:
+    """Whether an inflow is not 0, or traced."""
+    return isinstance(level, Tracer) or bool(np.any(np.asarray(level)))
 
 
 def steady_state(loop: Any, y: Any, plant: Any = None) -> tuple[Any, Any]:

@@ -225,6 +225,7 @@ def controller_of(table, loop, bias=None):
     if isinstance(table, dict) and table.get("kind") == "open-loop":
         start = ramps(np.asarray(loop.actuator.initial).tolist(), [], ramp=0.0)
         section, sizes = section_of("controller", "open-loop"), sizes_of(loop.plant)
+        section = dataclasses.replace(section, name="inputs")  # as its table may be called
         signal = ramps_of(section, table, start, ("pump", "input"), sizes)
         return controllers.OpenLoop(signal=signal)
     offered = {"bias": steady_bias(loop) if bias is None else bias}

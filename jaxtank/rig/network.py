@@ -34,6 +34,7 @@ from jaxtank.rig.entry import (
     unit,
 )
 from jaxtank.rig.schema import INPUTS, LISTS, SECTIONS
+from jaxtank.rig.signals import parts_of
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
 
@@ -431,8 +432,9 @@ def entries_of(loop):
 
 def _entry_of(loop, target, i):
     """Entry i of the field `target` of a loop, or a part of it; 0 of no steady inflow."""
-    if target.startswith("disturbance.") and not isinstance(loop.disturbance, Constant):
-        return 0.0
+    if target.startswith("disturbance."):
+        steady = parts_of(loop.disturbance)[0]
+        return steady.level[i] if isinstance(steady, Constant) else 0.0
     path = target.split(".")
     part = int(path.pop()) if path[-1].isdigit() else None
     # a custom actuator or sensor need not have what the tables of a rig may give

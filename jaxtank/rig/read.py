@@ -11,7 +11,7 @@ from jaxtank.case import Case
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import read_text
 from jaxtank.core.text import shortened
-from jaxtank.rig import components, network, signals, validation
+from jaxtank.rig import components, network, signals, tables, validation
 from jaxtank.rig.entry import (
     Problems,
     Sizes,
@@ -63,16 +63,17 @@ def load(path: str | Path) -> Case:
     ...     rig.load(path).clock.dt
     4.0
     """
-    return loads(read_text(path, "rig file"), f"rig file {str(path)!r}")
+    return loads(read_text(path, "rig file"), f"rig file {str(path)!r}", Path(path).parent)
 
 
-def loads(text: str, words: str = "rig file") -> Case:
+def loads(text: str, words: str = "rig file", folder: str | Path = "") -> Case:
     """Return the Case of the text of a rig file.
 
     Parameters
     ----------
     text : TOML
     words : what errors call it
+    folder : from which the names of its tables in files (csv) are read
 
     Returns
     -------
@@ -106,16 +107,18 @@ def loads(text: str, words: str = "rig file") -> Case:
     except RecursionError:
         raise InputError(f"{words} is not TOML that can be read: it is nested too deeply") from None
     try:
-        return from_table(table)
+        return from_table(table, folder)
     except InputError as error:
         raise type(error)(f"{words}: {error}") from None
     except RecursionError:
         raise InputError(f"{words}: a value is nested too deeply") from None
 
 
-def from_table(table: Mapping[str, Any]) -> Case:
-    """Return the Case of a table of the form of a rig file, {key or section: value}, checked."""
-    table = renamed(table)
+def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
+    """Return the Case of a table of the form of a rig file, {key or section: value}, checked;
+    `folder` as in `loads`.
+    """
+    table = with_inputs(tables.resolved(renamed(table), Path(folder)))
     case = start_of(table)
     dotted = [key for key in ("values", "free", "uncertain") if key in table]
     names = {key: by_rig_name(case.loop, by_dotted_name(table[key], key)) for key in dotted}
@@ -144,6 +147,17 @@ def renamed(table):
         if old in table and new in table:
             raise InputError(f"[{old}] is an older name of [{new}]: give one of them")
     return {FORMER.get(name, name): value for name, value in table.items()}
+
+
+def with_inputs(table):
+    """A table of a rig file whose [inputs] are those of an open loop."""
+    if not isinstance(table.get("inputs"), dict):
+        return table
+    control = table.get("controller", {"kind": "open-loop"})
+    if control != {"kind": "open-loop"}:
+        raise InputError("[inputs] are those of an open loop, and [controller] another: give one")
+    rest = {name: value for name, value in table.items() if name != "inputs"}
+    return {**rest, "controller": {**table["inputs"], **control}}
 
 
 def filtered(case: Case, on: bool | None = None, changes: Mapping[str, Any] | None = None) -> Case:

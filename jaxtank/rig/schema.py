@@ -137,6 +137,9 @@ SECTIONS = _sections()
 OPEN_LOOP = SECTIONS.pop("open-loop").keys
 """[controller] of kind "open-loop"; of other kinds the keys are the fields of the class."""
 
+INFLOW_TABLE = dataclasses.replace(SECTIONS.pop("inflow-table"), name="inflow")
+"""A table of [[inflow]] that is a measured inflow and no pulse."""
+
 WEIGHT = Key("weight", "weight in the sum that is minimised", low=0.0, default=1.0)
 SHARE = Key("share", "share", low=0.0, high=1.0, strict=True, default=0.05)
 

@@ -1,5 +1,5 @@
 """What moves a rig besides its controller, as tables of a rig file: [reference], [reference.sine],
-[disturbance], [[inflow]] and [[fault]].
+[inputs], [disturbance], [[inflow]] and [[fault]].
 """
 
 import dataclasses
@@ -7,15 +7,24 @@ import dataclasses
 import numpy as np
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.labels import index_of
+from jaxtank.core.labels import index_of, input_unit
 from jaxtank.core.quantities import converted
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import number
 from jaxtank.plants.faults import faults
-from jaxtank.rig.entry import is_finite, read_entries, read_entry, refusal, sizes_of, written
-from jaxtank.rig.schema import SECTIONS
+from jaxtank.rig import tables
+from jaxtank.rig.entry import (
+    Problems,
+    is_finite,
+    read_entries,
+    read_entry,
+    refusal,
+    sizes_of,
+    written,
+)
+from jaxtank.rig.schema import INFLOW_TABLE, SECTIONS
 from jaxtank.signals.base import Constant, Sum
-from jaxtank.signals.inflows import InflowPulses, inflow_pulses
+from jaxtank.signals.inflows import InflowPulses, InflowTable, inflow_pulses, inflow_table
 from jaxtank.signals.setpoints import Ramps, Sine, ramps
 
 COURSE = ("ramp", "shape", "band", "filter")
@@ -50,10 +59,34 @@ def ramps_of(section, table, old, words, sizes):
     """Return the Ramps of a table; what it leaves out is as in `old`. words: channel and value."""
     values = read_entry(section, _over(section, ramp_values(old), table), sizes)
     label, of = f"{section.name}.changes", section["changes"].meta(sizes.units)["unit"]
-    changes = _named(label, values["changes"], words[0], sizes.plant, of)
-    changes = _changes(label, changes, words, np.size(old.initial))
+    initial = values["initial"].tolist()
+    if columns := _columns_of(section.name, table):
+        names = columns.chosen(table.get("column"), words[0], sizes.plant, len(initial))
+        units = [
+            input_unit(sizes.plant, i, of) if words[0] == "pump" else of
+            for i in range(len(initial))
+        ]
+        times, rows = columns.read(names, dict(enumerate(units)))
+        if "initial" not in table:  # the first row holds before its time
+            initial = [float(rows[i][0]) if i in rows else v for i, v in enumerate(initial)]
+        changes = tables.changes_of(times, rows, initial)
+    elif (changes := _plain_changes(values["changes"], len(initial))) is None:
+        changes = _named(label, values["changes"], words[0], sizes.plant, of)
+        changes = _changes(label, changes, words, len(initial))
     course = {name: values.get(name, getattr(old, name)) for name in COURSE}
-    return ramps(values["initial"].tolist(), changes, **course)
+    return ramps(initial, changes, **course)
+
+
+def _columns_of(where, table):
+    """The Columns that a table names by `csv` in place of `changes`; None without."""
+    if "csv" not in table:
+        extra = [name for name in tables.KEYS if name in table]
+        if extra:
+            raise InputError(f"{where}: {extra[0]} is for a table in a file: needs csv")
+        return None
+    if "changes" in table:
+        raise InputError(f"{where}: changes and csv are the same: give one of them")
+    return tables.Columns(where, table)
 
 
 def _named(label, changes, kind, plant, unit):
@@ -96,6 +129,24 @@ def _changes(label, changes, words, channels):
     return [(float(t), i - 1, float(v)) for t, i, v in changes]
 
 
+def _plain_changes(changes, channels):
+    """`_changes` of a list that is right, by arrays: a year of hours is read at once. None of
+    another.
+    """
+    if not isinstance(changes, list) or not changes:
+        return None
+    if any(type(row) is not list or list(map(type, row)) != [float, int, float] for row in changes):
+        return None
+    t, which, value = (np.array(column, dtype=float) for column in zip(*changes))
+    fine = np.all(np.isfinite(t) & np.isfinite(value)) and np.all(np.diff(t) >= 0.0)
+    if not fine or which.min() < 1 or which.max() > channels:
+        return None
+    places = [(time, i - 1) for time, i, _ in changes]
+    if len(set(places)) < len(places):
+        return None
+    return [(*place, row[2]) for place, row in zip(places, changes)]
+
+
 def ramp_values(signal):
     """{key: value} of a Ramps; changes as in a file, [[time [s], channel from 1, value], ...]."""
     changes = zip(signal.changes, np.asarray(signal.targets))
@@ -126,34 +177,100 @@ def sine_values(sine):
     return {**values, "output": sine.channel + 1}
 
 
+def parts_of(disturbance):
+    """(steady inflow or pulses, table) of a disturbance, None for what it has not."""
+    if isinstance(disturbance, Sum):
+        return disturbance.first, disturbance.second
+    table = isinstance(disturbance, InflowTable)
+    return (None, disturbance) if table else (disturbance, None)
+
+
+def pulses_of(disturbance):
+    """The InflowPulses in a disturbance, None without."""
+    first, _ = parts_of(disturbance)
+    return first if isinstance(first, InflowPulses) else None
+
+
 def disturbance_of(table, loop):
     """What [disturbance] and [[inflow]] of a rig file make of a loop's disturbance."""
-    disturbance, sizes = loop.disturbance, sizes_of(loop.plant)
+    (first, rows), sizes = parts_of(loop.disturbance), sizes_of(loop.plant)
     values = read_entry(SECTIONS["disturbance"], table.get("disturbance", {}), sizes)
+    entries = table.get("inflow", [])
+    pulses = [e for e in entries if not _is_course(e)]
     if "inflow" in values:
-        if table.get("inflow"):
-            raise InputError("[disturbance] inflow and [[inflow]]: give one of them")
-        disturbance = Constant(level=values["inflow"])
+        if pulses:
+            raise InputError("[disturbance] inflow and a pulse of [[inflow]]: give one of them")
+        first = Constant(level=values["inflow"])
     if "inflow" in table:
-        entries = read_entries(SECTIONS["inflow"], table, sizes)
-        disturbance = _pulses(entries, disturbance, loop.plant.tanks)
+        first = None if isinstance(first, InflowPulses) else first
+        first, rows = _inflows(entries, first, sizes)
     if "window" in values:
-        if not isinstance(disturbance, InflowPulses):
+        if not isinstance(first, InflowPulses):
             raise InputError(
                 f"disturbance.window = {values['window']:g} s: is how long tanks are watched after"
-                " a [[inflow]], and there is none: leave it out"
+                " a pulse of [[inflow]], and there is none: leave it out"
             )
-        disturbance = dataclasses.replace(disturbance, window=values["window"])
-    return disturbance
+        first = dataclasses.replace(first, window=values["window"])
+    if first is None or rows is None:
+        return rows if first is None else first
+    return Sum(first=first, second=rows)
+
+
+def _inflows(entries, steady, sizes):
+    """(steady inflow or pulses, InflowTable or None) of the [[inflow]] tables."""
+    problems, courses, pulses = Problems(), [], [e for e in entries if not _is_course(e)]
+    for i, entry in enumerate(entries):
+        with problems.collect():
+            if _is_course(entry):
+                courses.append(_course(entry, sizes, i))
+    with problems.collect():
+        pulses = read_entries(SECTIONS["inflow"], {"inflow": pulses}, sizes)
+    problems.check()
+    first = _pulses(pulses, steady, sizes.tanks)
+    if not courses:
+        return first, None
+    *_, between = zip(*courses)
+    return first, inflow_table(sizes.tanks, [course[:3] for course in courses], between)
+
+
+def _is_course(entry):
+    """Whether a table of [[inflow]] is a measured inflow, and no pulse."""
+    return isinstance(entry, dict) and any(key in entry for key in ("csv", "changes", "column"))
+
+
+def _course(entry, sizes, index):
+    """(tank, times [s], flows, what is between) of a table of [[inflow]] with csv or changes."""
+    if sizes.tanks == 1:
+        entry = {"tank": 1, **entry}
+    values, label = read_entry(INFLOW_TABLE, entry, sizes, index), f"inflow {index + 1}"
+    tank, between = values["tank"], values["interpolate"]
+    of = INFLOW_TABLE["changes"].meta(sizes.units)["unit"]
+    if columns := _columns_of(label, entry):
+        names = columns.chosen(entry.get("column"), "tank", sizes.plant, 1)
+        if list(names) != [0]:
+            raise refusal(f"{label}: column", entry["column"], "be one column")
+        times, rows = columns.read(names, {0: of})
+        return tank, times, rows[0], between
+    label, changes = f"{label}: changes", values["changes"]
+    good = isinstance(changes, list) and bool(changes)
+    good = good and all(isinstance(row, list) and len(row) == 2 for row in changes)
+    rows = [[converted(label, t, "s"), converted(label, q, of)] for t, q in changes] if good else []
+    if not (good and is_finite(rows)):
+        raise refusal(label, changes, f"be a list of [time [s], inflow [{of}]], finite numbers")
+    times, flows = np.array(rows, dtype=float).T
+    if times[0] < 0.0 or np.any(np.diff(times) <= 0.0):
+        raise refusal(label, changes, "have times that increase from 0 s or later")
+    return tank, times, flows, between
 
 
 def _pulses(entries, old, tanks):
-    """The disturbance of the [[inflow]] tables; without any, `old` if it is no pulses."""
+    """The pulses of the [[inflow]] tables; without any, `old`."""
     if not entries:
-        return None if isinstance(old, InflowPulses) else old
+        return old
     if isinstance(old, Constant) and np.any(np.asarray(old.level) != 0.0):
         raise InputError(
-            "[[inflow]]: this rig has a steady inflow already: a rig file can have one of the two"
+            "[[inflow]]: this rig has a steady inflow already: a rig file can have one of the two;"
+            " a table of [[inflow]] with csv or changes may stand beside either"
         )
     return inflow_pulses(
         tanks, [(e["time"], e["duration"], e["tank"], e["volume"]) for e in entries]
@@ -178,8 +295,17 @@ def disturbance_tables(disturbance):
     if disturbance is None:
         return []
     steady, pulse = SECTIONS["disturbance"], SECTIONS["inflow"]
+    if isinstance(disturbance, Sum):
+        parts = [disturbance_tables(part) for part in (disturbance.first, disturbance.second)]
+        return None if None in parts else [row for part in parts for row in part]
     if isinstance(disturbance, Constant):
         return [(steady, {"inflow": disturbance.level})]
+    if isinstance(disturbance, InflowTable):
+        return [
+            (INFLOW_TABLE, {"tank": tank, "changes": rows, "interpolate": between})
+            for tank, between, times, flows in disturbance.tables()
+            for rows in [[[t, q] for t, q in zip(times.tolist(), np.asarray(flows).tolist())]]
+        ]
     if not isinstance(disturbance, InflowPulses):
         return None
     rows = zip(disturbance.events, np.asarray(disturbance.volume).tolist())

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxtank.analysis.steady_batch import SteadyStates
 from jaxtank.case import Case, Free, Scenario
 from jaxtank.core.checks import check_value
 from jaxtank.core.clock import CLOCK_UNITS
@@ -20,13 +21,13 @@ from jaxtank.core.text import shortened
 from jaxtank.core.tree import describe, get_value, split_index
 from jaxtank.loop import run
 from jaxtank.loop.closed_loop import ClosedLoop
-from jaxtank.loop.steady import steady_state
+from jaxtank.loop.steady import steady_inflow, steady_state
 from jaxtank.measures import MEASURES, check_names, entries
 from jaxtank.measures import unit as measure_unit
 from jaxtank.rig.entry import is_finite, is_numeric, read_entry, refusal, sizes_of
 from jaxtank.rig.schema import SECTIONS
 from jaxtank.rig.values import by_dotted_name, check_not_scheduled, scheduled_names, set_scenario
-from jaxtank.signals.setpoints import Ramps
+from jaxtank.signals.setpoints import MANY, Ramps
 
 
 def check(case: Case) -> Case:
@@ -64,15 +65,38 @@ def unreachable(case: Case) -> str | None:
     plant, reference = case.loop.plant, case.loop.reference
     controller = getattr(case.loop.controller, "law", case.loop.controller)
     square = plant.pumps == len(plant.outputs) or hasattr(controller, "shared")
-    if isinstance(reference, Ramps) and square:
+    inflow = case.loop.disturbance
+    varies = inflow is not None and inflow.is_table  # a level may be reached for a while
+    if isinstance(reference, Ramps) and square and not varies:
         plateaus = reference.plateaus(case.clock.duration)
         _, first = np.unique(plateaus, axis=0, return_index=True)
-        for values in plateaus[np.sort(first)]:
+        for values in _doubtful(case.loop, plateaus[np.sort(first)]):
             try:
                 steady_state(case.loop, values)
             except EquilibriumError as error:
                 return f"reference: {error}"
     return None
+
+
+def _doubtful(loop: ClosedLoop, plateaus: np.ndarray) -> np.ndarray:
+    """The plateaus that may have no steady state: of a long table not those that linear algebra
+    finds fine, or of a rig with elements or pipes the extremes and MANY of the others.
+    """
+    plant: Any = loop.plant
+    if len(plateaus) <= MANY:
+        return plateaus
+    if not (plant.plain and plant.pumps == len(plant.outputs)) or plant.pipes:
+        extremes = [
+            f(plateaus[:, i]) for i in range(plateaus.shape[1]) for f in (np.argmin, np.argmax)
+        ]
+        some = np.linspace(0, len(plateaus) - 1, MANY).astype(int)
+        return plateaus[np.unique([*extremes, *some])]
+    inflow: Any = steady_inflow(loop)
+    with np.errstate(invalid="ignore"):
+        x, u = SteadyStates(plant, {}, 0.0 if inflow is None else np.asarray(inflow)).at(plateaus)
+    low = np.asarray(loop.actuator.driving(tuple(np.asarray(loop.actuator.low, dtype=float))))
+    fine = np.all(x[0] >= 0.0, axis=1) & np.all(u[0] >= np.minimum(low, 0.0), axis=1)
+    return plateaus[~fine]
 
 
 def check_uncertain(loop: ClosedLoop, uncertain: Mapping[str, Any]) -> dict[str, float]:

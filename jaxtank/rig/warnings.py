@@ -13,8 +13,7 @@ from jaxtank.core.tree import get_value, is_component, split_index, walk
 from jaxtank.loop.estimate_notes import is_unused
 from jaxtank.loop.tank_bottom import is_open
 from jaxtank.plants.tank_network import TankNetwork
-from jaxtank.rig.signals import steps
-from jaxtank.signals.inflows import InflowPulses
+from jaxtank.rig.signals import pulses_of, steps
 from jaxtank.signals.setpoints import Sine, index
 
 
@@ -70,7 +69,8 @@ def clock_warnings(clock: Clock) -> list[str]:
 def _late(case):
     """On changes of the reference and inflow pulses after the end of the run."""
     loop, end = case.loop, case.clock.duration
-    pulses = loop.disturbance.onset if isinstance(loop.disturbance, InflowPulses) else ()
+    signal = pulses_of(loop.disturbance)
+    pulses = () if signal is None else signal.onset
     faults = () if loop.faults is None else [start for _, start, _ in loop.faults.windows]
     times = {
         "changes of the reference": _change_times(loop.reference),
@@ -125,9 +125,9 @@ def _unseen(case):
     sine = getattr(loop.reference, "second", None)
     if isinstance(sine, Sine) and not _holds_sample(sine.start, sine.end, clock):
         yield f"reference.sine from {sine.start:g} s to {sine.end:g} s: {between}"
-    if isinstance(loop.disturbance, InflowPulses):
-        window = loop.disturbance.window
-        for time in loop.disturbance.onset:
+    if (pulses := pulses_of(loop.disturbance)) is not None:
+        window = pulses.window
+        for time in pulses.onset:
             if time < clock.duration and not _holds_sample(time, time + window, clock):
                 yield f"disturbance.window = {window:g} s after the pulse at {time:g} s: {between}"
     for name, signal in (("reference", loop.reference), ("inputs", loop.controller)):

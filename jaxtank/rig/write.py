@@ -164,8 +164,8 @@ def _building(case, loop, origin, same):
     disturbing = signals.disturbance_tables(loop.disturbance)
     if disturbing is None:
         raise InputError("its disturbance has no table")
-    if origin is None and disturbing and "inflow" in disturbing[0][1]:
-        disturbing = []  # it is a key of the tanks
+    if origin is None:  # a steady inflow is a key of the tanks
+        disturbing = [row for row in disturbing if "inflow" not in row[1]]
     tables = [*disturbing, *signals.fault_tables(loop.faults)]
     emptied = [
         _none(name)

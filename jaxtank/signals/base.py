@@ -12,6 +12,9 @@ from jaxtank.core.clock import Clock, pointwise, sample_times
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.core.vectors import columns, serves_arrays
 
+BETWEEN = ("hold", "linear")
+"""What a table of rows does between them."""
+
 
 class Signal(abc.ABC):
     """A signal of one or more channels: a reference, a disturbance or an input.
@@ -26,6 +29,9 @@ class Signal(abc.ABC):
 
     onset: Any = None
     """(time [s], ...) at which a disturbance begins, in order of time, or None."""
+
+    is_table: bool = False
+    """Whether samples are looked up in a table, which code of a single sample does not hold."""
 
     @property
     @abc.abstractmethod
@@ -74,6 +80,10 @@ class Signal(abc.ABC):
         """
         return None
 
+    def steady(self) -> Any:
+        """Return the (channels,) values that last, or None: of pulses, which end."""
+        return None
+
 
 def sampled(signal: Signal, clock: Clock, arrays: bool = False) -> tuple[Any, Any, Any]:
     """Return `signal.sample(clock)`, whose vectors are arrays (samples, channels) if `arrays`."""
@@ -119,6 +129,9 @@ class Constant(Signal):
         flat = jnp.zeros((clock.samples, self.channels))
         return self.level + flat, flat, flat
 
+    def steady(self) -> Any:
+        return self.level
+
     def held(self) -> tuple[tuple[Any, ...], ...]:
         return (tuple(self.level[i] for i in range(self.channels)),)
 
@@ -141,7 +154,7 @@ class Table(Signal):
         "-", "recorded values, in the unit of what they stand for", shape=("channel", "sample")
     )
     period: float = static("s", "time between samples", low=0.0, strict=True)
-    between: str = static(doc="what is between samples", choices=("hold", "linear"), default="hold")
+    between: str = static(doc="what is between samples", choices=BETWEEN, default="hold")
 
     @property
     def channels(self) -> int:
@@ -184,6 +197,14 @@ class Sum(Signal):
     def changes(self) -> Any:
         return self.first.changes
 
+    @property
+    def onset(self) -> Any:
+        return self.first.onset
+
+    @property
+    def is_table(self) -> bool:
+        return self.first.is_table or self.second.is_table
+
     @pointwise
     def sample(self, clock: Clock) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
         value, rate, second = (
@@ -207,6 +228,14 @@ class Sum(Signal):
         channels[sine.channel] = tuple(jnp.where(still, a, 0.0) for a in channels[sine.channel])
         return tuple(channels)
 
+    @pointwise
+    def since(self, clock: Clock) -> jax.Array | None:
+        return self.first.since(clock)
+
     def held(self) -> tuple[tuple[Any, ...], ...] | None:
         """Return the plateaus of the first signal; the second one oscillates about them."""
         return self.first.held()
+
+    def steady(self) -> Any:
+        parts = [v for v in (self.first.steady(), self.second.steady()) if v is not None]
+        return sum(parts) if parts else None

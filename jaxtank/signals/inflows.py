@@ -1,4 +1,4 @@
-"""Inflow disturbances: volumes added to a tank for a while."""
+"""Inflow disturbances: volumes added to a tank for a while, and measured inflows."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtank.core.clock import Clock, pointwise, sample_times
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf, number, static
-from jaxtank.signals.base import Signal
+from jaxtank.signals.base import BETWEEN, Signal
 from jaxtank.xla.gather import gathered
 
 
@@ -120,3 +120,128 @@ def inflow_pulses(tanks: int, entries: Sequence[tuple[float, float, int, float]]
         ),
         width=tanks,
     )
+
+
+@component
+class InflowTable(Signal):
+    """Measured inflows: rows of time and flow, as an inflow per tank [cm^3/s].
+
+    Between rows the last one is held ("hold") or a straight line joins them ("linear"); the first
+    row also holds before its time, and the last one after it. The value of a sample is the mean
+    over that sample, so that the whole volume arrives whatever the sampling period. Several tables
+    of one tank add up. Built by `inflow_table`.
+
+    Examples
+    --------
+    >>> table = inflow_table(1, [(0, [0.0, 1.5, 3.0], [2.0, 4.0, 0.0])])
+    >>> table.sample(Clock(dt=1.0, duration=3.0))[0][0].tolist()
+    [2.0, 3.0, 4.0, 0.0]
+    """
+
+    flow: np.ndarray = leaf("cm^3/s", "inflow from each row on, table after table", shape="row")
+    rows: tuple = static(
+        doc="((tank, what is between its rows, times [s] of its rows), ...), one per table"
+    )
+    width: int = static("-", "number of tanks", low=1, high=5000)
+
+    is_table = True
+
+    @property
+    def channels(self) -> int:
+        return self.width
+
+    def tables(self) -> list[tuple[int, str, Any, Any]]:
+        """Return (tank, what is between rows, times [s], flows [cm^3/s]) of each table."""
+        ends = np.cumsum([0, *(len(times) for *_, times in self.rows)])
+        return [
+            (tank, between, np.array(times), self.flow[a:b])
+            for (tank, between, times), a, b in zip(self.rows, ends, ends[1:])
+        ]
+
+    @pointwise
+    def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
+        still = jnp.zeros_like(sample_times(clock))
+        flow = [still] * self.width
+        for tank, between, times, rows in self.tables():
+            flow[tank] = flow[tank] + _means(clock, times, rows, between == "linear")
+        return tuple(flow), (still,) * self.width, (still,) * self.width
+
+    def steady(self) -> Any:
+        """Return the (tanks,) mean flow from the first row to the last [cm^3/s]."""
+        mean = [0.0 * self.flow[0]] * self.width
+        for tank, between, times, rows in self.tables():
+            if len(times) == 1:
+                mean[tank] = mean[tank] + rows[0]
+                continue
+            spans = np.diff(times)
+            after = rows[1:] if between == "linear" else rows[:-1]
+            mean[tank] = mean[tank] + ((rows[:-1] + after) * (0.5 * spans / spans.sum())).sum()
+        return (np if isinstance(self.flow, np.ndarray) else jnp).stack(mean)
+
+
+def _means(clock, times, rows, linear):
+    """(samples,) means over each sample of the course through rows of flow."""
+    # Within a row the mean is that of its ends. Over more rows volumes add up: the rest of the
+    # first, those between from a running sum, and the begun part of the last.
+    rows, spans = jnp.asarray(rows), np.diff(times)
+    slopes = jnp.diff(rows) / spans if linear else jnp.zeros(len(spans))
+    slopes = jnp.append(slopes, 0.0)
+    volumes = spans * (rows[:-1] + 0.5 * slopes[:-1] * spans)
+    volumes = jnp.concatenate([jnp.zeros(1), jnp.cumsum(volumes)])
+    t, near = sample_times(clock), 1e-7 * clock.dt
+    end = t + clock.dt
+    # a row within the tolerance of a sample begins with it
+    place = lambda moment: jnp.clip(
+        jnp.searchsorted(times, moment, side="right") - 1, 0, len(times) - 1
+    )
+    first, last = place(t + near), place(end - near)
+    past = lambda row, moment: moment - jnp.asarray(times)[row]
+    flow = lambda row, moment: rows[row] + slopes[row] * past(row, moment)
+    one = 0.5 * (flow(first, t) + flow(first, end))
+    following = jnp.minimum(first + 1, len(times) - 1)
+    until = jnp.asarray(times)[following]
+    rest = (until - t) * 0.5 * (flow(first, t) + flow(first, until))
+    begun = past(last, end) * 0.5 * (rows[last] + flow(last, end))
+    several = (rest + (volumes[last] - volumes[following]) + begun) / clock.dt
+    return jnp.where(first == last, one, several)
+
+
+def inflow_table(
+    tanks: int, tables: Sequence[tuple[int, Any, Any]], between: str | Sequence[str] = "hold"
+) -> InflowTable:
+    """Return an `InflowTable` built from arrays.
+
+    Parameters
+    ----------
+    tanks : number of tanks
+    tables : (tank counted from 0, (rows,) times [s], (rows,) flows [cm^3/s]) of each table, a
+        negative flow taken out
+    between : "hold" or "linear", of all tables or one per table
+
+    Raises
+    ------
+    InputError for times before 0 or that do not increase, arrays of different lengths and a tank
+    that does not exist.
+
+    Examples
+    --------
+    >>> float(inflow_table(2, [(1, [0.0, 60.0], [5.0, 7.0])]).flow[1])
+    7.0
+    """
+    rows, flows = [], []
+    kinds = [between] * len(tables) if isinstance(between, str) else between
+    for kind, (tank, times, flow) in zip(kinds, tables, strict=True):
+        times, flow = number(times), number(flow)
+        good = times.ndim == 1 and times.shape == flow.shape and times.size > 0
+        if not (good and times[0] >= 0.0 and np.all(np.diff(times) > 0.0) and 0 <= tank < tanks):
+            raise InputError(
+                f"inflow table of tank {tank}: needs a tank from 0 to {tanks - 1}, counted from 0,"
+                " and as many flows as times, which increase from 0 s or later"
+            )
+        if times[0] > 0.0:  # the first row holds before its time
+            times, flow = np.insert(times, 0, 0.0), np.insert(flow, 0, flow[0])
+        if kind not in BETWEEN:
+            raise InputError(f"between = {kind!r}: must be one of {', '.join(BETWEEN)}")
+        rows.append((int(tank), kind, tuple(times.tolist())))
+        flows.append(flow)
+    return InflowTable(flow=np.concatenate(flows), rows=tuple(rows), width=int(tanks))

@@ -309,7 +309,7 @@ class Ramps(Signal):
     def sample_arrays(self, clock: Clock) -> tuple[Any, Any, Any]:
         """Return `sample` as three arrays (samples, channels)."""
         self._check_filter()
-        if self._many():
+        if self.is_table:
             value, rate, second = self.sample(clock)
             return columns(value), columns(rate), columns(second)
 
@@ -324,16 +324,17 @@ class Ramps(Signal):
 
     def window_arrays(self, clock: Clock) -> tuple[Any, Any, Any, Any]:
         """Return `windows` as four arrays (samples, channels)."""
-        if self._many():
+        if self.is_table:
             target, step, since, band = zip(*self.windows(clock))
             return columns(target), columns(step), columns(since), columns(band)
         t = sample_times(clock)[:, None]
         return self._by_count(clock, lambda which, *own: self._window(clock, t, *own))
 
-    def _many(self):
+    @property
+    def is_table(self) -> bool:
         """Whether a channel has more changes than the program has pieces for."""
         counts = np.bincount([i for _, i in self.changes], minlength=1)
-        return counts.max() > MANY
+        return bool(counts.max() > MANY)
 
     def _by_count(self, clock, course) -> Any:
         """Arrays (samples, channels) of course(which, initial, changes), by number of changes."""

@@ -19,7 +19,7 @@ from jaxtank.measures import MEASURES, of_loop
 from jaxtank.measures import unit as measure_unit
 from jaxtank.plots.equations import equations, physics
 from jaxtank.signals.base import Constant, Sum
-from jaxtank.signals.inflows import InflowPulses
+from jaxtank.signals.inflows import InflowPulses, InflowTable
 from jaxtank.signals.setpoints import Ramps, Sine
 from tuning.problem.wording import count
 from tuning.report import safety
@@ -310,21 +310,8 @@ def _actuator(loop):
 
 def _signals(loop):
     """Return sentences on reference, disturbances and faults."""
-    length, signal = loop.units[0], loop.disturbance
-    if signal is None:
-        words = "No disturbance."
-    elif isinstance(signal, Constant):
-        levels = ", ".join(f"{float(v):g}" for v in signal.level)
-        words = f"Constant inflow disturbance: {levels} {length}^3/s, by tank."
-    elif isinstance(signal, InflowPulses):
-        pulses = (
-            f"{float(v):g} {length}^3 into {label_of(loop.plant, 'tank', tank)}"
-            f" at {t:g} s over {s:g} s"
-            for (t, s, tank), v in zip(signal.events, signal.volume)
-        )
-        words = f"Inflow disturbance: {'; '.join(pulses)}."
-    else:
-        words = f"Disturbance: {type(signal).__name__}."
+    length = loop.units[0]
+    words = _disturbance(loop.disturbance, loop.plant, length)
     sentences = [_reference(loop.reference, length), words]
     if loop.faults is not None:
         windows = zip(loop.faults.windows, loop.faults.factor, loop.faults.extra)
@@ -337,6 +324,32 @@ def _signals(loop):
     return sentences
 
 
+def _disturbance(signal, plant, length):
+    """Return a sentence on each part of a disturbance."""
+    if signal is None:
+        return "No disturbance."
+    if isinstance(signal, Sum):
+        parts = (_disturbance(part, plant, length) for part in (signal.first, signal.second))
+        return " ".join(parts)
+    if isinstance(signal, Constant):
+        levels = ", ".join(f"{float(v):g}" for v in signal.level)
+        return f"Constant inflow disturbance: {levels} {length}^3/s, by tank."
+    if isinstance(signal, InflowPulses):
+        pulses = (
+            f"{float(v):g} {length}^3 into {label_of(plant, 'tank', tank)} at {t:g} s over {s:g} s"
+            for (t, s, tank), v in zip(signal.events, signal.volume)
+        )
+        return f"Inflow disturbance: {'; '.join(pulses)}."
+    if isinstance(signal, InflowTable):
+        tables = (
+            f"{len(times)} rows from {times[0]:g} to {times[-1]:g} s, {np.min(flow):g} to"
+            f" {np.max(flow):g} {length}^3/s into {label_of(plant, 'tank', tank)}"
+            for tank, _, times, flow in signal.tables()
+        )
+        return f"Measured inflow: {'; '.join(tables)}."
+    return f"Disturbance: {type(signal).__name__}."
+
+
 def _reference(signal, length):
     if isinstance(signal, Sum):
         return f"{_reference(signal.first, length)} {_reference(signal.second, length)}"
@@ -347,6 +360,12 @@ def _reference(signal, length):
         changes = "; ".join(
             f"{t:g} s r{i + 1} to {float(v):g}" for (t, i), v in zip(signal.changes, signal.targets)
         )
+        if signal.is_table:
+            (first, _), (last, _), ends = signal.changes[0], signal.changes[-1], signal.targets
+            changes = (
+                f"{len(ends)} times from {first:g} to {last:g} s, to {np.min(ends):g} to"
+                f" {np.max(ends):g}"
+            )
         return f"Setpoints [{length}]: {start}" + (f"; {course} at {changes}." if changes else ".")
     if isinstance(signal, Sine):
         size = f"{float(signal.amplitude):g} {length} about {float(signal.offset):g} {length}"

@@ -209,6 +209,8 @@ initial = [0.4, 0.2, 0.1, 0.3, 0.3]
 """
 # read beside another one only: a steady inflow is no [[inflow]], a file with tanks is no case
 APART = {("tank", "inflow"), ("disturbance", "inflow"), ("", "case"), ("reference", "sine")}
+# a table in a file is written as changes (test_tables.py)
+APART |= {("reference", key) for key in ("csv", "column", "time", "decimal")}
 KEYS = [
     (section.name, key.name)
     for section in SECTIONS.values()

@@ -1,0 +1,194 @@
+"""Tables in files beside a rig file: setpoints, inputs and inflows as columns over time."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxtank.core.errors import DataError, InputError, nearest
+from jaxtank.core.labels import index_of, name_of
+from jaxtank.core.quantities import factor
+from jaxtank.core.tables import Table, numbers, read_table, seconds, split_header, unit_name
+from jaxtank.rig.entry import Problems, refusal
+
+KEYS = ("csv", "column", "time", "decimal")
+"""Keys of a table of a rig file that name a file in place of `changes`."""
+MOST = 100_000
+"""Rows of a table, so that a rig file that holds them can be read again."""
+TIMES = ("t", "time", "zeit", "timestamp", "date", "datetime")
+"""Names of the column of times where none is given; else it is the first one."""
+
+
+def resolved(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return a rig file's table in which the names of files are paths from its folder."""
+
+    def path(value: Any) -> Any:
+        named = isinstance(value, dict) and isinstance(value.get("csv"), str)
+        return {**value, "csv": str(folder / value["csv"])} if named else value
+
+    out = {name: path(value) for name, value in table.items()}
+    if isinstance(out.get("inflow"), list):
+        out["inflow"] = [path(row) for row in out["inflow"]]
+    return out
+
+
+class Columns:
+    """The columns of a file that the keys of KEYS name; `label` begins each message."""
+
+    def __init__(self, label: str, keys: Mapping[str, Any]):
+        self.label = f"{label}: "
+        for name in ("csv", "time"):
+            if not isinstance(keys.get(name, ""), str):
+                what = "a file" if name == "csv" else "a column"
+                raise refusal(f"{self.label}{name}", keys[name], f"be the name of {what}")
+        try:
+            self.table: Table = read_table(keys["csv"], keys.get("decimal") or "")
+        except DataError as error:
+            raise InputError(f"{self.label}{error}") from None
+        if len(self.table.lines) > MOST:
+            raise InputError(
+                f"{self.label}{self.table.name}: {len(self.table.lines)} rows: must be at most"
+                f" {MOST}; keep those at which a value changes"
+            )
+        self.time = self._find(keys["time"]) if "time" in keys else self._usual_time()
+
+    def _usual_time(self) -> int:
+        names = [column.name.lower() for column in self.table.columns]
+        return next((i for i, name in enumerate(names) if name in TIMES), 0)
+
+    def _find(self, text: Any) -> int:
+        """Index of the column of a header, with or without its unit."""
+        if not isinstance(text, str):
+            raise refusal(f"{self.label}column", text, "be the name of a column")
+        columns, stem = self.table.columns, split_header(text)[0]
+        tests = (
+            lambda c: c.header == text,
+            lambda c: c.name == text,
+            lambda c: c.name == stem,
+            lambda c: c.name.lower() == stem.lower(),
+        )
+        for test in tests:
+            places = [i for i, column in enumerate(columns) if test(column)]
+            if len(places) > 1:
+                raise InputError(
+                    f"{self.label}{self.table.name}, line {self.table.head}: {len(places)} columns"
+                    f" are called {text!r}: give each its own name"
+                )
+            if places:
+                return places[0]
+        headers = [column.header for column in columns]
+        raise InputError(
+            f"{self.label}{self.table.name}, line {self.table.head}: has no column"
+            f" {text!r}{nearest(text, headers)}"
+        )
+
+    def chosen(self, column: Any, kind: str, plant: Any, count: int) -> dict[int, str]:
+        """Return {channel: header} of what `column` says: a header, one per channel in a list, or
+        {channel: header}; left out: columns with the names of the channels, or the only one.
+        """
+        if isinstance(column, dict):
+            where = f"{self.label}column"
+            return {index_of(where, plant, kind, key): text for key, text in column.items()}
+        if column is None:
+            return self._usual(kind, plant, count)
+        texts = column if isinstance(column, list) else [column]
+        if len(texts) != count:
+            example = ", ".join(
+                f'{name_of(plant, kind, i) or i + 1} = "..."' for i in range(min(count, 2))
+            )
+            raise refusal(
+                f"{self.label}column",
+                column,
+                f"be a column for each of {count} {kind}s, or {{ {example} }} for some of them",
+            )
+        return dict(enumerate(texts))
+
+    def _usual(self, kind: str, plant: Any, count: int) -> dict[int, str]:
+        others = [c.header for i, c in enumerate(self.table.columns) if i != self.time]
+        names = {c.name: c.header for c in self.table.columns}
+        by_name = {i: name_of(plant, kind, i) for i in range(count)}
+        by_name = {i: names[name] for i, name in by_name.items() if name in names}
+        if by_name:
+            return by_name
+        if count == 1 and len(others) == 1:
+            return {0: others[0]}
+        raise InputError(
+            f"{self.label}column: must name a column of {self.table.name}: {', '.join(others)}"
+        )
+
+    def read(self, columns: Mapping[int, Any], units: Mapping[int, str]) -> tuple[Any, Any]:
+        """Return ((rows,) times [s], {channel: (rows,) values in the unit of the channel})."""
+        problems, times, values = Problems(), np.zeros(0), {}
+        with problems.collect():
+            times = self._times()
+        for channel, text in columns.items():
+            with problems.collect():
+                values[channel] = self._values(text, units[channel])
+        problems.check()
+        return times, values
+
+    def _times(self) -> np.ndarray:
+        table, column = self.table, self.table.columns[self.time]
+        bare = table
+        if column.unit is None:  # seconds
+            columns = list(table.columns)
+            columns[self.time] = column._replace(unit="s")
+            bare = table._replace(columns=columns)
+        try:
+            t = _seconds(table, bare, self.time)
+        except DataError as error:
+            raise InputError(f"{self.label}{error}") from None
+        where = lambda k: f"{self.label}{table.where(self.time, k)}: {column.cells[k]!r}"
+        if t[0] < 0.0:
+            raise InputError(f"{where(0)}: must be at or after 0 s, where a run begins")
+        late = np.flatnonzero(np.diff(t) <= 0.0) + 1
+        if late.size:
+            more = f", and {late.size - 1} rows below" if late.size > 1 else ""
+            raise InputError(
+                f"{where(late[0])}{more}: does not come after {column.cells[late[0] - 1]!r} of the"
+                " row before: times must increase; sort the rows, and keep one of two at one time"
+            )
+        return t
+
+    def _values(self, text: Any, base: str) -> np.ndarray:
+        place = self._find(text)
+        try:
+            values, _ = numbers(self.table, place)
+        except DataError as error:
+            raise InputError(f"{self.label}{error}") from None
+        missing = np.flatnonzero(np.isnan(values))
+        if missing.size:
+            lines = [str(self.table.lines[k]) for k in missing[:3]]
+            more = f" and {missing.size - 3} more" if missing.size > 3 else ""
+            raise InputError(
+                f"{self.label}{self.table.where(place)}: no number in line {', '.join(lines)}{more}"
+                ": every row needs one; fill it in, or delete the row"
+            )
+        unit = self.table.columns[place].unit or split_header(text)[1]
+        size = 1.0 if unit is None else factor(unit_name(unit), base)
+        if size is None:
+            needed = "have no unit" if base == "-" else f"be in {base}, or a unit of its dimension"
+            raise InputError(f"{self.label}{self.table.where(place)}: {unit!r}: must {needed}")
+        return values * size
+
+
+def _seconds(table: Table, bare: Table, column: int) -> np.ndarray:
+    """Times [s] of a column: numbers without a unit that are no days or epochs are seconds."""
+    try:
+        return seconds(table, column)
+    except DataError:
+        if bare is table:
+            raise
+        return seconds(bare, column)
+
+
+def changes_of(times: Any, values: Mapping[int, Any], initial: Any) -> list[tuple]:
+    """Return [(time [s], channel from 0, value)] of the rows at which a channel changes."""
+    changes = []
+    for channel, column in values.items():
+        before = np.concatenate([[initial[channel]], column[:-1]])
+        changes += [
+            (float(times[k]), channel, float(column[k])) for k in np.flatnonzero(column != before)
+        ]
+    return sorted(changes)

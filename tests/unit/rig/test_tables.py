@@ -1,0 +1,268 @@
+"""Setpoints, inputs and inflows from tables in files and arrays."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import rig
+from jaxtank.controllers import OpenLoop
+from jaxtank.core.clock import Chunk, Clock
+from jaxtank.core.errors import InputError
+from jaxtank.export.whole import check_pointwise
+from jaxtank.loop.steady import steady_inflow
+from jaxtank.signals import inflow_table, ramps
+
+TANK = """
+units = ["m", "m^3/s"]
+tank = [{ name = "LT101", area = 10.0, rim = 9.0, level = 2.0 }]
+pump = [{ name = "P101", gain = 1.0, to = 1, high = 1.0, initial = 0.1 }]
+plant = { gravity = 9.81 }
+"""
+PI = 'controller = { kind = "pi", Kc = 0.5, Ti = 700.0, bias = 0.1 }\n'
+PAIR = """
+units = ["m", "%"]
+tank = [{ name = "LT101", area = 1.0, rim = 9.0, drain = 0.01 },
+        { name = "LT102", area = 1.0, rim = 9.0, drain = 0.01 }]
+pump = [{ gain = 0.001, to = "LT101", high = 100.0 }, { gain = 0.001, to = "LT102", high = 100.0 }]
+plant = { gravity = 9.81 }
+controller = { kind = "pi", Kc = 5.0, Ti = 70.0, bias = 10.0 }
+"""
+
+
+def loaded(folder, text, **files):
+    """The case of a rig file beside CSV files of these names and texts."""
+    for name, content in files.items():
+        (folder / f"{name}.csv").write_text(content)
+    (folder / "rig.toml").write_text(text)
+    return rig.load(folder / "rig.toml")
+
+
+def course(case):
+    return case.loop.reference.changes, np.asarray(case.loop.reference.targets).tolist()
+
+
+def means(times, flows, between, edges):
+    """Mean flow between edges, by exact sums over all breakpoints."""
+    grid = np.unique(np.concatenate([edges, times[(times > 0) & (times < edges[-1])]]))
+    middle = 0.5 * (grid[1:] + grid[:-1])
+    if between == "linear":
+        at = np.interp(middle, times, flows)
+    else:
+        at = flows[np.maximum(np.searchsorted(times, middle, side="right") - 1, 0)]
+    volume = np.concatenate([[0.0], np.cumsum(at * np.diff(grid))])
+    return np.diff(volume[np.searchsorted(grid, edges)]) / np.diff(edges)
+
+
+@pytest.mark.parametrize("between", ["hold", "linear"])
+@pytest.mark.parametrize("count", [1, 2, 7, 400])
+def test_the_volume_of_a_measured_inflow_arrives_whatever_the_sampling_period(between, count):
+    rng = np.random.default_rng(count)
+    times = np.sort(rng.uniform(0.3, 59.0, count))
+    times[: count // 2] = np.round(times[: count // 2])  # some on a sample
+    times, flows = np.unique(times), rng.normal(size=len(np.unique(times)))
+    table, clock = inflow_table(2, [(1, times, flows)], between), Clock(dt=0.5, duration=60.0)
+    none, flow = (np.asarray(v) for v in table.sample(clock)[0])
+    edges = np.arange(clock.samples + 1) * clock.dt
+    np.testing.assert_allclose(flow, means(times, flows, between, edges), atol=1e-12)
+    assert not none.any()
+    part = table.sample(Chunk(first=jnp.int32(40), samples=30, dt=0.5))[0][1]
+    np.testing.assert_allclose(np.asarray(part), flow[40:70], atol=1e-14)
+
+
+def test_the_slope_by_a_row_is_its_share_of_each_sample():
+    times, flows = np.array([0.0, 1.25, 1.5, 3.0]), np.array([1.0, 2.0, -1.0, 4.0])
+    clock = Clock(dt=1.0, duration=4.0)
+
+    def sampled(flow):
+        return inflow_like(flow).sample(clock)[0][0]
+
+    def inflow_like(flow):
+        table = inflow_table(1, [(0, times, flows)], "linear")
+        return jaxtank.with_values(table, {"flow": flow})
+
+    slope = jax.jacfwd(sampled)(jnp.asarray(flows))
+    step = np.eye(4)
+    right = np.stack([sampled(flows + e) - sampled(flows - e) for e in step], axis=1) / 2.0
+    np.testing.assert_allclose(slope, right, atol=1e-13)
+
+
+def test_the_program_of_a_table_does_not_grow_with_its_rows():
+    clock = Clock(dt=600.0, duration=86400.0)
+
+    def equations(count):
+        times = 60.0 * np.arange(count)
+        rows = ramps([2.0], [(t, 0, 2.0 + k % 7) for k, t in enumerate(times)], ramp=0.0)
+        flow = inflow_table(1, [(0, times, np.cos(times))])
+        return [
+            str(jax.make_jaxpr(lambda s: s.sample(clock))(signal)).count("\n")
+            for signal in (rows, flow)
+        ]
+
+    assert equations(100) == equations(8760)
+
+
+def test_setpoints_are_read_with_the_units_of_file_and_times(tmp_path):
+    text = TANK + PI + 'reference = { csv = "day.csv", column = "SP", ramp = 0.0 }'
+    rows = "time [h],PV [m],SP [cm]\n0,1.9,200\n0.5,2,200\n1,2.1,250.5\n"
+    case = loaded(tmp_path, text, day=rows)
+    assert case.loop.reference.initial.tolist() == [2.0]
+    assert course(case) == (((3600.0, 0),), [2.505])
+    semicolons = "when;SP\n2026-11-03T14:00:00Z;2,0\n2026-11-03T14:10:00Z;2,5\n"
+    assert course(loaded(tmp_path, text, day=semicolons)) == (((600.0, 0),), [2.5])
+    case = loaded(tmp_path, text.replace("SP", "SP [cm]"), day="t,SP\n0,200\n60,210\n")
+    assert course(case) == (((60.0, 0),), [2.1])
+
+
+def test_a_file_has_columns_for_several_outputs_by_name_or_in_order(tmp_path):
+    rows = "t [s],LT102,a,LT101\n0,1,5,2\n60,1.5,6,2\n120,1.5,7,3\n"
+    right = (((60.0, 1), (120.0, 0)), [1.5, 3.0])
+    for column in (
+        "",
+        ', column = ["LT101", "LT102"]',
+        ', column = { LT101 = "LT101", 2 = "LT102" }',
+    ):
+        text = PAIR + f'reference = {{ csv = "sp.csv"{column} }}'
+        assert course(loaded(tmp_path, text, sp=rows)) == right
+    text = PAIR + 'reference = { csv = "sp.csv", column = { LT102 = "a" }, initial = [1.0, 2.0] }'
+    case = loaded(tmp_path, text.replace("PAIR", ""), sp=rows)
+    assert case.loop.reference.initial.tolist() == [1.0, 2.0]
+    assert course(case) == (((0.0, 1), (60.0, 1), (120.0, 1)), [5.0, 6.0, 7.0])
+
+
+def test_inputs_of_a_file_are_played_and_may_be_called_inputs_without_a_file_too(tmp_path):
+    rows = "t [min],P101 [m3/h]\n0,360\n1,720\n2,720\n"
+    for inputs in (
+        'inputs = { csv = "u.csv", column = "P101" }',
+        'controller = { kind = "open-loop", csv = "u.csv" }',
+        "inputs = { initial = [0.1], changes = [[60.0, 1, 0.2]], ramp = 0.0 }",
+    ):
+        case = loaded(tmp_path, TANK + inputs, u=rows)
+        assert isinstance(case.loop.controller, OpenLoop)
+        u = np.asarray(jaxtank.simulate(case.loop, Clock(dt=30.0, duration=150.0)).u)[:, 0]
+        np.testing.assert_allclose(u, [0.1, 0.1, 0.2, 0.2, 0.2, 0.2], rtol=1e-15)
+
+
+INFLOWS = (
+    TANK.replace("level = 2.0", "level = 2.0, inflow = -0.01")
+    + PI
+    + 'inflow = [{ csv = "q.csv", column = "rain [l/s]", interpolate = "linear" },'
+    + ' { tank = "LT101", changes = [["1 min", "72 m3/h"], [90.0, 0.0]] }]'
+)
+RAIN = "t,rain\n0,10\n100,30\n"
+
+
+def test_measured_inflows_add_up_beside_a_steady_one(tmp_path):
+    case = loaded(tmp_path, INFLOWS, q=RAIN)
+    flow = np.asarray(case.loop.disturbance.sample(Clock(dt=10.0, duration=100.0))[0][0])
+    t = 10.0 * np.arange(11) + 5.0
+    step = np.where(t < 90.0, 0.02, 0.0)
+    right = -0.01 + np.interp(t, [0, 100], [0.01, 0.03]) + step
+    np.testing.assert_allclose(flow, right, atol=1e-15)
+    mean = -0.01 + 0.02 + 0.02  # of the rain, and of the other until its last row
+    assert float(steady_inflow(case.loop)[0]) == pytest.approx(mean, rel=1e-14)
+
+
+def test_a_written_rig_holds_its_tables_and_runs_alike_without_the_files(tmp_path):
+    day = "t [s],SP\n" + "\n".join(f"{60 * k},{2 + 0.1 * (k % 9)}" for k in range(100))
+    text = INFLOWS + '\nreference = { csv = "day.csv", column = "SP", ramp = 0.0 }'
+    case = loaded(tmp_path, text, q=RAIN, day=day)
+    run = jaxtank.simulate(case.loop, Clock(dt=7.0, duration=700.0))
+    for written in (rig.dump(case), rig.complete(case), rig.dump(case, tankwise=True)):
+        again = jaxtank.simulate(rig.loads(written).loop, Clock(dt=7.0, duration=700.0))
+        assert np.array_equal(again.x, run.x) and np.array_equal(again.r, run.r)
+
+
+def test_a_rig_that_only_a_measured_inflow_fills_has_its_bias_and_setpoints(tmp_path):
+    text = TANK.replace("to = 1", "from = 1").replace(", initial = 0.1", "")
+    text += 'controller = { kind = "pi", Kc = -0.5, Ti = 700.0 }\n'
+    text += 'inflow = [{ csv = "q.csv", column = "q" }]'
+    case = loaded(tmp_path, text, q="t,q\n0,0.1\n300,0.3\n600,0.3\n")
+    assert float(case.loop.controller.bias[0]) == pytest.approx(0.2, rel=1e-12)
+
+
+def test_a_preset_takes_setpoints_and_inflows_of_files(tmp_path):
+    text = 'case = "gouta2022/pi"\nreference = { csv = "a.csv", column = ["a", "b"] }\n'
+    text += 'inflow = [{ csv = "a.csv", column = "q [l/s]", tank = 2 }]'
+    case = loaded(tmp_path, text, a="t,a,b,q\n0,5,5,0\n50,6,5,0.01\n")
+    assert case.loop.reference.first.initial.tolist() == [5.0, 5.0]
+    flow = case.loop.disturbance.sample(Clock(dt=25.0, duration=50.0))[0]
+    np.testing.assert_allclose(np.asarray(flow[1]), [0.0, 0.0, 10.0])
+
+
+def test_long_tables_have_no_page_and_no_code_and_say_so(tmp_path):
+    case = loaded(tmp_path, INFLOWS, q=RAIN)
+    with pytest.raises(InputError, match="inflows are tables"):
+        check_pointwise(case)
+    rows = "t,SP\n" + "\n".join(f"{k},{2 + k % 2}" for k in range(100))
+    case = loaded(tmp_path, TANK + PI + 'reference = { csv = "day.csv" }', day=rows)
+    with pytest.raises(InputError, match="setpoints are tables"):
+        case.explore()
+
+
+def test_all_that_is_wrong_in_a_file_is_in_one_answer_with_its_lines(tmp_path):
+    text = TANK + PI + 'reference = { csv = "day.csv", column = "SP" }'
+    text += '\ninflow = [{ csv = "day.csv", column = "q" }, { csv = "none.csv" }]'
+    rows = "t [s],SP [l],q [m^3/h]\n0,2,1\n60,3,\n50,4,nan\n70,5,2\n"
+    with pytest.raises(InputError) as refused:
+        loaded(tmp_path, text, day=rows)
+    for words in (
+        "day.csv, line 4, column 't [s]': '50'",
+        "times must increase",
+        "column 'SP [l]': 'l': must be in m",
+        "column 'q [m^3/h]': no number in line 3, 4",
+        "none.csv' does not exist",
+    ):
+        assert words in str(refused.value), words
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ('csv = "day.csv", column = "S P"', "has no column 'S P'; nearest: SP"),
+        ('csv = "day.csv"', "must name a column of day.csv: SP, PV, SP2, SP2"),
+        ('csv = "day.csv", column = "SP2"', "2 columns are called 'SP2'"),
+        ('csv = "day.csv", column = ["SP", "PV"]', "a column for each of 1 outputs"),
+        ('csv = "day.csv", column = { LT9 = "SP" }', "LT9"),
+        ('csv = "day.csv", column = "SP", time = "when"', "has no column 'when'"),
+        ('csv = "day.csv", column = "SP", changes = []', "give one of them"),
+        ('column = "SP"', "needs csv"),
+        ('csv = 3, column = "SP"', "be the name of a file"),
+        ('csv = ".", column = "SP"', "is not a file"),
+        ('csv = "day.csv", column = 3', "be the name of a column"),
+        ('csv = "day.csv", column = "SP", decimal = ";"', "decimal"),
+    ],
+)
+def test_a_table_that_cannot_be_read_is_refused_with_what_to_write(tmp_path, keys, words):
+    rows = "t,SP,PV,SP2,SP2\n0,2,2,2,2\n60,3,2,3,3\n"
+    with pytest.raises(InputError, match=words.replace("{", r"\{")):
+        loaded(tmp_path, TANK + PI + f"reference = {{ {keys} }}", day=rows)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (PI + "inputs = { initial = [0.1] }", r"\[inputs\] are those of an open loop"),
+        ("inputs = { Kc = 1.0 }", "unknown key of .inputs. 'Kc'"),
+        (PI + "inflow = [{ changes = [[0.0, 1.0, 2.0]] }]", r"list of \[time \[s\], inflow"),
+        (PI + "inflow = [{ changes = [[5.0, 1.0], [5.0, 2.0]] }]", "times that increase"),
+        (PI + "inflow = [{ changes = [[5.0, 1.0]], interpolate = 'cubic' }]", "hold, linear"),
+        (PI + "inflow = [{ changes = [[5.0, 1.0]], volume = 3.0 }]", "unknown key"),
+    ],
+)
+def test_inputs_and_inflows_that_cannot_be_are_refused(text, words):
+    with pytest.raises(InputError, match=words):
+        rig.loads(TANK + text)
+
+
+def test_arrays_that_are_no_table_are_refused():
+    for table, between in (
+        ((0, [1.0, 1.0], [2.0, 2.0]), "hold"),
+        ((0, [-1.0], [2.0]), "hold"),
+        ((0, [0.0, 1.0], [2.0]), "hold"),
+        ((3, [0.0], [2.0]), "hold"),
+        ((0, [0.0], [2.0]), "cubic"),
+    ):
+        with pytest.raises(InputError):
+            inflow_table(2, [table], between)
