@@ -33,6 +33,13 @@ from jaxtank.loop.run import simulate as simulate
 from jaxtank.loop.trajectory import Trajectory as Trajectory
 from jaxtank.loop.validation import check as check
 from jaxtank.plots.style import notebook as notebook
+from jaxtank.rig.keywords import Orifice as Orifice
+from jaxtank.rig.keywords import Pipe as Pipe
+from jaxtank.rig.keywords import Pump as Pump
+from jaxtank.rig.keywords import Rig as Rig
+from jaxtank.rig.keywords import Spill as Spill
+from jaxtank.rig.keywords import Tank as Tank
+from jaxtank.rig.keywords import Valve as Valve
 from jaxtank.xla.program_cache import cache as cache
 
 __version__: str

@@ -116,11 +116,7 @@ CLOCK_UNITS: dict[str, str] = {name: meta["unit"] for name, meta in CLOCK.items(
 
 def check_clock(clock: Any) -> None:
     """Check that a clock describes a run."""
-    if not isinstance(clock, Clock):
-        raise InputError(
-            f"clock is a {type(clock).__name__}: must be a jaxtank.Clock, such as case.clock (the"
-            " arguments are loop, clock, in this order)"
-        )
+    check_is_clock(clock)
     _check_duration(clock)
     substeps: Any = clock.substeps
     if not isinstance(substeps, int) or isinstance(substeps, bool) or not 1 <= substeps <= 10:
@@ -128,6 +124,15 @@ def check_clock(clock: Any) -> None:
     if clock.integrator not in INTEGRATORS:
         raise InputError(
             f"clock.integrator = {clock.integrator!r}: must be one of {', '.join(INTEGRATORS)}"
+        )
+
+
+def check_is_clock(clock: Any) -> None:
+    """Raise InputError for what is no Clock."""
+    if not isinstance(clock, Clock):
+        raise InputError(
+            f"clock is a {type(clock).__name__}: must be a jaxtank.Clock, such as case.clock (the"
+            " arguments are loop, clock, in this order)"
         )
 
 

@@ -19,11 +19,13 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import describe, get_value, with_values
 from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.loop.of_case import check_is_values, takes_case
 from jaxtank.loop.run import BATCH, evaluate_and_flag
 from jaxtank.loop.validation import check
 from jaxtank.xla.jit import compiled
 
 
+@takes_case
 def evaluate_many(
     loop: ClosedLoop,
     clock: Clock,
@@ -40,8 +42,8 @@ def evaluate_many(
 
     Parameters
     ----------
-    loop : ClosedLoop
-    clock : Clock
+    loop : ClosedLoop; or a Case, whose clock is then used
+    clock : Clock; none after a Case
     measures : sequence of str
         Names of `jaxtank.measures.MEASURES`.
     values : {dotted name: (N, ...) array}
@@ -71,6 +73,7 @@ def evaluate_many(
     >>> jaxtank.evaluate_many(loop, clock, ["max_level"], gains)["max_level"].shape
     (5, 2)
     """
+    check_is_values(values)
     names = (measures,) if isinstance(measures, str) else tuple(measures)
     ms.check_names(names)
     rows = _rows(values)
@@ -79,9 +82,9 @@ def evaluate_many(
     return _mapped(loop, rows, key, clock, names, min(batch, count))
 
 
-def _rows(values: Any) -> dict[str, jax.Array]:
+def _rows(values: Mapping[str, Any]) -> dict[str, jax.Array]:
     """`values` as arrays; raises InputError for what is none."""
-    if not isinstance(values, Mapping) or not values:
+    if not values:
         raise InputError(
             "values: must be {parameter: array with a row for each run}, of one parameter at least"
         )

@@ -24,6 +24,7 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Tick
 from jaxtank.loop.closed_loop import ClosedLoop, Inputs, State, floats_of, initial, run_of, zero_of
+from jaxtank.loop.of_case import takes_case
 from jaxtank.loop.steady import steady_inflow
 from jaxtank.loop.step import decide, move
 from jaxtank.loop.validation import check
@@ -324,6 +325,7 @@ class Plateau(NamedTuple):
     margins: am.Margins  # NaN where there are none, or the loop is not stable
 
 
+@takes_case
 def stability_margins(loop: ClosedLoop, clock: Clock) -> tuple[Plateau, ...]:
     """Return the stability margins of the linearised loop at every plateau of its reference.
 
@@ -335,8 +337,8 @@ def stability_margins(loop: ClosedLoop, clock: Clock) -> tuple[Plateau, ...]:
 
     Parameters
     ----------
-    loop : ClosedLoop
-    clock : Clock
+    loop : ClosedLoop; or a Case, whose clock is then used
+    clock : Clock; none after a Case
         Its sampling period counts, not its duration.
 
     Returns

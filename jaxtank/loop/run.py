@@ -35,6 +35,7 @@ from jaxtank.loop.closed_loop import (
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.loop.functions import needed_by, values_of
 from jaxtank.loop.margins import run_with
+from jaxtank.loop.of_case import check_is_values, takes_case
 from jaxtank.loop.saved_rows import simulate_compiled
 from jaxtank.loop.step import step
 from jaxtank.loop.tank_bottom import TankBottomWarning, tank_bottom_warnings
@@ -50,6 +51,7 @@ BATCH = 256
 """
 
 
+@takes_case
 def simulate(
     loop: ClosedLoop, clock: Clock, key: jax.Array | None = None, save_every: int = 1
 ) -> Trajectory:
@@ -60,8 +62,8 @@ def simulate(
 
     Parameters
     ----------
-    loop : ClosedLoop
-    clock : Clock
+    loop : ClosedLoop; or a Case, whose clock is then used
+    clock : Clock; none after a Case
     key : jax random key, optional
         For the sensor noise; needed where `sensor.noise` is above 0.
     save_every : int
@@ -98,10 +100,11 @@ def simulate(
     _report_broken(broken, loop, clock, key)
     if not isinstance(trajectory.x, Tracer) and np.ndim(trajectory.x) == 2:
         for line in tank_bottom_warnings(loop, trajectory):
-            warnings.warn(line, TankBottomWarning, stacklevel=2)
+            warnings.warn(line, TankBottomWarning, stacklevel=3)
     return trajectory
 
 
+@takes_case
 def evaluate(
     loop: ClosedLoop, clock: Clock, measures: Sequence[str], key: jax.Array | None = None
 ) -> dict[str, jax.Array]:
@@ -111,8 +114,8 @@ def evaluate(
 
     Parameters
     ----------
-    loop : ClosedLoop
-    clock : Clock
+    loop : ClosedLoop; or a Case, whose clock is then used
+    clock : Clock; none after a Case
     measures : sequence of str
         Names of `jaxtank.measures.MEASURES`.
     key : jax random key, optional
@@ -193,6 +196,7 @@ def evaluate_for_reverse(
     return evaluate_compiled(loop, clock, names, key, checkpoint=True)[0]
 
 
+@takes_case
 def sensitivities(
     loop: ClosedLoop,
     clock: Clock,
@@ -208,8 +212,8 @@ def sensitivities(
 
     Parameters
     ----------
-    loop : ClosedLoop
-    clock : Clock
+    loop : ClosedLoop; or a Case, whose clock is then used
+    clock : Clock; none after a Case
     measures : sequence of str
     values : {dotted name: number or array}
         P numbers in all: the point, and the parameters to differentiate by (forward mode: worth it
@@ -245,6 +249,7 @@ def sensitivities(
     >>> found[1]["rms_error_total"].shape, found[2].shape
     ((1,), (1, 1))
     """
+    check_is_values(values)
     if not values:
         raise InputError("sensitivities needs at least one parameter: values is empty")
     check(with_values(loop, values), clock, key)

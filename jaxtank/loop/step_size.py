@@ -197,7 +197,7 @@ def check_step(loop: ClosedLoop, clock: Clock) -> None:
                 f" within one step: {unstable.remedy}"
             )
     for line in step_warnings(loop, clock):
-        warnings.warn(line, StepWarning, stacklevel=4)
+        warnings.warn(line, StepWarning, stacklevel=6)
 
 
 def step_warnings(loop: ClosedLoop, clock: Clock) -> list[str]:

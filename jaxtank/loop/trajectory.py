@@ -75,17 +75,17 @@ class Trajectory(TrajectoryViews):
     [0.0, 4.0, 8.0]
     """
 
-    t: Any
-    x: Any
-    y: Any
-    x_hat: Any
-    d_hat: Any
-    r: Any
-    e: Any
-    command: Any
-    applied: Any
-    u: Any
-    spilled: Any
+    t: jax.Array
+    x: jax.Array
+    y: jax.Array
+    x_hat: jax.Array
+    d_hat: jax.Array
+    r: jax.Array
+    e: jax.Array
+    command: jax.Array
+    applied: jax.Array
+    u: jax.Array
+    spilled: jax.Array
     units: tuple[str, str] = DEFAULT
     share: Any = None
 

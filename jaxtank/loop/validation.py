@@ -19,6 +19,7 @@ from jaxtank.core.records import check_key
 from jaxtank.core.tree import is_component, sizes_of_shape
 from jaxtank.instruments.base import Actuator
 from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.loop.of_case import check_is_loop, takes_case
 from jaxtank.loop.step_size import check_step
 from jaxtank.plants.base import Plant
 from jaxtank.plants.elements import check_plain
@@ -33,6 +34,7 @@ KEPT = 64
 _PASSED: dict[Any, None] = {}
 
 
+@takes_case
 def check(
     loop: ClosedLoop, clock: Clock, key: jax.Array | jax.ShapeDtypeStruct | None = None
 ) -> None:
@@ -43,8 +45,8 @@ def check(
 
     Parameters
     ----------
-    loop : ClosedLoop
-    clock : Clock
+    loop : ClosedLoop; or a Case, whose clock is then used
+    clock : Clock; none after a Case
     key : jax random key, optional
         As it will be given to the run.
 
@@ -63,11 +65,7 @@ def check(
     Traceback (most recent call last):
     jaxtank.core.errors.InputError: clock.dt = -1.0 s: must be a finite number above 0 s
     """
-    if not hasattr(loop, "plant"):
-        raise InputError(
-            f"loop is a {type(loop).__name__}: must be a ClosedLoop, such as case.loop (the"
-            " arguments are loop, clock, in this order)"
-        )
+    check_is_loop(loop)
     check_clock(clock)
     check_key(key)
     signature = _signature(loop, clock, key is None)

@@ -276,6 +276,8 @@ def instrument_of(name, table, loop):
 def component(name, table, plant, offered):
     """Return the component of a table: kind, then the fields of its class, by default `offered`."""
     role = ROLES[name]
+    if isinstance(table, role.base):  # of Python
+        return table
     if not isinstance(table, dict):
         raise InputError(f"[{name}]: must be a table")
     if "kind" not in table:
@@ -316,7 +318,7 @@ def steady_bias(loop, known: bool | list[bool] = False):
 
 def leaves_bias(table):
     """Whether a [controller] table leaves out a `bias` that is then `steady_bias`."""
-    kind = table.get("kind")
+    kind = table.get("kind") if isinstance(table, dict) else None
     cls = None if kind in REGISTERED else ROLES["controller"].classes.get(kind)
     return "bias" in getattr(cls, "__dataclass_fields__", ()) and "bias" not in table
 
@@ -328,6 +330,11 @@ def kind_of(name, part):
             return "pid"
         return "pi" if part.Ti is not None else "p" if part.Tt is None else "pid"
     return next((kind for kind, cls in ROLES[name].classes.items() if cls is type(part)), None)
+
+
+def title_of(table):
+    """The kind in a [controller] table, or the class of a controller of Python."""
+    return table.get("kind", "") if isinstance(table, dict) else type(table).__name__
 
 
 def has_section(name, part):

@@ -22,7 +22,7 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants.elements import full_open
 from jaxtank.plants.network import SURPLUS, TankNetwork, network
-from jaxtank.rig.components import controller_of, observer_of
+from jaxtank.rig.components import controller_of, observer_of, title_of
 from jaxtank.rig.entry import (
     Problems,
     Sizes,
@@ -69,7 +69,7 @@ def build(table):
     control = table.get("controller", {})
     return Case(
         name="my rig",
-        title=f"{sizes.tanks} tank{'s' * (sizes.tanks > 1)}, {control.get('kind', '')}",
+        title=f"{sizes.tanks} tank{'s' * (sizes.tanks > 1)}, {title_of(control)}",
         loop=_loop(plant, columns, control, table.get("observer")),
         clock=Clock(dt=1.0, duration=600.0),
         limits={"max_level": "rim"},

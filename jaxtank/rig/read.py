@@ -8,9 +8,11 @@ from typing import Any
 
 from jaxtank import presets
 from jaxtank.case import Case
+from jaxtank.controllers.base import Controller
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import read_text
 from jaxtank.core.text import shortened
+from jaxtank.observers.base import Observer
 from jaxtank.rig import components, network, signals, tables, validation
 from jaxtank.rig.entry import (
     Problems,
@@ -271,7 +273,7 @@ def _top(table):
                 top[name] = read_value(first[name], name, value, Sizes(0))
         elif name not in sections:
             problems.append(unknown_key(first, name))
-        elif not isinstance(value, list if sections[name].many else dict):
+        elif not isinstance(value, list if sections[name].many else (dict, Controller, Observer)):
             tables = f"a list of tables, [[{name}]]" if sections[name].many else "a table"
             problems.append(refusal(name, value, f"be {tables}"))
     problems.check()

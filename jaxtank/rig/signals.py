@@ -112,7 +112,7 @@ def _changes(label, changes, words, channels):
     for change in changes:
         good = isinstance(change, list) and len(change) == 3
         good = good and all(np.ndim(v) == 0 and is_finite(v) for v in change)
-        if not (good and isinstance(change[1], int) and 1 <= change[1] <= channels):
+        if not (good and change[1] in range(1, channels + 1)):  # 1.0 of an array too
             raise InputError(f"{label} has {shortened(change)}: must be {form}, finite numbers")
     known = set()
     for i, (time, channel, _) in enumerate(changes):
@@ -126,7 +126,7 @@ def _changes(label, changes, words, channels):
                 f"{label} has two changes of {words[0]} {channel} at {time:g} s: must be one"
             )
         known.add((time, channel))
-    return [(float(t), i - 1, float(v)) for t, i, v in changes]
+    return [(float(t), int(i) - 1, float(v)) for t, i, v in changes]
 
 
 def _plain_changes(changes, channels):

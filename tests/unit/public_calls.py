@@ -75,6 +75,9 @@ CALLS = {
     "with_values": lambda: jaxtank.with_values(loop, {"x0[0]": 1.0}),
     "presets": lambda: [presets.load(paper) for paper in presets.PAPERS],
     "rig": lambda: rig.loads(rig.complete(case)),
+    "Rig": lambda: jaxtank.Rig(case="cascaded/pi"),
+    **{name: getattr(jaxtank, name) for name in ("Tank", "Orifice", "Pipe", "Spill")},
+    **{name: getattr(jaxtank, name) for name in ("Pump", "Valve")},
     "export": lambda: jaxtank.export.export(case, "c"),
     "interop": interop,
 }

@@ -101,7 +101,7 @@ def test_one_program_for_a_gpu_without_a_call_to_the_host(for_gpu):
     ("values", "options", "words"),
     [
         ({}, {}, "one parameter at least"),
-        ([1.0], {}, "one parameter at least"),
+        ([1.0], {}, "values is a list"),
         ({"controller.Kc": "abc"}, {}, "Kc = 'abc': must be an array of numbers"),
         ({"controller.Kc": [[1.0], [1.0, 2.0]]}, {}, "must be an array of numbers"),
         ({"controller.Kc": np.ones(3)}, {}, r"must be \('N', 1\)"),
