@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.numerics import clip, quantise
+from jaxtank.core.numerics import clip, lower_clip, quantise
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.core.vectors import each
 from jaxtank.instruments.base import Sensor
@@ -23,8 +23,9 @@ def _without_adc(fields, value):
 
 @component
 class LevelSensor(Sensor):
-    """One level sensor per tank: noise, then an ADC where `bits` is not 0.
-    `LevelSensor(noise=[0.1])` suffices where there is no ADC.
+    """One level sensor per tank: noise, the ends of its span, then an ADC where `bits` is not 0.
+    `LevelSensor(noise=[0.1])` suffices where there is no ADC. With `low` and `high`, the levels at
+    0 % (4 mA) and 100 % (20 mA), readings stay within them, and the ADC divides what is between.
 
         y = h + offset + noise * xi,  xi ~ N(0, 1);  volts = y / gain, clipped to [0, full_scale],
         rounded to full_scale / 2^bits
@@ -52,6 +53,18 @@ class LevelSensor(Sensor):
     offset: np.ndarray | None = leaf(
         "cm", "what each sensor reads of an empty tank", like="gain", default=None, shape="tank"
     )
+    low: np.ndarray | None = leaf(
+        "cm", "level at 0 % (4 mA): no reading is below", like="gain", default=None, shape="tank"
+    )
+    high: np.ndarray | None = leaf(
+        "cm",
+        "level at 100 % (20 mA): no reading is above",
+        low=0.0,
+        strict=True,
+        like="gain",
+        default=None,
+        shape="tank",
+    )
     full_scale: np.ndarray = leaf(
         "volt", "range of the ADC", low=0.0, strict=True, default=lambda own: _without_adc(own, 5.0)
     )
@@ -76,8 +89,16 @@ class LevelSensor(Sensor):
         """
         y = x if self.offset is None else each(lambda h, offset: h + offset, x, self.offset)
         y = y if xi is None else each(lambda h, noise, z: h + noise * z, y, self.noise, xi)
+        if self.low is not None:
+            y = each(lower_clip, y, self.low)
+        if self.high is not None:
+            y = each(lambda h, high: -lower_clip(-h, -high), y, self.high)
         if self.bits == 0:
             return y
+        if self.low is not None and self.high is not None:
+            count = 2**self.bits
+            fine = lambda h, low, high: low + quantise(h - low, (high - low) / count)
+            return each(fine, y, self.low, self.high)
         full_scale, step = self.full_scale, self.full_scale / 2**self.bits
         return each(
             lambda h, gain: quantise(clip(h / gain, 0.0, full_scale), step) * gain, y, self.gain

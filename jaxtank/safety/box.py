@@ -21,7 +21,7 @@ LEAST_SIGMAS = 5.0
 
 COVERED = {
     "actuator": ("low", "high", "dead_zone", "stop", "pulse", "lag", "initial", "delay"),
-    "sensor": ("noise", "offset", "gain", "full_scale"),
+    "sensor": ("noise", "offset", "low", "high", "gain", "full_scale"),
 }
 """Leaves of instruments whose intervals the design counts with."""
 
@@ -126,21 +126,26 @@ def narrow_band(sensor: LevelSensor, band: np.ndarray, unit: str, widths: Widths
 
 
 def band_of(sensor: LevelSensor, sigmas: float = SIGMAS, widths: Widths = NONE) -> np.ndarray:
-    """Return the (n,) band of readings [cm]: 6 standard deviations, half an ADC step, offset; each
-    the largest over the box.
+    """Return the (n,) band of readings [cm]: 6 standard deviations, half an ADC step, offset, and
+    the level below which a sensor reads nothing; each the largest over the box.
     """
     ends = lambda leaf: interval(sensor, f"sensor.{leaf}", widths)
     band = sigmas * ends("noise")[1]
     if sensor.offset is not None:
         band = band + np.maximum(*np.abs(ends("offset")))
-    if sensor.bits:
+    if sensor.low is not None:  # what is read of an empty tank
+        band = band + np.maximum(ends("low")[1], 0.0)
+    if sensor.bits and sensor.low is not None and sensor.high is not None:
+        band = band + 0.5 * (ends("high")[1] - ends("low")[0]) / 2**sensor.bits
+    elif sensor.bits:
         band = band + 0.5 * ends("gain")[1] * ends("full_scale")[1] / 2**sensor.bits
     return band
 
 
 def top_of(sensor: LevelSensor, tanks: int, widths: Widths = NONE) -> np.ndarray:
-    """Return the (n,) highest level that sensors read for certain [cm]; inf without an ADC."""
-    if not sensor.bits:
-        return np.full(tanks, np.inf)
-    gain, full = (interval(sensor, f"sensor.{leaf}", widths)[0] for leaf in ("gain", "full_scale"))
-    return gain * full
+    """Return the (n,) highest level that sensors read for certain [cm]; inf without an end."""
+    least = lambda leaf: interval(sensor, f"sensor.{leaf}", widths)[0]
+    top = np.full(tanks, np.inf) if sensor.high is None else least("high") + np.zeros(tanks)
+    if sensor.bits and (sensor.low is None or sensor.high is None):
+        top = np.minimum(top, least("gain") * least("full_scale"))
+    return top

@@ -208,10 +208,17 @@ class _Rig:
         span = lambda name: self.span(f"sensor.{name}", getattr(sensor, name))
         self.needed = full(SIGMAS * span("noise")[1]) + np.maximum(*map(np.abs, span("offset")))
         self.top = np.full(self.tanks, np.inf)
-        if sensor.bits:
+        low, high = (None if getattr(sensor, end) is None else span(end) for end in ("low", "high"))
+        if low is not None:  # a lower level is read as this one
+            self.needed = self.needed + np.maximum(full(low[1]), 0.0)
+        if high is not None:
+            self.top = full(high[0])
+        if sensor.bits and low is not None and high is not None:
+            self.needed = self.needed + 0.5 * full(high[1] - low[0]) / 2**sensor.bits
+        elif sensor.bits:
             gain, scale = span("gain"), span("full_scale")
             self.needed = self.needed + 0.5 * full(gain[1]) * scale[1] / 2**sensor.bits
-            self.top = full(gain[0]) * scale[0]
+            self.top = np.minimum(self.top, full(gain[0]) * scale[0])
 
     def disturbed(self, inflow, volume, draws):
         """Take the inflow disturbances of the case."""

@@ -139,7 +139,7 @@ def _conditions(setting, tank, limits, bound, start, reach):
     for j in sorted(joined):
         readable = reach[j] + setting.spare[j] <= setting.top[j] * (1.0 + 1e-12)
         only = f"up to {setting.top[j]:.4g} {unit} only"
-        yield readable, f"relies on tank {j + 1}, whose ADC reads {only}"
+        yield readable, f"relies on tank {j + 1}, whose sensor reads {only}"
     if setting.delay != 0.0 or setting.lag != 0.0:
         yield from _late_conditions(setting, tank, limits, start, reach)
 

@@ -17,7 +17,7 @@ KNOWN = {
     "plant": {*FLOWS, *SHAPE, "rim", "caught", "outputs", "units", "names"},
     "actuator": {"low", "high", "dead_zone", "stop", "pulse", "lag", "initial", "delay"}
     | {"saturation", "dead_zone_kind"},
-    "sensor": {"gain", "noise", "offset", "full_scale", "bits"},
+    "sensor": {"gain", "noise", "offset", "low", "high", "full_scale", "bits"},
     "faults": {"factor", "extra", "windows"},
     "safety_filter": {"least", "most", "limit", "reach", "rate", "band", "inflow", "slope"}
     | {"spare", "age", "offset", "low", "bottom", "draw", "held", "kept", "predicted", "substeps"}
@@ -29,7 +29,7 @@ UNCERTAIN = {
     *(f"plant.{name}" for name in (*FLOWS, "rim", "caught")),
     *(f"actuator.{name}" for name in ("low", "high", "dead_zone", "stop", "pulse", "lag")),
     *("actuator.initial", "actuator.delay", "x0"),
-    *("sensor.noise", "sensor.offset", "sensor.gain", "sensor.full_scale"),
+    *(f"sensor.{name}" for name in ("noise", "offset", "low", "high", "gain", "full_scale")),
 }
 HARMLESS = ("controller.", "observer.", "reference.")
 """Uncertain parameters of what may be anything: beginnings of their names."""
