@@ -24,7 +24,9 @@ def names_of(plant: Any, kind: str) -> tuple[str, ...]:
     tanks = named.get("tank", ())
     if kind == "output":
         outputs: tuple[int, ...] = plant.outputs
-        return tuple(tanks[i] for i in outputs) if tanks else ()
+        sensors = named.get("sensor", ()) or ("",) * plant.tanks
+        each = tuple(sensors[i] or (tanks[i] if tanks else "") for i in outputs)
+        return each if any(each) else ()
     return named.get(kind, ())
 
 
@@ -98,8 +100,13 @@ def short(plant: Any, kind: str, index: int) -> Any:
 def index_of(where: str, plant: Any, kind: str, text: Any) -> int:
     """Return the index (from 0) of what a person calls by its name or its number from 1."""
     names, count = names_of(plant, kind), _count(plant, kind)
-    if text in names and text:
-        return names.index(text)
+    aliases = names_of(plant, "sensor") if kind == "tank" else ()
+    if kind == "output" and (tanks := names_of(plant, "tank")):  # also by the name of its tank
+        outputs: tuple[int, ...] = plant.outputs
+        aliases = tuple(tanks[i] for i in outputs)
+    for each in (names, aliases):
+        if text in each and text:
+            return each.index(text)
     number = int(text) if str(text).isascii() and str(text).isdigit() else 0
     if not 1 <= number <= count:
         known = [name or str(i + 1) for i, name in enumerate(names or [""] * min(count, 100))]

@@ -54,14 +54,20 @@ class LevelSensor(Sensor):
         "cm", "what each sensor reads of an empty tank", like="gain", default=None, shape="tank"
     )
     low: np.ndarray | None = leaf(
-        "cm", "level at 0 % (4 mA): no reading is below", like="gain", default=None, shape="tank"
+        "cm",
+        "level at 0 % (4 mA): no reading is below; -inf: none",
+        like="gain",
+        infinite=True,
+        default=None,
+        shape="tank",
     )
     high: np.ndarray | None = leaf(
         "cm",
-        "level at 100 % (20 mA): no reading is above",
+        "level at 100 % (20 mA): no reading is above; inf: none",
         low=0.0,
         strict=True,
         like="gain",
+        infinite=True,
         default=None,
         shape="tank",
     )

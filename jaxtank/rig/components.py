@@ -224,7 +224,7 @@ def controller_of(table, loop, bias=None):
     """Return the controller of a [controller] table."""
     if isinstance(table, dict) and table.get("kind") == "open-loop":
         start = ramps(np.asarray(loop.actuator.initial).tolist(), [], ramp=0.0)
-        section, sizes = section_of("controller", "open-loop"), sizes_of(loop.plant)
+        section, sizes = section_of("controller", "open-loop"), sizes_of(loop)
         section = dataclasses.replace(section, name="inputs")  # as its table may be called
         signal = ramps_of(section, table, start, ("pump", "input"), sizes)
         return controllers.OpenLoop(signal=signal)
@@ -234,7 +234,7 @@ def controller_of(table, loop, bias=None):
         offered |= {"low": loop.actuator.low, "high": loop.actuator.high}
     if kind == "split-range":  # of its inputs, which are not known yet
         offered["bias"] = np.zeros(len(loop.plant.outputs))
-    controller = component("controller", table, model_of(loop), offered)
+    controller = component("controller", table, loop, offered, model_of(loop))
     if isinstance(controller, controllers.PID):  # before the shape of its bias is
         controller.check_inputs()
     if kind == "split-range" and "bias" not in table:
@@ -256,7 +256,7 @@ def observer_of(table, loop):
         "inputs": loop.actuator.initial,
         "measured": list(range(1, loop.plant.tanks + 1)),
     }
-    return component("observer", table, model_of(loop), offered)
+    return component("observer", table, loop, offered, model_of(loop))
 
 
 def model_of(loop):
@@ -270,12 +270,14 @@ def instrument_of(name, table, loop):
     """Return the sensor or actuator of a table; `kept` fields that it leaves out are the loop's."""
     role = ROLES[name]
     offered = {key: getattr(getattr(loop, name), key) for key in role.kept}
-    return component(name, table, loop.plant, offered)
+    return component(name, table, loop, offered)
 
 
-def component(name, table, plant, offered):
-    """Return the component of a table: kind, then the fields of its class, by default `offered`."""
-    role = ROLES[name]
+def component(name, table, loop, offered, model=None):
+    """Return the component of a table: kind, then the fields of its class, by default `offered`;
+    model: its plant, where that is another than the loop's.
+    """
+    role, plant = ROLES[name], loop.plant if model is None else model
     if isinstance(table, role.base):  # of Python
         return table
     if not isinstance(table, dict):
@@ -289,7 +291,7 @@ def component(name, table, plant, offered):
     section, cls = section_of(name, kind, plant.units), role.classes[kind]
     if kind not in REGISTERED or role.kept:
         table = {**{k: v for k, v in offered.items() if k in section.names}, **table}
-    values = read_entry(section, table, sizes_of(plant), title=f"{section.title} {kind}")
+    values = read_entry(section, table, sizes_of(loop), title=f"{section.title} {kind}")
     del values["kind"]
     if issubclass(cls, controllers.PID):
         _track(kind, values)

@@ -14,6 +14,7 @@ from jaxtank.core.text import shortened
 from jaxtank.core.tree import number, sizes_of_shape
 from jaxtank.core.units import DEFAULT
 from jaxtank.rig.schema import NEEDED, PARTS, SECTIONS, Key, Section
+from jaxtank.rig.sensors import is_reading, readings
 
 LARGEST = 1e300
 """Magnitude of a number of a rig file: products of two stay finite for most."""
@@ -28,6 +29,7 @@ class Sizes(NamedTuple):
     units: tuple = DEFAULT
     names: Mapping[str, int] = {}
     plant: Any = None
+    loop: Any = None
 
     @property
     def counts(self) -> dict[str, int]:
@@ -35,10 +37,12 @@ class Sizes(NamedTuple):
         return {"tank": self.tanks, "pump": self.pumps, "output": self.outputs}
 
 
-def sizes_of(plant) -> Sizes:
-    """Return the Sizes of a plant."""
-    names = {name: i for i, name in enumerate(names_of(plant, "tank")) if name}
-    return Sizes(plant.tanks, plant.pumps, len(plant.outputs), plant.units, names, plant)
+def sizes_of(loop) -> Sizes:
+    """Return the Sizes of a loop; tanks are called by the names of their sensors too."""
+    plant = loop.plant
+    named = [(name, i) for k in ("sensor", "tank") for i, name in enumerate(names_of(plant, k))]
+    names = {name: i for name, i in named if name}
+    return Sizes(plant.tanks, plant.pumps, len(plant.outputs), plant.units, names, plant, loop)
 
 
 def read_entry(
@@ -150,7 +154,22 @@ def refusal(label: str, value: Any, must: str) -> InputError:
 
 def read_value(key, label: str, value: Any, sizes: Sizes) -> Any:
     """Return the value of a key, checked by its kind; `label` names it in errors."""
+    if sizes.loop is not None and key.unit in ("cm", "V/cm"):
+        unit, axes = key.local_unit(sizes.units), "tank" if key.shape == ("tank",) else "output"
+        value = readings(label, key.name, value, unit, axes, sizes.loop)
     return READ[key.kind](key, label, value, sizes)
+
+
+def _reading(key, label, value, sizes):
+    """A number, or a text such as "80 %", which waits for the span of its sensor."""
+    return value if is_reading(value) else _number(key, label, value, sizes)
+
+
+def _span(key, label, value, sizes):
+    value = converted(label, value, key.meta(sizes.units)["unit"])
+    if not (is_finite(value) and np.shape(value) == (2,)):
+        raise refusal(label, value, f"be two numbers{unit(key.meta(sizes.units))}: {key.doc}")
+    return tuple(map(float, value))
 
 
 def _number(key, label, value, sizes):
@@ -304,6 +323,8 @@ def _table(key, label, value, sizes):
 
 READ = {
     "number": _number,
+    "reading": _reading,
+    "span": _span,
     "integer": _integer,
     "flag": _flag,
     "choice": lambda key, label, value, sizes: static_value(label, value, key.meta(), str),

@@ -34,6 +34,7 @@ from jaxtank.rig.entry import (
     unit,
 )
 from jaxtank.rig.schema import INPUTS, LISTS, SECTIONS
+from jaxtank.rig.sensors import complete_rows, leaves_of, sensor_rows, with_names
 from jaxtank.rig.signals import parts_of
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
@@ -43,29 +44,44 @@ MOST = 5000
 
 
 def names_in(table):
-    """{name: index} of the [[tank]] tables that have a name."""
-    return {
-        t["name"]: i
-        for i, t in enumerate(table.get("tank", []))
-        if isinstance(t, dict) and isinstance(t.get("name"), str) and t["name"]
-    }
+    """{name: index} of the [[tank]] tables that have a name, and of those of their sensors."""
+    rows = [row for row in table["tank"] if isinstance(row, dict)]
+    names = {t["name"]: i for i, t in enumerate(rows) if _is_name(t.get("name"))}
+    sensors = [row for row in table.get("sensors", []) if isinstance(row, dict)]
+    for i, row in enumerate(sensors):
+        tank = row.get("tank", i + 1)
+        index = names.get(tank) if isinstance(tank, str) else None
+        index = tank - 1 if isinstance(tank, int) else index
+        if _is_name(row.get("name")) and index is not None:
+            names.setdefault(row["name"], index)
+    return names
+
+
+def _is_name(value):
+    return isinstance(value, str) and value != ""
 
 
 def build(table):
     """Return the Case of a table of a rig file that has [[tank]]."""
     table = {**table, **{name: _list(table, name) for name in LISTS}}
     units = _units(table.get("units", list(DEFAULT)))
-    sizes = Sizes(len(table["tank"]), units=units, names=names_in(table))
+    sizes = Sizes(len(table["tank"]), units=units)
     table["pump"] = [_with_gain(row, units) for row in table["pump"]]
+    table["sensors"] = sensor_rows(table, sizes.tanks)
+    sizes = sizes._replace(names=names_in(table))
     entries, more = _read(table, sizes)
-    columns = _columns(entries)
+    rims, noise, levels = ([t[key] for t in entries["tank"]] for key in ("rim", "noise", "level"))
+    leaves, levels = leaves_of(entries["sensors"], rims, noise, levels)
+    columns = _columns(entries) | {"x0": levels}
+    columns |= {f"sensor.{name}": value for name, value in leaves.items()}
     outputs = more.pop("outputs") if "outputs" in more else _usual_outputs(entries)
     if not outputs:
         raise InputError("plant.outputs = []: must be a list of at least one tank")
     if any("port" in row for row in table["spill"]):  # else such an opening would do nothing
         more = {"overflow": True, **more}
     plant = network(**_keywords(columns), **more, outputs=outputs, units=units)
-    plant = dataclasses.replace(plant, names=_names(entries))
+    names = with_names(_names(entries), entries["sensors"], sizes.tanks)
+    plant = dataclasses.replace(plant, names=names)
     control = table.get("controller", {})
     return Case(
         name="my rig",
@@ -81,8 +97,8 @@ def build(table):
 def _read(table, sizes):
     """({list: [values of each table]}, values of [plant]), with all problems in one answer."""
     problems, more = Problems(), {}
-    entries: dict[str, list[dict[str, Any]]] = {name: [] for name in LISTS}
-    for name in LISTS:
+    entries: dict[str, list[dict[str, Any]]] = {name: [] for name in (*LISTS, "sensors")}
+    for name in entries:
         with problems.collect():
             entries[name] = read_entries(SECTIONS[name], table, sizes)
     with problems.collect():
@@ -91,6 +107,8 @@ def _read(table, sizes):
         with problems.collect():
             tank |= _vessel(f"tank {i + 1}", tank, sizes.units)
     rows = {name: table[name] if entries[name] else () for name in LISTS}
+    with problems.collect():
+        complete_rows(entries["sensors"], sizes.tanks, sizes.units[0])
     checks = [
         lambda: _check_names(entries),
         lambda: _check_links(rows, entries, sizes.units),
@@ -427,7 +445,30 @@ def entries_of(loop):
                 del values["gain"]  # 1, or one of [values]
             entries.append((section, i + 1, values))
     more = {key.name: getattr(plant, key.name) for key in SECTIONS["plant"].keys}
-    return [*entries, (SECTIONS["plant"], 1, more)]
+    return [
+        *entries,
+        *_sensor_entries(
+            loop, [values for section, _, values in entries if section.name == "tank"]
+        ),
+        (SECTIONS["plant"], 1, more),
+    ]
+
+
+def _sensor_entries(loop, tanks):
+    """The tables [[sensor]] of a loop: names, and spans in its unit of length; the noise is theirs
+    instead of the tanks'.
+    """
+    low, high = (getattr(loop.sensor, end, None) for end in ("low", "high"))
+    rows = []
+    for i in range(loop.plant.tanks):
+        row = {"name": name_of_part(loop.plant, "sensor", i), "tank": i}
+        if low is not None and high is not None and np.isfinite([low[i], high[i]]).all():
+            row["span"] = [float(low[i]), float(high[i])]
+        if row["name"] or "span" in row:
+            offset = getattr(loop.sensor, "offset", None)
+            row |= {"noise": tanks[i].pop("noise"), "offset": None if offset is None else offset[i]}
+            rows.append((SECTIONS["sensors"], len(rows) + 1, row))
+    return rows
 
 
 def _entry_of(loop, target, i):

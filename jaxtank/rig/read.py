@@ -17,6 +17,7 @@ from jaxtank.rig import components, network, signals, tables, validation
 from jaxtank.rig.entry import (
     Problems,
     Sizes,
+    read_entries,
     read_entry,
     read_value,
     refusal,
@@ -24,6 +25,7 @@ from jaxtank.rig.entry import (
     unknown_key,
 )
 from jaxtank.rig.schema import INPUTS, LISTS, SECTIONS, TANKWISE
+from jaxtank.rig.sensors import check_stated, complete_rows, sensor_rows, with_sensors
 from jaxtank.rig.values import (
     by_dotted_name,
     by_rig_name,
@@ -148,7 +150,11 @@ def renamed(table):
     for old, new in FORMER.items():
         if old in table and new in table:
             raise InputError(f"[{old}] is an older name of [{new}]: give one of them")
-    return {FORMER.get(name, name): value for name, value in table.items()}
+    table = {FORMER.get(name, name): value for name, value in table.items()}
+    sensor = table.get("sensor")
+    if isinstance(sensor, list) or (isinstance(sensor, dict) and "kind" not in sensor):
+        table["sensors"] = table.pop("sensor")  # [[sensor]], or one [sensor] for all tanks
+    return table
 
 
 def with_inputs(table):
@@ -164,7 +170,7 @@ def with_inputs(table):
 
 def filtered(case: Case, on: bool | None = None, changes: Mapping[str, Any] | None = None) -> Case:
     """Return the case with the safety filter of its settings and `changes`, or without it."""
-    changes = read_entry(SECTIONS["safety_filter"], changes or {}, sizes_of(case.loop.plant))
+    changes = read_entry(SECTIONS["safety_filter"], changes or {}, sizes_of(case.loop))
     if (case.safety is None and not on) or on is False:
         if changes:
             raise InputError(
@@ -176,7 +182,7 @@ def filtered(case: Case, on: bool | None = None, changes: Mapping[str, Any] | No
 
 
 def _filter_settings(case, table):
-    return read_entry(SECTIONS["safety_filter"], table, sizes_of(case.loop.plant))
+    return read_entry(SECTIONS["safety_filter"], table, sizes_of(case.loop))
 
 
 TUNING = {
@@ -234,27 +240,31 @@ def start_of(table):
             network.build(table)
     problems.check()
     if "case" in top:
-        case = _with_parts(presets.find(top.pop("case")), table)
+        case = presets.find(top.pop("case"))
+        if "sensors" in table:
+            case = case.replace(loop=_with_sensors(case.loop, table))
+        case = _with_parts(case, table)
     else:
         case = network.build(table)
     loop, changes = case.loop, {}
     with problems.collect():
         _check_twice(table)
+    if "sensors" in table:
+        with problems.collect():
+            check_stated(table, loop)
     for name in ("sensor", "actuator"):
         if name in table:
             with problems.collect():
                 changes[name] = components.instrument_of(name, table[name], loop)
     if "reference" in table:
         with problems.collect():
-            changes["reference"] = signals.reference_of(
-                table["reference"], loop.reference, loop.plant
-            )
+            changes["reference"] = signals.reference_of(table["reference"], loop)
     if "disturbance" in table or "inflow" in table:
         with problems.collect():
             changes["disturbance"] = signals.disturbance_of(table, loop)
     if "fault" in table:
         with problems.collect():
-            changes["faults"] = signals.faults_of(table["fault"], loop.plant)
+            changes["faults"] = signals.faults_of(table["fault"], loop)
     problems.check()
     top.pop("units", None)
     return case.replace(loop=dataclasses.replace(loop, **changes), **top)
@@ -266,6 +276,7 @@ def _top(table):
     """
     first = SECTIONS[""]
     sections = {n: section for n, section in SECTIONS.items() if n and "." not in n}
+    table = {n: v for n, v in table.items() if n != "sensors" or isinstance(v, list)}
     problems, top = Problems(), {}
     for name, value in table.items():
         if name in first.names:
@@ -289,6 +300,13 @@ def _top(table):
             " [[tank]] to describe a rig"
         )
     return top
+
+
+def _with_sensors(loop, table):
+    """A preset's loop with the [[sensor]] tables of a file."""
+    rows, sizes = sensor_rows(table, loop.plant.tanks), sizes_of(loop)
+    rows = read_entries(SECTIONS["sensors"], {"sensors": rows}, sizes)
+    return with_sensors(loop, complete_rows(rows, sizes.tanks, sizes.units[0]))
 
 
 def _with_parts(case, table):

@@ -85,11 +85,13 @@ class Section:
     prose: str = ""
     per: str = ""
     elsewhere: str = ""
+    called: str = ""
 
     @property
     def title(self) -> str:
         """The line that begins the table: "[plant]", "[[tank]]"; "" of the top of a file."""
-        return f"[[{self.name}]]" if self.many else f"[{self.name}]" if self.name else ""
+        name = self.called or self.name
+        return f"[[{name}]]" if self.many else f"[{name}]" if name else ""
 
     @property
     def names(self) -> list[str]:

@@ -23,6 +23,7 @@ from jaxtank.rig.entry import (
     written,
 )
 from jaxtank.rig.schema import INFLOW_TABLE, SECTIONS
+from jaxtank.rig.sensors import readings
 from jaxtank.signals.base import Constant, Sum
 from jaxtank.signals.inflows import InflowPulses, InflowTable, inflow_pulses, inflow_table
 from jaxtank.signals.setpoints import Ramps, Sine, ramps
@@ -37,9 +38,10 @@ def steps(reference):
     return reference if isinstance(reference, Ramps) else None
 
 
-def reference_of(table, old, plant):
-    """The reference of a [reference] table; what the table leaves out is as in `old`."""
-    start, sizes = steps(old), sizes_of(plant)
+def reference_of(table, loop):
+    """The reference of a [reference] table; what the table leaves out is as in the loop's own."""
+    old, sizes = loop.reference, sizes_of(loop)
+    start = steps(old)
     if start is None:
         raise InputError("[reference] is for cases whose reference is made of ramps")
     first = ramps_of(SECTIONS["reference"], table, start, ("output", "level"), sizes)
@@ -71,7 +73,7 @@ def ramps_of(section, table, old, words, sizes):
             initial = [float(rows[i][0]) if i in rows else v for i, v in enumerate(initial)]
         changes = tables.changes_of(times, rows, initial)
     elif (changes := _plain_changes(values["changes"], len(initial))) is None:
-        changes = _named(label, values["changes"], words[0], sizes.plant, of)
+        changes = _named(label, values["changes"], words[0], sizes, of)
         changes = _changes(label, changes, words, len(initial))
     course = {name: values.get(name, getattr(old, name)) for name in COURSE}
     return ramps(initial, changes, **course)
@@ -89,7 +91,7 @@ def _columns_of(where, table):
     return tables.Columns(where, table)
 
 
-def _named(label, changes, kind, plant, unit):
+def _named(label, changes, kind, sizes, unit):
     """Changes with the numbers of outputs or pumps for their names, and of times and values with a
     unit.
     """
@@ -98,7 +100,10 @@ def _named(label, changes, kind, plant, unit):
         if isinstance(change, list) and len(change) == 3 and str in map(type, change):
             time, channel, value = change
             if isinstance(channel, str):
-                channel = index_of(label, plant, kind, channel) + 1
+                channel = index_of(label, sizes.plant, kind, channel) + 1
+            if kind == "output" and isinstance(channel, int) and 1 <= channel <= sizes.outputs:
+                tank = sizes.plant.outputs[channel - 1]
+                value = readings(label, "changes", value, unit, tank, sizes.loop)
             change = [converted(label, time, "s"), channel, converted(label, value, unit)]
         rows.append(change)
     return rows if isinstance(changes, list) else changes
@@ -193,7 +198,7 @@ def pulses_of(disturbance):
 
 def disturbance_of(table, loop):
     """What [disturbance] and [[inflow]] of a rig file make of a loop's disturbance."""
-    (first, rows), sizes = parts_of(loop.disturbance), sizes_of(loop.plant)
+    (first, rows), sizes = parts_of(loop.disturbance), sizes_of(loop)
     values = read_entry(SECTIONS["disturbance"], table.get("disturbance", {}), sizes)
     entries = table.get("inflow", [])
     pulses = [e for e in entries if not _is_course(e)]
@@ -277,10 +282,10 @@ def _pulses(entries, old, tanks):
     )
 
 
-def faults_of(entries, plant):
+def faults_of(entries, loop):
     """The Faults of the [[fault]] tables; None of none."""
-    events = []
-    for i, e in enumerate(read_entries(SECTIONS["fault"], {"fault": entries}, sizes_of(plant))):
+    events, plant = [], loop.plant
+    for i, e in enumerate(read_entries(SECTIONS["fault"], {"fault": entries}, sizes_of(loop))):
         values = (e[name] for name in ("start", "end", "factor", "extra"))
         events.append((e["of"].removeprefix("plant."), *values))
         try:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtank.case import Free
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import describe, get_value, is_component, parameters, walk
+from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.measures import MEASURES, of_loop
 from jaxtank.measures import unit as measure_unit
 from jaxtank.plants.tank_network import TankNetwork
@@ -150,12 +151,20 @@ def _examples(case):
             "end": instant(0.7),
             "factor": 0.6,
         },
+        "sensors": _sensors(loop),
         "covariance": None if case.covariance else _covariance(case),
         "safety_filter": {"limit": np.asarray(plant.rim)}
         if case.safety is None and isinstance(plant, TankNetwork) and plant.plain
         else None,
         "scenario": {"name": "noisy", "seed": 1, "values": {"sensor.noise": 0.0}},
     }
+
+
+def _sensors(loop):
+    """A span from the bottom to the rim of the first tank; None where there is one."""
+    if not isinstance(loop.sensor, LevelSensor) or loop.sensor.low is not None:
+        return None
+    return {"tank": 0, "span": [0.0, float(np.ravel(loop.plant.rim)[0])]}
 
 
 def _controller(loop):

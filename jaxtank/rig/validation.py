@@ -3,7 +3,6 @@ uncertain, covariance, scenarios, columns of experiment data.
 """
 
 import math
-import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -16,7 +15,7 @@ from jaxtank.core.checks import check_value
 from jaxtank.core.clock import CLOCK_UNITS
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.labels import index_of
-from jaxtank.core.quantities import NUMBER, converted
+from jaxtank.core.quantities import converted
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import describe, get_value, split_index
 from jaxtank.loop import run
@@ -26,7 +25,14 @@ from jaxtank.measures import MEASURES, check_names, entries
 from jaxtank.measures import unit as measure_unit
 from jaxtank.rig.entry import is_finite, is_numeric, read_entry, refusal, sizes_of
 from jaxtank.rig.schema import SECTIONS
-from jaxtank.rig.values import by_dotted_name, check_not_scheduled, scheduled_names, set_scenario
+from jaxtank.rig.sensors import is_reading, level_of, spans_of
+from jaxtank.rig.values import (
+    by_dotted_name,
+    check_not_scheduled,
+    in_unit,
+    scheduled_names,
+    set_scenario,
+)
 from jaxtank.signals.setpoints import MANY, Ramps
 
 
@@ -159,25 +165,27 @@ def check_limits(
     return checked
 
 
-def _limit(loop, measure, label, value, rims=None):
-    """A limit with its texts converted: numbers with a unit, levels also in % of each rim."""
+def _limit(loop, measure, label, value, spans=None):
+    """A limit with its texts converted: numbers with a unit, levels also in % of each span."""
     of = measure_unit(measure, loop.units)
     texts = value if isinstance(value, list) else [value]
-    if not any(map(_is_share, texts)) or of == "%" or measure not in ("max_level", "min_level"):
+    kind, width = MEASURES[measure].per, measure not in ("max_level", "min_level")
+    if not any(map(is_reading, texts)) or of != loop.units[0] or kind == "run":
         return converted(label, value, of)
-    rims = np.asarray(loop.plant.rim).tolist() if rims is None else rims
-    texts = texts * len(rims) if len(texts) == 1 else texts
-    if len(texts) != len(rims):
-        raise refusal(label, value, f"be a limit, or {len(rims)} of them")
+    spans = _spans(loop, kind) if spans is None else spans
+    texts = texts * len(spans) if len(texts) == 1 else texts
+    if len(texts) != len(spans):
+        raise refusal(label, value, f"be a limit, or {len(spans)} of them")
     return [
-        converted(label, v, "-") * rim if _is_share(v) else converted(label, v, of)
-        for v, rim in zip(texts, rims)
+        level_of(v, span, width) if is_reading(v) else converted(label, v, of)
+        for v, span in zip(texts, spans)
     ]
 
 
-def _is_share(value):
-    """Whether a value is a text such as "90 %"."""
-    return isinstance(value, str) and re.fullmatch(rf"{NUMBER.pattern}\s*%", value.strip())
+def _spans(loop, kind):
+    """Levels at 0 and 100 % of each tank, or each output."""
+    spans = spans_of(loop)
+    return spans if kind == "tank" else [spans[i] for i in loop.plant.outputs]
 
 
 def _of_entries(loop, measure, table, usual):
@@ -192,7 +200,8 @@ def _of_entries(loop, measure, table, usual):
         i, label = index_of(f"limit {measure}", plant, kind, name), f"limit {measure}.{name}"
         if value is not None:
             rim = rims[i : i + 1] if kind == "tank" else rims
-            value = _limit(loop, measure, label, value, rim)
+            spans = None if kind == "pump" else _spans(loop, kind)[i : i + 1]
+            value = _limit(loop, measure, label, value, spans)
             value = rim[0] if isinstance(value, str) and value == "rim" else value
             if not is_finite(value) or np.size(value) != 1:
                 raise refusal(label, value, "be one finite number")
@@ -241,8 +250,13 @@ def free_of(loop, table):
     free = {}
     for name, spec in table.items():
         if isinstance(spec, list):
-            of = describe(loop, scheduled_names(loop, name)[0])["unit"]
-            spec = [*converted(f"free {name}", spec[:2], of), *spec[2:]]
+            label, entry = f"free {name}", scheduled_names(loop, name)[0]
+            ends = [in_unit(loop, label, entry, end) for end in spec[:2]]
+            ends = [
+                v[0] if isinstance(end, str) and isinstance(v, list) else v
+                for v, end in zip(ends, spec)
+            ]
+            spec = [*ends, *spec[2:]]
         good = isinstance(spec, list) and len(spec) in (2, 3)
         good = good and all(is_numeric(v) and np.ndim(v) == 0 for v in spec[:2])
         if not good or spec[2:] not in ([], ["log"], ["linear"]):
@@ -259,7 +273,7 @@ def scenarios_of(case, tables):
 
 
 def _scenario(case, table, index):
-    entry = read_entry(SECTIONS["scenario"], table, sizes_of(case.loop.plant), index)
+    entry = read_entry(SECTIONS["scenario"], table, sizes_of(case.loop), index)
     name = entry.pop("name", f"scenario {index + 1}")
     try:
         values = by_dotted_name(entry.pop("values"), "scenario.values")
@@ -296,7 +310,7 @@ def check_log(plant, table):
 
 def check_covariance(loop, table):
     """Return (names, rows) of a [covariance] table after input validation."""
-    values = read_entry(SECTIONS["covariance"], table, sizes_of(loop.plant))
+    values = read_entry(SECTIONS["covariance"], table, sizes_of(loop))
     names, rows, size = values["names"], values["matrix"], len(values["names"])
     if len(set(names)) < size:
         raise InputError("covariance.names: one is given twice")

@@ -24,6 +24,7 @@ from jaxtank.core.tree import (
     walk,
     with_values,
 )
+from jaxtank.core.units import local
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.steady import steady_state
 from jaxtank.loop.tank_bottom import can_withdraw
@@ -39,6 +40,8 @@ from jaxtank.rig.entry import (
     unit,
 )
 from jaxtank.rig.schema import SECTIONS
+from jaxtank.rig.sensors import readings
+from jaxtank.rig.signals import steps
 
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
 """Where controller and observer hold the plant's parameters, by the same names."""
@@ -84,18 +87,45 @@ def dotted_name(loop: ClosedLoop, name: str) -> str:
         ]
         return f"{base}[{','.join(map(str, entries))}]" if len(entries) == len(axes) else name
     part, _, key = name.rpartition(".")
-    for kind, names in plant.names:
-        if part and part in names:
-            section, i = SECTIONS[kind], names.index(part)
-            if key not in section.names:
-                raise unknown(f"key of {kind} {part}", key, section.names)
-            target = section[key].target
-            if not target or section[key].kind != "number":
-                raise InputError(f"{name} is the topology of the rig and cannot be set")
-            # limits of valves come after those of the pumps
-            i += len(plant.feeds) if kind == "valve" and target.startswith("actuator.") else 0
-            return f"{target}[{i}]"
-    return name
+    kind = next((kind for kind, names in plant.names if part and part in names), "")
+    return _of_table(plant, kind, part, key) if kind else name
+
+
+def _of_table(plant, kind, part, key):
+    """`dotted_name` of a key of the table of a tank, pump, valve or sensor of that name."""
+    i = names_of(plant, kind).index(part)
+    section = SECTIONS["tank" if kind == "sensor" else kind]
+    if key not in section.names:
+        raise unknown(f"key of {kind} {part}", key, section.names)
+    target = section[key].target
+    if not target or section[key].kind not in ("number", "reading"):
+        raise InputError(f"{part}.{key} is the topology of the rig and cannot be set")
+    # limits of valves come after those of the pumps
+    names = dict(plant.names)
+    i = names[kind].index(part) if kind in ("pump", "valve") else i
+    i += len(plant.feeds) if kind == "valve" and target.startswith("actuator.") else 0
+    return f"{target}[{i}]"
+
+
+def in_unit(loop: ClosedLoop, label: str, name: str, value: Any) -> Any:
+    """Return the value of a parameter with texts such as "5 min" as numbers of its unit; of levels
+    and gains also texts in % of the span of a sensor.
+    """
+    meta = describe(loop, name)
+    base, index = split_index(name)
+    part, _, field = base.rpartition(".")
+    if part.split(".")[0] not in ("actuator", "plant") and "signal" not in part:
+        axis = (meta.get("shape") or ("output",))[0]
+        axes: Any = "tank" if axis == "tank" else "output"
+        if len(index) == 1:
+            axes = int(index[-1])
+            if axis in ("change", "knot"):
+                changes = getattr(steps(loop.reference), "changes", ())
+                axes = changes[axes][1] if axis == "change" and axes < len(changes) else 0
+            gain = meta["unit"] == local("V/cm", loop.units)
+            axes = axes if axis == "tank" or gain else loop.plant.outputs[axes]
+        value = readings(label, field, value, meta["unit"], axes, loop)
+    return converted(label, value, meta["unit"])
 
 
 def _index_of(name, plant, axis, entry):
@@ -113,7 +143,7 @@ def by_rig_name(loop: ClosedLoop, values: Mapping[str, Any]) -> dict[str, Any]:
         if dotted in renamed:
             raise InputError(f"{name} is given twice, as {dotted} too: give it once")
         if name != dotted and not (isinstance(value, str) and _RELATIVE.fullmatch(value.strip())):
-            value = converted(name, value, describe(loop, dotted)["unit"])
+            value = in_unit(loop, name, dotted, value)
         renamed[dotted] = value
     return renamed
 
@@ -157,7 +187,7 @@ def set_values(case: Case, values: Mapping[str, Any]) -> Case:
                 raise InputError(f"{name}: {name.split('[')[0]} has no entries, set it whole")
             case = case.replace(loop=_set_static(case.loop, name, name.split("."), value, meta))
             continue
-        value = converted(name, value, meta["unit"])
+        value = in_unit(case.loop, name, name, value)
         if not is_numeric(value):
             raise refusal(name, value, f"be a number or a list of numbers{unit(meta)}")
         check_not_scheduled(case.loop, name)
@@ -261,7 +291,9 @@ def _absolute(case, name, value):
     match = _RELATIVE.fullmatch(value.strip())
     if match is None and NUMBER.match(value.strip()):
         with contextlib.suppress(InputError):  # the refusal below names relative changes too
-            return converted(name, value, _meta(case, name)["unit"])
+            if name.startswith("clock."):
+                return converted(name, value, _meta(case, name)["unit"])
+            return in_unit(case.loop, name, name, value)
     if match is None:
         more = ', or "steady"' if name in STEADY else ""
         numbers = f"a number or a list of numbers{unit(_meta(case, name))}"
@@ -442,7 +474,7 @@ def schedule_table(loop):
 
 def _with_schedule(case, table):
     """Return `schedule` of a table as `schedule_table` makes it."""
-    gains = read_entry(SECTIONS["schedule"], table, sizes_of(case.loop.plant))["gains"]
+    gains = read_entry(SECTIONS["schedule"], table, sizes_of(case.loop))["gains"]
     for gain in gains:
         if gains.count(gain) > 1:
             raise InputError(f"schedule.gains: {gain} is scheduled twice: name it once")

@@ -18,7 +18,7 @@ from jaxtank.core.tree import is_component, walk
 from jaxtank.measures import unreadable
 from jaxtank.rig import components, network, signals, template
 from jaxtank.rig.entry import Block, Line, allowed, block_of, lines_of, terse, toml, unit
-from jaxtank.rig.read import start_of
+from jaxtank.rig.read import renamed, start_of
 from jaxtank.rig.schema import LISTS, SECTIONS, targets
 from jaxtank.rig.validation import unreachable
 from jaxtank.rig.values import MODELS, schedule_table, unscheduled
@@ -119,7 +119,7 @@ def _sections(case, origin):
     same = _same_parts(loop, origin.loop) if origin else ()
     top, *built = _building(case, loop, origin, same)
     text = "\n".join(line for block in (top, *built) for line in terse(block))
-    base = start_of(tomllib.loads(text))
+    base = start_of(renamed(tomllib.loads(text)))
     alike = structure(_without_tables(loop)) == structure(_without_tables(base.loop))
     if not alike or not _in_use(base.loop) <= _in_use(loop):
         raise InputError("its controller or observer has another model than its rig")
@@ -249,7 +249,9 @@ def _settable(case):
 def _is_built(case, name, tankwise, same):
     """Whether the tables that build a case set the field `name` of its loop."""
     part = name.partition(".")[0]
-    if tankwise and (part == "plant" or name in targets(*LISTS)):
+    if tankwise and (
+        part == "plant" or name in targets(*LISTS, "sensors") | {"sensor.low", "sensor.high"}
+    ):
         return True
     if part not in components.ROLES or part in same:
         return False

@@ -201,6 +201,12 @@ area = 0.002
 characteristic = [[0.0, 0.0], [0.5, 0.2], [1.0, 1.0]]
 check = true
 initial = 0.3
+[[sensor]]
+name = "LI2"
+tank = "LT2"
+span = [0.05, 0.9]
+noise = 0.002
+offset = 0.01
 [plant]
 gravity = 9.81
 [controller]
@@ -211,6 +217,7 @@ initial = [0.4, 0.2, 0.1, 0.3, 0.3]
 APART = {("tank", "inflow"), ("disturbance", "inflow"), ("", "case"), ("reference", "sine")}
 # a table in a file is written as changes (test_tables.py)
 APART |= {("reference", key) for key in ("csv", "column", "time", "decimal")}
+APART |= {("sensors", "unit")}  # numbers are written in the unit of the rig
 KEYS = [
     (section.name, key.name)
     for section in SECTIONS.values()
@@ -221,7 +228,7 @@ KEYS = [
 
 def tables_of(table, section):
     """The tables of a section in a parsed rig file."""
-    for step in filter(None, section.split(".")):
+    for step in filter(None, section.replace("sensors", "sensor").split(".")):
         table = table.get(step, {})
     return table if isinstance(table, list) else [table]
 

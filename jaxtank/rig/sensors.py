@@ -1,0 +1,246 @@
+"""[[sensor]]: spans, names and noise of the level sensors, and readings in % of a span or in mA."""
+
+import dataclasses
+import re
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.labels import index_of, input_unit, label_of
+from jaxtank.core.quantities import LENGTHS, NUMBER, factor
+from jaxtank.core.text import shortened
+from jaxtank.core.tree import number
+from jaxtank.core.units import local
+
+LEVELS = ("initial", "targets", "changes", "x0", "level", "levels", "on", "off", "knots")
+LEVELS += ("limit", "low", "max_level", "min_level")
+"""Names of values that are levels: 0 % is the level at the lower end of a span."""
+
+WIDTHS = ("noise", "offset", "deadband", "amplitude", "band")
+"""Names of values that are differences of levels: 0 % is 0."""
+
+_READING = re.compile(rf"(?P<number>{NUMBER.pattern})\s*(?P<unit>%|mA)")
+_GAIN = re.compile(rf"(?P<number>{NUMBER.pattern})\s*(?P<unit>.*\S)\s*/\s*%")
+
+CURRENTS = (4.0, 20.0)
+"""Current of a sensor at the ends of its span [mA]."""
+
+
+def spans_of(loop: Any) -> list[tuple[float, float]]:
+    """Return (level at 0 %, at 100 %) of each tank: the ends of its sensor, else bottom and rim."""
+    low, high = (getattr(loop.sensor, name, None) for name in ("low", "high"))
+    return _spans(low, high, np.broadcast_to(loop.plant.rim, (loop.plant.tanks,)))
+
+
+def _spans(low, high, rims):
+    """`spans_of` of leaves of a sensor, which may be None or infinite."""
+    low = np.zeros(len(rims)) if low is None else np.asarray(low)
+    high = np.asarray(rims if high is None else high)
+    low, high = np.where(np.isfinite(low), low, 0.0), np.where(np.isfinite(high), high, rims)
+    return list(zip(low.tolist(), high.tolist()))
+
+
+def is_reading(value: Any) -> bool:
+    """Whether a value is a text such as "80 %" or "12 mA"."""
+    return isinstance(value, str) and _READING.fullmatch(value.strip()) is not None
+
+
+def level_of(text: str, span: tuple[float, float], width: bool = False) -> float:
+    """Return the level, or the difference of levels, that a text such as "80 %" stands for."""
+    match: Any = _READING.fullmatch(text.strip())
+    share, (low, high) = float(match["number"]) / 100.0, span
+    if match["unit"] == "mA":
+        share = (float(match["number"]) - (0.0 if width else CURRENTS[0])) / (
+            CURRENTS[1] - CURRENTS[0]
+        )
+    return share * (high - low) if width else low + share * (high - low)
+
+
+def readings(label: str, name: str, value: Any, unit: str, axes: Any, loop: Any) -> Any:
+    """Return a value with its texts in % or mA of a span as numbers of the rig's unit.
+
+    name : of the key or parameter; axes : "output" or "tank", of which it has one entry each, or
+    the index of one of those (of a gain an output, else a tank). Other values are returned.
+    """
+    texts = list(value) if isinstance(value, (list, tuple)) else [value]
+    convert = _conversion(label, name, unit, axes, loop)
+    if convert is None or not any(map(convert.applies, texts)):
+        return value
+    apply = lambda v, i: convert.to_number(v, i) if convert.applies(v) else v
+    count = loop.plant.tanks if axes == "tank" else len(loop.plant.outputs)
+    if isinstance(axes, int):
+        each = [apply(v, axes) for v in texts]
+        return each if isinstance(value, (list, tuple)) else each[0]
+    if not isinstance(value, (list, tuple)):
+        each = [apply(value, i) for i in range(count)]
+        return each[0] if len(set(each)) == 1 else each
+    return [apply(v, i) if i < count else v for i, v in enumerate(texts)]
+
+
+class Conversion(NamedTuple):
+    """Which texts of a value are in % or mA, and (text, index) -> number."""
+
+    applies: Callable[[Any], bool]
+    to_number: Callable[[str, int], float]
+
+
+def _conversion(label, name, unit, axes, loop):
+    """The Conversion of a value by its name and unit; None of one that is no level and no gain."""
+    if unit == local("V/cm", loop.units):
+        return Conversion(_is_gain, lambda text, i: _gain(label, text, loop, i))
+    if unit != loop.units[0] or name not in LEVELS + WIDTHS:
+        return None
+    tanks = loop.plant.outputs if axes == "output" else range(loop.plant.tanks)
+    to_level = lambda text, i: level_of(text, spans_of(loop)[tanks[i]], name in WIDTHS)
+    return Conversion(is_reading, to_level)
+
+
+def _is_gain(value):
+    return isinstance(value, str) and _GAIN.fullmatch(value.strip()) is not None
+
+
+def _gain(label, text, loop, output):
+    """A gain such as "2 %/%" or "3 m3/h/%", per % of the span of an output's sensor."""
+    match: Any = _GAIN.fullmatch(text.strip())
+    low, high = spans_of(loop)[loop.plant.outputs[output]]
+    plant, bank = loop.plant, loop.actuator
+    single = plant.pumps == len(plant.outputs)
+    inputs = [output] if single else range(plant.pumps) if len(plant.outputs) == 1 else ()
+    units = {input_unit(plant, j, loop.units[1]) for j in inputs}
+    unit = units.pop() if len(units) == 1 else ""
+    size = factor(match["unit"], unit) if unit else None
+    if size is None and match["unit"] == "%" and inputs:  # of the range of the inputs
+        size = sum(float(bank.high[j] - bank.low[j]) for j in inputs) / 100.0
+    if size is None:
+        more = f", or {unit}/%" if unit else ""
+        raise InputError(
+            f"{label} = {shortened(text)}: must be a number [{local('V/cm', loop.units)}], or per %"
+            f' of the span of a sensor: "2 %/%"{more}'
+        )
+    return float(match["number"]) * size * 100.0 / (high - low)
+
+
+def leaves_of(rows, rims, noise, levels=()):
+    """({leaf of the sensor: (n,)}, levels without texts) of rows of [[sensor]], each with its tank.
+
+    Of a tank without a row, or with one that has only a name, the sensor has no ends. noise and
+    levels : of each tank, numbers or texts in % of its span.
+    """
+    low, high, offset = np.full(len(rims), -np.inf), np.full(len(rims), np.inf), [0.0] * len(rims)
+    noise = list(noise)
+    for row in rows:
+        tank = row["tank"]
+        if "span" in row or row["unit"] in ("%", "mA"):
+            low[tank], high[tank] = row.get("span", (0.0, rims[tank]))
+        noise[tank], offset[tank] = row.get("noise", noise[tank]), row.get("offset", 0.0)
+    spans = _spans(low, high, rims)
+    number_of = lambda v, span, width: level_of(v, span, width) if is_reading(v) else v
+    leaves = {"noise": [number_of(v, span, True) for v, span in zip(noise, spans)]}
+    if np.any(np.isfinite(high)):
+        leaves |= {"low": low, "high": high}
+    if any("offset" in row for row in rows):
+        leaves["offset"] = [number_of(v, span, True) for v, span in zip(offset, spans)]
+    levels = [number_of(v, span, False) for v, span in zip(levels, spans)]
+    return {name: number(value) for name, value in leaves.items()}, levels
+
+
+def with_sensors(loop, rows):
+    """Return the loop of a preset with the level sensors of rows of [[sensor]]."""
+    for i, row in enumerate(rows):
+        if row["name"]:
+            raise InputError(
+                f"sensor {i + 1}: name = {shortened(row['name'])}: leave it out: only a rig that is"
+                " described by [[tank]] has names"
+            )
+    plant, n = loop.plant, loop.plant.tanks
+    noise = np.broadcast_to(loop.sensor.noise, (n,)).tolist()
+    leaves, _ = leaves_of(rows, np.broadcast_to(plant.rim, (n,)).tolist(), noise)
+    return dataclasses.replace(loop, sensor=dataclasses.replace(loop.sensor, **leaves))
+
+
+def with_names(names, rows, tanks):
+    """Return the names of a plant with those of the sensors of its tanks."""
+    each = {row["tank"]: row["name"] for row in rows if row["name"]}
+    sensors = tuple(each.get(i, "") for i in range(tanks))
+    return (*names, ("sensor", sensors)) if each else names
+
+
+def sensor_rows(table, tanks):
+    """The [[sensor]] tables of a file; those of one [sensor] without kind, for all tanks alike."""
+    rows = table.get("sensors", [])
+    if not isinstance(rows, Mapping):
+        return rows
+    of = lambda value, i: value[i] if isinstance(value, list) and len(value) == tanks else value
+    each = [{k: v if k == "span" else of(v, i) for k, v in rows.items()} for i in range(tanks)]
+    return [{**row, "tank": i + 1} for i, row in enumerate(each)]
+
+
+def check_stated(table, loop):
+    """Raise InputError for setpoints and gains without a unit where a sensor reads in % or mA."""
+    units = {row["tank"]: row.get("unit") for row in _with_tanks(table, loop)}
+    units = [units.get(tank) for tank in loop.plant.outputs]
+    spans, length, problems = spans_of(loop), loop.units[0], []
+    of = lambda value: value if isinstance(value, list) else [value] * len(units)
+
+    def refuse(label, i, value, like):
+        plain = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if plain and 0 <= i < len(units) and units[i] in ("%", "mA"):
+            name = label_of(loop.plant, "output", i)
+            problems.append(
+                f"{label} = {value:g} of {name}, whose sensor reads in {units[i]}: give its unit,"
+                f" {' or '.join(like(value, spans[loop.plant.outputs[i]]))}"
+            )
+
+    level = lambda v, span: (f'"{v:g} %"', f'"{v:g} {length}"')
+    gain = lambda v, span: (f'"{v:g} %/%"', f'"{v:g} {local("V/cm", loop.units)}"')
+    reference, control = table.get("reference", {}), table.get("controller", {})
+    for name, section, like in (
+        ("initial", reference, level),
+        *((key, control, level) for key in ("on", "off", "deadband")),
+        ("Kc", control, gain),
+    ):
+        where = "reference" if section is reference else "controller"
+        for i, value in enumerate(of(section.get(name))):
+            refuse(f"{where}.{name}", i, value, like)
+    for change in reference.get("changes", []):
+        if isinstance(change, list) and len(change) == 3:
+            i = index_of("reference.changes", loop.plant, "output", change[1])
+            refuse("reference.changes", i, change[2], level)
+    if problems:
+        raise InputError("; ".join(problems))
+
+
+def _with_tanks(table, loop):
+    """Rows of [[sensor]] with the index of each tank."""
+    rows = sensor_rows(table, loop.plant.tanks)
+    at = lambda row, i: index_of("sensor", loop.plant, "tank", row.get("tank", i + 1))
+    return [{**row, "tank": at(row, i)} for i, row in enumerate(rows)]
+
+
+def complete_rows(rows: list[dict[str, Any]], tanks: int, length: str) -> list[dict[str, Any]]:
+    """Return rows of [[sensor]] with their tanks, after input validation."""
+    problems: list[str] = []
+    for i, row in enumerate(rows):
+        if "tank" not in row and len(rows) > 1 and len(rows) != tanks:
+            problems.append(f"sensor {i + 1} needs tank: the tank whose level it reads, by name")
+        row.setdefault("tank", i)
+        row.setdefault("unit", length)
+        if row["unit"] not in ("%", "mA", length) and factor(row["unit"], length) is None:
+            problems.append(
+                str(unknown(f"unit of sensor {i + 1}", row["unit"], ["%", "mA", *LENGTHS]))
+            )
+        if "span" in row and not row["span"][0] < row["span"][1]:
+            low, high = row["span"]
+            problems.append(
+                f"sensor {i + 1}: span = [{low:g}, {high:g}]: must be [level at 0 % (4 mA), level"
+                " at 100 % (20 mA)], the first below the second"
+            )
+    for tank in range(tanks):
+        same = [str(i + 1) for i, row in enumerate(rows) if row["tank"] == tank]
+        if len(same) > 1:
+            problems.append(f"sensors {' and '.join(same)} read one tank: give one of them")
+    if problems:
+        raise InputError("; ".join(problems))
+    return rows

@@ -1,0 +1,134 @@
+"""Sensors in % of a span and in mA, in a rig file: values against hand calculation."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import rig
+from jaxtank.core.errors import InputError
+from jaxtank.instruments.sensors import LevelSensor
+
+TEXT = """
+units = ["m", "m^3/h"]
+tank = [
+    {{ name = "TK101", area = 0.5, rim = 1.2, level = "40 %", drain = "4 cm^2" }},
+    {{ name = "TK102", area = 0.3, rim = 1.0, level = "12 mA" }},
+]
+pump = [{{ name = "P101", to = "LT101", low = 2.0, high = 10.0, initial = 4.0 }}]
+valve = [{{ name = "FV102", from = "TK102", area = "3 cm^2", initial = 0.4 }}]
+orifice = [{{ from = "TK101", to = "TK102", area = "1 cm^2" }}]
+plant = {{ outputs = ["LT101", "LT102"] }}
+reference = {{ initial = ["40 %", "50 %"], changes = [["5 min", "LT101", "60 %"]], ramp = 0.0 }}
+controller = {{ kind = "pi", Kc = ["2 %/%", "-3 %/%"], Ti = "5 min", {more} }}
+limits = {{ max_level = {{ LT101 = "90 %" }}, rms_error = "1 %" }}
+values = {{ clock.dt = 5.0, clock.duration = 600.0 }}
+free = {{ "controller.Kc[LT101]" = ["0.1 %/%", "10 %/%"] }}
+[[sensor]]
+name = "LT101"
+tank = "TK101"
+unit = "%"
+span = [0.1, 1.1]
+noise = "0.5 %"
+[[sensor]]
+name = "LT102"
+tank = "TK102"
+unit = "mA"
+span = ["10 cm", "90 cm"]
+"""
+
+
+def case_of(more="Tt = 300.0"):
+    return rig.loads(TEXT.format(more=more))
+
+
+def test_percent_and_milliampere_are_levels_of_the_span():
+    case, loop = case_of(), case_of().loop
+    np.testing.assert_allclose(loop.x0, [0.1 + 0.4 * 1.0, 0.1 + 0.5 * 0.8])
+    np.testing.assert_allclose(loop.reference.initial, [0.5, 0.5])
+    np.testing.assert_allclose(loop.reference.targets, [0.7])
+    np.testing.assert_allclose(loop.sensor.noise, [0.005, 0.0])
+    np.testing.assert_allclose(case.limits["max_level"], [1.0, 1.0])  # the other keeps its rim
+    np.testing.assert_allclose(case.limits["rms_error"], [0.01, 0.008])
+
+
+def test_a_gain_per_percent_moves_the_same_share_of_the_range():
+    loop = case_of().loop
+    # 1 % of 1 m is 0.01 m: 2 % of the pump's 8 m^3/h; 1 % of 0.8 m moves the valve by 3 %
+    np.testing.assert_allclose(loop.controller.Kc, [2 * 0.08 / 0.01, -3 * 0.01 / 0.008])
+    low, high, _ = case_of().free["controller.Kc[0]"]
+    assert (low, high) == pytest.approx((0.8, 80.0))
+    case = rig.set_values(case_of(), {"controller.Kc[LT101]": "1 m3/h/%", "LT101.level": "10 %"})
+    assert case.loop.controller.Kc[0] == pytest.approx(100.0)
+    assert case.loop.x0[0] == pytest.approx(0.2)
+
+
+def test_the_loop_is_that_of_numbers_and_is_written_back():
+    case = case_of()
+    numbers = rig.loads(rig.dump(case))
+    again = jaxtank.parameters(numbers.loop)
+    for name, value in jaxtank.parameters(case.loop).items():
+        np.testing.assert_array_equal(again[name], value)
+    assert numbers.names == case.names and numbers.limits == case.limits
+    assert rig.dump(numbers) == rig.dump(case)
+
+
+def test_a_sensor_saturates_at_the_ends_of_its_span():
+    sensor = LevelSensor(noise=[0.0, 0.0], low=[0.1, -np.inf], high=[1.1, np.inf])
+    y = lambda h: np.array(sensor.read((h, h), None))
+    np.testing.assert_allclose(y(0.5), [0.5, 0.5])
+    np.testing.assert_allclose(y(0.02), [0.1, 0.02])
+    np.testing.assert_allclose(y(1.4), [1.1, 1.4])
+    slope = jax.jacfwd(lambda h: jnp.stack(sensor.read((h, h), None)))
+    for h, expected in ((0.5, [1, 1]), (0.02, [0, 1]), (1.4, [0, 1])):
+        np.testing.assert_array_equal(slope(h), expected)
+
+
+def test_the_adc_of_a_sensor_with_a_span_divides_the_span():
+    sensor = LevelSensor(noise=[0.0], low=[0.1], high=[1.1], bits=8, gain=[1.0], full_scale=1.0)
+    h = np.linspace(0.0, 1.2, 601)
+    y = np.asarray(sensor.read((h,), None)[0])
+    inside = np.clip(h, 0.1, 1.1)
+    np.testing.assert_allclose(y, 0.1 + np.round((inside - 0.1) * 256) / 256, atol=1e-12)
+
+
+def test_the_controller_does_not_see_a_level_above_the_span():
+    case = case_of()
+    loop = dataclasses.replace(case.loop, x0=np.array([1.15, 0.5]))
+    loop = jaxtank.with_values(loop, {"sensor.noise": [0.0, 0.0]})
+    run = jaxtank.simulate(loop, case.clock)
+    above = np.asarray(run.x[:, 0]) > 1.1
+    assert above.any()
+    np.testing.assert_allclose(np.asarray(run.y[:, 0])[above], 1.1)
+
+
+@pytest.mark.parametrize(
+    "old, new, words",
+    [
+        ('"2 %/%", "-3 %/%"', "2.0, -3.0", ("LT101", "LT102", '"2 %/%"')),
+        ('"40 %", "50 %"', "0.4, 50", ("0.4 %", "LT101", "50 %", "LT102")),
+        ("[0.1, 1.1]", "[1.1, 0.1]", ("span", "below")),
+        ('unit = "mA"', 'unit = "mV"', ("sensor 2", "mA")),
+        ('tank = "TK102"', 'tank = "TK101"', ("sensors 1 and 2",)),
+    ],
+)
+def test_what_is_ambiguous_or_wrong_is_refused_with_what_to_write(old, new, words):
+    text = TEXT.format(more="Tt = 300.0")
+    start = text.index("[[sensor]]") if old.startswith(("tank", "unit", "[")) else 0
+    assert old in text[start:]
+    with pytest.raises(InputError) as refusal:
+        rig.loads(text[:start] + text[start:].replace(old, new))
+    assert all(word in str(refusal.value) for word in words)
+
+
+def test_one_sensor_table_is_for_all_tanks_of_a_preset():
+    text = 'case = "cascaded/pi"\n[sensor]\nunit = "%"\nnoise = "1 %"\n'
+    case = rig.loads(text + '[reference]\ninitial = ["50 %"]\nchanges = []\n')
+    np.testing.assert_allclose(case.loop.sensor.noise, [0.1, 0.1])
+    np.testing.assert_allclose(case.loop.sensor.high, [10.0, 10.0])
+    np.testing.assert_allclose(case.loop.reference.initial, [5.0])
+    again = rig.loads(rig.dump(case))
+    np.testing.assert_array_equal(again.loop.sensor.low, case.loop.sensor.low)
