@@ -420,38 +420,39 @@ def entries_of(loop):
     plant = loop.plant
     if not isinstance(plant, TankNetwork):
         raise InputError(f"its {type(plant).__name__} has no name in a rig file")
-    entries = []
-    for name in LISTS:
-        section = SECTIONS[name]
-        for i in range(len(getattr(plant, section.per))):
-            # valves are the inputs after the pumps
-            j = i + len(plant.feeds) * (name == "valve")
-            values = {
-                key.name: _entry_of(loop, key.target, i if key.target.startswith("plant.") else j)
-                for key in section.keys
-                if key.target
-            }
-            usual = {key.name: key.default for key in section.keys if key.like}
-            values = {k: v for k, v in values.items() if k not in usual or v != usual[k]}
-            if name in ("tank", *INPUTS):
-                values["name"] = name_of_part(plant, name, i)
-            if name == "tank":
-                values |= _sizes_of(values)
-            if name == "pump" and plant.feeds[i][1] is None:
-                del values["split"]
-            if values.get("to") == (None, None):
-                del values["to"]
-            if values.get("curve") is not None:
-                del values["gain"]  # 1, or one of [values]
-            entries.append((section, i + 1, values))
-    more = {key.name: getattr(plant, key.name) for key in SECTIONS["plant"].keys}
-    return [
-        *entries,
-        *_sensor_entries(
-            loop, [values for section, _, values in entries if section.name == "tank"]
-        ),
-        (SECTIONS["plant"], 1, more),
+    entries = [
+        (SECTIONS[name], i + 1, _values_of(loop, name, i))
+        for name in LISTS
+        for i in range(len(getattr(plant, SECTIONS[name].per)))
     ]
+    more = {key.name: getattr(plant, key.name) for key in SECTIONS["plant"].keys}
+    tanks = [values for section, _, values in entries if section.name == "tank"]
+    return [*entries, *_sensor_entries(loop, tanks), (SECTIONS["plant"], 1, more)]
+
+
+def _values_of(loop, name, i):
+    """{key: value} of table i of a list."""
+    plant, section = loop.plant, SECTIONS[name]
+    # valves are the inputs after the pumps
+    j = i + len(plant.feeds) * (name == "valve")
+    values = {
+        key.name: _entry_of(loop, key.target, i if key.target.startswith("plant.") else j)
+        for key in section.keys
+        if key.target
+    }
+    usual = {key.name: key.default for key in section.keys if key.like}
+    values = {k: v for k, v in values.items() if k not in usual or v != usual[k]}
+    if name in ("tank", *INPUTS):
+        values["name"] = name_of_part(plant, name, i)
+    if name == "tank":
+        values |= _sizes_of(values)
+    if name == "pump" and plant.feeds[i][1] is None:
+        del values["split"]
+    if values.get("to") == (None, None):
+        del values["to"]
+    if values.get("curve") is not None:
+        del values["gain"]  # 1, or one of [values]
+    return values
 
 
 def _sensor_entries(loop, tanks):
@@ -466,7 +467,10 @@ def _sensor_entries(loop, tanks):
             row["span"] = [float(low[i]), float(high[i])]
         if row["name"] or "span" in row:
             offset = getattr(loop.sensor, "offset", None)
-            row |= {"noise": tanks[i].pop("noise"), "offset": None if offset is None else offset[i]}
+            row |= {
+                "noise": tanks[i].pop("noise", None),
+                "offset": None if offset is None else offset[i],
+            }
             rows.append((SECTIONS["sensors"], len(rows) + 1, row))
     return rows
 

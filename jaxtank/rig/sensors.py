@@ -50,12 +50,14 @@ def is_reading(value: Any) -> bool:
 def level_of(text: str, span: tuple[float, float], width: bool = False) -> float:
     """Return the level, or the difference of levels, that a text such as "80 %" stands for."""
     match: Any = _READING.fullmatch(text.strip())
-    share, (low, high) = float(match["number"]) / 100.0, span
-    if match["unit"] == "mA":
-        share = (float(match["number"]) - (0.0 if width else CURRENTS[0])) / (
-            CURRENTS[1] - CURRENTS[0]
-        )
-    return share * (high - low) if width else low + share * (high - low)
+    return in_span(float(match["number"]), match["unit"], span, width)
+
+
+def in_span(value: Any, unit: str, span: tuple[float, float], width: bool = False) -> Any:
+    """Return the level of a reading in % or mA, or the difference of two."""
+    first, last = CURRENTS if unit == "mA" else (0.0, 100.0)
+    share = (value - (0.0 if width else first)) / (last - first)
+    return share * (span[1] - span[0]) + (0.0 if width else span[0])
 
 
 def readings(label: str, name: str, value: Any, unit: str, axes: Any, loop: Any) -> Any:

@@ -23,7 +23,7 @@ from jaxtank.rig.entry import (
     written,
 )
 from jaxtank.rig.schema import INFLOW_TABLE, SECTIONS
-from jaxtank.rig.sensors import readings
+from jaxtank.rig.sensors import readings, spans_of
 from jaxtank.signals.base import Constant, Sum
 from jaxtank.signals.inflows import InflowPulses, InflowTable, inflow_pulses, inflow_table
 from jaxtank.signals.setpoints import Ramps, Sine, ramps
@@ -68,7 +68,9 @@ def ramps_of(section, table, old, words, sizes):
             input_unit(sizes.plant, i, of) if words[0] == "pump" else of
             for i in range(len(initial))
         ]
-        times, rows = columns.read(names, dict(enumerate(units)))
+        spans = [spans_of(sizes.loop)[i] for i in sizes.plant.outputs]
+        spans = None if words[0] == "pump" else spans
+        times, rows = columns.read(names, dict(enumerate(units)), spans)
         if "initial" not in table:  # the first row holds before its time
             initial = [float(rows[i][0]) if i in rows else v for i, v in enumerate(initial)]
         changes = tables.changes_of(times, rows, initial)

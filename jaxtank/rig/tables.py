@@ -11,6 +11,7 @@ from jaxtank.core.labels import index_of, name_of
 from jaxtank.core.quantities import factor
 from jaxtank.core.tables import Table, numbers, read_table, seconds, split_header, unit_name
 from jaxtank.rig.entry import Problems, refusal
+from jaxtank.rig.sensors import in_span
 
 KEYS = ("csv", "column", "time", "decimal")
 """Keys of a table of a rig file that name a file in place of `changes`."""
@@ -117,14 +118,19 @@ class Columns:
             f"{self.label}column: must name a column of {self.table.name}: {', '.join(others)}"
         )
 
-    def read(self, columns: Mapping[int, Any], units: Mapping[int, str]) -> tuple[Any, Any]:
-        """Return ((rows,) times [s], {channel: (rows,) values in the unit of the channel})."""
+    def read(
+        self, columns: Mapping[int, Any], units: Mapping[int, str], spans: Any = None
+    ) -> tuple[Any, Any]:
+        """Return ((rows,) times [s], {channel: (rows,) values in the unit of the channel}); spans:
+        levels at 0 and 100 % of each channel, where it is a level.
+        """
         problems, times, values = Problems(), np.zeros(0), {}
         with problems.collect():
             times = self._times()
         for channel, text in columns.items():
             with problems.collect():
-                values[channel] = self._values(text, units[channel])
+                span = spans[channel] if spans else None
+                values[channel] = self._values(text, units[channel], span)
         problems.check()
         return times, values
 
@@ -151,7 +157,7 @@ class Columns:
             )
         return t
 
-    def _values(self, text: Any, base: str) -> np.ndarray:
+    def _values(self, text: Any, base: str, span: Any = None) -> np.ndarray:
         place = self._find(text)
         try:
             values, _ = numbers(self.table, place)
@@ -166,6 +172,8 @@ class Columns:
                 ": every row needs one; fill it in, or delete the row"
             )
         unit = self.table.columns[place].unit or split_header(text)[1]
+        if span and unit in ("%", "mA"):
+            return in_span(values, unit, span)
         size = 1.0 if unit is None else factor(unit_name(unit), base)
         if size is None:
             needed = "have no unit" if base == "-" else f"be in {base}, or a unit of its dimension"

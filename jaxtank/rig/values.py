@@ -117,8 +117,8 @@ def in_unit(loop: ClosedLoop, label: str, name: str, value: Any) -> Any:
     if part.split(".")[0] not in ("actuator", "plant") and "signal" not in part:
         axis = (meta.get("shape") or ("output",))[0]
         axes: Any = "tank" if axis == "tank" else "output"
-        if len(index) == 1:
-            axes = int(index[-1])
+        if len(entries := list(index)) == 1:
+            axes = int(entries[0])
             if axis in ("change", "knot"):
                 changes = getattr(steps(loop.reference), "changes", ())
                 axes = changes[axes][1] if axis == "change" and axes < len(changes) else 0
