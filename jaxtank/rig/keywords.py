@@ -16,7 +16,10 @@ from jaxtank.rig.read import from_table
 from jaxtank.rig.schema import LISTS, NEEDED, SECTIONS
 from jaxtank.rig.values import by_dotted_name
 
-KEYWORDS = {f"{name}s" if section.many else name: name for name, section in SECTIONS.items()}
+KEYWORDS = {
+    f"{name.removesuffix('s')}s" if section.many else name: name
+    for name, section in SECTIONS.items()
+}
 KEYWORDS = {k: name for k, name in KEYWORDS.items() if name.isidentifier()}
 KEYWORDS |= {name: name for name in SECTIONS[""].names}
 """{keyword of `Rig`: table or key of a rig file}, beside those of the clock."""
@@ -35,7 +38,7 @@ def Rig(**tables: Any) -> Case:
     dt, duration, substeps, integrator : of the clock; dt and duration in s
     units : (length, pump input), ("cm", "V") where left out
     limits, free, objective, uncertain, values : {name: value}
-    inflows, faults, scenarios : lists of dicts
+    inflows, faults, scenarios, sensors : lists of dicts
     plant, sensor, actuator, disturbance, schedule, covariance, safety_filter, log : dicts
     name : what reports call it
     case : "paper/case" to start from, instead of tanks

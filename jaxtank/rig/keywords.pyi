@@ -35,6 +35,7 @@ def Rig(
     objective: Table | None = ...,
     plant: Table | None = ...,
     sensor: Table | None = ...,
+    sensors: Sequence[Table] | None = ...,
     actuator: Table | None = ...,
     disturbance: Table | None = ...,
     inflows: Sequence[Table] | None = ...,

@@ -112,20 +112,26 @@ def in_unit(loop: ClosedLoop, label: str, name: str, value: Any) -> Any:
     and gains also texts in % of the span of a sensor.
     """
     meta = describe(loop, name)
-    base, index = split_index(name)
-    part, _, field = base.rpartition(".")
-    if part.split(".")[0] not in ("actuator", "plant") and "signal" not in part:
-        axis = (meta.get("shape") or ("output",))[0]
-        axes: Any = "tank" if axis == "tank" else "output"
-        if len(entries := list(index)) == 1:
-            axes = int(entries[0])
-            if axis in ("change", "knot"):
-                changes = getattr(steps(loop.reference), "changes", ())
-                axes = changes[axes][1] if axis == "change" and axes < len(changes) else 0
-            gain = meta["unit"] == local("V/cm", loop.units)
-            axes = axes if axis == "tank" or gain else loop.plant.outputs[axes]
-        value = readings(label, field, value, meta["unit"], axes, loop)
+    texts: Any = value if isinstance(value, (list, tuple)) else [value]
+    part, _, field = split_index(name)[0].rpartition(".")
+    level = part.split(".")[0] not in ("actuator", "plant") and "signal" not in part
+    if level and str in map(type, texts):
+        value = readings(label, field, value, meta["unit"], _axes(loop, name, meta), loop)
     return converted(label, value, meta["unit"])
+
+
+def _axes(loop, name, meta):
+    """Of which a parameter has one entry each, "tank" or "output"; of an entry its index."""
+    axis = (meta.get("shape") or ("output",))[0]
+    index: list[int] = list(split_index(name)[1])
+    if len(index) != 1:
+        return "tank" if axis == "tank" else "output"
+    changes: Any = getattr(steps(loop.reference), "changes", ())
+    if axis == "change":
+        index = [changes[index[0]][1] if index[0] < len(changes) else 0]
+    if axis == "tank" or meta["unit"] == local("V/cm", loop.units):
+        return index[0]
+    return loop.plant.outputs[index[0]] if index[0] < len(loop.plant.outputs) else 0
 
 
 def _index_of(name, plant, axis, entry):

@@ -132,3 +132,29 @@ def test_one_sensor_table_is_for_all_tanks_of_a_preset():
     np.testing.assert_allclose(case.loop.reference.initial, [5.0])
     again = rig.loads(rig.dump(case))
     np.testing.assert_array_equal(again.loop.sensor.low, case.loop.sensor.low)
+
+
+def test_setpoints_of_a_file_are_in_percent_of_the_span(tmp_path):
+    (tmp_path / "day.csv").write_text("t [s],LT101 [%],LT102 [mA]\n0,40,12\n100,60,20\n")
+    text = TEXT.format(more="Tt = 300.0")
+    line = next(line for line in text.splitlines() if line.startswith("reference"))
+    table = f'reference = {{ csv = "{tmp_path}/day.csv", ramp = 0.0 }}'
+    signal = rig.loads(text.replace(line, table)).loop.reference
+    np.testing.assert_allclose(signal.initial, [0.5, 0.5])
+    np.testing.assert_allclose(signal.targets, [0.7, 0.9])
+
+
+def test_a_limit_beyond_the_span_is_not_certified():
+    """The filter cannot hold a limit that the sensor does not see."""
+    text = """
+    tank = [{ area = 100.0, rim = 30.0, drain = 1.0, level = 5.0 }]
+    pump = [{ gain = 50.0, to = 1, high = 10.0, initial = 1.0 }]
+    controller = { kind = "p", Kc = 1.0 }
+    safety_filter = { limit = [25.0] }
+    [[sensor]]
+    tank = 1
+    span = [0.0, %s]
+    """
+    whole, short = (rig.loads(text % top).loop.safety_filter for top in ("30.0", "20.0"))
+    assert float(whole.limit[0]) == pytest.approx(25.0)
+    assert float(short.limit[0]) <= 20.0
