@@ -74,8 +74,15 @@ class Table(NamedTuple):
         return f"{self.name}, line {line}, column {self.columns[column].header!r}"
 
 
-class AmbiguousTime(DataError):
-    """Times that can be read in two ways; the message asks which."""
+class Ambiguous(DataError):
+    """Numbers or times that can be read in two ways; the message asks which.
+
+    setting: "decimal" of `read_table`, "time" of `seconds`; answers: what it may be.
+    """
+
+    def __init__(self, question: str, setting: str, answers: tuple[str, str]):
+        super().__init__(question)
+        self.setting, self.answers = setting, answers
 
 
 def read_table(path: str | Path, decimal: str = "") -> Table:
@@ -88,12 +95,8 @@ def read_table(path: str | Path, decimal: str = "") -> Table:
     name, data = printable(path.name), _bytes(path)
     spreadsheet = data.startswith(b"PK\x03\x04")
     rows = list(_sheet(data, name) if spreadsheet else _rows(_text(data, name), name))
-    if not rows:
-        raise DataError(f"{name}: is empty: a header line and samples are needed")
-    start = _header(rows)
-    head, header = rows[start]
-    header = [" ".join(cell.split()) for cell in header]
-    body, units = rows[start + 1 :], [""] * len(header)
+    head, header, body = _head_and_body(rows, name)
+    units = [""] * len(header)
     if body and _is_units(body[0][1], len(header)):
         units, body = [unit.strip().strip("[]()") for unit in body[0][1]], body[1:]
     if not body:
@@ -103,8 +106,25 @@ def read_table(path: str | Path, decimal: str = "") -> Table:
     for text, unit, values in zip(header, units, zip(*cells)):
         stem, own = split_header(text)
         columns.append(Column(text, stem, own or unit or None, list(values)))
-    sign = decimal or _decimal(columns, name, spreadsheet or len(rows[0][1]) == 1)
+    sign = decimal or _decimal(columns, name)
     return Table(name, columns, [line for line, _ in body], head, sign)
+
+
+def _head_and_body(
+    rows: list[tuple[int, list[str]]], name: str
+) -> tuple[int, list[str], list[tuple[int, list[str]]]]:
+    """Return (line of the names, the names, the rows below)."""
+    if not rows:
+        raise DataError(f"{name}: is empty: a header line and samples are needed")
+    start = _header(rows)
+    line, cells = rows[start]
+    header = [" ".join(cell.split()) for cell in cells]
+    if all(map(_like_value, header)):
+        raise DataError(
+            f"{name}, line {line}: has numbers where the columns' names should be: begin with a"
+            " header, such as 't [s],pump1 [V],h1 [cm]'"
+        )
+    return line, header, rows[start + 1 :]
 
 
 def _bytes(path: Path) -> bytes:
@@ -292,7 +312,7 @@ NUMBERS = {
 """{decimal sign: a number}; the other sign may separate thousands."""
 
 
-def _decimal(columns: Iterable[Column], name: str, split_by_cells: bool) -> str:
+def _decimal(columns: Iterable[Column], name: str) -> str:
     """Return the decimal sign of the numbers in a file."""
     doubtful = None
     for column in columns:
@@ -307,9 +327,11 @@ def _decimal(columns: Iterable[Column], name: str, split_by_cells: bool) -> str:
                 doubtful = cell
     if doubtful is None:
         return "."
-    raise AmbiguousTime(
+    raise Ambiguous(
         f"{name}: is {doubtful!r} a number with a decimal comma, or one in thousands? Every number"
-        " of the file can be read both ways: state decimal = ',' or decimal = '.'"
+        " of the file can be read both ways.",
+        "decimal",
+        (",", "."),
     )
 
 
@@ -334,21 +356,24 @@ def numbers(table: Table, column: int) -> tuple[np.ndarray, dict[str, int]]:
         wrong[cell] += 1
         first.setdefault(cell, k)
     if wrong:
-        raise DataError("; ".join(_refused(table, column, *w, first) for w in wrong.most_common(3)))
+        raise DataError(_refused(table, column, wrong, first))
     return values, {word: count for word, count in words.items() if count}
 
 
-def _refused(table: Table, column: int, cell: str, count: int, first: dict[str, int]) -> str:
-    """Return a message on a text that is no number."""
-    often = f" ({count} times)" if count > 1 else ""
+def _refused(table: Table, column: int, wrong: Counter[str], first: dict[str, int]) -> str:
+    """Return a message on texts that are no numbers."""
+    cell, *others = wrong
     if len(cell) > LONGEST_CELL:
         what = f"a cell of {len(cell)} characters is no number"
     elif NUMBERS["."].fullmatch(cell) and re.search(r"[eE]", cell):
         what = f"{cell!r} is not finite; leave a missing reading empty"
     else:
+        often = f" ({wrong[cell]} times)" if wrong[cell] > 1 else ""
         sign = "" if table.decimal == "." else ", where the decimal sign is a comma"
         what = f"{shortened(cell)} is not a number{often}{sign}"
-    return f"{table.where(column, first[cell])}: {what}"
+    more = ", ".join(shortened(other) for other in others[:3])
+    more = f"; nor is {more}" + f" and {len(others) - 3} more" * (len(others) > 3) if more else ""
+    return f"{table.where(column, first[cell])}: {what}{more}"
 
 
 CLOCK = (
@@ -402,7 +427,7 @@ def seconds(table: Table, column: int, order: str = "") -> np.ndarray:
     """Return (rows,) times [s] of a column: numbers in its unit; ISO or day-first time stamps,
     times of a day, durations, days of Excel and seconds since 1970, from the first row.
 
-    order: one of ORDERS, for times that can be read twice; without it they raise AmbiguousTime.
+    order: one of ORDERS, for times that can be read twice; without it they raise Ambiguous.
     """
     (_, _, unit, cells) = table.columns[column]
 
@@ -461,10 +486,13 @@ def _date_order(cells: list[str], unit: str | None, place: Callable[[int], str])
         if pair and int(pair["a"]) > 12:
             return "day-first"
         if pair and int(pair["b"]) > 12:
-            raise AmbiguousTime(f"{place(k)}: does the month come first in {cell!r}?")
+            question = f"{place(k)}: does the month come first in {cell!r}?"
+            raise Ambiguous(question, "time", ("month-first", "day-first"))
     day, month = int(match["a"]), int(match["b"])
-    raise AmbiguousTime(
-        f"{place(0)}: is {cells[0]!r} day {day} of month {month}, or day {month} of month {day}?"
+    raise Ambiguous(
+        f"{place(0)}: is {cells[0]!r} day {day} of month {month}, or day {month} of month {day}?",
+        "time",
+        ("day-first", "month-first"),
     )
 
 
@@ -515,9 +543,8 @@ def _clock_order(cells: list[str], unit: str | None, place: Callable[[int], str]
         return header
     if max(int(pair["a"]) for pair in pairs) > 23:
         return "m:s"
-    raise AmbiguousTime(
-        f"{place(0)}: is {cells[0]!r} in hours and minutes, or minutes and seconds?"
-    )
+    question = f"{place(0)}: is {cells[0]!r} in hours and minutes, or minutes and seconds?"
+    raise Ambiguous(question, "time", ("h:m", "m:s"))
 
 
 def _span(cell: str, order: str) -> float | None:

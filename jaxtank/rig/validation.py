@@ -14,8 +14,9 @@ from jaxtank.case import Case, Free, Scenario
 from jaxtank.core.checks import check_value
 from jaxtank.core.clock import CLOCK_UNITS
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
-from jaxtank.core.labels import index_of
+from jaxtank.core.labels import index_of, name_of
 from jaxtank.core.quantities import converted
+from jaxtank.core.tables import ORDERS
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import describe, get_value, split_index
 from jaxtank.loop import run
@@ -286,26 +287,68 @@ def _scenario(case, table, index):
     return Scenario(name, values, **entry)
 
 
+LOG_SETTINGS = {"decimal": (".", ","), "time": ORDERS, "hold": ("zero-order", "first-order")}
+"""Keys of [log] that are no columns, and what each may be."""
+
+
+def log_slots(plant):
+    """Return {slot: (kind, number from 0)} of columns of experiment data: "t", "pump1", "h1"."""
+    pumps = {f"pump{j + 1}": ("pump", j) for j in range(plant.pumps)}
+    return {"t": ("t", 0), **pumps, **{f"h{i + 1}": ("h", i) for i in range(plant.tanks)}}
+
+
+def log_keys(plant):
+    """Return {key of [log]: slot}: the slots, and the rig's own names of tanks and pumps."""
+    slots, names = log_slots(plant), {}
+    for slot, (kind, number) in slots.items():
+        for what in {"h": ("tank", "sensor"), "pump": ("pump",)}.get(kind, ()):
+            name = name_of(plant, what, number)
+            names |= {name: slot} if name else {}
+    return {**names, **dict(zip(slots, slots))}
+
+
 def check_log(plant, table):
-    """Return {slot: header or (header, unit)} of a [log] table after input validation."""
-    pumps = (f"pump{j + 1}" for j in range(plant.pumps))
-    slots = ["t", *pumps, *(f"h{i + 1}" for i in range(plant.tanks))]
-    columns, headers = {}, {}
-    for slot, spec in table.items():
-        if slot not in slots:
-            raise unknown("key of [log]", slot, slots)
-        pair = [spec] if isinstance(spec, str) else spec
-        good = isinstance(pair, (list, tuple)) and 1 <= len(pair) <= 2
-        if not (good and all(isinstance(v, str) and v.strip() for v in pair)):
-            raise refusal(f"log {slot}", spec, "be a column's header, or [header, unit]")
-        header = pair[0].strip()
-        if header in headers and header != "none":
+    """Return {slot or name: header or (header, unit), setting: value} of a [log] table after input
+    validation; `columns` and `units` in it may hold headers and units apart. Without a header it is
+    found by its name.
+    """
+    table = dict(table)
+    apart, units = (dict(_subtable(table.pop(key, {}), key)) for key in ("columns", "units"))
+    table |= apart | {key: [apart.get(key, ""), unit] for key, unit in units.items()}
+    keys, columns, headers = log_keys(plant), {}, {}
+    for key, spec in table.items():
+        if key in LOG_SETTINGS:
+            if spec not in LOG_SETTINGS[key]:
+                raise refusal(f"log {key}", spec, f"be one of {' '.join(LOG_SETTINGS[key])}")
+            columns[key] = spec
+            continue
+        if key not in keys:
+            raise unknown("key of [log]", key, [*keys, *LOG_SETTINGS])
+        columns[key] = _header_and_unit(key, spec)
+        header = columns[key] if isinstance(columns[key], str) else columns[key][0]
+        if header in headers and header not in ("", "none"):
             raise InputError(
-                f"log {slot} = {shortened(pair[0])}: that column is {headers[header]} already"
+                f"log {key} = {shortened(header)}: that column is {headers[header]} already"
             )
-        headers[header] = slot
-        columns[slot] = pair[0] if len(pair) == 1 else tuple(pair)
+        if any(other != key and keys.get(other) == keys[key] for other in columns):
+            raise InputError(f"log {key}: {keys[key]} is given twice")
+        headers[header] = key
     return columns
+
+
+def _header_and_unit(key, spec):
+    """Return a header, or (header, unit), of a line of [log]."""
+    pair = [spec] if isinstance(spec, str) else spec
+    good = isinstance(pair, (list, tuple)) and 1 <= len(pair) <= 2
+    if not (good and all(isinstance(v, str) for v in pair) and pair[-1].strip()):
+        raise refusal(f"log {key}", spec, "be a column's header, or [header, unit]")
+    return pair[0] if len(pair) == 1 else tuple(pair)
+
+
+def _subtable(table, key):
+    if not isinstance(table, dict):
+        raise refusal(f"log {key}", table, "be a table")
+    return table
 
 
 def check_covariance(loop, table):

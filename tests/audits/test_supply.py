@@ -106,7 +106,7 @@ READ = {
     " owner, mode and digest when the process began, and by the name and processor it holds",
     ("jaxtank.xla.program_cache", "processor", "open"): "/proc/cpuinfo",
     ("jaxtank.xla.flags", "_text_of", "open"): "the file that XLA_FLAGS names, looked through only",
-    ("tuning.identification.csv_log", "_text", "read_bytes"): "after `refusal`",
+    ("jaxtank.core.tables", "_bytes", "read_bytes"): "after `refusal`",
     ("tuning.storage.columns", "__getitem__", "memmap"): "a file without a name, its own",
     ("tuning.cli.main", "_drop_output", "open"): "/dev/null, to write",
     ("tuning.cli.terminal", "guard", "open"): "/dev/null, in place of a stream that was closed",

@@ -101,6 +101,8 @@ def _failed(error):
         )
         code = 1
     print(f"jaxtank: {words}", file=sys.stderr)
+    if table := getattr(error, "table", ""):  # of columns that were not found
+        print(f"Complete this table and put it into the rig file:\n\n{table}", file=sys.stderr)
     if isinstance(error, OSError) and code == 2:
         _drop_output()
     return code

@@ -1,76 +1,79 @@
-"""CSV files of experiment data: columns and units from the header, or from a rig's [log] table."""
+"""Experiment data from files: columns by the rig's names, their units, qualities and times."""
 
-import csv
-import io
-import math
 import re
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from jaxtank import rig as rigs
 from jaxtank.core.errors import DataError, InputError, nearest
-from jaxtank.core.files import refusal
-from jaxtank.core.labels import name_of
-from jaxtank.core.quantities import INPUT_UNITS, LEVEL_UNITS, TIMES, VOLTS, factor
+from jaxtank.core.labels import input_unit, label_of, name_of
+from jaxtank.core.quantities import INPUT_UNITS, LEVEL_UNITS, VOLTS, factor, quantity
+from jaxtank.core.tables import (
+    Ambiguous,
+    Column,
+    is_time,
+    numbers,
+    read_table,
+    seconds,
+    split_header,
+    unit_name,
+)
 from jaxtank.core.text import printable
 from jaxtank.core.units import canonical
 from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.plants.vessels import level_of
+from jaxtank.rig.sensors import in_span, spans_of
+from jaxtank.rig.validation import LOG_SETTINGS, log_keys, log_slots
 from tuning.identification.experiment import Log, check_hold, log
+from tuning.identification.signals import Signal, poor, rank, signals_of, time_columns
+from tuning.problem.wording import count
 
-LARGEST = 512 * 1024 * 1024  # bytes
-MOST_ROWS = 20_000_000
-LONGEST_CELL = 200  # characters
-MISSING = {"", "nan", "na", "null", "-"}
-KNOWN = {*TIMES, *LEVEL_UNITS, *INPUT_UNITS}
-WORDS = {
-    **dict.fromkeys(("t", "time", "zeit"), "t"),
-    **dict.fromkeys(("pump", "u", "voltage", "input"), "pump"),
-    **dict.fromkeys(("h", "level", "y", "tank", "x"), "h"),
-}
-"""Names of time, pump input and level in the header of a column."""
-KINDS = {"t": "time", "pump": "pump", "h": "level"}
+KINDS = {"pump": "pump", "h": "level"}
 
 
-class _Column(NamedTuple):
-    """A column of the file: its index, its quantity, and the factor to the rig's unit."""
+class LogError(DataError):
+    """Experiment data that cannot be read as they are: all that is wrong, and a [log] table."""
 
-    index: int
-    kind: str  # "t", "pump" or "h"
-    number: int  # of the pump or the tank, counted from 0
-    header: str
-    unit: str
-    factor: float
-    in_volts: bool  # a level as the sensor's voltage
+    def __init__(self, problems: list[str], table: str):
+        super().__init__("; ".join(problems))
+        self.problems, self.table = problems, table
 
 
 def read_log(
     path: str | Path,
     loop: ClosedLoop,
     columns: Mapping[str, Any] | None = None,
-    decimal: str = ".",
+    decimal: str = "",
     hold: str = "",
+    time: str = "",
 ) -> Log:
-    """Read experiment data from a CSV file.
+    """Read experiment data from a CSV or Excel file.
 
-    Cells are separated by comma, semicolon or tab; lines that begin with "#" are comments; an empty
-    cell or "nan" is a missing reading. A header such as "t [s]", "pump1_V" or "h1 (mm)" names
-    column and unit; values are converted to the rig's units.
+    Columns are found by the rig's own names ("LT101 [%]", "LT101.PV") or by "t", "pump1", "h1";
+    values are converted to the rig's units. Read are also long tables (time, tag, value, quality),
+    columns of quality, time stamps, decimal commas, levels in per cent of the rim or as volumes,
+    and pumps in flows. What is taken for granted is in `notes` of the result.
 
     Parameters
     ----------
     path : str or Path
-        The file, UTF-8.
+        The file: text in UTF-8, UTF-16 or Latin-1, or .xlsx.
     loop : ClosedLoop
         The rig that was measured.
     columns : mapping, optional
-        Column of each of "t", "pump1", .., "h1", ..: a header, or (header, unit), where the header
-        is in other words; "none" leaves a level out.
+        As the [log] table of a rig file: column of each of "t", "pump1", .., "h1", .. or of the
+        rig's names: a header, or (header, unit), where the header is in other words; "none" leaves
+        a level out and switches a pump off; "decimal", "time" and "hold" as below.
     decimal : str
-        Decimal sign, "." or ",".
+        Decimal sign, "." or ","; by default from the numbers.
     hold : {"", "zero-order", "first-order"}
         What inputs do between samples, as in `tuning.log`.
+    time : {"", "day-first", "month-first", "h:m", "m:s"}
+        How dates such as 03/11/2026, and times such as 14:05, are read.
 
     Returns
     -------
@@ -79,9 +82,10 @@ def read_log(
     Raises
     ------
     DataError
-        For a file that cannot be read so, naming line and column.
+        For a file that cannot be read so; where columns are in doubt, with a [log] table to
+        complete.
     InputError
-        For `columns`, `decimal` or `hold` that do not exist.
+        For `columns`, `decimal`, `hold` or `time` that do not exist.
 
     Examples
     --------
@@ -95,253 +99,426 @@ def read_log(
     >>> print(data.u[:, 0], data.y[:, 0], data.tanks)
     [3.  3.  3.5] [1.  1.5 nan] (1,)
     """
-    path = Path(path)
-    check_hold(hold)
-    if decimal not in (".", ","):
-        raise InputError(f"--decimal {decimal!r}: must be '.' or ','")
-    text, name = _text(path), printable(path.name)
-    rows = _rows(text, name)
-    line, header = next(rows, (0, ()))
-    if not header:
-        raise DataError(f"{name}: is empty: a header line and samples are needed")
-    header = [cell.strip() for cell in header]
-    used = _columns(header, f"{name}, line {line}", loop, columns or {})
-    table, lines = _samples(rows, header, used, decimal, name)
-    data = np.array(table) * [c.factor for c in used]
-    kinds = np.array([c.kind for c in used])
-    levels = [c for c in used if c.kind == "h"]
-    return log(
-        t=data[:, 0],
-        u=data[:, kinds == "pump"],
-        y=data[:, kinds == "h"],
-        tanks=[c.number for c in levels],
-        in_volts=[c.in_volts for c in levels],
-        name=name,
-        lines=lines,
-        headers=tuple(c.header for c in used),
-        units=tuple(c.unit for c in used),
-        hold=hold,
-    )
+    file = LogFile(path, loop, columns, decimal, hold, time)
+    data = file.log()
+    if file.problems or data is None:
+        raise LogError(file.problems, file.table_text() if file.in_doubt else "")
+    return data
 
 
-def _samples(rows, header, used, decimal, name):
-    """(Numbers of each sample, its line in the file)."""
-    table, lines = [], []
-    for line, cells in rows:
-        table.append(_numbers(cells, header, used, decimal, f"{name}, line {line}"))
-        lines.append(line)
-        if len(table) > MOST_ROWS:
-            raise DataError(f"{name}: more than {MOST_ROWS} samples")
-    if not table:
-        raise DataError(f"{name}: has a header, but no samples")
-    return table, lines
+class LogFile:
+    """A file of experiment data: its signals, those of the rig, and all that is wrong."""
 
-
-def _text(path):
-    """Return the text of a file; raise DataError where it cannot be read."""
-    try:
-        if why := refusal(path, LARGEST):
-            raise DataError(f"file {str(path)!r} {why}")
-        text = path.read_bytes().decode("utf-8-sig")
-    except FileNotFoundError:
-        raise DataError(f"file {str(path)!r} does not exist") from None
-    except OSError as error:  # a name that is too long for the disk, too
-        raise DataError(f"file {str(path)!r} cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise DataError(f"file {path.name!r} is not UTF-8 text (byte {error.start})") from None
-    if "\0" in text:
-        raise DataError(f"file {path.name!r} is not text: it has zero bytes")
-    return text.replace("\r\n", "\n").replace("\r", "\n")
-
-
-def _rows(text, name):
-    """Yield (line number, cells) of every line that is not empty and not a comment."""
-    lines = (line for line in text.splitlines() if not line.lstrip().startswith(("#", "\n")))
-    first = next(filter(str.strip, lines), "")
-    delimiter = max((";", "\t", ","), key=lambda d: (first.count(d), d == ","))
-    reader, end = csv.reader(io.StringIO(text), delimiter=delimiter), 0
-    try:
-        for cells in reader:
-            start, end = end + 1, reader.line_num
-            if end > start:
-                raise DataError(
-                    f"{name}, line {start}: a quotation mark opens and does not close on that line"
-                )
-            if any(c.strip() for c in cells) and not cells[0].lstrip().startswith("#"):
-                yield end, cells
-    except csv.Error as error:
-        raise DataError(f"{name}, line {reader.line_num}: {error}") from None
-
-
-def _numbers(cells, header, used, decimal, where):
-    """Return the numbers of the used columns of a row."""
-    while len(cells) > len(header) and not cells[-1].strip():  # a separator at the end of the line
-        cells.pop()
-    if len(cells) != len(header):
-        comma = ": a comma within a number? Cells need another separator then, as ';' with"
-        raise DataError(
-            f"{where}: {len(cells)} cells under {len(header)} column names"
-            + (f"{comma} --decimal ," if len(cells) > len(header) else "")
-        )
-    numbers = []
-    for column in used:
+    def __init__(
+        self,
+        path: str | Path,
+        loop: ClosedLoop,
+        columns: Mapping[str, Any] | None = None,
+        decimal: str = "",
+        hold: str = "",
+        time: str = "",
+    ):
+        self.loop, self.slots, self.keys = loop, log_slots(loop.plant), log_keys(loop.plant)
+        self.plant: Any = loop.plant
+        self.problems: list[str] = []
+        self.in_doubt = False  # a column, a unit or a setting, so that a [log] table helps
+        self.suggested: dict[str, tuple[str, ...]] = {}  # setting: answers to a question
+        self.time: Column | None = None
+        self.time_read = True
+        self.notes: dict[str, list[str]] = {}  # what was taken for granted: of which signals
+        settings, named = _settings_and_columns(self.plant, columns or {})
+        self.named = {slot: spec for slot, spec in named.items() if spec[0]}
+        self.units = {slot: unit for slot, (_, unit) in named.items() if unit}
+        self.hold, order = hold or settings.get("hold", ""), time or settings.get("time", "")
+        check_hold(self.hold)
+        decimal = decimal or settings.get("decimal", "")
+        for key, value in {"decimal": decimal, "time": order}.items():
+            if value and value not in LOG_SETTINGS[key]:
+                must = " ".join(LOG_SETTINGS[key])
+                raise InputError(f"--{key} {value!r}: must be one of {must}")
         try:
-            numbers.append(_number(cells[column.index].strip(), decimal, column.kind))
-        except ValueError as error:
-            raise DataError(f"{where}, column {column.header!r}: {error}") from None
-    return numbers
+            self.table = read_table(path, decimal)
+        except Ambiguous as question:
+            self._ask(question)
+            self.table = read_table(path, ",")
+        self.name, self.place = self.table.name, f"{self.table.name}, line {self.table.head}"
+        t, used = self._times(order)
+        self.signals = signals_of(self.table, used, t)
+        self.long = any(signal.t is not t for signal in self.signals)
+        self.taken = self._named_signals()
+        self.taken |= self._recognised_signals()
 
+    def _doubt(self, problem: str) -> None:
+        """Add a problem that a line of [log] solves."""
+        self.problems.append(problem)
+        self.in_doubt = True
 
-def _number(text, decimal, kind):
-    """Return the number in a cell, NaN for a missing reading."""
-    if len(text) > LONGEST_CELL:
-        raise ValueError(f"a cell of {len(text)} characters is no number")
-    if text.lower() in MISSING:
-        if kind == "h":
-            return math.nan
-        raise ValueError("is empty: every sample needs its time and the input of every pump")
-    if decimal == "," and "." in text:
-        raise ValueError(f"{text!r} has a point, where the decimal sign is a comma")
-    try:
-        if "_" in text or not text.isascii():
-            raise ValueError
-        value = float(text.replace(",", ".") if decimal == "," else text)
-    except ValueError:
-        comma = decimal == "." and re.fullmatch(r"[-+]?\d+,\d+([eE][-+]?\d+)?", text)
-        hint = ": a decimal comma? read it with --decimal ," if comma else ""
-        raise ValueError(f"{text!r} is not a number{hint}") from None
-    if not math.isfinite(value):
-        raise ValueError(f"{text!r} is not finite; leave a missing reading empty")
-    return value
+    def _ask(self, question: Ambiguous) -> None:
+        """Add a question to the problems, and its answers to the suggested table."""
+        answers = " or ".join(f"--{question.setting} {answer}" for answer in question.answers)
+        self._doubt(f"{question} State {answers}")
+        self.suggested[question.setting] = question.answers
 
+    def _times(self, order: str) -> tuple[np.ndarray, list[int]]:
+        """Return (times [s] of the rows, columns they are in); rows that come newest first are
+        turned round.
+        """
+        columns, t = self.table.columns, np.arange(len(self.table.lines), dtype=float)
+        if "t" in self.named:
+            used = self._found(self.named["t"][0], "t", columns)
+        elif not (used := time_columns(self.table)):
+            self._no_column("t", "time", [c.header for c in columns])
+        if not used:
+            return t, used
+        self.time = columns[used[-1]]
+        columns[used[-1]] = self.time._replace(unit=self.units.get("t", self.time.unit))
+        try:
+            t = seconds(self.table, used[-1], order)
+        except Ambiguous as question:
+            self._ask(question)
+        except DataError as error:
+            self.time_read = False
+            self.in_doubt |= not (self.time.unit or is_time(self.time.cells[0]))
+            self.problems.append(str(error))
+        if len(t) > 1 and np.all(np.diff(t) < 0):
+            for column in columns:
+                column.cells.reverse()
+            self.table.lines.reverse()
+            self._note("rows come newest first, and are turned round")
+            t = t[::-1] - t[-1]
+        return t, used
 
-def split_header(header):
-    """Return (name, unit or None) of a column's header: "h1 [cm]", "h1 (cm)", "pump1_V", "h1"."""
-    if brackets := re.fullmatch(r"(.*?)\s*[\[(]\s*(.*?)\s*[\])]", header):
-        return brackets[1].strip(), brackets[2]
-    stem, line, tail = header.rpartition("_")
-    if line and canonical(tail) in KNOWN and not tail.isdigit():
-        return stem.strip(), tail
-    return header.strip(), None
+    def _found(self, header: str, slot: str, columns: list[Column]) -> list[int]:
+        """Return [index] of the column with a header that was given for a slot; [] without."""
+        headers = [column.header for column in columns]
+        if header not in headers:
+            self._doubt(
+                f"{self.place}: there is no column {header!r} for {slot}{nearest(header, headers)}"
+            )
+            return []
+        if headers.count(header) > 1:
+            self._doubt(f"{self.place}: two columns are called {header!r}")
+        return [headers.index(header)]
 
-
-def _columns(header, where, loop, named):
-    """Return the columns in use: time, then pumps, then levels."""
-    plant, (length, drive) = loop.plant, loop.units
-    if all(re.fullmatch(r"[-+]?[\d.,]+([eE][-+]?\d+)?", cell) for cell in header):
-        raise DataError(
-            f"{where}: has numbers where the columns' names should be: begin with a header, as"
-            f" 't [s],pump1 [{drive}],h1 [{length}]'"
-        )
-    slots = {"t": ("t", 0), **{f"pump{j + 1}": ("pump", j) for j in range(plant.pumps)}}
-    slots |= {f"h{i + 1}": ("h", i) for i in range(plant.tanks)}
-    taken = _named_columns(header, where, slots, named)
-    taken |= _recognised_columns(header, where, slots, taken, named, _own(plant, slots))
-    columns, names = [], ", ".join(map(repr, header[:20]))
-    names += f" and {len(header) - 20} more" if len(header) > 20 else ""
-    for slot, (kind, number) in slots.items():
-        if slot not in taken:
-            if kind != "h":
-                what = "time" if kind == "t" else f"pump {number + 1}"
-                raise DataError(
-                    f"{where}: no column for {slot} ({what}) among {names}; name it with --column"
-                    f" {slot}=HEADER"
+    def _named_signals(self) -> dict[str, Signal]:
+        """Return {slot: its signal} by the headers that were given."""
+        taken: dict[str, Signal] = {}
+        known = [signal.described for signal in self.signals]
+        named = {s: header for s, (header, _) in self.named.items() if header != "none"}
+        named.pop("t", None)
+        for slot, header in named.items():
+            other = next((s for s in taken if named[s] == header), None)
+            if other:
+                self._doubt(
+                    f"{self.place}: column {header!r} is given for {other} and for {slot}: name one"
+                    " column for each"
                 )
-            continue
-        index, unit = taken[slot]
-        if header.count(header[index]) > 1:
-            raise DataError(f"{where}: two columns are called {header[index]!r}")
-        factor, in_volts = _factor(
-            kind, slot, unit, loop.units, f"{where}, column {header[index]!r}"
-        )
-        columns.append(_Column(index, kind, number, header[index], unit, factor, in_volts))
-    if columns[-1].kind != "h":
-        raise DataError(
-            f"{where}: no column for a level among {names}; name it with --column h1=HEADER"
-        )
-    return columns
+            for i in self._found(header, slot, known):
+                taken[slot] = self.signals[i]
+        return taken
 
+    def _recognised_signals(self) -> dict[str, Signal]:
+        """Return {slot: its signal} by the names of the other columns."""
+        taken: dict[str, Signal] = {}
+        for slot, (kind, _) in self.slots.items():
+            if slot in self.named or kind == "t":
+                continue
+            known = [key for key, its in self.keys.items() if its == slot]
+            ranks = [
+                max(rank(s.described.name, slot, name, self.slots) for name in known)
+                for s in self.unused
+            ]
+            alike = [s for r, s in zip(ranks, self.unused) if 0 < r == max(ranks)]
+            if len(alike) > 1:
+                a, b = (signal.described.header for signal in alike[:2])
+                alone = f"two columns are called {a!r}"
+                both = f"columns {a!r} and {b!r} both look like {slot}; name one with --column"
+                self._doubt(f"{self.place}: {alone if a == b else both}")
+            if alike:
+                taken[slot] = alike[0]
+        return taken
 
-def _named_columns(header, where, slots, named):
-    """Return {slot: (index, unit)} of the columns that --column or the rig file names."""
-    taken = {}
-    for slot, spec in named.items():
-        if slot not in slots:
-            raise InputError(f"unknown column {slot!r}{nearest(slot, slots)}")
-        name, unit = (spec, None) if isinstance(spec, str) else spec
-        if name.strip() == "none" and name not in header:
-            if slots[slot][0] != "h":
-                raise InputError(f"column {slot} = none: only a level may be left out, as h1=none")
-            continue
-        if name not in header:
+    @property
+    def unused(self) -> list[Signal]:
+        """The signals that are of no tank and no pump."""
+        used = {signal.described.header for signal in self.taken.values()}
+        return [signal for signal in self.signals if signal.described.header not in used]
+
+    def log(self) -> Log | None:
+        """Return the experiment data, None where something is wrong."""
+        pumps = self._of_kind("pump")
+        levels = [slot for slot in self._of_kind("h") if slot in self.taken]
+        constant = self._without_column([slot for slot in pumps if slot not in self.taken])
+        if not levels:
+            self._no_column("h1", "a level")
+        values = {slot: self._values(slot) for slot in self.taken}
+        if self.problems:
+            return None
+        t, u, y, lines = self._samples(pumps, levels, values, constant)
+        self._note_unused()
+        heads, units = zip(*(self._head(slot) for slot in (*pumps, *levels)))
+        return log(
+            t=t,
+            u=u,
+            y=y,
+            tanks=[self.slots[s][1] for s in levels],
+            in_volts=[values[s][1] for s in levels],
+            name=self.name,
+            lines=lines,
+            headers=(self.time.header if self.time else "", *heads),
+            units=("s", *units),
+            hold=self.hold or "zero-order" * self._own_times(pumps, levels),
+            notes=tuple(f"{', '.join(of)}: {what}" for what, of in self.notes.items()),
+        )
+
+    def _of_kind(self, kind: str) -> list[str]:
+        return [slot for slot, (its, _) in self.slots.items() if its == kind]
+
+    def _note_unused(self) -> None:
+        names = [repr(s.described.header) for s in self.unused]
+        if names:
+            self._note(f"not used: {', '.join(names[:12])}{', ..' * (len(names) > 12)}")
+
+    def _head(self, slot: str) -> tuple[str, str]:
+        """Return (header, unit) of a slot's column, "" without one."""
+        if slot not in self.taken:
+            return "", ""
+        return self.taken[slot].described.header, self._unit(slot) or ""
+
+    def _own_times(self, pumps: list[str], levels: list[str]) -> bool:
+        """Whether inputs are at other times than readings."""
+        if not self.long:
+            return False
+        readings = np.concatenate([self.taken[slot].t for slot in levels])
+        inputs = [self.taken[slot].t for slot in pumps if slot in self.taken]
+        return not all(np.isin(t, readings).all() for t in inputs)
+
+    def _samples(self, pumps, levels, values, constant):
+        """Return t, u (samples, pumps), y (samples, levels) and lines of the file, or None."""
+        t, lines = self.signals[0].t, np.array(self.table.lines)
+        if self.long:
+            t, lines = np.unique(np.concatenate([self.taken[s].t for s in values])), None
+        u = np.zeros((len(t), len(pumps)))
+        for j, slot in enumerate(pumps):
+            u[:, j] = self._held(slot, t, values[slot][0]) if slot in values else constant[slot]
+        y = np.full((len(t), len(levels)), np.nan)
+        for c, slot in enumerate(levels):
+            y[np.minimum(np.searchsorted(t, self.taken[slot].t), len(t) - 1), c] = values[slot][0]
+        keep = np.isfinite(u).all(axis=1)
+        if not keep.all():
+            self._note(f"{count(int((~keep).sum()), 'row')} before the first input left out")
+        if self.long:  # a row that tells neither a reading nor a change
+            keep &= np.isfinite(y).any(axis=1) | np.any(np.diff(u, axis=0, prepend=np.nan), axis=1)
+        return t[keep], u[keep], y[keep], None if lines is None else lines[keep]
+
+    def _note(self, what: str, of: str = "") -> None:
+        """Note what is taken for granted of a signal, or of the whole file."""
+        self.notes.setdefault(what, []).append(of or self.name)
+
+    def _label(self, slot: str) -> str:
+        kind, number = self.slots.get(slot, ("t", 0))
+        name = name_of(self.plant, "tank" if kind == "h" else kind, number) if kind != "t" else ""
+        return name or slot
+
+    def _unit(self, slot: str) -> str | None:
+        return self.units.get(slot, self.taken[slot].described.unit)
+
+    def _no_column(self, slot: str, what: str, headers: list[str] | None = None) -> None:
+        """Add to the problems that a slot has no column among some headers, the signals'."""
+        headers = headers or [signal.described.header for signal in self.signals]
+        headers = list(map(repr, headers))
+        more = f" and {len(headers) - 20} more" if len(headers) > 20 else ""
+        for_slot = f"for {what}" if slot == "h1" else f"for {slot} ({what})"
+        self._doubt(
+            f"{self.place}: no column {for_slot} among {', '.join(headers[:20])}{more}; name it"
+            f" with --column {slot}=HEADER"
+        )
+
+    def _without_column(self, missing: list[str]) -> dict[str, float]:
+        """Return {slot: input} of pumps without a column: off in a drain test."""
+        inputs, feeds = {}, len(getattr(self.plant, "feeds", ())) or self.plant.pumps
+        valves = [slot for slot in missing if self.slots[slot][1] >= feeds]
+        drained = len([s for s in missing if s not in valves]) == feeds
+        drained = drained and not any(map(self._like_input, self.unused))
+        for slot in missing:
+            number = self.slots[slot][1]
+            if slot in valves:
+                inputs[slot] = float(np.asarray(self.loop.actuator.initial)[number])
+                self._note(f"no column: it stays at {inputs[slot]:g}", self._label(slot))
+            elif slot in self.named or drained:
+                inputs[slot] = 0.0
+                self._note("no column: off throughout, a drain test", self._label(slot))
+            else:
+                self._no_column(slot, label_of(self.plant, "pump", number))
+        return inputs
+
+    def _like_input(self, signal: Signal) -> bool:
+        """Whether a signal without a name of the rig may be the input of a pump."""
+        unit = unit_name(signal.described.unit or self.loop.units[1])
+        if not any(factor(unit, name) for name in (self.loop.units[1], "m^3/s")):
+            return False
+        try:
+            values, _ = numbers(signal.table, signal.column)
+        except DataError:
+            return False
+        return len(np.unique(values[np.isfinite(values)])) > 1
+
+    def _values(self, slot: str) -> tuple[np.ndarray, bool]:
+        """Return (values of a slot in the rig's unit, whether they are a sensor's volts)."""
+        signal, label = self.taken[slot], self._label(slot)
+        values, in_volts, words = np.full(len(signal.t), np.nan), False, Counter[str]()
+        try:
+            values, missing = numbers(signal.table, signal.column)
+            values, in_volts = self._converted(slot, values)
+            words.update(missing)
+            bad = poor(signal)
+            words.update(signal.quality[k] for k in np.flatnonzero(bad & np.isfinite(values)))
+            values = np.where(bad, np.nan, values)
+        except DataError as error:
+            self.problems.append(str(error))
+        if words:
+            each = ", ".join(f"{n} {printable(word)}" for word, n in words.most_common(5))
+            self._note(f"{count(words.total(), 'value')} taken as missing ({each})", label)
+        return values, in_volts
+
+    def _held(self, slot: str, t: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return an input at the times t, each value held until the next."""
+        known = np.isfinite(values)
+        if not known.any():
+            raise DataError(f"{self.place}: {slot} has no value")
+        if not known.all():
+            missing = count(int((~known).sum()), "value")
+            self._note(f"{missing} missing: held from the row before", self._label(slot))
+        at = np.searchsorted(self.taken[slot].t[known], t, side="right") - 1
+        return np.where(at < 0, np.nan, values[known][at])
+
+    def _converted(self, slot: str, values: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Return (values in the rig's unit, whether they stay a sensor's volts)."""
+        (kind, number), written = self.slots[slot], self._unit(slot)
+        length, drive = self.loop.units
+        base = canonical(length if kind == "h" else input_unit(self.plant, number, drive))
+        if written is None:
+            self._note(f"no unit in the header: taken in {base}, the rig's", self._label(slot))
+            return values, False
+        unit = unit_name(written)
+        if kind == "h" and unit in VOLTS and base not in VOLTS:
+            return values * VOLTS[unit], True
+        if (size := factor(unit, base)) is not None:
+            return values * size, False
+        other = self._as_level if kind == "h" else self._as_input
+        result = other(number, values, written, base, self._label(slot))
+        if result is None:
+            usual = INPUT_UNITS if kind == "pump" else LEVEL_UNITS
+            names = [name for name in usual if factor(name, base)] or [base]
+            names += ["%", f"{base}^3"] * (kind == "h" and factor(base, "m") is not None)
+            where = self.taken[slot].table.where(self.taken[slot].column)
+            self.in_doubt = True
             raise DataError(
-                f"{where}: there is no column {name!r} for {slot}{nearest(name, header)}"
+                f"{where}: {written!r} is no unit of a {KINDS[kind]}: must be one of"
+                f" {', '.join(names)}"
             )
-        index = header.index(name)
-        if other := next((known for known, (column, _) in taken.items() if column == index), None):
-            raise DataError(
-                f"{where}: column {name!r} is given for {other} and for {slot}: name one column"
-                " for each"
-            )
-        taken[slot] = (index, unit or split_header(name)[1])
-    return taken
+        return result, False
+
+    def _as_level(
+        self, tank: int, values: np.ndarray, unit: str, base: str, label: str
+    ) -> np.ndarray | None:
+        """Return levels of per cents of a span, or of volumes; None of another unit."""
+        if share := re.fullmatch(r"(%|mA)(?: of (.+))?", unit_name(unit)):
+            low, high = spans_of(self.loop)[tank]
+            if share[2]:
+                low, high = 0.0, quantity(f"{label}, {share[1]} of", share[2], base)
+            self._note(f"in {share[1]} of {low:g} to {high:g} {base}", label)
+            return np.asarray(in_span(values, share[1], (low, high)))
+        size, plant = factor(unit_name(unit), f"{base}^3"), self.plant
+        if size is None or getattr(plant, "area", None) is None:
+            return None
+        self._note("a volume: read as the level that holds it", label)
+        shape = plant.shapes[tank] if getattr(plant, "shapes", ()) else "prism"
+        extent = getattr(plant, "extent", None)
+        top = 1.0 if extent is None else float(np.asarray(extent)[tank])
+        volumes = np.where(np.isfinite(values), values * size, 0.0)
+        levels = np.asarray(level_of(shape, float(np.asarray(plant.area)[tank]), top, volumes))
+        return np.where(np.isfinite(values), levels, np.nan)
+
+    def _as_input(
+        self, pump: int, values: np.ndarray, unit: str, base: str, label: str
+    ) -> np.ndarray | None:
+        """Return inputs of flows, by the pump's gain; None of another unit."""
+        length, plant = self.loop.units[0], self.plant
+        size = factor(unit_name(unit), f"{length}^3/s") if factor(length, "m") else None
+        curves = getattr(plant, "curves", ())
+        plain = pump < len(getattr(plant, "feeds", ())) and not (curves and curves[pump])
+        if size is None or not plain:
+            return None
+        gain = float(np.asarray(plant.pump_gain)[pump])
+        self._note(f"a flow: read as the input that gives it by the gain, {gain:.6g}", label)
+        return values * size / gain
+
+    def table_text(self) -> str:
+        """Return the [log] table of a rig file that reads the file, or that is to be completed."""
+        guesses = self._guesses()
+        lines = {"t": self._line_of_time()}
+        for slot in self.slots.keys() - lines.keys():
+            lines[slot] = "none", "no column"
+            if slot in self.taken:
+                lines[slot] = self._line_of(slot)
+            elif slot in guesses:
+                lines[slot] = guesses[slot].described.header, "a guess: check it"
+        for setting, (answer, other) in self.suggested.items():
+            lines[setting] = answer, f"or {rigs.toml(other)}"
+        texts = ["[log]"]
+        for slot in [*self.slots, *self.suggested]:
+            (value, remark), label = lines[slot], self._label(slot)
+            key = label if re.fullmatch(r"[\w-]+", label, re.ASCII) else rigs.toml(label)
+            texts.append(f"{key} = {rigs.toml(value)}" + f"  # {remark}" * bool(remark))
+        return "\n".join(texts)
+
+    def _line_of_time(self) -> tuple[Any, str]:
+        """Return (value, remark) of the line of the times."""
+        if self.time is None:
+            return self.table.columns[0].header, "a guess: which column is the time?"
+        if self.time_read or self.time.unit or is_time(self.time.cells[0]):
+            return self.time.header, ""
+        return [self.time.header, "s"], "or min, h, d"
+
+    def _line_of(self, slot: str) -> tuple[Any, str]:
+        """Return (value, remark) of the line of a slot that has a signal."""
+        column = self.taken[slot].described
+        (kind, number), (length, drive) = self.slots[slot], self.loop.units
+        base = length if kind == "h" else input_unit(self.plant, number, drive)
+        try:
+            self._converted(slot, np.zeros(1))
+        except DataError:
+            return [column.header, base], f"a guess: {printable(self._unit(slot))} is not read"
+        own, unit = split_header(column.header)[1], self._unit(slot) or base
+        return (column.header if own == unit else [column.header, unit]), ""
+
+    def _guesses(self) -> dict[str, Signal]:
+        """Return {slot: signal} that may be meant, of the same number or of a unit that suits."""
+        guesses: dict[str, Signal] = {}
+        for slot, (kind, _) in self.slots.items():
+            if slot in self.taken or kind == "t":
+                continue
+            digits = re.findall(r"\d+", self._label(slot))[-1:]
+            for signal in self.unused:
+                same = re.findall(r"\d+", signal.described.name)[-1:] == digits
+                suits = self._like_input(signal) == (kind == "pump")
+                if same and suits and not any(signal is other for other in guesses.values()):
+                    guesses.setdefault(slot, signal)
+        return guesses
 
 
-def _recognised_columns(header, where, slots, taken, named, by_name):
-    """Return {slot: (index, unit)} of the other columns whose headers name a slot themselves."""
-    used, columns = {index for index, _ in taken.values()}, {}
-    for index, cell in enumerate(header):
-        stem, unit = split_header(cell)
-        slot = by_name.get(stem) or _slot(stem, slots)
-        if index in used or slot is None or slot in named:
-            continue
-        if slot in columns:
-            raise DataError(
-                f"{where}: columns {header[columns[slot][0]]!r} and {cell!r} both look like {slot};"
-                " name one with --column"
-            )
-        columns[slot] = (index, unit)
-    return columns
-
-
-def _own(plant, slots):
-    """{"LT101", "h_LT101", "u_P101", ..: slot} of what a rig's own names call its columns."""
-    by_name = {}
-    for slot, (kind, number) in slots.items():
-        name = "" if kind == "t" else name_of(plant, "tank" if kind == "h" else kind, number)
-        letter = "h" if kind == "h" else "u"
-        by_name |= {name: slot, f"{letter}_{name}": slot} if name else {}
-    return by_name
-
-
-def _slot(stem, slots):
-    """Return the slot ("t", "pump1", "h2") that a column's name means, or None."""
-    # no rig has a tank of seven digits
-    word = re.fullmatch(r"([a-z]+)[ _]?(\d{0,6})", stem.strip().lower())
-    if not word or word[1] not in WORDS:
-        return None
-    kind, number = WORDS[word[1]], word[2] and str(int(word[2]))
-    alone = kind != "t" and not number and f"{kind}2" not in slots  # "level" of a single tank
-    slot = f"{kind}1" if alone else f"{kind}{number}"
-    return slot if slot in slots else None
-
-
-def _factor(kind, slot, unit, units, where):
-    """Return (factor of a cell to the rig's unit, whether it is the sensor's voltage)."""
-    length, drive = units
-    base = {"t": "s", "pump": drive, "h": length}[kind]
-    if unit is None:
-        raise DataError(
-            f"{where}: has no unit: write it in the header, as '{slot} [{base}]', or with --column"
-        )
-    name, base = canonical(unit), canonical(base)
-    if kind == "h" and name in VOLTS and length not in VOLTS:
-        return VOLTS[name], True
-    size = factor(name, base)
-    if size is None:
-        usual = {"t": tuple(TIMES), "pump": INPUT_UNITS, "h": LEVEL_UNITS}[kind]
-        names = [other for other in usual if factor(other, base)] or [base]
-        raise DataError(
-            f"{where}: {unit!r} is no unit of a {KINDS[kind]}: must be one of {', '.join(names)}"
-        )
-    return size, False
+def _settings_and_columns(plant, columns):
+    """Return ({setting: value}, {slot: (header, unit or None)}) of a [log] table."""
+    keys, settings, named = log_keys(plant), {}, {}
+    for key, spec in columns.items():
+        if key in LOG_SETTINGS:
+            settings[key] = spec
+        elif key not in keys:
+            raise InputError(f"unknown column {key!r}{nearest(key, [*keys, *LOG_SETTINGS])}")
+        else:
+            header, unit = (spec, None) if isinstance(spec, str) else spec
+            named[keys[key]] = (header.strip(), unit)  # "": found by its name
+    if named.get("t", ("", None))[0] == "none":
+        raise InputError("column t = none: only a level may be left out, or a pump that is off")
+    return settings, named

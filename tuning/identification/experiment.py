@@ -37,6 +37,8 @@ class Log:
         Column names in the file, and the units they were in: of t, of u and of y.
     hold : {"", "zero-order", "first-order"}
         As in `tuning.log`.
+    notes : tuple of str
+        What was taken for granted when a file was read.
 
     Examples
     --------
@@ -58,6 +60,7 @@ class Log:
     headers: tuple | None = None
     units: tuple | None = None
     hold: str = ""
+    notes: tuple = ()
 
     @property
     def samples(self) -> int:
@@ -102,6 +105,7 @@ def log(
     headers: tuple | None = None,
     units: tuple | None = None,
     hold: str = "",
+    notes: tuple = (),
 ) -> Log:
     """Return experiment data from arrays, for `tuning.identify`.
 
@@ -118,7 +122,7 @@ def log(
         Tank of each channel, counted from 0; 0, 1, ... by default.
     in_volts : sequence of bool, optional
         Whether each channel is the sensor's voltage; False by default: a level in the rig's unit.
-    name, lines, headers, units
+    name, lines, headers, units, notes
         As in `Log`, for messages.
     hold : {"", "zero-order", "first-order"}
         Inputs between samples: "zero-order", each held until the next sample; "first-order", a
@@ -161,7 +165,7 @@ def log(
     lines = None if lines is None else np.asarray(lines)
     data = Log(
         t=t, u=u, y=y, tanks=tanks, in_volts=in_volts, name=name, lines=lines, headers=headers,
-        units=units, hold=hold,
+        units=units, hold=hold, notes=notes,
     )  # fmt: skip
     _check_samples(data)
     return data

@@ -9,7 +9,7 @@ from jaxtank.core.text import printable
 from tuning.cli import values
 from tuning.cli.interrupts import Interrupts
 from tuning.cli.options import CASE, COMMON, RESUME, RUN, Command, Option
-from tuning.cli.steps import finish, open_case, print_result, report_unreachable
+from tuning.cli.steps import finish, note, open_case, print_result, report_unreachable
 from tuning.cli.terminal import Line
 
 LONGEST = 1e7
@@ -55,13 +55,24 @@ def _check_together(args):
         raise InputError("; ".join(problems))
 
 
-def _identify(args, case):
-    """Identify, then write and print the result; returns the exit code."""
+def read_logs(args, case):
+    """Return the experiment data of --data; what they take for granted goes to stderr."""
     from tuning.identification.csv_log import read_log
-    from tuning.identification.fit import identify
 
     columns = dict(case.log) | args.column
-    logs = [read_log(path, case.loop, columns, args.decimal, args.hold) for path in args.data]
+    settings = (columns, args.decimal, args.hold, args.time)
+    logs = [read_log(path, case.loop, *settings) for path in args.data]
+    for log in logs:
+        for sentence in log.notes:
+            note(args, sentence)
+    return logs
+
+
+def _identify(args, case):
+    """Identify, then write and print the result; returns the exit code."""
+    from tuning.identification.fit import identify
+
+    logs = read_logs(args, case)
     shortest = min(log.samples for log in logs)
     if args.hold_back >= shortest:
         raise InputError(
@@ -203,7 +214,10 @@ DATA = (
     Option("--column", "SLOT=HEADER[;UNIT]", "which column is t, pump1, .., h1, .., where its"
            " header is in other words; h3=none: leave that level out", values.pair(values.column),
            kind="pairs"),
-    Option("--decimal", "SIGN", "decimal sign of the data: . or ,", default=".", choices=".,"),
+    Option("--decimal", "SIGN", "decimal sign of the data: . or , (default: from the numbers)",
+           default="", choices=".,"),
+    Option("--time", "HOW", "how times that can be read twice are meant: day-first, month-first,"
+           " h:m, m:s", default=""),
     Option("--gap", "X", "longest step between samples, in median steps",
            values.above(1, including=True), 1.5),
     Option("--hold", "HOW", "inputs between samples: zero-order (each until the next row) or"

@@ -1,0 +1,187 @@
+"""Signals in a table: which columns are times, values and their qualities, and whose they are."""
+
+import re
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxtank.core.errors import DataError
+from jaxtank.core.quantities import factor
+from jaxtank.core.tables import Column, Table, is_time, split_header, unit_name
+
+# fmt: off
+TIME = {
+    "t", "time", "timestamp", "datetime", "date", "elapsed", "elapsedtime", "sampletime", "ts",
+    "localtime", "utctime", "timeutc", "seconds", "minutes", "hours", "zeit", "zeitstempel",
+    "datum", "datumzeit", "uhrzeit", "horodatage",
+}
+"""Names of a column of times, letters and digits only."""
+WORDS = {
+    **dict.fromkeys(("pump", "u", "voltage", "input"), "pump"),
+    **dict.fromkeys(("h", "level", "y", "tank", "x"), "h"),
+}
+"""Names of a pump's input and a level, before their number."""
+TAG = {
+    "tag", "tagname", "tagid", "name", "point", "pointname", "variable", "signal", "item",
+    "itemid", "sensor", "channel", "bezeichnung", "kanal",
+}
+VALUE = {"value", "val", "wert", "reading", "average", "valeur", "valor", "messwert"}
+UNIT = {"unit", "units", "uom", "eu", "einheit"}
+QUALITY = {"quality", "qual", "status", "q", "qly", "qualitat", "qualität"}
+"""Names of the columns of a long table, a row for each value of a tag."""
+OTHER = {
+    "r", "e", "w", "sp", "setpoint", "sollwert", "soll", "mode", "alarm", "alm", "hh", "ll", "hi",
+    "lo",
+}
+"""Words beside the name of a tank or a pump that mean another signal of it."""
+MEASURED = {"pv", "val", "value", "actual", "ist", "istwert", "avg", "mean", "measured", "act"}
+"""Words beside it that mean its value."""
+GOOD = {"good", "ok", "g", "valid", "gut", "true", "normal"}
+POOR = {
+    "bad", "uncertain", "questionable", "substituted", "b", "u", "poor", "invalid", "false",
+    "schlecht", "unsicher",
+}
+"""First words of a quality, in lower case."""
+# fmt: on
+GOOD_CODE = 192
+"""Least code of OPC for a good quality."""
+
+
+class Signal(NamedTuple):
+    """Readings of one column, or of one tag of a long table."""
+
+    table: Table
+    column: int
+    t: np.ndarray  # times of its cells [s]
+    quality: list[str]  # a word or number for each cell, [] without
+
+    @property
+    def described(self) -> Column:
+        """The column with its header, name and unit."""
+        return self.table.columns[self.column]
+
+
+def time_columns(table: Table) -> list[int]:
+    """Return the columns of the times, the last the one to read: of dates and times of day joined,
+    where they have a column each.
+    """
+    columns = table.columns
+    where = lambda holds: [i for i, column in enumerate(columns) if holds(column)]
+    days = where(lambda c: is_time(c.cells[0]) and ":" not in c.cells[0])
+    clocks = where(lambda c: is_time(c.cells[0]) and re.match(r"\d{1,2}:", c.cells[0]))
+    if days and clocks:
+        day, clock = columns[days[0]], columns[clocks[0]]
+        cells = [f"{a} {b}" for a, b in zip(day.cells, clock.cells)]
+        columns.append(Column(f"{day.header} {clock.header}", "", None, cells))
+        return [days[0], clocks[0], len(columns) - 1]
+    stamps = where(lambda c: is_time(c.cells[0]))
+    words = where(lambda c: compact(c.name) in TIME)
+    units = where(lambda c: factor(unit_name(c.unit or ""), "s"))
+    return [*(i for i in words if i in stamps), *words, *stamps, *units][:1]
+
+
+def signals_of(table: Table, used: list[int], t: np.ndarray) -> list[Signal]:
+    """Return the signals of a table whose rows are at the times t; used: the columns of these."""
+    names = [compact(column.name) for column in table.columns]
+    of = lambda words: next((i for i, name in enumerate(names) if name in words), None)
+    tag, value = of(TAG), of(VALUE)
+    if tag is None or value is None:
+        return _wide(table, used, t)
+    return _long(table, t, tag, value, of(UNIT), of(QUALITY))
+
+
+def _long(table, t, tag, value, unit, quality):
+    """Return the signals of a table with a row for each value of a tag."""
+    columns, rows = table.columns, {}
+    for k, text in enumerate(columns[tag].cells):
+        rows.setdefault(text, []).append(k)
+    signals = []
+    for text, of_tag in rows.items():
+        of_tag.sort(key=t.__getitem__)
+        cells = lambda i, of_tag=of_tag: [columns[i].cells[k] for k in of_tag]
+        name, own = split_header(text)
+        own = own or columns[value].unit or (None if unit is None else cells(unit)[0] or None)
+        lines = [table.lines[k] for k in of_tag]
+        part = table._replace(columns=[Column(text, name, own, cells(value))], lines=lines)
+        signals.append(Signal(part, 0, t[of_tag], [] if quality is None else cells(quality)))
+    return signals
+
+
+def _wide(table, used, t):
+    """Return the signals of a table with a column for each."""
+    rest = sorted({*range(len(table.columns))} - {*used})
+    judged = {i: name for i in rest if (name := _judged(table.columns[i])) is not None}
+    plain, marks = [i for i in rest if i not in judged], {}
+    for i, name in judged.items():
+        of = [j for j in plain if compact(table.columns[j].name) == name != ""]
+        if not of:  # the only one is of all columns, others of the one to their left
+            of = plain if [name] == [*judged.values()] == [""] else [j for j in plain if j < i][-1:]
+        marks |= dict.fromkeys(of, table.columns[i].cells)
+    return [Signal(table, i, t, marks.get(i, [])) for i in plain]
+
+
+def compact(text):
+    """Return the letters and digits of a name, in lower case."""
+    return re.sub(r"[\W_]+", "", text.lower())
+
+
+def rank(text, slot, name, slots):
+    """Return how well a column's name means a slot: 3 exactly, 2 with a word for a value, 1 with
+    other words, 0 not at all. name: the rig's own, or the slot.
+    """
+    letter = "h" if slots[slot][0] == "h" else "u"
+    if _generic(text, slots) == slot or text in (name, f"{letter}_{name}"):
+        return 3 if text else 0
+    if compact(text) == compact(name) != "":
+        return 3
+    parts = re.findall(r"[^\W\d_]+|\d+", name.lower())
+    if not any(map(str.isalpha, parts)):
+        return 0
+    pattern = r"(?<![^\W_])" + r"[\W_]*".join(parts) + r"(?![^\W_])"
+    if not re.search(pattern, text.lower()):
+        return 0
+    rest = set(re.split(r"[\W_]+", re.sub(pattern, " ", text.lower())))
+    return 0 if rest & (OTHER | QUALITY) else 2 if rest & MEASURED else 1
+
+
+def _generic(stem, slots):
+    """Return the slot ("t", "pump1", "h2") that a column's name means, or None."""
+    # no rig has a tank of seven digits
+    word = re.fullmatch(r"([a-z]+)[ _]?(\d{0,6})", stem.strip().lower())
+    if not word or word[1] not in WORDS:
+        return None
+    kind, number = WORDS[word[1]], word[2] and str(int(word[2]))
+    alone = not number and f"{kind}2" not in slots  # "level" of a single tank
+    return f"{kind}1" if alone else f"{kind}{number}"
+
+
+def _judged(column):
+    """Return the compact name of what a column of qualities judges, "" for all; None of another."""
+    *stem, last = re.split(r"[\W_]+", column.name.lower())
+    marks = {_word(cell) for cell in column.cells}
+    text = bool(marks & (GOOD | POOR))
+    number = last != "q" and all(re.fullmatch(r"\d*", mark) for mark in marks)
+    return compact("".join(stem)) if last in QUALITY and (text or number) else None
+
+
+def _word(mark):
+    """Return the first word of a quality, in lower case."""
+    return re.split(r"[\s,;(\[]+", mark.strip().lower())[0]
+
+
+def poor(signal):
+    """Return (cells,) whether the quality of a signal is not good."""
+    words = [_word(mark) for mark in signal.quality]
+    if not words:
+        return np.zeros(len(signal.t), dtype=bool)
+    codes = [int(word) for word in words if re.fullmatch(r"\d{1,9}", word)]
+    least = GOOD_CODE if max(codes, default=0) >= GOOD_CODE else 1
+    usual = least == GOOD_CODE or set(codes) <= {0, 1}
+    good = [w in GOOD or w == "" or (w.isdigit() and usual and int(w) >= least) for w in words]
+    if not any(good) or not usual:
+        known = ", ".join(map(repr, sorted(set(signal.quality))[:8]))
+        raise DataError(
+            f"{signal.table.where(signal.column)}: its quality is never known to be good: {known};"
+            " write Good, Bad or Uncertain, or OPC codes (192 is good), or leave the column out"
+        )
+    return ~np.array(good)
