@@ -114,7 +114,10 @@ def bounds(loop: ClosedLoop, free: Mapping[str, Any]) -> list[Bound]:
     # Raises InputError for an unknown name, a range that is empty, not finite or outside what the
     # parameter allows.
     if not free:
-        raise InputError("nothing to tune: name at least one parameter with --free NAME=LOW:HIGH")
+        raise InputError(
+            "nothing to tune: name at least one parameter, free={name: (low, high)} or --free"
+            " NAME=LOW:HIGH"
+        )
     entries: list[Bound] = []
     for name, spec in free.items():
         if name.startswith("safety_filter."):

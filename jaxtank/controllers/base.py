@@ -6,11 +6,12 @@ from typing import Any
 
 from jaxtank.core.clock import Clock, pointwise
 from jaxtank.core.records import Estimate, Tick
+from jaxtank.core.tree import Role
 from jaxtank.instruments.base import Actuator
 from jaxtank.signals.base import Signal
 
 
-class Controller(abc.ABC):
+class Controller(Role):
     """A sampled controller. Its model of the plant and the plant itself are different leaves.
 
     Examples
@@ -140,10 +141,10 @@ class Controller(abc.ABC):
         """
         return False
 
-    def check_pumps(self, actuator: Actuator) -> None:  # noqa: B027
+    def check_pumps(self, actuator: Actuator) -> None:
         """Raise InputError for pumps whose limits, or whose input before t = 0, do not suit the
         controller.
         """
 
-    def check(self, reference: Signal) -> None:  # noqa: B027  (there may be nothing to check)
+    def check(self, reference: Signal) -> None:
         """Raise InputError if the reference or the model does not suit the controller."""

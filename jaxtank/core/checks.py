@@ -1,7 +1,8 @@
-"""Input validation of leaves: real, finite and within their ranges."""
+"""Input validation of leaves: real, finite and within their ranges; calls of a user's methods."""
 
+import contextlib
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any, cast
 
 import jax
@@ -12,8 +13,29 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import is_real, number, walk
 
+NOT_TRACEABLE = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+"""Errors of jax if a program uses the number of a traced value."""
+TRACEABLE = (
+    "jax cannot trace it, because no value of a run is known while it is compiled: write jnp.where"
+    " instead of if, jnp.maximum instead of max(), and functions of jax.numpy instead of float() or"
+    " numpy"
+)
+
 SMALL = 16
 """Largest size of an array that is checked number by number."""
+
+
+@contextlib.contextmanager
+def traceable(label: str) -> Iterator[None]:
+    """Raise InputError, beginning with `label`, where the block needs the number of a tracer."""
+    try:
+        yield
+    except NOT_TRACEABLE as error:
+        raise InputError(f"{label}: {TRACEABLE} ({type(error).__name__})") from error
 
 
 def check_leaves(

@@ -92,6 +92,21 @@ def is_pointwise(part: Any) -> bool:
     )
 
 
+class ClockWarning(UserWarning):
+    """A run does not end when it is asked to. The command prints a note instead."""
+
+
+def clock_warnings(clock: Clock) -> list[str]:
+    """Return a sentence where a run of whole samples does not end when it is asked to."""
+    end = (clock.samples - 1) * clock.dt
+    if abs(end - clock.duration) <= 1e-6 * clock.dt:
+        return []
+    return [
+        f"clock.duration = {clock.duration:.9g} s is no whole number of samples of clock.dt ="
+        f" {clock.dt:.9g} s: the run ends at {end:.9g} s"
+    ]
+
+
 def _meta(
     unit: str,
     doc: str,

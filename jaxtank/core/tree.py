@@ -9,12 +9,13 @@ whatever a transformation carries (tracers, batches, axes, placeholders). Checks
 `jaxtank.core.checks`.
 """
 
+import abc
 import dataclasses
 import functools
 import numbers
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, TypeVar, cast, dataclass_transform
+from typing import TYPE_CHECKING, Any, TypeVar, cast, dataclass_transform
 
 import jax
 import jax.numpy as jnp
@@ -132,6 +133,19 @@ def static(
         "choices": choices,
     }
     return dataclasses.field(metadata=meta, default=default)
+
+
+class Role(abc.ABC):  # noqa: B024  (each role has its own abstract methods)
+    """Base of the parts of a loop, whose classes are made by `component`."""
+
+    if not TYPE_CHECKING:  # a type checker reports keywords that the class does not have
+
+        def __init__(self, *args: Any, **values: Any) -> None:
+            """Of a class that `component` has not made a dataclass."""
+            name = type(self).__name__
+            raise InputError(
+                f"the class {name} lacks @jaxtank.component: write this line above the class"
+            )
 
 
 def note(default: Any) -> Any:

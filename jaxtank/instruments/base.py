@@ -15,12 +15,13 @@ from jax.typing import ArrayLike
 
 from jaxtank.core.clock import CHUNK, Clock
 from jaxtank.core.numerics import clip
+from jaxtank.core.tree import Role
 from jaxtank.core.vectors import each
 from jaxtank.xla.barrier import materialised
 from jaxtank.xla.normal import is_fast, normal, normal_at
 
 
-class Sensor(abc.ABC):
+class Sensor(Role):
     """The level sensors of a rig, one per tank: readings of levels.
 
     A custom sensor is a `component` with its own `step`. A sensor with noise has a leaf
@@ -141,7 +142,7 @@ class Sensor(abc.ABC):
         return dataclasses.replace(cast(Any, self), noise=np.zeros(np.shape(self.noise)))
 
 
-class Actuator(abc.ABC):
+class Actuator(Role):
     """The pumps of a rig: from the commands of a controller to the inputs of the plant.
 
     In one sample `limit` first holds the command within the limits, which needs no memory:
@@ -202,7 +203,7 @@ class Actuator(abc.ABC):
         """(m,) part of the inputs that moves no liquid (see `driving`) [V]."""
         return 0.0
 
-    def check(self) -> None:  # noqa: B027
+    def check(self) -> None:
         """Raise InputError for values that contradict each other."""
 
     @abc.abstractmethod

@@ -10,18 +10,12 @@ import jax
 import jax.numpy as jnp
 
 from jaxtank import measures as ms
+from jaxtank.core.checks import NOT_TRACEABLE, TRACEABLE
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.text import one_line
 from jaxtank.loop.closed_loop import ClosedLoop, zero_of
 from jaxtank.loop.saved_rows import simulate_compiled
-
-NOT_TRACEABLE = (
-    jax.errors.ConcretizationTypeError,
-    jax.errors.TracerArrayConversionError,
-    jax.errors.TracerIntegerConversionError,
-)
-"""Errors of jax if a program uses the number of a traced value."""
 
 
 class Measures(Mapping[str, Any]):
@@ -143,11 +137,7 @@ def _called(name: str, spec: ms.RunFunction, measures: Measures, run: Any) -> An
     except InputError as error:
         _refuse(name, str(error))
     except NOT_TRACEABLE as error:
-        _refuse(
-            name,
-            "jax cannot trace it: write it with functions of jax.numpy, and without float(), if and"
-            f" while on values of the run ({type(error).__name__})",
-        )
+        _refuse(name, f"{TRACEABLE} ({type(error).__name__})")
     except Exception as error:  # whatever a function of the user's raises
         words = one_line(f"{type(error).__name__}: {error}", 200)
         raise InputError(f"function {name}: {words}") from error

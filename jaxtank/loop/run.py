@@ -18,7 +18,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from jaxtank import measures as ms
-from jaxtank.core.clock import CHUNK, Clock, is_pointwise
+from jaxtank.core.clock import CHUNK, Clock, ClockWarning, clock_warnings, is_pointwise
 from jaxtank.core.errors import InputError, NonFiniteError
 from jaxtank.core.labels import join_labels
 from jaxtank.core.tree import parameters, with_values
@@ -58,7 +58,7 @@ def simulate(
     """Run the loop and keep every `save_every`-th sample.
 
     Warns (TankBottomWarning) where a level falls below an empty tank: liquid was drawn that was not
-    there.
+    there; and ClockWarning where the duration is no whole number of samples.
 
     Parameters
     ----------
@@ -96,6 +96,8 @@ def simulate(
         raise InputError(
             f"save_every = {save_every!r}: must be a whole number of at least 1 sample"
         )
+    for line in clock_warnings(clock):
+        warnings.warn(line, ClockWarning, stacklevel=3)
     trajectory, broken = simulate_compiled(loop, clock, key, min(save_every, clock.samples))
     _report_broken(broken, loop, clock, key)
     if not isinstance(trajectory.x, Tracer) and np.ndim(trajectory.x) == 2:

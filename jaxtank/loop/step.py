@@ -7,11 +7,14 @@ Simulation, derivatives, export and Gymnasium call it.
 
 import operator
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, NoReturn, cast
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtank.controllers.base import Controller
+from jaxtank.core.checks import traceable
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Sample, Tick
@@ -162,30 +165,71 @@ def commanded(
     loop: ClosedLoop, state: Any, tick: Tick, estimate: Estimate
 ) -> tuple[Sequence[Any], Any]:
     """Return the controller's ((m,) inputs before their limits, new state)."""
-    # Raises InputError, while the loop is traced, if the number of inputs is not the number of
-    # pumps, or an input is no single real number.
-    tick_of_controller = _tick_for(loop.controller, tick)
-    command, state = loop.controller.step(state, tick_of_controller, _estimate_for(loop, estimate))
-    _check_command(command, loop.plant.pumps, type(loop.controller).__name__)
-    return like(command, estimate.x), state
+    # Raises InputError, while the loop is traced, for a step that jax cannot trace or whose result
+    # is not (one real number per pump, a state of the form of `init`).
+    controller, pumps = loop.controller, loop.plant.pumps
+    label = f"controller {type(controller).__name__}: its step"
+    arguments = state, _tick_for(controller, tick), _estimate_for(loop, estimate)
+    try:
+        with traceable(label):
+            result: Any = controller.step(*arguments)
+    except (IndexError, TypeError, ValueError) as error:
+        if isinstance(error, InputError) or not _is_stateless(controller, state):
+            raise
+        raise InputError(
+            f"{label} raises {type(error).__name__} ({error}), and its state is (): a class with a"
+            " state needs init(self, x0, u0), which returns the first one"
+        ) from error
+    if not (isinstance(result, tuple) and len(cast(Any, result)) == 2):
+        _refuse_result(label, result, pumps)
+    command, after = cast(tuple[Any, Any], result)
+    _check_command(label, command, after, pumps)
+    if _form(after) != _form(state):
+        first = "(), as its class has no init(self, x0, u0)"
+        first = first if _is_stateless(controller, state) else "that of its init"
+        raise InputError(
+            f"{label} returns a state of another form than the first one, {first}: must return"
+            " arrays of the same shapes, in the same order"
+        )
+    return like(command, estimate.x), after
 
 
-def _check_command(command: Any, pumps: int, name: str) -> None:
-    """Raise InputError unless `command`, of the controller `name`, is one real number per pump."""
+def _is_stateless(controller: Controller, state: Any) -> bool:
+    """Whether the state is () because the class has no `init`."""
+    cls: Any = type(controller)
+    return isinstance(state, tuple) and not state and cls.init is cast(Any, Controller).init
+
+
+def _form(state: Any) -> Any:
+    """Structure and shapes of the state of a controller."""
+    leaves: Any = jax.tree.leaves(state)
+    return jax.tree.structure(state), [np.shape(v) for v in leaves]
+
+
+def _refuse_result(label: str, result: Any, pumps: int, hint: str = "") -> NoReturn:
+    """Raise InputError for a result of `step` that is not (inputs, state)."""
+    several = isinstance(result, tuple | list)
+    count = (len(cast(Any, result)),) if several else np.shape(result)[:1]
+    words = f"{count[0]} input{'' if count[0] == 1 else 's'}" if count else "one number"
+    words = "None" if result is None else words
+    raise InputError(
+        f"{label} returns {words} for {pumps} pump{'' if pumps == 1 else 's'}{hint}: must return"
+        " (inputs, state), a tuple with one input for each pump"
+    )
+
+
+def _check_command(label: str, command: Any, after: Any, pumps: int) -> None:
+    """Raise InputError unless `command` is one real number per pump; after: the new state."""
     several = isinstance(command, tuple | list)
     entries: list[Any] = list(cast(Any, command)) if several else []
     count = (len(entries),) if several else np.shape(command)[:1]
     if count != (pumps,):
-        words = f"{count[0]} input{'' if count[0] == 1 else 's'}" if count else "one number"
-        raise InputError(
-            f"controller {name}: its step returns {words} for {pumps}"
-            f" pump{'' if pumps == 1 else 's'}: must return (inputs, state), a tuple with one input"
-            " for each pump"
-        )
+        bare = pumps == 2 and not count and is_real(after) and np.ndim(after) == 0
+        _refuse_result(label, command, pumps, " and, it seems, no state" if bare else "")
     parts = [(np.shape(v), v) for v in entries] if several else [(np.shape(command)[1:], command)]
     switch = np.dtype(bool)  # on or off: 1 or 0
     if any(shape or not (is_real(v) or getattr(v, "dtype", None) == switch) for shape, v in parts):
         raise InputError(
-            f"controller {name}: its step returns an input that is no single real number: must"
+            f"{label} returns an input that is no single real number: must"
             " return (inputs, state), a tuple with one number for each pump"
         )

@@ -106,6 +106,7 @@ def _check_parts(
     loop: ClosedLoop, clock: Clock, key: jax.Array | jax.ShapeDtypeStruct | None
 ) -> None:
     """Every check that looks at the loop."""
+    _check_components(loop)
     _check_sizes(loop)
     _check_units(loop.plant)
     if loop.actuator.allocates and (loop.plant.pumps != 2 or not loop.controller.allocates):
@@ -132,6 +133,24 @@ def _check_parts(
         loop.observer.check_clock(clock)
     if key is None:
         _check_noise(loop)
+
+
+def _check_components(loop: ClosedLoop) -> None:
+    """Raise InputError for a part of the loop whose class was not made by `component`."""
+    wrong: list[str] = []
+    for field in dataclasses.fields(cast(Any, loop)):
+        part = getattr(loop, field.name)
+        if field.name == "x0" or part is None:
+            continue
+        if isinstance(part, type):
+            wrong.append(f"{field.name} is the class {part.__name__}: give {part.__name__}(...)")
+        elif jax.tree_util.all_leaves([part]):  # jax does not know its class
+            wrong.append(
+                f"{field.name} is of the class {type(part).__name__}, which lacks"
+                " @jaxtank.component: write this line above the class"
+            )
+    if wrong:
+        raise InputError("; ".join(wrong))
 
 
 def _check_faults(loop: ClosedLoop, clock: Clock) -> None:

@@ -6,11 +6,11 @@ from typing import Any
 
 from jaxtank.core.clock import Clock
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.core.tree import component
+from jaxtank.core.tree import Role, component
 from jaxtank.plants.base import Plant
 
 
-class Observer(abc.ABC):
+class Observer(Role):
     """Estimator of the levels: corrected by measurements, predicted with the applied inputs.
 
     Examples
@@ -37,10 +37,10 @@ class Observer(abc.ABC):
         """
         return state
 
-    def check(self, plant: Plant) -> None:  # noqa: B027  (there may be nothing to check)
+    def check(self, plant: Plant) -> None:
         """Raise InputError if the observer does not fit this plant."""
 
-    def check_clock(self, clock: Clock) -> None:  # noqa: B027
+    def check_clock(self, clock: Clock) -> None:
         """Raise InputError if the observer cannot work at the sampling period of this clock."""
 
 

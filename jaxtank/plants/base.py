@@ -8,11 +8,12 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
+from jaxtank.core.tree import Role
 from jaxtank.core.units import DEFAULT
 from jaxtank.core.vectors import take, zeros
 
 
-class Plant(abc.ABC):
+class Plant(Role):
     """A vector field over levels, held inputs and disturbing inflows. Vectors are tuples of
     scalars; where a class says `arrays = True`, those of many tanks are arrays.
 

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxtank.core.checks import traceable
+from jaxtank.core.errors import InputError
 from jaxtank.core.kahan import added
 from jaxtank.core.vectors import each, unzipped, zeros
 from jaxtank.plants.base import Plant
@@ -65,7 +67,23 @@ def integrate(plant, integrator, t, x, u, d, h):
         flows = plant.net_flows(h)
         rate = lambda t, volumes, u, d: flows(t, plant.levels(volumes), u, d)
         return plant.levels(_step(rate, integrator, t, plant.stored(x), u, d, h))
-    return _step(plant.limited(h), integrator, t, x, u, d, h)
+    return _step(_field(plant, h), integrator, t, x, u, d, h)
+
+
+def _field(plant, h):
+    """The vector field of a step; InputError for one that jax cannot trace, or of another size."""
+    rate = plant.limited(h)
+    label = f"plant {type(plant).__name__}: its derivative"
+
+    def rates(t, x, u, d):
+        with traceable(label):
+            result = rate(t, x, u, d)
+        if not hasattr(result, "__len__") or len(result) != len(x):
+            count = len(result) if hasattr(result, "__len__") else "one number instead of"
+            raise InputError(f"{label} returns {count} rates for {len(x)} tanks: must be one each")
+        return result
+
+    return rates
 
 
 def _step(rate, integrator, t, x, u, d, h):
@@ -87,7 +105,7 @@ def change(plant, integrator, t, x, u, d, h):
     """Return the change of the levels in that step, for compensated sums (`jaxtank.core.kahan`)."""
     if plant.by_volume:
         return each(operator.sub, integrate(plant, integrator, t, x, u, d, h), x)
-    rates = _rates(plant.limited(h), integrator, t, x, u, d, h)
+    rates = _rates(_field(plant, h), integrator, t, x, u, d, h)
     if integrator == "midpoint":
         return each(lambda k: h * k, rates)
     return each(lambda p, q, r, s: (h / 6.0) * (p + 2.0 * (q + r) + s), *rates)

@@ -99,7 +99,6 @@ from jaxtank.rig.values import set_and_schedule as set_and_schedule
 from jaxtank.rig.values import set_scenario, set_values
 from jaxtank.rig.values import with_bottom as with_bottom
 from jaxtank.rig.warnings import case_warnings
-from jaxtank.rig.warnings import clock_warnings as clock_warnings
 from jaxtank.rig.warnings import model_warnings as model_warnings
 from jaxtank.rig.write import complete, dump, save, short
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtank import presets
 from jaxtank.case import Case
 from jaxtank.controllers.pid import PID
-from jaxtank.core.clock import Clock
+from jaxtank.core.clock import clock_warnings
 from jaxtank.core.labels import label_of
 from jaxtank.core.tree import get_value, is_component, split_index, walk
 from jaxtank.loop.estimate_notes import is_unused
@@ -52,17 +52,6 @@ def case_warnings(case: Case) -> list[str]:
         *_open_bottoms(case),
         *model_warnings(case),
         *_unused(case),
-    ]
-
-
-def clock_warnings(clock: Clock) -> list[str]:
-    """Return a sentence where a run of whole samples does not end when it is asked to."""
-    end = (clock.samples - 1) * clock.dt
-    if abs(end - clock.duration) <= 1e-6 * clock.dt:
-        return []
-    return [
-        f"clock.duration = {clock.duration:.9g} s is no whole number of samples of clock.dt ="
-        f" {clock.dt:.9g} s: the run ends at {end:.9g} s"
     ]
 
 

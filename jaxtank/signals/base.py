@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.core.clock import Clock, pointwise, sample_times
-from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.tree import Role, component, leaf, static
 from jaxtank.core.vectors import columns, serves_arrays
 
 BETWEEN = ("hold", "linear")
 """What a table of rows does between them."""
 
 
-class Signal(abc.ABC):
+class Signal(Role):
     """A signal of one or more channels: a reference, a disturbance or an input.
 
     A custom signal is a `component` with its own `channels` and `sample`. One whose setpoints

@@ -283,3 +283,80 @@ def test_nothing_is_claimed_on_plants_where_nothing_varies(case):
     stated = one.replace(uncertain={"plant.valve": 0.05})
     printed = " ".join(str(tuning.tune(stated, few, safety_filter=False)).split())
     assert "of 8 validation plants" in printed
+
+
+def branching(self, state, tick, estimate):
+    return ((1.0,) if tick.r[0] > estimate.x[0] else (0.0,)), state
+
+
+def by_numpy(self, state, tick, estimate):
+    return tuple(np.clip(np.array([tick.r[0]]), 0.0, 3.0)), state
+
+
+STEPS = {
+    "an if": (branching, r"controller Wrong: .* jnp\.where"),
+    "numpy": (by_numpy, r"controller Wrong: .* jax\.numpy"),
+    "no state": (lambda self, *_: (self.Kc, self.Kc, self.Kc), r"3 inputs .* \(inputs, state\)"),
+    "nothing": (lambda self, *_: None, r"None .* \(inputs, state\)"),
+    "an entry of no state": (lambda self, state, *_: ((state[0],), state), r"IndexError .* init"),
+    "a state added": (lambda self, state, *_: ((self.Kc,), (1.0,)), r"form .* no init"),
+}
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_a_wrong_step_is_named_with_its_class(case, name):
+    step, words = STEPS[name]
+    kind = type("Wrong", (Controller,), {"step": step, "Kc": leaf("V", "k"), "__annotations__": {}})
+    kind.__annotations__["Kc"] = float
+    loop = dataclasses.replace(case.loop, controller=component(kind)(Kc=1.0))
+    for run in (lambda loop: jaxtank.evaluate(loop, case.clock, ["iae"]), jaxtank.simulate):
+        with pytest.raises(InputError, match=words):
+            run(case.replace(loop=loop) if run is jaxtank.simulate else loop)
+
+
+@pytest.mark.parametrize("count", [0, 2])
+def test_a_plant_returns_one_rate_for_each_tank(case, count):
+    @component
+    class Several(Cone):
+        def derivative(self, t, x, u, d):
+            return super().derivative(t, x, u, d) * count
+
+    fields = {f.name: getattr(case.loop.plant, f.name) for f in dataclasses.fields(Cone)}
+    loop = dataclasses.replace(case.loop, plant=Several(**fields))
+    with pytest.raises(InputError, match=f"plant Several: .* {count} rates for 1 tanks"):
+        jaxtank.evaluate(loop, case.clock, ["iae"])
+
+
+def test_a_class_without_the_decorator_is_named(case):
+    class Bare(Controller):
+        Kc: float = leaf("V/cm", "gain")
+
+        def step(self, state, tick, estimate):
+            return (self.Kc,), state
+
+    class Derived(Proportional):
+        pass
+
+    with pytest.raises(InputError, match=r"Bare lacks @jaxtank\.component"):
+        Bare(Kc=1.0)
+    derived = dataclasses.replace(case.loop, controller=Derived(Kc=1.0, bias=1.0))
+    with pytest.raises(InputError, match=r"Derived, which lacks @jaxtank\.component"):
+        jaxtank.simulate(derived, case.clock)
+    with pytest.raises(InputError, match="class Proportional: give Proportional"):
+        jaxtank.simulate(dataclasses.replace(case.loop, controller=Proportional), case.clock)
+
+
+def test_a_run_that_ends_early_is_noted(case):
+    with pytest.warns(UserWarning, match="the run ends at 0.9 s"):
+        run = jaxtank.simulate(case, jaxtank.Clock(dt=0.3, duration=1.0))
+    assert run.t[-1] == pytest.approx(0.9)
+
+
+def test_a_plant_that_is_drawn_below_its_bottom_is_noted(case):
+    """Its pump draws from it, and the derivative does not limit the outflow."""
+    plant = jaxtank.with_values(case.loop.plant, {"drain": 0.0})
+    bank = jaxtank.instruments.PumpBank(low=[-12.0], high=[12.0], initial=[-12.0])
+    law = Proportional(Kc=0.0, bias=-12.0)
+    loop = dataclasses.replace(case.loop, plant=plant, actuator=bank, controller=law)
+    with pytest.warns(UserWarning, match="tank 1 falls below 0 .* derivative of the plant"):
+        jaxtank.simulate(loop, jaxtank.Clock(dt=0.01, duration=0.5))

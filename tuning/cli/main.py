@@ -22,6 +22,7 @@ def main(argv=None):
         # a note says the same, printed once when the case is opened
         warnings.filterwarnings("ignore", message=".* runs empty faster than the steps follow")
         warnings.filterwarnings("ignore", message="the level of .* falls below 0")
+        warnings.filterwarnings("ignore", message="clock.duration = .* is no whole number")
         warnings.showwarning = _with_cluster_notes(warnings.showwarning)
     try:
         code = _command(argv)

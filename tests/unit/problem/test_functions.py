@@ -305,7 +305,7 @@ def has_no_slope(measures):
     ("objective", "words"),
     [
         (takes_three, r"takes_three\(.*\): must take \(measures\) or \(measures, trajectory\)"),
-        (takes_the_number, "function takes_the_number: jax cannot trace it: .*without float"),
+        (takes_the_number, "function takes_the_number: jax cannot trace it.*instead of float"),
         (asks_whether, "function asks_whether: jax cannot trace it"),
         (gives_a_list, r"gives_a_list: returns an array of shape \(201,\): must return one number"),
         (gives_two, "gives_two: returns a tuple: must return one number"),

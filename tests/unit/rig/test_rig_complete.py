@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from jaxtank import presets, rig
-from jaxtank.core.clock import Clock
+from jaxtank.core.clock import Clock, clock_warnings
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import walk
 from jaxtank.measures import MEASURES, times
@@ -448,7 +448,7 @@ def test_a_run_of_another_length_than_asked_for_is_reported(capsys):
 
 def test_whole_samples_in_floating_point_are_no_doubt():
     for dt, duration in ((0.1, 0.3), (0.01, 1200.0), (1e-3, 9e4), (0.7, 0.7 * 3), (1 / 3, 100.0)):
-        assert rig.clock_warnings(Clock(dt=dt, duration=duration)) == []
+        assert clock_warnings(Clock(dt=dt, duration=duration)) == []
 
 
 def test_no_preset_is_doubted():
