@@ -283,7 +283,7 @@ def test_a_changed_gain_does_not_retrace_and_a_changed_static_does(gouta):
     ("call", "words"),
     [
         (lambda case: (case.clock, case.loop), "loop is a Clock: must be a ClosedLoop"),
-        (lambda case: (case, case.clock), "loop is a Case: must be a ClosedLoop"),
+        (lambda case: (case.loop.plant, case.clock), "loop is a TankNetwork: must be a"),
         (lambda case: (case.loop, 10.0), "clock is a float: must be a jaxtank.Clock"),
         (lambda case: (case.loop, case.clock, 0), "key is a int: must be one random key"),
         (lambda case: (case.loop, case.clock, np.arange(2)), "key is a ndarray: must be one"),
