@@ -27,6 +27,7 @@ from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
 from jaxtank.plants.faults import Faults
 from jaxtank.safety.filter import SafetyFilter
+from jaxtank.safety.outlets import OutletFilter
 from jaxtank.safety.prediction import line_of
 from jaxtank.signals.base import Signal, sampled
 
@@ -72,7 +73,7 @@ class ClosedLoop:
     reference: Signal
     disturbance: Signal | None = None
     faults: Faults | None = None
-    safety_filter: SafetyFilter | None = None
+    safety_filter: SafetyFilter | OutletFilter | None = None
     x0: np.ndarray[Any, Any] = leaf("cm", "levels at t = 0", low=0.0, shape="tank")
 
     @property

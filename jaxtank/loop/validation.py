@@ -25,6 +25,7 @@ from jaxtank.plants.base import Plant
 from jaxtank.plants.elements import check_plain
 from jaxtank.plants.faults import Faults
 from jaxtank.plants.network import check_caught
+from jaxtank.safety.filter import SafetyFilter
 
 KEPT = 64
 """Loops that have passed and are remembered, by structure and values, so that the next call of
@@ -120,7 +121,7 @@ def _check_parts(
     check_leaves(loop, vacant=[f"controller.law.{gain}" for gain in gains])
     for name, model in _plants(loop):
         check_caught(model, name)
-    if loop.safety_filter is not None:
+    if isinstance(loop.safety_filter, SafetyFilter):
         check_plain(loop.plant, "safety_filter", "run without the filter")
     _check_faults(loop, clock)
     loop.actuator.check()

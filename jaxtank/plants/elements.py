@@ -105,9 +105,48 @@ def valve_share(characteristic: Any, rangeability: Any, opening: Any) -> Any:
     return monotone_curve(characteristic, opening)
 
 
+def openings(net: Any) -> tuple[tuple[str, Any], ...]:
+    """Return the kinds of openings that discharge freely, with their (from, to)."""
+    return ("drain", [(i, None) for i in range(net.tanks)]), ("orifice", net.links)
+
+
+def outlet_flow(net: Any, kind: str, k: int, level: Any) -> Any:
+    """Return the flow of drain or orifice k of a tank that is filled to a level."""
+    area, port, exponent, resistance = (
+        None if values is None else values[k]
+        for values in (
+            getattr(net, name)
+            for name in (kind, f"{kind}_port", f"{kind}_exponent", f"{kind}_resistance")
+        )
+    )
+    return opening_flow(net, area, _head(level, port), exponent, resistance)
+
+
+def pipe_flow(net: Any, k: int, x: Any) -> Any:
+    """Return the flow of pipe k from its first tank to its second."""
+    port = None if net.pipe_port is None else net.pipe_port[k]
+    return _joined_flow(net, net.pipe[k], x, net.pipes[k], port)
+
+
+def valve_flow(net: Any, k: int, x: Any, share: Any = 1.0) -> Any:
+    """Return the flow of valve k with a share of its area open."""
+    (source, sink), area = net.valves[k], net.valve[k] * share
+    port = None if net.valve_port is None else net.valve_port[k]
+    if sink is None:
+        flow = opening_flow(net, area, _head(x[source], port), None, None)
+    else:
+        flow = _joined_flow(net, area, x, (source, sink), port)
+    return lower_clip(flow, 0.0) if net.one_way[k] else flow
+
+
+def _head(level: Any, port: Any) -> Any:
+    # an opening above the level is dry: no flow, in either direction
+    return level if port is None else lower_clip(level - port, 0.0)
+
+
 def _joined_flow(net: Any, area: Any, x: Any, ends: tuple[int, int], port: Any) -> Any:
     """Return the flow through an opening below the surface of two tanks, in both directions."""
-    heads = [x[i] if port is None else lower_clip(x[i] - port, 0.0) for i in ends]
+    heads = [_head(x[i], port) for i in ends]
     root = smooth_signed_sqrt(heads[0] - heads[1], net.knee)
     return area * jnp.sqrt(2.0 * net.gravity) * root
 
@@ -117,25 +156,11 @@ def streams(net: Any, x: Any, u: Any) -> list[Stream]:
     u (m,).
     """
     flows = []
-
-    def head(source: int, ports: Any, k: int) -> Any:
-        # an opening above the level is dry: no flow, in either direction
-        return x[source] if ports is None else lower_clip(x[source] - ports[k], 0.0)
-
-    outlets = [(i, None) for i in range(net.tanks)]
-    for kind, pairs in (("drain", outlets), ("orifice", net.links)):
-        area, ports, exponents, resistances = (
-            getattr(net, name)
-            for name in (kind, f"{kind}_port", f"{kind}_exponent", f"{kind}_resistance")
-        )
+    for kind, pairs in openings(net):
         for k, (source, sink) in enumerate(pairs):
-            exponent = None if exponents is None else exponents[k]
-            resistance = None if resistances is None else resistances[k]
-            flow = opening_flow(net, area[k], head(source, ports, k), exponent, resistance)
-            flows.append(Stream(source, sink, flow))
+            flows.append(Stream(source, sink, outlet_flow(net, kind, k, x[source])))
     for k, ends in enumerate(net.pipes):
-        port = None if net.pipe_port is None else net.pipe_port[k]
-        flows.append(Stream(ends[0], ends[1], _joined_flow(net, net.pipe[k], x, ends, port)))
+        flows.append(Stream(ends[0], ends[1], pipe_flow(net, k, x)))
     for j, (first, second) in enumerate(net.feeds):
         source = net.sources[j] if net.sources else None
         flow = net.pump_gain[j] * _driven(net, j, x, u[j], source, first)
@@ -146,13 +171,8 @@ def streams(net: Any, x: Any, u: Any) -> list[Stream]:
             flows.append(Stream(source, second, (1.0 - net.split[j]) * flow))
     for k, (source, sink) in enumerate(net.valves):
         opening = u[len(net.feeds) + k] / full_open(net.units)
-        area = net.valve[k] * valve_share(net.characteristics[k], net.rangeability[k], opening)
-        port = None if net.valve_port is None else net.valve_port[k]
-        if sink is None:
-            flow = opening_flow(net, area, head(source, net.valve_port, k), None, None)
-        else:
-            flow = _joined_flow(net, area, x, (source, sink), port)
-        flows.append(Stream(source, sink, lower_clip(flow, 0.0) if net.one_way[k] else flow))
+        share = valve_share(net.characteristics[k], net.rangeability[k], opening)
+        flows.append(Stream(source, sink, valve_flow(net, k, x, share)))
     return flows
 
 

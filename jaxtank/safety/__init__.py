@@ -3,5 +3,6 @@
 from jaxtank.safety.certificate import TankCertificate, design
 from jaxtank.safety.filter import SafetyFilter
 from jaxtank.safety.of_case import design_for
+from jaxtank.safety.outlets import OutletFilter
 
-__all__ = ["SafetyFilter", "TankCertificate", "design", "design_for"]
+__all__ = ["OutletFilter", "SafetyFilter", "TankCertificate", "design", "design_for"]

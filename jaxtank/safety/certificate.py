@@ -118,7 +118,7 @@ def design(
     """
     if not isinstance(plant, TankNetwork):
         raise InputError("safety_filter: is for tank networks (plants.network) only")
-    elements.check_plain(plant, "safety_filter", "it is for rigs without: run without the filter")
+    elements.check_plain(plant, "safety_filter", "outlet_design is for rigs with them")
     n, ends = plant.tanks, box_of(plant, widths)
     least, most = ends
     tankwise = lambda v: np.broadcast_to(np.asarray(v, float), (n,))

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,6 +31,45 @@ UNCERTAIN = {
     *("actuator.initial", "actuator.delay", "x0"),
     *(f"sensor.{name}" for name in ("noise", "offset", "low", "high", "gain", "full_scale")),
 }
+
+
+class Known(NamedTuple):
+    """What a checker knows: the class of the filter, {part: fields}, uncertain names, and the
+    fields of the plant in which the filter's two plants equal it.
+    """
+
+    filter: tuple[str, str]
+    fields: Mapping[str, set[str]]
+    uncertain: set[str]
+    static: tuple[str, ...] = ()
+    fixed: tuple[str, ...] = ()
+
+
+PLAIN = Known(("jaxtank.safety.filter", "SafetyFilter"), KNOWN, UNCERTAIN)
+STATIC = ("sources", "curves", "lift_curves", "valves", "characteristics", "one_way", "shapes")
+FIXED = ("rangeability", "spill_port", "valve_port", "pipe_port") + tuple(
+    f"{opening}_{option}"
+    for opening in ("drain", "orifice")
+    for option in ("port", "exponent", "resistance")
+)
+OUTLETS = Known(
+    filter=("jaxtank.safety.outlets", "OutletFilter"),
+    fields={
+        "plant": {*KNOWN["plant"], *STATIC, *FIXED, "valve", "extent"},
+        "actuator": KNOWN["actuator"],
+        "sensor": KNOWN["sensor"],
+        "faults": KNOWN["faults"],
+        "safety_filter": {"least", "most", "limit", "low", "reach", "bottom", "rate", "band"}
+        | {"inflow", "draw", "climb", "drop", "empty", "upper_rows", "low_rows", "predicted"},
+    },
+    uncertain={
+        *(f"plant.{name}" for name in (*FLOWS, "rim", "valve", "extent")),
+        *(name for name in UNCERTAIN if name.startswith("sensor.")),
+        "x0",
+    },
+    static=(*SHAPE, *STATIC),
+    fixed=FIXED,
+)
 HARMLESS = ("controller.", "observer.", "reference.")
 """Uncertain parameters of what may be anything: beginnings of their names."""
 
@@ -40,42 +79,43 @@ def first_failure(conditions: Iterable[tuple[Any, str]]) -> str:
     return next((why for holds, why in conditions if not holds), "")
 
 
-def unknown_feature(parts: Mapping[str, Any], box: Mapping[str, Any]) -> str:
+def unknown_feature(parts: Mapping[str, Any], box: Mapping[str, Any], known: Known = PLAIN) -> str:
     """The first feature that is not on the closed list, or a number that is none; or ""."""
-    why = first_failure(_known_classes(parts)) or first_failure(_known_fields(parts))
-    return why or first_failure(_known_names(box))
+    why = first_failure(_known_classes(parts, known))
+    why = why or first_failure(_known_fields(parts, known))
+    return why or first_failure(_known_names(box, known))
 
 
-def _known_classes(parts):
+def _known_classes(parts, known):
     for part, kind in CLASSES.items():
         value = parts.get(part)
         if part in parts:
             yield type(value) is kind, f"not covered: {part} of class {type(value).__name__}"
     kind = type(parts["safety_filter"])
-    same = (kind.__module__, kind.__name__) == ("jaxtank.safety.filter", "SafetyFilter")
+    same = (kind.__module__, kind.__name__) == known.filter
     yield same, f"not covered: safety filter of class {kind.__name__}"
     for end in ("least", "most"):
         kind = type(getattr(parts["safety_filter"], end))
-        known = kind is TankNetwork
-        yield known, f"not covered: safety_filter.{end} of class {kind.__name__}"
+        network = kind is TankNetwork
+        yield network, f"not covered: safety_filter.{end} of class {kind.__name__}"
 
 
-def _known_fields(parts):
+def _known_fields(parts, known):
     safety_filter = parts["safety_filter"]
     ends = {f"safety_filter.{end}": getattr(safety_filter, end) for end in ("least", "most")}
     for part, value in {**parts, **ends}.items():
-        known = KNOWN["plant" if part in ends else part]
+        fields = known.fields["plant" if part in ends else part]
         for name in (field.name for field in dataclasses.fields(value)):
             entry = getattr(value, name)
-            yield name in known or _neutral(entry), f"not covered: {part}.{name}"
-            number = name not in known or not _has_nan(entry)
+            yield name in fields or _neutral(entry), f"not covered: {part}.{name}"
+            number = name not in fields or not _has_nan(entry)
             yield number, f"not covered: {part}.{name} is no number"
 
 
-def _known_names(box):
+def _known_names(box, known):
     for name, ends in box.items():
-        known = name.partition("[")[0] in UNCERTAIN or name.startswith(HARMLESS)
-        yield known, f"not covered: uncertain {name}"
+        covered = name.partition("[")[0] in known.uncertain or name.startswith(HARMLESS)
+        yield covered, f"not covered: uncertain {name}"
         yield not any(map(_has_nan, ends)), f"not covered: uncertain {name} is no number"
 
 

@@ -17,6 +17,8 @@ from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.safety.box import spread, widths_of
 from jaxtank.safety.certificate import TankCertificate, design
 from jaxtank.safety.filter import SafetyFilter
+from jaxtank.safety.outlet_design import outlet_design
+from jaxtank.safety.outlets import OutletFilter
 from jaxtank.signals.inflows import InflowPulses
 
 FLOWS = ("drain", "orifice", "pipe", "pump_gain", "split", "valve")
@@ -40,7 +42,7 @@ def design_for(
     rate: float | None = None,
     low: ArrayLike | None = None,
     predict: bool = True,
-) -> tuple[SafetyFilter, tuple[TankCertificate, ...]]:
+) -> tuple[SafetyFilter | OutletFilter, tuple[TankCertificate, ...]]:
     """Return a safety filter for a case, and the certificate of each tank.
 
     Parameters
@@ -59,7 +61,7 @@ def design_for(
 
     Returns
     -------
-    (SafetyFilter, TankCertificate of each tank)
+    (SafetyFilter, or OutletFilter of a rig with outlets; TankCertificate of each tank)
 
     Raises
     ------
@@ -81,25 +83,21 @@ def design_for(
     rim, top = spread(loop.plant.rim, "plant.rim", box)[0], case.limits.get("max_level", "rim")
     if limit is None:
         limit = rim if isinstance(top, str) else np.minimum(rim, np.asarray(top, dtype=float))
-    safety_filter, rows = design(
-        loop.plant,
-        loop.actuator,
-        loop.sensor,
-        case.clock.dt,
-        widths=box,
-        limit=limit,
-        inflow=inflow * more,
-        volume=volume * more,
-        band=band,
-        rate=rate,
-        substeps=case.clock.substeps,
-        start=loop.x0,
-        low=np.maximum(case.limits.get("min_level", 0.0), 0.0) if low is None else low,
-        draw=draw * more,
-        draws=draws,
-        predict=predict,
-        faults=loop.faults,
-    )
+    settings = {
+        "widths": box,
+        "limit": limit,
+        "inflow": inflow * more,
+        "volume": volume * more,
+        "band": band,
+        "rate": rate,
+        "substeps": case.clock.substeps,
+        "start": loop.x0,
+        "low": np.maximum(case.limits.get("min_level", 0.0), 0.0) if low is None else low,
+        "draw": draw * more,
+        "draws": draws,
+        "faults": loop.faults,
+    }
+    safety_filter, rows = _design(loop, case.clock.dt, settings, predict)
     names = [] if widths is None else _beyond(case, safety_filter)
     if names:
         reason = f"not covered: {', '.join(names)} beyond the widths of the filter"
@@ -107,19 +105,26 @@ def design_for(
     return safety_filter, rows
 
 
+def _design(loop, hold, settings, predict):
+    """(filter, certificates): of outlets where the rig has elements, or where pumps may draw from
+    tanks and more limits are proved by it.
+    """
+    rig = loop.plant, loop.actuator, loop.sensor, hold
+    if features(loop.plant):
+        return outlet_design(*rig, **settings)
+    answer = design(*rig, **settings, predict=predict)
+    if not np.any(np.asarray(loop.actuator.low) < 0.0):
+        return answer
+    proved = lambda rows: sum(row.certified + row.low_certified for row in rows)
+    other = outlet_design(*rig, **settings)
+    return other if proved(other[1]) > proved(answer[1]) else answer
+
+
 def certificates_of(case: Any) -> tuple[TankCertificate, ...]:
     """Return the certificates of the filter in the loop; without one, of the filter that fits it.
 
-    A filter whose numbers were changed after its design is not certified, and no rig that is not
-    plain.
+    A filter whose numbers were changed after its design is not certified.
     """
-    if reason := ", ".join(features(case.loop.plant)):
-        rim, nan = np.asarray(case.loop.plant.rim, dtype=float), float("nan")
-        why = f"not covered: {reason}"
-        return tuple(
-            TankCertificate(i, float(top), False, why, nan, nan, nan, reach=float("inf"))
-            for i, top in enumerate(rim)
-        )
     safety_filter, rows = design_for(case, **(case.safety or {}))
     present = case.loop.safety_filter
     if present is None or _equal(present, safety_filter):

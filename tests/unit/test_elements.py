@@ -26,7 +26,6 @@ from jaxtank.plants.network import network
 from jaxtank.plants.runge_kutta import advance
 from jaxtank.plots.equations import equations
 from jaxtank.plots.layout import place, valves
-from jaxtank.safety.of_case import certificates_of
 
 WITH_STEADY_STATE = ("valve", "cone")
 NAMED = {"valve": "valve", "recycle": "pump that draws from a tank", "cone": "tank with a shape"}
@@ -149,16 +148,6 @@ def test_controllers_with_formulas_of_a_plain_rig_refuse(rig, kind):
     with pytest.raises(InputError, match=f"not covered: .*{NAMED[rig]}"):
         case = er.case(rig, controller=REFUSED[kind](plant), free={})
         jaxtank.check(case.loop, case.clock)
-
-
-@pytest.mark.parametrize("rig", er.RIGS)
-def test_no_level_is_proved_and_the_filter_refuses(rig):
-    case = er.case(rig)
-    rows = certificates_of(case)
-    assert not any(row.certified for row in rows)
-    assert all(row.reason.startswith("not covered: ") and NAMED[rig] in row.reason for row in rows)
-    with pytest.raises(InputError, match=f"not covered: .*{NAMED[rig]}"):
-        case.with_safety_filter()
 
 
 def test_a_filter_of_another_rig_is_refused_and_the_checker_names_the_field():

@@ -21,7 +21,7 @@ from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken
 from jaxtank.loop.step import step
 from jaxtank.plants.faults import Faults
 from jaxtank.safety.box import band_of, top_of
-from jaxtank.safety.filter import SHALLOW
+from jaxtank.safety.filter import SHALLOW, SafetyFilter
 from jaxtank.safety.of_case import FLOWS
 from jaxtank.safety.worst_case import rates_of
 from jaxtank.xla.hoist import scan
@@ -297,7 +297,7 @@ class Attacked:
         """
         safety_filter = self.case.loop.safety_filter
         x = [top * share for top, share in zip(self.ceiling, z)]
-        if safety_filter is None:
+        if not isinstance(safety_filter, SafetyFilter):
             return jnp.stack(x)
         rates = rates_of(safety_filter.least, safety_filter.most, safety_filter.inflow, 0.0)
         root = lambda h: smooth_sqrt(h, rates.knee)

@@ -14,6 +14,8 @@ from jaxtank.core.numerics import lower_clip
 from jaxtank.loop.validation import check
 from jaxtank.safety.certificate import TankCertificate
 from jaxtank.safety.of_case import certificates_of
+from jaxtank.safety.outlet_design import UNKNOWN
+from jaxtank.safety.outlets import OutletFilter
 from jaxtank.safety.worst_case import rates_of, rise
 from tuning.falsification.attacked import (
     Attacked,
@@ -165,7 +167,8 @@ def limits_of(case: Case) -> Limits:
         return Limits(limit, limit, None)
     limit = np.asarray(safety_filter.limit, dtype=float)
     if case.safety is None:  # made by hand
-        return Limits(limit + np.asarray(safety_filter.spare), limit, None)
+        spare = np.asarray(getattr(safety_filter, "spare", 0.0))
+        return Limits(limit + spare, limit, None)
     rows = certificates_of(case)
     return Limits(np.array([row.limit for row in rows]), limit, rows)
 
@@ -177,6 +180,8 @@ def _rises(case, reach):
     safety_filter = filter_or_design(case)
     if safety_filter is None:
         return np.full(len(reach), np.nan)
+    if isinstance(safety_filter, OutletFilter):
+        return np.where(safety_filter.climb < UNKNOWN, safety_filter.climb, np.nan)
     rates = rates_of(safety_filter.least, safety_filter.most, safety_filter.inflow, 0.0)
     high, rises = np.asarray(case.loop.actuator.high, dtype=float), []
     for i in range(len(reach)):

@@ -5,7 +5,6 @@ import numpy as np
 from jaxtank.core.errors import InputError
 from jaxtank.core.labels import short
 from jaxtank.core.units import local
-from jaxtank.plants.elements import features
 from jaxtank.safety.checker import CASE, LIMITS
 from jaxtank.safety.of_case import certificates_of
 from tuning.report.tables import Table, Value, clean
@@ -78,8 +77,6 @@ def sentences(case):
     length = local("cm", case.loop.units)
     start = ", ".join(f"{h:.4g}" for h in np.asarray(case.loop.x0, dtype=float))
     on = "on" if case.loop.safety_filter is not None else "off: --safety-filter turns it on"
-    if elements := features(case.loop.plant):
-        return [f"The safety filter does not cover this rig: {', '.join(elements)}."]
     return [
         f"The safety filter is {on}.",
         f"proved: no level passes its limit {PROMISE}, from the levels at t = 0 in the column"
@@ -93,3 +90,32 @@ def sentences(case):
         "gap: with its pumps at full command the nominal rig settles this far below the limit, or"
         " below where it would settle without the filter; -: no pump feeds the tank.",
     ]
+
+
+def passed(case, values):
+    """Return sentences on levels of a run, {measure: value}, that passed a limit of the safety
+    filter.
+    """
+    safety_filter, sentences = case.loop.safety_filter, []
+    sides = (("max_level", "limit", 1.0), ("min_level", "low", -1.0))
+    reasons = None
+    for measure, name, sign in sides:
+        limits = np.asarray(getattr(safety_filter, name), dtype=float)
+        if name == "limit":
+            limits = limits + np.asarray(getattr(safety_filter, "spare", 0.0))
+        levels = np.asarray(values.get(measure, limits), dtype=float)
+        for i in map(
+            int, np.flatnonzero((limits > 0.0) & (sign * (levels - limits) > 1e-9 * limits))
+        ):
+            reasons = reasons or certificates_of(case)
+            row, length = reasons[i], local("cm", case.loop.units)
+            proved, why = (
+                (row.certified, row.reason) if sign > 0.0 else (row.low_certified, row.low_reason)
+            )
+            side = "above the limit" if sign > 0.0 else "below the low limit"
+            sentences.append(
+                f"{short(case.loop.plant, 'tank', i)}: {levels[i]:.4g} {length}, {side}"
+                f" {limits[i]:.4g} {length} of the safety filter, which is"
+                + (" proved" if proved else f" not proved: {why}")
+            )
+    return sentences

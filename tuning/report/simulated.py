@@ -15,6 +15,7 @@ from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv, stride
 from jaxtank.plants.elements import sections
 from tuning.problem import provenance
+from tuning.report import safety
 from tuning.report.document import Live, Report, Text, failed
 from tuning.report.folder import save as save_all
 from tuning.report.tables import (
@@ -89,6 +90,7 @@ def report(case, values, plateaus=None):
     if loop.safety_filter is not None:
         words = "The safety filter is on: jaxtank show prints what is proved of each tank."
         sections.append(Text([words], gap=True, on="terminal"))
+        sections.append(Text(safety.passed(case, values)))
     verdict = "every limit holds" if limits else "no limits"
     if broken:
         verdict = "; ".join(map(_passed, broken[:WORST]))

@@ -66,11 +66,23 @@ def test_a_curve_is_scipys_monotone_cubic_inside_and_straight_beyond():
     assert np.all(np.diff(curve(np.linspace(-5.0, 105.0, 400))) > 0)
 
 
-@pytest.mark.parametrize(
-    "seed", [2, *(pytest.param(s, marks=pytest.mark.slow) for s in range(20, 50))]
-)
+RIGS = [0, 20, 1, 21, *(pytest.param(k, marks=pytest.mark.slow) for k in range(2, 14))]
+"""Rigs of two structures, and of twelve others."""
+
+
+@pytest.mark.parametrize("seed", RIGS)
 def test_a_random_rig_follows_an_integrator_of_the_tests(seed):
-    assert random_elements.errors(seed) < 1e-8
+    assert random_elements.errors(seed) < 1e-9
+
+
+@pytest.mark.parametrize("seed", RIGS)
+def test_a_rig_without_outlets_keeps_its_volume_while_tanks_run_empty(seed):
+    assert random_elements.lost(seed) < 1e-12
+
+
+@pytest.mark.parametrize("seed", RIGS)
+def test_slopes_of_a_random_rig_are_those_of_differences(seed):
+    assert random_elements.slope_error(seed) < 1e-6
 
 
 @pytest.mark.parametrize("shape", ["cone", "sphere"])

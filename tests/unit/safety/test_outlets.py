@@ -1,0 +1,238 @@
+"""Limits that hold with valves, pumps in outlets and between tanks, and inputs of either sign."""
+
+import dataclasses
+import tomllib
+
+import element_rigs as er
+import jax
+import numpy as np
+import outlet_attacks
+import pytest
+
+import jaxtank
+from jaxtank import presets, rig
+from jaxtank.core.errors import InputError
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.plants import network
+from jaxtank.safety import OutletFilter, SafetyFilter
+from jaxtank.safety.outlet_checker import check
+from jaxtank.safety.outlet_design import outlet_design
+
+PUMPED_OUT = """
+name = "outlet filter"
+units = ["m", "-"]
+reachable = false
+tank = [{ area = 1.0, rim = 2.0, level = 1.0, inflow = 0.03 }]
+pump = [{ gain = 0.05, to = 1, low = -1.0, high = 0.0, initial = -0.6 }]
+plant = { gravity = 9.81, overflow = false }
+law = { kind = "pid", Kc = -5.0, Ti = 20.0, Tt = 5.0, bias = -0.6 }
+reference = { initial = [1.2], changes = [[100.0, 1, 0.8], [300.0, 1, 1.5]], ramp = 0.0 }
+values = { "clock.dt" = 0.5, "clock.duration" = 600.0 }
+safety_filter = { limit = [2.0], low = [0.5] }
+uncertain = { "plant.pump_gain" = 0.1 }
+"""
+
+
+def pumped_out():
+    return rig.from_table(tomllib.loads(PUMPED_OUT))
+
+
+def series(spread=0.05, **options):
+    """(rig, settings): a pump fills tank 1, one lifts from it into tank 2, a valve empties that."""
+    plant = network(
+        area=[60.0, 40.0],
+        drain=[0.1, 0.0],
+        pump_gain=[12.0, 8.0],
+        feeds=[(0, None), (1, None)],
+        sources=[None, 0],
+        valves=[(1, None)],
+        valve=[1.2],
+        rim=[40.0, 40.0],
+        bottom=True,
+    )
+    bank = PumpBank(low=np.zeros(3), high=np.array([10.0, 10.0, 1.0]), initial=np.zeros(3))
+    sensor = LevelSensor(gain=np.ones(2), noise=np.full(2, 0.01), full_scale=100.0)
+    widths = {"pump_gain": spread * plant.pump_gain, "valve": spread * plant.valve}
+    settings = {"widths": widths, "limit": 30.0, "low": 5.0, "start": [20.0, 10.0], **options}
+    return (plant, bank, sensor, 0.5), settings
+
+
+def checked(safety_filter, parts, settings, **changes):
+    given = {
+        "hold": parts[3],
+        "box": {
+            **{
+                f"plant.{k}": (getattr(parts[0], k) - v, getattr(parts[0], k) + v)
+                for k, v in settings["widths"].items()
+            },
+            "x0": (np.array(settings["start"]), np.array(settings["start"])),
+        },
+    }
+    return check(safety_filter, *parts[:3], **{**given, **changes})
+
+
+def test_an_outflow_pump_is_held_between_both_limits_under_a_controller_of_the_wrong_sign():
+    case = pumped_out()
+    (row,) = case.safety_design(**case.safety)[1]
+    assert row.certified and row.low_certified and row.starts == "limits"
+    for gain in (0.045, 0.05, 0.055):
+        loop = jaxtank.with_values(case.loop, {"plant.pump_gain": [gain]})
+        loop = dataclasses.replace(loop, controller=case.loop.controller)
+        x = np.asarray(jaxtank.simulate(loop, case.clock).x)
+        assert x.min() >= 0.5 and 1.9 < x.max() <= 2.0
+    free = jaxtank.simulate(case.without_safety_filter().loop, case.clock)
+    assert np.min(free.x) < 0.1
+
+
+def test_the_outflow_that_the_filter_demands_is_that_of_the_weakest_pump():
+    loop = pumped_out().loop
+    for level, kappa in ((1.99, 1.0), (1.999, 1.0)):
+        (u,), acts = loop.safety_filter.apply(loop.actuator, (0.0,), None, (level,), 0.5)
+        assert acts == 1.0 and np.isclose(u, (kappa * (2.0 - level) - 0.03) / 0.045)
+    (u,), acts = loop.safety_filter.apply(loop.actuator, (-1.0,), None, (0.51,), 0.5)
+    assert acts == 1.0 and np.isclose(u, -0.01 / 0.055)
+
+
+def test_rigs_without_outlets_have_the_filter_that_they_had():
+    case = presets.find("gouta2022/enmpc").with_safety_filter()
+    assert type(case.loop.safety_filter) is SafetyFilter
+
+
+@pytest.mark.parametrize(
+    "seed", [0, 1, 4, *(pytest.param(k, marks=pytest.mark.slow) for k in range(600, 640))]
+)
+def test_no_attack_passes_a_proved_limit(seed):
+    rows, passes = outlet_attacks.trial(seed)
+    assert not passes and not isinstance(rows, str)
+
+
+def test_attacks_pass_a_limit_where_the_filter_approaches_it_too_fast():
+    parts, settings = series(spread=0.05)
+    safety_filter, rows = outlet_design(*parts, **settings)
+    assert all(r.certified and r.low_certified for r in rows)
+    settings |= {"low": np.full(2, 5.0), "start": np.array([20.0, 10.0]), "substeps": 1}
+    settings |= {"inflow": np.zeros(2), "draw": np.zeros(2)}
+    attack = lambda f: outlet_attacks.attack((*parts[:3], settings, 0.5), f, rows, 3, samples=120)
+    highest, lowest = attack(safety_filter)
+    assert np.all(highest <= 30.0 + 1e-9) and np.all(lowest >= 5.0 - 1e-9)
+    fast = dataclasses.replace(safety_filter, rate=8.0 * safety_filter.rate)
+    highest, lowest = attack(fast)
+    assert np.any(highest > 30.01) or np.any(lowest < 4.99)
+
+
+BROKEN = {
+    "rate": lambda f: {"rate": 2.2 * f.rate / f.rate},
+    "band": lambda f: {"band": 0.5 * f.band},
+    "least": lambda f: {"least": f.most},
+    "most": lambda f: {"most": f.least},
+    "low rows": lambda f: {"low_rows": ()},
+    "upper rows": lambda f: {"upper_rows": ()},
+    "empty": lambda f: {"empty": 0.0 * f.empty},
+    "inputs of a row": lambda f: {"upper_rows": tuple((i, ()) for i, _ in f.upper_rows)},
+    "a number that is none": lambda f: {"limit": np.nan * f.limit},
+}
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_the_checker_proves_nothing_of_a_filter_with_another(what):
+    parts, settings = series()
+    safety_filter, _ = outlet_design(*parts, **settings)
+    assert all(v.holds and v.low_holds for v in checked(safety_filter, parts, settings))
+    broken = dataclasses.replace(safety_filter, **BROKEN[what](safety_filter))
+    verdicts = checked(broken, parts, settings)
+    assert not all(v.holds and v.low_holds for v in verdicts)
+
+
+def joined():
+    """(rig, settings) of a pump into each of two tanks that an orifice joins."""
+    plant = network(
+        area=[60.0, 40.0],
+        drain=[0.2, 0.3],
+        links=[(0, 1)],
+        orifice=[0.2],
+        pump_gain=[12.0, 8.0],
+        feeds=[(0, None), (1, None)],
+        rim=[40.0, 40.0],
+        bottom=True,
+    )
+    bank = PumpBank(low=np.zeros(2), high=np.array([10.0, 10.0]), initial=np.zeros(2))
+    sensor = LevelSensor(gain=np.ones(2), noise=np.zeros(2), full_scale=100.0)
+    settings = {"widths": {}, "limit": 30.0, "start": [20.0, 10.0]}
+    return (plant, bank, sensor, 0.5), settings
+
+
+@pytest.mark.parametrize("what", ["climb", "reach"])
+def test_the_checker_proves_nothing_that_relies_on_levels_of_neighbours_that_are_not_bounds(what):
+    parts, settings = joined()
+    safety_filter, rows = outlet_design(*parts, **settings)
+    assert all(row.certified for row in rows)
+    wrong = dataclasses.replace(safety_filter, **{what: 0.5 * getattr(safety_filter, what)})
+    assert not checked(wrong, parts, settings)[1].holds
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"delay": np.array(1.0)}, "dead time"),
+        ({"lag": np.array(1.0)}, "lag"),
+        ({"dead_zone": np.array(1.0)}, "dead zone"),
+    ],
+)
+def test_what_the_theorem_does_not_cover_is_named(change, word):
+    parts, settings = series()
+    bank = dataclasses.replace(parts[1], **change)
+    _, rows = outlet_design(parts[0], bank, *parts[2:], **settings)
+    assert not any(r.certified or r.low_certified for r in rows)
+    assert all(word in r.reason and r.reason.startswith("not covered") for r in rows)
+
+
+@pytest.mark.parametrize(
+    ("settings", "word"),
+    [
+        ({"volume": [1.0, 0.0]}, "inflow pulses"),
+        ({"widths": {"actuator.high": 0.1}}, "uncertain actuator.high"),
+        ({"start": [31.0, 10.0]}, "start"),
+    ],
+)
+def test_disturbances_and_boxes_that_are_not_covered_are_named(settings, word):
+    parts, more = series()
+    _, rows = outlet_design(*parts, **{**more, **settings})
+    assert not rows[0].certified and word in rows[0].reason
+
+
+def test_two_limits_that_need_one_pump_both_ways_are_not_both_proved():
+    parts, settings = series()
+    plant = dataclasses.replace(parts[0], valves=(), valve=None, rangeability=None)
+    plant = dataclasses.replace(plant, characteristics=(), one_way=())
+    bank = PumpBank(low=np.array([2.0, 0.0]), high=np.array([10.0, 10.0]), initial=np.zeros(2))
+    settings["widths"] = {}
+    _, rows = outlet_design(plant, bank, *parts[2:], **settings)
+    # what tank 1 has too much can only go into tank 2, which nothing empties
+    assert not (rows[0].certified and rows[1].certified)
+
+
+@pytest.mark.parametrize("name", ["valve", "cone"])
+def test_rigs_of_elements_are_proved(name):
+    case = er.case(name)
+    (row,) = case.safety_design(limit=[25.0], low=[3.0])[1]
+    assert row.certified and row.low_certified
+
+
+def test_a_pump_curve_is_refused_by_name():
+    with pytest.raises(InputError, match="not covered: curve of pump 1"):
+        er.case("recycle").with_safety_filter()
+
+
+def test_slopes_through_caps_and_floors_are_those_of_differences():
+    case = pumped_out()
+
+    def last(gain):
+        loop = jaxtank.with_values(case.loop, {"safety_filter.least.pump_gain": gain})
+        return jaxtank.simulate(loop, dataclasses.replace(case.clock, duration=30.0)).x[-1, 0]
+
+    at = np.array([0.045])
+    assert type(case.loop.safety_filter) is OutletFilter
+    slope = jax.grad(lambda g: last(g))(at)[0]
+    difference = (last(at + 1e-6) - last(at - 1e-6)) / 2e-6
+    assert np.isclose(slope, difference, rtol=1e-5)
