@@ -14,12 +14,14 @@ SQUARINGS = 40
 
 
 class OpenLoop(NamedTuple):
-    """L(z) = C (z I - A)^-1 B z^-dead, the loop opened at its m inputs; closed with u = -L u."""
+    """L(z) = C (z I - A)^-1 B z^-dead, the loop opened at its m inputs; closed with u = -L u.
+    `dead` is a whole number, or one for each input, (m,).
+    """
 
     A: Any
     B: Any
     C: Any
-    dead: int
+    dead: Any
     dt: Any
 
 
@@ -79,6 +81,11 @@ def hessenberg(loop: OpenLoop) -> OpenLoop:
     return loop._replace(A=H, B=B, C=C)
 
 
+def _columns(z: Any, power: Any) -> Any:
+    """Return z (F,) to a power, or to one for each column, to multiply (F, m, m)."""
+    return (z[:, None] ** power)[:, None, :] if np.ndim(power) else (z**power)[:, None, None]
+
+
 def response(loop: OpenLoop, z: Any) -> tuple[Any, Any]:
     """Return (L (F, m, m), det(I - A/z) (F,)) at z (F,) of a loop in Hessenberg form."""
     H, B, C, dead, _ = loop
@@ -110,7 +117,7 @@ def response(loop: OpenLoop, z: Any) -> tuple[Any, Any]:
 
     zero = jnp.zeros((F, n, B.shape[1]), z.dtype)
     X = jax.lax.scan(substitute, zero, jnp.arange(n - 1, -1, -1))[0]
-    return jnp.einsum("in,fnm->fim", C, X) * (z**-dead)[:, None, None], det
+    return jnp.einsum("in,fnm->fim", C, X) * _columns(z, -dead), det
 
 
 class Held(NamedTuple):
@@ -142,4 +149,6 @@ def near(loop: OpenLoop, base: Held, w: Any) -> Any:
     X, Y = base
     residual = B - z[:, None, None] * X + jnp.einsum("ij,kjm->kim", A, X)
     L = jnp.einsum("ij,kjm->kim", C, X) + jnp.einsum("kin,knm->kim", Y, residual)
+    if np.ndim(dead):
+        return L * jnp.exp(-1j * (w * dt)[:, None] * dead)[:, None, :]
     return L * jnp.exp(-1j * w * dt * dead)[:, None, None]

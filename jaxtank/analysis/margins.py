@@ -65,7 +65,7 @@ def _is_stable(still: OpenLoop, form: OpenLoop) -> Any:
     """True if the closed loop is stable; with a dead time by the number of its unstable poles: the
     winding of its characteristic polynomial, as a share of z^degree, along |z| = 1 + RADIUS.
     """
-    if still.dead == 0:
+    if not np.any(still.dead):
         return fr.is_stable(still.A - still.B @ still.C)
     slow = jnp.exp(jnp.linspace(np.log(1e-3 * fr.RADIUS), np.log(LOWEST * np.pi), 24)[:-1])
     angles = jnp.concatenate([slow, _grid(still) * still.dt])
@@ -80,9 +80,9 @@ def _grid(loop: OpenLoop) -> Any:
     """Frequencies [rad/s] from LOWEST to the Nyquist frequency, in increasing order."""
     nyquist = np.pi / loop.dt
     grid = nyquist * jnp.exp(jnp.linspace(np.log(LOWEST), 0.0, POINTS))
-    if not loop.dead:
+    if not np.any(loop.dead):
         return grid
-    most = min(TURN / (loop.dead * np.pi), 1.0)
+    most = min(TURN / (np.max(loop.dead) * np.pi), 1.0)
     even = nyquist * jnp.linspace(0.0, most, DELAYED + 2)[1:-1]
     return jnp.sort(jnp.concatenate([grid, even]))
 

@@ -1,5 +1,6 @@
-"""PumpBank: saturation or allocation, dead zone, lag and transport delay of pumps, in order."""
+"""PumpBank: limits or allocation, rate, dead zone, lag and delay of pumps and valves, in order."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ from jaxtank.core.checks import check_order
 from jaxtank.core.clock import Clock
 from jaxtank.core.numerics import clip, lower_clip
 from jaxtank.core.tree import component, leaf, static
-from jaxtank.core.vectors import each, is_array, unzipped
+from jaxtank.core.vectors import each, is_array, like, scalars, unzipped
 from jaxtank.instruments.base import Actuator
 
 SATURATIONS = ("clip", "boxqp")
@@ -26,6 +27,7 @@ class ActuatorState(NamedTuple):
     lagged: Any  # voltage behind the lag [V]
     line: Any  # (delay samples,) ring buffer of each pump [V]; one (delay samples, m) of arrays
     head: Any  # where the ring buffers are read and written
+    own: Any = ()  # (line, head) of each pump with a further delay, () of the others
 
 
 def _largest(high):
@@ -41,15 +43,17 @@ class PumpBank(Actuator):
     1. Saturation (gouta2015 eq. 9): "clip" holds each voltage in [low, high]; "boxqp" takes the
        voltages in the box that are best by the controller's own cost (see `allocate`), which
        removes the wrong-way latch-up of clipping a decoupling controller.
-    2. Dead zone, if given: no flow at or below `dead_zone` (gouta2015, Remark 4: 3 V). "offset":
+    2. Rate, if given: the voltage moves by at most `rate` [V/s] from that of the sample before.
+       Controller and observer are given the result, so that anti-windup acts on it.
+    3. Dead zone, if given: no flow at or below `dead_zone` (gouta2015, Remark 4: 3 V). "offset":
        the flow is proportional to u - dead_zone above the dead zone (gouta2022 notes S2.3).
        "hysteresis": a pump that turns stops below `stop`, and starts again above `dead_zone`.
        "pulse": voltages that would not turn the pump are saved up as volt-seconds and paid out in
        samples at `pulse` volts, so that the mean flow is the one asked for (sigma-delta).
-    3. Lag, if given: first order with time constant `lag` [s], lag v' = u - v, solved exactly. The
+    4. Lag, if given: first order with time constant `lag` [s], lag v' = u - v, solved exactly. The
        plant receives the mean of v over each sample, so that the delivered volume is exact for any
        sampling period.
-    4. Transport delay: `delay` [s], whole samples.
+    5. Transport delay: `delay` [s] of all and `delays` [s] of each besides, whole samples.
 
     At the edge of a dead zone the derivative is one-sided; through "pulse" it is the
     derivative of the mean flow, 1.
@@ -90,6 +94,16 @@ class PumpBank(Actuator):
     lag: Any = leaf(
         "s", "time constant of each pump", low=0.0, like="low", default=None, shape="pump"
     )
+    rate: Any = leaf(
+        "V/s",
+        "largest change of the input of each pump per second; inf: none",
+        low=0.0,
+        strict=True,
+        like="low",
+        infinite=True,
+        default=None,
+        shape="pump",
+    )
     initial: np.ndarray = leaf(
         "V",
         "input at which the pumps ran before t = 0",
@@ -99,12 +113,20 @@ class PumpBank(Actuator):
     delay: float = static(
         "s", "transport delay from pump to tank", low=0.0, high=1000.0, default=0.0
     )
+    delays: tuple = static(
+        doc="transport delay [s] of each pump beyond `delay`, (): none", default=()
+    )
     saturation: str = static(
         "-", "what saturation does to a command", choices=SATURATIONS, default="clip"
     )
     dead_zone_kind: str = static(
         "-", "what the dead zone does", choices=DEAD_ZONES, default="plain"
     )
+
+    def __post_init__(self) -> None:
+        rate: Any = self.rate
+        if isinstance(rate, np.ndarray) and np.all(np.isinf(rate)):
+            object.__setattr__(self, "rate", None)  # no memory that never acts
 
     @property
     def allocates(self) -> bool:
@@ -150,6 +172,14 @@ class PumpBank(Actuator):
             lagged=self._turning(start) if self.lag is not None else (),
             line=line,
             head=jnp.int32(0),
+            own=self._own_lines(scalars(start), clock),
+        )
+
+    def _own_lines(self, start, clock):
+        """(line, head) of each pump with a delay beyond that of all, () of the others."""
+        counts = [round(delay / clock.dt) for delay in self.delays]
+        return tuple(
+            (jnp.broadcast_to(s, (n,)), jnp.int32(0)) if n else () for s, n in zip(start, counts)
         )
 
     def limit(self, command: Sequence, metric: tuple | None = None) -> tuple:
@@ -163,7 +193,17 @@ class PumpBank(Actuator):
             u, state = self._dead_zone(state, u, dt)
         if self.lag is not None:
             u, state = self._lagged(state, self._turning(u), dt)
-        return _delayed(state, u) if len(state.line) else (u, state)
+        u, state = _delayed(state, u) if len(state.line) else (u, state)
+        return _delayed_each(state, u) if state.own else (u, state)
+
+    def reachable(self, before: Any, dt: Any) -> "PumpBank":
+        """Return these pumps with the limits that they reach a sample after inputs `before`."""
+
+        def end(sign):
+            move = lambda u, rate, low, high: clip(u + sign * (rate * dt), low, high)
+            return each(move, before, self.rate, self.low, self.high)
+
+        return dataclasses.replace(self, low=end(-1.0), high=end(1.0), rate=None)
 
     def driving(self, u: tuple) -> tuple:
         """Return the part of the inputs `u` (m,) [V] at the plant that moves liquid: u less an
@@ -232,6 +272,20 @@ def _delayed(state, u):
         jax.lax.dynamic_update_index_in_dim(line, v, head, 0) for line, v in zip(state.line, u)
     )
     return out, state._replace(line=line, head=_next(head, line[0]))
+
+
+def _delayed_each(state, u):
+    """(inputs behind the further delay of each pump, new state)."""
+    out, own = [], []
+    for v, memory in zip(scalars(u), state.own):
+        if memory:
+            line, head = memory
+            v, now = jax.lax.dynamic_index_in_dim(line, head, keepdims=False), v
+            line = jax.lax.dynamic_update_index_in_dim(line, now, head, 0)
+            memory = line, _next(head, line)
+        out.append(v)
+        own.append(memory)
+    return like(tuple(out), u), state._replace(own=tuple(own))
 
 
 def _next(head, line):

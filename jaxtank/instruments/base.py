@@ -188,6 +188,12 @@ class Actuator(Role):
     delay: float = 0.0
     """Transport delay [s], a whole number of samples."""
 
+    delays: tuple[float, ...] = ()
+    """(m,) transport delay of each pump beyond `delay` [s], whole samples; () for none."""
+
+    rate: Any = None
+    """(m,) largest change of each input per second [V/s], kept by `reachable`; None for none."""
+
     @property
     def pumps(self) -> int:
         """Number of pumps m [-]."""
@@ -225,6 +231,12 @@ class Actuator(Role):
         (m,) inputs within [low, high] [V]
         """
         return each(clip, command, self.low, self.high)
+
+    def reachable(self, before: Any, dt: Any) -> "Actuator":
+        """Return the pumps with the limits that they reach a sample after inputs `before`; called
+        where there is a `rate`.
+        """
+        return self
 
     @abc.abstractmethod
     def step(self, state: Any, applied: tuple[Any, ...], dt: Any) -> tuple[tuple[Any, ...], Any]:

@@ -126,14 +126,20 @@ def _advance(loop, clock, samples, state, command, y):
     """
     kind, filtered = state.x[0].dtype, 0.0
     applied = tuple(jnp.asarray(v, dtype=kind) for v in command)
+    actuator, controller, rated = loop.actuator, state.controller, loop.actuator.rate is not None
+    if rated:
+        controller, before = controller
+        actuator = actuator.reachable(before, clock.dt)
+        applied = actuator.limit(applied) if loop.safety_filter is None else applied
     if loop.safety_filter is not None:
         guard, line = loop.safety_filter, None
         if guard.predicted:
-            controller, line = state.controller
+            controller, line = controller
         y = tuple(jnp.asarray(v, dtype=kind) for v in y)
-        applied, filtered = guard.apply(loop.actuator, applied, None, y, clock.dt, line)
+        applied, filtered = guard.apply(actuator, applied, None, y, clock.dt, line)
         if line is not None:
-            state = state._replace(controller=(controller, moved_on(line, applied)))
+            controller = controller, moved_on(line, applied)
+    state = state._replace(controller=(controller, applied) if rated else controller)
     state, u, spilled, _ = move(loop, clock, state, applied, _now(samples, state))
     y, state = _readings(loop, clock, samples, state)
     return state, y, u, spilled, filtered

@@ -256,12 +256,14 @@ def initial(loop: ClosedLoop, clock: Clock, arrays: bool = False) -> State:
 
 
 def control_state(loop: ClosedLoop, x0: Vector, u0: Vector) -> Any:
-    """State of the controller at t = 0; with the inputs under way where the filter predicts."""
+    """State of the controller at t = 0; with the inputs under way where the filter predicts, and
+    with the last inputs where their rate is limited.
+    """
     x0, u = form_for(loop.controller, x0), form_for(loop.controller, u0)
     state, safety_filter = loop.controller.init(x0, u), loop.safety_filter
-    if safety_filter is None or not safety_filter.predicted:
-        return state
-    return state, line_of(scalars(u0), safety_filter.predicted)
+    if safety_filter is not None and safety_filter.predicted:
+        state = state, line_of(scalars(u0), safety_filter.predicted)
+    return state if loop.actuator.rate is None else (state, u0)
 
 
 def keyed(loop: ClosedLoop, key: jax.Array | None) -> ClosedLoop:

@@ -98,8 +98,10 @@ def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
     return Linearised(OpenLoop(A, B, -C, dead, clock.dt), x, u, why)
 
 
-def _without_limits(loop: ClosedLoop, clock: Clock) -> tuple[ClosedLoop, int]:
-    """(the loop without noise, limits, dead time, filter; its dead time in samples)."""
+def _without_limits(loop: ClosedLoop, clock: Clock) -> tuple[ClosedLoop, Any]:
+    """(the loop without noise, limits, dead time, filter; its dead time in samples, of all inputs
+    or of each).
+    """
     sensor: Any = loop.sensor.without_noise()
     if getattr(sensor, "bits", 0):
         sensor = dataclasses.replace(sensor, bits=0)
@@ -110,6 +112,11 @@ def _without_limits(loop: ClosedLoop, clock: Clock) -> tuple[ClosedLoop, int]:
     dead = round(float(actuator.delay) / clock.dt)
     if dead:
         changes["delay"] = 0.0
+    if actuator.delays:
+        dead = dead + np.array([round(more / clock.dt) for more in actuator.delays])
+        changes["delays"] = ()
+    if actuator.rate is not None:  # small changes do not reach it
+        changes["rate"] = None
     quiet = dataclasses.replace(
         loop,
         sensor=sensor,

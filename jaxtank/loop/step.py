@@ -73,20 +73,24 @@ def decide(
 ) -> Decision:
     """Run observer and controller for one sample; every simulation and export uses this order."""
     safety_filter, under_way = loop.safety_filter, None
+    actuator, limited_rate = loop.actuator, loop.actuator.rate is not None
+    if limited_rate:  # anti-windup is given the inputs that the pumps reach
+        controller, before = controller
+        actuator = actuator.reachable(form_for(actuator, before), tick.dt)
     if safety_filter is not None and safety_filter.predicted:
         controller, under_way = controller
     tick_of_observer = _tick_for(loop.observer, tick)
     estimate, observer = loop.observer.step(observer, tick_of_observer, form_for(loop.observer, y))
     estimate = estimate._replace(x=like(estimate.x, y), d=like(estimate.d, y))
     command, controller = commanded(loop, controller, tick, estimate)
-    allocates = loop.actuator.allocates or safety_filter is not None
+    allocates = actuator.allocates or safety_filter is not None
     metric = loop.controller.input_metric(_estimate_for(loop, estimate)) if allocates else None
     if safety_filter is None:
-        applied, filtered = loop.actuator.limit(form_for(loop.actuator, command), metric), 0.0
+        applied, filtered = actuator.limit(form_for(actuator, command), metric), 0.0
     else:
         entries = scalars(command)
         applied, filtered = safety_filter.apply(
-            loop.actuator, entries, metric, scalars(y), tick.dt, under_way
+            actuator, entries, metric, scalars(y), tick.dt, under_way
         )
     applied = materialised(like(applied, y)) if is_array(y) else like(applied, y)
     watched, acting = form_for(loop.observer, command), form_for(loop.observer, applied)
@@ -96,6 +100,8 @@ def decide(
     controller = loop.controller.track(controller, tick_of_controller, raw, limited)
     if under_way is not None:
         controller = controller, moved_on(under_way, scalars(applied))
+    if limited_rate:
+        controller = controller, applied
     return Decision(estimate, command, applied, observer, controller, filtered)
 
 

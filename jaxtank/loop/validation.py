@@ -204,12 +204,21 @@ def _check_units(plant: Plant) -> None:
 
 
 def _check_delay(actuator: Actuator, clock: Clock) -> None:
-    samples = actuator.delay / clock.dt
-    if actuator.delay > clock.duration or abs(samples - round(samples)) > 1e-6 * max(1.0, samples):
+    if actuator.delays and len(actuator.delays) != actuator.pumps:
         raise InputError(
-            f"actuator.delay = {actuator.delay:g} s: must be a whole number of samples of"
-            f" {clock.dt:g} s, at most {clock.duration:g} s"
+            f"actuator.delays = {actuator.delays}: must be {actuator.pumps} dead times [s], one per"
+            " pump"
         )
+    for j, more in enumerate(actuator.delays or (0.0,)):
+        delay = actuator.delay + more
+        samples = delay / clock.dt
+        whole = abs(samples - round(samples)) <= 1e-6 * max(1.0, samples)
+        if not whole or not 0.0 <= more <= delay <= clock.duration:
+            of = f" of pump {j + 1}" if actuator.delays else ""
+            raise InputError(
+                f"actuator.delay{of} = {delay:g} s: must be a whole number of samples of"
+                f" {clock.dt:g} s, from 0 to {clock.duration:g} s"
+            )
 
 
 def check_shapes(loop: ClosedLoop) -> None:

@@ -181,8 +181,12 @@ USUAL = {"spread": 0.0}
 TRACKING = 30.0
 """Tracking time of a PID of a rig file that has none [s]; of a PI it is its integral time."""
 
-WITHOUT = {"p": ("Ti", "Td", "order", "Tt", "b", "anti_windup"), "pi": ("Td", "order")}
-"""Fields of a PID that it has not under a name of its own."""
+WITHOUT = {
+    "pumps": ("delays",),
+    "p": ("Ti", "Td", "order", "Tt", "b", "anti_windup"),
+    "pi": ("Td", "order"),
+}
+"""{kind: fields that its table has not}: of a PID under a name of its own; keys of [[pump]]."""
 
 LIMITED = ("on-off", "split-range")
 """Kinds whose `low` and `high` are by default the limits of the actuator."""

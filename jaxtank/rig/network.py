@@ -242,6 +242,9 @@ def _loop(plant, columns, control, observer):
     """The ClosedLoop of a plant and of the columns of its tables."""
     inputs, levels = _fields(columns, "actuator"), number(columns["x0"])
     inflow = columns["disturbance.level"]
+    delays = inputs.pop("delays")  # the least is that of all
+    delay = min(delays)
+    delays = tuple(more - delay for more in delays)
     unset: Any = None  # the controller needs the loop
     sensor = {"gain": np.ones(plant.tanks), "full_scale": np.max(plant.rim)}
     # the pulse is of use only above 0, beside a dead zone
@@ -251,7 +254,11 @@ def _loop(plant, columns, control, observer):
         sensor=LevelSensor(**_numbers(sensor | _fields(columns, "sensor"))),
         observer=Direct(),
         controller=unset,
-        actuator=PumpBank(**_numbers({"stop": np.zeros(plant.pumps), "pulse": pulse, **inputs})),
+        actuator=PumpBank(
+            **_numbers({"stop": np.zeros(plant.pumps), "pulse": pulse, **inputs}),
+            delay=delay,
+            delays=delays if any(delays) else (),
+        ),
         reference=ramps([float(levels[i]) for i in plant.outputs], [], ramp=0.0),
         disturbance=Constant(level=number(inflow)) if any(inflow) else None,
         x0=levels,
@@ -480,6 +487,9 @@ def _entry_of(loop, target, i):
     if target.startswith("disturbance."):
         steady = parts_of(loop.disturbance)[0]
         return steady.level[i] if isinstance(steady, Constant) else 0.0
+    if target == "actuator.delays":
+        delays = getattr(loop.actuator, "delays", ())
+        return loop.actuator.delay + delays[i] if delays else None
     path = target.split(".")
     part = int(path.pop()) if path[-1].isdigit() else None
     # a custom actuator or sensor need not have what the tables of a rig may give

@@ -69,8 +69,9 @@ class Key:
 
     def local_unit(self, units: tuple[str, str]) -> str:
         """Return its unit in the units of a rig; of a curve, those of its two columns."""
-        if self.unit == "opening":  # of a valve, a share
-            return "%" if full_open(units) > 1.0 else "-"
+        if self.unit.startswith("opening"):  # of a valve, a share
+            unit = "%" if full_open(units) > 1.0 else "-"
+            return self.unit.replace("opening", unit).replace("-/", "1/")
         columns = [local(unit, units) for unit in self.unit.split(", ")]
         return ", ".join(columns) if set(columns) != {"-"} else "-"
 

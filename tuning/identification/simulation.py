@@ -47,6 +47,13 @@ def rig_of(loop):
             " compared with the readings of a LevelSensor"
         )
     actuator = loop.actuator
+    present = {"rate": actuator.rate is not None, "delays": bool(actuator.delays)}
+    if names := [name for name, there in present.items() if there]:
+        raise InputError(
+            f"actuator.{' and '.join(names)}: experiment data are compared with pumps of one dead"
+            " time and without a rate: leave rate and delay of [[pump]] and [[valve]] out to"
+            " identify"
+        )
     if actuator.delay:
         actuator = dataclasses.replace(cast(Any, actuator), delay=0.0)
     return Rig(

@@ -84,7 +84,9 @@ def loop_of(case: Case, output: int) -> Loop:
     slopes = _slopes(case, inputs, output)
     lags = np.broadcast_to(0.0 if bank.lag is None else np.asarray(bank.lag), slopes.shape)
     lag = float(np.max(lags[slopes != 0.0]))
-    return Loop(A, B @ slopes, C[output], lag, float(bank.delay), case.clock.dt)
+    more = np.asarray(bank.delays or (0.0,) * len(slopes))
+    delay = float(bank.delay + np.max(more[slopes != 0.0]))
+    return Loop(A, B @ slopes, C[output], lag, delay, case.clock.dt)
 
 
 def _slopes(case: Case, inputs: np.ndarray, output: int) -> np.ndarray:

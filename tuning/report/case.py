@@ -305,6 +305,10 @@ def _actuator(loop):
         dead = f"dead zone {_list(bank.dead_zone)} {drive} ({bank.dead_zone_kind})"
     lag = f"lag {_list(bank.lag)} s" if bank.lag is not None else "no lag"
     delay = f"transport delay {bank.delay:g} s" if bank.delay else "no delay"
+    if bank.delays:
+        delay = f"transport delay {_list([bank.delay + more for more in bank.delays])} s"
+    if bank.rate is not None:
+        lag = f"at most {_list(bank.rate)} {drive}/s; {lag}"
     return f"Pumps: {bank.pumps}, {limits} ({kinds[bank.saturation]}); {dead}; {lag}; {delay}."
 
 

@@ -171,6 +171,9 @@ curve = [[0.0, 0.0], [0.5, 0.01], [1.0, 0.014]]
 high = 1.0
 initial = 0.4
 dead_zone = 0.1
+rate = 0.25
+lag = 3.0
+delay = 2.0
 [[pump]]
 from = 3
 to = 1
@@ -194,6 +197,9 @@ low = 0.1
 high = 0.9
 initial = 0.3
 dead_zone = 0.2
+rate = 0.05
+lag = 2.5
+delay = 1.0
 [[valve]]
 from = 5
 to = 4
