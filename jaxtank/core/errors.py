@@ -4,12 +4,18 @@ nearest valid name.
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 
 class InputError(ValueError):
     """Something a user gave cannot be used. The message is one line; the command line ends with
     exit code 2.
     """
+
+    place: Any = None
+    """Where in a rig file it is, (section, index, key); None where that is not known."""
+    parts: "tuple[InputError, ...]" = ()
+    """The problems that it reports, where there are several."""
 
 
 class EquilibriumError(InputError):

@@ -17,7 +17,7 @@ from jaxtank.instruments import Actuator, LevelSensor, PumpBank, Sensor
 from jaxtank.loop.steady import steady_state
 from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman, Observer
 from jaxtank.plants.hydraulics import in_unit
-from jaxtank.rig.entry import read_entry, sizes_of
+from jaxtank.rig.entry import Problems, read_entry, sizes_of, unknown_key
 from jaxtank.rig.schema import NEEDED, OPEN_LOOP, Key, Section, type_of
 from jaxtank.rig.signals import ramp_values, ramps_of
 from jaxtank.signals.setpoints import Ramps, ramps
@@ -284,14 +284,7 @@ def component(name, table, loop, offered, model=None):
     role, plant = ROLES[name], loop.plant if model is None else model
     if isinstance(table, role.base):  # of Python
         return table
-    if not isinstance(table, dict):
-        raise InputError(f"[{name}]: must be a table")
-    if "kind" not in table:
-        raise InputError(f"[{name}] needs kind = one of {', '.join(role.classes)}")
-    kind = table["kind"]
-    kinds = _kinds(role, kind) if isinstance(kind, str) else role.classes
-    if not isinstance(kind, str) or kind not in role.classes:
-        raise unknown(f"{name} kind", str(kind), kinds)
+    kind = _kind_in(name, table)
     section, cls = section_of(name, kind, plant.units), role.classes[kind]
     if kind not in REGISTERED or role.kept:
         table = {**{k: v for k, v in offered.items() if k in section.names}, **table}
@@ -300,6 +293,34 @@ def component(name, table, loop, offered, model=None):
     if issubclass(cls, controllers.PID):
         _track(kind, values)
     return cls(**values, **({"model": plant} if "model" in cls.__dataclass_fields__ else {}))
+
+
+def _kind_in(name, table):
+    """The kind of a table of a component, after input validation."""
+    role = ROLES[name]
+    if not isinstance(table, dict):
+        raise InputError(f"[{name}]: must be a table")
+    if "kind" not in table:
+        raise InputError(f"[{name}] needs kind = one of {', '.join(role.classes)}")
+    kind = table["kind"]
+    kinds = _kinds(role, kind) if isinstance(kind, str) else role.classes
+    if not isinstance(kind, str) or kind not in role.classes:
+        raise unknown(f"{name} kind", str(kind), kinds)
+    return kind
+
+
+def check_keys(name, table):
+    """Raise InputError for a kind or keys of a table that are unknown, whatever its rig is."""
+    if name not in table or isinstance(table[name], ROLES[name].base):
+        return
+    problems, row = Problems(), table[name]
+    with problems.collect((name, None, "kind")):
+        section = section_of(name, _kind_in(name, row))
+        for key in row:
+            if key not in section.names:
+                problems.append(unknown_key(section, key, name))
+                problems[-1].place = (name, None, key)
+    problems.check()
 
 
 def _track(kind, values):

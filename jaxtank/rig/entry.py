@@ -52,20 +52,22 @@ def read_entry(
     where = section.name if index is None else f"{section.name} {index + 1}"
     if not isinstance(table, Mapping):
         raise refusal(where, table, "be a table")
-    problems = Problems(
-        unknown_key(section, key, where) for key in table if key not in section.names
-    )
-    values = {}
+    problems, values = Problems(), {}
+    for key in table:
+        if key not in section.names:
+            problems.append(unknown_key(section, key, where))
+            problems[-1].place = (section.name, index, key)
     for key in section.keys:
         value = table.get(key.name, None if key.default is NEEDED else key.default)
         if key.name in table or value is not None:
             label = f"{where}: {key.name}" if section.many else f"{where}.{key.name}"
-            with problems.collect():
+            with problems.collect((section.name, index, key.name)):
                 values[key.name] = read_value(key, label, value, sizes)
         elif key.default is NEEDED:
             label = where if section.many else title or section.title
             needed = f"{label} needs {key.name}{unit(key.meta(sizes.units))}: {key.doc}"
             problems.append(InputError(needed))
+            problems[-1].place = (section.name, index, None)
     problems.check()
     return values
 
@@ -84,11 +86,12 @@ class Problems(list[InputError]):
     """What is wrong in a file, so that one answer has all of it."""
 
     @contextlib.contextmanager
-    def collect(self):
-        """Keep an InputError of the block, and go on after it."""
+    def collect(self, place=None):
+        """Keep an InputError of the block, and go on after it; place: where in a file it is."""
         try:
             yield
         except InputError as error:
+            error.place = error.place or place
             self.append(error)
 
     def check(self) -> None:
@@ -96,7 +99,11 @@ class Problems(list[InputError]):
         if len(self) == 1:
             raise self[0]
         if self:
-            raise InputError("; ".join(dict.fromkeys(str(error) for error in self)))
+            parts = [part for error in self for part in error.parts or (error,)]
+            parts = {str(part): part for part in parts}
+            joined = InputError("; ".join(parts))
+            joined.parts = tuple(parts.values())
+            raise joined
 
 
 def unknown_key(section, key: str, where: str = "") -> InputError:
@@ -114,7 +121,8 @@ def unknown_key(section, key: str, where: str = "") -> InputError:
     elif titles:
         hint = f"; it is a key of {', '.join(titles)}"
     else:
-        hint = f"; write {WORDS[key]}" if key in WORDS else nearest(key, names)
+        word = WORDS.get(key.lower())
+        hint = f"; write {word}" if word else nearest(key, names)
     of = f" of {section.title}" if section.name else ""
     return InputError(f"unknown key{of} {key!r}{hint}")
 
@@ -124,7 +132,27 @@ WORDS = {
     "sphere": '[[tank]] shape = "sphere" with diameter',
     "cylinder": "[[tank]] diameter and rim",
     "radius": "diameter",
-    "volume": "area and rim",
+    "sp": "[reference] initial and changes",
+    "pv": "[plant] outputs: the tanks whose levels are controlled",
+    "op": "[[pump]] or [[valve]], whose input the controller moves",
+    "mv": "[[pump]] or [[valve]], whose input the controller moves",
+    "kp": "Kc",
+    "ki": "Ti: Kp/Ki of a controller Kp e + Ki integral(e)",
+    "kd": "Td: Kd/Kp of a controller with Kd de/dt",
+    "tau_i": "Ti",
+    "tn": "Ti",
+    "reset": "Ti",
+    "tau_d": "Td",
+    "tv": "Td",
+    "action": "Kc below 0 where the input lowers the level",
+    "transmitter": "[[sensor]] with tank, unit, span",
+    "range": "span of [[sensor]], low and high of [[pump]]",
+    "bottom_area": "area",
+    "max_flow": "high: the largest input, with units = [length, flow]",
+    "capacity": "rim and area of [[tank]], high of [[pump]]",
+    "duration": '[values] "clock.duration"',
+    "dt": '[values] "clock.dt"',
+    "sample_time": '[values] "clock.dt"',
     "initial_level": "level",
     "setpoint": "[reference] initial and changes",
     "outlet": "drain of [[tank]], or a [[valve]] where its opening is an input",

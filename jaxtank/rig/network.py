@@ -104,7 +104,7 @@ def _read(table, sizes):
     with problems.collect():
         more = read_entry(SECTIONS["plant"], table.get("plant", {}), sizes)
     for i, tank in enumerate(entries["tank"]):
-        with problems.collect():
+        with problems.collect(("tank", i, None)):
             tank |= _vessel(f"tank {i + 1}", tank, sizes.units)
     rows = {name: table[name] if entries[name] else () for name in LISTS}
     with problems.collect():
@@ -134,7 +134,7 @@ FORMS: dict[str, tuple[tuple[str, ...], ...]] = {
 
 def _vessel(where, tank, units):
     """{key: value} of area, shape, height and rim of a [[tank]]; an upright one is a prism."""
-    shape, tank = tank.get("shape", "prism"), dict(tank)
+    shape, tank = tank.get("shape", "prism"), _with_volume(where, tank)
     kind, title = (shape, f'shape = "{shape}"') if isinstance(shape, str) else ("table", "shape")
     if kind == "prism":
         title = "an upright tank"
@@ -169,6 +169,26 @@ def _vessel(where, tank, units):
     elif "diameter" in sizes:
         area = _disc(sizes["diameter"])
     return {"area": area, "shape": shape, "height": extent, "rim": tank.get("rim", extent)}
+
+
+def _with_volume(where, tank):
+    """An upright [[tank]] whose volume and one of area, diameter and rim give the other."""
+    tank = dict(tank)
+    if "volume" not in tank:
+        return tank
+    if "shape" in tank:
+        raise InputError(f"{where}: volume: the sizes of a shape give it: leave it out")
+    if "height" in tank and "rim" not in tank:
+        tank["rim"] = tank.pop("height")
+    area = tank.get("area", _disc(tank["diameter"]) if "diameter" in tank else None)
+    if (area is None) == ("rim" not in tank) or {"area", "diameter"} <= tank.keys():
+        raise InputError(
+            f"{where}: volume is that of an upright tank: give with it one of rim, area, diameter"
+        )
+    rest = {k: v for k, v in tank.items() if k != "volume"}
+    if area is None:
+        return rest | {"area": tank["volume"] / tank["rim"]}
+    return rest | {"rim": tank["volume"] / area}
 
 
 def _disc(diameter):

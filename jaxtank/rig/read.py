@@ -12,6 +12,7 @@ from jaxtank.controllers.base import Controller
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import read_text
 from jaxtank.core.text import shortened
+from jaxtank.measures import check_names
 from jaxtank.observers.base import Observer
 from jaxtank.rig import components, network, signals, tables, validation
 from jaxtank.rig.entry import (
@@ -24,6 +25,7 @@ from jaxtank.rig.entry import (
     sizes_of,
     unknown_key,
 )
+from jaxtank.rig.lines import line_of, lines_of
 from jaxtank.rig.schema import INPUTS, LISTS, SECTIONS, TANKWISE
 from jaxtank.rig.sensors import check_stated, complete_rows, sensor_rows, with_sensors
 from jaxtank.rig.values import (
@@ -113,9 +115,20 @@ def loads(text: str, words: str = "rig file", folder: str | Path = "") -> Case:
     try:
         return from_table(table, folder)
     except InputError as error:
-        raise type(error)(f"{words}: {error}") from None
+        located = type(error)(f"{words}: {_located(error, text)}")
+        located.parts = error.parts
+        raise located from None
     except RecursionError:
         raise InputError(f"{words}: a value is nested too deeply") from None
+
+
+def _located(error, text):
+    """The problems of a file, each with its line."""
+    lines, sentences = lines_of(text), []
+    for part in error.parts or (error,):
+        line = line_of(lines, part.place) if part.place else None
+        sentences.append(f"line {line}: {part}" if line else str(part))
+    return "; ".join(sentences)
 
 
 def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
@@ -133,7 +146,7 @@ def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
     problems = Problems()
     for name, (field, read) in TUNING.items():
         if name in table:
-            with problems.collect():
+            with problems.collect((name, None, None)):
                 case = case.replace(**{field: read(case, table[name])})
     problems.check()
     if "bottom" not in table.get("plant", {}) and "plant.bottom" not in values:
@@ -231,21 +244,8 @@ def start_of(table):
     """Return the Case of the tables that build: case or tanks, controller, observer,
     instruments, reference, disturbance and faults; before any value is set.
     """
-    problems, top = Problems(), {}
-    with problems.collect():
-        top = _top(table)
-    lists = all(isinstance(table.get(name, []), list) for name in LISTS)
-    if problems and lists and "tank" in table and "case" not in table:
-        with problems.collect():
-            network.build(table)
-    problems.check()
-    if "case" in top:
-        case = presets.find(top.pop("case"))
-        if "sensors" in table:
-            case = case.replace(loop=_with_sensors(case.loop, table))
-        case = _with_parts(case, table)
-    else:
-        case = network.build(table)
+    problems = Problems()
+    case, top = _start(table, problems)
     loop, changes = case.loop, {}
     with problems.collect():
         _check_twice(table)
@@ -268,6 +268,47 @@ def start_of(table):
     problems.check()
     top.pop("units", None)
     return case.replace(loop=dataclasses.replace(loop, **changes), **top)
+
+
+def _start(table, problems):
+    """(Case of the tables of the rig and its controller, values at the top of a file)."""
+    top = {}
+    with problems.collect():
+        top = _top(table)
+    lists = all(isinstance(table.get(name, []), list) for name in LISTS)
+    if problems and lists and "tank" in table and "case" not in table:
+        with problems.collect():
+            network.build(table)
+    if problems:
+        _check_others(table, problems)
+    problems.check()
+    if "case" in top:
+        case = presets.find(top.pop("case"))
+        if "sensors" in table:
+            case = case.replace(loop=_with_sensors(case.loop, table))
+        case = _with_parts(case, table)
+    else:
+        with problems.collect():
+            case = network.build(table)
+        if problems:
+            _check_others(table, problems)
+        problems.check()
+    return case, top
+
+
+def _check_others(table, problems):
+    """Add what is wrong in the other tables of a file whose rig is wrong already."""
+    for name in ("controller", "observer"):
+        with problems.collect((name, None, None)):
+            components.check_keys(name, table)
+    for name in ("reference", "limits", "objective"):
+        row = table.get(name, {})
+        for key in row if isinstance(row, dict) else ():
+            with problems.collect((name, None, key)):
+                if name != "reference":
+                    check_names([key])
+                elif key not in SECTIONS[name].names:
+                    raise unknown_key(SECTIONS[name], key, name)
 
 
 def _top(table):

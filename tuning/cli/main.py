@@ -83,10 +83,11 @@ def _keep_programs(args):
 def _failed(error):
     """Print an exception in one line and return the exit code."""
     from jaxtank.core.errors import DataError, InputError, NonFiniteError
-    from jaxtank.core.text import one_line
+    from jaxtank.core.text import MOST, one_line
 
     if isinstance(error, (InputError, NonFiniteError)):
-        words, code = one_line(error), 5 if isinstance(error, DataError) else 2
+        count = max(len(getattr(error, "parts", ())), 1)
+        words, code = one_line(error, MOST * count), 5 if isinstance(error, DataError) else 2
     elif isinstance(error, BrokenPipeError):  # the reader of stdout has closed the pipe
         _drop_output()
         return 0

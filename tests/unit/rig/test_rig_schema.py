@@ -223,7 +223,7 @@ initial = [0.4, 0.2, 0.1, 0.3, 0.3]
 APART = {("tank", "inflow"), ("disturbance", "inflow"), ("", "case"), ("reference", "sine")}
 # a table in a file is written as changes (test_tables.py)
 APART |= {("reference", key) for key in ("csv", "column", "time", "decimal")}
-APART |= {("sensors", "unit")}  # numbers are written in the unit of the rig
+APART |= {("tank", "volume"), ("sensors", "unit")}  # numbers are written in the unit of the rig
 KEYS = [
     (section.name, key.name)
     for section in SECTIONS.values()
