@@ -11,6 +11,7 @@ from jaxtank.measures.functions import RunFunction, from_function, functions, na
 from jaxtank.measures.registry import (
     check_names,
     entries,
+    entry_units,
     linear,
     of_loop,
     placed,
@@ -36,6 +37,7 @@ __all__ = [
     "Worst",
     "check_names",
     "entries",
+    "entry_units",
     "from_function",
     "functions",
     "linear",

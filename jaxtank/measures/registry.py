@@ -8,6 +8,7 @@ import jax
 
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.installed import imported, installed
+from jaxtank.core.labels import input_unit
 from jaxtank.core.tree import shortened
 from jaxtank.core.units import DEFAULT, local
 from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context
@@ -207,6 +208,39 @@ def unit(name: str, units: tuple[str, str] = DEFAULT) -> str:
     ('cm^2 s', 'm^2 s')
     """
     return local(MEASURES[name].unit, units)
+
+
+def entry_units(name: str, plant: Any) -> str | list[str]:
+    """Return the unit of a measure of a plant; where its entries differ, as those of a pump and of
+    a valve, whose input is an opening, the unit of each.
+
+    Parameters
+    ----------
+    name : of a measure
+    plant : Plant
+
+    Returns
+    -------
+    Unit, or a list of units, one per entry.
+
+    Examples
+    --------
+    >>> from jaxtank import measures, presets
+    >>> measures.entry_units("rms_input", presets.find("cascaded/pi").loop.plant)
+    'V'
+    """
+    length, drive = plant.units
+    if MEASURES[name].per != "pump" or not getattr(plant, "valves", ()):
+        return unit(name, (length, drive))
+    drives = [input_unit(plant, j, drive) for j in range(plant.pumps)]
+    units = [_powers(unit(name, (length, each))) for each in drives]
+    return units[0] if len(set(units)) == 1 else units
+
+
+def _powers(text: str) -> str:
+    """A unit without factors "-", of what has none: "-^2 s" is "s"."""
+    factors = [factor for factor in text.split(" ") if not re.fullmatch(r"-(\^-?\d+)?", factor)]
+    return " ".join(factors) or "-"
 
 
 def entries(name: str, plant: Any) -> int:

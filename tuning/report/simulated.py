@@ -30,6 +30,7 @@ from tuning.report.tables import (
     number,
     reasons,
     undefined,
+    unit_text,
     units,
 )
 
@@ -57,7 +58,7 @@ def json_of_run(case, values, seed, plateaus=None):
     payload = {
         "case": case.name,
         "measures": measures_json(values),
-        "units": units(case.loop.units),
+        "units": units(case.loop.plant),
         "reasons": reasons(values),
         "clock": dataclasses.asdict(case.clock),
         "parameters": clean(lp.parameters(case.loop)),
@@ -70,8 +71,9 @@ def report(case, values, plateaus=None):
     """Return the Report of a run with the measures `values`."""
     loop, limits = case.loop, _limits(case, values)
     broken = [limit for limit in limits if not limit["margin"] >= 0.0]
+    unit = lambda name: unit_text(name, loop.units, loop.plant)
     facts = [
-        (name, f"{entries(name, values[name], loop.plant)} {ms.unit(name, loop.units)}".strip())
+        (name, f"{entries(name, values[name], loop.plant)} {unit(name)}".strip())
         for name in case.objective
         if name in values
     ]

@@ -115,11 +115,17 @@ def table(rows, head=()):
 def measure_table(values, rig_units=DEFAULT, gap=False, plant=None):
     """Return the Table of {measure: value}: unit, entries and what the measure is."""
     rows = [
-        [m, ms.unit(m, rig_units), entries(m, values[m], plant), spec.doc]
+        [m, unit_text(m, rig_units, plant), entries(m, values[m], plant), spec.doc]
         for m, spec in ms.MEASURES.items()
         if m in values and m not in ms.times()
     ]
     return Table(rows, ["measure", "unit", "value", ""], gap)
+
+
+def unit_text(measure, rig_units, plant=None):
+    """The unit of a measure in a table; those of its entries, where they differ."""
+    unit = ms.unit(measure, rig_units) if plant is None else ms.entry_units(measure, plant)
+    return unit if isinstance(unit, str) else ", ".join(dict.fromkeys(unit))
 
 
 def limit_table(rows, gap=False):
@@ -191,9 +197,9 @@ def dumps(table):
     return json.dumps(table, indent=2, allow_nan=False)
 
 
-def units(rig_units):
-    """Return {measure: unit} on a rig with these (length, pump input) units."""
-    return {m: ms.unit(m, rig_units) for m in ms.MEASURES}
+def units(plant):
+    """Return {measure: unit} of a plant; a list of units where those of entries differ."""
+    return {m: ms.entry_units(m, plant) for m in ms.MEASURES}
 
 
 def objective_unit(terms, rig_units=DEFAULT):

@@ -32,6 +32,7 @@ from tuning.report.tables import (
     objective_unit,
     reasons,
     undefined,
+    unit_text,
     units,
 )
 from tuning.search.result import Message
@@ -78,7 +79,7 @@ def json_of(result):
         "objective": {k: clean(result.objective[k]) for k in ("before", "after", "terms")},
         "measures": {side: measures_json(measures[side]) for side in SIDES},
         "reasons": {**reasons(measures["before"]), **reasons(measures["after"])},
-        "units": units(result.tuned.loop.units),
+        "units": units(result.tuned.loop.plant),
         "constraints": clean([c.to_json() for c in result.constraints]),
         "scenarios": scenario_rows(result),
         "slopes": {where: check.to_json() for where, check in result.slopes.items()},
@@ -369,7 +370,14 @@ def _measure_table(result):
     rows = [["objective", cost_unit(result), *(Value(objective[side]) for side in SIDES)]]
     for m in listed:
         after = numbers(measures["after"][m], 5 if "level" in m else 4)
-        rows.append([m, ms.unit(m, units), numbers(measures["before"][m], 4), after])
+        rows.append(
+            [
+                m,
+                unit_text(m, units, result.tuned.loop.plant),
+                numbers(measures["before"][m], 4),
+                after,
+            ]
+        )
     weighted = " + ".join(m if w == 1 else f"{w:g} {m}" for m, w in terms.items())
     before, after = ({m: measures[side][m] for m in listed} for side in SIDES)
     lines = [f"objective: {weighted}{_runs_of(result, bool(listed))}"]

@@ -51,7 +51,7 @@ def json_of(ensemble):
             for n, d in ensemble.distributions.items()
         },
         "measures": summary,
-        "units": {m: ms.unit(m, ensemble.case.loop.units) for m in ensemble.measures},
+        "units": {m: ms.entry_units(m, ensemble.case.loop.plant) for m in ensemble.measures},
         "violations": clean(ensemble.violations()),
         **fields(ensemble, "samples wall_s"),
         "provenance": provenance.provenance(ensemble.case, ensemble.seed),
@@ -133,8 +133,9 @@ def _facts(ensemble, violations):
 
 def _measure_table(ensemble):
     """The statistics of every measure, a row for each of its entries."""
-    rows, units = [], ensemble.case.loop.units
+    rows = []
     for name, summary in ensemble.summary().items():
+        each = ms.entry_units(name, ensemble.case.loop.plant)
         shape, per = ensemble.measures[name].shape[1:], ms.MEASURES[name].per
         columns = [np.nan if summary[q] is None else summary[q] for q in QUANTITIES]
         columns = [np.broadcast_to(values, shape).ravel() for values in columns]
@@ -145,7 +146,8 @@ def _measure_table(ensemble):
             interval = "-"
             if ends is not None:
                 interval = Value([np.ravel(end)[i] for end in ends], 4, between=" : ")
-            rows.append([label, ms.unit(name, units), mean, interval, *others])
+            unit = each if isinstance(each, str) else each[i]
+            rows.append([label, unit, mean, interval, *others])
     heads = ["measure", "unit", "mean", "95 % of the mean", "sd", "5 %", "median", "95 %"]
     return Table(rows, [*heads, "mean of worst 5 %", "highest"], gap=True)
 
