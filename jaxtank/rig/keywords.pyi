@@ -59,6 +59,7 @@ def Tank(
     diameter: Quantity | None = ...,
     length: Quantity | None = ...,
     height: Quantity | None = ...,
+    volume: Quantity | None = ...,
     rim: Quantity | None = ...,
     drain: Quantity = ...,
     drain_port: Quantity = ...,
