@@ -26,6 +26,7 @@ lazy.HOMES.update(
     Identification="tuning.report.identification",
     Identifications="tuning.report.identifications",
     InputBound="tuning.report.optimal_input",
+    Prediction="tuning.report.prediction",
     SensitivityResult="tuning.report.effects",
     TuningResult="tuning.report.tuned",
 )

@@ -16,6 +16,8 @@ from tuning.identification.design import compare_experiments as compare_experime
 from tuning.identification.experiment import Log as Log
 from tuning.identification.experiment import log as log
 from tuning.identification.fit import identify as identify
+from tuning.identification.prediction import Prediction as Prediction
+from tuning.identification.prediction import predict as predict
 from tuning.identification.problem import Estimation as Estimation
 from tuning.identification.result import Identification as Identification
 from tuning.identification.result import Identifications as Identifications

@@ -21,7 +21,7 @@ SECTIONS = {"Parameters", "Returns", "Examples"}
 RESULTS = {
     *("Attack", "Trajectory", "Bound", "Certificate", "Ensemble", "Estimation", "Identification"),
     *("Answer", "Comparison", "Feasibility", "Judged"),
-    *("Identifications", "Log", "ParameterChange", "TuningResult"),
+    *("Identifications", "Log", "ParameterChange", "Prediction", "TuningResult"),
 }
 
 

@@ -158,6 +158,8 @@ def coordinates_of(bounds, branches=True):
 def free_bounds(loop, free):
     """Return the Bounds of {name: (low, high)}; raise InputError for what no reading shows."""
     free = default_free(loop) if free is None else free
+    if not free:  # a prediction: the levels at the first sample alone
+        return []
     for name in free:
         if not name.startswith(ESTIMATED):
             raise InputError(

@@ -1,5 +1,6 @@
 """Checks of experiment data against a rig: conditions and messages."""
 
+import dataclasses
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
@@ -31,7 +32,7 @@ def checked(log, loop, gap: float) -> list[Log]:
         raise InputError(
             "identification needs float64: call jax.config.update('jax_enable_x64', True) first"
         )
-    logs = [log] if isinstance(log, Log) else list(log)
+    logs = [with_hold(data) for data in ([log] if isinstance(log, Log) else log)]
     if not logs:
         raise InputError("no log is given: identification needs experiment data")
     messages = [message for log in logs for _, message in findings(log, loop, gap)]
@@ -84,19 +85,35 @@ def _unknown_tanks(log, loop, gap):
 
 def _gaps(log, loop, gap):
     steps = np.diff(log.t)
-    usual, k = float(np.median(steps)), int(np.argmax(steps))
+    usual, k = float(np.quantile(steps, 0.9 if _irregular(log) else 0.5)), int(np.argmax(steps))
     if steps[k] > gap * usual * (1 + 1e-9):
         enough = np.ceil(10 * steps[k] / usual) / 10
         yield k + 1, 0, {"step": steps[k], "t": log.t[k], "usual": usual, "enough": enough}
 
 
-def _unknown_changes(log, loop, gap):
+def _irregular(log):
+    """Whether samples come at irregular times."""
     low, high = np.quantile(np.diff(log.t), [0.1, 0.9])
+    return high > IRREGULAR * low
+
+
+def with_hold(log: Log) -> Log:
+    """Return a Log that states what its inputs do between samples: where samples are irregular and
+    inputs change with the readings, it is not known when, and they follow a line from row to row.
+    """
+    # A step at its row would act late, by half a step on average, as a dead time does.
+    if log.hold or log.samples < FEWEST or not _irregular(log):
+        return log
     changed = changes_of(log.u)
     unsure = changed[np.isfinite(log.y[changed]).any(axis=1)]
-    if not log.hold and high > IRREGULAR * low and 2 * len(unsure) > len(changed):
-        k = unsure[0]
-        yield k, None, {"step": log.t[k] - log.t[k - 1], "t": log.t[k], "low": low, "high": high}
+    if 2 * len(unsure) <= len(changed):
+        return log
+    note = (
+        f"{log.name}: samples come irregularly and inputs change from one to the next: they are"
+        " taken along a line from row to row (--hold first-order); --hold zero-order for a step at"
+        " each row"
+    )
+    return dataclasses.replace(log, hold="first-order", notes=(*log.notes, note))
 
 
 def _empty_channels(log, loop, gap):
@@ -198,15 +215,6 @@ CHECKS = (
         "a gap of {step:g} s after {t:g} s, where samples come every {usual:g} s: what the pumps"
         " did there is not known; cut the file in two (give both with --data), or hold the input"
         " over it with --gap {enough:g}",
-    ),
-    Check(
-        "input-times",
-        _unknown_changes,
-        "an input changed in the {step:g} s before {t:g} s, and samples come irregularly, every"
-        " {low:g} to {high:g} s: when it changed is not known, and intervals would exclude the"
-        " truth. Add a row at the time of each change, with its inputs and no readings; or state"
-        " that inputs change at the times of their rows, --hold zero-order, or along a line from"
-        " row to row, --hold first-order",
     ),
     Check("no-reading", _empty_channels, "{slot} has no reading", ends=True),
     Check("range", _out_of_range, "{slot} = {value:g} {unit}, where the {limit} {unit}: " + UNIT),

@@ -45,6 +45,12 @@ class Experiments(dict[str, dict[str, Any]]):
         return html_table(rows, ["experiment", *names], caption)
 
 
+def channels_of(estimation: Estimation) -> list[tuple[str, str]]:
+    """Return (name, unit) of every channel of readings."""
+    length = estimation.case.loop.units[0]
+    return [(f"h{i + 1}", "V" if volts else length) for i, volts in estimation.data.channels]
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
 class Identification(Result):
     """Result of `tuning.identify`; `print(result)` for a table.
@@ -125,11 +131,7 @@ class Identification(Result):
     @property
     def channels(self) -> list[tuple[str, str]]:
         """(name, unit) of every channel of readings."""
-        length = self.case.loop.units[0]
-        return [
-            (f"h{tank + 1}", "V" if volts else length)
-            for tank, volts in self.estimation.data.channels
-        ]
+        return channels_of(self.estimation)
 
     @property
     def correlation(self) -> tuple[tuple, np.ndarray]:

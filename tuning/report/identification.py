@@ -136,6 +136,7 @@ def report(fit, page=False):
         facts,
         [
             Text([f"{fit.case.name}: {status}"], on="terminal"),
+            Text([note for log in fit.estimation.logs for note in log.notes], items=True),
             Text([_data(fit.estimation)]),
             _parameters(fit),
             Text(_levels(fit), gap=True),
@@ -259,7 +260,12 @@ def json_of(fit):
         "correlation": {"names": list(names), "matrix": correlation.tolist()},
         "free_combinations": clean(fit.directions),
         "data": [
-            {"name": log.name, "samples": log.samples, "readings": int(np.isfinite(log.y).sum())}
+            {
+                "name": log.name,
+                "samples": log.samples,
+                "readings": int(np.isfinite(log.y).sum()),
+                "notes": list(log.notes),
+            }
             for log in est.logs
         ],
         "substeps": est.substeps,
@@ -308,15 +314,9 @@ def figures(fit):
     from jaxtank.plots import fit as plots
     from jaxtank.plots.style import picture
 
-    est, rows, drawings = fit.estimation, len(fit.channels), {}
-    simulated = est.predicted(est.unknowns(fit.fit))
+    est, rows = fit.estimation, len(fit.channels)
     title = lambda words: f"{fit.case.name}: {words}"
-    for e, log in enumerate(est.logs):
-        draw = lambda axes, e=e: _fit(axes, fit, e, simulated[e])
-        words = title(f"{log.name}, measured and simulated with the fitted rig")
-        size = (7.0, 1.0 + 1.7 * (rows + 1))
-        name = f"fit_{e + 1}" if len(est.logs) > 1 else "fit"
-        drawings[name] = picture(draw, size, rows + 1, title=words, sharex=True)
+    drawings = draw_log(fit, "measured and simulated with the fitted rig", fit.validation)
     of = f" (the first of {len(est.logs)} logs; correlations of all)" if len(est.logs) > 1 else ""
     words, size = title(f"measured less simulated{of}"), (8.4, 0.9 + 1.9 * rows)
     draw = lambda axes: _residual_axes(axes, fit)
@@ -332,17 +332,32 @@ def figures(fit):
     return drawings
 
 
+def draw_log(fit, words, validation=None):
+    """Return {"fit": matplotlib Figure}, or "fit_1", .., of the logs of a fit or a prediction."""
+    from jaxtank.plots.style import picture
+
+    est, rows, drawings = fit.estimation, len(fit.channels), {}
+    simulated = est.predicted(est.unknowns(fit.fit))
+    for e, log in enumerate(est.logs):
+        draw = lambda axes, e=e: _fit(axes, fit, e, simulated[e], validation)
+        title = f"{fit.case.name}: {log.name}, {words}"
+        name = f"fit_{e + 1}" if len(est.logs) > 1 else "fit"
+        size = (7.0, 1.0 + 1.7 * (rows + 1))
+        drawings[name] = picture(draw, size, rows + 1, title=title, sharex=True)
+    return drawings
+
+
 LEGEND: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.98)}
 """Place of a legend: above the axes."""
 
 
-def _fit(axes, fit, e, simulated):
+def _fit(axes, fit, e, simulated, validation):
     """Draw log e: readings, simulated (samples, channels), and inputs."""
     from jaxtank.plots import fit as plots
 
     est, log = fit.estimation, fit.estimation.logs[e]
-    n, validated = log.samples, fit.validation and fit.validation["samples"][e]
-    begin = log.t[validated] if fit.validation and validated < n else None
+    n, validated = log.samples, validation and validation["samples"][e]
+    begin = log.t[validated] if validation and validated < n else None
     for c, (name, unit) in enumerate(fit.channels):
         plots.measured(axes[c], log.t, est.data.y[e, :n, c], simulated[:n, c], name, unit, begin)
     axes[0].legend(ncols=3, **LEGEND)

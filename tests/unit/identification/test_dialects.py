@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers import command
 
+import tuning
 from jaxtank import rig
 from tuning.identification.csv_log import LogError, read_log
 
@@ -184,6 +185,34 @@ def test_the_log_table_of_a_rig_may_hold_columns_and_units_apart(tmp_path):
     case = rig.loads(RIG + table)
     same(read_log(written(tmp_path, content), case.loop, case.log))
     assert rig.loads(rig.dump(case)).log == case.log
+
+
+def test_a_rig_predicts_a_log_from_its_first_samples(tmp_path):
+    """A falling tank in closed form, h = (sqrt(h0) - c t)^2: residuals are the noise, the bias of a
+    sensor is reported, and a constant level says that its fit in % means nothing.
+    """
+    area, drain, g, noise = 0.25, 4.15e-4, 9.81, 1e-3
+    text = """units = ["m", "%"]
+    tank = [{ name = "LT1", area = 0.25, rim = 1.0, drain = 4.15e-4, level = 0.9 }]
+    pump = [{ gain = 2e-5, to = "LT1", high = 100.0, initial = 0.0 }]
+    plant = { gravity = 9.81 }
+    controller = { kind = "open-loop", initial = [0.0] }
+    """
+    case, t = rig.loads(text), np.arange(0.0, 600.0, 5.0)
+    h = (np.sqrt(0.8) - drain * np.sqrt(2 * g) / (2 * area) * t) ** 2
+    rng = np.random.default_rng(0)
+    y = h + noise * rng.standard_normal(len(t))
+    result = tuning.predict(case, tuning.log(t=t, u=0 * t, y=y), start_samples=30)
+    assert result.levels[0, 0] == pytest.approx(0.8, abs=3 * noise)
+    assert result.quality["rmse"][0] == pytest.approx(noise, rel=0.25)
+    assert result.quality["white"][0] > 0.01 and abs(result.quality["bias"][0]) < noise
+    y[30:] += 0.02  # another sensor from then on
+    moved = tuning.predict(case, tuning.log(t=t, u=0 * t, y=y), start_samples=30)
+    assert moved.quality["bias"][0] == pytest.approx(0.02 * 90 / 120, abs=noise)
+    assert moved.quality["white"][0] < 1e-6 and result.to_json()["fit"]["rmse"][0] < 2 * noise
+    full = drain * np.sqrt(2 * g * 0.5) / 2e-5  # holds 0.5 m
+    still = tuning.log(t=t, u=0 * t + full, y=0.5 + noise * rng.standard_normal(len(t)))
+    assert "read the RMSE" in tuning.predict(case, still).to_json()["message"]
 
 
 def test_the_command_answers_once_and_writes_nothing(tmp_path):

@@ -10,7 +10,6 @@ import pytest
 
 import tuning
 from jaxtank import rig
-from jaxtank.core.errors import DataError
 from jaxtank.core.tree import number
 from tuning.cli.main import main
 from tuning.identification import simulation
@@ -140,15 +139,14 @@ def _irregular(seed=2):
     return t, times, inputs, y
 
 
-def test_an_irregular_log_that_does_not_tell_when_inputs_change_is_refused(tmp_path, capsys):
+def test_inputs_of_an_irregular_log_follow_a_line_and_no_dead_time(tmp_path, capsys):
+    """Pumps change between the rows: steps at the rows, which act late, fit worse than lines."""
     t, times, inputs, y = _irregular()
     _write(tmp_path, t, _held(times, inputs)(t), y)
-    code, _, err = _identify(tmp_path, capsys, "--gap", "2")
-    assert code == 5 and "when it changed is not known" in err
-    assert "--hold first-order" in err and "no readings" in err
-    log = tuning.log(t=t, u=_held(times, inputs)(t), y=y)
-    with pytest.raises(DataError, match="when it changed is not known"):
-        tuning.identify(rig.load(tmp_path / "rig.toml"), log, gap=2.0)
+    code, line, err = _identify(tmp_path, capsys)
+    assert code == 0 and "--hold first-order" in line["data"][0]["notes"][-1], err
+    code, steps, err = _identify(tmp_path, capsys, "--hold", "zero-order")
+    assert code == 0 and steps["fit"]["rmse"][0] > 1.3 * line["fit"]["rmse"][0], err
 
 
 @pytest.mark.slow_for("7.3")

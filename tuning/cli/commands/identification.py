@@ -110,6 +110,18 @@ def _identify(args, case):
     return interrupts.code if interrupts.stop else STATUS[result.status]
 
 
+def predict(args):
+    """Predict experiment data with a rig as it is; returns the exit code."""
+    if not args.data:
+        raise InputError("predict needs --data CSV, experiment data that the rig was not fitted to")
+    case = open_case(args)
+    from tuning.identification.prediction import predict as of
+
+    logs = read_logs(args, case)
+    finish(of(case, logs, start_samples=args.start_samples, gap=args.gap), args)
+    return 0
+
+
 def _report_next(args, result, written):
     """Print on stderr why no rig is written, or what to do with the one that is."""
     from tuning.report.identification import not_identifiable
@@ -218,10 +230,12 @@ DATA = (
            default="", choices=".,"),
     Option("--time", "HOW", "how times that can be read twice are meant: day-first, month-first,"
            " h:m, m:s", default=""),
-    Option("--gap", "X", "longest step between samples, in median steps",
+    Option("--gap", "X", "longest step between samples, in usual steps",
            values.above(1, including=True), 1.5),
     Option("--hold", "HOW", "inputs between samples: zero-order (each until the next row) or"
            " first-order (a line)", default=""),
+)
+HELD_BACK = (
     Option("--hold-back", "SHARE", "end of the data that validates a first fit: share, or samples",
            values.held_back, 0.25),
     Option("--noise", "SD", "standard deviation of the readings, one or one per channel (default:"
@@ -258,6 +272,22 @@ COMMANDS = {
     "identify": Command(
         run,
         "plant parameters from experiment data, with intervals; --out DIR writes a rig to tune",
-        (*COMMON, *CASE, *RUN, *DATA, *FIT, *PLAN),
-    )
+        (*COMMON, *CASE, *RUN, *DATA, *HELD_BACK, *FIT, *PLAN),
+    ),
+    "predict": Command(
+        predict,
+        "a rig as it is on experiment data that it was not fitted to: residuals and their tests",
+        (
+            *COMMON,
+            *CASE,
+            *RUN,
+            *DATA,
+            Option(
+                "--start-samples",
+                "N",
+                "samples at the beginning that the first levels follow from (default: all)",
+                values.whole(1, 10**8),
+            ),
+        ),
+    ),
 }

@@ -1,0 +1,167 @@
+"""`tuning.predict`: a rig as it is, played over experiment data that it has not seen."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from jaxtank.case import Case
+from jaxtank.core.errors import InputError
+from jaxtank.plants.base import Plant
+from tuning.identification.data_checks import checked
+from tuning.identification.experiment import Log
+from tuning.identification.identified_case import bare
+from tuning.identification.least_squares import Fit, solve
+from tuning.identification.problem import Estimation
+from tuning.identification.residuals import autocorrelation, fit_of, residuals_of
+from tuning.identification.result import channels_of
+from tuning.views import Result
+
+LAGS = 20
+"""Lags of the test of whiteness."""
+WIDE = 3.0
+"""Standard deviation of a level, in those of its noise, below which a fit in per cent compares
+the residual with noise."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
+class Prediction(Result):
+    """Result of `tuning.predict`; `print(result)` for a table.
+
+    Attributes
+    ----------
+    case : Case
+        The rig, unchanged.
+    estimation : Estimation
+        Experiment data, and levels at the first sample as the only unknowns.
+    fit : Fit
+        These levels.
+    start_samples : int or None
+        Samples of each log that the levels follow from; None: all.
+    quality : dict
+        {"rmse", "nrmse_percent", "bias", "after_start", "residual_autocorrelation", "white",
+        "input_correlation", "level_sd_in_noise"} of each channel.
+    levels : (logs, tanks) array
+        Levels at the first sample of each log.
+    """
+
+    case: Case
+    estimation: Estimation
+    fit: Fit
+    start_samples: int | None
+    quality: dict[str, list[Any]]
+    levels: np.ndarray
+
+    @property
+    def channels(self) -> list[tuple[str, str]]:
+        """(name, unit) of every channel of readings."""
+        return channels_of(self.estimation)
+
+
+def predict(
+    case: Case | Plant,
+    log: Log | Sequence[Log],
+    *,
+    start_samples: int | None = None,
+    gap: float = 1.5,
+) -> Prediction:
+    """Predict experiment data with a rig whose parameters stay as they are.
+
+    Only the levels at the first sample are estimated, from all readings or from the first ones;
+    the rest is one simulation under the inputs of the log.
+
+    Parameters
+    ----------
+    case : Case or Plant
+        The rig.
+    log : Log or sequence of Log
+        Experiment data, of `tuning.log` or `tuning.read_log`.
+    start_samples : int, optional
+        Samples at the beginning of each log that its first levels follow from; all by default.
+    gap : float
+        Longest step between samples, in usual steps.
+
+    Returns
+    -------
+    Prediction
+
+    Raises
+    ------
+    InputError
+        For `start_samples` that a log does not have.
+    DataError
+        For experiment data that cannot be used.
+
+    Examples
+    --------
+    >>> import jax, numpy as np, tuning
+    >>> from jaxtank import presets
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> case = presets.load("cascaded").cases["open-loop"]
+    >>> t = np.arange(30.0)
+    >>> data = tuning.log(t=t, u=0 * t + 3, y=4.46 + 0.02 * t, tanks=[0])
+    >>> result = tuning.predict(case, data, start_samples=5)
+    >>> len(result.quality["rmse"])
+    1
+    """
+    case = bare(case) if isinstance(case, Plant) else case
+    logs = checked(log, case.loop, gap)
+    shortest = min(data.samples for data in logs)
+    whole = isinstance(start_samples, int) and not isinstance(start_samples, bool)
+    if start_samples is not None and not (whole and 1 <= start_samples <= shortest):
+        raise InputError(
+            f"start_samples = {start_samples!r}: must be a whole number from 1 to {shortest}, the"
+            " samples of the shortest log"
+        )
+    estimation = Estimation(case, logs, {})
+    first = estimation
+    if start_samples is not None:
+        parts = [data.part(0, start_samples) for data in logs]
+        settings: dict[str, Any] = {"noise": estimation.noise, "substeps": estimation.substeps}
+        first = Estimation(case, parts, {}, samples=estimation.mask.shape[1], **settings)
+    fit = solve(first, first.nominal())
+    residual = residuals_of(estimation, fit)
+    return Prediction(
+        case=case,
+        estimation=estimation,
+        fit=fit,
+        start_samples=start_samples,
+        quality=_quality(estimation, residual, start_samples or 0),
+        levels=estimation.first_levels(estimation.unknowns(fit)),
+    )
+
+
+def _quality(estimation, residual, start):
+    """Return the measures and tests of residuals (logs, samples, channels)."""
+    y, quality = estimation.data.y, fit_of(estimation.data.y, residual)
+    after = fit_of(y[:, start:], residual[:, start:])
+    tests = {"bias": [], "residual_autocorrelation": [], "white": [], "input_correlation": []}
+    sd = np.nanstd(np.where(np.isnan(residual), np.nan, y), axis=(0, 1)) / estimation.noise
+    for r in np.moveaxis(residual, -1, 0):
+        rho, n = autocorrelation(r, LAGS), int(np.isfinite(r).sum())
+        # Ljung and Box (Biometrika 65, 1978, 297)
+        statistic = n * (n + 2) * np.sum(rho[1:] ** 2 / np.maximum(n - np.arange(1, len(rho)), 1))
+        tests["bias"].append(float(np.nanmean(r)) if n else None)
+        tests["residual_autocorrelation"].append(float(rho[1]) if len(rho) > 1 else None)
+        tests["white"].append(float(chi2.sf(statistic, len(rho) - 1)) if n > LAGS else None)
+        tests["input_correlation"].append(_input_correlation(estimation, r))
+    return {**quality, **tests, "after_start": after, "level_sd_in_noise": sd.tolist()}
+
+
+def _input_correlation(estimation, residual):
+    """Return the largest correlation of residuals with an input up to LAGS samples before, as a
+    multiple of its standard deviation for independent ones; None without a change of inputs.
+    """
+    u = estimation.data.u
+    u, largest = (u[:, :, 0] if u.ndim == 4 else u), 0.0
+    for j in range(u.shape[-1]):
+        for lag in range(LAGS + 1):
+            a, b = residual[:, lag:], u[:, : u.shape[1] - lag, j]
+            present = np.isfinite(a)
+            a, b = a[present], b[present]
+            if len(a) > 2 * LAGS and np.std(a) > 0 and np.std(b) > 0:
+                rho = float(np.corrcoef(a, b)[0, 1])
+                largest = max(largest, abs(rho) * float(np.sqrt(len(a))))
+    return largest or None

@@ -1,0 +1,105 @@
+"""The report of a Prediction: a rig as it is on experiment data."""
+
+import numpy as np
+
+from tuning.identification.prediction import WIDE
+from tuning.problem import provenance
+from tuning.report.document import Report, Text
+from tuning.report.folder import save as save_all
+from tuning.report.identification import draw_log, fit_csv
+from tuning.report.tables import Table, Value, clean
+
+CAPTIONS = {"fit": "Measured readings (dots), the rig as it is (line), and the inputs."}
+CHANCE = 0.01
+"""Probability below which residuals are called correlated."""
+FAR = 3.0
+"""Correlation, in standard deviations, above which residuals are called dependent on an input."""
+
+
+def sentences_of(result):
+    """Return sentences on the residuals of each channel."""
+    q, words = result.quality, []
+    for c, (name, unit) in enumerate(result.channels):
+        rmse, wide = q["rmse"][c], q["level_sd_in_noise"][c]
+        if rmse is None:
+            continue
+        noise = float(result.estimation.noise[c])
+        bias = f"{name}: mean residual {q['bias'][c]:+.3g} {unit}, noise {noise:.3g} {unit}"
+        tests = []
+        if q["white"][c] is not None:
+            white = q["white"][c] > CHANCE
+            tests.append("residuals are white" if white else "residuals are correlated in time")
+        if (q["input_correlation"][c] or 0.0) > FAR:
+            tests.append("and follow an input: part of its effect is not in the rig")
+        words.append(", ".join([bias, " ".join(tests)] if tests else [bias]))
+        if not wide > WIDE:
+            words.append(
+                f"{name} moves by {wide:.2g} standard deviations of its noise: its fit in %"
+                " compares the residual with that and says nothing; read the RMSE"
+            )
+    return words
+
+
+def report(result):
+    """Return the Report of a Prediction."""
+    q, logs = result.quality, result.estimation.logs
+    n = result.start_samples
+    start = "all readings" if n is None else f"the first {n} samples"
+    rows = [
+        [
+            name,
+            Value(q["rmse"][c], 4, unit),
+            Value(q["after_start"]["rmse"][c], 4, unit),
+            Value(q["nrmse_percent"][c], 3, "%"),
+        ]
+        for c, (name, unit) in enumerate(result.channels)
+    ]
+    names = ", ".join(log.name for log in logs)
+    samples = sum(log.samples for log in logs)
+    facts = [(f"RMSE of {row[0]}", row[1]) for row in rows]
+    return Report(
+        f"{result.case.name}: prediction of {names}",
+        "predicted",
+        facts,
+        [
+            Text([note for log in logs for note in log.notes], items=True),
+            Text([f"{names}: {samples} samples; no parameter fitted, first levels from {start}"]),
+            Table(rows, ["reading", "RMSE", "RMSE after the start", "fit"], gap=True),
+            Text(sentences_of(result), items=True, gap=True),
+        ],
+    )
+
+
+def json_of(result):
+    """Return the JSON object of `jaxtank predict --json`."""
+    q = result.quality
+    tests = ("bias", "residual_autocorrelation", "white", "input_correlation", "level_sd_in_noise")
+    return clean(
+        {
+            "case": result.case.name,
+            "fit": {name: q[name] for name in ("rmse", "nrmse_percent")},
+            "after_start": q["after_start"],
+            "tests": {name: q[name] for name in tests},
+            "start_samples": result.start_samples,
+            "initial_levels": np.asarray(result.levels).tolist(),
+            "channels": [{"name": name, "unit": unit} for name, unit in result.channels],
+            "data": [
+                {"name": log.name, "samples": log.samples, "notes": list(log.notes)}
+                for log in result.estimation.logs
+            ],
+            "message": "; ".join(sentences_of(result)),
+            "provenance": provenance.provenance(result.case, None),
+        }
+    )
+
+
+def figures(result):
+    """Return {"fit": matplotlib Figure}, or "fit_1", .. of several logs."""
+    return draw_log(result, "measured and predicted")
+
+
+def save(result, folder, command=None):
+    """Write result.json, fit.csv, pictures and report.html; return their paths."""
+    draw, page = (lambda: figures(result)), (lambda: report(result))
+    files = {"fit.csv": fit_csv(result)}
+    return save_all(folder, json_of(result), files, draw, page, CAPTIONS, command)
