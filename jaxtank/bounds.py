@@ -63,6 +63,10 @@ WIDE = 30.0
 GAINS: dict[type, tuple[str, ...]] = {
     controllers.PID: ("Kc", "Ti", "Td"),
     controllers.SplitRange: ("Kc", "Ti", "Td"),
+    controllers.Ratio: ("Kc", "Ti", "Td"),
+    controllers.Cascade: ("Kc", "Ti", "Td", "inner_Kc", "inner_Ti"),
+    controllers.FlowCascade: ("Kc", "Ti", "Td", "inner_Kc", "inner_Ti"),
+    controllers.Override: ("Kc", "Ti", "Td", "limit_Kc", "limit_Ti"),
     controllers.StateFeedback: ("K",),
     controllers.LQI: ("Q", "R"),
     controllers.NGPC: ("Tp",),

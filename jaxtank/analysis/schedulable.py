@@ -91,6 +91,7 @@ def _in_the_step(traced):
     plan, signals, state = (shapes for _, shapes in traced.before.values())
     row = lambda tree: jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape[1:], v.dtype), tree)
     tick = Tick(t=number, r=r, dr=r, ddr=r, dt=number, plan=row(plan), own=row(signals))
+    tick = tick._replace(inflow=x, flow=traced.u)
     step, (command, state) = traced.method("step", state, tick, Estimate(x=x, d=x))
     track, _ = traced.method("track", state, tick, command, traced.u)
     absent = parameters(traced.empty).get(traced.gain.split("[")[0], 0.0)

@@ -2,6 +2,7 @@
 
 from jaxtank.controllers.backstepping import Backstepping
 from jaxtank.controllers.base import Controller
+from jaxtank.controllers.cascade import Cascade, FlowCascade
 from jaxtank.controllers.enmpc import ENMPC
 from jaxtank.controllers.fuzzy import FuzzyBlend
 from jaxtank.controllers.gain_schedule import Scheduled
@@ -10,7 +11,9 @@ from jaxtank.controllers.laguerre import Laguerre
 from jaxtank.controllers.ngpc import NGPC
 from jaxtank.controllers.on_off import OnOff
 from jaxtank.controllers.open_loop import OpenLoop
+from jaxtank.controllers.override import Override
 from jaxtank.controllers.pid import PID
+from jaxtank.controllers.ratio import Ratio
 from jaxtank.controllers.sliding_mode import SlidingMode
 from jaxtank.controllers.split_range import SplitRange
 from jaxtank.controllers.state_feedback import LQI, StateFeedback
@@ -23,11 +26,15 @@ __all__ = [
     "NGPC",
     "PID",
     "Backstepping",
+    "Cascade",
     "Controller",
+    "FlowCascade",
     "FuzzyBlend",
     "Laguerre",
     "OnOff",
     "OpenLoop",
+    "Override",
+    "Ratio",
     "Scheduled",
     "SlidingMode",
     "SplitRange",

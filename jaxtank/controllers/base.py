@@ -135,6 +135,16 @@ class Controller(Role):
         return True
 
     @property
+    def reads_inflow(self) -> bool:
+        """True if inflows are measured for the controller (`tick.inflow`)."""
+        return False
+
+    @property
+    def reads_flow(self) -> bool:
+        """True if the flows of the inputs are measured for the controller (`tick.flow`)."""
+        return False
+
+    @property
     def ignores_disturbance(self) -> bool:
         """True if a setting of the controller states that `estimate.d` is not to be used, so that
         an observer that estimates it calls for no note.

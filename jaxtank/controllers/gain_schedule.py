@@ -151,6 +151,14 @@ class Scheduled(Controller):
     def allocates(self) -> bool:
         return self.law.allocates
 
+    @property
+    def reads_inflow(self) -> bool:
+        return self.law.reads_inflow
+
+    @property
+    def reads_flow(self) -> bool:
+        return self.law.reads_flow
+
     @pointwise
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
         return self._without_gains().prepare(r, dr, ddr)

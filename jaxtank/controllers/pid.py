@@ -22,7 +22,7 @@ from jaxtank.core.vectors import each, is_array, take
 from jaxtank.plants.base import Plant
 from jaxtank.signals.base import Signal
 
-FILTER = 8.0  # the derivative's filter has the time constant Td/8
+FILTER = 8.0  # the derivative's filter has the time constant Td/8 where no N is given
 LOWEST, HIGHEST, SECTIONS = 1e-3, 1e2, 5  # Oustaloup's band [rad/s] and N: 2N + 1 sections
 
 
@@ -65,13 +65,19 @@ class PID(Controller):
         v)/(Tt Kc)]
 
     (gouta2022 Table 4; gouta2022 notes S4.5) with r, y [cm], v [V], u the input v after the limits,
-    and the derivative of the measurement filtered by a lag of Td/8. `anti_windup`: with
+    and the derivative of the measurement filtered by a lag of Td/N, N = 8 if left out. With
+    action = "direct" the input rises with the level, as that of a valve in the outlet: Kc, above 0,
+    then counts as -Kc. `anti_windup`: with
     "back-calculation" the tracking time is Tt, with "conditioned" it is Ti (Hanus 1987), and with
     "clamping" the integral stops while v is beyond a limit and the error drives it further. Without
     Ti, or with Ti infinite, there is no integral action and nothing to wind up; an infinite entry
     does so to its loop alone. With `b` the proportional part is Kc (b r - y), from an integral that
-    starts without a bump where y = r; errors within `deadband` count as 0, and larger ones by what
-    is beyond it. Without Td there is no derivative; without `order` the
+    starts without a bump where y = r; errors within `deadband` count as 0, or with `gap_gain` by
+    this share (gap control of an averaging level), and larger ones by what is beyond it. With
+    `error_span` S the error e counts as e |e|/S (error-squared control; Shinskey, Process Control
+    Systems, 1996, ch. 6). With `inflow_gain` the product with the measured inflow of the output's
+    tank, or of the tanks `inflow_of`, is added to v. Without Td there is no derivative; without
+    `order` the
     integral is of order one, with it s^-order = (1/s) s^(1-order), where the second factor is
     Oustaloup's filter: a true integrator is kept. base = bias, or with `feed_forward` the
     steady-state input of the model on the reference, (r' - f(r))/c2, less d/c2 for a disturbance d
@@ -143,6 +149,49 @@ class PID(Controller):
         default=None,
         shape="output",
     )
+    gap_gain: np.ndarray | None = leaf(
+        "-",
+        "share of the gain within the deadband (gap control); left out: 0",
+        low=0.0,
+        high=1.0,
+        like="Kc",
+        default=None,
+        shape="output",
+    )
+    error_span: np.ndarray | None = leaf(
+        "cm",
+        "the error counts squared, and as itself at this size; left out: as itself",
+        low=0.0,
+        strict=True,
+        like="Kc",
+        default=None,
+        shape="output",
+    )
+    N: np.ndarray | None = leaf(
+        "-",
+        "the derivative is filtered by a lag of Td/N; left out: 8",
+        low=0.0,
+        strict=True,
+        like="Kc",
+        default=None,
+        shape="output",
+    )
+    inflow_gain: np.ndarray | None = leaf(
+        "V s/cm^3",
+        "input added for a unit of the measured inflow; left out: no inflow is measured",
+        like="Kc",
+        default=None,
+        shape="output",
+    )
+    inflow_of: tuple = static(
+        "-", "the tank of the measured inflow of each output; left out: its own", default=()
+    )
+    action: str = static(
+        "-",
+        "direct: the input rises with the level (Kc above 0 counts as -Kc); reverse: it falls",
+        choices=("reverse", "direct"),
+        default="reverse",
+    )
     bias: np.ndarray = leaf("V", "input added where there is no feed-forward", shape="output")
     feed_forward: bool = static(
         "-", "add the model's input on the reference", choices=(False, True), default=False
@@ -197,12 +246,27 @@ class PID(Controller):
     def reads_model(self) -> bool:
         return self.feed_forward
 
+    @property
+    def reads_inflow(self) -> bool:
+        return self.inflow_gain is not None
+
+    @property
+    def signed_gain(self) -> Any:
+        """Kc of e = r - y: below 0 of a direct action."""
+        return self.Kc if self.action == "reverse" else -cast(Any, self.Kc)
+
+    @property
+    def inflow_tanks(self) -> tuple[int, ...]:
+        """The tank of the measured inflow of each output."""
+        return self.inflow_of or tuple(self.model.outputs)
+
     def init(self, x0: tuple, u0: tuple) -> Any:
         none: Any = each(lambda u: 0.0 * u, u0) if is_array(u0) else (0.0 * u0[0],) * len(u0)
         integral: Any = () if self.Ti is None else none
         if self.b is not None and self.Ti is not None:  # no bump where y = r
             y = take(x0, self.model.outputs)
-            integral = each(lambda y, k, b: k * (1.0 - b) * y, y, self.Kc, self._weight())
+            Kc, weight = self.signed_gain, self._weight()
+            integral = each(lambda y, k, b: k * (1.0 - b) * y, y, Kc, weight)
         return Memory(
             integral=integral,
             slow=() if self.Td is None else take(x0, self.model.outputs),
@@ -215,33 +279,49 @@ class PID(Controller):
         if self.feed_forward and estimate.d:
             pushed = zip(base, self.model.output(estimate.d), authority(self.model))
             base = tuple(u - d / c for u, d, c in pushed)
-        y = take(estimate.x, self.model.outputs)
-        e = each(operator.sub, tick.r, y)
-        if self.deadband is not None:
-            e = each(lambda e, d: e - clip(e, -d, d), e, self.deadband)
+        if self.inflow_gain is not None and len(tick.inflow):
+            inflow = take(tick.inflow, self.inflow_tanks)
+            base = each(lambda d, k, b: b + k * d, inflow, self.inflow_gain, base)
+        y, Kc = take(estimate.x, self.model.outputs), self.signed_gain
+        e = self._counted(each(operator.sub, tick.r, y))
         if self.Ti is None:
-            v = each(lambda e, b, k: b + k * e, e, base, self.Kc)
+            v = each(lambda e, b, k: b + k * e, e, base, Kc)
         else:
-            v = each(lambda e, b, k, i: b + k * e + i, e, base, self.Kc, state.integral)
+            v = each(lambda e, b, k, i: b + k * e + i, e, base, Kc, state.integral)
         if self.b is not None and self.Ti is not None:
             weight = self._weight()
-            v = each(lambda v, r, k, b: v - k * (1.0 - b) * r, v, tick.r, self.Kc, weight)
+            v = each(lambda v, r, k, b: v - k * (1.0 - b) * r, v, tick.r, Kc, weight)
         slow = state.slow
         if self.Td is not None:
             # (y - slow)/Tf is the filtered derivative; the lag is exact for a level held over the
             # sample
-            v = each(lambda v, k, y, s: v - (FILTER * k) * (y - s), v, self.Kc, y, slow)
+            N = () if self.N is None else (self.N,)
+            of = lambda n: n[0] if n else FILTER
+            v = each(lambda v, k, y, s, *n: v - (of(n) * k) * (y - s), v, Kc, y, slow, *N)
             slow = each(
-                lambda y, s, Td: s + (1.0 - jnp.exp(-tick.dt * FILTER / Td)) * (y - s),
+                lambda y, s, Td, *n: s + (1.0 - jnp.exp(-tick.dt * of(n) / Td)) * (y - s),
                 y,
                 slow,
                 self.Td,
+                *N,
             )
         return v, state._replace(slow=slow, error=e)
+
+    def _counted(self, e: Any) -> Any:
+        """Errors as they count: less within the deadband, squared with an error span."""
+        if self.gap_gain is not None:
+            gap = lambda e, d, share: e - (1.0 - share) * clip(e, -d, d)
+            e = each(gap, e, self.deadband, self.gap_gain)
+        elif self.deadband is not None:
+            e = each(lambda e, d: e - clip(e, -d, d), e, self.deadband)
+        if self.error_span is not None:
+            e = each(lambda e, span: e * jnp.abs(e) / span, e, self.error_span)
+        return e
 
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         if self.Ti is None:
             return state
+        Kc = self.signed_gain
         # of one loop an infinite Ti is None; of several, 1 s stands in and the integral stays 0
         several = np.shape(self.Ti)[-1:] != (1,)
         finite = lambda Ti: jnp.where(jnp.isinf(Ti), 1.0, Ti) if several else Ti
@@ -254,20 +334,20 @@ class PID(Controller):
                 state.error,
                 self.Ti,
                 self.Tt,
-                self.Kc,
+                Kc,
             )
         elif self.anti_windup == "conditioned":
             conditioned = lambda v, u, e, Kc: e + (u - v) / Kc
-            w = each(conditioned, command, applied, state.error, self.Kc)
+            w = each(conditioned, command, applied, state.error, Kc)
         else:
             clamped = lambda v, u, e, Kc: jnp.where(Kc * e * (v - u) > 0.0, 0.0, e)
-            w = each(clamped, command, applied, state.error, self.Kc)
+            w = each(clamped, command, applied, state.error, Kc)
         if self.order is None:
             integral = each(
                 lambda w, i, Kc, Ti: unless_infinite(Ti, i + (tick.dt * Kc / finite(Ti)) * w),
                 w,
                 state.integral,
-                self.Kc,
+                Kc,
                 self.Ti,
             )
             return state._replace(integral=integral)
@@ -281,12 +361,13 @@ class PID(Controller):
     def _fractional(self, state, tick, w):
         """The state after errors w (m,) at the input of fractional integrals."""
         integral, sections, order, Ti = [], [], cast(Any, self.order), cast(Any, self.Ti)
+        Kc = self.signed_gain
         for i, error in enumerate(w):
             gain, poles, residues = oustaloup(1.0 - order[i])
             keep = jnp.exp(-poles * tick.dt)
             enter = residues * (1.0 - keep) / poles
             rate = gain * error + sum(state.sections[i])
-            integral.append(state.integral[i] + tick.dt * self.Kc[i] * Ti[i] ** -order[i] * rate)
+            integral.append(state.integral[i] + tick.dt * Kc[i] * Ti[i] ** -order[i] * rate)
             sections.append(
                 tuple(keep[j] * s + enter[j] * error for j, s in enumerate(state.sections[i]))
             )
@@ -317,6 +398,7 @@ class PID(Controller):
                 f"controller.Kc = {self.Kc}: must not be 0; a negative gain is for a pump that"
                 " lowers its output"
             )
+        self._check_options()
         if self.Ti is None and self.order is not None:
             raise InputError("controller.order: needs an integral time, controller.Ti [s]")
         if self.b is not None and self.Ti is None:
@@ -328,3 +410,22 @@ class PID(Controller):
             raise InputError("controller.Tt: needs a tracking time [s] where Ti is given")
         if self.feed_forward:
             check_own_pumps(self.model)
+
+    def _check_options(self) -> None:
+        """Raise InputError for an option without what it needs."""
+        if self.action == "direct" and isinstance(self.Kc, np.ndarray) and np.any(self.Kc < 0):
+            raise InputError(
+                f'controller.Kc = {self.Kc}: must be above 0 with action = "direct", which turns'
+                ' the sign; a negative Kc is the same with action = "reverse"'
+            )
+        if self.gap_gain is not None and self.deadband is None:
+            raise InputError("controller.gap_gain: needs the half width, controller.deadband")
+        if self.N is not None and self.Td is None:
+            raise InputError("controller.N: needs a derivative time, controller.Td [s]")
+        if self.inflow_of and len(self.inflow_of) != len(self.model.outputs):
+            raise InputError(
+                f"controller.inflow_of: must have a tank for each of {len(self.model.outputs)}"
+                f" outputs, not {len(self.inflow_of)}"
+            )
+        if self.inflow_of and self.inflow_gain is None:
+            raise InputError("controller.inflow_of: needs controller.inflow_gain")

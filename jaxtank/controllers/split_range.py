@@ -68,9 +68,9 @@ class SplitRange(PID):
         ranges = tuple(high - low for low, high in zip(self.low, self.high))
         return ranges if self.span is None else self.span
 
-    def shared(self, v: Any) -> tuple[Any, ...]:
+    def shared(self, v: Any, inflow: Any = ()) -> tuple[Any, ...]:
         """Return the inputs (m,) of PID outputs v (outputs,): the first and the last of a sequence
-        go on beyond their ranges, so that `total` is v.
+        go on beyond their ranges, so that `total` is v. Inflows are not used.
         """
         spans, inputs = self._spans(), [0.0] * self.model.pumps
         for i, members in enumerate(self.sequence):

@@ -36,6 +36,10 @@ class Tick(NamedTuple):
     dt: Any = 0.0  # sampling period Ts [s]
     plan: Any = ()  # entry of the controller's `prepare` for this sample
     own: Any = ()  # this sample of the controller's own signals (`Controller.inputs`)
+    # measured inflow of each tank [cm^3/s] for a controller that `reads_inflow`, else empty
+    inflow: Sequence[Any] = ()
+    # measured flow of each input [cm^3/s] for a controller that `reads_flow`, else empty
+    flow: Sequence[Any] = ()
 
 
 class Estimate(NamedTuple):

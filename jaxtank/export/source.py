@@ -123,6 +123,12 @@ def export(
         raise InputError(
             f"{case.name}: its controller plays a signal back, and exported code holds no signals"
         )
+    if controller.reads_inflow or controller.reads_flow:
+        raise InputError(
+            f"{case.name}: its controller reads measured flows, and exported code reads levels and"
+            " setpoints alone: leave out controller.inflow_gain and follow_inflow, and of a"
+            ' flow-cascade write kind = "pi"'
+        )
     check_prepared(controller)
     name = _checked_name(case, name, target.reserved)
     return target.write(program(case), name, precision)

@@ -25,6 +25,7 @@ from jaxtank.loop.change_windows import windows
 from jaxtank.loop.steady import steady_inflow
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
+from jaxtank.plants.elements import input_flows
 from jaxtank.plants.faults import Faults
 from jaxtank.safety.filter import SafetyFilter
 from jaxtank.safety.outlets import OutletFilter
@@ -92,6 +93,7 @@ class State(NamedTuple):
     actuator: Any
     sensor: Any = ()
     excess: Vector = ()  # in float32, the rounding error of each level [cm]
+    flow: Vector = ()  # of each input [cm^3/s], for a controller that `reads_flow`
 
 
 class Inputs(NamedTuple):
@@ -243,6 +245,9 @@ def initial(loop: ClosedLoop, clock: Clock, arrays: bool = False) -> State:
 
     x0, u0 = vector(loop.x0, loop.plant.tanks), vector(actuator.initial, loop.plant.pumps)
     excess: Any = jnp.zeros_like(x0) if arrays else (zero,) * loop.plant.tanks
+    flow: Any = ()
+    if loop.controller.reads_flow:
+        flow = input_flows(loop.plant, x0, loop.actuator.driving(form_for(loop.actuator, u0)))
     begin = actuator.init_arrays if arrays and serves_arrays(actuator) else actuator.init
     return State(
         k=jnp.int32(0),
@@ -252,6 +257,7 @@ def initial(loop: ClosedLoop, clock: Clock, arrays: bool = False) -> State:
         actuator=jax.tree.map(same_type, begin(clock)),
         sensor=jax.tree.map(same_type, loop.sensor.init(form_for(loop.sensor, x0))),
         excess=excess if zero.dtype == jnp.float32 else (),
+        flow=jax.tree.map(same_type, flow),
     )
 
 

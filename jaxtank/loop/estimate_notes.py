@@ -123,6 +123,7 @@ def is_unused(loop: ClosedLoop) -> bool:
         lambda v: jax.ShapeDtypeStruct(v.shape[1:], v.dtype), (plan, signals)
     )
     tick = Tick(t=number, r=r, dr=r, ddr=r, dt=number, plan=plan, own=signals)
+    tick = tick._replace(inflow=x, flow=u)
 
     def decided(d: Any, x: Any, u: Any, tick: Any) -> Any:
         return loop.controller.step(loop.controller.init(x, u), tick, Estimate(x=x, d=d))

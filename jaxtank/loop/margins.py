@@ -22,11 +22,10 @@ from jaxtank.analysis import margins as am
 from jaxtank.analysis.frequency import OpenLoop, solve
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
-from jaxtank.core.records import Tick
 from jaxtank.loop.closed_loop import ClosedLoop, Inputs, State, floats_of, initial, run_of, zero_of
 from jaxtank.loop.of_case import takes_case
 from jaxtank.loop.steady import steady_inflow
-from jaxtank.loop.step import decide, move
+from jaxtank.loop.step import decide, move, tick_of
 from jaxtank.loop.validation import check
 from jaxtank.measures import Context
 from jaxtank.signals.base import Constant
@@ -190,7 +189,7 @@ class _Sample:
         state, now, loop = self.state(s), self.now, self.loop
         y, sensor = loop.sensor.step(state.sensor, state.x, None, self.clock.dt)
         t = jnp.zeros_like(state.x[0])
-        tick = Tick(t, now.r, now.dr, now.ddr, self.clock.dt, now.plan, now.own)
+        tick = tick_of(loop, self.clock, t, state, now)
         decision = decide(loop, state.observer, state.controller, tick, y)
         parts = dict(observer=decision.observer, controller=decision.controller, sensor=sensor)
         return state._replace(**parts), decision.applied

@@ -2,6 +2,7 @@
 of its pumps (upper limits are not checked).
 """
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -28,11 +29,10 @@ def steady_state(loop: Any, y: Any, plant: Any = None) -> tuple[Any, Any]:
     low = loop.actuator.driving(tuple(np.asarray(loop.actuator.low, dtype=float)))
     # a controller that shares its output between inputs knows which of them runs
     controller = getattr(loop.controller, "law", loop.controller)
+    shared, inflow = getattr(controller, "shared", None), steady_inflow(loop)
+    if shared is not None and controller.reads_inflow and inflow is not None:
+        shared = functools.partial(shared, inflow=tuple(np.asarray(inflow, dtype=float)))
     x, u = equilibrium(
-        loop.plant if plant is None else plant,
-        y,
-        steady_inflow(loop),
-        np.asarray(low, dtype=float),
-        getattr(controller, "shared", None),
+        loop.plant if plant is None else plant, y, inflow, np.asarray(low, dtype=float), shared
     )
     return x, u + np.asarray(loop.actuator.offset)

@@ -22,6 +22,7 @@ from jaxtank.core.tree import is_real
 from jaxtank.core.vectors import each, form_for, is_array, like, scalars, zeros
 from jaxtank.instruments.base import Sensor
 from jaxtank.loop.closed_loop import ClosedLoop, Inputs, State, Vector
+from jaxtank.plants.elements import input_flows
 from jaxtank.plants.runge_kutta import advance
 from jaxtank.safety.prediction import moved_on
 from jaxtank.xla.barrier import materialised
@@ -41,7 +42,7 @@ class Decision(NamedTuple):
 def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[State, Sample]:
     """Return (state after a sample, Sample of it). now: this sample's slice of Inputs."""
     t = time_of(state, clock)
-    tick = Tick(t=t, r=now.r, dr=now.dr, ddr=now.ddr, dt=clock.dt, plan=now.plan, own=now.own)
+    tick = tick_of(loop, clock, t, state, now)
     y, sensor = readings(loop.sensor, state, now, clock)
     decision = decide(loop, state.observer, state.controller, tick, y)
     estimate, command, applied = decision.estimate, decision.command, decision.applied
@@ -105,6 +106,16 @@ def decide(
     return Decision(estimate, command, applied, observer, controller, filtered)
 
 
+def tick_of(loop: ClosedLoop, clock: Clock, t: Any, state: State, now: Inputs) -> Tick:
+    """Return the Tick of a sample, with the flows that the controller reads."""
+    inflow: Any = ()
+    if loop.controller.reads_inflow and now.d is not None:
+        inflow = now.d
+    setpoints = {"r": now.r, "dr": now.dr, "ddr": now.ddr}
+    signals = {"plan": now.plan, "own": now.own, "inflow": inflow, "flow": state.flow}
+    return Tick(t=t, dt=clock.dt, **setpoints, **signals)
+
+
 def readings(sensor: Sensor, state: State, now: Inputs, clock: Clock) -> tuple[Vector, Any]:
     """Return ((n,) readings of a state [cm], the sensor's state after them)."""
     x, xi = form_for(sensor, state.x), form_for(sensor, now.xi)
@@ -115,7 +126,8 @@ def readings(sensor: Sensor, state: State, now: Inputs, clock: Clock) -> tuple[V
 def _tick_for(part: Any, tick: Tick) -> Tick:
     """`tick` with setpoints in the form that a component takes."""
     r, dr, ddr = (form_for(part, v) for v in (tick.r, tick.dr, tick.ddr))
-    return tick._replace(r=r, dr=dr, ddr=ddr)
+    inflow, flow = form_for(part, tick.inflow), form_for(part, tick.flow)
+    return tick._replace(r=r, dr=dr, ddr=ddr, inflow=inflow, flow=flow)
 
 
 def _estimate_for(loop: ClosedLoop, estimate: Estimate) -> Estimate:
@@ -158,6 +170,8 @@ def move(
         excess=state.excess,
     )
     moved = state._replace(k=state.k + 1, x=advanced.x, actuator=actuator, excess=advanced.excess)
+    if loop.controller.reads_flow:
+        moved = moved._replace(flow=input_flows(plant, advanced.x, driving))
     return moved, u, advanced.spilled, advanced.shortfall
 
 

@@ -161,19 +161,32 @@ def streams(net: Any, x: Any, u: Any) -> list[Stream]:
             flows.append(Stream(source, sink, outlet_flow(net, kind, k, x[source])))
     for k, ends in enumerate(net.pipes):
         flows.append(Stream(ends[0], ends[1], pipe_flow(net, k, x)))
+    moved = input_flows(net, x, u)
     for j, (first, second) in enumerate(net.feeds):
-        source = net.sources[j] if net.sources else None
-        flow = net.pump_gain[j] * _driven(net, j, x, u[j], source, first)
+        source, flow = net.sources[j] if net.sources else None, moved[j]
         if second is None:
             flows.append(Stream(source, first, flow))
         else:
             flows.append(Stream(source, first, net.split[j] * flow))
             flows.append(Stream(source, second, (1.0 - net.split[j]) * flow))
     for k, (source, sink) in enumerate(net.valves):
+        flows.append(Stream(source, sink, moved[len(net.feeds) + k]))
+    return flows
+
+
+def input_flows(net: Any, x: Any, u: Any) -> tuple[Any, ...]:
+    """Return the flow (m,) [cm^3/s] that each pump and valve moves at levels x (n,) and inputs u
+    (m,), positive from its source to its sink.
+    """
+    flows: list[Any] = []
+    for j, (first, _) in enumerate(net.feeds):
+        source = net.sources[j] if net.sources else None
+        flows.append(net.pump_gain[j] * _driven(net, j, x, u[j], source, first))
+    for k in range(len(net.valves)):
         opening = u[len(net.feeds) + k] / full_open(net.units)
         share = valve_share(net.characteristics[k], net.rangeability[k], opening)
-        flows.append(Stream(source, sink, valve_flow(net, k, x, share)))
-    return flows
+        flows.append(valve_flow(net, k, x, share))
+    return tuple(flows)
 
 
 def _driven(net: Any, j: int, x: Any, u: Any, source: int | None, sink: int | None) -> Any:

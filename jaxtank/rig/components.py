@@ -14,8 +14,9 @@ from jaxtank.core.text import shortened
 from jaxtank.core.tree import number
 from jaxtank.core.units import DEFAULT
 from jaxtank.instruments import Actuator, LevelSensor, PumpBank, Sensor
-from jaxtank.loop.steady import steady_state
+from jaxtank.loop.steady import steady_inflow, steady_state
 from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman, Observer
+from jaxtank.plants.elements import input_flows
 from jaxtank.plants.hydraulics import in_unit
 from jaxtank.rig.entry import Problems, read_entry, sizes_of, unknown_key
 from jaxtank.rig.schema import NEEDED, OPEN_LOOP, Key, Section, type_of
@@ -42,6 +43,10 @@ ROLES = {
             "pi": controllers.PID,
             "p": controllers.PID,
             "split-range": controllers.SplitRange,
+            "cascade": controllers.Cascade,
+            "flow-cascade": controllers.FlowCascade,
+            "override": controllers.Override,
+            "ratio": controllers.Ratio,
             "on-off": controllers.OnOff,
             "state-feedback": controllers.StateFeedback,
             "lqi": controllers.LQI,
@@ -183,12 +188,18 @@ TRACKING = 30.0
 
 WITHOUT = {
     "pumps": ("delays",),
-    "p": ("Ti", "Td", "order", "Tt", "b", "anti_windup"),
-    "pi": ("Td", "order"),
+    "p": ("Ti", "Td", "order", "Tt", "b", "anti_windup", "N"),
+    "pi": ("Td", "order", "N"),
+    "ratio": ("feed_forward",),
+    "cascade": ("feed_forward", "order"),
+    "flow-cascade": ("feed_forward", "order", "inner"),
 }
 """{kind: fields that its table has not}: of a PID under a name of its own; keys of [[pump]]."""
 
-LIMITED = ("on-off", "split-range")
+INPUTS = ("sequence", "reverse", "lead", "follow")
+"""Static fields that hold inputs, not tanks."""
+
+LIMITED = ("on-off", "split-range", "ratio")
 """Kinds whose `low` and `high` are by default the limits of the actuator."""
 
 LOWER_LIMITS = {"level_floor": 0.01, "difference_floor": 0.01}
@@ -216,8 +227,8 @@ def _key(cls, field, kind, units):
     if kind == "pi" and field.name == "Ti":
         default = NEEDED
     changes = {}
-    if cls is controllers.SplitRange and field.name in ("sequence", "reverse"):
-        changes["kind"] = field.name
+    if issubclass(cls, controllers.PID) and field.name in INPUTS:
+        changes["kind"] = "sequence" if field.name == "sequence" else "inputs"
     if field.metadata["kind"] == "leaf":
         changes["kind"] = "array" if field.metadata["shape"] else "scalar"
     doc = field.metadata["doc"].replace("counted from 0", "counted from 1")  # as a file has tanks
@@ -232,25 +243,53 @@ def controller_of(table, loop, bias=None):
         section = dataclasses.replace(section, name="inputs")  # as its table may be called
         signal = ramps_of(section, table, start, ("pump", "input"), sizes)
         return controllers.OpenLoop(signal=signal)
-    offered = {"bias": steady_bias(loop) if bias is None else bias}
+    steady = steady_bias(loop) if bias is None else bias
     kind = table.get("kind") if isinstance(table, dict) else None
+    # of a PID it is known once its inputs are
+    cls = ROLES["controller"].classes.get(kind) if isinstance(kind, str) else None
+    is_pid = cls is not None and issubclass(cls, controllers.PID)
+    start = np.zeros(len(loop.plant.outputs))
+    offered = dict.fromkeys(BIASES, start) if is_pid else {"bias": steady}
     if kind in LIMITED:
         offered |= {"low": loop.actuator.low, "high": loop.actuator.high}
-    if kind == "split-range":  # of its inputs, which are not known yet
-        offered["bias"] = np.zeros(len(loop.plant.outputs))
     controller = component("controller", table, loop, offered, model_of(loop))
-    if isinstance(controller, controllers.PID):  # before the shape of its bias is
+    if isinstance(controller, controllers.PID):
         controller.check_inputs()
-    if kind == "split-range" and "bias" not in table:
-        return with_bias(controller, steady_bias(loop) if bias is None else bias)
+        left_out = [name for name in BIASES if name not in table]
+        return with_bias(controller, loop, steady, left_out)
     return controller
 
 
-def with_bias(controller, inputs):
-    """Return a controller whose bias is that of steady inputs (m,)."""
-    if isinstance(controller, controllers.SplitRange):
-        inputs = number(controller.total(inputs))
-    return dataclasses.replace(controller, bias=inputs)
+BIASES = ("bias", "inner_bias")
+"""Fields that follow from the steady state at t = 0 where a file leaves them out."""
+
+
+def with_bias(controller, loop, inputs, names=BIASES):
+    """Return a controller whose fields `names` of BIASES are those of steady inputs (m,)."""
+    biases = {"bias": inputs}
+    inflow = steady_inflow(loop)
+    if isinstance(controller, controllers.SplitRange | controllers.Ratio):
+        biases["bias"] = controller.total(inputs)
+    if isinstance(controller, controllers.Cascade):
+        levels = _steady_levels(loop)
+        readings = levels[list(controller.inner)]
+        if isinstance(controller, controllers.FlowCascade):
+            readings = input_flows(loop.plant, levels, loop.actuator.driving(tuple(inputs)))
+        biases = {"bias": readings, "inner_bias": inputs}
+    if getattr(controller, "inflow_gain", None) is not None and inflow is not None:
+        measured = np.asarray(inflow)[list(controller.inflow_tanks)]
+        biases["bias"] = np.asarray(biases["bias"]) - controller.inflow_gain * measured
+    known = {name: number(value) for name, value in biases.items() if name in names}
+    return dataclasses.replace(controller, **known)
+
+
+def _steady_levels(loop):
+    """Levels (n,) of the steady state with the outputs of x0; x0 without one."""
+    start = np.asarray(loop.x0, dtype=float)
+    try:
+        return np.asarray(steady_state(loop, start[list(loop.plant.outputs)])[0], dtype=float)
+    except (EquilibriumError, InputError, FloatingPointError):
+        return start
 
 
 def observer_of(table, loop):
@@ -343,11 +382,15 @@ def steady_bias(loop, known: bool | list[bool] = False):
     return number(np.where(known, bank.initial, steady))
 
 
-def leaves_bias(table):
-    """Whether a [controller] table leaves out a `bias` that is then `steady_bias`."""
+def leaves_out(table, values):
+    """The names of BIASES that a [controller] table and {name: value} of [values] leave out."""
     kind = table.get("kind") if isinstance(table, dict) else None
     cls = None if kind in REGISTERED else ROLES["controller"].classes.get(kind)
-    return "bias" in getattr(cls, "__dataclass_fields__", ()) and "bias" not in table
+    fields = getattr(cls, "__dataclass_fields__", None)
+    if fields is None:
+        return []
+    stated = {name.split("[")[0].removeprefix("controller.") for name in values}
+    return [name for name in BIASES if name in fields and name not in stated | {*table}]
 
 
 def kind_of(name, part):

@@ -296,7 +296,7 @@ def _sequence(key, label, value, sizes):
     return tuple(tuple(_input(label, v, sizes) for v in row) for row in rows)
 
 
-def _reverse(key, label, value, sizes):
+def _inputs(key, label, value, sizes):
     if not isinstance(value, list):
         raise refusal(label, value, "be a list of inputs")
     return tuple(_input(label, v, sizes) for v in value)
@@ -364,7 +364,7 @@ READ = {
     "tank": _tank,
     "tanks": _tanks,
     "sequence": _sequence,
-    "reverse": _reverse,
+    "inputs": _inputs,
     "pair": _pair,
     "feed": _feed,
     "curve": _curve,
@@ -383,7 +383,7 @@ def written(key, value: Any, names: Sequence[str] = ()) -> Any:
         return tank(value)
     if key.kind == "sequence":
         return [[j + 1 for j in row] for row in value]
-    if key.kind == "reverse":
+    if key.kind == "inputs":
         return [i + 1 for i in value]
     if key.kind in ("tanks", "pair", "feed"):
         tanks = [tank(i) for i in value if i is not None]

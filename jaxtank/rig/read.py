@@ -375,7 +375,8 @@ def _with_parts(case, table):
 def _with_bias(case, values, table):
     """(case with the bias that its [controller] leaves out, the values still to be set)."""
     control = table.get("controller", {})
-    if not components.leaves_bias(control) or any(n.startswith("controller.bias") for n in values):
+    names = components.leaves_out(control, values)
+    if not names:
         return case, values
     parts = ("plant.", "actuator.", "disturbance.", "x0")
     case = set_values(case, {n: v for n, v in values.items() if n.startswith(parts)})
@@ -384,6 +385,7 @@ def _with_bias(case, values, table):
     whole = "initial" in table.get("actuator", {}) or name in values
     known = [whole or "initial" in row or f"{name}[{j}]" in values for j, row in enumerate(rows)]
     controller: Any = case.loop.controller
-    controller = components.with_bias(controller, components.steady_bias(case.loop, known))
+    steady = components.steady_bias(case.loop, known)
+    controller = components.with_bias(controller, case.loop, steady, names)
     later = {n: v for n, v in values.items() if not n.startswith(parts)}
     return case.replace(loop=dataclasses.replace(case.loop, controller=controller)), later

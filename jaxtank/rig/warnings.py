@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxtank import presets
 from jaxtank.case import Case
+from jaxtank.controllers.cascade import Cascade
 from jaxtank.controllers.pid import PID
 from jaxtank.core.clock import clock_warnings
 from jaxtank.core.labels import label_of
@@ -185,12 +186,10 @@ def _signs(case):
     part, plant = getattr(case.loop.controller, "law", case.loop.controller), case.loop.plant
     if not isinstance(part, PID) or not isinstance(plant, TankNetwork):
         return
-    ends = [(None, *feed) for feed in plant.feeds]
-    if plant.sources:
-        ends = [(source, *feed) for source, feed in zip(plant.sources, plant.feeds)]
-    ends += [(source, sink) for source, sink in plant.valves]
+    name, gains, tanks_of = _acting(part)
+    ends = _ends(plant)
     reached = [_downstream(plant, (i for i in tanks if i is not None)) for tanks in ends]
-    for i, tank in enumerate(plant.outputs):
+    for i, tank in enumerate(tanks_of):
         members = part.inputs_of(i)
         # through another input the sign of a loop alone decides nothing
         if any(tank in reached[j] for j in range(len(ends)) if j not in members):
@@ -198,15 +197,28 @@ def _signs(case):
         for j in members:
             source, *sinks = ends[j]
             acts = (tank in sinks) - (tank == source)
-            gain = float(np.asarray(part.Kc)[i])
+            gain = float(np.asarray(gains)[i])
             sign = -acts if j in part.reversed_inputs else acts
             if sign * gain < 0.0:
                 yield (
-                    f"controller.Kc of {label_of(plant, 'output', i)} = {gain:g}:"
+                    f"controller.{name} of {label_of(plant, 'output', i)} = {gain:g}:"
                     f" {label_of(plant, 'pump', j)} {'fills' if acts > 0 else 'empties'}"
                     f" {label_of(plant, 'tank', tank)}, and this sign drives its level away"
                     " from the setpoint: change the sign"
                 )
+
+
+def _acting(part):
+    """(name, gains, tanks) of the loops of a PID that move the inputs."""
+    if isinstance(part, Cascade) and part.inner:
+        return "inner_Kc", part.inner_Kc, part.inner
+    return "Kc", part.signed_gain, part.model.outputs
+
+
+def _ends(plant):
+    """(source, sink, ...) of each input."""
+    sources = plant.sources or (None,) * len(plant.feeds)
+    return [(source, *feed) for source, feed in zip(sources, plant.feeds)] + list(plant.valves)
 
 
 def _downstream(plant, tanks):

@@ -24,7 +24,16 @@ values = {{ "clock.dt" = {DT}, "clock.duration" = {DT * (SAMPLES - 1)} }}
 
 
 def simulated(
-    Kc, Ti=math.inf, Td=None, Tt=None, b=1.0, deadband=0.0, anti_windup="back-calculation"
+    Kc,
+    Ti=math.inf,
+    Td=None,
+    Tt=None,
+    b=1.0,
+    deadband=0.0,
+    gap_gain=0.0,
+    error_span=None,
+    N=8.0,
+    anti_windup="back-calculation",
 ):
     """(levels, inputs) of the tank, which integrates exactly, under the textbook's PID."""
     h, slow = 1.0, 1.0
@@ -34,11 +43,13 @@ def simulated(
         t = k * DT
         r = 1.0 if t < 10.0 else 2.5 if t < 70.0 else 1.2
         e = r - h
-        e = math.copysign(max(abs(e) - deadband, 0.0), e)
+        inside = min(abs(e), deadband)
+        e = math.copysign(gap_gain * inside + abs(e) - inside, e)
+        e = e if error_span is None else e * abs(e) / error_span
         v = 0.6 + Kc * (e + (b - 1.0) * r) + integral
         if Td is not None:
-            v -= Kc * 8.0 * (h - slow)
-            slow = h + (slow - h) * math.exp(-8.0 * DT / Td)
+            v -= Kc * N * (h - slow)
+            slow = h + (slow - h) * math.exp(-N * DT / Td)
         u = min(max(v, LOW), HIGH)
         if not math.isinf(Ti):
             rate = Kc / Ti * e
@@ -61,6 +72,9 @@ GAINS = {
     "PID": {"Kc": 1.7, "Ti": 20.0, "Td": 3.0},
     "weighted": {"Kc": 1.7, "Ti": 20.0, "b": 0.3},
     "dead band": {"Kc": 1.7, "Ti": 20.0, "deadband": 0.2},
+    "gap": {"Kc": 1.7, "Ti": 20.0, "deadband": 0.2, "gap_gain": 0.3},
+    "squared": {"Kc": 1.7, "Ti": 20.0, "error_span": 0.8},
+    "filtered": {"Kc": 1.7, "Ti": 20.0, "Td": 3.0, "N": 4.0},
 }
 
 

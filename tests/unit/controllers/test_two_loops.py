@@ -1,0 +1,256 @@
+"""Cascade, override, ratio and feed-forward of a measured inflow, against simulations in plain
+Python whose integrals are lags of what is applied (external reset).
+"""
+
+import math
+
+import jax
+import numpy as np
+import pytest
+from helpers import assert_same_case
+
+import jaxtank
+from jaxtank import rig
+from jaxtank.bounds import gain_ranges
+from jaxtank.core.errors import InputError
+
+DT, SAMPLES, GRAVITY, DEAD = 0.5, 400, 9.81, 2
+UPPER, LOWER, ORIFICE, DRAIN, GAIN = 1.0, 0.5, 0.01, 0.01, 0.1
+START = 0.01 * math.sqrt(2 * GRAVITY) / GAIN  # the input at which both levels rest at 1 m
+PULSE = 0.3 / 20.0  # m^3/s from 110 s to 130 s
+
+RIG = f"""
+units = ["m", "-"]
+reachable = false
+tank = [
+    {{ name = "upper", area = {UPPER}, rim = 9.0, level = 1.0 }},
+    {{ name = "lower", area = {LOWER}, rim = 9.0, level = 1.0, drain = {DRAIN} }},
+]
+orifice = [{{ from = 1, to = 2, area = {ORIFICE} }}]
+pump = [{{ gain = {GAIN}, to = 1, high = 1.0, initial = {START!r} }}]
+plant = {{ gravity = {GRAVITY}, outputs = [2] }}
+inflow = [{{ time = 110.0, duration = 20.0, tank = 1, volume = 0.3 }}]
+reference = {{ initial = [1.0], changes = [[10.0, 1, 2.2], [80.0, 1, 0.9]], ramp = 0.0 }}
+values = {{ "clock.dt" = {DT}, "clock.duration" = {DT * (SAMPLES - 1)} }}
+"""
+
+
+def loads(text=RIG, **table):
+    return rig.loads(f"{text}controller = {rig.toml(table)}")
+
+
+def simulated(control, dead=0):
+    """(levels, inputs) of the two tanks under control(k, h, r, d, q) -> input and applied(u)."""
+    h, line, q = (1.0, 1.0), [START] * (dead + 1), GAIN * START
+    levels, inputs = [], []
+
+    def rates(h, u, d):
+        flow = [a * math.sqrt(2 * GRAVITY * v) for a, v in zip((ORIFICE, DRAIN), h)]
+        return (GAIN * u + d - flow[0]) / UPPER, (flow[0] - flow[1]) / LOWER
+
+    for k in range(SAMPLES):
+        t = k * DT
+        r = 1.0 if t < 10.0 else 2.2 if t < 80.0 else 0.9
+        d = PULSE if 110.0 <= t < 130.0 else 0.0
+        command, reset = control(h, r, d, q)
+        u = min(max(command, 0.0), 1.0)
+        reset(u)
+        levels.append(h)
+        inputs.append(u)
+        line.append(u)
+        acting = line[-1 - dead]
+        k1 = rates(h, acting, d)
+        k2 = rates([v + 0.5 * DT * s for v, s in zip(h, k1)], acting, d)
+        k3 = rates([v + 0.5 * DT * s for v, s in zip(h, k2)], acting, d)
+        k4 = rates([v + DT * s for v, s in zip(h, k3)], acting, d)
+        h = tuple(v + DT / 6 * (a + 2 * b + 2 * c + e) for v, a, b, c, e in zip(h, k1, k2, k3, k4))
+        q = GAIN * acting
+    return np.array(levels), np.array(inputs)
+
+
+class Reset:
+    """A PI as a gain and a positive feedback of what is applied through a lag Ti."""
+
+    def __init__(self, Kc, Ti, bias):
+        self.Kc, self.Ti, self.bias, self.lagged = Kc, Ti, bias, bias
+
+    def output(self, e):
+        return self.lagged + self.Kc * e
+
+    def reset(self, applied):
+        self.lagged += DT / self.Ti * (applied - self.lagged)
+
+
+def cascaded(outer, inner, low, high, reading):
+    """The control of `simulated` of two PI in cascade."""
+
+    def control(h, r, d, q):
+        s = min(max(outer.output(r - h[1]), low), high)
+        command = inner.output(s - reading(h, q))
+
+        def reset(u):
+            inner.reset(u)
+            outer.reset(min(max(s + (u - command) / inner.Kc, low), high))
+
+        return command, reset
+
+    return control
+
+
+CASCADE = {"kind": "cascade", "Kc": 3.0, "Ti": 60.0, "inner": [1], "inner_Kc": 1.5}
+CASCADE |= {"inner_Ti": 15.0, "inner_high": 4.0}
+FLOW = {"kind": "flow-cascade", "Kc": 0.1, "Ti": 80.0, "inner_Kc": 2.0, "inner_Ti": 1.5}
+OVERRIDE = {"kind": "override", "Kc": 2.0, "Ti": 40.0, "limited": ["upper"], "limit": 1.6}
+OVERRIDE |= {"limit_Kc": 3.0, "limit_Ti": 10.0}
+
+
+def test_a_cascade_of_levels_is_that_of_two_lags_of_what_is_applied():
+    case = loads(**CASCADE)
+    run = jaxtank.simulate(case.loop, case.clock)
+    control = cascaded(
+        Reset(3.0, 60.0, 1.0), Reset(1.5, 15.0, START), -math.inf, 4.0, lambda h, q: h[0]
+    )
+    levels, inputs = simulated(control)
+    np.testing.assert_allclose(np.asarray(run.x), levels, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(np.asarray(run.applied)[:, 0], inputs, rtol=0, atol=1e-9)
+    assert inputs.max() == 1.0 and inputs.min() == 0.0
+
+
+def test_a_flow_cascade_reads_the_flow_behind_the_dead_time_of_its_pump():
+    case = loads(RIG.replace("values = {", f'values = {{ "actuator.delay" = {DEAD * DT},'), **FLOW)
+    run = jaxtank.simulate(case.loop, case.clock)
+    outer, inner = Reset(0.1, 80.0, GAIN * START), Reset(2.0, 1.5, START)
+    control = cascaded(outer, inner, -math.inf, math.inf, lambda h, q: q)
+    levels, inputs = simulated(control, DEAD)
+    np.testing.assert_allclose(np.asarray(run.x), levels, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(np.asarray(run.applied)[:, 0], inputs, rtol=0, atol=1e-9)
+    assert inputs.max() == 1.0 and inputs.min() == 0.0
+
+
+@pytest.mark.parametrize("select", ["low", "high"])
+def test_an_override_resets_both_integrals_by_what_is_applied(select):
+    case = loads(**OVERRIDE, select=select)
+    run = jaxtank.simulate(case.loop, case.clock)
+    main, limiting = Reset(2.0, 40.0, START), Reset(3.0, 10.0, START)
+    choices = []
+
+    def control(h, r, d, q):
+        both = main.output(r - h[1]), limiting.output(1.6 - h[0])
+        choices.append(both[0] < both[1])
+
+        def reset(u):
+            main.reset(u)
+            limiting.reset(u)
+
+        return (min if select == "low" else max)(both), reset
+
+    levels, inputs = simulated(control)
+    np.testing.assert_allclose(np.asarray(run.x), levels, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(np.asarray(run.applied)[:, 0], inputs, rtol=0, atol=1e-9)
+    assert 20 < sum(choices) < SAMPLES - 20  # each of them is selected for a while
+
+
+@pytest.mark.parametrize("table", [CASCADE, FLOW, OVERRIDE], ids=lambda table: table["kind"])
+def test_derivatives_are_differences_of_runs_at_the_limits_too(table):
+    case = loads(**table)
+    names = ["controller.Kc", "controller.Ti", next(n for n in table if n[-3:] in ("_Kc",))]
+    names[2] = f"controller.{names[2]}"
+
+    def error(values):
+        loop = jaxtank.with_values(case.loop, dict(zip(names, values)))
+        return jaxtank.evaluate(loop, case.clock, ["rms_error_total"])["rms_error_total"]
+
+    first = np.array([float(np.asarray(jaxtank.parameters(case.loop)[n])[0]) for n in names])
+    slopes = np.asarray(jax.jit(jax.jacfwd(error))(first))
+    run = jax.jit(jax.vmap(error))
+    steps = 1e-6 * np.diag(first)
+    above, below = run(first + steps), run(first - steps)
+    differences = np.asarray(above - below) / (2e-6 * first)
+    np.testing.assert_allclose(slopes, differences, rtol=1e-5, atol=1e-9)
+
+
+def test_a_measured_inflow_that_is_taken_off_the_input_moves_no_level():
+    still = RIG.replace("[[10.0, 1, 2.2], [80.0, 1, 0.9]]", "[]")
+    case = loads(still, kind="p", Kc=1.0, inflow_gain=-1.0 / GAIN, inflow_of=["upper"])
+    run = jaxtank.simulate(case.loop, case.clock)
+    np.testing.assert_allclose(np.asarray(run.x), 1.0, rtol=0, atol=1e-12)
+    inputs = np.asarray(run.applied)[:, 0]
+    np.testing.assert_allclose(inputs.min(), START - PULSE / GAIN, rtol=1e-12)
+
+
+def test_a_steady_measured_inflow_is_in_the_bias():
+    still = RIG.replace("[[10.0, 1, 2.2], [80.0, 1, 0.9]]", "[]")
+    lines = [line for line in still.splitlines() if not line.startswith("inflow")]
+    steady = "\n".join(lines).replace('"upper", area', '"upper", inflow = 0.01, area') + "\n"
+    steady = steady.replace(f"initial = {START!r}", f"initial = {START - 0.1!r}")
+    case = loads(steady, kind="p", Kc=1.0, inflow_gain=-2.0, inflow_of=["upper"])
+    np.testing.assert_allclose(case.loop.controller.bias, START - 0.1 + 0.02, rtol=1e-9)
+    run = jaxtank.simulate(case.loop, case.clock)
+    np.testing.assert_allclose(np.asarray(run.x), 1.0, rtol=0, atol=1e-9)
+
+
+def test_inputs_follow_another_input_and_a_measured_inflow():
+    pump = f"pump = [{{ gain = {GAIN}, to = 1, high = 1.0, initial = {START!r} }}"
+    dose = "{ gain = 0.02, to = 2, high = 1.0 }"
+    text = RIG.replace(pump, f"{pump}, {dose}, {dose}")
+    table = {"kind": "ratio", "Kc": 1.0, "Ti": 30.0, "bias": START, "follow": [1], "ratio": [0.5]}
+    case = loads(text, **table, follow_inflow=["upper"], inflow_ratio=[20.0])
+    run = jaxtank.simulate(case.loop, case.clock)
+    lead, second, third = np.asarray(run.applied).T
+    assert lead.max() == 1.0 and lead.min() == 0.0
+    np.testing.assert_array_equal(second, 0.5 * lead)
+    t = np.asarray(run.t)
+    np.testing.assert_allclose(third, np.where((t >= 110) & (t < 130), 20.0 * PULSE, 0.0))
+    loop, expected = Reset(1.0, 30.0, START), []
+    for level, r in zip(np.asarray(run.x)[:, 1], np.asarray(run.r)[:, 0]):
+        expected.append(min(max(loop.output(r - level), 0.0), 1.0))
+        loop.reset(expected[-1])
+    np.testing.assert_allclose(lead, expected, rtol=0, atol=1e-10)
+
+
+def test_a_direct_action_is_a_negative_gain():
+    gains = {"Ti": 40.0, "b": 0.6}
+    text = RIG.replace("to = 1, high = 1.0", "from = 1, high = 1.0")
+    runs = [
+        np.asarray(jaxtank.simulate(case.loop, case.clock).x)
+        for case in (
+            loads(text, kind="pi", Kc=-1.0, **gains),
+            loads(text, kind="pi", Kc=1.0, action="direct", **gains),
+        )
+    ]
+    np.testing.assert_array_equal(*runs)
+    with pytest.raises(InputError, match="direct"):
+        loads(kind="p", Kc=-1.0, action="direct")
+
+
+RATIO = {"kind": "ratio", "Kc": 1.0, "Ti": 30.0}
+
+
+@pytest.mark.parametrize("table", [CASCADE, FLOW, OVERRIDE, RATIO], ids=lambda table: table["kind"])
+def test_a_kind_is_written_back_and_has_ranges_to_tune_in(table):
+    case = loads(**table)
+    assert_same_case(rig.loads(rig.dump(case)), case)
+    gains = {n for n in table if n.endswith(("Kc", "Ti"))}
+    assert gain_ranges(case.loop).keys() == {f"controller.{n}[0]" for n in gains}
+    # at rest at the start, and so it stays
+    first = jaxtank.simulate(case.loop, jaxtank.Clock(dt=DT, duration=9.0))
+    np.testing.assert_allclose(np.asarray(first.x), 1.0, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        (CASCADE | {"inner": [2]}, r"controller\.inner"),
+        (CASCADE | {"inner_low": 5.0}, r"controller\.inner_high"),
+        (FLOW | {"inner": [1]}, "'inner'"),
+        (OVERRIDE | {"anti_windup": "clamping"}, "clamping"),
+        (OVERRIDE | {"limited": [1, 2]}, r"controller\.limited"),
+        (RATIO | {"follow": [1]}, r"controller\.follow"),
+        ({"kind": "p", "Kc": 1.0, "gap_gain": 0.5}, r"controller\.deadband"),
+        ({"kind": "pid", "Kc": 1.0, "N": 5.0}, r"controller\.Td"),
+        ({"kind": "p", "Kc": 1.0, "inflow_of": [1]}, r"controller\.inflow_gain"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(table, words):
+    with pytest.raises(InputError, match=words):
+        loads(**table)
