@@ -5,6 +5,7 @@
 # pyright: reportUnknownVariableType=false
 # pyright: reportUnknownArgumentType=false
 # pyright: reportMissingParameterType=false
+# pyright: reportMissingTypeStubs=false
 
 import dataclasses
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+import scipy  # its parts are imported when they are first used
 
 from jaxtank import presets, rig
 from jaxtank.analysis.linear_model import linearise
@@ -19,7 +21,9 @@ from jaxtank.analysis.riccati import lqr
 from jaxtank.case import Case, Free
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.tree import describe, get_value
-from jaxtank.loop.steady import steady_state
+from jaxtank.loop.steady import steady_inflow, steady_state
+from jaxtank.plants.elements import closed_circuit, stored
+from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.components import REGISTERED, ROLES, controller_of, kind_of, model_of
 from jaxtank.rig.template import around
 
@@ -152,9 +156,45 @@ def operating_point(case: Case, plant: Any) -> tuple[np.ndarray, np.ndarray, np.
                 np.asarray(v, float) for v in steady_state(case.loop, setpoint, plant)
             )
         except EquilibriumError:
-            continue
+            rest = _circulating(case.loop, plant, np.asarray(setpoint, dtype=float))
+            if rest is None:
+                continue
+            levels, inputs = rest
         return np.asarray(setpoint, dtype=float), levels, inputs
     raise InputError("no setpoint has a steady state at which first gains could be computed")
+
+
+def _circulating(loop: Any, plant: Any, setpoint: np.ndarray) -> Any:
+    """(levels, inputs) at rest of tanks that exchange nothing with the basin, with the volume that
+    they hold at the start; None where there are none, or none is found.
+    """
+    if not isinstance(plant, TankNetwork) or not (closed := closed_circuit(plant)):
+        return None
+    start, outputs = np.asarray(loop.x0, dtype=float), list(plant.outputs)
+    free = [i for i in range(plant.tanks) if i not in outputs]
+    inflow = np.zeros(plant.tanks) if (flow := steady_inflow(loop)) is None else np.asarray(flow)
+    area = np.asarray(plant.area, dtype=float)
+
+    def held(x: np.ndarray) -> float:
+        volumes = stored(plant, tuple(x))
+        return float(sum(volumes[i] for i in closed))
+
+    def residual(z: np.ndarray) -> np.ndarray:
+        x = np.empty(plant.tanks)
+        x[outputs], x[free] = setpoint, z[: len(free)]
+        rates = plant.derivative(0.0, tuple(x), tuple(z[len(free) :]), tuple(inflow))
+        missing = (held(x) - held(start)) / volume
+        return np.append(np.asarray(rates, dtype=float) * area / volume, missing)
+
+    volume = held(start)
+    first = np.concatenate([start[free], np.asarray(loop.actuator.initial, dtype=float)])
+    with jax.enable_x64(True):
+        rest = scipy.optimize.least_squares(residual, first, x_scale="jac", xtol=1e-15, ftol=1e-15)
+    if not np.max(np.abs(rest.fun)) < 1e-7 or np.any(rest.x[: len(free)] < 0.0):
+        return None
+    x = start.copy()
+    x[outputs], x[free] = setpoint, rest.x[: len(free)]
+    return x, rest.x[len(free) :]
 
 
 def _pid(known: Rig) -> Any:

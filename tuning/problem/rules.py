@@ -28,10 +28,11 @@ from jaxtank.analysis.frequency import OpenLoop
 from jaxtank.analysis.linear_model import linearise, transmission_zeros
 from jaxtank.analysis.margins import Margins, margins
 from jaxtank.case import Case
-from jaxtank.controllers import PID, Controller, SplitRange
+from jaxtank.controllers import PID, Cascade, Controller, FlowCascade, Override, Ratio, SplitRange
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
+from jaxtank.plants.elements import input_flows
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.signals.setpoints import ramps
 from tuning.problem.controllers import operating_point
@@ -74,10 +75,13 @@ class Loop(NamedTuple):
     lag: float  # of its actuator [s]
     delay: float  # of its actuator [s]
     dt: float
+    nested: bool = False  # True where the input is the setpoint of an inner loop
 
 
-def loop_of(case: Case, output: int) -> Loop:
-    """Return the linear model of the loop of an output at the last plateau, other loops open."""
+def loop_of(case: Case, output: int, tank: int | None = None) -> Loop:
+    """Return the linear model of the loop of an output at the last plateau, other loops open; of
+    the level of `tank` where it is named.
+    """
     bank, plant = cast(Any, case.loop.actuator), case.loop.plant
     _, levels, inputs = operating_point(case, plant)
     A, B, C = (np.asarray(v, dtype=float) for v in linearise(plant, levels, inputs))
@@ -86,13 +90,50 @@ def loop_of(case: Case, output: int) -> Loop:
     lag = float(np.max(lags[slopes != 0.0]))
     more = np.asarray(bank.delays or (0.0,) * len(slopes))
     delay = float(bank.delay + np.max(more[slopes != 0.0]))
-    return Loop(A, B @ slopes, C[output], lag, delay, case.clock.dt)
+    row = C[output] if tank is None else np.eye(len(A))[tank]
+    return Loop(A, B @ slopes, row, lag, delay, case.clock.dt)
+
+
+def closed_around(loop: Loop, tank: int, gains: "Gains") -> Loop:
+    """Return a loop whose input is the setpoint of an inner PI on the level of `tank`."""
+    n, inner = len(loop.A), np.eye(len(loop.A))[tank]
+    closed, b = loop.A - gains.Kc * np.outer(loop.b, inner), gains.Kc * loop.b
+    if math.isinf(gains.Ti):
+        return loop._replace(A=closed, b=b, nested=True)
+    integral = gains.Kc / gains.Ti
+    with_integral = np.zeros((n + 1, n + 1))
+    with_integral[:n, :n], with_integral[:n, n] = closed, loop.b
+    with_integral[n, :n] = -integral * inner
+    b, c = np.append(b, integral), np.append(loop.c, 0.0)
+    return loop._replace(A=with_integral, b=b, c=c, nested=True)
+
+
+def flow_gains(case: Case, output: int, loop: Loop) -> tuple["Gains", Loop]:
+    """Return (SIMC gains of a flow loop, the loop whose input is the setpoint of the flow).
+
+    The flow follows its input with the lag and dead time of the actuator, read a sample later; the
+    closed flow loop is a lag and a dead time of this length.
+    """
+    plant: Any = case.loop.plant
+    _, levels, inputs = operating_point(case, plant)
+
+    def flows(u: Any) -> Any:
+        return jnp.stack(list(input_flows(plant, tuple(levels), tuple(u))))
+
+    with jax.enable_x64(True):
+        slope = float(np.asarray(jax.jacfwd(flows)(jnp.asarray(inputs)))[output, output])
+    if not slope:
+        raise InputError("the input moves no flow at the last plateau")
+    dead, lag = loop.delay + loop.dt, max(loop.lag, loop.dt)
+    return Gains(lag / (slope * 2.0 * dead), lag), loop._replace(
+        b=loop.b / slope, lag=dead, nested=True
+    )
 
 
 def _slopes(case: Case, inputs: np.ndarray, output: int) -> np.ndarray:
     """Change of the inputs (m,) for a unit of the controller's output, at inputs (m,)."""
     controller = case.loop.controller
-    if not isinstance(controller, SplitRange):
+    if not isinstance(controller, SplitRange | Ratio):
         return np.eye(len(inputs))[output]
 
     def inputs_of(v: Any) -> Any:
@@ -214,29 +255,35 @@ class Relay(Controller):
         return tuple(b + side * s for b, s in zip(self.base, self.step_up)), state
 
 
-def relay_experiment(case: Case, output: int) -> Ultimate:
+def relay_experiment(case: Case, output: int, linear: Loop | None = None) -> Ultimate:
     """Return Ku = 4 d/(pi a) and Pu of a simulated relay experiment on one loop, others open:
-    d is the amplitude of the input, a that of the level.
+    d is the amplitude of the input, a that of the level, the one that `linear` reads.
     """
     loop, plant = case.loop, case.loop.plant
-    linear = loop_of(case, output)
+    linear = loop_of(case, output) if linear is None else linear
+    if linear.nested:
+        raise InputError(
+            "a relay moves an input, and the outer loop of a cascade moves a setpoint: choose"
+            " another rule"
+        )
     expected = ultimate_of(linear)
     setpoint, levels, inputs = operating_point(case, plant)
     bank: Any = loop.actuator
     low, high = (np.broadcast_to(np.asarray(v, float), inputs.shape) for v in (bank.low, bank.high))
-    slopes, tank = _slopes(case, inputs, output), plant.outputs[output]
+    slopes, tank = _slopes(case, inputs, output), int(np.argmax(linear.c))
+    middle = setpoint[output] if tank == plant.outputs[output] else levels[tank]
     acting = slopes != 0.0
     room = 0.5 * np.min(np.minimum(high - inputs, inputs - low)[acting] / np.abs(slopes[acting]))
-    near = min(setpoint[output], max(float(np.asarray(plant.rim)[tank]) - setpoint[output], 0.0))
+    near = min(middle, max(float(np.asarray(plant.rim)[tank]) - middle, 0.0))
     # by the describing function the level then moves by EXCURSION of the way
-    most = EXCURSION * (near or setpoint[output]) * math.pi * abs(expected.gain) / 4.0
+    most = EXCURSION * (near or middle) * math.pi * abs(expected.gain) / 4.0
     size = float(min(room, most))
     if not 0.0 < size < math.inf:
         raise InputError("a relay has no room: the input is at a limit in the steady state")
     amplitude = slopes * math.copysign(size, expected.gain)
     dt = case.clock.dt
     duration = math.ceil(CYCLES * max(expected.period, 4.0 * dt) / dt) * dt
-    relay = Relay(base=inputs, step_up=amplitude, level=np.asarray(setpoint[output]), tank=tank)
+    relay = Relay(base=inputs, step_up=amplitude, level=np.asarray(middle), tank=tank)
     quiet = dataclasses.replace(
         loop,
         controller=relay,
@@ -251,7 +298,7 @@ def relay_experiment(case: Case, output: int) -> Ultimate:
     run = jaxtank.simulate(quiet, dataclasses.replace(case.clock, duration=duration))
     level, t = np.asarray(run.x)[:, tank], np.asarray(run.t)
     late = t >= 0.5 * duration
-    below = level < setpoint[output]
+    below = level < middle
     rising = t[1:][late[1:] & ~below[:-1] & below[1:]]
     amplitude_of_level = 0.5 * float(np.ptp(level[late]))
     if len(rising) < 2 or not amplitude_of_level > 0.0:
@@ -269,9 +316,9 @@ class Gains(NamedTuple):
     Td: float = 0.0
 
 
-def simc(case: Case, output: int, parts: str) -> Gains:
+def simc(case: Case, output: int, parts: str, loop: Loop) -> Gains:
     """SIMC with tau_c = the dead time (improved SIMC, Td = theta/3, without a second lag)."""
-    process = process_of(loop_of(case, output), 2 if "d" in parts else 1)
+    process = process_of(loop, 2 if "d" in parts else 1)
     theta = process.delay
     closed = 2.0 * theta
     Kc, Ti = 1.0 / (process.gain * closed), min(process.lag, 4.0 * closed)
@@ -282,9 +329,9 @@ def simc(case: Case, output: int, parts: str) -> Gains:
     return Gains(Kc * series, Ti * series, Td / series)
 
 
-def lambda_rule(case: Case, output: int, parts: str) -> Gains:
+def lambda_rule(case: Case, output: int, parts: str, loop: Loop) -> Gains:
     """A closed loop as fast as the open one; three dead times of a process that integrates."""
-    process = process_of(loop_of(case, output), 1)
+    process = process_of(loop, 1)
     theta, Td = process.delay, 0.5 * process.delay
     if math.isinf(process.lag):
         time = 3.0 * theta
@@ -294,9 +341,9 @@ def lambda_rule(case: Case, output: int, parts: str) -> Gains:
     return Gains(1.0 / (process.gain * (time + theta)), process.lag, Td)
 
 
-def ziegler_nichols(case: Case, output: int, parts: str) -> Gains:
+def ziegler_nichols(case: Case, output: int, parts: str, loop: Loop) -> Gains:
     """Of the ultimate gain and period of the linearised loop."""
-    gain, period = ultimate_of(loop_of(case, output))
+    gain, period = ultimate_of(loop)
     if parts == "p":
         return Gains(0.5 * gain)
     if "d" in parts:
@@ -304,9 +351,9 @@ def ziegler_nichols(case: Case, output: int, parts: str) -> Gains:
     return Gains(0.45 * gain, period / 1.2)
 
 
-def amigo(case: Case, output: int, parts: str) -> Gains:
+def amigo(case: Case, output: int, parts: str, loop: Loop) -> Gains:
     """Astrom and Hagglund's approximate M-constrained integral gain optimisation."""
-    process = process_of(loop_of(case, output), 1)
+    process = process_of(loop, 1)
     theta, lag = process.delay, process.lag
     if math.isinf(lag):
         if "d" in parts:
@@ -325,57 +372,93 @@ def amigo(case: Case, output: int, parts: str) -> Gains:
     )
 
 
-def relay(case: Case, output: int, parts: str) -> Gains:
+def relay(case: Case, output: int, parts: str, loop: Loop) -> Gains:
     """Tyreus and Luyben's gains of the cycle of a simulated relay experiment."""
-    gain, period = relay_experiment(case, output)
+    gain, period = relay_experiment(case, output, loop)
     if "d" in parts:
         return Gains(gain / 2.2, 2.2 * period, period / 6.3)
     return Gains(gain / 3.2, 2.2 * period)
 
 
-RULES: dict[str, Callable[[Case, int, str], Gains]] = {
+RULES: dict[str, Callable[[Case, int, str, Loop], Gains]] = {
     "simc": simc,
     "lambda": lambda_rule,
     "ziegler-nichols": ziegler_nichols,
     "amigo": amigo,
     "relay": relay,
 }
-"""{name: rule (case, output, parts of the controller: "p", "pi" or "pid") -> Gains}."""
+"""{name: rule (case, output, parts of the controller, "p", "pi" or "pid", its loop) -> Gains}."""
 
 
-def serves(case: Case) -> bool:
-    """Return whether the rules have gains for the controller of a case."""
-    controller = case.loop.controller
-    if not isinstance(controller, PID) or controller.order is not None:
-        return False
-    if not isinstance(case.loop.plant, TankNetwork):  # its steady states are not known
-        return False
-    return controller.Ti is None or bool(np.all(np.isfinite(controller.Ti)))
+def refusal(case: Case) -> str:
+    """Return why the rules have no gains for the controller of a case, "" where they have."""
+    controller, plant = case.loop.controller, case.loop.plant
+    if not isinstance(controller, PID) or not isinstance(plant, TankNetwork):
+        return (
+            "is for controllers of the kinds p, pi, pid, split-range, ratio, override and cascade"
+            f" on a TankNetwork, and not for {type(controller).__name__} on"
+            f" {type(plant).__name__}"
+        )
+    if controller.order is not None:
+        return "has no gains for an integral of fractional order"
+    if controller.Ti is not None and not np.all(np.isfinite(controller.Ti)):
+        return "has no gains where some loops have integral action and others have none"
+    return ""
 
 
 def rule_gains(case: Case, rule: str) -> dict[str, float]:
     """Return {dotted name of an entry: value} of a rule for every loop of a PID."""
     if rule not in RULES:
         raise unknown("tuning rule", rule, RULES)
-    controller: Any = case.loop.controller
-    if not serves(case):
-        raise InputError(
-            f"rule {rule}: is for controllers p, pi, pid and split-range of a TankNetwork, and not"
-            f" for {type(controller).__name__} of {type(case.loop.plant).__name__}"
-        )
-    parts = "p" + "i" * (controller.Ti is not None) + "d" * (controller.Td is not None)
+    if why := refusal(case):
+        raise InputError(f"rule {rule}: {why}")
     values: dict[str, float] = {}
     for i in range(len(case.loop.plant.outputs)):
         try:
-            gains = RULES[rule](case, i, parts)
+            values |= {f"controller.{n}[{i}]": v for n, v in _gains_of(case, rule, i).items()}
         except InputError as error:
             raise InputError(f"rule {rule}, output {i + 1}: {error}") from None
-        numbers = {"Kc": gains.Kc, "Ti": gains.Ti, "Td": gains.Td}
-        if controller.Tt is not None and controller.Ti is not None:
-            numbers["Tt"] = math.sqrt(gains.Ti * gains.Td) if "d" in parts else gains.Ti
-        values |= {
-            f"controller.{name}[{i}]": value
-            for name, value in numbers.items()
-            if getattr(controller, name) is not None and 0.0 < abs(value) < math.inf
-        }
-    return dict(sorted(values.items(), key=lambda item: "Kc Ti Td Tt".index(item[0][11:13])))
+    return {
+        name: value
+        for name, value in sorted(
+            values.items(), key=lambda item: ORDER.index(item[0].split("[")[0][11:])
+        )
+        if 0.0 < abs(value) < math.inf
+    }
+
+
+ORDER = ("Kc", "Ti", "Td", "Tt", "inner_Kc", "inner_Ti", "limit_Kc", "limit_Ti")
+"""Gains of a rule in the order in which they are printed."""
+
+
+def _gains_of(case: Case, rule: str, output: int) -> dict[str, float]:
+    """Return {gain: value} of a rule for one output; of a cascade by the inner loop first."""
+    controller: Any = case.loop.controller
+    loop, values = loop_of(case, output), {}
+
+    def second(prefix: str, tank: int) -> Gains:
+        parts = "p" if getattr(controller, f"{prefix}_Ti") is None else "pi"
+        gains = RULES[rule](case, output, parts, loop_of(case, output, tank))
+        values.update(_present(controller, {f"{prefix}_Kc": gains.Kc, f"{prefix}_Ti": gains.Ti}))
+        return gains
+
+    if isinstance(controller, FlowCascade):
+        inner, loop = flow_gains(case, output, loop)
+        values |= _present(controller, {"inner_Kc": inner.Kc, "inner_Ti": inner.Ti})
+    elif isinstance(controller, Cascade):
+        tank = controller.inner[output]
+        loop = closed_around(loop, tank, second("inner", tank))
+    elif isinstance(controller, Override):
+        second("limit", controller.limited[output])
+    parts = "p" + "i" * (controller.Ti is not None) + "d" * (controller.Td is not None)
+    gains = RULES[rule](case, output, parts, loop)
+    Kc = gains.Kc if controller.action == "reverse" else -gains.Kc
+    numbers = {"Kc": Kc, "Ti": gains.Ti, "Td": gains.Td}
+    if controller.Ti is not None:
+        numbers["Tt"] = math.sqrt(gains.Ti * gains.Td) if "d" in parts else gains.Ti
+    return _present(controller, numbers) | values
+
+
+def _present(controller: Any, values: dict[str, float]) -> dict[str, float]:
+    """`values` of the gains that a controller has."""
+    return {name: value for name, value in values.items() if getattr(controller, name) is not None}

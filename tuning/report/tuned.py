@@ -14,6 +14,7 @@ from jaxtank.core.tree import describe, get_value
 from jaxtank.limits import limited_levels
 from jaxtank.loop.trajectory import csv
 from tuning.problem.problem import TAIL
+from tuning.problem.rules import ORDER
 from tuning.report import feasible, optimal_input
 from tuning.report.document import Live, Report, Text, terminal
 from tuning.report.folder import earlier, rig_text
@@ -201,7 +202,7 @@ def of_answer(answer, result=None):
         sections.append(_values(result, answer))
     sections.append(_effects(answer, gap=result is not None))
     if result is not None and result.rules:
-        sections.append(_rules(result))
+        sections += _rules(result)
     if proved := [row.starts for row in answer.setting.certificates if row.certified]:
         sections.append(Text([f"proved: {PROMISE}, {start_of(proved)}"], gap=True))
     return sections
@@ -232,29 +233,37 @@ def _values(result, answer):
 
 
 def _rules(result):
-    """The table of tuning rules beside the answer."""
-    of = lambda values, gain: [v for n, v in values.items() if n.startswith(f"controller.{gain}[")]
-    names = [g for g in ("Kc", "Ti", "Td") if any(of(r["parameters"], g) for r in result.rules)]
-    units = {g: describe(result.case.loop, f"controller.{g}")["unit"] for g in names}
-    after, loop = result.answer.after, result.tuned.loop
+    """The table of tuning rules beside the answer, and why some of them have no gains."""
+    loop, unit = result.tuned.loop, cost_unit(result)
+    names = [g for g in ORDER if g != "Tt" and any(_of(r["parameters"], g) for r in result.rules)]
     gains = {
         f"controller.{g}[{i}]": v
         for g in names
         for i, v in enumerate(np.ravel(get_value(loop, f"controller.{g}")).tolist())
     }
-    answer = rule_row("this answer", gains, after)
-    words = {True: "yes", False: "no", None: "-"}
-    rows = [
-        [
-            row["rule"],
-            *(Value(of(row["parameters"], g) or np.nan, 4) for g in names),
-            *(Value(np.nan if row[k] is None else row[k], 3) for k in ("error", "travel_percent")),
-            words[row["holds"]],
-        ]
-        for row in (answer, *result.rules)
-    ]
-    head = ["tuning rules", *(f"{g} [{units[g]}]" for g in names)]
-    return Table(rows, [*head, f"error [{loop.units[0]}]", "input change [%]", "limits hold"], True)
+    answer = rule_row("this answer", gains, result.answer.after)
+    head = [f"{g} [{describe(loop, f'controller.{g}')['unit']}]" for g in names]
+    cost = "cost" if unit == "-" else f"cost [{unit}]"
+    table = Table(
+        [_rule(row, names) for row in (answer, *result.rules)],
+        ["tuning rules", *head, f"error [{loop.units[0]}]", "change [%]", cost, "holds"],
+        True,
+    )
+    reasons = dict.fromkeys(row["why"] for row in result.rules if row["why"])
+    return [table, *([Text(list(reasons))] if reasons else [])]
+
+
+def _of(values, gain):
+    """The entries of a gain in {name: value}."""
+    return [v for n, v in values.items() if n.startswith(f"controller.{gain}[")]
+
+
+def _rule(row, names):
+    """The cells of a rule with the gains `names`."""
+    gains = [Value(_of(row["parameters"], g) or np.nan, 4) for g in names]
+    numbers = [row[k] for k in ("error", "travel_percent", "objective")]
+    holds = {True: "yes", False: "no", None: "-"}[row["holds"]]
+    return [row["rule"], *gains, *(Value(np.nan if v is None else v, 3) for v in numbers), holds]
 
 
 def _effects(answer, gap):

@@ -1,7 +1,7 @@
 """The search of the default answer, from the problem to gains that hold on validation plants."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -147,6 +147,7 @@ class Task:
     samples: int  # validation plants
     progress: Any  # a callable, or None
     may_filter: bool = True
+    rivals: Sequence[Mapping[str, float]] = ()  # gains of tuning rules
     cache: Any = None  # of the first search
     stage: str = ""
     last: dict[str, Any] | None = None
@@ -243,7 +244,8 @@ def _search(
         problem = problem_of(setting, case, task.free, task.plan.seed, checks)
         attempt.evaluator, task.cache = Evaluator(problem, task.cache), None
         plan, first = dataclasses.replace(task.plan, method=automatic(problem)), problem.start()
-        stages = Stages(attempt.evaluator, plan, task.report(setting.cost_unit))
+        rivals = [_at(problem, first, gains) for gains in task.rivals]
+        stages = Stages(attempt.evaluator, plan, task.report(setting.cost_unit), rivals)
         if attempt.solution.point is None:  # else Ctrl-C leaves the answer of the search before
             attempt.solution = stages.solution
         stages.run(first)
@@ -269,6 +271,16 @@ def _search(
         if checks.hold() or attempt.solution.kept.all():
             break
     return checks
+
+
+def _at(problem: Problem, first: np.ndarray, gains: Mapping[str, float]) -> np.ndarray:
+    """Return `first` (P,) with the gains that are free, within their ranges."""
+    z = np.array(first)
+    for i, bound in enumerate(problem.bounds):
+        value = gains.get(bound.name)
+        if value is not None and (bound.scale != "log" or value > 0.0):
+            z[i] = np.clip(bound.to_unit(value), 0.0, 1.0)
+    return z
 
 
 def _tighter(after: Judged, checks: Checks) -> dict[Key, float]:

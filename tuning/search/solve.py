@@ -142,9 +142,11 @@ class Stages:
 
     search: Search
 
-    def __init__(self, evaluator: Evaluator, plan: Plan, report: Callable):
+    def __init__(
+        self, evaluator: Evaluator, plan: Plan, report: Callable, rivals: Sequence[np.ndarray] = ()
+    ):
         self.evaluator, self.plan, self.report = evaluator, plan, report
-        self.solution = Solution()
+        self.solution, self.rivals = Solution(), rivals
 
     def run(self, first: np.ndarray) -> None:
         """Search from z = first (P,)."""
@@ -200,7 +202,9 @@ class Stages:
         return bool(done) and not without_slope(self.search)
 
     def search_from(self, starts: Sequence[np.ndarray]) -> None:
-        """Search from `starts` until two agree, then from screened points that are better."""
+        """Search from `starts` until two agree, then from screened points and rivals that are
+        better.
+        """
         search, plan = self.search, self.plan
         tasks = [(z, number, tuple(plan.local)) for number, z in enumerate(starts)]
         report = lambda: self.report(search)
@@ -212,6 +216,9 @@ class Stages:
         while True:
             search.start, count = len(self.solution.starts), len(search.history)
             z = best_screened(search, self.screened)
+            if z is None and len(self.rivals):
+                zs, self.rivals = np.stack(self.rivals), ()
+                z = best_screened(search, Population(zs, *self.evaluator.screen(zs, plan.coarse)))
             if z is None:
                 return
             self.local_search(z, count)

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.bounds import WIDE
+from jaxtank.bounds import WIDE, gain_ranges
 from jaxtank.case import Case, Free
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
@@ -30,7 +30,7 @@ from tuning.problem.reported import (
     run_measures,
     table_of,
 )
-from tuning.problem.rules import RULES, rule_gains, serves
+from tuning.problem.rules import RULES, refusal, rule_gains
 from tuning.problem.scenarios import noisy, runs_of
 from tuning.problem.slopes import check_slopes
 from tuning.problem.status import Status
@@ -283,6 +283,8 @@ def _default_answer(
         setting = setting.without_filter()
     few = {"tolerance": TOLERANCE, "agree": AGREE, "lower_by": AGREE}
     plan = Plan.of(options, "auto", seed, engine=engine, polish=False, coarse=False, **few)
+    gains, reasons = _gains_of_rules(setting.case)
+    free = _with_rule(case, free, gains.get(GENTLE, {}))
     stated = Problem(setting.searched, free, setting.objective, setting.case.limits, None, seed)
     stated.start()
     _check_functions(setting, stated.needed)
@@ -292,7 +294,8 @@ def _default_answer(
         box = {n: repr(d) for n, d in setting.distributions.items()}
         more = {"distributions": box, "safety_filter": safety_filter, **vars(plan)}
         log = EvaluationLog(checkpoint, _what(stated, samples, "answer", more), resume)
-    task = Task(free, plan, samples, progress, safety_filter is not False, log)
+    rivals = tuple(gains.values())
+    task = Task(free, plan, samples, progress, safety_filter is not False, rivals, log)
     before = judge(_unfiltered(setting), samples, seed)
     near = matters(setting, before, NEAR)
     if safety_filter or (safety_filter is None and near.any()):
@@ -310,7 +313,7 @@ def _default_answer(
     first = solution.search.point(problem.start()) if solution.search is not None else None
     rules = ()
     if not solution.interrupted:
-        rules = rule_rows(setting, samples, seed, round_=attempt.number)
+        rules = rule_rows(setting, samples, seed, attempt.number, gains, reasons)
     summary, cloud = _validation(answer)
     sides = {"before": first, "after": solution.point}
     result = _result(
@@ -339,20 +342,62 @@ def _default_answer(
     return result
 
 
+GENTLE = "lambda"
+"""The slowest rule: from gains that are farther than WIDE from it, ranges that a case does not name
+are about its gains too."""
+
+
+def _with_rule(
+    case: Case, free: Mapping[str, Any] | None, gains: Mapping[str, float]
+) -> Mapping[str, Any] | None:
+    """What is free; of a case that names nothing the gains of its controller, a factor WIDE about
+    those of a rule too where one of these is outside.
+    """
+    if free is not None or case.free or not gains:
+        return free
+    ranges, about = gain_ranges(case.loop), dict[str, Free]()
+    outside = False
+    for name, (low, high, scale) in ranges.items():
+        gain = gains.get(name, 0.0)
+        if low * high > 0.0 and low * gain > 0.0:
+            ends = sorted((gain / WIDE, gain * WIDE))
+            about[name] = Free(min(low, ends[0]), max(high, ends[1]), scale)
+            outside |= not low <= gain <= high
+    return ranges | about if outside else ranges
+
+
+def _gains_of_rules(case: Case) -> tuple[dict[str, dict[str, float]], dict[str, str]]:
+    """({rule: gains}, {rule: why it has none}) of a case; of another controller, none of both."""
+    gains: dict[str, dict[str, float]] = {}
+    reasons: dict[str, str] = {}
+    for rule in () if refusal(case) else RULES:
+        try:
+            gains[rule] = rule_gains(case, rule)
+        except InputError as error:
+            reasons[rule] = str(error)
+    return gains, reasons
+
+
 def rule_rows(
-    setting: Setting, samples: int, seed: int, round_: int = 0
+    setting: Setting,
+    samples: int,
+    seed: int,
+    round_: int = 0,
+    gains: Mapping[str, Mapping[str, float]] | None = None,
+    reasons: Mapping[str, str] | None = None,
 ) -> tuple[dict[str, Any], ...]:
     """Return what each tuning rule gives on validation plants, () of another controller."""
+    if gains is None or reasons is None:
+        gains, reasons = _gains_of_rules(setting.case)
     rows: list[dict[str, Any]] = []
-    for rule in RULES if serves(setting.case) else ():
-        why, judgement = "", None
-        gains: dict[str, float] = {}
-        try:
-            gains = rule_gains(setting.case, rule)
-            judgement = judge(_with_gains(setting, gains), samples, seed, round_)
-        except InputError as error:
-            why = str(error)
-        rows.append(rule_row(rule, gains, judgement) | {"why": why})
+    for rule in () if refusal(setting.case) else RULES:
+        why, judgement = reasons.get(rule, ""), None
+        if rule in gains:
+            try:
+                judgement = judge(_with_gains(setting, gains[rule]), samples, seed, round_)
+            except InputError as error:
+                why = str(error)
+        rows.append(rule_row(rule, gains.get(rule, {}), judgement) | {"why": why})
     return tuple(rows)
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -12,8 +13,10 @@ from jaxtank import rig
 from jaxtank.bounds import gain_ranges
 from jaxtank.core.errors import InputError
 from tuning.problem import rules
+from tuning.problem.controllers import operating_point
+from tuning.search.options import Options
 from tuning.search.setting import setting_of
-from tuning.search.tuner import rule_rows
+from tuning.search.tuner import rule_rows, tune
 
 # Skogestad (2003): integrating process, k' = 0.01 1/s, dead time 60 s
 SIMC = """
@@ -132,3 +135,102 @@ def test_a_rule_is_refused_for_another_controller():
     case = jaxtank.presets.find("gouta2015/backstepping")
     with pytest.raises(InputError, match="Backstepping"):
         rules.rule_gains(case, "simc")
+
+
+CASCADE = {"kind": "cascade", "Kc": 2.0, "Ti": 80.0, "inner": [1], "inner_Kc": 2.0}
+
+
+def series(**table):
+    return rig.loads(re.sub("controller = .*", f"controller = {rig.toml(table)}", SERIES))
+
+
+def test_the_inner_loop_of_a_cascade_has_the_gains_of_its_own_tank():
+    gains = rules.rule_gains(series(**CASCADE, inner_Ti=30.0), "simc")
+    flow, theta = 0.01 * math.sqrt(2 * 9.81 * 1.2), 0.25  # half a sample
+    lag = 2 * 1.0 * 1.2 / flow
+    np.testing.assert_allclose(gains["controller.inner_Kc[0]"], 1.0 / (0.1 * 2 * theta), rtol=1e-6)
+    np.testing.assert_allclose(gains["controller.inner_Ti[0]"], min(lag, 8 * theta), rtol=1e-6)
+
+
+def test_the_outer_loop_of_a_cascade_is_that_of_the_closed_inner_one():
+    case = series(**CASCADE)  # P inside: x1' = -x1/lag + 0.1 K (s - x1)
+    inner = rules.Gains(Kc=2.0)
+    closed = rules.closed_around(rules.loop_of(case, 0), 0, inner)
+    flow = 0.01 * math.sqrt(2 * 9.81 * 1.2)
+    first, second = 2 * 1.0 * 1.2 / flow, 2 * 0.5 * 1.2 / flow
+    process = rules.process_of(closed, 2)
+    times = sorted((second, 1.0 / (1.0 / first + 0.2)), reverse=True)
+    np.testing.assert_allclose((process.lag, process.second), times, rtol=1e-6)
+    steady = 0.2 * times[1]  # of the lower level, which is that of the upper one
+    np.testing.assert_allclose(process.gain * process.lag, steady, rtol=1e-6)
+
+
+SECOND = {
+    "cascade": CASCADE | {"inner_Ti": 30.0},
+    "flow-cascade": {"kind": "flow-cascade", "Kc": 0.05, "Ti": 80.0, "inner_Kc": 4.0}
+    | {"inner_Ti": 1.0},
+    "override": {"kind": "override", "Kc": 1.0, "Ti": 80.0, "limited": [1], "limit": 2.5}
+    | {"limit_Kc": 3.0, "limit_Ti": 20.0},
+}
+
+
+@pytest.mark.parametrize("kind", SECOND)
+def test_simc_stabilises_both_loops_of_a_kind(kind):
+    case = series(**SECOND[kind])
+    gains = rules.rule_gains(case, "simc")
+    assert len(gains) == 5 and all(value > 0.0 for value in gains.values())  # with Tt
+    if kind != "override":  # whose margins are of a switch
+        loop = jaxtank.with_values(case.loop, gains)
+        assert all(plateau.stable for plateau in jaxtank.stability_margins(loop, case.clock))
+
+
+def test_a_relay_has_no_gains_for_a_setpoint_and_says_so():
+    rows = rule_rows(setting_of(series(**SECOND["cascade"])), 8, 0)
+    assert [row["rule"] for row in rows if row["why"]] == ["relay"]
+    assert "cascade" in rows[-1]["why"]
+
+
+def test_a_direct_action_turns_the_sign_of_a_rule():
+    valve = SERIES.replace("drain = 0.01 }", "inflow = 0.0 }").replace(
+        "pump = [", "valve = [{ from = 2, area = 0.02, initial = 0.5 }]\npump = ["
+    )
+    table = {"kind": "split-range", "Kc": 1.0, "Ti": 50.0, "sequence": [1, 2], "reverse": [2]}
+    table |= {"bias": 0.4}
+    reverse = rig.loads(re.sub("controller = .*", f"controller = {rig.toml(table)}", valve))
+    direct = rig.loads(
+        re.sub("controller = .*", f"controller = {rig.toml(table | {'action': 'direct'})}", valve)
+    )
+    one, other = (rules.rule_gains(case, "simc") for case in (reverse, direct))
+    assert one["controller.Kc[0]"] == -other["controller.Kc[0]"]
+    assert one["controller.Ti[0]"] == other["controller.Ti[0]"]
+
+
+CIRCUIT = """
+units = ["m", "m^3/s"]
+reachable = false
+tank = [{ area = 1.0, rim = 5.0, level = 1.0 }, { area = 2.0, rim = 5.0, level = 1.0 }]
+orifice = [{ from = 1, to = 2, area = 0.01 }]
+pump = [{ gain = 1.0, from = 2, to = 1, high = 0.1, initial = 0.02 }]
+plant = { outputs = [1], gravity = 9.81 }
+controller = { kind = "pi", Kc = 0.05, Ti = 60.0 }
+reference = { initial = [1.0], changes = [[100.0, 1, 1.3]], ramp = 0.0 }
+values = { "clock.dt" = 1.0, "clock.duration" = 1000.0 }
+"""
+
+
+def test_a_circuit_rests_with_the_volume_that_it_holds_at_the_start():
+    case = rig.loads(CIRCUIT)
+    _, levels, inputs = operating_point(case, case.loop.plant)
+    np.testing.assert_allclose(levels, (1.3, (3.0 - 1.3) / 2.0), rtol=1e-9)
+    np.testing.assert_allclose(inputs, [0.01 * math.sqrt(2 * 9.81 * 1.3)], rtol=1e-9)
+    gains = rules.rule_gains(case, "simc")  # slope 1/1 m^2, half a sample of dead time
+    np.testing.assert_allclose(gains["controller.Kc[0]"], 1.0, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_an_answer_costs_no_more_than_any_rule_from_gains_far_off():
+    case = rig.loads(SERIES.replace("Kc = 1.0", "Kc = 0.004").replace("Ti = 50.0", "Ti = 2000.0"))
+    result = tune(case, Options(validation=32))
+    costs = {row["rule"]: row["objective"] for row in result.rules if row["holds"]}
+    assert costs and result.objective["after"] < 1.01 * min(costs.values())
+    assert result["controller.Kc[0]"].after > 30.0 * 0.004
