@@ -737,3 +737,49 @@ def test_a_matrix_operation_without_counterpart_is_refused(language):
     else:
         with pytest.raises(InputError, match="no counterpart of the operation solve"):
             language().lines([solve])
+
+
+SERIES = """
+units = ["m", "-"]
+reachable = false
+tank = [
+    { area = 1.0, rim = 3.0, level = 1.0 },
+    { area = 0.5, rim = 3.0, level = 1.0, drain = 0.01 },
+]
+orifice = [{ from = 1, to = 2, area = 0.01 }]
+pump = [{ gain = 0.1, to = 1, high = 1.0, initial = 0.44 }]
+plant = { gravity = 9.81, outputs = [2] }
+reference = { initial = [1.0], changes = [[5.0, 1, 2.0], [60.0, 1, 0.8]], ramp = 0.0 }
+values = { "clock.dt" = 0.5, "clock.duration" = 150.0 }
+"""
+CASCADE = {"kind": "cascade", "Kc": 3.0, "Ti": 60.0, "inner": [1], "inner_Kc": 1.5}
+OVERRIDE = {"kind": "override", "Kc": 2.0, "Ti": 40.0, "limited": [1], "limit": 1.6}
+
+
+@needs_gcc
+@pytest.mark.parametrize(
+    "table",
+    [
+        CASCADE | {"inner_Ti": 15.0},
+        OVERRIDE | {"limit_Kc": 3.0, "limit_Ti": 10.0},
+        {"kind": "pid", "Kc": 2.0, "Ti": 30.0, "Td": 2.0, "N": 5.0, "error_span": 0.5},
+    ],
+    ids=lambda table: table["kind"],
+)
+def test_exported_loops_of_rig_files_are_those_of_the_simulation(tmp_path, table):
+    case = rig.loads(f"{SERIES}controller = {rig.toml(table)}").replace(name="law")
+    run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock))
+    signals = [
+        np.stack([np.asarray(v) for v in part], axis=1)
+        for part in case.loop.reference.sample(case.clock)
+    ]
+    inputs = Compiled(case, tmp_path).run(case, run, signals)
+    np.testing.assert_allclose(inputs, run.applied, rtol=0, atol=1e-12)
+    assert inputs.max() == 1.0 and inputs.min() == 0.0
+
+
+def test_code_that_reads_levels_alone_has_no_measured_flow():
+    flow = {"kind": "flow-cascade", "Kc": 0.1, "Ti": 80.0, "inner_Kc": 2.0, "inner_Ti": 1.5}
+    for table in (flow, {"kind": "p", "Kc": 1.0, "inflow_gain": -2.0}):
+        with pytest.raises(InputError, match="measured flows"):
+            export(rig.loads(f"{SERIES}controller = {rig.toml(table)}"))
