@@ -6,7 +6,7 @@
 import dataclasses
 import functools
 import warnings
-from typing import Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -32,8 +32,34 @@ from jaxtank.safety.outlets import OutletFilter
 from jaxtank.safety.prediction import line_of
 from jaxtank.signals.base import Signal, sampled
 
+Read = TypeVar("Read")
+Written = TypeVar("Written")
 Vector = Any
 """Vector: a tuple of numbers, one per tank, pump or output, or an array (jaxtank.core.vectors)."""
+
+
+if TYPE_CHECKING:
+
+    class Fields:
+        """Fields of a class that is known when a run is made: any name, of any type."""
+
+        def __getattr__(self, name: str) -> Any: ...
+
+    class AnyPlant(Fields, Plant): ...
+
+    class AnySensor(Fields, Sensor): ...
+
+    class AnyObserver(Fields, Observer): ...
+
+    class AnyController(Fields, Controller): ...
+
+    class AnyActuator(Fields, Actuator): ...
+
+    class Part(Generic[Read, Written]):
+        """A part of the loop for type checkers: written as a role, read with any fields."""
+
+        def __get__(self, loop: Any, cls: Any) -> Read: ...
+        def __set__(self, loop: Any, part: Written) -> None: ...
 
 
 @component
@@ -66,11 +92,11 @@ class ClosedLoop:
     ('PID', (2,), ('V', 'V'))
     """
 
-    plant: Plant
-    sensor: Sensor
-    observer: Observer
-    controller: Controller
-    actuator: Actuator
+    plant: "Part[AnyPlant, Plant]"
+    sensor: "Part[AnySensor, Sensor]"
+    observer: "Part[AnyObserver, Observer]"
+    controller: "Part[AnyController, Controller]"
+    actuator: "Part[AnyActuator, Actuator]"
     reference: Signal
     disturbance: Signal | None = None
     faults: Faults | None = None

@@ -47,7 +47,7 @@ def test_typical_user_code_is_accepted(reported):
 def test_mistyped_names_and_keywords_are_reported(reported):
     lines = (CODE / "wrong.py").read_text().splitlines()
     wrong = {i for i, line in enumerate(lines) if line.endswith("# wrong")}
-    assert len(wrong) == 6 and set(reported["wrong.py"]) == wrong
+    assert len(wrong) == 8 and set(reported["wrong.py"]) == wrong
 
 
 @pytest.mark.parametrize("package", [jaxtank, tuning])

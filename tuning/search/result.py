@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.case import Case
 from jaxtank.core.errors import unknown
 from jaxtank.limits import Limit
 from jaxtank.loop.closed_loop import ClosedLoop
@@ -192,8 +193,8 @@ class TuningResult(Result):
     >>> result["controller.Kc[0]"].after, result.status  # doctest: +SKIP
     """
 
-    case: Any
-    tuned: Any
+    case: Case
+    tuned: Case
     method: str
     status: Status
     messages: tuple[Message, ...] = ()

@@ -55,3 +55,17 @@ if study is not None:
     share: np.ndarray = study.failed
 data: tuning.Log = tuning.read_log("run.csv", loop)
 found: tuning.Identification = tuning.identify(case, [data], hold_back=0.2)
+
+tank = jaxtank.Tank("LT101", area="2500 cm^2", rim=1.2, level=np.float64(0.4))
+by_keywords: jaxtank.Case = jaxtank.Rig(
+    units=("m", "%"),
+    tanks=[tank],
+    pumps=[jaxtank.Pump("P101", to="LT101", gain=3e-5, high=100.0)],
+    controller={"kind": "pi", "Kc": 200.0, "Ti": "5 min"},
+    reference=np.array([[0.0, 0.4], [60.0, 0.6]]),
+    dt=5.0,
+    duration="20 min",
+)
+highest: jax.Array = jaxtank.simulate(by_keywords, save_every=2).x.max()
+shares = jaxtank.evaluate(by_keywords, ["max_level"])["max_level"]
+gain = float(by_keywords.loop.controller.Kc[0]) + float(result.tuned.loop.controller.Kc[0])

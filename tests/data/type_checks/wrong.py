@@ -11,3 +11,5 @@ jaxtank.signals.Ramps(initial=[1.0], sahpe="linear")  # wrong
 tuning.tune(case, strats=4)  # wrong
 print(case.lop)  # wrong
 jaxtank.simulat(case.loop, case.clock)  # wrong
+jaxtank.Tank("LT101", aera=1.0)  # wrong
+jaxtank.Rig(tank=[])  # wrong

@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import re
 import tomllib
 from pathlib import Path
 
@@ -142,3 +143,17 @@ def test_an_editor_sees_the_keywords_of_the_schema():
         defaults = [*args.defaults, *args.kw_defaults]
         optional = {a for a, d in zip(listed, defaults) if d is not None}
         assert optional == {n for n, p in parameters.items() if p.default is not p.empty}
+
+
+def test_the_rig_of_the_page_runs():
+    text = (Path(jaxtank.__file__).parent / "README.md").read_text()
+    (example,) = re.findall(r"```python\n(.*?)```", text, re.S)
+    names = {}
+    exec(example, names)
+    run, case = names["run"], names["rig"]
+    # one explicit Euler rule of the test's own, at a hundredth of the step
+    level = 0.4
+    for u in np.asarray(run.u[:-1, 0]):
+        for _ in range(100):
+            level += 0.05 * (3e-5 * u - 4e-4 * np.sqrt(2 * 9.80665 * level)) / 0.5
+    assert case.clock.samples == 241 and level == pytest.approx(float(run.x[-1, 0]), rel=1e-3)
