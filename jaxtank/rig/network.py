@@ -112,6 +112,7 @@ def _read(table, sizes):
     checks = [
         lambda: _check_names(entries),
         lambda: _check_links(rows, entries, sizes.units),
+        lambda: _check_spills(entries["spill"], rows["spill"]),
         lambda: _check_pumps(rows["pump"], entries["pump"], sizes.units),
         lambda: _check_valves(entries["valve"], sizes.units),
     ]
@@ -322,7 +323,7 @@ def _check_names(entries):
 
 
 def _check_links(table, entries, units):
-    """Raise InputError for a link of a tank to itself, and for spills of more than 1 in sum."""
+    """Raise InputError for a link of a tank to itself, and for an orifice without a size."""
     for name in ("orifice", "spill", "pump", "valve"):
         for i, (entry, row) in enumerate(zip(entries[name], table[name])):
             if "from" in row and "to" in row:
@@ -333,7 +334,10 @@ def _check_links(table, entries, units):
         if "area" not in row and "linear" not in row:
             area = unit(SECTIONS["orifice"]["area"].meta(units))
             raise InputError(f"orifice {i + 1} needs area{area}: effective area; or linear")
-    spills, rows = entries["spill"], table["spill"]
+
+
+def _check_spills(spills, rows):
+    """Raise InputError for spills of more than 1 in sum."""
     for source in dict.fromkeys(spill["from"] for spill in spills):
         same = [k for k, spill in enumerate(spills) if spill["from"] == source]
         total = sum(spills[k]["caught"] for k in same)

@@ -453,11 +453,7 @@ def _different(blocks, preset, case):
     for block in blocks:
         in_values = block.title == "[values]" or (in_values and not block.title)
         if in_values:
-            lines = [line for line in block.lines if line.on]
-            new = [line for line in lines if not set(terse(Block("", [line]))) <= known]
-            old = [line for line in lines if line not in new]
-            old = [line._replace(on=False) for line in old if line.name.strip('"') in suggested]
-            lines = new + old
+            lines = _new_first(block.lines, known, suggested)
         elif block.on and (
             block.title in ("", *SHORT) or tables[block.title] != same.get(block.title)
         ):
@@ -467,6 +463,14 @@ def _different(blocks, preset, case):
         if lines or block.title:
             different.append(block._replace(lines=lines))
     return different
+
+
+def _new_first(lines, known, suggested):
+    """Lines of [values] that are not `known`, then those that are `suggested`, commented out."""
+    lines = [line for line in lines if line.on]
+    new = [line for line in lines if not set(terse(Block("", [line]))) <= known]
+    old = [line for line in lines if line not in new]
+    return new + [line._replace(on=False) for line in old if line.name.strip('"') in suggested]
 
 
 def _by_title(blocks):

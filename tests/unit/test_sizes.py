@@ -15,10 +15,9 @@ LARGER = {
     "jaxtank/plants/tank_network.py": {"_flows": 18},
     "jaxtank/plots/equations.py": {"_of_elements": 18, "_streams": 25},
     "jaxtank/rig/entry.py": {"_curve": 16, "written": 17},
-    "jaxtank/rig/network.py": {"_check_links": 21, "_columns": 21, "_vessel": 23},
+    "jaxtank/rig/network.py": {"_columns": 21, "_vessel": 23},
     "jaxtank/rig/validation.py": {"check_limits": 18},
     "jaxtank/rig/warnings.py": {"_signs": 18},
-    "jaxtank/rig/write.py": {"_different": 23},
     "tuning/search/tuner.py": {"_default_answer": 16},
 }
 """{file: {function: its complexity}} of those that are still to be divided; none may be added."""
