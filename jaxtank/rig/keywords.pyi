@@ -33,9 +33,9 @@ def Rig(
     limits: Table | None = ...,
     free: Table | None = ...,
     objective: Table | None = ...,
+    sensors: Sequence[Table] | None = ...,
     plant: Table | None = ...,
     sensor: Table | None = ...,
-    sensors: Sequence[Table] | None = ...,
     actuator: Table | None = ...,
     disturbance: Table | None = ...,
     inflows: Sequence[Table] | None = ...,
@@ -97,6 +97,9 @@ def Pump(
     high: Quantity,
     initial: Quantity = ...,
     dead_zone: Quantity = ...,
+    rate: Quantity = ...,
+    lag: Quantity = ...,
+    delay: Quantity = ...,
 ) -> dict[str, Any]: ...
 def Valve(
     name: str = ...,
@@ -112,4 +115,7 @@ def Valve(
     high: Quantity | None = ...,
     initial: Quantity = ...,
     dead_zone: Quantity = ...,
+    rate: Quantity = ...,
+    lag: Quantity = ...,
+    delay: Quantity = ...,
 ) -> dict[str, Any]: ...
