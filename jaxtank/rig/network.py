@@ -63,7 +63,7 @@ def _is_name(value):
 
 def build(table):
     """Return the Case of a table of a rig file that has [[tank]]."""
-    table = {**table, **{name: _list(table, name) for name in LISTS}}
+    table = _with_drains({**table, **{name: _list(table, name) for name in LISTS}})
     units = _units(table.get("units", list(DEFAULT)))
     sizes = Sizes(len(table["tank"]), units=units)
     table["pump"] = [_with_gain(row, units) for row in table["pump"]]
@@ -92,6 +92,38 @@ def build(table):
         free={},
         objective={"rms_error_total": 1.0},
     )
+
+
+DRAIN = {
+    "area": "drain",
+    "port": "drain_port",
+    "exponent": "drain_exponent",
+    "linear": "drain_linear",
+}
+"""{key of an [[orifice]] into the basin: key of its [[tank]]}"""
+
+
+def _with_drains(table):
+    """A table whose orifices into the basin are the drains of their tanks."""
+    tanks, orifices = [*table["tank"]], []
+    for i, row in enumerate(table["orifice"]):
+        if "to" in row or not row.keys() - {"from"} <= DRAIN.keys():
+            orifices.append(row)
+            continue
+        names = [tank.get("name") for tank in tanks]
+        source = row.get("from")
+        at = names.index(source) if source in names else source
+        if not (isinstance(at, int) and (source in names or 1 <= at <= len(tanks))):
+            orifices.append(row)  # refused with the rest
+            continue
+        at -= source not in names
+        if tanks[at].keys() & set(DRAIN.values()):
+            raise InputError(
+                f"orifice {i + 1}: tank {source} has another opening into the basin: add their"
+                " areas, or name the tank that it flows into (to)"
+            )
+        tanks[at] = tanks[at] | {DRAIN[key]: v for key, v in row.items() if key in DRAIN}
+    return {**table, "tank": tanks, "orifice": orifices}
 
 
 def _read(table, sizes):

@@ -434,10 +434,15 @@ def _rounded(value: float, old: float, digits: int = 2) -> float:
 
 # setpoints
 
+MANY = 24
+"""Setpoints up to which their least change is searched for; nobody sets more by hand."""
+
 
 def _setpoints(needs: Needs) -> Mend | None:
     """The least change of all setpoints, in the sum of its squares."""
     names = list(dict.fromkeys(name for p in needs.plateaus for name in p.names))
+    if len(names) > MANY:
+        return None
     where = np.array([[names.index(name) for name in p.names] for p in needs.plateaus])
     moved = lambda change: needs.setpoints + change[where]
     share = lambda change: needs.feasible(needs.at(moved(change))).mean()

@@ -65,7 +65,7 @@ class Needs:
             raise InputError(
                 f"{case.name}: feasibility is for networks of tanks with as many pumps and valves"
                 " as outputs and an exchange with the basin, and setpoints that are held for a"
-                " while (no sine)"
+                " while (no sine), without a table of inflows"
             )
         count = len(next(iter(values.values()))) if values else 1
         of = lambda name: drawn_values(loop, name, values, count)
@@ -112,9 +112,10 @@ class Needs:
 
 def judges(case: Case) -> bool:
     """Return whether `Needs` is defined for a case."""
-    plant = case.loop.plant
+    plant, inflow = case.loop.plant, case.loop.disturbance
     return (
         isinstance(plant, TankNetwork)
+        and not (inflow is not None and inflow.is_table)  # it never rests
         and (plant.plain or not closed_circuit(plant))
         and plant.pumps == len(plant.outputs)
         and bool(plateaus_of(case))

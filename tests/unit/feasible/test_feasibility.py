@@ -1,5 +1,6 @@
 """Which plants can hold their setpoints at all: one plant at a time, other draws, brute force."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -11,6 +12,7 @@ from jaxtank import presets, rig
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.tree import get_value, parameters, with_values
+from jaxtank.signals import inflow_table
 from tuning.search.setting import setting_of
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import spread_of
@@ -214,6 +216,12 @@ def test_a_case_that_needs_no_mend_is_left_as_it_is():
     np.testing.assert_array_equal(same.loop.reference.targets, case.loop.reference.targets)
 
 
+def with_inflow_table(case):
+    """A case with a flow into tank 1 that never rests."""
+    table = inflow_table(4, [(0, [0.0, 50.0, 100.0], [0.0, 5.0, 1.0])])
+    return case.replace(loop=dataclasses.replace(case.loop, disturbance=table))
+
+
 @pytest.mark.parametrize(
     "call, words",
     [
@@ -226,6 +234,7 @@ def test_a_case_that_needs_no_mend_is_left_as_it_is():
             "no change of its pumps alone was found",
         ),
         (lambda: tuning.feasibility(presets.find("gouta2022/pi")), "setpoints that are held"),
+        (lambda: tuning.feasibility(with_inflow_table(CASE)), "without a table of inflows"),
         (lambda: tuning.feasibility(CASE, samples=0), "samples = 0"),
     ],
 )

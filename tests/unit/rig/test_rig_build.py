@@ -397,3 +397,27 @@ def test_sections_of_older_files_are_read_under_their_present_names():
     for name, extra in (("law", "law = {}"), ("pour", "pour = []")):
         with pytest.raises(InputError, match=rf"\[{name}\] .* \[(controller|inflow)\]"):
             rig.loads(f"{extra}\n{new}")
+
+
+def test_an_orifice_into_the_basin_is_the_drain_of_its_tank():
+    head = """
+        [[tank]]
+        name = "T1"
+        area = 15.0
+        rim = 40.0
+        DRAIN
+        [[pump]]
+        gain = 10.0
+        to = 1
+        high = 12.0
+        [controller]
+        kind = "pi"
+        Kc = 1.0
+        Ti = 50.0
+        """
+    orifice = '[[orifice]]\nfrom = "T1"\narea = 0.5\nport = 2.0\n'
+    drain = head.replace("DRAIN", "drain = 0.5\ndrain_port = 2.0")
+    left, right = (rig.loads(text) for text in (head.replace("DRAIN", "") + orifice, drain))
+    assert rig.dump(left) == rig.dump(right)
+    with pytest.raises(InputError, match="another opening"):
+        rig.loads(drain + orifice)
