@@ -87,7 +87,7 @@ def test_paths_in_texts_exist(name):
 
 
 def first_example():
-    example, _ = blocks("python", "README.md")
+    example = blocks("python", "README.md")[0]
     return compile(example, "README", "exec"), example
 
 
@@ -113,10 +113,18 @@ def test_the_python_example_is_tuned(capsys):
     assert "converged" in printed and "0.03987" in printed
 
 
+def test_the_rig_in_python_runs(capsys, monkeypatch):
+    """Its last line checks the problem in place of a search."""
+    monkeypatch.setattr(package, "tune", lambda case, starts: list(package.Problem(case).objective))
+    exec(compile(blocks("python", "README.md")[1], "README", "exec"), {})
+    printed = capsys.readouterr().out
+    assert "0.0372" in printed and "rms_error_total" in printed
+
+
 def custom_controller():
-    """The front page's example of a custom controller, the second of three examples in Python."""
-    _, example = blocks("python", "README.md")
-    assert len(blocks("python")) == 3
+    """The front page's example of a custom controller, the last of its examples in Python."""
+    *_, example = blocks("python", "README.md")
+    assert len(blocks("python")) == 4
     return compile(example, "README", "exec")
 
 
