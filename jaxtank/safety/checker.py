@@ -111,6 +111,27 @@ def _pipe_root(z, knee):
     return math.copysign(math.inf, z) if math.isinf(z) else z / math.sqrt(math.hypot(z, knee))
 
 
+def readable(sensor, span, full):
+    """((n,) least band, (n,) highest level that is read for certain [cm]); `span` of a leaf over
+    the box, `full` makes it (n,).
+    """
+    ends = {
+        name: span(f"sensor.{name}", getattr(sensor, name))
+        for name in ("noise", "offset", "low", "high", "gain", "full_scale")
+    }
+    needed = full(SIGMAS * ends["noise"][1]) + np.maximum(*map(np.abs, ends["offset"]))
+    top = full(np.inf if sensor.high is None else ends["high"][0])
+    if sensor.low is not None:  # a lower level is read as this one
+        needed = needed + np.maximum(full(ends["low"][1]), 0.0)
+    if sensor.bits and sensor.low is not None and sensor.high is not None:
+        needed = needed + 0.5 * full(ends["high"][1] - ends["low"][0]) / 2**sensor.bits
+    elif sensor.bits:
+        gain, scale = ends["gain"], ends["full_scale"]
+        needed = needed + 0.5 * full(gain[1]) * scale[1] / 2**sensor.bits
+        top = np.minimum(top, full(gain[0]) * scale[0])
+    return needed, top
+
+
 class _Rig:
     """The final numbers: coefficients per tank of the filter's plants, limits, pumps, readings."""
 
@@ -133,7 +154,7 @@ class _Rig:
         self.caught = self.span("plant.caught", plant.caught)[1]
         self._coefficients(safety_filter.least, safety_filter.most, hold / substeps)
         self._pumps(actuator, full)
-        self._readings(sensor, full)
+        self.needed, self.top = readable(sensor, self.span, full)
 
     def span(self, name, value):
         """(lower, upper) of a leaf over the box."""
@@ -203,22 +224,6 @@ class _Rig:
         self.most = np.maximum(np.maximum(self.high, self.under_way), 0.0)
         if self.pulsed:
             self.most = np.maximum(self.most, each("pulse")[1])
-
-    def _readings(self, sensor, full):
-        span = lambda name: self.span(f"sensor.{name}", getattr(sensor, name))
-        self.needed = full(SIGMAS * span("noise")[1]) + np.maximum(*map(np.abs, span("offset")))
-        self.top = np.full(self.tanks, np.inf)
-        low, high = (None if getattr(sensor, end) is None else span(end) for end in ("low", "high"))
-        if low is not None:  # a lower level is read as this one
-            self.needed = self.needed + np.maximum(full(low[1]), 0.0)
-        if high is not None:
-            self.top = full(high[0])
-        if sensor.bits and low is not None and high is not None:
-            self.needed = self.needed + 0.5 * full(high[1] - low[0]) / 2**sensor.bits
-        elif sensor.bits:
-            gain, scale = span("gain"), span("full_scale")
-            self.needed = self.needed + 0.5 * full(gain[1]) * scale[1] / 2**sensor.bits
-            self.top = np.minimum(self.top, full(gain[0]) * scale[0])
 
     def disturbed(self, inflow, volume, draws):
         """Take the inflow disturbances of the case."""

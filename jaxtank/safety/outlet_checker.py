@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy  # its parts are imported when they are first used
 
-from jaxtank.safety.checker import CASE, LIMITS, SIGMAS, Verdict
+from jaxtank.safety.checker import CASE, LIMITS, Verdict, readable
 from jaxtank.safety.known_features import OUTLETS, first_failure, unknown_feature
 
 PARTS = 500
@@ -148,13 +148,8 @@ class _Rig:
         self.ends = [full(end, self.inputs) for end in (actuator.low, actuator.high)]
         self.range = [[self.demand(j, v) for j, v in enumerate(end)] for end in self.ends]
         self.begin = [full(end) for end in box.get("x0", (0.0, 0.0))]
-        spans = lambda name: self.span(f"sensor.{name}", getattr(sensor, name))
-        self.needed = full(SIGMAS * spans("noise")[1]) + np.maximum(*map(np.abs, spans("offset")))
-        self.top = np.full(n, np.inf)
-        if sensor.bits:
-            gain, scale = spans("gain"), spans("full_scale")
-            self.needed = self.needed + 0.5 * full(gain[1]) * scale[1] / 2**sensor.bits
-            self.top = full(gain[0]) * scale[0]
+        self.needed, self.top = readable(sensor, self.span, full)
+        self.shallow = {}  # by tank, as far as computed
         order = [(*row, False) for row in outlet_filter.low_rows]
         order += [(*row, True) for row in outlet_filter.upper_rows]
         self.rows = [_Row(i, up, tuple(movers), k) for k, (i, movers, up) in enumerate(order)]
@@ -267,10 +262,11 @@ class _Rig:
             lift = own - (0.0 if other is None else others[other])
             share = _share(self.plant.lift_curves[j], -lift if takes else lift)
             a, b = a * share, b * share
-        by = lambda k: a if k is None else self.sure(k, own if k == i else others[k], a)
+        dry = lambda k: k is not None and self.sure(k, own if k == i else others[k], 1.0) == 0.0
         if takes == upper:  # a larger input helps
-            return -by(source), -b, True
-        return b, by(first if takes else i), False
+            return (0.0 if dry(source) else -a), -b, True
+        givers = (first, second) if takes else (i,)
+        return b, (0.0 if any(map(dry, givers)) else a), False
 
     def through(self, k, i, own, others, upper):
         """Effect of valve k on tank i."""
@@ -431,7 +427,9 @@ def _kept(rig, i, bounds, upper):
     words = "enter at its limit" if upper else "leave at its low limit"
     reason = f"{passing:.3g} {unit}^3/s more may {words} than its inputs can balance"
     yield passing <= ROUNDING * max(abs(rest), 1e-9), reason
-    yield rig.empty[i] >= _shallow(rig, i) * (1.0 - ROUNDING), "it may run empty within a step"
+    for k in sorted({i} | near):
+        sure = rig.empty[k] >= _shallow(rig, k) * (1.0 - ROUNDING)
+        yield sure, f"tank {k + 1} may run empty within a step"
     if row is not None:
         yield from _row_holds(rig, row, bounds, near)
 
@@ -469,8 +467,6 @@ def _row_holds(rig, row, bounds, near):
             for j in () if free else sorted(rig.neighbours(k, True) | rig.neighbours(k, False)):
                 inside = bounds.high[j] <= rig.reach[j] and bounds.low[j] >= rig.bottom[j]
                 yield inside, f"relies on tank {j + 1}, not proved"
-        sure = rig.empty[k] >= _shallow(rig, k) * (1.0 - ROUNDING)
-        yield sure, f"tank {k + 1} may run empty within a step"
     for other in rig.rows[row.place + 1 :]:
         yield from _compatible(rig, row, other, bounds)
 
@@ -484,6 +480,12 @@ def _fastest(rig, k, upper):
 
 def _shallow(rig, i):
     """The level [cm] below which a tank may hold less than it gives in a step."""
+    if i not in rig.shallow:
+        rig.shallow[i] = _shallow_level(rig, i)
+    return rig.shallow[i]
+
+
+def _shallow_level(rig, i):
     empty, none = rig.empty, np.zeros(rig.n)
     rig.empty = none
     levels, last = np.linspace(0.0, rig.limit[i], FINE + 1), 0.0
@@ -494,7 +496,7 @@ def _shallow(rig, i):
             max(0.0, *(_done(effect, end[j]) for end in rig.range))
             for j, effect in rig.effects(i, h, none, False).items()
         )
-        if rig.step * gives > rig.room(i, 0.0, h):
+        if rig.step * gives > rig.room(i, 0.0, h) * (1.0 + ROUNDING):
             last = levels[min(k + 1, FINE)]
             break
     rig.empty = empty

@@ -223,7 +223,7 @@ def _empty(base, ranges, step):
         others = [jnp.zeros(len(levels))] * base.least.tanks
         gives = base.harmful(i, levels, others, False) + base.draw[i]
         for j, effect in base.effects(i, levels, others, False).items():
-            gives = gives + jnp.maximum(*(effect.of(end[j]) for end in ranges))
+            gives = gives + jnp.maximum(0.0, jnp.maximum(*(effect.of(end[j]) for end in ranges)))
         holds = base._volume(i, 0.0, levels)
         short = np.flatnonzero(np.asarray(step * gives > holds))
         found.append(levels[min(short.max(initial=0) + 1, PARTS)])

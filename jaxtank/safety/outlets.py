@@ -208,11 +208,15 @@ class OutletFilter:
             lift = own - (0.0 if other is None else others[other])
             share = lower_clip(monotone_curve(by_lift, -lift if takes else lift), 0.0)
             least, most = least * share, most * share
-        certain = lambda i: least if i is None else self._certain(
-            i, own if i == tank else others[i], least
-        )  # fmt: skip
-        sure, back = (tank, other) if takes else (other, tank)
-        sure, back = certain(sure), certain(back)
+
+        def certain(*tanks):
+            flow = least
+            for i in (i for i in tanks if i is not None):
+                flow = self._certain(i, own if i == tank else others[i], flow)
+            return flow
+
+        both = self.least.feeds[pump]
+        sure, back = (certain(tank), certain(*both)) if takes else (certain(other), certain(tank))
         if upper:
             return Effect(-sure, -most, True) if takes else Effect(most, back, False)
         return Effect(most, back, False) if takes else Effect(-sure, -most, True)

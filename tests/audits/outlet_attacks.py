@@ -4,12 +4,15 @@
 
 Rigs of valves, pumps in outlets and between tanks, inputs of either sign, shaped tanks, ports,
 exponents. Plants at corners of the box, half of them changing in time; readings off by the whole
-band; inputs full, off or switching; simulated by a code of its own in numpy: of jaxtank it runs the
+band; inputs full, off or switching; simulated by a code of its own in numpy, with volumes
+as the state (a level divides by a section that is 0 at the tip of a cone): of jaxtank it runs the
 filter's `apply` alone. Exit code 1 where a proved limit is passed.
 """
 
 import collections
+import functools
 import sys
+from typing import Any
 
 import jax
 import numpy as np
@@ -67,6 +70,10 @@ def random_rig(seed):
             pump(a, (b, None), 0.0 if loss or rng.random() < 0.7 else -4.0, loss=loss)
     if n > 1 and rng.random() < 0.2:
         pump(None, (0, 1), 0.0)
+    more = np.random.default_rng([seed, 41])
+    if n == 3 and more.random() < 0.4:  # one pump for two tanks, or back from both
+        forth = more.random() < 0.5
+        pump(0, (1, 2), -4.0, 10.0 if forth else 0.0)
     valves = [(i, None) for i in tanks if rng.random() < 0.4]
     valves += [pair for pair in chain if rng.random() < 0.25]
     if not feeds and not valves:
@@ -108,7 +115,12 @@ def random_rig(seed):
         initial=np.zeros(m),
     )
     noise = 0.02 if rng.random() < 0.3 else 0.0
-    sensor = LevelSensor(gain=np.ones(n), noise=np.full(n, noise), full_scale=100.0)
+    span: dict[str, Any] = {"full_scale": np.array(100.0)}
+    if more.random() < 0.3:
+        span |= {"low": more.uniform(-1.0, 4.0, n), "high": rim * more.uniform(0.4, 1.2, n)}
+    if more.random() < 0.2:
+        span["bits"] = int(more.integers(4, 9))
+    sensor = LevelSensor(gain=np.ones(n), noise=np.full(n, noise), **span)
     spread = {"drain": 0.05, "orifice": 0.05, "pipe": 0.05, "pump_gain": 0.1, "split": 0.05}
     spread |= {"valve": 0.1} if valves else {}
     spread |= {"area": 0.05} if rng.random() < 0.3 else {}
@@ -125,6 +137,8 @@ def random_rig(seed):
         "start": least + (limit - least) * rng.uniform(0.05, 1.0, n),
         "substeps": int(rng.integers(1, 4)),
     }
+    if more.random() < 0.2:  # perhaps narrower than the sensor is
+        settings["band"] = np.full(n, more.choice([0.0, 0.1, 1.0]))
     hold = float(rng.choice([0.1, 0.25, 0.5, 1.0]))
     return plant, actuator, sensor, settings, hold
 
@@ -154,12 +168,25 @@ def level_of(shape, area, extent, volume):
         return volume / area
     if shape == "cone":
         return extent * np.cbrt(3.0 * volume / (area * extent))
-    low, high = np.zeros(len(volume)), extent + 0.0
-    for _ in range(50):
-        mid = 0.5 * (low + high)
-        full = volume_of(shape, area, extent, mid) > volume
-        low, high = np.where(full, low, mid), np.where(full, mid, high)
-    return low
+    y, below = table_of(shape)
+    share = np.minimum(volume / (area * extent), below[-1])
+    at = np.interp(share, below, y)
+    for _ in range(5):  # Newton, with the section by a central difference
+        step = 1e-6 * np.maximum(at, 1e-6)
+        section = (of_unit(shape, at + step) - of_unit(shape, at - step)) / (2.0 * step)
+        at = np.clip(at - (of_unit(shape, at) - share) / np.maximum(section, 1e-9), 0.0, 1.0)
+    return extent * at
+
+
+def of_unit(shape, y):
+    return volume_of(shape, 1.0, 1.0, y)
+
+
+@functools.cache
+def table_of(shape):
+    """(levels, volumes) of a tank of unit size."""
+    y = np.linspace(0.0, 1.0, 4001)
+    return y, of_unit(shape, y)
 
 
 def root(h):
@@ -288,8 +315,12 @@ def held(rng, samples, count, draw, periods=(1, 5, 30)):
 
 def attack(rig, outlet_filter, rows, seed, count=32, samples=240):
     """(highest, lowest) levels (n,) [cm] from starts that the certificates allow."""
-    plant, actuator, _, settings, hold = rig
+    plant, actuator, sensor, settings, hold = rig
     rng = np.random.default_rng([seed, 40])
+    span = [
+        none if end is None else np.maximum(end, 0.0)
+        for none, end in ((0.0, sensor.low), (np.inf, sensor.high))
+    ]
     n, m = plant.tanks, plant.pumps
     wanted = rng.choice([-1, 0, 1], count)
     p = parameters(rng, plant, settings["widths"], count, wanted)
@@ -326,7 +357,7 @@ def attack(rig, outlet_filter, rows, seed, count=32, samples=240):
             new = parameters(rng, plant, settings["widths"], count, wanted)
             for name in (name for name in new if name not in STEADY):
                 p[name] = np.where(changing[:, None], new[name], p[name])
-        y = np.maximum(x + errors[k], 0.0)
+        y = np.minimum(np.maximum(x + errors[k], span[0]), span[1])
         u = np.stack([np.asarray(v) for v in filtered(y, command[k])], axis=1)
         assert np.all(u >= low - 1e-12) and np.all(u <= high + 1e-12)
         v = by_tank(plant, p, volume_of, x)
@@ -387,6 +418,10 @@ def main(first, last):
         counts["passed"] += len(passes)
         for tank, side, by in passes:
             print(f"PASSED seed {seed} tank {tank + 1} {side} by {by:.3g} cm", flush=True)
+        if counts["rigs"] % 25 == 0:
+            proved = counts["upper limits proved"], counts["low limits proved"]
+            line = f"{counts['rigs']} rigs, proved {proved[0]} upper and {proved[1]} low limits"
+            print(f"{line}, passed {counts['passed']}", flush=True)
     for name, count in counts.items():
         print(f"{name} | {count}")
     for why, count in reasons.most_common(12):

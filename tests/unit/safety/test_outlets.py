@@ -100,7 +100,7 @@ def test_rigs_without_outlets_have_the_filter_that_they_had():
 
 
 @pytest.mark.parametrize(
-    "seed", [0, 1, 4, *(pytest.param(k, marks=pytest.mark.slow) for k in range(600, 640))]
+    "seed", [0, 1, 4, 17, 23, *(pytest.param(k, marks=pytest.mark.slow) for k in range(600, 640))]
 )
 def test_no_attack_passes_a_proved_limit(seed):
     rows, passes = outlet_attacks.trial(seed)
@@ -171,6 +171,91 @@ def test_the_checker_proves_nothing_that_relies_on_levels_of_neighbours_that_are
     assert not checked(wrong, parts, settings)[1].holds
 
 
+def spans(low=None, high=None, orifice=1.5, **options):
+    """(rig, settings): inflow fills tank 1, whose level no input moves; an orifice fills tank 2,
+    which a valve empties.
+    """
+    plant = network(
+        area=[50.0, 50.0],
+        drain=[0.0, 0.3],
+        links=[(0, 1)],
+        orifice=[orifice],
+        pump_gain=[20.0],
+        feeds=[(1, None)],
+        valves=[(1, None)],
+        valve=[2.2],
+        rim=[40.0, 40.0],
+        overflow=True,
+        bottom=True,
+    )
+    bank = PumpBank(low=np.zeros(2), high=np.array([20.0, 1.0]), initial=np.zeros(2))
+    sensor = LevelSensor(gain=np.ones(2), noise=np.zeros(2), low=low, high=high)
+    settings = {"widths": {}, "limit": [40.0, 20.0], "start": [9.0, 10.0], **options}
+    return (plant, bank, sensor, 0.5), settings
+
+
+def runs(parts, settings):
+    """(highest, lowest) levels by small steps of this test: of `spans`, first with its inflow and
+    full pumps, then without, the valve open.
+    """
+    (plant, bank, sensor, hold), w, fine = parts, np.sqrt(2.0 * 981.0), 20
+    orifice = float(plant.orifice[0])
+    safety_filter = outlet_design(*parts, **settings)[0]
+    apply = jax.jit(lambda y, command: safety_filter.apply(bank, command, None, y, hold)[0])
+    x = np.array(settings["start"])
+    seen = [x]
+    for inflow, command in ((settings.get("inflow", [0.0])[0], (20.0, 0.0)), (0.0, (0.0, 1.0))):
+        for _ in range(150):
+            u, v = apply(sensor.read(tuple(x), None), command)
+            for _ in range(fine):
+                out = w * np.sqrt(np.maximum(x, 0.0))
+                flow = np.array([inflow - orifice * out[0], orifice * out[0] + 20.0 * u])
+                flow[1] -= (0.3 + 2.2 * v) * out[1]
+                x = np.clip(x + hold / fine * flow / 50.0, 0.0, 40.0)
+                seen.append(x)
+    return np.max(seen, axis=0), np.min(seen, axis=0)
+
+
+def test_a_band_narrower_than_the_lower_end_of_a_sensor_proves_no_low_limit():
+    parts, settings = spans(low=np.array([4.0, 4.0]), orifice=0.0, band=[0.0, 0.0])
+    settings["low"] = [0.0, 2.0]  # read as 4 cm, where the valve may still open
+    assert runs(parts, settings)[1][1] < 1.9
+    _, rows = outlet_design(*parts, **settings)
+    assert not rows[1].low_certified and "band" in rows[1].low_reason
+
+
+def test_a_neighbour_that_rises_above_its_sensor_proves_no_limit_of_the_next_tank():
+    parts, settings = spans(high=np.array([10.0, 40.0]), inflow=[420.0, 0.0])
+    assert runs(parts, settings)[0][1] > 39.0
+    _, rows = outlet_design(*parts, **settings)
+    assert not rows[1].certified and "sensor" in rows[1].reason
+
+
+@pytest.mark.parametrize(("low", "proved"), [(0.0, False), (5.0, True)])
+def test_a_pump_that_runs_back_from_two_tanks_counts_only_where_both_hold_liquid(low, proved):
+    plant = network(
+        area=[50.0, 50.0, 50.0],
+        drain=[2.0, 0.0, 0.0],
+        pump_gain=[30.0, 20.0, 20.0],
+        feeds=[(1, 2), (1, None), (2, None)],
+        sources=[0, None, None],
+        split=[0.4, 1.0, 1.0],
+        rim=[60.0, 60.0, 60.0],
+        overflow=True,
+        bottom=True,
+    )
+    bank = PumpBank(  # tank 3 is filled for certain only where it has a low limit
+        low=np.array([-10.0, 15.0, 0.0 if low == 0.0 else 15.0]),
+        high=np.array([0.0, 20.0, 20.0]),
+        initial=np.zeros(3),
+    )
+    sensor = LevelSensor(gain=np.ones(3), noise=np.zeros(3))
+    settings = {"widths": {}, "limit": 60.0, "low": [5.0, 5.0, low], "start": [20.0, 20.0, low]}
+    _, rows = outlet_design(plant, bank, sensor, 0.5, **settings)
+    # 0.4 of 300 cm^3/s come back where tank 3 is dry, 198 leave tank 1 at 5 cm
+    assert rows[1].low_certified and rows[0].low_certified == proved
+
+
 @pytest.mark.parametrize(
     ("change", "word"),
     [
@@ -205,10 +290,10 @@ def test_two_limits_that_need_one_pump_both_ways_are_not_both_proved():
     parts, settings = series()
     plant = dataclasses.replace(parts[0], valves=(), valve=None, rangeability=None)
     plant = dataclasses.replace(plant, characteristics=(), one_way=())
-    bank = PumpBank(low=np.array([2.0, 0.0]), high=np.array([10.0, 10.0]), initial=np.zeros(2))
+    bank = PumpBank(low=np.array([3.0, 0.0]), high=np.array([10.0, 10.0]), initial=np.zeros(2))
     settings["widths"] = {}
     _, rows = outlet_design(plant, bank, *parts[2:], **settings)
-    # what tank 1 has too much can only go into tank 2, which nothing empties
+    # 36 cm^3/s enter tank 1, whose drain takes 24; the rest fills tank 2, which nothing empties
     assert not (rows[0].certified and rows[1].certified)
 
 
