@@ -85,7 +85,8 @@ def _unknown_tanks(log, loop, gap):
 
 def _gaps(log, loop, gap):
     steps = np.diff(log.t)
-    usual, k = float(np.quantile(steps, 0.9 if _irregular(log) else 0.5)), int(np.argmax(steps))
+    share, k = 0.9 if _irregular(log) else 0.5, int(np.argmax(steps))
+    usual = float(np.quantile(steps, share, method="lower"))
     if steps[k] > gap * usual * (1 + 1e-9):
         enough = np.ceil(10 * steps[k] / usual) / 10
         yield k + 1, 0, {"step": steps[k], "t": log.t[k], "usual": usual, "enough": enough}
@@ -93,7 +94,7 @@ def _gaps(log, loop, gap):
 
 def _irregular(log):
     """Whether samples come at irregular times."""
-    low, high = np.quantile(np.diff(log.t), [0.1, 0.9])
+    low, high = np.quantile(np.diff(log.t), [0.1, 0.9], method="lower")
     return high > IRREGULAR * low
 
 
