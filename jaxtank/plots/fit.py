@@ -7,7 +7,7 @@ import itertools
 
 import numpy as np
 
-from jaxtank.plots.style import AFTER, BEFORE, FORBIDDEN, OTHER, REFERENCE, write
+from jaxtank.plots.style import AFTER, BEFORE, FORBIDDEN, OTHER, REFERENCE, plain, write
 
 
 def measured(ax, t, y, simulated, name, unit, validation_from=None):
@@ -18,6 +18,14 @@ def measured(ax, t, y, simulated, name, unit, validation_from=None):
         shaded = {"color": OTHER, "alpha": 0.08, "linewidth": 0}
         ax.axvspan(validation_from, t[-1], label="for validation", **shaded)
     ax.set(ylabel=f"{name} [{unit}]", xlim=(t[0], t[-1]))
+    return ax
+
+
+def column(ax, t, values, name, unit):
+    """Draw a column of a file, as its cells are."""
+    ax.plot(t, values, ".-", color=BEFORE, markersize=2.0, linewidth=0.6)
+    ax.margins(x=0.0, y=0.1)
+    ax.set(ylabel=plain(f"{name} [{unit}]" if unit else name))
     return ax
 
 

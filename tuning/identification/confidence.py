@@ -68,7 +68,8 @@ class Spread:
         self.estimated, residual = estimated, self.residual
         self.freedom = max(residual.size - estimated.size, 1)
         self.scale = float(residual @ residual) / self.freedom
-        slopes = self.fit.jacobian[:, estimated]
+        self.earlier = self.estimation.prior_rows(self.fit.p)[1][:, estimated]
+        slopes = np.concatenate([self.fit.jacobian[:, estimated], self.earlier])
         _, self.singular, self.axes = np.linalg.svd(slopes, full_matrices=False)
         with np.errstate(divide="ignore", invalid="ignore"):
             sd = np.where(self.singular > 0, np.sqrt(self.scale) / self.singular, np.inf)
@@ -89,8 +90,9 @@ class Spread:
         white_noise = 3 / math.sqrt(n / len(self.estimation.data.channels))
         if max(map(abs, correlation), default=0.0) <= white_noise:
             return
+        earlier = self.scale * self.earlier.T @ self.earlier
         for middle in (self._newey_west() * n / self.freedom, self._first_order()):
-            sandwich = inverse @ middle @ inverse
+            sandwich = inverse @ (middle + earlier) @ inverse
             ratio = np.sqrt(np.maximum(np.diag(sandwich), 0) / np.maximum(np.diag(white), 1e-300))
             if ratio.size and np.median(ratio) > self.widened:
                 self.covariance, self.widened = sandwich, float(np.median(ratio))

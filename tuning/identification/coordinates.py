@@ -19,6 +19,10 @@ WITHOUT_EFFECT = {
 }
 
 
+OF_PUMPS = ("pump_gain", "split")
+"""Of a pump that is off throughout, no reading depends on these."""
+
+
 class Scalar(NamedTuple):
     """One parameter: p its logarithm, or its share of the range."""
 
@@ -182,8 +186,8 @@ def free_bounds(loop, free):
     return ranges
 
 
-def default_free(loop):
-    """Return {name: (low, high)}: the default unknowns of an identification."""
+def default_free(loop, logs=()):
+    """Return {name: (low, high)}: the default unknowns of an identification of `logs`."""
     # Pump gains, splits between two tanks, open orifices, pipes, valves, the captured share of an
     # overflow and a constant disturbance; not areas, which are measured with a ruler.
     plant: Any = loop.plant
@@ -201,7 +205,9 @@ def default_free(loop):
     if isinstance(loop.disturbance, Constant):
         sizes = enumerate(np.abs(np.asarray(loop.disturbance.level, dtype=float)).tolist())
         free |= {f"disturbance.level[{i}]": (-10 * v, 10 * v) for i, v in sizes if v}
-    return free
+    used = np.any([np.any(log.u != 0, axis=0) for log in logs], axis=0) if logs else ()
+    off = [f"plant.{n}[{j}]" for j in np.flatnonzero(~np.array(used, bool)) for n in OF_PUMPS]
+    return {name: ends for name, ends in free.items() if name not in off} or free
 
 
 def nominal(loop, names):

@@ -23,6 +23,7 @@ from tuning.identification.least_squares import Fit, profile_likelihood, solve
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import quality, residuals_of, validate
 from tuning.identification.result import Identification
+from tuning.identification.sanity import oddities, swapped
 from tuning.problem.status import Status
 from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
 from tuning.storage.fingerprint import digest, fingerprint
@@ -52,6 +53,7 @@ def identify(
     progress: Callable | None = None,
     ready: Callable | None = None,
     law: str | None = None,
+    prior: bool = True,
 ) -> Identification:
     """Estimate parameters of a rig from experiment data, by least squares on simulated readings.
 
@@ -99,6 +101,9 @@ def identify(
     law : {"pi"}, optional
         Propose a PI controller with gains from the identified model; the case's own
         controller by default.
+    prior : bool
+        Whether the `covariance` of a case that was identified before counts as what is known of
+        its parameters; each log is then given once.
 
     Returns
     -------
@@ -131,7 +136,7 @@ def identify(
     logs = checked(log, case.loop, gap)
     counts, parts = _first_parts(logs, hold_back)
     options: dict[str, Any] = {"start": start, "noise": noise, "substeps": substeps}
-    options |= {"free": free, "samples": max(log.samples for log in logs)}
+    options |= {"free": free, "samples": max(log.samples for log in logs), "prior": prior}
     if substeps is None and _longest_step(logs) > 1.01 * _longest_step(parts):
         options["substeps"] = Estimation(case, logs, **options).substeps  # of the validation set
     partial = Estimation(case, parts, **options)
@@ -150,6 +155,8 @@ def identify(
         options |= {"substeps": partial.substeps, "noise": partial.noise}
         estimation = Estimation(case, logs, **options)
         validation = validate(estimation, partial, best, counts)
+    if estimation is not partial or partial.prior is not None:
+        estimation.prior_weight = float(np.std(best.residual))
         best = solve(estimation, partial.unknowns(best), **settings)
     estimation, best = _within_ranges(estimation, best, settings)
     if not np.isfinite(best.cost):
@@ -161,6 +168,9 @@ def identify(
     if spread.open_axes.any():
         best = _nearest(estimation, best, spread.scale, settings)
         spread, fit_quality = _spread(estimation, best)
+    odd = [oddity for log in logs for oddity in oddities(log, case.loop)]
+    if not interrupted:
+        odd = swapped(estimation, best, fit_quality["rmse"], settings) + odd
     parameters = spread.parameters()
     status = _status(case, best, parameters, interrupted)
     unclear = status is Status.NOT_IDENTIFIABLE
@@ -173,6 +183,7 @@ def identify(
         levels=spread.levels(),
         covariance=spread.covariance_of_parameters(),
         directions=spread.directions(),
+        oddities=odd,
         remedies=remedies(estimation, best, spread) if unclear else [],
         quality=fit_quality
         | {"widened": spread.widened, "noise": [float(v) for v in estimation.noise]},
@@ -234,6 +245,7 @@ def _what(case, logs, partial, **options):
         hold=[log.hold for log in logs],
         free=partial.bounds,
         held_back=[log.samples for log in partial.logs],
+        prior=partial.prior is not None,
         noise=partial.noise,
         substeps=partial.substeps,
         **options,

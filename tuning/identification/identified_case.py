@@ -2,11 +2,13 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.linalg import block_diag
 
 from jaxtank import rig as rigs
 from jaxtank.analysis.linear_model import linearise
@@ -86,7 +88,7 @@ def identified_plant(result):
         gain = float(loop.sensor.gain[tank]) if volts else 1.0
         noise[tank] = (rmse if white else min(rmse, sd)) * gain
     loop = with_values(loop, {"sensor.noise": noise})
-    names, matrix = result.covariance
+    names, matrix = _with_earlier(case.covariance, result)
     uncertain = {}
     for name, share in case.uncertain.items():
         uncertain |= rigs.uncovered(loop, name, share, set(names))
@@ -94,6 +96,18 @@ def identified_plant(result):
     return case.replace(
         name=f"{case.name} identified", loop=loop, uncertain=uncertain, covariance=covariance
     )
+
+
+def _with_earlier(covariance, result):
+    """Return (names, matrix) of the estimates, and of parameters that were estimated before."""
+    names, matrix = result.covariance
+    before, rows = covariance or ((), ())
+    others = [i for i, name in enumerate(before) if name not in result.parameters]
+    if not others:
+        return names, matrix
+    earlier = np.array(rows)[np.ix_(others, others)]
+    joined: Any = block_diag(matrix, earlier)
+    return (*names, *(before[i] for i in others)), joined
 
 
 KINDS = ("pi",)
@@ -162,14 +176,6 @@ def with_pi(case, inputs):
         scenarios=tuple(s for s in case.scenarios if not any(map(ours, s.values))),
     )
     return _with_changes(case, x, start, inputs, total.max()) if still else rigs.check(case)
-
-
-def _around(Kc):
-    """Free of a thirtieth to thirty times gains; below 0 of a valve in an outlet."""
-    if Kc.min() > 0:
-        return Free(float(Kc.min() / 30), float(Kc.max() * 30))
-    high = 30 * Kc.max() if Kc.max() > 0 else Kc.max() / 30
-    return Free(float(30 * Kc.min()), float(high), "linear")
 
 
 def _gain_and_time(loop, model, inputs):

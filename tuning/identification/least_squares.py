@@ -54,12 +54,21 @@ class _Residual:
     def value(self, v):
         """Return the residual with the rows of the prior."""
         rows = self.weight * (v - self.prior) if self.prior.size else self.prior
-        return np.concatenate([self.at(v)[0], rows])
+        readings = self.at(v)[0]
+        return np.concatenate([readings, rows, self._earlier()[0]])
 
     def slope(self, v):
         """Return the Jacobian by the free unknowns with the rows of the prior."""
         slopes = self.at(v)[1][:, self.free]
-        return np.concatenate([slopes, np.diag(self.weight)]) if self.prior.size else slopes
+        if self.prior.size:
+            slopes = np.concatenate([slopes, np.diag(self.weight)])
+        if self.estimation.prior is not None:
+            slopes = np.concatenate([slopes, self._earlier()[1][:, self.free]])
+        return slopes
+
+    def _earlier(self):
+        """Return (residual, Jacobian) of an earlier identification, at the last point."""
+        return self.estimation.prior_rows(self.point[: self.estimation.coordinates.size])
 
 
 def solve(

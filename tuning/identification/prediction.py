@@ -8,8 +8,11 @@ import numpy as np
 from scipy.stats import chi2
 
 from jaxtank.case import Case
+from jaxtank.controllers import OpenLoop
 from jaxtank.core.errors import InputError
+from jaxtank.core.tree import number
 from jaxtank.plants.base import Plant
+from jaxtank.signals.base import Table
 from tuning.identification.data_checks import checked
 from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare
@@ -131,6 +134,46 @@ def predict(
         quality=_quality(estimation, residual, start_samples or 0),
         levels=estimation.first_levels(estimation.unknowns(fit)),
     )
+
+
+def played(case: Case, log: Log) -> Case:
+    """Return a case whose inputs are those of experiment data, from its first readings on."""
+    checked(log, case.loop, np.inf)
+    loop, dt, step = case.loop, case.clock.dt, np.diff(log.t)
+    t, u, linear = log.t - log.t[0], log.u, log.hold == "first-order"
+    if np.ptp(step) > 1e-6 * step.mean():
+        grid = dt * np.arange(int(t[-1] / dt + 1e-9) + 1)
+        rows = np.searchsorted(t, grid + 1e-9 * dt, side="right") - 1
+        u = np.stack([np.interp(grid, t, v) for v in u.T], axis=-1) if linear else u[rows]
+    period = float(np.mean(step)) if u is log.u else dt
+    signal = Table(values=number(u.T), period=period, between="linear" if linear else "hold")
+    x0 = np.array(loop.x0, dtype=float)
+    for readings, tank, volts in zip(log.y.T, log.tanks, log.in_volts):
+        offset = 0.0 if loop.sensor.offset is None else float(loop.sensor.offset[tank])
+        for y in readings[np.isfinite(readings)][:1]:
+            x0[tank] = max(y * float(loop.sensor.gain[tank] if volts else 1.0) - offset, 0.0)
+    return case.replace(
+        loop=dataclasses.replace(loop, controller=OpenLoop(signal=signal), x0=number(x0)),
+        clock=dataclasses.replace(case.clock, duration=dt * int(t[-1] / dt + 1e-9)),
+    )
+
+
+def beside(case: Case, log: Log, run: Any) -> dict[str, Any]:
+    """Return {"name", "t", "channels"} of experiment data and the Trajectory of its `played` case:
+    of each channel its "measured" and "simulated" readings, "rmse", "nrmse_percent", "bias".
+    """
+    t, sensor, channels = log.t - log.t[0], case.loop.sensor, []
+    inside = t <= float(run.t[-1]) * (1 + 1e-9)
+    for y, tank, volts in zip(log.y[inside].T, log.tanks, log.in_volts):
+        offset = 0.0 if sensor.offset is None else float(sensor.offset[tank])
+        level = np.interp(t[inside], np.asarray(run.t), np.asarray(run.x)[:, tank]) + offset
+        simulated = level / float(sensor.gain[tank]) if volts else level
+        fit = fit_of(y[None, :, None], (y - simulated)[None, :, None])
+        row = {"name": f"h{tank + 1}", "unit": "V" if volts else case.loop.units[0]}
+        row |= {name: value for name, (value,) in fit.items()}
+        bias = float(np.nanmean(y - simulated)) if np.isfinite(y).any() else None
+        channels.append(row | {"bias": bias, "measured": y, "simulated": simulated})
+    return {"name": log.name, "t": t[inside], "channels": channels}
 
 
 def _quality(estimation, residual, start):

@@ -13,7 +13,7 @@ from jaxtank.case import Case
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tree import with_values
 from tuning.identification import simulation
-from tuning.identification.coordinates import coordinates_of, free_bounds, nominal
+from tuning.identification.coordinates import coordinates_of, default_free, free_bounds, nominal
 from tuning.identification.experiment import Log
 from tuning.identification.residuals import given_noise, noise_of
 
@@ -51,6 +51,8 @@ class Estimation:
         Runge-Kutta steps per sample; found by halving if omitted.
     samples : int
         Least length that the data are padded to.
+    prior : bool
+        Whether the `covariance` of the case counts: that of an earlier identification.
 
     Raises
     ------
@@ -85,12 +87,15 @@ class Estimation:
         noise: ArrayLike | None = None,
         substeps: int | None = None,
         samples: int = 0,
+        prior: bool = False,
     ):
         self.case, self.logs, loop = case, logs, case.loop
         if start not in STARTS:
             raise InputError(f"start = {start!r}: must be one of {', '.join(STARTS)}")
-        self.bounds = free_bounds(loop, free)
+        self.bounds = free_bounds(loop, default_free(loop, logs) if free is None else free)
         self.coordinates = coordinates_of(self.bounds)
+        self.prior = self._prior() if prior else None
+        self.prior_weight = 1.0  # the standard deviation of the residual, once it is known
         self.rig = simulation.rig_of(loop)
         self.data = simulation.padded(logs, float(loop.actuator.delay), samples)
         self.initial = self._initial_levels(start)  # (logs, tanks), before any is estimated
@@ -106,6 +111,28 @@ class Estimation:
             )
         self.evaluations = 0  # of residual and Jacobian
         self.substeps = self._substeps() if substeps is None else int(substeps)
+
+    def _prior(self):
+        """Return (names, values (n,), root (n, n) of the information) of the case's covariance, of
+        the parameters that are estimated; None without one.
+        """
+        names, matrix = self.case.covariance or ((), ())
+        chosen = [i for i, name in enumerate(names) if name in self.coordinates.names]
+        if not chosen:
+            return None
+        names = tuple(names[i] for i in chosen)
+        root = np.linalg.inv(np.linalg.cholesky(np.array(matrix)[np.ix_(chosen, chosen)]))
+        return names, np.array(list(nominal(self.case.loop, names).values())), root
+
+    def prior_rows(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (residual (n,), Jacobian (n, unknowns)) of the prior at coordinates p."""
+        if self.prior is None:
+            return np.zeros(0), np.zeros((0, self.size))
+        (names, mean, root), of = self.prior, self.coordinates
+        values, slopes = of.values(p), np.zeros((len(names), self.size))
+        slopes[:, : of.size] = of.slopes(p)[[of.names.index(name) for name in names]]
+        change = np.array([values[name] for name in names]) - mean
+        return self.prior_weight * root @ change, self.prior_weight * root @ slopes
 
     def _initial_levels(self, start):
         """Return (logs, tanks) levels of the case or, where measured, of the first reading."""

@@ -5,6 +5,7 @@ import functools
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from jaxtank.case import Case
 from jaxtank.core.text import html_table
@@ -77,6 +78,9 @@ class Identification(Result):
         the factor by which correlated residuals widen the intervals.
     directions : list
         What is not identifiable: {"words", "parameters" {name: factor}, "sd"}.
+    oddities : list
+        What is odd in the data: (kind, log, where, count, first, value), kind one of "frozen",
+        "saturated", "spike", "still", "off", "swapped".
     remedies : list of str
         Which experiments would identify it.
     starts : list
@@ -102,6 +106,7 @@ class Identification(Result):
     covariance: tuple
     quality: dict
     directions: list
+    oddities: list
     remedies: list
     starts: list
     validation: dict | None
@@ -122,6 +127,24 @@ class Identification(Result):
         With covariance and noise.
         """
         return self.proposed[0]
+
+    @property
+    def prior(self) -> dict[str, Any] | None:
+        """Parameters with a prior, and the probability of a change from it as large as this one:
+        {"names", "probability"}; None without a prior.
+        """
+        est = self.estimation
+        if est.prior is None:
+            return None
+        names, _, root = est.prior
+        change = est.prior_rows(self.fit.p)[0] / est.prior_weight
+        later, matrix = self.covariance
+        after = np.array([[name == other for other in later] for name in names], dtype=float)
+        # the covariance of the change is that of the prior less that of the estimates
+        root = root @ after
+        size, axes = np.linalg.eigh(np.eye(len(names)) - root @ np.asarray(matrix) @ root.T)
+        moved = (axes.T @ change)[size > 1e-6] ** 2 / size[size > 1e-6]
+        return {"names": names, "probability": float(chi2.sf(moved.sum(), max(moved.size, 1)))}
 
     @property
     def identifiable(self) -> bool:

@@ -30,6 +30,10 @@ CAPTIONS = {
 }
 
 
+DOUBT = 1e-3
+"""Probability of a change from the prior below which data and prior contradict each other."""
+
+
 def not_identifiable(direction):
     """Return an unidentifiable direction: the name of a parameter, or a step of several."""
     names = list(direction["parameters"])
@@ -41,13 +45,7 @@ def sentences_of(fit):
     agree = sum(s["agrees"] for s in fit.starts)
     words = [*_ending(fit), f"{agree} of {len(fit.starts)} starts ended in the same place"]
     words += _residuals(fit)
-    if fit.case.covariance is not None:
-        parameters = count(len(fit.case.covariance[0]), "parameter")
-        words.append(
-            f"the [covariance] of {parameters} of an earlier identification, in {fit.case.name!r},"
-            " is not used: values and intervals follow from these data alone; give the earlier log"
-            " too, with another --data"
-        )
+    words += _prior(fit)
     words += [
         f"{n} ends at its bound, {p['value']:.4g} {p['unit']}: no interval"
         for n, p in fit.parameters.items()
@@ -61,6 +59,38 @@ def sentences_of(fit):
             )
         words += [_proposal(fit)] if fit.law else []
     return words
+
+
+ODD = {
+    "swapped": "{log}: columns {where} look exchanged: the residual falls to {percent:.2g} % with"
+    " each in place of the other; exchange them with --column",
+    "frozen": "{log}: {where} is frozen at {value:.6g} {unit} for {count} from {first:g} s on,"
+    " while inputs or other levels move: leave these cells empty",
+    "saturated": "{log}: {where} stays at {value:.6g} {unit} for {count} from {first:g} s on, an"
+    " end of what its sensor reads: leave these cells empty where the level went on",
+    "spike": "{log}: {where} has {count} that jump away and back, the first {value:.6g} {unit} at"
+    " {first:g} s: leave them empty, or --loss huber",
+    "off": "{log}: {where} is off throughout: these data tell nothing of its gain",
+    "still": "{log}: {where} is {value:.6g} {unit} throughout: its gain is known only from the"
+    " balance with the other flows",
+}
+"""{kind of an oddity in experiment data: sentence}"""
+
+
+def sentences_on(oddities):
+    """Return a sentence on each oddity of experiment data."""
+    known = [odd._asdict() | {"percent": 100 * odd.value} for odd in oddities]
+    return [
+        ODD[odd["kind"]].format(**odd | {"count": count(odd["count"], "reading")}) for odd in known
+    ]
+
+
+def _headline(fit, status):
+    """Return how the search ended, after what makes its answer worthless."""
+    kinds = dict.fromkeys(odd.kind for odd in fit.oddities if odd.alters_fit)
+    words = {"spike": "spikes", "swapped": "exchanged columns"}
+    names = [words.get(kind, f"{kind} readings") for kind in kinds]
+    return f"data with {' and '.join(names)}; {status}" if names else status
 
 
 def _ending(fit):
@@ -102,6 +132,28 @@ def _residuals(fit):
     return words
 
 
+def _prior(fit):
+    """Return sentences: what an earlier identification, the [covariance] of the case, counts."""
+    if fit.case.covariance is None:
+        return []
+    if fit.prior is None:
+        names = count(len(fit.case.covariance[0]), "parameter")
+        return [
+            f"the [covariance] of {names} of an earlier identification, in {fit.case.name!r}, is"
+            " not used: values and intervals follow from these data alone"
+        ]
+    words = [
+        f"prior: the [covariance] of {', '.join(fit.prior['names'])} in {fit.case.name!r}, of other"
+        " data than these (--no-prior: these data alone)"
+    ]
+    if fit.prior["probability"] < DOUBT:
+        words.append(
+            f"these data contradict the prior (probability {fit.prior['probability']:.1g}): the rig"
+            " has changed, or one of the two logs does not describe it; compare with --no-prior"
+        )
+    return words
+
+
 def _proposal(fit):
     """Return a sentence: the controller that is proposed."""
     case, why = fit.proposed
@@ -132,10 +184,11 @@ def report(fit, page=False):
     status = fit.status.replace("_", " ")
     return Report(
         f"{fit.case.name}: identified",
-        status,
+        _headline(fit, status),
         facts,
         [
-            Text([f"{fit.case.name}: {status}"], on="terminal"),
+            Text([f"{fit.case.name}: {_headline(fit, status)}"], on="terminal"),
+            Text(sentences_on(fit.oddities), items=True),
             Text([note for log in fit.estimation.logs for note in log.notes], items=True),
             Text([_data(fit.estimation)]),
             _parameters(fit),
@@ -255,6 +308,11 @@ def json_of(fit):
             {"name": n, "unit": u, "noise": s} for (n, u), s in zip(fit.channels, quality["noise"])
         ],
         "intervals_widened": quality["widened"],
+        "prior": clean(fit.prior),
+        "oddities": [
+            clean(odd._asdict() | {"sentence": sentence})
+            for odd, sentence in zip(fit.oddities, sentences_on(fit.oddities))
+        ],
         "initial_levels": clean(fit.levels),
         "covariance": {"names": list(free[0]), "matrix": np.asarray(free[1]).tolist()},
         "correlation": {"names": list(names), "matrix": correlation.tolist()},

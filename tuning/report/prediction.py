@@ -1,5 +1,7 @@
 """The report of a Prediction: a rig as it is on experiment data."""
 
+import dataclasses
+
 import numpy as np
 
 from tuning.identification.prediction import WIDE
@@ -10,6 +12,9 @@ from tuning.report.identification import draw_log, fit_csv
 from tuning.report.tables import Table, Value, clean
 
 CAPTIONS = {"fit": "Measured readings (dots), the rig as it is (line), and the inputs."}
+SIDES = ("measured", "simulated")
+ROWS = 12
+"""Times at which readings are printed side by side."""
 CHANCE = 0.01
 """Probability below which residuals are called correlated."""
 FAR = 3.0
@@ -68,6 +73,27 @@ def report(result):
             Text(sentences_of(result), items=True, gap=True),
         ],
     )
+
+
+def with_data(report, compared):
+    """Return the Report of a run with measured beside simulated readings."""
+    t, channels = compared["t"], compared["channels"]
+    rows = [
+        [f"{t[k]:.6g}", *(Value(c[side][k]) for c in channels for side in SIDES)]
+        for k in np.unique(np.linspace(0, len(t) - 1, ROWS).astype(int))
+    ]
+    heads = [f"{c['name']} {side} [{c['unit']}]" for c in channels for side in SIDES]
+    quality = [
+        [c["name"], Value(c["rmse"], 4, c["unit"]), Value(c["bias"], 3, c["unit"]),
+         Value(c["nrmse_percent"], 3, "%")]
+        for c in channels
+    ]  # fmt: skip
+    tables = [
+        Text([f"inputs of {compared['name']}, from its first readings on"], gap=True),
+        Table(quality, ["reading", "RMSE", "mean residual", "fit"]),
+        Table(rows, ["t [s]", *heads], gap=True),
+    ]
+    return dataclasses.replace(report, sections=[*report.sections, *tables])
 
 
 def json_of(result):

@@ -7,6 +7,7 @@ from pathlib import Path
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import write_folder
 from tuning.cli import values
+from tuning.cli.commands.identification import DATA, read_logs
 from tuning.cli.options import CASE, COMMON, RUN, Command, Option
 from tuning.cli.steps import note, open_case, print_result, report_written
 
@@ -63,15 +64,20 @@ def simulate(args):
     if args.others:
         return _simulate_together(args)
     case, second = open_case(args), None if args.against is None else _second_case(args.against)
+    log = _experiment(args, case) if args.data else None
     import jax
 
+    import jaxtank
+    from jaxtank.core.jsonable import clean
     from jaxtank.loop.halving import halving_warnings
     from jaxtank.loop.margins import stability_margins
+    from tuning.identification.prediction import beside, played
     from tuning.problem import reported
     from tuning.problem.scenarios import noisy
-    from tuning.report import simulated
+    from tuning.report import prediction, simulated
     from tuning.report.document import terminal
 
+    case = case if log is None else played(case, log)
     key_of = lambda case: jax.random.key(args.seed) if noisy(case) else None
     key = key_of(case)
     sentences = halving_warnings(case.loop, case.clock, key)
@@ -82,6 +88,10 @@ def simulate(args):
     measures |= reported.margin_measures(case.loop, case.clock) if args.margins else {}
     payload = simulated.json_of_run(case, measures, args.seed, plateaus)
     page = lambda: simulated.report(case, measures, plateaus)
+    if log is not None:
+        compared = beside(case, log, jaxtank.simulate(case.loop, case.clock, key))
+        payload["data"] = clean(compared)
+        page = lambda: prediction.with_data(simulated.report(case, measures, plateaus), compared)
     written = []
     if args.out:
         trajectory = simulated.run_for_people(case, key)
@@ -93,6 +103,13 @@ def simulate(args):
     print_result(args, payload, lambda: terminal(page()))
     report_written(written, args)
     return 0
+
+
+def _experiment(args, case):
+    """Return the experiment data of --data, whose inputs are played."""
+    if len(args.data) > 1 or args.against:
+        raise InputError("--data: of one log and one case: leave the others, and --against, out")
+    return read_logs(args, case)[0]
 
 
 def _notes_on_run(case, measures, key):
@@ -113,7 +130,7 @@ def _notes_on_run(case, measures, key):
 def _simulate_together(args):
     """Run several cases under the same conditions; one table, and with --out one page."""
     names = [args.case, *args.others]
-    for flag in ("gif", "margins", "columns", "against"):
+    for flag in ("gif", "margins", "columns", "against", "data"):
         if getattr(args, flag):
             raise InputError(f"--{flag}: of one case alone, and {len(names)} are given")
     cases = [open_case(argparse.Namespace(**{**vars(args), "case": name})) for name in names]
@@ -201,6 +218,9 @@ COMMANDS = {
                    " the first in the film"),
             Option("--columns", "N", "with --out also print.svg and print.png (300 dpi): the run in"
                    " the width of one or two columns of a journal: 1 or 2", choices=("1", "2")),
+            *DATA[:-2],
+            Option("--hold", "HOW", "inputs of --data between samples: zero-order or first-order",
+                   default=""),
             Option("--margins", help="also print the stability margins of the linearised loop at"
                    " each plateau of the reference", kind="flag"),
         ),

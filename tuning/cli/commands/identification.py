@@ -9,7 +9,14 @@ from jaxtank.core.text import printable
 from tuning.cli import values
 from tuning.cli.interrupts import Interrupts
 from tuning.cli.options import CASE, COMMON, RESUME, RUN, Command, Option
-from tuning.cli.steps import finish, note, open_case, print_result, report_unreachable
+from tuning.cli.steps import (
+    finish,
+    note,
+    open_case,
+    print_result,
+    report_unreachable,
+    report_written,
+)
 from tuning.cli.terminal import Line
 
 LONGEST = 1e7
@@ -22,15 +29,25 @@ STATUS = {"converged": 0, "not_converged": 3, "not_identifiable": 5, "interrupte
 
 def run(args):
     """Run the command; returns the exit code."""
+    if args.case is None and not args.inspect:
+        raise InputError("identify needs a case: PAPER/CASE (see jaxtank list) or a rig file .toml")
     _check_together(args)
-    case = open_case(args)
+    case = open_case(args) if args.case else None
+    if args.inspect:
+        return _inspect(args, case)
     return _plan(args, case) if args.plan else _identify(args, case)
 
 
 def _check_together(args):
     """Raise InputError if options of a planned experiment and of experiment data are both given."""
     problems = []
-    if args.plan:
+    if args.inspect:
+        if args.data or args.plan:
+            problems.append(
+                f"--inspect {args.inspect!r} reads one file and fits nothing: leave --data and"
+                " --plan out"
+            )
+    elif args.plan:
         if args.data:
             problems.append(
                 "--plan compares experiments before there are data: leave it out to fit --data"
@@ -104,10 +121,26 @@ def _identify(args, case):
         progress=interrupts.check,
         ready=ready,
         law=args.law,
+        prior=not args.no_prior,
     )
     line.end()
     _report_next(args, result, finish(result, args))
     return interrupts.code if interrupts.stop else STATUS[result.status]
+
+
+def _inspect(args, case):
+    """Print what a file of experiment data holds, with a [log] table; returns the exit code."""
+    from tuning.identification.inspection import inspect
+    from tuning.report import inspection
+    from tuning.report.document import terminal
+
+    loop, columns = (None, {}) if case is None else (case.loop, dict(case.log))
+    settings = (columns | args.column, args.decimal, args.hold, args.time)
+    result = inspect(args.inspect, loop, *settings, gap=args.gap)
+    written = inspection.save(result, args.out, args.line) if args.out else []
+    print_result(args, inspection.json_of(result), lambda: terminal(inspection.report(result)))
+    report_written(written, args)
+    return 5 if result.problems else 0
 
 
 def predict(args):
@@ -220,6 +253,8 @@ def _voltage(args, case):
 
 
 # fmt: off
+INSPECT = Option("--inspect", "CSV", "print what a file holds: columns, units, ranges, oddities and"
+                 " a [log] table to paste; fits nothing, needs no case")
 DATA = (
     Option("--data", "CSV", "experiment data; several experiments have first levels each",
            kind="list"),
@@ -253,6 +288,8 @@ FIT = (
            choices=("linear", "soft_l1", "huber")),
     Option("--law", "KIND", "write the rig under a controller to tune: pi, with gains from the"
            " identified model", choices=("pi",)),
+    Option("--no-prior", help="these data alone: without the [covariance] of an earlier"
+           " identification", kind="flag"),
     Option("--profile", help="also: profile likelihood of the least certain parameter",
            kind="flag"),
     RESUME,
@@ -272,7 +309,17 @@ COMMANDS = {
     "identify": Command(
         run,
         "plant parameters from experiment data, with intervals; --out DIR writes a rig to tune",
-        (*COMMON, *CASE, *RUN, *DATA, *HELD_BACK, *FIT, *PLAN),
+        (
+            *COMMON,
+            *CASE[:-1],
+            CASE[-1]._replace(nargs="?"),
+            *RUN,
+            INSPECT,
+            *DATA,
+            *HELD_BACK,
+            *FIT,
+            *PLAN,
+        ),
     ),
     "predict": Command(
         predict,

@@ -1,0 +1,111 @@
+"""The report of an Inspection: a file of experiment data before any fit."""
+
+from typing import Any
+
+import numpy as np
+
+from tuning.report.document import Report, Text
+from tuning.report.folder import save as save_all
+from tuning.report.identification import sentences_on
+from tuning.report.tables import Table, Value, clean
+
+CAPTIONS = {"log": "The columns of the file, over time."}
+MOST = 12
+"""Columns that are drawn."""
+
+
+def json_of(result):
+    """Return the JSON object of `jaxtank identify --inspect --json`."""
+    steps = _steps(result)
+    return clean(
+        {
+            "file": result.name,
+            "time": {"header": result.time, "samples": len(result.t), **steps},
+            "columns": [
+                {
+                    "header": c.header,
+                    "slot": c.slot or None,
+                    "unit": c.unit or None,
+                    "values": c.count,
+                    "missing": len(c.values) - c.count,
+                    "low": np.nanmin(c.values) if c.count else None,
+                    "high": np.nanmax(c.values) if c.count else None,
+                    "step": float(np.median(np.diff(c.t))) if len(c.t) > 1 else None,
+                }
+                for c in result.columns
+            ],
+            "log": result.table,
+            "oddities": [
+                odd._asdict() | {"sentence": sentence}
+                for odd, sentence in zip(result.oddities, sentences_on(result.oddities))
+            ],
+            "notes": result.notes,
+            "problems": result.problems,
+        }
+    )
+
+
+def _steps(result) -> dict[str, Any]:
+    """Return {"length", "step", "longest_step"} of the times [s]."""
+    if len(result.t) < 2:
+        return {"length": 0.0, "step": None, "longest_step": None}
+    steps = np.diff(result.t)
+    length = float(result.t[-1] - result.t[0])
+    return {"length": length, "step": float(np.median(steps)), "longest_step": float(steps.max())}
+
+
+def report(result):
+    """Return the Report of an Inspection."""
+    steps = _steps(result)
+    pace = "" if steps["step"] is None else f", every {steps['step']:g} s"
+    longest = steps["longest_step"]
+    if longest and longest > 1.01 * steps["step"]:
+        pace += f" (at most {longest:g} s apart)"
+    words = f"{result.name}: {len(result.t)} samples over {steps['length']:g} s{pace}"
+    rows = []
+    for c in result.columns:
+        ends = [np.nanmin(c.values), np.nanmax(c.values)] if c.count else [np.nan, np.nan]
+        missing, step = len(c.values) - c.count, np.median(np.diff(c.t)) if len(c.t) > 1 else np.nan
+        cells = [c.count, missing, Value(ends, between=" .. "), Value(step, 4, "s")]
+        rows.append([c.header, c.slot or "-", c.unit or "-", *cells])
+    verdict = "can be read" if not result.problems else "cannot be read yet"
+    return Report(
+        f"{result.name}: inspected",
+        verdict,
+        [("samples", len(result.t))],
+        [
+            Text([words]),
+            Text(sentences_on(result.oddities), items=True),
+            Text(result.problems, items=True),
+            Text(result.notes, items=True),
+            Table(rows, ["column", "is", "unit", "values", "missing", "range", "step"], gap=True),
+            Text(result.table.splitlines(), gap=True, layout=True),
+        ],
+        not result.problems,
+    )
+
+
+def figures(result):
+    """Return {"log": matplotlib Figure} of the columns with numbers."""
+    from jaxtank.plots import fit as plots
+    from jaxtank.plots.style import picture
+
+    columns = [c for c in result.columns if c.count][:MOST]
+    if not columns:
+        return {}
+
+    def draw(axes):
+        for ax, column in zip(axes[:, 0], columns):
+            plots.column(ax, column.t, column.values, column.slot or column.header, column.unit)
+        axes[-1, 0].set_xlabel("time [s]")
+
+    size = (7.0, 0.8 + 1.3 * len(columns))
+    title = {"title": result.name, "sharex": True, "squeeze": False}
+    return {"log": picture(draw, size, len(columns), **title)}
+
+
+def save(result, folder, command=None):
+    """Write result.json, log.toml, the picture and report.html; return their paths."""
+    draw, page = (lambda: figures(result)), (lambda: report(result))
+    files = {"log.toml": result.table + "\n"}
+    return save_all(folder, json_of(result), files, draw, page, CAPTIONS, command)
