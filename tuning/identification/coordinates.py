@@ -205,8 +205,15 @@ def default_free(loop, logs=()):
     if isinstance(loop.disturbance, Constant):
         sizes = enumerate(np.abs(np.asarray(loop.disturbance.level, dtype=float)).tolist())
         free |= {f"disturbance.level[{i}]": (-10 * v, 10 * v) for i, v in sizes if v}
-    used = np.any([np.any(log.u != 0, axis=0) for log in logs], axis=0) if logs else ()
-    off = [f"plant.{n}[{j}]" for j in np.flatnonzero(~np.array(used, bool)) for n in OF_PUMPS]
+    return _without_idle(free, logs)
+
+
+def _without_idle(free, logs):
+    """Return `free` without gain and split of a pump that is off throughout all logs."""
+    if not logs:
+        return free
+    used = np.any([np.any(log.u != 0, axis=0) for log in logs], axis=0)
+    off = [f"plant.{name}[{j}]" for j in np.flatnonzero(~used) for name in OF_PUMPS]
     return {name: ends for name, ends in free.items() if name not in off} or free
 
 

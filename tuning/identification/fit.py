@@ -149,15 +149,8 @@ def identify(
         ready()
     fits, interrupted = _searches(cache, partial, starts, seed, settings, progress)
     first = _best(fits, logs[0].name)
-    best, validation = solve(partial, partial.unknowns(first), **settings), None
-    estimation = partial
-    if any(count < log.samples for count, log in zip(counts, logs)):
-        options |= {"substeps": partial.substeps, "noise": partial.noise}
-        estimation = Estimation(case, logs, **options)
-        validation = validate(estimation, partial, best, counts)
-    if estimation is not partial or partial.prior is not None:
-        estimation.prior_weight = float(np.std(best.residual))
-        best = solve(estimation, partial.unknowns(best), **settings)
+    best = solve(partial, partial.unknowns(first), **settings)
+    estimation, best, validation = _of_all(partial, best, logs, counts, options, settings)
     estimation, best = _within_ranges(estimation, best, settings)
     if not np.isfinite(best.cost):
         raise DataError(
@@ -168,9 +161,6 @@ def identify(
     if spread.open_axes.any():
         best = _nearest(estimation, best, spread.scale, settings)
         spread, fit_quality = _spread(estimation, best)
-    odd = [oddity for log in logs for oddity in oddities(log, case.loop)]
-    if not interrupted:
-        odd = swapped(estimation, best, fit_quality["rmse"], settings) + odd
     parameters = spread.parameters()
     status = _status(case, best, parameters, interrupted)
     unclear = status is Status.NOT_IDENTIFIABLE
@@ -183,7 +173,7 @@ def identify(
         levels=spread.levels(),
         covariance=spread.covariance_of_parameters(),
         directions=spread.directions(),
-        oddities=odd,
+        oddities=_odd(estimation, best, fit_quality["rmse"], settings, interrupted),
         remedies=remedies(estimation, best, spread) if unclear else [],
         quality=fit_quality
         | {"widened": spread.widened, "noise": [float(v) for v in estimation.noise]},
@@ -210,6 +200,19 @@ def _first_parts(logs, hold_back):
     """(Number of samples of each log that are fitted first, the log up to there)."""
     counts = [first_samples(log, hold_back) for log in logs]
     return counts, [log.part(0, count) for log, count in zip(logs, counts)]
+
+
+def _of_all(partial, best, logs, counts, options, settings):
+    """Return (Estimation, Fit, validation or None) of whole logs, after a Fit to first parts."""
+    estimation, validation = partial, None
+    if any(count < log.samples for count, log in zip(counts, logs)):
+        options = options | {"substeps": partial.substeps, "noise": partial.noise}
+        estimation = Estimation(partial.case, logs, **options)
+        validation = validate(estimation, partial, best, counts)
+    if estimation is not partial or partial.prior is not None:
+        estimation.prior_weight = float(np.std(best.residual))
+        best = solve(estimation, partial.unknowns(best), **settings)
+    return estimation, best, validation
 
 
 def _longest_step(logs):
@@ -312,6 +315,12 @@ def _spread(estimation, fit):
     """Return (Spread, quality) of a Fit."""
     fit_quality = quality(estimation.data.y, residuals_of(estimation, fit))
     return Spread(estimation, fit, fit_quality["residual_autocorrelation"]), fit_quality
+
+
+def _odd(estimation, fit, rmse, settings, interrupted):
+    """Return the Oddities of the data, exchanged columns first."""
+    pairs = [] if interrupted else swapped(estimation, fit, rmse, settings)
+    return pairs + [odd for log in estimation.logs for odd in oddities(log, estimation.case.loop)]
 
 
 def _nearest(estimation, best, scale, settings):

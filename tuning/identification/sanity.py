@@ -42,33 +42,38 @@ class Oddity(NamedTuple):
 
 def oddities(log: Log, loop=None) -> list[Oddity]:
     """Return the oddities of experiment data; of a rig's sensors with its loop."""
-    rows: list[Oddity] = []
     length, drive = ("", "") if loop is None else loop.units
+    rows = [("pump", j, *row, drive) for j, u in enumerate(log.u.T) for row in _still(log.t, u)]
+    spans = None if loop is None else spans_of(loop)
+    for c, (tank, volts) in enumerate(zip(log.tanks, log.in_volts)):
+        ends = () if spans is None else spans[tank]
+        if loop is not None and volts:
+            ends = (0.0, float(loop.sensor.full_scale))
+        rows += [("h", tank, *row, "V" if volts else length) for row in _of_level(log, c, ends)]
+    return [
+        Oddity(kind, log.name, f"{letter}{i + 1}", int(n), float(first), float(value), unit)
+        for letter, i, kind, n, first, value, unit in rows
+    ]
 
-    def add(kind, where, count, first, value, unit):
-        rows.append(Oddity(kind, log.name, where, int(count), float(first), float(value), unit))
 
-    for j, u in enumerate(log.u.T):
-        if log.samples > 1 and np.ptp(u) == 0.0:
-            kind = "still" if u[0] else "off"
-            add(kind, f"pump{j + 1}", log.samples, log.t[0], u[0], drive)
-    ends = [()] * len(log.tanks)
-    if loop is not None:
-        spans, top = spans_of(loop), float(loop.sensor.full_scale)
-        ends = [(0.0, top) if v else spans[i] for i, v in zip(log.tanks, log.in_volts)]
-    for c, tank in enumerate(log.tanks):
-        present = np.flatnonzero(np.isfinite(log.y[:, c]))
-        t, y, where = log.t[present], log.y[present, c], f"h{tank + 1}"
-        unit = "V" if log.in_volts[c] else length
-        others = np.delete(log.y, c, axis=1)[present]
-        for start, stop in _stuck(y):
-            moved = np.any(np.diff(log.u[present[start] : present[stop - 1]], axis=0) != 0)
-            if moved or _moves(others[start:stop]):
-                kind = "saturated" if _at_end(y, y[start], ends[c]) else "frozen"
-                add(kind, where, stop - start, t[start], y[start], unit)
-        if (k := _spikes(y)).size:
-            add("spike", where, k.size, t[k[0]], y[k[0]], unit)
-    return rows
+def _still(t, u):
+    """Yield (kind, samples, first time, value) of an input that never changes."""
+    if len(u) > 1 and np.ptp(u) == 0.0:
+        yield "still" if u[0] else "off", len(u), t[0], u[0]
+
+
+def _of_level(log, c, ends):
+    """Yield (kind, readings, first time, value) of a channel whose sensor ends at `ends`."""
+    present = np.flatnonzero(np.isfinite(log.y[:, c]))
+    t, y = log.t[present], log.y[present, c]
+    others = np.delete(log.y, c, axis=1)[present]
+    for start, stop in _stuck(y):
+        moved = np.any(np.diff(log.u[present[start] : present[stop - 1]], axis=0) != 0)
+        if moved or _moves(others[start:stop]):
+            kind = "saturated" if _at_end(y, y[start], ends) else "frozen"
+            yield kind, stop - start, t[start], y[start]
+    if (k := _spikes(y)).size:
+        yield "spike", k.size, t[k[0]], y[k[0]]
 
 
 def _stuck(y):

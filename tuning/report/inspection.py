@@ -59,7 +59,7 @@ def report(result):
     steps = _steps(result)
     pace = "" if steps["step"] is None else f", every {steps['step']:g} s"
     longest = steps["longest_step"]
-    if longest and longest > 1.01 * steps["step"]:
+    if longest is not None and longest > 1.01 * float(steps["step"]):
         pace += f" (at most {longest:g} s apart)"
     words = f"{result.name}: {len(result.t)} samples over {steps['length']:g} s{pace}"
     rows = []

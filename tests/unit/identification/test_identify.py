@@ -943,7 +943,7 @@ BAD = {  # words of the command, and what the message must hold; exit code 2
     "--data LOG --decimal ;": "--decimal",
     "--data LOG --law pid": "--law 'pid': must be one of pi",
     "--data LOG --noise 0,05": "the comma may be a decimal one",
-    "--data LOG --column pump1=none": "only a level may be left out",
+    "--data LOG --column t=none": "only a level may be left out",
     "--data LOG --iterations 0 --seed x": "--iterations",
     "--data LOG --dta x": "nearest: --data",
     "--plan --duration 0": "--duration '0': must be above 0",

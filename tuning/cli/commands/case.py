@@ -64,20 +64,16 @@ def simulate(args):
     if args.others:
         return _simulate_together(args)
     case, second = open_case(args), None if args.against is None else _second_case(args.against)
-    log = _experiment(args, case) if args.data else None
+    case, log = _experiment(args, case)
     import jax
 
-    import jaxtank
-    from jaxtank.core.jsonable import clean
     from jaxtank.loop.halving import halving_warnings
     from jaxtank.loop.margins import stability_margins
-    from tuning.identification.prediction import beside, played
     from tuning.problem import reported
     from tuning.problem.scenarios import noisy
-    from tuning.report import prediction, simulated
+    from tuning.report import simulated
     from tuning.report.document import terminal
 
-    case = case if log is None else played(case, log)
     key_of = lambda case: jax.random.key(args.seed) if noisy(case) else None
     key = key_of(case)
     sentences = halving_warnings(case.loop, case.clock, key)
@@ -89,9 +85,7 @@ def simulate(args):
     payload = simulated.json_of_run(case, measures, args.seed, plateaus)
     page = lambda: simulated.report(case, measures, plateaus)
     if log is not None:
-        compared = beside(case, log, jaxtank.simulate(case.loop, case.clock, key))
-        payload["data"] = clean(compared)
-        page = lambda: prediction.with_data(simulated.report(case, measures, plateaus), compared)
+        page = _with_data(case, log, key, payload, page)
     written = []
     if args.out:
         trajectory = simulated.run_for_people(case, key)
@@ -106,10 +100,27 @@ def simulate(args):
 
 
 def _experiment(args, case):
-    """Return the experiment data of --data, whose inputs are played."""
+    """Return (case under the inputs of --data, its Log); (case, None) without."""
+    if not args.data:
+        return case, None
     if len(args.data) > 1 or args.against:
         raise InputError("--data: of one log and one case: leave the others, and --against, out")
-    return read_logs(args, case)[0]
+    from tuning.identification.prediction import played
+
+    log = read_logs(args, case)[0]
+    return played(case, log), log
+
+
+def _with_data(case, log, key, payload, page):
+    """Add measured beside simulated readings to the JSON object; return the page with them."""
+    import jaxtank
+    from jaxtank.core.jsonable import clean
+    from tuning.identification.prediction import beside
+    from tuning.report.prediction import with_data
+
+    compared = beside(case, log, jaxtank.simulate(case.loop, case.clock, key))
+    payload["data"] = clean(compared)
+    return lambda: with_data(page(), compared)
 
 
 def _notes_on_run(case, measures, key):
