@@ -521,8 +521,8 @@ INDICES = {"gather": slice(1, 2), "dynamic_slice": slice(1, None), "scatter": sl
 """{primitive that reads or writes at indices: its operands that are indices}."""
 
 MOVES = """
-broadcast_in_dim reshape transpose squeeze expand_dims slice concatenate pad rev stack tile split
-gather dynamic_slice scatter
+broadcast_in_dim reshape transpose squeeze expand_dims slice concatenate pad rev stack unstack tile
+split gather dynamic_slice scatter
 """
 """Primitives that only move elements."""
 

@@ -405,7 +405,10 @@ def is_numeric(value):
     if isinstance(value, (np.ndarray, np.generic)):
         return np.issubdtype(value.dtype, np.number)
     if isinstance(value, (list, tuple)):
-        return all(is_numeric(v) for v in value) and len({np.shape(v) for v in value}) <= 1
+        try:
+            return all(is_numeric(v) for v in value) and len({np.shape(v) for v in value}) <= 1
+        except ValueError:  # more lists in lists than an array has dimensions
+            return False
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
     try:

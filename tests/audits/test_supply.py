@@ -91,6 +91,8 @@ READ = {
     " rig file names as the kind of a component; nothing from a path",
     ("jaxtank.core.files", "read_text", "read_text"): "after `refusal`: a file of at most 4 MiB",
     ("jaxtank.rig.read", "load", "read_text"): "that of jaxtank.files",
+    ("jaxtank.core.tables", "_sheet", "ZipFile"): "sizes of the parts of an Excel file, in memory,"
+    " before openpyxl reads them",
     ("jaxtank.rig.schema", "_sections", "read_text"): "a table of the package",
     ("jaxtank.presets.paper", "printed", "read_text"): "the numbers of a paper, of the package",
     ("tuning.bench.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from helpers import DATA, RIGS
+from helpers import DATA, RIGS, ROOT
 
 import jaxtank
 from jaxtank import rig
@@ -146,11 +146,10 @@ def test_an_editor_sees_the_keywords_of_the_schema():
 
 
 def test_the_rig_of_the_page_runs():
-    text = (Path(jaxtank.__file__).parent / "README.md").read_text()
-    (example,) = re.findall(r"```python\n(.*?)```", text, re.S)
-    names = {}
-    exec(example, names)
-    run, case = names["run"], names["rig"]
+    text = (ROOT / "README.md").read_text()
+    example = re.findall(r"jaxtank\.Rig\(.*?\n\)", text, re.S)[0]
+    case = eval(example, {"jaxtank": jaxtank})
+    run = jaxtank.simulate(case)
     # one explicit Euler rule of the test's own, at a hundredth of the step
     level = 0.4
     for u in np.asarray(run.u[:-1, 0]):

@@ -280,7 +280,7 @@ LINES = {  # table: {line: words its message must have}
         "changes = [[20.0, 1, 0.0]]": ["reference.targets[0] = 0 cm", "above 0"],
         "changes = [[20.0, 1, nan]]": ["reference.changes has [20.0, 1, nan]", "finite"],
         "changes = [[20.0, 3, 5.0]]": ["[20.0, 3, 5.0]", "from 1 to 2"],
-        "changes = [[20.0, 1.0, 5.0]]": ["[20.0, 1.0, 5.0]"],
+        "changes = [[20.0, 1.5, 5.0]]": ["[20.0, 1.5, 5.0]"],
         "changes = [[20.0, 1]]": ["[20.0, 1]"],
         'changes = [["a", 1, 5]]': ["'a'"],
         "changes = [[[20.0], 1, 5.0]]": ["reference.changes", "[[20.0], 1, 5.0]"],

@@ -299,7 +299,7 @@ OF_A_TANK = {  # (words of the file, others instead): words of the message
     ("[controller]", "[plant]\nknee = 1e-300\n[controller]"): "plant.knee = 1e-300 cm: .* 1e-15 cm",
     ("high = 12.0", "high = 0.0"): "pump 1: high = 0 V: must be above its low, 0 V",
     ("high = 12.0", "low = 13.0\nhigh = 12.0"): "pump 1: high = 12 V: must be above its low, 13 V",
-    ("high = 12.0", "high = 12.0\nlag = 2.0"): r"pump 1: lag .*\"actuator.lag\" in \[values\]",
+    ("high = 12.0", "high = 12.0\npulse = 2.0"): r'pump 1: pulse .*"actuator.pulse" in \[values\]',
     ("rim = 30.0", "rim = 30.0\nbits = 12"): r'tank 1: bits .*"sensor.bits" in \[values\]',
     ("to = 1", "to = 1\nsplit = 0.5"): "pump 1: split is the share of the first of two tanks",
     ("area = 20.0", "area = -20.0"): r"tank 1: area = -20 cm\^2: must be above 0 cm\^2",

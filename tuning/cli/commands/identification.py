@@ -148,10 +148,10 @@ def predict(args):
     if not args.data:
         raise InputError("predict needs --data CSV, experiment data that the rig was not fitted to")
     case = open_case(args)
-    from tuning.identification.prediction import predict as of
+    import tuning
 
-    logs = read_logs(args, case)
-    finish(of(case, logs, start_samples=args.start_samples, gap=args.gap), args)
+    prediction, logs = tuning.predict, read_logs(args, case)
+    finish(prediction(case, logs, start_samples=args.start_samples, gap=args.gap), args)
     return 0
 
 
