@@ -190,3 +190,29 @@ def test_numbers_of_the_filter_are_not_tuned():
     case = presets.find("cascaded/pi").with_safety_filter()
     with pytest.raises(InputError, match=r"safety_filter\.rate: .* \[safety_filter\]"):
         tuning.Problem(case, free={"safety_filter.rate": (0.1, 1.0)})
+
+
+OVERFED = """
+units = ["m", "-"]
+reachable = false
+tank = [{ area = 1.0, rim = 2.0, level = 1.0, inflow = 0.08 }]
+pump = [{ gain = 0.05, to = 1, low = -1.0, high = 0.0 }]
+plant = { gravity = 9.81, overflow = false }
+law = { kind = "pid", Kc = 5.0, Ti = 20.0 }
+reference = { initial = [0.5] }
+values = { "clock.dt" = 0.5, "clock.duration" = 120.0 }
+safety_filter = { limit = [1.8] }
+"""
+
+
+def test_simulate_names_a_level_that_passed_a_limit_and_why_it_is_not_proved(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(OVERFED)
+    result = command("simulate", str(path))
+    # 0.08 m^3/s enter, the pump takes at most 0.05: the level is 1 m + 0.03 m/s 120 s at the end
+    (note,) = (line for line in result.out.splitlines() if "of the safety filter" in line)
+    level = float(note.split(": ")[1].split()[0])
+    assert level == pytest.approx(1.0 + 0.03 * 120.0, rel=1e-3)
+    assert "1.8 m of the safety filter, which is not proved: " in note
+    path.write_text(OVERFED.replace("inflow = 0.08", "inflow = 0.03"))
+    assert "of the safety filter, which" not in command("simulate", str(path)).out
