@@ -239,3 +239,15 @@ def test_ascent_finds_the_corner_of_a_linear_function_and_the_top_of_a_hill():
 def test_what_cannot_be_attacked_is_refused(given, words):
     with pytest.raises(InputError, match=words.replace(".", r"\.")):
         tuning.attack(presets.find("cascaded/pi"), **given)
+
+
+@pytest.mark.parametrize("pumps", ["own", pytest.param("random", marks=pytest.mark.slow)])
+def test_the_filter_of_an_outflow_pump_withstands_attacks_that_pass_its_limit_without_it(pumps):
+    case = rig.load(RIGS.parent / "cases" / "case31_safety_filter_outflow_pump.toml")
+    case = rig.set_values(case, {"clock.duration": 200.0})
+    few = {"starts": 1, "draws": 4, "iterations": 1, "windows": 1, "pumps": pumps}
+    held = tuning.attack(case, **few)
+    assert held.passed == [] and held.worst.certified and held.worst.level <= 2.0
+    free = tuning.attack(case.without_safety_filter(), **few)
+    # from the limit, with the pump off, 0.03 m^3/s raise 1 m^2 by 6 m in 200 s
+    assert free.worst.level == pytest.approx(2.0 + 0.03 * 200.0)
