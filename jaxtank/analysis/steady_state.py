@@ -145,16 +145,16 @@ def responses(plant, xp, inflow=None):
     return speeds, solution[len(free) :]
 
 
-def at_rest(plant, y, inflow=None, start=None, shared=None):
+def at_rest(plant, y, inflow=None, start=None, shared=None, held=()):
     """Return (levels (n,), inputs (m,), largest net inflow left) of a network of any elements where
     it stands still with outputs y (m,); differentiable, and as near to rest as was found.
 
     inflow : (n,) [cm^3/s] or None. start : (levels, inputs) to begin at, or None. shared : as in
-    `equilibrium`
+    `equilibrium`. held: `unregulated` tanks, half full, which may fill or run empty meanwhile
     """
     # Levenberg-Marquardt in the roots of the free levels and in the inputs; the derivatives
     # follow from the implicit function theorem.
-    free = [i for i in range(plant.tanks) if i not in plant.outputs]
+    free = [i for i in range(plant.tanks) if i not in {*plant.outputs, *held}]
     y, m = jnp.stack([jnp.asarray(v, dtype=float) for v in y]), len(free)
     scale = jax.lax.stop_gradient(jnp.max(y)) + plant.knee
     if start is None:
@@ -165,14 +165,15 @@ def at_rest(plant, y, inflow=None, start=None, shared=None):
         z = jnp.concatenate([jnp.sqrt(jnp.maximum(levels / scale, 0.0)), jnp.stack([*start[1]])])
 
     def split(z):
-        x = [0.0] * plant.tanks
+        x = [0.5 * plant.rim[i] for i in range(plant.tanks)]
         for value, i in [*zip(y, plant.outputs), *zip(scale * z[:m] * z[:m], free)]:
             x[i] = value
         return tuple(x), tuple(z[m:] if shared is None else shared(z[m:]))
 
     def imbalance(z):
         x, u = split(z)
-        return jnp.stack(elements.net_flows(plant, x, u, inflow))
+        rates = elements.net_flows(plant, x, u, inflow)
+        return jnp.stack([v for i, v in enumerate(rates) if i not in held])
 
     def solve(residual, z):
         eps = float(jnp.finfo(z.dtype).eps)
@@ -474,10 +475,11 @@ def equilibrium(
     if inflow is not None:
         inflow = np.asarray(inflow, dtype=float)
         words += " with inflow (" + ", ".join(f"{v:g}" for v in inflow) + f") {length}^3/s"
-    if plant.plain and not plant.pipes and shared is None:
+    held = tuple(elements.unregulated(plant))
+    if plant.plain and not plant.pipes and shared is None and not held:
         x, u = _free_discharge(plant, y, words, inflow)
     else:
-        x, u = _balanced(plant, y, words, inflow, shared)
+        x, u = _balanced(plant, y, words, inflow, shared, held)
     low = np.minimum(np.broadcast_to(np.asarray(low, dtype=float), u.shape), 0.0)
     for j, volts in enumerate(u):
         if volts < low[j] - 1e-9 * max(1.0, float(np.max(np.abs(u)))):
@@ -527,10 +529,10 @@ def _rate(plant, x, u):
 _slope = jax.jit(jax.jacfwd(_rate, argnums=(1, 2)))
 
 
-def _balanced(plant, y, words, inflow, shared):
+def _balanced(plant, y, words, inflow, shared, held):
     """(levels, inputs) at rest of a network with pipes or other elements, by damped Newton."""
-    if not plant.plain or shared is not None:
-        return _rest_of_elements(plant, y, words, inflow, shared)
+    if not plant.plain or shared is not None or held:
+        return _rest_of_elements(plant, y, words, inflow, shared, held)
     check_rest(plant, "equilibrium")
     speed = (
         float(np.max(np.abs(plant.drain)))
@@ -554,18 +556,23 @@ def _balanced(plant, y, words, inflow, shared):
     return x, u
 
 
-_at_rest = jax.jit(at_rest)
+_at_rest = jax.jit(at_rest, static_argnames="held")
 
 
-def _rest_of_elements(plant, y, words, inflow, shared):
+def _rest_of_elements(plant, y, words, inflow, shared, held):
     """(levels, inputs) at rest of a network of any elements; an input may be below its limit."""
-    if shared is None and not plant.plain:
+    if shared is None and not (plant.plain and plant.pipes):
         check_rest(plant, "steady state")
-    solve = _at_rest if shared is None else jax.jit(functools.partial(at_rest, shared=shared))
+    solve = functools.partial(at_rest, shared=shared, held=held)
+    solve = functools.partial(_at_rest, held=held) if shared is None else jax.jit(solve)
     with jax.enable_x64(True):
         exact = jax.tree.map(lambda v: np.asarray(v, dtype=float), (plant, y, inflow))
         x, u, imbalance = jax.tree.map(np.asarray, solve(*exact))
-        flows = [float(np.abs(s.flow)) for s in elements.streams(exact[0], x, u)]
+        flows = [  # those at work may all be 0: a valve closed, a pump off
+            float(np.abs(s.flow))
+            for inputs in (u, _middle(plant))
+            for s in elements.streams(exact[0], x, inputs)
+        ]
     if not imbalance <= 1e-9 * max(flows):
         raise EquilibriumError(f"{words} have no steady state")
     return np.array(x), np.array(u)

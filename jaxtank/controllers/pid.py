@@ -15,8 +15,10 @@ from jaxtank.controllers.base import Controller
 from jaxtank.controllers.feedback_linearisation import authority, check_own_pumps, drift
 from jaxtank.core.clock import pointwise
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import name_of
 from jaxtank.core.numerics import clip
 from jaxtank.core.records import Estimate, Tick
+from jaxtank.core.text import shortened
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.core.vectors import each, is_array, take
 from jaxtank.plants.base import Plant
@@ -379,17 +381,21 @@ class PID(Controller):
 
     def check_inputs(self) -> None:
         """Raise InputError unless there is an input for each output."""
-        outputs, pumps = len(self.model.outputs), self.model.pumps
-        if outputs != pumps:
+        model, pumps = self.model, self.model.pumps
+        outputs = len(model.outputs)
+        if outputs == pumps:
+            return
+        more = ": name as many of its tanks in plant.outputs"
+        if pumps > outputs:
+            names = [name_of(model, "pump", j) or j + 1 for j in range(pumps)]
             more = (
-                ': several inputs that share one level are kind = "split-range", with sequence ='
-                " [the first, the second, ...]"
-                if pumps > outputs
-                else ": name as many of its tanks in plant.outputs"
+                f": write lead = {shortened(names[:outputs])}, the input of each output, and the"
+                " others hold their `initial`; several inputs that share one level are kind ="
+                ' "split-range", with sequence = [the first, the second, ...]'
             )
-            raise InputError(
-                f"PID needs one pump per output: the model has {pumps} and {outputs}{more}"
-            )
+        raise InputError(
+            f"PID needs one pump per output: the model has {pumps} and {outputs}{more}"
+        )
 
     def check_gains(self) -> None:
         """Raise InputError for gains that do not go together."""

@@ -1,4 +1,4 @@
-"""Ratio control: some inputs follow another input or a measured inflow in a ratio."""
+"""Ratio control: inputs that follow another input or a measured inflow, or stand still."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -21,7 +21,8 @@ class Ratio(PID):
 
     (Seborg et al., Process Dynamics and Control, 2016, ch. 15), so that streams are blended. The
     inputs that do not lead follow in their order: first those of `follow`, then those of
-    `follow_inflow`.
+    `follow_inflow`. Where none follows, those that do not lead keep their inputs `held`: a manual
+    valve, a pump that runs all day.
 
     Examples
     --------
@@ -41,6 +42,13 @@ class Ratio(PID):
     low: np.ndarray = leaf("V", "lower limit of each input", shape="pump")
     high: np.ndarray = leaf("V", "upper limit of each input", shape="pump")
     lead: tuple = static("-", "the input of each output; left out: the first ones", default=())
+    held: np.ndarray | None = leaf(
+        "V",
+        "inputs of those that neither lead nor follow; left out: their `initial`",
+        like="low",
+        default=None,
+        shape="pump",
+    )
     follow: tuple = static("-", "the input that each of the next inputs follows", default=())
     ratio: np.ndarray | None = leaf(
         "-", "ratio to the input that is followed", default=None, shape="follower", like="Kc"
@@ -74,7 +82,8 @@ class Ratio(PID):
 
     def shared(self, v: Any, inflow: Any = ()) -> tuple[Any, ...]:
         """Return the inputs (m,) of PID outputs v (outputs,) and measured inflows (n,), if any."""
-        inputs: list[Any] = [0.0] * self.model.pumps
+        held: Any = self.held
+        inputs: list[Any] = [0.0 if held is None else held[j] for j in range(self.model.pumps)]
         for i, command in zip(self.lead, v):
             inputs[i] = command
         ratio: Any = self.ratio
@@ -106,10 +115,10 @@ class Ratio(PID):
                 f"controller.lead: must be {outputs} different inputs, one for each output"
             )
         following = len(self.follow) + len(self.follow_inflow)
-        if following != pumps - outputs:
+        if following not in (0, pumps - outputs):
             raise InputError(
                 f"controller.follow, controller.follow_inflow: must have an entry for each of the"
-                f" {pumps - outputs} inputs that do not lead, not {following}"
+                f" {pumps - outputs} inputs that do not lead, or for none of them, not {following}"
             )
         if not set(self.follow) <= set(self.lead):
             raise InputError("controller.follow: must be inputs of controller.lead")

@@ -54,6 +54,8 @@ NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 TOKEN = re.compile(
     r"\s*(?:(?P<name>[^\W\d_]+|%|1(?![\d.]))(?:(?:\^|\*\*)?(?P<power>-?\d+))?|(?P<sign>[*/·()]))"
 )
+NO_UNIT = re.compile(r"(?<![^\s/(])-(?![\w^])")
+"""A factor without a unit, as in "m^3/(s -)", the gain of a pump whose input has none."""
 
 Size = tuple[float, dict[str, int]]
 """Size of a unit, and the exponents of its dimensions."""
@@ -81,7 +83,8 @@ def _sizes() -> dict[str, Size]:
 def size_of(unit: str) -> Size:
     """Return the size of a unit such as "cm^3/(s V)"; KeyError with the name that is unknown."""
     text, end = unit.strip().translate(RAISED), 0
-    if text in ("-", ""):
+    text = NO_UNIT.sub("1", text)
+    if not text:
         return 1.0, {}
     # one level of the stack for each open bracket: (product so far, the power that comes next)
     stack: list[tuple[Size, int]] = [((1.0, {}), 1)]

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import labels_of, names_of
 from jaxtank.core.tree import walk
 from jaxtank.export.statements import REAL, TRUTH, WHOLE, Array, Define, Loop, Matrix, Ref, Until
 
@@ -161,10 +162,20 @@ def header(program, mark, call, begin):
         f"r, dr, ddr: {program.outputs} setpoint{outputs} [{length}], with first [{length}/s] and"
         f" second [{length}/s^2] derivative;",
         f"u: {program.pumps} pump input{pumps} [{drive}], within the limits of the pumps. {begin}",
+        *_order(case.loop.plant),
         "",
         *sorted(_gains(case)),
     ]
     return [f"{mark} {comment(line)}".rstrip() for line in lines]
+
+
+def _order(plant):
+    """Lines with the names of tanks, outputs and inputs in their order, where they have some."""
+    for symbol, kind, many in (("y", "tank", plant.tanks), ("r", "output", len(plant.outputs))):
+        if any(names_of(plant, kind)):
+            yield f"{symbol}: {labels_of(plant, kind, range(many))}"
+    if any(names_of(plant, "pump")):
+        yield f"u: {labels_of(plant, 'pump', range(plant.pumps))}"
 
 
 def _gains(case):

@@ -74,6 +74,23 @@ def closed_circuit(net: Any) -> list[int]:
     return [i for i in range(net.tanks) if i not in open_tanks]
 
 
+def unregulated(net: Any) -> list[int]:
+    """Return tanks that are not controlled and whose level acts on no flow: a store that is pumped
+    out of, or that collects what runs out of others. Only a balance by chance holds their level.
+    """
+    if any(isinstance(v, Tracer) for v in jax.tree.leaves((net.drain, net.drain_resistance))):
+        return []
+    acting = {*net.outputs, *np.flatnonzero(np.asarray(net.drain) > 0.0)}
+    if net.drain_resistance is not None:
+        acting |= set(np.flatnonzero(np.isfinite(np.asarray(net.drain_resistance))))
+    acting |= {source for source, _ in net.links}
+    acting |= {tank for pair in (*net.pipes, *net.valves) for tank in pair}
+    for j, curve in enumerate(net.lift_curves or ()):
+        if curve is not None:
+            acting |= {*net.feeds[j], *(net.sources[j : j + 1] if net.sources else ())}
+    return [i for i in range(net.tanks) if i not in acting]
+
+
 def power_law(head: Any, exponent: Any, knee: Any) -> Any:
     """Return head^exponent for a head >= 0, with a finite slope at 0, C1 at `knee`."""
     y = lower_clip(head, 0.0) / knee

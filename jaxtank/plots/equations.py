@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxtank.core.labels import label_of
 from jaxtank.core.units import local
 from jaxtank.plants.elements import full_open
 from jaxtank.plants.vessels import shape_name
@@ -200,7 +201,8 @@ def physics(plant):
     sentences = [f"Overflow is {words.format(rims=rims)}"]
     for (source, sink), share in zip(plant.spills, np.asarray(plant.caught)):
         sentences.append(
-            f"{100 * share:.4g} % of the overflow of tank {source + 1} falls into tank {sink + 1}."
+            f"{100 * share:.4g} % of the overflow of {label_of(plant, 'tank', source)} falls into"
+            f" {label_of(plant, 'tank', sink)}."
         )
     if plant.bottom:
         sentences.append(

@@ -237,6 +237,8 @@ def _key(cls, field, kind, units):
 
 def controller_of(table, loop, bias=None):
     """Return the controller of a [controller] table."""
+    if isinstance(table, controllers.Controller):  # of Python
+        return table
     if isinstance(table, dict) and table.get("kind") == "open-loop":
         start = ramps(np.asarray(loop.actuator.initial).tolist(), [], ramp=0.0)
         section, sizes = section_of("controller", "open-loop"), sizes_of(loop)
@@ -245,19 +247,29 @@ def controller_of(table, loop, bias=None):
         return controllers.OpenLoop(signal=signal)
     steady = steady_bias(loop) if bias is None else bias
     kind = table.get("kind") if isinstance(table, dict) else None
-    # of a PID it is known once its inputs are
-    cls = ROLES["controller"].classes.get(kind) if isinstance(kind, str) else None
-    is_pid = cls is not None and issubclass(cls, controllers.PID)
-    start = np.zeros(len(loop.plant.outputs))
-    offered = dict.fromkeys(BIASES, start) if is_pid else {"bias": steady}
-    if kind in LIMITED:
-        offered |= {"low": loop.actuator.low, "high": loop.actuator.high}
+    offered = _offered(kind, table, loop, steady)
     controller = component("controller", table, loop, offered, model_of(loop))
     if isinstance(controller, controllers.PID):
         controller.check_inputs()
         left_out = [name for name in BIASES if name not in table]
         return with_bias(controller, loop, steady, left_out)
     return controller
+
+
+def _offered(kind, table, loop, steady):
+    """The values that a [controller] table may leave out: bias, limits, inputs that stand still."""
+    bank, limited = loop.actuator, kind in LIMITED
+    cls = ROLES["controller"].classes.get(kind) if isinstance(kind, str) else None
+    if cls is None or not issubclass(cls, controllers.PID):
+        offered = {"bias": steady}
+    else:  # a bias of a PID is known once its inputs are
+        offered = dict.fromkeys(BIASES, np.zeros(len(loop.plant.outputs)))
+        if not {"follow", "follow_inflow"} & table.keys():
+            offered["held"] = bank.initial
+        limited = limited or "lead" in table
+    if limited:
+        offered |= {"low": bank.low, "high": bank.high}
+    return offered
 
 
 BIASES = ("bias", "inner_bias")
@@ -345,6 +357,8 @@ def _kind_in(name, table):
     kinds = _kinds(role, kind) if isinstance(kind, str) else role.classes
     if not isinstance(kind, str) or kind not in role.classes:
         raise unknown(f"{name} kind", str(kind), kinds)
+    if role.classes[kind] is controllers.PID and "lead" in table:
+        return "ratio"  # of which no input follows: those that do not lead stand still
     return kind
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxtank.core.checks import check_value
 from jaxtank.core.errors import InputError, nearest, unknown
-from jaxtank.core.labels import names_of
+from jaxtank.core.labels import index_of, names_of
 from jaxtank.core.quantities import converted
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import number, sizes_of_shape
@@ -281,9 +281,11 @@ def _tanks(key, label, value, sizes):
 
 
 def _input(label, value, sizes):
-    """Index of an input given by its number from 1: pumps, then valves."""
+    """Index of an input given by its name or its number from 1: pumps, then valves."""
+    if isinstance(value, str):
+        return index_of(label, sizes.plant, "pump", value)
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= sizes.pumps:
-        raise refusal(label, value, f"be an input, counted from 1 to {sizes.pumps}")
+        raise refusal(label, value, f"be an input, by its name or counted from 1 to {sizes.pumps}")
     return value - 1
 
 

@@ -31,6 +31,7 @@ from jaxtank.rig.sensors import check_stated, complete_rows, sensor_rows, with_s
 from jaxtank.rig.values import (
     by_dotted_name,
     by_rig_name,
+    dotted_name,
     has,
     set_and_schedule,
     set_values,
@@ -264,7 +265,7 @@ def start_of(table):
             changes["disturbance"] = signals.disturbance_of(table, loop)
     if "fault" in table:
         with problems.collect():
-            changes["faults"] = signals.faults_of(table["fault"], loop)
+            changes["faults"] = signals.faults_of(table["fault"], loop, dotted_name)
     problems.check()
     top.pop("units", None)
     return case.replace(loop=dataclasses.replace(loop, **changes), **top)

@@ -284,13 +284,14 @@ def _pulses(entries, old, tanks):
     )
 
 
-def faults_of(entries, loop):
-    """The Faults of the [[fault]] tables; None of none."""
+def faults_of(entries, loop, dotted):
+    """The Faults of the [[fault]] tables; None of none. dotted: name in the rig -> dotted name."""
     events, plant = [], loop.plant
     for i, e in enumerate(read_entries(SECTIONS["fault"], {"fault": entries}, sizes_of(loop))):
         values = (e[name] for name in ("start", "end", "factor", "extra"))
-        events.append((e["of"].removeprefix("plant."), *values))
+        of = e["of"] if "." in e["of"] else f"plant.{e['of']}"
         try:
+            events.append((dotted(loop, of).removeprefix("plant."), *values))
             faults(plant, events[-1:])
         except InputError as error:
             raise type(error)(f"fault {i + 1}: {error}") from None

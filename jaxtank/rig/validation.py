@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxtank.analysis.steady_batch import SteadyStates
 from jaxtank.case import Case, Free, Scenario
+from jaxtank.controllers import OnOff, OpenLoop
 from jaxtank.core.checks import check_value
 from jaxtank.core.clock import CLOCK_UNITS
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
@@ -24,6 +25,8 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.steady import steady_inflow, steady_state
 from jaxtank.measures import MEASURES, check_names, entries
 from jaxtank.measures import unit as measure_unit
+from jaxtank.plants.elements import closed_circuit
+from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.entry import is_finite, is_numeric, read_entry, refusal, sizes_of
 from jaxtank.rig.schema import SECTIONS
 from jaxtank.rig.sensors import is_reading, level_of, spans_of
@@ -74,7 +77,10 @@ def unreachable(case: Case) -> str | None:
     square = plant.pumps == len(plant.outputs) or hasattr(controller, "shared")
     inflow = case.loop.disturbance
     varies = inflow is not None and inflow.is_table  # a level may be reached for a while
-    if isinstance(reference, Ramps) and square and not varies:
+    if isinstance(controller, OpenLoop | OnOff):  # which follow no setpoint
+        return None
+    closed = isinstance(plant, TankNetwork) and closed_circuit(plant)  # what it holds decides
+    if isinstance(reference, Ramps) and square and not varies and not closed:
         plateaus = reference.plateaus(case.clock.duration)
         _, first = np.unique(plateaus, axis=0, return_index=True)
         for values in _doubtful(case.loop, plateaus[np.sort(first)]):

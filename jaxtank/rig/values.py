@@ -83,7 +83,7 @@ def dotted_name(loop: ClosedLoop, name: str) -> str:
         entries = [
             entry if entry.isdigit() else _index_of(name, plant, axis, entry)
             for entry, axis in zip(inner[:-1].split(","), axes)
-            if axis in ("tank", "pump", "output")
+            if axis in ("tank", "pump", "output", "feed", "valve")
         ]
         return f"{base}[{','.join(map(str, entries))}]" if len(entries) == len(axes) else name
     part, _, key = name.rpartition(".")
@@ -98,6 +98,11 @@ def _of_table(plant, kind, part, key):
     if key not in section.names:
         raise unknown(f"key of {kind} {part}", key, section.names)
     target = section[key].target
+    if target == "actuator.delays":
+        raise InputError(
+            f"{part}.{key} is a part of the compiled program: write it in the rig file's [[{kind}]]"
+            " (actuator.delay is the dead time of all inputs)"
+        )
     if not target or section[key].kind not in ("number", "reading"):
         raise InputError(f"{part}.{key} is the topology of the rig and cannot be set")
     # limits of valves come after those of the pumps
@@ -136,6 +141,7 @@ def _axes(loop, name, meta):
 
 def _index_of(name, plant, axis, entry):
     """Index of a named entry; a gain of an output is also called by the pump that moves it."""
+    axis = "pump" if axis == "feed" else axis
     paired = axis == "output" and plant.pumps == len(plant.outputs)
     axis = "pump" if paired and entry not in names_of(plant, axis) else axis
     return index_of(name, plant, axis, entry)

@@ -11,11 +11,15 @@ from jaxtank.controllers.pid import PID
 from jaxtank.core.clock import clock_warnings
 from jaxtank.core.labels import label_of
 from jaxtank.core.tree import get_value, is_component, split_index, walk
+from jaxtank.core.units import flow_per_input
 from jaxtank.loop.estimate_notes import is_unused
 from jaxtank.loop.tank_bottom import is_open
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.signals import pulses_of, steps
 from jaxtank.signals.setpoints import Sine, index
+
+LEAST_SHARE = 0.01
+"""Share of a measured inflow below which its gain is hardly meant [-]."""
 
 
 def case_warnings(case: Case) -> list[str]:
@@ -50,6 +54,7 @@ def case_warnings(case: Case) -> list[str]:
         *_above_rims(case),
         *_pumps(case),
         *_signs(case),
+        *_feed_forward(case),
         *_open_bottoms(case),
         *model_warnings(case),
         *_unused(case),
@@ -232,6 +237,23 @@ def _downstream(plant, tanks):
             reached.add(tank)
             queue += [sink for source, sink in pairs if source == tank and sink is not None]
     return reached
+
+
+def _feed_forward(case):
+    """On a gain of the measured inflow that was hardly meant in length^3/s."""
+    part, units = getattr(case.loop.controller, "law", case.loop.controller), case.loop.units
+    flow = flow_per_input(units)
+    for name in ("inflow_gain", "inflow_ratio"):
+        gains = getattr(part, name, None)
+        if gains is None or flow is None or isinstance(part, Cascade):
+            continue
+        most = flow * float(np.max(np.abs(gains)))
+        if 0.0 < most < LEAST_SHARE:
+            yield (
+                f"controller.{name}: {100 * most:.3g} % of the measured inflow: a number is in"
+                f" {units[1]} per {units[0]}^3/s, of which {1 / flow:.6g} are the whole inflow;"
+                f' write "100 %"'
+            )
 
 
 def _open_bottoms(case):

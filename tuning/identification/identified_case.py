@@ -191,9 +191,10 @@ def _gain_and_time(loop, model, inputs):
         settles &= gain > 0
     for j in np.flatnonzero(~settles)[:1]:
         at, name = ", ".join(f"{v:g}" for v in inputs), label_of(loop.plant, "pump", j)
+        tank = label_of(loop.plant, "output", j)
         raise InputError(
-            f"{name} does not settle tank {loop.plant.outputs[j] + 1} at inputs ({at})"
-            f" {loop.units[1]}: a PI controller does not fit, use another [controller]"
+            f"{name} does not settle {tank} at inputs ({at}) {loop.units[1]}: a PI"
+            " controller does not fit, use another [controller]"
         )
     return gain, area / gain + loop.actuator.delay
 
@@ -254,7 +255,8 @@ def _steady(loop, inputs):
     at = ", ".join(f"{v:.4g}" for v in inputs)
     for i in np.flatnonzero((x >= rim) | (x <= 1e-3 * rim) | (span > LONGEST)):
         raise InputError(
-            f"tank {i + 1} has no steady level between 0 and its rim at the mean inputs of the"
-            f" data, ({at}) {loop.units[1]}: add [controller], [reference] and [free]"
+            f"{label_of(plant, 'tank', int(i))} has no steady level between 0 and its rim at the"
+            f" mean inputs of the data, ({at}) {loop.units[1]}: add [controller], [reference] and"
+            " [free]"
         )
     return x

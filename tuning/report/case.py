@@ -100,7 +100,7 @@ def report(case):
     title = f"{page['case']}: {page['title']}"
     head = [title, *([preset.citation, f"notes: {page['notes']}"] if preset else [])]
     outputs = ", ".join(f"h{i + 1}{_name_in_file(case, 'tank', i)}" for i in loop.plant.outputs)
-    size = f"{count(loop.plant.tanks, 'tank')}, {count(loop.plant.pumps, 'pump')}"
+    size = _size(loop.plant)
     indents: dict[str, Any] = {"initial_indent": "  ", "subsequent_indent": "      "}
     rows = [line for row in page["equations"] for line in textwrap.wrap(row, WIDTH, **indents)]
     words = [_sensor(loop), _actuator(loop), *_signals(loop), _sampled(case)]
@@ -264,11 +264,18 @@ def _name_in_file(case, kind, i):
     return f" ({name})" if name else ""
 
 
+def _size(plant):
+    """Return "3 tanks, 1 pump, 1 valve"."""
+    valves = len(getattr(plant, "valves", ()))
+    counts = {"tank": plant.tanks, "pump": plant.pumps - valves, "valve": valves}
+    return ", ".join(count(n, kind) for kind, n in counts.items() if n)
+
+
 def _called(case):
-    """Return a sentence on the names that the rig file has for its tanks and pumps."""
+    """Return a sentence on the names that the rig file has for its parts."""
     names = [
         f"{kind} {i + 1} is {name!r}"
-        for kind in ("tank", "pump")
+        for kind in ("tank", "pump", "valve", "sensor")
         for i, name in enumerate(case.names.get(kind, ()))
         if name
     ]
@@ -296,9 +303,11 @@ def _sensor(loop):
 def _actuator(loop):
     """Return a sentence on what the pumps do to a command, in that order."""
     bank, drive = loop.actuator, loop.units[1]
+    valves = len(getattr(loop.plant, "valves", ()))
+    words = f"Pumps: {bank.pumps - valves}" + f", and {count(valves, 'valve')}" * bool(valves)
     limits = f"from {_list(bank.low)} to {_list(bank.high)} {drive}"
     if not isinstance(bank, PumpBank):
-        return f"Pumps: {bank.pumps}, {limits}, a {type(bank).__name__}."
+        return f"{words}, {limits}, a {type(bank).__name__}."
     kinds = {"clip": "each clipped", "boxqp": "allocated by the controller's own cost"}
     dead = "no dead zone"
     if bank.dead_zone is not None:
@@ -309,7 +318,7 @@ def _actuator(loop):
         delay = f"transport delay {_list([bank.delay + more for more in bank.delays])} s"
     if bank.rate is not None:
         lag = f"at most {_list(bank.rate)} {drive}/s; {lag}"
-    return f"Pumps: {bank.pumps}, {limits} ({kinds[bank.saturation]}); {dead}; {lag}; {delay}."
+    return f"{words}, {limits} ({kinds[bank.saturation]}); {dead}; {lag}; {delay}."
 
 
 def _signals(loop):

@@ -115,6 +115,16 @@ def side_stream(t, x, run):
     np.testing.assert_allclose(np.asarray(run.u)[before, 0], 5.90454, atol=1e-5)
 
 
+def by_hand(t, x, run):
+    percent = 0.3 * 0.002 * ROOT_2G * math.sqrt(1.2) * 3600.0 / 0.3
+    assert percent == pytest.approx(34.936, abs=1e-3)
+    np.testing.assert_allclose(np.asarray(run.u)[-1], [percent, 30.0], atol=1e-4)
+    assert x[-1, 1] == pytest.approx(1.2, abs=1e-6)
+    flow = np.asarray(run.u)[:-1, 0] * 0.3 / 3600.0
+    taken = 2.0 * flow.sum()
+    assert (3.0 - x[-1, 0]) * math.pi / 4.0 * 9.0 == pytest.approx(taken, rel=1e-9)
+
+
 RIGHT = {
     "05": signs_turned,
     "07": outflow_pump,
@@ -130,6 +140,7 @@ RIGHT = {
     "24": recycle,
     "35": ultrasonic,
     "37": side_stream,
+    "38": by_hand,
 }
 
 
@@ -319,6 +330,80 @@ def test_a_pump_follows_its_curve_and_loses_flow_to_the_lift():
     t, x, _ = vessel("area = 1.0, rim = 9.0", pump, 0.75)
     right = 4.0 - 2.4 * np.exp(-0.02 / 4.0 * t)
     np.testing.assert_allclose(x[:, 0], right, atol=1e-6)
+
+
+STORE = """
+units = ["m", "m^3/h"]
+tank = [
+    {{ name = "feed", area = 7.0, rim = 4.0, level = 3.0 }},
+    {{ name = "T1", area = 1.0, rim = 2.0, level = 1.0 }},
+]
+pump = [{{ name = "P1", from = "feed", to = "T1", high = 20.0 }}]
+{outlet}
+plant = {{ outputs = ["T1"] }}
+controller = {{ kind = {controller} }}
+reference = {{ initial = ["50 %"] }}
+"""
+HAND = 'valve = [{ name = "HV1", from = "T1", area = "8 cm^2", initial = 0.5 }]'
+TRANSFERS = {
+    "circuit": (
+        'orifice = [{ from = "T1", to = "feed", area = "4 cm^2" }]',
+        '"pi", Kc = 9, Ti = 99',
+    ),
+    "store": (HAND, '"pi", Kc = 9, Ti = 99, lead = ["P1"]'),
+    "switch": ("", '"on-off", on = [0.8], off = [1.2]'),
+}
+
+
+@pytest.mark.parametrize("kind", TRANSFERS)
+def test_a_store_without_a_steady_level_is_no_refusal(kind):
+    outlet, controller = TRANSFERS[kind]
+    case = rig.loads(STORE.format(outlet=outlet, controller=controller))
+    assert case.reachable
+
+
+def test_the_bias_of_a_pump_that_draws_from_a_store_holds_the_level():
+    outlet, controller = TRANSFERS["store"]
+    case = rig.loads(STORE.format(outlet=outlet, controller=controller))
+    held = 0.5 * 8e-4 * ROOT_2G * 3600.0
+    assert float(case.loop.controller.bias[0]) == pytest.approx(held, rel=1e-9)
+
+
+def test_inputs_and_entries_are_called_by_the_names_of_pumps_and_valves():
+    outlet, controller = TRANSFERS["store"]
+    text = STORE.format(outlet=outlet, controller=controller)
+    case = rig.loads(
+        text + 'fault = [{ of = "pump_gain[P1]", start = 10.0, end = 20.0, factor = 0.5 }]'
+    )
+    assert [name for name, *_ in case.loop.faults.windows] == ["pump_gain[0]"]
+    assert rig.dotted_name(case.loop, "plant.valve[HV1]") == "plant.valve[0]"
+    assert rig.dotted_name(case.loop, "plant.pump_gain[P1]") == "plant.pump_gain[0]"
+    with pytest.raises(InputError, match="P9"):
+        rig.loads(text.replace('lead = ["P1"]', 'lead = ["P9"]'))
+    with pytest.raises(InputError, match=r"lead = \['P1'\]"):
+        rig.loads(text.replace(', lead = ["P1"]', ""))
+
+
+def test_an_input_without_a_unit_has_gains_in_a_flow():
+    text = """
+    units = ["m", "{drive}"]
+    tank = [{{ area = 1.0, rim = 5.0 }}]
+    pump = [{{ to = 1, gain = "{gain}", high = 1.0 }}]
+    inputs = {{ initial = [0.0] }}
+    """
+    for drive, gain in (("-", "72 m3/h"), ("V", "72 m3/(h V)"), ("%", "72 m3/h/%")):
+        case = rig.loads(text.format(drive=drive, gain=gain))
+        assert float(case.loop.plant.pump_gain[0]) == pytest.approx(0.02, rel=1e-12), drive
+
+
+def test_a_gain_of_the_measured_inflow_of_a_3600th_is_noted():
+    text = STORE.format(outlet="", controller='"p", Kc = 9, inflow_gain = {gain}')
+    text = text.replace("rim = 2.0, level", 'rim = 2.0, inflow = "1 m3/h", level')
+    notes = [
+        rig.case_warnings(rig.loads(text.replace("{gain}", gain))) for gain in ("1.0", '"100 %"')
+    ]
+    assert any("inflow_gain" in note for note in notes[0])
+    assert not any("inflow_gain" in note for note in notes[1])
 
 
 WRONG = """
