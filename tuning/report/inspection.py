@@ -58,8 +58,8 @@ def report(result):
     """Return the Report of an Inspection."""
     steps = _steps(result)
     pace = "" if steps["step"] is None else f", every {steps['step']:g} s"
-    longest = steps["longest_step"]
-    if longest is not None and longest > 1.01 * float(steps["step"]):
+    longest, step = steps["longest_step"], steps["step"]
+    if longest is not None and step is not None and longest > 1.01 * step:
         pace += f" (at most {longest:g} s apart)"
     words = f"{result.name}: {len(result.t)} samples over {steps['length']:g} s{pace}"
     rows = []

@@ -192,9 +192,11 @@ WRONG = (
 DOUBT = "tank 1 runs empty faster than the steps follow"
 
 
-@pytest.mark.slow_for("0.2-6-None", "0.2-1-words0")
+@pytest.mark.slow_for("short", "long")
 @pytest.mark.parametrize(
-    ("last", "substeps", "words"), [(0.2, 1, WRONG), (10.0, 1, DOUBT), (0.2, 6, None)]
+    ("last", "substeps", "words"),
+    [(0.2, 1, WRONG), (10.0, 1, DOUBT), (0.2, 6, None)],
+    ids=["long", "doubtful", "short"],
 )
 def test_an_answer_states_that_its_run_is_of_steps_too_long(last, substeps, words, tmp_path):
     """Tuned to follow setpoints down to the bottom, not so far down, and with steps short enough;
