@@ -14,6 +14,7 @@ from jaxtank.measures import MEASURES, unit
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.safety import SafetyFilter, TankCertificate, design_for
 from jaxtank.safety.of_case import SPREAD, UNKNOWN
+from jaxtank.safety.outlets import OutletFilter
 from jaxtank.views import CaseViews
 
 
@@ -136,7 +137,9 @@ class Case(CaseViews):
         """Return a copy with the named fields changed."""
         return dataclasses.replace(self, **changes)
 
-    def safety_design(self, **settings: Any) -> tuple[SafetyFilter, tuple[TankCertificate, ...]]:
+    def safety_design(
+        self, **settings: Any
+    ) -> tuple[SafetyFilter | OutletFilter, tuple[TankCertificate, ...]]:
         """Return a safety filter for the case, and the certificate of each tank.
 
         Settings and their defaults, and errors, as in `jaxtank.safety.design_for`.

@@ -2,7 +2,7 @@
 
 import contextlib
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Generator, Mapping
 from typing import Any, cast
 
 import jax
@@ -30,7 +30,7 @@ SMALL = 16
 
 
 @contextlib.contextmanager
-def traceable(label: str) -> Iterator[None]:
+def traceable(label: str) -> Generator[None, None, None]:
     """Raise InputError, beginning with `label`, where the block needs the number of a tracer."""
     try:
         yield

@@ -463,13 +463,15 @@ def _numbers_as_times(table: Table, column: int, unit: str | None) -> np.ndarray
                 f"{table.where(column)}: {unit!r} is no unit of time: must be one of s, ms, min, h,"
                 " d"
             )
-        return t * size[0]
+        scale: float = size[0]
+        return np.asarray(t * scale)
     step = float(np.median(np.abs(np.diff(t)))) if len(t) > 1 else 0.0
     if t.min() > SERIALS[0] and t.max() < SERIALS[1] and step < 0.5:
-        return np.round((t - t[0]) * DAY, 3)  # a serial has that many digits
+        days: Any = (t - t[0]) * DAY
+        return np.asarray(days).round(3)  # a serial has that many digits
     sizes = [size for least, size in EPOCHS if t.min() >= least and t.max() < 4 * least]
     if sizes:
-        return (t - t[0]) * sizes[0]
+        return np.asarray((t - t[0]) * sizes[0])
     raise DataError(
         f"{table.where(column)}: has no unit: write it in the header, such as"
         f" '{table.columns[column].name} [s]'"

@@ -263,7 +263,8 @@ def _offered(kind, table, loop, steady):
     if cls is None or not issubclass(cls, controllers.PID):
         offered = {"bias": steady}
     else:  # a bias of a PID is known once its inputs are
-        offered = dict.fromkeys(BIASES, np.zeros(len(loop.plant.outputs)))
+        zeros = np.zeros(len(loop.plant.outputs))
+        offered = {name: zeros for name in BIASES}
         if not {"follow", "follow_inflow"} & table.keys():
             offered["held"] = bank.initial
         limited = limited or "lead" in table

@@ -2,7 +2,7 @@
 
 import copy
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -43,7 +43,9 @@ class Oddity(NamedTuple):
 def oddities(log: Log, loop=None) -> list[Oddity]:
     """Return the oddities of experiment data; of a rig's sensors with its loop."""
     length, drive = ("", "") if loop is None else loop.units
-    rows = [("pump", j, *row, drive) for j, u in enumerate(log.u.T) for row in _still(log.t, u)]
+    rows: list[Any] = [
+        ("pump", j, *row, drive) for j, u in enumerate(log.u.T) for row in _still(log.t, u)
+    ]
     spans = None if loop is None else spans_of(loop)
     for c, (tank, volts) in enumerate(zip(log.tanks, log.in_volts)):
         ends = () if spans is None else spans[tank]
