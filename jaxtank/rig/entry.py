@@ -52,18 +52,19 @@ def read_entry(
     where = section.name if index is None else f"{section.name} {index + 1}"
     if not isinstance(table, Mapping):
         raise refusal(where, table, "be a table")
-    problems, values = Problems(), {}
+    problems, values, meant = Problems(), {}, set()
     for key in table:
         if key not in section.names:
             problems.append(unknown_key(section, key, where))
             problems[-1].place = (section.name, index, key)
+            meant.add(WORDS.get(key.lower(), "").partition(":")[0])
     for key in section.keys:
         value = table.get(key.name, None if key.default is NEEDED else key.default)
         if key.name in table or value is not None:
             label = f"{where}: {key.name}" if section.many else f"{where}.{key.name}"
             with problems.collect((section.name, index, key.name)):
                 values[key.name] = read_value(key, label, value, sizes)
-        elif key.default is NEEDED:
+        elif key.default is NEEDED and key.name not in meant:
             label = where if section.many else title or section.title
             needed = f"{label} needs {key.name}{unit(key.meta(sizes.units))}: {key.doc}"
             problems.append(InputError(needed))
@@ -144,15 +145,15 @@ WORDS = {
     "reset": "Ti",
     "tau_d": "Td",
     "tv": "Td",
-    "action": "Kc below 0 where the input lowers the level",
+    "action": "action of [controller]: direct or reverse",
     "transmitter": "[[sensor]] with tank, unit, span",
     "range": "span of [[sensor]], low and high of [[pump]]",
     "bottom_area": "area",
     "max_flow": "high: the largest input, with units = [length, flow]",
     "capacity": "rim and area of [[tank]], high of [[pump]]",
-    "duration": '[values] "clock.duration"',
-    "dt": '[values] "clock.dt"',
-    "sample_time": '[values] "clock.dt"',
+    "duration": "duration at the top of the file",
+    "dt": "dt at the top of the file",
+    "sample_time": "dt at the top of the file",
     "initial_level": "level",
     "setpoint": "[reference] initial and changes",
     "outlet": "drain of [[tank]], or a [[valve]] where its opening is an input",

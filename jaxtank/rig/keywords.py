@@ -14,7 +14,6 @@ from jaxtank.core.errors import InputError, unknown
 from jaxtank.rig.entry import Problems, allowed, refusal, unit, unknown_key
 from jaxtank.rig.read import from_table
 from jaxtank.rig.schema import LISTS, NEEDED, SECTIONS
-from jaxtank.rig.values import by_dotted_name
 
 KEYWORDS = {
     f"{name.removesuffix('s')}s" if section.many else name: name
@@ -76,14 +75,7 @@ def Rig(**tables: Any) -> Case:
         if name not in KEYWORDS and name not in CLOCK
     )
     problems.check()
-    table = {KEYWORDS[k]: _plain(v) for k, v in tables.items() if k in KEYWORDS and v is not None}
-    clock = {f"clock.{k}": _plain(v) for k, v in tables.items() if k in CLOCK and v is not None}
-    values = by_dotted_name(table.get("values", {}), "values") if clock else {}
-    for name in clock.keys() & values.keys():
-        problems.append(InputError(f"{name} is given twice, as a keyword and in values"))
-    problems.check()
-    if clock:
-        table["values"] = values | clock
+    table = {KEYWORDS.get(k, k): _plain(v) for k, v in tables.items() if v is not None}
     for name in ("reference", "inputs"):
         if isinstance(table.get(name), list):
             table[name] = _steps(name, table[name])

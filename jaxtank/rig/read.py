@@ -9,6 +9,7 @@ from typing import Any
 from jaxtank import presets
 from jaxtank.case import Case
 from jaxtank.controllers.base import Controller
+from jaxtank.core.clock import CLOCK
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import read_text
 from jaxtank.core.text import shortened
@@ -136,7 +137,7 @@ def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
     """Return the Case of a table of the form of a rig file, {key or section: value}, checked;
     `folder` as in `loads`.
     """
-    table = with_inputs(tables.resolved(renamed(table), Path(folder)))
+    table = with_clock(with_inputs(tables.resolved(renamed(table), Path(folder))))
     case = start_of(table)
     dotted = [key for key in ("values", "free", "uncertain") if key in table]
     names = {key: by_rig_name(case.loop, by_dotted_name(table[key], key)) for key in dotted}
@@ -153,6 +154,18 @@ def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
     if "bottom" not in table.get("plant", {}) and "plant.bottom" not in values:
         case = with_bottom(case)
     return filtered(validation.check(case))
+
+
+def with_clock(table):
+    """A table of a rig file with dt, duration, .. of its top among its [values]."""
+    clock = {f"clock.{name}": table[name] for name in CLOCK if name in table}
+    if not clock:
+        return table
+    values = by_dotted_name(table.get("values", {}), "values")
+    twice = (f"{name} is given twice, also in [values]" for name in clock if name in values)
+    Problems(map(InputError, twice)).check()
+    rest = {name: value for name, value in table.items() if name not in CLOCK}
+    return {**rest, "values": values | clock}
 
 
 FORMER = {"law": "controller", "pour": "inflow"}
@@ -326,6 +339,7 @@ def _top(table):
                 top[name] = read_value(first[name], name, value, Sizes(0))
         elif name not in sections:
             problems.append(unknown_key(first, name))
+            problems[-1].place = ("", None, name)
         elif not isinstance(value, list if sections[name].many else (dict, Controller, Observer)):
             tables = f"a list of tables, [[{name}]]" if sections[name].many else "a table"
             problems.append(refusal(name, value, f"be {tables}"))
