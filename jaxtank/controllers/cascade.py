@@ -16,7 +16,7 @@ from jaxtank.plants.tank_network import TankNetwork
 
 
 class Outputs(NamedTuple):
-    """The entries that an inner loop reads, in the place of a plant."""
+    """The entries that an inner loop reads, as the model of its PI."""
 
     outputs: tuple[int, ...]
 

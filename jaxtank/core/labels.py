@@ -86,6 +86,12 @@ def symbol(plant: Any, letter: str, kind: str, index: int) -> str:
     return f"{letter}_{name}" if name else f"{letter}{index + 1}"
 
 
+def reading_label(plant: Any, tank: int) -> str:
+    """Return what a person reads for the reading of a tank: its sensor's name, its own, or "h1"."""
+    named = name_of(plant, "sensor", tank) or name_of(plant, "tank", tank)
+    return named or f"h{tank + 1}"
+
+
 def input_unit(plant: Any, index: int, drive: str) -> str:
     """Return the unit of an input: a valve's is its opening, in % where the rig's inputs are."""
     is_valve = getattr(plant, "valves", ()) and index >= len(plant.feeds)

@@ -104,8 +104,8 @@ def read_table(path: str | Path, decimal: str = "") -> Table:
     cells = [_widened(row, len(header), f"{name}, line {line}") for line, row in body]
     columns: list[Column] = []
     for text, unit, values in zip(header, units, zip(*cells)):
-        stem, own = split_header(text)
-        columns.append(Column(text, stem, own or unit or None, list(values)))
+        stem, stated = split_header(text)
+        columns.append(Column(text, stem, stated or unit or None, list(values)))
     sign = decimal or _decimal(columns, name)
     return Table(name, columns, [line for line, _ in body], head, sign)
 

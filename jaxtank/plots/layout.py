@@ -112,7 +112,7 @@ def valves(plant, where):
         side = box.x + box.width
         if sink is None:
             x, y = side + 0.24 + 0.14 * order, box.y + 0.05 + 0.1 * order
-            lines.append((source, ((side, y), (x, y), (x, -0.93)), (x, min(y - 0.3, -0.3))))
+            lines.append((source, ((side, y), (x, y), (x, -0.93)), (x, min(y - 0.17, -0.12))))
             continue
         other = where.boxes[sink]
         if box.y == other.y:

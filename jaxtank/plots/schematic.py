@@ -157,6 +157,9 @@ def _pump(ax, x, y, pump, label):
     ax.add_patch(Circle((x, y), 0.17, **circle))
     arrow = [(x - 0.1, y - 0.08), (x + 0.1, y - 0.08), (x, y + 0.13)]
     ax.add_patch(Polygon(arrow, facecolor=colour, zorder=5))
+    if y > -0.6:  # above the basin, beside pipes
+        write(ax, x, y - 0.26, label, 8, "center center", "black", zorder=5)
+        return
     away, side = (-0.23, "right") if x > 0 else (0.23, "left")
     write(ax, x + away, y + 0.12, label, 8, f"{side} center", "black", zorder=5)
 

@@ -16,7 +16,7 @@ from tuning.identification.experiment import Log
 from tuning.identification.least_squares import Fit
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import quality
-from tuning.identification.result import Identifications
+from tuning.identification.result import Identifications, channels_of
 
 MEMORY = 256 * 2**20
 """Bytes of sensitivities held at once: the logs are simulated in chunks that fit."""
@@ -90,14 +90,14 @@ def identify_many(
     fits = zip(*(_estimates(problem, e, z[e], *pair) for e, pair in enumerate(rows)))
     values, covariance, levels, half, fit = fits
     names, shared = problem.coordinates.names, problem.coordinates.size
-    values, levels, half, length = *map(np.stack, (values, levels, half)), case.loop.units[0]
+    values, levels, half = map(np.stack, (values, levels, half))
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     levels_sd = np.zeros(levels.shape)
     levels_sd[:, list(problem.tanks)] = sd[:, shared:]
     return Identifications(
         case=case,
         logs=tuple(log.name for log in logs),
-        channels=tuple((f"h{i + 1}", "V" if v else length) for i, v in problem.data.channels),
+        channels=tuple(channels_of(problem)),
         names=names,
         units=tuple(next(b.unit for b in problem.bounds if b.name == n) for n in names),
         values=values,

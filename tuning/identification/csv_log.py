@@ -490,8 +490,8 @@ class LogFile:
             self._converted(slot, np.zeros(1))
         except DataError:
             return [column.header, base], f"a guess: {printable(self._unit(slot))} is not read"
-        own, unit = split_header(column.header)[1], self._unit(slot) or base
-        return (column.header if own == unit else [column.header, unit]), ""
+        stated, unit = split_header(column.header)[1], self._unit(slot) or base
+        return (column.header if stated == unit else [column.header, unit]), ""
 
     def _guesses(self) -> dict[str, Signal]:
         """Return {slot: signal} that may be meant, of the same number or of a unit that suits."""

@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from jaxtank.case import Case
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import reading_label
 from jaxtank.core.tree import number
 from jaxtank.plants.base import Plant
 from jaxtank.signals.base import Table
@@ -169,7 +170,10 @@ def beside(case: Case, log: Log, run: Any) -> dict[str, Any]:
         level = np.interp(t[inside], np.asarray(run.t), np.asarray(run.x)[:, tank]) + offset
         simulated = level / float(sensor.gain[tank]) if volts else level
         fit = fit_of(y[None, :, None], (y - simulated)[None, :, None])
-        row = {"name": f"h{tank + 1}", "unit": "V" if volts else case.loop.units[0]}
+        row = {
+            "name": reading_label(case.loop.plant, tank),
+            "unit": "V" if volts else case.loop.units[0],
+        }
         row |= {name: value for name, (value,) in fit.items()}
         bias = float(np.nanmean(y - simulated)) if np.isfinite(y).any() else None
         channels.append(row | {"bias": bias, "measured": y, "simulated": simulated})

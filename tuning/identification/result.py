@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from jaxtank.case import Case
+from jaxtank.core.labels import reading_label
 from jaxtank.core.text import html_table
 from jaxtank.core.tree import get_value
 from tuning.identification.identified_case import proposed
@@ -48,8 +49,11 @@ class Experiments(dict[str, dict[str, Any]]):
 
 def channels_of(estimation: Estimation) -> list[tuple[str, str]]:
     """Return (name, unit) of every channel of readings."""
-    length = estimation.case.loop.units[0]
-    return [(f"h{i + 1}", "V" if volts else length) for i, volts in estimation.data.channels]
+    loop = estimation.case.loop
+    return [
+        (reading_label(loop.plant, tank), "V" if volts else loop.units[0])
+        for tank, volts in estimation.data.channels
+    ]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)

@@ -99,10 +99,10 @@ def _long(table, t, tag, value, unit, quality):
     for text, of_tag in rows.items():
         of_tag.sort(key=t.__getitem__)
         cells = lambda i, of_tag=of_tag: [columns[i].cells[k] for k in of_tag]
-        name, own = split_header(text)
-        own = own or columns[value].unit or (None if unit is None else cells(unit)[0] or None)
+        name, stated = split_header(text)
+        stated = stated or columns[value].unit or (None if unit is None else cells(unit)[0] or None)
         lines = [table.lines[k] for k in of_tag]
-        part = table._replace(columns=[Column(text, name, own, cells(value))], lines=lines)
+        part = table._replace(columns=[Column(text, name, stated, cells(value))], lines=lines)
         signals.append(Signal(part, 0, t[of_tag], [] if quality is None else cells(quality)))
     return signals
 

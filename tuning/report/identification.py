@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxtank import rig as rigs
+from jaxtank.core.labels import reading_label
 from jaxtank.core.tree import get_value
 from jaxtank.core.units import local
 from tuning.identification import residuals
@@ -243,7 +244,7 @@ def _levels(fit):
         for i, level in enumerate(row):
             ends = level["interval95"]
             interval = f" ({ends[0]:.4g} .. {ends[1]:.4g})" if ends else ""
-            levels.append(f"h{i + 1} {level['value']:.4g}{interval}")
+            levels.append(f"{reading_label(fit.case.loop.plant, i)} {level['value']:.4g}{interval}")
         head = f"levels at the first sample{which} [{fit.case.loop.units[0]}]"
         rows.append(f"{head}: {', '.join(levels)}")
     return rows
@@ -454,7 +455,11 @@ def plan_report(case, experiments, best, plan):
     known = [None if c is None or c > 1e15 else c for c in conditions]
     rows.append(["condition of J'J", "", *(Value(c, 3) for c in known)])
     levels = plan["levels"]
-    measured = "every level" if levels is None else ", ".join(f"h{i + 1}" for i in levels)
+    measured = (
+        "every level"
+        if levels is None
+        else ", ".join(reading_label(case.loop.plant, i) for i in levels)
+    )
     head = (
         f"{case.name}: standard deviations that {plan['duration']:g} s, {measured} read every"
         f" {plan['dt']:g} s with noise of {plan['noise']:g} {case.loop.units[0]} would leave"

@@ -1,10 +1,12 @@
 """The report of Identifications: many records, each fitted separately."""
 
 import csv
+import functools
 import io
 
 import numpy as np
 
+from jaxtank.core.labels import reading_label
 from tuning.problem import provenance
 from tuning.problem.wording import count
 from tuning.report.document import Report, Text
@@ -152,7 +154,8 @@ def estimates_csv(fits):
     for name, unit in zip(fits.names, fits.units):
         heads += [f"{name} [{unit}]", f"sd of {name} [{unit}]"]
     length = fits.case.loop.units[0]
-    heads += [f"h{i + 1} at the first sample [{length}]" for i in range(fits.levels.shape[1])]
+    label = functools.partial(reading_label, fits.case.loop.plant)
+    heads += [f"{label(i)} at the first sample [{length}]" for i in range(fits.levels.shape[1])]
     heads += [f"RMS residual of {name} [{unit}]" for name, unit in fits.channels]
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")

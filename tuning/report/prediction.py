@@ -29,7 +29,8 @@ def sentences_of(result):
         if rmse is None:
             continue
         noise = float(result.estimation.noise[c])
-        bias = f"{name}: mean residual {q['bias'][c]:+.3g} {unit}, noise {noise:.3g} {unit}"
+        mean = q["bias"][c] if abs(q["bias"][c]) > 1e-4 * noise else 0.0  # else rounding
+        bias = f"{name}: mean residual {mean:.3g} {unit}, noise {noise:.3g} {unit}"
         tests = []
         if q["white"][c] is not None:
             white = q["white"][c] > CHANCE
