@@ -169,3 +169,37 @@ def programs_in(jaxpr):
                 inner = getattr(inner, "jaxpr", inner)
                 if hasattr(inner, "eqns"):
                     yield from programs_in(inner)
+
+
+PROCESS = """
+units = ["m", "%"]
+[[tank]]
+area = 0.5
+rim = 1.2
+level = 0.4
+[[tank]]
+area = 0.25
+rim = 1.0
+drain = 4.15e-4
+level = 0.5
+[[orifice]]
+from = 1
+to = 2
+area = 3.2e-4
+[[pump]]
+gain = 2.64e-5
+to = 1
+high = 100.0
+[plant]
+outputs = [2]
+gravity = 9.81
+[controller]
+kind = "open-loop"
+initial = [40.0]
+changes = [[10.0, 1, 50.0]]
+[reference]
+initial = [0.5]
+[values]
+"clock.dt" = 0.1
+"""
+"""Two tanks in m with a pump in %, of which the tests of logs make data."""

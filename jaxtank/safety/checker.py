@@ -10,12 +10,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxtank.safety.known_features import FLOWS, SHAPE, first_failure, unknown_feature
+from jaxtank.safety.known_features import (
+    FLOWS,
+    SHAPE,
+    SIGMAS,
+    first_failure,
+    readable,
+    unknown_feature,
+)
 
 LIMITS, CASE = "limits", "case"
 """Levels at t = 0 for which a verdict holds: any at or below the limits, or the case's start."""
-SIGMAS = 5.0
-"""Standard deviations of the noise that a band must have at least."""
 SHALLOW = 0.05
 """a0 of Theorem 2 as a share of the root of the limit."""
 PARTS = 1000
@@ -109,27 +114,6 @@ def _root(h, knee):
 def _pipe_root(z, knee):
     """Signed root of a difference of levels in the flows of a TankNetwork."""
     return math.copysign(math.inf, z) if math.isinf(z) else z / math.sqrt(math.hypot(z, knee))
-
-
-def readable(sensor, span, full):
-    """((n,) least band, (n,) highest level that is read for certain [cm]); `span` of a leaf over
-    the box, `full` makes it (n,).
-    """
-    ends = {
-        name: span(f"sensor.{name}", getattr(sensor, name))
-        for name in ("noise", "offset", "low", "high", "gain", "full_scale")
-    }
-    needed = full(SIGMAS * ends["noise"][1]) + np.maximum(*map(np.abs, ends["offset"]))
-    top = full(np.inf if sensor.high is None else ends["high"][0])
-    if sensor.low is not None:  # a lower level is read as this one
-        needed = needed + np.maximum(full(ends["low"][1]), 0.0)
-    if sensor.bits and sensor.low is not None and sensor.high is not None:
-        needed = needed + 0.5 * full(ends["high"][1] - ends["low"][0]) / 2**sensor.bits
-    elif sensor.bits:
-        gain, scale = ends["gain"], ends["full_scale"]
-        needed = needed + 0.5 * full(gain[1]) * scale[1] / 2**sensor.bits
-        top = np.minimum(top, full(gain[0]) * scale[0])
-    return needed, top
 
 
 class _Rig:

@@ -1,4 +1,4 @@
-"""The closed list of features of a loop that the independent checker knows."""
+"""The closed list of features of a loop that the independent checkers know, and their readings."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping
@@ -31,6 +31,10 @@ UNCERTAIN = {
     *("actuator.initial", "actuator.delay", "x0"),
     *(f"sensor.{name}" for name in ("noise", "offset", "low", "high", "gain", "full_scale")),
 }
+
+
+SIGMAS = 5.0
+"""Standard deviations of the noise that a band must have at least."""
 
 
 class Known(NamedTuple):
@@ -130,3 +134,24 @@ def _has_nan(entry):
         return bool(np.isnan(np.asarray(entry, dtype=float)).any())
     except (TypeError, ValueError):  # names, another component
         return False
+
+
+def readable(sensor, span, full):
+    """((n,) least band, (n,) highest level that is read for certain [cm]); `span` of a leaf over
+    the box, `full` makes it (n,).
+    """
+    ends = {
+        name: span(f"sensor.{name}", getattr(sensor, name))
+        for name in ("noise", "offset", "low", "high", "gain", "full_scale")
+    }
+    needed = full(SIGMAS * ends["noise"][1]) + np.maximum(*map(np.abs, ends["offset"]))
+    top = full(np.inf if sensor.high is None else ends["high"][0])
+    if sensor.low is not None:  # a lower level is read as this one
+        needed = needed + np.maximum(full(ends["low"][1]), 0.0)
+    if sensor.bits and sensor.low is not None and sensor.high is not None:
+        needed = needed + 0.5 * full(ends["high"][1] - ends["low"][0]) / 2**sensor.bits
+    elif sensor.bits:
+        gain, scale = ends["gain"], ends["full_scale"]
+        needed = needed + 0.5 * full(gain[1]) * scale[1] / 2**sensor.bits
+        top = np.minimum(top, full(gain[0]) * scale[0])
+    return needed, top

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy  # its parts are imported when they are first used
 
-from jaxtank.safety.checker import CASE, LIMITS, Verdict, readable
-from jaxtank.safety.known_features import OUTLETS, first_failure, unknown_feature
+from jaxtank.safety.checker import CASE, LIMITS, Verdict
+from jaxtank.safety.known_features import OUTLETS, first_failure, readable, unknown_feature
 
 PARTS = 500
 """Intervals of readings on which floors and caps are compared."""
@@ -198,10 +198,10 @@ class _Rig:
         flow *= float(of(kind)[k]) * math.sqrt(2.0 * float(end.gravity))
         return flow if resistance is None else flow + head / float(resistance[k])
 
-    def joined(self, end, area, ports, k, one, other):
+    def joined(self, end, area, ports, k, first, second):
         """Flow between two tanks through pipe or valve k, towards the other level."""
         port = 0.0 if ports is None else float(ports[k])
-        heads = [h if ports is None else max(h - port, 0.0) for h in (one, other)]
+        heads = [h if ports is None else max(h - port, 0.0) for h in (first, second)]
         z = heads[0] - heads[1]
         flow = float(area[k]) * math.sqrt(2.0 * float(end.gravity))
         return flow * z / math.sqrt(math.hypot(z, float(end.knee)))
@@ -209,46 +209,46 @@ class _Rig:
     def sure(self, i, level, flow):
         return flow if level >= self.empty[i] else 0.0
 
-    def harm(self, i, own, others, upper):
+    def harm(self, i, h, others, upper):
         """Most that flows into tank i (upper), or out of it, without inputs [cm^3/s]."""
         enters, leaves = (self.strong, self.weak) if upper else (self.weak, self.strong)
         into = self.inflow[i] if upper else self.draw[i]
-        out = self.outlet(leaves, "drain", i, own)
-        out = self.sure(i, own, out) if upper else out
+        out = self.outlet(leaves, "drain", i, h)
+        out = self.sure(i, h, out) if upper else out
         for k, (a, b) in enumerate(self.plant.links):
             if a == i:
-                flow = self.outlet(leaves, "orifice", k, own)
-                out += self.sure(i, own, flow) if upper else flow
+                flow = self.outlet(leaves, "orifice", k, h)
+                out += self.sure(i, h, flow) if upper else flow
             if b == i:
                 flow = self.outlet(enters, "orifice", k, others[a])
                 into += flow if upper else self.sure(a, others[a], flow)
         harm = into - out if upper else out - into
         pipes = (k for k, ends in enumerate(self.plant.pipes) if i in ends)
-        return harm + sum(self.piped(k, i, own, others, upper) for k in pipes)
+        return harm + sum(self.piped(k, i, h, others, upper) for k in pipes)
 
-    def piped(self, k, i, own, others, upper):
+    def piped(self, k, i, h, others, upper):
         """Harm of pipe k to tank i at one of its ends."""
         (other,) = set(self.plant.pipes[k]) - {i}
         weak, strong = (
-            self.joined(end, end.pipe, end.pipe_port, k, own, others[other])
+            self.joined(end, end.pipe, end.pipe_port, k, h, others[other])
             for end in (self.weak, self.strong)
         )
         if upper:
-            return -(self.sure(i, own, weak) if weak >= 0.0 else strong)
+            return -(self.sure(i, h, weak) if weak >= 0.0 else strong)
         return strong if strong >= 0.0 else self.sure(other, others[other], weak)
 
-    def effects(self, i, own, others, upper):
+    def effects(self, i, h, others, upper):
         """{input: (harm per demand above 0, below 0, whether a larger input helps)}."""
         table = {}
         for j, pair in enumerate(self.plant.feeds):
             if i == self.source(j) or i in pair:
-                table[j] = self.pumped(j, i, own, others, upper)
+                table[j] = self.pumped(j, i, h, others, upper)
         for k, pair in enumerate(self.plant.valves):
             if i in pair:
-                table[self.m + k] = self.through(k, i, own, others, upper)
+                table[self.m + k] = self.through(k, i, h, others, upper)
         return table
 
-    def pumped(self, j, i, own, others, upper):
+    def pumped(self, j, i, h, others, upper):
         """Effect of pump j on tank i."""
         a, b = float(self.weak.pump_gain[j]), float(self.strong.pump_gain[j])
         source, (first, second) = self.source(j), self.plant.feeds[j]
@@ -259,30 +259,30 @@ class _Rig:
             p, q = (p, q) if i == first else (1.0 - q, 1.0 - p)
             a, b = a * p, b * q
         if self.plant.lift_curves and self.plant.lift_curves[j] is not None:
-            lift = own - (0.0 if other is None else others[other])
+            lift = h - (0.0 if other is None else others[other])
             share = _share(self.plant.lift_curves[j], -lift if takes else lift)
             a, b = a * share, b * share
-        dry = lambda k: k is not None and self.sure(k, own if k == i else others[k], 1.0) == 0.0
+        dry = lambda k: k is not None and self.sure(k, h if k == i else others[k], 1.0) == 0.0
         if takes == upper:  # a larger input helps
             return (0.0 if dry(source) else -a), -b, True
         givers = (first, second) if takes else (i,)
         return b, (0.0 if any(map(dry, givers)) else a), False
 
-    def through(self, k, i, own, others, upper):
+    def through(self, k, i, h, others, upper):
         """Effect of valve k on tank i."""
         (a, b), ends = self.plant.valves[k], (self.weak, self.strong)
         if b is not None:
             flow = self.joined(
-                self.strong, self.strong.valve, self.strong.valve_port, k, own,
+                self.strong, self.strong.valve, self.strong.valve_port, k, h,
                 others[b if i == a else a],
             )  # fmt: skip
             if self.plant.one_way[k] and (flow > 0.0) != (i == a):
                 flow = 0.0
             return max(-flow if upper else flow, 0.0), 0.0, False
         port = 0.0 if self.plant.valve_port is None else float(self.plant.valve_port[k])
-        root = _root(max(own - port, 0.0), float(self.plant.knee))
+        root = _root(max(h - port, 0.0), float(self.plant.knee))
         flows = [float(e.valve[k]) * math.sqrt(2.0 * float(e.gravity)) * root for e in ends]
-        plus = -self.sure(i, own, flows[0]) if upper else flows[1]
+        plus = -self.sure(i, h, flows[0]) if upper else flows[1]
         return plus, plus, upper
 
     def worst(self, effects, movers=()):
@@ -311,10 +311,10 @@ class _Rig:
             room = self.room(i, min(max(reading + self.band[i], 0.0), self.limit[i]), self.limit[i])
         else:
             room = self.room(i, self.low[i], max(reading - self.band[i], self.low[i]))
-        own = max(level - self.band[i] if up else level + self.band[i], 0.0)
-        effects = self.effects(i, own, others, up)
+        h = max(level - self.band[i] if up else level + self.band[i], 0.0)
+        effects = self.effects(i, h, others, up)
         rest = {j: e for j, e in effects.items() if j not in row.movers}
-        return effects, self.rate[i] * room - self.harm(i, own, others, up) - self.worst(rest)
+        return effects, self.rate[i] * room - self.harm(i, h, others, up) - self.worst(rest)
 
 
 def _done(effect, v):
@@ -473,8 +473,8 @@ def _row_holds(rig, row, bounds, near):
 
 def _fastest(rig, k, upper):
     """Largest rise (upper) or fall of a level [cm/s] of a tank with one cross-section."""
-    own, others = (0.0, rig.reach) if upper else (rig.reach[k], rig.bottom)
-    rate = rig.harm(k, own, others, upper) + rig.worst(rig.effects(k, own, others, upper))
+    h, others = (0.0, rig.reach) if upper else (rig.reach[k], rig.bottom)
+    rate = rig.harm(k, h, others, upper) + rig.worst(rig.effects(k, h, others, upper))
     return max(rate, 0.0) / float(rig.weak.area[k])
 
 

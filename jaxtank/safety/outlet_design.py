@@ -173,9 +173,9 @@ def _worst(effects, ranges, movers=()):
 
 def _able(base, tank, ranges, upper):
     """[inputs that keep a limit, those that close first]; [()] where it needs none."""
-    own, others = (base.limit[tank], base.reach) if upper else (base.low[tank], base.bottom)
-    effects = base.effects(tank, own, others, upper)
-    rest = float(base.harmful(tank, own, others, upper))
+    h, others = (base.limit[tank], base.reach) if upper else (base.low[tank], base.bottom)
+    effects = base.effects(tank, h, others, upper)
+    rest = float(base.harmful(tank, h, others, upper))
     down = tuple(j for j, effect in effects.items() if not effect.up)
     up = tuple(j for j, effect in effects.items() if effect.up)
     sets = dict.fromkeys([(), down, up, tuple(effects)])
@@ -207,9 +207,9 @@ def _agrees(movers, effects, directions):
 
 def _step(base, tank, ranges, upper, hold):
     """Largest change of a level [cm] in a hold, of a tank with one cross-section."""
-    own, others = (0.0, base.reach) if upper else (base.reach[tank], base.bottom)
-    rate = float(base.harmful(tank, own, others, upper))
-    rate += _worst(base.effects(tank, own, others, upper), ranges)
+    h, others = (0.0, base.reach) if upper else (base.reach[tank], base.bottom)
+    rate = float(base.harmful(tank, h, others, upper))
+    rate += _worst(base.effects(tank, h, others, upper), ranges)
     return hold * max(rate, 0.0) / float(base.least.area[tank])
 
 

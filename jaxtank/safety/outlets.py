@@ -106,13 +106,13 @@ class OutletFilter:
         """Return ({input: Effect} of the `movers`, the harmful flow that they may make at most)."""
         band, limit, least = self.band[tank], self.limit[tank], self.low[tank]
         if upper:
-            own, high = lower_clip(y - band, 0.0), y + band
+            h, high = lower_clip(y - band, 0.0), y + band
             room = self._volume(tank, jnp.where(high < limit, high, limit), limit)
         else:
-            own = lower_clip(y + band, 0.0)
+            h = lower_clip(y + band, 0.0)
             room = self._volume(tank, least, lower_clip(y - band, least))
-        effects = self.effects(tank, own, others, upper)
-        allowed = self.rate[tank] * room - self.harmful(tank, own, others, upper)
+        effects = self.effects(tank, h, others, upper)
+        allowed = self.rate[tank] * room - self.harmful(tank, h, others, upper)
         for j in (j for j in effects if j not in movers):
             allowed = allowed - jnp.maximum(*(effects[j].of(end[j]) for end in ends))
         return {j: effects[j] for j in movers}, allowed
@@ -126,7 +126,7 @@ class OutletFilter:
         ends = (self.least.extent[tank], self.most.extent[tank])
         return jnp.minimum(*(volume(e, high) - volume(e, low) for e in ends))
 
-    def harmful(self, tank: int, own: Any, others: Sequence[Any], upper: bool) -> Any:
+    def harmful(self, tank: int, h: Any, others: Sequence[Any], upper: bool) -> Any:
         """Return the largest flow in the harmful direction that no input makes [cm^3/s]."""
         leaving, entering = (self.least, self.most) if upper else (self.most, self.least)
         sign = 1.0 if upper else -1.0
@@ -134,27 +134,27 @@ class OutletFilter:
         for kind, pairs in elements.openings(self.least):
             for k, (source, sink) in enumerate(pairs):
                 if source == tank:
-                    flow = elements.outlet_flow(leaving, kind, k, own)
-                    total = total - sign * (self._certain(tank, own, flow) if upper else flow)
+                    flow = elements.outlet_flow(leaving, kind, k, h)
+                    total = total - sign * (self._certain(tank, h, flow) if upper else flow)
                 if sink == tank:
                     flow = elements.outlet_flow(entering, kind, k, others[source])
                     sure = flow if upper else self._certain(source, others[source], flow)
                     total = total + sign * sure
         for k, ends in enumerate(self.least.pipes):
             if tank in ends:
-                total = total + self._by_pipe(k, tank, own, others, upper)
+                total = total + self._by_pipe(k, tank, h, others, upper)
         return total
 
-    def _by_pipe(self, k, tank, own, others, upper):
+    def _by_pipe(self, k, tank, h, others, upper):
         """Harm of pipe k to a tank at one of its ends."""
         ends = self.least.pipes[k]
         other = ends[1] if ends[0] == tank else ends[0]
-        heads = {tank: own, other: others[other]}
+        heads = {tank: h, other: others[other]}
         weak, strong = (elements.pipe_flow(p, k, heads) for p in (self.least, self.most))
         if ends[1] == tank:
             weak, strong = -weak, -strong
         if upper:
-            return -jnp.where(weak >= 0.0, self._certain(tank, own, weak), strong)
+            return -jnp.where(weak >= 0.0, self._certain(tank, h, weak), strong)
         sure = self._certain(other, others[other], weak)
         return jnp.where(strong >= 0.0, strong, sure)
 
@@ -163,7 +163,7 @@ class OutletFilter:
         return jnp.where(level >= self.empty[tank], flow, 0.0)
 
     def effects(
-        self, tank: int, own: Any, others: Sequence[Any], upper: bool
+        self, tank: int, h: Any, others: Sequence[Any], upper: bool
     ) -> Mapping[int, Effect]:
         """Return {input: Effect} of the inputs that act on a tank."""
         table: dict[int, Effect] = {}
@@ -172,47 +172,47 @@ class OutletFilter:
             ends = [(p.pump_gain[j], p.split[j]) for p in (self.least, self.most)]
             (low, share), (high, most) = ends
             if source == tank:
-                table[j] = self._pumped(j, tank, own, others, (low, high), first, upper)
+                table[j] = self._pumped(j, tank, h, others, (low, high), first, upper)
             elif first == tank:
                 gains = (low, high) if second is None else (low * share, high * most)
-                table[j] = self._pumped(j, tank, own, others, gains, source, upper)
+                table[j] = self._pumped(j, tank, h, others, gains, source, upper)
             elif second == tank and second is not None:
                 gains = low * (1.0 - most), high * (1.0 - share)
-                table[j] = self._pumped(j, tank, own, others, gains, source, upper)
+                table[j] = self._pumped(j, tank, h, others, gains, source, upper)
         for k, pair in enumerate(self.least.valves):
             if tank in pair:
                 j = len(self.least.feeds) + k
-                table[j] = self._valve(k, tank, own, others, upper)
+                table[j] = self._valve(k, tank, h, others, upper)
         return table
 
-    def _valve(self, k, tank, own, others, upper):
+    def _valve(self, k, tank, h, others, upper):
         """Effect of a valve at a tank; closed, one between two tanks does no harm to either."""
         source, sink = self.least.valves[k]
         if sink is None:
-            strong = elements.valve_flow(self.most, k, {tank: own})
-            weak = self._certain(tank, own, elements.valve_flow(self.least, k, {tank: own}))
+            strong = elements.valve_flow(self.most, k, {tank: h})
+            weak = self._certain(tank, h, elements.valve_flow(self.least, k, {tank: h}))
             plus = -weak if upper else strong
             return Effect(plus, plus, upper)
         other = sink if tank == source else source
-        forth = elements.valve_flow(self.most, k, {tank: own, other: others[other]})
+        forth = elements.valve_flow(self.most, k, {tank: h, other: others[other]})
         into = forth if tank == sink else -forth
         harm = lower_clip(into if upper else -into, 0.0)
         return Effect(harm, harm, False)
 
-    def _pumped(self, pump, tank, own, others, gains, other, upper):
+    def _pumped(self, pump, tank, h, others, gains, other, upper):
         """Effect of a pump that brings liquid to a tank, or takes it out."""
         least, most = gains
         takes = bool(self.least.sources) and self.least.sources[pump] == tank
         by_lift = self.least.lift_curves[pump] if self.least.lift_curves else None
         if by_lift is not None:
-            lift = own - (0.0 if other is None else others[other])
+            lift = h - (0.0 if other is None else others[other])
             share = lower_clip(monotone_curve(by_lift, -lift if takes else lift), 0.0)
             least, most = least * share, most * share
 
         def certain(*tanks):
             flow = least
             for i in (i for i in tanks if i is not None):
-                flow = self._certain(i, own if i == tank else others[i], flow)
+                flow = self._certain(i, h if i == tank else others[i], flow)
             return flow
 
         both = self.least.feeds[pump]

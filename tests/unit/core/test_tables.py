@@ -3,6 +3,7 @@
 import datetime as dt
 
 import numpy as np
+import openpyxl
 import pytest
 
 from jaxtank.core.errors import DataError
@@ -151,7 +152,6 @@ def test_files_that_are_no_table(table, content, words):
 
 
 def test_an_excel_file(table, tmp_path):
-    openpyxl = pytest.importorskip("openpyxl")
     book = openpyxl.Workbook()
     book.active.append(["when", "LT101 [m]", "after"])
     for time, value in zip(TIMES, STEPS):

@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 import pytest
+from helpers import PROCESS as RIG
 
 import tuning
 from jaxtank import rig
@@ -14,37 +15,6 @@ from jaxtank.core.tree import number
 from tuning.cli.main import main
 from tuning.identification import simulation
 
-RIG = """
-units = ["m", "%"]
-[[tank]]
-area = 0.5
-rim = 1.2
-level = 0.4
-[[tank]]
-area = 0.25
-rim = 1.0
-drain = 4.15e-4
-level = 0.5
-[[orifice]]
-from = 1
-to = 2
-area = 3.2e-4
-[[pump]]
-gain = 2.64e-5
-to = 1
-high = 100.0
-[plant]
-outputs = [2]
-gravity = 9.81
-[controller]
-kind = "open-loop"
-initial = [40.0]
-changes = [[10.0, 1, 50.0]]
-[reference]
-initial = [0.5]
-[values]
-"clock.dt" = 0.1
-"""
 TRUTH = {"plant.pump_gain[0]": 2.64e-5, "plant.orifice[0]": 3.2e-4, "plant.drain[1]": 4.15e-4}
 FREE = {
     "plant.pump_gain": (1e-5, 1e-4),

@@ -62,7 +62,7 @@ max_levl = 1.0
         ("Kd = 0.1", "Td"),
         ("setpoint = 0.5", "[reference]"),
         ("SP = 0.5", "[reference]"),
-        ("dt = 1.0", "clock.dt"),
+        ("dt = 1.0", "dt at the top"),
     ],
 )
 def test_words_of_the_field_are_answered_with_ours(word, write):

@@ -421,3 +421,11 @@ def test_an_orifice_into_the_basin_is_the_drain_of_its_tank():
     assert rig.dump(left) == rig.dump(right)
     with pytest.raises(InputError, match="another opening"):
         rig.loads(drain + orifice)
+
+
+def test_the_clock_may_stand_at_the_top_of_a_file():
+    short = 'case = "cascaded/pi"\ndt = "2 s"\nduration = "5 min"\n'
+    long = 'case = "cascaded/pi"\n[values]\n"clock.dt" = 2.0\n"clock.duration" = 300.0\n'
+    assert rig.loads(short).clock == rig.loads(long).clock
+    with pytest.raises(InputError, match=r"clock\.dt is given twice"):
+        rig.loads(short + '[values]\n"clock.dt" = 2.0\n')
