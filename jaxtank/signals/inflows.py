@@ -197,13 +197,13 @@ def _means(clock, times, rows, linear):
     first, last = place(t + near), place(end - near)
     past = lambda row, moment: moment - jnp.asarray(times)[row]
     flow = lambda row, moment: rows[row] + slopes[row] * past(row, moment)
-    one = 0.5 * (flow(first, t) + flow(first, end))
+    within = 0.5 * (flow(first, t) + flow(first, end))
     following = jnp.minimum(first + 1, len(times) - 1)
     until = jnp.asarray(times)[following]
     rest = (until - t) * 0.5 * (flow(first, t) + flow(first, until))
     begun = past(last, end) * 0.5 * (rows[last] + flow(last, end))
-    several = (rest + (volumes[last] - volumes[following]) + begun) / clock.dt
-    return jnp.where(first == last, one, several)
+    across = (rest + (volumes[last] - volumes[following]) + begun) / clock.dt
+    return jnp.where(first == last, within, across)
 
 
 def inflow_table(

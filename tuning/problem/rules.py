@@ -412,18 +412,17 @@ def rule_gains(case: Case, rule: str) -> dict[str, float]:
         raise unknown("tuning rule", rule, RULES)
     if why := refusal(case):
         raise InputError(f"rule {rule}: {why}")
-    values: dict[str, float] = {}
+    outputs = []
     for i in range(len(case.loop.plant.outputs)):
         try:
-            values |= {f"controller.{n}[{i}]": v for n, v in _gains_of(case, rule, i).items()}
+            outputs.append(_gains_of(case, rule, i))
         except InputError as error:
             raise InputError(f"rule {rule}, output {i + 1}: {error}") from None
     return {
-        name: value
-        for name, value in sorted(
-            values.items(), key=lambda item: ORDER.index(item[0].split("[")[0][11:])
-        )
-        if 0.0 < abs(value) < math.inf
+        f"controller.{name}[{i}]": gains[name]
+        for name in ORDER
+        for i, gains in enumerate(outputs)
+        if name in gains and 0.0 < abs(gains[name]) < math.inf
     }
 
 
