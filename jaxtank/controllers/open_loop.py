@@ -30,6 +30,11 @@ class OpenLoop(Controller):
 
     signal: Signal
 
+    @property
+    def signal_units(self) -> dict[str, str]:
+        """{signal: the unit of what it carries}."""
+        return {"signal": "V"}
+
     @pointwise
     def inputs(self, clock: Clock) -> Any:
         return self.signal.sample(clock)[0]

@@ -273,16 +273,24 @@ def is_real(value: Any) -> bool:
 
 
 def walk(
-    tree: Any, prefix: str = "", kind: str = "leaf", units: tuple[str, str] = DEFAULT
+    tree: Any,
+    prefix: str = "",
+    kind: str = "leaf",
+    units: tuple[str, str] = DEFAULT,
+    carried: str = "",
 ) -> Iterator[tuple[str, Any, Meta]]:
     """Yield every field of one kind below a component, in the order of its fields."""
     units = getattr(tree, "units", units)
     for field in dataclasses.fields(tree):
         value, name = getattr(tree, field.name), f"{prefix}{field.name}"
         if is_component(value):
-            yield from walk(value, f"{name}.", kind, units)
+            # the unit of what a signal carries is known to the component that reads it
+            unit = getattr(tree, "signal_units", {}).get(field.name, carried)
+            yield from walk(value, f"{name}.", kind, units, unit)
         elif field.metadata.get("kind") == kind:
             inside: Meta = tree.metadata_of(field.name) if hasattr(tree, "metadata_of") else {}
+            if carried and inside.get("carried"):
+                inside = {**inside, "unit": carried}
             yield name, value, _localised({**field.metadata, **inside}, units)
 
 

@@ -108,6 +108,11 @@ class ClosedLoop:
         """(length, pump input) of the rig."""
         return self.plant.units
 
+    @property
+    def signal_units(self) -> dict[str, str]:
+        """{signal: the unit of what it carries, for a rig in cm}."""
+        return {"reference": "cm", "disturbance": "cm^3/s"}
+
 
 class State(NamedTuple):
     """State of the loop between two samples."""

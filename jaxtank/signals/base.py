@@ -16,6 +16,10 @@ BETWEEN = ("hold", "linear")
 """What a table of rows does between them."""
 
 
+CARRIED = ("level", "values", "initial", "targets", "amplitude", "offset")
+"""Leaves of signals that have the unit of what a signal stands for: a level, a flow, an input."""
+
+
 class Signal(Role):
     """A signal of one or more channels: a reference, a disturbance or an input.
 
@@ -32,6 +36,10 @@ class Signal(Role):
 
     is_table: bool = False
     """Whether samples are looked up in a table, which code of a single sample does not hold."""
+
+    def metadata_of(self, field: str) -> dict[str, Any]:
+        """Return what of a field's metadata depends on the signal's place (`walk`)."""
+        return {"carried": field in CARRIED}
 
     @property
     @abc.abstractmethod
