@@ -27,8 +27,8 @@ class LevelSensor(Sensor):
     `LevelSensor(noise=[0.1])` suffices where there is no ADC. With `low` and `high`, the levels at
     0 % (4 mA) and 100 % (20 mA), readings stay within them, and the ADC divides what is between.
 
-        y = h + offset + noise * xi,  xi ~ N(0, 1);  volts = y / gain, clipped to [0, full_scale],
-        rounded to full_scale / 2^bits
+        y = scale h + offset + noise * xi,  xi ~ N(0, 1);  volts = y / gain, clipped to
+        [0, full_scale], rounded to full_scale / 2^bits
 
     The derivative of the ADC is the slope of the line through its staircase (numerics.quantise).
 
@@ -52,6 +52,15 @@ class LevelSensor(Sensor):
     )
     offset: np.ndarray | None = leaf(
         "cm", "what each sensor reads of an empty tank", like="gain", default=None, shape="tank"
+    )
+    scale: np.ndarray | None = leaf(
+        "-",
+        "reading per level of each sensor; 1: calibrated",
+        low=0.0,
+        strict=True,
+        like="gain",
+        default=None,
+        shape="tank",
     )
     low: np.ndarray | None = leaf(
         "cm",
@@ -78,6 +87,18 @@ class LevelSensor(Sensor):
 
     arrays = True
 
+    def reading_of(self, tank: int, level: Any, in_volts: bool = False) -> Any:
+        """Return what the sensor of one tank reads of a level, without noise and ends."""
+        level = level if self.scale is None else self.scale[tank] * level
+        level = level if self.offset is None else level + self.offset[tank]
+        return level / self.gain[tank] if in_volts else level
+
+    def level_of(self, tank: int, reading: Any, in_volts: bool = False) -> Any:
+        """Return the level of a reading of one tank, the inverse of `reading_of`."""
+        level = reading * self.gain[tank] if in_volts else reading
+        level = level if self.offset is None else level - self.offset[tank]
+        return level if self.scale is None else level / self.scale[tank]
+
     def step(self, state: Any, x: Sequence, xi: Sequence | None, dt: Any) -> tuple[Sequence, Any]:
         return self.read(x, xi), state
 
@@ -93,7 +114,8 @@ class LevelSensor(Sensor):
         -------
         (n,) readings [cm]
         """
-        y = x if self.offset is None else each(lambda h, offset: h + offset, x, self.offset)
+        y = x if self.scale is None else each(lambda h, scale: scale * h, x, self.scale)
+        y = y if self.offset is None else each(lambda h, offset: h + offset, y, self.offset)
         y = y if xi is None else each(lambda h, noise, z: h + noise * z, y, self.noise, xi)
         if self.low is not None:
             y = each(lower_clip, y, self.low)

@@ -529,11 +529,10 @@ def _sensor_entries(loop, tanks):
         if low is not None and high is not None and np.isfinite([low[i], high[i]]).all():
             row["span"] = [float(low[i]), float(high[i])]
         if row["name"] or "span" in row:
-            offset = getattr(loop.sensor, "offset", None)
-            row |= {
-                "noise": tanks[i].pop("noise", None),
-                "offset": None if offset is None else offset[i],
-            }
+            row["noise"] = tanks[i].pop("noise", None)
+            for leaf in ("offset", "scale"):
+                values = getattr(loop.sensor, leaf, None)
+                row[leaf] = None if values is None else values[i]
             rows.append((SECTIONS["sensors"], len(rows) + 1, row))
     return rows
 

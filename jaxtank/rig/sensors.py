@@ -131,12 +131,14 @@ def leaves_of(rows, rims, noise, levels=()):
     levels : of each tank, numbers or texts in % of its span.
     """
     low, high, offset = np.full(len(rims), -np.inf), np.full(len(rims), np.inf), [0.0] * len(rims)
+    scale = [1.0] * len(rims)
     noise = list(noise)
     for row in rows:
         tank = row["tank"]
         if "span" in row or row["unit"] in ("%", "mA"):
             low[tank], high[tank] = row.get("span", (0.0, rims[tank]))
         noise[tank], offset[tank] = row.get("noise", noise[tank]), row.get("offset", 0.0)
+        scale[tank] = row.get("scale", 1.0)
     spans = _spans(low, high, rims)
     number_of = lambda v, span, width: level_of(v, span, width) if is_reading(v) else v
     leaves = {"noise": [number_of(v, span, True) for v, span in zip(noise, spans)]}
@@ -144,6 +146,8 @@ def leaves_of(rows, rims, noise, levels=()):
         leaves |= {"low": low, "high": high}
     if any("offset" in row for row in rows):
         leaves["offset"] = [number_of(v, span, True) for v, span in zip(offset, spans)]
+    if any("scale" in row for row in rows):
+        leaves["scale"] = scale
     levels = [number_of(v, span, False) for v, span in zip(levels, spans)]
     return {name: number(value) for name, value in leaves.items()}, levels
 

@@ -150,9 +150,8 @@ def played(case: Case, log: Log) -> Case:
     signal = Table(values=number(u.T), period=period, between="linear" if linear else "hold")
     x0 = np.array(loop.x0, dtype=float)
     for readings, tank, volts in zip(log.y.T, log.tanks, log.in_volts):
-        offset = 0.0 if loop.sensor.offset is None else float(loop.sensor.offset[tank])
         for y in readings[np.isfinite(readings)][:1]:
-            x0[tank] = max(y * float(loop.sensor.gain[tank] if volts else 1.0) - offset, 0.0)
+            x0[tank] = max(float(loop.sensor.level_of(tank, y, volts)), 0.0)
     return case.replace(
         loop=dataclasses.replace(loop, controller=OpenLoop(signal=signal), x0=number(x0)),
         clock=dataclasses.replace(case.clock, duration=dt * int(t[-1] / dt + 1e-9)),
@@ -166,9 +165,8 @@ def beside(case: Case, log: Log, run: Any) -> dict[str, Any]:
     t, sensor, channels = log.t - log.t[0], case.loop.sensor, []
     inside = t <= float(run.t[-1]) * (1 + 1e-9)
     for y, tank, volts in zip(log.y[inside].T, log.tanks, log.in_volts):
-        offset = 0.0 if sensor.offset is None else float(sensor.offset[tank])
-        level = np.interp(t[inside], np.asarray(run.t), np.asarray(run.x)[:, tank]) + offset
-        simulated = level / float(sensor.gain[tank]) if volts else level
+        level = np.interp(t[inside], np.asarray(run.t), np.asarray(run.x)[:, tank])
+        simulated = np.asarray(sensor.reading_of(tank, level, volts))
         fit = fit_of(y[None, :, None], (y - simulated)[None, :, None])
         row = {
             "name": reading_label(case.loop.plant, tank),

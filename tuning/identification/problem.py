@@ -139,13 +139,10 @@ class Estimation:
         x0 = np.tile(np.asarray(self.case.loop.x0, dtype=float), (len(self.logs), 1))
         if start == "case":
             return x0
-        sensor = self.rig.sensor
         for c, (tank, in_volts) in enumerate(self.data.channels):
-            scale = float(sensor.gain[tank]) if in_volts else 1.0
-            offset = 0.0 if sensor.offset is None else float(sensor.offset[tank])
             for e, readings in enumerate(self.data.y[..., c]):
                 for y in readings[np.isfinite(readings)][:1]:
-                    x0[e, tank] = max(float(y) * scale - offset, 0.0)
+                    x0[e, tank] = max(float(self.rig.sensor.level_of(tank, y, in_volts)), 0.0)
         return x0
 
     def _substeps(self):

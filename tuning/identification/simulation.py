@@ -153,7 +153,7 @@ def readings(rig, dt, u, channels, substeps):
         return advance(rig.plant, "rk4", 0.0, x, driven, d, step, substeps, rolled=True).x, state
 
     def sample(carry, pieces):
-        y = tuple(_reading(rig, carry[0], channel) for channel in channels)
+        y = tuple(rig.sensor.reading_of(tank, carry[0][tank], volts) for tank, volts in channels)
         x, state = advanced(*carry, *pieces[0])
         for step, inputs in pieces[1:]:
             # a piece of length zero is none: a pump with memory would see a sample
@@ -167,13 +167,6 @@ def readings(rig, dt, u, channels, substeps):
     pumps = range(rig.plant.pumps)
     pieces = tuple((dt[:, i], tuple(u[:, i, j] for j in pumps)) for i in range(dt.shape[1]))
     return jnp.stack(scan(sample, (x, state), pieces, length=dt.shape[0])[1], axis=-1)
-
-
-def _reading(rig, x, channel):
-    """Return the reading of one channel at levels x."""
-    tank, in_volts = channel
-    y = x[tank] if rig.sensor.offset is None else x[tank] + rig.sensor.offset[tank]
-    return y / rig.sensor.gain[tank] if in_volts else y
 
 
 @functools.partial(jax.jit, static_argnames=("coordinates", "tanks", "channels", "substeps"))

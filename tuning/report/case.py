@@ -297,7 +297,8 @@ def _sensor(loop):
         noise = f"noise of {_list(sensor.noise)} {length} (standard deviation)"
     bits = f"an ADC of {sensor.bits} bits" if sensor.bits else "no ADC (sensor.bits)"
     offset = "" if sensor.offset is None else f", offset {_list(sensor.offset)} {length}"
-    return f"Sensors: one per tank, {noise}, {bits}{offset}."
+    scale = "" if sensor.scale is None else f", reading {_list(sensor.scale)} of the level"
+    return f"Sensors: one per tank, {noise}, {bits}{offset}{scale}."
 
 
 def _actuator(loop):

@@ -213,6 +213,7 @@ tank = "LT2"
 span = [0.05, 0.9]
 noise = 0.002
 offset = 0.01
+scale = 1.02
 [plant]
 gravity = 9.81
 [controller]

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import PROCESS
 
 import jaxtank
 from jaxtank import rig
@@ -158,3 +159,11 @@ def test_a_limit_beyond_the_span_is_not_certified():
     whole, short = (rig.loads(text % top).loop.safety_filter for top in ("30.0", "20.0"))
     assert float(whole.limit[0]) == pytest.approx(25.0)
     assert float(short.limit[0]) <= 20.0
+
+
+def test_a_sensor_reads_a_share_of_the_level_and_a_file_keeps_it():
+    """y = scale h + offset, and its inverse; through a file and back."""
+    table = PROCESS + '[[sensor]]\ntank = 2\nname = "LT2"\nscale = 0.9\noffset = 0.02\n'
+    sensor = rig.loads(rig.dump(rig.loads(table))).loop.sensor
+    assert [float(y) for y in sensor.read((0.5, 0.5), None)] == pytest.approx([0.5, 0.47])
+    assert sensor.level_of(1, sensor.reading_of(1, 0.3)) == pytest.approx(0.3, rel=1e-12)
