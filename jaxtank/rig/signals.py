@@ -169,6 +169,9 @@ def _sine(table, old, sizes):
         if not table:
             return None
         table = _over(section, sine_values(old) if old else {}, table)
+        if isinstance(name := table["output"], str):
+            number_of = index_of("reference.sine", sizes.plant, "output", name) + 1
+            table = {**table, "output": number_of}
     values = read_entry(section, table, sizes)
     output = values.pop("output")
     if output > sizes.outputs:
@@ -203,10 +206,7 @@ def disturbance_of(table, loop):
     (first, rows), sizes = parts_of(loop.disturbance), sizes_of(loop)
     values = read_entry(SECTIONS["disturbance"], table.get("disturbance", {}), sizes)
     entries = table.get("inflow", [])
-    pulses = [e for e in entries if not _is_course(e)]
     if "inflow" in values:
-        if pulses:
-            raise InputError("[disturbance] inflow and a pulse of [[inflow]]: give one of them")
         first = Constant(level=values["inflow"])
     if "inflow" in table:
         first = None if isinstance(first, InflowPulses) else first
@@ -234,6 +234,9 @@ def _inflows(entries, steady, sizes):
         pulses = read_entries(SECTIONS["inflow"], {"inflow": pulses}, sizes)
     problems.check()
     first = _pulses(pulses, steady, sizes.tanks)
+    if pulses and isinstance(steady, Constant):  # beside pulses it is a table of one row
+        flows = enumerate(np.asarray(steady.level).tolist())
+        courses += [(tank, [0.0], [flow], "hold") for tank, flow in flows if flow]
     if not courses:
         return first, None
     *_, between = zip(*courses)
@@ -274,11 +277,6 @@ def _pulses(entries, old, tanks):
     """The pulses of the [[inflow]] tables; without any, `old`."""
     if not entries:
         return old
-    if isinstance(old, Constant) and np.any(np.asarray(old.level) != 0.0):
-        raise InputError(
-            "[[inflow]]: this rig has a steady inflow already: a rig file can have one of the two;"
-            " a table of [[inflow]] with csv or changes may stand beside either"
-        )
     return inflow_pulses(
         tanks, [(e["time"], e["duration"], e["tank"], e["volume"]) for e in entries]
     )
@@ -289,13 +287,23 @@ def faults_of(entries, loop, dotted):
     events, plant = [], loop.plant
     for i, e in enumerate(read_entries(SECTIONS["fault"], {"fault": entries}, sizes_of(loop))):
         values = (e[name] for name in ("start", "end", "factor", "extra"))
-        of = e["of"] if "." in e["of"] else f"plant.{e['of']}"
         try:
-            events.append((dotted(loop, of).removeprefix("plant."), *values))
+            events.append((dotted(loop, _of_fault(e["of"], plant)).removeprefix("plant."), *values))
             faults(plant, events[-1:])
         except InputError as error:
             raise type(error)(f"fault {i + 1}: {error}") from None
     return faults(plant, events) if events else None
+
+
+def _of_fault(of, plant):
+    """A name of what a fault is of: "P101" is the gain of that pump, "FV101" the valve's area."""
+    kind = next((kind for kind, names in plant.names if of in names), "")
+    if kind in ("tank", "sensor"):
+        raise InputError(f'{of} is a {kind}: must be one of its numbers, as of = "{of}.drain"')
+    if kind:
+        return f"{of}.{'area' if kind == 'valve' else 'gain'}"
+    named = any(of.partition(".")[0] in names for _, names in plant.names)
+    return of if named or of.startswith("plant.") else f"plant.{of}"
 
 
 def disturbance_tables(disturbance):

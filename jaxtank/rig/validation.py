@@ -118,7 +118,8 @@ def check_uncertain(loop: ClosedLoop, uncertain: Mapping[str, Any]) -> dict[str,
     for name, share in shares.items():
         get_value(loop, name)
         if not (is_finite(share, 0) and 0 < share < 1):
-            raise refusal(f"uncertain {name}", share, "be a share between 0 and 1")
+            words = 'be a share between 0 and 1, as 0.05 or "5 %"'
+            raise refusal(f"uncertain {name}", share, words)
     return {name: float(share) for name, share in shares.items()}
 
 
@@ -144,6 +145,7 @@ def check_limits(
     A limit may be a text with a unit, of levels also in % of each rim, and {name or number from 1:
     limit} of some tanks, pumps or outputs; the others keep the limit of `usual`, or have none.
     """
+    limits = by_measure(limits)
     check_names(limits)
     checked = {}
     for measure, value in limits.items():
@@ -193,6 +195,20 @@ def _spans(loop, kind):
     """Levels at 0 and 100 % of each tank, or each output."""
     spans = spans_of(loop)
     return spans if kind == "tank" else [spans[i] for i in loop.plant.outputs]
+
+
+def by_measure(limits: Mapping[str, Any]) -> dict[str, Any]:
+    """{measure: limit}, of "max_level.LT101" and others {measure: {entry: limit}}."""
+    grouped: dict[str, Any] = {}
+    for name, value in limits.items():
+        measure, _, entry = name.partition(".")
+        if not entry:
+            grouped[name] = value
+        elif isinstance(table := grouped.setdefault(measure, {}), dict):
+            table[entry] = value
+        else:
+            raise InputError(f"limit {measure} of all and limit {name}: give one of them")
+    return grouped
 
 
 def _of_entries(loop, measure, table, usual):

@@ -87,6 +87,8 @@ def dotted_name(loop: ClosedLoop, name: str) -> str:
         ]
         return f"{base}[{','.join(map(str, entries))}]" if len(entries) == len(axes) else name
     part, _, key = name.rpartition(".")
+    if part.startswith("plant.") and any(key in names for _, names in plant.names):
+        return dotted_name(loop, f"{part}[{key}]")
     kind = next((kind for kind, names in plant.names if part and part in names), "")
     return _of_table(plant, kind, part, key) if kind else name
 

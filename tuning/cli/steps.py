@@ -124,11 +124,7 @@ def limits_of(args, case):
     limits = rig.check_limits(
         case.loop, {m: limit for m, limit in limits.items() if limit is not None}
     )
-    entries = {}
-    for name, limit in args.limit.items():
-        measure, dot, entry = name.partition(".")
-        if dot:
-            entries.setdefault(measure, {})[entry] = limit
+    entries = {name: limit for name, limit in args.limit.items() if "." in name}
     return limits | rig.check_limits(case.loop, entries, limits)
 
 
