@@ -14,9 +14,7 @@ from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig import components
 from jaxtank.rig.entry import Block, Line, suggestion, toml
 from jaxtank.rig.schema import SECTIONS, SHARE, WEIGHT, Section
-from jaxtank.rig.signals import parts_of
 from jaxtank.rig.values import schedule, schedule_table
-from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps
 
 
@@ -124,11 +122,9 @@ def _examples(case):
     """{section: {key: value} that could be in a file, None where it cannot}."""
     loop, plant, disturbance = case.loop, case.loop.plant, case.loop.disturbance
     instant = lambda share: _rounded(share * case.clock.duration)  # [s]
-    first = parts_of(disturbance)[0]
-    steady = isinstance(first, Constant) and np.any(np.asarray(first.level))
     # a sine changes the names of the reference, which a scenario may have
     named = any(name.startswith("reference.") for s in case.scenarios for name in s.values)
-    volume = float(np.asarray(plant.area)[0] * np.asarray(plant.rim)[0]) if not steady else 0.0
+    volume = float(np.asarray(plant.area)[0] * np.asarray(plant.rim)[0])
     return {
         "controller": _controller(loop),
         "schedule": _schedule(case),
@@ -142,9 +138,7 @@ def _examples(case):
             "duration": instant(0.01),
             "tank": 0,
             "volume": _rounded(0.01 * volume),
-        }
-        if not steady
-        else None,
+        },
         "fault": {
             "of": f"{_first_input(plant)}[0]",
             "start": instant(0.5),

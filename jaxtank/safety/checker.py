@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxtank.core.labels import label_of
 from jaxtank.safety.known_features import (
     FLOWS,
     SHAPE,
@@ -150,6 +151,10 @@ class _Rig:
                 low[at] = np.minimum(low[at], np.asarray(lower, float))
                 high[at] = np.maximum(high[at], np.asarray(upper, float))
         return low, high
+
+    def label(self, tank):
+        """What a person calls a tank."""
+        return label_of(self.plant, "tank", tank)
 
     def _coefficients(self, least, most, step):
         plant, n = self.plant, self.tanks
@@ -378,7 +383,7 @@ def _reason(rig, i, alone, together, lost):
         return alone
     others = sorted(lost - {i})
     near = [k for k in others if k in rig.neighbours(i)] or others
-    return f"relies on tank {', '.join(str(k + 1) for k in near)}, not proved"
+    return f"relies on {', '.join(map(rig.label, near))}, not proved"
 
 
 def _stays(rig, i, at):
@@ -404,7 +409,7 @@ def _entering(rig, i, at):
         ringed = _ringed(rig.plant.spills, i)
         yield not ringed, "not covered: a ring of tanks that overflow into each other"
         below = at.begin[a] + rig.spare[a] <= rig.rim[a] * (1.0 + 1e-12)
-        yield below, f"not covered: volumes that overflow at once from tank {a + 1}"
+        yield below, f"not covered: volumes that overflow at once from {rig.label(a)}"
         yield from _entering(rig, a, at)
         over = rig.rise(a, rig.rim[a], at.bounds) + rig.pumped(a, rig.most)
         entering += share * max(over, 0.0) * float(np.asarray(rig.filter.most.area)[a])
@@ -510,7 +515,7 @@ def _readable(rig, i, bounds):
         yield readable, f"level {bounds[k]:.4g} {unit} {reason}"
     for k in sorted(near.union(*(rig.neighbours(k) for k in near))):
         reason = f"may reach {bounds[k]:.4g} {unit}, {counts} {rig.reach[k]:.4g} {unit}"
-        yield rig.reach[k] >= bounds[k] * (1.0 - ROUNDING), f"tank {k + 1} {reason}"
+        yield rig.reach[k] >= bounds[k] * (1.0 - ROUNDING), f"{rig.label(k)} {reason}"
     for j, dead in enumerate(rig.dead):
         reason = f"may move liquid above {dead:.4g} V, {counts} {rig.offset[j]:.4g} V"
         yield rig.offset[j] <= dead * (1.0 + 1e-12), f"pump {j + 1} {reason}"
@@ -745,7 +750,7 @@ def _lower(rig, i, proved, begin, upper):
         return
     near = rig.neighbours(i)
     for k in sorted(near.union({i}, *(rig.neighbours(k) for k in near))):
-        yield rig.bottom[k] <= proved[k], f"relies on the low limit of tank {k + 1}, not proved"
+        yield rig.bottom[k] <= proved[k], f"relies on the low limit of {rig.label(k)}, not proved"
     bounded = all(math.isfinite(upper.bounds[k]) for k in {i} | near)
     yield bounded, "not covered: a low limit where a level has no upper bound"
     yield i in rig.kept, "no row of the filter keeps it"
@@ -791,6 +796,6 @@ def _caps_of_others(rig, i, needed):
         common = set(rig.gains[k]) & set(gains)
         total = sum(rig.gains[k][j][1] / max(gains[j][0], 1e-300) for j in common) * needed
         alone = len(gains) == len(rig.gains[k]) == 1
-        yield alone and total <= _caps(rig, k, edges).min(), f"the cap for tank {k + 1} {stops}"
+        yield alone and total <= _caps(rig, k, edges).min(), f"the cap for {rig.label(k)} {stops}"
     for k in sorted({k for f in fed for k in rig.below[f]} & rig.held):
-        yield not rig.slope[k] > 0.0, f"the cap for tank {k + 1} {stops}"
+        yield not rig.slope[k] > 0.0, f"the cap for {rig.label(k)} {stops}"

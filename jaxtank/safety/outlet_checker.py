@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy  # its parts are imported when they are first used
 
+from jaxtank.core.labels import label_of
 from jaxtank.safety.checker import CASE, LIMITS, Verdict
 from jaxtank.safety.known_features import OUTLETS, first_failure, readable, unknown_feature
 
@@ -165,6 +166,10 @@ class _Rig:
                 low[at] = np.minimum(low[at], np.asarray(lower, dtype=float))
                 high[at] = np.maximum(high[at], np.asarray(upper, dtype=float))
         return low, high
+
+    def label(self, tank):
+        """What a person calls a tank."""
+        return label_of(self.plant, "tank", tank)
 
     def demand(self, j, u):
         k = j - self.m
@@ -381,7 +386,7 @@ def _covered_elements(rig):
         if shape == "prism":
             continue
         least, most = (float(e.extent[i]) for e in (rig.weak, rig.strong))
-        word = f"not covered: tank {i + 1}"
+        word = f"not covered: {rig.label(i)}"
         yield rig.limit[i] <= least, f"{word} with a limit above its shape"
         sure = least == most or isinstance(shape, str)
         yield sure, f"{word} with a table of areas of uncertain extent"
@@ -429,7 +434,7 @@ def _kept(rig, i, bounds, upper):
     yield passing <= ROUNDING * max(abs(rest), 1e-9), reason
     for k in sorted({i} | near):
         sure = rig.empty[k] >= _shallow(rig, k) * (1.0 - ROUNDING)
-        yield sure, f"tank {k + 1} may run empty within a step"
+        yield sure, f"{rig.label(k)} may run empty within a step"
     if row is not None:
         yield from _row_holds(rig, row, bounds, near)
 
@@ -437,7 +442,7 @@ def _kept(rig, i, bounds, upper):
 def _relied_on(rig, near, bounds, upper):
     """(holds, reason): the levels of neighbours are within what the filter counts on."""
     for k in sorted(near):
-        word = f"relies on tank {k + 1}"
+        word = f"relies on {rig.label(k)}"
         yield math.isfinite(bounds.high[k]), f"{word}, which has no upper bound"
         yield rig.reach[k] < UNKNOWN, f"{word}, not proved"
         yield bounds.high[k] <= rig.reach[k] * (1.0 + ROUNDING), f"{word}, not proved"
@@ -454,7 +459,7 @@ def _row_holds(rig, row, bounds, near):
     for k in sorted({i} | near):
         narrow = f"noise band {rig.band[k]:.3g} {unit} below {rig.needed[k]:.3g} {unit}"
         yield rig.band[k] >= rig.needed[k] * (1.0 - ROUNDING), narrow
-        reason = f"tank {k + 1} may rise above what its sensor can read, {rig.top[k]:.4g} {unit}"
+        reason = f"{rig.label(k)} may rise above what its sensor can read, {rig.top[k]:.4g} {unit}"
         yield bounds.high[k] <= rig.top[k] * (1.0 + 1e-12), reason
     for k in sorted(near):
         rates = [_fastest(rig, k, up) * rig.hold for up in (True, False)]
@@ -463,10 +468,10 @@ def _row_holds(rig, row, bounds, near):
             counted = getattr(rig, name)[k]
             prism = rig.shapes[k] == "prism" and most <= counted * (1.0 + ROUNDING)
             free = counted >= ranges
-            yield prism or free, f"tank {k + 1} may change faster than is counted on"
+            yield prism or free, f"{rig.label(k)} may change faster than is counted on"
             for j in () if free else sorted(rig.neighbours(k, True) | rig.neighbours(k, False)):
                 inside = bounds.high[j] <= rig.reach[j] and bounds.low[j] >= rig.bottom[j]
-                yield inside, f"relies on tank {j + 1}, not proved"
+                yield inside, f"relies on {rig.label(j)}, not proved"
     for other in rig.rows[row.place + 1 :]:
         yield from _compatible(rig, row, other, bounds)
 
@@ -521,7 +526,7 @@ def _compatible(rig, row, later, bounds):
     against = [j for j in set(row.movers) & set(later.movers) if ups[0][j] != ups[1][j]]
     if not against:
         return
-    limit = f"the {'upper' if later.upper else 'low'} limit of tank {later.tank + 1}"
+    limit = f"the {'upper' if later.upper else 'low'} limit of {rig.label(later.tank)}"
     word = f"not covered: {limit} moves the same inputs the other way"
     yield len(row.movers) == 1 and len(later.movers) == 1, word
     (j,) = against
