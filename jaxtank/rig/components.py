@@ -18,7 +18,7 @@ from jaxtank.loop.steady import steady_inflow, steady_state
 from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman, Observer
 from jaxtank.plants.elements import input_flows
 from jaxtank.plants.hydraulics import in_unit
-from jaxtank.rig.entry import Problems, read_entry, sizes_of, unknown_key
+from jaxtank.rig.entry import Problems, hyphened, read_entry, sizes_of, unknown_key
 from jaxtank.rig.schema import NEEDED, OPEN_LOOP, Key, Section, type_of
 from jaxtank.rig.signals import ramp_values, ramps_of
 from jaxtank.signals.setpoints import Ramps, ramps
@@ -363,11 +363,21 @@ def _kind_in(name, table):
     return kind
 
 
+def with_kind(name, table):
+    """A table of a component with its kind as it is registered: "PI" is "pi"."""
+    kind, known = table.get("kind") if isinstance(table, dict) else None, ROLES[name].classes
+    if isinstance(kind, str) and kind not in known and hyphened(kind) in known:
+        return {**table, "kind": hyphened(kind)}
+    return table
+
+
 def check_keys(name, table):
     """Raise InputError for a kind or keys of a table that are unknown, whatever its rig is."""
     if name not in table or isinstance(table[name], ROLES[name].base):
         return
     problems, row = Problems(), table[name]
+    if isinstance(row, dict) and row.get("kind") == "open-loop":  # `controller_of` checks them
+        return
     with problems.collect((name, None, "kind")):
         section = section_of(name, _kind_in(name, row))
         for key in row:

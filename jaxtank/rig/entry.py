@@ -57,7 +57,8 @@ def read_entry(
         if key not in section.names:
             problems.append(unknown_key(section, key, where))
             problems[-1].place = (section.name, index, key)
-            meant.add(WORDS.get(key.lower(), "").partition(":")[0])
+            word = WORDS.get(f"{section.name}.{key.lower()}", WORDS.get(key.lower(), ""))
+            meant |= set(word.partition(":")[0].split(" or "))
     for key in section.keys:
         value = table.get(key.name, None if key.default is NEEDED else key.default)
         if key.name in table or value is not None:
@@ -117,7 +118,9 @@ def unknown_key(section, key: str, where: str = "") -> InputError:
         )
     titles = [s.title for s in SECTIONS.values() if key in s.names and s.name]
     names = section.names if section.name else [*section.names, *SECTIONS]
-    if section.name and key in SECTIONS:
+    if word := WORDS.get(f"{section.name}.{key.lower()}"):
+        hint = f"; write {word}"
+    elif section.name and key in SECTIONS:
         hint = f"; {SECTIONS[key].title} is a table of its own"
     elif titles:
         hint = f"; it is a key of {', '.join(titles)}"
@@ -170,10 +173,31 @@ WORDS = {
     "source": "from",
     "sink": "to",
     "flow": "curve of [[pump]]: [[input, flow], ...]",
+    "hysteresis": "on or off: levels at which an input goes to high, and to low",
+    "dead_time": "delay",
+    "deadtime": "delay",
+    "stroke_time": "rate",
+    "stroke": "low or high",
+    "check_valve": "check",
+    "safety": "[safety_filter]",
+    "pump.ramp": "rate",
+    "pump.flow": "gain or curve: flow per unit of the input, or [[input, flow], ...]",
+    "pump.head_curve": "curve_head: [[lift, share of the flow], ...]",
+    "pump.deadband": "dead_zone",
+    "valve.r": "rangeability",
+    "valve.curve": "characteristic: [[opening from 0 to 1, share], ...]",
+    "valve.diameter": "area: C pi/4 diameter^2, C the discharge coefficient",
+    "orifice.diameter": "area: C pi/4 diameter^2, C the discharge coefficient",
+    "pipe.diameter": "area: C pi/4 diameter^2, C the discharge coefficient",
+    "pipe.from": "between: the two tanks that it joins",
+    "pipe.to": "between: the two tanks that it joins",
+    "inflow.flow": "changes: [[time, flow], ...]; or time, duration and volume of a pulse",
+    "tank.width": "area",
+    "tank.drain_diameter": "drain: C pi/4 diameter^2, C the discharge coefficient",
     "max": "high",
     "min": "low",
 }
-"""{word of the field that is no key: what to write}."""
+"""{word of the field that is no key, or "table.word": what to write}."""
 
 
 def refusal(label: str, value: Any, must: str) -> InputError:
@@ -236,8 +260,18 @@ def _texts(key, label, value, sizes):
     return [name_of(label, text) for text in value]
 
 
+def hyphened(text: str) -> str:
+    """Return a name such as "Equal percentage" as files have it: "equal-percentage"."""
+    return text.strip().lower().replace("_", "-").replace(" ", "-")
+
+
 def _list(key, label, value, sizes):
     shape = sizes_of_shape(key.shape, sizes.counts) or ()
+    if isinstance(value, dict) and sizes.plant is not None:  # by name or number, all of them
+        places = {index_of(label, sizes.plant, key.shape[0], name): v for name, v in value.items()}
+        value = [places[i] for i in sorted(places)]
+    elif shape == (1,) and np.ndim(value) == 0:
+        value = [value]
     value = converted(label, value, key.meta(sizes.units)["unit"])
     if not (is_finite(value) and np.shape(value) == shape):
         numbers = f"{shape[0] if shape else 1} finite numbers{unit(key.meta(sizes.units))}"
@@ -329,8 +363,8 @@ def different(label, value, tanks):
 
 def _curve(key, label, value, sizes):
     """Points ((x, y), ...) with increasing x, or the name of one of the key's choices."""
-    if isinstance(value, str) and value in (key.choices or ()):
-        return value
+    if isinstance(value, str) and hyphened(value) in (key.choices or ()):
+        return hyphened(value)
     names = "".join(f'"{choice}", ' for choice in key.choices or ())
     pairs = isinstance(value, list) and len(value) > 1
     if not (pairs and all(isinstance(point, list) and len(point) == 2 for point in value)):

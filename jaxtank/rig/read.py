@@ -16,6 +16,7 @@ from jaxtank.core.text import shortened
 from jaxtank.measures import check_names
 from jaxtank.observers.base import Observer
 from jaxtank.rig import components, network, signals, tables, validation
+from jaxtank.rig.components import ROLES, with_kind
 from jaxtank.rig.entry import (
     Problems,
     Sizes,
@@ -140,7 +141,10 @@ def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
     table = with_clock(with_inputs(tables.resolved(renamed(table), Path(folder))))
     case = start_of(table)
     dotted = [key for key in ("values", "free", "uncertain") if key in table]
-    names = {key: by_rig_name(case.loop, by_dotted_name(table[key], key)) for key in dotted}
+    names = {
+        key: by_rig_name(case.loop, by_dotted_name(table[key], key), key != "uncertain")
+        for key in dotted
+    }
     table = {**table, **names}
     values = with_models(case.loop, table.get("values", {}))
     case, values = _with_bias(case, values, table)
@@ -157,7 +161,10 @@ def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
 
 
 def with_clock(table):
-    """A table of a rig file with dt, duration, .. of its top among its [values]."""
+    """A table of a rig file with dt, duration, .. of its top or of [clock] among its [values]."""
+    if isinstance(table.get("clock"), dict):
+        rest = {name: value for name, value in table.items() if name != "clock"}
+        return with_clock({**rest, "values": {"clock": table["clock"], **table.get("values", {})}})
     clock = {f"clock.{name}": table[name] for name in CLOCK if name in table}
     if not clock:
         return table
@@ -178,6 +185,7 @@ def renamed(table):
         if old in table and new in table:
             raise InputError(f"[{old}] is an older name of [{new}]: give one of them")
     table = {FORMER.get(name, name): value for name, value in table.items()}
+    table |= {name: with_kind(name, table[name]) for name in ROLES if name in table}
     sensor = table.get("sensor")
     if isinstance(sensor, list) or (isinstance(sensor, dict) and "kind" not in sensor):
         table["sensors"] = table.pop("sensor")  # [[sensor]], or one [sensor] for all tanks

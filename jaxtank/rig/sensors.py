@@ -24,6 +24,8 @@ WIDTHS = ("noise", "offset", "deadband", "amplitude", "band")
 _READING = re.compile(rf"(?P<number>{NUMBER.pattern})\s*(?P<unit>%|mA)")
 _GAIN = re.compile(rf"(?P<number>{NUMBER.pattern})\s*(?P<unit>.*\S)\s*/\s*%")
 
+_LOOP = re.compile(r"\s*4\s*(?:mA)?\s*(?:\.{2,3}|…|-|–|to)\s*20\s*mA\s*")
+
 CURRENTS = (4.0, 20.0)
 """Current of a sensor at the ends of its span [mA]."""
 
@@ -177,10 +179,17 @@ def sensor_rows(table, tanks):
     """The [[sensor]] tables of a file; those of one [sensor] without kind, for all tanks alike."""
     rows = table.get("sensors", [])
     if not isinstance(rows, Mapping):
-        return rows
+        return [_with_unit(row) for row in rows] if isinstance(rows, list) else rows
+    rows = _with_unit(rows)
     of = lambda value, i: value[i] if isinstance(value, list) and len(value) == tanks else value
     each = [{k: v if k == "span" else of(v, i) for k, v in rows.items()} for i in range(tanks)]
     return [{**row, "tank": i + 1} for i, row in enumerate(each)]
+
+
+def _with_unit(row):
+    """A row of [[sensor]] whose unit "4..20 mA" is "mA"."""
+    unit = row.get("unit") if isinstance(row, Mapping) else None
+    return {**row, "unit": "mA"} if isinstance(unit, str) and _LOOP.fullmatch(unit) else row
 
 
 def check_stated(table, loop):

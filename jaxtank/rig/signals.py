@@ -95,10 +95,12 @@ def _columns_of(where, table):
 
 def _named(label, changes, kind, sizes, unit):
     """Changes with the numbers of outputs or pumps for their names, and of times and values with a
-    unit.
+    unit; of one output or pump a change may have none.
     """
-    rows = []
+    rows, alone = [], (sizes.outputs if kind == "output" else sizes.pumps) == 1
     for change in changes if isinstance(changes, list) else ():
+        if isinstance(change, list) and len(change) == 2 and alone:
+            change = [change[0], 1, change[1]]
         if isinstance(change, list) and len(change) == 3 and str in map(type, change):
             time, channel, value = change
             if isinstance(channel, str):
@@ -245,7 +247,9 @@ def _inflows(entries, steady, sizes):
 
 def _is_course(entry):
     """Whether a table of [[inflow]] is a measured inflow, and no pulse."""
-    return isinstance(entry, dict) and any(key in entry for key in ("csv", "changes", "column"))
+    return isinstance(entry, dict) and any(
+        key in entry for key in ("csv", "changes", "column", "flow")
+    )
 
 
 def _course(entry, sizes, index):

@@ -146,6 +146,9 @@ def check_limits(
     limit} of some tanks, pumps or outputs; the others keep the limit of `usual`, or have none.
     """
     limits = by_measure(limits)
+    for name in limits:
+        if any(name in names for _, names in getattr(loop.plant, "names", ())):
+            raise InputError(f"limit {name}: is of which measure? as max_level.{name}")
     check_names(limits)
     checked = {}
     for measure, value in limits.items():

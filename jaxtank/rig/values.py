@@ -149,14 +149,22 @@ def _index_of(name, plant, axis, entry):
     return index_of(name, plant, axis, entry)
 
 
-def by_rig_name(loop: ClosedLoop, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return {`dotted_name`: value}, numbers with a unit of what has another name converted."""
+def by_rig_name(
+    loop: ClosedLoop, values: Mapping[str, Any], convert: bool = True
+) -> dict[str, Any]:
+    """Return {`dotted_name`: value}, numbers with a unit of what has another name converted; not
+    `convert`: values that are shares.
+    """
     renamed = {}
     for name, value in values.items():
         dotted = dotted_name(loop, name)
         if dotted in renamed:
             raise InputError(f"{name} is given twice, as {dotted} too: give it once")
-        if name != dotted and not (isinstance(value, str) and _RELATIVE.fullmatch(value.strip())):
+        if (
+            convert
+            and name != dotted
+            and not (isinstance(value, str) and _RELATIVE.fullmatch(value.strip()))
+        ):
             value = in_unit(loop, name, dotted, value)
         renamed[dotted] = value
     return renamed

@@ -1,7 +1,8 @@
 """Every key of a rig file under every command: an answer, or a refusal that says why.
 
-    python tests/audits/elements_by_command.py [PART ...]     rigs whose name holds one of the words
+    python tests/audits/elements_by_command.py [PART ...] [COMMAND,COMMAND]
 
+runs the rigs whose name holds one of the parts (default: all) under the commands (all), and
 prints a table, rigs by commands: `.` an answer, `r` a refusal (exit code 2 or 3), `X` a traceback
 or a number that is none. The refusals follow. Exit code 1 where there is an X.
 `tests/unit/rig/test_all_elements.py` holds that the rigs below use every key of the schema.
@@ -29,6 +30,7 @@ BASE = {
     "controller": '{kind = "pi", Kc = 200.0, Ti = "200 s", bias = 37.0}',
     "reference": '{initial = [0.5], changes = [[100.0, "LT101", 0.6]]}',
     "free": '{"controller.Kc" = [50.0, 800.0]}',
+    "uncertain": '{"plant.area" = 0.02}',
     "values": '{"clock.dt" = 2.0, "clock.duration" = 400.0}',
 }
 ONE = '[{name = "LT101", rim = 1.2, level = 0.5, drain = 0.0005, '
@@ -267,13 +269,16 @@ def row_of(name, commands=tuple(COMMANDS)):
 
 
 def table(words=()):
-    """Print the table of the rigs that are asked for; return whether none has an X."""
-    names = [n for n in RIGS if not words or any(w in n for w in words)]
+    """Print the table of the rigs and commands that are asked for; return whether none has an X."""
+    parts = [word for word in words if not set(word.split(",")) <= set(COMMANDS)]
+    asked = [command for word in words if word not in parts for command in word.split(",")]
+    commands = tuple(asked or COMMANDS)
+    names = [n for n in RIGS if not parts or any(part in n for part in parts)]
     width = max(map(len, names))
-    print(" " * width, *(f"{c[:8]:>8}" for c in COMMANDS))
+    print(" " * width, *(f"{c[:8]:>8}" for c in commands))
     reasons, good = [], True
     for name in names:
-        row = row_of(name)
+        row = row_of(name, commands)
         print(f"{name:{width}}", *(f"{mark:>8}" for mark, _ in row.values()), flush=True)
         reasons += [f"{name}, {c}: {mark} {why}" for c, (mark, why) in row.items() if mark != "."]
         good &= all(mark != "X" for mark, _ in row.values())

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jaxtank
+from jaxtank.rig.entry import unknown_key
 from jaxtank.rig.read import load, loads
 from jaxtank.rig.schema import INFLOW_TABLE, SECTIONS
 
@@ -84,6 +85,44 @@ values = {"clock.dt" = 1.0, "clock.duration" = 100.0}
     run = jaxtank.simulate(case)
     assert np.isclose(np.ravel(run.x)[-1], 1.0 + (1.0 + 0.5) / 2.0, rtol=1e-12)
     assert case.loop.disturbance.since(case.clock)[15] == 5.0
+
+
+SPELLINGS = {
+    "controller": '{kind = "PI", Kc = 200.0, Ti = "200 s", bias = 37.0}',
+    "reference": "{initial = {LT101 = 0.5}, changes = [[100.0, 0.6]]}",
+    "uncertain": '{"LT101.area" = "2 %", "LT102.area" = 0.02}',
+    "values": None,
+    "clock": "{dt = 2.0, duration = 400.0}",
+}
+
+
+def test_a_rig_may_be_spelled_as_people_spell_it(base):
+    lines = {**audit.BASE, **SPELLINGS}
+    other = loads("\n".join(f"{k} = {v}" for k, v in lines.items() if v is not None))
+    case = loads(base)
+    assert other.clock == case.clock
+    assert other.loop.reference.initial == case.loop.reference.initial == [0.5]
+    assert other.loop.reference.changes == case.loop.reference.changes
+    assert type(other.loop.controller) is type(case.loop.controller)
+    assert other.uncertain == {"plant.area[0]": 0.02, "plant.area[1]": 0.02}
+
+
+@pytest.mark.parametrize(
+    "section, key, word",
+    [
+        ("valve", "R", "rangeability"),
+        ("valve", "curve", "characteristic"),
+        ("valve", "stroke_time", "rate"),
+        ("pump", "dead_time", "delay"),
+        ("pump", "flow", "gain"),
+        ("pipe", "from", "between"),
+        ("orifice", "diameter", "area"),
+        ("inflow", "flow", "changes"),
+        ("controller", "hysteresis", "on or off"),
+    ],
+)
+def test_a_word_of_the_field_is_answered_with_the_key(section, key, word):
+    assert f"; write {word}" in str(unknown_key(SECTIONS[section], key))
 
 
 @pytest.mark.slow
