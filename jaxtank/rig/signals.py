@@ -171,7 +171,7 @@ def _sine(table, old, sizes):
         if not table:
             return None
         table = _over(section, sine_values(old) if old else {}, table)
-        if isinstance(name := table["output"], str):
+        if isinstance(name := table.get("output"), str):
             number_of = index_of("reference.sine", sizes.plant, "output", name) + 1
             table = {**table, "output": number_of}
     values = read_entry(section, table, sizes)

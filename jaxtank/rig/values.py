@@ -79,18 +79,23 @@ def dotted_name(loop: ClosedLoop, name: str) -> str:
         return name
     base, bracket, inner = name.partition("[")
     if bracket and inner.endswith("]") and not re.fullmatch(r"[\d,]*", inner[:-1]):
-        axes = describe(loop, base).get("shape", ())
-        entries = [
-            entry if entry.isdigit() else _index_of(name, plant, axis, entry)
-            for entry, axis in zip(inner[:-1].split(","), axes)
-            if axis in ("tank", "pump", "output", "feed", "valve")
-        ]
-        return f"{base}[{','.join(map(str, entries))}]" if len(entries) == len(axes) else name
+        return _of_entries(loop, name, base, inner[:-1].split(","))
     part, _, key = name.rpartition(".")
     if part.startswith("plant.") and any(key in names for _, names in plant.names):
-        return dotted_name(loop, f"{part}[{key}]")
+        return _of_entries(loop, name, part, [key])
     kind = next((kind for kind, names in plant.names if part and part in names), "")
     return _of_table(plant, kind, part, key) if kind else name
+
+
+def _of_entries(loop, name, base, inner):
+    """`dotted_name` of a parameter and what its brackets hold: names, or numbers from 0."""
+    axes = describe(loop, base).get("shape", ())
+    entries = [
+        entry if entry.isdigit() else _index_of(name, loop.plant, axis, entry)
+        for entry, axis in zip(inner, axes)
+        if axis in ("tank", "pump", "output", "feed", "valve")
+    ]
+    return f"{base}[{','.join(map(str, entries))}]" if len(entries) == len(axes) else name
 
 
 def _of_table(plant, kind, part, key):
