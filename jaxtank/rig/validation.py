@@ -145,10 +145,7 @@ def check_limits(
     A limit may be a text with a unit, of levels also in % of each rim, and {name or number from 1:
     limit} of some tanks, pumps or outputs; the others keep the limit of `usual`, or have none.
     """
-    limits = by_measure(limits)
-    for name in limits:
-        if any(name in names for _, names in getattr(loop.plant, "names", ())):
-            raise InputError(f"limit {name}: is of which measure? as max_level.{name}")
+    limits = by_measure(loop, limits)
     check_names(limits)
     checked = {}
     for measure, value in limits.items():
@@ -200,10 +197,12 @@ def _spans(loop, kind):
     return spans if kind == "tank" else [spans[i] for i in loop.plant.outputs]
 
 
-def by_measure(limits: Mapping[str, Any]) -> dict[str, Any]:
+def by_measure(loop: ClosedLoop, limits: Mapping[str, Any]) -> dict[str, Any]:
     """{measure: limit}, of "max_level.LT101" and others {measure: {entry: limit}}."""
     grouped: dict[str, Any] = {}
     for name, value in limits.items():
+        if any(name in names for _, names in getattr(loop.plant, "names", ())):
+            raise InputError(f"limit {name}: is of which measure? as max_level.{name}")
         measure, _, entry = name.partition(".")
         if not entry:
             grouped[name] = value

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.labels import label_of
 from jaxtank.instruments.base import Actuator
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants import elements
@@ -137,7 +136,7 @@ def design(
         draws=draws,
         uncovered=("; ".join(f"not covered: uncertain {x}" for x in uncovered(widths)),) * n,
         unit=plant.units[0],
-        labels=tuple(label_of(plant, "tank", i) for i in range(n)),
+        plant=plant,
         **_of_pumps(actuator, dead, widths),
     )
     setting = setting._replace(

@@ -1,10 +1,11 @@
 """The conditions of the theorems, tank by tank, in plain numbers before a run."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxtank.core.labels import label_of
 from jaxtank.safety.filter import SHALLOW
 from jaxtank.safety.worst_case import PLAIN, Rates, fall, plain_root, rise
 
@@ -31,7 +32,11 @@ class Setting(NamedTuple):
     divided: tuple = ()  # tanks whose row is divided among their pumps
     uncovered: tuple = ()  # (n) why a tank has a feature that no theorem covers, ""
     unit: str = "cm"  # of a length
-    labels: tuple = ()  # (n) what a person calls the tanks
+    plant: Any = None  # whose names the reasons have
+
+    def label(self, tank):
+        """What a person calls a tank."""
+        return label_of(self.plant, "tank", tank)
 
     def rise(self, tank, level, others):
         """Phi_max(level) [cm/s]; others: limits of all tanks, before volumes that enter besides."""
@@ -140,7 +145,7 @@ def _conditions(setting, tank, limits, bound, start, reach):
     for j in sorted(joined):
         readable = reach[j] + setting.spare[j] <= setting.top[j] * (1.0 + 1e-12)
         only = f"up to {setting.top[j]:.4g} {unit} only"
-        yield readable, f"relies on {setting.labels[j]}, whose sensor reads {only}"
+        yield readable, f"relies on {setting.label(j)}, whose sensor reads {only}"
     if setting.delay != 0.0 or setting.lag != 0.0:
         yield from _late_conditions(setting, tank, limits, start, reach)
 
@@ -241,7 +246,7 @@ def _relied_on(setting, tank, limits, reasons, reach):
         above = above or [j for j, reason in enumerate(reasons) if reason]
         if not above:
             return f"rim condition: {excess:.3g} {setting.unit}/s too much may enter at the limit"
-    names = ", ".join(setting.labels[j] for j in above)
+    names = ", ".join(map(setting.label, above))
     return f"relies on {names}, not certified" if above else ""
 
 
@@ -278,7 +283,7 @@ def spills(setting, plant, limits, start):
         falls[sink] += float(most.caught[k]) * float(most.area[source]) * max(net, 0.0)
         at_once = spare > 0.0 or (start is not None and start[source] > rim)
         if (at_once or setting.uncovered[source]) and not uncovered[sink]:
-            uncovered[sink] = f"not covered: volumes that spill from {setting.labels[source]}"
+            uncovered[sink] = f"not covered: volumes that spill from {setting.label(source)}"
     return falls, tuple(uncovered)
 
 

@@ -80,7 +80,7 @@ def _caps_of_others(setting, tank, needed, chosen):
     """(holds, reason) of no cap of another tank stopping a pump on which `needed` [cm/s] relies."""
     pumps = setting.rates.pumps
     gains = pumps[tank]
-    stops = lambda k: f"the cap for {setting.labels[k]} may stop a pump that the floor relies on"
+    stops = lambda k: f"the cap for {setting.label(k)} may stop a pump that the floor relies on"
     if needed <= 0.0:
         return
     for k, others in enumerate(pumps):
