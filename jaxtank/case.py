@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxtank.core.clock import CLOCK_UNITS, Clock
 from jaxtank.core.jsonable import clean
+from jaxtank.core.text import count
 from jaxtank.core.tree import describe, get_value, parameters, walk
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.measures import MEASURES, unit
@@ -201,7 +202,7 @@ class Case(CaseViews):
     def _summary(self) -> list[tuple[str, str]]:
         """(what, text) of each line for people."""
         plant, loop, clock = self.loop.plant, self.loop, self.clock
-        sizes = f"{_count(plant.tanks, 'tank')}, {_count(plant.pumps, 'pump')}"
+        sizes = f"{count(plant.tanks, 'tank')}, {count(plant.pumps, 'pump')}"
         parts = (
             f"controller {type(loop.controller).__name__}, observer {type(loop.observer).__name__}"
         )
@@ -236,7 +237,3 @@ def uncertain_shares(case: Case) -> dict[str, float]:
     if np.max(np.asarray(values.get("plant.split", 0.0)), initial=0.0) * (1.0 + SPREAD) > 1.0:
         shares.pop("plant.split")
     return shares or {"sensor.noise": SPREAD}
-
-
-def _count(number: int, word: str) -> str:
-    return f"{number} {word}{'' if number == 1 else 's'}"

@@ -15,7 +15,7 @@ from jaxtank.controllers.feedback_linearisation import (
     less_upper,
 )
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.plants.base import Plant
 from jaxtank.signals.base import Signal
 
@@ -65,9 +65,9 @@ class Backstepping(Controller):
     """
 
     model: Plant
-    k: float = leaf("1/s", "gain k of the second step", low=0.0, strict=True)
-    k1: float = leaf("1/s", "gain k1 of the first step", low=0.0, strict=True)
-    level_floor: float = leaf("cm", "lower clip of the levels in the roots", low=0.0, strict=True)
+    k: float = leaf("1/s", "gain k of the second step", **POSITIVE)
+    k1: float = leaf("1/s", "gain k1 of the first step", **POSITIVE)
+    level_floor: float = leaf("cm", "lower clip of the levels in the roots", **POSITIVE)
     reference_rates: bool = static(
         "-", "use r' and r'' (backstepping-ff)", choices=(False, True), default=False
     )

@@ -1,18 +1,22 @@
 """Cascade control: a level PI(D) gives the setpoint of an inner loop, a level or a flow."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxtank.controllers.pid import PID
+from jaxtank.controllers.pid import PID, option
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.core.vectors import each
 from jaxtank.plants.base import Plant
 from jaxtank.plants.tank_network import TankNetwork
+
+inner_option = functools.partial(leaf, like="inner_Kc", default=None, shape="output")
+"""A leaf of the inner loops that may be left out."""
 
 
 class Outputs(NamedTuple):
@@ -71,33 +75,20 @@ class Cascade(PID):
     model: Plant
     Kc: np.ndarray = leaf("-", "gain of the outer loop, not 0: setpoint by level", shape="output")
     bias: np.ndarray = leaf("cm", "setpoint of the inner level at zero error", shape="output")
-    inflow_gain: np.ndarray | None = leaf(
+    inflow_gain: np.ndarray | None = option(
         "s/cm^2",
         "setpoint added for a unit of the measured inflow; left out: no inflow is measured",
-        like="Kc",
-        default=None,
-        shape="output",
     )
     inner: tuple = static("-", "the tank whose level is the inner one, of each output")
     inner_Kc: np.ndarray = leaf(
         "V/cm", "gain of the inner loop, not 0; below 0 where the input lowers it", shape="output"
     )
     inner_bias: np.ndarray = leaf("V", "input at zero error of the inner loop", shape="output")
-    inner_Ti: np.ndarray | None = leaf(
-        "s",
-        "integral time of the inner loop; left out: none",
-        low=0.0,
-        strict=True,
-        like="inner_Kc",
-        default=None,
-        shape="output",
+    inner_Ti: np.ndarray | None = inner_option(
+        "s", "integral time of the inner loop; left out: none", **POSITIVE
     )
-    inner_low: np.ndarray | None = leaf(
-        "cm", "least inner setpoint", like="inner_Kc", default=None, shape="output"
-    )
-    inner_high: np.ndarray | None = leaf(
-        "cm", "largest inner setpoint", like="inner_Kc", default=None, shape="output"
-    )
+    inner_low: np.ndarray | None = inner_option("cm", "least inner setpoint")
+    inner_high: np.ndarray | None = inner_option("cm", "largest inner setpoint")
 
     def inner_entries(self) -> tuple[int, ...]:
         """The places of the inner loops' readings."""
@@ -191,21 +182,13 @@ class FlowCascade(Cascade):
 
     Kc: np.ndarray = leaf("cm^2/s", "gain of the outer loop, not 0: flow by level", shape="output")
     bias: np.ndarray = leaf("cm^3/s", "setpoint of the flow at zero error", shape="output")
-    inflow_gain: np.ndarray | None = leaf(
-        "-",
-        "share of the measured inflow added to the setpoint; left out: no inflow is measured",
-        like="Kc",
-        default=None,
-        shape="output",
+    inflow_gain: np.ndarray | None = option(
+        "-", "share of the measured inflow added to the setpoint; left out: no inflow is measured"
     )
     inner: tuple = static("-", "not in use: the flow is that of the output's input", default=())
     inner_Kc: np.ndarray = leaf("V s/cm^3", "gain of the flow loop, not 0", shape="output")
-    inner_low: np.ndarray | None = leaf(
-        "cm^3/s", "least setpoint of the flow", like="inner_Kc", default=None, shape="output"
-    )
-    inner_high: np.ndarray | None = leaf(
-        "cm^3/s", "largest setpoint of the flow", like="inner_Kc", default=None, shape="output"
-    )
+    inner_low: np.ndarray | None = inner_option("cm^3/s", "least setpoint of the flow")
+    inner_high: np.ndarray | None = inner_option("cm^3/s", "largest setpoint of the flow")
 
     @property
     def reads_flow(self) -> bool:

@@ -8,7 +8,7 @@ from typing import Any
 from jaxtank.controllers.base import Controller
 from jaxtank.controllers.feedback_linearisation import authority, check_own_pumps, drift
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.plants.base import Plant
 from jaxtank.signals.base import Signal
 
@@ -49,7 +49,7 @@ class ENMPC(Controller):
     """
 
     model: Plant
-    Tp: float = leaf("s", "prediction horizon Tp", low=0.0, strict=True)
+    Tp: float = leaf("s", "prediction horizon Tp", **POSITIVE)
     compensation: str = static(
         "-",
         "how often the disturbance estimate is subtracted",

@@ -13,7 +13,7 @@ from jaxtank.controllers.state_feedback import feedback
 from jaxtank.core.clock import pointwise
 from jaxtank.core.numerics import clip, magnitude
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.plants.base import Plant
 from jaxtank.signals.base import Signal
 
@@ -62,18 +62,17 @@ class FuzzyBlend(Controller):
 
     model: Plant
     K: np.ndarray = leaf("V/cm", "gain K of the state feedback", shape=(2, 4))
-    surface: float = leaf("1/s", "slope lambda of the sliding surface", low=0.0, strict=True)
+    surface: float = leaf("1/s", "slope lambda of the sliding surface", **POSITIVE)
     ks: float = leaf("cm/s^2", "switching gain ks, of both surfaces", low=0.0)
-    phi: float = leaf("cm/s", "half width of the boundary layer", low=0.0, strict=True)
+    phi: float = leaf("cm/s", "half width of the boundary layer", **POSITIVE)
     b: np.ndarray = leaf(
         "cm",
         "size of error at which both controllers weigh half, per input",
-        low=0.0,
-        strict=True,
+        **POSITIVE,
         shape=(2,),
     )
     w: np.ndarray = leaf(
-        "cm", "half width of the blend, per input; at most b", low=0.0, strict=True, shape=(2,)
+        "cm", "half width of the blend, per input; at most b", **POSITIVE, shape=(2,)
     )
     low: np.ndarray = leaf("V", "lower limit of the sliding-mode inputs", shape=(2,))
     high: np.ndarray = leaf("V", "upper limit of the sliding-mode inputs", shape=(2,))

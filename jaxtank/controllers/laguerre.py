@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxtank.controllers.incremental import MODES, LinearPredictive
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.plants.network import TankNetwork
 from jaxtank.signals.base import Signal
 
@@ -48,15 +48,15 @@ class Laguerre(LinearPredictive):
 
     model: TankNetwork
     operating_point: np.ndarray = leaf(
-        "cm", "levels at which the model is linearised (H1, H2)", low=0.0, strict=True, shape="tank"
+        "cm", "levels at which the model is linearised (H1, H2)", **POSITIVE, shape="tank"
     )
-    r_w: np.ndarray = leaf("cm^2/V^2", "weight of the increments (rw)", low=0.0, strict=True)
+    r_w: np.ndarray = leaf("cm^2/V^2", "weight of the increments (rw)", **POSITIVE)
     a: np.ndarray = leaf(
         "-", "pole of each pump's Laguerre functions (a)", low=0.0, high=0.999, shape="pump"
     )
     q: np.ndarray = leaf("-", "weight of each output (Qy)", low=0.0, shape="output")
     du_limit: np.ndarray = leaf(
-        "V", "largest change of each input in a sample", low=0.0, strict=True, shape="pump"
+        "V", "largest change of each input in a sample", **POSITIVE, shape="pump"
     )
     u_low: np.ndarray = leaf("V", "lower limit of each input in the constraints", shape="pump")
     u_high: np.ndarray = leaf("V", "upper limit of each input in the constraints", shape="pump")

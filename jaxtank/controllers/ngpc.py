@@ -13,7 +13,7 @@ from jaxtank.controllers.feedback_linearisation import (
     less_upper,
 )
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.core.tree import component, leaf
+from jaxtank.core.tree import POSITIVE, component, leaf
 from jaxtank.plants.base import Plant
 from jaxtank.signals.base import Signal
 
@@ -50,8 +50,8 @@ class NGPC(Controller):
     """
 
     model: Plant
-    Tp: float = leaf("s", "prediction horizon Tp", low=0.0, strict=True)
-    level_floor: float = leaf("cm", "lower clip of the levels in the roots", low=0.0, strict=True)
+    Tp: float = leaf("s", "prediction horizon Tp", **POSITIVE)
+    level_floor: float = leaf("cm", "lower clip of the levels in the roots", **POSITIVE)
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         c = coefficients(self.model)

@@ -10,7 +10,7 @@ from jaxtank.controllers.cascade import loop_on
 from jaxtank.controllers.pid import PID
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.core.vectors import each
 
 
@@ -58,8 +58,7 @@ class Override(PID):
     limit_Ti: np.ndarray | None = leaf(
         "s",
         "integral time of the loop on the limit; left out: none",
-        low=0.0,
-        strict=True,
+        **POSITIVE,
         like="limit_Kc",
         default=None,
         shape="output",

@@ -2,6 +2,7 @@
 gouta2022 notes S4.5).
 """
 
+import functools
 import operator
 from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
@@ -19,7 +20,7 @@ from jaxtank.core.labels import name_of
 from jaxtank.core.numerics import clip
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.text import shortened
-from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.core.vectors import each, is_array, take
 from jaxtank.plants.base import Plant
 from jaxtank.signals.base import Signal
@@ -27,10 +28,13 @@ from jaxtank.signals.base import Signal
 FILTER = 8.0  # the derivative's filter has the time constant Td/8 where no N is given
 LOWEST, HIGHEST, SECTIONS = 1e-3, 1e2, 5  # Oustaloup's band [rad/s] and N: 2N + 1 sections
 
-
 ENDLESS = 1e6
 """Integral times of so many tracking times are infinite: the integral would keep what the
 anti-windup has added [-]."""
+
+
+option = functools.partial(leaf, like="Kc", default=None, shape="output")
+"""A leaf of a PID that may be left out."""
 
 
 class Memory(NamedTuple):
@@ -103,87 +107,31 @@ class PID(Controller):
     Kc: np.ndarray = leaf(
         "V/cm", "gain Kc, not 0; below 0 where a pump lowers its output", shape="output"
     )
-    Ti: np.ndarray | None = leaf(
-        "s",
-        "integral time Ti; inf: none",
-        low=0.0,
-        strict=True,
-        like="Kc",
-        infinite=True,
-        default=None,
-        shape="output",
+    Ti: np.ndarray | None = option("s", "integral time Ti; inf: none", **POSITIVE, infinite=True)
+    Td: np.ndarray | None = option("s", "derivative time Td", **POSITIVE)
+    order: np.ndarray | None = option("-", "order of the integral (lambda)", **POSITIVE, high=1.0)
+    Tt: np.ndarray | None = option(
+        "s", "tracking time of back-calculation; needed with Ti", **POSITIVE
     )
-    Td: np.ndarray | None = leaf(
-        "s", "derivative time Td", low=0.0, strict=True, like="Kc", default=None, shape="output"
+    b: np.ndarray | None = option(
+        "-", "weight of the setpoint in the proportional part; left out: 1", low=0.0
     )
-    order: np.ndarray | None = leaf(
-        "-",
-        "order of the integral (lambda)",
-        low=0.0,
-        high=1.0,
-        strict=True,
-        like="Kc",
-        default=None,
-        shape="output",
+    deadband: np.ndarray | None = option(
+        "cm", "errors up to it, of either sign, count as 0", low=0.0
     )
-    Tt: np.ndarray | None = leaf(
-        "s",
-        "tracking time of back-calculation; needed with Ti",
-        low=0.0,
-        strict=True,
-        like="Kc",
-        default=None,
-        shape="output",
+    gap_gain: np.ndarray | None = option(
+        "-", "share of the gain within the deadband (gap control); left out: 0", low=0.0, high=1.0
     )
-    b: np.ndarray | None = leaf(
-        "-",
-        "weight of the setpoint in the proportional part; left out: 1",
-        low=0.0,
-        like="Kc",
-        default=None,
-        shape="output",
-    )
-    deadband: np.ndarray | None = leaf(
-        "cm",
-        "errors up to it, of either sign, count as 0",
-        low=0.0,
-        like="Kc",
-        default=None,
-        shape="output",
-    )
-    gap_gain: np.ndarray | None = leaf(
-        "-",
-        "share of the gain within the deadband (gap control); left out: 0",
-        low=0.0,
-        high=1.0,
-        like="Kc",
-        default=None,
-        shape="output",
-    )
-    error_span: np.ndarray | None = leaf(
+    error_span: np.ndarray | None = option(
         "cm",
         "the error counts squared, and as itself at this size; left out: as itself",
-        low=0.0,
-        strict=True,
-        like="Kc",
-        default=None,
-        shape="output",
+        **POSITIVE,
     )
-    N: np.ndarray | None = leaf(
-        "-",
-        "the derivative is filtered by a lag of Td/N; left out: 8",
-        low=0.0,
-        strict=True,
-        like="Kc",
-        default=None,
-        shape="output",
+    N: np.ndarray | None = option(
+        "-", "the derivative is filtered by a lag of Td/N; left out: 8", **POSITIVE
     )
-    inflow_gain: np.ndarray | None = leaf(
-        "V s/cm^3",
-        "input added for a unit of the measured inflow; left out: no inflow is measured",
-        like="Kc",
-        default=None,
-        shape="output",
+    inflow_gain: np.ndarray | None = option(
+        "V s/cm^3", "input added for a unit of the measured inflow; left out: no inflow is measured"
     )
     inflow_of: tuple = static(
         "-", "the tank of the measured inflow of each output; left out: its own", default=()

@@ -12,7 +12,7 @@ from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import pointwise
 from jaxtank.core.numerics import clip, smooth_signed_sqrt, smooth_signed_sqrt_slope
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.plants.base import Plant
 from jaxtank.plants.rigs import QUADRUPLE_FEEDS, QUADRUPLE_LINKS, check_topology
 from jaxtank.signals.base import Signal
@@ -147,9 +147,9 @@ class SlidingMode(Controller):
     """
 
     model: Plant
-    surface: float = leaf("1/s", "slope lambda of the sliding surface", low=0.0, strict=True)
+    surface: float = leaf("1/s", "slope lambda of the sliding surface", **POSITIVE)
     ks: float = leaf("cm/s^2", "switching gain ks, of both surfaces", low=0.0)
-    phi: float = leaf("cm/s", "half width of the boundary layer", low=0.0, strict=True)
+    phi: float = leaf("cm/s", "half width of the boundary layer", **POSITIVE)
     switch: str = static("-", "switching function", choices=tuple(SWITCHES), default="tanh")
     form: str = static("-", "which control law", choices=FORMS, default="corrected")
 

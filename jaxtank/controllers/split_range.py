@@ -9,7 +9,7 @@ from jaxtank.controllers.pid import PID
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import lower_clip
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.core.vectors import total
 
 
@@ -41,8 +41,7 @@ class SplitRange(PID):
     span: np.ndarray | None = leaf(
         "V",
         "what each input takes of the output of its PID; left out: its range",
-        low=0.0,
-        strict=True,
+        **POSITIVE,
         like="low",
         default=None,
         shape="pump",

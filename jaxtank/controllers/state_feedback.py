@@ -16,7 +16,7 @@ from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import pointwise
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.core.tree import component, leaf
+from jaxtank.core.tree import POSITIVE, component, leaf
 from jaxtank.plants.base import Plant
 from jaxtank.plants.network import TankNetwork
 from jaxtank.signals.base import Signal
@@ -113,9 +113,9 @@ class LQI(Controller):
         low=0.0,
         shape=("tank + output",),
     )
-    R: np.ndarray = leaf("1/V^2", "weight of each input", low=0.0, strict=True, shape="pump")
+    R: np.ndarray = leaf("1/V^2", "weight of each input", **POSITIVE, shape="pump")
     operating_point: np.ndarray = leaf(
-        "cm", "setpoint at which the model is linearised", low=0.0, strict=True, shape="output"
+        "cm", "setpoint at which the model is linearised", **POSITIVE, shape="output"
     )
 
     @pointwise

@@ -11,7 +11,7 @@ from jaxtank.core.clock import pointwise
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clipped_sqrt
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.core.tree import component, leaf
+from jaxtank.core.tree import POSITIVE, component, leaf
 from jaxtank.plants.network import TankNetwork
 from jaxtank.plants.rigs import COUPLED_PIPES, check_topology
 from jaxtank.signals.base import Signal
@@ -47,14 +47,10 @@ class TwoTankBackstepping(Controller):
     """
 
     model: TankNetwork
-    K_phi: float = leaf("1/s", "gain K_phi of the first step", low=0.0, strict=True)
-    K_y: float = leaf("1/s", "gain K_y of the second step", low=0.0, strict=True)
-    level_floor: float = leaf(
-        "cm", "lower clip of the level h3 in the control law", low=0.0, strict=True
-    )
-    difference_floor: float = leaf(
-        "cm", "lower clip of h1 - h3 in the control law", low=0.0, strict=True
-    )
+    K_phi: float = leaf("1/s", "gain K_phi of the first step", **POSITIVE)
+    K_y: float = leaf("1/s", "gain K_y of the second step", **POSITIVE)
+    level_floor: float = leaf("cm", "lower clip of the level h3 in the control law", **POSITIVE)
+    difference_floor: float = leaf("cm", "lower clip of h1 - h3 in the control law", **POSITIVE)
 
     def coefficients(self) -> tuple:
         """Return (a1, a3, b): c1/A of the first and of the second tank, c2/A [cm^0.5/s]; a1 = a3

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import jax
 import jax.numpy as jnp
 
+from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError
 
 CHUNK = 2**18  # samples
@@ -133,9 +134,7 @@ def check_clock(clock: Any) -> None:
     """Check that a clock describes a run."""
     check_is_clock(clock)
     _check_duration(clock)
-    substeps: Any = clock.substeps
-    if not isinstance(substeps, int) or isinstance(substeps, bool) or not 1 <= substeps <= 10:
-        raise InputError(f"clock.substeps = {substeps!r}: must be a whole number from 1 to 10")
+    check_whole("clock.substeps", clock.substeps, 1, 10)
     if clock.integrator not in INTEGRATORS:
         raise InputError(
             f"clock.integrator = {clock.integrator!r}: must be one of {', '.join(INTEGRATORS)}"

@@ -63,14 +63,6 @@ def labels_of(plant: Any, kind: str, indices: Iterable[int]) -> str:
     return numbered(kind, [i + 1 for i in indices])
 
 
-def join_labels(plant: Any, kind: str, indices: Iterable[int]) -> str:
-    """Return "tank 1, 3", or the names "LT101, LT103"."""
-    indices = list(indices)
-    if any(name_of(plant, kind, i) for i in indices):
-        return ", ".join(label_of(plant, kind, i) for i in indices)
-    return f"{kind} {', '.join(str(i + 1) for i in indices)}"
-
-
 def numbered(word: str, numbers: list[int]) -> str:
     """Return "tank 3", "tanks 1, 3" or "tanks 1 to 4"."""
     if len(numbers) == 1:

@@ -29,6 +29,12 @@ def printable(text: object) -> str:
     )
 
 
+def count(number: int, thing: str) -> str:
+    """Return a number with its noun in the singular or the plural."""
+    plural = f"{thing}es" if thing.endswith(("s", "ch", "sh", "x")) else f"{thing}s"
+    return f"{number} {thing if number == 1 else plural}"
+
+
 def one_line(text: object, most: int = MOST) -> str:
     """Return `text` as one printable line of at most `most` characters."""
     line = printable(" ".join(str(text).split()))

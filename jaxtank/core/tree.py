@@ -93,6 +93,10 @@ def leaf(
     return dataclasses.field(metadata=meta, default=dataclasses.MISSING if needed else None)
 
 
+POSITIVE: dict[str, Any] = {"low": 0.0, "strict": True}
+"""Range of a leaf that is above 0."""
+
+
 def static(
     unit: str = "-",
     doc: str = "",

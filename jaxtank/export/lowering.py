@@ -66,9 +66,7 @@ class Writer:
         """Return the elements (shape) of a Matrix operation on the arrays of `operands`."""
         name = self.fresh("m")
         self.scopes[-1].append(Matrix(name, op, tuple(self.array(o) for o in operands), sizes))
-        out = np.empty(int(np.prod(shape)), dtype=object)
-        out[:] = [Ref(name, i) for i in range(out.size)]
-        return out.reshape(shape)
+        return elements_of(name, int(np.prod(shape))).reshape(shape)
 
     def run(self, jaxpr, consts, arguments):
         """Return the outputs of a jaxpr, arrays of elements, as its `arguments` are."""

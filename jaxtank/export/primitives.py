@@ -4,6 +4,8 @@ Loops stay loops, branches become selections, products of small matrices are wri
 array of the state that is read and written at an index, a transport delay, stays an array: a line.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,23 +34,25 @@ def kind_of(dtype):
     return TRUTH if dtype == jnp.bool_ else WHOLE
 
 
+def filled(shape, f):
+    """Return an array of objects f(index)."""
+    out = np.empty(shape, dtype=object)
+    for i in np.ndindex(out.shape):
+        out[i] = f(i)
+    return out
+
+
 def elements(value):
     """Return the numbers of an array as Python numbers, in an array of objects."""
     array = np.asarray(value)
-    out = np.empty(array.shape, dtype=object)
     plain = {REAL: float, WHOLE: int, TRUTH: bool}[kind_of(array.dtype)]
-    for i in np.ndindex(array.shape):
-        out[i] = plain(array[i])
-    return out
+    return filled(array.shape, lambda i: plain(array[i]))
 
 
 def each(f, *arrays):
     """Return f of the elements of arrays, which are broadcast against each other."""
     arrays = np.broadcast_arrays(*arrays)
-    out = np.empty(arrays[0].shape, dtype=object)
-    for i in np.ndindex(out.shape):
-        out[i] = f(*(a[i] for a in arrays))
-    return out
+    return filled(arrays[0].shape, lambda i: f(*(a[i] for a in arrays)))
 
 
 def constant(eqn, operands):
@@ -171,13 +175,8 @@ def _reduce(op):
         (array,), axes, kind = operands, eqn.params["axes"], _out_kind(eqn)
         others = [i for i in range(array.ndim) if i not in axes]
         rows = array.transpose(*others, *axes).reshape(*(array.shape[i] for i in others), -1)
-        out = np.empty(rows.shape[:-1], dtype=object)
-        for i in np.ndindex(out.shape):
-            total = rows[i][0]
-            for e in rows[i][1:]:
-                total = writer.define(kind, op, total, e)
-            out[i] = total
-        return [out]
+        both = lambda a, b: writer.define(kind, op, a, b)
+        return [filled(rows.shape[:-1], lambda i: functools.reduce(both, rows[i]))]
 
     return rule
 
@@ -210,14 +209,16 @@ def _position(largest):
             return writer.define(TRUTH, "and", yes, writer.define(TRUTH, "not", no))
 
         rows = np.moveaxis(operands[0], eqn.params["axes"][0], -1)
-        out = np.empty(rows.shape[:-1], dtype=object)
-        for i in np.ndindex(out.shape):
-            best, out[i] = rows[i][0], 0
+
+        def place(i):
+            best, at = rows[i][0], 0
             for k, e in enumerate(rows[i][1:], start=1):
                 take = better(e, best)
-                out[i] = writer.define(WHOLE, "select", take, out[i], k)
+                at = writer.define(WHOLE, "select", take, at, k)
                 best = writer.define(kind, "select", take, best, e)
-        return [out]
+            return at
+
+        return [filled(rows.shape[:-1], place)]
 
     return rule
 
@@ -234,17 +235,14 @@ def product(writer, a, b, dimensions):
     shape = tuple(a.shape[i] for i in rows) + tuple(b.shape[i] for i in columns)
     if A.shape[0] * A.shape[1] * B.shape[1] > writer.large:
         return writer.matrix("product", (A, B), (*A.shape, B.shape[1]), shape)
-    out = np.empty((A.shape[0], B.shape[1]), dtype=object)
-    for i, j in np.ndindex(out.shape):
-        out[i, j] = _inner_product(writer, A[i], B[:, j])
-    return out.reshape(shape)
+    times = lambda a, b: writer.define(REAL, "mul", a, b)
+    plus = lambda total, pair: writer.define(REAL, "add", total, times(*pair))
 
+    def inner(at):
+        first, *others = zip(A[at[0]], B[:, at[1]])
+        return functools.reduce(plus, others, times(*first))
 
-def _inner_product(writer, row, column):
-    total = writer.define(REAL, "mul", row[0], column[0])
-    for a, b in zip(row[1:], column[1:]):
-        total = writer.define(REAL, "add", total, writer.define(REAL, "mul", a, b))
-    return total
+    return filled((A.shape[0], B.shape[1]), inner).reshape(shape)
 
 
 def _product(writer, eqn, operands):
@@ -281,8 +279,7 @@ def _linear_solve(writer, eqn, operands):
     closed, consts = jaxprs.matvec, operands[: lengths.matvec]
     columns = []
     for i in range(b.size):
-        unit = np.zeros(b.size, dtype=object)
-        unit[:] = [float(i == j) for j in range(b.size)]
+        unit = elements(np.eye(b.size)[i])
         (column,) = writer.run(closed.jaxpr, closed.consts, [*consts, unit.reshape(shape)])
         columns.append(column.ravel())
     a, x = np.stack(columns, axis=1), np.empty(b.size, dtype=object)
@@ -357,9 +354,7 @@ def _scan(writer, eqn, operands):
         carry, counter = (carried[:-1], carried[-1:]) if sequences else (carried, [])
         out = writer.run(closed.jaxpr, closed.consts, [*operands[:first], *carry, *read(*counter)])
         if sequences:
-            after = np.empty((), dtype=object)
-            after[()] = writer.define(WHOLE, "add", counter[0].item(), 1)
-            out = [*out, after]
+            out = [*out, filled((), lambda _: writer.define(WHOLE, "add", counter[0].item(), 1))]
         return out
 
     kinds = [kind_of(v.aval.dtype) for v in eqn.outvars] + [WHOLE] * bool(sequences)
@@ -385,22 +380,17 @@ def _reader(writer, sequences, variables, backwards):
     """
     arrays = []
     for rows, v in zip(sequences, variables):
-        rows, names = rows[::-1] if backwards else rows, np.empty(rows.shape[1:], dtype=object)
-        for i in np.ndindex(names.shape):
-            names[i] = writer.array(rows[(slice(None), *i)])
+        rows = rows[::-1] if backwards else rows
+        names = filled(rows.shape[1:], lambda i, rows=rows: writer.array(rows[(slice(None), *i)]))
         arrays.append((kind_of(v.aval.dtype), names))
 
-    def read(counter):
-        row = []
-        for kind, names in arrays:
-            entries = np.empty(names.shape, dtype=object)
-            for i in np.ndindex(names.shape):
-                entry = Ref(names[i], counter.item())
-                entries[i] = entry if kind == REAL else writer.define(kind, kind, entry)
-            row.append(entries)
-        return row
+    def entry(name, kind, counter):
+        ref = Ref(name, counter.item())
+        return ref if kind == REAL else writer.define(kind, kind, ref)
 
-    return read
+    return lambda counter: [
+        each(lambda name, kind=kind: entry(name, kind, counter), names) for kind, names in arrays
+    ]
 
 
 def _while(writer, eqn, operands):
@@ -421,10 +411,8 @@ def _loop(writer, kinds, starts, count, body):
     """The carried variables after a loop; body: function of them that returns the next ones."""
     carried, variables = [], []
     for kind, start in zip(kinds, starts):
-        refs = np.empty(start.shape, dtype=object)
-        for i in np.ndindex(start.shape):
-            ref = refs[i] = Ref(writer.fresh("c"))
-            carried.append((kind, ref.name, start[i]))
+        refs = filled(start.shape, lambda _: Ref(writer.fresh("c")))
+        carried += [(kind, ref.name, e) for ref, e in zip(refs.ravel(), start.ravel())]
         variables.append(refs)
     writer.scopes.append([])
     writer.known.append({})
@@ -456,9 +444,7 @@ def written(jaxpr):
 
 def elements_of(name, size):
     """Return the elements of the line `name`."""
-    out = np.empty(size, dtype=object)
-    out[:] = [Ref(name, i) for i in range(size)]
-    return out
+    return filled((size,), lambda i: Ref(name, *i))
 
 
 def line_of(array):
@@ -477,9 +463,7 @@ def _read(writer, eqn, operands):
     name = line_of(array)
     if name is None or eqn.params["slice_sizes"] != (1,):
         return [_chosen_slice(writer, eqn, array, [i.item() for i in index])]
-    out = np.empty(1, dtype=object)
-    out[0] = writer.define(REAL, "item", Ref(name), index[0].item())
-    return [out]
+    return [filled((1,), lambda _: writer.define(REAL, "item", Ref(name), index[0].item()))]
 
 
 def _chosen_slice(writer, eqn, array, index):
@@ -500,11 +484,8 @@ def _chosen_slice(writer, eqn, array, index):
     for i in range(array.shape[d] - sizes[d] + 1):
         ranges[d] = slice(i, i + sizes[d])
         choices.append(array[tuple(ranges)])
-    at = np.empty(choices[0].shape, dtype=object)
-    for i in np.ndindex(at.shape):
-        at[i] = index[d]
-    kind = kind_of(eqn.outvars[0].aval.dtype)
-    return chosen(writer, at, choices, kind)
+    at = filled(choices[0].shape, lambda _: index[d])
+    return chosen(writer, at, choices, _out_kind(eqn))
 
 
 def _write(writer, eqn, operands):

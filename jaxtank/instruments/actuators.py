@@ -1,6 +1,7 @@
 """PumpBank: limits or allocation, rate, dead zone, lag and delay of pumps and valves, in order."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -11,12 +12,15 @@ import numpy as np
 from jaxtank.core.checks import check_order
 from jaxtank.core.clock import Clock
 from jaxtank.core.numerics import clip, lower_clip
-from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.core.vectors import each, is_array, like, scalars, unzipped
 from jaxtank.instruments.base import Actuator
 
 SATURATIONS = ("clip", "boxqp")
 DEAD_ZONES = ("plain", "offset", "hysteresis", "pulse")
+
+option = functools.partial(leaf, like="low", default=None, shape="pump")
+"""A leaf of the pumps that may be left out."""
 
 
 class ActuatorState(NamedTuple):
@@ -68,14 +72,7 @@ class PumpBank(Actuator):
 
     low: np.ndarray = leaf("V", "lower limit of each pump", shape="pump")
     high: np.ndarray = leaf("V", "upper limit of each pump", shape="pump")
-    dead_zone: Any = leaf(
-        "V",
-        "input at or below which a pump stands still",
-        low=0.0,
-        like="low",
-        default=None,
-        shape="pump",
-    )
+    dead_zone: Any = option("V", "input at or below which a pump stands still", low=0.0)
     stop: np.ndarray = leaf(
         "V",
         "input below which a turning pump stops (hysteresis)",
@@ -86,23 +83,16 @@ class PumpBank(Actuator):
     pulse: np.ndarray = leaf(
         "V",
         "input of the pulses that replace a dead zone (pulse)",
-        low=0.0,
-        strict=True,
+        **POSITIVE,
         default=lambda own: _largest(own["high"]),
         shape="pump",
     )
-    lag: Any = leaf(
-        "s", "time constant of each pump", low=0.0, like="low", default=None, shape="pump"
-    )
-    rate: Any = leaf(
+    lag: Any = option("s", "time constant of each pump", low=0.0)
+    rate: Any = option(
         "V/s",
         "largest change of the input of each pump per second; inf: none",
-        low=0.0,
-        strict=True,
-        like="low",
+        **POSITIVE,
         infinite=True,
-        default=None,
-        shape="pump",
     )
     initial: np.ndarray = leaf(
         "V",

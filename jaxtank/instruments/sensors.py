@@ -1,5 +1,6 @@
 """LevelSensor: readings of levels with noise and an ADC."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -7,9 +8,12 @@ import numpy as np
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip, lower_clip, quantise
-from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.core.vectors import each
 from jaxtank.instruments.base import Sensor
+
+option = functools.partial(leaf, like="gain", default=None, shape="tank")
+"""A leaf of the sensors that may be left out."""
 
 
 def _without_adc(fields, value):
@@ -42,46 +46,25 @@ class LevelSensor(Sensor):
     gain: np.ndarray = leaf(
         "cm/volt",
         "level per volt of each sensor (a)",
-        low=0.0,
-        strict=True,
+        **POSITIVE,
         default=lambda own: _without_adc(own, np.ones(np.shape(own["noise"]))),
         shape="tank",
     )
     noise: np.ndarray = leaf(
         "cm", "standard deviation of the noise on each level", low=0.0, shape="tank"
     )
-    offset: np.ndarray | None = leaf(
-        "cm", "what each sensor reads of an empty tank", like="gain", default=None, shape="tank"
+    offset: np.ndarray | None = option("cm", "what each sensor reads of an empty tank")
+    scale: np.ndarray | None = option(
+        "-", "reading per level of each sensor; 1: calibrated", **POSITIVE
     )
-    scale: np.ndarray | None = leaf(
-        "-",
-        "reading per level of each sensor; 1: calibrated",
-        low=0.0,
-        strict=True,
-        like="gain",
-        default=None,
-        shape="tank",
+    low: np.ndarray | None = option(
+        "cm", "level at 0 % (4 mA): no reading is below; -inf: none", infinite=True
     )
-    low: np.ndarray | None = leaf(
-        "cm",
-        "level at 0 % (4 mA): no reading is below; -inf: none",
-        like="gain",
-        infinite=True,
-        default=None,
-        shape="tank",
-    )
-    high: np.ndarray | None = leaf(
-        "cm",
-        "level at 100 % (20 mA): no reading is above; inf: none",
-        low=0.0,
-        strict=True,
-        like="gain",
-        infinite=True,
-        default=None,
-        shape="tank",
+    high: np.ndarray | None = option(
+        "cm", "level at 100 % (20 mA): no reading is above; inf: none", **POSITIVE, infinite=True
     )
     full_scale: np.ndarray = leaf(
-        "volt", "range of the ADC", low=0.0, strict=True, default=lambda own: _without_adc(own, 5.0)
+        "volt", "range of the ADC", **POSITIVE, default=lambda own: _without_adc(own, 5.0)
     )
     bits: int = static("-", "resolution of the ADC; 0: none", low=0, high=24, default=0)
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
-from jaxtank.core.labels import entry_label, join_labels, label_of
+from jaxtank.core.labels import entry_label, label_of, labels_of
 from jaxtank.loop import step_size
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.run import evaluate_and_flag
@@ -48,7 +48,7 @@ def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> l
     )
     if errors[tank] > MAX_ERROR:
         remedy = max(unstable, key=lambda item: item.height).remedy
-        tanks = join_labels(loop.plant, "tank", [item.tank for item in unstable])
+        tanks = labels_of(loop.plant, "tank", [item.tank for item in unstable])
         raise InputError(
             f"clock.dt = {clock.dt:g} s: steps too long to follow {tanks}, near empty:"
             f" {sentence}: {remedy}"

@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from jaxtank import measures as ms
-from jaxtank.core.checks import check_value
+from jaxtank.core.checks import check_value, check_whole
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import shortened
@@ -101,8 +101,7 @@ def _rows(values: Mapping[str, Any]) -> dict[str, jax.Array]:
 
 def _count(loop: ClosedLoop, rows: Mapping[str, jax.Array], batch: Any) -> int:
     """The number of runs; raises InputError for rows of several lengths, shapes or out of range."""
-    if not isinstance(batch, int) or isinstance(batch, bool) or batch < 1:
-        raise InputError(f"batch = {batch!r}: must be a whole number of at least 1 run")
+    check_whole("batch", batch, 1)
     for name, value in rows.items():
         shape = np.shape(get_value(loop, name))
         if value.ndim < 1 or value.shape[1:] != shape or not value.shape[0]:

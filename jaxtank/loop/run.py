@@ -18,9 +18,10 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from jaxtank import measures as ms
+from jaxtank.core.checks import check_whole
 from jaxtank.core.clock import CHUNK, Clock, ClockWarning, clock_warnings, is_pointwise
 from jaxtank.core.errors import InputError, NonFiniteError
-from jaxtank.core.labels import join_labels
+from jaxtank.core.labels import labels_of
 from jaxtank.core.tree import parameters, with_values
 from jaxtank.loop.closed_loop import (
     ClosedLoop,
@@ -91,11 +92,7 @@ def simulate(
     ((3, 2), [0.0, 20.0, 40.0])
     """
     check(loop, clock, key)
-    whole: Any = save_every
-    if not isinstance(whole, int) or whole < 1:
-        raise InputError(
-            f"save_every = {save_every!r}: must be a whole number of at least 1 sample"
-        )
+    check_whole("save_every", save_every, 1)
     for line in clock_warnings(clock):
         warnings.warn(line, ClockWarning, stacklevel=3)
     trajectory, broken = simulate_compiled(loop, clock, key, min(save_every, clock.samples))
@@ -334,7 +331,7 @@ def _report_broken(
     first = int(np.argmax(bad.any(axis=1)))
     if first == 0 and key is None:  # the NaN of `keyed`
         raise InputError("sensor.noise is above 0: give a key, or set it to 0")
-    tanks = join_labels(loop.plant, "tank", np.flatnonzero(bad[first]).tolist())
+    tanks = labels_of(loop.plant, "tank", np.flatnonzero(bad[first]).tolist())
     text = ", ".join(
         f"{name} = {np.asarray(value)}"
         for name, value in parameters(loop).items()

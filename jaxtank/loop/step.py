@@ -18,6 +18,7 @@ from jaxtank.core.checks import traceable
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Sample, Tick
+from jaxtank.core.text import count
 from jaxtank.core.tree import is_real
 from jaxtank.core.vectors import each, form_for, is_array, like, scalars, zeros
 from jaxtank.instruments.base import Sensor
@@ -229,11 +230,11 @@ def _form(state: Any) -> Any:
 def _refuse_result(label: str, result: Any, pumps: int, hint: str = "") -> NoReturn:
     """Raise InputError for a result of `step` that is not (inputs, state)."""
     several = isinstance(result, tuple | list)
-    count = (len(cast(Any, result)),) if several else np.shape(result)[:1]
-    words = f"{count[0]} input{'' if count[0] == 1 else 's'}" if count else "one number"
+    sizes = (len(cast(Any, result)),) if several else np.shape(result)[:1]
+    words = count(sizes[0], "input") if sizes else "one number"
     words = "None" if result is None else words
     raise InputError(
-        f"{label} returns {words} for {pumps} pump{'' if pumps == 1 else 's'}{hint}: must return"
+        f"{label} returns {words} for {count(pumps, 'pump')}{hint}: must return"
         " (inputs, state), a tuple with one input for each pump"
     )
 
@@ -242,9 +243,9 @@ def _check_command(label: str, command: Any, after: Any, pumps: int) -> None:
     """Raise InputError unless `command` is one real number per pump; after: the new state."""
     several = isinstance(command, tuple | list)
     entries: list[Any] = list(cast(Any, command)) if several else []
-    count = (len(entries),) if several else np.shape(command)[:1]
-    if count != (pumps,):
-        bare = pumps == 2 and not count and is_real(after) and np.ndim(after) == 0
+    sizes = (len(entries),) if several else np.shape(command)[:1]
+    if sizes != (pumps,):
+        bare = pumps == 2 and not sizes and is_real(after) and np.ndim(after) == 0
         _refuse_result(label, command, pumps, " and, it seems, no state" if bare else "")
     parts = [(np.shape(v), v) for v in entries] if several else [(np.shape(command)[1:], command)]
     switch = np.dtype(bool)  # on or off: 1 or 0

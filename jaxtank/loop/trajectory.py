@@ -13,6 +13,7 @@ from jax.core import Tracer
 
 from jaxtank.core.jsonable import clean
 from jaxtank.core.labels import input_unit, symbol
+from jaxtank.core.text import count
 from jaxtank.core.units import DEFAULT, local
 from jaxtank.views import TrajectoryViews
 
@@ -108,8 +109,7 @@ class Trajectory(TrajectoryViews):
             return "Trajectory of several runs, or of a traced one"
         ends = f"run from {float(self.t[0]):g} to {float(self.t[-1]):g} s"
         sizes = {"row": len(self.t), "tank": np.shape(self.x)[1], "pump": np.shape(self.u)[1]}
-        words = [f"{n} {word}{'' if n == 1 else 's'}" for word, n in sizes.items()]
-        lines = [f"{ends}: {', '.join(words)}"]
+        lines = [f"{ends}: {', '.join(count(n, word) for word, n in sizes.items())}"]
         for name, *numbers in self._summary():
             lines.append(f"  {name}: from {numbers[0]} to {numbers[1]}, at the end {numbers[2]}")
         return "\n".join(lines)

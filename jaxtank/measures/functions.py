@@ -5,6 +5,7 @@ import inspect
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import shortened
 from jaxtank.measures.catalogue import MEASURES, Measure
@@ -83,12 +84,7 @@ def from_function(
     True
     >>> del jaxtank.measures.MEASURES["fastest_change"]  # as it was before this example
     """
-    whole: Any = save_every
-    if isinstance(whole, bool) or not isinstance(whole, int) or whole < 1:
-        raise InputError(
-            f"{name_of(function)}: save_every = {save_every!r}: must be a whole number of at least"
-            " 1 sample"
-        )
+    check_whole(f"{name_of(function)}: save_every", save_every, 1)
     if not isinstance(unit, str):
         raise InputError(f"{name_of(function)}: unit = {shortened(unit)}: must be a text")
     read = RunFunction(function, _takes_trajectory(function), save_every)

@@ -9,7 +9,7 @@ from jaxtank.controllers.feedback_linearisation import check_own_pumps
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.observers.base import Observer
 from jaxtank.observers.checks import check_model, check_tanks
 from jaxtank.plants.base import Plant
@@ -69,11 +69,7 @@ class DisturbanceObserver(Observer):
 
     model: Plant
     l: np.ndarray = leaf(
-        "1/s",
-        "gain l of each tank; of unmeasured tanks not used",
-        low=0.0,
-        strict=True,
-        shape="tank",
+        "1/s", "gain l of each tank; of unmeasured tanks not used", **POSITIVE, shape="tank"
     )
     fed: str = static("-", "input that the observer uses", choices=FED, default="applied")
     before_compensation: bool = static(

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.observers.base import Observer
 from jaxtank.observers.checks import check_disturbed, check_model, check_tanks
 from jaxtank.plants.base import Plant
@@ -68,8 +68,7 @@ class ExtendedKalman(Observer):
     measurement: np.ndarray = leaf(
         "cm^2",
         "variance of each sensor's noise (r); of unmeasured tanks not used",
-        low=0.0,
-        strict=True,
+        **POSITIVE,
         shape="tank",
     )
     spread: np.ndarray = leaf(
@@ -87,8 +86,7 @@ class ExtendedKalman(Observer):
         "cm^2/s^3",
         "variance that the disturbance of each level's rate gains per second; of tanks not in"
         " `disturbed` not used",
-        low=0.0,
-        strict=True,
+        **POSITIVE,
         like="process",
         default=None,
         shape="tank",

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtank.analysis.linear_model import linearise
 from jaxtank.analysis.riccati import discrete_riccati, zero_order_hold
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.observers.base import Observer
 from jaxtank.observers.checks import check_disturbed, check_model, check_tanks
 from jaxtank.plants.base import Plant
@@ -56,23 +56,20 @@ class Kalman(Observer):
     process: np.ndarray = leaf(
         "cm^2/s",
         "variance that each level's own disturbance gains per second",
-        low=0.0,
-        strict=True,
+        **POSITIVE,
         shape="tank",
     )
     measurement: np.ndarray = leaf(
         "cm^2",
         "variance of each sensor's noise; of unmeasured tanks not used",
-        low=0.0,
-        strict=True,
+        **POSITIVE,
         shape="tank",
     )
     walk: np.ndarray | None = leaf(
         "cm^2/s^3",
         "variance that the disturbance of each level's rate gains per second; of tanks not in"
         " `disturbed` not used",
-        low=0.0,
-        strict=True,
+        **POSITIVE,
         like="process",
         default=None,
         shape="tank",

@@ -17,7 +17,7 @@ from jaxtank.core.numerics import (
     smooth_signed_sqrt,
     smooth_sqrt,
 )
-from jaxtank.core.tree import component, leaf, note, static
+from jaxtank.core.tree import POSITIVE, component, leaf, note, static
 from jaxtank.core.units import DEFAULT
 from jaxtank.core.vectors import each, is_array, take, zeros
 from jaxtank.plants import elements
@@ -242,9 +242,7 @@ class TankNetwork(Plant):
     [0.857]
     """
 
-    area: np.ndarray = leaf(
-        "cm^2", "cross-section A of each tank", low=0.0, strict=True, shape="tank"
-    )
+    area: np.ndarray = leaf("cm^2", "cross-section A of each tank", **POSITIVE, shape="tank")
     drain: np.ndarray = leaf(
         "cm^2",
         "effective orifice area from each tank to the basin; 0: closed",
@@ -264,7 +262,7 @@ class TankNetwork(Plant):
         shape="pipe",
     )
     pump_gain: np.ndarray = leaf(
-        "cm^3/(s V)", "flow per unit of each pump's input (Kp)", low=0.0, strict=True, shape="feed"
+        "cm^3/(s V)", "flow per unit of each pump's input (Kp)", **POSITIVE, shape="feed"
     )
     split: np.ndarray = leaf(
         "-", "share of each pump that goes to its first tank", low=0.0, high=1.0, shape="feed"
@@ -312,8 +310,8 @@ class TankNetwork(Plant):
     orifice_resistance: Any = _option(
         "s/cm^2", RESISTANCE.format("orifice"), of="orifice", strict=True, infinite=True
     )
-    gravity: np.ndarray = leaf("cm/s^2", "acceleration g", low=0.0, strict=True)
-    rim: np.ndarray = leaf("cm", "height of each tank", low=0.0, strict=True, shape="tank")
+    gravity: np.ndarray = leaf("cm/s^2", "acceleration g", **POSITIVE)
+    rim: np.ndarray = leaf("cm", "height of each tank", **POSITIVE, shape="tank")
     caught: np.ndarray = leaf(
         "-",
         "share of what passes a rim that falls into another tank",

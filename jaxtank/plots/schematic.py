@@ -32,7 +32,6 @@ def schematic(ax, plant, levels=None, setpoints=None, lost=None):
     # than 24 tanks is drawn by `overview.overview`.
     if plant.tanks > LARGEST:
         return overview(ax, plant, levels)
-        return overview(ax, plant, levels)
     where = place(plant)
     _basin(ax, where)
     _pipework(ax, plant, where)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.core.clock import Clock, pointwise, sample_times
-from jaxtank.core.tree import Role, component, leaf, static
+from jaxtank.core.tree import POSITIVE, Role, component, leaf, static
 from jaxtank.core.vectors import columns, serves_arrays
 
 BETWEEN = ("hold", "linear")
@@ -161,7 +161,7 @@ class Table(Signal):
     values: np.ndarray = leaf(
         "-", "recorded values, in the unit of what they stand for", shape=("channel", "sample")
     )
-    period: float = static("s", "time between samples", low=0.0, strict=True)
+    period: float = static("s", "time between samples", **POSITIVE)
     between: str = static(doc="what is between samples", choices=BETWEEN, default="hold")
 
     @property

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxtank.core.clock import Clock, pointwise, sample_times
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import component, leaf, number, static
+from jaxtank.core.tree import POSITIVE, component, leaf, number, static
 from jaxtank.signals.base import BETWEEN, Signal
 from jaxtank.xla.gather import gathered
 
@@ -36,8 +36,7 @@ class InflowPulses(Signal):
     window: float = static(
         "s",
         "time after an inflow pulse in which the recovery of its tank is measured",
-        low=0.0,
-        strict=True,
+        **POSITIVE,
         default=60.0,
     )
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxtank.core.clock import Chunk, Clock, indices, pointwise, sample_times
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import component, leaf, number, static
+from jaxtank.core.tree import POSITIVE, component, leaf, number, static
 from jaxtank.core.vectors import columns
 from jaxtank.signals.base import Signal
 from jaxtank.xla.barrier import materialised
@@ -413,7 +413,7 @@ class Sine(Signal):
 
     amplitude: np.ndarray = leaf("cm", "amplitude of the sine")
     offset: np.ndarray = leaf("cm", "mean of the sine")
-    period: float = static("s", "period", low=0.0, strict=True)
+    period: float = static("s", "period", **POSITIVE)
     zero: float = static("s", "a time at which the sine rises through its mean")
     start: float = static("s", "when it begins", low=0.0)
     end: float = static("s", "when it ends", low=0.0)

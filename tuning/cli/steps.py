@@ -75,7 +75,7 @@ def settings(args):
 
 def _replaced(name, scenarios):
     """A sentence: a value of --set replaces the values in scenarios."""
-    from tuning.problem.wording import count
+    from jaxtank.core.text import count
 
     names = [repr(printable(s)) for s in scenarios[:3]] + ["..."] * (len(scenarios) > 3)
     return (

@@ -22,7 +22,7 @@ from jaxtank.core.tables import (
     split_header,
     unit_name,
 )
-from jaxtank.core.text import printable
+from jaxtank.core.text import count, printable
 from jaxtank.core.units import canonical
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.plants.vessels import level_of
@@ -30,7 +30,6 @@ from jaxtank.rig.sensors import in_span, spans_of
 from jaxtank.rig.validation import LOG_SETTINGS, log_keys, log_slots
 from tuning.identification.experiment import Log, check_hold, log
 from tuning.identification.signals import Signal, poor, rank, signals_of, time_columns
-from tuning.problem.wording import count
 
 KINDS = {"pump": "pump", "h": "level"}
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from jaxtank import rig
 from jaxtank.case import Case, Scenario
+from jaxtank.core.checks import check_whole
 from jaxtank.core.clock import CHUNK, Clock
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.tree import split_index, with_values
@@ -109,11 +110,7 @@ def _check_scenario(s: Scenario, free: Sequence[str]) -> None:
         raise InputError(
             f"scenario {s.name!r}: weight = {s.weight!r} must be a finite number above 0"
         )
-    seed: Any = s.seed  # of a file, where it may be anything
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**31:
-        raise InputError(
-            f"scenario {s.name!r}: seed = {seed!r} must be a whole number from 0 to {2**31 - 1}"
-        )
+    check_whole(f"scenario {s.name!r}: seed", s.seed, 0, 2**31 - 1)
     for name in s.values:
         for other in free:
             if name == other or split_index(name)[0] == other or name == split_index(other)[0]:

@@ -11,6 +11,7 @@ from jaxtank import presets
 from jaxtank.case import Free
 from jaxtank.core.clock import CLOCK
 from jaxtank.core.labels import label_of
+from jaxtank.core.text import count
 from jaxtank.core.tree import walk
 from jaxtank.core.units import local
 from jaxtank.instruments import LevelSensor, PumpBank
@@ -21,7 +22,6 @@ from jaxtank.plots.equations import equations, physics
 from jaxtank.signals.base import Constant, Sum
 from jaxtank.signals.inflows import InflowPulses, InflowTable
 from jaxtank.signals.setpoints import Ramps, Sine
-from tuning.problem.wording import count
 from tuning.report import safety
 from tuning.report.document import Report, Text
 from tuning.report.tables import Table, Value, clean

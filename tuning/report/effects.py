@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxtank.core.text import count
 from jaxtank.core.tree import describe, get_value
 from tuning.problem import provenance
-from tuning.problem.wording import count
 from tuning.report.document import Report, Text
 from tuning.report.folder import earlier
 from tuning.report.folder import save as save_all

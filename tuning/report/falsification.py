@@ -7,12 +7,12 @@ import numpy as np
 
 from jaxtank import rig as rigs
 from jaxtank.core.labels import label_of, labels_of, short
+from jaxtank.core.text import count
 from jaxtank.core.tree import describe, get_value
 from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv
 from jaxtank.safety.checker import CASE
 from tuning.problem import provenance
-from tuning.problem.wording import count
 from tuning.report.document import Report, Text
 from tuning.report.folder import earlier, rig_text
 from tuning.report.folder import save as save_all

@@ -8,12 +8,12 @@ import numpy as np
 
 from jaxtank import rig as rigs
 from jaxtank.core.labels import reading_label
+from jaxtank.core.text import count
 from jaxtank.core.tree import get_value
 from jaxtank.core.units import local
 from tuning.identification import residuals
 from tuning.identification.confidence import at_search_bounds
 from tuning.problem import provenance
-from tuning.problem.wording import count
 from tuning.report.document import Report, Text
 from tuning.report.folder import earlier, rig_text
 from tuning.report.folder import save as save_all

@@ -7,8 +7,8 @@ import io
 import numpy as np
 
 from jaxtank.core.labels import reading_label
+from jaxtank.core.text import count
 from tuning.problem import provenance
-from tuning.problem.wording import count
 from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
 from tuning.report.tables import Table, Value, clean

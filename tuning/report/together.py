@@ -12,10 +12,11 @@ from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder
+from jaxtank.core.labels import numbered
+from jaxtank.core.text import count
 from jaxtank.loop.trajectory import csv
 from tuning.problem import provenance, reported
 from tuning.problem.scenarios import noisy
-from tuning.problem.wording import count, numbered
 from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
 from tuning.report.simulated import json_of_run, run_for_people

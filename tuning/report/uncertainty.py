@@ -9,9 +9,9 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.labels import entry_label
+from jaxtank.core.text import count
 from jaxtank.loop import step_size
 from tuning.problem import provenance
-from tuning.problem.wording import count
 from tuning.report.document import Live, Report, Text
 from tuning.report.folder import earlier
 from tuning.report.folder import save as save_all

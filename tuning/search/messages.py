@@ -53,11 +53,11 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.labels import entry_label, label_of, labels_of
+from jaxtank.core.text import count
 from jaxtank.core.tree import parameters
 from jaxtank.safety.of_case import SPREAD
 from tuning.problem.problem import DIVERGED
 from tuning.problem.status import Status
-from tuning.problem.wording import count
 from tuning.search.driver import SLOPING, UNSTABLE
 from tuning.search.result import ConstraintRow, Message, TuningResult, constraint_rows
 from tuning.search.solve import AGREE, RENEWED

@@ -283,11 +283,6 @@ def constraint_rows(
     return rows
 
 
-def _entry(table: Sequence[Mapping[str, Any]], limit: Limit, measure: str) -> float:
-    """Return the entry of a measure that a limit is of, in its scenario."""
-    return float(np.ravel(table[limit.run][measure])[limit.index])
-
-
 def row_of(
     limit: Limit, loop: ClosedLoop, value: float, *, multiplier: float = 0.0, **more: Any
 ) -> ConstraintRow:

@@ -314,7 +314,6 @@ def _default_answer(
     rules = ()
     if not solution.interrupted:
         rules = rule_rows(setting, samples, seed, attempt.number, gains, reasons)
-    summary, cloud = _validation(answer)
     sides = {"before": first, "after": solution.point}
     result = _result(
         evaluator,
@@ -322,21 +321,11 @@ def _default_answer(
         values,
         began,
         diagnostics.step_warnings(setting.tuned(values), values),
-        case=setting.case,
-        tuned=setting.tuned(values),
         method="default answer",
         status=solution.status(answer.held, answer.lost),
-        objective={"before": _mean(before), "after": _mean(answer.after)}
-        | {"terms": dict(setting.objective)},
-        measures=dict(answer.measures),
         tables={side: [] if p is None else list(p.measures) for side, p in sides.items()},
-        constraints=_rows(answer),
-        symmetry=None,
-        validation=summary,
-        cloud=cloud,
-        lost=answer.lost,
-        answer=answer,
         rules=rules,
+        **_judged_parts(answer, values),
     )
     log.close()
     return result
@@ -480,27 +469,16 @@ def tune_by_rule(
     attempt = Attempt(setting, evaluator=evaluator, after=after)
     answer = _answer(attempt, evaluator.problem, before, gains)
     status = Status.CONVERGED if answer.held else Status.INFEASIBLE
-    summary, cloud = _validation(answer)
     return _result(
         evaluator,
         attempt.solution,
         gains,
         began,
         diagnostics.step_warnings(setting.tuned(gains), gains),
-        case=setting.case,
-        tuned=setting.tuned(gains),
         method=f"rule {rule}",
         status=Status.NOT_CONVERGED if answer.held and answer.lost else status,
-        objective={"before": _mean(before), "after": _mean(after)}
-        | {"terms": dict(setting.objective)},
-        measures=dict(answer.measures),
         tables={"before": [], "after": []},
-        constraints=_rows(answer),
-        symmetry=None,
-        validation=summary,
-        cloud=cloud,
-        lost=answer.lost,
-        answer=answer,
+        **_judged_parts(answer, gains),
     )
 
 
@@ -545,6 +523,25 @@ def _result(
     )
     wall_s = time.perf_counter() - began
     return result.replace(messages=messages_of(result), wall_s=wall_s)
+
+
+def _judged_parts(answer: Answer, values: Mapping[str, float]) -> dict[str, Any]:
+    """Return the fields of a TuningResult that follow from an Answer."""
+    setting, sides = answer.setting, {"before": answer.before, "after": answer.after}
+    costs: dict[str, Any] = {side: _mean(plants) for side, plants in sides.items()}
+    summary, cloud = _validation(answer)
+    return {
+        "case": setting.case,
+        "tuned": setting.tuned(values),
+        "objective": costs | {"terms": dict(setting.objective)},
+        "measures": dict(answer.measures),
+        "constraints": _rows(answer),
+        "symmetry": None,
+        "validation": summary,
+        "cloud": cloud,
+        "lost": answer.lost,
+        "answer": answer,
+    }
 
 
 def _what(problem, validation, command, more):

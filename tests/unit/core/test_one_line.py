@@ -75,14 +75,14 @@ def test_an_error_of_a_long_word_is_a_short_line(say, words, end):
 
 
 def test_a_log_of_many_columns_is_refused_in_a_short_line(say, tmp_path):
-    header = ",".join(f"column {i}" for i in range(100_000))
-    (tmp_path / "wide.csv").write_text(header + "\n" + ",".join(["1"] * 100_000) + "\n")
+    header = ",".join(f"column {i}" for i in range(3_000))
+    (tmp_path / "wide.csv").write_text(header + "\n" + ",".join(["1"] * 3_000) + "\n")
     code, out, err = say(*IDENTIFY, "wide.csv")
     assert code == 5 and out == ""
     assert max(map(len, err.splitlines())) <= MOST + len("jaxtank: ")  # a [log] table below
     assert (
         "no column for t (time) among 'column 0', 'column 1'" in err
-        and "and 99980 more; name it with --column" in err
+        and "and 2980 more; name it with --column" in err
     )
 
 
