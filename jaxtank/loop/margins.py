@@ -170,7 +170,7 @@ class _Sample:
         actuator: Any = loop.actuator
         started: Any = dataclasses.replace(actuator, initial=u)
         self.loop, self.clock = loop, clock
-        self.now = _constant_inputs(loop, clock, r)
+        self.now = constant_inputs(loop, clock, r)
         first = initial(dataclasses.replace(loop, x0=x, actuator=started), clock)
         self.parts = floats_of(first)
         floats, self.rest = self.parts.split(first)
@@ -239,8 +239,8 @@ class _Rest(NamedTuple):
     counts: Any  # True where a sample changes whole numbers of the state
 
 
-def _constant_inputs(loop: ClosedLoop, clock: Clock, r: Any) -> Inputs:
-    """The Inputs of one sample with setpoints r (outputs,) that do not change."""
+def constant_inputs(loop: ClosedLoop, clock: Clock, r: Any) -> Inputs:
+    """Return the Inputs of one sample with setpoints r (outputs,) that do not change."""
     columns = tuple(v[None] for v in r)
     zero = tuple(jnp.zeros_like(v) for v in columns)
     plan = loop.controller.prepare(columns, zero, zero)

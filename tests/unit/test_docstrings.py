@@ -69,7 +69,7 @@ LONG = {
     *("jaxtank.loop.margins", "jaxtank.live.engine", "tuning.figures.comparison"),
     *("tuning.search.judged", "tuning.identification.design", "tuning.falsification.study"),
     *("tuning.uncertainty.study", "tuning.uncertainty.sensitivity_study"),
-    *("jaxtank.analysis.linear_model", "jaxtank.analysis.steady_state"),
+    *("jaxtank.analysis.linear_model", "jaxtank.analysis.steady_state", "tuning.search.tuner"),
 }
 
 

@@ -96,7 +96,8 @@ def imports(tree):
         "__builtins__",
     }
     by_name = bool(names.known or direct)
-    parent = {id(child): node for node in ast.walk(tree) for child in ast.iter_child_nodes(node)}
+    pairs = ((c, node) for node in ast.walk(tree) for c in ast.iter_child_nodes(node))
+    parent = {id(child): node for child, node in pairs} if by_name else {}
     for node in ast.walk(tree):
         above = parent.get(id(node))
         if isinstance(node, ast.Import):

@@ -12,11 +12,11 @@ import numpy as np
 import scipy  # its parts are imported when they are first used
 from jax.flatten_util import ravel_pytree
 
-from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
-from jaxtank.loop.closed_loop import Inputs, initial
-from jaxtank.loop.steady import steady_inflow, steady_state
+from jaxtank.loop.closed_loop import floats_of, initial
+from jaxtank.loop.margins import constant_inputs
+from jaxtank.loop.steady import steady_state
 from jaxtank.loop.step import step
 from tuning.problem.scenarios import screening_clock
 
@@ -78,37 +78,15 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
 
     def jacobian(values, r, x, u):
         changed = with_values(loop, {**values, "x0": x, "actuator.initial": u})
-        state = initial(changed, clock)
-        leaves, structure = jax.tree.flatten(state)
-        moves = [jnp.issubdtype(jnp.result_type(v), jnp.floating) for v in leaves]
-        zero = jnp.zeros_like(r)
-        inflow = steady_inflow(loop)
-        d = None if loop.disturbance is None else tuple(jnp.zeros(loop.plant.tanks))
-        d = d if inflow is None else tuple(jnp.asarray(inflow))
-        plan = changed.controller.prepare(
-            tuple(r[:, None]), tuple(zero[:, None]), tuple(zero[:, None])
-        )
-        now = Inputs(
-            r=tuple(r),
-            dr=tuple(zero),
-            ddr=tuple(zero),
-            d=d,
-            xi=None,
-            context=ms.Context(),
-            plan=jax.tree.map(lambda a: a[0], plan),
-            own=jax.tree.map(lambda a: a[0], changed.controller.inputs(clock)),
-            fault=None if loop.faults is None else (0.0,) * len(loop.faults.windows),
-        )
+        state, now = initial(changed, clock), constant_inputs(changed, clock, r)
+        parts = floats_of(state)
+        floats, rest = parts.split(state)
+        flat, unravel = ravel_pytree(floats)
 
         def after(flat):
-            floats, rest = iter(unravel(flat)), iter([v for v, m in zip(leaves, moves) if not m])
-            state = jax.tree.unflatten(
-                structure, [next(floats) if m else next(rest) for m in moves]
-            )
-            out = jax.tree.leaves(step(changed, clock, state, now)[0])
-            return jnp.concatenate([jnp.ravel(v) for v, m in zip(out, moves) if m])
+            moved, _ = step(changed, clock, parts.join(unravel(flat), rest), now)
+            return ravel_pytree(parts.split(moved)[0])[0]
 
-        flat, unravel = ravel_pytree([v for v, m in zip(leaves, moves) if m])
         return jax.jacfwd(after)(flat)
 
     return jax.vmap(lambda v: jax.vmap(lambda *at: jacobian(v, *at))(r, x, u))(values)
