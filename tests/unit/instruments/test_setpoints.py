@@ -127,11 +127,11 @@ def test_a_filter_is_for_ramps():
 )
 def test_many_changes_give_what_as_many_pieces_give(course, monkeypatch):
     rng = np.random.default_rng(0)
-    times = np.sort(rng.choice(np.arange(1, 400), 15, replace=False)) * 0.25
-    changes = [(float(t), 0, float(v)) for t, v in zip(times, rng.uniform(1.0, 3.0, 15))]
+    times = np.sort(rng.choice(np.arange(1, 400), 8, replace=False)) * 0.25
+    changes = [(float(t), 0, float(v)) for t, v in zip(times, rng.uniform(1.0, 3.0, 8))]
     reference = ramps([2.0], changes, **{"ramp": 4.0, **course})
     clock = Clock(dt=0.5, duration=90.0)
-    monkeypatch.setattr(setpoints, "MANY", 10)
+    monkeypatch.setattr(setpoints, "MANY", 5)
     sampled = lambda: jax.jit(lambda r: (r.sample(clock), r.windows(clock)))(reference)
     looked_up = sampled()
     monkeypatch.setattr(setpoints, "MANY", 1000)
