@@ -146,15 +146,11 @@ class Controller(Role):
 
     @property
     def ignores_disturbance(self) -> bool:
-        """True if a setting of the controller states that `estimate.d` is not to be used, so that
-        an observer that estimates it calls for no note.
-        """
+        """True if a setting states that `estimate.d` is not used: it then calls for no note."""
         return False
 
     def check_pumps(self, actuator: Actuator) -> None:
-        """Raise InputError for pumps whose limits, or whose input before t = 0, do not suit the
-        controller.
-        """
+        """Raise InputError for pumps whose limits, or first inputs, do not suit the controller."""
 
     def check(self, reference: Signal) -> None:
         """Raise InputError if the reference or the model does not suit the controller."""

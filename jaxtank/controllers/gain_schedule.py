@@ -194,9 +194,7 @@ class Scheduled(Controller):
         return inner.input_metric(estimate)
 
     def metadata_of(self, field: str) -> dict[str, Any]:
-        """Return what to change of a field's metadata: the values have the units and ranges of
-        their gains.
-        """
+        """Return changes of a field's metadata: values have units and ranges of their gains."""
         if field != "values":
             return {}
         rows = []

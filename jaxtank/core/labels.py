@@ -53,9 +53,7 @@ def _numbered(plant: Any, kind: str, index: int) -> str:
 
 
 def labels_of(plant: Any, kind: str, indices: Iterable[int]) -> str:
-    """Return the labels of several entries: "LT101, LT103", "tank 3", "tanks 1, 3" or
-    "tanks 1 to 4".
-    """
+    """Return labels of entries: "LT101, LT103", "tank 3", "tanks 1, 3" or "tanks 1 to 4"."""
     indices = list(indices)
     valves = kind == "pump" and len(getattr(plant, "valves", ())) > 0
     if valves or any(name_of(plant, kind, i) for i in indices):

@@ -140,9 +140,7 @@ def lower_all(f, arguments, writer=None):
 
 
 def _inputs(writer, name, tree):
-    """Yield (Ref of the first element, elements) of each array of an argument; each element is
-    converted to its kind, for every input is a real.
-    """
+    """Yield (Ref of the first element, elements, each of its kind) of each array of an argument."""
     count = 0
     for leaf in jax.tree.leaves(tree):
         size = int(np.prod(leaf.shape))

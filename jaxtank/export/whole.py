@@ -82,9 +82,7 @@ def served(case: Case) -> tuple[str, ...]:
 
 
 def sample_of(case: Case, names: Sequence[str], squares: Sequence[tuple[str, float]] = ()) -> Any:
-    """Return the function (p, k, c, n) -> (c before the first sample, c after this one, saved,
-    measures, residuals) of a case.
-    """
+    """Return (p, k, c, n) -> (first c, next c, saved, measures, residuals) of a case's sample."""
     clock, names = case.clock, tuple(names)
 
     def whole(p: Any, k: Any, c: Any, n: Any) -> Any:

@@ -196,9 +196,7 @@ class PumpBank(Actuator):
         return dataclasses.replace(self, low=end(-1.0), high=end(1.0), rate=None)
 
     def driving(self, u: tuple) -> tuple:
-        """Return the part of the inputs `u` (m,) [V] at the plant that moves liquid: u less an
-        "offset" dead zone, else u itself.
-        """
+        """Return the part of inputs `u` (m,) [V] that moves liquid: less an "offset" dead zone."""
         if not self._has_dead_zone("offset"):
             return u
         return each(lambda v, least: lower_clip(v - least, 0.0), u, self.dead_zone)

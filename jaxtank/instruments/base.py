@@ -233,9 +233,7 @@ class Actuator(Role):
         return each(clip, command, self.low, self.high)
 
     def reachable(self, before: Any, dt: Any) -> "Actuator":
-        """Return the pumps with the limits that they reach a sample after inputs `before`; called
-        where there is a `rate`.
-        """
+        """Return the pumps within what their `rate` lets them reach a sample after `before`."""
         return self
 
     @abc.abstractmethod

@@ -144,9 +144,7 @@ def data(value: Any) -> str:
 
 
 def squares_of(objective: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
-    """Return ((measure, weight), ...) of the Gauss-Newton matrix of an objective, as
-    `tune` has it.
-    """
+    """Return ((measure, weight), ...) of the Gauss-Newton matrix of an objective."""
     squares = tuple((m, w) for m, w in objective.items() if m in ms.squares())
     return (
         (("mean_square_error", 1.0),) if "rms_error_total" in objective or not squares else squares

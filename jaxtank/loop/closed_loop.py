@@ -293,9 +293,7 @@ def initial(loop: ClosedLoop, clock: Clock, arrays: bool = False) -> State:
 
 
 def control_state(loop: ClosedLoop, x0: Vector, u0: Vector) -> Any:
-    """State of the controller at t = 0; with the inputs under way where the filter predicts, and
-    with the last inputs where their rate is limited.
-    """
+    """State of the controller at t = 0, with inputs under way and last inputs where they count."""
     x0, u = form_for(loop.controller, x0), form_for(loop.controller, u0)
     state, safety_filter = loop.controller.init(x0, u), loop.safety_filter
     if safety_filter is not None and safety_filter.predicted:

@@ -98,9 +98,7 @@ def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
 
 
 def _without_limits(loop: ClosedLoop, clock: Clock) -> tuple[ClosedLoop, Any]:
-    """(the loop without noise, limits, dead time, filter; its dead time in samples, of all inputs
-    or of each).
-    """
+    """(the loop without noise, limits, dead time and filter; its dead time in samples)."""
     sensor: Any = loop.sensor.without_noise()
     if getattr(sensor, "bits", 0):
         sensor = dataclasses.replace(sensor, bits=0)

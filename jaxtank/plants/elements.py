@@ -55,9 +55,7 @@ def check_plain(net: Any, what: str, remedy: str) -> None:
 
 
 def closed_circuit(net: Any) -> list[int]:
-    """Return tanks that exchange nothing with the basin, so that their volume stays what it is; []
-    of traced areas.
-    """
+    """Return tanks that exchange nothing with the basin; [] of traced areas."""
     if any(isinstance(v, Tracer) for v in jax.tree.leaves((net.drain, net.drain_resistance))):
         return []
     open_tanks, joined = set(np.flatnonzero(np.asarray(net.drain) > 0.0)), [*net.links, *net.pipes]
@@ -100,9 +98,7 @@ def power_law(head: Any, exponent: Any, knee: Any) -> Any:
 
 
 def opening_flow(net: Any, area: Any, head: Any, exponent: Any, resistance: Any) -> Any:
-    """Return the flow out of an opening under a head: area sqrt(2 g) head^exponent, and
-    head / resistance beside it.
-    """
+    """Return area sqrt(2 g) head^exponent, and head/resistance beside it, of an opening."""
     root = smooth_sqrt(head, net.knee) if exponent is None else power_law(head, exponent, net.knee)
     flow = area * jnp.sqrt(2.0 * net.gravity) * root
     return flow if resistance is None else flow + lower_clip(head, 0.0) / resistance
@@ -169,9 +165,7 @@ def _joined_flow(net: Any, area: Any, x: Any, ends: tuple[int, int], port: Any) 
 
 
 def streams(net: Any, x: Any, u: Any) -> list[Stream]:
-    """Return the flow of each drain, orifice, pipe, pump and valve at levels x (n,) and inputs
-    u (m,).
-    """
+    """Return the flow of each drain, orifice, pipe, pump and valve at levels x and inputs u."""
     flows = []
     for kind, pairs in openings(net):
         for k, (source, sink) in enumerate(pairs):
@@ -192,9 +186,7 @@ def streams(net: Any, x: Any, u: Any) -> list[Stream]:
 
 
 def input_flows(net: Any, x: Any, u: Any) -> tuple[Any, ...]:
-    """Return the flow (m,) [cm^3/s] that each pump and valve moves at levels x (n,) and inputs u
-    (m,), positive from its source to its sink.
-    """
+    """Return the flow (m,) [cm^3/s] of each pump and valve, positive from source to sink."""
     flows: list[Any] = []
     for j, (first, _) in enumerate(net.feeds):
         source = net.sources[j] if net.sources else None
@@ -236,9 +228,7 @@ def largest_supply(net: Any, u: np.ndarray) -> Any:
 
 
 def net_flows(net: Any, x: Any, u: Any, d: Any, step: Any = None) -> tuple[Any, ...]:
-    """Return the net inflow of each tank (n,) [cm^3/s]; with `step`, at most what a tank holds
-    leaves it in that time.
-    """
+    """Return the net inflow (n,) [cm^3/s]; with `step`, at most what a tank holds leaves it."""
     flows = streams(net, x, u)
     shares: list[Any] = [1.0] * net.tanks
     if step is not None:

@@ -58,9 +58,7 @@ class Faults:
         return np.flatnonzero(first == after).tolist()
 
     def problems(self, plant: Plant, clock: Clock) -> list[str]:
-        """Return a sentence for each fault that makes no physics of `plant`: an entry out of its
-        range, volume from nowhere.
-        """
+        """Return a sentence for each fault that leaves an entry's range or creates volume."""
         texts = []
         for k, (name, start, end) in enumerate(self.windows):
             field, (index,) = split_index(name)

@@ -362,9 +362,7 @@ class TankNetwork(Plant):
 
     @property
     def plain(self) -> bool:
-        """Whether drains, orifices, pipes and pumps are as in the equations above, and the rig has
-        nothing else.
-        """
+        """Whether the rig has nothing but what the equations above have."""
         absent = (getattr(self, name) is None for name in OPTIONS)
         return all(absent) and not (
             self.sources or self.curves or self.lift_curves or self.valves or self.shapes

@@ -40,9 +40,7 @@ def size(tanks):
 
 
 def overview(ax, plant, levels=None):
-    """Draw a rig of many tanks: a cell each, in the order of their numbers, filled as a share of
-    its rim.
-    """
+    """Draw a rig of many tanks: a cell for each, in their order, filled as a share of its rim."""
     n, columns = plant.tanks, per_line(plant.tanks)
     corners = np.array([(i % columns, -(i // columns)) for i in range(n)], dtype=float) * PITCH
     centres, full = corners + 0.5 * CELL, np.ones(n)

@@ -309,9 +309,7 @@ def elementary(ax, names, size, intervals, spread, unit, title):
 
 
 def shares(ax, names, first, total, title):
-    """Draw the first-order and total shares of the variance of a measure (Sobol), each as (values,
-    intervals).
-    """
+    """Draw first-order and total shares of a measure's variance (Sobol), as (values, intervals)."""
     y = _bars(ax, names, title)
     for (values, ends), side, colour, label in (
         (first, -0.2, BEFORE, "first order: alone"),

@@ -81,9 +81,7 @@ def _pumps(ax, plant, where):
 
 
 def mark(ax, tank, setpoint):
-    """Mark a setpoint [cm] with a line and a triangle at the right of a tank; return both
-    artists.
-    """
+    """Mark a setpoint [cm] by a line and a triangle at the right of a tank; return both."""
     y, x = mark_height(tank, setpoint), tank.x + tank.width
     (line,) = ax.plot([x - 0.1 * tank.width, x], [y, y], color=REFERENCE, linewidth=1.3, zorder=4)
     (triangle,) = ax.plot([x + 0.07], [y], marker="<", color=REFERENCE, markersize=5, zorder=4)

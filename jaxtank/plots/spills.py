@@ -85,9 +85,7 @@ def amount(volume: float, unit: str) -> str:
 
 
 class Stack:
-    """Liquid above the rim of a tank, hatched, with the rim as a line; a triangle on top where it
-    is higher than drawn.
-    """
+    """Liquid above the rim of a tank, hatched; a triangle where it is higher than drawn."""
 
     def __init__(self, ax: Any, box: Any, area: float):
         self.box, self.area, top = box, float(area), box.y + box.height
@@ -119,9 +117,7 @@ def headroom(ax: Any, stacks: Any) -> None:
 
 
 def above_rim(ax: Any, trajectories: Any, tank: int, rim: Any, spills: Any) -> str:
-    """Hatch what is above the rim of a tank in a picture of its level over time; return ": 774 cm^3
-    above the rim" for the title, "" where nothing is.
-    """
+    """Hatch levels above the rim; return ": 774 cm^3 above the rim" for the title, or ""."""
     wet = {name: spill for name, spill in (spills or {}).items() if spill.most[tank] > 0}
     amounts = []
     for name, spill in wet.items():
@@ -135,9 +131,7 @@ def above_rim(ax: Any, trajectories: Any, tank: int, rim: Any, spills: Any) -> s
 
 
 def spill_note(plant: Any, trajectories: Any) -> str:
-    """Return lines of a title, each after a line break, of the runs with a level above its rim:
-    how much, and whether overflow is simulated.
-    """
+    """Return lines of a title on the runs with a level above its rim, each after a line break."""
     lines = []
     for name, run in trajectories.items():
         if (spill := spilled(plant, run)).any:

@@ -126,9 +126,7 @@ def beside(most):
 
 
 def height(usual, rows, legend=0.5):
-    """Return the height of a figure of rows of panels [inch]: 1.3 each for a journal, or
-    `usual`.
-    """
+    """Return the height of a figure of rows of panels [inch]: 1.3 each in a journal, or `usual`."""
     return min(1.3 * rows + legend, TALLEST) if _COLUMNS else usual
 
 

@@ -134,9 +134,7 @@ ACCURATE, SAME = 1e-3, 0.05
 
 
 def constant_flow(case):
-    """Return the error of h1 (samples,) [m] with the steady flow of each setpoint instead of the
-    controller (u_s alone, notes S7.1).
-    """
+    """Return the error of h1 (samples,) [m] with the steady flow u_s alone (notes S7.1)."""
     up, down = (C1 * (h * (1 - KAPPA)) ** 0.5 for h in (0.8 * H0, 0.5 * H0))
     flow = OpenLoop(signal=ramps([up], [(600.0, 0, down)], ramp=0.0))
     return np.asarray(simulate(dataclasses.replace(case.loop, controller=flow), case.clock).e[:, 0])

@@ -66,9 +66,7 @@ def _by_ramp(run):
 
 
 def _claims(run, ramp):
-    """The claims of BY_RAMP with ramps of `ramp` [s]; their parts are NGPC and backstepping where
-    both are meant.
-    """
+    """The claims of BY_RAMP with ramps of `ramp` [s]; parts: NGPC, backstepping."""
     wide = {"actuator.low": -1e3, "actuator.high": 1e3}
     pair = [run(name, {"reference.ramp": ramp}, EVERY)[1] for name in PAIR]
     unlimited = [run(name, {"reference.ramp": ramp, **wide}, EVERY)[1] for name in PAIR]

@@ -313,9 +313,7 @@ class Attacked:
         return jnp.stack(x)
 
     def loop_of(self, values: Mapping[str, Any]) -> ClosedLoop:
-        """Return the loop with these values; coefficients of the plant are faults of it, unknown to
-        controller and filter.
-        """
+        """Return the loop with these values; coefficients of the plant are faults of it."""
         loop: Any = self.case.loop
         n, clock = self.shapes["varying"][0], self.case.clock
         constant = list(zip(self.coefficients[n:], values["constant"]))
@@ -368,16 +366,12 @@ class Attacked:
 
 
 def of_plant(coefficient: Coefficient) -> bool:
-    """Return whether a coefficient is an entry of an array of the plant, which may have a
-    course.
-    """
+    """Return whether a coefficient is an entry of an array of the plant."""
     return coefficient.name.startswith("plant.") and len(split_index(coefficient.name)[1]) == 1
 
 
 def without_overflow(loop: ClosedLoop) -> ClosedLoop:
-    """Return a loop whose levels may rise past the rims: at a rim, nothing could be seen
-    to pass.
-    """
+    """Return a loop whose levels may rise past the rims, where that can be seen."""
     plant: Any = loop.plant
     if not plant.overflow:
         return loop

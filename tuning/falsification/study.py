@@ -192,8 +192,7 @@ def _rises(case, reach):
 
 
 class _Climbed(NamedTuple):
-    """The highest run of each tank: its values, level and time; highest level of each tank by step
-    of the ascent (steps + 1, n)."""
+    """The highest run of each tank: values, level, time; and levels by step (steps + 1, n)."""
 
     values: list[dict[str, np.ndarray]]
     level: np.ndarray
@@ -254,9 +253,7 @@ class _Search:
 
 
 def _in_batches(function, size, *arrays):
-    """`function` of trees of arrays (runs, ...), `size` runs at a time; the last row is repeated to
-    fill the last batch.
-    """
+    """`function` of trees (runs, ...), `size` at a time; the last row fills the last batch."""
     runs = len(jax.tree.leaves(arrays)[0])
     rows = [np.minimum(np.arange(i, i + size), runs - 1) for i in range(0, runs, size)]
     parts = [function(*jax.tree.map(lambda v, r=r: v[r], arrays)) for r in rows]
@@ -288,8 +285,7 @@ SHORTEST = 1 / 64
 
 
 class Ascent(NamedTuple):
-    """Points (runs, ...) after an ascent, their values (runs,), and the values (iterations + 1,
-    runs) on the way."""
+    """Points (runs, ...) after an ascent, values (runs,), and values (iterations + 1, runs)."""
 
     z: dict[str, np.ndarray]
     value: np.ndarray

@@ -131,9 +131,7 @@ def _rows(needs, nominal, excess):
 
 
 def can_judge(case: Case) -> bool:
-    """Return whether `feasibility` is defined for a case: its reference has plateaus, and its rig
-    as many pumps as outputs.
-    """
+    """Return whether a reference has plateaus, and its rig as many pumps as outputs."""
     return judges(case)
 
 
@@ -538,10 +536,7 @@ def _pumps(needs: Needs) -> Mend | None:
 
 
 def _raised(needs, what, leaf, first, columns, end) -> Mend | None:
-    """Return the Mend that raises the violated limits among `columns`.
-
-    Limits that are equal before are equal after.
-    """
+    """Return the Mend that raises the violated limits among `columns`; equal ones stay equal."""
     needed = needs.at()
     most = np.nan_to_num(needed, nan=np.inf).max(axis=1)
     old = needs.high[0]

@@ -58,10 +58,7 @@ class Comparison(Shown):
         return sum(verdict in (None, row["verdict"]) for row in self.rows)
 
     def row(self, quantity: str) -> dict[str, Any]:
-        """Return the row of a quantity, the first of that name.
-
-        Raises InputError for a quantity that no paper here has.
-        """
+        """Return the row of a quantity, the first of that name; InputError for an unknown one."""
         for row in self.rows:
             if row["quantity"] == quantity:
                 return row

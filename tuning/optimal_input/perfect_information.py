@@ -214,9 +214,7 @@ class InputSearch:
         return min(ends, key=lambda pair: pair[1] if np.isfinite(pair[1]) else np.inf)[0]
 
     def _closed_loop(self):
-        """Return the means over each interval of the case's own inputs, None if the run
-        diverges.
-        """
+        """Return the interval means of the case's own inputs, None if its run diverges."""
         problem = self.problem
         loop, clock = problem.case.loop, problem.case.clock
         quiet = dataclasses.replace(loop, sensor=loop.sensor.without_noise())
@@ -321,9 +319,7 @@ class InputSearch:
         )
 
     def _repair(self, u, check):
-        """Return the check of inputs that hold the limits at the case's own step, if any
-        are found.
-        """
+        """Return the check of inputs that hold the limits at the case's step, or None."""
         for k in range(ROUNDS):
             if check["excess"] <= TOLERANCE:
                 break
@@ -352,9 +348,7 @@ class InputSearch:
 
 
 def _better(a, b, strictly=False):
-    """Return whether a is preferred: limits that hold, then the smaller excess, then the cost;
-    strictly: never where its limits do not hold.
-    """
+    """Return whether a is preferred: limits hold, then the smaller excess, then the cost."""
     if a["holds"] != b["holds"]:
         return a["holds"]
     if not a["holds"]:

@@ -49,9 +49,7 @@ below the ultimate gain, so that the loop is stable [-]."""
 
 
 class Process(NamedTuple):
-    """A loop's process as gain exp(-delay s)/((s + 1/lag) (second s + 1)); lag is inf where it
-    integrates.
-    """
+    """A process gain exp(-delay s)/((s + 1/lag) (second s + 1)); lag is inf where it integrates."""
 
     gain: float  # initial slope of the level for a unit of the input [cm/(s V)]
     lag: float  # [s]
@@ -79,9 +77,7 @@ class Loop(NamedTuple):
 
 
 def loop_of(case: Case, output: int, tank: int | None = None) -> Loop:
-    """Return the linear model of the loop of an output at the last plateau, other loops open; of
-    the level of `tank` where it is named.
-    """
+    """Return the linear model of one loop at the last plateau, of the level of `tank` if named."""
     bank, plant = cast(Any, case.loop.actuator), case.loop.plant
     _, levels, inputs = operating_point(case, plant)
     A, B, C = (np.asarray(v, dtype=float) for v in linearise(plant, levels, inputs))

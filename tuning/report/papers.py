@@ -199,9 +199,7 @@ def ramps_text(rows):
 
 
 def _set_in(preset, name):
-    """The value of parameter `name` in the first case that has it, or None where it is no
-    parameter.
-    """
+    """The value of parameter `name` in the first case that has it, None of another name."""
     for case in preset.cases.values():
         if name.startswith("clock."):
             return getattr(case.clock, name.removeprefix("clock."), None)

@@ -93,9 +93,7 @@ def sentences(case):
 
 
 def passed(case, values):
-    """Return sentences on levels of a run, {measure: value}, that passed a limit of the safety
-    filter.
-    """
+    """Return sentences on levels of {measure: value} that passed a limit of the safety filter."""
     safety_filter, sentences = case.loop.safety_filter, []
     sides = (("max_level", "limit", 1.0), ("min_level", "low", -1.0))
     reasons = None

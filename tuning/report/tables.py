@@ -129,9 +129,7 @@ def unit_text(measure, rig_units, plant=None):
 
 
 def limit_table(rows, gap=False):
-    """Return the Table of limits, rows of {"name", "measure", "unit", "limit", "value", "margin",
-    "reason", "time_s"}.
-    """
+    """Return the Table of limits, rows as those of `ConstraintRow`."""
     timed = any(row["time_s"] is not None for row in rows)
     cells = [
         [
@@ -173,10 +171,7 @@ def _why(measure, values, plant=None):
 
 
 def _unserved():
-    """Return {measure: why a case has no value}.
-
-    Without measures of the linearised loop, which are computed only on request.
-    """
+    """Return {measure: why a case has no value}, without those that are computed on request."""
     named = ms.linear()
     return {m: s.unserved for m, s in ms.MEASURES.items() if s.unserved and m not in named}
 

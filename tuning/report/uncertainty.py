@@ -197,9 +197,7 @@ def _extent(d):
 
 
 def draws_csv(ensemble):
-    """Return every draw as CSV, some lines at a time: number, whether it diverged, parameters,
-    measures.
-    """
+    """Yield every draw as CSV, some lines at a time."""
     units = {m: f" [{ms.unit(m, ensemble.case.loop.units)}]" for m in ensemble.measures}
     columns = [(table, name) for table in (ensemble.values, ensemble.measures) for name in table]
     heads = ["draw", "failed"]

@@ -202,9 +202,7 @@ class Stages:
         return bool(done) and not without_slope(self.search)
 
     def search_from(self, starts: Sequence[np.ndarray]) -> None:
-        """Search from `starts` until two agree, then from screened points and rivals that are
-        better.
-        """
+        """Search from `starts` until two agree, then from better screened points and rivals."""
         search, plan = self.search, self.plan
         tasks = [(z, number, tuple(plan.local)) for number, z in enumerate(starts)]
         report = lambda: self.report(search)

@@ -339,9 +339,7 @@ are about its gains too."""
 def _with_rule(
     case: Case, free: Mapping[str, Any] | None, gains: Mapping[str, float]
 ) -> Mapping[str, Any] | None:
-    """What is free; of a case that names nothing the gains of its controller, a factor WIDE about
-    those of a rule too where one of these is outside.
-    """
+    """What is free; else the gains, about those of a rule too where one of these is outside."""
     if free is not None or case.free or not gains:
         return free
     ranges, about = gain_ranges(case.loop), dict[str, Free]()

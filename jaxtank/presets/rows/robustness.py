@@ -39,10 +39,7 @@ class Study(NamedTuple):
 
 
 def coefficients(plant, spread):
-    """Return {name: (N, ...)}: c1, c2, c3, c7, c8 (and their twins) times independent factors.
-
-    The factors are uniform within 1 +-spread.
-    """
+    """Return {name: (N, ...)}: c1, c2, c3, c7, c8 and twins times factors uniform in 1 +-spread."""
     f1, f2, f3, f7, f8 = np.random.default_rng(2015).uniform(1 - spread, 1 + spread, (5, N))
     inner, outer = np.asarray(plant.orifice)[:2]
     rest = f7 * (inner + outer) - f2 * inner - f3 * outer
@@ -87,9 +84,7 @@ def everything(run):
 
 
 def interval(values, of=np.mean, draws=2000):
-    """Return (estimate, low, high) of a statistic of (N,) or of rows of (N, k), by resampling
-    plants.
-    """
+    """Return (estimate, low, high) of a statistic of (N,) or (N, k), by resampling plants."""
     values = np.asarray(values, dtype=float)
     picks = np.random.default_rng(0).integers(0, len(values), (draws, len(values)))
     return float(of(values, axis=0)), *(
@@ -133,9 +128,7 @@ def _both(pair):
 
 
 def _growth(nominal):
-    """The statistic of pairs (N, 2): how much more NGPC's median error grows over its own than
-    backstepping's does.
-    """
+    """How much more NGPC's median error grows than backstepping's, of pairs (N, 2)."""
     return lambda pairs, axis: (
         np.median(pairs[:, 0]) / nominal["ngpc"] - np.median(pairs[:, 1]) / nominal["backstepping"]
     )
