@@ -17,6 +17,7 @@ from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, get_value, leaf, split_index, static, with_values
 from jaxtank.instruments.base import Sensor
 from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.limits import without_overflow
 from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken
 from jaxtank.loop.step import step
 from jaxtank.plants.faults import Faults
@@ -368,14 +369,6 @@ class Attacked:
 def of_plant(coefficient: Coefficient) -> bool:
     """Return whether a coefficient is an entry of an array of the plant."""
     return coefficient.name.startswith("plant.") and len(split_index(coefficient.name)[1]) == 1
-
-
-def without_overflow(loop: ClosedLoop) -> ClosedLoop:
-    """Return a loop whose levels may rise past the rims, where that can be seen."""
-    plant: Any = loop.plant
-    if not plant.overflow:
-        return loop
-    return dataclasses.replace(loop, plant=dataclasses.replace(plant, overflow=False))
 
 
 def reading_band(loop: ClosedLoop) -> np.ndarray:

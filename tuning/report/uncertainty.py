@@ -4,12 +4,14 @@ import dataclasses
 import io
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.labels import entry_label
 from jaxtank.core.text import count
+from jaxtank.core.tree import describe, get_value
 from jaxtank.loop import step_size
 from tuning.problem import provenance
 from tuning.report.document import Live, Report, Text
@@ -21,6 +23,9 @@ from tuning.storage.store import discard
 from tuning.uncertainty.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
 
 QUANTITIES = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
+LIKELY = 3
+"""Most likely failures that are printed."""
+
 LINES = 1 << 12
 """Draws that are written as CSV at once."""
 
@@ -56,6 +61,9 @@ def json_of(ensemble):
         **fields(ensemble, "samples wall_s"),
         "provenance": provenance.provenance(ensemble.case, ensemble.seed),
     }
+    if ensemble.promise is not None:
+        sentence = promise_sentence(ensemble.promise)
+        payload["promise"] = {**clean(dataclasses.asdict(ensemble.promise)), "sentence": sentence}
     if ensemble.method != "random":
         payload["intervals"] = INTERVALS
     if remarks := remarks_of(ensemble):
@@ -103,12 +111,16 @@ def report(ensemble):
             " and pump limits at some plateau of the reference: included in all figures"
         )
         sections.append(Text([words]))
+    if ensemble.promise is not None:
+        sections += _promise_sections(ensemble)
     good, verdict = not diverged, "no limits were given"
     if violations:
         good = good and not any(v["count"] for v in violations)
         verdict = "no limit was broken in any draw" if good else "some draws break a limit"
     if diverged:
         verdict = f"{diverged} of {count(ensemble.samples, 'run')} diverged"
+    if ensemble.promise is not None:
+        good, verdict = ensemble.promise.answer == "kept", promise_sentence(ensemble.promise)
     return Report(
         f"{ensemble.case.name}: uncertainty",
         verdict,
@@ -122,6 +134,8 @@ def report(ensemble):
 def _facts(ensemble, violations):
     """Return (name, value) of the facts at the top of the page."""
     facts, error = [("draws", ensemble.samples)], ensemble.summary().get("rms_error_total")
+    if ensemble.promise is not None:
+        facts.append(("any limit broken", Value(100 * ensemble.promise.probability, 3, "%")))
     if violations:
         worst = max(v["probability"] for v in violations)
         facts.append(("the limit most often broken", Value(100 * worst, 3, "%")))
@@ -150,6 +164,53 @@ def _measure_table(ensemble):
             rows.append([label, unit, mean, interval, *others])
     heads = ["measure", "unit", "mean", "95 % of the mean", "sd", "5 %", "median", "95 %"]
     return Table(rows, [*heads, "mean of worst 5 %", "highest"], gap=True)
+
+
+def promise_sentence(promise):
+    """Return the sentence on a Promise that can be quoted."""
+    inverse = 1.0 / promise.promise
+    rate = f"{100 * promise.promise:g} %"
+    if abs(inverse - round(inverse)) < 1e-6 * inverse:
+        rate = f"1 in {round(inverse):,}"
+    runs = f"{promise.runs:,} runs, {promise.gradients:,} of them with derivatives"
+    interval = Value(promise.interval95, 3, between=" to ")
+    found = f"probability {Value(promise.probability, 3)}, 95 % interval {interval}, from {runs}"
+    given = "given that the parameters are distributed as stated"
+    if promise.answer == "undecided":
+        return (
+            f"Undecided: a share of {rate} plants that break any limit, {given}, lies within the"
+            f" 95 % interval ({found}); more --samples allow more runs"
+        )
+    fewer = "fewer" if promise.answer == "kept" else "more"
+    return f"With 95 % confidence {fewer} than {rate} plants break any limit, {given} ({found})"
+
+
+def _promise_sections(ensemble):
+    """The sentence on the promise, how often each limit is the one broken, likely failures."""
+    promise, loop = ensemble.promise, ensemble.case.loop
+    lines = [
+        f"A further kind of failure, of which no run is near, would be among the plain draws with"
+        f" 95 % confidence if its probability were {Value(promise.unseen, 2)}."
+    ]
+    if promise.subset_simulation is not None:
+        size = Value(promise.subset_simulation, 3)
+        lines.append(
+            f"The slopes of the margins led to no failure; subset simulation estimates {size}."
+        )
+    sentence = promise_sentence(promise)
+    sections: list[Any] = [Text([sentence], heading="Promise", gap=True), Text(lines)]
+    if promise.limits:
+        rows = [[name, Value(100 * share, 3, "%")] for name, share in promise.limits.items()]
+        sections.append(Table(rows, ["limit", "share of failures that break it most"], gap=True))
+    if likely := promise.failures[:LIKELY]:
+        rows = [
+            [name, describe(loop, name)["unit"], Value(get_value(loop, name))]
+            + [Value(failure["values"][name]) for failure in likely]
+            for name in likely[0]["values"]
+        ]
+        heads = [f"failure at {failure['distance']:.2f} sd" for failure in likely]
+        sections.append(Table(rows, ["parameter", "unit", "nominal", *heads], gap=True))
+    return sections
 
 
 def _violation_table(violations):

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from tuning.storage.columns import column, row_blocks
+from tuning.uncertainty.promise import Promise
 from tuning.uncertainty.sampling import clopper_pearson
 from tuning.views import Result
 
@@ -46,6 +47,8 @@ class Ensemble(Result):
         Those whose violations are counted.
     fan : dict or None
         {"t", "r", "x", "u"}: quantiles (5, rows, ...) of the first draws.
+    promise : Promise or None
+        Probability that any limit is broken, beside the promised one.
     wall_s : float
         [s].
     seed : int
@@ -62,6 +65,7 @@ class Ensemble(Result):
     infeasible: np.ndarray | None
     limits: list
     fan: dict | None
+    promise: Promise | None
     wall_s: float
     seed: int
     method: str

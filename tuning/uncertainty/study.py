@@ -29,6 +29,7 @@ from tuning.uncertainty.batches import (
 from tuning.uncertainty.distributions import stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.needs import BLOCK, infeasible
+from tuning.uncertainty.promise import Study, check_promise, promise_of
 from tuning.uncertainty.result import Ensemble
 from tuning.uncertainty.sampling import Points, spread_of
 
@@ -46,6 +47,7 @@ def ensemble(
     measures: Sequence[str] | None = None,
     limits: Any = None,
     fan: bool = True,
+    promise: float | None = None,
     batch: int | None = None,
     devices: int = 1,
     cluster: Any = None,
@@ -75,6 +77,10 @@ def ensemble(
         {measure: limit} as in `tune`; by default the limits of the case.
     fan : bool
         Keep quantiles of the trajectories of the first draws.
+    promise : float or None
+        Largest share of plants in which any limit may be broken: it is estimated by importance
+        sampling around the most likely failures, which start from these draws, with at most
+        100 times as many further runs.
     batch : int or None
         Draws run at once on a device; a size that fits the case where None.
     devices : int
@@ -115,6 +121,7 @@ def ensemble(
     check_cluster(cluster, devices)
     distributions = spread_of(case) if distributions is None else stated(distributions)
     limits = [*resolve_limits(case, as_measures(None, limits)[1]), *_tank_bottoms(case)]
+    check_promise(case, promise, limits)
     if measures is None:
         measures = [m for m in ms.placed("summary") if ms.serves(m, case.loop)]
     ms.check_names(tuple(measures))
@@ -153,6 +160,7 @@ def ensemble(
         enter(k, result)
     values, beyond = _values(case, space, points, checkpoint)
     first = {n: np.array(v[:FAN_DRAWS]) for n, v in values.items()}
+    study = Study(case, space, tuple(limits), names, seed, key, batch)
     return Ensemble(
         case=case,
         distributions=distributions,
@@ -163,6 +171,7 @@ def ensemble(
         infeasible=beyond,
         limits=limits,
         fan=fan_of(case, first, seed) if fan else None,
+        promise=promise_of(study, promise, points, table, failed, devices, cluster, progress),
         wall_s=time.perf_counter() - began,
         seed=key,
         method=draws,

@@ -1,0 +1,135 @@
+"""Probabilities of rare failures against closed forms."""
+
+import numpy as np
+import pytest
+from helpers import command
+from scipy import stats
+
+from tuning.uncertainty import rare_events
+
+SIDE = np.array([0.6, 0.8, 0.0])
+
+
+def numbers_of(function, promise=1e-4, seed=0, dimensions=3):
+    """The Failures of margins function(z) -> (n, K), with differences for slopes."""
+
+    def slopes(z):
+        moves = 1e-5 * np.eye(z.shape[1])
+        rates = [(function(z + m) - function(z - m)) / 2e-5 for m in moves]
+        return function(z), np.stack(rates, axis=-1)
+
+    pilot = np.random.default_rng(seed + 50).standard_normal((500, dimensions))
+    margins = rare_events.Margins(function, function, slopes)
+    pair = pilot, function(pilot)
+    return rare_events.probability(margins, pair, promise, 50_000, seed)
+
+
+PROBLEMS = {
+    "a plane": (lambda z: 4.0 - z[:, :1], stats.norm.sf(4.0)),
+    "two planes in two directions": (
+        lambda z: np.stack([4.0 - z @ SIDE, 4.2 + z[:, 2]], axis=1),
+        1.0 - stats.norm.cdf(4.0) * stats.norm.cdf(4.2),
+    ),
+    "one limit, broken on either side": (lambda z: 16.0 - z[:, :1] ** 2, 2 * stats.norm.sf(4.0)),
+    "a ball outside": (lambda z: 25.0 - np.sum(z**2, axis=1)[:, None], stats.chi2.sf(25.0, 3)),
+    "a corner of a box": (lambda z: 2.9 - np.sum(stats.norm.cdf(z), axis=1)[:, None], 0.1**3 / 6),
+    "a plane without a slope": (lambda z: np.where(z[:, :1] > 3.5, -1.0, 1.0), stats.norm.sf(3.5)),
+}
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_probabilities_are_those_of_closed_forms(name):
+    function, exact = PROBLEMS[name]
+    results = [numbers_of(function, seed=seed) for seed in range(6)]
+    ratios = np.array([r.estimate.probability for r in results]) / exact
+    assert np.all(np.abs(ratios - 1.0) < 0.3) and abs(ratios.mean() - 1.0) < 0.1
+    inside = [r.estimate.interval95[0] <= exact <= r.estimate.interval95[1] for r in results]
+    assert sum(inside) >= 5
+    assert max(r.runs + r.gradients for r in results) < 20_000
+
+
+def test_the_most_likely_failure_is_the_foot_of_the_plane():
+    result = numbers_of(lambda z: 2.0 * (3.5 - z @ SIDE)[:, None])
+    np.testing.assert_allclose(result.centres[0], 3.5 * SIDE, atol=0.3)
+    assert result.subset is None
+
+
+def test_subset_simulation_needs_no_slopes():
+    exact = (2 * stats.norm.sf(3.2)) ** 2
+
+    def function(z):
+        return np.floor(50.0 * (3.2 - np.min(np.abs(z), axis=1)))[:, None]
+
+    margins = rare_events.Counted(rare_events.Margins(function, function, None))
+    estimates = []
+    for seed in range(10):
+        size, failing = rare_events.subset_simulation(margins, 2, np.random.default_rng(seed))
+        assert np.all(function(failing) < 0)
+        estimates.append(size)
+    assert np.mean(estimates) == pytest.approx(exact, rel=0.5)
+
+
+def test_a_weighted_count_has_the_interval_of_a_poisson_count_where_weights_are_equal():
+    low, high = rare_events.interval(np.full(7, 1e-3), 1e-3)
+    assert low == pytest.approx(1e-3 * stats.gamma.ppf(0.025, 7))
+    assert high == pytest.approx(1e-3 * stats.gamma.ppf(0.975, 8))
+    low, high = rare_events.interval(np.zeros(0), 1e-3)
+    assert low == 0.0 and high == pytest.approx(1e-3 * stats.gamma.ppf(0.975, 1))
+
+
+RIG = """
+name = "two basins"
+[[tank]]
+area = 10.0
+rim = 14.7
+level = 1.0
+[[tank]]
+area = 10.0
+rim = 14.6
+level = 1.0
+[[pump]]
+gain = 2.0
+to = 1
+high = 10.0
+[[pump]]
+gain = 2.0
+to = 2
+high = 10.0
+[plant]
+outputs = [1, 2]
+overflow = true
+[controller]
+kind = "open-loop"
+initial = [3.0, 3.0]
+[reference]
+initial = [5.0, 5.0]
+[values]
+"clock.dt" = 0.5
+"clock.duration" = 20.0
+[limits]
+max_level = "rim"
+"""
+
+
+@pytest.mark.parametrize("promise, code, answer", [(8e-3, 0, "kept"), (1e-3, 4, "not kept")])
+def test_two_tanks_that_fill_overflow_as_often_as_their_gains_are_large(
+    tmp_path, promise, code, answer
+):
+    """Each level is 1 + 6 gain at the end: a closed form of the normal distribution, cut at 3 sd;
+    below its rim a tank shows no overflow and no slope of it."""
+    (tmp_path / "rig.toml").write_text(RIG)
+    words = ["uncertainty", str(tmp_path / "rig.toml"), "--vary", "plant.pump_gain=normal:2:0.1"]
+    words += ["--measure", "max_level", "--promise", str(promise), "--json", "--quiet"]
+    done = command(*words)
+    normal = stats.truncnorm(-3, 3, loc=2.0, scale=0.1)
+    each = normal.sf((14.7 - 1.0) / 6.0), normal.sf((14.6 - 1.0) / 6.0)
+    exact = 1.0 - (1.0 - each[0]) * (1.0 - each[1])
+    result = done.json["promise"]
+    assert done.code == code and result["answer"] == answer
+    assert result["probability"] == pytest.approx(exact, rel=0.25)
+    assert result["interval95"][0] < exact < result["interval95"][1]
+    assert result["limits"]["overflow_volume of tank 2"] == pytest.approx(
+        each[1] / sum(each), abs=0.1
+    )
+    likely = result["failures"][0]["values"]["plant.pump_gain[1]"]
+    assert likely == pytest.approx(13.6 / 6.0, rel=0.01)
