@@ -12,6 +12,8 @@ from jaxtank.controllers import OpenLoop
 from jaxtank.core.errors import InputError
 from jaxtank.core.labels import reading_label
 from jaxtank.core.tree import number
+from jaxtank.limits import resolve_limits
+from jaxtank.loop.run import simulate
 from jaxtank.plants.base import Plant
 from jaxtank.signals.base import Table
 from tuning.identification.data_checks import checked
@@ -176,6 +178,36 @@ def beside(case: Case, log: Log, run: Any) -> dict[str, Any]:
         bias = float(np.nanmean(y - simulated)) if np.isfinite(y).any() else None
         channels.append(row | {"bias": bias, "measured": y, "simulated": simulated})
     return {"name": log.name, "t": t[inside], "channels": channels}
+
+
+def achieved(case: Case, log: Log) -> list[dict[str, Any]]:
+    """Return the levels of experiment data beside those that the rig predicts of its own loop.
+
+    Of each channel {"name", "unit", "limit", "error", "highest", "lowest"}, the last three
+    {"predicted", "achieved"}, over the time that both have.
+
+    The reference is the rig's, from the first sample on; "error" (root mean square) is None for a
+    tank that is not controlled.
+    """
+    run = simulate(case.loop, case.clock)
+    t, loop, rows = log.t - log.t[0], case.loop, []
+    inside = t <= float(run.t[-1]) * (1 + 1e-9)
+    limits = {v.index: v.value for v in resolve_limits(case) if v.measure == "max_level"}
+    for y, tank, volts in zip(log.y[inside].T, log.tanks, log.in_volts):
+        sides = {
+            "predicted": np.interp(t[inside], np.asarray(run.t), np.asarray(run.x)[:, tank]),
+            "achieved": np.asarray(loop.sensor.level_of(tank, y, volts)),
+        }
+        row: dict[str, Any] = {"name": reading_label(loop.plant, tank), "unit": loop.units[0]}
+        row |= {"limit": limits.get(tank), "error": None}
+        if tank in loop.plant.outputs:
+            r = np.asarray(run.r)[:, list(loop.plant.outputs).index(tank)]
+            r = np.interp(t[inside], np.asarray(run.t), r)
+            row["error"] = {s: float(np.sqrt(np.nanmean((h - r) ** 2))) for s, h in sides.items()}
+        row["highest"] = {s: float(np.nanmax(h)) for s, h in sides.items()}
+        row["lowest"] = {s: float(np.nanmin(h)) for s, h in sides.items()}
+        rows.append(row)
+    return rows
 
 
 def _quality(estimation, residual, start):

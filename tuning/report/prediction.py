@@ -13,6 +13,7 @@ from tuning.report.tables import Table, Value, clean
 
 CAPTIONS = {"fit": "Measured readings (dots), the rig as it is (line), and the inputs."}
 SIDES = ("measured", "simulated")
+PREDICTED = ("predicted", "achieved")
 ROWS = 12
 """Times at which readings are printed side by side."""
 CHANCE = 0.01
@@ -95,6 +96,20 @@ def with_data(report, compared):
         Table(rows, ["t [s]", *heads], gap=True),
     ]
     return dataclasses.replace(report, sections=[*report.sections, *tables])
+
+
+def achieved_table(rows):
+    """Return the Table of `achieved` rows: what the rig predicted beside what the data show."""
+    both = lambda pair: (
+        "-" if pair is None else Value([pair[s] for s in PREDICTED], 4, between=" : ")
+    )
+    cells = [
+        [row["name"], row["unit"], *(both(row[n]) for n in ("error", "highest", "lowest"))]
+        + ["-" if row["limit"] is None else Value(row["limit"])]
+        for row in rows
+    ]
+    heads = ["predicted : achieved", "unit", "rms error", "highest", "lowest", "limit"]
+    return Table(cells, heads)
 
 
 def json_of(result):

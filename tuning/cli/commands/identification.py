@@ -155,6 +155,42 @@ def predict(args):
     return 0
 
 
+def learn(args):
+    """Update a rig by the log of its last batches, and tune it on what is known then; returns the
+    exit code of the tuning.
+    """
+    if not args.data:
+        raise InputError("learn needs --data CSV, the log of a batch that ran with this rig")
+    case = open_case(args)
+    import tuning
+    from tuning.cli.commands.tuning import EXIT
+    from tuning.identification.prediction import achieved
+    from tuning.report.document import Report, terminal
+    from tuning.report.prediction import achieved_table
+
+    logs, line = read_logs(args, case), Line(args.quiet)
+    rows = [row | {"data": log.name} for log in logs for row in achieved(case, log)]
+    line.compiling("the simulation and its derivatives", 10)
+    fit = tuning.identify(case, logs, gap=args.gap, seed=args.seed)
+    parts = {"identification": fit}
+    if fit.identifiable:
+        filtered = args.safety_filter is not False
+        answer = tuning.tune(fit.identified, safety_filter=filtered, seed=args.seed)
+        parts["tuning"] = answer
+    line.end()
+    last, written = list(parts.values())[-1], []
+    if args.out:
+        written = fit.save(f"{args.out}/identified", args.line)
+        written = last.save(args.out, args.line) if last is not fit else written
+    payload = {"case": case.name, "achieved": rows}
+    payload |= {name: part.to_json() for name, part in parts.items()}
+    table = Report("", "", [], [achieved_table(rows)])
+    texts = [terminal(table), *map(str, parts.values())]
+    print_result(args, payload, lambda: "\n\n".join(texts))
+    report_written(written, args)
+    return STATUS[fit.status] if last is fit else EXIT[last.status]
+
+
 def _report_next(args, result, written):
     """Print on stderr why no rig is written, or what to do with the one that is."""
     from tuning.report.identification import not_identifiable
@@ -320,6 +356,12 @@ COMMANDS = {
             *FIT,
             *PLAN,
         ),
+    ),
+    "learn": Command(
+        learn,
+        "the next rig after a batch: update by its log, tune through the safety filter, predicted"
+        " beside achieved",
+        (*COMMON, *CASE, *RUN, *DATA),
     ),
     "predict": Command(
         predict,

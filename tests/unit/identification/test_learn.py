@@ -1,0 +1,88 @@
+"""A batch, its log, and the next rig."""
+
+import jax
+import numpy as np
+import pytest
+from helpers import command
+
+import jaxtank
+import tuning
+from jaxtank import rig
+from tuning.identification.prediction import achieved
+
+RIG = """
+name = "one tank"
+[[tank]]
+area = 10.0
+rim = 20.0
+drain = 0.05
+level = 5.0
+[[pump]]
+gain = 3.0
+to = 1
+high = 10.0
+initial = 1.5
+[controller]
+kind = "pi"
+Kc = 1.0
+Ti = 20.0
+[reference]
+initial = [5.0]
+changes = [[5.0, 1, 12.0]]
+[values]
+"clock.dt" = 0.5
+"clock.duration" = 60.0
+[limits]
+max_level = 13.0
+[free]
+"controller.Kc" = [0.1, 10.0]
+[objective]
+rms_error_total = 1.0
+[uncertain]
+"plant.drain" = 0.1
+"""
+
+
+@pytest.fixture
+def case(tmp_path):
+    (tmp_path / "rig.toml").write_text(RIG)
+    return rig.load(tmp_path / "rig.toml")
+
+
+def test_levels_achieved_stand_beside_those_that_the_rig_predicted(case):
+    """The log of a loop whose levels are all 1 cm higher; its error is that of the setpoints."""
+    run = jaxtank.simulate(case.loop, case.clock)
+    t, u, h, r = (np.asarray(v) for v in (run.t, run.u, run.x, run.r))
+    log = tuning.log(t=t[:100] + 7.0, u=u[:100], y=h[:100] + 1.0)
+    (row,) = achieved(case, log)
+    h, r = h[:100, 0], r[:100, 0]
+    assert row["limit"] == 13.0 and row["unit"] == "cm"
+    expected = {"predicted": h, "achieved": h + 1.0}
+    for side, level in expected.items():
+        assert row["highest"][side] == pytest.approx(level.max())
+        assert row["lowest"][side] == pytest.approx(level.min())
+        assert row["error"][side] == pytest.approx(np.sqrt(np.mean((level - r) ** 2)))
+
+
+@pytest.mark.slow
+def test_a_batch_is_learned_and_its_covariance_is_the_next_prior(case, tmp_path):
+    values = {"plant.pump_gain": [2.85], "plant.drain": [0.053], "sensor.noise": 0.03}
+    other = rig.set_values(case, values)
+    for k in (1, 2):
+        run = jaxtank.simulate(other.loop, other.clock, jax.random.key(k))
+        rows = np.column_stack([run.t, run.u[:, 0], run.y[:, 0]])
+        heads = "t [s],pump1 [V],h1 [cm]"
+        np.savetxt(tmp_path / f"{k}.csv", rows, "%.6f", ",", header=heads, comments="")
+    widths = []
+    for k, file in ((1, "rig.toml"), (2, "next1/rig.toml")):
+        words = [str(tmp_path / file), "--data", str(tmp_path / f"{k}.csv"), "--json", "--quiet"]
+        done = command("learn", *words, "--out", str(tmp_path / f"next{k}"))
+        assert done.code == 0
+        gain = done.json["identification"]["parameters"]["plant.pump_gain[0]"]
+        low, high = gain["interval95"]
+        assert low < 2.85 < high
+        widths.append(high - low)
+        assert done.json["tuning"]["holds"]["limits_on_validation"] == 1.0
+    assert widths[1] < 0.85 * widths[0]
+    learned = rig.load(tmp_path / "next2" / "rig.toml")
+    assert learned.covariance is not None and learned.loop.safety_filter is not None
