@@ -9,7 +9,9 @@ from scipy.linalg import block_diag, qr
 from scipy.signal import lfilter
 from scipy.stats import t as student
 
-from jaxtank.core.tree import describe, get_value
+from jaxtank.core.tree import describe
+from tuning.identification.coordinates import nominal
+from tuning.identification.inputs import STATIC
 from tuning.identification.least_squares import Fit
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import autocorrelation, pseudo
@@ -161,12 +163,13 @@ class Spread:
         """Return {name: {"before", "value", "unit", "lower", "upper", "sd", "interval95", ...}}."""
         est, rows = self.estimation, {}
         values = est.coordinates.values(self.fit.p)
+        before = nominal(est.case.loop, est.coordinates.leaves.names) | est.of_inputs
         for b in est.bounds:
             i = est.coordinates.names.index(b.name)
             value, half = float(values[b.name]), self.quantile * float(self.sd[i])
             interval = _within(describe(est.case.loop, b.name), value - half, value + half)
             rows[b.name] = {
-                "before": float(np.asarray(get_value(est.case.loop, b.name))),
+                "before": before[b.name],
                 "value": value,
                 "unit": b.unit,
                 "lower": b.low,
@@ -197,7 +200,8 @@ class Spread:
     def covariance_of_parameters(self):
         """Return (names, (n, n) covariance) of the parameters with an interval, in their units."""
         names = self.estimation.coordinates.names
-        present = np.flatnonzero(~self.without_interval[: len(names)])
+        leaf = [name.split("[")[0] not in STATIC for name in names]  # which a rig file can draw
+        present = np.flatnonzero(~self.without_interval[: len(names)] & leaf)
         return tuple(names[i] for i in present), self.values_covariance[np.ix_(present, present)]
 
     def directions(self):

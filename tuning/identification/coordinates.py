@@ -97,6 +97,7 @@ class Coordinates:
     """The coordinates p of the parameters to be estimated, as a hashable description."""
 
     items: tuple  # of Scalar and Branches
+    inputs: tuple = ()  # (field of Inputs, pump, null) of each of the last items, in no program
 
     @property
     def names(self):
@@ -107,6 +108,11 @@ class Coordinates:
     def size(self):
         """Number of coordinates [-]."""
         return len(self.names)
+
+    @property
+    def leaves(self):
+        """The coordinates of leaves of the rig alone."""
+        return Coordinates(self.items[: len(self.items) - len(self.inputs)])
 
     @property
     def pairs(self):
@@ -140,8 +146,8 @@ class Coordinates:
         return block_diag(*(item.slopes(entries) for item, entries in self._items(p)))
 
 
-def coordinates_of(bounds, branches=True):
-    """Return the Coordinates of a list of jaxtank.bounds.Bound."""
+def coordinates_of(bounds, branches=True, inputs=()):
+    """Return the Coordinates of a list of jaxtank.bounds.Bound, the last of `inputs`."""
     by_name = {b.name: b for b in bounds}
     items = {}
     for b in bounds:
@@ -156,7 +162,7 @@ def coordinates_of(bounds, branches=True):
         second = (gain.low * (1 - high), gain.high * (1 - low))
         if b is gain:
             items[gain.name] = Branches(gain.name, split.name, first, second)
-    return Coordinates(tuple(items.values()))
+    return Coordinates(tuple(items.values()), inputs)
 
 
 def free_bounds(loop, free):

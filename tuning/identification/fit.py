@@ -17,13 +17,14 @@ from jaxtank.plants.base import Plant
 from tuning.identification.confidence import Spread, at_search_bounds
 from tuning.identification.data_checks import checked, first_samples
 from tuning.identification.design import remedies
+from tuning.identification.diagnosis import accepted, place_of
 from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare, check_kind
 from tuning.identification.least_squares import Fit, profile_likelihood, solve
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import quality, residuals_of, validate
 from tuning.identification.result import Identification
-from tuning.identification.sanity import oddities, swapped
+from tuning.identification.sanity import oddities
 from tuning.problem.status import Status
 from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
 from tuning.storage.fingerprint import digest, fingerprint
@@ -54,6 +55,7 @@ def identify(
     ready: Callable | None = None,
     law: str | None = None,
     prior: bool = True,
+    accept: Sequence[str] = (),
 ) -> Identification:
     """Estimate parameters of a rig from experiment data, by least squares on simulated readings.
 
@@ -104,6 +106,9 @@ def identify(
     prior : bool
         Whether the `covariance` of a case that was identified before counts as what is known of
         its parameters; each log is then given once.
+    accept : sequence of str
+        Causes of a `diagnosis` to put into the rig and estimate: "pump-delay", or with its place
+        from 1, "pump-delay:2", "swapped:1,2".
 
     Returns
     -------
@@ -131,31 +136,32 @@ def identify(
     """
     began = time.perf_counter()
     _check_settings(loss, starts=starts, iterations=iterations)
+    places = [place_of(text) for text in accept]
     case = bare(case) if isinstance(case, Plant) else case
     check_kind(law, case)
     logs = checked(log, case.loop, gap)
-    counts, parts = _first_parts(logs, hold_back)
     options: dict[str, Any] = {"start": start, "noise": noise, "substeps": substeps}
     options |= {"free": free, "samples": max(log.samples for log in logs), "prior": prior}
-    if substeps is None and _longest_step(logs) > 1.01 * _longest_step(parts):
-        options["substeps"] = Estimation(case, logs, **options).substeps  # of the validation set
-    partial = Estimation(case, parts, **options)
     settings = {"loss": loss, "iterations": iterations}
+    counts, partial = _partial(case, logs, hold_back, options)
     cache = EvaluationCache()
     if checkpoint is not None:
         what = _what(case, logs, partial, start=start, gap=gap, **settings)
         cache = EvaluationLog(checkpoint, what, resume)
     if ready is not None:
         ready()
-    fits, interrupted = _searches(cache, partial, starts, seed, settings, progress)
-    first = _best(fits, logs[0].name)
-    best = solve(partial, partial.unknowns(first), **settings)
-    estimation, best, validation = _of_all(partial, best, logs, counts, options, settings)
-    estimation, best = _within_ranges(estimation, best, settings)
-    if not np.isfinite(best.cost):
-        raise DataError(
-            f"{logs[0].name}: the fit to the first {counts[0]} samples diverges when simulated over"
-            " all of them"
+    search: Any = (starts, seed, settings, progress)
+    fits, interrupted, estimation, best, validation = _all(
+        cache, partial, logs, counts, options, search
+    )
+    if places and not interrupted:
+        more = accepted(estimation, best, places)
+        case, logs = more.case, more.logs
+        options |= {"free": more.free, "inputs": more.inputs, "begin": more.begin}
+        _, partial = _partial(case, logs, hold_back, options | {"substeps": estimation.substeps})
+        search = (1, seed, settings, None)
+        _, _, estimation, best, validation = _all(
+            EvaluationCache(), partial, logs, counts, options, search
         )
     spread, fit_quality = _spread(estimation, best)
     if spread.open_axes.any():
@@ -173,11 +179,11 @@ def identify(
         levels=spread.levels(),
         covariance=spread.covariance_of_parameters(),
         directions=spread.directions(),
-        oddities=_odd(estimation, best, fit_quality["rmse"], settings, interrupted),
+        oddities=[odd for log in logs for odd in oddities(log, case.loop)],
         remedies=remedies(estimation, best, spread) if unclear else [],
         quality=fit_quality
         | {"widened": spread.widened, "noise": [float(v) for v in estimation.noise]},
-        starts=_starts(fits, first),
+        starts=_starts(fits),
         validation=validation,
         profile=profile_likelihood(estimation, best, spread, loss)
         if profile and not interrupted
@@ -185,7 +191,35 @@ def identify(
         wall_s=time.perf_counter() - began,
         seed=seed,
         law=law,
+        accepted=tuple(accept),
     )
+
+
+def _partial(case, logs, hold_back, options):
+    """Return (number of samples of each log that are fitted first, Estimation of these)."""
+    counts = [first_samples(log, hold_back) for log in logs]
+    parts = [log.part(0, count) for log, count in zip(logs, counts)]
+    if options["substeps"] is None and _longest_step(logs) > 1.01 * _longest_step(parts):
+        # of the validation set
+        options = options | {"substeps": Estimation(case, logs, **options).substeps}
+    return counts, Estimation(case, parts, **options)
+
+
+def _all(cache, partial, logs, counts, options, search):
+    """Return (Fits of the searches, whether they were interrupted, Estimation of all data, its Fit,
+    validation or None).
+    """
+    starts, seed, settings, progress = search
+    fits, interrupted = _searches(cache, partial, starts, seed, settings, progress)
+    best = solve(partial, partial.unknowns(_best(fits, logs[0].name)), **settings)
+    estimation, best, validation = _of_all(partial, best, logs, counts, options, settings)
+    estimation, best = _within_ranges(estimation, best, settings)
+    if not np.isfinite(best.cost):
+        raise DataError(
+            f"{logs[0].name}: the fit to the first {counts[0]} samples diverges when simulated over"
+            " all of them"
+        )
+    return fits, interrupted, estimation, best, validation
 
 
 def _check_settings(loss, **counts):
@@ -194,12 +228,6 @@ def _check_settings(loss, **counts):
     for name, count in counts.items():
         if not isinstance(count, int) or isinstance(count, bool) or count < 1:
             raise InputError(f"{name} = {count!r}: must be a whole number above 0")
-
-
-def _first_parts(logs, hold_back):
-    """(Number of samples of each log that are fitted first, the log up to there)."""
-    counts = [first_samples(log, hold_back) for log in logs]
-    return counts, [log.part(0, count) for log, count in zip(logs, counts)]
 
 
 def _of_all(partial, best, logs, counts, options, settings):
@@ -227,8 +255,9 @@ def _best(fits, name):
     return best
 
 
-def _starts(fits, best):
-    """Cost and effort of each search, and whether it has found the minimum of the `best`."""
+def _starts(fits):
+    """Cost and effort of each search, and whether it has found the minimum of the best."""
+    best = min((fit for fit in fits if np.isfinite(fit.cost)), key=lambda fit: fit.cost)
     return [
         {
             "cost": fit.cost,
@@ -315,12 +344,6 @@ def _spread(estimation, fit):
     """Return (Spread, quality) of a Fit."""
     fit_quality = quality(estimation.data.y, residuals_of(estimation, fit))
     return Spread(estimation, fit, fit_quality["residual_autocorrelation"]), fit_quality
-
-
-def _odd(estimation, fit, rmse, settings, interrupted):
-    """Return the Oddities of the data, exchanged columns first."""
-    pairs = [] if interrupted else swapped(estimation, fit, rmse, settings)
-    return pairs + [odd for log in estimation.logs for odd in oddities(log, estimation.case.loop)]
 
 
 def _nearest(estimation, best, scale, settings):

@@ -25,6 +25,7 @@ from jaxtank.observers import Direct
 from jaxtank.rig.components import controller_of
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps, ramps
+from tuning.identification.inputs import STATIC, with_inputs
 
 
 def bare(plant):
@@ -73,8 +74,11 @@ def proposed(result):
 
 def identified_plant(result):
     """Return the Case of an Identification, with the covariance of its estimates."""
-    case, loop = result.case, result.case.loop
+    case, static = _with_inputs(result)
+    loop = case.loop
     for name, p in result.parameters.items():
+        if name in static:
+            continue
         loop = with_values(loop, {name: p["value"]})
         for holder in ("controller", "observer"):
             model = getattr(getattr(loop, holder), "model", None)
@@ -96,6 +100,33 @@ def identified_plant(result):
     return case.replace(
         name=f"{case.name} identified", loop=loop, uncertain=uncertain, covariance=covariance
     )
+
+
+REFINED = (1, 2, 4, 5, 10, 20)
+"""Divisors of the sampling period of an open loop, so that a dead time is whole samples of it."""
+NEAR = 0.02
+"""Error of a dead time, as a share of it, that whole samples may make."""
+
+
+def _with_inputs(result):
+    """Return (the case of an Identification with the dead times and curves of its inputs, their
+    names), dead times in whole samples.
+    """
+    case, u = result.case, result.estimation.data.u
+    values = {n: p["value"] for n, p in result.parameters.items() if n.split("[")[0] in STATIC}
+    if not values:
+        return case, ()
+    top, loop = u.reshape(-1, u.shape[-1]).max(axis=0), case.loop
+    delays, dt = np.array([v for n, v in values.items() if "delays" in n]), case.clock.dt
+    steps = [dt / k for k in (REFINED if isinstance(loop.controller, OpenLoop) else (1,))]
+    error = lambda step: np.max(
+        np.abs(delays / step - np.round(delays / step)) * step - NEAR * delays
+    )
+    if delays.size:
+        dt = next((step for step in steps if error(step) <= 0.0), steps[-1])
+        values = {n: round(v / dt) * dt if "delays" in n else v for n, v in values.items()}
+    clock = dataclasses.replace(case.clock, dt=dt) if dt != case.clock.dt else case.clock
+    return case.replace(loop=with_inputs(loop, values, top), clock=clock), tuple(values)
 
 
 def _with_earlier(covariance, result):

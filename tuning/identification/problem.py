@@ -9,18 +9,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import qmc
 
+from jaxtank.bounds import Bound
 from jaxtank.case import Case
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tree import with_values
 from tuning.identification import simulation
 from tuning.identification.coordinates import coordinates_of, default_free, free_bounds, nominal
 from tuning.identification.experiment import Log
+from tuning.identification.inputs import played
 from tuning.identification.residuals import given_noise, noise_of
 
 STARTS = ("free", "measured", "case")
 
 LARGEST_ERROR = 0.05
 """Share of a channel's largest reading by which halving the steps may still move a reading."""
+
+DIFFERENCE = 1e-6
+"""Change of a coordinate of an input by which slopes are computed."""
 
 LARGEST_SLOPE = 1e60
 """Sensitivity, in standard deviations per unit of a coordinate, above which a run diverged."""
@@ -53,6 +58,11 @@ class Estimation:
         Least length that the data are padded to.
     prior : bool
         Whether the `covariance` of the case counts: that of an earlier identification.
+    inputs : sequence
+        (Bound, (field of Inputs, pump, value that the rig has)) of dead times, lags, dead zones and
+        curves to estimate.
+    begin : mapping, optional
+        {name: value} from which a search begins; the case's own by default.
 
     Raises
     ------
@@ -88,16 +98,19 @@ class Estimation:
         substeps: int | None = None,
         samples: int = 0,
         prior: bool = False,
+        inputs: Sequence[tuple[Bound, tuple]] = (),
+        begin: Mapping[str, float] | None = None,
     ):
-        self.case, self.logs, loop = case, logs, case.loop
+        self.case, self.logs, loop, self.begin = case, logs, case.loop, begin or {}
         if start not in STARTS:
             raise InputError(f"start = {start!r}: must be one of {', '.join(STARTS)}")
         self.bounds = free_bounds(loop, default_free(loop, logs) if free is None else free)
-        self.coordinates = coordinates_of(self.bounds)
+        self.bounds = [*self.bounds, *(bound for bound, _ in inputs)]
+        self.coordinates = coordinates_of(self.bounds, inputs=tuple(way for _, way in inputs))
         self.prior = self._prior() if prior else None
         self.prior_weight = 1.0  # the standard deviation of the residual, once it is known
         self.rig = simulation.rig_of(loop)
-        self.data = simulation.padded(logs, float(loop.actuator.delay), samples)
+        self.data = simulation.padded(logs, simulation.delays_of(loop.actuator), samples)
         self.initial = self._initial_levels(start)  # (logs, tanks), before any is estimated
         self.tanks = tuple(range(loop.plant.tanks)) if start == "free" else ()
         channels = len(self.data.channels)
@@ -192,10 +205,18 @@ class Estimation:
             np.concatenate([high, np.tile(top, len(self.logs)) / scale]),
         )
 
+    @property
+    def of_inputs(self) -> dict[str, float]:
+        """{name: value that the rig has} of what is estimated of inputs."""
+        of = self.coordinates
+        return dict(zip(of.names[of.leaves.size :], (null for *_, null in of.inputs)))
+
     def without_branch_gains(self) -> "Estimation":
         """Return the same problem with one coordinate for each parameter: no branch gains."""
         other = copy.copy(self)
-        other.coordinates = coordinates_of(self.bounds, branches=False)
+        other.coordinates = coordinates_of(
+            self.bounds, branches=False, inputs=self.coordinates.inputs
+        )
         return other
 
     def of_log(self, e: int) -> "Estimation":
@@ -208,7 +229,8 @@ class Estimation:
 
     def nominal(self) -> np.ndarray:
         """Return (unknowns,) the case's own values, levels as measured."""
-        p = self.coordinates.point(nominal(self.case.loop, self.coordinates.names))
+        values = nominal(self.case.loop, self.coordinates.leaves.names) | self.of_inputs
+        p = self.coordinates.point(values | self.begin)
         levels = self.initial[:, list(self.tanks)].ravel() / self.level_scale
         return np.clip(np.concatenate([p, levels]), *self.box)
 
@@ -224,7 +246,8 @@ class Estimation:
 
     def rig_at(self, z: np.ndarray) -> Any:
         """Return the Rig at the unknowns z."""
-        return with_values(self.rig, self.coordinates.values(self.split(z)[0]))
+        leaves = self.coordinates.leaves
+        return with_values(self.rig, leaves.values(z[: leaves.size]))
 
     def first_levels(self, z: np.ndarray) -> np.ndarray:
         """Return (logs, tanks) levels at the first sample of each log, at the unknowns z."""
@@ -241,12 +264,17 @@ class Estimation:
             simulation.play(
                 self.rig_at(z),
                 data.dt,
-                data.u,
+                self.inputs_at(self.split(z)[0], data),
                 self.first_levels(z),
                 channels=data.channels,
                 substeps=self.substeps,
             )
         )
+
+    def inputs_at(self, p: np.ndarray, data: Any) -> np.ndarray:
+        """Return (logs, samples, .., pumps) inputs of PaddedData at coordinates p."""
+        of = self.coordinates
+        return played(data, of.inputs, list(of.values(p).values())[of.leaves.size :])
 
     def by_log(self, p: np.ndarray, levels: np.ndarray, logs: Any = slice(None)) -> tuple:
         """Return (residual (logs, samples, channels), Jacobian (.., unknowns of a log)), weighted,
@@ -257,23 +285,31 @@ class Estimation:
             levels, tanks = self.initial[logs], tuple(range(self.initial.shape[1]))
         elif not tanks:
             rig = dataclasses.replace(rig, x0=self.initial[0])
+        of = self.coordinates.leaves
         y, slopes = simulation.sensitivities(
             rig,
             self.data.dt[logs],
-            self.data.u[logs],
-            p,
+            self.inputs_at(p, self.data)[logs] if self.coordinates.inputs else self.data.u[logs],
+            p[..., : of.size],
             levels,
-            coordinates=self.coordinates,
+            coordinates=of,
             tanks=tanks,
             channels=self.data.channels,
             substeps=self.substeps,
         )
-        shared = self.coordinates.size
-        slopes = np.array(slopes)[..., : shared + free]
+        shared, slopes = self.coordinates.size, np.array(slopes)[..., : of.size + free]
+        if shared > of.size:
+            slopes = np.insert(slopes, [of.size], self._by_inputs(p, levels, y), axis=-1)
         measured = np.where(self.mask[logs], self.data.y[logs], 0.0)
         with np.errstate(all="ignore"):
             slopes[..., shared:] *= self.level_scale[:free]
             return (np.asarray(y) - measured) / self.noise, slopes / self.noise[:, None]
+
+    def _by_inputs(self, p, levels, y):
+        """Return (logs, samples, channels, inputs) slopes of the readings y, by differences."""
+        z = np.concatenate([p, levels.ravel() / self.level_scale])
+        steps = DIFFERENCE * np.eye(z.size)[self.coordinates.leaves.size : self.coordinates.size]
+        return np.stack([(self.predicted(z + step) - y) / DIFFERENCE for step in steps], axis=-1)
 
     def residual_and_jacobian(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (residual (rows,), Jacobian (rows, unknowns)), weighted, a row for each reading.

@@ -11,6 +11,7 @@ from jaxtank.case import Case
 from jaxtank.core.labels import reading_label
 from jaxtank.core.text import html_table
 from jaxtank.core.tree import get_value
+from tuning.identification.diagnosis import Diagnosis, diagnose
 from tuning.identification.identified_case import proposed
 from tuning.identification.least_squares import Fit
 from tuning.identification.problem import Estimation
@@ -84,7 +85,7 @@ class Identification(Result):
         What is not identifiable: {"words", "parameters" {name: factor}, "sd"}.
     oddities : list
         What is odd in the data: (kind, log, where, count, first, value), kind one of "frozen",
-        "saturated", "spike", "still", "off", "swapped".
+        "saturated", "spike", "still", "off".
     remedies : list of str
         Which experiments would identify it.
     starts : list
@@ -99,6 +100,8 @@ class Identification(Result):
         Of the starts.
     law : str or None
         Kind of controller that is proposed for the identified rig.
+    accepted : tuple of str
+        Causes that were put into the rig.
     """
 
     case: Any
@@ -118,6 +121,21 @@ class Identification(Result):
     wall_s: float
     seed: int
     law: str | None = None
+    accepted: tuple = ()
+
+    @functools.cached_property
+    def structure(self) -> Diagnosis:
+        """Whether the structure of the rig is right: tests of the residuals, fits of what passes
+        them.
+        """
+        return diagnose(self.estimation, self.fit)
+
+    @property
+    def diagnosis(self) -> dict[str, Any]:
+        """{"clean", "causes": [{"kind", "where", "value", "unit", "interval95", "delta_bic",
+        "equivalent"}], "sentence"} of `structure`, places counted from 1.
+        """
+        return self._report().diagnosis_of(self)
 
     @functools.cached_property
     def proposed(self) -> tuple[Case, str | None]:

@@ -1,15 +1,11 @@
 """What is odd in experiment data before and after a fit: readings that no tank makes."""
 
-import copy
-import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxtank.rig.sensors import spans_of
 from tuning.identification.experiment import Log
-from tuning.identification.least_squares import Fit, solve
-from tuning.identification.problem import Estimation
 
 LUCK = 1e-4
 """Probability of equal readings in a row above which they may be chance."""
@@ -17,27 +13,23 @@ SHORTEST = 8
 """Fewest equal readings in a row that are called frozen, and fewest changes of others [-]."""
 JUMP = 8.0
 """Least jump of a spike, there and back, in noise, and over the changes beside it a half of it."""
-BAD_FIT = 3.0
-"""RMS of a residual, in the noise of its channel, from which exchanged columns are tried."""
-BETTER = 0.2
-"""Share of the sum of squares that an exchange of columns must come below."""
 
 
 class Oddity(NamedTuple):
-    """Something odd in experiment data; kind: frozen, saturated, spike, still, off or swapped."""
+    """Something odd in experiment data; kind: frozen, saturated, spike, still or off."""
 
     kind: str
     log: str
-    where: str  # pump1, h2; of swapped "h1, h2"
+    where: str  # pump1, h2
     count: int  # readings
     first: float  # time of the first [s]
-    value: float  # the value it stays at; of swapped the RMS that is left, as a share
+    value: float  # the value it stays at
     unit: str = ""
 
     @property
     def alters_fit(self) -> bool:
         """Whether the fit describes readings that the tanks did not have."""
-        return self.kind in ("frozen", "saturated", "spike", "swapped")
+        return self.kind in ("frozen", "saturated", "spike")
 
 
 def oddities(log: Log, loop=None) -> list[Oddity]:
@@ -128,30 +120,3 @@ def _spikes(y):
     beside = np.maximum(np.abs(step[:-3]), np.abs(step[3:]))
     lasting = np.abs(there - back)
     return 2 + np.flatnonzero((jump > JUMP * noise) & (jump > 5 * beside) & (jump > 2 * lasting))
-
-
-def swapped(estimation: Estimation, fit: Fit, rmse, settings) -> list[Oddity]:
-    """Return the pair of channels that fit far better exchanged, where the fit is bad."""
-    channels = estimation.data.channels
-    bad = [c for c, r in enumerate(rmse) if r is not None and r > BAD_FIT * estimation.noise[c]]
-    best, pair = BETTER * fit.cost, None
-    for a, b in itertools.combinations(range(len(channels)), 2):
-        if not {a, b} & {*bad} or channels[a][1] != channels[b][1]:
-            continue
-        other, order = copy.copy(estimation), list(range(len(channels)))
-        order[a], order[b] = b, a
-        other.data = estimation.data._replace(y=estimation.data.y[..., order])
-        other.mask, other.noise = estimation.mask[..., order], estimation.noise[order]
-        other.initial = estimation.initial.copy()
-        first, second = channels[a][0], channels[b][0]
-        other.initial[:, [first, second]] = estimation.initial[:, [second, first]]
-        cost = min(
-            solve(other, start, tolerance=1e-6, **settings).cost
-            for start in (other.nominal(), estimation.unknowns(fit))
-        )
-        if cost < best:
-            best, pair = cost, f"h{first + 1}, h{second + 1}"
-    if pair is None:
-        return []
-    log, share = estimation.logs[0], float(np.sqrt(best / fit.cost))
-    return [Oddity("swapped", log.name, pair, log.samples, float(log.t[0]), share)]

@@ -47,18 +47,21 @@ def rig_of(loop):
             " compared with the readings of a LevelSensor"
         )
     actuator = loop.actuator
-    present = {"rate": actuator.rate is not None, "delays": bool(actuator.delays)}
-    if names := [name for name, there in present.items() if there]:
+    if actuator.rate is not None:
         raise InputError(
-            f"actuator.{' and '.join(names)}: experiment data are compared with pumps of one dead"
-            " time and without a rate: leave rate and delay of [[pump]] and [[valve]] out to"
-            " identify"
+            "actuator.rate: experiment data are compared with pumps without a rate: leave rate of"
+            " [[pump]] and [[valve]] out to identify"
         )
-    if actuator.delay:
-        actuator = dataclasses.replace(cast(Any, actuator), delay=0.0)
+    if actuator.delay or actuator.delays:
+        actuator = dataclasses.replace(cast(Any, actuator), delay=0.0, delays=())
     return Rig(
         plant=loop.plant, sensor=loop.sensor, actuator=actuator, disturbance=disturbance, x0=loop.x0
     )
+
+
+def delays_of(actuator):
+    """Return (pumps,) the dead time of each pump [s], or one of all."""
+    return float(actuator.delay) + np.asarray(actuator.delays or 0.0)
 
 
 class PaddedData(NamedTuple):
@@ -78,13 +81,13 @@ class PaddedData(NamedTuple):
         return self.dt if self.dt.ndim == 2 else self.dt.sum(axis=-1)
 
 
-def padded(logs, delay=0.0, samples=0):
+def padded(logs, delays=0.0, samples=0):
     """Return the PaddedData of a list of Log, of at least `samples` samples."""
-    # An input reaches its tank after the pumps' delay [s], also between samples. Truncated data
-    # padded to the length of the whole run through the same compiled program.
+    # An input reaches its tank after the delay [s] of its pump, also between samples. Truncated
+    # data padded to the length of the whole run through the same compiled program.
     channels = tuple(sorted({pair for log in logs for pair in zip(log.tanks, log.in_volts)}))
     n = max(samples, *(log.samples for log in logs))
-    parts = [_pieces(log, delay) for log in logs]
+    parts = [_pieces(log, np.broadcast_to(delays, log.u.shape[1])) for log in logs]
     most = max(lengths.shape[1] for lengths, _ in parts)
     dt, u = np.zeros((len(logs), n, most)), np.zeros((len(logs), n, most, logs[0].u.shape[1]))
     y = np.full((len(logs), n, len(channels)), np.nan)
@@ -98,31 +101,40 @@ def padded(logs, delay=0.0, samples=0):
     return PaddedData(dt, u, y, channels)
 
 
-def _pieces(log, delay):
+def _pieces(log, delays):
     """Return (samples, pieces) lengths [s] and (samples, pieces, pumps) inputs of a Log: the steps
-    between its samples, cut where an input that reaches the tanks `delay` [s] later changes.
+    between its samples, cut where an input that reaches the tanks after its pump's delay [s]
+    changes.
     """
-    near = 1e-9 * max(1.0, delay, float(np.abs(log.t).max()))
-    changed = changes_of(log.u)
-    cuts = log.t[changed] + delay
-    if log.hold == "first-order":  # two pieces for each slope: one would delay its volume
-        start, end = log.t[changed - 1] + delay, cuts
-        cuts = np.unique(np.concatenate([start, 0.5 * (start + end), end]))
+    near = 1e-9 * max(1.0, float(np.max(delays)), float(np.abs(log.t).max()))
+    cuts = np.unique(np.concatenate([_cuts(log, j, delay) for j, delay in enumerate(delays)]))
     after = np.minimum(np.searchsorted(log.t, cuts - near), log.samples - 1)
     inside = (np.abs(cuts - log.t[after]) > near) & (cuts > log.t[0]) & (cuts < log.t[-1])
     edges = np.sort(np.concatenate([log.t, cuts[inside]]))
     step = np.searchsorted(log.t, edges, side="right") - 1  # the sample before
     piece = np.arange(len(edges)) - np.searchsorted(edges, log.t)[step]
     lengths = np.append(np.diff(edges), 0.0)
-    command = edges + lengths / 2 - delay
-    if log.hold == "first-order":
-        inputs = np.stack([np.interp(command, log.t, v) for v in log.u.T], axis=-1)
-    else:
-        inputs = log.u[np.maximum(np.searchsorted(log.t, command, side="right") - 1, 0)]
+    inputs = np.empty((len(edges), len(delays)))
+    for j, (delay, u) in enumerate(zip(delays, log.u.T)):
+        command = edges + lengths / 2 - delay
+        if log.hold == "first-order":
+            inputs[:, j] = np.interp(command, log.t, u)
+        else:
+            inputs[:, j] = u[np.maximum(np.searchsorted(log.t, command, side="right") - 1, 0)]
     shape = (log.samples, int(piece.max()) + 1)
     dt, u = np.zeros(shape), np.zeros((*shape, log.u.shape[1]))
     dt[step, piece], u[step, piece] = lengths, inputs
     return dt, u
+
+
+def _cuts(log, j, delay):
+    """Return the times at which input j of a Log changes after a delay [s]."""
+    changed = changes_of(log.u[:, j : j + 1])
+    cuts = log.t[changed] + delay
+    if log.hold == "first-order":  # two pieces for each slope: one would delay its volume
+        start = log.t[changed - 1] + delay
+        cuts = np.unique(np.concatenate([start, 0.5 * (start + cuts), cuts]))
+    return cuts
 
 
 def changes_of(u):
@@ -130,8 +142,10 @@ def changes_of(u):
     return 1 + np.flatnonzero(np.any(np.diff(u, axis=0) != 0.0, axis=1))
 
 
-def readings(rig, dt, u, channels, substeps):
-    """Return (samples, channels) readings without noise, in the channels' units."""
+def readings(rig, dt, u, channels, substeps, flows=None):
+    """Return (samples, channels) readings without noise, in the channels' units; levels where there
+    are no channels. flows : (samples, tanks) inflows beside the rig's own.
+    """
     if dt.ndim == 1:
         dt, u = dt[:, None], u[:, None]
     x, d = tuple(rig.x0[i] + 0.0 * dt[0, 0] for i in range(rig.plant.tanks)), None
@@ -142,31 +156,39 @@ def readings(rig, dt, u, channels, substeps):
         rig.actuator.init(Clock(dt=1.0, duration=1.0)),
     )
 
-    def advanced(x, state, step, inputs):
+    def advanced(x, state, step, inputs, more):
         # experiment data hold the command, which may lie beyond the pump's limits
         inputs = tuple(
             clip(v, rig.actuator.low[j], rig.actuator.high[j]) for j, v in enumerate(inputs)
         )
         # no division by zero in the padding
         driven, state = rig.actuator.step(state, inputs, jnp.where(step > 0, step, 1.0))
-        driven = rig.actuator.driving(driven)
-        return advance(rig.plant, "rk4", 0.0, x, driven, d, step, substeps, rolled=True).x, state
+        driven, enters = rig.actuator.driving(driven), d
+        if more is not None:
+            enters = more if d is None else tuple(a + b for a, b in zip(d, more))
+        return advance(
+            rig.plant, "rk4", 0.0, x, driven, enters, step, substeps, rolled=True
+        ).x, state
 
-    def sample(carry, pieces):
-        y = tuple(rig.sensor.reading_of(tank, carry[0][tank], volts) for tank, volts in channels)
-        x, state = advanced(*carry, *pieces[0])
+    def sample(carry, now):
+        pieces, more = now
+        y = carry[0]
+        if channels is not None:
+            y = tuple(rig.sensor.reading_of(i, carry[0][i], volts) for i, volts in channels)
+        x, state = advanced(*carry, *pieces[0], more)
         for step, inputs in pieces[1:]:
             # a piece of length zero is none: a pump with memory would see a sample
             x, state = jax.tree.map(
                 lambda new, old, step=step: jnp.where(step > 0, new, old),
-                advanced(x, state, step, inputs),
+                advanced(x, state, step, inputs, more),
                 (x, state),
             )
         return (x, state), y
 
     pumps = range(rig.plant.pumps)
     pieces = tuple((dt[:, i], tuple(u[:, i, j] for j in pumps)) for i in range(dt.shape[1]))
-    return jnp.stack(scan(sample, (x, state), pieces, length=dt.shape[0])[1], axis=-1)
+    more = None if flows is None else tuple(flows[:, i] for i in range(rig.plant.tanks))
+    return jnp.stack(scan(sample, (x, state), (pieces, more), length=dt.shape[0])[1], axis=-1)
 
 
 @functools.partial(jax.jit, static_argnames=("coordinates", "tanks", "channels", "substeps"))
@@ -187,6 +209,25 @@ def sensitivities(rig, dt, u, p, first, *, coordinates, tanks, channels, substep
         return jax.vmap(slope, out_axes=(None, -1))(jnp.eye(q.size, dtype=q.dtype))
 
     return jax.vmap(of_log, in_axes=(0, 0, 0 if p.ndim == 2 else None, 0))(dt, u, p, first)
+
+
+@functools.partial(
+    jax.jit,
+    static_argnames=("coordinates", "substeps"),
+    compiler_options={"xla_backend_optimization_level": 0},  # it runs seldom: compiled in half
+)
+def variants(rig, dt, u, flows, p, first, *, coordinates, substeps):
+    """Return (variants, logs, samples, tanks) levels of a Rig at coordinates p (variants, shared),
+    for inputs u, further inflows `flows` and levels `first` of each variant and log.
+    """
+
+    def of_log(dt, u, flows, p, first):
+        r = dataclasses.replace(with_values(rig, coordinates.values(p)), x0=first)
+        return readings(r, dt, u, None, substeps, flows)
+
+    return jax.vmap(jax.vmap(of_log, (0, 0, 0, None, 0)), (None, 0, 0, 0, 0))(
+        dt, u, flows, p, first
+    )
 
 
 def _play(rig, dt, u, first, *, channels, substeps):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxtank import rig as rigs
-from jaxtank.core.labels import reading_label
+from jaxtank.core.labels import label_of, labels_of, reading_label
 from jaxtank.core.text import count
 from jaxtank.core.tree import get_value
 from jaxtank.core.units import local
@@ -63,8 +63,6 @@ def sentences_of(fit):
 
 
 ODD = {
-    "swapped": "{log}: columns {where} look exchanged: the residual falls to {percent:.2g} % with"
-    " each in place of the other; exchange them with --column",
     "frozen": "{log}: {where} is frozen at {value:.6g} {unit} for {count} from {first:g} s on,"
     " while inputs or other levels move: leave these cells empty",
     "saturated": "{log}: {where} stays at {value:.6g} {unit} for {count} from {first:g} s on, an"
@@ -80,18 +78,113 @@ ODD = {
 
 def sentences_on(oddities):
     """Return a sentence on each oddity of experiment data."""
-    known = [odd._asdict() | {"percent": 100 * odd.value} for odd in oddities]
     return [
-        ODD[odd["kind"]].format(**odd | {"count": count(odd["count"], "reading")}) for odd in known
+        ODD[odd.kind].format(**odd._asdict() | {"count": count(odd.count, "reading")})
+        for odd in oddities
     ]
+
+
+CAUSES = {
+    "pump-delay": "a dead time of {pump}",
+    "pump-lag": "a lag of {pump}",
+    "dead-zone": "a dead zone of {pump}",
+    "pump-curve": "a flow of {pump} that is a power of its input",
+    "sensor-offset": "an offset of the sensor of {tank}",
+    "sensor-scale": "a scale of the sensor of {tank}",
+    "leak": "an outlet of {tank} to the basin",
+    "outlet-exponent": "an outlet of {tank} that follows another power of its level",
+    "inflow": "an inflow of {tank} without a column",
+    "area": "another area of {tank}",
+    "swapped": "the columns of {tank} exchanged",
+}
+"""{kind of a cause: what the data need}"""
+EXPERIMENTS = {
+    "pump-delay": "steps of the pump with samples closer together",
+    "pump-lag": "steps of the pump with samples closer together",
+    "dead-zone": "the pump held at three inputs or more, one of them near 0",
+    "pump-curve": "the pump held at three inputs or more, one of them near 0",
+    "sensor-offset": "a reading of the empty tank",
+    "sensor-scale": "a reading beside a measured level, near the rim",
+    "leak": "the tank filled and left alone, pumps off and outlets shut",
+    "outlet-exponent": "a drain test from near the rim to near empty",
+    "inflow": "all pumps off, and levels that settle",
+    "area": "the area measured, or a known volume poured in with the outlets shut",
+}
+"""{kind of a cause: what would tell it from others}"""
+
+
+def diagnosis_of(fit):
+    """Return {"clean", "causes", "sentence"}: whether the structure of the rig is right."""
+    if fit.status == "interrupted":
+        return {"clean": None, "causes": [], "sentence": "not tested: interrupted"}
+    causes = []
+    for cause in fit.structure.causes:
+        row = cause._asdict()
+        row["equivalent"] = [{"kind": kind, "where": where} for kind, where in cause.equivalent]
+        del row["name"]
+        causes.append(clean(row))
+    return {"clean": fit.structure.clean, "causes": causes, "sentence": "; ".join(_structure(fit))}
+
+
+def _structure(fit):
+    """Return sentences: what the data need that the rig has not, and what cannot be told apart."""
+    causes, words = fit.structure.causes, []
+    if fit.structure.clean:
+        return ["no test rejects the structure of the rig"]
+    for cause in causes:
+        which = f"{cause.kind}:{','.join(map(str, np.ravel(cause.where)))}"
+        value = f", {_amount(cause)}" if cause.value is not None else ""
+        need = _named(fit, cause.kind, cause.where)
+        words.append(f"the data need {need}{value}: identify with --accept {which}")
+        if cause.equivalent:
+            others = " or ".join(_named(fit, kind, where) for kind, where in cause.equivalent)
+            tell = EXPERIMENTS[cause.kind]
+            words.append(f"they do not tell it from {others}; to tell them apart: {tell}")
+    if not fit.structure.white:
+        rest = "what these leave" if causes else f"what the fit leaves ({_explained(fit)})"
+        words.append(
+            f"{rest} is no noise, and no cause that is tried explains it: an inflow without a"
+            " column, or another part that the rig has not"
+        )
+    return words
+
+
+def _explained(fit):
+    """Return how much of each level a fit explains."""
+    shares = zip(fit.channels, fit.quality["nrmse_percent"])
+    return ", ".join(f"fit of {name} {v:.0f} %" for (name, _), v in shares if v is not None)
+
+
+def _named(fit, kind, where):
+    """Return a kind of cause and its place in words."""
+    plant, at = fit.case.loop.plant, [int(i) - 1 for i in np.ravel(where)]
+    tanks = labels_of(plant, "tank", at) if kind not in PUMPS else ""
+    pump = label_of(plant, "pump", at[0]) if kind in PUMPS else ""
+    return CAUSES[kind].format(tank=tanks, pump=pump)
+
+
+PUMPS = ("pump-delay", "pump-lag", "dead-zone", "pump-curve")
+"""Kinds of causes that are of pumps."""
+
+
+def _amount(cause):
+    """Return the value of a cause with its interval."""
+    if cause.value is None:
+        return ""
+    unit = "" if cause.unit == "-" else f" {cause.unit}"
+    low, high = cause.interval95
+    return f"{cause.value:.4g}{unit} ({low:.4g} .. {high:.4g})"
 
 
 def _headline(fit, status):
     """Return how the search ended, after what makes its answer worthless."""
     kinds = dict.fromkeys(odd.kind for odd in fit.oddities if odd.alters_fit)
-    words = {"spike": "spikes", "swapped": "exchanged columns"}
-    names = [words.get(kind, f"{kind} readings") for kind in kinds]
-    return f"data with {' and '.join(names)}; {status}" if names else status
+    names = ["spikes" if kind == "spike" else f"{kind} readings" for kind in kinds]
+    words = [f"data with {' and '.join(names)}"] if names else []
+    if fit.status == "interrupted":
+        return "; ".join([*words, status])
+    words += [status] if fit.structure.clean else []
+    return "; ".join([*words, _structure(fit)[0]])
 
 
 def _ending(fit):
@@ -126,10 +219,7 @@ def _residuals(fit):
         correlation = f"correlation from sample to sample {rho:.2f}"
         words.append(f"{name}: residual {rmse:.3g} {unit} RMS{percent}, {correlation}")
     if q["widened"] > 1.05:
-        words.append(
-            "residuals are correlated, so that the model and not the noise limits the fit:"
-            f" intervals are widened {q['widened']:.1f} times for it"
-        )
+        words.append(f"intervals are {q['widened']:.1f} times wider, for correlated residuals")
     return words
 
 
@@ -183,13 +273,14 @@ def report(fit, page=False):
     rig, why = rig_text(fit.identified) if page and fit.identifiable else (None, None)
     simulations = sum(s["evaluations"] for s in fit.starts)
     status = fit.status.replace("_", " ")
+    more = [] if fit.status == "interrupted" else _structure(fit)[1:]
     return Report(
         f"{fit.case.name}: identified",
         _headline(fit, status),
         facts,
         [
             Text([f"{fit.case.name}: {_headline(fit, status)}"], on="terminal"),
-            Text(sentences_on(fit.oddities), items=True),
+            Text([*sentences_on(fit.oddities), *more], items=True),
             Text([note for log in fit.estimation.logs for note in log.notes], items=True),
             Text([_data(fit.estimation)]),
             _parameters(fit),
@@ -200,7 +291,7 @@ def report(fit, page=False):
             *_profile(fit.profile),
             Text([f"{fit.wall_s:.1f} s, {simulations} simulations with sensitivities"], gap=True),
         ],
-        fit.status == "converged",
+        fit.status == "converged" and fit.structure.clean,
         ", ".join(log.name for log in fit.estimation.logs),
         files={"The identified rig as a file (rig.toml)": rig} if rig else {},
     )
@@ -301,6 +392,7 @@ def json_of(fit):
         "status": str(fit.status),
         "success": fit.status == "converged",
         "message": "; ".join(sentences_of(fit)),
+        "diagnosis": diagnosis_of(fit),
         **fields(fit, "parameters remedies validation profile starts wall_s"),
         "fit": clean(
             {k: quality[k] for k in ("rmse", "nrmse_percent", "residual_autocorrelation")}

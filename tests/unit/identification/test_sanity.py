@@ -100,18 +100,6 @@ def _files(folder, t, u, y, header="t [s],pump1 [%],h1 [m],h2 [m]"):
     return [str(folder / "rig.toml"), "--data", str(folder / "log.csv"), "--starts", "1"]
 
 
-def test_exchanged_columns_come_before_the_word_converged(tmp_path, capsys):
-    t, u, y = record(0)
-    files = _files(tmp_path, t, u, y[:, ::-1])
-    code = main(["identify", *files, "--json"])
-    result = json.loads(capsys.readouterr().out)
-    odd = [(o["kind"], o["where"]) for o in result["oddities"]]
-    assert code == 0 and odd == [("swapped", "h1, h2")]
-    files = _files(tmp_path, t, u, y)
-    assert main(["identify", *files, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["oddities"] == []
-
-
 def test_the_gain_of_a_pump_that_is_off_is_not_estimated(tmp_path, capsys):
     """A drain test: drain and orifice follow, and the rig keeps its gain."""
     y = _levels(np.zeros(200), [0.9, 0.6], 1.0)

@@ -122,6 +122,7 @@ def _identify(args, case):
         ready=ready,
         law=args.law,
         prior=not args.no_prior,
+        accept=args.accept or (),
     )
     line.end()
     _report_next(args, result, finish(result, args))
@@ -324,6 +325,8 @@ FIT = (
            choices=("linear", "soft_l1", "huber")),
     Option("--law", "KIND", "write the rig under a controller to tune: pi, with gains from the"
            " identified model", choices=("pi",)),
+    Option("--accept", "KIND[:PLACE]", "put a cause that the diagnosis names into the rig and"
+           " estimate it: pump-delay, sensor-scale:2", kind="list"),
     Option("--no-prior", help="these data alone: without the [covariance] of an earlier"
            " identification", kind="flag"),
     Option("--profile", help="also: profile likelihood of the least certain parameter",

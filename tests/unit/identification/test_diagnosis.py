@@ -1,0 +1,96 @@
+"""Is the structure right? Logs with one fault each, from an integrator of this file."""
+
+import json
+
+import numpy as np
+import pytest
+from helpers import PROCESS
+
+import tuning
+from jaxtank import rig
+from tuning.cli.main import main
+
+NOISE, DT, SAMPLES = 0.002, 5.0, 500
+TRUE = {"plant.pump_gain[0]": 2.64e-5, "plant.drain[1]": 4.15e-4, "plant.orifice[0]": 3.2e-4}
+GUESS = PROCESS.replace("4.15e-4", "4.6e-4").replace("2.64e-5", "2.4e-5")
+
+
+def flow(u, delay=0.0, exponent=1.0):
+    """(steps of 0.5 s,) flow of the pump [m^3/s] for inputs u (samples,)."""
+    t = 0.5 * np.arange(SAMPLES * 10)
+    late = u[np.maximum(((t - delay) // DT).astype(int), 0)]
+    return TRUE["plant.pump_gain[0]"] * 75.0 * (late / 75.0) ** exponent
+
+
+def record(fault, seed=0):
+    """Log of the rig with a fault: (kind, value) or None."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(np.round(rng.uniform(20.0, 75.0, SAMPLES // 20), 1), 20)
+    kind, value = fault or ("", 0.0)
+    q = flow(u, value if kind == "pump-delay" else 0.0, value if kind == "pump-curve" else 1.0)
+    areas, h, y = np.array([0.5, 0.25]), np.array([0.4, 0.5]), np.empty((SAMPLES, 2))
+
+    def rate(h, q):
+        out = np.sqrt(2 * 9.81 * np.maximum(h, 0.0)) * [3.2e-4, 4.15e-4]
+        return np.array([q - out[0], out[0] - out[1]]) / areas
+
+    for k in range(SAMPLES * 10):
+        if k % 10 == 0:
+            y[k // 10] = h
+        a = rate(h, q[k])
+        b = rate(h + 0.25 * a, q[k])
+        c = rate(h + 0.25 * b, q[k])
+        h = h + 0.5 / 6 * (a + 2 * b + 2 * c + rate(h + 0.5 * c, q[k]))
+    y = y * [1.0, value] if kind == "sensor-scale" else y
+    y = y + NOISE * rng.standard_normal(y.shape)
+    return DT * np.arange(SAMPLES), u, y[:, ::-1] if kind == "swapped" else y
+
+
+def identified(fault, **options):
+    t, u, y = record(fault)
+    log = tuning.log(t=t, u=u, y=y)
+    return tuning.identify(rig.loads(GUESS), log, starts=1, hold_back=0, **options)
+
+
+def test_a_clean_log_is_not_accused():
+    diagnosis = identified(None).diagnosis
+    assert diagnosis["clean"] and diagnosis["causes"] == []
+
+
+@pytest.mark.parametrize(
+    ("fault", "where"),
+    [
+        (("pump-delay", 3.0), 1),
+        (("pump-curve", 1.2), 1),
+        (("sensor-scale", 1.05), 2),
+        (("swapped", None), [1, 2]),
+    ],
+)
+def test_the_fault_of_a_log_is_named_first_with_its_value(fault, where):
+    """A dead time of 3 s in samples of 5 s, too."""
+    (kind, value), diagnosis = fault, identified(fault).diagnosis
+    first = diagnosis["causes"][0]
+    places = [(c["kind"], c["where"]) for c in (first, *first["equivalent"])]
+    assert not diagnosis["clean"] and (kind, where) in places
+    if value is not None and places[0] == (kind, where):
+        low, high = first["interval95"]
+        assert low < value < high and high - low < 0.4 * value
+
+
+def test_an_accepted_cause_is_estimated_and_written(tmp_path, capsys):
+    """Intervals cover the truth again, and the rig predicts the log within its noise."""
+    t, u, y = record(("pump-delay", 3.0))
+    (tmp_path / "rig.toml").write_text(GUESS)
+    rows = "\n".join(",".join(f"{v:.8g}" for v in row) for row in np.column_stack([t, u, y]))
+    (tmp_path / "log.csv").write_text(f"t [s],pump1 [%],h1 [m],h2 [m]\n{rows}\n")
+    files = [str(tmp_path / "rig.toml"), "--data", str(tmp_path / "log.csv"), "--json"]
+    more = ["--starts", "1", "--hold-back", "0", "--accept", "pump-delay"]
+    assert main(["identify", *files, *more, "--out", str(tmp_path / "out")]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["diagnosis"]["clean"]
+    for name, value in {**TRUE, "actuator.delays[0]": 3.0}.items():
+        low, high = result["parameters"][name]["interval95"]
+        assert low < value < high, name
+    assert main(["predict", str(tmp_path / "out" / "rig.toml"), *files[1:]]) == 0
+    rmse = json.loads(capsys.readouterr().out)["fit"]["rmse"]
+    assert np.all(np.array(rmse) < 1.1 * NOISE)

@@ -1,0 +1,99 @@
+"""From the command of a pump to its flow: dead zone, curve, lag and delay, to estimate."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.signal import lfilter
+
+from jaxtank.core.tree import split_index
+
+
+class Inputs(NamedTuple):
+    """What an input meets before it reaches the plant, beyond the rig as it is."""
+
+    delay: float = 0.0  # [s]
+    lag: float = 0.0  # time constant [s]
+    dead: float = 0.0  # input below which nothing flows
+    exponent: float = 1.0  # of the flow in the input, at the same largest flow
+
+
+STATIC = ("actuator.delays", "plant.curves")
+"""Names of such numbers that no leaf of a rig holds."""
+POINTS = 12
+"""Points of the curve that stands for an exponent in a rig file."""
+
+
+def with_inputs(loop: Any, values: Mapping[str, float], top: np.ndarray) -> Any:
+    """Return a loop with dead times and curves {name: value}; top (pumps,): the largest inputs."""
+    bank, plant = loop.actuator, loop.plant
+    delays = float(bank.delay) + np.zeros(bank.pumps) + np.asarray(bank.delays or 0.0)
+    curves = list(plant.curves) if values and getattr(plant, "curves", ()) else [None] * bank.pumps
+    for name, value in values.items():
+        base, (j,) = split_index(name)
+        if base == "actuator.delays":
+            delays[j] = max(value, 0.0)
+        else:
+            x = np.linspace(0.0, 1.0, POINTS) ** 2
+            last = (
+                max(float(bank.high[j]), 1.2 * top[j]) if np.isfinite(bank.high[j]) else 2 * top[j]
+            )
+            u = np.unique([*(x * top[j]), last])
+            curves[j] = tuple(zip(u.tolist(), (top[j] * (u / top[j]) ** value).tolist()))
+    least = float(delays.min())
+    more = tuple((delays - least).tolist())
+    bank = dataclasses.replace(bank, delay=least, delays=more if any(more) else ())
+    if any(curves):
+        plant = dataclasses.replace(plant, curves=tuple(curves[: len(plant.feeds)]))
+    return dataclasses.replace(loop, actuator=bank, plant=plant)
+
+
+def transformed(dt: np.ndarray, u: np.ndarray, by: Inputs) -> np.ndarray:
+    """Return the means over pieces of length dt (pieces,) of an input u (pieces,) behind a dead
+    zone, a curve, a lag and a delay; the first input is taken to have lasted.
+    """
+    top = float(u.max())
+    if by.dead > 0.0:
+        u = np.maximum(u - by.dead, 0.0)
+    if by.exponent != 1.0 and top > 0.0:
+        u = np.where(u > 0.0, top * (np.maximum(u, 1e-12 * top) / top) ** by.exponent, u)
+    if by.lag > 0.0:
+        u = _lagged(dt, u, by.lag)
+    if by.delay != 0.0:
+        edges = np.concatenate([[0.0], np.cumsum(dt)])
+        volume, at = np.concatenate([[0.0], np.cumsum(u * dt)]), edges - by.delay
+        outside = np.minimum(at, 0.0) * u[0] + np.maximum(at - edges[-1], 0.0) * u[-1]
+        through = np.interp(at, edges, volume) + outside
+        u = np.where(dt > 0.0, np.diff(through) / np.where(dt > 0.0, dt, 1.0), u)
+    return u
+
+
+def _lagged(dt, u, lag):
+    """Return the means over the pieces of an input behind a first-order lag [s], solved exactly."""
+    keep, regular = np.exp(-dt / lag), dt[dt > 0.0]
+    if np.ptp(regular) < 1e-9 * regular[0]:
+        end: Any = lfilter([1 - keep[0]], [1.0, -keep[0]], u, zi=[keep[0] * u[0]])[0]
+    else:
+        end, v = np.empty_like(u), u[0]
+        for k, (share, target) in enumerate(zip(keep, u)):
+            end[k] = v = target + share * (v - target)
+    start = np.concatenate([u[:1], end[:-1]])
+    mean = lag / np.where(dt > 0.0, dt, 1.0) * (1.0 - keep) * (start - u)
+    return np.where(dt > 0.0, u + mean, u)
+
+
+def played(data: Any, inputs: tuple, values: Any) -> np.ndarray:
+    """Return the inputs of PaddedData behind what values (inputs,) of (field of Inputs, pump, value
+    that the data have already) say.
+    """
+    if not inputs:
+        return data.u
+    logs, u = data.u.shape[0], np.array(data.u)
+    dt, flat = data.dt.reshape(logs, -1), u.reshape(logs, -1, u.shape[-1])
+    for j in dict.fromkeys(pump for _, pump, _ in inputs):
+        of_pump = [(field, v, null) for (field, pump, null), v in zip(inputs, values) if pump == j]
+        by = Inputs(**{field: v - null * (field == "delay") for field, v, null in of_pump})
+        for e in range(logs):
+            flat[e, :, j] = transformed(dt[e], flat[e, :, j], by)
+    return u
