@@ -5,6 +5,7 @@ say, fits of what passes them, and what the data cannot tell apart.
 import copy
 import dataclasses
 import itertools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,7 +40,9 @@ BAD_FIT = 3.0
 """RMS of a residual, in the noise of its channel, from which exchanged columns are tried."""
 BETTER = 0.5
 """Share of the sum of squares that an exchange of columns must come below."""
-FIELD = dict(zip(("pump-delay", "pump-lag", "dead-zone", "pump-curve"), Inputs._fields))
+FIELD: dict[str, str] = dict(
+    zip(("pump-delay", "pump-lag", "dead-zone", "pump-curve"), Inputs._fields)
+)
 """{kind: field of Inputs} of what changes an input before it reaches its pump."""
 
 
@@ -170,8 +173,10 @@ class Enlarged(Estimation):
         u = np.clip(estimation.data.u, np.asarray(bank.low), np.asarray(bank.high))
         self.data = estimation.data._replace(u=u)
         wide = np.full(rig.actuator.pumps, np.inf)
-        plant = with_exponents(rig.plant) if exponents else rig.plant
-        actuator = dataclasses.replace(rig.actuator, low=-wide, high=wide)
+        plant: Any = rig.plant
+        plant = with_exponents(plant) if exponents else plant
+        own: Any = rig.actuator
+        actuator = dataclasses.replace(own, low=-wide, high=wide)
         self.rig = dataclasses.replace(rig, plant=plant, actuator=actuator)
         names = [f"sensor.{leaf}" for leaf in ("offset", "scale")]
         self.sensor = with_leaves(estimation.case.loop, names).sensor
@@ -327,7 +332,7 @@ class Cause(NamedTuple):
     value: float | None
     interval95: list[float] | None
     delta_bic: float
-    equivalent: list[tuple[str, Any]]
+    equivalent: Sequence[tuple[str, Any]]
 
 
 class Diagnosis(NamedTuple):

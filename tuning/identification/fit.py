@@ -179,7 +179,7 @@ def identify(
         levels=spread.levels(),
         covariance=spread.covariance_of_parameters(),
         directions=spread.directions(),
-        oddities=[odd for log in logs for odd in oddities(log, case.loop)],
+        oddities=[odd for log in logs for odd in oddities(log, estimation.case.loop)],
         remedies=remedies(estimation, best, spread) if unclear else [],
         quality=fit_quality
         | {"widened": spread.widened, "noise": [float(v) for v in estimation.noise]},

@@ -101,7 +101,7 @@ class Estimation:
         inputs: Sequence[tuple[Bound, tuple]] = (),
         begin: Mapping[str, float] | None = None,
     ):
-        self.case, self.logs, loop, self.begin = case, logs, case.loop, begin or {}
+        self.case, self.logs, loop, self.begin = case, logs, case.loop, dict(begin or {})
         if start not in STARTS:
             raise InputError(f"start = {start!r}: must be one of {', '.join(STARTS)}")
         self.bounds = free_bounds(loop, default_free(loop, logs) if free is None else free)

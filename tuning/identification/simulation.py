@@ -81,7 +81,7 @@ class PaddedData(NamedTuple):
         return self.dt if self.dt.ndim == 2 else self.dt.sum(axis=-1)
 
 
-def padded(logs, delays=0.0, samples=0):
+def padded(logs, delays: Any = 0.0, samples=0):
     """Return the PaddedData of a list of Log, of at least `samples` samples."""
     # An input reaches its tank after the delay [s] of its pump, also between samples. Truncated
     # data padded to the length of the whole run through the same compiled program.
@@ -175,7 +175,8 @@ def readings(rig, dt, u, channels, substeps, flows=None):
         y = carry[0]
         if channels is not None:
             y = tuple(rig.sensor.reading_of(i, carry[0][i], volts) for i, volts in channels)
-        x, state = advanced(*carry, *pieces[0], more)
+        (x, state), (step, inputs) = carry, pieces[0]
+        x, state = advanced(x, state, step, inputs, more)
         for step, inputs in pieces[1:]:
             # a piece of length zero is none: a pump with memory would see a sample
             x, state = jax.tree.map(
