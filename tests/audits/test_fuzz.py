@@ -68,9 +68,7 @@ def broken(text, rng):
     for _ in range(rng.randint(1, 3)):
         i = rng.randrange(len(lines))
         name, equals, _ = lines[i].partition("=")
-        change = rng.choice(
-            ["delete", "repeat", "cut", "word", "character", "entry", "table", "swap", "number"]
-        )
+        change = rng.choice(RIG_CHANGES)
         if (fewer := changed_lines(lines, change, rng)) is not None:
             lines = fewer or [""]
         elif change == "word" and equals:
@@ -217,9 +215,7 @@ def broken_log(rng):
     for _ in range(rng.randint(1, 3)):
         i = rng.randrange(len(lines))
         cells = lines[i].split(",")
-        change = rng.choice(
-            ["delete", "repeat", "cut", "cell", "short", "long", "head", "word", "comma"]
-        )
+        change = rng.choice(LOG_CHANGES)
         if (fewer := changed_lines(lines, change, rng)) is not None:
             lines = fewer or [""]
         elif change == "cell":

@@ -236,7 +236,8 @@ def test_only_pictures_import_matplotlib(trees):
 CALLS = Path(__file__).with_name("public_calls.py")
 
 
+@pytest.mark.slow
 def test_no_public_call_of_jaxtank_loads_tuning():
-    """In a process of its own: tests/unit/public_calls.py."""
+    """In a process of its own, tests/unit/public_calls.py; the imports above show the same."""
     ran = subprocess.run([sys.executable, CALLS], capture_output=True, text=True, timeout=300)
     assert ran.returncode == 0, ran.stderr

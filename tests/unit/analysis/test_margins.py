@@ -12,12 +12,6 @@ from jaxtank.analysis.margins import margins
 control = pytest.importorskip("control", reason="python-control is the independent answer")
 
 
-@pytest.fixture(autouse=True, scope="module")
-def float64():
-    with jax.enable_x64(True):
-        yield
-
-
 def lags_under_pi(rng):
     """Two lags under a sampled PI controller, of generic gains, as python-control builds it."""
     dt, plant = 0.5, control.tf([1.0], [1.0])

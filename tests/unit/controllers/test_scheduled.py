@@ -28,7 +28,6 @@ from jaxtank.xla.reachability import use_of
 # rounding of the others, where the slope would
 # be that of one side and a difference that of both (at one sample of 24,001: 6e-4 of that slope).
 KNOTS = (4.317, 8.0, 11.137, 15.071)
-BOTH = {"controller.k": "r1", "controller.k1": "r1"}
 VALUES = np.array([[0.02, 0.05, 0.03, 0.08], [0.06, 0.12, 0.09, 0.05]])
 MEASURES = ("rms_error_total", "max_level")
 

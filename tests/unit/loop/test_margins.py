@@ -32,12 +32,6 @@ control = pytest.importorskip("control", reason="python-control is the independe
 AREA, DRAIN, GAIN, KC, TI, DT = 100.0, 0.5, 10.0, 2.0, 30.0, 1.0
 
 
-@pytest.fixture(autouse=True, scope="module")
-def float64():
-    with jax.enable_x64(True):
-        yield
-
-
 def one_tank(lag=None, delay=0.0, level=9.0, high=12.0, **plant):
     """A tank with an outlet under PI control, and its clock."""
     tank = network(area=AREA, drain=DRAIN, pump_gain=GAIN, feeds=[(0, None)], rim=30.0, **plant)

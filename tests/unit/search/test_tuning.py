@@ -17,7 +17,6 @@ from tuning.search.options import options_of
 from tuning.search.screening import screen, spectral_radius
 
 LBFGS = pytest.param("lbfgs", marks=pytest.mark.slow)
-COARSE = {"clock.dt": 0.1}
 FAST = {"clock.dt": 0.1, "clock.duration": 400.0}
 
 
