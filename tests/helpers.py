@@ -2,10 +2,13 @@
 (pyproject.toml), so that every test imports it by name.
 """
 
+import collections
 import contextlib
 import dataclasses
 import io
 import json
+import logging
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -169,6 +172,31 @@ def programs_in(jaxpr):
                 inner = getattr(inner, "jaxpr", inner)
                 if hasattr(inner, "eqns"):
                     yield from programs_in(inner)
+
+
+LISTED = re.compile(r"Compiling (?:jit\()?(\w+)\)? with global shapes")
+
+
+@contextlib.contextmanager
+def programs_compiled():
+    """A Counter of how often each program is compiled inside, where none is at hand."""
+    counter = collections.Counter()
+    handler = logging.Handler()
+    logger = logging.getLogger("jax")
+
+    def emit(record):
+        if listed := LISTED.match(record.getMessage()):
+            counter[listed[1]] += 1
+
+    handler.emit = emit
+    logger.addHandler(handler)
+    jax.clear_caches()
+    jax.config.update("jax_log_compiles", True)  # of every thread, as `jax.log_compiles` is not
+    try:
+        yield counter
+    finally:
+        jax.config.update("jax_log_compiles", False)
+        logger.removeHandler(handler)
 
 
 PROCESS = """

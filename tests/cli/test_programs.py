@@ -1,48 +1,29 @@
 """Which programs a command compiles: each costs a second or two that no user asked for."""
 
-import collections
-import re
-
-import jax
 import pytest
-
-from tuning.cli.main import main
-
-LISTED = re.compile(r"Compiling (?:jit\()?(\w+)\)? with global shapes")
+from helpers import command, programs_compiled
 
 
-@pytest.fixture
-def compiled(caplog, capsys):
-    """A function that runs a command and returns how often each program was compiled."""
-
-    def run(*words):
-        jax.clear_caches()
-        jax.config.update("jax_log_compiles", True)  # of every thread, as `jax.log_compiles` is not
-        try:
-            with caplog.at_level("WARNING"):
-                assert main([*words, "--json", "--quiet"]) in (0, 3, 4)
-        finally:
-            jax.config.update("jax_log_compiles", False)
-        capsys.readouterr()
-        result = (LISTED.match(record.getMessage()) for record in caplog.records)
-        return collections.Counter(match[1] for match in result if match)
-
-    return run
+def compiled(*words):
+    """How often a command compiles each program."""
+    with programs_compiled() as programs:
+        assert command(*words, "--json", "--quiet").code in (0, 3, 4)
+    return programs
 
 
-def test_a_run_is_one_program(compiled):
+def test_a_run_is_one_program():
     assert compiled("simulate", "cascaded/pi", "--dt", "8") == {"evaluate_compiled": 1}
 
 
 @pytest.mark.slow
-def test_an_ensemble_is_two_programs(compiled):
+def test_an_ensemble_is_two_programs():
     """The measures of a batch, and the trajectories of the fan chart."""
     result = compiled("uncertainty", "cascaded/pi", "--dt", "8", "--samples", "8")
     assert result == {"_run": 1, "_trajectories": 1}
 
 
 @pytest.mark.slow
-def test_the_nominal_optimum_needs_four_large_programs(compiled):
+def test_the_nominal_optimum_needs_four_large_programs():
     """Measures to report, derivatives, values of a block of points, values of validation plants. At
     10,241 samples no coarse step is used, and no Jacobian is compiled to judge it.
     """
@@ -54,7 +35,7 @@ def test_the_nominal_optimum_needs_four_large_programs(compiled):
 
 
 @pytest.mark.slow
-def test_the_default_answer_needs_six_large_programs(compiled):
+def test_the_default_answer_needs_six_large_programs():
     """Judged and reported with and without a safety filter; derivatives and values of a block."""
     result = compiled("tune", "gouta2015/backstepping", "--dt", "0.5", "--starts", "2")
     large = {"_run": 2, "evaluate_compiled": 2, "_slopes": 1, "_values": 1}
