@@ -421,7 +421,7 @@ def accepted(estimation: Estimation, fit: Fit, places: list[tuple[str, tuple]]) 
 
 def _best_of_kind(trial, kind, where):
     """Return the Trial with a Candidate of a kind at a place from 1, or at the best one."""
-    (_, steps), candidates = _scores(trial), trial.problem.candidates
+    candidates = trial.problem.candidates
     options = [i for i, c in enumerate(candidates) if c.kind == kind]
     chosen = [i for i in options if where in ((), (candidates[i].where + 1,))]
     if not chosen:
@@ -430,7 +430,7 @@ def _best_of_kind(trial, kind, where):
             f"accept {':'.join([kind, *map(str, where)])}: "
             + (f"must be one of {places}" if places else "is estimated already, or no part has it")
         )
-    return min((_with(trial, i, steps[i]) for i in chosen), key=lambda t: t.loss)
+    return min((_with(trial, i) for i in chosen), key=lambda t: t.loss)
 
 
 def with_leaves(loop: Any, names: list[str]) -> Any:
@@ -557,7 +557,7 @@ def _is_white(trial):
 
 
 def _scores(trial):
-    """Return (candidates,) by how much a step of each reduces the sum of squares, and the steps."""
+    """Return (candidates,) by how much a step of each reduces the sum of squares."""
     problem, J, r = trial.problem, trial.jacobian, trial.residual
     extra = np.delete(np.arange(problem.size), problem.usual)
     inside = [*problem.usual, *extra[list(trial.chosen)]]
@@ -572,7 +572,7 @@ def _scores(trial):
     share = trial.point[extra]
     outside = (share < 1e-9) & (steps < 0.0) | (share > 1 - 1e-9) & (steps > 0.0)
     steps[outside | np.isin(np.arange(len(extra)), trial.chosen)] = 0.0
-    return steps**2 * size, steps
+    return steps**2 * size
 
 
 def _limit(problem):
@@ -587,19 +587,17 @@ def _passes(trial, before):
 
 def _fitted(trial):
     """Return Trials with a Candidate more each, those that the scores promise most of."""
-    gains, steps = _scores(trial)
+    gains = _scores(trial)
     variance = trial.loss / max(len(trial.residual) - trial.problem.size, 1)
     promising = [i for i in np.argsort(-gains) if gains[i] > variance * _limit(trial.problem)]
-    return [_with(trial, int(i), steps[i]) for i in promising[:TRIED]]
+    return [_with(trial, int(i)) for i in promising[:TRIED]]
 
 
-def _with(trial, i, step):
-    """Return the Trial with Candidate i, from a step of it."""
-    problem, start = trial.problem, trial.point.copy()
+def _with(trial, i):
+    """Return the Trial with Candidate i beside those that it has."""
+    problem, start = trial.problem, trial.point
     if problem.candidates[i].name in problem.by_exponent:
         problem = Enlarged(problem.original, start[problem.usual], problem.loss, exponents=True)
-    at = problem.known + i
-    start[at] = np.clip(start[at] + step, 0.0, 1.0)
     return _fit(problem, (*trial.chosen, i), start)
 
 
