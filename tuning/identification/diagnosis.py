@@ -18,7 +18,7 @@ from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.signals.base import Constant
 from tuning.identification import simulation
 from tuning.identification.coordinates import Coordinates, Scalar
-from tuning.identification.inputs import Inputs, played
+from tuning.identification.inputs import played
 from tuning.identification.least_squares import Fit
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import ROBUST_LIMIT, autocorrelation, residuals_of
@@ -34,16 +34,23 @@ TRIED = 10
 ITERATIONS = 15
 ENOUGH = 0.01
 """Reduction of the sum of squares, in its mean, below which a fit has converged."""
+STRIDE = 5
+"""Every which of the inputs that occur is tried first as a threshold."""
 STEP = 1e-6
 """Change of an unknown, in its coordinate, by which slopes are computed."""
 BAD_FIT = 3.0
 """RMS of a residual, in the noise of its channel, from which exchanged columns are tried."""
 BETTER = 0.5
 """Share of the sum of squares that an exchange of columns must come below."""
-FIELD: dict[str, str] = dict(
-    zip(("pump-delay", "pump-lag", "dead-zone", "pump-curve"), Inputs._fields)
-)
-"""{kind: field of Inputs} of what changes an input before it reaches its pump."""
+FIELD = {
+    "actuator.delays": "delay",
+    "actuator.lag": "lag",
+    "actuator.dead_zone": "dead",
+    "actuator.threshold": "threshold",
+    "plant.curves": "exponent",
+}
+"""{name: field of Inputs} of what changes an input before it reaches its pump; a dead zone takes
+its width from the input above it, a threshold nothing."""
 
 
 class Candidate(NamedTuple):
@@ -57,6 +64,11 @@ class Candidate(NamedTuple):
     null: float
     low: float
     high: float
+
+    @property
+    def field(self) -> str:
+        """Field of Inputs that its value is, "" of another."""
+        return FIELD.get(self.name.split("[")[0], "")
 
 
 def candidates_of(estimation: Estimation) -> list[Candidate]:
@@ -106,7 +118,8 @@ def _of_inputs(loop, data):
         if bank.lag is None:
             yield Candidate("pump-lag", j, f"actuator.lag[{j}]", 0.0, 0.0, longest)
         if bank.dead_zone is None and top > 0.0:
-            yield Candidate("dead-zone", j, f"actuator.dead_zone[{j}]", 0.0, 0.0, 0.9 * top)
+            for name in ("dead_zone", "threshold"):
+                yield Candidate("dead-zone", j, f"actuator.{name}[{j}]", 0.0, 0.0, 0.9 * top)
         if not (loop.plant.curves and loop.plant.curves[j]) and top > 0.0:
             yield Candidate("pump-curve", j, f"plant.curves[{j}]", 1.0, 0.25, 4.0)
 
@@ -188,7 +201,7 @@ class Enlarged(Estimation):
         self.inside = Coordinates((*own.items, *(items[i] for i in leaves)))
         self.inside_at = [*range(own.size), *(known.size + i for i in leaves)]
         self.fields = dict(zip(known.names[own.size :], known.inputs))
-        self.fields |= {c.name: (FIELD[c.kind], c.where, c.null) for c in more if c.kind in FIELD}
+        self.fields |= {c.name: (c.field, c.where, c.null) for c in more if c.field}
         self.known, self.swapped = known.size, ()
         self.usual = np.delete(np.arange(self.size), known.size + np.arange(len(more)))
         self.columns = self.usual
@@ -196,7 +209,7 @@ class Enlarged(Estimation):
         shares = [(c.null - c.low) / (c.high - c.low) for c in more]
         self.begin = np.insert(z, known.size, shares)
         self.by_exponent: dict[str, np.ndarray] = {}
-        if len(leaves) < sum(c.name.startswith("plant.") and c.kind not in FIELD for c in more):
+        if len(leaves) < sum(c.name.startswith("plant.") and not c.field for c in more):
             self.by_exponent = _by_exponent(self.rig_at(z), self._levels(self.begin[None])[0])
 
     def rig_at(self, z):
@@ -284,7 +297,7 @@ class Enlarged(Estimation):
 def _is_leaf(plant, candidate):
     """Whether the value of a Candidate is a leaf of the plant."""
     part, _, leaf = candidate.name.split("[")[0].partition(".")
-    of_plant = part == "plant" and candidate.kind not in FIELD
+    of_plant = part == "plant" and not candidate.field
     return of_plant and getattr(plant, leaf) is not None
 
 
@@ -405,18 +418,32 @@ def accepted(estimation: Estimation, fit: Fit, places: list[tuple[str, tuple]]) 
             trial = _best_of_kind(trial, kind, where)
     chosen = [trial.problem.candidates[i] for i in trial.chosen]
     of = trial.problem.coordinates
+    values = of.values(trial.point[: of.size])
     known = {*estimation.coordinates.names, *(c.name for c in chosen)}
     loop = with_leaves(estimation.case.loop, [c.name for c in chosen])
-    inputs = [c for c in chosen if c.kind in FIELD]
-    leaves = {c.name: (c.low, c.high, "linear") for c in chosen if c.kind not in FIELD}
+    inputs = [c for c in chosen if c.field not in ("", "threshold")]
+    leaves = {c.name: (c.low, c.high, "linear") for c in chosen if not c.field}
+    loop = _with_thresholds(loop, chosen, values)
     bound = lambda c: Bound(c.name, c.low, c.high, "linear", _unit(loop, c))
     return Accepted(
         case=estimation.case.replace(loop=loop),
         logs=logs,
         free={b.name: (b.low, b.high, b.scale) for b in estimation.bounds} | leaves,
-        inputs=[(bound(c), (FIELD[c.kind], c.where, c.null)) for c in inputs],
-        begin={n: float(v) for n, v in of.values(trial.point[: of.size]).items() if n in known},
+        inputs=[(bound(c), (c.field, c.where, c.null)) for c in inputs],
+        begin={n: float(v) for n, v in values.items() if n in known},
     )
+
+
+def _with_thresholds(loop, chosen, values):
+    """Return a loop with the thresholds among the chosen Candidates, which no search estimates."""
+    rows = [c for c in chosen if c.field == "threshold"]
+    if not rows:
+        return loop
+    dead_zone = np.zeros(loop.actuator.pumps)
+    for c in rows:
+        dead_zone[c.where] = values[c.name]
+    actuator = dataclasses.replace(loop.actuator, dead_zone=dead_zone, dead_zone_kind="plain")
+    return dataclasses.replace(loop, actuator=actuator)
 
 
 def _best_of_kind(trial, kind, where):
@@ -457,6 +484,8 @@ def _unit(loop, candidate):
     """Return the unit of the value of a Candidate."""
     if candidate.kind == "pump-delay":
         return "s"
+    if candidate.field == "threshold":
+        return loop.units[1]
     return "-" if candidate.kind == "pump-curve" else describe(loop, candidate.name)["unit"]
 
 
@@ -572,7 +601,35 @@ def _scores(trial):
     share = trial.point[extra]
     outside = (share < 1e-9) & (steps < 0.0) | (share > 1 - 1e-9) & (steps > 0.0)
     steps[outside | np.isin(np.arange(len(extra)), trial.chosen)] = 0.0
-    return steps**2 * size
+    gains = steps**2 * size
+    for i, c in enumerate(problem.candidates):
+        if c.field == "threshold" and i not in trial.chosen:
+            gains[i] = _best_threshold(trial, i, _thresholds(problem, c)[::STRIDE], basis)[0]
+    return gains
+
+
+def _thresholds(problem, candidate):
+    """Return inputs between those that occur, below the range of a Candidate's top."""
+    levels = np.unique(problem.data.u[..., candidate.where])
+    between = 0.5 * (levels[1:] + levels[:-1])
+    return between[(between > candidate.low) & (between < candidate.high)]
+
+
+def _best_threshold(trial, i, options, basis=None):
+    """Return (reduction of the sum of squares to first order, value) of the best threshold."""
+    problem, c = trial.problem, trial.problem.candidates[i]
+    if not len(options):
+        return 0.0, c.null
+    if basis is None:
+        inside = [*problem.usual, *(problem.known + k for k in trial.chosen)]
+        basis, _ = np.linalg.qr(trial.jacobian[:, inside])
+    points = np.tile(trial.point, (1 + len(options), 1))
+    points[1:, problem.known + i] = (options - c.low) / (c.high - c.low)
+    y = problem.simulated(points)
+    rows = trial.residual + (y - y[0])
+    left = np.sum(rows**2, axis=1) - np.sum((rows @ basis) ** 2, axis=1)
+    best = int(np.argmin(left[1:]))
+    return max(float(left[0] - left[1 + best]), 0.0), float(options[best])
 
 
 def _limit(problem):
@@ -598,7 +655,25 @@ def _with(trial, i):
     problem, start = trial.problem, trial.point
     if problem.candidates[i].name in problem.by_exponent:
         problem = Enlarged(problem.original, start[problem.usual], problem.loss, exponents=True)
+    if problem.candidates[i].field == "threshold":
+        return _with_threshold(trial, i)
     return _fit(problem, (*trial.chosen, i), start)
+
+
+def _with_threshold(trial, i):
+    """Return the Trial with the best threshold: between the inputs about the best of a few."""
+    problem, c, at = trial.problem, trial.problem.candidates[i], trial.problem.known + i
+    options, chosen = _thresholds(problem, c), (*trial.chosen, i)
+    value = _best_threshold(trial, i, options[::STRIDE])[1]
+    for _ in range(3):
+        near = np.argmin(np.abs(options - value))
+        value = _best_threshold(trial, i, options[max(near - STRIDE, 0) : near + STRIDE + 1])[1]
+        start = trial.point.copy()
+        start[at] = (value - c.low) / (c.high - c.low)
+        if trial.chosen == chosen and np.isclose(trial.point[at], start[at]):
+            break
+        trial = _fit(problem, chosen, start)
+    return trial
 
 
 def _exchanged(trial, always=False):
@@ -662,5 +737,9 @@ def _with_value(cause, trial):
     at = list(inside).index(problem.known + i)
     c = problem.candidates[i]
     value = c.low + trial.point[problem.known + i] * (c.high - c.low)
+    if c.field == "threshold":
+        levels = np.unique(problem.data.u[..., c.where])
+        ends = [float(levels[levels < value].max()), float(levels[levels > value].min())]
+        return cause._replace(value=float(value), interval95=ends)
     half = 1.96 * float(np.sqrt(covariance[at, at])) * (c.high - c.low)
     return cause._replace(value=float(value), interval95=[float(value - half), float(value + half)])

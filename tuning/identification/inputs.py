@@ -17,6 +17,7 @@ class Inputs(NamedTuple):
     lag: float = 0.0  # time constant [s]
     dead: float = 0.0  # input below which nothing flows
     exponent: float = 1.0  # of the flow in the input, at the same largest flow
+    threshold: float = 0.0  # input at or below which nothing flows, and above it all
 
 
 STATIC = ("actuator.delays", "plant.curves")
@@ -49,11 +50,13 @@ def with_inputs(loop: Any, values: Mapping[str, float], top: np.ndarray) -> Any:
     return dataclasses.replace(loop, actuator=bank, plant=plant)
 
 
-def transformed(dt: np.ndarray, u: np.ndarray, by: Inputs) -> np.ndarray:
+def transformed(dt: np.ndarray, u: np.ndarray, by: Inputs, top: float) -> np.ndarray:
     """Return the means over pieces of length dt (pieces,) of an input u (pieces,) behind a dead
-    zone, a curve, a lag and a delay; the first input is taken to have lasted.
+    zone, a curve that leaves the largest input `top` as it is, a lag and a delay; the first input
+    is taken to have lasted.
     """
-    top = float(u.max())
+    if by.threshold > 0.0:
+        u = np.where(u > by.threshold, u, 0.0)
     if by.dead > 0.0:
         u = np.maximum(u - by.dead, 0.0)
     if by.exponent != 1.0 and top > 0.0:
@@ -94,6 +97,7 @@ def played(data: Any, inputs: tuple, values: Any) -> np.ndarray:
     for j in dict.fromkeys(pump for _, pump, _ in inputs):
         of_pump = [(field, v, null) for (field, pump, null), v in zip(inputs, values) if pump == j]
         by = Inputs(**{field: v - null * (field == "delay") for field, v, null in of_pump})
+        top = float(flat[:, :, j].max())
         for e in range(logs):
-            flat[e, :, j] = transformed(dt[e], flat[e, :, j], by)
+            flat[e, :, j] = transformed(dt[e], flat[e, :, j], by, top)
     return u
