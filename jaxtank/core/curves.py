@@ -5,6 +5,21 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtank.core.numerics import lower_clip
+
+
+def straight_curve(x: Any, y: Any, at: Any) -> Any:
+    """Return straight lines through points (x (.., k), y (.., k)) at `at` (..), the first and last
+    of them prolonged. The inverse is that of x and y exchanged.
+    """
+    slope = (y[..., 1] - y[..., 0]) / (x[..., 1] - x[..., 0])
+    value = y[..., 0] + slope * (at - x[..., 0])
+    for i in range(1, np.shape(x)[-1] - 1):
+        after = (y[..., i + 1] - y[..., i]) / (x[..., i + 1] - x[..., i])
+        value = value + (after - slope) * lower_clip(at - x[..., i], 0.0)
+        slope = after
+    return value
+
 
 def monotone_slopes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return slopes at the points by which the cubic between two of them is monotone

@@ -436,7 +436,8 @@ def _replace(tree: T, path: list[str], index: tuple[int, ...], value: Any, name:
         like = fields[head].metadata.get("like")
         if child is None and like is not None:
             absent = np.inf if fields[head].metadata.get("infinite") else 0.0
-            child = np.full(np.shape(getattr(tree, like)), absent)
+            sibling = getattr(tree, like)  # of a pair that comes together it is absent too
+            child = np.full(np.shape(value if sibling is None else sibling), absent)
         new = _fitted(child, index, value, name)
     return cast(T, dataclasses.replace(cast(Any, tree), **{head: new}))
 

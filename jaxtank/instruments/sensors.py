@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxtank.core.curves import straight_curve
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip, lower_clip, quantise
 from jaxtank.core.tree import POSITIVE, component, leaf, static
@@ -31,7 +32,7 @@ class LevelSensor(Sensor):
     `LevelSensor(noise=[0.1])` suffices where there is no ADC. With `low` and `high`, the levels at
     0 % (4 mA) and 100 % (20 mA), readings stay within them, and the ADC divides what is between.
 
-        y = scale h + offset + noise * xi,  xi ~ N(0, 1);  volts = y / gain, clipped to
+        y = scale curve(h) + offset + noise * xi,  xi ~ N(0, 1);  volts = y / gain, clipped to
         [0, full_scale], rounded to full_scale / 2^bits
 
     The derivative of the ADC is the slope of the line through its staircase (numerics.quantise).
@@ -63,6 +64,18 @@ class LevelSensor(Sensor):
     high: np.ndarray | None = option(
         "cm", "level at 100 % (20 mA): no reading is above; inf: none", **POSITIVE, infinite=True
     )
+    curve_level: np.ndarray | None = option(
+        "cm",
+        "levels of the points of each sensor's curve, increasing",
+        like="curve_reading",
+        shape=("tank", "point"),
+    )
+    curve_reading: np.ndarray | None = option(
+        "cm",
+        "readings at these levels, straight lines between",
+        like="curve_level",
+        shape=("tank", "point"),
+    )
     full_scale: np.ndarray = leaf(
         "volt", "range of the ADC", **POSITIVE, default=lambda own: _without_adc(own, 5.0)
     )
@@ -72,6 +85,8 @@ class LevelSensor(Sensor):
 
     def reading_of(self, tank: int, level: Any, in_volts: bool = False) -> Any:
         """Return what the sensor of one tank reads of a level, without noise and ends."""
+        if self.curve_level is not None and self.curve_reading is not None:
+            level = straight_curve(self.curve_level[tank], self.curve_reading[tank], level)
         level = level if self.scale is None else self.scale[tank] * level
         level = level if self.offset is None else level + self.offset[tank]
         return level / self.gain[tank] if in_volts else level
@@ -80,7 +95,10 @@ class LevelSensor(Sensor):
         """Return the level of a reading of one tank, the inverse of `reading_of`."""
         level = reading * self.gain[tank] if in_volts else reading
         level = level if self.offset is None else level - self.offset[tank]
-        return level if self.scale is None else level / self.scale[tank]
+        level = level if self.scale is None else level / self.scale[tank]
+        if self.curve_level is None or self.curve_reading is None:
+            return level
+        return straight_curve(self.curve_reading[tank], self.curve_level[tank], level)
 
     def step(self, state: Any, x: Sequence, xi: Sequence | None, dt: Any) -> tuple[Sequence, Any]:
         return self.read(x, xi), state
@@ -97,7 +115,11 @@ class LevelSensor(Sensor):
         -------
         (n,) readings [cm]
         """
-        y = x if self.scale is None else each(lambda h, scale: scale * h, x, self.scale)
+        y = x
+        if self.curve_level is not None:
+            curve = lambda h, levels, readings: straight_curve(levels, readings, h)
+            y = each(curve, y, self.curve_level, self.curve_reading)
+        y = y if self.scale is None else each(lambda h, scale: scale * h, y, self.scale)
         y = y if self.offset is None else each(lambda h, offset: h + offset, y, self.offset)
         y = y if xi is None else each(lambda h, noise, z: h + noise * z, y, self.noise, xi)
         if self.low is not None:

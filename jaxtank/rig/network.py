@@ -34,7 +34,7 @@ from jaxtank.rig.entry import (
     unit,
 )
 from jaxtank.rig.schema import INPUTS, LISTS, SECTIONS
-from jaxtank.rig.sensors import complete_rows, leaves_of, sensor_rows, with_names
+from jaxtank.rig.sensors import complete_rows, curve_of, leaves_of, sensor_rows, with_names
 from jaxtank.rig.signals import parts_of
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
@@ -528,7 +528,9 @@ def _sensor_entries(loop, tanks):
         row = {"name": name_of_part(loop.plant, "sensor", i), "tank": i}
         if low is not None and high is not None and np.isfinite([low[i], high[i]]).all():
             row["span"] = [float(low[i]), float(high[i])]
-        if row["name"] or "span" in row:
+        if (curve := curve_of(loop.sensor, i)) is not None:
+            row["curve"] = curve
+        if row["name"] or row.keys() & {"span", "curve"}:
             row["noise"] = tanks[i].pop("noise", None)
             for leaf in ("offset", "scale"):
                 values = getattr(loop.sensor, leaf, None)

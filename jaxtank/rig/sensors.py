@@ -150,8 +150,36 @@ def leaves_of(rows, rims, noise, levels=()):
         leaves["offset"] = [number_of(v, span, True) for v, span in zip(offset, spans)]
     if any("scale" in row for row in rows):
         leaves["scale"] = scale
+    leaves |= _curves(rows, len(rims))
     levels = [number_of(v, span, False) for v, span in zip(levels, spans)]
     return {name: number(value) for name, value in leaves.items()}, levels
+
+
+def _curves(rows, tanks):
+    """{leaf: (n, points)} of the curves of rows, as many points for all; {} of none."""
+    given = {row["tank"]: row["curve"] for row in rows if "curve" in row}
+    if not given:
+        return {}
+    curves = [given.get(i, ((0.0, 0.0), (1.0, 1.0))) for i in range(tanks)]
+    most = max(map(len, curves))
+    points = np.stack([longer(np.array(curve).T, most) for curve in curves], axis=1)
+    return dict(zip(("curve_level", "curve_reading"), points))
+
+
+def longer(values: np.ndarray, count: int) -> np.ndarray:
+    """Return (.., count) points of (.., k): more on the line through the last two."""
+    more = np.arange(1, count - values.shape[-1] + 1) * (values[..., -1:] - values[..., -2:-1])
+    return np.concatenate([values, values[..., -1:] + more], axis=-1)
+
+
+def curve_of(sensor: Any, tank: int) -> list[list[float]] | None:
+    """Return the [[level, reading], ...] of the sensor of a tank, None where it reads the level."""
+    if getattr(sensor, "curve_level", None) is None:
+        return None
+    levels, readings = (np.asarray(v[tank]) for v in (sensor.curve_level, sensor.curve_reading))
+    return (
+        None if np.array_equal(levels, readings) else np.column_stack([levels, readings]).tolist()
+    )
 
 
 def with_sensors(loop, rows):
@@ -256,6 +284,16 @@ def complete_rows(rows: list[dict[str, Any]], tanks: int, length: str) -> list[d
         same = [str(i + 1) for i, row in enumerate(rows) if row["tank"] == tank]
         if len(same) > 1:
             problems.append(f"sensors {' and '.join(same)} read one tank: give one of them")
+    problems += _turning(rows)
     if problems:
         raise InputError("; ".join(problems))
     return rows
+
+
+def _turning(rows):
+    """What is wrong with the curves of rows of [[sensor]]."""
+    return [
+        f"sensor {i + 1}: curve: its readings must increase with the level"
+        for i, row in enumerate(rows)
+        if np.any(np.diff([reading for _, reading in row.get("curve", ())]) <= 0)
+    ]

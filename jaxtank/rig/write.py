@@ -241,17 +241,21 @@ def _settable(case):
         # a tuple is the topology of the rig; an array of a rig without pipes, say, is empty
         empty = isinstance(value, tuple) or (value is not None and np.size(value) == 0)
         # what a rig does not have is added by its tables, not by a value
-        empty = empty or (value is None and name.rpartition(".")[0].endswith(("plant", "model")))
+        curve = name.startswith("sensor.curve")
+        inside = name.rpartition(".")[0].endswith(("plant", "model"))
+        empty = empty or (value is None and (inside or curve))
         if not empty and not name.startswith(tables) and name not in scheduled:
             yield name, None if value is None else np.asarray(value).tolist(), meta
+
+
+SENSOR = {f"sensor.{name}" for name in ("low", "high", "curve_level", "curve_reading")}
+"""Fields that keys of [[sensor]] give together."""
 
 
 def _is_built(case, name, tankwise, same):
     """Whether the tables that build a case set the field `name` of its loop."""
     part = name.partition(".")[0]
-    if tankwise and (
-        part == "plant" or name in targets(*LISTS, "sensors") | {"sensor.low", "sensor.high"}
-    ):
+    if tankwise and (part == "plant" or name in targets(*LISTS, "sensors") | SENSOR):
         return True
     if part not in components.ROLES or part in same:
         return False

@@ -78,6 +78,10 @@ def design_for(
     loop = case.loop
     if not isinstance(loop.plant, TankNetwork) or not isinstance(loop.sensor, LevelSensor):
         raise InputError("safety_filter: needs a TankNetwork as the plant and a LevelSensor")
+    if loop.sensor.curve_level is not None:
+        raise InputError(
+            "safety_filter: not covered: curve of [[sensor]]; give readings as levels, without it"
+        )
     box, more = _box(case, widths)
     draw, inflow, volume, draws = _disturbances(loop, case.clock)
     rim, top = spread(loop.plant.rim, "plant.rim", box)[0], case.limits.get("max_level", "rim")

@@ -92,11 +92,40 @@ class Branches(NamedTuple):
         return [[first, second], [share * (1 - share), -share * (1 - share)]]
 
 
+class Ladder(NamedTuple):
+    """Levels of the points of a sensor's curve below its last: p the logarithms of their distances,
+    so that they increase."""
+
+    names: tuple
+    top: float  # level of the last point
+
+    @property
+    def box(self):
+        """(low, high) of each coordinate."""
+        return [(np.log(1e-3 * self.top), np.log(self.top))] * len(self.names)
+
+    def values(self, p, exp):
+        """Return the levels at p, the first point first."""
+        levels, level = [], self.top
+        for distance in reversed(p):
+            level = level - exp(distance)
+            levels.append(level)
+        return tuple(reversed(levels))
+
+    def point(self, *levels):
+        """Return p of levels."""
+        return np.log(np.maximum(np.diff([*levels, self.top]), 1e-300)).tolist()
+
+    def slopes(self, p):
+        """Return d level / dp."""
+        return np.triu(np.tile(-np.exp(p), (len(p), 1)))
+
+
 @dataclasses.dataclass(frozen=True)
 class Coordinates:
     """The coordinates p of the parameters to be estimated, as a hashable description."""
 
-    items: tuple  # of Scalar and Branches
+    items: tuple  # of Scalar, Branches and Ladder
     inputs: tuple = ()  # (field of Inputs, pump, null) of each of the last items, in no program
 
     @property
@@ -149,9 +178,13 @@ class Coordinates:
 def coordinates_of(bounds, branches=True, inputs=()):
     """Return the Coordinates of a list of jaxtank.bounds.Bound, the last of `inputs`."""
     by_name = {b.name: b for b in bounds}
-    items = {}
+    items: dict[str, Any] = {}
     for b in bounds:
-        _, index = split_index(b.name)
+        base, index = split_index(b.name)
+        if base == "sensor.curve_level" and branches:
+            curve = items.get(f"{base}[{index[0]}]", Ladder((), b.high))
+            items[f"{base}[{index[0]}]"] = curve._replace(names=(*curve.names, b.name))
+            continue
         pump = index[0] if index else None
         gain, split = (by_name.get(f"plant.{n}[{pump}]") for n in ("pump_gain", "split"))
         if not (branches and gain and split and b in (gain, split)):

@@ -2,6 +2,7 @@
 sensitivities from several starts.
 """
 
+import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -20,8 +21,10 @@ from tuning.identification.design import remedies
 from tuning.identification.diagnosis import accepted, place_of
 from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare, check_kind
+from tuning.identification.innovations import KINDS, chosen
 from tuning.identification.least_squares import Fit, profile_likelihood, solve
 from tuning.identification.problem import Estimation
+from tuning.identification.refinement import refined
 from tuning.identification.residuals import quality, residuals_of, validate
 from tuning.identification.result import Identification
 from tuning.identification.sanity import oddities
@@ -56,6 +59,8 @@ def identify(
     law: str | None = None,
     prior: bool = True,
     accept: Sequence[str] = (),
+    refine: bool = False,
+    likelihood: str = "output-error",
 ) -> Identification:
     """Estimate parameters of a rig from experiment data, by least squares on simulated readings.
 
@@ -109,6 +114,15 @@ def identify(
     accept : sequence of str
         Causes of a `diagnosis` to put into the rig and estimate: "pump-delay", or with its place
         from 1, "pump-delay:2", "swapped:1,2".
+    refine : bool
+        Whether parts that the rig lacks are added where blocks of the data are then predicted
+        better by fits to the others: a curve of a sensor, the exponent of an outlet or a linear
+        one beside it, the area of a tank without a reading.
+    likelihood : {"output-error", "innovations", "auto"}
+        "output-error": readings are simulated levels with white noise. "innovations": noise also
+        drives each level, and an extended Kalman filter predicts each reading from those before, so
+        that intervals hold where the rig differs a little from its equations. "auto": by the
+        autocorrelation of the residuals, then by Schwarz's criterion (BIC).
 
     Returns
     -------
@@ -135,8 +149,21 @@ def identify(
     (<Status.CONVERGED: 'converged'>, ['plant.pump_gain[0]'])
     """
     began = time.perf_counter()
-    _check_settings(loss, starts=starts, iterations=iterations)
+    _check_settings(loss, likelihood, starts=starts, iterations=iterations)
     places = [place_of(text) for text in accept]
+    if refine:
+        if places:
+            raise InputError(
+                "accept and refine: each changes the rig; accept a cause first, with out, and refine"
+                " the rig that is written"
+            )
+        same: dict[str, Any] = {"start": start, "hold_back": hold_back, "noise": noise}
+        same |= {"seed": seed, "loss": loss, "substeps": substeps, "iterations": iterations}
+        same |= {"gap": gap, "prior": prior}
+        more = {"checkpoint": checkpoint, "resume": resume, "progress": progress, "ready": ready}
+        first = identify(case, log, free, starts=starts, **same, **more)
+        same |= {"profile": profile, "law": law, "likelihood": likelihood}
+        return _refined(first, log, same, began)
     case = bare(case) if isinstance(case, Plant) else case
     check_kind(law, case)
     logs = checked(log, case.loop, gap)
@@ -167,6 +194,10 @@ def identify(
     if spread.open_axes.any():
         best = _nearest(estimation, best, spread.scale, settings)
         spread, fit_quality = _spread(estimation, best)
+    simulated = best
+    best, spread, fit_quality, kind = _likeliest(
+        likelihood, estimation, simulated, (spread, fit_quality), iterations
+    )
     parameters = spread.parameters()
     status = _status(case, best, parameters, interrupted)
     unclear = status is Status.NOT_IDENTIFIABLE
@@ -181,12 +212,13 @@ def identify(
         directions=spread.directions(),
         oddities=[odd for log in logs for odd in oddities(log, estimation.case.loop)],
         remedies=remedies(estimation, best, spread) if unclear else [],
-        quality=fit_quality
-        | {"widened": spread.widened, "noise": [float(v) for v in estimation.noise]},
+        quality=fit_quality | {"widened": spread.widened, "noise": kind.pop("noise")},
+        likelihood=kind,
+        simulated=simulated,
         starts=_starts(fits),
         validation=validation,
         profile=profile_likelihood(estimation, best, spread, loss)
-        if profile and not interrupted
+        if profile and not interrupted and best is simulated
         else None,
         wall_s=time.perf_counter() - began,
         seed=seed,
@@ -222,9 +254,25 @@ def _all(cache, partial, logs, counts, options, search):
     return fits, interrupted, estimation, best, validation
 
 
-def _check_settings(loss, **counts):
+def _refined(first, log, settings, began):
+    """Return the Identification of the rig of a first one with the parts that it lacks."""
+    if first.status is Status.INTERRUPTED:
+        return first
+    case, free, added = refined(first, {name: settings[name] for name in ("loss", "iterations")})
+    again = identify(case, log, free, starts=1, **settings)
+    return dataclasses.replace(again, refinements=added, wall_s=time.perf_counter() - began)
+
+
+def _check_settings(loss, likelihood, **counts):
     if loss not in LOSSES:
         raise InputError(f"loss = {loss!r}: must be one of {', '.join(LOSSES)}")
+    if likelihood not in KINDS:
+        raise InputError(f"likelihood = {likelihood!r}: must be one of {', '.join(KINDS)}")
+    if loss != "linear" and likelihood != "output-error":
+        raise InputError(
+            f"loss = {loss!r} beside likelihood = {likelihood!r}: the filter is that of normal"
+            " noise: leave one of them out"
+        )
     for name, count in counts.items():
         if not isinstance(count, int) or isinstance(count, bool) or count < 1:
             raise InputError(f"{name} = {count!r}: must be a whole number above 0")
@@ -340,10 +388,26 @@ def _within_ranges(estimation, fit, settings):
     return plain, solve(plain, np.clip(start, *plain.box), **settings)
 
 
-def _spread(estimation, fit):
-    """Return (Spread, quality) of a Fit."""
+def _likeliest(likelihood, estimation, simulated, before, iterations):
+    """Return (Fit, Spread, quality, report) of the likelihood that is asked for or chosen, after a
+    Fit to simulated readings with its (Spread, quality).
+    """
+    result, report = chosen(likelihood, estimation, simulated, iterations)
+    if result is None:
+        return simulated, *before, report | {"noise": [float(v) for v in estimation.noise]}
+    after = _spread(estimation, result.fit, whitened=True)
+    return result.fit, *after, report | {"noise": result.noise.tolist()}
+
+
+def _spread(estimation, fit, whitened=False):
+    """Return (Spread, quality) of a Fit; `whitened`: its residual are innovations."""
     fit_quality = quality(estimation.data.y, residuals_of(estimation, fit))
-    return Spread(estimation, fit, fit_quality["residual_autocorrelation"]), fit_quality
+    correlation = fit_quality["residual_autocorrelation"]
+    if whitened:
+        residual = np.full(estimation.mask.shape, np.nan)
+        residual[estimation.mask] = fit.residual
+        correlation = quality(estimation.data.y, residual)["residual_autocorrelation"]
+    return Spread(estimation, fit, correlation), fit_quality
 
 
 def _nearest(estimation, best, scale, settings):

@@ -86,11 +86,12 @@ def identified_plant(result):
             if name.startswith("plant.") and model is not None and rigs.has(loop, inner):
                 loop = with_values(loop, {inner: p["value"]})
     noise = np.array(loop.sensor.noise, dtype=float)
-    white = result.quality["widened"] <= 1.05
+    by_filter = result.likelihood.get("kind") == "innovations"
+    white = result.quality["widened"] <= 1.05 and not by_filter
     channels = result.estimation.data.channels
     for (tank, volts), rmse, sd in zip(channels, result.quality["rmse"], result.quality["noise"]):
         gain = float(loop.sensor.gain[tank]) if volts else 1.0
-        noise[tank] = (rmse if white else min(rmse, sd)) * gain
+        noise[tank] = (rmse if white else sd if by_filter else min(rmse, sd)) * gain
     loop = with_values(loop, {"sensor.noise": noise})
     names, matrix = _with_earlier(case.covariance, result)
     uncertain = {}

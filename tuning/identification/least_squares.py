@@ -8,7 +8,6 @@ from typing import Any, cast
 import numpy as np
 from scipy import optimize
 
-from tuning.identification.problem import Estimation
 from tuning.identification.residuals import ROBUST_LIMIT
 
 CHI_SQUARED_95 = 3.841458820694124
@@ -27,6 +26,7 @@ class Fit:
     evaluations: int
     status: int  # of scipy: above 0 where it has converged
     loss: str = "linear"
+    z: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))  # (unknowns,)
 
 
 class _Residual:
@@ -72,7 +72,7 @@ class _Residual:
 
 
 def solve(
-    estimation: Estimation,
+    estimation: Any,
     start: np.ndarray,
     loss: str = "linear",
     iterations: int = 100,
@@ -80,7 +80,9 @@ def solve(
     tolerance: float = 1e-14,
     prior: Any = None,
 ) -> Fit:
-    """Return the Fit of a search from the unknowns `start` (unknowns,)."""
+    """Return the Fit of a search from the unknowns `start` (unknowns,) of an Estimation, or of a
+    Likelihood.
+    """
     before, residual = estimation.evaluations, _Residual(estimation, start, fixed or {}, prior)
     low, high = (side[residual.free] for side in estimation.box)
     begin = np.clip(residual.point[residual.free], low, high)
@@ -116,6 +118,7 @@ def solve(
         evaluations=estimation.evaluations - before,
         status=status,
         loss=loss,
+        z=end,
     )
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -102,6 +103,14 @@ class Identification(Result):
         Kind of controller that is proposed for the identified rig.
     accepted : tuple of str
         Causes that were put into the rig.
+    likelihood : dict
+        {"kind", "asked", "reason", "bic", "process_noise"}: "output-error" or "innovations", why,
+        and the standard deviation that the process noise adds to each level per root of a second.
+    simulated : Fit
+        That to simulated readings, of which the `diagnosis` is.
+    refinements : list
+        Parts that were added to the rig: (kind, where, before, after), the RMS of predicted blocks
+        in the noise without it and with it.
     """
 
     case: Any
@@ -122,13 +131,16 @@ class Identification(Result):
     seed: int
     law: str | None = None
     accepted: tuple = ()
+    likelihood: dict[str, Any] = dataclasses.field(default_factory=dict)
+    refinements: Sequence[Any] = ()
+    simulated: Fit | None = None
 
     @functools.cached_property
     def structure(self) -> Diagnosis:
         """Whether the structure of the rig is right: tests of the residuals, fits of what passes
         them.
         """
-        return diagnose(self.estimation, self.fit)
+        return diagnose(self.estimation, self.simulated or self.fit)
 
     @property
     def diagnosis(self) -> dict[str, Any]:

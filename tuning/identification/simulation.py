@@ -142,9 +142,9 @@ def changes_of(u):
     return 1 + np.flatnonzero(np.any(np.diff(u, axis=0) != 0.0, axis=1))
 
 
-def readings(rig, dt, u, channels, substeps, flows=None):
-    """Return (samples, channels) readings without noise, in the channels' units; levels where there
-    are no channels. flows : (samples, tanks) inflows beside the rig's own.
+def player(rig, dt, u, substeps):
+    """Return (levels, state of the pumps, (levels, state, pieces of a sample, further inflows) ->
+    both one sample later, pieces of all samples).
     """
     if dt.ndim == 1:
         dt, u = dt[:, None], u[:, None]
@@ -170,13 +170,8 @@ def readings(rig, dt, u, channels, substeps, flows=None):
             rig.plant, "rk4", 0.0, x, driven, enters, step, substeps, rolled=True
         ).x, state
 
-    def sample(carry, now):
-        pieces, more = now
-        y = carry[0]
-        if channels is not None:
-            y = tuple(rig.sensor.reading_of(i, carry[0][i], volts) for i, volts in channels)
-        (x, state), (step, inputs) = carry, pieces[0]
-        x, state = advanced(x, state, step, inputs, more)
+    def stepped(x, state, pieces, more=None):
+        x, state = advanced(x, state, *pieces[0], more)
         for step, inputs in pieces[1:]:
             # a piece of length zero is none: a pump with memory would see a sample
             x, state = jax.tree.map(
@@ -184,11 +179,26 @@ def readings(rig, dt, u, channels, substeps, flows=None):
                 advanced(x, state, step, inputs, more),
                 (x, state),
             )
-        return (x, state), y
+        return x, state
 
     pumps = range(rig.plant.pumps)
     pieces = tuple((dt[:, i], tuple(u[:, i, j] for j in pumps)) for i in range(dt.shape[1]))
+    return x, state, stepped, pieces
+
+
+def readings(rig, dt, u, channels, substeps, flows=None):
+    """Return (samples, channels) readings without noise, in the channels' units; levels where there
+    are no channels. flows : (samples, tanks) inflows beside the rig's own.
+    """
+    x, state, stepped, pieces = player(rig, dt, u, substeps)
     more = None if flows is None else tuple(flows[:, i] for i in range(rig.plant.tanks))
+
+    def sample(carry, now):
+        y = carry[0]
+        if channels is not None:
+            y = tuple(rig.sensor.reading_of(i, carry[0][i], volts) for i, volts in channels)
+        return stepped(carry[0], carry[1], *now), y
+
     return jnp.stack(scan(sample, (x, state), (pieces, more), length=dt.shape[0])[1], axis=-1)
 
 

@@ -298,7 +298,8 @@ def _sensor(loop):
     bits = f"an ADC of {sensor.bits} bits" if sensor.bits else "no ADC (sensor.bits)"
     offset = "" if sensor.offset is None else f", offset {_list(sensor.offset)} {length}"
     scale = "" if sensor.scale is None else f", reading {_list(sensor.scale)} of the level"
-    return f"Sensors: one per tank, {noise}, {bits}{offset}{scale}."
+    curve = "" if sensor.curve_level is None else ", readings by a curve (curve of [[sensor]])"
+    return f"Sensors: one per tank, {noise}, {bits}{curve}{scale}{offset}."
 
 
 def _actuator(loop):

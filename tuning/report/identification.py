@@ -46,6 +46,8 @@ def sentences_of(fit):
     agree = sum(s["agrees"] for s in fit.starts)
     words = [*_ending(fit), f"{agree} of {len(fit.starts)} starts ended in the same place"]
     words += _residuals(fit)
+    words += _likelihood(fit)
+    words += _refinements(fit)
     words += _prior(fit)
     words += [
         f"{n} ends at its bound, {p['value']:.4g} {p['unit']}: no interval"
@@ -220,6 +222,53 @@ def _residuals(fit):
         words.append(f"{name}: residual {rmse:.3g} {unit} RMS{percent}, {correlation}")
     if q["widened"] > 1.05:
         words.append(f"intervals are {q['widened']:.1f} times wider, for correlated residuals")
+    return words
+
+
+def _likelihood(fit):
+    """Return a sentence on the likelihood that was maximised, where it was asked for."""
+    chosen = fit.likelihood
+    if chosen.get("asked", "output-error") == "output-error":
+        return []
+    why = {"asked": "as asked", "white": "as the residuals are white"}.get(chosen["reason"])
+    if chosen["bic"]:
+        values = ", ".join(f"{v:.1f} for {kind}" for kind, v in chosen["bic"].items())
+        why = f"by the lower BIC, {values}"
+    words = f"likelihood: {chosen['kind']}, {why}"
+    if chosen["kind"] == "innovations":
+        unit, plant = fit.case.loop.units[0], fit.case.loop.plant
+        process = ", ".join(
+            f"{label_of(plant, 'tank', i)} {sd:.2g}" for i, sd in enumerate(chosen["process_noise"])
+        )
+        noise = ", ".join(
+            f"{name} {sd:.3g} {of}" for (name, of), sd in zip(fit.channels, fit.quality["noise"])
+        )
+        words += f"; process noise [{unit}/s^0.5]: {process}; noise of the readings: {noise}"
+    return [words]
+
+
+PARTS = {
+    "sensor-curve": "a curve of the sensor of {}",
+    "outlet-exponent": "an exponent of an outlet of {}",
+    "outlet-linear": "a linear outlet of {}, beside the other",
+    "area": "the cross-section of {}",
+}
+"""{kind of a part that was added to a rig: what it is}"""
+
+
+def _refinements(fit):
+    """Return a sentence on each part that was added to the rig."""
+    noise, words = fit.quality["noise"], []
+    scale, unit = (noise[0], fit.channels[0][1]) if len(noise) == 1 else (1.0, "times the noise")
+    for part in fit.refinements:
+        plant, tank = fit.case.loop.plant, part.where
+        read = part.kind == "sensor-curve"
+        label = reading_label(plant, tank) if read else label_of(plant, "tank", tank)
+        what = PARTS[part.kind].format(label)
+        words.append(
+            f"added: {what}: a quarter of the data is predicted by a fit to the rest with"
+            f" {scale * part.after:.3g} {unit} RMS, without it with {scale * part.before:.3g}"
+        )
     return words
 
 
@@ -402,6 +451,10 @@ def json_of(fit):
         ],
         "intervals_widened": quality["widened"],
         "prior": clean(fit.prior),
+        "likelihood": clean(fit.likelihood),
+        "refinements": [
+            clean(part._asdict() | {"where": part.where + 1}) for part in fit.refinements
+        ],
         "oddities": [
             clean(odd._asdict() | {"sentence": sentence})
             for odd, sentence in zip(fit.oddities, sentences_on(fit.oddities))

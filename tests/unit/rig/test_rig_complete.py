@@ -136,7 +136,7 @@ def test_every_name_stands_in_the_file_with_its_unit_and_range():
                 isinstance(value, tuple)
                 or np.size(value) == 0
                 or (value is None and name.rpartition(".")[0].endswith(("plant", "model")))
-                or name.startswith(("reference.", "disturbance."))
+                or name.startswith(("reference.", "disturbance.", "sensor.curve"))
             ):
                 continue
             above = re.search(rf'(?m)^(# .*)\n#?"{re.escape(name)}" = ', text)

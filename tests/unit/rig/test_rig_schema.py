@@ -214,6 +214,7 @@ span = [0.05, 0.9]
 noise = 0.002
 offset = 0.01
 scale = 1.02
+curve = [[0.0, 0.01], [0.5, 0.4], [0.9, 0.9]]
 [plant]
 gravity = 9.81
 [controller]

@@ -167,3 +167,52 @@ def test_a_sensor_reads_a_share_of_the_level_and_a_file_keeps_it():
     sensor = rig.loads(rig.dump(rig.loads(table))).loop.sensor
     assert [float(y) for y in sensor.read((0.5, 0.5), None)] == pytest.approx([0.5, 0.47])
     assert sensor.level_of(1, sensor.reading_of(1, 0.3)) == pytest.approx(0.3, rel=1e-12)
+
+
+CURVES = [[[1.0, 0.8], [4.0, 2.4], [9.0, 8.9], [15.0, 15.0]], [[0.0, 0.5], [20.0, 18.0]]]
+CURVED = """
+tank = [{ area = 20.0, rim = 30.0, drain = 0.3 }, { area = 15.0, rim = 30.0, drain = 0.2 }]
+pump = [{ to = [1, 2], gain = 4.0, split = 0.5, high = 12.0 }]
+inputs = { initial = [5.0] }
+[[sensor]]
+tank = 1
+curve = [[1.0, 0.8], [4.0, 2.4], [9.0, 8.9], [15.0, 15.0]]
+[[sensor]]
+tank = 2
+curve = [[0.0, 0.5], [20.0, 18.0]]
+"""
+
+
+def test_a_curve_of_a_sensor_is_that_of_numpy_and_straight_beyond_its_ends():
+    case = rig.loads(CURVED)
+    sensor, levels = case.loop.sensor, np.linspace(-1.0, 25.0, 53)
+    for tank, points in enumerate(CURVES):
+        h, y = np.array(points).T
+        expected = np.interp(levels, h, y)
+        for end, side in ((0, levels < h[0]), (-1, levels > h[-1])):
+            slope = np.diff(y)[end] / np.diff(h)[end]
+            expected[side] = y[end] + slope * (levels[side] - h[end])
+        tuples = [float(sensor.read((h, h), None)[tank]) for h in levels]
+        arrays = [float(sensor.read(jnp.array([h, h]), None)[tank]) for h in levels]
+        np.testing.assert_allclose(tuples, expected, atol=1e-12)
+        np.testing.assert_allclose(arrays, expected, atol=1e-12)
+        np.testing.assert_allclose(sensor.level_of(tank, expected), levels, atol=1e-12)
+        slope = jax.grad(lambda h, tank=tank: sensor.read((h, h), None)[tank])(6.0)
+        assert slope == pytest.approx(np.interp(6.5, h, y) - np.interp(5.5, h, y))
+
+
+@pytest.mark.parametrize("preset", ["", 'case = "cascaded/pi"\n'])
+def test_a_curve_of_a_sensor_is_written_back(preset):
+    text = preset + CURVED[CURVED.index("[[sensor]]") :] if preset else CURVED
+    case = rig.loads(text)
+    again = rig.loads(rig.dump(case))
+    levels = np.linspace(0.0, 12.0, 7)
+    for tank in range(2):
+        reading = case.loop.sensor.reading_of(tank, levels)
+        assert np.max(np.abs(reading - levels)) > 0.3
+        np.testing.assert_allclose(again.loop.sensor.reading_of(tank, levels), reading, atol=1e-12)
+
+
+def test_a_curve_of_a_sensor_that_turns_is_refused():
+    with pytest.raises(InputError, match="sensor 2: curve: its readings must increase"):
+        rig.loads(CURVED.replace("[20.0, 18.0]", "[20.0, 0.4]"))

@@ -123,6 +123,8 @@ def _identify(args, case):
         law=args.law,
         prior=not args.no_prior,
         accept=args.accept or (),
+        refine=args.refine,
+        likelihood=args.likelihood,
     )
     line.end()
     _report_next(args, result, finish(result, args))
@@ -329,6 +331,11 @@ FIT = (
            " estimate it: pump-delay, sensor-scale:2", kind="list"),
     Option("--no-prior", help="these data alone: without the [covariance] of an earlier"
            " identification", kind="flag"),
+    Option("--likelihood", "KIND", "output-error (noise of the readings alone), innovations (noise"
+           " of the levels too, by an extended Kalman filter), or auto", default="output-error",
+           choices=("output-error", "innovations", "auto")),
+    Option("--refine", help="also: parts that the rig lacks, where blocks of the data are then"
+           " predicted better: curves of sensors, exponents of outlets", kind="flag"),
     Option("--profile", help="also: profile likelihood of the least certain parameter",
            kind="flag"),
     RESUME,

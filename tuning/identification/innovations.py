@@ -1,0 +1,274 @@
+"""The likelihood of experiment data by an extended Kalman filter: noise drives the levels too."""
+
+import dataclasses
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import with_values
+from jaxtank.xla.hoist import scan
+from tuning.identification.least_squares import Fit, solve
+from tuning.identification.problem import LARGEST_SLOPE, Estimation
+from tuning.identification.residuals import autocorrelation, residuals_of
+from tuning.identification.simulation import player
+
+KINDS = ("output-error", "innovations", "auto")
+WHITE = 3.0
+"""Autocorrelation of residuals, in standard deviations of that of noise, up to which they count as
+noise of the readings alone."""
+REACH = 3.0
+"""Logarithm of the factor by which the noise of the readings may differ from its first value."""
+PROCESS = (1e-8, 1e-1)
+"""Range of the process noise, in rims per root of a second."""
+
+
+ALIKE = 0.5
+"""Standard deviation of the logarithm of a tank's process noise about the mean of all tanks'."""
+
+
+class Filtered(NamedTuple):
+    """A fit by the innovations."""
+
+    fit: Fit  # residual and Jacobian of the innovations in their standard deviations
+    process: np.ndarray  # (tanks,) standard deviation per root of time [cm/s^0.5]
+    noise: np.ndarray  # (channels,) of the readings, in their units
+    log_likelihood: float
+
+
+def innovations(rig, dt, u, y, present, process, variance, channels, substeps):
+    """Return (samples, channels) innovations and their variances, in the channels' units.
+
+    process : (tanks,) variance that each level gains per second [cm^2/s]
+    variance : (channels,) of the readings
+    """
+    n = range(rig.plant.tanks)
+    x, state, stepped, pieces = player(rig, dt, u, substeps)
+    zero, one = 0.0 * x[0], 1.0 + 0.0 * x[0]
+    steps = dt if dt.ndim == 1 else dt.sum(axis=-1)
+    unit = tuple(jnp.eye(len(n), dtype=one.dtype))
+
+    def corrected(x, P, c, y, present):
+        tank, volts = channels[c]
+        read = lambda h: rig.sensor.reading_of(tank, h, volts)
+        reading, slope = jax.jvp(read, (x[tank],), (one,))
+        along = [slope * P[i][tank] for i in n]
+        S, v = slope * along[tank] + variance[c], y - reading
+        K = [jnp.where(present, a / S, 0.0) for a in along]
+        x = tuple(x[i] + K[i] * v for i in n)
+        return x, [[P[i][j] - K[i] * along[j] for j in n] for i in n], (v, S)
+
+    def sample(carry, now):
+        (x, P, state), (pieces, step, y, present), rows = carry, now, []
+        for c in range(len(channels)):
+            x, P, row = corrected(x, P, c, y[c], present[c])
+            rows.append(row)
+        onward = lambda x: stepped(x, state, pieces)[0]
+        # columns of the transition matrix F = d x(next) / d x
+        slope = lambda tangent: jax.jvp(onward, (x,), (tangent,))[1]
+        F = jax.vmap(slope)(unit)
+        after, state = stepped(x, state, pieces)
+        FP = [[sum(F[i][k] * P[k][j] for k in n) for j in n] for i in n]
+        P = [[sum(FP[i][k] * F[j][k] for k in n) for j in n] for i in n]
+        # the upper half of both: round-off would make them differ
+        P = [[P[min(i, j)][max(i, j)] + (i == j) * process[i] * step for j in n] for i in n]
+        return (after, P, state), tuple(rows)
+
+    columns = lambda values: tuple(values[:, c] for c in range(len(channels)))
+    start = (x, [[zero for _ in n] for _ in n], state)
+    now = (pieces, steps, columns(y), columns(present))
+    rows = scan(sample, start, now, length=dt.shape[0])[1]
+    return tuple(jnp.stack(v, axis=-1) for v in zip(*rows))
+
+
+@functools.partial(jax.jit, static_argnames=("coordinates", "tanks", "channels", "substeps"))
+def sensitivities(
+    rig, dt, u, y, present, p, first, noises, *, coordinates, tanks, channels, substeps
+):
+    """Return innovations and variances (logs, samples, channels), and their derivatives by the
+    unknowns of each log: coordinates p, levels `first`, and the logarithms `noises` of the standard
+    deviations of the tanks and of the channels.
+    """
+    shared, n = coordinates.size, rig.plant.tanks
+
+    def of_log(dt, u, y, present, first):
+        def run(q):
+            r = with_values(rig, coordinates.values(q[:shared]))
+            levels = q[shared : shared + len(tanks)]
+            r = with_values(r, {f"x0[{tank}]": h for tank, h in zip(tanks, levels)})
+            variances = jnp.exp(2.0 * q[shared + len(tanks) :])
+            parts = (variances[:n], variances[n:], channels, substeps)
+            return innovations(r, dt, u, y, present, *parts)
+
+        q = jnp.concatenate([p, first[: len(tanks)], noises])
+        slope = lambda tangent: jax.jvp(run, (q,), (tangent,))
+        return jax.vmap(slope, out_axes=(None, -1))(jnp.eye(q.size, dtype=q.dtype))
+
+    return jax.vmap(of_log)(dt, u, y, present, first)
+
+
+class Likelihood:
+    """Minus twice the logarithm of the likelihood as a sum of squares, for `solve`.
+
+        sum v^2 / S + log S = sum (v / root S)^2 + (root(log S + c))^2 - c
+
+    With c = 1 - log S the Gauss-Newton matrix of these rows is Fisher's information. c is that of
+    the least S, and the rows are real for every S. The unknowns are those of an Estimation, then
+    the logarithms of the process noise of each tank and of the noise of each channel.
+    """
+
+    def __init__(self, estimation: Estimation):
+        self.estimation, self.coordinates = estimation, estimation.coordinates
+        self.prior, self.evaluations = estimation.prior, 0
+        rim = np.asarray(estimation.case.loop.plant.rim, dtype=float)
+        noise = np.log(estimation.noise)
+        low, high = estimation.box
+        ends = [np.log(rim * end) for end in PROCESS]
+        self.box = (
+            np.concatenate([low, ends[0], noise - REACH]),
+            np.concatenate([high, ends[1], noise + REACH]),
+        )
+        self.shift = 1.0 - 2.0 * (noise - REACH)
+        # else the noise of a tank of which few readings tell would often be estimated as 0
+        first, n = estimation.size, rim.size
+        self.alike = np.zeros((n, self.size))
+        self.alike[:, first : first + n] = (np.eye(n) - 1.0 / n) / ALIKE
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns [-]."""
+        return self.box[0].size
+
+    def split(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (coordinates, levels) of the unknowns z."""
+        return self.estimation.split(z[: self.estimation.size])
+
+    def prior_rows(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (residual, Jacobian) of the prior at coordinates p."""
+        rows, slopes = self.estimation.prior_rows(p)
+        return rows, np.pad(slopes, ((0, 0), (0, self.size - slopes.shape[1])))
+
+    def at(self, z: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return innovations v (rows,), variances S, and their Jacobians (rows, unknowns)."""
+        est, data = self.estimation, self.estimation.data
+        levels, tanks = est.first_levels(z[: est.size]), est.tanks
+        rig, shared, free = est.rig, est.coordinates.size, len(est.tanks)
+        if not tanks:
+            tanks = tuple(range(levels.shape[1]))
+        results, slopes = sensitivities(
+            rig,
+            data.dt,
+            data.u,
+            np.where(est.mask, data.y, 0.0),
+            est.mask,
+            self.split(z)[0],
+            levels,
+            z[est.size :],
+            coordinates=est.coordinates,
+            tanks=tanks,
+            channels=data.channels,
+            substeps=est.substeps,
+        )
+        self.evaluations += 1
+        parts, jacobians = [np.asarray(v)[est.mask] for v in results], []
+        log = np.broadcast_to(np.arange(len(est.logs))[:, None, None], est.mask.shape)[est.mask]
+        for slope in map(np.asarray, slopes):
+            rows = slope[est.mask]
+            jacobian = np.zeros((len(rows), self.size))
+            jacobian[:, :shared] = rows[:, :shared]
+            jacobian[:, est.size :] = rows[:, shared + len(tanks) :]
+            for e in range(len(est.logs) if free else 0):
+                begin = shared + e * free
+                own = rows[log == e, shared : shared + free] * est.level_scale[:free]
+                jacobian[log == e, begin : begin + free] = own
+            jacobians.append(jacobian)
+        return (*parts, *jacobians)
+
+    def residual_and_jacobian(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (residual (rows,), Jacobian (rows, unknowns)) of the sum of squares."""
+        with np.errstate(all="ignore"):
+            v, S, dv, dS = self.at(z)
+            a, dS = v / np.sqrt(S), dS / S[:, None]
+            channel = np.nonzero(self.estimation.mask)[2]
+            b = np.sqrt(np.log(S) + self.shift[channel])
+            da = dv / np.sqrt(S)[:, None] - 0.5 * a[:, None] * dS
+            rows = np.concatenate([a, b, self.alike @ z])
+            jacobian = np.concatenate([da, 0.5 * dS / b[:, None], self.alike])
+        if not np.all(np.abs(jacobian) < LARGEST_SLOPE):  # also where it is NaN
+            return np.full_like(rows, np.nan), np.zeros_like(jacobian)
+        return rows, jacobian
+
+    def start(self, fit: Fit) -> np.ndarray:
+        """Return the unknowns from which the search after a Fit to the simulated readings begins:
+        the process noise that explains how its residuals change from sample to sample.
+        """
+        est = self.estimation
+        residual, steps = residuals_of(est, fit), est.data.steps[:, :-1, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            gained = np.diff(residual, axis=1) ** 2 / np.where(steps > 0, steps, np.nan)
+        usual = np.median(steps[steps > 0])
+        noise = est.noise**2
+        rates = np.maximum(
+            np.nanmean(gained, axis=(0, 1)) - 2 * noise / usual, 0.01 * noise / usual
+        )
+        gains = [
+            float(est.rig.sensor.gain[tank]) if volts else 1.0 for tank, volts in est.data.channels
+        ]
+        process = 0.5 * np.log(np.mean(rates * np.square(gains)))
+        tanks = est.case.loop.plant.tanks
+        z = np.concatenate([est.unknowns(fit), np.full(tanks, process), np.log(est.noise)])
+        return np.clip(z, *self.box)
+
+
+def filtered(estimation: Estimation, fit: Fit, iterations: int) -> Filtered:
+    """Return the Filtered of a search from a Fit to the simulated readings."""
+    problem, size = Likelihood(estimation), estimation.size
+    best = solve(problem, problem.start(fit), iterations=iterations, tolerance=1e-10)
+    v, S, dv, _ = problem.at(best.z)
+    root, tanks = np.sqrt(S), estimation.case.loop.plant.tanks
+    noises = np.exp(best.z[size:])
+    # of the mean of the readings alone: that of S tells little of the parameters
+    fit = dataclasses.replace(
+        best, residual=v / root, jacobian=dv[:, :size] / root[:, None], z=best.z[:size]
+    )
+    value = -0.5 * float(np.sum(v**2 / S + np.log(2 * np.pi * S)))
+    return Filtered(fit, noises[:tanks], noises[tanks:], value)
+
+
+def chosen(kind: str, estimation: Estimation, fit: Fit, iterations: int) -> tuple[Any, dict]:
+    """Return (Filtered, or None for the fit to simulated readings, {"kind", "asked", "reason",
+    "bic", "process_noise"}). reason: "asked", "white" residuals, or "bic", the lower one.
+    """
+    report = {"kind": "output-error", "asked": kind, "reason": "asked", "bic": None}
+    report["process_noise"] = None
+    if kind == "output-error":
+        return None, report
+    if estimation.coordinates.inputs:
+        raise InputError(
+            f"likelihood = {kind!r} beside an accepted {next(iter(estimation.of_inputs))}: accept it first, with"
+            " out, and identify the rig that is written"
+        )
+    residual = residuals_of(estimation, fit)
+    count, channels = int(estimation.mask.sum()), np.moveaxis(residual, -1, 0)
+    limit = WHITE / np.sqrt(count / len(channels))
+    if kind == "auto" and all(abs(autocorrelation(r, 1)[1]) < limit for r in channels):
+        return None, report | {"reason": "white"}
+    result = filtered(estimation, fit, iterations)
+    report["process_noise"] = result.process.tolist()
+    if kind == "auto":
+        present = [r[np.isfinite(r)] for r in channels]
+        simple = sum(r.size * (np.log(2 * np.pi * np.mean(r**2)) + 1) for r in present)
+        k = estimation.size + len(channels)
+        bic = {
+            "output-error": float(simple + k * np.log(count)),
+            "innovations": float(
+                -2 * result.log_likelihood + (k + result.process.size) * np.log(count)
+            ),
+        }
+        report |= {"reason": "bic", "bic": bic}
+        if bic["output-error"] <= bic["innovations"]:
+            return None, report
+    return result, report | {"kind": "innovations"}

@@ -1,0 +1,230 @@
+"""Parts that a rig lacks and its readings show, added one after the other by cross-validation."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxtank.core.tree import get_value, number, with_values
+from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.plants.tank_network import TankNetwork
+from jaxtank.rig.sensors import longer
+from tuning.identification.least_squares import solve
+from tuning.identification.problem import Estimation
+from tuning.identification.residuals import autocorrelation
+
+FOLDS = 4
+"""Blocks of the data, each predicted by a fit to the others."""
+BETTER = 0.95
+"""Share of the mean square of the predictions that a part must come below to be added."""
+POINTS = 8
+"""Most points of a curve of a sensor."""
+TRIED = 2
+"""Parts that are fitted, of those that promise most."""
+SUBSTEPS = 8
+"""Most Runge-Kutta steps per sample while parts are compared."""
+RANK = 1e-6
+"""Singular value, of the largest, below which the other blocks do not determine a direction."""
+READINGS = 20
+"""Fewest readings per point."""
+WHITE = 3.0
+"""Autocorrelation of residuals, in standard deviations of that of noise, up to which no part is
+looked for."""
+
+
+class Part(NamedTuple):
+    """What may be added to a rig: what is free in it, and the loop with it, without effect."""
+
+    kind: str  # "sensor-curve", "outlet-exponent", "outlet-linear", "area"
+    where: int  # tank, counted from 0
+    free: dict[str, tuple[float, float, str]]
+    attach: Callable[[Any], Any]
+
+
+class Refinement(NamedTuple):
+    """A part that was added: RMS of predicted blocks, in the noise, without it and with it."""
+
+    kind: str
+    where: int  # tank, counted from 0
+    before: float
+    after: float
+
+
+def parts_of(estimation: Estimation) -> list[Part]:
+    """Return the Parts that the rig of an estimation could have."""
+    loop, taken = estimation.case.loop, {b.name for b in estimation.bounds}
+    parts = [
+        part
+        for c, (tank, volts) in enumerate(estimation.data.channels)
+        if (part := _sensor_curve(loop.sensor, estimation.data.y[..., c], tank, volts)) is not None
+    ]
+    plant: Any = loop.plant
+    if type(plant) is not TankNetwork:
+        return parts
+    read = {tank for tank, _ in estimation.data.channels}
+    for tank in sorted({*range(plant.tanks)} - read):
+        area, name = float(np.asarray(plant.area)[tank]), f"plant.area[{tank}]"
+        parts.append(Part("area", tank, {name: (area / 5, area * 5, "log")}, lambda loop: loop))
+    for kind, sources in (("drain", range(plant.tanks)), ("orifice", [a for a, _ in plant.links])):
+        areas = np.asarray(getattr(plant, kind))
+        parts += [
+            part
+            for k, tank in enumerate(sources)
+            if areas[k] > 0
+            for part in _outlet(plant, f"plant.{kind}", k, tank, float(areas[k]))
+        ]
+    return [part for part in parts if not part.free.keys() & taken]
+
+
+def _outlet(plant, kind, k, tank, area):
+    """Return the Parts of an open outlet: a free exponent, and a linear outlet beside it."""
+    # flows are alike at half the height where area sqrt(2 g / head) = 1 / resistance
+    usual = (0.5 * float(np.asarray(plant.rim)[tank])) ** 0.5
+    usual /= area * (2.0 * float(plant.gravity)) ** 0.5
+    name, other = f"{kind}_exponent", f"{kind}_resistance[{k}]"
+    every = np.full(np.shape(get_value(plant, kind.removeprefix("plant."))), 0.5)
+
+    def with_exponents(loop):
+        absent = getattr(loop.plant, name.removeprefix("plant.")) is None
+        return with_values(loop, {name: every}) if absent else loop
+
+    return [
+        Part("outlet-exponent", tank, {f"{name}[{k}]": (0.1, 1.5, "linear")}, with_exponents),
+        Part(
+            "outlet-linear",
+            tank,
+            {other: (0.1 * usual, 1e4 * usual, "log")},
+            lambda loop: with_values(loop, {other: 1e3 * usual}),
+        ),
+    ]
+
+
+def _sensor_curve(sensor, y, tank, volts):
+    """Return the Part of a sensor whose readings are a curve of the level; None of too few."""
+    present = np.isfinite(y)
+    count = min(POINTS, int(present.sum()) // READINGS)
+    if not isinstance(sensor, LevelSensor) or sensor.curve_level is not None or count < 3:
+        return None
+    readings = np.asarray(sensor.level_of(tank, y[present], volts))
+    points = np.linspace(readings.min(), readings.max(), count)
+    # a piece without readings goes with the one above; the last point stays
+    points = points[np.append(np.histogram(readings, points)[0] >= READINGS // 4, True)]
+    if len(points) < 3 or points[-1] <= 0:
+        return None
+    # the last point holds the scale of the levels, which outlets and pumps could else take up
+    names = [f"sensor.curve_level[{tank},{k}]" for k in range(len(points) - 1)]
+    ends = (-float(points[-1]), float(points[-1]), "linear")
+
+    def with_curve(loop):
+        sensor, every = loop.sensor, np.tile(points, (loop.plant.tanks, 1))
+        if sensor.curve_level is not None:  # of another tank: as many points for all
+            rows = np.array(sensor.curve_level), np.array(sensor.curve_reading)
+            most = max(every.shape[1], rows[0].shape[1])
+            every, *rows = (longer(v, most) for v in (every, *rows))
+            levels, readings = rows
+            levels[tank] = readings[tank] = every[tank]
+        else:
+            levels = readings = every
+        sensor = dataclasses.replace(
+            sensor, curve_level=number(levels), curve_reading=number(readings)
+        )
+        return dataclasses.replace(loop, sensor=sensor)
+
+    return Part("sensor-curve", tank, dict.fromkeys(names, ends), with_curve)
+
+
+class _Search:
+    """The rig with every Part, those that are not added yet held without effect: one program."""
+
+    def __init__(self, result, settings):
+        self.result, self.settings, before = result, settings, result.estimation
+        self.parts, self.added = parts_of(before), []
+        values = before.coordinates.values(result.fit.p)
+        self.loop = with_values(result.case.loop, values)
+        loop, free = self.loop, {b.name: (b.low, b.high, b.scale) for b in before.bounds}
+        for part in self.parts:
+            loop, free = part.attach(loop), free | part.free
+        self.problem = Estimation(
+            result.case.replace(loop=loop, covariance=None),
+            before.logs,
+            free,
+            "free" if before.tanks else "case",
+            before.noise,
+            min(before.substeps, SUBSTEPS),
+        )
+        self.problem.initial = before.first_levels(before.unknowns(result.fit))
+        self.start = self.problem.nominal()
+        names = self.problem.coordinates.names
+        self.places = [[names.index(name) for name in part.free] for part in self.parts]
+
+    def unknowns(self, chosen):
+        """Return the free unknowns where the Parts `chosen` are added."""
+        absent = {i for k, places in enumerate(self.places) if k not in chosen for i in places}
+        return np.array([i for i in range(self.problem.size) if i not in absent])
+
+    def fit(self, chosen, start):
+        """Return (Fit with the Parts `chosen`, its squares of predicted blocks)."""
+        free = self.unknowns(chosen)
+        fixed = {i: float(self.start[i]) for i in {*range(self.problem.size)} - {*free.tolist()}}
+        fit = solve(self.problem, start, fixed=fixed, tolerance=1e-6, **self.settings)
+        return fit, self.predicted(fit.residual, fit.jacobian[:, free])
+
+    def predicted(self, residual, jacobian):
+        """Return (FOLDS,) sums of squares of each block's residuals under a fit to the others: one
+        Gauss-Newton step from the fit to all.
+        """
+        samples = np.nonzero(self.problem.mask)[1]
+        fold = samples * FOLDS // self.problem.mask.shape[1]
+        squares = np.zeros(FOLDS)
+        for f in range(FOLDS):
+            block = fold == f
+            step = np.linalg.lstsq(jacobian[~block], -residual[~block], rcond=RANK)[0]
+            squares[f] = np.sum((residual[block] + jacobian[block] @ step) ** 2)
+        return squares
+
+
+def refined(result: Any, settings: Mapping[str, Any]) -> tuple[Any, dict, list[Refinement]]:
+    """Return (case, what is free in it, Refinements): that of an Identification with the Parts that
+    predict its data better.
+    """
+    free = {b.name: (b.low, b.high, b.scale) for b in result.estimation.bounds}
+    if _is_white(result.estimation, result.fit):
+        return result.case, free, []
+    search = _Search(result, settings)
+    chosen, added = [], []
+    fit, best = search.fit(chosen, search.start)
+    root = lambda squares: float(np.sqrt(squares.sum() / search.problem.mask.sum()))
+    while len(chosen) < len(search.parts):
+        rest = [k for k in range(len(search.parts)) if k not in chosen]
+        # the parts that promise most by one step, each then fitted
+        promise = {
+            k: search.predicted(fit.residual, fit.jacobian[:, search.unknowns([*chosen, k])]).sum()
+            for k in rest
+        }
+        start = search.problem.unknowns(fit)
+        trials = [
+            (search.fit([*chosen, k], start), k)
+            for k in sorted(rest, key=promise.__getitem__)[:TRIED]
+        ]
+        (trial, after), k = min(trials, key=lambda t: t[0][1].sum())
+        if not (after.sum() < BETTER * best.sum() and (after < best).sum() > FOLDS / 2):
+            break
+        part = search.parts[k]
+        added.append(Refinement(part.kind, part.where, root(best), root(after)))
+        chosen, fit, best = [*chosen, k], trial, after
+    loop, values = search.loop, search.problem.coordinates.values(fit.p)
+    for k in chosen:
+        loop, free = search.parts[k].attach(loop), free | search.parts[k].free
+    loop = with_values(loop, {name: float(values[name]) for name in free})
+    return result.case.replace(loop=loop), free, added
+
+
+def _is_white(estimation, fit):
+    """Whether residuals are as independent from sample to sample as noise."""
+    residual = np.full(estimation.mask.shape, np.nan)
+    residual[estimation.mask] = fit.residual
+    n = estimation.mask.sum() / residual.shape[-1]
+    return all(
+        abs(autocorrelation(r, 1)[1]) < WHITE / np.sqrt(n) for r in np.moveaxis(residual, -1, 0)
+    )
