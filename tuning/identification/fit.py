@@ -149,14 +149,10 @@ def identify(
     (<Status.CONVERGED: 'converged'>, ['plant.pump_gain[0]'])
     """
     began = time.perf_counter()
-    _check_settings(loss, likelihood, starts=starts, iterations=iterations)
+    together = {"refine": refine, "accept": bool(accept)}
+    _check_settings(loss, likelihood, together, starts=starts, iterations=iterations)
     places = [place_of(text) for text in accept]
     if refine:
-        if places:
-            raise InputError(
-                "accept and refine: each changes the rig; accept a cause first, with out, and refine"
-                " the rig that is written"
-            )
         same: dict[str, Any] = {"start": start, "hold_back": hold_back, "noise": noise}
         same |= {"seed": seed, "loss": loss, "substeps": substeps, "iterations": iterations}
         same |= {"gap": gap, "prior": prior}
@@ -218,7 +214,7 @@ def identify(
         starts=_starts(fits),
         validation=validation,
         profile=profile_likelihood(estimation, best, spread, loss)
-        if profile and not interrupted and best is simulated
+        if all((profile, not interrupted, best is simulated))
         else None,
         wall_s=time.perf_counter() - began,
         seed=seed,
@@ -263,7 +259,7 @@ def _refined(first, log, settings, began):
     return dataclasses.replace(again, refinements=added, wall_s=time.perf_counter() - began)
 
 
-def _check_settings(loss, likelihood, **counts):
+def _check_settings(loss, likelihood, together, **counts):
     if loss not in LOSSES:
         raise InputError(f"loss = {loss!r}: must be one of {', '.join(LOSSES)}")
     if likelihood not in KINDS:
@@ -272,6 +268,11 @@ def _check_settings(loss, likelihood, **counts):
         raise InputError(
             f"loss = {loss!r} beside likelihood = {likelihood!r}: the filter is that of normal"
             " noise: leave one of them out"
+        )
+    if all(together.values()):
+        raise InputError(
+            f"{' and '.join(together)} each change the rig: accept a cause first, and refine the"
+            " rig file that is written"
         )
     for name, count in counts.items():
         if not isinstance(count, int) or isinstance(count, bool) or count < 1:

@@ -247,9 +247,10 @@ def chosen(kind: str, estimation: Estimation, fit: Fit, iterations: int) -> tupl
     if kind == "output-error":
         return None, report
     if estimation.coordinates.inputs:
+        names = ", ".join(estimation.of_inputs)
         raise InputError(
-            f"likelihood = {kind!r} beside an accepted {next(iter(estimation.of_inputs))}: accept it first, with"
-            " out, and identify the rig that is written"
+            f"likelihood = {kind!r} beside an accepted {names}: accept it first, and identify the"
+            " rig file that is written"
         )
     residual = residuals_of(estimation, fit)
     count, channels = int(estimation.mask.sum()), np.moveaxis(residual, -1, 0)

@@ -171,7 +171,7 @@ def player(rig, dt, u, substeps):
         ).x, state
 
     def stepped(x, state, pieces, more=None):
-        x, state = advanced(x, state, *pieces[0], more)
+        x, state = advanced(x, state, pieces[0][0], pieces[0][1], more)
         for step, inputs in pieces[1:]:
             # a piece of length zero is none: a pump with memory would see a sample
             x, state = jax.tree.map(
