@@ -46,9 +46,11 @@ from tuning.search.tuner import tune as tune
 from tuning.search.tuner import tune_by_rule as tune_by_rule
 from tuning.uncertainty.distributions import Correlated as Correlated
 from tuning.uncertainty.distributions import Discrete as Discrete
+from tuning.uncertainty.distributions import Empirical as Empirical
 from tuning.uncertainty.distributions import LogUniform as LogUniform
 from tuning.uncertainty.distributions import Normal as Normal
 from tuning.uncertainty.distributions import Uniform as Uniform
+from tuning.uncertainty.distributions import empirical as empirical
 from tuning.uncertainty.result import Ensemble as Ensemble
 from tuning.uncertainty.sensitivity_study import sensitivity as sensitivity
 from tuning.uncertainty.study import ensemble as ensemble

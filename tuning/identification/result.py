@@ -111,6 +111,8 @@ class Identification(Result):
     refinements : list
         Parts that were added to the rig: (kind, where, before, after), the RMS of predicted blocks
         in the noise without it and with it.
+    posterior : Posterior or None
+        Draws of the posterior, of which the covariance then is.
     """
 
     case: Any
@@ -134,6 +136,7 @@ class Identification(Result):
     likelihood: dict[str, Any] = dataclasses.field(default_factory=dict)
     refinements: Sequence[Any] = ()
     simulated: Fit | None = None
+    posterior: Any = None
 
     @functools.cached_property
     def structure(self) -> Diagnosis:

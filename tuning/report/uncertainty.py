@@ -20,7 +20,14 @@ from tuning.report.folder import save as save_all
 from tuning.report.tables import Table, Value, clean, fields
 from tuning.storage.columns import row_blocks
 from tuning.storage.store import discard
-from tuning.uncertainty.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
+from tuning.uncertainty.distributions import (
+    Correlated,
+    Discrete,
+    Empirical,
+    LogUniform,
+    Normal,
+    Uniform,
+)
 
 QUANTITIES = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
 LIKELY = 3
@@ -230,6 +237,8 @@ def _violation_table(violations):
 
 def in_words(d):
     """Return a distribution in words, in the unit of its parameter."""
+    if isinstance(d, Empirical):
+        return f"{count(len(d.names), 'parameter')}, {count(len(d.draws), 'draw')} of all together"
     if isinstance(d, Correlated):
         means = "" if d.mean is None else " and custom means"
         return f"{count(len(d.names), 'parameter')}, correlated, with a covariance{means}"

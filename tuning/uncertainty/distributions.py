@@ -1,14 +1,16 @@
 """Distributions of parameters by their quantile functions; imported by every study of `tuning`."""
 
+import csv
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import scipy  # its parts are imported when they are first used
+from numpy.typing import ArrayLike
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.text import shortened
+from jaxtank.core.text import one_line, printable, shortened
 from jaxtank.core.tree import is_real
 
 # In every class, `quantile` returns values (draws, ...) at probabilities p (draws, ...), where
@@ -236,6 +238,68 @@ class Correlated:
             raise InputError(f"{name}: covariance must be positive definite") from None
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Empirical(Correlated):
+    """Several scalars that were drawn together, as from a posterior: each plant has one of the
+    draws, all of which are as likely. `empirical` makes one.
+
+    Attributes
+    ----------
+    names : tuple of str
+        (n,) dotted names of scalars or entries.
+    covariance, mean, cut : as in Correlated
+        Of the draws, where a study needs no more.
+    draws : tuple
+        (N, n) in their units.
+
+    Examples
+    --------
+    >>> pair = empirical(("x0[0]", "x0[1]"), [[1.0, 5.0], [2.0, 4.0], [3.0, 5.0]])
+    >>> pair.quantile(np.array([[0.4, 0.9]]), np.zeros(2)).tolist()
+    [[2.0, 4.0]]
+    """
+
+    draws: tuple = ()
+
+    def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
+        """Return draws (.., n): the first probability chooses one, the others are not used."""
+        rows = (p[:, 0] * len(self.draws)).astype(int)
+        return np.asarray(self.draws)[np.minimum(rows, len(self.draws) - 1)]
+
+
+def empirical(names: Sequence[str], draws: ArrayLike) -> Empirical:
+    """Return the distribution of draws (N, n) of the parameters `names`.
+
+    Examples
+    --------
+    >>> empirical(("x0[0]",), [[1.0], [2.0], [3.0]]).mean
+    (2.0,)
+    """
+    rows = np.asarray(draws, dtype=float)
+    if rows.ndim != 2 or rows.shape[1] != len(names) or len(rows) < 3:
+        raise InputError(f"draws of {', '.join(names)}: must be 3 rows or more, a column for each")
+    if not np.all(np.isfinite(rows)):
+        raise InputError(f"draws of {', '.join(names)}: some are not finite")
+    return Empirical(
+        names=tuple(names),
+        covariance=tuple(map(tuple, np.atleast_2d(np.cov(rows.T)).tolist())),
+        mean=tuple(rows.mean(axis=0).tolist()),
+        draws=tuple(map(tuple, rows.tolist())),
+    )
+
+
+def read_draws(path: str) -> Empirical:
+    """Return the distribution of a CSV file of draws, names of parameters in its first line."""
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            names, *rows = list(csv.reader(file))
+            return empirical(names, [[float(v) for v in row] for row in rows])
+    except OSError as error:
+        raise InputError(f"draws {printable(path)}: {error.strerror}") from None
+    except ValueError as error:
+        raise InputError(f"draws {printable(path)}: {one_line(error)}") from None
+
+
 def truncated_normal(p, cut):
     """Return quantiles of the standard normal distribution, truncated at +-cut."""
     tail = scipy.special.ndtr(-cut)
@@ -298,6 +362,8 @@ FORMS = {
 def parse(name, text):
     """Return the distribution of a text of the command line."""
     kind, *parts = [p.strip() for p in text.split(":")]
+    if kind == "draws" and parts:
+        return read_draws(text.split(":", 1)[1].strip())
     tied = bool(parts) and parts[-1] == "tied"
     parts = parts[:-1] if tied else parts
     try:
@@ -311,7 +377,7 @@ def parse(name, text):
         raise InputError(
             f"{name} = {text!r}: must be uniform:LOW:HIGH, uniform:5%, loguniform:LOW:HIGH,"
             " loguniform:FACTOR, normal:5%, normal:MEAN:SD or discrete:V1:V2, with :tied for one"
-            " draw of a whole array"
+            " draw of a whole array, or draws:FILE"
         ) from None
     distribution = KINDS[kind](**fields, tied=tied)
     distribution.check(name)

@@ -16,6 +16,7 @@ from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.xla.jit import compiled
 from tuning.uncertainty import rare_events
 from tuning.uncertainty.batches import batch_runner
+from tuning.uncertainty.distributions import Empirical
 from tuning.uncertainty.draws import Draws
 
 PILOT = 4096
@@ -70,12 +71,18 @@ class Promise:
     subset_simulation: float | None
 
 
-def check_promise(case: Case, promise: Any, limits: Any) -> None:
+def check_promise(case: Case, promise: Any, limits: Any, distributions: Any) -> None:
     """Raise InputError unless `promise` is None, or a probability of breaking one of `limits`."""
     if promise is None:
         return
     if not (is_real(promise) and np.ndim(promise) == 0 and 0 < promise < 1):
         raise InputError(f"promise = {promise!r}: must be a probability above 0 and below 1")
+    for name, d in distributions.items():
+        if isinstance(d, Empirical):
+            raise InputError(
+                f"promise = {promise:g}: {name} has {len(d.draws)} draws and no tail: give a"
+                " distribution, or leave it out for the [covariance] of the rig"
+            )
     if not limits:
         raise InputError(
             f"promise = {promise:g}: {case.name} has no limit that could be broken; state one, as"

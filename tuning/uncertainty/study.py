@@ -121,7 +121,7 @@ def ensemble(
     check_cluster(cluster, devices)
     distributions = spread_of(case) if distributions is None else stated(distributions)
     limits = [*resolve_limits(case, as_measures(None, limits)[1]), *_tank_bottoms(case)]
-    check_promise(case, promise, limits)
+    check_promise(case, promise, limits, distributions)
     if measures is None:
         measures = [m for m in ms.placed("summary") if ms.serves(m, case.loop)]
     ms.check_names(tuple(measures))
