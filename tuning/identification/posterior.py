@@ -5,6 +5,7 @@ al., Bayesian Data Analysis (3rd ed., 2013), ch. 11.
 """
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +20,9 @@ from tuning.identification.result import Identification
 
 CHAINS, WARM_UP, DRAWS = 4, 300, 500
 """Chains, steps of each that adapt the step size, and its draws."""
+
+OUTSIDE = -1e12
+"""Logarithm of the density outside the ranges of the parameters."""
 
 LARGEST_RHAT = 1.05
 """R-hat above which the chains have not come to the same distribution [-]."""
@@ -57,36 +61,42 @@ def with_draws(fit: Identification, seed: int = 0) -> Identification:
     The likelihood has the variance of the residuals, widened as the intervals are for correlated
     ones; parameters at a bound stay there.
     """
-    library = blackjax()
     if not fit.identifiable:
         raise InputError("--posterior hmc: some parameters are not identifiable from these data")
     est = fit.estimation
+    if fit.likelihood.get("kind", "output-error") != "output-error":
+        raise InputError(
+            "--posterior hmc: draws are of the likelihood of simulated readings: leave --likelihood"
+            f" {fit.likelihood['kind']} or --posterior out"
+        )
     if est.coordinates.inputs:
         raise InputError(
             "--posterior hmc: a cause of the inputs was accepted, which has no exact derivative:"
             " leave --posterior out for the Laplace approximation"
         )
     spread = Spread(est, fit.fit, fit.quality["residual_autocorrelation"])
-    density = _density(est, fit, spread)
-    draw = jax.jit(lambda keys: jax.vmap(lambda key: _chain(library, density, spread, key))(keys))
-    w = np.asarray(draw(jax.random.split(jax.random.key(seed), CHAINS)))
+    keys = jax.random.split(jax.random.key(seed), CHAINS)
+    w = np.asarray(_chains(keys, *_problem(est, fit.fit, spread)))
     z = np.array(np.broadcast_to(est.unknowns(fit.fit), (*w.shape[:2], est.size)))
     z[..., spread.estimated] += w @ np.linalg.cholesky(spread.covariance).T
     names = fit.covariance[0]
     values = np.array([[_values(est, point, names) for point in chain] for chain in z])
     rhat, size = (
-        getattr(library.diagnostics, name)(jnp.asarray(values))
+        np.ravel(getattr(blackjax().diagnostics, name)(jnp.asarray(values)))
         for name in ("potential_scale_reduction", "effective_sample_size")
     )
     flat = values.reshape(-1, len(names))
     posterior = Posterior(
-        names,
-        flat,
-        dict(zip(names, map(float, rhat))),
-        dict(zip(names, map(float, size))),
+        names, flat, dict(zip(names, map(float, rhat))), dict(zip(names, map(float, size)))
     )
-    matrix = np.atleast_2d(np.cov(flat.T))
-    return dataclasses.replace(fit, covariance=(names, matrix), posterior=posterior)
+    parameters = dict(fit.parameters)
+    for name, column in zip(names, flat.T):
+        interval = np.quantile(column, (0.025, 0.975)).tolist()
+        parameters[name] = parameters[name] | {"sd": float(column.std()), "interval95": interval}
+    covariance = names, np.atleast_2d(np.cov(flat.T))
+    return dataclasses.replace(
+        fit, parameters=parameters, covariance=covariance, posterior=posterior
+    )
 
 
 def _values(est, z, names):
@@ -95,50 +105,76 @@ def _values(est, z, names):
     return [values[name] for name in names]
 
 
-def _chain(library, density, spread, key):
-    """Draws (DRAWS, n) of one chain, in standard deviations of the Laplace approximation."""
-    first, warm, later = jax.random.split(key, 3)
-    start = jax.random.normal(first, (len(spread.estimated),))
-    adaptation = library.window_adaptation(library.nuts, density)
-    (state, settings), _ = adaptation.run(warm, start, num_steps=WARM_UP)
-    step = library.nuts(density, **settings).step
+class Static(NamedTuple):
+    """The part of an estimation that a compiled sampler is made for."""
 
-    def move(state, key):
-        state, _ = step(key, state)
-        return state, state.position
-
-    return jax.lax.scan(move, state, jax.random.split(later, DRAWS))[1]
+    coordinates: Any
+    prior: tuple[str, ...]  # names of parameters with a prior
+    tanks: tuple[int, ...]
+    channels: tuple
+    substeps: int
 
 
-def _density(est, fit, spread):
+def _problem(est, fit, spread):
+    """Arrays and Static of the density."""
+    names, mean, root = est.prior or ((), np.zeros(0), np.zeros((0, 0)))
+    arrays = {
+        "rig": est.rig,
+        "data": (est.data.dt, est.data.u, np.where(est.mask, est.data.y, 0.0)),
+        "weights": est.mask / est.noise,
+        "initial": est.initial,
+        "scale": est.level_scale,
+        "at": est.unknowns(fit),
+        "estimated": spread.estimated,
+        "factor": np.linalg.cholesky(spread.covariance),
+        "box": est.box,
+        "variance": spread.scale * spread.widened**2,
+        "prior": (mean, est.prior_weight * root),
+    }
+    return arrays, Static(est.coordinates, names, est.tanks, est.data.channels, est.substeps)
+
+
+@functools.partial(jax.jit, static_argnames="static")
+def _chains(keys, arrays, static):
+    """Draws (chains, DRAWS, n) in standard deviations of the Laplace approximation."""
+    library = blackjax()
+
+    def density(w):
+        return _density(w, arrays, static)
+
+    def chain(key):
+        first, warm, later = jax.random.split(key, 3)
+        start = jax.random.normal(first, arrays["estimated"].shape)
+        adaptation = library.window_adaptation(library.nuts, density)
+        (state, settings), _ = adaptation.run(warm, start, num_steps=WARM_UP)
+        step = library.nuts(density, **settings).step
+
+        def move(state, key):
+            state, _ = step(key, state)
+            return state, state.position
+
+        return jax.lax.scan(move, state, jax.random.split(later, DRAWS))[1]
+
+    return jax.vmap(chain)(keys)
+
+
+def _density(w, arrays, static):
     """The logarithm of the posterior at w (n,), standard deviations of its Laplace approximation
     away from the estimates.
     """
-    at, shared = jnp.asarray(est.unknowns(fit.fit)), est.coordinates.size
-    factor = jnp.asarray(np.linalg.cholesky(spread.covariance))
-    low, high = (jnp.asarray(side) for side in est.box)
-    data, tanks, scale = est.data, list(est.tanks), jnp.asarray(est.level_scale)
-    variance = spread.scale * spread.widened**2
-    measured = jnp.where(est.mask, jnp.nan_to_num(data.y), 0.0)
-
-    def density(w):
-        z = at.at[spread.estimated].add(factor @ w)
-        values = est.coordinates.values(z[:shared])
-        rig = with_values(est.rig, values)
-        first = jnp.asarray(est.initial)
-        if tanks:
-            levels = (z[shared:] * scale).reshape(len(est.logs), len(tanks))
-            first = first.at[:, jnp.array(tanks)].set(levels)
-        y = simulation.play(
-            rig, data.dt, data.u, first, channels=data.channels, substeps=est.substeps
-        )
-        residual = jnp.where(est.mask, (y - measured) / est.noise, 0.0)
-        square = jnp.sum(residual**2)
-        if est.prior is not None:
-            names, mean, root = est.prior
-            change = jnp.stack([values[name] for name in names]) - mean
-            square += jnp.sum((est.prior_weight * root @ change) ** 2)
-        inside = jnp.all((z >= low - 1e-9) & (z <= high + 1e-9))
-        return jnp.where(inside, -0.5 * square / variance, -1e12)
-
-    return density
+    z = arrays["at"].at[arrays["estimated"]].add(arrays["factor"] @ w)
+    shared, (dt, u, measured), first = static.coordinates.size, arrays["data"], arrays["initial"]
+    values = static.coordinates.values(z[:shared])
+    if static.tanks:
+        levels = (z[shared:] * arrays["scale"]).reshape(len(first), len(static.tanks))
+        first = first.at[:, jnp.array(static.tanks)].set(levels)
+    rig = with_values(arrays["rig"], values)
+    y = simulation.play(rig, dt, u, first, channels=static.channels, substeps=static.substeps)
+    square = jnp.sum(((y - measured) * arrays["weights"]) ** 2)
+    if static.prior:
+        mean, root = arrays["prior"]
+        change = jnp.stack([values[name] for name in static.prior]) - mean
+        square += jnp.sum((root @ change) ** 2)
+    (low, high), edge = arrays["box"], 1e-9
+    inside = jnp.all((z >= low - edge) & (z <= high + edge))
+    return jnp.where(inside, -0.5 * square / arrays["variance"], OUTSIDE)

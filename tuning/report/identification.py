@@ -48,7 +48,7 @@ def sentences_of(fit):
     words += _residuals(fit)
     words += _likelihood(fit)
     words += _refinements(fit)
-    words += _prior(fit)
+    words += _prior(fit) + _posterior(fit)
     words += [
         f"{n} ends at its bound, {p['value']:.4g} {p['unit']}: no interval"
         for n, p in fit.parameters.items()
@@ -294,6 +294,25 @@ def _prior(fit):
     return words
 
 
+def _posterior(fit):
+    """Return a sentence on the draws of the posterior."""
+    if fit.posterior is None:
+        return []
+    rhat, size = max(fit.posterior.rhat.values()), min(fit.posterior.effective.values())
+    ends = "" if fit.posterior.mixed else ": the chains differ, do not use the intervals"
+    return [
+        f"posterior: {len(fit.posterior.values)} draws by NUTS, of which intervals and covariance"
+        f" are; largest R-hat {rhat:.3f}, least effective sample size {size:.0f}{ends}"
+    ]
+
+
+def draws_csv(fit):
+    """Return the draws of the posterior as CSV text: `--vary NAME=draws:FILE` reads it."""
+    head = ",".join(f'"{name}"' for name in fit.posterior.names)
+    rows = (",".join(f"{v:.10g}" for v in row) for row in fit.posterior.values)
+    return "\n".join([head, *rows]) + "\n"
+
+
 def _proposal(fit):
     """Return a sentence: the controller that is proposed."""
     case, why = fit.proposed
@@ -455,6 +474,9 @@ def json_of(fit):
         "refinements": [
             clean(part._asdict() | {"where": part.where + 1}) for part in fit.refinements
         ],
+        "posterior": None
+        if fit.posterior is None
+        else {"draws": len(fit.posterior.values), **fields(fit.posterior, "rhat effective")},
         "oddities": [
             clean(odd._asdict() | {"sentence": sentence})
             for odd, sentence in zip(fit.oddities, sentences_on(fit.oddities))
@@ -503,6 +525,7 @@ def save(fit, folder, command=None):
         warnings.warn(why, stacklevel=3)  # the line that called fit.save
         payload["message"] += f"; {why}"
     files = {"fit.csv": fit_csv(fit), **({"rig.toml": rig} if rig else {})}
+    files |= {} if fit.posterior is None else {"draws.csv": draws_csv(fit)}
     stale, old = earlier(folder, ["residuals", "rig"]), Path(folder)
     if (old / "fit.csv").exists():  # the rig file of an earlier result must not remain
         names = ["rig.toml", "fit.png", "correlation.png", "profile.png"]

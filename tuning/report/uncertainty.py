@@ -59,7 +59,10 @@ def json_of(ensemble):
         "infeasible": None if feasible is None else int(feasible.sum()),
         "draws": ensemble.method,
         "distributions": {
-            n: {"kind": type(d).__name__, **clean(dataclasses.asdict(d))}
+            n: {
+                "kind": type(d).__name__,
+                **clean({k: v for k, v in dataclasses.asdict(d).items() if k != "draws"}),
+            }
             for n, d in ensemble.distributions.items()
         },
         "measures": summary,

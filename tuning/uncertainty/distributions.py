@@ -268,7 +268,23 @@ class Empirical(Correlated):
 
 
 def empirical(names: Sequence[str], draws: ArrayLike) -> Empirical:
-    """Return the distribution of draws (N, n) of the parameters `names`.
+    """Return the distribution of parameters that were drawn together.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Dotted names of scalars or entries.
+    draws : (N, n) array
+        A row for each draw, in the parameters' units.
+
+    Returns
+    -------
+    Empirical
+
+    Raises
+    ------
+    InputError
+        For fewer than 3 draws, and numbers that are not finite.
 
     Examples
     --------

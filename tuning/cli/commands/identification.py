@@ -3,6 +3,7 @@ experiments before one is made.
 """
 
 import sys
+from typing import Any
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import printable
@@ -90,6 +91,15 @@ def _identify(args, case):
     from tuning.identification.fit import identify
 
     logs = read_logs(args, case)
+    if args.posterior == "hmc":
+        from tuning.identification import posterior
+
+        posterior.blackjax()  # before the long search
+        if args.likelihood != "output-error":
+            raise InputError(
+                f"--posterior hmc beside --likelihood {args.likelihood}: its draws are of the"
+                " likelihood output-error: leave one of them out"
+            )
     shortest = min(log.samples for log in logs)
     if args.hold_back >= shortest:
         raise InputError(
@@ -126,6 +136,8 @@ def _identify(args, case):
         refine=args.refine,
         likelihood=args.likelihood,
     )
+    if args.posterior == "hmc" and result.identifiable and not interrupts.stop:
+        result = posterior.with_draws(result, args.seed)
     line.end()
     _report_next(args, result, finish(result, args))
     return interrupts.code if interrupts.stop else STATUS[result.status]
@@ -175,7 +187,7 @@ def learn(args):
     rows = [row | {"data": log.name} for log in logs for row in achieved(case, log)]
     line.compiling("the simulation and its derivatives", 10)
     fit = tuning.identify(case, logs, gap=args.gap, seed=args.seed)
-    parts = {"identification": fit}
+    parts: dict[str, Any] = {"identification": fit}
     if fit.identifiable:
         filtered = args.safety_filter is not False
         answer = tuning.tune(fit.identified, safety_filter=filtered, seed=args.seed)
@@ -336,6 +348,9 @@ FIT = (
            choices=("output-error", "innovations", "auto")),
     Option("--refine", help="also: parts that the rig lacks, where blocks of the data are then"
            " predicted better: curves of sensors, exponents of outlets", kind="flag"),
+    Option("--posterior", "KIND", "laplace, or hmc: intervals and covariance of draws by the"
+           " No-U-Turn sampler (pip install blackjax), also written to draws.csv",
+           default="laplace", choices=("laplace", "hmc")),
     Option("--profile", help="also: profile likelihood of the least certain parameter",
            kind="flag"),
     RESUME,
