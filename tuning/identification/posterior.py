@@ -50,7 +50,7 @@ def blackjax() -> Any:
         return blackjax
     except ImportError:
         raise InputError(
-            "--posterior hmc: blackjax is not installed: pip install blackjax, or leave it out for"
+            "--posterior hmc: blackjax is not installed (pip install blackjax); without the option:"
             " the Laplace approximation"
         ) from None
 

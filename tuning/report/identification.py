@@ -129,7 +129,7 @@ def diagnosis_of(fit):
 
 
 def _structure(fit):
-    """Return sentences: what the data need that the rig has not, and what cannot be told apart."""
+    """Return sentences: what the data need that the rig does not have, and what cannot be told apart."""
     causes, words = fit.structure.causes, []
     if fit.structure.clean:
         return ["no test rejects the structure of the rig"]
@@ -145,8 +145,8 @@ def _structure(fit):
     if not fit.structure.white:
         rest = "what these leave" if causes else f"what the fit leaves ({_explained(fit)})"
         words.append(
-            f"{rest} is no noise, and no cause that is tried explains it: an inflow without a"
-            " column, or another part that the rig has not"
+            f"{rest} is not noise, and none of the causes that are tried explains it: an inflow"
+            " without a column, or a part that the rig does not have (--refine tries some)"
         )
     return words
 
