@@ -13,12 +13,12 @@ from scipy.stats import chi2
 
 from jaxtank.bounds import Bound
 from jaxtank.core.errors import InputError, unknown
-from jaxtank.core.tree import describe, get_value, with_values
+from jaxtank.core.tree import describe, get_value, split_index, with_values
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.signals.base import Constant
 from tuning.identification import simulation
 from tuning.identification.coordinates import Coordinates, Scalar
-from tuning.identification.inputs import played
+from tuning.identification.inputs import CURVE, Inputs, played
 from tuning.identification.least_squares import Fit
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import ROBUST_LIMIT, autocorrelation, residuals_of
@@ -68,7 +68,8 @@ class Candidate(NamedTuple):
     @property
     def field(self) -> str:
         """Field of Inputs that its value is, "" of another."""
-        return FIELD.get(self.name.split("[")[0], "")
+        base, index = split_index(self.name)
+        return CURVE[index[1]] if len(index) > 1 and base in FIELD else FIELD.get(base, "")
 
 
 def candidates_of(estimation: Estimation) -> list[Candidate]:
@@ -122,6 +123,10 @@ def _of_inputs(loop, data):
                 yield Candidate("dead-zone", j, f"actuator.{name}[{j}]", 0.0, 0.0, 0.9 * top)
         if not (loop.plant.curves and loop.plant.curves[j]) and top > 0.0:
             yield Candidate("pump-curve", j, f"plant.curves[{j}]", 1.0, 0.25, 4.0)
+            if levels.size > 2:
+                yield Candidate("pump-curve", j, f"plant.curves[{j},1]", 0.0, -1.0, 3.0)
+            if levels.size > 3:
+                yield Candidate("pump-curve", j, f"plant.curves[{j},2]", 0.0, -3.0, 3.0)
 
 
 def _largest_flow(plant, data):
@@ -363,12 +368,20 @@ def diagnose(estimation: Estimation, fit: Fit) -> Diagnosis:
     problem = Enlarged(weighted, estimation.unknowns(fit), loss=fit.loss)
     # a prior stays outside: what it holds back is no structure
     trial = _trial(problem, (), problem.begin) if estimation.prior is None else _fit(problem, ())
-    for _ in range(CAUSES):
+    while len(causes) <= CAUSES:
         options = _fitted(trial) + ([] if causes else _exchanged(trial))
         best = min(options, key=lambda t: t.loss, default=None)
         if best is None or not _passes(best, trial):
             break
-        causes.append(_cause(best, trial, options))
+        cause = _cause(best, trial, options)
+        same = [i for i, c in enumerate(causes) if (c.kind, c.where) == (cause.kind, cause.where)]
+        if same:  # another coefficient of it
+            bic = causes[same[0]].delta_bic + cause.delta_bic
+            causes[same[0]] = causes[same[0]]._replace(delta_bic=bic)
+        elif len(causes) == CAUSES:
+            break
+        else:
+            causes.append(cause)
         trial = best
     causes = [_with_value(cause, trial) for cause in causes]
     white = _is_white(trial)
@@ -457,7 +470,16 @@ def _best_of_kind(trial, kind, where):
             f"accept {':'.join([kind, *map(str, where)])}: "
             + (f"must be one of {places}" if places else "is estimated already, or no part has it")
         )
-    return min((_with(trial, i) for i in chosen), key=lambda t: t.loss)
+    best = min((_with(trial, i) for i in chosen), key=lambda t: t.loss)
+    if kind != "pump-curve":
+        return best
+    place = best.problem.candidates[best.chosen[-1]].where
+    while True:
+        chosen = [i for i in options if candidates[i].where == place and i not in best.chosen]
+        more = min((_with(best, i) for i in chosen), key=lambda t: t.loss, default=best)
+        if not _passes(more, best):
+            return best
+        best = more
 
 
 def with_leaves(loop: Any, names: list[str]) -> Any:
@@ -737,9 +759,27 @@ def _with_value(cause, trial):
     at = list(inside).index(problem.known + i)
     c = problem.candidates[i]
     value = c.low + trial.point[problem.known + i] * (c.high - c.low)
+    if c.kind == "pump-curve":
+        return _with_exponent(cause, trial, covariance, list(inside))
     if c.field == "threshold":
         levels = np.unique(problem.data.u[..., c.where])
         ends = [float(levels[levels < value].max()), float(levels[levels > value].min())]
         return cause._replace(value=float(value), interval95=ends)
     half = 1.96 * float(np.sqrt(covariance[at, at])) * (c.high - c.low)
     return cause._replace(value=float(value), interval95=[float(value - half), float(value + half)])
+
+
+def _with_exponent(cause, trial, covariance, inside):
+    """Return a Cause with the exponent that gives the flow of its curve at half the input."""
+    problem, chosen = trial.problem, [trial.problem.candidates[i] for i in trial.chosen]
+    rows = [c for c in chosen if c.kind == cause.kind and c.where + 1 == cause.where]
+    names = [c.name for c in problem.candidates]
+    at = [problem.known + names.index(c.name) for c in rows]
+    ranges = np.array([c.high - c.low for c in rows])
+    values = np.array([c.low for c in rows]) + trial.point[at] * ranges
+    exponent = lambda v: -float(np.log2(Inputs(**{c.field: x for c, x in zip(rows, v)}).curve(0.5)))
+    value, steps = exponent(values), 1e-6 * np.eye(len(rows))
+    slopes = np.array([exponent(values + step) - value for step in steps]) / 1e-6 * ranges
+    entries = [inside.index(i) for i in at]
+    sd = float(np.sqrt(slopes @ covariance[np.ix_(entries, entries)] @ slopes))
+    return cause._replace(value=value, interval95=[value - 1.96 * sd, value + 1.96 * sd])

@@ -17,11 +17,20 @@ class Inputs(NamedTuple):
     lag: float = 0.0  # time constant [s]
     dead: float = 0.0  # input below which nothing flows
     exponent: float = 1.0  # of the flow in the input, at the same largest flow
+    bend: float = 0.0  # of the flow from the power: 1 + bend (1 - x) + twist (1 - x)^2,
+    twist: float = 0.0  # x the input as a share of the largest
     threshold: float = 0.0  # input at or below which nothing flows, and above it all
+
+    def curve(self, x: Any) -> Any:
+        """Return the flow at inputs x, both as shares of the largest."""
+        shape = 1.0 + (1.0 - x) * (self.bend + (1.0 - x) * self.twist)
+        return np.maximum(x, 1e-12) ** self.exponent * shape
 
 
 STATIC = ("actuator.delays", "plant.curves")
 """Names of such numbers that no leaf of a rig holds."""
+CURVE = ("exponent", "bend", "twist")
+"""Fields of Inputs that `plant.curves[j]`, `[j,1]` and `[j,2]` are."""
 POINTS = 12
 """Points of the curve that stands for an exponent in a rig file."""
 
@@ -31,17 +40,22 @@ def with_inputs(loop: Any, values: Mapping[str, float], top: np.ndarray) -> Any:
     bank, plant = loop.actuator, loop.plant
     delays = float(bank.delay) + np.zeros(bank.pumps) + np.asarray(bank.delays or 0.0)
     curves = list(plant.curves) if values and getattr(plant, "curves", ()) else [None] * bank.pumps
+    shapes: dict[int, Inputs] = {}
     for name, value in values.items():
-        base, (j,) = split_index(name)
+        base, (j, *more) = split_index(name)
         if base == "actuator.delays":
             delays[j] = max(value, 0.0)
         else:
-            x = np.linspace(0.0, 1.0, POINTS) ** 2
-            last = (
-                max(float(bank.high[j]), 1.2 * top[j]) if np.isfinite(bank.high[j]) else 2 * top[j]
-            )
-            u = np.unique([*(x * top[j]), last])
-            curves[j] = tuple(zip(u.tolist(), (top[j] * (u / top[j]) ** value).tolist()))
+            field = CURVE[more[0] if more else 0]
+            shapes[j] = shapes.get(j, Inputs())._replace(**{field: value})
+    for j, shape in shapes.items():
+        u = top[j] * np.linspace(0.0, 1.0, POINTS) ** 2
+        flow = np.maximum.accumulate(np.where(u > 0.0, top[j] * shape.curve(u / top[j]), 0.0))
+        rises = np.flatnonzero(
+            np.diff(flow, prepend=-1.0) > 0.0
+        )  # of two that are level, the first
+        points = ((float(f"{v:.7g}") for v in column[rises]) for column in (u, flow))
+        curves[j] = tuple(zip(*points))
     least = float(delays.min())
     more = tuple((delays - least).tolist())
     bank = dataclasses.replace(bank, delay=least, delays=more if any(more) else ())
@@ -59,8 +73,8 @@ def transformed(dt: np.ndarray, u: np.ndarray, by: Inputs, top: float) -> np.nda
         u = np.where(u > by.threshold, u, 0.0)
     if by.dead > 0.0:
         u = np.maximum(u - by.dead, 0.0)
-    if by.exponent != 1.0 and top > 0.0:
-        u = np.where(u > 0.0, top * (np.maximum(u, 1e-12 * top) / top) ** by.exponent, u)
+    if (by.exponent, by.bend, by.twist) != (1.0, 0.0, 0.0) and top > 0.0:
+        u = np.where(u > 0.0, top * by.curve(u / top), u)
     if by.lag > 0.0:
         u = _lagged(dt, u, by.lag)
     if by.delay != 0.0:
