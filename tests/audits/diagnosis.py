@@ -1,17 +1,18 @@
 """Does `identify` name the fault of a log? Logs of an integrator of this file (RK4 in numpy), with
 faults of eleven kinds at two sizes on four rigs, and clean ones among them.
 
-python tests/audits/diagnosis.py [logs] [first seed] [--accept]
+python tests/audits/diagnosis.py [logs] [seed]
 """
 
 import sys
-from pathlib import Path
+import time
 from typing import Any
 
+import jax
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT)] * (str(ROOT) not in sys.path)
+import tuning
+from jaxtank import rig as rigs
 
 FINE = 8
 """Integration steps per sample; delays are multiples of one."""
@@ -144,13 +145,11 @@ def simulated(rig, cases, u):
         last = moved[:, i] + half * (middle - moved[:, i])
         ends.append((v if np.any(lag) else moved[:, i], middle, last))
         v = last
-    split = np.array([p[2] for p in rig["pump"]])
     feed = np.zeros((N, m))
     for j, (first, second, share, gain) in enumerate(rig["pump"]):
         feed[first, j] += gain * share
         if second is not None:
             feed[second, j] += gain * (1 - share)
-    del split
 
     def rate(x, v):
         power = np.maximum(x, 0.0) ** exponent
@@ -232,3 +231,68 @@ def _fault(rng, name, kind):
         return (None, 0.0, 0)
     size = FAULTS[kind][int(rng.integers(2))]
     return kind, size, int(rng.choice(places(name, kind)))
+
+
+def truth(name, fault):
+    """{name of a coefficient: its value}, and the value of the fault under ""."""
+    rig, (kind, size, place) = RIGS[name], fault
+    columns = {"drain": rig["drain"], "pump_gain": [pump[3] for pump in rig["pump"]]}
+    columns |= {part: [area for *_, area in rig[part]] for part in ("orifice", "pipe")}
+    columns["split"] = [pump[2] for pump in rig["pump"]]
+    values = {f"plant.{n}[{i}]": v for n, row in columns.items() for i, v in enumerate(row) if v}
+    span = rig["levels"][0][1]
+    scale = {"pump-delay": rig["dt"], "pump-lag": rig["dt"], "dead-zone": span, "pump-curve": 1.0,
+             "sensor-scale": 1.0, "outlet-exponent": 1.0, "leak": _outlet(rig, place),
+             "inflow": rig["pump"][0][3] * span, "area": rig["area"][place]}  # fmt: skip
+    if kind in scale:
+        values[""] = size * scale[kind]
+    return values
+
+
+def judged(trial):
+    """(whether the right cause is first, or alike; [(coefficient, whether its interval after
+    --accept holds the truth)]) of one of `trials`.
+    """
+    _, name, fault, u, y = trial
+    kind, _, place = fault
+    log = tuning.log(t=np.arange(len(u)) * RIGS[name]["dt"], u=u, y=y)
+    case = rigs.loads(toml(RIGS[name], (1.1, 0.9)))
+    result = tuning.identify(case, log, starts=1)
+    where = [place + 1, place + 2] if kind == "swapped" else place + 1
+    named = [c for first in result.diagnosis["causes"][:1] for c in (first, *first["equivalent"])]
+    right = any((c["kind"], c["where"]) == (kind, where) for c in named)
+    if kind is None:
+        right = result.diagnosis["clean"]
+    else:
+        text = ",".join(map(str, np.ravel(where)))
+        result = tuning.identify(case, log, starts=1, accept=[f"{kind}:{text}"])
+    values, rows = truth(name, fault), []
+    for parameter, row in result.parameters.items():
+        value = values.get(parameter, values.get(""))
+        if value is not None:
+            low, high = row["interval95"] or (np.inf, -np.inf)
+            rows.append((parameter, low <= value <= high))
+    return right, rows
+
+
+def main(count=100, seed=0):
+    """Print what is judged wrongly; returns (share right, clean ones accused, share covered)."""
+    jax.config.update("jax_enable_x64", True)
+    right, clean, covered, began = [], [], [], time.process_time()
+    for trial in trials(count, seed):
+        fault = trial[2]
+        good, rows = judged(trial)
+        (clean if fault[0] is None else right).append(good)
+        covered += [inside for _, inside in rows]
+        if not good:
+            print(f"log {trial[0]} of {trial[1]}: {fault}", flush=True)
+    accused = clean.count(False)
+    print(f"right cause first, or alike: {sum(right)} of {len(right)}")
+    print(f"clean logs accused: {accused} of {len(clean)}")
+    print(f"intervals that hold the truth: {sum(covered)} of {len(covered)}")
+    print(f"{time.process_time() - began:.0f} core-s")
+    return np.mean(right), accused, np.mean(covered)
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:3]))
