@@ -471,15 +471,19 @@ def _best_of_kind(trial, kind, where):
             + (f"must be one of {places}" if places else "is estimated already, or no part has it")
         )
     best = min((_with(trial, i) for i in chosen), key=lambda t: t.loss)
-    if kind != "pump-curve":
-        return best
-    place = best.problem.candidates[best.chosen[-1]].where
+    return _with_all(best) if kind == "pump-curve" else best
+
+
+def _with_all(trial):
+    """Return the Trial with all coefficients of its last cause that the data ask for."""
+    candidates = trial.problem.candidates
+    place = candidates[trial.chosen[-1]][:2]
     while True:
-        chosen = [i for i in options if candidates[i].where == place and i not in best.chosen]
-        more = min((_with(best, i) for i in chosen), key=lambda t: t.loss, default=best)
-        if not _passes(more, best):
-            return best
-        best = more
+        rest = [i for i, c in enumerate(candidates) if c[:2] == place and i not in trial.chosen]
+        more = min((_with(trial, i) for i in rest), key=lambda t: t.loss, default=trial)
+        if not _passes(more, trial):
+            return trial
+        trial = more
 
 
 def with_leaves(loop: Any, names: list[str]) -> Any:
