@@ -34,6 +34,7 @@ def withheld(loop: ClosedLoop) -> Any:
     return rates[0] - rates[1]
 
 
+@jax.jit
 def linear_distance(observer: Kalman, x: Any, u: Any) -> tuple[Any, Any, Any]:
     """(distances of x [cm], errors [cm/s], changes [cm/s]) (rows, n) of the linear model."""
     A, B, _ = linearise(observer.model, observer.levels, observer.inputs)
@@ -44,7 +45,7 @@ def linear_distance(observer: Kalman, x: Any, u: Any) -> tuple[Any, Any, Any]:
     centre = (jnp.asarray(observer.levels), jnp.asarray(observer.inputs))
     dx, du = (jnp.asarray(v) - of for v, of in zip((x, u), centre))
     error = rates(*centre) + dx @ A.T + du @ B.T - jax.vmap(rates)(jnp.asarray(x), jnp.asarray(u))
-    return np.abs(dx), np.abs(error), np.abs(dx) @ np.abs(A).T
+    return jnp.abs(dx), jnp.abs(error), jnp.abs(dx) @ jnp.abs(A).T
 
 
 def _far(loop: ClosedLoop, x: Any, u: Any, when: str) -> list[str]:
@@ -52,7 +53,7 @@ def _far(loop: ClosedLoop, x: Any, u: Any, when: str) -> list[str]:
     observer = loop.observer
     if not isinstance(observer, Kalman):
         return []
-    distance, error, change = linear_distance(observer, np.asarray(x), np.asarray(u))
+    distance, error, change = map(np.asarray, linear_distance(observer, x, u))
     if not np.any(error > FAR * change):
         return []
     i, j = (int(np.argmax(v.max(axis=0))) for v in (distance, error))

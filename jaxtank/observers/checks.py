@@ -5,7 +5,7 @@ import numpy as np
 from jax.core import Tracer
 from numpy.typing import ArrayLike
 
-from jaxtank.analysis.linear_model import linearise
+from jaxtank.analysis.linear_model import linearise_compiled
 from jaxtank.core.errors import InputError
 
 
@@ -51,7 +51,7 @@ def check_disturbed(observer, plant, levels, shares: ArrayLike = 1.0):
     if any(isinstance(v, Tracer) for v in jax.tree.leaves(traced)):
         return
     eye, still = np.eye(plant.tanks), np.zeros(plant.pumps)
-    A = np.asarray(linearise(observer.model, np.asarray(levels) * shares, still)[0])
+    A = np.asarray(linearise_compiled(observer.model, np.asarray(levels) * shares, still)[0])
     # each state in units of what it does in a time constant: all entries are near 1
     A = A / max(np.abs(A).max(), 1e-300)
     E, C = eye[:, list(observer.disturbed)], eye[list(observer.measured)]

@@ -1,6 +1,7 @@
 """What imports what: imports inside functions and imports by a computed name count as any other."""
 
 import ast
+import functools
 import graphlib
 import subprocess
 import sys
@@ -45,9 +46,9 @@ def sources():
 class Names:
     """What each name of a module may stand for: {name: dotted names}, wherever it is bound."""
 
-    def __init__(self, tree):
+    def __init__(self, nodes):
         self.known, size = {}, -1
-        for node in ast.walk(tree):
+        for node in nodes:
             if isinstance(node, ast.Import):
                 for a in node.names:
                     first = a.name.split(".")[0]
@@ -57,7 +58,7 @@ class Names:
                     self.add(a.asname or a.name, [f"{node.module}.{a.name}"])
         while self.known and size != sum(map(len, self.known.values())):  # aliases of aliases
             size = sum(map(len, self.known.values()))
-            for node in ast.walk(tree):
+            for node in nodes:
                 for target, value in bound(node):
                     self.add(target, self.of(value))
 
@@ -88,17 +89,15 @@ def bound(node):
     return []
 
 
+@functools.cache
 def imports(tree):
     """Names of what a module imports anywhere in it; "?" where it computes the name."""
-    names, found = Names(tree), set()
-    direct = {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)} & {
-        "__import__",
-        "__builtins__",
-    }
-    by_name = bool(names.known or direct)
-    pairs = ((c, node) for node in ast.walk(tree) for c in ast.iter_child_nodes(node))
+    nodes, found = list(ast.walk(tree)), set()
+    names, used = Names(nodes), {n.id for n in nodes if isinstance(n, ast.Name)}
+    by_name = bool(names.known or used & {"__import__", "__builtins__"})
+    pairs = ((c, node) for node in nodes for c in ast.iter_child_nodes(node))
     parent = {id(child): node for child, node in pairs} if by_name else {}
-    for node in ast.walk(tree):
+    for node in nodes:
         above = parent.get(id(node))
         if isinstance(node, ast.Import):
             found |= {a.name for a in node.names}
@@ -115,7 +114,7 @@ def imports(tree):
             read = isinstance(above, ast.Attribute) or names.of(above)
             if isinstance(node.ctx, ast.Load) and not read and not bound(above):
                 found.add("?")  # vars(importlib), importlib as an argument
-    return found
+    return frozenset(found)
 
 
 def graph_of(trees, modules=None):

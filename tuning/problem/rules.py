@@ -25,7 +25,7 @@ import scipy  # its parts are imported when they are first used
 
 import jaxtank
 from jaxtank.analysis.frequency import OpenLoop
-from jaxtank.analysis.linear_model import linearise, transmission_zeros
+from jaxtank.analysis.linear_model import linearise_compiled, transmission_zeros
 from jaxtank.analysis.margins import Margins, margins
 from jaxtank.case import Case
 from jaxtank.controllers import PID, Cascade, Controller, FlowCascade, Override, Ratio, SplitRange
@@ -80,7 +80,7 @@ def loop_of(case: Case, output: int, tank: int | None = None) -> Loop:
     """Return the linear model of one loop at the last plateau, of the level of `tank` if named."""
     bank, plant = cast(Any, case.loop.actuator), case.loop.plant
     _, levels, inputs = operating_point(case, plant)
-    A, B, C = (np.asarray(v, dtype=float) for v in _linearised(plant, levels, inputs))
+    A, B, C = (np.asarray(v, dtype=float) for v in linearise_compiled(plant, levels, inputs))
     slopes = _slopes(case, inputs, output)
     lags = np.broadcast_to(0.0 if bank.lag is None else np.asarray(bank.lag), slopes.shape)
     lag = float(np.max(lags[slopes != 0.0]))
@@ -88,9 +88,6 @@ def loop_of(case: Case, output: int, tank: int | None = None) -> Loop:
     delay = float(bank.delay + np.max(more[slopes != 0.0]))
     row = C[output] if tank is None else np.eye(len(A))[tank]
     return Loop(A, B @ slopes, row, lag, delay, case.clock.dt)
-
-
-_linearised = jax.jit(linearise)  # fifty small programs otherwise
 
 
 def closed_around(loop: Loop, tank: int, gains: "Gains") -> Loop:
