@@ -23,7 +23,7 @@ EDGES = (0.0, 3.0, 3.5, 4.0, 5.0, 6.0, 8.0, 9.9, 11.0)
 
 def fitted(case, logs):
     """The identified case of `jaxtank identify cascaded/open-loop --refine`."""
-    result = tuning.identify(case, logs, refine=True, starts=4, hold_back=0)
+    result = tuning.identify(case, logs, refine=True, starts=2, hold_back=0)
     parts = ", ".join(f"{p.kind} {p.where + 1}" for p in result.refinements) or "no part added"
     return result, parts
 

@@ -20,12 +20,8 @@ BETTER = 0.95
 """Share of the mean square of the predictions that a part must come below to be added."""
 POINTS = 8
 """Most points of a curve of a sensor."""
-TRIED = 2
-"""Parts that are fitted, of those that promise most."""
 SUBSTEPS = 8
 """Most Runge-Kutta steps per sample while parts are compared."""
-RANK = 1e-6
-"""Singular value, of the largest, below which the other blocks do not determine a direction."""
 READINGS = 20
 """Fewest readings per point."""
 WHITE = 3.0
@@ -165,22 +161,28 @@ class _Search:
 
     def fit(self, chosen, start):
         """Return (Fit with the Parts `chosen`, its squares of predicted blocks)."""
-        free = self.unknowns(chosen)
-        fixed = {i: float(self.start[i]) for i in {*range(self.problem.size)} - {*free.tolist()}}
+        free = set(self.unknowns(chosen).tolist())
+        fixed = {i: float(self.start[i]) for i in {*range(self.problem.size)} - free}
         fit = solve(self.problem, start, fixed=fixed, tolerance=1e-6, **self.settings)
-        return fit, self.predicted(fit.residual, fit.jacobian[:, free])
+        return fit, self.predicted(fit, chosen)
 
-    def predicted(self, residual, jacobian):
+    def predicted(self, fit, chosen):
         """Return (FOLDS,) sums of squares of each block's residuals under a fit to the others: one
-        Gauss-Newton step from the fit to all.
+        Gauss-Newton step of the parameters from a Fit to all.
         """
-        samples = np.nonzero(self.problem.mask)[1]
-        fold = samples * FOLDS // self.problem.mask.shape[1]
-        squares = np.zeros(FOLDS)
+        # what the others do not determine stays: as if each coordinate were known to within 1, and
+        # the levels at the first sample, which a prediction finds from the block itself
+        free = self.unknowns(chosen)
+        J = fit.jacobian[:, free[free < self.problem.coordinates.size]]
+        r, squares = fit.residual, np.zeros(FOLDS)
+        ridge = np.sqrt(np.mean(r**2)) * np.eye(J.shape[1])
+        fold = np.nonzero(self.problem.mask)[1] * FOLDS // self.problem.mask.shape[1]
         for f in range(FOLDS):
             block = fold == f
-            step = np.linalg.lstsq(jacobian[~block], -residual[~block], rcond=RANK)[0]
-            squares[f] = np.sum((residual[block] + jacobian[block] @ step) ** 2)
+            rows = np.concatenate([J[~block], ridge])
+            change = np.concatenate([-r[~block], np.zeros(len(ridge))])
+            step = np.linalg.lstsq(rows, change)[0]
+            squares[f] = np.sum((r[block] + J[block] @ step) ** 2)
         return squares
 
 
@@ -197,16 +199,8 @@ def refined(result: Any, settings: Mapping[str, Any]) -> tuple[Any, dict, list[R
     root = lambda squares: float(np.sqrt(squares.sum() / search.problem.mask.sum()))
     while len(chosen) < len(search.parts):
         rest = [k for k in range(len(search.parts)) if k not in chosen]
-        # the parts that promise most by one step, each then fitted
-        promise = {
-            k: search.predicted(fit.residual, fit.jacobian[:, search.unknowns([*chosen, k])]).sum()
-            for k in rest
-        }
         start = search.problem.unknowns(fit)
-        trials = [
-            (search.fit([*chosen, k], start), k)
-            for k in sorted(rest, key=promise.__getitem__)[:TRIED]
-        ]
+        trials = [(search.fit([*chosen, k], start), k) for k in rest]
         (trial, after), k = min(trials, key=lambda t: t[0][1].sum())
         if not (after.sum() < BETTER * best.sum() and (after < best).sum() > FOLDS / 2):
             break

@@ -216,3 +216,8 @@ def test_a_curve_of_a_sensor_is_written_back(preset):
 def test_a_curve_of_a_sensor_that_turns_is_refused():
     with pytest.raises(InputError, match="sensor 2: curve: its readings must increase"):
         rig.loads(CURVED.replace("[20.0, 18.0]", "[20.0, 0.4]"))
+
+
+def test_the_safety_filter_does_not_cover_a_curve_of_a_sensor():
+    with pytest.raises(InputError, match="not covered: curve"):
+        rig.loads(CURVED).with_safety_filter()
