@@ -129,7 +129,7 @@ def diagnosis_of(fit):
 
 
 def _structure(fit):
-    """Return sentences: what the data need that the rig does not have, and what cannot be told apart."""
+    """Return sentences: what the data need beyond the rig, and what cannot be told apart."""
     causes, words = fit.structure.causes, []
     if fit.structure.clean:
         return ["no test rejects the structure of the rig"]
