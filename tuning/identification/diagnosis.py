@@ -135,7 +135,7 @@ def _largest_flow(plant, data):
     u = np.abs(data.u.reshape(-1, data.u.shape[-1])).max(axis=0)[: gains.size]
     if np.any(u):
         return 2.0 * float(gains @ u)
-    return float(np.max(np.asarray(plant.area) * np.asarray(plant.rim))) / 60.0
+    return float(np.max(np.asarray(getattr(plant, "area", 1.0)) * np.asarray(plant.rim))) / 60.0
 
 
 def _of_network(plant):
@@ -439,7 +439,7 @@ def accepted(estimation: Estimation, fit: Fit, places: list[tuple[str, tuple]]) 
     loop = _with_thresholds(loop, chosen, values)
     bound = lambda c: Bound(c.name, c.low, c.high, "linear", _unit(loop, c))
     return Accepted(
-        case=estimation.case.replace(loop=loop),
+        case=estimation.case.replace(loop=loop, log=_columns(estimation, logs)),
         logs=logs,
         free={b.name: (b.low, b.high, b.scale) for b in estimation.bounds} | leaves,
         inputs=[(bound(c), (c.field, c.where, c.null)) for c in inputs],
@@ -522,6 +522,17 @@ def _best_exchange(trial, where):
     if not options:
         raise InputError("--accept swapped: needs two levels that are measured in the same unit")
     return min(options, key=lambda t: t.loss)
+
+
+def _columns(estimation, logs):
+    """Return the [log] table of a case with the headers of the columns that were exchanged."""
+    columns = dict(estimation.case.log)
+    for old, log in zip(estimation.logs, logs):
+        moved = log.headers is not None and log.tanks != old.tanks
+        for header, a, b in zip((log.headers or ())[1 + log.u.shape[1] :], old.tanks, log.tanks):
+            if moved and a != b:
+                columns[f"h{b + 1}"] = header
+    return columns
 
 
 def _exchanged_log(log, tanks):
