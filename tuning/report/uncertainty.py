@@ -199,8 +199,8 @@ def _promise_sections(ensemble):
     """The sentence on the promise, how often each limit is the one broken, likely failures."""
     promise, loop = ensemble.promise, ensemble.case.loop
     lines = [
-        f"A further kind of failure, of which no run is near, would be among the plain draws with"
-        f" 95 % confidence if its probability were {Value(promise.unseen, 2)}."
+        "A kind of failure that search and runs missed would be among the plain draws with 95 %"
+        f" confidence if its probability were above {Value(promise.unseen, 2)}."
     ]
     if promise.subset_simulation is not None:
         size = Value(promise.subset_simulation, 3)

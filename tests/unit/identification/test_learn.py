@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from calibration import ONE
 from helpers import command
 
 import jaxtank
@@ -10,28 +11,7 @@ import tuning
 from jaxtank import rig
 from tuning.identification.prediction import achieved
 
-RIG = """
-name = "one tank"
-[[tank]]
-area = 10.0
-rim = 20.0
-drain = 0.05
-level = 5.0
-[[pump]]
-gain = 3.0
-to = 1
-high = 10.0
-initial = 1.5
-[controller]
-kind = "pi"
-Kc = 1.0
-Ti = 20.0
-[reference]
-initial = [5.0]
-changes = [[5.0, 1, 12.0]]
-[values]
-"clock.dt" = 0.5
-"clock.duration" = 60.0
+RIG = f"""{ONE}
 [limits]
 max_level = 13.0
 [free]
@@ -45,7 +25,7 @@ rms_error_total = 1.0
 
 @pytest.fixture
 def case(tmp_path):
-    (tmp_path / "rig.toml").write_text(RIG)
+    (tmp_path / "rig.toml").write_text(RIG.replace('"sensor.noise" = [0.05]', ""))
     return rig.load(tmp_path / "rig.toml")
 
 
