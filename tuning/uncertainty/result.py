@@ -65,7 +65,7 @@ class Ensemble(Result):
     infeasible: np.ndarray | None
     limits: list
     fan: dict | None
-    promise: Promise | None
+    promise: Promise | None = None
     wall_s: float
     seed: int
     method: str
