@@ -270,7 +270,7 @@ def _list(key, label, value, sizes):
     if isinstance(value, dict) and sizes.plant is not None:  # by name or number, all of them
         places = {index_of(label, sizes.plant, key.shape[0], name): v for name, v in value.items()}
         value = [places[i] for i in sorted(places)]
-    elif shape == (1,) and np.ndim(value) == 0:
+    elif shape == (1,) and (is_plain(value) or isinstance(value, str)):
         value = [value]
     value = converted(label, value, key.meta(sizes.units)["unit"])
     if not (is_finite(value) and np.shape(value) == shape):

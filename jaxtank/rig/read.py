@@ -184,7 +184,7 @@ def renamed(table):
     for old, new in FORMER.items():
         if old in table and new in table:
             raise InputError(f"[{old}] is an older name of [{new}]: give one of them")
-    table = {FORMER.get(name, name): value for name, value in table.items()}
+    table = {str(FORMER.get(name, name)): value for name, value in table.items()}
     table |= {name: with_kind(name, table[name]) for name in ROLES if name in table}
     sensor = table.get("sensor")
     if isinstance(sensor, list) or (isinstance(sensor, dict) and "kind" not in sensor):

@@ -142,6 +142,9 @@ RIGS = {
         "controller": '{kind = "pi", Kc = "2 %/%", Ti = "200 s", bias = 37.0}',
         "reference": '{initial = ["42 %"], changes = [[100.0, "LT101", "0.6 m"]]}',
     },
+    "sensor with a curve": {
+        "sensor": '[{tank = "LT101", curve = [[0.0, 0.0], [0.6, 0.58], [1.2, 1.2]]}]'
+    },
     "setpoints from a table": {"reference": '{csv = "sp.csv", column = "SP", time = "t [s]"}'},
     "semicolons": {"reference": '{csv = "semi.csv", column = "SP", decimal = ","}'},
     "shaped setpoints": {

@@ -402,7 +402,8 @@ def place_of(text: str) -> tuple[str, tuple]:
         raise unknown("cause to accept", kind, KINDS)
     if not all(number.isascii() and number.isdigit() for number in numbers):
         raise InputError(
-            f"accept {text!r}: must be a cause, or with its place counted from 1: {kind}:1"
+            f"accept {text!r}: the place must be the number of a pump or tank, from 1, as {kind}:1;"
+            " swapped takes two tanks, swapped:1,2"
         )
     return kind, tuple(map(int, numbers))
 
@@ -423,7 +424,8 @@ def accepted(estimation: Estimation, fit: Fit, places: list[tuple[str, tuple]]) 
     weighted.noise = _fast_noise(estimation, fit)
     problem = Enlarged(weighted, estimation.unknowns(fit), fit.loss)
     trial = _trial(problem, (), problem.begin)
-    for kind, where in places:
+    # an exchange is fitted without the other causes, so it comes first
+    for kind, where in sorted(places, key=lambda place: place[0] != "swapped"):
         if kind == "swapped":
             trial = _best_exchange(trial, where)
             logs = [_exchanged_log(log, trial.problem.swapped) for log in logs]

@@ -90,29 +90,30 @@ CAUSES = {
     "pump-delay": "a dead time of {pump}",
     "pump-lag": "a lag of {pump}",
     "dead-zone": "a dead zone of {pump}",
-    "pump-curve": "a flow of {pump} that is a power of its input",
+    "pump-curve": "a curve of {pump}, by its exponent at half input",
     "sensor-offset": "an offset of the sensor of {tank}",
-    "sensor-scale": "a scale of the sensor of {tank}",
-    "leak": "an outlet of {tank} to the basin",
-    "outlet-exponent": "an outlet of {tank} that follows another power of its level",
-    "inflow": "an inflow of {tank} without a column",
-    "area": "another area of {tank}",
+    "sensor-scale": "a scale error of the sensor of {tank}",
+    "leak": "a leak of {tank}",
+    "outlet-exponent": "another exponent of the outlet of {tank}",
+    "inflow": "a constant inflow into {tank}",
+    "area": "an area of {tank} that differs from the rig's",
     "swapped": "the columns of {tank} exchanged",
 }
 """{kind of a cause: what the data need}"""
 EXPERIMENTS = {
-    "pump-delay": "steps of the pump with samples closer together",
-    "pump-lag": "steps of the pump with samples closer together",
+    "pump-delay": "steps of the pump, sampled faster",
+    "pump-lag": "steps of the pump, sampled faster",
     "dead-zone": "the pump held at three inputs or more, one of them near 0",
     "pump-curve": "the pump held at three inputs or more, one of them near 0",
     "sensor-offset": "a reading of the empty tank",
-    "sensor-scale": "a reading beside a measured level, near the rim",
-    "leak": "the tank filled and left alone, pumps off and outlets shut",
+    "sensor-scale": "a level measured by hand near the rim, with its reading",
+    "leak": "the level recorded with pumps off and outlets shut",
     "outlet-exponent": "a drain test from near the rim to near empty",
     "inflow": "all pumps off, and levels that settle",
-    "area": "the area measured, or a known volume poured in with the outlets shut",
+    "area": "a known volume added with the outlets shut",
+    "swapped": "a step of one pump, and which reading moves first",
 }
-"""{kind of a cause: what would tell it from others}"""
+"""{kind of a cause: experiment that distinguishes it}"""
 
 
 def diagnosis_of(fit):
@@ -137,16 +138,19 @@ def _structure(fit):
         which = f"{cause.kind}:{','.join(map(str, np.ravel(cause.where)))}"
         value = f", {_amount(cause)}" if cause.value is not None else ""
         need = _named(fit, cause.kind, cause.where)
-        words.append(f"the data need {need}{value}: identify with --accept {which}")
+        words.append(f"the data require {need}{value}; to add it to the rig: --accept {which}")
         if cause.equivalent:
             others = " or ".join(_named(fit, kind, where) for kind, where in cause.equivalent)
             tell = EXPERIMENTS[cause.kind]
-            words.append(f"they do not tell it from {others}; to tell them apart: {tell}")
+            words.append(
+                f"these data cannot distinguish it from {others}; an experiment that can: {tell}"
+            )
     if not fit.structure.white:
-        rest = "what these leave" if causes else f"what the fit leaves ({_explained(fit)})"
+        rest = "the residual after these causes" if causes else f"the residual ({_explained(fit)})"
         words.append(
-            f"{rest} is not noise, and none of the causes that are tried explains it: an inflow"
-            " without a column, or a part that the rig does not have (--refine tries some)"
+            f"{rest} is not white, and none of the tested causes explains it; possible: an inflow"
+            " that varies without a column, or a part that the rig does not have (--refine tests"
+            " curves of sensors, outlets and areas)"
         )
     return words
 
@@ -266,8 +270,8 @@ def _refinements(fit):
         label = reading_label(plant, tank) if read else label_of(plant, "tank", tank)
         what = PARTS[part.kind].format(label)
         words.append(
-            f"added: {what}: a quarter of the data is predicted by a fit to the rest with"
-            f" {scale * part.after:.3g} {unit} RMS, without it with {scale * part.before:.3g}"
+            f"added: {what}: RMS error in left-out quarters of the data {scale * part.after:.3g}"
+            f" {unit}, {scale * part.before:.3g} without it (linearised cross-validation)"
         )
     return words
 
@@ -299,10 +303,11 @@ def _posterior(fit):
     if fit.posterior is None:
         return []
     rhat, size = max(fit.posterior.rhat.values()), min(fit.posterior.effective.values())
-    ends = "" if fit.posterior.mixed else ": the chains differ, do not use the intervals"
+    ends = "" if fit.posterior.mixed else "; the chains disagree: do not use the intervals"
     return [
-        f"posterior: {len(fit.posterior.values)} draws by NUTS, of which intervals and covariance"
-        f" are; largest R-hat {rhat:.3f}, least effective sample size {size:.0f}{ends}"
+        f"posterior: intervals and covariance from {len(fit.posterior.values)} draws of the"
+        f" No-U-Turn sampler; largest R-hat {rhat:.3f}, smallest effective sample size"
+        f" {size:.0f}{ends}"
     ]
 
 

@@ -339,17 +339,20 @@ FIT = (
            choices=("linear", "soft_l1", "huber")),
     Option("--law", "KIND", "write the rig under a controller to tune: pi, with gains from the"
            " identified model", choices=("pi",)),
-    Option("--accept", "KIND[:PLACE]", "put a cause that the diagnosis names into the rig and"
-           " estimate it: pump-delay, sensor-scale:2", kind="list"),
+    Option("--accept", "KIND[:PLACE]", "add a cause to the rig and identify again; PLACE:"
+           " number of the pump or tank (default: the best). KIND: pump-delay, pump-lag, dead-zone,"
+           " pump-curve, sensor-offset, sensor-scale, leak, outlet-exponent, inflow, area,"
+           " swapped:1,2", kind="list"),
     Option("--no-prior", help="these data alone: without the [covariance] of an earlier"
            " identification", kind="flag"),
-    Option("--likelihood", "KIND", "output-error (noise of the readings alone), innovations (noise"
-           " of the levels too, by an extended Kalman filter), or auto", default="output-error",
+    Option("--likelihood", "KIND", "output-error (noise of the readings alone), innovations"
+           " (also process noise, by an extended Kalman filter), or auto", default="output-error",
            choices=("output-error", "innovations", "auto")),
-    Option("--refine", help="also: parts that the rig lacks, where blocks of the data are then"
-           " predicted better: curves of sensors, exponents of outlets", kind="flag"),
-    Option("--posterior", "KIND", "laplace, or hmc: intervals and covariance of draws by the"
-           " No-U-Turn sampler (pip install blackjax), also written to draws.csv",
+    Option("--refine", help="add parts that predict left-out blocks of the data better: curves of"
+           " sensors, exponents or linear terms of outlets, areas of tanks without a reading",
+           kind="flag"),
+    Option("--posterior", "KIND", "laplace (normal approximation), or hmc (No-U-Turn sampler;"
+           " pip install \".[posterior]\"): intervals and covariance of draws, also in draws.csv",
            default="laplace", choices=("laplace", "hmc")),
     Option("--profile", help="also: profile likelihood of the least certain parameter",
            kind="flag"),
