@@ -29,6 +29,7 @@ def tables_of(name):
     """The tables of a rig, [reference.sine] among them."""
     lines = [f"{k} = {v}" for k, v in {**audit.BASE, **audit.RIGS[name]}.items() if v is not None]
     tables = tomllib.loads("\n".join(lines))
+    tables["sensors"] = tables.pop("sensor", [])
     return {**tables, "reference.sine": tables["reference"].get("sine", {})}
 
 
