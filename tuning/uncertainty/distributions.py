@@ -1,6 +1,5 @@
 """Distributions of parameters by their quantile functions; imported by every study of `tuning`."""
 
-import csv
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
@@ -10,6 +9,7 @@ import scipy  # its parts are imported when they are first used
 from numpy.typing import ArrayLike
 
 from jaxtank.core.errors import InputError
+from jaxtank.core.tables import numbers, read_table
 from jaxtank.core.text import one_line, printable, shortened
 from jaxtank.core.tree import is_real
 
@@ -306,12 +306,10 @@ def empirical(names: Sequence[str], draws: ArrayLike) -> Empirical:
 
 def read_draws(path: str) -> Empirical:
     """Return the distribution of a CSV file of draws, names of parameters in its first line."""
+    table = read_table(path, ".")
     try:
-        with open(path, newline="", encoding="utf-8") as file:
-            names, *rows = list(csv.reader(file))
-            return empirical(names, [[float(v) for v in row] for row in rows])
-    except OSError as error:
-        raise InputError(f"draws {printable(path)}: {error.strerror}") from None
+        columns = [numbers(table, i)[0] for i in range(len(table.columns))]
+        return empirical([column.header for column in table.columns], np.stack(columns, axis=1))
     except ValueError as error:
         raise InputError(f"draws {printable(path)}: {one_line(error)}") from None
 

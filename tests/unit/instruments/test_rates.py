@@ -226,8 +226,6 @@ def test_no_limit_is_proved_of_pumps_with_a_rate_or_dead_times_that_differ():
 def test_experiment_data_are_not_compared_with_pumps_that_they_do_not_show():
     with pytest.raises(InputError, match=r"actuator\.rate"):
         rig_of(case_of(valve={"rate": 0.1}, pump={}).loop)
-    with pytest.raises(InputError, match=r"actuator\.delays"):
-        rig_of(case_of(valve={"delay": 1.0}, pump={}).loop)
 
 
 def test_arrays_and_scalars_of_a_rate_are_the_same():

@@ -223,7 +223,7 @@ def test_nan_is_reported_with_time_tank_and_parameters(gouta):
         lambda: jaxtank.simulate(broken, case.clock, save_every=10),
     ):
         with pytest.raises(
-            jaxtank.NonFiniteError, match=r"tank 1, 2, 3 .* t = 2\.01 s .* controller.Tp = 11"
+            jaxtank.NonFiniteError, match=r"tanks 1 to 3 .* t = 2\.01 s .* controller.Tp = 11"
         ):
             call()
 
