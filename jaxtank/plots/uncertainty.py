@@ -28,15 +28,17 @@ CUT = 0.05
 """Share of the plants below a bar, and above it [-]."""
 
 
-def fan(loop, bands, title):
-    """Return a figure of the quantiles of levels over many draws, with setpoints and rims."""
+def fan(loop, bands, title, limits=None):
+    """Return a figure of the quantiles of levels over many draws, with setpoints, rims and limits
+    {tank: highest level}.
+    """
     tanks = loop.plant.tanks
     columns = beside(min(2, tanks))
     rows = -(-tanks // columns)
     with styled():
         figure, axes = grid(rows, columns, (width(9.6), height(2.7 * rows, rows)), sharex=True)
         for i, ax in enumerate(axes.ravel()[:tanks]):
-            _band(ax, loop, bands, i)
+            _band(ax, loop, bands, i, (limits or {}).get(i))
         # the lowest panel of each column, above one that stays empty too
         for ax in axes.ravel()[max(0, tanks - columns) : tanks]:
             ax.set_xlabel("time [s]")
@@ -46,7 +48,7 @@ def fan(loop, bands, title):
     return figure
 
 
-def _band(ax, loop, bands, i):
+def _band(ax, loop, bands, i, limit):
     """The quantiles of one tank."""
     t, rim, unit = bands["t"], float(loop.plant.rim[i]), loop.units[0]
     low, first, middle, third, high = bands["x"][:, :, i]
@@ -62,6 +64,9 @@ def _band(ax, loop, bands, i):
     else:  # a rim far above all levels would only compress the picture
         label = f"rim {rim:g} {unit}, above the picture"
         ax.plot([], [], color=RIM, linewidth=1.2, label=label)
+    if limit is not None and limit != rim and high.max() > 0.25 * limit:
+        style = {"color": FORBIDDEN, "linewidth": 1.2, "linestyle": "-."}
+        ax.axhline(limit, **style, label=f"limit {limit:g} {unit}")
     ax.set(title=plain(label_of(loop.plant, "tank", i)), ylabel=f"level [{unit}]")
     ax.legend(loc="best", fontsize="x-small")
 

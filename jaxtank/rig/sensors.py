@@ -157,10 +157,10 @@ def leaves_of(rows, rims, noise, levels=()):
 
 def _curves(rows, tanks):
     """{leaf: (n, points)} of the curves of rows, as many points for all; {} of none."""
-    given = {row["tank"]: row["curve"] for row in rows if "curve" in row}
-    if not given:
+    points = {row["tank"]: row["curve"] for row in rows if "curve" in row}
+    if not points:
         return {}
-    curves = [given.get(i, ((0.0, 0.0), (1.0, 1.0))) for i in range(tanks)]
+    curves = [points.get(i, ((0.0, 0.0), (1.0, 1.0))) for i in range(tanks)]
     most = max(map(len, curves))
     points = np.stack([longer(np.array(curve).T, most) for curve in curves], axis=1)
     return dict(zip(("curve_level", "curve_reading"), points))
@@ -168,8 +168,8 @@ def _curves(rows, tanks):
 
 def longer(values: np.ndarray, count: int) -> np.ndarray:
     """Return (.., count) points of (.., k): more on the line through the last two."""
-    more = np.arange(1, count - values.shape[-1] + 1) * (values[..., -1:] - values[..., -2:-1])
-    return np.concatenate([values, values[..., -1:] + more], axis=-1)
+    steps = np.arange(1, count - values.shape[-1] + 1) * (values[..., -1:] - values[..., -2:-1])
+    return np.concatenate([values, values[..., -1:] + steps], axis=-1)
 
 
 def curve_of(sensor: Any, tank: int) -> list[list[float]] | None:

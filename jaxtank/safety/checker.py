@@ -4,6 +4,7 @@ It works on the final numbers, with its own formulas; README.md: "What the check
 """
 # Conditions are generators of (holds, reason), holds written so that a NaN fails it.
 
+import functools
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -126,6 +127,7 @@ class _Rig:
 
     def __init__(self, safety_filter, plant, actuator, sensor, hold, substeps, box, faults):
         self.filter, self.plant, self.hold = safety_filter, plant, float(hold)
+        self.label = functools.partial(label_of, plant, "tank")
         self.unit, self.knee = plant.units[0], float(plant.knee)
         n = self.tanks = len(np.atleast_1d(plant.rim))
         full = lambda v, size=n: np.broadcast_to(np.asarray(v, dtype=float), (size,))
@@ -151,10 +153,6 @@ class _Rig:
                 low[at] = np.minimum(low[at], np.asarray(lower, float))
                 high[at] = np.maximum(high[at], np.asarray(upper, float))
         return low, high
-
-    def label(self, tank):
-        """What a person calls a tank."""
-        return label_of(self.plant, "tank", tank)
 
     def _coefficients(self, least, most, step):
         plant, n = self.plant, self.tanks

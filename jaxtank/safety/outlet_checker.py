@@ -4,6 +4,7 @@ It works on the final numbers with its own formulas; Theorem 6 of README.md of t
 """
 # Conditions are generators of (holds, reason), holds written so that a NaN fails it.
 
+import functools
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -137,6 +138,7 @@ class _Rig:
 
     def __init__(self, outlet_filter, plant, actuator, sensor, hold, substeps, box):
         self.filter, self.plant, self.actuator = outlet_filter, plant, actuator
+        self.label = functools.partial(label_of, plant, "tank")
         self.hold, self.step, self.box = float(hold), hold / substeps, dict(box)
         self.weak, self.strong = outlet_filter.least, outlet_filter.most
         n, m = len(np.atleast_1d(plant.rim)), len(plant.feeds)
@@ -166,10 +168,6 @@ class _Rig:
                 low[at] = np.minimum(low[at], np.asarray(lower, dtype=float))
                 high[at] = np.maximum(high[at], np.asarray(upper, dtype=float))
         return low, high
-
-    def label(self, tank):
-        """What a person calls a tank."""
-        return label_of(self.plant, "tank", tank)
 
     def demand(self, j, u):
         k = j - self.m

@@ -88,8 +88,8 @@ def shares(case, names, count, hmc=False, seed=0):
             columns = [draws.values[:, draws.names.index(n)] for n in names]
             rows.append([np.mean(c < v) for c, v in zip(columns, values)])
         else:
-            found = [fit.parameters[n] for n in names]
-            scores = [(v - p["value"]) / p["sd"] for p, v in zip(found, values)]
+            estimates = [fit.parameters[n] for n in names]
+            scores = [(v - p["value"]) / p["sd"] for p, v in zip(estimates, values)]
             rows.append(stats.norm.cdf(scores))
     return np.array(rows)
 

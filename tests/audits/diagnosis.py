@@ -276,7 +276,7 @@ def judged(trial):
 
 
 def main(count=100, seed=0):
-    """Print what is judged wrongly; returns (share right, clean ones accused, share covered)."""
+    """Print wrong diagnoses; return shares (right, of clean ones accused, of intervals held)."""
     jax.config.update("jax_enable_x64", True)
     right, clean, covered, began = [], [], [], time.process_time()
     for trial in trials(count, seed):

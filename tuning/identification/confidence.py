@@ -14,7 +14,7 @@ from tuning.identification.coordinates import nominal
 from tuning.identification.inputs import STATIC
 from tuning.identification.least_squares import Fit
 from tuning.identification.problem import Estimation
-from tuning.identification.residuals import autocorrelation, pseudo
+from tuning.identification.residuals import WHITE, autocorrelation, pseudo
 
 LARGEST_DEVIATION = 0.5
 """Standard deviation of a direction, in units of its coordinates (logarithms, shares of a range),
@@ -89,7 +89,7 @@ class Spread:
         inverse = (vt.T / s**2) @ vt
         white = inverse * self.scale
         self.covariance, self.widened = white, 1.0
-        white_noise = 3 / math.sqrt(n / len(self.estimation.data.channels))
+        white_noise = WHITE / math.sqrt(n / len(self.estimation.data.channels))
         if max(map(abs, correlation), default=0.0) <= white_noise:
             return
         earlier = self.scale * self.earlier.T @ self.earlier

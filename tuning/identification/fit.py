@@ -15,13 +15,13 @@ from scipy.stats import chi2
 from jaxtank.case import Case
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.plants.base import Plant
+from tuning.identification.acceptance import accept_causes, place_of
 from tuning.identification.confidence import Spread, at_search_bounds
 from tuning.identification.data_checks import checked, first_samples
 from tuning.identification.design import remedies
-from tuning.identification.diagnosis import accepted, place_of
 from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare, check_kind
-from tuning.identification.innovations import KINDS, chosen
+from tuning.identification.innovations import LIKELIHOODS, choose_likelihood
 from tuning.identification.least_squares import Fit, profile_likelihood, solve
 from tuning.identification.problem import Estimation
 from tuning.identification.refinement import refined
@@ -178,9 +178,9 @@ def identify(
         cache, partial, logs, counts, options, search
     )
     if places and not interrupted:
-        more = accepted(estimation, best, places)
-        case, logs = more.case, more.logs
-        options |= {"free": more.free, "inputs": more.inputs, "begin": more.begin}
+        structure = accept_causes(estimation, best, places)
+        case, logs = structure.case, structure.logs
+        options |= {"free": structure.free, "inputs": structure.inputs, "begin": structure.begin}
         _, partial = _partial(case, logs, hold_back, options | {"substeps": estimation.substeps})
         search = (1, seed, settings, None)
         _, _, estimation, best, validation = _all(
@@ -262,8 +262,8 @@ def _refined(first, log, settings, began):
 def _check_settings(loss, likelihood, together, **counts):
     if loss not in LOSSES:
         raise InputError(f"loss = {loss!r}: must be one of {', '.join(LOSSES)}")
-    if likelihood not in KINDS:
-        raise InputError(f"likelihood = {likelihood!r}: must be one of {', '.join(KINDS)}")
+    if likelihood not in LIKELIHOODS:
+        raise InputError(f"likelihood = {likelihood!r}: must be one of {', '.join(LIKELIHOODS)}")
     if loss != "linear" and likelihood != "output-error":
         raise InputError(
             f"loss = {loss!r} beside likelihood = {likelihood!r}: the filter is that of normal"
@@ -393,7 +393,7 @@ def _likeliest(likelihood, estimation, simulated, before, iterations):
     """Return (Fit, Spread, quality, report) of the likelihood that is asked for or chosen, after a
     Fit to simulated readings with its (Spread, quality).
     """
-    result, report = chosen(likelihood, estimation, simulated, iterations)
+    result, report = choose_likelihood(likelihood, estimation, simulated, iterations)
     if result is None:
         return simulated, *before, report | {"noise": [float(v) for v in estimation.noise]}
     after = _spread(estimation, result.fit, whitened=True)

@@ -13,24 +13,19 @@ from jaxtank.core.tree import with_values
 from jaxtank.xla.hoist import scan
 from tuning.identification.least_squares import Fit, solve
 from tuning.identification.problem import LARGEST_SLOPE, Estimation
-from tuning.identification.residuals import autocorrelation, residuals_of
+from tuning.identification.residuals import WHITE, autocorrelation, residuals_of
 from tuning.identification.simulation import player
 
-KINDS = ("output-error", "innovations", "auto")
-WHITE = 3.0
-"""Autocorrelation of residuals, in standard deviations of that of noise, up to which they count as
-noise of the readings alone."""
+LIKELIHOODS = ("output-error", "innovations", "auto")
 REACH = 3.0
-"""Logarithm of the factor by which the noise of the readings may differ from its first value."""
+"""Largest change of log(noise of the readings) from its first value."""
 PROCESS = (1e-8, 1e-1)
 """Range of the process noise, in rims per root of a second."""
+PROCESS_SD = 0.5
+"""Prior standard deviation of a tank's log(process noise) about the mean of all tanks."""
 
 
-ALIKE = 0.5
-"""Standard deviation of the logarithm of a tank's process noise about the mean of all tanks'."""
-
-
-class Filtered(NamedTuple):
+class InnovationsFit(NamedTuple):
     """A fit by the innovations."""
 
     fit: Fit  # residual and Jacobian of the innovations in their standard deviations
@@ -135,7 +130,7 @@ class Likelihood:
         # else the noise of a tank of which few readings tell would often be estimated as 0
         first, n = estimation.size, rim.size
         self.alike = np.zeros((n, self.size))
-        self.alike[:, first : first + n] = (np.eye(n) - 1.0 / n) / ALIKE
+        self.alike[:, first : first + n] = (np.eye(n) - 1.0 / n) / PROCESS_SD
 
     @property
     def size(self) -> int:
@@ -182,8 +177,8 @@ class Likelihood:
             jacobian[:, est.size :] = rows[:, shared + len(tanks) :]
             for e in range(len(est.logs) if free else 0):
                 begin = shared + e * free
-                own = rows[log == e, shared : shared + free] * est.level_scale[:free]
-                jacobian[log == e, begin : begin + free] = own
+                slopes = rows[log == e, shared : shared + free] * est.level_scale[:free]
+                jacobian[log == e, begin : begin + free] = slopes
             jacobians.append(jacobian)
         return (*parts, *jacobians)
 
@@ -223,8 +218,8 @@ class Likelihood:
         return np.clip(z, *self.box)
 
 
-def filtered(estimation: Estimation, fit: Fit, iterations: int) -> Filtered:
-    """Return the Filtered of a search from a Fit to the simulated readings."""
+def fit_innovations(estimation: Estimation, fit: Fit, iterations: int) -> InnovationsFit:
+    """Return the InnovationsFit of a search from a Fit to the simulated readings."""
     problem, size = Likelihood(estimation), estimation.size
     best = solve(problem, problem.start(fit), iterations=iterations, tolerance=1e-10)
     v, S, dv, _ = problem.at(best.z)
@@ -235,12 +230,14 @@ def filtered(estimation: Estimation, fit: Fit, iterations: int) -> Filtered:
         best, residual=v / root, jacobian=dv[:, :size] / root[:, None], z=best.z[:size]
     )
     value = -0.5 * float(np.sum(v**2 / S + np.log(2 * np.pi * S)))
-    return Filtered(fit, noises[:tanks], noises[tanks:], value)
+    return InnovationsFit(fit, noises[:tanks], noises[tanks:], value)
 
 
-def chosen(kind: str, estimation: Estimation, fit: Fit, iterations: int) -> tuple[Any, dict]:
-    """Return (Filtered, or None for the fit to simulated readings, {"kind", "asked", "reason",
-    "bic", "process_noise"}). reason: "asked", "white" residuals, or "bic", the lower one.
+def choose_likelihood(
+    kind: str, estimation: Estimation, fit: Fit, iterations: int
+) -> tuple[Any, dict]:
+    """Return (InnovationsFit, None for the fit to simulated readings; {"kind", "asked",
+    "reason", "bic", "process_noise"}). reason: "asked", "white" residuals, or "bic", the lower one.
     """
     report = {"kind": "output-error", "asked": kind, "reason": "asked", "bic": None}
     report["process_noise"] = None
@@ -249,15 +246,15 @@ def chosen(kind: str, estimation: Estimation, fit: Fit, iterations: int) -> tupl
     if estimation.coordinates.inputs:
         names = ", ".join(estimation.of_inputs)
         raise InputError(
-            f"likelihood = {kind!r} beside an accepted {names}: accept it first, and identify the"
-            " rig file that is written"
+            f"likelihood = {kind!r} cannot estimate {names}: accept it with output-error first,"
+            " then identify with the rig.toml that is written"
         )
     residual = residuals_of(estimation, fit)
     count, channels = int(estimation.mask.sum()), np.moveaxis(residual, -1, 0)
     limit = WHITE / np.sqrt(count / len(channels))
     if kind == "auto" and all(abs(autocorrelation(r, 1)[1]) < limit for r in channels):
         return None, report | {"reason": "white"}
-    result = filtered(estimation, fit, iterations)
+    result = fit_innovations(estimation, fit, iterations)
     report["process_noise"] = result.process.tolist()
     if kind == "auto":
         present = [r[np.isfinite(r)] for r in channels]

@@ -11,7 +11,7 @@ from jaxtank.core.tree import split_index
 
 
 class Inputs(NamedTuple):
-    """What an input meets before it reaches the plant, beyond the rig as it is."""
+    """Dead zone, curve, lag and delay that are applied to an input outside the compiled program."""
 
     delay: float = 0.0  # [s]
     lag: float = 0.0  # time constant [s]

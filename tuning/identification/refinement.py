@@ -1,4 +1,4 @@
-"""Parts that a rig lacks and its readings show, added one after the other by cross-validation."""
+"""Missing parts of a rig, added one at a time by cross-validation."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -12,21 +12,18 @@ from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.sensors import longer
 from tuning.identification.least_squares import solve
 from tuning.identification.problem import Estimation
-from tuning.identification.residuals import autocorrelation
+from tuning.identification.residuals import WHITE, autocorrelation
 
 FOLDS = 4
 """Blocks of the data, each predicted by a fit to the others."""
-BETTER = 0.95
-"""Share of the mean square of the predictions that a part must come below to be added."""
-POINTS = 8
+CROSS_VALIDATION_RATIO = 0.95
+"""Ratio of the mean squares of the prediction errors below which a part is added [-]."""
+MOST_POINTS = 8
 """Most points of a curve of a sensor."""
 SUBSTEPS = 8
 """Most Runge-Kutta steps per sample while parts are compared."""
 READINGS = 20
 """Fewest readings per point."""
-WHITE = 3.0
-"""Autocorrelation of residuals, in standard deviations of that of noise, up to which no part is
-looked for."""
 
 
 class Part(NamedTuple):
@@ -99,7 +96,7 @@ def _outlet(plant, kind, k, tank, area):
 def _sensor_curve(sensor, y, tank, volts):
     """Return the Part of a sensor whose readings are a curve of the level; None of too few."""
     present = np.isfinite(y)
-    count = min(POINTS, int(present.sum()) // READINGS)
+    count = min(MOST_POINTS, int(present.sum()) // READINGS)
     if not isinstance(sensor, LevelSensor) or sensor.curve_level is not None or count < 3:
         return None
     readings = np.asarray(sensor.level_of(tank, y[present], volts))
@@ -187,8 +184,8 @@ class _Search:
 
 
 def refined(result: Any, settings: Mapping[str, Any]) -> tuple[Any, dict, list[Refinement]]:
-    """Return (case, what is free in it, Refinements): that of an Identification with the Parts that
-    predict its data better.
+    """Return (case, free, Refinements) of an Identification after adding the Parts that predict
+    left-out blocks of its data better.
     """
     free = {b.name: (b.low, b.high, b.scale) for b in result.estimation.bounds}
     if _is_white(result.estimation, result.fit):
@@ -198,11 +195,13 @@ def refined(result: Any, settings: Mapping[str, Any]) -> tuple[Any, dict, list[R
     fit, best = search.fit(chosen, search.start)
     root = lambda squares: float(np.sqrt(squares.sum() / search.problem.mask.sum()))
     while len(chosen) < len(search.parts):
-        rest = [k for k in range(len(search.parts)) if k not in chosen]
+        others = [k for k in range(len(search.parts)) if k not in chosen]
         start = search.problem.unknowns(fit)
-        trials = [(search.fit([*chosen, k], start), k) for k in rest]
+        trials = [(search.fit([*chosen, k], start), k) for k in others]
         (trial, after), k = min(trials, key=lambda t: t[0][1].sum())
-        if not (after.sum() < BETTER * best.sum() and (after < best).sum() > FOLDS / 2):
+        if not (
+            after.sum() < CROSS_VALIDATION_RATIO * best.sum() and (after < best).sum() > FOLDS / 2
+        ):
             break
         part = search.parts[k]
         added.append(Refinement(part.kind, part.where, root(best), root(after)))

@@ -7,6 +7,8 @@ from jaxtank.core.errors import InputError
 ENOUGH = 10
 """Fewest second differences from which the noise of a channel is estimated."""
 LAGS = 60
+WHITE = 3.0
+"""Largest autocorrelation of white residuals at lag 1, in its standard deviation 1/sqrt(n)."""
 ROBUST_LIMIT = 3.0
 """Residual, in standard deviations, beyond which a robust loss reduces its weight."""
 

@@ -156,7 +156,7 @@ def player(rig, dt, u, substeps):
         rig.actuator.init(Clock(dt=1.0, duration=1.0)),
     )
 
-    def advanced(x, state, step, inputs, more):
+    def advanced(x, state, step, inputs, entering):
         # experiment data hold the command, which may lie beyond the pump's limits
         inputs = tuple(
             clip(v, rig.actuator.low[j], rig.actuator.high[j]) for j, v in enumerate(inputs)
@@ -164,19 +164,19 @@ def player(rig, dt, u, substeps):
         # no division by zero in the padding
         driven, state = rig.actuator.step(state, inputs, jnp.where(step > 0, step, 1.0))
         driven, enters = rig.actuator.driving(driven), d
-        if more is not None:
-            enters = more if d is None else tuple(a + b for a, b in zip(d, more))
+        if entering is not None:
+            enters = entering if d is None else tuple(a + b for a, b in zip(d, entering))
         return advance(
             rig.plant, "rk4", 0.0, x, driven, enters, step, substeps, rolled=True
         ).x, state
 
-    def stepped(x, state, pieces, more=None):
-        x, state = advanced(x, state, pieces[0][0], pieces[0][1], more)
+    def stepped(x, state, pieces, entering=None):
+        x, state = advanced(x, state, pieces[0][0], pieces[0][1], entering)
         for step, inputs in pieces[1:]:
             # a piece of length zero is none: a pump with memory would see a sample
             x, state = jax.tree.map(
                 lambda new, old, step=step: jnp.where(step > 0, new, old),
-                advanced(x, state, step, inputs, more),
+                advanced(x, state, step, inputs, entering),
                 (x, state),
             )
         return x, state
@@ -191,7 +191,7 @@ def readings(rig, dt, u, channels, substeps, flows=None):
     are no channels. flows : (samples, tanks) inflows beside the rig's own.
     """
     x, state, stepped, pieces = player(rig, dt, u, substeps)
-    more = None if flows is None else tuple(flows[:, i] for i in range(rig.plant.tanks))
+    entering = None if flows is None else tuple(flows[:, i] for i in range(rig.plant.tanks))
 
     def sample(carry, now):
         y = carry[0]
@@ -199,7 +199,7 @@ def readings(rig, dt, u, channels, substeps, flows=None):
             y = tuple(rig.sensor.reading_of(i, carry[0][i], volts) for i, volts in channels)
         return stepped(carry[0], carry[1], *now), y
 
-    return jnp.stack(scan(sample, (x, state), (pieces, more), length=dt.shape[0])[1], axis=-1)
+    return jnp.stack(scan(sample, (x, state), (pieces, entering), length=dt.shape[0])[1], axis=-1)
 
 
 @functools.partial(jax.jit, static_argnames=("coordinates", "tanks", "channels", "substeps"))

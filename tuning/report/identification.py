@@ -130,7 +130,7 @@ def diagnosis_of(fit):
 
 
 def _structure(fit):
-    """Return sentences: what the data need beyond the rig, and what cannot be told apart."""
+    """Return sentences: causes that the rig lacks, and those equivalent to them."""
     causes, words = fit.structure.causes, []
     if fit.structure.clean:
         return ["no test rejects the structure of the rig"]
@@ -146,17 +146,19 @@ def _structure(fit):
                 f"these data cannot distinguish it from {others}; an experiment that can: {tell}"
             )
     if not fit.structure.white:
-        rest = "the residual after these causes" if causes else f"the residual ({_explained(fit)})"
+        residual = (
+            "the residual after these causes" if causes else f"the residual ({_explained(fit)})"
+        )
         words.append(
-            f"{rest} is not white, and none of the tested causes explains it; possible: an inflow"
-            " that varies without a column, or a part that the rig does not have (--refine tests"
-            " curves of sensors, outlets and areas)"
+            f"{residual} is not white, and none of the tested causes explains it; possible: an"
+            " inflow that varies without a column, or a part that the rig does not have (--refine"
+            " tests curves of sensors, outlets and areas)"
         )
     return words
 
 
 def _explained(fit):
-    """Return how much of each level a fit explains."""
+    """Return the fit of each level in per cent."""
     shares = zip(fit.channels, fit.quality["nrmse_percent"])
     return ", ".join(f"fit of {name} {v:.0f} %" for (name, _), v in shares if v is not None)
 
@@ -170,26 +172,27 @@ def _named(fit, kind, where):
 
 
 PUMPS = ("pump-delay", "pump-lag", "dead-zone", "pump-curve")
-"""Kinds of causes that are of pumps."""
+"""Kinds of causes located at a pump."""
 
 
 def _amount(cause):
     """Return the value of a cause with its interval."""
-    if cause.value is None:
-        return ""
     unit = "" if cause.unit == "-" else f" {cause.unit}"
-    low, high = cause.interval95
-    return f"{cause.value:.4g}{unit} ({low:.4g} .. {high:.4g})"
+    present = cause.present if cause.kind in ("leak", "area", "outlet-exponent", "inflow") else 0.0
+    beside = f" instead of {present:.4g}" if present else ""
+    words = "between inputs " if cause.interval95 is None else ""
+    low, high = cause.interval95 or cause.between
+    return f"{cause.value:.4g}{unit}{beside} ({words}{low:.4g} .. {high:.4g})"
 
 
 def _headline(fit, status):
-    """Return how the search ended, after what makes its answer worthless."""
+    """Return the headline: problems of the data, then how the search ended, or the first cause."""
     kinds = dict.fromkeys(odd.kind for odd in fit.oddities if odd.alters_fit)
     names = ["spikes" if kind == "spike" else f"{kind} readings" for kind in kinds]
     words = [f"data with {' and '.join(names)}"] if names else []
     if fit.status == "interrupted":
         return "; ".join([*words, status])
-    words += [status] if fit.structure.clean else []
+    words += [status] if fit.structure.clean or fit.status != "converged" else []
     return "; ".join([*words, _structure(fit)[0]])
 
 
@@ -262,7 +265,7 @@ PARTS = {
 
 def _refinements(fit):
     """Return a sentence on each part that was added to the rig."""
-    noise, words = fit.quality["noise"], []
+    noise, words = fit.estimation.noise, []
     scale, unit = (noise[0], fit.channels[0][1]) if len(noise) == 1 else (1.0, "times the noise")
     for part in fit.refinements:
         plant, tank = fit.case.loop.plant, part.where

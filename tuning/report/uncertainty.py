@@ -184,15 +184,17 @@ def promise_sentence(promise):
         rate = f"1 in {round(inverse):,}"
     runs = f"{promise.runs:,} runs, {promise.gradients:,} of them with derivatives"
     interval = Value(promise.interval95, 3, between=" to ")
-    found = f"probability {Value(promise.probability, 3)}, 95 % interval {interval}, from {runs}"
-    given = "given that the parameters are distributed as stated"
+    estimate = f"probability {Value(promise.probability, 3)}, 95 % interval {interval}, from {runs}"
+    condition = "given that the parameters are distributed as stated"
     if promise.answer == "undecided":
         return (
-            f"Undecided: a share of {rate} plants that break any limit, {given}, lies within the"
-            f" 95 % interval ({found}); more --samples allow more runs"
+            f"Undecided: a share of {rate} plants that break any limit, {condition}, lies within"
+            f" the 95 % interval ({estimate}); more --samples allow more runs"
         )
     fewer = "fewer" if promise.answer == "kept" else "more"
-    return f"With 95 % confidence {fewer} than {rate} plants break any limit, {given} ({found})"
+    return (
+        f"With 95 % confidence {fewer} than {rate} plants break any limit, {condition} ({estimate})"
+    )
 
 
 def _promise_sections(ensemble):
@@ -295,7 +297,8 @@ def figures(ensemble):
     drawings, loop = {}, ensemble.case.loop
     if ensemble.fan is not None:
         title = f"{ensemble.case.name}: {_draws_of_fan(ensemble)}"
-        drawings["fan"] = fan(loop, ensemble.fan, title)
+        limits = {lim.index: lim.value for lim in ensemble.limits if lim.measure == "max_level"}
+        drawings["fan"] = fan(loop, ensemble.fan, title, limits)
     if ensemble.limits:
         drawings["violations"] = violations(ensemble.violations(), ensemble.samples)
     return drawings | plots.rig(loop.plant, None, ensemble.case.name)

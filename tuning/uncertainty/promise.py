@@ -34,13 +34,13 @@ STEP = 1e-4
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Promise:
-    """The probability that any limit is broken, beside the promised one.
+    """The estimated probability that any limit is broken, and the promised upper bound.
 
     Attributes
     ----------
     promise : float
     answer : {"kept", "not kept", "undecided"}
-        By which side of the promise the interval lies on, "undecided" where it lies on both.
+        Which side of the promise the 95 % interval lies on; "undecided" if it contains it.
     probability : float
     interval95 : (low, high)
     coefficient_of_variation : float or None
@@ -53,9 +53,9 @@ class Promise:
     runs, gradients : int
         Runs, the draws of the study among them, and runs with derivatives.
     unseen : float
-        A further kind of failure with this probability would be among the plain draws with 95 %.
+        95 % upper bound on the probability of a kind of failure that is not among the plain draws.
     subset_simulation : float or None
-        Its estimate, where the slopes led to no failure.
+        Estimate by subset simulation, if the search by gradients found no failure.
     """
 
     promise: float

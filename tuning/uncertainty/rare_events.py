@@ -297,8 +297,8 @@ def interval(weights: Any, largest: float) -> tuple[float, float]:
     total, square = float(np.sum(weights)), float(np.sum(weights**2))
     chi2 = lambda p, freedom: 2.0 * float(scipy.special.gammaincinv(freedom / 2.0, p))
     low = square / (2 * total) * chi2(0.025, 2 * total**2 / square) if total else 0.0
-    more = float(np.max(weights)) if total else largest
-    total, square = total + more, square + more**2
+    weight = float(np.max(weights)) if total else largest
+    total, square = total + weight, square + weight**2
     high = float(square / (2 * total) * chi2(0.975, 2 * total**2 / square))
     return low, min(1.0, high)
 

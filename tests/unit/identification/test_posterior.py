@@ -63,7 +63,6 @@ def test_hmc_without_blackjax_is_refused_before_the_search(tmp_path, monkeypatch
 @pytest.mark.slow
 def test_draws_of_a_linear_model_are_those_of_its_normal_posterior(tank):
     """A tank without a drain: the level is linear in the gain."""
-    pytest.importorskip("blackjax")
     from tuning.identification.posterior import with_draws
 
     closed = rig.set_values(tank, {"plant.drain": [0.0], "x0": [1.0]})

@@ -210,6 +210,14 @@ def test_every_run_is_drawn_and_distinguished_from_the_others(count):
     plt.close(figure)
 
 
+def test_a_limit_below_the_rim_is_in_its_panel_of_a_fan():
+    loop = presets.find("cascaded/pi").loop
+    bands = {"t": np.arange(3.0), "r": np.ones((3, 1)), "x": np.full((5, 3, 2), 6.0)}
+    first, second = uncertainty.fan(loop, bands, "fan", {0: 7.0, 1: float(loop.plant.rim[1])}).axes
+    assert [7.0, 7.0] in [list(line.get_ydata()) for line in first.lines]
+    assert not [line for line in second.lines if line.get_label().startswith("limit")]
+
+
 def test_the_rim_is_in_every_panel_of_a_fan():
     """As a line, or in words where it stands far above all levels."""
     loop = presets.find("mirakhorli/sfc").loop
