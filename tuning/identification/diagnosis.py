@@ -79,9 +79,12 @@ def diagnose(estimation: Estimation, fit: Fit) -> Diagnosis:
     """Return the Diagnosis of a fit."""
     weighted, causes = copy.copy(estimation), []
     weighted.noise = fast_noise(estimation, fit)
-    problem = AugmentedEstimation(weighted, estimation.unknowns(fit), loss=fit.loss)
+    z = estimation.unknowns(fit)
+    weighted.substeps = weighted.substeps_for(z)  # fewer than of noise that was stated too small
+    problem = AugmentedEstimation(weighted, z, loss=fit.loss)
     # the prior is left out of the tests: it would hide a wrong structure
-    trial = trial_at(problem, (), problem.begin) if estimation.prior is None else _fit(problem, ())
+    same = estimation.prior is None and weighted.substeps == estimation.substeps
+    trial = trial_at(problem, (), problem.begin) if same else _fit(problem, ())
     while len(causes) <= MAX_CAUSES:
         options = _fitted(trial) + ([] if causes else exchanges(trial))
         best = min(options, key=lambda t: t.loss, default=None)

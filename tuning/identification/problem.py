@@ -123,7 +123,7 @@ class Estimation:
                 " longer data, or free fewer"
             )
         self.evaluations = 0  # of residual and Jacobian
-        self.substeps = self._substeps() if substeps is None else int(substeps)
+        self.substeps = self.substeps_for(self.nominal()) if substeps is None else int(substeps)
 
     def _prior(self):
         """Return (names, values (n,), root (n, n) of the information) of the case's covariance, of
@@ -158,9 +158,8 @@ class Estimation:
                     x0[e, tank] = max(float(self.rig.sensor.level_of(tank, y, in_volts)), 0.0)
         return x0
 
-    def _substeps(self):
-        """Return Runge-Kutta steps per sample at the case's own values."""
-        z = self.nominal()
+    def substeps_for(self, z):
+        """Return Runge-Kutta steps per sample at unknowns z, for an error below the noise."""
         count, change = simulation.substeps_for(
             self.rig_at(z), self.data, self.first_levels(z), 0.1 * self.noise
         )

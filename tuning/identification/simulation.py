@@ -222,11 +222,7 @@ def sensitivities(rig, dt, u, p, first, *, coordinates, tanks, channels, substep
     return jax.vmap(of_log, in_axes=(0, 0, 0 if p.ndim == 2 else None, 0))(dt, u, p, first)
 
 
-@functools.partial(
-    jax.jit,
-    static_argnames=("coordinates", "substeps"),
-    compiler_options={"xla_backend_optimization_level": 0},  # it runs seldom: compiled in half
-)
+@functools.partial(jax.jit, static_argnames=("coordinates", "substeps"))
 def variants(rig, dt, u, flows, p, first, *, coordinates, substeps):
     """Return (variants, logs, samples, tanks) levels of a Rig at coordinates p (variants, shared),
     for inputs u, further inflows `flows` and levels `first` of each variant and log.
