@@ -21,6 +21,7 @@ lazy.HOMES.update(
     # results
     Answer="tuning.report.tuned",
     Attack="tuning.report.falsification",
+    ControllerComparison="tuning.report.controllers",
     Ensemble="tuning.report.uncertainty",
     Feasibility="tuning.report.feasible",
     Identification="tuning.report.identification",

@@ -26,6 +26,8 @@ from tuning.problem.functions import Constraint as Constraint
 from tuning.problem.functions import Objective as Objective
 from tuning.problem.problem import Problem as Problem
 from tuning.problem.status import Status as Status
+from tuning.search.comparison import ControllerComparison as ControllerComparison
+from tuning.search.comparison import compare_controllers as compare_controllers
 from tuning.search.discrete import tune_choices as tune_choices
 from tuning.search.judged import Answer as Answer
 from tuning.search.judged import Judged as Judged

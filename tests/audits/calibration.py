@@ -8,16 +8,18 @@ python tests/audits/calibration.py --hmc [N]      draws by NUTS, N (60) logs of 
 """
 
 import sys
+from pathlib import Path
 
 import jax
 import numpy as np
-from helpers import RIGS
 from scipy import stats
 
 import jaxtank
 import tuning
 from jaxtank import rig
 from jaxtank.core.tree import get_value, with_values
+
+RIGS = Path(__file__).parents[1] / "data" / "rigs"
 
 ONE = """
 name = "one tank"

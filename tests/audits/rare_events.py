@@ -6,16 +6,18 @@ python tests/audits/rare_events.py --quick    the estimates alone
 
 import sys
 import time
+from pathlib import Path
 
 import jax
 import numpy as np
-from helpers import RIGS
 
 import jaxtank
 import tuning
 from jaxtank import rig
 from jaxtank.limits import resolve_limits
 from tuning.uncertainty.draws import Draws
+
+RIGS = Path(__file__).parents[1] / "data" / "rigs"
 
 BLOCK = 1 << 16
 Normal, Uniform = tuning.Normal, tuning.Uniform

@@ -87,7 +87,7 @@ def _published(case: Case, kind: str) -> tuple[Any, dict[str, Any]] | None:
     if paper not in presets.PAPERS:
         return None
     for other in presets.load(paper).cases.values():
-        if _is_kind(other.loop.controller, kind) and _same(other, case):
+        if _is_kind(other.loop.controller, kind) and same_rig(other, case):
             free = {n: f for n, f in other.free.items() if n.startswith("controller.")}
             controller: Any = other.loop.controller
             if hasattr(controller, "model"):
@@ -96,7 +96,7 @@ def _published(case: Case, kind: str) -> tuple[Any, dict[str, Any]] | None:
     return None
 
 
-def _same(*cases: Case) -> bool:
+def same_rig(*cases: Case) -> bool:
     """Return whether two cases have the same plant and pumps."""
     trees = [jax.tree.flatten((case.loop.plant, case.loop.actuator)) for case in cases]
     (leaves, form), (others, other_form) = trees

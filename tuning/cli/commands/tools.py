@@ -9,8 +9,9 @@ from pathlib import Path
 from jaxtank.core.errors import InputError, nearest
 from jaxtank.core.files import check_folder, write_folder
 from jaxtank.core.text import printable
-from tuning.cli.options import COMMON, Command, Option
-from tuning.cli.steps import print_result, report_written, use_float64
+from tuning.cli.options import COMMON, SEEDS, Command, Option
+from tuning.cli.steps import finish, print_result, report_written, use_float64
+from tuning.cli.terminal import Line
 from tuning.cli.values import folder, whole
 
 
@@ -51,8 +52,12 @@ def figure(args):
 
 
 def compare(args):
-    """Print the published numbers of a paper next to the numbers of our runs."""
+    """Print the published numbers of a paper next to the numbers of our runs, or every controller
+    that fits a rig.
+    """
     use_float64()
+    if args.controllers:
+        return _controllers(args)
     from jaxtank import presets
     from tuning.report import papers as report
     from tuning.report.document import terminal
@@ -69,6 +74,27 @@ def compare(args):
     text = report.markdown if args.markdown else lambda rows: terminal(report.report(rows))
     print_result(args, rows if args.paper == "all" else rows[args.paper], lambda: text(rows))
     report_written(written, args)
+    return 0
+
+
+def _controllers(args):
+    """Print every controller that fits a rig, tuned and judged alike."""
+    from jaxtank import rig
+    from tuning.search.comparison import compare_controllers
+
+    if args.markdown:
+        raise InputError("--markdown: is of published numbers, not of --controllers")
+    line = Line(args.quiet)
+    line.compiling("the simulation and its derivatives", 15)
+    result = compare_controllers(
+        rig.check(rig.open_case(args.paper)),
+        kinds=args.kind or None,
+        samples=args.samples,
+        seed=args.seed,
+        progress=lambda name: line.show(f"{name}: search and judging"),
+    )
+    line.end()
+    finish(result, args)
     return 0
 
 
@@ -130,7 +156,16 @@ COMMANDS = {
         "published and measured numbers side by side, and why they differ; PAPER or all",
         (
             *COMMON,
-            Option("paper", "PAPER", 'a paper (see jaxtank list), or "all"'),
+            Option("paper", "PAPER", 'a paper (see jaxtank list), or "all"; with --controllers a'
+                   " case or rig file"),
+            Option("--controllers", help="instead: every controller that fits the rig, at its first"
+                   " gains and tuned, with and without the safety filter, on the same plants"
+                   " (about a minute for each)", kind="flag"),
+            Option("--kind", "NAME", "with --controllers: this one only, as the table names it",
+                   kind="list"),
+            Option("--samples", "N", "with --controllers: plants", whole(1, 10**6), 256),
+            Option("--seed", "N", "with --controllers: seed of plants, noise and searches", SEEDS,
+                   0),
             Option("--out", "DIR", "folder for report.html, result.json and pictures", folder),
             Option("--markdown", help="as a Markdown table", kind="flag"),
         ),

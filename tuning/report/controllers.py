@@ -1,0 +1,142 @@
+"""The report of `jaxtank compare --controllers`: every controller that fits a rig, side by side."""
+
+import numpy as np
+
+from tuning.problem import provenance
+from tuning.report.document import Report, Text
+from tuning.report.folder import earlier
+from tuning.report.folder import save as save_all
+from tuning.report.tables import Table, Value, clean
+
+CAPTIONS = {
+    "controllers": "Mean error of the plants that can follow, of each controller at its first gains"
+    " (open) and tuned (filled); squares have the safety filter, and a cross marks limits that are"
+    " broken on some plant."
+}
+
+
+def json_of(result):
+    """The JSON object of `jaxtank compare --controllers --json`."""
+    return clean(
+        {
+            "case": result.case.name,
+            "samples": result.samples,
+            "unit": result.case.loop.units[0],
+            "controllers": [_row(rival) for rival in result.rivals],
+            "refused": result.refused,
+            "sentence": sentence(result),
+            "provenance": provenance.provenance(result.case, result.seed),
+        }
+    )
+
+
+def _row(rival):
+    """The JSON object of a Rival."""
+    judged = rival.judged.to_json()
+    return {
+        "name": rival.name,
+        "kind": rival.kind,
+        "gains": rival.gains,
+        "tuned": rival.tuned,
+        "filter": rival.filtered,
+        "error": rival.error,
+        "objective": judged["objective"],
+        "violations": rival.violations,
+        "failed": judged["failed"],
+        "travel_percent": judged["travel_percent"],
+        "sensitivity_peak": rival.peak,
+        "why": rival.why or None,
+        "step_us": rival.step_us,
+    }
+
+
+def sentence(result):
+    """Return who wins, by how much, and where the case's own controller stands."""
+    unit, best, own = result.case.loop.units[0], result.best, result.own
+    if best.error is None:
+        return "no controller has a finite run on a plant that can follow"
+    words = f"{best.words()}: least error ({best.error:.3g} {unit}) of those that hold every limit"
+    words += f" on {result.samples} of {result.samples} plants"
+    if not best.holds:
+        words = f"no controller holds every limit; {best.words()} breaks one on fewest plants"
+        words += f" ({best.violations} of {result.samples}), error {best.error:.3g} {unit}"
+    if best.name == own.name:
+        rivals = [r for r in result.rivals if r.name != own.name and r.holds == best.holds]
+        if rivals and rivals[0].error is not None:
+            return f"{words}; next: {rivals[0].words()} ({rivals[0].error:.3g} {unit})"
+        return f"{words}; no other controller does as well"
+    stands = "no finite run" if own.error is None else f"{own.error:.3g} {unit}"
+    if own.violations:
+        stands += f", a limit broken on {own.violations} plants"
+    return f"{words}; the case's own controller at its best ({own.words()}): {stands}"
+
+
+def report(result):
+    """Return the Report of a ControllerComparison."""
+    unit = result.case.loop.units[0]
+    heads = ["controller", "gains", "filter", f"error [{unit}]", "limits broken", "travel [%]"]
+    heads += ["Ms [-]", "C [us/step]"]
+    rows = []
+    for rival in result.rivals:
+        travel = rival.judged.to_json()["travel_percent"]
+        rows.append(
+            [
+                rival.name,
+                rival.gains,
+                "yes" if rival.filtered else "no",
+                Value(rival.error, 4),
+                f"{rival.violations} of {result.samples}",
+                Value(travel, 3),
+                Value(rival.peak, 3),
+                Value(rival.step_us, 3),
+            ]
+        )
+    notes = [
+        "error: mean total rms error of the plants that can follow: on which some controller can"
+        " hold every setpoint; travel: rms change of the inputs per sample, as a share of their"
+        " range; Ms: largest sensitivity peak at the plateaus of the nominal plant.",
+        *(f"{name} does not fit this rig: {why}" for name, why in result.refused.items()),
+    ]
+    best = result.best
+    return Report(
+        f"{result.case.name}: controllers",
+        sentence(result),
+        [("plants", result.samples), ("controllers", len({r.name for r in result.rivals}))],
+        [Text([sentence(result)]), Table(rows, heads, gap=True), Text(notes, items=True, gap=True)],
+        best.holds,
+        result.case.title,
+        width=100,
+    )
+
+
+def figures(result):
+    """Return matplotlib figures {"controllers": errors of all Rivals}."""
+    from jaxtank.plots.style import picture
+
+    names = list(dict.fromkeys(rival.name for rival in result.rivals))
+
+    def errors(ax):
+        for rival in result.rivals:
+            if rival.error is None:
+                continue
+            colour = "C0" if rival.holds else "C3"
+            face = colour if rival.tuned else "none"
+            marker = ("s" if rival.holds else "X") if rival.filtered else "o"
+            marker = marker if rival.holds else "X"
+            ax.plot(
+                rival.error, names.index(rival.name), marker, color=colour, markerfacecolor=face
+            )
+        ax.set_yticks(np.arange(len(names)), names)
+        ax.invert_yaxis()
+        ax.set_xscale("log")
+        ax.set_xlabel(f"mean total rms error [{result.case.loop.units[0]}]")
+        ax.grid(True, axis="x", alpha=0.3)
+
+    return {"controllers": picture(errors, (6.4, 0.6 + 0.35 * len(names)))}
+
+
+def save(result, folder, command=None):
+    """Write result.json, the picture and report.html of a ControllerComparison to a folder."""
+    draw, page = lambda: figures(result), lambda: report(result)
+    stale = earlier(folder, CAPTIONS)
+    return save_all(folder, json_of(result), {}, draw, page, CAPTIONS, command, stale)
