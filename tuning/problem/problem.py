@@ -93,7 +93,7 @@ class Problem:
     free : {name: (low, high) or Free}; the case's own where None, as for the next three.
     objective : {measure: weight}; a measure with several entries counts with their sum. Also a
         custom function, or a `tuning.Objective`, alone or instead of a measure.
-    limits : as in `resolve_limits`, or a list with `tuning.Constraint`s; of every scenario.
+    limits : as in `resolve_limits`, or a list with a `tuning.Constraint`; of every scenario.
     scenarios : tuple of Scenario, () for the case's own run alone.
     seed : of the sensor noise, which is the same for every evaluation (common random numbers).
     risk : how the costs of the scenarios are combined, one of RISKS.

@@ -233,7 +233,7 @@ def validate(
     distributions : {name: distribution or share}; by default the tolerances of the case, else 5 %
         of every flow.
     objective : {measure: weight} or a custom function, as in `tuning.tune`.
-    limits : {measure: value}, and `Constraint`s, as in `tuning.tune`; default: of the case.
+    limits : {measure: value}, and `Constraint`, as in `tuning.tune`; default: of the case.
 
     Returns
     -------
