@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
-from jaxtank.core.labels import label_of
+from jaxtank.core.labels import label_of, place_of
 from jaxtank.loop.change_windows import windows
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.rig import check_limits
@@ -40,6 +40,7 @@ class Limit:
     run: int = 0
     scenario: str = ""
     name: str = ""  # of the entry's tank, pump or valve
+    place: str = ""  # the same for people, of an output its tank
 
     @property
     def sign(self) -> float:
@@ -53,6 +54,13 @@ class Limit:
         where = f" in {self.scenario}" if self.scenario else ""
         entry = self.name or f"{per} {self.index + 1}"
         return (self.measure if per == "run" else f"{self.measure} of {entry}") + where
+
+    @property
+    def words(self) -> str:
+        """The limited entry for people: "highest level of tank 3", and its scenario."""
+        per, where = ms.MEASURES[self.measure].per, f" in {self.scenario}" if self.scenario else ""
+        place = self.place or self.name or f"{per} {self.index + 1}"
+        return ms.label(self.measure) + (f" of {place}" if per != "run" else "") + where
 
     @property
     def key(self) -> tuple[str, int]:
@@ -144,8 +152,9 @@ def resolve_in(
             for j, v in enumerate(values):
                 if not missing[j] and np.isfinite(v):
                     measured, at = _without_overflow(measure, j, float(v), loop.plant)
-                    name = "" if per == "run" else label_of(loop.plant, per, j)
-                    resolved.append(Limit(measured, j, at, i, scenario, name))
+                    entry = (loop.plant, per, j)
+                    names = ("", "") if per == "run" else (label_of(*entry), place_of(*entry))
+                    resolved.append(Limit(measured, j, at, i, scenario, *names))
     for measure, (value, reason) in why.items():
         if not any(limit.measure == measure for limit in resolved):
             text = ", ".join(f"{v:g}" for v in np.ravel(value))

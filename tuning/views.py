@@ -40,7 +40,7 @@ class Result(Shown):
     """A result with a report: `print(result)`, `.to_json()`, `.plot()`, `.save(folder)`."""
 
     def _sections(self) -> Sequence[Any]:
-        return self._report().report(self).sections
+        return self._report().report(self).judged
 
     def __str__(self) -> str:
         return repr(self)

@@ -41,6 +41,13 @@ def label_of(plant: Any, kind: str, index: int) -> str:
     return name_of(plant, kind, index) or _numbered(plant, kind, index)
 
 
+def place_of(plant: Any, kind: str, index: int) -> str:
+    """Return `label_of`, of an output without a name the label of its tank."""
+    if kind == "output" and not name_of(plant, kind, index):
+        return label_of(plant, "tank", plant.outputs[index])
+    return label_of(plant, kind, index)
+
+
 def entry_label(plant: Any, name: str, per: str, index: int) -> str:
     """Return the name of an entry of a measure: "max_level of LT101"; `name` of one of the run."""
     return name if per == "run" else f"{name} of {label_of(plant, per, index)}"

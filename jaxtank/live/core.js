@@ -225,38 +225,90 @@ function extent(arrays) {
   return [low, high];
 }
 
-// margins of the limits in a run: [{limit, value, margin, where}], the smallest first
+// of the loop as it runs, where inForce(name, otherwise) is the value of a leaf: the rim of a tank, and the
+// limits, of which those at a rim follow it
+const rimIn = (info, inForce, i) => inForce(`plant.rim[${i}]`, inForce("plant.rim", info.tanks[i].rim));
+const limitsIn = (info, inForce) => info.limits.map((limit) => {
+  const upper = limit.follows ? inForce(limit.follows, limit.upper) : null;
+  return upper === null ? limit : { ...limit, upper, scale: upper };
+});
+
+const entryOf = (value, entry) => (typeof value === "number" ? value : value[entry ?? 0]);
+
+// margins of the limits in a run: [{limit, value, margin}], the smallest first; by jaxtank.limits
 function marginsOf(limits, measures) {
-  const found = [];
-  for (const limit of limits) {
-    const all = measures[limit.measure];
-    if (all === undefined || all === null) continue;
-    const value = Array.isArray(all) || ArrayBuffer.isView(all) ? all[limit.entry ?? 0] : all;
-    const margins = [];
-    if (limit.upper !== null && limit.upper !== undefined) margins.push(limit.upper - value);
-    if (limit.lower !== null && limit.lower !== undefined) margins.push(value - limit.lower);
-    found.push({ limit, value, margin: Math.min(...margins) });
-  }
+  const found = limits.filter(({ measure }) => measures[measure] !== undefined && measures[measure] !== null)
+    .map((limit) => {
+      const value = entryOf(measures[limit.measure], limit.entry);
+      const margin = (limit.upper ?? null) === null ? value - limit.lower : limit.upper - value;
+      const undefined_ = limit.nan_holds ? 1e6 : -1e6;
+      return { limit, value, margin: Number.isNaN(value) ? undefined_ : clamp(margin, -1e6, 1e6) };
+    });
   // the tightest first, as a share of its limit: units differ
   const share = ({ limit, margin }) => margin / (limit.scale || Math.abs(limit.upper ?? limit.lower) || 1);
   return found.sort((a, b) => share(a) - share(b));
 }
 
+// The verdict on a run: the rules and words of tuning/report/verdict.py, which judges for commands.
+
 const OFF = 0.05; // share of a tank's height by which a level may miss its setpoint
 
-// where a level is farthest from its setpoint at the end of a plateau: {tank, error, setpoint, time, share}, or null
-function farthest(run, outputs, rimOf) {
-  let worst = null;
-  outputs.forEach((tank, o) => {
-    const r = run.r[o], h = run.h[tank], last = r.length - 1, rim = rimOf(tank);
-    const height = Number.isFinite(rim) && rim !== null ? rim : Math.max(...extent([r]).map(Math.abs)) || 1;
-    for (let k = 1; k <= last; k += 1) {
-      if (r[k] !== r[k - 1] || (k < last && r[k + 1] === r[k])) continue;
-      const error = Math.abs(h[k] - r[k]), share = error / height;
-      if (worst === null || share > worst.share) worst = { tank, error, setpoint: r[k], time: run.t[k], share };
-    }
+// {good, words} of the measures of a run, null for a loop without feedback
+function trackingOf(info, inForce, measures) {
+  if (!info.tracks) return null;
+  const { outputs } = info, unit = info.units.length;
+  const list = (name) => Array.from(typeof measures[name] === "number" ? [measures[name]] : measures[name]);
+  const rms = list("rms_error"), steady = list("steady_state_error"), highest = list("max_level");
+  if (!rms.every(Number.isFinite)) return { good: false, words: "the run diverged: a level is not a finite number" };
+  const missed = steady.map((error, o) => (Number.isNaN(error) ? rms[o] : error));
+  const shares = missed.map((error, o) => {
+    const rim = rimIn(info, inForce, outputs[o]), height = Number.isFinite(rim) ? rim : Math.abs(highest[outputs[o]]);
+    return error / (height > 0 ? height : 1);
   });
-  return worst;
+  const worst = shares.indexOf(Math.max(...shares)), tank = info.tanks[outputs[worst]].name;
+  const total = `RMS error ${shown(measures.rms_error_total, 3)} ${unit}`;
+  if (shares[worst] > OFF && Number.isNaN(steady[worst]))
+    return { good: false, words: `${tank} has an RMS error of ${shown(rms[worst], 3)} ${unit}` };
+  if (shares[worst] > OFF) {
+    const off = `${shown(missed[worst], 3)} ${unit} off its setpoint`;
+    const time = shown(list("time_of_steady_state_error")[worst], 5);
+    return { good: false, words: `${tank} is ${off} at ${time} s, ${total}` };
+  }
+  const settled = steady.filter((error) => !Number.isNaN(error));
+  if (!settled.length) return { good: true, words: `tracks with ${total}` };
+  return { good: true, words: `settles within ${shown(Math.max(...settled), 3)} ${unit} of its setpoints, ${total}` };
+}
+
+// {good, words} of marginsOf, null without limits
+function limitsOf(margins, measures) {
+  if (!margins.length) return null;
+  const { limit, value, margin } = margins[0], overflow = limit.measure === "overflow_volume";
+  const broken = margins.filter((one) => !(one.margin >= 0)).length;
+  const of = (text) => (limit.unit === "-" ? text : `${text} ${limit.unit}`);
+  if (!broken) {
+    const spare = `, smallest margin ${of(shown(margin, 3))} (${limit.words})`;
+    return { good: true, words: `every limit holds${overflow || !Number.isFinite(value) ? "" : spare}` };
+  }
+  const bound = of(shown(limit.upper ?? limit.lower, 5)), side = (limit.upper ?? null) === null ? "below" : "above";
+  const time = limit.reached ? ` at ${shown(entryOf(measures[limit.reached], limit.entry), 5)} s` : "";
+  let words = `${limit.words} is ${of(shown(value, 3))}`;
+  if (!Number.isFinite(value)) words = `${limit.words} is undefined, for a limit of ${bound}`;
+  else if (!overflow) words += `${time}, ${of(shown(-margin, 3))} ${side} its limit of ${bound}`;
+  const more = broken === 2 ? "; 1 other limit is broken" : `; ${broken - 1} other limits are broken`;
+  return { good: false, words: words + (broken > 1 ? more : "") };
+}
+
+// {good, sentence} of a run; plants: {kept, count} where many were simulated
+function verdictOf(info, inForce, { measures }, plants = null) {
+  const margins = marginsOf(limitsIn(info, inForce), measures);
+  const parts = [trackingOf(info, inForce, measures), limitsOf(margins, measures)];
+  if (plants && margins.length) {
+    const good = plants.kept === plants.count;
+    if (good && parts[1].good) parts.pop();
+    parts.push({ good, words: `limits hold on ${plants.kept} of ${plants.count} plants` });
+  }
+  const known = parts.filter((part) => part !== null);
+  return { good: known.every((part) => part.good), sentence: known.map((part) => part.words).join("; ") };
 }
 
 // a quantile of numbers, between the nearest two

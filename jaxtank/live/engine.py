@@ -260,6 +260,8 @@ def _limits(case):
         rows.append(
             {
                 "measure": limit.measure,
+                "words": limit.words,
+                "reached": ms.MEASURES[limit.measure].reached or None,
                 "entry": None if single else limit.index,
                 "upper": None,
                 "lower": None,

@@ -52,16 +52,12 @@ const options = () => ({ seed: state.seed, filter: state.filter === true });
 
 // the value of a leaf or of its entry in the loop as it runs, else what the case has
 const inForce = (name, otherwise) => effective()[name] ?? byName.get(name)?.value ?? otherwise;
-const rimOf = (i) => inForce(`plant.rim[${i}]`, inForce("plant.rim", info.tanks[i].rim));
+const rimOf = (i) => rimIn(info, inForce, i);
 const pumpOf = (j) => ({
   lower: inForce(`actuator.low[${j}]`, info.pumps[j].lower), upper: inForce(`actuator.high[${j}]`, info.pumps[j].upper),
 });
 
-// the limits of the loop as it runs: those at a rim follow its slider
-const limitsNow = () => info.limits.map((limit) => {
-  const upper = limit.follows ? inForce(limit.follows, limit.upper) : null;
-  return upper === null ? limit : { ...limit, upper, scale: upper };
-});
+const limitsNow = () => limitsIn(info, inForce);
 
 // engine.run, as this page prints its measures
 function runOf({ values, options: own }) {
@@ -243,13 +239,12 @@ const cells = (value) =>
     .map((v) => shown(v)).join(", ");
 
 function showTables() {
-  const margins = marginsOf(limitsNow(), current.measures);
-  const { words, good } = verdictOf(current, margins);
-  $("verdict").textContent = words;
+  const margins = marginsOf(limitsNow(), current.measures), { sentence, good } = verdict(current);
+  $("verdict").textContent = sentence;
   $("verdict").className = good ? "good" : "bad";
   const pinned = pins[pins.length - 1];
   fill($("margins"), "Limits", ["", "value", "margin"], margins.map(({ limit, value, margin }) => ({
-    head: `${limitWords(limit)} ${limit.lower === null || limit.lower === undefined ? "≤" : "≥"} ${
+    head: `${limit.words} ${limit.lower === null || limit.lower === undefined ? "≤" : "≥"} ${
       shown(limit.upper ?? limit.lower)} ${limit.unit}`,
     cells: [shown(value), shown(margin, 3)],
     bad: margin < 0,
@@ -262,38 +257,8 @@ function showTables() {
   fill($("measures"), "Measures", ["", "now", ...(pinned ? [pinned.name] : [])], rows);
 }
 
-// {words, good} of a run: its limits and, at the end of each plateau, its setpoints
-function verdictOf(found, margins) {
-  if (found.broken) return { words: "The run diverged: a level stopped being finite.", good: false };
-  const worst = margins[0], parts = [];
-  let good = true;
-  if (worst) {
-    good = worst.margin >= 0;
-    const which = `${limitWords(worst.limit)}: ${shown(worst.value)} ${worst.limit.unit}`;
-    parts.push(good
-      ? `Every limit holds, smallest margin ${shown(worst.margin, 3)} ${worst.limit.unit}`
-      : `Limit exceeded by ${shown(-worst.margin, 3)} ${worst.limit.unit}: ${which}`);
-  }
-  const off = info.tracks ? farthest(found, info.outputs, rimOf) : null;
-  if (off) {
-    const { length } = info.units, far = off.share > OFF;
-    good &&= !far;
-    parts.push(far
-      ? `${info.tanks[off.tank].name} is ${shown(off.error, 3)} ${length} from its setpoint of ${
-        shown(off.setpoint, 3)} ${length} at ${shown(off.time)} s`
-      : `setpoints reached within ${shown(off.error, 3)} ${length}`);
-    if (far) parts.reverse();
-  }
-  return { words: parts.join("; "), good };
-}
-
-// e.g. "max_level of tank 3"
-function limitWords(limit) {
-  const own = info.measures.find((m) => m.name === limit.measure);
-  if (limit.entry === null || limit.entry === undefined) return limit.measure;
-  const tank = own && own.size === info.tanks.length ? info.tanks[limit.entry].name : limit.entry + 1;
-  return `${limit.measure}, ${tank}`;
-}
+// the verdict on a run, with its plants where they were simulated
+const verdict = (found) => verdictOf(info, inForce, found, bands);
 
 // a name that may be broken after each "_"
 const broken = (text) => text.split(/(?<=_)/).flatMap((part, i) => (i ? [make("wbr"), part] : [part]));
@@ -897,6 +862,7 @@ window.jaxtank = {
     return { measures, t: Array.from(found.t), h: plain(found.h), u: plain(found.u) };
   },
   tune: () => tuneNow(),
+  verdict: () => verdict(present()),
   csv,
   command,
   toml,

@@ -6,7 +6,7 @@ whole run.
 """
 
 from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context, Run, Worst
-from jaxtank.measures.catalogue import MEASURES, Measure
+from jaxtank.measures.catalogue import MEASURES, Measure, label
 from jaxtank.measures.functions import RunFunction, from_function, functions, name_of
 from jaxtank.measures.registry import (
     check_names,
@@ -40,6 +40,7 @@ __all__ = [
     "entry_units",
     "from_function",
     "functions",
+    "label",
     "linear",
     "name_of",
     "needs",

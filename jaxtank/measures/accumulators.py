@@ -204,6 +204,20 @@ def settled(last, outside):
     return jnp.where(outside > 0, jnp.inf, last)
 
 
+def _update_plateau(run, state, sample, context):
+    """Per output (setpoint, |error|, time and whether it was constant at the last sample; the
+    largest error at the end of a plateau so far, its time)."""
+
+    def update(r, e, before):
+        setpoint, error, time, constant, worst, when = before
+        ends = (r != setpoint) & (constant > 0) & (error > worst)
+        worst, when = jnp.where(ends, error, worst), jnp.where(ends, time, when)
+        now = jnp.broadcast_to(sample.t, jnp.shape(e))
+        return r, magnitude(e), now, jnp.where(r == setpoint, 1.0, 0.0), worst, when
+
+    return each(update, sample.r, sample.e, state)
+
+
 def _update_rise(run, state, sample, context):
     """Per output (target, times of the first 10 % and of the first 90 %, longest rise)."""
 
@@ -313,6 +327,11 @@ _BUILT_IN: dict[str, Accumulator] = {
         lambda run: _rows(run, "outputs", 0.0, -1e9, 0.0, -1e9),
         _update_settling,
         "window",
+        rows=True,
+    ),
+    "plateau": Accumulator(
+        lambda run: _rows(run, "outputs", -1e9, 0.0, 0.0, 0.0, -1.0, 0.0),
+        _update_plateau,
         rows=True,
     ),
     "rise": Accumulator(

@@ -145,6 +145,16 @@ def _settling(_, last, outside, worst):
     return jnp.where(worst < -1e8, jnp.nan, worst)
 
 
+def _steady_state_error(setpoint, error, time, constant, worst, when):
+    """Largest error at the end of a plateau; the last one ends with the run."""
+    largest = jnp.where((constant > 0) & (error > worst), error, worst)
+    return jnp.where(largest < 0, jnp.nan, largest)
+
+
+def _steady_state_time(setpoint, error, time, constant, worst, when):
+    return jnp.where((constant > 0) & (error > worst), time, when)
+
+
 def _margin(field, unit, doc, unlimited="", low=0.0, high=None, per="pump", sense=-1.0) -> Measure:
     """A stability margin of the linearised loop: infinite where nothing crosses."""
     return Measure(
@@ -184,6 +194,16 @@ _BUILT_IN: dict[str, Measure] = {
         "cm s", "output", "abs_e", _integral, "integral of the absolute error", by_input=True
     ),
     "max_error": _of_rows("cm", "output", "max_error", _first, "largest absolute tracking error"),
+    "steady_state_error": _of_rows(
+        "cm",
+        "output",
+        "plateau",
+        _steady_state_error,
+        "largest absolute error at the end of a plateau of the setpoint",
+        reached="time_of_steady_state_error",
+        undefined="its setpoint is at no time constant",
+        nan_holds="its setpoint is at no time constant",
+    ),
     "mean_square_overshoot": _sum_of_squares(
         "cm^2",
         "output",
@@ -313,6 +333,14 @@ _BUILT_IN: dict[str, Measure] = {
     "time_of_min_level": _of_rows(
         "s", "tank", "min_level", _second, "when the lowest level was reached", counts=True
     ),
+    "time_of_steady_state_error": _of_rows(
+        "s",
+        "output",
+        "plateau",
+        _steady_state_time,
+        "when the largest error at the end of a plateau occurred",
+        counts=True,
+    ),
     "sensitivity_peak": _margin(
         "sensitivity_peak",
         "-",
@@ -355,6 +383,41 @@ SUMMARY = (
     "saturated_fraction",
 )
 """Measures in an ensemble's summary unless others are named, in order."""
+
+
+LABELS = {
+    "rms_error": "RMS error",
+    "rms_error_total": "total RMS error",
+    "ise": "integral of the squared error",
+    "iae": "integral of the absolute error",
+    "max_error": "largest error",
+    "steady_state_error": "steady-state error",
+    "rms_input": "RMS input",
+    "input_travel": "total variation of the input",
+    "mean_square_travel": "mean square change of the input",
+    "saturated_fraction": "share of saturated samples",
+    "filter_active_fraction": "share of filtered samples",
+    "saturation_excess": "command beyond the limits",
+    "max_level": "highest level",
+    "min_level": "lowest level",
+    "rms_over_rim": "RMS rise above the rims",
+    "mean_square_over_rim": "mean square rise above the rim",
+    "overshoot_percent": "overshoot",
+    "estimation_rms": "RMS error of the estimate",
+    "sensitivity_peak": "sensitivity peak Ms",
+}
+"""{measure: its name for people}, where that is not the name itself."""
+
+
+def label(name: str) -> str:
+    """Return the name of a measure for people: "highest level" for max_level.
+
+    Examples
+    --------
+    >>> label("max_level"), label("settling_time")
+    ('highest level', 'settling time')
+    """
+    return LABELS.get(name, name.replace("_", " "))
 
 
 def _place(name: str, names: tuple[str, ...]) -> int:

@@ -183,10 +183,17 @@ def use_devices(args):
         jax.config.update("jax_num_cpu_devices", args.devices)
 
 
-def print_result(args, payload, text):
-    """Print a JSON object under --json, else what `text()` returns."""
+def print_result(args, payload, text, done=""):
+    """Print a JSON object under --json, else what `text()` returns.
+
+    `done` : the sentence of the verdict of a command that judges nothing.
+    """
     from tuning.report import tables
 
+    if args.json and done:
+        from tuning.report.verdict import outcome
+
+        payload = {**payload, "verdict": outcome(done).to_json()}
     print(tables.dumps(payload) if args.json else text())
 
 

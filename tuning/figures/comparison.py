@@ -66,7 +66,7 @@ class Comparison(Shown):
 
     def to_json(self) -> dict[str, Any]:
         """Return {paper: page}, as `jaxtank compare all --json` prints them."""
-        return dict(self.pages)
+        return {**self.pages, "verdict": papers.verdict_of(self.pages).to_json()}
 
     def plot(self) -> dict[str, Any]:
         """Return matplotlib figures {"published": measured over published, coloured by verdict}."""
@@ -74,12 +74,12 @@ class Comparison(Shown):
 
     def __str__(self) -> str:
         counts = tables.table(self._counts(), ["paper", *papers.VERDICTS])
-        return "\n".join([counts, papers.headline_text(self.rows), *self.notes])
+        return "\n".join([counts, str(papers.verdict_of(self.pages)), *self.notes])
 
     def _repr_html_(self) -> str:
         counts = html_table(self._counts(), ["paper", *papers.VERDICTS])
         folded = (_folded(name, page["rows"]) for name, page in self.pages.items())
-        head = f"<p>{html.escape(papers.headline_text(self.rows))}</p>"
+        head = f"<p>{html.escape(str(papers.verdict_of(self.pages)))}</p>"
         return head + counts + "".join(folded) + _noted(self.notes)
 
     def _counts(self) -> list[list[Any]]:

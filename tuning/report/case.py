@@ -23,6 +23,7 @@ from jaxtank.signals.base import Constant, Sum
 from jaxtank.signals.inflows import InflowPulses, InflowTable
 from jaxtank.signals.setpoints import Ramps, Sine
 from tuning.report import safety
+from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.tables import Table, Value, clean
 
@@ -53,6 +54,7 @@ def json_of(case):
     return {
         "case": case.name,
         "title": case.title,
+        "verdict": verdicts.outcome(f"{case.name} is a case that can be run").to_json(),
         "citation": preset.citation if preset else None,
         "notes": str(preset.notes) if preset else None,
         "plant": type(loop.plant).__name__,
@@ -127,7 +129,7 @@ def report(case):
         _measures(loop),
         *_paper(case, preset, page),
     ]
-    return Report(title, "", (), sections, width=WIDTH)
+    return Report(title, "", None, (), sections, width=WIDTH)
 
 
 def _tuning(case, preset, page):

@@ -8,6 +8,7 @@ from typing import Any
 
 from jaxtank.core.text import one_line
 from tuning.report.tables import Table
+from tuning.report.verdict import Verdict
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,21 +50,34 @@ class Live:
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """A result as data for printing and display."""
+    """A result as data for printing and display; without a verdict where it judges nothing."""
 
-    title: str
-    verdict: str
+    name: str  # of the case, paper or file
+    what: str  # that was done with it
+    verdict: Verdict | None
     facts: Sequence[tuple[str, Any]]
     sections: Sequence[Text | Table | Figure | Live]
-    good: bool = True
     subtitle: str = ""
     width: int = 0  # of lines on a terminal [characters]; 0: not wrapped
     files: Mapping[str, str] = dataclasses.field(default_factory=dict)  # {heading: text}
+
+    @property
+    def title(self) -> str:
+        """The name, and what was done."""
+        return ": ".join(filter(None, [self.name, self.what]))
+
+    @property
+    def judged(self) -> Sequence[Text | Table | Figure | Live]:
+        """The sections, after the name and the verdict."""
+        first = [Text([f"{self.name}: {self.verdict}"])] if self.verdict else []
+        return [*first, *self.sections]
 
 
 def terminal(report: Report) -> str:
     """Return the text of a Report for a terminal."""
     lines: list[str] = []
+    if report.verdict:
+        lines += textwrap.wrap(f"{report.name}: {report.verdict}", 80, break_on_hyphens=False)
     for section in report.sections:
         if isinstance(section, (Figure, Live)) or section.on == "page":
             continue

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtank.core.text import count
 from jaxtank.core.tree import describe, get_value
 from tuning.problem import provenance
+from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.folder import earlier
 from tuning.report.folder import save as save_all
@@ -134,10 +135,10 @@ def report(result):
         ("runs", result.runs),
         ("time", f"{result.wall_s:.1f} s"),
     ]
-    diverged = f"{count(result.failed, 'run')} diverged"
     return Report(
-        f"{result.case.name}: sensitivity",
-        f"{result.method}: {diverged if result.failed else 'every run is finite'}",
+        result.case.name,
+        "sensitivity",
+        verdict_of(result),
         facts,
         [
             Text([head], on="terminal"),
@@ -145,9 +146,18 @@ def report(result):
             *(section for c in result.columns for section in _column(result, c)),
             Text(notes_of(result), items=True, gap=True),
         ],
-        not result.failed,
         result.case.title,
     )
+
+
+def verdict_of(result):
+    """Return the Verdict of a SensitivityResult: which parameter matters most to each measure."""
+    first = {c.label: result.parameters[result.order(c)[0]] for c in result.columns if not c.empty}
+    words = [f"{label} is most sensitive to {name}" for label, name in first.items()]
+    if result.failed:
+        words.insert(0, f"{count(result.failed, 'run')} diverged")
+    words = words or ["no measure depends on a parameter"]
+    return verdicts.outcome("; ".join(words), not result.failed)
 
 
 def _column(result, c):
@@ -186,6 +196,7 @@ def json_of(result):
         distributions[name] = {"kind": type(d).__name__, **known}
     return {
         "case": result.case.name,
+        "verdict": verdict_of(result).to_json(),
         **fields(result, "method samples runs failed wall_s"),
         "distributions": distributions,
         "parameters": {n: _parameter_json(result, n) for n in result.parameters},

@@ -13,6 +13,7 @@ from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv
 from jaxtank.safety.checker import CASE
 from tuning.problem import provenance
+from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.folder import earlier, rig_text
 from tuning.report.folder import save as save_all
@@ -45,6 +46,7 @@ def json_of(attack):
     case, attacked = attack.case, attack.attacked
     return {
         "case": case.name,
+        "verdict": verdict_of(attack).to_json(),
         "passed": bool(attack.passed),
         "worst": [_row(attack, tank) for tank in attack.found],
         "unit": case.loop.units[0],
@@ -145,8 +147,9 @@ def report(attack):
         )
     name = label_of(case.loop.plant, "tank", worst.tank)
     return Report(
-        f"{case.name}: attack",
-        verdict(attack),
+        case.name,
+        "attack",
+        verdict_of(attack),
         [
             ("highest level", f"{worst.level:.5g} {unit} ({name})"),
             ("its limit", Value(worst.limit, unit=unit)),
@@ -155,13 +158,11 @@ def report(attack):
         [
             Text([head, *_scope(attack)]),
             _levels(attack),
-            Text([verdict(attack)], gap=True),
             Text([f"The run with the least margin to a limit, {name}:"], gap=True),
             _parameters(attack, worst),
             Text(options, gap=True),
             Text(remarks_of(attack), items=True, gap=True),
         ],
-        not attack.passed,
         case.title,
     )
 
@@ -207,20 +208,22 @@ def _levels(attack):
     return Table(rows, ["tank", f"limit [{unit}]", "proved", *levels, "at [s]", ""], gap=True)
 
 
-def verdict(attack):
-    """Return one sentence on the limits."""
-    if not attack.passed:
-        return "No limit was passed."
+def verdict_of(attack):
+    """Return the Verdict of an Attack: which limits were passed, by how much and when."""
     words = []
     for tank in attack.passed:
         loop = attack.case.loop
-        name = label_of(loop.plant, "tank", tank.tank)
-        words.append(f"{name} by {-tank.margin:.3g} {loop.units[0]}")
+        name, by = label_of(loop.plant, "tank", tank.tank), verdicts.shown(-tank.margin)
+        words.append(f"{name} by {by} {loop.units[0]} at {verdicts.shown(tank.time_s, 5)} s")
         if tank.certified is False:
             words[-1] += f" ({tank.reason})"
         if _starts_elsewhere(attack, tank):
             words[-1] += f" (proved {start_of([CASE])} only)"
-    return f"Limits are passed: {', '.join(words)}."
+    proved = [tank.tank for tank in attack.found if tank.certified]
+    passed = f"limits are passed: {', '.join(words)}" if words else "no limit was passed"
+    if proved and not words:
+        passed += f", proved for {labels_of(attack.case.loop.plant, 'tank', proved)}"
+    return verdicts.Verdict(limits=verdicts.Part(passed, not words))
 
 
 def _parameters(attack, tank):

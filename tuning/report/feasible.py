@@ -4,6 +4,7 @@ import dataclasses
 
 from jaxtank.core.labels import label_of, short
 from tuning.problem import provenance
+from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
 from tuning.report.tables import Table, Value, clean, fields, number
@@ -31,7 +32,7 @@ def json_of(study):
     }
 
 
-def verdict(study):
+def sentence(study):
     """Return the sentence on the share of plants with an unreachable setpoint."""
     if not study.infeasible.any():
         return f"Each of {study.samples} sampled plants has a steady state at every plateau."
@@ -76,7 +77,7 @@ def unreachable(study):
     """Return the sections of a default answer: lost setpoints, and options that mend them."""
     if not study.case.reachable and study.infeasible.all():
         return []  # the file says so: a tank that nothing holds level, say
-    sections = [Text([verdict(study)]), *needs(study, MATTERS)]
+    sections = [Text([sentence(study)]), *needs(study, MATTERS)]
     # without the change of setpoints, which is long: see the JSON and the report of the study
     if study.mends:
         kinds = [
@@ -100,11 +101,11 @@ def report(study):
     elif not good:
         mends = ["No change of setpoints, rims, orifices or pumps alone is enough for 95 %."]
     return Report(
-        f"{study.case.name}: feasibility of the setpoints",
-        verdict(study),
+        study.case.name,
+        "feasibility of the setpoints",
+        verdicts.outcome(sentence(study), good),
         [("plants", study.samples), ("infeasible", Value(100 * share, 2, "%"))],
-        [Text([f"{study.case.name}: {verdict(study)}"], on="terminal"), *needs(study), Text(mends)],
-        good,
+        [*needs(study), Text(mends)],
         study.case.title,
     )
 

@@ -14,6 +14,7 @@ from jaxtank.core.units import local
 from tuning.identification import residuals
 from tuning.identification.confidence import at_search_bounds
 from tuning.problem import provenance
+from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.folder import earlier, rig_text
 from tuning.report.folder import save as save_all
@@ -185,8 +186,13 @@ def _amount(cause):
     return f"{cause.value:.4g}{unit}{beside} ({words}{low:.4g} .. {high:.4g})"
 
 
-def _headline(fit, status):
-    """Return the headline: problems of the data, then how the search ended, or the first cause."""
+def verdict_of(fit):
+    """Return the Verdict of an Identification: problems of the data, end of the search, causes."""
+    return verdicts.outcome(_headline(fit), fit.status == "converged" and fit.structure.clean)
+
+
+def _headline(fit):
+    status = fit.status.replace("_", " ")
     kinds = dict.fromkeys(odd.kind for odd in fit.oddities if odd.alters_fit)
     names = ["spikes" if kind == "spike" else f"{kind} readings" for kind in kinds]
     words = [f"data with {' and '.join(names)}"] if names else []
@@ -348,14 +354,13 @@ def report(fit, page=False):
         facts.append((f"residual of {name}", f"{rmse:.3g} {unit}{percent}"))
     rig, why = rig_text(fit.identified) if page and fit.identifiable else (None, None)
     simulations = sum(s["evaluations"] for s in fit.starts)
-    status = fit.status.replace("_", " ")
     more = [] if fit.status == "interrupted" else _structure(fit)[1:]
     return Report(
-        f"{fit.case.name}: identified",
-        _headline(fit, status),
+        fit.case.name,
+        "identified",
+        verdict_of(fit),
         facts,
         [
-            Text([f"{fit.case.name}: {_headline(fit, status)}"], on="terminal"),
             Text([*sentences_on(fit.oddities), *more], items=True),
             Text([note for log in fit.estimation.logs for note in log.notes], items=True),
             Text([_data(fit.estimation)]),
@@ -367,7 +372,6 @@ def report(fit, page=False):
             *_profile(fit.profile),
             Text([f"{fit.wall_s:.1f} s, {simulations} simulations with sensitivities"], gap=True),
         ],
-        fit.status == "converged" and fit.structure.clean,
         ", ".join(log.name for log in fit.estimation.logs),
         files={"The identified rig as a file (rig.toml)": rig} if rig else {},
     )
@@ -465,6 +469,7 @@ def json_of(fit):
     quality, est, free = fit.quality, fit.estimation, fit.covariance
     return {
         "case": fit.case.name,
+        "verdict": verdict_of(fit).to_json(),
         "status": str(fit.status),
         "success": fit.status == "converged",
         "message": "; ".join(sentences_of(fit)),
@@ -640,14 +645,18 @@ def plan_report(case, experiments, best, plan):
         f"{case.name}: standard deviations that {plan['duration']:g} s, {measured} read every"
         f" {plan['dt']:g} s with noise of {plan['noise']:g} {case.loop.units[0]} would leave"
     )
-    last = f"Most informative: {best}." if best else "None identifies all of these parameters."
     sections = [
         Text([head]),
         Table(rows, ["parameter", "value", *letters], gap=True),
         Text([f"{letter}  {name}" for letter, name in letters.items()], gap=True),
-        Text([last], gap=True),
     ]
-    return Report(f"{case.name}: planned experiments", last, (), sections)
+    return Report(case.name, "planned experiments", plan_verdict(best), (), sections)
+
+
+def plan_verdict(best):
+    """Return the Verdict on planned experiments: the most informative one."""
+    words = f"most informative: {best}" if best else "none identifies all of these parameters"
+    return verdicts.outcome(words, bool(best))
 
 
 def _share(sd, value):

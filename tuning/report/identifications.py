@@ -9,6 +9,7 @@ import numpy as np
 from jaxtank.core.labels import reading_label
 from jaxtank.core.text import count
 from tuning.problem import provenance
+from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
 from tuning.report.tables import Table, Value, clean
@@ -35,10 +36,10 @@ def report(fits):
         f"{fits.case.name}: {records}, each fitted separately; {converged} converged, at most"
         f" {fits.iterations} iterations"
     )
-    good = converged == len(fits)
     return Report(
-        f"{fits.case.name}: {len(fits)} records identified",
-        "converged" if good else "not every fit converged",
+        fits.case.name,
+        f"{len(fits)} records identified",
+        verdict_of(fits),
         [("records", len(fits)), ("converged", converged)],
         [
             Text([head]),
@@ -47,8 +48,14 @@ def report(fits):
             Text(_residuals(fits), gap=True),
             Text([f"{fits.wall_s:.1f} s"], gap=True),
         ],
-        good,
     )
+
+
+def verdict_of(fits):
+    """Return the Verdict of Identifications: how many of them converged."""
+    converged = int(fits.converged.sum())
+    words = f"{converged} of {count(len(fits), 'fit')} converged"
+    return verdicts.outcome(words, converged == len(fits))
 
 
 def _summary(fits):
@@ -91,6 +98,7 @@ def json_of(fits):
     """Return a JSON object: the estimates of every record, null where there is no interval."""
     return {
         "case": fits.case.name,
+        "verdict": verdict_of(fits).to_json(),
         "success": bool(fits.converged.all()),
         "channels": [{"name": n, "unit": u} for n, u in fits.channels],
         "records": [_record(fits, e, name) for e, name in enumerate(labels(fits))],

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
 from tuning.report.identification import sentences_on
@@ -20,6 +21,7 @@ def json_of(result):
     return clean(
         {
             "file": result.name,
+            "verdict": verdict_of(result).to_json(),
             "time": {"header": result.time, "samples": len(result.t), **steps},
             "columns": [
                 {
@@ -68,10 +70,10 @@ def report(result):
         missing, step = len(c.values) - c.count, np.median(np.diff(c.t)) if len(c.t) > 1 else np.nan
         cells = [c.count, missing, Value(ends, between=" .. "), Value(step, 4, "s")]
         rows.append([c.header, c.slot or "-", c.unit or "-", *cells])
-    verdict = "can be read" if not result.problems else "cannot be read yet"
     return Report(
-        f"{result.name}: inspected",
-        verdict,
+        result.name,
+        "inspected",
+        verdict_of(result),
         [("samples", len(result.t))],
         [
             Text([words]),
@@ -81,8 +83,14 @@ def report(result):
             Table(rows, ["column", "is", "unit", "values", "missing", "range", "step"], gap=True),
             Text(result.table.splitlines(), gap=True, layout=True),
         ],
-        not result.problems,
     )
+
+
+def verdict_of(result):
+    """Return the Verdict of an Inspection: whether the file can be read, or the first problem."""
+    problems = result.problems
+    words = f"cannot be read yet: {problems[0]}" if problems else "can be read"
+    return verdicts.outcome(words, not problems)
 
 
 def figures(result):

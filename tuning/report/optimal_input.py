@@ -6,6 +6,7 @@ import jax
 import numpy as np
 
 from tuning.problem import provenance
+from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
 from tuning.report.tables import Table, Value, fields, number
@@ -42,12 +43,18 @@ def report(bound):
     )
     grids = [Table(rows, ["interval [s]", "cost", "excess over limits"])] if rows else []
     return Report(
-        f"{bound.case.name}: {TITLE}",
-        "limits held" if bound.holds else "limits not held",
+        bound.case.name,
+        TITLE,
+        verdict_of(bound),
         [("cost", Value(bound.cost, 6)), ("intervals", len(bound.u))],
         [Text(first), *grids, Text([last, NOTE])],
-        bound.holds,
     )
+
+
+def verdict_of(bound):
+    """Return the Verdict of an InputBound: whether its inputs keep the limits."""
+    words = "the best inputs keep every limit" if bound.holds else "the best inputs break a limit"
+    return verdicts.outcome(words, bound.holds)
 
 
 def _comparison(bound):
@@ -68,6 +75,7 @@ def json_of(bound):
     """Return the JSON object of an InputBound, without inputs and case."""
     names = "cost objective measures constraints holds closed_loop gain_percent source grids slope"
     return {
+        "verdict": verdict_of(bound).to_json(),
         **fields(bound, f"{names} interrupted wall_s"),
         "interval_s": bound.interval,
         "intervals": len(bound.u),

@@ -14,8 +14,9 @@ from jaxtank.core.tree import get_value
 from jaxtank.loop import run as lp
 from jaxtank.plants.network import TankNetwork
 from jaxtank.presets.paper import Claim, Sample
-from jaxtank.presets.paper import verdict as verdict_of
+from jaxtank.presets.paper import verdict as word_of
 from tuning.problem.scenarios import noisy
+from tuning.report import verdict as verdicts
 from tuning.report.document import Live, Report, Text
 from tuning.report.folder import earlier
 from tuning.report.folder import save as save_all
@@ -142,7 +143,7 @@ def measure(paper):
                 "verdict": word,
                 "reason": reason,
                 "ramp_s": printed.ramp,
-                "by_ramp": {f"{ramp:g}": verdict_of(holds) for ramp, holds in by_ramp.items()},
+                "by_ramp": {f"{ramp:g}": word_of(holds) for ramp, holds in by_ramp.items()},
             }
         )
     heading = {"paper": paper, "citation": preset.citation, "notes": str(preset.notes)}
@@ -236,19 +237,30 @@ def _reason(row):
     return "; ".join(filter(None, [row["reason"], f"ramps of {ramp:g} s" if ramp else ""]))
 
 
+def verdict_of(pages):
+    """Return the Verdict on {paper: page}: how much was reproduced."""
+    rows = [row for page in pages.values() for row in page["rows"]]
+    return verdicts.outcome(headline_text(rows), all(row["verdict"] != DIFFERS for row in rows))
+
+
+def json_of(pages):
+    """Return the JSON object of `jaxtank compare`: a page, or {paper: page} of several."""
+    (first, *others) = pages.values()
+    return (dict(pages) if others else dict(first)) | {"verdict": verdict_of(pages).to_json()}
+
+
 def report(pages):
     """Return the Report of {paper: page}."""
     rows = [row for page in pages.values() for row in page["rows"]]
     tally = Counter(row["verdict"] for row in rows)
-    verdicts = [word for word in VERDICTS if tally[word]]
-    head = [Text([f"all papers: {headline_text(rows)}"], on="terminal")] if len(pages) > 1 else []
+    words = [word for word in VERDICTS if tally[word]]
     return Report(
-        f"{', '.join(pages)}: published and measured",
-        headline_text(rows),
-        [(word, tally[word]) for word in verdicts],
+        next(iter(pages)) if len(pages) == 1 else "all papers",
+        "published and measured",
+        verdict_of(pages),
+        [(word, tally[word]) for word in words],
         [
-            *head,
-            Text([f"{word}: {VERDICTS[word]}" for word in verdicts], items=True, on="page"),
+            Text([f"{word}: {VERDICTS[word]}" for word in words], items=True, on="page"),
             *(section for page in pages.values() for section in _sections(page)),
             *(Live(next(iter(presets.load(p).cases.values()))) for p in pages),
         ],
@@ -274,7 +286,7 @@ def _sections(page):
     heads = ["quantity", "unit", "published", "measured", "verdict"]
     head = [page["citation"], f"notes: {presets.load(page['paper']).notes}"]
     return [
-        Text([*head, headline_text(page["rows"]), *ramped], gap=True, on="terminal"),
+        Text([*head, *ramped], gap=True, on="terminal"),
         Table(brief, heads, gap=True, on="terminal"),
         Text(notes, items=True, on="terminal"),
         Text([page["citation"], *ramped], on="page"),
@@ -287,9 +299,7 @@ def save(pages, folder, command=None):
     captions = {"published": OVERVIEW}
     draw, page = lambda: overview(pages) | _rigs(pages, captions), lambda: report(pages)
     old = [path.stem for paper in presets.PAPERS for path in Path(folder).glob(f"rig-{paper}*.png")]
-    payload, stale = pages, earlier(folder, [*old, "published"])
-    if len(pages) == 1:
-        (payload,) = pages.values()
+    payload, stale = json_of(pages), earlier(folder, [*old, "published"])
     versions = {"jaxtank": jaxtank.__version__, "jax": jax.__version__, "numpy": np.__version__}
     return save_all(folder, payload, {}, draw, page, captions, command, stale, versions)
 

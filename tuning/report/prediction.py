@@ -6,6 +6,7 @@ import numpy as np
 
 from tuning.identification.prediction import WIDE
 from tuning.problem import provenance
+from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
 from tuning.report.identification import draw_log, fit_csv
@@ -47,6 +48,14 @@ def sentences_of(result):
     return words
 
 
+def verdict_of(result):
+    """Return the Verdict of a Prediction: how far the readings are from it."""
+    errors = zip(result.channels, result.quality["rmse"])
+    words = [f"{name} {verdicts.shown(rmse)} {unit}" for (name, unit), rmse in errors if rmse]
+    more = f" and {len(words) - ROWS} others" if len(words) > ROWS else ""
+    return verdicts.outcome(f"RMS errors of the prediction: {', '.join(words[:ROWS])}{more}")
+
+
 def report(result):
     """Return the Report of a Prediction."""
     q, logs = result.quality, result.estimation.logs
@@ -65,8 +74,9 @@ def report(result):
     samples = sum(log.samples for log in logs)
     facts = [(f"RMSE of {row[0]}", row[1]) for row in rows]
     return Report(
-        f"{result.case.name}: prediction of {names}",
-        "predicted",
+        result.case.name,
+        f"prediction of {names}",
+        verdict_of(result),
         facts,
         [
             Text([note for log in logs for note in log.notes], items=True),
@@ -119,6 +129,7 @@ def json_of(result):
     return clean(
         {
             "case": result.case.name,
+            "verdict": verdict_of(result).to_json(),
             "fit": {name: q[name] for name in ("rmse", "nrmse_percent")},
             "after_start": q["after_start"],
             "tests": {name: q[name] for name in tests},

@@ -6,16 +6,15 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder, write_folder
 from jaxtank.core.units import local
-from jaxtank.limits import resolve_limits
 from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv, stride
 from jaxtank.plants.elements import sections
 from tuning.problem import provenance
 from tuning.report import safety
+from tuning.report import verdict as verdicts
 from tuning.report.document import Live, Report, Text, failed
 from tuning.report.folder import save as save_all
 from tuning.report.tables import (
@@ -27,7 +26,6 @@ from tuning.report.tables import (
     limit_table,
     measure_table,
     measures_json,
-    number,
     reasons,
     undefined,
     unit_text,
@@ -57,6 +55,7 @@ def json_of_run(case, values, seed, plateaus=None):
     """Return the JSON object of `jaxtank simulate --json`."""
     payload = {
         "case": case.name,
+        "verdict": verdicts.of_run(case, values).to_json(),
         "measures": measures_json(values),
         "units": units(case.loop.plant),
         "reasons": reasons(values),
@@ -69,8 +68,7 @@ def json_of_run(case, values, seed, plateaus=None):
 
 def report(case, values, plateaus=None):
     """Return the Report of a run with the measures `values`."""
-    loop, limits = case.loop, _limits(case, values)
-    broken = [limit for limit in limits if not limit["margin"] >= 0.0]
+    loop, limits = case.loop, verdicts.limit_rows(case, values)
     unit = lambda name: unit_text(name, loop.units, loop.plant)
     facts = [
         (name, f"{entries(name, values[name], loop.plant)} {unit(name)}".strip())
@@ -78,7 +76,7 @@ def report(case, values, plateaus=None):
         if name in values
     ]
     facts += [("length", f"{case.clock.duration:g} s"), ("sampled every", f"{case.clock.dt:g} s")]
-    sections = [Live(case), Text([f"{case.name}: {case.title}"], on="terminal")]
+    sections = [Live(case), Text([case.title], on="terminal")]
     if limits:
         table = limit_table(limits if len(limits) <= MANY else limits[:WORST])
         more = len(limits) - len(table.rows)
@@ -93,35 +91,7 @@ def report(case, values, plateaus=None):
         words = "The safety filter is on: jaxtank show prints what is proved of each tank."
         sections.append(Text([words], gap=True, on="terminal"))
         sections.append(Text(safety.passed(case, values)))
-    verdict = "every limit holds" if limits else "no limits"
-    if broken:
-        verdict = "; ".join(map(_passed, broken[:WORST]))
-    return Report(case.name, verdict, facts, sections, not broken, case.title)
-
-
-def _passed(limit):
-    """A sentence on a limit that does not hold."""
-    value, most = (f"{number(limit[k])} {limit['unit']}" for k in ("value", "limit"))
-    return f"{limit['name']}: {value}, the limit of {most} is passed"
-
-
-def _limits(case, values):
-    """The rows of `limit_table` of a run, the tightest first."""
-    rows = [
-        {
-            "name": limit.label,
-            "measure": limit.measure,
-            "unit": ms.unit(limit.measure, case.loop.units),
-            "limit": float(limit.value),
-            "value": float(np.ravel(values[limit.measure])[limit.index]),
-            "margin": limit.margin(values),
-            "reason": None if np.isfinite(limit.margin(values)) else "undefined",
-            "time_s": None,
-        }
-        for limit in resolve_limits(case)
-        if limit.measure in values
-    ]
-    return sorted(rows, key=lambda row: row["margin"])
+    return Report(case.name, "", verdicts.of_run(case, values), facts, sections, case.title)
 
 
 def margins_json(plateaus):

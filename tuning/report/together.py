@@ -17,6 +17,7 @@ from jaxtank.core.text import count
 from jaxtank.loop.trajectory import csv
 from tuning.problem import provenance, reported
 from tuning.problem.scenarios import noisy
+from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
 from tuning.report.simulated import json_of_run, run_for_people
@@ -105,6 +106,7 @@ def _equal(a, b):
 def report(runs: list[Run]) -> Report:
     """Return the Report of several runs: measures, a column for each case, and what differs."""
     units, words, errors = runs[0].case.loop.units, [], []
+    each = {run.case.name: verdicts.of_run(run.case, run.measures) for run in runs}
     listed = [m for m in ms.MEASURES if all(m in r.measures for r in runs) and m not in ms.times()]
     rows = [
         [m, ms.unit(m, units), *(entries(m, r.measures[m], r.case.loop.plant) for r in runs)]
@@ -119,11 +121,15 @@ def report(runs: list[Run]) -> Report:
         if "rms_error_total" in run.measures:
             error = Value(run.measures["rms_error_total"], 4, units[0])
             errors.append((run.case.name, f"{error} rms error"))
+    shared = "The disturbances, faults and sensor noise of the first case are used for all."
     return Report(
         f"{len(runs)} cases",
-        "the disturbances, faults and sensor noise of the first case for all",
+        "",
+        verdict_of(runs),
         errors,
         [
+            Text([f"{name}: {verdict}" for name, verdict in each.items()], items=True),
+            Text([shared]),
             Table(rows, ["measure", "unit", *(r.case.name for r in runs)]),
             Text(words, on="terminal"),
             Text(words, items=True, on="page"),
@@ -137,7 +143,13 @@ def json_of(runs: list[Run], seed: int) -> dict[str, Any]:
     rows = [
         {**json_of_run(run.case, run.measures, seed), "differs": list(run.differs)} for run in runs
     ]
-    return {"cases": rows}
+    return {"verdict": verdict_of(runs).to_json(), "cases": rows}
+
+
+def verdict_of(runs: list[Run]) -> verdicts.Verdict:
+    """Return the Verdict on several runs: how many of them are good."""
+    good = [verdicts.of_run(run.case, run.measures).good for run in runs]
+    return verdicts.outcome(f"{sum(good)} of {len(runs)} runs are good", all(good))
 
 
 def save(runs: list[Run], folder: str | Path, seed: int, command: str | None = None) -> list[Path]:

@@ -9,13 +9,13 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.core.labels import labels_of
 from jaxtank.core.tree import describe, get_value
 from jaxtank.limits import limited_levels
 from jaxtank.loop.trajectory import csv
 from tuning.problem.problem import TAIL
 from tuning.problem.rules import ORDER
 from tuning.report import feasible, optimal_input
+from tuning.report import verdict as verdicts
 from tuning.report.document import Live, Report, Text, terminal
 from tuning.report.folder import earlier, rig_text
 from tuning.report.folder import save as save_all
@@ -70,7 +70,7 @@ def json_of(result):
     return {
         "case": result.tuned.name,
         "status": str(result.status),
-        "verdict": {"good": result.success, "sentence": verdict(result)},
+        "verdict": verdicts.of_tuning(result).to_json(),
         **fields(result, "method success headline message evaluations wall_s starts symmetry"),
         **fields(result, "choices optimality curvature tradeoff validation provenance"),
         "messages": [{"code": m.code, "text": m.text} for m in result.messages],
@@ -92,48 +92,25 @@ def json_of(result):
     }
 
 
-def verdict(result):
-    """Return the sentence on the outcome: the status, and where the limits hold."""
-    words, answer = [result.headline.replace("_", " ")], result.answer
-    if answer is None:
-        broken = sum(c["margin"] < 0 for c in result.constraints)
-        if result.constraints:
-            hold = len(result.constraints) - broken
-            words += [f"{hold} of {hold + broken} limits hold" if broken else "every limit holds"]
-        return "; ".join(words)
-    if answer.after is None:
-        return f"{words[0]}; no validation plants"
-    if answer.after.limits:
-        hold, samples = int(answer.after.held.sum()), answer.after.samples
-        words.append(f"limits hold on {hold} of {samples} {answer.setting.runs}")
-        if proved := [row.tank for row in answer.setting.certificates if row.certified]:
-            words[-1] += f", proved for {labels_of(result.tuned.loop.plant, 'tank', proved)}"
-    if answer.kept:
-        changed = sum(not stays for stays in answer.kept.values())
-        words.append(f"{changed} of {len(answer.kept)} gains changed")
-    return "; ".join(words)
-
-
 def report(result, page=False):
     """Return the Report of a TuningResult; `page`: with the sections of an HTML page."""
     answer, notes = result.answer, [m.text for m in result.messages]
-    head = f"{result.tuned.name}: {verdict(result)} ({_effort(result)})"
     sections = sections_of(result) if answer is None else of_answer(answer, result)
     if page and answer is not None:
         sections += [dataclasses.replace(s, on="page") for s in sections_of(result)]
     rig = rig_of(result)[0] if page else None
     return Report(
-        f"{result.tuned.name}: tuned",
-        verdict(result),
+        result.tuned.name,
+        "tuned",
+        verdicts.of_tuning(result),
         _facts(result),
         [
             Live(result),
-            Text([head], on="terminal"),
+            Text([_effort(result)], on="terminal"),
             *sections,
             Text(["notes"] if notes else [], gap=True, on="terminal"),
             Text(notes, items=True),
         ],
-        result.success,
         result.case.title,
         0 if answer is None else 80,
         {"The tuned rig as a file (rig.toml)": rig} if rig else {},
@@ -210,7 +187,7 @@ def of_answer(answer, result=None):
 
 def answer_text(answer):
     """Return the text of an Answer alone."""
-    return terminal(Report("default answer", "", (), of_answer(answer), width=80))
+    return terminal(Report("default answer", "", None, (), of_answer(answer), width=80))
 
 
 def _values(result, answer):
@@ -653,7 +630,7 @@ def _title(result):
         f" {p['unit']}"
         for n, p in list(result.parameters.items())[:4]
     )
-    return f"{result.tuned.name}: {verdict(result)}\n({gains})"
+    return f"{result.tuned.name}: {verdicts.of_tuning(result)}\n({gains})"
 
 
 def _clouds(result, unit):

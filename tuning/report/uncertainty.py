@@ -14,6 +14,7 @@ from jaxtank.core.text import count
 from jaxtank.core.tree import describe, get_value
 from jaxtank.loop import step_size
 from tuning.problem import provenance
+from tuning.report import verdict as verdicts
 from tuning.report.document import Live, Report, Text
 from tuning.report.folder import earlier
 from tuning.report.folder import save as save_all
@@ -28,6 +29,7 @@ from tuning.uncertainty.distributions import (
     Normal,
     Uniform,
 )
+from tuning.uncertainty.sampling import clopper_pearson
 
 QUANTITIES = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
 LIKELY = 3
@@ -55,6 +57,7 @@ def json_of(ensemble):
     summary, feasible = clean(ensemble.summary()), ensemble.infeasible
     payload = {
         "case": ensemble.case.name,
+        "verdict": verdict_of(ensemble).to_json(),
         "failed": int(ensemble.failed.sum()),
         "infeasible": None if feasible is None else int(feasible.sum()),
         "draws": ensemble.method,
@@ -123,22 +126,38 @@ def report(ensemble):
         sections.append(Text([words]))
     if ensemble.promise is not None:
         sections += _promise_sections(ensemble)
-    good, verdict = not diverged, "no limits were given"
-    if violations:
-        good = good and not any(v["count"] for v in violations)
-        verdict = "no limit was broken in any draw" if good else "some draws break a limit"
-    if diverged:
-        verdict = f"{diverged} of {count(ensemble.samples, 'run')} diverged"
-    if ensemble.promise is not None:
-        good, verdict = ensemble.promise.answer == "kept", promise_sentence(ensemble.promise)
     return Report(
-        f"{ensemble.case.name}: uncertainty",
-        verdict,
+        ensemble.case.name,
+        "uncertainty",
+        verdict_of(ensemble),
         [*_facts(ensemble, violations), ("runs that diverged", diverged), ("time", time)],
         sections,
-        good,
         ensemble.case.title,
     )
+
+
+def verdict_of(ensemble):
+    """Return the Verdict of an Ensemble: the limit that is broken most often, and the draws."""
+    samples, violations = ensemble.samples, ensemble.violations()
+    diverged, parts = int(ensemble.failed.sum()), {}
+    if diverged:
+        words = f"{diverged} of {count(samples, 'run')} diverged"
+        parts["outcome"] = verdicts.Part(words, False)
+    if violations:
+        worst = max(violations, key=lambda v: v["count"])
+        held, share = int(ensemble.held.sum()), verdicts.shown(100 * worst["probability"])
+        of = f"{worst['words']} (limit {verdicts.shown(worst['limit'], 5)} {worst['unit']})"
+        most = f"most often broken: {of}, in {share} % of the draws"
+        none = not worst["count"]
+        parts["limits"] = verdicts.Part("no limit is broken" if none else most, none)
+        interval = clopper_pearson(held, samples)
+        parts["plants"] = verdicts.plants(held, samples, "draws", interval=interval)
+    if ensemble.promise is not None:  # of its own, weighted runs
+        kept = ensemble.promise.answer == "kept"
+        parts["plants"] = verdicts.Part(promise_sentence(ensemble.promise), kept)
+    if not parts:
+        return verdicts.outcome(f"{count(samples, 'draw')}, no limits to judge them by")
+    return verdicts.Verdict(**parts)
 
 
 def _facts(ensemble, violations):
@@ -209,8 +228,7 @@ def _promise_sections(ensemble):
         lines.append(
             f"The slopes of the margins led to no failure; subset simulation estimates {size}."
         )
-    sentence = promise_sentence(promise)
-    sections: list[Any] = [Text([sentence], heading="Promise", gap=True), Text(lines)]
+    sections: list[Any] = [Text(lines, heading="Promise", gap=True)]
     if promise.limits:
         rows = [[name, Value(100 * share, 3, "%")] for name, share in promise.limits.items()]
         sections.append(Table(rows, ["limit", "share of failures that break it most"], gap=True))

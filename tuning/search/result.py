@@ -81,7 +81,7 @@ class ConstraintRow:
 
     Parameters
     ----------
-    name : the limit in words, with its tank, pump or output and its scenario.
+    name : the limit, with its tank, pump or output and its scenario; words : the same for people.
     measure, unit : name of the measure that is limited, and its unit.
     limit : the limit [unit].
     value, before : the measure after and before tuning [unit]; before is None where not asked.
@@ -116,6 +116,7 @@ class ConstraintRow:
     reason: str | None = None
     active: bool = False
     multiplier: float = 0.0
+    words: str = ""
 
     def __getitem__(self, name: str) -> Any:
         if name not in self.__dataclass_fields__:
@@ -292,6 +293,7 @@ def row_of(
     tanks = {"tank": limit.index, "output": plant.outputs[limit.index % len(plant.outputs)]}
     return ConstraintRow(
         name=limit.label,
+        words=limit.words,
         measure=limit.measure,
         unit=ms.unit(limit.measure, loop.units),
         limit=limit.value,

@@ -98,14 +98,11 @@ class Ensemble(Result):
         """
         rows, n = [], self.samples
         for limit in self.limits:
-            count = 0
-            for block in row_blocks(n):
-                values = self.measures[limit.measure][block]
-                values = values.reshape(len(values), -1)[:, limit.index]
-                count += int(np.sum(self.failed[block] | (limit.margins(values) < 0)))
+            count = int(np.sum(self._broken(limit)))
             rows.append(
                 {
                     "name": limit.label,
+                    "words": limit.words,
                     "limit": limit.value,
                     "unit": ms.unit(limit.measure, self.case.loop.units),
                     "count": count,
@@ -114,6 +111,23 @@ class Ensemble(Result):
                 }
             )
         return rows
+
+    def _broken(self, limit):
+        """(N,) True where a draw breaks a limit."""
+        broken = self.failed.copy()
+        for block in row_blocks(self.samples):
+            values = self.measures[limit.measure][block]
+            values = values.reshape(len(values), -1)[:, limit.index]
+            broken[block] |= limit.margins(values) < 0
+        return broken
+
+    @property
+    def held(self) -> np.ndarray:
+        """(N,) True where the run is finite and every limit holds."""
+        held = ~self.failed
+        for limit in self.limits:
+            held &= ~self._broken(limit)
+        return held
 
 
 def _statistics(measures, name, finite):

@@ -37,7 +37,7 @@ def test_rows_are_counted_by_verdict_and_found_by_quantity(comparison):
     table = [line.split() for line in str(comparison).splitlines()[2:5]]
     table = [" ".join(line) for line in table]
     assert table == ["one 1 0 1 0 0", "two 0 1 1 0 0", "all 1 1 2 0 0"]
-    assert set(comparison.to_json()) == {"one", "two"}
+    assert set(comparison.to_json()) == {"one", "two", "verdict"}
 
 
 def test_entries_that_differ_by_rounding_alone_are_one_point():
@@ -127,7 +127,7 @@ def test_the_command_says_numbers_and_claims_apart(capsys, monkeypatch, tmp_path
 
     monkeypatch.setattr(papers, "measure", measure)
     assert main.main(["compare", "calofir", "--out", str(tmp_path), "--quiet"]) == 0
-    printed = capsys.readouterr().out
+    printed = " ".join(capsys.readouterr().out.split())
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     for shown in (printed, page):
         assert text in shown and "with setpoint ramps of 60 s: 1 of 1 claims" in shown
@@ -137,4 +137,5 @@ def test_the_command_says_numbers_and_claims_apart(capsys, monkeypatch, tmp_path
     assert found["headline"]["numbers"]["of"] == 2 and found["headline"]["claims"]["of"] == 1
     assert [one["reproduced"] for one in found["ramps"]] == [0, 1]
     assert main.main(["compare", "all", "--quiet"]) == 0
-    assert "all papers: printed numbers: 8 of 16 reproduced" in capsys.readouterr().out
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "all papers: printed numbers: 8 of 16 reproduced" in printed

@@ -232,17 +232,26 @@ def test_results_are_on_the_disk_before_any_picture_is_drawn(
     assert (tmp_path / "rig.toml").read_bytes() == (folder_of("tune") / "rig.toml").read_bytes()
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_verdict_is_one_sentence_on_page_terminal_notebook_and_in_json(saves, folder_of, kind):
+    read = Reader((folder_of(kind) / "report.html").read_text(encoding="utf-8"))
+    said = json.loads((folder_of(kind) / "result.json").read_text())["verdict"]
+    sentence = " ".join(said["sentence"].split())
+    (status,) = [a["class"] for tag, a in read.tags if a.get("class", "").startswith("status")]
+    assert sentence and sentence in read.words and ("warn" in status) != said["good"]
+    if kind != "compare":
+        result = saves(kind).__self__
+        assert result.to_json()["verdict"] == said
+        assert sentence in " ".join(repr(result).split())
+        assert sentence in Reader(result._repr_html_()).words
+
+
 def test_the_numbers_of_a_tuning_are_on_its_page(saves, folder_of):
-    """And its verdict: the same sentence on the page, on a terminal and in JSON."""
     read = Reader((folder_of("tune") / "report.html").read_text(encoding="utf-8"))
     result = saves("tune").__self__
-    sentence = result.to_json()["verdict"]["sentence"]
-    assert sentence in " ".join(repr(result).split())
     cost = tables.number(result.objective["after"])
-    for text in (sentence, *result.message.split("; "), *result.parameters, cost, "seed"):
+    for text in (*result.message.split("; "), *result.parameters, cost, "seed"):
         assert " ".join(text.split()) in read.words
-    warned = [a for tag, a in read.tags if a.get("class", "").startswith("status")]
-    assert ("warn" in warned[0]["class"]) == (not result.success)
     assert "[controller]" in read.words or "controller" in rig.dump(result.tuned)
 
 
@@ -297,7 +306,7 @@ def test_compare_and_show_write_to_the_folder_asked_for(tmp_path, monkeypatch, c
 
 
 def rendered(*sections):
-    return html.document(Report("t", "s", [], sections))
+    return html.document(Report("t", "", None, [], sections))
 
 
 def test_sections_become_tables_lists_and_paragraphs():
@@ -312,7 +321,7 @@ def test_sections_become_tables_lists_and_paragraphs():
     assert {tag: tags.count(tag) for tag in counts} == counts
     assert ("td", {"class": "number"}) in read.tags and "never" not in read.words
     assert "x<1" in read.words and f"<p>{words}</p>" in html.fragment(sections)
-    text = terminal(Report("t", "s", [], sections, width=80)).splitlines()
+    text = terminal(Report("t", "", None, [], sections, width=80)).splitlines()
     assert text[:6] == [*textwrap.wrap(words, 80), "other", "- first", "- second", "name  value"]
 
 

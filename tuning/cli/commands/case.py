@@ -18,7 +18,8 @@ def list_cases(args):
     from tuning.report import tables
 
     cases = {f"{p}/{n}": c.title for p in presets.PAPERS for n, c in presets.load(p).cases.items()}
-    print_result(args, cases, lambda: tables.table(cases.items(), ["case", ""]))
+    text, done = lambda: tables.table(cases.items(), ["case", ""]), f"{len(cases)} cases"
+    print_result(args, cases, text, done)
     return 0
 
 
@@ -96,7 +97,12 @@ def simulate(args):
         )
     print_result(args, payload, lambda: terminal(page()))
     report_written(written, args)
-    return 0
+    return _checked(args, payload)
+
+
+def _checked(args, payload):
+    """Return the exit code: 4 with --check where the verdict is not good."""
+    return 4 if args.check and not payload["verdict"]["good"] else 0
 
 
 def _experiment(args, case):
@@ -150,10 +156,10 @@ def _simulate_together(args):
 
     runs = together.run_together(cases, args.seed)
     written = together.save(runs, args.out, args.seed, args.line) if args.out else []
-    payload = together.json_of(runs, args.seed) if args.json else None
+    payload = together.json_of(runs, args.seed)
     print_result(args, payload, lambda: terminal(together.report(runs)))
     report_written(written, args)
-    return 0
+    return _checked(args, payload)
 
 
 def _second_case(name):
@@ -176,7 +182,7 @@ def init(args):
     from jaxtank import rig
 
     text = rig.short(case) if args.short else rig.complete(case, tankwise=args.tanks)
-    _print_source(args, {"case": case.name, "rig": text}, text)
+    _print_source(args, {"case": case.name, "rig": text}, text, f"the rig file of {case.name}")
     return 0
 
 
@@ -190,16 +196,17 @@ def export(args):
     name = args.name or function_name(case)
     if args.json or not args.out:
         payload = {"case": case.name, "lang": args.lang, "name": name, "source": text}
-        _print_source(args, payload, text)
+        done = f"the controller of {case.name} in the language {args.lang}"
+        _print_source(args, payload, text, done)
     if args.out:
         report_written(write_folder(Path(args.out), {f"{name}.{args.lang}": text}), args)
     return 0
 
 
-def _print_source(args, payload, text):
+def _print_source(args, payload, text, done):
     """Print a JSON object with --json, else the text unchanged."""
     if args.json:
-        print_result(args, payload, str)
+        print_result(args, payload, str, done)
     else:
         sys.stdout.write(text)
 
@@ -232,6 +239,7 @@ COMMANDS = {
             *DATA[:-2],
             Option("--hold", "HOW", "inputs of --data between samples: zero-order or first-order",
                    default=""),
+            Option("--check", help="exit code 4 where the verdict is not good", kind="flag"),
             Option("--margins", help="also print the stability margins of the linearised loop at"
                    " each plateau of the reference", kind="flag"),
         ),

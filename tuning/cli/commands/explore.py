@@ -29,7 +29,8 @@ def explore(args):
     live.save(path)
     size = len(live.text.encode())
     if args.json:
-        print_result(args, {"case": case.name, "page": str(path), "bytes": size}, str)
+        payload = {"case": case.name, "page": str(path), "bytes": size}
+        print_result(args, payload, str, f"the live page of {case.name} is written")
     elif not args.quiet:
         print(f"written: {printable(path)}, {size / 1000:.0f} kB", file=sys.stderr)
     if args.open:

@@ -199,7 +199,8 @@ def learn(args):
         written = last.save(args.out, args.line) if last is not fit else written
     payload = {"case": case.name, "achieved": rows}
     payload |= {name: part.to_json() for name, part in parts.items()}
-    table = Report("", "", [], [achieved_table(rows)])
+    payload["verdict"] = last.to_json()["verdict"]
+    table = Report("", "", None, [], [achieved_table(rows)])
     texts = [terminal(table), *map(str, parts.values())]
     print_result(args, payload, lambda: "\n\n".join(texts))
     report_written(written, args)
@@ -258,7 +259,7 @@ def _plan(args, case):
     from tuning.identification.design import compare_experiments, most_informative
     from tuning.report import tables
     from tuning.report.document import terminal
-    from tuning.report.identification import plan_report
+    from tuning.report.identification import plan_report, plan_verdict
 
     if isinstance(noise, list):
         raise InputError(f"--noise {noise}: must be one number with --plan")
@@ -271,6 +272,7 @@ def _plan(args, case):
     experiments = compare_experiments(case, args.free or None, start="known", **settings)
     best = most_informative(experiments)
     payload = {"case": case.name, **plan, "experiments": experiments, "most_informative": best}
+    payload["verdict"] = plan_verdict(best).to_json()
     text = lambda: terminal(plan_report(case, experiments, best, settings))
     print_result(args, tables.clean(payload), text)
     return 0

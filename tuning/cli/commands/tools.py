@@ -26,7 +26,8 @@ def figure(args):
             raise InputError("--out needs a figure such as gouta2015/6: jaxtank figure lists them")
         rows = [[f.name, "" if f.runs else "no result", f.shows] for f in FIGURES.values()]
         payload = {f.name: {"shows": f.shows, "result": bool(f.runs)} for f in FIGURES.values()}
-        print_result(args, payload, lambda: tables.table(rows, ["figure", "", "it shows"]))
+        text = lambda: tables.table(rows, ["figure", "", "it shows"])
+        print_result(args, payload, text, f"{len(rows)} figures")
         return 0
     selected = find(args.figure)
     from tuning.figures import drawing
@@ -43,7 +44,7 @@ def figure(args):
         runs = [{"label": r.label, "case": r.case, "values": dict(r.values)} for r in selected.runs]
         texts = {"shows": selected.shows, "states": selected.states, "here": list(result.ours)}
         payload = {"figure": selected.name, **texts, "remark": selected.remark, "cases": runs}
-        print_result(args, tables.clean(payload), str)
+        print_result(args, tables.clean(payload), str, f"{selected.name} is redrawn")
     elif not args.quiet or not args.picture:
         print("\n".join(textwrap.fill(p, 80) for p in drawing.caption(selected, result.ours)))
     if args.picture and not args.quiet:
@@ -72,7 +73,7 @@ def compare(args):
         rows[paper] = report.measure(paper)
     written = report.save(rows, args.out, args.line) if args.out else []
     text = report.markdown if args.markdown else lambda rows: terminal(report.report(rows))
-    print_result(args, rows if args.paper == "all" else rows[args.paper], lambda: text(rows))
+    print_result(args, report.json_of(rows), lambda: text(rows))
     report_written(written, args)
     return 0
 
@@ -107,10 +108,10 @@ def bench(args):
     if args.cases:
         names = presets.names() if args.cases == ["all"] else args.cases
         rows = timing.measure_cases({name: rig.open_case(name) for name in names}, args.rounds)
-        print_result(args, rows, lambda: timing.text_of_cases(rows))
+        print_result(args, rows, lambda: timing.text_of_cases(rows), f"{len(names)} cases timed")
     else:
         rows = timing.measure(args.rounds)
-        print_result(args, rows, lambda: timing.text(rows))
+        print_result(args, rows, lambda: timing.text(rows), "the closed loop is timed")
     return 0
 
 
@@ -124,7 +125,8 @@ def cache(args):
     base = programs.base_folder()
     if base is None:
         why = "JAXTANK_CACHE=0" if os.environ.get(programs.SWITCH) else "there is no home folder"
-        print_result(args, {"folder": None, "why": why}, lambda: f"off: {why}")
+        off = f"off: {why}"
+        print_result(args, {"folder": None, "why": why}, lambda: off, off)
         return 0
     if base.exists() and (why := programs.refused(base)):
         raise InputError(f"cache: {why}")
@@ -134,7 +136,7 @@ def cache(args):
     limit = f"at most {programs.LARGEST / 2**20:.0f} MiB for each version"
     lines = [f"{number} programs removed" for number in removed.values()]
     lines.append(f"{base}: {count} programs, {size / 2**20:.2g} MiB ({limit})")
-    print_result(args, payload | removed, lambda: "\n".join(lines))
+    print_result(args, payload | removed, lambda: "\n".join(lines), f"{count} programs are kept")
     return 0
 
 

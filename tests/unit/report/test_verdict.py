@@ -1,0 +1,166 @@
+"""The verdict: the live page and the commands judge one run alike; a level that ends far from its
+setpoint, a broken limit and an unstable loop are not good.
+"""
+
+import functools
+import json
+
+import numpy as np
+import pytest
+from helpers import NODE, node
+
+import jaxtank
+from jaxtank import presets, rig
+from jaxtank.live.engine import engine
+from jaxtank.live.page import _script
+from tuning.cli import main
+from tuning.cli.parser import COMMANDS, parser
+from tuning.problem.reported import run_measures
+from tuning.report import verdict as verdicts
+
+PAGE = """
+const e = makeEngine(), leaf = (name) => e.info.leaves.find((one) => one.name === name)?.value;
+console.log(JSON.stringify(GIVEN.map(({ values, filter }) => {
+  const inForce = (name, otherwise) => values[name] ?? leaf(name) ?? otherwise;
+  return verdictOf(e.info, inForce, e.run(values, { filter, every: 100 }));
+})));
+"""
+FOUR, TWO = "gouta2015/backstepping", "cascaded/pi"
+CLOCKS = {FOUR: {"clock.dt": 0.5, "clock.duration": 400.0}, TWO: {}}
+RUNS = {  # values and filter of a run, and whether it is good
+    FOUR: [
+        ({}, False, False),
+        ({f"plant.rim[{i}]": 36.0 for i in range(4)}, False, True),
+        ({"plant.rim[2]": 15.0, "plant.rim[3]": 15.0}, False, False),
+        ({"controller.k1": 0.2}, True, True),
+        ({"plant.drain[0]": 0.6}, True, False),
+        ({"actuator.high[0]": 2.0}, False, False),
+    ],
+    TWO: [
+        ({}, False, False),
+        ({"plant.rim[0]": 14.0, "plant.rim[1]": 14.0}, False, True),
+        ({"plant.rim[0]": 7.0}, False, False),
+        ({"controller.Kc[0]": 0.05, "controller.Ti[0]": 2000.0}, False, False),
+        ({"plant.pump_gain[0]": 2.0}, False, False),
+    ],
+}
+
+
+def measured(name, values, filtered):
+    """(case, its measures) of a run."""
+    case = rig.set_values(presets.find(name), CLOCKS[name])
+    case = case.with_safety_filter() if filtered else case
+    case = rig.set_values(case, values) if values else case
+    return case, run_measures(case.loop, case.clock, None)
+
+
+EACH = pytest.mark.parametrize("name", [TWO, pytest.param(FOUR, marks=pytest.mark.slow)])
+
+
+@pytest.fixture(scope="module")
+def judged():
+    """Function of a case's name that returns [(case, measures)] of RUNS."""
+    return functools.cache(lambda name: [measured(name, *run[:2]) for run in RUNS[name]])
+
+
+@pytest.mark.skipif(NODE is None, reason="no node on this machine")
+@EACH
+def test_page_and_command_have_the_same_verdict_on_a_run(judged, name):
+    case = rig.set_values(presets.find(name), CLOCKS[name])
+    text = engine(case, case.with_safety_filter() if name == FOUR else None) + _script("core")
+    given = [{"values": values, "filter": filtered} for values, filtered, _ in RUNS[name]]
+    page = node(text + PAGE, given)
+    ours = [verdicts.of_run(*of) for of in judged(name)]
+    assert page == [{"good": v.good, "sentence": v.sentence} for v in ours]
+    assert len({v.sentence for v in ours}) > len(ours) - 2
+
+
+@EACH
+def test_a_run_is_good_where_levels_settle_and_limits_hold(judged, name):
+    for (case, measures), (values, _, good) in zip(judged(name), RUNS[name], strict=True):
+        verdict = verdicts.of_run(case, measures)
+        run = jaxtank.simulate(case.loop, case.clock)
+        levels, setpoints = np.asarray(run.x), np.asarray(run.r)
+        ends = [*np.flatnonzero(np.diff(setpoints[:, 0])), len(setpoints) - 1]
+        ends = [k for k in ends if setpoints[k, 0] == setpoints[k - 1, 0]]
+        tank = case.loop.plant.outputs[0]
+        errors = np.abs(levels[ends, tank] - setpoints[ends, 0])
+        worst = np.ravel(measures["steady_state_error"])[0]
+        assert worst == pytest.approx(errors.max(), abs=1e-12), values
+        when = np.ravel(measures["time_of_steady_state_error"])[0]
+        assert when == pytest.approx(np.asarray(run.t)[ends[np.argmax(errors)]])
+        assert verdict.good == good == (verdict.tracking.good and verdict.limits.good), values
+        if verdict.limits.good and len(case.loop.plant.outputs) == 1:
+            assert verdict.tracking.good == (worst <= 0.05 * np.ravel(case.loop.plant.rim)[tank])
+
+
+def test_one_bad_part_makes_a_verdict_bad():
+    part = verdicts.Part
+    unstable = verdicts.robustness({"sensitivity_peak": np.inf})
+    assert not unstable.good and verdicts.robustness({"sensitivity_peak": 1.3}).good
+    assert verdicts.robustness({}) is verdicts.robustness({"sensitivity_peak": np.nan}) is None
+    assert verdicts.Verdict(tracking=part("a"), limits=part("b")).good
+    assert not verdicts.Verdict(tracking=part("a"), robustness=unstable).good
+    some = verdicts.plants(3, 4, interval=(0.2, 0.9))
+    assert not some.good and "20 to 90 %" in some.words
+    whole = verdicts.Verdict(limits=part("limits"), plants=verdicts.plants(4, 4))
+    assert whole.good and "limits;" not in whole.sentence and whole.to_json()["limits"] == "limits"
+
+
+@pytest.mark.skipif(NODE is None, reason="no node on this machine")
+def test_numbers_are_written_as_the_page_writes_them():
+    rng = np.random.default_rng(0)
+    values = [0.0, 2.125, 12.25, 0.0625, 1e-3, 9.996e-4, 999999.0, 1e6, 99.95, -3.5, 123456.5]
+    values += (rng.normal(size=300) * 10.0 ** rng.uniform(-8, 8, 300)).tolist()
+    for digits in (3, 5):
+        texts = f"JSON.stringify(GIVEN.map((v) => shown(v, {digits})))"
+        page = node(f"{_script('core')}\nconsole.log({texts})", values)
+        assert page == [verdicts.shown(value, digits) for value in values]
+
+
+QUICK = ["--set", "clock.duration=400"]
+JUDGED = {  # commands that judge nothing, or one short run, with the shortest words
+    "list": [],
+    "show": [TWO],
+    "init": [TWO],
+    "export": [TWO],
+    "figure": [],
+    "cache": [],
+    "simulate": [TWO, *QUICK],
+    "explore": [TWO, "--out", "page.html"],
+    "bench": [],
+    "identify": ["--inspect", "log.csv"],
+    "predict": [TWO, "--data", "log.csv"],
+}
+RESULTS = {"tune", "uncertainty", "sensitivity", "compare", "attack", "learn"}
+"""Commands that print a result whose `to_json` has the verdict (test_page.py, below)."""
+
+
+def test_every_command_with_json_is_judged_here():
+    known = parser()
+    with_json = {name for name in COMMANDS if "--json" in known.options(name)}
+    assert with_json == {*JUDGED, *RESULTS}
+
+
+SLOW = ("explore", "identify", "predict")  # of which other tests read the JSON too
+
+
+@pytest.mark.parametrize(
+    "command", [pytest.param(c, marks=pytest.mark.slow) if c in SLOW else c for c in JUDGED]
+)
+def test_the_json_of_every_command_has_a_verdict(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    rows = "\n".join(f"{4 * k},3.0,{4 + k / 20}" for k in range(40))
+    (tmp_path / "log.csv").write_text(f"t_s,pump_V,lower_tank_V\n{rows}\n")
+    monkeypatch.setattr("tuning.bench.bench.measure", lambda rounds: {})
+    assert main.main([command, *JUDGED[command], "--json", "--quiet"]) == 0
+    verdict = json.loads(capsys.readouterr().out)["verdict"]
+    assert set(verdict) == {"good", "sentence", "tracking", "limits", "plants", "robustness"}
+    assert isinstance(verdict["good"], bool) and verdict["sentence"]
+    if command == "simulate":
+        checked = [command, *JUDGED[command], "--quiet", "--check"]
+        assert main.main(checked) == (0 if verdict["good"] else 4)
+        printed = capsys.readouterr().out
+        assert verdict["sentence"] in " ".join(printed.split())
+        wide = [command, TWO, *QUICK, "--set", "plant.pump_gain=2", "--quiet"]
+        assert main.main(wide) == 0 and main.main([*wide, "--check"]) == 4

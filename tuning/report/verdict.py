@@ -1,0 +1,244 @@
+"""The verdict on a result: one sentence on tracking, limits, plants and robustness.
+
+Every command, report and notebook takes its sentence from here; `verdictOf` of the live page
+(jaxtank/live/core.js) follows the same rules for a run.
+"""
+
+import dataclasses
+import decimal
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxtank import measures as ms
+from jaxtank.case import Case
+from jaxtank.controllers import OpenLoop
+from jaxtank.core.labels import label_of, labels_of
+from jaxtank.limits import limit_scale, resolve_limits
+from jaxtank.loop.closed_loop import ClosedLoop
+
+OFF = 0.05
+"""Share of a tank's height by which a level may miss its setpoint where it should have settled."""
+
+
+class Part(NamedTuple):
+    """One part of a verdict."""
+
+    words: str
+    good: bool = True
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """Whether a result is good, and the sentence that says why; a part that is not known is None.
+
+    `outcome` : how a search ended, or what a command without a run of the loop has done.
+    """
+
+    outcome: Part | None = None
+    tracking: Part | None = None
+    limits: Part | None = None
+    plants: Part | None = None
+    robustness: Part | None = None
+
+    @property
+    def _parts(self) -> list[Part]:
+        names = (field.name for field in dataclasses.fields(self))
+        return [part for name in names if (part := getattr(self, name)) is not None]
+
+    @property
+    def good(self) -> bool:
+        """True where every part is."""
+        return all(part.good for part in self._parts)
+
+    @property
+    def sentence(self) -> str:
+        """The parts that are known; without the limits where they hold on every plant."""
+        implied = self.limits and self.limits.good and self.plants and self.plants.good
+        parts = (part for part in self._parts if not (implied and part is self.limits))
+        return "; ".join(part.words for part in parts)
+
+    def __str__(self) -> str:
+        return self.sentence
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the object `verdict` of a command's JSON."""
+        names = ("tracking", "limits", "plants", "robustness")
+        parts = {n: None if (part := getattr(self, n)) is None else part.words for n in names}
+        return {"good": self.good, "sentence": self.sentence, **parts}
+
+
+def outcome(words: str, good: bool = True) -> Verdict:
+    """Return the Verdict of a result that judges no run of a loop."""
+    return Verdict(outcome=Part(words, good))
+
+
+def of_run(case: Case, values: Mapping[str, Any]) -> Verdict:
+    """Return the Verdict of a run with the measures `values`."""
+    return Verdict(
+        tracking=tracking(case.loop, values),
+        limits=limits(limit_rows(case, values)),
+        robustness=robustness(values),
+    )
+
+
+def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
+    """Return how near the controlled levels come to their setpoints: at the end of each plateau,
+    and by their RMS errors where a setpoint has none.
+    """
+    if isinstance(loop.controller, OpenLoop) or "steady_state_error" not in values:
+        return None
+    column = lambda name: np.ravel(np.asarray(values[name], dtype=float))
+    plant: Any = loop.plant
+    steady, rms, unit = column("steady_state_error"), column("rms_error"), loop.units[0]
+    if not np.all(np.isfinite(rms)):
+        return Part("the run diverged: a level is not a finite number", False)
+    outputs = list(plant.outputs)
+    rims, levels = np.broadcast_to(plant.rim, plant.tanks)[outputs], column("max_level")[outputs]
+    heights = np.where(np.isfinite(rims), rims, np.abs(levels))
+    missed = np.where(np.isnan(steady), rms, steady)
+    shares = missed / np.where(heights > 0.0, heights, 1.0)
+    worst = int(np.argmax(shares))
+    total = f"RMS error {shown(column('rms_error_total')[0])} {unit}"
+    if shares[worst] > OFF and math.isnan(steady[worst]):
+        tank = label_of(plant, "tank", outputs[worst])
+        return Part(f"{tank} has an RMS error of {shown(rms[worst])} {unit}", False)
+    if shares[worst] > OFF:
+        tank, time = label_of(plant, "tank", outputs[worst]), column("time_of_steady_state_error")
+        off = f"{tank} is {shown(missed[worst])} {unit} off its setpoint at {shown(time[worst], 5)}"
+        return Part(f"{off} s, {total}", False)
+    if np.isnan(steady).all():
+        return Part(f"tracks with {total}")
+    return Part(f"settles within {shown(np.nanmax(steady))} {unit} of its setpoints, {total}")
+
+
+def limit_rows(case: Case, values: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the limits of a run as fields of `ConstraintRow`, the tightest first."""
+    rows = []
+    for limit in resolve_limits(case):
+        if limit.measure not in values:
+            continue
+        entry = lambda name, i=limit.index: float(np.ravel(values[name])[i])
+        reached = ms.MEASURES[limit.measure].reached
+        rows.append(
+            {
+                "name": limit.label,
+                "words": limit.words,
+                "measure": limit.measure,
+                "unit": ms.unit(limit.measure, case.loop.units),
+                "limit": float(limit.value),
+                "value": entry(limit.measure),
+                "margin": limit.margin(values),
+                "scale": limit_scale(limit, case.loop),
+                "reason": None if np.isfinite(entry(limit.measure)) else "undefined",
+                "time_s": entry(reached) if reached in values else None,
+            }
+        )
+    return sorted(rows, key=_share)
+
+
+def _share(row):
+    """The margin of a limit as a share of its size."""
+    return row["margin"] / (row.get("scale") or abs(row["limit"]) or 1.0)
+
+
+def limits(rows: Sequence[Mapping[str, Any]]) -> Part | None:
+    """Return which limit is the tightest or broken, by how much and when; None without any."""
+    if not rows:
+        return None
+    worst = min(rows, key=_share)
+    broken = sum(not row["margin"] >= 0.0 for row in rows)
+    name, unit, value = worst["words"], worst["unit"], shown(worst["value"])
+    of = lambda text: f"{text} {unit}" if unit != "-" else text
+    if not broken:
+        spare = f", smallest margin {of(shown(worst['margin']))} ({name})"
+        finite = np.isfinite(worst["value"]) and worst["measure"] != "overflow_volume"
+        return Part("every limit holds" + spare * bool(finite))
+    when = "" if worst["time_s"] is None else f" at {shown(worst['time_s'], 5)} s"
+    excess, bound = of(shown(-worst["margin"])), of(shown(worst["limit"], 5))
+    side = "below" if ms.MEASURES[worst["measure"]].sense < 0 else "above"
+    words = f"{name} is {of(value)}{when}, {excess} {side} its limit of {bound}"
+    if not np.isfinite(worst["value"]):
+        words = f"{name} is undefined, for a limit of {bound}"
+    elif worst["measure"] == "overflow_volume":
+        words = f"{name} is {of(value)}"
+    more = {1: "", 2: "; 1 other limit is broken"}
+    return Part(words + more.get(broken, f"; {broken - 1} other limits are broken"), False)
+
+
+def plants(
+    held: int, samples: int, runs: str = "plants", proved: str = "", interval: Any = None
+) -> Part:
+    """Return on how many plants every limit holds, and for which tanks that is guaranteed."""
+    words = f"limits hold on {held} of {samples} {runs}"
+    if held < samples and interval is not None:
+        low, high = (shown(100.0 * end) for end in interval)
+        words += f" (95 % interval {low} to {high} %)"
+    return Part(words + (f", proved for {proved}" if proved else ""), held == samples)
+
+
+def robustness(values: Mapping[str, Any]) -> Part | None:
+    """Return the sensitivity peak of the linearised loop, where it is known."""
+    peak = float(values["sensitivity_peak"]) if "sensitivity_peak" in values else math.nan
+    if math.isnan(peak):
+        return None
+    stable = peak < math.inf
+    return Part(f"Ms {shown(peak)}" if stable else "the linearised loop is unstable", stable)
+
+
+def of_tuning(result: Any) -> Verdict:
+    """Return the Verdict of a TuningResult: of its own run, and of the plants that judged it."""
+    answer, case, values = result.answer, result.tuned, result.measures["after"]
+    where = "" if answer is None else " on the worst plant"
+    rows = [
+        row.to_json() | {"words": (row.words or row.name) + where} for row in result.constraints
+    ]
+    return Verdict(
+        outcome=Part(result.headline.replace("_", " "), result.success),
+        tracking=tracking(case.loop, values),
+        limits=limits(rows),
+        plants=_validated(result) if answer is None else _judged(answer),
+        robustness=robustness(values),
+    )
+
+
+def _validated(result):
+    """The plants of a nominal optimum."""
+    runs = result.validation
+    share = runs["limits_held"]["after"] if runs and result.constraints else None
+    if share is None:
+        return None
+    finite = runs["samples"] - runs["failed"]
+    return plants(round(share * finite), runs["samples"], "validation runs")
+
+
+def _judged(answer):
+    """The validation plants of a default answer."""
+    after, certificates = answer.after, answer.setting.certificates
+    if after is None or not after.limits:
+        return None
+    certified = [row.tank for row in certificates if row.certified]
+    plant = answer.setting.case.loop.plant
+    proved = labels_of(plant, "tank", certified) if certified else ""
+    interval = after.share_held()["interval95"]
+    return plants(int(after.held.sum()), after.samples, answer.setting.runs, proved, interval)
+
+
+def shown(value: Any, digits: int = 3) -> str:
+    """Return a number as the live page writes it (`shown` of core.js): rounded half up, with an
+    exponent below 0.001 and from a million on.
+    """
+    value = float(value)
+    if not math.isfinite(value):
+        return "–"
+    exact = decimal.Decimal(value)
+    if not exact:
+        return "0"
+    place = decimal.Decimal(1).scaleb(exact.adjusted() - digits + 1)
+    rounded = exact.quantize(place, decimal.ROUND_HALF_UP)
+    if 1e-3 <= abs(value) < 1e6:
+        return f"{rounded.normalize():f}"
+    exponent = rounded.adjusted()
+    return f"{rounded.scaleb(-exponent):.{digits - 1}f}e{exponent:+d}"
