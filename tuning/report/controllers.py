@@ -3,6 +3,7 @@
 import numpy as np
 
 from tuning.problem import provenance
+from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.folder import earlier
 from tuning.report.folder import save as save_all
@@ -20,6 +21,7 @@ def json_of(result):
     return clean(
         {
             "case": result.case.name,
+            "verdict": verdict_of(result).to_json(),
             "samples": result.samples,
             "unit": result.case.loop.units[0],
             "controllers": [_row(rival) for rival in result.rivals],
@@ -71,6 +73,11 @@ def sentence(result):
     return f"{words}; the case's own controller at its best ({own.words()}): {stands}"
 
 
+def verdict_of(result):
+    """Return the Verdict of a ControllerComparison: which controller is best."""
+    return verdicts.outcome(sentence(result), result.best.holds)
+
+
 def report(result):
     """Return the Report of a ControllerComparison."""
     unit = result.case.loop.units[0]
@@ -97,13 +104,12 @@ def report(result):
         " range; Ms: largest sensitivity peak at the plateaus of the nominal plant.",
         *(f"{name} does not fit this rig: {why}" for name, why in result.refused.items()),
     ]
-    best = result.best
     return Report(
-        f"{result.case.name}: controllers",
-        sentence(result),
+        result.case.name,
+        "controllers",
+        verdict_of(result),
         [("plants", result.samples), ("controllers", len({r.name for r in result.rivals}))],
-        [Text([sentence(result)]), Table(rows, heads, gap=True), Text(notes, items=True, gap=True)],
-        best.holds,
+        [Table(rows, heads, gap=True), Text(notes, items=True, gap=True)],
         result.case.title,
         width=100,
     )
