@@ -5,6 +5,7 @@ subprocesses; `pytest --cache-clear` compiles everything anew.
 """
 
 import os
+import re
 import shutil
 
 import jax
@@ -17,6 +18,35 @@ jax.config.update("jax_enable_x64", True)
 FOLDER = "JAX_COMPILATION_CACHE_DIR"
 LARGEST_CACHE = 2**30
 """Bytes of compiled programs above which a run begins without any."""
+
+
+SKIPS = (
+    r"no Chromium( on this machine)?$",  # and, of the same kind, what a machine may lack
+    r"(no node on this machine|node runs the exported code)$",
+    r"no gcc on this machine$",
+    r"(fish|zsh|bash) is not installed here$",
+    r"needs JupyterLab: ",  # of the extra "notebooks", which tests do without
+    r"pyright (is not installed|cannot run here)",
+    r"could not import 'xarray'",
+    r"CasADi is not installed",
+    r"FMPy is not installed",
+    r"killed before the search began$",
+)
+"""Reasons for which a test may skip. Under JAXTANK_SKIPS=listed, as in CI, any other one fails."""
+
+
+def pytest_sessionfinish(session):
+    """Fail a run in which a test skipped for a reason that is not on the list."""
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if reporter is None or os.environ.get("JAXTANK_SKIPS") != "listed":
+        return
+    reasons = {
+        report.longrepr[2].removeprefix("Skipped: ") for report in reporter.stats.get("skipped", ())
+    }
+    unlisted = sorted(r for r in reasons if not any(re.match(allowed, r) for allowed in SKIPS))
+    if unlisted:
+        reporter.write_line(f"skipped for reasons that are not on the list: {unlisted}", red=True)
+        session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
 
 
 def pytest_configure(config):
