@@ -4,6 +4,7 @@
 
 import collections
 import contextlib
+import ctypes
 import dataclasses
 import io
 import json
@@ -21,6 +22,7 @@ import pytest
 from jaxtank import presets
 from jaxtank.core.tree import parameters
 from jaxtank.export import source
+from jaxtank.export.program import program
 from jaxtank.measures import accumulators, catalogue
 from jaxtank.presets import Free
 from jaxtank.rig import components
@@ -231,3 +233,72 @@ initial = [0.5]
 "clock.dt" = 0.1
 """
 """Two tanks in m with a pump in %, of which the tests of logs make data."""
+
+
+GCC = shutil.which("gcc")
+FLAGS = ["-O1", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror"]
+needs_gcc = pytest.mark.skipif(GCC is None, reason="no gcc on this machine")
+
+SERIES = """
+units = ["m", "-"]
+reachable = false
+tank = [
+    { area = 1.0, rim = 3.0, level = 1.0 },
+    { area = 0.5, rim = 3.0, level = 1.0, drain = 0.01 },
+]
+orifice = [{ from = 1, to = 2, area = 0.01 }]
+pump = [{ gain = 0.1, to = 1, high = 1.0, initial = 0.44 }]
+plant = { gravity = 9.81, outputs = [2] }
+reference = { initial = [1.0], changes = [[5.0, 1, 2.0], [60.0, 1, 0.8]], ramp = 0.0 }
+values = { "clock.dt" = 0.5, "clock.duration" = 150.0 }
+"""
+"""A rig of two tanks in series, the second one controlled, as a rig file without a controller."""
+
+
+class Compiled:
+    """An exported controller as Python functions."""
+
+    def __init__(self, case, folder, precision="double"):
+        for file, text in source.files(case, "c", precision, name="law").items():
+            (folder / file).write_text(text)
+        library = folder / "law.so"
+        words = [GCC, *FLAGS, "-std=c99", "-shared", "-fPIC", "-o", library, folder / "law.c"]
+        compiled = subprocess.run([*words, "-lm"], capture_output=True, text=True)
+        assert compiled.returncode == 0, compiled.stderr
+        self.library = ctypes.CDLL(str(library))
+        self.type = np.dtype(precision if precision == "double" else np.float32)
+        self.real = ctypes.c_double if precision == "double" else ctypes.c_float
+        shapes = [(p.name, p.value.shape) for p in program(case).parameters]
+        count = sum(int(np.prod(shape)) for _, shape in shapes)
+        size = self.real * count
+        self.defaults = np.array(size.in_dll(self.library, "law_defaults"))
+        ends = np.cumsum([int(np.prod(shape)) for _, shape in shapes])
+        self.slices = {n: slice(e - int(np.prod(s)), e) for (n, s), e in zip(shapes, ends)}
+        self.state = np.zeros(20_000, dtype=self.type)  # larger than that of any controller
+
+    def set(self, values):
+        """The parameters with some of them changed."""
+        p = self.defaults.copy()
+        for name, value in values.items():
+            p[self.slices[name]] = np.ravel(value)
+        return p
+
+    def pointer(self, array):
+        return None if array is None else array.ctypes.data_as(ctypes.c_void_p)
+
+    def init(self, y=None, u=None, p=None):
+        """Begin from levels and inputs, those of the case for None."""
+        self.library.law_init(*map(self.pointer, (self.state, p, y, u)))
+
+    def step(self, t, y, r, dr, ddr, manual=None, p=None):
+        """The inputs of a sample."""
+        u = np.zeros(16, dtype=self.type)
+        arrays = map(self.pointer, (y, r, dr, ddr, manual, u))
+        self.library.law_step(self.pointer(self.state), self.pointer(p), self.real(t), *arrays)
+        return u
+
+    def run(self, case, run, signals, p=None):
+        y, r, dr, ddr = (np.ascontiguousarray(v, dtype=self.type) for v in (run.y, *signals))
+        self.init(p=p)
+        out = [self.step(run.t[k], y[k], r[k], dr[k], ddr[k], p=p) for k in range(len(y))]
+        return np.stack(out)[:, : case.loop.plant.pumps]

@@ -118,6 +118,19 @@ class Controller(Role):
         """
         return state
 
+    def transfer(
+        self, state: Any, tick: Tick, command: Sequence[Any], applied: Sequence[Any]
+    ) -> Any:
+        """Return the state after a sample in manual operation, in exported code: with integral
+        action, that from which the same sample gives `applied`. Arguments as of `track`.
+        """
+        return self.track(state, tick, command, applied)
+
+    @property
+    def bumpless(self) -> bool:
+        """True if the inputs go on from manual ones without a bump, by `transfer` or `track`."""
+        return False
+
     def input_metric(self, estimate: Estimate) -> tuple[Any, ...] | None:
         """Return the weights (g11, g12, g22) of a change of the two inputs in the controller's
         cost, for allocation by box QP; None if it has none.

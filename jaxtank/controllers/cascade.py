@@ -127,6 +127,23 @@ class Cascade(PID):
         outer = PID.track(self, state.outer, tick, state.asked, reached)
         return state._replace(outer=outer, inner=inner)
 
+    def transfer(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
+        # the outer loop follows the inner level, so that the inner loop begins without an error
+        follows: Any = lambda s, e, v, u, k: s - e
+        if self.inner_Ti is None:
+            follows = lambda s, e, v, u, k: s + (u - v) / k
+        s, k = state.setpoint, self.inner_Kc
+        if self.Ti is not None:
+            s = self._within(each(follows, s, state.inner.error, command, applied, k))
+        moved = each(lambda v, a, b, k: v + k * (a - b), command, s, state.setpoint, k)
+        inner = self.inner_loop.transfer(state.inner, tick, moved, applied)
+        outer = PID.transfer(self, state.outer, tick, state.asked, s)
+        return state._replace(outer=outer, inner=inner)
+
+    @property
+    def bumpless(self) -> bool:
+        return self.inner_loop.bumpless or super().bumpless
+
     def _within(self, setpoint: Any) -> Any:
         """Setpoints within their limits."""
         low, high = self.inner_low, self.inner_high

@@ -179,10 +179,20 @@ class Scheduled(Controller):
         return command, Memory(inner=inner, at=state.at if self._on_setpoint else at)
 
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
-        at = tick.r[self._index] if self._on_setpoint else state.at
-        return state._replace(
-            inner=self._controller_at(at).track(state.inner, tick, command, applied)
-        )
+        controller = self._controller_then(state, tick)
+        return state._replace(inner=controller.track(state.inner, tick, command, applied))
+
+    def transfer(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
+        controller = self._controller_then(state, tick)
+        return state._replace(inner=controller.transfer(state.inner, tick, command, applied))
+
+    @property
+    def bumpless(self) -> bool:
+        return self._without_gains().bumpless
+
+    def _controller_then(self, state: Any, tick: Tick) -> Controller:
+        """The controller of the sample that `state` is from."""
+        return self._controller_at(tick.r[self._index] if self._on_setpoint else state.at)
 
     def input_metric(self, estimate: Estimate) -> tuple | None:
         # the setpoint is not available here: `check` refuses gains that would need it

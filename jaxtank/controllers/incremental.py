@@ -196,6 +196,10 @@ class LinearPredictive(Controller):
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return state._replace(u=applied)
 
+    @property
+    def bumpless(self) -> bool:
+        return True
+
     def check_pumps(self, actuator: Actuator) -> None:
         """Raise InputError if the quadratic programme may be infeasible at the first sample."""
         if self.mode != "constrained":

@@ -89,6 +89,15 @@ class Override(PID):
         limiting = self.limiting_loop.track(state.limiting, tick, state.override, applied)
         return state._replace(main=main, limiting=limiting)
 
+    def transfer(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
+        main = PID.transfer(self, state.main, tick, state.asked, applied)
+        limiting = self.limiting_loop.transfer(state.limiting, tick, state.override, applied)
+        return state._replace(main=main, limiting=limiting)
+
+    @property
+    def bumpless(self) -> bool:
+        return super().bumpless and self.limiting_loop.bumpless
+
     def check_gains(self) -> None:
         PID.check_gains(self)
         outputs = self.model.outputs

@@ -303,6 +303,20 @@ class PID(Controller):
             return state._replace(integral=integral)
         return self._fractional(state, tick, w)
 
+    def transfer(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
+        if self.Ti is None:
+            return state
+        several = np.shape(self.Ti)[-1:] != (1,)  # an infinite Ti keeps its integral at 0
+        moves = lambda Ti: jnp.where(jnp.isinf(Ti), 0.0, 1.0) if several else 1.0
+        move = lambda i, u, v, Ti: i + moves(Ti) * (u - v)
+        integral = each(move, state.integral, applied, command, self.Ti)
+        fresh = jax.tree.map(lambda s: 0.0 * s, state.sections)
+        return state._replace(integral=integral, sections=fresh)
+
+    @property
+    def bumpless(self) -> bool:
+        return self.Ti is not None and not np.any(np.isinf(cast(Any, self.Ti)))
+
     def _weight(self) -> Any:
         """Setpoint weights; 1 of a loop whose integral time is infinite."""
         Ti, b = cast(Any, self.Ti), cast(Any, self.b)

@@ -104,6 +104,9 @@ class SplitRange(PID):
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return PID.track(self, state, tick, self.total(command), self.total(applied))
 
+    def transfer(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
+        return PID.transfer(self, state, tick, self.total(command), self.total(applied))
+
     def check_inputs(self) -> None:
         outputs, pumps = len(self.model.outputs), self.model.pumps
         entries = [j for members in self.sequence for j in members]

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtank.analysis.elimination import solve
 from jaxtank.analysis.linear_model import linearise
 from jaxtank.analysis.riccati import lqr
 from jaxtank.analysis.steady_state import check_rest, steady_along, steady_flows, steady_under
@@ -145,6 +146,16 @@ class LQI(Controller):
         z, error = state
         free = sum(jnp.where(c == a, 0.0, 1.0) for c, a in zip(command, applied)) == 0.0
         return tuple(jnp.where(free, i + tick.dt * e, i) for i, e in zip(z, error)), error
+
+    def transfer(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
+        z, error = state
+        short = jnp.stack([v - u for u, v in zip(applied, command)])  # of Ki z
+        move = solve(self.gain()[:, -len(z) :], short)
+        return tuple(i + move[j] for j, i in enumerate(z)), error
+
+    @property
+    def bumpless(self) -> bool:
+        return True
 
     def check(self, reference: Signal) -> None:
         check_free_outlets(self.model)

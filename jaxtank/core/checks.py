@@ -103,6 +103,20 @@ def _out_of_range(name: str, entry: Any, index: tuple[int, ...], meta: Mapping[s
     return f"{label} = {entry:g}{unit}: must be {bound} {meta['low']:g}{unit}"
 
 
+def allowed(meta: Mapping[str, Any], value: Any = 0.0) -> str:
+    """Return the range in `meta` in words, "above 0" for one; value: whether numbers are whole."""
+    if meta.get("choices") is not None:
+        return " or ".join(
+            str(c).lower() if isinstance(c, bool) else f'"{c}"' for c in meta["choices"]
+        )
+    low, high = meta.get("low"), meta.get("high")
+    above = "" if low is None else f"{'above' if meta['strict'] else 'at least'} {low:.10g}"
+    below = "" if high is None else f"at most {high:.10g}"
+    integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    integer = integer and meta.get("kind") not in ("tank", "feed")  # by name too
+    return ", ".join(filter(None, ["whole number" if integer else "", above, below]))
+
+
 def check_order(name: str, part: Any, lower: str, upper: str, equal: bool = False) -> None:
     """Check that each entry of a leaf is below the entry of another; traced leaves are skipped."""
     a, b = getattr(part, lower), getattr(part, upper)

@@ -1,83 +1,99 @@
-"""Controllers as C99."""
+"""Controllers and plants as C99: a header with the parameters, and a file of functions."""
 
-import re
+import numpy as np
 
-from jaxtank.export.printer import FUNCTIONS, OPERATIONS, Printer, header
-from jaxtank.export.statements import REAL, TRUTH, WHOLE, Ref, matrix_operations
-
-MATHS = [*FUNCTIONS, "fabs", "pow", "rint", "fmod", "cbrt", "exp2", "atan2"]
-"""Functions of math.h, each with a macro in capitals that is the one of the file's precision."""
+from jaxtank.export.printer import FUNCTIONS, OPERATIONS, Printer, field_of, header, note_of
+from jaxtank.export.statements import REAL, TRUTH, WHOLE, Matrix, Ref, Store, every
 
 
 class C(Printer):
-    """The statements of C99."""
+    """The statements of C99, in double or single precision."""
 
-    operations = {
-        **OPERATIONS,
-        **{name: f"{name.upper()}({{0}})" for name in [*FUNCTIONS, "cbrt", "exp2"]},
-        "abs": "FABS({0})",
-        "atan2": "ATAN2({0}, {1})",
-        "pow": "POW({0}, {1})",
-        "max": "MAX({0}, {1})",
-        "min": "MIN({0}, {1})",
-        "round": "RINT({0})",
-        "rem": "FMOD({0}, {1})",
-        "is_finite": "isfinite({0})",
-        "not": "!{0}",
-        "ne": "{0} != {1}",
-        "and": "{0} && {1}",
-        "or": "{0} || {1}",
-        "rsqrt": "R(1.0) / SQRT({0})",
-        "logistic": "R(1.0) / (R(1.0) + EXP(-{0}))",
-        "quotient": "{0} / {1}",
-        "remainder": "{0} % {1}",
-        "sign": "(real)(({0} > R(0.0)) - ({0} < R(0.0)))",
-        "select": "{0} ? {2} : {1}",
-        "real": "(real){0}",
-        "whole": "(int){0}",
-    }
-    kinds = {REAL: "real", WHOLE: "int", TRUTH: "int"}
-    rename = {"s": "state->s"}
-    real = "R({0})"
+    kinds = {REAL: "double", WHOLE: "int", TRUTH: "int"}
     truths = ("0", "1")
     constant, variable = "const {kind} {name} = {value};", "{kind} {name} = {value};"
-    open_array, close_array = "const real {name}[{size}] = {{", "};"
-    matrix_call = "real {name}[{size}];\n{op}({arguments}, {name});"
-    counted, endless, end = "for (int i = 0; i < {0}; ++i) {{", "for (;;) {", "}"
+    open_array, close_array = "const {real} {name}[{size}] = {{", "};"
+    matrix_call = "{real} {name}[{size}];\n{op}({arguments}, {name});"
+    matrices = ("product", "cholesky", "forward", "backward", "solve")
+    counted, endless, end = "for (int i = 0; i < {0}; ++i) {{", "", "}"
     until = "if (!({0})) break;"
+    store = "{array}[{index}] = {value};\n{real} *const {name} = {array};"
+
+    def __init__(self, precision="double", places=()):
+        f = "f" if precision == "float" else ""
+        self.type, self.suffix, self.places = precision, f, dict(places)
+        self.kinds = {**self.kinds, REAL: precision}
+        self.rename = {"s": "state->s"}
+        one = f"1.0{f}"
+        self.operations = {
+            **OPERATIONS,
+            **{name: f"{name}{f}({{0}})" for name in [*FUNCTIONS, "cbrt", "exp2"]},
+            **{name: f"{name}{f}({{0}}, {{1}})" for name in ("atan2", "pow")},
+            "abs": f"fabs{f}({{0}})",
+            "max": "{0} > {1} ? {0} : {1}",
+            "min": "{0} < {1} ? {0} : {1}",
+            "round": f"rint{f}({{0}})",
+            "rem": f"fmod{f}({{0}}, {{1}})",
+            "is_finite": "isfinite({0})",
+            "not": "!{0}",
+            "ne": "{0} != {1}",
+            "and": "{0} && {1}",
+            "or": "{0} || {1}",
+            "rsqrt": f"{one} / sqrt{f}({{0}})",
+            "logistic": f"{one} / ({one} + exp{f}(-{{0}}))",
+            "quotient": "{0} / {1}",
+            "remainder": "{0} % {1}",
+            "sign": f"({precision})(({{0}} > 0) - ({{0}} < 0))",
+            "select": "{0} ? {2} : {1}",
+            "real": f"({precision}){{0}}",
+            "whole": "(int){0}",
+            "item": "{0}[{1}]",
+        }
+
+    def value(self, e):
+        """Return a number or a Ref as text."""
+        if isinstance(e, Ref) and e in self.places:
+            return self.places[e]
+        text = super().value(e)
+        if isinstance(e, float) and self.suffix and np.isfinite(e):
+            return f"{text[:-1]}f)" if text.endswith(")") else f"{text}f"
+        return text
+
+    def as_real(self, e):
+        """Return a number or a Ref of any kind as a real."""
+        return self.value(e) if isinstance(e, float) else f"({self.type}){self.value(e)}"
 
     def _array(self, s):
         first, *others = super()._array(s)
         fixed = not any(isinstance(e, Ref) for e in s.entries)
         return [f"static {first}" if fixed else first, *others]
 
-    def as_real(self, e):
-        """Return a number or a Ref of any kind as a real."""
-        return self.value(e) if isinstance(e, float) else f"(real)({self.value(e)})"
 
-
-MATRICES = """
+MATRICES = {
+    "product": """
 static void product(int m, int k, int n, const real *a, const real *b, real *out)
 {
     for (int i = 0; i < m; ++i)
         for (int j = 0; j < n; ++j) {
-            real s = R(0.0);
+            real s = 0;
             for (int l = 0; l < k; ++l) s += a[i * k + l] * b[l * n + j];
             out[i * n + j] = s;
         }
 }
-
+""",
+    "cholesky": """
 static void cholesky(int n, const real *a, real *out)
 {
     for (int j = 0; j < n; ++j)
         for (int i = 0; i < n; ++i) {
             real s = a[i * n + j];
-            if (i < j) { out[i * n + j] = R(0.0); continue; }
+            if (i < j) { out[i * n + j] = 0; continue; }
             for (int l = 0; l < j; ++l) s -= out[i * n + l] * out[j * n + l];
             out[i * n + j] = i == j ? SQRT(s) : s / out[j * n + j];
         }
 }
-
+""",
+    "forward": """
 static void forward(int n, int k, const real *a, const real *b, real *out)
 {
     for (int c = 0; c < k; ++c)
@@ -87,7 +103,8 @@ static void forward(int n, int k, const real *a, const real *b, real *out)
             out[i * k + c] = s / a[i * n + i];
         }
 }
-
+""",
+    "backward": """
 static void backward(int n, int k, const real *a, const real *b, real *out)
 {
     for (int c = 0; c < k; ++c)
@@ -97,83 +114,282 @@ static void backward(int n, int k, const real *a, const real *b, real *out)
             out[i * k + c] = s / a[i * n + i];
         }
 }
-"""
+""",
+    "solve": """
+static void solve(int n, int k, const real *a, const real *b, real *out)
+{
+    real A[LARGEST];
+    for (int i = 0; i < n * n; ++i) A[i] = a[i];
+    for (int i = 0; i < n * k; ++i) out[i] = b[i];
+    for (int j = 0; j < n; ++j) {
+        int best = j;
+        for (int i = j + 1; i < n; ++i)
+            if (FABS(A[i * n + j]) > FABS(A[best * n + j])) best = i;
+        for (int l = 0; l < n; ++l) {
+            const real old = A[j * n + l];
+            A[j * n + l] = A[best * n + l];
+            A[best * n + l] = old;
+        }
+        for (int c = 0; c < k; ++c) {
+            const real old = out[j * k + c];
+            out[j * k + c] = out[best * k + c];
+            out[best * k + c] = old;
+        }
+        for (int i = j + 1; i < n; ++i) {
+            const real f = A[i * n + j] / A[j * n + j];
+            for (int l = j; l < n; ++l) A[i * n + l] -= f * A[j * n + l];
+            for (int c = 0; c < k; ++c) out[i * k + c] -= f * out[j * k + c];
+        }
+    }
+    for (int c = 0; c < k; ++c)
+        for (int i = n - 1; i >= 0; --i) {
+            real s = out[i * k + c];
+            for (int l = i + 1; l < n; ++l) s -= A[i * n + l] * out[l * k + c];
+            out[i * k + c] = s / A[i * n + i];
+        }
+}
+""",
+}
+"""{matrix operation: a function of its sizes, its operands, row by row, and its result}."""
+
+MANUAL = " * manual: inputs that an operator sets; NULL in automatic operation."
+
+
+class Text:
+    """The two files of a Program."""
+
+    def __init__(self, program, name, precision):
+        self.program, self.name, self.real = program, name, precision
+        entries = enumerate(program.entries)
+        places = {Ref("p", j): f"p->{field_of(n)}{_index(i)}" for j, (n, i) in entries}
+        self.plain = C(precision, places)
+        for e, (kind, i) in program.constants.items():
+            cast = "" if kind == REAL else "(int)"
+            places[e] = f"{cast}state->c[{i}]"
+        places |= {Ref(n): f"(state->c + {at})" for n, (at, _) in program.arrays.items()}
+        self.printer = C(precision, places)
+        self.printer.rename = {**self.printer.rename, "on": "manual"}
+        arrays = "".join(f", const {precision} *{v}" for v in program.inputs if v != "w")
+        results = "".join(f", {precision} *{v}" for v in program.outputs_of)
+        first = f"{name}_state *state, const {name}_parameters *p"
+        if program.plant:
+            self.init_call = f"void {name}_init({first}{results})"
+            self.step_call = f"void {name}_step({first}{arrays}{results})"
+        else:
+            before = f"const {precision} *y, const {precision} *u"
+            self.init_call = f"void {name}_init({first}, {before})"
+            arrays = f", {precision} t{arrays}, const {precision} *manual"
+            self.step_call = f"void {name}_step({first}{arrays}{results})"
+
+    def header(self):
+        """Return the text of the header."""
+        program, name, real = self.program, self.name, self.real
+        begin = f"{name}_init takes levels and inputs before the first period (NULL: of the case)."
+        begin = f"{name}_init gives those at t = 0." if program.plant else begin
+        sizes = {
+            "STATE": max(program.state, 1),
+            "TANKS": program.tanks,
+            "OUTPUTS": program.outputs,
+            "PUMPS": program.pumps,
+        }
+        facts = ", ".join(f"{name.upper()}_{key} = {value}" for key, value in sizes.items())
+        kept = [f"    {real} c[{program.kept}]; /* results of p alone */"] if program.kept else []
+        kept += [f"    {name}_parameters p;"] if program.prepare else []
+        zero = "d" if program.plant else "dr, ddr"
+        return "\n".join(
+            [
+                "/*",
+                *header(program, " *", f"{name}_step", begin),
+                " *",
+                " * p: the parameters, which may change between two periods (NULL: the defaults);",
+                f" * {zero}: NULL for zeros.",
+                *([] if program.plant else [MANUAL]),
+                " */",
+                f"#ifndef {name.upper()}_H",
+                f"#define {name.upper()}_H",
+                "",
+                "#ifdef __cplusplus",
+                'extern "C" {',
+                "#endif",
+                "",
+                f"enum {{ {facts} }};",
+                f"extern const {real} {name}_dt; /* sampling period [s] */",
+                "",
+                "typedef struct {",
+                *map(self._declared, program.parameters),
+                f"}} {name}_parameters;",
+                f"extern const {name}_parameters {name}_defaults;",
+                "",
+                f"typedef struct {{\n    {real} s[{name.upper()}_STATE];",
+                *kept,
+                f"}} {name}_state;",
+                "",
+                f"{self.init_call};",
+                f"{self.step_call};",
+                "",
+                "#ifdef __cplusplus",
+                "}",
+                "#endif",
+                "#endif",
+                "",
+            ]
+        )
+
+    def _declared(self, p):
+        """The line of a parameter in the structure."""
+        words = {"separator": ", ", "threshold": 99, "max_line_width": 9999, "precision": 10}
+        value = np.array2string(p.value, **words).replace("\n", "")
+        field = f"{self.real} {field_of(p.name)}{_index(np.shape(p.value))}"
+        return f"    {field}; /* {note_of(p)}; default {value} */"
+
+    def source(self):
+        """Return the text of the functions, without the line that includes the header."""
+        program, name, real = self.program, self.name, self.real
+        loop = program.case.loop
+        values = (self._initialiser(p.value) for p in program.parameters)
+        start = {} if program.plant else {"y": loop.x0, "u": loop.actuator.initial}
+        return "\n".join(
+            [
+                "#include <math.h>",
+                *(["#include <string.h>"] if program.prepare else []),
+                *self._matrix_functions(),
+                "",
+                f"const {real} {name}_dt = {self.plain.value(float(program.case.clock.dt))};",
+                f"const {name}_parameters {name}_defaults = {{",
+                *(f"    {v}," for v in values),
+                "};",
+                *(
+                    f"static const {real} {v}_before[{np.size(e)}] = {self._initialiser(e)};"
+                    for v, e in start.items()
+                ),
+                *self._prepare(),
+                "",
+                *self._init(),
+                "",
+                *self._step(),
+                "",
+            ]
+        )
+
+    def _initialiser(self, value):
+        value = np.asarray(value, dtype=float)
+        if not value.ndim:
+            return self.plain.value(float(value))
+        return f"{{{', '.join(map(self._initialiser, value))}}}"
+
+    def _matrix_functions(self):
+        """The functions that the statements call for their matrix operations."""
+        program = self.program
+        statements = [*program.begin, *program.prepare, *program.step]
+        used = [s for s in every(statements) if isinstance(s, Matrix)]
+        suffix = "f" if self.real == "float" else ""
+        largest = max((s.sizes[0] ** 2 for s in used if s.op == "solve"), default=0)
+        words = {"real": self.real, "SQRT": f"sqrt{suffix}", "FABS": f"fabs{suffix}"}
+        for op, text in MATRICES.items():
+            if any(s.op == op for s in used):
+                for word, meant in {**words, "LARGEST": str(largest)}.items():
+                    text = text.replace(word, meant)
+                yield text.rstrip()
+
+    def _prepare(self):
+        program, name = self.program, self.name
+        if not program.prepare:
+            return []
+        arrays = program.arrays.items()
+        return [
+            "",
+            f"static void prepare({name}_state *state, const {name}_parameters *p)",
+            "{",
+            *self.plain.lines(program.prepare),
+            *(
+                f"    state->c[{i}] = {self.plain.as_real(e)};"
+                for e, (_, i) in program.constants.items()
+            ),
+            *(
+                f"    for (int i = 0; i < {size}; ++i) state->c[{at} + i] = {array}[i];"
+                for array, (at, size) in arrays
+            ),
+            "    state->p = *p;",
+            "}",
+        ]
+
+    def _init(self):
+        program, name = self.program, self.name
+        printer = C(self.real, self.plain.places)
+        first = [f"    state->s[{i}] = {printer.as_real(e)};" for i, e in enumerate(program.first)]
+        before = ["    (void)y; (void)u;"]
+        if not program.plant:
+            before = [f"    if (!{v}) {v} = {v}_before;" for v in ("y", "u")] + before
+        else:
+            before = [f"    (void){v};" for v in program.start]
+        return [
+            self.init_call,
+            "{",
+            f"    if (!p) p = &{name}_defaults;",
+            *before,
+            *printer.lines(program.begin),
+            *(first or ["    state->s[0] = 0;"]),
+            *self._results(printer, program.start),
+            *(["    prepare(state, p);"] if program.prepare else []),
+            "}",
+        ]
+
+    def _results(self, printer, results):
+        return [
+            f"    {v}[{j}] = {printer.value(e)};"
+            for v, entries in results.items()
+            for j, e in enumerate(entries)
+        ]
+
+    def _step(self):
+        program, name, real, printer = self.program, self.name, self.real, self.printer
+        changing = list(_changing(program))
+        zeros = {v: n for v, n in program.inputs.items() if v in ("d", "dr", "ddr")}
+        unused = ["state", *(v for v in program.inputs if v != "w")]
+        operator = []
+        if not program.plant:
+            unused += ["t", "w"]
+            operator = [f"    const {real} *const w = manual ? manual : u_before;"]
+        return [
+            self.step_call,
+            "{",
+            f"    static const {real} zeros[{max(zeros.values())}] = {{0}};",
+            *(f"    if (!{v}) {v} = zeros;" for v in zeros),
+            *operator,
+            f"    if (!p) p = &{name}_defaults;",
+            "    " + " ".join(f"(void){v};" for v in unused),
+            *(
+                ["    if (memcmp(&state->p, p, sizeof *p) != 0) prepare(state, p);"]
+                if program.prepare
+                else []
+            ),
+            *(f"    {real} *const {v} = state->s + {at};" for v, at in program.lines.items()),
+            *printer.lines(program.step),
+            # a state that is returned as it was must be read before it is written
+            *(f"    const {real} next{i} = {printer.as_real(e)};" for i, e in changing),
+            *self._results(printer, program.outputs_of),
+            *(f"    state->s[{i}] = next{i};" for i, _ in changing),
+            "}",
+        ]
+
+
+def _changing(program):
+    """(place, entry) of the state after a step, without what stays and what is changed in place."""
+    root = dict(zip(program.lines, program.lines))
+    for s in every(program.step):
+        if isinstance(s, Store):
+            root[s.name] = root[s.array]
+    for i, e in enumerate(program.after):
+        line = root.get(e.name) if isinstance(e, Ref) else None
+        if e != Ref("s", i) and (line is None or program.lines[line] + e.index != i):
+            yield i, e
+
+
+def _index(index):
+    return "".join(f"[{i}]" for i in index)
 
 
 def print_c(program, name, precision):
-    """Return a Program as the text of a C99 file."""
-    begin = f"{name}_init takes the levels and inputs before the first period."
-    lines = [
-        "/*",
-        *header(program, " *", f"{name}_step", begin),
-        " */",
-        *_definitions(program, name.upper(), precision),
-        "",
-        f"typedef struct {{ real s[{name.upper()}_STATE]; }} {name}_state;",
-        *_matrix_functions(program),
-        "",
-        *_init(program, name),
-        "",
-        *_step(program, name),
-        "",
-    ]
-    return "\n".join(lines)
-
-
-def _definitions(program, prefix, precision):
-    """The type of a number, the functions of math.h, and the sizes of the arguments."""
-    suffix = "f" if precision == "float" else ""
-    sizes = {
-        "STATE": max(program.state, 1),
-        "TANKS": program.tanks,
-        "OUTPUTS": program.outputs,
-        "PUMPS": program.pumps,
-    }
-    return [
-        "#include <math.h>",
-        "",
-        f"typedef {precision} real;",
-        "#define R(x) ((real)(x))",
-        *(f"#define {m.upper()} {m}{suffix}" for m in MATHS),
-        "#define MAX(a, b) ((a) > (b) ? (a) : (b))",
-        "#define MIN(a, b) ((a) < (b) ? (a) : (b))",
-        "",
-        f"#define {prefix}_DT {program.case.clock.dt!r}",
-        *(f"#define {prefix}_{size} {value}" for size, value in sizes.items()),
-    ]
-
-
-def _matrix_functions(program):
-    """The functions that the step calls for its matrix operations."""
-    used = matrix_operations(program.step)
-    functions = MATRICES.strip("\n").split("\n\n")
-    return [f for f in functions if re.findall(r"void (\w+)", f)[0] in used]
-
-
-def _init(program, name):
-    printer = C()
-    first = [f"    state->s[{i}] = {printer.as_real(e)};" for i, e in enumerate(program.first)]
-    return [
-        f"void {name}_init({name}_state *state, const real *y, const real *u)",
-        "{",
-        "    (void)y; (void)u;",
-        *printer.lines(program.begin),
-        *(first or ["    state->s[0] = R(0.0);"]),
-        "}",
-    ]
-
-
-def _step(program, name):
-    printer, after = C(), program.after
-    return [
-        f"void {name}_step({name}_state *state, real t, const real *y, const real *r, const"
-        " real *dr, const real *ddr, real *u)",
-        "{",
-        "    (void)t; (void)y; (void)r; (void)dr; (void)ddr; (void)state;",
-        *printer.lines(program.step),
-        # a state that is returned as it was must be read before it is written
-        *(f"    const real next{i} = {printer.as_real(e)};" for i, e in enumerate(after)),
-        *(f"    u[{j}] = {printer.value(e)};" for j, e in enumerate(program.u)),
-        *(f"    state->s[{i}] = next{i};" for i in range(program.state)),
-        "}",
-    ]
+    """Return {file: text} of a Program."""
+    text = Text(program, name, precision)
+    return {f"{name}.h": text.header(), f"{name}.c": f'#include "{name}.h"\n\n{text.source()}'}

@@ -33,6 +33,8 @@ class Writer:
 
     large = 300
     """Number of multiplications in a matrix product above which it is a loop."""
+    sparse = False
+    """Whether multiplications by the number 0 are not counted."""
 
     def __init__(self):
         self.counter, self.scopes, self.known = 0, [[]], [{}]
@@ -97,6 +99,37 @@ class Writer:
         if name not in RULES:
             raise no_code(f"it uses the operation {name}")
         return RULES[name](self, eqn, operands)
+
+
+class WholeWriter(Writer):
+    """A Writer for the many matrices that are computed from the numbers of a loop."""
+
+    large = 60
+    sparse = True
+
+    def __init__(self):
+        super().__init__()
+        self.sizes = {}
+        self.arrays = {}
+
+    def matrix(self, op, operands, sizes, shape):
+        out = super().matrix(op, operands, sizes, shape)
+        self.sizes[out.ravel()[0].name] = out.size
+        return out
+
+    def array(self, entries):
+        """Return the name of an array with these entries: a result, an earlier one or a new one."""
+        elements = tuple(entries.ravel())
+        name = getattr(elements[0], "name", "")
+        whole = tuple(Ref(name, i) for i in range(self.sizes.get(name, 0)))
+        if elements == whole:
+            return name
+        if len(self.scopes) > 1:
+            return super().array(entries)
+        key = tuple((type(e), e) for e in elements)
+        if key not in self.arrays:
+            self.arrays[key] = super().array(entries)
+        return self.arrays[key]
 
 
 def _called(eqn):

@@ -223,6 +223,14 @@ def _position(largest):
     return rule
 
 
+def _multiplications(A, B, sparse):
+    """Number of products of two elements in A B; sparse: without those with the number 0."""
+    if not sparse:
+        return A.shape[0] * A.shape[1] * B.shape[1]
+    some = lambda M: np.array([[not (is_number(e) and e == 0) for e in row] for row in M], int)
+    return int(np.sum(some(A) @ some(B)))
+
+
 def product(writer, a, b, dimensions):
     """Return the elements of a product of two arrays."""
     (contracted, right), batches = dimensions
@@ -233,7 +241,7 @@ def product(writer, a, b, dimensions):
     A = a.transpose(*rows, *contracted).reshape(int(np.prod([a.shape[i] for i in rows])), -1)
     B = b.transpose(*right, *columns).reshape(A.shape[1], -1)
     shape = tuple(a.shape[i] for i in rows) + tuple(b.shape[i] for i in columns)
-    if A.shape[0] * A.shape[1] * B.shape[1] > writer.large:
+    if _multiplications(A, B, writer.sparse) > writer.large:
         return writer.matrix("product", (A, B), (*A.shape, B.shape[1]), shape)
     times = lambda a, b: writer.define(REAL, "mul", a, b)
     plus = lambda total, pair: writer.define(REAL, "add", total, times(*pair))
@@ -404,10 +412,22 @@ def _while(writer, eqn, operands):
         return writer.run(body.jaxpr, body.consts, [*operands[first:last], *carried])
 
     kinds = [kind_of(v.aval.dtype) for v in eqn.outvars]
-    return _loop(writer, kinds, operands[last:], None, tested_body)
+    return _loop(writer, kinds, operands[last:], None, tested_body, _most(test.jaxpr))
 
 
-def _loop(writer, kinds, starts, count, body):
+def _most(test):
+    """The passes of a loop that goes on while a counter is below a number, None if it has none."""
+    bounds = [
+        int(eqn.invars[1].val)
+        for eqn in test.eqns
+        if eqn.primitive.name == "lt"
+        and isinstance(eqn.invars[1], Literal)
+        and kind_of(eqn.invars[1].aval.dtype) == WHOLE
+    ]
+    return min(bounds, default=None)
+
+
+def _loop(writer, kinds, starts, count, body, most=None):
     """The carried variables after a loop; body: function of them that returns the next ones."""
     carried, variables = [], []
     for kind, start in zip(kinds, starts):
@@ -420,7 +440,7 @@ def _loop(writer, kinds, starts, count, body):
     statements = writer.scopes.pop()
     writer.known.pop()
     new = tuple(e for o in out for e in o.ravel())
-    writer.scopes[-1].append(Loop(count, tuple(carried), statements, new))
+    writer.scopes[-1].append(Loop(count, tuple(carried), statements, new, most))
     return variables
 
 

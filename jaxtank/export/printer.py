@@ -5,10 +5,25 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from jaxtank.core.checks import allowed
 from jaxtank.core.errors import InputError
 from jaxtank.core.labels import labels_of, names_of
-from jaxtank.core.tree import walk
-from jaxtank.export.statements import REAL, TRUTH, WHOLE, Array, Define, Loop, Matrix, Ref, Until
+from jaxtank.core.tree import parameters, walk
+from jaxtank.core.units import local
+from jaxtank.export.program import CONTROL, PLANT
+from jaxtank.export.statements import (
+    REAL,
+    TRUTH,
+    WHOLE,
+    Array,
+    Define,
+    Loop,
+    Matrix,
+    Ref,
+    Store,
+    Until,
+    size_of,
+)
 
 WIDTH = 126
 """Length of a line of an array, without its indentation."""
@@ -57,11 +72,18 @@ class Printer:
     matrices = ("product", "cholesky", "forward", "backward")
     """Operations of Matrix statements that the language has."""
     counted, endless, end = "for i = 1:{0}", "while true", "end"
+    """`endless` "": the language has loops of a bounded number of passes alone."""
+    store = ""
+    """A Store statement, of name, array, index and value; "": the language has none."""
+    places: Mapping[Ref, str] = {}
+    """{Ref: its text, where that is another than its name}."""
     until = "if not ({0}) break"
 
     def value(self, e):
         """Return a number or a Ref as text."""
         if isinstance(e, Ref):
+            if e in self.places:
+                return self.places[e]
             name = self.rename.get(e.name, e.name)
             return name if e.index is None else self.entry.format(name, self._index(e.index))
         if isinstance(e, bool):
@@ -90,6 +112,7 @@ class Printer:
             Define: self._define,
             Array: self._array,
             Matrix: self._matrix,
+            Store: self._store,
             Until: self._until,
             Loop: self._loop,
         }
@@ -102,7 +125,8 @@ class Printer:
         return [self._set(self.constant, s.kind, s.name, self.right(s.op, s.args))]
 
     def _array(self, s):
-        rows, line = [], self.open_array.format(name=s.name, size=len(s.entries))
+        words = {"name": s.name, "size": len(s.entries), "real": self.kinds[REAL]}
+        rows, line = [], self.open_array.format(**words)
         for item in map(self.value, s.entries):
             if len(line) + len(item) > WIDTH:
                 rows.append(line.rstrip() + self.line_break)
@@ -113,18 +137,30 @@ class Printer:
     def _matrix(self, s):
         if not self.matrix_call or s.op not in self.matrices:
             raise InputError(f"--lang: this language has no counterpart of the operation {s.op}")
-        rows = {"product": lambda m, k, n: m * n, "cholesky": lambda n: n * n}
-        size = rows.get(s.op, lambda n, k: n * k)(*s.sizes)
-        arguments = ", ".join([*map(str, s.sizes), *s.operands])
-        call = self.matrix_call.format(name=s.name, op=s.op, size=size, arguments=arguments)
-        return call.split("\n")
+        operands = (self.value(Ref(o)) for o in s.operands)
+        arguments = ", ".join([*map(str, s.sizes), *operands])
+        words = {"name": s.name, "op": s.op, "size": size_of(s), "arguments": arguments}
+        return self.matrix_call.format(**words, real=self.kinds[REAL]).split("\n")
+
+    def _store(self, s):
+        if not self.store:
+            raise InputError("--lang: this language has no arrays that are changed entry by entry")
+        words = {"name": s.name, "array": s.array, "real": self.kinds[REAL]}
+        words |= {"index": self.value(s.index), "value": self.value(s.value)}
+        return self.store.format(**words).split("\n")
 
     def _until(self, s):
         return [self.until.format(self.value(s.test))]
 
+    def _passes(self, count):
+        return self.counted.format(count)
+
     def _loop(self, s):
         lines = [self._set(self.variable, k, n, self.value(start)) for k, n, start in s.carried]
-        lines.append(self.endless if s.count is None else self.counted.format(s.count))
+        passes = s.count if self.endless or s.count is not None else s.most
+        if passes is None and not self.endless:
+            raise InputError("--lang: a loop of this controller has no bound on its passes")
+        lines.append(self.endless if passes is None else self._passes(passes))
         lines += self.lines(s.body)
         for (kind, name, _), new in zip(s.carried, s.new):
             lines.append("    " + self._set(self.constant, kind, f"n{name}", self.value(new)))
@@ -141,32 +177,89 @@ def function_name(case):
 def comment(text):
     """Return a text as one line that may stand in a comment of any language and does not end it."""
     # Characters that do not print, line breaks of every script among them, are replaced by spaces,
-    # backslashes by slashes; the ends of comments and the trigraphs of C are taken apart.
+    # backslashes by slashes; ends of comments and the trigraphs of C are taken apart.
     text = "".join(c if c.isprintable() else " " for c in text).replace("\\", "/")
-    return re.sub(r"\*(?=/)|/(?=\*)|\?(?=\?)", lambda found: found[0] + " ", text)
+    return re.sub(r"\*(?=[/)])|[/(](?=\*)|\?(?=\?)", lambda found: found[0] + " ", text)
 
 
 def header(program, mark, call, begin):
     """Return the comment at the top of a file: the case, the arguments with units, the gains."""
     case = program.case
-    length, drive = case.loop.units
-    outputs, pumps = (s * (n > 1) for s, n in (("s", program.outputs), ("s", program.pumps)))
+    part = "plant with its instruments" if program.plant else "controller and the observer"
+    describe_part = _plant if program.plant else _control
     lines = [
         f"{case.name}: {case.title}",
-        "Generated by `jaxtank export` from the controller and the observer that jaxtank"
-        " simulates. Do not edit.",
+        f"Generated by `jaxtank export` from the {part} that jaxtank simulates. Do not edit.",
         "",
         f"Sampling period {case.clock.dt:g} s: call {call} once each period.",
+        *describe_part(program, begin),
+        *_order(case.loop.plant),
+        "",
+        *(_compiled_in(program) if program.entries else sorted(_gains(case))),
+    ]
+    return [f"{mark} {comment(line)}".rstrip() for line in lines]
+
+
+def _control(program, begin):
+    """Lines on the arguments of a controller."""
+    length, drive = program.case.loop.units
+    outputs, pumps = (s * (n > 1) for s, n in (("s", program.outputs), ("s", program.pumps)))
+    lines = [
         f"t: time [s]; y: {program.tanks} measured levels [{length}], of every tank in the order of"
         " the rig;",
         f"r, dr, ddr: {program.outputs} setpoint{outputs} [{length}], with first [{length}/s] and"
         f" second [{length}/s^2] derivative;",
         f"u: {program.pumps} pump input{pumps} [{drive}], within the limits of the pumps. {begin}",
-        *_order(case.loop.plant),
-        "",
-        *sorted(_gains(case)),
     ]
-    return [f"{mark} {comment(line)}".rstrip() for line in lines]
+    if not program.entries:
+        return lines
+    bump = "returns to automatic operation without a bump: its state follows the manual inputs."
+    if not program.case.loop.controller.bumpless:
+        bump = (
+            "has no integral action of its own to follow the manual inputs: back in automatic"
+            " operation its inputs may jump."
+        )
+    return [*lines, f"Manual operation applies inputs of an operator. The controller {bump}"]
+
+
+def _plant(program, begin):
+    """Lines on the arguments of a plant."""
+    units = program.case.loop.units
+    length, drive, flow, volume = (local(v, units) for v in ("cm", "V", "cm^3/s", "cm^3"))
+    return [
+        f"u: {program.pumps} inputs [{drive}] within the limits of the pumps, constant over the"
+        " period;",
+        f"d: {program.tanks} inflows [{flow}] besides those of the case, 0 if there are none;",
+        f"y: {program.tanks} readings without noise [{length}], h: levels [{length}], spilled:"
+        f" volumes over the rims [{volume}], at the end of the period. {begin}",
+    ]
+
+
+def _compiled_in(program):
+    """Lines on what is no parameter: structure, sampling, long tables."""
+    loop, roots = program.case.loop, PLANT if program.plant else CONTROL
+    facts = [f"clock.dt = {program.case.clock.dt:g}"]
+    for name, value, _ in walk(loop, kind="static"):
+        if name.split(".")[0] in roots and ".model." not in name and value not in (None, ()):
+            facts.append(f"{name} = {value}")
+    traced = {name for name, _ in program.entries}
+    long = [n for n in parameters(loop) if n.split(".")[0] in roots and n not in traced]
+    facts += [f"{name} (a table)" for name in long if np.size(parameters(loop)[name])]
+    yield "Compiled in, and changed by a new export alone:"
+    yield from (f"    {fact}" for fact in facts)
+
+
+def field_of(name):
+    """Return the dotted name of a parameter as a name of most languages."""
+    return name.replace(".", "_")
+
+
+def note_of(parameter):
+    """Return what a parameter is: its dotted name, description, unit and range."""
+    unit = "" if parameter.meta["unit"] == "-" else f" [{parameter.meta['unit']}]"
+    range_ = allowed(parameter.meta, 0.0)
+    words = f"{parameter.name}: {parameter.meta['doc']}{unit}"
+    return comment(f"{words}, {range_}" if range_ else words)
 
 
 def _order(plant):

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from jaxtank.case import Case
 from jaxtank.controllers import LQI, OpenLoop, StateFeedback
+from jaxtank.core.clock import is_pointwise
 from jaxtank.core.errors import InputError
 from jaxtank.export.c import print_c
 from jaxtank.export.javascript import RESERVED as JAVASCRIPT_NAMES
@@ -16,6 +17,8 @@ from jaxtank.export.javascript import print_javascript
 from jaxtank.export.matlab import RESERVED, print_matlab
 from jaxtank.export.printer import function_name
 from jaxtank.export.program import Program, program
+from jaxtank.export.structured_text import RESERVED as ST_NAMES
+from jaxtank.export.structured_text import print_structured_text
 from jaxtank.plants.elements import check_plain
 
 PRECISIONS = ("double", "float")
@@ -24,10 +27,12 @@ PRECISIONS = ("double", "float")
 class Language(NamedTuple):
     """A language to export to.
 
-    write : function (program, name, precision) -> text of one file, where program is a
-        `jaxtank.export.program.Program`
+    write : function (program, name, precision) -> text of one file, or {file: text or bytes},
+        where program is a `jaxtank.export.program.Program`
     precisions : "double", "float" or both
     reserved : names that the function may not have
+    adjustable : whether the numbers of the controller are parameters of the code
+    plants : whether a plant can be exported too
 
     Examples
     --------
@@ -35,15 +40,18 @@ class Language(NamedTuple):
     ('double',)
     """
 
-    write: Callable[[Program, str, str], str]
+    write: Callable[[Program, str, str], Any]
     precisions: tuple = ("double",)
     reserved: Collection[str] = ()
+    adjustable: bool = False
+    plants: bool = False
 
 
 LANGUAGES = {
-    "c": Language(print_c, PRECISIONS),
+    "c": Language(print_c, PRECISIONS, adjustable=True, plants=True),
     "m": Language(print_matlab, reserved=RESERVED),
     "js": Language(print_javascript, reserved=JAVASCRIPT_NAMES),
+    "st": Language(print_structured_text, PRECISIONS, ST_NAMES, adjustable=True),
 }
 """{name, which is also the suffix of the file: Language}."""
 
@@ -88,13 +96,14 @@ def export(
     Parameters
     ----------
     case : Case
-    language : "c" (C99), "m" (MATLAB), "js" (JavaScript), or one that was added by `register`
-    precision : "double" or, in C, "float"
+    language : "c" (C99), "st" (Structured Text), "m" (MATLAB), "js" (JavaScript), or one that was
+        added by `register`
+    precision : "double" or, in C and Structured Text, "float"
     name : of the functions; None: made from the case's
 
     Returns
     -------
-    The text of one file.
+    The text; of a language with several files (C: a header) one after the other.
 
     Raises
     ------
@@ -109,6 +118,17 @@ def export(
     >>> text.split("(")[0]
     'function [u, s] = tanks'
     """
+    return "\n".join(files(case, language, precision, name).values())
+
+
+def files(
+    case: Case,
+    language: str = "c",
+    precision: str = "double",
+    name: str | None = None,
+    plant: bool = False,
+) -> dict[str, Any]:
+    """Return {file: text or bytes} of the controller of a case, or of its plant."""
     if language not in LANGUAGES:
         raise InputError(f"--lang {language!r}: must be one of {', '.join(LANGUAGES)}")
     if precision not in PRECISIONS:
@@ -118,6 +138,17 @@ def export(
         raise InputError(
             f"--precision {precision}: --lang {language} has {' and '.join(target.precisions)} only"
         )
+    if plant and not target.plants:
+        with_plants = " or ".join(n for n, other in LANGUAGES.items() if other.plants)
+        raise InputError(f"--plant: --lang {language} has controllers only; give {with_plants}")
+    (_check_plant if plant else _check_controller)(case)
+    name = _checked_name(case, name, target.reserved)
+    written = target.write(program(case, plant, target.adjustable), name, precision)
+    return written if isinstance(written, dict) else {f"{name}.{language}": written}
+
+
+def _check_controller(case):
+    """Raise InputError for a controller whose inputs do not follow from levels and setpoints."""
     controller = case.loop.controller
     if isinstance(controller, OpenLoop) or controller.inputs(case.clock) != ():
         raise InputError(
@@ -130,8 +161,16 @@ def export(
             ' flow-cascade write kind = "pi"'
         )
     check_prepared(controller)
-    name = _checked_name(case, name, target.reserved)
-    return target.write(program(case), name, precision)
+
+
+def _check_plant(case):
+    """Raise InputError for a plant whose inflows are recorded."""
+    inflows = case.loop.disturbance
+    if inflows is not None and (inflows.is_table or not is_pointwise(inflows)):
+        raise InputError(
+            f"{case.name}: its inflows are a table of many rows, which code of single samples does"
+            " not hold: leave them out and give them to the input d of the plant"
+        )
 
 
 def check_prepared(controller: Any) -> None:

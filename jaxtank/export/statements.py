@@ -1,7 +1,7 @@
 """The statements of exported code, on scalars: output of lowering, input of the printers."""
 
-from collections.abc import Iterable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, NamedTuple, cast
 
 REAL, WHOLE, TRUTH = "real", "whole", "truth"
 
@@ -88,6 +88,7 @@ class Loop(NamedTuple):
     carried: tuple  # ((kind, name, start), ...)
     body: list
     new: tuple
+    most: int | None = None  # passes after which a loop without a count has ended
 
     @property
     def reads(self):
@@ -133,3 +134,91 @@ def used(statements: list[Statement], read: set[str]) -> list[Statement]:
         read |= s.reads
         needed.append(s)
     return needed[::-1]
+
+
+def hoisted(statements: Iterable[Statement]) -> list[Statement]:
+    """Return statements with the loop-invariant ones moved in front of their loop."""
+    out: list[Statement] = []
+    for s in statements:
+        if not isinstance(s, Loop):
+            out.append(s)
+            continue
+        inside, body = {name for _, name, _ in s.carried}, []
+        for inner in hoisted(s.body):
+            free = isinstance(inner, Define | Array) and not inner.reads & inside
+            if free:
+                out.append(inner)
+                continue
+            body.append(inner)
+            inside |= defined(inner)
+        out.append(s._replace(body=body))
+    return out
+
+
+def defined(statement: Statement) -> set[str]:
+    """Return the names that a statement defines for those after it."""
+    if isinstance(statement, Loop):
+        return {name for _, name, _ in statement.carried}
+    return set() if isinstance(statement, Until) else {statement.name}
+
+
+def ranks(statements: Iterable[Statement], inputs: Mapping[str, int]) -> dict[str, int]:
+    """Return {name: rank} of every variable: the largest rank of its operands."""
+    rank_of = dict(inputs)
+    for s in statements:
+        read = s.reads if not isinstance(s, Loop) else s.reads - local(s)
+        rank = max((rank_of[n] for n in read), default=0)
+        if isinstance(s, Store):
+            rank = max(rank, rank_of[s.array])
+        rank_of.update(dict.fromkeys(defined(s), rank))
+    return rank_of
+
+
+def local(loop: Loop) -> set[str]:
+    """Return the names that exist in a loop's body alone, and its carried variables."""
+    inside = {name for _, name, _ in loop.carried}
+    for s in loop.body:
+        inside |= local(s) if isinstance(s, Loop) else defined(s)
+    return inside
+
+
+def of_rank(
+    statements: Iterable[Statement], rank: Mapping[str, int], level: int
+) -> list[Statement]:
+    """Return the statements of one rank, in order."""
+    return [s for s in statements if any(rank[n] == level for n in defined(s))]
+
+
+def refs(statements: Iterable[Statement], entries: Iterable = ()) -> set[Ref]:
+    """Return every Ref that statements and entries read, without those that a loop has inside; of
+    an array that is read at a variable index, the array and the index.
+    """
+    read = {e for e in entries if isinstance(e, Ref)}
+    for s in statements:
+        if isinstance(s, Loop):
+            inside = refs(s.body, [*s.new, *(start for *_, start in s.carried)])
+            private = local(s)
+            read |= {e for e in inside if e.name not in private}
+        else:
+            read |= {e for e in entries_read(s) if isinstance(e, Ref)}
+    moving = {e for e in read if isinstance(e.index, Ref)}
+    return (read - moving) | {r for e in moving for r in (Ref(e.name), cast(Ref, e.index))}
+
+
+def entries_read(s: Statement) -> tuple:
+    """Return the numbers and Refs that a statement, not a loop, reads one by one."""
+    if isinstance(s, Define):
+        return s.args
+    if isinstance(s, Array):
+        return s.entries
+    if isinstance(s, Store):
+        return s.index, s.value, Ref(s.array)
+    return (s.test,) if isinstance(s, Until) else ()
+
+
+def size_of(s: Array | Matrix) -> int:
+    """Return the number of entries of an Array or of the result of a Matrix."""
+    if isinstance(s, Array):
+        return len(s.entries)
+    rows: dict[str, Any] = {"product": lambda m, k, n: m * n, "cholesky": lambda n: n * n}
+    return rows.get(s.op, lambda n, k: n * k)(*s.sizes)

@@ -10,7 +10,7 @@ import dataclasses
 import itertools
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,9 +21,10 @@ from jaxtank.analysis.elimination import rolled
 from jaxtank.case import Case
 from jaxtank.core.clock import Chunk, is_pointwise
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import parameters, with_values
+from jaxtank.core.tree import with_values
 from jaxtank.export.javascript import MATRICES, ROUND
-from jaxtank.export.lowering import Writer, lower_all
+from jaxtank.export.lowering import WholeWriter, lower_all
+from jaxtank.export.program import entries_of, flat, traced_leaves
 from jaxtank.export.source import check_prepared
 from jaxtank.export.statements import (
     Array,
@@ -34,6 +35,7 @@ from jaxtank.export.statements import (
     Statement,
     Store,
     Until,
+    defined,
     names,
     used,
 )
@@ -68,12 +70,6 @@ class WholeLoop:
     """{measure: its entries}, read of c after the last sample."""
     lines: dict[int, str]
     """{entry of c at which a Line begins: its name}."""
-
-
-def traced_leaves(case: Case, largest: int = 64) -> dict[str, np.ndarray]:
-    """Return {dotted name: value} of the numbers of a loop that are inputs of its statements."""
-    values = {n: np.asarray(v, dtype=float) for n, v in parameters(case.loop).items()}
-    return {n: v for n, v in values.items() if 0 < v.size <= largest}
 
 
 def served(case: Case) -> tuple[str, ...]:
@@ -173,11 +169,6 @@ def arguments(case: Case, names: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def entries_of(shapes: dict[str, Any]) -> tuple[tuple[str, tuple[int, ...]], ...]:
-    """Return (dotted name, index in it) of each entry of arrays, in the order of an argument."""
-    return tuple((name, i) for name in sorted(shapes) for i in np.ndindex(shapes[name].shape))
-
-
 def carried(case: Case, names: Sequence[str]) -> Any:
     """Return shapes and types of the loop state, with the accumulators of measures `names`."""
 
@@ -190,126 +181,11 @@ def carried(case: Case, names: Sequence[str]) -> Any:
     return jax.eval_shape(start)
 
 
-class WholeWriter(Writer):
-    """A Writer for the many matrices that are computed from the numbers of a loop."""
-
-    large = 60
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.sizes: dict[str, int] = {}
-        self.arrays: dict[tuple[Any, ...], str] = {}
-
-    def matrix(self, op: str, operands: Any, sizes: Any, shape: Any) -> np.ndarray:
-        out = super().matrix(op, operands, sizes, shape)
-        self.sizes[out.ravel()[0].name] = out.size
-        return out
-
-    def array(self, entries: np.ndarray) -> str:
-        """Return the name of an array with these entries: a result, an earlier one or a new one."""
-        elements = tuple(entries.ravel())
-        name = getattr(elements[0], "name", "")
-        whole = tuple(Ref(name, i) for i in range(self.sizes.get(name, 0)))
-        if elements == whole:
-            return name
-        if len(self.scopes) > 1:
-            return super().array(entries)
-        key = tuple((type(e), e) for e in elements)
-        if key not in self.arrays:
-            self.arrays[key] = super().array(entries)
-        return self.arrays[key]
-
-
-def flat(tree: Any) -> list[Any]:
-    """Return the entries of all arrays of a tree."""
-    return [e for array in jax.tree.leaves(tree) for e in np.ravel(array)]
-
-
 _CHEAP = """
 add sub mul neg abs max min lt le gt ge eq ne and or not select real square truth
 """
 CHEAP = frozenset(_CHEAP.split())
 """Operations that cost less than a number that is kept for every sample."""
-
-
-def hoisted(statements: Iterable[Statement]) -> list[Statement]:
-    """Return statements with the loop-invariant ones moved in front of their loop."""
-    out: list[Statement] = []
-    for s in statements:
-        if not isinstance(s, Loop):
-            out.append(s)
-            continue
-        inside, body = {name for _, name, _ in s.carried}, []
-        for inner in hoisted(s.body):
-            free = isinstance(inner, Define | Array) and not inner.reads & inside
-            if free:
-                out.append(inner)
-                continue
-            body.append(inner)
-            inside |= defined(inner)
-        out.append(s._replace(body=body))
-    return out
-
-
-def defined(statement: Statement) -> set[str]:
-    """Return the names that a statement defines for those after it."""
-    if isinstance(statement, Loop):
-        return {name for _, name, _ in statement.carried}
-    return set() if isinstance(statement, Until) else {statement.name}
-
-
-def ranks(statements: Iterable[Statement], inputs: Mapping[str, int]) -> dict[str, int]:
-    """Return {name: rank} of every variable: the largest rank of its operands."""
-    rank_of = dict(inputs)
-    for s in statements:
-        read = s.reads if not isinstance(s, Loop) else s.reads - local(s)
-        rank = max((rank_of[n] for n in read), default=0)
-        if isinstance(s, Store):
-            rank = max(rank, rank_of[s.array])
-        rank_of.update(dict.fromkeys(defined(s), rank))
-    return rank_of
-
-
-def local(loop: Loop) -> set[str]:
-    """Return the names that exist in a loop's body alone, and its carried variables."""
-    inside = {name for _, name, _ in loop.carried}
-    for s in loop.body:
-        inside |= local(s) if isinstance(s, Loop) else defined(s)
-    return inside
-
-
-def of_rank(
-    statements: Iterable[Statement], rank: Mapping[str, int], level: int
-) -> list[Statement]:
-    """Return the statements of one rank, in order."""
-    return [s for s in statements if any(rank[n] == level for n in defined(s))]
-
-
-def refs(statements: Iterable[Statement], entries: Iterable = ()) -> set[Ref]:
-    """Return every Ref that statements and entries read, without those that a loop has inside; of
-    an array that is read at a variable index, the array and the index.
-    """
-    read = {e for e in entries if isinstance(e, Ref)}
-    for s in statements:
-        if isinstance(s, Loop):
-            inside = refs(s.body, [*s.new, *(start for *_, start in s.carried)])
-            private = local(s)
-            read |= {e for e in inside if e.name not in private}
-        else:
-            read |= {e for e in entries_read(s) if isinstance(e, Ref)}
-    moving = {e for e in read if isinstance(e.index, Ref)}
-    return (read - moving) | {r for e in moving for r in (Ref(e.name), cast(Ref, e.index))}
-
-
-def entries_read(s: Statement) -> tuple:
-    """Return the numbers and Refs that a statement, not a loop, reads one by one."""
-    if isinstance(s, Define):
-        return s.args
-    if isinstance(s, Array):
-        return s.entries
-    if isinstance(s, Store):
-        return s.index, s.value, Ref(s.array)
-    return (s.test,) if isinstance(s, Until) else ()
 
 
 def kept_in_time(

@@ -11,20 +11,14 @@ from jaxtank.export.statements import (
     Ref,
     Statement,
     every,
-    names,
-    used,
-)
-from jaxtank.export.whole import (
-    MATHS,
-    Text,
-    WholeLoop,
     hoisted,
-    kept_in_time,
+    names,
     of_rank,
     ranks,
     refs,
-    short_names,
+    used,
 )
+from jaxtank.export.whole import MATHS, Text, WholeLoop, kept_in_time, short_names
 
 ALONE, TIMED, MOVING = 0, 1, 2
 """Ranks of values: from the numbers of the loop alone, also from time, also from the state."""

@@ -5,6 +5,7 @@ Simulation, derivatives, export and Gymnasium call it.
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false
 
+import functools
 import operator
 from collections.abc import Sequence
 from typing import Any, NamedTuple, NoReturn, cast
@@ -71,9 +72,17 @@ def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[Sta
 
 
 def decide(
-    loop: ClosedLoop, observer: Any, controller: Any, tick: Tick, y: Sequence[Any]
+    loop: ClosedLoop,
+    observer: Any,
+    controller: Any,
+    tick: Tick,
+    y: Sequence[Any],
+    manual: tuple[Any, Sequence[Any]] | None = None,
 ) -> Decision:
-    """Run observer and controller for one sample; every simulation and export uses this order."""
+    """Run observer and controller for one sample; every simulation and export uses this order.
+
+    manual: (whether an operator sets the inputs, these inputs (m) [V]), of exported code.
+    """
     safety_filter, under_way = loop.safety_filter, None
     actuator, limited_rate = loop.actuator, loop.actuator.rate is not None
     if limited_rate:  # anti-windup is given the inputs that the pumps reach
@@ -85,6 +94,9 @@ def decide(
     estimate, observer = loop.observer.step(observer, tick_of_observer, form_for(loop.observer, y))
     estimate = estimate._replace(x=like(estimate.x, y), d=like(estimate.d, y))
     command, controller = commanded(loop, controller, tick, estimate)
+    wanted = command
+    if manual is not None:
+        command = tuple(jnp.where(manual[0], w, u) for w, u in zip(manual[1], scalars(command)))
     allocates = actuator.allocates or safety_filter is not None
     metric = loop.controller.input_metric(_estimate_for(loop, estimate)) if allocates else None
     if safety_filter is None:
@@ -98,8 +110,13 @@ def decide(
     watched, acting = form_for(loop.observer, command), form_for(loop.observer, applied)
     observer = loop.observer.predict(observer, tick_of_observer, watched, acting)
     tick_of_controller = _tick_for(loop.controller, tick)
-    raw, limited = form_for(loop.controller, command), form_for(loop.controller, applied)
-    controller = loop.controller.track(controller, tick_of_controller, raw, limited)
+    raw, limited = form_for(loop.controller, wanted), form_for(loop.controller, applied)
+    after = loop.controller.track(controller, tick_of_controller, raw, limited)
+    if manual is not None:
+        set_by_hand = loop.controller.transfer(controller, tick_of_controller, raw, limited)
+        choose: Any = functools.partial(jnp.where, manual[0])
+        after = jax.tree.map(choose, set_by_hand, after)
+    controller = after
     if under_way is not None:
         controller = controller, moved_on(under_way, scalars(applied))
     if limited_rate:

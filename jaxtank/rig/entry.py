@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxtank.core.checks import check_value
+from jaxtank.core.checks import allowed, check_value
 from jaxtank.core.errors import InputError, nearest, unknown
 from jaxtank.core.labels import index_of, names_of
 from jaxtank.core.quantities import converted
@@ -497,20 +497,6 @@ def static_value(name, value, meta, kind):
 def unit(meta):
     """ " [cm]" of metadata, or nothing where there is no unit."""
     return "" if meta["unit"] == "-" else f" [{meta['unit']}]"
-
-
-def allowed(meta, value=0.0):
-    """The range in `meta` in words, "above 0" for one; value: whether numbers are whole."""
-    if meta.get("choices") is not None:
-        return " or ".join(
-            str(c).lower() if isinstance(c, bool) else f'"{c}"' for c in meta["choices"]
-        )
-    low, high = meta.get("low"), meta.get("high")
-    above = "" if low is None else f"{'above' if meta['strict'] else 'at least'} {low:.10g}"
-    below = "" if high is None else f"at most {high:.10g}"
-    integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    integer = integer and meta.get("kind") not in ("tank", "feed")  # by name too
-    return ", ".join(filter(None, ["whole number" if integer else "", above, below]))
 
 
 class Line(NamedTuple):

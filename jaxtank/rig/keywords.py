@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from jaxtank.case import Case
+from jaxtank.core.checks import allowed
 from jaxtank.core.clock import CLOCK
 from jaxtank.core.errors import InputError, unknown
-from jaxtank.rig.entry import Problems, allowed, refusal, unit, unknown_key
+from jaxtank.rig.entry import Problems, refusal, unit, unknown_key
 from jaxtank.rig.read import from_table
 from jaxtank.rig.schema import LISTS, NEEDED, SECTIONS
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxtank import presets
 from jaxtank.case import Case, Free
+from jaxtank.core.checks import allowed
 from jaxtank.core.clock import CLOCK
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import write_atomic
@@ -17,7 +18,7 @@ from jaxtank.core.labels import names_of
 from jaxtank.core.tree import is_component, walk
 from jaxtank.measures import unreadable
 from jaxtank.rig import components, network, signals, template
-from jaxtank.rig.entry import Block, Line, allowed, block_of, lines_of, terse, toml, unit
+from jaxtank.rig.entry import Block, Line, block_of, lines_of, terse, toml, unit
 from jaxtank.rig.read import renamed, start_of
 from jaxtank.rig.schema import LISTS, SECTIONS, targets
 from jaxtank.rig.validation import unreachable

@@ -2,7 +2,6 @@
 of every law of every paper.
 """
 
-import ctypes
 import dataclasses
 import functools
 import json
@@ -15,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import FLAGS, GCC, SERIES, Compiled, needs_gcc
 
 import jaxtank
 from jaxtank import presets, rig
@@ -32,18 +32,6 @@ from jaxtank.plants.network import network
 from tuning.cli import main
 
 SAMPLES = 10_000
-GCC = shutil.which("gcc")
-FLAGS = [
-    "-pedantic",
-    "-O1",
-    "-Wall",
-    "-Wextra",
-    "-Werror",
-    "-Wno-unused-function",
-    "-Wno-unused-variable",
-]
-needs_gcc = pytest.mark.skipif(GCC is None, reason="no gcc on this machine")
-
 # one case of every law, observer and way of saturating; the rest differ in numbers alone
 QUICK = [
     "gouta2015/ngpc",
@@ -83,39 +71,6 @@ def replayed(name, noise=1e-4, values=(), filtered=False):
         for part in case.loop.reference.sample(case.clock)
     ]
     return case, run, signals
-
-
-class Compiled:
-    """An exported law as Python functions."""
-
-    def __init__(self, case, folder, precision="double"):
-        text = export(case, "c", precision, name="law")
-        source, library = folder / "law.c", folder / "law.so"
-        source.write_text(text)
-        words = [GCC, *FLAGS, "-std=c99", "-shared", "-fPIC", "-o", library, source, "-lm"]
-        compiled = subprocess.run(words, capture_output=True, text=True)
-        assert compiled.returncode == 0, compiled.stderr
-        self.library = ctypes.CDLL(str(library))
-        self.real = ctypes.c_double if precision == "double" else ctypes.c_float
-        self.type = np.float64 if precision == "double" else np.float32
-        self.state = np.zeros(int(re.search(r"LAW_STATE (\d+)", text).group(1)), dtype=self.type)
-
-    def pointer(self, array):
-        return array.ctypes.data_as(ctypes.POINTER(self.real))
-
-    def run(self, case, run, signals):
-        y, r, dr, ddr = (np.ascontiguousarray(v, dtype=self.type) for v in (run.y, *signals))
-        u = np.asarray(case.loop.actuator.initial, dtype=self.type).copy()
-        start = np.asarray(case.loop.x0, dtype=self.type).copy()
-        self.library.law_init(self.pointer(self.state), self.pointer(start), self.pointer(u))
-        out = np.zeros((len(y), len(u)), dtype=self.type)
-        for k in range(len(y)):
-            self.library.law_step(
-                self.pointer(self.state),
-                self.real(run.t[k]),
-                *(self.pointer(v[k]) for v in (y, r, dr, ddr, out)),
-            )
-        return out
 
 
 @pytest.mark.slow_for(
@@ -509,14 +464,10 @@ def test_c_of_the_functions_that_a_controller_of_ones_own_may_use(tmp_path):
     case, errors = own()
     code = Compiled(case, tmp_path)
     for error in errors:
-        y, zero, u = np.array([error + 3.0, 1.0]), np.zeros(1), np.zeros(1)
-        code.library.law_init(code.pointer(code.state), code.pointer(y), code.pointer(u))
-        code.library.law_step(
-            code.pointer(code.state),
-            code.real(0.0),
-            *map(code.pointer, (y, np.array([3.0]), zero, zero, u)),
-        )
-        np.testing.assert_allclose(code.state, expected(y[0] - 3.0), rtol=1e-12, atol=1e-15)
+        y, right = np.array([error + 3.0, 1.0]), expected(error + 3.0 - 3.0)
+        code.init(y, np.zeros(1))
+        code.step(0.0, y, np.array([3.0]), None, None)
+        np.testing.assert_allclose(code.state[: len(right)], right, rtol=1e-12, atol=1e-15)
 
 
 @pytest.mark.slow
@@ -556,12 +507,9 @@ def test_the_command_writes_a_file_that_names_units_and_gains(tmp_path, capsys):
         )
         == 0
     )
-    text = (tmp_path / "gouta2015_backstepping.c").read_text()
-    assert (
-        "controller.k1 = 0.01 1/s" in text
-        and "measured levels [cm]" in text
-        and "pump inputs [V]" in text
-    )
+    text = (tmp_path / "gouta2015_backstepping.h").read_text()
+    assert re.search(r"double controller_k1; /\* .*\[1/s\], above 0; default 0\.01 \*/", text)
+    assert "measured levels [cm]" in text and "pump inputs [V]" in text
     assert main.main(["export", "gouta2015/backstepping", "--lang", "m"]) == 0
     assert capsys.readouterr().out.startswith("function [u, s] = gouta2015_backstepping(")
     assert main.main(["export", "gouta2015/backstepping", "--lang", "rust"]) == 2
@@ -604,39 +552,47 @@ HOSTILE = [
 
 @pytest.fixture(scope="module")
 def traced():
-    """The Program of a rig whose tank and pump have hostile names."""
-    return program(rig.loads(HOSTILE_RIG.format(name='"r"')))
+    """The Programs of a rig whose tank and pump have hostile names, by whether they have
+    parameters.
+    """
+    case = rig.loads(HOSTILE_RIG.format(name='"r"'))
+    return {kind: program(case, adjustable=kind) for kind in (True, False)}
 
 
 def printed(traced, name, language, title="r"):
-    """The text of an export of the same case with other words."""
-    case = dataclasses.replace(traced.case, name=name, title=title)
-    written = dataclasses.replace(traced, case=case)
-    return LANGUAGES[language].write(written, "law", "double")
+    """{file: text} of an export of the same case with other words."""
+    target = LANGUAGES[language]
+    original = traced[target.adjustable]
+    case = dataclasses.replace(original.case, name=name, title=title)
+    text = target.write(dataclasses.replace(original, case=case), "law", "double")
+    return text if isinstance(text, dict) else {f"law.{language}": text}
 
 
 @needs_gcc
 @pytest.mark.parametrize("standard", ["c99", "gnu99"])  # with trigraphs and without
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_name_stays_within_the_comment_of_c(traced, name, standard, tmp_path):
+    for file, text in printed(traced, name, "c").items():
+        (tmp_path / file).write_text(text)
     source, code = tmp_path / "law.c", tmp_path / "law.o"
-    source.write_text(printed(traced, name, "c"))
     words = [GCC, *FLAGS, f"-std={standard}", "-c", "-o", code, source]
     compiled = subprocess.run(words, capture_output=True, text=True)
     assert compiled.returncode == 0, compiled.stderr
     words = ["nm", "-g", "--defined-only", code]
     symbols = subprocess.run(words, capture_output=True, text=True, check=True)
-    assert {line.split()[-1] for line in symbols.stdout.splitlines()} == {"law_init", "law_step"}
+    names = {line.split()[-1] for line in symbols.stdout.splitlines()}
+    assert names == {"law_init", "law_step", "law_dt", "law_defaults"}
 
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_name_stays_within_the_comments_of_matlab_and_of_c(traced, name):
     """One comment in C; every line before the first statement begins with % in MATLAB."""
-    text = printed(traced, name, "c")
-    head, after = text.split("*/", 1)
+    texts = printed(traced, name, "c")
+    head, after = texts["law.h"].split("*/", 1)
     assert head.startswith("/*") and "/*" not in head[2:] and "taken" not in after
-    assert after.startswith("\n#include <math.h>") and not re.search(r"\\|\?\?", text)
-    lines = printed(traced, name, "m").splitlines()[1:]
+    assert after.startswith("\n#ifndef") and not re.search(r"\\|\?\?", texts["law.h"])
+    assert "taken" not in texts["law.c"]
+    lines = printed(traced, name, "m")["law.m"].splitlines()[1:]
     body = [line for line in lines if not line.startswith("% ") and line != "%"]
     assert "taken" not in "\n".join(body) and body[0].strip() == "if isempty(s)"
 
@@ -648,10 +604,12 @@ def test_a_line_break_in_the_name_of_a_case_ends_no_comment(traced, separator):
     """A rig file may not hold one; a Case made in Python may."""
     name = f"t{separator}taken = 1;"
     for language, marks in (("c", (" *", "/*")), ("m", ("%",))):
-        lines = printed(traced, name, language, f"{name} */").split("\n")
-        assert all(line.startswith(marks) for line in lines if "taken" in line)
-        assert len(lines) == len(printed(traced, "r", language).split("\n"))
-        "\n".join(lines).encode()
+        plain = printed(traced, "r", language)
+        for file, text in printed(traced, name, language, f"{name} */").items():
+            lines = text.split("\n")
+            assert all(line.startswith(marks) for line in lines if "taken" in line)
+            assert len(lines) == len(plain[file].split("\n"))
+            text.encode()
 
 
 @pytest.mark.parametrize(
@@ -730,28 +688,15 @@ def test_a_function_has_a_name_of_the_language(name, tmp_path, capsys):
 
 @pytest.mark.parametrize("language", [C, Matlab, JavaScript])
 def test_a_matrix_operation_without_counterpart_is_refused(language):
-    """A linear solve with any matrix: JavaScript has it, C and MATLAB have not."""
+    """A linear solve with any matrix: MATLAB has none."""
     solve = Matrix("m1", "solve", ("a1", "a2"), (2, 1))
-    if language is JavaScript:
-        assert "solve(2, 1, a1, a2)" in "\n".join(language().lines([solve]))
+    if language is not Matlab:
+        assert "solve(2, 1, a1, a2" in "\n".join(language().lines([solve]))
     else:
         with pytest.raises(InputError, match="no counterpart of the operation solve"):
             language().lines([solve])
 
 
-SERIES = """
-units = ["m", "-"]
-reachable = false
-tank = [
-    { area = 1.0, rim = 3.0, level = 1.0 },
-    { area = 0.5, rim = 3.0, level = 1.0, drain = 0.01 },
-]
-orifice = [{ from = 1, to = 2, area = 0.01 }]
-pump = [{ gain = 0.1, to = 1, high = 1.0, initial = 0.44 }]
-plant = { gravity = 9.81, outputs = [2] }
-reference = { initial = [1.0], changes = [[5.0, 1, 2.0], [60.0, 1, 0.8]], ramp = 0.0 }
-values = { "clock.dt" = 0.5, "clock.duration" = 150.0 }
-"""
 CASCADE = {"kind": "cascade", "Kc": 3.0, "Ti": 60.0, "inner": [1], "inner_Kc": 1.5}
 OVERRIDE = {"kind": "override", "Kc": 2.0, "Ti": 40.0, "limited": [1], "limit": 1.6}
 

@@ -187,19 +187,22 @@ def init(args):
 
 
 def export(args):
-    """Print the controller and its observer as source text, or write it to --out."""
+    """Print the controller and its observer, or the plant, as source text, or write it to --out."""
     case = open_case(args)
     from jaxtank.export import source
-    from jaxtank.export.printer import function_name
 
-    text = source.export(case, args.lang, args.precision, args.name)
-    name = args.name or function_name(case)
+    files = source.files(case, args.lang, args.precision, args.name, args.plant)
+    if any(isinstance(content, bytes) for content in files.values()) and not args.out:
+        raise InputError(f"--lang {args.lang} is no text: give --out DIR, where it is written")
     if args.json or not args.out:
-        payload = {"case": case.name, "lang": args.lang, "name": name, "source": text}
+        texts = {file: text for file, text in files.items() if isinstance(text, str)}
+        payload = {"case": case.name, "lang": args.lang, "name": Path(next(iter(files))).stem}
+        payload |= {"source": "\n".join(texts.values()), "files": list(files)}
         done = f"the controller of {case.name} in the language {args.lang}"
-        _print_source(args, payload, text, done)
+        done = done.replace("controller", "plant") if args.plant else done
+        _print_source(args, payload, payload["source"], done)
     if args.out:
-        report_written(write_folder(Path(args.out), {f"{name}.{args.lang}": text}), args)
+        report_written(write_folder(Path(args.out), files), args)
     return 0
 
 
@@ -256,13 +259,16 @@ COMMANDS = {
     ),
     "export": Command(
         export,
-        "the controller and its observer as one C99 or JavaScript file or MATLAB function",
+        "the controller and its observer, or the plant, as C99, Structured Text, JavaScript, MATLAB"
+        " or FMU",
         (
             *COMMON, *CASE,
-            Option("--lang", "LANG", "c, m or js", default="c"),
-            Option("--precision", "TYPE", "double or float, of C", default="double"),
+            Option("--lang", "LANG", "c, st, m or js", default="c"),
+            Option("--precision", "TYPE", "double or float, of C and Structured Text", default="double"),
             Option("--name", "NAME", "of the functions (default: the case's)"),
-            Option("--out", "DIR", "folder for the file (default: print it)", values.folder),
+            Option("--plant", help="the plant with its pumps and gauges instead of the controller",
+                   kind="flag"),
+            Option("--out", "DIR", "folder for the files (default: print them)", values.folder),
         ),
     ),
 }

@@ -1,0 +1,375 @@
+"""Controllers as a function block in Structured Text (IEC 61131-3)."""
+
+import numpy as np
+
+from jaxtank.core.errors import InputError
+from jaxtank.export.printer import OPERATIONS, Printer, field_of, header, note_of
+from jaxtank.export.statements import (
+    REAL,
+    TRUTH,
+    WHOLE,
+    Array,
+    Define,
+    Loop,
+    Matrix,
+    Ref,
+    every,
+    size_of,
+)
+
+LARGEST = {"double": "1.7976931348623157E+308", "float": "3.4028234E+38"}
+"""What stands for infinity, of which the language has no number."""
+
+INPUTS = {
+    "y": "level",
+    "r": "setpoint",
+    "dr": "setpoint_rate",
+    "ddr": "setpoint_second",
+    "w": "manual_input",
+}
+"""{argument of a step: its name}."""
+
+
+class StructuredText(Printer):
+    """The statements of Structured Text."""
+
+    truths = ("FALSE", "TRUE")
+    assign = constant = variable = "{name} := {value};"
+    counted, endless, end = "FOR {1} := 0 TO {0} DO", "", "END_FOR;"
+    until = "IF NOT ({0}) THEN EXIT; END_IF;"
+    rename = {**INPUTS, "s": "state", "t": "time_s", "u": "input_before"}
+
+    def __init__(self, precision, places, variables):
+        real = "LREAL" if precision == "double" else "REAL"
+        self.infinity, self.places, self.counters = LARGEST[precision], places, 0
+        self.kinds = {REAL: real, WHOLE: "DINT", TRUTH: "BOOL"}
+        self.kind_of = variables
+        whole = f"DINT_TO_{real}(TRUNC({{0}}))"
+        same = ["sqrt", "exp", "sin", "cos", "tan", "asin", "acos", "atan", "abs"]
+        self.operations = {
+            **OPERATIONS,
+            **{name: f"{name.upper()}({{0}})" for name in same},
+            **{name: f"{name.upper()}({{0}}, {{1}})" for name in ("max", "min", "atan2")},
+            "log": "LN({0})",
+            "log1p": "LN(1.0 + {0})",
+            "expm1": "EXP({0}) - 1.0",
+            "exp2": "EXPT(2.0, {0})",
+            "pow": "EXPT({0}, {1})",
+            "sinh": "0.5 * (EXP({0}) - EXP(-{0}))",
+            "cosh": "0.5 * (EXP({0}) + EXP(-{0}))",
+            "tanh": "1.0 - 2.0 / (EXP(2.0 * {0}) + 1.0)",
+            "logistic": "1.0 / (1.0 + EXP(-{0}))",
+            "rsqrt": "1.0 / SQRT({0})",
+            "floor": f"{whole} - SEL({{0}} < {whole}, 0.0, 1.0)",
+            "ceil": f"{whole} + SEL({{0}} > {whole}, 0.0, 1.0)",
+            "round": f"DINT_TO_{real}({real}_TO_DINT({{0}}))",
+            "rem": f"{{0}} - {{1}} * DINT_TO_{real}(TRUNC({{0}} / {{1}}))",
+            "is_finite": f"ABS({{0}}) < {self.infinity}",
+            "sign": "SEL({0} > 0.0, SEL({0} < 0.0, 0.0, -1.0), 1.0)",
+            "eq": "{0} = {1}",
+            "ne": "{0} <> {1}",
+            "truth": "{0} <> 0.0",
+            "not": "NOT {0}",
+            "and": "{0} AND {1}",
+            "or": "{0} OR {1}",
+            "select": "SEL({0}, {1}, {2})",
+            "quotient": "{0} / {1}",
+            "remainder": "{0} MOD {1}",
+            "real": f"DINT_TO_{real}({{0}})",
+            "whole": "TRUNC({0})",
+        }
+
+    def value(self, e):
+        """Return a number or a Ref as text."""
+        if isinstance(e, float) and np.isnan(e):
+            raise InputError("--lang: this language has no number that is not a number")
+        text = super().value(e)
+        if isinstance(e, float) and np.isfinite(e) and "e" in text:
+            return (text if "." in text else text.replace("e", ".0e")).upper()
+        return text
+
+    def right(self, op, args):
+        """Return op(args) as an expression."""
+        if op in ("real", "whole") and self._kind(args[0]) == TRUTH:
+            ends = "0.0, 1.0" if op == "real" else "0, 1"
+            return f"SEL({self.value(args[0])}, {ends})"
+        return super().right(op, args)
+
+    def as_real(self, e):
+        """Return a number or a Ref of any kind as a real."""
+        plain = isinstance(e, float) or self._kind(e) == REAL
+        return self.value(e) if plain else self.right("real", (e,))
+
+    def _kind(self, e):
+        if isinstance(e, Ref):
+            return self.kind_of.get(e.name, REAL)
+        return TRUTH if isinstance(e, bool) else WHOLE if isinstance(e, int) else REAL
+
+    def _passes(self, count):
+        self.counters += 1
+        return self.counted.format(count - 1, f"k{self.counters}")
+
+    def _array(self, s):
+        if not any(isinstance(e, Ref) for e in s.entries):
+            return []  # declared with its numbers
+        return [f"{s.name}[{i}] := {self.as_real(e)};" for i, e in enumerate(s.entries)]
+
+    def _matrix(self, s):
+        a, *b = (self.value(Ref(o)) for o in s.operands)
+        words = {"x": s.name, "a": a, "b": b[0] if b else ""}
+        sizes = dict(zip({"product": "mkn", "cholesky": "n"}.get(s.op, "nk"), s.sizes))
+        ends = {f"{key}_": size - 1 for key, size in sizes.items()}
+        return MATRICES[s.op].strip().format(**words, **sizes, **ends).split("\n")
+
+
+MATRICES = {
+    "product": """
+FOR i := 0 TO {m_} DO
+    FOR j := 0 TO {n_} DO
+        sum := 0.0;
+        FOR l := 0 TO {k_} DO
+            sum := sum + {a}[i * {k} + l] * {b}[l * {n} + j];
+        END_FOR;
+        {x}[i * {n} + j] := sum;
+    END_FOR;
+END_FOR;
+""",
+    "cholesky": """
+FOR j := 0 TO {n_} DO
+    FOR i := 0 TO {n_} DO
+        sum := {a}[i * {n} + j];
+        FOR l := 0 TO {n_} DO
+            IF l < j AND i >= j THEN
+                sum := sum - {x}[i * {n} + l] * {x}[j * {n} + l];
+            END_IF;
+        END_FOR;
+        IF i < j THEN
+            {x}[i * {n} + j] := 0.0;
+        ELSIF i = j THEN
+            {x}[i * {n} + j] := SQRT(sum);
+        ELSE
+            {x}[i * {n} + j] := sum / {x}[j * {n} + j];
+        END_IF;
+    END_FOR;
+END_FOR;
+""",
+    "forward": """
+FOR j := 0 TO {k_} DO
+    FOR i := 0 TO {n_} DO
+        sum := {b}[i * {k} + j];
+        FOR l := 0 TO {n_} DO
+            IF l < i THEN
+                sum := sum - {a}[i * {n} + l] * {x}[l * {k} + j];
+            END_IF;
+        END_FOR;
+        {x}[i * {k} + j] := sum / {a}[i * {n} + i];
+    END_FOR;
+END_FOR;
+""",
+    "backward": """
+FOR j := 0 TO {k_} DO
+    FOR i := {n_} TO 0 BY -1 DO
+        sum := {b}[i * {k} + j];
+        FOR l := 0 TO {n_} DO
+            IF l > i THEN
+                sum := sum - {a}[l * {n} + i] * {x}[l * {k} + j];
+            END_IF;
+        END_FOR;
+        {x}[i * {k} + j] := sum / {a}[i * {n} + i];
+    END_FOR;
+END_FOR;
+""",
+    "solve": """
+FOR i := 0 TO {n} * {n} - 1 DO
+    work[i] := {a}[i];
+END_FOR;
+FOR i := 0 TO {n} * {k} - 1 DO
+    {x}[i] := {b}[i];
+END_FOR;
+FOR j := 0 TO {n_} DO
+    best := j;
+    FOR i := 0 TO {n_} DO
+        IF i > j AND ABS(work[i * {n} + j]) > ABS(work[best * {n} + j]) THEN
+            best := i;
+        END_IF;
+    END_FOR;
+    FOR l := 0 TO {n_} DO
+        sum := work[j * {n} + l];
+        work[j * {n} + l] := work[best * {n} + l];
+        work[best * {n} + l] := sum;
+    END_FOR;
+    FOR l := 0 TO {k_} DO
+        sum := {x}[j * {k} + l];
+        {x}[j * {k} + l] := {x}[best * {k} + l];
+        {x}[best * {k} + l] := sum;
+    END_FOR;
+    FOR i := 0 TO {n_} DO
+        IF i > j THEN
+            sum := work[i * {n} + j] / work[j * {n} + j];
+            FOR l := 0 TO {n_} DO
+                work[i * {n} + l] := work[i * {n} + l] - sum * work[j * {n} + l];
+            END_FOR;
+            FOR l := 0 TO {k_} DO
+                {x}[i * {k} + l] := {x}[i * {k} + l] - sum * {x}[j * {k} + l];
+            END_FOR;
+        END_IF;
+    END_FOR;
+END_FOR;
+FOR j := 0 TO {k_} DO
+    FOR i := {n_} TO 0 BY -1 DO
+        sum := {x}[i * {k} + j];
+        FOR l := 0 TO {n_} DO
+            IF l > i THEN
+                sum := sum - work[i * {n} + l] * {x}[l * {k} + j];
+            END_IF;
+        END_FOR;
+        {x}[i * {k} + j] := sum / work[i * {n} + i];
+    END_FOR;
+END_FOR;
+""",
+}
+"""{matrix operation: loops over its operands, row by row}."""
+
+_RESERVED = """
+abs acos and array asin atan atan2 begin bool by byte case configuration constant continue cos date
+dint do dword else elsif end_case end_for end_function end_function_block end_if end_repeat end_var
+end_while exit exp expt false for function function_block if int limit ln log lreal lword max min
+mod mux not of or real repeat retain return sel sin sint sqrt string struct tan then time to true
+trunc type udint uint until usint var var_input var_output var_temp while word xor
+"""
+_OWN = "reset level setpoint setpoint_rate setpoint_second manual manual_input input_before pump"
+RESERVED = {form(word) for word in f"{_RESERVED} {_OWN}".split() for form in (str.lower, str.upper)}
+"""Names that the function block must not have: keywords, functions, its inputs."""
+
+
+def print_structured_text(program, name, precision):
+    """Return a Program as the text of a function block."""
+    statements = [*every(program.begin), *every(program.prepare), *every(program.step)]
+    kinds = {s.name: s.kind for s in statements if isinstance(s, Define)}
+    for s in statements:
+        if isinstance(s, Loop):
+            kinds |= {n: kind for kind, n, _ in s.carried}
+            kinds |= {f"n{n}": kind for kind, n, _ in s.carried}
+    entries = enumerate(program.entries)
+    places = {Ref("p", j): f"{field_of(n)}{_index(i)}" for j, (n, i) in entries}
+    places[Ref("on")] = "SEL(manual, 0.0, 1.0)"
+    printer = StructuredText(precision, places, kinds)
+    body = _body(printer, program)
+    begin = "The first call, and each one with reset, begins anew from level and input_before."
+    order = "t is time_s, y level, r setpoint, dr setpoint_rate, ddr setpoint_second, u pump."
+    lines = [
+        "(*",
+        *header(program, " *", name, f"{begin} Here {order}"),
+        " *)",
+        f"FUNCTION_BLOCK {name}",
+        *_interface(printer, program),
+        *_variables(printer, program, statements),
+        "",
+        *body,
+        "END_FUNCTION_BLOCK",
+        "",
+    ]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _body(printer, program):
+    """The statements of the function block."""
+    indented = lambda lines: [f"    {line}" for line in lines]
+    first = [f"state[{i}] := {printer.as_real(e)};" for i, e in enumerate(program.first)]
+    lines = ["IF reset OR NOT started THEN", *printer.lines(program.begin), *indented(first)]
+    lines += ["    started := TRUE;", "END_IF;"]
+    if program.prepare:
+        for j, (name, _) in enumerate(program.entries):
+            if any(p.name == name for p in program.parameters):
+                now = printer.places[Ref("p", j)]
+                lines += [f"IF {now} <> before[{j}] OR NOT prepared THEN"]
+                lines += [f"    before[{j}] := {now};", "    changed := TRUE;", "END_IF;"]
+        lines += ["IF changed THEN", *printer.lines(program.prepare)]
+        lines += indented(["changed := FALSE;", "prepared := TRUE;"]) + ["END_IF;"]
+    changing = [(i, e) for i, e in enumerate(program.after) if e != Ref("s", i)]
+    lines += printer.lines(program.step, "")
+    lines += [f"next[{i}] := {printer.as_real(e)};" for i, e in changing]
+    lines += [f"pump[{j}] := {printer.value(e)};" for j, e in enumerate(program.u)]
+    return lines + [f"state[{i}] := next[{i}];" for i, _ in changing]
+
+
+def _interface(printer, program):
+    """Declarations of inputs, outputs and parameters."""
+    real, start = printer.kinds[REAL], np.ravel(program.case.loop.actuator.initial)
+    length, drive = program.case.loop.units
+    units = {"y": length, "r": length, "dr": f"{length}/s", "ddr": f"{length}/s^2", "w": drive}
+    return [
+        "VAR_INPUT",
+        f"    time_s : {real}; (* [s] *)",
+        *(
+            f"    {INPUTS[v]} : {_array(size, real)}; (* [{units[v]}] *)"
+            for v, size in program.inputs.items()
+        ),
+        "    manual : BOOL; (* TRUE: the pumps get manual_input *)",
+        f"    input_before : {_array(program.pumps, real)}{_initial(printer, start)};",
+        "    reset : BOOL;",
+        "END_VAR",
+        "VAR_OUTPUT",
+        f"    pump : {_array(program.pumps, real)}; (* [{drive}] *)",
+        "END_VAR",
+        "VAR (* parameters, which may change between two calls *)",
+        *(
+            f"    {field_of(p.name)} : {_array(np.shape(p.value), real)}"
+            f"{_initial(printer, p.value)}; (* {note_of(p)} *)"
+            for p in program.parameters
+        ),
+        "END_VAR",
+    ]
+
+
+def _variables(printer, program, statements):
+    """Declarations of the state and of what the statements compute."""
+    real = printer.kinds[REAL]
+    arrays = [s for s in statements if isinstance(s, Array | Matrix)]
+    tables = [s for s in arrays if isinstance(s, Array) and not s.reads]
+    types = {n: printer.kinds[kind] for n, kind in printer.kind_of.items()}
+    types |= {s.name: _array(size_of(s), real) for s in arrays if s not in tables}
+    lasting = {e.name for e in program.constants} | set(program.arrays)
+    size, count = max(program.state, 1), len(program.entries)
+    kept = {"state": _array(size, real), "started": "BOOL"}
+    if program.prepare:
+        kept |= {"before": _array(count, real), "changed": "BOOL", "prepared": "BOOL"}
+    kept |= {n: t for n, t in types.items() if n in lasting}
+    passing = {"next": _array(size, real)}
+    passing |= {n: t for n, t in types.items() if n not in lasting}
+    passing |= {f"k{i + 1}": "DINT" for i in range(printer.counters)}
+    matrices = [s for s in statements if isinstance(s, Matrix)]
+    if matrices:
+        work = max((s.sizes[0] ** 2 for s in matrices if s.op == "solve"), default=1)
+        passing |= dict.fromkeys(["i", "j", "l", "best"], "DINT")
+        passing |= {"sum": real, "work": _array(work, real)}
+    constant = [
+        f"    {s.name} : {_array(len(s.entries), real)}{_initial(printer, s.entries)};"
+        for s in tables
+    ]
+    return [
+        *(["VAR CONSTANT", *constant, "END_VAR"] if constant else []),
+        "VAR",
+        *(f"    {n} : {t};" for n, t in kept.items()),
+        "END_VAR",
+        "VAR_TEMP",
+        *(f"    {n} : {t};" for n, t in passing.items()),
+        "END_VAR",
+    ]
+
+
+def _initial(printer, values):
+    """The initial value of a variable."""
+    numbers = [printer.value(float(v)).strip("()") for v in np.ravel(values)]
+    return f" := {numbers[0]}" if np.ndim(values) == 0 else f" := [{', '.join(numbers)}]"
+
+
+def _index(index):
+    return f"[{', '.join(map(str, index))}]" if index else ""
+
+
+def _array(shape, kind):
+    """The type of an array, or of one number for shape ()."""
+    sizes = (shape,) if isinstance(shape, int) else shape
+    ends = ", ".join(f"0..{n - 1}" for n in sizes)
+    return f"ARRAY [{ends}] OF {kind}" if sizes else kind
