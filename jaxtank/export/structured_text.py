@@ -330,32 +330,36 @@ def _variables(printer, program, statements):
     types = {n: printer.kinds[kind] for n, kind in printer.kind_of.items()}
     types |= {s.name: _array(size_of(s), real) for s in arrays if s not in tables}
     lasting = {e.name for e in program.constants} | set(program.arrays)
-    size, count = max(program.state, 1), len(program.entries)
-    kept = {"state": _array(size, real), "started": "BOOL"}
+    kept = {"state": _array(max(program.state, 1), real), "started": "BOOL"}
     if program.prepare:
-        kept |= {"before": _array(count, real), "changed": "BOOL", "prepared": "BOOL"}
-    kept |= {n: t for n, t in types.items() if n in lasting}
-    passing = {"next": _array(size, real)}
-    passing |= {n: t for n, t in types.items() if n not in lasting}
-    passing |= {f"k{i + 1}": "DINT" for i in range(printer.counters)}
-    matrices = [s for s in statements if isinstance(s, Matrix)]
-    if matrices:
-        work = max((s.sizes[0] ** 2 for s in matrices if s.op == "solve"), default=1)
-        passing |= dict.fromkeys(["i", "j", "l", "best"], "DINT")
-        passing |= {"sum": real, "work": _array(work, real)}
-    constant = [
-        f"    {s.name} : {_array(len(s.entries), real)}{_initial(printer, s.entries)};"
-        for s in tables
-    ]
+        kept |= {"before": _array(len(program.entries), real)}
+        kept |= dict.fromkeys(["changed", "prepared"], "BOOL")
+    passing = {"next": kept["state"]} | _helpers(printer, statements)
+    for n, kind in types.items():
+        (kept if n in lasting else passing)[n] = kind
+    constant = {
+        s.name: f"{_array(len(s.entries), real)}{_initial(printer, s.entries)}" for s in tables
+    }
     return [
-        *(["VAR CONSTANT", *constant, "END_VAR"] if constant else []),
-        "VAR",
-        *(f"    {n} : {t};" for n, t in kept.items()),
-        "END_VAR",
-        "VAR_TEMP",
-        *(f"    {n} : {t};" for n, t in passing.items()),
-        "END_VAR",
+        *(_block("VAR CONSTANT", constant) if constant else []),
+        *_block("VAR", kept),
+        *_block("VAR_TEMP", passing),
     ]
+
+
+def _block(kind, variables):
+    return [kind, *(f"    {n} : {t};" for n, t in variables.items()), "END_VAR"]
+
+
+def _helpers(printer, statements):
+    """{variable of the loops: its type}."""
+    counters = {f"k{i + 1}": "DINT" for i in range(printer.counters)}
+    matrices = [s for s in statements if isinstance(s, Matrix)]
+    if not matrices:
+        return counters
+    work = max((s.sizes[0] ** 2 for s in matrices if s.op == "solve"), default=1)
+    counters |= dict.fromkeys(["i", "j", "l", "best"], "DINT")
+    return counters | {"sum": printer.kinds[REAL], "work": _array(work, printer.kinds[REAL])}
 
 
 def _initial(printer, values):

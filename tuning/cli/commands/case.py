@@ -264,7 +264,7 @@ COMMANDS = {
         (
             *COMMON, *CASE,
             Option("--lang", "LANG", "c, st, m or js", default="c"),
-            Option("--precision", "TYPE", "double or float, of C and Structured Text", default="double"),
+            Option("--precision", "TYPE", "double or float, of c and st", default="double"),
             Option("--name", "NAME", "of the functions (default: the case's)"),
             Option("--plant", help="the plant with its pumps and gauges instead of the controller",
                    kind="flag"),
