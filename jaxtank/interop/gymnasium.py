@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.loop.closed_loop import initial, inputs
-from jaxtank.loop.step import move
+from jaxtank.loop.step import move, readings
 from jaxtank.loop.validation import check
 from jaxtank.safety.prediction import moved_on
 
@@ -115,8 +115,7 @@ def _begin(loop, clock, key):
 @functools.partial(jax.jit, static_argnums=1)
 def _readings(loop, clock, samples, state):
     """((tanks,) readings of a state, the state after them); of the last sample also after it."""
-    y, sensor = loop.sensor.step(state.sensor, state.x, _now(samples, state).xi, clock.dt)
-    return y, state._replace(sensor=sensor)
+    return readings(loop, state, _now(samples, state), clock)
 
 
 @functools.partial(jax.jit, static_argnums=1)

@@ -22,6 +22,7 @@ from jaxtank.core.tree import describe, get_value
 from jaxtank.export.whole import WholeLoop, library, whole_loop
 from jaxtank.limits import limit_scale, resolve_limits
 from jaxtank.live.printed import Printed, maths
+from jaxtank.loop.closed_loop import draws_bursts
 
 ROWS = 3000
 """Approximate number of rows of a plotted run, as in `jaxtank simulate --out`."""
@@ -220,7 +221,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
             "present": len(loops) > 1 or loop.safety_filter is not None,
             "default_on": loop.safety_filter is not None,
         },
-        "noise": bool(np.any(np.asarray(loop.sensor.noise) > 0)),
+        "noise": draws_bursts(loop) or bool(np.any(np.asarray(loop.sensor.noise) > 0)),
         "tracks": not isinstance(loop.controller, OpenLoop),
     }
 

@@ -125,6 +125,7 @@ class State(NamedTuple):
     sensor: Any = ()
     excess: Vector = ()  # in float32, the rounding error of each level [cm]
     flow: Vector = ()  # of each input [cm^3/s], for a controller that `reads_flow`
+    readings: Vector = ()  # of the sample before [cm], where a sensor may freeze
 
 
 class Inputs(NamedTuple):
@@ -138,7 +139,7 @@ class Inputs(NamedTuple):
     context: ms.Context  # reference data of the measures
     plan: Any  # result of the controller's `prepare`
     own: Any  # signals of the controller's own
-    fault: Vector | None  # 1 while a fault lasts
+    fault: Vector | None  # 1 while a fault lasts (`Faults.sample`)
 
 
 class Partition(NamedTuple):
@@ -289,7 +290,18 @@ def initial(loop: ClosedLoop, clock: Clock, arrays: bool = False) -> State:
         sensor=jax.tree.map(same_type, loop.sensor.init(form_for(loop.sensor, x0))),
         excess=excess if zero.dtype == jnp.float32 else (),
         flow=jax.tree.map(same_type, flow),
+        readings=x0 if faulty_sensors(loop) and cast(Any, loop.faults).holds else (),
     )
+
+
+def draws_bursts(loop: ClosedLoop) -> bool:
+    """Whether a fault of the loop is noise of a sensor, which needs a key."""
+    return faulty_sensors(loop) and cast(Any, loop.faults).noisy
+
+
+def faulty_sensors(loop: ClosedLoop) -> bool:
+    """Whether a fault of the loop is one of a sensor."""
+    return isinstance(loop.faults, Faults) and bool(loop.faults.sensors)
 
 
 def control_state(loop: ClosedLoop, x0: Vector, u0: Vector) -> Any:
@@ -301,6 +313,12 @@ def control_state(loop: ClosedLoop, x0: Vector, u0: Vector) -> Any:
     return state if loop.actuator.rate is None else (state, u0)
 
 
+def without_noise(loop: ClosedLoop) -> ClosedLoop:
+    """Return the loop without the noise of its sensors, and without faults that are noise."""
+    faults = cast(Any, loop.faults).without_noise() if faulty_sensors(loop) else loop.faults
+    return dataclasses.replace(loop, sensor=loop.sensor.without_noise(), faults=faults)
+
+
 def keyed(loop: ClosedLoop, key: jax.Array | None) -> ClosedLoop:
     """Return `loop`; with noise and no key its levels are NaN from the start."""
     # Input validation does not see a traced noise; a run without it would look like an answer.
@@ -309,6 +327,7 @@ def keyed(loop: ClosedLoop, key: jax.Array | None) -> ClosedLoop:
     noise = jnp.asarray(loop.sensor.noise)
     # the derivative by the noise is NaN too
     missing = jnp.sum(jnp.where(noise > 0, noise, 0.0) * jnp.where(noise > 0, jnp.nan, 0.0))
+    missing = missing + jnp.nan if draws_bursts(loop) else missing
     start: Any = loop.x0 + missing.astype(zero_of(loop).dtype)
     return dataclasses.replace(loop, x0=start)
 

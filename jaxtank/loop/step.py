@@ -22,8 +22,7 @@ from jaxtank.core.records import Estimate, Sample, Tick
 from jaxtank.core.text import count
 from jaxtank.core.tree import is_real
 from jaxtank.core.vectors import each, form_for, is_array, like, scalars, zeros
-from jaxtank.instruments.base import Sensor
-from jaxtank.loop.closed_loop import ClosedLoop, Inputs, State, Vector
+from jaxtank.loop.closed_loop import ClosedLoop, Inputs, State, Vector, faulty_sensors
 from jaxtank.plants.elements import input_flows
 from jaxtank.plants.runge_kutta import advance
 from jaxtank.safety.prediction import moved_on
@@ -45,7 +44,7 @@ def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[Sta
     """Return (state after a sample, Sample of it). now: this sample's slice of Inputs."""
     t = time_of(state, clock)
     tick = tick_of(loop, clock, t, state, now)
-    y, sensor = readings(loop.sensor, state, now, clock)
+    y, state = readings(loop, state, now, clock)
     decision = decide(loop, state.observer, state.controller, tick, y)
     estimate, command, applied = decision.estimate, decision.command, decision.applied
     moved, u, spilled, shortfall = move(loop, clock, state, applied, now)
@@ -65,10 +64,7 @@ def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[Sta
         shortfall=shortfall,
         filtered=decision.filtered,
     )
-    moved = moved._replace(
-        observer=decision.observer, controller=decision.controller, sensor=sensor
-    )
-    return moved, sample
+    return moved._replace(observer=decision.observer, controller=decision.controller), sample
 
 
 def decide(
@@ -134,11 +130,17 @@ def tick_of(loop: ClosedLoop, clock: Clock, t: Any, state: State, now: Inputs) -
     return Tick(t=t, dt=clock.dt, **setpoints, **signals)
 
 
-def readings(sensor: Sensor, state: State, now: Inputs, clock: Clock) -> tuple[Vector, Any]:
-    """Return ((n,) readings of a state [cm], the sensor's state after them)."""
-    x, xi = form_for(sensor, state.x), form_for(sensor, now.xi)
-    y, after = sensor.step(state.sensor, x, xi, clock.dt)
-    return like(y, state.x), after
+def readings(loop: ClosedLoop, state: State, now: Inputs, clock: Clock) -> tuple[Vector, State]:
+    """Return ((n,) readings of a state [cm], the state with its sensors after them)."""
+    sensor, x = loop.sensor, state.x
+    faults: Any = loop.faults if faulty_sensors(loop) and now.fault is not None else None
+    x = x if faults is None else faults.seen(x, now.xi, now.fault)
+    y, after = sensor.step(state.sensor, form_for(sensor, x), form_for(sensor, now.xi), clock.dt)
+    y = like(y, state.x)
+    if faults is not None and faults.holds:
+        y = faults.frozen(y, state.readings, now.fault)
+        state = state._replace(readings=y)
+    return y, state._replace(sensor=after)
 
 
 def _tick_for(part: Any, tick: Tick) -> Tick:

@@ -18,7 +18,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.records import check_key
 from jaxtank.core.tree import is_component, sizes_of_shape
 from jaxtank.instruments.base import Actuator
-from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.loop.closed_loop import ClosedLoop, draws_bursts
 from jaxtank.loop.of_case import check_is_loop, takes_case
 from jaxtank.loop.step_size import check_step
 from jaxtank.plants.base import Plant
@@ -158,11 +158,18 @@ def _check_faults(loop: ClosedLoop, clock: Clock) -> None:
     faults = loop.faults if isinstance(loop.faults, Faults) else None
     if faults and not _traced(faults, loop.plant) and (wrong := faults.problems(loop.plant, clock)):
         raise InputError("; ".join(wrong))
+    if faults and faults.noisy and np.ndim(loop.sensor.noise) == 0:
+        raise InputError(
+            f"a fault is noise of a sensor, and the class {type(loop.sensor).__name__} has none:"
+            " choose another kind, or give the sensor a leaf noise"
+        )
 
 
 def _check_noise(loop: ClosedLoop) -> None:
     """Raise InputError for a noisy sensor, of a run without a key."""
     noise = loop.sensor.noise
+    if draws_bursts(loop):
+        raise InputError("a fault is noise of a sensor: give a key (or --seed)")
     if not _traced(noise) and np.any(np.asarray(noise) > 0):
         raise InputError(
             f"sensor.noise = {np.asarray(noise)} {loop.units[0]}: give a key (or --seed), or set it"

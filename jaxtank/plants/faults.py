@@ -1,8 +1,8 @@
-"""Faults: parameters of the plant that change for a while."""
+"""Faults: parameters of the plant that change for a while, and readings that are wrong."""
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any, NamedTuple, Self, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,16 +11,34 @@ from jaxtank.core.clock import Clock, pointwise, sample_times
 from jaxtank.core.errors import InputError
 from jaxtank.core.labels import label_of
 from jaxtank.core.tree import component, describe, get_value, leaf, number, split_index, static
+from jaxtank.core.vectors import is_array
 from jaxtank.plants.base import Plant
+
+KINDS = ("offset", "drift", "freeze", "spikes", "noise")
+"""Faults of sensors."""
+
+
+class SensorFault(NamedTuple):
+    """A fault of the sensor of a tank from `start` until before `end` [s], spikes `every` [s]."""
+
+    tank: int
+    kind: str
+    start: float
+    end: float
+    every: float = 0.0
 
 
 @component
 class Faults:
     """Entries of the plant's leaves that are `factor` times themselves plus `extra` within a window
-    of time, unknown to the controller.
+    of time, and readings that are wrong within one, unknown to the controller.
 
     A pump at 60 %: ("pump_gain[0]", 300, 400) with factor 0.6 (gouta2022). A leak: ("drain[0]",
     900, 1050) with extra = its area (calofir). Built by `faults`.
+
+    A sensor with an offset, a drift, spikes of one sample or more noise sees its level plus
+    `size` times 1, the time since its start, 1, or the deviate of its noise; then come its span and
+    ADC. A frozen sensor repeats its last reading before its start, or its first one.
 
     Examples
     --------
@@ -37,22 +55,66 @@ class Faults:
     windows: tuple[Any, ...] = static(
         doc='(("drain[1]", start [s], end [s]), ...) entry of the plant and when, one per fault'
     )
+    size: Any = leaf(
+        "cm",
+        "size of each fault of a sensor; of a drift per second, of noise its standard deviation",
+        like="factor",
+        default=None,
+        shape="sensor fault",
+    )
+    sensors: tuple[SensorFault, ...] = static(doc="faults of sensors", default=())
 
     @pointwise
     def sample(self, clock: Clock) -> tuple[Any, ...]:
-        """Return an array (samples,) per fault: 1 from its start until before its end, else 0."""
+        """Return an array (samples,) per fault: 1 from its start until before its end, else 0; of
+        sensors what their size is multiplied by.
+        """
         t = sample_times(clock)
         half = 1e-7 * clock.dt
-        return tuple(
+        lasts = [
             jnp.where((t >= start - half) & (t < end - half), 1.0, 0.0)
-            for _, start, end in self.windows
-        )
+            for _, start, end in self.events
+        ]
+        count = len(self.windows)
+        for k, fault in enumerate(self.sensors, count):
+            since = t - fault.start
+            if fault.kind == "drift":
+                lasts[k] = lasts[k] * since
+            elif fault.kind == "freeze":  # there is no reading before the first one
+                lasts[k] = jnp.where(t > half, lasts[k], 0.0)
+            elif fault.kind == "spikes":
+                phase = since + half - fault.every * jnp.floor((since + half) / fault.every)
+                lasts[k] = jnp.where(phase < clock.dt, lasts[k], 0.0)
+        return tuple(lasts)
+
+    @property
+    def events(self) -> list[tuple[Any, float, float]]:
+        """[(entry of the plant or "sensor n", start [s], end [s])] of all faults."""
+        sensors = ((f"sensor {f.tank + 1}", f.start, f.end) for f in self.sensors)
+        return [*self.windows, *sensors]
+
+    @property
+    def holds(self) -> bool:
+        """Whether a sensor freezes, so that readings are carried from sample to sample."""
+        return any(fault.kind == "freeze" for fault in self.sensors)
+
+    @property
+    def noisy(self) -> bool:
+        """Whether a sensor has more noise for a while, so that a run needs a key."""
+        return any(fault.kind == "noise" for fault in self.sensors)
+
+    def without_noise(self) -> Self:
+        """Return the faults without those that are noise."""
+        quiet = [k for k, fault in enumerate(self.sensors) if fault.kind != "noise"]
+        size = None if self.size is None else self.size[np.array(quiet, dtype=int)]
+        sensors = tuple(self.sensors[k] for k in quiet)
+        return dataclasses.replace(cast(Any, self), size=size, sensors=sensors)
 
     def unseen(self, clock: Clock) -> list[int]:
-        """Return the faults that no sample lies in which lasts for dt: they do nothing."""
+        """Return the `events` that no sample lies in which lasts for dt: they do nothing."""
         times, half = clock.dt * np.arange(clock.samples - 1), 1e-7 * clock.dt
         first, after = (
-            np.searchsorted(times, [float(window[i]) - half for window in self.windows])
+            np.searchsorted(times, [float(event[i]) - half for event in self.events])
             for i in (1, 2)
         )
         return np.flatnonzero(first == after).tolist()
@@ -60,6 +122,16 @@ class Faults:
     def problems(self, plant: Plant, clock: Clock) -> list[str]:
         """Return a sentence for each fault that leaves an entry's range or creates volume."""
         texts = []
+        if np.shape(self.size if self.sensors else ()) != (len(self.sensors),):
+            counts = f"{np.size(self.size)} sizes for {len(self.sensors)} faults of sensors"
+            return [f"faults.size: {counts}: must be one for each"]
+        for fault, size in zip(self.sensors, () if self.size is None else self.size):
+            if fault.kind == "noise" and size < 0.0:
+                texts.append(
+                    f"noise of sensor {fault.tank + 1} from {fault.start:g} s to {fault.end:g} s:"
+                    f" size = {float(size):g} {plant.units[0]}: must be at least 0"
+                    f" {plant.units[0]}"
+                )
         for k, (name, start, end) in enumerate(self.windows):
             field, (index,) = split_index(name)
             what = f"fault {k + 1} of {name} from {start:g} s to {end:g} s"
@@ -143,24 +215,62 @@ class Faults:
             cast(Any, plant), **{field: tuple(entries) for field, entries in changed.items()}
         )
 
+    def seen(self, x: Any, xi: Any, active: Sequence) -> Any:
+        """Return the levels that faulty sensors see; xi: deviates of their noise, None without."""
+        for k, fault in enumerate(self.sensors):
+            if fault.kind == "freeze" or (fault.kind == "noise" and xi is None):
+                continue
+            error = cast(Any, self).size[k] * active[len(self.windows) + k]
+            error = error * xi[fault.tank] if fault.kind == "noise" else error
+            x = _with_entry(x, fault.tank, x[fault.tank] + error)
+        return x
+
+    def frozen(self, y: Any, last: Any, active: Sequence) -> Any:
+        """Return readings with those of frozen sensors as they were a sample before, `last`."""
+        for k, fault in enumerate(self.sensors, len(self.windows)):
+            if fault.kind == "freeze":
+                entry = jnp.where(active[k] > 0.0, last[fault.tank], y[fault.tank])
+                y = _with_entry(y, fault.tank, entry)
+        return y
+
     def _faulty(self, k, value, active):
         """`value` of an entry under fault k."""
         share = 1.0 + (self.factor[k] - 1.0) * active[k]
         return value * share + self.extra[k] * active[k]
 
 
-def faults(plant, entries):
-    """Return a `Faults` built from a list."""
+def _with_entry(vector, index, value):
+    """A vector of the loop with one entry replaced."""
+    if is_array(vector):
+        return jnp.where(np.arange(vector.shape[0]) == index, value, vector)
+    return (*vector[:index], value, *vector[index + 1 :])
+
+
+def faults(plant, entries, sensors=()):
+    """Return a `Faults` built from lists.
+
+    entries : (entry of the plant, start [s], end [s], factor, extra)
+    sensors : (`SensorFault`, size)
+    """
     for name, start, end, _, _ in entries:
         if np.ndim(get_value(plant, name)) != 0 or not split_index(name)[1]:
             raise InputError(f"fault of {name}: name one entry, as in {name}[0]")
-        if not 0 <= start < end:
-            raise InputError(
-                f"fault of {name} from {start} s to {end} s: must start at or after 0 s and end"
-                " later"
-            )
+        _check_window(name, start, end)
+    for fault, _ in sensors:
+        _check_window(f"sensor {fault.tank + 1}", fault.start, fault.end)
+        if fault.kind == "spikes" and not fault.every > 0.0:
+            raise InputError(f"spikes of sensor {fault.tank + 1}: every must be above 0 s")
     return Faults(
         factor=number([factor for *_, factor, _ in entries]),
         extra=number([extra for *_, extra in entries]),
         windows=tuple((name, float(start), float(end)) for name, start, end, _, _ in entries),
+        size=number([size for _, size in sensors]) if sensors else None,
+        sensors=tuple(fault for fault, _ in sensors),
     )
+
+
+def _check_window(name, start, end):
+    if not 0 <= start < end:
+        raise InputError(
+            f"fault of {name} from {start} s to {end} s: must start at or after 0 s and end later"
+        )

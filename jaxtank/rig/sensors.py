@@ -18,7 +18,7 @@ LEVELS = ("initial", "targets", "changes", "x0", "level", "levels", "on", "off",
 LEVELS += ("limit", "low", "max_level", "min_level")
 """Names of values that are levels: 0 % is the level at the lower end of a span."""
 
-WIDTHS = ("noise", "offset", "deadband", "amplitude", "band")
+WIDTHS = ("noise", "offset", "deadband", "amplitude", "band", "size")
 """Names of values that are differences of levels: 0 % is 0."""
 
 _READING = re.compile(rf"(?P<number>{NUMBER.pattern})\s*(?P<unit>%|mA)")

@@ -11,18 +11,19 @@ from jaxtank.core.labels import index_of, input_unit
 from jaxtank.core.quantities import converted
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import number
-from jaxtank.plants.faults import faults
+from jaxtank.plants.faults import KINDS, SensorFault, faults
 from jaxtank.rig import tables
 from jaxtank.rig.entry import (
     Problems,
     is_finite,
     read_entries,
     read_entry,
+    read_value,
     refusal,
     sizes_of,
     written,
 )
-from jaxtank.rig.schema import INFLOW_TABLE, SECTIONS
+from jaxtank.rig.schema import INFLOW_TABLE, SECTIONS, Key
 from jaxtank.rig.sensors import readings, spans_of
 from jaxtank.signals.base import Constant, Sum
 from jaxtank.signals.inflows import InflowPulses, InflowTable, inflow_pulses, inflow_table
@@ -288,15 +289,59 @@ def _pulses(entries, old, tanks):
 
 def faults_of(entries, loop, dotted):
     """The Faults of the [[fault]] tables; None of none. dotted: name in the rig -> dotted name."""
-    events, plant = [], loop.plant
-    for i, e in enumerate(read_entries(SECTIONS["fault"], {"fault": entries}, sizes_of(loop))):
-        values = (e[name] for name in ("start", "end", "factor", "extra"))
-        try:
-            events.append((dotted(loop, _of_fault(e["of"], plant)).removeprefix("plant."), *values))
-            faults(plant, events[-1:])
-        except InputError as error:
-            raise type(error)(f"fault {i + 1}: {error}") from None
-    return faults(plant, events) if events else None
+    plant, sizes, problems, events, sensors = loop.plant, sizes_of(loop), Problems(), [], []
+    for i, e in enumerate(read_entries(SECTIONS["fault"], {"fault": entries}, sizes)):
+        with problems.collect(("fault", i, None)):
+            try:
+                _check_kind(entries[i])
+                if "sensor" in e:
+                    sensors.append(_sensor_fault(e, entries[i], sizes))
+                    faults(plant, (), sensors[-1:])
+                    continue
+                values = (e[name] for name in ("start", "end", "factor", "extra"))
+                of = dotted(loop, _of_fault(e["of"], plant)).removeprefix("plant.")
+                events.append((of, *values))
+                faults(plant, events[-1:])
+            except InputError as error:
+                raise type(error)(f"fault {i + 1}: {error}") from None
+    problems.check()
+    return faults(plant, events, sensors) if events or sensors else None
+
+
+OF_SENSORS = {kind: ("size",) for kind in KINDS} | {"freeze": (), "spikes": ("size", "every")}
+"""{kind of a fault of a sensor: keys that it needs}."""
+
+
+def _check_kind(entry):
+    """Raise InputError unless an entry of [[fault]] has the keys of its kind, and no others."""
+    keys = {"of", "sensor", "kind", "size", "every", "factor", "extra"} & set(entry)
+    if ("of" in keys) == ("sensor" in keys):
+        raise InputError("needs either of, an entry of the plant, or sensor, a tank")
+    kind = entry.get("kind")
+    if "sensor" in keys and kind is None:
+        raise InputError(f"needs kind = one of {', '.join(KINDS)}")
+    needed = {"sensor", "kind", *OF_SENSORS[kind]} if "sensor" in keys else {"of"}
+    more = keys - needed - ({"factor", "extra"} if "of" in keys else set())
+    words = f"{kind} of a sensor" if "sensor" in keys else "an entry of the plant"
+    if needed - keys:
+        raise InputError(f"{words} needs {' and '.join(sorted(needed - keys))}")
+    if more:
+        raise InputError(f"{' and '.join(sorted(more))} is not for {words}: leave it out")
+
+
+def _sensor_fault(values, entry, sizes):
+    """(SensorFault, size) of an entry of [[fault]]."""
+    tank, kind, size = values["sensor"], values["kind"], 0.0
+    if kind != "freeze":
+        key = Key("size", unit="cm/s" if kind == "drift" else "cm", low=NOT_BELOW.get(kind))
+        size = readings("size", "size", entry["size"], sizes.units[0], tank, sizes.loop)
+        size = read_value(key, "size", size, sizes)
+    row = (tank, kind, values["start"], values["end"], values.get("every", 0.0))
+    return SensorFault(*row), size
+
+
+NOT_BELOW = {"noise": 0.0}
+"""{kind of a fault of a sensor: its least size}."""
 
 
 def _of_fault(of, plant):
@@ -338,8 +383,13 @@ def fault_tables(part):
     if part is None:
         return []
     section = SECTIONS["fault"]
+    names = ("of", "start", "end", "factor", "extra")
     rows = zip(part.windows, np.asarray(part.factor).tolist(), np.asarray(part.extra).tolist())
-    return [
-        (section, dict(zip(section.names, (*window, factor, extra))))
-        for window, factor, extra in rows
-    ]
+    plants = [dict(zip(names, (*window, factor, extra))) for window, factor, extra in rows]
+    sizes = np.zeros(0) if part.size is None else np.asarray(part.size)
+    of_sensors = []
+    for fault, size in zip(part.sensors, sizes.tolist()):
+        row = {"sensor": fault.tank, **fault._asdict(), "size": size}
+        keys = ("sensor", "kind", "start", "end", *OF_SENSORS[fault.kind])
+        of_sensors.append({key: row[key] for key in keys})
+    return [(section, values) for values in (*plants, *of_sensors)]

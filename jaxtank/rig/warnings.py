@@ -66,7 +66,7 @@ def _late(case):
     loop, end = case.loop, case.clock.duration
     signal = pulses_of(loop.disturbance)
     pulses = () if signal is None else signal.onset
-    faults = () if loop.faults is None else [start for _, start, _ in loop.faults.windows]
+    faults = () if loop.faults is None else [start for _, start, _ in loop.faults.events]
     times = {
         "changes of the reference": _change_times(loop.reference),
         "changes of the inputs": _change_times(getattr(loop.controller, "signal", None)),
@@ -111,7 +111,7 @@ def _unseen(case):
     between = f"no sample, every {clock.dt:g} s, lies in it: it has no effect"
     if loop.faults is not None:
         for k in loop.faults.unseen(clock):
-            of, start, end = loop.faults.windows[k]
+            of, start, end = loop.faults.events[k]
             if start < clock.duration:
                 yield f"fault {k + 1} of {of} from {start:g} s to {end:g} s: {between}"
         for k, (of, *_) in enumerate(loop.faults.windows):

@@ -170,6 +170,15 @@ RIGS = {
         ' {tank = 1, csv = "semi.csv", column = "q [L/s]", decimal = ","}]'
     },
     "fault": {"fault": '[{of = "P101", start = 150.0, end = 250.0, factor = 0.7}]'},
+    "faults of sensors": {
+        "fault": '[{sensor = "LT101", kind = "offset", start = 50.0, end = 350.0, size = "8 mm"},'
+        ' {sensor = 1, kind = "spikes", start = 60.0, end = 300.0, size = 0.05, every = "30 s"}]'
+    },
+    "frozen sensor": {
+        "fault": '[{sensor = "LT102", kind = "drift", start = 50.0, end = 350.0, size = 1e-5},'
+        ' {sensor = "LT101", kind = "freeze", start = 120.0, end = 160.0},'
+        ' {sensor = 2, kind = "noise", start = 60.0, end = 300.0, size = "0.1 %"}]'
+    },
     "leak": {"fault": '[{of = "LT101.drain", start = 150.0, end = 250.0, extra = 1e-4}]'},
     "safety filter": {
         "safety_filter": "{limit = [1.1, 0.9], low = [0.1, 0.0], rate = 0.05,"

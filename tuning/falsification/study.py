@@ -11,6 +11,7 @@ from jaxtank.case import Case
 from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import lower_clip
+from jaxtank.loop.closed_loop import faulty_sensors
 from jaxtank.loop.validation import check
 from jaxtank.safety.certificate import TankCertificate
 from jaxtank.safety.of_case import certificates_of
@@ -107,6 +108,10 @@ def attack(
         if value not in allowed:
             raise InputError(f"{name} = {value!r}: must be one of {', '.join(allowed)}")
     check(case.loop, case.clock, jax.random.key(0) if noisy(case) else None)
+    if faulty_sensors(case.loop):
+        raise InputError(
+            "attack searches the errors of readings itself: leave out [[fault]] with sensor"
+        )
     limits = limits_of(case)
     attacked = Attacked(
         case=case,

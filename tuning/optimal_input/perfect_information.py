@@ -16,6 +16,7 @@ from jaxtank.case import Case
 from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError, NonFiniteError
 from jaxtank.loop import run as lp
+from jaxtank.loop.closed_loop import without_noise
 from jaxtank.loop.steady import steady_state
 from jaxtank.loop.trajectory import Trajectory
 from tuning.optimal_input.cost import POINTWISE, open_loop, scaled
@@ -217,9 +218,8 @@ class InputSearch:
         """Return the interval means of the case's own inputs, None if its run diverges."""
         problem = self.problem
         loop, clock = problem.case.loop, problem.case.clock
-        quiet = dataclasses.replace(loop, sensor=loop.sensor.without_noise())
         try:
-            applied = np.asarray(lp.simulate(quiet, clock).applied).T
+            applied = np.asarray(lp.simulate(without_noise(loop), clock).applied).T
         except NonFiniteError:
             return None
         self.simulations += 1

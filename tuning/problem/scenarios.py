@@ -21,7 +21,7 @@ from jaxtank.core.clock import CHUNK, Clock
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.tree import split_index, with_values
 from jaxtank.loop import run as lp
-from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.loop.closed_loop import ClosedLoop, draws_bursts
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.xla.jit import compiled
 
@@ -87,7 +87,7 @@ class Group(NamedTuple):
 
 def noisy(case: Case) -> bool:
     """Return True if a run of the case draws noise."""
-    return bool(np.any(np.asarray(case.loop.sensor.noise) > 0))
+    return draws_bursts(case.loop) or bool(np.any(np.asarray(case.loop.sensor.noise) > 0))
 
 
 def check_scenarios(

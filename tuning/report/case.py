@@ -332,11 +332,19 @@ def _signals(loop):
     sentences = [_reference(loop.reference, length), words]
     if loop.faults is not None:
         windows = zip(loop.faults.windows, loop.faults.factor, loop.faults.extra)
-        faults = (
+        faults = [
             f"plant.{n} times {float(f):g}{f' plus {float(e):g}' if float(e) else ''} from {a:g} to"
             f" {b:g} s"
             for (n, a, b), f, e in windows
-        )
+        ]
+        for fault, size in zip(loop.faults.sensors, np.ravel(loop.faults.size)):
+            rate = "/s" if fault.kind == "drift" else ""
+            amount = "" if fault.kind == "freeze" else f" {float(size):g} {length}{rate}"
+            tank = label_of(loop.plant, "tank", fault.tank)
+            faults.append(
+                f"{fault.kind}{amount} of the sensor of {tank} from {fault.start:g} to"
+                f" {fault.end:g} s"
+            )
         sentences.append(f"Faults, unknown to the controller: {'; '.join(faults)}.")
     return sentences
 

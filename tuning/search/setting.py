@@ -15,7 +15,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index, with_values
 from jaxtank.limits import limited_levels
 from jaxtank.loop import run as lp
-from jaxtank.loop.closed_loop import takes_arrays
+from jaxtank.loop.closed_loop import takes_arrays, without_noise
 from jaxtank.loop.step_size import unstable_tanks
 from jaxtank.plants.runge_kutta import advance
 from jaxtank.presets import find
@@ -280,7 +280,7 @@ def input_range(case: Case) -> np.ndarray:
     )
     if np.all(low >= 0.0) and np.all(np.isfinite(high)):
         return high - low
-    quiet = dataclasses.replace(case.loop, sensor=case.loop.sensor.without_noise())
+    quiet = without_noise(case.loop)
     used = 2.0 * np.asarray(lp.evaluate(quiet, case.clock, ["rms_input"])["rms_input"])
     return np.where((low >= 0.0) & np.isfinite(high), high - low, used)
 

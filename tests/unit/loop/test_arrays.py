@@ -17,7 +17,7 @@ from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.loop.run import evaluate_compiled
 from jaxtank.loop.saved_rows import simulate_compiled
 from jaxtank.observers import Direct
-from jaxtank.plants.faults import faults
+from jaxtank.plants.faults import SensorFault, faults
 from jaxtank.plants.network import network
 from jaxtank.signals import ramps
 from jaxtank.signals.inflows import inflow_pulses
@@ -102,7 +102,13 @@ def random_loop(seed, tanks):
             tanks, [(9.0, 4.0, 0, 120.0), (12.5, 5.0, tanks - 1, -30.0), (11.0, 3.0, 0, 50.0)]
         ),
         faults=faults(
-            plant, [("pump_gain[0]", 20.0, 40.0, 0.6, 0.0), ("drain[1]", 25.0, 50.0, 1.0, 0.1)]
+            plant,
+            [("pump_gain[0]", 20.0, 40.0, 0.6, 0.0), ("drain[1]", 25.0, 50.0, 1.0, 0.1)],
+            [
+                (SensorFault(0, "freeze", 15.0, 30.0), 0.0),
+                (SensorFault(0, "spikes", 32.0, 50.0, 5.0), 0.4),
+                (SensorFault(1, "noise", 25.0, 40.0), 0.3),
+            ],
         ),
         x0=rng.uniform(1.0, 8.0, tanks),
     )

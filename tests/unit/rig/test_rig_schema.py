@@ -97,6 +97,13 @@ start = 200.0
 end = 250.0
 factor = 0.5
 extra = 0.01
+[[fault]]
+sensor = "left"
+kind = "spikes"
+start = 20.0
+end = 80.0
+size = 0.3
+every = 7.0
 [schedule]
 gains = ["controller.Kc[0]"]
 variable = "r1"
