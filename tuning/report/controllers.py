@@ -100,8 +100,10 @@ def report(result):
         )
     notes = [
         "error: mean total rms error of the plants that can follow: on which some controller can"
-        " hold every setpoint; travel: rms change of the inputs per sample, as a share of their"
-        " range; Ms: largest sensitivity peak at the plateaus of the nominal plant.",
+        " hold every setpoint",
+        "travel: rms change of the inputs per sample, as a share of their range",
+        "Ms: largest sensitivity peak at the plateaus of the nominal plant",
+        "C: time of a step of the controller alone, without the filter",
         *(f"{name} does not fit this rig: {why}" for name, why in result.refused.items()),
     ]
     return Report(

@@ -16,6 +16,7 @@ from jaxtank.bounds import free_of
 from jaxtank.case import Case
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.errors import InputError, unknown
+from jaxtank.export.timing import step_time
 from jaxtank.loop.margins import stability_margins
 from jaxtank.rig.components import kind_of
 from tuning.problem.controllers import START, same_rig, with_kind
@@ -37,7 +38,7 @@ class Rival(NamedTuple):
     case: Case
     judged: Judged
     peak: float | None  # largest sensitivity peak Ms of all plateaus; None where not known
-    step_us: float | None  # time of one step of the controller in C; None where not known
+    step_us: float | None  # time of a step of the controller alone in C; None if unknown
     why: str = ""  # why there is no peak
 
     @property
@@ -262,7 +263,7 @@ def _reasons(refused: dict[str, str]) -> str:
 def _judged(name: str, gains: str, case: Case, samples: int, seed: int) -> Iterator[Rival]:
     """Yield the Rivals of one controller: as it is and tuned, each without and with the filter."""
     kind = str(kind_of("controller", case.loop.controller))
-    tuned = case
+    tuned, (step, _) = case, step_time(case.without_safety_filter())
     if free_of(case):
         tuned = tune(case, seed=seed).tuned.replace(objective=case.objective)
     for origin, judged in ((gains, case), ("tuned", tuned))[: 1 + bool(free_of(case))]:
@@ -272,4 +273,4 @@ def _judged(name: str, gains: str, case: Case, samples: int, seed: int) -> Itera
             sides.append(judged if judged.loop.safety_filter else plain.with_safety_filter())
         for side in sides:
             peak, why = _peak(side)
-            yield Rival(name, kind, origin, side, validate(side, samples, seed), peak, None, why)
+            yield Rival(name, kind, origin, side, validate(side, samples, seed), peak, step, why)

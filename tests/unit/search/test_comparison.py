@@ -1,11 +1,14 @@
 """Every controller that fits a rig, tuned and judged on the same plants."""
 
+import shutil
+
 import numpy as np
 import pytest
 
 import tuning
 from jaxtank import presets
 from jaxtank.core.errors import InputError
+from jaxtank.export.timing import step_time
 from tuning.report import controllers as report
 from tuning.search import comparison
 from tuning.search.comparison import ControllerComparison, Rival
@@ -90,6 +93,14 @@ def test_rows_are_the_judgement_of_the_same_plants():
     tuned = next(r for r in result.rivals if r.tuned and r.filtered)
     assert tuned.holds and not first.holds
     assert tuned.judged.cost.mean() <= first.judged.cost.mean() * 1.2
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine")
+def test_a_step_is_timed_in_c():
+    time, why = step_time(presets.find("cascaded/pi"))
+    assert time > 0.0 and not why
+    time, why = step_time(presets.find("cascaded/open-loop"))
+    assert time is None and why  # it plays a signal back, and has no code
 
 
 def test_an_unknown_controller_is_named_with_what_fits():
