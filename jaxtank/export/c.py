@@ -213,6 +213,7 @@ class Text:
                 "#endif",
                 "",
                 f"enum {{ {facts} }};",
+                f"typedef {real} {name}_real;",
                 f"extern const {real} {name}_dt; /* sampling period [s] */",
                 "",
                 "typedef struct {",

@@ -12,6 +12,7 @@ from jaxtank.controllers import LQI, OpenLoop, StateFeedback
 from jaxtank.core.clock import is_pointwise
 from jaxtank.core.errors import InputError
 from jaxtank.export.c import print_c
+from jaxtank.export.fmi import print_fmu, print_fmu2
 from jaxtank.export.javascript import RESERVED as JAVASCRIPT_NAMES
 from jaxtank.export.javascript import print_javascript
 from jaxtank.export.matlab import RESERVED, print_matlab
@@ -52,6 +53,8 @@ LANGUAGES = {
     "m": Language(print_matlab, reserved=RESERVED),
     "js": Language(print_javascript, reserved=JAVASCRIPT_NAMES),
     "st": Language(print_structured_text, PRECISIONS, ST_NAMES, adjustable=True),
+    "fmu": Language(print_fmu, reserved=["fmi"], adjustable=True, plants=True),
+    "fmu2": Language(print_fmu2, reserved=["fmi"], adjustable=True, plants=True),
 }
 """{name, which is also the suffix of the file: Language}."""
 
@@ -118,7 +121,10 @@ def export(
     >>> text.split("(")[0]
     'function [u, s] = tanks'
     """
-    return "\n".join(files(case, language, precision, name).values())
+    texts = files(case, language, precision, name)
+    if not all(isinstance(text, str) for text in texts.values()):
+        raise InputError(f"--lang {language} is no text: call jaxtank.export.source.files")
+    return "\n".join(texts.values())
 
 
 def files(

@@ -191,7 +191,10 @@ def export(args):
     case = open_case(args)
     from jaxtank.export import source
 
-    files = source.files(case, args.lang, args.precision, args.name, args.plant)
+    if args.fmi == "2" and args.lang != "fmu":
+        raise InputError(f"--fmi 2: is a version of --lang fmu, not of {args.lang}")
+    lang = "fmu2" if args.fmi == "2" else args.lang
+    files = source.files(case, lang, args.precision, args.name, args.plant)
     if any(isinstance(content, bytes) for content in files.values()) and not args.out:
         raise InputError(f"--lang {args.lang} is no text: give --out DIR, where it is written")
     if args.json or not args.out:
@@ -203,6 +206,26 @@ def export(args):
         _print_source(args, payload, payload["source"], done)
     if args.out:
         report_written(write_folder(Path(args.out), files), args)
+    return 0
+
+
+def replay(args):
+    """Run an export against a log and print the largest difference of each input."""
+    if not args.data:
+        raise InputError("replay needs --data CSV, a log of readings, setpoints and inputs")
+    from jaxtank.export.replay import replay as run
+    from tuning.report import tables
+
+    result = run(args.export, args.data)
+    worst = max(result["inputs"], key=lambda row: row["largest_difference"])
+    done = f"largest difference {worst['largest_difference']:.6g} of {worst['name']}"
+    done += f" at {worst['time_s']:g} s, in {result['samples']} samples"
+    rows = [
+        (row["name"], f"{row['largest_difference']:.6g}", f"{row['time_s']:g}")
+        for row in result["inputs"]
+    ]
+    head = ["input", "largest difference", "at time [s]"]
+    print_result(args, result, lambda: f"{tables.table(rows, head)}\n{done}", done)
     return 0
 
 
@@ -263,13 +286,24 @@ COMMANDS = {
         " or FMU",
         (
             *COMMON, *CASE,
-            Option("--lang", "LANG", "c, st, m or js", default="c"),
+            Option("--lang", "LANG", "c, st, m, js or fmu", default="c"),
+            Option("--fmi", "VERSION", "of an FMU: 3 or 2", default="3", choices=("3", "2")),
             Option("--precision", "TYPE", "double or float, of c and st", default="double"),
             Option("--name", "NAME", "of the functions (default: the case's)"),
             Option("--plant", help="the plant with its pumps and gauges instead of the controller",
                    kind="flag"),
             Option("--out", "DIR", "folder for the files (default: print them)", values.folder),
         ),
+    ),
+    "replay": Command(
+        replay,
+        "an export (C, JavaScript, FMU) run against a log: the largest difference of each input",
+        (
+            *COMMON,
+            Option("export", "EXPORT", "NAME.c, NAME.js or NAME.fmu of `jaxtank export`"),
+            Option("--data", "CSV", "log with a row for each period: t, y1, .., r1, .., u1, .."),
+        ),
+        compiles=False,
     ),
 }
 # fmt: on

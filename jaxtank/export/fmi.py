@@ -1,0 +1,508 @@
+"""Controllers and plants as FMUs for co-simulation (FMI 3.0, 2.0): description, sources, binary."""
+
+import functools
+import hashlib
+import io
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from jaxtank.core.labels import label_of
+from jaxtank.core.units import local
+from jaxtank.export.c import C, print_c
+from jaxtank.export.printer import note_of
+
+SIGNALS = {
+    "y": ("tank", "cm", "reading"),
+    "r": ("output", "cm", "setpoint"),
+    "dr": ("output", "cm/s", "rate of the setpoint"),
+    "ddr": ("output", "cm/s^2", "second derivative of the setpoint"),
+    "w": ("pump", "V", "input in manual operation"),
+    "u": ("pump", "V", "input"),
+    "d": ("tank", "cm^3/s", "further inflow"),
+    "h": ("tank", "cm", "level"),
+    "spilled": ("tank", "cm^3", "volume over the rim in the last period"),
+}
+"""{argument of a step: (what it has an entry for, unit of a rig in cm and V, what it is)}."""
+
+NAMES = {"w": "manual_input"}
+"""{argument: its name in the FMU, where that is another}."""
+
+MANUAL = "manual"
+
+
+class Variable(NamedTuple):
+    """A number of an FMU; its value reference is its place in the list."""
+
+    name: str
+    causality: str
+    start: float
+    unit: str
+    words: str
+    low: float | None = None
+    high: float | None = None
+
+
+def variables(program: Any) -> list[Variable]:
+    """Return the variables of an FMU: parameters, inputs, outputs."""
+    loop, found = program.case.loop, []
+    for p in program.parameters:
+        for i in np.ndindex(p.value.shape):
+            name = p.name + (f"[{','.join(map(str, i))}]" if i else "")
+            words, unit = note_of(p), p.meta["unit"]
+            ends = p.meta["low"], p.meta["high"]
+            found.append(Variable(name, "parameter", float(p.value[i]), unit, words, *ends))
+    starts = {"y": loop.x0, "u": loop.actuator.initial}
+    groups = {"input": program.inputs, "output": program.outputs_of}
+    for causality, names in groups.items():
+        for name in names:
+            kind, unit, words = SIGNALS[name]
+            size = {"tank": program.tanks, "pump": program.pumps}.get(kind, program.outputs)
+            for j in range(size):
+                start = float(starts[name][j]) if name in starts else 0.0
+                label = f"{words} of {label_of(loop.plant, kind, j)}"
+                full, unit_of_rig = f"{NAMES.get(name, name)}[{j}]", local(unit, loop.units)
+                found.append(Variable(full, causality, start, unit_of_rig, label))
+    return found
+
+
+def _attributes(**words):
+    return "".join(f" {k}={quoteattr(str(v))}" for k, v in words.items() if v is not None)
+
+
+def _number(value):
+    return None if value is None else repr(float(value)).replace("inf", "INF")
+
+
+def description(program: Any, name: str, version: str, token: str) -> str:
+    """Return modelDescription.xml."""
+    third = version == "3.0"
+    numbers, case = variables(program), program.case
+    units = sorted({v.unit for v in numbers} - {"-"})
+    head = {"fmiVersion": version, "modelName": case.name, "description": case.title}
+    head |= {"instantiationToken" if third else "guid": token, "generationTool": "jaxtank"}
+    steps = {"canHandleVariableCommunicationStepSize": "false"}
+    if third:
+        steps |= {"fixedInternalStepSize": repr(float(case.clock.dt))}
+    sources = "" if third else SOURCES.format(name=name)
+    experiment = {"startTime": "0", "stopTime": repr(float(case.clock.duration))}
+    experiment |= {"stepSize": repr(float(case.clock.dt))}
+    outputs = [i for i, v in enumerate(numbers) if v.causality == "output"]
+    if third:
+        structure = [f'    <Output valueReference="{i}"/>' for i in outputs]
+        structure += [f'    <InitialUnknown valueReference="{i}"/>' for i in outputs]
+    else:
+        unknown = [f'      <Unknown index="{i + 1}"/>' for i in outputs]
+        structure = ["    <Outputs>", *unknown, "    </Outputs>"]
+        structure += ["    <InitialUnknowns>", *unknown, "    </InitialUnknowns>"]
+    naming = _attributes(variableNamingConvention="structured")
+    return "\n".join(
+        [
+            '<?xml version="1.0" encoding="UTF-8"?>',
+            f"<fmiModelDescription{_attributes(**head)}{naming}>",
+            f"  <CoSimulation{_attributes(modelIdentifier=name, **steps)}>{sources}</CoSimulation>",
+            "  <UnitDefinitions>",
+            *(f"    <Unit{_attributes(name=unit)}/>" for unit in units),
+            "  </UnitDefinitions>",
+            f"  <DefaultExperiment{_attributes(**experiment)}/>",
+            "  <ModelVariables>",
+            *_rows(program, numbers, third),
+            "  </ModelVariables>",
+            "  <ModelStructure>",
+            *structure,
+            "  </ModelStructure>",
+            "</fmiModelDescription>",
+            "",
+        ]
+    )
+
+
+SOURCES = '<SourceFiles><File name="{name}.c"/><File name="fmi.c"/></SourceFiles>'
+BUILD = """<?xml version="1.0" encoding="UTF-8"?>
+<fmiBuildDescription fmiVersion="3.0">
+  <BuildConfiguration modelIdentifier="{name}">
+    <SourceFileSet language="C99">
+      <SourceFile name="{name}.c"/>
+      <SourceFile name="fmi.c"/>
+    </SourceFileSet>
+  </BuildConfiguration>
+</fmiBuildDescription>
+"""
+
+
+def _rows(program, numbers, third):
+    """The variables as elements: numbers, time, the switch of manual operation."""
+    rows = [(_row3 if third else _row2)(i, v) for i, v in enumerate(numbers)]
+    words = {"valueReference": len(numbers) + 1, "causality": "independent"}
+    time = _attributes(name="time", **words, variability="continuous")
+    two = f"    <ScalarVariable{time}><Real/></ScalarVariable>"
+    rows.append(f"    <Float64{time}/>" if third else two)
+    if program.plant:
+        return rows
+    words = {"valueReference": len(numbers), "causality": "input", "variability": "discrete"}
+    switch = _attributes(name=MANUAL, **words, description="true: u is manual_input")
+    two = f'    <ScalarVariable{switch}><Boolean start="false"/></ScalarVariable>'
+    return [*rows, f'    <Boolean{switch} start="false"/>' if third else two]
+
+
+def _parts(v):
+    """(attributes of a variable, attributes of its value)."""
+    variability = "tunable" if v.causality == "parameter" else "discrete"
+    outer = {"causality": v.causality, "variability": variability, "description": v.words}
+    inner = {"unit": None if v.unit == "-" else v.unit, "min": _number(v.low)}
+    inner |= {"max": _number(v.high)}
+    if v.causality != "output":
+        inner |= {"start": _number(v.start)}
+    return outer, inner
+
+
+def _row3(i, v):
+    outer, inner = _parts(v)
+    return f"    <Float64{_attributes(name=v.name, valueReference=i, **outer, **inner)}/>"
+
+
+def _row2(i, v):
+    outer, inner = _parts(v)
+    words = _attributes(name=v.name, valueReference=i, **outer)
+    return f"    <ScalarVariable{words}><Real{_attributes(**inner)}/></ScalarVariable>"
+
+
+CORE = """
+#include "{name}.h"
+#include <math.h>
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdlib.h>
+
+#if defined(_WIN32)
+#define EXPORT __declspec(dllexport)
+#else
+#define EXPORT __attribute__((visibility("default")))
+#endif
+
+enum {{ OK = 0, ERROR = 3, PARAMETERS = {parameters}, NUMBERS = {numbers} }};
+
+typedef struct {{
+    {name}_state state;
+    {name}_parameters p;
+    double v[NUMBERS - PARAMETERS]; /* inputs, then outputs */
+    double t;
+    bool manual, begun;
+}} Model;
+
+static void reset(Model *m)
+{{
+    static const double start[NUMBERS - PARAMETERS] = {{{start}}};
+    m->p = {name}_defaults;
+    for (int i = 0; i < NUMBERS - PARAMETERS; ++i) m->v[i] = start[i];
+    m->t = 0.0;
+    m->manual = m->begun = false;
+}}
+
+static Model *make(void)
+{{
+    Model *m = calloc(1, sizeof *m);
+    if (m) reset(m);
+    return m;
+}}
+
+static void begin(Model *m)
+{{
+    {init};
+    m->begun = true;
+}}
+
+static int advance(Model *m, double t, double h)
+{{
+    const int periods = (int)(h / {name}_dt + 0.5);
+    const double rest = h - periods * {name}_dt;
+    if (periods < 1 || rest > 1e-6 * {name}_dt || rest < -1e-6 * {name}_dt) return ERROR;
+    for (int i = 0; i < periods; ++i) {step};
+    m->t = t + h;
+    return OK;
+}}
+
+static double *at(Model *m, uint32_t i)
+{{
+    if (i < PARAMETERS) return (double *)&m->p + i;
+    return i < NUMBERS ? m->v + (i - PARAMETERS) : i == NUMBERS + 1 ? &m->t : NULL;
+}}
+
+static int get(Model *m, const uint32_t *refs, size_t n, double *values)
+{{
+    if (!m->begun) begin(m);
+    for (size_t k = 0; k < n; ++k) {{
+        if (!at(m, refs[k])) return ERROR;
+        values[k] = *at(m, refs[k]);
+    }}
+    return OK;
+}}
+
+static int set(Model *m, const uint32_t *refs, size_t n, const double *values)
+{{
+    for (size_t k = 0; k < n; ++k) {{
+        if (!at(m, refs[k])) return ERROR;
+        *at(m, refs[k]) = values[k];
+    }}
+    return OK;
+}}
+
+/* functions that this FMU has not: the arguments are not read */
+#define NONE(name) EXPORT int name(void); int name(void) {{ return ERROR; }}
+#define FINE(name) EXPORT int name(void); int name(void) {{ return OK; }}
+"""
+
+THIRD = """
+EXPORT const char *fmi3GetVersion(void);
+const char *fmi3GetVersion(void) { return "3.0"; }
+
+EXPORT void *fmi3InstantiateCoSimulation(void);
+void *fmi3InstantiateCoSimulation(void) { return make(); }
+
+EXPORT void fmi3FreeInstance(Model *m);
+void fmi3FreeInstance(Model *m) { free(m); }
+
+EXPORT int fmi3Reset(Model *m);
+int fmi3Reset(Model *m) { reset(m); return OK; }
+
+EXPORT int fmi3EnterInitializationMode(Model *m, bool b, double e, double t, bool s, double end);
+int fmi3EnterInitializationMode(Model *m, bool b, double e, double t, bool s, double end)
+{
+    (void)b; (void)e; (void)s; (void)end;
+    m->t = t;
+    return OK;
+}
+
+EXPORT int fmi3ExitInitializationMode(Model *m);
+int fmi3ExitInitializationMode(Model *m) { begin(m); return OK; }
+
+EXPORT int fmi3GetFloat64(Model *m, const uint32_t *refs, size_t n, double *values, size_t many);
+int fmi3GetFloat64(Model *m, const uint32_t *refs, size_t n, double *values, size_t many)
+{
+    return many == n ? get(m, refs, n, values) : ERROR;
+}
+
+EXPORT int fmi3SetFloat64(Model *m, const uint32_t *refs, size_t n, const double *v, size_t many);
+int fmi3SetFloat64(Model *m, const uint32_t *refs, size_t n, const double *v, size_t many)
+{
+    return many == n ? set(m, refs, n, v) : ERROR;
+}
+
+EXPORT int fmi3GetBoolean(Model *m, const uint32_t *refs, size_t n, bool *values, size_t many);
+int fmi3GetBoolean(Model *m, const uint32_t *refs, size_t n, bool *values, size_t many)
+{
+    for (size_t k = 0; k < n; ++k) {
+        if (refs[k] != NUMBERS || many != n) return ERROR;
+        values[k] = m->manual;
+    }
+    return OK;
+}
+
+EXPORT int fmi3SetBoolean(Model *m, const uint32_t *refs, size_t n, const bool *v, size_t many);
+int fmi3SetBoolean(Model *m, const uint32_t *refs, size_t n, const bool *v, size_t many)
+{
+    for (size_t k = 0; k < n; ++k) {
+        if (refs[k] != NUMBERS || many != n) return ERROR;
+        m->manual = v[k];
+    }
+    return OK;
+}
+
+EXPORT int fmi3DoStep(Model *m, double t, double h, bool no, bool *event, bool *stop, bool *early,
+                      double *last);
+int fmi3DoStep(Model *m, double t, double h, bool no, bool *event, bool *stop, bool *early,
+               double *last)
+{
+    (void)no;
+    const int status = advance(m, t, h);
+    *event = *stop = *early = false;
+    *last = m->t;
+    return status;
+}
+"""
+
+SECOND = """
+EXPORT const char *fmi2GetTypesPlatform(void);
+const char *fmi2GetTypesPlatform(void) { return "default"; }
+
+EXPORT const char *fmi2GetVersion(void);
+const char *fmi2GetVersion(void) { return "2.0"; }
+
+EXPORT void *fmi2Instantiate(void);
+void *fmi2Instantiate(void) { return make(); }
+
+EXPORT void fmi2FreeInstance(Model *m);
+void fmi2FreeInstance(Model *m) { free(m); }
+
+EXPORT int fmi2Reset(Model *m);
+int fmi2Reset(Model *m) { reset(m); return OK; }
+
+EXPORT int fmi2SetupExperiment(Model *m, int b, double e, double t, int s, double end);
+int fmi2SetupExperiment(Model *m, int b, double e, double t, int s, double end)
+{
+    (void)b; (void)e; (void)s; (void)end;
+    m->t = t;
+    return OK;
+}
+
+EXPORT int fmi2ExitInitializationMode(Model *m);
+int fmi2ExitInitializationMode(Model *m) { begin(m); return OK; }
+
+EXPORT int fmi2GetReal(Model *m, const uint32_t *refs, size_t n, double *values);
+int fmi2GetReal(Model *m, const uint32_t *refs, size_t n, double *values)
+{
+    return get(m, refs, n, values);
+}
+
+EXPORT int fmi2SetReal(Model *m, const uint32_t *refs, size_t n, const double *values);
+int fmi2SetReal(Model *m, const uint32_t *refs, size_t n, const double *values)
+{
+    return set(m, refs, n, values);
+}
+
+EXPORT int fmi2GetBoolean(Model *m, const uint32_t *refs, size_t n, int *values);
+int fmi2GetBoolean(Model *m, const uint32_t *refs, size_t n, int *values)
+{
+    for (size_t k = 0; k < n; ++k) {
+        if (refs[k] != NUMBERS) return ERROR;
+        values[k] = m->manual;
+    }
+    return OK;
+}
+
+EXPORT int fmi2SetBoolean(Model *m, const uint32_t *refs, size_t n, const int *values);
+int fmi2SetBoolean(Model *m, const uint32_t *refs, size_t n, const int *values)
+{
+    for (size_t k = 0; k < n; ++k) {
+        if (refs[k] != NUMBERS) return ERROR;
+        m->manual = values[k] != 0;
+    }
+    return OK;
+}
+
+EXPORT int fmi2DoStep(Model *m, double t, double h, int no);
+int fmi2DoStep(Model *m, double t, double h, int no) { (void)no; return advance(m, t, h); }
+"""
+
+_TYPES = "Float32 Int8 UInt8 Int16 UInt16 Int32 UInt32 Int64 UInt64 String Binary Clock"
+_NONE3 = """
+InstantiateModelExchange InstantiateScheduledExecution GetNumberOfVariableDependencies
+GetVariableDependencies GetFMUState SetFMUState FreeFMUState SerializedFMUStateSize
+SerializeFMUState DeserializeFMUState GetDirectionalDerivative GetAdjointDerivative
+EnterConfigurationMode ExitConfigurationMode GetIntervalDecimal GetIntervalFraction GetShiftDecimal
+GetShiftFraction SetIntervalDecimal SetIntervalFraction SetShiftDecimal SetShiftFraction
+EvaluateDiscreteStates UpdateDiscreteStates EnterContinuousTimeMode CompletedIntegratorStep SetTime
+SetContinuousStates GetContinuousStateDerivatives GetEventIndicators GetContinuousStates
+GetNominalsOfContinuousStates GetNumberOfEventIndicators GetNumberOfContinuousStates
+GetOutputDerivatives ActivateModelPartition EnterEventMode
+"""
+_NONE2 = """
+GetInteger SetInteger GetString SetString GetFMUstate SetFMUstate FreeFMUstate
+SerializedFMUstateSize SerializeFMUstate DeSerializeFMUstate GetDirectionalDerivative
+SetRealInputDerivatives GetRealOutputDerivatives CancelStep GetStatus GetRealStatus
+GetIntegerStatus GetBooleanStatus GetStringStatus
+"""
+# functions that return an error, and those that have nothing to do
+NONE = {
+    "3": [*_NONE3.split(), *(f"{a}{t}" for t in _TYPES.split() for a in ("Get", "Set"))],
+    "2": _NONE2.split(),
+}
+FINE = {
+    "3": ["SetDebugLogging", "EnterStepMode", "Terminate"],
+    "2": ["SetDebugLogging", "EnterInitializationMode", "Terminate"],
+}
+
+
+def interface(program: Any, name: str, version: str) -> str:
+    """Return the functions of FMI as C99, around those of the controller or plant."""
+    numbers = variables(program)
+    parameters = sum(v.causality == "parameter" for v in numbers)
+    place, places = 0, {}
+    for group in (program.inputs, program.outputs_of):
+        for argument, entries in group.items():
+            places[argument] = f"m->v + {place}"
+            place += entries if isinstance(entries, int) else len(entries)
+    inputs = [places[v] for v in program.inputs if v != "w"]
+    outputs = [places[v] for v in program.outputs_of]
+    manual = [] if program.plant else [f"m->manual ? {places['w']} : NULL"]
+    clock = [] if program.plant else [f"t + i * {name}_dt"]
+    step = ", ".join(["&m->state", "&m->p", *clock, *inputs, *manual, *outputs])
+    results = outputs if program.plant else [places["y"], places["u"]]
+    init = ", ".join(["&m->state", "&m->p", *results])
+    words = {"name": name, "parameters": parameters, "numbers": len(numbers)}
+    words |= {"start": ", ".join(C().value(v.start) for v in numbers[parameters:])}
+    words |= {"init": f"{name}_init({init})", "step": f"{name}_step({step})"}
+    major = version[0]
+    stubs = [f"NONE(fmi{major}{f})" for f in NONE[major]] + [
+        f"FINE(fmi{major}{f})" for f in FINE[major]
+    ]
+    text = CORE.lstrip().format(**words)
+    return "\n".join([text, (THIRD if major == "3" else SECOND).strip(), "", *stubs, ""])
+
+
+def place_of(version: str) -> tuple[str, str] | None:
+    """Return (folder of binaries in an FMU, suffix) of this machine, None where it has none."""
+    system = {
+        "linux": ("linux", ".so"),
+        "darwin": ("darwin", ".dylib"),
+        "win32": ("windows", ".dll"),
+    }
+    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(platform.machine().lower())
+    name, suffix = system.get(sys.platform, ("", ""))
+    if not name:
+        return None
+    if version[0] == "3":
+        return f"{machine or platform.machine()}-{name}", suffix
+    return {"linux": "linux64", "darwin": "darwin64", "windows": "win64"}[name], suffix
+
+
+def compiler() -> str | None:
+    """Return the C compiler at hand, None if there is none."""
+    return next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
+
+
+def library(files: dict[str, str], suffix: str = ".so") -> bytes | None:
+    """Return a shared library compiled from C sources, None where no compiler is at hand."""
+    command = compiler()
+    if command is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        for file, text in files.items():
+            (Path(folder) / file).write_text(text)
+        target = Path(folder) / f"out{suffix}"
+        sources = [file for file in files if file.endswith(".c")]
+        flags = ["-std=c99", "-O1", "-shared", "-fPIC", "-fvisibility=hidden", "-o", str(target)]
+        words = [command, *flags, *sources, "-lm"]
+        done = subprocess.run(words, cwd=folder, capture_output=True, check=False)
+        return target.read_bytes() if done.returncode == 0 else None
+
+
+def print_fmu(program: Any, name: str, precision: str, version: str = "3.0") -> dict[str, bytes]:
+    """Return {file: content} of a Program as an FMU."""
+    sources = {**print_c(program, name, precision), "fmi.c": interface(program, name, version)}
+    token = hashlib.sha256("".join(sources.values()).encode()).hexdigest()[:32]
+    files: dict[str, Any] = {"modelDescription.xml": description(program, name, version, token)}
+    files |= {f"sources/{file}": text for file, text in sources.items()}
+    if version[0] == "3":
+        files["sources/buildDescription.xml"] = BUILD.format(name=name)
+    place = place_of(version)
+    binary = library(sources, place[1]) if place else None
+    if place and binary:
+        files[f"binaries/{place[0]}/{name}{place[1]}"] = binary
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file, content in files.items():
+            archive.writestr(zipfile.ZipInfo(file, (2000, 1, 1, 0, 0, 0)), content)
+    return {f"{name}.fmu": out.getvalue()}
+
+
+print_fmu2 = functools.partial(print_fmu, version="2.0")

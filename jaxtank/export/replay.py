@@ -1,0 +1,327 @@
+"""An exported controller run against a log: its inputs beside those of the log."""
+
+import contextlib
+import ctypes
+import io
+import json
+import re
+import shutil
+import subprocess
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+
+from jaxtank.core.errors import DataError, InputError
+from jaxtank.core.tables import is_time, numbers, read_table, seconds
+from jaxtank.core.text import printable
+from jaxtank.export.fmi import compiler, library, place_of
+
+GROUPS = re.compile(r"(y|h|r|dr|ddr|u|pump)(?:\d+|_.+)", re.IGNORECASE)
+"""Names of columns: of "y1" or "y_LT101" the first part is the signal."""
+
+
+class Export(NamedTuple):
+    """A controller as functions."""
+
+    dt: float
+    sizes: tuple[int, int, int]
+    """Numbers of levels, setpoints, inputs."""
+    run: Any
+    """Function of a Log that returns the inputs (samples, inputs)."""
+
+
+class Log(NamedTuple):
+    """Signals of a log, arrays (samples, entries)."""
+
+    t: np.ndarray
+    y: np.ndarray
+    r: np.ndarray
+    dr: np.ndarray
+    ddr: np.ndarray
+    u: np.ndarray
+
+
+def replay(path: str | Path, data: str | Path) -> dict[str, Any]:
+    """Return the largest difference of each input between a log and an export run against it.
+
+    Parameters
+    ----------
+    path : an exported controller: NAME.c (with NAME.h beside it), NAME.js or NAME.fmu
+    data : log with a row for each period: t, y1, .. (or h1, ..), r1, .., u1, .. (or pump1, ..)
+
+    Returns
+    -------
+    {"samples": number of rows, "inputs": [{"name", "largest_difference", "time_s"}]}
+
+    Raises
+    ------
+    InputError
+        For a file that is no export or needs a program that is not at hand.
+    DataError
+        For a log that does not suit the export.
+    """
+    path = Path(path)
+    loaders = {".c": _load_c, ".js": _load_javascript, ".fmu": _load_fmu}
+    if not path.is_file():
+        raise InputError(f"{printable(str(path))}: there is no such file")
+    if path.suffix not in loaders:
+        missing = {".st": "an interpreter of Structured Text", ".m": "MATLAB or Octave"}
+        why = f"needs {missing[path.suffix]}, " if path.suffix in missing else "is none of these; "
+        raise InputError(
+            f"{printable(path.name)}: {why}replay runs NAME.c, NAME.js and NAME.fmu: export the"
+            " same rig in one of them"
+        )
+    with loaders[path.suffix](path) as export:
+        log, columns = read(data, export)
+        inputs = export.run(log)
+    apart = np.abs(inputs - log.u)
+    at = np.argmax(apart, axis=0)
+    rows = [
+        {"name": name, "largest_difference": float(apart[k, j]), "time_s": float(log.t[k])}
+        for j, (name, k) in enumerate(zip(columns, at))
+    ]
+    return {"samples": len(log.t), "inputs": rows}
+
+
+def read(path: str | Path, export: Export) -> tuple[Log, list[str]]:
+    """Return (Log for an export, names of the columns of its inputs)."""
+    table, groups, time = read_table(path), {}, None
+    for i, column in enumerate(table.columns):
+        if time is None and (column.name.lower() in ("t", "time") or is_time(column.cells[0])):
+            time = i
+        elif match := GROUPS.fullmatch(column.name):
+            groups.setdefault(match[1].lower(), []).append(i)
+    wanted = dict(zip(("y", "r", "u"), export.sizes))
+    names = {"y": ("y", "h"), "r": ("r",), "u": ("u", "pump")}
+    chosen, problems = {}, [] if time is not None else ["a column t"]
+    for key, count in wanted.items():
+        chosen[key] = next((groups[name] for name in names[key] if name in groups), [])
+        if len(chosen[key]) != count:
+            columns = " or ".join(f"{name}1, .." for name in names[key])
+            problems.append(f"{count} of {columns} (it has {len(chosen[key])})")
+    if problems or time is None:
+        raise DataError(f"{table.name}: the export needs {'; '.join(problems)}")
+    t = seconds(table, time)
+    arrays = {k: np.stack([numbers(table, i)[0] for i in v], axis=1) for k, v in chosen.items()}
+    if any(not np.all(np.isfinite(a)) for a in arrays.values()):
+        raise DataError(f"{table.name}: has cells without a number; replay needs every sample")
+    steps = np.diff(t)
+    if np.any(np.abs(steps - export.dt) > 1e-3 * export.dt):
+        k = int(np.argmax(np.abs(steps - export.dt)))
+        raise DataError(
+            f"{table.name}, line {table.lines[k + 1]}: is {steps[k]:.6g} s after the row before;"
+            f" the export runs every {export.dt:.6g} s: log every period (simulate --set"
+            " clock.duration=S of a shorter run saves all samples)"
+        )
+    rates = _rates(arrays["r"], export.dt)
+    given = [groups.get(key, []) for key in ("dr", "ddr")]
+    dr, ddr = (
+        np.stack([numbers(table, i)[0] for i in columns], axis=1)
+        if len(columns) == export.sizes[1]
+        else otherwise
+        for columns, otherwise in zip(given, (rates, 0.0 * rates))
+    )
+    log = Log(t, arrays["y"], arrays["r"], dr, ddr, arrays["u"])
+    return log, [table.columns[i].name for i in chosen["u"]]
+
+
+def _rates(r, dt):
+    """Rates of setpoints: of ramps their slope, of jumps 0."""
+    ahead = np.diff(r, axis=0, append=r[-1:]) / dt
+    before = np.roll(ahead, 1, axis=0)
+    after = np.roll(ahead, -1, axis=0)
+    same = lambda other: np.abs(other - ahead) <= 1e-3 * np.abs(ahead)
+    return np.where(same(before) | same(after), ahead, 0.0)
+
+
+HARNESS = """
+#include "{name}.h"
+static {name}_state state;
+static void copy({name}_real *a, const double *b, int n) {{
+    for (int i = 0; i < n; ++i) a[i] = ({name}_real)b[i];
+}}
+#define OUT __attribute__((visibility("default")))
+OUT void sizes(int *n);
+void sizes(int *n) {{ n[0] = {upper}_TANKS; n[1] = {upper}_OUTPUTS; n[2] = {upper}_PUMPS; }}
+OUT double period(void);
+double period(void) {{ return {name}_dt; }}
+OUT void begin(const double *y);
+void begin(const double *y) {{
+    {name}_real a[{upper}_TANKS];
+    copy(a, y, {upper}_TANKS);
+    {name}_init(&state, 0, a, 0);
+}}
+OUT void step(double t, const double *y, const double *r, const double *dr, const double *ddr,
+              double *u);
+void step(double t, const double *y, const double *r, const double *dr, const double *ddr,
+          double *u) {{
+    {name}_real a[{upper}_TANKS], b[{upper}_OUTPUTS], c[{upper}_OUTPUTS], d[{upper}_OUTPUTS],
+        e[{upper}_PUMPS];
+    copy(a, y, {upper}_TANKS);
+    copy(b, r, {upper}_OUTPUTS);
+    copy(c, dr, {upper}_OUTPUTS);
+    copy(d, ddr, {upper}_OUTPUTS);
+    {name}_step(&state, 0, ({name}_real)t, a, b, c, d, 0, e);
+    for (int i = 0; i < {upper}_PUMPS; ++i) u[i] = e[i];
+}}
+"""
+"""Functions of double precision around an export in C."""
+
+
+@contextlib.contextmanager
+def _loaded(binary, suffix) -> Iterator[ctypes.CDLL]:
+    """A shared library in this process, which stays loaded."""
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / f"replayed{suffix}"
+        target.write_bytes(binary)
+        yield ctypes.CDLL(str(target))
+
+
+@contextlib.contextmanager
+def _load_c(path):
+    if compiler() is None:
+        raise InputError(f"{printable(path.name)}: needs a C compiler (cc, gcc or clang)")
+    header = path.with_suffix(".h")
+    if not header.is_file():
+        raise InputError(f"{printable(path.name)}: needs its header {printable(header.name)}")
+    name = path.stem
+    files = {p.name: p.read_text(errors="replace") for p in (path, header)}
+    binary = library({**files, "replay.c": HARNESS.format(name=name, upper=name.upper())})
+    if binary is None:
+        raise InputError(
+            f"{printable(path.name)}: does not compile as a controller that `jaxtank export --lang"
+            " c` has written under this name"
+        )
+    with _loaded(binary, ".so") as code:
+        code.period.restype = ctypes.c_double
+        sizes = (ctypes.c_int * 3)()
+        code.sizes(sizes)
+        pointer = lambda a: a.ctypes.data_as(ctypes.c_void_p)
+
+        def run(log):
+            signals = [np.ascontiguousarray(v) for v in (log.y, log.r, log.dr, log.ddr)]
+            out = np.zeros_like(log.u)
+            code.begin(pointer(signals[0][0]))
+            for k, t in enumerate(log.t):
+                code.step(ctypes.c_double(t), *(pointer(v[k]) for v in (*signals, out)))
+            return out
+
+        yield Export(code.period(), (sizes[0], sizes[1], sizes[2]), run)
+
+
+SCRIPT = """
+const law = require(process.argv[1]);
+if (process.argv[2] === "facts")
+    console.log(JSON.stringify([law.dt, law.tanks, law.outputs, law.pumps]));
+else {
+    const d = JSON.parse(require("fs").readFileSync(0)), s = law.init(d.y[0], d.u[0]);
+    const step = (t, k) => law.step(s, t, d.y[k], d.r[k], d.dr[k], d.ddr[k]);
+    console.log(JSON.stringify(d.t.map(step)));
+}
+"""
+
+
+@contextlib.contextmanager
+def _load_javascript(path):
+    if shutil.which("node") is None:
+        raise InputError(f"{printable(path.name)}: needs node, which runs JavaScript")
+
+    def node(what, text=""):
+        words = ["node", "-e", SCRIPT, str(path.resolve()), what]
+        done = subprocess.run(words, input=text, capture_output=True, text=True, check=False)
+        with contextlib.suppress(ValueError):
+            return json.loads(done.stdout) if done.returncode == 0 else None
+        return None
+
+    facts = node("facts")
+    if not facts or None in facts:
+        raise InputError(f"{printable(path.name)}: is no controller of `jaxtank export --lang js`")
+
+    def run(log):
+        text = json.dumps({k: v.tolist() for k, v in log._asdict().items()})
+        inputs = np.array(node("run", text) or [], dtype=float)
+        if inputs.shape != log.u.shape:
+            raise InputError(f"{printable(path.name)}: stopped with an error in node")
+        return inputs
+
+    yield Export(float(facts[0]), tuple(facts[1:]), run)
+
+
+@contextlib.contextmanager
+def _load_fmu(path):
+    name = printable(path.name)
+    try:
+        with zipfile.ZipFile(io.BytesIO(path.read_bytes())) as archive:
+            files = {file: archive.read(file) for file in archive.namelist()}
+        root = ElementTree.fromstring(files["modelDescription.xml"])
+        version, kind, clock = root.attrib["fmiVersion"], *map(root.find, PARTS)
+        model, dt = kind.attrib["modelIdentifier"], float(clock.attrib["stepSize"])
+    except (zipfile.BadZipFile, KeyError, AttributeError, ValueError, ElementTree.ParseError):
+        raise InputError(f"{name}: is no FMU of `jaxtank export --lang fmu`") from None
+    references = _references(root)
+    if not {"y", "r", "u"} <= references.keys():
+        raise InputError(f"{name}: has no inputs y, r and no output u: it is no controller")
+    place = place_of(version)
+    binary = files.get(f"binaries/{place[0]}/{model}{place[1]}") if place else None
+    is_source = re.compile(r"sources/\w+\.[ch]").fullmatch
+    sources = {f[8:]: t.decode(errors="replace") for f, t in files.items() if is_source(f)}
+    binary = binary or library(sources)
+    if binary is None:
+        raise InputError(f"{name}: has no binary for this machine, and no C compiler is at hand")
+    y, r, u = (len(references[key]) for key in ("y", "r", "u"))
+    with _loaded(binary, place[1] if place else ".so") as code:
+        yield Export(dt, (y, r, u), lambda log: _run_fmu(code, version[0], references, dt, log))
+
+
+PARTS = ("CoSimulation", "DefaultExperiment")
+
+
+def _references(root):
+    """{signal: its value references} of an FMU's inputs and outputs."""
+    references: dict[str, list[int]] = {}
+    for variable in root.find("ModelVariables"):
+        if variable.attrib.get("causality") in ("input", "output"):
+            key = variable.attrib["name"].split("[")[0]
+            references.setdefault(key, []).append(int(variable.attrib["valueReference"]))
+    return references
+
+
+def _run_fmu(code, major, references, dt, log):
+    """Inputs (samples, inputs) of an FMU."""
+    make = code.fmi3InstantiateCoSimulation if major == "3" else code.fmi2Instantiate
+    make.restype = ctypes.c_void_p
+    model = ctypes.c_void_p(make(b"replay", b"", None))
+    real = "Float64" if major == "3" else "Real"
+    refs = {k: (ctypes.c_uint32 * len(v))(*v) for k, v in references.items()}
+    more = lambda n: [ctypes.c_size_t(n)] if major == "3" else []
+    flags = [ctypes.byref(ctypes.c_bool()) for _ in range(3)]
+    last = [*flags, ctypes.byref(ctypes.c_double())] if major == "3" else []
+
+    def put(name, row):
+        n, values = len(row), (ctypes.c_double * len(row))(*row)
+        getattr(code, f"fmi{major}Set{real}")(
+            model, refs[name], ctypes.c_size_t(n), values, *more(n)
+        )
+
+    def take(n):
+        values = (ctypes.c_double * n)()
+        get = getattr(code, f"fmi{major}Get{real}")
+        get(model, refs["u"], ctypes.c_size_t(n), values, *more(n))
+        return list(values)
+
+    put("y", log.y[0])
+    getattr(code, f"fmi{major}ExitInitializationMode")(model)
+    out = np.zeros_like(log.u)
+    for k, t in enumerate(log.t):
+        for name in ("y", "r", "dr", "ddr"):
+            put(name, getattr(log, name)[k])
+        step = getattr(code, f"fmi{major}DoStep")
+        step(model, ctypes.c_double(t), ctypes.c_double(dt), ctypes.c_bool(True), *last)
+        out[k] = take(out.shape[1])
+    getattr(code, f"fmi{major}FreeInstance")(model)
+    return out

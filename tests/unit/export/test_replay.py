@@ -1,0 +1,79 @@
+"""`jaxtank replay`: exports in several languages against logs."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import presets, rig
+from jaxtank.export.replay import _rates
+from jaxtank.loop.trajectory import csv
+from tuning.cli import main
+
+WORDS = {"c": "gcc", "js": "node", "fmu": "gcc"}
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    """A run of 100 samples of cascaded/pi, as `simulate --out` saves it."""
+    case = rig.set_values(presets.find("cascaded/pi"), {"clock.duration": 396.0})
+    path = tmp_path_factory.mktemp("log") / "trajectory.csv"
+    path.write_text(csv(jaxtank.simulate(case.loop, case.clock), case.loop.units, case.loop.plant))
+    return path
+
+
+def export(folder, *words):
+    assert main.main(["export", "cascaded/pi", "--name", "law", "--out", str(folder), *words]) == 0
+
+
+@pytest.mark.parametrize("lang", ["c", "js", "fmu"])
+def test_an_export_gives_the_inputs_of_a_log_of_its_simulation(tmp_path, capsys, log, lang):
+    """And the difference is one of the gain where that was changed: Kc times the error."""
+    if shutil.which(WORDS[lang]) is None:
+        pytest.skip(f"no {WORDS[lang]} on this machine")
+    differences = []
+    for i, words in enumerate([(), ("--set", "controller.bias=2.6")]):
+        export(tmp_path / str(i), "--lang", lang, *words)
+        capsys.readouterr()
+        file = tmp_path / str(i) / f"law.{lang}"
+        assert main.main(["replay", str(file), "--data", str(log), "--json"]) == 0
+        (row,) = json.loads(capsys.readouterr().out)["inputs"]
+        differences.append(row["largest_difference"])
+    assert row["name"] == "u1"
+    assert differences[0] < 1e-8  # the log has ten digits
+    assert differences[1] == pytest.approx(2.6 - 2.50030361456214, rel=1e-3)
+
+
+def test_a_log_that_does_not_suit_and_an_export_that_is_none_are_reported(tmp_path, capsys, log):
+    """Exit codes 5 and 2."""
+    if shutil.which("gcc") is None:
+        pytest.skip("no gcc on this machine")
+    export(tmp_path, "--lang", "c")
+    export(tmp_path, "--lang", "st")
+    capsys.readouterr()
+    rows = log.read_text().splitlines()
+    sparse, short = tmp_path / "sparse.csv", tmp_path / "short.csv"
+    sparse.write_text("\n".join([rows[0], *rows[1::2]]))
+    short.write_text("\n".join(line.rsplit(",", 4)[0].rsplit(",", 1)[0] for line in rows))
+    law = str(tmp_path / "law.c")
+    for data, words in ((sparse, "every 4 s"), (short, "1 of u1, .. or pump1")):
+        assert main.main(["replay", law, "--data", str(data)]) == 5
+        assert words in capsys.readouterr().err
+    (tmp_path / "other.c").write_text("int other;\n")
+    (tmp_path / "other.h").write_text("int other;\n")
+    for file, words in (
+        ("other.c", "does not compile"),
+        ("law.st", "interpreter of Structured Text"),
+        ("none.c", "no such file"),
+    ):
+        assert main.main(["replay", str(tmp_path / file), "--data", str(log)]) == 2
+        error = capsys.readouterr().err
+        assert words in error and error.count("\n") == 1
+    assert main.main(["replay", law]) == 2
+
+
+def test_rates_of_ramps_are_their_slopes_and_those_of_jumps_are_zero():
+    r = np.array([[1.0], [1.0], [1.5], [2.0], [2.5], [2.5], [4.0], [4.0]])
+    np.testing.assert_allclose(_rates(r, 0.5)[:, 0], [0, 1, 1, 1, 0, 0, 0, 0])
