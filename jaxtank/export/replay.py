@@ -90,44 +90,55 @@ def replay(path: str | Path, data: str | Path) -> dict[str, Any]:
 
 def read(path: str | Path, export: Export) -> tuple[Log, list[str]]:
     """Return (Log for an export, names of the columns of its inputs)."""
-    table, groups, time = read_table(path), {}, None
-    for i, column in enumerate(table.columns):
-        if time is None and (column.name.lower() in ("t", "time") or is_time(column.cells[0])):
-            time = i
-        elif match := GROUPS.fullmatch(column.name):
-            groups.setdefault(match[1].lower(), []).append(i)
-    wanted = dict(zip(("y", "r", "u"), export.sizes))
-    names = {"y": ("y", "h"), "r": ("r",), "u": ("u", "pump")}
-    chosen, problems = {}, [] if time is not None else ["a column t"]
-    for key, count in wanted.items():
-        chosen[key] = next((groups[name] for name in names[key] if name in groups), [])
-        if len(chosen[key]) != count:
-            columns = " or ".join(f"{name}1, .." for name in names[key])
-            problems.append(f"{count} of {columns} (it has {len(chosen[key])})")
-    if problems or time is None:
-        raise DataError(f"{table.name}: the export needs {'; '.join(problems)}")
-    t = seconds(table, time)
-    arrays = {k: np.stack([numbers(table, i)[0] for i in v], axis=1) for k, v in chosen.items()}
+    table = read_table(path)
+    groups = _groups(table)
+    chosen = _chosen(table, groups, export)
+    t = seconds(table, groups["t"][0])
+    array = lambda columns: np.stack([numbers(table, i)[0] for i in columns], axis=1)
+    arrays = {key: array(columns) for key, columns in chosen.items()}
     if any(not np.all(np.isfinite(a)) for a in arrays.values()):
         raise DataError(f"{table.name}: has cells without a number; replay needs every sample")
-    steps = np.diff(t)
-    if np.any(np.abs(steps - export.dt) > 1e-3 * export.dt):
-        k = int(np.argmax(np.abs(steps - export.dt)))
+    apart = np.abs(np.diff(t) - export.dt)
+    if np.any(apart > 1e-3 * export.dt):
+        k = int(np.argmax(apart))
         raise DataError(
-            f"{table.name}, line {table.lines[k + 1]}: is {steps[k]:.6g} s after the row before;"
-            f" the export runs every {export.dt:.6g} s: log every period (simulate --set"
-            " clock.duration=S of a shorter run saves all samples)"
+            f"{table.name}, line {table.lines[k + 1]}: is {t[k + 1] - t[k]:.6g} s after the row"
+            f" before; the export runs every {export.dt:.6g} s: log every period (of a simulation:"
+            " a shorter run, which saves all samples)"
         )
-    rates = _rates(arrays["r"], export.dt)
-    given = [groups.get(key, []) for key in ("dr", "ddr")]
-    dr, ddr = (
-        np.stack([numbers(table, i)[0] for i in columns], axis=1)
-        if len(columns) == export.sizes[1]
-        else otherwise
-        for columns, otherwise in zip(given, (rates, 0.0 * rates))
-    )
+    dr, ddr = _rates(arrays["r"], export.dt), np.zeros_like(arrays["r"])
+    if len(groups.get("dr", [])) == export.sizes[1]:
+        dr = array(groups["dr"])
+    if len(groups.get("ddr", [])) == export.sizes[1]:
+        ddr = array(groups["ddr"])
     log = Log(t, arrays["y"], arrays["r"], dr, ddr, arrays["u"])
     return log, [table.columns[i].name for i in chosen["u"]]
+
+
+def _groups(table):
+    """{signal: its columns}, "t" the time."""
+    groups: dict[str, list[int]] = {}
+    for i, column in enumerate(table.columns):
+        match = GROUPS.fullmatch(column.name)
+        if column.name.lower() in ("t", "time") or (not match and is_time(column.cells[0])):
+            groups.setdefault("t", []).append(i)
+        elif match:
+            groups.setdefault(match[1].lower(), []).append(i)
+    return groups
+
+
+def _chosen(table, groups, export):
+    """{"y", "r", "u": columns} for an export. Raises DataError for columns that are missing."""
+    names = {"y": ("y", "h"), "r": ("r",), "u": ("u", "pump")}
+    chosen, problems = {}, [] if "t" in groups else ["a column t"]
+    for (key, words), count in zip(names.items(), export.sizes):
+        chosen[key] = next((groups[name] for name in words if name in groups), [])
+        if len(chosen[key]) != count:
+            columns = " or ".join(f"{name}1, .." for name in words)
+            problems.append(f"{count} of {columns} (it has {len(chosen[key])})")
+    if problems:
+        raise DataError(f"{table.name}: the export needs {'; '.join(problems)}")
+    return chosen
 
 
 def _rates(r, dt):
@@ -258,7 +269,7 @@ def _load_fmu(path):
     try:
         with zipfile.ZipFile(io.BytesIO(path.read_bytes())) as archive:
             files = {file: archive.read(file) for file in archive.namelist()}
-        root = ElementTree.fromstring(files["modelDescription.xml"])
+        root: Any = ElementTree.fromstring(files["modelDescription.xml"])
         version, kind, clock = root.attrib["fmiVersion"], *map(root.find, PARTS)
         model, dt = kind.attrib["modelIdentifier"], float(clock.attrib["stepSize"])
     except (zipfile.BadZipFile, KeyError, AttributeError, ValueError, ElementTree.ParseError):

@@ -11,6 +11,7 @@ from helpers import NODE, node
 
 import jaxtank
 from jaxtank import presets, rig
+from jaxtank.export import export
 from jaxtank.live.engine import engine
 from jaxtank.live.page import _script
 from tuning.cli import main
@@ -131,6 +132,7 @@ JUDGED = {  # commands that judge nothing, or one short run, with the shortest w
     "bench": [],
     "identify": ["--inspect", "log.csv"],
     "predict": [TWO, "--data", "log.csv"],
+    "replay": ["law.js", "--data", "run.csv"],
 }
 RESULTS = {"tune", "uncertainty", "sensitivity", "compare", "attack", "learn"}
 """Commands that print a result whose `to_json` has the verdict (test_page.py, below)."""
@@ -153,6 +155,11 @@ def test_the_json_of_every_command_has_a_verdict(command, tmp_path, monkeypatch,
     rows = "\n".join(f"{4 * k},3.0,{4 + k / 20}" for k in range(40))
     (tmp_path / "log.csv").write_text(f"t_s,pump_V,lower_tank_V\n{rows}\n")
     monkeypatch.setattr("tuning.bench.bench.measure", lambda rounds: {})
+    if command == "replay":
+        if NODE is None:
+            pytest.skip("no node on this machine")
+        (tmp_path / "law.js").write_text(export(presets.find(TWO), "js", name="law"))
+        (tmp_path / "run.csv").write_text("t,y1,y2,r1,u1\n0,4,4,4,2.5\n4,4,4,4,2.5\n")
     assert main.main([command, *JUDGED[command], "--json", "--quiet"]) == 0
     verdict = json.loads(capsys.readouterr().out)["verdict"]
     assert set(verdict) == {"good", "sentence", "tracking", "limits", "plants", "robustness"}
