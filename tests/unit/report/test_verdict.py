@@ -159,7 +159,7 @@ def test_the_json_of_every_command_has_a_verdict(command, tmp_path, monkeypatch,
         if NODE is None:
             pytest.skip("no node on this machine")
         (tmp_path / "law.js").write_text(export(presets.find(TWO), "js", name="law"))
-        (tmp_path / "run.csv").write_text("t,y1,y2,r1,u1\n0,4,4,4,2.5\n4,4,4,4,2.5\n")
+        (tmp_path / "run.csv").write_text("t [s],y1,y2,r1,u1\n0,4,4,4,2.5\n4,4,4,4,2.5\n")
     assert main.main([command, *JUDGED[command], "--json", "--quiet"]) == 0
     verdict = json.loads(capsys.readouterr().out)["verdict"]
     assert set(verdict) == {"good", "sentence", "tracking", "limits", "plants", "robustness"}
