@@ -76,6 +76,7 @@ GAINS: dict[type, tuple[str, ...]] = {
     controllers.SlidingMode: ("surface", "ks", "phi"),
     controllers.GPC: ("r_w",),
     controllers.Laguerre: ("r_w", "a"),
+    controllers.NMPC: ("horizon", "r_w"),
 }
 """Gains of a controller, which are tuned where a case does not say what is free."""
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 UNROLLED = 40  # variables up to which the elimination is written out
+ROWS = 64  # rows above which a product of three matrices is done row by row: a quarter of the time
 STAGES = 4  # parts of a larger one: 1 takes twice the time of 4 at 100 variables, 8 as much as 4
 
 
@@ -45,12 +46,13 @@ def solve(A, b):
 
 def normal_matrix(H, G, weight):
     """Return H + G' diag(weight) G (n, n) for H (n, n), G (rows, n) and weight (rows,)."""
-    return H + (_weighted(G, weight) if H.shape[0] > UNROLLED else (G.T * weight) @ G)
+    many = H.shape[0] > UNROLLED or G.shape[0] > ROWS
+    return H + (weighted_squares(G, weight) if many else (G.T * weight) @ G)
 
 
 @jax.jit
-def _weighted(G, weight):
-    """Return G' diag(weight) G (n, n) for G (rows, n), row by row."""
+def weighted_squares(G, weight):
+    """Return G' diag(weight) G (n, n) for G (rows, n) and weight (rows,), row by row."""
     # Inside a loop that is one compiled function, XLA vectorises the product of a vector and a
     # matrix, but writes the product of two matrices as three plain loops.
     product = jnp.zeros((G.shape[1], G.shape[1]), G.dtype)
@@ -93,8 +95,8 @@ def _cholesky(A):
     """Return U (n, n) upper triangular, A = U'U, of A positive definite (else NaN)."""
     # One row of U at a time, from a product of the rows before it. The rows are done in STAGES
     # parts of fixed shape, so that little of a product is spent on entries that are zero.
-    # `jaxtank.export.lowering` writes this function, `_cholesky_solve` and `_weighted` as loops of
-    # its own: it knows them by their names.
+    # `jaxtank.export.lowering` writes this function, `_cholesky_solve` and `weighted_squares` as
+    # loops of its own: it knows them by their names.
     n = A.shape[0]
     ends = [round(n * k / STAGES) for k in range(STAGES + 1)]
     U = jnp.zeros((0, n), A.dtype)

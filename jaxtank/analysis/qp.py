@@ -53,10 +53,69 @@ class Point(NamedTuple):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(5,))
-def solve(H, f, G, l, u, iterations=MOST):
-    """Return x that minimises 1/2 x'Hx + f'x within l <= G x <= u; differentiable in all five."""
+def solve(H, f, G, l, u, iterations=MOST, needed=True):
+    """Return x that minimises 1/2 x'Hx + f'x within l <= G x <= u; differentiable in all five.
+
+    needed: False (of one programme of a batch) saves the iterations, and x is of no use.
+    """
     unit, inside = _scaled(H, f, G, l, u)
-    return unit * interior_point(*inside, iterations).x
+    return unit * interior_point(*inside, iterations, needed).x
+
+
+@jax.custom_jvp
+def minimum(H, f):
+    """Return x that minimises 1/2 x'Hx + f'x."""
+    return -substitute(factor(H), f)
+
+
+@minimum.defjvp
+def _minimum_slope(primals, tangents):
+    (H, f), (dH, df) = primals, tangents
+    x = minimum(H, f)
+    return x, -_solver(H)(dH @ x + df)
+
+
+def _solver(A):
+    """Return the function b -> A^-1 b, whose derivatives follow from the linear system."""
+    factored = factor(jax.lax.stop_gradient(A))
+    return lambda b: jax.lax.custom_linear_solve(
+        lambda x: A @ x, b, lambda _, b: substitute(factored, b), symmetric=True
+    )
+
+
+def solve_soft(H, f, A, l, u, G, room, penalty, span):
+    """Return (x (n,), s (k,)) of a programme with soft limits, which is always feasible:
+
+        min 1/2 x'Hx + f'x + penalty sum_i (s_i + 50 s_i^2 / span),
+        l <= A x <= u,  G_ji'x <= room_ji + s_i,  s_i >= 0
+
+    with G (samples, k, n), room (samples, k) and s, room far below span. Where the minimum without
+    limits is within them it is taken, which most programmes of a loop spend no iteration on.
+    """
+    n, (samples, k) = f.shape[0], room.shape
+    free = minimum(H, f)
+    reached = A @ free
+    within = jnp.all((l <= reached) & (reached <= u)) & jnp.all(G @ free <= room)
+
+    def limited():
+        none, eye = jnp.zeros((n, k)), jnp.eye(k)
+        curvature = 100.0 / span * penalty * eye
+        rows = jnp.concatenate([G, jnp.broadcast_to(-eye, (samples, k, k))], axis=2)
+        far, high = jnp.full(samples * k, span), jnp.full(k, span)
+        hard = jnp.concatenate([jnp.pad(A, ((0, 0), (0, k))), jnp.eye(k, n + k, n)])
+        z = solve(
+            jnp.block([[H, none], [none.T, curvature]]),
+            jnp.concatenate([f, jnp.full(k, penalty)]),
+            jnp.concatenate([hard, rows.reshape(-1, n + k)]),
+            jnp.concatenate([l, 0.0 * high, -far]),
+            jnp.concatenate([u, high, room.reshape(-1)]),
+            MOST,
+            ~within,
+        )
+        return z[:n], z[n:]
+
+    # of a batch both branches run, with no iteration where `within`
+    return jax.lax.cond(within, lambda: (free, jnp.zeros(k, f.dtype)), limited)
 
 
 def _scaled(H, f, G, l, u):
@@ -84,8 +143,8 @@ def _scaled(H, f, G, l, u):
 
 @solve.defjvp
 def _slope(iterations, primals, tangents):
-    (unit, data), (_, moved) = jax.jvp(_scaled, primals, tangents)
-    point = _held(interior_point(*jax.lax.stop_gradient(data), iterations=iterations), *data)
+    (unit, data), (_, moved) = jax.jvp(_scaled, primals[:5], tangents[:5])
+    point = _held(interior_point(*jax.lax.stop_gradient(data), iterations, primals[5]), *data)
     return unit * point.x, unit * _implicit(point, data, moved)
 
 
@@ -127,13 +186,7 @@ def _implicit(point, data, moved):
         return H @ x + f + G.T @ (lu - ll), row * (G @ x - (up * u + low * l) / both)
 
     a, b = (-r for r in jax.jvp(residual, tuple(data), tuple(moved))[1])
-    normal = _normal(H, G, point)
-    factored = factor(jax.lax.stop_gradient(normal))
-
-    def solved(right):
-        return jax.lax.custom_linear_solve(
-            lambda z: normal @ z, right, lambda _, z: substitute(factored, z), symmetric=True
-        )
+    solved = _solver(_normal(H, G, point))
 
     def corrected(solution, _):
         dx, v = solution
@@ -146,8 +199,10 @@ def _implicit(point, data, moved):
     )[0][0]
 
 
-def interior_point(H, f, G, l, u, iterations=MOST):
-    """Return the `Point` at which the iterates converge, or the last of `iterations`."""
+def interior_point(H, f, G, l, u, iterations=MOST, needed=True):
+    """Return the `Point` at which the iterates converge, or the last of `iterations`; the first
+    unless `needed`.
+    """
     x = jnp.zeros_like(f)
     multipliers = jnp.full(G.shape[0], 0.1, f.dtype)
     rounding = 64.0 * jnp.finfo(f.dtype).eps * jnp.maximum(1.0, jnp.maximum(jnp.abs(u), jnp.abs(l)))
@@ -182,7 +237,8 @@ def interior_point(H, f, G, l, u, iterations=MOST):
             lambda a, b: jnp.where(good, b, a), p, new
         )
 
-    return jax.lax.while_loop(under_way, advance, (jnp.int32(0), start))[1]
+    first = jnp.int32(0) if needed is True else jnp.where(needed, 0, iterations).astype(jnp.int32)
+    return jax.lax.while_loop(under_way, advance, (first, start))[1]
 
 
 def _residuals(p, H, f, G, l, u):

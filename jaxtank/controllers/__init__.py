@@ -9,6 +9,7 @@ from jaxtank.controllers.gain_schedule import Scheduled
 from jaxtank.controllers.gpc import GPC
 from jaxtank.controllers.laguerre import Laguerre
 from jaxtank.controllers.ngpc import NGPC
+from jaxtank.controllers.nmpc import NMPC
 from jaxtank.controllers.on_off import OnOff
 from jaxtank.controllers.open_loop import OpenLoop
 from jaxtank.controllers.override import Override
@@ -24,6 +25,7 @@ __all__ = [
     "GPC",
     "LQI",
     "NGPC",
+    "NMPC",
     "PID",
     "Backstepping",
     "Cascade",

@@ -61,6 +61,17 @@ class Controller(Role):
         """
         return ()
 
+    @pointwise
+    def announced(self, clock: Clock, r: tuple[Any, ...]) -> Any:
+        """Return `inputs`, or what each sample knows of later setpoints r (`NMPC`).
+
+        Parameters
+        ----------
+        clock : sampling instants
+        r : tuple of arrays (samples,), one per output [cm]
+        """
+        return self.inputs(clock)
+
     def shares(self, x: tuple[Any, ...], r: tuple[Any, ...]) -> tuple[Any, ...] | None:
         """Return the share of the first of two blended controllers in each input [-].
 
@@ -156,6 +167,20 @@ class Controller(Role):
     def reads_flow(self) -> bool:
         """True if the flows of the inputs are measured for the controller (`tick.flow`)."""
         return False
+
+    @property
+    def reads_ahead(self) -> bool:
+        """True if later setpoints are known to the controller (`announced`)."""
+        return False
+
+    @property
+    def limits_levels(self) -> bool:
+        """True if levels have limits in the controller's own programme (`slack`)."""
+        return False
+
+    def slack(self, state: Any) -> Any:
+        """Return how far a limit of a level is given up in the plan of `state` [cm]."""
+        return 0.0
 
     @property
     def ignores_disturbance(self) -> bool:

@@ -167,6 +167,21 @@ class Scheduled(Controller):
     def inputs(self, clock: Clock) -> Any:
         return self._without_gains().inputs(clock)
 
+    @pointwise
+    def announced(self, clock: Clock, r: tuple) -> Any:
+        return self._without_gains().announced(clock, r)
+
+    def slack(self, state: Any) -> Any:
+        return self.law.slack(state.inner)
+
+    @property
+    def limits_levels(self) -> bool:
+        return self.law.limits_levels
+
+    @property
+    def reads_ahead(self) -> bool:
+        return self.law.reads_ahead
+
     def init(self, x0: tuple, u0: tuple) -> Any:
         return Memory(
             inner=self._without_gains().init(x0, u0),

@@ -18,7 +18,7 @@ from jaxtank.core.errors import InputError
 
 CHUNK = 2**18  # samples
 # methods of components that are called before the time loop
-METHODS = ("sample", "windows", "since", "prepare", "inputs")
+METHODS = ("sample", "windows", "since", "prepare", "inputs", "announced")
 INTEGRATORS = ("rk4", "midpoint")
 LARGEST_RUN = 100_000_000  # samples
 

@@ -69,3 +69,4 @@ class Sample(NamedTuple):
     # volume that a negative inflow could not take from each tank in that time [cm^3]
     shortfall: Sequence[Any] = ()
     filtered: Any = 0.0  # 1 where the safety filter changed an input, else 0
+    slack: Any = 0.0  # by which the controller gives up a limit of a level [cm]

@@ -332,7 +332,7 @@ def _cholesky_solve(writer, upper, b):
     return writer.matrix("backward", (upper.T, y), (n, 1), (n,))
 
 
-def _weighted(writer, g, weight):
+def weighted_squares(writer, g, weight):
     scaled = each(lambda a, w: writer.define(REAL, "mul", a, w), g, weight[:, None])
     return product(writer, scaled.T, g, (((1,), (0,)), ((), ())))
 
@@ -564,5 +564,5 @@ RULES = {
 }
 """{primitive of jax: function (writer, equation, operands) -> list of arrays of elements}."""
 
-NAMED = {f.__name__: f for f in (_cholesky, _cholesky_solve, _weighted)}
+NAMED = {f.__name__: f for f in (_cholesky, _cholesky_solve, weighted_squares)}
 """{function of `jaxtank.analysis.qp`: function (writer, *operands) -> array of elements}."""

@@ -166,6 +166,11 @@ def _check_controller(case):
             " setpoints alone: leave out controller.inflow_gain and follow_inflow, and of a"
             ' flow-cascade write kind = "pi"'
         )
+    if controller.reads_ahead:
+        raise InputError(
+            f"{case.name}: its controller reads setpoints ahead, and exported code reads those of"
+            " the present sample: set controller.preview = 0"
+        )
     check_prepared(controller)
 
 

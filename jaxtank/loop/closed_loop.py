@@ -221,7 +221,7 @@ def inputs_at(
         xi=xi,
         context=_context(loop, moments, names, r),
         plan=loop.controller.prepare(*known),
-        own=loop.controller.inputs(moments),
+        own=loop.controller.announced(moments, known[0]),
         fault=None if loop.faults is None else loop.faults.sample(moments),
     )
 

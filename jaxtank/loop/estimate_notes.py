@@ -119,7 +119,8 @@ def is_unused(loop: ClosedLoop) -> bool:
         return False
     along = tuple(jax.ShapeDtypeStruct((1,), number.dtype) for _ in r)
     plan: Any = jax.eval_shape(loop.controller.prepare, along, along, along)
-    signals: Any = jax.eval_shape(lambda: loop.controller.inputs(Clock(dt=1.0, duration=0.0)))
+    clock = Clock(dt=1.0, duration=0.0)
+    signals: Any = jax.eval_shape(lambda r: loop.controller.announced(clock, r), along)
     plan, signals = jax.tree.map(
         lambda v: jax.ShapeDtypeStruct(v.shape[1:], v.dtype), (plan, signals)
     )

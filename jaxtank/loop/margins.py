@@ -242,7 +242,7 @@ def constant_inputs(loop: ClosedLoop, clock: Clock, r: Any) -> Inputs:
     columns = tuple(v[None] for v in r)
     zero = tuple(jnp.zeros_like(v) for v in columns)
     plan = loop.controller.prepare(columns, zero, zero)
-    signals = loop.controller.inputs(dataclasses.replace(clock, duration=clock.dt))
+    signals = loop.controller.announced(dataclasses.replace(clock, duration=clock.dt), columns)
     rows: Any = (columns, zero, zero, plan, signals)
     r, dr, ddr, plan, signals = jax.tree.map(lambda a: a[0], rows)
     inflow = steady_inflow(loop)

@@ -38,6 +38,7 @@ class Decision(NamedTuple):
     observer: Any  # its state after the sample
     controller: Any  # its state after the sample
     filtered: Any = 0.0  # 1 where the safety filter changed an input, else 0
+    slack: Any = 0.0  # by which the controller gives up a limit of a level [cm]
 
 
 def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[State, Sample]:
@@ -63,6 +64,7 @@ def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[Sta
         spilled=spilled,
         shortfall=shortfall,
         filtered=decision.filtered,
+        slack=decision.slack,
     )
     return moved._replace(observer=decision.observer, controller=decision.controller), sample
 
@@ -93,6 +95,7 @@ def decide(
     wanted = command
     if manual is not None:
         command = tuple(jnp.where(manual[0], w, u) for w, u in zip(manual[1], scalars(command)))
+    slack = loop.controller.slack(controller)
     allocates = actuator.allocates or safety_filter is not None
     metric = loop.controller.input_metric(_estimate_for(loop, estimate)) if allocates else None
     if safety_filter is None:
@@ -117,7 +120,7 @@ def decide(
         controller = controller, moved_on(under_way, scalars(applied))
     if limited_rate:
         controller = controller, applied
-    return Decision(estimate, command, applied, observer, controller, filtered)
+    return Decision(estimate, command, applied, observer, controller, filtered, slack)
 
 
 def tick_of(loop: ClosedLoop, clock: Clock, t: Any, state: State, now: Inputs) -> Tick:

@@ -314,6 +314,9 @@ _BUILT_IN: dict[str, Accumulator] = {
         lambda run: nothing(run.zero),
         lambda run, state, sample, context: plus(state, sample.filtered),
     ),
+    "slack": Accumulator(
+        lambda run: run.zero, lambda run, state, sample, context: jnp.maximum(state, sample.slack)
+    ),
     "over_rim2": _sum_of_squares("tanks", _over_rim),
     "spilled": _sum("tanks", _lasting(lambda run, s: s.spilled)),
     "shortfall": _sum("tanks", _lasting(lambda run, s: s.shortfall)),

@@ -256,6 +256,14 @@ _BUILT_IN: dict[str, Measure] = {
         counts=True,
         unserved="the safety filter is off",
     ),
+    "limit_slack": _measure(
+        "cm",
+        "run",
+        "slack",
+        lambda run, largest: largest,
+        "largest level above a limit in the plans of the controller: above 0, no input keeps it",
+        unserved="the controller has no limits of levels",
+    ),
     "saturation_excess": _measure(
         "-",
         "run",

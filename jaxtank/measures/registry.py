@@ -270,7 +270,7 @@ def of_loop(loop: Any) -> tuple[str, ...]:
 def serves(name: str, loop: Any) -> bool:
     """Return whether the measure `name` means something for this loop: its reference changes, its
     holds setpoints, its tanks have inflow pulses, its steady inputs are known in closed form, its
-    levels have a lower clip, it has a safety filter.
+    levels have a lower clip, it has a safety filter, its controller has limits of levels.
     """
     fields, plant = refers_to([name]), loop.plant
     if MEASURES[name].linear and loop.reference.held() is None:
@@ -282,6 +282,8 @@ def serves(name: str, loop: Any) -> bool:
     if "shortfall" in MEASURES[name].needs and not plant.bottom:
         return False
     if "filtered" in MEASURES[name].needs and loop.safety_filter is None:
+        return False
+    if "slack" in MEASURES[name].needs and not loop.controller.limits_levels:
         return False
     return not fields & _missing(loop)
 

@@ -106,6 +106,6 @@ def _in_scalars(sample: Sample, context: Context) -> tuple[Sample, Context]:
     """The same with tuples of scalars as vectors."""
     window = None if context.window is None else _rows_of(context.window)
     context = context._replace(window=window, steady=scalars(context.steady))
-    alone = {"t": sample.t, "filtered": sample.filtered}
+    alone = {"t": sample.t, "filtered": sample.filtered, "slack": sample.slack}
     vectors = {f: scalars(v) for f, v in sample._asdict().items() if f not in alone}
     return Sample(**alone, **vectors), context

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Case, Free
-from jaxtank.controllers import NGPC, Backstepping
+from jaxtank.controllers import NGPC, NMPC, Backstepping
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
 from jaxtank.loop.margins import stability_margins
@@ -281,6 +281,9 @@ START = (3.0, 3.0)  # r(0) [cm]
 
 TUNABLE = {
     "controller.Tp": Free(1.0, 60.0),
+    "controller.horizon": Free(10.0, 200.0),
+    "controller.rate_time": Free(1.0, 60.0),
+    "controller.r_w": Free(1e-6, 1.0),
     "controller.k": Free(1e-3, 50.0),
     "controller.k1": Free(1e-3, 5.0),
     "observer.l": Free(2e-3, 5.0),
@@ -305,7 +308,18 @@ OBSERVED = {
     ),
 }
 # a1 .. a4, sec. 5.2 [cm/V]; full scale of the STM32 board's converter, not in the paper [V]
+PREDICTIVE = {
+    "nmpc": (
+        "nonlinear predictive control by programmes in the loop, with the rims as limits",
+        ("controller.horizon", "controller.rate_time"),
+    ),
+    "nmpc-preview": (
+        "the same with setpoints known a minute ahead",
+        ("controller.horizon", "controller.r_w"),
+    ),
+}
 SENSOR = ((9.4458, 8.7106, 8.5106, 9.3458), 3.3)
+SECOND = Clock(dt=1.0, duration=1200.0, substeps=10)  # of the predictive controllers
 GAIN = 0.5  # l of every tank in OBSERVED (notes A10) [1/s]
 VARIANTS = {
     "-table1": "plant A: areas as printed in Table 1",
@@ -318,6 +332,10 @@ def controller_of(kind, model):
     """Return a controller with the gains of sec. 5.1 and `model` as its model of the plant."""
     if kind == "ngpc":
         return NGPC(model=model, Tp=11.0, level_floor=0.01)
+    if kind in PREDICTIVE:
+        preview, limits = kind == "nmpc-preview", {"low": [0.0] * 2, "high": [12.0] * 2}
+        times = {"horizon": 50.0, "preview": 60.0} if preview else {"horizon": 30.0}
+        return NMPC(model=model, r_w=[1e-4] * 2, rate_time=8.0, **times, **limits)
     rates = kind == "backstepping-ff"
     return Backstepping(model=model, k=0.03, k1=0.088, level_floor=0.01, reference_rates=rates)
 
@@ -393,8 +411,9 @@ def measured(run):
 def preset():
     """Return the Preset of this paper."""
     suffixes = itertools.product(("", "-table1"), ("", "-boxqp"), ("", "-slow"))
-    cases, kinds = {}, CONTROLLERS | OBSERVED
-    every = [*itertools.product(CONTROLLERS, suffixes), *((kind, ("",) * 3) for kind in OBSERVED)]
+    cases, kinds = {}, CONTROLLERS | OBSERVED | PREDICTIVE
+    single = [(kind, ("",) * 3) for kind in OBSERVED | PREDICTIVE]
+    every = [*itertools.product(CONTROLLERS, suffixes), *single]
     for kind, (table1, boxqp, slow) in every:
         title, free = kinds[kind]
         name = f"{kind}{table1}{boxqp}{slow}"
@@ -408,7 +427,7 @@ def preset():
                 saturation="boxqp" if boxqp else "clip",
                 ramp=200.0 if slow else 60.0,
             ),
-            clock=Clock(dt=0.01, duration=1200.0),
+            clock=SECOND if kind in PREDICTIVE else Clock(dt=0.01, duration=1200.0),
             limits={"max_level": "rim"},
             free={p: TUNABLE[p] for p in free},
             objective={"rms_error_total": 1.0},

@@ -58,6 +58,7 @@ ROLES = {
             "fuzzy": controllers.FuzzyBlend,
             "gpc": controllers.GPC,
             "laguerre": controllers.Laguerre,
+            "nmpc": controllers.NMPC,
             "open-loop": controllers.OpenLoop,
         },
     ),
@@ -199,10 +200,10 @@ WITHOUT = {
 INPUTS = ("sequence", "reverse", "lead", "follow")
 """Static fields that hold inputs, not tanks."""
 
-LIMITED = ("on-off", "split-range", "ratio")
+LIMITED = ("on-off", "split-range", "ratio", "nmpc")
 """Kinds whose `low` and `high` are by default the limits of the actuator."""
 
-LOWER_LIMITS = {"level_floor": 0.01, "difference_floor": 0.01}
+LENGTHS = {"level_floor": 0.01, "difference_floor": 0.01, "penalty": 1e3}
 """Such defaults in centimetres [cm], converted to the rig's unit of length."""
 
 
@@ -222,8 +223,8 @@ def _key(cls, field, kind, units):
     default = NEEDED if field.default is dataclasses.MISSING else None
     if kind not in REGISTERED:
         default = USUAL.get(field.name, default)
-        if field.name in LOWER_LIMITS:
-            default = in_unit(LOWER_LIMITS[field.name], units[0])
+        if field.name in LENGTHS:
+            default = in_unit(LENGTHS[field.name], units[0])
     if kind == "pi" and field.name == "Ti":
         default = NEEDED
     changes = {}

@@ -36,7 +36,7 @@ def core_us(n, batch, slope):
 
 
 def main():
-    names = ("_cholesky", "_cholesky_solve", "_weighted")
+    names = ("_cholesky", "_cholesky_solve", "weighted_squares")
     ours = [getattr(elimination, name) for name in names]
     lapack = (
         lambda A: jax.scipy.linalg.cholesky(A),

@@ -24,7 +24,7 @@ NEW = [name for name in NAMES if not name.startswith("gouta2015")]
 CONTRACT = {
     "gouta2015": (
         "ngpc backstepping backstepping-ff ngpc-table1 backstepping-boxqp ngpc-slow ngpc-observer"
-        " backstepping-observer"
+        " backstepping-observer nmpc nmpc-preview"
     ),
     "gouta2022": (
         "enmpc chadpc pi pi-ff pid pid-ff fopi fopi-ff enmpc-printed chadpc-printed"
@@ -45,6 +45,7 @@ CONTRACT = {
 }
 NAMES_THAT_MUST_EXIST = {
     "gouta2022/chadpc": "controller.Tp observer.l plant.pump_gain actuator.dead_zone",
+    "gouta2015/nmpc": "controller.horizon controller.r_w controller.q controller.terminal",
     "gouta2015/backstepping-observer": "controller.k controller.k1 observer.l",
     "gouta2022/pid": "controller.Kc controller.Ti controller.Td",
     "gouta2022/fopi": "controller.order",

@@ -287,6 +287,13 @@ def _laguerre(known: Rig) -> Any:
     return table | {"a": np.full(len(known.C), 0.5)}, (*names, "a")
 
 
+def _nonlinear(known: Rig) -> Any:
+    """A horizon of the slowest time constant; moves that cost little."""
+    effort = 0.01 * (known.off / known.effort) ** 2
+    limits = {"low": known.low, "high": known.high}
+    return {"horizon": known.slowest, "r_w": effort, **limits}, ("horizon", "r_w")
+
+
 START: dict[str, Callable[[Rig], Any]] = {
     "pid": _pid,
     "pi": _pid,
@@ -300,5 +307,6 @@ START: dict[str, Callable[[Rig], Any]] = {
     "fuzzy": _fuzzy,
     "gpc": _predictive,
     "laguerre": _laguerre,
+    "nmpc": _nonlinear,
 }
 """{kind: rule (Rig) -> ({field: first value}, names of those that are tuned)}."""

@@ -1,0 +1,215 @@
+"""Nonlinear predictive control against an independent programme, differences and its own limits."""
+
+import jax
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import jaxtank
+from jaxtank import presets, rig
+from jaxtank.controllers import NMPC
+from jaxtank.core.clock import Clock
+from jaxtank.core.errors import InputError
+from jaxtank.core.records import Estimate, Tick
+from jaxtank.export import export
+from jaxtank.plants.rigs import quadruple_tank
+from jaxtank.presets.paper import closed_loop
+from jaxtank.signals.setpoints import ramps
+
+SERIES = """
+tank = [
+    { area = 12.0, rim = 20.0, level = 4.0, inflow = 1.0 },
+    { area = 10.0, rim = 20.0, drain = 0.1, level = 4.0, inflow = 1.0 },
+]
+orifice = [{ from = 1, to = 2, area = 0.1 }]
+pump = [{ gain = 2.0, to = 1, high = 12.0, initial = 4.43 }]
+plant = { outputs = [2] }
+observer = { kind = "disturbance", l = [0.5, 0.5] }
+reference = { initial = [4.0], changes = [[5.0, 1, 6.0]], ramp = 10.0 }
+values = { "clock.dt" = 1.0, "clock.duration" = 60.0 }
+controller = { kind = "nmpc", horizon = 12.0, r_w = 1e-3, rate = 100.0, N = 6, moves = 4 }
+"""
+T, N, WEIGHT, LAST = 2.0, 6, 1e-3, 4.43
+
+
+@pytest.fixture(scope="module")
+def case():
+    return rig.loads(SERIES)
+
+
+def run(case, **values):
+    loop = jaxtank.with_values(case.loop, {k.replace("__", "."): v for k, v in values.items()})
+    return loop, jaxtank.simulate(loop, case.clock)
+
+
+def predicted(x, inputs):
+    """Levels (N, 2) of the two tanks in series by the classical Runge-Kutta method."""
+
+    def rates(x, u):
+        upper, lower = 0.1 * np.sqrt(2.0 * 981.0 * x[0]), 0.1 * np.sqrt(2.0 * 981.0 * x[1])
+        return np.array([(2.0 * u - upper) / 12.0, (upper - lower) / 10.0])
+
+    levels = []
+    for u in inputs:
+        k1 = rates(x, u)
+        k2 = rates(x + 0.5 * T * k1, u)
+        k3 = rates(x + 0.5 * T * k2, u)
+        k4 = rates(x + T * k3, u)
+        x = x + T / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+        levels.append(x)
+    return np.array(levels)
+
+
+def best_plan(x, setpoint, limit, last):
+    """Inputs at the knots by SLSQP on the nonlinear programme, slopes by complex steps."""
+    places = np.array([0.0, 1.0, 20.0 / 9.0, 5.0])  # the larger of k and 5 (k/3)^2
+    blend = np.array([np.interp(np.arange(N), places, row) for row in np.eye(4)]).T
+
+    def cost(knots):
+        inputs = blend @ knots
+        levels = predicted(x, inputs)
+        moves = np.concatenate([inputs[:1] - last, np.diff(inputs)])
+        return np.sum((levels[:, 1] - setpoint) ** 2) + WEIGHT * np.sum(moves**2)
+
+    def slope(f, at):
+        steps = 1e-30j * np.eye(4)
+        return np.stack([np.imag(f(at + step)) / 1e-30 for step in steps], axis=-1)
+
+    room = lambda knots: limit - predicted(x, blend @ knots)[:, 0]
+    answer = minimize(
+        cost,
+        np.full(4, last),
+        jac=lambda knots: slope(cost, knots),
+        bounds=[(0.0, 12.0)] * 4,
+        constraints={"type": "ineq", "fun": room, "jac": lambda knots: slope(room, knots)},
+        options={"ftol": 1e-15, "maxiter": 200},
+    )
+    return answer.x, room(answer.x)
+
+
+LEAVES = ("horizon", "r_w", "rate_time", "terminal", "limit[0]", "rate")
+
+
+@pytest.fixture(scope="module")
+def planned(case):
+    """One sample: (plan (4,), its derivatives (4, 6) by LEAVES, the state after it)."""
+
+    def plan(point, state, tick):
+        values = dict(zip((f"controller.{name}" for name in LEAVES), point))
+        controller = jaxtank.with_values(case.loop, values).controller
+        after = controller.step(state, tick, Estimate(x=(4.0, 4.0), d=(0.0, 0.0)))[1]
+        return after.knots, after
+
+    def both(*arguments):
+        slopes, after = jax.jacfwd(plan, has_aux=True)(*arguments)
+        return after.knots, slopes, after
+
+    compiled = jax.jit(both)
+    start = case.loop.controller.init((4.0, 4.0), (LAST,))
+
+    def sample(point, setpoint, dt, state=start):
+        tick = Tick(t=0.0, r=(setpoint,), dr=(0.1,), ddr=(0.0,), dt=dt)
+        return compiled(np.asarray(point), state, tick)
+
+    return sample
+
+
+@pytest.mark.parametrize(("setpoint", "limit"), [(4.2, 20.0), (4.5, 4.6), (7.0, 20.0)])
+def test_programmes_in_sequence_end_at_the_solution_of_the_nonlinear_programme(
+    planned, setpoint, limit
+):
+    # a clock that stands still: the same programme is linearised at its own solution
+    point = (12.0, WEIGHT, 0.0, 1.0, limit, 1e9)
+    knots, _, state = planned(point, setpoint, 1e-6)
+    for _ in range(12):
+        knots, _, state = planned(point, setpoint, 1e-6, state)
+    plan, room = best_plan(np.array([4.0, 4.0]), setpoint, limit, LAST)
+    np.testing.assert_allclose(knots, plan, atol=1e-6)
+    assert (room.min() < 1e-8) == (limit < 20.0)
+    assert float(state.slack) < 1e-8
+
+
+@pytest.mark.parametrize(
+    ("setpoint", "limit", "rate"),
+    [
+        (4.2, 20.0, 100.0),
+        (4.5, 4.6, 100.0),
+        (7.0, 20.0, 100.0),
+        (4.2, 20.0, 0.3),
+        (4.2, 2.5, 100.0),
+    ],
+    ids=["no limit acts", "level", "input", "rate", "slack"],
+)
+def test_slopes_of_a_plan_are_those_of_differences(planned, setpoint, limit, rate):
+    point = np.array([12.0, WEIGHT, 3.0, 1.0, limit, rate])
+    state = planned(point, setpoint, 1.0)[2]
+    value = lambda point: np.asarray(planned(point, setpoint, 1.0, state)[0])
+    steps = 1e-4 * np.diag(point)
+    differences = [(value(point + h) - value(point - h)) / (2.0 * h.sum()) for h in steps]
+    exact = planned(point, setpoint, 1.0, state)[1]
+    np.testing.assert_allclose(exact, np.stack(differences, axis=1), rtol=1e-4, atol=1e-5)
+
+
+def test_a_limit_that_no_input_keeps_is_given_up_and_reported(case):
+    loop, trajectory = run(case, controller__limit=[1.0, 20.0])
+    assert np.all(np.isfinite(trajectory.x))
+    assert float(trajectory.u[0, 0]) < 1e-9  # while the level is above its limit
+    assert float(trajectory.x[-1, 0]) == pytest.approx(1.0, abs=1e-4)
+    measured = jaxtank.evaluate(loop, case.clock, ["limit_slack"])["limit_slack"]
+    falling = predicted(np.array([4.0, 4.0]), np.zeros(1))[0, 0] - 1.0  # after a predicted sample
+    assert float(measured) == pytest.approx(falling, abs=0.02)  # linearised at another input
+
+
+def test_a_constant_inflow_leaves_no_error(case):
+    _, trajectory = run(case, disturbance__level=[3.0, 4.0])
+    assert abs(float(trajectory.e[-1, 0])) < 1e-4
+
+
+def test_the_inputs_keep_their_largest_rate(case):
+    _, trajectory = run(case, controller__rate=0.2)
+    moves = np.abs(np.diff(trajectory.u[:, 0]))
+    assert moves.max() == pytest.approx(0.2, abs=1e-6) and moves.max() < 0.2 + 1e-8
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"controller.moves": 7}, "controller.moves = 7"),
+        ({"actuator.delay": 2.0}, "actuator.delay = 2 s"),
+        ({"controller.high": -1.0}, "controller.high"),
+    ],
+)
+def test_what_the_programme_cannot_have_is_refused(case, change, words):
+    with pytest.raises(InputError, match=words):
+        rig.check(rig.set_values(case, change))
+
+
+def test_code_of_one_sample_reads_no_setpoints_ahead():
+    with pytest.raises(InputError, match=r"controller\.preview"):
+        export(presets.find("gouta2015/nmpc-preview"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "most"), [("nmpc", 0.045), ("nmpc-preview", 0.032)])
+def test_the_four_tank_follows_below_its_rims(kind, most):
+    case = presets.find(f"gouta2015/{kind}")
+    trajectory = jaxtank.simulate(case)
+    assert np.sqrt(np.mean(trajectory.e**2, axis=0).sum()) < most
+    assert trajectory.x.max() < 30.0005
+
+
+@pytest.mark.slow
+def test_a_quadruple_tank_reaches_its_setpoints_without_passing_a_limit():
+    # the task of Dyad's quadruple tank: [2, 1, 8, 3] to [9.82, 9.82, 6.28, 6.28] cm
+    shape = {"area": (4.9,) * 4, "outlet": (0.03,) * 4, "pump_gain": 1.6, "split": 0.2, "rim": 20.0}
+    plant = jaxtank.with_values(quadruple_tank(**shape), {"gravity": 9.81})
+    programme = {"low": [0.0, 0.0], "high": [0.6, 0.6], "iterations": 3}
+    limits = np.array([12.0, 12.0, 8.0, 8.0])
+    controller = NMPC(model=plant, horizon=600.0, r_w=[1.0, 1.0], limit=limits, **programme)
+    loop = closed_loop(
+        plant, controller, ramps([9.82, 9.82], []), [2.0, 1.0, 8.0, 3.0],
+        sensor=(1.0, 3.3), pumps={"low": 0.0, "high": 0.6, "initial": 0.26},
+    )  # fmt: skip
+    trajectory = jaxtank.simulate(loop, Clock(dt=10.0, duration=3000.0, substeps=10))
+    assert np.all(trajectory.x.max(axis=0) < limits + 1e-6)
+    np.testing.assert_allclose(trajectory.x[-1], [9.82, 9.82, 6.28, 6.28], atol=0.01)
