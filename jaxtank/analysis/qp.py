@@ -109,8 +109,7 @@ def solve_soft(H, f, A, l, u, G, room, penalty, span):
             jnp.concatenate([hard, rows.reshape(-1, n + k)]),
             jnp.concatenate([l, 0.0 * high, -far]),
             jnp.concatenate([u, high, room.reshape(-1)]),
-            MOST,
-            ~within,
+            needed=~within,
         )
         return z[:n], z[n:]
 

@@ -134,7 +134,8 @@ class NMPC(Controller):
 
     def blend(self, at: Any) -> jax.Array:
         """Return rows (places m, moves m): inputs at places `at`, in T from now, by a plan."""
-        knots, at, m = self.places, jnp.asarray(at)[:, None], self.model.pumps
+        knots: Any = self.places
+        at, m = jnp.asarray(at)[:, None], self.model.pumps
         past = portion(at, knots[:-1], knots[1:]) / np.diff(knots)  # 0 before a knot, 1 after
         first, last = jnp.ones_like(at), jnp.zeros_like(at)
         share = jnp.concatenate([first, past], axis=1) - jnp.concatenate([past, last], axis=1)

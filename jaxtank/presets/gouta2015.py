@@ -333,9 +333,16 @@ def controller_of(kind, model):
     if kind == "ngpc":
         return NGPC(model=model, Tp=11.0, level_floor=0.01)
     if kind in PREDICTIVE:
-        preview, limits = kind == "nmpc-preview", {"low": [0.0] * 2, "high": [12.0] * 2}
-        times = {"horizon": 50.0, "preview": 60.0} if preview else {"horizon": 30.0}
-        return NMPC(model=model, r_w=[1e-4] * 2, rate_time=8.0, **times, **limits)
+        preview, each = kind == "nmpc-preview", lambda value: number([value] * 2)
+        return NMPC(
+            model=model,
+            horizon=50.0 if preview else 30.0,
+            r_w=each(1e-4),
+            rate_time=8.0,
+            low=each(0.0),
+            high=each(12.0),
+            preview=60.0 if preview else 0.0,
+        )
     rates = kind == "backstepping-ff"
     return Backstepping(model=model, k=0.03, k1=0.088, level_floor=0.01, reference_rates=rates)
 
