@@ -143,7 +143,9 @@ def _scaled(H, f, G, l, u):
 @solve.defjvp
 def _slope(iterations, primals, tangents):
     (unit, data), (_, moved) = jax.jvp(_scaled, primals[:5], tangents[:5])
-    point = _held(interior_point(*jax.lax.stop_gradient(data), iterations, primals[5]), *data)
+    inside = jax.lax.stop_gradient(data)
+    point = interior_point(*inside, iterations=iterations, needed=primals[5])
+    point = _held(point, *data)
     return unit * point.x, unit * _implicit(point, data, moved)
 
 
