@@ -1,4 +1,4 @@
-"""A controller and its observer as source code without dependencies: C99, MATLAB, or your own."""
+"""A controller and its observer, or a plant, as C99, Structured Text, MATLAB, JavaScript or FMU."""
 
 from jaxtank.export.source import Language, export, register
 

@@ -142,8 +142,10 @@ def _integer_power(writer, eqn, operands):
 
 
 def _clamp(writer, eqn, operands):
+    kind = _out_kind(eqn)
+
     def clamp(low, x, high):
-        return writer.define(REAL, "min", writer.define(REAL, "max", x, low), high)
+        return writer.define(kind, "min", writer.define(kind, "max", x, low), high)
 
     return [each(clamp, *operands)]
 
