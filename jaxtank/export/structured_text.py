@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from jaxtank.core.errors import InputError
 from jaxtank.export.printer import OPERATIONS, Printer, field_of, header, note_of
 from jaxtank.export.statements import (
     REAL,
@@ -18,7 +17,7 @@ from jaxtank.export.statements import (
 )
 
 LARGEST = {"double": "1.7976931348623157E+308", "float": "3.4028234E+38"}
-"""What stands for infinity, of which the language has no number."""
+"""Stands for infinity and for NaN, of which the language has no numbers."""
 
 INPUTS = {
     "y": "level",
@@ -41,7 +40,8 @@ class StructuredText(Printer):
 
     def __init__(self, precision, places, variables):
         real = "LREAL" if precision == "double" else "REAL"
-        self.infinity, self.places, self.counters = LARGEST[precision], places, 0
+        self.nan = self.infinity = LARGEST[precision]
+        self.places, self.counters = places, 0
         self.kinds = {REAL: real, WHOLE: "DINT", TRUTH: "BOOL"}
         self.kind_of = variables
         whole = f"DINT_TO_{real}(TRUNC({{0}}))"
@@ -81,8 +81,6 @@ class StructuredText(Printer):
 
     def value(self, e):
         """Return a number or a Ref as text."""
-        if isinstance(e, float) and np.isnan(e):
-            raise InputError("--lang: this language has no number that is not a number")
         text = super().value(e)
         if isinstance(e, float) and np.isfinite(e) and "e" in text:
             return (text if "." in text else text.replace("e", ".0e")).upper()
