@@ -196,10 +196,10 @@ class Case(CaseViews):
         }
 
     def __str__(self) -> str:
-        heading, *lines = (f"{what}: {text}" if what else text for what, text in self._summary())
+        heading, *lines = (f"{what}: {text}" if what else text for what, text in self.summary())
         return "\n".join([heading, *(f"  {line}" for line in lines)])
 
-    def _summary(self) -> list[tuple[str, str]]:
+    def summary(self) -> list[tuple[str, str]]:
         """(what, text) of each line for people."""
         plant, loop, clock = self.loop.plant, self.loop, self.clock
         sizes = f"{count(plant.tanks, 'tank')}, {count(plant.pumps, 'pump')}"

@@ -53,7 +53,7 @@ class CaseViews:
         return write_folder(folder, files | call("pngs", self.plot()))
 
     def _repr_html_(self: Any) -> str:
-        (_, caption), *rows = self._summary()
+        (_, caption), *rows = self.summary()
         return with_picture(html_table(rows, caption=caption), lambda: call("small", self.plot()))
 
 

@@ -40,13 +40,17 @@ class Result(Shown):
     """A result with a report: `print(result)`, `.to_json()`, `.plot()`, `.save(folder)`."""
 
     def _sections(self) -> Sequence[Any]:
-        return self._report().report(self).judged
+        return self.report().judged
 
     def __str__(self) -> str:
         return repr(self)
 
     def __repr__(self) -> str:
-        return call("terminal", self._report().report(self))
+        return call("terminal", self.report())
+
+    def report(self) -> Any:
+        """Return the `tuning.report.document.Report` of the result: what its renderers show."""
+        return self._report().report(self)
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON object that the command prints with --json: plain numbers, no NaN."""

@@ -165,6 +165,8 @@ def find(name: str) -> Case:
     if not isinstance(name, str):
         raise InputError(f"case {name!r}: must be a text, as 'gouta2015/ngpc'")
     paper, _, case = name.partition("/")
+    if "." in name:
+        raise InputError(f"unknown case {name!r}: the name of a rig file ends in .toml")
     if paper not in PAPERS:
         raise unknown("case", name, names())
     if case not in (cases := load(paper).cases):

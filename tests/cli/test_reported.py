@@ -32,7 +32,7 @@ def test_without_limits_nothing_is_reported_to_hold():
     case = rig.load(ONE_TANK).replace(uncertain={"plant.drain": 0.1})
     quick = tuning.Options(starts=1, screening=1, iterations=1, validation=2)
     result = tuning.tune(case, quick, limits={})
-    page = repr(result)
+    page = " ".join(repr(result).split())
     assert "validation runs" in page and "all limits held" not in page
     assert "rims are limits" not in page and "a level above its rim is not reported" in page
     limit = {"limit": 1.0, "value": 0.5, "margin": 0.5}

@@ -8,7 +8,7 @@ import glob
 import os
 from pathlib import Path
 
-from jaxtank.core.errors import unknown
+from jaxtank.core.errors import InputError, nearest
 
 NAMES = Path(__file__).with_name("names.txt")
 SCRIPTS = {
@@ -58,7 +58,8 @@ KINDS = {
 def script(shell):
     """Return the completion script of a shell."""
     if shell not in SCRIPTS:
-        raise unknown("shell", shell, SCRIPTS)
+        close = nearest(shell, SCRIPTS)
+        raise InputError(f"unknown shell {shell!r}{close}; must be one of {', '.join(SCRIPTS)}")
     return SCRIPTS[shell]
 
 

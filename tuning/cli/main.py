@@ -25,7 +25,10 @@ def main(argv=None):
         warnings.filterwarnings("ignore", message="clock.duration = .* is no whole number")
         warnings.showwarning = _with_cluster_notes(warnings.showwarning)
     try:
-        code = _command(argv)
+        try:
+            code = _command(argv)
+        finally:
+            terminal.end_lines()
         sys.stdout.flush()
         return code
     except KeyboardInterrupt:

@@ -18,6 +18,7 @@ class Option(NamedTuple):
     kind: str = "once"  # or "flag", "switch", "list", "pairs"
     dest: str | None = None
     nargs: Any = None
+    group: str = "options of this command"  # its heading in the help
 
 
 class Command(NamedTuple):
@@ -31,13 +32,20 @@ class Command(NamedTuple):
     compiles: bool = True
 
 
+def grouped(group: str, *options: Option) -> tuple[Option, ...]:
+    """Return options under one heading of the help."""
+    return tuple(option._replace(group=group) for option in options)
+
+
 SEEDS = values.whole(0, 2**31 - 1)
 # fmt: off
-COMMON = (
+COMMON = grouped(
+    "output",
     Option("--json", help="one JSON object on stdout instead of tables", kind="flag"),
     Option("--quiet", help="no progress on stderr", kind="flag"),
 )
-CASE = (
+CASE = grouped(
+    "the case",
     Option("--set", "NAME=VALUE", "set a parameter by its dotted name", values.pair(), kind="pairs",
            dest="values"),
     Option("--schedule", "NAME=VARIABLE:K1,K2,...", "a gain that follows a setpoint (r1, ..) or a"
@@ -49,26 +57,33 @@ CASE = (
            " comes near its limit; --no-safety-filter: none", kind="switch"),
     Option("case", "CASE", '"paper/case" (see jaxtank list) or a rig file ending in .toml'),
 )
-RUN = (
+RUN = grouped(
+    "output",
     Option("--seed", "N", "seed of noise, plants and search points", SEEDS, 0),
     Option("--out", "DIR", "folder for result.json, report.html, CSV, pictures and the rig (attack:"
            " worst.toml)", values.folder),
 )
-UNCERTAIN = (
+UNCERTAIN = grouped(
+    "uncertain plants",
     Option("--spread", "FRACTION", "one relative half-width for all parameters that the case calls"
            " uncertain, as 0.1 for +-10 % (tune: not with --nominal)", values.share),
     Option("--vary", "NAME=DISTRIBUTION", "an uncertain parameter; replaces the ones of the case;"
            " plant.drain=uniform:5% or normal:MEAN:SD (tune: not with --nominal)",
            values.pair(str), kind="pairs"),
 )
-CLUSTER = (
+CLUSTER = grouped(
+    "machines",
     Option("--cluster", "ADDRESS", "run on a Dask cluster: HOST:PORT of its scheduler, or local:N"
            ' for N workers on this machine (pip install ".[cluster]")'),
 )
-DEVICES = (
+DEVICES = grouped(
+    "machines",
     *CLUSTER,
     Option("--devices", "N", "devices of this machine to use", values.whole(1, 1024), 1),
 )
-RESUME = Option("--resume", "DIR", "go on where a killed run with --out DIR ended, to the same"
-                " result", values.earlier_folder)
+(RESUME,) = grouped(
+    "output",
+    Option("--resume", "DIR", "go on where a killed run with --out DIR ended, to the same result",
+           values.earlier_folder),
+)
 # fmt: on

@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+import textwrap
 
 from jaxtank.core.errors import InputError, nearest
 from tuning.cli.commands import case, explore, falsification, identification, studies, tools, tuning
@@ -92,6 +93,34 @@ class Pairs(argparse.Action):
         setattr(namespace, self.dest, pairs | {name: value})
 
 
+EXAMPLES = {
+    "list": ("", "--all"),
+    "show": ("gouta2015/backstepping", "tank.toml --json"),
+    "simulate": ("cascaded/pi --set controller.Kc=2", "gouta2015/ngpc --safety-filter --out run"),
+    "init": ("cascaded/pi > tank.toml", "gouta2015/ngpc --tanks > rig.toml"),
+    "export": ("cascaded/pi --lang c", "tuned/rig.toml --lang js --out controller"),
+    "explore": ("cascaded/pi --out page.html", "tuned/rig.toml --open"),
+    "tune": (
+        "gouta2015/backstepping --out tuned",
+        "cascaded/pi --free controller.Kc=0.1:5 --limit max_level=9",
+    ),
+    "uncertainty": ("cascaded/pi --samples 500", "tuned/rig.toml --promise 0.001 --out plants"),
+    "sensitivity": ("cascaded/pi", "cascaded/pi --method sobol --measure max_level"),
+    "attack": ("gouta2015/backstepping --safety-filter", "tuned/rig.toml --out worst"),
+    "identify": ("rig.toml --data log.csv --out identified", "--inspect log.csv"),
+    "learn": ("tuned/rig.toml --data batch.csv --out next", "tuned/rig.toml --data batch.csv"),
+    "predict": ("identified/rig.toml --data other.csv", "rig.toml --data log.csv --json"),
+    "compare": ("calofir", "all --markdown"),
+    "figure": ("", "gouta2015/6 --out figure.svg"),
+    "completion": ("bash > ~/.local/share/bash-completion/completions/jaxtank", "zsh"),
+    "cache": ("", "clear"),
+    "bench": ("", "cascaded/pi --rounds 3"),
+}
+"""{command: what may follow it}."""
+
+GROUPS = {"the case": 1, "uncertain plants": 2, "machines": 3, "output": 4}
+"""{group of options: its place in the help}; those of the command alone are before them."""
+
 ACTIONS = {"pairs": (Pairs, {}), "list": ("append", []), "flag": ("store_true", False)}
 ACTIONS |= {"switch": (argparse.BooleanOptionalAction, None), "once": (Once, None)}
 
@@ -128,25 +157,48 @@ def parser():
     top.add_argument("--version", action="store_true", help="print the version and exit")
     group = top.add_subparsers(dest="command", metavar="COMMAND")
     for name, command in COMMANDS.items():
+        places = [_place(o) for o in command.options if not o.flag.startswith("-")]
         sub = group.add_parser(
             name,
             help=command.help,
-            description=command.description or f"{command.help[0].upper()}{command.help[1:]}.",
-            epilog=command.epilog,
-            formatter_class=argparse.RawDescriptionHelpFormatter
-            if "\n" in command.epilog
-            else argparse.HelpFormatter,
+            description=_filled(command.description)
+            or _filled(f"{command.help[0].upper()}{command.help[1:]}."),
+            usage=" ".join([f"jaxtank {name}", *places, "[options]"]),
+            epilog="\n".join(["examples:", *(f"  jaxtank {name} {e}" for e in EXAMPLES[name])])
+            + (f"\n\n{_filled(command.epilog)}" if command.epilog else ""),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
         )
+        groups = {}
         for option in command.options:
-            add(sub, option)
+            if not option.flag.startswith("-"):
+                add(sub, option)
+        named = (option for option in command.options if option.flag.startswith("-"))
+        for option in sorted(named, key=lambda o: GROUPS.get(o.group, 0)):
+            if option.group not in groups:
+                groups[option.group] = sub.add_argument_group(option.group)
+            add(groups[option.group], option)
         sub.set_defaults(run=command.run)
     return top
+
+
+def _filled(text):
+    """A text in lines of a terminal; one that has lines is a layout."""
+    return text if "\n" in text else textwrap.fill(text, 78)
+
+
+def _place(option):
+    """An argument in the line of usage."""
+    names = {None: "{}", "?": "[{}]", "*": "[{} ...]", "...": "..."}
+    return names[option.nargs].format(option.metavar)
 
 
 def arguments(argv):
     """Return the Namespace of the words of a command line; InputError with all that is wrong."""
     top = parser()
     Parser.problems = []
+    words = sys.argv[1:] if argv is None else argv
+    if words[:1] == ["help"]:  # jaxtank help, jaxtank help tune
+        argv = [*(word for word in words[1:2] if word in COMMANDS), "--help"]
     args, rest = top.parse_known_args(argv)
     if rest and not rest[0].startswith("-"):
         top.error(f"unknown argument {rest[0]!r}")
@@ -154,7 +206,8 @@ def arguments(argv):
         close = nearest(rest[0].split("=")[0], top.options(args.command))
         top.error(f"unknown option {rest[0]!r}{close}")
     if args.command is None and not args.version:
-        top.error("no command: try jaxtank --help")
+        top.print_help(sys.stdout)
+        raise SystemExit(0)
     resume, out = getattr(args, "resume", None), getattr(args, "out", None)
     if resume and out and resume != out:
         Parser.problems.append(

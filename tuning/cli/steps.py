@@ -4,6 +4,7 @@ import sys
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import printable
+from tuning.cli.terminal import coloured
 
 FILTER = "safety_filter."
 
@@ -197,13 +198,22 @@ def print_result(args, payload, text, done=""):
     print(tables.dumps(payload) if args.json else text())
 
 
+def printed(report):
+    """Return the text of a Report, in colours where stdout takes them."""
+    from tuning.report.document import terminal
+
+    return terminal(report, coloured(sys.stdout))
+
+
 def finish(result, args):
     """Write a result to --out and print it; return the paths that were written."""
     written = []
     try:
         written = result.save(args.out, args.line) if args.out else []
     finally:  # a full disk costs the files, not the printed result; and the checkpoint is kept
-        print_result(args, result.to_json() if args.json else None, lambda: str(result))
+        print_result(
+            args, result.to_json() if args.json else None, lambda: printed(result.report())
+        )
     if args.out and hasattr(args, "resume") and getattr(result, "status", "") != "interrupted":
         from tuning.storage.store import discard
 

@@ -7,6 +7,8 @@ program.
 import io
 import os
 import sys
+import threading
+import time
 
 
 class Forgiving(io.RawIOBase):
@@ -61,22 +63,56 @@ def guard():
     )
 
 
+def coloured(stream):
+    """Return whether colours may be written to a stream (https://no-color.org)."""
+    plain = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb"
+    return stream.isatty() and not plain
+
+
+OPEN: set["Line"] = set()
+"""Lines of progress that have not ended."""
+
+
+def end_lines():
+    """End every line of progress, as before an error is printed."""
+    for line in list(OPEN):
+        line.end()
+
+
 class Line:
-    """Progress on stderr: one line that is overwritten on a terminal, few lines elsewhere."""
+    """Progress on stderr: one line that is overwritten on a terminal, with the seconds since it
+    appeared; few lines elsewhere.
+    """
 
     def __init__(self, quiet):
         self.quiet, self.terminal = quiet, sys.stderr.isatty()
-        self.begun, self.last = False, 0
+        self.words, self.since, self.last = "", 0.0, 0
+        self.ended = threading.Event()
+        self.clock = None
 
     def show(self, words):
         """Print `words`; on a terminal in place of the line before."""
         if self.quiet:
             return
-        start, end = ("\r", "") if self.terminal else ("", "\n")
-        print(
-            f"{start}{words:<70}" if self.terminal else words, end=end, file=sys.stderr, flush=True
-        )
-        self.begun = self.terminal
+        if not self.terminal:
+            print(words, file=sys.stderr, flush=True)
+            return
+        self.words, self.since = words, time.monotonic()
+        self._print()
+        if self.clock is None:
+            OPEN.add(self)
+            self.ended.clear()
+            self.clock = threading.Thread(target=self._tick, daemon=True)
+            self.clock.start()
+
+    def _tick(self):
+        while not self.ended.wait(1.0):
+            self._print()
+
+    def _print(self):
+        seconds = int(time.monotonic() - self.since)
+        text = f"{self.words}, {seconds} s" if seconds else self.words
+        print(f"\r{text[:78]:<78}", end="", file=sys.stderr, flush=True)
 
     def compiling(self, what, seconds):
         """Print, on a terminal only, that `what` is compiled before anything else is to be seen."""
@@ -91,6 +127,9 @@ class Line:
 
     def end(self):
         """End the line on a terminal."""
-        if self.begun:
+        self.ended.set()
+        OPEN.discard(self)
+        if self.clock is not None:
+            self.clock.join()
             print(file=sys.stderr)
-            self.begun = False
+            self.clock = None

@@ -25,9 +25,8 @@ from jaxtank.signals.setpoints import Ramps, Sine
 from tuning.report import safety
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
-from tuning.report.tables import Table, Value, clean
+from tuning.report.tables import Table, Value, clean, columns
 
-WIDTH = 100
 # the head of a numpydoc section: a title underlined with dashes
 SECTION = re.compile(r"^[A-Z]\w*(?: \w+)*\n-{3,}$", re.M)
 BRACKETED = re.compile(r"\[([\w^/(). ]+)\]")
@@ -104,15 +103,18 @@ def report(case):
     outputs = ", ".join(f"h{i + 1}{_name_in_file(case, 'tank', i)}" for i in loop.plant.outputs)
     size = _size(loop.plant)
     indents: dict[str, Any] = {"initial_indent": "  ", "subsequent_indent": "      "}
-    rows = [line for row in page["equations"] for line in textwrap.wrap(row, WIDTH, **indents)]
+    rows = [line for row in page["equations"] for line in textwrap.wrap(row, columns(), **indents)]
     words = [_sensor(loop), _actuator(loop), *_signals(loop), _sampled(case)]
     inner = getattr(loop.controller, "law", None)
     described = [(inner or loop.controller, f"The controller: {page['law']}")]
     described += [(loop.controller, "")] if inner is not None else []
     described += [(loop.observer, f"The observer: {page['observer']}")]
     setpoints = np.stack(loop.reference.sample(case.clock)[0], axis=-1)
+    go_on = [f"jaxtank {words} {case.name}" for words in ("simulate", "tune --out DIR")]
     sections = [
         Text(head),
+        Table([[what, text] for what, text in case.summary()[1:]], gap=True),
+        Text(go_on, gap=True),
         Text(rows, heading=f"The rig: {size}; controlled: {outputs}", layout=True),
         Text([*_called(case), *physics(loop.plant)], items=True, gap=True),
         Text(words, items=True, heading="The loop"),
@@ -129,7 +131,7 @@ def report(case):
         _measures(loop),
         *_paper(case, preset, page),
     ]
-    return Report(title, "", None, (), sections, width=WIDTH)
+    return Report(title, "", None, (), sections)
 
 
 def _tuning(case, preset, page):
@@ -153,7 +155,7 @@ def _measures(loop):
         per = "" if spec.per == "run" else spec.per
         rows.append([m, measure_unit(m, loop.units), per, spec.doc])
     heads = ["measure", "unit", "of each", "what it is"]
-    return Table(rows, heads, heading="What is measured", widths=(22, 9, 8))
+    return Table(rows, heads, heading="What is measured")
 
 
 def _paper(case, preset, page):
@@ -183,10 +185,10 @@ def _docstring(part, loop, heading=""):
         if line.strip() and not line.startswith("  "):
             prose.append(line.strip())
             continue
-        lines += textwrap.wrap(" ".join(prose), WIDTH)
+        lines += textwrap.wrap(" ".join(prose), columns())
         prose = []
-        long = len(line) > WIDTH
-        lines += textwrap.wrap(line.strip(), WIDTH, **indents) if long else [line.rstrip()]
+        long = len(line) > columns()
+        lines += textwrap.wrap(line.strip(), columns(), **indents) if long else [line.rstrip()]
     return Text(lines[:-1], gap=True, heading=heading, layout=True)
 
 
@@ -211,9 +213,9 @@ def _tuned(case, preset, parameters):
         span = f"{free.low:g} : {free.high:g}"
         value = _value(parameter["value"], False)
         rows.append([name, value, printed, parameter["unit"], span, about])
-    heads, widths = ["parameter", "value", "published", "unit", "range"], (26, 18, 12, 8, 14)
+    heads = ["parameter", "value", "published", "unit", "range"]
     rows = rows or [["none", "", "", "", "", ""]]
-    return Table(rows, [*heads, "what it is"], heading="What is tuned", widths=widths)
+    return Table(rows, [*heads, "what it is"], heading="What is tuned")
 
 
 def _every(page):
@@ -227,7 +229,7 @@ def _every(page):
             value = _value(p["value"], p["static"])
             rows.append([name + "*" * p["static"], value, p["unit"], span, p["about"]])
     heads = ["parameter", "value", "unit", "tunable in", "what it is"]
-    return Table(rows, heads, heading="Every parameter", widths=(30, 18, 11, 13))
+    return Table(rows, heads, heading="Every parameter")
 
 
 def _published(preset, parameters):
@@ -242,7 +244,7 @@ def _published(preset, parameters):
         rows.append([name, printed, value, p.where + (f"; {p.reason}" if p.reason else "")])
     heading = f"What the paper prints (`jaxtank compare {preset.paper}` measures it again)"
     heads = ["published", "value", "here", "where"]
-    return Table(rows, heads, heading=heading, widths=(34, 22, 16))
+    return Table(rows, heads, heading=heading)
 
 
 def _plain(value):

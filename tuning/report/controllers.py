@@ -113,7 +113,6 @@ def report(result):
         [("plants", result.samples), ("controllers", len({r.name for r in result.rivals}))],
         [Table(rows, heads, gap=True), Text(notes, items=True, gap=True)],
         result.case.title,
-        width=100,
     )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from jaxtank.core.text import one_line
-from tuning.report.tables import Table
+from tuning.report.tables import Table, columns
 from tuning.report.verdict import Verdict
 
 
@@ -22,14 +22,16 @@ class Text:
     on: str = ""
     layout: bool = False  # columns of characters, as of equations
 
-    def lines(self, width=0):
-        """Return the lines of the sentences, wrapped to `width` characters (0: not wrapped)."""
+    def lines(self):
+        """Return the lines of the sentences, wrapped unless they are a layout."""
         first, rest = ("- ", "  ") if self.items else ("", "")
-        if not width or self.layout:
+        if self.layout:
             return [first + sentence for sentence in self.sentences]
         style: dict[str, Any] = {"break_on_hyphens": False, "break_long_words": False}
         style |= {"initial_indent": first, "subsequent_indent": rest}
-        return [line for s in self.sentences for line in textwrap.wrap(s, width, **style) or [""]]
+        return [
+            line for s in self.sentences for line in textwrap.wrap(s, columns(), **style) or [""]
+        ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +60,6 @@ class Report:
     facts: Sequence[tuple[str, Any]]
     sections: Sequence[Text | Table | Figure | Live]
     subtitle: str = ""
-    width: int = 0  # of lines on a terminal [characters]; 0: not wrapped
     files: Mapping[str, str] = dataclasses.field(default_factory=dict)  # {heading: text}
 
     @property
@@ -73,20 +74,26 @@ class Report:
         return [*first, *self.sections]
 
 
-def terminal(report: Report) -> str:
+BOLD, GOOD, BAD, END = "\033[1m", "\033[1;32m", "\033[1;31m", "\033[0m"
+"""Colours of a terminal: headings, and verdicts."""
+
+
+def terminal(report: Report, colour: bool = False) -> str:
     """Return the text of a Report for a terminal."""
+    painted = lambda line, code: f"{code}{line}{END}" if colour else line
     lines: list[str] = []
     if report.verdict:
-        lines += textwrap.wrap(f"{report.name}: {report.verdict}", 80, break_on_hyphens=False)
+        words, code = f"{report.name}: {report.verdict}", GOOD if report.verdict.good else BAD
+        lines += (painted(line, code) for line in Text([words]).lines())
     for section in report.sections:
         if isinstance(section, (Figure, Live)) or section.on == "page":
             continue
         if (section.gap or section.heading) and lines:
             lines.append("")
         if section.heading:
-            lines += textwrap.wrap(section.heading, report.width or 80)
-            lines.append("=" * min(report.width or 80, len(section.heading)))
-        lines += section.lines(report.width)
+            lines += (painted(line, BOLD) for line in Text([section.heading]).lines())
+            lines.append("=" * min(columns(), len(section.heading)))
+        lines += section.lines()
     return "\n".join(lines)
 
 

@@ -68,8 +68,7 @@ def table_of(case, rows):
             cells.append([tank(row), limit, proved, start, rate, "-", "-", low["why"]])
     heads = ["tank", f"limit [{length}]", "proved", "start", "kappa [1/s]", "at most [1/s]"]
     heads += [f"gap [{length}]", "by, or why not"]
-    widths = (4, 12, 6, 6, 11, 13, 10)
-    return Table(cells, heads, heading="Limits on levels", widths=widths)
+    return Table(cells, heads, heading="Limits on levels")
 
 
 def sentences(case):

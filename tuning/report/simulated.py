@@ -66,8 +66,18 @@ def json_of_run(case, values, seed, plateaus=None):
     return payload if plateaus is None else {**payload, "margins": margins_json(plateaus)}
 
 
-def report(case, values, plateaus=None):
-    """Return the Report of a run with the measures `values`."""
+BRIEF = ("rms_error", "settling_time", "overshoot_percent", "max_level", "input_travel")
+"""Measures of a run on a terminal, after those of the objective, of which there are so many."""
+
+
+def _brief(case, values):
+    """The names of the measures on a terminal: the objective's, then others, five in all."""
+    names = dict.fromkeys([*case.objective, *BRIEF])
+    return [m for m in names if m in values][: len(BRIEF)]
+
+
+def report(case, values, plateaus=None, every=False):
+    """Return the Report of a run with the measures `values`; `every`: all of them on a terminal."""
     loop, limits = case.loop, verdicts.limit_rows(case, values)
     unit = lambda name: unit_text(name, loop.units, loop.plant)
     facts = [
@@ -82,11 +92,21 @@ def report(case, values, plateaus=None):
         more = len(limits) - len(table.rows)
         sections.append(dataclasses.replace(table, on="page"))
         sections.append(Text([f"{more} further limits have larger margins"][:more], on="page"))
-    sections += [
-        measure_table(values, loop.units, gap=True, plant=loop.plant),
-        Text(undefined(values, loop.plant)),
-        *(_margins(loop, plateaus) if plateaus is not None else ()),
-    ]
+    brief = _brief(case, values)
+    of = {"rig_units": loop.units, "gap": True, "plant": loop.plant}
+    if every:
+        sections += [measure_table(values, **of), Text(undefined(values, loop.plant))]
+    else:
+        few = {m: values[m] for m in brief}
+        whole = measure_table(values, **of, on="page")
+        sections += [
+            measure_table(values, **of, names=brief, on="terminal"),
+            Text(undefined(few, loop.plant), on="terminal"),
+            Text([f"--all prints all {len(whole.rows)} measures"], on="terminal"),
+            whole,
+            Text(undefined(values, loop.plant), on="page"),
+        ]
+    sections += [*(_margins(loop, plateaus) if plateaus is not None else ())]
     if loop.safety_filter is not None:
         words = "The safety filter is on: jaxtank show prints what is proved of each tank."
         sections.append(Text([words], gap=True, on="terminal"))

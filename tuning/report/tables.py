@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 import math
+import shutil
 import textwrap
 from collections.abc import Sequence
 from typing import Any
@@ -12,11 +13,17 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.jsonable import clean as clean
-from jaxtank.core.labels import label_of, name_of
+from jaxtank.core.labels import label_of, place_of
 from jaxtank.core.units import DEFAULT
 
-LONGEST = 100
-"""Characters of the line under the head of a table."""
+NARROW, WIDE = 60, 100
+"""Least and most characters of a line on a terminal."""
+
+WORD = 50
+"""Characters of a word in a cell, above which it is broken."""
+
+JOINED = "\u00a0"
+"""A space at which no line is broken."""
 
 MANY = 16
 """Entries of a measure that are printed side by side; of more, the worst."""
@@ -58,11 +65,11 @@ def numbers(value, digits=5):
 def entries(measure, value, plant=None):
     """Return the entries of a measure; of more than 16, the four worst with their numbers."""
     values, spec = np.ravel(np.asarray(value, dtype=float)), ms.MEASURES[measure]
-    if len(values) <= MANY:
-        names = [name_of(plant, spec.per, i) for i in range(len(values)) if spec.per != "run"]
-        if any(names):
-            return "  ".join(f"{name} {numbers(v)}".strip() for name, v in zip(names, values))
+    if spec.per == "run" or (plant is None and len(values) <= MANY):
         return numbers(values)
+    if len(values) <= MANY:
+        places = [place_of(plant, spec.per, i) for i in range(len(values))]
+        return "  ".join(f"{place} {numbers(v)}" for place, v in zip(places, values))
     if np.all(values == values[0]):
         return f"{numbers(values[0])} (each of {len(values)})"
     # undefined values first
@@ -70,6 +77,25 @@ def entries(measure, value, plant=None):
     order = np.argsort(-worse, kind="stable")
     worst = ", ".join(f"{numbers(values[i])} ({label_of(plant, spec.per, i)})" for i in order[:4])
     return f"worst of {len(values)}: {worst}"
+
+
+def columns():
+    """Return the characters of a line on the terminal, 80 where there is none."""
+    return min(max(shutil.get_terminal_size((80, 24)).columns, NARROW), WIDE)
+
+
+def _joined(cell):
+    """The text of a cell: a Value, or entries with two spaces between them, are not broken."""
+    text = str(cell)
+    if not isinstance(cell, Value) and "  " not in text:
+        return text
+    return "  ".join(entry.replace(" ", JOINED) for entry in text.split("  "))
+
+
+def _wrapped(cell, width):
+    """The lines of a cell."""
+    lines = textwrap.wrap(cell, max(width, 1), break_on_hyphens=False) or [""]
+    return [line.replace(JOINED, " ") for line in lines]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,27 +107,46 @@ class Table:
     gap: bool = False
     heading: str = ""
     on: str = ""
-    widths: Sequence[int] = ()  # of the columns but the last one, whose cells are then wrapped
 
-    def lines(self, width=0):
-        """Return the lines of the table as aligned columns."""
-        body = [[str(cell) for cell in row] for row in self.rows]
-        rows = [*([list(self.head)] if self.head else []), *body]
-        widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-        if self.widths:
-            widths = [min(pair) for pair in zip(widths, self.widths)]
-            widths.append(width - sum(widths) - 2 * len(widths))
-        lines = []
-        for row in rows:
-            cells = [self._wrapped(c, w) for c, w in zip(row, widths)]
-            for parts in itertools.zip_longest(*cells, fillvalue=""):
-                lines.append("  ".join(c.ljust(w) for c, w in zip(parts, widths)).rstrip())
-        if self.head:
-            lines[1:1] = ["-" * (width if self.widths else min(LONGEST, len(max(lines, key=len))))]
+    def lines(self):
+        """Return the lines of the table as aligned columns, not wider than the terminal: cells are
+        wrapped, and columns that do not fit stand below the others, after the first column again.
+        """
+        body = [[_joined(cell) for cell in row] for row in self.rows]
+        rows, width = [*([list(self.head)] if self.head else []), *body], columns()
+        words = lambda i: (word for row in rows for word in row[i].split(" "))
+        least = [min(max(map(len, words(i)), default=0), WORD) for i in range(len(rows[0]))]
+        least[0] = min(max(len(row[0]) for row in rows), WORD)
+        blocks, used = [[0]], least[0]
+        for i in range(1, len(least)):
+            if used + 2 + least[i] > width and len(blocks[-1]) > 1:
+                blocks.append([0])
+                used = least[0]
+            blocks[-1].append(i)
+            used += 2 + least[i]
+        lines: list[str] = []
+        for block in blocks:
+            part = [[row[i] for i in block] for row in rows]
+            lines += [""] * bool(lines) + self._aligned(part, [least[i] for i in block], width)
         return lines
 
-    def _wrapped(self, cell, width):
-        return (textwrap.wrap(cell, width) or [""]) if self.widths else [cell]
+    def _aligned(self, rows, least, width):
+        """The lines of columns that fit, the widest ones wrapped; `least` : longest words."""
+        widths = [max(len(row[i]) for row in rows) for i in range(len(least))]
+        while sum(widths) + 2 * (len(widths) - 1) > width:
+            spare = [w - m for w, m in zip(widths, least)]
+            wide = [w if s > 0 else 0 for w, s in zip(widths, spare)]
+            if not any(wide):
+                break
+            widths[wide.index(max(wide))] -= 1
+        lines = []
+        for row in rows:
+            cells = [_wrapped(cell, w) for cell, w in zip(row, widths)]
+            for parts in itertools.zip_longest(*cells, fillvalue=""):
+                lines.append("  ".join(c.ljust(w) for c, w in zip(parts, widths)).rstrip())
+            if self.head and row is rows[0]:
+                lines.append("-" * min(width, sum(widths) + 2 * (len(widths) - 1)))
+        return lines
 
     def __str__(self):
         return "\n".join(self.lines())
@@ -112,14 +157,14 @@ def table(rows, head=()):
     return str(Table(rows, head))
 
 
-def measure_table(values, rig_units=DEFAULT, gap=False, plant=None):
-    """Return the Table of {measure: value}: unit, entries and what the measure is."""
+def measure_table(values, rig_units=DEFAULT, gap=False, plant=None, names=None, on=""):
+    """Return the Table of {measure: value}, of `names` alone: entries with their places, units."""
     rows = [
-        [m, unit_text(m, rig_units, plant), entries(m, values[m], plant), spec.doc]
-        for m, spec in ms.MEASURES.items()
+        [f"{ms.label(m)} [{unit_text(m, rig_units, plant)}]", entries(m, values[m], plant), m]
+        for m in (ms.MEASURES if names is None else names)
         if m in values and m not in ms.times()
     ]
-    return Table(rows, ["measure", "unit", "value", ""], gap)
+    return Table(rows, ["measure", "", "name"], gap, on=on)
 
 
 def unit_text(measure, rig_units, plant=None):

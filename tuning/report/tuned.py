@@ -112,7 +112,6 @@ def report(result, page=False):
             Text(notes, items=True),
         ],
         result.case.title,
-        0 if answer is None else 80,
         {"The tuned rig as a file (rig.toml)": rig} if rig else {},
     )
 
@@ -187,7 +186,7 @@ def of_answer(answer, result=None):
 
 def answer_text(answer):
     """Return the text of an Answer alone."""
-    return terminal(Report("default answer", "", None, (), of_answer(answer), width=80))
+    return terminal(Report("default answer", "", None, (), of_answer(answer)))
 
 
 def _values(result, answer):

@@ -36,8 +36,8 @@ def first(ensemble, samples):
 
 def row(page, label):
     """The cells of one row of the table of measures: unit, mean, its interval, sd, ..."""
-    line = next(line for line in page.splitlines() if line.startswith(label))
-    return [cell.strip() for cell in line.removeprefix(label).split("  ") if cell.strip()]
+    lines = [line.removeprefix(label) for line in page.splitlines() if line.startswith(label)]
+    return [cell.strip() for line in lines for cell in line.split("  ") if cell.strip()]
 
 
 def test_a_single_draw_is_reported_without_a_spread(five):

@@ -24,7 +24,7 @@ def test_the_input_of_a_valve_has_no_unit_beside_that_of_a_pump():
     assert units(plant)["input_deviation"] == ["(m^3/h)^2 s", "s"]
     assert units(plant)["max_level"] == "m" and units(plant)["saturated_fraction"] == "-"
     table = measure_table({"rms_input": np.array([1.0, 0.5])}, plant.units, plant=plant)
-    assert table.rows[0][1] == "m^3/h, -"
+    assert "[m^3/h, -]" in table.rows[0][0]
 
 
 def test_a_valve_in_percent_has_the_unit_of_a_pump_in_percent():

@@ -243,6 +243,7 @@ def test_the_verdict_is_one_sentence_on_page_terminal_notebook_and_in_json(saves
         result = saves(kind).__self__
         assert result.to_json()["verdict"] == said
         assert sentence in " ".join(repr(result).split())
+        assert max(map(len, repr(result).splitlines())) <= 80
         assert sentence in Reader(result._repr_html_()).words
 
 
@@ -321,7 +322,7 @@ def test_sections_become_tables_lists_and_paragraphs():
     assert {tag: tags.count(tag) for tag in counts} == counts
     assert ("td", {"class": "number"}) in read.tags and "never" not in read.words
     assert "x<1" in read.words and f"<p>{words}</p>" in html.fragment(sections)
-    text = terminal(Report("t", "", None, [], sections, width=80)).splitlines()
+    text = terminal(Report("t", "", None, [], sections)).splitlines()
     assert text[:6] == [*textwrap.wrap(words, 80), "other", "- first", "- second", "name  value"]
 
 

@@ -138,6 +138,15 @@ RESULTS = {"tune", "uncertainty", "sensitivity", "compare", "attack", "learn"}
 """Commands that print a result whose `to_json` has the verdict (test_page.py, below)."""
 
 
+@pytest.mark.parametrize("command", [None, *COMMANDS])
+def test_the_help_of_every_command_is_in_groups_with_two_examples(command, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    top = parser()
+    text = (top.commands[command] if command else top).format_help()
+    assert all(len(line) <= 80 for line in text.splitlines())
+    assert command is None or text.count(f"  jaxtank {command}") >= 2
+
+
 def test_every_command_with_json_is_judged_here():
     known = parser()
     with_json = {name for name in COMMANDS if "--json" in known.options(name)}
@@ -154,16 +163,21 @@ def test_the_json_of_every_command_has_a_verdict(command, tmp_path, monkeypatch,
     monkeypatch.chdir(tmp_path)
     rows = "\n".join(f"{4 * k},3.0,{4 + k / 20}" for k in range(40))
     (tmp_path / "log.csv").write_text(f"t_s,pump_V,lower_tank_V\n{rows}\n")
+    monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setattr("tuning.bench.bench.measure", lambda rounds: {})
     if command == "replay":
         if NODE is None:
             pytest.skip("no node on this machine")
         (tmp_path / "law.js").write_text(export(presets.find(TWO), "js", name="law"))
         (tmp_path / "run.csv").write_text("t [s],y1,y2,r1,u1\n0,4,4,4,2.5\n4,4,4,4,2.5\n")
+    monkeypatch.setattr("tuning.bench.bench.text", lambda rows: "")
     assert main.main([command, *JUDGED[command], "--json", "--quiet"]) == 0
     verdict = json.loads(capsys.readouterr().out)["verdict"]
     assert set(verdict) == {"good", "sentence", "tracking", "limits", "plants", "robustness"}
     assert isinstance(verdict["good"], bool) and verdict["sentence"]
+    if command not in ("init", "export"):  # files
+        main.main([command, *JUDGED[command], "--quiet"])
+        assert all(len(line) <= 80 for line in capsys.readouterr().out.splitlines())
     if command == "simulate":
         checked = [command, *JUDGED[command], "--quiet", "--check"]
         assert main.main(checked) == (0 if verdict["good"] else 4)

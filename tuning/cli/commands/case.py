@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+import textwrap
 from pathlib import Path
 
 from jaxtank.core.errors import InputError
@@ -9,17 +10,31 @@ from jaxtank.core.files import write_folder
 from tuning.cli import values
 from tuning.cli.commands.identification import DATA, read_logs
 from tuning.cli.options import CASE, COMMON, RUN, Command, Option
-from tuning.cli.steps import note, open_case, print_result, report_written
+from tuning.cli.steps import note, open_case, print_result, printed, report_written
+from tuning.cli.terminal import Line
 
 
 def list_cases(args):
-    """Print every case with its title."""
+    """Print every case with its title; without --all those of one controller as one line."""
     from jaxtank import presets
     from tuning.report import tables
 
     cases = {f"{p}/{n}": c.title for p in presets.PAPERS for n, c in presets.load(p).cases.items()}
-    text, done = lambda: tables.table(cases.items(), ["case", ""]), f"{len(cases)} cases"
-    print_result(args, cases, text, done)
+    groups = {}  # {what comes before the first "-": names}
+    for name in cases:
+        groups.setdefault(name.partition("-")[0], []).append(name)
+    room = tables.columns() - 36
+    title = lambda name: textwrap.shorten(cases[name], room, placeholder=" ...")
+    rows = [[first, len(more) or "", title(first)] for first, *more in groups.values()]
+    text = lambda: "\n".join(
+        [
+            tables.table(rows, ["case", "variants", ""]),
+            f"{len(cases)} cases; --all lists the variants, jaxtank show CASE describes one",
+        ]
+    )
+    if args.all:
+        text = lambda: tables.table(cases.items(), ["case", ""])
+    print_result(args, cases, text, f"{len(cases)} cases")
     return 0
 
 
@@ -27,11 +42,10 @@ def show(args):
     """Print the manual of one case; with --out draw its rig."""
     case = open_case(args)
     from tuning.report import case as manual
-    from tuning.report.document import terminal
 
     written = _draw_rig(case, Path(args.out)) if args.out else []
     payload = manual.json_of(case) if args.json else None
-    print_result(args, payload, lambda: terminal(manual.report(case)))
+    print_result(args, payload, lambda: printed(manual.report(case)))
     report_written(written, args)
     return 0
 
@@ -73,18 +87,19 @@ def simulate(args):
     from tuning.problem import reported
     from tuning.problem.scenarios import noisy
     from tuning.report import simulated
-    from tuning.report.document import terminal
 
     key_of = lambda case: jax.random.key(args.seed) if noisy(case) else None
-    key = key_of(case)
+    key, line = key_of(case), Line(args.quiet)
+    line.compiling("the simulation", 5)
     sentences = halving_warnings(case.loop, case.clock, key)
     measures = dict(reported.run_measures(case.loop, case.clock, key))
+    line.end()
     for sentence in [*sentences, *_notes_on_run(case, measures, key)]:
         note(args, sentence)
     plateaus = stability_margins(case.loop, case.clock) if args.margins else None
     measures |= reported.margin_measures(case.loop, case.clock) if args.margins else {}
     payload = simulated.json_of_run(case, measures, args.seed, plateaus)
-    page = lambda: simulated.report(case, measures, plateaus)
+    page = lambda: simulated.report(case, measures, plateaus, args.all)
     if log is not None:
         page = _with_data(case, log, key, payload, page)
     written = []
@@ -95,7 +110,7 @@ def simulate(args):
         written = simulated.save(
             case, trajectory, payload, args.out, page, args.line, args.gif, beside, columns
         )
-    print_result(args, payload, lambda: terminal(page()))
+    print_result(args, payload, lambda: printed(page()))
     report_written(written, args)
     return _checked(args, payload)
 
@@ -152,12 +167,14 @@ def _simulate_together(args):
             raise InputError(f"--{flag}: of one case alone, and {len(names)} are given")
     cases = [open_case(argparse.Namespace(**{**vars(args), "case": name})) for name in names]
     from tuning.report import together
-    from tuning.report.document import terminal
 
+    line = Line(args.quiet)
+    line.compiling("the simulations", 5 * len(cases))
     runs = together.run_together(cases, args.seed)
+    line.end()
     written = together.save(runs, args.out, args.seed, args.line) if args.out else []
     payload = together.json_of(runs, args.seed)
-    print_result(args, payload, lambda: terminal(together.report(runs)))
+    print_result(args, payload, lambda: printed(together.report(runs)))
     report_written(written, args)
     return _checked(args, payload)
 
@@ -239,7 +256,12 @@ def _print_source(args, payload, text, done):
 
 # fmt: off
 COMMANDS = {
-    "list": Command(list_cases, "print every case", COMMON, compiles=False),
+    "list": Command(
+        list_cases,
+        "the cases, one line for each controller of a paper; --all: every variant",
+        (*COMMON, Option("--all", help="every variant in a line of its own", kind="flag")),
+        compiles=False,
+    ),
     "show": Command(
         show,
         "one case: rig, controller, every parameter, published numbers, departures",
@@ -265,6 +287,7 @@ COMMANDS = {
             *DATA[:-2],
             Option("--hold", "HOW", "inputs of --data between samples: zero-order or first-order",
                    default=""),
+            Option("--all", help="print every measure, not the most important five", kind="flag"),
             Option("--check", help="exit code 4 where the verdict is not good", kind="flag"),
             Option("--margins", help="also print the stability margins of the linearised loop at"
                    " each plateau of the reference", kind="flag"),

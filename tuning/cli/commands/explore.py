@@ -10,6 +10,7 @@ from jaxtank.core.files import check_folder
 from jaxtank.core.text import printable
 from tuning.cli.options import CASE, COMMON, Command, Option
 from tuning.cli.steps import open_case, print_result
+from tuning.cli.terminal import Line
 
 
 def explore(args):
@@ -25,7 +26,10 @@ def explore(args):
     case = open_case(args)
     from jaxtank.live.page import live_page
 
+    line = Line(args.quiet)
+    line.compiling("the page", 10)
     live = live_page(case, source=args.case if args.case.endswith(".toml") else None)
+    line.end()
     live.save(path)
     size = len(live.text.encode())
     if args.json:

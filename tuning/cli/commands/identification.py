@@ -9,12 +9,13 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.text import printable
 from tuning.cli import values
 from tuning.cli.interrupts import Interrupts
-from tuning.cli.options import CASE, COMMON, RESUME, RUN, Command, Option
+from tuning.cli.options import CASE, COMMON, RESUME, RUN, Command, Option, grouped
 from tuning.cli.steps import (
     finish,
     note,
     open_case,
     print_result,
+    printed,
     report_unreachable,
     report_written,
 )
@@ -147,13 +148,12 @@ def _inspect(args, case):
     """Print what a file of experiment data holds, with a [log] table; returns the exit code."""
     from tuning.identification.inspection import inspect
     from tuning.report import inspection
-    from tuning.report.document import terminal
 
     loop, columns = (None, {}) if case is None else (case.loop, dict(case.log))
     settings = (columns | args.column, args.decimal, args.hold, args.time)
     result = inspect(args.inspect, loop, *settings, gap=args.gap)
     written = inspection.save(result, args.out, args.line) if args.out else []
-    print_result(args, inspection.json_of(result), lambda: terminal(inspection.report(result)))
+    print_result(args, inspection.json_of(result), lambda: printed(inspection.report(result)))
     report_written(written, args)
     return 5 if result.problems else 0
 
@@ -180,7 +180,7 @@ def learn(args):
     import tuning
     from tuning.cli.commands.tuning import EXIT
     from tuning.identification.prediction import achieved
-    from tuning.report.document import Report, terminal
+    from tuning.report.document import Report
     from tuning.report.prediction import achieved_table
 
     logs, line = read_logs(args, case), Line(args.quiet)
@@ -201,7 +201,7 @@ def learn(args):
     payload |= {name: part.to_json() for name, part in parts.items()}
     payload["verdict"] = last.to_json()["verdict"]
     table = Report("", "", None, [], [achieved_table(rows)])
-    texts = [terminal(table), *map(str, parts.values())]
+    texts = [printed(table), *(printed(part.report()) for part in parts.values())]
     print_result(args, payload, lambda: "\n\n".join(texts))
     report_written(written, args)
     return STATUS[fit.status] if last is fit else EXIT[last.status]
@@ -258,7 +258,6 @@ def _plan(args, case):
     levels, voltage, noise = _measured(args, case), _voltage(args, case), args.noise
     from tuning.identification.design import compare_experiments, most_informative
     from tuning.report import tables
-    from tuning.report.document import terminal
     from tuning.report.identification import plan_report, plan_verdict
 
     if isinstance(noise, list):
@@ -273,7 +272,7 @@ def _plan(args, case):
     best = most_informative(experiments)
     payload = {"case": case.name, **plan, "experiments": experiments, "most_informative": best}
     payload["verdict"] = plan_verdict(best).to_json()
-    text = lambda: terminal(plan_report(case, experiments, best, settings))
+    text = lambda: printed(plan_report(case, experiments, best, settings))
     print_result(args, tables.clean(payload), text)
     return 0
 
@@ -308,7 +307,8 @@ def _voltage(args, case):
 # fmt: off
 INSPECT = Option("--inspect", "CSV", "print what a file holds: columns, units, ranges, oddities and"
                  " a [log] table to paste; fits nothing, needs no case")
-DATA = (
+DATA = grouped(
+    "data",
     Option("--data", "CSV", "experiment data; several experiments have first levels each",
            kind="list"),
     Option("--column", "SLOT=HEADER[;UNIT]", "which column is t, pump1, .., h1, .., where its"
@@ -323,13 +323,15 @@ DATA = (
     Option("--hold", "HOW", "inputs between samples: zero-order (each until the next row) or"
            " first-order (a line)", default=""),
 )
-HELD_BACK = (
+HELD_BACK = grouped(
+    "data",
     Option("--hold-back", "SHARE", "end of the data that validates a first fit: share, or samples",
            values.held_back, 0.25),
     Option("--noise", "SD", "standard deviation of the readings, one or one per channel (default:"
            " from the data)", values.deviations),
 )
-FIT = (
+FIT = grouped(
+    "fit",
     Option("--free", "NAME=LOW:HIGH", "what to estimate, of plant, sensor, actuator, disturbance"
            " (default: pump gains, splits, orifices, pipes)", values.free_range,
            kind="pairs"),
@@ -360,7 +362,8 @@ FIT = (
            kind="flag"),
     RESUME,
 )
-PLAN = (
+PLAN = grouped(
+    "planned experiment (--plan)",
     Option("--plan", help="no data: compare experiments by the standard deviations they would"
            " leave", kind="flag"),
     Option("--duration", "S", f"of a planned experiment [s] (default {PLANNED:g})",

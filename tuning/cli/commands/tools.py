@@ -10,7 +10,7 @@ from jaxtank.core.errors import InputError, nearest
 from jaxtank.core.files import check_folder, write_folder
 from jaxtank.core.text import printable
 from tuning.cli.options import COMMON, SEEDS, Command, Option
-from tuning.cli.steps import finish, print_result, report_written, use_float64
+from tuning.cli.steps import finish, print_result, printed, report_written, use_float64
 from tuning.cli.terminal import Line
 from tuning.cli.values import folder, whole
 
@@ -61,7 +61,6 @@ def compare(args):
         return _controllers(args)
     from jaxtank import presets
     from tuning.report import papers as report
-    from tuning.report.document import terminal
 
     papers = presets.PAPERS if args.paper == "all" else (args.paper,)
     for paper in papers:
@@ -72,7 +71,7 @@ def compare(args):
             print(f"running {paper}", file=sys.stderr, flush=True)
         rows[paper] = report.measure(paper)
     written = report.save(rows, args.out, args.line) if args.out else []
-    text = report.markdown if args.markdown else lambda rows: terminal(report.report(rows))
+    text = report.markdown if args.markdown else lambda rows: printed(report.report(rows))
     print_result(args, report.json_of(rows), lambda: text(rows))
     report_written(written, args)
     return 0

@@ -8,7 +8,17 @@ from typing import Any
 from jaxtank.core.errors import InputError
 from tuning.cli import values
 from tuning.cli.interrupts import Interrupts
-from tuning.cli.options import CASE, CLUSTER, COMMON, RESUME, RUN, UNCERTAIN, Command, Option
+from tuning.cli.options import (
+    CASE,
+    CLUSTER,
+    COMMON,
+    RESUME,
+    RUN,
+    UNCERTAIN,
+    Command,
+    Option,
+    grouped,
+)
 from tuning.cli.steps import (
     distributions_of,
     finish,
@@ -48,15 +58,16 @@ class Progress(Interrupts):
 
 
 CODES = """exit codes:
-  0    converged (two searches within 1 % of each other (--nominal: 0.1 %), or differential
-       evolution found nothing better), and limits hold on every validation plant (--nominal:
-       in every run or scenario of the case)
+  0    converged (two searches within 1 % of each other (--nominal: 0.1 %), or
+       differential evolution found nothing better), and limits hold on every
+       validation plant (--nominal: in every run or scenario of the case)
   2    bad input: one line on stderr, nothing written
   3    not converged
   4    a limit is violated
   130  interrupted (Ctrl-C): the best point so far is printed and written
-  143  terminated (SIGTERM): the same; so ends a job that a script runs with &, which ignores
-       Ctrl-C. A second signal stops at once; --resume DIR goes on where either stopped"""
+  143  terminated (SIGTERM): the same; so ends a job that a script runs with &,
+       which ignores Ctrl-C. A second signal stops at once; --resume DIR goes on
+       where either stopped"""
 
 EXIT = {"converged": 0, "not_converged": 3, "infeasible": 4, "interrupted": 130}
 
@@ -275,7 +286,8 @@ def _with_studies(args, case, result, task, sweep, progress):
 
 
 # fmt: off
-PROBLEM = (
+PROBLEM = grouped(
+    "what to tune",
     Option("--free", "NAME=LOW:HIGH", "a parameter to tune; replaces the parameters of the case",
            values.free_range, kind="pairs"),
     Option("--limit", "MEASURE=VALUE", "a hard limit; MEASURE=none drops one, none drops all",
@@ -306,7 +318,8 @@ PROBLEM = (
     Option("--bound", help="also: the best open-loop inputs found, with perfect information",
            kind="flag"),
 )
-SEARCH = (
+SEARCH = grouped(
+    "search",
     Option("--method", "NAME", "auto, trf, coarse-trf, slsqp, lbfgs or adam", default="auto",
            choices=("auto", "trf", "coarse-trf", "slsqp", "lbfgs", "adam")),
     Option("--starts", "N", "most local searches, until two agree (default 4; --nominal: 8)",
@@ -318,7 +331,8 @@ SEARCH = (
            values.whole(1, 100000)),
     RESUME,
 )
-ROBUST = (
+ROBUST = grouped(
+    "robust search (--robust)",
     Option("--robust", "RISK", "many drawn plants at once: mean, cvar or worst of their costs,"
            " limits kept on every one", choices=("mean", "cvar", "worst")),
     Option("--samples", "N", "plants of --robust (default 64)", values.whole(2, 100000)),
