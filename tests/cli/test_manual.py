@@ -43,6 +43,12 @@ def rate(line, h, u):
     return eval(right, {"np": np, **names})
 
 
+@pytest.fixture(autouse=True)
+def wide(monkeypatch):
+    """Cells that no narrow terminal breaks."""
+    monkeypatch.setenv("COLUMNS", "100")
+
+
 @pytest.mark.parametrize("paper", presets.PAPERS)
 def test_the_equations_in_numbers_are_those_of_the_plant(paper):
     loop = next(iter(presets.load(paper).cases.values())).loop

@@ -110,6 +110,7 @@ EXAMPLES = {
     "identify": ("rig.toml --data log.csv --out identified", "--inspect log.csv"),
     "learn": ("tuned/rig.toml --data batch.csv --out next", "tuned/rig.toml --data batch.csv"),
     "predict": ("identified/rig.toml --data other.csv", "rig.toml --data log.csv --json"),
+    "replay": ("law.js --data log.csv", "law.fmu --data log.csv --json"),
     "compare": ("calofir", "all --markdown"),
     "figure": ("", "gouta2015/6 --out figure.svg"),
     "completion": ("bash > ~/.local/share/bash-completion/completions/jaxtank", "zsh"),
@@ -164,7 +165,9 @@ def parser():
             description=_filled(command.description)
             or _filled(f"{command.help[0].upper()}{command.help[1:]}."),
             usage=" ".join([f"jaxtank {name}", *places, "[options]"]),
-            epilog="\n".join(["examples:", *(f"  jaxtank {name} {e}" for e in EXAMPLES[name])])
+            epilog="\n".join(
+                ["examples:", *(f"  jaxtank {name} {e}" for e in EXAMPLES.get(name, ()))]
+            )
             + (f"\n\n{_filled(command.epilog)}" if command.epilog else ""),
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
