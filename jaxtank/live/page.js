@@ -31,6 +31,7 @@ const state = {
 const view = { from: 0, to: info.duration, at: info.duration };
 const pins = []; // {name, run}
 const framed = window !== window.parent; // in a report or a notebook
+let took = 100; // milliseconds of the last run
 let current = null, bands = null, worker = null, charts = [], rig = null;
 
 // --- what a run takes -------------------------------------------------------------------------
@@ -87,6 +88,7 @@ let asked = false, resting = 0, due = false, slow = false, done = 0;
 
 const runner = makeRunner(newWorker, runOf, {
   done(found, { options: own }, milliseconds) {
+    took = milliseconds;
     if (!own.filter) delete found.measures.filter_active_fraction;
     current = found;
     due = runner.busy;
@@ -177,7 +179,10 @@ function changed(own = false) {
   if (!own && tuneNow.stop) tuneNow.stop("Tuning stopped: the loop was changed");
   else if (!own && worker) stop(); // plants about other values
   noteFilter();
-  bands = null;
+  if (bands) {
+    bands = null;
+    makeLegend();
+  }
   touch();
 }
 
@@ -516,9 +521,28 @@ function ask(message, answers) {
   worker.postMessage(message);
 }
 
-function tuneNow() {
+// values of the loop, and the shares by which plants differ from it
+function plantsNow() {
+  const spread = {}, now = effective(), values = { ...now };
+  for (const leaf of leaves) {
+    const share = data.uncertain[leaf.name] ?? data.uncertain[leaf.name.split("[")[0]];
+    if (share === undefined || HIDDEN.includes(leaf.group)) continue;
+    spread[leaf.name] = share;
+    values[leaf.name] = now[leaf.name] ?? leaf.value;
+  }
+  const measures = [...new Set(["rms_error_total", ...info.limits.map((limit) => limit.measure)])];
+  return { values, spread, measures, limits: limitsNow(), every: Math.max(1, Math.ceil(info.samples / 400)), ...options() };
+}
+
+const SEARCHED = { least: 16, most: 64, milliseconds: 15 }; // plants of a search: fewer where a run takes longer
+
+// plants: how many the search runs on, 1: this loop alone
+function tuneNow(plants = null) {
   let best = null, finish = null;
-  const names = [...state.free], start = effective();
+  const names = [...state.free], before = { ...state.values }, base = plantsNow();
+  const varied = Object.keys(base.spread).length > 0;
+  const quick = Math.floor((SEARCHED.least * SEARCHED.milliseconds) / Math.max(1, took));
+  const searched = varied ? plants ?? clamp(quick, SEARCHED.least, SEARCHED.most) : 1;
   const promise = new Promise((resolve, reject) => (finish = { resolve, reject }));
   const apply = (found) => {
     for (const name of names)
@@ -534,23 +558,43 @@ function tuneNow() {
   const alone = data.scenarios ? ` For this run alone; jaxtank tune takes the mean of ${data.scenarios} scenario${data.scenarios > 1 ? "s" : ""}.` : "";
   const words = (found) => `objective ${shown(found.objective)}${
     found.violation > 0 ? `, limits exceeded by ${shown(100 * found.violation, 3)} %` : ""}`;
-  ask({ kind: "tune", values: start, free: names, limits: limitsNow(), ...options() }, {
+  const on = searched > 1 ? ` on ${searched} plants` : "";
+  ask({ kind: "tune", ...base, free: names, searched, judged: varied ? data.plants : 1 }, {
     progress(now) {
+      if (now.of) return say(`Judging on ${now.of} plants: ${now.done} done`);
       if (!best || now.values) best = now;
-      say(`Tuning ${names.length === 1 ? "one parameter" : `${names.length} parameters`}: iteration ${now.iterations}, ${words(now)}`);
+      say(`Tuning ${names.length === 1 ? "one parameter" : `${names.length} parameters`}${on}: iteration ${now.iterations}, ${words(now)}`);
       if (now.values) apply(now);
     },
     tuned(found) {
+      const { kept, count, error } = found.plants, unit = info.units.length;
       apply(found);
+      if (varied) {
+        bands = { ...found.plants, words: keptWords(found.plants) };
+        $("plants").setAttribute("aria-pressed", "true");
+        makeLegend();
+      }
       touch(data.drawn, true);
-      say(`Tuned in ${found.iterations} iterations (${found.status}): ${words(found)}.${alone}`);
-      finish.resolve({ values: found.values, objective: found.objective, violation: found.violation });
+      const holds = varied && info.limits.length ? `; limits hold on ${kept} of ${count} other plants` : "";
+      const errors = `error ${shown(found.before, 3)} to ${shown(error, 3)} ${unit}${varied ? " in the mean" : ""}`;
+      const ends = found.ends.map((name) => `; ${name} ends on its range`).join("");
+      say(`Tuned${on} in ${found.iterations} iterations (${found.status})${holds}; ${errors}${ends}.${alone}`);
+      $("undo").hidden = false;
+      $("undo").onclick = () => {
+        state.values = before;
+        $("undo").hidden = true;
+        refresh();
+        say("The values before tuning are set again.");
+      };
+      const { values, objective, violation } = found;
+      finish.resolve({ values, objective, violation, holds: kept, of: count, ends: found.ends });
     },
     failed({ text }) {
       say(`Tuning failed: ${text}`);
       finish.reject(new Error(text));
     },
   });
+  $("undo").hidden = true;
   $("tune").textContent = "Stop";
   tuneNow.stop = (why = "Tuning stopped") => {
     stop();
@@ -560,28 +604,17 @@ function tuneNow() {
   return promise;
 }
 
+const keptWords = ({ kept }) => (info.limits.length ? `, ${kept} keep every limit` : "");
+
 // spoken: whether the message says how many; not where they follow a slider or a search
 function manyPlants(spoken = true) {
   tuneNow.stop?.();
-  const spread = {}, values = {};
-  const now = effective();
-  for (const leaf of leaves) {
-    const share = data.uncertain[leaf.name] ?? data.uncertain[leaf.name.split("[")[0]];
-    if (share === undefined || HIDDEN.includes(leaf.group)) continue;
-    spread[leaf.name] = share;
-    values[leaf.name] = now[leaf.name] ?? leaf.value;
-  }
-  ask({
-    kind: "plants", count: data.plants, values: { ...now, ...values }, spread, limits: limitsNow(), ...options(),
-    measures: [...new Set(info.limits.map((limit) => limit.measure))],
-    every: Math.max(1, Math.ceil(info.samples / 400)),
-  }, {
+  ask({ kind: "plants", count: data.plants, ...plantsNow() }, {
     progress: ({ done, of }) => spoken && say(`Simulating ${of} plants: ${done} done`),
     plants(found) {
-      bands = found;
+      bands = { ...found, words: keptWords(found) };
       const kept = info.limits.length ? `${found.kept} of ${found.count} plants keep every limit` :
         `${found.count} plants simulated`;
-      bands.words = info.limits.length ? `, ${found.kept} keep every limit` : "";
       if (spoken) say(`${kept}${found.broken ? `; ${found.broken} diverged` : ""}. The band holds 90 % of them at each time.`);
       makeLegend();
       show();
@@ -743,6 +776,7 @@ function listen() {
   $("reset").addEventListener("click", reset);
   $("run").addEventListener("click", () => touch(data.drawn, true));
   $("tune").addEventListener("click", () => (tuneNow.stop ? tuneNow.stop() : tuneNow().catch(() => {})));
+  $("nominal").addEventListener("click", () => tuneNow(1).catch(() => {}));
   $("plants").addEventListener("click", () => {
     const on = $("plants").getAttribute("aria-pressed") !== "true";
     $("plants").setAttribute("aria-pressed", String(on));
@@ -861,7 +895,8 @@ window.jaxtank = {
     }));
     return { measures, t: Array.from(found.t), h: plain(found.h), u: plain(found.u) };
   },
-  tune: () => tuneNow(),
+  // {plants}: how many the search runs on (1: this loop alone); holds, of: limits on plants it has not seen
+  tune: ({ plants = null } = {}) => tuneNow(plants),
   verdict: () => verdict(present()),
   csv,
   command,

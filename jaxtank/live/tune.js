@@ -8,12 +8,14 @@ No DOM: a worker and node run the same text. */
   {values, objective, violation, iterations, evaluations, status}
 
 values: {name: number} to start from; free: names to change, of engine.info.leaves; limits: as
-engine.info.limits; options: {filter, seed, starts, most}. Violation: the largest share by which a
-limit is passed, 0 where all hold. Status: "converged", "stopped", "limit of iterations",
-"limits not met". The best values so far are returned whenever shouldStop() is true. */
+engine.info.limits; options: {filter, seed, starts, most, plants}. plants: [{values, seed}] on which the
+mean of the objectives is minimised and every limit kept; [{values, seed}] of the loop alone by default.
+Violation: the largest share by which a limit is passed, 0 where all hold. Status: "converged", "stopped",
+"limit of iterations", "limits not met". ends: the free numbers that end on their range. The best values so
+far are returned whenever shouldStop() is true. */
 function tune(engine, values, free, limits, onProgress, shouldStop, options) {
-  const { filter, seed = 0, starts = 2, most = 60 } = options || {};
-  const search = searchOf(engine, values, free, limits, { filter, seed });
+  const { filter, seed = 0, starts = 2, most = 60, plants = [{ values, seed }] } = options || {};
+  const search = searchOf(engine, values, free, limits, plants, filter);
   const report = () => onProgress && onProgress(search.found());
   const stop = () => Boolean(shouldStop && shouldStop());
   let status = local(search, search.start, most, report, stop);
@@ -37,8 +39,10 @@ function tune(engine, values, free, limits, onProgress, shouldStop, options) {
   return { ...found, status };
 }
 
+const EDGE = 1e-6; // share of its range from an end at which a number ends on it
+
 /* The search in z, the free numbers between their bounds as 0 to 1, with the best point so far. */
-function searchOf(engine, values, free, limits, options) {
+function searchOf(engine, values, free, limits, plants, filter) {
   const info = engine.info, logs = new Set(info.logarithmic || []);
   const boxes = free.map((name) => boxOf(info, name, values, logs));
   const weights = Object.entries(info.objective.measures);
@@ -46,16 +50,18 @@ function searchOf(engine, values, free, limits, options) {
   const known = new Map(), ends = []; // points by where they are, where local searches ended
   let best = null, iterations = 0, evaluations = 0, scale = null;
 
-  const at = (z) => {
-    const out = { ...values };
+  const at = (z, plant = values) => {
+    const out = { ...plant };
     boxes.forEach((box, j) => (out[free[j]] = box.from(z[j])));
     return out;
   };
+  const optionsOf = (plant) => ({ filter, seed: plant.seed });
 
-  function judged(z, measures, broken) {
+  function judged(z, runs) {
     let cost = 0;
-    for (const [m, w] of weights) cost += w * sum(measures[m]);
-    const margins = limits.map((limit) => marginOf(limit, measures));
+    for (const [m, w] of weights) for (const { measures } of runs) cost += (w * sum(measures[m])) / runs.length;
+    const margins = runs.flatMap(({ measures }) => limits.map((limit) => marginOf(limit, measures)));
+    const broken = runs.some((run) => run.broken);
     const violation = Math.max(0, ...margins.map((m) => -m));
     const finite = !broken && Number.isFinite(cost);
     const point = { z, cost, margins, violation, finite };
@@ -69,8 +75,7 @@ function searchOf(engine, values, free, limits, options) {
   }
 
   return {
-    start, size: free.length, limits,
-    rows: limits.length, ends,
+    start, size: free.length, ends,
     get scale() { return scale; },
     get best() { return best; },
     next() { iterations += 1; },
@@ -80,31 +85,39 @@ function searchOf(engine, values, free, limits, options) {
         values: at(z),
         objective: best ? best.cost : NaN,
         violation: best ? best.violation : Infinity,
+        ends: free.filter((_, j) => z[j] < EDGE || z[j] > 1 - EDGE),
         iterations, evaluations,
       };
     },
     value(z) {
       if (known.has(z.join())) return known.get(z.join());
-      const run = engine.run(at(z), { ...options, every: engine.every, search: true });
-      return Object.assign(judged(z, run.measures, run.broken), { run });
+      const runs = plants.map((plant) =>
+        engine.run(at(z, plant.values), { ...optionsOf(plant), every: engine.every, search: true }));
+      return Object.assign(judged(z, runs), { runs });
     },
     point(z) {
       const before = known.get(z.join());
       if (before && before.gradient) return before;
-      const run = engine.slopes(at(z), free, options, before && before.run), P = free.length;
-      const point = before || judged(z, run.measures, run.broken), per = boxes.map((box, j) => box.slope(z[j]));
-      const gradient = new Float64Array(P);
-      const row = (m, i, j) => run.jacobian[m][i * P + j] * per[j];
-      for (const [m, w] of weights)
-        for (let j = 0; j < P; ++j)
-          for (let i = 0; i < run.jacobian[m].length / P; ++i) gradient[j] += w * row(m, i, j);
-      const slopes = limits.map((limit, i) => {
-        const { measure, entry } = limit, sign = limit.upper === null ? 1 : -1;
-        if (!run.jacobian[measure]) throw new Error(`${measure}: no derivatives to keep its limit`);
-        return Float64Array.from({ length: P }, (_, j) =>
-          Math.abs(point.margins[i]) > 1e5 ? 0 : (sign * row(measure, entry || 0, j)) / scaleOf(limit));
+      const P = free.length, per = boxes.map((box, j) => box.slope(z[j]));
+      const runs = plants.map((plant, k) =>
+        engine.slopes(at(z, plant.values), free, optionsOf(plant), before && before.runs && before.runs[k]));
+      const point = before || judged(z, runs);
+      const gradient = new Float64Array(P), slopes = [], curvature = new Float64Array(P * P);
+      runs.forEach((run, k) => {
+        const row = (m, i, j) => run.jacobian[m][i * P + j] * per[j];
+        for (const [m, w] of weights)
+          for (let j = 0; j < P; ++j)
+            for (let i = 0; i < run.jacobian[m].length / P; ++i) gradient[j] += (w * row(m, i, j)) / runs.length;
+        limits.forEach((limit, i) => {
+          const { measure, entry } = limit, sign = limit.upper === null ? 1 : -1;
+          if (!run.jacobian[measure]) throw new Error(`${measure}: no derivatives to keep its limit`);
+          const margin = point.margins[k * limits.length + i];
+          slopes.push(Float64Array.from({ length: P }, (_, j) =>
+            Math.abs(margin) > 1e5 ? 0 : (sign * row(measure, entry || 0, j)) / scaleOf(limit)));
+        });
+        curvatureOf(run, per, weights).forEach((v, i) => (curvature[i] += v / runs.length));
       });
-      const curvature = curvatureOf(run, per, weights);
+      delete point.runs; // a hundred points of many plants are not held
       return Object.assign(point, { gradient, slopes, curvature });
     },
   };

@@ -16,6 +16,7 @@ function plantsOf(message) {
   });
 }
 
+// the runs of `count` plants: bands of levels and inputs, how many keep the limits, and their mean error
 function many(message) {
   const runs = [];
   plantsOf(message).forEach((values, i) => {
@@ -35,16 +36,30 @@ function many(message) {
       return { low, high };
     });
   const kept = runs.filter((run) => marginsOf(message.limits, run.measures).every((m) => m.margin >= 0));
-  postMessage({
-    kind: "plants",
+  const errors = runs.map((run) => run.measures.rms_error_total);
+  return {
     t: runs.length ? runs[0].t : new Float64Array(0),
     h: bands("h"),
     u: bands("u"),
     kept: kept.length,
     count: message.count,
     broken: message.count - runs.length,
-  });
+    error: errors.reduce((a, b) => a + b, 0) / errors.length,
+  };
 }
+
+// a search on the loop and `searched` - 1 plants about it; the answer and the start on `count` others
+async function search(message) {
+  const { values, free, limits, filter, seed, searched, judged } = message;
+  const others = searched > 1 ? plantsOf({ ...message, count: searched - 1 }) : [];
+  const plants = [values, ...others].map((plant) => ({ values: plant, seed }));
+  const progress = (now) => postMessage({ kind: "progress", ...now });
+  const found = await tune(engine, values, free, limits, progress, () => false, { filter, seed, plants });
+  const on = (at) => many({ ...message, values: { ...message.values, ...at }, count: judged, seed: seed + UNSEEN });
+  return { ...found, before: on({}).error, plants: on(found.values) };
+}
+
+const UNSEEN = 104729; // added to the seed of plants that judge a search
 
 // names of the sliders {name, ends} at whose ends the run is what it is at `values`
 function effects(message) {
@@ -73,15 +88,9 @@ onmessage = async (event) => {
   const message = event.data;
   try {
     if (message.kind === "run") one(message);
-    else if (message.kind === "plants") many(message);
+    else if (message.kind === "plants") postMessage({ kind: "plants", ...many(message) });
     else if (message.kind === "effects") effects(message);
-    else {
-      const progress = (now) => postMessage({ kind: "progress", ...now });
-      const { values, free, limits } = message;
-      const options = { filter: message.filter, seed: message.seed };
-      const found = await tune(engine, values, free, limits, progress, () => false, options);
-      postMessage({ kind: "tuned", ...found });
-    }
+    else postMessage({ kind: "tuned", ...(await search(message)) });
   } catch (error) {
     postMessage({ kind: "failed", text: String((error && error.message) || error) });
   }

@@ -370,14 +370,33 @@ def test_the_search_of_the_page_ends_where_that_of_the_command_ends(browser, wri
     case = presets.find("cascaded/pi")
     wanted = tuning.tune(case, tuning.Options(starts=1, screening=16)).objective
     with opened(browser, written) as live:
-        found = live("jaxtank.tune()")
+        found = live("jaxtank.tune({ plants: 1 })")
         assert found["violation"] == 0.0
         assert "before tuning" in live.text("#legend") and "Tuned in" in live.text("#message")
         assert live("jaxtank.state().values")["controller.Kc[0]"] == pytest.approx(
             found["values"]["controller.Kc[0]"]
         )
-        assert "every limit holds" in live.text("#verdict") and live("jaxtank.verdict().good")
+        # the limit is active: many other plants pass it, and the page says so
+        assert found["of"] == 64 and found["holds"] < 60
+        held = f"limits hold on {found['holds']} of 64"
+        assert held in live.text("#verdict") and held in live.text("#message")
+        assert not live("jaxtank.verdict().good")
     assert found["objective"] == pytest.approx(wanted["after"], rel=5e-3)
+
+
+def test_tune_is_on_plants_and_judged_on_others(browser, written):
+    with opened(browser, written) as live:
+        start = live("jaxtank.state().values")
+        found = live("jaxtank.tune()")
+        assert found["violation"] == 0.0 and found["holds"] >= 56 and found["of"] == 64
+        message = live.text("#message")
+        assert f"limits hold on {found['holds']} of 64" in message and "Tuned on" in message
+        assert f"{found['holds']} keep every limit" in live.text("#legend")
+        assert f"{found['holds']} of 64" in live.text("#verdict") or found["holds"] == 64
+        assert all((f"{name} ends" in message) for name in found["ends"])
+        live.page.click("#undo")
+        assert live("jaxtank.state().values") == start
+        assert "keep every limit" not in live.text("#legend")  # of other values
 
 
 @pytest.mark.slow
@@ -401,7 +420,7 @@ def test_a_search_that_is_stopped_keeps_the_best_so_far(browser, written):
             live.page.click("#tune")
         message = "document.querySelector('#message').textContent"
         stopped = f"{message}.startsWith('Tuning stopped; the best so far is set: ')"
-        live.wait(f"{stopped} || {message}.includes('Tuned in')")
+        live.wait(f"{stopped} || {message}.startsWith('Tuned')")
         live.wait("document.querySelector('#tune').textContent === 'Tune'")
 
 
@@ -503,9 +522,9 @@ def test_reset_ticks_what_is_tuned_and_plants_leave_the_message_of_a_search(brow
         live.page.click("#plants")
         live.wait("document.querySelector('#legend').textContent.includes('keep every limit')")
         live("jaxtank.tune()")
-        assert live.text("#message").startswith("Tuned in")
+        assert live.text("#message").startswith("Tuned")
         live.wait("document.querySelector('#legend').textContent.includes('keep every limit')")
-        assert live.text("#message").startswith("Tuned in")
+        assert live.text("#message").startswith("Tuned")
 
 
 @pytest.mark.slow

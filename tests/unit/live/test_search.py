@@ -1,5 +1,6 @@
 """The search of a live page, run by node, against scans and the search of the command."""
 
+import json
 from importlib import resources
 
 import numpy as np
@@ -46,6 +47,29 @@ def test_a_search_keeps_the_limits():
     levels = jaxtank.evaluate(loop, case.clock, ["max_level"])["max_level"]
     start = jaxtank.evaluate(case.loop, case.clock, ["max_level"])["max_level"]
     assert np.max(start) > 17.0 >= np.max(levels) > 16.9
+
+
+def test_a_search_on_plants_keeps_the_limits_of_each_and_minimises_their_mean():
+    """The answer, run by the library on every plant."""
+    case = rig.set_values(
+        presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 300.0}
+    ).replace(limits={"max_level": 17.0})
+    name, usual = "plant.pump_gain[0]", float(case.loop.plant.pump_gain[0])
+    plants = [{}, {name: 0.9 * usual}, {name: 1.1 * usual}]
+    script = f"""
+const e = makeEngine(), plants = {json.dumps(plants)}.map((values) => ({{ values, seed: 0 }}));
+console.log(JSON.stringify(tune(e, {{}}, e.info.free, e.info.limits, null, null, {{ plants }})));
+"""
+    search = resources.files("jaxtank.live").joinpath("tune.js").read_text("utf-8")
+    found = node(engine(case) + search + script)
+    costs, highest = [], []
+    for plant in plants:
+        loop = jaxtank.with_values(case.loop, found["values"] | plant)
+        values = jaxtank.evaluate(loop, case.clock, ["rms_error_total", "max_level"])
+        costs.append(float(values["rms_error_total"]))
+        highest.append(float(np.max(values["max_level"])))
+    assert found["violation"] == 0 and max(highest) <= 17.0
+    assert found["objective"] == pytest.approx(np.mean(costs), rel=1e-6)
 
 
 @pytest.mark.slow
