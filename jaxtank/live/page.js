@@ -569,6 +569,7 @@ function tuneNow(plants = null) {
     tuned(found) {
       const { kept, count, error } = found.plants, unit = info.units.length;
       apply(found);
+      current = run() ?? current; // not one of other values beside these plants
       if (varied) {
         bands = { ...found.plants, words: keptWords(found.plants) };
         $("plants").setAttribute("aria-pressed", "true");
