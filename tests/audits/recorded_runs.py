@@ -64,7 +64,7 @@ def differences(name, found, recorded, exact):
     lines = []
     if exact and recorded["bits"] is not None and found["bits"] != recorded["bits"]:
         lines.append(f"{name}: the bits of its trajectory differ")
-    rtol = 1e-6 if "constrained" in name else 1e-12
+    rtol = 1e-6 if "constrained" in name or "nmpc" in name else 1e-12
     for group in ("points", "measures"):
         if set(found[group]) != set(recorded[group]):
             lines.append(f"{name}: {group} {sorted(set(found[group]) ^ set(recorded[group]))}")
