@@ -139,6 +139,11 @@ def check_pointwise(case: Case) -> None:
             f"{case.name}: its rig has {case.loop.plant.tanks} tanks: a loop as code may have at"
             f" most {LARGEST}"
         )
+    if case.loop.controller.limits_levels:
+        raise InputError(
+            f"{case.name}: its controller nmpc solves quadratic programmes, whose code for a page"
+            " has megabytes; `jaxtank export --lang c` writes the controller alone"
+        )
     signals = {
         "setpoints": case.loop.reference,
         "inputs": getattr(case.loop.controller, "signal", None),

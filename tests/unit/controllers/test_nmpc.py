@@ -12,6 +12,7 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.export import export
+from jaxtank.export.whole import check_pointwise
 from jaxtank.plants.rigs import quadruple_tank
 from jaxtank.presets.paper import closed_loop
 from jaxtank.signals.setpoints import ramps
@@ -187,6 +188,11 @@ def test_what_the_programme_cannot_have_is_refused(case, change, words):
 def test_code_of_one_sample_reads_no_setpoints_ahead():
     with pytest.raises(InputError, match=r"controller\.preview"):
         export(presets.find("gouta2015/nmpc-preview"))
+
+
+def test_a_live_page_is_refused(case):
+    with pytest.raises(InputError, match="nmpc"):
+        check_pointwise(case)
 
 
 @pytest.mark.slow
