@@ -49,6 +49,8 @@ class Estimate(NamedTuple):
     # estimated disturbance of each level rate, what the model of the observer does not explain:
     # inflow over area [cm/s]; empty where none is estimated
     d: Sequence[Any] = ()
+    # of a bank of H fault models: (2 H,) probabilities, then sizes of the faults; else empty
+    modes: Any = ()
 
 
 class Sample(NamedTuple):
@@ -70,3 +72,4 @@ class Sample(NamedTuple):
     shortfall: Sequence[Any] = ()
     filtered: Any = 0.0  # 1 where the safety filter changed an input, else 0
     slack: Any = 0.0  # by which the controller gives up a limit of a level [cm]
+    modes: Any = ()  # as in Estimate

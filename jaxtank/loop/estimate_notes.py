@@ -105,7 +105,7 @@ def design_notes(loop: ClosedLoop, setpoints: Any) -> list[str]:
 def is_unused(loop: ClosedLoop) -> bool:
     """Return True if the observer estimates disturbances and the controller does not use them."""
     # By tracing one sample, which serves custom controllers too; nothing is computed.
-    if loop.controller.ignores_disturbance:
+    if loop.controller.ignores_disturbance or loop.observer.mode_names(loop.plant):
         return False
     number = jax.ShapeDtypeStruct((), jnp.result_type(float))
     x, u, r = ((number,) * n for n in (loop.plant.tanks, loop.plant.pumps, loop.reference.channels))

@@ -70,4 +70,7 @@ def simulate_compiled(
         columns[name] = value if is_array(value) else jnp.stack(value, axis=-1)
     shares = loop.controller.shares(*(tuple(columns[name].T) for name in ("x_hat", "r")))
     share = None if shares is None else jnp.stack(shares, axis=-1)
-    return Trajectory(**columns, units=loop.units, share=share), is_broken(state)
+    names = loop.observer.mode_names(loop.plant)
+    modes = saved.modes if names else None
+    kept = Trajectory(**columns, units=loop.units, share=share, modes=modes, mode_names=names)
+    return kept, is_broken(state)

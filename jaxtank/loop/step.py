@@ -65,6 +65,7 @@ def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[Sta
         shortfall=shortfall,
         filtered=decision.filtered,
         slack=decision.slack,
+        modes=estimate.modes,
     )
     return moved._replace(observer=decision.observer, controller=decision.controller), sample
 

@@ -35,7 +35,9 @@ COLUMNS = (*("t", "x", "y", "x_hat", "d_hat", "r", "e"), *("command", "applied",
 
 
 @functools.partial(
-    jax.tree_util.register_dataclass, data_fields=(*COLUMNS, "share"), meta_fields=("units",)
+    jax.tree_util.register_dataclass,
+    data_fields=(*COLUMNS, "share", "modes"),
+    meta_fields=("units", "mode_names"),
 )
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Trajectory(TrajectoryViews):
@@ -63,6 +65,9 @@ class Trajectory(TrajectoryViews):
     share : (rows, pumps) array or None
         If the controller blends two, the share of the first one in each input [-]; the share of
         sliding mode for `FuzzyBlend`.
+    modes : (rows, 2 modes) array or None
+        Of a `FaultBank`, the probability of each fault [-], then the size it has if it is there.
+    mode_names : ((name, unit of the size, "" without one), ...) of these faults; () without a bank
 
     Examples
     --------
@@ -89,6 +94,8 @@ class Trajectory(TrajectoryViews):
     spilled: jax.Array
     units: tuple[str, str] = DEFAULT
     share: Any = None
+    modes: Any = None
+    mode_names: tuple[tuple[str, str], ...] = ()
 
     def replace(self, **changes: Any) -> "Trajectory":
         """Return a copy with the named fields changed."""
@@ -102,7 +109,33 @@ class Trajectory(TrajectoryViews):
         units |= {field: local(unit, self.units) for _, field, unit in FIELDS}
         names = [*COLUMNS, *(["share"] if self.share is not None else [])]
         result: dict[str, Any] = {"units": {name: units[name] for name in names}}
-        return result | {name: clean(getattr(self, name)) for name in names}
+        result |= {name: clean(getattr(self, name)) for name in names}
+        return result | ({"diagnosis": self.diagnosis} if self.mode_names else {})
+
+    @property
+    def diagnosis(self) -> list[dict[str, Any]]:
+        """Faults that a `FaultBank` named, one for each time in which no fault is improbable."""
+        count, episodes = len(self.mode_names), list[dict[str, Any]]()
+        if not count:
+            return episodes
+        t, (p, sizes) = np.asarray(self.t), np.split(np.asarray(self.modes), [count], axis=1)
+        faulty = np.flatnonzero(p[:, 0] < 0.5)
+        for rows in np.split(faulty, np.flatnonzero(np.diff(faulty) > 1) + 1):
+            if len(rows):
+                k = 1 + int(np.argmax(p[rows, 1:].sum(axis=0)))
+                best, (name, unit) = rows[p[rows, k] >= 0.5], self.mode_names[k]
+                size = float(sizes[best if len(best) else rows, k][-1])
+                episodes.append(
+                    {
+                        "fault": name,
+                        "from_s": float(t[rows[0]]),
+                        "to_s": float(t[rows[-1]]),
+                        "probability": float(p[rows, k].mean()),
+                        "size": size if unit else None,
+                        "unit": unit,
+                    }
+                )
+        return episodes
 
     def __str__(self) -> str:
         if np.ndim(self.t) != 1 or isinstance(self.t, Tracer):
@@ -148,6 +181,8 @@ def columns(
                 drives = name in ("u", "command")
                 unit_of_entry = input_unit(plant, i, units[1]) if drives else local(unit, units)
                 table[key, unit_of_entry] = column
+    for k, (name, _) in enumerate(run.mode_names):
+        table[f"probability of {name}", "-"] = np.asarray(run.modes)[:, k]
     if dimension is None:
         return {f"{name} [{unit}]": values for (name, unit), values in table.items()}
     return {

@@ -37,6 +37,10 @@ class Observer(Role):
         """
         return state
 
+    def mode_names(self, plant: Plant) -> tuple[tuple[str, str], ...]:
+        """Return (name, unit of its size) of each mode of its estimate; () without."""
+        return ()
+
     def check(self, plant: Plant) -> None:
         """Raise InputError if the observer does not fit this plant."""
 

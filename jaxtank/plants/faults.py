@@ -217,11 +217,12 @@ class Faults:
 
     def seen(self, x: Any, xi: Any, active: Sequence) -> Any:
         """Return the levels that faulty sensors see; xi: deviates of their noise, None without."""
+        quiet = ("freeze",) if xi is not None else ("freeze", "noise")
         for k, fault in enumerate(self.sensors):
-            if fault.kind == "freeze" or (fault.kind == "noise" and xi is None):
+            if fault.kind in quiet:
                 continue
-            error = cast(Any, self).size[k] * active[len(self.windows) + k]
-            error = error * xi[fault.tank] if fault.kind == "noise" else error
+            error = cast(Any, self.size)[k] * active[len(self.windows) + k]
+            error = error * cast(Any, xi)[fault.tank] if fault.kind == "noise" else error
             x = _with_entry(x, fault.tank, x[fault.tank] + error)
         return x
 

@@ -15,7 +15,14 @@ from jaxtank.core.tree import number
 from jaxtank.core.units import DEFAULT
 from jaxtank.instruments import Actuator, LevelSensor, PumpBank, Sensor
 from jaxtank.loop.steady import steady_inflow, steady_state
-from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman, Observer
+from jaxtank.observers import (
+    Direct,
+    DisturbanceObserver,
+    ExtendedKalman,
+    FaultBank,
+    Kalman,
+    Observer,
+)
 from jaxtank.plants.elements import input_flows
 from jaxtank.plants.hydraulics import in_unit
 from jaxtank.rig.entry import Problems, hyphened, read_entry, sizes_of, unknown_key
@@ -69,6 +76,7 @@ ROLES = {
             "disturbance": DisturbanceObserver,
             "kalman": Kalman,
             "extended-kalman": ExtendedKalman,
+            "fault-bank": FaultBank,
         },
     ),
     "sensor": Role(Sensor, {"level": LevelSensor}, ("noise",), LevelSensor),

@@ -76,7 +76,30 @@ def _brief(case, values):
     return [m for m in names if m in values][: len(BRIEF)]
 
 
-def report(case, values, plateaus=None, every=False):
+def diagnosis_of(case, key):
+    """Return the faults that a bank of fault models named in a run; None without a bank."""
+    if not case.loop.observer.mode_names(case.loop.plant):
+        return None
+    return lp.simulate(case.loop, case.clock, key).diagnosis
+
+
+def _diagnosis(diagnosis):
+    """The section on the faults that were named."""
+    heads = ["diagnosed fault", "from [s]", "to [s]", "size", "probability [-]"]
+    rows = [
+        [
+            d["fault"],
+            Value(d["from_s"], 5),
+            Value(d["to_s"], 5),
+            "" if d["size"] is None else Value(d["size"], 3, d["unit"].strip("-")),
+            Value(d["probability"], 3),
+        ]
+        for d in diagnosis
+    ]
+    return [Table(rows, heads)] if rows else [Text(["no fault is diagnosed"], gap=True)]
+
+
+def report(case, values, plateaus=None, every=False, diagnosis=None):
     """Return the Report of a run with the measures `values`; `every`: all of them on a terminal."""
     loop, limits = case.loop, verdicts.limit_rows(case, values)
     unit = lambda name: unit_text(name, loop.units, loop.plant)
@@ -107,6 +130,7 @@ def report(case, values, plateaus=None, every=False):
             Text(undefined(values, loop.plant), on="page"),
         ]
     sections += [*(_margins(loop, plateaus) if plateaus is not None else ())]
+    sections += [*(_diagnosis(diagnosis) if diagnosis is not None else ())]
     if loop.safety_filter is not None:
         words = "The safety filter is on: jaxtank show prints what is proved of each tank."
         sections.append(Text([words], gap=True, on="terminal"))

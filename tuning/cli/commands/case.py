@@ -99,7 +99,9 @@ def simulate(args):
     plateaus = stability_margins(case.loop, case.clock) if args.margins else None
     measures |= reported.margin_measures(case.loop, case.clock) if args.margins else {}
     payload = simulated.json_of_run(case, measures, args.seed, plateaus)
-    page = lambda: simulated.report(case, measures, plateaus, args.all)
+    diagnosis = simulated.diagnosis_of(case, key)
+    payload |= {} if diagnosis is None else {"diagnosis": diagnosis}
+    page = lambda: simulated.report(case, measures, plateaus, args.all, diagnosis)
     if log is not None:
         page = _with_data(case, log, key, payload, page)
     written = []

@@ -1,0 +1,87 @@
+"""The bank of fault models: its filters, and the faults that it names."""
+
+import fault_bank as audit
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import rig
+from jaxtank.core.clock import Clock
+from jaxtank.core.records import Tick
+from jaxtank.observers import ExtendedKalman, FaultBank
+
+RIG = """
+tank = [{name = "LT1", area = 50.0, rim = 40.0, level = 12.0},
+        {name = "LT2", area = 40.0, rim = 40.0, level = 12.0, drain = 0.5}]
+orifice = [{from = 1, to = 2, area = 0.5}]
+pump = [{name = "P1", to = 1, gain = 8.0, high = 20.0, initial = 9.6}]
+plant = {outputs = [2]}
+controller = {kind = "pi", Kc = 0.5, Ti = 60.0}
+reference = {initial = [12.0], changes = [[20.0, 1, 14.0]]}
+observer = {kind = "fault-bank", process = 1e-6, measurement = 0.0025, spread = 0.0025}
+fault = [{of = "LT1.drain", start = 100.0, end = 200.0, extra = 0.08}]
+values = {"sensor.noise" = 0.05, "clock.dt" = 1.0, "clock.duration" = 300.0}
+"""
+VALUES = {"process": [1e-4] * 2, "measurement": [0.01] * 2, "spread": [0.02] * 2}
+
+
+@pytest.fixture(scope="module")
+def case():
+    return rig.loads(RIG)
+
+
+def filtered(observer, ys, us):
+    """Levels that an observer estimates after each sample, from 12 cm."""
+
+    def body(state, now):
+        y, u = now
+        tick = Tick(t=0.0, r=(), dr=(), ddr=(), dt=1.0)
+        estimate, state = observer.step(state, tick, tuple(y))
+        state = observer.predict(state, tick, tuple(u), tuple(u))
+        return state, jnp.stack(estimate.x)
+
+    return jax.lax.scan(body, observer.init((jnp.array(12.0),) * 2), (ys, us))[1]
+
+
+def test_without_a_fault_the_bank_is_the_extended_filter_and_so_is_its_derivative(case):
+    rng, common = np.random.default_rng(0), {"model": case.loop.plant, "measured": (0, 1)}
+    ys, along = 12.0 + 0.1 * rng.standard_normal((15, 2)), rng.standard_normal((15, 2))
+    us = np.full((15, 1), 9.59)  # which holds 12 cm
+    bank = FaultBank(**common, **VALUES, prior=1e-14)
+    one = ExtendedKalman(**common, **VALUES, integrator="midpoint")
+    mine, theirs = (
+        jax.jit(lambda y, v, of=of: jax.jvp(lambda y: filtered(of, y, us), (y,), (v,)))(ys, along)
+        for of in (bank, one)
+    )
+    for ours, known in zip(mine, theirs, strict=True):
+        np.testing.assert_allclose(ours, known, atol=1e-9)
+
+
+def test_a_leak_of_a_rig_file_is_named_with_its_time_and_size(case):
+    run = jaxtank.simulate(case, key=jax.random.key(2))
+    (leak,) = run.diagnosis
+    assert leak["fault"] == "leak of LT1" and leak["unit"] == "cm^2"
+    assert 100.0 <= leak["from_s"] < 120.0 and 200.0 <= leak["to_s"] < 220.0
+    assert abs(leak["size"] - 0.08) < 0.02
+    np.testing.assert_allclose(run.modes[:, : len(run.mode_names)].sum(axis=1), 1.0)
+    assert type(rig.loads(rig.dump(case)).loop.observer) is FaultBank
+
+
+@pytest.mark.slow
+def test_each_fault_is_named_and_a_clean_run_names_none(case):
+    clock = Clock(dt=1.0, duration=500.0)
+    names = [name for name, _ in case.loop.observer.mode_names(case.loop.plant)]
+    # the same to the levels while input and level are at rest
+    alike = {names.index("loss of P1"): names.index("leak of LT1")}
+    values, which, entries = audit.drawn(case.loop, clock, 9, np.random.default_rng(3))
+    clean = {
+        name: np.append(v, 0.0 * v[:1] + (name == "factor"), axis=0) for name, v in values.items()
+    }
+    modes, _ = audit.runs(case.loop, clock, clean, entries, np.arange(9 + 1))
+    best = modes[:, :, : len(names)].argmax(axis=2)
+    ends = np.ceil(np.minimum(values["end"], values["start"] + 200.0)).astype(int) - 1
+    answers = best[np.arange(9), ends]
+    assert [alike.get(k, k) for k in answers] == [alike.get(k, k) for k in which]
+    assert not best[-1].any()
