@@ -215,14 +215,17 @@ class FaultBank(Observer):
     def _restarted(self, state):
         """The state with the filters that have fallen behind begun again."""
         totals, zero = self._totals(state), 0.0 * state.score
-        best, n = jnp.argmax(totals), len(state.y)
+        best, n = jnp.arange(len(self.modes)) == jnp.argmax(totals), len(state.y)
+        of_best = lambda v: jnp.sum(
+            jnp.where(best.reshape(-1, *[1] * (v.ndim - 1)), v, 0.0), axis=0
+        )
         again = totals < jnp.log(self.prior) - RESTART
         # without a wrong sensor its reading is the level
-        doubted = [jnp.sum((a + b)[best]) > 0.0 for a, b in zip(*map(jnp.asarray, self._masks()))]
+        doubted = [of_best(a + b) > 0.0 for a, b in zip(*map(jnp.asarray, self._masks()))]
         doubted = jnp.stack(doubted)
-        z = jnp.where(doubted, jnp.stack(state.y), state.z[best, :-1])
+        z = jnp.where(doubted, jnp.stack(state.y), of_best(state.z[:, :-1]))
         noise = jnp.asarray(self.measurement) * np.eye(n)
-        P = jnp.where(doubted[:, None] | doubted, noise, state.P[best, :-1, :-1])
+        P = jnp.where(doubted[:, None] | doubted, noise, of_best(state.P[:, :-1, :-1]))
         z = jnp.append(z + zero[:, None], zero[:, None], axis=1)
         last = self._prior(zero)[:, None, None] * np.diag([0.0] * n + [1.0])
         P = jnp.pad(P, (0, 1)) + last
