@@ -252,6 +252,7 @@ function marginsOf(limits, measures) {
 // The verdict on a run: the rules and words of tuning/report/verdict.py, which judges for commands.
 
 const OFF = 0.05; // share of a tank's height by which a level may miss its setpoint
+const EXACT = 1e-4; // share below which a miss is not worth a number
 
 // {good, words} of the measures of a run, null for a loop without feedback
 function trackingOf(info, inForce, measures) {
@@ -261,10 +262,11 @@ function trackingOf(info, inForce, measures) {
   const rms = list("rms_error"), steady = list("steady_state_error"), highest = list("max_level");
   if (!rms.every(Number.isFinite)) return { good: false, words: "the run diverged: a level is not a finite number" };
   const missed = steady.map((error, o) => (Number.isNaN(error) ? rms[o] : error));
-  const shares = missed.map((error, o) => {
+  const share = (error, o) => {
     const rim = rimIn(info, inForce, outputs[o]), height = Number.isFinite(rim) ? rim : Math.abs(highest[outputs[o]]);
     return error / (height > 0 ? height : 1);
-  });
+  };
+  const shares = missed.map(share);
   const worst = shares.indexOf(Math.max(...shares)), tank = info.tanks[outputs[worst]].name;
   const total = `RMS error ${shown(measures.rms_error_total, 3)} ${unit}`;
   if (shares[worst] > OFF && Number.isNaN(steady[worst]))
@@ -276,6 +278,8 @@ function trackingOf(info, inForce, measures) {
   }
   const settled = steady.filter((error) => !Number.isNaN(error));
   if (!settled.length) return { good: true, words: `tracks with ${total}` };
+  if (steady.every((error, o) => Number.isNaN(error) || share(error, o) < EXACT))
+    return { good: true, words: `settles on its setpoints, ${total}` };
   return { good: true, words: `settles within ${shown(Math.max(...settled), 3)} ${unit} of its setpoints, ${total}` };
 }
 

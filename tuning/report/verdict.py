@@ -22,6 +22,9 @@ from jaxtank.loop.closed_loop import ClosedLoop
 OFF = 0.05
 """Share of a tank's height by which a level may miss its setpoint where it should have settled."""
 
+EXACT = 1e-4
+"""Share of a tank's height below which a miss is not worth a number."""
+
 
 class Part(NamedTuple):
     """One part of a verdict."""
@@ -111,6 +114,8 @@ def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
         return Part(f"{off} s, {total}", False)
     if np.isnan(steady).all():
         return Part(f"tracks with {total}")
+    if np.nanmax(steady / np.where(heights > 0.0, heights, 1.0)) < EXACT:
+        return Part(f"settles on its setpoints, {total}")
     return Part(f"settles within {shown(np.nanmax(steady))} {unit} of its setpoints, {total}")
 
 
