@@ -191,9 +191,9 @@ WORDS = {
     "pipe.diameter": "area: C pi/4 diameter^2, C the discharge coefficient",
     "pipe.from": "between: the two tanks that it joins",
     "pipe.to": "between: the two tanks that it joins",
-    "inflow.flow": "inflow of [[tank]] where it is constant; changes: [[time, flow], ...]; or time,"
+    "inflow.flow": "changes: [[time, flow], ...]; inflow of [[tank]] where it is constant; or time,"
     " duration and volume of a pulse",
-    "inflow.initial": "inflow of [[tank]] where it is constant; else changes: [[time, flow], ...]",
+    "inflow.initial": "changes: [[time, flow], ...]; inflow of [[tank]] where it is constant",
     "tank.width": "area",
     "tank.drain_diameter": "drain: C pi/4 diameter^2, C the discharge coefficient",
     "max": "high",
