@@ -319,6 +319,7 @@ PREDICTIVE = {
     ),
 }
 SENSOR = ((9.4458, 8.7106, 8.5106, 9.3458), 3.3)
+MARGIN = 1e-4  # below the rims: a programme is solved to about 1e-6 cm [cm]
 SECOND = Clock(dt=1.0, duration=1200.0, substeps=10)  # of the predictive controllers
 GAIN = 0.5  # l of every tank in OBSERVED (notes A10) [1/s]
 VARIANTS = {
@@ -339,6 +340,7 @@ def controller_of(kind, model):
             horizon=50.0 if preview else 30.0,
             r_w=each(1e-4),
             rate_time=8.0,
+            limit=np.asarray(model.rim) - MARGIN,
             low=each(0.0),
             high=each(12.0),
             preview=60.0 if preview else 0.0,
