@@ -140,11 +140,11 @@ figure = responses(case.loop, {"first guess": before, "tuned": after}, "buffer a
 
 # %%
 code = jaxtank.export.export(result.tuned.without_safety_filter(), "c", name="product")
-head, start, step = code.partition("void product_step")
+head, start, step = code.rpartition("void product_step")  # the header has its declaration
 print(start + step)
 
 # %% [markdown]
-# That is the step of the controller, {{len(step.splitlines())}} lines; the file also has its state and its start. `result.save(folder)` writes
+# That is the step of the controller, {{len(step.splitlines())}} lines, in which the gains are entries of a struct, `p`: they can be changed without a new export. The files also have its state, its start and their ranges. `result.save(folder)` writes
 # the tuned rig as a TOML file, the pictures, the numbers and a report; `result.explore()` is a page
 # in which the whole loop runs in the browser, to give to a colleague.
 #
