@@ -121,21 +121,6 @@ def test_the_rig_in_python_runs(capsys, monkeypatch):
     assert "0.0372" in printed and "rms_error_total" in printed
 
 
-def custom_controller():
-    """The front page's example of a custom controller, the last of its examples in Python."""
-    *_, example = blocks("python", "README.md")
-    assert len(blocks("python")) == 4
-    return compile(example, "README", "exec")
-
-
-def test_the_custom_controller_runs(capsys, monkeypatch):
-    """Its last line simulates once in place of a search."""
-    run = lambda case, free, **_: jaxtank.evaluate(case.loop, case.clock, ["rms_error_total"])
-    monkeypatch.setattr(package, "tune", run)
-    exec(custom_controller(), {"__name__": "README"})
-    assert "0.809" in capsys.readouterr().out
-
-
 @pytest.mark.slow
 def test_the_custom_objective_runs(monkeypatch):
     """Its last line evaluates the problem once, at a longer step, in place of a search."""
@@ -153,13 +138,6 @@ def test_the_custom_objective_runs(monkeypatch):
     assert [limit.label for limit in problem.limits][-1] == "fastest_change"
     for name in set(MEASURES) - known:
         del MEASURES[name]
-
-
-@pytest.mark.slow
-def test_the_custom_controller_is_tuned(capsys):
-    exec(custom_controller(), {"__name__": "README"})
-    printed = capsys.readouterr().out
-    assert "controller.Kc" in printed and "converged" in printed
 
 
 def test_the_rigs_shown_are_the_one_that_is_tested():
