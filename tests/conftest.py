@@ -31,6 +31,7 @@ SKIPS = (
     r"could not import 'xarray'",
     r"CasADi is not installed",
     r"FMPy is not installed",
+    r"diffrax is not installed",
     r"killed before the search began$",
 )
 """Reasons for which a test may skip. Under JAXTANK_SKIPS=listed, as in CI, any other one fails."""

@@ -89,8 +89,8 @@ def physics(case: Case, loop: Any) -> tuple[Any, Any]:
         return Inputs(**keys | {"d": d, "xi": None, "fault": fault})
 
     def read(state, inputs, spilled):
-        y, sensor = readings(loop.sensor, state, inputs, clock)
-        state = state._replace(sensor=sensor, observer=(), controller=())
+        y, state = readings(loop, state, inputs, clock)
+        state = state._replace(observer=(), controller=())
         return tuple(jnp.stack([jnp.asarray(e) for e in v]) for v in (y, state.x, spilled)), state
 
     def begin():

@@ -42,6 +42,16 @@ IMPORTED = {
         "subprocess",
     ): "`jaxtank bench` compiles its own floor.c with gcc, where there is one",
     ("tuning.bench.bench", "ctypes"): "and calls it",
+    (
+        "jaxtank.export.timing",
+        "subprocess",
+    ): "gcc compiles a controller of ours, which is then timed",
+    ("jaxtank.export.fmi", "subprocess"): "gcc compiles an FMU of ours, where there is one",
+    (
+        "jaxtank.export.replay",
+        "subprocess",
+    ): "gcc or node for the export that a user asks to be run",
+    ("jaxtank.export.replay", "ctypes"): "and calls it",
     ("tuning.cli.commands.explore", "webbrowser"): "`explore --open` shows the file it has written",
 }
 
@@ -86,6 +96,16 @@ MADE = {
     ("jaxtank.presets", "_load", "import_module"): "names of presets.PAPERS, checked before",
 }
 READ = {
+    ("jaxtank.export.replay", "_load_c", "read_text"): "an export that the user asks to be run",
+    ("jaxtank.export.replay", "_loaded", "CDLL"): "its code, compiled here or in the user's FMU",
+    ("jaxtank.export.replay", "_load_fmu", "read_bytes"): "an FMU that the user asks to be run",
+    (
+        "jaxtank.export.replay",
+        "_load_fmu",
+        "ZipFile",
+    ): "its parts by their names; nothing is extracted but its library",
+    ("jaxtank.export.fmi", "library", "read_bytes"): "the library that gcc has made",
+    ("jaxtank.export.fmi", "print_fmu", "ZipFile"): "is written",
     ("jaxtank.core.lazy", "attach", "read_text"): "the stub of its own package",
     ("jaxtank.core.installed", "imported", "load"): "an entry point of an installed package that a"
     " rig file names as the kind of a component; nothing from a path",

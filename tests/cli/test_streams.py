@@ -113,6 +113,7 @@ class Screen(io.StringIO):
 def test_a_long_compilation_is_announced_on_a_terminal_only(monkeypatch, stream, quiet):
     monkeypatch.setattr(sys, "stderr", stream())
     Progress("cm", quiet)
+    terminal.end_lines()
     announced = "compiling the simulation and its derivatives, about" in sys.stderr.getvalue()
     assert announced == (stream is Screen and not quiet)
 

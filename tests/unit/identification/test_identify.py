@@ -222,7 +222,8 @@ def test_many_records_are_reported_as_every_result(hundred, tmp_path):
     few.sd[2, 1], few.interval95[2, 1] = np.nan, np.nan
     text = str(few)
     assert f"{few.values[0, 0]:.5g} (sd {few.sd[0, 0]:.2g})" in text
-    assert f"{few.values[2, 1]:.5g} (no interval)" in text and "<table>" in few._repr_html_()
+    page = few._repr_html_()
+    assert f"{few.values[2, 1]:.5g} (no interval)" in page and "<table>" in page
 
     paths = few.save(tmp_path / "out")
     names = {"result.json", "estimates.csv", "estimates.png", "report.html"}

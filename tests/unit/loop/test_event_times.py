@@ -18,6 +18,7 @@ COUNTS = (
     "recovery_time",
     "time_of_max_level",
     "time_of_min_level",
+    "time_of_steady_state_error",
 )
 
 
