@@ -17,7 +17,8 @@ HIDDEN = (
     (re.compile(r"0x[0-9a-f]{6,}"), "0x"),  # addresses
     (re.compile(r"/tmp/[\w./-]+"), "/tmp"),
     (re.compile(r"(Run time: about )\d+ s"), r"\1# s"),
-    (re.compile(r"\(\d+(\.\d+)? s\)"), "(# s)"),  # at the end of what tune prints
+    (re.compile(r"\(\d+(\.\d+)? s\)"), "(# s)"),
+    (re.compile(r"(\bMs [\d.]+)\s+\d+\.\d s\b"), r"\1 # s"),  # below the verdict of tune
     # and identify, whose number of simulations follows from rounding
     (re.compile(r"\b\d+\.\d s, \d+( simulations with)"), r"# s, #\1"),
 )
