@@ -144,7 +144,9 @@ head, start, step = code.rpartition("void product_step")  # the header has its d
 print(start + step)
 
 # %% [markdown]
-# That is the step of the controller, {{len(step.splitlines())}} lines, in which the gains are entries of a struct, `p`: they can be changed without a new export. The files also have its state, its start and their ranges. `result.save(folder)` writes
+# That is the step of the controller, {{len(step.splitlines())}} lines, in which the gains are entries of a
+# struct, `p`: they can be changed without a new export. The files also have its state, its start and the
+# ranges of the gains. `result.save(folder)` writes
 # the tuned rig as a TOML file, the pictures, the numbers and a report; `result.explore()` is a page
 # in which the whole loop runs in the browser, to give to a colleague.
 #

@@ -24,7 +24,7 @@ class C(Printer):
         self.type, self.suffix, self.places = precision, f, dict(places)
         self.kinds = {**self.kinds, REAL: precision}
         self.rename = {"s": "state->s"}
-        one = f"1.0{f}"
+        unit = f"1.0{f}"
         self.operations = {
             **OPERATIONS,
             **{name: f"{name}{f}({{0}})" for name in [*FUNCTIONS, "cbrt", "exp2"]},
@@ -39,8 +39,8 @@ class C(Printer):
             "ne": "{0} != {1}",
             "and": "{0} && {1}",
             "or": "{0} || {1}",
-            "rsqrt": f"{one} / sqrt{f}({{0}})",
-            "logistic": f"{one} / ({one} + exp{f}(-{{0}}))",
+            "rsqrt": f"{unit} / sqrt{f}({{0}})",
+            "logistic": f"{unit} / ({unit} + exp{f}(-{{0}}))",
             "quotient": "{0} / {1}",
             "remainder": "{0} % {1}",
             "sign": f"({precision})(({{0}} > 0) - ({{0}} < 0))",
@@ -193,8 +193,10 @@ class Text:
             "PUMPS": program.pumps,
         }
         facts = ", ".join(f"{name.upper()}_{key} = {value}" for key, value in sizes.items())
-        kept = [f"    {real} c[{program.kept}]; /* results of p alone */"] if program.kept else []
-        kept += [f"    {name}_parameters p;"] if program.prepare else []
+        prepared = (
+            [f"    {real} c[{program.kept}]; /* results of p alone */"] if program.kept else []
+        )
+        prepared += [f"    {name}_parameters p;"] if program.prepare else []
         zero = "d" if program.plant else "dr, ddr"
         return "\n".join(
             [
@@ -222,7 +224,7 @@ class Text:
                 f"extern const {name}_parameters {name}_defaults;",
                 "",
                 f"typedef struct {{\n    {real} s[{name.upper()}_STATE];",
-                *kept,
+                *prepared,
                 f"}} {name}_state;",
                 "",
                 f"{self.init_call};",

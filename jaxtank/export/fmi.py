@@ -53,13 +53,13 @@ class Variable(NamedTuple):
 
 def variables(program: Any) -> list[Variable]:
     """Return the variables of an FMU: parameters, inputs, outputs."""
-    loop, found = program.case.loop, []
+    loop, numbers = program.case.loop, []
     for p in program.parameters:
         for i in np.ndindex(p.value.shape):
             name = p.name + (f"[{','.join(map(str, i))}]" if i else "")
             words, unit = note_of(p), p.meta["unit"]
             ends = p.meta["low"], p.meta["high"]
-            found.append(Variable(name, "parameter", float(p.value[i]), unit, words, *ends))
+            numbers.append(Variable(name, "parameter", float(p.value[i]), unit, words, *ends))
     starts = {"y": loop.x0, "u": loop.actuator.initial}
     groups = {"input": program.inputs, "output": program.outputs_of}
     for causality, names in groups.items():
@@ -70,8 +70,8 @@ def variables(program: Any) -> list[Variable]:
                 start = float(starts[name][j]) if name in starts else 0.0
                 label = f"{words} of {label_of(loop.plant, kind, j)}"
                 full, unit_of_rig = f"{NAMES.get(name, name)}[{j}]", local(unit, loop.units)
-                found.append(Variable(full, causality, start, unit_of_rig, label))
-    return found
+                numbers.append(Variable(full, causality, start, unit_of_rig, label))
+    return numbers
 
 
 def _attributes(**words):

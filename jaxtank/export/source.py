@@ -4,7 +4,8 @@ The file is made from the step function that is simulated.
 """
 
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from jaxtank.case import Case
@@ -34,6 +35,7 @@ class Language(NamedTuple):
     reserved : names that the function may not have
     adjustable : whether the numbers of the controller are parameters of the code
     plants : whether a plant can be exported too
+    versions : {version: its function in place of `write`}
 
     Examples
     --------
@@ -46,6 +48,7 @@ class Language(NamedTuple):
     reserved: Collection[str] = ()
     adjustable: bool = False
     plants: bool = False
+    versions: Mapping[str, Callable[[Program, str, str], Any]] = MappingProxyType({})
 
 
 LANGUAGES = {
@@ -53,8 +56,13 @@ LANGUAGES = {
     "m": Language(print_matlab, reserved=RESERVED),
     "js": Language(print_javascript, reserved=JAVASCRIPT_NAMES),
     "st": Language(print_structured_text, PRECISIONS, ST_NAMES, adjustable=True),
-    "fmu": Language(print_fmu, reserved=["fmi"], adjustable=True, plants=True),
-    "fmu2": Language(print_fmu2, reserved=["fmi"], adjustable=True, plants=True),
+    "fmu": Language(
+        print_fmu,
+        reserved=["fmi"],
+        adjustable=True,
+        plants=True,
+        versions={"3": print_fmu, "2": print_fmu2},
+    ),
 }
 """{name, which is also the suffix of the file: Language}."""
 
@@ -133,6 +141,7 @@ def files(
     precision: str = "double",
     name: str | None = None,
     plant: bool = False,
+    version: str | None = None,
 ) -> dict[str, Any]:
     """Return {file: text or bytes} of the controller of a case, or of its plant."""
     if language not in LANGUAGES:
@@ -147,9 +156,13 @@ def files(
     if plant and not target.plants:
         with_plants = " or ".join(n for n, other in LANGUAGES.items() if other.plants)
         raise InputError(f"--plant: --lang {language} has controllers only; give {with_plants}")
+    if version is not None and version not in target.versions:
+        known = " or ".join(target.versions) or "left out"
+        raise InputError(f"--fmi {version}: of --lang {language} it must be {known}")
     (_check_plant if plant else _check_controller)(case)
     name = _checked_name(case, name, target.reserved)
-    written = target.write(program(case, plant, target.adjustable), name, precision)
+    write = target.versions.get(version or "", target.write)
+    written = write(program(case, plant, target.adjustable), name, precision)
     return written if isinstance(written, dict) else {f"{name}.{language}": written}
 
 

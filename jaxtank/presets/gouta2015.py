@@ -314,7 +314,7 @@ PREDICTIVE = {
         ("controller.horizon", "controller.rate_time"),
     ),
     "nmpc-preview": (
-        "the same with setpoints known a minute ahead",
+        "nonlinear predictive control that knows setpoints a minute ahead, with the rims as limits",
         ("controller.horizon", "controller.r_w"),
     ),
 }

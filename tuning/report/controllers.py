@@ -1,5 +1,7 @@
 """The report of `jaxtank compare --controllers`: every controller that fits a rig, side by side."""
 
+from typing import Any
+
 import numpy as np
 
 from tuning.problem import provenance
@@ -10,9 +12,8 @@ from tuning.report.folder import save as save_all
 from tuning.report.tables import Table, Value, clean
 
 CAPTIONS = {
-    "controllers": "Mean error of the plants that can follow, of each controller at its first gains"
-    " (open) and tuned (filled); squares have the safety filter, and a cross marks limits that are"
-    " broken on some plant."
+    "controllers": "Mean error of each controller on the plants where every setpoint is reachable."
+    " Red: a limit is broken on some plant."
 }
 
 
@@ -56,7 +57,7 @@ def sentence(result):
     """Return who wins, by how much, and where the case's own controller stands."""
     unit, best, own = result.case.loop.units[0], result.best, result.own
     if best.error is None:
-        return "no controller has a finite run on a plant that can follow"
+        return "no controller has a finite run on a plant where every setpoint is reachable"
     words = f"{best.words()}: least error ({best.error:.3g} {unit}) of those that hold every limit"
     words += f" on {result.samples} of {result.samples} plants"
     if not best.holds:
@@ -99,12 +100,15 @@ def report(result):
             ]
         )
     notes = [
-        "error: mean total rms error of the plants that can follow: on which some controller can"
-        " hold every setpoint",
+        "error: mean total rms error of the plants where every setpoint is reachable",
         "travel: rms change of the inputs per sample, as a share of their range",
         "Ms: largest sensitivity peak at the plateaus of the nominal plant",
         "C: time of a step of the controller alone, without the filter",
-        *(f"{name} does not fit this rig: {why}" for name, why in result.refused.items()),
+        *(
+            [f"not for this rig: {', '.join(result.refused)} (reasons: --json)"]
+            if result.refused
+            else []
+        ),
     ]
     return Report(
         result.case.name,
@@ -118,28 +122,34 @@ def report(result):
 
 def figures(result):
     """Return matplotlib figures {"controllers": errors of all Rivals}."""
+    from matplotlib.lines import Line2D
+
     from jaxtank.plots.style import picture
 
     names = list(dict.fromkeys(rival.name for rival in result.rivals))
+    rivals = [rival for rival in result.rivals if rival.error is not None]
+
+    def point(tuned, filtered, colour="0.3") -> dict[str, Any]:
+        face = colour if tuned else "none"
+        return {"marker": "s" if filtered else "o", "color": colour, "markerfacecolor": face}
 
     def errors(ax):
-        for rival in result.rivals:
-            if rival.error is None:
-                continue
-            colour = "C0" if rival.holds else "C3"
-            face = colour if rival.tuned else "none"
-            marker = ("s" if rival.holds else "X") if rival.filtered else "o"
-            marker = marker if rival.holds else "X"
-            ax.plot(
-                rival.error, names.index(rival.name), marker, color=colour, markerfacecolor=face
-            )
+        for rival in rivals:
+            style = point(rival.tuned, rival.filtered, "C0" if rival.holds else "C3")
+            ax.plot(rival.error, names.index(rival.name), linestyle="none", **style)
+        sides = ((False, False), (True, False), (False, True), (True, True))
+        words = ("first gains", "tuned", "first gains, safety filter", "tuned, safety filter")
+        handles = [Line2D([], [], linestyle="none", **point(*side)) for side in sides]
+        ax.legend(handles, words, loc="upper left", bbox_to_anchor=(1.0, 1.0))
         ax.set_yticks(np.arange(len(names)), names)
-        ax.invert_yaxis()
-        ax.set_xscale("log")
+        ax.set_ylim(len(names) - 0.5, -0.5)
+        values = [rival.error for rival in rivals]
+        if values and max(values) > 10.0 * min(values):
+            ax.set_xscale("log")
         ax.set_xlabel(f"mean total rms error [{result.case.loop.units[0]}]")
         ax.grid(True, axis="x", alpha=0.3)
 
-    return {"controllers": picture(errors, (6.4, 0.6 + 0.35 * len(names)))}
+    return {"controllers": picture(errors, (7.6, max(1.9, 0.8 + 0.32 * len(names))))}
 
 
 def save(result, folder, command=None):

@@ -59,7 +59,7 @@ class Rival(NamedTuple):
 
     @property
     def error(self) -> float | None:
-        """Mean total rms error of the plants that can follow [unit of length]."""
+        """Mean total rms error of the plants where every setpoint is reachable [unit of length]."""
         good = self.followers & ~self.judged.failed
         return float(np.mean(self.judged.error[good])) if good.any() else None
 

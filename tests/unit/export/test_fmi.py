@@ -33,13 +33,13 @@ class Unit:
     """An FMU of either version in this process."""
 
     def __init__(self, case, folder, version, plant=False):
-        (name, content), *_ = files(case, version, name="law", plant=plant).items()
-        path = folder / f"{plant}_{name}"
+        (name, content), *_ = files(case, "fmu", name="law", plant=plant, version=version).items()
+        path = folder / f"{plant}_{version}_{name}"
         path.write_bytes(content)
         assert validation.validate_fmu(str(path)) == []
         self.text = fmpy.read_model_description(str(path))
         self.refs = {v.name: v.valueReference for v in self.text.modelVariables}
-        self.third = version == "fmu"
+        self.third = version == "3"
         kind = fmi3.FMU3Slave if self.third else fmi2.FMU2Slave
         words = {"modelIdentifier": "law", "unzipDirectory": fmpy.extract(str(path))}
         words["guid"] = self.text.guid
@@ -86,10 +86,10 @@ def looped(case, run, controller, plant):
 @pytest.mark.parametrize(
     ("name", "version", "delay"),
     [
-        ("cascaded/pi", "fmu", 3.0),
-        ("cascaded/pi", "fmu2", 3.0),
+        ("cascaded/pi", "3", 3.0),
+        ("cascaded/pi", "2", 3.0),
         *(
-            pytest.param(name, "fmu", 0.0, marks=pytest.mark.slow)
+            pytest.param(name, "3", 0.0, marks=pytest.mark.slow)
             for name in (
                 *("gouta2015/backstepping-boxqp", "gouta2022/chadpc", "gouta2022/fopi"),
                 *("calofir/backstepping-perturbed", "dts200/pi-faults", "mirakhorli/lqi"),
@@ -109,7 +109,7 @@ def test_two_fmus_in_a_loop_are_the_simulation(tmp_path, name, version, delay):
 
 def test_parameters_of_an_fmu_are_tunable_with_units_and_ranges(tmp_path):
     case, _ = case_and_run("cascaded/pi", 3.0)
-    unit = Unit(case, tmp_path, "fmu")
+    unit = Unit(case, tmp_path, "3")
     (Kc,) = (v for v in unit.text.modelVariables if v.name == "controller.Kc[0]")
     assert (Kc.causality, Kc.variability, Kc.unit) == ("parameter", "tunable", "V/V")
     (Ti,) = (v for v in unit.text.modelVariables if v.name == "controller.Ti[0]")

@@ -11,7 +11,7 @@ import pytest
 from safety_attacks import attack, of, random_rig, sensor_of
 from scipy.integrate import solve_ivp
 
-from jaxtank import evaluate, presets, with_values
+from jaxtank import evaluate, presets, rig, with_values
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants import network
@@ -275,3 +275,37 @@ def test_gradients_through_the_filter_are_central_differences(name, gain, value,
         central = float(cost(theta + e) - cost(theta - e)) / (2 * step)
         assert float(slopes[i]) == pytest.approx(central, rel=2e-5, abs=1e-9)
     assert abs(slopes[1]) > 1e-7
+
+
+SENSOR_RIG = """
+name = "one tank"
+tank = [{ area = 10.0, rim = 20.0, drain = 0.05, level = 5.0 }]
+pump = [{ gain = 3.0, to = 1, high = 10.0, initial = 1.5 }]
+controller = { kind = "pi", Kc = 5.0, Ti = 20.0 }
+reference = { initial = [5.0], changes = [[5.0, 1, 19.0]] }
+values = { "clock.dt" = 0.5, "clock.duration" = 200.0, "sensor.noise" = [0.01] }
+limits = { max_level = 19.5 }
+safety_filter = {}
+"""
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        'kind = "offset", size = -4.0',
+        'kind = "drift", size = -0.05',
+        'kind = "noise", size = 2.0',
+        'kind = "spikes", size = -4.0, every = 10.0',
+        'kind = "freeze"',
+    ],
+)
+def test_nothing_is_proved_where_a_sensor_is_faulty(fault):
+    faulty = f"fault = [{{ sensor = 1, start = 20.0, end = 200.0, {fault} }}]\n"
+    case = rig.loads(SENSOR_RIG + faulty)
+    (row,) = case.safety_design()[1]
+    assert not row.certified and "faults" in row.reason
+    (sound,) = rig.loads(SENSOR_RIG).safety_design()[1]
+    assert sound.certified
+    if "offset" in fault:  # the filter believes the reading, and the limit is passed
+        highest = evaluate(case.loop, case.clock, ["max_level"], key=jax.random.key(0))
+        assert float(np.max(highest["max_level"])) > 19.5 + 1.0

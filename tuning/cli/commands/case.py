@@ -210,10 +210,7 @@ def export(args):
     case = open_case(args)
     from jaxtank.export import source
 
-    if args.fmi == "2" and args.lang != "fmu":
-        raise InputError(f"--fmi 2: is a version of --lang fmu, not of {args.lang}")
-    lang = "fmu2" if args.fmi == "2" else args.lang
-    files = source.files(case, lang, args.precision, args.name, args.plant)
+    files = source.files(case, args.lang, args.precision, args.name, args.plant, args.fmi)
     if any(isinstance(content, bytes) for content in files.values()) and not args.out:
         raise InputError(f"--lang {args.lang} is no text: give --out DIR, where it is written")
     if args.json or not args.out:
@@ -312,7 +309,7 @@ COMMANDS = {
         (
             *COMMON, *CASE,
             Option("--lang", "LANG", "c, st, m, js or fmu", default="c"),
-            Option("--fmi", "VERSION", "of an FMU: 3 or 2", default="3", choices=("3", "2")),
+            Option("--fmi", "VERSION", "of an FMU: 3 (if left out) or 2", choices=("3", "2")),
             Option("--precision", "TYPE", "double or float, of c and st", default="double"),
             Option("--name", "NAME", "of the functions (default: the case's)"),
             Option("--plant", help="the plant with its pumps and gauges instead of the controller",
