@@ -18,7 +18,7 @@ from jaxtank.core.text import one_line
 from jaxtank.plots.layout import place
 from jaxtank.plots.overview import LARGEST as MOST_TANKS
 from jaxtank.plots.schematic import HALO, depth, mark, mark_height, schematic
-from jaxtank.plots.spills import Stack, headroom, spilled
+from jaxtank.plots.spills import Lost, Stack, headroom, spilled
 from jaxtank.plots.style import PUMPS, TUNED, WATER, box, plain, styled
 
 RATE = 12
@@ -186,7 +186,6 @@ class _Stage:
         number, of = place_of  # of the rig in the figure, and how many there are
         self.loop, self.where = loop, place(loop.plant)
         self.t, self.x, self.r, self.u = (np.asarray(v) for v in (run.t, run.x, run.r, run.u))
-        area = np.asarray(loop.plant.area, dtype=float)
         self.low, self.high = (
             np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high)
         )
@@ -204,7 +203,10 @@ class _Stage:
         self.words = figure.text(middle, 0.1 * inch, "", va="bottom", **words)
         self.water, self.marks, self.bars = _moving(ax, loop, self.where)
         most, tanks = self.spilled.most, self.where.boxes
-        self.stacks = {i: Stack(ax, tanks[i], area[i]) for i in np.flatnonzero(most > 0)}
+        area, unit = np.asarray(loop.plant.area, dtype=float), self.spilled.unit
+        gone = self.spilled.simulated
+        above = lambda i: Lost(ax, tanks[i], unit) if gone else Stack(ax, tanks[i], area[i])
+        self.stacks = {i: above(i) for i in np.flatnonzero(most > 0)}
         headroom(ax, [(stack, most[i]) for i, stack in self.stacks.items()])
 
     def draw(self, t):

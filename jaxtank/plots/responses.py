@@ -45,27 +45,40 @@ SHOWN = 16
 """Tanks between, outputs and pumps that are drawn each; of more, those that matter."""
 
 
-def level(ax, runs, tank, output=None, rim=None, limit=None, unit="cm", spills=None, plant=None):
-    """Draw the level of one tank, with its setpoint, rim and limit."""
+def level(
+    ax, runs, tank, output=None, rim=None, limit=None, unit="cm", spills=None, plant=None, top=0.0
+):
+    """Draw the level of one tank, with its setpoint, rim and limit; `top`: end of the axis, that of
+    tanks beside it.
+    """
     lines(ax, runs, "x", tank, linewidth=1.4)
     if output is not None:
         last = next(iter(runs.values()))[0]
         dots = {"color": REFERENCE, "linestyle": ":", "linewidth": 1.2, "label": "setpoint"}
         ax.plot(last.t, last.r[:, output], **dots)
-    highest = max(float(np.max(run.x[:, tank])) for run, _, _ in runs.values())
+    highest = max(_highest(runs, tank), top / HEADROOM)
     highest_bound = 0.0
     # a rim far above all levels would only compress the picture
     for bound, name in ((rim, "rim"), (limit if limit != rim else None, "limit")):
         if bound is not None and (highest > 0.6 * bound):
             highest_bound = max(highest_bound, bound)
-            top = max(highest * 1.03, highest_bound * 1.05)
+            top = max(highest * 1.03, highest_bound * HEADROOM, top)
             ax.axhspan(bound, top, **BEYOND)
             ax.axhline(bound, color=FORBIDDEN, linewidth=1.0, label=f"{name} {bound:g} {unit}")
-            ax.set_ylim(top=top)
+    if top:
+        ax.set_ylim(top=top)
     ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]) if output is None else None)
     ax.set(title=f"{plain(label_of(plant, 'tank', tank))}{above_rim(ax, runs, tank, rim, spills)}")
     ax.set_ylabel(f"level [{unit}]")
     return ax
+
+
+HEADROOM = 1.05
+"""End of the axis of a level over what it has to show [-]."""
+
+
+def _highest(runs, tank):
+    return max(float(np.max(run.x[:, tank])) for run, _, _ in runs.values())
 
 
 def voltage(ax, runs, pump, low, high, unit="V", plant=None):
@@ -176,9 +189,15 @@ def _rows(loop, runs, which, limits):
     rims, low, high = loop.plant.rim, loop.actuator.low, loop.actuator.high
     lost = {name: spilled(loop.plant, run) for name, (run, *_) in runs.items()}
 
-    def level_of(i, k=None):
+    def level_of(i, k=None, top=0.0):
         bounds = _at(rims, i), _at(limits, i)
-        return lambda ax: level(ax, runs, i, k, *bounds, length, lost, loop.plant)
+        return lambda ax: level(ax, runs, i, k, *bounds, length, lost, loop.plant, top)
+
+    def top_of(tanks):  # tanks without a setpoint have one axis
+        highest = max((_highest(runs, i) for i in tanks), default=0.0)
+        bounds = (_at(array, i) for array in (rims, limits) for i in tanks)
+        top = HEADROOM * max([highest, *(b for b in bounds if b and highest > 0.6 * b)])
+        return top if np.isfinite(top) else 0.0
 
     def error_of(i, k):
         return lambda ax: error(ax, runs, k, i, length, loop.plant)
@@ -191,7 +210,7 @@ def _rows(loop, runs, which, limits):
     kinds = [
         [level_of(i, k) for k, i in outputs],
         [error_of(i, k) for k, i in outputs],
-        [level_of(i) for i in others],
+        [level_of(i, top=top_of(others)) for i in others],
         [voltage_of(j) for j in pumps],
     ]
     most = beside(COLUMNS)

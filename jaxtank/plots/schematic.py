@@ -14,7 +14,7 @@ from jaxtank.core.units import local
 from jaxtank.plants.vessels import shape_name
 from jaxtank.plots.layout import jets, overflows, pipes, place, valves
 from jaxtank.plots.overview import LARGEST, overview
-from jaxtank.plots.spills import Stack, amount, headroom, volume_above
+from jaxtank.plots.spills import Lost, Stack, amount, headroom, volume_above
 from jaxtank.plots.style import AFTER, GLASS, PUMPS, REFERENCE, WATER, box, write
 
 JET = {"color": AFTER, "linewidth": 1.1, "linestyle": (0, (3, 1.5)), "zorder": 2}
@@ -99,18 +99,22 @@ def depth(tank, level):
 
 
 def _above(ax, plant, where, levels, lost):
-    """What is above the rims, hatched and counted: lost volumes, or what the tanks cannot hold."""
+    """Volumes that are lost, or those above the rims where no overflow is simulated, hatched."""
     area, rim = (np.asarray(v, dtype=float) for v in (plant.area, plant.rim))
-    volumes, words = volume_above(plant, levels), "above"
-    if lost is not None:
-        volumes, words = np.asarray(lost, dtype=float), "spilled"
+    volumes = volume_above(plant, levels) if lost is None else np.asarray(lost, dtype=float)
+    unit = local("cm^3", plant.units)
     for i in np.flatnonzero(volumes > 1e-9 * area * rim):
         tank, volume = where.boxes[i], float(volumes[i])
+        if lost is not None:
+            gone = Lost(ax, tank, unit)
+            gone.set(volume)
+            headroom(ax, [(gone, volume)])
+            continue
         stack = Stack(ax, tank, float(area[i]))
         stack.set(volume)
         headroom(ax, [(stack, volume)])
         y = tank.y + tank.height + min(0.5 * stack.height(volume), 0.2)
-        text = f"{amount(volume, local('cm^3', plant.units))} {words}"
+        text = f"{amount(volume, unit)} above"
         look = {"colour": "black", "path_effects": HALO, "zorder": 6, "gid": "above"}
         write(ax, tank.middle, y, text, **look)
 

@@ -107,8 +107,29 @@ class Stack:
         self.more.set_visible(height > HIGHEST)
 
 
+class Lost:
+    """Liquid that is gone over the rim of a tank: a drop outside each wall, and its volume."""
+
+    def __init__(self, ax: Any, box: Any, unit: str):
+        self.box, self.unit, top = box, unit, box.y + box.height
+        sides = [box.x - 0.07, box.x + box.width + 0.07]
+        look = {"marker": "v", "color": RIM, "markersize": 5, "zorder": 3.7, "linestyle": "none"}
+        (self.drops,) = ax.plot(sides, [top - 0.06] * 2, visible=False, **look)
+        words = {"ha": "center", "va": "bottom", "fontsize": 7.5, "zorder": 6, "gid": "above"}
+        self.text = ax.text(box.middle, top + 0.03, "", color=RIM, **words)
+
+    def height(self, volume: float) -> float:
+        """Return the height of its words."""
+        return 0.17 if volume > 0.0 else 0.0
+
+    def set(self, volume: float) -> None:
+        """Show a volume [cm^3]."""
+        self.drops.set_visible(volume > 0.0)
+        self.text.set_text(f"{amount(volume, self.unit)} spilled" if volume > 0.0 else "")
+
+
 def headroom(ax: Any, stacks: Any) -> None:
-    """Make room in a drawing for [(Stack, largest volume)]."""
+    """Make room in a drawing for [(Stack or Lost, largest volume)]."""
     top = ax.get_ylim()[1]
     for stack, volume in stacks:
         rim = stack.box.y + stack.box.height

@@ -64,6 +64,7 @@ def test_what_is_on_the_floor_is_the_overflow_volume_of_the_library(runs):
     ax = schematic(Figure().gca(), loop.plant, run.x[-1], lost=run.spilled[-1])
     words = {t.get_text() for t in ax.texts if t.get_gid() == "above"}
     assert f"{volume[3]:.0f} cm^3 spilled" in words
+    assert hatched(ax) == []  # it is gone, and stands nowhere
 
 
 def test_what_stands_above_a_rim_follows_from_the_highest_level(runs):
