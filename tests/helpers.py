@@ -46,7 +46,7 @@ RANKS = [
     "jaxtank.case",
     "jaxtank.presets",
     "jaxtank.rig jaxtank.plots jaxtank.export jaxtank.interop",
-    "jaxtank.limits jaxtank.bounds",
+    "jaxtank.limits jaxtank.bounds jaxtank.task",
     "jaxtank.live",
     "jaxtank.__main__",
     "tuning.views",

@@ -64,8 +64,8 @@ class WholeLoop:
     """Entries of c after a sample."""
     saved: dict[str, list[Any]]
     """{field of `SAVED`, or "errors": its entries at a sample}."""
-    weights: list[float]
-    """Weight of the square of each of the errors."""
+    weights: list[tuple[str, float]]
+    """(measure, weight of the square) of each of the errors."""
     measures: dict[str, list[Any]]
     """{measure: its entries}, read of c after the last sample."""
     lines: dict[int, str]
@@ -124,7 +124,11 @@ def whole_loop(
         first=flat(before),
         after=flat(after),
         saved={"errors": flat(errors)} if squares else {f: flat(saved[f]) for f in SAVED},
-        weights=[float(w) for w in ms.residual_weights(run_of(case.loop, case.clock), squares)],
+        weights=[
+            (m, float(w))
+            for m, weight in squares
+            for w in ms.residual_weights(run_of(case.loop, case.clock), ((m, weight),))
+        ],
         measures={m: flat(values[m]) for m in names},
         lines={start.index: name for start, name in lowered.lines.items()},
     )

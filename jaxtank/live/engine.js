@@ -81,13 +81,21 @@ info.leaves = info.leaves.flatMap(([unit, doc, group, entries]) =>
 const PIECE = 500; // samples
 const RESIDUALS = 4000; // samples whose residuals make a Gauss-Newton matrix, about
 const STEP = 1e-6; // of a difference, as a share of the number
+const DEVIATES = 1e7; // numbers of noise that are kept
+
+/* {measure: weight} of the sums of squares whose Gauss-Newton matrix stands for an objective. */
+function squaresOf(objective) {
+  const own = Object.entries(objective).filter(([m]) => info.squares.includes(m));
+  return "rms_error_total" in objective || !own.length ? { mean_square_error: 1 } : Object.fromEntries(own);
+}
 
 function makeEngine() {
   const defaults = new Map(info.leaves.map((leaf) => [leaf.name, leaf.value]));
   const noisy = info.leaves.filter((leaf) => leaf.name.startsWith("sensor.noise"));
   const samples = info.samples, tanks = info.tanks.length;
   const kept = new Map();
-  let drawn = { seed: null, noise: null }, still = null;
+  const drawn = new Map();
+  let still = null;
 
   function numberOf(values, name) {
     return values && name in values ? Number(values[name]) : defaults.get(name);
@@ -109,8 +117,11 @@ function makeEngine() {
       still = still || new Float64Array(samples);
       return Array(tanks).fill(still);
     }
-    if (drawn.seed !== seed) drawn = { seed, noise: deviates(seed, tanks, samples) };
-    return drawn.noise;
+    if (!drawn.has(seed)) {
+      if ((drawn.size + 1) * tanks * samples > DEVIATES) drawn.clear();
+      drawn.set(seed, deviates(seed, tanks, samples));
+    }
+    return drawn.get(seed);
   }
 
   /* What is known of each sample, computed again where the numbers that it depends on changed. */
@@ -171,13 +182,14 @@ function makeEngine() {
     return out;
   }
 
-  /* Measures, their derivatives by `names` and the Gauss-Newton matrix, by differences of runs.
-  base: the run at `values`, if known. */
+  /* Measures, their derivatives by `names` and the Gauss-Newton matrix of options.objective (of the case
+  by default), by differences of runs. base: the run at `values`, if known. */
   const every = Math.max(1, Math.floor(samples / RESIDUALS));
 
   function slopes(values, names, options, base = null) {
     const P = names.length;
-    const { weights } = programs[chosen((options || {}).filter)].search;
+    const { objective = info.objective.measures, filter } = options || {}, squares = squaresOf(objective);
+    const weights = programs[chosen(filter)].search.weights.map(([m, w]) => w * (squares[m] || 0));
     const go = (at) => run(at, { ...options, every, search: true });
     const before = base || go(values), jacobian = {}, G = new Float64Array(P * P);
     const moved = names.map((name) => {
@@ -200,6 +212,7 @@ function makeEngine() {
       for (let b = 0; b <= a; ++b) {
         let s = 0;
         weights.forEach((w, i) => {
+          if (w === 0) return;
           const x = changes[a][i], y = changes[b][i];
           for (let k = 0; k < x.length; ++k) s += w * x[k] * y[k];
         });

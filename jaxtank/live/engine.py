@@ -3,11 +3,13 @@
 The text needs no page: node runs it too.
 """
 
+import dataclasses
 import json
 import math
 import re
 from collections.abc import Callable, Mapping
 from importlib import resources
+from itertools import chain
 from typing import Any
 
 import jax
@@ -18,11 +20,12 @@ from jaxtank.bounds import bounds
 from jaxtank.case import Case, Free
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.labels import input_unit, label_of
-from jaxtank.core.tree import describe, get_value
+from jaxtank.core.tree import describe, get_value, parameters
 from jaxtank.export.whole import WholeLoop, library, whole_loop
 from jaxtank.limits import limit_scale, resolve_limits
 from jaxtank.live.printed import Printed, maths
 from jaxtank.loop.closed_loop import draws_bursts
+from jaxtank.task import default_cost, has_own_objective, input_range, sensor_noise, with_noise
 
 ROWS = 3000
 """Approximate number of rows of a plotted run, as in `jaxtank simulate --out`."""
@@ -153,10 +156,40 @@ def squares_of(objective: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
 
 
 def _lean(case: Case) -> WholeLoop:
-    """The loop with only what a search asks for: its measures, and residuals."""
-    names = [*case.objective, *(x.measure for x in resolve_limits(case)), *ALWAYS]
+    """The loop with only what a search asks for: its measures, and residuals of weight 1."""
+    objectives = (case.objective, _objective(case))
+    names = [*chain(*objectives), *(x.measure for x in resolve_limits(case)), *ALWAYS]
     measures = [m for m in dict.fromkeys(names) if ms.serves(m, case.loop)]
-    return whole_loop(case, measures, squares_of(case.objective))
+    squares = dict.fromkeys(m for o in objectives for m, _ in squares_of(o))
+    return whole_loop(case, measures, tuple((m, 1.0) for m in squares))
+
+
+def _objective(case: Case) -> Mapping[str, float]:
+    """The objective of a search on plants, as of `jaxtank tune`."""
+    return case.objective if has_own_objective(case) else default_cost(case, input_range(case))
+
+
+def _task(loops: list[WholeLoop]) -> dict[str, Any]:
+    """What a search on plants changes, as `jaxtank tune` does: the objective, and values {leaf:
+    number} of the sensor noise, and of the safety filter that is designed for this noise.
+    """
+    case, known = loops[-1].case, {_name(*leaf) for loop in loops for leaf in loop.leaves}
+    noisy = with_noise(case.without_safety_filter(), sensor_noise(case)[0])
+    values, proved = {"sensor.noise": noisy.loop.sensor.noise}, False
+    if case.loop.safety_filter is not None:
+        safety_filter, rows = noisy.safety_design(**dict(case.safety or {}))
+        loop = dataclasses.replace(case.loop, safety_filter=safety_filter)
+        guard = {n: v for n, v in parameters(loop).items() if n.startswith("safety_filter.")}
+        values, proved = values | guard, all(row.certified for row in rows)
+    entries = {
+        _name(name, index): float(v)
+        for name, array in values.items()
+        for index, v in np.ndenumerate(np.asarray(array, dtype=float))
+        if np.isfinite(v)
+    }
+    objective = {m: float(w) for m, w in _objective(loops[0].case).items()}
+    entries = {n: v for n, v in entries.items() if n in known}
+    return {"objective": objective, "values": entries, "proved": proved}
 
 
 def _program(loop: WholeLoop, search: str = "") -> str:
@@ -217,6 +250,8 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
             "text": " + ".join(f"{w:g} {m}" for m, w in case.objective.items()),
             "measures": {m: float(w) for m, w in case.objective.items()},
         },
+        "squares": list(ms.squares()),
+        "task": _task(loops),
         "filter": {
             "present": len(loops) > 1 or loop.safety_filter is not None,
             "default_on": loop.safety_filter is not None,

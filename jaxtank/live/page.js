@@ -521,9 +521,15 @@ function ask(message, answers) {
   worker.postMessage(message);
 }
 
-// values of the loop, and the shares by which plants differ from it
-function plantsNow() {
-  const spread = {}, now = effective(), values = { ...now };
+// what a search on plants sets beside the sliders: noise where there is none, and a safety filter for it
+function taskValues(now) {
+  const noisy = leaves.some(({ name, value }) => name.startsWith("sensor.noise") && (now[name] ?? value) > 0);
+  return Object.fromEntries(Object.entries(info.task.values).filter(([name]) => !(name.startsWith("sensor.noise") && noisy)));
+}
+
+// values of the loop, and the shares by which plants differ from it; task: as a search on plants has them
+function plantsNow(task = false) {
+  const spread = {}, now = effective(), values = { ...(task ? taskValues(now) : {}), ...now };
   for (const leaf of leaves) {
     const share = data.uncertain[leaf.name] ?? data.uncertain[leaf.name.split("[")[0]];
     if (share === undefined || HIDDEN.includes(leaf.group)) continue;
@@ -539,7 +545,8 @@ const SEARCHED = { least: 16, most: 64, milliseconds: 15 }; // plants of a searc
 // plants: how many the search runs on, 1: this loop alone
 function tuneNow(plants = null) {
   let best = null, finish = null;
-  const names = [...state.free], before = { ...state.values }, base = plantsNow();
+  const names = [...state.free], before = { ...state.values }, filtered = state.filter;
+  const base = plantsNow(plants !== 1);
   const varied = Object.keys(base.spread).length > 0;
   const quick = Math.floor((SEARCHED.least * SEARCHED.milliseconds) / Math.max(1, took));
   const searched = varied ? plants ?? clamp(quick, SEARCHED.least, SEARCHED.most) : 1;
@@ -568,6 +575,10 @@ function tuneNow(plants = null) {
     },
     tuned(found) {
       const { kept, count, error } = found.plants, unit = info.units.length;
+      if (found.filter && !state.filter) {
+        state.filter = $("filter").checked = true;
+        noteFilter();
+      }
       apply(found);
       current = run() ?? current; // not one of other values beside these plants
       if (varied) {
@@ -579,16 +590,19 @@ function tuneNow(plants = null) {
       const holds = varied && info.limits.length ? `; limits hold on ${kept} of ${count} other plants` : "";
       const errors = `error ${shown(found.before, 3)} to ${shown(error, 3)} ${unit}${varied ? " in the mean" : ""}`;
       const ends = found.ends.map((name) => `; ${name} ends on its range`).join("");
-      say(`Tuned${on} in ${found.iterations} iterations (${found.status})${holds}; ${errors}${ends}.${alone}`);
+      const noise = searched > 1 ? " with noise and a price on input changes" : "";
+      const guard = state.filter && !filtered ? ", safety filter switched on" : "";
+      say(`Tuned${on}${noise}${guard} in ${found.iterations} iterations (${found.status})${holds}; ${errors}${ends}.${alone}`);
       $("undo").hidden = false;
       $("undo").onclick = () => {
         state.values = before;
+        state.filter = filtered;
         $("undo").hidden = true;
         refresh();
         say("The values before tuning are set again.");
       };
-      const { values, objective, violation } = found;
-      finish.resolve({ values, objective, violation, holds: kept, of: count, ends: found.ends });
+      const { values, objective, violation, filter } = found;
+      finish.resolve({ values, objective, violation, filter, holds: kept, of: count, ends: found.ends });
     },
     failed({ text }) {
       say(`Tuning failed: ${text}`);

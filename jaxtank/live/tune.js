@@ -8,14 +8,15 @@ No DOM: a worker and node run the same text. */
   {values, objective, violation, iterations, evaluations, status}
 
 values: {name: number} to start from; free: names to change, of engine.info.leaves; limits: as
-engine.info.limits; options: {filter, seed, starts, most, plants}. plants: [{values, seed}] on which the
+engine.info.limits; options: {filter, seed, starts, most, plants, objective, close}. plants: [{values, seed}] on which the
 mean of the objectives is minimised and every limit kept; [{values, seed}] of the loop alone by default.
 Violation: the largest share by which a limit is passed, 0 where all hold. Status: "converged", "stopped",
 "limit of iterations", "limits not met". ends: the free numbers that end on their range. The best values so
 far are returned whenever shouldStop() is true. */
 function tune(engine, values, free, limits, onProgress, shouldStop, options) {
   const { filter, seed = 0, starts = 2, most = 60, plants = [{ values, seed }] } = options || {};
-  const search = searchOf(engine, values, free, limits, plants, filter);
+  const { objective = engine.info.objective.measures, close = CLOSE } = options || {};
+  const search = Object.assign(searchOf(engine, values, free, limits, plants, { filter, objective }), { close });
   const report = () => onProgress && onProgress(search.found());
   const stop = () => Boolean(shouldStop && shouldStop());
   let status = local(search, search.start, most, report, stop);
@@ -42,20 +43,20 @@ function tune(engine, values, free, limits, onProgress, shouldStop, options) {
 const EDGE = 1e-6; // share of its range from an end at which a number ends on it
 
 /* The search in z, the free numbers between their bounds as 0 to 1, with the best point so far. */
-function searchOf(engine, values, free, limits, plants, filter) {
+function searchOf(engine, values, free, limits, plants, common) {
   const info = engine.info, logs = new Set(info.logarithmic || []);
   const boxes = free.map((name) => boxOf(info, name, values, logs));
-  const weights = Object.entries(info.objective.measures);
+  const weights = Object.entries(common.objective);
   const start = boxes.map((box, j) => box.to(valueOf(info, values, free[j])));
   const known = new Map(), ends = []; // points by where they are, where local searches ended
-  let best = null, iterations = 0, evaluations = 0, scale = null;
+  let best = null, iterations = 0, evaluations = 0, scale = null, last = {};
 
   const at = (z, plant = values) => {
     const out = { ...plant };
     boxes.forEach((box, j) => (out[free[j]] = box.from(z[j])));
     return out;
   };
-  const optionsOf = (plant) => ({ filter, seed: plant.seed });
+  const optionsOf = (plant) => ({ ...common, seed: plant.seed });
 
   function judged(z, runs) {
     let cost = 0;
@@ -93,7 +94,8 @@ function searchOf(engine, values, free, limits, plants, filter) {
       if (known.has(z.join())) return known.get(z.join());
       const runs = plants.map((plant) =>
         engine.run(at(z, plant.values), { ...optionsOf(plant), every: engine.every, search: true }));
-      return Object.assign(judged(z, runs), { runs });
+      delete last.runs; // a hundred points of many plants are not held
+      return (last = Object.assign(judged(z, runs), { runs }));
     },
     point(z) {
       const before = known.get(z.join());
@@ -117,7 +119,7 @@ function searchOf(engine, values, free, limits, plants, filter) {
         });
         curvatureOf(run, per, weights).forEach((v, i) => (curvature[i] += v / runs.length));
       });
-      delete point.runs; // a hundred points of many plants are not held
+      delete point.runs;
       return Object.assign(point, { gradient, slopes, curvature });
     },
   };
@@ -170,7 +172,7 @@ function marginOf(limit, measures) {
 }
 
 const INSIDE = 1e-7; // share of a limit that a search stays away from it
-const CLOSE = 1e-7; // predicted fall of the merit at which a search has converged
+const CLOSE = 1e-7; // predicted fall of the merit at which a search has converged, where no other is asked for
 
 const NEAR = 0.03; // of the end of another search, where nothing new is expected
 
@@ -198,7 +200,7 @@ function local(search, z, most, report, stop) {
     }
     const { step, fall, forces } = now;
     const stuck = point.margins.some((m, j) => m < 0 && forces[j] >= penalty * (1 - 1e-9));
-    if (fall < CLOSE) {
+    if (fall < search.close) {
       if (!(stuck && penalty < 1e5)) break;
       if (i === most - 1) return "limit of iterations";
       penalty *= 10;

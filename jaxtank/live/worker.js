@@ -16,17 +16,17 @@ function plantsOf(message) {
   });
 }
 
-// the runs of `count` plants: bands of levels and inputs, how many keep the limits, and their mean error
+// the runs of `count` plants: bands of levels and inputs (unless brief), how many keep the limits, their mean error
 function many(message) {
   const runs = [];
   plantsOf(message).forEach((values, i) => {
-    const options = { every: message.every, seed: message.seed + i, filter: message.filter };
+    const options = { every: message.every, seed: message.seed + (i % (message.noises ?? Infinity)), filter: message.filter, search: message.brief };
     const run = engine.run(values, { ...options, measures: message.measures });
     if (!run.broken) runs.push(run);
     if (i % 4 === 3) postMessage({ kind: "progress", done: i + 1, of: message.count });
   });
   const bands = (what) =>
-    (runs.length ? runs[0][what] : []).map((_, i) => {
+    (runs.length && !message.brief ? runs[0][what] : []).map((_, i) => {
       const low = new Float64Array(runs[0].t.length), high = new Float64Array(low.length);
       for (let k = 0; k < low.length; k += 1) {
         const sorted = Float64Array.from(runs, (run) => run[what][i][k]).sort();
@@ -48,17 +48,31 @@ function many(message) {
   };
 }
 
-// a search on the loop and `searched` - 1 plants about it; the answer and the start on `count` others
-async function search(message) {
-  const { values, free, limits, filter, seed, searched, judged } = message;
-  const others = searched > 1 ? plantsOf({ ...message, count: searched - 1 }) : [];
-  const plants = [values, ...others].map((plant) => ({ values: plant, seed }));
+// a search on the loop and `searched` - 1 plants about it; the answer and the start on `judged` others. On plants
+// it is that of `jaxtank tune`: its objective, with noise, and with the safety filter where limits break without it.
+function search(message) {
+  const { values, free, limits, filter, seed, searched, judged } = message, { info } = engine, several = searched > 1;
+  const others = several ? plantsOf({ ...message, count: searched - 1 }) : [];
+  const plants = [values, ...others].map((plant, i) => ({ values: plant, seed: seed + (i % NOISES) }));
+  const guard = filter || (several && info.filter.present);
+  const keep = limits.filter(({ measure }) => !(guard && several && info.task.proved && measure === "max_level"));
+  const own = several ? { filter: guard, seed, objective: info.task.objective, close: CLOSE_ENOUGH } : { filter, seed };
   const progress = (now) => postMessage({ kind: "progress", ...now });
-  const found = await tune(engine, values, free, limits, progress, () => false, { filter, seed, plants });
-  const on = (at) => many({ ...message, values: { ...message.values, ...at }, count: judged, seed: seed + UNSEEN });
-  return { ...found, before: on({}).error, plants: on(found.values) };
+  const from = (start, more) => tune(engine, start, free, keep, progress, () => false, { ...own, ...more });
+  const on = (at, guarded, brief) => many({
+    ...message, values: { ...values, ...at }, count: judged, seed: seed + UNSEEN, noises: NOISES, filter: guarded, brief,
+  });
+  // from several starts on few plants, then from the best end on all
+  let found = several ? from(values, { plants: plants.slice(0, FEW) }) : {};
+  found = from({ ...values, ...found.values }, several ? { plants, starts: 1 } : { plants });
+  const before = on({}, filter, true).error;
+  const needed = guard && (filter || on(found.values, false, true).kept < judged);
+  return { ...found, before, filter: needed, plants: on(found.values, needed) };
 }
 
+const FEW = 4; // plants of the first search
+const NOISES = 4; // different sequences of noise: one of 480,000 numbers takes a tenth of a second
+const CLOSE_ENOUGH = 1e-4; // share of the objective that the next step of a search on plants may still gain
 const UNSEEN = 104729; // added to the seed of plants that judge a search
 
 // names of the sliders {name, ends} at whose ends the run is what it is at `values`
@@ -84,13 +98,13 @@ function one(message) {
   postMessage({ kind: "run", run, milliseconds }, columns.map((column) => column.buffer));
 }
 
-onmessage = async (event) => {
+onmessage = (event) => {
   const message = event.data;
   try {
     if (message.kind === "run") one(message);
     else if (message.kind === "plants") postMessage({ kind: "plants", ...many(message) });
     else if (message.kind === "effects") effects(message);
-    else postMessage({ kind: "tuned", ...(await search(message)) });
+    else postMessage({ kind: "tuned", ...search(message) });
   } catch (error) {
     postMessage({ kind: "failed", text: String((error && error.message) || error) });
   }

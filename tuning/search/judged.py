@@ -13,11 +13,12 @@ from jaxtank.core.jsonable import clean
 from jaxtank.core.tree import get_value
 from jaxtank.limits import limited_levels, resolve_limits
 from jaxtank.loop import run as lp
+from jaxtank.task import COST
 from tuning.feasible.study import can_follow, can_judge
 from tuning.problem.functions import as_measures
 from tuning.problem.scenarios import noisy
 from tuning.search.options import check_numbers, check_precision
-from tuning.search.setting import COST, Setting, setting_of
+from tuning.search.setting import Setting, setting_of
 from tuning.uncertainty.batches import batch_size, run_batch
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import Points, clopper_pearson

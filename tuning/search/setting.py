@@ -15,10 +15,17 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index, with_values
 from jaxtank.limits import limited_levels
 from jaxtank.loop import run as lp
-from jaxtank.loop.closed_loop import takes_arrays, without_noise
+from jaxtank.loop.closed_loop import takes_arrays
 from jaxtank.loop.step_size import unstable_tanks
 from jaxtank.plants.runge_kutta import advance
-from jaxtank.presets import find
+from jaxtank.task import (
+    default_cost,
+    has_own_objective,
+    height,
+    input_range,
+    sensor_noise,
+    with_noise,
+)
 from tuning.problem.scenarios import screening_clock
 from tuning.uncertainty.distributions import Uniform
 from tuning.uncertainty.distributions import stated as stated_of
@@ -60,18 +67,9 @@ def midpoint_error(case: Case, clock: Clock, height: float, span: np.ndarray) ->
     return float(share) if np.isfinite(share) else np.inf
 
 
-NOISE = 1e-3
-"""Standard deviation of the sensor noise where the case states none, as a share of the rim [-]."""
-
-PRICE = (5e-3, 1e-2)
-"""The cost weighs an RMS error of the first share of the height equal to an RMS change of the
-inputs per sample of the second share of their range [-]."""
-
 NEAR = 0.9  # share of its limit that a level must reach on some plant for the limit to matter
 FREE = 10.0  # limit of a tank that a safety filter leaves alone, in heights of the rig
 PLANTS = 32  # plants that the search runs on
-
-COST = ("mean_square_error", "mean_square_travel")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -233,15 +231,15 @@ def setting_of(
     if distributions is not None:
         distributions = stated_of(distributions)
         case = _with_box(case, distributions)
-    (noise, assumed), span = _noise(case), input_range(case)
+    (noise, assumed), span = sensor_noise(case), input_range(case)
     if objective is not None:
         objective = rig.check_objective(objective)
-    elif _has_own_objective(case):
+    elif has_own_objective(case):
         objective = dict(case.objective)
     setting = Setting(
         case=case,
-        searched=_noisy(case, noise) if assumed or noise else case,
-        objective=_default_cost(case, span) if objective is None else objective,
+        searched=with_noise(case, noise) if assumed or noise else case,
+        objective=default_cost(case, span) if objective is None else objective,
         own_objective=objective is not None,
         distributions=distributions or plants_of(case),
         stated=is_stated(case) or distributions is not None,
@@ -258,65 +256,6 @@ def _with_box(case, distributions):
     if len(shares) < len(distributions) or None in shares.values():
         return case
     return case.replace(uncertain=shares, covariance=None)
-
-
-def height(case: Case) -> float:
-    """Return the highest rim [unit of length], or setpoint where no rim is finite."""
-    rims = np.asarray(getattr(case.loop.plant, "rim", np.inf), dtype=float)
-    if np.isfinite(rims).any():
-        return float(rims[np.isfinite(rims)].max())
-    plateaus = case.loop.reference.plateaus()
-    return float(np.max(np.abs(plateaus))) if plateaus is not None else 1.0
-
-
-def input_range(case: Case) -> np.ndarray:
-    """Return the (pumps,) range of each pump's input."""
-    # A pump has no negative or infinite limits, only a model has: the range is then twice the rms
-    # input of the case's run.
-    actuator = case.loop.actuator
-    shape = (case.loop.plant.pumps,)
-    low, high = (
-        np.broadcast_to(np.asarray(v, float), shape) for v in (actuator.low, actuator.high)
-    )
-    if np.all(low >= 0.0) and np.all(np.isfinite(high)):
-        return high - low
-    quiet = without_noise(case.loop)
-    used = 2.0 * np.asarray(lp.evaluate(quiet, case.clock, ["rms_input"])["rms_input"])
-    return np.where((low >= 0.0) & np.isfinite(high), high - low, used)
-
-
-def _default_cost(case, span):
-    """The default cost: the mean square error, and the priced mean square change of the input."""
-    pumps, span = case.loop.plant.pumps, float(np.mean(span))
-    weight = (PRICE[0] * height(case)) ** 2 / (pumps * (PRICE[1] * span) ** 2)
-    return {COST[0]: 1.0, COST[1]: weight}
-
-
-def _has_own_objective(case):
-    """Return True for a custom objective: neither the default nor the objective of a preset."""
-    objective = dict(case.objective)
-    if objective == {"rms_error_total": 1.0}:
-        return False
-    try:
-        return objective != dict(find(case.name).objective)
-    except InputError:
-        return True
-
-
-def _noise(case):
-    """Return (standard deviation of the sensor noise, True if neither case nor scenario has it)."""
-    noise = float(np.max(np.asarray(case.loop.sensor.noise)))
-    loops = [rig.set_scenario(case, s.values).loop for s in case.scenarios]
-    stated = max([noise, *(float(np.max(np.asarray(loop.sensor.noise))) for loop in loops)])
-    return (stated, False) if stated > 0.0 else (NOISE * height(case), True)
-
-
-def _noisy(case, noise):
-    """Return the case with sensor noise where it has none."""
-    stated = np.asarray(case.loop.sensor.noise, dtype=float)
-    if np.any(stated > 0.0):
-        return case
-    return case.replace(loop=with_values(case.loop, {"sensor.noise": np.full(stated.shape, noise)}))
 
 
 def is_stated(case: Case) -> bool:

@@ -3,6 +3,7 @@
 import json
 from importlib import resources
 
+import jax
 import numpy as np
 import pytest
 from helpers import NODE, node
@@ -11,6 +12,10 @@ import jaxtank
 from jaxtank import presets, rig
 from jaxtank.limits import limit_scale, resolve_limits
 from jaxtank.live.engine import engine
+from jaxtank.live.origin import both
+from jaxtank.live.page import _script, data_of
+from tuning.search.judged import judge
+from tuning.search.setting import setting_of
 
 pytestmark = pytest.mark.skipif(NODE is None, reason="no node on this machine")
 SEARCH = """
@@ -146,3 +151,69 @@ def test_searches_of_all_papers_end_where_those_of_the_command_end(name):
 def test_limits_that_no_gains_keep_are_passed_as_little_as_by_the_command(name):
     violation, wanted = ends_like_the_command(name)
     assert violation > 0.01 and not wanted.success
+
+
+COSTS = """
+const e = makeEngine(), { objective, values } = e.info.task;
+console.log(JSON.stringify([e.info.task, GIVEN.map(([plant, seed, filter]) => {
+  const { measures } = e.run({ ...values, ...plant }, { seed, filter, search: true });
+  const total = (m) => [measures[m]].flat().reduce((a, b) => a + b);
+  return Object.entries(objective).reduce((sum, [m, w]) => sum + w * total(m), 0);
+})]));
+"""
+
+
+def test_a_search_on_plants_has_the_cost_the_noise_and_the_filter_of_the_command():
+    """A price on changes of inputs; the runs of the library, with the same deviates."""
+    case = rig.set_values(presets.find("cascaded/pi"), {"clock.duration": 400.0})
+    off, on, _ = both(case)
+    setting, gain = setting_of(case), "plant.pump_gain[0]"
+    plants = [({}, 3, False), ({gain: 0.044}, 4, False), ({gain: 0.048, "x0[0]": 4.6}, 5, True)]
+    task, costs = node(engine(off, on) + COSTS, plants)
+    assert task["objective"] == pytest.approx(dict(setting.objective)) and task["proved"]
+    assert task["objective"]["mean_square_travel"] > 0.0
+    filtered = setting.with_filter()
+    for (values, seed, guard), cost in zip(plants, costs, strict=True):
+        loop = (filtered if guard else setting).searched.loop
+        own, clock = jaxtank.with_values(loop, values), setting.searched.clock
+        measures = jaxtank.evaluate(own, clock, list(setting.objective), jax.random.key(seed))
+        wanted = sum(w * float(np.sum(measures[m])) for m, w in setting.objective.items())
+        assert cost == pytest.approx(wanted, rel=1e-9)
+
+
+TUNED = """
+const postMessage = () => {}, spread = {}, values = { ...makeEngine().info.task.values };
+let onmessage;
+WORKER
+for (const { name, value, group } of engine.info.leaves) {
+  const share = GIVEN[name] ?? GIVEN[name.split("[")[0]];
+  if (share !== undefined && !["model", "safety filter"].includes(group))
+    [spread[name], values[name]] = [share, value];
+}
+const { info } = engine, { limits, free } = info, filter = info.filter.default_on;
+const size = { every: 100, searched: 16, judged: 64 };
+const { plants, ...found } = search({ values, spread, limits, free, filter, seed: 0, ...size });
+console.log(JSON.stringify(found));
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", ["cascaded/pi", "gouta2015/backstepping", "dts200/pi", "johansson/pi-minimum"]
+)
+def test_tune_of_the_page_is_the_answer_of_the_command_on_its_plants(name):
+    """The cost of the command, on its 256 plants: at most 3 % more, and the limits hold as well."""
+    import tuning
+
+    case = presets.find(name)
+    off, on, _ = both(case)
+    search = f"const tune = (() => {{ {_script('tune')}\nreturn tune; }})();"
+    worker = "\n".join([search, _script("core"), _script("worker")])
+    found = node(engine(off, on) + TUNED.replace("WORKER", worker), data_of(case)["uncertain"])
+    setting = setting_of(case).with_filter() if found["filter"] else setting_of(case)
+    answer = tuning.tune(case)
+    gains, wanted = {name: found["values"][name] for name in answer}, answer.answer.after
+    loop = jaxtank.with_values(setting.searched.loop, gains)
+    own = judge(setting.replace(searched=setting.searched.replace(loop=loop)), 256, 0)
+    assert np.mean(own.cost) <= 1.03 * np.mean(wanted.cost)
+    assert own.held.sum() >= 0.97 * wanted.held.sum()

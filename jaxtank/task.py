@@ -1,0 +1,82 @@
+"""The task of a search for gains that hold on uncertain plants: its cost and its sensor noise.
+
+`jaxtank tune` and the live page take both from here.
+"""
+
+import numpy as np
+
+from jaxtank import rig
+from jaxtank.case import Case
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import with_values
+from jaxtank.loop import run as lp
+from jaxtank.loop.closed_loop import without_noise
+from jaxtank.presets import find
+
+NOISE = 1e-3
+"""Standard deviation of the sensor noise where the case states none, as a share of the rim [-]."""
+
+PRICE = (5e-3, 1e-2)
+"""The cost weighs an RMS error of the first share of the height equal to an RMS change of the
+inputs per sample of the second share of their range [-]."""
+
+COST = ("mean_square_error", "mean_square_travel")
+
+
+def height(case: Case) -> float:
+    """Return the highest rim [unit of length], or setpoint where no rim is finite."""
+    rims = np.asarray(getattr(case.loop.plant, "rim", np.inf), dtype=float)
+    if np.isfinite(rims).any():
+        return float(rims[np.isfinite(rims)].max())
+    plateaus = case.loop.reference.plateaus()
+    return float(np.max(np.abs(plateaus))) if plateaus is not None else 1.0
+
+
+def input_range(case: Case) -> np.ndarray:
+    """Return the (pumps,) range of each pump's input."""
+    # A pump has no negative or infinite limits, only a model has: the range is then twice the rms
+    # input of the case's run.
+    actuator = case.loop.actuator
+    shape = (case.loop.plant.pumps,)
+    low, high = (
+        np.broadcast_to(np.asarray(v, float), shape) for v in (actuator.low, actuator.high)
+    )
+    if np.all(low >= 0.0) and np.all(np.isfinite(high)):
+        return high - low
+    quiet = without_noise(case.loop)
+    used = 2.0 * np.asarray(lp.evaluate(quiet, case.clock, ["rms_input"])["rms_input"])
+    return np.where((low >= 0.0) & np.isfinite(high), high - low, used)
+
+
+def default_cost(case: Case, span: np.ndarray) -> dict[str, float]:
+    """Return the default cost: mean square error, and a price on mean square changes of inputs."""
+    pumps, span = case.loop.plant.pumps, float(np.mean(span))
+    weight = (PRICE[0] * height(case)) ** 2 / (pumps * (PRICE[1] * span) ** 2)
+    return {COST[0]: 1.0, COST[1]: weight}
+
+
+def has_own_objective(case: Case) -> bool:
+    """Return True for a custom objective: neither the default nor the objective of a preset."""
+    objective = dict(case.objective)
+    if objective == {"rms_error_total": 1.0}:
+        return False
+    try:
+        return objective != dict(find(case.name).objective)
+    except InputError:
+        return True
+
+
+def sensor_noise(case: Case) -> tuple[float, bool]:
+    """Return (standard deviation of the sensor noise, True if neither case nor scenario has it)."""
+    noise = float(np.max(np.asarray(case.loop.sensor.noise)))
+    loops = [rig.set_scenario(case, s.values).loop for s in case.scenarios]
+    stated = max([noise, *(float(np.max(np.asarray(loop.sensor.noise))) for loop in loops)])
+    return (stated, False) if stated > 0.0 else (NOISE * height(case), True)
+
+
+def with_noise(case: Case, noise: float) -> Case:
+    """Return the case with sensor noise where it has none."""
+    stated = np.asarray(case.loop.sensor.noise, dtype=float)
+    if np.any(stated > 0.0):
+        return case
+    return case.replace(loop=with_values(case.loop, {"sensor.noise": np.full(stated.shape, noise)}))
