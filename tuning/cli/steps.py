@@ -202,7 +202,7 @@ def printed(report):
     """Return the text of a Report, in colours where stdout takes them."""
     from tuning.report.document import terminal
 
-    return terminal(report, coloured(sys.stdout))
+    return terminal(report, coloured(sys.stdout), advice=True)
 
 
 def finish(result, args):

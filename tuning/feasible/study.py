@@ -130,6 +130,14 @@ def _rows(needs, nominal, excess):
     return tuple(rows)
 
 
+def of_nominal_plant(case: Case) -> tuple[PlateauNeed, ...] | None:
+    """Return what the plateaus need and the plant of the case cannot have; None where not known."""
+    if not can_judge(case):
+        return None
+    needs = Needs(case, {})
+    return _rows(needs, needs.at()[0], needs.excess())
+
+
 def can_judge(case: Case) -> bool:
     """Return whether a reference has plateaus, and its rig as many pumps as outputs."""
     return judges(case)

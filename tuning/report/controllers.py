@@ -6,6 +6,7 @@ import numpy as np
 
 from tuning.problem import provenance
 from tuning.report import verdict as verdicts
+from tuning.report.advice import Advice, amount, of_nominal_plant
 from tuning.report.document import Report, Text
 from tuning.report.folder import earlier
 from tuning.report.folder import save as save_all
@@ -23,6 +24,7 @@ def json_of(result):
         {
             "case": result.case.name,
             "verdict": verdict_of(result).to_json(),
+            "advice": list(advice_of(result)),
             "samples": result.samples,
             "unit": result.case.loop.units[0],
             "controllers": [_row(rival) for rival in result.rivals],
@@ -115,9 +117,23 @@ def report(result):
         "controllers",
         verdict_of(result),
         [("plants", result.samples), ("controllers", len({r.name for r in result.rivals}))],
-        [Table(rows, heads, gap=True), Text(notes, items=True, gap=True)],
+        [Table(rows, heads, gap=True, top=True), Text(notes, items=True, gap=True)],
         result.case.title,
+        advice=advice_of(result),
     )
+
+
+def advice_of(result):
+    """Return the Advice on a ControllerComparison: which controller, its error, lost setpoints."""
+    best, unit, samples = result.best, result.case.loop.units[0], result.samples
+    gives = f"It gives: no finite run on {samples} plants."
+    if best.error is not None:
+        held = samples - best.violations
+        gives = (
+            f"It gives: mean RMS error {amount(best.error, unit)}; limits hold on {held} of"
+            f" {samples} plants."
+        )
+    return Advice(f"Set the controller {best.words()}.", gives, of_nominal_plant(result.case))
 
 
 def figures(result):

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from jaxtank.core.text import one_line
+from tuning.report.advice import Advice
 from tuning.report.tables import Table, columns
 from tuning.report.verdict import Verdict
 
@@ -21,6 +22,7 @@ class Text:
     heading: str = ""
     on: str = ""
     layout: bool = False  # columns of characters, as of equations
+    top: bool = False  # above the parts of a page that are folded
 
     def lines(self):
         """Return the lines of the sentences, wrapped unless they are a layout."""
@@ -61,6 +63,7 @@ class Report:
     sections: Sequence[Text | Table | Figure | Live]
     subtitle: str = ""
     files: Mapping[str, str] = dataclasses.field(default_factory=dict)  # {heading: text}
+    advice: Advice | None = None
 
     @property
     def title(self) -> str:
@@ -78,13 +81,15 @@ BOLD, GOOD, BAD, END = "\033[1m", "\033[1;32m", "\033[1;31m", "\033[0m"
 """Colours of a terminal: headings, and verdicts."""
 
 
-def terminal(report: Report, colour: bool = False) -> str:
-    """Return the text of a Report for a terminal."""
+def terminal(report: Report, colour: bool = False, advice: bool = False) -> str:
+    """Return the text of a Report for a terminal; advice: with its three sentences."""
     painted = lambda line, code: f"{code}{line}{END}" if colour else line
     lines: list[str] = []
     if report.verdict:
         words, code = f"{report.name}: {report.verdict}", GOOD if report.verdict.good else BAD
         lines += (painted(line, code) for line in Text([words]).lines())
+    if advice and report.advice:
+        lines += Text(report.advice, items=True).lines()
     for section in report.sections:
         if isinstance(section, (Figure, Live)) or section.on == "page":
             continue

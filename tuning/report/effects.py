@@ -10,12 +10,14 @@ import numpy as np
 from jaxtank.core.text import count
 from jaxtank.core.tree import describe, get_value
 from tuning.problem import provenance
+from tuning.report import advice
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.folder import earlier
 from tuning.report.folder import save as save_all
 from tuning.report.tables import Table, Value, clean, fields, number
 from tuning.report.uncertainty import in_words
+from tuning.report.verdict import shown
 from tuning.uncertainty.distributions import Correlated, Normal
 from tuning.uncertainty.sensitivity_study import NORMAL_WIDTH
 
@@ -147,6 +149,39 @@ def report(result):
             Text(notes_of(result), items=True, gap=True),
         ],
         result.case.title,
+        advice=advice_of(result),
+    )
+
+
+SIZES = {"local": "effect", "morris": "mu_star", "sobol": "total"}
+"""{method: quantity that ranks parameters}."""
+
+
+def advice_of(result):
+    """Return the Advice on a SensitivityResult: what to know best, and how much it matters."""
+    known = [c for c in result.columns if not c.empty]
+    if not known:
+        return advice.Advice(
+            "Nothing to set: no measure depends on a parameter.",
+            f"It gives: no effect in {count(result.runs, 'run')}.",
+            "What no gain can change was not studied here.",
+        )
+    effects: dict[str, list[str]] = {}  # of the first parameter of each measure
+    for c in known:
+        first = result.order(c)[0]
+        size = abs(float(c.effects[SIZES[result.method]][first]))
+        words = f"{c.label} by {shown(size)} of {advice.amount(c.nominal, c.unit)}"
+        if result.method == "sobol":
+            words = f"{c.label} with {advice.amount(100 * size, '%')} of its variance"
+        effects.setdefault(result.parameters[first], []).extend([words] if size else [])
+    moves = [f"{name} moves {advice.listed(words)}" for name, words in effects.items() if words]
+    gains = [n for n in result.parameters if n.split(".")[0] in ("controller", "observer")]
+    varied = f"{len(gains)} of {count(len(result.parameters), 'parameter')} are gains"
+    return advice.Advice(
+        f"Nothing to set; know these parameters best: {advice.listed(list(effects))}.",
+        f"Within its spread {advice.listed(moves) or 'no parameter moves a measure'}.",
+        f"No gain can change this: {varied if gains else 'no gain was varied'}; only a measurement"
+        " (jaxtank identify) or other equipment makes the effects of the rig's parameters smaller.",
     )
 
 
@@ -197,6 +232,7 @@ def json_of(result):
     return {
         "case": result.case.name,
         "verdict": verdict_of(result).to_json(),
+        "advice": list(advice_of(result)),
         **fields(result, "method samples runs failed wall_s"),
         "distributions": distributions,
         "parameters": {n: _parameter_json(result, n) for n in result.parameters},

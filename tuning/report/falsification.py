@@ -13,6 +13,7 @@ from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv
 from jaxtank.safety.checker import CASE
 from tuning.problem import provenance
+from tuning.report import advice
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.folder import earlier, rig_text
@@ -47,6 +48,7 @@ def json_of(attack):
     return {
         "case": case.name,
         "verdict": verdict_of(attack).to_json(),
+        "advice": list(advice_of(attack)),
         "passed": bool(attack.passed),
         "worst": [_row(attack, tank) for tank in attack.found],
         "unit": case.loop.units[0],
@@ -164,6 +166,7 @@ def report(attack):
             Text(remarks_of(attack), items=True, gap=True),
         ],
         case.title,
+        advice=advice_of(attack),
     )
 
 
@@ -205,7 +208,28 @@ def _levels(attack):
         for tank in attack.found
     ]
     levels = [f"{name} [{unit}]" for name in ("nominal", "draws", "highest", "margin")]
-    return Table(rows, ["tank", f"limit [{unit}]", "proved", *levels, "at [s]", ""], gap=True)
+    heads = ["tank", f"limit [{unit}]", "proved", *levels, "at [s]", ""]
+    return Table(rows, heads, gap=True, top=True)
+
+
+def advice_of(attack):
+    """Return the Advice on an Attack: whether a limit is passed, by how much, what is proved."""
+    worst, loop = attack.worst, attack.case.loop
+    name, unit = label_of(loop.plant, "tank", worst.tank), loop.units[0]
+    level = f"{name} reaches {advice.amount(worst.level, unit, 4)}"
+    where = f"{advice.amount(worst.time_s, 's', 5)}, its limit is"
+    to_set = "Nothing to set: no level was driven past its limit."
+    if attack.passed and loop.safety_filter is None:
+        to_set = "Set --safety-filter or lower setpoints: a level was driven past its limit."
+    elif attack.passed:
+        to_set = "Set lower limits or wider tolerances of the safety filter: a level passed one."
+    proved = [tank.tank for tank in attack.found if tank.certified]
+    beyond = "Nothing is proved: a plant that was not tried may pass a limit."
+    if proved:
+        tanks = labels_of(loop.plant, "tank", proved)
+        beyond = f"Proved whatever the gains: no plant of the box passes the limits of {tanks}."
+    bound = advice.amount(worst.limit, unit, 4)
+    return advice.Advice(to_set, f"The worst run: {level} at {where} {bound}.", beyond)
 
 
 def verdict_of(attack):
@@ -272,10 +296,7 @@ def figures(attack, runs=None):
 
     worst, loop = attack.worst, attack.case.loop
     limits = np.array([tank.limit for tank in attack.found])
-    title = (
-        f"{attack.case.name}: {label_of(loop.plant, 'tank', worst.tank)} reaches {worst.level:.4g}"
-        f" {loop.units[0]}, limit {worst.limit:.4g}"
-    )
+    title = f"{attack.case.name}: the worst run for {label_of(loop.plant, 'tank', worst.tank)}"
 
     def ascent(ax):
         for i, limit in enumerate(limits):

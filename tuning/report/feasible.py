@@ -4,6 +4,7 @@ import dataclasses
 
 from jaxtank.core.labels import label_of, short
 from tuning.problem import provenance
+from tuning.report import advice
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
@@ -41,6 +42,18 @@ def sentence(study):
         f"On {share} % of {study.samples} sampled plants at least one setpoint is unreachable"
         " within the limits, whatever the controller."
     )
+
+
+def beyond(study):
+    """Return the sentence of an Advice: the setpoint most often out of reach, and its mends."""
+    if not study.infeasible.any() or not study.plateaus:
+        return f"{advice.REACHABLE} on each of {study.samples} sampled plants."
+    row = max(study.plateaus, key=lambda row: row.share)
+    share = number(*_percent(study.infeasible_for_any_controller))
+    mends = [m.what for m in study.mends]
+    way = f"; --mend {' or '.join(mends)} helps" if mends else ""
+    need = advice.need(study.case, row, plants=True)
+    return f"{advice.BEYOND}: on {share} % of plants a setpoint is out of reach ({need}){way}."
 
 
 def _percent(share):

@@ -61,9 +61,9 @@ def document(report: Report, command: str | None = None, provenance: Any = ()) -
     """Return the whole page of a Report; the same report gives the same bytes."""
     # command, provenance: the line that made the result, and versions, machine and seed
     sections = [s for s in report.sections if getattr(s, "on", "") != "terminal"]
-    body = [s for s in sections if not isinstance(s, Figure)]
-    texts = [s for s in body if not isinstance(s, Live)]
+    top, texts = (_texts(sections, top) for top in (True, False))
     words = [s for s in texts if _is_list(s)]
+    pictures = [_picture(s) for s in sections if isinstance(s, Figure)]
     template = _templates().get_template("page.html")
     return template.render(
         report=report,
@@ -71,11 +71,16 @@ def document(report: Report, command: str | None = None, provenance: Any = ()) -
         provenance=dict(provenance),
         style=_style(),
         frames=_frames(sections),
-        last=bool(body) and isinstance(body[-1], Live),
         words=words,
-        pictures=[_picture(s) for s in sections if isinstance(s, Figure)],
+        first=pictures[:1] if report.advice else [],
+        top=top,
+        pictures=pictures[1:] if report.advice else pictures,
         numbers=[s for s in texts if s not in words],
     )
+
+
+def _texts(sections, top):
+    return [s for s in sections if isinstance(s, (Text, Table)) and s.top == top]
 
 
 def _frames(sections):

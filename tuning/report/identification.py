@@ -15,6 +15,7 @@ from tuning.identification import residuals
 from tuning.identification.confidence import at_search_bounds
 from tuning.problem import provenance
 from tuning.report import verdict as verdicts
+from tuning.report.advice import Advice, changes, listed
 from tuning.report.document import Report, Text
 from tuning.report.folder import earlier, rig_text
 from tuning.report.folder import save as save_all
@@ -374,7 +375,51 @@ def report(fit, page=False):
         ],
         ", ".join(log.name for log in fit.estimation.logs),
         files={"The identified rig as a file (rig.toml)": rig} if rig else {},
+        advice=advice_of(fit),
     )
+
+
+def advice_of(fit):
+    """Return the Advice on an Identification: diagnosis and values, residuals, what stays open."""
+    moved = [
+        f"{n} {changes(p['before'], p['value'], p['unit'], 4)}"
+        for n, p in fit.parameters.items()
+        if p["interval95"] and abs(p["value"] - p["before"]) > SAME * abs(p["before"])
+    ]
+    to_set = "set nothing: the values of the rig stand"
+    if moved or not fit.identifiable:
+        to_set = f"set {listed(moved)}" if fit.identifiable else "set nothing from these data"
+    rest = [
+        f"{name} {verdicts.shown(rmse)} {unit}"
+        for (name, unit), rmse in zip(fit.channels, fit.quality["rmse"])
+        if rmse is not None
+    ]
+    unknown = [n for n, p in fit.parameters.items() if not p["interval95"]]
+    beyond = "Nothing stays open: every parameter has an interval."
+    if unknown:
+        beyond = f"These data cannot tell: {listed(unknown)} (no interval); another experiment can."
+    gives = f"It gives: residuals {listed(rest)} RMS."
+    return Advice(f"Diagnosis: {_short_diagnosis(fit)}; {to_set}.", gives, beyond)
+
+
+SAME = 5e-4
+"""Relative change of a value below which it is not to be set [-]."""
+
+
+def _short_diagnosis(fit):
+    """The diagnosis of an identification as part of a sentence."""
+    if fit.status == "interrupted":
+        return "not tested, interrupted"
+    if fit.structure.clean:
+        return "the structure of the rig explains the data"
+    if not fit.structure.causes:
+        return "the residual is more than noise, and no tested cause explains it"
+    words = [
+        _named(fit, cause.kind, cause.where)
+        + (f", {_amount(cause)}" if cause.value is not None else "")
+        for cause in fit.structure.causes
+    ]
+    return f"the data require {' and '.join(words[:2])}{' and more' * (len(words) > 2)} (--accept)"
 
 
 def _data(est):
@@ -403,7 +448,7 @@ def _parameters(fit):
         cells = [Value(p["before"]), Value(p["value"]), interval, Value(share, 2, "%")]
         rows.append([n, p["unit"], *cells])
     heads = ["parameter", "unit", "before", "estimate", "95 % interval", "sd"]
-    return Table(rows, heads, gap=True)
+    return Table(rows, heads, gap=True, top=True)
 
 
 def _levels(fit):
@@ -470,6 +515,7 @@ def json_of(fit):
     return {
         "case": fit.case.name,
         "verdict": verdict_of(fit).to_json(),
+        "advice": list(advice_of(fit)),
         "status": str(fit.status),
         "success": fit.status == "converged",
         "message": "; ".join(sentences_of(fit)),

@@ -17,6 +17,7 @@ from jaxtank.presets.paper import Claim, Sample
 from jaxtank.presets.paper import verdict as word_of
 from tuning.problem.scenarios import noisy
 from tuning.report import verdict as verdicts
+from tuning.report.advice import Advice, listed
 from tuning.report.document import Live, Report, Text
 from tuning.report.folder import earlier
 from tuning.report.folder import save as save_all
@@ -246,7 +247,42 @@ def verdict_of(pages):
 def json_of(pages):
     """Return the JSON object of `jaxtank compare`: a page, or {paper: page} of several."""
     (first, *others) = pages.values()
-    return (dict(pages) if others else dict(first)) | {"verdict": verdict_of(pages).to_json()}
+    above = {"verdict": verdict_of(pages).to_json(), "advice": list(advice_of(pages))}
+    return (dict(pages) if others else dict(first)) | above
+
+
+def advice_of(pages):
+    """Return the Advice on {paper: page}: its claims, its numbers, and what cannot be measured."""
+    rows = [row for page in pages.values() for row in page["rows"]]
+    counts: Any = headline(rows)
+    claims, numbers = counts["claims"], counts["numbers"]
+    differs = lambda kind: [
+        row["quantity"] for row in rows if row["kind"] == kind and row["verdict"] == DIFFERS
+    ]
+    failed, apart = differs(CLAIM), differs(NUMBER)
+    to_set = f"Claims: {claims[REPRODUCED]} of {claims['of']} hold in our runs"
+    to_set += f"; not, or in part only: {listed(failed)}" if failed else ""
+    gives = f"Printed numbers: {numbers[REPRODUCED]} of {numbers['of']} reproduced"
+    gives += f"; furthest apart: {_furthest(rows)}" if apart else ""
+    missing = [row["quantity"] for row in rows if row["verdict"] == IMPOSSIBLE]
+    beyond = "No run is missing: every quantity could be measured."
+    if missing:
+        beyond = f"No run can tell {len(missing)} of {len(rows)} quantities: {listed(missing)}."
+    return Advice(f"{to_set}.", f"{gives}.", beyond)
+
+
+def _furthest(rows):
+    """The number that is furthest from the printed one, as a ratio."""
+    apart = [
+        (float(np.max(np.abs(np.log(ratios)))), row, ratios)
+        for row in rows
+        if row["verdict"] == DIFFERS and (ratios := _ratios(row)).size
+    ]
+    if not apart:
+        return "none, as the others cannot be divided"
+    _, row, ratios = max(apart, key=lambda entry: entry[0])
+    worst = ratios[np.argmax(np.abs(np.log(ratios)))]
+    return f"{row['quantity']}, {verdicts.shown(worst)} times the printed value"
 
 
 def report(pages):
@@ -266,6 +302,7 @@ def report(pages):
         ],
         subtitle="Published numbers, numbers of our runs of the same rigs and controllers, and why"
         " they differ.",
+        advice=advice_of(pages),
     )
 
 

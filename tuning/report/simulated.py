@@ -13,7 +13,7 @@ from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv, stride
 from jaxtank.plants.elements import sections
 from tuning.problem import provenance
-from tuning.report import safety
+from tuning.report import advice, safety
 from tuning.report import verdict as verdicts
 from tuning.report.document import Live, Report, Text, failed
 from tuning.report.folder import save as save_all
@@ -23,7 +23,6 @@ from tuning.report.tables import (
     Value,
     clean,
     entries,
-    limit_table,
     measure_table,
     measures_json,
     reasons,
@@ -56,6 +55,7 @@ def json_of_run(case, values, seed, plateaus=None):
     payload = {
         "case": case.name,
         "verdict": verdicts.of_run(case, values).to_json(),
+        "advice": list(advice.of_run(case, values)),
         "measures": measures_json(values),
         "units": units(case.loop.plant),
         "reasons": reasons(values),
@@ -111,10 +111,10 @@ def report(case, values, plateaus=None, every=False, diagnosis=None):
     facts += [("length", f"{case.clock.duration:g} s"), ("sampled every", f"{case.clock.dt:g} s")]
     sections = [Live(case), Text([case.title], on="terminal")]
     if limits:
-        table = limit_table(limits if len(limits) <= MANY else limits[:WORST])
+        table = advice.limits_of(limits if len(limits) <= MANY else limits[:WORST])
         more = len(limits) - len(table.rows)
-        sections.append(dataclasses.replace(table, on="page"))
-        sections.append(Text([f"{more} further limits have larger margins"][:more], on="page"))
+        note = [f"{more} further limits have larger margins"][:more]
+        sections += [table, Text(note, on="page", top=True)]
     brief = _brief(case, values)
     of = {"rig_units": loop.units, "gap": True, "plant": loop.plant}
     if every:
@@ -135,7 +135,8 @@ def report(case, values, plateaus=None, every=False, diagnosis=None):
         words = "The safety filter is on: jaxtank show prints what is proved of each tank."
         sections.append(Text([words], gap=True, on="terminal"))
         sections.append(Text(safety.passed(case, values)))
-    return Report(case.name, "", verdicts.of_run(case, values), facts, sections, case.title)
+    verdict, above = verdicts.of_run(case, values), advice.of_run(case, values)
+    return Report(case.name, "", verdict, facts, sections, case.title, advice=above)
 
 
 def margins_json(plateaus):

@@ -100,13 +100,16 @@ def _wrapped(cell, width):
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """A table: cells are texts, numbers and Values; `gap`: after an empty line on a terminal."""
+    """A table: cells are texts, numbers and Values; `gap`: after an empty line on a terminal;
+    `top`: above the parts of a page that are folded.
+    """
 
     rows: Sequence[Sequence[Any]]
     head: Sequence[str] = ()
     gap: bool = False
     heading: str = ""
     on: str = ""
+    top: bool = False
 
     def lines(self):
         """Return the lines of the table as aligned columns, not wider than the terminal: cells are

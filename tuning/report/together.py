@@ -18,6 +18,7 @@ from jaxtank.loop.trajectory import csv
 from tuning.problem import provenance, reported
 from tuning.problem.scenarios import noisy
 from tuning.report import verdict as verdicts
+from tuning.report.advice import GIVEN, Advice, amount, of_nominal_plant
 from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
 from tuning.report.simulated import json_of_run, run_for_people
@@ -135,7 +136,22 @@ def report(runs: list[Run]) -> Report:
             Text(words, items=True, on="page"),
         ],
         subtitle=", ".join(run.case.name for run in runs),
+        advice=advice_of(runs),
     )
+
+
+def advice_of(runs: list[Run]) -> Advice:
+    """Return the Advice on several runs: which is best, and how many are good."""
+    good = [run for run in runs if verdicts.of_run(run.case, run.measures).good]
+    known = [run for run in good or runs if "rms_error_total" in run.measures]
+    error = lambda run: float(np.ravel(run.measures["rms_error_total"])[0])
+    words = f"{len(good)} of {count(len(runs), 'run')} settle and keep their limits"
+    if known:
+        best = min(known, key=error)
+        least = amount(error(best), best.case.loop.units[0])
+        words += f"; least RMS error{' of these' * bool(good)}: {best.case.name}, {least}"
+    beyond = of_nominal_plant(runs[0].case)
+    return Advice(f"{GIVEN}; jaxtank tune searches for better ones.", f"{words}.", beyond)
 
 
 def json_of(runs: list[Run], seed: int) -> dict[str, Any]:
@@ -143,7 +159,8 @@ def json_of(runs: list[Run], seed: int) -> dict[str, Any]:
     rows = [
         {**json_of_run(run.case, run.measures, seed), "differs": list(run.differs)} for run in runs
     ]
-    return {"verdict": verdict_of(runs).to_json(), "cases": rows}
+    advice = list(advice_of(runs))
+    return {"verdict": verdict_of(runs).to_json(), "advice": advice, "cases": rows}
 
 
 def verdict_of(runs: list[Run]) -> verdicts.Verdict:

@@ -1,7 +1,7 @@
 """The report of a tuning result: text, JSON, pictures, page and folder."""
 
-import dataclasses
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from jaxtank.limits import limited_levels
 from jaxtank.loop.trajectory import csv
 from tuning.problem.problem import TAIL
 from tuning.problem.rules import ORDER
-from tuning.report import feasible, optimal_input
+from tuning.report import advice, feasible, optimal_input
 from tuning.report import verdict as verdicts
 from tuning.report.document import Live, Report, Text, terminal
 from tuning.report.folder import earlier, rig_text
@@ -36,7 +36,7 @@ from tuning.report.tables import (
     unit_text,
     units,
 )
-from tuning.search.result import Message
+from tuning.search.result import Message, row_of
 from tuning.search.tuner import rule_row
 
 COSTLIEST, MANY = 5, 12
@@ -71,6 +71,7 @@ def json_of(result):
         "case": result.tuned.name,
         "status": str(result.status),
         "verdict": verdicts.of_tuning(result).to_json(),
+        "advice": list(advice_of(result)),
         **fields(result, "method success headline message evaluations wall_s starts symmetry"),
         **fields(result, "choices optimality curvature tradeoff validation provenance"),
         "messages": [{"code": m.code, "text": m.text} for m in result.messages],
@@ -97,7 +98,7 @@ def report(result, page=False):
     answer, notes = result.answer, [m.text for m in result.messages]
     sections = sections_of(result) if answer is None else of_answer(answer, result)
     if page and answer is not None:
-        sections += [dataclasses.replace(s, on="page") for s in sections_of(result)]
+        sections += [*_by_tank(answer), *(replace(s, on="page") for s in sections_of(result))]
     rig = rig_of(result)[0] if page else None
     return Report(
         result.tuned.name,
@@ -113,7 +114,62 @@ def report(result, page=False):
         ],
         result.case.title,
         {"The tuned rig as a file (rig.toml)": rig} if rig else {},
+        advice_of(result),
     )
+
+
+def advice_of(result):
+    """Return the Advice on a TuningResult."""
+    moved = [
+        f"{name} {advice.changes(p['before'], p['after'], p['unit'], 4)}"
+        for name, p in result.parameters.items()
+        if p["exercised"] and p["before"] != p["after"]
+    ]
+    if result.tuned.loop.safety_filter is not None and result.case.loop.safety_filter is None:
+        moved.insert(advice.FEW - 1, "safety filter on")
+    to_set = f"Set {advice.listed(moved)}" if moved else "Nothing to set: no better gains known"
+    unfinished = {"interrupted": "interrupted", "not_converged": "the search has not converged"}
+    if why := unfinished.get(result.status):
+        to_set += f" ({why})"
+    return advice.Advice(f"{to_set}.", f"It gives: {'; '.join(_gives(result))}.", _beyond(result))
+
+
+def _gives(result):
+    """What a tuning gives: its error before and after, and how many runs keep every limit."""
+    answer, words, cost = result.answer, [], result.objective
+    if answer is not None and answer.after is not None and not answer.setting.own_objective:
+        sides, unit = (answer.before, answer.after), answer.setting.case.loop.units[0]
+        means = [_mean(side.error, side).value for side in sides]
+        words.append(f"mean RMS error {advice.changes(*means, unit)}")
+    else:
+        terms = next(iter(cost["terms"])) if len(cost["terms"]) == 1 else "objective"
+        words.append(f"{terms} {advice.changes(cost['before'], cost['after'], cost_unit(result))}")
+    if answer is not None and answer.after is not None and answer.after.limits:
+        held = [int(side.held.sum()) for side in (answer.before, answer.after)]
+        words.append(f"limits hold on {held[0]} -> {held[1]} of {answer.after.samples} plants")
+    elif rows := worst_of_scenarios(result.constraints):
+        held = sum(row["margin"] >= 0.0 for row in rows)
+        words.append(f"{held} of {len(rows)} limits hold")
+    return words
+
+
+def _beyond(result):
+    """The sentence on limits that the tuning does not hold, and setpoints out of reach."""
+    answer, words = result.answer, []
+    if answer is not None and answer.after is not None:
+        words += [
+            f"{row['limit'].words} breaks its limit on {row['broken']} plants"
+            for row in answer.after.worst()
+            if row["broken"]
+        ]
+    else:
+        rows = worst_of_scenarios(result.constraints)
+        words += [f"{row['words']} breaks its limit" for row in rows if not row["margin"] >= 0.0]
+    broken = f"Not held: {advice.listed(words)}. " if words else ""
+    study = None if answer is None else answer.feasibility
+    if study is None:
+        return broken + advice.of_nominal_plant(result.tuned)
+    return broken + feasible.beyond(study)
 
 
 def _effort(result):
@@ -184,6 +240,20 @@ def of_answer(answer, result=None):
     return sections
 
 
+def _by_tank(answer):
+    """The table of the worst value of each limit over the validation plants."""
+    if answer.after is None or not answer.after.limits:
+        return []
+    certificates = {("max_level", row.tank): row for row in answer.setting.certificates}
+    rows, loop, samples = [], answer.setting.case.loop, answer.after.samples
+    for row in answer.after.worst():
+        known = certificates.get(row["limit"].key)
+        proof = "no" if known is None else ("yes" if known.certified else f"no: {known.reason}")
+        limit = row_of(row["limit"], loop, row["value"]).to_json()
+        rows.append(limit | {"more": [f"{row['broken']} of {samples}", proof]})
+    return [advice.limits_of(rows, ["worst", "margin", "broken on plants", "proved"])]
+
+
 def answer_text(answer):
     """Return the text of an Answer alone."""
     return terminal(Report("default answer", "", None, (), of_answer(answer)))
@@ -205,7 +275,7 @@ def _values(result, answer):
         chosen = answer.setting.searched.loop.safety_filter
         rate, band = float(np.max(chosen.rate)), float(np.max(chosen.band))
         row[2:] = ["on", f"rate {rate:.3g} 1/s, noise band {band:.3g} {loop.units[0]}"]
-    return Table([*rows, row], ["what to set", "was", "now", ""])
+    return Table([*rows, row], ["what to set", "was", "now", ""], top=True)
 
 
 def _rules(result):
@@ -301,7 +371,7 @@ def _mean(values, side, digits=3, of=slice(None)):
 def sections_of(result):
     """Return every table of a TuningResult."""
     sections = [
-        _parameter_table(result),
+        replace(_parameter_table(result), top=result.answer is None),
         *_measure_table(result),
         *_limit_table(result),
         *_scenario_table(result),
@@ -311,7 +381,7 @@ def sections_of(result):
     ]
     if result.bound is not None:
         first, *others = optimal_input.report(result.bound).sections
-        sections += [dataclasses.replace(first, gap=True), *others]
+        sections += [replace(first, gap=True), *others]
     step = f"evaluated at dt = {result.tuned.clock.dt:g} s"
     return [*sections, Text([f"{_rims(result)}; {step}"], gap=True)]
 
@@ -413,7 +483,10 @@ def worst_of_scenarios(constraints):
 
 def _limit_table(result):
     rows = worst_of_scenarios(result.constraints)
-    return [limit_table(rows, gap=True)] if rows else []
+    if not rows or result.answer is not None:
+        return [limit_table(rows, gap=True)] if rows else []
+    of_page = advice.limits_of([row.to_json() for row in rows])
+    return [replace(limit_table(rows, gap=True), on="terminal"), of_page]
 
 
 def scenario_rows(result):
@@ -623,13 +696,13 @@ def _level_limits(result):
 
 
 def _title(result):
-    """The verdict and the first gains before and after, as the title of the responses."""
+    """The first gains before and after, as the title of the responses."""
     gains = ", ".join(
         f"{n.removeprefix('controller.')} {number(p['before'], 4)} -> {number(p['after'], 4)}"
         f" {p['unit']}"
         for n, p in list(result.parameters.items())[:4]
     )
-    return f"{result.tuned.name}: {verdicts.of_tuning(result)}\n({gains})"
+    return f"{result.tuned.name}: {gains}"
 
 
 def _clouds(result, unit):

@@ -14,6 +14,7 @@ from jaxtank.core.text import count
 from jaxtank.core.tree import describe, get_value
 from jaxtank.loop import step_size
 from tuning.problem import provenance
+from tuning.report import advice
 from tuning.report import verdict as verdicts
 from tuning.report.document import Live, Report, Text
 from tuning.report.folder import earlier
@@ -58,6 +59,7 @@ def json_of(ensemble):
     payload = {
         "case": ensemble.case.name,
         "verdict": verdict_of(ensemble).to_json(),
+        "advice": list(advice_of(ensemble)),
         "failed": int(ensemble.failed.sum()),
         "infeasible": None if feasible is None else int(feasible.sum()),
         "draws": ensemble.method,
@@ -133,6 +135,37 @@ def report(ensemble):
         [*_facts(ensemble, violations), ("runs that diverged", diverged), ("time", time)],
         sections,
         ensemble.case.title,
+        advice=advice_of(ensemble),
+    )
+
+
+def advice_of(ensemble):
+    """Return the Advice on an Ensemble: the limit most often broken, and lost setpoints."""
+    samples, words = ensemble.samples, []
+    if violations := ensemble.violations():
+        words.append(f"limits hold on {int(ensemble.held.sum())} of {count(samples, 'draw')}")
+        worst = max(violations, key=lambda v: v["count"])
+        bound = advice.amount(worst["limit"], worst["unit"], 5)
+        if worst["count"]:
+            often = f"{worst['words']} passes its limit of {bound}"
+            words.append(f"most often {often}, in {worst['count']}")
+    error = ensemble.summary().get("rms_error_total")
+    if error is not None and error["p50"] is not None:
+        unit = ms.unit("rms_error_total", ensemble.case.loop.units)
+        words.append(f"median RMS error {advice.amount(error['p50'], unit)}")
+    lost = ensemble.infeasible
+    beyond = f"{advice.REACHABLE} on each of {count(samples, 'draw')}."
+    if lost is None:
+        beyond = advice.UNKNOWN
+    elif lost.any():
+        beyond = (
+            f"{advice.BEYOND}: on {int(lost.sum())} of {count(samples, 'draw')} a setpoint needs a"
+            " level above a rim or an input outside its range; jaxtank tune says which."
+        )
+    return advice.Advice(
+        f"{advice.GIVEN}; jaxtank tune searches for gains that hold on such plants.",
+        f"It gives: {'; '.join(words) or 'no limit and no error to judge by'}.",
+        beyond,
     )
 
 
@@ -255,7 +288,7 @@ def _violation_table(violations):
         for v in violations
     ]
     heads = ["limit", "value", "broken in", "probability", "95 % interval"]
-    return Table(rows, heads, gap=True)
+    return Table(rows, heads, gap=True, top=True)
 
 
 def in_words(d):

@@ -49,6 +49,7 @@ def test_a_limit_that_holds_is_exit_code_0_and_the_rig_file_keeps_the_filter(tmp
     assert found.code == 0 and "no limit was passed" in found.out
     assert "between two samples a level can rise by at most" in " ".join(found.out.split())
     assert "--set 'plant.drain[0]=" in found.out
+    assert max(map(len, found.out.splitlines())) <= 80
     assert json.loads((tmp_path / "out/result.json").read_text())["rig"]["same"]
 
 

@@ -10,6 +10,7 @@ import jaxtank
 import tuning
 from jaxtank import rig
 from tuning.identification.prediction import achieved
+from tuning.report.prediction import achieved_table
 
 RIG = f"""{ONE}
 [limits]
@@ -42,6 +43,8 @@ def test_levels_achieved_stand_beside_those_that_the_rig_predicted(case):
         assert row["highest"][side] == pytest.approx(level.max())
         assert row["lowest"][side] == pytest.approx(level.min())
         assert row["error"][side] == pytest.approx(np.sqrt(np.mean((level - r) ** 2)))
+    long = row | {"name": "level transmitter LT-101 of the buffer tank", "unit": "cm"}
+    assert max(map(len, achieved_table([row, long]).lines())) <= 80
 
 
 @pytest.mark.slow

@@ -141,10 +141,11 @@ def test_a_page_is_well_formed_and_asks_nothing_of_the_network(folder_of, kind):
     whole = (folder_of(kind) / "report.html").read_text(encoding="utf-8")
     text, frames = LIVE.subn("<iframe>", whole)
     assert frames == whole.count("<iframe") == (kind in ("tune", "uncertainty", "compare"))
-    if kind == "compare":  # what was found comes before what can be moved
-        assert text.index('id="published"') < text.index("<table") < text.index("<iframe>")
-    elif frames:
-        assert text.index("<iframe>") < text.index("<figure")
+    parts = [text.index(part) for part in ('class="status', 'class="advice"', "<figure")]
+    if kind not in ("compare", "sensitivity"):  # whose tables are long
+        parts.append(text.index("<table"))
+    folded = text.index("<details")
+    assert parts == sorted(parts) and parts[-1] < folded < text.find("<iframe>") % len(text)
     read = Reader(text)
     assert len(read.ids) == len(set(read.ids))
     for tag, attrs in read.tags:
@@ -235,13 +236,19 @@ def test_results_are_on_the_disk_before_any_picture_is_drawn(
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_verdict_is_one_sentence_on_page_terminal_notebook_and_in_json(saves, folder_of, kind):
     read = Reader((folder_of(kind) / "report.html").read_text(encoding="utf-8"))
-    said = json.loads((folder_of(kind) / "result.json").read_text())["verdict"]
+    payload = json.loads((folder_of(kind) / "result.json").read_text())
+    said, advice = payload["verdict"], payload["advice"]
+    assert len(advice) == 3 and all(line.endswith(".") and len(line) < 300 for line in advice)
+    assert all(" ".join(line.split()) in read.words for line in advice)
     sentence = " ".join(said["sentence"].split())
     (status,) = [a["class"] for tag, a in read.tags if a.get("class", "").startswith("status")]
     assert sentence and sentence in read.words and ("warn" in status) != said["good"]
     if kind != "compare":
         result = saves(kind).__self__
-        assert result.to_json()["verdict"] == said
+        assert result.to_json()["verdict"] == said and result.to_json()["advice"] == advice
+        printed = " ".join(terminal(result.report(), advice=True).split())
+        assert all(" ".join(line.split()) in printed for line in advice)
+        assert not any(" ".join(line.split()) in " ".join(repr(result).split()) for line in advice)
         assert sentence in " ".join(repr(result).split())
         assert max(map(len, repr(result).splitlines())) <= 80
         assert sentence in Reader(result._repr_html_()).words
@@ -361,6 +368,13 @@ def test_a_browser_opens_the_page_without_complaint_and_pictures_fit_a_phone(
     page.on("console", lambda m: complaints.append(m.text))
     page.on("pageerror", lambda e: complaints.append(str(e)))
     page.goto((folder_of(kind) / "report.html").as_uri())
+    unfolded = """[...document.querySelectorAll('details:not(.screen) :is(table, svg, pre)')]
+        .every((e) => e.checkVisibility())"""
+    assert not page.evaluate(unfolded)
+    page.emulate_media(media="print")  # what is folded is on paper, but for the live page
+    assert page.evaluate(unfolded) and not page.is_visible("details.screen")
+    page.emulate_media(media="screen")
+    page.evaluate("document.querySelectorAll('details').forEach((one) => (one.open = true))")
     assert page.evaluate(PROBE) == [True] * len(PICTURES[kind])
     assert complaints == []
     page.close()
@@ -377,6 +391,8 @@ def test_no_column_of_a_page_of_claims_is_cut(browser, tmp_path):
     many = [tuple(start + k for k in range(16)) for start in (0.123456, 0.654321)]
     claim = row(**texts, published=words, measured=words)
     numbers = row(**texts, published=many[0], measured=many[1])
+    printed = terminal(papers.report(page_of(claim, numbers)), advice=True)
+    assert max(map(len, printed.splitlines())) <= 80
     papers.save(page_of(claim, numbers), tmp_path)
     for width in (1400, 900, 390):
         page = browser.new_page(viewport={"width": width, "height": 1000})

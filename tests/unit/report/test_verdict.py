@@ -16,7 +16,9 @@ from jaxtank.live.engine import engine
 from jaxtank.live.page import _script
 from tuning.cli import main
 from tuning.cli.parser import COMMANDS, parser
+from tuning.feasible import study
 from tuning.problem.reported import run_measures
+from tuning.report import advice
 from tuning.report import verdict as verdicts
 
 PAGE = """
@@ -106,6 +108,20 @@ def test_one_bad_part_makes_a_verdict_bad():
     assert not some.good and "20 to 90 %" in some.words
     whole = verdicts.Verdict(limits=part("limits"), plants=verdicts.plants(4, 4))
     assert whole.good and "limits;" not in whole.sentence and whole.to_json()["limits"] == "limits"
+
+
+def test_a_setpoint_above_a_rim_is_beyond_any_gain():
+    """Setpoints of 7 V in tank 2; tank 1 then stands at (drain 2 / orifice 1)^2 of that."""
+    case = presets.find(TWO)
+    assert advice.of_nominal_plant(case).startswith(advice.REACHABLE)
+    (need,) = study.of_nominal_plant(rig.set_values(case, {"plant.rim[1]": 6.0}))
+    assert (need.tank, need.needed, need.limit, need.unit) == (2, pytest.approx(7.0), 6.0, "V")
+    low = rig.set_values(case, {"plant.rim[0]": 7.5})
+    (need,) = study.of_nominal_plant(low)
+    plant = case.loop.plant
+    ratio = float(plant.drain[1] / plant.orifice[0])
+    assert need.tank == 1 and need.needed == pytest.approx(7.0 * ratio**2)
+    assert verdicts.shown(need.needed) in advice.of_nominal_plant(low)
 
 
 @pytest.mark.skipif(NODE is None, reason="no node on this machine")

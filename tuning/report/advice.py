@@ -1,0 +1,112 @@
+"""The three sentences above a report: what to set, what it gives, and what no gain can change.
+
+`advice_of` of each report makes them of its result; page, terminal and JSON show the same ones.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxtank.case import Case
+from jaxtank.core.labels import label_of
+from jaxtank.core.text import count
+from jaxtank.measures import MEASURES
+from tuning.feasible import study
+from tuning.feasible.result import PlateauNeed
+from tuning.report import verdict as verdicts
+from tuning.report.tables import Table, Value
+from tuning.report.verdict import shown
+
+
+class Advice(NamedTuple):
+    """Three sentences; of `compare` and `identify` the first one begins with what was found."""
+
+    to_set: str
+    gives: str
+    beyond: str
+
+
+FEW = 4
+"""Entries of a list in a sentence."""
+
+GIVEN = "Nothing to set: the gains are those of the case"
+"""The first words where a command changes no gain."""
+
+BEYOND = "No gain can change this"
+"""The first words of the last sentence, where something is out of reach."""
+
+REACHABLE = "Nothing is out of reach of the gains: every setpoint can be held"
+"""The first words where nothing is."""
+
+UNKNOWN = "Setpoints out of reach are not known: this rig has no steady states in closed form."
+"""The last sentence of a rig that `tuning.feasibility` does not judge."""
+
+
+def listed(words: Sequence[str]) -> str:
+    """Return words as a list, of more than FEW the first ones and how many others."""
+    more = f" and {len(words) - FEW} more" if len(words) > FEW else ""
+    return ", ".join(words[:FEW]) + more
+
+
+def amount(value: Any, unit: str, digits: int = 3) -> str:
+    """Return a number with its unit."""
+    return shown(value, digits) + (f" {unit}" if unit not in ("", "-") else "")
+
+
+def changes(before: Any, after: Any, unit: str, digits: int = 3) -> str:
+    """Return "before -> after unit"."""
+    return f"{shown(before, digits)} -> {amount(after, unit, digits)}"
+
+
+def limits_of(
+    rows: Sequence[Mapping[str, Any]], heads: Sequence[str] = ("value", "margin", "at")
+) -> Table:
+    """Return the Table of limits for the top of a page; `rows` as those of `ConstraintRow`, with
+    cells of further columns, in place of the time, as "more".
+    """
+    cells = []
+    for row in rows:
+        at_least = MEASURES[row["measure"]].sense < 0
+        value = "undefined" if row["reason"] else amount(row["value"], row["unit"], 4)
+        bound = amount(row["limit"], row["unit"], 5)
+        margin = "-" if row["reason"] else amount(row["margin"], row["unit"])
+        cells.append([row["words"], ("≥ " if at_least else "≤ ") + bound, value, margin])
+        cells[-1] += row.get("more", ["" if row["time_s"] is None else f"{row['time_s']:.4g} s"])
+    return Table(cells, ["", "limit", *heads], on="page", top=True)
+
+
+def of_run(case: Case, values: Mapping[str, Any]) -> Advice:
+    """Return the Advice on a run with the measures `values`."""
+    rows = verdicts.limit_rows(case, values)
+    broken = [row["words"] for row in rows if not row["margin"] >= 0.0]
+    words = [f"{len(rows) - len(broken)} of {count(len(rows), 'limit')} hold"] if rows else []
+    words += [f"broken: {listed(broken)}"] if broken else []
+    if "rms_error_total" in values:
+        error = float(np.ravel(values["rms_error_total"])[0])
+        words.insert(0, f"RMS error {amount(error, case.loop.units[0])}")
+    return Advice(
+        f"{GIVEN}; jaxtank tune searches for better ones.",
+        f"It gives: {'; '.join(words) or 'a run without setpoints and limits'}.",
+        of_nominal_plant(case),
+    )
+
+
+def of_nominal_plant(case: Case) -> str:
+    """Return the sentence on setpoints that the plant of a case cannot hold whatever its gains."""
+    needs = study.of_nominal_plant(case)
+    if needs is None:
+        return UNKNOWN
+    if not needs:
+        return f"{REACHABLE} on this plant."
+    return f"{BEYOND}: {need(case, needs[0])}."
+
+
+def need(case: Case, row: PlateauNeed, plants: bool = False) -> str:
+    """Return what a plateau needs and cannot have; plants: of 95 % of them, not of the nominal."""
+    kind, number = ("tank", row.tank) if row.pump is None else ("pump", row.pump)
+    part = label_of(case.loop.plant, kind, (number or 1) - 1)
+    setpoints = Value(row.setpoints, 4, case.loop.units[0], ", ")
+    needed = f"up to {amount(row.needed_p95, row.unit)}" if plants else amount(row.needed, row.unit)
+    bound = amount(row.limit, row.unit)
+    return f"setpoints {setpoints} need {needed} in {part}, its limit is {bound}"
