@@ -50,8 +50,8 @@ def input_range(case: Case) -> np.ndarray:
 
 def default_cost(case: Case, span: np.ndarray) -> dict[str, float]:
     """Return the default cost: mean square error, and a price on mean square changes of inputs."""
-    pumps, span = case.loop.plant.pumps, float(np.mean(span))
-    weight = (PRICE[0] * height(case)) ** 2 / (pumps * (PRICE[1] * span) ** 2)
+    pumps, mean = case.loop.plant.pumps, float(np.mean(span))
+    weight = (PRICE[0] * height(case)) ** 2 / (pumps * (PRICE[1] * mean) ** 2)
     return {COST[0]: 1.0, COST[1]: weight}
 
 
