@@ -184,6 +184,7 @@ DRAWERS = slow_but("simulate")
 DRAWERS = [d for d in DRAWERS if d == "simulate" or d.values[0] in ("show", "tune", "uncertainty")]
 
 
+@pytest.mark.slow_for("simulate")
 @pytest.mark.parametrize("name", DRAWERS)
 def test_a_picture_that_fails_costs_itself_and_not_the_answer(name, tmp_path, capsys, monkeypatch):
     """A text that matplotlib cannot set, in one kind of picture; then a function that fails."""
@@ -215,6 +216,7 @@ def test_a_picture_that_fails_costs_itself_and_not_the_answer(name, tmp_path, ca
             assert json.loads(rest["result.json"]) and (name == "simulate" or "report.html" in rest)
 
 
+@pytest.mark.slow_for("simulate")
 @pytest.mark.parametrize("name", DRAWERS)
 def test_what_a_file_calls_things_is_never_set_as_mathematics(name, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)

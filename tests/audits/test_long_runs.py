@@ -195,6 +195,7 @@ def noisy(reference=None):
     )
 
 
+@pytest.mark.slow_for("1000")
 @pytest.mark.parametrize("rest", [pytest.param(0, marks=pytest.mark.slow), 1000])
 def test_a_run_in_chunks_equals_the_run_in_one(rest):
     """Longer runs are made in chunks of CHUNK samples: measures against the trajectory of the same

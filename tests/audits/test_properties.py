@@ -165,6 +165,7 @@ def never_lower(plant, x, more_x, u, more_u):
     return (low - high).max()
 
 
+@pytest.mark.slow_for("6")
 @of_every_rig(6, 500)
 def test_more_voltage_never_lowers_a_level(seed, tanks, kind):
     """Every network is cooperative, whatever its orifices, pipes and rims: what flows into a tank

@@ -120,7 +120,7 @@ READ = {
     ("tuning.report.html", "_style", "read_text"): "page.css of the package",
     ("jaxtank.live.page", "_read", "read_text"): "a part of the page, of the package",
     ("jaxtank.live.engine", "engine", "read_text"): "engine.js of the package",
-    ("tuning.cli.completion", "names", "read_text"): "names.txt of the package",
+    ("tuning.cli.completion", "_lines", "read_text"): "names.txt of the package",
     ("jaxtank.xla.program_cache", "_digest", "read_bytes"): "an entry that jax has just written, or"
     " one of a folder of mode 700 and the user's own, to compare its digest",
     ("jaxtank.xla.program_cache", "_check_entries", "read_text"): "that digest, compared only",

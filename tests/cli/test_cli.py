@@ -97,10 +97,9 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_list_prints_every_case():
-    lines = done("list", "--all").out.splitlines()
-    named = [line.split()[0] for line in lines[2:] if not line.startswith(" ")]
+    named = [line.split()[0] for line in done("list", "--all").out.splitlines()[:-1]]
     assert named == presets.names()
-    *rows, last = done("list").out.splitlines()[2:]
+    *rows, last = done("list").out.splitlines()
     firsts, counts = [row.split()[0] for row in rows], [row.split()[1] for row in rows]
     assert set(firsts) < set(named) and len(rows) < 25 and last.startswith(f"{len(named)} cases")
     assert len(rows) + sum(int(n) for n in counts if n.isdigit()) == len(named)
@@ -268,6 +267,7 @@ def test_dt_is_short_for_the_clock_and_order_does_not_matter():
     assert text == init("--set", "clock.duration=200", "--dt", "1")
 
 
+@pytest.mark.slow
 def test_the_seed_decides_the_noise_and_nothing_else():
     short = ("cascaded/pi", "--dt", "4", "--json")
     noisy = ("simulate", *short, "--set", "sensor.noise=0.05", "--seed")
@@ -461,6 +461,7 @@ APART = "controller.model.pump_gain = [27.43, 19.55] cm^3/(s V), and plant.pump_
 BRIEF = (*setting("clock.duration=20"), "--dt", "1")
 
 
+@pytest.mark.slow
 def test_the_model_of_a_file_follows_its_plant(folder):
     """Whoever edits plant.* of the file of `init` has a right model; a wrong one is reported."""
     text = done("init", "mirakhorli/sfc").out
@@ -818,3 +819,12 @@ def test_robust_tuning_from_the_command_line():
     assert result["certificate"]["scenarios"] == 4 == len(result["scenarios"])
     assert result["certificate"]["fresh"] == 1024
     assert all(c["margin"] >= 0 for c in result["constraints"]) and len(result["constraints"]) == 16
+
+
+def test_list_imports_neither_jax_nor_numpy(tmp_path):
+    code = (
+        "import sys; from tuning.cli.main import main; main(['list']);"
+        " sys.exit(bool({'jax', 'numpy'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True)
+    assert done.returncode == 0 and done.stdout

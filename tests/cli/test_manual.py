@@ -75,7 +75,7 @@ def test_the_letters_follow_the_topology():
     )
 
 
-@pytest.mark.slow_for(*(set(NAMES) - {"mirakhorli/sfc-fitted", "khalid/gpc-mimo-constrained"}))
+@pytest.mark.slow_for(*(set(NAMES) - {"khalid/gpc-mimo-constrained"}))
 @pytest.mark.parametrize("name", NAMES)
 def test_everything_of_a_case_is_on_its_page(name):
     case, page = presets.find(name), text_of(presets.find(name))

@@ -11,6 +11,7 @@ def compiled(*words):
     return programs
 
 
+@pytest.mark.slow
 def test_a_run_is_one_program():
     assert compiled("simulate", "cascaded/pi", "--dt", "8") == {"evaluate_compiled": 1}
 

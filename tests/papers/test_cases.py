@@ -245,7 +245,9 @@ NUMBERS = {  # measured numbers that are not the printed ones, and what they are
 }
 
 
-@pytest.mark.slow_for("dts200", "gouta2015", "gouta2022", "johansson", "khalid", "mirakhorli")
+@pytest.mark.slow_for(
+    "calofir", "dts200", "gouta2015", "gouta2022", "johansson", "khalid", "mirakhorli"
+)
 @pytest.mark.parametrize("paper", presets.PAPERS)
 def test_rows_of_a_paper_are_measured(paper, monkeypatch):
     """Every number and claim of a paper: what holds of it, and why where it does not."""

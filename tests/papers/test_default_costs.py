@@ -48,6 +48,7 @@ def cases():
                 yield pytest.param(full, marks=() if full in QUICK else pytest.mark.slow)
 
 
+@pytest.mark.slow_for("cascaded/pi")
 @pytest.mark.parametrize("name", list(cases()))
 def test_slopes_of_the_default_cost(name):
     paper = presets.load(name.split("/")[0])

@@ -245,6 +245,7 @@ def test_gains(kind, printed, radius, condition):
         assert np.linalg.cond(np.asarray(part.design(DT)[0])) == pytest.approx(condition, abs=0.05)
 
 
+@pytest.mark.slow
 def test_gains_with_other_horizons():
     """Notes H6: with few functions the gain depends on the horizon, with eight it does not; the
     condition of Omega grows.
@@ -545,6 +546,7 @@ def test_against_a_loop_of_numpy_and_solve_ivp():
     np.testing.assert_allclose(run.u[:200], inputs, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_against_a_loop_with_slsqp():
     _, run = closed("laguerre", mode=QP, du=0.1)
     levels, inputs = own_loop("laguerre", "S2", 60, limited=True, du=0.1)

@@ -810,6 +810,7 @@ def after_change(reading, high, controller):
     return np.asarray(jaxtank.simulate(case.loop, case.clock).e)[-1000:]
 
 
+@pytest.mark.slow
 @pytest.mark.slow_for("k1 x 0.7-6.0-LQI-error26")
 @pytest.mark.parametrize(
     "reading, high, controller, error", STEADY, ids=lambda v: v if isinstance(v, str) else None

@@ -157,6 +157,7 @@ def parts(claim):
 FAST = ("dts200",)
 
 
+@pytest.mark.slow_for("dts200")
 @pytest.mark.parametrize(
     "paper", [pytest.param(p, marks=() if p in FAST else pytest.mark.slow) for p in presets.PAPERS]
 )

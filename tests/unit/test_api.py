@@ -522,7 +522,7 @@ def test_a_notebook_shows_a_result_as_tables_with_every_text_escaped(results, ki
     assert ("alert(1)" in joined) == (kind != "certificate")
 
 
-@pytest.mark.slow_for("identification")
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ("tuning", "identification"))
 def test_save_leaves_out_the_rig_file_of_a_class_without_a_name_with_a_note(
     results, kind, tmp_path, monkeypatch

@@ -144,6 +144,7 @@ def test_a_package_that_cannot_be_used_is_named_in_one_line(installed, tmp_path,
     assert why in found.err
 
 
+@pytest.mark.slow
 def test_a_measure_from_outside_is_evaluated_limited_and_minimised(added, capsys):
     case = presets.find("cascaded/pi").replace(clock=jaxtank.Clock(dt=4.0, duration=800.0))
     with pytest.raises(InputError, match="unknown measure"):

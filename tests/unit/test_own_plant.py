@@ -130,6 +130,7 @@ def test_it_is_tuned_under_limits_drawn_and_validated(case, result):
         jaxtank.simulate(jaxtank.with_values(case.loop, {"plant.drain": -1.0}), case.clock)
 
 
+@pytest.mark.slow
 def test_what_was_tuned_is_saved_without_a_rig_file_with_a_note(result, tmp_path):
     """Neither class has a name in a rig file; all but rig.toml is written."""
     (tmp_path / "rig.toml").write_text("of an earlier result")

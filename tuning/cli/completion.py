@@ -6,6 +6,7 @@ Words that only a started jax knows (cases, parameters, measures) are in names.t
 
 import glob
 import os
+import sys
 from pathlib import Path
 
 from jaxtank.core.errors import InputError, nearest
@@ -104,10 +105,23 @@ def names():
     """Return the words of each kind: cases, papers, figures, parameters, measures and others."""
     words = {"shells": list(SCRIPTS), "languages": ["c", "m", "js"]}
     words["precisions"] = ["double", "float"]
-    for line in NAMES.read_text(encoding="utf-8").splitlines():
-        kind, _, word = line.partition(" ")
+    for line in _lines():
+        kind, _, word = line.partition("\t")[0].partition(" ")
         words.setdefault(kind, []).append(word)
     return words | {"papers": [*dict.fromkeys(c.split("/")[0] for c in words["cases"]), "all"]}
+
+
+def _lines():
+    """Return the lines of names.txt: "KIND WORD", of a case with a tab and its title."""
+    return NAMES.read_text(encoding="utf-8").splitlines()
+
+
+def titles():
+    """Return {case: title} of names.txt, and of the papers that were registered since."""
+    cases = dict(line.removeprefix("cases ").split("\t") for line in _lines() if "\t" in line)
+    presets = sys.modules.get("jaxtank.presets")  # none is registered where it is not imported
+    papers = () if presets is None else presets.PAPERS
+    return cases | {f"{p}/{n}": c.title for p in papers for n, c in presets.load(p).cases.items()}
 
 
 def gather():
@@ -124,7 +138,7 @@ def gather():
     ]
     parameters = {name for name, value, _ in leaves if not isinstance(value, tuple)}
     kinds = {
-        "cases": presets.names(),
+        "cases": [f"{name}\t{presets.find(name).title}" for name in presets.names()],
         "parameters": sorted(parameters | {f"clock.{k}" for k in CLOCK}),
         # without custom functions
         "measures": [m for m in MEASURES if m not in functions(MEASURES)],

@@ -189,13 +189,14 @@ def print_result(args, payload, text, done=""):
 
     `done` : the sentence of the verdict of a command that judges nothing.
     """
-    from tuning.report import tables
+    if not args.json:
+        print(text())
+        return
+    from tuning.report import tables, verdict
 
-    if args.json and done:
-        from tuning.report.verdict import outcome
-
-        payload = {**payload, "verdict": outcome(done).to_json()}
-    print(tables.dumps(payload) if args.json else text())
+    if done:
+        payload = {**payload, "verdict": verdict.outcome(done).to_json()}
+    print(tables.dumps(payload))
 
 
 def printed(report):

@@ -125,6 +125,7 @@ def test_local_workers_listen_on_this_machine_alone_and_to_their_own_client_alon
                 urllib.request.urlopen(f"http://{ip}:{port}{path}", timeout=2)
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_in_mid_run_changes_no_bit(case, whole, client, tmp_path):
     victim, pid = next(iter(client.run(os.getpid).items()))
     counts, folder = [], tmp_path / "run"

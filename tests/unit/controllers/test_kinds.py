@@ -107,6 +107,7 @@ def test_on_off_has_no_derivative_and_says_so():
         jax.grad(error)(np.array([0.9]))
 
 
+@pytest.mark.slow_for("options0")
 @pytest.mark.parametrize("options", [(), ("--method", "slsqp")])
 def test_tuning_an_on_off_controller_is_one_line_of_refusal(tmp_path, options):
     path = tmp_path / "rig.toml"

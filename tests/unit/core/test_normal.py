@@ -38,6 +38,7 @@ def test_its_program_holds_no_loop():
     assert "while" not in text and "threefry" not in text
 
 
+@pytest.mark.slow
 def test_the_noise_of_a_run_drawn_in_its_loop_is_that_drawn_before():
     """Deviates that are given, as the tuner gives them, against those drawn sample by sample."""
     import jaxtank

@@ -75,6 +75,7 @@ def replayed(name, noise=1e-4, values=(), filtered=False):
 
 @pytest.mark.slow_for(
     "gouta2015/ngpc",
+    "gouta2015/backstepping-boxqp",
     "gouta2022/fopi",
     "mirakhorli/smc",
     "calofir/backstepping",

@@ -241,6 +241,7 @@ def test_what_cannot_be_attacked_is_refused(given, words):
         tuning.attack(presets.find("cascaded/pi"), **given)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pumps", ["own", pytest.param("random", marks=pytest.mark.slow)])
 def test_the_filter_of_an_outflow_pump_withstands_attacks_that_pass_its_limit_without_it(pumps):
     case = rig.load(RIGS.parent / "cases" / "case31_safety_filter_outflow_pump.toml")

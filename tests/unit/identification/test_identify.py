@@ -588,6 +588,7 @@ def test_correlation_of_residuals_against_sums_over_pairs():
     np.testing.assert_array_equal(residuals.autocorrelation(np.zeros((1, 20)), 3), [1, 0, 0, 0])
 
 
+@pytest.mark.slow
 def test_a_reading_that_never_moves_has_no_fit_percent(case, away, clean):
     """tank 4's sensor hangs at 2 cm: its percent is null, not minus a large number."""
     y = clean.y.copy()

@@ -122,6 +122,7 @@ def covered(result, widened=True):
     return hits
 
 
+@pytest.mark.slow
 def test_the_data_choose_the_likelihood_and_the_noises():
     disturbed, quiet = (identified(data(3, process), "auto") for process in (PROCESS, 0.0))
     assert disturbed.likelihood["kind"] == "innovations"

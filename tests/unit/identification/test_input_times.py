@@ -164,6 +164,7 @@ def test_a_piece_of_length_zero_is_none_to_pumps_with_memory(tmp_path):
     np.testing.assert_allclose(cut, whole, rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_two_logs_in_sequence_give_what_both_together_give(tmp_path, capsys):
     """The rig of the first log, with its covariance, on the second: estimates and intervals."""
     times, inputs = _commands(0)

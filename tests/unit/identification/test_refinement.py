@@ -51,6 +51,7 @@ def bent():
     return refined(data(1, GAUGES["bent"]))
 
 
+@pytest.mark.slow
 def test_a_gauge_that_is_not_straight_is_found_and_predicts_another_log(bent):
     assert [(part.kind, part.where) for part in bent.refinements][:1] == [("sensor-curve", 0)]
     part = bent.refinements[0]

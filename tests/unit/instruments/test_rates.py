@@ -84,6 +84,7 @@ def independent(windup, pump=PUMP, valve=VALVE, dt=0.5, samples=241):
     return tuple(np.array(column) for column in zip(*rows))
 
 
+@pytest.mark.slow_for("clamping", "conditioned")
 @pytest.mark.parametrize("windup", ["back-calculation", "clamping", "conditioned"])
 def test_rate_lag_and_dead_time_of_each_act_and_anti_windup_has_the_inputs_that_are_reached(windup):
     case = case_of(windup)
@@ -109,6 +110,7 @@ def test_a_long_ramp_of_the_pump_does_not_wind_the_integral_up():
     assert highest["conditioned"] == pytest.approx(x[:, 0].max(), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_slopes_by_rate_lag_and_gains_are_those_of_differences_while_the_rate_acts():
     case = case_of()
     clock = jaxtank.Clock(dt=0.5, duration=15.0)

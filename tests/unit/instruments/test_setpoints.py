@@ -122,6 +122,7 @@ def test_a_filter_is_for_ramps():
         curves.sample(CLOCK)
 
 
+@pytest.mark.slow_for("course3")
 @pytest.mark.parametrize(
     "course", [{"ramp": 0.0}, {"ramp": 9.3}, {"ramp": 5.0, "shape": "quintic"}, {"filter": [3.0]}]
 )

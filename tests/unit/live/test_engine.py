@@ -222,6 +222,7 @@ def test_of_runs_asked_for_meanwhile_the_newest_is_sent_and_without_a_worker_it_
     assert found["shown"] == [["a", 1], ["b", 3], [-4, 4], [-5, 5], "x"]
 
 
+@pytest.mark.slow
 def test_names_of_a_rig_stay_text():
     hostile = "</script><script>alert(1)//\u2028"
     case = presets.find("cascaded/pi").replace(name=hostile, title=hostile, limits={})

@@ -143,6 +143,7 @@ def test_a_number_out_of_range_is_refused_in_words(browser, written):
         assert "controller.Kc[0] = 1" in live.text("#message") and "to 5" in live.text("#message")
 
 
+@pytest.mark.slow
 def test_a_link_brings_back_the_state_and_a_false_one_is_refused(browser, written):
     with opened(browser, written, f"#v1&{MANY}&seed=3&filter=0") as live:
         state = live("jaxtank.state()")
@@ -343,6 +344,7 @@ def test_a_result_without_a_case_has_no_page():
     assert json.dumps(live.name) in repr(live).replace("'", '"')
 
 
+@pytest.mark.slow
 def test_a_page_of_n_plants_shows_their_band_at_once_and_tunes_what_is_free(browser, tmp_path):
     case = presets.find("cascaded/pi")
     path = case.explore({"controller.Ti": (60.0, 600.0)}, plants=20).save(tmp_path / "page.html")

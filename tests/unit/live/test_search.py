@@ -41,6 +41,7 @@ def test_a_search_ends_where_a_scan_has_its_minimum():
     assert found["objective"] <= 1.005 * min(scan)
 
 
+@pytest.mark.slow
 def test_a_search_keeps_the_limits():
     """The answer, run by the library: no limit is passed."""
     case = rig.set_values(

@@ -42,6 +42,7 @@ def test_the_list_is_that_of_the_catalogue_and_the_values_have_steps(case):
     assert a["rms_error_total"] != b["rms_error_total"]
 
 
+@pytest.mark.slow
 @pytest.mark.slow_for("jacfwd-settling_time")
 @pytest.mark.parametrize(
     "transform, name", [(jax.jacfwd, "settling_time"), (jax.jacrev, "time_of_max_level")]

@@ -40,6 +40,7 @@ def one_by_one(loop, clock, rows, key=None):
     return {n: np.stack([run[n] for run in runs]) for n in NAMES}
 
 
+@pytest.mark.slow_for("2")
 @pytest.mark.parametrize("batch", [2, 256])
 def test_batches_give_what_single_runs_give(batch):
     loop, clock = short("gouta2015/backstepping")
@@ -148,6 +149,7 @@ def batched_and_direct(samples=40):
     return of(jaxtank.evaluate), direct, jnp.asarray(points)
 
 
+@pytest.mark.slow
 def test_a_large_vmap_of_evaluate_runs_in_batches():
     value, direct, points = batched_and_direct()
     np.testing.assert_allclose(

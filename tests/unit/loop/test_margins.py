@@ -60,6 +60,7 @@ def of_theory(lag, dead, level=9.0, dt=DT):
     return control.tf(tank * pi) * control.tf([1.0], [1.0] + [0.0] * dead, dt)
 
 
+@pytest.mark.slow
 @pytest.mark.slow_for("None-0")
 @pytest.mark.parametrize(("lag", "dead"), [(None, 0), (2.5, 2)])
 def test_a_tank_under_pi_with_lag_and_dead_time_has_the_margins_of_linear_theory(lag, dead):

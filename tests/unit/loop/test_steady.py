@@ -58,6 +58,7 @@ def test_a_pump_that_takes_out_holds_a_level_against_an_inflow():
         rig.loads(text.replace("low = -5.0", "low = -3.0"))
 
 
+@pytest.mark.slow
 def test_margins_are_those_at_the_inflow(capsys, tmp_path):
     """The inflow into the lower tank sets the level of the upper one, and so its time constant."""
     path = tmp_path / "two.toml"

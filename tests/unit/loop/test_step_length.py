@@ -192,7 +192,7 @@ WRONG = (
 DOUBT = "tank 1 runs empty faster than the steps follow"
 
 
-@pytest.mark.slow_for("short", "long")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("last", "substeps", "words"),
     [(0.2, 1, WRONG), (10.0, 1, DOUBT), (0.2, 6, None)],

@@ -71,6 +71,7 @@ def test_presets_that_cannot_draw_keep_their_bits():
             assert rig.with_bottom(case) is case
 
 
+@pytest.mark.slow
 def test_no_pump_takes_more_than_a_tank_holds(tmp_path, capsys):
     (tmp_path / "dry.toml").write_text(DRY)
     assert main(["simulate", str(tmp_path / "dry.toml"), "--out", str(tmp_path / "out")]) == 0

@@ -69,6 +69,7 @@ def sums(chain, run):
     }
 
 
+@pytest.mark.slow
 def test_the_volume_lost_in_an_hour_is_that_of_an_hour(tmp_path, capsys):
     (tmp_path / "full.toml").write_text(FULL)
     assert main(["simulate", str(tmp_path / "full.toml"), "--out", str(tmp_path / "out")]) == 0

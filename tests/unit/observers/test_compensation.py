@@ -59,12 +59,7 @@ def commanded(case, h, u, r, d):
     return np.asarray(step(d))
 
 
-@pytest.mark.slow_for(
-    *(
-        set(CASES)
-        - {"gouta2015/backstepping-ff", "gouta2022/chadpc", "mirakhorli/sfc", "khalid/gpc"}
-    )
-)
+@pytest.mark.slow_for(*(set(CASES) - {"gouta2015/backstepping-ff", "gouta2022/chadpc"}))
 @pytest.mark.parametrize("name", CASES)
 def test_the_steady_state_of_a_wrong_plant_is_that_of_the_controller(name):
     """Levels and inputs of the wrong plant at the setpoint, by `equilibrium`, and its d by the mass

@@ -58,6 +58,7 @@ def test_the_estimate_is_the_inflow_less_what_the_dead_zones_withhold():
     np.testing.assert_allclose(estimate, zones + [15.0 / 225.0, 0.0], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_command_says_that_the_estimate_contains_the_dead_zones(capsys):
     short = ["--set", "clock.duration=5"]
     assert main(["simulate", "gouta2022/chadpc", *short]) == 0

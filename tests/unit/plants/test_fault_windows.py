@@ -185,6 +185,7 @@ def test_a_number_that_two_tables_give_differently_is_refused(text, words):
         rig.loads(text)
 
 
+@pytest.mark.slow_for("words1-tank 1 starts at 50 cm")
 @pytest.mark.parametrize(
     ("words", "note"),
     [

@@ -95,6 +95,7 @@ class Tags(HTMLParser):
         self.found.append((tag, dict(attrs)))
 
 
+@pytest.mark.slow
 def test_the_fragment_for_notebooks_asks_nothing_of_the_network_and_is_the_same_twice(short):
     page = animation.to_html(*short, seconds=1)
     assert page == animation.to_html(*short, seconds=1)

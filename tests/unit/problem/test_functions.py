@@ -97,6 +97,7 @@ def test_its_derivatives_are_those_of_the_measure_that_it_repeats(watertank):
         np.testing.assert_allclose(change, reverse[i], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_problem_has_the_point_of_the_measure_that_its_function_repeats(watertank):
     """Cost, margins and slopes over several plants, forward and (many parameters) in reverse."""
     plants = scenarios_of(watertank, {"plant.pump_gain": 0.05}, samples=2, seed=1)
@@ -215,6 +216,7 @@ def test_robust_tuning_and_the_tradeoff_take_functions(watertank):
     assert first["objective"] < second["objective"]
 
 
+@pytest.mark.slow
 def test_new_plants_are_judged_by_functions(watertank):
     own = tuning.Objective("own_root", root_mean_square, unit="cm")
     limits = [tuning.Constraint("fastest", fastest_change, upper=60.0, unit="V/s")]

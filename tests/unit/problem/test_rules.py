@@ -174,6 +174,7 @@ SECOND = {
 }
 
 
+@pytest.mark.slow_for("flow-cascade")
 @pytest.mark.parametrize("kind", SECOND)
 def test_simc_stabilises_both_loops_of_a_kind(kind):
     case = series(**SECOND[kind])
@@ -184,12 +185,14 @@ def test_simc_stabilises_both_loops_of_a_kind(kind):
         assert all(plateau.stable for plateau in jaxtank.stability_margins(loop, case.clock))
 
 
+@pytest.mark.slow
 def test_a_relay_has_no_gains_for_a_setpoint_and_says_so():
     rows = rule_rows(setting_of(series(**SECOND["cascade"])), 8, 0)
     assert [row["rule"] for row in rows if row["why"]] == ["relay"]
     assert "cascade" in rows[-1]["why"]
 
 
+@pytest.mark.slow
 def test_a_direct_action_turns_the_sign_of_a_rule():
     valve = SERIES.replace("drain = 0.01 }", "inflow = 0.0 }").replace(
         "pump = [", "valve = [{ from = 2, area = 0.02, initial = 0.5 }]\npump = ["

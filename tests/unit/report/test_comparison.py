@@ -114,6 +114,7 @@ def test_the_claims_of_a_ramp_are_the_same_for_each():
     assert papers.ramps(rows[2:]) == []
 
 
+@pytest.mark.slow
 def test_the_command_says_numbers_and_claims_apart(capsys, monkeypatch, tmp_path):
     """In the terminal, in JSON and on the page."""
     text = "printed numbers: 1 of 2 reproduced, 0 fitted; claims in words: 1 of 1 hold, 0 fitted"

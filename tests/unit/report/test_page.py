@@ -160,6 +160,7 @@ def test_a_page_is_well_formed_and_asks_nothing_of_the_network(folder_of, kind):
     assert '<meta name="viewport"' in text and "@media print" in text and "max-width" in text
 
 
+@pytest.mark.slow_for("tune")
 @pytest.mark.parametrize("kind", KINDS)
 def test_pictures_have_captions_and_names_of_users_are_no_markup(folder_of, kind):
     text = (folder_of(kind) / "report.html").read_text(encoding="utf-8")
@@ -380,6 +381,7 @@ def test_a_browser_opens_the_page_without_complaint_and_pictures_fit_a_phone(
     page.close()
 
 
+@pytest.mark.slow
 def test_no_column_of_a_page_of_claims_is_cut(browser, tmp_path):
     """A box of the page is as wide as what it holds: nothing has to be pushed aside to be read."""
     words = (

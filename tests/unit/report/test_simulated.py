@@ -49,6 +49,7 @@ def test_an_estimated_disturbance_is_drawn_and_kept_and_an_earlier_picture_goes(
     assert found["d_hat1 [cm/s]"].max() == pytest.approx(rate, rel=0.02)
 
 
+@pytest.mark.slow
 def test_only_a_blend_has_shares():
     clock = jaxtank.Clock(dt=4.0, duration=40.0)
     run = jaxtank.simulate(presets.find("cascaded/pi").loop, clock)

@@ -82,6 +82,7 @@ def results():
 """
 
 
+@pytest.mark.slow
 def test_a_rig_is_read_written_and_simulated_whatever_its_docstrings_say():
     """All docstrings and descriptions of both packages are replaced by "x" in a new process."""
     script = f"{REWORD}\n{RESULTS}\nimport json\nprint(json.dumps(results()))"

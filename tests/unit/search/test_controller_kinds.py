@@ -65,6 +65,7 @@ def test_published_gains_of_the_same_plant_are_taken():
     assert float(with_kind(weaker, "ngpc").loop.controller.Tp) != float(other.loop.controller.Tp)
 
 
+@pytest.mark.slow_for("enmpc")
 @pytest.mark.parametrize("kind", START)
 def test_every_kind_has_first_gains_for_a_rig_that_it_fits(kind):
     """They are finite, pass input validation, and are written to a file and read back."""

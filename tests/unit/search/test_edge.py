@@ -146,6 +146,7 @@ def exploding():
     return rig.set_values(presets.find("gouta2015/backstepping"), settings)
 
 
+@pytest.mark.slow
 def test_the_local_table_has_no_slope_that_runs_contradict(exploding):
     found = tuning.sensitivity(exploding, {"controller.k": 0.1}, method="local")
     error = next(c for c in found.columns if c.measure == "rms_error_total")

@@ -29,6 +29,7 @@ def held(result):
     return [cost for _, cost, violation, _ in result.history if violation == 0.0]
 
 
+@pytest.mark.slow
 def test_no_screened_point_is_better_at_the_true_step_where_the_coarse_one_differs(watertank):
     case = rig.set_values(watertank, {"clock.dt": 0.004})
     few = tuning.Options(starts=1, screening=16, validation=0)

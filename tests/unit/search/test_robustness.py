@@ -55,6 +55,7 @@ def test_a_fragile_answer_moves_back_as_far_as_its_sensitivity_peak_asks(answere
     assert found.kept.tolist() == [False, True]
 
 
+@pytest.mark.slow
 def test_tuned_again_the_answer_stays(answered, monkeypatch):
     """The first values are an earlier answer, a little below the peak that is allowed."""
     setting, problem, search = answered

@@ -292,6 +292,7 @@ def test_a_result_is_saved_whole_and_its_rig_runs_to_the_same_numbers(short, tmp
     assert np.asarray(rows["h3_[cm]"]).max() <= 30.0 and rows["t_[s]"][-1] == 400.0
 
 
+@pytest.mark.slow
 def test_chatter_is_told_and_drawn(gouta, limited):
     """k + k1 = 22 1/s at a step of 0.1 s, past 2/dt: the pumps jump from limit to limit at every
     sample.

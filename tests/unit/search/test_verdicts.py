@@ -162,6 +162,7 @@ def edited(tmp_path, **lines):
     return str(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", ["0", "1", "2"])
 def test_one_start_does_not_end_above_a_screened_point(capsys, seed):
     """The search from the rig's own values ends at 1.0285; a screened point within the limits is at
@@ -174,6 +175,7 @@ def test_one_start_does_not_end_above_a_screened_point(capsys, seed):
     assert found["starts"][0]["cost"] > 1.0 and len(found["starts"]) == 2
 
 
+@pytest.mark.slow
 def test_a_trade_off_starts_from_what_was_screened(capsys):
     """A grid of 150 by 150, refined once, finds 0.18913 without overshoot."""
     words = ["--starts", "1", "--validation", "0", "--tradeoff", "overshoot_percent=0:5:4"]
@@ -264,6 +266,7 @@ def test_an_output_without_a_step_is_not_limited_and_one_with_is(gouta):
         resolve_limits(quiet, {"recovery_time": 5.0})
 
 
+@pytest.mark.slow
 def test_what_becomes_undefined_in_the_search_breaks_its_limit(capsys, tmp_path):
     """With gains this small no run reaches 90 % of the step: no rise time is defined."""
     path = edited(tmp_path, Kc="0.15", Ti="95.0", overshoot_percent=None, settling_time=None)

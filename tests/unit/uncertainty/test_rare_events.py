@@ -37,6 +37,7 @@ PROBLEMS = {
 }
 
 
+@pytest.mark.slow_for("a ball outside")
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_probabilities_are_those_of_closed_forms(name):
     function, exact = PROBLEMS[name]

@@ -263,6 +263,7 @@ def test_batches_and_seeds(case):
         assert not np.array_equal(a.effects["total"], d.effects["total"])
 
 
+@pytest.mark.slow
 def test_noise_is_the_same_in_every_run(case):
     """That of `evaluate` with the key of the seed. A parameter that does nothing has no effect at
     all, although every run is noisy.

@@ -1,6 +1,7 @@
 """`jaxtank list`, `show`, `simulate`, `init` and `export`: the cases, and one unchanged case."""
 
 import argparse
+import shutil
 import sys
 import textwrap
 from pathlib import Path
@@ -9,6 +10,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.files import write_folder
 from tuning.cli import values
 from tuning.cli.commands.identification import DATA, read_logs
+from tuning.cli.completion import titles
 from tuning.cli.options import CASE, COMMON, RUN, Command, Option
 from tuning.cli.steps import note, open_case, print_result, printed, report_written
 from tuning.cli.terminal import Line
@@ -16,25 +18,20 @@ from tuning.cli.terminal import Line
 
 def list_cases(args):
     """Print every case with its title; without --all those of one controller as one line."""
-    from jaxtank import presets
-    from tuning.report import tables
-
-    cases = {f"{p}/{n}": c.title for p in presets.PAPERS for n, c in presets.load(p).cases.items()}
+    cases = titles()  # neither jax nor numpy is imported
     groups = {}  # {what comes before the first "-": names}
     for name in cases:
-        groups.setdefault(name.partition("-")[0], []).append(name)
-    room = tables.columns() - 36
-    title = lambda name: textwrap.shorten(cases[name], room, placeholder=" ...")
-    rows = [[first, len(more) or "", title(first)] for first, *more in groups.values()]
-    text = lambda: "\n".join(
-        [
-            tables.table(rows, ["case", "variants", ""]),
-            f"{len(cases)} cases; --all lists the variants, jaxtank show CASE describes one",
-        ]
-    )
-    if args.all:
-        text = lambda: tables.table(cases.items(), ["case", ""])
-    print_result(args, cases, text, f"{len(cases)} cases")
+        groups.setdefault(name if args.all else name.partition("-")[0], []).append(name)
+    wide = max(len(first) for first, *_ in groups.values())
+    counts = ["" if args.all else str(len(names) - 1 or "") for names in groups.values()]
+    room = max(shutil.get_terminal_size().columns, 60) - wide - 7
+    lines = [
+        f"{first:{wide}}  {count:>2}  {textwrap.shorten(cases[first], room, placeholder=' ...')}"
+        for (first, *_), count in zip(groups.values(), counts)
+    ]
+    more = "" if args.all else "; numbers count variants (--all)"
+    lines.append(f"{len(cases)} cases{more}; jaxtank show CASE describes one")
+    print_result(args, cases, lambda: "\n".join(lines), f"{len(cases)} cases")
     return 0
 
 
