@@ -2,8 +2,16 @@
 
 from jaxtank.observers.base import Direct, Observer
 from jaxtank.observers.disturbance import DisturbanceObserver
-from jaxtank.observers.extended_kalman import ExtendedKalman
+from jaxtank.observers.extended_kalman import ExtendedKalman, UnscentedKalman
 from jaxtank.observers.fault_bank import FaultBank
 from jaxtank.observers.kalman import Kalman
 
-__all__ = ["Direct", "DisturbanceObserver", "ExtendedKalman", "FaultBank", "Kalman", "Observer"]
+__all__ = [
+    "Direct",
+    "DisturbanceObserver",
+    "ExtendedKalman",
+    "FaultBank",
+    "Kalman",
+    "Observer",
+    "UnscentedKalman",
+]

@@ -22,6 +22,7 @@ from jaxtank.observers import (
     FaultBank,
     Kalman,
     Observer,
+    UnscentedKalman,
 )
 from jaxtank.plants.elements import input_flows
 from jaxtank.plants.hydraulics import in_unit
@@ -76,6 +77,7 @@ ROLES = {
             "disturbance": DisturbanceObserver,
             "kalman": Kalman,
             "extended-kalman": ExtendedKalman,
+            "unscented-kalman": UnscentedKalman,
             "fault-bank": FaultBank,
         },
     ),

@@ -177,6 +177,7 @@ def run(plant, x, u, duration, steps):
     return jax.lax.fori_loop(0, steps, body, tuple(x))
 
 
+@functools.cache
 def exact(seed):
     """(seconds, levels (n,) [m] then) of our own integrator, until a level comes near a kink: the
     top, an opening that falls dry, or a corner of a table.

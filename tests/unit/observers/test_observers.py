@@ -18,9 +18,10 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.records import Tick
 from jaxtank.core.tree import component, get_value, number, static, with_values
 from jaxtank.loop.run import evaluate_compiled
-from jaxtank.observers import ExtendedKalman, Kalman
+from jaxtank.observers import ExtendedKalman, Kalman, UnscentedKalman
 from jaxtank.plants import state_coupled_four_tank
 from jaxtank.plants.base import Plant
+from jaxtank.plants.network import network
 
 PLANT = state_coupled_four_tank(15 * 2**0.5)
 LEVELS, INPUTS = equilibrium(PLANT, (8.0, 8.0))
@@ -59,8 +60,8 @@ def kalman(**changes):
     )
 
 
-def extended(**changes):
-    return ExtendedKalman(
+def extended(of=ExtendedKalman, **changes):
+    return of(
         **{
             **dict(model=PLANT, process=Q, measurement=R, spread=np.full(4, 1.0), measured=(0, 1)),
             **changes,
@@ -78,16 +79,17 @@ def filtered(observer, ys, us, x0, dt):
     return np.array(found), state
 
 
-@pytest.mark.slow_for("measured0", "measured2")
+@pytest.mark.slow_for("measured0-extended", "measured2-extended", "measured2-unscented")
+@pytest.mark.parametrize("of", [ExtendedKalman, UnscentedKalman], ids=["extended", "unscented"])
 @pytest.mark.parametrize("measured", [(0, 1), (1,), (0, 1, 2, 3)])
-def test_on_a_linear_model_the_extended_filter_is_the_ordinary_one(measured):
+def test_on_a_linear_model_the_filter_is_the_ordinary_one(measured, of):
     """Joint correction and matrix inverse in numpy; the step's matrix is Taylor's series to h^4,
     which is what RK4 makes of A.
     """
     rng, dt = np.random.default_rng(0), 0.5
     ys, us = rng.normal(5.0, 1.0, (20, 4)), rng.normal(3.0, 1.0, (20, 2))
     found, state = filtered(
-        extended(model=Linear(), measured=measured), ys, us, np.full(4, 5.0), dt
+        extended(of, model=Linear(), measured=measured), ys, us, np.full(4, 5.0), dt
     )
     H = A * dt
     F = np.eye(4) + H @ (np.eye(4) + H / 2 @ (np.eye(4) + H / 3 @ (np.eye(4) + H / 4)))
@@ -99,6 +101,49 @@ def test_on_a_linear_model_the_extended_filter_is_the_ordinary_one(measured):
         np.testing.assert_allclose(found[k], x, rtol=1e-11)
         x, P = F @ x + G @ us[k], F @ P @ F.T + np.diag(Q) * dt
     np.testing.assert_allclose(state.P, P, rtol=1e-10, atol=1e-14)
+
+
+def test_near_the_bottom_the_unscented_filter_predicts_the_mean_that_levels_have():
+    """A tank that empties by Torricelli's law: after t its level is (root of the level - c t/2)^2,
+    whose mean over normal levels is a quadrature.
+    """
+    dt, c = 8.0, 0.2
+    after = lambda level: (np.sqrt(level) - c * dt / 2) ** 2
+    nodes, weights = np.polynomial.hermite_e.hermegauss(9)
+    exact = weights @ after(3.0 + 0.5 * nodes) / weights.sum()
+    tank = network(
+        area=[1.0],
+        drain=[c / np.sqrt(2 * 981.0)],
+        pump_gain=[1.0],
+        feeds=[(0, None)],
+        rim=[10.0],
+        gravity=981.0,
+        knee=1e-6,
+    )
+    mean = {}
+    for of in (ExtendedKalman, UnscentedKalman):
+        observer = of(
+            model=tank, process=[0.0], measurement=[1.0], spread=[0.25], measured=(0,), substeps=10
+        )
+        tick = Tick(t=0.0, r=(), dr=(), ddr=(), dt=dt)
+        state = observer.predict(observer.init((3.0,)), tick, (0.0,), (0.0,))
+        mean[of] = state.x[0]
+    assert abs(mean[UnscentedKalman] - exact) < 0.1 * abs(mean[ExtendedKalman] - exact)
+    np.testing.assert_allclose(mean[UnscentedKalman], (after(3.5) + after(2.5)) / 2, rtol=1e-5)
+    np.testing.assert_allclose(state.P[0][0], ((after(3.5) - after(2.5)) / 2) ** 2, rtol=1e-5)
+
+
+def test_a_level_without_a_variance_has_finite_slopes():
+    """The start of a filter that is told the levels: the root of a variance of 0."""
+    observer = extended(UnscentedKalman, spread=np.zeros(4), process=np.zeros(4))
+
+    def level(x):
+        tick = Tick(t=0.0, r=(), dr=(), ddr=(), dt=0.5)
+        return observer.predict(observer.init(tuple(x)), tick, (3.0, 3.0), (3.0, 3.0)).x[0]
+
+    x, step = np.full(4, 5.0), 1e-5 * np.eye(4)[0]
+    slope = jax.grad(level)(x)[0]
+    assert abs(slope - (level(x + step) - level(x - step)) / 2e-5) < 1e-8
 
 
 @pytest.mark.slow_for("measured0", "measured1")
