@@ -4,9 +4,11 @@ Compiled programs are kept in pytest's own cache between runs and shared by work
 subprocesses; `pytest --cache-clear` compiles everything anew.
 """
 
+import gc
 import os
 import re
 import shutil
+from pathlib import Path
 
 import jax
 import pytest
@@ -19,6 +21,8 @@ FOLDER = "JAX_COMPILATION_CACHE_DIR"
 LARGEST_CACHE = 2**30
 """Bytes of compiled programs above which a run begins without any."""
 
+LARGEST_WORKER = 2 * 10**9
+"""Bytes of memory of a process of tests from which on it forgets its compiled programs."""
 
 SKIPS = (
     r"no Chromium( on this machine)?$",  # and, of the same kind, what a machine may lack
@@ -68,6 +72,16 @@ def pytest_configure(config):
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
     jax.config.update("jax_compilation_cache_dir", str(folder))  # jax has read the environment
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def pytest_runtest_teardown(item, nextitem):
+    """Forget compiled programs between two files where a worker holds more than LARGEST_WORKER."""
+    pages = Path("/proc/self/statm")  # of Linux; elsewhere nothing is forgotten
+    if nextitem is None or nextitem.path == item.path or not pages.exists():
+        return
+    if int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > LARGEST_WORKER:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest selects by marks
