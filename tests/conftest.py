@@ -14,8 +14,12 @@ import jax
 import pytest
 
 import jaxtank  # noqa: F401  (before jax starts, so that the XLA option takes)
+from jaxtank.measures import catalogue
 
 jax.config.update("jax_enable_x64", True)
+
+MEASURES = set(catalogue.MEASURES)
+"""Measures of the package, before a test registers one."""
 
 FOLDER = "JAX_COMPILATION_CACHE_DIR"
 LARGEST_CACHE = 2**30
@@ -75,11 +79,17 @@ def pytest_configure(config):
 
 
 def pytest_runtest_teardown(item, nextitem):
-    """Forget compiled programs between two files where a worker holds more than LARGEST_WORKER."""
-    pages = Path("/proc/self/statm")  # of Linux; elsewhere nothing is forgotten
-    if nextitem is None or nextitem.path == item.path or not pages.exists():
+    """Between two files take out registered measures, and forget compiled programs where they are
+    of such a measure or a worker holds more than LARGEST_WORKER.
+    """
+    if nextitem is None or nextitem.path == item.path:
         return
-    if int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > LARGEST_WORKER:
+    registered = set(catalogue.MEASURES) - MEASURES
+    for name in registered:
+        del catalogue.MEASURES[name]
+    pages = Path("/proc/self/statm")  # of Linux
+    held = int(pages.read_text().split()[1]) if pages.exists() else 0
+    if registered or held * os.sysconf("SC_PAGE_SIZE") > LARGEST_WORKER:
         jax.clear_caches()
         gc.collect()
 

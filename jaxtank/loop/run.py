@@ -8,7 +8,7 @@ All are pure: jit, vmap, grad and jacfwd work on them with the loop as an argume
 
 import functools
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, cast
 
 import jax
@@ -267,7 +267,8 @@ def sensitivities(
 
 
 def _names(measures: str | Sequence[str] | Mapping[str, Any]) -> tuple[str, ...]:
-    names = (measures,) if isinstance(measures, str) else tuple(measures)
+    one = isinstance(measures, str) or not isinstance(measures, Iterable)
+    names = (measures,) if one else tuple(measures)
     ms.check_names(names)
     return names
 

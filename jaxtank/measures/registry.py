@@ -152,6 +152,11 @@ def _check_measure(name, measure, accumulators):
 def check_names(names: Iterable[str]) -> None:
     """Raise InputError for a name that is no measure; one of an installed package is registered."""
     for name in names:
+        if not isinstance(name, str):
+            raise InputError(
+                f"measure {shortened(name)}: must be a name; a function gets one by"
+                " jaxtank.measures.register(NAME, jaxtank.measures.from_function(function))"
+            )
         if name in MEASURES:
             continue
         points = installed(GROUP)

@@ -131,6 +131,12 @@ def registered():
             table.pop(key, None)
 
 
+@pytest.mark.parametrize("measures", [max, [max], ["max_level", 3], 3, None])
+def test_what_is_no_name_is_refused_as_a_measure(measures):
+    with pytest.raises(InputError, match="must be a name"):
+        jaxtank.evaluate(presets.find("cascaded/pi"), measures)
+
+
 @pytest.mark.slow
 def test_a_registered_measure_is_evaluated_with_its_derivative(registered):
     case = rig.loads(RIG)
