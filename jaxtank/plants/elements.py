@@ -54,16 +54,21 @@ def check_plain(net: Any, what: str, remedy: str) -> None:
         raise InputError(f"{what}: not covered: {', '.join(elements)}; {remedy}")
 
 
+def _joined(net):
+    """Return (tank or None for the basin, the same) of all that moves liquid but the drains."""
+    pumps = zip(net.sources or (None,) * len(net.feeds), net.feeds)
+    pumped = [(source, sink) for source, sinks in pumps for sink in sinks[: 2 - (None in sinks)]]
+    return [*net.links, *net.pipes, *pumped, *net.valves]
+
+
 def closed_circuit(net: Any) -> list[int]:
     """Return tanks that exchange nothing with the basin; [] of traced areas."""
     if any(isinstance(v, Tracer) for v in jax.tree.leaves((net.drain, net.drain_resistance))):
         return []
-    open_tanks, joined = set(np.flatnonzero(np.asarray(net.drain) > 0.0)), [*net.links, *net.pipes]
+    open_tanks = set(np.flatnonzero(np.asarray(net.drain) > 0.0))
     if net.drain_resistance is not None:
         open_tanks |= set(np.flatnonzero(np.isfinite(np.asarray(net.drain_resistance))))
-    pumps = zip(net.sources or (None,) * len(net.feeds), net.feeds)
-    joined += [(source, sink) for source, sinks in pumps for sink in sinks[: 2 - (None in sinks)]]
-    joined += net.valves
+    joined = _joined(net)
     for a, b in joined:
         open_tanks |= {b} if a is None else {a} if b is None else set()
     within = [pair for pair in joined if None not in pair]
@@ -166,13 +171,18 @@ def _joined_flow(net: Any, area: Any, x: Any, ends: tuple[int, int], port: Any) 
 
 def streams(net: Any, x: Any, u: Any) -> list[Stream]:
     """Return the flow of each drain, orifice, pipe, pump and valve at levels x and inputs u."""
+    flows = [
+        Stream(source, sink, outlet_flow(net, kind, k, x[source]))
+        for kind, pairs in openings(net)
+        for k, (source, sink) in enumerate(pairs)
+    ]
+    flows += [Stream(a, b, pipe_flow(net, k, x)) for k, (a, b) in enumerate(net.pipes)]
+    return flows + _moved(net, input_flows(net, x, u))
+
+
+def _moved(net, moved):
+    """Return the streams of pumps, one for each tank that they fill, and of valves."""
     flows = []
-    for kind, pairs in openings(net):
-        for k, (source, sink) in enumerate(pairs):
-            flows.append(Stream(source, sink, outlet_flow(net, kind, k, x[source])))
-    for k, ends in enumerate(net.pipes):
-        flows.append(Stream(ends[0], ends[1], pipe_flow(net, k, x)))
-    moved = input_flows(net, x, u)
     for j, (first, second) in enumerate(net.feeds):
         source, flow = net.sources[j] if net.sources else None, moved[j]
         if second is None:

@@ -1,6 +1,7 @@
 """Building a `TankNetwork` from plain numbers, and checking its topology."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
@@ -126,29 +127,17 @@ def network(
     (2, array([15., 15.]))
     """
     units = check_units("plant.units", units)
-    feeds = tuple(tuple(None if i is None else int(i) for i in pair) for pair in feeds)
-    links, pipes, spills = (
-        tuple((int(a), int(b)) for a, b in pairs) for pairs in (links, pipes, spills)
-    )
-    valves = tuple((int(a), None if b is None else int(b)) for a, b in valves)
-    sources = tuple(None if a is None else int(a) for a in sources)
-    joined = {"links": links, "pipes": pipes, "spills": spills, "feeds": feeds, "valves": valves}
+    joined = _joined(links, pipes, spills, feeds, valves)
+    links, pipes, spills, feeds, valves = joined.values()
+    sources = tuple(map(_tank, sources))
     joined["sources"] = [(source,) for source in sources]
     n = np.size(area) if np.ndim(area) else 1 + _last_tank(joined)
     _check_tanks({**joined, "outputs": [outputs]}, n)
     _check_feeds(feeds, sources)
     m, sizes = len(feeds), {"drain": n, "orifice": len(links), "pipe": len(pipes)}
     sizes |= {"spill": len(spills), "valve": len(valves)}
-    options: dict[str, Any] = {
-        f"{name}_{option}": _fitted(f"plant.{name}_{option}", value, sizes[name])
-        for option, values in (
-            ("port", ports),
-            ("exponent", exponents),
-            ("resistance", resistances),
-        )
-        for name, value in values.items()
-    }
-    each_valve = lambda value: (value,) * len(valves) if isinstance(value, str | bool) else value
+    options = _options(sizes, port=ports, exponent=exponents, resistance=resistances)
+    for_valves = functools.partial(_fitted, size=len(valves)) if valves else lambda *_: None
     plant = TankNetwork(
         area=_fitted("plant.area", area, n),
         drain=_fitted("plant.drain", drain, n),
@@ -159,25 +148,22 @@ def network(
         gravity=number(default_gravity(units[0]) if gravity is None else gravity),
         rim=_fitted("plant.rim", rim, n),
         caught=_fitted("plant.caught", caught, len(spills)),
-        valve=_fitted("plant.valve", valve, len(valves)) if valves else None,
-        rangeability=_fitted("plant.rangeability", rangeability, len(valves)) if valves else None,
+        valve=for_valves("plant.valve", valve),
+        rangeability=for_valves("plant.rangeability", rangeability),
         extent=None if extent is None else _fitted("plant.extent", extent, n),
         **options,
         links=links,
         pipes=pipes,
         feeds=feeds,
-        sources=sources if any(a is not None for a in sources) else (),
+        sources=sources if set(sources) - {None} else (),
         curves=_points(curves),
         lift_curves=_points(lift_curves),
         valves=valves,
-        characteristics=tuple(
-            kind if isinstance(kind, str) else _points([kind])[0]
-            for kind in each_valve(characteristics)
-        ),
-        one_way=tuple(bool(v) for v in each_valve(one_way)),
-        shapes=tuple(v if isinstance(v, str) else _points([v])[0] for v in shapes),
+        characteristics=_names_or_points(_each(characteristics, len(valves))),
+        one_way=tuple(map(bool, _each(one_way, len(valves)))),
+        shapes=_names_or_points(shapes),
         spills=spills,
-        outputs=tuple(int(i) for i in outputs),
+        outputs=tuple(map(int, outputs)),
         overflow=bool(overflow),
         bottom=bool(bottom),
         units=tuple(units),
@@ -185,6 +171,42 @@ def network(
     )
     check_caught(plant)
     return plant
+
+
+def _tank(i: Any) -> int | None:
+    """Return the number of a tank, or None for the basin."""
+    return None if i is None else int(i)
+
+
+def _joined(
+    links: Sequence, pipes: Sequence, spills: Sequence, feeds: Sequence, valves: Sequence
+) -> dict[str, Any]:
+    """Return the pairs of tanks by what joins them; pumps and valves may end in the basin."""
+    between = {"links": links, "pipes": pipes, "spills": spills}
+    joined = {name: tuple((int(a), int(b)) for a, b in pairs) for name, pairs in between.items()}
+    return joined | {
+        "feeds": tuple(tuple(map(_tank, pair)) for pair in feeds),
+        "valves": tuple((int(a), _tank(b)) for a, b in valves),
+    }
+
+
+def _options(sizes: dict[str, int], **options: Mapping[str, ArrayLike]) -> dict[str, Any]:
+    """Return {"drain_port": an array, ...} of the ports, exponents and resistances of openings."""
+    return {
+        f"{name}_{option}": _fitted(f"plant.{name}_{option}", value, sizes[name])
+        for option, values in options.items()
+        for name, value in values.items()
+    }
+
+
+def _each(value: Any, count: int) -> Sequence:
+    """Return a word or a truth value once for each valve, others as they are."""
+    return (value,) * count if isinstance(value, str | bool) else value
+
+
+def _names_or_points(values: Sequence) -> tuple:
+    """Return names as they are, and lists of points as hashable tuples."""
+    return tuple(v if isinstance(v, str) else _points([v])[0] for v in values)
 
 
 def _last_tank(joined: dict[str, Sequence]) -> int:

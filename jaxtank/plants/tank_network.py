@@ -458,6 +458,10 @@ class TankNetwork(Plant):
             return tuple(r / a for r, a in zip(rates, elements.sections(self, x)))
         if is_array(x):
             return flows(self, x, u, d, step)
+        return self._plain_flows(x, u, d, step)
+
+    def _plain_flows(self, x, u, d, step):
+        """Rates [cm/s] of a network of prisms, orifices, pipes and pumps, by scalars."""
         # Coefficients that do not depend on the state (the c_i of gouta2015 eq. 7) are computed
         # once by the loop. What u and d bring
         # comes first in each sum: within a Runge-Kutta step it is ready before the roots are.
@@ -468,12 +472,13 @@ class TankNetwork(Plant):
         rate = [0.0 if d is None else d[i] / self.area[i] for i in range(n)]
         for j, tank, gain in self.shares():
             rate[tank] = rate[tank] + (gain / self.area[tank]) * u[j]
-        supply = () if step is None else self._supply(step)
-        q = [
-            smooth_sqrt(h, self.knee) if step is None else limited_sqrt(h, self.knee, supply[i])
-            for i, h in enumerate(x)
-        ]
-        levels = x if step is None else [lower_clip(h, 0.0) for h in x]
+        if step is None:
+            supply, levels = (), x
+            q = [smooth_sqrt(h, self.knee) for h in x]
+        else:
+            supply = self._supply(step)
+            q = [limited_sqrt(h, self.knee, most) for h, most in zip(x, supply)]
+            levels = [lower_clip(h, 0.0) for h in x]
         for k, (source, sink) in enumerate(self.links):
             rate[sink] = rate[sink] + (self.orifice[k] * w / self.area[sink]) * q[source]
         for k, (first, second) in enumerate(self.pipes):

@@ -1,7 +1,6 @@
 """The equations of a rig in plain text, read from its topology: with letters, and in numbers."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
@@ -50,53 +49,74 @@ def _of_elements(plant, disturbed):
         rows.append(f"{content}{i + 1}' = {_sum(flows)}")
     lines = ["q(x) = sqrt(x) for x > 0, else 0", "w(x) = sgn(x) sqrt|x|"]
     lines = [f"  {line}" for line in lines if any(f" {line[0]}(" in row for row in rows)]
-    for name in ("curves", "lift_curves", "characteristics"):
+    lines += [*_curves(plant), *_volumes(plant)]
+    meaning = f"h levels [{length}], u inputs [{drive}] of the pumps, then of the valves"
+    return [f"in numbers [{local('cm^3/s', plant.units)}]:", *rows, *lines, f"  {meaning}"]
+
+
+def _curves(plant):
+    """Lines of the points of each curve."""
+    for name, letter in (("curves", "f"), ("lift_curves", "e"), ("characteristics", "c")):
         for j, points in enumerate(getattr(plant, name)):
-            letter = {"curves": "f", "lift_curves": "e", "characteristics": "c"}[name]
             if isinstance(points, tuple):
                 pairs = ", ".join(f"({a:g}, {b:g})" for a, b in points)
-                lines.append(f"  {letter}{j + 1} through {pairs}")
+                yield f"  {letter}{j + 1} through {pairs}"
+
+
+def _volumes(plant):
+    """Lines of the volume of each tank, of a network with shapes."""
+    length = plant.units[0]
     for i in range(plant.tanks):
         if shape := shape_name(plant, i):
             sizes = (
                 f"area {float(plant.area[i]):g} {length}^2, to {float(plant.extent[i]):g} {length}"
             )
-            lines.append(f"  V{i + 1}(h{i + 1}): volume of a {shape} ({sizes})")
+            yield f"  V{i + 1}(h{i + 1}): volume of a {shape} ({sizes})"
         elif plant.shapes:
-            lines.append(f"  V{i + 1} = {float(plant.area[i]):.4g} h{i + 1}")
-    meaning = f"h levels [{length}], u inputs [{drive}] of the pumps, then of the valves"
-    return [f"in numbers [{local('cm^3/s', plant.units)}]:", *rows, *lines, f"  {meaning}"]
+            yield f"  V{i + 1} = {float(plant.area[i]):.4g} h{i + 1}"
 
 
 def _streams(plant):
     """(from, to, flow in numbers) of each opening, pump and valve, closed ones left out."""
     root = float(np.sqrt(2.0 * float(plant.gravity)))
+    yield from _outflows(plant, root)
+    for k, (a, b) in enumerate(plant.pipes):
+        yield a, b, f"{_entry(plant, 'pipe', k) * root:.4g} {_apart(plant, 'pipe', k, a, b)}"
+    yield from _pumped(plant)
+    yield from _through_valves(plant, root)
 
-    def of(name: str, k: int) -> Any:
-        value = getattr(plant, name)
-        return None if value is None else float(value[k])
 
-    def head(kind, k, i):
-        port = of(f"{kind}_port", k)
-        return f"h{i + 1} - {port:g}" if port else f"h{i + 1}"
+def _entry(plant, name, k):
+    value = getattr(plant, name)
+    return None if value is None else float(value[k])
 
-    def apart(kind, k, a, b):
-        port = of(f"{kind}_port", k)
-        ends = (f"max(h{i + 1}, {port:g})" if port else f"h{i + 1}" for i in (a, b))
-        return f"w({' - '.join(ends)})"
 
+def _head(plant, kind, k, i):
+    port = _entry(plant, f"{kind}_port", k)
+    return f"h{i + 1} - {port:g}" if port else f"h{i + 1}"
+
+
+def _apart(plant, kind, k, a, b):
+    port = _entry(plant, f"{kind}_port", k)
+    ends = (f"max(h{i + 1}, {port:g})" if port else f"h{i + 1}" for i in (a, b))
+    return f"w({' - '.join(ends)})"
+
+
+def _outflows(plant, root):
     outlets = [(i, None) for i in range(plant.tanks)]
     for kind, pairs in (("drain", outlets), ("orifice", plant.links)):
         for k, (source, sink) in enumerate(pairs):
-            exponent, resistance = of(f"{kind}_exponent", k), of(f"{kind}_resistance", k)
-            above, size = head(kind, k, source), of(kind, k) * root
+            exponent = _entry(plant, f"{kind}_exponent", k)
+            resistance = _entry(plant, f"{kind}_resistance", k)
+            above, size = _head(plant, kind, k, source), _entry(plant, kind, k) * root
             power = f"({above})^{exponent:g}" if exponent else f"q({above})"
             if size > 0.0:
                 yield source, sink, f"{size:.4g} {power}"
             if resistance and np.isfinite(resistance):
                 yield source, sink, f"({above})/{resistance:g}"
-    for k, (a, b) in enumerate(plant.pipes):
-        yield a, b, f"{of('pipe', k) * root:.4g} {apart('pipe', k, a, b)}"
+
+
+def _pumped(plant):
     for j, (first, second) in enumerate(plant.feeds):
         source = plant.sources[j] if plant.sources else None
         text = f"u{j + 1}"
@@ -111,6 +131,9 @@ def _streams(plant):
             shares = [(first, share), (second, 1.0 - share)]
         for sink, share in shares:
             yield source, sink, f"{share * float(plant.pump_gain[j]):.4g} {text}"
+
+
+def _through_valves(plant, root):
     for k, (source, sink) in enumerate(plant.valves):
         u = f"u{len(plant.feeds) + k + 1}"
         u = f"{u}/100" if full_open(plant.units) == 100.0 else u
@@ -118,10 +141,10 @@ def _streams(plant):
             "linear": u,
             "equal-percentage": f"{float(plant.rangeability[k]):g}^({u} - 1)",
         }.get(plant.characteristics[k], f"c{k + 1}({u})")
-        above = head("valve", k, source)
-        flow = f"q({above})" if sink is None else apart("valve", k, source, sink)
+        head, ends = _head(plant, "valve", k, source), ("valve", k, source, sink)
+        flow = f"q({head})" if sink is None else _apart(plant, *ends)
         direction = " one way" if plant.one_way[k] and sink is not None else ""
-        yield source, sink, f"{of('valve', k) * root:.4g} {share} {flow}{direction}"
+        yield source, sink, f"{_entry(plant, 'valve', k) * root:.4g} {share} {flow}{direction}"
 
 
 def _meanings(plant, disturbed):

@@ -363,13 +363,18 @@ def different(label, value, tanks):
     return tanks
 
 
+def _are_points(value):
+    """True for a list of at least two pairs."""
+    is_pair = lambda point: isinstance(point, list) and len(point) == 2
+    return isinstance(value, list) and len(value) > 1 and all(map(is_pair, value))
+
+
 def _curve(key, label, value, sizes):
     """Points ((x, y), ...) with increasing x, or the name of one of the key's choices."""
     if isinstance(value, str) and hyphened(value) in (key.choices or ()):
         return hyphened(value)
-    names = "".join(f'"{choice}", ' for choice in key.choices or ())
-    pairs = isinstance(value, list) and len(value) > 1
-    if not (pairs and all(isinstance(point, list) and len(point) == 2 for point in value)):
+    if not _are_points(value):
+        names = "".join(f'"{choice}", ' for choice in key.choices or ())
         columns = key.local_unit(sizes.units)
         raise refusal(label, value, f"be {names}or a list of points [{columns}]: {key.doc}")
     columns = [Key(key.name, unit=unit) for unit in key.unit.split(", ")]
@@ -420,14 +425,17 @@ def written(key, value: Any, names: Sequence[str] = ()) -> Any:
         return value
     if key.kind == "tank":
         return tank(value)
-    if key.kind == "sequence":
-        return [[j + 1 for j in row] for row in value]
-    if key.kind == "inputs":
-        return [i + 1 for i in value]
+    if key.kind in ("sequence", "inputs"):
+        return _from_one(value)
     if key.kind in ("tanks", "pair", "feed"):
         tanks = [tank(i) for i in value if i is not None]
         return tanks[0] if key.kind == "feed" and len(tanks) == 1 else tanks
     return np.asarray(value).tolist()
+
+
+def _from_one(numbers):
+    """Return numbers that count from 0 as those that count from 1; lists of lists too."""
+    return [_from_one(v) for v in numbers] if np.ndim(numbers) else numbers + 1
 
 
 def name_of(where, value):

@@ -171,12 +171,7 @@ def _vessel(where, tank, units):
     kind, title = (shape, f'shape = "{shape}"') if isinstance(shape, str) else ("table", "shape")
     if kind == "prism":
         title = "an upright tank"
-        if "height" in tank and "rim" in tank:
-            raise InputError(f"{where}: height and rim are the same of {title}: give one of them")
-        if "height" in tank:
-            tank["rim"] = tank.pop("height")
-        if "rim" not in tank:
-            raise InputError(f"{where} needs rim [{units[0]}]: height")
+        _name_rim(where, tank, units)
     sizes = {key: tank[key] for key in ("area", "diameter", "height", "length") if key in tank}
     if tuple(sorted(sizes)) not in FORMS[kind]:
         if kind == "prism" and not sizes:
@@ -187,21 +182,41 @@ def _vessel(where, tank, units):
             f"{where}: {title} needs {forms} of area, diameter, height, length, not"
             f" {', '.join(sizes) or 'none'}"
         )
-    extent = sizes.get("height", sizes.get("diameter"))
-    extent, area = tank["rim"] if kind == "prism" else extent, sizes.get("area", 0.0)
     if kind == "table":
-        levels, areas = zip(*shape)
-        if levels[0] != 0.0 or min(areas) < 0.0 or min(areas[1:]) == 0.0:
-            raise refusal(
-                f"{where}: shape", shape, "be [[level, area], ...] from level 0, areas above 0"
-            )
-        extent, area = sizes.get("height", levels[-1]), sizes.get("area", max(areas))
-        shape = tuple((h / levels[-1], a / max(areas)) for h, a in shape)
-    elif "length" in sizes:
-        area = sizes["diameter"] * sizes["length"]
-    elif "diameter" in sizes:
-        area = _disc(sizes["diameter"])
+        extent, area, shape = _table_of_sections(where, shape, sizes)
+    else:
+        extent = tank["rim"] if kind == "prism" else sizes.get("height", sizes.get("diameter"))
+        area = _largest_section(sizes)
     return {"area": area, "shape": shape, "height": extent, "rim": tank.get("rim", extent)}
+
+
+def _name_rim(where, tank, units):
+    """Call the height of an upright tank its rim."""
+    if "height" in tank and "rim" in tank:
+        raise InputError(
+            f"{where}: height and rim are the same of an upright tank: give one of them"
+        )
+    if "height" in tank:
+        tank["rim"] = tank.pop("height")
+    if "rim" not in tank:
+        raise InputError(f"{where} needs rim [{units[0]}]: height")
+
+
+def _table_of_sections(where, shape, sizes):
+    """Return (extent, largest section, points of both as shares of these)."""
+    levels, areas = zip(*shape)
+    if levels[0] != 0.0 or min(areas) < 0.0 or min(areas[1:]) == 0.0:
+        rule = "be [[level, area], ...] from level 0, areas above 0"
+        raise refusal(f"{where}: shape", shape, rule)
+    points = tuple((h / levels[-1], a / max(areas)) for h, a in shape)
+    return sizes.get("height", levels[-1]), sizes.get("area", max(areas)), points
+
+
+def _largest_section(sizes):
+    """Return the largest cross-section of a shape that has a name."""
+    if "length" in sizes:
+        return sizes["diameter"] * sizes["length"]
+    return _disc(sizes["diameter"]) if "diameter" in sizes else sizes.get("area", 0.0)
 
 
 def _with_volume(where, tank):
@@ -249,8 +264,8 @@ def _list(table, name):
     return entries
 
 
-def _columns(entries) -> dict[str, Any]:
-    """{target: [value of each table]} of the lists of a rig; of parts of an entry, pairs."""
+def _stacked(entries):
+    """{target: [value of each table]}; without options that no table has."""
     columns: dict[str, Any] = {}
     for name in LISTS:
         for key in (key for key in SECTIONS[name].keys if key.target):
@@ -258,7 +273,13 @@ def _columns(entries) -> dict[str, Any]:
             column += [entry.get(key.name) for entry in entries[name]]
     for key in (key for name in LISTS for key in SECTIONS[name].keys if key.like):
         if all(value == key.default for value in columns.get(key.target, [0.0])):
-            columns.pop(key.target, None)  # what no table has is absent
+            columns.pop(key.target, None)
+    return columns
+
+
+def _columns(entries) -> dict[str, Any]:
+    """{target: [value of each table]} of the lists of a rig; of parts of an entry, pairs."""
+    columns = _stacked(entries)
     for name in ("plant.links", "plant.spills", "plant.valves"):
         columns[name] = list(zip(columns.pop(f"{name}.0"), columns.pop(f"{name}.1")))
     if all(shape == "prism" for shape in columns["plant.shapes"]):

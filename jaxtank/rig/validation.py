@@ -163,15 +163,19 @@ def check_limits(
             many = f", or {count} of them" if count > 1 else ""
             rim = ', or "rim"' if measure == "max_level" else ""
             raise refusal(f"limit {measure}", value, f"be a finite number [{unit}]{many}{rim}")
-        of = "" if unit == "-" else f" {unit}"
-        for sign, words in ((1.0, "least"), (-1.0, "most")):
-            end = MEASURES[measure].low if sign > 0 else MEASURES[measure].high
-            if end is not None and np.any(sign * np.asarray(value) < sign * end):
-                raise InputError(
-                    f"limit {measure} = {shortened(value)}{of}: must be at {words} {end:g}{of}; no"
-                    " run has a value beyond"
-                )
+        _check_range(measure, value, "" if unit == "-" else f" {unit}")
     return checked
+
+
+def _check_range(measure, value, unit):
+    """Raise InputError for a limit beyond what a run can have."""
+    spec = MEASURES[measure]
+    for sign, words, end in ((1.0, "least", spec.low), (-1.0, "most", spec.high)):
+        if end is not None and np.any(sign * np.asarray(value) < sign * end):
+            raise InputError(
+                f"limit {measure} = {shortened(value)}{unit}: must be at {words} {end:g}{unit}; no"
+                " run has a value beyond"
+            )
 
 
 def _limit(loop, measure, label, value, spans=None):

@@ -199,18 +199,23 @@ def _signs(case):
         # through another input the sign of a loop alone decides nothing
         if any(tank in reached[j] for j in range(len(ends)) if j not in members):
             continue
+        gain = float(np.asarray(gains)[i])
         for j in members:
             source, *sinks = ends[j]
             acts = (tank in sinks) - (tank == source)
-            gain = float(np.asarray(gains)[i])
-            sign = -acts if j in part.reversed_inputs else acts
-            if sign * gain < 0.0:
-                yield (
-                    f"controller.{name} of {label_of(plant, 'output', i)} = {gain:g}:"
-                    f" {label_of(plant, 'pump', j)} {'fills' if acts > 0 else 'empties'}"
-                    f" {label_of(plant, 'tank', tank)}, and this sign drives its level away"
-                    " from the setpoint: change the sign"
-                )
+            if gain * (-acts if j in part.reversed_inputs else acts) < 0.0:
+                yield _wrong_sign(plant, f"controller.{name}", gain, (i, j, tank), acts)
+
+
+def _wrong_sign(plant, name, gain, places, acts):
+    """The sentence on a gain of an output by a pump, places: (output, pump, tank)."""
+    output, pump, tank = (
+        label_of(plant, kind, i) for kind, i in zip(("output", "pump", "tank"), places)
+    )
+    return (
+        f"{name} of {output} = {gain:g}: {pump} {'fills' if acts > 0 else 'empties'} {tank}, and"
+        " this sign drives its level away from the setpoint: change the sign"
+    )
 
 
 def _acting(part):

@@ -254,6 +254,14 @@ def _varies(problem: Problem) -> bool:
     return stated or any(run.key is not None for run in problem.runs)
 
 
+def _setting(case, objective, limits, distributions, safety_filter):
+    """Return the Setting of a default answer, before a filter is taken for levels near a limit."""
+    if safety_filter and not case.safety:  # asked for here: the case as given has none
+        case = case.without_safety_filter()
+    setting = setting_of(case, objective, limits, distributions)
+    return setting.without_filter() if safety_filter is False else setting
+
+
 def _default_answer(
     case: Case,
     options: Options,
@@ -276,11 +284,7 @@ def _default_answer(
             "validation = 0: the default answer is judged on at least 1 plant (the nominal optimum"
             " needs none)"
         )
-    if safety_filter and not case.safety:  # asked for here: the case as given has none
-        case = case.without_safety_filter()
-    setting = setting_of(case, objective, limits, distributions)
-    if safety_filter is False:
-        setting = setting.without_filter()
+    setting = _setting(case, objective, limits, distributions, safety_filter)
     few = {"tolerance": TOLERANCE, "agree": AGREE, "lower_by": AGREE}
     plan = Plan.of(options, "auto", seed, engine=engine, polish=False, coarse=False, **few)
     gains, reasons = _gains_of_rules(setting.case)
