@@ -6,6 +6,7 @@ import io
 import re
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -130,3 +131,23 @@ def test_a_line_is_overwritten_on_a_terminal_and_elsewhere_printed_at_each_tenth
     screen, file = printed
     assert screen.count("\r") == 100 and screen.count("\n") == 1
     assert file.splitlines() == [f"run {done}/100" for done in range(10, 101, 10)]
+
+
+def test_a_phase_is_shown_after_a_while_and_erased_before_anything_else(monkeypatch):
+    wrote = []
+    monkeypatch.setattr(terminal.os, "write", lambda fd, data: wrote.append(data) or len(data))
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    phase = terminal.Phase()
+    phase.show("importing")
+    assert phase.clock is None  # --quiet
+    phase.quiet, phase.DELAY = False, 0.0
+    monkeypatch.setattr(terminal, "phase", phase)
+    phase.show("importing")
+    deadline = time.monotonic() + 10.0
+    while not phase.there and time.monotonic() < deadline:
+        time.sleep(0.01)
+    terminal.Forgiving(2).write(b"a note")
+    shown, erased, note = wrote[0], *wrote[-2:]
+    assert shown.startswith(b"\rimporting") and erased == b"\r\033[K" and note == b"a note"
+    terminal.end_lines()
+    assert phase.clock is None and not phase.there

@@ -53,6 +53,8 @@ def _command(argv):
 
         print(jaxtank.__version__)
         return 0
+    terminal.phase.quiet = getattr(args, "quiet", True)
+    terminal.phase.show("importing")
     args.line = shlex.join(["jaxtank", *(sys.argv[1:] if argv is None else argv)])
     if argv is None and COMMANDS[args.command].compiles:
         _keep_programs(args)

@@ -4,7 +4,7 @@ import sys
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import printable
-from tuning.cli.terminal import coloured
+from tuning.cli.terminal import coloured, end_lines, phase
 
 FILTER = "safety_filter."
 
@@ -27,6 +27,8 @@ def open_case(args):
     use_float64()
     from jaxtank import rig
     from jaxtank.loop import tank_bottom
+
+    phase.show("opening the case")
 
     opened = rig.open_case(args.case)
     args.values = rig.by_rig_name(opened.loop, args.values)
@@ -190,13 +192,14 @@ def print_result(args, payload, text, done=""):
     `done` : the sentence of the verdict of a command that judges nothing.
     """
     if not args.json:
-        print(text())
-        return
-    from tuning.report import tables, verdict
+        shown = text()
+    else:
+        from tuning.report import tables, verdict
 
-    if done:
-        payload = {**payload, "verdict": verdict.outcome(done).to_json()}
-    print(tables.dumps(payload))
+        more = {"verdict": verdict.outcome(done).to_json()} if done else {}
+        shown = tables.dumps({**payload, **more})
+    end_lines()
+    print(shown)
 
 
 def printed(report):
@@ -209,6 +212,8 @@ def printed(report):
 def finish(result, args):
     """Write a result to --out and print it; return the paths that were written."""
     written = []
+    if args.out:
+        phase.show("writing results and pictures")
     try:
         written = result.save(args.out, args.line) if args.out else []
     finally:  # a full disk costs the files, not the printed result; and the checkpoint is kept

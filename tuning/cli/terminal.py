@@ -31,6 +31,7 @@ class Forgiving(io.RawIOBase):
 
     def write(self, data):
         """Write `data`; return the number of bytes taken, all of them where none can be written."""
+        phase.erase()
         try:
             return os.write(self.descriptor, data)
         except OSError:
@@ -69,12 +70,60 @@ def coloured(stream):
     return stream.isatty() and not plain
 
 
+class Phase:
+    """What goes on before, between and after lines of progress, on a terminal: once it has taken
+    DELAY it is shown with its seconds, and it is erased when anything else is written.
+    """
+
+    DELAY = 0.7  # s
+
+    def __init__(self):
+        self.quiet, self.words, self.since = True, "", 0.0
+        self.there, self.ended = False, threading.Event()
+        self.clock: threading.Thread | None = None
+
+    def show(self, words):
+        """Show `words` from DELAY on, until the next phase or the end."""
+        if self.quiet or not sys.stderr.isatty():
+            return
+        self.words, self.since = words, time.monotonic()
+        if self.clock is None:
+            self.ended.clear()
+            self.clock = threading.Thread(target=self._tick, daemon=True)
+            self.clock.start()
+
+    def _tick(self):
+        while not self.ended.wait(0.35):
+            seconds = time.monotonic() - self.since
+            if seconds > self.DELAY:
+                text = f"{self.words}, {seconds:.0f} s"
+                self.there = True
+                os.write(2, f"\r{text[:78]:<78}".encode())
+
+    def erase(self):
+        """Remove what is shown."""
+        if self.there:
+            self.there = False
+            os.write(2, b"\r\033[K")
+
+    def end(self):
+        """Show nothing any more."""
+        if self.clock is not None:
+            self.ended.set()
+            self.clock.join()
+            self.clock = None
+            self.erase()
+
+
+phase = Phase()
+
 OPEN: set["Line"] = set()
 """Lines of progress that have not ended."""
 
 
 def end_lines():
-    """End every line of progress, as before an error is printed."""
+    """End every line of progress, as before a result or an error is printed."""
+    phase.end()
     for line in list(OPEN):
         line.end()
 
@@ -88,7 +137,7 @@ class Line:
         self.quiet, self.terminal = quiet, sys.stderr.isatty()
         self.words, self.since, self.last = "", 0.0, 0
         self.ended = threading.Event()
-        self.clock = None
+        self.clock: threading.Thread | None = None
 
     def show(self, words):
         """Print `words`; on a terminal in place of the line before."""
@@ -97,6 +146,7 @@ class Line:
         if not self.terminal:
             print(words, file=sys.stderr, flush=True)
             return
+        phase.end()
         self.words, self.since = words, time.monotonic()
         self._print()
         if self.clock is None:

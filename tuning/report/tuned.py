@@ -149,7 +149,9 @@ def _gives(result):
         words.append(f"limits hold on {held[0]} -> {held[1]} of {answer.after.samples} plants")
     elif rows := worst_of_scenarios(result.constraints):
         held = sum(row["margin"] >= 0.0 for row in rows)
-        words.append(f"{held} of {len(rows)} limits hold")
+        words.append(f"{held} of {len(rows)} limits hold in the runs of the search")
+        judged = verdicts.of_tuning(result).plants
+        words += [judged.words] if judged else []
     return words
 
 

@@ -13,7 +13,7 @@ from tuning.cli.commands.identification import DATA, read_logs
 from tuning.cli.completion import titles
 from tuning.cli.options import CASE, COMMON, RUN, Command, Option
 from tuning.cli.steps import note, open_case, print_result, printed, report_written
-from tuning.cli.terminal import Line
+from tuning.cli.terminal import Line, end_lines, phase
 
 
 def list_cases(args):
@@ -91,6 +91,7 @@ def simulate(args):
     sentences = halving_warnings(case.loop, case.clock, key)
     measures = dict(reported.run_measures(case.loop, case.clock, key))
     line.end()
+    phase.show("checking the run")
     for sentence in [*sentences, *_notes_on_run(case, measures, key)]:
         note(args, sentence)
     plateaus = stability_margins(case.loop, case.clock) if args.margins else None
@@ -103,6 +104,7 @@ def simulate(args):
         page = _with_data(case, log, key, payload, page)
     written = []
     if args.out:
+        phase.show("drawing the film" if args.gif else "writing results and pictures")
         trajectory = simulated.run_for_people(case, key)
         beside = second and (second, simulated.run_for_people(second, key_of(second)))
         columns = args.columns and int(args.columns)
@@ -171,6 +173,7 @@ def _simulate_together(args):
     line.compiling("the simulations", 5 * len(cases))
     runs = together.run_together(cases, args.seed)
     line.end()
+    phase.show("writing results and pictures")
     written = together.save(runs, args.out, args.seed, args.line) if args.out else []
     payload = together.json_of(runs, args.seed)
     print_result(args, payload, lambda: printed(together.report(runs)))
@@ -247,6 +250,7 @@ def _print_source(args, payload, text, done):
     if args.json:
         print_result(args, payload, str, done)
     else:
+        end_lines()
         sys.stdout.write(text)
 
 

@@ -19,7 +19,7 @@ from tuning.cli.steps import (
     report_unreachable,
     report_written,
 )
-from tuning.cli.terminal import Line
+from tuning.cli.terminal import Line, phase
 
 LONGEST = 1e7
 """Longest planned experiment [s]: four months."""
@@ -195,6 +195,7 @@ def learn(args):
     line.end()
     last, written = list(parts.values())[-1], []
     if args.out:
+        phase.show("writing results and pictures")
         written = fit.save(f"{args.out}/identified", args.line)
         written = last.save(args.out, args.line) if last is not fit else written
     payload = {"case": case.name, "achieved": rows}
