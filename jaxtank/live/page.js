@@ -179,6 +179,7 @@ function changed(own = false) {
   if (!own && tuneNow.stop) tuneNow.stop("Tuning stopped: the loop was changed");
   else if (!own && worker) stop(); // plants about other values
   noteFilter();
+  if (!own && say.about) say("");
   if (bands) {
     bands = null;
     makeLegend();
@@ -290,8 +291,10 @@ function fill(host, caption, heads, rows) {
   });
 }
 
-function say(text) {
+// about: whether it is about this run or its plants, and goes with them
+function say(text, about = false) {
   $("message").textContent = text;
+  say.about = about;
 }
 
 // --- sliders ----------------------------------------------------------------------------------
@@ -592,7 +595,7 @@ function tuneNow(plants = null) {
       const ends = found.ends.map((name) => `; ${name} ends on its range`).join("");
       const noise = searched > 1 ? " with noise and a price on input changes" : "";
       const guard = state.filter && !filtered ? ", safety filter switched on" : "";
-      say(`Tuned${on}${noise}${guard} in ${found.iterations} iterations (${found.status})${holds}; ${errors}${ends}.${alone}`);
+      say(`Tuned${on}${noise}${guard} in ${found.iterations} iterations (${found.status})${holds}; ${errors}${ends}.${alone}`, true);
       $("undo").hidden = false;
       $("undo").onclick = () => {
         state.values = before;
@@ -601,7 +604,8 @@ function tuneNow(plants = null) {
         refresh();
         say("The values before tuning are set again.");
       };
-      const { values, objective, violation, filter } = found;
+      const { objective, violation, filter } = found;
+      const values = Object.fromEntries(names.map((name) => [name, found.values[name]]));
       finish.resolve({ values, objective, violation, filter, holds: kept, of: count, ends: found.ends });
     },
     failed({ text }) {
@@ -630,7 +634,7 @@ function manyPlants(spoken = true) {
       bands = { ...found, words: keptWords(found) };
       const kept = info.limits.length ? `${found.kept} of ${found.count} plants keep every limit` :
         `${found.count} plants simulated`;
-      if (spoken) say(`${kept}${found.broken ? `; ${found.broken} diverged` : ""}. The band holds 90 % of them at each time.`);
+      if (spoken) say(`${kept}${found.broken ? `; ${found.broken} diverged` : ""}. The band holds 90 % of them at each time.`, true);
       makeLegend();
       show();
     },

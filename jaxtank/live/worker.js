@@ -63,8 +63,9 @@ function search(message) {
     ...message, values: { ...values, ...at }, count: judged, seed: seed + UNSEEN, noises: NOISES, filter: guarded, brief,
   });
   // from several starts on few plants, then from the best end on all
-  let found = several ? from(values, { plants: plants.slice(0, FEW) }) : {};
-  found = from({ ...values, ...found.values }, several ? { plants, starts: 1 } : { plants });
+  const first = several ? from(values, { plants: plants.slice(0, FEW) }) : { iterations: 0 };
+  const found = from({ ...values, ...first.values }, several ? { plants, starts: 1 } : { plants });
+  found.iterations += first.iterations;
   const before = on({}, filter, true).error;
   const needed = guard && (filter || on(found.values, false, true).kept < judged);
   return { ...found, before, filter: needed, plants: on(found.values, needed) };

@@ -33,7 +33,7 @@ LINES = {
     "sensitivity": "sensitivity cascaded/pi --out {out}",
     "attack": "attack cascaded/pi --starts 2 --iterations 3 --out {out}",
     "compare": "compare calofir --out {out}",
-    "figure": "figure calofir/5 --out {out}",
+    "figure": "figure calofir/3 --out {out}",
     "identify": "identify cascaded/pi --data {log} --out {out}",
     "predict": "predict cascaded/pi --data {log}",
     "learn": "learn cascaded/pi --data {log}",
