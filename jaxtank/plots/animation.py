@@ -205,7 +205,7 @@ class _Stage:
         most, tanks = self.spilled.most, self.where.boxes
         area, unit = np.asarray(loop.plant.area, dtype=float), self.spilled.unit
         gone = self.spilled.simulated
-        above = lambda i: Lost(ax, tanks[i], unit) if gone else Stack(ax, tanks[i], area[i])
+        above = lambda i: Lost(ax, tanks[i], unit) if gone else Stack(ax, tanks[i], float(area[i]))
         self.stacks = {i: above(i) for i in np.flatnonzero(most > 0)}
         headroom(ax, [(stack, most[i]) for i, stack in self.stacks.items()])
 

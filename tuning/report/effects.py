@@ -127,12 +127,6 @@ def report(result):
         f" {result.failed} not finite, seed {result.seed}, {result.wall_s:.1f} s"
     )
     facts = [
-        (f"{c.label} is most sensitive to", result.parameters[result.order(c)[0]])
-        for c in result.columns
-        if not c.empty
-    ]
-    facts = [
-        *facts[:1],
         ("parameters", len(result.parameters)),
         ("runs", result.runs),
         ("time", f"{result.wall_s:.1f} s"),

@@ -135,7 +135,7 @@ def _outside(attack):
 
 def report(attack):
     """Return the Report of an Attack."""
-    worst, case, unit = attack.worst, attack.case, attack.case.loop.units[0]
+    worst, case = attack.worst, attack.case
     head = (
         f"{case.name}: attack from {count(attack.draws, 'draw')}, ascent of"
         f" {count(attack.starts, 'start')} for each tank in {len(attack.history) - 1} steps (seed"
@@ -152,11 +152,7 @@ def report(attack):
         case.name,
         "attack",
         verdict_of(attack),
-        [
-            ("highest level", f"{worst.level:.5g} {unit} ({name})"),
-            ("its limit", Value(worst.limit, unit=unit)),
-            ("time", f"{attack.wall_s:.1f} s"),
-        ],
+        [("time", f"{attack.wall_s:.1f} s")],
         [
             Text([head, *_scope(attack)]),
             _levels(attack),

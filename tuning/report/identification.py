@@ -349,10 +349,6 @@ def report(fit, page=False):
         ("parameters with an interval", f"{certain} of {len(fit.parameters)}"),
         ("samples", sum(log.samples for log in fit.estimation.logs)),
     ]
-    quality = zip(fit.channels, fit.quality["rmse"], fit.quality["nrmse_percent"])
-    for (name, unit), rmse, share in quality:
-        percent = "" if share is None else f" ({share:.1f} %)"
-        facts.append((f"residual of {name}", f"{rmse:.3g} {unit}{percent}"))
     rig, why = rig_text(fit.identified) if page and fit.identifiable else (None, None)
     simulations = sum(s["evaluations"] for s in fit.starts)
     more = [] if fit.status == "interrupted" else _structure(fit)[1:]

@@ -22,12 +22,10 @@ from tuning.report.tables import (
     Table,
     Value,
     clean,
-    entries,
     measure_table,
     measures_json,
     reasons,
     undefined,
-    unit_text,
     units,
 )
 
@@ -102,13 +100,7 @@ def _diagnosis(diagnosis):
 def report(case, values, plateaus=None, every=False, diagnosis=None):
     """Return the Report of a run with the measures `values`; `every`: all of them on a terminal."""
     loop, limits = case.loop, verdicts.limit_rows(case, values)
-    unit = lambda name: unit_text(name, loop.units, loop.plant)
-    facts = [
-        (name, f"{entries(name, values[name], loop.plant)} {unit(name)}".strip())
-        for name in case.objective
-        if name in values
-    ]
-    facts += [("length", f"{case.clock.duration:g} s"), ("sampled every", f"{case.clock.dt:g} s")]
+    facts = [("length", f"{case.clock.duration:g} s"), ("sampled every", f"{case.clock.dt:g} s")]
     sections = [Live(case), Text([case.title], on="terminal")]
     if limits:
         table = advice.limits_of(limits if len(limits) <= MANY else limits[:WORST])

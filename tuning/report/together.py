@@ -22,7 +22,7 @@ from tuning.report.advice import GIVEN, Advice, amount, of_nominal_plant
 from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
 from tuning.report.simulated import json_of_run, run_for_people
-from tuning.report.tables import Table, Value, entries, undefined
+from tuning.report.tables import Table, entries, undefined
 
 MOST = 6
 """Number of cases in one picture: each has a different colour."""
@@ -106,7 +106,7 @@ def _equal(a, b):
 
 def report(runs: list[Run]) -> Report:
     """Return the Report of several runs: measures, a column for each case, and what differs."""
-    units, words, errors = runs[0].case.loop.units, [], []
+    units, words = runs[0].case.loop.units, []
     each = {run.case.name: verdicts.of_run(run.case, run.measures) for run in runs}
     listed = [m for m in ms.MEASURES if all(m in r.measures for r in runs) and m not in ms.times()]
     rows = [
@@ -119,15 +119,12 @@ def report(runs: list[Run]) -> Report:
         ]
         if run.differs:
             words.append(f"{run.case.name} has its own {', '.join(run.differs)}")
-        if "rms_error_total" in run.measures:
-            error = Value(run.measures["rms_error_total"], 4, units[0])
-            errors.append((run.case.name, f"{error} rms error"))
     shared = "The disturbances, faults and sensor noise of the first case are used for all."
     return Report(
         f"{len(runs)} cases",
         "",
         verdict_of(runs),
-        errors,
+        (),
         [
             Text([f"{name}: {verdict}" for name, verdict in each.items()], items=True),
             Text([shared]),

@@ -104,7 +104,11 @@ def report(result, page=False):
         result.tuned.name,
         "tuned",
         verdicts.of_tuning(result),
-        _facts(result),
+        [
+            ("gains tuned", sum(p["exercised"] for p in result.parameters.values())),
+            ("simulations", result.evaluations["simulations"]),
+            ("time", f"{result.wall_s:.1f} s"),
+        ],
         [
             Live(result),
             Text([_effort(result)], on="terminal"),
@@ -188,41 +192,6 @@ def cost_unit(result):
     # default answer: unit of the squared error, and of the price on input changes
     unit = result.answer and result.answer.setting.cost_unit
     return unit or objective_unit(result.objective["terms"], result.tuned.loop.units)
-
-
-def _facts(result):
-    """Return (name, value) of the facts at the top of the page."""
-    answer, limits, costs = result.answer, result.constraints, _costs(result)
-    before, after = (result.objective[side] for side in SIDES)
-    broken = sum(c["margin"] < 0 for c in limits)
-    hold = ("limits", f"{len(limits) - broken} of {len(limits)} hold" if limits else "none")
-    shares = list(result.validation["limits_held"].values()) if result.validation else []
-    if answer and limits and None not in shares:
-        shares = Value([100 * share for share in shares], 3, "%", " % -> ")
-        hold = ("plants that keep every limit", shares)
-    elif np.isfinite(before) and before and not broken:
-        costs.append(("change", f"{100 * (after / before - 1):+.3g} %"))
-    return [
-        *costs,
-        hold,
-        ("gains tuned", sum(p["exercised"] for p in result.parameters.values())),
-        ("simulations", result.evaluations["simulations"]),
-        ("time", f"{result.wall_s:.1f} s"),
-    ]
-
-
-def _costs(result) -> list[Any]:
-    """[(name, Value)] of the objective, or of a default answer the errors in the levels' unit."""
-    answer = result.answer
-    if answer and not answer.setting.own_objective and answer.after is not None:
-        join = {"digits": 3, "unit": answer.setting.case.loop.units[0], "between": " -> "}
-        means = [_mean(s.error, s).value for s in (answer.before, answer.after)]
-        return [
-            (f"error, mean of {answer.after.samples} plants", Value(means, **join)),
-            ("error, nominal plant", Value(list(answer.nominal.values()), **join)),
-        ]
-    unit = cost_unit(result).replace("-", "")
-    return [(f"objective {side}", Value(result.objective[side], unit=unit)) for side in SIDES]
 
 
 def of_answer(answer, result=None):

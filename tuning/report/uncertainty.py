@@ -132,7 +132,7 @@ def report(ensemble):
         ensemble.case.name,
         "uncertainty",
         verdict_of(ensemble),
-        [*_facts(ensemble, violations), ("runs that diverged", diverged), ("time", time)],
+        [("draws", ensemble.samples), ("runs that diverged", diverged), ("time", time)],
         sections,
         ensemble.case.title,
         advice=advice_of(ensemble),
@@ -191,20 +191,6 @@ def verdict_of(ensemble):
     if not parts:
         return verdicts.outcome(f"{count(samples, 'draw')}, no limits to judge them by")
     return verdicts.Verdict(**parts)
-
-
-def _facts(ensemble, violations):
-    """Return (name, value) of the facts at the top of the page."""
-    facts, error = [("draws", ensemble.samples)], ensemble.summary().get("rms_error_total")
-    if ensemble.promise is not None:
-        facts.append(("any limit broken", Value(100 * ensemble.promise.probability, 3, "%")))
-    if violations:
-        worst = max(v["probability"] for v in violations)
-        facts.append(("the limit most often broken", Value(100 * worst, 3, "%")))
-    if error is not None and error["p50"] is not None:
-        unit = ms.unit("rms_error_total", ensemble.case.loop.units)
-        facts.append(("median rms_error_total", Value(error["p50"], 4, unit)))
-    return facts
 
 
 def _measure_table(ensemble):
