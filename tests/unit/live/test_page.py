@@ -633,6 +633,7 @@ def test_the_frame_of_a_report_has_the_limits_of_the_command(browser, tmp_path):
     with contextlib.closing(browser.new_context()) as context:
         report = context.new_page()
         report.goto((tmp_path / "tuned" / "report.html").as_uri())
+        report.click("details.screen summary")
         report.locator("iframe.live").scroll_into_view_if_needed()
         frame = report.frame_locator("iframe.live")
         frame.locator("#margins table").wait_for(timeout=60_000)
