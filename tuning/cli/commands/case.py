@@ -104,7 +104,7 @@ def simulate(args):
         page = _with_data(case, log, key, payload, page)
     written = []
     if args.out:
-        phase.show("drawing the film" if args.gif else "writing results and pictures")
+        phase.show("writing results and pictures")
         trajectory = simulated.run_for_people(case, key)
         beside = second and (second, simulated.run_for_people(second, key_of(second)))
         columns = args.columns and int(args.columns)
