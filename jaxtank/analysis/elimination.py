@@ -50,6 +50,12 @@ def normal_matrix(H, G, weight):
     return H + (weighted_squares(G, weight) if many else (G.T * weight) @ G)
 
 
+def times(A, x):
+    """Return A x (rows,) without a product of matrices, as derivatives in many directions are."""
+    return jnp.sum(A * x, axis=-1)
+
+
+@jax.custom_jvp
 @jax.jit
 def weighted_squares(G, weight):
     """Return G' diag(weight) G (n, n) for G (rows, n) and weight (rows,), row by row."""
@@ -62,6 +68,19 @@ def weighted_squares(G, weight):
         return jax.lax.dynamic_update_index_in_dim(product, new, j, 0)
 
     return jax.lax.fori_loop(0, G.shape[1], row, product)
+
+
+@weighted_squares.defjvp
+def _weighted_squares_slope(primals, tangents):
+    (G, weight), (dG, dweight) = primals, tangents
+    moved = weight[:, None] * dG + (0.5 * dweight)[:, None] * G
+    # a product of matrices as a sum of outer products, each of which is a loop over entries
+    half = jax.lax.scan(
+        lambda half, rows: (half + rows[0][:, None] * rows[1], None),
+        jnp.zeros((G.shape[1], G.shape[1]), G.dtype),
+        (moved, G),
+    )[0]
+    return weighted_squares(G, weight), half + half.T
 
 
 def factor(A):

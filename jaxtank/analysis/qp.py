@@ -53,26 +53,10 @@ class Point(NamedTuple):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(5,))
-def solve(H, f, G, l, u, iterations=MOST, needed=True):
-    """Return x that minimises 1/2 x'Hx + f'x within l <= G x <= u; differentiable in all five.
-
-    needed: False (of one programme of a batch) saves the iterations, and x is of no use.
-    """
-    unit, inside = _scaled(H, f, G, l, u)
-    return unit * interior_point(*inside, iterations, needed).x
-
-
-@jax.custom_jvp
-def minimum(H, f):
-    """Return x that minimises 1/2 x'Hx + f'x."""
-    return -substitute(factor(H), f)
-
-
-@minimum.defjvp
-def _minimum_slope(primals, tangents):
-    (H, f), (dH, df) = primals, tangents
-    x = minimum(H, f)
-    return x, -_solver(H)(dH @ x + df)
+def solve(H, f, G, l, u, iterations=MOST):
+    """Return x that minimises 1/2 x'Hx + f'x within l <= G x <= u; differentiable in all five."""
+    unit, inside = scaled(H, f, G, l, u)
+    return unit * interior_point(*inside, iterations).x
 
 
 def _solver(A):
@@ -83,41 +67,7 @@ def _solver(A):
     )
 
 
-def solve_soft(H, f, A, l, u, G, room, penalty, span):
-    """Return (x (n,), s (k,)) of a programme with soft limits, which is always feasible:
-
-        min 1/2 x'Hx + f'x + penalty sum_i (s_i + 50 s_i^2 / span),
-        l <= A x <= u,  G_ji'x <= room_ji + s_i,  s_i >= 0
-
-    with G (samples, k, n), room (samples, k) and s, room far below span. Where the minimum without
-    limits is within them it is taken, which most programmes of a loop spend no iteration on.
-    """
-    n, (samples, k) = f.shape[0], room.shape
-    free = minimum(H, f)
-    reached = A @ free
-    within = jnp.all((l <= reached) & (reached <= u)) & jnp.all(G @ free <= room)
-
-    def limited():
-        none, eye = jnp.zeros((n, k)), jnp.eye(k)
-        curvature = 100.0 / span * penalty * eye
-        rows = jnp.concatenate([G, jnp.broadcast_to(-eye, (samples, k, k))], axis=2)
-        far, high = jnp.full(samples * k, span), jnp.full(k, span)
-        hard = jnp.concatenate([jnp.pad(A, ((0, 0), (0, k))), jnp.eye(k, n + k, n)])
-        z = solve(
-            jnp.block([[H, none], [none.T, curvature]]),
-            jnp.concatenate([f, jnp.full(k, penalty)]),
-            jnp.concatenate([hard, rows.reshape(-1, n + k)]),
-            jnp.concatenate([l, 0.0 * high, -far]),
-            jnp.concatenate([u, high, room.reshape(-1)]),
-            needed=~within,
-        )
-        return z[:n], z[n:]
-
-    # of a batch both branches run, with no iteration where `within`
-    return jax.lax.cond(within, lambda: (free, jnp.zeros(k, f.dtype)), limited)
-
-
-def _scaled(H, f, G, l, u):
+def scaled(H, f, G, l, u):
     """(unit (n,), the programme of z = x / unit): with a Hessian of unit diagonal, rows of length
     1, and a z of the order of 1, for what the iterates begin and end with are plain numbers. The
     unit of x is the largest of the narrowest row, of the slope at 0, and of how far from there the
@@ -142,9 +92,9 @@ def _scaled(H, f, G, l, u):
 
 @solve.defjvp
 def _slope(iterations, primals, tangents):
-    (unit, data), (_, moved) = jax.jvp(_scaled, primals[:5], tangents[:5])
+    (unit, data), (_, moved) = jax.jvp(scaled, primals[:5], tangents[:5])
     inside = jax.lax.stop_gradient(data)
-    point = interior_point(*inside, iterations=iterations, needed=primals[5])
+    point = interior_point(*inside, iterations=iterations)
     point = _held(point, *data)
     return unit * point.x, unit * _implicit(point, data, moved)
 
@@ -200,10 +150,8 @@ def _implicit(point, data, moved):
     )[0][0]
 
 
-def interior_point(H, f, G, l, u, iterations=MOST, needed=True):
-    """Return the `Point` at which the iterates converge, or the last of `iterations`; the first
-    unless `needed`.
-    """
+def interior_point(H, f, G, l, u, iterations=MOST):
+    """Return the `Point` at which the iterates converge, or the last of `iterations`."""
     x = jnp.zeros_like(f)
     multipliers = jnp.full(G.shape[0], 0.1, f.dtype)
     rounding = 64.0 * jnp.finfo(f.dtype).eps * jnp.maximum(1.0, jnp.maximum(jnp.abs(u), jnp.abs(l)))
@@ -238,8 +186,7 @@ def interior_point(H, f, G, l, u, iterations=MOST, needed=True):
             lambda a, b: jnp.where(good, b, a), p, new
         )
 
-    first = jnp.int32(0) if needed is True else jnp.where(needed, 0, iterations).astype(jnp.int32)
-    return jax.lax.while_loop(under_way, advance, (first, start))[1]
+    return jax.lax.while_loop(under_way, advance, (jnp.int32(0), start))[1]
 
 
 def _residuals(p, H, f, G, l, u):

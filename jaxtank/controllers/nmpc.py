@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.analysis import qp
-from jaxtank.analysis.elimination import weighted_squares
+from jaxtank.analysis.active_set import solve_soft
+from jaxtank.analysis.elimination import times, weighted_squares
 from jaxtank.controllers.base import Controller
 from jaxtank.core.checks import check_order
 from jaxtank.core.clock import INTEGRATORS, Clock
@@ -165,7 +165,7 @@ class NMPC(Controller):
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         later = self.places + tick.dt / self.period
-        plan, r = state._replace(knots=self.blend(later) @ state.knots), self.setpoints(tick)
+        plan, r = state._replace(knots=times(self.blend(later), state.knots)), self.setpoints(tick)
         for _ in range(self.iterations):
             plan = self._improved(plan, tick, estimate, r)
         return materialised(tuple(plan.knots[j] for j in range(self.model.pumps))), plan
@@ -173,21 +173,21 @@ class NMPC(Controller):
     def _improved(self, plan, tick, estimate, r):
         """The plan after one quadratic programme for setpoints r (N, outputs)."""
         N, m, basis = self.N, self.model.pumps, self.blend(np.arange(self.N))
-        inputs = basis @ plan.knots
+        inputs = times(basis, plan.knots)
         x, S = self._predict(tick, estimate, inputs.reshape(N, m), basis.reshape(N, m, -1))
-        places = np.array(self.model.outputs)
+        outputs = lambda v: jnp.stack([v[:, i] for i in self.model.outputs], axis=1)
         weight = jnp.ones(N).at[N - 1].set(self.terminal)[:, None] * self.q
-        Y, e = S[:, places].reshape(-1, basis.shape[1]), (x[:, places] - r).reshape(-1)
+        Y, e = outputs(S).reshape(-1, basis.shape[1]), (outputs(x) - r).reshape(-1)
         moves = jnp.concatenate([basis[:m], basis[m:] - basis[:-m]])
         du = jnp.concatenate([inputs[:m] - plan.applied, inputs[m:] - inputs[:-m]])
         effort = jnp.tile(jnp.asarray(self.r_w), N)
         H = weighted_squares(moves, effort) + weighted_squares(Y, weight.reshape(-1))
-        f = (weight.reshape(-1) * e) @ Y + (effort * du) @ moves
+        f = times(Y.T, weight.reshape(-1) * e) + times(moves.T, effort * du)
         rows, low, high = self._input_rows(plan, tick.dt)
         limit = jnp.asarray(self.limit)
         size_of = jax.lax.stop_gradient(jnp.maximum(jnp.abs(x).max(), _finite(limit).max()))
         room = jnp.minimum(limit - x, SPAN * size_of)
-        change, slack = qp.solve_soft(
+        change, slack = solve_soft(
             2.0 * H, 2.0 * f, rows, low, high, S, room, self.penalty, SPAN * size_of
         )
         return plan._replace(knots=plan.knots + change, slack=jnp.max(slack))
@@ -199,26 +199,32 @@ class NMPC(Controller):
         model, d = self.model, estimate.d
 
         def onward(x, u):
-            levels, area = tuple(x[i] for i in range(model.tanks)), None
+            levels, area = tuple(x[i] for i in range(n)), None
             if d:
                 area = sections(model, levels)
             inflow = None if area is None else tuple(a * v for a, v in zip(area, d))
-            after = advance(
-                model, self.integrator, tick.t, levels, tuple(u), inflow, self.period, 1
-            ).x
+            integrated = model, self.integrator, tick.t, levels, tuple(u), inflow
+            after = advance(*integrated, self.period, 1).x
             if d and area is None:  # a plant that counts in no volumes
                 after = [h + self.period * v for h, v in zip(after, d)]
             return jnp.stack(list(after))
 
-        def sample(state, now):
-            (x, S), (u, b) = state, now
-            slope = jax.vmap(lambda s, w: jax.jvp(onward, (x, u), (s, w))[1], 1, 1)
-            after = onward(x, u), slope(S, b)
-            return after, after
+        def slopes(x, u):
+            along = lambda s, w: jax.jvp(onward, (x, u), (s, w))[1]
+            return jax.vmap(along)(unit[:, :n], unit[:, n:])
 
+        def grow(S, now):
+            slope, b = now  # (n + m, n), (m, K m)
+            S = sum(along[:, None] * row for along, row in zip(slope, [*S, *b]))
+            return S, S
+
+        n, unit = model.tanks, jnp.eye(model.tanks + model.pumps)
         x = jnp.stack(list(estimate.x))
-        start = x, jnp.zeros((x.shape[0], basis.shape[2]), x.dtype)
-        return jax.lax.scan(sample, start, (inputs, basis))[1]
+        last, starts = jax.lax.scan(lambda x, u: (onward(x, u), x), x, inputs)
+        # of all samples at once: the vectors are long, and the levels are known
+        each = jax.vmap(slopes, in_axes=1)(starts.T, inputs.T)
+        S = jax.lax.scan(grow, jnp.zeros((n, basis.shape[2]), x.dtype), (each, basis))[1]
+        return jnp.concatenate([starts[1:], last[None]]), S
 
     def _input_rows(self, plan, dt):
         """(A, low, high) of low <= A change <= high: limits of the knots, and of their rates."""
@@ -241,6 +247,10 @@ class NMPC(Controller):
 
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return state._replace(applied=jnp.stack(list(applied)))
+
+    @property
+    def alone(self) -> bool:
+        return True  # each has as many iterations as its own samples need
 
     @property
     def limits_levels(self) -> bool:

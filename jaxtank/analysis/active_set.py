@@ -1,0 +1,219 @@
+"""Small quadratic programmes whose minimum is often free of limits, by an active-set method.
+
+    min_x 1/2 x'Hx + f'x    subject to    l <= G x <= u
+
+The dual method of Goldfarb and Idnani (Mathematical Programming 27, 1983) in its first form: it
+starts from the minimum without rows and adds the row that is violated most, until none is. An
+iteration costs a product with G and six with a matrix of the variables. Its derivatives are those
+of the optimality conditions with the same rows: one-sided where a row begins to bind.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.analysis.elimination import times
+from jaxtank.analysis.qp import scaled
+
+TOLERANCE = 1e-9  # violation of a row at which it is added, in the scaled problem
+DEPENDENT = 1e-10  # share of a row that the rows of the face leave free, below which it is 0
+PASSES = 5  # largest number of iterations for each variable
+
+
+class Face(NamedTuple):
+    """The rows that bind, one in each of n slots, and the minimum among the x that keep them."""
+
+    x: Any  # (n,)
+    multiplier: Any  # (n,)
+    row: Any  # (n,) its number
+    side: Any  # (n,) 1 if its lower end binds, -1 if its upper end does, 0 in an empty slot
+    inverse: Any  # (n, n) of H, within the face
+    image: Any  # (n, n) image[i]: the change of x that changes row i alone, at the least cost
+
+
+class Entry(NamedTuple):
+    """The row that is being added."""
+
+    row: Any
+    side: Any  # 0: there is none
+    multiplier: Any
+
+
+@jax.jit
+def solve_soft(H, f, A, l, u, G, room, penalty, span):
+    """Return (x (n,), s (k,)) of a programme with soft limits, which is always feasible:
+
+        min 1/2 x'Hx + f'x + penalty sum_i (s_i + 50 s_i^2 / span),
+        l <= A x <= u,  G_ji'x <= room_ji + s_i,  s_i >= 0
+
+    with G (samples, k, n), room (samples, k) and s, room far below span. Where the minimum without
+    limits is within them it is taken: most programmes of a loop end there.
+    """
+    n, (samples, k) = f.shape[0], room.shape
+    fixed = jax.lax.stop_gradient(H)
+    each = jax.lax.rsqrt(jnp.diagonal(fixed))
+    inverse = _inverse(fixed * jnp.outer(each, each)) * jnp.outer(each, each)
+
+    def unlimited(_, right):
+        x = times(inverse, right)
+        return x + times(inverse, right - times(fixed, x))
+
+    free = jax.lax.custom_linear_solve(lambda x: times(H, x), -f, unlimited, symmetric=True)
+    reached = times(A, free)
+    within = jnp.all((l <= reached) & (reached <= u)) & jnp.all(times(G, free) <= room)
+
+    def limited():
+        none, eye = jnp.zeros((n, k)), jnp.eye(k)
+        rows = jnp.concatenate([G, jnp.broadcast_to(-eye, (samples, k, k))], axis=2)
+        hard = jnp.concatenate([jnp.eye(k, n + k, n), jnp.pad(A, ((0, 0), (0, k)))])
+        far, high = jnp.full(samples * k, span), jnp.full(k, span)
+        unit, programme = scaled(
+            jnp.block([[H, none], [none.T, 100.0 / span * penalty * eye]]),
+            jnp.concatenate([f, jnp.full(k, penalty)]),
+            jnp.concatenate([hard, rows.reshape(-1, n + k)]),
+            jnp.concatenate([0.0 * high, l, -far]),
+            jnp.concatenate([high, u, room.reshape(-1)]),
+        )
+        z = unit * minimum(*programme, k).x
+        return z[:n], z[n:]
+
+    return jax.lax.cond(within, lambda: (free, jnp.zeros(k, f.dtype)), limited)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(5,))
+def minimum(H, f, G, l, u, held):
+    """Return the Face of the minimum. The first `held` rows are the last variables, which start at
+    their lower end, 0, with f > 0; H joins them to no others.
+    """
+    size, rows = f.shape[0], G.shape[0]
+    index, slots = np.arange(rows), np.arange(size)
+    whole = jnp.pad(_inverse(H[: size - held, : size - held]), (0, held))
+
+    def excess(x, out):
+        values = G @ x
+        return jnp.where(out, jnp.maximum(l - values, values - u), -jnp.inf)
+
+    def under_way(state):
+        k, face, out, entry = state
+        more = (entry.side != 0.0) | (jnp.max(excess(face.x, out)) > TOLERANCE)
+        return (k < PASSES * size) & more
+
+    def advance(state):
+        k, face, out, entry = state
+        waits = entry.side != 0.0
+        p = jnp.where(waits, entry.row, jnp.argmax(excess(face.x, out)).astype(jnp.int32))
+        row, low, high = _at(G, p), _at(l, p), _at(u, p)
+        value = row @ face.x
+        side = jnp.where(waits, entry.side, jnp.where(low - value > value - high, 1.0, -1.0))
+        gap, row = jnp.where(side > 0.0, low - value, value - high), side * row
+        along, against = face.inverse @ row, face.image @ row
+        # where a row of the face, or the new one, stops a step along `along`
+        leaves = (face.side != 0.0) & (against > 0.0)
+        stops = jnp.where(leaves, face.multiplier / jnp.where(leaves, against, 1.0), jnp.inf)
+        j, free = jnp.argmin(stops), row @ along
+        moves = free > DEPENDENT * (row @ (whole @ row))
+        reach = jnp.where(moves, gap / jnp.where(moves, free, 1.0), jnp.inf)
+        joins = reach <= jnp.min(stops)
+        step = jnp.minimum(reach, jnp.min(stops))
+        goes_on = jnp.isfinite(step)  # else no x keeps all rows
+        step = jnp.where(goes_on, step, 0.0)
+        there = goes_on & (slots == jnp.where(joins, jnp.argmin(jnp.abs(face.side)), j))
+        # one row more and one row less both change the two matrices by one of rank 1
+        gone = _at(face.image, j)
+        bent = H @ gone
+        line = jnp.where(joins, along, gone)
+        tilt = jnp.where(joins, there - against, -(face.image @ bent))
+        over = jnp.where(goes_on, 1.0 / jnp.where(joins, free, gone @ bent), 0.0)
+        multiplier = face.multiplier - step * against
+        new = Face(
+            x=face.x + step * jnp.where(moves, along, 0.0),
+            multiplier=jnp.where(there, joins * (entry.multiplier + step), multiplier),
+            row=jnp.where(there & joins, p, face.row),
+            side=jnp.where(there, joins * side, face.side),
+            inverse=face.inverse + jnp.where(joins, -over, over) * line[:, None] * line,
+            image=face.image + (over * tilt)[:, None] * line,
+        )
+        left = _at(face.row, j)
+        out = jnp.where(joins, out & (index != p), out | (index == left))
+        waiting = Entry(
+            p, jnp.where(joins, 0.0, side), jnp.where(joins, 0.0, entry.multiplier + step)
+        )
+        return jnp.where(goes_on, k + 1, PASSES * size), new, out, waiting
+
+    zero = 0.0 * f[0]
+    face = Face(
+        x=-(whole @ f),
+        multiplier=jnp.concatenate([f[size - held :], 0.0 * f[: size - held]]),
+        row=jnp.asarray(slots, dtype=jnp.int32),
+        side=jnp.where(slots < held, 1.0, 0.0) + zero,
+        inverse=whole,
+        image=jnp.eye(size, k=size - held) + 0.0 * whole,
+    )
+    first = jnp.int32(0), face, jnp.asarray(index >= held), Entry(jnp.int32(0), zero, zero)
+    face = jax.lax.while_loop(under_way, advance, first)[1]
+    # what rounding has left
+    stationary, kept = _residuals(face, H, f, G, l, u)
+    x, multiplier = _towards(face, H, stationary, kept)
+    return face._replace(x=face.x - x, multiplier=face.multiplier + multiplier)
+
+
+def _inverse(A):
+    """Return A^-1 (n, n), positive definite with a unit diagonal, by sweeps."""
+    index = np.arange(A.shape[0])
+
+    def sweep(k, A):
+        here, column = index == k, _at(A, k)
+        pivot = _at(column, k)
+        # c c' / pivot, with pivot - 1 as c_k, does the whole sweep but 2 on the diagonal
+        c = column - here
+        return A - (c / pivot)[:, None] * c - 2.0 * here[:, None] * here
+
+    return -jax.lax.fori_loop(0, A.shape[0], sweep, A)
+
+
+def _residuals(face, H, f, G, l, u):
+    """Residuals of the optimality conditions: of the gradient, and of the rows in the slots."""
+    rows = face.side[:, None] * G[face.row]
+    ends = jnp.where(face.side > 0.0, l[face.row], -u[face.row]) * (face.side != 0.0)
+    return times(H, face.x) + f - times(rows.T, face.multiplier), times(rows, face.x) - ends
+
+
+def _towards(face, H, a, c):
+    """Solve H x + R'y = a, R x = c for x, y with the rows R of the face."""
+    x = times(face.inverse, a) + times(face.image.T, c)
+    return x, times(face.image, a - times(H, x))
+
+
+@minimum.defjvp
+def _slope(held, data, moved):
+    face = minimum(*data, held)
+    H, G = data[0], data[2]
+    fixed = jax.lax.stop_gradient(face)
+    at_face = lambda *data: _residuals(face, *data)
+    stationary, kept = jax.jvp(at_face, tuple(data), tuple(moved))[1]
+    rows = face.side[:, None] * G[face.row]
+
+    def conditions(change):
+        x, y = change
+        return times(H, x) + times(rows.T, y), times(rows, x) - (face.side == 0.0) * y
+
+    x, y = jax.lax.custom_linear_solve(
+        conditions,
+        (-stationary, -kept),
+        lambda _, right: _towards(fixed, jax.lax.stop_gradient(H), *right),
+        symmetric=True,
+    )
+    still = jax.tree.map(_still, face)
+    return face, still._replace(x=x, multiplier=-y)
+
+
+def _still(v):
+    whole = jnp.issubdtype(v.dtype, jnp.integer)
+    return np.zeros(v.shape, jax.dtypes.float0) if whole else jnp.zeros_like(v)
+
+
+def _at(array, k):
+    return jax.lax.dynamic_index_in_dim(array, k, 0, keepdims=False)
