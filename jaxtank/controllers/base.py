@@ -174,6 +174,11 @@ class Controller(Role):
         return False
 
     @property
+    def alone(self) -> bool:
+        """Whether runs take less time one after the other than side by side."""
+        return False
+
+    @property
     def limits_levels(self) -> bool:
         """True if levels have limits in the controller's own programme (`slack`)."""
         return False

@@ -16,6 +16,7 @@ import importlib
 import json
 import os
 import re
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -46,6 +47,7 @@ class Kept:
         code = function.__code__
         self.names = code.co_varnames[: code.co_argcount]
         self.programs: dict[Any, Any] = {}
+        self.lock = threading.Lock()  # two threads compile no program twice
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Return the result of the function."""
@@ -60,8 +62,9 @@ class Kept:
             return self.compiled(*args, **kwargs)
         kinds = tuple(map(kind_of, leaves))
         key = tree, kinds, tuple(sorted(static.items())), context()
-        if key not in self.programs:
-            self.programs[key] = self._program(folder, tree, kinds, static, moving)
+        with self.lock:
+            if key not in self.programs:
+                self.programs[key] = self._program(folder, tree, kinds, static, moving)
         program = self.programs[key]
         return program(**moving) if program else self.compiled(*args, **kwargs)
 

@@ -7,7 +7,9 @@
 
 import dataclasses
 import functools
+import os
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -181,12 +183,50 @@ def with_noise_drawn(group: Group) -> Group:
     return group._replace(noise=jax.jit(jax.vmap(draw))(group.keys))
 
 
+def at_once(function: Callable[[Any], Any], tasks: Sequence[Any]) -> list[Any]:
+    """Return the results of a compiled function for each task, in as many threads."""
+
+    def run(task: Any) -> Any:
+        return jax.block_until_ready(function(task))
+
+    if len(tasks) == 1:
+        return [function(tasks[0])]
+    with ThreadPoolExecutor(len(tasks)) as pool:
+        return list(pool.map(run, tasks))
+
+
+def processors() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _shares(group: Group) -> list[Group]:
+    """Return groups of as many runs each that together are `group`, one for each processor."""
+    # where runs are done one after the other
+    count = len(group.runs)
+    if not jax.tree.unflatten(group.structure, group.leaves).controller.alone:
+        return [group]
+    most = max(n for n in range(1, processors() + 1) if count % n == 0)
+    return [take(group, rows) for rows in np.split(np.arange(count), most)]
+
+
+def _joined(results: Sequence[Any], axis: int) -> Any:
+    """Return the results of the shares of a group along their axis of runs."""
+    if len(results) == 1:
+        return results[0]
+    return jax.tree.map(lambda *v: np.concatenate(list(map(np.asarray, v)), axis), *results)
+
+
 def values_of(
     group: Group, names: Sequence[str], points: Mapping[str, Any], clock: Clock | None = None
 ) -> tuple[Measures, Any]:
     """Return (measures {name: (points, runs, ...)}, (points, runs) True where not finite)."""
-    group = group.at(clock or group.clock)
-    return _values(group.leaves, group.draws, group.shape, group.clock, tuple(names), dict(points))
+    static = tuple(names), dict(points)
+
+    def run(g: Group) -> Any:
+        return _values(g.leaves, g.draws, g.shape, g.clock, *static)
+
+    return _joined(at_once(run, _shares(group.at(clock or group.clock))), 1)
 
 
 def slopes_of(
@@ -198,10 +238,12 @@ def slopes_of(
     """Return measures, slopes, Gauss-Newton and flags of a group at `values`, by forward mode."""
     # Measures {name: (runs, ...)}, slopes {name: (runs, ..., P)}, the Gauss-Newton matrix (runs, P,
     # P) of `squares`, and (runs,) True where a run is not finite.
-    order, theta = tuple(values), tuple(values.values())
-    return _slopes(
-        group.leaves, group.draws, group.shape, group.clock, tuple(names), order, theta, squares
-    )
+    static = tuple(names), tuple(values), tuple(values.values()), squares
+
+    def run(g: Group) -> Any:
+        return _slopes(g.leaves, g.draws, g.shape, g.clock, *static)
+
+    return _joined(at_once(run, _shares(group)), 0)
 
 
 def reverse_slopes_of(
@@ -224,6 +266,14 @@ def _mapped(function: Callable[..., Any], leaves: Any, keys: Any, shape: Shape) 
         mine = leaves if not any(apart) else [v[0] if a else v for v, a in zip(leaves, apart)]
         result: Any = one(mine, None if keys is None else keys[0])
         return jax.tree.map(_first_axis, result)
+    if jax.tree.unflatten(structure, leaves).controller.alone:
+        moving = [v for v, a in zip(leaves, apart) if a]
+
+        def row(now: Any) -> Any:
+            rest = iter(now[0])
+            return one([next(rest) if a else v for v, a in zip(leaves, apart)], now[1])
+
+        return jax.lax.map(row, (moving, keys))
     axes = (tuple(0 if a else None for a in apart), None if keys is None else 0)
     return jax.vmap(one, in_axes=axes, axis_size=count)(leaves, keys)
 
@@ -243,6 +293,9 @@ def _values(
 
         return _mapped(one, leaves, keys, shape)
 
+    structure = shape[0]
+    if jax.tree.unflatten(structure, leaves).controller.alone:
+        return jax.lax.map(at, points)
     return jax.vmap(at)(points)
 
 
@@ -257,9 +310,8 @@ def _slopes(
     values: Any,
     squares: Any,
 ) -> Any:
-    several = shape[-1] > 1
-
     def one(loop: ClosedLoop, key: Any) -> Any:
+        several = shape[-1] > 1 and not loop.controller.alone
         return sensitivities_compiled(loop, clock, names, order, values, key, squares, several)
 
     return _mapped(one, leaves, keys, shape)

@@ -16,7 +16,7 @@ from jaxtank.loop import run as lp
 from jaxtank.task import COST
 from tuning.feasible.study import can_follow, can_judge
 from tuning.problem.functions import as_measures
-from tuning.problem.scenarios import noisy
+from tuning.problem.scenarios import at_once, noisy, processors
 from tuning.search.options import check_numbers, check_precision
 from tuning.search.setting import Setting, setting_of
 from tuning.uncertainty.batches import batch_size, run_batch
@@ -59,6 +59,8 @@ def run_plants(
     values = _with_nominal(case.loop, plants, samples) if quiet else dict(plants)
     count = samples + quiet
     size = _batch(batch_size(case, random, count), count)
+    if case.loop.controller.alone:
+        size = -(-count // processors())
     measures = _run_batches(case, tuple(names), seed if random else None, values, count, size)
     failed, nominal = measures.pop("failed") > 0, None
     if quiet and not failed[samples]:
@@ -72,10 +74,13 @@ def _run_batches(
 ) -> dict[str, np.ndarray]:
     """Measures of `count` runs in batches of `size`, of which the last one repeats its last run."""
     rows = np.minimum(np.arange(-(-count // size) * size), count - 1)
-    batches: list[Any] = []
-    for batch in np.split(np.arange(len(rows)), len(rows) // size):
+
+    def run(batch: np.ndarray) -> Any:
         block = {n: np.asarray(v)[rows[batch]] for n, v in values.items()}
-        batches.append(run_batch(case, names, key, block, batch))
+        return run_batch(case, names, key, block, batch)
+
+    tasks = np.split(np.arange(len(rows)), len(rows) // size)
+    batches = at_once(run, tasks) if case.loop.controller.alone else list(map(run, tasks))
     return {n: np.concatenate([b[n] for b in batches]) for n in batches[0]}
 
 
