@@ -32,10 +32,13 @@ class JavaScript(Printer):
         "real": "+{0}",
         "whole": "Math.trunc({0})",
         "truth": "{0} != 0",
+        "item": "{0}[{1}]",
     }
     kinds = {REAL: "", WHOLE: "", TRUTH: ""}
     nan, infinity = "NaN", "Infinity"
     constant, variable = "const {name} = {value};", "let {name} = {value};"
+    empty = "const {name} = new Float64Array({size});"
+    each = "for (let {0} = 0; {0} < {1}; ++{0}) {{"
     open_array = "const {name} = ["
     matrix_call = "const {name} = {op}({arguments});"
     matrices = ("product", "cholesky", "forward", "backward", "solve")

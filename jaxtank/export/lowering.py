@@ -11,16 +11,8 @@ import jax
 import numpy as np
 from jax.extend.core import Literal
 
-from jaxtank.export.primitives import (
-    NAMED,
-    RULES,
-    constant,
-    elements,
-    elements_of,
-    kind_of,
-    no_code,
-    written,
-)
+from jaxtank.export.arrays import copied, elements_of, place_of
+from jaxtank.export.primitives import NAMED, RULES, constant, elements, kind_of, no_code, written
 from jaxtank.export.simplify import is_number, simplified
 from jaxtank.export.statements import REAL, Array, Define, Matrix, Ref, names, used
 
@@ -36,8 +28,9 @@ class Writer:
     sparse = False
     """Whether multiplications by the number 0 are not counted."""
 
-    def __init__(self):
+    def __init__(self, loops=False):
         self.counter, self.scopes, self.known = 0, [[]], [{}]
+        self.loops, self.sizes = loops, dict[str, int]()
 
     def fresh(self, letter="v"):
         """Return a name that is not used yet."""
@@ -58,17 +51,24 @@ class Writer:
         self.known[-1][key] = ref
         return ref
 
-    def array(self, entries):
-        """Return the name of an array of reals with these entries (any shape, row by row)."""
+    def array(self, entries, kind=REAL):
+        """Return the name of an array with these entries (any shape, row by row)."""
         name = self.fresh("a")
-        self.scopes[-1].append(Array(name, tuple(entries.ravel())))
+        self.sizes[name] = entries.size
+        self.scopes[-1].append(Array(name, tuple(entries.ravel()), kind))
+        return name
+
+    def new_array(self, kind, size):
+        """Return the name of an array that a statement will fill."""
+        name = self.fresh("m")
+        self.sizes[name] = size
         return name
 
     def matrix(self, op, operands, sizes, shape):
         """Return the elements (shape) of a Matrix operation on the arrays of `operands`."""
-        name = self.fresh("m")
+        name = self.new_array(REAL, int(np.prod(shape)))
         self.scopes[-1].append(Matrix(name, op, tuple(self.array(o) for o in operands), sizes))
-        return elements_of(name, int(np.prod(shape))).reshape(shape)
+        return elements_of(name, shape)
 
     def run(self, jaxpr, consts, arguments):
         """Return the outputs of a jaxpr, arrays of elements, as its `arguments` are."""
@@ -107,28 +107,24 @@ class WholeWriter(Writer):
     large = 60
     sparse = True
 
-    def __init__(self):
-        super().__init__()
-        self.sizes = {}
+    def __init__(self, loops=False):
+        super().__init__(loops)
         self.arrays = {}
 
-    def matrix(self, op, operands, sizes, shape):
-        out = super().matrix(op, operands, sizes, shape)
-        self.sizes[out.ravel()[0].name] = out.size
-        return out
-
-    def array(self, entries):
+    def array(self, entries, kind=REAL):
         """Return the name of an array with these entries: a result, an earlier one or a new one."""
         elements = tuple(entries.ravel())
         name = getattr(elements[0], "name", "")
         whole = tuple(Ref(name, i) for i in range(self.sizes.get(name, 0)))
         if elements == whole:
             return name
+        if self.loops and place_of(self, entries) is not None:
+            return copied(self, kind, entries)
         if len(self.scopes) > 1:
-            return super().array(entries)
+            return super().array(entries, kind)
         key = tuple((type(e), e) for e in elements)
         if key not in self.arrays:
-            self.arrays[key] = super().array(entries)
+            self.arrays[key] = super().array(entries, kind)
         return self.arrays[key]
 
 
@@ -164,7 +160,7 @@ def lower_all(f, arguments, writer=None):
         for start, array in _inputs(writer, name, tree):
             if closed.jaxpr.invars[len(inputs)] in moved:
                 starts[start] = f"{name}_{start.index}"
-                array = elements_of(starts[start], array.size)
+                array = elements_of(starts[start], (array.size,))
             inputs.append(array)
     outputs = writer.run(closed.jaxpr, closed.consts, inputs)
     read = names(e for out in outputs for e in out.ravel())

@@ -27,11 +27,14 @@ class Matlab(Printer):
         "real": "double({0})",
         "whole": "fix({0})",
         "truth": "{0} ~= 0",
+        "item": "{0}({1} + 1)",
     }
     first = 1
     entry = "{0}({1})"
     nan, infinity = "NaN", "Inf"
     line_break = " ..."
+    empty, each = "{name} = zeros(1, {size});", "for {0} = 0:{2}"
+    when, close_when = "if {0},", " end"
     matrix_call = "{name} = {op}_({arguments});"
     until = "if ~({0}), break; end"
 

@@ -5,6 +5,7 @@ array of the state that is read and written at an index, a transport delay, stay
 """
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +13,10 @@ import numpy as np
 from jax.extend.core import Literal
 
 from jaxtank.core.errors import InputError
+from jaxtank.export import arrays
+from jaxtank.export.arrays import LOOPED, elements_of, filled
 from jaxtank.export.simplify import FUNCTIONS, OPERATORS, is_number
-from jaxtank.export.statements import REAL, TRUTH, WHOLE, Loop, Ref, Store, Until
+from jaxtank.export.statements import REAL, TRUTH, WHOLE, Loop, Ref, Store, Until, Vector
 
 REDUCTIONS = {"sum": "add", "prod": "mul", "max": "max", "min": "min", "and": "and", "or": "or"}
 """{what reduces an array: the operation on two of its elements}."""
@@ -32,14 +35,6 @@ def kind_of(dtype):
     if jnp.issubdtype(dtype, jnp.floating):
         return REAL
     return TRUTH if dtype == jnp.bool_ else WHOLE
-
-
-def filled(shape, f):
-    """Return an array of objects f(index)."""
-    out = np.empty(shape, dtype=object)
-    for i in np.ndindex(out.shape):
-        out[i] = f(i)
-    return out
 
 
 def elements(value):
@@ -70,6 +65,11 @@ def _numbers(operand, variable):
     return np.array(operand.tolist(), dtype=variable.aval.dtype).reshape(variable.aval.shape)
 
 
+def _kinds(eqn):
+    """The kinds of the operands."""
+    return [kind_of(v.aval.dtype) for v in eqn.invars]
+
+
 def _out_kind(eqn):
     return kind_of(eqn.outvars[0].aval.dtype)
 
@@ -79,7 +79,7 @@ def _elementwise(op):
 
     def rule(writer, eqn, operands):
         kind = TRUTH if op in TRUTHS else _out_kind(eqn)
-        return [each(lambda *a: writer.define(kind, op, *a), *operands)]
+        return [arrays.each(writer, kind, op, operands, _kinds(eqn))]
 
     return rule
 
@@ -105,10 +105,10 @@ def _same(writer, eqn, operands):
 
 
 def _convert(writer, eqn, operands):
-    kind = _out_kind(eqn)
-    if kind_of(eqn.invars[0].aval.dtype) == kind:
+    kind, kinds = _out_kind(eqn), _kinds(eqn)
+    if kinds[0] == kind:
         return operands
-    return [each(lambda a: writer.define(kind, kind, a), operands[0])]
+    return [arrays.each(writer, kind, kind, operands, kinds)]
 
 
 def _move(writer, eqn, operands):
@@ -129,44 +129,52 @@ def _move(writer, eqn, operands):
     return [each(lambda i: table[int(i)], np.asarray(v)) for v in outs]
 
 
+def _gather(writer, eqn, operands):
+    """The rows of an array at indices that are computed, or elements that are only moved."""
+    table, index = operands
+    numbers, sizes = eqn.params["dimension_numbers"], eqn.params["slice_sizes"]
+    rows = numbers.start_index_map == numbers.collapsed_slice_dims == (0,)
+    rows = rows and sizes == (1, *table.shape[1:]) and index.ndim == 2
+    if not (writer.loops and rows) or all(map(is_number, index.flat)):
+        return _move(writer, eqn, operands)
+    kind, out = _out_kind(eqn), np.empty((len(index), *table.shape[1:]), dtype=object)
+    name = arrays.whole_of(writer, kind, table)
+    for i, (k,) in enumerate(index):
+        k = writer.define(WHOLE, "min", writer.define(WHOLE, "max", k, 0), len(table) - 1)
+        offset = writer.define(WHOLE, "mul", k, math.prod(table.shape[1:]))
+        out[i] = arrays.part_of(writer, kind, name, offset, table.shape[1:])[()]
+    return [out]
+
+
 def _integer_power(writer, eqn, operands):
     y = eqn.params["y"]
 
-    def power(a):
-        out = a
-        for _ in range(abs(y) - 1):
-            out = writer.define(REAL, "mul", out, a)
-        return writer.define(REAL, "div", 1.0, out) if y < 0 else out
-
-    return [each(power, operands[0])]
+    out, one = operands[0], np.array(1.0, dtype=object)
+    for _ in range(abs(y) - 1):
+        out = arrays.each(writer, REAL, "mul", [out, operands[0]], [REAL] * 2)
+    return [arrays.each(writer, REAL, "div", [one, out], [REAL] * 2) if y < 0 else out]
 
 
 def _clamp(writer, eqn, operands):
-    kind = _out_kind(eqn)
-
-    def clamp(low, x, high):
-        return writer.define(kind, "min", writer.define(kind, "max", x, low), high)
-
-    return [each(clamp, *operands)]
+    kind, (low, x, high) = _out_kind(eqn), operands
+    above = arrays.each(writer, kind, "max", [x, low], [kind] * 2)
+    return [arrays.each(writer, kind, "min", [above, high], [kind] * 2)]
 
 
 def _select(writer, eqn, operands):
     kind = _out_kind(eqn)
     if len(operands) == 3:
-        return [each(lambda *a: writer.define(kind, "select", *a), *operands)]
-    index, *values = np.broadcast_arrays(*operands)
-    return [chosen(writer, index, values, kind)]
+        return [arrays.each(writer, kind, "select", operands, _kinds(eqn))]
+    return [chosen(writer, operands[0], operands[1:], kind)]
 
 
 def chosen(writer, index, values, kind):
     """Return values[i] where `index` is i (below 0 as 0, past the end as the last)."""
 
-    def choose(n, no, yes, i):
-        return writer.define(kind, "select", writer.define(TRUTH, "ge", n, i), no, yes)
-
     out = values[0]
     for i, value in enumerate(values[1:], start=1):
-        out = each(lambda n, no, yes, i=i: choose(n, no, yes, i), index, out, value)
+        past = arrays.each(writer, TRUTH, "ge", [index, np.array(i, dtype=object)], [WHOLE] * 2)
+        out = arrays.each(writer, kind, "select", [past, out, value], [TRUTH, kind, kind])
     return out
 
 
@@ -176,7 +184,10 @@ def _reduce(op):
     def rule(writer, eqn, operands):
         (array,), axes, kind = operands, eqn.params["axes"], _out_kind(eqn)
         others = [i for i in range(array.ndim) if i not in axes]
-        rows = array.transpose(*others, *axes).reshape(*(array.shape[i] for i in others), -1)
+        rows = array.transpose(*others, *axes)
+        if writer.loops and array.size >= LOOPED:
+            return [arrays.reduced(writer, kind, op, rows, len(axes), kind)]
+        rows = rows.reshape(*(array.shape[i] for i in others), -1)
         both = lambda a, b: writer.define(kind, op, a, b)
         return [filled(rows.shape[:-1], lambda i: functools.reduce(both, rows[i]))]
 
@@ -211,6 +222,9 @@ def _position(largest):
             return writer.define(TRUTH, "and", yes, writer.define(TRUTH, "not", no))
 
         rows = np.moveaxis(operands[0], eqn.params["axes"][0], -1)
+        if writer.loops and rows.size >= LOOPED:
+            op = "argmax" if largest else "argmin"
+            return [arrays.reduced(writer, WHOLE, op, rows, 1, kind)]
 
         def place(i):
             best, at = rows[i][0], 0
@@ -281,6 +295,9 @@ def _linear_solve(writer, eqn, operands):
     # Numbers that do not meet in it (several right sides) are solved for apart.
     lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
     right = operands[sum(lengths) :]
+    first, inner = lengths.matvec + lengths.vecmat, jaxprs.solve
+    if not any(e.primitive.name in ("lu", "triangular_solve") for e in _operations(inner.jaxpr)):
+        return writer.run(inner.jaxpr, inner.consts, [*operands[first:][: lengths.solve], *right])
     if len(right) != 1:
         raise no_code("it solves for several arrays at once")
     b, shape = right[0].ravel(), right[0].shape
@@ -297,6 +314,15 @@ def _linear_solve(writer, eqn, operands):
         n, k = places.shape
         x[places] = writer.matrix("solve", (matrix, b[places]), (n, k), (n, k))
     return [x.reshape(shape)]
+
+
+def _operations(jaxpr):
+    """Yield the operations of a jaxpr and of those that it calls."""
+    for eqn in jaxpr.eqns:
+        yield eqn
+        for inner in eqn.params.values():
+            if hasattr(inner, "jaxpr"):
+                yield from _operations(inner.jaxpr)
 
 
 def _blocks(a):
@@ -335,7 +361,7 @@ def _cholesky_solve(writer, upper, b):
 
 
 def weighted_squares(writer, g, weight):
-    scaled = each(lambda a, w: writer.define(REAL, "mul", a, w), g, weight[:, None])
+    scaled = arrays.each(writer, REAL, "mul", [g, weight[:, None]], [REAL] * 2)
     return product(writer, scaled.T, g, (((1,), (0,)), ((), ())))
 
 
@@ -344,8 +370,7 @@ def _cond(writer, eqn, operands):
     branches = [writer.run(b.jaxpr, b.consts, operands[1:]) for b in eqn.params["branches"]]
     out = []
     for variable, *values in zip(eqn.outvars, *branches):
-        index = np.broadcast_to(operands[0], values[0].shape)
-        out.append(chosen(writer, index, values, kind_of(variable.aval.dtype)))
+        out.append(chosen(writer, operands[0], values, kind_of(variable.aval.dtype)))
     return out
 
 
@@ -353,6 +378,8 @@ def _scan(writer, eqn, operands):
     p = eqn.params
     first, last = p["num_consts"], p["num_consts"] + p["num_carry"]
     closed, sequences = p["jaxpr"], operands[last:]
+    if writer.loops:
+        return _counted(writer, eqn, operands[:first], operands[first:last], sequences)
     if len(eqn.outvars) > p["num_carry"]:
         return _unrolled(writer, p, operands[:first], operands[first:last], sequences)
     starts, read = operands[first:last], lambda *counter: []
@@ -369,6 +396,35 @@ def _scan(writer, eqn, operands):
 
     kinds = [kind_of(v.aval.dtype) for v in eqn.outvars] + [WHOLE] * bool(sequences)
     return _loop(writer, kinds, starts, p["length"], body)[: len(eqn.outvars)]
+
+
+def _counted(writer, eqn, consts, carry, sequences):
+    """The results of a scan as a loop that reads and writes its sequences row by row."""
+    p, many = eqn.params, len(carry)
+    closed, kinds = p["jaxpr"], [kind_of(v.aval.dtype) for v in eqn.outvars]
+    read = [kind_of(v.aval.dtype) for v in eqn.invars[len(consts) + many :]]
+    tables = [arrays.copied(writer, k, s) for k, s in zip(read, sequences)]
+    blank = [filled(v.aval.shape, lambda _: 0) for v in eqn.outvars[many:]]
+
+    def body(carried):
+        *carried, counter = carried[:many], carried[many:-1], carried[-1].item()
+        k = writer.define(WHOLE, "sub", p["length"] - 1, counter) if p["reverse"] else counter
+        start = lambda size: writer.define(WHOLE, "mul", k, size)
+        rows = [
+            arrays.part_of(writer, kind, name, start(s[0].size), s.shape[1:])
+            for kind, name, s in zip(read, tables, sequences)
+        ]
+        out = writer.run(closed.jaxpr, closed.consts, [*consts, *carried[0], *rows])
+        after = [
+            arrays.put(writer, kind, table.flat[0].name, start(row.size), row)
+            for kind, table, row in zip(kinds[many:], carried[1], out[many:])
+        ]
+        after = [elements_of(name, table.shape) for name, table in zip(after, blank)]
+        return [*out[:many], *after, filled((), lambda _: writer.define(WHOLE, "add", counter, 1))]
+
+    starts = [*carry, *blank, np.array(0, dtype=object)]
+    tabled = range(many, many + len(blank))
+    return _loop(writer, [*kinds, WHOLE], starts, p["length"], body, tables=tabled)[:-1]
 
 
 def _unrolled(writer, p, consts, carry, sequences):
@@ -429,20 +485,30 @@ def _most(test):
     return min(bounds, default=None)
 
 
-def _loop(writer, kinds, starts, count, body, most=None):
-    """The carried variables after a loop; body: function of them that returns the next ones."""
-    carried, variables = [], []
-    for kind, start in zip(kinds, starts):
+def _loop(writer, kinds, starts, count, body, most=None, tables=()):
+    """The carried variables after a loop; body: function of them that returns the next ones.
+
+    tables: the places of those that are arrays whatever their size.
+    """
+    carried, variables, whole = [], [], []
+    for i, (kind, start) in enumerate(zip(kinds, starts)):
+        whole.append(i in tables or (writer.loops and start.size >= LOOPED))
+        if whole[-1]:
+            name, vector = writer.new_array(kind, start.size), Vector(kind, start.size)
+            variables.append(elements_of(name, start.shape))
+            carried.append((vector, name, Ref(arrays.whole_of(writer, kind, start))))
+            continue
         refs = filled(start.shape, lambda _: Ref(writer.fresh("c")))
         carried += [(kind, ref.name, e) for ref, e in zip(refs.ravel(), start.ravel())]
         variables.append(refs)
     writer.scopes.append([])
     writer.known.append({})
-    out = body(variables)
+    before, new = {name for kind, name, _ in carried if isinstance(kind, Vector)}, []
+    for kind, is_whole, o in zip(kinds, whole, body(variables)):
+        new += [Ref(arrays.whole_of(writer, kind, o, before))] if is_whole else list(o.ravel())
     statements = writer.scopes.pop()
     writer.known.pop()
-    new = tuple(e for o in out for e in o.ravel())
-    writer.scopes[-1].append(Loop(count, tuple(carried), statements, new, most))
+    writer.scopes[-1].append(Loop(count, tuple(carried), statements, tuple(new), most))
     return variables
 
 
@@ -464,11 +530,6 @@ def written(jaxpr):
     return variables & inputs
 
 
-def elements_of(name, size):
-    """Return the elements of the line `name`."""
-    return filled((size,), lambda i: Ref(name, *i))
-
-
 def line_of(array):
     """Return the name of the line that holds exactly the elements of an array, else None."""
     whole = array.ndim == 1 and all(
@@ -482,8 +543,14 @@ def _read(writer, eqn, operands):
     array, *index = operands
     if all(is_number(i.item()) for i in index):
         return RULES["slice"](writer, eqn, operands)
-    name = line_of(array)
-    if name is None or eqn.params["slice_sizes"] != (1,):
+    name, sizes = line_of(array), eqn.params["slice_sizes"]
+    if writer.loops and name is None and sizes[1:] == array.shape[1:]:
+        kind, rows = _out_kind(eqn), array.shape[0] - sizes[0]
+        start = writer.define(WHOLE, "min", writer.define(WHOLE, "max", index[0].item(), 0), rows)
+        offset = writer.define(WHOLE, "mul", start, array.size // array.shape[0])
+        table = arrays.whole_of(writer, kind, array)
+        return [arrays.part_of(writer, kind, table, offset, tuple(sizes))]
+    if name is None or sizes != (1,):
         return [_chosen_slice(writer, eqn, array, [i.item() for i in index])]
     return [filled((1,), lambda _: writer.define(REAL, "item", Ref(name), index[0].item()))]
 
@@ -517,7 +584,7 @@ def _write(writer, eqn, operands):
         raise no_code("it writes to an array at an index")
     new = writer.fresh("l")
     writer.scopes[-1].append(Store(new, name, index.item(), update[0]))
-    return [elements_of(new, array.size)]
+    return [elements_of(new, (array.size,))]
 
 
 INDICES = {"gather": slice(1, 2), "dynamic_slice": slice(1, None), "scatter": slice(1, 2)}
@@ -557,6 +624,7 @@ RULES = {
     "scan": _scan,
     "while": _while,
     "dynamic_slice": _read,
+    "gather": _gather,
     "dynamic_update_slice": _write,
     "dot_general": _product,
     "cholesky": _factorise,

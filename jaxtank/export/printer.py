@@ -1,5 +1,6 @@
 """How statements are printed: templates that a language fills in, and the header of a file."""
 
+import math
 import re
 from collections.abc import Mapping
 
@@ -17,11 +18,14 @@ from jaxtank.export.statements import (
     WHOLE,
     Array,
     Define,
+    Each,
     Loop,
     Matrix,
     Ref,
     Store,
     Until,
+    Vector,
+    View,
     size_of,
 )
 
@@ -41,6 +45,7 @@ OPERATIONS = {
     "ge": "{0} >= {1}",
     "eq": "{0} == {1}",
     "truth": "{0} != 0",
+    "same": "{0}",
 }
 """Operations that most languages write in the same way, as formats of their arguments."""
 
@@ -63,6 +68,7 @@ class Printer:
     """Index of the first entry of an array."""
     entry = "{0}[{1}]"
     real = "{0}"
+    when, close_when = "if ({0})", ""
     truths = ("false", "true")
     nan, infinity = "NAN", "INFINITY"
     assign = constant = variable = "{name} = {value};"
@@ -71,6 +77,10 @@ class Printer:
     """A Matrix statement, of name, op, size and arguments; "": the language has none."""
     matrices = ("product", "cholesky", "forward", "backward")
     """Operations of Matrix statements that the language has."""
+    empty, each, put = "", "", "{place} = {value};"
+    """An array of kind, name and size before it is filled; the loop over one of its axes, of
+    variable and size; an assignment to an entry. `each` "": the language has no such loops.
+    """
     counted, endless, end = "for i = 1:{0}", "while true", "end"
     """`endless` "": the language has loops of a bounded number of passes alone."""
     store = ""
@@ -111,6 +121,7 @@ class Printer:
         methods = {
             Define: self._define,
             Array: self._array,
+            Each: self._each,
             Matrix: self._matrix,
             Store: self._store,
             Until: self._until,
@@ -125,7 +136,7 @@ class Printer:
         return [self._set(self.constant, s.kind, s.name, self.right(s.op, s.args))]
 
     def _array(self, s):
-        words = {"name": s.name, "size": len(s.entries), "real": self.kinds[REAL]}
+        words = {"name": s.name, "size": len(s.entries), "real": self.kinds[s.kind]}
         rows, line = [], self.open_array.format(**words)
         for item in map(self.value, s.entries):
             if len(line) + len(item) > WIDTH:
@@ -142,6 +153,76 @@ class Printer:
         words = {"name": s.name, "op": s.op, "size": size_of(s), "arguments": arguments}
         return self.matrix_call.format(**words, real=self.kinds[REAL]).split("\n")
 
+    def _each(self, s):
+        counters = [f"e{d}" for d in range(len(s.shape) + len(s.over))]
+        steps = [math.prod(s.shape[d + 1 :]) for d in range(len(s.shape))]
+        if s.array:
+            target = self.rename.get(s.array, s.array)
+            self.rename = {**self.rename, s.name: target}
+            declared = []
+        else:
+            target, declared = s.name, self._empty(s.kind, s.name, math.prod(s.shape))
+        place = self._entry_at(target, s.offset, steps, counters)
+        if s.over:
+            filling = self._reduction(s, place, counters)
+        else:
+            value = self.operations[s.op].format(*(self._argument(a, counters) for a in s.args))
+            filling = [self.put.format(place=place, value=value)]
+        return [*declared, *self._around(s.shape, counters, filling)]
+
+    def _reduction(self, s, place, counters):
+        """The lines that reduce one entry of an `Each`."""
+        (view,), outer = s.args, counters[: len(s.shape)]
+        ahead = [*outer, *(["0"] * len(s.over))]
+        put = lambda value: self.put.format(place=place, value=value)
+        if s.op in ("argmax", "argmin"):
+            best = self._argument(view, [*outer, place])
+            test = f"{self._argument(view, counters)} {'><'[s.op == 'argmin']} {best}"
+            start, step = put("0"), f"{self.when.format(test)} {put(counters[-1])}{self.close_when}"
+        else:
+            neutral = {"add": self.value(0.0), "mul": self.value(1.0)}
+            start = put(neutral.get(s.op, self._argument(view, ahead)))
+            step = put(self.operations[s.op].format(place, self._argument(view, counters)))
+        return [start, *self._around(s.over, counters[len(outer) :], [step])]
+
+    def _around(self, shape, counters, lines):
+        """Lines in loops over the axes of a shape."""
+        for counter, size in reversed(list(zip(counters, shape))):
+            inside = ["    " + line for line in lines]
+            lines = [self.each.format(counter, size, size - 1), *inside, self.end]
+        return lines
+
+    def _argument(self, a, counters):
+        if not isinstance(a, View):
+            return self.value(a)
+        return self._entry_at(a.name, a.offset, a.strides, counters)
+
+    def _entry_at(self, name, offset, strides, counters):
+        """The text of an entry of an array at offset + sum_d strides[d] counters[d]."""
+        terms = [f"{s} * {c}" if s > 1 else c for s, c in zip(strides, counters) if s and c != "0"]
+        start = offset.name if isinstance(offset, Ref) else offset + self.first
+        if isinstance(offset, Ref) and self.first:
+            terms = [*terms, str(self.first)]
+        terms = [*terms, str(start)] if start or not terms else terms
+        return self.entry.format(self.value(Ref(name)), " + ".join(terms))
+
+    def _empty(self, kind, name, size):
+        """The lines that declare an array."""
+        if not self.each:
+            raise InputError("--lang: this language has no loops over arrays")
+        text = self.empty.format(kind=self.kinds[kind], name=name, size=size)
+        return [text] if text else []
+
+    def _copy(self, vector, name, source):
+        """The lines that copy an array."""
+        text = [
+            self.put.format(
+                place=self._entry_at(name, 0, [1], ["e0"]),
+                value=self._entry_at(source, 0, [1], ["e0"]),
+            )
+        ]
+        return self._around((vector.size,), ["e0"], text)
+
     def _store(self, s):
         if not self.store:
             raise InputError("--lang: this language has no arrays that are changed entry by entry")
@@ -156,16 +237,25 @@ class Printer:
         return self.counted.format(count)
 
     def _loop(self, s):
-        lines = [self._set(self.variable, k, n, self.value(start)) for k, n, start in s.carried]
+        lines, ends = [], []
+        for kind, name, start in s.carried:
+            if isinstance(kind, Vector):
+                lines += self._empty(kind.kind, name, kind.size)
+                lines += self._copy(kind, name, start.name)
+            else:
+                lines.append(self._set(self.variable, kind, name, self.value(start)))
         passes = s.count if self.endless or s.count is not None else s.most
         if passes is None and not self.endless:
             raise InputError("--lang: a loop of this controller has no bound on its passes")
         lines.append(self.endless if passes is None else self._passes(passes))
         lines += self.lines(s.body)
         for (kind, name, _), new in zip(s.carried, s.new):
-            lines.append("    " + self._set(self.constant, kind, f"n{name}", self.value(new)))
-        for kind, name, _ in s.carried:
-            lines.append("    " + self._set(self.assign, kind, name, f"n{name}"))
+            if not isinstance(kind, Vector):
+                lines.append("    " + self._set(self.constant, kind, f"n{name}", self.value(new)))
+                ends.append(self._set(self.assign, kind, name, f"n{name}"))
+            elif self.rename.get(new.name, new.name) != name:
+                ends += self._copy(kind, name, new.name)
+        lines += ["    " + line for line in ends]
         return [*lines, self.end] if self.end else lines
 
 

@@ -13,22 +13,22 @@ from jaxtank.core.clock import Chunk
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Tick
 from jaxtank.core.tree import describe, parameters, walk, with_values
-from jaxtank.export.lowering import WholeWriter, lower_all
+from jaxtank.export.lowering import WholeWriter, Writer, lower_all
 from jaxtank.export.statements import (
     REAL,
-    Array,
     Define,
+    Each,
     Loop,
     Matrix,
     Ref,
     Statement,
+    array_kinds,
     every,
     hoisted,
     names,
     of_rank,
     ranks,
     refs,
-    size_of,
     used,
 )
 from jaxtank.loop.closed_loop import Inputs, control_state, initial
@@ -260,9 +260,11 @@ def _lowered(case, plant, adjustable):
     before = {} if plant else {"y": real(tanks), "u": real(pumps)}
     if not adjustable:
         step, begin = functions({})
-        return lower_all(begin, before), lower_all(step, {"s": state, **arguments}), sizes, {}
+        begun = lower_all(begin, before, Writer(loops=True))
+        done = lower_all(step, {"s": state, **arguments}, Writer(loops=True))
+        return begun, done, sizes, {}
     with rolled():
-        first, writer = WholeWriter(), WholeWriter()
+        first, writer = WholeWriter(loops=True), WholeWriter(loops=True)
         begun = lower_all(lambda p, *v: functions(p)[1](*v), given | before, first)
         writer.counter = first.counter  # no name twice
         step = lambda p, *v: functions(p)[0](*v)
@@ -288,10 +290,10 @@ def _divided(result):
     inputs = {"p": 0, "s": 1, "t": 1, "on": 1, **dict.fromkeys(result.inputs, 1)}
     rank = ranks(statements, inputs | dict.fromkeys(result.lines, 1))
     alone = of_rank(statements, rank, 0)
-    if len(alone) <= INLINE and not [s for s in alone if isinstance(s, Loop | Matrix)]:
+    if len(alone) <= INLINE and not [s for s in alone if isinstance(s, Each | Loop | Matrix)]:
         return result
     moving = of_rank(statements, rank, 1)
-    sizes = {s.name: size_of(s) for s in every(alone) if isinstance(s, Array | Matrix)}
+    sizes = {name: vector.size for name, vector in array_kinds(alone).items()}
     crossing = _crossing(moving, [*result.after, *flat(result.outputs_of)], rank)
     whole = [e.name for e in crossing if e.index is None and e.name in sizes]
     numbers, kinds = [e for e in crossing if e.name not in whole], _kinds(alone)
@@ -316,4 +318,5 @@ def _kinds(statements):
     """{variable: its kind} of the numbers that statements define."""
     loops = (s for s in every(statements) if isinstance(s, Loop))
     carried = {name: kind for s in loops for kind, name, _ in s.carried}
-    return carried | {s.name: s.kind for s in every(statements) if isinstance(s, Define)}
+    single = (s for s in every(statements) if isinstance(s, Define | Each))
+    return carried | {s.name: s.kind for s in single}

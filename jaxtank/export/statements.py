@@ -1,5 +1,6 @@
 """The statements of exported code, on scalars: output of lowering, input of the printers."""
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple, cast
 
@@ -27,11 +28,51 @@ class Define(NamedTuple):
         return names(self.args)
 
 
+class Vector(NamedTuple):
+    """The kind of an array of `size` entries that a loop carries."""
+
+    kind: str
+    size: int
+
+
+class View(NamedTuple):
+    """Entries of an array at offset + sum_d strides[d] i_d, for the counters i_d of loops."""
+
+    name: str
+    offset: "int | Ref"
+    strides: tuple
+
+
+class Each(NamedTuple):
+    """name[i] = op(args at i), for every i below `shape`, row by row; over: what is reduced by op.
+
+    An argument is a number, a Ref or a View. With `over`, (sizes) of more counters, the one View
+    has strides for them too. `array`: the larger array that is written instead, from `offset` on,
+    in place; `name` is what it is called from then on.
+    """
+
+    kind: str
+    name: str
+    shape: tuple
+    op: str
+    args: tuple
+    over: tuple = ()
+    array: str = ""
+    offset: Any = 0
+
+    @property
+    def reads(self):
+        """Names of the variables that it reads."""
+        views = {a.name for a in self.args if isinstance(a, View)}
+        return names(entries_read(self)) | views | ({self.array} if self.array else set())
+
+
 class Array(NamedTuple):
-    """An array of reals with its entries."""
+    """An array with its entries."""
 
     name: str
     entries: tuple
+    kind: str = REAL
 
     @property
     def reads(self):
@@ -97,7 +138,7 @@ class Loop(NamedTuple):
         return inside | names(self.new) | names(start for _, _, start in self.carried)
 
 
-Statement = Define | Array | Matrix | Store | Until | Loop
+Statement = Define | Array | Each | Matrix | Store | Until | Loop
 
 
 def names(entries: Iterable) -> set[str]:
@@ -145,7 +186,7 @@ def hoisted(statements: Iterable[Statement]) -> list[Statement]:
             continue
         inside, body = {name for _, name, _ in s.carried}, []
         for inner in hoisted(s.body):
-            free = isinstance(inner, Define | Array) and not inner.reads & inside
+            free = isinstance(inner, Define | Array | Each) and not inner.reads & inside
             if free:
                 out.append(inner)
                 continue
@@ -170,6 +211,8 @@ def ranks(statements: Iterable[Statement], inputs: Mapping[str, int]) -> dict[st
         rank = max((rank_of[n] for n in read), default=0)
         if isinstance(s, Store):
             rank = max(rank, rank_of[s.array])
+        if isinstance(s, Array | Each) and s.kind != REAL:  # constants that are kept are reals
+            rank = max(rank, 1)
         rank_of.update(dict.fromkeys(defined(s), rank))
     return rank_of
 
@@ -211,14 +254,33 @@ def entries_read(s: Statement) -> tuple:
         return s.args
     if isinstance(s, Array):
         return s.entries
+    if isinstance(s, Each):
+        views = [a for a in s.args if isinstance(a, View)]
+        read = [Ref(a.name) for a in views] + [a.offset for a in views]
+        return *(a for a in s.args if not isinstance(a, View)), *read, s.offset
     if isinstance(s, Store):
         return s.index, s.value, Ref(s.array)
     return (s.test,) if isinstance(s, Until) else ()
 
 
-def size_of(s: Array | Matrix) -> int:
-    """Return the number of entries of an Array or of the result of a Matrix."""
+def size_of(s: Array | Each | Matrix) -> int:
+    """Return the number of entries of an Array or of the result of an Each or a Matrix."""
     if isinstance(s, Array):
         return len(s.entries)
+    if isinstance(s, Each):
+        return math.prod(s.shape)
     rows: dict[str, Any] = {"product": lambda m, k, n: m * n, "cholesky": lambda n: n * n}
     return rows.get(s.op, lambda n, k: n * k)(*s.sizes)
+
+
+def array_kinds(statements: Iterable[Statement]) -> dict[str, Vector]:
+    """Return {array that the statements define, but for those written in place: its kind, size}."""
+    kinds: dict[str, Vector] = {}
+    for s in every(statements):
+        if isinstance(s, Array) or (isinstance(s, Each) and not s.array):
+            kinds[s.name] = Vector(s.kind, size_of(s))
+        elif isinstance(s, Matrix):
+            kinds[s.name] = Vector(REAL, size_of(s))
+        elif isinstance(s, Loop):
+            kinds |= {name: kind for kind, name, _ in s.carried if isinstance(kind, Vector)}
+    return kinds

@@ -9,11 +9,13 @@ from jaxtank.export.statements import (
     WHOLE,
     Array,
     Define,
+    Each,
     Loop,
     Matrix,
     Ref,
+    Vector,
+    array_kinds,
     every,
-    size_of,
 )
 
 LARGEST = {"double": "1.7976931348623157E+308", "float": "3.4028234E+38"}
@@ -35,6 +37,8 @@ class StructuredText(Printer):
     truths = ("FALSE", "TRUE")
     assign = constant = variable = "{name} := {value};"
     counted, endless, end = "FOR {1} := 0 TO {0} DO", "", "END_FOR;"
+    each, put = "FOR {0} := 0 TO {2} DO", "{place} := {value};"
+    when, close_when = "IF {0} THEN", " END_IF;"
     until = "IF NOT ({0}) THEN EXIT; END_IF;"
     rename = {**INPUTS, "s": "state", "t": "time_s", "u": "input_before"}
 
@@ -76,6 +80,7 @@ class StructuredText(Printer):
             "quotient": "{0} / {1}",
             "remainder": "{0} MOD {1}",
             "real": f"DINT_TO_{real}({{0}})",
+            "item": "{0}[{1}]",
             "whole": "TRUNC({0})",
         }
 
@@ -246,8 +251,8 @@ def print_structured_text(program, name, precision):
     kinds = {s.name: s.kind for s in statements if isinstance(s, Define)}
     for s in statements:
         if isinstance(s, Loop):
-            kinds |= {n: kind for kind, n, _ in s.carried}
-            kinds |= {f"n{n}": kind for kind, n, _ in s.carried}
+            single = {n: kind for kind, n, _ in s.carried if not isinstance(kind, Vector)}
+            kinds |= single | {f"n{n}": kind for n, kind in single.items()}
     entries = enumerate(program.entries)
     places = {Ref("p", j): f"{field_of(n)}{_index(i)}" for j, (n, i) in entries}
     places[Ref("on")] = "SEL(manual, 0.0, 1.0)"
@@ -323,10 +328,10 @@ def _interface(printer, program):
 def _variables(printer, program, statements):
     """Declarations of the state and of what the statements compute."""
     real = printer.kinds[REAL]
-    arrays = [s for s in statements if isinstance(s, Array | Matrix)]
-    tables = [s for s in arrays if isinstance(s, Array) and not s.reads]
+    tables = [s for s in statements if isinstance(s, Array) and not s.reads]
     types = {n: printer.kinds[kind] for n, kind in printer.kind_of.items()}
-    types |= {s.name: _array(size_of(s), real) for s in arrays if s not in tables}
+    sized = array_kinds(s for s in statements if s not in tables)
+    types |= {n: _array(vector.size, printer.kinds[vector.kind]) for n, vector in sized.items()}
     lasting = {e.name for e in program.constants} | set(program.arrays)
     kept = {"state": _array(max(program.state, 1), real), "started": "BOOL"}
     if program.prepare:
@@ -336,7 +341,8 @@ def _variables(printer, program, statements):
     for n, kind in types.items():
         (kept if n in lasting else passing)[n] = kind
     constant = {
-        s.name: f"{_array(len(s.entries), real)}{_initial(printer, s.entries)}" for s in tables
+        s.name: f"{_array(len(s.entries), printer.kinds[s.kind])}{_initial(printer, s.entries)}"
+        for s in tables
     }
     return [
         *(_block("VAR CONSTANT", constant) if constant else []),
@@ -352,6 +358,8 @@ def _block(kind, variables):
 def _helpers(printer, statements):
     """{variable of the loops: its type}."""
     counters = {f"k{i + 1}": "DINT" for i in range(printer.counters)}
+    deep = [len(s.shape) + len(s.over) for s in statements if isinstance(s, Each)]
+    counters |= {f"e{d}": "DINT" for d in range(max(deep, default=0))}
     matrices = [s for s in statements if isinstance(s, Matrix)]
     if not matrices:
         return counters

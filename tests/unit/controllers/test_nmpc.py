@@ -1,5 +1,7 @@
 """Nonlinear predictive control against an independent programme, differences and its own limits."""
 
+import shutil
+
 import jax
 import numpy as np
 import pytest
@@ -12,6 +14,8 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.export import export
+from jaxtank.export.replay import replay
+from jaxtank.export.source import files
 from jaxtank.export.whole import check_pointwise
 from jaxtank.plants.rigs import quadruple_tank
 from jaxtank.presets.paper import closed_loop
@@ -183,6 +187,29 @@ def test_the_inputs_keep_their_largest_rate(case):
 def test_what_the_programme_cannot_have_is_refused(case, change, words):
     with pytest.raises(InputError, match=words):
         rig.check(rig.set_values(case, change))
+
+
+@pytest.mark.parametrize(
+    ("lang", "tool"), [("c", "gcc"), pytest.param("js", "node", marks=pytest.mark.slow)]
+)
+def test_code_gives_the_inputs_of_the_loop(case, lang, tool, tmp_path):
+    if shutil.which(tool) is None:
+        pytest.skip(f"no {tool} on this machine")
+    rest = 0.05 * (2.0 * 981.0 * 4.0) ** 0.5  # replay begins from the first input of the log
+    limits = {"controller.limit": [4.5, 20.0], "controller.rate": 0.5}
+    bound = rig.set_values(case, limits | {"actuator.initial": [rest]})
+    run = jaxtank.simulate(bound)
+    signals = {"y": run.y, "u": run.u}
+    for name, parts in zip(("r", "dr", "ddr"), bound.loop.reference.sample(bound.clock)):
+        signals[name] = np.stack([np.asarray(v) for v in parts], axis=1)
+    names = [f"{name}{i + 1}" for name, v in signals.items() for i in range(v.shape[1])]
+    table = np.column_stack([run.t, *signals.values()])
+    log = tmp_path / "log.csv"
+    np.savetxt(log, table, "%.17g", ",", header=",".join(["t [s]", *names]), comments="")
+    for name, text in files(bound, lang, name="law").items():
+        (tmp_path / name).write_text(text)
+    (row,) = replay(tmp_path / f"law.{lang}", log)["inputs"]
+    assert np.ptp(run.u) > 1.0 and row["largest_difference"] < 1e-9
 
 
 def test_code_of_one_sample_reads_no_setpoints_ahead():
