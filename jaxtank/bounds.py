@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from jaxtank import controllers
 from jaxtank.case import Case, Free
 from jaxtank.core.errors import InputError
+from jaxtank.core.text import shortened
 from jaxtank.core.tree import describe, get_value, split_index
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.rig import check_free
@@ -118,6 +119,8 @@ def bounds(loop: ClosedLoop, free: Mapping[str, Any]) -> list[Bound]:
     """Return the Bounds of {name: Free}; the name of an array stands for all its entries."""
     # Raises InputError for an unknown name, a range that is empty, not finite or outside what the
     # parameter allows.
+    if not isinstance(free, Mapping) or not all(isinstance(name, str) for name in free):
+        raise InputError(f"free = {shortened(free)}: must be {{name: (low, high)}}")
     if not free:
         raise InputError(
             "nothing to tune: name at least one parameter, free={name: (low, high)} or --free"
@@ -125,6 +128,11 @@ def bounds(loop: ClosedLoop, free: Mapping[str, Any]) -> list[Bound]:
         )
     entries: list[Bound] = []
     for name, spec in free.items():
+        if not isinstance(spec, tuple | list) or len(spec) not in (2, 3):
+            raise InputError(
+                f"free {name} = {shortened(spec)}: must be (low, high), (low, high, scale) or a"
+                " jaxtank.case.Free"
+            )
         if name.startswith("safety_filter."):
             raise InputError(
                 f"free {name}: the safety filter is designed for the rig, not tuned: its settings"

@@ -6,7 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxtank.core.checks import check_whole
 from jaxtank.core.clock import CLOCK_UNITS, Clock
+from jaxtank.core.errors import InputError
 from jaxtank.core.jsonable import clean
 from jaxtank.core.text import count
 from jaxtank.core.tree import describe, get_value, parameters, walk
@@ -17,6 +19,16 @@ from jaxtank.safety import SafetyFilter, TankCertificate, design_for
 from jaxtank.safety.of_case import SPREAD, UNKNOWN
 from jaxtank.safety.outlets import OutletFilter
 from jaxtank.views import CaseViews
+
+
+def check_case(case: Any, seed: Any = 0) -> None:
+    """Raise InputError for what is no Case, and for a seed that is no whole number from 0."""
+    if not isinstance(case, Case):
+        raise InputError(
+            f"case is a {type(case).__name__}: must be a Case; jaxtank.presets.find(NAME) returns"
+            " one of this package, jaxtank.rig.load(FILE) that of a rig file"
+        )
+    check_whole("seed", seed, 0, 2**31 - 1)
 
 
 class Free(NamedTuple):

@@ -537,3 +537,41 @@ def test_save_leaves_out_the_rig_file_of_a_class_without_a_name_with_a_note(
         "rig.toml is not written" in json.loads((tmp_path / "result.json").read_text())["message"]
     )
     assert "rig.toml is not written" in (tmp_path / "report.html").read_text()
+
+
+OF_A_CASE = {
+    "attack": {},
+    "bound": {},
+    "can_follow": {"draws": {}},
+    "compare_controllers": {},
+    "ensemble": {},
+    "feasibility": {},
+    "identify": {"log": None},
+    "least_offset": {"draws": {}},
+    "predict": {"log": None},
+    "sensitivity": {},
+    "tradeoff": {"measure": "rise_time", "values": [9.0]},
+    "tune": {},
+    "tune_by_rule": {"rule": "simc"},
+    "tune_choices": {"choices": {}},
+    "tune_robust": {},
+    "validate": {},
+}
+
+
+@pytest.mark.parametrize("name", OF_A_CASE)
+def test_what_is_no_case_and_a_seed_that_is_none_are_refused(name):
+    function, case = getattr(tuning, name), presets.find("cascaded/pi")
+    for wrong in ("cascaded/pi", None, case.loop):
+        with pytest.raises(InputError, match="must be a Case"):
+            function(wrong, **OF_A_CASE[name])
+    if "seed" in inspect.signature(function).parameters:
+        for seed in (-1, 1.5, None):
+            with pytest.raises(InputError, match="seed"):
+                function(case, **OF_A_CASE[name], seed=seed)
+
+
+@pytest.mark.parametrize("free", [3, {"controller.Kc": 1.0}, {3: (1.0, 2.0)}, ["controller.Kc"]])
+def test_free_parameters_without_a_range_are_refused(free):
+    with pytest.raises(InputError, match="free"):
+        tuning.tune(presets.find("cascaded/pi"), nominal=True, free=free)

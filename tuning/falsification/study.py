@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxtank.case import Case
+from jaxtank.case import Case, check_case
 from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import lower_clip
@@ -99,6 +99,7 @@ def attack(
     >>> [run.tank for run in attack.found]
     [0, 1]
     """
+    check_case(case, seed)
     began = time.perf_counter()
     counts = {"starts": starts, "iterations": iterations, "windows": windows, "draws": draws}
     for name, value in {**counts, "seed": seed}.items():

@@ -13,7 +13,7 @@ import scipy  # its parts are imported when they are first used
 
 from jaxtank import rig
 from jaxtank.analysis.steady_batch import SteadyStates
-from jaxtank.case import Case
+from jaxtank.case import Case, check_case
 from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value
@@ -79,8 +79,8 @@ def feasibility(
     >>> [mend.what for mend in study.mends]
     ['setpoints', 'rims', 'orifices']
     """
+    check_case(case, seed)
     check_whole("samples", samples, 2, 2**20)
-    check_whole("seed", seed, 0, 2**31 - 1)
     began = time.perf_counter()
     distributions = spread_of(case) if distributions is None else stated(distributions)
     draws = Draws(case.loop, distributions)
@@ -168,6 +168,7 @@ def can_follow(
     >>> can_follow(case, {"plant.orifice[0]": np.array([0.12, 0.09])}).tolist()
     [True, False]
     """
+    check_case(case)
     return Needs(case, draws, limits).feasible()
 
 
@@ -195,6 +196,7 @@ def least_offset(
     >>> least_offset(case, {"plant.orifice[0]": np.array([0.12, 0.1])}).round(2).tolist()
     [0.0, 0.68]
     """
+    check_case(case)
     needs = Needs(case, draws, limits)
     return np.sqrt(np.mean(least_offsets(needs) ** 2, axis=1) / needs.setpoints.shape[2])
 
@@ -238,6 +240,7 @@ def apply_mend(
     >>> float(mended.loop.plant.rim[2]) > 35.0, mend.what
     (True, 'rims')
     """
+    check_case(case, seed)
     if kind not in KINDS:
         raise InputError(f"unknown mend {str(kind)!r}: must be one of {', '.join(KINDS)}")
     if kind == "ramps":

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxtank.case import Case
+from jaxtank.case import Case, check_case
 from tuning.identification.confidence import Spread
 from tuning.identification.data_checks import checked
 from tuning.identification.experiment import Log
@@ -80,6 +80,7 @@ def identify_many(
     >>> len(result), result.names, bool(result.values[0, 0] < result.values[1, 0])
     (2, ('plant.pump_gain[0]',), True)
     """
+    check_case(case)
     began, logs = time.perf_counter(), checked(logs, case.loop, gap)
     first = Estimation(case, logs[:1], free, start, noise, substeps)
     noise = first.noise if noise is None else noise

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxtank.case import Case
+from jaxtank.case import Case, check_case
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.loop.steady import steady_state
 from jaxtank.plants.runge_kutta import advance
@@ -169,6 +169,7 @@ def compare_experiments(
     >>> experiments["step"]["open"], experiments["step"]["sd"]["plant.pump_gain[0]"] < 0.1
     ([], True)
     """
+    check_case(case)
     loop, count = case.loop, 1
     tanks = tuple(range(loop.plant.tanks)) if levels is None else tuple(levels)
     coordinates = coordinates_of(free_bounds(loop, free))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
-from jaxtank.case import Case
+from jaxtank.case import Case, check_case
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.plants.base import Plant
 from tuning.identification.acceptance import accept_causes, place_of
@@ -161,6 +161,7 @@ def identify(
         same |= {"profile": profile, "law": law, "likelihood": likelihood}
         return _refined(first, log, same, began)
     case = bare(case) if isinstance(case, Plant) else case
+    check_case(case, seed)
     check_kind(law, case)
     logs = checked(log, case.loop, gap)
     options: dict[str, Any] = {"start": start, "noise": noise, "substeps": substeps}

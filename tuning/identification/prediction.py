@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from jaxtank.case import Case
+from jaxtank.case import Case, check_case
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.errors import InputError
 from jaxtank.core.labels import reading_label
@@ -113,6 +113,7 @@ def predict(
     1
     """
     case = bare(case) if isinstance(case, Plant) else case
+    check_case(case)
     logs = checked(log, case.loop, gap)
     shortest = min(data.samples for data in logs)
     whole = isinstance(start_samples, int) and not isinstance(start_samples, bool)

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.case import Case
+from jaxtank.case import Case, check_case
 from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError, NonFiniteError
 from jaxtank.loop import run as lp
@@ -128,6 +128,7 @@ def bound(
     >>> result.holds, result.cost < result.closed_loop["cost"]  # doctest: +SKIP
     (True, True)
     """
+    check_case(case)
     began = time.perf_counter()
     problem = InputProblem(case, objective, limits, interval)
     search = InputSearch(problem, iterations, progress)

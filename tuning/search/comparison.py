@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxtank import presets, rig
 from jaxtank.bounds import free_of
-from jaxtank.case import Case
+from jaxtank.case import Case, check_case
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.export.timing import step_time
@@ -229,6 +229,7 @@ def compare_controllers(
     >>> result.best.name  # doctest: +SKIP
     'pi'
     """
+    check_case(case, seed)
     check_precision()
     check_numbers(samples=samples)
     refused: dict[str, str] = {}

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from jaxtank import rig
 from jaxtank.bounds import bounds, free_of
-from jaxtank.case import Case, Scenario
+from jaxtank.case import Case, Scenario, check_case
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import split_index
@@ -82,6 +82,7 @@ def tune_choices(
     >>> case = presets.find("cascaded/pi")
     >>> tuning.tune_choices(case, {"clock.substeps": [1, 2]}).choices  # doctest: +SKIP
     """
+    check_case(case, seed)
     check_precision()
     variants = _variants(case, choices, free)
     folders = [Path(checkpoint or ".") / f"choice_{i + 1}" for i in range(len(variants))]

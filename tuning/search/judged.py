@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.case import Case
+from jaxtank.case import Case, check_case
 from jaxtank.core.jsonable import clean
 from jaxtank.core.tree import get_value
 from jaxtank.limits import limited_levels, resolve_limits
@@ -260,6 +260,7 @@ def validate(
     >>> tuning.validate(presets.find("cascaded/pi"), samples=8).share_held()["share"]
     0.0
     """
+    check_case(case, seed)
     check_precision()
     check_numbers(samples=samples)
     objective, limits = as_measures(objective, limits)

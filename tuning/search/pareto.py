@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.case import Case, Scenario
+from jaxtank.case import Case, Scenario, check_case
 from jaxtank.core.errors import InputError
 from tuning.problem.evaluator import Evaluator
 from tuning.problem.functions import as_measures
@@ -67,6 +67,7 @@ def tradeoff(
     >>> case = presets.find("cascaded/pi")
     >>> tuning.tradeoff(case, "input_travel", [80.0, 40.0])  # doctest: +SKIP
     """
+    check_case(case, seed)
     objective, limits = as_measures(objective, limits)
     ms.check_names([measure])
     values = [float(v) for v in values]

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.case import Case
+from jaxtank.case import Case, check_case
 from jaxtank.core.errors import InputError
 from jaxtank.limits import tightened
 from jaxtank.rig import check_limits
@@ -144,6 +144,7 @@ def tune_robust(
     >>> case = presets.find("gouta2015/backstepping")
     >>> tuning.tune_robust(case, samples=16, back_off=0.03).certificate  # doctest: +SKIP
     """
+    check_case(case, seed)
     check_numbers(low=2, samples=samples)
     check_numbers(fresh=fresh)
     number = isinstance(back_off, (int, float)) and not isinstance(back_off, bool)

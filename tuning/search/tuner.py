@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.bounds import WIDE, gain_ranges
-from jaxtank.case import Case, Free
+from jaxtank.case import Case, Free, check_case
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.limits import limited_levels, resolve_limits
@@ -135,6 +135,7 @@ def tune(
     >>> result = tuning.tune(presets.find("gouta2015/backstepping"))  # doctest: +SKIP
     >>> result["controller.k1"].after, result.answer.held  # doctest: +SKIP
     """
+    check_case(case.case if isinstance(case, Problem) else case, seed)
     options = options_of(method, starts=starts)
     implied = _implies_nominal(case, options)
     if nominal is False and implied:
@@ -448,6 +449,7 @@ def tune_by_rule(
     >>> round(result["controller.Kc[0]"].after, 2)
     0.31
     """
+    check_case(case, seed)
     began = time.perf_counter()
     check_precision()
     objective, limits = as_measures(objective, limits)

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.case import Case
+from jaxtank.case import Case, check_case
 from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError, NonFiniteError, unknown
 from jaxtank.core.labels import entry_label
@@ -124,6 +124,7 @@ def sensitivity(
     >>> found.parameters, [c.label for c in found.columns]
     (['plant.pump_gain[0]'], ['max_level of tank 1', 'max_level of tank 2'])
     """
+    check_case(case, seed)
     began, notes = time.perf_counter(), []
     if method not in METHODS:
         raise unknown("method", method, METHODS)
@@ -141,7 +142,6 @@ def sensitivity(
                 f"{name}: the effects of parameters that vary together cannot be separated; use"
                 " the local method"
             )
-    check_whole("seed", seed, 0, 2**31 - 1)
     if batch is not None:
         check_whole("batch", batch, 1)
     check_devices(devices)

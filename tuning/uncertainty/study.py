@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.case import Case
+from jaxtank.case import Case, check_case
 from jaxtank.core.checks import check_whole
 from jaxtank.limits import Limit, resolve_limits
 from jaxtank.loop import tank_bottom
@@ -114,6 +114,7 @@ def ensemble(
     >>> found.samples, found.measures["max_level"].shape
     (4, (4, 2))
     """
+    check_case(case)
     began = time.perf_counter()
     check_whole("samples", samples, 1, 2**31 - 1)
     check_whole("key", key, 0, 2**31 - 1)
