@@ -197,7 +197,8 @@ class Actuator(Role):
     @property
     def pumps(self) -> int:
         """Number of pumps m [-]."""
-        return np.shape(self.low)[-1]
+        low: Any = self.low  # scalars in the loop, where `reachable` has narrowed them
+        return len(low) if isinstance(low, tuple) else np.shape(low)[-1]
 
     @property
     def allocates(self) -> bool:

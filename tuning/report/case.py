@@ -95,8 +95,11 @@ def _parameters(case, preset):
     return parameters
 
 
-def report(case):
-    """Return the Report of a case: its rig, its loop, free parameters, and every parameter."""
+def report(case, word=""):
+    """Return the Report of a case: its rig, its loop, free parameters, and every parameter.
+
+    word : what a command takes for the case, of a rig file its path.
+    """
     page, preset, loop = json_of(case), _preset(case), case.loop
     title = f"{page['case']}: {page['title']}"
     head = [title, *([preset.citation, f"notes: {page['notes']}"] if preset else [])]
@@ -110,7 +113,8 @@ def report(case):
     described += [(loop.controller, "")] if inner is not None else []
     described += [(loop.observer, f"The observer: {page['observer']}")]
     setpoints = np.stack(loop.reference.sample(case.clock)[0], axis=-1)
-    go_on = [f"jaxtank {words} {case.name}" for words in ("simulate", "tune --out DIR")]
+    word = word or case.name
+    go_on = [f"jaxtank {words} {word}" for words in ("simulate", "tune --out DIR")]
     sections = [
         Text(head),
         Table([[what, text] for what, text in case.summary()[1:]], gap=True),

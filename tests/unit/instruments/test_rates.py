@@ -264,3 +264,21 @@ def test_exported_code_and_the_page_limit_the_rate_as_the_simulation_does():
     np.testing.assert_allclose(out["u"], run.applied, atol=1e-12)
     np.testing.assert_allclose(np.transpose(out["h"]), run.x, atol=1e-10)
     np.testing.assert_allclose(np.transpose(out["p"]), run.u, atol=1e-10)
+
+
+def test_the_safety_filter_takes_what_a_pump_reaches_at_its_rate():
+    """A rig of pumps and orifices, and one with a valve: each has a filter of its own."""
+    plain = """
+tank = [{ area = 100.0, rim = 30.0, drain = 0.5, level = 10.0 }]
+pump = [{ to = 1, gain = 30.0, high = 10.0, initial = 2.3, rate = 0.4 }]
+controller = { kind = "p", Kc = 4.0, bias = 2.3 }
+reference = { initial = [10.0], changes = [[5.0, 1, 27.0]], ramp = 0.0 }
+values = { "clock.dt" = 0.5, "clock.duration" = 60.0 }
+limits = { max_level = 25.0 }
+"""
+    for case, pump in ((rig.loads(plain), 0), (case_of(), 0)):
+        case = rig.filtered(case, True)
+        run = jaxtank.simulate(case)
+        steps = np.abs(np.diff(np.asarray(run.u)[:, pump])) / case.clock.dt
+        assert np.isfinite(run.x).all() and steps.max() <= case.loop.actuator.rate[pump] + 1e-9
+        assert all("rate" in c.reason for c in certificates_of(case) if c.limit)

@@ -1,6 +1,7 @@
 """`jaxtank list`, `show`, `simulate`, `init` and `export`: the cases, and one unchanged case."""
 
 import argparse
+import shlex
 import shutil
 import sys
 import textwrap
@@ -42,7 +43,7 @@ def show(args):
 
     written = _draw_rig(case, Path(args.out)) if args.out else []
     payload = manual.json_of(case) if args.json else None
-    print_result(args, payload, lambda: printed(manual.report(case)))
+    print_result(args, payload, lambda: printed(manual.report(case, shlex.quote(args.case))))
     report_written(written, args)
     return 0
 
