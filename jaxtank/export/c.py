@@ -12,7 +12,7 @@ class C(Printer):
     kinds = {REAL: "double", WHOLE: "int", TRUTH: "int"}
     truths = ("0", "1")
     constant, variable = "const {kind} {name} = {value};", "{kind} {name} = {value};"
-    empty, each = "{kind} {name}[{size}];", "for (int {0} = 0; {0} < {1}; ++{0}) {{"
+    empty, each = "{kind} {name}[{size}];", "for (int {0} = 0; {0} < {1}; ++{0})"
     open_array, close_array = "const {real} {name}[{size}] = {{", "};"
     matrix_call = "{real} {name}[{size}];\n{op}({arguments}, {name});"
     matrices = ("product", "cholesky", "forward", "backward", "solve")

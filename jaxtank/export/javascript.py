@@ -38,7 +38,7 @@ class JavaScript(Printer):
     nan, infinity = "NaN", "Infinity"
     constant, variable = "const {name} = {value};", "let {name} = {value};"
     empty = "const {name} = new Float64Array({size});"
-    each = "for (let {0} = 0; {0} < {1}; ++{0}) {{"
+    each = "for (let {0} = 0; {0} < {1}; ++{0})"
     open_array = "const {name} = ["
     matrix_call = "const {name} = {op}({arguments});"
     matrices = ("product", "cholesky", "forward", "backward", "solve")

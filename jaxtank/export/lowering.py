@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jax.extend.core import Literal
 
-from jaxtank.export.arrays import copied, elements_of, place_of
+from jaxtank.export.arrays import FEW, assembled, copied, elements_of, place_of
 from jaxtank.export.primitives import NAMED, RULES, constant, elements, kind_of, no_code, written
 from jaxtank.export.simplify import is_number, simplified
 from jaxtank.export.statements import REAL, Array, Define, Matrix, Ref, names, used
@@ -120,6 +120,10 @@ class WholeWriter(Writer):
             return name
         if self.loops and place_of(self, entries) is not None:
             return copied(self, kind, entries)
+        if self.loops and kind == REAL and entries.size > 4 * FEW:
+            joined = assembled(self, kind, entries)
+            if joined is not None:
+                return joined
         if len(self.scopes) > 1:
             return super().array(entries, kind)
         key = tuple((type(e), e) for e in elements)

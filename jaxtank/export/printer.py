@@ -155,7 +155,7 @@ class Printer:
 
     def _each(self, s):
         counters = [f"e{d}" for d in range(len(s.shape) + len(s.over))]
-        steps = [math.prod(s.shape[d + 1 :]) for d in range(len(s.shape))]
+        steps = s.steps or [math.prod(s.shape[d + 1 :]) for d in range(len(s.shape))]
         if s.array:
             target = self.rename.get(s.array, s.array)
             self.rename = {**self.rename, s.name: target}
@@ -189,7 +189,13 @@ class Printer:
         """Lines in loops over the axes of a shape."""
         for counter, size in reversed(list(zip(counters, shape))):
             inside = ["    " + line for line in lines]
-            lines = [self.each.format(counter, size, size - 1), *inside, self.end]
+            head = self.each.format(counter, size, size - 1)
+            if self.end != "}":
+                lines = [head, *inside, self.end]
+            elif sum(not line.startswith(" ") for line in lines) > 1:
+                lines = [head + " {", *inside, "}"]
+            else:
+                lines = [head, *inside]
         return lines
 
     def _argument(self, a, counters):

@@ -1,7 +1,7 @@
 """The statements of exported code, on scalars: output of lowering, input of the printers."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 REAL, WHOLE, TRUTH = "real", "whole", "truth"
@@ -59,6 +59,7 @@ class Each(NamedTuple):
     over: tuple = ()
     array: str = ""
     offset: Any = 0
+    steps: tuple = ()  # strides in it, where not row by row
 
     @property
     def reads(self):
@@ -203,7 +204,7 @@ def defined(statement: Statement) -> set[str]:
     return set() if isinstance(statement, Until) else {statement.name}
 
 
-def ranks(statements: Iterable[Statement], inputs: Mapping[str, int]) -> dict[str, int]:
+def ranks(statements: Sequence[Statement], inputs: Mapping[str, int]) -> dict[str, int]:
     """Return {name: rank} of every variable: the largest rank of its operands."""
     rank_of = dict(inputs)
     for s in statements:
@@ -214,7 +215,13 @@ def ranks(statements: Iterable[Statement], inputs: Mapping[str, int]) -> dict[st
         if isinstance(s, Array | Each) and s.kind != REAL:  # constants that are kept are reals
             rank = max(rank, 1)
         rank_of.update(dict.fromkeys(defined(s), rank))
-    return rank_of
+    first: dict[str, str] = {}  # an array that is written in place has one rank
+    for s in statements:
+        if isinstance(s, Each) and s.array:
+            first[s.name] = first.get(s.array, s.array)
+    for name, array in first.items():
+        rank_of[array] = max(rank_of[array], rank_of[name])
+    return rank_of | {name: rank_of[array] for name, array in first.items()}
 
 
 def local(loop: Loop) -> set[str]:
