@@ -411,7 +411,7 @@ def _counted(writer, eqn, consts, carry, sequences):
         k = writer.define(WHOLE, "sub", p["length"] - 1, counter) if p["reverse"] else counter
         start = lambda size: writer.define(WHOLE, "mul", k, size)
         rows = [
-            arrays.part_of(writer, kind, name, start(s[0].size), s.shape[1:])
+            arrays.part_of(writer, kind, name, start(math.prod(s.shape[1:])), s.shape[1:])
             for kind, name, s in zip(read, tables, sequences)
         ]
         out = writer.run(closed.jaxpr, closed.consts, [*consts, *carried[0], *rows])
