@@ -31,7 +31,7 @@ class Block:
     def __init__(self, text):
         tokens = [t for t in TOKENS.findall(text) if not t.startswith("(*")]
         assert tokens[0] == "FUNCTION_BLOCK" and tokens[-1] == "END_FUNCTION_BLOCK"
-        self.variables, at = {}, 2
+        self.variables, self.whole, at = {}, set(), 2
         while tokens[at].startswith("VAR"):
             end = tokens.index("END_VAR", at)
             start = at + 1 + (tokens[at + 1] == "CONSTANT")
@@ -40,6 +40,8 @@ class Block:
             at = end + 1
         lines, depth = [], 1
         for words in split(tokens[at:-1], "THEN", "DO", "ELSE"):
+            if words[0] in self.whole:  # whole numbers are divided without a rest
+                words = ["//" if word == "/" else word for word in words]
             depth -= words[0] in ("END_IF", "END_FOR", "ELSE", "ELSIF")
             if not words[0].startswith("END_"):
                 lines.append("    " * depth + python(words))
@@ -54,12 +56,14 @@ class Block:
     def _declare(self, words):
         name, kind = words[0], words[words.index(":") + 1]
         values = words[words.index(":=") + 1 :] if ":=" in words else []
+        if kind == "DINT":
+            self.whole.add(name)
         if kind != "ARRAY":
             self.variables[name] = eval("".join(values)) if values else {"BOOL": False}.get(kind, 0)
             return
         ends = [int(words[i + 1]) + 1 for i, w in enumerate(words) if w == ".."]
         flat = eval("".join(values)) if values else [0.0] * math.prod(ends)
-        array = np.array(flat, dtype=float).reshape(ends)
+        array = np.array(flat, dtype=int if "DINT" in words else float).reshape(ends)
         self.variables[name] = array
 
     def __call__(self, **inputs):
