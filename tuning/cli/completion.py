@@ -118,10 +118,13 @@ def _lines():
 
 def titles():
     """Return {case: title} of names.txt, and of the papers that were registered since."""
-    cases = dict(line.removeprefix("cases ").split("\t") for line in _lines() if "\t" in line)
-    presets = sys.modules.get("jaxtank.presets")  # none is registered where it is not imported
-    papers = () if presets is None else presets.PAPERS
-    return cases | {f"{p}/{n}": c.title for p in papers for n, c in presets.load(p).cases.items()}
+    pairs = (line.removeprefix("cases ").partition("\t") for line in _lines() if "\t" in line)
+    cases = {name: title for name, _, title in pairs}
+    if presets := sys.modules.get("jaxtank.presets"):  # none is registered where it is not imported
+        cases |= {
+            f"{p}/{n}": c.title for p in presets.PAPERS for n, c in presets.load(p).cases.items()
+        }
+    return cases
 
 
 def gather():
