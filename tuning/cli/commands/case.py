@@ -321,7 +321,7 @@ COMMANDS = {
     ),
     "replay": Command(
         replay,
-        "an export (C, JavaScript, FMU) run against a log: the largest difference of each input",
+        "run an export (C, JavaScript, FMU) that you trust against a log: largest difference by input",
         (
             *COMMON,
             Option("export", "EXPORT", "NAME.c, NAME.js or NAME.fmu of `jaxtank export`"),
