@@ -321,7 +321,7 @@ COMMANDS = {
     ),
     "replay": Command(
         replay,
-        "run an export (C, JavaScript, FMU) that you trust against a log: largest difference by input",
+        "run an export (C, JavaScript, FMU) that you trust against a log: differences of inputs",
         (
             *COMMON,
             Option("export", "EXPORT", "NAME.c, NAME.js or NAME.fmu of `jaxtank export`"),
