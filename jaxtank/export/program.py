@@ -258,13 +258,15 @@ def _lowered(case, plant, adjustable):
         ran = ran.observer, ran.controller
     state = jax.tree.map(lambda a: jax.ShapeDtypeStruct(np.shape(a), jnp.result_type(a)), ran)
     before = {} if plant else {"y": real(tanks), "u": real(pumps)}
+    # other controllers have arrays of a few entries
+    loops = not plant and case.loop.controller.alone
     if not adjustable:
         step, begin = functions({})
-        begun = lower_all(begin, before, Writer(loops=True))
-        done = lower_all(step, {"s": state, **arguments}, Writer(loops=True))
+        begun = lower_all(begin, before, Writer(loops))
+        done = lower_all(step, {"s": state, **arguments}, Writer(loops))
         return begun, done, sizes, {}
     with rolled():
-        first, writer = WholeWriter(loops=True), WholeWriter(loops=True)
+        first, writer = WholeWriter(loops), WholeWriter(loops)
         begun = lower_all(lambda p, *v: functions(p)[1](*v), given | before, first)
         writer.counter = first.counter  # no name twice
         step = lambda p, *v: functions(p)[0](*v)
