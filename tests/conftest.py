@@ -4,11 +4,9 @@ Compiled programs are kept in pytest's own cache between runs and shared by work
 subprocesses; `pytest --cache-clear` compiles everything anew.
 """
 
-import gc
 import os
 import re
 import shutil
-from pathlib import Path
 
 import jax
 import pytest
@@ -25,8 +23,6 @@ FOLDER = "JAX_COMPILATION_CACHE_DIR"
 LARGEST_CACHE = 2**30
 """Bytes of compiled programs above which a run begins without any."""
 
-LARGEST_WORKER = 2 * 10**9
-"""Bytes of memory of a process of tests from which on it forgets its compiled programs."""
 
 SKIPS = (
     r"no Chromium( on this machine)?$",  # and, of the same kind, what a machine may lack
@@ -79,19 +75,13 @@ def pytest_configure(config):
 
 
 def pytest_runtest_teardown(item, nextitem):
-    """Between two files take out registered measures, and forget compiled programs where they are
-    of such a measure or a worker holds more than LARGEST_WORKER.
-    """
+    """Take out the measures that a file has registered, and the programs that know them by name."""
     if nextitem is None or nextitem.path == item.path:
         return
-    registered = set(catalogue.MEASURES) - MEASURES
-    for name in registered:
-        del catalogue.MEASURES[name]
-    pages = Path("/proc/self/statm")  # of Linux
-    held = int(pages.read_text().split()[1]) if pages.exists() else 0
-    if registered or held * os.sysconf("SC_PAGE_SIZE") > LARGEST_WORKER:
+    if registered := set(catalogue.MEASURES) - MEASURES:
+        for name in registered:
+            del catalogue.MEASURES[name]
         jax.clear_caches()
-        gc.collect()
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest selects by marks

@@ -226,12 +226,13 @@ def test_results_are_on_the_disk_before_any_picture_is_drawn(
     def end(*_):
         raise Ended
 
+    whole = folder_of("tune")
     monkeypatch.setattr(responses, "responses", end)
     with pytest.raises(Ended):
         saves("tune")(tmp_path)
     files = {"result.json", "rig.toml", "trajectory.csv", "before.csv"}
     assert {path.name for path in tmp_path.iterdir()} == files
-    assert (tmp_path / "rig.toml").read_bytes() == (folder_of("tune") / "rig.toml").read_bytes()
+    assert (tmp_path / "rig.toml").read_bytes() == (whole / "rig.toml").read_bytes()
 
 
 @pytest.mark.parametrize("kind", KINDS)
