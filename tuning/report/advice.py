@@ -69,7 +69,7 @@ def limits_of(
     for row in rows:
         at_least = MEASURES[row["measure"]].sense < 0
         value = "undefined" if row["reason"] else amount(row["value"], row["unit"], 4)
-        bound = amount(row["limit"], row["unit"], 5)
+        bound = f"{row['limit']:.5g}" + (f" {row['unit']}" if row["unit"] not in ("", "-") else "")
         margin = "-" if row["reason"] else amount(row["margin"], row["unit"])
         cells.append([row["words"], ("≥ " if at_least else "≤ ") + bound, value, margin])
         cells[-1] += row.get("more", ["" if row["time_s"] is None else f"{row['time_s']:.4g} s"])

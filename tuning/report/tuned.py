@@ -215,14 +215,27 @@ def _by_tank(answer):
     """The table of the worst value of each limit over the validation plants."""
     if answer.after is None or not answer.after.limits:
         return []
-    certificates = {("max_level", row.tank): row for row in answer.setting.certificates}
+    certificates = {row.tank: row for row in answer.setting.certificates}
     rows, loop, samples = [], answer.setting.case.loop, answer.after.samples
     for row in answer.after.worst():
-        known = certificates.get(row["limit"].key)
-        proof = "no" if known is None else ("yes" if known.certified else f"no: {known.reason}")
+        measure, tank = row["limit"].key
         limit = row_of(row["limit"], loop, row["value"]).to_json()
+        most = np.asarray(loop.plant.rim)[tank] if measure == "overflow_volume" else limit["limit"]
+        proof = _proof(certificates.get(tank), measure, most)
         rows.append(limit | {"more": [f"{row['broken']} of {samples}", proof]})
     return [advice.limits_of(rows, ["worst", "margin", "broken on plants", "proved"])]
+
+
+def _proof(certificate, measure, limit):
+    """Whether a TankCertificate proves a limit on the level, of the overflow that is its rim."""
+    if certificate is None or measure not in ("max_level", "overflow_volume", "min_level"):
+        return "no"
+    proved, reason = certificate.certified, certificate.reason
+    holds = certificate.limit <= limit
+    if measure == "min_level":
+        proved, reason = certificate.low_certified, certificate.low_reason
+        holds = certificate.low >= limit
+    return f"no: {reason}" if not proved else "yes" if holds else "no"
 
 
 def answer_text(answer):

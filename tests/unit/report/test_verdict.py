@@ -2,6 +2,7 @@
 setpoint, a broken limit and an unstable loop are not good.
 """
 
+import dataclasses
 import functools
 import json
 
@@ -14,11 +15,12 @@ from jaxtank import presets, rig
 from jaxtank.export import export
 from jaxtank.live.engine import engine
 from jaxtank.live.page import _script
+from jaxtank.safety import TankCertificate
 from tuning.cli import main
 from tuning.cli.parser import COMMANDS, parser
 from tuning.feasible import study
 from tuning.problem.reported import run_measures
-from tuning.report import advice
+from tuning.report import advice, tuned
 from tuning.report import verdict as verdicts
 
 PAGE = """
@@ -201,3 +203,15 @@ def test_the_json_of_every_command_has_a_verdict(command, tmp_path, monkeypatch,
         assert verdict["sentence"] in " ".join(printed.split())
         wide = [command, TWO, *QUICK, "--set", "plant.pump_gain=2", "--quiet"]
         assert main.main(wide) == 0 and main.main([*wide, "--check"]) == 4
+
+
+def test_a_limit_is_proved_where_the_certificate_is_at_least_as_strict():
+    proved = TankCertificate(0, 10.0, True, "theorem 1", 0.1, 0.2, 0.5, 9.9, low=1.0)
+    failed = dataclasses.replace(proved, certified=False, reason="not covered: leak")
+    low = dataclasses.replace(proved, low_certified=True)
+    proof = tuned._proof
+    assert proof(proved, "max_level", 10.0) == proof(proved, "overflow_volume", 10.0) == "yes"
+    assert proof(proved, "max_level", 9.0) == proof(proved, "rise_time", 9.0) == "no"
+    assert proof(failed, "overflow_volume", 10.0) == "no: not covered: leak"
+    assert proof(None, "max_level", 10.0) == "no" and proof(low, "min_level", 0.5) == "yes"
+    assert proof(low, "min_level", 1.5) == "no"
