@@ -2,7 +2,6 @@
 
 import contextlib
 import math
-import numbers
 from collections.abc import Collection, Generator, Mapping
 from typing import Any, cast
 
@@ -134,7 +133,8 @@ def check_order(name: str, part: Any, lower: str, upper: str, equal: bool = Fals
 
 def check_whole(name: str, value: Any, low: int, high: int | None = None) -> None:
     """Raise InputError unless `value` is a whole number from `low` to `high`."""
-    good = isinstance(value, numbers.Integral) and not isinstance(value, bool) and value >= low
+    whole: Any = (int, np.integer)
+    good = isinstance(value, whole) and not isinstance(value, bool) and value >= low
     if not good or (high is not None and value > high):
         ends = f"of at least {low}" if high is None else f"from {low} to {high}"
         raise InputError(f"{name} = {value!r}: must be a whole number {ends}")

@@ -8,7 +8,7 @@ All are pure: jit, vmap, grad and jacfwd work on them with the loop as an argume
 
 import functools
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import jax
@@ -267,8 +267,9 @@ def sensitivities(
 
 
 def _names(measures: str | Sequence[str] | Mapping[str, Any]) -> tuple[str, ...]:
-    one = isinstance(measures, str) or not isinstance(measures, Iterable)
-    names = (measures,) if one else tuple(measures)
+    stated: Any = measures  # of any type, from a caller
+    several = hasattr(stated, "__iter__") and not isinstance(measures, str)
+    names: tuple[str, ...] = tuple(stated) if several else (stated,)
     ms.check_names(names)
     return names
 

@@ -72,5 +72,5 @@ def simulate_compiled(
     share = None if shares is None else jnp.stack(shares, axis=-1)
     names = loop.observer.mode_names(loop.plant)
     modes = saved.modes if names else None
-    rows = Trajectory(**columns, units=loop.units, share=share, modes=modes, mode_names=names)
-    return rows, is_broken(state)
+    run = Trajectory(**columns, units=loop.units, share=share, modes=modes, mode_names=names)
+    return run, is_broken(state)

@@ -1,6 +1,7 @@
 """The equations of a rig in plain text, read from its topology: with letters, and in numbers."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -86,7 +87,7 @@ def _streams(plant):
     yield from _through_valves(plant, root)
 
 
-def _entry(plant, name, k):
+def _entry(plant, name, k) -> Any:
     value = getattr(plant, name)
     return None if value is None else float(value[k])
 
