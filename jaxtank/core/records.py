@@ -51,6 +51,8 @@ class Estimate(NamedTuple):
     d: Sequence[Any] = ()
     # of a bank of H fault models: (2 H,) probabilities, then sizes of the faults; else empty
     modes: Any = ()
+    # values of the entries of the model that the observer estimates (`Observer.coefficients`)
+    coefficients: Sequence[Any] = ()
 
 
 class Sample(NamedTuple):
@@ -73,3 +75,4 @@ class Sample(NamedTuple):
     filtered: Any = 0.0  # 1 where the safety filter changed an input, else 0
     slack: Any = 0.0  # by which the controller gives up a limit of a level [cm]
     modes: Any = ()  # as in Estimate
+    coefficients: Sequence[Any] = ()  # as in Estimate

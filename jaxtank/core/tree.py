@@ -382,6 +382,19 @@ def with_values(tree: T, values: Mapping[str, Any]) -> T:
     return tree
 
 
+def with_entries(tree: T, functions: Iterable[tuple[str, Callable[[Any], Any]]]) -> T:
+    """Return a component with entries such as "drain[1]" replaced by functions of them, one after
+    the other; their leaves become tuples of numbers."""
+    leaves: dict[str, list[Any]] = {}
+    for name, function in functions:
+        field, (index,) = split_index(name)
+        whole: Any = getattr(tree, field)
+        entries = leaves.setdefault(field, [whole[i] for i in range(np.shape(whole)[0])])
+        entries[index] = function(entries[index])
+    values = {field: tuple(entries) for field, entries in leaves.items()}
+    return cast(T, dataclasses.replace(cast(Any, tree), **values))
+
+
 def split_index(name: str) -> tuple[str, tuple[int, ...]]:
     """Return a dotted name without its index, and the index."""
     parts = name.split(".")

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxtank.core.clock import Clock
+from jaxtank.core.tree import describe
 from jaxtank.core.vectors import each, is_array, zeros
 from jaxtank.loop.closed_loop import (
     ClosedLoop,
@@ -73,4 +74,10 @@ def simulate_compiled(
     names = loop.observer.mode_names(loop.plant)
     modes = saved.modes if names else None
     run = Trajectory(**columns, units=loop.units, share=share, modes=modes, mode_names=names)
+    if drifting := loop.observer.coefficients:
+        meta = [describe(cast(Any, loop.observer).model, name) for name in drifting]
+        run = run.replace(
+            coefficients=jnp.stack(saved.coefficients, axis=-1),
+            coefficient_names=tuple((n, m["unit"]) for n, m in zip(drifting, meta)),
+        )
     return run, is_broken(state)

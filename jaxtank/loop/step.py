@@ -66,6 +66,7 @@ def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[Sta
         filtered=decision.filtered,
         slack=decision.slack,
         modes=estimate.modes,
+        coefficients=estimate.coefficients,
     )
     return moved._replace(observer=decision.observer, controller=decision.controller), sample
 

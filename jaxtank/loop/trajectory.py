@@ -36,8 +36,8 @@ COLUMNS = (*("t", "x", "y", "x_hat", "d_hat", "r", "e"), *("command", "applied",
 
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=(*COLUMNS, "share", "modes"),
-    meta_fields=("units", "mode_names"),
+    data_fields=(*COLUMNS, "share", "modes", "coefficients"),
+    meta_fields=("units", "mode_names", "coefficient_names"),
 )
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Trajectory(TrajectoryViews):
@@ -68,6 +68,9 @@ class Trajectory(TrajectoryViews):
     modes : (rows, 2 modes) array or None
         Of a `FaultBank`, the probability of each fault [-], then the size it has if it is there.
     mode_names : ((name, unit of the size, "" without one), ...) of these faults; () without a bank
+    coefficients : (rows, coefficients) array or None
+        Estimates of the entries of the model that the observer estimates.
+    coefficient_names : ((name, unit), ...) of these entries, such as ("drain[0]", "cm^2")
 
     Examples
     --------
@@ -96,6 +99,8 @@ class Trajectory(TrajectoryViews):
     share: Any = None
     modes: Any = None
     mode_names: tuple[tuple[str, str], ...] = ()
+    coefficients: Any = None
+    coefficient_names: tuple[tuple[str, str], ...] = ()
 
     def replace(self, **changes: Any) -> "Trajectory":
         """Return a copy with the named fields changed."""
@@ -110,6 +115,9 @@ class Trajectory(TrajectoryViews):
         names = [*COLUMNS, *(["share"] if self.share is not None else [])]
         result: dict[str, Any] = {"units": {name: units[name] for name in names}}
         result |= {name: clean(getattr(self, name)) for name in names}
+        for k, (name, unit) in enumerate(self.coefficient_names):
+            values = clean(np.asarray(self.coefficients)[..., k])
+            result.setdefault("coefficients", {})[name] = {"values": values, "unit": unit}
         return result | ({"diagnosis": self.diagnosis} if self.mode_names else {})
 
     @property
@@ -183,6 +191,8 @@ def columns(
                 table[key, unit_of_entry] = column
     for k, (name, _) in enumerate(run.mode_names):
         table[f"probability of {name}", "-"] = np.asarray(run.modes)[:, k]
+    for k, (name, unit) in enumerate(run.coefficient_names):
+        table[f"estimate of {name}", unit] = np.asarray(run.coefficients)[:, k]
     if dimension is None:
         return {f"{name} [{unit}]": values for (name, unit), values in table.items()}
     return {

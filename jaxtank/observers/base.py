@@ -19,6 +19,9 @@ class Observer(Role):
     ()
     """
 
+    coefficients: tuple[str, ...] = ()
+    """Entries of its model that it estimates, such as "drain[0]"."""
+
     def init(self, x0: tuple[Any, ...]) -> Any:
         """Return the state before the first sample, for levels x0 (n) [cm] at t = 0."""
         return ()

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.core.tree import POSITIVE, component, leaf, static
+from jaxtank.core.tree import POSITIVE, component, leaf, split_index, static, with_entries
 from jaxtank.observers.base import Observer
-from jaxtank.observers.checks import check_disturbed, check_model, check_tanks
+from jaxtank.observers.checks import check_coefficients, check_disturbed, check_model, check_tanks
 from jaxtank.plants.base import Plant
 from jaxtank.plants.elements import sections
 from jaxtank.plants.runge_kutta import advance
@@ -21,10 +21,11 @@ SMALLEST = 1e-14
 
 
 class Belief(NamedTuple):
-    """State of the extended filter, of n tanks and N = n + disturbed numbers."""
+    """State of the extended filter, of n tanks and N = n + disturbed + coefficients numbers."""
 
-    x: Sequence  # (N) levels [cm], then disturbances of level rates [cm/s]
+    x: Sequence  # (N) levels [cm], disturbances of level rates [cm/s], logarithms of coefficients
     P: tuple  # (N) rows of N covariances [cm^2, cm^2/s, cm^2/s^2]
+    u: Sequence = ()  # (m) last inputs within the limits [V], where coefficients are estimated
 
 
 @component
@@ -44,6 +45,12 @@ class ExtendedKalman(Observer):
     random walk that gains the variance `walk` per second and is 0 at first; x is then extended by
     them, d(k+1) = d(k), and the controller receives the estimate. There can be no more of them than
     measured tanks, and each must act on one.
+
+    `coefficients` names entries of the model that drift, such as "pump_gain[0]" or "drain[1]": each
+    is its value in the model times exp(s), s a random walk that begins at 0 with the variance
+    `coefficient_spread` and gains `coefficient_walk` per second (the joint state, Ljung 1979). The
+    controller receives as d also what the new coefficients add to the level rates at the last
+    inputs.
 
     Examples
     --------
@@ -95,9 +102,26 @@ class ExtendedKalman(Observer):
         default=None,
         shape="tank",
     )
+    coefficient_spread: Any = leaf(
+        "-",
+        "variance of the logarithm of each of `coefficients` at t = 0: of its relative error",
+        **POSITIVE,
+        like="coefficient_walk",
+        default=None,
+    )
+    coefficient_walk: Any = leaf(
+        "1/s",
+        "variance that the logarithm of each of `coefficients` gains per second",
+        low=0.0,
+        like="coefficient_spread",
+        default=None,
+    )
     measured: tuple = static(doc="tanks whose levels are measured, counted from 0")
     disturbed: tuple = static(
         doc="tanks whose rate has a disturbance that is estimated, counted from 0", default=()
+    )
+    coefficients: tuple = static(
+        doc='entries of the model that are estimated too, such as "pump_gain[0]"', default=()
     )
     substeps: int = static("-", "integrator steps per sample", low=1, high=10, default=1)
     integrator: str = static(
@@ -107,50 +131,77 @@ class ExtendedKalman(Observer):
     def init(self, x0: tuple) -> Any:
         n = range(len(x0))
         x = x0 if self.start is None else tuple(self.start[i] + 0.0 * x0[i] for i in n)
-        zero, N = 0.0 * x0[0], range(len(x0) + len(self.disturbed))
+        zero = 0.0 * x0[0]
+        walks, logarithms = [zero for _ in self.disturbed], [zero for _ in self.coefficients]
+        variances = [self.spread[i] + 0.0 * x0[i] for i in n] + walks
+        variances += [self.coefficient_spread + v for v in logarithms]
+        N = range(len(variances))
         return Belief(
-            x=(*x, *(zero for _ in self.disturbed)),
-            P=tuple(
-                tuple(self.spread[i] + 0.0 * x0[i] if i == j and i in n else zero for j in N)
-                for i in N
-            ),
+            x=(*x, *walks, *logarithms),
+            P=tuple(tuple(variances[i] if i == j else zero for j in N) for i in N),
+            u=(zero,) * self.model.pumps if self.coefficients else (),
         )
 
     def step(self, state: Any, tick: Tick, y: Sequence) -> tuple[Estimate, Any]:
-        x, P = state
+        x, P = self._corrected(state, y)
+        return self._estimate(x, state.u, tick), Belief(x, P, state.u)
+
+    def _corrected(self, state, y):
+        """((N) numbers, (N) rows of N covariances) of a Belief after readings y (n)."""
+        x, P, _ = state
         n = range(len(x))
         for i in self.measured:
             K = [P[j][i] / (P[i][i] + self.measurement[i]) for j in n]
             x = tuple(x[j] + K[j] * (y[i] - x[i]) for j in n)
             P = _symmetric([[P[j][k] - K[j] * P[i][k] for k in n] for j in n])
-        levels, d = self._parts(x)
-        return Estimate(x=levels, d=d), Belief(x, P)
+        return x, P
+
+    def _estimate(self, x, u, tick):
+        """The Estimate of a state, with last inputs u."""
+        levels, d, plant = self._parts(x)
+        if not self.coefficients:
+            return Estimate(x=levels, d=d)
+        rates = [of.derivative(tick.t, levels, u, None) for of in (plant, self.model)]
+        added = tuple(after - before for after, before in zip(*rates))
+        entries = [split_index(name) for name in self.coefficients]
+        return Estimate(
+            x=levels,
+            d=tuple(a + b for a, b in zip(added, d)) if d else added,
+            coefficients=tuple(getattr(plant, field)[i] for field, (i,) in entries),
+        )
 
     def _parts(self, x):
-        """((n) levels [cm], (n) disturbances [cm/s], () without `disturbed`) of a state."""
-        levels, disturbances = x[: self.model.tanks], x[self.model.tanks :]
-        if not self.disturbed:
-            return levels, ()
-        d = [0.0 * h for h in levels]
-        for i, value in zip(self.disturbed, disturbances):
+        """((n) levels [cm], (n) disturbances [cm/s], () without `disturbed`, model) of a state."""
+        model, n, after = self.model, self.model.tanks, self.model.tanks + len(self.disturbed)
+        levels, d = x[:n], [0.0 * h for h in x[:n]] if self.disturbed else []
+        for i, value in zip(self.disturbed, x[n:after]):
             d[i] = value
-        return levels, tuple(d)
+        if self.coefficients:
+            factors = [lambda value, s=s: value * jnp.exp(s) for s in x[after:]]
+            model = with_entries(model, zip(self.coefficients, factors))
+        return levels, tuple(d), model
 
     def predict(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
-        model, N, n = self.model, range(len(state.x)), self.model.tanks
-        walk = cast(Any, self.walk)
-
-        def onward(x):  # the levels alone: a random walk stays where it is
-            levels, d = self._parts(x)
-            inflow = tuple(a * v for a, v in zip(sections(model, levels), d)) if d else None
-            return advance(
-                model, self.integrator, tick.t, levels, applied, inflow, tick.dt, self.substeps
-            ).x
-
-        levels, P = self._moved(onward, *state)
-        gained = [self.process[i] for i in range(n)] + [walk[i] for i in self.disturbed]
+        x, N, n = state.x, range(len(state.x)), self.model.tanks
+        levels, P = self._moved(lambda x: self._onward(x, applied, tick), x, state.P)
+        gained = self._gained()
         P = [[P[i][j] + (gained[i] * tick.dt if i == j else 0.0) for j in N] for i in N]
-        return Belief((*levels, *state.x[n:]), _symmetric(P))
+        u = tuple(applied) if self.coefficients else ()
+        return Belief((*levels, *x[n:]), _symmetric(P), u)
+
+    def _onward(self, x, applied, tick):
+        """(n) levels a sample later; a random walk stays where it is."""
+        levels, d, model = self._parts(x)
+        inflow = tuple(a * v for a, v in zip(sections(model, levels), d)) if d else None
+        known = model, self.integrator, tick.t, levels, applied, inflow
+        return advance(*known, tick.dt, self.substeps).x
+
+    def _gained(self):
+        """(N) variances that the state gains per second."""
+        walk = cast(Any, self.walk)
+        gained = [self.process[i] for i in range(self.model.tanks)]
+        gained += [walk[i] for i in self.disturbed]
+        return gained + [self.coefficient_walk for _ in self.coefficients]
 
     def _moved(self, onward: Any, x: Sequence, P: Sequence) -> tuple[Sequence, list]:
         """Return the (n) levels a sample later and the (N) rows of N covariances, without noise."""
@@ -168,6 +219,7 @@ class ExtendedKalman(Observer):
     def check(self, plant: Plant) -> None:
         check_model(self, plant)
         check_tanks(self, "measured", plant)
+        check_coefficients(self)
         # half full, each tank a little differently: levels at which no two flows cancel
         check_disturbed(self, plant, self.model.rim, 0.5 + 0.01 * np.arange(plant.tanks))
 
@@ -206,7 +258,7 @@ class UnscentedKalman(ExtendedKalman):
     def _moved(self, onward: Any, x: Sequence, P: Sequence) -> tuple[Sequence, list]:
         N, n = range(len(x)), self.model.tanks
         root, points = math.sqrt(len(x)), []
-        for column in _columns(P):
+        for column in columns_of(P):
             for sign in (root, -root):
                 point = tuple(x[i] + sign * column[i] for i in N)
                 points.append((*onward(point), *point[n:]))
@@ -216,7 +268,7 @@ class UnscentedKalman(ExtendedKalman):
         return levels, [[share * sum(d[i] * d[j] for d in away) for j in N] for i in N]
 
 
-def _columns(P):
+def columns_of(P):
     """Return the columns of L, L L' = P; that of a number without a variance is 0."""
     N, columns = range(len(P)), []
     for j in N:

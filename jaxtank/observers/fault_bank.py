@@ -1,6 +1,5 @@
 """Bank of extended Kalman filters, one for each single fault of a rig, with their probabilities."""
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
@@ -11,7 +10,7 @@ import numpy as np
 from jaxtank.core.errors import InputError
 from jaxtank.core.labels import label_of
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.core.tree import POSITIVE, component, leaf, static
+from jaxtank.core.tree import POSITIVE, component, leaf, static, with_entries
 from jaxtank.core.units import local
 from jaxtank.observers.base import Observer
 from jaxtank.observers.checks import check_model, check_tanks
@@ -237,14 +236,12 @@ class FaultBank(Observer):
 
     def _faulty(self, s, mode):
         """The model with the fault of a mode, of size s; mode: (H,) 1 at its place, else 0."""
-        model = cast(Any, self.model)
-        changes: dict[str, list] = {}
-        for k, ((_, field, i, _), scale) in enumerate(zip(self.modes, self._scales())):
-            if field:
-                whole = getattr(model, field)
-                values = changes.setdefault(field, [whole[j] for j in range(np.shape(whole)[0])])
-                values[i] = values[i] + mode[k] * s * scale
-        return dataclasses.replace(model, **{f: tuple(v) for f, v in changes.items()})
+        changes = [
+            (f"{field}[{i}]", lambda value, k=k, scale=scale: value + mode[k] * s * scale)
+            for k, ((_, field, i, _), scale) in enumerate(zip(self.modes, self._scales()))
+            if field
+        ]
+        return with_entries(self.model, changes)
 
     def _scales(self):
         """What a size of 1 adds to the entry of each mode: the largest opening to a leak's."""

@@ -1,6 +1,7 @@
 """Faults: parameters of the plant that change for a while, and readings that are wrong."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Self, cast
 
@@ -10,7 +11,16 @@ import numpy as np
 from jaxtank.core.clock import Clock, pointwise, sample_times
 from jaxtank.core.errors import InputError
 from jaxtank.core.labels import label_of
-from jaxtank.core.tree import component, describe, get_value, leaf, number, split_index, static
+from jaxtank.core.tree import (
+    component,
+    describe,
+    get_value,
+    leaf,
+    number,
+    split_index,
+    static,
+    with_entries,
+)
 from jaxtank.core.vectors import is_array
 from jaxtank.plants.base import Plant
 
@@ -199,21 +209,14 @@ class Faults:
         for k, (name, _, _) in enumerate(self.windows):
             field, (index,) = split_index(name)
             entries = changed.get(field, jnp.asarray(getattr(plant, field)))
-            faulty = self._faulty(k, entries, active)
+            faulty = self._faulty(k, active, entries)
             changed[field] = jnp.where(np.arange(entries.shape[0]) == index, faulty, entries)
         return dataclasses.replace(cast(Any, plant), **changed)
 
     def apply(self, plant: Plant, active: Sequence) -> Plant:
         """Return the plant of a sample; active: one number per fault, 1 while it lasts."""
-        changed = {}
-        for k, (name, _, _) in enumerate(self.windows):
-            field, (index,) = split_index(name)
-            whole = getattr(plant, field)
-            entries = changed.setdefault(field, [whole[i] for i in range(np.shape(whole)[0])])
-            entries[index] = self._faulty(k, entries[index], active)
-        return dataclasses.replace(
-            cast(Any, plant), **{field: tuple(entries) for field, entries in changed.items()}
-        )
+        faulty = [functools.partial(self._faulty, k, active) for k in range(len(self.windows))]
+        return with_entries(plant, zip((name for name, _, _ in self.windows), faulty))
 
     def seen(self, x: Any, xi: Any, active: Sequence) -> Any:
         """Return the levels that faulty sensors see; xi: deviates of their noise, None without."""
@@ -234,7 +237,7 @@ class Faults:
                 y = _with_entry(y, fault.tank, entry)
         return y
 
-    def _faulty(self, k, value, active):
+    def _faulty(self, k, active, value):
         """`value` of an entry under fault k."""
         share = 1.0 + (self.factor[k] - 1.0) * active[k]
         return value * share + self.extra[k] * active[k]

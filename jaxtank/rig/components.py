@@ -26,9 +26,10 @@ from jaxtank.observers import (
 )
 from jaxtank.plants.elements import input_flows
 from jaxtank.plants.hydraulics import in_unit
-from jaxtank.rig.entry import Problems, hyphened, read_entry, sizes_of, unknown_key
+from jaxtank.rig.entry import Problems, hyphened, is_texts, read_entry, sizes_of, unknown_key
 from jaxtank.rig.schema import NEEDED, OPEN_LOOP, Key, Section, type_of
-from jaxtank.rig.signals import ramp_values, ramps_of
+from jaxtank.rig.signals import entry_named, ramp_values, ramps_of
+from jaxtank.rig.values import dotted_name
 from jaxtank.signals.setpoints import Ramps, ramps
 
 
@@ -238,6 +239,8 @@ def _key(cls, field, kind, units):
     if kind == "pi" and field.name == "Ti":
         default = NEEDED
     changes = {}
+    if issubclass(cls, ExtendedKalman) and field.name == "coefficients":
+        changes["kind"] = "texts"
     if issubclass(cls, controllers.PID) and field.name in INPUTS:
         changes["kind"] = "sequence" if field.name == "sequence" else "inputs"
     if field.metadata["kind"] == "leaf":
@@ -323,6 +326,10 @@ def observer_of(table, loop):
         "inputs": loop.actuator.initial,
         "measured": list(range(1, loop.plant.tanks + 1)),
     }
+    if isinstance(table, dict) and is_texts(table.get("coefficients")):
+        names = [entry_named(name, loop.plant) for name in table["coefficients"]]
+        names = [dotted_name(loop, name).removeprefix("plant.") for name in names]
+        table = {**table, "coefficients": names}
     return component("observer", table, loop, offered, model_of(loop))
 
 
@@ -459,6 +466,7 @@ def values_of(name, part):
             raise InputError("its OpenLoop plays a signal that no rig file describes")
         return section, {"kind": kind, **ramp_values(part.signal)}
     values = {key.name: getattr(part, key.name) for key in section.keys[1:]}
+    values = {n: v for n, v in values.items() if section[n].kind != "texts" or v}
     for key in section.keys:
         tanks = values.get(key.name)
         if key.kind == "tanks" and not all(type(i) is int for i in tanks or ()):

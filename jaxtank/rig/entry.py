@@ -257,9 +257,14 @@ def _flag(key, label, value, sizes):
 
 
 def _texts(key, label, value, sizes):
-    if not (isinstance(value, list) and value and all(isinstance(v, str) for v in value)):
+    if not (value and is_texts(value)):
         raise refusal(label, value, f"be a list of texts: {key.doc}")
-    return [name_of(label, text) for text in value]
+    return tuple(name_of(label, text) for text in value)
+
+
+def is_texts(value):
+    """Whether a value is a list of texts."""
+    return isinstance(value, list | tuple) and all(isinstance(v, str) for v in value)
 
 
 def hyphened(text: str) -> str:

@@ -299,7 +299,7 @@ def faults_of(entries, loop, dotted):
                     faults(plant, (), sensors[-1:])
                     continue
                 values = (e[name] for name in ("start", "end", "factor", "extra"))
-                of = dotted(loop, _of_fault(e["of"], plant)).removeprefix("plant.")
+                of = dotted(loop, entry_named(e["of"], plant)).removeprefix("plant.")
                 events.append((of, *values))
                 faults(plant, events[-1:])
             except InputError as error:
@@ -344,8 +344,8 @@ NOT_BELOW = {"noise": 0.0}
 """{kind of a fault of a sensor: its least size}."""
 
 
-def _of_fault(of, plant):
-    """A name of what a fault is of: "P101" is the gain of that pump, "FV101" the valve's area."""
+def entry_named(of, plant):
+    """A name of an entry: "P101" is the gain of that pump, "FV101" the area of that valve."""
     kind = next((kind for kind, names in plant.names if of in names), "")
     if kind in ("tank", "sensor"):
         raise InputError(f'{of} is a {kind}: must be one of its numbers, as of = "{of}.drain"')

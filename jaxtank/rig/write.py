@@ -242,7 +242,7 @@ def _settable(case):
         # a tuple is the topology of the rig; an array of a rig without pipes, say, is empty
         empty = isinstance(value, tuple) or (value is not None and np.size(value) == 0)
         # what a rig does not have is added by its tables, not by a value
-        curve = name.startswith("sensor.curve")
+        curve = name.startswith(("sensor.curve", "observer.coefficient_"))
         inside = name.rpartition(".")[0].endswith(("plant", "model"))
         empty = empty or (value is None and (inside or curve))
         if not empty and not name.startswith(tables) and name not in scheduled:

@@ -468,6 +468,11 @@ def observed():
 
 FOUR = functools.partial(state_coupled_four_tank, FAST_AREA)
 FILTER = {"process": np.full(4, 0.02), "measurement": np.full(4, 0.05), "measured": (0, 1)}
+DRIFT = {
+    "coefficients": ("pump_gain[0]", "drain[1]"),
+    "coefficient_spread": np.array(0.02),
+    "coefficient_walk": np.array(1e-3),
+}
 WALKS = {**FILTER, "walk": np.full(4, 0.03), "disturbed": (2, 3)}
 OBSERVERS = {
     "Kalman": lambda: observers.Kalman(
@@ -485,6 +490,9 @@ OBSERVERS = {
     ),
     "ExtendedKalman with disturbances": lambda: observers.ExtendedKalman(
         model=FOUR(), spread=np.full(4, 0.3), start=np.full(4, 7.0), **WALKS
+    ),
+    "ExtendedKalman with coefficients": lambda: observers.ExtendedKalman(
+        model=FOUR(), spread=np.full(4, 0.3), start=np.full(4, 7.0), **FILTER, **DRIFT
     ),
     "DisturbanceObserver without a sensor": lambda: observers.DisturbanceObserver(
         model=FOUR(), l=np.array([0.5, 0.7, 0.9, 1.1]), measured=(0, 1, 3)
@@ -505,6 +513,7 @@ of_observer("UnscentedKalman", 4, 1)
 of_observer("DisturbanceObserver", 2, 3)
 of_observer("Kalman with disturbances", 4, 1)
 of_observer("ExtendedKalman with disturbances", 4, 1)
+of_observer("ExtendedKalman with coefficients", 4, 1)
 of_observer("DisturbanceObserver without a sensor", 4, 3)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder, write_folder
+from jaxtank.core.tree import get_value
 from jaxtank.core.units import local
 from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv, stride
@@ -74,11 +75,36 @@ def _brief(case, values):
     return [m for m in names if m in values][: len(BRIEF)]
 
 
-def diagnosis_of(case, key):
-    """Return the faults that a bank of fault models named in a run; None without a bank."""
-    if not case.loop.observer.mode_names(case.loop.plant):
-        return None
-    return lp.simulate(case.loop, case.clock, key).diagnosis
+def estimates_of_run(case, key):
+    """Return {"diagnosis": the faults that a bank of fault models named in a run, "coefficients":
+    the coefficients of the model that were estimated}, as far as the observer has them.
+    """
+    observer = case.loop.observer
+    has_modes, names = bool(observer.mode_names(case.loop.plant)), observer.coefficients
+    if not has_modes and not names:
+        return {}
+    run = lp.simulate(case.loop, case.clock, key)
+    rows = [
+        {"name": name, "model": float(get_value(observer.model, name)), "estimate": v, "unit": unit}
+        for (name, unit), v in zip(run.coefficient_names, np.ravel(run.coefficients)[-len(names) :])
+    ]
+    diagnosis = {"diagnosis": run.diagnosis} if has_modes else {}
+    return diagnosis | ({"coefficients": clean(rows)} if names else {})
+
+
+def _coefficients(rows):
+    """The section on the coefficients that were estimated."""
+    heads = ["estimated coefficient", "in the model", "at the end", "change [%]"]
+    table = [
+        [
+            row["name"],
+            Value(row["model"], 5, row["unit"]),
+            Value(row["estimate"], 5, row["unit"]),
+            Value(100.0 * (row["estimate"] / row["model"] - 1.0), 3),
+        ]
+        for row in rows
+    ]
+    return [Table(table, heads)]
 
 
 def _diagnosis(diagnosis):
@@ -97,7 +123,7 @@ def _diagnosis(diagnosis):
     return [Table(rows, heads)] if rows else [Text(["no fault is diagnosed"], gap=True)]
 
 
-def report(case, values, plateaus=None, every=False, diagnosis=None):
+def report(case, values, plateaus=None, every=False, estimated=None):
     """Return the Report of a run with the measures `values`; `every`: all of them on a terminal."""
     loop, limits = case.loop, verdicts.limit_rows(case, values)
     facts = [("length", f"{case.clock.duration:g} s"), ("sampled every", f"{case.clock.dt:g} s")]
@@ -122,7 +148,10 @@ def report(case, values, plateaus=None, every=False, diagnosis=None):
             Text(undefined(values, loop.plant), on="page"),
         ]
     sections += [*(_margins(loop, plateaus) if plateaus is not None else ())]
-    sections += [*(_diagnosis(diagnosis) if diagnosis is not None else ())]
+    parts = {"diagnosis": _diagnosis, "coefficients": _coefficients}
+    sections += [
+        section for name, rows in (estimated or {}).items() for section in parts[name](rows)
+    ]
     if loop.safety_filter is not None:
         words = "The safety filter is on: jaxtank show prints what is proved of each tank."
         sections.append(Text([words], gap=True, on="terminal"))

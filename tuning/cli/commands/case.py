@@ -98,9 +98,9 @@ def simulate(args):
     plateaus = stability_margins(case.loop, case.clock) if args.margins else None
     measures |= reported.margin_measures(case.loop, case.clock) if args.margins else {}
     payload = simulated.json_of_run(case, measures, args.seed, plateaus)
-    diagnosis = simulated.diagnosis_of(case, key)
-    payload |= {} if diagnosis is None else {"diagnosis": diagnosis}
-    page = lambda: simulated.report(case, measures, plateaus, args.all, diagnosis)
+    estimated = simulated.estimates_of_run(case, key)
+    payload |= estimated
+    page = lambda: simulated.report(case, measures, plateaus, args.all, estimated)
     if log is not None:
         page = _with_data(case, log, key, payload, page)
     written = []

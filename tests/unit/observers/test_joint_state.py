@@ -1,0 +1,138 @@
+"""Coefficients that a filter estimates with the levels, on readings of an independent rig."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import rig
+from jaxtank.core.errors import InputError
+from jaxtank.core.records import Tick
+from jaxtank.core.tree import parameters
+from jaxtank.observers import ExtendedKalman, UnscentedKalman
+from jaxtank.plants.network import network
+
+MODEL = network(
+    area=[50.0, 40.0],
+    drain=[0.0, 0.5],
+    links=[(0, 1)],
+    orifice=[0.5],
+    pump_gain=[8.0],
+    feeds=[(0, None)],
+    rim=[40.0, 40.0],
+)
+VALUES = {"process": [1e-6] * 2, "measurement": [4e-4] * 2, "spread": [0.01] * 2}
+DRIFT = {"coefficient_spread": 0.01, "coefficient_walk": 1e-8}
+US = np.repeat([9.6, 11.0, 8.5, 10.0], 60)[:, None]
+
+
+def readings(gain, drain):
+    """Levels (samples, 2) of the rig by Runge-Kutta of its two balances, with noise of 0.02 cm."""
+
+    def rates(h, u):
+        upper, lower = 0.5 * np.sqrt(2 * 981.0 * h[0]), drain * np.sqrt(2 * 981.0 * h[1])
+        return np.array([(gain * u - upper) / 50.0, (upper - lower) / 40.0])
+
+    h, rows, step = np.array([12.0, 12.0]), [], 0.1
+    for (u,) in US:
+        rows.append(h)
+        for _ in range(10):
+            k1 = rates(h, u)
+            k2 = rates(h + step / 2 * k1, u)
+            k3 = rates(h + step / 2 * k2, u)
+            h = h + step / 6 * (k1 + 2 * k2 + 2 * k3 + rates(h + step * k3, u))
+    levels = np.array(rows)
+    return levels, levels + 0.02 * np.random.default_rng(0).standard_normal(levels.shape)
+
+
+@jax.jit
+def estimated(observer, ys):
+    """(levels, coefficients, d) that an observer estimates after each sample, from 12 cm."""
+
+    def body(state, now):
+        y, u = now
+        tick = Tick(t=0.0, r=(), dr=(), ddr=(), dt=1.0)
+        estimate, state = observer.step(state, tick, tuple(y))
+        state = observer.predict(state, tick, tuple(u), tuple(u))
+        parts = estimate.x, estimate.coefficients, estimate.d
+        return state, tuple(jnp.stack(list(v)) if v else None for v in parts)
+
+    return jax.lax.scan(body, observer.init((jnp.array(12.0),) * 2), (ys, US))[1]
+
+
+@pytest.mark.parametrize(
+    "of", [ExtendedKalman, pytest.param(UnscentedKalman, marks=pytest.mark.slow)]
+)
+@pytest.mark.parametrize("name, gain, drain", [("pump_gain[0]", 8.8, 0.5), ("drain[1]", 8.0, 0.45)])
+def test_a_coefficient_that_is_wrong_by_a_tenth_is_estimated_and_the_levels_with_it(
+    of, name, gain, drain
+):
+    """Only the lower level is read. What the model lacks in the level rates is in d."""
+    levels, ys = readings(gain, drain)
+    plain = of(model=MODEL, measured=(1,), **VALUES)
+    x, (after, coefficient, d) = estimated(plain, ys)[0], estimated(joint(of, name), ys)
+    settled = slice(120, None)
+    assert np.abs(x - levels)[settled].max(axis=0).min() > 0.3
+    assert np.abs(after - levels)[settled].max() < 0.02  # below the noise
+    truth, other = (gain, 8.0) if name == "pump_gain[0]" else (drain, 0.5)
+    np.testing.assert_allclose(coefficient[settled, 0], truth, rtol=1e-3)
+    lower = (other - truth) * np.sqrt(2 * 981.0 * levels[settled, 1]) / 40.0
+    upper = (truth - other) * US[119:-1, 0] / 50.0
+    pumped, zero = name == "pump_gain[0]", 0.0 * lower
+    lacking = np.column_stack([upper, zero] if pumped else [zero, lower])
+    np.testing.assert_allclose(d[settled], lacking, atol=1e-3)
+
+
+def joint(of=ExtendedKalman, *names, **changes):
+    values = {"measured": (1,), "coefficients": names, **VALUES, **DRIFT, **changes}
+    return of(model=MODEL, **values)
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"coefficients": ("drain[1]", "drain[1]")}, "each entry once"),
+        ({"coefficients": ("drain[0]",)}, r"drain\[0\] = 0 cm\^2: must be above 0"),
+        ({"coefficients": ("rim[0]",)}, "of an area or of a gain"),
+        ({"coefficients": ("drain",)}, "of an area or of a gain"),
+        ({"coefficients": ("drains[0]",)}, "drain"),
+        ({"coefficients": ("drain[1]", "orifice[0]")}, "not identifiable"),
+        ({"coefficients": ("drain[1]",), "coefficient_walk": None}, "coefficient_walk: needs"),
+    ],
+)
+def test_coefficients_that_cannot_be_estimated_are_refused(changes, words):
+    with pytest.raises(InputError, match=words):
+        joint(**changes).check(MODEL)
+
+
+def test_a_rig_file_names_coefficients_by_its_own_names_and_a_run_has_their_estimates():
+    case = rig.loads("""
+        tank = [{name = "LT1", area = 50.0, rim = 40.0, level = 12.0},
+                {name = "LT2", area = 40.0, rim = 40.0, level = 12.0, drain = 0.1}]
+        orifice = [{from = 1, to = 2, area = 0.1}]
+        pump = [{name = "P1", to = 1, gain = 8.0, high = 20.0, initial = 2.0}]
+        plant = {outputs = [2]}
+        controller = {kind = "pi", Kc = 0.5, Ti = 60.0}
+        reference = {initial = [12.0]}
+        [observer]
+        kind = "extended-kalman"
+        process = 1e-6
+        measurement = 4e-4
+        measured = [2]
+        coefficients = ["P1"]
+        coefficient_spread = 0.01
+        coefficient_walk = 1e-8
+        [values]
+        plant.pump_gain = [8.8]
+        observer.model.pump_gain = [8.0]
+        clock.dt = 1.0
+        clock.duration = 300.0
+    """)
+    run = jaxtank.simulate(case)
+    assert run.coefficient_names == (("pump_gain[0]", "cm^3/(s V)"),)
+    np.testing.assert_allclose(run.coefficients[-1], 8.8, rtol=0.01)
+    assert run.to_json()["coefficients"]["pump_gain[0]"]["values"][-1] == run.coefficients[-1, 0]
+    again = rig.loads(rig.dump(case)).loop.observer
+    assert again.coefficients == ("pump_gain[0]",)
+    assert parameters(again).keys() == parameters(case.loop.observer).keys()
