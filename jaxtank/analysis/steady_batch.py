@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxtank.analysis.steady_state import at_rest, check_rest
+from jaxtank.analysis.steady_state import at_rest, check_rest, levels_of
 from jaxtank.core.errors import InputError
 from jaxtank.plants import elements
 from jaxtank.plants.tank_network import OPTIONS
@@ -35,8 +35,14 @@ class SteadyStates:
     # for once; with pipes, by Newton's method in the levels that are not controlled; of a network
     # that is not plain, one by one in a compiled program.
 
-    def __init__(self, plant: Any, values: Mapping[str, ArrayLike], inflow: ArrayLike = 0.0):
-        if plant.pumps != len(plant.outputs):
+    def __init__(
+        self,
+        plant: Any,
+        values: Mapping[str, ArrayLike],
+        inflow: ArrayLike = 0.0,
+        shared: Any = None,
+    ):
+        if plant.pumps != len(plant.outputs) and shared is None:
             raise InputError(
                 "a steady state needs as many pumps as outputs: this rig has"
                 f" {plant.pumps} and {len(plant.outputs)}"
@@ -47,10 +53,11 @@ class SteadyStates:
             value = np.asarray(values.get(name, getattr(plant, name)), dtype=float)
             batched = value if name in values else value[None]
             leaves[name] = np.broadcast_to(batched, (count, *batched.shape[1:]))
-        self.plant, self.own = plant, leaves
+        self.plant, self.own, self.shared = plant, leaves, shared
         self.inflow = np.broadcast_to(np.asarray(inflow, dtype=float), (count, plant.tanks))
-        if not plant.plain:
+        if not plant.plain and shared is None:
             check_rest(plant, "feasibility")
+        if not plant.plain or shared is not None:
             return
         self.out, self.efflux, self.pumps = _balance(plant, leaves)
         self.free = [i for i in range(plant.tanks) if i not in plant.outputs]
@@ -62,19 +69,20 @@ class SteadyStates:
         # A level below zero stands for an efflux that would have to flow backwards: no steady state
         # exists. NaN where none was found.
         y = np.asarray(outputs, dtype=float)
-        if not self.plant.plain:
+        if not self.plant.plain or self.shared is not None:
             return self._of_elements(np.broadcast_to(y, (len(self.inflow), *y.shape[-2:])))
         if self.plant.pipes:
             return self._with_pipes(np.broadcast_to(y, (len(self.out), *y.shape[-2:])))
         weight = 2.0 * self.own["gravity"][:, None, None]
-        known = np.sqrt(weight * y)
+        known = np.sqrt(weight) * _root(y, self.plant.knee)[0]
         speeds = known @ self.speeds.swapaxes(1, 2) + self.constant[:, None, : self.plant.tanks]
         inputs = known @ self.inputs.swapaxes(1, 2) + self.constant[:, None, self.plant.tanks :]
-        return speeds * np.abs(speeds) / weight, inputs
+        return levels_of(speeds, weight, self.plant.knee), inputs
 
     def _of_elements(self, y):
         with jax.enable_x64(True):
-            x, u, imbalance, size = _many_at_rest(self.plant, self.own, self.inflow, y)
+            exact = (self.plant, self.own, self.inflow, y, self.shared)
+            x, u, imbalance, size = _many_at_rest(*exact)
         still = np.asarray(imbalance <= 1e-9 * size)[..., None]
         x, u = (np.where(still, np.stack(v, axis=-1), np.nan) for v in (x, u))
         return x, u
@@ -163,12 +171,12 @@ class SteadyStates:
 
 
 @jax.jit
-def _many_at_rest(plant, leaves, inflow, outputs):
+def _many_at_rest(plant, leaves, inflow, outputs, shared):
     """(levels, inputs, net inflow left, largest flow) of plants and outputs, (N, P) each."""
 
     def at(leaves, inflow, y):
         net = dataclasses.replace(plant, **leaves)
-        x, u, imbalance = at_rest(net, y, inflow)
+        x, u, imbalance = at_rest(net, y, inflow, shared=shared)
         flows = [jnp.abs(s.flow) for s in elements.streams(net, x, u)]
         return x, u, imbalance, jnp.max(jnp.stack(flows))
 

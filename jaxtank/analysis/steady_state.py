@@ -1,6 +1,5 @@
 """Steady states of a rig."""
 
-import functools
 from typing import Any
 
 import jax
@@ -449,7 +448,7 @@ def equilibrium(
     inflow : (n,) steady inflow of each tank that no pump brings [cm^3/s], or None
     low : (m,) least input of each pump [V]; above 0 it counts as 0
     shared : where there are more inputs than outputs, (outputs,) numbers -> (m,) inputs, each of
-        which rises or falls with the number of its output
+        which rises or falls with the number of its output: a jax.tree_util.Partial
 
     Returns
     -------
@@ -499,12 +498,14 @@ def _free_discharge(plant, y, words, inflow):
     """(levels, inputs) of a network without pipes in its steady state; inputs may be negative."""
     with np.errstate(all="ignore"):  # an overflow is reported below
         try:
+            with jax.enable_x64(True):
+                roots = np.asarray(smooth_sqrt(y, plant.knee))
             speeds, u = _from_known_speeds(
-                plant, np.sqrt(2.0 * float(plant.gravity)) * np.sqrt(y), np, inflow
+                plant, np.sqrt(2.0 * float(plant.gravity)) * roots, np, inflow
             )
         except np.linalg.LinAlgError:
             speeds = u = np.array([np.nan])
-        x = np.maximum(speeds, 0.0) ** 2 / (2.0 * float(plant.gravity))
+        x = levels_of(np.maximum(speeds, 0.0), 2.0 * float(plant.gravity), plant.knee)
     if not all(np.all(np.isfinite(v)) for v in (speeds, u, x)):
         raise EquilibriumError(
             f"{words} have no unique steady state: the pumps cannot move the outputs independently"
@@ -518,6 +519,15 @@ def _free_discharge(plant, y, words, inflow):
                 f" {-v:.3g} {plant.units[0]}/s backwards (below empty)"
             )
     return x, u
+
+
+def levels_of(speeds: Any, weight: Any, knee: Any) -> Any:
+    """Return the levels of efflux speeds v: v |v|/(2 g) = v |v|/weight, and below the knee by the
+    inverse of `smooth_sqrt`.
+    """
+    root = np.clip(np.abs(speeds) / np.sqrt(weight * knee), 0.0, 1.0)
+    laminar = knee * np.sign(speeds) * (1.5 - np.sqrt(2.25 - 2.0 * root))
+    return np.where(root < 1.0, laminar, speeds * np.abs(speeds) / weight)
 
 
 @jax.jit
@@ -563,11 +573,10 @@ def _rest_of_elements(plant, y, words, inflow, shared, held):
     """(levels, inputs) at rest of a network of any elements; an input may be below its limit."""
     if shared is None and not (plant.plain and plant.pipes):
         check_rest(plant, "steady state")
-    solve = functools.partial(at_rest, shared=shared, held=held)
-    solve = functools.partial(_at_rest, held=held) if shared is None else jax.jit(solve)
     with jax.enable_x64(True):
-        exact = jax.tree.map(lambda v: np.asarray(v, dtype=float), (plant, y, inflow))
-        x, u, imbalance = jax.tree.map(np.asarray, solve(*exact))
+        exact = jax.tree.map(lambda v: np.asarray(v, dtype=float), (plant, y, inflow, shared))
+        rest = _at_rest(*exact[:3], shared=exact[3], held=held)
+        x, u, imbalance = jax.tree.map(np.asarray, rest)
         flows = [  # those at work may all be 0: a valve closed, a pump off
             float(np.abs(s.flow))
             for inputs in (u, _middle(plant))

@@ -21,8 +21,12 @@ from jaxtank.core.tables import is_time, numbers, read_table, seconds
 from jaxtank.core.text import printable
 from jaxtank.export.fmi import compiler, library, place_of
 
-GROUPS = re.compile(r"(y|h|r|dr|ddr|u|pump)(?:\d+|_.+)", re.IGNORECASE)
+GROUPS = re.compile(r"(y|h|r|dr|ddr|applied|u|pump)(?:\d+|_.+)", re.IGNORECASE)
 """Names of columns: of "y1" or "y_LT101" the first part is the signal."""
+
+
+ROWS = 5000
+"""Samples of a run all of which `jaxtank simulate --out` saves."""
 
 
 class Export(NamedTuple):
@@ -52,7 +56,8 @@ def replay(path: str | Path, data: str | Path) -> dict[str, Any]:
     Parameters
     ----------
     path : an exported controller: NAME.c (with NAME.h beside it), NAME.js or NAME.fmu
-    data : log with a row for each period: t, y1, .. (or h1, ..), r1, .., u1, .. (or pump1, ..)
+    data : log with a row for each period: t, y1, .. (or h1, ..), r1, .., u1, .. (or pump1, ..), and
+        applied1, .. where pumps have a lag, delay or dead zone behind the inputs of the controller
 
     Returns
     -------
@@ -103,8 +108,8 @@ def read(path: str | Path, export: Export) -> tuple[Log, list[str]]:
         k = int(np.argmax(apart))
         raise DataError(
             f"{table.name}, line {table.lines[k + 1]}: is {t[k + 1] - t[k]:.6g} s after the row"
-            f" before; the export runs every {export.dt:.6g} s: log every period (of a simulation:"
-            " a shorter run, which saves all samples)"
+            f" before; the export runs every {export.dt:.6g} s: log every period (of a simulation"
+            f" --set clock.duration={ROWS * export.dt:.6g} or less, which saves all samples)"
         )
     dr, ddr = _rates(arrays["r"], export.dt), np.zeros_like(arrays["r"])
     if len(groups.get("dr", [])) == export.sizes[1]:
@@ -129,7 +134,7 @@ def _groups(table):
 
 def _chosen(table, groups, export):
     """{"y", "r", "u": columns} for an export. Raises DataError for columns that are missing."""
-    names = {"y": ("y", "h"), "r": ("r",), "u": ("u", "pump")}
+    names = {"y": ("y", "h"), "r": ("r",), "u": ("applied", "u", "pump")}
     chosen, problems = {}, [] if "t" in groups else ["a column t"]
     for (key, words), count in zip(names.items(), export.sizes):
         chosen[key] = next((groups[name] for name in words if name in groups), [])

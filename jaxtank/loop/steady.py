@@ -2,11 +2,11 @@
 of its pumps (upper limits are not checked).
 """
 
-import functools
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from jax.core import Tracer
+from jax.tree_util import Partial
 
 from jaxtank.analysis.steady_state import equilibrium
 
@@ -24,15 +24,28 @@ def _lasts(level: Any) -> bool:
     return isinstance(level, Tracer) or bool(np.any(np.asarray(level)))
 
 
+def sharing(loop: Any) -> Any:
+    """The function (outputs,) -> (m,) inputs of a controller that shares its outputs between them,
+    and so knows which of them runs; None of others.
+    """
+    controller: Any = getattr(loop.controller, "law", loop.controller)
+    if not hasattr(controller, "shared"):
+        return None
+    inflow = steady_inflow(loop) if controller.reads_inflow else None
+    measured = () if inflow is None else tuple(np.asarray(inflow, dtype=float))
+    # its numbers are arguments: one program for all of its kind
+    cls = cast(Any, type(controller))
+    return Partial(cls.shared, controller, inflow=measured)
+
+
 def steady_state(loop: Any, y: Any, plant: Any = None) -> tuple[Any, Any]:
     """Return levels and inputs at which a loop stands still with outputs y."""
     low = loop.actuator.driving(tuple(np.asarray(loop.actuator.low, dtype=float)))
-    # a controller that shares its output between inputs knows which of them runs
-    controller = getattr(loop.controller, "law", loop.controller)
-    shared, inflow = getattr(controller, "shared", None), steady_inflow(loop)
-    if shared is not None and controller.reads_inflow and inflow is not None:
-        shared = functools.partial(shared, inflow=tuple(np.asarray(inflow, dtype=float)))
     x, u = equilibrium(
-        loop.plant if plant is None else plant, y, inflow, np.asarray(low, dtype=float), shared
+        loop.plant if plant is None else plant,
+        y,
+        steady_inflow(loop),
+        np.asarray(low, dtype=float),
+        sharing(loop),
     )
     return x, u + np.asarray(loop.actuator.offset)

@@ -24,6 +24,7 @@ FIELDS = (
     ("r", "r", "cm"),
     ("u", "u", "V"),
     ("command", "command", "V"),
+    ("applied", "applied", "V"),
     ("spilled", "spilled", "cm^3"),
     ("d_hat", "d_hat", "cm/s"),
     ("share", "share", "-"),
@@ -182,11 +183,13 @@ def columns(
     """
     table: dict[tuple[str, str], Any] = {("t", "s"): np.asarray(run.t)}
     for name, field, unit in FIELDS:
-        if getattr(run, field) is not None:  # the share is of some controllers alone
+        absent = getattr(run, field) is None  # the share is of some controllers alone
+        same = field == "applied" and np.array_equal(run.applied, run.u)
+        if not absent and not same:
             for i, column in enumerate(np.asarray(getattr(run, field)).T):
-                kind = {"r": "output", "u": "pump", "command": "pump", "share": "pump"}
+                kind = dict.fromkeys(("u", "command", "applied", "share"), "pump") | {"r": "output"}
                 key = symbol(plant, name, kind.get(name, "tank"), i)
-                drives = name in ("u", "command")
+                drives = name in ("u", "command", "applied")
                 unit_of_entry = input_unit(plant, i, units[1]) if drives else local(unit, units)
                 table[key, unit_of_entry] = column
     for k, (name, _) in enumerate(run.mode_names):

@@ -1,10 +1,11 @@
 """Every key of a rig file under every command: an answer, or a refusal that says why.
 
-    python tests/audits/elements_by_command.py [PART ...] [COMMAND,COMMAND]
+    python tests/audits/elements_by_command.py [PART ...] [COMMAND,COMMAND] [RECORD.json]
 
 runs the rigs whose name holds one of the parts (default: all) under the commands (all), and
 prints a table, rigs by commands: `.` an answer, `r` a refusal (exit code 2 or 3), `X` a traceback
 or a number that is none. The refusals follow. Exit code 1 where there is an X.
+What a record holds is not run again; it is written after each rig.
 `tests/unit/rig/test_all_elements.py` holds that the rigs below use every key of the schema.
 """
 
@@ -204,6 +205,27 @@ RIGS = {
         ' anti_windup = "conditioned"'
     ),
     "on-off": controlled('kind = "on-off", on = [0.45], off = [0.55]'),
+    "cascade": controlled(
+        'kind = "cascade", Kc = 1.0, Ti = 300.0, inner = ["LT101"], inner_Kc = 200.0,'
+        " inner_Ti = 100.0, inner_low = 0.1, inner_high = 1.0",
+        plant='{outputs = ["LT102"]}',
+        reference='{initial = [0.3], changes = [[100.0, "LT102", 0.35]]}',
+    ),
+    "flow cascade": controlled(
+        'kind = "flow-cascade", Kc = 0.01, Ti = 200.0, inner_Kc = 5e3, inner_Ti = 4.0'
+    ),
+    "override": controlled(
+        'kind = "override", Kc = 200.0, Ti = 200.0, bias = 37.0, limited = ["LT102"],'
+        " limit = [0.35], limit_Kc = [300.0], limit_Ti = [200.0]"
+    ),
+    "split range": controlled(
+        'kind = "split-range", Kc = 200.0, Ti = 200.0',
+        pump=TWO["pump"].replace('"LT102"', '"LT101"'),
+    ),
+    "ratio": controlled(
+        'kind = "ratio", Kc = 200.0, Ti = 200.0, follow = ["P101"], ratio = [0.2]',
+        pump=TWO["pump"].replace('to = "LT102"', 'to = "LT101"'),
+    ),
 }
 
 
@@ -236,6 +258,10 @@ COMMANDS = {
     "c": "export RIG --lang c --out DIR/c --quiet",
     "js": "export RIG --lang js --out DIR/js --quiet",
     "matlab": "export RIG --lang m --out DIR/m --quiet",
+    "st": "export RIG --lang st --out DIR/st --quiet",
+    "fmu": "export RIG --lang fmu --out DIR/fmu --quiet",
+    "plant": "export RIG --lang fmu --plant --out DIR/plant --quiet",
+    "replay": "replay DIR/c/my_rig.c --data DIR/run/trajectory.csv --json",
     "identify": "identify RIG --data DIR/run/trajectory.csv --json --starts 1",
     "predict": "predict RIG --data DIR/run/trajectory.csv --json",
 }
@@ -269,7 +295,9 @@ def row_of(name, commands=tuple(COMMANDS)):
     """{command: (mark, reason)} of a rig."""
     with tempfile.TemporaryDirectory() as folder:
         path = rig_file(folder, name)
-        if {"identify", "predict"} & set(commands):
+        if "replay" in commands:
+            outcome(COMMANDS["c"].replace("RIG", str(path)).replace("DIR", folder).split())
+        if {"identify", "predict", "replay"} & set(commands):
             outcome(["simulate", str(path), "--out", folder + "/run", "--quiet"])
         row = {}
         for command in commands:
@@ -282,6 +310,9 @@ def row_of(name, commands=tuple(COMMANDS)):
 
 def table(words=()):
     """Print the table of the rigs and commands that are asked for; return whether none has an X."""
+    files = [Path(word) for word in words if word.endswith(".json")]
+    record = json.loads(files[0].read_text()) if files and files[0].exists() else {}
+    words = [word for word in words if not word.endswith(".json")]
     parts = [word for word in words if not set(word.split(",")) <= set(COMMANDS)]
     asked = [command for word in words if word not in parts for command in word.split(",")]
     commands = tuple(asked or COMMANDS)
@@ -290,10 +321,13 @@ def table(words=()):
     print(" " * width, *(f"{c[:8]:>8}" for c in commands))
     reasons, good = [], True
     for name in names:
-        row = row_of(name, commands)
-        print(f"{name:{width}}", *(f"{mark:>8}" for mark, _ in row.values()), flush=True)
-        reasons += [f"{name}, {c}: {mark} {why}" for c, (mark, why) in row.items() if mark != "."]
-        good &= all(mark != "X" for mark, _ in row.values())
+        row = record.setdefault(name, {})
+        row |= row_of(name, [c for c in commands if c not in row])
+        for file in files:
+            file.write_text(json.dumps(record, indent=1))
+        print(f"{name:{width}}", *(f"{row[c][0]:>8}" for c in commands), flush=True)
+        reasons += [f"{name}, {c}: {' '.join(row[c])}" for c in commands if row[c][0] != "."]
+        good &= all(row[c][0] != "X" for c in commands)
     print(*reasons, sep="\n")
     return good
 

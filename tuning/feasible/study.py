@@ -25,7 +25,7 @@ from tuning.feasible.result import Feasibility, Mend, PlateauNeed
 from tuning.problem.scenarios import runs_of
 from tuning.uncertainty.distributions import stated
 from tuning.uncertainty.draws import Draws
-from tuning.uncertainty.needs import Needs, judges
+from tuning.uncertainty.needs import Needs, unjudged
 from tuning.uncertainty.sampling import probabilities, spread_of
 
 
@@ -66,8 +66,8 @@ def feasibility(
     Raises
     ------
     InputError
-        The reference has no plateaus (a sine moves it), or the rig another number of pumps than of
-        outputs; `can_judge` answers beforehand.
+        The steady states are not known, as where a sine moves the reference; `can_judge` answers
+        beforehand.
 
     Examples
     --------
@@ -139,8 +139,8 @@ def of_nominal_plant(case: Case) -> tuple[PlateauNeed, ...] | None:
 
 
 def can_judge(case: Case) -> bool:
-    """Return whether a reference has plateaus, and its rig as many pumps as outputs."""
-    return judges(case)
+    """Return whether the steady states of a case at its setpoints are known."""
+    return not unjudged(case)
 
 
 def can_follow(
@@ -597,7 +597,7 @@ def _orifices(needs: Needs) -> Mend | None:
     def share(factor):
         leaves_of = needs.states.own
         scaled = {n: v * (factor if n in leaves else 1.0) for n, v in leaves_of.items()}
-        states = SteadyStates(needs.states.plant, scaled, needs.states.inflow)
+        states = SteadyStates(needs.states.plant, scaled, needs.states.inflow, needs.states.shared)
         return needs.feasible(np.concatenate(states.at(needs.setpoints), axis=2)).mean()
 
     good = lambda factor: share(factor) >= AIM

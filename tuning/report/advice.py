@@ -17,6 +17,7 @@ from tuning.feasible.result import PlateauNeed
 from tuning.report import verdict as verdicts
 from tuning.report.tables import Table, Value
 from tuning.report.verdict import shown
+from tuning.uncertainty.needs import unjudged
 
 
 class Advice(NamedTuple):
@@ -38,9 +39,6 @@ BEYOND = "No gain can change this"
 
 REACHABLE = "Nothing is out of reach of the gains: every setpoint can be held"
 """The first words where nothing is."""
-
-UNKNOWN = "Setpoints out of reach are not known: this rig has no steady states in closed form."
-"""The last sentence of a rig that `tuning.feasibility` does not judge."""
 
 
 def listed(words: Sequence[str]) -> str:
@@ -96,10 +94,16 @@ def of_nominal_plant(case: Case) -> str:
     """Return the sentence on setpoints that the plant of a case cannot hold whatever its gains."""
     needs = study.of_nominal_plant(case)
     if needs is None:
-        return UNKNOWN
+        return unknown(case)
     if not needs:
         return f"{REACHABLE} on this plant."
     return f"{BEYOND}: {need(case, needs[0])}."
+
+
+def unknown(case: Case) -> str:
+    """Return the sentence on a rig that `tuning.feasibility` does not judge."""
+    why = unjudged(case) or "of a rig with pipes jaxtank tune works them out"
+    return f"Setpoints out of reach are not known: {why}."
 
 
 def need(case: Case, row: PlateauNeed, plants: bool = False) -> str:
@@ -107,6 +111,8 @@ def need(case: Case, row: PlateauNeed, plants: bool = False) -> str:
     kind, number = ("tank", row.tank) if row.pump is None else ("pump", row.pump)
     part = label_of(case.loop.plant, kind, (number or 1) - 1)
     setpoints = Value(row.setpoints, 4, case.loop.units[0], ", ")
+    if not np.isfinite(row.needed_p95 if plants else row.needed):
+        return f"setpoints {setpoints} have no steady state"
     needed = f"up to {amount(row.needed_p95, row.unit)}" if plants else amount(row.needed, row.unit)
     bound = amount(row.limit, row.unit)
     return f"setpoints {setpoints} need {needed} in {part}, its limit is {bound}"

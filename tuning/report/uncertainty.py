@@ -156,7 +156,7 @@ def advice_of(ensemble):
     lost = ensemble.infeasible
     beyond = f"{advice.REACHABLE} on each of {count(samples, 'draw')}."
     if lost is None:
-        beyond = advice.UNKNOWN
+        beyond = advice.unknown(ensemble.case)
     elif lost.any():
         beyond = (
             f"{advice.BEYOND}: on {int(lost.sum())} of {count(samples, 'draw')} a setpoint needs a"

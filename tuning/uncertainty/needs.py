@@ -8,11 +8,14 @@ import numpy as np
 from jaxtank.analysis.steady_batch import SteadyStates, flow_leaves
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import labels_of
+from jaxtank.core.text import count
 from jaxtank.core.tree import get_value, split_index
-from jaxtank.plants.elements import closed_circuit
+from jaxtank.loop.steady import sharing, steady_inflow
+from jaxtank.plants.elements import closed_circuit, unregulated
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig import check_limits
-from jaxtank.signals.base import Constant
+from jaxtank.signals.base import Constant, Sum
 from jaxtank.signals.setpoints import Ramps
 
 
@@ -61,21 +64,20 @@ class Needs:
     ):
         loop: Any = case.loop
         plateaus = plateaus_of(case)
-        if not judges(case) or not plateaus:
-            raise InputError(
-                f"{case.name}: feasibility is for networks of tanks with as many pumps and valves"
-                " as outputs and an exchange with the basin, and setpoints that are held for a"
-                " while (no sine), without a table of inflows"
-            )
+        if (why := unjudged(case)) or not plateaus:
+            raise InputError(f"{case.name}: feasibility is not known: {why}")
         count = len(next(iter(values.values()))) if values else 1
         of = lambda name: drawn_values(loop, name, values, count)
-        inflow = of("disturbance.level") if isinstance(loop.disturbance, Constant) else 0.0
+        steady = steady_inflow(loop)
+        inflow = 0.0 if steady is None else np.asarray(steady, dtype=float)
+        if isinstance(loop.disturbance, Constant):
+            inflow = of("disturbance.level")
         zoned = np.ndim(loop.actuator.offset) > 0
         self.offset = of("actuator.dead_zone") if zoned else np.zeros((1, loop.plant.pumps))
         self.case, self.values, self.limits = case, dict(values), limits
         self.plateaus, self.count = plateaus, count
         flows = {name: of(f"plant.{name}") for name in flow_leaves(loop.plant)}
-        self.states = SteadyStates(loop.plant, flows, inflow)
+        self.states = SteadyStates(loop.plant, flows, inflow, sharing(loop))
         self.setpoints = np.stack(
             [np.stack([of(name) for name in p.names], axis=-1) for p in plateaus], axis=1
         )
@@ -110,16 +112,30 @@ class Needs:
         return ~np.any(self.excess(needed, low, high) > 0, axis=(1, 2))
 
 
-def judges(case: Case) -> bool:
-    """Return whether `Needs` is defined for a case."""
-    plant, inflow = case.loop.plant, case.loop.disturbance
-    return (
-        isinstance(plant, TankNetwork)
-        and not (inflow is not None and inflow.is_table)  # it never rests
-        and (plant.plain or not closed_circuit(plant))
-        and plant.pumps == len(plant.outputs)
-        and bool(plateaus_of(case))
+def unjudged(case: Case) -> str:
+    """Return why `Needs` is not defined for a case; "" where it is."""
+    plant: Any = case.loop.plant
+    if not isinstance(plant, TankNetwork):
+        return f"a {type(plant).__name__} is no network of tanks"
+    if case.loop.disturbance is not None and _varies(case.loop.disturbance):
+        return "its inflow follows a table and never rests"
+    names = lambda tanks: (
+        f"{labels_of(plant, 'tank', tanks)} {'has' if len(tanks) == 1 else 'have'}"
     )
+    if tanks := () if plant.plain else closed_circuit(plant):
+        return f"{names(tanks)} no exchange with the basin, and any level as a steady one"
+    if tanks := unregulated(plant):
+        return f"{names(tanks)} no outflow that rises with the level, and fills or runs empty"
+    if plant.pumps != len(plant.outputs) and sharing(case.loop) is None:
+        return f"it has {count(plant.pumps, 'input')} and {count(len(plant.outputs), 'output')}"
+    return "" if plateaus_of(case) else "its setpoints are never held for a while"
+
+
+def _varies(inflow: Any) -> bool:
+    """Whether an inflow never rests: a table of more than one row."""
+    if isinstance(inflow, Sum):
+        return _varies(inflow.first) or _varies(inflow.second)
+    return inflow.is_table and any(len(row[2]) > 1 for row in getattr(inflow, "rows", [((),) * 3]))
 
 
 def drawn_values(loop: Any, name: str, values: Mapping[str, Any], count: int) -> np.ndarray:
@@ -149,7 +165,7 @@ def _limit_of(case, limits):
 
 def infeasible(case: Case, values: Mapping[str, Any]) -> np.ndarray | None:
     """Return where a plateau of the reference has no steady state within rims and pump limits."""
-    if getattr(case.loop.plant, "pipes", None) != () or not judges(case):
+    if getattr(case.loop.plant, "pipes", None) != () or unjudged(case):
         return None
     rims, blocks = {"max_level": "rim"}, range(0, len(next(iter(values.values()))), BLOCK)
     parts = ({n: v[i : i + BLOCK] for n, v in values.items()} for i in blocks)

@@ -51,6 +51,28 @@ def test_a_steady_inflow_and_a_pump_into_two_tanks_leave_no_rate():
     np.testing.assert_allclose(np.asarray(rates), 0.0, atol=1e-12)
 
 
+@pytest.mark.parametrize("level", [0.05, 0.4, 2.0])
+def test_below_the_knee_the_flow_at_rest_is_that_of_the_plant(level):
+    """A linear outlet is written as one below its knee: the lower tank then stands at the inverse
+    of its flow.
+    """
+    plant = network(
+        area=[20.0] * 2,
+        drain=[0.1, 0.2],
+        links=[(0, 1)],
+        orifice=[0.3],
+        pump_gain=[5.0],
+        feeds=[(0, None)],
+        rim=30.0,
+        outputs=(0,),
+        knee=1.0,
+    )
+    levels, inputs = SteadyStates(plant, {}).at([[level]])
+    for x, u in ((levels[0, 0], inputs[0, 0]), equilibrium(plant, [level])):
+        assert x[0] == pytest.approx(level, rel=1e-12)
+        np.testing.assert_allclose(np.asarray(plant.rates(tuple(x), tuple(u))), 0.0, atol=1e-12)
+
+
 def test_a_flow_that_would_run_backwards_is_a_level_below_zero():
     levels, _ = SteadyStates(presets.find("gouta2015/ngpc").loop.plant, {}).at([[16.0, 3.0]])
     assert levels[0, 0, 3] < 0 < levels[0, 0, 2]

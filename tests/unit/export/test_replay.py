@@ -46,6 +46,35 @@ def test_an_export_gives_the_inputs_of_a_log_of_its_simulation(tmp_path, capsys,
     assert differences[1] == pytest.approx(2.6 - 2.50030361456214, rel=1e-3)
 
 
+SLOW_PUMP = """
+tank = [{area = 100.0, rim = 60.0, drain = 0.5, level = 20.0}]
+pump = [
+    {name = "P", to = 1, gain = 10.0, high = 12.0, initial = 9.0, lag = 3.0, delay = 2.0},
+]
+controller = {kind = "pi", Kc = 1.0, Ti = 20.0}
+reference = {initial = [20.0], changes = [[5.0, 1, 25.0]]}
+values = {"clock.dt" = 1.0, "clock.duration" = 60.0}
+"""
+
+
+def test_an_export_gives_the_inputs_ahead_of_dead_time_and_lag(tmp_path, capsys):
+    """Those behind them, which the log holds besides, are others."""
+    if shutil.which("gcc") is None:
+        pytest.skip("no gcc on this machine")
+    (tmp_path / "rig.toml").write_text(SLOW_PUMP)
+    case = rig.load(tmp_path / "rig.toml")
+    run = jaxtank.simulate(case.loop, case.clock)
+    (tmp_path / "log.csv").write_text(csv(run, case.loop.units, case.loop.plant))
+    words = ["export", str(tmp_path / "rig.toml"), "--name", "law", "--out", str(tmp_path)]
+    assert main.main([*words, "--lang", "c"]) == 0
+    capsys.readouterr()
+    log = str(tmp_path / "log.csv")
+    assert main.main(["replay", str(tmp_path / "law.c"), "--data", log, "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["inputs"]
+    assert row["name"] == "applied_P" and row["largest_difference"] < 1e-8
+    assert np.max(np.abs(run.applied - run.u)) > 1.0
+
+
 def test_a_log_that_does_not_suit_and_an_export_that_is_none_are_reported(tmp_path, capsys, log):
     """Exit codes 5 and 2."""
     if shutil.which("gcc") is None:
@@ -58,7 +87,7 @@ def test_a_log_that_does_not_suit_and_an_export_that_is_none_are_reported(tmp_pa
     sparse.write_text("\n".join([rows[0], *rows[1::2]]))
     short.write_text("\n".join(line.rsplit(",", 4)[0].rsplit(",", 1)[0] for line in rows))
     law = str(tmp_path / "law.c")
-    for data, words in ((sparse, "every 4 s"), (short, "1 of u1, .. or pump1")):
+    for data, words in ((sparse, "every 4 s"), (short, "1 of applied1, .. or u1, .. or pump1")):
         assert main.main(["replay", law, "--data", str(data)]) == 5
         assert words in capsys.readouterr().err
     (tmp_path / "other.c").write_text("int other;\n")

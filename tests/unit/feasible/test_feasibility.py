@@ -13,8 +13,10 @@ from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.tree import get_value, parameters, with_values
 from jaxtank.signals import inflow_table
+from tuning.feasible.study import of_nominal_plant
 from tuning.search.setting import setting_of
 from tuning.uncertainty.draws import Draws
+from tuning.uncertainty.needs import unjudged
 from tuning.uncertainty.sampling import spread_of
 
 CASE = presets.find("gouta2015/backstepping")
@@ -216,6 +218,32 @@ def test_a_case_that_needs_no_mend_is_left_as_it_is():
     np.testing.assert_array_equal(same.loop.reference.targets, case.loop.reference.targets)
 
 
+STAGED = """
+units = ["cm", "V"]
+tank = [{area = 2500.0, rim = 100.0, level = 30.0, drain = 3.0}]
+pump = [{to = 1, gain = 40.0, high = 10.0}, {to = 1, gain = 60.0, low = 1.0, high = 8.0}]
+plant = {outputs = [1]}
+controller = {kind = "split-range", Kc = 0.5, span = [5.0, 10.0]}
+reference = {initial = [30.0], changes = [[60.0, 1, 70.0]]}
+values = {"clock.dt" = 1.0, "clock.duration" = 200.0}
+"""
+
+
+def test_pumps_that_share_a_level_are_judged_by_their_total():
+    (row,) = of_nominal_plant(rig.loads(STAGED))
+    flow = 3.0 * np.sqrt(2.0 * 981.0 * 70.0)
+    assert row.pump == 2 and row.limit == 8.0
+    assert row.needed == pytest.approx((flow - 40.0 * 10.0) / 60.0, rel=1e-9)
+
+
+def test_a_store_that_no_level_empties_is_not_judged():
+    store = "{name = 'S', area = 1e4, rim = 100.0, level = 50.0, inflow = 10.0}, "
+    text = STAGED.replace("tank = [", "tank = [" + store).replace("to = 1,", "from = 1, to = 2,")
+    text = text.replace("outputs = [1]", "outputs = [2]")
+    case = rig.loads("reachable = false\n" + text)
+    assert of_nominal_plant(case) is None and "S has no outflow" in unjudged(case)
+
+
 def with_inflow_table(case):
     """A case with a flow into tank 1 that never rests."""
     table = inflow_table(4, [(0, [0.0, 50.0, 100.0], [0.0, 5.0, 1.0])])
@@ -233,8 +261,8 @@ def with_inflow_table(case):
             lambda: tuning.apply_mend(CASE, "pumps", samples=256),
             "no change of its pumps alone was found",
         ),
-        (lambda: tuning.feasibility(presets.find("gouta2022/pi")), "setpoints that are held"),
-        (lambda: tuning.feasibility(with_inflow_table(CASE)), "without a table of inflows"),
+        (lambda: tuning.feasibility(presets.find("gouta2022/pi")), "never held"),
+        (lambda: tuning.feasibility(with_inflow_table(CASE)), "follows a table"),
         (lambda: tuning.feasibility(CASE, samples=0), "samples = 0"),
     ],
 )
