@@ -67,7 +67,7 @@ GAINS: dict[type, tuple[str, ...]] = {
     controllers.Ratio: ("Kc", "Ti", "Td"),
     controllers.Cascade: ("Kc", "Ti", "Td", "inner_Kc", "inner_Ti"),
     controllers.FlowCascade: ("Kc", "Ti", "Td", "inner_Kc", "inner_Ti"),
-    controllers.Override: ("Kc", "Ti", "Td", "limit_Kc", "limit_Ti"),
+    controllers.Override: ("Kc", "Ti", "Td"),  # a weak loop on the limit costs an objective nothing
     controllers.StateFeedback: ("K",),
     controllers.LQI: ("Q", "R"),
     controllers.NGPC: ("Tp",),

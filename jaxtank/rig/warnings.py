@@ -7,7 +7,7 @@ import numpy as np
 from jaxtank import presets
 from jaxtank.case import Case
 from jaxtank.controllers.cascade import Cascade
-from jaxtank.controllers.pid import PID
+from jaxtank.controllers.pid import FILTER, PID
 from jaxtank.core.clock import clock_warnings
 from jaxtank.core.labels import label_of
 from jaxtank.core.tree import get_value, is_component, split_index, walk
@@ -27,9 +27,9 @@ def case_warnings(case: Case) -> list[str]:
 
     A run that does not end at a sample, changes, inflow pulses and faults after its end, changes
     that overlap, what no sample sees, levels and setpoints above a rim, pumps that start outside
-    their limits, gains of the wrong sign, levels that may fall below 0, models that differ from the
-    plant, estimates of disturbances that the controller does not use. (Steps that are too long:
-    `loop.step_size`.)
+    their limits, gains of the wrong sign, derivatives shorter than a sample, levels that may fall
+    below 0, models that differ from the plant, estimates of disturbances that the controller does
+    not use. (Steps that are too long: `loop.step_size`.)
 
     Parameters
     ----------
@@ -54,6 +54,7 @@ def case_warnings(case: Case) -> list[str]:
         *_above_rims(case),
         *_pumps(case),
         *_signs(case),
+        *_derivative(case),
         *_feed_forward(case),
         *_open_bottoms(case),
         *model_warnings(case),
@@ -242,6 +243,27 @@ def _downstream(plant, tanks):
             reached.add(tank)
             queue += [sink for source, sink in pairs if source == tank and sink is not None]
     return reached
+
+
+LONGER = 1.5
+"""Share of Td at which the derivative of a sampled PID acts as one that is hardly meant [-]."""
+
+
+def _derivative(case):
+    """On a derivative whose filter is shorter than the sample: it acts over a whole sample."""
+    part, dt = getattr(case.loop.controller, "law", case.loop.controller), case.clock.dt
+    if not isinstance(part, PID) or part.Td is None:
+        return
+    Td = np.asarray(part.Td, dtype=float)
+    N = np.broadcast_to(FILTER if part.N is None else np.asarray(part.N, dtype=float), Td.shape)
+    acts = N * dt / -np.expm1(-N * dt / Td)  # on a ramp, by the lag that is exact for samples
+    for time, share, longer in {*zip(Td.tolist(), N.tolist(), acts.tolist())}:
+        if longer > LONGER * time:
+            yield (
+                f"controller.Td = {time:g} s acts as one of {longer:.3g} s: its filter Td/N ="
+                f" {time / share:.3g} s is shorter than the sampling period of {dt:g} s; take N ="
+                f" {max(0.5 * time / dt, 0.01):.2g} or a shorter period"
+            )
 
 
 def _feed_forward(case):

@@ -108,3 +108,17 @@ def test_a_setpoint_weight_needs_an_integral():
 def test_a_gain_of_the_wrong_sign_is_a_warning(gain, warned):
     case = rig.loads(f'{TANK}controller = {{ kind = "pid", Kc = {gain} }}')
     assert any("Kc" in sentence for sentence in rig.case_warnings(case)) is warned
+
+
+@pytest.mark.parametrize(("share", "warned"), [(0.5, False), (8.0, True)])
+def test_a_derivative_that_acts_longer_than_Td_is_a_warning(share, warned):
+    """On a ramp, sample by sample: N times the level less a lag that follows it with Td/N."""
+    Td = 2.0 * DT
+    case = rig.loads(f'{TANK}controller = {{ kind = "pid", Kc = 1.0, Td = {Td}, N = {share} }}')
+    lag = 0.0
+    for k in range(100):
+        acts = share * (k - lag) * DT
+        lag += (1.0 - math.exp(-share * DT / Td)) * (k - lag)
+    assert (acts > 1.5 * Td) is warned
+    sentences = [sentence for sentence in rig.case_warnings(case) if "controller.Td" in sentence]
+    assert [f"{acts:.3g} s" in sentence for sentence in sentences] == [True] * warned
