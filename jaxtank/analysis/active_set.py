@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.analysis.elimination import times
+from jaxtank.analysis.elimination import entry, times
 from jaxtank.analysis.qp import scaled
 
 TOLERANCE = 1e-9  # violation of a row at which it is added, in the scaled problem
@@ -34,7 +34,7 @@ class Face(NamedTuple):
     image: Any  # (n, n) image[i]: the change of x that changes row i alone, at the least cost
 
 
-class Entry(NamedTuple):
+class Candidate(NamedTuple):
     """The row that is being added."""
 
     row: Any
@@ -84,79 +84,84 @@ def solve_soft(H, f, A, l, u, G, room, penalty, span):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(5,))
-def minimum(H, f, G, l, u, held):
-    """Return the Face of the minimum. The first `held` rows are the last variables, which start at
-    their lower end, 0, with f > 0; H joins them to no others.
+def minimum(H, f, G, l, u, active):
+    """Return the Face of the minimum. The first `active` rows are the last variables, which start
+    at their lower end, 0, with f > 0; H joins them to no others.
     """
     size, rows = f.shape[0], G.shape[0]
     index, slots = np.arange(rows), np.arange(size)
-    whole = jnp.pad(_inverse(H[: size - held, : size - held]), (0, held))
+    whole = jnp.pad(_inverse(H[: size - active, : size - active]), (0, active))
 
-    def excess(x, out):
+    def excess(x, candidates):
         values = G @ x
-        return jnp.where(out, jnp.maximum(l - values, values - u), -jnp.inf)
+        return jnp.where(candidates, jnp.maximum(l - values, values - u), -jnp.inf)
 
-    def under_way(state):
-        k, face, out, entry = state
-        more = (entry.side != 0.0) | (jnp.max(excess(face.x, out)) > TOLERANCE)
-        return (k < PASSES * size) & more
+    def goes_on(state):
+        count, face, candidates, candidate = state
+        more = (candidate.side != 0.0) | (jnp.max(excess(face.x, candidates)) > TOLERANCE)
+        return (count < PASSES * size) & more
 
     def advance(state):
-        k, face, out, entry = state
-        waits = entry.side != 0.0
-        p = jnp.where(waits, entry.row, jnp.argmax(excess(face.x, out)).astype(jnp.int32))
-        row, low, high = _at(G, p), _at(l, p), _at(u, p)
+        count, face, candidates, candidate = state
+        pending = candidate.side != 0.0
+        worst = jnp.argmax(excess(face.x, candidates)).astype(jnp.int32)
+        number = jnp.where(pending, candidate.row, worst)
+        row, low, high = entry(G, number), entry(l, number), entry(u, number)
         value = row @ face.x
-        side = jnp.where(waits, entry.side, jnp.where(low - value > value - high, 1.0, -1.0))
+        side = jnp.where(pending, candidate.side, jnp.where(low - value > value - high, 1.0, -1.0))
         gap, row = jnp.where(side > 0.0, low - value, value - high), side * row
-        along, against = face.inverse @ row, face.image @ row
-        # where a row of the face, or the new one, stops a step along `along`
-        leaves = (face.side != 0.0) & (against > 0.0)
-        stops = jnp.where(leaves, face.multiplier / jnp.where(leaves, against, 1.0), jnp.inf)
-        j, free = jnp.argmin(stops), row @ along
-        moves = free > DEPENDENT * (row @ (whole @ row))
-        reach = jnp.where(moves, gap / jnp.where(moves, free, 1.0), jnp.inf)
-        joins = reach <= jnp.min(stops)
-        step = jnp.minimum(reach, jnp.min(stops))
-        goes_on = jnp.isfinite(step)  # else no x keeps all rows
-        step = jnp.where(goes_on, step, 0.0)
-        there = goes_on & (slots == jnp.where(joins, jnp.argmin(jnp.abs(face.side)), j))
+        direction, dual = face.inverse @ row, face.image @ row  # z and r of the paper
+        # the step ends where a multiplier becomes 0, or where the new row binds
+        shrinks = (face.side != 0.0) & (dual > 0.0)
+        ratios = jnp.where(shrinks, face.multiplier / jnp.where(shrinks, dual, 1.0), jnp.inf)
+        leaving, curvature = jnp.argmin(ratios), row @ direction
+        independent = curvature > DEPENDENT * (row @ (whole @ row))
+        full = jnp.where(independent, gap / jnp.where(independent, curvature, 1.0), jnp.inf)
+        joins = full <= jnp.min(ratios)
+        step = jnp.minimum(full, jnp.min(ratios))
+        feasible = jnp.isfinite(step)  # else no x keeps all rows
+        step = jnp.where(feasible, step, 0.0)
+        empty = jnp.argmin(jnp.abs(face.side))
+        slot = feasible & (slots == jnp.where(joins, empty, leaving))
         # one row more and one row less both change the two matrices by one of rank 1
-        gone = _at(face.image, j)
-        bent = H @ gone
-        line = jnp.where(joins, along, gone)
-        tilt = jnp.where(joins, there - against, -(face.image @ bent))
-        over = jnp.where(goes_on, 1.0 / jnp.where(joins, free, gone @ bent), 0.0)
-        multiplier = face.multiplier - step * against
+        released = entry(face.image, leaving)
+        force = H @ released
+        line = jnp.where(joins, direction, released)
+        tilt = jnp.where(joins, slot - dual, -(face.image @ force))
+        divisor = jnp.where(joins, curvature, released @ force)
+        scale = jnp.where(feasible, 1.0 / divisor, 0.0)
+        multiplier = face.multiplier - step * dual
         new = Face(
-            x=face.x + step * jnp.where(moves, along, 0.0),
-            multiplier=jnp.where(there, joins * (entry.multiplier + step), multiplier),
-            row=jnp.where(there & joins, p, face.row),
-            side=jnp.where(there, joins * side, face.side),
-            inverse=face.inverse + jnp.where(joins, -over, over) * line[:, None] * line,
-            image=face.image + (over * tilt)[:, None] * line,
+            x=face.x + step * jnp.where(independent, direction, 0.0),
+            multiplier=jnp.where(slot, joins * (candidate.multiplier + step), multiplier),
+            row=jnp.where(slot & joins, number, face.row),
+            side=jnp.where(slot, joins * side, face.side),
+            inverse=face.inverse + jnp.where(joins, -scale, scale) * line[:, None] * line,
+            image=face.image + (scale * tilt)[:, None] * line,
         )
-        left = _at(face.row, j)
-        out = jnp.where(joins, out & (index != p), out | (index == left))
-        waiting = Entry(
-            p, jnp.where(joins, 0.0, side), jnp.where(joins, 0.0, entry.multiplier + step)
+        dropped = entry(face.row, leaving)
+        candidates = jnp.where(
+            joins, candidates & (index != number), candidates | (index == dropped)
         )
-        return jnp.where(goes_on, k + 1, PASSES * size), new, out, waiting
+        multiplier = jnp.where(joins, 0.0, candidate.multiplier + step)
+        candidate = Candidate(number, jnp.where(joins, 0.0, side), multiplier)
+        return jnp.where(feasible, count + 1, PASSES * size), new, candidates, candidate
 
     zero = 0.0 * f[0]
     face = Face(
         x=-(whole @ f),
-        multiplier=jnp.concatenate([f[size - held :], 0.0 * f[: size - held]]),
+        multiplier=jnp.concatenate([f[size - active :], 0.0 * f[: size - active]]),
         row=jnp.asarray(slots, dtype=jnp.int32),
-        side=jnp.where(slots < held, 1.0, 0.0) + zero,
+        side=jnp.where(slots < active, 1.0, 0.0) + zero,
         inverse=whole,
-        image=jnp.eye(size, k=size - held) + 0.0 * whole,
+        image=jnp.eye(size, k=size - active) + 0.0 * whole,
     )
-    first = jnp.int32(0), face, jnp.asarray(index >= held), Entry(jnp.int32(0), zero, zero)
-    face = jax.lax.while_loop(under_way, advance, first)[1]
-    # what rounding has left
-    stationary, kept = _residuals(face, H, f, G, l, u)
-    x, multiplier = _towards(face, H, stationary, kept)
+    none = Candidate(jnp.int32(0), zero, zero)
+    first = jnp.int32(0), face, jnp.asarray(index >= active), none
+    face = jax.lax.while_loop(goes_on, advance, first)[1]
+    # one step of refinement removes the rounding errors of the updates
+    gradient, violation = _residuals(face, H, f, G, l, u)
+    x, multiplier = _solve_on(face, H, gradient, violation)
     return face._replace(x=face.x - x, multiplier=face.multiplier + multiplier)
 
 
@@ -165,8 +170,8 @@ def _inverse(A):
     index = np.arange(A.shape[0])
 
     def sweep(k, A):
-        here, column = index == k, _at(A, k)
-        pivot = _at(column, k)
+        here, column = index == k, entry(A, k)
+        pivot = entry(column, k)
         # c c' / pivot, with pivot - 1 as c_k, does the whole sweep but 2 on the diagonal
         c = column - here
         return A - (c / pivot)[:, None] * c - 2.0 * here[:, None] * here
@@ -181,19 +186,19 @@ def _residuals(face, H, f, G, l, u):
     return times(H, face.x) + f - times(rows.T, face.multiplier), times(rows, face.x) - ends
 
 
-def _towards(face, H, a, c):
+def _solve_on(face, H, a, c):
     """Solve H x + R'y = a, R x = c for x, y with the rows R of the face."""
     x = times(face.inverse, a) + times(face.image.T, c)
     return x, times(face.image, a - times(H, x))
 
 
 @minimum.defjvp
-def _slope(held, data, moved):
-    face = minimum(*data, held)
+def _slope(active, data, tangents):
+    face = minimum(*data, active)
     H, G = data[0], data[2]
     fixed = jax.lax.stop_gradient(face)
     at_face = lambda *data: _residuals(face, *data)
-    stationary, kept = jax.jvp(at_face, tuple(data), tuple(moved))[1]
+    gradient, violation = jax.jvp(at_face, tuple(data), tuple(tangents))[1]
     rows = face.side[:, None] * G[face.row]
 
     def conditions(change):
@@ -202,18 +207,14 @@ def _slope(held, data, moved):
 
     x, y = jax.lax.custom_linear_solve(
         conditions,
-        (-stationary, -kept),
-        lambda _, right: _towards(fixed, jax.lax.stop_gradient(H), *right),
+        (-gradient, -violation),
+        lambda _, right: _solve_on(fixed, jax.lax.stop_gradient(H), *right),
         symmetric=True,
     )
-    still = jax.tree.map(_still, face)
-    return face, still._replace(x=x, multiplier=-y)
+    zeros = jax.tree.map(_zero_tangent, face)
+    return face, zeros._replace(x=x, multiplier=-y)
 
 
-def _still(v):
+def _zero_tangent(v):
     whole = jnp.issubdtype(v.dtype, jnp.integer)
     return np.zeros(v.shape, jax.dtypes.float0) if whole else jnp.zeros_like(v)
-
-
-def _at(array, k):
-    return jax.lax.dynamic_index_in_dim(array, k, 0, keepdims=False)

@@ -64,7 +64,7 @@ def weighted_squares(G, weight):
     product = jnp.zeros((G.shape[1], G.shape[1]), G.dtype)
 
     def row(j, product):
-        new = (_entry(G, j, axis=1) * weight) @ G
+        new = (entry(G, j, axis=1) * weight) @ G
         return jax.lax.dynamic_update_index_in_dim(product, new, j, 0)
 
     return jax.lax.fori_loop(0, G.shape[1], row, product)
@@ -123,9 +123,9 @@ def _cholesky(A):
         index, block = np.arange(n - first), A[first:, first:]
 
         def row(j, rows, first=first, index=index, block=block):
-            column = _entry(rows, j, axis=1)
-            new = _entry(block, j) - column @ rows
-            new = jnp.where(index < j, 0.0, new * jax.lax.rsqrt(_entry(new, j)))
+            column = entry(rows, j, axis=1)
+            new = entry(block, j) - column @ rows
+            new = jnp.where(index < j, 0.0, new * jax.lax.rsqrt(entry(new, j)))
             return jax.lax.dynamic_update_index_in_dim(rows, new, first + j, 0)
 
         rows = jnp.concatenate([U[:, first:], jnp.zeros((end - first, n - first), A.dtype)])
@@ -141,18 +141,19 @@ def _cholesky_solve(U, b):
     index = np.arange(n)
 
     def forward(j, b):
-        row = _entry(U, j)
-        y = _entry(b, j) / _entry(row, j)
+        row = entry(U, j)
+        y = entry(b, j) / entry(row, j)
         return jnp.where(index < j, b, jnp.where(index == j, y, b - row * y))
 
     def backward(k, x):
         j = n - 1 - k
-        row = _entry(U, j)
-        y = (_entry(x, j) - jnp.sum(jnp.where(index > j, row * x, 0.0))) / _entry(row, j)
+        row = entry(U, j)
+        y = (entry(x, j) - jnp.sum(jnp.where(index > j, row * x, 0.0))) / entry(row, j)
         return jax.lax.dynamic_update_index_in_dim(x, y, j, 0)
 
     return jax.lax.fori_loop(0, n, backward, jax.lax.fori_loop(0, n, forward, b))
 
 
-def _entry(array, j, axis=0):
+def entry(array, j, axis=0):
+    """Return entry j, a variable, of an array along an axis."""
     return jax.lax.dynamic_index_in_dim(array, j, axis, keepdims=False)

@@ -174,8 +174,8 @@ class Controller(Role):
         return False
 
     @property
-    def alone(self) -> bool:
-        """Whether runs take less time one after the other than side by side."""
+    def sequential(self) -> bool:
+        """True if many runs take less time in sequence than as one vectorised batch."""
         return False
 
     @property

@@ -197,6 +197,7 @@ class NMPC(Controller):
         K m) by the knots; basis (N, m, K m): of the inputs.
         """
         model, d = self.model, estimate.d
+        n, unit = model.tanks, jnp.eye(model.tanks + model.pumps)
 
         def onward(x, u):
             levels, area = tuple(x[i] for i in range(n)), None
@@ -218,7 +219,6 @@ class NMPC(Controller):
             S = sum(along[:, None] * row for along, row in zip(slope, [*S, *b]))
             return S, S
 
-        n, unit = model.tanks, jnp.eye(model.tanks + model.pumps)
         x = jnp.stack(list(estimate.x))
         last, starts = jax.lax.scan(lambda x, u: (onward(x, u), x), x, inputs)
         # of all samples at once: the vectors are long, and the levels are known
@@ -249,7 +249,7 @@ class NMPC(Controller):
         return state._replace(applied=jnp.stack(list(applied)))
 
     @property
-    def alone(self) -> bool:
+    def sequential(self) -> bool:
         return True  # each has as many iterations as its own samples need
 
     @property

@@ -11,7 +11,7 @@ LOOPED = 16
 """Operations on single entries from which one on arrays is a loop."""
 
 FEW = 12
-"""Blocks from which a large array is joined, at most; of more, its entries are listed."""
+"""Largest number of blocks from which a large array is joined; of more, its entries are listed."""
 
 
 def filled(shape, f):
@@ -57,16 +57,16 @@ def reduced(writer, kind, op, rows, axes, of):
 
 
 def place_of(writer, array):
-    """Return (name, offset, strides) of an array whose elements lie so in one, else None."""
+    """Return (name, offset, strides) of elements at regular places of one array, else None."""
     first = array.flat[0]
     if getattr(first, "name", None) not in writer.sizes:
         return None
     if any(not isinstance(e, Ref) or e.name != first.name for e in array.flat):
         return None
     index = np.array([e.index for e in array.flat]).reshape(array.shape)
-    ones = [tuple(int(d == k) for d in range(array.ndim)) for k in range(array.ndim)]
     offset = int(index.flat[0])
-    strides = tuple(int(index[i]) - offset if index.shape[k] > 1 else 0 for k, i in enumerate(ones))
+    seconds = [index.take(min(1, n - 1), axis=k).flat[0] for k, n in enumerate(array.shape)]
+    strides = tuple(int(second) - offset for second in seconds)
     grid = np.indices(array.shape).reshape(array.ndim, -1)
     regular = np.array_equal(np.array(strides, int) @ grid + offset, index.ravel())
     return (first.name, offset, strides) if regular else None
@@ -127,10 +127,8 @@ def assembled(writer, kind, array):
     """Return the name of an array that is joined from a few blocks; None where it has many."""
     if all(map(is_number, array.flat)):
         return None
-    blocks, steps = (
-        list(_blocks(writer, array, 0, row_by_row(array.shape))),
-        row_by_row(array.shape),
-    )
+    steps = row_by_row(array.shape)
+    blocks = list(_blocks(writer, array, 0, steps))
     if len(blocks) > FEW:
         return None
     name = writer.new_array(kind, array.size)

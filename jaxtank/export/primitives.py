@@ -149,10 +149,10 @@ def _gather(writer, eqn, operands):
 def _integer_power(writer, eqn, operands):
     y = eqn.params["y"]
 
-    out, one = operands[0], np.array(1.0, dtype=object)
+    out, unit = operands[0], np.array(1.0, dtype=object)
     for _ in range(abs(y) - 1):
         out = arrays.each(writer, REAL, "mul", [out, operands[0]], [REAL] * 2)
-    return [arrays.each(writer, REAL, "div", [one, out], [REAL] * 2) if y < 0 else out]
+    return [arrays.each(writer, REAL, "div", [unit, out], [REAL] * 2) if y < 0 else out]
 
 
 def _clamp(writer, eqn, operands):

@@ -200,11 +200,15 @@ def processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def _is_sequential(structure: Any, leaves: Any) -> bool:
+    """Return whether the runs of a group are done in sequence."""
+    return jax.tree.unflatten(structure, leaves).controller.sequential
+
+
 def _shares(group: Group) -> list[Group]:
-    """Return groups of as many runs each that together are `group`, one for each processor."""
-    # where runs are done one after the other
+    """Return a group in equal parts, one for each processor, where its runs are in sequence."""
     count = len(group.runs)
-    if not jax.tree.unflatten(group.structure, group.leaves).controller.alone:
+    if not _is_sequential(group.structure, group.leaves):
         return [group]
     most = max(n for n in range(1, processors() + 1) if count % n == 0)
     return [take(group, rows) for rows in np.split(np.arange(count), most)]
@@ -266,7 +270,7 @@ def _mapped(function: Callable[..., Any], leaves: Any, keys: Any, shape: Shape) 
         mine = leaves if not any(apart) else [v[0] if a else v for v, a in zip(leaves, apart)]
         result: Any = one(mine, None if keys is None else keys[0])
         return jax.tree.map(_first_axis, result)
-    if jax.tree.unflatten(structure, leaves).controller.alone:
+    if _is_sequential(structure, leaves):
         moving = [v for v, a in zip(leaves, apart) if a]
 
         def row(now: Any) -> Any:
@@ -293,8 +297,7 @@ def _values(
 
         return _mapped(one, leaves, keys, shape)
 
-    structure = shape[0]
-    if jax.tree.unflatten(structure, leaves).controller.alone:
+    if _is_sequential(shape[0], leaves):
         return jax.lax.map(at, points)
     return jax.vmap(at)(points)
 
@@ -311,7 +314,7 @@ def _slopes(
     squares: Any,
 ) -> Any:
     def one(loop: ClosedLoop, key: Any) -> Any:
-        several = shape[-1] > 1 and not loop.controller.alone
+        several = shape[-1] > 1 and not loop.controller.sequential
         return sensitivities_compiled(loop, clock, names, order, values, key, squares, several)
 
     return _mapped(one, leaves, keys, shape)

@@ -1,4 +1,4 @@
-"""The three sentences above a report: what to set, what it gives, and what no gain can change.
+"""The three sentences above a report: new gains, their result, limits of every gain.
 
 `advice_of` of each report makes them of its result; page, terminal and JSON show the same ones.
 """
@@ -21,7 +21,7 @@ from tuning.uncertainty.needs import unjudged
 
 
 class Advice(NamedTuple):
-    """Three sentences; of `compare` and `identify` the first one begins with what was found."""
+    """Three sentences; the first of `compare` is on claims, of `identify` on the diagnosis."""
 
     to_set: str
     gives: str
@@ -49,7 +49,12 @@ def listed(words: Sequence[str]) -> str:
 
 def amount(value: Any, unit: str, digits: int = 3) -> str:
     """Return a number with its unit."""
-    return shown(value, digits) + (f" {unit}" if unit not in ("", "-") else "")
+    return _with_unit(shown(value, digits), unit)
+
+
+def _with_unit(text: str, unit: str) -> str:
+    """Return the text of a number with its unit, alone where it has none."""
+    return text if unit in ("", "-") else f"{text} {unit}"
 
 
 def changes(before: Any, after: Any, unit: str, digits: int = 3) -> str:
@@ -67,7 +72,7 @@ def limits_of(
     for row in rows:
         at_least = MEASURES[row["measure"]].sense < 0
         value = "undefined" if row["reason"] else amount(row["value"], row["unit"], 4)
-        bound = f"{row['limit']:.5g}" + (f" {row['unit']}" if row["unit"] not in ("", "-") else "")
+        bound = _with_unit(f"{row['limit']:.5g}", row["unit"])
         margin = "-" if row["reason"] else amount(row["margin"], row["unit"])
         cells.append([row["words"], ("≥ " if at_least else "≤ ") + bound, value, margin])
         cells[-1] += row.get("more", ["" if row["time_s"] is None else f"{row['time_s']:.4g} s"])

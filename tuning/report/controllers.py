@@ -128,9 +128,9 @@ def advice_of(result):
     best, unit, samples = result.best, result.case.loop.units[0], result.samples
     gives = f"It gives: no finite run on {samples} plants."
     if best.error is not None:
-        held = samples - best.violations
+        holding = samples - best.violations
         gives = (
-            f"It gives: mean RMS error {amount(best.error, unit)}; limits hold on {held} of"
+            f"It gives: mean RMS error {amount(best.error, unit)}; limits hold on {holding} of"
             f" {samples} plants."
         )
     return Advice(f"Set the controller {best.words()}.", gives, of_nominal_plant(result.case))

@@ -158,7 +158,7 @@ def advice_of(result):
         return advice.Advice(
             "Nothing to set: no measure depends on a parameter.",
             f"It gives: no effect in {count(result.runs, 'run')}.",
-            "What no gain can change was not studied here.",
+            "Setpoints out of reach of every gain were not studied here.",
         )
     effects: dict[str, list[str]] = {}  # of the first parameter of each measure
     for c in known:
@@ -174,8 +174,8 @@ def advice_of(result):
     return advice.Advice(
         f"Nothing to set; know these parameters best: {advice.listed(list(effects))}.",
         f"Within its spread {advice.listed(moves) or 'no parameter moves a measure'}.",
-        f"No gain can change this: {varied if gains else 'no gain was varied'}; only a measurement"
-        " (jaxtank identify) or other equipment makes the effects of the rig's parameters smaller.",
+        f"The effects of the rig's parameters ({varied if gains else 'no gain was varied'}) become"
+        " smaller by a measurement (jaxtank identify) or by other equipment only.",
     )
 
 

@@ -149,11 +149,11 @@ def _gives(result):
         terms = next(iter(cost["terms"])) if len(cost["terms"]) == 1 else "objective"
         words.append(f"{terms} {advice.changes(cost['before'], cost['after'], cost_unit(result))}")
     if answer is not None and answer.after is not None and answer.after.limits:
-        held = [int(side.held.sum()) for side in (answer.before, answer.after)]
-        words.append(f"limits hold on {held[0]} -> {held[1]} of {answer.after.samples} plants")
+        counts = [int(side.held.sum()) for side in (answer.before, answer.after)]
+        words.append(f"limits hold on {counts[0]} -> {counts[1]} of {answer.after.samples} plants")
     elif rows := worst_of_scenarios(result.constraints):
-        held = sum(row["margin"] >= 0.0 for row in rows)
-        words.append(f"{held} of {len(rows)} limits hold in the runs of the search")
+        holding = sum(row["margin"] >= 0.0 for row in rows)
+        words.append(f"{holding} of {len(rows)} limits hold in the runs of the search")
         judged = verdicts.of_tuning(result).plants
         words += [judged.words] if judged else []
     return words

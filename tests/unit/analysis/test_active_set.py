@@ -30,13 +30,13 @@ def reference(H, f, A, l, u, G, room, penalty):
     cost = lambda z: 0.5 * z[:N] @ H @ z[:N] + f @ z[:N] + price(z[N:])
     slope = lambda z: np.concatenate([H @ z[:N] + f, penalty * (1.0 + 100.0 * z[N:] / SPAN)])
     rows = np.concatenate([-G, np.broadcast_to(np.eye(K), (SAMPLES, K, K))], axis=2)
-    held = {"type": "ineq", "fun": lambda z: np.ravel(room + z[N:] - G @ z[:N])}
+    limits = {"type": "ineq", "fun": lambda z: np.ravel(room + z[N:] - G @ z[:N])}
     return minimize(
         cost,
         np.zeros(N + K),
         jac=slope,
         bounds=[*zip(l, u), *[(0.0, None)] * K],
-        constraints=held | {"jac": lambda _: rows.reshape(-1, N + K)},
+        constraints=limits | {"jac": lambda _: rows.reshape(-1, N + K)},
         options={"ftol": 1e-15, "maxiter": 500},
     ).x
 

@@ -178,8 +178,8 @@ def test_a_search_on_plants_has_the_cost_the_noise_and_the_filter_of_the_command
         loop = (filtered if guard else setting).searched.loop
         own, clock = jaxtank.with_values(loop, values), setting.searched.clock
         measures = jaxtank.evaluate(own, clock, list(setting.objective), jax.random.key(seed))
-        wanted = sum(w * float(np.sum(measures[m])) for m, w in setting.objective.items())
-        assert cost == pytest.approx(wanted, rel=1e-9)
+        expected = sum(w * float(np.sum(measures[m])) for m, w in setting.objective.items())
+        assert cost == pytest.approx(expected, rel=1e-9)
 
 
 TUNED = """
@@ -213,8 +213,8 @@ def test_tune_of_the_page_is_the_answer_of_the_command_on_its_plants(name):
     found = node(engine(off, on) + TUNED.replace("WORKER", worker), data_of(case)["uncertain"])
     setting = setting_of(case).with_filter() if found["filter"] else setting_of(case)
     answer = tuning.tune(case)
-    gains, wanted = {name: found["values"][name] for name in answer}, answer.answer.after
+    gains, command = {name: found["values"][name] for name in answer}, answer.answer.after
     loop = jaxtank.with_values(setting.searched.loop, gains)
     own = judge(setting.replace(searched=setting.searched.replace(loop=loop)), 256, 0)
-    assert np.mean(own.cost) <= 1.03 * np.mean(wanted.cost)
-    assert own.held.sum() >= 0.97 * wanted.held.sum()
+    assert np.mean(own.cost) <= 1.03 * np.mean(command.cost)
+    assert own.held.sum() >= 0.97 * command.held.sum()
