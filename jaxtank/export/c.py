@@ -53,8 +53,6 @@ class C(Printer):
 
     def value(self, e):
         """Return a number or a Ref as text."""
-        if isinstance(e, Ref) and e in self.places:
-            return self.places[e]
         text = super().value(e)
         if isinstance(e, float) and self.suffix and np.isfinite(e):
             return f"{text[:-1]}f)" if text.endswith(")") else f"{text}f"

@@ -1,5 +1,7 @@
 """Controllers as JavaScript."""
 
+import numpy as np
+
 from jaxtank.export.printer import FUNCTIONS, OPERATIONS, Printer, header
 from jaxtank.export.statements import REAL, TRUTH, WHOLE, Define, Ref, every, matrix_operations
 
@@ -156,7 +158,10 @@ def helpers(statements):
 def print_javascript(program, name, precision):
     """Return a Program as the text of a JavaScript file."""
     printer = JavaScript()
-    begin = f"{name}.init(y, u) returns the state from the levels and inputs before the first."
+    begin = f"{name}.init(y, u) returns the state; u: inputs before the first sample, optional."
+    initial = ", ".join(
+        printer.value(float(v)) for v in np.ravel(program.case.loop.actuator.initial)
+    )
     sizes = {
         "dt": program.case.clock.dt,
         "state": program.state,
@@ -173,7 +178,7 @@ def print_javascript(program, name, precision):
         f"const {name} = (() => {{",
         *helpers([*program.begin, *program.step]),
         "",
-        "function init(y, u) {",
+        f"function init(y, u = [{initial}]) {{",
         *printer.lines(program.begin),
         f"    return Float64Array.of({first});",
         "}",

@@ -94,7 +94,7 @@ class Printer:
         if isinstance(e, Ref):
             if e in self.places:
                 return self.places[e]
-            name = self.rename.get(e.name, e.name)
+            name = self.places.get(Ref(e.name), self.rename.get(e.name, e.name))
             return name if e.index is None else self.entry.format(name, self._index(e.index))
         if isinstance(e, bool):
             return self.truths[e]

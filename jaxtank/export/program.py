@@ -22,6 +22,7 @@ from jaxtank.export.statements import (
     Matrix,
     Ref,
     Statement,
+    Vector,
     array_kinds,
     every,
     hoisted,
@@ -319,6 +320,7 @@ def _crossing(moving, results, rank):
 def _kinds(statements):
     """{variable: its kind} of the numbers that statements define."""
     loops = (s for s in every(statements) if isinstance(s, Loop))
-    carried = {name: kind for s in loops for kind, name, _ in s.carried}
+    of_entries = lambda kind: kind.kind if isinstance(kind, Vector) else kind
+    carried = {name: of_entries(kind) for s in loops for kind, name, _ in s.carried}
     single = (s for s in every(statements) if isinstance(s, Define | Each))
     return carried | {s.name: s.kind for s in single}
