@@ -4,6 +4,7 @@ Compiled programs are kept in pytest's own cache between runs and shared by work
 subprocesses; `pytest --cache-clear` compiles everything anew.
 """
 
+import gc
 import os
 import re
 import shutil
@@ -15,6 +16,7 @@ import jaxtank  # noqa: F401  (before jax starts, so that the XLA option takes)
 from jaxtank.measures import catalogue
 
 jax.config.update("jax_enable_x64", True)
+gc.set_threshold(50_000, 20, 100)  # as the command does: tracing makes many objects, few circles
 
 MEASURES = set(catalogue.MEASURES)
 """Measures of the package, before a test registers one."""

@@ -274,6 +274,7 @@ def drained(samples):
     )
 
 
+@pytest.mark.slow_for("4096")
 @pytest.mark.parametrize("samples", MANY)
 def test_every_draw_is_its_closed_form(samples):
     """The lowest level of every draw, and their mean."""

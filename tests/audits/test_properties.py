@@ -348,6 +348,7 @@ def check_order(plant, x, u, d, integrator, order):
     assert errors[-1] < 1e-4
 
 
+@pytest.mark.slow_for("4")
 @of_every_rig()
 def test_runge_kutta_is_of_fourth_order(seed, tanks, kind):
     check_order(*smooth_rig(seed, tanks, kind), "rk4", 4)

@@ -322,6 +322,7 @@ def test_tune_json_has_the_keys_of_the_contract(tuned):
     assert result["scenarios"] == [] and result["choices"] == [] and result["tradeoff"] is None
 
 
+@pytest.mark.slow
 def test_tune_is_no_worse_than_its_start_and_its_numbers_are_of_its_runs(tuned, gouta):
     result = tuned[0].json
     # Tp = 11 s, the paper's, is not the best of this run
@@ -511,6 +512,7 @@ def test_too_few_iterations_end_with_3():
     assert (printed.json["success"], printed.json["status"]) == (False, "not_converged")
 
 
+@pytest.mark.slow
 def test_an_interrupted_search_ends_with_130_and_its_best_point_is_written(folder, monkeypatch):
     class Impatient(tune_command.Progress):
         def __call__(self, event):
@@ -543,6 +545,7 @@ def test_a_trade_off_that_is_interrupted_costs_itself_and_not_the_answer(folder,
     assert (folder / "out" / "rig.toml").exists() and printed.json.get("tradeoff") is None
 
 
+@pytest.mark.slow
 def test_an_objective_that_no_run_can_give_is_reported():
     # before 20 s nothing changes, so nothing settles: the objective is not a number anywhere
     clock = (*setting("clock.duration=10"), "--dt", "0.1", "--quiet", "--nominal")

@@ -149,6 +149,7 @@ def test_what_is_set_is_what_is_reported():
     )
 
 
+@pytest.mark.slow
 def test_a_rig_of_a_file_is_printed(capsys):
     assert main.main(["show", str(RIGS / "two_tanks.toml")]) == 0
     page = capsys.readouterr().out

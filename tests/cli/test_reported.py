@@ -28,6 +28,7 @@ def test_the_advice_is_taken(capsys):
     assert main.main(["sensitivity", ONE_TANK, "--vary", "plant.drain=uniform:10%", "--quiet"]) == 0
 
 
+@pytest.mark.slow
 def test_without_limits_nothing_is_reported_to_hold():
     case = rig.load(ONE_TANK).replace(uncertain={"plant.drain": 0.1})
     quick = tuning.Options(starts=1, screening=1, iterations=1, validation=2)

@@ -215,7 +215,7 @@ def test_a_negative_inflow_draws_nothing_from_the_tank_below(substeps, dt):
         assert exact[:, 0].min() == 0.0 and np.abs(run.x - exact).max() < 0.05  # 0.5 % of the rim
 
 
-@pytest.mark.slow_for("1-0.003", "2-0.001", "10-3e-05")
+@pytest.mark.slow_for("1-0.003", "2-0.001", "10-3e-05", "4-0.0003")
 @pytest.mark.parametrize("substeps, within", [(1, 3e-3), (2, 1e-3), (4, 3e-4), (10, 3e-5)])
 def test_with_the_pump_off_the_lower_tank_empties_through_its_own_outlet(substeps, within):
     case = rig.set_values(CASES["pi"], {"actuator.high": 1e-9})

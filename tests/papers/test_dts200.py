@@ -67,6 +67,7 @@ def test_the_faults_are_those_of_scipy(start):
         np.testing.assert_allclose(run.x[i + 1], h, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_setpoints_are_reached_and_faults_are_removed():
     """Setpoint 1 and 2 within 0.2 cm before the next step; the faults move level 1 by more than
     that, and are integrated away.

@@ -83,6 +83,7 @@ def test_the_run_is_that_of_scipy(name):
         h = solve_ivp(rate, (0, 1), h, rtol=1e-9, atol=1e-11).y[:, -1]
 
 
+@pytest.mark.slow
 def test_signs_and_pairings():
     """The printed pairing at P+ is stable with the printed, negative, gain and unstable with its
     opposite; positive gains are stable with the other pairing.
@@ -112,6 +113,7 @@ def test_signs_and_pairings():
     assert error((1, 0), crossed) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_negative_gain_has_its_slope():
     case = rig.set_values(CASES["pi-nonminimum"], {"clock.duration": 600.0})
     cost = lambda k: jaxtank.evaluate(

@@ -65,6 +65,7 @@ def summary(kind, *setting, **more):
 # S2.3: the linear model
 
 
+@pytest.mark.slow_for("2")
 @pytest.mark.parametrize("pumps", [1, 2])
 def test_linear_model_is_the_printed_one_with_its_signs_mended(pumps):
     """Eqs. 10-13 and the matrix exponential of SciPy."""
@@ -332,6 +333,7 @@ def test_rows_with_one_pump(row):
 SPOT = [1.77263736, 2.64963504, 3.26998347, 3.67895546]
 
 
+@pytest.mark.slow
 def test_spot_values_unconstrained():
     """To 4e-6: the prototype's outlet flows through a regularised root, which at 0.03 m is short by
     (1e-4/0.03)^2/4 = 3e-6 of itself.

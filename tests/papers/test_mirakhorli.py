@@ -162,6 +162,7 @@ def test_zeros_directions_and_relative_gains(split, at_set_point, zeros, gain, d
     )
 
 
+@pytest.mark.slow_for("target0-0-11.435-1-12.78")
 @pytest.mark.parametrize(
     "target, falls, least, rises, most",
     [((14, 10), 0, 11.435, 1, 12.780), ((10, 14), 1, 11.312, 0, 12.572)],
@@ -265,6 +266,7 @@ def test_other_weights_miss_the_printed_gain(r, worst):
     )
 
 
+@pytest.mark.slow
 def test_steady_states_along_a_reference_are_those_of_every_sample():
     r = (np.array([12.0, 6.0, 14.0, 0.0]), np.array([12.0, 6.0, 10.0, 0.0]))
     levels, volts = steady_along(PLANT, r)
@@ -386,6 +388,7 @@ def test_an_error_of_tank_2_alone_decides_on_one_input(pairing, moved):
     assert abs(blended[moved] - plain[moved]) > 0.1
 
 
+@pytest.mark.slow
 def test_the_blend_has_the_steady_state_of_its_controllers():
     for kind in ("sfc", "smc", "hybrid", "lqi"):
         controller = load("mirakhorli").cases[kind].loop.controller
@@ -623,6 +626,7 @@ TABLE_3 = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow_for("5.0")
 @pytest.mark.parametrize("row", TABLE_3, ids=lambda row: str(row[0]))
 def test_rows_beside_table_3_of_the_paper(row):
     high, factor, blend, *rows = row
@@ -835,6 +839,7 @@ def test_limit_cycles_of_the_relay(reading, high, rms):
     )
 
 
+@pytest.mark.slow
 def test_integral_action_from_empty_tanks():
     _, trajectory = run("lqi")
     np.testing.assert_allclose(

@@ -104,6 +104,7 @@ def test_a_registered_controller_and_observer_are_read_and_written(own):
         assert again.free == own.free
 
 
+@pytest.mark.slow
 def test_save_writes_the_rig_file_of_a_registered_controller(tuned, tmp_path, monkeypatch):
     monkeypatch.setattr("tuning.report.tuned.figures", lambda *_: {})
     tuned.save(tmp_path)

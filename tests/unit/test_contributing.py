@@ -62,6 +62,7 @@ ramp = 0.0
 """
 
 
+@pytest.mark.slow
 def test_a_controller_from_outside_runs_and_is_tuned_by_the_commands(added, tmp_path, capsys):
     path = tmp_path / "rig.toml"
     path.write_text(RIG)
@@ -185,7 +186,7 @@ def test_a_paper_from_outside_is_found_listed_and_compared(added, tmp_path, caps
         presets.register(module.preset())
 
 
-@pytest.mark.slow_for("gouta2015/backstepping")
+@pytest.mark.slow_for("gouta2015/backstepping", "calofir/backstepping")
 @pytest.mark.parametrize("name", ["gouta2015/backstepping", "calofir/backstepping"])
 def test_a_language_from_outside_gives_the_voltages_of_the_simulation(added, name, capsys):
     with pytest.raises(InputError, match=r"must be one of c, m, js, st, fmu$"):

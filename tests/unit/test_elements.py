@@ -42,6 +42,7 @@ def at_rest(case, x, u, duration=50.0):
     return np.array(x)
 
 
+@pytest.mark.slow_for("valve")
 @pytest.mark.parametrize("rig", WITH_STEADY_STATE)
 def test_a_rig_stays_where_its_steady_state_is(rig):
     case = er.case(rig)
@@ -97,6 +98,7 @@ def test_a_closed_circuit_has_no_unique_steady_state():
             of()
 
 
+@pytest.mark.slow
 def test_slopes_of_a_steady_state_are_those_of_its_balance():
     plant, _, _ = er.cone()
 
@@ -119,7 +121,7 @@ def gpc(plant, level):
     return controllers.GPC(model=plant, operating_point=level, r_w=r_w, **sizes)
 
 
-@pytest.mark.slow_for("recycle-gpc", "valve-lqi", "cone-gpc")
+@pytest.mark.slow_for("recycle-gpc", "valve-lqi", "cone-gpc", "cone-lqi", "valve-gpc")
 @pytest.mark.parametrize(
     ("rig", "kind"), [(r, k) for r in er.RIGS for k in (lqi, gpc) if (r, k) != ("recycle", lqi)]
 )
@@ -236,6 +238,7 @@ def test_the_lowest_setpoint_that_is_feasible_is_that_of_the_open_valve():
         assert tuning.can_follow(low, {"plant.valve": np.array([[0.8]])}).tolist() == [feasible]
 
 
+@pytest.mark.slow
 def test_an_extended_kalman_filter_finds_an_unmeasured_level():
     start = er.case("recycle")
     observer = observers.ExtendedKalman(
@@ -350,7 +353,7 @@ def test_the_linear_model_of_a_valve_is_its_slope():
     assert np.isclose(B[0, 0], -flow / 50.0) and np.isclose(A[0, 0], -0.4 * flow / 2 / 15.0 / 50.0)
 
 
-@pytest.mark.slow_for("valve-off0")
+@pytest.mark.slow_for("valve-off0", "cone-off1")
 @pytest.mark.parametrize(
     ("rig", "off"),
     [

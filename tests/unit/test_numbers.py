@@ -106,6 +106,7 @@ for run in (*calls, lambda: tuning.tune_robust(case)):
 """
 
 
+@pytest.mark.slow
 def test_a_run_has_the_precision_of_its_most_precise_leaf():
     """x0 of 32 bits in a loop of 64, and one gain of 64 bits in a loop of 32: jax's scan would not
     have a state change its type.

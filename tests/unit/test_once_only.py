@@ -78,7 +78,7 @@ PLANT = dataclasses.replace(
 )  # so low that all tanks overflow
 
 
-@pytest.mark.slow_for("midpoint")
+@pytest.mark.slow_for("midpoint", "rk4")
 @pytest.mark.parametrize("integrator", ["rk4", "midpoint"])
 def test_a_rolled_sample_is_the_unrolled_one(integrator):
     """Levels and lost volumes agree, also for a number of substeps that is traced."""

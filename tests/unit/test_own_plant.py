@@ -267,6 +267,7 @@ def test_a_plant_whose_levels_are_not_in_its_units_is_refused(case):
         jaxtank.check(metres(case, Unsaid).loop, case.clock)
 
 
+@pytest.mark.slow
 def test_runs_of_a_plant_that_does_not_vary_are_no_plants(case):
     assert "8 runs of one plant" in str(tuning.validate(metres(case), samples=8))
 

@@ -63,6 +63,7 @@ def test_rigs_are_read_without_a_remark():
         assert not rig.case_warnings(case)
 
 
+@pytest.mark.slow_for("howto/plants.md")
 @pytest.mark.parametrize("page", [p for p in PAGES if blocks("python", p)])
 def test_python_runs(page, capsys):
     with jax.enable_x64(True):

@@ -17,8 +17,11 @@ def main(argv=None):
     if argv is None:
         terminal.guard()
         interrupts.listen()  # before the slow imports
+        import gc
         import warnings
 
+        # tracing makes many objects and few circles: a twentieth of a tuning's time went there
+        gc.set_threshold(50_000, 20, 100)
         # a note says the same, printed once when the case is opened
         warnings.filterwarnings("ignore", message=".* runs empty faster than the steps follow")
         warnings.filterwarnings("ignore", message="the level of .* falls below 0")

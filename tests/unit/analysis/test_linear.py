@@ -58,7 +58,7 @@ CONTINUOUS = [
 ]
 
 
-@pytest.mark.slow_for("1", "2", "3", "5")
+@pytest.mark.slow_for("1", "2", "3", "5", "4")
 @pytest.mark.parametrize("case", CONTINUOUS, ids=range(len(CONTINUOUS)))
 def test_riccati_against_scipy(case):
     A, B, Q, R = case
@@ -125,6 +125,7 @@ def test_derivatives_forward_and_reverse(solve, case):
     check_grads(f, args, order=1, modes=("fwd", "rev"), rtol=1e-5, atol=1e-5, eps=1e-6)
 
 
+@pytest.mark.slow
 def test_they_work_in_batches_and_on_a_scalar_by_hand():
     """a = 0, b = q = r = 1: P = 1, and dP/dq = 1/2; the discrete one with a = 1 is the golden
     ratio.

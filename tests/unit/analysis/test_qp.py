@@ -202,6 +202,7 @@ def test_nearly_collinear_rows_of_laguerre_functions():
         np.testing.assert_allclose(solve(H, f, G, l, u), expected, atol=1e-7)
 
 
+@pytest.mark.slow_for("63.4-0.36-0.113")
 @pytest.mark.parametrize(
     "error, before, least_step", [(63.4, 0.36, 0.113), (66.3, 0.0, 0.212), (-73.7, 0.275, 0.159)]
 )
@@ -237,6 +238,7 @@ def test_without_a_feasible_point_it_ends_with_numbers(gap):
     assert np.all(np.isfinite(x))
 
 
+@pytest.mark.slow
 def test_it_ends_when_it_has_arrived():
     """More iterations change nothing, and no bit: they are not done."""
     for seed in range(4):
@@ -256,6 +258,7 @@ def test_second_derivatives_in_reverse():
         np.testing.assert_allclose(one, expected, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_no_row_is_left_behind():
     """The product of slack and multiplier is the same for every row at the end, not only in the
     mean of 64: a row that is left at 7e-11 where the others have 1e-12 bends slopes by 1e-4.
@@ -300,6 +303,7 @@ def test_slopes_on_a_corner_are_those_that_differences_see():
     assert np.ptp(slopes[:, 1, 1]) > 0.8  # from bound to free
 
 
+@pytest.mark.slow
 def test_a_large_programme_meets_its_optimality_conditions():
     """Stationary, multipliers of the right sign on the rows that bind: enough if convex."""
     H, f, G, l, u = problem(60, 100, 7, tight=2.0)

@@ -313,6 +313,7 @@ def test_a_worker_that_differs_is_refused(case, monkeypatch):
         received(text)
 
 
+@pytest.mark.slow_for("tune")
 @pytest.mark.parametrize("words", ["uncertainty", "sensitivity --method morris", "tune"])
 def test_the_command_refuses_what_is_no_cluster_in_one_line(words, tmp_path):
     name, *more = words.split()

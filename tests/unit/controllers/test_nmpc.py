@@ -155,6 +155,7 @@ def test_slopes_of_a_plan_are_those_of_differences(planned, setpoint, limit, rat
     np.testing.assert_allclose(exact, np.stack(differences, axis=1), rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_limit_that_no_input_keeps_is_given_up_and_reported(case):
     loop, trajectory = run(case, controller__limit=[1.0, 20.0])
     assert np.all(np.isfinite(trajectory.x))
@@ -189,6 +190,7 @@ def test_what_the_programme_cannot_have_is_refused(case, change, words):
         rig.check(rig.set_values(case, change))
 
 
+@pytest.mark.slow_for("c-gcc")
 @pytest.mark.parametrize(
     ("lang", "tool"), [("c", "gcc"), pytest.param("js", "node", marks=pytest.mark.slow)]
 )

@@ -82,7 +82,9 @@ def test_portion_has_half_slopes_at_its_ends():
 
 
 @pytest.mark.slow_for(
-    "gouta2015/backstepping-boxqp-gains1-h2-knots1", "gouta2015/backstepping-gains0-r1-knots0"
+    "gouta2015/backstepping-boxqp-gains1-h2-knots1",
+    "gouta2015/backstepping-gains0-r1-knots0",
+    "mirakhorli/smc-printed-gains2-h4-knots2",
 )
 @pytest.mark.parametrize(
     ("name", "gains", "variable", "knots"),
@@ -391,6 +393,7 @@ def test_dependence_is_followed_into_calls_and_loops():
 # rig files and the command
 
 
+@pytest.mark.slow_for("mirakhorli/sfc-gains1-h4")
 @pytest.mark.parametrize(
     ("name", "gains", "variable"),
     [("gouta2022/pid", ("Kc[1]", "Ti"), "h1"), ("mirakhorli/sfc", ("K",), "h4")],

@@ -150,6 +150,7 @@ def test_an_override_resets_both_integrals_by_what_is_applied(select):
     assert 20 < sum(choices) < SAMPLES - 20  # each of them is selected for a while
 
 
+@pytest.mark.slow_for("flow-cascade")
 @pytest.mark.parametrize("table", [CASCADE, FLOW, OVERRIDE], ids=lambda table: table["kind"])
 def test_derivatives_are_differences_of_runs_at_the_limits_too(table):
     case = loads(**table)
@@ -208,6 +209,7 @@ def test_inputs_follow_another_input_and_a_measured_inflow():
     np.testing.assert_allclose(lead, expected, rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_direct_action_is_a_negative_gain():
     gains = {"Ti": 40.0, "b": 0.6}
     text = RIG.replace("to = 1, high = 1.0", "from = 1, high = 1.0")

@@ -80,6 +80,7 @@ def replayed(name, noise=1e-4, values=(), filtered=False):
     "mirakhorli/smc",
     "calofir/backstepping",
     "mirakhorli/hybrid",
+    "gouta2022/chadpc",
 )
 @needs_gcc
 @pytest.mark.parametrize("name", EVERY)
@@ -210,6 +211,7 @@ bias = 1.5
 """
 
 
+@pytest.mark.slow_for("c")
 @pytest.mark.parametrize(
     "lang", [pytest.param("c", marks=needs_gcc), "m", pytest.param("js", marks=needs_node)]
 )
@@ -702,6 +704,7 @@ CASCADE = {"kind": "cascade", "Kc": 3.0, "Ti": 60.0, "inner": [1], "inner_Kc": 1
 OVERRIDE = {"kind": "override", "Kc": 2.0, "Ti": 40.0, "limited": [1], "limit": 1.6}
 
 
+@pytest.mark.slow_for("cascade")
 @needs_gcc
 @pytest.mark.parametrize(
     "table",

@@ -29,6 +29,7 @@ def signals_of(case):
     return [np.stack([np.asarray(v) for v in part], axis=1) for part in sampled]
 
 
+@pytest.mark.slow_for("cascaded/pi")
 @needs_gcc
 @pytest.mark.parametrize(
     "name",

@@ -43,6 +43,7 @@ def test_the_rig_file_of_the_worst_run_gives_its_level_again(passing):
     assert rows[:, 1].max() == pytest.approx(level, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_limit_that_holds_is_exit_code_0_and_the_rig_file_keeps_the_filter(tmp_path):
     words = ["--safety-filter", "--set", "sensor.noise=[0.02]", "--constant-errors", *SHORT]
     found = command("attack", *CASE, *words, *FEW, "--out", str(tmp_path / "out"))
@@ -53,6 +54,7 @@ def test_a_limit_that_holds_is_exit_code_0_and_the_rig_file_keeps_the_filter(tmp
     assert json.loads((tmp_path / "out/result.json").read_text())["rig"]["same"]
 
 
+@pytest.mark.slow
 def test_errors_that_change_in_time_are_named_where_the_rig_file_lacks_them(tmp_path):
     words = ["--safety-filter", "--set", "sensor.noise=[0.2]", "--draws", "4", "--starts", "1"]
     words += ["--iterations", "0", "--quiet", *SHORT, "--out", str(tmp_path / "out")]

@@ -77,6 +77,7 @@ def test_the_fault_of_a_log_is_named_first_with_its_value(fault, where):
         assert low < value < high and high - low < 0.4 * value
 
 
+@pytest.mark.slow
 def test_an_accepted_cause_is_estimated_and_written(tmp_path, capsys):
     """Intervals cover the truth again, and the rig predicts the log within its noise."""
     t, u, y = record(("pump-delay", 3.0))

@@ -153,6 +153,7 @@ def test_a_notebook_shows_experiments_as_a_table():
     assert isinstance(result, dict) and list(result) == ["a <step>"]
 
 
+@pytest.mark.slow
 def test_the_candidates_are_those_of_the_notes(case):
     inputs = candidates(case.loop, duration=300, dt=1.0, voltage=VOLTAGE, size=0.5)
     expected, names = experiments(case), list(inputs)
@@ -195,6 +196,7 @@ def hundred(case, away, clean):
     )
 
 
+@pytest.mark.slow
 def test_coverage_of_the_intervals(case, hundred):
     """Of 400 intervals 95 % +- 2.2 % hold the truth (asked: 0.90 to 0.98); scatter within 15 %, 2
     standard errors of that of 100.
@@ -1110,6 +1112,7 @@ def test_robust_tuning_without_the_scenarios_of_the_rig(logged):
         )
 
 
+@pytest.mark.slow
 def test_a_controller_that_cannot_be_proposed_leaves_the_rig_and_the_reason(tmp_path):
     text = OPEN.replace("rim = 40.0", "rim = 15.0").replace(
         "[[60.0, 1, 6.0], [260.0, 1, 4.0]]", "[[10.0, 1, 6.5]]"

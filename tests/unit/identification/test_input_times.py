@@ -109,6 +109,7 @@ def _irregular(seed=2):
     return t, times, inputs, y
 
 
+@pytest.mark.slow
 def test_inputs_of_an_irregular_log_follow_a_line_and_no_dead_time(tmp_path, capsys):
     """Pumps change between the rows: steps at the rows, which act late, fit worse than lines."""
     t, times, inputs, y = _irregular()

@@ -67,6 +67,7 @@ def test_a_gauge_that_is_not_straight_is_found_and_predicts_another_log(bent):
     assert np.sqrt(np.mean(off**2)) < 0.5
 
 
+@pytest.mark.slow
 def test_what_was_added_is_reported_and_written(bent):
     assert "a curve of the sensor of" in str(bent)
     row = bent.to_json()["refinements"][0]

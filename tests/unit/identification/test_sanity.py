@@ -100,6 +100,7 @@ def _files(folder, t, u, y, header="t [s],pump1 [%],h1 [m],h2 [m]"):
     return [str(folder / "rig.toml"), "--data", str(folder / "log.csv"), "--starts", "1"]
 
 
+@pytest.mark.slow
 def test_the_gain_of_a_pump_that_is_off_is_not_estimated(tmp_path, capsys):
     """A drain test: drain and orifice follow, and the rig keeps its gain."""
     y = _levels(np.zeros(200), [0.9, 0.6], 1.0)

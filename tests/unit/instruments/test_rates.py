@@ -255,6 +255,7 @@ console.log(JSON.stringify({ u, h: part(e.h), p: part(e.u) }));
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(NODE is None, reason="node runs the exported code")
 def test_exported_code_and_the_page_limit_the_rate_as_the_simulation_does():
     case = case_of()

@@ -126,6 +126,7 @@ def test_a_run_with_an_own_rate_limit_is_that_of_another_integrator():
     np.testing.assert_allclose(travel, 12.0 - u[0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_gradient_passes_through_an_own_actuator():
     loop = loop_of(actuator=LIMITED)
     cost = jax.jit(
@@ -164,6 +165,7 @@ def test_an_own_sensor_has_memory_and_noise():
     np.testing.assert_allclose(run.command[:, 0], 2.0 * (run.r[:, 0] - run.y[:, 0]), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_environment_plays_a_case_with_instruments_of_ones_own():
     environment = pytest.importorskip("jaxtank.interop.gymnasium")
     loop = loop_of(sensor=Lagged(noise=[0.05], tau=3.0), actuator=LIMITED)

@@ -30,6 +30,7 @@ def sample(signal):
     return tuple(jnp.stack(v) for v in signal.sample(CLOCK))
 
 
+@pytest.mark.slow
 def test_the_filter_of_ramps_is_that_of_another_solver():
     lags = (4.0, 0.3)
     plain, found = np.asarray(sample(reference())[0]), np.asarray(sample(reference(10.0, lags))[0])

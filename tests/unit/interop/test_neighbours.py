@@ -174,6 +174,7 @@ def pumps_and_sensors(case):
     "mirakhorli/hybrid-lag-delay-noise-offset-adc",
     "mirakhorli/hybrid-own",
     "gouta2022/chadpc-lag-delay-noise-offset-adc",
+    "cascaded/pi-own",
 )
 @pytest.mark.parametrize(
     "change", [lambda case: case, pumps_and_sensors], ids=["own", "lag-delay-noise-offset-adc"]

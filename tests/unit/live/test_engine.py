@@ -191,6 +191,7 @@ def test_the_safety_filter_is_switched_on():
     agrees(case, [{}], 1e-9, filtered=rig.filtered(case, True))
 
 
+@pytest.mark.slow_for("cascaded/pi")
 @pytest.mark.parametrize(
     "name",
     [

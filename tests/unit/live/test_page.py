@@ -288,6 +288,7 @@ def test_states_of_a_result_are_compared(browser, tmp_path):
         context.close()
 
 
+@pytest.mark.slow
 def test_the_command_writes_one_file_or_none(tmp_path):
     path = tmp_path / "new" / "page.html"
     done = command("explore", "cascaded/pi", "--out", str(path), "--json", "--set", "plant.rim=9")

@@ -164,6 +164,7 @@ console.log(JSON.stringify([e.info.task, GIVEN.map(([plant, seed, filter]) => {
 """
 
 
+@pytest.mark.slow
 def test_a_search_on_plants_has_the_cost_the_noise_and_the_filter_of_the_command():
     """A price on changes of inputs; the runs of the library, with the same deviates."""
     case = rig.set_values(presets.find("cascaded/pi"), {"clock.duration": 400.0})

@@ -201,6 +201,7 @@ def loop_of(tanks):
     return list(programs_in(body))
 
 
+@pytest.mark.slow
 def test_the_body_of_the_loop_does_not_grow_with_the_number_of_tanks():
     """What makes the time to compile a rig grow is the number of operations in the loop."""
     few, many = loop_of(16), loop_of(200)

@@ -204,6 +204,7 @@ def test_evaluate_simulate_and_sensitivities_tell_the_same(gouta):
         np.testing.assert_allclose(carried[m], values[m], rtol=1e-12)
 
 
+@pytest.mark.slow_for("7")
 @pytest.mark.parametrize("save_every", [7, 5000])
 def test_saved_rows_are_the_rows_of_the_run(gouta, save_every):
     case = gouta("ngpc", {"clock.duration": 30.0})

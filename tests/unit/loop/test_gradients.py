@@ -83,7 +83,7 @@ REFERENCE_SLOPES = [  # case, D, free, d RMS_tot / d ln p (gouta2015 notes S9.1)
 ]
 
 
-@pytest.mark.slow_for("1", "2", "3", "5")
+@pytest.mark.slow_for("1", "2", "3", "5", "4")
 @pytest.mark.parametrize("name, ramp, values, slopes", REFERENCE_SLOPES, ids="012345")
 def test_slopes_of_the_prototype(gouta, name, ramp, values, slopes):
     case = gouta(name, {**values, "reference.ramp": ramp, "clock.dt": 0.05})
@@ -178,6 +178,7 @@ def test_a_measure_that_is_zero_throughout_has_slope_zero(gouta):
     np.testing.assert_array_equal(jax.jacfwd(f)(z), np.zeros((2, 1)))
 
 
+@pytest.mark.slow
 def test_gauss_newton_matrix_is_that_of_the_residuals(gouta):
     case = gouta("backstepping", {"clock.duration": 200.0, "clock.dt": 0.05})
     names = ["controller.k", "controller.k1"]

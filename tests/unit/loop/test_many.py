@@ -266,6 +266,7 @@ def test_a_controller_may_close_over_what_is_traced():
         np.testing.assert_allclose(slopes[i], differences, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_no_derivatives_are_computed_by_what_does_not_move():
     """Derivatives by two of sixty numbers take no more operations than without batching."""
     value, direct, points = batched_and_direct()

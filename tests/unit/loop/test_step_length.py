@@ -243,7 +243,7 @@ def test_draws_of_steps_too_long_say_so(substeps, tmp_path):
     assert [DOUBT in text for text in reported] == [substeps == 1] * 3
 
 
-@pytest.mark.slow_for(*list(stiff_rigs.KINDS)[1:])
+@pytest.mark.slow_for(*list(stiff_rigs.KINDS)[1:], "cascaded")
 @pytest.mark.parametrize("kind", stiff_rigs.KINDS)
 def test_a_random_stiff_rig_is_right_or_reported(kind):
     """No level is off by more than 5 % of its rim without a StepWarning (`python

@@ -99,6 +99,7 @@ def test_the_command_line_brings_a_bottom_too(tmp_path, capsys):
     assert "plant.bottom = true" in note
 
 
+@pytest.mark.slow
 def test_draws_below_an_empty_tank_break_a_limit():
     found = tuning.ensemble(rig.loads(OPEN), samples=4)
     rows = {row["name"]: row for row in found.violations()}

@@ -103,7 +103,7 @@ def test_the_change_of_the_levels_in_gpc_is_that_of_a_linear_plant():
     np.testing.assert_allclose(found, (h - point) - earlier, rtol=1e-4)
 
 
-@pytest.mark.slow_for("ngpc")
+@pytest.mark.slow_for("ngpc", "backstepping")
 @pytest.mark.parametrize("kind", ["backstepping", "ngpc"])
 def test_the_error_at_the_end_of_a_plateau_vanishes(kind):
     """A wrong plant on the first two plateaus of the benchmark, with and without the observer."""

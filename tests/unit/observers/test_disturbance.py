@@ -77,7 +77,7 @@ def test_unmeasured_levels_are_predicted():
     assert at_the_end(row(5, own, inflows), inflows)[0] < 0.02
 
 
-@pytest.mark.slow_for("3")
+@pytest.mark.slow_for("3", "2")
 @pytest.mark.parametrize("n", [2, 3], ids=str)
 def test_an_inflow_into_an_unmeasured_tank_is_found_by_the_extended_filter(n):
     """Tank 1 is not measured; its inflow shows in tank 2, below it."""

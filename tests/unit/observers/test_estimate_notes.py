@@ -114,6 +114,7 @@ def test_an_observer_of_a_file_compensates_as_one_of_the_preset_does():
     assert errors[0] > 0.1 and errors[1] < 1e-3
 
 
+@pytest.mark.slow_for("cascaded/pi-state-feedback")
 @pytest.mark.parametrize(
     "name, kind", [("cascaded/pi", "state-feedback"), ("gouta2022/enmpc", "pid")]
 )

@@ -133,6 +133,7 @@ def test_near_the_bottom_the_unscented_filter_predicts_the_mean_that_levels_have
     np.testing.assert_allclose(state.P[0][0], ((after(3.5) - after(2.5)) / 2) ** 2, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_level_without_a_variance_has_finite_slopes():
     """The start of a filter that is told the levels: the root of a variance of 0."""
     observer = extended(UnscentedKalman, spread=np.zeros(4), process=np.zeros(4))
@@ -146,7 +147,7 @@ def test_a_level_without_a_variance_has_finite_slopes():
     assert abs(slope - (level(x + step) - level(x - step)) / 2e-5) < 1e-8
 
 
-@pytest.mark.slow_for("measured0", "measured1")
+@pytest.mark.slow_for("measured0", "measured1", "measured2")
 @pytest.mark.parametrize("measured", [(0, 1), (1,), (0, 1, 2, 3)])
 def test_the_steady_gain_is_scipys(measured):
     Ad, _, drift, L = kalman(measured=measured).design(0.5)

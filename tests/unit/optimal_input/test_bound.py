@@ -99,6 +99,7 @@ def test_five_intervals_against_another_solver():
     np.testing.assert_allclose(found.cost, best, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_it_goes_below_the_controller_and_keeps_the_limit(climb, climbed):
     again = jaxtank.evaluate(
         open_loop(climb.loop, climbed.u.T, 1.0), climb.clock, ["rms_error_total", "max_level"]

@@ -76,6 +76,7 @@ def test_a_random_rig_follows_an_integrator_of_the_tests(seed):
     assert random_elements.errors(seed) < 1e-9
 
 
+@pytest.mark.slow_for("0")
 @pytest.mark.parametrize("seed", RIGS)
 def test_a_rig_without_outlets_keeps_its_volume_while_tanks_run_empty(seed):
     assert random_elements.lost(seed) < 1e-12

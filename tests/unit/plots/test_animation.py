@@ -59,6 +59,7 @@ def test_the_tanks_of_the_gif_hold_what_the_run_says(short, tmp_path):
     assert np.abs(np.polyval(slope, stored) - seen).max() < 0.05 * np.ptp(seen)
 
 
+@pytest.mark.slow
 def test_two_rigs_stand_beside_each_other_and_the_shorter_run_stays_at_its_end(short):
     loop, run = short
     other = jaxtank.presets.find("cascaded/pi").loop

@@ -27,6 +27,7 @@ def drawn(run, columns):
         return {"run": responses.responses(run[0], {"PI": run[1]}, "a title")}
 
 
+@pytest.mark.slow_for("1-3.5")
 @pytest.mark.parametrize(("columns", "inches"), [(1, 3.5), (2, 7.16)])
 def test_a_figure_is_as_wide_as_the_columns_at_300_dpi(run, columns, inches):
     files = for_journal(drawn(run, columns), columns)
@@ -48,6 +49,7 @@ def test_letters_are_outlines_of_7_to_8_points_and_there_is_no_title(run):
     assert "<text" not in svg and not plt.rcParams["text.usetex"]
 
 
+@pytest.mark.slow
 def test_the_same_figure_gives_the_same_bytes_and_settings_are_taken_back(run):
     before = plt.rcParams["font.family"], plt.rcParams["savefig.dpi"]
     assert for_journal(drawn(run, 2), 2) == for_journal(drawn(run, 2), 2)

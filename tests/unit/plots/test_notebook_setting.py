@@ -46,6 +46,7 @@ def test_one_call_sets_precision_style_and_resolution(restored):
     plt.close(figure)
 
 
+@pytest.mark.slow
 def test_a_case_a_run_and_a_study_have_one_small_picture_each(restored):
     case = presets.find("cascaded/pi")
     clock = jaxtank.Clock(dt=4.0, duration=80.0)

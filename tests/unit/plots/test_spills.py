@@ -54,6 +54,7 @@ def test_full_to_the_rim_is_not_above_it():
     assert hatched(schematic(Figure().gca(), plant, [30.0] * 4)) == []
 
 
+@pytest.mark.slow
 def test_what_is_on_the_floor_is_the_overflow_volume_of_the_library(runs):
     loop, run, clock = runs[True]
     volume = np.asarray(jaxtank.evaluate(loop, clock, ["overflow_volume"])["overflow_volume"])

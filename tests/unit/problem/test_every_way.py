@@ -45,7 +45,7 @@ def default_with_checks(case):
 EVERY = [nominal, robust, default, default_with_checks]
 
 
-@pytest.mark.slow_for("default_with_checks", "robust")
+@pytest.mark.slow_for("default_with_checks", "robust", "nominal")
 @pytest.mark.parametrize("make", EVERY)
 def test_every_problem_is_run_at_every_step(case, make):
     """The noise of the default answer is drawn beforehand, and not for the coarse step."""

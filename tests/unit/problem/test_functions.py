@@ -347,6 +347,7 @@ def test_a_constraint_has_one_finite_limit_and_a_name_of_its_own(watertank):
         Problem(watertank, limits=[3.0])
 
 
+@pytest.mark.slow
 def test_a_function_that_is_replaced_under_its_name_is_compiled_anew(watertank):
     def own(factor):
         register("scaled", from_function(lambda m: factor * m["rms_error_total"]))

@@ -64,6 +64,7 @@ def test_simc_of_an_integrator_has_the_published_gains():
     np.testing.assert_allclose(gains["controller.Ti[0]"], 480.0, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_the_ultimate_cycle_of_an_integrator_is_that_of_its_dead_time():
     ultimate = rules.ultimate_of(rules.loop_of(rig.loads(SIMC), 0))
     theta = 60.0 + 0.05  # half a sample more
@@ -90,6 +91,7 @@ def test_the_half_rule_shares_the_second_lag():
     np.testing.assert_allclose(second.gain * second.lag, steady, rtol=1e-6)
 
 
+@pytest.mark.slow_for("simc")
 @pytest.mark.parametrize("rule", rules.RULES)
 def test_every_rule_stabilises_an_integrator_with_dead_time(rule):
     case = rig.loads(SIMC)
@@ -174,7 +176,7 @@ SECOND = {
 }
 
 
-@pytest.mark.slow_for("flow-cascade")
+@pytest.mark.slow_for("flow-cascade", "cascade")
 @pytest.mark.parametrize("kind", SECOND)
 def test_simc_stabilises_both_loops_of_a_kind(kind):
     case = series(**SECOND[kind])

@@ -40,6 +40,7 @@ def row(page, label):
     return [cell.strip() for line in lines for cell in line.split("  ") if cell.strip()]
 
 
+@pytest.mark.slow
 def test_a_single_draw_is_reported_without_a_spread(five):
     """The rig has two tanks: a measure of several entries has no spread either."""
     one = first(five, 1)

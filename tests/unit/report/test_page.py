@@ -135,7 +135,7 @@ LIVE = re.compile(
 )
 
 
-@pytest.mark.slow_for("tune")
+@pytest.mark.slow_for("tune", "compare")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_page_is_well_formed_and_asks_nothing_of_the_network(folder_of, kind):
     whole = (folder_of(kind) / "report.html").read_text(encoding="utf-8")
@@ -215,6 +215,7 @@ def test_a_picture_that_fails_costs_itself_and_not_the_answer(
         assert not plt.get_fignums()
 
 
+@pytest.mark.slow
 def test_results_are_on_the_disk_before_any_picture_is_drawn(
     saves, folder_of, tmp_path, monkeypatch
 ):

@@ -174,6 +174,7 @@ def test_every_command_with_json_is_judged_here():
 SLOW = ("explore", "identify", "predict")  # of which other tests read the JSON too
 
 
+@pytest.mark.slow_for("show")
 @pytest.mark.parametrize(
     "command", [pytest.param(c, marks=pytest.mark.slow) if c in SLOW else c for c in JUDGED]
 )

@@ -40,7 +40,7 @@ def used(text):
     return re.sub(r"(?m)^#(?=\S)", "", text)
 
 
-@pytest.mark.slow_for(*EIGHT[1:4], EIGHT[7])
+@pytest.mark.slow_for(*EIGHT[1:4], EIGHT[7], "mirakhorli/hybrid")
 @pytest.mark.parametrize("name", EIGHT)
 def test_a_preset_is_read_back_from_each_of_its_files(name, tmp_path):
     case = presets.find(name)

@@ -27,6 +27,7 @@ def simulated(*words):
     return np.array(result.json["measures"]["max_level"]), result
 
 
+@pytest.mark.slow
 def test_options_and_rig_files_turn_the_filter_on_and_off(tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text(RIG)

@@ -216,6 +216,7 @@ def runs(parts, settings):
     return np.max(seen, axis=0), np.min(seen, axis=0)
 
 
+@pytest.mark.slow
 def test_a_band_narrower_than_the_lower_end_of_a_sensor_proves_no_low_limit():
     parts, settings = spans(low=np.array([4.0, 4.0]), orifice=0.0, band=[0.0, 0.0])
     settings["low"] = [0.0, 2.0]  # read as 4 cm, where the valve may still open
@@ -224,6 +225,7 @@ def test_a_band_narrower_than_the_lower_end_of_a_sensor_proves_no_low_limit():
     assert not rows[1].low_certified and "band" in rows[1].low_reason
 
 
+@pytest.mark.slow
 def test_a_neighbour_that_rises_above_its_sensor_proves_no_limit_of_the_next_tank():
     parts, settings = spans(high=np.array([10.0, 40.0]), inflow=[420.0, 0.0])
     assert runs(parts, settings)[0][1] > 39.0

@@ -77,6 +77,7 @@ def result(case):
     return tuning.tune(case, tuning.Options(validation=64))
 
 
+@pytest.mark.slow
 def test_the_answer_keeps_its_limits(result):
     answer = result.answer
     assert result.status == "converged" and answer.held and 0.0 < answer.tightened <= LARGEST

@@ -77,6 +77,7 @@ def test_a_paper_brings_its_controllers_and_rules_bring_others():
     assert all(same)
 
 
+@pytest.mark.slow
 def test_an_observer_comes_with_its_controller():
     case, refused = presets.find("gouta2022/pi"), {}
     fitting = {n: c for n, _, c in comparison._candidates(case, refused)}

@@ -142,6 +142,7 @@ def test_plants_that_cannot_follow_are_those_of_the_limits(case):
     assert not judge(setting_of(case), 4, 0).infeasible.any()
 
 
+@pytest.mark.slow
 def test_noise_that_is_drawn_once_gives_the_same_bits(case):
     setting = setting_of(case)
     plants = setting.plants(setting.searched, 3, 0)
@@ -185,6 +186,7 @@ def test_the_nominal_plant_runs_beside_the_judged_ones(case):
             np.testing.assert_allclose(judged.nominal[name], alone[name], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_noise_that_a_case_states_is_in_its_own_run():
     noisy = presets.find("gouta2015/ngpc-observer")
     noisy = rig.set_values(noisy, {"sensor.noise": 0.02, "clock.dt": 1.0})
@@ -293,6 +295,7 @@ def test_the_answer_is_a_rig_that_is_left_alone_when_tuned_again(result, tmp_pat
     assert f"<dt>error, mean of 24 plants</dt>{words}" in page.replace("\n", "")
 
 
+@pytest.mark.slow
 def test_a_limit_that_no_gain_can_hold_is_said_and_ends_with_4(path):
     words = ["tune", path, "--limit", "max_level=0.9", "--quiet", "--no-safety-filter"]
     said = command(*words, "--validation", "8", "--starts", "1", "--iterations", "1")
@@ -324,6 +327,7 @@ def test_options_of_the_nominal_optimum_imply_it_and_say_so(path):
     assert "validation" not in said.out and "what it gives" not in said.out
 
 
+@pytest.mark.slow
 def test_progress_is_a_line_for_each_local_search(path):
     said = command("tune", path, "--validation", "8")
     lines = [line for line in said.err.splitlines() if line.startswith("start ")]

@@ -70,6 +70,7 @@ def test_tuned_again_the_answer_stays(answered, monkeypatch):
     assert np.array_equal(found.z, problem.start()) and found.kept.all()
 
 
+@pytest.mark.slow_for("1.04-0.05")
 @pytest.mark.parametrize(("Kc", "price"), [(1.04, 0.05), (1.25, 0.0)])
 def test_an_answer_stays_that_is_robust_enough_or_for_which_it_costs_too_much(
     answered, monkeypatch, Kc, price

@@ -45,7 +45,7 @@ BOWL = Analytic(limited_bowl, lambda z: (0.5 - z[0], [-1.0, 0.0]))
 """Under z1 <= 0.5: optimum (0.5, 0.2), multiplier 0.4."""
 
 
-@pytest.mark.slow_for("start1-lbfgs", "start1-adam")
+@pytest.mark.slow_for("start1-lbfgs", "start1-adam", "start0-lbfgs")
 @pytest.mark.parametrize("method", ["slsqp", "lbfgs", "adam"])
 @pytest.mark.parametrize("start", [(0.1, 0.9), (0.9, 0.1)])
 def test_methods_on_a_bowl_with_a_known_answer(method, start):

@@ -73,6 +73,7 @@ def limited(gouta):
     return tuning.tune(gouta("backstepping"), few)
 
 
+@pytest.mark.slow
 def test_the_answer_names_the_tank_with_an_active_limit_and_when(limited):
     tight = min(limited.constraints, key=lambda c: c["margin"])
     assert tight["tank"] == 3 and tight["measure"] == "max_level" and 0 <= tight["margin"] < 1e-3

@@ -284,6 +284,7 @@ def test_what_becomes_undefined_in_the_search_breaks_its_limit(capsys, tmp_path)
     assert code == 0 and found["violations"][0]["count"] == 8
 
 
+@pytest.mark.slow
 def test_gains_that_no_run_exercises_are_kept(capsys):
     """The setpoint goes from 1 to 2 cm: knots at 5 and 8 cm have no effect, nor has the one at 1
     cm, where there is no error.

@@ -66,6 +66,7 @@ def test_with_and_without_a_log_alike(whole):
     assert reported(tuning.tune(case(), OPTIONS)) == reported(whole[0])
 
 
+@pytest.mark.slow_for("0.02")
 @pytest.mark.parametrize("share", [0.02, 0.4, 0.97])
 def test_a_log_that_ends_anywhere_is_gone_on_with(whole, tmp_path, share):
     copied(whole, tmp_path)

@@ -244,6 +244,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.slow_for("a value")
 @pytest.mark.parametrize("words", CHANGES.values(), ids=CHANGES)
 def test_a_batch_that_was_changed_is_refused(case, tmp_path, words):
     options = {**FEW, "samples": 12, "batch": 4}
@@ -316,6 +317,7 @@ def test_runs_that_fail_are_counted_and_break_every_limit(case):
     assert f"{bad.sum()} runs diverged" in repr(found)
 
 
+@pytest.mark.slow
 def test_plateaus_without_a_steady_state_are_counted(gouta):
     """gouta2015 notes S11: with c1 0.9 % above its value, (16, 10) cm needs more than 30 cm."""
     case = gouta("ngpc", {"clock.dt": 0.5})

@@ -37,7 +37,12 @@ PROBLEMS = {
 }
 
 
-@pytest.mark.slow_for("a ball outside")
+@pytest.mark.slow_for(
+    "a ball outside",
+    "a corner of a box",
+    "two planes in two directions",
+    "one limit, broken on either side",
+)
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_probabilities_are_those_of_closed_forms(name):
     function, exact = PROBLEMS[name]

@@ -168,6 +168,7 @@ def test_morris_agrees_with_salib():
         )
 
 
+@pytest.mark.slow
 def test_a_closed_loop_agrees_with_salib(case, at_cube):
     sobol = pytest.importorskip("SALib.analyze.sobol")
     morris = pytest.importorskip("SALib.analyze.morris")
@@ -244,6 +245,7 @@ def test_local_against_central_differences(case, monkeypatch):
     assert row["derivative_unit"] == "cm per cm^2" and "effect [cm]" in str(study)
 
 
+@pytest.mark.slow
 def test_batches_and_seeds(case):
     """A run is the same in any batch, but for the last bits; the same seed gives the same bits,
     another one others.
@@ -277,6 +279,7 @@ def test_noise_is_the_same_in_every_run(case):
     assert column.nominal == pytest.approx(float(own), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_noise_may_vary_from_none(case):
     """Travel of the pumps grows with the noise, which the case itself has none of."""
     varied = {"sensor.noise": Uniform(low=0.0, high=0.2, tied=True)}
