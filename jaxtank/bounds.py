@@ -78,6 +78,7 @@ GAINS: dict[type, tuple[str, ...]] = {
     controllers.GPC: ("r_w",),
     controllers.Laguerre: ("r_w", "a"),
     controllers.NMPC: ("horizon", "r_w"),
+    controllers.Scheduled: ("values",),
 }
 """Gains of a controller, which are tuned where a case does not say what is free."""
 
@@ -101,7 +102,7 @@ def gain_ranges(loop: ClosedLoop) -> dict[str, Free]:
             entry = f"{name}[{','.join(map(str, index))}]" if index else name
             number = float(array[index])
             low, high = sorted((number / WIDE, number * WIDE))
-            if array.ndim > 1:
+            if array.ndim > 1 and gain != "values":
                 high = 4.0 * float(np.abs(array).max())
                 low = -high
             low = _rounded(low if meta["low"] is None else max(low, meta["low"]))
@@ -115,6 +116,16 @@ def _rounded(value: float) -> float:
     return float(f"{value:.3g}")
 
 
+def _remedy(loop: ClosedLoop) -> str:
+    """What to do where nothing is free."""
+    if isinstance(loop.controller, controllers.OnOff):
+        return (
+            "on-off has no gains; compare values of `on` and `off` by simulate or uncertainty with"
+            " --set controller.on=VALUE"
+        )
+    return "name at least one parameter, free={name: (low, high)} or --free NAME=LOW:HIGH"
+
+
 def bounds(loop: ClosedLoop, free: Mapping[str, Any]) -> list[Bound]:
     """Return the Bounds of {name: Free}; the name of an array stands for all its entries."""
     # Raises InputError for an unknown name, a range that is empty, not finite or outside what the
@@ -122,10 +133,7 @@ def bounds(loop: ClosedLoop, free: Mapping[str, Any]) -> list[Bound]:
     if not isinstance(free, Mapping) or not all(isinstance(name, str) for name in free):
         raise InputError(f"free = {shortened(free)}: must be {{name: (low, high)}}")
     if not free:
-        raise InputError(
-            "nothing to tune: name at least one parameter, free={name: (low, high)} or --free"
-            " NAME=LOW:HIGH"
-        )
+        raise InputError(f"nothing to tune: {_remedy(loop)}")
     entries: list[Bound] = []
     for name, spec in free.items():
         if not isinstance(spec, tuple | list) or len(spec) not in (2, 3):

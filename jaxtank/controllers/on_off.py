@@ -30,8 +30,8 @@ def _refused(primals: Any, tangents: Any) -> Any:
     if any(moving):
         raise InputError(
             "controller: on-off switches at times that depend on the levels, and a run with samples"
-            " has no derivative there: compare values of `on` and `off` by --scan, or by"
-            " uncertainty and simulate, which need none"
+            " has no derivative there: compare values of `on` and `off` by simulate"
+            " or uncertainty with --set controller.on=VALUE, which need none"
         )
     return switched(*primals), jnp.zeros_like(primals[0])
 

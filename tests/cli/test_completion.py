@@ -1,13 +1,17 @@
 """Shell completion: the words that complete a line, and the scripts in the shells themselves."""
 
+import ast
 import os
 import re
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+import jaxtank
+import tuning
 from tuning.cli import completion, main
 from tuning.cli.parser import COMMANDS, parser
 
@@ -20,6 +24,21 @@ def need(shell):
 
 def words(line):
     return completion.candidates(parser(), line.split(" ")[1:])
+
+
+OTHERS = {"--xla", "--preload", "--version"}
+"""Options of XLA and Dask, and the one of no command."""
+
+
+def test_options_in_texts_are_options_of_a_command():
+    options = {option for name in COMMANDS for option in parser().options(name)} | OTHERS
+    for path in (p for root in (jaxtank, tuning) for p in Path(root.__file__).parent.rglob("*.py")):
+        if path.parent.name == "export":  # --i of C and JavaScript
+            continue
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", node.value))
+                assert named <= options, f"{path.name}, line {node.lineno}"
 
 
 def test_commands_options_cases_parameters_and_measures(tmp_path, monkeypatch):

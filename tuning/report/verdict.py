@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.case import Case
-from jaxtank.controllers import OpenLoop
+from jaxtank.controllers import OnOff, OpenLoop
 from jaxtank.core.labels import label_of, labels_of
 from jaxtank.limits import limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import ClosedLoop
@@ -91,7 +91,7 @@ def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
     """Return how near the controlled levels come to their setpoints: at the end of each plateau,
     and by their RMS errors where a setpoint has none.
     """
-    if isinstance(loop.controller, OpenLoop) or "steady_state_error" not in values:
+    if isinstance(loop.controller, OpenLoop | OnOff) or "steady_state_error" not in values:
         return None
     column = lambda name: np.ravel(np.asarray(values[name], dtype=float))
     plant: Any = loop.plant

@@ -14,6 +14,7 @@ from helpers import command as say
 
 import jaxtank
 from jaxtank import presets, rig
+from jaxtank.bounds import gain_ranges
 from jaxtank.case import Free
 from jaxtank.controllers import Backstepping, Controller, Scheduled
 from jaxtank.controllers.gain_schedule import interpolate
@@ -484,3 +485,13 @@ def test_the_command_schedules():
         "the same for all"
         in say("show", *case, *gains[:2], "--schedule", "controller.k1=r2:4,8")[2]
     )
+
+
+def test_scheduled_gains_are_tuned_where_nothing_is_named():
+    """A factor of 30 either way from their values at each knot."""
+    loop = on(presets.find("cascaded/pi"), ["Kc"], "r1", (2.0, 8.0)).loop
+    ranges = gain_ranges(loop)
+    values = np.asarray(loop.controller.values)
+    assert list(ranges) == ["controller.values[0,0]", "controller.values[0,1]"]
+    for free, value in zip(ranges.values(), values[0]):
+        np.testing.assert_allclose([free.low, free.high], [value / 30, value * 30], rtol=5e-3)
