@@ -16,10 +16,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxtank import presets
+from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import parameters
 from jaxtank.export import source
 from jaxtank.export.program import program
@@ -68,6 +70,23 @@ ONE_FUNCTION = 'xla_cpu_small_call="true"'
 def loops_in(compiled):
     """Number of loops that a compiled program runs as one function."""
     return compiled.as_text().count(ONE_FUNCTION)
+
+
+@jax.jit
+def estimates_along(observer, x0, ys, us, dt):
+    """The Estimate (x, d, coefficients: (samples, .) arrays or None) of an observer after each of
+    the readings (samples, n), with inputs (samples, m) after them, from levels x0 (n).
+    """
+
+    def body(state, now):
+        y, u = now
+        tick = Tick(t=0.0, r=(), dr=(), ddr=(), dt=dt)
+        estimate, state = observer.step(state, tick, tuple(y))
+        state = observer.predict(state, tick, tuple(u), tuple(u))
+        rows = [jnp.stack(list(v)) if len(v) else None for v in estimate]
+        return state, Estimate(*rows)
+
+    return jax.lax.scan(body, observer.init(tuple(x0)), (ys, us))[1]
 
 
 def in_metres(plant):

@@ -21,6 +21,7 @@ from jaxtank.analysis.qp import scaled
 TOLERANCE = 1e-9  # violation of a row at which it is added, in the scaled problem
 DEPENDENT = 1e-10  # share of a row that the rows of the face leave free, below which it is 0
 PASSES = 5  # largest number of iterations for each variable
+SPAN = 10.0  # bounds of rows that have one side, in the largest level or limit: far, but finite
 
 
 class Face(NamedTuple):

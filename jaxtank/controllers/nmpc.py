@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.analysis.active_set import solve_soft
+from jaxtank.analysis.active_set import SPAN, solve_soft
+from jaxtank.analysis.condensing import condensed, slopes_along
 from jaxtank.analysis.elimination import times, weighted_squares
 from jaxtank.controllers.base import Controller
 from jaxtank.core.checks import check_order
@@ -22,9 +23,6 @@ from jaxtank.plants.elements import sections
 from jaxtank.plants.runge_kutta import advance
 from jaxtank.signals.base import Signal
 from jaxtank.xla.barrier import materialised
-
-SPAN = 10.0
-"""Bounds of rows that have one side, in the largest level or limit: far, but finite [-]."""
 
 
 class Course(NamedTuple):
@@ -197,7 +195,7 @@ class NMPC(Controller):
         K m) by the knots; basis (N, m, K m): of the inputs.
         """
         model, d = self.model, estimate.d
-        n, unit = model.tanks, jnp.eye(model.tanks + model.pumps)
+        n = model.tanks
 
         def onward(x, u):
             levels, area = tuple(x[i] for i in range(n)), None
@@ -210,20 +208,10 @@ class NMPC(Controller):
                 after = [h + self.period * v for h, v in zip(after, d)]
             return jnp.stack(list(after))
 
-        def slopes(x, u):
-            along = lambda s, w: jax.jvp(onward, (x, u), (s, w))[1]
-            return jax.vmap(along)(unit[:, :n], unit[:, n:])
-
-        def grow(S, now):
-            slope, b = now  # (n + m, n), (m, K m)
-            S = sum(along[:, None] * row for along, row in zip(slope, [*S, *b]))
-            return S, S
-
         x = jnp.stack(list(estimate.x))
         last, starts = jax.lax.scan(lambda x, u: (onward(x, u), x), x, inputs)
-        # of all samples at once: the vectors are long, and the levels are known
-        each = jax.vmap(slopes, in_axes=1)(starts.T, inputs.T)
-        S = jax.lax.scan(grow, jnp.zeros((n, basis.shape[2]), x.dtype), (each, basis))[1]
+        slopes = slopes_along(onward, starts, inputs)
+        S = condensed(slopes, basis, jnp.zeros((n, basis.shape[2]), x.dtype))
         return jnp.concatenate([starts[1:], last[None]]), S
 
     def _input_rows(self, plan, dt):

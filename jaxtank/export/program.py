@@ -260,7 +260,7 @@ def _lowered(case, plant, adjustable):
     state = jax.tree.map(lambda a: jax.ShapeDtypeStruct(np.shape(a), jnp.result_type(a)), ran)
     before = {} if plant else {"y": real(tanks), "u": real(pumps)}
     # other controllers have arrays of a few entries
-    loops = not plant and case.loop.controller.sequential
+    loops = not plant and case.loop.sequential
     if not adjustable:
         step, begin = functions({})
         begun = lower_all(begin, before, Writer(loops))

@@ -143,10 +143,11 @@ def check_pointwise(case: Case) -> None:
             f"{case.name}: its rig has {case.loop.plant.tanks} tanks: a loop as code may have at"
             f" most {LARGEST}"
         )
-    if case.loop.controller.limits_levels:
+    if case.loop.sequential:
+        part = "controller nmpc" if case.loop.controller.sequential else "observer moving-horizon"
         raise InputError(
-            f"{case.name}: its controller nmpc solves quadratic programmes, whose code for a page"
-            " has megabytes; `jaxtank export --lang c` writes the controller alone"
+            f"{case.name}: its {part} solves quadratic programmes, whose code for a page has"
+            " megabytes; `jaxtank export --lang c` writes controller and observer alone"
         )
     signals = {
         "setpoints": case.loop.reference,

@@ -109,6 +109,11 @@ class ClosedLoop:
         return self.plant.units
 
     @property
+    def sequential(self) -> bool:
+        """True if controller or observer iterate (`Controller.sequential`)."""
+        return self.controller.sequential or self.observer.sequential
+
+    @property
     def signal_units(self) -> dict[str, str]:
         """{signal: the unit of what it carries, for a rig in cm}."""
         return {"reference": "cm", "disturbance": "cm^3/s"}

@@ -170,6 +170,8 @@ class _Sample:
         self.loop, self.clock = loop, clock
         self.now = constant_inputs(loop, clock, r)
         first = initial(dataclasses.replace(loop, x0=x, actuator=started), clock)
+        settled = loop.observer.settled(first.observer, clock.dt, tuple(u))
+        first = first._replace(observer=settled)
         self.parts = floats_of(first)
         floats, self.rest = self.parts.split(first)
         self.shapes = [v.shape for v in floats]

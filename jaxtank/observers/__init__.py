@@ -5,6 +5,7 @@ from jaxtank.observers.disturbance import DisturbanceObserver
 from jaxtank.observers.extended_kalman import ExtendedKalman, UnscentedKalman
 from jaxtank.observers.fault_bank import FaultBank
 from jaxtank.observers.kalman import Kalman
+from jaxtank.observers.moving_horizon import MovingHorizon
 
 __all__ = [
     "Direct",
@@ -12,6 +13,7 @@ __all__ = [
     "ExtendedKalman",
     "FaultBank",
     "Kalman",
+    "MovingHorizon",
     "Observer",
     "UnscentedKalman",
 ]

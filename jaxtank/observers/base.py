@@ -40,6 +40,17 @@ class Observer(Role):
         """
         return state
 
+    def settled(self, state: Any, dt: Any, u: Sequence[Any]) -> Any:
+        """Return `state` after many samples of dt [s] at its levels with inputs u (m) [V], from
+        where a steady state of the loop is searched; unchanged where that does not help.
+        """
+        return state
+
+    @property
+    def sequential(self) -> bool:
+        """As of a controller (`Controller.sequential`)."""
+        return False
+
     def mode_names(self, plant: Plant) -> tuple[tuple[str, str], ...]:
         """Return (name, unit of its size) of each mode of its estimate; () without."""
         return ()

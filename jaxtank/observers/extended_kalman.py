@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtank.analysis.riccati import discrete_riccati
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import POSITIVE, component, leaf, split_index, static, with_entries
 from jaxtank.observers.base import Observer
@@ -215,6 +216,22 @@ class ExtendedKalman(Observer):
         return onward(x), [
             [sum(FP[i][k] * columns[k][j] for k in N) if j < n else FP[i][j] for j in N] for i in N
         ]
+
+    def settled(self, state: Any, dt: Any, u: Sequence) -> Any:
+        # from no variance of a random walk Newton's method does not find that of a steady state
+        return self._at_rest(state, dt, u) if self.disturbed or self.coefficients else state
+
+    def _at_rest(self, state, dt, u):
+        """A Belief with the covariances of its steady state."""
+        n, tick = self.model.tanks, Tick(t=0.0, r=(), dr=(), ddr=(), dt=dt)
+        x = jnp.stack(list(state.x))
+        A = jax.jacfwd(lambda x: jnp.stack([*self._onward(tuple(x), u, tick), *x[n:]]))(x)
+        C = jnp.eye(len(x))[np.array(self.measured)]
+        noise = jnp.diag(jnp.stack(self._gained()) * dt)
+        R = jnp.diag(jnp.asarray(self.measurement)[np.array(self.measured)])
+        P = discrete_riccati(A.T, C.T, noise, R)
+        u = tuple(u) if self.coefficients else ()
+        return state._replace(P=tuple(tuple(row) for row in P), u=u)
 
     def check(self, plant: Plant) -> None:
         check_model(self, plant)

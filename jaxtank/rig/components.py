@@ -21,6 +21,7 @@ from jaxtank.observers import (
     ExtendedKalman,
     FaultBank,
     Kalman,
+    MovingHorizon,
     Observer,
     UnscentedKalman,
 )
@@ -79,6 +80,7 @@ ROLES = {
             "kalman": Kalman,
             "extended-kalman": ExtendedKalman,
             "unscented-kalman": UnscentedKalman,
+            "moving-horizon": MovingHorizon,
             "fault-bank": FaultBank,
         },
     ),

@@ -484,6 +484,9 @@ OBSERVERS = {
     "UnscentedKalman": lambda: observers.UnscentedKalman(
         model=FOUR(), spread=np.full(4, 0.3), start=np.full(4, 7.0), **FILTER
     ),
+    "MovingHorizon": lambda: observers.MovingHorizon(
+        model=FOUR(), spread=np.full(4, 0.3), limit=np.full(4, 8.0), samples=3, **FILTER
+    ),
     "DisturbanceObserver": lambda: presets.find("gouta2022/chadpc").loop.observer,
     "Kalman with disturbances": lambda: observers.Kalman(
         model=FOUR(), levels=np.array([8.0, 7.0, 6.0, 9.0]), inputs=np.array([3.0, 3.1]), **WALKS
@@ -510,6 +513,7 @@ def of_observer(name, tanks, samples):
 of_observer("Kalman", 4, 1)  # each sample designs it anew, and takes as long to compile
 of_observer("ExtendedKalman", 4, 1)
 of_observer("UnscentedKalman", 4, 1)
+of_observer("MovingHorizon", 4, 2)
 of_observer("DisturbanceObserver", 2, 3)
 of_observer("Kalman with disturbances", 4, 1)
 of_observer("ExtendedKalman with disturbances", 4, 1)

@@ -202,7 +202,7 @@ def processors() -> int:
 
 def _is_sequential(structure: Any, leaves: Any) -> bool:
     """Return whether the runs of a group are done in sequence."""
-    return jax.tree.unflatten(structure, leaves).controller.sequential
+    return jax.tree.unflatten(structure, leaves).sequential
 
 
 def _shares(group: Group) -> list[Group]:
@@ -314,7 +314,7 @@ def _slopes(
     squares: Any,
 ) -> Any:
     def one(loop: ClosedLoop, key: Any) -> Any:
-        several = shape[-1] > 1 and not loop.controller.sequential
+        several = shape[-1] > 1 and not loop.sequential
         return sensitivities_compiled(loop, clock, names, order, values, key, squares, several)
 
     return _mapped(one, leaves, keys, shape)

@@ -59,7 +59,7 @@ def run_plants(
     values = _with_nominal(case.loop, plants, samples) if quiet else dict(plants)
     count = samples + quiet
     size = _batch(batch_size(case, random, count), count)
-    if case.loop.controller.sequential:
+    if case.loop.sequential:
         size = -(-count // processors())
     measures = _run_batches(case, tuple(names), seed if random else None, values, count, size)
     failed, nominal = measures.pop("failed") > 0, None
@@ -80,7 +80,7 @@ def _run_batches(
         return run_batch(case, names, key, block, batch)
 
     tasks = np.split(np.arange(len(rows)), len(rows) // size)
-    batches = at_once(run, tasks) if case.loop.controller.sequential else list(map(run, tasks))
+    batches = at_once(run, tasks) if case.loop.sequential else list(map(run, tasks))
     return {n: np.concatenate([b[n] for b in batches]) for n in batches[0]}
 
 

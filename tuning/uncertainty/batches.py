@@ -113,7 +113,7 @@ def _run(loop, values, indices, seed, clock, names):
         measures, diverged = lp.evaluate_and_flag(with_values(loop, values), clock, names, noise)
         return {**measures, "failed": diverged.astype(jnp.result_type(float))}
 
-    if loop.controller.sequential:
+    if loop.sequential:
         return jax.lax.map(lambda draw: run(*draw), (values, indices))
     return jax.vmap(run)(values, indices)
 

@@ -2,14 +2,13 @@
 
 import fault_bank as audit
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import estimates_along
 
 import jaxtank
 from jaxtank import rig
 from jaxtank.core.clock import Clock
-from jaxtank.core.records import Tick
 from jaxtank.observers import ExtendedKalman, FaultBank
 
 RIG = """
@@ -33,16 +32,7 @@ def case():
 
 
 def filtered(observer, ys, us):
-    """Levels that an observer estimates after each sample, from 12 cm."""
-
-    def body(state, now):
-        y, u = now
-        tick = Tick(t=0.0, r=(), dr=(), ddr=(), dt=1.0)
-        estimate, state = observer.step(state, tick, tuple(y))
-        state = observer.predict(state, tick, tuple(u), tuple(u))
-        return state, jnp.stack(estimate.x)
-
-    return jax.lax.scan(body, observer.init((jnp.array(12.0),) * 2), (ys, us))[1]
+    return estimates_along(observer, np.full(2, 12.0), ys, us, 1.0).x
 
 
 def test_without_a_fault_the_bank_is_the_extended_filter_and_so_is_its_derivative(case):

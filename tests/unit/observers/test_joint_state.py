@@ -1,16 +1,14 @@
 """Coefficients that a filter estimates with the levels, on readings of an independent rig."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import estimates_along
 
 import jaxtank
 from jaxtank import rig
 from jaxtank.core.errors import InputError
-from jaxtank.core.records import Tick
 from jaxtank.core.tree import parameters
-from jaxtank.observers import ExtendedKalman, UnscentedKalman
+from jaxtank.observers import ExtendedKalman, MovingHorizon, UnscentedKalman
 from jaxtank.plants.network import network
 
 MODEL = network(
@@ -46,23 +44,17 @@ def readings(gain, drain):
     return levels, levels + 0.02 * np.random.default_rng(0).standard_normal(levels.shape)
 
 
-@jax.jit
 def estimated(observer, ys):
-    """(levels, coefficients, d) that an observer estimates after each sample, from 12 cm."""
-
-    def body(state, now):
-        y, u = now
-        tick = Tick(t=0.0, r=(), dr=(), ddr=(), dt=1.0)
-        estimate, state = observer.step(state, tick, tuple(y))
-        state = observer.predict(state, tick, tuple(u), tuple(u))
-        parts = estimate.x, estimate.coefficients, estimate.d
-        return state, tuple(jnp.stack(list(v)) if v else None for v in parts)
-
-    return jax.lax.scan(body, observer.init((jnp.array(12.0),) * 2), (ys, US))[1]
+    return estimates_along(observer, np.full(2, 12.0), ys, US, 1.0)
 
 
 @pytest.mark.parametrize(
-    "of", [ExtendedKalman, pytest.param(UnscentedKalman, marks=pytest.mark.slow)]
+    "of",
+    [
+        ExtendedKalman,
+        pytest.param(UnscentedKalman, marks=pytest.mark.slow),
+        pytest.param(MovingHorizon, marks=pytest.mark.slow),
+    ],
 )
 @pytest.mark.parametrize("name, gain, drain", [("pump_gain[0]", 8.8, 0.5), ("drain[1]", 8.0, 0.45)])
 def test_a_coefficient_that_is_wrong_by_a_tenth_is_estimated_and_the_levels_with_it(
@@ -71,17 +63,17 @@ def test_a_coefficient_that_is_wrong_by_a_tenth_is_estimated_and_the_levels_with
     """Only the lower level is read. What the model lacks in the level rates is in d."""
     levels, ys = readings(gain, drain)
     plain = of(model=MODEL, measured=(1,), **VALUES)
-    x, (after, coefficient, d) = estimated(plain, ys)[0], estimated(joint(of, name), ys)
+    x, joined = estimated(plain, ys).x, estimated(joint(of, name), ys)
     settled = slice(120, None)
     assert np.abs(x - levels)[settled].max(axis=0).min() > 0.3
-    assert np.abs(after - levels)[settled].max() < 0.02  # below the noise
+    assert np.abs(joined.x - levels)[settled].max() < 0.02  # below the noise
     truth, other = (gain, 8.0) if name == "pump_gain[0]" else (drain, 0.5)
-    np.testing.assert_allclose(coefficient[settled, 0], truth, rtol=1e-3)
+    np.testing.assert_allclose(joined.coefficients[settled, 0], truth, rtol=1e-3)
     lower = (other - truth) * np.sqrt(2 * 981.0 * levels[settled, 1]) / 40.0
     upper = (truth - other) * US[119:-1, 0] / 50.0
     pumped, zero = name == "pump_gain[0]", 0.0 * lower
     lacking = np.column_stack([upper, zero] if pumped else [zero, lower])
-    np.testing.assert_allclose(d[settled], lacking, atol=1e-3)
+    np.testing.assert_allclose(joined.d[settled], lacking, atol=1e-3)
 
 
 def joint(of=ExtendedKalman, *names, **changes):
@@ -106,29 +98,32 @@ def test_coefficients_that_cannot_be_estimated_are_refused(changes, words):
         joint(**changes).check(MODEL)
 
 
+RIG = """
+tank = [{name = "LT1", area = 50.0, rim = 40.0, level = 12.0},
+        {name = "LT2", area = 40.0, rim = 40.0, level = 12.0, drain = 0.1}]
+orifice = [{from = 1, to = 2, area = 0.1}]
+pump = [{name = "P1", to = 1, gain = 8.0, high = 20.0, initial = 2.0}]
+plant = {outputs = [2]}
+controller = {kind = "pi", Kc = 0.5, Ti = 60.0}
+reference = {initial = [12.0]}
+[observer]
+kind = "extended-kalman"
+process = 1e-6
+measurement = 4e-4
+measured = [2]
+coefficients = ["P1"]
+coefficient_spread = 0.01
+coefficient_walk = 1e-8
+[values]
+plant.pump_gain = [8.8]
+observer.model.pump_gain = [8.0]
+clock.dt = 1.0
+clock.duration = 300.0
+"""
+
+
 def test_a_rig_file_names_coefficients_by_its_own_names_and_a_run_has_their_estimates():
-    case = rig.loads("""
-        tank = [{name = "LT1", area = 50.0, rim = 40.0, level = 12.0},
-                {name = "LT2", area = 40.0, rim = 40.0, level = 12.0, drain = 0.1}]
-        orifice = [{from = 1, to = 2, area = 0.1}]
-        pump = [{name = "P1", to = 1, gain = 8.0, high = 20.0, initial = 2.0}]
-        plant = {outputs = [2]}
-        controller = {kind = "pi", Kc = 0.5, Ti = 60.0}
-        reference = {initial = [12.0]}
-        [observer]
-        kind = "extended-kalman"
-        process = 1e-6
-        measurement = 4e-4
-        measured = [2]
-        coefficients = ["P1"]
-        coefficient_spread = 0.01
-        coefficient_walk = 1e-8
-        [values]
-        plant.pump_gain = [8.8]
-        observer.model.pump_gain = [8.0]
-        clock.dt = 1.0
-        clock.duration = 300.0
-    """)
+    case = rig.loads(RIG)
     run = jaxtank.simulate(case)
     assert run.coefficient_names == (("pump_gain[0]", "cm^3/(s V)"),)
     np.testing.assert_allclose(run.coefficients[-1], 8.8, rtol=0.01)
@@ -136,3 +131,10 @@ def test_a_rig_file_names_coefficients_by_its_own_names_and_a_run_has_their_esti
     again = rig.loads(rig.dump(case)).loop.observer
     assert again.coefficients == ("pump_gain[0]",)
     assert parameters(again).keys() == parameters(case.loop.observer).keys()
+
+
+@pytest.mark.slow
+def test_a_loop_whose_filter_estimates_a_coefficient_has_a_steady_state_and_margins():
+    case = rig.set_values(rig.loads(RIG), {"observer.coefficient_walk": 1e-4})
+    (plateau,) = jaxtank.stability_margins(case)
+    assert plateau.why == "" and plateau.stable and plateau.margins.sensitivity_peak > 1.0
