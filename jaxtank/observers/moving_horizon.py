@@ -57,9 +57,9 @@ class MovingHorizon(ExtendedKalman):
     ...     samples=5,
     ... )
     >>> tick = Tick(t=0.0, r=(12.0, 12.0), dr=(0.0, 0.0), ddr=(0.0, 0.0), dt=0.1)
-    >>> estimate, _ = observer.step(observer.init((0.1, 12.0, 2.0, 2.0)), tick, (-0.4, 12.0, 0, 0))
-    >>> [round(float(h), 6) for h in estimate.x]  # a Kalman filter has -0.15
-    [0.0, 12.0, 2.0, 2.0]
+    >>> estimate, _ = observer.step(observer.init((19.9, 12.0, 2.0, 2.0)), tick, (20.4, 12.0, 0, 0))
+    >>> [round(float(h), 6) for h in estimate.x]  # a rim of 20 cm; a filter has 20.15
+    [20.0, 12.0, 2.0, 2.0]
     """
 
     limit: np.ndarray = leaf(
