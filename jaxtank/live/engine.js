@@ -76,7 +76,10 @@ function deviates(seed, tanks, samples) {
 }
 
 info.leaves = info.leaves.flatMap(([unit, doc, group, entries]) =>
-  entries.map(([name, value, lower, upper]) => ({ name, unit, doc, value, lower, upper, group })));
+  entries.map(([name, number, lower, upper]) => {
+    const value = typeof number === "string" ? null : number; // an infinite one has no slider
+    return { name, unit, doc, value, fixed: Number(number), lower, upper, group };
+  }));
 
 const PIECE = 500; // samples
 const RESIDUALS = 4000; // samples whose residuals make a Gauss-Newton matrix, about
@@ -90,7 +93,7 @@ function squaresOf(objective) {
 }
 
 function makeEngine() {
-  const defaults = new Map(info.leaves.map((leaf) => [leaf.name, leaf.value]));
+  const defaults = new Map(info.leaves.map((leaf) => [leaf.name, leaf.fixed]));
   const noisy = info.leaves.filter((leaf) => leaf.name.startsWith("sensor.noise"));
   const samples = info.samples, tanks = info.tanks.length;
   const kept = new Map();

@@ -129,7 +129,8 @@ def _packed(facts: dict[str, Any]) -> dict[str, Any]:
     groups: dict[tuple[Any, ...], list[Any]] = {}
     for leaf in facts["leaves"]:
         shared = tuple(leaf[key] for key in SHARED)
-        entry = [leaf["name"], *(leaf[key] for key in ("value", "lower", "upper"))]
+        number = leaf["infinite"] if leaf["value"] is None else leaf["value"]
+        entry = [leaf["name"], number, leaf["lower"], leaf["upper"]]
         groups.setdefault((leaf["name"].split("[")[0], *shared), []).append(entry)
     packed = [[*shared, entries] for (_, *shared), entries in groups.items()]
     return {**facts, "leaves": packed}
@@ -314,6 +315,10 @@ def _limits(case):
     return rows
 
 
+INFINITE = {math.inf: "Infinity", -math.inf: "-Infinity"}
+"""Numbers that JSON does not have, as `Number` of JavaScript reads them."""
+
+
 def leaf_of(case: Case, name: str, index: tuple[int, ...]) -> dict[str, Any]:
     """Return the slider of one number of a loop, as a JSON object."""
     full = f"{name}[{','.join(map(str, index))}]" if index else name
@@ -322,12 +327,14 @@ def leaf_of(case: Case, name: str, index: tuple[int, ...]) -> dict[str, Any]:
     group = GROUPS.get(name.split(".")[0], name.split(".")[0])
     if ".model." in name:
         group = "model"
-    lower, upper = _ends(case, name, full, value, meta, group)
+    finite = math.isfinite(value)
+    lower, upper = _ends(case, name, full, value, meta, group) if finite else (None, None)
     return {
         "name": full,
         "unit": meta["unit"],
         "doc": meta["doc"],
-        "value": value if math.isfinite(value) else None,
+        "value": value if finite else None,
+        "infinite": INFINITE.get(value),
         "lower": lower,
         "upper": upper,
         "group": group,

@@ -136,7 +136,7 @@ function curvatureOf(run, per, weights) {
 }
 
 function valueOf(info, values, name) {
-  return name in values ? values[name] : info.leaves.find((leaf) => leaf.name === name).value;
+  return name in values ? values[name] : info.leaves.find((leaf) => leaf.name === name).fixed;
 }
 
 /* A free number as 0 to 1, logarithmic where a search of the command has it so. */

@@ -146,6 +146,28 @@ def test_runs_are_those_of_the_library(name):
     assert agrees(case, [{}, *settings_of(case, 2)], 1e-9) >= 3
 
 
+INFINITE = """
+units = ["m", "%"]
+tank = [
+    {name = "A", area = 0.5, rim = 1.2, level = 0.5, drain = 2e-4, drain_linear = 2000.0},
+    {name = "B", area = 0.4, rim = 1.2, level = 0.5, drain = 2e-4},
+]
+pump = [
+    {to = "A", gain = 4e-5, high = 100.0, initial = 20.0, rate = 2.0},
+    {to = "B", gain = 4e-5, high = 100.0, initial = 20.0},
+]
+sensor = [{tank = "A", unit = "m", span = [0.1, 0.56]}]
+controller = {kind = "p", Kc = 300.0}
+reference = {initial = [0.5, 0.5], changes = [[10.0, 1, 0.6], [20.0, 2, 0.6]]}
+values = {"clock.dt" = 1.0, "clock.duration" = 60.0}
+"""
+
+
+def test_numbers_that_are_infinite_are_so_in_the_engine():
+    """Rates, resistances and ends of spans of the parts that have none."""
+    assert agrees(rig.loads(INFINITE), [{}], 1e-9) == 1
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LONG)
 def test_every_case_runs_as_in_the_library(name):
