@@ -28,6 +28,7 @@ from tuning.storage.store import NAME, Store
 from tuning.uncertainty import validation
 from tuning.uncertainty.distributions import parse, stated
 from tuning.uncertainty.draws import Draws
+from tuning.uncertainty.result import _statistics
 from tuning.uncertainty.sampling import clopper_pearson, probabilities
 
 SHORT = {"clock.dt": 0.1, "clock.duration": 60.0, "sensor.noise": 0.02}
@@ -217,6 +218,25 @@ def test_quantiles_of_a_linear_gaussian_case():
     )
     assert summary["cvar95"][0] == pytest.approx(tail, abs=0.01)
     assert found.violations()[0]["probability"] == pytest.approx(control.sf(14.0), abs=2e-3)
+
+
+@pytest.mark.parametrize("beyond", [0.0, 1e-6])
+@pytest.mark.parametrize("side", [0.0, 1.0])
+def test_a_share_has_the_interval_of_its_mean_within_0_and_1_or_what_was_measured(side, beyond):
+    shares = side + (1.0 - 2.0 * side) * np.array([0.9] + [0.1] + 29 * [-beyond])
+    others = np.linspace(0.2, 0.8, 31)
+    columns, finite = np.stack([shares, others], axis=1), np.arange(31) != 1
+    summary = _statistics({"saturated_fraction": columns}, "saturated_fraction", finite)
+    ends = np.array(summary["mean_interval95"])
+    for k, values in enumerate((shares[finite], others[finite])):
+        half = stats.norm.ppf(0.975) * values.std(ddof=1) / np.sqrt(30)
+        both = np.clip(
+            values.mean() + np.array([-half, half]), min(0.0, *values), max(1.0, *values)
+        )
+        np.testing.assert_allclose(ends[:, k], both, rtol=0, atol=1e-7)
+        worst = np.sort(values)[-2:]  # 5 % of 30 draws are 1.5
+        assert summary["cvar95"][k] == pytest.approx(worst.mean(), rel=1e-14)
+        assert summary["p95"][k] == np.sort(values)[28] and summary["max"][k] == values.max()
 
 
 def test_the_worst_side_of_a_minimum_is_its_lower_one(whole):
