@@ -11,11 +11,12 @@ import pytest
 from safety_attacks import sensor_of
 
 from jaxtank import rig, simulate
+from jaxtank.core.errors import InputError
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants import network
 from jaxtank.safety import SafetyFilter, design
-from jaxtank.safety.box import narrow_band
+from jaxtank.safety.box import band_of, box_of, narrow_band
 from jaxtank.safety.low_limits import certain_share
 
 W = math.sqrt(2 * 981.0)
@@ -263,6 +264,36 @@ def test_the_band_is_six_deviations_half_an_adc_step_and_the_size_of_the_offset(
     found, _ = designed(plant, actuator, sensor=sensor)
     step = 8.0 * 5.0 / 64
     assert float(found.band[0]) == pytest.approx(6 * 0.05 + 0.5 * step + 0.3, rel=1e-12)
+
+
+def test_a_band_has_what_an_empty_tank_reads_and_half_a_step_of_the_widest_span():
+    adc = {"gain": [1.0, 1.0], "full_scale": 30.0, "bits": 6}
+    span = {"low": [0.4, -0.2], "high": [20.0, 25.0]}
+    sensor = LevelSensor(noise=[0.05, 0.02], offset=[-0.3, 0.1], **span, **adc)
+    widths = {"high[0]": 0.5, "low[0]": 0.1, "offset[1]": 0.2, "noise[0]": 0.01}
+    band = band_of(sensor, widths={f"sensor.{name}": width for name, width in widths.items()})
+    first = 6 * 0.06 + 0.3 + 0.5 + 0.5 * (20.5 - 0.3) / 64
+    second = 6 * 0.02 + 0.3 + 0.0 + 0.5 * (25.0 + 0.2) / 64
+    np.testing.assert_allclose(band, [first, second], rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("widths", "refused"),
+    [
+        ({"drain[0]": 0.3}, False),  # an outlet may be plugged
+        ({"drain[0]": 0.31}, True),
+        ({"area[0]": 20.0}, True),  # a tank has an area
+        ({"area[0]": 19.0, "drain": 0.15}, False),
+    ],
+)
+def test_a_box_has_no_parameter_below_0_and_no_area_of_0(widths, refused):
+    if refused:
+        with pytest.raises(InputError):
+            box_of(cascade(), widths)
+        return
+    for plant, sign in zip(box_of(cascade(), widths), (-1.0, 1.0)):
+        assert plant.drain[0] == 0.3 + sign * widths.get("drain[0]", widths.get("drain", 0.0))
+        assert plant.area[0] == 20.0 + sign * widths.get("area[0]", 0.0)
 
 
 @pytest.mark.parametrize(("sigmas", "proved"), [(4.9, False), (5.1, True)])
