@@ -49,7 +49,8 @@ REASONS = (
     "a tank would be empty, or below its laminar threshold",
     "a pump would run at or beyond its limits",
     "the controller or an instrument has no derivative there (a switch, a dead zone)",
-    "no steady state of the loop is found there (a switching controller has none)",
+    "no steady state of the loop is found there (a controller that switches, or one whose action"
+    " vanishes at the setpoint, has none)",
     "the controller or an instrument counts samples, and has no steady state",
     "the controller does not use the readings",
 )
