@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 from safety_attacks import sensor_of
+from scipy.integrate import solve_ivp
 
 from jaxtank import rig, simulate
 from jaxtank.core.errors import InputError
@@ -329,6 +330,16 @@ def test_inputs_under_way_may_fill_a_predicted_tank_up_to_its_limit(share):
     plant, actuator = one_tank(delay=2.0, initial=np.array([3.0]))
     found, (row,) = designed(plant, actuator, start=[30.0 - 2.4 / share])
     assert found.predicted == 4 and row.certified == (share < 1.0)
+
+
+@pytest.mark.parametrize("share", [0.995, 1.005])
+def test_a_steady_inflow_and_the_outlet_count_while_inputs_under_way_fill_a_tank(share):
+    plant, actuator = one_tank(drain=0.05, delay=5.0, initial=np.array([12.0]))
+    falling = lambda t, h: -(8.0 * 12.0 + 12.0 - 0.05 * W * np.sqrt(h)) / 20.0
+    earlier = solve_ivp(falling, (0.0, 5.0), [30.0], rtol=1e-10).y[0, -1]
+    room = (30.0 - earlier) / share
+    _, (row,) = designed(plant, actuator, start=[30.0 - room], inflow=[12.0])
+    assert row.certified == (share < 1.0), row.reason
 
 
 def test_a_pipe_with_dead_time_is_not_proved():
