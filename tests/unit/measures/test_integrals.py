@@ -142,3 +142,26 @@ def test_the_search_for_the_best_inputs_minimises_the_same_integral(chain):
     cost = _search_cost(jnp.asarray(inputs), loop, chain.clock, terms, lagrangian)
     iae = jaxtank.evaluate(loop, chain.clock, ["iae"])["iae"]
     np.testing.assert_allclose(cost, iae[0], rtol=1e-9)
+
+
+PULSED = """
+name = "pulsed tank"
+reachable = false
+tank = [{ area = 20.0, rim = 30.0, level = 10.0, drain = 0.3 }]
+pump = [{ gain = 8.0, to = 1, high = 12.0, initial = 5.0 }]
+controller = { kind = "pi", Kc = 0.4, Ti = 20.0 }
+reference = { initial = [10.0] }
+inflow = [{ time = 20.0, duration = 5.0, tank = 1, volume = 60.0 },
+        { time = 80.0, duration = 5.0, tank = 1, volume = 90.0 }]
+values = { "clock.dt" = 0.5, "clock.duration" = 140.0 }
+"""
+
+
+def test_the_recovery_time_ends_at_the_last_sample_outside_5_percent_of_the_setpoint():
+    case = rig.loads(PULSED)
+    run = jaxtank.simulate(case.loop, case.clock)
+    t, outside, each = np.asarray(run.t), np.abs(np.asarray(run.x)[:, 0] - 10.0) > 0.5, []
+    for start, end in ((20.0, 80.0), (80.0, 141.0)):
+        each.append(t[(t >= start) & (t < end) & outside].max() - start)
+    measured = jaxtank.evaluate(case.loop, case.clock, ["recovery_time"])["recovery_time"]
+    assert float(measured[0]) == pytest.approx(max(each), abs=1e-9) and each[0] < each[1]
