@@ -171,11 +171,11 @@ def _inverse(A):
     index = np.arange(A.shape[0])
 
     def sweep(k, A):
-        here, column = index == k, entry(A, k)
+        unit, column = index == k, entry(A, k)
         pivot = entry(column, k)
         # c c' / pivot, with pivot - 1 as c_k, does the whole sweep but 2 on the diagonal
-        c = column - here
-        return A - (c / pivot)[:, None] * c - 2.0 * here[:, None] * here
+        c = column - unit
+        return A - (c / pivot)[:, None] * c - 2.0 * unit[:, None] * unit
 
     return -jax.lax.fori_loop(0, A.shape[0], sweep, A)
 

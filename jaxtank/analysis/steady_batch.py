@@ -53,7 +53,7 @@ class SteadyStates:
             value = np.asarray(values.get(name, getattr(plant, name)), dtype=float)
             batched = value if name in values else value[None]
             leaves[name] = np.broadcast_to(batched, (count, *batched.shape[1:]))
-        self.plant, self.own, self.shared = plant, leaves, shared
+        self.plant, self.leaves, self.shared = plant, leaves, shared
         self.inflow = np.broadcast_to(np.asarray(inflow, dtype=float), (count, plant.tanks))
         if not plant.plain and shared is None:
             check_rest(plant, "feasibility")
@@ -73,7 +73,7 @@ class SteadyStates:
             return self._of_elements(np.broadcast_to(y, (len(self.inflow), *y.shape[-2:])))
         if self.plant.pipes:
             return self._with_pipes(np.broadcast_to(y, (len(self.out), *y.shape[-2:])))
-        weight = 2.0 * self.own["gravity"][:, None, None]
+        weight = 2.0 * self.leaves["gravity"][:, None, None]
         known = np.sqrt(weight) * _root(y, self.plant.knee)[0]
         speeds = known @ self.speeds.swapaxes(1, 2) + self.constant[:, None, : self.plant.tanks]
         inputs = known @ self.inputs.swapaxes(1, 2) + self.constant[:, None, self.plant.tanks :]
@@ -81,7 +81,7 @@ class SteadyStates:
 
     def _of_elements(self, y):
         with jax.enable_x64(True):
-            exact = (self.plant, self.own, self.inflow, y, self.shared)
+            exact = (self.plant, self.leaves, self.inflow, y, self.shared)
             x, u, imbalance, size = _many_at_rest(*exact)
         still = np.asarray(imbalance <= 1e-9 * size)[..., None]
         x, u = (np.where(still, np.stack(v, axis=-1), np.nan) for v in (x, u))
@@ -156,13 +156,13 @@ class SteadyStates:
 
     def _flows(self, x):
         """(N, P, n) flow into each tank without pumps [cm^3/s], (N, P, n, n) its slopes."""
-        plant, w = self.plant, np.sqrt(2.0 * self.own["gravity"])[:, None]
+        plant, w = self.plant, np.sqrt(2.0 * self.leaves["gravity"])[:, None]
         root, steep = _root(x, plant.knee)
         flow = np.einsum("sij,spj->spi", self.efflux, root) * w[..., None] + self.inflow[:, None]
         slope = self.efflux[:, None] * steep[:, :, None] * w[..., None, None]
         for k, (upper, other) in enumerate(plant.pipes):
             s, ds = _signed_root(x[..., upper] - x[..., other], plant.knee)
-            size = self.own["pipe"][:, k, None] * w
+            size = self.leaves["pipe"][:, k, None] * w
             for tank, sign in ((upper, -1.0), (other, 1.0)):
                 flow[..., tank] += sign * size * s
                 slope[..., tank, upper] += sign * size * ds

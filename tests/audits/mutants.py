@@ -144,8 +144,8 @@ def copy_of(root, copy):
 def reached(copy, target, tests):
     """({(file, line): tests that reach it}, {test: its seconds})."""
     (copy / "recorder.py").write_text(RECORDER)
-    told = {"MUTATED": str(copy / target), "REACHED": str(copy / "reached.json")}
-    if not pytest_run(copy, ["-p", "recorder", *tests], None, **told):
+    variables = {"MUTATED": str(copy / target), "REACHED": str(copy / "reached.json")}
+    if not pytest_run(copy, ["-p", "recorder", *tests], None, **variables):
         raise SystemExit("the tests fail before anything is changed")
     lines, times = json.loads((copy / "reached.json").read_text())
     by_line = collections.defaultdict(set)

@@ -590,12 +590,12 @@ def _raised(needs, what, leaf, first, columns, end) -> Mend | None:
 
 def _orifices(needs: Needs) -> Mend | None:
     """One factor on the areas of all orifices and pipes between tanks, the one nearest to 1."""
-    leaves = [n for n in ("orifice", "pipe") if needs.states.own[n].shape[1]]
+    leaves = [n for n in ("orifice", "pipe") if needs.states.leaves[n].shape[1]]
     if not leaves:
         return None
 
     def share(factor):
-        leaves_of = needs.states.own
+        leaves_of = needs.states.leaves
         scaled = {n: v * (factor if n in leaves else 1.0) for n, v in leaves_of.items()}
         states = SteadyStates(needs.states.plant, scaled, needs.states.inflow, needs.states.shared)
         return needs.feasible(np.concatenate(states.at(needs.setpoints), axis=2)).mean()

@@ -214,8 +214,8 @@ def test_the_margins_of_a_loop_are_those_with_the_extended_filter():
     cases = [rig.set_values(rig.loads(t), {"reference.initial": 3.0}) for t in (RIG, WINDOW)]
     filtered, window = (jaxtank.stability_margins(case)[0].margins for case in cases)
     assert filtered.stable and np.isfinite(filtered.sensitivity_peak)
-    for one, other in zip(filtered[1:], window[1:]):
-        np.testing.assert_allclose(one, other, rtol=1e-5)
+    for extended, moving in zip(filtered[1:], window[1:]):
+        np.testing.assert_allclose(moving, extended, rtol=1e-5)
 
 
 @needs_gcc
