@@ -19,6 +19,7 @@ from jaxtank.plants.runge_kutta import advance
 from tuning.identification import simulation
 from tuning.identification.confidence import LARGEST_DEVIATION
 from tuning.identification.coordinates import coordinates_of, free_bounds, nominal
+from tuning.identification.experiment import log as experiment_data
 from tuning.identification.result import Experiments
 
 AT_ONCE = "step of every pump at once, from empty"
@@ -177,7 +178,7 @@ def compare_experiments(
         inputs = candidates(loop, duration=duration, dt=dt, voltage=voltage, size=size, bit=bit)
     values = nominal(loop, coordinates.names)
     p, rig, rows = coordinates.point(values), simulation.rig_of(loop), {}
-    runs = [(_data(t, u, tanks), np.asarray(x0, float)) for t, u, x0 in inputs.values()]
+    runs = [(_data(t, u, tanks, case), np.asarray(x0, float)) for t, u, x0 in inputs.values()]
     error = 1e-5 * float(np.max(np.asarray(rig.plant.rim)))
     for data, x0 in runs:
         count = max(count, simulation.substeps_for(rig, data, x0[None], error)[0])
@@ -190,15 +191,19 @@ def compare_experiments(
         )
         if not np.all(np.isfinite(jacobian)):
             raise InputError(
-                f"{name}: the simulation diverges with samples every {data.dt[0, 0]:g} s; take a"
+                f"{name}: the simulation diverges with samples every {data.steps[0, 0]:g} s; take a"
                 " shorter duration"
             )
         rows[name] = _precision(coordinates, p, values, jacobian)
     return Experiments(case, rows)
 
 
-def _data(t, u, tanks):
+def _data(t, u, tanks, case):
     """Return PaddedData of an experiment, without readings."""
+    if case.loop.actuator.rate is not None:
+        run = experiment_data(t=t, u=u, y=np.zeros((len(t), len(tanks))), tanks=tanks)
+        courses = simulation.courses_of([run], case.loop.actuator, case.clock.dt)
+        return simulation.padded([run], courses=courses)
     channels = tuple((i, False) for i in tanks)
     y = np.zeros((1, len(t), len(tanks)))
     return simulation.PaddedData(np.append(np.diff(t), 0.0)[None], u[None], y, channels)
@@ -287,7 +292,7 @@ def _largest_deviation(estimation, z, experiment, scale):
     channels = zip(estimation.data.channels, estimation.noise)
     noise |= {tank: float(sd) for (tank, volts), sd in channels if not volts}
     coordinates, steps = estimation.coordinates, 2 * estimation.substeps
-    data = _data(t, u, tanks)
+    data = _data(t, u, tanks, estimation.case)
     jacobian = _jacobian(estimation.rig, coordinates, estimation.split(z)[0], data, x0, steps)
     weight = scale * np.array([noise[i] for i in tanks])[:, None]
     jacobian = (jacobian[..., : coordinates.size] / weight).reshape(-1, coordinates.size)

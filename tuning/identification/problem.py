@@ -110,7 +110,9 @@ class Estimation:
         self.prior = self._prior() if prior else None
         self.prior_weight = 1.0  # the standard deviation of the residual, once it is known
         self.rig = simulation.rig_of(loop)
-        self.data = simulation.padded(logs, simulation.delays_of(loop.actuator), samples)
+        courses = simulation.courses_of(logs, loop.actuator, case.clock.dt)
+        delays = simulation.delays_of(loop.actuator)
+        self.data = simulation.padded(logs, delays, samples, courses)
         self.initial = self._initial_levels(start)  # (logs, tanks), before any is estimated
         self.tanks = tuple(range(loop.plant.tanks)) if start == "free" else ()
         channels = len(self.data.channels)

@@ -39,7 +39,7 @@ class Rig:
 def rig_of(loop):
     """Return the Rig of a loop."""
     # A constant disturbance belongs to it; one that varies belongs to another run and does not. The
-    # transport delay of the pumps is applied by `padded`.
+    # limit of change and the transport delay of the pumps are applied by `padded`.
     disturbance = loop.disturbance if isinstance(loop.disturbance, Constant) else None
     if not isinstance(loop.sensor, LevelSensor):
         raise InputError(
@@ -47,13 +47,8 @@ def rig_of(loop):
             " compared with the readings of a LevelSensor"
         )
     actuator = loop.actuator
-    if actuator.rate is not None:
-        raise InputError(
-            "actuator.rate: experiment data are compared with pumps without a rate: leave rate of"
-            " [[pump]] and [[valve]] out to identify"
-        )
-    if actuator.delay or actuator.delays:
-        actuator = dataclasses.replace(cast(Any, actuator), delay=0.0, delays=())
+    if actuator.rate is not None or actuator.delay or actuator.delays:
+        actuator = dataclasses.replace(cast(Any, actuator), rate=None, delay=0.0, delays=())
     return Rig(
         plant=loop.plant, sensor=loop.sensor, actuator=actuator, disturbance=disturbance, x0=loop.x0
     )
@@ -81,13 +76,17 @@ class PaddedData(NamedTuple):
         return self.dt if self.dt.ndim == 2 else self.dt.sum(axis=-1)
 
 
-def padded(logs, delays: Any = 0.0, samples=0):
-    """Return the PaddedData of a list of Log, of at least `samples` samples."""
+def padded(logs, delays: Any = 0.0, samples=0, courses=None):
+    """Return the PaddedData of a list of Log, of at least `samples` samples; courses: `courses_of`
+    each log, its inputs as they are by default.
+    """
     # An input reaches its tank after the delay [s] of its pump, also between samples. Truncated
     # data padded to the length of the whole run through the same compiled program.
     channels = tuple(sorted({pair for log in logs for pair in zip(log.tanks, log.in_volts)}))
     n = max(samples, *(log.samples for log in logs))
-    parts = [_pieces(log, np.broadcast_to(delays, log.u.shape[1])) for log in logs]
+    delays = np.broadcast_to(delays, logs[0].u.shape[1])
+    courses = courses or [[(log.t, u) for u in log.u.T] for log in logs]
+    parts = [_pieces(log, of_log, delays) for log, of_log in zip(logs, courses)]
     most = max(lengths.shape[1] for lengths, _ in parts)
     dt, u = np.zeros((len(logs), n, most)), np.zeros((len(logs), n, most, logs[0].u.shape[1]))
     y = np.full((len(logs), n, len(channels)), np.nan)
@@ -101,13 +100,51 @@ def padded(logs, delays: Any = 0.0, samples=0):
     return PaddedData(dt, u, y, channels)
 
 
-def _pieces(log, delays):
+def courses_of(logs, actuator, dt):
+    """Return (times [s], inputs) of each pump of each Log: its commands within the limits, as the
+    pumps of a rig with sampling period dt [s] follow them at their `rate`; None without a rate.
+    """
+    if actuator.rate is None:
+        return None
+    rates = np.broadcast_to(np.asarray(actuator.rate, dtype=float), logs[0].u.shape[1])
+    inside = [np.clip(log.u, np.asarray(actuator.low), np.asarray(actuator.high)) for log in logs]
+    return [
+        [_followed(log, column, rate, dt) for column, rate in zip(u.T, rates)]
+        for log, u in zip(logs, inside)
+    ]
+
+
+def _followed(log, u, rate, dt):
+    """Return (times [s], inputs) of a pump that follows u (samples,) at a rate per second; inputs
+    that never move faster are those that the pump had, and stay. It starts at the first one.
+    """
+    steps = np.diff(log.t)
+    if np.all(np.abs(np.diff(u)) <= rate * steps * (1 + 1e-6)):
+        return log.t, u
+    times, followed, ends = [log.t[0]], [u[0]], np.append(log.t[2:], np.inf)
+    for start, end, target, step in zip(log.t[1:], ends, u[1:], steps):
+        if log.hold == "first-order":  # the line to a sample ends at it
+            period, end = step, start
+        else:
+            period = min(dt, float(steps.min()))
+        now, k = followed[-1], 0
+        while k == 0 or (now != target and start + k * period < end * (1 - 1e-9)):
+            now += np.clip(target - now, -rate * period, rate * period)
+            times.append(start + k * period)
+            followed.append(now)
+            k += 1
+    return np.array(times), np.array(followed)
+
+
+def _pieces(log, courses, delays):
     """Return (samples, pieces) lengths [s] and (samples, pieces, pumps) inputs of a Log: the steps
-    between its samples, cut where an input that reaches the tanks after its pump's delay [s]
-    changes.
+    between its samples, cut where an input (times, values) that reaches the tanks after its pump's
+    delay [s] changes.
     """
     near = 1e-9 * max(1.0, float(np.max(delays)), float(np.abs(log.t).max()))
-    cuts = np.unique(np.concatenate([_cuts(log, j, delay) for j, delay in enumerate(delays)]))
+    linear = log.hold == "first-order"
+    cuts = [_cuts(t, u, linear, delay) for (t, u), delay in zip(courses, delays)]
+    cuts = np.unique(np.concatenate(cuts))
     after = np.minimum(np.searchsorted(log.t, cuts - near), log.samples - 1)
     inside = (np.abs(cuts - log.t[after]) > near) & (cuts > log.t[0]) & (cuts < log.t[-1])
     edges = np.sort(np.concatenate([log.t, cuts[inside]]))
@@ -115,24 +152,24 @@ def _pieces(log, delays):
     piece = np.arange(len(edges)) - np.searchsorted(edges, log.t)[step]
     lengths = np.append(np.diff(edges), 0.0)
     inputs = np.empty((len(edges), len(delays)))
-    for j, (delay, u) in enumerate(zip(delays, log.u.T)):
+    for j, (delay, (t, u)) in enumerate(zip(delays, courses)):
         command = edges + lengths / 2 - delay
-        if log.hold == "first-order":
-            inputs[:, j] = np.interp(command, log.t, u)
+        if linear:
+            inputs[:, j] = np.interp(command, t, u)
         else:
-            inputs[:, j] = u[np.maximum(np.searchsorted(log.t, command, side="right") - 1, 0)]
+            inputs[:, j] = u[np.maximum(np.searchsorted(t, command, side="right") - 1, 0)]
     shape = (log.samples, int(piece.max()) + 1)
     dt, u = np.zeros(shape), np.zeros((*shape, log.u.shape[1]))
     dt[step, piece], u[step, piece] = lengths, inputs
     return dt, u
 
 
-def _cuts(log, j, delay):
-    """Return the times at which input j of a Log changes after a delay [s]."""
-    changed = changes_of(log.u[:, j : j + 1])
-    cuts = log.t[changed] + delay
-    if log.hold == "first-order":  # two pieces for each slope: one would delay its volume
-        start = log.t[changed - 1] + delay
+def _cuts(t, u, linear, delay):
+    """Return the times at which an input of values u at times t changes after a delay [s]."""
+    changed = changes_of(u[:, None])
+    cuts = t[changed] + delay
+    if linear:  # two pieces for each slope: one would delay its volume
+        start = t[changed - 1] + delay
         cuts = np.unique(np.concatenate([start, 0.5 * (start + cuts), cuts]))
     return cuts
 

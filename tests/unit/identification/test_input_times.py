@@ -207,3 +207,66 @@ def test_inputs_along_a_line_from_row_to_row(tmp_path, capsys):
     code, steps, err = _identify(tmp_path, capsys, "--gap", "2", "--hold", "zero-order")
     assert code == 0 and steps["fit"]["rmse"][0] > 3 * line["fit"]["rmse"][0]
     assert main(["identify", str(tmp_path / "rig.toml"), "--data", "log.csv", "--hold", "foh"]) == 2
+
+
+RATE = RIG.replace("high = 100.0", "high = 100.0\nrate = 0.5")
+
+
+@pytest.fixture(scope="module")
+def slow_valve():
+    """(commands, inputs that a pump of 0.5 %/s has, levels) every 5 s, by an own integrator."""
+    t = np.arange(0.0, 2000.0, 5.0)
+    command = np.where(t % 400.0 < 200.0, 30.0, 60.0)
+    applied = [command[0]]
+    for u in command[1:]:
+        applied.append(applied[-1] + np.clip(u - applied[-1], -2.5, 2.5))
+    applied = np.array(applied)
+    return t, command, applied, _levels(t, _held(t, applied), dt=0.5)
+
+
+@pytest.mark.parametrize("column", ["command", "applied"])
+def test_a_pump_with_a_rate_is_identified_from_commands_and_from_what_it_reached(
+    slow_valve, column
+):
+    t, command, applied, y = slow_valve
+    u = {"command": command, "applied": applied}[column]
+    case = rig.loads(RATE)
+    case = case.replace(clock=dataclasses.replace(case.clock, dt=5.0))
+    data = tuning.log(t=t, u=u, y=y)
+    problem = tuning.Estimation(case, [data], FREE, noise=NOISE, substeps=4)
+    np.testing.assert_allclose(problem.data.u[0, :-1, 0], applied[:-1], atol=1e-9)
+    values = problem.coordinates.point({**TRUTH})
+    z = np.concatenate([values, y[0] / problem.level_scale])
+    np.testing.assert_allclose(problem.predicted(z)[0], y, atol=1e-6)
+    z[:3] += 0.05
+    _, jacobian = problem.residual_and_jacobian(z)
+    for j, step in enumerate(1e-5 * np.eye(z.size)):
+        high, low = (problem.residual_and_jacobian(z + sign * step)[0] for sign in (1, -1))
+        scale = np.abs(jacobian[:, j]).max()
+        np.testing.assert_allclose(jacobian[:, j], (high - low) / 2e-5, atol=1e-6 * scale)
+
+
+def test_commands_too_fast_for_the_pump_move_it_from_their_row_on():
+    """A step of 80 % at 100 s, 1 %/s: 80 s later it is there, though rows are 50 s apart."""
+    case = rig.loads(RATE.replace("rate = 0.5", "rate = 1.0"))
+    t = np.array([0.0, 50.0, 100.0, 150.0, 200.0])
+    log = tuning.log(t=t, u=[20.0, 20.0, 100.0, 100.0, 100.0], y=np.full((5, 2), 0.5))
+    courses = simulation.courses_of([log], case.loop.actuator, 0.25)
+    data = simulation.padded([log], courses=courses)
+    np.testing.assert_allclose(data.dt.sum(axis=-1)[0], [50, 50, 50, 50, 0])
+    means = (data.dt * data.u[..., 0]).sum(axis=-1)[0, :4] / 50.0
+    np.testing.assert_allclose(means, [20.0, 20.0, 45.0, 91.0], atol=0.25)
+
+
+def test_a_planned_experiment_moves_a_pump_no_faster_than_its_rate():
+    """Steps from sample to sample through a pump that needs twenty of them say less."""
+    t = np.arange(0.0, 400.0, 5.0)
+    inputs = {"steps": (t, np.where(t % 20.0 < 10.0, 30.0, 60.0)[:, None], np.array([0.4, 0.5]))}
+    sd = [
+        tuning.compare_experiments(
+            rig.loads(text), {"plant.drain[1]": (1e-4, 1e-3)}, noise=0.002, duration=400, dt=5,
+            inputs=inputs, start="known",
+        )["steps"]["sd"]["plant.drain[1]"]
+        for text in (RIG, RATE.replace("rate = 0.5", "rate = 0.02"))
+    ]  # fmt: skip
+    assert abs(sd[1] / sd[0] - 1.0) > 0.01
