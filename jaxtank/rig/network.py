@@ -563,7 +563,7 @@ def _sensor_entries(loop, tanks):
 def _entry_of(loop, target, i):
     """Entry i of the field `target` of a loop, or a part of it; 0 of no steady inflow."""
     if target.startswith("disturbance."):
-        steady = parts_of(loop.disturbance)[0]
+        _, steady, _ = parts_of(loop.disturbance)
         return steady.level[i] if isinstance(steady, Constant) else 0.0
     if target == "actuator.delays":
         delays = getattr(loop.actuator, "delays", ())

@@ -191,43 +191,36 @@ def sine_values(sine):
 
 
 def parts_of(disturbance):
-    """(steady inflow or pulses, table) of a disturbance, None for what it has not."""
+    """(pulses, steady inflow, table) of a disturbance, None for what it has not."""
+    parts = [disturbance]
     if isinstance(disturbance, Sum):
-        return disturbance.first, disturbance.second
-    table = isinstance(disturbance, InflowTable)
-    return (None, disturbance) if table else (disturbance, None)
-
-
-def pulses_of(disturbance):
-    """The InflowPulses in a disturbance, None without."""
-    first, _ = parts_of(disturbance)
-    return first if isinstance(first, InflowPulses) else None
+        parts = [disturbance.first, disturbance.second]
+    pulses = next((part for part in parts if isinstance(part, InflowPulses)), None)
+    table = next((part for part in parts if isinstance(part, InflowTable)), None)
+    return pulses, next((p for p in parts if p is not pulses and p is not table), None), table
 
 
 def disturbance_of(table, loop):
     """What [disturbance] and [[inflow]] of a rig file make of a loop's disturbance."""
-    (first, rows), sizes = parts_of(loop.disturbance), sizes_of(loop)
+    (pulses, steady, rows), sizes = parts_of(loop.disturbance), sizes_of(loop)
     values = read_entry(SECTIONS["disturbance"], table.get("disturbance", {}), sizes)
-    entries = table.get("inflow", [])
     if "inflow" in values:
-        first = Constant(level=values["inflow"])
+        pulses, steady = None, Constant(level=values["inflow"])
     if "inflow" in table:
-        first = None if isinstance(first, InflowPulses) else first
-        first, rows = _inflows(entries, first, sizes)
+        pulses, steady, rows = _inflows(table["inflow"], steady, sizes)
     if "window" in values:
-        if not isinstance(first, InflowPulses):
+        if pulses is None:
             raise InputError(
                 f"disturbance.window = {values['window']:g} s: is how long tanks are watched after"
                 " a pulse of [[inflow]], and there is none: leave it out"
             )
-        first = dataclasses.replace(first, window=values["window"])
-    if first is None or rows is None:
-        return rows if first is None else first
-    return Sum(first=first, second=rows)
+        pulses = dataclasses.replace(pulses, window=values["window"])
+    first, *more = [part for part in (pulses, steady, rows) if part is not None] or [None]
+    return Sum(first=first, second=more[0]) if more else first
 
 
 def _inflows(entries, steady, sizes):
-    """(steady inflow or pulses, InflowTable or None) of the [[inflow]] tables."""
+    """(pulses, steady inflow, table) of the [[inflow]] tables, None for what there is not."""
     problems, courses, pulses = Problems(), [], [e for e in entries if not _is_course(e)]
     for i, entry in enumerate(entries):
         with problems.collect():
@@ -236,14 +229,27 @@ def _inflows(entries, steady, sizes):
     with problems.collect():
         pulses = read_entries(SECTIONS["inflow"], {"inflow": pulses}, sizes)
     problems.check()
-    first = _pulses(pulses, steady, sizes.tanks)
-    if pulses and isinstance(steady, Constant):  # beside pulses it is a table of one row
-        flows = enumerate(np.asarray(steady.level).tolist())
-        courses += [(tank, [0.0], [flow], "hold") for tank, flow in flows if flow]
+    first = None
+    if pulses:
+        first = inflow_pulses(sizes.tanks, [_pulse(e) for e in pulses])
+        flows = np.asarray(steady.level).tolist() if isinstance(steady, Constant) else []
+        steady = steady if any(flows) and not courses else None
+        if courses:  # beside pulses and a table it is a table of one row
+            courses += [(tank, [0.0], [flow], "hold") for tank, flow in enumerate(flows) if flow]
+    return first, steady, _table(courses, sizes.tanks)
+
+
+def _table(courses, tanks):
+    """The InflowTable of courses, None of none."""
     if not courses:
-        return first, None
+        return None
     *_, between = zip(*courses)
-    return first, inflow_table(sizes.tanks, [course[:3] for course in courses], between)
+    return inflow_table(tanks, [course[:3] for course in courses], between)
+
+
+def _pulse(entry):
+    """(time, duration, tank, volume) of a table of [[inflow]]."""
+    return entry["time"], entry["duration"], entry["tank"], entry["volume"]
 
 
 def _is_course(entry):
@@ -276,15 +282,6 @@ def _course(entry, sizes, index):
     if times[0] < 0.0 or np.any(np.diff(times) <= 0.0):
         raise refusal(label, changes, "have times that increase from 0 s or later")
     return tank, times, flows, between
-
-
-def _pulses(entries, old, tanks):
-    """The pulses of the [[inflow]] tables; without any, `old`."""
-    if not entries:
-        return old
-    return inflow_pulses(
-        tanks, [(e["time"], e["duration"], e["tank"], e["volume"]) for e in entries]
-    )
 
 
 def faults_of(entries, loop, dotted):
@@ -362,7 +359,7 @@ def disturbance_tables(disturbance):
     steady, pulse = SECTIONS["disturbance"], SECTIONS["inflow"]
     if isinstance(disturbance, Sum):
         parts = [disturbance_tables(part) for part in (disturbance.first, disturbance.second)]
-        return None if None in parts else [row for part in parts for row in part]
+        return None if None in parts else _merged([row for part in parts for row in part])
     if isinstance(disturbance, Constant):
         return [(steady, {"inflow": disturbance.level})]
     if isinstance(disturbance, InflowTable):
@@ -376,6 +373,14 @@ def disturbance_tables(disturbance):
     rows = zip(disturbance.events, np.asarray(disturbance.volume).tolist())
     pulses = [dict(zip(pulse.names, (*event, volume))) for event, volume in rows]
     return [(steady, {"window": disturbance.window}), *((pulse, values) for values in pulses)]
+
+
+def _merged(tables):
+    """Tables of a disturbance with one [disturbance], of the keys of all."""
+    steady = SECTIONS["disturbance"]
+    keys = {key: v for section, values in tables if section is steady for key, v in values.items()}
+    others = [row for row in tables if row[0] is not steady]
+    return [(steady, keys), *others] if keys else others
 
 
 def fault_tables(part):

@@ -15,7 +15,7 @@ from jaxtank.core.units import flow_per_input
 from jaxtank.loop.estimate_notes import is_unused
 from jaxtank.loop.tank_bottom import is_open
 from jaxtank.plants.tank_network import TankNetwork
-from jaxtank.rig.signals import pulses_of, steps
+from jaxtank.rig.signals import parts_of, steps
 from jaxtank.signals.setpoints import Sine, index
 
 LEAST_SHARE = 0.01
@@ -65,7 +65,7 @@ def case_warnings(case: Case) -> list[str]:
 def _late(case):
     """On changes of the reference and inflow pulses after the end of the run."""
     loop, end = case.loop, case.clock.duration
-    signal = pulses_of(loop.disturbance)
+    signal, *_ = parts_of(loop.disturbance)
     pulses = () if signal is None else signal.onset
     faults = () if loop.faults is None else [start for _, start, _ in loop.faults.events]
     times = {
@@ -121,7 +121,8 @@ def _unseen(case):
     sine = getattr(loop.reference, "second", None)
     if isinstance(sine, Sine) and not _holds_sample(sine.start, sine.end, clock):
         yield f"reference.sine from {sine.start:g} s to {sine.end:g} s: {between}"
-    if (pulses := pulses_of(loop.disturbance)) is not None:
+    pulses, *_ = parts_of(loop.disturbance)
+    if pulses is not None:
         window = pulses.window
         for time in pulses.onset:
             if time < clock.duration and not _holds_sample(time, time + window, clock):

@@ -166,7 +166,7 @@ def _building(case, loop, origin, same):
     if disturbing is None:
         raise InputError("its disturbance has no table")
     if origin is None:  # a steady inflow is a key of the tanks
-        disturbing = [row for row in disturbing if "inflow" not in row[1]]
+        disturbing = _without_steady_inflow(disturbing)
     tables = [*disturbing, *signals.fault_tables(loop.faults)]
     emptied = [
         _none(name)
@@ -179,6 +179,12 @@ def _building(case, loop, origin, same):
         *blocks,
         *(block_of(section, values, units, names) for section, values in tables),
     ]
+
+
+def _without_steady_inflow(tables):
+    """Tables of a disturbance without what the tanks say."""
+    rest = [(section, {k: v for k, v in row.items() if k != "inflow"}) for section, row in tables]
+    return [(section, row) for section, row in rest if row]
 
 
 def _of_rig(section, number, values, units, names):

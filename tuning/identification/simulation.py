@@ -16,6 +16,7 @@ from jaxtank.instruments.base import Actuator
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants.base import Plant
 from jaxtank.plants.runge_kutta import advance
+from jaxtank.rig.signals import parts_of
 from jaxtank.signals.base import Constant
 from jaxtank.xla.hoist import scan
 
@@ -40,7 +41,8 @@ def rig_of(loop):
     """Return the Rig of a loop."""
     # A constant disturbance belongs to it; one that varies belongs to another run and does not. The
     # limit of change and the transport delay of the pumps are applied by `padded`.
-    disturbance = loop.disturbance if isinstance(loop.disturbance, Constant) else None
+    _, steady, _ = parts_of(loop.disturbance)
+    disturbance = steady if isinstance(steady, Constant) else None
     if not isinstance(loop.sensor, LevelSensor):
         raise InputError(
             f"the sensor of this loop is a {type(loop.sensor).__name__}: experiment data are"

@@ -7,9 +7,13 @@ import numpy as np
 import pytest
 
 import jaxtank
+from jaxtank.export.source import files
+from jaxtank.export.whole import check_pointwise
 from jaxtank.rig.entry import unknown_key
 from jaxtank.rig.read import load, loads
 from jaxtank.rig.schema import INFLOW_TABLE, SECTIONS
+from jaxtank.rig.write import dump
+from tuning.identification import simulation
 
 ELSEWHERE = {
     "values": "any dotted name; the base rig sets its clock",
@@ -86,6 +90,13 @@ values = {"clock.dt" = 1.0, "clock.duration" = 100.0}
     run = jaxtank.simulate(case)
     assert np.isclose(np.ravel(run.x)[-1], 1.0 + (1.0 + 0.5) / 2.0, rtol=1e-12)
     assert case.loop.disturbance.since(case.clock)[15] == 5.0
+    again = loads(dump(case))
+    assert dump(again) == dump(case)
+    np.testing.assert_array_equal(jaxtank.simulate(again).x, run.x)
+    check_pointwise(case)  # a page and code hold it: no table
+    assert files(case, "c", plant=True)
+    levels = simulation.rig_of(case.loop).disturbance.level
+    np.testing.assert_array_equal(levels, [0.01])
 
 
 SPELLINGS = {
