@@ -40,6 +40,11 @@ FAR = 1e6
 PROBES = 2
 """Directions in which differences on both sides of a steady state are compared with slopes."""
 
+NEAR, FLOORS = 1e-2, (1e-3, 1e-8)
+"""Of the second, nearer difference in a direction: its length as a share of the first; and, of
+both, the least change of a number, in changes of the largest. A kink shows in both; the curvature
+of a small variance of an observer in the first alone."""
+
 KINK = 1e-3
 """Largest relative difference of a derivative from a finite difference [-]."""
 
@@ -256,7 +261,7 @@ def constant_inputs(loop: ClosedLoop, clock: Clock, r: Any) -> Inputs:
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _rest(clock: Clock, loop: ClosedLoop, r: Any) -> _Rest:
     """The state at which a sample changes nothing, by Newton's method; not finite where there is
-    none. Then PROBES differences on each side of it are compared with the derivatives. One sample
+    none. Then PROBES pairs of differences on each side are compared with the slopes. One sample
     is compiled once for all of that.
     """
     sample = _Sample(loop, clock, r, _plant_at_rest(loop, r))
@@ -264,23 +269,28 @@ def _rest(clock: Clock, loop: ClosedLoop, r: Any) -> _Rest:
     share = jnp.finfo(eye.dtype).eps ** (1.0 / 3.0)
 
     def body(state: Any, k: Any) -> Any:
-        point, s, reference, kink = state
+        point, s, reference, far, kink = state
         sampled = sample.slopes(point)
-        kink = kink | ((k > LOOP_STEPS) & _differs(sampled, reference, point - s))
+        differs = _differs(sampled, reference, point - s)
+        i = k - LOOP_STEPS  # probes are far and near in turn
+        kink = kink | ((i > 0) & (i % 2 == 0) & far & differs)
         searching = k <= LOOP_STEPS
         reference = jax.tree.map(lambda a, b: jnp.where(searching, a, b), sampled, reference)
         s = jnp.where(searching, point, s)
         newton = s + solve(eye - sampled.closed, (sampled.after - s)[:, None])[:, 0]
-        size = jnp.maximum(jnp.abs(s), 1e-3 * jnp.max(jnp.abs(s)))
-        probe = s + share * size * _direction(k, len(eye))
-        return (jnp.where(k < LOOP_STEPS, newton, probe), s, reference, kink), None
+        near = i % 2 == 1
+        floor = jnp.where(near, FLOORS[1], FLOORS[0]) * jnp.max(jnp.abs(s))
+        size = jnp.where(near, NEAR, 1.0) * share * jnp.maximum(jnp.abs(s), floor)
+        probe = s + size * _direction(LOOP_STEPS + i // 2, len(eye))
+        return (jnp.where(k < LOOP_STEPS, newton, probe), s, reference, differs, kink), None
 
     nothing = jax.tree.map(
         lambda v: jnp.zeros(v.shape, v.dtype), jax.eval_shape(sample.slopes, sample.start)
     )
-    start = (sample.start, sample.start, nothing, jnp.array(False))
-    sampled: Any = jax.lax.scan(body, start, jnp.arange(LOOP_STEPS + 1 + 2 * PROBES))[0]
-    _, s, reference, kink = sampled
+    no = jnp.array(False)
+    start = (sample.start, sample.start, nothing, no, no)
+    sampled: Any = jax.lax.scan(body, start, jnp.arange(LOOP_STEPS + 1 + 4 * PROBES))[0]
+    _, s, reference, _, kink = sampled
     return _Rest(reference, s, kink, jnp.array(sample.counts))
 
 
