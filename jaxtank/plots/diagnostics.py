@@ -79,6 +79,16 @@ def estimate(ax, run, tank, unit="cm", plant=None):
     return ax
 
 
+def coefficient(ax, run, k, true=None):
+    """Draw the estimate of one coefficient of the model, with the plant's own value."""
+    name, unit = run.coefficient_names[k]
+    if true is not None:
+        ax.axhline(true, color=REFERENCE, linewidth=1.3, label="true")
+    ax.plot(run.t, run.coefficients[:, k], "--", color=AFTER, linewidth=1.2, label="estimated")
+    ax.set(title=plain(name), ylabel=f"estimate [{unit}]")
+    return ax
+
+
 def disturbance(ax, run, tank, inflow=None, unit="cm/s", plant=None):
     """Draw the estimated disturbance of one level's rate, which holds all model errors."""
     if inflow is not None:

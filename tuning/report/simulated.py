@@ -259,9 +259,9 @@ def _for_journal(case, run, folder, columns):
 
 
 def estimates(loop, clock, run, title=""):
-    """Return {"estimates": levels and disturbances as the observer estimated them}."""
+    """Return {"estimates": levels, disturbances, coefficients as the observer estimated them}."""
     # {} where the controller takes the levels as they are measured.
-    from jaxtank.plots import diagnostics, style
+    from jaxtank.plots import diagnostics, responses, style
 
     tanks, disturbed = loop.plant.tanks, bool(np.any(run.d_hat))
     if not disturbed and np.array_equal(run.x_hat, run.y):
@@ -279,9 +279,14 @@ def estimates(loop, clock, run, title=""):
             if disturbed:
                 rate = local("cm/s", loop.units)
                 diagnostics.disturbance(axes[1, i], run, i, inflow[i], rate, loop.plant)
-            axes[-1, i].set_xlabel("time [s]")
+        below = axes[2 if disturbed else 1 :].ravel()
+        for k, ((name, _), ax) in enumerate(zip(run.coefficient_names, below)):
+            true = get_value(loop, f"plant.{name}") if loop.faults is None else None
+            diagnostics.coefficient(ax, run, k, true)
+        style.hide(below[len(run.coefficient_names) :])
+        responses.label_time(axes)
 
-    rows = 2 if disturbed else 1
+    rows = (2 if disturbed else 1) - (-len(run.coefficient_names) // tanks)
     size = (max(6.4, 3.2 * tanks), 2.3 * rows + 0.5)
     of = {"legend": 5, "title": title, "sharex": True, "squeeze": False}
     return {"estimates": style.picture(draw, size, rows, tanks, **of)}

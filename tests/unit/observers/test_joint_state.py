@@ -10,6 +10,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import parameters
 from jaxtank.observers import ExtendedKalman, MovingHorizon, UnscentedKalman
 from jaxtank.plants.network import network
+from tuning.report.simulated import estimates
 
 MODEL = network(
     area=[50.0, 40.0],
@@ -155,3 +156,20 @@ observer = {kind = "extended-kalman", process = [1e-6], measurement = [1e-6], sp
     assert (known.why, drifting.why) == ("", "")
     peaks = [float(plateau.margins.sensitivity_peak) for plateau in (known, drifting)]
     np.testing.assert_allclose(*peaks, rtol=0.02)
+
+
+def test_the_picture_of_estimates_has_a_panel_for_each_coefficient():
+    text = """units = ["m", "%"]
+tank = [{area = 0.5, rim = 1.2, level = 0.5, drain = 0.0006}]
+pump = [{to = 1, gain = 4e-5, high = 100.0, initial = 37.0}]
+controller = {kind = "pi", Kc = 200.0, Ti = 200.0, bias = 37.0}
+reference = {initial = [0.5]}
+values = {"clock.dt" = 2.0, "clock.duration" = 40.0}
+observer = {kind = "extended-kalman", process = [1e-6], measurement = [1e-6], spread = [1e-6],
+coefficients = ["drain[0]"], coefficient_spread = 0.01, coefficient_walk = 1e-8}"""
+    case = rig.loads(text.replace(",\n", ", "))
+    run = jaxtank.simulate(case)
+    axes = estimates(case.loop, case.clock, run)["estimates"].axes
+    panels = {ax.get_title(): ax.lines[-1].get_ydata() for ax in axes if ax.get_visible()}
+    for k, (name, _) in enumerate(run.coefficient_names):
+        np.testing.assert_array_equal(panels[name], run.coefficients[:, k])
