@@ -171,7 +171,9 @@ def _check_controller(case):
     controller = case.loop.controller
     if isinstance(controller, OpenLoop) or controller.inputs(case.clock) != ():
         raise InputError(
-            f"{case.name}: its controller plays a signal back, and exported code holds no signals"
+            f"{case.name}: its controller plays a signal back, and exported code holds no signals:"
+            ' give a controller that reads levels ([controller] kind = "pi"), or export the plant'
+            " alone (--plant --lang fmu)"
         )
     if controller.reads_inflow or controller.reads_flow:
         raise InputError(

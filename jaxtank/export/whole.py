@@ -163,7 +163,8 @@ def check_pointwise(case: Case) -> None:
     if not is_pointwise(case.loop):
         raise InputError(
             f"{case.name}: its signals are recorded samples, or its controller looks ahead; its"
-            " loop has no code of single samples"
+            " loop has no code of single samples: give changes (reference, inputs) in place of"
+            " recorded samples, or set controller.preview = 0"
         )
     check_prepared(case.loop.controller)
 
