@@ -210,10 +210,12 @@ def _update_plateau(run, state, sample, context):
 
     def update(r, e, before):
         setpoint, error, time, constant, worst, when = before
-        ends = (r != setpoint) & (constant > 0) & (error > worst)
+        # as code for a page, which rounds each product, and compiled code, which does not, have it
+        moved = magnitude(r - setpoint) > 4.0 * jnp.finfo(jnp.result_type(r)).eps * magnitude(r)
+        ends = moved & (constant > 0) & (error > worst)
         worst, when = jnp.where(ends, error, worst), jnp.where(ends, time, when)
         now = jnp.broadcast_to(sample.t, jnp.shape(e))
-        return r, magnitude(e), now, jnp.where(r == setpoint, 1.0, 0.0), worst, when
+        return r, magnitude(e), now, jnp.where(moved, 0.0, 1.0), worst, when
 
     return each(update, sample.r, sample.e, state)
 

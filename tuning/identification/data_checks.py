@@ -32,7 +32,7 @@ def checked(log, loop, gap: float) -> list[Log]:
         raise InputError(
             "identification needs float64: call jax.config.update('jax_enable_x64', True) first"
         )
-    logs = [with_hold(data) for data in ([log] if isinstance(log, Log) else log)]
+    logs = [with_hold(with_even_times(data)) for data in ([log] if isinstance(log, Log) else log)]
     if not logs:
         raise InputError("no log is given: identification needs experiment data")
     messages = [message for log in logs for _, message in findings(log, loop, gap)]
@@ -96,6 +96,29 @@ def _irregular(log):
     """Whether samples come at irregular times."""
     low, high = np.quantile(np.diff(log.t), [0.1, 0.9], method="lower")
     return high > IRREGULAR * low
+
+
+def with_even_times(log):
+    """A Log whose days were written with few decimals, at the even times that they round."""
+    if log.samples < FEWEST:
+        return log
+    steps, k = np.diff(log.t), np.arange(log.samples)
+    for raster in 86400.0 / 10.0 ** np.arange(2, 8):  # s, of a day with so many decimals
+        whole = steps / raster
+        if raster > 1e-3 * np.median(steps) and np.allclose(whole, np.round(whole), atol=1e-3):
+            break
+    else:
+        return log
+    step = float(np.polyfit(k, log.t, 1)[0])
+    short = float(f"{step:.3g}")
+    step = short if abs(short - step) * log.samples < raster else step
+    if np.ptp(whole) < 0.5 or np.ptp(log.t - step * k) > raster * (1.0 + 1e-3):
+        return log
+    note = (
+        f"{log.name}: its days are rounded to {raster:.4g} s: samples are taken as evenly spaced, "
+        f"{step:.6g} s apart"
+    )
+    return dataclasses.replace(log, t=log.t[0] + step * k, notes=(*log.notes, note))
 
 
 def with_hold(log: Log) -> Log:

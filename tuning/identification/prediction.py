@@ -13,6 +13,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.labels import reading_label
 from jaxtank.core.tree import number
 from jaxtank.limits import resolve_limits
+from jaxtank.loop.closed_loop import without_noise
 from jaxtank.loop.run import simulate
 from jaxtank.plants.base import Plant
 from jaxtank.signals.base import Table
@@ -190,7 +191,7 @@ def achieved(case: Case, log: Log) -> list[dict[str, Any]]:
     The reference is the rig's, from the first sample on; "error" (root mean square) is None for a
     tank that is not controlled.
     """
-    run = simulate(case.loop, case.clock)
+    run = simulate(without_noise(case.loop), case.clock)
     t, loop, rows = log.t - log.t[0], case.loop, []
     inside = t <= float(run.t[-1]) * (1 + 1e-9)
     limits = {v.index: v.value for v in resolve_limits(case) if v.measure == "max_level"}

@@ -18,6 +18,7 @@ from helpers import FLAGS, GCC, SERIES, Compiled, needs_gcc
 
 import jaxtank
 from jaxtank import presets, rig
+from jaxtank.analysis import elimination
 from jaxtank.controllers.base import Controller
 from jaxtank.core import units
 from jaxtank.core.errors import InputError
@@ -129,7 +130,7 @@ def test_c_has_the_safety_filter_that_predicts_over_the_dead_time(tmp_path):
 @needs_gcc
 def test_a_programme_of_many_variables_gives_the_inputs_of_the_loop(tmp_path, monkeypatch):
     """As above 40 variables, where loops find the factor; of 4, which compile in less time."""
-    monkeypatch.setattr(jaxtank.analysis.qp, "UNROLLED", 3)
+    monkeypatch.setattr(elimination, "UNROLLED", 3)
     case = presets.find("khalid/laguerre-constrained")
     case = rig.set_values(case, {"clock.duration": 300 * case.clock.dt, "controller.rows": 3})
     run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock))

@@ -1106,7 +1106,7 @@ def test_robust_tuning_without_the_scenarios_of_the_rig(logged):
         words = (str(file), "--robust", "mean", *QUICK, "--validation", "0", "--json", *more)
         code, out, err = command("tune", *words)
         assert code in (0, 3), err
-        costs = [row["objective"]["before"] for row in json.loads(out)["scenarios"]]
+        costs = np.array([row["objective"]["before"] for row in json.loads(out)["scenarios"]])
         assert np.all(
             (low < costs / run["rms_error_total"]) & (costs / run["rms_error_total"] < high)
         )

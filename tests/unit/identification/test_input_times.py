@@ -14,6 +14,7 @@ from jaxtank import rig
 from jaxtank.core.tree import number
 from tuning.cli.main import main
 from tuning.identification import simulation
+from tuning.identification.data_checks import with_even_times
 
 TRUTH = {"plant.pump_gain[0]": 2.64e-5, "plant.orifice[0]": 3.2e-4, "plant.drain[1]": 4.15e-4}
 FREE = {
@@ -270,3 +271,17 @@ def test_a_planned_experiment_moves_a_pump_no_faster_than_its_rate():
         for text in (RIG, RATE.replace("rate = 0.5", "rate = 0.02"))
     ]  # fmt: skip
     assert abs(sd[1] / sd[0] - 1.0) > 0.01
+
+
+def test_days_with_few_decimals_are_taken_at_the_even_times_that_they_round():
+    """45376.0001 is of a raster of 8.64 s; samples every 10 s."""
+    t = np.arange(60) * 10.0
+    days = np.round(45376.0 + t / 86400.0, 4)
+    u, y = np.where(np.arange(60) % 7 < 3, 4.0, 2.0)[:, None], np.linspace(10.0, 20.0, 60)[:, None]
+    rounded = tuning.log(t=(days - days[0]) * 86400.0, u=u, y=y)
+    read = with_even_times(rounded)
+    np.testing.assert_allclose(read.t, t, atol=1e-6)
+    assert "8.64 s" in read.notes[-1]
+    uneven = tuning.log(t=np.cumsum(np.where(np.arange(60) % 5, 8.64, 25.92)), u=u, y=y)
+    read = with_even_times(uneven)
+    np.testing.assert_array_equal(read.t, uneven.t)

@@ -47,6 +47,13 @@ def test_levels_achieved_stand_beside_those_that_the_rig_predicted(case):
     assert max(map(len, achieved_table([row, long]).lines())) <= 80
 
 
+def test_what_a_noisy_rig_predicts_is_its_level_without_noise(case):
+    run = jaxtank.simulate(case.loop, case.clock)
+    log = tuning.log(t=run.t[:100], u=run.u[:100], y=run.x[:100])
+    (row,) = achieved(rig.set_values(case, {"sensor.noise": 0.05}), log)
+    assert row["highest"]["predicted"] == pytest.approx(float(run.x[:100].max()))
+
+
 @pytest.mark.slow
 def test_a_batch_is_learned_and_its_covariance_is_the_next_prior(case, tmp_path):
     values = {"plant.pump_gain": [2.85], "plant.drain": [0.053], "sensor.noise": 0.03}

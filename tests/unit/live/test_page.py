@@ -164,9 +164,9 @@ def test_a_link_brings_back_the_state_and_a_false_one_is_refused(browser, writte
 @pytest.mark.slow
 def test_names_of_a_rig_stay_text(browser, tmp_path):
     evil = "</script><img src=x onerror=alert(1)>\u2028${alert(2)}"
-    case = presets.find("cascaded/pi").replace(
-        name=evil, title=evil, names={"tank": (evil, "b"), "pump": (evil,)}
-    )
+    case = presets.find("cascaded/pi").replace(name=evil, title=evil)
+    plant = dataclasses.replace(case.loop.plant, names=(("tank", (evil, "b")), ("pump", (evil,))))
+    case = case.replace(loop=dataclasses.replace(case.loop, plant=plant))
     path = tmp_path / "page.html"
     path.write_text(page(case), encoding="utf-8")
     with opened(browser, path) as live:

@@ -3,11 +3,12 @@
 import dataclasses
 
 import jax
+import numpy as np
 import pytest
 
 import jaxtank
 from jaxtank import measures as ms
-from jaxtank import presets
+from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 
 COUNTS = (
@@ -70,3 +71,20 @@ def test_other_measures_keep_their_derivatives_and_counts_their_values(case):
     both = jax.vmap(lambda Kc: jaxtank.evaluate(at(case, Kc), case.clock, ["settling_time"]))
     one = jaxtank.evaluate(at(case, 1.0), case.clock, ["settling_time"])["settling_time"]
     assert both(jax.numpy.array([1.0, 2.0]))["settling_time"][0] == one
+
+
+def test_a_plateau_ends_at_the_sample_at_which_its_ramp_begins():
+    """k dt rounded once and once more is not the start of a ramp to the last bit."""
+    case = rig.set_values(
+        presets.find("gouta2015/backstepping"),
+        {"controller.k": 0.002, "controller.k1": 0.002, "clock.duration": 900.0},
+    )
+    run = jaxtank.simulate(case.loop, case.clock, None, 1)
+    names = ["steady_state_error", "time_of_steady_state_error"]
+    measured = jaxtank.evaluate(case.loop, case.clock, names)
+    for output in range(2):
+        time = float(measured["time_of_steady_state_error"][output])
+        (k,) = np.flatnonzero(np.abs(run.t - time) < 1e-6)
+        assert abs(run.e[k, output]) == pytest.approx(measured["steady_state_error"][output])
+        later = np.asarray(run.r)[k : k + 2, output]
+        assert time == pytest.approx(900.0) or later[0] != later[1]

@@ -538,7 +538,7 @@ def test_a_back_off_is_kept_in_the_search_and_fresh_plants_are_judged_without(go
     )
     assert (
         all(c["margin"] >= 0 for c in result.constraints)
-        and "5 % off every limit" in result.message
+        and "tightened every limit by 5 %" in result.message
     )
     costs, held = np.zeros((48, 2)), np.zeros((48, 2), dtype=bool)
     for side, there in enumerate((result.case, result.tuned)):

@@ -473,8 +473,7 @@ def test_three_devices_give_the_bits_of_one():
     numbers = [line for line in lines if line.startswith("[")]
     assert half == 2 and numbers[0] == numbers[1] and "nan" not in numbers[0]
     done = [int(line.split()[0]) for line in lines if not line.startswith("[")]
-    # 55 runs in batches of 8: seven, or three groups of three
-    assert done.count(54) == 2 and len(done) == 7 + 3
+    assert done.count(54) == 2 and len(done) == 7 + 7  # 55 runs in batches of 8
     with pytest.raises(InputError, match="devices = 2: this process has 1"):
         sensitivity(presets.find("cascaded/pi"), method="morris", devices=2)
 
