@@ -5,6 +5,9 @@ import numpy as np
 from jaxtank.export.printer import FUNCTIONS, OPERATIONS, Printer, field_of, header, note_of
 from jaxtank.export.statements import REAL, TRUTH, WHOLE, Matrix, Ref, Store, every
 
+WHOLES = {"sign": "({0} > 0) - ({0} < 0)", "abs": "{0} < 0 ? -{0} : {0}"}
+"""Operations on whole numbers whose result is one, where those on real ones give a real one."""
+
 
 class C(Printer):
     """The statements of C99, in double or single precision."""
@@ -57,6 +60,12 @@ class C(Printer):
         if isinstance(e, float) and self.suffix and np.isfinite(e):
             return f"{text[:-1]}f)" if text.endswith(")") else f"{text}f"
         return text
+
+    def _define(self, s):
+        if s.kind != WHOLE or s.op not in WHOLES:
+            return super()._define(s)
+        value = WHOLES[s.op].format(*map(self.value, s.args))
+        return [self._set(self.constant, s.kind, s.name, value)]
 
     def as_real(self, e):
         """Return a number or a Ref of any kind as a real."""
