@@ -23,8 +23,7 @@ SHORT = {
     "gouta2022/pi": {"clock.dt": 0.2, "actuator.delay": 1.0, "actuator.lag": 0.9},
 }
 NO_PAGE = ("gouta2015/nmpc", "gouta2015/nmpc-preview")
-SHORT = ("cascaded/pi", "gouta2015/backstepping")
-LONG = [n for n in presets.names() if n not in SHORT + NO_PAGE]
+LONG = [n for n in presets.names() if n not in ("cascaded/pi", "gouta2015/backstepping", *NO_PAGE)]
 
 RUN = """
 const entries = (m) => Object.entries(m).map(([k, v]) => [k, [].concat(v).map(String)]);
