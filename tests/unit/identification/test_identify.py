@@ -384,7 +384,7 @@ def test_the_scale_of_areas_drains_and_gains_is_refused(case, clean):
         # every reading stays where it is
         moved = {n: v * factors.get(n, 1.0) for n, v in values.items()}
         np.testing.assert_allclose(levels(moved), levels(values), atol=0.02)
-    assert result.remedies and "by itself" in result.remedies[-1]
+    assert result.remedies and "plant.area[0]" in result.remedies[-1]
 
 
 @pytest.mark.slow

@@ -16,7 +16,6 @@ from jaxtank.instruments.actuators import PumpBank
 from jaxtank.live.engine import engine
 from jaxtank.loop.margins import stability_margins
 from jaxtank.safety.of_case import certificates_of
-from tuning.identification.simulation import rig_of
 
 RIG = """
 units = ["m", "-"]
@@ -223,11 +222,6 @@ def test_no_limit_is_proved_of_pumps_with_a_rate_or_dead_times_that_differ():
         rows = certificates_of(rig.loads(text.format(keys=keys(changes))))
         assert [row.certified for row in rows] == [False, False]
         assert all(row.reason == f"not covered: actuator.{name}" for row in rows)
-
-
-def test_experiment_data_are_not_compared_with_pumps_that_they_do_not_show():
-    with pytest.raises(InputError, match=r"actuator\.rate"):
-        rig_of(case_of(valve={"rate": 0.1}, pump={}).loop)
 
 
 def test_arrays_and_scalars_of_a_rate_are_the_same():
