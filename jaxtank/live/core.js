@@ -280,7 +280,7 @@ function trackingOf(info, inForce, measures) {
   if (!settled.length) return { good: true, words: `tracks with ${total}` };
   if (steady.every((error, o) => Number.isNaN(error) || share(error, o) < EXACT))
     return { good: true, words: `settles on its setpoints, ${total}` };
-  return { good: true, words: `ends within ${shown(Math.max(...settled), 3)} ${unit} of its setpoints, ${total}` };
+  return { good: true, words: `comes within ${shown(Math.max(...settled), 3)} ${unit} of each setpoint, ${total}` };
 }
 
 // {good, words} of marginsOf, null without limits

@@ -210,7 +210,7 @@ def _update_plateau(run, state, sample, context):
 
     def update(r, e, before):
         setpoint, error, time, constant, worst, when = before
-        # as code for a page, which rounds each product, and compiled code, which does not, have it
+        # rounding alone is no change: compiled code may fuse k dt - t0, that of a page does not
         moved = magnitude(r - setpoint) > 4.0 * jnp.finfo(jnp.result_type(r)).eps * magnitude(r)
         ends = moved & (constant > 0) & (error > worst)
         worst, when = jnp.where(ends, error, worst), jnp.where(ends, time, when)

@@ -116,6 +116,10 @@ def courses_of(logs, actuator, dt):
     ]
 
 
+MOST_PIECES = 4
+"""Pieces of a sample at most for the ramp of a slow pump: each is compiled."""
+
+
 def _followed(log, u, rate, dt):
     """Return (times [s], inputs) of a pump that follows u (samples,) at a rate per second; inputs
     that never move faster are those that the pump had, and stay. It starts at the first one.
@@ -123,19 +127,29 @@ def _followed(log, u, rate, dt):
     steps = np.diff(log.t)
     if np.all(np.abs(np.diff(u)) <= rate * steps * (1 + 1e-6)):
         return log.t, u
-    times, followed, ends = [log.t[0]], [u[0]], np.append(log.t[2:], np.inf)
-    for start, end, target, step in zip(log.t[1:], ends, u[1:], steps):
-        if log.hold == "first-order":  # the line to a sample ends at it
-            period, end = step, start
-        else:
-            period = min(dt, float(steps.min()))
-        now, k = followed[-1], 0
-        while k == 0 or (now != target and start + k * period < end * (1 - 1e-9)):
-            now += np.clip(target - now, -rate * period, rate * period)
-            times.append(start + k * period)
-            followed.append(now)
-            k += 1
-    return np.array(times), np.array(followed)
+    linear = log.hold == "first-order"  # the line to a sample ends at it
+    period = steps if linear else np.full(len(steps), min(dt, float(steps.min())))
+    times, followed = [log.t[:1]], [u[:1]]
+    ends = log.t[1:] if linear else np.append(log.t[2:], np.inf)
+    for start, end, target, tick in zip(log.t[1:], ends, u[1:], period):
+        now, most = followed[-1][-1], rate * tick  # change in one period
+        needed, fit = (np.ceil(v - 1e-9) for v in (abs(target - now) / most, (end - start) / tick))
+        k = np.arange(max(1, int(min(needed, fit))))
+        times.append(start + k * tick)
+        followed.append(now + np.clip(target - now, -most * (k + 1), most * (k + 1)))
+    t, followed = np.concatenate(times), np.concatenate(followed)
+    coarse = linear or period[0] * MOST_PIECES >= steps.min() * (1 - 1e-9)
+    return (t, followed) if coarse else _averaged(log.t, t, followed)
+
+
+def _averaged(samples, t, u):
+    """Return (times, means of the inputs u from times t on) of MOST_PIECES of each sample."""
+    share = np.arange(MOST_PIECES) / MOST_PIECES
+    edges = (samples[:-1, None] + np.diff(samples)[:, None] * share).ravel()
+    edges = np.append(edges, samples[-1])
+    t = np.append(t, max(t[-1], samples[-1]) + 1.0)  # the last input lasts
+    total = np.append(0.0, np.cumsum(np.diff(t) * u))
+    return edges[:-1], np.diff(np.interp(edges, t, total)) / np.diff(edges)
 
 
 def _pieces(log, courses, delays):

@@ -10,7 +10,6 @@ import numpy as np
 
 from jaxtank.case import Case
 from jaxtank.core.labels import label_of
-from jaxtank.core.text import count
 from jaxtank.measures import MEASURES
 from tuning.feasible import study
 from tuning.feasible.result import PlateauNeed
@@ -83,7 +82,7 @@ def of_run(case: Case, values: Mapping[str, Any]) -> Advice:
     """Return the Advice on a run with the measures `values`."""
     rows = verdicts.limit_rows(case, values)
     broken = [row["words"] for row in rows if not row["margin"] >= 0.0]
-    words = [f"{len(rows) - len(broken)} of {count(len(rows), 'limit')} hold"] if rows else []
+    words = [f"limits held: {len(rows) - len(broken)} of {len(rows)}"] if rows else []
     words += [f"broken: {listed(broken)}"] if broken else []
     if "rms_error_total" in values:
         error = float(np.ravel(values["rms_error_total"])[0])

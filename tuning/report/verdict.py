@@ -116,7 +116,7 @@ def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
         return Part(f"tracks with {total}")
     if np.nanmax(steady / np.where(heights > 0.0, heights, 1.0)) < EXACT:
         return Part(f"settles on its setpoints, {total}")
-    return Part(f"ends within {shown(np.nanmax(steady))} {unit} of its setpoints, {total}")
+    return Part(f"comes within {shown(np.nanmax(steady))} {unit} of each setpoint, {total}")
 
 
 def limit_rows(case: Case, values: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -91,10 +91,10 @@ def runs(case, every, seed):
     return np.asarray(run.x).T, np.asarray(run.u).T, {m: np.ravel(found[m]) for m in names}
 
 
-def same(one, other, tolerance, rounding=0.0):
+def same(expected, actual, tolerance, rounding=0.0):
     """Whether two arrays are the same but for `tolerance` of their largest finite entry."""
-    size = np.max(np.abs(one[np.isfinite(one)]), initial=1e-12)
-    return np.allclose(other, one, rtol=0, atol=tolerance * size + rounding, equal_nan=True)
+    size = np.max(np.abs(expected[np.isfinite(expected)]), initial=1e-12)
+    return np.allclose(actual, expected, rtol=0, atol=tolerance * size + rounding, equal_nan=True)
 
 
 def nearby(case, every, seed):

@@ -141,17 +141,22 @@ def test_a_loop_whose_filter_estimates_a_coefficient_has_a_steady_state_and_marg
     assert plateau.why == "" and plateau.stable and plateau.margins.sensitivity_peak > 1.0
 
 
-def test_a_slow_drift_leaves_the_margins_that_the_known_model_has():
-    """Readings weigh the same in the limit of no drift; its tiny variances are no kinks."""
-    text = """units = ["m", "%"]
+KNOWN = """
+units = ["m", "%"]
 tank = [{area = 0.5, rim = 1.2, level = 0.5, drain = 0.0006}]
 pump = [{to = 1, gain = 4e-5, high = 100.0, initial = 37.0}]
 controller = {kind = "pi", Kc = 200.0, Ti = 200.0, bias = 37.0}
 reference = {initial = [0.5]}
 values = {"clock.dt" = 2.0, "clock.duration" = 40.0}
-observer = {kind = "extended-kalman", process = [1e-6], measurement = [1e-6], spread = [1e-6]"""
-    drift = ', coefficients = ["drain[0]"], coefficient_spread = 0.01, coefficient_walk = 1e-8}'
-    cases = [rig.loads(text + end) for end in ("}", drift)]
+observer = {kind = "extended-kalman", process = [1e-6], measurement = [1e-6], spread = [1e-6]}
+"""
+WALK = ', coefficients = ["drain[0]"], coefficient_spread = 0.01, coefficient_walk = 1e-8}'
+DRIFTING = KNOWN.replace("spread = [1e-6]}", "spread = [1e-6]" + WALK)
+
+
+def test_a_slow_drift_leaves_the_margins_that_the_known_model_has():
+    """Readings weigh the same in the limit of no drift; its tiny variances are no kinks."""
+    cases = [rig.loads(KNOWN), rig.loads(DRIFTING)]
     (known,), (drifting,) = (jaxtank.stability_margins(case) for case in cases)
     assert (known.why, drifting.why) == ("", "")
     peaks = [float(plateau.margins.sensitivity_peak) for plateau in (known, drifting)]
@@ -159,15 +164,7 @@ observer = {kind = "extended-kalman", process = [1e-6], measurement = [1e-6], sp
 
 
 def test_the_picture_of_estimates_has_a_panel_for_each_coefficient():
-    text = """units = ["m", "%"]
-tank = [{area = 0.5, rim = 1.2, level = 0.5, drain = 0.0006}]
-pump = [{to = 1, gain = 4e-5, high = 100.0, initial = 37.0}]
-controller = {kind = "pi", Kc = 200.0, Ti = 200.0, bias = 37.0}
-reference = {initial = [0.5]}
-values = {"clock.dt" = 2.0, "clock.duration" = 40.0}
-observer = {kind = "extended-kalman", process = [1e-6], measurement = [1e-6], spread = [1e-6],
-coefficients = ["drain[0]"], coefficient_spread = 0.01, coefficient_walk = 1e-8}"""
-    case = rig.loads(text.replace(",\n", ", "))
+    case = rig.loads(DRIFTING)
     run = jaxtank.simulate(case)
     axes = estimates(case.loop, case.clock, run)["estimates"].axes
     panels = {ax.get_title(): ax.lines[-1].get_ydata() for ax in axes if ax.get_visible()}
