@@ -9,6 +9,7 @@ import sys
 import time
 
 import pytest
+from helpers import ONE_TANK
 
 from tuning.cli import terminal
 from tuning.cli.commands.tuning import Progress
@@ -43,10 +44,12 @@ def figures(out):
 
 
 def test_a_closed_stdout_is_output_that_cannot_be_written(tmp_path):
-    done = shell(["export", "cascaded/pi", "--json", "--out", str(tmp_path)], ">&-")
+    (tmp_path / "one.toml").write_text(ONE_TANK)
+    out = tmp_path / "out"
+    done = shell(["export", str(tmp_path / "one.toml"), "--json", "--out", str(out)], ">&-")
     assert done.returncode == 2
     assert done.stderr.splitlines()[-1] == "jaxtank: output: Bad file descriptor"
-    for path in tmp_path.iterdir():  # nothing that was printed got into a file
+    for path in out.iterdir():  # nothing that was printed got into a file
         assert not path.read_text().startswith("{")
 
 

@@ -141,7 +141,7 @@ def agrees(case, settings, tolerance, seed=0, filtered=None):
     return compared
 
 
-@pytest.mark.slow_for("gouta2015/backstepping", "gouta2022/pi")
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHORT)
 def test_runs_are_those_of_the_library(name):
     case = short(name)
@@ -167,7 +167,8 @@ values = {"clock.dt" = 1.0, "clock.duration" = 60.0}
 
 def test_numbers_that_are_infinite_are_so_in_the_engine():
     """Rates, resistances and ends of spans of the parts that have none."""
-    assert agrees(rig.loads(INFINITE), [{}], 1e-9) == 1
+    case = rig.loads(INFINITE)
+    assert agrees(case, [{}, *settings_of(case, 2)], 1e-9) >= 5
 
 
 @pytest.mark.slow

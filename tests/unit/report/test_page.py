@@ -2,6 +2,7 @@
 browser where there is one.
 """
 
+import contextlib
 import functools
 import json
 import re
@@ -14,6 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from browser import chromium
+from helpers import ONE_TANK, no_live_page
 
 import tuning
 from jaxtank import rig
@@ -29,12 +31,13 @@ NASTY = "a <b>\"rig\"</b> & $\\x{$ 'y' </style><script>alert(1)</script>"
 TUNED = "responses rig margins inner saturation clouds convergence landscape"
 PICTURES = {
     "tune": TUNED.split(),
+    "tune-one": [name for name in TUNED.split() if name != "inner"],
     "compare": ["published", "rig-calofir"],
     "uncertainty": ["fan", "violations", "rig"],
     "sensitivity": ["tornado"],
     "identify": ["fit", "residuals", "rig"],
 }
-QUICK = ("tune", "compare")
+QUICK = ("tune-one", "compare")
 KINDS = [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in PICTURES]
 VOID = {"meta", "br", "img", "link", "hr", "input"}
 
@@ -102,8 +105,10 @@ def saves(gouta, tmp_path_factory):
     limits = {"max_level": 30.0}
     search = tuning.Options(starts=1, screening=2, iterations=3, validation=4)
     area = {"plant.drain[0]": tuning.Uniform(relative=0.05)}
+    one = rig.loads(ONE_TANK).replace(name=NASTY)
     makers = {
         "tune": lambda: tuning.tune(case, search, limits=limits),
+        "tune-one": lambda: tuning.tune(one, search, nominal=True),
         "uncertainty": lambda: tuning.ensemble(case, samples=4, limits={"max_level": 9.0}),
         "sensitivity": lambda: tuning.sensitivity(case, area, measures=["rms_error_total"]),
         "identify": identified,
@@ -120,7 +125,8 @@ def folder_of(saves, tmp_path_factory):
     @functools.cache
     def folder(kind):
         path = tmp_path_factory.mktemp(kind)
-        saves(kind)(path, f"jaxtank {kind} {NASTY}")
+        with no_live_page() if kind == "tune-one" else contextlib.nullcontext():
+            saves(kind)(path, f"jaxtank {kind} {NASTY}")
         plt.close("all")
         return path
 
@@ -135,7 +141,7 @@ LIVE = re.compile(
 )
 
 
-@pytest.mark.slow_for("tune", "compare")
+@pytest.mark.slow_for("tune-one", "compare")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_page_is_well_formed_and_asks_nothing_of_the_network(folder_of, kind):
     whole = (folder_of(kind) / "report.html").read_text(encoding="utf-8")
@@ -160,7 +166,6 @@ def test_a_page_is_well_formed_and_asks_nothing_of_the_network(folder_of, kind):
     assert '<meta name="viewport"' in text and "@media print" in text and "max-width" in text
 
 
-@pytest.mark.slow_for("tune")
 @pytest.mark.parametrize("kind", KINDS)
 def test_pictures_have_captions_and_names_of_users_are_no_markup(folder_of, kind):
     text = (folder_of(kind) / "report.html").read_text(encoding="utf-8")
@@ -179,7 +184,7 @@ def test_pictures_have_captions_and_names_of_users_are_no_markup(folder_of, kind
         assert read.words.count("alert(1)") > 2
 
 
-@pytest.mark.slow_for("tune", "uncertainty", "sensitivity", "identify")
+@pytest.mark.slow_for("tune", "tune-one", "uncertainty", "sensitivity", "identify")
 @pytest.mark.parametrize("kind", PICTURES)
 def test_a_picture_that_fails_costs_itself_and_not_the_answer(
     saves, folder_of, kind, tmp_path, monkeypatch, capsys
@@ -258,8 +263,8 @@ def test_the_verdict_is_one_sentence_on_page_terminal_notebook_and_in_json(saves
 
 
 def test_the_numbers_of_a_tuning_are_on_its_page(saves, folder_of):
-    read = Reader((folder_of("tune") / "report.html").read_text(encoding="utf-8"))
-    result = saves("tune").__self__
+    read = Reader((folder_of("tune-one") / "report.html").read_text(encoding="utf-8"))
+    result = saves("tune-one").__self__
     cost = tables.number(result.objective["after"])
     for text in (*result.message.split("; "), *result.parameters, cost, "seed"):
         assert " ".join(text.split()) in read.words

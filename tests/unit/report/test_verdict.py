@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import NODE, node
+from helpers import NODE, ONE_TANK, node
 
 import jaxtank
 from jaxtank import presets, rig
@@ -31,8 +31,8 @@ console.log(JSON.stringify(GIVEN.map(({ values, filter }) => {
   return verdictOf(e.info, inForce, e.run(values, { filter, every: 100 }));
 })));
 """
-FOUR, TWO = "gouta2015/backstepping", "cascaded/pi"
-CLOCKS = {FOUR: {"clock.dt": 0.5, "clock.duration": 400.0}, TWO: {}}
+FOUR, TWO, ONE = "gouta2015/backstepping", "cascaded/pi", "one tank"
+CLOCKS = {FOUR: {"clock.dt": 0.5, "clock.duration": 400.0}}
 RUNS = {  # values and filter of a run, and whether it is good
     FOUR: [
         ({}, False, False),
@@ -42,25 +42,32 @@ RUNS = {  # values and filter of a run, and whether it is good
         ({"plant.drain[0]": 0.6}, True, False),
         ({"actuator.high[0]": 2.0}, False, False),
     ],
-    TWO: [
-        ({}, False, False),
-        ({"plant.rim[0]": 14.0, "plant.rim[1]": 14.0}, False, True),
-        ({"plant.rim[0]": 7.0}, False, False),
-        ({"controller.Kc[0]": 0.05, "controller.Ti[0]": 2000.0}, False, False),
-        ({"plant.pump_gain[0]": 2.0}, False, False),
+    ONE: [
+        ({}, False, True),
+        ({"plant.rim[0]": 2.9}, False, False),
+        ({"plant.rim[0]": 2.5, "controller.Kc[0]": 10.0}, False, False),
+        ({"controller.Kc[0]": 0.05, "controller.Ti[0]": 100.0}, False, False),
+        ({"plant.pump_gain[0]": 1.0}, False, False),
     ],
 }
 
 
+def case_of(name):
+    """A case whose limits are its rims."""
+    if name == ONE:
+        return rig.loads(ONE_TANK).replace(limits={"max_level": "rim"})
+    return rig.set_values(presets.find(name), CLOCKS[name])
+
+
 def measured(name, values, filtered):
     """(case, its measures) of a run."""
-    case = rig.set_values(presets.find(name), CLOCKS[name])
+    case = case_of(name)
     case = case.with_safety_filter() if filtered else case
     case = rig.set_values(case, values) if values else case
     return case, run_measures(case.loop, case.clock, None)
 
 
-EACH = pytest.mark.parametrize("name", [TWO, pytest.param(FOUR, marks=pytest.mark.slow)])
+EACH = pytest.mark.parametrize("name", [ONE, pytest.param(FOUR, marks=pytest.mark.slow)])
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +79,7 @@ def judged():
 @pytest.mark.skipif(NODE is None, reason="no node on this machine")
 @EACH
 def test_page_and_command_have_the_same_verdict_on_a_run(judged, name):
-    case = rig.set_values(presets.find(name), CLOCKS[name])
+    case = case_of(name)
     text = engine(case, case.with_safety_filter() if name == FOUR else None) + _script("core")
     given = [{"values": values, "filter": filtered} for values, filtered, _ in RUNS[name]]
     page = node(text + PAGE, given)
@@ -138,7 +145,6 @@ def test_numbers_are_written_as_the_page_writes_them():
         assert page == [verdicts.shown(value, digits) for value in values]
 
 
-QUICK = ["--set", "clock.duration=400"]
 JUDGED = {  # commands that judge nothing, or one short run, with the shortest words
     "list": [],
     "show": [TWO],
@@ -146,7 +152,7 @@ JUDGED = {  # commands that judge nothing, or one short run, with the shortest w
     "export": [TWO],
     "figure": [],
     "cache": [],
-    "simulate": [TWO, *QUICK],
+    "simulate": ["one.toml"],
     "explore": [TWO, "--out", "page.html"],
     "bench": [],
     "identify": ["--inspect", "log.csv"],
@@ -182,6 +188,7 @@ SLOW = ("explore", "identify", "predict")  # of which other tests read the JSON 
 def test_the_json_of_every_command_has_a_verdict(command, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     rows = "\n".join(f"{4 * k},3.0,{4 + k / 20}" for k in range(40))
+    (tmp_path / "one.toml").write_text(ONE_TANK)
     (tmp_path / "log.csv").write_text(f"t_s,pump_V,lower_tank_V\n{rows}\n")
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setattr("tuning.bench.bench.measure", lambda rounds: {})
@@ -205,7 +212,7 @@ def test_the_json_of_every_command_has_a_verdict(command, tmp_path, monkeypatch,
         assert main.main(checked) == (0 if verdict["good"] else 4)
         printed = capsys.readouterr().out
         assert verdict["sentence"] in " ".join(printed.split())
-        wide = [command, TWO, *QUICK, "--set", "plant.pump_gain=2", "--quiet"]
+        wide = [command, "one.toml", "--set", "plant.pump_gain=1", "--quiet"]
         assert main.main(wide) == 0 and main.main([*wide, "--check"]) == 4
 
 

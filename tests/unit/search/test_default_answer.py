@@ -8,6 +8,7 @@ import pickle
 import jax
 import numpy as np
 import pytest
+from helpers import ONE_TANK as TANK
 from helpers import command, programs_compiled
 
 import jaxtank
@@ -20,22 +21,6 @@ from jaxtank.xla import jit
 from tuning.problem.problem import Problem
 from tuning.search.judged import judge
 from tuning.search.setting import input_range, setting_of
-
-TANK = """
-name = "one tank"
-tank = [{ area = 20.0, rim = 3.0, drain = 2.0, level = 1.0 }]
-pump = [{ gain = 5.0, to = 1, low = 0.0, high = 2.0, initial = 0.4 }]
-plant = { gravity = 0.5 }
-law = { kind = "pid", Kc = 1.0, Ti = 4.0, Tt = 5.0 }
-reference = { initial = [1.0], changes = [[1.0, 1, 2.6]], ramp = 0.0 }
-values = { "clock.dt" = 0.1, "clock.duration" = 40.0 }
-limits = { max_level = 2.7 }
-uncertain = { "plant.drain" = 0.1, "plant.pump_gain" = 0.1 }
-
-[free]
-"controller.Kc" = [0.05, 50.0]
-"controller.Ti" = [0.5, 100.0]
-"""
 
 
 @pytest.fixture(scope="module")
