@@ -6,10 +6,11 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from helpers import ONE_TANK
 from jax.experimental.compilation_cache import compilation_cache
 
 import jaxtank
-from jaxtank import presets, rig
+from jaxtank import rig
 
 HIT = "/jax/compilation_cache/cache_hits"
 
@@ -30,8 +31,7 @@ def empty(tmp_path):
 
 def bits():
     """Measures of a short run and their exact derivatives, compiled now."""
-    clock = {"clock.dt": 4.0, "clock.duration": 200.0}
-    case = rig.set_values(presets.find("cascaded/pi"), clock)
+    case = rig.set_values(rig.loads(ONE_TANK), {"clock.duration": 5.0})
 
     def run(gain):
         loop = jaxtank.with_values(case.loop, {"controller.Kc": gain})

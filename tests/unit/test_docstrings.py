@@ -66,6 +66,7 @@ def test_a_docstring_without_sections_is_reported():
 
 # seconds of compilation: what these examples show has tests of its own
 LONG = {
+    *("jaxtank.controllers.nmpc", "jaxtank.observers.moving_horizon"),
     *("jaxtank.loop.margins", "jaxtank.live.engine", "tuning.figures.comparison"),
     *("tuning.search.judged", "tuning.identification.design", "tuning.falsification.study"),
     *("tuning.uncertainty.study", "tuning.uncertainty.sensitivity_study"),

@@ -7,6 +7,7 @@ import sys
 import jax
 import numpy as np
 import pytest
+from helpers import ONE_TANK
 
 import jaxtank
 from jaxtank import presets, rig
@@ -110,9 +111,7 @@ def test_the_environment_plays_the_case():
 
     from jaxtank.interop.gymnasium import TankEnv
 
-    case = rig.set_values(
-        presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 150.0}
-    )
+    case = rig.loads(ONE_TANK).replace(limits={"max_level": "rim"})
     run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock))
     env = TankEnv(case)
     env.reset(seed=0)
@@ -125,8 +124,8 @@ def test_the_environment_plays_the_case():
         assert not broken and info["t"] == pytest.approx(run.t[k])
     assert k == case.clock.samples - 1
     assert total == pytest.approx(
-        -np.sum(np.mean((run.e[1:] / 30.0) ** 2, axis=1))
-        - 100 * np.sum(np.maximum(run.x[1:] - 30, 0) ** 2 / 900),
+        -np.sum(np.mean((run.e[1:] / 3.0) ** 2, axis=1))
+        - 100 * np.sum(np.maximum(run.x[1:] - 3, 0) ** 2 / 9),
         rel=1e-6,
     )
     check_env(TankEnv(case), skip_render_check=True)

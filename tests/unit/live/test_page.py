@@ -10,7 +10,7 @@ import shlex
 import numpy as np
 import pytest
 from browser import chromium, opened
-from helpers import command
+from helpers import ONE_TANK, command
 
 import jaxtank
 from jaxtank import presets, rig
@@ -570,21 +570,31 @@ def four_tanks(tmp_path_factory):
     return path
 
 
-def test_limits_and_verdict_follow_the_slider_of_a_rim(browser, four_tanks):
-    """A rim of 36 cm ends the excess of 33.08 cm over 30; one of 20 cm makes it 13.08 cm."""
-    with opened(browser, four_tanks) as live:
-        assert verdict(live, "highest level of tank 4 is 33.1 cm", "3.08 cm above") == "bad"
-        set_all(live, {f"plant.rim[{i}]": 36.0 for i in range(4)})
-        assert verdict(live, "smallest margin 2.92 cm") == "good"
-        assert "36 cm" in live.page.inner_text("#margins")
-        set_all(live, {"plant.rim[3]": 20.0})
-        assert verdict(live, "highest level of tank 4 is", "13.1 cm above") == "bad"
-        row = live.page.locator("#margins tr", has_text="tank 4").inner_text()
-        assert "≤ 20 cm" in row
-        # drawn as high as it is, and asked for by the search
+@pytest.fixture(scope="module")
+def one_tank(tmp_path_factory):
+    """The page of a tank whose limit is its rim of 3 cm; it rises to 2.97 cm."""
+    path = tmp_path_factory.mktemp("live") / "one.html"
+    case = rig.loads(ONE_TANK).replace(limits={"max_level": "rim"})
+    path.write_text(page(case), encoding="utf-8")
+    return path
+
+
+def test_limits_and_verdict_follow_the_slider_of_a_rim(browser, one_tank):
+    with opened(browser, one_tank) as live:
+        assert verdict(live, "smallest margin 0.0335 cm") == "good"
+        assert "3 cm" in live.page.inner_text("#margins")
+        set_all(live, {"plant.rim[0]": 2.5})
+        assert verdict(live, "highest level of tank 1 is 2.97 cm", "0.466 cm above") == "bad"
+        row = live.page.locator("#margins tr", has_text="tank 1").inner_text()
+        assert "≤ 2.5 cm" in row
+
+
+def test_a_tank_is_drawn_as_high_as_its_rim(browser, written):
+    with opened(browser, written) as live:
+        set_all(live, {"plant.rim[0]": 5.0})
         heights = [float(h) for h in live.page.locator("#rig .inside").evaluate_all(
             "nodes => nodes.map((node) => node.getAttribute('height'))")]  # fmt: skip
-        assert heights[3] / heights[2] == pytest.approx(20.0 / 36.0, rel=1e-3)
+        assert heights[0] / heights[1] == pytest.approx(0.5, rel=1e-3)
 
 
 @pytest.mark.slow

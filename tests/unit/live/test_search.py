@@ -6,7 +6,7 @@ from importlib import resources
 import jax
 import numpy as np
 import pytest
-from helpers import NODE, node
+from helpers import NODE, ONE_TANK, node
 
 import jaxtank
 from jaxtank import presets, rig
@@ -44,9 +44,7 @@ def test_a_search_ends_where_a_scan_has_its_minimum():
 @pytest.mark.slow
 def test_a_search_keeps_the_limits():
     """The answer, run by the library: no limit is passed."""
-    case = rig.set_values(
-        presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 300.0}
-    ).replace(limits={"max_level": 17.0})
+    case = rig.loads(ONE_TANK).replace(limits={"max_level": 2.8})
     search = resources.files("jaxtank.live").joinpath("tune.js").read_text("utf-8")
     found = node(engine(case) + search + SEARCH)
     loop = jaxtank.with_values(case.loop, found["values"])
@@ -57,9 +55,7 @@ def test_a_search_keeps_the_limits():
 
 def test_a_search_on_plants_keeps_the_limits_of_each_and_minimises_their_mean():
     """The answer, run by the library on every plant."""
-    case = rig.set_values(
-        presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 300.0}
-    ).replace(limits={"max_level": 17.0})
+    case = rig.loads(ONE_TANK).replace(limits={"max_level": 2.8})
     name, usual = "plant.pump_gain[0]", float(case.loop.plant.pump_gain[0])
     plants = [{}, {name: 0.9 * usual}, {name: 1.1 * usual}]
     script = f"""
@@ -74,7 +70,7 @@ console.log(JSON.stringify(tune(e, {{}}, e.info.free, e.info.limits, null, null,
         values = jaxtank.evaluate(loop, case.clock, ["rms_error_total", "max_level"])
         costs.append(float(values["rms_error_total"]))
         highest.append(float(np.max(values["max_level"])))
-    assert found["violation"] == 0 and max(highest) <= 17.0
+    assert found["violation"] == 0 and max(highest) <= 2.8
     assert found["objective"] == pytest.approx(np.mean(costs), rel=1e-6)
 
 

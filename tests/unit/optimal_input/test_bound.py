@@ -6,6 +6,7 @@ import json
 import jax
 import numpy as np
 import pytest
+from helpers import ONE_TANK
 from scipy.optimize import lsq_linear, minimize
 
 import jaxtank
@@ -124,16 +125,22 @@ def test_a_looser_limit_and_a_finer_grid_cost_less(climb, climbed):
     assert 0 < looser.gain_percent < 100
 
 
-def test_what_is_reported_of_it(climbed):
-    reported = json.loads(json.dumps(climbed.to_json(), allow_nan=False))
-    assert (
-        reported["intervals"] == 40
-        and reported["cost"] == climbed.cost
-        and "certificate" in reported["note"]
-    )
-    text = str(climbed)
+def test_the_bound_of_one_tank_keeps_its_limit_costs_less_and_is_reported():
+    """Its PI controller passes 2.7 cm by 0.27 cm."""
+    case = rig.loads(ONE_TANK)
+    found = bound(case, interval=1.0, iterations=60)
+    names = ["rms_error_total", "max_level"]
+    again = jaxtank.evaluate(open_loop(case.loop, found.u.T, 1.0), case.clock, names)
+    assert found.cost == pytest.approx(float(again["rms_error_total"]), rel=1e-9)
+    assert found.holds and float(again["max_level"][0]) <= 2.7 * (1 + TOLERANCE)
+    assert found.source == "search" and found.u.min() >= 0.0 and found.u.max() <= 2.0
+    assert found.cost < found.closed_loop["cost"] and not found.closed_loop["holds"]
+    reported = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    assert reported["intervals"] == 40 and reported["cost"] == found.cost
+    assert "certificate" in reported["note"]
+    text = str(found)
     assert "limits held; tightest: max_level of tank" in text and "not a certificate" in text
-    assert climbed.trajectory(save_every=10).x.shape == (41, 4)
+    assert found.trajectory(save_every=10).x.shape == (41, 1)
 
 
 @pytest.mark.slow

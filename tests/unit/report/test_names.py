@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from helpers import no_live_page
 
 from jaxtank import rig
 from jaxtank.core.labels import label_of, labels_of
@@ -92,14 +93,16 @@ def simulated(tmp_path, text, *options):
 
 
 def test_a_run_is_printed_with_names_and_its_columns_are_read_again(tmp_path, capsys):
-    assert simulated(tmp_path, NAMED, "--out", str(tmp_path / "out")) == 0
+    with no_live_page():
+        assert simulated(tmp_path, NAMED, "--out", str(tmp_path / "out")) == 0
     out = capsys.readouterr().out
     assert re.search(r"highest level \[m\] +LT101 0\.\d+ +LT102 0\.\d+", out)
     header = (tmp_path / "out" / "trajectory.csv").read_text().partition("\n")[0].split(",")
     assert header[:3] == ["t [s]", "h_LT101 [m]", "h_LT102 [m]"] and "u_P101 [%]" in header
     named = read_log(tmp_path / "out" / "trajectory.csv", rig.loads(NAMED).loop)
     assert named.tanks == (0, 1) and named.u.shape[1] == 1
-    assert simulated(tmp_path, PLAIN, "--out", str(tmp_path / "plain")) == 0
+    with no_live_page():
+        assert simulated(tmp_path, PLAIN, "--out", str(tmp_path / "plain")) == 0
     assert re.search(r"highest level \[m\] +tank 1 0\.\d+ +tank 2 0\.\d+", capsys.readouterr().out)
     header = (tmp_path / "plain" / "trajectory.csv").read_text().partition("\n")[0].split(",")
     assert header[:3] == ["t [s]", "h1 [m]", "h2 [m]"]
