@@ -7,6 +7,7 @@ It works on the final numbers with its own formulas; Theorem 6 of README.md of t
 import functools
 import math
 from collections.abc import Mapping
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -181,8 +182,12 @@ class _Rig:
     def source(self, j):
         return self.plant.sources[j] if self.plant.sources else None
 
-    def neighbours(self, i, upper):
-        """Tanks on whose levels the harm to tank i depends."""
+    def row(self, i, upper):
+        """The row of a limit, or None."""
+        return next((r for r in self.rows if r.tank == i and r.upper == upper), None)
+
+    def neighbours(self, i, upper=False):
+        """Tanks on whose levels the harm to tank i depends: at its low limit the pumps' too."""
         lifts = self.plant.lift_curves or (None,) * self.m
         pairs = [*self.plant.pipes, *self.plant.valves]
         for j, pair in enumerate(self.plant.feeds):
@@ -402,7 +407,11 @@ def _joint(rig):
         low = np.where([bool(why) for why in lower], 0.0, rig.low)
         bounds = _Bounds(high, low)
         after = [
-            [why or first_failure(_kept(rig, i, bounds, up)) for i, why in enumerate(reasons)]
+            [
+                why
+                or first_failure(chain(_kept(rig, i, bounds, up), _relied_on(rig, i, bounds, up)))
+                for i, why in enumerate(reasons)
+            ]
             for reasons, up in ((upper, True), (lower, False))
         ]
         if after == [upper, lower]:
@@ -418,9 +427,7 @@ def _kept(rig, i, bounds, upper):
     start, side = rig.begin[1][i] if upper else rig.begin[0][i], "above" if upper else "below"
     starts = start <= limit * (1.0 + 1e-12) if upper else start >= limit * (1.0 - 1e-12)
     yield starts, f"start at {start:.4g} {unit}, {side} the limit {limit:.4g} {unit}"
-    near = rig.neighbours(i, upper)
-    yield from _relied_on(rig, near, bounds, upper)
-    row = next((r for r in rig.rows if r.tank == i and r.upper == upper), None)
+    near, row = rig.neighbours(i, upper), rig.row(i, upper)
     others = rig.reach if upper else rig.bottom
     movers = () if row is None else row.movers
     rest = rig.harm(i, limit, others, upper)
@@ -437,19 +444,29 @@ def _kept(rig, i, bounds, upper):
         yield from _row_holds(rig, row, bounds, near)
 
 
-def _relied_on(rig, near, bounds, upper):
-    """(holds, reason): the levels of neighbours are within what the filter counts on."""
-    for k in sorted(near):
+def _relied_on(rig, i, bounds, upper):
+    """(holds, reason): the levels of neighbours are within what one limit counts on. Asked last: of
+    two tanks that rely on each other the answer names what the first of them lacks.
+    """
+    if not upper and rig.low[i] <= 0.0:
+        return
+    near = sorted(rig.neighbours(i, upper))
+    for k in near:
         word = f"relies on {rig.label(k)}"
         yield math.isfinite(bounds.high[k]), f"{word}, which has no upper bound"
         yield rig.reach[k] < UNKNOWN, f"{word}, not proved"
         yield bounds.high[k] <= rig.reach[k] * (1.0 + ROUNDING), f"{word}, not proved"
         yield bounds.low[k] >= rig.bottom[k], f"{word}, whose low limit is not proved"
         yield upper or bounds.high[k] <= rig.limit[k], f"{word}, not proved"
+    for k in near if rig.row(i, upper) is not None else ():
+        for j in () if _any_change(rig, k) else sorted(rig.neighbours(k)):
+            word = "its own" if j == i else f"{rig.label(j)}, whose"
+            yield bounds.high[j] <= rig.reach[j], f"relies on {word} upper limit, not proved"
+            yield bounds.low[j] >= rig.bottom[j], f"relies on {word} low limit, not proved"
 
 
 def _row_holds(rig, row, bounds, near):
-    """(holds, reason) of the readings and the other rows that a row relies on."""
+    """(holds, reason) of the readings and of the other rows."""
     i, unit = row.tank, rig.plant.units[0]
     value = rig.rate[i] * rig.hold
     yield value <= 1.0 + 1e-12, f"kappa T = {value:.3g} above 1"
@@ -458,20 +475,24 @@ def _row_holds(rig, row, bounds, near):
         narrow = f"noise band {rig.band[k]:.3g} {unit} below {rig.needed[k]:.3g} {unit}"
         yield rig.band[k] >= rig.needed[k] * (1.0 - ROUNDING), narrow
         reason = f"{rig.label(k)} may rise above what its sensor can read, {rig.top[k]:.4g} {unit}"
-        yield bounds.high[k] <= rig.top[k] * (1.0 + 1e-12), reason
+        # one without a bound is a limit that another one relies on
+        yield (
+            not math.isfinite(bounds.high[k]) or bounds.high[k] <= rig.top[k] * (1.0 + 1e-12),
+            reason,
+        )
     for k in sorted(near):
         rates = [_fastest(rig, k, up) * rig.hold for up in (True, False)]
-        ranges = rig.reach[k] + rig.band[k]
-        for name, most in zip(("climb", "drop"), rates):
-            counted = getattr(rig, name)[k]
-            prism = rig.shapes[k] == "prism" and most <= counted * (1.0 + ROUNDING)
-            free = counted >= ranges
-            yield prism or free, f"{rig.label(k)} may change faster than is counted on"
-            for j in () if free else sorted(rig.neighbours(k, True) | rig.neighbours(k, False)):
-                inside = bounds.high[j] <= rig.reach[j] and bounds.low[j] >= rig.bottom[j]
-                yield inside, f"relies on {rig.label(j)}, not proved"
+        for counted, most in zip((rig.climb[k], rig.drop[k]), rates):
+            slower = rig.shapes[k] == "prism" and most <= counted * (1.0 + ROUNDING)
+            reason = f"{rig.label(k)} may change faster than is counted on"
+            yield slower or _any_change(rig, k, counted), reason
     for other in rig.rows[row.place + 1 :]:
         yield from _compatible(rig, row, other, bounds)
+
+
+def _any_change(rig, k, *counted):
+    """Whether a row counts on any change of a level in a hold, so on no limit around the tank."""
+    return min(counted or (rig.climb[k], rig.drop[k])) >= rig.reach[k] + rig.band[k]
 
 
 def _fastest(rig, k, upper):

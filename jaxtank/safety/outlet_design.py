@@ -96,6 +96,7 @@ def outlet_design(
         pulses=bool(np.any(tankwise(volume) > 0.0) or draws),
         faults=faults,
     )
+    lost: dict = {}  # {(tank, upper): why a limit was given up, while the others were relied on}
     while True:
         reach = np.where(relied[0], limit, loose)
         base = dataclasses.replace(base, reach=reach, bottom=np.where(relied[1], low, 0.0))
@@ -106,25 +107,35 @@ def outlet_design(
         whole = len(set(reasons)) == 1 and reasons[0].startswith("not covered: ")
         if whole or np.all(proved | ~relied):
             break
+        for v in verdicts:
+            lost |= {(v.tank, up): why for up, why in _failures(v) if (v.tank, up) not in lost}
         relied &= proved
-    return finished, tuple(_certificate(finished, v, hold) for v in verdicts)
+    return finished, tuple(_certificate(finished, v, hold, lost) for v in verdicts)
 
 
-def _certificate(finished, verdict, hold):
+def _failures(verdict):
+    """[(upper, why)] of the limits of a tank that do not hold."""
+    rows = (True, verdict.holds, verdict.reason), (False, verdict.low_holds, verdict.low_reason)
+    return [(upper, why) for upper, holds, why in rows if not holds]
+
+
+def _certificate(finished, verdict, hold, lost):
     """The certificate of a tank."""
     i = verdict.tank
+    reasons = {True: verdict.reason, False: verdict.low_reason}
+    reasons |= {up: lost.get((i, up), why) for up, why in _failures(verdict)}
     return TankCertificate(
         tank=i,
         limit=float(finished.limit[i]),
         certified=verdict.holds,
-        reason=verdict.reason,
+        reason=reasons[True],
         rate=float(finished.rate[i]),
         rate_bound=1.0 / hold,
         gap=float("nan"),
         reach=float(finished.reach[i]),
         low=float(finished.low[i]),
         low_certified=verdict.low_holds,
-        low_reason=verdict.low_reason,
+        low_reason=reasons[False],
         starts=verdict.starts if verdict.holds else "",
     )
 
