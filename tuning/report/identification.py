@@ -212,7 +212,8 @@ def _ending(fit):
         if ended := at_search_bounds(fit.case.loop, fit.parameters):
             words.append(
                 f"{', '.join(ended)} {'ends' if len(ended) == 1 else 'end'} at the bound of the"
-                " search: check the ranges (--free), and units and columns of the data"
+                " search: check the ranges (--free), and units and columns of the data; the intervals"
+                " of other parameters hold only for that value"
             )
         if fit.fit.status <= 0:
             words.append("the best search did not converge in its iterations: raise --iterations")
@@ -385,6 +386,9 @@ def advice_of(fit):
     to_set = "set nothing: the values of the rig stand"
     if moved or not fit.identifiable:
         to_set = f"set {listed(moved)}" if fit.identifiable else "set nothing from these data"
+    if fit.status in ("not_converged", "interrupted"):
+        ended = "was interrupted" if fit.status == "interrupted" else "has not converged"
+        to_set = f"set nothing: the search {ended}"
     rest = [
         f"{name} {verdicts.shown(rmse)} {unit}"
         for (name, unit), rmse in zip(fit.channels, fit.quality["rmse"])

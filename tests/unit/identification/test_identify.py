@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import functools
 import json
+import re
 
 import jax
 import numpy as np
@@ -980,7 +981,7 @@ def test_the_plan():
 
 
 @pytest.mark.slow
-def test_a_log_that_cannot_tell_writes_no_rig(tmp_path, resting):
+def test_of_a_log_that_cannot_tell_no_value_is_advised(tmp_path, resting):
     warm, log = resting
     rig_file, path, out = tmp_path / "warm.toml", tmp_path / "log.csv", tmp_path / "out"
     rig_file.write_text(rig.dump(warm))
@@ -989,17 +990,9 @@ def test_a_log_that_cannot_tell_writes_no_rig(tmp_path, resting):
     code, printed, reported = command(
         "identify", str(rig_file), "--data", str(path), *FLAGS[2:], "--out", str(out), "--quiet"
     )
-    assert (
-        code == 5
-        and reported.count("\n") == 1
-        and "not identifiable from these data" in reported
-        and "no rig is written" in reported
-    )
-    assert (
-        not (out / "rig.toml").exists()
-        and "not identifiable" in printed
-        and "What would identify them separately" in printed
-    )
+    # one share runs to its bound along the combinations that change no reading
+    assert code == 3 and "at the bound of the search" in " ".join(printed.split())
+    assert not re.search(r"[Ss]et plant", printed), "values of a search that has not converged"
 
 
 # A rig without a controller
