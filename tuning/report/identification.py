@@ -212,8 +212,8 @@ def _ending(fit):
         if ended := at_search_bounds(fit.case.loop, fit.parameters):
             words.append(
                 f"{', '.join(ended)} {'ends' if len(ended) == 1 else 'end'} at the bound of the"
-                " search: check the ranges (--free), and units and columns of the data; the intervals"
-                " of other parameters hold only for that value"
+                " search: check the ranges (--free), and units and columns of the data; the other"
+                " other parameters hold only for that value"
             )
         if fit.fit.status <= 0:
             words.append("the best search did not converge in its iterations: raise --iterations")

@@ -987,7 +987,7 @@ def test_of_a_log_that_cannot_tell_no_value_is_advised(tmp_path, resting):
     rig_file.write_text(rig.dump(warm))
     rows = "\n".join(f"{t:g},3,2.8,{a:.4f},{b:.4f}" for t, (a, b) in zip(log.t[::3], log.y[::3]))
     path.write_text(f"t [s],pump1 [V],pump2 [V],h1 [cm],h2 [cm]\n{rows}\n")
-    code, printed, reported = command(
+    code, printed, _ = command(
         "identify", str(rig_file), "--data", str(path), *FLAGS[2:], "--out", str(out), "--quiet"
     )
     # one share runs to its bound along the combinations that change no reading
