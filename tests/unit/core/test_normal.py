@@ -1,11 +1,12 @@
-"""Deviates that are drawn by our own rounds of Threefry are those of jax, bit for bit."""
+"""Deviates drawn by our own Threefry and inverse error function are those of jax."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import erfinv
 
-from jaxtank.xla.normal import normal
+from jaxtank.xla.normal import erf_inv, normal
 
 
 @pytest.mark.parametrize("shape, compiled", [((4, 1001), True), ((3,), True), ((1, 7), False)])
@@ -15,14 +16,22 @@ def test_deviates_are_those_of_jax(shape, compiled):
         mine, theirs = (jax.jit(f, static_argnums=1) for f in (mine, theirs))
     for seed in (0, 2**31 - 1):
         key = jax.random.fold_in(jax.random.key(seed), 3)
-        np.testing.assert_array_equal(mine(key, shape), theirs(key, shape))
+        np.testing.assert_allclose(mine(key, shape), theirs(key, shape), rtol=1e-13)
+
+
+def test_the_inverse_error_function_holds_from_0_to_the_last_number_below_1():
+    rng = np.random.default_rng(0)
+    ends = [0.0, 2.0**-60, np.nextafter(1.0, 0.0), np.nextafter(-1.0, 0.0)]
+    near_1, near_0 = 1.0 - 2.0 ** -rng.uniform(1, 53, 20_000), 2.0 ** -rng.uniform(1, 60, 2_000)
+    x = np.concatenate([rng.uniform(-1, 1, 200_000), near_1, -near_1, near_0, ends])
+    np.testing.assert_allclose(jax.jit(erf_inv)(x), erfinv(x), rtol=3e-15)
 
 
 def test_a_batch_of_keys_has_the_deviates_of_each():
     keys = jax.random.split(jax.random.key(5), 6)
     many = jax.jit(jax.vmap(lambda key: normal(key, (2, 9))))(keys)
     for key, row in zip(keys, many):
-        np.testing.assert_array_equal(row, jax.random.normal(key, (2, 9), jnp.float64))
+        np.testing.assert_allclose(row, jax.random.normal(key, (2, 9), jnp.float64), rtol=1e-13)
 
 
 def test_other_generators_and_types_are_left_to_jax():
