@@ -12,7 +12,8 @@ function colour(name) {
 }
 
 // One panel. spec: {title, name, unit, limits: [{value, words}], forbidden: above it, zero}
-// on: {cursor(time), zoom(from, to), whole()}; series: band low, band high, pins, setpoint, run
+// on: {cursor(time), zoom(from, to), whole(), handle(spec, time, near) -> {name} or null: what is dragged,
+// drag(name, value)}; series: band low, band high, pins, setpoint, run
 function makeChart(host, spec, view, on) {
   const title = make("span", { class: "name" }, spec.title);
   const reading = make("span", { class: "reading" });
@@ -74,17 +75,35 @@ function makeChart(host, spec, view, on) {
     [[0, 1], ...series.slice(1).map(() => [null, null])],
     box,
   );
+  // a setpoint or a rim follows the pointer that presses on its line; elsewhere a drag zooms
+  let held = null;
+  const grip = (event) => {
+    const { left, top } = plot.over.getBoundingClientRect(), y = event.clientY - top;
+    const near = (value) => Math.abs(plot.valToPos(value, "y") - y) < 6;
+    return on.handle(spec, plot.posToVal(event.clientX - left, "x"), near);
+  };
+  plot.over.addEventListener("pointermove", (event) => {
+    if (held) on.drag(held, Number(plot.posToVal(event.clientY - plot.over.getBoundingClientRect().top, "y").toPrecision(3)));
+    else plot.over.style.cursor = grip(event) ? "ns-resize" : "";
+  });
+  plot.over.addEventListener("pointerdown", (event) => {
+    held = event.button === 0 ? grip(event)?.name ?? null : null;
+    if (held) plot.over.setPointerCapture(event.pointerId);
+  });
+  for (const end of ["pointerup", "pointercancel"]) plot.over.addEventListener(end, () => (held = null));
+  box.addEventListener("mousedown", (event) => held && event.stopPropagation(), true); // not a zoom
   const show = (k, yes) => plot.series[k].show !== yes && plot.setSeries(k, { show: yes }, false);
   return {
     spec,
     figure,
     // lines: {run, setpoint or null, pins: [values], band: {t, low, high} or null}, over times t
     draw(t, lines) {
-      const used = [...lines.pins, ...(lines.setpoint ? [lines.setpoint] : []), lines.run];
+      const used = [...lines.pins.filter(Boolean), ...(lines.setpoint ? [lines.setpoint] : []), lines.run];
       const cut = envelope(t, used, view.from, view.to, Math.max(50, Math.round(plot.width)));
       const at = cut[0], none = new Array(at.length).fill(null);
       const data = [at, none, none];
-      for (let i = 0; i < PINS; i += 1) data.push(i < lines.pins.length ? cut[1 + i] : none);
+      const seen = lines.pins.filter(Boolean);
+      for (let i = 0; i < PINS; i += 1) data.push(lines.pins[i] ? cut[1 + seen.indexOf(lines.pins[i])] : none);
       data.push(lines.setpoint ? cut[cut.length - 2] : none, cut[cut.length - 1]);
       const { band } = lines;
       if (band) {
@@ -95,7 +114,7 @@ function makeChart(host, spec, view, on) {
       plot.batch(() => {
         show(1, Boolean(band));
         show(2, Boolean(band));
-        for (let i = 0; i < PINS; i += 1) show(3 + i, i < lines.pins.length);
+        for (let i = 0; i < PINS; i += 1) show(3 + i, Boolean(lines.pins[i]));
         show(3 + PINS, Boolean(lines.setpoint));
         plot.setData(data, true);
       });

@@ -76,9 +76,9 @@ function deviates(seed, tanks, samples) {
 }
 
 info.leaves = info.leaves.flatMap(([unit, doc, group, entries]) =>
-  entries.map(([name, number, lower, upper]) => {
+  entries.map(([name, number, lower, upper, label]) => {
     const value = typeof number === "string" ? null : number; // an infinite one has no slider
-    return { name, unit, doc, value, fixed: Number(number), lower, upper, group };
+    return { name, label, unit, doc, value, fixed: Number(number), lower, upper, group };
   }));
 
 const PIECE = 500; // samples

@@ -19,12 +19,13 @@ from jaxtank import measures as ms
 from jaxtank.bounds import bounds
 from jaxtank.case import Case, Free
 from jaxtank.controllers import OpenLoop
-from jaxtank.core.labels import input_unit, label_of
+from jaxtank.core.labels import input_unit, label_of, place_of
 from jaxtank.core.tree import describe, get_value, parameters
 from jaxtank.export.whole import WholeLoop, library, whole_loop
 from jaxtank.limits import limit_scale, resolve_limits
 from jaxtank.live.printed import Printed, maths
 from jaxtank.loop.closed_loop import draws_bursts
+from jaxtank.signals.setpoints import Ramps
 from jaxtank.task import default_cost, has_own_objective, input_range, sensor_noise, with_noise
 
 ROWS = 3000
@@ -47,6 +48,26 @@ GROUPS = {
     "x0": "initial",
 }
 """{first part of a dotted name: group of its slider}."""
+
+NOUNS = {
+    "actuator.high": "upper limit",
+    "actuator.initial": "input before the run",
+    "actuator.low": "lower limit",
+    "actuator.stop": "stopping input",
+    "controller.du_limit": "largest change",
+    "controller.high": "upper limit",
+    "controller.low": "lower limit",
+    "controller.u_high": "upper limit",
+    "controller.u_low": "lower limit",
+    "plant.drain": "outlet",
+    "plant.orifice": "outlet",
+    "plant.pump_gain": "gain",
+    "reference.initial": "setpoint",
+    "sensor.gain": "sensor gain",
+    "sensor.noise": "noise",
+    "x0": "starting level",
+}
+"""What a person reads for a field; of the others its name."""
 
 WIDE = {"controller": (0.2, 5.0), "observer": (0.2, 5.0), "plant": (0.5, 1.5), "pumps": (0.5, 1.5)}
 """{group: ends of a slider as multiples of a value that has no bounds}; (0, 2) of the others."""
@@ -125,12 +146,12 @@ def facts_of(case: Case, filtered: Case | None = None) -> dict[str, Any]:
 
 
 def _packed(facts: dict[str, Any]) -> dict[str, Any]:
-    """Return `facts` with grouped leaves: common fields once, then [name, value, range]."""
+    """Return `facts` with grouped leaves: common fields once, then [name, value, range, label]."""
     groups: dict[tuple[Any, ...], list[Any]] = {}
     for leaf in facts["leaves"]:
         shared = tuple(leaf[key] for key in SHARED)
         number = leaf["infinite"] if leaf["value"] is None else leaf["value"]
-        entry = [leaf["name"], number, leaf["lower"], leaf["upper"]]
+        entry = [leaf["name"], number, leaf["lower"], leaf["upper"], leaf["label"]]
         groups.setdefault((leaf["name"].split("[")[0], *shared), []).append(entry)
     packed = [[*shared, entries] for (_, *shared), entries in groups.items()]
     return {**facts, "leaves": packed}
@@ -242,6 +263,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
             for j in range(plant.pumps)
         ],
         "leaves": _leaves(loops),
+        "setpoints": _setpoints(loop),
         "measures": [_measure(case, m, entries) for m, entries in loops[-1].measures.items()],
         "limits": _limits(case),
         "free": [b.name for b in free],
@@ -260,6 +282,19 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         "noise": draws_bursts(loop) or bool(np.any(np.asarray(loop.sensor.noise) > 0)),
         "tracks": not isinstance(loop.controller, OpenLoop),
     }
+
+
+def _setpoints(loop):
+    """[[parameter, output, the time from which it is the setpoint]], where the setpoints step."""
+    reference = loop.reference
+    if not isinstance(reference, Ramps):
+        return []
+    first = [[f"reference.initial[{i}]", i, 0.0] for i in range(reference.channels)]
+    later = [
+        [f"reference.targets[{k}]", channel, float(time)]
+        for k, (time, channel) in enumerate(reference.changes)
+    ]
+    return first + later
 
 
 def _tanks(case):
@@ -331,6 +366,7 @@ def leaf_of(case: Case, name: str, index: tuple[int, ...]) -> dict[str, Any]:
     lower, upper = _ends(case, name, full, value, meta, group) if finite else (None, None)
     return {
         "name": full,
+        "label": words_of(case.loop, name, index),
         "unit": meta["unit"],
         "doc": meta["doc"],
         "value": value if finite else None,
@@ -339,6 +375,29 @@ def leaf_of(case: Case, name: str, index: tuple[int, ...]) -> dict[str, Any]:
         "upper": upper,
         "group": group,
     }
+
+
+def words_of(loop: Any, name: str, index: tuple[int, ...]) -> str:
+    """Return what a person reads for one number of a loop: "outlet of LT102"."""
+    plant, shape = loop.plant, describe(loop, name).get("shape")
+    noun = NOUNS.get(name, name.rsplit(".", 1)[-1].replace("_", " "))
+    if not index:
+        return noun
+    (i, *others), kind = index, shape[0] if isinstance(shape, tuple) and shape else ""
+    if name == "reference.targets" and hasattr(loop.reference, "changes"):
+        time, channel = loop.reference.changes[i]
+        return f"setpoint of {place_of(plant, 'output', channel)} from {time:.5g} s"
+    if kind == "channel" and name.startswith("reference."):
+        start = " at first" * (name == "reference.initial")
+        return f"{noun} of {place_of(plant, 'output', i)}{start}"
+    if kind in ("tank", "output", "pump", "feed") and not others:
+        return f"{noun} of {place_of(plant, 'pump' if kind == 'feed' else kind, i)}"
+    ends = {"orifice": ("links", "of {} into {}"), "pipe": ("pipes", "between {} and {}")}
+    if kind in ends:
+        pairs, place = ends[kind]
+        tanks = (label_of(plant, "tank", k) for k in getattr(plant, pairs)[i])
+        return f"{noun} {place.format(*tanks)}"
+    return f"{noun} {', '.join(str(k + 1) for k in index)}"
 
 
 def _ends(case, name, full, value, meta, group):

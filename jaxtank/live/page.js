@@ -29,7 +29,8 @@ const state = {
   free: new Set(entriesOf(info.free)),
 };
 const view = { from: 0, to: info.duration, at: info.duration };
-const pins = []; // {name, run}
+const pins = []; // {name, run, words: what differs from the case}
+const unseen = new Set(); // keys of the legend that are switched off
 const framed = window !== window.parent; // in a report or a notebook
 let took = 100; // milliseconds of the last run
 let current = null, bands = null, worker = null, charts = [], rig = null;
@@ -195,13 +196,14 @@ function show() {
     const { what, index, output } = chart.spec;
     chart.draw(current.t, {
       run: current[what][index],
-      setpoint: what === "h" && output >= 0 ? current.r[output] : null,
-      pins: pins.map((pin) => onTimes(pin.run, what, index)),
-      band: bands && { t: bands.t, ...bands[what][index] },
+      setpoint: what === "h" && output >= 0 && !unseen.has("setpoint") ? current.r[output] : null,
+      pins: pins.map((pin) => (unseen.has(pin.name) ? null : onTimes(pin.run, what, index))),
+      band: bands && !unseen.has("band") ? { t: bands.t, ...bands[what][index] } : null,
     });
   });
   showTables();
   atTime(view.at);
+  if (!worker && !due) tested(current);
 }
 
 function onTimes(other, what, index) {
@@ -225,7 +227,9 @@ function atTime(time) {
   charts.forEach(({ spec, read }) => {
     const { what, index, output, unit } = spec;
     const target = what === "h" && output >= 0 ? `, setpoint ${shown(r[output])}` : "";
-    read(`${shown((what === "h" ? h : u)[index])} ${unit}${target}`);
+    const others = pins.filter((pin) => !unseen.has(pin.name))
+      .map((pin) => `, ${pin.name} ${shown(onTimes(pin.run, what, index)[k])}`).join("");
+    read(`${shown((what === "h" ? h : u)[index])} ${unit}${target}${others}`);
   });
   $("now").textContent = `${shown(view.at, 5)} s`;
   $("time").value = Math.round((1000 * view.at) / info.duration);
@@ -248,6 +252,7 @@ function showTables() {
   const margins = marginsOf(limitsNow(), current.measures), { sentence, good } = verdict(current);
   $("verdict").textContent = sentence;
   $("verdict").className = good ? "good" : "bad";
+  reveal(sentence);
   const pinned = pins[pins.length - 1];
   fill($("margins"), "Limits", ["", "value", "margin"], margins.map(({ limit, value, margin }) => ({
     head: `${limit.words} ${limit.lower === null || limit.lower === undefined ? "≤" : "≥"} ${
@@ -261,6 +266,14 @@ function showTables() {
     cells: [cells(current.measures[m.name]), ...(pinned ? [cells(pinned.run.measures[m.name])] : [])],
   }));
   fill($("measures"), "Measures", ["", "now", ...(pinned ? [pinned.name] : [])], rows);
+}
+
+// where the charts lie side by side: the one that the verdict names
+function reveal(sentence) {
+  const named = charts.find(({ spec }) => sentence.includes(`${spec.title.split(/, controlled| \[/)[0]} `));
+  if (!named || named === reveal.last) return;
+  reveal.last = named;
+  $("panels").scrollLeft = named.figure.offsetLeft - $("panels").offsetLeft;
 }
 
 // the verdict on a run, with its plants where they were simulated
@@ -301,17 +314,27 @@ function say(text, about = false) {
 
 const rows = new Map(); // {leaf name: {update, row}}
 
+function setLeaf(name, value) {
+  const leaf = byName.get(name), { low, high } = scaleOf(leaf);
+  const next = clamp(value, low, high);
+  if (next === leaf.value) delete state.values[name];
+  else state.values[name] = next;
+  rows.get(name)?.update();
+  changed();
+}
+
 function slider(leaf) {
   const scale = scaleOf(leaf), id = `leaf-${rows.size}`;
   const words = leaf.unit && leaf.unit !== "-" ? ` [${leaf.unit}]` : "";
-  const range = make("input", { type: "range", min: 0, max: STEPS, id, title: leaf.doc });
+  const title = `${leaf.name}: ${leaf.doc}`;
+  const range = make("input", { type: "range", min: 0, max: STEPS, id, title });
   const number = make("input", { type: "number", step: "any", min: scale.low, max: scale.high,
     "aria-label": `${leaf.name}${words}` });
-  const label = make("label", { for: id, title: leaf.doc }, leaf.name, make("span", { class: "unit" }, words));
-  const row = make("div", { class: "row" }, label, number, range);
+  const label = make("label", { for: id, title }, leaf.label, make("span", { class: "unit" }, words));
+  const row = make("div", { class: "row", "data-leaf": leaf.name }, label, number, range);
   let ticked = () => {};
   if (state.free.has(leaf.name)) {
-    const free = make("input", { type: "checkbox", "aria-label": `tune ${leaf.name}` });
+    const free = make("input", { type: "checkbox", "aria-label": `tune ${leaf.label}` });
     free.checked = true;
     ticked = () => (free.checked = state.free.has(leaf.name));
     free.addEventListener("change", () => state.free[free.checked ? "add" : "delete"](leaf.name));
@@ -320,12 +343,7 @@ function slider(leaf) {
   }
   range.style.setProperty("--default", positionOf(leaf.value, scale) / STEPS);
   let dragged = false;
-  const set = (value) => {
-    if (value === leaf.value) delete state.values[leaf.name];
-    else state.values[leaf.name] = value;
-    update();
-    changed();
-  };
+  const set = (value) => setLeaf(leaf.name, value);
   const update = () => {
     const value = valueOf(leaf.name);
     range.value = positionOf(value, scale);
@@ -353,7 +371,7 @@ function slider(leaf) {
     const value = number.value.trim() === "" ? NaN : Number(number.value);
     if (!Number.isFinite(value)) number.value = valueOf(leaf.name);
     else if (value < scale.low || value > scale.high) {
-      say(`${leaf.name} = ${shown(value)} ${leaf.unit}: from ${shown(scale.low)} to ${shown(scale.high)}`);
+      say(`${leaf.label} = ${shown(value)} ${leaf.unit}: from ${shown(scale.low)} to ${shown(scale.high)}`);
       number.value = clamp(value, scale.low, scale.high);
       set(clamp(value, scale.low, scale.high));
     }
@@ -464,32 +482,51 @@ function refresh() {
 
 // --- buttons ----------------------------------------------------------------------------------
 
-function keep(name, found) {
+function keep(name, found, words = "") {
   const old = pins.findIndex((other) => other.name === name);
   if (old >= 0) pins.splice(old, 1);
   if (pins.length === PINS) pins.shift();
-  pins.push({ name, run: found });
+  pins.push({ name, run: found, words });
+}
+
+// what sets the run apart from the case, in words
+function differences() {
+  const words = Object.entries(state.values).map(([name, value]) => `${byName.get(name).label} ${shown(value)}`);
+  words.push(...state.broken);
+  if (state.filter !== (info.filter.present ? data.filter : null)) words.push(`filter ${state.filter ? "on" : "off"}`);
+  return `${words.slice(0, 2).join(", ")}${words.length > 2 ? ` and ${words.length - 2} more` : ""}` || "the case";
 }
 
 function pin(name) {
   if (!present()) return;
-  keep(name, current);
+  keep(name, current, differences());
   makeLegend();
   show();
 }
 
 function makeLegend() {
-  const key = (kind, text) => make("span", { class: `key ${kind}` }, text);
+  const key = (kind, text, name = kind) => {
+    const button = make("button", { type: "button", class: `key ${kind}`, "aria-pressed": String(!unseen.has(name)),
+      title: "show or hide" }, text);
+    button.addEventListener("click", () => {
+      unseen[unseen.has(name) ? "delete" : "add"](name);
+      makeLegend();
+      show();
+    });
+    return button;
+  };
   const own = pins.map((one, i) => {
     const remove = make("button", { type: "button", "aria-label": `remove ${one.name}` }, "×");
     remove.addEventListener("click", () => {
       pins.splice(pins.indexOf(one), 1);
+      unseen.delete(one.name);
       makeLegend();
       show();
     });
-    return make("span", { class: `key pin${i}` }, one.name, remove);
+    const words = one.words ? `${one.name}: ${one.words}` : one.name;
+    return make("span", { class: "pinned" }, key(`pin${i}`, words, one.name), remove);
   });
-  $("legend").replaceChildren(key("run", "this run"), ...own, key("setpoint", "setpoint"),
+  $("legend").replaceChildren(make("span", { class: "key run" }, "this run"), ...own, key("setpoint", "setpoint"),
     ...(bands ? [key("band", `90 % of ${data.plants} plants${bands.words}`)] : []));
 }
 
@@ -595,7 +632,7 @@ function tuneNow(plants = null) {
       const ends = found.ends.map((name) => `; ${name} ends on its range`).join("");
       const noise = searched > 1 ? " with noise and a price on input changes" : "";
       const guard = state.filter && !filtered ? ", safety filter switched on" : "";
-      say(`Tuned${on}${noise}${guard} in ${found.iterations} iterations (${found.status})${holds}; ${errors}${ends}.${alone}`, true);
+      say(`Tuned${on}${noise}${guard} in ${found.iterations} iterations (${found.status})${holds}; ${errors}${ends}.${alone}${mission?.tuned?.(current) ?? ""}`, true);
       $("undo").hidden = false;
       $("undo").onclick = () => {
         state.values = before;
@@ -657,12 +694,33 @@ async function copy(text, what) {
   }
 }
 
-function download(name, text) {
-  const url = URL.createObjectURL(new Blob([text], { type: "text/csv" }));
+function download(name, blob) {
+  const url = URL.createObjectURL(blob);
   const link = make("a", { href: url, download: name });
   link.click();
   setTimeout(() => URL.revokeObjectURL(url), 1000);
 }
+
+// the charts as one picture, two in a row, their titles above them
+function png() {
+  const all = charts.map(({ figure, spec }) => ({ canvas: figure.querySelector("canvas"), title: spec.title }));
+  const scale = devicePixelRatio, head = 22 * scale, across = all.length > 2 ? 2 : 1;
+  const width = Math.max(...all.map(({ canvas }) => canvas.width)), height = head + Math.max(...all.map(({ canvas }) => canvas.height));
+  const whole = make("canvas", { width: across * width, height: Math.ceil(all.length / across) * height });
+  const ctx = whole.getContext("2d");
+  ctx.fillStyle = colour("--back");
+  ctx.fillRect(0, 0, whole.width, whole.height);
+  ctx.fillStyle = colour("--text");
+  ctx.font = `${12 * scale}px system-ui, sans-serif`;
+  all.forEach(({ canvas, title }, i) => {
+    const x = (i % across) * width, y = Math.floor(i / across) * height;
+    ctx.fillText(title, x + 8 * scale, y + 15 * scale);
+    ctx.drawImage(canvas, x, y + head);
+  });
+  whole.toBlob((blob) => download(`${fileName}.png`, blob), "image/png");
+}
+
+const fileName = info.case.replace(/[^\w-]+/g, "-");
 
 const csv = () => {
   const found = run(effective(), data.every);
@@ -693,6 +751,7 @@ function initial() {
 }
 
 function reset() {
+  mission = null;
   tuneNow.stop?.();
   stop();
   initial();
@@ -730,6 +789,82 @@ function moveCursor(time) {
   charts.forEach((chart) => chart.at(view.at));
 }
 
+// --- missions ---------------------------------------------------------------------------------
+
+let mission = null; // {solved(found) -> words or null}: what the run that is shown is tested for
+
+const exceeded = (found) => marginsOf(limitsNow(), found.measures).filter(({ margin }) => margin < 0);
+
+function begin(one) {
+  reset();
+  say(one.start());
+  $("runs").scrollIntoView?.({ block: "nearest" });
+}
+
+function tested(found) {
+  const words = mission?.solved(found);
+  if (!words) return;
+  mission = null;
+  say(words);
+}
+
+// one gain against all limits, a fault by its traces, and the least error within the limits
+const MISSIONS = [{
+  name: "One gain alone",
+  text: "Keep every limit with one gain",
+  possible: (found) => info.free.length && exceeded(found).length && !state.filter,
+  start() {
+    const name = entriesOf(info.free).at(-1), { label } = byName.get(name);
+    mission = {
+      solved: (found) => Object.keys(state.values).every((moved) => moved === name) && !state.broken.size && !state.filter &&
+        !exceeded(found).length && `Done: with ${label} = ${shown(valueOf(name))} every limit holds, and the error is ${
+          shown(found.measures.rms_error_total)} ${info.units.length}.`,
+    };
+    return `Mission: make every limit hold by moving ${label} alone. The verdict names the limit that is broken.`;
+  },
+}, {
+  name: "Find the fault",
+  text: "Something is broken: find out what",
+  possible: () => $("breaks").querySelectorAll("button").length > 1,
+  start() {
+    const known = data.breaks.filter((one) => byName.has(one.leaf));
+    const secret = known[Math.floor(Math.random() * known.length)].name;
+    state.broken.add(secret);
+    const faulty = run();
+    state.broken.clear();
+    if (!faulty) return "";
+    keep("the plant", faulty, "with a fault");
+    makeLegend();
+    refresh();
+    $("breaks").open = true;
+    mission = {
+      solved: () => state.broken.size === 1 && (state.broken.has(secret) ? `Done: ${secret} it is.`
+        : (say(`Not ${[...state.broken][0]}: compare the curves with those of the plant, tank by tank.`), null)),
+    };
+    return "Mission: the dashed curves are of a plant with one fault. Which button under Break something gives the same?";
+  },
+}, {
+  name: "Guess the frontier",
+  text: "How small can the error be within the limits?",
+  possible: () => info.tracks && info.free.length && info.limits.length,
+  start() {
+    let least = Infinity;
+    mission = {
+      solved: (found) => {
+        if (!exceeded(found).length) least = Math.min(least, found.measures.rms_error_total);
+        return null;
+      },
+      tuned(found) {
+        const { length } = info.units, reached = found.measures.rms_error_total;
+        const own = Number.isFinite(least) ? `${shown(least)} ${length}` : "no run within the limits";
+        return ` Your best within the limits: ${own}; the search: ${shown(reached)} ${length}${
+          exceeded(found).length ? ", past a limit" : least <= 1.02 * reached ? ". You have found the frontier" : ""}.`;
+      },
+    };
+    return "Mission: move the gains to the smallest error with every limit kept, then press Tune this plant to compare.";
+  },
+}];
+
 // --- start ------------------------------------------------------------------------------------
 
 function makeCharts() {
@@ -740,7 +875,7 @@ function makeCharts() {
     zoom(from, to);
     setTimeout(() => (drawn = false));
   };
-  const on = { cursor: atTime, zoom: once, whole: () => zoom(0, info.duration) };
+  const on = { cursor: atTime, zoom: once, whole: () => zoom(0, info.duration), handle: handleOf, drag: setLeaf };
   const { length } = info.units;
   info.tanks.forEach((tank, i) => {
     const rim = rimOf(i), output = info.outputs.indexOf(i);
@@ -774,6 +909,16 @@ function makeCharts() {
     show();
   }).observe($("panels"));
   charts.forEach((chart) => chart.size());
+}
+
+// the parameter whose line in a chart is at a time and near a value, as {name, value}; the setpoint before the rim
+function handleOf({ what, index, output }, time, near) {
+  if (what !== "h") return null;
+  const steps = info.setpoints.filter(([name, channel, from]) => channel === output && from <= time && byName.has(name));
+  const names = output >= 0 ? steps.slice(-1).map(([name]) => name) : [];
+  const rim = byName.has(`plant.rim[${index}]`) ? `plant.rim[${index}]` : "plant.rim";
+  return [...names, rim].filter((name) => byName.has(name)).map((name) => ({ name, value: inForce(name) }))
+    .find(({ value }) => near(value)) ?? null;
 }
 
 function chips(host, list, pressed, act) {
@@ -811,8 +956,9 @@ function listen() {
   $("copy-toml").addEventListener("click", () => copy(toml(), "Rig file"));
   $("csv").addEventListener("click", () => {
     const text = csv();
-    if (text) download(`${info.case.replace(/[^\w-]+/g, "-")}.csv`, text);
+    if (text) download(`${fileName}.csv`, new Blob([text], { type: "text/csv" }));
   });
+  $("png").addEventListener("click", png);
   $("link").addEventListener("click", () => {
     const link = linkOf(linked(), leaves);
     copy(location.href.split("#")[0] + link, "Link");
@@ -869,7 +1015,8 @@ function start() {
   $("plants").textContent = `${data.plants} plant${data.plants > 1 ? "s" : ""}`;
   $("plants").setAttribute("aria-pressed", String(data.band));
   if (!info.filter.present) $("filter-row").hidden = true;
-  if (data.rig) rig = makeRig($("rig"), data.rig, info);
+  const movable = (name) => byName.has(name) && { value: () => inForce(name), set: (value) => setLeaf(name, value), leaf: byName.get(name) };
+  if (data.rig) rig = makeRig($("rig"), data.rig, info, movable);
   else $("rig").parentNode.hidden = true;
   makeSliders();
   const known = data.breaks.filter((one) => byName.has(one.leaf));
@@ -889,6 +1036,9 @@ function start() {
   makeLegend();
   listen();
   open();
+  const first = run(), offered = first ? MISSIONS.filter(({ possible }) => possible(first)) : [];
+  chips($("missions").querySelector(".chips"), offered, false, begin);
+  $("missions").hidden = !offered.length;
 }
 
 window.jaxtank = {

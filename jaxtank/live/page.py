@@ -37,7 +37,7 @@ from jaxtank.plots.layout import jets, overflows, pipes, place, valves
 
 HERE = Path(__file__).parent
 SCRIPTS = ("charts", "rig", "runner", "page")
-LARGEST = 112_000
+LARGEST = 117_000
 """Characters of a page above which the safety filter that a case has not is left out."""
 
 DIGITS = str.maketrans("&<>`", ",.:[")
@@ -273,7 +273,7 @@ def drawing(plant):
         "suctions": [[pump, tank, _path(path)] for pump, tank, path in where.suctions],
         "valves": [[tank, _path(path), _rounded(at)] for tank, path, at in valves(plant, where)],
         "shapes": [shape_name(plant, i) for i in range(plant.tanks)],
-        "jets": [[tank, _path(path)] for tank, path in jets(plant, where)],
+        "jets": [[tank, _path(path), name] for tank, path, name in jets(plant, where)],
         "overflows": [[tank, _path(path)] for tank, path in overflows(plant, where)],
         **{end: round(float(getattr(where, end)), 4) for end in ("left", "right", "bottom", "top")},
     }

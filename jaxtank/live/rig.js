@@ -13,8 +13,9 @@ function draw(tag, attributes, text) {
 // a name as long as a tank is wide
 const shortened = (name) => (name.length > 12 ? `${name.slice(0, 11)}…` : name);
 
-// rig: data of jaxtank/live/page.py; returns {update({h, r, u, spills})}
-function makeRig(svg, rig, info) {
+// rig: data of jaxtank/live/page.py; movable(name) -> {leaf, value(), set(value)} or false; returns
+// {update({h, r, u, spills})}
+function makeRig(svg, rig, info, movable) {
   const { left, right, bottom, top } = rig;
   const X = (x) => (x - left) * UNIT, Y = (y) => (top - y) * UNIT;
   const points = (path) => path.map(([x, y]) => `${X(x).toFixed(1)},${Y(y).toFixed(1)}`).join(" ");
@@ -67,6 +68,32 @@ function makeRig(svg, rig, info) {
       class: `rotor pump${j % 4}` });
     add("text", { x: X(x), y: Y(y) - 22, "text-anchor": "middle", class: "halo small" }, `${j + 1}`);
   });
+  // a rim or an outlet follows a pointer: moved(start value, pixels of the drawing upwards) is its next value
+  function handle(node, name, moved) {
+    const one = movable(name);
+    if (!one) return;
+    let from = null;
+    const height = () => (svg.getScreenCTM()?.d ?? 1);
+    node.classList.add("handle");
+    node.append(draw("title", {}, `${one.leaf.label}: drag up or down`));
+    node.addEventListener("pointerdown", (event) => {
+      from = { y: event.clientY, value: one.value() };
+      node.setPointerCapture(event.pointerId);
+      event.preventDefault();
+    });
+    node.addEventListener("pointermove", (event) => {
+      if (from) one.set(Number(moved(from.value, (from.y - event.clientY) / height()).toPrecision(3)));
+    });
+    for (const end of ["pointerup", "pointercancel"]) node.addEventListener(end, () => (from = null));
+  }
+  const opened = (value, up) => value * Math.exp(up / 40);
+  tanks.forEach((tank, i) => {
+    const grip = add("rect", { class: "grip", x: X(tank.x) - 6, width: tank.width * UNIT + 12, height: 12 });
+    tank.grip = grip;
+    const name = movable(`plant.rim[${i}]`) ? `plant.rim[${i}]` : "plant.rim";
+    handle(grip, name, (value, up) => value + up / UNIT / tank.scale);
+  });
+  rig.jets.forEach(([, path, name]) => handle(add("polyline", { points: points(path), class: "grip", fill: "none" }), name, opened));
   return {
     update(now) {
       tanks.forEach((tank, i) => {
@@ -78,6 +105,7 @@ function makeRig(svg, rig, info) {
           tank.wall.setAttribute("points", points([[x, y + tank.height], [x, y], [x + width, y], [x + width, y + tank.height]]));
           tank.inside.setAttribute("y", Y(y + tank.height));
           tank.inside.setAttribute("height", tank.height * UNIT);
+          tank.grip.setAttribute("y", Y(y + tank.height) - 6);
         }
         const deep = clamp((Number.isFinite(level) ? level : 0) * tank.scale, 0, 1.05 * tank.height);
         tank.water.setAttribute("y", Y(tank.y + deep));

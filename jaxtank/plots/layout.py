@@ -71,25 +71,25 @@ def place(plant):
 
 
 def jets(plant, where):
-    """Return [(tank, path ((x, y), ...))] of the free jets from the bottoms of the tanks: into the
-    tanks below, and into the basin. A closed orifice (area 0) has none.
+    """Return [(tank, path ((x, y), ...), name of the outlet's area)] of the free jets from the
+    bottoms of the tanks: into the tanks below, and into the basin. A closed orifice has none.
     """
     paths, orifices = [], np.asarray(plant.orifice, dtype=float)
     for i, box in enumerate(where.boxes):
         links = [(sink, k) for k, (source, sink) in enumerate(plant.links) if source == i]
-        sinks = [where.boxes[sink] for sink, k in links if orifices[k] > 0]
-        sinks.sort(key=lambda below: below.middle)
-        for k, below in enumerate(sinks):
+        sinks = [(where.boxes[sink], k) for sink, k in links if orifices[k] > 0]
+        sinks.sort(key=lambda one: one[0].middle)
+        for k, (below, orifice) in enumerate(sinks):
             x = box.x + box.width * (k + 1) / (len(sinks) + 1)
             end = min(max(x, below.x + 0.35 * below.width), below.x + 0.65 * below.width)
             path = ((x, box.y - 0.06), (x, box.y - 0.12), (end, below.y + 0.97 * below.height))
-            paths.append((i, path))
+            paths.append((i, path, f"plant.orifice[{orifice}]"))
         if float(np.asarray(plant.drain)[i]) > 0:
             side = box.x + box.width
             path = ((box.middle, box.y - 0.06), (box.middle, -0.93))
             if sinks:  # past the tanks below
                 path = ((side, box.y + 0.05), (side + 0.16, box.y + 0.05), (side + 0.16, -0.93))
-            paths.append((i, path))
+            paths.append((i, path, f"plant.drain[{i}]"))
     return paths
 
 

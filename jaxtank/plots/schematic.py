@@ -195,7 +195,7 @@ def _shares(ax, plant, where):
 
 def _jets(ax, plant, where):
     """Free jets from the bottom of each tank: into the tanks below it, and into the basin."""
-    for tank, path in jets(plant, where):
+    for tank, path, _ in jets(plant, where):
         ax.plot(*np.array(path).T, **JET)
         (x, start), y = path[0], where.boxes[tank].y
         if start < y:  # from an orifice in the bottom
