@@ -140,7 +140,7 @@ def test_a_number_out_of_range_is_refused_in_words(browser, written):
         assert box.get_attribute("aria-invalid") == "true"
         assert live("jaxtank.state().values") == {}
         box.press("Tab")
-        assert "controller.Kc[0] = 1" in live.text("#message") and "to 5" in live.text("#message")
+        assert "Kc of tank 2 = 1" in live.text("#message") and "to 5" in live.text("#message")
 
 
 @pytest.mark.slow
