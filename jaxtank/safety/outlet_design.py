@@ -103,14 +103,18 @@ def outlet_design(
         finished = _finished(base, ranges, hold, shaped)
         verdicts = check_of(finished)
         proved = np.array([[v.holds for v in verdicts], [v.low_holds for v in verdicts]])
-        reasons = [v.reason for v in verdicts]
-        whole = len(set(reasons)) == 1 and reasons[0].startswith("not covered: ")
+        reasons = {v.reason for v in verdicts}
+        whole = len(reasons) == 1 and reasons.pop().startswith("not covered: ")
         if whole or np.all(proved | ~relied):
             break
-        for v in verdicts:
-            lost |= {(v.tank, up): why for up, why in _failures(v) if (v.tank, up) not in lost}
+        lost = _reasons(verdicts) | lost
         relied &= proved
     return finished, tuple(_certificate(finished, v, hold, lost) for v in verdicts)
+
+
+def _reasons(verdicts):
+    """{(tank, upper): why} of the limits that do not hold."""
+    return {(v.tank, up): why for v in verdicts for up, why in _failures(v)}
 
 
 def _failures(verdict):
