@@ -169,7 +169,7 @@ def net_flows(rig, x, u):
     return rates
 
 
-@functools.partial(jax.jit, static_argnames="steps")
+@jax.jit
 def run(plant, x, u, duration, steps):
     """Levels (n,) [m] after a time."""
     step = duration / steps
@@ -210,7 +210,7 @@ def errors(seed, steps=1000):
     """Return the worst error of a level as a share of the tank's height."""
     rig, start, u = random_rig(seed)
     duration, right = exact(seed)
-    levels = np.array(run(network(**rig), start, u, duration, steps))
+    levels = np.array(run(network(**rig), start, np.asarray(u), float(duration), steps))
     return float(np.max(np.abs(levels - right) / rig["extent"]))
 
 
@@ -225,7 +225,7 @@ def lost(seed, steps=200):
     rng = np.random.default_rng([seed, 7])
     start = start * rng.choice([1.0, 0.1, 1e-3], len(start))
     plant = network(**rig)
-    after = run(plant, start, u, 10.0 * DURATION, steps)
+    after = run(plant, start, u, float(10.0 * DURATION), steps)
     before, now = (sum(float(v) for v in plant.stored(x)) for x in (tuple(start), after))
     return abs(now - before) / before
 

@@ -229,11 +229,13 @@ def test_empty_tanks_at_their_setpoint_are_a_kink_of_the_travel(way):
     """
     case = presets.find("gouta2022/enmpc")
     clock = Clock(dt=0.05, duration=0.2)
-    f = lambda x0: evaluate_and_flag(
-        dataclasses.replace(case.loop, x0=x0), clock, ("input_travel",)
-    )[0]["input_travel"]
+    f = jax.jit(
+        lambda x0: evaluate_and_flag(
+            dataclasses.replace(case.loop, x0=x0), clock, ("input_travel",)
+        )[0]["input_travel"]
+    )
     at_rest = jnp.zeros(2)
-    found = np.asarray(way(f)(at_rest))
+    found = np.asarray(jax.jit(way(f))(at_rest))
     for i, axis in enumerate(np.eye(2)):
         left, right = one_sided(lambda h, axis=axis: f(at_rest + h * axis), 0.0)
         assert left[0] < -5.0 and right[0] == 0.0

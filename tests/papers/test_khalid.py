@@ -81,7 +81,8 @@ def test_linear_model_is_the_printed_one_with_its_signs_mended(pumps):
         (khalid.U0 / area * np.eye(2))[:, :pumps],
     )
     held = expm(block * DT)
-    A, B, C = incremental_model(khalid.tanks(pumps), jnp.array(khalid.MIDDLE[pumps]), DT)
+    model = jax.jit(lambda level: incremental_model(khalid.tanks(pumps), level, DT))
+    A, B, C = model(jnp.array(khalid.MIDDLE[pumps]))
     np.testing.assert_allclose(A[:2, :2], held[:2, :2], rtol=1e-12)
     np.testing.assert_allclose(B[:2], held[:2, 2:], rtol=1e-12)
     Cm = np.eye(2)[[1] if pumps == 1 else [0, 1]]
@@ -93,9 +94,8 @@ def test_linear_model_is_the_printed_one_with_its_signs_mended(pumps):
 
 def test_incremental_model_predicts_the_plain_one():
     rng = np.random.default_rng(0)
-    A, B, C = (
-        np.asarray(m) for m in incremental_model(khalid.tanks(2), jnp.array(khalid.MIDDLE[2]), DT)
-    )
+    model = jax.jit(lambda level: incremental_model(khalid.tanks(2), level, DT))
+    A, B, C = (np.asarray(m) for m in model(jnp.array(khalid.MIDDLE[2])))
     Am, Bm = A[:2, :2], B[:2]
     now, u = rng.normal(size=2), rng.normal(size=2)
     after = Am @ now + Bm @ u
@@ -138,16 +138,16 @@ def test_laguerre_functions_are_impulse_responses(a):
 @pytest.mark.parametrize("pole", [0.0, 0.4])
 def test_slopes_of_laguerre_functions_by_their_pole(pole):
     """At a = 0 too, where a power would have none: the one-sided limit is the polynomial's."""
-    f = lambda a: laguerre_functions(a, 4, 12)
-    slope, step = jax.jacfwd(f)(jnp.float64(pole)), 1e-6
+    f = jax.jit(lambda a: laguerre_functions(a, 4, 12))
+    slope, step = jax.jit(jax.jacfwd(f))(jnp.float64(pole)), 1e-6
     np.testing.assert_allclose(
         slope, (f(jnp.float64(pole + step)) - f(jnp.float64(pole - step))) / (2 * step), atol=1e-8
     )
-    np.testing.assert_allclose(jax.jacrev(f)(jnp.float64(pole)), slope, atol=1e-13)
+    np.testing.assert_allclose(jax.jit(jax.jacrev(f))(jnp.float64(pole)), slope, atol=1e-13)
 
 
 def test_cost_of_the_laguerre_controller():
-    Omega, Psi, _ = control("laguerre").design(DT)
+    Omega, Psi, _ = jax.jit(lambda law: law.design(DT))(control("laguerre"))
     np.testing.assert_allclose(
         np.diag(Omega), [0.28060482, 0.23929632, 0.2014798, 0.16722567], atol=5e-9
     )

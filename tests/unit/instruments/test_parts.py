@@ -1,5 +1,7 @@
 """Signals, sensors, pumps and measures, each alone."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +20,11 @@ from jaxtank.signals.setpoints import ramps
 # signals
 
 
+@functools.partial(jax.jit, static_argnums=1)
+def sampled(reference, clock):
+    return reference.sample(clock)
+
+
 @pytest.mark.slow_for("0.01-linear", "0.01-quintic")
 @pytest.mark.parametrize("shape", ["linear", "quintic"])
 @pytest.mark.parametrize("dt", [0.01, 0.7])
@@ -25,7 +32,7 @@ def test_a_ramp_against_its_definition(shape, dt):
     clock = Clock(dt=dt, duration=200.0)
     r, dr, ddr = (
         np.asarray(v[0])
-        for v in ramps([3.0], [(20.0, 0, 8.0), (90.0, 0, 5.0)], 60.0, shape).sample(clock)
+        for v in sampled(ramps([3.0], [(20.0, 0, 8.0), (90.0, 0, 5.0)], 60.0, shape), clock)
     )
     t = np.arange(clock.samples) * dt
     x1, x2 = np.clip((t - 20) / 60, 0, 1), np.clip((t - 90) / 60, 0, 1)
@@ -48,7 +55,7 @@ def test_a_ramp_against_its_definition(shape, dt):
 def test_an_s_curve_integrates_its_own_rates():
     clock = Clock(dt=0.01, duration=100.0)
     r, dr, ddr = (
-        np.asarray(v[0]) for v in ramps([3.0], [(20.0, 0, 8.0)], 60.0, "quintic").sample(clock)
+        np.asarray(v[0]) for v in sampled(ramps([3.0], [(20.0, 0, 8.0)], 60.0, "quintic"), clock)
     )
     np.testing.assert_allclose(np.gradient(r, 0.01)[1:-1], dr[1:-1], atol=1e-6)
     # at its ends the third derivative jumps
@@ -79,8 +86,8 @@ def test_plateaus_and_windows():
 def test_gradient_of_a_reference_by_its_targets():
     clock = Clock(dt=1.0, duration=100.0)
     reference = ramps([3.0], [(20.0, 0, 8.0)], 60.0)
-    slope = jax.jacfwd(
-        lambda v: jaxtank.with_values(reference, {"targets[0]": v}).sample(clock)[0][0]
+    slope = jax.jit(
+        jax.jacfwd(lambda v: jaxtank.with_values(reference, {"targets[0]": v}).sample(clock)[0][0])
     )(8.0)
     np.testing.assert_allclose(slope, np.clip((np.arange(101) - 20) / 60, 0, 1), atol=1e-12)
 

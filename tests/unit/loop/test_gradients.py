@@ -124,6 +124,7 @@ def test_at_every_kink_of_the_physics(gouta, kink):
     agree(case, free, measure or "rms_error_total", atol=ATOL.get(measure, 1e-9), step=step)
 
 
+@pytest.mark.slow
 def test_equal_levels(gouta):
     """All tanks at the same level throughout the first plateau: no difference of levels has a kink
     there.

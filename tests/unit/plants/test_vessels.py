@@ -31,14 +31,15 @@ def test_volume_is_the_geometry_and_level_its_inverse(shape):
     area, extent = SIZES[shape]
     inside = np.linspace(0.01, 0.99, 40) * extent
     volumes = [random_elements.volume(shape, area, extent, h) for h in inside]
-    volume = lambda h: volume_of(shape, area, extent, h)
-    np.testing.assert_allclose(jax.vmap(volume)(inside), volumes, rtol=1e-13)
+    volume = jax.jit(lambda h: volume_of(shape, area, extent, h))
+    np.testing.assert_allclose(volume(inside), volumes, rtol=1e-13)
     levels = np.concatenate([[-0.1, 0.0, 1e-9, 1e-6], inside, [extent, 1.2 * extent]])
-    back = jax.vmap(lambda v: level_of(shape, area, extent, v))(jax.vmap(volume)(levels))
+    back = jax.jit(jax.vmap(lambda v: level_of(shape, area, extent, v)))(volume(levels))
     np.testing.assert_allclose(back, levels, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(jax.vmap(volume)(back), jax.vmap(volume)(levels), atol=1e-14)
+    np.testing.assert_allclose(volume(back), volume(levels), atol=1e-14)
     low, high = 0.05 * extent, 0.2 * extent  # at the tip itself the cross-section has a lower bound
-    exact = quad(lambda h: float(area_of(shape, area, extent, h)), low, high)[0]
+    section = jax.jit(lambda h: area_of(shape, area, extent, h))
+    exact = quad(lambda h: float(section(h)), low, high)[0]
     assert float(volume(high) - volume(low)) == pytest.approx(exact, rel=1e-9)
 
 
@@ -48,19 +49,21 @@ def test_slopes_by_size_and_level_are_differences(shape, function):
     at = np.array([*SIZES[shape], 0.3 * SIZES[shape][1]])
     if function is level_of:
         at[2] = volume_of(shape, *at)
-    value = lambda v: function(shape, v[0], v[1], v[2])
+    value = jax.jit(lambda v: function(shape, v[0], v[1], v[2]))
     steps = 1e-6 * np.eye(3)
     differences = [(value(at + step) - value(at - step)) / 2e-6 for step in steps]
-    np.testing.assert_allclose(jax.grad(value)(jnp.array(at)), differences, rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(
+        jax.jit(jax.grad(value))(jnp.array(at)), differences, rtol=1e-7, atol=1e-8
+    )
 
 
 def test_a_curve_is_scipys_monotone_cubic_inside_and_straight_beyond():
     points = ((0.0, 0.0), (20.0, 1.0), (50.0, 7.0), (80.0, 8.0), (100.0, 8.5))
     middle = np.linspace(20.0, 80.0, 61)
-    curve = jax.vmap(lambda u: monotone_curve(points, u))
+    curve = jax.jit(jax.vmap(lambda u: monotone_curve(points, u)))
     np.testing.assert_allclose(curve(middle), PchipInterpolator(*zip(*points))(middle), rtol=1e-13)
     np.testing.assert_allclose(curve(np.array([-10.0, 110.0])), [-0.5, 8.75])
-    slope = jax.vmap(jax.grad(lambda u: monotone_curve(points, u)))
+    slope = jax.jit(jax.vmap(jax.grad(lambda u: monotone_curve(points, u))))
     knots = np.array([x for x, _ in points])
     np.testing.assert_allclose(slope(knots - 1e-7), slope(knots + 1e-7), rtol=1e-5)
     assert np.all(np.diff(curve(np.linspace(-5.0, 105.0, 400))) > 0)

@@ -56,18 +56,20 @@ def means(times, flows, between, edges):
 
 
 @pytest.mark.parametrize("between", ["hold", "linear"])
-@pytest.mark.parametrize("count", [1, 2, 7, 400])
+@pytest.mark.parametrize("count", [1, 7, 400])
 def test_the_volume_of_a_measured_inflow_arrives_whatever_the_sampling_period(between, count):
     rng = np.random.default_rng(count)
     times = np.sort(rng.uniform(0.3, 59.0, count))
     times[: count // 2] = np.round(times[: count // 2])  # some on a sample
     times, flows = np.unique(times), rng.normal(size=len(np.unique(times)))
     table, clock = inflow_table(2, [(1, times, flows)], between), Clock(dt=0.5, duration=60.0)
-    none, flow = (np.asarray(v) for v in table.sample(clock)[0])
+    whole = jax.jit(lambda table: table.sample(clock)[0])
+    none, flow = (np.asarray(v) for v in whole(table))
     edges = np.arange(clock.samples + 1) * clock.dt
     np.testing.assert_allclose(flow, means(times, flows, between, edges), atol=1e-12)
     assert not none.any()
-    part = table.sample(Chunk(first=jnp.int32(40), samples=30, dt=0.5))[0][1]
+    some = jax.jit(lambda table, first: table.sample(Chunk(first, samples=30, dt=0.5))[0][1])
+    part = some(table, jnp.int32(40))
     np.testing.assert_allclose(np.asarray(part), flow[40:70], atol=1e-14)
 
 
@@ -75,14 +77,13 @@ def test_the_slope_by_a_row_is_its_share_of_each_sample():
     times, flows = np.array([0.0, 1.25, 1.5, 3.0]), np.array([1.0, 2.0, -1.0, 4.0])
     clock = Clock(dt=1.0, duration=4.0)
 
+    table = inflow_table(1, [(0, times, flows)], "linear")
+
+    @jax.jit
     def sampled(flow):
-        return inflow_like(flow).sample(clock)[0][0]
+        return jaxtank.with_values(table, {"flow": flow}).sample(clock)[0][0]
 
-    def inflow_like(flow):
-        table = inflow_table(1, [(0, times, flows)], "linear")
-        return jaxtank.with_values(table, {"flow": flow})
-
-    slope = jax.jacfwd(sampled)(jnp.asarray(flows))
+    slope = jax.jit(jax.jacfwd(sampled))(jnp.asarray(flows))
     step = np.eye(4)
     right = np.stack([sampled(flows + e) - sampled(flows - e) for e in step], axis=1) / 2.0
     np.testing.assert_allclose(slope, right, atol=1e-13)
