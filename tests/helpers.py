@@ -6,6 +6,7 @@ import collections
 import contextlib
 import ctypes
 import dataclasses
+import functools
 import io
 import json
 import logging
@@ -87,6 +88,20 @@ def estimates_along(observer, x0, ys, us, dt):
         return state, Estimate(*rows)
 
     return jax.lax.scan(body, observer.init(tuple(x0)), (ys, us))[1]
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def sampled(reference, clock):
+    """What `reference.sample(clock)` gives, as one program: part by part it takes ten times as long
+    to compile.
+    """
+    return reference.sample(clock)
+
+
+def signals_of(case):
+    """Setpoints of a case and their first and second rates, (samples, outputs) each."""
+    parts = sampled(case.loop.reference, case.clock)
+    return [np.stack([np.asarray(v) for v in part], axis=1) for part in parts]
 
 
 def in_metres(plant):

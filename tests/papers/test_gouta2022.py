@@ -6,7 +6,7 @@ import functools
 import jax
 import numpy as np
 import pytest
-from helpers import in_metres
+from helpers import in_metres, sampled
 
 import jaxtank
 from jaxtank import rig
@@ -185,8 +185,8 @@ def test_steady_voltages():
 
 
 def test_the_reference_is_that_of_the_text():
-    sample = jax.jit(lambda reference: reference.sample(Clock(dt=0.01, duration=900.0)))
-    r, dr, _ = (np.array(v) for v in sample(loops.benchmark()))
+    clock = Clock(dt=0.01, duration=900.0)
+    r, dr, _ = (np.array(v) for v in sampled(loops.benchmark(), clock))
     assert r[0].max() == pytest.approx(14.0) and r[0][100 * 60 :].min() == pytest.approx(8.0)
     np.testing.assert_allclose((r[0][50000], r[0][70000]), (10.0729, 13.4271), atol=1e-4)
     np.testing.assert_allclose(np.abs(dr[0]).max(), 0.0754, atol=1e-4)
@@ -198,7 +198,8 @@ def test_an_inflow_pulse_arrives_whole_and_lifts_the_tank_by_what_the_paper_repo
     r = run("chadpc")
     assert 2.0 < r.d_hat[(r.t > 499) & (r.t < 530), 1].max() < 2.04  # "about 2 cm/s"
     for dt in (0.01, 0.1, 0.7):
-        flow = np.array(CASES["chadpc"].loop.disturbance.sample(Clock(dt=dt, duration=900.0))[0])
+        clock = Clock(dt=dt, duration=900.0)
+        flow = np.array(sampled(CASES["chadpc"].loop.disturbance, clock)[0])
         np.testing.assert_allclose(flow.sum(axis=1) * dt, 500.0, rtol=1e-9)
 
 

@@ -85,6 +85,7 @@ def test_the_option_off_gives_the_same_noisy_runs_batches_and_slopes(plain):
         )
 
 
+@pytest.mark.slow
 def test_a_batch_member_is_the_run_alone(plain):
     for name in ("rms_error_total", "input_travel", "max_level"):
         alone, batch = plain[f"one {name}"], plain[f"lanes {name}"]

@@ -5,6 +5,7 @@ import shutil
 import jax
 import numpy as np
 import pytest
+from helpers import signals_of
 from scipy.optimize import minimize
 
 import jaxtank
@@ -202,8 +203,7 @@ def test_code_gives_the_inputs_of_the_loop(case, lang, tool, tmp_path):
     bound = rig.set_values(case, limits | {"actuator.initial": [rest]})
     run = jaxtank.simulate(bound)
     signals = {"y": run.y, "u": run.u}
-    for name, parts in zip(("r", "dr", "ddr"), bound.loop.reference.sample(bound.clock)):
-        signals[name] = np.stack([np.asarray(v) for v in parts], axis=1)
+    signals |= zip(("r", "dr", "ddr"), signals_of(bound))
     names = [f"{name}{i + 1}" for name, v in signals.items() for i in range(v.shape[1])]
     table = np.column_stack([run.t, *signals.values()])
     log = tmp_path / "log.csv"

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import FLAGS, GCC, SERIES, Compiled, needs_gcc
+from helpers import FLAGS, GCC, SERIES, Compiled, needs_gcc, signals_of
 
 import jaxtank
 from jaxtank import presets, rig
@@ -68,11 +68,7 @@ def replayed(name, noise=1e-4, values=(), filtered=False):
     }
     case = rig.filtered(rig.set_values(case, values), filtered or None)
     run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock, jax.random.key(1)))
-    signals = [
-        np.stack([np.asarray(v) for v in part], axis=1)
-        for part in case.loop.reference.sample(case.clock)
-    ]
-    return case, run, signals
+    return case, run, signals_of(case)
 
 
 @pytest.mark.slow_for(
@@ -83,6 +79,7 @@ def replayed(name, noise=1e-4, values=(), filtered=False):
     "calofir/backstepping",
     "mirakhorli/hybrid",
     "gouta2022/chadpc",
+    "cascaded/pi",
 )
 @needs_gcc
 @pytest.mark.parametrize("name", EVERY)
@@ -135,11 +132,7 @@ def test_a_programme_of_many_variables_gives_the_inputs_of_the_loop(tmp_path, mo
     case = presets.find("khalid/laguerre-constrained")
     case = rig.set_values(case, {"clock.duration": 300 * case.clock.dt, "controller.rows": 3})
     run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock))
-    signals = [
-        np.stack([np.asarray(v) for v in part], axis=1)
-        for part in case.loop.reference.sample(case.clock)
-    ]
-    reported = Compiled(case, tmp_path).run(case, run, signals)
+    reported = Compiled(case, tmp_path).run(case, run, signals_of(case))
     assert np.ptp(run.applied) > 0.1 * np.abs(run.applied).max()
     np.testing.assert_allclose(
         reported, run.applied, atol=1e-9 * float(np.abs(run.applied).max()), rtol=0
@@ -720,11 +713,7 @@ OVERRIDE = {"kind": "override", "Kc": 2.0, "Ti": 40.0, "limited": [1], "limit": 
 def test_exported_loops_of_rig_files_are_those_of_the_simulation(tmp_path, table):
     case = rig.loads(f"{SERIES}controller = {rig.toml(table)}").replace(name="law")
     run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock))
-    signals = [
-        np.stack([np.asarray(v) for v in part], axis=1)
-        for part in case.loop.reference.sample(case.clock)
-    ]
-    inputs = Compiled(case, tmp_path).run(case, run, signals)
+    inputs = Compiled(case, tmp_path).run(case, run, signals_of(case))
     np.testing.assert_allclose(inputs, run.applied, rtol=0, atol=1e-12)
     assert inputs.max() == 1.0 and inputs.min() == 0.0
 

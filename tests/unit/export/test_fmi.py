@@ -6,6 +6,7 @@ import shutil
 import jax
 import numpy as np
 import pytest
+from helpers import signals_of
 
 import jaxtank
 from jaxtank import presets, rig
@@ -68,7 +69,7 @@ def looped(case, run, controller, plant):
     """Inputs and levels of both FMUs in a loop."""
     dt, u, h = case.clock.dt, [], []
     plant.fmu.exitInitializationMode()
-    signals = [np.stack(list(s), axis=1) for s in case.loop.reference.sample(case.clock)]
+    signals = signals_of(case)
     controller.set("y", plant.get("y"))
     controller.fmu.exitInitializationMode()
     for k in range(len(run.t)):

@@ -5,7 +5,7 @@ import functools
 import jax
 import numpy as np
 import pytest
-from helpers import SERIES, Compiled, needs_gcc
+from helpers import SERIES, Compiled, needs_gcc, signals_of
 
 import jaxtank
 from jaxtank import presets, rig
@@ -21,12 +21,6 @@ def shortened(name):
     values = {"clock.duration": (SAMPLES - 1) * case.clock.dt, "sensor.noise": 0.0}
     levels = 0.98 * np.asarray(case.loop.x0) + 0.01  # away from the first setpoint
     return rig.set_values(case, {**values, "actuator.delay": 0.0, "x0": levels.tolist()})
-
-
-def signals_of(case):
-    """Setpoints with their rates (samples, outputs)."""
-    sampled = case.loop.reference.sample(case.clock)
-    return [np.stack([np.asarray(v) for v in part], axis=1) for part in sampled]
 
 
 @pytest.mark.slow_for("cascaded/pi")

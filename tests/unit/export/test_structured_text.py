@@ -7,6 +7,7 @@ import re
 import jax
 import numpy as np
 import pytest
+from helpers import signals_of
 
 import jaxtank
 from jaxtank import presets, rig
@@ -111,8 +112,7 @@ def block_and_run(name):
     values = {"clock.duration": (SAMPLES - 1) * case.clock.dt, "sensor.noise": 0.0}
     case = rig.set_values(case, {**values, "actuator.delay": 0.0})
     run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock))
-    sampled = case.loop.reference.sample(case.clock)
-    return export(case, "st", name="law"), run, [np.stack(list(s), axis=1) for s in sampled]
+    return export(case, "st", name="law"), run, signals_of(case)
 
 
 NAMES = [

@@ -1,11 +1,10 @@
 """Signals, sensors, pumps and measures, each alone."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import sampled
 from scipy.integrate import solve_ivp
 
 import jaxtank
@@ -18,11 +17,6 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.signals.setpoints import ramps
 
 # signals
-
-
-@functools.partial(jax.jit, static_argnums=1)
-def sampled(reference, clock):
-    return reference.sample(clock)
 
 
 @pytest.mark.slow_for("0.01-linear", "0.01-quintic")
@@ -64,10 +58,10 @@ def test_an_s_curve_integrates_its_own_rates():
 
 def test_steps_and_overlapping_ramps():
     clock = Clock(dt=0.1, duration=30.0)
-    r, dr, _ = (np.asarray(v[0]) for v in ramps([1.0], [(10.0, 0, 4.0)], 0.0).sample(clock))
+    r, dr, _ = (np.asarray(v[0]) for v in sampled(ramps([1.0], [(10.0, 0, 4.0)], 0.0), clock))
     assert r[99] == 1.0 and r[100] == 4.0 and not dr.any()
     # the second change starts from where the first has got to, half way
-    r = np.asarray(ramps([0.0], [(0.0, 0, 10.0), (10.0, 0, 0.0)], 20.0).sample(clock)[0][0])
+    r = np.asarray(sampled(ramps([0.0], [(0.0, 0, 10.0), (10.0, 0, 0.0)], 20.0), clock)[0][0])
     np.testing.assert_allclose(r[[50, 100, 150, 200, 300]], (2.5, 5.0, 3.75, 2.5, 0.0), atol=1e-12)
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from helpers import Compiled, estimates_along, needs_gcc
+from helpers import Compiled, estimates_along, needs_gcc, signals_of
 from scipy.optimize import least_squares, lsq_linear
 
 import jaxtank
@@ -225,6 +225,5 @@ def test_a_page_refuses_it_and_code_in_c_gives_the_inputs_of_the_loop(tmp_path):
     with pytest.raises(InputError, match="observer moving-horizon solves quadratic programmes"):
         case.explore()
     run = jaxtank.simulate(case)
-    signals = [np.stack(part, axis=1) for part in case.loop.reference.sample(case.clock)]
-    inputs = Compiled(case, tmp_path).run(case, run, signals)
+    inputs = Compiled(case, tmp_path).run(case, run, signals_of(case))
     np.testing.assert_allclose(inputs, run.applied, rtol=0, atol=1e-9 * 9.0)
