@@ -85,14 +85,6 @@ def test_the_option_off_gives_the_same_noisy_runs_batches_and_slopes(plain):
         )
 
 
-@pytest.mark.slow
-def test_a_batch_member_is_the_run_alone(plain):
-    for name in ("rms_error_total", "input_travel", "max_level"):
-        alone, batch = plain[f"one {name}"], plain[f"lanes {name}"]
-        np.testing.assert_allclose(batch.reshape(3, -1)[1], alone, rtol=1e-12, err_msg=name)
-        assert np.all(np.ptp(batch.reshape(3, -1), axis=0) > 0)
-
-
 FLOAT32 = """
 import jaxtank, tuning
 from jaxtank import presets

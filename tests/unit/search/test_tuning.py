@@ -232,27 +232,6 @@ def test_a_limit_of_no_overflow_can_be_met_and_is_held_by_the_answer(gouta):
     assert {c["measure"] for c in numeric.constraints} == {"overflow_volume"}
 
 
-@pytest.mark.slow
-def test_first_order_methods_that_stop_early_do_not_claim_to_have_converged(gouta):
-    result = quick(gouta, "ngpc", method="adam", limits={}, iterations=2, starts=1)
-    assert result.status == "not_converged" and not result.success
-
-
-@pytest.mark.slow
-def test_an_interrupt_gives_the_best_point_so_far(gouta):
-    seen = []
-
-    def stop(event):
-        seen.append(event)
-        if len(seen) == 6:
-            raise KeyboardInterrupt
-
-    result = quick(gouta, "ngpc", limits={}, progress=stop)
-    assert result.status == "interrupted" and not result.success
-    assert result.objective["after"] == pytest.approx(min(h[1] for h in result.history), rel=1e-9)
-    assert len(result.history) == 6
-
-
 @pytest.mark.parametrize(
     "options, words",
     [
