@@ -234,7 +234,7 @@ def physics(plant):
             " it holds."
         )
     sentences.append(
-        f"Flow turns laminar (linear in the level) below {plant.knee:g} {length}, of a level or of"
-        " a difference of levels."
+        f"Below {plant.knee:g} {length}, of a level or of a difference of levels, a parabola replaces"
+        " the root in the flow: its slope at 0 is finite."
     )
     return sentences
