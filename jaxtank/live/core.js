@@ -252,6 +252,9 @@ function marginsOf(limits, measures) {
 // The verdict on a run: the rules and words of tuning/report/verdict.py, which judges for commands.
 
 const OFF = 0.05; // share of a tank's height by which a level may miss its setpoint
+const SHARE = 0.5, SMALL = 0.005; // of the largest step that it may miss, where steps are above SMALL of the height
+const SATURATED = 0.5; // share of the samples at a pump limit
+const EMPTY = 1e-4; // share of a height below which a pump that draws from the tank runs dry
 const EXACT = 1e-4; // share below which a miss is not worth a number
 
 // {good, words} of the measures of a run, null for a loop without feedback
@@ -262,23 +265,31 @@ function trackingOf(info, inForce, measures) {
   const rms = list("rms_error"), steady = list("steady_state_error"), highest = list("max_level");
   if (!rms.every(Number.isFinite)) return { good: false, words: "the run diverged: a level is not a finite number" };
   const missed = steady.map((error, o) => (Number.isNaN(error) ? rms[o] : error));
-  const share = (error, o) => {
-    const rim = rimIn(info, inForce, outputs[o]), height = Number.isFinite(rim) ? rim : Math.abs(highest[outputs[o]]);
-    return error / (height > 0 ? height : 1);
-  };
-  const shares = missed.map(share);
-  const worst = shares.indexOf(Math.max(...shares)), tank = info.tanks[outputs[worst]].name;
+  const heights = outputs.map((tank) => {
+    const rim = rimIn(info, inForce, tank), height = Number.isFinite(rim) ? rim : Math.abs(highest[tank]);
+    return height > 0 ? height : 1;
+  });
+  const allowed = heights.map((height, o) => {
+    const values = info.setpoints.filter(([, output]) => output === o).map(([name]) => inForce(name));
+    const step = values.length ? Math.max(...values) - Math.min(...values) : 0;
+    return step > SMALL * height ? Math.min(OFF * height, SHARE * step) : OFF * height;
+  });
+  const largest = (list) => list.indexOf(Math.max(...list));
+  const worst = largest(missed.map((error, o) => error / allowed[o]));
   const total = `RMS error ${shown(measures.rms_error_total, 3)} ${unit}`;
-  if (shares[worst] > OFF && Number.isNaN(steady[worst]))
-    return { good: false, words: `${tank} has an RMS error of ${shown(rms[worst], 3)} ${unit}` };
-  if (shares[worst] > OFF) {
-    const off = `${shown(missed[worst], 3)} ${unit} off its setpoint`;
-    const time = shown(list("time_of_steady_state_error")[worst], 5);
-    return { good: false, words: `${tank} is ${off} at ${time} s, ${total}` };
+  if (missed[worst] > allowed[worst] && !Number.isNaN(steady[worst])) {
+    const off = `${info.tanks[outputs[worst]].name} is ${shown(missed[worst], 3)} ${unit} off its setpoint`;
+    return { good: false, words: `${off} at ${shown(list("time_of_steady_state_error")[worst], 5)} s, ${total}` };
   }
+  const busy = list("saturated_fraction"), pump = largest(busy), far = largest(rms.map((error, o) => error / heights[o]));
+  const large = `${info.tanks[outputs[far]].name} has an RMS error of ${shown(rms[far], 3)} ${unit}`;
+  const isLarge = rms[far] > OFF * heights[far];
+  if (isLarge && Number.isNaN(steady[far])) return { good: false, words: large };
+  if (isLarge && busy[pump] > SATURATED)
+    return { good: false, words: `${large}, ${info.pumps[pump].name} is at a limit in ${shown(100 * busy[pump], 3)} % of the samples` };
   const settled = steady.filter((error) => !Number.isNaN(error));
   if (!settled.length) return { good: true, words: `tracks with ${total}` };
-  if (steady.every((error, o) => Number.isNaN(error) || share(error, o) < EXACT))
+  if (steady.every((error, o) => Number.isNaN(error) || error / heights[o] < EXACT))
     return { good: true, words: `settles on its setpoints, ${total}` };
   return { good: true, words: `comes within ${shown(Math.max(...settled), 3)} ${unit} of each setpoint, ${total}` };
 }
@@ -302,10 +313,31 @@ function limitsOf(margins, measures) {
   return { good: false, words: words + (broken > 1 ? more : "") };
 }
 
+// what is wrong though no limit names it: a level above its rim, liquid that spills, a pump that draws from an empty tank
+function beyond(info, inForce, measures) {
+  const unit = info.units.length, highest = measures.max_level, lowest = measures.min_level, spilled = measures.overflow_volume;
+  const named = new Set(limitsIn(info, inForce).filter(({ measure, entry, upper }) =>
+    ["max_level", "overflow_volume"].includes(measure) && upper <= 2 * rimIn(info, inForce, entry)).map(({ entry }) => entry));
+  const words = [];
+  info.tanks.forEach(({ name }, i) => {
+    const rim = rimIn(info, inForce, i);
+    if (named.has(i) || rim === null || !Number.isFinite(rim)) return;
+    if (entryOf(highest, i) > rim * (1 + 1e-9)) words.push(`${name} rises to ${shown(entryOf(highest, i), 3)} ${unit}, above its rim of ${shown(rim, 3)} ${unit}`);
+    else if (spilled !== undefined && entryOf(spilled, i) > 0) words.push(`${shown(entryOf(spilled, i), 3)} ${unit}^3 spill over the rim of ${name}`);
+  });
+  for (const [pump, tank] of info.draws)
+    if (entryOf(lowest, tank) <= EMPTY * rimIn(info, inForce, tank))
+      words.push(`${info.tanks[tank].name} runs empty, from which ${info.pumps[pump].name} draws`);
+  return words;
+}
+
 // {good, sentence} of a run; plants: {kept, count} where many were simulated
 function verdictOf(info, inForce, { measures }, plants = null) {
   const margins = marginsOf(limitsIn(info, inForce), measures);
-  const parts = [trackingOf(info, inForce, measures), limitsOf(margins, measures)];
+  const wrong = beyond(info, inForce, measures);
+  let limits = limitsOf(margins, measures);
+  if (wrong.length) limits = { good: false, words: [...(limits && !limits.good ? [limits.words] : []), ...wrong].join("; ") };
+  const parts = [trackingOf(info, inForce, measures), limits];
   if (plants && margins.length) {
     const good = plants.kept === plants.count;
     if (good && parts[1].good) parts.pop();

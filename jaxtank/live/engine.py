@@ -264,6 +264,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         ],
         "leaves": _leaves(loops),
         "setpoints": _setpoints(loop),
+        "draws": [[j, i] for j, i in enumerate(plant.sources or ()) if i is not None],
         "measures": [_measure(case, m, entries) for m, entries in loops[-1].measures.items()],
         "limits": _limits(case),
         "free": [b.name for b in free],

@@ -234,7 +234,7 @@ def physics(plant):
             " it holds."
         )
     sentences.append(
-        f"Below {plant.knee:g} {length}, of a level or of a difference of levels, a parabola replaces"
-        " the root in the flow: its slope at 0 is finite."
+        f"Below {plant.knee:g} {length}, of a level or of a difference of levels, a parabola"
+        " replaces the root in the flow: its slope at 0 is finite."
     )
     return sentences

@@ -213,7 +213,7 @@ def _ending(fit):
             words.append(
                 f"{', '.join(ended)} {'ends' if len(ended) == 1 else 'end'} at the bound of the"
                 " search: check the ranges (--free), and units and columns of the data; the other"
-                " other parameters hold only for that value"
+                " intervals hold only for that value"
             )
         if fit.fit.status <= 0:
             words.append("the best search did not converge in its iterations: raise --iterations")

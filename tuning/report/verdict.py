@@ -18,9 +18,22 @@ from jaxtank.controllers import OnOff, OpenLoop
 from jaxtank.core.labels import label_of, labels_of
 from jaxtank.limits import limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.signals.setpoints import Ramps
 
 OFF = 0.05
 """Share of a tank's height by which a level may miss its setpoint where it should have settled."""
+
+SHARE = 0.5
+"""Share of an output's largest step by which it may miss, where steps are above SMALL."""
+
+SMALL = 0.005
+"""Share of a tank's height from which a step is one to be followed, and not noise."""
+
+SATURATED = 0.5
+"""Share of the samples at a pump limit from which a large RMS error is no transient."""
+
+EMPTY = 1e-4
+"""Share of a tank's height below which a pump that draws from it runs dry."""
 
 EXACT = 1e-4
 """Share of a tank's height below which a miss is not worth a number."""
@@ -80,11 +93,51 @@ def outcome(words: str, good: bool = True) -> Verdict:
 
 def of_run(case: Case, values: Mapping[str, Any]) -> Verdict:
     """Return the Verdict of a run with the measures `values`."""
+    rows = limit_rows(case, values)
     return Verdict(
         tracking=tracking(case.loop, values),
-        limits=limits(limit_rows(case, values)),
+        limits=limits(rows, beyond(case.loop, values, rows)),
         robustness=robustness(values),
     )
+
+
+def beyond(
+    loop: ClosedLoop, values: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]
+) -> list[str]:
+    """Return what is wrong though no limit of `rows` names it: a level above its rim, liquid that
+    spills over it, a pump that draws from an empty tank.
+    """
+    plant: Any = loop.plant
+    if "max_level" not in values or not hasattr(plant, "rim"):
+        return []
+    unit, of = loop.units[0], lambda name: np.ravel(np.asarray(values[name], dtype=float))
+    rims, words = np.broadcast_to(plant.rim, plant.tanks), []
+    tops = [row for row in rows if row["measure"] in ("max_level", "overflow_volume")]
+    named = {row["tank"] for row in tops if row["limit"] <= 2.0 * rims[row["tank"] - 1]}
+    spilled = of("overflow_volume") if "overflow_volume" in values else np.zeros(plant.tanks)
+    for i in (i for i in range(plant.tanks) if i + 1 not in named and np.isfinite(rims[i])):
+        tank, top = label_of(plant, "tank", i), of("max_level")[i]
+        if top > rims[i] * (1.0 + 1e-9):
+            words.append(
+                f"{tank} rises to {shown(top)} {unit}, above its rim of {shown(rims[i])} {unit}"
+            )
+        elif spilled[i] > 0.0:
+            words.append(f"{shown(spilled[i])} {unit}^3 spill over the rim of {tank}")
+    for j, i in enumerate(getattr(plant, "sources", ()) or ()):
+        if i is not None and "min_level" in values and of("min_level")[i] <= EMPTY * rims[i]:
+            tank, pump = label_of(plant, "tank", i), label_of(plant, "pump", j)
+            words.append(f"{tank} runs empty, from which {pump} draws")
+    return words
+
+
+def _allowed(loop, heights):
+    """(outputs,) errors that may stay: OFF of a height, and SHARE of the largest step."""
+    reference: Any = loop.reference
+    allowed = OFF * heights
+    if not isinstance(reference, Ramps):
+        return allowed
+    steps = np.ptp(np.array([np.broadcast_to(v, len(heights)) for v in reference.held()]), axis=0)
+    return np.where(steps > SMALL * heights, np.minimum(allowed, SHARE * steps), allowed)
 
 
 def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
@@ -101,20 +154,27 @@ def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
     outputs = list(plant.outputs)
     rims, levels = np.broadcast_to(plant.rim, plant.tanks)[outputs], column("max_level")[outputs]
     heights = np.where(np.isfinite(rims), rims, np.abs(levels))
-    missed = np.where(np.isnan(steady), rms, steady)
-    shares = missed / np.where(heights > 0.0, heights, 1.0)
-    worst = int(np.argmax(shares))
+    heights = np.where(heights > 0.0, heights, 1.0)
+    missed, allowed = np.where(np.isnan(steady), rms, steady), _allowed(loop, heights)
+    worst = int(np.argmax(missed / allowed))
     total = f"RMS error {shown(column('rms_error_total')[0])} {unit}"
-    if shares[worst] > OFF and math.isnan(steady[worst]):
-        tank = label_of(plant, "tank", outputs[worst])
-        return Part(f"{tank} has an RMS error of {shown(rms[worst])} {unit}", False)
-    if shares[worst] > OFF:
+    if missed[worst] > allowed[worst] and not math.isnan(steady[worst]):
         tank, time = label_of(plant, "tank", outputs[worst]), column("time_of_steady_state_error")
         off = f"{tank} is {shown(missed[worst])} {unit} off its setpoint at {shown(time[worst], 5)}"
         return Part(f"{off} s, {total}", False)
+    busy = column("saturated_fraction") if "saturated_fraction" in values else np.zeros(1)
+    pump, worst = int(np.argmax(busy)), int(np.argmax(rms / heights))
+    large = (
+        f"{label_of(plant, 'tank', outputs[worst])} has an RMS error of {shown(rms[worst])} {unit}"
+    )
+    if math.isnan(steady[worst]) and rms[worst] > OFF * heights[worst]:
+        return Part(large, False)
+    if busy[pump] > SATURATED and rms[worst] > OFF * heights[worst]:
+        at = f"{label_of(plant, 'pump', pump)} is at a limit in {shown(100.0 * busy[pump])} %"
+        return Part(f"{large}, {at} of the samples", False)
     if np.isnan(steady).all():
         return Part(f"tracks with {total}")
-    if np.nanmax(steady / np.where(heights > 0.0, heights, 1.0)) < EXACT:
+    if np.nanmax(steady / heights) < EXACT:
         return Part(f"settles on its setpoints, {total}")
     return Part(f"comes within {shown(np.nanmax(steady))} {unit} of each setpoint, {total}")
 
@@ -138,6 +198,7 @@ def limit_rows(case: Case, values: Mapping[str, Any]) -> list[dict[str, Any]]:
                 "margin": limit.margin(values),
                 "scale": limit_scale(limit, case.loop),
                 "reason": None if np.isfinite(entry(limit.measure)) else "undefined",
+                "tank": limit.index + 1 if ms.MEASURES[limit.measure].per == "tank" else None,
                 "time_s": entry(reached) if reached in values else None,
             }
         )
@@ -149,10 +210,18 @@ def _share(row):
     return row["margin"] / (row.get("scale") or abs(row["limit"]) or 1.0)
 
 
-def limits(rows: Sequence[Mapping[str, Any]]) -> Part | None:
-    """Return which limit is the tightest or broken, by how much and when; None without any."""
-    if not rows:
-        return None
+def limits(rows: Sequence[Mapping[str, Any]], more: Sequence[str] = ()) -> Part | None:
+    """Return which limit is the tightest or broken, by how much and when, and what is wrong beside
+    them; None without any.
+    """
+    part = _of_limits(rows) if rows else None
+    if not more:
+        return part
+    known = [] if part is None or part.good else [part.words]
+    return Part("; ".join([*known, *more]), False)
+
+
+def _of_limits(rows):
     worst = min(rows, key=_share)
     broken = sum(not row["margin"] >= 0.0 for row in rows)
     name, unit, value = worst["words"], worst["unit"], shown(worst["value"])
@@ -203,7 +272,7 @@ def of_tuning(result: Any) -> Verdict:
     return Verdict(
         outcome=Part(result.headline.replace("_", " "), result.success),
         tracking=tracking(case.loop, values),
-        limits=limits(rows),
+        limits=limits(rows, beyond(case.loop, values, rows)),
         plants=_validated(result) if answer is None else _judged(answer),
         robustness=robustness(values),
     )

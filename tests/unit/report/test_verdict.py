@@ -31,7 +31,24 @@ console.log(JSON.stringify(GIVEN.map(({ values, filter }) => {
   return verdictOf(e.info, inForce, e.run(values, { filter, every: 100 }));
 })));
 """
-FOUR, TWO, ONE = "gouta2015/backstepping", "cascaded/pi", "one tank"
+FOUR, TWO, ONE, BARE = "gouta2015/backstepping", "cascaded/pi", "one tank", "no limit on levels"
+TRANSFER = """
+dt = 5.0
+duration = 3600.0
+units = ["m", "%"]
+tank = [
+    { name = "T1", area = 0.5, rim = 1.2, drain = "4 cm^2", level = 0.4 },
+    { name = "S", area = 0.5, rim = 8.0, level = 7.0 },
+]
+pump = [
+    { name = "P1", to = "T1", gain = 3e-5, high = 100.0 },
+    { name = "P2", from = "S", gain = 1e-6, high = 100.0, initial = 50.0 },
+]
+plant = { outputs = ["T1"] }
+controller = { kind = "pi", Kc = 200.0, Ti = "5 min", lead = ["P1"] }
+reference = { initial = [0.4], changes = [[60.0, 1, 1.0]] }
+limits = { overshoot_percent = 80.0 }
+"""
 CLOCKS = {FOUR: {"clock.dt": 0.5, "clock.duration": 400.0}}
 RUNS = {  # values and filter of a run, and whether it is good
     FOUR: [
@@ -49,11 +66,25 @@ RUNS = {  # values and filter of a run, and whether it is good
         ({"controller.Kc[0]": 0.05, "controller.Ti[0]": 100.0}, False, False),
         ({"plant.pump_gain[0]": 1.0}, False, False),
     ],
+    BARE: [
+        ({}, False, True),
+        ({"reference.targets[0]": 1.3}, False, False),
+        ({"plant.pump_gain[1]": 1e-4}, False, False),
+        ({"actuator.high[0]": 38.0, "reference.ramp": 6000.0}, False, False),
+        (
+            {"plant.rim[0]": 4.0, "x0[0]": 2.0, "reference.initial[0]": 2.0}
+            | {"reference.targets[0]": 2.19, "actuator.high[0]": 84.0},
+            False,
+            False,
+        ),
+    ],
 }
 
 
 def case_of(name):
     """A case whose limits are its rims."""
+    if name == BARE:
+        return rig.loads(TRANSFER)
     if name == ONE:
         return rig.loads(ONE_TANK).replace(limits={"max_level": "rim"})
     return rig.set_values(presets.find(name), CLOCKS[name])
@@ -67,6 +98,7 @@ def measured(name, values, filtered):
     return case, run_measures(case.loop, case.clock, None)
 
 
+EVERY = pytest.mark.parametrize("name", [ONE, BARE, pytest.param(FOUR, marks=pytest.mark.slow)])
 EACH = pytest.mark.parametrize("name", [ONE, pytest.param(FOUR, marks=pytest.mark.slow)])
 
 
@@ -77,7 +109,7 @@ def judged():
 
 
 @pytest.mark.skipif(NODE is None, reason="no node on this machine")
-@EACH
+@EVERY
 def test_page_and_command_have_the_same_verdict_on_a_run(judged, name):
     case = case_of(name)
     text = engine(case, case.with_safety_filter() if name == FOUR else None) + _script("core")
@@ -105,6 +137,18 @@ def test_a_run_is_good_where_levels_settle_and_limits_hold(judged, name):
         assert verdict.good == good == (verdict.tracking.good and verdict.limits.good), values
         if verdict.limits.good and len(case.loop.plant.outputs) == 1:
             assert verdict.tracking.good == (worst <= 0.05 * np.ravel(case.loop.plant.rim)[tank])
+
+
+def test_what_no_limit_names_is_judged_all_the_same(judged):
+    """A rim without a limit, an empty tank under a pump, a pump at its limit, a step not taken."""
+    found = [verdicts.of_run(*of) for of in judged(BARE)]
+    assert [v.good for v in found] == [good for *_, good in RUNS[BARE]]
+    parts = [(v.tracking.good, v.limits.good) for v in found]
+    assert parts == [(True, True), (True, False), (True, False), (False, True), (False, True)]
+    rises, dry = (v.limits.words for v in found[1:3])
+    measures = judged(BARE)[1][1]
+    assert f"T1 rises to {verdicts.shown(measures['max_level'][0])} m" in rises
+    assert "S" in dry and "P2" in dry and judged(BARE)[2][1]["min_level"][1] < 1e-3
 
 
 def test_one_bad_part_makes_a_verdict_bad():
