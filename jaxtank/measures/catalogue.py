@@ -294,7 +294,8 @@ _BUILT_IN: dict[str, Measure] = {
         "output",
         "overshoot",
         lambda share, time: 100.0 * lower_clip(share, 0.0),
-        "worst overshoot of a change, in percent of it",
+        "worst overshoot of a change, in percent of it; not counted within `disturbance.window`"
+        " after an inflow pulse",
         undefined="the reference does not change",
         unserved=NO_CHANGES,
     ),
@@ -327,7 +328,7 @@ _BUILT_IN: dict[str, Measure] = {
         "recovery",
         lambda last, outside, worst: jnp.maximum(worst, settled(last, outside)),
         "longest time from the start of an inflow pulse to the last sample outside +-5 % of the"
-        " setpoint; none: never recovered",
+        " setpoint, of those within `disturbance.window`; none: never recovered",
         counts=True,
         undefined="an output was still outside the band when it was watched no longer",
         unserved="this case has no disturbance to recover from",

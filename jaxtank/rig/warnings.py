@@ -26,9 +26,9 @@ def case_warnings(case: Case) -> list[str]:
     """Return sentences on what in a case is hardly meant.
 
     A run that does not end at a sample, changes, inflow pulses and faults after its end, changes
-    that overlap, what no sample sees, levels and setpoints above a rim, pumps that start outside
-    their limits, gains of the wrong sign, derivatives shorter than a sample, levels that may fall
-    below 0, models that differ from the plant, estimates of disturbances that the controller does
+    that overlap, what no sample sees, levels, limits and setpoints above a rim, pumps that start
+    outside their limits, valves that hardly open, gains of the wrong sign, derivatives shorter than
+    a sample, levels that may fall below 0, models that differ from the plant, estimates of disturbances that the controller does
     not use. (Steps that are too long: `loop.step_size`.)
 
     Parameters
@@ -53,6 +53,7 @@ def case_warnings(case: Case) -> list[str]:
         *_unseen(case),
         *_above_rims(case),
         *_pumps(case),
+        *_openings(case),
         *_signs(case),
         *_derivative(case),
         *_feed_forward(case),
@@ -163,6 +164,14 @@ def _above_rims(case):
                 f"{tanks[i]} starts at {level:g} {length}, above its rim at {rim[i]:g} {length}: "
                 + ("what is above it overflows at once" if plant.overflow else limits)
             )
+    top = case.limits.get("max_level")
+    if top is not None and not isinstance(top, str):
+        for i, limit in enumerate(np.broadcast_to(np.asarray(top, dtype=float), plant.tanks)):
+            if np.isfinite(limit) and limit > 2.0 * rim[i]:
+                yield (
+                    f"limits.max_level of {tanks[i]} is {limit:g} {length}, far above its rim at"
+                    f" {rim[i]:g} {length}: limits are in {length}"
+                )
     if reference is None:
         return
     for i, tank in enumerate(plant.outputs):
@@ -185,6 +194,21 @@ def _pumps(case):
             yield (
                 f"{label_of(case.loop.plant, 'pump', j)} runs at {volts:g} {drive} before t = 0,"
                 f" outside its limits of {low:g} and {high:g} {drive}"
+            )
+
+
+def _openings(case):
+    """On valves of a rig whose inputs are in %, that open by less than 1 %."""
+    plant, bank = case.loop.plant, case.loop.actuator
+    if case.loop.units[1] != "%":
+        return
+    first = plant.pumps - len(getattr(plant, "valves", ()))
+    for j in range(first, plant.pumps):
+        high, initial = float(bank.high[j]), float(bank.initial[j])
+        if high <= 1.0 or 0.0 < initial <= 1.0:
+            yield (
+                f"{label_of(plant, 'pump', j)}: openings are in % here as all inputs: high ="
+                f" {high:g} %, initial = {initial:g} %; full open is 100"
             )
 
 

@@ -13,6 +13,9 @@ from jaxtank.core.tree import POSITIVE, component, leaf, number, static
 from jaxtank.signals.base import BETWEEN, Signal
 from jaxtank.xla.gather import gathered
 
+SHORTEST, WATCHED = 60.0, 5.0
+"""How long recovery from an inflow pulse is watched: s, and in durations of the longest pulse."""
+
 
 @component
 class InflowPulses(Signal):
@@ -37,7 +40,7 @@ class InflowPulses(Signal):
         "s",
         "time after an inflow pulse in which the recovery of its tank is measured",
         **POSITIVE,
-        default=60.0,
+        default=SHORTEST,
     )
 
     @property
@@ -112,12 +115,14 @@ def inflow_pulses(tanks: int, entries: Sequence[tuple[float, float, int, float]]
                 f"inflow pulse at {time} s over {duration} s into tank {tank}: needs a time at or"
                 f" after 0 s, a duration above 0 s and a tank from 0 to {tanks - 1}, counted from 0"
             )
+    longest = max((duration for _, duration, *_ in entries), default=0.0)
     return InflowPulses(
         volume=number([volume for *_, volume in entries]),
         events=tuple(
             (float(time), float(duration), int(tank)) for time, duration, tank, _ in entries
         ),
         width=tanks,
+        window=max(SHORTEST, WATCHED * longest),
     )
 
 

@@ -147,7 +147,9 @@ def advice_of(runs: list[Run]) -> Advice:
         best = min(known, key=error)
         least = amount(error(best), best.case.loop.units[0])
         words += f"; least RMS error{' of these' * bool(good)}: {best.case.name}, {least}"
-    beyond = of_nominal_plant(runs[0].case)
+    each = {run.case.name: of_nominal_plant(run.case) for run in runs}
+    same = len(set(each.values())) == 1
+    beyond = " ".join(list(each.values())[:1] if same else [f"{n}: {w}" for n, w in each.items()])
     return Advice(f"{GIVEN}; jaxtank tune searches for better ones.", f"{words}.", beyond)
 
 
