@@ -352,8 +352,8 @@ class PID(Controller):
             names = [name_of(model, "pump", j) or j + 1 for j in range(pumps)]
             more = (
                 f": write lead = {shortened(names[:outputs])} in [controller], the input of each"
-                " output, and the others hold their `initial`; several inputs that share one level are"
-                ' kind = "split-range", with sequence = [the first, the second, ...]'
+                " output, and the others hold their `initial`; several inputs that share one level"
+                ' are kind = "split-range", with sequence = [the first, the second, ...]'
             )
         raise InputError(
             f"PID needs one pump per output: the model has {pumps} and {outputs}{more}"

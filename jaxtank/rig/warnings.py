@@ -28,8 +28,8 @@ def case_warnings(case: Case) -> list[str]:
     A run that does not end at a sample, changes, inflow pulses and faults after its end, changes
     that overlap, what no sample sees, levels, limits and setpoints above a rim, pumps that start
     outside their limits, valves that hardly open, gains of the wrong sign, derivatives shorter than
-    a sample, levels that may fall below 0, models that differ from the plant, estimates of disturbances that the controller does
-    not use. (Steps that are too long: `loop.step_size`.)
+    a sample, levels that may fall below 0, models that differ from the plant, estimates of
+    disturbances that the controller does not use. (Steps that are too long: `loop.step_size`.)
 
     Parameters
     ----------
