@@ -18,7 +18,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.bounds import bounds
 from jaxtank.case import Case, Free
-from jaxtank.controllers import OpenLoop
+from jaxtank.controllers import OnOff, OpenLoop
 from jaxtank.core.labels import input_unit, label_of, place_of
 from jaxtank.core.tree import describe, get_value, parameters
 from jaxtank.export.whole import WholeLoop, library, whole_loop
@@ -281,7 +281,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
             "default_on": loop.safety_filter is not None,
         },
         "noise": draws_bursts(loop) or bool(np.any(np.asarray(loop.sensor.noise) > 0)),
-        "tracks": not isinstance(loop.controller, OpenLoop),
+        "tracks": not isinstance(loop.controller, OpenLoop | OnOff),
     }
 
 

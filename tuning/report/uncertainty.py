@@ -176,6 +176,13 @@ def verdict_of(ensemble):
     if diverged:
         words = f"{diverged} of {count(samples, 'run')} diverged"
         parts["outcome"] = verdicts.Part(words, False)
+    names = [n for n in verdicts.STUCK if n in ensemble.measures]
+    columns = {n: np.asarray(ensemble.measures[n]) for n in names}
+    draws = ({n: v[k] for n, v in columns.items()} for k in range(samples))
+    stuck = [part for one in draws if (part := verdicts.stuck(ensemble.case.loop, one))]
+    if stuck:
+        many = f"on {len(stuck)} of {samples} draws a pump is at a limit with a large error"
+        parts["tracking"] = verdicts.Part(f"{many}, as: {stuck[0].words}", False)
     if violations:
         worst = max(violations, key=lambda v: v["count"])
         held, share = int(ensemble.held.sum()), verdicts.shown(100 * worst["probability"])

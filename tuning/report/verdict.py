@@ -20,6 +20,9 @@ from jaxtank.limits import limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.signals.setpoints import Ramps
 
+UNJUDGED = (OpenLoop, OnOff)
+"""Controllers that are not judged on tracking."""
+
 OFF = 0.05
 """Share of a tank's height by which a level may miss its setpoint where it should have settled."""
 
@@ -31,6 +34,9 @@ SMALL = 0.005
 
 SATURATED = 0.5
 """Share of the samples at a pump limit from which a large RMS error is no transient."""
+
+STUCK = ("saturated_fraction", "rms_error", "max_level")
+"""Measures by which a loop is found at a pump limit and far from its setpoint."""
 
 EMPTY = 1e-4
 """Share of a tank's height below which a pump that draws from it runs dry."""
@@ -144,7 +150,7 @@ def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
     """Return how near the controlled levels come to their setpoints: at the end of each plateau,
     and by their RMS errors where a setpoint has none.
     """
-    if isinstance(loop.controller, OpenLoop | OnOff) or "steady_state_error" not in values:
+    if isinstance(loop.controller, UNJUDGED) or "steady_state_error" not in values:
         return None
     column = lambda name: np.ravel(np.asarray(values[name], dtype=float))
     plant: Any = loop.plant
@@ -152,9 +158,7 @@ def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
     if not np.all(np.isfinite(rms)):
         return Part("the run diverged: a level is not a finite number", False)
     outputs = list(plant.outputs)
-    rims, levels = np.broadcast_to(plant.rim, plant.tanks)[outputs], column("max_level")[outputs]
-    heights = np.where(np.isfinite(rims), rims, np.abs(levels))
-    heights = np.where(heights > 0.0, heights, 1.0)
+    heights = _heights(plant, column("max_level"))
     missed, allowed = np.where(np.isnan(steady), rms, steady), _allowed(loop, heights)
     worst = int(np.argmax(missed / allowed))
     total = f"RMS error {shown(column('rms_error_total')[0])} {unit}"
@@ -162,21 +166,44 @@ def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
         tank, time = label_of(plant, "tank", outputs[worst]), column("time_of_steady_state_error")
         off = f"{tank} is {shown(missed[worst])} {unit} off its setpoint at {shown(time[worst], 5)}"
         return Part(f"{off} s, {total}", False)
-    busy = column("saturated_fraction") if "saturated_fraction" in values else np.zeros(1)
-    pump, worst = int(np.argmax(busy)), int(np.argmax(rms / heights))
-    large = (
-        f"{label_of(plant, 'tank', outputs[worst])} has an RMS error of {shown(rms[worst])} {unit}"
-    )
+    worst = int(np.argmax(rms / heights))
     if math.isnan(steady[worst]) and rms[worst] > OFF * heights[worst]:
-        return Part(large, False)
-    if busy[pump] > SATURATED and rms[worst] > OFF * heights[worst]:
-        at = f"{label_of(plant, 'pump', pump)} is at a limit in {shown(100.0 * busy[pump])} %"
-        return Part(f"{large}, {at} of the samples", False)
+        return Part(_rms_words(plant, outputs[worst], rms[worst], unit), False)
+    if part := stuck(loop, values):
+        return part
     if np.isnan(steady).all():
         return Part(f"tracks with {total}")
     if np.nanmax(steady / heights) < EXACT:
         return Part(f"settles on its setpoints, {total}")
     return Part(f"comes within {shown(np.nanmax(steady))} {unit} of each setpoint, {total}")
+
+
+def stuck(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
+    """Return the Part of a large RMS error with a pump at a limit in most samples, else None."""
+    if not set(STUCK) <= set(values) or isinstance(loop.controller, UNJUDGED):
+        return None
+    plant: Any = loop.plant
+    column = lambda name: np.ravel(np.asarray(values[name], dtype=float))
+    busy, rms, outputs = column("saturated_fraction"), column("rms_error"), list(plant.outputs)
+    heights = _heights(plant, column("max_level"))
+    pump, worst = int(np.argmax(busy)), int(np.argmax(rms / heights))
+    if not (busy[pump] > SATURATED and rms[worst] > OFF * heights[worst]):
+        return None
+    at = f"{label_of(plant, 'pump', pump)} is at a limit in {shown(100.0 * busy[pump])} %"
+    words = _rms_words(plant, outputs[worst], rms[worst], loop.units[0])
+    return Part(f"{words}, {at} of the samples", False)
+
+
+def _rms_words(plant, tank, error, unit):
+    return f"{label_of(plant, 'tank', tank)} has an RMS error of {shown(error)} {unit}"
+
+
+def _heights(plant, highest):
+    """(outputs,) heights of the controlled tanks, of those without a rim their highest levels."""
+    outputs = list(plant.outputs)
+    rims = np.broadcast_to(plant.rim, plant.tanks)[outputs]
+    heights = np.where(np.isfinite(rims), rims, np.abs(highest[outputs]))
+    return np.where(heights > 0.0, heights, 1.0)
 
 
 def limit_rows(case: Case, values: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -6,12 +6,13 @@ import importlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from helpers import ONE_TANK
 from scipy import stats
 
 import tuning
 from jaxtank import measures as measured
 from jaxtank import presets, rig
-from tuning.report import uncertainty
+from tuning.report import uncertainty, verdict
 
 MEASURES = ("max_level", "overflow_volume", "saturated_fraction", "settling_time", "iae")
 
@@ -96,3 +97,22 @@ def test_a_fan_of_some_draws_states_of_which(five, samples, words):
     figure = uncertainty.figures(first(five, samples))["fan"]
     assert figure.get_suptitle() == f"{five.case.name}: {words}"
     plt.close("all")
+
+
+def test_draws_with_a_pump_at_its_limit_and_a_large_error_are_not_good():
+    """A step for which the pump is too small on most draws, though every limit holds."""
+    case = rig.set_values(rig.loads(ONE_TANK), {"actuator.high": 0.55})
+    names = (*verdict.STUCK, "rms_error_total")
+    found = tuning.ensemble(
+        case.replace(limits={"max_level": "rim"}),
+        {"plant.drain": tuning.Uniform(relative=0.05)},
+        samples=4,
+        measures=names,
+        fan=False,
+    )
+    busy = np.max(found.measures["saturated_fraction"], axis=1) > 0.5
+    rims = np.ravel(case.loop.plant.rim)[list(case.loop.plant.outputs)]
+    far = np.max(found.measures["rms_error"] / rims, axis=1) > 0.05
+    judged = uncertainty.verdict_of(found)
+    assert (busy & far).any() and not judged.good and judged.limits.good
+    assert f"on {(busy & far).sum()} of 4 draws" in judged.tracking.words
