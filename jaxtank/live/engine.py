@@ -264,7 +264,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         ],
         "leaves": _leaves(loops),
         "setpoints": _setpoints(loop),
-        "draws": [[j, i] for j, i in enumerate(plant.sources or ()) if i is not None],
+        "draws": _draws(plant),
         "measures": [_measure(case, m, entries) for m, entries in loops[-1].measures.items()],
         "limits": _limits(case),
         "free": [b.name for b in free],
@@ -283,6 +283,11 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         "noise": draws_bursts(loop) or bool(np.any(np.asarray(loop.sensor.noise) > 0)),
         "tracks": not isinstance(loop.controller, OpenLoop | OnOff),
     }
+
+
+def _draws(plant):
+    """[[pump, the tank from which it draws]]."""
+    return [[j, i] for j, i in enumerate(getattr(plant, "sources", ()) or ()) if i is not None]
 
 
 def _setpoints(loop):

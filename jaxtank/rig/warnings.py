@@ -52,6 +52,7 @@ def case_warnings(case: Case) -> list[str]:
         *_overlapping(case),
         *_unseen(case),
         *_above_rims(case),
+        *_high_limits(case),
         *_pumps(case),
         *_openings(case),
         *_signs(case),
@@ -164,14 +165,6 @@ def _above_rims(case):
                 f"{tanks[i]} starts at {level:g} {length}, above its rim at {rim[i]:g} {length}: "
                 + ("what is above it overflows at once" if plant.overflow else limits)
             )
-    top = case.limits.get("max_level")
-    if top is not None and not isinstance(top, str):
-        for i, limit in enumerate(np.broadcast_to(np.asarray(top, dtype=float), plant.tanks)):
-            if np.isfinite(limit) and limit > 2.0 * rim[i]:
-                yield (
-                    f"limits.max_level of {tanks[i]} is {limit:g} {length}, far above its rim at"
-                    f" {rim[i]:g} {length}: limits are in {length}"
-                )
     if reference is None:
         return
     for i, tank in enumerate(plant.outputs):
@@ -182,6 +175,19 @@ def _above_rims(case):
                 f"reference: {label_of(plant, 'output', i)} is asked for {highest:g} {length},"
                 f" above the rim of {tanks[tank]} at {rim[tank]:g} {length}: "
                 + ("a level cannot get there" if plant.overflow else limits)
+            )
+
+
+def _high_limits(case):
+    """On limits on levels far above a rim."""
+    plant, length, top = case.loop.plant, case.loop.units[0], case.limits.get("max_level")
+    if top is None or isinstance(top, str):
+        return
+    for i, limit in enumerate(np.broadcast_to(np.asarray(top, dtype=float), plant.tanks)):
+        if np.isfinite(limit) and limit > 2.0 * plant.rim[i]:
+            yield (
+                f"limits.max_level of {label_of(plant, 'tank', i)} is {limit:g} {length}, far above"
+                f" its rim at {plant.rim[i]:g} {length}: limits are in {length}"
             )
 
 

@@ -116,24 +116,37 @@ def beyond(
     plant: Any = loop.plant
     if "max_level" not in values or not hasattr(plant, "rim"):
         return []
-    unit, of = loop.units[0], lambda name: np.ravel(np.asarray(values[name], dtype=float))
-    rims, words = np.broadcast_to(plant.rim, plant.tanks), []
+    rims = np.broadcast_to(plant.rim, plant.tanks)
     tops = [row for row in rows if row["measure"] in ("max_level", "overflow_volume")]
-    named = {row["tank"] for row in tops if row["limit"] <= 2.0 * rims[row["tank"] - 1]}
-    spilled = of("overflow_volume") if "overflow_volume" in values else np.zeros(plant.tanks)
-    for i in (i for i in range(plant.tanks) if i + 1 not in named and np.isfinite(rims[i])):
-        tank, top = label_of(plant, "tank", i), of("max_level")[i]
-        if top > rims[i] * (1.0 + 1e-9):
-            words.append(
-                f"{tank} rises to {shown(top)} {unit}, above its rim of {shown(rims[i])} {unit}"
-            )
+    limits = {row["tank"]: row["limit"] for row in tops}
+    free = [i for i, rim in enumerate(rims) if not limits.get(i + 1, np.inf) <= 2.0 * rim]
+    return [*_past_rims(loop, values, rims, free), *_dry_pumps(plant, values, rims)]
+
+
+def _column(values, name, size):
+    """(size,) entries of a measure, 0 where it is not known."""
+    return np.ravel(np.asarray(values.get(name, np.zeros(size)), dtype=float))
+
+
+def _past_rims(loop, values, rims, tanks):
+    """On those of `tanks` whose level passes the rim or spills over it."""
+    unit, highest = loop.units[0], _column(values, "max_level", len(rims))
+    spilled = _column(values, "overflow_volume", len(rims))
+    for i in (i for i in tanks if np.isfinite(rims[i])):
+        tank, rim = label_of(loop.plant, "tank", i), f"{shown(rims[i])} {unit}"
+        if highest[i] > rims[i] * (1.0 + 1e-9):
+            yield f"{tank} rises to {shown(highest[i])} {unit}, above its rim of {rim}"
         elif spilled[i] > 0.0:
-            words.append(f"{shown(spilled[i])} {unit}^3 spill over the rim of {tank}")
+            yield f"{shown(spilled[i])} {unit}^3 spill over the rim of {tank}"
+
+
+def _dry_pumps(plant, values, rims):
+    """On pumps that draw from a tank that is empty at some time."""
+    lowest = _column(values, "min_level", len(rims)) if "min_level" in values else np.inf + rims
     for j, i in enumerate(getattr(plant, "sources", ()) or ()):
-        if i is not None and "min_level" in values and of("min_level")[i] <= EMPTY * rims[i]:
+        if i is not None and lowest[i] <= EMPTY * rims[i]:
             tank, pump = label_of(plant, "tank", i), label_of(plant, "pump", j)
-            words.append(f"{tank} runs empty, from which {pump} draws")
-    return words
+            yield f"{tank} runs empty, from which {pump} draws"
 
 
 def _allowed(loop, heights):
