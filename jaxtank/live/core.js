@@ -327,7 +327,7 @@ function beyond(info, inForce, measures) {
   });
   for (const [pump, tank] of info.draws)
     if (entryOf(lowest, tank) <= EMPTY * rimIn(info, inForce, tank))
-      words.push(`${info.tanks[tank].name} runs empty, from which ${info.pumps[pump].name} draws`);
+      words.push(`${info.tanks[tank].name}, from which ${info.pumps[pump].name} draws, runs empty`);
   return words;
 }
 

@@ -1,5 +1,5 @@
 /* The driver of one case's printed functions: runs, noise, measures. No DOM: a page, a worker and
-node run the same text. `info` and `programs` stand above it. */
+node run the same text. `info`, `programs` and `inverseErf` stand above it. */
 
 /* The deviates of jax.random.normal: threefry2x32 (Salmon et al. 2011) in counter mode, and
 a quotient of polynomials for the inverse error function. */
@@ -20,19 +20,7 @@ function threefry(key, a, b) {
   return [a >>> 0, b >>> 0];
 }
 
-/* Coefficients of w^0, w^1, ...: their quotient is erf_inv(x)/x at w = -log(1 - x^2), as in
-jaxtank/xla/normal.py. */
-const inverseErf = [
-  [0.886226925452758, 0.37295923435619166, 0.1078698275134423, 0.022637047019527286,
-    0.003647761505339555, 0.00046946820365559213, 4.880581408985848e-05, 4.129357883818834e-06,
-    2.881506695657402e-07, 1.6848303056499265e-08, 8.162288545560231e-10, 2.8444266040380894e-11,
-    1.1250333940426505e-12, 1.47361631773671e-14, 3.36185941885605e-17],
-  [1.0, 0.15904004242427522, 0.06704944343237143, 0.0085519333555328, 0.001566909164122308,
-    0.00015512336634086922, 1.5616859359819715e-05, 1.1672049956501198e-06,
-    7.233280754721521e-08, 4.107628440791895e-09, 1.5189732595414491e-10, 6.211258667720306e-12,
-    1.5622160735065302e-13, 9.175687076560176e-16, 5.53778670617121e-19],
-];
-
+/* `inverseErf`, above: two lists of coefficients, whose quotient at w = -log(1 - x^2) is erf_inv(x)/x. */
 function normal(bits) {
   const least = -1 + 2 ** -53;
   const share = (bits[0] * 2 ** 20 + (bits[1] >>> 12)) * 2 ** -52;

@@ -27,6 +27,7 @@ from jaxtank.live.printed import Printed, maths
 from jaxtank.loop.closed_loop import draws_bursts
 from jaxtank.signals.setpoints import Ramps
 from jaxtank.task import default_cost, has_own_objective, input_range, sensor_noise, with_noise
+from jaxtank.xla.normal import DENOMINATOR, NUMERATOR
 
 ROWS = 3000
 """Approximate number of rows of a plotted run, as in `jaxtank simulate --out`."""
@@ -123,6 +124,7 @@ def engine(
             '"use strict";',
             f"const info={data(_packed(facts))};",
             f"const programs={programs};",
+            f"const inverseErf={data([NUMERATOR, DENOMINATOR])};",
             bare(driver),
             "return makeEngine;",
             "})();",

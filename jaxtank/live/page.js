@@ -203,6 +203,7 @@ function show() {
   });
   showTables();
   atTime(view.at);
+  if (!offer.done) offer(current);
   if (!worker && !due) tested(current);
 }
 
@@ -252,7 +253,7 @@ function showTables() {
   const margins = marginsOf(limitsNow(), current.measures), { sentence, good } = verdict(current);
   $("verdict").textContent = sentence;
   $("verdict").className = good ? "good" : "bad";
-  reveal(sentence);
+  if (!good) reveal(margins[0]);
   const pinned = pins[pins.length - 1];
   fill($("margins"), "Limits", ["", "value", "margin"], margins.map(({ limit, value, margin }) => ({
     head: `${limit.words} ${limit.lower === null || limit.lower === undefined ? "≤" : "≥"} ${
@@ -268,9 +269,12 @@ function showTables() {
   fill($("measures"), "Measures", ["", "now", ...(pinned ? [pinned.name] : [])], rows);
 }
 
-// where the charts lie side by side: the one that the verdict names
-function reveal(sentence) {
-  const named = charts.find(({ spec }) => sentence.includes(`${spec.title.split(/, controlled| \[/)[0]} `));
+// where the charts lie side by side: that of the tank whose limit is broken, else of the largest last error
+function reveal(tightest) {
+  const ofTank = tightest?.margin < 0 && ["max_level", "min_level", "overflow_volume"].includes(tightest.limit.measure);
+  const errors = Array.from([current.measures.steady_state_error ?? []].flat(), (error) => error || 0);
+  const tank = ofTank ? tightest.limit.entry : info.outputs[errors.indexOf(Math.max(...errors))];
+  const named = charts[tank];
   if (!named || named === reveal.last) return;
   reveal.last = named;
   $("panels").scrollLeft = named.figure.offsetLeft - $("panels").offsetLeft;
@@ -865,6 +869,14 @@ const MISSIONS = [{
   },
 }];
 
+// those that the first run allows
+function offer(found) {
+  const offered = MISSIONS.filter(({ possible }) => possible(found));
+  chips($("missions").querySelector(".chips"), offered, false, begin);
+  $("missions").hidden = !offered.length;
+  offer.done = true;
+}
+
 // --- start ------------------------------------------------------------------------------------
 
 function makeCharts() {
@@ -1036,9 +1048,6 @@ function start() {
   makeLegend();
   listen();
   open();
-  const first = run(), offered = first ? MISSIONS.filter(({ possible }) => possible(first)) : [];
-  chips($("missions").querySelector(".chips"), offered, false, begin);
-  $("missions").hidden = !offered.length;
 }
 
 window.jaxtank = {

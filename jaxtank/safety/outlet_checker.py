@@ -459,10 +459,11 @@ def _relied_on(rig, i, bounds, upper):
         yield bounds.low[k] >= rig.bottom[k], f"{word}, whose low limit is not proved"
         yield upper or bounds.high[k] <= rig.limit[k], f"{word}, not proved"
     for k in near if rig.row(i, upper) is not None else ():
-        for j in () if _any_change(rig, k) else sorted(rig.neighbours(k)):
-            word = "its own" if j == i else f"{rig.label(j)}, whose"
-            yield bounds.high[j] <= rig.reach[j], f"relies on {word} upper limit, not proved"
-            yield bounds.low[j] >= rig.bottom[j], f"relies on {word} low limit, not proved"
+        any_change = _any_change(rig, k, min(rig.climb[k], rig.drop[k]))
+        for j in () if any_change else sorted(rig.neighbours(k)):
+            word = f"limit of {rig.label(j)}, not proved"
+            yield bounds.high[j] <= rig.reach[j], f"relies on the upper {word}"
+            yield bounds.low[j] >= rig.bottom[j], f"relies on the low {word}"
 
 
 def _row_holds(rig, row, bounds, near):
@@ -490,9 +491,9 @@ def _row_holds(rig, row, bounds, near):
         yield from _compatible(rig, row, other, bounds)
 
 
-def _any_change(rig, k, *counted):
-    """Whether a row counts on any change of a level in a hold, so on no limit around the tank."""
-    return min(counted or (rig.climb[k], rig.drop[k])) >= rig.reach[k] + rig.band[k]
+def _any_change(rig, k, counted):
+    """Whether a change of a level in a hold that is counted on is as large as any can be."""
+    return counted >= rig.reach[k] + rig.band[k]
 
 
 def _fastest(rig, k, upper):

@@ -178,9 +178,9 @@ def test_simulate_json_has_the_keys_of_the_contract_and_the_values_of_the_librar
     assert simulated["provenance"]["dtype"] == "float64" and simulated["provenance"]["seed"] == 0
 
 
-def test_what_is_not_a_number_is_null_with_a_reason(one):
+def test_what_is_not_a_number_is_null_with_a_reason(tank_file):
     # nothing changes in 0.8 s
-    result = done("simulate", one, *setting("clock.duration=0.8"), "--json").json
+    result = done("simulate", tank_file, *setting("clock.duration=0.8"), "--json").json
     printed, result = result, result["measures"]
     assert result["settling_time"] == [None] and result["recovery_time"] is None
     nothing = {m for m, v in result.items() if v is None or (isinstance(v, list) and None in v)}
@@ -291,7 +291,7 @@ def test_a_run_that_leaves_the_numbers_is_reported_and_nothing_is_written(folder
 
 
 @pytest.fixture(scope="module")
-def one(tmp_path_factory):
+def tank_file(tmp_path_factory):
     """A rig file of one tank, whose programs are small."""
     path = tmp_path_factory.mktemp("one") / "one.toml"
     path.write_text(ONE_TANK, encoding="utf-8")
@@ -302,11 +302,11 @@ TUNE = (*SEARCH, "--validation", "8", "--free", "controller.Kc=0.05:50", "--limi
 
 
 @pytest.fixture(scope="module")
-def tuned(one, tmp_path_factory):
+def tuned(tank_file, tmp_path_factory):
     """One search, with its files: (output, folder)."""
     folder = tmp_path_factory.mktemp("tuned") / "out"
     with no_live_page():
-        return say("tune", one, *TUNE, "--json", "--out", str(folder)), folder
+        return say("tune", tank_file, *TUNE, "--json", "--out", str(folder)), folder
 
 
 def test_tune_json_has_the_keys_of_the_contract(tuned):
@@ -334,18 +334,18 @@ def test_tune_json_has_the_keys_of_the_contract(tuned):
 
 
 @pytest.mark.slow
-def test_tune_is_no_worse_than_its_start_and_its_numbers_are_of_its_runs(tuned, one):
+def test_tune_is_no_worse_than_its_start_and_its_numbers_are_of_its_runs(tuned, tank_file):
     result = tuned[0].json
     assert result["objective"]["after"] < result["objective"]["before"]
     for when in ("before", "after"):
         gain = {n: p[when] for n, p in result["parameters"].items()}
-        assert_close(result["measures"][when], measured(rig.set_values(rig.load(one), gain)))
+        assert_close(result["measures"][when], measured(rig.set_values(rig.load(tank_file), gain)))
         assert result["objective"][when] == result["measures"][when]["rms_error_total"]
 
 
-def test_tune_reports_its_progress_on_stderr_and_quiet_does_not(tuned, one):
+def test_tune_reports_its_progress_on_stderr_and_quiet_does_not(tuned, tank_file):
     assert all(words in tuned[0].err for words in ("start 1/2", "best ", "written to"))
-    printed = done("tune", one, *TUNE, "--quiet")
+    printed = done("tune", tank_file, *TUNE, "--quiet")
     assert printed.err == ""
     assert all(w in printed.out for w in ("one tank: converged", "controller.Kc", "tank 1"))
 
@@ -377,8 +377,8 @@ def test_the_tuned_rig_runs_to_the_measures_of_the_result(tuned):
     np.testing.assert_allclose(rows[:, 1:2], jaxtank.simulate(case.loop, case.clock).x, rtol=1e-9)
 
 
-def test_the_same_seed_finds_the_same(tuned, one):
-    again = done("tune", one, *TUNE, "--json", "--quiet").json
+def test_the_same_seed_finds_the_same(tuned, tank_file):
+    again = done("tune", tank_file, *TUNE, "--json", "--quiet").json
     assert again | {"wall_s": 0} == tuned[0].json | {"wall_s": 0}
 
 
@@ -790,21 +790,21 @@ def test_a_reader_that_has_left_is_no_error():
 DRAWS = ("--vary", "plant.drain=uniform:5%", "--vary", "controller.k1=normal:0.1:0.01")
 
 
-def test_uncertainty_json_has_the_keys_of_the_contract_and_the_numbers_of_the_library(one):
+def test_uncertainty_json_has_the_keys_of_the_contract_and_the_numbers_of_the_library(tank_file):
     vary = {
         "plant.drain": tuning.Uniform(relative=0.05),
         "plant.rim": tuning.Normal(mean=3.0, sd=0.1),
     }
     words = ("--vary", "plant.drain=uniform:5%", "--vary", "plant.rim=normal:3:0.1")
     more = ("--samples", "24", "--seed", "2", "--json", "--quiet")
-    result = done("uncertainty", one, *words, *more).json
+    result = done("uncertainty", tank_file, *words, *more).json
     assert set(result) >= {"case", "samples", "failed", "measures", "violations", "provenance"}
     assert result["samples"] == 24
     keys = {"mean", "sd", "p05", "p50", "p95", "cvar95", "max"}
     assert all(set(summary) >= keys for summary in result["measures"].values())
     keys = {"name", "limit", "count", "probability", "interval95"}
     assert all(set(v) >= keys for v in result["violations"])
-    summary = tuning.ensemble(rig.load(one), vary, samples=24, key=2).summary()
+    summary = tuning.ensemble(rig.load(tank_file), vary, samples=24, key=2).summary()
     assert result["measures"]["rms_error_total"]["p95"] == summary["rms_error_total"]["p95"]
     assert result["measures"]["max_level"]["max"] == summary["max_level"]["max"].tolist()
 

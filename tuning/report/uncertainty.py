@@ -179,7 +179,8 @@ def verdict_of(ensemble):
     names = [n for n in verdicts.STUCK if n in ensemble.measures]
     columns = {n: np.asarray(ensemble.measures[n]) for n in names}
     draws = ({n: v[k] for n, v in columns.items()} for k in range(samples))
-    stuck = [part for one in draws if (part := verdicts.stuck(ensemble.case.loop, one))]
+    parts_of = (verdicts.stuck(ensemble.case.loop, draw) for draw in draws)
+    stuck = [part for part in parts_of if part]
     if stuck:
         many = f"on {len(stuck)} of {samples} draws a pump is at a limit with a large error"
         parts["tracking"] = verdicts.Part(f"{many}, as: {stuck[0].words}", False)

@@ -146,7 +146,7 @@ def _dry_pumps(plant, values, rims):
     for j, i in enumerate(getattr(plant, "sources", ()) or ()):
         if i is not None and lowest[i] <= EMPTY * rims[i]:
             tank, pump = label_of(plant, "tank", i), label_of(plant, "pump", j)
-            yield f"{tank} runs empty, from which {pump} draws"
+            yield f"{tank}, from which {pump} draws, runs empty"
 
 
 def _allowed(loop, heights):

@@ -14,6 +14,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value
 from jaxtank.export.whole import served
 from jaxtank.live.engine import data, engine, facts_of, squares_of
+from jaxtank.xla.normal import DENOMINATOR, NUMERATOR
 
 pytestmark = pytest.mark.skipif(NODE is None, reason="no node on this machine")
 # {case: what makes it short}
@@ -204,7 +205,8 @@ def test_noise_is_that_of_a_seed():
 
 def test_deviates_are_those_of_jax():
     text = resources.files("jaxtank.live").joinpath("engine.js").read_text("utf-8")
-    script = "const info = {leaves: []}, programs = [];\n" + text
+    facts = f"{{leaves: []}}, programs = [], inverseErf = {[[*NUMERATOR], [*DENOMINATOR]]}"
+    script = f"const info = {facts};\n{text}"
     found = node(script + "console.log(JSON.stringify(deviates(5, 2, 400).map((v) => [...v])))")
     expected = jax.random.normal(jax.random.key(5), (2, 400), dtype=float)
     np.testing.assert_allclose(np.array(found), expected, rtol=1e-12, atol=1e-14)

@@ -12,8 +12,8 @@ from jaxtank.live.page import page
 def live(tmp_path_factory):
     path = tmp_path_factory.mktemp("live") / "page.html"
     path.write_text(page(presets.find("cascaded/pi")), encoding="utf-8")
-    with chromium() as browser, opened(browser, path) as found:
-        yield found
+    with chromium() as browser, opened(browser, path) as page_open:
+        yield page_open
 
 
 def drag(live, x, y, up):
@@ -96,5 +96,5 @@ def test_numbers_have_names_for_people():
     assert words["plant.drain[1]"] == "outlet of tank 2"
     assert words["reference.targets[3]"] == "setpoint of tank 1 from 470 s"
     assert words["plant.orifice[0]"] == "outlet of tank 3 into tank 1"
-    own = [label for name, label in words.items() if ".model." not in name]
-    assert len(set(own)) == len(own), "two numbers with one name"
+    labels = [label for name, label in words.items() if ".model." not in name]
+    assert len(set(labels)) == len(labels), "two numbers with one name"

@@ -594,8 +594,8 @@ def test_the_rig_of_the_study(study):
 @pytest.mark.slow
 @pytest.mark.parametrize("objective", [STUDY, PENALISED])
 def test_64_plants_a_back_off_and_no_violation_among_4096(study, objective):
-    """64 plants, two gains, 33 cm: no violation among 4096 fresh plants, in at most 26 evaluations,
-    curvature and all.
+    """64 plants, two gains, 33 cm: no violation on 4096 other plants, within 26 evaluations that
+    include second derivatives.
     """
     result = tuning.tune_robust(
         study,
