@@ -4,24 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+from helpers import ONE_TANK
 
 from jaxtank import Clock, presets, rig
 from tuning.search.setting import LARGEST_ERROR, midpoint_error, setting_of
 
-TANK = """
-name = "one tank"
-tank = [{ area = 20.0, rim = 3.0, drain = DRAIN, level = 1.0 }]
-pump = [{ gain = 5.0, to = 1, low = 0.0, high = 2.0, initial = 0.4 }]
-plant = { gravity = 0.5 }
-law = { kind = "pid", Kc = 1.0, Ti = 4.0, Tt = 5.0 }
-reference = { initial = [1.0], changes = [[1.0, 1, 2.6]], ramp = 0.0 }
-values = { "clock.dt" = 0.1, "clock.duration" = 1000.0 }
-limits = { max_level = 2.7 }
-"""
-
 
 def tank(drain=2.0):
-    return rig.loads(TANK.replace("DRAIN", str(drain)))
+    return rig.set_values(rig.loads(ONE_TANK), {"plant.drain": drain, "clock.duration": 1000.0})
 
 
 def by_hand(dt, states=20_000):
