@@ -262,9 +262,9 @@ function trackingOf(info, inForce, measures) {
   if (!info.tracks) return null;
   const { outputs } = info, unit = info.units.length;
   const list = (name) => Array.from(typeof measures[name] === "number" ? [measures[name]] : measures[name]);
-  const rms = list("rms_error"), steady = list("steady_state_error"), highest = list("max_level");
+  const rms = list("rms_error"), highest = list("max_level"), swing = list("steady_state_swing");
+  const steady = list("steady_state_error").map((error, o) => Math.max(error, swing[o]));
   if (!rms.every(Number.isFinite)) return { good: false, words: "the run diverged: a level is not a finite number" };
-  const missed = steady.map((error, o) => (Number.isNaN(error) ? rms[o] : error));
   const heights = outputs.map((tank) => {
     const rim = rimIn(info, inForce, tank), height = Number.isFinite(rim) ? rim : Math.abs(highest[tank]);
     return height > 0 ? height : 1;
@@ -275,18 +275,24 @@ function trackingOf(info, inForce, measures) {
     return step > SMALL * height ? Math.min(OFF * height, SHARE * step) : OFF * height;
   });
   const largest = (list) => list.indexOf(Math.max(...list));
-  const worst = largest(missed.map((error, o) => error / allowed[o]));
+  const among = (sizes, where) => largest(sizes.map((size, o) => (where[o] ? size : -Infinity)));
   const total = `RMS error ${shown(measures.rms_error_total, 3)} ${unit}`;
-  if (missed[worst] > allowed[worst] && !Number.isNaN(steady[worst])) {
-    const off = `${info.tanks[outputs[worst]].name} is ${shown(missed[worst], 3)} ${unit} off its setpoint`;
-    return { good: false, words: `${off} at ${shown(list("time_of_steady_state_error")[worst], 5)} s, ${total}` };
+  const off = steady.map((error, o) => error > allowed[o]);
+  if (off.includes(true)) {
+    const o = among(steady.map((error, o) => error / allowed[o]), off);
+    const tank = info.tanks[outputs[o]].name, amount = `${shown(steady[o], 3)} ${unit}`;
+    const words = swing[o] === steady[o] ? `${tank} swings ${amount} to either side of its setpoint`
+      : `${tank} is ${amount} off its setpoint at ${shown(list("time_of_steady_state_error")[o], 5)} s`;
+    return { good: false, words: `${words}, ${total}` };
   }
-  const busy = list("saturated_fraction"), pump = largest(busy), far = largest(rms.map((error, o) => error / heights[o]));
-  const large = `${info.tanks[outputs[far]].name} has an RMS error of ${shown(rms[far], 3)} ${unit}`;
-  const isLarge = rms[far] > OFF * heights[far];
-  if (isLarge && Number.isNaN(steady[far])) return { good: false, words: large };
-  if (isLarge && busy[pump] > SATURATED)
-    return { good: false, words: `${large}, ${info.pumps[pump].name} is at a limit in ${shown(100 * busy[pump], 3)} % of the samples` };
+  const busy = list("saturated_fraction"), pump = largest(busy), stuck = busy[pump] > SATURATED;
+  const large = rms.map((error, o) => error > OFF * heights[o] && (Number.isNaN(steady[o]) || stuck));
+  if (large.includes(true)) {
+    const o = among(rms.map((error, o) => error / heights[o]), large);
+    const words = `${info.tanks[outputs[o]].name} has an RMS error of ${shown(rms[o], 3)} ${unit}`;
+    const at = stuck ? `, ${info.pumps[pump].name} is at a limit in ${shown(100 * busy[pump], 3)} % of the samples` : "";
+    return { good: false, words: words + at };
+  }
   const settled = steady.filter((error) => !Number.isNaN(error));
   if (!settled.length) return { good: true, words: `tracks with ${total}` };
   if (steady.every((error, o) => Number.isNaN(error) || error / heights[o] < EXACT))

@@ -204,20 +204,53 @@ def settled(last, outside):
     return jnp.where(outside > 0, jnp.inf, last)
 
 
+def _moves(r, before):
+    """Whether a setpoint is another one; rounding alone is no change: compiled code may fuse
+    k dt - t0, that of a page does not.
+    """
+    return magnitude(r - before) > 4.0 * jnp.finfo(jnp.result_type(r)).eps * magnitude(r)
+
+
 def _update_plateau(run, state, sample, context):
     """Per output (setpoint, |error|, time and whether it was constant at the last sample; the
     largest error at the end of a plateau so far, its time)."""
 
     def update(r, e, before):
         setpoint, error, time, constant, worst, when = before
-        # rounding alone is no change: compiled code may fuse k dt - t0, that of a page does not
-        moved = magnitude(r - setpoint) > 4.0 * jnp.finfo(jnp.result_type(r)).eps * magnitude(r)
+        moved = _moves(r, setpoint)
         ends = moved & (constant > 0) & (error > worst)
         worst, when = jnp.where(ends, error, worst), jnp.where(ends, time, when)
         now = jnp.broadcast_to(sample.t, jnp.shape(e))
         return r, magnitude(e), now, jnp.where(moved, 0.0, 1.0), worst, when
 
     return each(update, sample.r, sample.e, state)
+
+
+def _update_swing(run, state, sample, context):
+    """Per output (setpoint, whether it was constant at the last sample; samples of its plateau, at
+    how many the next part of it begins; largest errors above and below in this part and in the
+    one before; largest swing of a plateau so far). A part ends where its plateau is a fifth longer.
+    """
+
+    def update(r, e, before):
+        setpoint, constant, count, end, above, below, above_old, below_old, worst = before
+        moved = _moves(r, setpoint)
+        swing = swing_of(above, below, above_old, below_old)
+        worst = jnp.where(moved & (constant > 0) & (swing > worst), swing, worst)
+        count = jnp.where(moved, 1.0, count + 1.0)
+        fresh = moved | (count >= end)
+        old = lambda now, before: jnp.where(moved, 0.0, jnp.where(fresh, now, before))
+        new = lambda now, v: jnp.where(fresh | (v > now), lower_clip(v, 0.0), now)
+        parts = new(above, e), new(below, -e), old(above, above_old), old(below, below_old)
+        end = jnp.where(fresh, lower_clip(1.2 * count, 4.0), end)
+        return r, jnp.where(moved, 0.0, 1.0), count, end, *parts, worst
+
+    return each(update, sample.r, sample.e, state)
+
+
+def swing_of(above, below, above_old, below_old):
+    """Smaller of the largest errors above and below, over the last two parts of a plateau."""
+    return magnitude(jnp.minimum(jnp.maximum(above, above_old), jnp.maximum(below, below_old)))
 
 
 def _update_rise(run, state, sample, context):
@@ -337,6 +370,11 @@ _BUILT_IN: dict[str, Accumulator] = {
     "plateau": Accumulator(
         lambda run: _rows(run, "outputs", -1e9, 0.0, 0.0, 0.0, -1.0, 0.0),
         _update_plateau,
+        rows=True,
+    ),
+    "swing": Accumulator(
+        lambda run: _rows(run, "outputs", -1e9, 0.0, 0.0, 4.0, 0.0, 0.0, 0.0, 0.0, -1.0),
+        _update_swing,
         rows=True,
     ),
     "rise": Accumulator(

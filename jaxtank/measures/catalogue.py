@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from jaxtank.core.numerics import lower_clip, root_of_mean
 from jaxtank.core.vectors import each, is_array, total
-from jaxtank.measures.accumulators import Run, settled
+from jaxtank.measures.accumulators import Run, settled, swing_of
 
 
 class Measure(NamedTuple):
@@ -151,6 +151,14 @@ def _steady_state_error(setpoint, error, time, constant, worst, when):
     return jnp.where(largest < 0, jnp.nan, largest)
 
 
+def _steady_state_swing(setpoint, constant, count, end, *rest):
+    """Largest swing at the end of a plateau; the last one ends with the run."""
+    *parts, worst = rest
+    swing = swing_of(*parts)
+    largest = jnp.where((constant > 0) & (swing > worst), swing, worst)
+    return jnp.where(largest < 0, jnp.nan, largest)
+
+
 def _steady_state_time(setpoint, error, time, constant, worst, when):
     return jnp.where((constant > 0) & (error > worst), time, when)
 
@@ -201,6 +209,16 @@ _BUILT_IN: dict[str, Measure] = {
         _steady_state_error,
         "largest absolute error at the end of a plateau of the setpoint",
         reached="time_of_steady_state_error",
+        undefined="its setpoint is at no time constant",
+        nan_holds="its setpoint is at no time constant",
+    ),
+    "steady_state_swing": _of_rows(
+        "cm",
+        "output",
+        "swing",
+        _steady_state_swing,
+        "smaller of the largest errors above and below the setpoint over the end of a plateau: a"
+        " sixth to three tenths of it",
         undefined="its setpoint is at no time constant",
         nan_holds="its setpoint is at no time constant",
     ),
@@ -389,7 +407,7 @@ SHOWN = (
 SUMMARY = (
     *("rms_error", "rms_error_total", "max_error", "overshoot_percent", "settling_time"),
     *("max_level", "min_level", "overflow_volume", "rms_input", "input_travel"),
-    "saturated_fraction",
+    *("saturated_fraction", "steady_state_error", "steady_state_swing"),
 )
 """Measures in an ensemble's summary unless others are named, in order."""
 
@@ -401,6 +419,7 @@ LABELS = {
     "iae": "integral of the absolute error",
     "max_error": "largest error",
     "steady_state_error": "steady-state error",
+    "steady_state_swing": "swing at the steady state",
     "rms_input": "RMS input",
     "input_travel": "total variation of the input",
     "mean_square_travel": "mean square change of the input",

@@ -172,18 +172,17 @@ def advice_of(ensemble):
 def verdict_of(ensemble):
     """Return the Verdict of an Ensemble: the limit that is broken most often, and the draws."""
     samples, violations = ensemble.samples, ensemble.violations()
-    diverged, parts = int(ensemble.failed.sum()), {}
+    diverged, parts, known = int(ensemble.failed.sum()), {}, ensemble.measures
     if diverged:
         words = f"{diverged} of {count(samples, 'run')} diverged"
         parts["outcome"] = verdicts.Part(words, False)
-    names = [n for n in verdicts.STUCK if n in ensemble.measures]
-    columns = {n: np.asarray(ensemble.measures[n]) for n in names}
-    draws = ({n: v[k] for n, v in columns.items()} for k in range(samples))
-    parts_of = (verdicts.stuck(ensemble.case.loop, draw) for draw in draws)
-    stuck = [part for part in parts_of if part]
-    if stuck:
-        many = f"on {len(stuck)} of {samples} draws a pump is at a limit with a large error"
-        parts["tracking"] = verdicts.Part(f"{many}, as: {stuck[0].words}", False)
+    columns = {n: np.asarray(ensemble.measures[n]) for n in verdicts.TRACKED if n in known}
+    lost = verdicts.lost(ensemble.case.loop, columns)
+    if lost is not None and (lost := lost & ~ensemble.failed).any():
+        first = {n: v[np.argmax(lost)] for n, v in columns.items()}
+        example = verdicts.tracking(ensemble.case.loop, first).words
+        many = f"{int(lost.sum())} of {samples} draws do not keep to the setpoints, as: {example}"
+        parts["tracking"] = verdicts.Part(many, False)
     if violations:
         worst = max(violations, key=lambda v: v["count"])
         held, share = int(ensemble.held.sum()), verdicts.shown(100 * worst["probability"])

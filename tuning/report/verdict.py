@@ -35,8 +35,12 @@ SMALL = 0.005
 SATURATED = 0.5
 """Share of the samples at a pump limit from which a large RMS error is no transient."""
 
-STUCK = ("saturated_fraction", "rms_error", "max_level")
-"""Measures by which a loop is found at a pump limit and far from its setpoint."""
+TRACKED = (
+    *("steady_state_error", "steady_state_swing", "rms_error", "max_level", "saturated_fraction"),
+)
+"""Measures by which a run is judged on tracking."""
+
+WHEN = "time_of_steady_state_error"
 
 EMPTY = 1e-4
 """Share of a tank's height below which a pump that draws from it runs dry."""
@@ -149,74 +153,88 @@ def _dry_pumps(plant, values, rims):
             yield f"{tank}, from which {pump} draws, runs empty"
 
 
+class _Tracked(NamedTuple):
+    """Of a run, or of many in front: (..., outputs) numbers, and where they are too large."""
+
+    swing: Any  # to either side of the setpoint at the end of a plateau
+    steady: Any  # error at the end of a plateau or swing, NaN where the setpoint has none
+    rms: Any
+    heights: Any
+    allowed: Any
+    off: Any  # misses its setpoint at the end of a plateau
+    loose: Any  # large RMS error, with no plateau
+    stuck: Any  # large RMS error, with a pump at a limit in most samples
+
+
+def _tracked(loop: ClosedLoop, values: Mapping[str, Any]) -> _Tracked | None:
+    if isinstance(loop.controller, UNJUDGED) or not set(TRACKED) <= set(values):
+        return None
+    plant: Any = loop.plant
+    outputs = list(plant.outputs)
+    row = lambda name: np.asarray(values[name], dtype=float)
+    rims = np.broadcast_to(plant.rim, plant.tanks)[outputs]
+    heights = np.where(np.isfinite(rims), rims, np.abs(row("max_level")[..., outputs]))
+    heights = np.where(heights > 0.0, heights, 1.0)  # of tanks without a rim their highest levels
+    swing, rms = row("steady_state_swing"), row("rms_error")
+    steady, allowed = np.maximum(row("steady_state_error"), swing), _allowed(loop, heights)
+    large, held = rms > OFF * heights, np.isnan(steady)
+    busy = np.max(row("saturated_fraction"), axis=-1, keepdims=True) > SATURATED
+    masks = ~held & (steady > allowed), held & large, large & busy
+    return _Tracked(swing, steady, rms, heights, allowed, *masks)
+
+
 def _allowed(loop, heights):
-    """(outputs,) errors that may stay: OFF of a height, and SHARE of the largest step."""
+    """(..., outputs) errors that may stay: OFF of a height, and SHARE of the largest step."""
     reference: Any = loop.reference
     allowed = OFF * heights
     if not isinstance(reference, Ramps):
         return allowed
-    steps = np.ptp(np.array([np.broadcast_to(v, len(heights)) for v in reference.held()]), axis=0)
+    outputs = heights.shape[-1]
+    steps = np.ptp(np.array([np.broadcast_to(v, outputs) for v in reference.held()]), axis=0)
     return np.where(steps > SMALL * heights, np.minimum(allowed, SHARE * steps), allowed)
+
+
+def lost(loop: ClosedLoop, values: Mapping[str, Any]) -> np.ndarray | None:
+    """Return for which of many runs `tracking` is not good, (N,) of measures (N, ...)."""
+    found = _tracked(loop, values)
+    if found is None:
+        return None
+    unknown = ~np.isfinite(found.rms)
+    return np.any(unknown | found.off | found.loose | found.stuck, axis=-1)
 
 
 def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
     """Return how near the controlled levels come to their setpoints: at the end of each plateau,
-    and by their RMS errors where a setpoint has none.
+    where they may swing about it, and by their RMS errors where a setpoint has none.
     """
-    if isinstance(loop.controller, UNJUDGED) or "steady_state_error" not in values:
+    found = _tracked(loop, values)
+    if found is None:
         return None
-    column = lambda name: np.ravel(np.asarray(values[name], dtype=float))
-    plant: Any = loop.plant
-    steady, rms, unit = column("steady_state_error"), column("rms_error"), loop.units[0]
-    if not np.all(np.isfinite(rms)):
+    unit, plant = loop.units[0], loop.plant
+    total = f"RMS error {shown(math.hypot(*found.rms))} {unit}"
+    largest = lambda sizes, where: int(np.argmax(np.where(where, sizes, -np.inf)))
+    name = lambda kind, i: label_of(plant, kind, i)
+    if not np.all(np.isfinite(found.rms)):
         return Part("the run diverged: a level is not a finite number", False)
-    outputs = list(plant.outputs)
-    heights = _heights(plant, column("max_level"))
-    missed, allowed = np.where(np.isnan(steady), rms, steady), _allowed(loop, heights)
-    worst = int(np.argmax(missed / allowed))
-    total = f"RMS error {shown(column('rms_error_total')[0])} {unit}"
-    if missed[worst] > allowed[worst] and not math.isnan(steady[worst]):
-        tank, time = label_of(plant, "tank", outputs[worst]), column("time_of_steady_state_error")
-        off = f"{tank} is {shown(missed[worst])} {unit} off its setpoint at {shown(time[worst], 5)}"
-        return Part(f"{off} s, {total}", False)
-    worst = int(np.argmax(rms / heights))
-    if math.isnan(steady[worst]) and rms[worst] > OFF * heights[worst]:
-        return Part(_rms_words(plant, outputs[worst], rms[worst], unit), False)
-    if part := stuck(loop, values):
-        return part
-    if np.isnan(steady).all():
+    if np.any(found.off):
+        o = largest(found.steady / found.allowed, found.off)
+        tank, amount = name("tank", plant.outputs[o]), f"{shown(found.steady[o])} {unit}"
+        if found.swing[o] == found.steady[o]:
+            return Part(f"{tank} swings {amount} to either side of its setpoint, {total}", False)
+        at = f" at {shown(values[WHEN][o], 5)} s" if WHEN in values else ""
+        return Part(f"{tank} is {amount} off its setpoint{at}, {total}", False)
+    if np.any(found.loose | found.stuck):
+        o = largest(found.rms / found.heights, found.loose | found.stuck)
+        words = f"{name('tank', plant.outputs[o])} has an RMS error of {shown(found.rms[o])} {unit}"
+        busy = np.asarray(values["saturated_fraction"], dtype=float)
+        j = int(np.argmax(busy))
+        at = f", {name('pump', j)} is at a limit in {shown(100.0 * busy[j])} % of the samples"
+        return Part(words + at * bool(found.stuck[o]), False)
+    if np.isnan(found.steady).all():
         return Part(f"tracks with {total}")
-    if np.nanmax(steady / heights) < EXACT:
+    if np.nanmax(found.steady / found.heights) < EXACT:
         return Part(f"settles on its setpoints, {total}")
-    return Part(f"comes within {shown(np.nanmax(steady))} {unit} of each setpoint, {total}")
-
-
-def stuck(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
-    """Return the Part of a large RMS error with a pump at a limit in most samples, else None."""
-    if not set(STUCK) <= set(values) or isinstance(loop.controller, UNJUDGED):
-        return None
-    plant: Any = loop.plant
-    column = lambda name: np.ravel(np.asarray(values[name], dtype=float))
-    busy, rms, outputs = column("saturated_fraction"), column("rms_error"), list(plant.outputs)
-    heights = _heights(plant, column("max_level"))
-    pump, worst = int(np.argmax(busy)), int(np.argmax(rms / heights))
-    if not (busy[pump] > SATURATED and rms[worst] > OFF * heights[worst]):
-        return None
-    at = f"{label_of(plant, 'pump', pump)} is at a limit in {shown(100.0 * busy[pump])} %"
-    words = _rms_words(plant, outputs[worst], rms[worst], loop.units[0])
-    return Part(f"{words}, {at} of the samples", False)
-
-
-def _rms_words(plant, tank, error, unit):
-    return f"{label_of(plant, 'tank', tank)} has an RMS error of {shown(error)} {unit}"
-
-
-def _heights(plant, highest):
-    """(outputs,) heights of the controlled tanks, of those without a rim their highest levels."""
-    outputs = list(plant.outputs)
-    rims = np.broadcast_to(plant.rim, plant.tanks)[outputs]
-    heights = np.where(np.isfinite(rims), rims, np.abs(highest[outputs]))
-    return np.where(heights > 0.0, heights, 1.0)
+    return Part(f"comes within {shown(np.nanmax(found.steady))} {unit} of each setpoint, {total}")
 
 
 def limit_rows(case: Case, values: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -107,7 +107,7 @@ FRESH = 256  # plants on which an answer is judged
 
 NOMINAL = (
     *("rms_error_total", "rms_error", "settling_time", "recovery_time"),
-    *("steady_state_error", "time_of_steady_state_error"),
+    *("steady_state_error", "steady_state_swing", "time_of_steady_state_error"),
 )
 """Measures of the nominal plant, which runs in addition to the plants."""
 

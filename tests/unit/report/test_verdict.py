@@ -50,6 +50,22 @@ reference = { initial = [0.4], changes = [[60.0, 1, 1.0]] }
 limits = { overshoot_percent = 80.0 }
 """
 CLOCKS = {FOUR: {"clock.dt": 0.5, "clock.duration": 400.0}}
+RELAY = "relay"
+SWINGING = """
+name = "relay"
+units = ["m", "-"]
+tank = [{ area = 1.0, rim = 2.0, level = 1.0 }]
+pump = [{ gain = 0.02, to = 1, low = 0.0, high = 1.0, initial = 0.5 }]
+plant = { gravity = 9.81 }
+law = { kind = "pid", Kc = 1e6, Ti = 1e12, Tt = 1e12, bias = 0.5 }
+reference = { initial = [1.0], changes = [[1.0, 1, 1.02]], ramp = 0.0 }
+disturbance = { inflow = [-0.01] }
+values = { "clock.dt" = 0.05, "clock.duration" = 79.0, "actuator.delay" = 5.0 }
+"""
+"""A P controller that switches a pump with dead time, above a constant outflow: the level swings by
+0.05 m (Tsypkin) and ends near its setpoint.
+"""
+
 RUNS = {  # values and filter of a run, and whether it is good
     FOUR: [
         ({}, False, False),
@@ -78,11 +94,14 @@ RUNS = {  # values and filter of a run, and whether it is good
             False,
         ),
     ],
+    RELAY: [({}, False, False), ({"controller.Kc[0]": 1.0}, False, True)],
 }
 
 
 def case_of(name):
     """A case whose limits are its rims."""
+    if name == RELAY:
+        return rig.loads(SWINGING)
     if name == BARE:
         return rig.loads(TRANSFER)
     if name == ONE:
@@ -98,8 +117,9 @@ def measured(name, values, filtered):
     return case, run_measures(case.loop, case.clock, None)
 
 
-EVERY = pytest.mark.parametrize("name", [ONE, BARE, pytest.param(FOUR, marks=pytest.mark.slow)])
-EACH = pytest.mark.parametrize("name", [ONE, pytest.param(FOUR, marks=pytest.mark.slow)])
+ALL_FOUR = pytest.param(FOUR, marks=pytest.mark.slow)
+EVERY = pytest.mark.parametrize("name", [ONE, BARE, RELAY, ALL_FOUR])
+EACH = pytest.mark.parametrize("name", [ONE, ALL_FOUR])
 
 
 @pytest.fixture(scope="module")
@@ -137,6 +157,35 @@ def test_a_run_is_good_where_levels_settle_and_limits_hold(judged, name):
         assert verdict.good == good == (verdict.tracking.good and verdict.limits.good), values
         if verdict.limits.good and len(case.loop.plant.outputs) == 1:
             assert verdict.tracking.good == (worst <= 0.05 * np.ravel(case.loop.plant.rim)[tank])
+
+
+def swing(errors):
+    """Smaller of the largest errors to either side over the last two parts of one plateau; a part
+    begins where the plateau is a fifth longer than at the begin of the part before.
+    """
+    begins, count = [1, 4], 4
+    while (count := int(np.ceil(1.2 * count - 1e-9))) <= len(errors):
+        begins.append(count)
+    end = errors[begins[-2] - 1 :] if len(errors) >= 4 else errors
+    return max(0.0, min(end.max(), -end.min()))
+
+
+@pytest.mark.parametrize("name", [ONE, RELAY])
+def test_a_level_that_swings_is_judged_by_its_swing(judged, name):
+    for (case, measures), (values, _, good) in zip(judged(name), RUNS[name], strict=True):
+        run = jaxtank.simulate(case.loop, case.clock)
+        errors = np.asarray(run.x[:, 0] - run.r[:, 0])
+        begin = np.flatnonzero(np.abs(np.diff(run.r[:, 0])) > 1e-9)[-1] + 1
+        before = swing(errors[:begin]) if begin > 1 else 0.0
+        expected = max(before, swing(errors[begin:]))
+        assert measures["steady_state_swing"][0] == pytest.approx(expected, abs=1e-12), values
+        if name == RELAY:
+            words = verdicts.tracking(case.loop, measures)
+            assert words.good == good and ("swings 0.05 m" in words.words) != good
+    if name == RELAY:  # of a relay: flow times dead time over area, 0.01 * 5 / 1 (Tsypkin)
+        worst = [float(np.ravel(measures["steady_state_swing"])[0]) for _, measures in judged(name)]
+        assert worst[0] == pytest.approx(0.05, rel=2e-3) and worst[1] == 0.0
+        assert judged(name)[0][1]["steady_state_error"][0] < 0.01  # at the end of the run: good
 
 
 def test_what_no_limit_names_is_judged_all_the_same(judged):
