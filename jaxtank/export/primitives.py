@@ -52,7 +52,12 @@ def each(f, *arrays):
 
 def constant(eqn, operands):
     """Return the result of an operation on numbers, computed by jax."""
+    name = eqn.primitive.name
+    if name in PLACED:
+        return _move(None, eqn, operands)
     values = [_numbers(o, v) for o, v in zip(operands, eqn.invars)]
+    if name == "convert_element_type":
+        return [elements(values[0].astype(eqn.outvars[0].aval.dtype))]
     bound = eqn.primitive.get_bind_params(eqn.params)
     functions, params = bound if isinstance(bound, tuple) else ((), bound)
     with jax.ensure_compile_time_eval():
@@ -111,8 +116,31 @@ def _convert(writer, eqn, operands):
     return [arrays.each(writer, kind, kind, operands, kinds)]
 
 
+def _broadcast(x, shape, broadcast_dimensions, **_):
+    """`x` with its axes at these of a new shape, and repeated along the others."""
+    sizes = [1] * len(shape)
+    for axis, size in zip(broadcast_dimensions, x.shape):
+        sizes[axis] = size
+    return np.broadcast_to(x.reshape(sizes), shape)
+
+
+def _slice(x, start_indices, limit_indices, strides):
+    steps = strides or (1,) * x.ndim
+    return x[tuple(map(slice, start_indices, limit_indices, steps))]
+
+
+PLACED = {
+    "squeeze": lambda x, dimensions: np.squeeze(x, dimensions),
+    "slice": _slice,
+    "broadcast_in_dim": _broadcast,
+}
+"""Moves of one array that numpy makes: most of a loop's, and jax takes half a second for them."""
+
+
 def _move(writer, eqn, operands):
     """The elements that an operation only moves, found by moving their numbers."""
+    if eqn.primitive.name in PLACED:
+        return [PLACED[eqn.primitive.name](operands[0], **eqn.params)]
     table, ids = [], []
     for o, v in zip(operands, eqn.invars):
         if v in eqn.invars[INDICES.get(eqn.primitive.name, slice(0))]:
