@@ -195,6 +195,8 @@ def test_what_no_limit_names_is_judged_all_the_same(judged):
     parts = [(v.tracking.good, v.limits.good) for v in found]
     assert parts == [(True, True), (True, False), (True, False), (False, True), (False, True)]
     rises, dry = (v.limits.words for v in found[1:3])
+    told = [advice.of_run(*of).gives for of in judged(BARE)]
+    assert all(v.limits.good or v.limits.words in told[i] for i, v in enumerate(found))
     measures = judged(BARE)[1][1]
     assert f"T1 rises to {verdicts.shown(measures['max_level'][0])} m" in rises
     assert "S" in dry and "P2" in dry and judged(BARE)[2][1]["min_level"][1] < 1e-3
