@@ -146,6 +146,30 @@ with tempfile.TemporaryDirectory() as folder:
 """
 
 
+def drawing(rounds):
+    """Row of sensor noise that is drawn for 256 plants as they run, beside the runs without it."""
+    case = presets.find("gouta2015/backstepping")
+    keys = jax.random.split(jax.random.key(0), 256)
+    gains = np.random.default_rng(0).uniform(0.95, 1.05, (256, 1)) * case.loop.plant.pump_gain
+
+    def compiled(noise):
+        def one(gain, key):
+            at = {"plant.pump_gain": gain, "sensor.noise": noise}
+            return loop.evaluate(with_values(case.loop, at), case.clock, COST, key)
+
+        keyless = lambda gain, key: one(gain, None)
+        call = jax.jit(jax.vmap(one if noise.any() else keyless)).lower(gains, keys).compile()
+        return lambda: call(gains, keys)
+
+    quiet = np.zeros_like(np.asarray(case.loop.sensor.noise))
+    calls = {"quiet": compiled(quiet), "noisy": compiled(quiet + 0.1)}
+    seconds = core_times(calls, max(rounds // 4, 3))
+    steps = 256 * case.clock.samples
+    spent = f"{1e9 * statistics.median(seconds['noisy']) / steps:.0f} ns per step and plant"
+    of_run = ratio(seconds, "noisy", "quiet")
+    return [["batch of 256, noise of 4 sensors drawn", spent, of_run, "without noise", "2"]]
+
+
 def gauss_newton(rounds):
     """Row of the tuner's pass: gradient and Gauss-Newton matrix of 8 parameters over 16 scenarios,
     beside the run of the same lanes.
@@ -205,6 +229,8 @@ def controllers(rounds):
     return rows
 
 
+BLOCKS = one_run, batch, drawing, gauss_newton, controllers
+
 COMPILE = """
 import time, jax, jaxtank, numpy as np
 jax.config.update("jax_enable_x64", True)
@@ -260,7 +286,7 @@ def main(words):
     if cores:
         os.sched_setaffinity(0, {max(cores)})  # before jax starts its threads
     rounds = measuring.first_number(words, 15)
-    rows = [*one_run(rounds), *batch(rounds), *gauss_newton(rounds), *controllers(rounds)]
+    rows = [row for block in BLOCKS for row in block(rounds)]
     if cores:
         os.sched_setaffinity(0, cores)
     rows += cold()
