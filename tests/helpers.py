@@ -222,8 +222,8 @@ LISTED = re.compile(r"Compiling (?:jit\()?(\w+)\)? with global shapes")
 
 
 @contextlib.contextmanager
-def programs_compiled():
-    """A Counter of how often each program is compiled inside, where none is at hand."""
+def programs_compiled(cold=True):
+    """A Counter of how often each program is compiled inside; cold: where none is at hand."""
     counter = collections.Counter()
     handler = logging.Handler()
     logger = logging.getLogger("jax")
@@ -234,7 +234,8 @@ def programs_compiled():
 
     handler.emit = emit
     logger.addHandler(handler)
-    jax.clear_caches()
+    if cold:
+        jax.clear_caches()
     jax.config.update("jax_log_compiles", True)  # of every thread, as `jax.log_compiles` is not
     try:
         yield counter

@@ -176,11 +176,13 @@ def with_noise_drawn(group: Group) -> Group:
     count = len(group.runs) * samples * int(np.size(np.asarray(sensor.noise)))
     if group.keys is None or samples > CHUNK or count > LARGEST_NOISE:
         return group
+    return group._replace(noise=_drawn(sensor, group.keys, samples=samples))
 
-    def draw(key: Any) -> Any:
-        return jnp.stack(sensor.draw(key, samples))
 
-    return group._replace(noise=jax.jit(jax.vmap(draw))(group.keys))
+@compiled("samples")
+def _drawn(sensor: Any, keys: Any, samples: int) -> Any:
+    """The noise of each run, (runs, sensors, samples)."""
+    return jax.vmap(lambda key: jnp.stack(sensor.draw(key, samples)))(keys)
 
 
 def at_once(function: Callable[[Any], Any], tasks: Sequence[Any]) -> list[Any]:

@@ -210,6 +210,14 @@ def test_a_default_answer_has_five_programs(counted):
     assert {name: n for name, n in counted[1].items() if name in large} == DEFAULT_ANSWER
 
 
+def test_another_value_in_the_same_process_compiles_nothing(result, case):
+    other = rig.set_values(case, {"plant.drain[0]": 1.01 * float(case.loop.plant.drain[0])})
+    with programs_compiled(cold=False) as programs:
+        again = tuning.tune(other, tuning.Options(validation=24))
+    assert again.tuned.loop.safety_filter.held == result.tuned.loop.safety_filter.held
+    assert not programs
+
+
 def test_validate_gives_what_judged_the_answer(result, case):
     again = tuning.validate(result.tuned, 24)
     assert np.array_equal(again.error, result.answer.after.error)
