@@ -1,7 +1,6 @@
 """Simulated readings of a rig for the inputs of experiment data, and their sensitivities."""
 
 import dataclasses
-import functools
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -19,6 +18,7 @@ from jaxtank.plants.runge_kutta import advance
 from jaxtank.rig.signals import parts_of
 from jaxtank.signals.base import Constant
 from jaxtank.xla.hoist import scan
+from jaxtank.xla.jit import compiled
 
 
 @component
@@ -255,7 +255,7 @@ def readings(rig, dt, u, channels, substeps, flows=None):
     return jnp.stack(scan(sample, (x, state), (pieces, entering), length=dt.shape[0])[1], axis=-1)
 
 
-@functools.partial(jax.jit, static_argnames=("coordinates", "tanks", "channels", "substeps"))
+@compiled("coordinates", "tanks", "channels", "substeps", keep=True)
 def sensitivities(rig, dt, u, p, first, *, coordinates, tanks, channels, substeps):
     """Return (logs, samples, channels) readings and their derivatives by the unknowns of each log:
     coordinates p, of all logs or (logs, coordinates), then levels `first` (logs, tanks).
@@ -275,7 +275,7 @@ def sensitivities(rig, dt, u, p, first, *, coordinates, tanks, channels, substep
     return jax.vmap(of_log, in_axes=(0, 0, 0 if p.ndim == 2 else None, 0))(dt, u, p, first)
 
 
-@functools.partial(jax.jit, static_argnames=("coordinates", "substeps"))
+@compiled("coordinates", "substeps", keep=True)
 def variants(rig, dt, u, flows, p, first, *, coordinates, substeps):
     """Return (variants, logs, samples, tanks) levels of a Rig at coordinates p (variants, shared),
     for inputs u, further inflows `flows` and levels `first` of each variant and log.
@@ -297,8 +297,8 @@ def _play(rig, dt, u, first, *, channels, substeps):
     )(dt, u, first)
 
 
-play = jax.jit(_play, static_argnames=("channels", "substeps"))
-_play_any = jax.jit(_play, static_argnames=("channels",))  # one program for any number of substeps
+play = compiled("channels", "substeps", keep=True)(_play)
+_play_any = compiled("channels", keep=True)(_play)  # one program for any number of substeps
 
 MOST_SUBSTEPS = 64
 
