@@ -29,7 +29,7 @@ from jaxtank.xla.hoist import scan
 from jaxtank.xla.jit import compiled
 
 
-@compiled("clock", "save_every", "checkpoint")
+@compiled("clock", "save_every", "checkpoint", keep=True)
 def simulate_compiled(
     loop: ClosedLoop, clock: Clock, key: jax.Array | None, save_every: int, checkpoint: bool = False
 ) -> tuple[Trajectory, jax.Array]:

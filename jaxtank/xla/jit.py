@@ -11,6 +11,7 @@ checks that the folder belongs to the user; the digest of each entry is checked 
 its name (the signature) and the processor for which it was compiled.
 """
 
+import dataclasses
 import functools
 import importlib
 import json
@@ -210,9 +211,16 @@ def _load_lapack() -> None:
 
 
 def _words(tree: Any) -> Any:
-    """A structure of results as JSON: dicts, lists, tuples and named tuples of this package."""
+    """A structure of results as JSON: dicts, lists, tuples, named tuples and data classes of this
+    package.
+    """
     if isinstance(tree, dict):
         return ["dict", {name: _words(value) for name, value in tree.items()}]
+    if isinstance(tree, str):
+        return ["str", tree]
+    if dataclasses.is_dataclass(tree):
+        fields = {field.name: getattr(tree, field.name) for field in dataclasses.fields(tree)}
+        return [name_of(type(tree)), _words(fields)[1]]
     if hasattr(tree, "_fields"):
         return [name_of(type(tree)), [_words(value) for value in tree]]
     if type(tree) in (tuple, list):
@@ -227,15 +235,23 @@ def _tree(words: Any) -> Any:
     if not isinstance(words, list):
         return words
     kind, content = words
-    if kind == "dict":
-        return {name: _tree(value) for name, value in content.items()}
+    if kind == "str":
+        return content
+    if isinstance(content, dict):
+        fields = {name: _tree(value) for name, value in content.items()}
+        return fields if kind == "dict" else _definition(kind)(**fields)
     parts = [_tree(value) for value in content]
     if kind in ("tuple", "list"):
         return tuple(parts) if kind == "tuple" else parts
+    return _definition(kind)(*parts)
+
+
+def _definition(kind: str) -> Any:
+    """The class of these words, one of this package."""
     module, name = kind.split(":")
     if module.split(".")[0] not in OURS:
         raise Unknown
-    return getattr(importlib.import_module(module), name)(*parts)
+    return getattr(importlib.import_module(module), name)
 
 
 F = TypeVar("F", bound=Callable[..., Any])

@@ -179,7 +179,7 @@ def with_noise_drawn(group: Group) -> Group:
     return group._replace(noise=_drawn(sensor, group.keys, samples=samples))
 
 
-@compiled("samples")
+@compiled("samples", keep=True)
 def _drawn(sensor: Any, keys: Any, samples: int) -> Any:
     """The noise of each run, (runs, sensors, samples)."""
     return jax.vmap(lambda key: jnp.stack(sensor.draw(key, samples)))(keys)

@@ -61,7 +61,7 @@ def midpoint_error(case: Case, clock: Clock, height: float, span: np.ndarray) ->
     return float(share) if np.isfinite(share) else np.inf
 
 
-@compiled("substeps", "arrays")
+@compiled("substeps", "arrays", keep=True)
 def _changes(plant: Any, x: Any, u: Any, dt: Any, substeps: int, arrays: bool) -> Any:
     """Squared difference of the midpoint rule and RK4 over one sample from each state of `x`, and
     the squared change of the level.

@@ -12,6 +12,7 @@ import pytest
 
 import jaxtank
 from jaxtank import measures, presets
+from jaxtank.loop import saved_rows
 from jaxtank.loop.run import evaluate_compiled
 from jaxtank.xla import jit, program_cache, signatures
 
@@ -28,9 +29,12 @@ clock = jaxtank.Clock(dt=case.clock.dt, duration=100 * case.clock.dt)
 names = ["rms_error_total", "input_travel", "settling_time"]
 found = jaxtank.evaluate(case.loop, clock, names)
 slopes = jaxtank.sensitivities(case.loop, clock, names[:1], {"controller.r_w": 0.02})
-flat = [v for part in (found, *slopes[:2]) for v in part.values()] + [slopes[2]]
+run = jaxtank.simulate(case.loop, clock, save_every=10)
+flat = [v for part in (found, *slopes[:2]) for v in part.values()] + [slopes[2], run.x, run.u]
 print(json.dumps([[float(x).hex() for x in jax.numpy.ravel(v)] for v in flat]))
 """
+
+LARGE = ["evaluate_compiled", "sensitivities_compiled", "simulate_compiled"]
 
 
 def run(folder):
@@ -41,7 +45,7 @@ def run(folder):
     )
     assert done.returncode == 0, done.stderr
     lines = [line for line in done.stderr.splitlines() if "Compiling" in line]
-    large = [n for n in ("evaluate_compiled", "sensitivities_compiled") if n in " ".join(lines)]
+    large = [n for n in LARGE if n in " ".join(lines)]
     return json.loads(done.stdout), large
 
 
@@ -54,14 +58,14 @@ def test_a_program_that_is_known_is_not_traced_and_gives_the_same_bits(tmp_path)
     """With LAPACK in it, whose functions a new process has not looked up yet; and damaged."""
     folder = tmp_path / "kept"
     plain, compiled = run("none")
-    assert compiled == ["evaluate_compiled", "sensitivities_compiled"]
+    assert compiled == LARGE
     first, compiled = run(folder)
-    assert len(compiled) == 2 and len(whole(folder)) == 2
+    assert len(compiled) == 3 and len(whole(folder)) == 3
     assert any(b'"lapack": true' in path.read_bytes()[:300] for path in whole(folder))
     second, compiled = run(folder)
     assert compiled == [] and plain == first == second
     assert not list(folder.glob("*/*.tried"))
-    one, other = whole(folder)
+    one, other, _ = whole(folder)
     one.with_name(f"{one.name}.tried").touch()  # a process ended in its first run
     other.write_bytes(other.read_bytes()[:-50])
     third, compiled = run(folder)
@@ -138,6 +142,17 @@ def test_inside_a_transformation_nothing_is_kept(folder):
     difference = (cost(np.array([1.0 + step])) - cost(np.array([1.0 - step]))) / (2 * step)
     assert slope == pytest.approx(float(difference), rel=1e-5)
     assert len(names_of(folder)) == 1  # that of the two runs
+
+
+def test_a_structure_of_results_is_read_as_it_was_written():
+    case = presets.find("cascaded/pi")
+    shape = lambda loop: saved_rows.simulate_compiled(loop, case.clock, None, 1)
+    structure = jax.tree.structure(jax.eval_shape(shape, case.loop))
+    words = jit._words(jax.tree.unflatten(structure, range(structure.num_leaves)))
+    read = jit._tree(json.loads(json.dumps(words)))
+    assert jax.tree.structure(read) == structure and jax.tree.leaves(read)[:2] == [0, 1]
+    with pytest.raises(signatures.Unknown):
+        jit._tree(["os:stat_result", {}])
 
 
 def test_names_of_static_values_are_exact():
