@@ -209,11 +209,15 @@ def printed(report):
     return terminal(report, coloured(sys.stdout), advice=True)
 
 
+def show_end(args):
+    """Show that the search is over, and what is still to be done."""
+    phase.show("writing results and pictures" if args.out else "working out what to report")
+
+
 def finish(result, args):
     """Write a result to --out and print it; return the paths that were written."""
     written = []
-    if args.out:
-        phase.show("writing results and pictures")
+    show_end(args)
     try:
         written = result.save(args.out, args.line) if args.out else []
     finally:  # a full disk costs the files, not the printed result; and the checkpoint is kept

@@ -18,8 +18,9 @@ from tuning.cli.steps import (
     printed,
     report_unreachable,
     report_written,
+    show_end,
 )
-from tuning.cli.terminal import Line, phase
+from tuning.cli.terminal import Line
 
 LONGEST = 1e7
 """Longest planned experiment [s]: four months."""
@@ -178,7 +179,7 @@ def learn(args):
         raise InputError("learn needs --data CSV, the log of a batch that ran with this rig")
     case = open_case(args)
     import tuning
-    from tuning.cli.commands.tuning import EXIT
+    from tuning.cli.commands.tuning import EXIT, Progress
     from tuning.identification.prediction import achieved
     from tuning.report.document import Report
     from tuning.report.prediction import achieved_table
@@ -188,14 +189,19 @@ def learn(args):
     line.compiling("the simulation and its derivatives", 10)
     fit = tuning.identify(case, logs, gap=args.gap, seed=args.seed)
     parts: dict[str, Any] = {"identification": fit}
-    if fit.identifiable:
-        filtered = args.safety_filter is not False
-        answer = tuning.tune(fit.identified, safety_filter=filtered, seed=args.seed)
-        parts["tuning"] = answer
     line.end()
+    code = STATUS[fit.status]
+    if fit.identifiable:
+        progress, filtered = Progress("", args.quiet), args.safety_filter is not False
+        answer = tuning.tune(
+            fit.identified, safety_filter=filtered, seed=args.seed, progress=progress
+        )
+        progress.line.end()
+        parts["tuning"] = answer
+        code = progress.code if progress.stop else EXIT[answer.status]
     last, written = list(parts.values())[-1], []
+    show_end(args)
     if args.out:
-        phase.show("writing results and pictures")
         written = fit.save(f"{args.out}/identified", args.line)
         written = last.save(args.out, args.line) if last is not fit else written
     payload = {"case": case.name, "achieved": rows}
@@ -205,7 +211,7 @@ def learn(args):
     texts = [printed(table), *(printed(part.report()) for part in parts.values())]
     print_result(args, payload, lambda: "\n\n".join(texts))
     report_written(written, args)
-    return STATUS[fit.status] if last is fit else EXIT[last.status]
+    return code
 
 
 def _report_next(args, result, written):
