@@ -30,8 +30,12 @@ PREAMBLE = 20
 MISSING = {
     *("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "---", "bad", "no data", "error"),
     *("bad input", "i/o timeout", "comm fail", "scan off", "pt created", "shutdown", "invalid"),
+    *("configure", "over range", "under range", "over-range", "under-range", "out of serv", "err"),
+    *("bad total", "no result", "not connect", "timeout", "#value!", "#div/0!", "#ref!", "#num!"),
+    *("****", "1.#qnan", "-1.#ind", "[-11059] no good data for calculation"),
 }
 """Words in place of a number, in lower case."""
+EMPTY = "leave a missing reading empty"
 ORDERS = ("day-first", "month-first", "h:m", "m:s")
 """How dates such as 03/11/2026, and times such as 14:05, are read where they can be read twice."""
 
@@ -366,14 +370,15 @@ def _refused(table: Table, column: int, wrong: Counter[str], first: dict[str, in
     if len(cell) > LONGEST_CELL:
         what = f"a cell of {len(cell)} characters is no number"
     elif NUMBERS["."].fullmatch(cell) and re.search(r"[eE]", cell):
-        what = f"{cell!r} is not finite; leave a missing reading empty"
+        what = f"{cell!r} is not finite"
     else:
         often = f" ({wrong[cell]} times)" if wrong[cell] > 1 else ""
         sign = "" if table.decimal == "." else ", where the decimal sign is a comma"
         what = f"{shortened(cell)} is not a number{often}{sign}"
     more = ", ".join(shortened(other) for other in others[:3])
     more = f"; nor is {more}" + f" and {len(others) - 3} more" * (len(others) > 3) if more else ""
-    return f"{table.where(column, first[cell])}: {what}{more}"
+    few = 2 * wrong.total() < len(table.columns[column].cells)
+    return f"{table.where(column, first[cell])}: {what}{more}" + f"; {EMPTY}" * few
 
 
 CLOCK = (

@@ -63,6 +63,9 @@ READ = {
     "long, with tags of the plant": long(TAGS),
     "long, sorted by tag, with another tag": long(
         [*reversed(TAGS), (f"{STAMPS[0]}Z", "TT101.PV", 20.5, "Good")]),
+    "long, topics and payloads": long([row[:3] for row in TAGS], "time,topic,payload"),
+    "long, fields of annotated CSV": long(
+        [("", 0, *row[:3]) for row in TAGS], "#group,false\n,table,_time,_field,_value"),
     "zones, other order, other columns, capitals": wide(
         ["TT101 [°C]", "lt102 (MM)", "Time", "lt101 (MM)", "p-101 (PCT)"], T, 1000 * Y[:, 1],
         [f"{t}+01:00" for t in STAMPS], 1000 * Y[:, 0], U),
@@ -100,6 +103,9 @@ REFUSED = {
                                     FLOW * 0.06, *Y.T),
     "units that are none": wide(["t [s]", "P101 [%]", "LT101 [metre above]", "LT102 [masl]"], T, U,
                                 *Y.T),
+    "an input in mA": wide(["t [s]", "P101 [mA]", "LT101", "LT102"], T, 4 + 0.16 * U, *Y.T),
+    "setpoint, value and output of a controller": wide(
+        ["t [s]", "LIC101.SP", "LIC101.PV", "LIC101.OUT", "LT102"], T, 9 * U, Y[:, 0], U, Y[:, 1]),
     "all at once": wide(["when", "FIC101 [%]", "Lvl 101 [m]", "LT102 [x]"], AMERICAN, U, *Y.T),
 }  # fmt: skip
 
