@@ -1,5 +1,6 @@
 """The report of an Identification, and of a planned experiment: text, JSON, pictures and files."""
 
+import dataclasses
 import warnings
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from jaxtank.core.tree import get_value
 from jaxtank.core.units import local
 from tuning.identification import residuals
 from tuning.identification.confidence import at_search_bounds
+from tuning.identification.identified_case import LACKS
 from tuning.problem import provenance
 from tuning.report import verdict as verdicts
 from tuning.report.advice import Advice, changes, listed
@@ -137,7 +139,7 @@ def _structure(fit):
     if fit.structure.clean:
         return ["no test rejects the structure of the rig"]
     for cause in causes:
-        which = f"{cause.kind}:{','.join(map(str, np.ravel(cause.where)))}"
+        which = _option(cause)
         value = f", {_amount(cause)}" if cause.value is not None else ""
         need = _named(fit, cause.kind, cause.where)
         words.append(f"the data require {need}{value}; to add it to the rig: --accept {which}")
@@ -157,6 +159,24 @@ def _structure(fit):
             " tests curves of sensors, outlets and areas)"
         )
     return words
+
+
+def _option(cause):
+    """Return a cause as --accept takes it."""
+    return f"{cause.kind}:{','.join(map(str, np.ravel(cause.where)))}"
+
+
+def lacking(fit):
+    """Return the causes that the data require and the rig does not have, as --accept takes them."""
+    causes = [] if fit.status == "interrupted" else fit.structure.causes
+    return [_option(cause) for cause in causes]
+
+
+def _to_write(fit):
+    """Return the identified case; its name, with which answers begin, says what it lacks."""
+    case, lacks = fit.identified, lacking(fit)
+    name = f"{case.name}{LACKS}{listed(lacks)}"
+    return dataclasses.replace(case, name=name) if lacks else case
 
 
 def _explained(fit):
@@ -350,7 +370,7 @@ def report(fit, page=False):
         ("parameters with an interval", f"{certain} of {len(fit.parameters)}"),
         ("samples", sum(log.samples for log in fit.estimation.logs)),
     ]
-    rig, why = rig_text(fit.identified) if page and fit.identifiable else (None, None)
+    rig, why = rig_text(_to_write(fit)) if page and fit.identifiable else (None, None)
     simulations = sum(s["evaluations"] for s in fit.starts)
     more = [] if fit.status == "interrupted" else _structure(fit)[1:]
     return Report(
@@ -389,6 +409,8 @@ def advice_of(fit):
     if fit.status in ("not_converged", "interrupted"):
         ended = "was interrupted" if fit.status == "interrupted" else "has not converged"
         to_set = f"set nothing: the search {ended}"
+    elif lacking(fit):
+        to_set = "set nothing: the values below are those of a rig without it"
     rest = [
         f"{name} {verdicts.shown(rmse)} {unit}"
         for (name, unit), rmse in zip(fit.channels, fit.quality["rmse"])
@@ -578,7 +600,7 @@ def save(fit, folder, command=None):
     """Write result.json, fit.csv, figures, report.html and, if identifiable, rig.toml."""
     from jaxtank.plots import run as plots
 
-    rig, why = rig_text(fit.identified) if fit.identifiable else (None, None)
+    rig, why = rig_text(_to_write(fit)) if fit.identifiable else (None, None)
     payload = json_of(fit)
     if why:
         warnings.warn(why, stacklevel=3)  # the line that called fit.save

@@ -180,7 +180,7 @@ def learn(args):
     import tuning
     from tuning.cli.commands.tuning import EXIT
     from tuning.identification.prediction import achieved
-    from tuning.report.document import Report
+    from tuning.report.document import Report, Text
     from tuning.report.prediction import achieved_table
 
     logs, line = read_logs(args, case), Line(args.quiet)
@@ -201,7 +201,8 @@ def learn(args):
     payload = {"case": case.name, "achieved": rows}
     payload |= {name: part.to_json() for name, part in parts.items()}
     payload["verdict"] = last.to_json()["verdict"]
-    table = Report("", "", None, [], [achieved_table(rows)])
+    whose = Text(["errors: to the setpoints of the rig, whatever those of the batch were"])
+    table = Report("", "", None, [], [achieved_table(rows), whose])
     texts = [printed(table), *(printed(part.report()) for part in parts.values())]
     print_result(args, payload, lambda: "\n\n".join(texts))
     report_written(written, args)
@@ -228,7 +229,12 @@ def _report_next(args, result, written):
 
 def _next_command(result, file):
     """Return the next step for the rig that was written to `file`."""
+    from tuning.report.identification import lacking
+
     case, why = result.proposed
+    if lacks := lacking(result):
+        options = " ".join(f"--accept {cause}" for cause in lacks)
+        return f"{file} lacks what the data require: identify again with {options} before you tune"
     if why:
         return f"jaxtank: {file}: note: --law {result.law}: {why}"
     if case.free:
