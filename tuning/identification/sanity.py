@@ -16,7 +16,7 @@ JUMP = 8.0
 
 
 class Oddity(NamedTuple):
-    """Something odd in experiment data; kind: frozen, saturated, spike, still or off."""
+    """Something odd in experiment data; kind: frozen, saturated, spike, held, still or off."""
 
     kind: str
     log: str
@@ -29,7 +29,7 @@ class Oddity(NamedTuple):
     @property
     def alters_fit(self) -> bool:
         """Whether the fit describes readings that the tanks did not have."""
-        return self.kind in ("frozen", "saturated", "spike")
+        return self.kind in ("frozen", "saturated", "spike", "held")
 
 
 def oddities(log: Log, loop=None) -> list[Oddity]:
@@ -68,6 +68,20 @@ def _of_level(log, c, ends):
             yield kind, stop - start, t[start], y[start]
     if (k := _spikes(y)).size:
         yield "spike", k.size, t[k[0]], y[k[0]]
+    repeats = 1 + np.flatnonzero(np.diff(y) == 0.0)
+    if (band := _band(y)) > 0.0:
+        yield "held", repeats.size, t[repeats[0]], band
+
+
+def _band(y):
+    """Return the least change of readings that a log writes on change and repeats until then, 0 of
+    others: most are repeated, and values are finer than their changes.
+    """
+    changes = np.abs(np.diff(y))
+    changes = changes[changes > 0.0]
+    if changes.size < SHORTEST or 2 * changes.size > len(y) - 1:
+        return 0.0
+    return float(changes.min()) if np.diff(np.unique(y)).min() < 0.5 * changes.min() else 0.0
 
 
 def _stuck(y):

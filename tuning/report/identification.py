@@ -75,6 +75,8 @@ ODD = {
     " end of what its sensor reads: leave these cells empty where the level went on",
     "spike": "{log}: {where} has {count} that jump away and back, the first {value:.6g} {unit} at"
     " {first:g} s: leave them empty, or --loss huber",
+    "held": "{log}: {where} repeats {count} until it has changed by {value:.6g} {unit}, written on"
+    " change: leave the repeated cells empty",
     "off": "{log}: {where} is off throughout: these data tell nothing of its gain",
     "still": "{log}: {where} is {value:.6g} {unit} throughout: its gain is known only from the"
     " balance with the other flows",
