@@ -145,11 +145,16 @@ def _structure(fit):
         value = f", {_amount(cause)}" if cause.value is not None else ""
         need = _named(fit, cause.kind, cause.where)
         words.append(f"the data require {need}{value}; to add it to the rig: --accept {which}")
-        if cause.equivalent:
-            others = " or ".join(_named(fit, kind, where) for kind, where in cause.equivalent)
+        others = [_named(fit, kind, where) for kind, where in cause.equivalent]
+        logs = [log for log in fit.estimation.logs if log.hold == "first-order"]
+        late = cause.value if cause.kind in LATE and cause.value is not None else np.inf
+        if any(late < np.diff(log.t).max() for log in logs):
+            others.append("inputs that step at each row (--hold zero-order)")
+        if others:
             tell = EXPERIMENTS[cause.kind]
             words.append(
-                f"these data cannot distinguish it from {others}; an experiment that can: {tell}"
+                f"these data cannot distinguish it from {' or '.join(others)}; an experiment that"
+                f" can: {tell}"
             )
     if not fit.structure.white:
         residual = (
@@ -197,6 +202,10 @@ def _named(fit, kind, where):
 
 PUMPS = ("pump-delay", "pump-lag", "dead-zone", "pump-curve")
 """Kinds of causes located at a pump."""
+
+
+LATE = ("pump-delay", "pump-lag")
+"""Those that look like inputs which follow no line from row to row."""
 
 
 def _amount(cause):
