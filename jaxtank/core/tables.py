@@ -434,6 +434,7 @@ def seconds(table: Table, column: int, order: str = "") -> np.ndarray:
 
     order: one of ORDERS, for times that can be read twice; without it they raise Ambiguous.
     """
+    table = _unit_in_cells(table, column)
     (_, _, unit, cells) = table.columns[column]
 
     def place(k: int) -> str:
@@ -456,6 +457,18 @@ def seconds(table: Table, column: int, order: str = "") -> np.ndarray:
     if not dated and t.max() < DAY:  # times of a day go on over midnight
         t += DAY * np.cumsum(np.diff(t, prepend=t[0]) < -DAY / 2)
     return t - t[0]
+
+
+def _unit_in_cells(table: Table, column: int) -> Table:
+    """Return the table with the unit that each cell of a column has, as durations of MATLAB."""
+    old = table.columns[column]
+    word = re.fullmatch(r"[\d.,]+ ([a-z]+)", old.cells[0])
+    if old.unit or not word or not all(cell.endswith(f" {word[1]}") for cell in old.cells):
+        return table
+    cells = [cell.removesuffix(word[1]).strip() for cell in old.cells]
+    columns = [*table.columns]
+    columns[column] = old._replace(unit=word[1], cells=cells)
+    return table._replace(columns=columns)
 
 
 def _numbers_as_times(table: Table, column: int, unit: str | None) -> np.ndarray:

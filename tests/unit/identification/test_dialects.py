@@ -81,6 +81,8 @@ READ = {
         ["elapsed", "P101 [%]", "LT101 [l]", "LT102 [L]"],
         [str(dt.timedelta(seconds=s)) for s in T], U, 500 * Y[:, 0], 250 * Y[:, 1],
         above="Trend export\n# by hand\n"),
+    "durations with their unit, as of MATLAB": wide(
+        ["Time", "P101", "LT101", "LT102"], [f"{s / 60:.9g} min" for s in T], U, *Y.T),
     "minutes, thin spaces, UTF-16": wide(
         ["t [min]", "P101 [%]", "LT101 [µm]".replace("µm", "mm"), "LT102 [mm]"], T / 60, U,
         [f"{1000 * y:.6f}" for y in Y[:, 0]], [f"{1000 * y:,.6f}".replace(",", "\u2009")
