@@ -57,7 +57,8 @@ def replay(path: str | Path, data: str | Path) -> dict[str, Any]:
     ----------
     path : an exported controller: NAME.c (with NAME.h beside it), NAME.js or NAME.fmu
     data : log with a row of each period: t [s], y1, .. (or h1, ..), r1, .., u1, .. (or pump1, ..),
-        and applied1, .. where pumps have a lag, delay or dead zone behind the inputs of the controller
+        and applied1, .. where pumps have a lag, delay or dead zone behind the inputs of the
+        controller
 
     Returns
     -------
