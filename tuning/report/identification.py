@@ -179,7 +179,7 @@ def lacking(fit):
     return [_option(cause) for cause in causes]
 
 
-def _to_write(fit):
+def marked(fit):
     """Return the identified case; its name, with which answers begin, says what it lacks."""
     case, lacks = fit.identified, lacking(fit)
     name = f"{case.name}{LACKS}{listed(lacks)}"
@@ -381,7 +381,7 @@ def report(fit, page=False):
         ("parameters with an interval", f"{certain} of {len(fit.parameters)}"),
         ("samples", sum(log.samples for log in fit.estimation.logs)),
     ]
-    rig, why = rig_text(_to_write(fit)) if page and fit.identifiable else (None, None)
+    rig, why = rig_text(marked(fit)) if page and fit.identifiable else (None, None)
     simulations = sum(s["evaluations"] for s in fit.starts)
     more = [] if fit.status == "interrupted" else _structure(fit)[1:]
     return Report(
@@ -611,7 +611,7 @@ def save(fit, folder, command=None):
     """Write result.json, fit.csv, figures, report.html and, if identifiable, rig.toml."""
     from jaxtank.plots import run as plots
 
-    rig, why = rig_text(_to_write(fit)) if fit.identifiable else (None, None)
+    rig, why = rig_text(marked(fit)) if fit.identifiable else (None, None)
     payload = json_of(fit)
     if why:
         warnings.warn(why, stacklevel=3)  # the line that called fit.save

@@ -181,6 +181,7 @@ def learn(args):
     from tuning.cli.commands.tuning import EXIT
     from tuning.identification.prediction import achieved
     from tuning.report.document import Report, Text
+    from tuning.report.identification import marked
     from tuning.report.prediction import achieved_table
 
     logs, line = read_logs(args, case), Line(args.quiet)
@@ -190,7 +191,7 @@ def learn(args):
     parts: dict[str, Any] = {"identification": fit}
     if fit.identifiable:
         filtered = args.safety_filter is not False
-        answer = tuning.tune(fit.identified, safety_filter=filtered, seed=args.seed)
+        answer = tuning.tune(marked(fit), safety_filter=filtered, seed=args.seed)
         parts["tuning"] = answer
     line.end()
     last, written = list(parts.values())[-1], []
