@@ -101,6 +101,9 @@ def read_table(path: str | Path, decimal: str = "") -> Table:
     rows = list(_sheet(data, name) if spreadsheet else _rows(_text(data, name), name))
     head, header, body = _head_and_body(rows, name)
     units = [""] * len(header)
+    if len(body) > 1 and _is_units(body[1][1], len(header)):
+        above = [cell.strip() for cell in body[0][1] if cell.strip()]
+        body = body if any(map(_like_value, above)) else body[1:]  # without descriptions
     if body and _is_units(body[0][1], len(header)):
         units, body = [unit.strip().strip("[]()") for unit in body[0][1]], body[1:]
     if not body:

@@ -73,6 +73,10 @@ READ = {
         ["Date", "P101", "LT101", "LT102"],
         ["", *(f"{(t - dt.datetime(1899, 12, 30)) / dt.timedelta(days=1):.10f}" for t in WHEN)],
         ["%", *U], ["cm", *(100 * Y[:, 0])], ["cm", *(100 * Y[:, 1])], separator="\t"),
+    "rows of descriptions and units": wide(
+        ["Tag", "P101.CV", "LT101.PV", "LT102.PV"], ["Description", "Units", *STAMPS],
+        ['"Feed pump, command"', "%", *U], ["Level", "cm", *(100 * Y[:, 0])],
+        ["Level", "cm", *(100 * Y[:, 1])]),
     "date and time apart, newest first": wide(
         ["Date", "Time", "P101 [%]", "LT101 [m]", "LT102 [m]"],
         [t.strftime("%d.%m.%Y") for t in WHEN][::-1], [t.strftime("%H:%M:%S") for t in WHEN][::-1],
