@@ -130,6 +130,10 @@ def _groups(table):
             groups.setdefault("t", []).append(i)
         elif match:
             groups.setdefault(match[1].lower(), []).append(i)
+    number = lambda i: int("0" + re.sub(r"\D", "", table.columns[i].name))
+    for name, columns in groups.items():
+        if all(re.fullmatch(rf"{name}\d+", table.columns[i].name.lower()) for i in columns):
+            columns.sort(key=number)  # y1 is the first level wherever it stands
     return groups
 
 
