@@ -65,6 +65,11 @@ def spiked(y):
     y[[50, 300, 431], 0] += [0.3, -0.2, 0.25]
 
 
+def dropped(y):
+    """A transmitter that reads 0 for three samples, between two steps of the pump."""
+    y[205:208, 0] = 0.0
+
+
 def held(y):
     """Compression by exception: written when it has changed by 0.02 m, and repeated until then."""
     for k in range(1, len(y)):
@@ -77,6 +82,7 @@ def held(y):
         (frozen, ("frozen", "h2")),
         (saturated, ("saturated", "h2")),
         (spiked, ("spike", "h1")),
+        (dropped, ("spike", "h1")),
         (held, ("held", "h1")),
     ],
 )
