@@ -100,12 +100,7 @@ def read_table(path: str | Path, decimal: str = "") -> Table:
     spreadsheet = data.startswith(b"PK\x03\x04")
     rows = list(_sheet(data, name) if spreadsheet else _rows(_text(data, name), name))
     head, header, body = _head_and_body(rows, name)
-    units = [""] * len(header)
-    if len(body) > 1 and _is_units(body[1][1], len(header)):
-        above = [cell.strip() for cell in body[0][1] if cell.strip()]
-        body = body if any(map(_like_value, above)) else body[1:]  # without descriptions
-    if body and _is_units(body[0][1], len(header)):
-        units, body = [unit.strip().strip("[]()") for unit in body[0][1]], body[1:]
+    units, body = _units_and_samples(body, len(header))
     if not body:
         raise DataError(f"{name}: has a header, but no samples")
     cells = [_widened(row, len(header), f"{name}, line {line}") for line, row in body]
@@ -115,6 +110,18 @@ def read_table(path: str | Path, decimal: str = "") -> Table:
         columns.append(Column(text, stem, stated or unit or None, list(values)))
     sign = decimal or _decimal(columns, name)
     return Table(name, columns, [line for line, _ in body], head, sign)
+
+
+def _units_and_samples(
+    body: list[tuple[int, list[str]]], width: int
+) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return (units, "" where none are stated; the rows below) of the rows below the names."""
+    if len(body) > 1 and _is_units(body[1][1], width):
+        above = [cell.strip() for cell in body[0][1] if cell.strip()]
+        body = body if any(map(_like_value, above)) else body[1:]  # without descriptions
+    if body and _is_units(body[0][1], width):
+        return [unit.strip().strip("[]()") for unit in body[0][1]], body[1:]
+    return [""] * width, body
 
 
 def _head_and_body(

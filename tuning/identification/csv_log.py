@@ -4,7 +4,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -418,18 +418,22 @@ class LogFile:
         other = self._as_level if kind == "h" else self._as_input
         result = other(number, values, written, base, self._label(slot))
         if result is None:
-            usual = INPUT_UNITS if kind == "pump" else LEVEL_UNITS
-            names = [name for name in usual if factor(name, base)] or [base]
-            names += ["%", f"{base}^3"] * (kind == "h" and factor(base, "m") is not None)
-            shares = [share for share in ("%", "mA") if factor(share, base) is None]
-            names += [f"{share} of {self._top(slot)}" for share in shares if kind == "pump"]
-            where = self.taken[slot].table.where(self.taken[slot].column)
-            self.in_doubt = True
-            raise DataError(
-                f"{where}: {written!r} is no unit of a {KINDS[kind]}: must be one of"
-                f" {', '.join(names)}"
-            )
+            self._refuse_unit(slot, base, written)
         return result, False
+
+    def _refuse_unit(self, slot: str, base: str, written: str) -> NoReturn:
+        """Raise DataError with the units that the column of a slot may have."""
+        kind = self.slots[slot][0]
+        usual = INPUT_UNITS if kind == "pump" else LEVEL_UNITS
+        names = [name for name in usual if factor(name, base)] or [base]
+        names += ["%", f"{base}^3"] * (kind == "h" and factor(base, "m") is not None)
+        shares = [share for share in ("%", "mA") if factor(share, base) is None]
+        names += [f"{share} of {self._top(slot)}" for share in shares if kind == "pump"]
+        where = self.taken[slot].table.where(self.taken[slot].column)
+        self.in_doubt = True
+        raise DataError(
+            f"{where}: {written!r} is no unit of a {KINDS[kind]}: must be one of {', '.join(names)}"
+        )
 
     def _as_level(
         self, tank: int, values: np.ndarray, unit: str, base: str, label: str
