@@ -142,6 +142,13 @@ def quantity(where: str, text: str, unit: str) -> float:
         )
     value, name = float(number[0]), name.strip()
     size = factor(name, unit)
+    if size is not None and "%" in unit.partition("/")[2] and "%" not in name:  # a hundredth of it?
+        top, _, bottom = name.partition("/")
+        each = f"{top}/({bottom} %)" if bottom else f"{top}/%"
+        raise InputError(
+            f'{where} = {shortened(text)}: for each %, or for 100 %? Write "{value:g} {each}" or'
+            f' "{value / 100:g} {each}"'
+        )
     if size is not None:
         return value * size
     needed = "%, or have no unit" if unit == "-" else f"{unit}, or in a unit that converts to it"

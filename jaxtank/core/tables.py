@@ -30,8 +30,12 @@ PREAMBLE = 20
 MISSING = {
     *("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "---", "bad", "no data", "error"),
     *("bad input", "i/o timeout", "comm fail", "scan off", "pt created", "shutdown", "invalid"),
+    *("configure", "over range", "under range", "over-range", "under-range", "out of serv", "err"),
+    *("bad total", "no result", "not connect", "timeout", "#value!", "#div/0!", "#ref!", "#num!"),
+    *("****", "1.#qnan", "-1.#ind", "[-11059] no good data for calculation"),
 }
 """Words in place of a number, in lower case."""
+EMPTY = "leave a missing reading empty"
 ORDERS = ("day-first", "month-first", "h:m", "m:s")
 """How dates such as 03/11/2026, and times such as 14:05, are read where they can be read twice."""
 
@@ -96,9 +100,7 @@ def read_table(path: str | Path, decimal: str = "") -> Table:
     spreadsheet = data.startswith(b"PK\x03\x04")
     rows = list(_sheet(data, name) if spreadsheet else _rows(_text(data, name), name))
     head, header, body = _head_and_body(rows, name)
-    units = [""] * len(header)
-    if body and _is_units(body[0][1], len(header)):
-        units, body = [unit.strip().strip("[]()") for unit in body[0][1]], body[1:]
+    units, body = _units_and_samples(body, len(header))
     if not body:
         raise DataError(f"{name}: has a header, but no samples")
     cells = [_widened(row, len(header), f"{name}, line {line}") for line, row in body]
@@ -108,6 +110,18 @@ def read_table(path: str | Path, decimal: str = "") -> Table:
         columns.append(Column(text, stem, stated or unit or None, list(values)))
     sign = decimal or _decimal(columns, name)
     return Table(name, columns, [line for line, _ in body], head, sign)
+
+
+def _units_and_samples(
+    body: list[tuple[int, list[str]]], width: int
+) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return (units, "" where none are stated; the rows below) of the rows below the names."""
+    if len(body) > 1 and _is_units(body[1][1], width):
+        above = [cell.strip() for cell in body[0][1] if cell.strip()]
+        body = body if any(map(_like_value, above)) else body[1:]  # without descriptions
+    if body and _is_units(body[0][1], width):
+        return [unit.strip().strip("[]()") for unit in body[0][1]], body[1:]
+    return [""] * width, body
 
 
 def _head_and_body(
@@ -366,14 +380,15 @@ def _refused(table: Table, column: int, wrong: Counter[str], first: dict[str, in
     if len(cell) > LONGEST_CELL:
         what = f"a cell of {len(cell)} characters is no number"
     elif NUMBERS["."].fullmatch(cell) and re.search(r"[eE]", cell):
-        what = f"{cell!r} is not finite; leave a missing reading empty"
+        what = f"{cell!r} is not finite"
     else:
         often = f" ({wrong[cell]} times)" if wrong[cell] > 1 else ""
         sign = "" if table.decimal == "." else ", where the decimal sign is a comma"
         what = f"{shortened(cell)} is not a number{often}{sign}"
     more = ", ".join(shortened(other) for other in others[:3])
     more = f"; nor is {more}" + f" and {len(others) - 3} more" * (len(others) > 3) if more else ""
-    return f"{table.where(column, first[cell])}: {what}{more}"
+    few = 2 * wrong.total() < len(table.columns[column].cells)
+    return f"{table.where(column, first[cell])}: {what}{more}" + f"; {EMPTY}" * few
 
 
 CLOCK = (
@@ -429,6 +444,7 @@ def seconds(table: Table, column: int, order: str = "") -> np.ndarray:
 
     order: one of ORDERS, for times that can be read twice; without it they raise Ambiguous.
     """
+    table = _unit_in_cells(table, column)
     (_, _, unit, cells) = table.columns[column]
 
     def place(k: int) -> str:
@@ -451,6 +467,18 @@ def seconds(table: Table, column: int, order: str = "") -> np.ndarray:
     if not dated and t.max() < DAY:  # times of a day go on over midnight
         t += DAY * np.cumsum(np.diff(t, prepend=t[0]) < -DAY / 2)
     return t - t[0]
+
+
+def _unit_in_cells(table: Table, column: int) -> Table:
+    """Return the table with the unit that each cell of a column has, as durations of MATLAB."""
+    old = table.columns[column]
+    word = re.fullmatch(r"[\d.,]+ ([a-z]+)", old.cells[0])
+    if old.unit or not word or not all(cell.endswith(f" {word[1]}") for cell in old.cells):
+        return table
+    cells = [cell.removesuffix(word[1]).strip() for cell in old.cells]
+    columns = [*table.columns]
+    columns[column] = old._replace(unit=word[1], cells=cells)
+    return table._replace(columns=columns)
 
 
 def _numbers_as_times(table: Table, column: int, unit: str | None) -> np.ndarray:

@@ -56,8 +56,9 @@ def replay(path: str | Path, data: str | Path) -> dict[str, Any]:
     Parameters
     ----------
     path : an exported controller: NAME.c (with NAME.h beside it), NAME.js or NAME.fmu
-    data : log with a row for each period: t, y1, .. (or h1, ..), r1, .., u1, .. (or pump1, ..), and
-        applied1, .. where pumps have a lag, delay or dead zone behind the inputs of the controller
+    data : log with a row of each period: t [s], y1, .. (or h1, ..), r1, .., u1, .. (or pump1, ..),
+        and applied1, .. where pumps have a lag, delay or dead zone behind the inputs of the
+        controller
 
     Returns
     -------
@@ -129,6 +130,10 @@ def _groups(table):
             groups.setdefault("t", []).append(i)
         elif match:
             groups.setdefault(match[1].lower(), []).append(i)
+    number = lambda i: int("0" + re.sub(r"\D", "", table.columns[i].name))
+    for name, columns in groups.items():
+        if all(re.fullmatch(rf"{name}\d+", table.columns[i].name.lower()) for i in columns):
+            columns.sort(key=number)  # y1 is the first level wherever it stands
     return groups
 
 

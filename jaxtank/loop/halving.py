@@ -28,7 +28,8 @@ MOST = 4
 def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> list[str]:
     """One sentence on what half the step changes, or [] where nothing visible changes."""
     unstable = list(step_size.unstable_tanks(loop, clock))
-    if not unstable:
+    narrow = step_size.narrow_tanks(loop, clock)
+    if not unstable and not narrow:
         return []
     finer = dataclasses.replace(clock, substeps=2 * clock.substeps)
     (run, broken), (half, _) = (simulate_compiled(loop, c, key, 1) for c in (clock, finer))
@@ -46,7 +47,12 @@ def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> l
         f" {label_of(loop.plant, 'tank', tank)}"
         f" differs by {apart[:, tank].max():.3g} {length} at t = {time:g} s"
     )
-    if errors[tank] > MAX_ERROR:
+    if tank in narrow:
+        sentence += (
+            " (near its tip a step takes more than it holds: halve the step, by clock.substeps or"
+            " clock.dt, until this note is gone)"
+        )
+    elif errors[tank] > MAX_ERROR:
         remedy = max(unstable, key=lambda item: item.height).remedy
         tanks = labels_of(loop.plant, "tank", [item.tank for item in unstable])
         raise InputError(

@@ -96,9 +96,23 @@ def _slopes_of_elements(plant: Any) -> tuple[Any, Any]:
         height = np.maximum(x, SEEN * np.asarray(plant.rim, dtype=float) if plant.shapes else 0.0)
         section = np.stack([np.broadcast_to(v, len(heads)) for v in plant.sections(height.T)], 1)
     # near a tip a step that is too long misplaces a small volume only, which `bottom` keeps
-    narrow = [plant.bottom and shape in ("cone", "sphere") for shape in plant.shapes]
-    counted = 1.0 - np.array(narrow or [False] * n, dtype=float)
+    counted = 1.0 - _narrow(plant)
     return counted * np.max(slopes / section, axis=0), counted * np.max(joined / section, axis=0)
+
+
+def _narrow(plant: Any) -> Any:
+    """(n,) 1.0 of a tank with a tip below which `bottom` lets no level fall, else 0.0."""
+    narrow = [plant.bottom and shape in ("cone", "sphere") for shape in plant.shapes]
+    return np.array(narrow or [False] * plant.tanks, dtype=float)
+
+
+def narrow_tanks(loop: ClosedLoop, clock: Clock) -> list[int]:
+    """Tanks that may stand visibly too high: a step takes more from near the tip than it holds."""
+    plant: Any = loop.plant
+    if not getattr(plant, "shapes", ()) or not _narrow(plant).any():
+        return []
+    above = _overdrawn(plant, clock.dt / clock.substeps) > visible_heights(loop)
+    return np.flatnonzero(above & (_narrow(plant) > 0)).tolist()
 
 
 @jax.jit

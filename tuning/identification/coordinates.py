@@ -9,6 +9,9 @@ from scipy.linalg import block_diag
 
 from jaxtank.bounds import bounds
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import input_unit
+from jaxtank.core.quantities import factor
+from jaxtank.core.tables import unit_name
 from jaxtank.core.tree import get_value, split_index
 from jaxtank.signals.base import Constant
 
@@ -244,16 +247,27 @@ def default_free(loop, logs=()):
     if isinstance(loop.disturbance, Constant):
         sizes = enumerate(np.abs(np.asarray(loop.disturbance.level, dtype=float)).tolist())
         free |= {f"disturbance.level[{i}]": (-10 * v, 10 * v) for i, v in sizes if v}
-    return _without_idle(free, logs)
+    return _without_idle(free, loop, logs)
 
 
-def _without_idle(free, logs):
-    """Return `free` without gain and split of a pump that is off throughout all logs."""
+def _without_idle(free, loop, logs):
+    """Return `free` without gain and split of a pump that is off throughout all logs, and without
+    the gain by which a log's flows became inputs.
+    """
     if not logs:
         return free
     used = np.any([np.any(log.u != 0, axis=0) for log in logs], axis=0)
     off = [f"plant.{name}[{j}]" for j in np.flatnonzero(~used) for name in OF_PUMPS]
+    off += [f"plant.pump_gain[{j}]" for j in range(len(used)) if _is_flow(loop, logs, j)]
     return {name: ends for name, ends in free.items() if name not in off} or free
+
+
+def _is_flow(loop, logs, pump):
+    """Whether a log has flows of a pump whose input is none."""
+    length, drive = loop.units
+    units = [unit_name(log.units[1 + pump]) for log in logs if log.units is not None]
+    own = input_unit(loop.plant, pump, drive)
+    return any(factor(u, f"{length}^3/s") and factor(u, own) is None for u in units if u)
 
 
 def nominal(loop, names):

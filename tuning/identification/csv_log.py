@@ -4,7 +4,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -29,9 +29,20 @@ from jaxtank.plants.vessels import level_of
 from jaxtank.rig.sensors import in_span, spans_of
 from jaxtank.rig.validation import LOG_SETTINGS, log_keys, log_slots
 from tuning.identification.experiment import Log, check_hold, log
-from tuning.identification.signals import Signal, poor, rank, signals_of, time_columns
+from tuning.identification.signals import (
+    DRIVEN,
+    MEASURED,
+    OTHER,
+    Signal,
+    poor,
+    rank,
+    signals_of,
+    time_columns,
+)
 
 KINDS = {"pump": "pump", "h": "level"}
+SHARE = r"(%|mA)(?: of (.+))?"
+"""Units of a reading in a span, which may be stated."""
 
 
 class LogError(DataError):
@@ -407,22 +418,28 @@ class LogFile:
         other = self._as_level if kind == "h" else self._as_input
         result = other(number, values, written, base, self._label(slot))
         if result is None:
-            usual = INPUT_UNITS if kind == "pump" else LEVEL_UNITS
-            names = [name for name in usual if factor(name, base)] or [base]
-            names += ["%", f"{base}^3"] * (kind == "h" and factor(base, "m") is not None)
-            where = self.taken[slot].table.where(self.taken[slot].column)
-            self.in_doubt = True
-            raise DataError(
-                f"{where}: {written!r} is no unit of a {KINDS[kind]}: must be one of"
-                f" {', '.join(names)}"
-            )
+            self._refuse_unit(slot, base, written)
         return result, False
+
+    def _refuse_unit(self, slot: str, base: str, written: str) -> NoReturn:
+        """Raise DataError with the units that the column of a slot may have."""
+        kind = self.slots[slot][0]
+        usual = INPUT_UNITS if kind == "pump" else LEVEL_UNITS
+        names = [name for name in usual if factor(name, base)] or [base]
+        names += ["%", f"{base}^3"] * (kind == "h" and factor(base, "m") is not None)
+        shares = [share for share in ("%", "mA") if factor(share, base) is None]
+        names += [f"{share} of {self._top(slot)}" for share in shares if kind == "pump"]
+        where = self.taken[slot].table.where(self.taken[slot].column)
+        self.in_doubt = True
+        raise DataError(
+            f"{where}: {written!r} is no unit of a {KINDS[kind]}: must be one of {', '.join(names)}"
+        )
 
     def _as_level(
         self, tank: int, values: np.ndarray, unit: str, base: str, label: str
     ) -> np.ndarray | None:
         """Return levels of per cents of a span, or of volumes; None of another unit."""
-        if share := re.fullmatch(r"(%|mA)(?: of (.+))?", unit_name(unit)):
+        if share := re.fullmatch(SHARE, unit_name(unit)):
             low, high = spans_of(self.loop)[tank]
             if share[2]:
                 low, high = 0.0, quantity(f"{label}, {share[1]} of", share[2], base)
@@ -442,16 +459,34 @@ class LogFile:
     def _as_input(
         self, pump: int, values: np.ndarray, unit: str, base: str, label: str
     ) -> np.ndarray | None:
-        """Return inputs of flows, by the pump's gain; None of another unit."""
+        """Return inputs of shares of a range, or of flows by the pump's gain; None of others."""
         length, plant = self.loop.units[0], self.plant
+        if share := re.fullmatch(SHARE, unit_name(unit)):
+            if not share[2]:
+                return None  # of which range its controller writes is not known
+            high = quantity(f"{label}, {share[1]} of", share[2], base)
+            self._note(f"in {share[1]} of 0 to {high:g} {base}", label)
+            return np.asarray(in_span(values, share[1], (0.0, high)))
         size = factor(unit_name(unit), f"{length}^3/s") if factor(length, "m") else None
         curves = getattr(plant, "curves", ())
         plain = pump < len(getattr(plant, "feeds", ())) and not (curves and curves[pump])
         if size is None or not plain:
             return None
         gain = float(np.asarray(plant.pump_gain)[pump])
-        self._note(f"a flow: read as the input that gives it by the gain, {gain:.6g}", label)
+        self._note(
+            f"a flow: read as the input that gives it by the gain, {gain:.6g}, which this log"
+            " cannot tell",
+            label,
+        )
         return values * size / gain
+
+    def _top(self, slot: str) -> str:
+        """Return the upper limit of an input with its unit, as a span."""
+        number = self.slots[slot][1]
+        base = canonical(input_unit(self.plant, number, self.loop.units[1]))
+        high = float(np.asarray(self.loop.actuator.high)[number])
+        high = high if np.isfinite(high) else 10.0  # of no limit an example
+        return f"{100 * high:g} %" if base == "-" else f"{high:g} {base}"
 
     def table_text(self) -> str:
         """Return the [log] table of a rig file that reads the file, or that is to be completed."""
@@ -475,7 +510,9 @@ class LogFile:
     def _line_of_time(self) -> tuple[Any, str]:
         """Return (value, remark) of the line of the times."""
         if self.time is None:
-            return self.table.columns[0].header, "a guess: which column is the time?"
+            used = [signal.described.header for signal in self.taken.values()]
+            free = [c.header for c in self.table.columns if c.header not in used]
+            return (free or ["TIME"])[0], "a guess: which column is the time?"
         if self.time_read or self.time.unit or is_time(self.time.cells[0]):
             return self.time.header, ""
         return [self.time.header, "s"], "or min, h, d"
@@ -488,7 +525,10 @@ class LogFile:
         try:
             self._converted(slot, np.zeros(1))
         except DataError:
-            return [column.header, base], f"a guess: {printable(self._unit(slot))} is not read"
+            unit = printable(self._unit(slot))
+            if kind == "pump" and unit_name(unit) in ("%", "mA"):
+                return [column.header, f"{unit} of {self._top(slot)}"], "a guess: of which range?"
+            return [column.header, base], f"if its numbers are in {base}: {unit} is not read"
         stated, unit = split_header(column.header)[1], self._unit(slot) or base
         return (column.header if stated == unit else [column.header, unit]), ""
 
@@ -501,7 +541,9 @@ class LogFile:
             digits = re.findall(r"\d+", self._label(slot))[-1:]
             for signal in self.unused:
                 same = re.findall(r"\d+", signal.described.name)[-1:] == digits
-                suits = self._like_input(signal) == (kind == "pump")
+                words = set(re.split(r"[\W_]+", signal.described.name.lower()))
+                drives = words & DRIVEN or (not words & MEASURED and self._like_input(signal))
+                suits = bool(drives) == (kind == "pump") and not words & OTHER
                 if same and suits and not any(signal is other for other in guesses.values()):
                     guesses.setdefault(slot, signal)
         return guesses

@@ -211,7 +211,9 @@ def _other_units(log, column, values, unit, ends):
         and np.nanmin(cells) * size >= ends[0]
         and np.nanmax(cells) * size <= ends[1]
     ]
-    return f" Write it in the header, as {' or '.join(fits[:2])}" if fits else ""
+    if not fits:
+        return " Leave the cell empty where it stands for a failed reading"
+    return f" Write it in the header, as {' or '.join(fits[:2])}"
 
 
 class Check(NamedTuple):

@@ -119,7 +119,9 @@ def fast_noise(estimation, fit):
     reach.
     """
     steps = np.diff(residuals_of(estimation, fit), axis=1) / np.sqrt(2.0)
-    noise = np.sqrt(np.nanmean(steps**2, axis=(0, 1)))
+    known = np.isfinite(steps)  # of no two readings in a row there is none
+    squares = np.sum(steps**2, axis=(0, 1), where=known)
+    noise = np.sqrt(squares / np.where(known.any((0, 1)), known.sum((0, 1)), np.nan))
     return np.where(np.isfinite(noise), np.maximum(noise, 0.1 * estimation.noise), estimation.noise)
 
 

@@ -200,9 +200,12 @@ def _check_samples(data):
     for k in 1 + np.flatnonzero(np.diff(t) <= 0)[:1]:
         back = t[k - 1] - t[k]
         before = f"{back:g} s before that of" if back else "that of"
+        remedy = "delete one of the two rows, or write times with their seconds"
+        if back:
+            remedy = "sort the rows; of a clock that was set back, write the zone in each stamp"
         raise DataError(
             f"{data.where(k, 0)}: time {t[k]:.10g} s is {before} the sample before: times must"
-            " increase from sample to sample"
+            f" increase from sample to sample: {remedy}"
         )
 
 

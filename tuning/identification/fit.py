@@ -241,6 +241,10 @@ def _all(cache, partial, logs, counts, options, search):
     starts, seed, settings, progress = search
     fits, interrupted = _searches(cache, partial, starts, seed, settings, progress)
     best = solve(partial, partial.unknowns(_best(fits, logs[0].name)), **settings)
+    finer = partial.substeps_for(partial.unknowns(best)) if options["substeps"] is None else 0
+    if finer > partial.substeps:  # than the values of the case needed
+        partial.substeps = finer
+        best = solve(partial, partial.unknowns(best), **settings)
     estimation, best, validation = _of_all(partial, best, logs, counts, options, settings)
     estimation, best = _within_ranges(estimation, best, settings)
     if not np.isfinite(best.cost):

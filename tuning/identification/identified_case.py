@@ -27,6 +27,9 @@ from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps, ramps
 from tuning.identification.inputs import STATIC, with_inputs
 
+LACKS = ", lacks "
+"""Between the name of a rig and causes that the data require and the rig does not have."""
+
 
 def bare(plant):
     """Return a Case around a plant: ideal pumps and sensors, empty tanks, no controller."""
@@ -99,7 +102,10 @@ def identified_plant(result):
         uncertain |= rigs.uncovered(loop, name, share, set(names))
     covariance = (tuple(names), tuple(tuple(map(float, row)) for row in matrix)) if names else None
     return case.replace(
-        name=f"{case.name} identified", loop=loop, uncertain=uncertain, covariance=covariance
+        name=f"{case.name.partition(LACKS)[0]} identified",
+        loop=loop,
+        uncertain=uncertain,
+        covariance=covariance,
     )
 
 

@@ -86,7 +86,7 @@ class Identification(Result):
         What is not identifiable: {"words", "parameters" {name: factor}, "sd"}.
     oddities : list
         What is odd in the data: (kind, log, where, count, first, value), kind one of "frozen",
-        "saturated", "spike", "still", "off".
+        "saturated", "spike", "held", "still", "off".
     remedies : list of str
         Which experiments would identify it.
     starts : list

@@ -14,9 +14,12 @@ SHORTEST = 8
 JUMP = 8.0
 """Least jump of a spike, there and back, in noise, and over the changes beside it a half of it."""
 
+FEW = 5
+"""Most readings in a row that a spike has."""
+
 
 class Oddity(NamedTuple):
-    """Something odd in experiment data; kind: frozen, saturated, spike, still or off."""
+    """Something odd in experiment data; kind: frozen, saturated, spike, held, still or off."""
 
     kind: str
     log: str
@@ -29,7 +32,7 @@ class Oddity(NamedTuple):
     @property
     def alters_fit(self) -> bool:
         """Whether the fit describes readings that the tanks did not have."""
-        return self.kind in ("frozen", "saturated", "spike")
+        return self.kind in ("frozen", "saturated", "spike", "held")
 
 
 def oddities(log: Log, loop=None) -> list[Oddity]:
@@ -66,8 +69,23 @@ def _of_level(log, c, ends):
         if moved or _moves(others[start:stop]):
             kind = "saturated" if _at_end(y, y[start], ends) else "frozen"
             yield kind, stop - start, t[start], y[start]
-    if (k := _spikes(y)).size:
+    quiet = np.all(np.diff(log.u[present], axis=0) == 0, axis=1)
+    if (k := np.union1d(_spikes(y), _dips(y, quiet))).size:
         yield "spike", k.size, t[k[0]], y[k[0]]
+    repeats = 1 + np.flatnonzero(np.diff(y) == 0.0)
+    if (band := _band(y)) > 0.0:
+        yield "held", repeats.size, t[repeats[0]], band
+
+
+def _band(y):
+    """Return the least change of readings that a log writes on change and repeats until then, 0 of
+    others: most are repeated, and values are finer than their changes.
+    """
+    changes = np.abs(np.diff(y))
+    changes = changes[changes > 0.0]
+    if changes.size < SHORTEST or 2 * changes.size > len(y) - 1:
+        return 0.0
+    return float(changes.min()) if np.diff(np.unique(y)).min() < 0.5 * changes.min() else 0.0
 
 
 def _stuck(y):
@@ -108,13 +126,38 @@ def _at_end(y, value, ends):
     return any(near) or ((y == value).sum() > SHORTEST and value in (y.min(), y.max()))
 
 
+def _noise(y):
+    """Return the noise of readings from sample to sample, at least their resolution."""
+    step, bend = np.diff(y), np.diff(y, 2)
+    resolution = np.min(np.abs(step), where=step != 0.0, initial=np.inf)
+    return max(1.4826 * np.median(np.abs(bend)) / np.sqrt(6), resolution)
+
+
+def _dips(y, quiet):
+    """Return the samples of two to FEW readings that jump away together and back, as `_spikes` of
+    one, while no input changes (quiet, between readings).
+    """
+    if len(y) < SHORTEST:
+        return np.zeros(0, dtype=int)
+    found: list[int] = []
+    step, noise = np.abs(np.diff(y)), _noise(y)
+    for n in range(2, FEW + 1):
+        for k in range(1, len(y) - n - 2):  # k is the last before them, k + n + 1 the first after
+            if step[k] <= JUMP * noise or step[k + n] <= JUMP * noise:
+                continue
+            around, away = y[[k, k + n + 1]], y[k + 1 : k + n + 1]
+            jump = np.abs(away - around.mean()).min()
+            beside = max(step[k - 1], step[k + n + 1], np.ptp(around))
+            if jump > max(JUMP * noise, 5 * beside) and quiet[k - 1 : k + n + 2].all():
+                found += range(k + 1, k + n + 1)
+    return np.array(found, dtype=int)
+
+
 def _spikes(y):
     """Return the samples of single readings that jump away and back, as no level does."""
     if len(y) < SHORTEST:
         return np.zeros(0, dtype=int)
-    step, bend = np.diff(y), np.diff(y, 2)
-    resolution = np.min(np.abs(step), where=step != 0.0, initial=np.inf)
-    noise = max(1.4826 * np.median(np.abs(bend)) / np.sqrt(6), resolution)
+    step, noise = np.diff(y), _noise(y)
     there, back = step[1:-2], -step[2:-1]
     jump = np.where(there * back > 0, np.minimum(np.abs(there), np.abs(back)), 0.0)
     beside = np.maximum(np.abs(step[:-3]), np.abs(step[3:]))

@@ -23,9 +23,9 @@ WORDS = {
 """Names of a pump's input and a level, before their number."""
 TAG = {
     "tag", "tagname", "tagid", "name", "point", "pointname", "variable", "signal", "item",
-    "itemid", "sensor", "channel", "bezeichnung", "kanal",
+    "itemid", "sensor", "channel", "bezeichnung", "kanal", "topic", "field", "metric", "series",
 }
-VALUE = {"value", "val", "wert", "reading", "average", "valeur", "valor", "messwert"}
+VALUE = {"value", "val", "wert", "reading", "average", "valeur", "valor", "messwert", "payload"}
 UNIT = {"unit", "units", "uom", "eu", "einheit"}
 QUALITY = {"quality", "qual", "status", "q", "qly", "qualitat", "qualität"}
 """Names of the columns of a long table, a row for each value of a tag."""
@@ -36,6 +36,8 @@ OTHER = {
 """Words beside the name of a tank or a pump that mean another signal of it."""
 MEASURED = {"pv", "val", "value", "actual", "ist", "istwert", "avg", "mean", "measured", "act"}
 """Words beside it that mean its value."""
+DRIVEN = {"op", "out", "output", "cv", "mv", "co", "cmd", "command"}
+"""Words of a controller that mean its output, the input of a pump."""
 GOOD = {"good", "ok", "g", "valid", "gut", "true", "normal"}
 POOR = {
     "bad", "uncertain", "questionable", "substituted", "b", "u", "poor", "invalid", "false",

@@ -1,5 +1,6 @@
 """The report of an Identification, and of a planned experiment: text, JSON, pictures and files."""
 
+import dataclasses
 import warnings
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from jaxtank.core.tree import get_value
 from jaxtank.core.units import local
 from tuning.identification import residuals
 from tuning.identification.confidence import at_search_bounds
+from tuning.identification.identified_case import LACKS
 from tuning.problem import provenance
 from tuning.report import verdict as verdicts
 from tuning.report.advice import Advice, changes, listed
@@ -73,6 +75,8 @@ ODD = {
     " end of what its sensor reads: leave these cells empty where the level went on",
     "spike": "{log}: {where} has {count} that jump away and back, the first {value:.6g} {unit} at"
     " {first:g} s: leave them empty, or --loss huber",
+    "held": "{log}: {where} repeats {count} until it has changed by {value:.6g} {unit}, written on"
+    " change: leave the repeated cells empty",
     "off": "{log}: {where} is off throughout: these data tell nothing of its gain",
     "still": "{log}: {where} is {value:.6g} {unit} throughout: its gain is known only from the"
     " balance with the other flows",
@@ -137,15 +141,20 @@ def _structure(fit):
     if fit.structure.clean:
         return ["no test rejects the structure of the rig"]
     for cause in causes:
-        which = f"{cause.kind}:{','.join(map(str, np.ravel(cause.where)))}"
+        which = _option(cause)
         value = f", {_amount(cause)}" if cause.value is not None else ""
         need = _named(fit, cause.kind, cause.where)
         words.append(f"the data require {need}{value}; to add it to the rig: --accept {which}")
-        if cause.equivalent:
-            others = " or ".join(_named(fit, kind, where) for kind, where in cause.equivalent)
+        others = [_named(fit, kind, where) for kind, where in cause.equivalent]
+        logs = [log for log in fit.estimation.logs if log.hold == "first-order"]
+        late = cause.value if cause.kind in LATE and cause.value is not None else np.inf
+        if any(late < np.diff(log.t).max() for log in logs):
+            others.append("inputs that step at each row (--hold zero-order)")
+        if others:
             tell = EXPERIMENTS[cause.kind]
             words.append(
-                f"these data cannot distinguish it from {others}; an experiment that can: {tell}"
+                f"these data cannot distinguish it from {' or '.join(others)}; an experiment that"
+                f" can: {tell}"
             )
     if not fit.structure.white:
         residual = (
@@ -157,6 +166,24 @@ def _structure(fit):
             " tests curves of sensors, outlets and areas)"
         )
     return words
+
+
+def _option(cause):
+    """Return a cause as --accept takes it."""
+    return f"{cause.kind}:{','.join(map(str, np.ravel(cause.where)))}"
+
+
+def lacking(fit):
+    """Return the causes that the data require and the rig does not have, as --accept takes them."""
+    causes = [] if fit.status == "interrupted" else fit.structure.causes
+    return [_option(cause) for cause in causes]
+
+
+def marked(fit):
+    """Return the identified case; its name, with which answers begin, says what it lacks."""
+    case, lacks = fit.identified, lacking(fit)
+    name = f"{case.name}{LACKS}{listed(lacks)}"
+    return dataclasses.replace(case, name=name) if lacks else case
 
 
 def _explained(fit):
@@ -175,6 +202,10 @@ def _named(fit, kind, where):
 
 PUMPS = ("pump-delay", "pump-lag", "dead-zone", "pump-curve")
 """Kinds of causes located at a pump."""
+
+
+LATE = ("pump-delay", "pump-lag")
+"""Those that look like inputs which follow no line from row to row."""
 
 
 def _amount(cause):
@@ -350,7 +381,7 @@ def report(fit, page=False):
         ("parameters with an interval", f"{certain} of {len(fit.parameters)}"),
         ("samples", sum(log.samples for log in fit.estimation.logs)),
     ]
-    rig, why = rig_text(fit.identified) if page and fit.identifiable else (None, None)
+    rig, why = rig_text(marked(fit)) if page and fit.identifiable else (None, None)
     simulations = sum(s["evaluations"] for s in fit.starts)
     more = [] if fit.status == "interrupted" else _structure(fit)[1:]
     return Report(
@@ -389,6 +420,8 @@ def advice_of(fit):
     if fit.status in ("not_converged", "interrupted"):
         ended = "was interrupted" if fit.status == "interrupted" else "has not converged"
         to_set = f"set nothing: the search {ended}"
+    elif lacking(fit):
+        to_set = "set nothing: the values below are those of a rig without it"
     rest = [
         f"{name} {verdicts.shown(rmse)} {unit}"
         for (name, unit), rmse in zip(fit.channels, fit.quality["rmse"])
@@ -578,7 +611,7 @@ def save(fit, folder, command=None):
     """Write result.json, fit.csv, figures, report.html and, if identifiable, rig.toml."""
     from jaxtank.plots import run as plots
 
-    rig, why = rig_text(fit.identified) if fit.identifiable else (None, None)
+    rig, why = rig_text(marked(fit)) if fit.identifiable else (None, None)
     payload = json_of(fit)
     if why:
         warnings.warn(why, stacklevel=3)  # the line that called fit.save

@@ -51,8 +51,9 @@ def step_warnings(tuned, values, key=None, scenarios=()):
     for name, loop, clock, noise_key in runs:
         warnings = step_size.step_warnings(loop, clock)
         try:
-            if warnings:
-                halving_warnings(loop, clock, noise_key)
+            if warnings or step_size.narrow_tanks(loop, clock):
+                halved = halving_warnings(loop, clock, noise_key)
+                warnings = warnings or halved
         except InputError as error:
             return [f"{name}this answer's run is wrong, and so are its numbers: {error}"]
         sentences += [f"{name}{sentence}" for sentence in warnings]

@@ -34,6 +34,8 @@ class Subspace(Search):
         super().__init__(owner.evaluator, owner.last_finite, tolerance=tolerance)
         self.scale, self.owner, self.fixed = owner.scale, owner, z
         self.free: np.ndarray = np.asarray(free)
+        # what a point that is not finite falls back on has the derivatives of all parameters
+        self.last_finite = self.within(owner.last_finite)
 
     def full(self, z: Any) -> np.ndarray:
         """Return (P,) the point of the owner at z, values of the free parameters."""
@@ -45,18 +47,19 @@ class Subspace(Search):
         """Return the Point at z, derivatives by the free parameters alone; cached."""
         z = np.clip(z, 0.0, 1.0)
         if z.tobytes() not in self.memory:
-            point, free = self.owner.point(self.full(z)), self.free
-            slopes = point.run_slopes
-            self.take(
-                point._replace(
-                    z=z,
-                    gradient=point.gradient[free],
-                    gauss_newton=point.gauss_newton[free][:, free],
-                    margin_slopes=point.margin_slopes[:, free],
-                    run_slopes=slopes[:, free] if slopes.size else np.zeros(0),
-                )
-            )
+            self.take(self.within(self.owner.point(self.full(z)))._replace(z=z))
         return self.memory[z.tobytes()]
+
+    def within(self, point: Any) -> Any:
+        """Return a Point of the owner with derivatives by the free parameters alone."""
+        free, slopes = self.free, point.run_slopes
+        return point._replace(
+            z=point.z[free],
+            gradient=point.gradient[free],
+            gauss_newton=point.gauss_newton[free][:, free],
+            margin_slopes=point.margin_slopes[:, free],
+            run_slopes=slopes[:, free] if slopes.size else np.zeros(0),
+        )
 
 
 def stay_put(

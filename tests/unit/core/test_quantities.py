@@ -49,6 +49,8 @@ def test_a_number_with_a_unit_is_that_of_the_tables(text, unit, number):
         ("2,5 m", "m", "a point as the decimal sign"),
         ("2.5", "m", "one with a unit"),
         ("m", "m", "one with a unit"),
+        ("3 L/s", "m^3/(s %)", 'Write "3 L/(s %)" or "0.03 L/(s %)"'),
+        ("3 m", "m/%", 'Write "3 m/%" or "0.03 m/%"'),
     ],
 )
 def test_a_text_that_is_no_such_number_is_refused(text, unit, words):

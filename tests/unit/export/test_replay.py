@@ -8,7 +8,7 @@ import pytest
 
 import jaxtank
 from jaxtank import presets, rig
-from jaxtank.export.replay import _rates
+from jaxtank.export.replay import Export, _rates, read
 from jaxtank.loop.trajectory import csv
 from tuning.cli import main
 
@@ -101,6 +101,15 @@ def test_a_log_that_does_not_suit_and_an_export_that_is_none_are_reported(tmp_pa
         error = capsys.readouterr().err
         assert words in error and error.count("\n") == 1
     assert main.main(["replay", law]) == 2
+
+
+def test_levels_are_those_of_their_numbers_wherever_their_columns_stand(tmp_path, log):
+    rows = [line.split(",")[::-1] for line in log.read_text().splitlines()]
+    (tmp_path / "back.csv").write_text("\n".join(map(",".join, rows)))
+    levels = [
+        read(path, Export(4.0, (2, 1, 1), None))[0].y for path in (log, tmp_path / "back.csv")
+    ]
+    np.testing.assert_array_equal(*levels)
 
 
 def test_rates_of_ramps_are_their_slopes_and_those_of_jumps_are_zero():

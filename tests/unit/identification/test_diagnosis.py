@@ -9,6 +9,7 @@ from helpers import PROCESS
 import tuning
 from jaxtank import rig
 from tuning.cli.main import main
+from tuning.report.identification import advice_of
 
 NOISE, DT, SAMPLES = 0.002, 5.0, 500
 TRUE = {"plant.pump_gain[0]": 2.64e-5, "plant.drain[1]": 4.15e-4, "plant.orifice[0]": 3.2e-4}
@@ -75,6 +76,19 @@ def test_the_fault_of_a_log_is_named_first_with_its_value(fault, where):
     if value is not None and places[0] == (kind, where):
         low, high = first["interval95"]
         assert low < value < high and high - low < 0.4 * value
+
+
+def test_a_rig_without_what_the_data_require_says_so_in_its_name(tmp_path):
+    """And its values are not advised: the interval of a gain is far from the truth."""
+    fit = identified(("pump-delay", 20.0))
+    fit.save(tmp_path / "lacks")
+    assert "set nothing: the values below are those of a rig without it" in str(advice_of(fit))
+    again = rig.load(tmp_path / "lacks" / "rig.toml")
+    assert again.name.endswith("identified, lacks pump-delay:1")
+    t, u, y = record(("pump-delay", 20.0))
+    data = tuning.log(t=t, u=u, y=y)
+    right = tuning.identify(again, data, starts=1, hold_back=0, accept=["pump-delay"], prior=False)
+    assert right.diagnosis["clean"] and ", lacks" not in right.identified.name
 
 
 @pytest.mark.slow

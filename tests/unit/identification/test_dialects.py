@@ -63,6 +63,9 @@ READ = {
     "long, with tags of the plant": long(TAGS),
     "long, sorted by tag, with another tag": long(
         [*reversed(TAGS), (f"{STAMPS[0]}Z", "TT101.PV", 20.5, "Good")]),
+    "long, topics and payloads": long([row[:3] for row in TAGS], "time,topic,payload"),
+    "long, fields of annotated CSV": long(
+        [("", 0, *row[:3]) for row in TAGS], "#group,false\n,table,_time,_field,_value"),
     "zones, other order, other columns, capitals": wide(
         ["TT101 [°C]", "lt102 (MM)", "Time", "lt101 (MM)", "p-101 (PCT)"], T, 1000 * Y[:, 1],
         [f"{t}+01:00" for t in STAMPS], 1000 * Y[:, 0], U),
@@ -70,6 +73,10 @@ READ = {
         ["Date", "P101", "LT101", "LT102"],
         ["", *(f"{(t - dt.datetime(1899, 12, 30)) / dt.timedelta(days=1):.10f}" for t in WHEN)],
         ["%", *U], ["cm", *(100 * Y[:, 0])], ["cm", *(100 * Y[:, 1])], separator="\t"),
+    "rows of descriptions and units": wide(
+        ["Tag", "P101.CV", "LT101.PV", "LT102.PV"], ["Description", "Units", *STAMPS],
+        ['"Feed pump, command"', "%", *U], ["Level", "cm", *(100 * Y[:, 0])],
+        ["Level", "cm", *(100 * Y[:, 1])]),
     "date and time apart, newest first": wide(
         ["Date", "Time", "P101 [%]", "LT101 [m]", "LT102 [m]"],
         [t.strftime("%d.%m.%Y") for t in WHEN][::-1], [t.strftime("%H:%M:%S") for t in WHEN][::-1],
@@ -78,6 +85,8 @@ READ = {
         ["elapsed", "P101 [%]", "LT101 [l]", "LT102 [L]"],
         [str(dt.timedelta(seconds=s)) for s in T], U, 500 * Y[:, 0], 250 * Y[:, 1],
         above="Trend export\n# by hand\n"),
+    "durations with their unit, as of MATLAB": wide(
+        ["Time", "P101", "LT101", "LT102"], [f"{s / 60:.9g} min" for s in T], U, *Y.T),
     "minutes, thin spaces, UTF-16": wide(
         ["t [min]", "P101 [%]", "LT101 [µm]".replace("µm", "mm"), "LT102 [mm]"], T / 60, U,
         [f"{1000 * y:.6f}" for y in Y[:, 0]], [f"{1000 * y:,.6f}".replace(",", "\u2009")
@@ -100,6 +109,9 @@ REFUSED = {
                                     FLOW * 0.06, *Y.T),
     "units that are none": wide(["t [s]", "P101 [%]", "LT101 [metre above]", "LT102 [masl]"], T, U,
                                 *Y.T),
+    "an input in mA": wide(["t [s]", "P101 [mA]", "LT101", "LT102"], T, 4 + 0.16 * U, *Y.T),
+    "setpoint, value and output of a controller": wide(
+        ["t [s]", "LIC101.SP", "LIC101.PV", "LIC101.OUT", "LT102"], T, 9 * U, Y[:, 0], U, Y[:, 1]),
     "all at once": wide(["when", "FIC101 [%]", "Lvl 101 [m]", "LT102 [x]"], AMERICAN, U, *Y.T),
 }  # fmt: skip
 

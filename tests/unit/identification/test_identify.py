@@ -1201,3 +1201,32 @@ def test_a_parameter_that_no_reading_depends_on_is_named_with_a_remedy(free, adv
     assert "not identifiable from these data: plant.caught[0]: no rig is written" in reported
     assert "plant.caught[0] is not identifiable: " in " ".join(printed.split())
     assert "What would identify it:" in printed and "separately" not in reported + printed
+
+
+def test_steps_are_as_short_as_the_fitted_values_need_near_the_tip_of_a_cone():
+    """Levels down to 0.12 m, in closed form where they settle: h = (q / a)^2 / 2 g; the values of
+    the case settle at 0.3 m, where steps four times as long are right.
+    """
+    case = rig.loads("""
+        tank = [{ shape = "cone", diameter = 2.0, height = 2.0, level = 0.8 }]
+        units = ["m", "m^3/h"]
+        pump = [{ to = 1, high = 15.0, initial = 4.0 }]
+        valve = [{ from = 1, area = "6 cm^2", initial = 0.8 }]
+        plant = { bottom = true }
+        controller = { kind = "open-loop" }
+        reference = { initial = [0.8] }
+        values = { "clock.dt" = 10.0, "clock.duration" = 600.0 }
+    """)
+    t, u = 10.0 * np.arange(120), np.tile([4.0, 0.8], (120, 1))
+    u[60:, 1] = 0.5
+    true = dataclasses.replace(case, loop=with_values(case.loop, {"plant.valve": (9e-4,)}))
+    y = played(true, t, u, [0.8], substeps=64)
+    settled = (4.0 / 3600 / (9e-4 * 0.8)) ** 2 / (2 * 9.81)
+    np.testing.assert_allclose(y[59], settled, rtol=1e-3)
+    log = noisy(tuning.log(t=t, u=u, y=y), 0, sd=0.003)
+    free = {"plant.valve[0]": (3e-4, 2e-3), "plant.pump_gain[0]": (1e-4, 1e-3)}
+    found = tuning.identify(case, log, free, starts=1)
+    assert found.diagnosis["clean"]
+    for name, value in (("plant.valve[0]", 9e-4), ("plant.pump_gain[0]", 1 / 3600)):
+        low, high = found.parameters[name]["interval95"]
+        assert low < value < high < 1.02 * low

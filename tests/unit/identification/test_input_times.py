@@ -122,6 +122,20 @@ def test_inputs_of_an_irregular_log_follow_a_line_and_no_dead_time(tmp_path, cap
     assert code == 0 and steps["fit"]["rmse"][0] > 1.15 * line["fit"]["rmse"][0], err
 
 
+def test_a_dead_time_that_a_line_makes_is_not_told_from_steps_at_the_rows(tmp_path, capsys):
+    """Irregular readings, inputs that a controller sets with them."""
+    t, *_ = _irregular()
+    t = t[:300]
+    u = np.repeat(np.random.default_rng(3).uniform(20.0, 70.0, 15), 20)
+    y = _levels(t, _held(t, u)) + NOISE * np.random.default_rng(4).standard_normal((len(t), 2))
+    _write(tmp_path, t, u, y)
+    code, line, err = _identify(tmp_path, capsys)
+    assert code == 0 and line["diagnosis"]["causes"][0]["kind"] in ("pump-delay", "pump-lag"), err
+    assert "or inputs that step at each row (--hold zero-order)" in line["diagnosis"]["sentence"]
+    code, steps, err = _identify(tmp_path, capsys, "--hold", "zero-order")
+    assert code == 0 and steps["diagnosis"]["clean"] and not _outside(steps), err
+
+
 @pytest.mark.slow_for("7.3")
 @pytest.mark.parametrize("delay", [0.0, 7.3])
 def test_rows_of_inputs_between_readings_act_at_their_own_times(tmp_path, capsys, delay):

@@ -8,6 +8,7 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tables import split_header
+from tuning.identification.coordinates import default_free
 from tuning.identification.csv_log import read_log
 from tuning.identification.data_checks import findings
 
@@ -142,6 +143,13 @@ def test_units_of_a_rig_in_metres_and_flows(read):
     np.testing.assert_allclose(log.y, [[0.05, 0.013], [0.06, 0.014], [0.07, 0.015]])
 
 
+def test_the_gain_is_not_estimated_from_flows_that_it_made_inputs(read, case):
+    flows = read(text("t [s],pump1 [l/h],pump2 [V],h1 [cm],h2 [cm],h3 [cm],h4 [cm]"))
+    gains = [f"plant.pump_gain[{j}]" for j in (0, 1)]
+    assert [name in default_free(case.loop, [flows]) for name in gains] == [False, True]
+    assert all(name in default_free(case.loop, [read(text())]) for name in gains)
+
+
 def test_a_level_in_volts_is_the_sensors(read):
     log = read("t [s],pump1 [V],pump2 [V],h2 [cm],h1 [mV]\n0,3,3,1,200\n1,3,3,2,300\n")
     assert log.tanks == (0, 1) and log.in_volts == (True, False)
@@ -274,8 +282,10 @@ BAD = {  # a file, and what the message must hold
     "no header": (text().split("\n", 1)[1], "line 1: has numbers"),
     "single sample": (text(cells=rows(1)), "number of samples is 1,", "at least 3"),
     "two samples": (text(cells=rows(2)), "number of samples is 2,"),
-    "duplicated time": (text(cells=changed(3, 0, "2")), "line 5, column 't [s]': time 2 s is that"),
-    "backward time": (text(cells=changed(3, 0, "0.5")), "line 5,", "time 0.5 s is 1.5 s before"),
+    "duplicated time": (text(cells=changed(3, 0, "2")), "line 5, column 't [s]': time 2 s is that",
+                        "delete one of the two rows"),
+    "backward time": (text(cells=changed(3, 0, "0.5")), "line 5,", "time 0.5 s is 1.5 s before",
+                      "sort the rows"),
     "time missing": (text(cells=changed(3, 0, "")), "line 5, column 't [s]': is empty"),
     "time as a date": (text(cells=changed(0, 0, "2024-01-01 00:00")), "line 3,", "time stamp"),
     "gap": (text(cells=[*rows(5), ["60", *rows(1)[0][1:]]]), "line 7, column 't [s]'",
@@ -285,7 +295,9 @@ BAD = {  # a file, and what the message must hold
     "time without a unit": (headed("t [s]", "t"), "line 1, column 't': has no unit"),
     "unit of another kind": (headed("h1 [cm]", "h1 [s]"), "column 'h1 [s]': 's'"),
     "unknown unit": (headed("h2 [cm]", "h2 [furlong]"), "'furlong' is no unit"),
-    "pump in percent": (headed("pump1 [V]", "pump1 [%]"), "'%' is no unit", "V, mV"),
+    "pump in percent": (headed("pump1 [V]", "pump1 [%]"), "'%' is no unit", "V, mV, % of 5 V"),
+    "number of a failed input": (text(cells=changed(3, 3, "-9999")), "h1 = -9999 cm",
+                                 "Leave the cell empty"),
     "mm called cm": (text(cells=changed(4, 3, "85")), "line 6, column 'h1 [cm]': h1 = 85 cm",
                      "rim is 30 cm", CALLED, "'h1 [mm]'"),
     "mV called V": (scaled(1000, (1,)), "line 2, column 'pump1 [V]'", "3000 V", "'pump1 [mV]'"),

@@ -65,9 +65,26 @@ def spiked(y):
     y[[50, 300, 431], 0] += [0.3, -0.2, 0.25]
 
 
+def dropped(y):
+    """A transmitter that reads 0 for three samples, between two steps of the pump."""
+    y[205:208, 0] = 0.0
+
+
+def held(y):
+    """Compression by exception: written when it has changed by 0.02 m, and repeated until then."""
+    for k in range(1, len(y)):
+        y[k, 0] = y[k, 0] if abs(y[k, 0] - y[k - 1, 0]) > 0.02 else y[k - 1, 0]
+
+
 @pytest.mark.parametrize(
     ("fault", "expected"),
-    [(frozen, ("frozen", "h2")), (saturated, ("saturated", "h2")), (spiked, ("spike", "h1"))],
+    [
+        (frozen, ("frozen", "h2")),
+        (saturated, ("saturated", "h2")),
+        (spiked, ("spike", "h1")),
+        (dropped, ("spike", "h1")),
+        (held, ("held", "h1")),
+    ],
 )
 def test_a_fault_of_a_sensor_is_named_with_its_place(fault, expected):
     for seed in range(10):

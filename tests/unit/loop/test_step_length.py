@@ -337,3 +337,27 @@ def test_the_note_on_the_step_reports_measured_errors(tmp_path, capsys):
     least = [np.asarray(run.x)[:, 0].min() for run in runs]
     words = f"min_level of tank 1 is {least[1]:.3g} cm in place of {least[0]:.3g} cm"
     assert words in note  # one of the measures that change most
+
+
+TIP = """
+units = ["m", "m^3/h"]
+tank = [{ shape = "cone", diameter = 2.0, height = 2.0, level = 0.2 }]
+pump = [{ to = 1, high = 15.0, initial = 3.72 }]
+valve = [{ from = 1, area = "8.8 cm^2", initial = 0.7 }]
+plant = { bottom = true }
+controller = { kind = "open-loop" }
+reference = { initial = [0.2] }
+values = { "clock.dt" = 10.0, "clock.duration" = 600.0 }
+"""
+"""It settles where the valve passes what the pump brings: (q / a)^2 / 2 g = 0.1434 m."""
+
+
+@pytest.mark.parametrize("dt, right", [(10.0, False), (1.25, False), (0.5, True)])
+def test_a_level_near_the_tip_of_a_cone_is_right_or_noted(tmp_path, capsys, dt, right):
+    text = TIP.replace("= 10.0,", f"= {dt},")
+    (tmp_path / "tip.toml").write_text(text)
+    level = (3.72 / 3600 / (8.8e-4 * 0.7)) ** 2 / (2 * 9.81)
+    last = float(finer(rig.loads(text), 1).x[-1, 0])
+    assert (abs(last - level) < 1e-4) == right and (last > 1.15 * level) != right
+    assert main.main(["simulate", str(tmp_path / "tip.toml")]) == 0
+    assert ("takes more than it holds" in capsys.readouterr().err) != right

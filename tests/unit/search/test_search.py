@@ -11,7 +11,7 @@ from tuning.search import diagnostics, methods
 from tuning.search.driver import Search, downhill, optimality
 from tuning.search.methods import METHODS, slsqp
 from tuning.search.screening import Population, best_screened, distinct_starts, evolve, sobol
-from tuning.search.small_changes import WORTH, stay_put
+from tuning.search.small_changes import WORTH, Subspace, stay_put
 from tuning.search.solve import Plan, Stages, solve
 
 
@@ -293,6 +293,17 @@ def test_a_gain_stays_where_a_change_is_worth_less_than_one_percent(worth, stays
         assert found.z[1] == 0.7 and 0.7 < found.z[0] < 0.8
     else:  # as far back as 1 % in all allows
         assert found.z[0] < 0.8 and found.z[1] > 0.2 and found.point.cost > 1.005
+
+
+def test_a_search_of_some_gains_has_their_slopes_alone_where_no_point_is_finite():
+    outer = searched(BOWL, (0.1, 0.9))
+    inner = Subspace(outer, np.array([0.1, 0.9]), np.array([0]))
+    cost, gradient = inner.cost(np.array([1.0]))
+    margins, slopes = inner.margins(np.array([1.0]))  # NaN: those of the last finite point
+    assert cost == 10.0 and gradient.shape == (1,)
+    expected, all_slopes = outer.margins(np.array([0.1, 0.9]))
+    assert margins == pytest.approx(expected, abs=0.01)  # less the tightening
+    assert slopes.tolist() == all_slopes[:, :1].tolist()
 
 
 # curvature, and slopes that runs contradict

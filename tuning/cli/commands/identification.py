@@ -181,7 +181,8 @@ def learn(args):
     import tuning
     from tuning.cli.commands.tuning import EXIT, Progress
     from tuning.identification.prediction import achieved
-    from tuning.report.document import Report
+    from tuning.report.document import Report, Text
+    from tuning.report.identification import marked
     from tuning.report.prediction import achieved_table
 
     logs, line = read_logs(args, case), Line(args.quiet)
@@ -193,9 +194,7 @@ def learn(args):
     code = STATUS[fit.status]
     if fit.identifiable:
         progress, filtered = Progress("", args.quiet), args.safety_filter is not False
-        answer = tuning.tune(
-            fit.identified, safety_filter=filtered, seed=args.seed, progress=progress
-        )
+        answer = tuning.tune(marked(fit), safety_filter=filtered, seed=args.seed, progress=progress)
         progress.line.end()
         parts["tuning"] = answer
         code = progress.code if progress.stop else EXIT[answer.status]
@@ -207,7 +206,8 @@ def learn(args):
     payload = {"case": case.name, "achieved": rows}
     payload |= {name: part.to_json() for name, part in parts.items()}
     payload["verdict"] = last.to_json()["verdict"]
-    table = Report("", "", None, [], [achieved_table(rows)])
+    whose = Text(["errors: to the setpoints of the rig, whatever those of the batch were"])
+    table = Report("", "", None, [], [achieved_table(rows), whose])
     texts = [printed(table), *(printed(part.report()) for part in parts.values())]
     print_result(args, payload, lambda: "\n\n".join(texts))
     report_written(written, args)
@@ -234,7 +234,12 @@ def _report_next(args, result, written):
 
 def _next_command(result, file):
     """Return the next step for the rig that was written to `file`."""
+    from tuning.report.identification import lacking
+
     case, why = result.proposed
+    if lacks := lacking(result):
+        options = " ".join(f"--accept {cause}" for cause in lacks)
+        return f"{file} lacks what the data require: identify again with {options} before you tune"
     if why:
         return f"jaxtank: {file}: note: --law {result.law}: {why}"
     if case.free:
