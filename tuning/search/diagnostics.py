@@ -17,7 +17,7 @@ from jaxtank.loop.change_windows import windows
 from jaxtank.loop.halving import halving_warnings
 from tuning.problem.reported import table_of
 from tuning.problem.scenarios import ScenarioRun
-from tuning.search.result import Lost
+from tuning.search.result import Lost, Message
 
 CHECKED_RUNS = 16  # scenarios that are run, at most, to look for a step that is too long
 STEP = 1e-4  # step of the differences of the gradient, in the unit cube [-]
@@ -38,11 +38,15 @@ overshoot [%] above which a run points to a fragile loop: an Ms above 2.5 oversh
 LARGEST_CURVATURE = 24  # number of parameters up to which the second derivative is computed
 
 
+WRONG = "step-too-long"
+"""Code of a Message on the step; one with a headline is of a run whose numbers are wrong."""
+
+
 def step_warnings(tuned, values, key=None, scenarios=()):
-    """Return [] where the steps of the tuned case and of its scenarios are short enough."""
-    # Else one sentence: which run is wrong, because an explicit step was unstable near an empty
-    # tank, or what would happen to a tank that runs empty. Runs are made only where there is a
-    # warning.
+    """Return () where the steps of the tuned case and of its scenarios are short enough, else the
+    Message on a run that is wrong, because an explicit step was unstable near an empty tank, or on
+    what would happen to a tank that runs empty.
+    """
     runs = [("", tuned.loop, tuned.clock, key)]
     for run in scenarios[:CHECKED_RUNS]:
         loop = with_values(run.case.loop, values)
@@ -55,9 +59,10 @@ def step_warnings(tuned, values, key=None, scenarios=()):
                 halved = halving_warnings(loop, clock, noise_key)
                 warnings = warnings or halved
         except InputError as error:
-            return [f"{name}this answer's run is wrong, and so are its numbers: {error}"]
+            text = f"{name}this answer's run is wrong, and so are its numbers: {error}"
+            return (Message(WRONG, text, "its steps are too long"),)
         sentences += [f"{name}{sentence}" for sentence in warnings]
-    return sentences[:1]
+    return tuple(Message(WRONG, text) for text in sentences[:1])
 
 
 def neighbours(problem, z):

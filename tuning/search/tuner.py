@@ -501,10 +501,14 @@ def _result(
     solution: Solution,
     values: Mapping[str, float],
     began: float,
-    steps: list[str],
+    steps: tuple[Message, ...],
     **parts: Any,
 ) -> TuningResult:
-    """Return the TuningResult of a search; steps : problems with the step size of the answer."""
+    """Return the TuningResult of a search; steps : problems with the step size of the answer. One
+    whose run is wrong has not converged.
+    """
+    if parts["status"] == Status.CONVERGED and any(message.headline for message in steps):
+        parts["status"] = Status.NOT_CONVERGED
     result = TuningResult(
         parameters=_parameters(evaluator, solution, values),
         evaluations={
@@ -522,7 +526,7 @@ def _result(
         problem=evaluator.problem,
         probe=solution.probe,
         slopes=solution.slopes,
-        messages=tuple(Message("step-too-long", text) for text in steps),
+        messages=steps,
         **parts,
     )
     wall_s = time.perf_counter() - began

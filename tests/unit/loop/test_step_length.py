@@ -3,6 +3,7 @@ would be right.
 """
 
 import dataclasses
+import html
 import json
 import tomllib
 import warnings
@@ -22,6 +23,7 @@ from jaxtank.plants.faults import faults
 from jaxtank.signals.inflows import inflow_pulses
 from tuning.cli import main
 from tuning.report import tuned as report
+from tuning.report import verdict
 
 FEW = tuning.Options(starts=1, screening=2, iterations=2, validation=0)
 
@@ -213,8 +215,12 @@ def test_an_answer_states_that_its_run_is_of_steps_too_long(last, substeps, word
     if words is None:
         assert not any("steps too long" in text or "runs empty" in text for text in reported)
     else:
-        assert result.message.startswith(words) and f"\n- {words}" in reported[0]
-        assert all(words in text.replace("&#x27;", "'") for text in reported)
+        plain = [" ".join(html.unescape(text).split()) for text in reported]
+        assert result.message.startswith(words) and f"- {words}" in plain[0]
+        assert all(words in text for text in plain)
+        # a run that is wrong is no answer, whatever its search says
+        assert result.success == verdict.of_tuning(result).good == (words == DOUBT)
+        assert ("its steps are too long" in plain[0]) == (words == WRONG)
 
 
 @pytest.mark.slow
