@@ -428,7 +428,10 @@ def advice_of(fit):
         if rmse is not None
     ]
     unknown = [n for n, p in fit.parameters.items() if not p["interval95"]]
-    beyond = "Nothing stays open: every parameter has an interval."
+    beyond = (
+        "Nothing stays open: every parameter has an interval, which holds if areas and scales of"
+        " sensors are as the rig states them."
+    )
     if unknown:
         beyond = f"These data cannot tell: {listed(unknown)} (no interval); another experiment can."
     gives = f"It gives: residuals {listed(rest)} RMS."

@@ -91,6 +91,23 @@ def test_a_rig_without_what_the_data_require_says_so_in_its_name(tmp_path):
     assert right.diagnosis["clean"] and ", lacks" not in right.identified.name
 
 
+def test_a_scale_error_of_every_sensor_is_seen_by_no_test_and_the_advice_says_so():
+    """y = s h: with gains s times and outlets sqrt(s) times as large, A y' = s k u - sqrt(s) a
+    sqrt(2 g y) is the same rig.
+    """
+    t, u, y = record(None)
+    fit, high = (
+        tuning.identify(rig.loads(GUESS), tuning.log(t=t, u=u, y=s * y), starts=1, hold_back=0)
+        for s in (1.0, 1.1)
+    )
+    assert fit.diagnosis["clean"] and high.diagnosis["clean"]
+    for name, p in fit.parameters.items():
+        if name.startswith("plant."):
+            size = 1.1 if "gain" in name else 1.1**0.5
+            assert high.parameters[name]["value"] == pytest.approx(size * p["value"], rel=0.01)
+    assert "holds if areas and scales of sensors are as the rig states them" in str(advice_of(high))
+
+
 @pytest.mark.slow
 def test_an_accepted_cause_is_estimated_and_written(tmp_path, capsys):
     """Intervals cover the truth again, and the rig predicts the log within its noise."""
