@@ -245,34 +245,16 @@ def programs_compiled():
 
 PROCESS = """
 units = ["m", "%"]
-[[tank]]
-area = 0.5
-rim = 1.2
-level = 0.4
-[[tank]]
-area = 0.25
-rim = 1.0
-drain = 4.15e-4
-level = 0.5
-[[orifice]]
-from = 1
-to = 2
-area = 3.2e-4
-[[pump]]
-gain = 2.64e-5
-to = 1
-high = 100.0
-[plant]
-outputs = [2]
-gravity = 9.81
-[controller]
-kind = "open-loop"
-initial = [40.0]
-changes = [[10.0, 1, 50.0]]
-[reference]
-initial = [0.5]
-[values]
-"clock.dt" = 0.1
+tank = [
+    { area = 0.5, rim = 1.2, level = 0.4 },
+    { area = 0.25, rim = 1.0, drain = 4.15e-4, level = 0.5 },
+]
+orifice = [{ from = 1, to = 2, area = 3.2e-4 }]
+pump = [{ gain = 2.64e-5, to = 1, high = 100.0 }]
+plant = { outputs = [2], gravity = 9.81 }
+controller = { kind = "open-loop", initial = [40.0], changes = [[10.0, 1, 50.0]] }
+reference = { initial = [0.5] }
+values = { "clock.dt" = 0.1 }
 """
 """Two tanks in m with a pump in %, of which the tests of logs make data."""
 
@@ -306,10 +288,7 @@ reference = { initial = [1.0], changes = [[1.0, 1, 2.6]], ramp = 0.0 }
 values = { "clock.dt" = 0.1, "clock.duration" = 40.0 }
 limits = { max_level = 2.7 }
 uncertain = { "plant.drain" = 0.1, "plant.pump_gain" = 0.1 }
-
-[free]
-"controller.Kc" = [0.05, 50.0]
-"controller.Ti" = [0.5, 100.0]
+free = { "controller.Kc" = [0.05, 50.0], "controller.Ti" = [0.5, 100.0] }
 """
 """A tank whose outflow at 1 cm is 2 cm^3/s, with a PI controller: what is studied anywhere on it
 compiles in a fifth of the time of a case of four tanks.

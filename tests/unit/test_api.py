@@ -59,7 +59,7 @@ class Offset(Observer):
         return jaxtank.core.records.Estimate(x=x), state
 
 
-RIG = ONE_TANK.partition("[free]")[0].replace("one tank", "own")
+RIG = ONE_TANK.partition("\nfree")[0].replace("one tank", "own")
 for old, new in {
     "limits = { max_level = 2.7 }": "limits = {}",
     "law = ": 'observer = { kind = "offset", offset = [0.01] }\nlaw = ',
@@ -68,7 +68,7 @@ for old, new in {
     ),
 }.items():
     RIG = RIG.replace(old, new)
-RIG += '[free]\n"controller.Kc" = [0.1, 10.0]\n'
+RIG += '\nfree = { "controller.Kc" = [0.1, 10.0] }\n'
 
 
 QUICK = dict(starts=1, screening=2, iterations=3, validation=0)

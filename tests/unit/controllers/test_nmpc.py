@@ -3,6 +3,7 @@
 import shutil
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import signals_of
@@ -111,7 +112,8 @@ def planned(case):
         return after.knots, slopes, after
 
     compiled = jax.jit(both)
-    start = case.loop.controller.init((4.0, 4.0), (LAST,))
+    # arrays, as the state after a sample: one program for the first and for the later ones
+    start = jax.tree.map(jnp.asarray, case.loop.controller.init((4.0, 4.0), (LAST,)))
 
     def sample(point, setpoint, dt, state=start):
         tick = Tick(t=0.0, r=(setpoint,), dr=(0.1,), ddr=(0.0,), dt=dt)

@@ -199,10 +199,7 @@ def inputs_of(case, run, signals):
 
 PROPORTIONAL = """
 case = "cascaded/pi"
-[controller]
-kind = "pid"
-Kc = 2.0
-bias = 1.5
+controller = { kind = "pid", Kc = 2.0, bias = 1.5 }
 """
 
 

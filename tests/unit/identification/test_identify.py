@@ -999,23 +999,10 @@ def test_of_a_log_that_cannot_tell_no_value_is_advised(tmp_path, resting):
 
 OPEN = """
 name = "one tank"
-[[tank]]
-area = 100.0
-rim = 40.0
-drain = 0.5
-level = 5.0
-[[pump]]
-gain = 15.0
-to = 1
-high = 10.0
-initial = 3.0
-[controller]
-kind = "open-loop"
-initial = [3.0]
-changes = [[60.0, 1, 6.0], [260.0, 1, 4.0]]
-[values]
-"clock.dt" = 2.0
-"clock.duration" = 400.0
+tank = [{ area = 100.0, rim = 40.0, drain = 0.5, level = 5.0 }]
+pump = [{ gain = 15.0, to = 1, high = 10.0, initial = 3.0 }]
+controller = { kind = "open-loop", initial = [3.0], changes = [[60.0, 1, 6.0], [260.0, 1, 4.0]] }
+values = { "clock.dt" = 2.0, "clock.duration" = 400.0 }
 """
 
 

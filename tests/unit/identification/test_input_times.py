@@ -210,7 +210,7 @@ def test_inputs_along_a_line_from_row_to_row(tmp_path, capsys):
     assert main(["identify", str(tmp_path / "rig.toml"), "--data", "log.csv", "--hold", "foh"]) == 2
 
 
-RATE = RIG.replace("high = 100.0", "high = 100.0\nrate = 0.5")
+RATE = RIG.replace("high = 100.0", "high = 100.0, rate = 0.5")
 
 
 @pytest.fixture(scope="module")

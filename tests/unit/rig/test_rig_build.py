@@ -18,57 +18,20 @@ from jaxtank.plots import equations
 from tuning.cli import main
 
 FOUR = """
-[[tank]]
-name = "left"
-area = 21.2
-rim = 30.0
-drain = 0.18
-level = 3.0
-[[tank]]
-name = "right"
-area = 21.2
-rim = 30.0
-drain = 0.18
-level = 3.0
-[[tank]]
-name = "upper left"
-area = 21.2
-rim = 30.0
-level = 1.0
-[[tank]]
-name = "upper right"
-area = 21.2
-rim = 30.0
-level = 1.0
-[[orifice]]
-from = "upper left"
-to = "left"
-area = 0.18
-[[orifice]]
-from = 4
-to = 2
-area = 0.18
-[[pipe]]
-between = ["left", "right"]
-area = 0.05
-[[pump]]
-gain = 7.7
-to = ["left", "upper right"]
-split = 0.4
-high = 12.0
-[[pump]]
-gain = 7.7
-to = ["right", "upper left"]
-split = 0.34
-high = 12.0
-[controller]
-kind = "pid"
-Kc = [0.5, 0.6]
-Ti = 60.0
-[reference]
-initial = [3.0, 3.0]
-changes = [[20.0, 1, 4.0], [20.0, 2, 3.5]]
-ramp = 30.0
+tank = [
+    { name = "left", area = 21.2, rim = 30.0, drain = 0.18, level = 3.0 },
+    { name = "right", area = 21.2, rim = 30.0, drain = 0.18, level = 3.0 },
+    { name = "upper left", area = 21.2, rim = 30.0, level = 1.0 },
+    { name = "upper right", area = 21.2, rim = 30.0, level = 1.0 },
+]
+orifice = [{ from = "upper left", to = "left", area = 0.18 }, { from = 4, to = 2, area = 0.18 }]
+pipe = [{ between = ["left", "right"], area = 0.05 }]
+pump = [
+    { gain = 7.7, to = ["left", "upper right"], split = 0.4, high = 12.0 },
+    { gain = 7.7, to = ["right", "upper left"], split = 0.34, high = 12.0 },
+]
+controller = { kind = "pid", Kc = [0.5, 0.6], Ti = 60.0 }
+reference = { initial = [3.0, 3.0], changes = [[20.0, 1, 4.0], [20.0, 2, 3.5]], ramp = 30.0 }
 """
 
 GPC = {"kind": "gpc", "operating_point": [4.0, 3.0, 2.0, 2.0], "q": 1.0, "du_limit": 1.0}
