@@ -67,11 +67,23 @@ def test_a_rig_in_litres_per_minute_has_no_volts_in_its_files_and_measures(tmp_p
 
 PUMPED = """
 units = [{}]
-tank = [{ area = 0.5, rim = 1.2, drain = 4e-4, level = 0.4 }]
-pump = [{ gain = {}, to = 1, high = 100.0 }]
-plant = { gravity = 9.81 }
-controller = { kind = "pid", Kc = 1.0, Ti = 100.0 }
-reference = { initial = [0.4] }
+[[tank]]
+area = 0.5
+rim = 1.2
+drain = 4e-4
+level = 0.4
+[[pump]]
+gain = {}
+to = 1
+high = 100.0
+[plant]
+gravity = 9.81
+[controller]
+kind = "pid"
+Kc = 1.0
+Ti = 100.0
+[reference]
+initial = [0.4]
 """
 
 

@@ -193,18 +193,14 @@ def test_gauss_newton_matrix_is_that_of_the_residuals(gouta):
 
 
 def test_straight_through_is_not_what_we_do(gouta):
-    """A fully saturated run has no derivative by the gains, and says so with an exact zero."""
-    case = gouta(
-        "backstepping", {"actuator.low": 11.0, "actuator.high": 11.5, "clock.duration": 50.0}
-    )
-    assert np.all(
-        np.asarray(
-            jaxtank.evaluate(case.loop, case.clock, "saturated_fraction")["saturated_fraction"]
-        )
-        == 1.0
-    )
-    f, z = sloped(case, ["controller.k", "controller.k1"], "rms_error_total")
-    np.testing.assert_array_equal(jax.jacfwd(f)(z), np.zeros((1, 2)))
+    """A fully saturated run has no derivative by the gains, and says so with an exact zero; it has
+    the program of `test_slopes_of_the_prototype`.
+    """
+    case = gouta("ngpc", {"actuator.low": 11.0, "actuator.high": 11.5, "clock.dt": 0.05})
+    saturated = jaxtank.evaluate(case.loop, case.clock, "saturated_fraction")["saturated_fraction"]
+    assert np.all(np.asarray(saturated) == 1.0)
+    f, z = sloped(case, ["controller.Tp"], "rms_error_total")
+    np.testing.assert_array_equal(jax.jacfwd(f)(z), np.zeros((1, 1)))
 
 
 def test_nan_is_reported_with_time_tank_and_parameters(gouta):
