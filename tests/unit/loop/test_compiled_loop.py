@@ -242,13 +242,8 @@ def test_the_options_are_set_before_jax_starts_or_missed_with_a_warning(monkeypa
 def python(code, *words, **env):
     """Run code in a fresh process; (stdout, stderr)."""
     clean = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", _xla.SWITCH)}
-    done = subprocess.run(
-        [sys.executable, "-c", code, *words],
-        capture_output=True,
-        text=True,
-        env={**clean, **env},
-        check=True,
-    )
+    pipes = {"capture_output": True, "text": True, "env": {**clean, **env}, "check": True}
+    done = subprocess.run([sys.executable, "-c", code, *words], **pipes)
     return done.stdout.strip(), done.stderr
 
 

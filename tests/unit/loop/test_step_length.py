@@ -252,10 +252,8 @@ def test_a_random_stiff_rig_is_right_or_reported(kind):
     tests/audits/stiff_rigs.py` tries more).
     """
     found = stiff_rigs.tried(kind, range(8))
-    assert (
-        len(found) == 8
-        and [error for error, reported in found if not reported and error > stiff_rigs.OFF] == []
-    )
+    assert len(found) == 8
+    assert [error for error, reported in found if not reported and error > stiff_rigs.OFF] == []
     assert min(error for error, _ in found) < 0.01
 
 

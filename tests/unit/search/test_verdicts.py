@@ -177,24 +177,14 @@ def test_a_trade_off_starts_from_what_was_screened(capsys):
     case = rig.load(WATERTANK)
     loop = jaxtank.with_values(case.loop, points[-1]["parameters"])
     held = jaxtank.evaluate(loop, case.clock, ["overshoot_percent", "rise_time", "settling_time"])
-    assert (
-        held["overshoot_percent"][0] == 0.0
-        and held["rise_time"][0] <= 2.5
-        and held["settling_time"][0] <= 20.0
-    )
+    assert held["overshoot_percent"][0] == 0.0
+    assert held["rise_time"][0] <= 2.5 and held["settling_time"][0] <= 20.0
 
 
 NOISY = [
-    "gouta2022/chadpc",
-    "--dt",
-    "0.05",
-    "--set",
-    "clock.duration=100",
-    "--set",
-    "sensor.noise=0.02",
-    "--set",
-    "actuator.delay=0.2",
-]
+    "gouta2022/chadpc", "--dt", "0.05", "--set", "clock.duration=100", "--set", "sensor.noise=0.02",
+    "--set", "actuator.delay=0.2",
+]  # fmt: skip
 
 
 @pytest.mark.slow
@@ -225,11 +215,8 @@ def test_a_limit_that_no_run_can_be_measured_by_is_refused(capsys, tmp_path, com
     assert main.main([command[0], path, *command[1:], "--limit", "none", "--limit", limit]) == 2
     out, err = capsys.readouterr()
     assert out == "" and err.count("\n") == 1
-    assert (
-        err.startswith(f"jaxtank: limit {limit.replace('=', ' = ')} ")
-        and "undefined on this run" in err
-        and why in err
-    )
+    assert err.startswith(f"jaxtank: limit {limit.replace('=', ' = ')} ")
+    assert "undefined on this run" in err and why in err
 
 
 def test_an_output_without_a_step_is_not_limited_and_one_with_is(gouta):
