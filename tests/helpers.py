@@ -52,6 +52,25 @@ RANKS = [
 ]  # fmt: skip
 RANK = {folder: rank for rank, folders in enumerate(RANKS) for folder in folders.split()}
 
+
+def faulty_pictures(usual):
+    """In place of a function that draws: a text that matplotlib cannot set, and one that fails."""
+
+    def unset(*args):
+        drawn = usual(*args)
+        for figure in drawn.values() if isinstance(drawn, dict) else [drawn]:
+            figure.suptitle(r"$\x{$")
+        return drawn
+
+    def undrawn(*_):
+        from matplotlib import pyplot
+
+        pyplot.figure()
+        raise ZeroDivisionError
+
+    return unset, undrawn
+
+
 ONE_FUNCTION = 'xla_cpu_small_call="true"'
 
 

@@ -670,6 +670,7 @@ BAD = {
     "tune still.toml --tradeoff rise_time=10:20:2": "no setpoint has a step within its 200 s",
     "tune C --tradeoff max_levl=20:30": "unknown measure 'max_levl'; nearest: max_level",
     "tune C --batch 2 --method slsqp": "only method adam",
+    "tune C --resume ''": "--resume",
     "tune C --resume out/deep": "'out/deep': cannot be read as a run",
     "tune C --resume . --out b": "different folders", "tune C --samples 8": "belong to --robust",
     "tune C --robust mean --back-off 2": "from 0 to below 1",

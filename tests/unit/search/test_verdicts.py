@@ -80,21 +80,6 @@ def test_a_staircase_is_not_called_an_optimum(quick):
     assert result.status == "not_converged" and "changes in steps" in result.message
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["--limit", "max_level=28", "--limit", "max_level=33"],
-        ["--free", "controller.k=0.1:1", "--free", "controller.k=0.1:2"],
-        ["--objective", "iae=1", "--objective", "iae=2"],
-        ["--resume", ""],
-    ],
-)
-def test_what_is_given_twice_or_empty_is_refused(words, capsys):
-    assert main.main(["tune", "gouta2015/backstepping", *words]) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1 and words[0] in told
-
-
 @pytest.mark.slow
 def test_a_search_over_choices_is_resumed(tmp_path, capsys):
     """Killed after its first combination: the same answer, and no log is left."""
