@@ -23,27 +23,11 @@ RIGS = Path(__file__).parents[1] / "data" / "rigs"
 
 ONE = """
 name = "one tank"
-[[tank]]
-area = 10.0
-rim = 20.0
-drain = 0.05
-level = 5.0
-[[pump]]
-gain = 3.0
-to = 1
-high = 10.0
-initial = 1.5
-[controller]
-kind = "pi"
-Kc = 1.0
-Ti = 20.0
-[reference]
-initial = [5.0]
-changes = [[5.0, 1, 12.0]]
-[values]
-"clock.dt" = 0.5
-"clock.duration" = 60.0
-"sensor.noise" = [0.05]
+tank = [{ area = 10.0, rim = 20.0, drain = 0.05, level = 5.0 }]
+pump = [{ gain = 3.0, to = 1, high = 10.0, initial = 1.5 }]
+controller = { kind = "pi", Kc = 1.0, Ti = 20.0 }
+reference = { initial = [5.0], changes = [[5.0, 1, 12.0]] }
+values = { "clock.dt" = 0.5, "clock.duration" = 60.0, "sensor.noise" = [0.05] }
 """
 
 

@@ -16,6 +16,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from safety_attacks import held, rk4
 from scipy.interpolate import CubicHermiteSpline
 
 from jaxtank.core.errors import InputError
@@ -26,6 +27,8 @@ from jaxtank.safety.box import widths_of
 from jaxtank.safety.outlet_design import outlet_design
 
 GRAVITY, KNEE = 981.0, 0.01
+PERIODS = (1, 5, 30)
+"""Samples for which a draw is held, on average."""
 STEADY = ("area", "extent")
 """Parameters that do not change in time: the volume in a tank depends on them."""
 TABLE = ((0.0, 0.4), (0.5, 1.0), (1.0, 0.6))
@@ -129,14 +132,10 @@ def random_rig(seed):
     limit = rim * rng.uniform(0.7, 1.0, n)
     least = np.where(rng.random(n) < 0.6, rim * rng.uniform(0.05, 0.3, n), 0.0)
     settings = {
-        "widths": widths_of(plant, spread),
-        "limit": limit,
-        "low": least,
-        "inflow": inflow,
-        "draw": draw,
-        "start": least + (limit - least) * rng.uniform(0.05, 1.0, n),
+        "widths": widths_of(plant, spread), "limit": limit, "low": least, "inflow": inflow,
+        "draw": draw, "start": least + (limit - least) * rng.uniform(0.05, 1.0, n),
         "substeps": int(rng.integers(1, 4)),
-    }
+    }  # fmt: skip
     if more.random() < 0.2:  # perhaps narrower than the sensor is
         settings["band"] = np.full(n, more.choice([0.0, 0.1, 1.0]))
     hold = float(rng.choice([0.1, 0.25, 0.5, 1.0]))
@@ -305,14 +304,6 @@ def parameters(rng, plant, widths, count, wanted):
     return found
 
 
-def held(rng, samples, count, draw, periods=(1, 5, 30)):
-    """(samples, P, ..) of draws, each held for a while of random length."""
-    redraw = rng.random((samples, count)) < 1.0 / rng.choice(periods, count)
-    redraw[0] = True
-    last = np.maximum.accumulate(np.where(redraw, np.arange(samples)[:, None], 0), axis=0)
-    return draw[last, np.arange(count)]
-
-
 def attack(rig, outlet_filter, rows, seed, count=32, samples=240):
     """(highest, lowest) levels (n,) [cm] from starts that the certificates allow."""
     plant, actuator, sensor, settings, hold = rig
@@ -331,7 +322,7 @@ def attack(rig, outlet_filter, rows, seed, count=32, samples=240):
     if anywhere:
         share = np.where(rng.random((count, n)) < 0.4, np.round(rng.random((count, n))), 0.5)
         x[::2] = (least + (limit - least) * share)[::2]
-    command = held(rng, samples, count, rng.choice([0.0, 1.0], (samples, count, m)))
+    command = held(rng, samples, count, rng.choice([0.0, 1.0], (samples, count, m)), PERIODS)
     for j in range(m):  # a third of the runs does all it can to fill, or to empty
         outlet = j >= len(plant.feeds) and plant.valves[j - len(plant.feeds)][1] is None
         outlet |= j < len(plant.feeds) and plant.feeds[j][0] is None
@@ -342,7 +333,7 @@ def attack(rig, outlet_filter, rows, seed, count=32, samples=240):
     errors[:, np.arange(count) % 4 == 0] = np.asarray(outlet_filter.band)
     errors[:, np.arange(count) % 4 == 1] = -np.asarray(outlet_filter.band)
     inflow = settings["draw"] + (settings["inflow"] - settings["draw"]) * held(
-        rng, samples, count, rng.choice([0.0, 1.0], (samples, count, n))
+        rng, samples, count, rng.choice([0.0, 1.0], (samples, count, n)), PERIODS
     )
     inflow[:, wanted > 0] = settings["inflow"]
     inflow[:, wanted < 0] = settings["draw"]
@@ -363,11 +354,7 @@ def attack(rig, outlet_filter, rows, seed, count=32, samples=240):
         v = by_tank(plant, p, volume_of, x)
         for _ in range(parts):
             f = lambda at, u=u, k=k: rates(plant, p, at, u, inflow[k], step)
-            a = f(v)
-            b = f(v + 0.5 * fine * a)
-            c = f(v + 0.5 * fine * b)
-            d = f(v + fine * c)
-            v = np.maximum(v + fine / 6.0 * (a + 2 * b + 2 * c + d), 0.0)
+            v = np.maximum(rk4(f, v, fine), 0.0)
             x = by_tank(plant, p, level_of, v)
             if plant.overflow:
                 x = np.minimum(x, np.asarray(plant.rim))

@@ -15,8 +15,8 @@ import sys
 
 import jax
 import numpy as np
+from outlet_attacks import share_of
 from scipy.integrate import solve_ivp
-from scipy.interpolate import PchipInterpolator
 
 from jaxtank.plants.network import network
 from jaxtank.plants.runge_kutta import advance
@@ -92,45 +92,6 @@ def section(shape, area, extent, h):
     return area * float(np.interp(y, *zip(*shape)))
 
 
-def volume(shape, area, extent, h):
-    """Volume below a level, from geometry."""
-    y = h / extent
-    if shape == "prism":
-        return area * h
-    if shape == "cone":
-        return area * extent * y**3 / 3.0
-    if shape == "sphere":  # largest disc pi r^2: pi h^2 (3 r - h) / 3 with r = extent / 2
-        return area / (extent / 2.0) ** 2 * h**2 * (1.5 * extent - h) / 3.0
-    if shape == "horizontal-cylinder":  # of length area / extent
-        r = extent / 2.0
-        segment = r * r * math.acos((r - h) / r) - (r - h) * math.sqrt(h * (2.0 * r - h))
-        return area / extent * segment
-    total, points = 0.0, [(a * extent, b * area) for a, b in shape]
-    for (z0, a0), (z1, a1) in zip(points, points[1:]):
-        z = min(max(h, z0), z1)
-        total += (z - z0) * (a0 + 0.5 * (a1 - a0) / (z1 - z0) * (z - z0))
-    return total
-
-
-def straight_pchip(points, at):
-    """The C1 monotone cubic with the secants as the slopes at its ends."""
-    x, y = (np.array(v, dtype=float) for v in zip(*points))
-    if at <= x[0]:
-        return y[0] + (y[1] - y[0]) / (x[1] - x[0]) * (at - x[0])
-    if at >= x[-1]:
-        return y[-1] + (y[-1] - y[-2]) / (x[-1] - x[-2]) * (at - x[-1])
-    inner = PchipInterpolator(x, y).derivative()(x)
-    inner[0], inner[-1] = (y[1] - y[0]) / (x[1] - x[0]), (y[-1] - y[-2]) / (x[-1] - x[-2])
-    i = int(np.searchsorted(x, at, side="right")) - 1
-    h, t = x[i + 1] - x[i], (at - x[i]) / (x[i + 1] - x[i])
-    return (
-        (2 * t**3 - 3 * t**2 + 1) * y[i]
-        + (t**3 - 2 * t**2 + t) * h * inner[i]
-        + (3 * t**2 - 2 * t**3) * y[i + 1]
-        + (t**3 - t**2) * h * inner[i + 1]
-    )
-
-
 def net_flows(rig, x, u):
     """Net inflow of each tank, written from the definitions."""
     w, rates = math.sqrt(2.0 * GRAVITY), np.zeros(len(x))
@@ -155,11 +116,11 @@ def net_flows(rig, x, u):
         port = rig["ports"]["pipe"][k]
         move(i, j, rig["pipe"][k] * w * signed((x[i] - port) - (x[j] - port)))
     (a, _), (b, _) = rig["feeds"]
-    move(None, a, straight_pchip(rig["curves"][0], u[0]))
+    move(None, a, share_of(rig["curves"][0], u[0]))
     source = rig["sources"][1]
     lift = x[b] - x[source]
-    move(source, b, 0.01 * u[1] * straight_pchip(rig["lift_curves"][1], lift))
-    shares = [30.0 ** (u[2] - 1.0), straight_pchip(rig["characteristics"][1], u[3])]
+    move(source, b, 0.01 * u[1] * share_of(rig["lift_curves"][1], lift))
+    shares = [30.0 ** (u[2] - 1.0), share_of(rig["characteristics"][1], u[3])]
     for k, (i, j) in enumerate(rig["valves"]):
         port, area = rig["ports"]["valve"][k], rig["valve"][k] * shares[k]
         if j is None:
@@ -196,13 +157,8 @@ def exact(seed):
     near.terminal = True
     solution = solve_ivp(
         lambda t, x: net_flows(rig, x, u) / [section(*s, h) for s, h in zip(sizes, x)],
-        (0.0, DURATION),
-        start,
-        method="DOP853",
-        rtol=1e-12,
-        atol=1e-13,
-        events=near,
-    )
+        (0.0, DURATION), start, method="DOP853", rtol=1e-12, atol=1e-13, events=near,
+    )  # fmt: skip
     return solution.t[-1], solution.y[:, -1]
 
 

@@ -16,6 +16,7 @@ import interrupt_drill
 import numpy as np
 import pytest
 from fault_drill import kept
+from helpers import faulty_pictures
 
 import tuning
 from jaxtank import presets
@@ -194,16 +195,7 @@ def test_a_picture_that_fails_costs_itself_and_not_the_answer(name, tmp_path, ca
     plot, broken = (responses, "responses") if name == "simulate" else (figures, "rig")
     usual = getattr(plot, broken)
 
-    def unset(*args):
-        drawn = usual(*args)
-        for figure in drawn.values() if isinstance(drawn, dict) else [drawn]:
-            figure.suptitle(r"$\x{$")
-        return drawn
-
-    def undrawn(*_):
-        raise ZeroDivisionError
-
-    for fault in (unset, undrawn):
+    for fault in faulty_pictures(usual):
         monkeypatch.setattr(plot, broken, fault)
         code, _, err = say([*words, "--out", folder], capsys)
         notes = [line for line in err if line.startswith("jaxtank: ")]

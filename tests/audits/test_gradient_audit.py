@@ -131,14 +131,9 @@ def one_sided(f, at, h=1e-6):
 
 def rimmed(h, **more):
     return network(
-        area=[20.0],
-        drain=[0.2],
-        pump_gain=[5.0],
-        feeds=((0, None),),
-        rim=[10.0],
-        overflow=True,
+        area=[20.0], drain=[0.2], pump_gain=[5.0], feeds=((0, None),), rim=[10.0], overflow=True,
         **more,
-    ).spill((h,))
+    ).spill((h,))  # fmt: skip
 
 
 def limited(one, other):
@@ -239,9 +234,8 @@ def test_empty_tanks_at_their_setpoint_are_a_kink_of_the_travel(way):
     for i, axis in enumerate(np.eye(2)):
         left, right = one_sided(lambda h, axis=axis: f(at_rest + h * axis), 0.0)
         assert left[0] < -5.0 and right[0] == 0.0
-        assert np.all(np.minimum(left, right) <= found[:, i]) and np.all(
-            found[:, i] <= np.maximum(left, right)
-        )
+        assert np.all(np.minimum(left, right) <= found[:, i])
+        assert np.all(found[:, i] <= np.maximum(left, right))
 
 
 def test_a_staircase_has_the_slope_of_the_line_through_it():

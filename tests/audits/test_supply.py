@@ -37,73 +37,33 @@ SUSPECT = {
     "subprocess", "ctypes", "cffi", "multiprocessing", "pty",
 }  # fmt: skip
 IMPORTED = {
-    (
-        "tuning.bench.bench",
-        "subprocess",
-    ): "`jaxtank bench` compiles its own floor.c with gcc, where there is one",
+    ("tuning.bench.bench", "subprocess"): "`jaxtank bench` compiles its floor.c with gcc",
     ("tuning.bench.bench", "ctypes"): "and calls it",
-    (
-        "jaxtank.export.timing",
-        "subprocess",
-    ): "gcc compiles a controller of ours, which is then timed",
+    ("jaxtank.export.timing", "subprocess"): "gcc compiles a controller of ours, to be timed",
     ("jaxtank.export.fmi", "subprocess"): "gcc compiles an FMU of ours, where there is one",
-    (
-        "jaxtank.export.replay",
-        "subprocess",
-    ): "gcc or node for the export that a user asks to be run",
+    ("jaxtank.export.replay", "subprocess"): "gcc or node for an export to be run",
     ("jaxtank.export.replay", "ctypes"): "and calls it",
     ("tuning.cli.commands.explore", "webbrowser"): "`explore --open` shows the file it has written",
 }
 
 # Calls that run text, and those that open a file to read it.
-CALLS = {
-    "eval",
-    "exec",
-    "__import__",
-    "import_module",
-    "system",
-    "popen",
-    "execv",
-    "execve",
-    "spawnv",
-    "startfile",
-    "breakpoint",
-}
-READS = {
-    "open",
-    "read_text",
-    "read_bytes",
-    "load",
-    "fromfile",
-    "loadtxt",
-    "genfromtxt",
-    "memmap",
-    "ZipFile",
-    "TarFile",
-    "imread",
-    "CDLL",
-}
+CALLS = "eval exec __import__ import_module system popen execv execve spawnv startfile breakpoint"
+READS = (
+    "open read_text read_bytes load fromfile loadtxt genfromtxt memmap ZipFile TarFile imread CDLL"
+)
 MADE = {
     ("jaxtank.core.lazy", "get", "import_module"): "names of the stub of its own package",
     ("jaxtank.core.lazy", "home", "import_module"): "modules that the two `__init__` name",
     ("jaxtank.xla.jit", "_tree", "import_module"): "of a named tuple of ours, of an entry",
     ("jaxtank.plots.style", "notebook", "import_module"): "matplotlib_inline, by a constant name",
-    (
-        "tuning.cluster.engine",
-        "call",
-        "import_module",
-    ): "names of its own table, in its own package",
+    ("tuning.cluster.engine", "call", "import_module"): "names of its table, in its package",
     ("jaxtank.presets", "_load", "import_module"): "names of presets.PAPERS, checked before",
 }
 READ = {
     ("jaxtank.export.replay", "_load_c", "read_text"): "an export that the user asks to be run",
     ("jaxtank.export.replay", "_loaded", "CDLL"): "its code, compiled here or in the user's FMU",
     ("jaxtank.export.replay", "_load_fmu", "read_bytes"): "an FMU that the user asks to be run",
-    (
-        "jaxtank.export.replay",
-        "_load_fmu",
-        "ZipFile",
-    ): "its parts by their names; nothing is extracted but its library",
+    ("jaxtank.export.replay", "_load_fmu", "ZipFile"): "parts by name; its library is extracted",
     ("jaxtank.export.fmi", "library", "read_bytes"): "the library that gcc has made",
     ("jaxtank.export.fmi", "print_fmu", "ZipFile"): "is written",
     ("jaxtank.core.lazy", "attach", "read_text"): "the stub of its own package",
@@ -148,8 +108,15 @@ def sources():
     return trees
 
 
-def called(tree):
-    """(function it stands in, name) of every call; a name is the last word: `np.load` is load."""
+@functools.cache
+def calls():
+    """[(module, function it stands in, name, whole name, node)] of every call of the packages; the
+    name is the last word: `np.load` is load.
+    """
+    return [(module, *call) for module, tree in sources() for call in _called(tree)]
+
+
+def _called(tree):
     inside = {}
     for function in ast.walk(tree):
         if isinstance(function, ast.FunctionDef):
@@ -185,45 +152,27 @@ UNPICKLES = {
 def test_every_call_that_unpickles_is_known_and_why_it_is_safe():
     names = {"deserialize_and_load", "Client", "Unpickler", "loads", "deserialize"}
     plain = ("json.loads", "rig.loads", "rigs.loads", "tomllib.loads", "rig_files.loads", "loads")
-    calls = {
-        (module, where, name)
-        for module, tree in sources()
-        for where, name, whole, _ in called(tree)
-        if name in names and whole not in plain
-    }
-    assert calls == set(UNPICKLES)
+    unpickling = {c[:3] for c in calls() if c[2] in names and c[3] not in plain}
+    assert unpickling == set(UNPICKLES)
 
 
 def test_no_text_is_run():
-    found = {
-        (m, where, name)
-        for m, tree in sources()
-        for where, name, _, _ in called(tree)
-        if name in CALLS
-    }
-    assert found == set(MADE)
-    for module, tree in sources():
-        for _, name, _, node in called(tree):
-            assert not any(
-                k.arg == "allow_pickle"
-                and not (isinstance(k.value, ast.Constant) and k.value.value is False)
-                for k in node.keywords
-            )
-            assert name not in ("to_pickle", "read_pickle") and not any(
-                k.arg == "shell" for k in node.keywords
-            ), module
+    assert {call[:3] for call in calls() if call[2] in CALLS.split()} == set(MADE)
+    for module, _, name, _, node in calls():
+        words = {k.arg: ast.unparse(k.value) for k in node.keywords if k.arg}
+        assert words.get("allow_pickle", "False") == "False" and "shell" not in words, module
+        assert name not in ("to_pickle", "read_pickle"), module
 
 
 def test_every_reading_of_a_file_is_known_and_why_it_is_safe():
     # load: of a case by its name, of a rig by read_text
     ours = ("presets.", "jaxtank.presets", "rig.", "rigs.")
     found = {
-        (m, where, name)
-        for m, tree in sources()
-        for where, name, whole, _ in called(tree)
-        if name in READS
+        (module, where, name)
+        for module, where, name, whole, _ in calls()
+        if name in READS.split()
         and not whole.startswith(ours)
-        and not (m in ("jaxtank.presets", "jaxtank.rig.read") and whole == "load")
+        and not (module in ("jaxtank.presets", "jaxtank.rig.read") and whole == "load")
     }
     assert found == set(READ)
     assert all(READ.values()) and all(MADE.values()) and all(IMPORTED.values())
@@ -279,12 +228,8 @@ def test_the_wheel_holds_the_two_packages_and_nothing_else(built):
         if path.is_file() and "__pycache__" not in path.parts
     }
     assert packed == there
-    assert {
-        "tuning/bench/floor.c",
-        "tuning/cli/names.txt",
-        "jaxtank/README.md",
-        "tuning/README.md",
-    } <= packed
+    there = "tuning/bench/floor.c tuning/cli/names.txt jaxtank/README.md tuning/README.md"
+    assert set(there.split()) <= packed
     assert {n.rsplit(".", 1)[1] for n in packed} == {
         *("py", "pyi", "c", "css", "html", "js", "md", "toml", "txt", "typed")
     }
@@ -295,27 +240,13 @@ def test_the_sdist_holds_what_builds_and_tests_it(built):
     with tarfile.open(built[1]) as archive:
         names = {m.name.split("/", 1)[1] for m in archive.getmembers()}
         assert all(m.isreg() and not m.name.startswith(("/", "..")) for m in archive.getmembers())
-    assert {
-        "pyproject.toml",
-        "README.md",
-        "CHANGELOG.md",
-        "LICENSE",
-        "jaxtank/__init__.py",
-        "tuning/bench/floor.c",
-        "CITATION.cff",
-        "tests/conftest.py",
-    } <= names
-    assert {
-        "tests/data/rigs/watertank.toml",
-        "tests/data/recorded_runs.json",
-        "tests/audits/versions.sh",
-        "notebooks/run.py",
-    } <= names
-    assert {
-        "tests/benchmarks/README.md",
-        "notebooks/README.md",
-        "notebooks/images/filter.gif",
-    } <= names
+    there = (
+        "pyproject.toml README.md CHANGELOG.md LICENSE CITATION.cff jaxtank/__init__.py"
+        " tuning/bench/floor.c tests/conftest.py tests/data/rigs/watertank.toml"
+        " tests/data/recorded_runs.json tests/audits/versions.sh tests/benchmarks/README.md"
+        " notebooks/run.py notebooks/README.md notebooks/images/filter.gif"
+    )
+    assert set(there.split()) <= names
     assert not any("__pycache__" in n or n.endswith((".pyc", ".so", ".log")) for n in names)
 
 

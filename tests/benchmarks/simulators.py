@@ -175,15 +175,9 @@ def measured(name, option):
 
 
 HEADS = [
-    "",
-    "XLA options",
-    "run, ns per step",
-    "times ours (range)",
-    "gradient, times its own run",
-    "gradient, times ours (range)",
-    "RMS error from ours, cm",
-    "slopes from ours",
-]
+    "", "XLA options", "run, ns per step", "times ours (range)", "gradient, times its own run",
+    "gradient, times ours (range)", "RMS error from ours, cm", "slopes from ours",
+]  # fmt: skip
 
 
 def main(words):

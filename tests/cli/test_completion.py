@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers import python
 
 import jaxtank
 import tuning
@@ -147,7 +148,6 @@ def test_help_and_completion_do_not_start_jax(capsys):
         " == cli.main(['completion', 'words', 'tune', 'c']) == 0\n"
         "print([m for m in ('jax', 'numpy', 'scipy', 'matplotlib') if m in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stdout.strip() == "[]"
+    assert python(code) == "[]"
     assert main.main(["completion", "bahs"]) == 2
     assert "unknown shell 'bahs'; nearest: bash" in capsys.readouterr().err

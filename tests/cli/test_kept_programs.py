@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import pytest
+from helpers import python
 
 from jaxtank.xla import program_cache as kept
 from tuning.cli.main import main
@@ -231,10 +232,4 @@ def test_in_python_programs_are_kept_where_asked(tmp_path):
         "print(len(list(found.glob('*-cache'))))"
     )
     env = {n: v for n, v in os.environ.items() if not n.startswith("JAX_")}
-    done = subprocess.run(
-        [sys.executable, "-c", program, str(tmp_path / "kept")],
-        capture_output=True,
-        text=True,
-        env=env,
-    )
-    assert done.stdout == "1\n", done.stderr
+    assert python(program, tmp_path / "kept", env=env) == "1"

@@ -135,10 +135,8 @@ def test_what_is_set_is_what_is_reported():
     ):
         assert words in page, words
     faulty = " ".join(text_of(presets.find("calofir/backstepping-perturbed")).split())
-    assert (
-        "plant.drain[1] times 0.75 from 300 to 450 s" in faulty
-        and "a level stops at its rim (0.6, 0.6 m)" in faulty
-    )
+    assert "plant.drain[1] times 0.75 from 300 to 450 s" in faulty
+    assert "a level stops at its rim (0.6, 0.6 m)" in faulty
     loop = dataclasses.replace(case.loop, disturbance=None)
     assert "No disturbance." in text_of(case.replace(loop=loop))
     assert (

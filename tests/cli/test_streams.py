@@ -17,17 +17,8 @@ from tuning.cli.commands.tuning import Progress
 JAXTANK = [sys.executable, "-m", "tuning.cli.main"]
 SHORT = ["cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400"]
 SEARCH = [
-    "tune",
-    *SHORT,
-    "--starts",
-    "1",
-    "--screening",
-    "2",
-    "--validation",
-    "0",
-    "--iterations",
-    "3",
-]
+    "tune", *SHORT, "--starts", "1", "--screening", "2", "--validation", "0", "--iterations", "3",
+]  # fmt: skip
 
 
 def shell(words, tail):
@@ -98,9 +89,8 @@ def test_ctrl_c_where_nothing_can_be_reported():
 def test_a_forgiving_stream_writes_what_is_taken(tmp_path):
     with open(tmp_path / "told", "w+b") as file:
         raw = terminal.Forgiving(file.fileno())
-        assert (
-            raw.write(b"start 1/8\n") == 10 and not raw.isatty() and raw.fileno() == file.fileno()
-        )
+        assert raw.write(b"start 1/8\n") == 10
+        assert not raw.isatty() and raw.fileno() == file.fileno()
         assert (tmp_path / "told").read_bytes() == b"start 1/8\n"
     assert terminal.Forgiving(10**6).write(b"lost") == 4  # no descriptor has that number
 

@@ -4,10 +4,10 @@ compared.
 
 import dataclasses
 
-import jax
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from helpers import assert_same_tree
 
 import jaxtank
 from jaxtank import presets, rig
@@ -114,9 +114,7 @@ FITTED = {  # case: (the one it starts from, what is changed)
 def test_a_fitted_case_is_another_one_with_what_the_notes_list(name):
     case, (other, changes) = presets.find(name), FITTED[name]
     wanted = rig.set_values(presets.find(other), changes)
-    assert jax.tree.structure(case.loop) == jax.tree.structure(wanted.loop)
-    for a, b in zip(jax.tree.leaves(case.loop), jax.tree.leaves(wanted.loop)):
-        np.testing.assert_array_equal(a, b)
+    assert_same_tree(case.loop, wanted.loop)
     assert case.free and case.clock == wanted.clock
     assert rig.case_warnings(case) == []  # its own difference between plant and model is meant
     far = rig.set_values(case, {"plant.pump_gain": [3.0, 3.0]})
@@ -128,9 +126,7 @@ def test_a_fitted_case_is_another_one_with_what_the_notes_list(name):
 def test_a_case_is_checked_and_its_rig_file_is_itself(name):
     case = rig.check(presets.find(name))
     again = rig.loads(rig.dump(case))
-    assert jax.tree.structure(again.loop) == jax.tree.structure(case.loop)
-    for a, b in zip(jax.tree.leaves(again.loop), jax.tree.leaves(case.loop)):
-        np.testing.assert_array_equal(a, b)
+    assert_same_tree(again.loop, case.loop)
     assert again.clock == case.clock and dict(again.free) == dict(case.free)
 
 

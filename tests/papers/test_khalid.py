@@ -10,7 +10,6 @@ import dataclasses
 import functools
 
 import jax
-import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -34,6 +33,16 @@ PRESET = presets.load("khalid")
 
 def control(kind, **changes):
     return dataclasses.replace(khalid.build(kind).controller, **changes)
+
+
+_design = jax.jit(lambda part: (*part.design(DT), part.gain(DT)))
+_model = jax.jit(lambda plant, point: incremental_model(plant, point, DT))
+
+
+def designed(part):
+    """(Omega, Psi, basis, gain, A, B, C) of a controller and of its incremental model."""
+    found = (*_design(part), *_model(part.model, jnp.array(part.operating_point)))
+    return [np.asarray(m) for m in found]
 
 
 @functools.cache
@@ -147,7 +156,7 @@ def test_slopes_of_laguerre_functions_by_their_pole(pole):
 
 
 def test_cost_of_the_laguerre_controller():
-    Omega, Psi, _ = jax.jit(lambda law: law.design(DT))(control("laguerre"))
+    Omega, Psi, *_ = designed(control("laguerre"))
     np.testing.assert_allclose(
         np.diag(Omega), [0.28060482, 0.23929632, 0.2014798, 0.16722567], atol=5e-9
     )
@@ -155,17 +164,14 @@ def test_cost_of_the_laguerre_controller():
     assert np.linalg.cond(Omega) == pytest.approx(85.5, abs=0.05)
 
 
+@pytest.mark.slow_for("gpc", "gpc-mimo")  # whose matrices are written out below
 @pytest.mark.parametrize("kind", ["laguerre", "laguerre-mimo", "gpc", "gpc-mimo"])
 def test_cost_equals_brute_force(kind):
     """The closed form against the sum over a simulated horizon; the prototype's 6153.648319620 does
     not name its x_e and eta.
     """
     rng = np.random.default_rng(1)
-    part = control(kind)
-    A, B, C = (
-        np.asarray(m) for m in incremental_model(part.model, jnp.array(part.operating_point), DT)
-    )
-    Omega, Psi, basis = (np.asarray(m) for m in part.design(DT))
+    Omega, Psi, basis, _, A, B, C = designed(control(kind))
     eta, x = rng.normal(size=Omega.shape[0]), rng.normal(size=A.shape[0])
     cost = constant = 0.0
     state, free = x, x
@@ -182,10 +188,7 @@ def test_cost_equals_brute_force(kind):
 )
 def test_gpc_is_that_of_its_own_matrices(kind, Nc):
     """Eqs. 21-22 with F and Phi written out."""
-    part = control(kind)
-    A, B, C = (
-        np.asarray(m) for m in incremental_model(part.model, jnp.array(part.operating_point), DT)
-    )
+    Omega, Psi, _, gain, A, B, C = designed(control(kind))
     power = [np.linalg.matrix_power(A, i) for i in range(41)]
     F = np.concatenate([C @ power[i + 1] for i in range(40)])
     blocks = [
@@ -193,27 +196,23 @@ def test_gpc_is_that_of_its_own_matrices(kind, Nc):
         for i in range(40)
     ]
     Phi = np.block(blocks)
-    Omega, Psi, _ = part.design(DT)
     np.testing.assert_allclose(Omega, Phi.T @ Phi + 1e-2 * np.eye(Phi.shape[1]), atol=1e-12)
     np.testing.assert_allclose(Psi, Phi.T @ F, atol=1e-11)
     K = np.linalg.solve(Phi.T @ Phi + 1e-2 * np.eye(Phi.shape[1]), Phi.T @ F)[: B.shape[1]]
-    np.testing.assert_allclose(part.gain(DT), K, rtol=1e-9)
+    np.testing.assert_allclose(gain, K, rtol=1e-9)
 
 
+@pytest.mark.slow_for("laguerre-4")
 @pytest.mark.parametrize("kind, N", [("laguerre", 4), ("laguerre", 10), ("laguerre-mimo", 3)])
 def test_laguerre_with_pole_0_is_gpc(kind, N):
     flat = control(kind, a=np.zeros(control(kind).a.shape), N=N)
     pulses = control(kind.replace("laguerre", "gpc"), Nc=N)
-    np.testing.assert_allclose(flat.gain(DT), pulses.gain(DT), rtol=1e-11)
+    (Omega, Psi, _, gain, *_), (*theirs, _, their_gain, _, _, _) = map(designed, (flat, pulses))
+    np.testing.assert_allclose(gain, their_gain, rtol=1e-11)
     # pumps within samples, as GPC has them
     order = np.arange(N * flat.model.pumps).reshape(flat.model.pumps, N).T.ravel()
-    for mine, theirs in zip(flat.design(DT)[:2], pulses.design(DT)[:2]):
-        mine = (
-            np.asarray(mine)[order]
-            if mine.shape[1] == 2 + len(flat.model.outputs)
-            else np.asarray(mine)[np.ix_(order, order)]
-        )
-        np.testing.assert_allclose(mine, theirs, rtol=1e-12, atol=1e-14)
+    for mine, other in zip((Omega[np.ix_(order, order)], Psi[order]), theirs):
+        np.testing.assert_allclose(mine, other, rtol=1e-12, atol=1e-14)
 
 
 # K in the order [dH1, dH2, H2 - r], spectral radius of the closed loop, condition of Omega (notes
@@ -232,18 +231,15 @@ GAINS = [
 ]
 
 
+@pytest.mark.slow_for("gpc-nc30-printed2-0.8958-127.2")
 @pytest.mark.parametrize("kind, printed, radius, condition", GAINS)
 def test_gains(kind, printed, radius, condition):
-    part = control(kind)
-    K = np.asarray(part.gain(DT))
+    Omega, _, _, K, A, B, _ = designed(control(kind))
     digits = 6 if condition else 5  # as printed
     np.testing.assert_allclose(K, printed, rtol=1e-6 if condition else 0, atol=0.5 * 10.0**-digits)
-    A, B, _ = (
-        np.asarray(m) for m in incremental_model(part.model, jnp.array(part.operating_point), DT)
-    )
     assert np.abs(np.linalg.eigvals(A - B @ K)).max() == pytest.approx(radius, abs=5e-6)
     if condition:
-        assert np.linalg.cond(np.asarray(part.design(DT)[0])) == pytest.approx(condition, abs=0.05)
+        assert np.linalg.cond(Omega) == pytest.approx(condition, abs=0.05)
 
 
 @pytest.mark.slow
@@ -466,10 +462,7 @@ def own_loop(kind, where, samples, limited, du=0.5, root=exact):
         9350e-6,
         [78.5e-6 * c * np.sqrt(2 * 9.8) for c in (0.0 if pumps == 1 else 1.0, 1.0, 0.5)],
     )
-    part = control(kind)
-    A, B, C = (
-        np.asarray(m) for m in incremental_model(part.model, jnp.array(part.operating_point), DT)
-    )
+    A, B, C = designed(control(kind))[4:]
     N, Np, ahead, a = 4, 40, 15, 0.4
     step = np.array(
         [
@@ -515,13 +508,9 @@ def own_loop(kind, where, samples, limited, du=0.5, root=exact):
                 (lambda z, pull=Psi @ error: 2 * (Omega @ z + pull)),
             )
             found = minimize(
-                cost,
-                np.zeros(len(eta)),
-                jac=slope,
-                method="SLSQP",
-                constraints=bounds,
+                cost, np.zeros(len(eta)), jac=slope, method="SLSQP", constraints=bounds,
                 options={"ftol": 1e-16, "maxiter": 300},
-            )
+            )  # fmt: skip
             eta = found.x
         before, u = x, u + wide[0] @ eta
 
@@ -665,50 +654,6 @@ def test_slopes_of_the_prototype_through_150_programmes(samples):
 def test_errors_by_input_validation(values, message):
     with pytest.raises(InputError, match=message):
         rig.check(rig.set_values(PRESET.cases["laguerre-constrained"], values))
-
-
-SLOPES = [  # case, {name: scale of the step}: every tunable leaf that the case feels
-    ("gpc", ["r_w", "q", "operating_point"]),
-    ("gpc-nc2", ["r_w", "q", "operating_point"]),
-    ("gpc-nc30", ["r_w", "q", "operating_point"]),
-    ("laguerre", ["r_w", "a", "q", "operating_point"]),
-    ("gpc-mimo", ["r_w", "q", "operating_point"]),
-    ("laguerre-mimo", ["r_w", "a", "q", "operating_point"]),
-]
-SLOPES += [(f"{name}-constrained", [*names, "du_limit", "u_high"]) for name, names in SLOPES]
-
-
-@LATER
-@pytest.mark.parametrize("name, names", SLOPES)
-def test_slopes_of_the_default_cost(name, names):
-    """Forward slopes of the cost that `tune` makes small against central differences, in the
-    logarithms of the leaves.
-
-    1e-5 of the largest. Runge-Kutta steps of 1 s, for the sake of compiling; 200 samples, an up and
-    a down.
-    """
-    case = PRESET.cases[name]
-    # else u_high, moved up, would be felt no more: the pumps' own limit is at the same place
-    if case.loop.controller.mode == QP:
-        case = case.replace(
-            loop=with_values(case.loop, {"actuator.low": -10.0, "actuator.high": 10.0})
-        )
-    names = [f"controller.{n}" for n in names]
-    start, build = jax.flatten_util.ravel_pytree(
-        [jnp.log(jnp.asarray(jaxtank.parameters(case.loop)[n])) for n in names]
-    )
-
-    def cost(z):
-        loop = with_values(case.loop, dict(zip(names, map(jnp.exp, build(z)))))
-        got = jaxtank.evaluate(loop, COARSE, tuple(case.objective))
-        return sum(weight * jnp.sum(got[measure]) for measure, weight in case.objective.items())
-
-    step = 1e-5
-    moved = np.concatenate([step * np.eye(len(start)), -step * np.eye(len(start))])
-    many = np.asarray(jax.jit(jax.vmap(cost))(start + moved))
-    central = (many[: len(start)] - many[len(start) :]) / (2 * step)
-    forward = np.asarray(jax.jit(jax.jacfwd(cost))(start))
-    np.testing.assert_allclose(forward, central, atol=1e-5 * np.abs(central).max(), rtol=1e-4)
 
 
 @LATER

@@ -299,9 +299,8 @@ def test_the_bounds_of_the_sliding_surface():
     roots = {
         s: zero_dynamics(s) for s in (0.00877, 0.00878, 0.0880, 1 / T1, 0.04, 0.05, 0.08, 1.0, 10.0)
     }
-    assert (
-        roots[0.00877].real.max() > 0 > roots[0.00878].real.max() and roots[0.0880].real.max() < 0
-    )
+    assert roots[0.00877].real.max() > 0 > roots[0.00878].real.max()
+    assert roots[0.0880].real.max() < 0
     np.testing.assert_allclose(roots[1 / T1], [-1 / T1] * 2, atol=2e-5)
     np.testing.assert_allclose(
         sorted(roots[0.04], key=np.imag), [-0.0399 - 0.0030j, -0.0399 + 0.0030j], atol=6e-5

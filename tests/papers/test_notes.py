@@ -62,11 +62,8 @@ def dangling(path, text):
 def test_every_paper_has_a_note_with_its_sections(paper):
     found = labels(paper)
     assert len(found) == len(set(found))
-    assert (
-        {"S1", "S2", "S3", "S4", "S5", "S6", "S7", "S8", "S9"} <= set(found)
-        and "A1" in found
-        and "H1" in found
-    )
+    assert {"S1", "S2", "S3", "S4", "S5", "S6", "S7", "S8", "S9"} <= set(found)
+    assert "A1" in found and "H1" in found
 
 
 def test_references_to_notes_name_a_section_that_exists():
@@ -76,10 +73,8 @@ def test_references_to_notes_name_a_section_that_exists():
 
 def test_a_wrong_reference_is_found():
     here = Path("test_gouta2015.py")
-    assert (
-        dangling(here, "as in notes S4.3") == []
-        and dangling(here, "khalid notes S4.5 and H4") == []
-    )
+    assert dangling(here, "as in notes S4.3") == []
+    assert dangling(here, "khalid notes S4.5 and H4") == []
     assert dangling(here, "notes S4.9, E1") == [("gouta2015", "S4.9")]
     # outside a paper's own files the paper is named
     assert dangling(Path("qp.py"), "notes S4.5") == [(None, "S4.5")]

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from fault_drill import kept
-from helpers import ONE_TANK
+from helpers import ONE_TANK, assert_same_tree
 
 import jaxtank
 import tuning
@@ -59,7 +59,7 @@ class Offset(Observer):
         return jaxtank.core.records.Estimate(x=x), state
 
 
-RIG = ONE_TANK.partition("[free]")[0].replace("one tank", "own")
+RIG = ONE_TANK.partition("\nfree")[0].replace("one tank", "own")
 for old, new in {
     "limits = { max_level = 2.7 }": "limits = {}",
     "law = ": 'observer = { kind = "offset", offset = [0.01] }\nlaw = ',
@@ -68,7 +68,7 @@ for old, new in {
     ),
 }.items():
     RIG = RIG.replace(old, new)
-RIG += '[free]\n"controller.Kc" = [0.1, 10.0]\n'
+RIG += '\nfree = { "controller.Kc" = [0.1, 10.0] }\n'
 
 
 QUICK = dict(starts=1, screening=2, iterations=3, validation=0)
@@ -96,9 +96,7 @@ def test_a_registered_controller_and_observer_are_read_and_written(own):
     assert isinstance(own.loop.observer, Offset)
     for text in (rig.dump(own), rig.dump(own, tankwise=True), rig.complete(own)):
         again = rig.loads(text)
-        assert jax.tree.structure(again.loop) == jax.tree.structure(own.loop)
-        for one, other in zip(jax.tree.leaves(again.loop), jax.tree.leaves(own.loop)):
-            np.testing.assert_array_equal(one, other)
+        assert_same_tree(again.loop, own.loop)
         assert again.free == own.free
 
 
@@ -185,10 +183,8 @@ def test_a_constructor_converts_lists_and_numbers():
     )
     sensors = (LevelSensor(noise=[0.1]), LevelSensor(gain=[1], noise=(0.1,), full_scale=5))
     for one, other in ((short, full), sensors):
-        assert jax.tree.structure(one) == jax.tree.structure(other)
-        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other)):
-            assert type(a) is np.ndarray and a.dtype == np.float64
-            np.testing.assert_array_equal(a, b)
+        assert_same_tree(one, other)
+        assert all(type(a) is np.ndarray and a.dtype == np.float64 for a in jax.tree.leaves(one))
     assert dataclasses.replace(short, low=[2, 3]).low.tolist() == [2.0, 3.0]
     assert PumpBank(low=[0.0], high=[np.inf]).pulse == 1.0
 
@@ -203,13 +199,8 @@ def test_a_constructor_refuses_what_it_cannot_fill():
 def test_what_is_no_number_passes_a_constructor_and_a_transformation_untouched():
     bank = PumpBank(low=[0.0], high=[12.0])
     marks = [
-        object(),
-        jax.ShapeDtypeStruct((1,), np.float64),
-        None,
-        "x",
-        np.float32(1.0),
-        [[1.0], 2.0],
-    ]
+        object(), jax.ShapeDtypeStruct((1,), np.float64), None, "x", np.float32(1.0), [[1.0], 2.0],
+    ]  # fmt: skip
     for mark in marks:
         assert PumpBank(low=mark, high=[12.0], stop=0.0, initial=0.0).low is mark
     for mark in (*marks, 0, 1.0, (1, 2)):
@@ -399,9 +390,8 @@ def test_a_trajectory_is_data_to_jax_and_keeps_its_units(run):
     assert type(doubled) is jaxtank.Trajectory and doubled.units == ("cm", "V")
     np.testing.assert_array_equal(doubled.x, 2.0 * np.asarray(run.x))
     several = jax.vmap(lambda a: jax.tree.map(lambda v: a * v, run))(jnp.arange(3.0))
-    assert str(several).startswith("Trajectory of several runs") and "<table>" in (
-        several._repr_html_()
-    )
+    assert str(several).startswith("Trajectory of several runs")
+    assert "<table>" in (several._repr_html_())
     assert run.replace(units=("m", "V")).to_json()["units"]["x"] == "m"
     broken = run.replace(x=np.asarray(run.x) * np.nan)
     assert broken.to_json()["x"][0] == [None]
@@ -491,17 +481,10 @@ def results(own, tuned):
             "identification": lambda: tuning.identify(case, [data], free, starts=1, iterations=2),
             "certificate": lambda: tuning.Certificate(64, 3, 0.4, 1024, 12, [0.006, 0.02]),
             "bound": lambda: InputBound(
-                case=case,
-                objective={NASTY: 1.0},
-                constraints=[cell],
-                holds=True,
-                closed_loop=None,
-                source="search",
-                grids=[],
-                **numbers,
-                **counts,
+                case=case, objective={NASTY: 1.0}, constraints=[cell], holds=True, closed_loop=None,
+                source="search", grids=[], **numbers, **counts,
             ),
-        }
+        }  # fmt: skip
 
 
 KINDS = ("tuning", "ensemble", "sensitivity", "identification", "certificate", "bound")
@@ -539,23 +522,13 @@ def test_save_leaves_out_the_rig_file_of_a_class_without_a_name_with_a_note(
 
 
 OF_A_CASE = {
-    "attack": {},
-    "bound": {},
-    "can_follow": {"draws": {}},
-    "compare_controllers": {},
-    "ensemble": {},
-    "feasibility": {},
-    "identify": {"log": None},
-    "least_offset": {"draws": {}},
-    "predict": {"log": None},
-    "sensitivity": {},
-    "tradeoff": {"measure": "rise_time", "values": [9.0]},
-    "tune": {},
-    "tune_by_rule": {"rule": "simc"},
-    "tune_choices": {"choices": {}},
-    "tune_robust": {},
+    "attack": {}, "bound": {}, "can_follow": {"draws": {}}, "compare_controllers": {},
+    "ensemble": {}, "feasibility": {}, "identify": {"log": None}, "least_offset": {"draws": {}},
+    "predict": {"log": None}, "sensitivity": {},
+    "tradeoff": {"measure": "rise_time", "values": [9.0]}, "tune": {},
+    "tune_by_rule": {"rule": "simc"}, "tune_choices": {"choices": {}}, "tune_robust": {},
     "validate": {},
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", OF_A_CASE)

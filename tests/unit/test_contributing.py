@@ -47,18 +47,10 @@ def added(tmp_path):
 RIG = """
 case = "cascaded/pi"
 name = "own"
-[controller]
-kind = "biased-proportional"
-Kc = 1.0
-bias = 4.0
-[values]
-"clock.duration" = 400.0
-[reference]
-initial = [4.0]
-changes = [[40.0, 1, 5.0]]
-ramp = 0.0
-[free]
-"controller.Kc" = [0.05, 5.0]
+controller = { kind = "biased-proportional", Kc = 1.0, bias = 4.0 }
+values = { "clock.duration" = 400.0 }
+reference = { initial = [4.0], changes = [[40.0, 1, 5.0]], ramp = 0.0 }
+free = { "controller.Kc" = [0.05, 5.0] }
 """
 
 

@@ -71,6 +71,9 @@ LONG = {
     *("tuning.search.judged", "tuning.identification.design", "tuning.falsification.study"),
     *("tuning.uncertainty.study", "tuning.uncertainty.sensitivity_study"),
     *("jaxtank.analysis.linear_model", "jaxtank.analysis.steady_state", "tuning.search.tuner"),
+    *("jaxtank.signals.inflows", "jaxtank.measures.functions", "jaxtank.loop.many"),
+    *("tuning.identification.prediction", "tuning.identification.fit", "tuning.feasible.study"),
+    *("tuning.identification.problem", "tuning.identification.batch"),
 }
 
 

@@ -14,6 +14,7 @@ import sys
 import jax
 import numpy as np
 import pytest
+from helpers import python
 
 from jaxtank import InputError, evaluate, presets, sensitivities, with_values
 from jaxtank.core.clock import Clock
@@ -47,14 +48,7 @@ def reported(devices, option):
     env = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", flags.SWITCH)} | {
         flags.SWITCH: option
     }
-    done = subprocess.run(
-        [sys.executable, "-c", RUNS, str(devices)],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=env,
-    )
-    found, places = json.loads(done.stdout)
+    found, places = json.loads(python(RUNS, devices, env=env))
     return {
         name: np.array([float.fromhex(v) for v in values]) for name, values in found.items()
     }, places
@@ -123,14 +117,9 @@ def test_a_run_has_the_precision_of_its_most_precise_leaf():
 
 
 SHAPES = {
-    "plant.orifice": (3,),
-    "plant.area": (1,),
-    "actuator.initial": (2, 1),
-    "sensor.noise": (5,),
-    "observer.l": (1,),
-    "controller.model.orifice": (1,),
-    "x0": (3,),
-}
+    "plant.orifice": (3,), "plant.area": (1,), "actuator.initial": (2, 1), "sensor.noise": (5,),
+    "observer.l": (1,), "controller.model.orifice": (1,), "x0": (3,),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", SHAPES)
@@ -186,16 +175,11 @@ def test_noise_that_no_key_draws_is_no_answer():
     for run in (travel, jax.grad(travel)):
         with pytest.raises(InputError, match="give a key"):
             run(0.1)
-    assert (
-        np.isnan(jax.jit(travel)(0.1))
-        and np.isnan(jax.jit(jax.grad(travel))(0.1))
-        and np.isnan(jax.jit(slope)(0.1)).all()
-    )
+    assert np.isnan(jax.jit(travel)(0.1))
+    assert np.isnan(jax.jit(jax.grad(travel))(0.1)) and np.isnan(jax.jit(slope)(0.1)).all()
     assert np.isfinite(jax.jit(travel)(0.0)) and np.isfinite(jax.jit(slope)(0.0)).all()
-    assert (
-        jax.jit(travel)(0.1, key) == pytest.approx(float(travel(0.1, key)), rel=1e-12)
-        and jax.grad(travel)(0.1, key) > 1.0
-    )
+    assert jax.jit(travel)(0.1, key) == pytest.approx(float(travel(0.1, key)), rel=1e-12)
+    assert jax.grad(travel)(0.1, key) > 1.0
 
 
 def test_float32_is_refused_where_it_would_be_wrong():

@@ -3,9 +3,10 @@
 import shutil
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import signals_of
+from helpers import rk4, signals_of
 from scipy.optimize import minimize
 
 import jaxtank
@@ -57,11 +58,7 @@ def predicted(x, inputs):
 
     levels = []
     for u in inputs:
-        k1 = rates(x, u)
-        k2 = rates(x + 0.5 * T * k1, u)
-        k3 = rates(x + 0.5 * T * k2, u)
-        k4 = rates(x + T * k3, u)
-        x = x + T / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+        x = rk4(lambda x, u=u: rates(x, u), x, T)
         levels.append(x)
     return np.array(levels)
 
@@ -111,7 +108,8 @@ def planned(case):
         return after.knots, slopes, after
 
     compiled = jax.jit(both)
-    start = case.loop.controller.init((4.0, 4.0), (LAST,))
+    # arrays, as the state after a sample: one program for the first and for the later ones
+    start = jax.tree.map(jnp.asarray, case.loop.controller.init((4.0, 4.0), (LAST,)))
 
     def sample(point, setpoint, dt, state=start):
         tick = Tick(t=0.0, r=(setpoint,), dr=(0.1,), ddr=(0.0,), dt=dt)

@@ -13,14 +13,8 @@ RED = "a\033[31m.csv"
 ESCAPED = r"a\x1b[31m.csv"
 HEADER = "t [s],pump1 [V],pump2 [V],h1 [cm],h2 [cm],h3 [cm],h4 [cm]"
 IDENTIFY = (
-    "identify",
-    "mirakhorli/sfc",
-    "--free",
-    "plant.pump_gain=5:60",
-    "--starts",
-    "1",
-    "--data",
-)
+    "identify", "mirakhorli/sfc", "--free", "plant.pump_gain=5:60", "--starts", "1", "--data",
+)  # fmt: skip
 SHORT = ("--set", "clock.dt=1", "--set", "clock.duration=100")
 
 
@@ -45,11 +39,8 @@ def test_characters_that_a_terminal_obeys_are_escaped():
 
 def test_a_long_line_keeps_both_its_ends():
     line = one_line("file.csv, line 3: " + 10_000 * "x" + " is no unit; nearest: cm")
-    assert (
-        len(line) == MOST
-        and line.startswith("file.csv, line 3: xx")
-        and line.endswith("xx is no unit; nearest: cm")
-    )
+    assert len(line) == MOST
+    assert line.startswith("file.csv, line 3: xx") and line.endswith("xx is no unit; nearest: cm")
     assert one_line("a\n  b ") == "a b" and one_line("x" * MOST) == "x" * MOST
 
 
@@ -66,12 +57,8 @@ def test_a_long_line_keeps_both_its_ends():
 def test_an_error_of_a_long_word_is_a_short_line(say, words, end):
     code, out, err = say("simulate", "cascaded/pi", *words)
     (line,) = err.splitlines()
-    assert (
-        code == 2
-        and out == ""
-        and len(line) <= MOST + len("jaxtank: ")
-        and line.endswith(end or "")
-    )
+    assert code == 2
+    assert out == "" and len(line) <= MOST + len("jaxtank: ") and line.endswith(end or "")
 
 
 def test_a_log_of_many_columns_is_refused_in_a_short_line(say, tmp_path):
@@ -80,10 +67,8 @@ def test_a_log_of_many_columns_is_refused_in_a_short_line(say, tmp_path):
     code, out, err = say(*IDENTIFY, "wide.csv")
     assert code == 5 and out == ""
     assert max(map(len, err.splitlines())) <= MOST + len("jaxtank: ")  # a [log] table below
-    assert (
-        "no column for t (time) among 'column 0', 'column 1'" in err
-        and "and 2980 more; name it with --column" in err
-    )
+    assert "no column for t (time) among 'column 0', 'column 1'" in err
+    assert "and 2980 more; name it with --column" in err
 
 
 @pytest.mark.parametrize("content", [None, "", HEADER + "\n0,3,2,1,1,1,x\n", b"\xff"])
@@ -113,12 +98,8 @@ def test_names_of_rigs_and_folders(say, tmp_path):
         text.replace("[values]\n", "[values]\nx0 = [11.0, 11.0]\n", 1)
     )
     code, _, err = say("simulate", "b\033[31m.toml", *SHORT, "--out", "c\033[31m")
-    assert (
-        code == 0
-        and r"jaxtank: b\x1b[31m.toml: note:" in err
-        and r"written to c\x1b[31m:" in err
-        and "\033" not in err
-    )
+    assert code == 0 and r"jaxtank: b\x1b[31m.toml: note:" in err
+    assert r"written to c\x1b[31m:" in err and "\033" not in err
 
 
 def test_a_number_of_thousands_of_digits_in_a_rig_file_is_reported_in_our_words():

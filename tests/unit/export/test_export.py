@@ -35,15 +35,9 @@ from tuning.cli import main
 SAMPLES = 10_000
 # one case of every law, observer and way of saturating; the rest differ in numbers alone
 QUICK = [
-    "gouta2015/ngpc",
-    "gouta2015/backstepping-boxqp",
-    "gouta2022/chadpc",
-    "gouta2022/fopi",
-    "calofir/backstepping",
-    "cascaded/pi",
-    "mirakhorli/hybrid",
-    "mirakhorli/smc",
-]
+    "gouta2015/ngpc", "gouta2015/backstepping-boxqp", "gouta2022/chadpc", "gouta2022/fopi",
+    "calofir/backstepping", "cascaded/pi", "mirakhorli/hybrid", "mirakhorli/smc",
+]  # fmt: skip
 SLOW = [
     name
     for name in presets.names()
@@ -72,15 +66,9 @@ def replayed(name, noise=1e-4, values=(), filtered=False):
 
 
 @pytest.mark.slow_for(
-    "gouta2015/ngpc",
-    "gouta2015/backstepping-boxqp",
-    "gouta2022/fopi",
-    "mirakhorli/smc",
-    "calofir/backstepping",
-    "mirakhorli/hybrid",
-    "gouta2022/chadpc",
-    "cascaded/pi",
-)
+    "gouta2015/ngpc", "gouta2015/backstepping-boxqp", "gouta2022/fopi", "mirakhorli/smc",
+    "calofir/backstepping", "mirakhorli/hybrid", "gouta2022/chadpc", "cascaded/pi",
+)  # fmt: skip
 @needs_gcc
 @pytest.mark.parametrize("name", EVERY)
 def test_c_gives_the_inputs_of_the_loop(name, tmp_path):
@@ -199,10 +187,7 @@ def inputs_of(case, run, signals):
 
 PROPORTIONAL = """
 case = "cascaded/pi"
-[controller]
-kind = "pid"
-Kc = 2.0
-bias = 1.5
+controller = { kind = "pid", Kc = 2.0, bias = 1.5 }
 """
 
 
@@ -443,13 +428,8 @@ def own():
     """The case, and the errors at which it is tried."""
     case = presets.find("cascaded/pi")
     return case.replace(loop=dataclasses.replace(case.loop, controller=EveryFunction())), (
-        -1.7,
-        -0.61,
-        0.23,
-        0.7,
-        1.37,
-        2.06,
-    )
+        -1.7, -0.61, 0.23, 0.7, 1.37, 2.06,
+    )  # fmt: skip
 
 
 def expected(error):
@@ -490,21 +470,8 @@ def test_what_cannot_be_exported_is_reported():
 
 
 def test_the_command_writes_a_file_that_names_units_and_gains(tmp_path, capsys):
-    assert (
-        main.main(
-            [
-                "export",
-                "gouta2015/backstepping",
-                "--set",
-                "controller.k1=0.01",
-                "--lang",
-                "c",
-                "--out",
-                str(tmp_path),
-            ]
-        )
-        == 0
-    )
+    words = "export gouta2015/backstepping --set controller.k1=0.01 --lang c --out"
+    assert main.main([*words.split(), str(tmp_path)]) == 0
     text = (tmp_path / "gouta2015_backstepping.h").read_text()
     assert re.search(r"double controller_k1; /\* .*\[1/s\], above 0; default 0\.01 \*/", text)
     assert "measured levels [cm]" in text and "pump inputs [V]" in text
@@ -613,47 +580,24 @@ def test_a_line_break_in_the_name_of_a_case_ends_no_comment(traced, separator):
 @pytest.mark.parametrize(
     "unit",
     [
-        "V*/ int taken; /*",
-        "V\\\\",
-        "??/",
-        "$\\\\x{$",
-        "cm, V",
-        "<b>",
-        "V\\u2028",
-        "a" * 41,
-        "^2",
+        "V*/ int taken; /*", "V\\\\", "??/", "$\\\\x{$", "cm, V", "<b>", "V\\u2028", "a" * 41, "^2",
         "V V V*",
     ],
-)
+)  # fmt: skip
 def test_a_unit_that_is_none_is_refused_in_one_line(unit, tmp_path, capsys):
     text = HOSTILE_RIG.format(name='"r"').replace('["cm", "V"]', f'["cm", "{unit}"]')
     (tmp_path / "rig.toml").write_text(text)
     assert main.main(["export", str(tmp_path / "rig.toml"), "--out", str(tmp_path / "out")]) == 2
     printed = capsys.readouterr()
-    assert (
-        printed.out == ""
-        and printed.err.count("\n") == 1
-        and "units: entry = " in printed.err
-        and not (tmp_path / "out").exists()
-    )
+    assert printed.out == "" and printed.err.count("\n") == 1
+    assert "units: entry = " in printed.err and not (tmp_path / "out").exists()
 
 
 def test_units_of_rigs_are_taken():
     known = [
-        "cm",
-        "V",
-        "U0",
-        "m^3/s",
-        "cm^3/(s V)",
-        "L/min",
-        "%",
-        "-",
-        "°C",
-        "m³/s",
-        "ml / s",
-        "(m^3/s)^2",
-        "m^0.5",
-    ]
+        "cm", "V", "U0", "m^3/s", "cm^3/(s V)", "L/min", "%", "-", "°C", "m³/s", "ml / s",
+        "(m^3/s)^2", "m^0.5",
+    ]  # fmt: skip
     assert [units.check_unit("unit", one) for one in known] == known
     with pytest.raises(InputError, match=r"plant\.units: entry = 'cm\*/'"):
         network(area=1.0, drain=1.0, pump_gain=1.0, feeds=[(0, None)], rim=1.0, units=("cm*/", "V"))

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from helpers import PROCESS
+from helpers import PROCESS, rk4
 
 import tuning
 from jaxtank import rig
@@ -38,10 +38,7 @@ def record(fault, seed=0):
     for k in range(SAMPLES * 10):
         if k % 10 == 0:
             y[k // 10] = h
-        a = rate(h, q[k])
-        b = rate(h + 0.25 * a, q[k])
-        c = rate(h + 0.25 * b, q[k])
-        h = h + 0.5 / 6 * (a + 2 * b + 2 * c + rate(h + 0.5 * c, q[k]))
+        h = rk4(lambda h, k=k: rate(h, q[k]), h, 0.5)
     y = y * [1.0, value] if kind == "sensor-scale" else y
     y = y + NOISE * rng.standard_normal(y.shape)
     return DT * np.arange(SAMPLES), u, y[:, ::-1] if kind == "swapped" else y

@@ -11,7 +11,7 @@ import re
 import jax
 import numpy as np
 import pytest
-from helpers import CASCADED_TANKS, command
+from helpers import CASCADED_TANKS, command, rk4
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
@@ -277,10 +277,7 @@ def rungekutta(theta, x0, u, h=0.25, steps=4):
     for v in u:
         out.append(x)
         for _ in range(steps):
-            a = rate(x, v)
-            b = rate(x + h / 2 * a, v)
-            c = rate(x + h / 2 * b, v)
-            x = x + h / 6 * (a + 2 * b + 2 * c + rate(x + h * c, v))
+            x = rk4(lambda x, v=v: rate(x, v), x, h)
     return np.stack(out)
 
 
@@ -402,15 +399,12 @@ def test_a_level_that_no_reading_tells_costs_only_its_own_interval(case):
         tanks=(0,),
     )
     result = tuning.identify(case, log, free, starts=1, hold_back=0, noise=0.01)
-    assert (
-        result.status is tuning.Status.CONVERGED
-        and result.parameters["plant.pump_gain[0]"]["identifiable"]
-    )
+    assert result.status is tuning.Status.CONVERGED
+    assert result.parameters["plant.pump_gain[0]"]["identifiable"]
     low, high = result.parameters["plant.pump_gain[0]"]["interval95"]
     assert low < 27.43 < high
-    assert (
-        result.levels[0][0]["interval95"] is not None and result.levels[0][1]["interval95"] is None
-    )
+    assert result.levels[0][0]["interval95"] is not None
+    assert result.levels[0][1]["interval95"] is None
 
 
 def test_residuals_that_are_not_white_widen_the_intervals(case, away, clean):
@@ -473,15 +467,9 @@ def test_slopes_with_volts_dead_zone_lag_gain_and_offset():
         [np.where(t < 40, 8.0, np.where(t < 90, 0.5, 6.0)), np.where(t < 60, 7.0, 3.0)], axis=1
     )
     names = [
-        "plant.pump_gain[0]",
-        "plant.drain[0]",
-        "plant.pipe[0]",
-        "plant.area[1]",
-        "actuator.dead_zone[0]",
-        "actuator.lag[1]",
-        "sensor.gain[0]",
-        "sensor.offset[1]",
-    ]
+        "plant.pump_gain[0]", "plant.drain[0]", "plant.pipe[0]", "plant.area[1]",
+        "actuator.dead_zone[0]", "actuator.lag[1]", "sensor.gain[0]", "sensor.offset[1]",
+    ]  # fmt: skip
     exact, differences = slopes_of(
         base, names, t, u, [4.0, 2.0], ((0, True), (1, False)), tanks=(0, 1)
     )
@@ -598,10 +586,8 @@ def test_a_reading_that_never_moves_has_no_fit_percent(case, away, clean):
     y[:, 3] = 2.0
     log = tuning.log(t=clean.t, u=clean.u, y=y)
     result = fit(away, log, WIDE)
-    assert (
-        result.quality["nrmse_percent"][3] is None
-        and result.quality["nrmse_percent"][0] is not None
-    )
+    assert result.quality["nrmse_percent"][3] is None
+    assert result.quality["nrmse_percent"][0] is not None
     assert json.loads(json.dumps(result.to_json()))["fit"]["nrmse_percent"][3] is None
 
 
@@ -687,10 +673,8 @@ def test_the_profile_agrees_with_the_interval_where_all_is_near_linear(away, cle
     result = fit(away, noisy(clean, 4), WIDE, profile=True)
     p = result.parameters[result.profile["name"]]
     np.testing.assert_allclose(result.profile["interval95"], p["interval95"], atol=0.1 * p["sd"])
-    assert (
-        len(result.profile["values"]) == len(result.profile["rise"])
-        and min(result.profile["rise"]) < 1e-6
-    )
+    assert len(result.profile["values"]) == len(result.profile["rise"])
+    assert min(result.profile["rise"]) < 1e-6
 
 
 def test_an_outlier_of_a_robust_loss_hides_nothing(away, clean):
@@ -704,9 +688,8 @@ def test_an_outlier_of_a_robust_loss_hides_nothing(away, clean):
     result = tuning.identify(
         away, spoiled, WIDE, start="case", starts=1, hold_back=0, substeps=4, loss="huber"
     )
-    assert result.status == "converged" and all(
-        p["sd"] < 0.02 * p["value"] for p in result.parameters.values()
-    )
+    assert result.status == "converged"
+    assert all(p["sd"] < 0.02 * p["value"] for p in result.parameters.values())
 
 
 @pytest.mark.slow
@@ -778,15 +761,11 @@ def test_a_command_past_its_limit_is_what_the_pump_can_do(case):
         ({"free": {"plant.pump_gain[7]": (1.0, 2.0)}}, "pump_gain"),
         ({"free": {"plant.pmp_gain[0]": (1.0, 2.0)}}, "nearest"),
         ({"free": {"plant.pump_gain[0]": (3.0, 2.0)}}, "pump_gain"),
-        ({"start": "warm"}, "must be one of"),
-        ({"loss": "cauchy"}, "must be one of"),
-        ({"hold_back": 1.5e9}, "hold_back"),
-        ({"hold_back": -0.1}, "hold_back"),
-        ({"noise": -0.1}, "noise"),
-        ({"noise": [0.1, 0.1]}, "noise"),
-        ({"starts": 0}, "starts"),
+        ({"start": "warm"}, "must be one of"), ({"loss": "cauchy"}, "must be one of"),
+        ({"hold_back": 1.5e9}, "hold_back"), ({"hold_back": -0.1}, "hold_back"),
+        ({"noise": -0.1}, "noise"), ({"noise": [0.1, 0.1]}, "noise"), ({"starts": 0}, "starts"),
     ],
-)
+)  # fmt: skip
 def test_refused_by_input_validation(case, clean, options, words):
     with pytest.raises(InputError, match=words):
         tuning.identify(case, clean, **({"free": FREE} | options))
@@ -832,15 +811,9 @@ def identified(tmp_path_factory):
     folder = tmp_path_factory.mktemp("identified")
     (folder / "log.csv").write_text(csv_text())
     code, out, err = command(
-        "identify",
-        "mirakhorli/sfc",
-        "--data",
-        str(folder / "log.csv"),
-        *FLAGS,
-        "--json",
-        "--out",
+        "identify", "mirakhorli/sfc", "--data", str(folder / "log.csv"), *FLAGS, "--json", "--out",
         str(folder / "out"),
-    )
+    )  # fmt: skip
     assert code == 0, err
     return folder, out, err
 
@@ -851,9 +824,8 @@ def test_json_as_in_the_contract(identified):
     for name, value in zip(SPLITS, (0.42, 0.34, 27.43, 19.55)):
         p = result["parameters"][name]
         assert p["identifiable"] is True and p["interval95"][0] < p["value"] < p["interval95"][1]
-        assert abs(p["value"] - value) < 4 * p["sd"] and p["unit"] == (
-            "-" if "split" in name else "cm^3/(s V)"
-        )
+        assert abs(p["value"] - value) < 4 * p["sd"]
+        assert p["unit"] == ("-" if "split" in name else "cm^3/(s V)")
     assert set(result["fit"]) == {"rmse", "nrmse_percent", "residual_autocorrelation"}
     np.testing.assert_allclose(result["fit"]["rmse"], 0.05, rtol=0.25)
     assert (
@@ -999,23 +971,10 @@ def test_of_a_log_that_cannot_tell_no_value_is_advised(tmp_path, resting):
 
 OPEN = """
 name = "one tank"
-[[tank]]
-area = 100.0
-rim = 40.0
-drain = 0.5
-level = 5.0
-[[pump]]
-gain = 15.0
-to = 1
-high = 10.0
-initial = 3.0
-[controller]
-kind = "open-loop"
-initial = [3.0]
-changes = [[60.0, 1, 6.0], [260.0, 1, 4.0]]
-[values]
-"clock.dt" = 2.0
-"clock.duration" = 400.0
+tank = [{ area = 100.0, rim = 40.0, drain = 0.5, level = 5.0 }]
+pump = [{ gain = 15.0, to = 1, high = 10.0, initial = 3.0 }]
+controller = { kind = "open-loop", initial = [3.0], changes = [[60.0, 1, 6.0], [260.0, 1, 4.0]] }
+values = { "clock.dt" = 2.0, "clock.duration" = 400.0 }
 """
 
 
@@ -1153,10 +1112,8 @@ def test_the_cascaded_tanks(cascaded):
     """Residual at most 0.26 V on all 1024 samples (0.45 V is published for the other record)."""
     assert cascaded.status == "converged" and cascaded.quality["rmse"][0] <= 0.26
     assert cascaded.validation["samples"] == [700]
-    assert (
-        cascaded.validation["fitted"]["rmse"][0] <= 0.26
-        and cascaded.validation["held_back"]["rmse"][0] <= 0.35
-    )
+    assert cascaded.validation["fitted"]["rmse"][0] <= 0.26
+    assert cascaded.validation["held_back"]["rmse"][0] <= 0.35
     assert cascaded.quality["widened"] > 2  # the model, not the noise, is what is left
     reported = cascaded.estimation.predicted(cascaded.estimation.unknowns(cascaded.fit))[0, :, 0]
     y = cascaded.estimation.data.y[0, :, 0]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers import rk4
 
 import tuning
 from jaxtank import rig
@@ -30,16 +31,6 @@ def rate(x, v, gain=8.0, orifice=0.35, drain=0.4):
     return np.array([(gain * v - first) / 200.0, (first - second) / 150.0])
 
 
-def rk4(x, v, dt, steps, **values):
-    h = dt / steps
-    for _ in range(steps):
-        a = rate(x, v, **values)
-        b = rate(x + h / 2 * a, v, **values)
-        c = rate(x + h / 2 * b, v, **values)
-        x = x + h / 6 * (a + 2 * b + 2 * c + rate(x + h * c, v, **values))
-    return x
-
-
 def data(seed, process=PROCESS, samples=200, parts=8, tanks=(1,)):
     """A log of Euler's and Maruyama's steps with noise on both levels."""
     rng = np.random.default_rng(seed)
@@ -65,7 +56,8 @@ def log_likelihood(log, x, process, noise, **values):
             total -= 0.5 * (v**2 / S + np.log(2 * np.pi * S))
             K = P @ H / S
             x, P = x + K * v, P - np.outer(K, H @ P)
-        move = lambda x, v=log.u[k, 0]: rk4(x, v, DT, SUBSTEPS, **values)
+        step = lambda x, v=log.u[k, 0]: rk4(lambda x: rate(x, v, **values), x, DT / SUBSTEPS)
+        move = lambda x, step=step: step(step(x))  # SUBSTEPS
         F = np.stack([move(x + 1e-30j * e).imag / 1e-30 for e in np.eye(2)], axis=1)
         x, P = move(x), F @ P @ F.T + DT * np.diag(process) ** 2
     return total

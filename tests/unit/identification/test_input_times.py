@@ -8,6 +8,7 @@ import json
 import numpy as np
 import pytest
 from helpers import PROCESS as RIG
+from helpers import rk4
 
 import tuning
 from jaxtank import rig
@@ -37,10 +38,7 @@ def _levels(t, input_at, h=(0.4, 0.5), dt=0.05):
         if k in sampled:
             result.append(h)
         u = input_at((k + 0.5) * dt)
-        a = _rate(h, u)
-        b = _rate(h + 0.5 * dt * a, u)
-        c = _rate(h + 0.5 * dt * b, u)
-        h = h + dt / 6 * (a + 2 * b + 2 * c + _rate(h + dt * c, u))
+        h = rk4(lambda h, u=u: _rate(h, u), h, dt)
     return np.array(result)
 
 
@@ -224,7 +222,7 @@ def test_inputs_along_a_line_from_row_to_row(tmp_path, capsys):
     assert main(["identify", str(tmp_path / "rig.toml"), "--data", "log.csv", "--hold", "foh"]) == 2
 
 
-RATE = RIG.replace("high = 100.0", "high = 100.0\nrate = 0.5")
+RATE = RIG.replace("high = 100.0", "high = 100.0, rate = 0.5")
 
 
 @pytest.fixture(scope="module")

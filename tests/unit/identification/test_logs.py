@@ -182,13 +182,9 @@ def test_columns_named_by_option_or_rig(read, case):
         [[r[0], r[1], str(1000 * float(r[2])), *r[3:]] for r in rows()],
     )
     columns = {
-        "t": ("when", "s"),
-        "pump1": ("left", "V"),
-        "pump2": "right [mV]",
-        "h1": ("a", "cm"),
-        "h2": ("b", "cm"),
-        "h3": ("c", "cm"),
-    }
+        "t": ("when", "s"), "pump1": ("left", "V"), "pump2": "right [mV]", "h1": ("a", "cm"),
+        "h2": ("b", "cm"), "h3": ("c", "cm"),
+    }  # fmt: skip
     assert same(read(content, columns=columns), read(text()))
     with pytest.raises(InputError, match="unknown column 'h9'"):
         read(content, columns={"h9": "a"})
@@ -246,15 +242,11 @@ def test_init_shows_a_log_table_that_works(tmp_path, read):
 @pytest.mark.parametrize(
     ("header", "expected"),
     [
-        ("h1 [cm]", ("h1", "cm")),
-        ("h1(cm)", ("h1", "cm")),
-        ("pump1_V", ("pump1", "V")),
-        ("pump_1", ("pump_1", None)),
-        ("flow_l/min", ("flow", "l/min")),
-        ("h1", ("h1", None)),
+        ("h1 [cm]", ("h1", "cm")), ("h1(cm)", ("h1", "cm")), ("pump1_V", ("pump1", "V")),
+        ("pump_1", ("pump_1", None)), ("flow_l/min", ("flow", "l/min")), ("h1", ("h1", None)),
         ("upper_tank", ("upper_tank", None)),
     ],
-)
+)  # fmt: skip
 def test_a_header_in_parts(header, expected):
     assert split_header(header) == expected
 
@@ -463,11 +455,8 @@ def test_every_column_in_another_unit_is_reported_at_once(case):
 
 def test_a_part_keeps_its_lines(read):
     log = read(text()).part(2, 5)
-    assert (
-        log.samples == 3
-        and list(log.lines) == [4, 5, 6]
-        and log.where(0, 0) == "log.csv, line 4, column 't [s]'"
-    )
+    assert log.samples == 3
+    assert list(log.lines) == [4, 5, 6] and log.where(0, 0) == "log.csv, line 4, column 't [s]'"
 
 
 def test_a_long_log_is_read(read):

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import assert_same_tree
 from scipy.integrate import solve_ivp
 
 import jaxtank
@@ -85,14 +86,10 @@ TANK = dict(area=[25.0], drain=[0.3], pump_gain=[8.0], feeds=[(0, None)], rim=[3
 
 def loop_of(**parts):
     usual = dict(
-        plant=network(**TANK),
-        sensor=LevelSensor(noise=[0.0]),
-        observer=Direct(),
-        controller=Proportional(Kc=2.0),
-        actuator=PumpBank(low=[0.0], high=[12.0]),
-        reference=ramps([4.0], [(10.0, 0, 9.0)], ramp=0.0),
-        x0=np.array([3.3]),
-    )
+        plant=network(**TANK), sensor=LevelSensor(noise=[0.0]), observer=Direct(),
+        controller=Proportional(Kc=2.0), actuator=PumpBank(low=[0.0], high=[12.0]),
+        reference=ramps([4.0], [(10.0, 0, 9.0)], ramp=0.0), x0=np.array([3.3]),
+    )  # fmt: skip
     return ClosedLoop(**{**usual, **parts})
 
 
@@ -203,9 +200,7 @@ def test_registered_instruments_are_read_from_a_rig_file_and_written():
     np.testing.assert_allclose(run.x, jaxtank.simulate(built, CLOCK).x, rtol=1e-12)
     for text in (rig.dump(own), rig.complete(own)):
         again = rig.loads(text).loop
-        assert jax.tree.structure(again) == jax.tree.structure(own.loop)
-        for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(own.loop)):
-            np.testing.assert_array_equal(one, other)
+        assert_same_tree(again, own.loop)
 
 
 def test_a_preset_takes_registered_instruments_and_keeps_its_limits():

@@ -142,17 +142,10 @@ def test_through_plant_sensor_actuator_and_reference(gouta):
         {"actuator.lag": 0.7, "actuator.delay": 0.5, "clock.dt": 0.05, "clock.duration": 400.0},
     )
     names = [
-        "plant.drain[0]",
-        "plant.area[2]",
-        "plant.orifice[1]",
-        "plant.pump_gain[0]",
-        "plant.gravity",
-        "controller.model.drain[0]",
-        "actuator.lag[0]",
-        "actuator.high[1]",
-        "reference.targets[1]",
-        "x0[2]",
-    ]
+        "plant.drain[0]", "plant.area[2]", "plant.orifice[1]", "plant.pump_gain[0]",
+        "plant.gravity", "controller.model.drain[0]", "actuator.lag[0]", "actuator.high[1]",
+        "reference.targets[1]", "x0[2]",
+    ]  # fmt: skip
     agree(case, names, rtol=2e-5)
 
 
@@ -193,18 +186,14 @@ def test_gauss_newton_matrix_is_that_of_the_residuals(gouta):
 
 
 def test_straight_through_is_not_what_we_do(gouta):
-    """A fully saturated run has no derivative by the gains, and says so with an exact zero."""
-    case = gouta(
-        "backstepping", {"actuator.low": 11.0, "actuator.high": 11.5, "clock.duration": 50.0}
-    )
-    assert np.all(
-        np.asarray(
-            jaxtank.evaluate(case.loop, case.clock, "saturated_fraction")["saturated_fraction"]
-        )
-        == 1.0
-    )
-    f, z = sloped(case, ["controller.k", "controller.k1"], "rms_error_total")
-    np.testing.assert_array_equal(jax.jacfwd(f)(z), np.zeros((1, 2)))
+    """A fully saturated run has no derivative by the gains, and says so with an exact zero; it has
+    the program of `test_slopes_of_the_prototype`.
+    """
+    case = gouta("ngpc", {"actuator.low": 11.0, "actuator.high": 11.5, "clock.dt": 0.05})
+    saturated = jaxtank.evaluate(case.loop, case.clock, "saturated_fraction")["saturated_fraction"]
+    assert np.all(np.asarray(saturated) == 1.0)
+    f, z = sloped(case, ["controller.Tp"], "rms_error_total")
+    np.testing.assert_array_equal(jax.jacfwd(f)(z), np.zeros((1, 1)))
 
 
 def test_nan_is_reported_with_time_tank_and_parameters(gouta):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import estimates_along
+from helpers import estimates_along, rk4
 
 import jaxtank
 from jaxtank import rig
@@ -13,14 +13,9 @@ from jaxtank.plants.network import network
 from tuning.report.simulated import estimates
 
 MODEL = network(
-    area=[50.0, 40.0],
-    drain=[0.0, 0.5],
-    links=[(0, 1)],
-    orifice=[0.5],
-    pump_gain=[8.0],
-    feeds=[(0, None)],
-    rim=[40.0, 40.0],
-)
+    area=[50.0, 40.0], drain=[0.0, 0.5], links=[(0, 1)], orifice=[0.5], pump_gain=[8.0],
+    feeds=[(0, None)], rim=[40.0, 40.0],
+)  # fmt: skip
 VALUES = {"process": [1e-6] * 2, "measurement": [4e-4] * 2, "spread": [0.01] * 2}
 DRIFT = {"coefficient_spread": 0.01, "coefficient_walk": 1e-8}
 US = np.repeat([9.6, 11.0, 8.5, 10.0], 60)[:, None]
@@ -37,10 +32,7 @@ def readings(gain, drain):
     for (u,) in US:
         rows.append(h)
         for _ in range(10):
-            k1 = rates(h, u)
-            k2 = rates(h + step / 2 * k1, u)
-            k3 = rates(h + step / 2 * k2, u)
-            h = h + step / 6 * (k1 + 2 * k2 + 2 * k3 + rates(h + step * k3, u))
+            h = rk4(lambda h, u=u: rates(h, u), h, step)
     levels = np.array(rows)
     return levels, levels + 0.02 * np.random.default_rng(0).standard_normal(levels.shape)
 

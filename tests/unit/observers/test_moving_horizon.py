@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from helpers import Compiled, estimates_along, needs_gcc, signals_of
+from helpers import Compiled, estimates_along, needs_gcc, rk4, signals_of
 from scipy.optimize import least_squares, lsq_linear
 
 import jaxtank
@@ -133,14 +133,9 @@ def test_its_derivatives_are_the_differences_where_limits_bind():
 
 
 TANKS = network(
-    area=[5.0, 4.0],
-    drain=[0.0, 0.06],
-    links=[(0, 1)],
-    orifice=[0.05],
-    pump_gain=[1.0],
-    feeds=[(0, None)],
-    rim=[8.0, 8.0],
-)
+    area=[5.0, 4.0], drain=[0.0, 0.06], links=[(0, 1)], orifice=[0.05], pump_gain=[1.0],
+    feeds=[(0, None)], rim=[8.0, 8.0],
+)  # fmt: skip
 
 
 def onward(h, u):
@@ -150,10 +145,7 @@ def onward(h, u):
         upper, lower = np.array([0.05, 0.06]) * np.sqrt(2 * 981.0 * h)
         return np.array([(u - upper) / 5.0, (upper - lower) / 4.0])
 
-    k1 = rates(h)
-    k2 = rates(h + DT / 2 * k1)
-    k3 = rates(h + DT / 2 * k2)
-    return h + DT / 6 * (k1 + 2 * k2 + 2 * k3 + rates(h + DT * k3))
+    return rk4(rates, h, DT)
 
 
 @pytest.mark.slow

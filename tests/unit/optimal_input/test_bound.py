@@ -165,16 +165,11 @@ def test_a_controller_that_no_search_beats_is_its_own_bound():
     """
     case = short("gouta2015", "ngpc")
     found = bound(case, limits={}, interval=60.0)
-    assert (
-        found.source == "closed loop"
-        and found.gain_percent == 0.0
-        and found.interval == case.clock.dt
-    )
+    assert found.source == "closed loop"
+    assert found.gain_percent == 0.0 and found.interval == case.clock.dt
     controller = jaxtank.evaluate(case.loop, case.clock, "rms_error_total")["rms_error_total"]
-    assert (
-        found.cost == pytest.approx(float(controller), rel=1e-9)
-        and found.grids[-1]["cost"] > 2 * found.cost
-    )
+    assert found.cost == pytest.approx(float(controller), rel=1e-9)
+    assert found.grids[-1]["cost"] > 2 * found.cost
     assert "its own inputs are the bound" in str(found)
 
 

@@ -12,30 +12,12 @@ from jaxtank.loop.run import evaluate, simulate
 
 CLOCK = Clock(dt=2.0, duration=60.0)
 ROWS = """
-[[fault]]
-sensor = 1
-kind = "drift"
-start = 10.0
-end = 30.0
-size = 0.25
-[[fault]]
-sensor = 1
-kind = "spikes"
-start = 41.0
-end = 56.0
-size = 3.0
-every = 5.0
-[[fault]]
-sensor = 2
-kind = "offset"
-start = 20.0
-end = 40.0
-size = -0.5
-[[fault]]
-sensor = 2
-kind = "freeze"
-start = 45.0
-end = 55.0
+fault = [
+    { sensor = 1, kind = "drift", start = 10.0, end = 30.0, size = 0.25 },
+    { sensor = 1, kind = "spikes", start = 41.0, end = 56.0, size = 3.0, every = 5.0 },
+    { sensor = 2, kind = "offset", start = 20.0, end = 40.0, size = -0.5 },
+    { sensor = 2, kind = "freeze", start = 45.0, end = 55.0 },
+]
 """
 
 

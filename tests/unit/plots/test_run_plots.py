@@ -126,10 +126,8 @@ def test_margins_are_shares_of_the_limit_with_the_nearest_first(ax):
         to_rgba(c) for c in (style.FORBIDDEN, style.AFTER, style.AFTER)
     ]
     names = [label.get_text() for label in ax.get_yticklabels()]
-    assert (
-        names == ["broken\n33 of 30 cm", "met\n30 of 30 cm", "far\n15 of 30 cm"]
-        and ax.yaxis_inverted()
-    )
+    assert names == ["broken\n33 of 30 cm", "met\n30 of 30 cm", "far\n15 of 30 cm"]
+    assert ax.yaxis_inverted()
     assert list(ax.lines[0].get_ydata()) == [1]  # a bar without length is marked
 
 

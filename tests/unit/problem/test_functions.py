@@ -387,5 +387,3 @@ def test_a_number_that_a_function_reads_may_change_between_calls(watertank):
     first = before()
     price[0] = 10.0
     assert before() == pytest.approx(10.0 * first, rel=1e-12)
-    price[0] = 1.0
-    assert before() == pytest.approx(first, rel=1e-12)

@@ -56,9 +56,8 @@ def test_a_label_is_a_name_or_a_number_from_1():
         "LT101",
     ]
     assert labels_of(named, "tank", [0, 1]) == "LT101, LT102"
-    assert labels_of(plain, "tank", [0, 1]) == "tanks 1, 2" and label_of(plain, "pump", 0) == (
-        "pump 1"
-    )
+    assert labels_of(plain, "tank", [0, 1]) == "tanks 1, 2"
+    assert label_of(plain, "pump", 0) == ("pump 1")
     assert [limit.label for limit in resolve_limits(rig.loads(NAMED))] == [
         "max_level of LT101",
         "max_level of LT102",

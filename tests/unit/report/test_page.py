@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from browser import chromium
-from helpers import ONE_TANK, no_live_page
+from helpers import ONE_TANK, faulty_pictures, no_live_page
 
 import tuning
 from jaxtank import rig
@@ -196,16 +196,7 @@ def test_a_picture_that_fails_costs_itself_and_not_the_answer(
     usual, whole = getattr(plot, name), {path.name for path in folder_of(kind).iterdir()}
     shutil.copytree(folder_of(kind), tmp_path, dirs_exist_ok=True)
 
-    def unset(*args):
-        drawn = usual(*args)
-        for figure in drawn.values() if isinstance(drawn, dict) else [drawn]:
-            figure.suptitle(r"$\x{$")
-        return drawn
-
-    def undrawn(*_):
-        plt.figure()
-        raise ZeroDivisionError
-
+    unset, undrawn = faulty_pictures(usual)
     for fault in (unset, undrawn):
         monkeypatch.setattr(plot, name, fault)
         written = saves(kind)(tmp_path, "")

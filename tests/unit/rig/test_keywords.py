@@ -6,10 +6,9 @@ import re
 import tomllib
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
-from helpers import DATA, RIGS, ROOT
+from helpers import DATA, RIGS, ROOT, assert_same_tree
 
 import jaxtank
 from jaxtank import rig
@@ -50,9 +49,7 @@ def in_python(table):
 
 
 def assert_same(case, other):
-    assert jax.tree.structure(case.loop) == jax.tree.structure(other.loop)
-    for a, b in zip(jax.tree.leaves(case.loop), jax.tree.leaves(other.loop)):
-        np.testing.assert_array_equal(a, b)
+    assert_same_tree(case.loop, other.loop)
     for field in ("name", "clock", "limits", "free", "objective", "uncertain", "scenarios"):
         assert getattr(case, field) == getattr(other, field)
 
@@ -102,14 +99,9 @@ def test_a_controller_of_python_takes_the_place_of_its_table():
             return (self.Kc * (tick.r[0] - estimate.x[0]),), state
 
     case = jaxtank.Rig(
-        **PARTS,
-        controller=Proportional(Kc=2.0),
-        free={"controller.Kc": (1.0, 50.0)},
-        values={"controller.Kc": 3.0},
-        reference=[[0.0, 0.5]],
-        duration="10 s",
-        dt=2,
-    )
+        **PARTS, controller=Proportional(Kc=2.0), free={"controller.Kc": (1.0, 50.0)},
+        values={"controller.Kc": 3.0}, reference=[[0.0, 0.5]], duration="10 s", dt=2,
+    )  # fmt: skip
     run = jaxtank.simulate(case)
     np.testing.assert_allclose(run.u[:, 0], 3.0 * (0.5 - np.asarray(run.x[:, 0])), rtol=1e-12)
     assert case.clock.samples == 6 and case.free["controller.Kc"].high == 50.0

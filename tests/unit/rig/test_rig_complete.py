@@ -12,6 +12,7 @@ import warnings
 import jax
 import numpy as np
 import pytest
+from helpers import assert_same_tree
 
 from jaxtank import presets, rig
 from jaxtank.core.clock import Clock, clock_warnings
@@ -30,9 +31,8 @@ EIGHT = [
 
 
 def assert_same_loop(a, b):
-    assert jax.tree.structure(a.loop) == jax.tree.structure(b.loop) and a.clock == b.clock
-    for one, other in zip(jax.tree.leaves(a.loop), jax.tree.leaves(b.loop)):
-        np.testing.assert_array_equal(one, other)
+    assert_same_tree(a.loop, b.loop)
+    assert a.clock == b.clock
 
 
 def used(text):
@@ -158,14 +158,8 @@ def test_the_short_file_has_what_differs_and_what_is_tuned():
     case = rig.set_values(presets.find("gouta2015/backstepping"), own | model)
     text = rig.short(case)
     table = tomllib.loads(text)
-    assert set(table["values"]) == {"plant.area", "plant.overflow"} and set(table) == {
-        "case",
-        "name",
-        "values",
-        "limits",
-        "free",
-        "objective",
-    }
+    assert set(table["values"]) == {"plant.area", "plant.overflow"}
+    assert set(table) == {"case", "name", "values", "limits", "free", "objective"}
     assert_same_loop(rig.loads(text), case)
     rig.loads(used(text))
     assert len(text.splitlines()) < 50
@@ -173,9 +167,8 @@ def test_the_short_file_has_what_differs_and_what_is_tuned():
 
 def test_the_example_of_the_module_can_be_used():
     again = rig.loads(rig.__doc__.partition("\n\n")[2])
-    assert type(again.loop.observer).__name__ == "ExtendedKalman" and again.loop.faults.windows == (
-        ("pump_gain[0]", 300.0, 400.0),
-    )
+    assert type(again.loop.observer).__name__ == "ExtendedKalman"
+    assert again.loop.faults.windows == (("pump_gain[0]", 300.0, 400.0),)
     assert set(again.free) == {f"controller.values[1,{j}]" for j in range(3)}
     assert again.loop.safety_filter.rate.tolist() == [1.0] * 4
 
@@ -196,15 +189,13 @@ def test_faults_inflow_pulses_and_a_sine_over_a_preset_are_those_of_python():
     sine = Sine(
         amplitude=0.5, offset=0.0, period=100.0, zero=0.0, start=50.0, end=150.0, channel=1, width=2
     )
-    assert jax.tree.structure(loop.reference.second) == jax.tree.structure(sine)
-    np.testing.assert_array_equal(jax.tree.leaves(loop.reference.second), jax.tree.leaves(sine))
+    assert_same_tree(loop.reference.second, sine)
     assert jax.tree.structure(loop.reference.first) == jax.tree.structure(old.reference)
     for ours, theirs in (
         (loop.disturbance, inflow_pulses(4, [(30.0, 2.0, 1, 40.0)])),
         (loop.faults, faults(old.plant, [("pump_gain[1]", 10, 20, 0.6, 0.0)])),
     ):
-        assert jax.tree.structure(ours) == jax.tree.structure(theirs)
-        np.testing.assert_array_equal(jax.tree.leaves(ours), jax.tree.leaves(theirs))
+        assert_same_tree(ours, theirs)
     # and are read back, over the preset and tank by tank
     case = rig.loads(text)
     for tankwise in (False, True):
@@ -219,11 +210,8 @@ def test_what_a_preset_has_can_be_taken_away():
         "[reference]\nsine = {}\n"
     )
     case = rig.loads(text)
-    assert (
-        case.loop.disturbance is None
-        and case.scenarios == ()
-        and type(case.loop.reference).__name__ == "Ramps"
-    )
+    assert case.loop.disturbance is None
+    assert case.scenarios == () and type(case.loop.reference).__name__ == "Ramps"
     assert_same_loop(rig.loads(rig.dump(case)), case)
     assert rig.loads('case = "calofir/backstepping-perturbed"\nfault = []\n').loop.faults is None
 
@@ -241,9 +229,8 @@ def test_another_controller_and_observer_over_a_preset():
         'case = "mirakhorli/sfc"\n[observer]\nkind = "kalman"\nprocess = 1e-3\nmeasurement ='
         " 0.01\nmeasured = [1, 2]\n"
     )
-    assert kalman.loop.observer.measured == (0, 1) and np.shape(kalman.loop.observer.process) == (
-        4,
-    )
+    assert kalman.loop.observer.measured == (0, 1)
+    assert np.shape(kalman.loop.observer.process) == (4,)
     assert_same_loop(rig.loads(rig.dump(kalman)), kalman)
 
 

@@ -20,31 +20,24 @@ EVERY = """
 name = "mine"
 reachable = false
 units = ["dm", "W"]
-[[tank]]
-name = "left"
-area = 20.0
-rim = 30.0
-drain = 0.2
-level = 3.0
-noise = 0.01
-[[tank]]
-name = "right"
-area = 21.0
-rim = 31.0
-drain = 0.3
-level = 4.0
-noise = 0.02
-[[orifice]]
-from = "left"
-to = "right"
-area = 0.1
-[[pipe]]
-between = ["left", "right"]
-area = 0.15
-[[spill]]
-from = "left"
-to = "right"
-caught = 0.5
+tank = [
+    { name = "left", area = 20.0, rim = 30.0, drain = 0.2, level = 3.0, noise = 0.01 },
+    { name = "right", area = 21.0, rim = 31.0, drain = 0.3, level = 4.0, noise = 0.02 },
+]
+orifice = [{ from = "left", to = "right", area = 0.1 }]
+pipe = [{ between = ["left", "right"], area = 0.15 }]
+spill = [{ from = "left", to = "right", caught = 0.5 }]
+plant = { outputs = ["right"], gravity = 98.0, overflow = true, bottom = true, knee = 0.002 }
+controller = { kind = "pid", Kc = [1.0], Ti = [9.0] }
+disturbance = { window = 50.0 }
+inflow = [{ time = 100.0, duration = 2.0, tank = "right", volume = 10.0 }]
+fault = [
+    { of = "drain[0]", start = 200.0, end = 250.0, factor = 0.5, extra = 0.01 },
+    { sensor = "left", kind = "spikes", start = 20.0, end = 80.0, size = 0.3, every = 7.0 },
+]
+schedule = { gains = ["controller.Kc[0]"], variable = "r1", knots = [3.0, 6.0] }
+covariance = { names = ["plant.drain[0]"], matrix = [[0.0001]] }
+scenario = [{ name = "noisy", seed = 7, weight = 2.0, values = { "sensor.noise" = 0.1 } }]
 [[pump]]
 name = "P-101"
 gain = 5.0
@@ -53,16 +46,6 @@ split = 0.4
 low = 0.5
 high = 12.0
 initial = 2.0
-[plant]
-outputs = ["right"]
-gravity = 98.0
-overflow = true
-bottom = true
-knee = 0.002
-[controller]
-kind = "pid"
-Kc = [1.0]
-Ti = [9.0]
 [observer]
 kind = "extended-kalman"
 process = [0.1, 0.1]
@@ -84,30 +67,6 @@ zero = 3.0
 start = 100.0
 end = 300.0
 output = 1
-[disturbance]
-window = 50.0
-[[inflow]]
-time = 100.0
-duration = 2.0
-tank = "right"
-volume = 10.0
-[[fault]]
-of = "drain[0]"
-start = 200.0
-end = 250.0
-factor = 0.5
-extra = 0.01
-[[fault]]
-sensor = "left"
-kind = "spikes"
-start = 20.0
-end = 80.0
-size = 0.3
-every = 7.0
-[schedule]
-gains = ["controller.Kc[0]"]
-variable = "r1"
-knots = [3.0, 6.0]
 [safety_filter]
 limit = [2.5, 2.4]
 low = [0.2, 0.1]
@@ -115,19 +74,16 @@ predict = false
 band = [0.01, 0.02]
 rate = 0.5
 widths = { "plant.drain" = 0.01 }
-[covariance]
-names = ["plant.drain[0]"]
-matrix = [[0.0001]]
-[[scenario]]
-name = "noisy"
-seed = 7
-weight = 2.0
-values = { "sensor.noise" = 0.1 }
 """
 # values that replace a key of EVERY
 ELEMENTS = """
 reachable = false
 units = ["m", "-"]
+orifice = [{ from = 1, to = 2, area = 0.001, port = 0.05, exponent = 0.55, linear = 900.0 }]
+pipe = [{ between = [2, 3], area = 0.002, port = 0.02 }]
+spill = [{ from = 1, to = 2, port = 1.7 }]
+plant = { gravity = 9.81 }
+controller = { kind = "open-loop", initial = [0.4, 0.2, 0.1, 0.3, 0.3] }
 [[tank]]
 name = "LT1"
 shape = "cone"
@@ -156,21 +112,6 @@ level = 0.3
 diameter = 0.7
 height = 1.7
 level = 0.9
-[[orifice]]
-from = 1
-to = 2
-area = 0.001
-port = 0.05
-exponent = 0.55
-linear = 900.0
-[[pipe]]
-between = [2, 3]
-area = 0.002
-port = 0.02
-[[spill]]
-from = 1
-to = 2
-port = 1.7
 [[pump]]
 name = "P1"
 to = 1
@@ -222,11 +163,6 @@ noise = 0.002
 offset = 0.01
 scale = 1.02
 curve = [[0.0, 0.01], [0.5, 0.4], [0.9, 0.9]]
-[plant]
-gravity = 9.81
-[controller]
-kind = "open-loop"
-initial = [0.4, 0.2, 0.1, 0.3, 0.3]
 """
 # read beside another one only: a steady inflow is no [[inflow]], a file with tanks is no case
 APART = {("tank", "inflow"), ("disturbance", "inflow"), ("", "case"), ("reference", "sine")}
@@ -378,22 +314,12 @@ def test_the_fields_of_a_class_are_the_keys_of_its_section():
 
 SIZES = Sizes(4, 2, 2, names={"left": 0})
 KINDS = {
-    "number": (1.5, "x"),
-    "integer": (3, 2.5),
-    "flag": (True, 1),
-    "choice": ("clip", 3),
-    "text": ("a b", "a\nb"),
-    "texts": (["a", "b"], [1]),
-    "list": ([1.0, 2.0, 3.0, 4.0], [1.0]),
-    "array": ([1.0, 2.0, 3.0, 4.0], "x"),
-    "scalar": (2.0, [1.0, 2.0]),
-    "tank": (3, 5),
-    "tanks": ([1, 4], 3),
-    "pair": ([1, 4], [1, 1]),
-    "feed": ([2, 3], [1, 2, 3]),
-    "curve": ([[0.0, 1.0], [2.0, 3.0]], [[0.0, 1.0]]),
-    "table": ({"a": 1}, 3),
-}
+    "number": (1.5, "x"), "integer": (3, 2.5), "flag": (True, 1), "choice": ("clip", 3),
+    "text": ("a b", "a\nb"), "texts": (["a", "b"], [1]), "list": ([1.0, 2.0, 3.0, 4.0], [1.0]),
+    "array": ([1.0, 2.0, 3.0, 4.0], "x"), "scalar": (2.0, [1.0, 2.0]), "tank": (3, 5),
+    "tanks": ([1, 4], 3), "pair": ([1, 4], [1, 1]), "feed": ([2, 3], [1, 2, 3]),
+    "curve": ([[0.0, 1.0], [2.0, 3.0]], [[0.0, 1.0]]), "table": ({"a": 1}, 3),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -3,11 +3,10 @@
 import dataclasses
 import json
 import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
+from helpers import python
 
 import jaxtank
 from jaxtank import presets
@@ -86,14 +85,7 @@ def results():
 def test_a_rig_is_read_written_and_simulated_whatever_its_docstrings_say():
     """All docstrings and descriptions of both packages are replaced by "x" in a new process."""
     script = f"{REWORD}\n{RESULTS}\nimport json\nprint(json.dumps(results()))"
-    run = subprocess.run(
-        [sys.executable, "-c", script],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "JAX_ENABLE_X64": "1"},
-    )
-    assert run.returncode == 0, run.stderr[-2000:]
-    reworded, words = json.loads(run.stdout)
+    reworded, words = json.loads(python(script, env={**os.environ, "JAX_ENABLE_X64": "1"}))
     space: dict = {}
     exec(RESULTS, space)
     found, ours = space["results"]()

@@ -470,9 +470,8 @@ def test_a_lag_and_a_dead_time_with_a_bottom_count_with_less_outflow(delay):
     assert "(N)" in proved.reason(**at(step, rate=[0.999 * needed]))
     for share, holds in EDGE:
         verdict = proved.check(**at(math.sqrt(2.0 * share) / c_max))[0]
-        assert verdict.holds == (holds or not lag) and ("limit below 4 x" in verdict.reason) != (
-            verdict.holds
-        )
+        assert verdict.holds == (holds or not lag)
+        assert ("limit below 4 x" in verdict.reason) != (verdict.holds)
     assert "where outflow is less" in proved.reason(**at(math.sqrt(8.01) / c_max))
 
 

@@ -20,10 +20,7 @@ reference = { initial = [1.0], changes = [[1.0, 1, 2.0]], ramp = 0.0 }
 values = { "clock.dt" = 0.1, "clock.duration" = 30.0 }
 limits = { overshoot_percent = 4.0 }
 uncertain = { "plant.drain" = 0.1, "plant.pump_gain" = 0.1 }
-
-[free]
-"controller.Kc" = [0.05, 50.0]
-"controller.Ti" = [0.5, 100.0]
+free = { "controller.Kc" = [0.05, 50.0], "controller.Ti" = [0.5, 100.0] }
 """
 
 

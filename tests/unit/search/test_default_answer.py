@@ -123,8 +123,8 @@ def test_a_share_is_that_of_every_flow_where_a_rig_names_nothing(path, tmp_path)
 def test_plants_that_cannot_follow_are_those_of_the_limits(case):
     """2.6 cm is the highest setpoint: 2.5 cm as the limit leaves no plant that can follow."""
     limited = setting_of(case, limits={"max_level": 2.5})
-    assert judge(limited, 4, 0).infeasible.all()
-    assert not judge(setting_of(case), 4, 0).infeasible.any()
+    assert judge(limited, 3, 0).infeasible.all()
+    assert not judge(setting_of(case), 3, 0).infeasible.any()
 
 
 @pytest.mark.slow
@@ -191,9 +191,8 @@ def test_what_only_a_report_shows_is_run_when_it_is_asked_for(case):
     np.testing.assert_allclose(before["iae"], alone["iae"], rtol=1e-12)
     assert before.made and len(dict(before)) == len(before)
     other = pickle.loads(pickle.dumps(result.measures))
-    assert type(other["after"]) is dict and sorted(other["after"]) == sorted(
-        result.measures["after"]
-    )
+    assert type(other["after"]) is dict
+    assert sorted(other["after"]) == sorted(result.measures["after"])
     assert repr(result.measures["after"]).startswith("{'")
     error = float(alone["rms_error_total"])
     assert result.answer.nominal["before"] == pytest.approx(error, rel=1e-12)

@@ -80,21 +80,6 @@ def test_a_staircase_is_not_called_an_optimum(quick):
     assert result.status == "not_converged" and "changes in steps" in result.message
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["--limit", "max_level=28", "--limit", "max_level=33"],
-        ["--free", "controller.k=0.1:1", "--free", "controller.k=0.1:2"],
-        ["--objective", "iae=1", "--objective", "iae=2"],
-        ["--resume", ""],
-    ],
-)
-def test_what_is_given_twice_or_empty_is_refused(words, capsys):
-    assert main.main(["tune", "gouta2015/backstepping", *words]) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1 and words[0] in told
-
-
 @pytest.mark.slow
 def test_a_search_over_choices_is_resumed(tmp_path, capsys):
     """Killed after its first combination: the same answer, and no log is left."""
@@ -177,24 +162,14 @@ def test_a_trade_off_starts_from_what_was_screened(capsys):
     case = rig.load(WATERTANK)
     loop = jaxtank.with_values(case.loop, points[-1]["parameters"])
     held = jaxtank.evaluate(loop, case.clock, ["overshoot_percent", "rise_time", "settling_time"])
-    assert (
-        held["overshoot_percent"][0] == 0.0
-        and held["rise_time"][0] <= 2.5
-        and held["settling_time"][0] <= 20.0
-    )
+    assert held["overshoot_percent"][0] == 0.0
+    assert held["rise_time"][0] <= 2.5 and held["settling_time"][0] <= 20.0
 
 
 NOISY = [
-    "gouta2022/chadpc",
-    "--dt",
-    "0.05",
-    "--set",
-    "clock.duration=100",
-    "--set",
-    "sensor.noise=0.02",
-    "--set",
-    "actuator.delay=0.2",
-]
+    "gouta2022/chadpc", "--dt", "0.05", "--set", "clock.duration=100", "--set", "sensor.noise=0.02",
+    "--set", "actuator.delay=0.2",
+]  # fmt: skip
 
 
 @pytest.mark.slow
@@ -225,11 +200,8 @@ def test_a_limit_that_no_run_can_be_measured_by_is_refused(capsys, tmp_path, com
     assert main.main([command[0], path, *command[1:], "--limit", "none", "--limit", limit]) == 2
     out, err = capsys.readouterr()
     assert out == "" and err.count("\n") == 1
-    assert (
-        err.startswith(f"jaxtank: limit {limit.replace('=', ' = ')} ")
-        and "undefined on this run" in err
-        and why in err
-    )
+    assert err.startswith(f"jaxtank: limit {limit.replace('=', ' = ')} ")
+    assert "undefined on this run" in err and why in err
 
 
 def test_an_output_without_a_step_is_not_limited_and_one_with_is(gouta):

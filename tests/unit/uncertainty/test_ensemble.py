@@ -163,43 +163,28 @@ def test_quantiles_of_a_linear_gaussian_case():
 
     base = jaxtank.presets.find("cascaded/open-loop").loop
     plant = network(
-        area=[10.0],
-        drain=[0.0],
-        links=(),
-        orifice=[],
-        pump_gain=[2.0],
-        feeds=((0, None),),
-        rim=1e3,
-        outputs=(0,),
-    )
+        area=[10.0], drain=[0.0], links=(), orifice=[], pump_gain=[2.0], feeds=((0, None),),
+        rim=1e3, outputs=(0,),
+    )  # fmt: skip
     loop = dataclasses.replace(
         base,
         plant=plant,
         sensor=dataclasses.replace(base.sensor, gain=np.ones(1), noise=np.zeros(1)),
         controller=OpenLoop(signal=Constant(level=np.array([3.0]))),
         actuator=dataclasses.replace(
-            base.actuator,
-            low=np.zeros(1),
-            high=np.full(1, 10.0),
-            initial=np.zeros(1),
-            stop=np.zeros(1),
-            pulse=np.ones(1),
+            base.actuator, low=np.zeros(1), high=np.full(1, 10.0), initial=np.zeros(1),
+            stop=np.zeros(1), pulse=np.ones(1),
         ),
         reference=Constant(level=np.array([5.0])),
         disturbance=None,
         faults=None,
         x0=np.array([1.0]),
-    )
+    )  # fmt: skip
     clock = jaxtank.Clock(dt=0.5, duration=20.0)
     case = jaxtank.presets.Case(
-        name="one tank",
-        title="",
-        loop=loop,
-        clock=clock,
-        limits={"max_level": 14.0},
-        free={},
+        name="one tank", title="", loop=loop, clock=clock, limits={"max_level": 14.0}, free={},
         objective={"ise": 1.0},
-    )
+    )  # fmt: skip
     found = tuning.ensemble(
         case, {"plant.pump_gain": tuning.Normal(sd=0.1)}, samples=4096, draws="sobol", fan=False
     )
@@ -207,9 +192,8 @@ def test_quantiles_of_a_linear_gaussian_case():
     np.testing.assert_allclose(found.measures["max_level"][:, 0], level, rtol=1e-12)
     summary = found.summary()["max_level"]
     control = stats.truncnorm(-3, 3, loc=13.0, scale=0.6)
-    assert summary["mean"][0] == pytest.approx(13.0, abs=2e-3) and summary["sd"][
-        0
-    ] == pytest.approx(control.std(), rel=5e-3)
+    assert summary["mean"][0] == pytest.approx(13.0, abs=2e-3)
+    assert summary["sd"][0] == pytest.approx(control.std(), rel=5e-3)
     for name, p in (("p05", 0.05), ("p50", 0.5), ("p95", 0.95)):
         assert summary[name][0] == pytest.approx(control.ppf(p), abs=5e-3)
     tail = (
@@ -248,11 +232,8 @@ def test_the_worst_side_of_a_minimum_is_its_lower_one(whole):
 @pytest.mark.slow
 def test_one_draw_claims_no_spread(case):
     found = tuning.ensemble(case, samples=1, key=3, fan=False).summary()["max_level"]
-    assert (
-        found["sd"] is None
-        and found["mean_interval95"] is None
-        and np.all(np.isfinite(found["mean"]))
-    )
+    assert found["sd"] is None
+    assert found["mean_interval95"] is None and np.all(np.isfinite(found["mean"]))
 
 
 FEW = {"measures": ("max_level", "rms_error_total"), "fan": False, "key": 5}
@@ -478,10 +459,8 @@ def test_the_scenario_bound_is_that_of_the_table():
         np.testing.assert_allclose(
             [robust.scenario_bound(n, k) for k in (1, 2, 8)], bounds, atol=6e-4
         )
-    assert (
-        robust.scenario_bound(64, 1) == pytest.approx(0.296, abs=5e-4)
-        and robust.scenario_bound(5, 5) == 1.0
-    )
+    assert robust.scenario_bound(64, 1) == pytest.approx(0.296, abs=5e-4)
+    assert robust.scenario_bound(5, 5) == 1.0
 
 
 @pytest.mark.slow_for("cvar", "mean", "worst")
@@ -494,14 +473,9 @@ def test_robust_gains_hold_the_limit_on_every_plant_and_the_certificate_is_of_fr
     )
     free = {"controller.k": (1e-3, 2.0), "controller.k1": (1e-3, 1.0)}
     result = tuning.tune_robust(
-        case,
-        risk=risk,
-        samples=12,
-        fresh=64,
-        free=free,
-        limits={"max_level": 33.0},
+        case, risk=risk, samples=12, fresh=64, free=free, limits={"max_level": 33.0},
         method=tuning.Options(starts=1, screening=8, validation=0),
-    )
+    )  # fmt: skip
     assert all(c["margin"] >= 0 for c in result.constraints) and len(result.constraints) == 48
     costs = []
     values = {n: p["after"] for n, p in result.parameters.items()}
@@ -514,9 +488,8 @@ def test_robust_gains_hold_the_limit_on_every_plant_and_the_certificate_is_of_fr
     expected = {"mean": np.mean(costs), "worst": max(costs), "cvar": max(costs)}[risk]
     assert result.objective["after"] == pytest.approx(expected, rel=1e-9)
     known = result.certificate
-    assert (known.scenarios, known.fresh) == (12, 64) and known.bound == robust.scenario_bound(
-        12, known.support
-    )
+    assert (known.scenarios, known.fresh) == (12, 64)
+    assert known.bound == robust.scenario_bound(12, known.support)
     np.testing.assert_allclose(known.interval95, clopper_pearson(known.broken, 64), atol=1e-12)
     assert "new plants" in result.message
 
@@ -536,10 +509,8 @@ def test_a_back_off_is_kept_in_the_search_and_fresh_plants_are_judged_without(go
     assert [c["limit"] for c in result.constraints[:4]] == pytest.approx(
         [31.35, 31.35, 30.4, 31.35]
     )
-    assert (
-        all(c["margin"] >= 0 for c in result.constraints)
-        and "tightened every limit by 5 %" in result.message
-    )
+    assert all(c["margin"] >= 0 for c in result.constraints)
+    assert "tightened every limit by 5 %" in result.message
     costs, held = np.zeros((48, 2)), np.zeros((48, 2), dtype=bool)
     for side, there in enumerate((result.case, result.tuned)):
         seen = tuning.ensemble(
@@ -553,11 +524,8 @@ def test_a_back_off_is_kept_in_the_search_and_fresh_plants_are_judged_without(go
         held[:, side] = (seen.measures["max_level"] <= options["limits"]["max_level"]).all(axis=1)
     assert result.certificate.broken == (~held[:, 1]).sum() < (~held[:, 0]).sum()
     np.testing.assert_allclose(result.cloud["objective"], costs, rtol=1e-9)
-    assert (
-        np.array_equal(result.cloud["held"], held)
-        and result.cloud["past"]
-        and result.cloud["limit"] == 0.0
-    )
+    assert np.array_equal(result.cloud["held"], held)
+    assert result.cloud["past"] and result.cloud["limit"] == 0.0
     both, found = held.all(axis=1), result.validation
     assert (found["samples"], found["comparable"]) == (48, both.mean())
     assert found["better_share_of_comparable"] == np.mean(costs[both, 1] < costs[both, 0])
@@ -598,13 +566,9 @@ def test_64_plants_a_back_off_and_no_violation_among_4096(study, objective):
     include second derivatives.
     """
     result = tuning.tune_robust(
-        study,
-        fresh=4096,
-        objective=objective,
-        limits={"max_level": 33.0},
-        method=tuning.Options(starts=1, screening=1),
-        back_off=0.03,
-    )
+        study, fresh=4096, objective=objective, limits={"max_level": 33.0},
+        method=tuning.Options(starts=1, screening=1), back_off=0.03,
+    )  # fmt: skip
     known = result.certificate
     assert result.success and result.evaluations["gradients"] <= 26 * 64
     assert (known.broken, known.fresh, known.support) == (0, 4096, 1) and known.interval95[1] < 1e-3
@@ -625,9 +589,8 @@ def test_a_limit_that_one_plant_holds_in_place_is_broken_by_one_fresh_plant_in_n
     )
     known = result.certificate
     controller = stats.beta(1, 64)
-    assert known.support == 1 and controller.ppf(0.025) < known.broken / 4096 < controller.ppf(
-        0.975
-    )
+    assert known.support == 1
+    assert controller.ppf(0.025) < known.broken / 4096 < controller.ppf(0.975)
     assert "back-off" in result.message
 
 

@@ -85,35 +85,13 @@ def test_a_weighted_count_has_the_interval_of_a_poisson_count_where_weights_are_
 
 RIG = """
 name = "two basins"
-[[tank]]
-area = 10.0
-rim = 14.7
-level = 1.0
-[[tank]]
-area = 10.0
-rim = 14.6
-level = 1.0
-[[pump]]
-gain = 2.0
-to = 1
-high = 10.0
-[[pump]]
-gain = 2.0
-to = 2
-high = 10.0
-[plant]
-outputs = [1, 2]
-overflow = true
-[controller]
-kind = "open-loop"
-initial = [3.0, 3.0]
-[reference]
-initial = [5.0, 5.0]
-[values]
-"clock.dt" = 0.5
-"clock.duration" = 20.0
-[limits]
-max_level = "rim"
+tank = [{ area = 10.0, rim = 14.7, level = 1.0 }, { area = 10.0, rim = 14.6, level = 1.0 }]
+pump = [{ gain = 2.0, to = 1, high = 10.0 }, { gain = 2.0, to = 2, high = 10.0 }]
+plant = { outputs = [1, 2], overflow = true }
+controller = { kind = "open-loop", initial = [3.0, 3.0] }
+reference = { initial = [5.0, 5.0] }
+values = { "clock.dt" = 0.5, "clock.duration" = 20.0 }
+limits = { max_level = "rim" }
 """
 
 

@@ -3,15 +3,13 @@
 import csv
 import functools
 import json
-import subprocess
-import sys
 
 import jax
 import matplotlib.image
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from helpers import command
+from helpers import command, python
 
 import jaxtank
 from jaxtank import presets, rig
@@ -124,9 +122,8 @@ def test_morris_points():
     points = indices.morris_points(5, 200, seed=3)
     assert points.min() == 0.0 and points.max() == 1.0
     moved = np.abs(np.diff(points, axis=1))
-    assert (np.isclose(moved, 2 / 3).sum(axis=2) == 1).all() and np.isclose(
-        moved.sum(axis=(1, 2)), 5 * 2 / 3
-    ).all()
+    assert (np.isclose(moved, 2 / 3).sum(axis=2) == 1).all()
+    assert np.isclose(moved.sum(axis=(1, 2)), 5 * 2 / 3).all()
     levels = np.round(points[:, 0] * 3)
     np.testing.assert_allclose(points[:, 0] * 3, levels, atol=1e-12)
     # 4 sd of a binomial
@@ -426,21 +423,16 @@ def test_command_prints_tables():
 @pytest.mark.parametrize(
     "args",
     [
-        ("cascaded/pid",),
-        (*SHORT, "--method", "sobel"),
-        (*SHORT, "--samples", "many"),
-        (*SHORT, "--method", "morris", "--samples", "0"),
-        (*SHORT, "--spread", "5%"),
-        (*SHORT, "--spread", "-0.1"),
-        (*SHORT, "--vary", "plant.drain"),
+        ("cascaded/pid",), (*SHORT, "--method", "sobel"), (*SHORT, "--samples", "many"),
+        (*SHORT, "--method", "morris", "--samples", "0"), (*SHORT, "--spread", "5%"),
+        (*SHORT, "--spread", "-0.1"), (*SHORT, "--vary", "plant.drain"),
         (*SHORT, "--vary", "plant.drain=gauss:5%"),
         (*SHORT, "--vary", "plant.drain=uniform:5%", "--vary", "plant.drain=uniform:6%"),
         (*SHORT, "--vary", "plant.drain=uniform:5%", "--spread", "0.1"),
-        (*SHORT, "--measure", "height"),
-        (*SHORT, "--seed", "x"),
+        (*SHORT, "--measure", "height"), (*SHORT, "--seed", "x"),
     ],
     ids=" ".join,
-)
+)  # fmt: skip
 def test_bad_command(args, tmp_path):
     code, out, err = say(*args, "--out", str(tmp_path / "none"))
     assert code == 2 and out == "" and not (tmp_path / "none").exists()
@@ -466,9 +458,7 @@ for devices in (1, 3):
 
 @pytest.mark.slow
 def test_three_devices_give_the_bits_of_one():
-    ran = subprocess.run([sys.executable, "-c", DEVICES], capture_output=True, text=True)
-    assert ran.returncode == 0, ran.stderr[-2000:]
-    lines = ran.stdout.splitlines()
+    lines = python(DEVICES).splitlines()
     half = len([line for line in lines if line.startswith("[")])
     numbers = [line for line in lines if line.startswith("[")]
     assert half == 2 and numbers[0] == numbers[1] and "nan" not in numbers[0]
@@ -506,19 +496,14 @@ def test_pictures():
     effect = np.linspace(1.0, 0.05, 20) * (-1.0) ** np.arange(20)
     ends = np.abs(effect)[:, None] + [-0.1, 0.1]
     ax = responses.tornado(axes[0], names, effect, "cm", "x")
-    assert (
-        ax.get_xlabel() == "change [cm]"
-        and len(ax.patches) == 2 * responses.BARS
-        and "6 smaller ones not shown" in ax.get_title()
-    )
+    assert ax.get_xlabel() == "change [cm]"
+    assert len(ax.patches) == 2 * responses.BARS and "6 smaller ones not shown" in ax.get_title()
     assert [p.get_width() for p in ax.patches[:2]] == list(effect[:2]) and ax.yaxis_inverted()
     ax = responses.elementary(
         axes[1], names[:3], np.abs(effect[:3]), ends[:3], np.ones(3), "cm", "x"
     )
-    assert (
-        ax.get_xlabel() == "change over the range [cm]"
-        and [t.get_text() for t in ax.get_yticklabels()] == names[:3]
-    )
+    assert ax.get_xlabel() == "change over the range [cm]"
+    assert [t.get_text() for t in ax.get_yticklabels()] == names[:3]
     ax = responses.shares(axes[2], few, *[(np.ones(3), ends[:3])] * 2, "x")
     assert "[-]" in ax.get_xlabel() and len(ax.patches) == 6
     segments = np.sort(np.array(ax.collections[0].get_segments())[:, :, 0], axis=1)
