@@ -40,16 +40,29 @@ NODE = shutil.which("node")
 
 # Folders of both packages: a folder imports those of its own or of an earlier line.
 RANKS = [
-    "jaxtank.core jaxtank.xla", "jaxtank.views",
-    "jaxtank.signals jaxtank.instruments jaxtank.plants", "jaxtank.analysis",
-    "jaxtank.controllers jaxtank.observers jaxtank.measures jaxtank.safety", "jaxtank.loop",
-    "jaxtank.case", "jaxtank.presets", "jaxtank.rig jaxtank.plots jaxtank.export jaxtank.interop",
-    "jaxtank.limits jaxtank.bounds jaxtank.task", "jaxtank.live", "jaxtank.__main__",
-    "tuning.views", "tuning.problem tuning.storage", "tuning.cluster",
-    "tuning.uncertainty tuning.identification tuning.optimal_input", "tuning.feasible",
-    "tuning.search tuning.falsification", "tuning.report", "tuning.figures", "tuning.bench",
+    "jaxtank.core jaxtank.xla",
+    "jaxtank.views",
+    "jaxtank.signals jaxtank.instruments jaxtank.plants",
+    "jaxtank.analysis",
+    "jaxtank.controllers jaxtank.observers jaxtank.measures jaxtank.safety",
+    "jaxtank.loop",
+    "jaxtank.case",
+    "jaxtank.presets",
+    "jaxtank.rig jaxtank.plots jaxtank.export jaxtank.interop",
+    "jaxtank.limits jaxtank.bounds jaxtank.task",
+    "jaxtank.live",
+    "jaxtank.__main__",
+    "tuning.views",
+    "tuning.problem tuning.storage",
+    "tuning.cluster",
+    "tuning.uncertainty tuning.identification tuning.optimal_input",
+    "tuning.feasible",
+    "tuning.search tuning.falsification",
+    "tuning.report",
+    "tuning.figures",
+    "tuning.bench",
     "tuning.cli",
-]  # fmt: skip
+]
 RANK = {folder: rank for rank, folders in enumerate(RANKS) for folder in folders.split()}
 
 
@@ -186,9 +199,13 @@ def assert_same_case(a, b):
 
 
 REGISTRIES = (
-    *(role.classes for role in components.ROLES.values()), components.REGISTERED,
-    catalogue.MEASURES, accumulators.ACCUMULATORS, presets._ADDED, source.LANGUAGES,
-)  # fmt: skip
+    *(role.classes for role in components.ROLES.values()),
+    components.REGISTERED,
+    catalogue.MEASURES,
+    accumulators.ACCUMULATORS,
+    presets._ADDED,
+    source.LANGUAGES,
+)
 """Where classes, measures, papers and languages of a user's own are registered."""
 
 

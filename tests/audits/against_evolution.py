@@ -65,11 +65,18 @@ def evolved(case, seeds=3, generations=300):
     size = len(problem.bounds)
     found = [
         scipy.optimize.differential_evolution(
-            merits, [(0.0, 1.0)] * size, rng=seed, popsize=64 // size, maxiter=generations,
-            tol=1e-10, vectorized=True, updating="deferred", polish=False,
+            merits,
+            [(0.0, 1.0)] * size,
+            rng=seed,
+            popsize=64 // size,
+            maxiter=generations,
+            tol=1e-10,
+            vectorized=True,
+            updating="deferred",
+            polish=False,
         )
         for seed in range(seeds)
-    ]  # fmt: skip
+    ]
     best = min(found, key=lambda f: f.fun)
     return float(best.fun), problem.values(best.x)
 

@@ -19,9 +19,14 @@ from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.signals.setpoints import Ramps
 
 MEASURES = (
-    "mean_square_error", "iae", "rms_input", "input_travel", "saturation_excess", "max_level",
+    "mean_square_error",
+    "iae",
+    "rms_input",
+    "input_travel",
+    "saturation_excess",
+    "max_level",
     "min_level",
-)  # fmt: skip
+)
 SAMPLES = 64
 """A square: reverse mode then has no rest to compile."""
 STARTS = ("near", "far", "dry", "empty", "equal", "full", "over", "zero")

@@ -237,9 +237,13 @@ of_signal("Ramps filtered", lambda: signals.ramps((3.0, 8.0), CHANGES, 3.2, filt
 of_signal("Ramps quintic", lambda: signals.ramps((3.0, 8.0), CHANGES, ramp=3.0, shape="quintic"))
 of_signal("Ramps steps", lambda: signals.ramps((3.0, 8.0), CHANGES, ramp=0.0))
 SINE = {
-    "amplitude": np.array(2.0), "offset": np.array(1.0), "period": 7.0, "zero": 1.0, "start": 3.0,
+    "amplitude": np.array(2.0),
+    "offset": np.array(1.0),
+    "period": 7.0,
+    "zero": 1.0,
+    "start": 3.0,
     "end": 15.0,
-}  # fmt: skip
+}
 of_signal("Sine", lambda: signals.Sine(**SINE, channel=1, width=2))
 of_signal(
     "Sum",
@@ -566,9 +570,14 @@ def of_controller(name, points=12, change=lambda case: case, **more):
             np.asarray(loop.actuator.high) - np.asarray(loop.actuator.low)
         )
         return (
-            near(rng, loop.controller, 0.02), x, r, rate[0], 0.1 * rate[1],
-            0.01 * rng.normal(size=n), u0,
-        ), commanded(case)  # fmt: skip
+            near(rng, loop.controller, 0.02),
+            x,
+            r,
+            rate[0],
+            0.1 * rate[1],
+            0.01 * rng.normal(size=n),
+            u0,
+        ), commanded(case)
 
 
 CONTROLLERS = {

@@ -64,9 +64,13 @@ def valve(more, start="LT101", end=None):
     to = f', to = "{end}"' if end else ""
     keys = f'name = "FV101", from = "{start}"{to}, area = 0.001, high = 100.0, initial = 50.0'
     return {
-        "tank": OUTLET, "orifice": "[]", "pump": "[]", "valve": f"[{{{keys}{more}}}]",
-        "controller": REVERSE, "reachable": "false",
-    }  # fmt: skip
+        "tank": OUTLET,
+        "orifice": "[]",
+        "pump": "[]",
+        "valve": f"[{{{keys}{more}}}]",
+        "controller": REVERSE,
+        "reachable": "false",
+    }
 
 
 def shaped(keys):
@@ -238,15 +242,19 @@ def rig_file(folder, name):
 
 
 COMMANDS = {
-    "show": "show RIG", "init": "init RIG", "simulate": "simulate RIG --json",
-    "margins": "simulate RIG --json --margins", "filter": "simulate RIG --json --safety-filter",
+    "show": "show RIG",
+    "init": "init RIG",
+    "simulate": "simulate RIG --json",
+    "margins": "simulate RIG --json --margins",
+    "filter": "simulate RIG --json --safety-filter",
     "tune": "tune RIG --json --starts 1 --validation 16",
     "nominal": "tune RIG --json --nominal --starts 1 --screening 4 --validation 8",
     "rule": "tune RIG --json --rule simc --validation 16",
     "bound": "tune RIG --json --nominal --starts 1 --screening 4 --validation 0 --bound",
     "spread": "uncertainty RIG --json --samples 16",
     "sensitivity": "sensitivity RIG --json --method local",
-    "attack": "attack RIG --json --starts 1", "explore": "explore RIG --out DIR/page.html --quiet",
+    "attack": "attack RIG --json --starts 1",
+    "explore": "explore RIG --out DIR/page.html --quiet",
     "c": "export RIG --lang c --out DIR/c --quiet",
     "js": "export RIG --lang js --out DIR/js --quiet",
     "matlab": "export RIG --lang m --out DIR/m --quiet",
@@ -256,7 +264,7 @@ COMMANDS = {
     "replay": "replay DIR/c/my_rig.c --data DIR/run/trajectory.csv --json",
     "identify": "identify RIG --data DIR/run/trajectory.csv --json --starts 1",
     "predict": "predict RIG --data DIR/run/trajectory.csv --json",
-}  # fmt: skip
+}
 ANSWERS = (0, 4, 5)
 """Exit codes of a command that did what was asked (4, 5: and says that something does not hold)."""
 

@@ -132,10 +132,14 @@ def random_rig(seed):
     limit = rim * rng.uniform(0.7, 1.0, n)
     least = np.where(rng.random(n) < 0.6, rim * rng.uniform(0.05, 0.3, n), 0.0)
     settings = {
-        "widths": widths_of(plant, spread), "limit": limit, "low": least, "inflow": inflow,
-        "draw": draw, "start": least + (limit - least) * rng.uniform(0.05, 1.0, n),
+        "widths": widths_of(plant, spread),
+        "limit": limit,
+        "low": least,
+        "inflow": inflow,
+        "draw": draw,
+        "start": least + (limit - least) * rng.uniform(0.05, 1.0, n),
         "substeps": int(rng.integers(1, 4)),
-    }  # fmt: skip
+    }
     if more.random() < 0.2:  # perhaps narrower than the sensor is
         settings["band"] = np.full(n, more.choice([0.0, 0.1, 1.0]))
     hold = float(rng.choice([0.1, 0.25, 0.5, 1.0]))

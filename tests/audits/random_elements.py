@@ -157,8 +157,13 @@ def exact(seed):
     near.terminal = True
     solution = solve_ivp(
         lambda t, x: net_flows(rig, x, u) / [section(*s, h) for s, h in zip(sizes, x)],
-        (0.0, DURATION), start, method="DOP853", rtol=1e-12, atol=1e-13, events=near,
-    )  # fmt: skip
+        (0.0, DURATION),
+        start,
+        method="DOP853",
+        rtol=1e-12,
+        atol=1e-13,
+        events=near,
+    )
     return solution.t[-1], solution.y[:, -1]
 
 

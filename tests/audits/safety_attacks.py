@@ -345,19 +345,31 @@ def values_of(table):
     )
     n, m = len(table["tank"]), len(table["pump"])
     found = {
-        "plant.area": column("tank", "area"), "plant.rim": column("tank", "rim"),
-        "plant.drain": column("tank", "drain"), "plant.orifice": column("orifice", "area"),
-        "plant.pipe": column("pipe", "area"), "plant.caught": column("spill", "caught"),
-        "plant.pump_gain": column("pump", "gain"), "plant.split": column("pump", "split", 1.0),
-        "plant.gravity": np.array([981.0]), "actuator.low": column("pump", "low"),
-        "actuator.high": column("pump", "high"), "actuator.initial": column("pump", "initial"),
-        "actuator.lag": np.zeros(m), "actuator.dead_zone": np.zeros(m),
-        "actuator.stop": np.zeros(m), "actuator.pulse": column("pump", "high"),
-        "sensor.noise": np.zeros(n), "sensor.offset": np.zeros(n), "sensor.gain": np.ones(n),
-        "sensor.full_scale": np.array([5.0]), "disturbance.level": column("tank", "inflow", 0.0),
+        "plant.area": column("tank", "area"),
+        "plant.rim": column("tank", "rim"),
+        "plant.drain": column("tank", "drain"),
+        "plant.orifice": column("orifice", "area"),
+        "plant.pipe": column("pipe", "area"),
+        "plant.caught": column("spill", "caught"),
+        "plant.pump_gain": column("pump", "gain"),
+        "plant.split": column("pump", "split", 1.0),
+        "plant.gravity": np.array([981.0]),
+        "actuator.low": column("pump", "low"),
+        "actuator.high": column("pump", "high"),
+        "actuator.initial": column("pump", "initial"),
+        "actuator.lag": np.zeros(m),
+        "actuator.dead_zone": np.zeros(m),
+        "actuator.stop": np.zeros(m),
+        "actuator.pulse": column("pump", "high"),
+        "sensor.noise": np.zeros(n),
+        "sensor.offset": np.zeros(n),
+        "sensor.gain": np.ones(n),
+        "sensor.full_scale": np.array([5.0]),
+        "disturbance.level": column("tank", "inflow", 0.0),
         "disturbance.volume": column("inflow", "volume"),
-        "faults.factor": column("fault", "factor"), "x0": column("tank", "level"),
-    }  # fmt: skip
+        "faults.factor": column("fault", "factor"),
+        "x0": column("tank", "level"),
+    }
     given = {f"sensor.{key}": v for key, v in table.get("sensor", {}).items()} | table["values"]
     return found | {n: np.atleast_1d(np.array(given[n], float)) for n in given if n in found}
 
@@ -589,10 +601,14 @@ def attack_file(table, actuator, safety_filter, rows, seed, low, any_start, coun
     if table.get("sensor", {}).get("bits", 0):
         top = np.array(table["sensor"]["gain"]) * table["sensor"]["full_scale"]
     plan = Plan(
-        start=start, wanted=wanted, errors=signs * band_of(table, box),
+        start=start,
+        wanted=wanted,
+        errors=signs * band_of(table, box),
         parameters=parameters_of(rng, table, box, shape, count, p, target),
-        inflow=inflow_of(rng, table, box, samples, count), setpoint=share * limits, top=top,
-    )  # fmt: skip
+        inflow=inflow_of(rng, table, box, samples, count),
+        setpoint=share * limits,
+        top=top,
+    )
     kind = table["values"].get("actuator.dead_zone_kind", "")
     delay = round(table["values"].get("actuator.delay", 0.0) / hold)
     substeps = substeps_of(shape, p, hold)

@@ -19,10 +19,12 @@ MOST = 2.0
 LOG = "tests/data/cascaded_tanks.csv"
 
 LINES = {
-    "list": "list", "show": "show gouta2015/backstepping",
+    "list": "list",
+    "show": "show gouta2015/backstepping",
     "simulate": "simulate gouta2015/backstepping --out {out}",
     "together": "simulate gouta2015/backstepping gouta2015/ngpc --out {out}",
-    "film": "simulate cascaded/pi --out {out} --gif", "init": "init gouta2015/backstepping",
+    "film": "simulate cascaded/pi --out {out} --gif",
+    "init": "init gouta2015/backstepping",
     "export": "export gouta2015/backstepping --lang c",
     "explore": "explore gouta2015/backstepping --out {out}/page.html",
     "tune": "tune cascaded/pi --starts 1 --out {out}",
@@ -30,10 +32,12 @@ LINES = {
     "uncertainty": "uncertainty cascaded/pi --samples 200 --out {out}",
     "sensitivity": "sensitivity cascaded/pi --out {out}",
     "attack": "attack cascaded/pi --starts 2 --iterations 3 --out {out}",
-    "compare": "compare calofir --out {out}", "figure": "figure calofir/3 --out {out}",
+    "compare": "compare calofir --out {out}",
+    "figure": "figure calofir/3 --out {out}",
     "identify": "identify cascaded/pi --data {log} --out {out}",
-    "predict": "predict cascaded/pi --data {log}", "learn": "learn cascaded/pi --data {log}",
-}  # fmt: skip
+    "predict": "predict cascaded/pi --data {log}",
+    "learn": "learn cascaded/pi --data {log}",
+}
 """{name: command line}"""
 
 

@@ -131,9 +131,14 @@ def one_sided(f, at, h=1e-6):
 
 def rimmed(h, **more):
     return network(
-        area=[20.0], drain=[0.2], pump_gain=[5.0], feeds=((0, None),), rim=[10.0], overflow=True,
+        area=[20.0],
+        drain=[0.2],
+        pump_gain=[5.0],
+        feeds=((0, None),),
+        rim=[10.0],
+        overflow=True,
         **more,
-    ).spill((h,))  # fmt: skip
+    ).spill((h,))
 
 
 def limited(one, other):

@@ -43,19 +43,28 @@ def tank(reference, x0=REST, rim=30.0, volts=2.0, overflow=False):
     """A tank that rests at REST while its pump runs at 2 V, whatever the setpoint."""
     return ClosedLoop(
         plant=network(
-            area=[20.0], drain=[0.1], pump_gain=[5.0], feeds=((0, None),), rim=[rim],
+            area=[20.0],
+            drain=[0.1],
+            pump_gain=[5.0],
+            feeds=((0, None),),
+            rim=[rim],
             overflow=overflow,
         ),
         sensor=LevelSensor(gain=np.ones(1), noise=np.zeros(1), full_scale=np.array(10.0)),
         observer=Direct(),
         controller=OpenLoop(signal=Constant(level=np.array([volts]))),
         actuator=PumpBank(
-            low=np.zeros(1), high=np.full(1, 12.0), stop=np.zeros(1), pulse=np.ones(1), lag=None,
-            dead_zone=None, initial=np.zeros(1),
+            low=np.zeros(1),
+            high=np.full(1, 12.0),
+            stop=np.zeros(1),
+            pulse=np.ones(1),
+            lag=None,
+            dead_zone=None,
+            initial=np.zeros(1),
         ),
         reference=reference,
         x0=np.array([x0]),
-    )  # fmt: skip
+    )
 
 
 def moving():
@@ -241,14 +250,23 @@ def drained(samples):
     """An Ensemble: a draining tank whose outlet varies, 8 s."""
     loop = tank(ramps((3.0,), [(2.0, 0, 4.0)], ramp=0.0), x0=16.0, volts=0.0)
     case = presets.find("cascaded/pi").replace(
-        loop=loop, clock=Clock(dt=0.5, duration=8.0, substeps=4), limits={}, uncertain={},
-        objective="rms_error_total", name="a draining tank",
-    )  # fmt: skip
+        loop=loop,
+        clock=Clock(dt=0.5, duration=8.0, substeps=4),
+        limits={},
+        uncertain={},
+        objective="rms_error_total",
+        name="a draining tank",
+    )
     spread = {"plant.drain": tuning.Uniform(relative=0.2)}
     return tuning.ensemble(
-        case, spread, samples, draws="latin", measures=("min_level", "rms_error"), limits={},
+        case,
+        spread,
+        samples,
+        draws="latin",
+        measures=("min_level", "rms_error"),
+        limits={},
         fan=False,
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.slow_for("4096")

@@ -34,11 +34,16 @@ from tuning.uncertainty.needs import Needs, plateaus_of
 from tuning.uncertainty.sampling import probabilities
 
 ROWS = {
-    "gouta2015/backstepping": {}, "gouta2015/backstepping-ff": {}, "gouta2015/ngpc": {},
-    "cascaded/pi": {}, "gouta2022/chadpc, delay 0.2 s": {"actuator.delay": 0.2},
-    "tests/data/rigs/watertank.toml": {}, "khalid/laguerre": {}, "calofir/backstepping": {},
+    "gouta2015/backstepping": {},
+    "gouta2015/backstepping-ff": {},
+    "gouta2015/ngpc": {},
+    "cascaded/pi": {},
+    "gouta2022/chadpc, delay 0.2 s": {"actuator.delay": 0.2},
+    "tests/data/rigs/watertank.toml": {},
+    "khalid/laguerre": {},
+    "calofir/backstepping": {},
     "mirakhorli/sfc": {},
-}  # fmt: skip
+}
 
 CORNERS, OFFSETS = 256, 256
 

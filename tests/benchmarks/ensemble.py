@@ -94,10 +94,15 @@ def c_run(function, case, samples, single=False):
     scalars = [
         c_real(float(x))
         for x in (
-            plant.gravity, plant.knee, clock.dt, controller.k, controller.k1,
-            controller.level_floor, case.loop.actuator.high[0],
+            plant.gravity,
+            plant.knee,
+            clock.dt,
+            controller.k,
+            controller.k1,
+            controller.level_floor,
+            case.loop.actuator.high[0],
         )
-    ]  # fmt: skip
+    ]
     gravity, knee, dt, *rest = scalars
 
     def run():

@@ -55,9 +55,13 @@ def constants(case):
     b = np.array([c[5], c[2], c[4], c[1]]) / (alpha * np.array([c[7], c[7], c[9], c[9]]))
     b = np.append(b, [c[6] / c[7], c[8] / c[9]])
     return (
-        c, float(controller.k) + float(controller.k1), float(controller.k1), b,
-        float(controller.level_floor), float(case.loop.actuator.high[0]),
-    )  # fmt: skip
+        c,
+        float(controller.k) + float(controller.k1),
+        float(controller.k1),
+        b,
+        float(controller.level_floor),
+        float(case.loop.actuator.high[0]),
+    )
 
 
 def controller(c, gain, k1, b, floor, high, x, r, np):
@@ -362,9 +366,13 @@ def main(words):
         cells += [f"{abs(float(results[name]) - same):.1e}", f"{steps[name]:,}"]
         rows.append([name, *cells])
     heads = [
-        "one run in float64", "ns per step", "times ours (range)", "first call, s more",
-        "RMS error from ours, cm", "samples",
-    ]  # fmt: skip
+        "one run in float64",
+        "ns per step",
+        "times ours (range)",
+        "first call, s more",
+        "RMS error from ours, cm",
+        "samples",
+    ]
     print(tables.table(rows, heads))
     if missing:
         print(f"not here: {', '.join(missing)}")

@@ -175,9 +175,15 @@ def measured(name, option):
 
 
 HEADS = [
-    "", "XLA options", "run, ns per step", "times ours (range)", "gradient, times its own run",
-    "gradient, times ours (range)", "RMS error from ours, cm", "slopes from ours",
-]  # fmt: skip
+    "",
+    "XLA options",
+    "run, ns per step",
+    "times ours (range)",
+    "gradient, times its own run",
+    "gradient, times ours (range)",
+    "RMS error from ours, cm",
+    "slopes from ours",
+]
 
 
 def main(words):

@@ -176,9 +176,13 @@ def two_tank():
     for delay, target in {0.0: "0.505", 0.2: "0.534", 0.5: "0.579", 1.0: "0.657"}.items():
         values, name = {"actuator.delay": delay}, f"gouta2022-delay-{delay:g}"
         rows[name] = Row(
-            "gouta2022/chadpc", values, unit="cm^2", target=target, options={"starts": 4},
+            "gouta2022/chadpc",
+            values,
+            unit="cm^2",
+            target=target,
+            options={"starts": 4},
             bound=name,
-        )  # fmt: skip
+        )
     return rows
 
 
@@ -214,12 +218,19 @@ def metres():
     one, two = "khalid/laguerre", "khalid/laguerre-mimo"
     rows = {
         "laguerre": Row(
-            one, free=FLAT, objective=PLAIN, choices={"controller.N": [1, 2, 4, 8]}, target="7.887",
+            one,
+            free=FLAT,
+            objective=PLAIN,
+            choices={"controller.N": [1, 2, 4, 8]},
+            target="7.887",
             bound="khalid",
         ),
         "gpc": Row(
-            "khalid/gpc", free={"controller.r_w": FLAT["controller.r_w"]}, objective=PLAIN,
-            target="7.873", bound="khalid",
+            "khalid/gpc",
+            free={"controller.r_w": FLAT["controller.r_w"]},
+            objective=PLAIN,
+            target="7.873",
+            bound="khalid",
         ),
         "laguerre-priced": Row(one, objective=PRICED, bound="khalid-priced"),
         "clipped": Row(one, loop=clipped, objective=PLAIN, target="12.644", bound="khalid-clipped"),
@@ -230,14 +241,23 @@ def metres():
         "mimo": Row(two, HALF, objective=PLAIN_TWO, target="4.147", bound="khalid-mimo"),
         "mimo-priced": Row(two, HALF, objective=PRICED_TWO, bound="khalid-mimo-priced"),
         "mimo-constrained": Row(
-            f"{two}-constrained", HALF, objective=PLAIN_TWO, options=more, target="7.719",
+            f"{two}-constrained",
+            HALF,
+            objective=PLAIN_TWO,
+            options=more,
+            target="7.719",
             bound="khalid-mimo-constrained",
         ),
         "mimo-constrained-M3": Row(
-            f"{two}-constrained", HALF, loop=delayed, objective=PLAIN_TWO, options=more,
-            target="11.12", bound="khalid-mimo-M3",
+            f"{two}-constrained",
+            HALF,
+            loop=delayed,
+            objective=PLAIN_TWO,
+            options=more,
+            target="11.12",
+            bound="khalid-mimo-M3",
         ),
-    }  # fmt: skip
+    }
     return {
         "calofir-backstepping": Row("calofir/backstepping", unit="m", bound="calofir-error"),
         **{f"khalid-{name}": row._replace(unit="cm^2") for name, row in rows.items()},

@@ -254,15 +254,25 @@ def _bound(row, bounds):
 def markdown(stored):
     """The table that belongs between the marks."""
     heads = (
-        "row", "published → tuned", "objective", "limits at the true step",
-        "validation plants and noise", "bound", "s",
-    )  # fmt: skip
+        "row",
+        "published → tuned",
+        "objective",
+        "limits at the true step",
+        "validation plants and noise",
+        "bound",
+        "s",
+    )
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for name, row in stored["rows"].items():
         cells = [
-            name, _free(row), _objective(row), _limits(row), _held(row),
-            _bound(row, stored["bounds"]), f"{row['wall_s']:.0f}",
-        ]  # fmt: skip
+            name,
+            _free(row),
+            _objective(row),
+            _limits(row),
+            _held(row),
+            _bound(row, stored["bounds"]),
+            f"{row['wall_s']:.0f}",
+        ]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 

@@ -125,9 +125,13 @@ def test_continuous_loop_is_the_matrix_exponential(K_phi, K_y):
         )
     )
     found = solve_ivp(
-        lambda t, x: np.asarray(rate(x)), (0, 100), [0.33, 0.06], method="DOP853", rtol=1e-13,
+        lambda t, x: np.asarray(rate(x)),
+        (0, 100),
+        [0.33, 0.06],
+        method="DOP853",
+        rtol=1e-13,
         atol=1e-15,
-    )  # fmt: skip
+    )
 
     def errors(x):
         e = x[1] - h3r

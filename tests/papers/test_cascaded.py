@@ -25,9 +25,14 @@ recorded = pytest.mark.skipif(
     reason="the record is not beside the tests (data/cascaded_tanks.csv)",
 )
 FITTED = [
-    "plant.orifice[0]", "plant.drain[1]", "plant.pump_gain[0]", "plant.caught[0]",
-    "disturbance.level[0]", "x0[0]", "x0[1]",
-]  # fmt: skip
+    "plant.orifice[0]",
+    "plant.drain[1]",
+    "plant.pump_gain[0]",
+    "plant.caught[0]",
+    "disturbance.level[0]",
+    "x0[0]",
+    "x0[1]",
+]
 
 
 def playback():
@@ -80,9 +85,14 @@ def test_a_fit_from_elsewhere_comes_back():
     start = there * np.array([1.3, 0.8, 1.2, 0.5, 0.5, 0.8, 1.1])
     low, high = [1e-3, 1e-3, 1e-3, 0.0, -0.2, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0, 0.2, 10.0, 10.0]
     found = least_squares(
-        lambda z: np.asarray(error(z)), start, lambda z: np.asarray(slope(z)), (low, high),
-        x_scale="jac", xtol=1e-12, ftol=1e-12,
-    )  # fmt: skip
+        lambda z: np.asarray(error(z)),
+        start,
+        lambda z: np.asarray(slope(z)),
+        (low, high),
+        x_scale="jac",
+        xtol=1e-12,
+        ftol=1e-12,
+    )
     # the numbers are rounded, and the valley of the offset is flat
     np.testing.assert_allclose(found.x, there, rtol=2e-3)
 
@@ -174,9 +184,14 @@ def levels_for(loop, inputs, start, dt):
                 ((0.0 if dry else k1 * film(h[0])) - k2 * film(h[1])) / a2,
             ]
             found = solve_ivp(
-                rate, (t, dt), x, method="Radau", rtol=1e-8, atol=1e-10,
+                rate,
+                (t, dt),
+                x,
+                method="Radau",
+                rtol=1e-8,
+                atol=1e-10,
                 events=None if dry else empty,
-            )  # fmt: skip
+            )
             t, x = found.t[-1], found.y[:, -1]
             if found.status == 1:
                 x = np.array([0.0, x[1]])
@@ -215,9 +230,16 @@ def test_what_an_inflow_could_not_take_is_counted(capsys):
     command.
     """
     words = [
-        "simulate", "cascaded/pi", "--set", "actuator.high=1e-9", "--set", "x0=[0,0]", "--set",
-        "clock.duration=100", "--json",
-    ]  # fmt: skip
+        "simulate",
+        "cascaded/pi",
+        "--set",
+        "actuator.high=1e-9",
+        "--set",
+        "x0=[0,0]",
+        "--set",
+        "clock.duration=100",
+        "--json",
+    ]
     assert main.main(words) == 0
     counted = json.loads(capsys.readouterr().out)["measures"]["inflow_shortfall"]
     # 25 samples of 4 s: the last of 26 is at the end
@@ -233,9 +255,13 @@ def test_gradients_of_a_rig_that_runs_dry():
     """
     case = rig.set_values(CASES["pi"], {**STIFF, "clock.duration": 400.0, "actuator.high": 2.0})
     names = [
-        "plant.orifice[0]", "plant.drain[1]", "plant.pump_gain[0]", "disturbance.level[0]",
-        "plant.area[1]", "controller.Kc[0]",
-    ]  # fmt: skip
+        "plant.orifice[0]",
+        "plant.drain[1]",
+        "plant.pump_gain[0]",
+        "disturbance.level[0]",
+        "plant.area[1]",
+        "controller.Kc[0]",
+    ]
     z = jnp.array([float(get_value(case.loop, n)) for n in names])
 
     def f(factors, start):

@@ -16,11 +16,17 @@ def coefficients(case):
     assert [tuple(link) for link in p.links] == [(2, 0), (2, 1), (3, 0), (3, 1)]
     g, (s31, s32, s41, s42), area = np.sqrt(2 * float(p.gravity)), p.orifice, p.area
     found = {
-        "c1": p.drain[0] * g / area[0], "c4": p.drain[1] * g / area[1], "c2": s31 * g / area[0],
-        "c6": s42 * g / area[1], "c3": s41 * g / area[0], "c5": s32 * g / area[1],
-        "c7": (s31 + s32) * g / area[2], "c9": (s41 + s42) * g / area[3],
-        "c8": p.pump_gain[0] / area[2], "c10": p.pump_gain[1] / area[3],
-    }  # fmt: skip
+        "c1": p.drain[0] * g / area[0],
+        "c4": p.drain[1] * g / area[1],
+        "c2": s31 * g / area[0],
+        "c6": s42 * g / area[1],
+        "c3": s41 * g / area[0],
+        "c5": s32 * g / area[1],
+        "c7": (s31 + s32) * g / area[2],
+        "c9": (s41 + s42) * g / area[3],
+        "c8": p.pump_gain[0] / area[2],
+        "c10": p.pump_gain[1] / area[3],
+    }
     found["alpha"] = 0.5 * (found["c2"] * found["c6"] - found["c3"] * found["c5"])
     found["alpha3"] = 0.5 * (found["c2"] + found["c3"]) * found["c7"]
     return found

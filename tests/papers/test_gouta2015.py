@@ -25,9 +25,18 @@ from jaxtank.presets.gouta2015 import FAST_AREA, PRINTED_AREA, controller_of
 from jaxtank.signals.base import Constant
 
 MEASURES = (
-    "rms_error", "rms_error_total", "ise", "max_error", "rms_input", "saturated_fraction",
-    "max_level", "min_level", "input_travel", "overshoot_percent", "settling_time",
-)  # fmt: skip
+    "rms_error",
+    "rms_error_total",
+    "ise",
+    "max_error",
+    "rms_input",
+    "saturated_fraction",
+    "max_level",
+    "min_level",
+    "input_travel",
+    "overshoot_percent",
+    "settling_time",
+)
 
 
 @functools.cache
@@ -60,9 +69,13 @@ PLANT_B = [
 
 
 @pytest.mark.slow_for(
-    "backstepping-ff-60s", "ngpc-30s", "backstepping-30s", "backstepping-ff-30s",
-    "backstepping-20s", "backstepping-ff-20s",
-)  # fmt: skip
+    "backstepping-ff-60s",
+    "ngpc-30s",
+    "backstepping-30s",
+    "backstepping-ff-30s",
+    "backstepping-20s",
+    "backstepping-ff-20s",
+)
 @pytest.mark.parametrize("row", PLANT_B, ids=lambda row: f"{row[1]}-{row[0]}s")
 def test_plant_b_rows_of_the_acceptance_table(row):
     ramp, name, rms, total, ise, peak, u, saturated, high, low, travel = row

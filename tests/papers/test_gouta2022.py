@@ -446,9 +446,14 @@ def test_the_rig_in_metres_runs_as_in_centimetres(name):
     volume = jaxtank.with_values(level.disturbance, {"volume": level.disturbance.volume * 1e-6})
     reference = jaxtank.with_values(level.reference, {"level": level.reference.level / 100})
     metres = dataclasses.replace(
-        level, plant=m, controller=small(control), observer=small(watch), reference=reference,
-        disturbance=volume, x0=np.array([0.11, 0.09]),
-    )  # fmt: skip
+        level,
+        plant=m,
+        controller=small(control),
+        observer=small(watch),
+        reference=reference,
+        disturbance=volume,
+        x0=np.array([0.11, 0.09]),
+    )
     clock = Clock(dt=0.01, duration=20.0)
     a, b = (
         jaxtank.simulate(one, clock)

@@ -508,9 +508,13 @@ def own_loop(kind, where, samples, limited, du=0.5, root=exact):
                 (lambda z, pull=Psi @ error: 2 * (Omega @ z + pull)),
             )
             found = minimize(
-                cost, np.zeros(len(eta)), jac=slope, method="SLSQP", constraints=bounds,
+                cost,
+                np.zeros(len(eta)),
+                jac=slope,
+                method="SLSQP",
+                constraints=bounds,
                 options={"ftol": 1e-16, "maxiter": 300},
-            )  # fmt: skip
+            )
             eta = found.x
         before, u = x, u + wide[0] @ eta
 

@@ -199,8 +199,13 @@ def test_a_constructor_refuses_what_it_cannot_fill():
 def test_what_is_no_number_passes_a_constructor_and_a_transformation_untouched():
     bank = PumpBank(low=[0.0], high=[12.0])
     marks = [
-        object(), jax.ShapeDtypeStruct((1,), np.float64), None, "x", np.float32(1.0), [[1.0], 2.0],
-    ]  # fmt: skip
+        object(),
+        jax.ShapeDtypeStruct((1,), np.float64),
+        None,
+        "x",
+        np.float32(1.0),
+        [[1.0], 2.0],
+    ]
     for mark in marks:
         assert PumpBank(low=mark, high=[12.0], stop=0.0, initial=0.0).low is mark
     for mark in (*marks, 0, 1.0, (1, 2)):
@@ -481,10 +486,17 @@ def results(own, tuned):
             "identification": lambda: tuning.identify(case, [data], free, starts=1, iterations=2),
             "certificate": lambda: tuning.Certificate(64, 3, 0.4, 1024, 12, [0.006, 0.02]),
             "bound": lambda: InputBound(
-                case=case, objective={NASTY: 1.0}, constraints=[cell], holds=True, closed_loop=None,
-                source="search", grids=[], **numbers, **counts,
+                case=case,
+                objective={NASTY: 1.0},
+                constraints=[cell],
+                holds=True,
+                closed_loop=None,
+                source="search",
+                grids=[],
+                **numbers,
+                **counts,
             ),
-        }  # fmt: skip
+        }
 
 
 KINDS = ("tuning", "ensemble", "sensitivity", "identification", "certificate", "bound")
@@ -522,13 +534,23 @@ def test_save_leaves_out_the_rig_file_of_a_class_without_a_name_with_a_note(
 
 
 OF_A_CASE = {
-    "attack": {}, "bound": {}, "can_follow": {"draws": {}}, "compare_controllers": {},
-    "ensemble": {}, "feasibility": {}, "identify": {"log": None}, "least_offset": {"draws": {}},
-    "predict": {"log": None}, "sensitivity": {},
-    "tradeoff": {"measure": "rise_time", "values": [9.0]}, "tune": {},
-    "tune_by_rule": {"rule": "simc"}, "tune_choices": {"choices": {}}, "tune_robust": {},
+    "attack": {},
+    "bound": {},
+    "can_follow": {"draws": {}},
+    "compare_controllers": {},
+    "ensemble": {},
+    "feasibility": {},
+    "identify": {"log": None},
+    "least_offset": {"draws": {}},
+    "predict": {"log": None},
+    "sensitivity": {},
+    "tradeoff": {"measure": "rise_time", "values": [9.0]},
+    "tune": {},
+    "tune_by_rule": {"rule": "simc"},
+    "tune_choices": {"choices": {}},
+    "tune_robust": {},
     "validate": {},
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", OF_A_CASE)

@@ -117,9 +117,14 @@ def test_a_run_has_the_precision_of_its_most_precise_leaf():
 
 
 SHAPES = {
-    "plant.orifice": (3,), "plant.area": (1,), "actuator.initial": (2, 1), "sensor.noise": (5,),
-    "observer.l": (1,), "controller.model.orifice": (1,), "x0": (3,),
-}  # fmt: skip
+    "plant.orifice": (3,),
+    "plant.area": (1,),
+    "actuator.initial": (2, 1),
+    "sensor.noise": (5,),
+    "observer.l": (1,),
+    "controller.model.orifice": (1,),
+    "x0": (3,),
+}
 
 
 @pytest.mark.parametrize("name", SHAPES)

@@ -157,9 +157,13 @@ class Several(Controller):
 
 
 KINDS = {
-    "vectors": True, "columns": True, "texts": True, "complex": True, "array": False,
+    "vectors": True,
+    "columns": True,
+    "texts": True,
+    "complex": True,
+    "array": False,
     "switch": False,
-}  # fmt: skip
+}
 """What Odd returns: whether it is wrong."""
 
 
@@ -173,9 +177,13 @@ class Odd(Controller):
         r = jnp.stack(tick.r)
         on = tick.r[0] > 8.0
         return {
-            "vectors": (r, r), "columns": r[:, None], "texts": ("on", "off"),
-            "complex": (1j * r[0], r[1]), "array": r, "switch": (on, on),
-        }[self.kind], state  # fmt: skip
+            "vectors": (r, r),
+            "columns": r[:, None],
+            "texts": ("on", "off"),
+            "complex": (1j * r[0], r[1]),
+            "array": r,
+            "switch": (on, on),
+        }[self.kind], state
 
 
 @pytest.mark.parametrize(("count", "words"), [(0, "one number"), (1, "1 input"), (3, "3 inputs")])
@@ -242,10 +250,14 @@ def metres(case, kind=Metres):
     controller = Proportional(Kc=100.0, bias=20.0)
     actuator = jaxtank.instruments.PumpBank(low=[0.0], high=[100.0])
     loop = dataclasses.replace(
-        case.loop, plant=plant, controller=controller, actuator=actuator,
+        case.loop,
+        plant=plant,
+        controller=controller,
+        actuator=actuator,
         sensor=jaxtank.instruments.LevelSensor(noise=[0.0]),
-        reference=jaxtank.signals.ramps([0.05], [(5.0, 0, 0.12)], ramp=0.0), x0=number([0.05]),
-    )  # fmt: skip
+        reference=jaxtank.signals.ramps([0.05], [(5.0, 0, 0.12)], ramp=0.0),
+        x0=number([0.05]),
+    )
     free = {"controller.Kc": presets.Free(10.0, 1000.0)}
     return case.replace(loop=loop, free=free, uncertain={}, objective={"rms_error_total": 1.0})
 

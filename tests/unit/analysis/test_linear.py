@@ -49,9 +49,13 @@ def augmented(weight=1e-3):
 
 
 CONTINUOUS = [
-    system(0), system(1), system(2, n=8, m=1), (*QUADRUPLE, np.diag([1.0, 1, 0, 0]), 3 * np.eye(2)),
-    augmented(), augmented(1e-8),
-]  # fmt: skip
+    system(0),
+    system(1),
+    system(2, n=8, m=1),
+    (*QUADRUPLE, np.diag([1.0, 1, 0, 0]), 3 * np.eye(2)),
+    augmented(),
+    augmented(1e-8),
+]
 
 
 @pytest.mark.slow_for("1", "2", "3", "5", "4")

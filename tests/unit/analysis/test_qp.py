@@ -72,9 +72,14 @@ def test_equals_scipy(n, rows):
     H, f, G, l, u = problem(n, rows, 5, tight=1.0)
     options = {"gtol": 1e-12, "xtol": 1e-14, "barrier_tol": 1e-13, "maxiter": 400}
     found = minimize(
-        lambda x: 0.5 * x @ H @ x + f @ x, np.zeros(n), jac=lambda x: H @ x + f, hess=lambda x: H,
-        method="trust-constr", constraints=LinearConstraint(G, l, u), options=options,
-    )  # fmt: skip
+        lambda x: 0.5 * x @ H @ x + f @ x,
+        np.zeros(n),
+        jac=lambda x: H @ x + f,
+        hess=lambda x: H,
+        method="trust-constr",
+        constraints=LinearConstraint(G, l, u),
+        options=options,
+    )
     x = np.asarray(solve(H, f, G, l, u))
     margin = np.minimum(u - G @ x, G @ x - l)
     assert margin.min() > -1e-9 and np.sum(margin < 1e-6) >= 2  # feasible, and rows bind
@@ -222,9 +227,13 @@ def test_without_a_feasible_point_it_ends_with_numbers(gap):
     """
     G, f = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), np.array([-1.0, 0.5])
     x = solve(
-        np.eye(2), f, G, np.array([0.1 + gap, -1.0, -1.0]), np.array([1.0, 0.1, 1.0]),
+        np.eye(2),
+        f,
+        G,
+        np.array([0.1 + gap, -1.0, -1.0]),
+        np.array([1.0, 0.1, 1.0]),
         iterations=400,
-    )  # fmt: skip
+    )
     assert np.all(np.isfinite(x))
 
 

@@ -57,9 +57,16 @@ def test_below_the_knee_the_flow_at_rest_is_that_of_the_plant(level):
     of its flow.
     """
     plant = network(
-        area=[20.0] * 2, drain=[0.1, 0.2], links=[(0, 1)], orifice=[0.3], pump_gain=[5.0],
-        feeds=[(0, None)], rim=30.0, outputs=(0,), knee=1.0,
-    )  # fmt: skip
+        area=[20.0] * 2,
+        drain=[0.1, 0.2],
+        links=[(0, 1)],
+        orifice=[0.3],
+        pump_gain=[5.0],
+        feeds=[(0, None)],
+        rim=30.0,
+        outputs=(0,),
+        knee=1.0,
+    )
     levels, inputs = SteadyStates(plant, {}).at([[level]])
     for x, u in ((levels[0, 0], inputs[0, 0]), equilibrium(plant, [level])):
         assert x[0] == pytest.approx(level, rel=1e-12)
@@ -73,8 +80,12 @@ def test_a_flow_that_would_run_backwards_is_a_level_below_zero():
 
 def test_a_rig_with_fewer_pumps_than_outputs_is_refused():
     plant = network(
-        area=[20.0] * 2, drain=[0.2] * 2, pump_gain=[5.0], feeds=[(0, None)], rim=30.0,
+        area=[20.0] * 2,
+        drain=[0.2] * 2,
+        pump_gain=[5.0],
+        feeds=[(0, None)],
+        rim=30.0,
         outputs=(0, 1),
-    )  # fmt: skip
+    )
     with pytest.raises(InputError, match="as many pumps as outputs"):
         SteadyStates(plant, {})

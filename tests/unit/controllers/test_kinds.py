@@ -149,9 +149,13 @@ def test_split_range_of_a_pump_and_a_valve_in_the_outlet():
         "units =", "reachable = false\nunits ="
     )
     table = {
-        "kind": "split-range", "Kc": 5.0, "Ti": 500.0, "bias": 1.0, "sequence": [2, 1],
+        "kind": "split-range",
+        "Kc": 5.0,
+        "Ti": 500.0,
+        "bias": 1.0,
+        "sequence": [2, 1],
         "reverse": [2],
-    }  # fmt: skip
+    }
     case = loads(text.replace("[100.0, 1, 2.0]", "[100.0, 1, 1.3], [500.0, 1, 0.6]"), **table)
     rest = {"area": 1.0, "drain": 0.0, "rim": 2.0, "units": ("m", "-")}
     plant = network(pump_gain=0.02, feeds=[(0, None)], valves=[(0, None)], valve=0.01, **rest)

@@ -106,16 +106,33 @@ max_level = {limit}
 clock.duration = {duration}
 """
 NUMBERS = {
-    "flow": "m^3/h", "area": 0.5, "rim": 1.2, "drain": 4e-4, "level": 0.4, "high": 6.0,
-    "Kc": "[5.0, 5.0]", "Ti": "[300.0, 300.0]", "changes": "[[120.0, 2, 0.35]]",
-    "limit": "[1.2, 0.8]", "free": '"controller.Kc[0]" = [1.0, 10.0]', "duration": 600.0,
-}  # fmt: skip
+    "flow": "m^3/h",
+    "area": 0.5,
+    "rim": 1.2,
+    "drain": 4e-4,
+    "level": 0.4,
+    "high": 6.0,
+    "Kc": "[5.0, 5.0]",
+    "Ti": "[300.0, 300.0]",
+    "changes": "[[120.0, 2, 0.35]]",
+    "limit": "[1.2, 0.8]",
+    "free": '"controller.Kc[0]" = [1.0, 10.0]',
+    "duration": 600.0,
+}
 TEXTS = {
-    "flow": "m³/h", "area": '"5000 cm^2"', "rim": '"120 cm"', "drain": '"4 cm^2"',
-    "level": '"40 cm"', "high": '"100 L/min"', "Kc": '["5 (m3/h)/m", 5.0]', "Ti": '"5 min"',
-    "changes": '[["2 min", "LT102", "35 cm"]]', "limit": '{ LT102 = "80 %" }',
-    "free": '"controller.Kc[P101]" = ["1 m^2/h", 10.0]', "duration": '"10 min"',
-}  # fmt: skip
+    "flow": "m³/h",
+    "area": '"5000 cm^2"',
+    "rim": '"120 cm"',
+    "drain": '"4 cm^2"',
+    "level": '"40 cm"',
+    "high": '"100 L/min"',
+    "Kc": '["5 (m3/h)/m", 5.0]',
+    "Ti": '"5 min"',
+    "changes": '[["2 min", "LT102", "35 cm"]]',
+    "limit": '{ LT102 = "80 %" }',
+    "free": '"controller.Kc[P101]" = ["1 m^2/h", 10.0]',
+    "duration": '"10 min"',
+}
 
 
 def leaves(case):

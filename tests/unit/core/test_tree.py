@@ -116,11 +116,15 @@ def test_complex_values_are_reported_inside_a_trace(loop):
 @pytest.mark.parametrize(
     ("name", "near"),
     [
-        ("controller.kk", "controller.k1"), ("plant.aera", "plant.area"),
-        ("plant.area.x", "plant.area"), ("plnt.area", "plant.area"), ("plant", "plant.rim"),
-        ("plant.drian[0]", "plant.drain"), ("actuator.saturated", "actuator.saturation"),
+        ("controller.kk", "controller.k1"),
+        ("plant.aera", "plant.area"),
+        ("plant.area.x", "plant.area"),
+        ("plnt.area", "plant.area"),
+        ("plant", "plant.rim"),
+        ("plant.drian[0]", "plant.drain"),
+        ("actuator.saturated", "actuator.saturation"),
     ],
-)  # fmt: skip
+)
 def test_an_unknown_name_is_answered_with_the_nearest(loop, name, near):
     for ask in (get_value, describe, lambda tree, name: with_values(tree, {name: 1.0})):
         with pytest.raises(InputError) as caught:
@@ -255,10 +259,14 @@ def test_a_changed_gain_does_not_retrace_and_a_changed_static_does(gouta):
         "backstepping", {"x0": 5.0}
     )  # away from the steady state, so that the gain has an effect
     changes = [
-        {"controller.k1": 0.05}, {"controller.k1": np.float32(0.1)},
-        {"controller.k1": jnp.asarray(0.2)}, {"controller.k": 1}, {"plant.area[0]": 20.0},
-        {"plant.drain": [0.1, 0.2, 0.0, 0.0]}, {"reference.ramp": 45.0},
-    ]  # fmt: skip
+        {"controller.k1": 0.05},
+        {"controller.k1": np.float32(0.1)},
+        {"controller.k1": jnp.asarray(0.2)},
+        {"controller.k": 1},
+        {"plant.area[0]": 20.0},
+        {"plant.drain": [0.1, 0.2, 0.0, 0.0]},
+        {"reference.ramp": 45.0},
+    ]
     costs = [float(error(with_values(case.loop, values))) for values in changes]
     assert len(traces) == 1
     assert len(set(costs)) == len(changes)

@@ -155,15 +155,20 @@ FLOW_RIG = PUMPED.format('"m", "m^3/h"', 1 / 3600).replace("100.0\n[plant]", "5.
 @pytest.mark.parametrize(
     "command",
     [
-        "show RIG", "init RIG", "simulate RIG --margins",
+        "show RIG",
+        "init RIG",
+        "simulate RIG --margins",
         "tune RIG --starts 1 --iterations 3 --validation 8 --quiet",
         "tune RIG --nominal --starts 1 --iterations 3 --quiet",
         "uncertainty RIG --samples 8 --vary plant.drain=uniform:5% --quiet",
         "sensitivity RIG --samples 8 --vary plant.drain=uniform:5% --quiet",
-        "attack RIG --starts 1 --quiet", "export RIG --lang c", "export RIG --lang m",
-        "export RIG --lang js", "identify RIG --plan",
+        "attack RIG --starts 1 --quiet",
+        "export RIG --lang c",
+        "export RIG --lang m",
+        "export RIG --lang js",
+        "identify RIG --plan",
     ],
-)  # fmt: skip
+)
 @pytest.mark.parametrize("units", ["m^3/h", "%"])
 def test_no_command_prints_centimetres_or_volts_of_another_rig(tmp_path, capsys, command, units):
     file = tmp_path / "rig.toml"

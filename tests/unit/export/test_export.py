@@ -35,9 +35,15 @@ from tuning.cli import main
 SAMPLES = 10_000
 # one case of every law, observer and way of saturating; the rest differ in numbers alone
 QUICK = [
-    "gouta2015/ngpc", "gouta2015/backstepping-boxqp", "gouta2022/chadpc", "gouta2022/fopi",
-    "calofir/backstepping", "cascaded/pi", "mirakhorli/hybrid", "mirakhorli/smc",
-]  # fmt: skip
+    "gouta2015/ngpc",
+    "gouta2015/backstepping-boxqp",
+    "gouta2022/chadpc",
+    "gouta2022/fopi",
+    "calofir/backstepping",
+    "cascaded/pi",
+    "mirakhorli/hybrid",
+    "mirakhorli/smc",
+]
 SLOW = [
     name
     for name in presets.names()
@@ -66,9 +72,15 @@ def replayed(name, noise=1e-4, values=(), filtered=False):
 
 
 @pytest.mark.slow_for(
-    "gouta2015/ngpc", "gouta2015/backstepping-boxqp", "gouta2022/fopi", "mirakhorli/smc",
-    "calofir/backstepping", "mirakhorli/hybrid", "gouta2022/chadpc", "cascaded/pi",
-)  # fmt: skip
+    "gouta2015/ngpc",
+    "gouta2015/backstepping-boxqp",
+    "gouta2022/fopi",
+    "mirakhorli/smc",
+    "calofir/backstepping",
+    "mirakhorli/hybrid",
+    "gouta2022/chadpc",
+    "cascaded/pi",
+)
 @needs_gcc
 @pytest.mark.parametrize("name", EVERY)
 def test_c_gives_the_inputs_of_the_loop(name, tmp_path):
@@ -428,8 +440,13 @@ def own():
     """The case, and the errors at which it is tried."""
     case = presets.find("cascaded/pi")
     return case.replace(loop=dataclasses.replace(case.loop, controller=EveryFunction())), (
-        -1.7, -0.61, 0.23, 0.7, 1.37, 2.06,
-    )  # fmt: skip
+        -1.7,
+        -0.61,
+        0.23,
+        0.7,
+        1.37,
+        2.06,
+    )
 
 
 def expected(error):
@@ -580,10 +597,18 @@ def test_a_line_break_in_the_name_of_a_case_ends_no_comment(traced, separator):
 @pytest.mark.parametrize(
     "unit",
     [
-        "V*/ int taken; /*", "V\\\\", "??/", "$\\\\x{$", "cm, V", "<b>", "V\\u2028", "a" * 41, "^2",
+        "V*/ int taken; /*",
+        "V\\\\",
+        "??/",
+        "$\\\\x{$",
+        "cm, V",
+        "<b>",
+        "V\\u2028",
+        "a" * 41,
+        "^2",
         "V V V*",
     ],
-)  # fmt: skip
+)
 def test_a_unit_that_is_none_is_refused_in_one_line(unit, tmp_path, capsys):
     text = HOSTILE_RIG.format(name='"r"').replace('["cm", "V"]', f'["cm", "{unit}"]')
     (tmp_path / "rig.toml").write_text(text)
@@ -595,9 +620,20 @@ def test_a_unit_that_is_none_is_refused_in_one_line(unit, tmp_path, capsys):
 
 def test_units_of_rigs_are_taken():
     known = [
-        "cm", "V", "U0", "m^3/s", "cm^3/(s V)", "L/min", "%", "-", "°C", "m³/s", "ml / s",
-        "(m^3/s)^2", "m^0.5",
-    ]  # fmt: skip
+        "cm",
+        "V",
+        "U0",
+        "m^3/s",
+        "cm^3/(s V)",
+        "L/min",
+        "%",
+        "-",
+        "°C",
+        "m³/s",
+        "ml / s",
+        "(m^3/s)^2",
+        "m^0.5",
+    ]
     assert [units.check_unit("unit", one) for one in known] == known
     with pytest.raises(InputError, match=r"plant\.units: entry = 'cm\*/'"):
         network(area=1.0, drain=1.0, pump_gain=1.0, feeds=[(0, None)], rim=1.0, units=("cm*/", "V"))

@@ -33,13 +33,21 @@ def shortened(name):
         *(
             pytest.param(n, marks=pytest.mark.slow)
             for n in (
-                "calofir/backstepping", "gouta2015/ngpc", "gouta2022/chadpc", "gouta2022/fopi-ff",
-                "gouta2022/pid-ff", "johansson/pi-minimum", "khalid/gpc-nc2-constrained",
-                "khalid/laguerre", "mirakhorli/hybrid", "mirakhorli/lqi", "mirakhorli/smc",
+                "calofir/backstepping",
+                "gouta2015/ngpc",
+                "gouta2022/chadpc",
+                "gouta2022/fopi-ff",
+                "gouta2022/pid-ff",
+                "johansson/pi-minimum",
+                "khalid/gpc-nc2-constrained",
+                "khalid/laguerre",
+                "mirakhorli/hybrid",
+                "mirakhorli/lqi",
+                "mirakhorli/smc",
             )
         ),
     ],
-)  # fmt: skip
+)
 def test_a_changed_gain_gives_the_inputs_of_a_simulation_with_it(name, tmp_path):
     """Of every tunable gain, within 1e-9 of the pumps' range, without compiling again."""
     case = shortened(name)

@@ -467,9 +467,15 @@ def test_slopes_with_volts_dead_zone_lag_gain_and_offset():
         [np.where(t < 40, 8.0, np.where(t < 90, 0.5, 6.0)), np.where(t < 60, 7.0, 3.0)], axis=1
     )
     names = [
-        "plant.pump_gain[0]", "plant.drain[0]", "plant.pipe[0]", "plant.area[1]",
-        "actuator.dead_zone[0]", "actuator.lag[1]", "sensor.gain[0]", "sensor.offset[1]",
-    ]  # fmt: skip
+        "plant.pump_gain[0]",
+        "plant.drain[0]",
+        "plant.pipe[0]",
+        "plant.area[1]",
+        "actuator.dead_zone[0]",
+        "actuator.lag[1]",
+        "sensor.gain[0]",
+        "sensor.offset[1]",
+    ]
     exact, differences = slopes_of(
         base, names, t, u, [4.0, 2.0], ((0, True), (1, False)), tanks=(0, 1)
     )
@@ -761,11 +767,15 @@ def test_a_command_past_its_limit_is_what_the_pump_can_do(case):
         ({"free": {"plant.pump_gain[7]": (1.0, 2.0)}}, "pump_gain"),
         ({"free": {"plant.pmp_gain[0]": (1.0, 2.0)}}, "nearest"),
         ({"free": {"plant.pump_gain[0]": (3.0, 2.0)}}, "pump_gain"),
-        ({"start": "warm"}, "must be one of"), ({"loss": "cauchy"}, "must be one of"),
-        ({"hold_back": 1.5e9}, "hold_back"), ({"hold_back": -0.1}, "hold_back"),
-        ({"noise": -0.1}, "noise"), ({"noise": [0.1, 0.1]}, "noise"), ({"starts": 0}, "starts"),
+        ({"start": "warm"}, "must be one of"),
+        ({"loss": "cauchy"}, "must be one of"),
+        ({"hold_back": 1.5e9}, "hold_back"),
+        ({"hold_back": -0.1}, "hold_back"),
+        ({"noise": -0.1}, "noise"),
+        ({"noise": [0.1, 0.1]}, "noise"),
+        ({"starts": 0}, "starts"),
     ],
-)  # fmt: skip
+)
 def test_refused_by_input_validation(case, clean, options, words):
     with pytest.raises(InputError, match=words):
         tuning.identify(case, clean, **({"free": FREE} | options))
@@ -811,9 +821,15 @@ def identified(tmp_path_factory):
     folder = tmp_path_factory.mktemp("identified")
     (folder / "log.csv").write_text(csv_text())
     code, out, err = command(
-        "identify", "mirakhorli/sfc", "--data", str(folder / "log.csv"), *FLAGS, "--json", "--out",
+        "identify",
+        "mirakhorli/sfc",
+        "--data",
+        str(folder / "log.csv"),
+        *FLAGS,
+        "--json",
+        "--out",
         str(folder / "out"),
-    )  # fmt: skip
+    )
     assert code == 0, err
     return folder, out, err
 

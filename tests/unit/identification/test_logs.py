@@ -182,9 +182,13 @@ def test_columns_named_by_option_or_rig(read, case):
         [[r[0], r[1], str(1000 * float(r[2])), *r[3:]] for r in rows()],
     )
     columns = {
-        "t": ("when", "s"), "pump1": ("left", "V"), "pump2": "right [mV]", "h1": ("a", "cm"),
-        "h2": ("b", "cm"), "h3": ("c", "cm"),
-    }  # fmt: skip
+        "t": ("when", "s"),
+        "pump1": ("left", "V"),
+        "pump2": "right [mV]",
+        "h1": ("a", "cm"),
+        "h2": ("b", "cm"),
+        "h3": ("c", "cm"),
+    }
     assert same(read(content, columns=columns), read(text()))
     with pytest.raises(InputError, match="unknown column 'h9'"):
         read(content, columns={"h9": "a"})
@@ -242,11 +246,15 @@ def test_init_shows_a_log_table_that_works(tmp_path, read):
 @pytest.mark.parametrize(
     ("header", "expected"),
     [
-        ("h1 [cm]", ("h1", "cm")), ("h1(cm)", ("h1", "cm")), ("pump1_V", ("pump1", "V")),
-        ("pump_1", ("pump_1", None)), ("flow_l/min", ("flow", "l/min")), ("h1", ("h1", None)),
+        ("h1 [cm]", ("h1", "cm")),
+        ("h1(cm)", ("h1", "cm")),
+        ("pump1_V", ("pump1", "V")),
+        ("pump_1", ("pump_1", None)),
+        ("flow_l/min", ("flow", "l/min")),
+        ("h1", ("h1", None)),
         ("upper_tank", ("upper_tank", None)),
     ],
-)  # fmt: skip
+)
 def test_a_header_in_parts(header, expected):
     assert split_header(header) == expected
 

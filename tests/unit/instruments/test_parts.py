@@ -257,9 +257,16 @@ def test_delay_is_whole_samples_and_starts_from_the_initial_voltage():
 
 def fake_run(error, dt=1.0):
     return ms.Run(
-        tanks=1, outputs=1, pumps=1, samples=len(error), dt=dt, low=(0.0,), high=(12.0,),
-        rim=(10.0,), zero=jnp.zeros(()),
-    )  # fmt: skip
+        tanks=1,
+        outputs=1,
+        pumps=1,
+        samples=len(error),
+        dt=dt,
+        low=(0.0,),
+        high=(12.0,),
+        rim=(10.0,),
+        zero=jnp.zeros(()),
+    )
 
 
 def folded(names, levels, target, step, since, u=None, command=None, r=None):
@@ -272,10 +279,18 @@ def folded(names, levels, target, step, since, u=None, command=None, r=None):
         rk = target[k] if r is None else r[k]
         uk = 0.0 if u is None else u[k]
         sample = Sample(
-            t=jnp.float64(k), x=(jnp.float64(h),), y=(h,), x_hat=(h,), d_hat=(0.0,), r=(rk,),
-            e=(jnp.float64(h - rk),), command=(uk if command is None else command[k],),
-            applied=(jnp.float64(uk),), u=(jnp.float64(uk),), spilled=(0.0,),
-        )  # fmt: skip
+            t=jnp.float64(k),
+            x=(jnp.float64(h),),
+            y=(h,),
+            x_hat=(h,),
+            d_hat=(0.0,),
+            r=(rk,),
+            e=(jnp.float64(h - rk),),
+            command=(uk if command is None else command[k],),
+            applied=(jnp.float64(uk),),
+            u=(jnp.float64(uk),),
+            spilled=(0.0,),
+        )
         window = (
             (
                 jnp.float64(target[k]),
@@ -326,9 +341,14 @@ def test_a_downward_step_has_its_overshoot_below():
 
 def test_saturation_is_of_the_command_and_its_excess_is_bounded():
     got = folded(
-        ("saturated_fraction", "saturation_excess"), [1] * 4, [1] * 4, [0] * 4, [0] * 4,
-        u=[0, 5, 12, 12], command=[-12, 5, 12, 24],
-    )  # fmt: skip
+        ("saturated_fraction", "saturation_excess"),
+        [1] * 4,
+        [1] * 4,
+        [0] * 4,
+        [0] * 4,
+        u=[0, 5, 12, 12],
+        command=[-12, 5, 12, 24],
+    )
     np.testing.assert_allclose(got["saturated_fraction"], 0.5)
     np.testing.assert_allclose(got["saturation_excess"], 0.25)  # (1/2 + 0 + 0 + 1/2) / 4
 

@@ -146,9 +146,13 @@ def pumps_and_sensors(case):
         actuator, lag=np.full(len(reach), 2.5 * case.clock.dt), delay=3 * case.clock.dt
     )
     gauges = dataclasses.replace(
-        sensor, noise=0.01 * rim, offset=0.02 * rim * (-1.0) ** np.arange(len(rim)), gain=rim / 5.0,
-        bits=12, full_scale=5.0,
-    )  # fmt: skip
+        sensor,
+        noise=0.01 * rim,
+        offset=0.02 * rim * (-1.0) ** np.arange(len(rim)),
+        gain=rim / 5.0,
+        bits=12,
+        full_scale=5.0,
+    )
     return case.replace(loop=dataclasses.replace(case.loop, actuator=pumps, sensor=gauges))
 
 
@@ -156,11 +160,16 @@ def pumps_and_sensors(case):
     "calofir/backstepping-perturbed-own",
     "calofir/backstepping-perturbed-lag-delay-noise-offset-adc",
     "cascaded/pi-lag-delay-noise-offset-adc",
-    "gouta2015/backstepping-boxqp-lag-delay-noise-offset-adc", "gouta2015/backstepping-boxqp-own",
-    "gouta2022/chadpc-own", "khalid/laguerre-constrained-lag-delay-noise-offset-adc",
-    "khalid/laguerre-constrained-own", "mirakhorli/hybrid-lag-delay-noise-offset-adc",
-    "mirakhorli/hybrid-own", "gouta2022/chadpc-lag-delay-noise-offset-adc", "cascaded/pi-own",
-)  # fmt: skip
+    "gouta2015/backstepping-boxqp-lag-delay-noise-offset-adc",
+    "gouta2015/backstepping-boxqp-own",
+    "gouta2022/chadpc-own",
+    "khalid/laguerre-constrained-lag-delay-noise-offset-adc",
+    "khalid/laguerre-constrained-own",
+    "mirakhorli/hybrid-lag-delay-noise-offset-adc",
+    "mirakhorli/hybrid-own",
+    "gouta2022/chadpc-lag-delay-noise-offset-adc",
+    "cascaded/pi-own",
+)
 @pytest.mark.parametrize(
     "change", [lambda case: case, pumps_and_sensors], ids=["own", "lag-delay-noise-offset-adc"]
 )

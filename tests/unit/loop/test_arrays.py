@@ -44,15 +44,22 @@ def random_plant(rng, tanks):
     outputs = tuple(int(i) for i in rng.permutation(tanks)[:pumps])
     second = [int(rng.choice([t for t in range(tanks) if t != i])) for i in outputs]
     return network(
-        area=rng.uniform(15.0, 60.0, tanks), drain=rng.uniform(0.05, 0.3, tanks), links=links,
-        orifice=rng.uniform(0.0, 0.1, len(links)), pipes=pipes,
-        pipe=rng.uniform(0.0, 0.1, len(pipes)), pump_gain=rng.uniform(5.0, 15.0, pumps),
+        area=rng.uniform(15.0, 60.0, tanks),
+        drain=rng.uniform(0.05, 0.3, tanks),
+        links=links,
+        orifice=rng.uniform(0.0, 0.1, len(links)),
+        pipes=pipes,
+        pipe=rng.uniform(0.0, 0.1, len(pipes)),
+        pump_gain=rng.uniform(5.0, 15.0, pumps),
         split=rng.uniform(0.3, 1.0, pumps),
         feeds=[(i, j if rng.random() < 0.5 else None) for i, j in zip(outputs, second)],
-        spills=spills, caught=[rng.uniform(0.2, 1.0) / count[source] for source, _ in spills],
-        rim=rng.uniform(6.0, 20.0, tanks), outputs=outputs, overflow=bool(rng.random() < 0.8),
+        spills=spills,
+        caught=[rng.uniform(0.2, 1.0) / count[source] for source, _ in spills],
+        rim=rng.uniform(6.0, 20.0, tanks),
+        outputs=outputs,
+        overflow=bool(rng.random() < 0.8),
         bottom=bool(rng.random() < 0.5),
-    )  # fmt: skip
+    )
 
 
 def random_loop(seed, tanks):
@@ -66,19 +73,29 @@ def random_loop(seed, tanks):
     return ClosedLoop(
         plant=plant,
         sensor=LevelSensor(
-            noise=rng.uniform(0.0, 0.05, tanks), offset=some(rng.uniform(-0.1, 0.1, tanks)),
-            gain=np.full(tanks, 8.0), full_scale=np.float64(5.0), bits=int(rng.choice([0, 12])),
+            noise=rng.uniform(0.0, 0.05, tanks),
+            offset=some(rng.uniform(-0.1, 0.1, tanks)),
+            gain=np.full(tanks, 8.0),
+            full_scale=np.float64(5.0),
+            bits=int(rng.choice([0, 12])),
         ),
         observer=Direct(),
         controller=PID(
-            model=plant, Kc=rng.uniform(0.2, 1.0, m), Ti=rng.uniform(10.0, 40.0, m),
-            Td=some(rng.uniform(0.5, 2.0, m)), Tt=rng.uniform(10.0, 40.0, m),
+            model=plant,
+            Kc=rng.uniform(0.2, 1.0, m),
+            Ti=rng.uniform(10.0, 40.0, m),
+            Td=some(rng.uniform(0.5, 2.0, m)),
+            Tt=rng.uniform(10.0, 40.0, m),
             bias=rng.uniform(1.0, 3.0, m),
         ),
         actuator=PumpBank(
-            low=np.zeros(m), high=rng.uniform(6.0, 12.0, m), initial=rng.uniform(0.0, 3.0, m),
-            dead_zone=some(rng.uniform(0.1, 0.8, m)), dead_zone_kind=str(rng.choice(kinds)),
-            lag=some(rng.uniform(0.0, 3.0, m)), delay=float(rng.choice([0.0, 2.0])),
+            low=np.zeros(m),
+            high=rng.uniform(6.0, 12.0, m),
+            initial=rng.uniform(0.0, 3.0, m),
+            dead_zone=some(rng.uniform(0.1, 0.8, m)),
+            dead_zone_kind=str(rng.choice(kinds)),
+            lag=some(rng.uniform(0.0, 3.0, m)),
+            delay=float(rng.choice([0.0, 2.0])),
         ),
         reference=ramps(rng.uniform(3.0, 8.0, m), changes, ramp=float(rng.choice([0.0, 7.5]))),
         disturbance=inflow_pulses(
@@ -94,7 +111,7 @@ def random_loop(seed, tanks):
             ],
         ),
         x0=rng.uniform(1.0, 8.0, tanks),
-    )  # fmt: skip
+    )
 
 
 def measures_of(loop):
@@ -142,10 +159,22 @@ def row(tanks):
     """Tanks in a row with every kind of part, whose structure is the same for any number."""
     ends = [(i, i + 1) for i in range(tanks - 1)]
     plant = network(
-        area=15.0 + np.arange(tanks) % 3, drain=0.05, links=ends[::2], orifice=0.05, pipes=ends,
-        pipe=0.2, pump_gain=8.0, feeds=[(0, 1), (tanks // 2, None)], split=0.5, spills=ends,
-        caught=0.5, rim=20.0, outputs=(0, tanks // 2), overflow=True, bottom=True,
-    )  # fmt: skip
+        area=15.0 + np.arange(tanks) % 3,
+        drain=0.05,
+        links=ends[::2],
+        orifice=0.05,
+        pipes=ends,
+        pipe=0.2,
+        pump_gain=8.0,
+        feeds=[(0, 1), (tanks // 2, None)],
+        split=0.5,
+        spills=ends,
+        caught=0.5,
+        rim=20.0,
+        outputs=(0, tanks // 2),
+        overflow=True,
+        bottom=True,
+    )
     two = {name: [value] * 2 for name, value in {"Kc": 1.0, "Ti": 10.0, "Tt": 10.0}.items()}
     return ClosedLoop(
         plant=plant,

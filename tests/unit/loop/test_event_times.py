@@ -12,9 +12,15 @@ from jaxtank import presets
 from jaxtank.core.errors import InputError
 
 COUNTS = (
-    "saturated_fraction", "filter_active_fraction", "rise_time", "settling_time", "recovery_time",
-    "time_of_max_level", "time_of_min_level", "time_of_steady_state_error",
-)  # fmt: skip
+    "saturated_fraction",
+    "filter_active_fraction",
+    "rise_time",
+    "settling_time",
+    "recovery_time",
+    "time_of_max_level",
+    "time_of_min_level",
+    "time_of_steady_state_error",
+)
 
 
 @pytest.fixture(scope="module")

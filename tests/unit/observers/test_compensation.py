@@ -22,13 +22,18 @@ from jaxtank.plants import state_coupled_four_tank
 # the case, its setpoints [cm], and the largest error of a command [V]: roots in the sliding mode
 # are smooth at 0, and a quadratic programme ends its iterations
 CASES = {
-    "gouta2015/ngpc": ((12.0, 10.0), 1e-9), "gouta2015/backstepping": ((12.0, 10.0), 1e-9),
-    "gouta2015/backstepping-ff": ((12.0, 10.0), 1e-9), "gouta2022/chadpc": ((9.0, 10.0), 1e-9),
-    "gouta2022/pi-ff": ((9.0, 10.0), 1e-9), "mirakhorli/sfc": ((12.0, 12.0), 1e-9),
-    "mirakhorli/lqi": ((12.0, 12.0), 1e-9), "mirakhorli/smc": ((12.0, 12.0), 1e-4),
-    "mirakhorli/hybrid": ((12.0, 12.0), 1e-9), "khalid/gpc": ((0.4,), 1e-9),
+    "gouta2015/ngpc": ((12.0, 10.0), 1e-9),
+    "gouta2015/backstepping": ((12.0, 10.0), 1e-9),
+    "gouta2015/backstepping-ff": ((12.0, 10.0), 1e-9),
+    "gouta2022/chadpc": ((9.0, 10.0), 1e-9),
+    "gouta2022/pi-ff": ((9.0, 10.0), 1e-9),
+    "mirakhorli/sfc": ((12.0, 12.0), 1e-9),
+    "mirakhorli/lqi": ((12.0, 12.0), 1e-9),
+    "mirakhorli/smc": ((12.0, 12.0), 1e-4),
+    "mirakhorli/hybrid": ((12.0, 12.0), 1e-9),
+    "khalid/gpc": ((0.4,), 1e-9),
     "khalid/laguerre": ((0.4,), 1e-9),
-}  # fmt: skip
+}
 OFFSET = [name for name in CASES if not name.startswith("khalid")]
 
 

@@ -94,10 +94,19 @@ def test_slopes_of_a_random_rig_are_those_of_differences(seed):
 @pytest.mark.parametrize("shape", ["cone", "sphere"])
 def test_volume_is_kept_while_a_tank_of_changing_section_drains_into_another(shape):
     plant = network(
-        area=[1.0, 2.0], drain=0.0, links=[(0, 1)], orifice=0.02, pump_gain=1.0, feeds=[(0, None)],
-        sources=[1], rim=3.0, shapes=[shape, "prism"], extent=2.0, units=("m", "m^3/s"),
+        area=[1.0, 2.0],
+        drain=0.0,
+        links=[(0, 1)],
+        orifice=0.02,
+        pump_gain=1.0,
+        feeds=[(0, None)],
+        sources=[1],
+        rim=3.0,
+        shapes=[shape, "prism"],
+        extent=2.0,
+        units=("m", "m^3/s"),
         bottom=True,
-    )  # fmt: skip
+    )
 
     @jax.jit
     def run(x):
@@ -111,9 +120,15 @@ def test_volume_is_kept_while_a_tank_of_changing_section_drains_into_another(sha
 
 def test_a_pump_that_draws_takes_no_more_than_the_tank_holds():
     plant = network(
-        area=1.0, drain=0.0, pump_gain=1.0, feeds=[(1, None)], sources=[0], rim=[2.0, 9.0],
-        units=("m", "m^3/s"), bottom=True,
-    )  # fmt: skip
+        area=1.0,
+        drain=0.0,
+        pump_gain=1.0,
+        feeds=[(1, None)],
+        sources=[0],
+        rim=[2.0, 9.0],
+        units=("m", "m^3/s"),
+        bottom=True,
+    )
     x = (0.5, 0.0)
     for _ in range(30):
         x = advance(plant, "rk4", 0.0, x, (0.05,), None, 1.0, 1).x
@@ -124,10 +139,20 @@ def test_a_pump_that_draws_takes_no_more_than_the_tank_holds():
 def test_an_opening_above_the_level_is_dry(opening):
     sizes = {"drain": 0.0, "orifice": 0.0, "pipe": 0.0, "valve": 1e-9} | {opening: 0.01}
     plant = network(
-        area=[1.0, 1.0], drain=[sizes["drain"], 0.0], links=[(0, 1)], orifice=sizes["orifice"],
-        pipes=[(0, 1)], pipe=sizes["pipe"], valves=[(0, None)], valve=sizes["valve"], pump_gain=1.0,
-        feeds=[(0, None)], rim=5.0, ports={opening: 0.5}, units=("m", "m^3/s"),
-    )  # fmt: skip
+        area=[1.0, 1.0],
+        drain=[sizes["drain"], 0.0],
+        links=[(0, 1)],
+        orifice=sizes["orifice"],
+        pipes=[(0, 1)],
+        pipe=sizes["pipe"],
+        valves=[(0, None)],
+        valve=sizes["valve"],
+        pump_gain=1.0,
+        feeds=[(0, None)],
+        rim=5.0,
+        ports={opening: 0.5},
+        units=("m", "m^3/s"),
+    )
     rates = lambda level: plant.derivative(0.0, (level, 0.2), (0.0, 1.0), None)
     np.testing.assert_allclose(rates(0.3), 0.0, atol=1e-8)
     speed = np.sqrt(2.0 * 9.81 * 0.25)

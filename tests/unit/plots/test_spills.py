@@ -107,9 +107,13 @@ def test_volumes_have_three_figures_and_a_unit(volume, text):
 
 def test_no_two_roles_share_a_colour_and_the_live_page_has_the_same():
     roles = {
-        "run": style.TUNED, "pin0": style.PUBLISHED, "pin1": style.FILTERED, "limit": style.RIM,
-        "water": style.WATER, **{f"pump{j}": colour for j, colour in enumerate(style.PUMPS)},
-    }  # fmt: skip
+        "run": style.TUNED,
+        "pin0": style.PUBLISHED,
+        "pin1": style.FILTERED,
+        "limit": style.RIM,
+        "water": style.WATER,
+        **{f"pump{j}": colour for j, colour in enumerate(style.PUMPS)},
+    }
     assert len({to_rgba(c) for c in (*roles.values(), style.REFERENCE)}) == len(roles) + 1
     sheet = (ROOT / "jaxtank" / "live" / "page.css").read_text().split("@media")[0]
     for role, colour in roles.items():

@@ -122,12 +122,17 @@ def test_a_rig_may_be_spelled_as_people_spell_it(base):
 @pytest.mark.parametrize(
     "section, key, word",
     [
-        ("valve", "R", "rangeability"), ("valve", "curve", "characteristic"),
-        ("valve", "stroke_time", "rate"), ("pump", "dead_time", "delay"), ("pump", "flow", "gain"),
-        ("pipe", "from", "between"), ("orifice", "diameter", "area"), ("inflow", "flow", "changes"),
+        ("valve", "R", "rangeability"),
+        ("valve", "curve", "characteristic"),
+        ("valve", "stroke_time", "rate"),
+        ("pump", "dead_time", "delay"),
+        ("pump", "flow", "gain"),
+        ("pipe", "from", "between"),
+        ("orifice", "diameter", "area"),
+        ("inflow", "flow", "changes"),
         ("controller", "hysteresis", "on or off"),
     ],
-)  # fmt: skip
+)
 def test_a_word_of_the_field_is_answered_with_the_key(section, key, word):
     assert f"; write {word}" in str(unknown_key(SECTIONS[section], key))
 

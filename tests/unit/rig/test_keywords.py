@@ -99,9 +99,14 @@ def test_a_controller_of_python_takes_the_place_of_its_table():
             return (self.Kc * (tick.r[0] - estimate.x[0]),), state
 
     case = jaxtank.Rig(
-        **PARTS, controller=Proportional(Kc=2.0), free={"controller.Kc": (1.0, 50.0)},
-        values={"controller.Kc": 3.0}, reference=[[0.0, 0.5]], duration="10 s", dt=2,
-    )  # fmt: skip
+        **PARTS,
+        controller=Proportional(Kc=2.0),
+        free={"controller.Kc": (1.0, 50.0)},
+        values={"controller.Kc": 3.0},
+        reference=[[0.0, 0.5]],
+        duration="10 s",
+        dt=2,
+    )
     run = jaxtank.simulate(case)
     np.testing.assert_allclose(run.u[:, 0], 3.0 * (0.5 - np.asarray(run.x[:, 0])), rtol=1e-12)
     assert case.clock.samples == 6 and case.free["controller.Kc"].high == 50.0

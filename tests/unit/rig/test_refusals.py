@@ -56,11 +56,15 @@ max_levl = 1.0
 @pytest.mark.parametrize(
     ("word", "write"),
     [
-        ("Kp = 2.0", "Kc"), ("tau_i = 9.0", "Ti"), ("Ki = 0.1", "Ti"), ("Kd = 0.1", "Td"),
-        ("setpoint = 0.5", "[reference]"), ("SP = 0.5", "[reference]"),
+        ("Kp = 2.0", "Kc"),
+        ("tau_i = 9.0", "Ti"),
+        ("Ki = 0.1", "Ti"),
+        ("Kd = 0.1", "Td"),
+        ("setpoint = 0.5", "[reference]"),
+        ("SP = 0.5", "[reference]"),
         ("dt = 1.0", "dt at the top"),
     ],
-)  # fmt: skip
+)
 def test_words_of_the_field_are_answered_with_ours(word, write):
     _, message = problems_of(HEAD + word)
     assert write in message.partition("write")[2] and "line 13" in message

@@ -41,17 +41,21 @@ def round_trip(case, folder):
         {"reference.ramp": 0.0},
         {"reference.ramp": 12.5, "reference.shape": "quintic", "reference.targets[0]": 7.0},
         {
-            "clock.dt": 0.1, "clock.duration": 500, "clock.substeps": 3,
+            "clock.dt": 0.1,
+            "clock.duration": 500,
+            "clock.substeps": 3,
             "clock.integrator": "midpoint",
         },
         {
-            "actuator.saturation": "boxqp", "actuator.delay": 0.5, "sensor.noise": 0.02,
+            "actuator.saturation": "boxqp",
+            "actuator.delay": 0.5,
+            "sensor.noise": 0.02,
             "sensor.bits": 12,
         },
         {"controller.k1": 1 / 3, "plant.area[2]": 1e5, "plant.pump_gain": 1e22, "plant.knee": 0.02},
     ],
     ids=lambda values: next(iter(values)),
-)  # fmt: skip
+)
 def test_overrides_are_read_back(gouta, values, tmp_path):
     case = gouta("backstepping-ff", values)
     assert_same(round_trip(case, tmp_path), case)

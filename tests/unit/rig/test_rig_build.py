@@ -48,8 +48,13 @@ def test_two_tanks_against_scipy():
     case = rig.set_values(case, {"controller.Kc": 0.4, "clock.duration": 600.0})
     run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock))
     k1, k3, k4, integral, x, u0 = (
-        0.05, 0.05, 0.06, 0.0, np.array([4.0, 4.0]), float(case.loop.controller.bias[0]),
-    )  # fmt: skip
+        0.05,
+        0.05,
+        0.06,
+        0.0,
+        np.array([4.0, 4.0]),
+        float(case.loop.controller.bias[0]),
+    )
     assert u0 == pytest.approx(1.7)  # `initial` of the file, 2 % above the steady 1.667 V
     for k in range(len(run.t)):
         np.testing.assert_allclose(run.x[k], x, atol=1e-5)

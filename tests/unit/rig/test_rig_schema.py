@@ -314,12 +314,22 @@ def test_the_fields_of_a_class_are_the_keys_of_its_section():
 
 SIZES = Sizes(4, 2, 2, names={"left": 0})
 KINDS = {
-    "number": (1.5, "x"), "integer": (3, 2.5), "flag": (True, 1), "choice": ("clip", 3),
-    "text": ("a b", "a\nb"), "texts": (["a", "b"], [1]), "list": ([1.0, 2.0, 3.0, 4.0], [1.0]),
-    "array": ([1.0, 2.0, 3.0, 4.0], "x"), "scalar": (2.0, [1.0, 2.0]), "tank": (3, 5),
-    "tanks": ([1, 4], 3), "pair": ([1, 4], [1, 1]), "feed": ([2, 3], [1, 2, 3]),
-    "curve": ([[0.0, 1.0], [2.0, 3.0]], [[0.0, 1.0]]), "table": ({"a": 1}, 3),
-}  # fmt: skip
+    "number": (1.5, "x"),
+    "integer": (3, 2.5),
+    "flag": (True, 1),
+    "choice": ("clip", 3),
+    "text": ("a b", "a\nb"),
+    "texts": (["a", "b"], [1]),
+    "list": ([1.0, 2.0, 3.0, 4.0], [1.0]),
+    "array": ([1.0, 2.0, 3.0, 4.0], "x"),
+    "scalar": (2.0, [1.0, 2.0]),
+    "tank": (3, 5),
+    "tanks": ([1, 4], 3),
+    "pair": ([1, 4], [1, 1]),
+    "feed": ([2, 3], [1, 2, 3]),
+    "curve": ([[0.0, 1.0], [2.0, 3.0]], [[0.0, 1.0]]),
+    "table": ({"a": 1}, 3),
+}
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -41,9 +41,16 @@ def pumped_out():
 def series(spread=0.05, **options):
     """(rig, settings): a pump fills tank 1, one lifts from it into tank 2, a valve empties that."""
     plant = network(
-        area=[60.0, 40.0], drain=[0.1, 0.0], pump_gain=[12.0, 8.0], feeds=[(0, None), (1, None)],
-        sources=[None, 0], valves=[(1, None)], valve=[1.2], rim=[40.0, 40.0], bottom=True,
-    )  # fmt: skip
+        area=[60.0, 40.0],
+        drain=[0.1, 0.0],
+        pump_gain=[12.0, 8.0],
+        feeds=[(0, None), (1, None)],
+        sources=[None, 0],
+        valves=[(1, None)],
+        valve=[1.2],
+        rim=[40.0, 40.0],
+        bottom=True,
+    )
     bank = PumpBank(low=np.zeros(3), high=np.array([10.0, 10.0, 1.0]), initial=np.zeros(3))
     sensor = LevelSensor(gain=np.ones(2), noise=np.full(2, 0.01), full_scale=100.0)
     widths = {"pump_gain": spread * plant.pump_gain, "valve": spread * plant.valve}
@@ -140,9 +147,15 @@ def test_the_checker_proves_nothing_of_a_filter_with_another(what):
 def joined():
     """(rig, settings) of a pump into each of two tanks that an orifice joins."""
     plant = network(
-        area=[60.0, 40.0], drain=[0.2, 0.3], links=[(0, 1)], orifice=[0.2], pump_gain=[12.0, 8.0],
-        feeds=[(0, None), (1, None)], rim=[40.0, 40.0], bottom=True,
-    )  # fmt: skip
+        area=[60.0, 40.0],
+        drain=[0.2, 0.3],
+        links=[(0, 1)],
+        orifice=[0.2],
+        pump_gain=[12.0, 8.0],
+        feeds=[(0, None), (1, None)],
+        rim=[40.0, 40.0],
+        bottom=True,
+    )
     bank = PumpBank(low=np.zeros(2), high=np.array([10.0, 10.0]), initial=np.zeros(2))
     sensor = LevelSensor(gain=np.ones(2), noise=np.zeros(2), full_scale=100.0)
     settings = {"widths": {}, "limit": 30.0, "start": [20.0, 10.0]}
@@ -163,10 +176,18 @@ def spans(low=None, high=None, orifice=1.5, **options):
     which a valve empties.
     """
     plant = network(
-        area=[50.0, 50.0], drain=[0.0, 0.3], links=[(0, 1)], orifice=[orifice], pump_gain=[20.0],
-        feeds=[(1, None)], valves=[(1, None)], valve=[2.2], rim=[40.0, 40.0], overflow=True,
+        area=[50.0, 50.0],
+        drain=[0.0, 0.3],
+        links=[(0, 1)],
+        orifice=[orifice],
+        pump_gain=[20.0],
+        feeds=[(1, None)],
+        valves=[(1, None)],
+        valve=[2.2],
+        rim=[40.0, 40.0],
+        overflow=True,
         bottom=True,
-    )  # fmt: skip
+    )
     bank = PumpBank(low=np.zeros(2), high=np.array([20.0, 1.0]), initial=np.zeros(2))
     sensor = LevelSensor(gain=np.ones(2), noise=np.zeros(2), low=low, high=high)
     settings = {"widths": {}, "limit": [40.0, 20.0], "start": [9.0, 10.0], **options}
@@ -215,10 +236,16 @@ def test_a_neighbour_that_rises_above_its_sensor_proves_no_limit_of_the_next_tan
 @pytest.mark.parametrize(("low", "proved"), [(0.0, False), (5.0, True)])
 def test_a_pump_that_runs_back_from_two_tanks_counts_only_where_both_hold_liquid(low, proved):
     plant = network(
-        area=[50.0, 50.0, 50.0], drain=[2.0, 0.0, 0.0], pump_gain=[30.0, 20.0, 20.0],
-        feeds=[(1, 2), (1, None), (2, None)], sources=[0, None, None], split=[0.4, 1.0, 1.0],
-        rim=[60.0, 60.0, 60.0], overflow=True, bottom=True,
-    )  # fmt: skip
+        area=[50.0, 50.0, 50.0],
+        drain=[2.0, 0.0, 0.0],
+        pump_gain=[30.0, 20.0, 20.0],
+        feeds=[(1, 2), (1, None), (2, None)],
+        sources=[0, None, None],
+        split=[0.4, 1.0, 1.0],
+        rim=[60.0, 60.0, 60.0],
+        overflow=True,
+        bottom=True,
+    )
     bank = PumpBank(  # tank 3 is filled for certain only where it has a low limit
         low=np.array([-10.0, 15.0, 0.0 if low == 0.0 else 15.0]),
         high=np.array([0.0, 20.0, 20.0]),

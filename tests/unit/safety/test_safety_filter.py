@@ -74,9 +74,14 @@ def one_tank(drain=0.0, inflow=None):
             area=[20.0], drain=[drain], feeds=[(0, None)], pump_gain=[8.0], rim=[30.0]
         ), PumpBank(low=[0.0], high=[12.0])
     return network(
-        area=20.0, drain=[drain, 0.0], links=[(1, 0)], orifice=[inflow],
-        feeds=[(0, None), (1, None)], pump_gain=8.0, rim=30.0,
-    ), PumpBank(low=[0.0, 0.0], high=[12.0, 12.0])  # fmt: skip
+        area=20.0,
+        drain=[drain, 0.0],
+        links=[(1, 0)],
+        orifice=[inflow],
+        feeds=[(0, None), (1, None)],
+        pump_gain=8.0,
+        rim=30.0,
+    ), PumpBank(low=[0.0, 0.0], high=[12.0, 12.0])
 
 
 def passes(plant, actuator, found, spread, **how):

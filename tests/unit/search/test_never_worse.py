@@ -45,9 +45,13 @@ def test_no_screened_point_is_better_at_the_true_step_where_the_coarse_one_diffe
 @pytest.mark.slow
 def test_robust_tuning_with_one_start_ends_at_or_below_all_that_it_saw(watertank):
     result = tuning.tune_robust(
-        watertank, {"plant.pump_gain": tuning.Uniform(relative=0.05)}, samples=4, fresh=4,
-        limits={"overshoot_percent": 20.0}, method=tuning.Options(starts=1, screening=16),
-    )  # fmt: skip
+        watertank,
+        {"plant.pump_gain": tuning.Uniform(relative=0.05)},
+        samples=4,
+        fresh=4,
+        limits={"overshoot_percent": 20.0},
+        method=tuning.Options(starts=1, screening=16),
+    )
     assert all(c.margin >= 0 for c in result.constraints)
     assert result.objective["after"] <= min(held(result)) * (1 + 1e-9)
     assert result.objective["after"] <= result.objective["before"]

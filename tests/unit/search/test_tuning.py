@@ -172,9 +172,13 @@ def test_the_better_of_two_minima_is_found_from_either_side(gouta, Tp):
     """
     case = gouta("ngpc", {"reference.ramp": 30.0, "controller.Tp": Tp})
     result = tuning.tune(
-        case, nominal=True, free={"controller.Tp": (1.0, 100.0)}, objective=PENALISED, limits={},
+        case,
+        nominal=True,
+        free={"controller.Tp": (1.0, 100.0)},
+        objective=PENALISED,
+        limits={},
         starts=4,
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(result.parameters["controller.Tp"]["after"], 7.33, atol=0.15)
     np.testing.assert_allclose(result.objective["after"], 1.796, rtol=5e-3)
 
@@ -256,11 +260,21 @@ def test_a_result_is_saved_whole_and_its_rig_runs_to_the_same_numbers(short, tmp
     result = short
     names = {p.name for p in result.save(tmp_path / "out")}
     pictures = {
-        "responses.png", "rig.png", "margins.png", "inner.png", "convergence.png", "landscape.png",
-    }  # fmt: skip
+        "responses.png",
+        "rig.png",
+        "margins.png",
+        "inner.png",
+        "convergence.png",
+        "landscape.png",
+    }
     assert names == {
-        "result.json", "rig.toml", "trajectory.csv", "before.csv", "report.html", *pictures,
-    }  # fmt: skip
+        "result.json",
+        "rig.toml",
+        "trajectory.csv",
+        "before.csv",
+        "report.html",
+        *pictures,
+    }
     assert {p.name for p in (tmp_path / "out").iterdir()} == names
     table = json.loads((tmp_path / "out" / "result.json").read_text())
     case = rig.load(tmp_path / "out" / "rig.toml")

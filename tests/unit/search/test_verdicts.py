@@ -167,9 +167,16 @@ def test_a_trade_off_starts_from_what_was_screened(capsys):
 
 
 NOISY = [
-    "gouta2022/chadpc", "--dt", "0.05", "--set", "clock.duration=100", "--set", "sensor.noise=0.02",
-    "--set", "actuator.delay=0.2",
-]  # fmt: skip
+    "gouta2022/chadpc",
+    "--dt",
+    "0.05",
+    "--set",
+    "clock.duration=100",
+    "--set",
+    "sensor.noise=0.02",
+    "--set",
+    "actuator.delay=0.2",
+]
 
 
 @pytest.mark.slow

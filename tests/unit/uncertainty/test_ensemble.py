@@ -163,28 +163,43 @@ def test_quantiles_of_a_linear_gaussian_case():
 
     base = jaxtank.presets.find("cascaded/open-loop").loop
     plant = network(
-        area=[10.0], drain=[0.0], links=(), orifice=[], pump_gain=[2.0], feeds=((0, None),),
-        rim=1e3, outputs=(0,),
-    )  # fmt: skip
+        area=[10.0],
+        drain=[0.0],
+        links=(),
+        orifice=[],
+        pump_gain=[2.0],
+        feeds=((0, None),),
+        rim=1e3,
+        outputs=(0,),
+    )
     loop = dataclasses.replace(
         base,
         plant=plant,
         sensor=dataclasses.replace(base.sensor, gain=np.ones(1), noise=np.zeros(1)),
         controller=OpenLoop(signal=Constant(level=np.array([3.0]))),
         actuator=dataclasses.replace(
-            base.actuator, low=np.zeros(1), high=np.full(1, 10.0), initial=np.zeros(1),
-            stop=np.zeros(1), pulse=np.ones(1),
+            base.actuator,
+            low=np.zeros(1),
+            high=np.full(1, 10.0),
+            initial=np.zeros(1),
+            stop=np.zeros(1),
+            pulse=np.ones(1),
         ),
         reference=Constant(level=np.array([5.0])),
         disturbance=None,
         faults=None,
         x0=np.array([1.0]),
-    )  # fmt: skip
+    )
     clock = jaxtank.Clock(dt=0.5, duration=20.0)
     case = jaxtank.presets.Case(
-        name="one tank", title="", loop=loop, clock=clock, limits={"max_level": 14.0}, free={},
+        name="one tank",
+        title="",
+        loop=loop,
+        clock=clock,
+        limits={"max_level": 14.0},
+        free={},
         objective={"ise": 1.0},
-    )  # fmt: skip
+    )
     found = tuning.ensemble(
         case, {"plant.pump_gain": tuning.Normal(sd=0.1)}, samples=4096, draws="sobol", fan=False
     )
@@ -473,9 +488,14 @@ def test_robust_gains_hold_the_limit_on_every_plant_and_the_certificate_is_of_fr
     )
     free = {"controller.k": (1e-3, 2.0), "controller.k1": (1e-3, 1.0)}
     result = tuning.tune_robust(
-        case, risk=risk, samples=12, fresh=64, free=free, limits={"max_level": 33.0},
+        case,
+        risk=risk,
+        samples=12,
+        fresh=64,
+        free=free,
+        limits={"max_level": 33.0},
         method=tuning.Options(starts=1, screening=8, validation=0),
-    )  # fmt: skip
+    )
     assert all(c["margin"] >= 0 for c in result.constraints) and len(result.constraints) == 48
     costs = []
     values = {n: p["after"] for n, p in result.parameters.items()}
@@ -566,9 +586,13 @@ def test_64_plants_a_back_off_and_no_violation_among_4096(study, objective):
     include second derivatives.
     """
     result = tuning.tune_robust(
-        study, fresh=4096, objective=objective, limits={"max_level": 33.0},
-        method=tuning.Options(starts=1, screening=1), back_off=0.03,
-    )  # fmt: skip
+        study,
+        fresh=4096,
+        objective=objective,
+        limits={"max_level": 33.0},
+        method=tuning.Options(starts=1, screening=1),
+        back_off=0.03,
+    )
     known = result.certificate
     assert result.success and result.evaluations["gradients"] <= 26 * 64
     assert (known.broken, known.fresh, known.support) == (0, 4096, 1) and known.interval95[1] < 1e-3

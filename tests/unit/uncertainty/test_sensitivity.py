@@ -423,16 +423,21 @@ def test_command_prints_tables():
 @pytest.mark.parametrize(
     "args",
     [
-        ("cascaded/pid",), (*SHORT, "--method", "sobel"), (*SHORT, "--samples", "many"),
-        (*SHORT, "--method", "morris", "--samples", "0"), (*SHORT, "--spread", "5%"),
-        (*SHORT, "--spread", "-0.1"), (*SHORT, "--vary", "plant.drain"),
+        ("cascaded/pid",),
+        (*SHORT, "--method", "sobel"),
+        (*SHORT, "--samples", "many"),
+        (*SHORT, "--method", "morris", "--samples", "0"),
+        (*SHORT, "--spread", "5%"),
+        (*SHORT, "--spread", "-0.1"),
+        (*SHORT, "--vary", "plant.drain"),
         (*SHORT, "--vary", "plant.drain=gauss:5%"),
         (*SHORT, "--vary", "plant.drain=uniform:5%", "--vary", "plant.drain=uniform:6%"),
         (*SHORT, "--vary", "plant.drain=uniform:5%", "--spread", "0.1"),
-        (*SHORT, "--measure", "height"), (*SHORT, "--seed", "x"),
+        (*SHORT, "--measure", "height"),
+        (*SHORT, "--seed", "x"),
     ],
     ids=" ".join,
-)  # fmt: skip
+)
 def test_bad_command(args, tmp_path):
     code, out, err = say(*args, "--out", str(tmp_path / "none"))
     assert code == 2 and out == "" and not (tmp_path / "none").exists()
