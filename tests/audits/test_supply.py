@@ -54,7 +54,7 @@ READS = (
 MADE = {
     ("jaxtank.core.lazy", "get", "import_module"): "names of the stub of its own package",
     ("jaxtank.core.lazy", "home", "import_module"): "modules that the two `__init__` name",
-    ("jaxtank.xla.jit", "_tree", "import_module"): "of a named tuple of ours, of an entry",
+    ("jaxtank.xla.jit", "_definition", "import_module"): "of a class of ours, of an entry",
     ("jaxtank.plots.style", "notebook", "import_module"): "matplotlib_inline, by a constant name",
     ("tuning.cluster.engine", "call", "import_module"): "names of its table, in its package",
     ("jaxtank.presets", "_load", "import_module"): "names of presets.PAPERS, checked before",

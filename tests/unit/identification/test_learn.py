@@ -26,7 +26,7 @@ rms_error_total = 1.0
 
 @pytest.fixture
 def case(tmp_path):
-    (tmp_path / "rig.toml").write_text(RIG.replace('"sensor.noise" = [0.05]', ""))
+    (tmp_path / "rig.toml").write_text(RIG.replace(', "sensor.noise" = [0.05]', ""))
     return rig.load(tmp_path / "rig.toml")
 
 

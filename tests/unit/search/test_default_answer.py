@@ -200,11 +200,12 @@ def test_what_only_a_report_shows_is_run_when_it_is_asked_for(case):
 
 
 DEFAULT_ANSWER = {"_run": 2, "_slopes": 1, "_values": 1, "_compiled": 1}
+DEFAULT_ANSWER |= {"simulate_compiled": 1, "_drawn": 1}
 """Programs of a default answer: judging without the safety filter and with it, derivatives and
-values of the search's plants, stability margins."""
+values of the search's plants, stability margins; the run of the answer, the noise of the search."""
 
 
-def test_a_default_answer_has_five_programs(counted):
+def test_a_default_answer_has_seven_programs(counted):
     large = {part.__name__ for part in gc.get_objects() if isinstance(part, jit.Kept)}
     assert {name: n for name, n in counted[1].items() if name in large} == DEFAULT_ANSWER
 
