@@ -182,7 +182,11 @@ def with_noise_drawn(group: Group) -> Group:
 @compiled("samples", keep=True)
 def _drawn(sensor: Any, keys: Any, samples: int) -> Any:
     """The noise of each run, (runs, sensors, samples)."""
-    return jax.vmap(lambda key: jnp.stack(sensor.draw(key, samples)))(keys)
+
+    def draw(key: Any) -> Any:
+        return jnp.stack(sensor.draw(key, samples))
+
+    return jax.vmap(draw)(keys)
 
 
 def at_once(function: Callable[[Any], Any], tasks: Sequence[Any]) -> list[Any]:

@@ -180,9 +180,10 @@ def verdict_of(ensemble):
     lost = verdicts.lost(ensemble.case.loop, columns)
     if lost is not None and (lost := lost & ~ensemble.failed).any():
         first = {n: v[np.argmax(lost)] for n, v in columns.items()}
-        example = verdicts.tracking(ensemble.case.loop, first).words
-        many = f"{int(lost.sum())} of {samples} draws do not keep to the setpoints, as: {example}"
-        parts["tracking"] = verdicts.Part(many, False)
+        example = verdicts.tracking(ensemble.case.loop, first)
+        many = f"{int(lost.sum())} of {samples} draws do not keep to the setpoints"
+        words = many if example is None else f"{many}, as: {example.words}"
+        parts["tracking"] = verdicts.Part(words, False)
     if violations:
         worst = max(violations, key=lambda v: v["count"])
         held, share = int(ensemble.held.sum()), verdicts.shown(100 * worst["probability"])
