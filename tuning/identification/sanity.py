@@ -141,10 +141,10 @@ def _dips(y, quiet):
         return np.zeros(0, dtype=int)
     found: list[int] = []
     step, noise = np.abs(np.diff(y)), _noise(y)
+    large = step > JUMP * noise
     for n in range(2, FEW + 1):
-        for k in range(1, len(y) - n - 2):  # k is the last before them, k + n + 1 the first after
-            if step[k] <= JUMP * noise or step[k + n] <= JUMP * noise:
-                continue
+        both = large[1 : len(y) - n - 2] & large[1 + n : len(y) - 2]
+        for k in 1 + np.flatnonzero(both):  # the last before them; k + n + 1 is the first after
             around, away = y[[k, k + n + 1]], y[k + 1 : k + n + 1]
             jump = np.abs(away - around.mean()).min()
             beside = max(step[k - 1], step[k + n + 1], np.ptp(around))
