@@ -11,7 +11,7 @@ from jaxtank.analysis import elimination
 from jaxtank.core import vectors
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.labels import label_of, labels_of
-from jaxtank.core.numerics import lower_clip, smooth_signed_sqrt, smooth_sqrt
+from jaxtank.core.numerics import lower_clip, root_of, smooth_signed_sqrt, smooth_sqrt
 from jaxtank.plants import elements
 
 STEPS = 200
@@ -498,8 +498,7 @@ def _free_discharge(plant, y, words, inflow):
     """(levels, inputs) of a network without pipes in its steady state; inputs may be negative."""
     with np.errstate(all="ignore"):  # an overflow is reported below
         try:
-            with jax.enable_x64(True):
-                roots = np.asarray(smooth_sqrt(y, plant.knee))
+            roots = root_of(np.asarray(y, dtype=float), plant.knee, np)
             speeds, u = _from_known_speeds(
                 plant, np.sqrt(2.0 * float(plant.gravity)) * roots, np, inflow
             )
