@@ -4,6 +4,7 @@ import math
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from jaxtank.core.numerics import lower_clip, smooth_signed_sqrt, smooth_sqrt
 from jaxtank.plants.tank_network import TankNetwork
@@ -28,7 +29,8 @@ def rates_of(
 ) -> Rates:
     """Return the Rates of all plants whose parameters lie between those of two networks."""
     n = least.tanks
-    slow, fast = jnp.sqrt(2.0 * least.gravity), jnp.sqrt(2.0 * most.gravity)
+    number = isinstance(least.gravity, float | np.ndarray | np.generic)  # nothing to compile
+    slow, fast = ((np if number else jnp).sqrt(2.0 * plant.gravity) for plant in (least, most))
     out, out_most = _free_outlets(least), _free_outlets(most)
     outlets = list(out_most)
     for k, ends in enumerate(least.pipes):
