@@ -147,7 +147,7 @@ def quantity(where: str, text: str, unit: str) -> float:
         each = f"{top}/({bottom} %)" if bottom else f"{top}/%"
         raise InputError(
             f'{where} = {shortened(text)}: for each %, or for 100 %? Write "{value:g} {each}" or'
-            f' "{value / 100:g} {each}"'
+            f' "{value / 100:.10g} {each}"'
         )
     if size is not None:
         return value * size

@@ -117,7 +117,7 @@ def _convert(writer, eqn, operands):
 
 
 def _broadcast(x, shape, broadcast_dimensions, **_):
-    """`x` with its axes at these of a new shape, and repeated along the others."""
+    """`x` with its axes at `broadcast_dimensions` of `shape`, repeated along the others."""
     sizes = [1] * len(shape)
     for axis, size in zip(broadcast_dimensions, x.shape):
         sizes[axis] = size
@@ -134,7 +134,7 @@ PLACED = {
     "slice": _slice,
     "broadcast_in_dim": _broadcast,
 }
-"""Moves of one array that numpy makes: most of a loop's, and jax takes half a second for them."""
+"""Moves of one array, by numpy: jax takes half a second for those of a loop."""
 
 
 def _move(writer, eqn, operands):

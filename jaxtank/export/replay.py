@@ -56,7 +56,7 @@ def replay(path: str | Path, data: str | Path) -> dict[str, Any]:
     Parameters
     ----------
     path : an exported controller: NAME.c (with NAME.h beside it), NAME.js or NAME.fmu
-    data : log with a row of each period: t [s], y1, .. (or h1, ..), r1, .., u1, .. (or pump1, ..),
+    data : log with one row a period: t [s], y1, .. (or h1, ..), r1, .., u1, .. (or pump1, ..),
         and applied1, .. where pumps have a lag, delay or dead zone behind the inputs of the
         controller
 

@@ -47,10 +47,11 @@ def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> l
         f" {label_of(loop.plant, 'tank', tank)}"
         f" differs by {apart[:, tank].max():.3g} {length} at t = {time:g} s"
     )
-    if tank in narrow:
+    if narrow and (tank in narrow or not unstable):
+        tips = labels_of(loop.plant, "tank", narrow)
         sentence += (
-            " (near its tip a step takes more than it holds: halve the step, by clock.substeps or"
-            " clock.dt, until this note is gone)"
+            f" (near the tip of {tips} a step takes more than there is: halve the step, by"
+            " clock.substeps or clock.dt, until this note is gone)"
         )
     elif errors[tank] > MAX_ERROR:
         remedy = max(unstable, key=lambda item: item.height).remedy

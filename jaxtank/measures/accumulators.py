@@ -205,8 +205,8 @@ def settled(last, outside):
 
 
 def _moves(r, before):
-    """Whether a setpoint is another one; rounding alone is no change: compiled code may fuse
-    k dt - t0, that of a page does not.
+    """Whether a setpoint has changed by more than rounding: compiled code may fuse k dt - t0, that
+    of a page does not.
     """
     return magnitude(r - before) > 4.0 * jnp.finfo(jnp.result_type(r)).eps * magnitude(r)
 
@@ -229,7 +229,8 @@ def _update_plateau(run, state, sample, context):
 def _update_swing(run, state, sample, context):
     """Per output (setpoint, whether it was constant at the last sample; samples of its plateau, at
     how many the next part of it begins; largest errors above and below in this part and in the
-    one before; largest swing of a plateau so far). A part ends where its plateau is a fifth longer.
+    one before; largest swing of a plateau so far). A part ends when the plateau is a fifth longer
+    than at its begin.
     """
 
     def update(r, e, before):

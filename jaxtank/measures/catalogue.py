@@ -217,8 +217,8 @@ _BUILT_IN: dict[str, Measure] = {
         "output",
         "swing",
         _steady_state_swing,
-        "smaller of the largest errors above and below the setpoint over the end of a plateau: a"
-        " sixth to three tenths of it",
+        "smaller of the largest errors above and below the setpoint, over the last sixth to three"
+        " tenths of a plateau",
         undefined="its setpoint is at no time constant",
         nan_holds="its setpoint is at no time constant",
     ),
@@ -419,7 +419,7 @@ LABELS = {
     "iae": "integral of the absolute error",
     "max_error": "largest error",
     "steady_state_error": "steady-state error",
-    "steady_state_swing": "swing at the steady state",
+    "steady_state_swing": "steady-state swing",
     "rms_input": "RMS input",
     "input_travel": "total variation of the input",
     "mean_square_travel": "mean square change of the input",

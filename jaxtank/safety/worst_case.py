@@ -29,8 +29,9 @@ def rates_of(
 ) -> Rates:
     """Return the Rates of all plants whose parameters lie between those of two networks."""
     n = least.tanks
-    number = isinstance(least.gravity, float | np.ndarray | np.generic)  # nothing to compile
-    slow, fast = ((np if number else jnp).sqrt(2.0 * plant.gravity) for plant in (least, most))
+    numbers = isinstance(least.gravity, float | int | np.ndarray | np.generic)
+    xp = np if numbers else jnp  # of numbers nothing is compiled
+    slow, fast = xp.sqrt(2.0 * least.gravity), xp.sqrt(2.0 * most.gravity)
     out, out_most = _free_outlets(least), _free_outlets(most)
     outlets = list(out_most)
     for k, ends in enumerate(least.pipes):

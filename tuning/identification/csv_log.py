@@ -463,7 +463,7 @@ class LogFile:
         length, plant = self.loop.units[0], self.plant
         if share := re.fullmatch(SHARE, unit_name(unit)):
             if not share[2]:
-                return None  # of which range its controller writes is not known
+                return None  # its range is not known
             high = quantity(f"{label}, {share[1]} of", share[2], base)
             self._note(f"in {share[1]} of 0 to {high:g} {base}", label)
             return np.asarray(in_span(values, share[1], (0.0, high)))
@@ -484,8 +484,8 @@ class LogFile:
         """Return the upper limit of an input with its unit, as a span."""
         number = self.slots[slot][1]
         base = canonical(input_unit(self.plant, number, self.loop.units[1]))
-        high = float(np.asarray(self.loop.actuator.high)[number])
-        high = high if np.isfinite(high) else 10.0  # of no limit an example
+        high = float(np.broadcast_to(self.loop.actuator.high, (self.plant.pumps,))[number])
+        high = high if np.isfinite(high) and high else 10.0  # an example
         return f"{100 * high:g} %" if base == "-" else f"{high:g} {base}"
 
     def table_text(self) -> str:

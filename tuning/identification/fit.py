@@ -241,10 +241,8 @@ def _all(cache, partial, logs, counts, options, search):
     starts, seed, settings, progress = search
     fits, interrupted = _searches(cache, partial, starts, seed, settings, progress)
     best = solve(partial, partial.unknowns(_best(fits, logs[0].name)), **settings)
-    finer = partial.substeps_for(partial.unknowns(best)) if options["substeps"] is None else 0
-    if finer > partial.substeps:  # than the values of the case needed
-        partial.substeps = finer
-        best = solve(partial, partial.unknowns(best), **settings)
+    if options["substeps"] is None and not interrupted and np.isfinite(best.cost):
+        best = _in_finer_steps(partial, best, settings)
     estimation, best, validation = _of_all(partial, best, logs, counts, options, settings)
     estimation, best = _within_ranges(estimation, best, settings)
     if not np.isfinite(best.cost):
@@ -253,6 +251,20 @@ def _all(cache, partial, logs, counts, options, search):
             " all of them"
         )
     return fits, interrupted, estimation, best, validation
+
+
+def _in_finer_steps(partial, best, settings):
+    """Return the Fit in the steps that its values need, where these are shorter than those that the
+    values of the case needed.
+    """
+    try:
+        finer = partial.substeps_for(partial.unknowns(best))
+    except DataError:  # no number of steps is enough: the validation set and the report say so
+        return best
+    if finer <= partial.substeps:
+        return best
+    partial.substeps = finer
+    return solve(partial, partial.unknowns(best), **settings)
 
 
 def _refined(first, log, settings, began):

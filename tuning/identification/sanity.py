@@ -78,14 +78,15 @@ def _of_level(log, c, ends):
 
 
 def _band(y):
-    """Return the least change of readings that a log writes on change and repeats until then, 0 of
-    others: most are repeated, and values are finer than their changes.
+    """Return the dead band of readings that are written on change and repeated until then; 0 where
+    fewer than half repeat, or where readings are no finer than their changes.
     """
     changes = np.abs(np.diff(y))
     changes = changes[changes > 0.0]
     if changes.size < SHORTEST or 2 * changes.size > len(y) - 1:
         return 0.0
-    return float(changes.min()) if np.diff(np.unique(y)).min() < 0.5 * changes.min() else 0.0
+    band = float(np.quantile(changes, 0.1))  # some are written by time, however small
+    return band if np.diff(np.unique(y)).min() < 0.5 * band else 0.0
 
 
 def _stuck(y):
@@ -140,11 +141,13 @@ def _dips(y, quiet):
     if len(y) < SHORTEST:
         return np.zeros(0, dtype=int)
     found: list[int] = []
-    step, noise = np.abs(np.diff(y)), _noise(y)
-    large = step > JUMP * noise
+    step, noise = np.diff(y), _noise(y)
+    jumps, step = np.sign(step) * (np.abs(step) > JUMP * noise), np.abs(step)
     for n in range(2, FEW + 1):
-        both = large[1 : len(y) - n - 2] & large[1 + n : len(y) - 2]
-        for k in 1 + np.flatnonzero(both):  # the last before them; k + n + 1 is the first after
+        there, back = jumps[1 : len(y) - n - 2], jumps[1 + n : len(y) - 2]
+        for k in 1 + np.flatnonzero(
+            there * back < 0
+        ):  # the last before them; k + n + 1 is the first after
             around, away = y[[k, k + n + 1]], y[k + 1 : k + n + 1]
             jump = np.abs(away - around.mean()).min()
             beside = max(step[k - 1], step[k + n + 1], np.ptp(around))

@@ -148,7 +148,7 @@ def _structure(fit):
         others = [_named(fit, kind, where) for kind, where in cause.equivalent]
         logs = [log for log in fit.estimation.logs if log.hold == "first-order"]
         late = cause.value if cause.kind in LATE and cause.value is not None else np.inf
-        if any(late < np.diff(log.t).max() for log in logs):
+        if any(late < _longest_change(log) for log in logs):
             others.append("inputs that step at each row (--hold zero-order)")
         if others:
             tell = EXPERIMENTS[cause.kind]
@@ -166,6 +166,12 @@ def _structure(fit):
             " tests curves of sensors, outlets and areas)"
         )
     return words
+
+
+def _longest_change(log):
+    """The longest time between rows over which an input changes [s]."""
+    changes = np.any(np.diff(log.u, axis=0) != 0, axis=1)
+    return np.max(np.diff(log.t), where=changes, initial=0.0)
 
 
 def _option(cause):
@@ -421,7 +427,7 @@ def advice_of(fit):
         ended = "was interrupted" if fit.status == "interrupted" else "has not converged"
         to_set = f"set nothing: the search {ended}"
     elif lacking(fit):
-        to_set = "set nothing: the values below are those of a rig without it"
+        to_set = "set nothing: the values below are those of a rig without what the data require"
     rest = [
         f"{name} {verdicts.shown(rmse)} {unit}"
         for (name, unit), rmse in zip(fit.channels, fit.quality["rmse"])

@@ -177,7 +177,7 @@ def verdict_of(ensemble):
         words = f"{diverged} of {count(samples, 'run')} diverged"
         parts["outcome"] = verdicts.Part(words, False)
     columns = {n: np.asarray(ensemble.measures[n]) for n in verdicts.TRACKED if n in known}
-    lost = verdicts.lost(ensemble.case.loop, columns)
+    lost = verdicts.not_tracking(ensemble.case.loop, columns)
     if lost is not None and (lost := lost & ~ensemble.failed).any():
         first = {n: v[np.argmax(lost)] for n, v in columns.items()}
         example = verdicts.tracking(ensemble.case.loop, first)

@@ -154,10 +154,12 @@ def _dry_pumps(plant, values, rims):
 
 
 class _Tracked(NamedTuple):
-    """Of a run, or of many in front: (..., outputs) numbers, and where they are too large."""
+    """Tracking of a run, or of many (leading axes): (..., outputs) numbers, and where they are too
+    large.
+    """
 
     swing: Any  # to either side of the setpoint at the end of a plateau
-    steady: Any  # error at the end of a plateau or swing, NaN where the setpoint has none
+    missed: Any  # larger of swing and error at the end of a plateau, NaN where there is none
     rms: Any
     heights: Any
     allowed: Any
@@ -171,16 +173,16 @@ def _tracked(loop: ClosedLoop, values: Mapping[str, Any]) -> _Tracked | None:
         return None
     plant: Any = loop.plant
     outputs = list(plant.outputs)
-    row = lambda name: np.asarray(values[name], dtype=float)
+    row = lambda name: np.atleast_1d(np.asarray(values[name], dtype=float))
     rims = np.broadcast_to(plant.rim, plant.tanks)[outputs]
     heights = np.where(np.isfinite(rims), rims, np.abs(row("max_level")[..., outputs]))
     heights = np.where(heights > 0.0, heights, 1.0)  # of tanks without a rim their highest levels
     swing, rms = row("steady_state_swing"), row("rms_error")
-    steady, allowed = np.maximum(row("steady_state_error"), swing), _allowed(loop, heights)
-    large, held = rms > OFF * heights, np.isnan(steady)
-    busy = np.max(row("saturated_fraction"), axis=-1, keepdims=True) > SATURATED
-    masks = ~held & (steady > allowed), held & large, large & busy
-    return _Tracked(swing, steady, rms, heights, allowed, *masks)
+    missed, allowed = np.maximum(row("steady_state_error"), swing), _allowed(loop, heights)
+    large, moving = rms > OFF * heights, np.isnan(missed)
+    busy = np.max(row("saturated_fraction"), axis=-1, keepdims=True, initial=0.0) > SATURATED
+    masks = ~moving & (missed > allowed), moving & large, large & busy
+    return _Tracked(swing, missed, rms, heights, allowed, *masks)
 
 
 def _allowed(loop, heights):
@@ -194,7 +196,7 @@ def _allowed(loop, heights):
     return np.where(steps > SMALL * heights, np.minimum(allowed, SHARE * steps), allowed)
 
 
-def lost(loop: ClosedLoop, values: Mapping[str, Any]) -> np.ndarray | None:
+def not_tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> np.ndarray | None:
     """Return for which of many runs `tracking` is not good, (N,) of measures (N, ...)."""
     found = _tracked(loop, values)
     if found is None:
@@ -211,17 +213,18 @@ def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
     if found is None:
         return None
     unit, plant = loop.units[0], loop.plant
-    total = f"RMS error {shown(math.hypot(*found.rms))} {unit}"
+    error = np.ravel(values.get("rms_error_total", math.hypot(*found.rms)))[0]
+    total = f"RMS error {shown(error)} {unit}"
     largest = lambda sizes, where: int(np.argmax(np.where(where, sizes, -np.inf)))
     name = lambda kind, i: label_of(plant, kind, i)
     if not np.all(np.isfinite(found.rms)):
         return Part("the run diverged: a level is not a finite number", False)
     if np.any(found.off):
-        o = largest(found.steady / found.allowed, found.off)
-        tank, amount = name("tank", plant.outputs[o]), f"{shown(found.steady[o])} {unit}"
-        if found.swing[o] == found.steady[o]:
+        o = largest(found.missed / found.allowed, found.off)
+        tank, amount = name("tank", plant.outputs[o]), f"{shown(found.missed[o])} {unit}"
+        if found.swing[o] == found.missed[o]:
             return Part(f"{tank} swings {amount} to either side of its setpoint, {total}", False)
-        at = f" at {shown(values[WHEN][o], 5)} s" if WHEN in values else ""
+        at = f" at {shown(np.ravel(values[WHEN])[o], 5)} s" if WHEN in values else ""
         return Part(f"{tank} is {amount} off its setpoint{at}, {total}", False)
     if np.any(found.loose | found.stuck):
         o = largest(found.rms / found.heights, found.loose | found.stuck)
@@ -230,11 +233,11 @@ def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
         j = int(np.argmax(busy))
         at = f", {name('pump', j)} is at a limit in {shown(100.0 * busy[j])} % of the samples"
         return Part(words + at * bool(found.stuck[o]), False)
-    if np.isnan(found.steady).all():
+    if np.isnan(found.missed).all():
         return Part(f"tracks with {total}")
-    if np.nanmax(found.steady / found.heights) < EXACT:
+    if np.nanmax(found.missed / found.heights) < EXACT:
         return Part(f"settles on its setpoints, {total}")
-    return Part(f"comes within {shown(np.nanmax(found.steady))} {unit} of each setpoint, {total}")
+    return Part(f"comes within {shown(np.nanmax(found.missed))} {unit} of each setpoint, {total}")
 
 
 def limit_rows(case: Case, values: Mapping[str, Any]) -> list[dict[str, Any]]:

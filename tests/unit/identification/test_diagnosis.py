@@ -79,7 +79,7 @@ def test_a_rig_without_what_the_data_require_says_so_in_its_name(tmp_path):
     """And its values are not advised: the interval of a gain is far from the truth."""
     fit = identified(("pump-delay", 20.0))
     fit.save(tmp_path / "lacks")
-    assert "set nothing: the values below are those of a rig without it" in str(advice_of(fit))
+    assert "set nothing: the values below are those of a rig without what" in str(advice_of(fit))
     again = rig.load(tmp_path / "lacks" / "rig.toml")
     assert again.name.endswith("identified, lacks pump-delay:1")
     t, u, y = record(("pump-delay", 20.0))

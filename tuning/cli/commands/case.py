@@ -325,7 +325,7 @@ COMMANDS = {
         (
             *COMMON,
             Option("export", "EXPORT", "NAME.c, NAME.js or NAME.fmu of `jaxtank export`"),
-            Option("--data", "CSV", "log with a row of each period: t [s], y1, .., r1, .., u1, .."),
+            Option("--data", "CSV", "log with one row a period: t [s], y1, .., r1, .., u1, .."),
         ),
         compiles=False,
     ),
