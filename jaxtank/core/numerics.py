@@ -33,15 +33,10 @@ def smooth_sqrt(h: Real, threshold: float = LAMINAR_THRESHOLD) -> jax.Array:
     # Negative levels are drawn back to 0. A run whose levels stay above the threshold equals the
     # run with the exact root. With ramps of 30 s, where NGPC brings tank 3 of the benchmark down to
     # 0.004 cm, no level changes by more than 3e-3 cm.
-    return root_of(h, threshold, jnp)
-
-
-def root_of(h: Any, threshold: Any, xp: Any) -> Any:
-    """`smooth_sqrt` by numpy or jax.numpy."""
     # sqrt(h) of a negative level is NaN and not taken; the rule below keeps it out of the
     # derivatives, which spares the select in front of every root of the time loop
-    laminar = h * (1.5 * threshold**-0.5 - (0.5 * threshold**-1.5) * xp.where(h > 0.0, h, 0.0))
-    return xp.where(h >= threshold, xp.sqrt(h), laminar)
+    laminar = h * (1.5 * threshold**-0.5 - (0.5 * threshold**-1.5) * jnp.where(h > 0.0, h, 0.0))
+    return jnp.where(h >= threshold, jnp.sqrt(h), laminar)
 
 
 @smooth_sqrt.defjvp

@@ -7,7 +7,8 @@ import pytest
 
 from jaxtank import presets
 from jaxtank.analysis.steady_batch import SteadyStates
-from jaxtank.analysis.steady_state import equilibrium
+from jaxtank.analysis.steady_state import _roots_of, equilibrium
+from jaxtank.core import numerics
 from jaxtank.core.errors import InputError
 from jaxtank.plants.network import network
 
@@ -89,3 +90,9 @@ def test_a_rig_with_fewer_pumps_than_outputs_is_refused():
     )
     with pytest.raises(InputError, match="as many pumps as outputs"):
         SteadyStates(plant, {})
+
+
+def test_roots_of_numbers_are_those_of_the_loop():
+    levels = np.array([-3.0, -1e-9, 0.0, 1e-4, 0.004, 0.01, 0.0100001, 2.0, 30.0])
+    expected = np.asarray(numerics.smooth_sqrt(levels, 0.01))
+    np.testing.assert_allclose(_roots_of(levels, 0.01), expected, rtol=1e-15)
