@@ -38,7 +38,7 @@ overshoot [%] above which a run points to a fragile loop: an Ms above 2.5 oversh
 LARGEST_CURVATURE = 24  # number of parameters up to which the second derivative is computed
 
 
-STEP = "step-too-long"
+TOO_LONG = "step-too-long"
 """Code of a Message on the step; with a headline where the numbers of the run are wrong."""
 
 
@@ -60,9 +60,9 @@ def step_warnings(tuned, values, key=None, scenarios=()):
                 warnings = warnings or halved
         except InputError as error:
             text = f"{name}this answer's run is wrong, and so are its numbers: {error}"
-            return (Message(STEP, text, "its steps are too long"),)
+            return (Message(TOO_LONG, text, "its steps are too long"),)
         sentences += [f"{name}{sentence}" for sentence in warnings]
-    return tuple(Message(STEP, text) for text in sentences[:1])
+    return tuple(Message(TOO_LONG, text) for text in sentences[:1])
 
 
 def neighbours(problem, z):
