@@ -140,7 +140,7 @@ def _dips(y, quiet):
     """
     if len(y) < SHORTEST:
         return np.zeros(0, dtype=int)
-    found: list[int] = []
+    dips: list[int] = []
     step, noise = np.diff(y), _noise(y)
     jumps, step = np.sign(step) * (np.abs(step) > JUMP * noise), np.abs(step)
     for n in range(2, FEW + 1):
@@ -152,8 +152,8 @@ def _dips(y, quiet):
             jump = np.abs(away - around.mean()).min()
             beside = max(step[k - 1], step[k + n + 1], np.ptp(around))
             if jump > max(JUMP * noise, 5 * beside) and quiet[k - 1 : k + n + 2].all():
-                found += range(k + 1, k + n + 1)
-    return np.array(found, dtype=int)
+                dips += range(k + 1, k + n + 1)
+    return np.array(dips, dtype=int)
 
 
 def _spikes(y):

@@ -178,7 +178,10 @@ def verdict_of(ensemble):
         parts["outcome"] = verdicts.Part(words, False)
     columns = {n: np.asarray(ensemble.measures[n]) for n in verdicts.TRACKED if n in known}
     lost = verdicts.not_tracking(ensemble.case.loop, columns)
-    if lost is not None and (lost := lost & ~ensemble.failed).any():
+    lost = None if lost is None or diverged == samples else lost & ~ensemble.failed
+    if lost is not None and not lost.any():
+        parts["tracking"] = verdicts.Part("every draw keeps to its setpoints")
+    elif lost is not None:
         first = {n: v[np.argmax(lost)] for n, v in columns.items()}
         example = verdicts.tracking(ensemble.case.loop, first)
         many = f"{int(lost.sum())} of {samples} draws do not keep to the setpoints"

@@ -198,46 +198,47 @@ def _allowed(loop, heights):
 
 def not_tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> np.ndarray | None:
     """Return for which of many runs `tracking` is not good, (N,) of measures (N, ...)."""
-    found = _tracked(loop, values)
-    if found is None:
+    tracked = _tracked(loop, values)
+    if tracked is None:
         return None
-    unknown = ~np.isfinite(found.rms)
-    return np.any(unknown | found.off | found.loose | found.stuck, axis=-1)
+    unknown = ~np.isfinite(tracked.rms)
+    return np.any(unknown | tracked.off | tracked.loose | tracked.stuck, axis=-1)
 
 
 def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
     """Return how near the controlled levels come to their setpoints: at the end of each plateau,
     where they may swing about it, and by their RMS errors where a setpoint has none.
     """
-    found = _tracked(loop, values)
-    if found is None:
+    tracked = _tracked(loop, values)
+    if tracked is None:
         return None
     unit, plant = loop.units[0], loop.plant
-    error = np.ravel(values.get("rms_error_total", math.hypot(*found.rms)))[0]
+    error = np.ravel(values.get("rms_error_total", math.hypot(*tracked.rms)))[0]
     total = f"RMS error {shown(error)} {unit}"
     largest = lambda sizes, where: int(np.argmax(np.where(where, sizes, -np.inf)))
     name = lambda kind, i: label_of(plant, kind, i)
-    if not np.all(np.isfinite(found.rms)):
+    if not np.all(np.isfinite(tracked.rms)):
         return Part("the run diverged: a level is not a finite number", False)
-    if np.any(found.off):
-        o = largest(found.missed / found.allowed, found.off)
-        tank, amount = name("tank", plant.outputs[o]), f"{shown(found.missed[o])} {unit}"
-        if found.swing[o] == found.missed[o]:
+    if np.any(tracked.off):
+        o = largest(tracked.missed / tracked.allowed, tracked.off)
+        tank, amount = name("tank", plant.outputs[o]), f"{shown(tracked.missed[o])} {unit}"
+        if tracked.swing[o] == tracked.missed[o]:
             return Part(f"{tank} swings {amount} to either side of its setpoint, {total}", False)
         at = f" at {shown(np.ravel(values[WHEN])[o], 5)} s" if WHEN in values else ""
         return Part(f"{tank} is {amount} off its setpoint{at}, {total}", False)
-    if np.any(found.loose | found.stuck):
-        o = largest(found.rms / found.heights, found.loose | found.stuck)
-        words = f"{name('tank', plant.outputs[o])} has an RMS error of {shown(found.rms[o])} {unit}"
+    if np.any(tracked.loose | tracked.stuck):
+        o = largest(tracked.rms / tracked.heights, tracked.loose | tracked.stuck)
+        tank, amount = name("tank", plant.outputs[o]), f"{shown(tracked.rms[o])} {unit}"
+        words = f"{tank} has an RMS error of {amount}"
         busy = np.asarray(values["saturated_fraction"], dtype=float)
         j = int(np.argmax(busy))
         at = f", {name('pump', j)} is at a limit in {shown(100.0 * busy[j])} % of the samples"
-        return Part(words + at * bool(found.stuck[o]), False)
-    if np.isnan(found.missed).all():
+        return Part(words + at * bool(tracked.stuck[o]), False)
+    if np.isnan(tracked.missed).all():
         return Part(f"tracks with {total}")
-    if np.nanmax(found.missed / found.heights) < EXACT:
+    if np.nanmax(tracked.missed / tracked.heights) < EXACT:
         return Part(f"settles on its setpoints, {total}")
-    return Part(f"comes within {shown(np.nanmax(found.missed))} {unit} of each setpoint, {total}")
+    return Part(f"comes within {shown(np.nanmax(tracked.missed))} {unit} of each setpoint, {total}")
 
 
 def limit_rows(case: Case, values: Mapping[str, Any]) -> list[dict[str, Any]]:

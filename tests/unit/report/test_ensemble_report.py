@@ -117,3 +117,6 @@ def test_draws_that_do_not_keep_to_the_setpoints_are_not_good():
     assert 0 < len(lost) < 6 and not judged.good and judged.limits.good
     assert f"{len(lost)} of 6 draws" in judged.tracking.words
     assert lost[0].partition(" at ")[0] in judged.tracking.words
+    enough = rig.set_values(case, {"actuator.high": 2.0})
+    judged = uncertainty.verdict_of(tuning.ensemble(enough, drawn, samples=6, fan=False))
+    assert judged.tracking.good and "every draw keeps to its setpoints" in judged.sentence
