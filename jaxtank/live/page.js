@@ -33,7 +33,7 @@ const pins = []; // {name, run, words: what differs from the case}
 const unseen = new Set(); // keys of the legend that are switched off
 const framed = window !== window.parent; // in a report or a notebook
 let took = 100; // milliseconds of the last run
-let current = null, bands = null, worker = null, charts = [], rig = null;
+let current = null, bands = null, worker = null, helpers = [], charts = [], rig = null;
 
 // --- what a run takes -------------------------------------------------------------------------
 
@@ -543,26 +543,36 @@ function newWorker() {
 }
 
 function stop() {
-  if (worker) worker.terminate();
+  for (const each of [worker, ...helpers]) each?.terminate();
   worker = tuneNow.stop = null;
+  helpers = [];
   $("tune").textContent = "Tune";
   document.body.removeAttribute("aria-busy");
 }
 
-// starts a worker; answers: {kind: function}, each called with the message
+const WORKERS = Math.min(8, navigator.hardwareConcurrency || 1); // that share the runs of many plants
+
+// starts a worker and its helpers; answers: {kind: function}, each called with the message
 function ask(message, answers) {
   stop();
   worker = newWorker();
+  helpers = Array.from({ length: WORKERS - 1 }, newWorker);
+  const ports = helpers.map((helper) => {
+    const { port1, port2 } = new MessageChannel();
+    helper.postMessage({ kind: "serve" }, [port1]);
+    return port2;
+  });
   document.body.setAttribute("aria-busy", "true");
   worker.onmessage = ({ data: answer }) => {
     if (answer.kind !== "progress") stop();
     answers[answer.kind](answer);
   };
-  worker.onerror = (event) => {
+  const failed = (event) => {
     stop();
     answers.failed({ text: event.message });
   };
-  worker.postMessage(message);
+  for (const each of [worker, ...helpers]) each.onerror = failed;
+  worker.postMessage(message, ports);
 }
 
 // what a search on plants sets beside the sliders: noise where there is none, and a safety filter for it
@@ -592,7 +602,7 @@ function tuneNow(plants = null) {
   const names = [...state.free], before = { ...state.values }, filtered = state.filter;
   const base = plantsNow(plants !== 1);
   const varied = Object.keys(base.spread).length > 0;
-  const quick = Math.floor((SEARCHED.least * SEARCHED.milliseconds) / Math.max(1, took));
+  const quick = Math.floor((WORKERS * SEARCHED.least * SEARCHED.milliseconds) / Math.max(1, took));
   const searched = varied ? plants ?? clamp(quick, SEARCHED.least, SEARCHED.most) : 1;
   const promise = new Promise((resolve, reject) => (finish = { resolve, reject }));
   const apply = (found) => {

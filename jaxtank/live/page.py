@@ -179,6 +179,12 @@ def _uncertain(case):
     return shares
 
 
+def _worker():
+    """The script of a worker, after that of the engine and core.js."""
+    names = "{tune,runOfTask}"
+    return f"const {names}=(()=>{{\n{_script('tune')}\nreturn {names};\n}})();\n{_script('worker')}"
+
+
 def assemble(engine_text, name, data):
     """Return the page as text."""
     uplot, core, scripts = _read("vendor/uPlot.iife.min.js"), _script("core"), _own()
@@ -195,9 +201,8 @@ def assemble(engine_text, name, data):
             "form-action 'none'",
         ]
     )
-    search = f"const tune=(()=>{{\n{_script('tune')}\nreturn tune;\n}})();"
     facts = json.dumps(data, allow_nan=False, separators=(",", ":"))
-    parts = [uplot, scripts, core, f"{search}\n{_script('worker')}", facts, engine_text]
+    parts = [uplot, scripts, core, _worker(), facts, engine_text]
     return "\n".join(
         [
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',

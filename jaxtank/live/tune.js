@@ -4,46 +4,56 @@ Levenberg and Marquardt's method on the Gauss-Newton matrix of the run, with lim
 sequential quadratic programming and an exact penalty (Nocedal & Wright 2006, secs. 10.3 and 18.5).
 No DOM: a worker and node run the same text. */
 
-/* tune(engine, values, free, limits, onProgress, shouldStop, options) ->
+/* tune(engine, values, free, limits, onProgress, shouldStop, options) -> a promise of
   {values, objective, violation, iterations, evaluations, status}
 
 values: {name: number} to start from; free: names to change, of engine.info.leaves; limits: as
-engine.info.limits; options: {filter, seed, starts, most, plants, objective, close}. plants: [{values, seed}] on which the
-mean of the objectives is minimised and every limit kept; [{values, seed}] of the loop alone by default.
+engine.info.limits; options: {filter, seed, starts, most, plants, objective, close, runs}. plants: [{values, seed}] on which
+the mean of the objectives is minimised and every limit kept; [{values, seed}] of the loop alone by default. runs: the runs
+of tasks (runOfTask), as an array or a promise of it; by default one after another, here.
 Violation: the largest share by which a limit is passed, 0 where all hold. Status: "converged", "stopped",
 "limit of iterations", "limits not met". ends: the free numbers that end on their range. The best values so
 far are returned whenever shouldStop() is true. */
-function tune(engine, values, free, limits, onProgress, shouldStop, options) {
+async function tune(engine, values, free, limits, onProgress, shouldStop, options) {
   const { filter, seed = 0, starts = 2, most = 60, plants = [{ values, seed }] } = options || {};
   const { objective = engine.info.objective.measures, close = CLOSE } = options || {};
-  const search = Object.assign(searchOf(engine, values, free, limits, plants, { filter, objective }), { close });
+  const { runs = (tasks) => tasks.map((task) => runOfTask(engine, task)) } = options || {};
+  const search = Object.assign(searchOf(engine, values, free, limits, plants, { filter, objective }, runs), { close });
   const report = () => onProgress && onProgress(search.found());
   const stop = () => Boolean(shouldStop && shouldStop());
-  let status = local(search, search.start, most, report, stop);
+  let status = await local(search, search.start, most, report, stop);
   // where no point that keeps the limits was found, the least violation may be far from here
   const wanted = search.found().violation > 0 ? Math.max(starts, 4) : starts;
-  const screened = status === "stopped" ? [] : others(search, wanted, stop);
+  const screened = status === "stopped" ? [] : await others(search, wanted, stop);
   for (const z of screened) {
-    const next = local(search, z, most, report, stop);
+    const next = await local(search, z, most, report, stop);
     if (next === "stopped") status = next;
     if (stop()) break;
   }
   if (search.found().violation > 0 && Number.isFinite(search.found().violation)) {
     for (const z of [search.best.z, ...screened]) {
       if (stop()) status = "stopped";
-      else if (search.best.violation > 0) restore(search, z, most, report, stop);
+      else if (search.best.violation > 0) await restore(search, z, most, report, stop);
     }
-    if (search.best.violation === 0 && !stop()) status = local(search, search.best.z, most, report, stop);
+    if (search.best.violation === 0 && !stop()) status = await local(search, search.best.z, most, report, stop);
   }
   const found = search.found();
   if (status === "converged" && found.violation > 0) status = "limits not met";
   return { ...found, status };
 }
 
+/* The run of a task {values, options, free, base}: with free, with derivatives by these names; base: the same without. */
+function runOfTask(engine, { values, options, free, base }) {
+  const { run, ...found } = free ? engine.slopes(values, free, options, base) : engine.run(values, options);
+  if (!options.search) return found;
+  const { measures, errors, broken } = found; // of a search, no columns that would be copied between workers
+  return { measures, errors, broken };
+}
+
 const EDGE = 1e-6; // share of its range from an end at which a number ends on it
 
 /* The search in z, the free numbers between their bounds as 0 to 1, with the best point so far. */
-function searchOf(engine, values, free, limits, plants, common) {
+function searchOf(engine, values, free, limits, plants, common, runsOf) {
   const info = engine.info, logs = new Set(info.logarithmic || []);
   const boxes = free.map((name) => boxOf(info, name, values, logs));
   const weights = Object.entries(common.objective);
@@ -90,19 +100,19 @@ function searchOf(engine, values, free, limits, plants, common) {
         iterations, evaluations,
       };
     },
-    value(z) {
+    async value(z) {
       if (known.has(z.join())) return known.get(z.join());
-      const runs = plants.map((plant) =>
-        engine.run(at(z, plant.values), { ...optionsOf(plant), every: engine.every, search: true }));
+      const runs = await runsOf(plants.map((plant) => (
+        { values: at(z, plant.values), options: { ...optionsOf(plant), every: engine.every, search: true } })));
       delete last.runs; // a hundred points of many plants are not held
       return (last = Object.assign(judged(z, runs), { runs }));
     },
-    point(z) {
+    async point(z) {
       const before = known.get(z.join());
       if (before && before.gradient) return before;
       const P = free.length, per = boxes.map((box, j) => box.slope(z[j]));
-      const runs = plants.map((plant, k) =>
-        engine.slopes(at(z, plant.values), free, optionsOf(plant), before && before.runs && before.runs[k]));
+      const runs = await runsOf(plants.map((plant, k) => (
+        { values: at(z, plant.values), free, options: optionsOf(plant), base: before && before.runs && before.runs[k] })));
       const point = before || judged(z, runs);
       const gradient = new Float64Array(P), slopes = [], curvature = new Float64Array(P * P);
       runs.forEach((run, k) => {
@@ -177,9 +187,9 @@ const CLOSE = 1e-7; // predicted fall of the merit at which a search has converg
 const NEAR = 0.03; // of the end of another search, where nothing new is expected
 
 /* A local search from z; returns its status. */
-function local(search, z, most, report, stop) {
+async function local(search, z, most, report, stop) {
   const P = search.size;
-  let point = search.point(z), damping = 1e-3, penalty = 10, taken = true, more = 8;
+  let point = await search.point(z), damping = 1e-3, penalty = 10, taken = true, more = 8;
   if (!point.finite) return "not finite";
   const scale = search.scale;
   const merit = (p) => (p.finite
@@ -206,11 +216,11 @@ function local(search, z, most, report, stop) {
       penalty *= 10;
       continue;
     }
-    const next = moved(point.z, step), tried = search.value(next);
+    const next = moved(point.z, step), tried = await search.value(next);
     const gained = (merit(point) - merit(tried)) / fall;
     taken = gained > 1e-4;
     if (taken) {
-      point = search.point(tried.z);
+      point = await search.point(tried.z);
       damping = Math.max(1e-9, damping * (gained > 0.75 ? 0.1 : gained > 0.25 ? 0.5 : 2));
       more = 8;
       if (known()) return "converged";
@@ -227,9 +237,9 @@ function local(search, z, most, report, stop) {
 
 /* A search from z for the least violation, the largest share by which a limit is passed: the least t
 with margins + slopes d >= -t, by bisection, for steps d within a trust region. */
-function restore(search, z, most, report, stop) {
+async function restore(search, z, most, report, stop) {
   const P = search.size, none = new Float64Array(P);
-  let point = search.point(z), reach = 0.25;
+  let point = await search.point(z), reach = 0.25;
   for (let i = 0; i < most && point.finite && point.violation > 0 && reach > 1e-5; ++i) {
     if (stop()) return;
     search.next();
@@ -244,9 +254,9 @@ function restore(search, z, most, report, stop) {
     }
     const fall = point.violation - high;
     if (step === null || fall < CLOSE) return;
-    const tried = search.value(moved(point.z, step));
+    const tried = await search.value(moved(point.z, step));
     if (tried.finite && tried.violation < point.violation - 0.1 * fall) {
-      point = search.point(tried.z);
+      point = await search.point(tried.z);
       reach = Math.min(1, 2 * reach);
     } else reach /= 4;
   }
@@ -321,11 +331,11 @@ function inverseOf(H, n) {
 }
 
 /* Starts after the first: the best of points spread over the box (Halton's), one for each. */
-function others(search, starts, stop) {
+async function others(search, starts, stop) {
   const points = [], primes = [2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37];
   const count = starts > 1 ? 8 * (starts - 1) : 0;
   for (let i = 1; i <= count && !stop(); ++i)
-    points.push(search.value(Array.from({ length: search.size }, (_, j) => {
+    points.push(await search.value(Array.from({ length: search.size }, (_, j) => {
       let share = 1, at = 0;
       const prime = primes[j % primes.length];
       for (let rest = i; rest > 0; rest = Math.floor(rest / prime)) at += (share /= prime) * (rest % prime);

@@ -1,6 +1,29 @@
 // In a worker, after the text of the engine, the tuner and core.js: runs, searches, many plants.
 
 const engine = makeEngine();
+let helpers = []; // ports to other workers, which take a share of the runs
+
+// runs of tasks (runOfTask of tune.js), in their order: of n workers each makes every n-th
+async function runs(tasks) {
+  const n = helpers.length + 1, share = (k) => tasks.filter((_, i) => i % n === k);
+  const others = helpers.map((port, k) => new Promise((resolve, reject) => {
+    port.onmessage = ({ data: { found, failed } }) => (failed ? reject(new Error(failed)) : resolve(found));
+    port.postMessage(share(k + 1));
+  }));
+  const parts = await Promise.all([share(0).map((task) => runOfTask(engine, task)), ...others]);
+  return tasks.map((_, i) => parts[i % n][Math.floor(i / n)]);
+}
+
+// runs tasks that come by a port
+function serve(port) {
+  port.onmessage = ({ data: tasks }) => {
+    try {
+      port.postMessage({ found: tasks.map((task) => runOfTask(engine, task)) });
+    } catch (error) {
+      port.postMessage({ failed: String((error && error.message) || error) });
+    }
+  };
+}
 
 // values of `count` plants about `values`: each leaf of `spread` {name: share} times 1 +- share
 // the models of controller and observer are separate leaves and do not change
@@ -17,58 +40,60 @@ function plantsOf(message) {
 }
 
 // the runs of `count` plants: bands of levels and inputs (unless brief), how many keep the limits, their mean error
-function many(message) {
-  const runs = [];
-  plantsOf(message).forEach((values, i) => {
-    const options = { every: message.every, seed: message.seed + (i % (message.noises ?? Infinity)), filter: message.filter, search: message.brief };
-    const run = engine.run(values, { ...options, measures: message.measures });
-    if (!run.broken) runs.push(run);
-    if (i % 4 === 3) postMessage({ kind: "progress", done: i + 1, of: message.count });
+async function many(message) {
+  const { every, filter, measures, brief } = message, whole = [], block = 4 * (helpers.length + 1);
+  const tasks = plantsOf(message).map((values, i) => {
+    const seed = message.seed + (i % (message.noises ?? Infinity));
+    return { values, options: { every, seed, filter, search: brief, measures } };
   });
+  for (let i = 0; i < tasks.length; i += block) {
+    whole.push(...(await runs(tasks.slice(i, i + block))).filter((run) => !run.broken));
+    postMessage({ kind: "progress", done: Math.min(i + block, tasks.length), of: tasks.length });
+  }
   const bands = (what) =>
-    (runs.length && !message.brief ? runs[0][what] : []).map((_, i) => {
-      const low = new Float64Array(runs[0].t.length), high = new Float64Array(low.length);
+    (whole.length && !brief ? whole[0][what] : []).map((_, i) => {
+      const low = new Float64Array(whole[0].t.length), high = new Float64Array(low.length);
       for (let k = 0; k < low.length; k += 1) {
-        const sorted = Float64Array.from(runs, (run) => run[what][i][k]).sort();
+        const sorted = Float64Array.from(whole, (run) => run[what][i][k]).sort();
         low[k] = quantile(sorted, 0.05);
         high[k] = quantile(sorted, 0.95);
       }
       return { low, high };
     });
-  const kept = runs.filter((run) => marginsOf(message.limits, run.measures).every((m) => m.margin >= 0));
-  const errors = runs.map((run) => run.measures.rms_error_total);
+  const kept = whole.filter((run) => marginsOf(message.limits, run.measures).every((m) => m.margin >= 0));
+  const errors = whole.map((run) => run.measures.rms_error_total);
   return {
-    t: runs.length ? runs[0].t : new Float64Array(0),
+    t: whole.length && !brief ? whole[0].t : new Float64Array(0),
     h: bands("h"),
     u: bands("u"),
     kept: kept.length,
     count: message.count,
-    broken: message.count - runs.length,
+    broken: message.count - whole.length,
     error: errors.reduce((a, b) => a + b, 0) / errors.length,
   };
 }
 
 // a search on the loop and `searched` - 1 plants about it; the answer and the start on `judged` others. On plants
 // it is that of `jaxtank tune`: its objective, with noise, and with the safety filter where limits break without it.
-function search(message) {
+async function search(message) {
   const { values, free, limits, filter, seed, searched, judged } = message, { info } = engine, several = searched > 1;
   const others = several ? plantsOf({ ...message, count: searched - 1 }) : [];
   const plants = [values, ...others].map((plant, i) => ({ values: plant, seed: seed + (i % NOISES) }));
   const guard = filter || (several && info.filter.present);
   const keep = limits.filter(({ measure }) => !(guard && several && info.task.proved && measure === "max_level"));
-  const own = several ? { filter: guard, seed, objective: info.task.objective, close: CLOSE_ENOUGH } : { filter, seed };
+  const own = { runs, seed, ...(several ? { filter: guard, objective: info.task.objective, close: CLOSE_ENOUGH } : { filter }) };
   const progress = (now) => postMessage({ kind: "progress", ...now });
   const from = (start, more) => tune(engine, start, free, keep, progress, () => false, { ...own, ...more });
   const on = (at, guarded, brief) => many({
     ...message, values: { ...values, ...at }, count: judged, seed: seed + UNSEEN, noises: NOISES, filter: guarded, brief,
   });
   // from several starts on few plants, then from the best end on all
-  const first = several ? from(values, { plants: plants.slice(0, FEW) }) : { iterations: 0 };
-  const found = from({ ...values, ...first.values }, several ? { plants, starts: 1 } : { plants });
+  const first = several ? await from(values, { plants: plants.slice(0, FEW) }) : { iterations: 0 };
+  const found = await from({ ...values, ...first.values }, several ? { plants, starts: 1 } : { plants });
   found.iterations += first.iterations;
-  const before = on({}, filter, true).error;
-  const needed = guard && (filter || on(found.values, false, true).kept < judged);
-  return { ...found, before, filter: needed, plants: on(found.values, needed) };
+  const before = (await on({}, filter, true)).error;
+  const needed = guard && (filter || (await on(found.values, false, true)).kept < judged);
+  return { ...found, before, filter: needed, plants: await on(found.values, needed) };
 }
 
 const FEW = 4; // plants of the first search
@@ -99,13 +124,15 @@ function one(message) {
   postMessage({ kind: "run", run, milliseconds }, columns.map((column) => column.buffer));
 }
 
-onmessage = (event) => {
+onmessage = async (event) => {
   const message = event.data;
+  helpers = [...event.ports];
   try {
     if (message.kind === "run") one(message);
-    else if (message.kind === "plants") postMessage({ kind: "plants", ...many(message) });
+    else if (message.kind === "serve") serve(helpers.pop());
+    else if (message.kind === "plants") postMessage({ kind: "plants", ...(await many(message)) });
     else if (message.kind === "effects") effects(message);
-    else postMessage({ kind: "tuned", ...search(message) });
+    else postMessage({ kind: "tuned", ...(await search(message)) });
   } catch (error) {
     postMessage({ kind: "failed", text: String((error && error.message) || error) });
   }
