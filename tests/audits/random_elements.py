@@ -212,7 +212,7 @@ def slope_error(seed, steps=400):
         weights
         @ np.array(run(*jax.tree.map(lambda a, b: a + h * b, point, direction), duration, steps))
     )
-    h = 2e-4
+    h = 2e-5
     difference = (8.0 * (at(h) - at(-h)) - (at(2.0 * h) - at(-2.0 * h))) / (12.0 * h)
     slope = float(_slope(*point, duration, direction, weights, steps))
     return abs(slope - difference) / max(abs(difference), 0.1)
