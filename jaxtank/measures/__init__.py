@@ -6,7 +6,7 @@ whole run.
 """
 
 from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context, Run, Worst
-from jaxtank.measures.catalogue import MEASURES, Measure, label
+from jaxtank.measures.catalogue import MEASURES, TRACKED, Measure, label
 from jaxtank.measures.functions import RunFunction, from_function, functions, name_of
 from jaxtank.measures.registry import (
     check_names,
@@ -29,6 +29,7 @@ from jaxtank.measures.running import needs, read, residual_weights, residuals, s
 __all__ = [
     "ACCUMULATORS",
     "MEASURES",
+    "TRACKED",
     "Accumulator",
     "Context",
     "Measure",

@@ -411,6 +411,11 @@ SUMMARY = (
 )
 """Measures in an ensemble's summary unless others are named, in order."""
 
+TRACKED = (
+    *("steady_state_error", "steady_state_swing", "rms_error", "max_level", "saturated_fraction"),
+)
+"""Measures by which a run is judged on tracking."""
+
 
 LABELS = {
     "rms_error": "RMS error",

@@ -310,6 +310,10 @@ def _effects(answer, gap):
     if answer.before.limits:
         broken = [f"{100 * (1 - s.held.mean()):.3g} %" for s in sides]
         rows.append(["plants that violate a limit", *broken])
+    lost = [verdicts.not_tracking(loop, s.measures, s.failed) for s in sides]
+    if all(each is not None for each in lost):
+        shares = [f"{100 * each.mean():.3g} %" for each in lost]
+        rows.append(["plants that do not keep to their setpoints", *shares])
     limited = np.isfinite(limited_levels(answer.setting.case))
     if limited.any():
         levels = [s.level[~s.failed][:, limited] for s in sides]

@@ -176,15 +176,14 @@ def verdict_of(ensemble):
     if diverged:
         words = f"{diverged} of {count(samples, 'run')} diverged"
         parts["outcome"] = verdicts.Part(words, False)
-    columns = {n: np.asarray(ensemble.measures[n]) for n in verdicts.TRACKED if n in known}
-    lost = verdicts.not_tracking(ensemble.case.loop, columns)
-    lost = None if lost is None or diverged == samples else lost & ~ensemble.failed
+    columns = {n: np.asarray(ensemble.measures[n]) for n in ms.TRACKED if n in known}
+    lost = verdicts.not_tracking(ensemble.case.loop, columns, ensemble.failed)
     if lost is not None and not lost.any():
         parts["tracking"] = verdicts.Part("every draw keeps to its setpoints")
     elif lost is not None:
         first = {n: v[np.argmax(lost)] for n, v in columns.items()}
         example = verdicts.tracking(ensemble.case.loop, first)
-        many = f"{int(lost.sum())} of {samples} draws do not keep to the setpoints"
+        many = verdicts.astray(lost, "draws", ensemble.infeasible)
         words = many if example is None else f"{many}, as: {example.words}"
         parts["tracking"] = verdicts.Part(words, False)
     if violations:

@@ -35,11 +35,6 @@ SMALL = 0.005
 SATURATED = 0.5
 """Share of the samples at a pump limit from which a large RMS error is no transient."""
 
-TRACKED = (
-    *("steady_state_error", "steady_state_swing", "rms_error", "max_level", "saturated_fraction"),
-)
-"""Measures by which a run is judged on tracking."""
-
 WHEN = "time_of_steady_state_error"
 
 EMPTY = 1e-4
@@ -169,7 +164,7 @@ class _Tracked(NamedTuple):
 
 
 def _tracked(loop: ClosedLoop, values: Mapping[str, Any]) -> _Tracked | None:
-    if isinstance(loop.controller, UNJUDGED) or not set(TRACKED) <= set(values):
+    if isinstance(loop.controller, UNJUDGED) or not set(ms.TRACKED) <= set(values):
         return None
     plant: Any = loop.plant
     outputs = list(plant.outputs)
@@ -196,13 +191,18 @@ def _allowed(loop, heights):
     return np.where(steps > SMALL * heights, np.minimum(allowed, SHARE * steps), allowed)
 
 
-def not_tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> np.ndarray | None:
-    """Return for which of many runs `tracking` is not good, (N,) of measures (N, ...)."""
+def not_tracking(
+    loop: ClosedLoop, values: Mapping[str, Any], failed: np.ndarray
+) -> np.ndarray | None:
+    """Return for which of many runs that have not failed `tracking` is not good, (N,) of measures
+    (N, ...); None where runs are not judged on tracking, or all have failed.
+    """
     tracked = _tracked(loop, values)
-    if tracked is None:
+    if tracked is None or failed.all():
         return None
     unknown = ~np.isfinite(tracked.rms)
-    return np.any(unknown | tracked.off | tracked.loose | tracked.stuck, axis=-1)
+    wrong = unknown | tracked.off | tracked.loose | tracked.stuck
+    return np.any(wrong, axis=-1) & ~failed
 
 
 def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
@@ -333,11 +333,28 @@ def of_tuning(result: Any) -> Verdict:
     ]
     return Verdict(
         outcome=Part(result.headline.replace("_", " "), result.success),
-        tracking=tracking(case.loop, values),
+        tracking=_tracking_of_answer(case.loop, values, answer),
         limits=limits(rows, beyond(case.loop, values, rows)),
         plants=_validated(result) if answer is None else _judged(answer),
         robustness=robustness(values),
     )
+
+
+def _tracking_of_answer(loop, values, answer):
+    """The tracking of its own run, and on how many validation plants it is not good."""
+    own, after = tracking(loop, values), None if answer is None else answer.after
+    lost = None if after is None else not_tracking(loop, after.measures, after.failed)
+    if own is None or lost is None or not lost.any():
+        return own
+    joint = ", but " if own.good else "; "
+    return Part(own.words + joint + astray(lost, answer.setting.runs, after.infeasible), False)
+
+
+def astray(lost: np.ndarray, runs: str, infeasible: np.ndarray | None) -> str:
+    """Return on how many of N runs, `lost` (N,), the setpoints are not kept."""
+    words = f"{int(lost.sum())} of {len(lost)} {runs} do not keep to their setpoints"
+    out_of_reach = infeasible is not None and infeasible[lost].all()
+    return words + ", which are out of reach there" * bool(out_of_reach)
 
 
 def _validated(result):

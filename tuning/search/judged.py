@@ -271,7 +271,7 @@ def judge(setting: Setting, samples: int, seed: int, round_: int = 0) -> Judged:
     """Return how the searched case of a setting does on `samples` plants."""
     case = setting.searched
     limits = resolve_limits(case, setting.case.limits)
-    names = [*setting.objective, *COST, "rms_error_total", "max_level", "mean_square_travel"]
+    names = [*setting.objective, *COST, "rms_error_total", "mean_square_travel", *ms.TRACKED]
     names = [m for m in dict.fromkeys(names) if ms.serves(m, case.loop)]
     names += [limit.measure for limit in limits]
     quiet = [m for m in NOMINAL if ms.serves(m, case.loop)] if not noisy(setting.case) else []
