@@ -5,6 +5,7 @@ setpoint, a broken limit and an unstable loop are not good.
 import dataclasses
 import functools
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from helpers import NODE, ONE_TANK, node
 
 import jaxtank
+import tuning
 from jaxtank import presets, rig
 from jaxtank.export import export
 from jaxtank.live.engine import engine
@@ -23,6 +25,8 @@ from tuning.feasible import study
 from tuning.problem.reported import run_measures
 from tuning.report import advice, tuned
 from tuning.report import verdict as verdicts
+from tuning.search.judged import run_plants
+from tuning.uncertainty.validation import SEED_OFFSET
 
 PAGE = """
 const e = makeEngine(), leaf = (name) => e.info.leaves.find((one) => one.name === name)?.value;
@@ -326,3 +330,25 @@ def test_a_limit_is_proved_where_the_certificate_is_at_least_as_strict():
     assert proof(failed, "overflow_volume", 10.0) == "no: not covered: leak"
     assert proof(None, "max_level", 10.0) == "no" and proof(low, "min_level", 0.5) == "yes"
     assert proof(low, "min_level", 1.5) == "no"
+
+
+def test_tune_says_on_how_many_plants_setpoints_are_not_kept():
+    """A pump that is too small for the setpoint of 2.6 cm on plants whose pump at its limit fills
+    the tank to less, (gain high / drain)^2 / (2 g).
+    """
+    weak = ONE_TANK.replace("high = 2.0", "high = 0.66").replace("= 40.0", "= 400.0")
+    result = tuning.tune(rig.loads(weak), tuning.Options(validation=64))
+    setting, after = result.answer.setting, result.answer.after
+    drawn = run_plants(setting.searched, setting.distributions, 64, SEED_OFFSET, ("max_level",))
+    gain, drain = (np.ravel(drawn.values[f"plant.{n}"]) for n in ("pump_gain", "drain"))
+    low = (gain * 0.66 / drain) ** 2 / (2.0 * 0.5) < 2.6
+    verdict = verdicts.of_tuning(result)
+    assert 10 < low.sum() < 54 and result.success and not verdict.good
+    assert f"but {low.sum()} of 64 validation plants do not keep" in verdict.tracking.words
+    assert "out of reach" in verdict.tracking.words
+    np.testing.assert_array_equal(
+        verdicts.not_tracking(setting.case.loop, after.measures, after.failed), low
+    )
+    share = f"{100 * low.mean():.3g} %"
+    table = str(result.answer)
+    assert re.search(rf"do not keep to their setpoints +[.0-9]+ % +{share}", table)
