@@ -121,16 +121,15 @@ def saves(gouta, tmp_path_factory):
 @pytest.fixture(scope="module")
 def folder_of(saves, tmp_path_factory):
     """Function of a kind that returns the folder with its result."""
+    return functools.cache(lambda kind: saved(saves, kind, tmp_path_factory.mktemp(kind)))
 
-    @functools.cache
-    def folder(kind):
-        path = tmp_path_factory.mktemp(kind)
-        with no_live_page() if kind == "tune-one" else contextlib.nullcontext():
-            saves(kind)(path, f"jaxtank {kind} {NASTY}")
-        plt.close("all")
-        return path
 
-    return folder
+def saved(saves, kind, path):
+    """The folder `path` with the result of a kind."""
+    with no_live_page() if kind == "tune-one" else contextlib.nullcontext():
+        saves(kind)(path, f"jaxtank {kind} {NASTY}")
+    plt.close("all")
+    return path
 
 
 # the live page, which has no access to the report and a policy of its own (tests/unit/live)
@@ -265,9 +264,8 @@ def test_the_numbers_of_a_tuning_are_on_its_page(saves, folder_of):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", PICTURES)
 def test_the_same_result_gives_the_same_bytes(saves, folder_of, tmp_path, kind):
-    saves(kind)(tmp_path, f"jaxtank {kind} {NASTY}")
-    plt.close("all")
-    assert (tmp_path / "report.html").read_bytes() == (folder_of(kind) / "report.html").read_bytes()
+    again = saved(saves, kind, tmp_path)
+    assert (again / "report.html").read_bytes() == (folder_of(kind) / "report.html").read_bytes()
 
 
 def test_ids_of_two_equal_figures_do_not_clash():

@@ -214,7 +214,7 @@ def test_a_rig_is_the_same_in_any_unit_of_length():
     for unit, c, knee in (("m", 1e-2, 1e-4), ("mm", 10.0, 0.1), ("dm", 0.1, 1e-3)):
         loop, found = levels(unit, c, pid)
         np.testing.assert_allclose(found, cm, atol=1e-9)
-        assert f"below {knee:g} {unit}," in " ".join(equations.physics(loop.plant))
+        assert f"elow {knee:g} {unit}," in " ".join(equations.physics(loop.plant))
         controller = levels(unit, c, floored)[0].controller
         assert float(controller.level_floor) == float(controller.difference_floor) == knee
 
