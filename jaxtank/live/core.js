@@ -337,13 +337,21 @@ function beyond(info, inForce, measures) {
   return words;
 }
 
-// {good, sentence} of a run; plants: {kept, count} where many were simulated
+// the tracking of a run beside that of many plants
+function withPlants(tracking, plants) {
+  if (!tracking || !plants?.astray) return tracking;
+  return { good: false, words: `${tracking.words}${tracking.good ? ", but " : "; "}${astrayWords(plants)}` };
+}
+
+const astrayWords = ({ astray, count }) => `${astray} of ${count} plants do not keep to their setpoints`;
+
+// {good, sentence} of a run; plants: {kept, astray, count} where many were simulated
 function verdictOf(info, inForce, { measures }, plants = null) {
   const margins = marginsOf(limitsIn(info, inForce), measures);
   const wrong = beyond(info, inForce, measures);
   let limits = limitsOf(margins, measures);
   if (wrong.length) limits = { good: false, words: [...(limits && !limits.good ? [limits.words] : []), ...wrong].join("; ") };
-  const parts = [trackingOf(info, inForce, measures), limits];
+  const parts = [withPlants(trackingOf(info, inForce, measures), plants), limits];
   if (plants && margins.length) {
     const good = plants.kept === plants.count;
     if (good && parts[1].good) parts.pop();

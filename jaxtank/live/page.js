@@ -641,7 +641,8 @@ function tuneNow(plants = null) {
         makeLegend();
       }
       touch(data.drawn, true);
-      const holds = varied && info.limits.length ? `; limits hold on ${kept} of ${count} other plants` : "";
+      const holds = (varied && info.limits.length ? `; limits hold on ${kept} of ${count} other plants` : "") +
+        (varied && found.plants.astray ? `; ${astrayWords(found.plants)}` : "");
       const errors = `error ${shown(found.before, 3)} to ${shown(error, 3)} ${unit}${varied ? " in the mean" : ""}`;
       const ends = found.ends.map((name) => `; ${name} ends on its range`).join("");
       const noise = searched > 1 ? " with noise and a price on input changes" : "";
@@ -674,7 +675,8 @@ function tuneNow(plants = null) {
   return promise;
 }
 
-const keptWords = ({ kept }) => (info.limits.length ? `, ${kept} keep every limit` : "");
+const keptWords = ({ kept, astray }) =>
+  (info.limits.length ? `, ${kept} keep every limit` : "") + (astray ? `, ${astray} miss their setpoints` : "");
 
 // spoken: whether the message says how many; not where they follow a slider or a search
 function manyPlants(spoken = true) {
@@ -685,7 +687,7 @@ function manyPlants(spoken = true) {
       bands = { ...found, words: keptWords(found) };
       const kept = info.limits.length ? `${found.kept} of ${found.count} plants keep every limit` :
         `${found.count} plants simulated`;
-      if (spoken) say(`${kept}${found.broken ? `; ${found.broken} diverged` : ""}. The band holds 90 % of them at each time.`, true);
+      if (spoken) say(`${kept}${found.astray ? `; ${found.astray} do not keep to their setpoints` : ""}${found.broken ? `; ${found.broken} diverged` : ""}. The band holds 90 % of them at each time.`, true);
       makeLegend();
       show();
     },

@@ -39,15 +39,27 @@ function plantsOf(message) {
   });
 }
 
-// the runs of `count` plants: bands of levels and inputs (unless brief), how many keep the limits, their mean error
+// whether a run of a plant misses its setpoints, as the verdict on it alone would say
+function isAstray({ measures }, values) {
+  const usual = (name) => engine.info.leaves.find((leaf) => leaf.name === name)?.value;
+  const tracking = trackingOf(engine.info, (name, otherwise) => values[name] ?? usual(name) ?? otherwise, measures);
+  return tracking !== null && !tracking.good;
+}
+
+// the runs of `count` plants: bands of levels and inputs and how many miss their setpoints (unless brief), how many
+// keep the limits, their mean error
 async function many(message) {
-  const { every, filter, measures, brief } = message, whole = [], block = 4 * (helpers.length + 1);
+  const { every, filter, measures, brief } = message, block = 4 * (helpers.length + 1);
+  const whole = [];
+  let astray = 0;
   const tasks = plantsOf(message).map((values, i) => {
     const seed = message.seed + (i % (message.noises ?? Infinity));
     return { values, options: { every, seed, filter, search: brief, measures } };
   });
   for (let i = 0; i < tasks.length; i += block) {
-    whole.push(...(await runs(tasks.slice(i, i + block))).filter((run) => !run.broken));
+    const found = await runs(tasks.slice(i, i + block));
+    whole.push(...found.filter((run) => !run.broken));
+    if (!brief) astray += found.filter((run, k) => !run.broken && isAstray(run, tasks[i + k].values)).length;
     postMessage({ kind: "progress", done: Math.min(i + block, tasks.length), of: tasks.length });
   }
   const bands = (what) =>
@@ -67,6 +79,7 @@ async function many(message) {
     h: bands("h"),
     u: bands("u"),
     kept: kept.length,
+    astray,
     count: message.count,
     broken: message.count - whole.length,
     error: errors.reduce((a, b) => a + b, 0) / errors.length,

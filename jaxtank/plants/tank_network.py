@@ -423,10 +423,9 @@ class TankNetwork(Plant):
         s_k / (sum of the tank's outlets) of A_i max(h_i, 0) / step. An rk4 step then ends at or
         above zero where no inflow from outside is negative: stage s holds at most h_i plus what
         flows in up to it, so the weighted sum of the outflows is less than h_i plus the sum of the
-        inflows (the
-        midpoint rule: where an inflow does not fall by half within half a step). What leaves one
-        tank arrives in the next, so volume is conserved whatever the step, and the lower clip in
-        `spill` adds only what a negative inflow could not take (`shortfall`).
+        inflows (the midpoint rule: where an inflow does not fall by half within half a step). What
+        leaves one tank arrives in the next, so volume is conserved whatever the step, and the lower
+        clip in `spill` adds only what a negative inflow could not take (`shortfall`).
 
         The limit acts below h = (step sqrt(2 g) sum s_k / A)^2, where the tank holds less than it
         gives in one step; elsewhere the rates are those of `derivative`, bit for bit. Where it
@@ -463,8 +462,8 @@ class TankNetwork(Plant):
     def _plain_flows(self, x, u, d, step):
         """Rates [cm/s] of a network of prisms, orifices, pipes and pumps, by scalars."""
         # Coefficients that do not depend on the state (the c_i of gouta2015 eq. 7) are computed
-        # once by the loop. What u and d bring
-        # comes first in each sum: within a Runge-Kutta step it is ready before the roots are.
+        # once by the loop. What u and d bring comes first in each sum: within a Runge-Kutta step it
+        # is ready before the roots are.
         n, w = self.tanks, jnp.sqrt(2.0 * self.gravity)
         out = [self.drain[i] for i in range(n)]
         for k, (source, _) in enumerate(self.links):

@@ -75,7 +75,8 @@ CORE
     same(row.cells[0].textContent, row.cells[2].textContent, shown(margins[i].margin, 3));
   });
   const count = text("#legend").match(/of (\\d+) plants, (\\d+) keep/);
-  const plants = count && { count: Number(count[1]), kept: Number(count[2]) };
+  const astray = Number(text("#legend").match(/(\\d+) miss their setpoints/)?.[1] ?? 0);
+  const plants = count && { count: Number(count[1]), kept: Number(count[2]), astray };
   const { sentence, good } = verdictOf(info, inForce, run, plants);
   same("verdict", text("#verdict"), sentence);
   same("colour", document.querySelector("#verdict").className, good ? "good" : "bad");

@@ -9,11 +9,13 @@ import pytest
 from helpers import NODE, ONE_TANK, node
 
 import jaxtank
+from jaxtank import measures as ms
 from jaxtank import presets, rig
 from jaxtank.limits import limit_scale, resolve_limits
 from jaxtank.live.engine import engine
 from jaxtank.live.origin import both
 from jaxtank.live.page import _script, _worker, data_of
+from tuning.report import verdict as verdicts
 from tuning.search.judged import judge
 from tuning.search.setting import setting_of
 
@@ -181,7 +183,7 @@ def test_a_search_on_plants_has_the_cost_the_noise_and_the_filter_of_the_command
         assert cost == pytest.approx(expected, rel=1e-9)
 
 
-TUNED = """
+PLANTS = """
 let served = 0;
 const postMessage = () => {}, spread = {}, values = { ...makeEngine().info.task.values };
 let onmessage;
@@ -192,17 +194,19 @@ for (const { name, value, group } of engine.info.leaves) {
     [spread[name], values[name]] = [share, value];
 }
 const { info } = engine, { limits, free } = info, filter = info.filter.default_on;
-const size = { every: 100, searched: 16, judged: 64 };
-search({ values, spread, limits, free, filter, seed: 0, ...size }).then(
+const base = { values, spread, limits, free, filter, seed: 0, every: 100 };
+"""
+TUNED = """
+search({ ...base, searched: 16, judged: 64 }).then(
   ({ plants, ...found }) => console.log(JSON.stringify({ ...found, served })));
 """
 
 
-def searched_on_plants(case, before=""):
-    """What the worker of a page answers to Tune; before: a script that it runs first."""
+def in_worker(case, script):
+    """What a script prints in the worker of a page."""
     off, on, _ = both(case)
-    worker = "\n".join([_script("core"), _worker(), before])
-    return node(engine(off, on) + TUNED.replace("WORKER", worker), data_of(case)["uncertain"])
+    worker = PLANTS.replace("WORKER", "\n".join([_script("core"), _worker()]))
+    return node(engine(off, on) + worker + script, data_of(case)["uncertain"])
 
 
 HELPED = """
@@ -220,11 +224,38 @@ helpers = [port(), port()];
 
 def test_workers_that_share_the_plants_find_the_same_as_one():
     case = rig.loads(ONE_TANK)
-    alone = searched_on_plants(case)
-    shared = searched_on_plants(case, HELPED)
+    alone = in_worker(case, TUNED)
+    shared = in_worker(case, HELPED + TUNED)
     assert shared["values"] == alone["values"] and shared["objective"] == alone["objective"]
     assert shared["iterations"] == alone["iterations"] > 1 and alone["served"] == 0
     assert shared["served"] > 100
+
+
+COUNTED = """
+many({ ...base, count: 64 }).then(({ astray }) =>
+  console.log(JSON.stringify([astray, plantsOf({ ...base, count: 64 })])));
+"""
+
+
+def test_plants_that_miss_their_setpoints_are_counted():
+    """Those that the command would count; among them all whose pump at its limit fills the tank to
+    less than the setpoint of 2.6 cm.
+    """
+    weak = ONE_TANK.replace("high = 2.0", "high = 0.66").replace("= 40.0", "= 400.0")
+    case = rig.loads(weak)
+    astray, plants = in_worker(case, COUNTED)
+    names = ["plant.pump_gain[0]", "plant.drain[0]", "sensor.noise[0]"]
+
+    def run(plant, seed):
+        loop = jaxtank.with_values(case.loop, {n: plant[n] for n in names})
+        return jaxtank.evaluate(loop, case.clock, ms.TRACKED, jax.random.key(seed))
+
+    values = [run(plant, seed) for seed, plant in enumerate(plants)]
+    columns = {m: np.array([v[m] for v in values]) for m in ms.TRACKED}
+    lost = verdicts.not_tracking(case.loop, columns, np.zeros(64, dtype=bool))
+    gain, drain, _ = np.array([[p[n] for p in plants] for n in names])
+    assert lost[(gain * 0.66 / drain) ** 2 / (2.0 * 0.5) < 2.6].all()
+    assert 10 < lost.sum() == astray < 54
 
 
 @pytest.mark.slow
@@ -236,7 +267,7 @@ def test_tune_of_the_page_is_the_answer_of_the_command_on_its_plants(name):
     import tuning
 
     case = presets.find(name)
-    found = searched_on_plants(case)
+    found = in_worker(case, TUNED)
     setting = setting_of(case).with_filter() if found["filter"] else setting_of(case)
     answer = tuning.tune(case)
     gains, command = {name: found["values"][name] for name in answer}, answer.answer.after
