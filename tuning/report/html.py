@@ -47,7 +47,7 @@ def _templates():
         trim_blocks=True,
     )
     long = lambda cell: len(str(cell)) > LONG
-    templates.filters["identifier"] = identifier
+    templates.filters |= {"identifier": identifier, "unbroken": unbroken}
     templates.tests |= {
         "table": lambda section: isinstance(section, Table),
         "long": long,
@@ -118,6 +118,12 @@ def _picture(section):
     """(Figure, its <svg> element, whether a tap enlarges it in a narrow window)."""
     wide = 72 * section.drawing.get_size_inches()[0] > WIDE
     return section, Markup(svg(section.drawing, section.name, section.caption)), wide
+
+
+def unbroken(sentence):
+    """Return a sentence as HTML in which no line breaks within an option."""
+    option = r'<span class="option">\g<0></span>'
+    return Markup(re.sub(r"--[a-z][a-z-]*", option, str(escape(sentence))))
 
 
 def identifier(name):

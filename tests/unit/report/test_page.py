@@ -399,3 +399,8 @@ def test_no_column_of_a_page_of_claims_is_cut(browser, tmp_path):
             e => e.scrollWidth - e.clientWidth))"""
         assert page.evaluate(cut) == 0, width
         page.close()
+
+
+def test_no_line_breaks_within_an_option_and_what_a_name_says_is_escaped():
+    text = str(html.unbroken("--mend <b> helps; not a--b or 5 -> 3"))
+    assert text.startswith('<span class="option">--mend</span> &lt;b&gt; helps')
