@@ -61,7 +61,7 @@ info.leaves = info.leaves.flatMap(([unit, doc, group, entries]) =>
 const PIECE = 500; // samples
 const RESIDUALS = 4000; // samples whose residuals make a Gauss-Newton matrix, about
 const STEP = 1e-6; // of a difference, as a share of the number
-const DEVIATES = 1e7; // numbers of noise that are kept
+const DEVIATES = 4e6; // numbers of noise that are kept: 32 MB in each worker
 
 /* {measure: weight} of the sums of squares whose Gauss-Newton matrix stands for an objective. */
 function squaresOf(objective) {
