@@ -1,5 +1,6 @@
 """Experiment data from files: columns by the rig's names, their units, qualities and times."""
 
+import dataclasses
 import re
 from collections import Counter
 from collections.abc import Mapping
@@ -36,6 +37,7 @@ from tuning.identification.signals import (
     Signal,
     poor,
     rank,
+    setpoint_of,
     signals_of,
     time_columns,
 )
@@ -157,6 +159,7 @@ class LogFile:
         self.long = any(signal.t is not t for signal in self.signals)
         self.taken = self._named_signals()
         self.taken |= self._recognised_signals()
+        self.setpoints = self._signals_of_setpoints()
 
     def _doubt(self, problem: str) -> None:
         """Add a problem that a line of [log] solves."""
@@ -248,6 +251,17 @@ class LogFile:
                 taken[slot] = alike[0]
         return taken
 
+    def _signals_of_setpoints(self) -> dict[int, Signal]:
+        """Return {tank of an output: signal of its setpoint}."""
+        slots = {tank: f"h{tank + 1}" for tank in self.plant.outputs}
+        names = {tank: [k for k, its in self.keys.items() if its == s] for tank, s in slots.items()}
+        signals: dict[int, Signal] = {}
+        for signal in self.unused:
+            tank = setpoint_of(signal.described.name, names)
+            if tank is not None:
+                signals.setdefault(tank, signal)
+        return signals
+
     @property
     def unused(self) -> list[Signal]:
         """The signals that are of no tank and no pump."""
@@ -265,9 +279,10 @@ class LogFile:
         if self.problems:
             return None
         t, u, y, lines = self._samples(pumps, levels, values, constant)
-        self._note_unused()
         heads, units = zip(*(self._head(slot) for slot in (*pumps, *levels)))
-        return log(
+        setpoints = self._setpoints(t)
+        self._note_unused({header for header, _ in setpoints.values()})
+        data = log(
             t=t,
             u=u,
             y=y,
@@ -280,12 +295,33 @@ class LogFile:
             hold=self.hold or "zero-order" * self._own_times(pumps, levels),
             notes=tuple(f"{', '.join(of)}: {what}" for what, of in self.notes.items()),
         )
+        return dataclasses.replace(data, setpoints=setpoints)
+
+    def _setpoints(self, t: np.ndarray) -> dict[int, tuple[str, np.ndarray]]:
+        """Return {tank: (header, setpoints at the times t in the rig's unit)}."""
+        notes, rows = {what: [*of] for what, of in self.notes.items()}, {}
+        for tank, signal in self.setpoints.items():
+            column, slot = signal.described, f"h{tank + 1}"
+            unit = column.unit or (self._unit(slot) if slot in self.taken else None)
+            try:
+                values, _ = numbers(signal.table, signal.column)
+                values, volts = self._converted(slot, values, unit)
+            except DataError:
+                continue  # listed as not used
+            levels = np.asarray(self.loop.sensor.level_of(tank, values, volts))
+            known = np.isfinite(levels)
+            at = np.searchsorted(signal.t[known], t, side="right") - 1
+            held = np.append(levels[known], np.nan)[at]  # at -1: before the first
+            rows[tank] = column.header, held
+        self.notes = notes  # only of what every command uses
+        return rows
 
     def _of_kind(self, kind: str) -> list[str]:
         return [slot for slot, (its, _) in self.slots.items() if its == kind]
 
-    def _note_unused(self) -> None:
-        names = [repr(s.described.header) for s in self.unused]
+    def _note_unused(self, setpoints: set[str]) -> None:
+        headers = [s.described.header for s in self.unused]
+        names = [repr(header) for header in headers if header not in setpoints]
         if names:
             self._note(f"not used: {', '.join(names[:12])}{', ..' * (len(names) > 12)}")
 
@@ -379,7 +415,7 @@ class LogFile:
         values, in_volts, words = np.full(len(signal.t), np.nan), False, Counter[str]()
         try:
             values, missing = numbers(signal.table, signal.column)
-            values, in_volts = self._converted(slot, values)
+            values, in_volts = self._converted(slot, values, self._unit(slot))
             words.update(missing)
             bad = poor(signal)
             words.update(signal.quality[k] for k in np.flatnonzero(bad & np.isfinite(values)))
@@ -402,9 +438,11 @@ class LogFile:
         at = np.searchsorted(self.taken[slot].t[known], t, side="right") - 1
         return np.where(at < 0, np.nan, values[known][at])
 
-    def _converted(self, slot: str, values: np.ndarray) -> tuple[np.ndarray, bool]:
+    def _converted(
+        self, slot: str, values: np.ndarray, written: str | None
+    ) -> tuple[np.ndarray, bool]:
         """Return (values in the rig's unit, whether they stay a sensor's volts)."""
-        (kind, number), written = self.slots[slot], self._unit(slot)
+        kind, number = self.slots[slot]
         length, drive = self.loop.units
         base = canonical(length if kind == "h" else input_unit(self.plant, number, drive))
         if written is None:
@@ -523,7 +561,7 @@ class LogFile:
         (kind, number), (length, drive) = self.slots[slot], self.loop.units
         base = length if kind == "h" else input_unit(self.plant, number, drive)
         try:
-            self._converted(slot, np.zeros(1))
+            self._converted(slot, np.zeros(1), self._unit(slot))
         except DataError:
             unit = printable(self._unit(slot))
             if kind == "pump" and unit_name(unit) in ("%", "mA"):

@@ -39,6 +39,8 @@ class Log:
         As in `tuning.log`.
     notes : tuple of str
         What was taken for granted when a file was read.
+    setpoints : dict
+        {tank: (header, (samples,) setpoints in the rig's unit of length)} of a file that has them.
 
     Examples
     --------
@@ -61,6 +63,7 @@ class Log:
     units: tuple | None = None
     hold: str = ""
     notes: tuple = ()
+    setpoints: dict = dataclasses.field(default_factory=dict)
 
     @property
     def samples(self) -> int:
@@ -71,7 +74,9 @@ class Log:
         """Return the samples start .. stop - 1 as a Log."""
         cut = slice(start, stop)
         lines = None if self.lines is None else self.lines[cut]
-        return dataclasses.replace(self, t=self.t[cut], u=self.u[cut], y=self.y[cut], lines=lines)
+        setpoints = {tank: (head, r[cut]) for tank, (head, r) in self.setpoints.items()}
+        arrays = {"t": self.t[cut], "u": self.u[cut], "y": self.y[cut], "lines": lines}
+        return dataclasses.replace(self, **arrays, setpoints=setpoints)
 
     def where(self, k: int | None = None, column: int | None = None) -> str:
         """Return the place of sample k for a message: its line in the file, or its number.

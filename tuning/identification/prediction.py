@@ -185,10 +185,11 @@ def beside(case: Case, log: Log, run: Any) -> dict[str, Any]:
 def achieved(case: Case, log: Log) -> list[dict[str, Any]]:
     """Return the levels of experiment data beside those that the rig predicts of its own loop.
 
-    Of each channel {"name", "unit", "limit", "error", "highest", "lowest"}, the last three
-    {"predicted", "achieved"}, over the time that both have.
+    Of each channel {"name", "unit", "limit", "setpoints", "error", "highest", "lowest"}, the last
+    three {"predicted", "achieved"}, over the time that both have.
 
-    The reference is the rig's, from the first sample on; "error" (root mean square) is None for a
+    The reference is the rig's, from the first sample on; "achieved" has that of the data where
+    "setpoints", the header of its column, is not None. "error" (root mean square) is None for a
     tank that is not controlled.
     """
     run = simulate(without_noise(case.loop), case.clock)
@@ -201,11 +202,16 @@ def achieved(case: Case, log: Log) -> list[dict[str, Any]]:
             "achieved": np.asarray(loop.sensor.level_of(tank, y, volts)),
         }
         row: dict[str, Any] = {"name": reading_label(loop.plant, tank), "unit": loop.units[0]}
-        row |= {"limit": limits.get(tank), "error": None}
+        row |= {"limit": limits.get(tank), "setpoints": None, "error": None}
         if tank in loop.plant.outputs:
             r = np.asarray(run.r)[:, list(loop.plant.outputs).index(tank)]
             r = np.interp(t[inside], np.asarray(run.t), r)
-            row["error"] = {s: float(np.sqrt(np.nanmean((h - r) ** 2))) for s, h in sides.items()}
+            own = {"predicted": r, "achieved": r}
+            if tank in log.setpoints:
+                row["setpoints"], own["achieved"] = log.setpoints[tank]
+                own["achieved"] = own["achieved"][inside]
+            error = {side: np.nanmean((h - own[side]) ** 2) for side, h in sides.items()}
+            row["error"] = {side: float(np.sqrt(square)) for side, square in error.items()}
         row["highest"] = {s: float(np.nanmax(h)) for s, h in sides.items()}
         row["lowest"] = {s: float(np.nanmin(h)) for s, h in sides.items()}
         rows.append(row)

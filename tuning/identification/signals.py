@@ -29,10 +29,9 @@ VALUE = {"value", "val", "wert", "reading", "average", "valeur", "valor", "messw
 UNIT = {"unit", "units", "uom", "eu", "einheit"}
 QUALITY = {"quality", "qual", "status", "q", "qly", "qualitat", "qualität"}
 """Names of the columns of a long table, a row for each value of a tag."""
-OTHER = {
-    "r", "e", "w", "sp", "setpoint", "sollwert", "soll", "mode", "alarm", "alm", "hh", "ll", "hi",
-    "lo",
-}
+SETPOINT = {"r", "w", "sp", "setpoint", "sollwert", "soll", "consigne"}
+"""Words that mean the setpoint of a level."""
+OTHER = {*SETPOINT, "e", "mode", "alarm", "alm", "hh", "ll", "hi", "lo"}
 """Words beside the name of a tank or a pump that mean another signal of it."""
 MEASURED = {"pv", "val", "value", "actual", "ist", "istwert", "avg", "mean", "measured", "act"}
 """Words beside it that mean its value."""
@@ -144,6 +143,39 @@ def rank(text, slot, name, slots):
         return 0
     rest = set(re.split(r"[\W_]+", re.sub(pattern, " ", text.lower())))
     return 0 if rest & (OTHER | QUALITY) else 2 if rest & MEASURED else 1
+
+
+def setpoint_of(text, names):
+    """Return the tank whose setpoint a column's name means, or None; names: {tank of each output:
+    its names}.
+    """
+    # "SP1" is of output 1, also where that is another tank; "LIC101.SP" of the tank with number 101
+    spoken = re.sub(r"set[\W_]?points?", "sp", text.lower())
+    parts = re.findall(r"[^\W\d_]+|\d+", spoken)
+    rest, tanks = [part for part in parts if part not in SETPOINT], [*names]
+    if len(rest) == len(parts):
+        return None
+    if not rest and len(tanks) == 1:
+        return tanks[0]
+    number = rest[-1] if rest and rest[-1].isdigit() else ""
+    if rest == [number] and 0 < int(number) <= len(tanks):
+        return tanks[int(number) - 1]
+    own = [i for i, of in names.items() if any(_within(compact(n), rest) for n in of)]
+    beside = "".join(rest[-2:-1])
+    if not own and (beside[:1] in ("", "l") or WORDS.get(beside) == "h"):  # FIC101: of a flow
+        own = [i for i, of in names.items() if any(number == _digits(n) != "" for n in of)]
+    return own[0] if len(own) == 1 else None
+
+
+def _within(name, parts):
+    """Whether parts of a text in a row make up a name."""
+    ends = range(len(parts) + 1)
+    return any("".join(parts[a:b]) == name for a in ends for b in ends[a + 1 :])
+
+
+def _digits(name):
+    """Return the last number in a name, "" without one."""
+    return (re.findall(r"\d+", name) or [""])[-1]
 
 
 def _generic(stem, slots):

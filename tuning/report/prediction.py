@@ -122,6 +122,20 @@ def achieved_table(rows):
     return Table(cells, heads)
 
 
+def setpoints_used(rows):
+    """Return a sentence: to which setpoints the errors of `achieved` rows are."""
+    rows = [row for row in rows if row["error"] is not None]
+    columns = dict.fromkeys(repr(row["setpoints"]) for row in rows if row["setpoints"] is not None)
+    if not columns:
+        return "errors: to the setpoints of the rig, whatever those of the batch were"
+    others = dict.fromkeys(row["name"] for row in rows if row["setpoints"] is None)
+    rest = f"; of {', '.join(others)}: to those of the rig" if others else ""
+    return (
+        f"errors achieved: to the setpoints of the batch, {', '.join(columns)}{rest}; predicted:"
+        " to those of the rig"
+    )
+
+
 def json_of(result):
     """Return the JSON object of `jaxtank predict --json`."""
     q = result.quality

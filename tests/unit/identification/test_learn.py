@@ -10,7 +10,7 @@ import jaxtank
 import tuning
 from jaxtank import rig
 from tuning.identification.prediction import achieved
-from tuning.report.prediction import achieved_table
+from tuning.report.prediction import achieved_table, setpoints_used
 
 RIG = f"""{ONE}
 [limits]
@@ -76,3 +76,39 @@ def test_a_batch_is_learned_and_its_covariance_is_the_next_prior(case, tmp_path)
     assert widths[1] < 0.85 * widths[0]
     learned = rig.load(tmp_path / "next2" / "rig.toml")
     assert learned.covariance is not None and learned.loop.safety_filter is not None
+
+
+SETPOINTS = ["h1.SP", "SP1", "setpoint", "r1", "LIC1.SP", "Level 1 set point"]
+
+
+@pytest.mark.parametrize("header", SETPOINTS)
+def test_the_error_of_a_batch_is_to_its_own_setpoints(case, tmp_path, header):
+    """A batch that kept setpoints of its own without an error; the rig's are others."""
+    run = jaxtank.simulate(case.loop, case.clock)
+    t, u, h, r = (np.asarray(v)[:100] for v in (run.t, run.u, run.x, run.r))
+    own = h[:, 0] - 0.25
+    rows = np.column_stack([t, u[:, 0], h[:, 0], own])
+    rows[:, 3] *= 10.0
+    heads = f"t [s],pump1 [V],h1 [cm],{header} [mm]"
+    np.savetxt(tmp_path / "log.csv", rows, "%.9g", ",", header=heads, comments="")
+    log = tuning.read_log(tmp_path / "log.csv", case.loop)
+    (row,) = achieved(case, log)
+    assert row["setpoints"] == f"{header} [mm]" and not log.notes
+    assert row["error"]["achieved"] == pytest.approx(0.25)
+    assert row["error"]["predicted"] == pytest.approx(np.sqrt(np.mean((h - r) ** 2)))
+    assert row["setpoints"] in setpoints_used([row])
+    np.testing.assert_allclose(log.part(10, 20).setpoints[0][1], own[10:20])
+
+
+def test_columns_that_are_no_setpoint_of_a_level_leave_those_of_the_rig(case, tmp_path):
+    """A setpoint of a flow, of a unit that no level has, and of another loop."""
+    run = jaxtank.simulate(case.loop, case.clock)
+    rows = np.column_stack(
+        [*(np.asarray(v)[:50] for v in (run.t, run.u, run.x)), *3 * [run.t[:50]]]
+    )
+    heads = "t [s],pump1 [V],h1 [cm],FIC1.SP,LIC1.SP [degC],LIC7.SP"
+    np.savetxt(tmp_path / "log.csv", rows, "%.9g", ",", header=heads, comments="")
+    log = tuning.read_log(tmp_path / "log.csv", case.loop)
+    (row,) = achieved(case, log)
+    assert row["setpoints"] is None and "of the rig" in setpoints_used([row])
+    assert not log.setpoints and all(head in log.notes[0] for head in heads.split(",")[3:])

@@ -183,7 +183,7 @@ def learn(args):
     from tuning.identification.prediction import achieved
     from tuning.report.document import Report, Text
     from tuning.report.identification import marked
-    from tuning.report.prediction import achieved_table
+    from tuning.report.prediction import achieved_table, setpoints_used
 
     logs, line = read_logs(args, case), Line(args.quiet)
     rows = [row | {"data": log.name} for log in logs for row in achieved(case, log)]
@@ -206,8 +206,7 @@ def learn(args):
     payload = {"case": case.name, "achieved": rows}
     payload |= {name: part.to_json() for name, part in parts.items()}
     payload["verdict"] = last.to_json()["verdict"]
-    whose = Text(["errors: to the setpoints of the rig, whatever those of the batch were"])
-    table = Report("", "", None, [], [achieved_table(rows), whose])
+    table = Report("", "", None, [], [achieved_table(rows), Text([setpoints_used(rows)])])
     texts = [printed(table), *(printed(part.report()) for part in parts.values())]
     print_result(args, payload, lambda: "\n\n".join(texts))
     report_written(written, args)
