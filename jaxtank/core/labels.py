@@ -95,6 +95,11 @@ def input_unit(plant: Any, index: int, drive: str) -> str:
     return "-" if is_valve and drive != "%" else drive
 
 
+def signal_units(plant: Any, units: tuple[str, str]) -> list[str]:
+    """Return the units of an export's signals: of levels and setpoints, and of each input."""
+    return [units[0], *(input_unit(plant, j, units[1]) for j in range(plant.pumps))]
+
+
 def short(plant: Any, kind: str, index: int) -> Any:
     """Return the name of an entry, or its number from 1: what a column headed "tank" shows."""
     return name_of(plant, kind, index) or index + 1

@@ -1,7 +1,10 @@
 """Controllers and plants as C99: a header with the parameters, and a file of functions."""
 
+import json
+
 import numpy as np
 
+from jaxtank.core.labels import signal_units
 from jaxtank.export.printer import FUNCTIONS, OPERATIONS, Printer, field_of, header, note_of
 from jaxtank.export.statements import REAL, TRUTH, WHOLE, Matrix, Ref, Store, every
 
@@ -206,6 +209,9 @@ class Text:
         )
         prepared += [f"    {name}_parameters p;"] if program.prepare else []
         zero = "d" if program.plant else "dr, ddr"
+        loop = program.case.loop
+        units = ", ".join(json.dumps(unit) for unit in signal_units(loop.plant, loop.units))
+        units = f"#define {name.upper()}_UNITS {units} /* of y and r, of each u */"
         return "\n".join(
             [
                 "/*",
@@ -223,6 +229,7 @@ class Text:
                 "#endif",
                 "",
                 f"enum {{ {facts} }};",
+                *([] if program.plant else [units]),
                 f"typedef {real} {name}_real;",
                 f"extern const {real} {name}_dt; /* sampling period [s] */",
                 "",

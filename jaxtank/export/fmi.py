@@ -15,7 +15,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from jaxtank.core.labels import label_of
+from jaxtank.core.labels import input_unit, label_of
 from jaxtank.core.units import local
 from jaxtank.export.c import C, print_c
 from jaxtank.export.printer import note_of
@@ -69,8 +69,9 @@ def variables(program: Any) -> list[Variable]:
             for j in range(size):
                 start = float(starts[name][j]) if name in starts else 0.0
                 label = f"{words} of {label_of(loop.plant, kind, j)}"
-                full, unit_of_rig = f"{NAMES.get(name, name)}[{j}]", local(unit, loop.units)
-                numbers.append(Variable(full, causality, start, unit_of_rig, label))
+                full, own = f"{NAMES.get(name, name)}[{j}]", local(unit, loop.units)
+                own = input_unit(loop.plant, j, own) if kind == "pump" else own
+                numbers.append(Variable(full, causality, start, own, label))
     return numbers
 
 

@@ -1,7 +1,10 @@
 """Controllers as JavaScript."""
 
+import json
+
 import numpy as np
 
+from jaxtank.core.labels import signal_units
 from jaxtank.export.printer import FUNCTIONS, OPERATIONS, Printer, header
 from jaxtank.export.statements import REAL, TRUTH, WHOLE, Define, Ref, every, matrix_operations
 
@@ -170,6 +173,8 @@ def print_javascript(program, name, precision):
         "pumps": program.pumps,
     }
     facts = ", ".join(f"{key}: {printer.value(value)}" for key, value in sizes.items())
+    loop = program.case.loop
+    facts += f", units: {json.dumps(signal_units(loop.plant, loop.units))}"
     first = ", ".join(map(printer.as_real, program.first))
     lines = [
         *header(program, "//", f"{name}.step(s, t, y, r, dr, ddr)", begin),

@@ -17,8 +17,10 @@ from xml.etree import ElementTree
 import numpy as np
 
 from jaxtank.core.errors import DataError, InputError
-from jaxtank.core.tables import is_time, numbers, read_table, seconds
+from jaxtank.core.quantities import factor
+from jaxtank.core.tables import is_time, numbers, read_table, seconds, unit_name
 from jaxtank.core.text import printable
+from jaxtank.core.units import canonical
 from jaxtank.export.fmi import compiler, library, place_of
 
 GROUPS = re.compile(r"(y|h|r|dr|ddr|applied|u|pump)(?:\d+|_.+)", re.IGNORECASE)
@@ -37,6 +39,8 @@ class Export(NamedTuple):
     """Numbers of levels, setpoints, inputs."""
     run: Any
     """Function of a Log that returns the inputs (samples, inputs)."""
+    units: tuple[str, ...] = ()
+    """Of levels and setpoints, and of each input; () of an export that does not tell."""
 
 
 class Log(NamedTuple):
@@ -58,7 +62,7 @@ def replay(path: str | Path, data: str | Path) -> dict[str, Any]:
     path : an exported controller: NAME.c (with NAME.h beside it), NAME.js or NAME.fmu
     data : log with one row a period: t [s], y1, .. (or h1, ..), r1, .., u1, .. (or pump1, ..),
         and applied1, .. where pumps have a lag, delay or dead zone behind the inputs of the
-        controller
+        controller; units in heads, or in a row below them, are converted to those of the export
 
     Returns
     -------
@@ -100,8 +104,14 @@ def read(path: str | Path, export: Export) -> tuple[Log, list[str]]:
     groups = _groups(table)
     chosen = _chosen(table, groups, export)
     t = seconds(table, groups["t"][0])
-    array = lambda columns: np.stack([numbers(table, i)[0] for i in columns], axis=1)
-    arrays = {key: array(columns) for key, columns in chosen.items()}
+
+    def array(key, columns):
+        units = export.units[1:] if key == "u" else export.units[:1] * len(columns)
+        rate = {"dr": "/s", "ddr": "/s^2"}.get(key, "")
+        scaled = [_in_unit(table, i, f"{u}{rate}") for i, u in zip(columns, units)]
+        return np.stack(scaled or [numbers(table, i)[0] for i in columns], axis=1)
+
+    arrays = {key: array(key, columns) for key, columns in chosen.items()}
     if any(not np.all(np.isfinite(a)) for a in arrays.values()):
         raise DataError(f"{table.name}: has cells without a number; replay needs every sample")
     apart = np.abs(np.diff(t) - export.dt)
@@ -114,11 +124,34 @@ def read(path: str | Path, export: Export) -> tuple[Log, list[str]]:
         )
     dr, ddr = _rates(arrays["r"], export.dt), np.zeros_like(arrays["r"])
     if len(groups.get("dr", [])) == export.sizes[1]:
-        dr = array(groups["dr"])
+        dr = array("dr", groups["dr"])
     if len(groups.get("ddr", [])) == export.sizes[1]:
-        ddr = array(groups["ddr"])
+        ddr = array("ddr", groups["ddr"])
     log = Log(t, arrays["y"], arrays["r"], dr, ddr, arrays["u"])
     return log, [table.columns[i].name for i in chosen["u"]]
+
+
+def _refuse_twice(table, columns):
+    """Raise DataError for columns of one name."""
+    names = [table.columns[i].name for i in columns]
+    for name in names:
+        if [other.lower() for other in names].count(name.lower()) > 1:
+            raise DataError(
+                f"{table.name}, line {table.head}: two columns are called {name!r}: leave one out,"
+                " or rename it"
+            )
+
+
+def _in_unit(table, i, base):
+    """Return the numbers of a column in the export's unit, that of a column without one."""
+    values, unit = numbers(table, i)[0], table.columns[i].unit
+    size = 1.0 if unit is None else factor(unit_name(unit), canonical(base))
+    if size is None:
+        raise DataError(
+            f"{table.where(i)}: {unit!r} is no unit that converts to the export's, {base}: write"
+            f" its numbers in {base}"
+        )
+    return values * size
 
 
 def _groups(table):
@@ -141,8 +174,11 @@ def _chosen(table, groups, export):
     """{"y", "r", "u": columns} for an export. Raises DataError for columns that are missing."""
     names = {"y": ("y", "h"), "r": ("r",), "u": ("applied", "u", "pump")}
     chosen, problems = {}, [] if "t" in groups else ["a column t"]
+    for name in ("t", "dr", "ddr"):
+        _refuse_twice(table, groups.get(name, []))
     for (key, words), count in zip(names.items(), export.sizes):
         chosen[key] = next((groups[name] for name in words if name in groups), [])
+        _refuse_twice(table, chosen[key])
         if len(chosen[key]) != count:
             columns = " or ".join(f"{name}1, .." for name in words)
             problems.append(f"{count} of {columns} (it has {len(chosen[key])})")
@@ -169,6 +205,12 @@ static void copy({name}_real *a, const double *b, int n) {{
 #define OUT __attribute__((visibility("default")))
 OUT void sizes(int *n);
 void sizes(int *n) {{ n[0] = {upper}_TANKS; n[1] = {upper}_OUTPUTS; n[2] = {upper}_PUMPS; }}
+#ifndef {upper}_UNITS
+#define {upper}_UNITS 0
+#endif
+static const char *const units[{upper}_PUMPS + 1] = {{ {upper}_UNITS }};
+OUT const char *unit(int i);
+const char *unit(int i) {{ return units[i]; }}
 OUT double period(void);
 double period(void) {{ return {name}_dt; }}
 OUT void begin(const double *y);
@@ -219,7 +261,7 @@ def _load_c(path):
             " c` has written under this name"
         )
     with _loaded(binary, ".so") as code:
-        code.period.restype = ctypes.c_double
+        code.period.restype, code.unit.restype = ctypes.c_double, ctypes.c_char_p
         sizes = (ctypes.c_int * 3)()
         code.sizes(sizes)
         pointer = lambda a: a.ctypes.data_as(ctypes.c_void_p)
@@ -232,13 +274,14 @@ def _load_c(path):
                 code.step(ctypes.c_double(t), *(pointer(v[k]) for v in (*signals, out)))
             return out
 
-        yield Export(code.period(), (sizes[0], sizes[1], sizes[2]), run)
+        units = tuple(word.decode() for i in range(sizes[2] + 1) if (word := code.unit(i)))
+        yield Export(code.period(), (sizes[0], sizes[1], sizes[2]), run, units)
 
 
 SCRIPT = """
 const law = require(process.argv[1]);
 if (process.argv[2] === "facts")
-    console.log(JSON.stringify([law.dt, law.tanks, law.outputs, law.pumps]));
+    console.log(JSON.stringify([law.dt, law.tanks, law.outputs, law.pumps, law.units || []]));
 else {
     const d = JSON.parse(require("fs").readFileSync(0)), s = law.init(d.y[0]);
     const step = (t, k) => law.step(s, t, d.y[k], d.r[k], d.dr[k], d.ddr[k]);
@@ -270,7 +313,7 @@ def _load_javascript(path):
             raise InputError(f"{printable(path.name)}: stopped with an error in node")
         return inputs
 
-    yield Export(float(facts[0]), tuple(facts[1:]), run)
+    yield Export(float(facts[0]), tuple(facts[1:4]), run, tuple(facts[4]))
 
 
 @contextlib.contextmanager
@@ -284,7 +327,7 @@ def _load_fmu(path):
         model, dt = kind.attrib["modelIdentifier"], float(clock.attrib["stepSize"])
     except (zipfile.BadZipFile, KeyError, AttributeError, ValueError, ElementTree.ParseError):
         raise InputError(f"{name}: is no FMU of `jaxtank export --lang fmu`") from None
-    references = _references(root)
+    references, units = _references(root)
     if not {"y", "r", "u"} <= references.keys():
         raise InputError(f"{name}: has no inputs y, r and no output u: it is no controller")
     place = place_of(version)
@@ -296,20 +339,24 @@ def _load_fmu(path):
         raise InputError(f"{name}: has no binary for this machine, and no C compiler is at hand")
     y, r, u = (len(references[key]) for key in ("y", "r", "u"))
     with _loaded(binary, place[1] if place else ".so") as code:
-        yield Export(dt, (y, r, u), lambda log: _run_fmu(code, version[0], references, dt, log))
+        run = lambda log: _run_fmu(code, version[0], references, dt, log)
+        yield Export(dt, (y, r, u), run, (units["y"][0], *units["u"]))
 
 
 PARTS = ("CoSimulation", "DefaultExperiment")
 
 
 def _references(root):
-    """{signal: its value references} of an FMU's inputs and outputs."""
+    """({signal: its value references}, {signal: their units}) of an FMU's inputs and outputs."""
     references: dict[str, list[int]] = {}
+    units: dict[str, list[str]] = {}
     for variable in root.find("ModelVariables"):
         if variable.attrib.get("causality") in ("input", "output"):
             key = variable.attrib["name"].split("[")[0]
             references.setdefault(key, []).append(int(variable.attrib["valueReference"]))
-    return references
+            own = [part.attrib["unit"] for part in variable.iter() if "unit" in part.attrib]
+            units.setdefault(key, []).append((own or ["-"])[0])
+    return references, units
 
 
 def _run_fmu(code, major, references, dt, log):

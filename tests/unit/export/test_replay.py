@@ -8,6 +8,7 @@ import pytest
 
 import jaxtank
 from jaxtank import presets, rig
+from jaxtank.core.errors import DataError
 from jaxtank.export.replay import Export, _rates, read
 from jaxtank.loop.trajectory import csv
 from tuning.cli import main
@@ -53,6 +54,20 @@ pump = [
 ]
 controller = {kind = "pi", Kc = 1.0, Ti = 20.0}
 reference = {initial = [20.0], changes = [[5.0, 1, 25.0]]}
+values = {"clock.dt" = 1.0, "clock.duration" = 60.0}
+"""
+
+
+VALVE = """
+tank = [{area = 100.0, rim = 60.0, level = 20.0}, {area = 100.0, rim = 60.0, level = 10.0}]
+pump = [{to = 1, gain = 10.0, high = 12.0, initial = 6.0}]
+valve = [
+    {from = 1, to = 2, area = 0.4, initial = 0.5},
+]
+orifice = [{from = 2, area = 0.3}]
+plant = { gravity = 981.0, outputs = [1, 2] }
+controller = {kind = "pi", Kc = [1.0, 0.05], Ti = 20.0}
+reference = {initial = [20.0, 10.0], changes = [[5.0, 1, 22.0]]}
 values = {"clock.dt" = 1.0, "clock.duration" = 60.0}
 """
 
@@ -115,3 +130,72 @@ def test_levels_are_those_of_their_numbers_wherever_their_columns_stand(tmp_path
 def test_rates_of_ramps_are_their_slopes_and_those_of_jumps_are_zero():
     r = np.array([[1.0], [1.0], [1.5], [2.0], [2.5], [2.5], [4.0], [4.0]])
     np.testing.assert_allclose(_rates(r, 0.5)[:, 0], [0, 1, 1, 1, 0, 0, 0, 0])
+
+
+def in_other_units(log, units, row_of_units):
+    """The log in other units (levels, setpoints and inputs are in V), stated in heads or in a row
+    below them.
+    """
+    heads, *rows = [line.split(",") for line in log.read_text().splitlines()]
+    names = [head.split(" [")[0] for head in heads]
+    scale = {"mV": 1e3, "kV": 1e-3, "V": 1.0, "s": 1.0, "min": 1 / 60}
+    chosen = ["min", *([units] * (len(names) - 1))]
+    cells = [[f"{float(c) * scale[u]:.17g}" for c, u in zip(row, chosen)] for row in rows]
+    if row_of_units:
+        return "\n".join(map(",".join, [names, chosen, *cells]))
+    return "\n".join(map(",".join, [[f"{n} [{u}]" for n, u in zip(names, chosen)], *cells]))
+
+
+@pytest.mark.parametrize("lang", ["c", "js", "fmu", "fmu2"])
+@pytest.mark.parametrize("row_of_units", [False, True])
+def test_a_log_in_other_units_is_converted_to_those_of_the_export(
+    tmp_path, capsys, log, lang, row_of_units
+):
+    if shutil.which(WORDS[lang.rstrip("2")]) is None:
+        pytest.skip(f"no {WORDS[lang.rstrip('2')]} on this machine")
+    more = ("--fmi", "2") if lang == "fmu2" else ()
+    export(tmp_path, "--lang", lang.rstrip("2"), *more)
+    data = tmp_path / "log.csv"
+    data.write_text(in_other_units(log, "mV", row_of_units))
+    capsys.readouterr()
+    words = ["replay", str(tmp_path / f"law.{lang.rstrip('2')}"), "--data", str(data), "--json"]
+    assert main.main(words) == 0
+    (row,) = json.loads(capsys.readouterr().out)["inputs"]
+    assert row["largest_difference"] < 1e-8
+
+
+def test_a_unit_that_does_not_convert_and_a_column_twice_are_refused_by_name(log, tmp_path):
+    for name, unit in (("y2", "cm"), ("u1", "%"), ("r1", "m3/h")):
+        (tmp_path / "log.csv").write_text(
+            log.read_text().replace(f"{name} [V]", f"{name} [{unit}]")
+        )
+        with pytest.raises(
+            DataError, match=rf"column '{name} \[{unit}\]': '{unit}' is no unit .* V"
+        ):
+            read(tmp_path / "log.csv", Export(4.0, (2, 1, 1), None, ("V", "V")))
+    for name, other in (("y1 [V]", "y2 [mV]"), ("u1 [V]", "u1 [V]"), ("t [s]", "t [s]")):
+        lines = log.read_text().splitlines()
+        lines = [f"{lines[0]},{other}", *(f"{line},1" for line in lines[1:])]
+        (tmp_path / "log.csv").write_text("\n".join(lines))
+        with pytest.raises(DataError, match=f"two columns are called '{other.split()[0]}'"):
+            read(tmp_path / "log.csv", Export(4.0, (2, 1, 1), None))
+
+
+def test_the_opening_of_a_valve_has_a_unit_of_its_own(tmp_path, capsys):
+    """In a rig whose pumps are in V, the opening of a valve is a share."""
+    if shutil.which("gcc") is None:
+        pytest.skip("no gcc on this machine")
+    (tmp_path / "rig.toml").write_text(VALVE)
+    case = rig.load(tmp_path / "rig.toml")
+    run = jaxtank.simulate(case.loop, case.clock)
+    text = csv(run, case.loop.units, case.loop.plant)
+    assert "u2 [-]" in text
+    (tmp_path / "log.csv").write_text(text)
+    for lang in ("c", "fmu"):
+        words = ["export", str(tmp_path / "rig.toml"), "--name", "law", "--out", str(tmp_path)]
+        assert main.main([*words, "--lang", lang]) == 0
+        capsys.readouterr()
+        file = str(tmp_path / f"law.{lang}")
+        assert main.main(["replay", file, "--data", str(tmp_path / "log.csv"), "--json"]) == 0
+        rows = json.loads(capsys.readouterr().out)["inputs"]
+        assert max(row["largest_difference"] for row in rows) < 1e-8
