@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxtank.core.errors import DataError
 from jaxtank.core.files import refusal
-from jaxtank.core.quantities import size_of
+from jaxtank.core.quantities import factor, size_of
 from jaxtank.core.text import printable, shortened
 from jaxtank.core.units import canonical
 
@@ -109,6 +109,7 @@ def read_table(path: str | Path, decimal: str = "") -> Table:
         stem, stated = split_header(text)
         columns.append(Column(text, stem, stated or unit or None, list(values)))
     sign = decimal or _decimal(columns, name)
+    columns = [in_one_unit(column, sign) for column in columns]
     return Table(name, columns, [line for line, _ in body], head, sign)
 
 
@@ -333,7 +334,7 @@ def _decimal(columns: Iterable[Column], name: str) -> str:
         for cell in column.cells:
             if "," not in cell and "." not in cell:
                 continue
-            text = cell.translate(SPACES)
+            text, _ = _number_and_unit(cell)
             point, comma = (bool(NUMBERS[sign].fullmatch(text)) for sign in ".,")
             if point != comma:
                 return "." if point else ","
@@ -347,6 +348,35 @@ def _decimal(columns: Iterable[Column], name: str) -> str:
         "decimal",
         (",", "."),
     )
+
+
+def _number_and_unit(cell: str) -> tuple[str, str]:
+    """Return (number, unit) of a cell such as "12.3 cm"; (the cell, "") of another."""
+    text = cell.translate(SPACES)
+    parts = re.fullmatch(r"([-+]?[\d.,]*\d[.,]?(?:[eE][-+]?\d+)?)((?:[^\W\d_]|%).*)", text)
+    return (parts[1], parts[2]) if parts and is_known(unit_name(parts[2])) else (text, "")
+
+
+def in_one_unit(column: Column, sign: str) -> Column:
+    """Return a column whose cells have units with numbers in that of its head, or of its first
+    cell; a cell that does not convert stays, for `numbers` to refuse. sign: the decimal one.
+    """
+    if not re.search(r"[^\W\d_]|%", "".join(column.cells)):
+        return column
+    parts = [_number_and_unit(cell) for cell in column.cells]
+    base = column.unit or next((unit for _, unit in parts if unit), None)
+    bare = any(not unit and NUMBERS[sign].fullmatch(text) for text, unit in parts)
+    if base is None or (bare and not column.unit):
+        return column
+    cells = []
+    for cell, (text, unit) in zip(column.cells, parts):
+        size = factor(unit_name(unit), unit_name(base)) if unit else None
+        if size is not None and NUMBERS[sign].fullmatch(text):
+            group = "," if sign == "." else "."
+            value = float(text.replace(group, "").replace(sign, "."))
+            cell = text if size == 1.0 else repr(value * size).replace(".", sign)
+        cells.append(cell)
+    return column._replace(unit=base, cells=cells)
 
 
 def numbers(table: Table, column: int) -> tuple[np.ndarray, dict[str, int]]:
@@ -384,6 +414,8 @@ def _refused(table: Table, column: int, wrong: Counter[str], first: dict[str, in
     else:
         often = f" ({wrong[cell]} times)" if wrong[cell] > 1 else ""
         sign = "" if table.decimal == "." else ", where the decimal sign is a comma"
+        if _number_and_unit(cell)[1]:
+            sign = ": its unit does not convert to that of the column, or other cells have none"
         what = f"{shortened(cell)} is not a number{often}{sign}"
     more = ", ".join(shortened(other) for other in others[:3])
     more = f"; nor is {more}" + f" and {len(others) - 3} more" * (len(others) > 3) if more else ""
@@ -444,7 +476,6 @@ def seconds(table: Table, column: int, order: str = "") -> np.ndarray:
 
     order: one of ORDERS, for times that can be read twice; without it they raise Ambiguous.
     """
-    table = _unit_in_cells(table, column)
     (_, _, unit, cells) = table.columns[column]
 
     def place(k: int) -> str:
@@ -467,18 +498,6 @@ def seconds(table: Table, column: int, order: str = "") -> np.ndarray:
     if not dated and t.max() < DAY:  # times of a day go on over midnight
         t += DAY * np.cumsum(np.diff(t, prepend=t[0]) < -DAY / 2)
     return t - t[0]
-
-
-def _unit_in_cells(table: Table, column: int) -> Table:
-    """Return the table with the unit that each cell of a column has, as durations of MATLAB."""
-    old = table.columns[column]
-    word = re.fullmatch(r"[\d.,]+ ([a-z]+)", old.cells[0])
-    if old.unit or not word or not all(cell.endswith(f" {word[1]}") for cell in old.cells):
-        return table
-    cells = [cell.removesuffix(word[1]).strip() for cell in old.cells]
-    columns = [*table.columns]
-    columns[column] = old._replace(unit=word[1], cells=cells)
-    return table._replace(columns=columns)
 
 
 def _numbers_as_times(table: Table, column: int, unit: str | None) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxtank.core.errors import DataError
 from jaxtank.core.quantities import factor
-from jaxtank.core.tables import Column, Table, is_time, split_header, unit_name
+from jaxtank.core.tables import Column, Table, in_one_unit, is_time, split_header, unit_name
 
 # fmt: off
 TIME = {
@@ -101,9 +101,14 @@ def _long(table, t, tag, value, unit, quality):
         of_tag.sort(key=t.__getitem__)
         cells = lambda i, of_tag=of_tag: [columns[i].cells[k] for k in of_tag]
         name, stated = split_header(text)
-        stated = stated or columns[value].unit or (None if unit is None else cells(unit)[0] or None)
+        values, units = cells(value), [] if unit is None else cells(unit)
+        if len({*units} - {""}) > 1:  # each value has its own
+            values = [f"{v} {u}".strip() if v[-1:].isdigit() else v for v, u in zip(values, units)]
+        else:
+            stated = stated or columns[value].unit or next(filter(None, units), None)
         lines = [table.lines[k] for k in of_tag]
-        part = table._replace(columns=[Column(text, name, stated, cells(value))], lines=lines)
+        column = in_one_unit(Column(text, name, stated, values), table.decimal)
+        part = table._replace(columns=[column], lines=lines)
         signals.append(Signal(part, 0, t[of_tag], [] if quality is None else cells(quality)))
     return signals
 

@@ -244,3 +244,46 @@ def test_the_command_answers_once_and_writes_nothing(tmp_path):
         "time": "day-first",
     }  # fmt: skip
     assert re.search(r"day 11 of month 3", err)
+
+
+MIXED = ["m", "cm", "mm"] * 4
+IN_M = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
+
+
+def in_cells(units, values):
+    return [f"{v * IN_M[u]:.12g} {u}" for v, u in zip(values, units)]
+
+
+@pytest.mark.parametrize("header", ["LT101", "LT101 [mm]"])
+@pytest.mark.parametrize("comma", [False, True])
+def test_a_unit_in_each_cell_is_the_unit_of_that_cell(tmp_path, loop, header, comma):
+    cells = in_cells(MIXED, Y[:, 0])
+    times = [f"{t:g} s" if t < 30 else f"{t / 60:.12g} min" for t in T]
+    columns = [times, [f"{u:g} %" for u in U], cells, Y[:, 1]]
+    if comma:
+        columns = [[str(cell).replace(".", ",") for cell in column] for column in columns]
+    content = wide(["time", "P101", header, "LT102"], *columns, separator=";" if comma else ",")
+    same(read_log(written(tmp_path, content), loop))
+
+
+def test_a_long_table_may_have_a_unit_for_each_value(tmp_path, loop):
+    rows = [
+        *((t, "LT101", f"{y * IN_M[u]:.12g}", u) for t, y, u in zip(STAMPS, Y[:, 0], MIXED)),
+        *((t, "LT102", y, "m") for t, y in zip(STAMPS, Y[:, 1])),
+        *((t, "P101", u, "%") for t, u in zip(STAMPS, U)),
+    ]
+    header = "timestamp,tag,value,unit"
+    same(read_log(written(tmp_path, long(rows, header)), loop))
+    rows[5] = (STAMPS[5], "LT101", 0.4, "V")
+    with pytest.raises(LogError, match=r"line 7, column .LT101.: .0.4 V. .* does not convert"):
+        read_log(written(tmp_path, long(rows, header)), loop)
+
+
+@pytest.mark.parametrize("cell", ["12 %", "400"])
+def test_a_cell_whose_unit_is_not_known_is_refused_with_its_row(tmp_path, loop, cell):
+    cells = in_cells(MIXED, Y[:, 0])
+    cells[3] = cell
+    content = wide(["t [s]", "P101", "LT101", "LT102"], T, U, cells, Y[:, 1])
+    line = 5 if "%" in cell else 2
+    with pytest.raises(LogError, match=f"line {line}, column 'LT101': .* other cells have none"):
+        read_log(written(tmp_path, content), loop)
