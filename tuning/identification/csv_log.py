@@ -39,6 +39,7 @@ from tuning.identification.signals import (
     rank,
     setpoint_of,
     signals_of,
+    states_of,
     time_columns,
 )
 
@@ -400,6 +401,8 @@ class LogFile:
 
     def _like_input(self, signal: Signal) -> bool:
         """Whether a signal without a name of the rig may be the input of a pump."""
+        if (states := states_of(signal.described)) is not None:
+            return len(np.unique(states[np.isfinite(states)])) > 1
         unit = unit_name(signal.described.unit or self.loop.units[1])
         if not any(factor(unit, name) for name in (self.loop.units[1], "m^3/s")):
             return False
@@ -413,9 +416,13 @@ class LogFile:
         """Return (values of a slot in the rig's unit, whether they are a sensor's volts)."""
         signal, label = self.taken[slot], self._label(slot)
         values, in_volts, words = np.full(len(signal.t), np.nan), False, Counter[str]()
+        states = states_of(signal.described) if self.slots[slot][0] == "pump" else None
         try:
-            values, missing = numbers(signal.table, signal.column)
-            values, in_volts = self._converted(slot, values, self._unit(slot))
+            if states is not None:
+                values, missing = self._switched(slot, states), {}
+            else:
+                values, missing = numbers(signal.table, signal.column)
+                values, in_volts = self._converted(slot, values, self._unit(slot))
             words.update(missing)
             bad = poor(signal)
             words.update(signal.quality[k] for k in np.flatnonzero(bad & np.isfinite(values)))
@@ -426,6 +433,27 @@ class LogFile:
             each = ", ".join(f"{n} {printable(word)}" for word, n in words.most_common(5))
             self._note(f"{count(words.total(), 'value')} taken as missing ({each})", label)
         return values, in_volts
+
+    def _switched(self, slot: str, states: np.ndarray) -> np.ndarray:
+        """Return inputs of the states of a pump, the ends of its range."""
+        number, signal, label = self.slots[slot][1], self.taken[slot], self._label(slot)
+        limits = (self.loop.actuator.low, self.loop.actuator.high)
+        low, high = (float(np.broadcast_to(v, (self.plant.pumps,))[number]) for v in limits)
+        base = canonical(input_unit(self.plant, number, self.loop.units[1]))
+        cells = signal.described.cells
+        words = {share: cells[list(states).index(share)] for share in (1.0, 0.0) if share in states}
+        if not (np.isfinite(low) and np.isfinite(high)):
+            raise DataError(
+                f"{signal.table.where(signal.column)}: {' and '.join(map(repr, words.values()))}"
+                f" stand for no number, for the rig gives {label} no range: write low and high of"
+                f" {label} [{base}] in the rig file, or numbers in {base} in the log"
+            )
+        ends = {1.0: high, 0.0: low}
+        read = [f"{printable(word)} is read as {ends[v]:g} {base}" for v, word in words.items()]
+        self._note(
+            f"{', '.join(read)}, the {'ends' if len(read) > 1 else 'end'} of its range", label
+        )
+        return low + states * (high - low)
 
     def _held(self, slot: str, t: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return an input at the times t, each value held until the next."""

@@ -14,7 +14,7 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from tuning.identification.csv_log import LogFile
 from tuning.identification.data_checks import findings
 from tuning.identification.sanity import Oddity, oddities
-from tuning.identification.signals import Signal, poor, signals_of, time_columns
+from tuning.identification.signals import Signal, poor, signals_of, states_of, time_columns
 
 
 class ColumnOf(NamedTuple):
@@ -78,7 +78,9 @@ def _column(signal: Signal, slot: str = "") -> ColumnOf:
     """Return the ColumnOf of a signal."""
     column, values, why = signal.described, np.full(len(signal.t), np.nan), ""
     try:
-        values = np.where(poor(signal), np.nan, numbers(signal.table, signal.column)[0])
+        states = states_of(column)
+        values = numbers(signal.table, signal.column)[0] if states is None else states
+        values = np.where(poor(signal), np.nan, values)
     except DataError as error:
         why = str(error)
     return ColumnOf(column.header, slot, column.unit or "", signal.t, values, why)

@@ -7,7 +7,15 @@ import numpy as np
 
 from jaxtank.core.errors import DataError
 from jaxtank.core.quantities import factor
-from jaxtank.core.tables import Column, Table, in_one_unit, is_time, split_header, unit_name
+from jaxtank.core.tables import (
+    MISSING,
+    Column,
+    Table,
+    in_one_unit,
+    is_time,
+    split_header,
+    unit_name,
+)
 
 # fmt: off
 TIME = {
@@ -43,6 +51,13 @@ POOR = {
     "schlecht", "unsicher",
 }
 """First words of a quality, in lower case."""
+SWITCH = {
+    **dict.fromkeys(("on", "true", "running", "run", "open", "opened", "started", "start"), 1.0),
+    **dict.fromkeys(("ein", "an", "wahr", "auf", "offen", "läuft", "yes", "enabled"), 1.0),
+    **dict.fromkeys(("off", "false", "stopped", "stop", "closed", "close", "idle", "shut"), 0.0),
+    **dict.fromkeys(("aus", "falsch", "zu", "geschlossen", "steht", "no", "disabled"), 0.0),
+}
+"""{word for the state of a pump or a valve, in lower case: share of its range}."""
 # fmt: on
 GOOD_CODE = 192
 """Least code of OPC for a good quality."""
@@ -117,6 +132,10 @@ def _wide(table, used, t):
     """Return the signals of a table with a column for each."""
     rest = sorted({*range(len(table.columns))} - {*used})
     judged = {i: name for i in rest if (name := _judged(table.columns[i])) is not None}
+    values = [compact(table.columns[i].name) for i in rest if i not in judged]
+    for i, name in [*judged.items()]:  # TRUE and FALSE are states of what has no values
+        if states_of(table.columns[i]) is not None and not any(name in value for value in values):
+            del judged[i]
     plain, marks = [i for i in rest if i not in judged], {}
     for i, name in judged.items():
         of = [j for j in plain if compact(table.columns[j].name) == name != ""]
@@ -148,6 +167,16 @@ def rank(text, slot, name, slots):
         return 0
     rest = set(re.split(r"[\W_]+", re.sub(pattern, " ", text.lower())))
     return 0 if rest & (OTHER | QUALITY) else 2 if rest & MEASURED else 1
+
+
+def states_of(column):
+    """Return (cells,) shares of a range of a column of words such as ON and OFF, NaN of a missing
+    one; None of another column.
+    """
+    words = [cell.lower() for cell in column.cells]
+    if not {*words} & SWITCH.keys() or not {*words} <= SWITCH.keys() | MISSING:
+        return None
+    return np.array([SWITCH.get(word, np.nan) for word in words])
 
 
 def setpoint_of(text, names):

@@ -14,6 +14,7 @@ from helpers import command
 import tuning
 from jaxtank import rig
 from tuning.identification.csv_log import LogError, read_log
+from tuning.identification.identified_case import bare
 
 RIG = """
 units = ["m", "%"]
@@ -287,3 +288,44 @@ def test_a_cell_whose_unit_is_not_known_is_refused_with_its_row(tmp_path, loop, 
     line = 5 if "%" in cell else 2
     with pytest.raises(LogError, match=f"line {line}, column 'LT101': .* other cells have none"):
         read_log(written(tmp_path, content), loop)
+
+
+@pytest.mark.parametrize(
+    "pair", ["ON OFF", "TRUE FALSE", "True False", "Running Stopped", "open closed", "ein aus"]
+)
+@pytest.mark.parametrize("header", ["P101", "P101 [%]", "P101 running"])
+def test_words_for_a_pump_are_the_ends_of_its_range(tmp_path, pair, header):
+    on, off = pair.split()
+    loop = rig.loads(RIG.replace("high = 100.0", "low = 5.0, high = 80.0")).loop
+    cells = [on if k % 4 < 2 else off for k in ROWS]
+    cells[5] = ""
+    log = read_log(
+        written(tmp_path, wide(["t [s]", header, "LT101", "LT102"], T, cells, *Y.T)), loop
+    )
+    np.testing.assert_array_equal(log.u[:, 0], [80.0 if k % 4 < 2 else 5.0 for k in ROWS])
+    (note,) = [note for note in log.notes if on in note]
+    assert "80 %" in note and "5 %" in note and off in note
+
+
+def test_words_for_a_pump_without_a_range_are_refused_with_the_remedy(tmp_path, loop):
+    cells = ["ON" if k % 4 < 2 else "OFF" for k in ROWS]
+    path = written(tmp_path, wide(["t [s]", "P101", "LT101", "LT102"], T, cells, *Y.T))
+    with pytest.raises(LogError, match="'P101': 'ON' and 'OFF' .* write low and high of P101"):
+        read_log(path, bare(loop.plant).loop)
+    cells[3] = "40"
+    path = written(tmp_path, wide(["t [s]", "P101", "LT101", "LT102"], T, cells, *Y.T))
+    with pytest.raises(LogError, match="'ON' is not a number"):
+        read_log(path, loop)
+
+
+@pytest.mark.parametrize("pair", ["TRUE FALSE", "Running Stopped"])
+@pytest.mark.parametrize("header", ["P101 status", "feed pump"])
+def test_the_state_of_a_pump_judges_no_reading_and_is_no_drain_test(tmp_path, loop, header, pair):
+    """A column of another name is asked for; named, it is read, and no reading is missing."""
+    on, off = pair.split()
+    cells = [on if k % 4 < 2 else off for k in ROWS]
+    path = written(tmp_path, wide(["t [s]", "LT101", "LT102", header], T, *Y.T, cells))
+    with pytest.raises(LogError, match=f"no column for pump1 .* among .*'{header}'"):
+        read_log(path, loop)
+    log = read_log(path, loop, {"P101": header})
+    assert np.isfinite(log.y).all() and set(log.u[:, 0]) == {0.0, 100.0}
