@@ -25,6 +25,7 @@ from jaxtank.core.units import canonical
 LARGEST = 512 * 1024 * 1024  # bytes
 MOST_ROWS = 20_000_000
 LONGEST_CELL = 200  # characters
+LABVIEW = "LabVIEW Measurement"
 PREAMBLE = 20
 """Lines among which the names of the columns are looked for."""
 MISSING = {
@@ -90,15 +91,21 @@ class Ambiguous(DataError):
 
 
 def read_table(path: str | Path, decimal: str = "") -> Table:
-    """Return the Table in a file: cells separated by comma, semicolon, tab or "|", or an Excel file
-    (.xlsx). Lines that begin with "#" are comments. decimal: its sign, from the numbers if "".
+    """Return the Table in a file: cells separated by comma, semicolon, tab or "|", an Excel file
+    (.xlsx) or a LabVIEW measurement file (.lvm). Lines that begin with "#" are comments. decimal:
+    its sign, from the numbers if "".
 
     Raises DataError, in one line with file and line, for one that cannot be read.
     """
     path = Path(path)
     name, data = printable(path.name), _bytes(path)
-    spreadsheet = data.startswith(b"PK\x03\x04")
-    rows = list(_sheet(data, name) if spreadsheet else _rows(_text(data, name), name))
+    if data.startswith(b"PK\x03\x04"):
+        rows = list(_sheet(data, name))
+    elif (text := _text(data, name)).startswith(LABVIEW):
+        rows, sign = _labview(text, name)
+        decimal = decimal or sign
+    else:
+        rows = list(_rows(text, name))
     head, header, body = _head_and_body(rows, name)
     units, body = _units_and_samples(body, len(header))
     if not body:
@@ -193,6 +200,59 @@ def _rows(text: str, name: str) -> Iterator[tuple[int, list[str]]]:
                 yield end, cells
     except csv.Error as error:
         raise DataError(f"{name}, line {reader.line_num}: {error}") from None
+
+
+def _labview(text: str, name: str) -> tuple[list[tuple[int, list[str]]], str]:
+    """Return ([(line, cells)], the decimal sign or "") of a LabVIEW measurement file: names, units
+    and the samples of all segments.
+    """
+    facts: dict[str, list[str]] = {}  # of the file and of the latest segment
+    names: list[str] = []
+    rows: list[tuple[int, list[str]]] = []
+    begins = 0  # row of the first sample
+    separator, in_header = "," if re.search(r"^Separator,", text, re.MULTILINE) else "\t", True
+    for line, written in enumerate(text.split("\n"), 1):
+        first, *rest = cells = [cell.strip() for cell in written.split(separator)]
+        if first in ("Channels", "***End_of_Header***"):  # the first begins the header of a segment
+            in_header = first == "Channels"
+        elif in_header:
+            facts[first] = rest
+        elif first == "X_Value":
+            segment = cells[: cells.index("Comment")] if "Comment" in cells else cells
+            if segment.count("X_Value") > 1 or facts.get("X_Columns", ["One"])[0] != "One":
+                raise DataError(
+                    f"{name}, line {line}: its X values are not in one column for all channels:"
+                    " write the file with 'One column only' for X values, or as CSV with a column"
+                    " 't [s]'"
+                )
+            if not names:
+                rows = _labview_heads(line, segment, facts)
+            others, names, begins = names not in ([], segment), segment, begins or len(rows)
+            if others:
+                raise DataError(_another_segment(name, line, "has other channels"))
+        elif names and any(cells):
+            if len(rows) > begins and first == rows[begins][1][0]:
+                raise DataError(_another_segment(name, line, f"begins again at X_Value {first}"))
+            rows.append((line, (cells + [""] * len(names))[: len(names)]))
+    return rows, facts.get("Decimal_Separator", [""])[0]
+
+
+def _labview_heads(
+    line: int, names: list[str], facts: dict[str, list[str]]
+) -> list[tuple[int, list[str]]]:
+    """Return the rows of names and, where any is known, of units of a LabVIEW measurement file."""
+    units = ["s" if facts.get("X_Dimension", ["Time"])[0] == "Time" else ""]
+    units += facts.get("Y_Unit_Label", [])
+    units = [unit if is_known(unit_name(unit)) else "" for unit in units][: len(names)]
+    return [(line, names), *([(line, units)] if any(units) else [])]
+
+
+def _another_segment(name: str, line: int, what: str) -> str:
+    """Return a message on a segment of a LabVIEW measurement file that does not go on."""
+    return (
+        f"{name}, line {line}: a segment that {what}: give each segment as a file of its own, all"
+        " with --data"
+    )
 
 
 def _delimiter(text: str) -> str:

@@ -74,7 +74,7 @@ def read_log(
     Parameters
     ----------
     path : str or Path
-        The file: text in UTF-8, UTF-16 or Latin-1, or .xlsx.
+        The file: text in UTF-8, UTF-16 or Latin-1, .xlsx, or .lvm of LabVIEW.
     loop : ClosedLoop
         The rig that was measured.
     columns : mapping, optional

@@ -13,6 +13,7 @@ from helpers import command
 
 import tuning
 from jaxtank import rig
+from jaxtank.core.errors import DataError
 from tuning.identification.csv_log import LogError, read_log
 from tuning.identification.identified_case import bare
 
@@ -310,7 +311,7 @@ def test_words_for_a_pump_are_the_ends_of_its_range(tmp_path, pair, header):
 def test_words_for_a_pump_without_a_range_are_refused_with_the_remedy(tmp_path, loop):
     cells = ["ON" if k % 4 < 2 else "OFF" for k in ROWS]
     path = written(tmp_path, wide(["t [s]", "P101", "LT101", "LT102"], T, cells, *Y.T))
-    with pytest.raises(LogError, match="'P101': 'ON' and 'OFF' .* write low and high of P101"):
+    with pytest.raises(LogError, match=r"'P101': 'ON' and 'OFF' .* write low and high of P101"):
         read_log(path, bare(loop.plant).loop)
     cells[3] = "40"
     path = written(tmp_path, wide(["t [s]", "P101", "LT101", "LT102"], T, cells, *Y.T))
@@ -329,3 +330,44 @@ def test_the_state_of_a_pump_judges_no_reading_and_is_no_drain_test(tmp_path, lo
         read_log(path, loop)
     log = read_log(path, loop, {"P101": header})
     assert np.isfinite(log.y).all() and set(log.u[:, 0]) == {0.0, 100.0}
+
+
+def labview(segments=1, decimal=".", columns="One", unit="cm", again=False):
+    """A measurement file of LabVIEW; each segment has a header, and the last cell is a comment."""
+
+    def head(**facts):
+        rows = ["\t".join([k, *np.atleast_1d(v)]) for k, v in facts.items()]
+        return [*rows, "***End_of_Header***\t", "\t"]
+
+    text = ["LabVIEW Measurement\t"]
+    text += head(Writer_Version="2", Separator="Tab", Decimal_Separator=decimal,
+                 Multi_Headings="Yes", X_Columns=columns, Time_Pref="Relative",
+                 Date="2026/11/03", Time="23:59:40.0")  # fmt: skip
+    for k in np.split(np.arange(len(T)), segments):
+        text += head(Channels="3", Samples=["4"] * 3, Y_Unit_Label=["Volts", unit, unit],
+                     X_Dimension=["Time"] * 3, Delta_X=["5.000000"] * 3)[:-1]  # fmt: skip
+        text.append("X_Value\tP101\tLT101\tLT102\tComment")
+        t = T[k] - T[k[0]] * again
+        rows = zip(t, U[k], *(100 * Y[k]).T)
+        text += ["\t".join(f"{v:.6f}" for v in row).replace(".", decimal) for row in rows]
+    return "\r\n".join(text) + "\r\n"
+
+
+@pytest.mark.parametrize("segments", [1, 3])
+@pytest.mark.parametrize("decimal", [".", ","])
+def test_a_measurement_file_of_labview_is_read(tmp_path, segments, decimal):
+    loop = rig.loads(RIG.replace('["m", "%"]', '["m", "V"]')).loop
+    same(read_log(written(tmp_path, labview(segments, decimal)), loop))
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (labview(columns="Multi"), "line 18: its X values .* 'One column only'"),
+        (labview(segments=3, again=True), "begins again at X_Value 0.000000: .* all with --data"),
+    ],
+)
+def test_one_of_several_x_columns_or_runs_is_refused_with_the_remedy(tmp_path, content, words):
+    loop = rig.loads(RIG.replace('["m", "%"]', '["m", "V"]')).loop
+    with pytest.raises(DataError, match=words):
+        read_log(written(tmp_path, content), loop)
