@@ -27,8 +27,8 @@ def given_noise(noise, channels):
 def noise_of(data):
     """Return (channels,) standard deviation of the noise in PaddedData."""
     # From second differences, for a level is smooth, by their median absolute deviation, which
-    # steps do not affect. At least a thousandth of the range of the channel: with less, weights
-    # would follow from round-off.
+    # steps do not affect. At least that of rounding to the sensor's resolution, and a thousandth of
+    # the range of the channel: with less, weights would follow from round-off.
     present = np.isfinite(data.y)
     top = np.max(data.y, axis=1, where=present, initial=-np.inf)
     span = top - np.min(data.y, axis=1, where=present, initial=np.inf)
@@ -38,15 +38,29 @@ def noise_of(data):
         # of consecutive readings only: across a gap a level is not smooth
         bends = np.abs(np.diff(data.y[..., c], 2, axis=1)) / np.sqrt(6.0)
         bends = bends[np.isfinite(bends)]
-        if bends.size >= ENOUGH:
-            noise[c] = max(1.4826 * np.median(bends), least[c])
+        if bends.size >= ENOUGH and span[..., c].max() > 0.0:
+            rounding = resolution_of(data.y[..., c]) / np.sqrt(12.0)
+            noise[c] = max(1.4826 * np.median(bends), least[c], rounding)
     volts = np.array([in_volts for _, in_volts in data.channels])
     for c in np.flatnonzero(np.isnan(noise)):
-        # too few readings: the noise of other channels of this kind, or a hundredth of the range
+        # too few readings, or one that never moves: the noise of other channels of this kind, or a
+        # hundredth of the range
         alike = noise[(volts == volts[c]) & np.isfinite(noise)]
         largest = np.nanmax(np.abs(data.y[..., c]))
         noise[c] = max([*alike, least[c]] if alike.size else [10 * least[c], 1e-3 * largest])
     return noise
+
+
+def resolution_of(y):
+    """Return the step of a sensor that rounds; 0 where readings do not repeat on a grid."""
+    y = y[np.isfinite(y)]
+    values = np.unique(y)
+    steps = np.diff(values)
+    steps = steps[steps > 1e-9 * np.ptp(values)] if steps.size else steps
+    if y.size - values.size < ENOUGH or not steps.size:
+        return 0.0
+    cells = steps / steps.min()
+    return float(steps.min()) if np.all(np.abs(cells - np.round(cells)) < 0.01) else 0.0
 
 
 def residuals_of(estimation, fit):

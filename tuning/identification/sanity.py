@@ -130,7 +130,8 @@ def _at_end(y, value, ends):
 def _noise(y):
     """Return the noise of readings from sample to sample, at least their resolution."""
     step, bend = np.diff(y), np.diff(y, 2)
-    resolution = np.min(np.abs(step), where=step != 0.0, initial=np.inf)
+    changes = np.abs(step) > 1e-9 * np.ptp(y)  # less is rounding, of a unit that was converted
+    resolution = np.min(np.abs(step), where=changes, initial=np.inf)
     return max(1.4826 * np.median(np.abs(bend)) / np.sqrt(6), resolution)
 
 

@@ -722,6 +722,28 @@ def test_sparse_readings_do_not_make_noise(away, clean):
     assert np.all((noise > 0.07) & (noise < 0.13))
 
 
+@pytest.mark.parametrize("step", [0.25, 0.1])
+@pytest.mark.parametrize("share", [0.005, 0.02, 0.1, 0.5])
+@pytest.mark.parametrize("rise", [0.0, 5.0, 20.0])
+def test_the_noise_of_a_sensor_that_flickers_by_one_step_is_that_of_rounding(step, share, rise):
+    """Of a level that stays or rises by some steps: from step / sqrt(12) to a step."""
+    rng, k = np.random.default_rng(3), np.arange(1000)
+    code = np.floor(rise * k / len(k)) + (rng.random(len(k)) < share)
+    data = simulation.padded([tuning.log(t=k, u=0.0 * k, y=8.0 + step * code)])
+    (noise,) = residuals.noise_of(data)
+    assert step / np.sqrt(12.0) <= noise * (1 + 1e-9) and noise <= step
+
+
+def test_the_noise_of_a_reading_that_never_moves_is_that_of_the_others(away, clean):
+    log = noisy(clean, 5)
+    y = log.y.copy()
+    y[:, 2] = 7.0
+    data = simulation.padded([tuning.log(t=log.t, u=log.u, y=y)])
+    assert np.all((residuals.noise_of(data) > 0.07) & (residuals.noise_of(data) < 0.13))
+    (alone,) = residuals.noise_of(simulation.padded([tuning.log(t=log.t, u=log.u, y=y[:, 2])]))
+    assert 1e-3 <= alone <= 0.1
+
+
 def test_a_split_that_does_nothing_is_no_unknown():
     """Both pumps of gouta2015 feed one tank each."""
     case = presets.find("gouta2015/backstepping")

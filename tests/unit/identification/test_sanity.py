@@ -53,6 +53,18 @@ def test_a_clean_log_is_not_accused(noise, resolution):
         assert not kinds(t, u, rounded)
 
 
+@pytest.mark.parametrize("share", [0.003, 0.02, 0.1, 0.5])
+def test_a_sensor_that_flickers_by_one_step_is_not_accused(share):
+    """Also where its unit was converted, and equal readings differ by rounding."""
+    for seed in range(10):
+        t, u, _ = record(seed)
+        rng = np.random.default_rng(seed)
+        y = 0.4 + 0.005 * (rng.random((len(t), 2)) < share)
+        assert not kinds(t, 0.0 * u + u[0], y) - {("still", "pump1")}
+        y *= 1.0 + 1e-15 * rng.integers(-1, 2, y.shape)
+        assert not kinds(t, 0.0 * u + u[0], y) - {("still", "pump1")}
+
+
 def frozen(y):
     y[200:245, 1] = y[200, 1]
 
