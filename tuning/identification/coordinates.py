@@ -270,6 +270,28 @@ def _is_flow(loop, logs, pump):
     return any(factor(u, f"{length}^3/s") and factor(u, own) is None for u in units if u)
 
 
+def refuse_used(loop, logs, names):
+    """Raise InputError for parameters by which columns of a log became inputs or levels: fitted to
+    these, each would come back as it was.
+    """
+    pumps, length, drive = loop.plant.pumps, *loop.units
+    of_pumps = [(f"plant.pump_gain[{j}]", 1 + j, "flows", "inputs") for j in range(pumps)]
+    for log in logs:
+        of_tanks = [(f"plant.area[{i}]", 1 + pumps + c, "volumes", "levels")
+                    for c, i in enumerate(log.tanks)]  # fmt: skip
+        for name, column, what, became in of_pumps + of_tanks:
+            unit = log.units and unit_name(log.units[column] or "")
+            volume = unit and factor(length, "m") and factor(unit, f"{length}^3")
+            used = _is_flow(loop, [log], column - 1) if became == "inputs" else volume
+            if name in names and used:
+                own = input_unit(loop.plant, column - 1, drive) if became == "inputs" else length
+                raise InputError(
+                    f"free {name}: {log.where(column=column)} has {what}, which became {became} by"
+                    f" it, so that these data cannot tell it: leave it out, or give {became} in"
+                    f" {own}"
+                )
+
+
 def nominal(loop, names):
     """Return {name: value} of a loop as floats."""
     return {name: float(np.asarray(get_value(loop, name))) for name in names}

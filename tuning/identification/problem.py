@@ -14,7 +14,13 @@ from jaxtank.case import Case
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tree import with_values
 from tuning.identification import simulation
-from tuning.identification.coordinates import coordinates_of, default_free, free_bounds, nominal
+from tuning.identification.coordinates import (
+    coordinates_of,
+    default_free,
+    free_bounds,
+    nominal,
+    refuse_used,
+)
 from tuning.identification.experiment import Log
 from tuning.identification.inputs import played
 from tuning.identification.residuals import given_noise, noise_of
@@ -105,6 +111,7 @@ class Estimation:
         if start not in STARTS:
             raise InputError(f"start = {start!r}: must be one of {', '.join(STARTS)}")
         self.bounds = free_bounds(loop, default_free(loop, logs) if free is None else free)
+        refuse_used(loop, logs, {bound.name for bound in self.bounds})
         self.bounds = [*self.bounds, *(bound for bound, _ in inputs)]
         self.coordinates = coordinates_of(self.bounds, inputs=tuple(way for _, way in inputs))
         self.prior = self._prior() if prior else None

@@ -1,5 +1,7 @@
 """Logs as files: what is read of them, and one line with the place for each that cannot be used."""
 
+import re
+
 import numpy as np
 import pytest
 from helpers import command
@@ -148,6 +150,23 @@ def test_the_gain_is_not_estimated_from_flows_that_it_made_inputs(read, case):
     gains = [f"plant.pump_gain[{j}]" for j in (0, 1)]
     assert [name in default_free(case.loop, [flows]) for name in gains] == [False, True]
     assert all(name in default_free(case.loop, [read(text())]) for name in gains)
+
+
+@pytest.mark.parametrize(
+    ("header", "name", "other"),
+    [
+        (HEADER.replace("pump1 [V]", "pump1 [l/h]"), "plant.pump_gain", "plant.pump_gain[1]"),
+        (HEADER.replace("h1 [cm]", "h1 [ml]"), "plant.area[0]", "plant.area[1]"),
+    ],
+)
+def test_a_parameter_that_made_a_column_is_not_estimated_from_it(read, case, header, name, other):
+    log = read(text(header, [[*r[:3], str(30 * float(r[3])), *r[4:]] for r in rows()]))
+    column = next(head for head in header.split(",") if head not in HEADER)
+    with pytest.raises(
+        InputError, match=rf"free {re.escape(name)}.*'{re.escape(column)}' has .* leave it out"
+    ):
+        tuning.Estimation(case, [log], {name: (0.1, 100.0)})
+    assert tuning.Estimation(case, [log], {other: (0.1, 100.0)}, substeps=1).bounds
 
 
 def test_a_level_in_volts_is_the_sensors(read):
