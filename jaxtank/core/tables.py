@@ -428,7 +428,7 @@ def in_one_unit(column: Column, sign: str) -> Column:
     bare = any(not unit and NUMBERS[sign].fullmatch(text) for text, unit in parts)
     if base is None or (bare and not column.unit):
         return column
-    cells = []
+    cells: list[str] = []
     for cell, (text, unit) in zip(column.cells, parts):
         size = factor(unit_name(unit), unit_name(base)) if unit else None
         if size is not None and NUMBERS[sign].fullmatch(text):
