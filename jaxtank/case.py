@@ -110,6 +110,8 @@ class Case(CaseViews):
         What a result is validated on.
     covariance : (names (n,), matrix (n, n) in their units), optional
         Of parameters that were identified together.
+    rejected : bool
+        Whether the data reject the structure of the rig with which `covariance` was estimated.
     log : {"t", "pump1", "h1", ..: column of a data file, its unit in its header}
         Where a data file of this rig names them otherwise.
     safety : settings of `with_safety_filter`, optional
@@ -137,6 +139,7 @@ class Case(CaseViews):
     symmetry: Symmetry | None = None
     uncertain: Mapping[str, float] = dataclasses.field(default_factory=dict)
     covariance: tuple | None = None
+    rejected: bool = False
     log: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     safety: Mapping[str, Any] | None = None
     origin: str = ""

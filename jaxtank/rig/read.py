@@ -155,6 +155,8 @@ def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
             with problems.collect((name, None, None)):
                 case = case.replace(**{field: read(case, table[name])})
     problems.check()
+    if "covariance" in table:
+        case = case.replace(rejected=table["covariance"].get("rejected", False))
     if "bottom" not in table.get("plant", {}) and "plant.bottom" not in values:
         case = with_bottom(case)
     return filtered(validation.check(case))

@@ -324,6 +324,7 @@ def _tuning(case):
     if case.covariance is not None:
         names, rows = case.covariance
         values = {"names": names, "matrix": [list(map(float, row)) for row in rows]}
+        values |= {"rejected": True} if case.rejected else {}
         blocks.append(block_of(SECTIONS["covariance"], values))
     if case.safety is not None:
         blocks.append(block_of(SECTIONS["safety_filter"], dict(case.safety), case.loop.units))

@@ -106,6 +106,7 @@ def identified_plant(result):
         loop=loop,
         uncertain=uncertain,
         covariance=covariance,
+        rejected=False,
     )
 
 

@@ -35,6 +35,10 @@ CAPTIONS = {
 }
 
 
+REJECTED = (
+    "these data reject the structure of the rig: intervals and [covariance] are those of a rejected"
+    " structure (rejected = true in rig.toml) and hold for no plant of another"
+)
 DOUBT = 1e-3
 """Probability of a change from the prior below which data and prior contradict each other."""
 
@@ -65,6 +69,7 @@ def sentences_of(fit):
                 " tuning"
             )
         words += [_proposal(fit)] if fit.law else []
+        words += [REJECTED] if _is_rejected(fit) else []
     return words
 
 
@@ -186,10 +191,18 @@ def lacking(fit):
 
 
 def marked(fit):
-    """Return the identified case; its name, with which answers begin, says what it lacks."""
+    """Return the identified case; its name, with which answers begin, says what it lacks, and its
+    [covariance] whether the data reject its structure.
+    """
     case, lacks = fit.identified, lacking(fit)
+    case = dataclasses.replace(case, rejected=_is_rejected(fit))
     name = f"{case.name}{LACKS}{listed(lacks)}"
     return dataclasses.replace(case, name=name) if lacks else case
+
+
+def _is_rejected(fit):
+    """Whether the data reject the structure of the rig."""
+    return fit.status != "interrupted" and not fit.structure.clean
 
 
 def _explained(fit):
@@ -337,6 +350,8 @@ def _prior(fit):
     words = [
         f"prior: the [covariance] of {', '.join(fit.prior['names'])} in {fit.case.name!r}, of other"
         " data than these (--no-prior: these data alone)"
+        + "; those data rejected the structure with which it was estimated"
+        * fit.case.rejected
     ]
     if fit.prior["probability"] < DOUBT:
         words.append(

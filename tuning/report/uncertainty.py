@@ -94,8 +94,16 @@ def json_of(ensemble):
 
 
 def remarks_of(ensemble):
-    """Return warnings on the draws: that the steps are too long for the rig before any is drawn."""
-    return [
+    """Return warnings on the draws: that the steps are too long for the rig before any is drawn,
+    and that they are of a rejected structure.
+    """
+    drawn = ensemble.case.rejected and "identified" in ensemble.distributions
+    rejected = (
+        f"draws are from the [covariance] of {ensemble.case.name}, of a structure that the data of"
+        " its identification reject: they say nothing of a plant of another structure; identify"
+        " again with --accept or --refine"
+    )
+    return [rejected] * drawn + [
         f"of the rig before any draw: {line}"
         for line in step_size.step_warnings(ensemble.case.loop, ensemble.case.clock)
     ]

@@ -82,10 +82,19 @@ def test_a_rig_without_what_the_data_require_says_so_in_its_name(tmp_path):
     assert "set nothing: the values below are those of a rig without what" in str(advice_of(fit))
     again = rig.load(tmp_path / "lacks" / "rig.toml")
     assert again.name.endswith("identified, lacks pump-delay:1")
+    assert again.rejected and "rejected = true" in fit.to_json()["message"]
+    draws = tuning.ensemble(again, samples=2, key=0)
+    assert "reject" in draws.to_json()["remarks"][0] and "reject" in str(draws.report())
+    stated = tuning.ensemble(again, {"plant.drain": 0.05}, samples=2, key=0)
+    assert "remarks" not in stated.to_json()  # its covariance is not used
     t, u, y = record(("pump-delay", 20.0))
     data = tuning.log(t=t, u=u, y=y)
     right = tuning.identify(again, data, starts=1, hold_back=0, accept=["pump-delay"], prior=False)
     assert right.diagnosis["clean"] and ", lacks" not in right.identified.name
+    right.save(tmp_path / "right")
+    text = (tmp_path / "right" / "rig.toml").read_text()
+    assert "[covariance]" in text and "rejected" not in text
+    assert not rig.loads(text).rejected and "rejected" not in right.to_json()["message"]
 
 
 def test_a_scale_error_of_every_sensor_is_seen_by_no_test_and_the_advice_says_so():
