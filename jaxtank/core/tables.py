@@ -5,6 +5,7 @@ signs, rows of units, time stamps.
 import codecs
 import csv
 import datetime as dt
+import functools
 import io
 import math
 import re
@@ -218,30 +219,29 @@ def _labview(text: str, name: str) -> tuple[list[tuple[int, list[str]]], str]:
         elif in_header:
             facts[first] = rest
         elif first == "X_Value":
-            segment = cells[: cells.index("Comment")] if "Comment" in cells else cells
-            if segment.count("X_Value") > 1 or facts.get("X_Columns", ["One"])[0] != "One":
-                raise DataError(
-                    f"{name}, line {line}: its X values are not in one column for all channels:"
-                    " write the file with 'One column only' for X values, or as CSV with a column"
-                    " 't [s]'"
-                )
-            if not names:
-                rows = _labview_heads(line, segment, facts)
-            others, names, begins = names not in ([], segment), segment, begins or len(rows)
-            if others:
+            heads = _labview_heads(line, cells, facts, name)
+            if names not in ([], heads[0][1]):
                 raise DataError(_another_segment(name, line, "has other channels"))
+            if not names:
+                rows, begins, names = heads, len(heads), heads[0][1]
         elif names and any(cells):
             if len(rows) > begins and first == rows[begins][1][0]:
                 raise DataError(_another_segment(name, line, f"begins again at X_Value {first}"))
             rows.append((line, (cells + [""] * len(names))[: len(names)]))
-    return rows, facts.get("Decimal_Separator", [""])[0]
+    return rows, "".join(facts.get("Decimal_Separator", [])[:1])
 
 
 def _labview_heads(
-    line: int, names: list[str], facts: dict[str, list[str]]
+    line: int, cells: list[str], facts: dict[str, list[str]], name: str
 ) -> list[tuple[int, list[str]]]:
     """Return the rows of names and, where any is known, of units of a LabVIEW measurement file."""
-    units = ["s" if facts.get("X_Dimension", ["Time"])[0] == "Time" else ""]
+    names = cells[: cells.index("Comment")] if "Comment" in cells else cells
+    if names.count("X_Value") > 1 or facts.get("X_Columns", ["One"])[:1] != ["One"]:
+        raise DataError(
+            f"{name}, line {line}: its X values are not in one column for all channels: write the"
+            " file with 'One column only' for X values, or as CSV with a column 't [s]'"
+        )
+    units = ["s" if facts.get("X_Dimension", ["Time"])[:1] == ["Time"] else ""]
     units += facts.get("Y_Unit_Label", [])
     units = [unit if is_known(unit_name(unit)) else "" for unit in units][: len(names)]
     return [(line, names), *([(line, units)] if any(units) else [])]
@@ -414,29 +414,42 @@ def _number_and_unit(cell: str) -> tuple[str, str]:
     """Return (number, unit) of a cell such as "12.3 cm"; (the cell, "") of another."""
     text = cell.translate(SPACES)
     parts = re.fullmatch(r"([-+]?[\d.,]*\d[.,]?(?:[eE][-+]?\d+)?)((?:[^\W\d_]|%).*)", text)
-    return (parts[1], parts[2]) if parts and is_known(unit_name(parts[2])) else (text, "")
+    return (parts[1], parts[2]) if parts and _stands_for_unit(parts[2]) else (text, "")
+
+
+@functools.lru_cache(maxsize=4096)
+def _stands_for_unit(text: str) -> bool:
+    """Whether a text behind a number is its unit."""
+    return is_known(unit_name(text.translate(SPACES)))
 
 
 def in_one_unit(column: Column, sign: str) -> Column:
     """Return a column whose cells have units with numbers in that of its head, or of its first
     cell; a cell that does not convert stays, for `numbers` to refuse. sign: the decimal one.
     """
-    if not re.search(r"[^\W\d_]|%", "".join(column.cells)):
+    tails = re.findall(
+        r"\d[.,]?[^\S\n]*((?:[^\W\d_]|%)[^\n:]{0,20})$", "\n".join(column.cells), re.MULTILINE
+    )
+    if not any(map(_stands_for_unit, {*tails})):
         return column
     parts = [_number_and_unit(cell) for cell in column.cells]
-    base = column.unit or next((unit for _, unit in parts if unit), None)
-    bare = any(not unit and NUMBERS[sign].fullmatch(text) for text, unit in parts)
-    if base is None or (bare and not column.unit):
+    base = column.unit or next((unit for _, unit in parts if unit), "")
+    bare = (not unit and NUMBERS[sign].fullmatch(text) for text, unit in parts)
+    if not base or (not column.unit and any(bare)):
         return column
-    cells: list[str] = []
-    for cell, (text, unit) in zip(column.cells, parts):
-        size = factor(unit_name(unit), unit_name(base)) if unit else None
-        if size is not None and NUMBERS[sign].fullmatch(text):
-            group = "," if sign == "." else "."
-            value = float(text.replace(group, "").replace(sign, "."))
-            cell = text if size == 1.0 else repr(value * size).replace(".", sign)
-        cells.append(cell)
-    return column._replace(unit=base, cells=cells)
+    rows = zip(column.cells, parts)
+    cells = [_in_unit(text, unit, base, sign) if unit else cell for cell, (text, unit) in rows]
+    changed = [new or cell for new, cell in zip(cells, column.cells)]
+    return column._replace(unit=base, cells=changed)
+
+
+def _in_unit(text: str, unit: str, base: str, sign: str) -> str:
+    """Return a number with a unit as a number in another, "" where it does not convert."""
+    size, group = factor(unit_name(unit), unit_name(base)), "," if sign == "." else "."
+    if size is None or not NUMBERS[sign].fullmatch(text):
+        return ""
+    value = float(text.replace(group, "").replace(sign, "."))
+    return text if size == 1.0 else repr(value * size).replace(".", sign)
 
 
 def numbers(table: Table, column: int) -> tuple[np.ndarray, dict[str, int]]:

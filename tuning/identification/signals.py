@@ -131,11 +131,7 @@ def _long(table, t, tag, value, unit, quality):
 def _wide(table, used, t):
     """Return the signals of a table with a column for each."""
     rest = sorted({*range(len(table.columns))} - {*used})
-    judged = {i: name for i in rest if (name := _judged(table.columns[i])) is not None}
-    values = [compact(table.columns[i].name) for i in rest if i not in judged]
-    for i, name in [*judged.items()]:  # TRUE and FALSE are states of what has no values
-        if states_of(table.columns[i]) is not None and not any(name in value for value in values):
-            del judged[i]
+    judged = _qualities(table.columns, rest)
     plain, marks = [i for i in rest if i not in judged], {}
     for i, name in judged.items():
         of = [j for j in plain if compact(table.columns[j].name) == name != ""]
@@ -143,6 +139,17 @@ def _wide(table, used, t):
             of = plain if [name] == [*judged.values()] == [""] else [j for j in plain if j < i][-1:]
         marks |= dict.fromkeys(of, table.columns[i].cells)
     return [Signal(table, i, t, marks.get(i, [])) for i in plain]
+
+
+def _qualities(columns, rest):
+    """Return {column of qualities: what it judges} among some; TRUE and FALSE of what has no values
+    are its states.
+    """
+    judged = {i: name for i in rest if (name := _judged(columns[i])) is not None}
+    values = [compact(columns[i].name) for i in rest if i not in judged]
+    states = [i for i in judged if states_of(columns[i]) is not None]
+    alone = [i for i in states if not any(judged[i] in value for value in values)]
+    return {i: name for i, name in judged.items() if i not in alone}
 
 
 def compact(text):
@@ -189,16 +196,19 @@ def setpoint_of(text, names):
     rest, tanks = [part for part in parts if part not in SETPOINT], [*names]
     if len(rest) == len(parts):
         return None
-    if not rest and len(tanks) == 1:
-        return tanks[0]
-    number = rest[-1] if rest and rest[-1].isdigit() else ""
-    if rest == [number] and 0 < int(number) <= len(tanks):
-        return tanks[int(number) - 1]
     own = [i for i, of in names.items() if any(_within(compact(n), rest) for n in of)]
-    beside = "".join(rest[-2:-1])
-    if not own and (beside[:1] in ("", "l") or WORDS.get(beside) == "h"):  # FIC101: of a flow
-        own = [i for i, of in names.items() if any(number == _digits(n) != "" for n in of)]
+    own = own or (_of_number(rest, names) if rest else tanks)
     return own[0] if len(own) == 1 else None
+
+
+def _of_number(parts, names):
+    """Return the tanks whose number ends the parts of a name: of an output where it is alone."""
+    number, beside = parts[-1], "".join(parts[-2:-1])
+    if not number.isdigit() or not (beside[:1] in ("", "l") or WORDS.get(beside) == "h"):
+        return []  # FIC101: of a flow
+    if not beside and 0 < int(number) <= len(names):
+        return [[*names][int(number) - 1]]
+    return [i for i, of in names.items() if any(number == _digits(n) for n in of)]
 
 
 def _within(name, parts):

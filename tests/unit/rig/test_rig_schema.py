@@ -36,7 +36,7 @@ fault = [
     { sensor = "left", kind = "spikes", start = 20.0, end = 80.0, size = 0.3, every = 7.0 },
 ]
 schedule = { gains = ["controller.Kc[0]"], variable = "r1", knots = [3.0, 6.0] }
-covariance = { names = ["plant.drain[0]"], matrix = [[0.0001]] }
+covariance = { names = ["plant.drain[0]"], matrix = [[0.0001]], rejected = true }
 scenario = [{ name = "noisy", seed = 7, weight = 2.0, values = { "sensor.noise" = 0.1 } }]
 [[pump]]
 name = "P-101"
