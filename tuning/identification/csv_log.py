@@ -185,6 +185,8 @@ class LogFile:
         if not used:
             return t, used
         self.time = columns[used[-1]]
+        if "t" not in self.named:
+            self._found(self.time.header, "t", columns)  # not twice
         columns[used[-1]] = self.time._replace(unit=self.units.get("t", self.time.unit))
         try:
             t = seconds(self.table, used[-1], order)
@@ -401,6 +403,8 @@ class LogFile:
 
     def _like_input(self, signal: Signal) -> bool:
         """Whether a signal without a name of the rig may be the input of a pump."""
+        if any(signal is setpoint for setpoint in self.setpoints.values()):
+            return False
         if (states := states_of(signal.described)) is not None:
             return len(np.unique(states[np.isfinite(states)])) > 1
         unit = unit_name(signal.described.unit or self.loop.units[1])

@@ -196,6 +196,7 @@ def test_without_a_pump_it_is_a_drain_test(tmp_path, loop):
     with pytest.raises(LogError):  # where another column may be the pump's, it is asked
         read_log(written(tmp_path, wide([*head, "speed"], T, *Y.T, U)), loop)
     read_log(written(tmp_path, wide([*head, "TT101 [°C]"], T, *Y.T, U)), loop)
+    read_log(written(tmp_path, wide([*head, "LT101.SP"], T, *Y.T, U)), loop)
 
 
 def test_the_log_table_of_a_rig_may_hold_columns_and_units_apart(tmp_path):

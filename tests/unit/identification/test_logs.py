@@ -329,6 +329,8 @@ BAD = {  # a file, and what the message must hold
                                   "column 'pump2 [V]'", "'2.8' is not a number"),
     "decimal comma between commas": (text(cells=COMMA), "10 cells under 7 "),
     "two for one": (headed("h2 [cm]", "y1 [cm]"), "'h1 [cm]' and 'y1 [cm]' both look like h1"),
+    "two for time": (text(HEADER + ",t [s]", [[*r, "1"] for r in rows()]),
+                     "line 1: two columns are called 't [s]'"),
     "no pump": (headed("pump2 [V]", "valve [V]"), "no column for pump2", "--column pump2=HEADER"),
     "no time": (headed("t [s]", "n"), "line 1: no column for t"),
     "no level": ("t [s],pump1 [V],pump2 [V],a\n0,3,3,1\n1,3,3,1\n", "no column for a level"),
