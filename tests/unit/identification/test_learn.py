@@ -100,6 +100,18 @@ def test_the_error_of_a_batch_is_to_its_own_setpoints(case, tmp_path, header):
     np.testing.assert_allclose(log.part(10, 20).setpoints[0][1], own[10:20])
 
 
+def test_a_setpoint_that_is_written_on_change_is_held(case, tmp_path):
+    """Of a row each 1 s of t; one that is never written is none."""
+    rows = [(k, 2, 10 + k, 12.5 if k == 4 else "", "") for k in range(8)]
+    text = "\n".join(",".join(map(str, row)) for row in rows)
+    (tmp_path / "log.csv").write_text(f"t [s],pump1 [V],h1 [cm],h1.SP [cm],SP7 [cm]\n{text}\n")
+    log = tuning.read_log(tmp_path / "log.csv", case.loop)
+    _, held = log.setpoints[0]
+    np.testing.assert_array_equal(held, [np.nan] * 4 + [12.5] * 4)
+    (tmp_path / "log.csv").write_text((tmp_path / "log.csv").read_text().replace("12.5", ""))
+    assert not tuning.read_log(tmp_path / "log.csv", case.loop).setpoints
+
+
 def test_columns_that_are_no_setpoint_of_a_level_leave_those_of_the_rig(case, tmp_path):
     """A setpoint of a flow, of a unit that no level has, and of another loop."""
     run = jaxtank.simulate(case.loop, case.clock)
