@@ -277,8 +277,8 @@ def refuse_used(loop, logs, names):
     pumps, length, drive = loop.plant.pumps, *loop.units
     of_pumps = [(f"plant.pump_gain[{j}]", 1 + j, "flows", "inputs") for j in range(pumps)]
     for log in logs:
-        of_tanks = [(f"plant.area[{i}]", 1 + pumps + c, "volumes", "levels")
-                    for c, i in enumerate(log.tanks)]  # fmt: skip
+        areas = {f"plant.area[{i}]": 1 + pumps + c for c, i in enumerate(log.tanks)}
+        of_tanks = [(name, column, "volumes", "levels") for name, column in areas.items()]
         for name, column, what, became in of_pumps + of_tanks:
             unit = log.units and unit_name(log.units[column] or "")
             volume = unit and factor(length, "m") and factor(unit, f"{length}^3")
