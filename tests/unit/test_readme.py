@@ -5,6 +5,7 @@ folder maps hold.
 import re
 import shlex
 import tomllib
+from pathlib import Path
 
 import jax
 import pytest
@@ -47,6 +48,8 @@ def words(line):
 
 LINES = [line for block in blocks("sh") for line in block.replace("&&", "\n").splitlines()]
 COMMANDS = list(dict.fromkeys(words(line) for line in LINES if line.strip()[:7] == "jaxtank"))
+KEPT = {words(line): line.partition(" >")[2].split()[0] for line in LINES if " >" in line}
+"""{command: the file that its output goes to}"""
 
 
 def anchors(page):
@@ -110,7 +113,8 @@ def test_the_python_example_runs_and_is_short(capsys, monkeypatch):
 def test_the_python_example_is_tuned(capsys):
     exec(first_example()[0], {})
     printed = capsys.readouterr().out
-    assert "converged" in printed and "0.03987" in printed
+    assert printed.startswith("0.0819") and "ngpc: converged" in printed
+    assert "RMS error 0.0778 cm" in printed and "controller.Tp" in printed
 
 
 def test_the_rig_in_python_runs(capsys, monkeypatch):
@@ -182,10 +186,14 @@ def test_commands_parse():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("line", COMMANDS, ids=" ".join)
+@pytest.mark.parametrize("line", [c for c in COMMANDS if "host:8786" not in c], ids=" ".join)
 def test_commands_run(line, tmp_path_factory, monkeypatch, capsys):
+    """All but the one on a scheduler of the reader's; in their order, in one folder."""
     monkeypatch.chdir(tmp_path_factory.getbasetemp())
-    assert main.main(list(line)) == 0, capsys.readouterr().err
+    code, printed = main.main(list(line)), capsys.readouterr()
+    assert code == 0, printed.err
+    if line in KEPT:
+        Path(KEPT[line]).write_text(printed.out)
 
 
 @pytest.mark.parametrize("name", PAGES)
