@@ -120,11 +120,11 @@ tuning.compare_experiments(case, free, duration=0.0, inputs=inputs, **usual)
 # ## The estimate
 #
 # The rig is simulated with the recorded voltage, and Gauss-Newton with exact sensitivities reduces
-# the difference to the readings. Four searches start from different points. The last quarter of the
+# the difference to the readings. Two searches start from different points. The last quarter of the
 # record is kept for validation: a fit to the first three quarters predicts it.
 
 # %%
-found = tuning.identify(guess, record, free, starts=4, law="pi")
+found = tuning.identify(guess, record, free, starts=2, law="pi")
 found
 
 # %% [markdown]
@@ -147,7 +147,7 @@ found
 
 # %%
 sizes = (96, 192, 256, 768, 1024)
-part = lambda n: tuning.identify(guess, record.part(0, n), free, starts=2, hold_back=0)
+part = lambda n: tuning.identify(guess, record.part(0, n), free, starts=1, hold_back=0)
 fits = {n: part(n) for n in sizes}
 overflow = float(record.t[np.argmax(record.y[:, 0] > 9.9)])  # s
 
