@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.core.tree import describe, get_value
+from jaxtank.core.tree import describe, get_value, parameters
 from jaxtank.limits import limited_levels
 from jaxtank.loop.trajectory import csv
 from tuning.problem.problem import TAIL
@@ -131,11 +131,26 @@ def advice_of(result):
     ]
     if result.tuned.loop.safety_filter is not None and result.case.loop.safety_filter is None:
         moved.insert(advice.FEW - 1, "safety filter on")
+    moved += [f"{name} stays {amount}" for name, amount in _tracking_times(result)]
     to_set = f"Set {advice.listed(moved)}" if moved else "Nothing to set: no better gains known"
     unfinished = {"interrupted": "interrupted", "not_converged": "the search has not converged"}
     if why := unfinished.get(result.status):
         to_set += f" ({why})"
     return advice.Advice(f"{to_set}.", f"It gives: {'; '.join(_gives(result))}.", _beyond(result))
+
+
+def _tracking_times(result):
+    """[(name, value with unit)] of tracking times that stay while their integral times change: left
+    out of a rig file, they would follow these.
+    """
+    controller = result.tuned.loop.controller
+    tuned, rows = {name.partition("[")[0] for name in result.parameters}, []
+    for own, value in parameters(controller).items():
+        Tt, Ti = f"controller.{own}", f"controller.{own.removesuffix('Tt')}Ti"
+        if own.endswith("Tt") and value is not None and Ti in tuned and Tt not in tuned:
+            numbers = ", ".join(verdicts.shown(v, 4) for v in np.unique(np.asarray(value)))
+            rows.append((Tt, f"{numbers} {describe(controller, own)['unit']}"))
+    return rows
 
 
 def _gives(result):
@@ -253,6 +268,8 @@ def _values(result, answer):
         if not p["exercised"]:
             remark = "unchanged: no effect in any run"
         rows.append([f"{name} [{p['unit']}]", *(Value(p[s], 4) for s in SIDES), remark])
+    for name, amount in _tracking_times(result):
+        rows.append([name, amount, amount, "not tuned"])
     loop = result.case.loop
     row = ["safety filter", "off" if loop.safety_filter is None else "on", "off", ""]
     if answer.setting.filter is not None:

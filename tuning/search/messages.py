@@ -143,14 +143,16 @@ def _near_the_edge(result: TuningResult) -> Messages:
     before, after = (float(m.get("sensitivity_peak", np.nan)) for m in sides)
     if not after > FRAGILE:  # NaN: it has none
         return
-    where = f"{'beyond' if np.isinf(after) else 'at'} the edge of sampled stability"
-    peak = "the linearised loop is unstable" if np.isinf(after) else f"Ms = {after:.3g}"
+    unstable = np.isinf(after)
+    where = "beyond the edge of sampled stability" if unstable else "near the edge of stability"
+    peak = "the linearised loop is unstable" if unstable else f"Ms = {after:.3g}"
+    step = "a smaller step or " * bool(unstable)
     old = "unstable" if np.isinf(before) else f"{before:.3g}"
     yield Message(
         "edge-of-stability",
         f"{where}: {peak} at a plateau, {old} before (sensitivity peak of the sampled loop, at most"
-        " 2 is usual): --limit sensitivity_peak=2 bounds it, a smaller step or narrower ranges"
-        " (--free) may help",
+        f" 2 is usual): --limit sensitivity_peak=2 bounds it, {step}narrower ranges (--free) may"
+        " help",
         f"{where} ({peak})",
     )
 

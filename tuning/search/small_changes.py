@@ -157,9 +157,21 @@ def move_back(setting: Setting, solution: Solution) -> None:
     if not highest > allowed:
         return
     line = z + np.arange(1, LINE + 1)[:, None] / LINE * (first - z)
-    ceiling, violation = point.cost + PRICE * abs(point.cost), search.violation(point)
+    calm = lambda each: _peak(setting, problem, each) <= allowed
+    # at any price below that of the start where PRICE does not do: a fragile loop is no answer
+    for ceiling in (point.cost + PRICE * abs(point.cost), search.point(first).cost):
+        each = _first_calm(search, line, calm, ceiling, search.violation(point))
+        if each is not None:
+            solution.z, solution.kept = each, each == first
+            return
+
+
+def _first_calm(search, line, calm, ceiling, violation):
+    """The first point of a line that is calm and costs at most `ceiling`, or the end of the line
+    where this costs hardly more; None where there is none.
+    """
     for some in np.split(line, LINE // STRIDE):
-        low = np.array([_peak(setting, problem, each) <= allowed for each in some])
+        low = np.array([calm(each) for each in some])
         if not low.any():
             continue
         costs, _ = search.evaluator.screen(some)
@@ -167,11 +179,10 @@ def move_back(setting: Setting, solution: Solution) -> None:
             there = search.point(each)
             if search.violation(there) <= violation:
                 dearest = min(ceiling, there.cost + WORTH * abs(there.cost))
-                start = search.point(first)
-                if start.cost <= dearest and search.violation(start) <= violation:
-                    each = first.copy()
-                solution.z, solution.kept = each, each == first
-                return
+                start = search.point(line[-1])
+                near = start.cost <= dearest and search.violation(start) <= violation
+                return line[-1].copy() if near else each
+    return None
 
 
 def _descended(setting, solution, highest):

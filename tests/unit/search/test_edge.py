@@ -62,7 +62,7 @@ def test_a_nominal_answer_with_a_high_sensitivity_peak_is_news_of_the_headline(f
     found = command("tune", str(fragile), *fixed, *WORDS, "--json").json
     assert found["measures"]["before"]["sensitivity_peak"] > 6.0
     assert found["measures"]["after"]["sensitivity_peak"] > 4.0
-    assert "at the edge of sampled stability (Ms = " in found["headline"]
+    assert "near the edge of stability (Ms = " in found["headline"]
 
 
 @pytest.mark.slow
