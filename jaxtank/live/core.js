@@ -254,7 +254,8 @@ function marginsOf(limits, measures) {
 const OFF = 0.05; // share of a tank's height by which a level may miss its setpoint
 const SHARE = 0.5, SMALL = 0.005; // of the largest step that it may miss, where steps are above SMALL of the height
 const SATURATED = 0.5; // share of the samples at a pump limit
-const EMPTY = 1e-4; // share of a height below which a pump that draws from the tank runs dry
+// shares of a height below which a tank is empty, and above which it is not, whatever a pump draws from it in a step
+const EMPTY = 1e-4, DREGS = 0.01;
 const EXACT = 1e-4; // share below which a miss is not worth a number
 
 // {good, words} of the measures of a run, null for a loop without feedback
@@ -320,6 +321,18 @@ function limitsOf(margins, measures) {
 }
 
 // what is wrong though no limit names it: a level above its rim, liquid that spills, a pump that draws from an empty tank
+// the level at and below which a tank is empty for a pump that draws from it; share: at the values of the rig, of
+// what the tank holds up to DREGS of its rim, what one step of the pump at its upper limit takes
+function dryLevel(info, inForce, pump, tank, share) {
+  const ratio = (name) => {
+    const usual = info.leaves.find((leaf) => leaf.name === name)?.value;
+    return usual ? inForce(name, usual) / usual : 1;
+  };
+  const drawn = share * ratio(`plant.pump_gain[${pump}]`) * ratio(`actuator.high[${pump}]`);
+  const held = ratio(`plant.area[${tank}]`) * ratio(`plant.rim[${tank}]`);
+  return Math.max(EMPTY, DREGS * Math.min(1, drawn / held)) * rimIn(info, inForce, tank);
+}
+
 function beyond(info, inForce, measures) {
   const unit = info.units.length, highest = measures.max_level, lowest = measures.min_level, spilled = measures.overflow_volume;
   const named = new Set(limitsIn(info, inForce).filter(({ measure, entry, upper }) =>
@@ -331,8 +344,8 @@ function beyond(info, inForce, measures) {
     if (entryOf(highest, i) > rim * (1 + 1e-9)) words.push(`${name} rises to ${shown(entryOf(highest, i), 3)} ${unit}, above its rim of ${shown(rim, 3)} ${unit}`);
     else if (spilled !== undefined && entryOf(spilled, i) > 0) words.push(`${shown(entryOf(spilled, i), 3)} ${unit}^3 spill over the rim of ${name}`);
   });
-  for (const [pump, tank] of info.draws)
-    if (entryOf(lowest, tank) <= EMPTY * rimIn(info, inForce, tank))
+  for (const [pump, tank, share] of info.draws)
+    if (entryOf(lowest, tank) <= dryLevel(info, inForce, pump, tank, share))
       words.push(`${info.tanks[tank].name}, from which ${info.pumps[pump].name} draws, runs empty`);
   return words;
 }

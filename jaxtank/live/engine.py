@@ -22,7 +22,7 @@ from jaxtank.controllers import OnOff, OpenLoop
 from jaxtank.core.labels import input_unit, label_of, place_of
 from jaxtank.core.tree import describe, get_value, parameters
 from jaxtank.export.whole import WholeLoop, library, whole_loop
-from jaxtank.limits import limit_scale, resolve_limits
+from jaxtank.limits import draws, limit_scale, resolve_limits
 from jaxtank.live.printed import Printed, maths
 from jaxtank.loop.closed_loop import draws_bursts
 from jaxtank.signals.setpoints import Ramps
@@ -266,7 +266,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         ],
         "leaves": _leaves(loops),
         "setpoints": _setpoints(loop),
-        "draws": _draws(plant),
+        "draws": draws(case),
         "measures": [_measure(case, m, entries) for m, entries in loops[-1].measures.items()],
         "limits": _limits(case),
         "free": [b.name for b in free],
@@ -285,11 +285,6 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         "noise": draws_bursts(loop) or bool(np.any(np.asarray(loop.sensor.noise) > 0)),
         "tracks": not isinstance(loop.controller, OpenLoop | OnOff),
     }
-
-
-def _draws(plant):
-    """[[pump, the tank from which it draws]]."""
-    return [[j, i] for j, i in enumerate(getattr(plant, "sources", ()) or ()) if i is not None]
 
 
 def _setpoints(loop):

@@ -84,7 +84,7 @@ def of_run(case: Case, values: Mapping[str, Any]) -> Advice:
     broken = [row["words"] for row in rows if not row["margin"] >= 0.0]
     words = [f"limits held: {len(rows) - len(broken)} of {len(rows)}"] if rows else []
     words += [f"broken: {listed(broken)}"] if broken else []
-    words += verdicts.beyond(case.loop, values, rows)
+    words += verdicts.beyond(case, values, rows)
     if "rms_error_total" in values:
         error = float(np.ravel(values["rms_error_total"])[0])
         words.insert(0, f"RMS error {amount(error, case.loop.units[0])}")

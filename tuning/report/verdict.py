@@ -8,7 +8,7 @@ import dataclasses
 import decimal
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.controllers import OnOff, OpenLoop
 from jaxtank.core.labels import label_of, labels_of
-from jaxtank.limits import limit_scale, resolve_limits
+from jaxtank.limits import draws, dry_level, limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.signals.setpoints import Ramps
 
@@ -36,9 +36,6 @@ SATURATED = 0.5
 """Share of the samples at a pump limit from which a large RMS error is no transient."""
 
 WHEN = "time_of_steady_state_error"
-
-EMPTY = 1e-4
-"""Share of a tank's height below which a pump that draws from it runs dry."""
 
 EXACT = 1e-4
 """Share of a tank's height below which a miss is not worth a number."""
@@ -101,25 +98,23 @@ def of_run(case: Case, values: Mapping[str, Any]) -> Verdict:
     rows = limit_rows(case, values)
     return Verdict(
         tracking=tracking(case.loop, values),
-        limits=limits(rows, beyond(case.loop, values, rows)),
+        limits=limits(rows, beyond(case, values, rows)),
         robustness=robustness(values),
     )
 
 
-def beyond(
-    loop: ClosedLoop, values: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]
-) -> list[str]:
+def beyond(case: Case, values: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return what is wrong though no limit of `rows` names it: a level above its rim, liquid that
     spills over it, a pump that draws from an empty tank.
     """
-    plant: Any = loop.plant
+    loop, plant = case.loop, cast(Any, case.loop.plant)
     if "max_level" not in values or not hasattr(plant, "rim"):
         return []
     rims = np.broadcast_to(plant.rim, plant.tanks)
     tops = [row for row in rows if row["measure"] in ("max_level", "overflow_volume")]
     limits = {row["tank"]: row["limit"] for row in tops}
     free = [i for i, rim in enumerate(rims) if not limits.get(i + 1, np.inf) <= 2.0 * rim]
-    return [*_past_rims(loop, values, rims, free), *_dry_pumps(plant, values, rims)]
+    return [*_past_rims(loop, values, rims, free), *_dry_pumps(case, values, rims)]
 
 
 def _column(values, name, size):
@@ -139,11 +134,12 @@ def _past_rims(loop, values, rims, tanks):
             yield f"{shown(spilled[i])} {unit}^3 spill over the rim of {tank}"
 
 
-def _dry_pumps(plant, values, rims):
+def _dry_pumps(case, values, rims):
     """On pumps that draw from a tank that is empty at some time."""
+    plant = case.loop.plant
     lowest = _column(values, "min_level", len(rims)) if "min_level" in values else np.inf + rims
-    for j, i in enumerate(getattr(plant, "sources", ()) or ()):
-        if i is not None and lowest[i] <= EMPTY * rims[i]:
+    for j, i, share in draws(case):
+        if lowest[i] <= dry_level(rims[i], share):
             tank, pump = label_of(plant, "tank", i), label_of(plant, "pump", j)
             yield f"{tank}, from which {pump} draws, runs empty"
 
@@ -334,7 +330,7 @@ def of_tuning(result: Any) -> Verdict:
     return Verdict(
         outcome=Part(result.headline.replace("_", " "), result.success),
         tracking=_tracking_of_answer(case.loop, values, answer),
-        limits=limits(rows, beyond(case.loop, values, rows)),
+        limits=limits(rows, beyond(case, values, rows)),
         plants=_validated(result) if answer is None else _judged(answer),
         robustness=robustness(values),
     )
