@@ -2,6 +2,7 @@
 of its pumps (upper limits are not checked).
 """
 
+from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
@@ -16,6 +17,12 @@ def steady_inflow(loop: Any) -> Any:
     pulses end.
     """
     level: Any = None if loop.disturbance is None else loop.disturbance.steady()
+    return level if level is not None and _lasts(level) else None
+
+
+def start_inflow(loop: Any) -> Any:
+    """Inflow (n,) [cm^3/s] at t = 0 that no pump brings; None without any."""
+    level: Any = None if loop.disturbance is None else loop.disturbance.at_start()
     return level if level is not None and _lasts(level) else None
 
 
@@ -38,13 +45,15 @@ def sharing(loop: Any) -> Any:
     return Partial(cls.shared, controller, inflow=measured)
 
 
-def steady_state(loop: Any, y: Any, plant: Any = None) -> tuple[Any, Any]:
-    """Return levels and inputs at which a loop stands still with outputs y."""
+def steady_state(
+    loop: Any, y: Any, plant: Any = None, inflow: Callable[[Any], Any] = steady_inflow
+) -> tuple[Any, Any]:
+    """Return levels and inputs at which a loop stands still with outputs y and an inflow."""
     low = loop.actuator.driving(tuple(np.asarray(loop.actuator.low, dtype=float)))
     x, u = equilibrium(
         loop.plant if plant is None else plant,
         y,
-        steady_inflow(loop),
+        inflow(loop),
         np.asarray(low, dtype=float),
         sharing(loop),
     )

@@ -14,7 +14,7 @@ from jaxtank.core.text import shortened
 from jaxtank.core.tree import number
 from jaxtank.core.units import DEFAULT
 from jaxtank.instruments import Actuator, LevelSensor, PumpBank, Sensor
-from jaxtank.loop.steady import steady_inflow, steady_state
+from jaxtank.loop.steady import start_inflow, steady_state
 from jaxtank.observers import (
     Direct,
     DisturbanceObserver,
@@ -296,7 +296,7 @@ BIASES = ("bias", "inner_bias")
 def with_bias(controller, loop, inputs, names=BIASES):
     """Return a controller whose fields `names` of BIASES are those of steady inputs (m,)."""
     biases = {"bias": inputs}
-    inflow = steady_inflow(loop)
+    inflow = start_inflow(loop)
     if isinstance(controller, controllers.SplitRange | controllers.Ratio):
         biases["bias"] = controller.total(inputs)
     if isinstance(controller, controllers.Cascade):
@@ -316,7 +316,8 @@ def _steady_levels(loop):
     """Levels (n,) of the steady state with the outputs of x0; x0 without one."""
     start = np.asarray(loop.x0, dtype=float)
     try:
-        return np.asarray(steady_state(loop, start[list(loop.plant.outputs)])[0], dtype=float)
+        outputs = start[list(loop.plant.outputs)]
+        return np.asarray(steady_state(loop, outputs, inflow=start_inflow)[0], dtype=float)
     except (EquilibriumError, InputError, FloatingPointError):
         return start
 
@@ -421,7 +422,7 @@ def steady_bias(loop, known: bool | list[bool] = False):
     """Return (m,) inputs that hold the outputs at x0; those before t = 0 if `known`."""
     bank, start = loop.actuator, np.asarray(loop.x0)[list(loop.plant.outputs)]
     try:
-        steady = np.clip(steady_state(loop, start)[1], bank.low, bank.high)
+        steady = np.clip(steady_state(loop, start, inflow=start_inflow)[1], bank.low, bank.high)
     except (EquilibriumError, InputError, FloatingPointError):
         return bank.initial
     return number(np.where(known, bank.initial, steady))

@@ -92,6 +92,10 @@ class Signal(Role):
         """Return the (channels,) values that last, or None: of pulses, which end."""
         return None
 
+    def at_start(self) -> Any:
+        """Return the (channels,) values at t = 0 as if they lasted, or None: of pulses."""
+        return self.steady()
+
 
 def sampled(signal: Signal, clock: Clock, arrays: bool = False) -> tuple[Any, Any, Any]:
     """Return `signal.sample(clock)`, whose vectors are arrays (samples, channels) if `arrays`."""
@@ -245,5 +249,13 @@ class Sum(Signal):
         return self.first.held()
 
     def steady(self) -> Any:
-        parts = [v for v in (self.first.steady(), self.second.steady()) if v is not None]
-        return sum(parts) if parts else None
+        return _added(self.first.steady(), self.second.steady())
+
+    def at_start(self) -> Any:
+        return _added(self.first.at_start(), self.second.at_start())
+
+
+def _added(*parts):
+    """The sum of those that are not None; None without any."""
+    known = [part for part in parts if part is not None]
+    return sum(known) if known else None

@@ -180,7 +180,21 @@ class InflowTable(Signal):
             spans = np.diff(times)
             after = rows[1:] if between == "linear" else rows[:-1]
             mean[tank] = mean[tank] + ((rows[:-1] + after) * (0.5 * spans / spans.sum())).sum()
-        return (np if isinstance(self.flow, np.ndarray) else jnp).stack(mean)
+        return self._stacked(mean)
+
+    def at_start(self) -> Any:
+        """Return the (tanks,) flow at t = 0 [cm^3/s]."""
+        flow = [0.0 * self.flow[0]] * self.width
+        for tank, between, times, rows in self.tables():
+            k = max(int(np.searchsorted(times, 0.0, side="right")) - 1, 0)
+            first = rows[k]
+            if between == "linear" and times[k] < 0.0 and k + 1 < len(times):
+                first = first - (rows[k + 1] - rows[k]) * times[k] / (times[k + 1] - times[k])
+            flow[tank] = flow[tank] + first
+        return self._stacked(flow)
+
+    def _stacked(self, flows):
+        return (np if isinstance(self.flow, np.ndarray) else jnp).stack(flows)
 
 
 def _means(clock, times, rows, linear):
