@@ -21,15 +21,19 @@ from jaxtank.signals.setpoints import Sine, index
 LEAST_SHARE = 0.01
 """Share of a measured inflow below which its gain is hardly meant [-]."""
 
+STILL = 0.02
+"""Share of a pump's range by which its input before t = 0 may miss that of the start [-]."""
+
 
 def case_warnings(case: Case) -> list[str]:
     """Return sentences on what in a case is hardly meant.
 
     A run that does not end at a sample, changes, inflow pulses and faults after its end, changes
     that overlap, what no sample sees, levels, limits and setpoints above a rim, pumps that start
-    outside their limits, valves that hardly open, gains of the wrong sign, derivatives shorter than
-    a sample, levels that may fall below 0, models that differ from the plant, estimates of
-    disturbances that the controller does not use. (Steps that are too long: `loop.step_size`.)
+    outside their limits or stood still before, valves that hardly open, gains of the wrong sign,
+    derivatives shorter than a sample, levels that may fall below 0, models that differ from the
+    plant, estimates of disturbances that the controller does not use. (Steps that are too long:
+    `loop.step_size`.)
 
     Parameters
     ----------
@@ -54,6 +58,7 @@ def case_warnings(case: Case) -> list[str]:
         *_above_rims(case),
         *_high_limits(case),
         *_pumps(case),
+        *_standing(case),
         *_openings(case),
         *_signs(case),
         *_derivative(case),
@@ -200,6 +205,27 @@ def _pumps(case):
             yield (
                 f"{label_of(case.loop.plant, 'pump', j)} runs at {volts:g} {drive} before t = 0,"
                 f" outside its limits of {low:g} and {high:g} {drive}"
+            )
+
+
+def _standing(case):
+    """On pumps with a dead time, lag or rate that stood still before t = 0, though the level of the
+    start needs an input.
+    """
+    bank, (_, drive) = case.loop.actuator, case.loop.units
+    part = getattr(case.loop.controller, "law", case.loop.controller)
+    if not isinstance(part, PID) or np.shape(part.bias) != (case.loop.plant.pumps,):
+        return
+    late = bank.delay or any(bank.delays) or bank.lag is not None or bank.rate is not None
+    if part.reads_inflow or not late:
+        return
+    for j, (first, bias) in enumerate(zip(np.asarray(bank.initial), np.asarray(part.bias))):
+        reach = float(bank.high[j] - bank.low[j])
+        if first == 0.0 and abs(bias) > STILL * (reach if np.isfinite(reach) else abs(bias)):
+            yield (
+                f"{label_of(case.loop.plant, 'pump', j)} ran at 0 {drive} before t = 0, where"
+                f" {bias:.4g} {drive} hold the level of the start: until its dead time, lag or rate"
+                f" is over the level leaves its start; initial = {bias:.4g} keeps it there"
             )
 
 

@@ -470,3 +470,36 @@ def test_an_element_that_cannot_be_is_refused_with_what_to_write(changes, words)
     }
     with pytest.raises(InputError, match=words):
         rig.from_table(table | changes)
+
+
+LATE = """
+units = ["m", "%"]
+dt = 5.0
+duration = "40 min"
+tank = [{ area = 1.0, rim = 2.0, drain = "6 cm^2", level = 0.8 }]
+pump = [{ to = 1, gain = "0.05 L/(s %)", high = 100.0, delay = 95.0 }]
+controller = { kind = "pi", Kc = 60.0, Ti = "10 min" }
+reference = { initial = [0.8] }
+"""
+
+
+def test_a_pump_that_stood_still_before_a_dead_time_is_noted_with_what_holds_the_start():
+    case = rig.loads(LATE)
+    (sentence,) = rig.case_warnings(case)
+    needed = 6e-4 * np.sqrt(2 * 9.81 * 0.8) / 5e-5  # % of the pump: the outflow at 0.8 m
+    assert f"initial = {needed:.4g} keeps it there" in sentence
+    begun = rig.loads(LATE.replace("delay = ", f"initial = {needed}, delay = "))
+    assert rig.case_warnings(begun) == []
+    level = np.asarray(jaxtank.simulate(begun.loop, begun.clock).x)[:, 0]
+    assert np.ptp(level) < 1e-3 < np.ptp(np.asarray(jaxtank.simulate(case.loop, case.clock).x))
+
+
+def test_a_bias_left_out_is_that_of_the_inflow_at_the_start_of_a_table():
+    """1 L/s of 6 cm^2 sqrt(2 g 0.8 m) = 2.377 L/s flows in at first, 4 L/s later."""
+    table = 'inflow = [{ tank = 1, changes = [[0, "1 L/s"], ["10 min", "4 L/s"]] }]\n'
+    plain = rig.loads(LATE + table)
+    flow = 6e-4 * np.sqrt(2 * 9.81 * 0.8) - 1e-3  # m^3/s, of the pump
+    assert float(plain.loop.controller.bias[0]) == pytest.approx(flow / 5e-5, rel=1e-3)
+    gain = LATE.replace('"10 min" }', '"10 min", inflow_gain = "-10 % s/L" }')
+    fed = rig.loads(gain + table).loop.controller
+    assert float(fed.bias[0]) == pytest.approx(flow / 5e-5 + 10.0, rel=1e-3)
