@@ -180,7 +180,7 @@ def test_a_rig_that_only_a_measured_inflow_fills_has_its_bias_and_setpoints(tmp_
     text += 'controller = { kind = "pi", Kc = -0.5, Ti = 700.0 }\n'
     text += 'inflow = [{ csv = "q.csv", column = "q" }]'
     case = loaded(tmp_path, text, q="t,q\n0,0.1\n300,0.3\n600,0.3\n")
-    assert float(case.loop.controller.bias[0]) == pytest.approx(0.2, rel=1e-12)
+    assert float(case.loop.controller.bias[0]) == pytest.approx(0.1, rel=1e-12)
 
 
 def test_a_preset_takes_setpoints_and_inflows_of_files(tmp_path):
