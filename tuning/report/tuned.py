@@ -144,10 +144,12 @@ def _tracking_times(result):
     out of a rig file, they would follow these.
     """
     controller = result.tuned.loop.controller
-    tuned, rows = {name.partition("[")[0] for name in result.parameters}, []
+    tuned = {name.partition("[")[0] for name in result.parameters}
+    moved = {n.partition("[")[0] for n, p in result.parameters.items() if p["before"] != p["after"]}
+    rows = []
     for own, value in parameters(controller).items():
         Tt, Ti = f"controller.{own}", f"controller.{own.removesuffix('Tt')}Ti"
-        if own.endswith("Tt") and value is not None and Ti in tuned and Tt not in tuned:
+        if own.endswith("Tt") and value is not None and Ti in moved and Tt not in tuned:
             numbers = ", ".join(verdicts.shown(v, 4) for v in np.unique(np.asarray(value)))
             rows.append((Tt, f"{numbers} {describe(controller, own)['unit']}"))
     return rows
@@ -328,7 +330,7 @@ def _effects(answer, gap):
         broken = [f"{100 * (1 - s.held.mean()):.3g} %" for s in sides]
         rows.append(["plants that violate a limit", *broken])
     lost = [verdicts.not_tracking(loop, s.measures, s.failed) for s in sides]
-    if all(each is not None for each in lost):
+    if all(each is not None for each in lost) and np.any(lost):
         shares = [f"{100 * each.mean():.3g} %" for each in lost]
         rows.append(["plants that do not keep to their setpoints", *shares])
     limited = np.isfinite(limited_levels(answer.setting.case))
