@@ -15,7 +15,7 @@ from jaxtank.controllers import OnOff, OpenLoop
 from jaxtank.core.checks import check_value
 from jaxtank.core.clock import CLOCK_UNITS
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
-from jaxtank.core.labels import index_of, name_of
+from jaxtank.core.labels import index_of, label_of, name_of
 from jaxtank.core.quantities import converted
 from jaxtank.core.tables import ORDERS
 from jaxtank.core.text import shortened
@@ -27,9 +27,10 @@ from jaxtank.measures import MEASURES, check_names, entries
 from jaxtank.measures import unit as measure_unit
 from jaxtank.plants.elements import closed_circuit
 from jaxtank.plants.tank_network import TankNetwork
-from jaxtank.rig.entry import is_finite, is_numeric, read_entry, refusal, sizes_of
+from jaxtank.rig.entry import Problems, is_finite, is_numeric, read_entry, refusal, sizes_of
 from jaxtank.rig.schema import SECTIONS
-from jaxtank.rig.sensors import is_reading, level_of, spans_of
+from jaxtank.rig.sensors import CURRENTS, is_reading, level_of, spans_of
+from jaxtank.rig.signals import steps
 from jaxtank.rig.values import (
     by_dotted_name,
     check_not_scheduled,
@@ -54,8 +55,8 @@ def check(case: Case) -> Case:
 
     Raises
     ------
-    InputError for a loop that cannot be run; EquilibriumError for a plateau without a steady state,
-    unless `case.reachable` is False.
+    InputError for a loop that cannot be run, and for a setpoint outside the span of its sensor;
+    EquilibriumError for a plateau without a steady state, unless `case.reachable` is False.
 
     Examples
     --------
@@ -65,9 +66,48 @@ def check(case: Case) -> Case:
     """
     # a key will be given where there is noise
     run.check(case.loop, case.clock, key=jax.ShapeDtypeStruct((), np.uint32))
+    check_setpoints(case)
     if case.reachable and (why := unreachable(case)):
         raise EquilibriumError(f"{why}; with reachable = false the file is run without this check")
     return case
+
+
+def check_setpoints(case: Case) -> None:
+    """Raise InputError for setpoints that a sensor whose readings end cannot read."""
+    loop, reference = case.loop, steps(case.loop.reference)
+    low, high = (getattr(loop.sensor, name, None) for name in ("low", "high"))
+    controller = getattr(loop.controller, "law", loop.controller)
+    follows = not isinstance(controller, OpenLoop | OnOff)
+    if low is None or high is None or reference is None or not follows:
+        return
+    entries = [(0.0, i, v, "initial") for i, v in enumerate(np.asarray(reference.initial))]
+    changes = zip(reference.changes, np.asarray(reference.targets))
+    entries += [(t, i, v, "changes") for (t, i), v in changes if t < case.clock.duration]
+    # the rounding of "20 mA"
+    slack, first = 1e-9 * np.broadcast_to(loop.plant.rim, np.shape(low)), {}
+    for entry in entries:
+        _, output, value, _ = entry
+        i = loop.plant.outputs[output]
+        if not low[i] - slack[i] <= value <= high[i] + slack[i]:
+            first.setdefault(output, entry)
+    problems = Problems()
+    for entry in first.values():
+        with problems.collect(("reference", None, entry[-1])):
+            raise InputError(_unreadable(loop, *entry[:-1]))
+    problems.check()
+
+
+def _unreadable(loop, time, output, value):
+    """The sentence on a setpoint outside what its sensor reads."""
+    low, high = spans_of(loop)[loop.plant.outputs[output]]
+    share, length = (value - low) / (high - low), loop.units[0]
+    first, last = CURRENTS
+    return (
+        f"reference: {label_of(loop.plant, 'output', output)} is asked for {value:g} {length}"
+        f" ({100.0 * share:.4g} %, {first + share * (last - first):.4g} mA) from {time:g} s on, and"
+        f" its sensor reads from {low:g} to {high:g} {length}: no controller can tell whether it is"
+        " held; give a setpoint within this span, or [[sensor]] a wider span"
+    )
 
 
 def unreachable(case: Case) -> str | None:

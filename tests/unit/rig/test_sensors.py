@@ -125,6 +125,26 @@ def test_what_is_ambiguous_or_wrong_is_refused_with_what_to_write(old, new, word
     assert all(word in str(refusal.value) for word in words)
 
 
+@pytest.mark.parametrize(
+    "old, new, words",
+    [
+        ('"50 %"]', '"20 mA"]', ()),
+        ('"50 %"]', '"22 mA"]', ("LT102", "1 m", "22 mA", "from 0 s", "0.1 to 0.9 m", "span")),
+        ('"LT101", "60 %"', '"LT101", "-5 %"', ("LT101", "0.05 m", "from 300 s", "0.1 to 1.1 m")),
+        ('"5 min", "LT101", "60 %"', '"11 min", "LT101", "150 %"', ()),  # after the run
+    ],
+)
+def test_a_setpoint_that_a_sensor_cannot_read_is_refused(old, new, words):
+    text = TEXT.format(more="Tt = 300.0")
+    assert old in text
+    if not words:
+        rig.loads("reachable = false\n" + text.replace(old, new))
+        return
+    with pytest.raises(InputError) as refusal:
+        rig.loads(text.replace(old, new))
+    assert all(word in str(refusal.value) for word in words)
+
+
 def test_one_sensor_table_is_for_all_tanks_of_a_preset():
     text = 'case = "cascaded/pi"\n[sensor]\nunit = "%"\nnoise = "1 %"\n'
     case = rig.loads(text + '[reference]\ninitial = ["50 %"]\nchanges = []\n')
