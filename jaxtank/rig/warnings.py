@@ -8,8 +8,9 @@ from jaxtank import presets
 from jaxtank.case import Case
 from jaxtank.controllers.cascade import Cascade
 from jaxtank.controllers.pid import FILTER, PID
+from jaxtank.controllers.split_range import SplitRange
 from jaxtank.core.clock import clock_warnings
-from jaxtank.core.labels import label_of
+from jaxtank.core.labels import label_of, name_of
 from jaxtank.core.tree import get_value, is_component, split_index, walk
 from jaxtank.core.units import flow_per_input
 from jaxtank.loop.estimate_notes import is_unused
@@ -258,11 +259,14 @@ def _signs(case):
         if any(tank in reached[j] for j in range(len(ends)) if j not in members):
             continue
         gain = float(np.asarray(gains)[i])
+        acts = {j: (tank in ends[j][1:]) - (tank == ends[j][0]) for j in members}
+        effects = {j: -act if j in part.reversed_inputs else act for j, act in acts.items()}
+        if isinstance(part, SplitRange) and {-1, 1} <= set(effects.values()):
+            yield _both_ways(plant, part, acts, gain, (i, tank))
+            continue
         for j in members:
-            source, *sinks = ends[j]
-            acts = (tank in sinks) - (tank == source)
-            if gain * (-acts if j in part.reversed_inputs else acts) < 0.0:
-                yield _wrong_sign(plant, f"controller.{name}", gain, (i, j, tank), acts)
+            if gain * effects[j] < 0.0:
+                yield _wrong_sign(plant, f"controller.{name}", gain, (i, j, tank), acts[j])
 
 
 def _wrong_sign(plant, name, gain, places, acts):
@@ -273,6 +277,24 @@ def _wrong_sign(plant, name, gain, places, acts):
     return (
         f"{name} of {output} = {gain:g}: {pump} {'fills' if acts > 0 else 'empties'} {tank}, and"
         " this sign drives its level away from the setpoint: change the sign"
+    )
+
+
+def _both_ways(plant, part, acts, gain, places):
+    """The sentence on inputs of an output that no sign of its gain serves, acts: {input: 1 where it
+    fills the tank, -1 where it empties it}; places: (output, tank).
+    """
+    output, tank = (label_of(plant, kind, i) for kind, i in zip(("output", "tank"), places))
+    does = {1: "fills", -1: "empties"}
+    words = [f"{label_of(plant, 'pump', j)} {does[a]} {tank}" for j, a in acts.items() if a]
+    emptying = {j for j, act in acts.items() if act < 0}
+    reverse = sorted(set(part.reversed_inputs) - set(acts) | emptying)
+    values = [f'"{name}"' if (name := name_of(plant, "pump", j)) else f"{j + 1}" for j in reverse]
+    write = f"write reverse = [{', '.join(values)}]" if reverse else "leave reverse out"
+    return (
+        f"controller.reverse: {', '.join(words)}, and no sign of controller.Kc of {output} ="
+        f" {gain:g} brings its level to the setpoint through each of them: {write}"
+        + (", and change the sign of controller.Kc" if gain < 0.0 else "")
     )
 
 

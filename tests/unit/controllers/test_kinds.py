@@ -173,6 +173,37 @@ def test_split_range_of_a_pump_and_a_valve_in_the_outlet():
     assert sum("Kc" in sentence for sentence in rig.case_warnings(wrong)) == 2
 
 
+@pytest.mark.parametrize(
+    "Kc, reverse, write",
+    [
+        (300.0, (), 'reverse = ["DRAIN"]'),
+        (-300.0, (), 'reverse = ["DRAIN"], and change the sign'),
+        (300.0, (1, 2), 'reverse = ["DRAIN"]'),
+        (300.0, (2,), ""),
+        (-300.0, (2,), "change the sign"),
+    ],
+)
+def test_split_range_of_inputs_that_fill_and_empty_is_told_what_to_reverse(Kc, reverse, write):
+    case = rig.loads(f"""
+        units = ["m", "%"]
+        reachable = false
+        tank = [{{ name = "T1", area = 1.5, rim = 2.5, level = 1.0 }}]
+        pump = [{{ name = "FILL", to = "T1", gain = "0.03 L/(s %)", high = 100.0 }}]
+        valve = [{{ name = "DRAIN", from = "T1", area = "8 cm^2", initial = 0.0 }}]
+        [controller]
+        kind = "split-range"
+        sequence = ["DRAIN", "FILL"]
+        reverse = {list(reverse)}
+        Kc = {Kc}
+        Ti = "5 min"
+        bias = 100.0
+        [reference]
+        initial = [1.0]
+    """)
+    sentences = [s for s in rig.case_warnings(case) if "controller." in s]
+    assert bool(sentences) == bool(write) and all(write in s for s in sentences)
+
+
 def test_a_pid_with_more_pumps_than_levels_says_what_to_write():
     with pytest.raises(InputError, match=r'kind = "split-range"'):
         loads(STAGED, kind="pid", Kc=50.0, Ti=200.0)
