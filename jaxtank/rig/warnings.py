@@ -29,12 +29,12 @@ STILL = 0.02
 def case_warnings(case: Case) -> list[str]:
     """Return sentences on what in a case is hardly meant.
 
-    A run that does not end at a sample, changes, inflow pulses and faults after its end, changes
-    that overlap, what no sample sees, levels, limits and setpoints above a rim, pumps that start
-    outside their limits or stood still before, valves that hardly open, gains of the wrong sign,
-    derivatives shorter than a sample, levels that may fall below 0, models that differ from the
-    plant, estimates of disturbances that the controller does not use. (Steps that are too long:
-    `loop.step_size`.)
+    A run that does not end at a sample, changes, inflow pulses and faults after its end, tables
+    of inflow that do not cover it, changes that overlap, what no sample sees, levels, limits and
+    setpoints above a rim, pumps that start outside their limits or stood still before, valves that
+    hardly open, gains of the wrong sign, derivatives shorter than a sample, levels that may fall
+    below 0, models that differ from the plant, estimates of disturbances that the controller does
+    not use. (Steps that are too long: `loop.step_size`.)
 
     Parameters
     ----------
@@ -54,6 +54,7 @@ def case_warnings(case: Case) -> list[str]:
     return [
         *clock_warnings(case.clock),
         *_late(case),
+        *_short_tables(case),
         *_overlapping(case),
         *_unseen(case),
         *_above_rims(case),
@@ -86,6 +87,30 @@ def _late(case):
         late = sum(time >= end for time in events)
         if late:
             yield f"{late} of {len(events)} {name} come after the end of the run at {end:g} s"
+
+
+MEASURED = 10
+"""Rows from which on a table of inflow is taken as measured, and no list of steps."""
+
+
+def _short_tables(case):
+    """On tables of inflow that begin after the run does, or end before it."""
+    plant, end = case.loop.plant, case.clock.duration
+    *_, table = parts_of(case.loop.disturbance)
+    for tank, _, times, flows in () if table is None else table.tables():
+        flow = f"{label_of(plant, 'tank', tank)}: the inflow of its table"
+        unit, first, last = f"{case.loop.units[0]}^3/s", float(times[0]), float(times[-1])
+        if first >= case.clock.dt:
+            yield (
+                f"{flow} begins at {first:g} s: its first value, {flows[0]:.4g} {unit}, is also"
+                " used from 0 s on; give a row at 0 s, or times that begin there"
+            )
+        if len(times) >= MEASURED and end - last > np.diff(times).max():
+            yield (
+                f"{flow} ends at {last:g} s, and the run at {end:g} s: its last value,"
+                f" {flows[-1]:.4g} {unit}, is held for {end - last:g} s; duration ="
+                f" {last:g} ends the run with the table"
+            )
 
 
 def _change_times(signal):

@@ -155,25 +155,37 @@ class InflowTable(Signal):
         return self.width
 
     def tables(self) -> list[tuple[int, str, Any, Any]]:
-        """Return (tank, what is between rows, times [s], flows [cm^3/s]) of each table."""
+        """Return (tank, what is between rows, times [s], flows [cm^3/s]) of each table; the first
+        row may be later than 0 s.
+        """
         ends = np.cumsum([0, *(len(times) for *_, times in self.rows)])
         return [
             (tank, between, np.array(times), self.flow[a:b])
             for (tank, between, times), a, b in zip(self.rows, ends, ends[1:])
         ]
 
+    def _from_start(self) -> list[tuple[int, str, Any, Any]]:
+        """`tables` with the first row at 0 s too, as it also holds before its time."""
+        join = (np if isinstance(self.flow, np.ndarray) else jnp).concatenate
+        return [
+            (tank, between, np.insert(times, 0, 0.0), join([rows[:1], rows]))
+            if times[0] > 0.0
+            else (tank, between, times, rows)
+            for tank, between, times, rows in self.tables()
+        ]
+
     @pointwise
     def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
         still = jnp.zeros_like(sample_times(clock))
         flow = [still] * self.width
-        for tank, between, times, rows in self.tables():
+        for tank, between, times, rows in self._from_start():
             flow[tank] = flow[tank] + _means(clock, times, rows, between == "linear")
         return tuple(flow), (still,) * self.width, (still,) * self.width
 
     def steady(self) -> Any:
-        """Return the (tanks,) mean flow from the first row to the last [cm^3/s]."""
+        """Return the (tanks,) mean flow from 0 s to the last row [cm^3/s]."""
         mean = [0.0 * self.flow[0]] * self.width
-        for tank, between, times, rows in self.tables():
+        for tank, between, times, rows in self._from_start():
             if len(times) == 1:
                 mean[tank] = mean[tank] + rows[0]
                 continue
@@ -256,8 +268,6 @@ def inflow_table(
                 f"inflow table of tank {tank}: needs a tank from 0 to {tanks - 1}, counted from 0,"
                 " and as many flows as times, which increase from 0 s or later"
             )
-        if times[0] > 0.0:  # the first row holds before its time
-            times, flow = np.insert(times, 0, 0.0), np.insert(flow, 0, flow[0])
         if kind not in BETWEEN:
             raise InputError(f"between = {kind!r}: must be one of {', '.join(BETWEEN)}")
         rows.append((int(tank), kind, tuple(times.tolist())))

@@ -257,6 +257,35 @@ def test_inputs_and_inflows_that_cannot_be_are_refused(text, words):
         rig.loads(TANK + text)
 
 
+@pytest.mark.parametrize(
+    ("start", "hours", "words"),
+    [
+        (0, 24.0, ()),
+        (0, 25.0, ()),  # one row more would begin where the run ends
+        (0, 72.0, ("LT101", "ends at 86400 s", "2 m^3/s", "held for 172800 s")),
+        (6, 24.0, ("LT101", "begins at 21600 s", "8 m^3/s", "also used from 0 s")),
+    ],
+)
+def test_a_table_of_inflow_that_does_not_cover_the_run_is_noted(tmp_path, start, hours, words):
+    rows = "t [h],q [m^3/s]\n" + "\n".join(f"{k},{2 + k % 24}" for k in range(start, 25))
+    text = f'duration = "{hours} h"\ndt = 60.0\n' + TANK + "inputs = { initial = [0.1] }\n"
+    case = loaded(tmp_path, text + 'inflow = [{ csv = "day.csv", column = "q" }]', day=rows)
+    notes = [s for s in rig.case_warnings(case) if "table" in s]
+    assert len(notes) == bool(words) and all(word in notes[0] for word in words)
+    (row,) = case.loop.disturbance.tables()
+    assert len(row[2]) == len(row[3]) == 25 - start  # as the file has them
+    flow = np.asarray(case.loop.disturbance.sample(case.clock)[0][0])
+    assert flow[0] == 2.0 + start and flow[-1] == 2.0
+    again = rig.loads(rig.dump(case)).loop.disturbance
+    np.testing.assert_array_equal(again.flow, case.loop.disturbance.flow)
+
+
+def test_a_few_steps_of_inflow_and_then_a_constant_one_are_no_short_table():
+    steps = "inflow = [{ changes = [[0.0, 1.0], [60.0, 2.0], [120.0, 1.5]] }]"
+    case = rig.loads("duration = 9000.0\ndt = 60.0\n" + TANK + PI + steps)
+    assert not [s for s in rig.case_warnings(case) if "table" in s]
+
+
 def test_arrays_that_are_no_table_are_refused():
     for table, between in (
         ((0, [1.0, 1.0], [2.0, 2.0]), "hold"),
