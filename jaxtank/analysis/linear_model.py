@@ -8,7 +8,7 @@ import scipy  # its parts are imported when they are first used
 from jaxtank.core.errors import InputError
 
 
-def linearise(plant, x, u):
+def linearise(plant, x, u, inflow=None):
     """Return the linear model of a rig: delta x' = A delta x + B delta u, y = C delta x.
 
     Exact derivatives of `plant.derivative`; differentiable in everything. A pipe between equal
@@ -19,6 +19,8 @@ def linearise(plant, x, u):
     plant : Plant
     x : (n,) levels [cm]
     u : (m,) inputs [V]
+    inflow : (n,) steady inflow that no pump brings [cm^3/s], None without any: it counts where the
+        area of a tank changes with its level
 
     Returns
     -------
@@ -33,8 +35,9 @@ def linearise(plant, x, u):
     (-0.1329, 0.32)
     """
     x, u = jnp.asarray(x, dtype=float), jnp.asarray(u, dtype=float)
+    d = None if inflow is None else tuple(inflow)
     A, B = jax.jacfwd(
-        lambda x, u: jnp.stack(plant.derivative(0.0, tuple(x), tuple(u), None)), argnums=(0, 1)
+        lambda x, u: jnp.stack(plant.derivative(0.0, tuple(x), tuple(u), d)), argnums=(0, 1)
     )(x, u)
     return A, B, jnp.eye(plant.tanks)[np.array(plant.outputs)]
 

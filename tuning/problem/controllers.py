@@ -132,7 +132,8 @@ def _rig_of(case: Case) -> Rig:
             f" {plant.pumps} and {len(plant.outputs)}"
         )
     setpoint, levels, inputs = operating_point(case, plant)
-    A, B, C = (np.asarray(v, dtype=float) for v in linearise(plant, levels, inputs))
+    linear = linearise(plant, levels, inputs, steady_inflow(case.loop))
+    A, B, C = (np.asarray(v, dtype=float) for v in linear)
     actuator: Any = case.loop.actuator
     low, high = (
         np.broadcast_to(np.asarray(v, float), pumps) for v in (actuator.low, actuator.high)

@@ -32,6 +32,7 @@ from jaxtank.controllers import PID, Cascade, Controller, FlowCascade, Override,
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
+from jaxtank.loop.steady import steady_inflow
 from jaxtank.plants.elements import input_flows
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.signals.setpoints import ramps
@@ -80,7 +81,9 @@ def loop_of(case: Case, output: int, tank: int | None = None) -> Loop:
     """Return the linear model of one loop at the last plateau, of the level of `tank` if named."""
     bank, plant = cast(Any, case.loop.actuator), case.loop.plant
     _, levels, inputs = operating_point(case, plant)
-    A, B, C = (np.asarray(v, dtype=float) for v in linearise_compiled(plant, levels, inputs))
+    inflow = steady_inflow(case.loop)
+    linear = linearise_compiled(plant, levels, inputs, inflow)
+    A, B, C = (np.asarray(v, dtype=float) for v in linear)
     slopes = _slopes(case, inputs, output)
     lags = np.broadcast_to(0.0 if bank.lag is None else np.asarray(bank.lag), slopes.shape)
     lag = float(np.max(lags[slopes != 0.0]))
@@ -262,7 +265,7 @@ def relay_experiment(case: Case, output: int, linear: Loop | None = None) -> Ult
             "a relay moves an input, and the outer loop of a cascade moves a setpoint: choose"
             " another rule"
         )
-    expected = ultimate_of(linear)
+    expected = _usable(case, linear)
     setpoint, levels, inputs = operating_point(case, plant)
     bank: Any = loop.actuator
     low, high = (np.broadcast_to(np.asarray(v, float), inputs.shape) for v in (bank.low, bank.high))
@@ -337,9 +340,20 @@ def lambda_rule(case: Case, output: int, parts: str, loop: Loop) -> Gains:
     return Gains(1.0 / (process.gain * (time + theta)), process.lag, Td)
 
 
+def _usable(case: Case, loop: Loop) -> Ultimate:
+    """`ultimate_of` a loop. Raises InputError where its period is longer than the run."""
+    ultimate, duration = ultimate_of(loop), case.clock.duration
+    if ultimate.period > duration:
+        raise InputError(
+            f"its ultimate period of {ultimate.period:.4g} s is longer than the run of"
+            f" {duration:g} s: choose another rule, as simc"
+        )
+    return ultimate
+
+
 def ziegler_nichols(case: Case, output: int, parts: str, loop: Loop) -> Gains:
     """Of the ultimate gain and period of the linearised loop."""
-    gain, period = ultimate_of(loop)
+    gain, period = _usable(case, loop)
     if parts == "p":
         return Gains(0.5 * gain)
     if "d" in parts:

@@ -114,6 +114,33 @@ def test_gains_without_ranges_are_free_within_a_factor_of_thirty():
     }
 
 
+CONE = """
+units = ["m", "%"]
+tank = [{ shape = "cone", diameter = 2.0, height = 2.5, level = 0.8, inflow = "3 L/s" }]
+valve = [{ from = 1, area = "20 cm^2", initial = 40.0 }]
+plant = { gravity = 9.81 }
+controller = { kind = "pi", action = "direct", Kc = 80.0, Ti = 300.0 }
+reference = { initial = [0.8], changes = [[60.0, 1, 0.9]] }
+values = { "clock.dt" = 2.0, "clock.duration" = 2400.0 }
+"""
+
+
+def test_the_lag_of_a_cone_counts_its_inflow():
+    """h' = (q - a u sqrt(2 g h))/A(h): at rest the slope is that of the outflow, -q/(2 h A(h))."""
+    case = rig.loads(CONE)
+    area = math.pi / 4.0 * (2.0 * 0.9 / 2.5) ** 2
+    expected = 0.003 / (2.0 * 0.9 * area)
+    assert rules.loop_of(case, 0).A[0, 0] == pytest.approx(-expected, rel=1e-6)
+    assert rules.process_of(rules.loop_of(case, 0), 1).lag == pytest.approx(1.0 / expected)
+
+
+@pytest.mark.parametrize("rule", ["ziegler-nichols", "relay"])
+def test_an_ultimate_cycle_longer_than_the_run_gives_no_gains(rule):
+    words = f"rule {rule}, output 1: .*period of 240.[0-9] s is longer than the run of 200 s.*simc"
+    with pytest.raises(InputError, match=words):
+        rules.rule_gains(rig.loads(SIMC.replace("4000.0", "200.0")), rule)
+
+
 def test_rules_are_judged_on_the_plants_of_an_answer():
     case = rig.loads(SERIES)
     rows = rule_rows(setting_of(case), 8, 0)
