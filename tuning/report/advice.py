@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxtank.case import Case
+from jaxtank.controllers import OpenLoop
 from jaxtank.core.labels import label_of
 from jaxtank.measures import MEASURES
 from tuning.feasible import study
@@ -61,6 +62,12 @@ def changes(before: Any, after: Any, unit: str, digits: int = 3) -> str:
     return f"{shown(before, digits)} -> {amount(after, unit, digits)}"
 
 
+def error_of(before: Any, after: Any, unit: str) -> str:
+    """Return `changes` of an error, or that it is the same to the digits shown."""
+    same = shown(before, 3) == shown(after, 3)
+    return f"{amount(after, unit)}, as before" if same else changes(before, after, unit)
+
+
 def limits_of(
     rows: Sequence[Mapping[str, Any]], heads: Sequence[str] = ("value", "margin", "at")
 ) -> Table:
@@ -88,8 +95,9 @@ def of_run(case: Case, values: Mapping[str, Any]) -> Advice:
     if "rms_error_total" in values:
         error = float(np.ravel(values["rms_error_total"])[0])
         words.insert(0, f"RMS error {amount(error, case.loop.units[0])}")
+    to_set = f"{GIVEN}; jaxtank tune searches for better ones"
     return Advice(
-        f"{GIVEN}; jaxtank tune searches for better ones.",
+        "Nothing to set: an open loop has no gains." if _follows_none(case) else f"{to_set}.",
         f"It gives: {'; '.join(words) or 'a run without setpoints and limits'}.",
         of_nominal_plant(case),
     )
@@ -97,12 +105,19 @@ def of_run(case: Case, values: Mapping[str, Any]) -> Advice:
 
 def of_nominal_plant(case: Case) -> str:
     """Return the sentence on setpoints that the plant of a case cannot hold whatever its gains."""
+    if _follows_none(case):
+        return "No setpoints are followed: the loop is open."
     needs = study.of_nominal_plant(case)
     if needs is None:
         return unknown(case)
     if not needs:
         return f"{REACHABLE} on this plant."
     return f"{BEYOND}: {need(case, needs[0])}."
+
+
+def _follows_none(case: Case) -> bool:
+    """Whether the inputs of a case are given, whatever its setpoints."""
+    return isinstance(getattr(case.loop.controller, "law", case.loop.controller), OpenLoop)
 
 
 def unknown(case: Case) -> str:

@@ -161,7 +161,7 @@ def _gives(result):
     if answer is not None and answer.after is not None and not answer.setting.own_objective:
         sides, unit = (answer.before, answer.after), answer.setting.case.loop.units[0]
         before, after = (_mean(side.error, side).value for side in sides)
-        words.append(f"mean RMS error {advice.changes(before, after, unit)}")
+        words.append(f"mean RMS error {advice.error_of(before, after, unit)}")
     else:
         terms = next(iter(cost["terms"])) if len(cost["terms"]) == 1 else "objective"
         words.append(f"{terms} {advice.changes(cost['before'], cost['after'], cost_unit(result))}")

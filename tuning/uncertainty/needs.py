@@ -118,7 +118,7 @@ def unjudged(case: Case) -> str:
     if not isinstance(plant, TankNetwork):
         return f"a {type(plant).__name__} is no network of tanks"
     if case.loop.disturbance is not None and _varies(case.loop.disturbance):
-        return "its inflow follows a table and never rests"
+        return "its inflow follows a table, and what can be held changes with it"
     names = lambda tanks: (
         f"{labels_of(plant, 'tank', tanks)} {'has' if len(tanks) == 1 else 'have'}"
     )
@@ -132,7 +132,7 @@ def unjudged(case: Case) -> str:
 
 
 def _varies(inflow: Any) -> bool:
-    """Whether an inflow never rests: a table of more than one row."""
+    """Whether an inflow changes: a table of more than one row."""
     if isinstance(inflow, Sum):
         return _varies(inflow.first) or _varies(inflow.second)
     return inflow.is_table and any(len(row[2]) > 1 for row in getattr(inflow, "rows", [((),) * 3]))

@@ -241,6 +241,19 @@ def test_a_setpoint_above_a_rim_is_beyond_any_gain():
     assert verdicts.shown(need.needed) in advice.of_nominal_plant(low)
 
 
+def test_an_open_loop_has_no_gains_and_no_setpoint_out_of_reach():
+    case = presets.find("cascaded/open-loop")
+    said = advice.of_run(case, run_measures(case.loop, case.clock, None))
+    assert said.to_set == "Nothing to set: an open loop has no gains."
+    assert "gain" not in said.beyond and "steady state" not in said.beyond
+    assert advice.of_nominal_plant(presets.find(TWO)) != said.beyond
+
+
+def test_an_error_that_stays_is_said_to_stay():
+    assert advice.error_of(0.35401, 0.35379, "ft") == "0.354 ft, as before"
+    assert advice.error_of(0.667, 0.47, "cm") == "0.667 -> 0.47 cm"
+
+
 @pytest.mark.skipif(NODE is None, reason="no node on this machine")
 def test_numbers_are_written_as_the_page_writes_them():
     rng = np.random.default_rng(0)
