@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxtank.controllers.base import Controller
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import name_of
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf
 from jaxtank.core.vectors import each, take, zeros
@@ -86,12 +87,21 @@ class OnOff(Controller):
         )
         return inputs, running
 
+    def check_inputs(self) -> None:
+        """Raise InputError unless each output has its pump or valve."""
+        outputs, pumps = self.model.outputs, self.model.pumps
+        if len(outputs) == pumps:
+            return
+        tank = name_of(self.model, "tank", outputs[0])
+        entry = f'"{tank}"' if tank else f"{outputs[0] + 1}"
+        raise InputError(
+            f"controller: on-off needs one pump or valve per output: the model has {pumps} and"
+            f" {len(outputs)}; [plant] outputs may name a tank several times, once for each pump"
+            f" with its own `on` and `off`, as outputs = [{entry}, {entry}]"
+        )
+
     def check(self, reference: Signal) -> None:
-        if len(self.model.outputs) != self.model.pumps:
-            raise InputError(
-                f"controller: on-off needs one pump or valve per output: the model has"
-                f" {self.model.pumps} and {len(self.model.outputs)}"
-            )
+        self.check_inputs()
         same = np.asarray(self.on) == np.asarray(self.off)
         if np.any(same):
             raise InputError(

@@ -265,8 +265,9 @@ def controller_of(table, loop, bias=None):
     kind = table.get("kind") if isinstance(table, dict) else None
     offered = _offered(kind, table, loop, steady)
     controller = component("controller", table, loop, offered, model_of(loop))
-    if isinstance(controller, controllers.PID):
+    if isinstance(controller, controllers.PID | controllers.OnOff):
         controller.check_inputs()
+    if isinstance(controller, controllers.PID):
         left_out = [name for name in BIASES if name not in table]
         return with_bias(controller, loop, steady, left_out)
     return controller

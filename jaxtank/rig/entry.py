@@ -118,7 +118,9 @@ def unknown_key(section, key: str, where: str = "") -> InputError:
         )
     titles = [s.title for s in SECTIONS.values() if key in s.names and s.name]
     names = section.names if section.name else [*section.names, *SECTIONS]
-    if word := WORDS.get(f"{section.name}.{key.lower()}"):
+    if (section.name, key) == ("controller", "action"):
+        hint = f"; leave it out: {UNTURNED['on' in section.names]}"
+    elif word := WORDS.get(f"{section.name}.{key.lower()}"):
         hint = f"; write {word}"
     elif section.name and key in SECTIONS:
         hint = f"; {SECTIONS[key].title} is a table of its own"
@@ -130,6 +132,12 @@ def unknown_key(section, key: str, where: str = "") -> InputError:
     of = f" of {section.title}" if section.name else ""
     return InputError(f"unknown key{of} {key!r}{hint}")
 
+
+UNTURNED = {
+    True: "`on` above `off` empties a tank, and `on` below `off` fills it",
+    False: "this kind takes the direction of its inputs from its model or the sign of its gains",
+}
+"""{whether a kind without `action` switches: what turns its inputs}."""
 
 WORDS = {
     "cone": '[[tank]] shape = "cone" with height and diameter',
@@ -185,6 +193,8 @@ WORDS = {
     "pump.head_curve": "curve_head: [[lift, share of the flow], ...]",
     "pump.deadband": "dead_zone",
     "valve.r": "rangeability",
+    "valve.stroke": 'rate: the full travel over its time, as "1.667 %/s" of 60 s',
+    "valve.stroke_time": 'rate: the full travel over its time, as "1.667 %/s" of 60 s',
     "valve.curve": "characteristic: [[opening from 0 to 1, share], ...]",
     "valve.diameter": "area: C pi/4 diameter^2, C the discharge coefficient",
     "orifice.diameter": "area: C pi/4 diameter^2, C the discharge coefficient",

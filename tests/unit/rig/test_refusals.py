@@ -70,6 +70,43 @@ def test_words_of_the_field_are_answered_with_ours(word, write):
     assert write in message.partition("write")[2] and "line 13" in message
 
 
+WELL = """units = ["m", "%"]
+[[tank]]
+name = "WW1"
+area = 5.0
+rim = 5.0
+level = 1.2
+inflow = "5 L/s"
+[[pump]]
+name = "P1"
+from = "WW1"
+gain = "0.4 L/(s %)"
+high = 100.0
+"""
+SECOND = WELL[WELL.index("[[pump]]") :].replace("P1", "P2")
+FLOATS = '[controller]\nkind = "on-off"\non = [2.0, 2.5]\noff = [1.0, 1.2]\n'
+
+
+def test_on_off_has_no_action_and_its_levels_say_the_direction():
+    one = FLOATS.replace(", 2.5", "").replace(", 1.2", "")
+    _, message = problems_of(WELL + one + 'action = "direct"\n')
+    assert "leave it out" in message and "`on` above `off`" in message and "write" not in message
+    assert rig.loads(WELL + one).loop.controller.on > 1.0
+
+
+def test_two_floats_of_one_tank_are_told_to_name_it_twice():
+    _, message = problems_of(WELL + SECOND + FLOATS)
+    assert 'outputs = ["WW1", "WW1"]' in message
+    twice = WELL + SECOND + '[plant]\noutputs = ["WW1", "WW1"]\n' + FLOATS
+    assert rig.loads(twice).loop.controller.off.tolist() == [1.0, 1.2]
+
+
+def test_the_stroke_of_a_valve_is_its_rate():
+    valve = '[[valve]]\nfrom = "T1"\narea = 0.001\nstroke = "60 s"\n'
+    problems, _ = problems_of(HEAD.replace("[controller]", valve + "[controller]"))
+    assert "rate" in problems[12] and "%/s" in problems[12] and "low or high" not in problems[12]
+
+
 def test_texts_and_comments_do_not_move_the_lines():
     text = HEAD.replace("rim = 1.2", 'rim = 1.2  # a [note] = { of }\nwrong = "[[tank]] { = }"')
     problems, _ = problems_of(text + "Kq = 1\n")
