@@ -22,7 +22,9 @@ def absent(loop, name, meta):
     """Return the least allowed value of an absent optional leaf, in its shape."""
     sibling = get_value(loop, f"{name.rpartition('.')[0]}.{meta['like']}")
     low, high = meta["low"], meta["high"]
-    if low is None or (low <= 0.0 and not meta["strict"]):
+    if name == "sensor.high":  # setpoints are within a span
+        value = np.inf
+    elif low is None or (low <= 0.0 and not meta["strict"]):
         value = 0.0
     else:
         value = 1.0 if high is None or high >= 1.0 else 0.5 * (low + high)

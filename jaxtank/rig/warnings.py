@@ -283,15 +283,23 @@ def _signs(case):
         # through another input the sign of a loop alone decides nothing
         if any(tank in reached[j] for j in range(len(ends)) if j not in members):
             continue
-        gain = float(np.asarray(gains)[i])
         acts = {j: (tank in ends[j][1:]) - (tank == ends[j][0]) for j in members}
-        effects = {j: -act if j in part.reversed_inputs else act for j, act in acts.items()}
-        if isinstance(part, SplitRange) and {-1, 1} <= set(effects.values()):
-            yield _both_ways(plant, part, acts, gain, (i, tank))
-            continue
-        for j in members:
-            if gain * effects[j] < 0.0:
-                yield _wrong_sign(plant, f"controller.{name}", gain, (i, j, tank), acts[j])
+        gain = float(np.asarray(gains)[i])
+        yield from _wrong_ways(plant, part, f"controller.{name}", gain, acts, (i, tank))
+
+
+def _wrong_ways(plant, part, name, gain, acts, places):
+    """Sentences on the gain of an output whose inputs act against its level, acts: {input: 1 where
+    it fills the tank, -1 where it empties it}; places: (output, tank).
+    """
+    effects = {j: -act if j in part.reversed_inputs else act for j, act in acts.items()}
+    if isinstance(part, SplitRange) and {-1, 1} <= set(effects.values()):
+        yield _both_ways(plant, part, acts, gain, places)
+        return
+    output, tank = places
+    for j, effect in effects.items():
+        if gain * effect < 0.0:
+            yield _wrong_sign(plant, name, gain, (output, j, tank), acts[j])
 
 
 def _wrong_sign(plant, name, gain, places, acts):
@@ -306,9 +314,7 @@ def _wrong_sign(plant, name, gain, places, acts):
 
 
 def _both_ways(plant, part, acts, gain, places):
-    """The sentence on inputs of an output that no sign of its gain serves, acts: {input: 1 where it
-    fills the tank, -1 where it empties it}; places: (output, tank).
-    """
+    """The sentence on inputs of an output that no sign of its gain serves, as `_wrong_ways`."""
     output, tank = (label_of(plant, kind, i) for kind, i in zip(("output", "tank"), places))
     does = {1: "fills", -1: "empties"}
     words = [f"{label_of(plant, 'pump', j)} {does[a]} {tank}" for j, a in acts.items() if a]
