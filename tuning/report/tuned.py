@@ -326,13 +326,7 @@ def _effects(answer, gap):
         name += "" if of == "-" else f" [{of}]"
         rows.append([name, *(_mean(s.cost, s) for s in sides)])
     rows += _errors(answer, sides, unit) + _margins(answer)
-    if answer.before.limits:
-        broken = [f"{100 * (1 - s.held.mean()):.3g} %" for s in sides]
-        rows.append(["plants that violate a limit", *broken])
-    lost = [verdicts.not_tracking(loop, s.measures, s.failed) for s in sides]
-    if all(each is not None for each in lost) and np.any(lost):
-        shares = [f"{100 * each.mean():.3g} %" for each in lost]
-        rows.append(["plants that do not keep to their setpoints", *shares])
+    rows += _shares(answer, sides)
     limited = np.isfinite(limited_levels(answer.setting.case))
     if limited.any():
         levels = [s.level[~s.failed][:, limited] for s in sides]
@@ -341,6 +335,19 @@ def _effects(answer, gap):
     changes = [_mean(100 * s.travel, s, 2) for s in sides]
     rows.append(["rms change of input per sample [% of range]", *changes])
     return Table(rows, ["what it gives", "before", "now"][: 1 + len(sides)], gap)
+
+
+def _shares(answer, sides):
+    """The rows of the shares of plants that violate a limit, or miss a setpoint."""
+    rows, share = [], lambda flags: f"{100 * np.mean(flags):.3g} %"
+    if answer.before.limits:
+        rows.append(["plants that violate a limit", *(share(~s.held) for s in sides)])
+    loop = answer.setting.case.loop
+    found = (verdicts.not_tracking(loop, s.measures, s.failed) for s in sides)
+    lost = [flags for flags in found if flags is not None]
+    if len(lost) == len(sides) and np.any(lost):
+        rows.append(["plants that do not keep to their setpoints", *map(share, lost)])
+    return rows
 
 
 def _errors(answer, sides, unit):

@@ -338,9 +338,12 @@ def of_tuning(result: Any) -> Verdict:
 
 def _tracking_of_answer(loop, values, answer):
     """The tracking of its own run, and on how many validation plants it is not good."""
-    own, after = tracking(loop, values), None if answer is None else answer.after
-    lost = None if after is None else not_tracking(loop, after.measures, after.failed)
-    if own is None or lost is None or not lost.any():
+    own = tracking(loop, values)
+    if own is None or answer is None or answer.after is None:
+        return own
+    after = answer.after
+    lost = not_tracking(loop, after.measures, after.failed)
+    if lost is None or not lost.any():
         return own
     joint = ", but " if own.good else "; "
     return Part(own.words + joint + astray(lost, answer.setting.runs, after.infeasible), False)
