@@ -192,6 +192,11 @@ class Text:
             arrays = f", {precision} t{arrays}, const {precision} *manual"
             self.step_call = f"void {name}_step({first}{arrays}{results})"
 
+    @property
+    def units(self):
+        """The declaration of the units of a controller's signals."""
+        return f"const char *const {self.name}_units[1 + {self.name.upper()}_PUMPS]"
+
     def header(self):
         """Return the text of the header."""
         program, name, real = self.program, self.name, self.real
@@ -209,9 +214,6 @@ class Text:
         )
         prepared += [f"    {name}_parameters p;"] if program.prepare else []
         zero = "d" if program.plant else "dr, ddr"
-        loop = program.case.loop
-        units = ", ".join(json.dumps(unit) for unit in signal_units(loop.plant, loop.units))
-        units = f"#define {name.upper()}_UNITS {units} /* of y and r, of each u */"
         return "\n".join(
             [
                 "/*",
@@ -229,9 +231,9 @@ class Text:
                 "#endif",
                 "",
                 f"enum {{ {facts} }};",
-                *([] if program.plant else [units]),
                 f"typedef {real} {name}_real;",
                 f"extern const {real} {name}_dt; /* sampling period [s] */",
+                *([] if program.plant else [f"extern {self.units}; /* of y and r, of each u */"]),
                 "",
                 "typedef struct {",
                 *map(self._declared, program.parameters),
@@ -266,6 +268,7 @@ class Text:
         loop = program.case.loop
         values = (self._initialiser(p.value) for p in program.parameters)
         start = {} if program.plant else {"y": loop.x0, "u": loop.actuator.initial}
+        words = ", ".join(json.dumps(unit) for unit in signal_units(loop.plant, loop.units))
         return "\n".join(
             [
                 "#include <math.h>",
@@ -273,6 +276,7 @@ class Text:
                 *self._matrix_functions(),
                 "",
                 f"const {real} {name}_dt = {self.plain.value(float(program.case.clock.dt))};",
+                *([] if program.plant else [f"{self.units} = {{{words}}};"]),
                 f"const {name}_parameters {name}_defaults = {{",
                 *(f"    {v}," for v in values),
                 "};",

@@ -205,12 +205,8 @@ static void copy({name}_real *a, const double *b, int n) {{
 #define OUT __attribute__((visibility("default")))
 OUT void sizes(int *n);
 void sizes(int *n) {{ n[0] = {upper}_TANKS; n[1] = {upper}_OUTPUTS; n[2] = {upper}_PUMPS; }}
-#ifndef {upper}_UNITS
-#define {upper}_UNITS 0
-#endif
-static const char *const units[{upper}_PUMPS + 1] = {{ {upper}_UNITS }};
 OUT const char *unit(int i);
-const char *unit(int i) {{ return units[i]; }}
+const char *unit(int i) {{ return {units}; }}
 OUT double period(void);
 double period(void) {{ return {name}_dt; }}
 OUT void begin(const double *y);
@@ -254,7 +250,10 @@ def _load_c(path):
         raise InputError(f"{printable(path.name)}: needs its header {printable(header.name)}")
     name = path.stem
     files = {p.name: p.read_text(errors="replace") for p in (path, header)}
-    binary = library({**files, "replay.c": HARNESS.format(name=name, upper=name.upper())})
+    stated = f" {name}_units[" in files[header.name]
+    units = f"{name}_units[i]" if stated else "(void)i, (const char *)0"
+    harness = HARNESS.format(name=name, upper=name.upper(), units=units)
+    binary = library({**files, "replay.c": harness})
     if binary is None:
         raise InputError(
             f"{printable(path.name)}: does not compile as a controller that `jaxtank export --lang"

@@ -563,7 +563,7 @@ def test_a_name_stays_within_the_comment_of_c(traced, name, standard, tmp_path):
     words = ["nm", "-g", "--defined-only", code]
     symbols = subprocess.run(words, capture_output=True, text=True, check=True)
     names = {line.split()[-1] for line in symbols.stdout.splitlines()}
-    assert names == {"law_init", "law_step", "law_dt", "law_defaults"}
+    assert names == {"law_init", "law_step", "law_dt", "law_units", "law_defaults"}
 
 
 @pytest.mark.parametrize("name", HOSTILE)
