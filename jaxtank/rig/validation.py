@@ -73,7 +73,9 @@ def check(case: Case) -> Case:
 
 
 def check_setpoints(case: Case) -> None:
-    """Raise InputError for setpoints that a sensor whose readings end cannot read."""
+    """Raise InputError for setpoints that a sensor whose readings end cannot read; a start below
+    them, of an empty tank, is allowed.
+    """
     loop, reference = case.loop, steps(case.loop.reference)
     low, high = (getattr(loop.sensor, name, None) for name in ("low", "high"))
     controller = getattr(loop.controller, "law", loop.controller)
@@ -88,7 +90,8 @@ def check_setpoints(case: Case) -> None:
     for entry in entries:
         _, output, value, _ = entry
         i = loop.plant.outputs[output]
-        if not low[i] - slack[i] <= value <= high[i] + slack[i]:
+        least = low[i] - slack[i] if entry[-1] == "changes" else -np.inf
+        if not least <= value <= high[i] + slack[i]:
             first.setdefault(output, entry)
     problems = Problems()
     for entry in first.values():
