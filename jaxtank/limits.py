@@ -106,8 +106,8 @@ def draws(case: Case) -> list[tuple[int, int, float]]:
         curve, demand = plant.curves[j] if plant.curves else None, float(case.loop.actuator.high[j])
         demand = demand if curve is None else float(monotone_curve(curve, demand))
         most = DREGS * float(plant.rim[i])
-        held = plant.stored((most,) * plant.tanks)[i] if plant.shapes else plant.area[i] * most
-        rows.append((j, i, float(plant.pump_gain[j] * demand * step / held)))
+        capacity = plant.stored((most,) * plant.tanks)[i] if plant.shapes else plant.area[i] * most
+        rows.append((j, i, float(plant.pump_gain[j] * demand * step / capacity)))
     return rows
 
 

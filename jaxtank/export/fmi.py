@@ -69,9 +69,10 @@ def variables(program: Any) -> list[Variable]:
             for j in range(size):
                 start = float(starts[name][j]) if name in starts else 0.0
                 label = f"{words} of {label_of(loop.plant, kind, j)}"
-                full, own = f"{NAMES.get(name, name)}[{j}]", local(unit, loop.units)
-                own = input_unit(loop.plant, j, own) if kind == "pump" else own
-                numbers.append(Variable(full, causality, start, own, label))
+                full, signal_unit = f"{NAMES.get(name, name)}[{j}]", local(unit, loop.units)
+                if kind == "pump":
+                    signal_unit = input_unit(loop.plant, j, signal_unit)
+                numbers.append(Variable(full, causality, start, signal_unit, label))
     return numbers
 
 

@@ -353,8 +353,8 @@ def _references(root):
         if variable.attrib.get("causality") in ("input", "output"):
             key = variable.attrib["name"].split("[")[0]
             references.setdefault(key, []).append(int(variable.attrib["valueReference"]))
-            own = [part.attrib["unit"] for part in variable.iter() if "unit" in part.attrib]
-            units.setdefault(key, []).append((own or ["-"])[0])
+            stated = [part.attrib["unit"] for part in variable.iter() if "unit" in part.attrib]
+            units.setdefault(key, []).append((stated or ["-"])[0])
     return references, units
 
 

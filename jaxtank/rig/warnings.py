@@ -250,8 +250,8 @@ def _standing(case):
         if first == 0.0 and abs(bias) > STILL * (reach if np.isfinite(reach) else abs(bias)):
             yield (
                 f"{label_of(case.loop.plant, 'pump', j)} ran at 0 {drive} before t = 0, where"
-                f" {bias:.4g} {drive} hold the level of the start: until its dead time, lag or rate"
-                f" is over the level leaves its start; initial = {bias:.4g} keeps it there"
+                f" {bias:.4g} {drive} hold the level of the start: while its dead time, lag or rate"
+                f" limit lasts, the level leaves its start; initial = {bias:.4g} keeps it there"
             )
 
 

@@ -284,11 +284,11 @@ def refuse_used(loop, logs, names):
             volume = unit and factor(length, "m") and factor(unit, f"{length}^3")
             used = _is_flow(loop, [log], column - 1) if became == "inputs" else volume
             if name in names and used:
-                own = input_unit(loop.plant, column - 1, drive) if became == "inputs" else length
+                unit = input_unit(loop.plant, column - 1, drive) if became == "inputs" else length
                 raise InputError(
                     f"free {name}: {log.where(column=column)} has {what}, which became {became} by"
                     f" it, so that these data cannot tell it: leave it out, or give {became} in"
-                    f" {own}"
+                    f" {unit}"
                 )
 
 

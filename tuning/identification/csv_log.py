@@ -314,8 +314,8 @@ class LogFile:
             levels = np.asarray(self.loop.sensor.level_of(tank, values, True)) if volts else values
             known = np.isfinite(levels)
             at = np.searchsorted(signal.t[known], t, side="right") - 1
-            held = np.append(levels[known], np.nan)[at]  # at -1: before the first
-            rows |= {tank: (column.header, held)} if known.any() else {}
+            setpoints = np.append(levels[known], np.nan)[at]  # at -1: before the first
+            rows |= {tank: (column.header, setpoints)} if known.any() else {}
         self.notes = notes  # only of what every command uses
         return rows
 

@@ -206,11 +206,11 @@ def achieved(case: Case, log: Log) -> list[dict[str, Any]]:
         if tank in loop.plant.outputs:
             r = np.asarray(run.r)[:, list(loop.plant.outputs).index(tank)]
             r = np.interp(t[inside], np.asarray(run.t), r)
-            own = {"predicted": r, "achieved": r}
+            setpoints = {"predicted": r, "achieved": r}
             if tank in log.setpoints:
-                row["setpoints"], own["achieved"] = log.setpoints[tank]
-                own["achieved"] = own["achieved"][inside]
-            error = {side: np.nanmean((h - own[side]) ** 2) for side, h in sides.items()}
+                row["setpoints"], setpoints["achieved"] = log.setpoints[tank]
+                setpoints["achieved"] = setpoints["achieved"][inside]
+            error = {side: np.nanmean((h - setpoints[side]) ** 2) for side, h in sides.items()}
             row["error"] = {side: float(np.sqrt(square)) for side, square in error.items()}
         row["highest"] = {s: float(np.nanmax(h)) for s, h in sides.items()}
         row["lowest"] = {s: float(np.nanmin(h)) for s, h in sides.items()}

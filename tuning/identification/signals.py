@@ -131,12 +131,13 @@ def _long(table, t, tag, value, unit, quality):
 def _wide(table, used, t):
     """Return the signals of a table with a column for each."""
     rest = sorted({*range(len(table.columns))} - {*used})
-    judged = _qualities(table.columns, rest)
-    plain, marks = [i for i in rest if i not in judged], {}
-    for i, name in judged.items():
+    qualities = _qualities(table.columns, rest)
+    plain, marks = [i for i in rest if i not in qualities], {}
+    for i, name in qualities.items():
         of = [j for j in plain if compact(table.columns[j].name) == name != ""]
         if not of:  # the only one is of all columns, others of the one to their left
-            of = plain if [name] == [*judged.values()] == [""] else [j for j in plain if j < i][-1:]
+            alone = [name] == [*qualities.values()] == [""]
+            of = plain if alone else [j for j in plain if j < i][-1:]
         marks |= dict.fromkeys(of, table.columns[i].cells)
     return [Signal(table, i, t, marks.get(i, [])) for i in plain]
 
@@ -145,11 +146,11 @@ def _qualities(columns, rest):
     """Return {column of qualities: what it judges} among some; TRUE and FALSE of what has no values
     are its states.
     """
-    judged = {i: name for i in rest if (name := _judged(columns[i])) is not None}
-    values = [compact(columns[i].name) for i in rest if i not in judged]
-    states = [i for i in judged if states_of(columns[i]) is not None]
-    alone = [i for i in states if not any(judged[i] in value for value in values)]
-    return {i: name for i, name in judged.items() if i not in alone}
+    qualities = {i: name for i in rest if (name := _judged(columns[i])) is not None}
+    values = [compact(columns[i].name) for i in rest if i not in qualities]
+    states = [i for i in qualities if states_of(columns[i]) is not None]
+    alone = [i for i in states if not any(qualities[i] in value for value in values)]
+    return {i: name for i, name in qualities.items() if i not in alone}
 
 
 def compact(text):
@@ -196,9 +197,9 @@ def setpoint_of(text, names):
     rest, tanks = [part for part in parts if part not in SETPOINT], [*names]
     if len(rest) == len(parts):
         return None
-    own = [i for i, of in names.items() if any(_within(compact(n), rest) for n in of)]
-    own = own or (_of_number(rest, names) if rest else tanks)
-    return own[0] if len(own) == 1 else None
+    meant = [i for i, of in names.items() if any(_within(compact(n), rest) for n in of)]
+    meant = meant or (_of_number(rest, names) if rest else tanks)
+    return meant[0] if len(meant) == 1 else None
 
 
 def _of_number(parts, names):

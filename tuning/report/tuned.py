@@ -147,11 +147,11 @@ def _tracking_times(result):
     tuned = {name.partition("[")[0] for name in result.parameters}
     moved = {n.partition("[")[0] for n, p in result.parameters.items() if p["before"] != p["after"]}
     rows = []
-    for own, value in parameters(controller).items():
-        Tt, Ti = f"controller.{own}", f"controller.{own.removesuffix('Tt')}Ti"
-        if own.endswith("Tt") and value is not None and Ti in moved and Tt not in tuned:
+    for name, value in parameters(controller).items():
+        Tt, Ti = f"controller.{name}", f"controller.{name.removesuffix('Tt')}Ti"
+        if name.endswith("Tt") and value is not None and Ti in moved and Tt not in tuned:
             numbers = ", ".join(verdicts.shown(v, 4) for v in np.unique(np.asarray(value)))
-            rows.append((Tt, f"{numbers} {describe(controller, own)['unit']}"))
+            rows.append((Tt, f"{numbers} {describe(controller, name)['unit']}"))
     return rows
 
 
@@ -343,8 +343,8 @@ def _shares(answer, sides):
     if answer.before.limits:
         rows.append(["plants that violate a limit", *(share(~s.held) for s in sides)])
     loop = answer.setting.case.loop
-    found = (verdicts.not_tracking(loop, s.measures, s.failed) for s in sides)
-    lost = [flags for flags in found if flags is not None]
+    flags = [verdicts.not_tracking(loop, s.measures, s.failed) for s in sides]
+    lost = [astray for astray in flags if astray is not None]
     if len(lost) == len(sides) and np.any(lost):
         rows.append(["plants that do not keep to their setpoints", *map(share, lost)])
     return rows

@@ -338,15 +338,15 @@ def of_tuning(result: Any) -> Verdict:
 
 def _tracking_of_answer(loop, values, answer):
     """The tracking of its own run, and on how many validation plants it is not good."""
-    own = tracking(loop, values)
-    if own is None or answer is None or answer.after is None:
-        return own
+    nominal = tracking(loop, values)
+    if nominal is None or answer is None or answer.after is None:
+        return nominal
     after = answer.after
     lost = not_tracking(loop, after.measures, after.failed)
     if lost is None or not lost.any():
-        return own
-    joint = ", but " if own.good else "; "
-    return Part(own.words + joint + astray(lost, answer.setting.runs, after.infeasible), False)
+        return nominal
+    joint = ", but " if nominal.good else "; "
+    return Part(nominal.words + joint + astray(lost, answer.setting.runs, after.infeasible), False)
 
 
 def astray(lost: np.ndarray, runs: str, infeasible: np.ndarray | None) -> str:
