@@ -50,6 +50,9 @@ class Plant(Role):
     overflow: bool = False
     """True where a level stops at its rim and the rest overflows."""
 
+    catching: bool = False
+    """True where a tank overflows into another; `spill` then takes a second argument."""
+
     bottom: bool = False
     """True where a level stops at zero whatever is drawn from it."""
 

@@ -298,10 +298,16 @@ def brims(net: Any) -> list[Any]:
     return heights
 
 
-def overflowed(net: Any, x: Any, order: tuple[list[int], list[int]]) -> tuple[Any, Any]:
-    """Return (levels (n,) at or below the brims, volume lost over each (n,) [cm^3])."""
+def overflowed(
+    net: Any, x: Any, order: tuple[list[int], list[int]], moved: Any = None
+) -> tuple[Any, Any]:
+    """Return (levels (n,) at or below the brims, volume lost over each (n,) [cm^3]); `moved`: as
+    of `TankNetwork.spill`.
+    """
     heights, volumes, lost = brims(net), list(stored(net, x)), [0.0] * net.tanks
     brim = stored(net, heights)
+    if moved is not None:
+        volumes = [v - m for v, m in zip(volumes, moved)]
     full = [False] * net.tanks
 
     def over(i: int) -> Any:
@@ -319,6 +325,8 @@ def overflowed(net: Any, x: Any, order: tuple[list[int], list[int]]) -> tuple[An
                 volumes[sink] = volumes[sink] + net.caught[k] * excess
     for i in ring:  # what has come back to a full tank leaves the rig there
         over(i)
+    if moved is not None and net.bottom:
+        volumes = [lower_clip(v, 0.0) for v in volumes]
     # a tank that overflows stands at its brim exactly, and others keep their level to the bit
-    moved = levels(net, volumes)
-    return tuple(jnp.where(full[i], heights[i], moved[i]) for i in range(net.tanks)), tuple(lost)
+    lower = levels(net, volumes)
+    return tuple(jnp.where(full[i], heights[i], lower[i]) for i in range(net.tanks)), tuple(lost)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtank.core.checks import traceable
 from jaxtank.core.errors import InputError
 from jaxtank.core.kahan import added
+from jaxtank.core.numerics import lower_clip
 from jaxtank.core.vectors import each, unzipped, zeros
 from jaxtank.plants.base import Plant
 from jaxtank.xla.barrier import materialised
@@ -41,15 +42,25 @@ def advance(
     """Return the plant's levels a sample later, with overflow after each of its substeps."""
     h = dt / substeps
 
+    def moved(j, x, excess, d):
+        if not len(excess):
+            return integrate(plant, integrator, t + j * h, x, u, d, h), excess
+        changes = change(plant, integrator, t + j * h, x, u, d, h)
+        return unzipped(x, each(added, x, excess, changes))
+
     def substep(j, before):
-        x, excess, spilled, shortfall = before
-        if len(excess):
-            changes = change(plant, integrator, t + j * h, x, u, d, h)
-            x, excess = unzipped(x, each(added, x, excess, changes))
+        start, rounded, spilled, shortfall = before
+        x, excess = moved(j, start, rounded, d)
+        if not plant.catching:
+            shortfall = each(operator.add, shortfall, plant.shortfall(x))
+            x, over = plant.spill(x)
         else:
-            x = integrate(plant, integrator, t + j * h, x, u, d, h)
-        shortfall = each(operator.add, shortfall, plant.shortfall(x))
-        x, over = plant.spill(x)
+            # Liquid that came and went at the end of a step would leave a tank below a weir half
+            # a step's overflow too high: the step is taken again with it as in- and outflows
+            within = overflowing(plant, x)
+            x, excess = moved(j, start, rounded, entering(d, within, h))
+            shortfall = each(operator.add, shortfall, plant.shortfall(x))
+            x, over = plant.spill(x, within)
         return Advanced(x, excess, each(operator.add, spilled, over), shortfall)
 
     if rolled and not (isinstance(substeps, int) and substeps == 1):
@@ -59,6 +70,19 @@ def advance(
     for j in range(substeps):
         advanced = substep(j, advanced)
     return advanced
+
+
+def overflowing(plant, x):
+    """Volumes (n,) that overflow brings to each tank that stands at levels `x`, or takes."""
+    full = each(lambda h: lower_clip(h, 0.0), x) if plant.bottom else x
+    stored = plant.stored if plant.by_volume else lambda x: each(operator.mul, x, plant.area)
+    return each(operator.sub, stored(plant.spill(full)[0]), stored(full))
+
+
+def entering(d, volumes, h):
+    """Inflows `d`, and volumes besides that enter within `h` [s]."""
+    rates = each(lambda v: v / h, volumes)
+    return rates if d is None else each(operator.add, d, rates)
 
 
 def integrate(plant, integrator, t, x, u, d, h):

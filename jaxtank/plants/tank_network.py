@@ -398,6 +398,10 @@ class TankNetwork(Plant):
         return self._flows(t, x, u, d)
 
     @property
+    def catching(self) -> bool:
+        return self.overflow and bool(self.spills)
+
+    @property
     def by_volume(self) -> bool:
         return bool(self.shapes)
 
@@ -512,13 +516,23 @@ class TankNetwork(Plant):
             return tuple(lower_clip(-v, 0.0) for v in elements.stored(self, x))
         return each(lambda h, area: area * (lower_clip(h, 0.0) - h), x, self.area)
 
-    def spill(self, x: Sequence) -> tuple[Sequence, Sequence]:
+    def spill(self, x: Sequence, moved: Sequence | None = None) -> tuple[Sequence, Sequence]:
+        """Return (levels at or below the rims, volume lost over each rim [cm^3]); `moved`: what
+        overflow has brought to each tank of levels `x` already, or taken (n,) [cm^3].
+        """
         if self.bottom:
             x = each(lambda h: lower_clip(h, 0.0), x)
         if not self.overflow:
             return x, zeros(x)
         if not self.plain:
-            return elements.overflowed(self, x, downwards(self.spills, self.tanks))
+            return elements.overflowed(self, x, downwards(self.spills, self.tanks), moved)
+        if moved is None:
+            return self._overflowed(x)
+        x, lost = self._overflowed(each(lambda h, v, area: h - v / area, x, moved, self.area))
+        return each(lambda h: lower_clip(h, 0.0), x) if self.bottom else x, lost
+
+    def _overflowed(self, x):
+        """`spill` of prisms, without what `moved`."""
         if is_array(x):
             return overflowed(self, x)
         x, overflow = list(x), [0.0] * self.tanks

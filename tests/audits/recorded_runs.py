@@ -2,7 +2,8 @@
 number.
 
 python tests/audits/recorded_runs.py            compare every case with the record
-python tests/audits/recorded_runs.py --record   record them again: after a change of numbers
+python tests/audits/recorded_runs.py --record   record them again: after a change of numbers; with
+                                                names of cases, these
 
 On a machine with the recorded processor and versions, runs agree to the last bit; elsewhere
 samples of them agree to 1e-12 of their size (1e-6 where quadratic programmes end their iterations).
@@ -82,9 +83,13 @@ def differences(name, found, recorded, exact):
 def main():
     jax.config.update("jax_enable_x64", True)
     if "--record" in sys.argv:
-        cases = {name: run(name) for name in presets.names()}
-        FILE.parent.mkdir(exist_ok=True)
-        FILE.write_text(json.dumps({"machine": machine(), "cases": cases}) + "\n")
+        names = sys.argv[2:] or presets.names()
+        cases = {name: run(name) for name in names}
+        record = {"machine": machine(), "cases": cases}
+        if sys.argv[2:]:
+            record = json.loads(FILE.read_text())
+            record["cases"] |= cases
+        FILE.write_text(json.dumps(record) + "\n")
         print(f"{len(cases)} cases recorded")
         return 0
     record = json.loads(FILE.read_text())

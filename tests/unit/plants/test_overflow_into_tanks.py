@@ -1,0 +1,92 @@
+"""What passes a rim and falls into another tank arrives as it falls, not when a step ends."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxtank.plants.network import network
+from jaxtank.plants.runge_kutta import advance
+
+GRAVITY, FLOW, DRAIN = 981.0, 180.0, 1.5
+BELOW = (FLOW / DRAIN) ** 2 / (2.0 * GRAVITY)  # Torricelli: the level whose outflow is FLOW
+
+
+def weir(tanks=2, **more):
+    """A full tank whose pump pours FLOW over its rim into one with an outlet; others are empty."""
+    return network(
+        area=[200.0, 150.0] + [1.0] * (tanks - 2),
+        drain=[0.0, DRAIN] + [0.0] * (tanks - 2),
+        rim=40.0,
+        pump_gain=30.0,
+        feeds=[(0, None)],
+        spills=[(0, 1)],
+        caught=1.0,
+        gravity=GRAVITY,
+        overflow=True,
+        bottom=True,
+        **more,
+    )
+
+
+def after(plant, x, u, dt, steps):
+    """(Levels, volumes lost) after that many steps with the input held."""
+    start = jax.tree.map(lambda v: jnp.asarray(v, dtype=float), x)
+
+    def step(carry, _):
+        moved = advance(plant, "rk4", 0.0, carry[0], u, None, dt, 1)
+        lost = jax.tree.map(lambda a, b: a + b, carry[1], moved.spilled)
+        return (moved.x, lost), None
+
+    carry = (start, jax.tree.map(jnp.zeros_like, start))
+    x, lost = jax.lax.scan(step, carry, length=steps)[0]
+    return np.array(x), np.array(lost)
+
+
+@pytest.mark.parametrize("dt", [0.25, 1.0, 4.0])
+@pytest.mark.parametrize("form", ["scalars", "arrays", "by volume"])
+def test_a_tank_below_a_weir_stands_where_its_outlet_carries_the_flow(form, dt):
+    tanks = 12 if form == "arrays" else 2
+    plant = weir(tanks)
+    if form == "by volume":
+        plant = weir(shapes=["sphere", "prism"], extent=[40.0, 40.0])
+    x, u = (40.0, 10.0, *[0.0] * (tanks - 2)), (6.0,)
+    if form == "arrays":
+        x, u = jnp.array(x), jnp.array(u)
+    levels, lost = after(plant, x, u, dt, int(1200 / dt))
+    assert levels[0] == 40.0 and lost[0] == pytest.approx(0.0, abs=1e-9)
+    assert levels[1] == pytest.approx(BELOW, rel=1e-9)
+
+
+def chain(drain):
+    """Two tanks that overflow one into the next, a pipe from the first, a third that collects."""
+    return network(
+        area=[20.0, 15.0, 300.0, 30.0],
+        drain=[drain, drain, 0.0, drain],
+        rim=[10.0, 8.0, 90.0, 40.0],
+        pipes=[(0, 3)],
+        pipe=0.05,
+        pump_gain=20.0,
+        feeds=[(0, None)],
+        spills=[(0, 1), (1, 2)],
+        caught=[1.0, 0.9],
+        gravity=GRAVITY,
+        overflow=True,
+        bottom=True,
+    )
+
+
+def test_no_volume_is_lost_in_a_chain_of_overflows():
+    plant, start = chain(0.0), (9.0, 7.5, 0.0, 3.0)
+    levels, lost = after(plant, start, (6.0,), 0.5, 200)
+    stored = lambda x: float(np.dot(plant.area, x))
+    assert lost[1] > 100.0
+    assert stored(levels) + lost.sum() == pytest.approx(stored(start) + 120.0 * 100.0, rel=1e-12)
+
+
+def test_a_chain_of_overflows_is_of_second_order_in_the_step():
+    plant, start = chain(0.1), (10.0, 8.0, 0.0, 3.0)
+    at = lambda dt: after(plant, start, (6.0,), dt, int(20 / dt))[0]
+    exact = at(1 / 256)
+    coarse, fine = np.abs(at(0.5) - exact), np.abs(at(0.25) - exact)
+    assert np.all(fine <= 0.35 * coarse) and 1e-5 < coarse.max() < 0.05
