@@ -646,8 +646,9 @@ function tuneNow(plants = null) {
       const errors = `error ${shown(found.before, 3)} to ${shown(error, 3)} ${unit}${varied ? " in the mean" : ""}`;
       const ends = found.ends.map((name) => `; ${name} ends on its range`).join("");
       const noise = searched > 1 ? " with noise and a price on input changes" : "";
+      const peak = searched > 1 ? " Ms is not computed here; jaxtank tune keeps it at most 2.5 where it can." : "";
       const guard = state.filter && !filtered ? ", safety filter switched on" : "";
-      say(`Tuned${on}${noise}${guard} in ${found.iterations} iterations (${found.status})${holds}; ${errors}${ends}.${alone}${mission?.tuned?.(current) ?? ""}`, true);
+      say(`Tuned${on}${noise}${guard} in ${found.iterations} iterations (${found.status})${holds}; ${errors}${ends}.${peak}${alone}${mission?.tuned?.(current) ?? ""}`, true);
       $("undo").hidden = false;
       $("undo").onclick = () => {
         state.values = before;
