@@ -63,3 +63,10 @@ def test_a_moving_picture_of_an_earlier_run_does_not_stay(tmp_path):
     assert not (tmp_path / "run.gif").exists() and (tmp_path / "trajectory.csv").exists()
     assert main.main([*words[:-2], str(foreign), "--quiet"]) == 0
     assert (foreign / "run.gif").exists()  # no run of this program lay there
+
+
+def test_simulate_says_that_inputs_chatter(capsys):
+    assert main.main(["simulate", "mirakhorli/smc-printed"]) == 0
+    assert "the input of pump 1 chatters: it changes by 100 %" in capsys.readouterr().err
+    assert main.main(["simulate", "mirakhorli/smc"]) == 0
+    assert "chatters" not in capsys.readouterr().err

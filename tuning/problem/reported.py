@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.clock import Clock
+from jaxtank.core.labels import label_of
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import ClosedLoop, zero_of
@@ -24,6 +25,25 @@ def run_measures(
     """Return {measure: value} of everything that is reported of one run."""
     values = lp.evaluate(loop, clock, reported_names(loop, besides), key)
     return {m: np.asarray(v) for m, v in values.items()}
+
+
+CHATTER = 0.1
+"""Mean change of an input from sample to sample, as a share of its range, above which it is said
+to chatter [-]. Of the preset cases only the relay of mirakhorli passes 0.01."""
+
+
+def chatter(loop: ClosedLoop, clock: Clock, values: Mapping[str, Any]) -> list[str]:
+    """Return a sentence where an input of a run with measures `values` changes all the time."""
+    low, high = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
+    travel = np.ravel(values.get("input_travel", 0.0)) / (clock.samples * (high - low))
+    j = int(np.argmax(travel))
+    if not travel[j] > CHATTER:
+        return []
+    return [
+        f"the input of {label_of(loop.plant, 'pump', j)} chatters: it changes by"
+        f" {100 * travel[j]:.0f} % of its range from sample to sample, in the mean (smaller gains,"
+        " a filter of the derivative or the sensor, or less noise)"
+    ]
 
 
 def in_force(loop: ClosedLoop, values: Mapping[str, float]) -> dict[str, float]:

@@ -8,6 +8,7 @@ code                             reported when
 step-too-long                    the integration step is too long for the answer
 edge-of-stability                the sampled linearised loop is unstable or has Ms above 2.5
 input-total-variation            the total variation of the inputs grew tenfold or more
+input-chatters                   an input changes by a tenth of its range each sample
 no-longer-follows                the answer leaves a setpoint that the start held
 no-feasible-point-found          the search ended before a point met every limit
 infeasible                       the least violation of the limits is not zero
@@ -56,6 +57,7 @@ from jaxtank.core.labels import entry_label, label_of, labels_of
 from jaxtank.core.text import count
 from jaxtank.core.tree import parameters
 from jaxtank.safety.of_case import SPREAD
+from tuning.problem import reported
 from tuning.problem.problem import DIVERGED
 from tuning.problem.status import Status
 from tuning.search.driver import SLOPING, UNSTABLE
@@ -193,6 +195,12 @@ def _busier(result: TuningResult) -> Messages:
             f" {new / old:.0f} times that before",
             f"inputs change {new / old:.0f} times as much as before",
         )
+
+
+def _chatters(result: TuningResult) -> Messages:
+    problem, values = result.problem, result.measures.get("after", {})
+    for sentence in reported.chatter(problem.loop, problem.clock, values):
+        yield Message("input-chatters", sentence)
 
 
 def _no_feasible_point(result: TuningResult) -> Messages:
@@ -601,6 +609,7 @@ RULES: tuple[tuple[Callable[[TuningResult], Messages], str], ...] = (
     (_less_robust, ANSWER),
     (_total_variation, OPTIMUM),
     (_busier, ANSWER),
+    (_chatters, ANY),
     (_no_feasible_point, OPTIMUM),
     (_infeasible, OPTIMUM),
     (_interrupted, ANY),

@@ -303,7 +303,10 @@ def test_chatter_is_told_and_drawn(gouta, limited):
     told = {"before": calm, "after": run_measures(wild.loop, wild.clock, None)}
     codes = lambda measures: [m.code for m in messages_of(result.replace(measures=measures))]
     assert "input-total-variation" in codes(told)
-    assert "input-total-variation" not in codes({"before": calm, "after": calm})
+    everywhere = calm | {"input_travel": 1e9 * calm["input_travel"]}
+    assert "input-chatters" in codes({"before": calm, "after": everywhere})
+    same = codes({"before": calm, "after": calm})
+    assert not {"input-total-variation", "input-chatters"} & set(same)
 
 
 @pytest.mark.slow

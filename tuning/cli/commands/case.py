@@ -93,6 +93,7 @@ def simulate(args):
     measures = dict(reported.run_measures(case.loop, case.clock, key))
     line.end()
     phase.show("checking the run")
+    sentences += reported.chatter(case.loop, case.clock, measures)
     for sentence in [*sentences, *_notes_on_run(case, measures, key)]:
         note(args, sentence)
     plateaus = stability_margins(case.loop, case.clock) if args.margins else None
