@@ -221,11 +221,15 @@ def physics(plant):
         " how far."
     )
     if plant.overflow:
-        words = "simulated: a level stops at its rim ({rims}), and the liquid above it is lost."
+        words = "simulated: a level stops at its rim ({rims}), and the liquid above it overflows."
     sentences = [f"Overflow is {words.format(rims=rims)}"]
-    for (source, sink), share in zip(plant.spills, np.asarray(plant.caught)):
+    for k, ((source, sink), share) in enumerate(zip(plant.spills, np.asarray(plant.caught))):
+        tank = label_of(plant, "tank", source)
+        ports = getattr(plant, "spill_port", None)
+        if plant.overflow and ports is not None and ports[k] < plant.rim[source]:
+            sentences.append(f"The level of {tank} stops below its rim, at {ports[k]:g} {length}.")
         sentences.append(
-            f"{100 * share:.4g} % of the overflow of {label_of(plant, 'tank', source)} falls into"
+            f"{100 * share:.4g} % of the overflow of {tank} falls into"
             f" {label_of(plant, 'tank', sink)}."
         )
     if plant.bottom:
