@@ -50,8 +50,8 @@ class Plant(Role):
     overflow: bool = False
     """True where a level stops at its rim and the rest overflows."""
 
-    catching: bool = False
-    """True where a tank overflows into another; `spill` then takes a second argument."""
+    overflow_within: bool = False
+    """True where overflow leaves within a step, not at its end: `spill` has a second argument."""
 
     bottom: bool = False
     """True where a level stops at zero whatever is drawn from it."""

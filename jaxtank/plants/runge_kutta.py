@@ -51,12 +51,13 @@ def advance(
     def substep(j, before):
         start, rounded, spilled, shortfall = before
         x, excess = moved(j, start, rounded, d)
-        if not plant.catching:
+        if not plant.overflow_within:
             shortfall = each(operator.add, shortfall, plant.shortfall(x))
             x, over = plant.spill(x)
         else:
-            # Liquid that came and went at the end of a step would leave a tank below a weir half
-            # a step's overflow too high: the step is taken again with it as in- and outflows
+            # Overflow at the end of a step is of first order: a full tank stands above its rim
+            # until then and gives too much through its outlets, one below a weir stands half a
+            # step's overflow too high. So the step is taken again with it as in- and outflows
             within = overflowing(plant, x)
             x, excess = moved(j, start, rounded, entering(d, within, h))
             shortfall = each(operator.add, shortfall, plant.shortfall(x))

@@ -398,8 +398,8 @@ class TankNetwork(Plant):
         return self._flows(t, x, u, d)
 
     @property
-    def catching(self) -> bool:
-        return self.overflow and bool(self.spills)
+    def overflow_within(self) -> bool:
+        return self.overflow
 
     @property
     def by_volume(self) -> bool:

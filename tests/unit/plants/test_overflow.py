@@ -1,4 +1,4 @@
-"""What passes a rim and falls into another tank arrives as it falls, not when a step ends."""
+"""Overflow leaves, and enters the tank below, while it flows and not when a step ends."""
 
 import jax
 import jax.numpy as jnp
@@ -90,3 +90,21 @@ def test_a_chain_of_overflows_is_of_second_order_in_the_step():
     exact = at(1 / 256)
     coarse, fine = np.abs(at(0.5) - exact), np.abs(at(0.25) - exact)
     assert np.all(fine <= 0.35 * coarse) and 1e-5 < coarse.max() < 0.05
+
+
+@pytest.mark.parametrize("dt", [1.0, 10.0])
+def test_a_full_tank_loses_what_its_outlet_does_not_carry(dt):
+    plant = network(
+        area=5000.0,
+        drain=4.0,
+        rim=120.0,
+        pump_gain=30.0,
+        feeds=[(0, None)],
+        gravity=GRAVITY,
+        overflow=True,
+        bottom=True,
+    )
+    levels, lost = after(plant, (120.0,), (100.0,), dt, int(1800 / dt))
+    carried = 4.0 * (2.0 * GRAVITY * 120.0) ** 0.5
+    assert levels[0] == 120.0
+    assert lost[0] == pytest.approx((3000.0 - carried) * 1800.0, rel=1e-4)
