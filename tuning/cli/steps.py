@@ -187,10 +187,7 @@ def use_devices(args):
 
 
 def print_result(args, payload, text, done=""):
-    """Print a JSON object under --json, else what `text()` returns.
-
-    `done` : the sentence of the verdict of a command that judges nothing.
-    """
+    """Print a JSON object under --json, else `text()`; done: a verdict where nothing is judged."""
     if not args.json:
         shown = text()
     else:

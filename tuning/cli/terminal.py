@@ -71,9 +71,7 @@ def coloured(stream):
 
 
 class Phase:
-    """What goes on before, between and after lines of progress, on a terminal: once it has taken
-    DELAY it is shown with its seconds, and it is erased when anything else is written.
-    """
+    """Work that a terminal shows with its seconds, after DELAY, between lines of progress."""
 
     DELAY = 0.7  # s
 
@@ -117,8 +115,7 @@ class Phase:
 
 phase = Phase()
 
-OPEN: set["Line"] = set()
-"""Lines of progress that have not ended."""
+OPEN: set["Line"] = set()  # lines of progress that have not ended
 
 
 def end_lines():
@@ -129,9 +126,7 @@ def end_lines():
 
 
 class Line:
-    """Progress on stderr: one line that is overwritten on a terminal, with the seconds since it
-    appeared; few lines elsewhere.
-    """
+    """Progress on stderr: one line, overwritten on a terminal; few lines elsewhere."""
 
     def __init__(self, quiet):
         self.quiet, self.terminal = quiet, sys.stderr.isatty()

@@ -150,8 +150,7 @@ def span(text):
     return low, high, scale or ("log" if low > 0 else "linear")
 
 
-free_range = pair(span, "NAME=LOW:HIGH")
-"""What reads (name, range) of --free."""
+free_range = pair(span, "NAME=LOW:HIGH")  # what reads (name, range) of --free
 
 
 def limit(text):

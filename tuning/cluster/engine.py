@@ -14,14 +14,9 @@ from typing import Any
 from jaxtank.core.errors import InputError
 from tuning.cluster.local import local_workers
 
-CONNECT = 8.0
-"""Time within which a scheduler must answer [s]."""
-
-AT_ONCE = 1024
-"""Largest number of tasks under way at once, and of workers on one machine."""
-
-LOOK = 0.5
-"""Time after which the workers are looked at, where no result has come [s]."""
+CONNECT = 8.0  # time within which a scheduler must answer [s]
+AT_ONCE = 1024  # largest number of tasks under way at once, and of workers on one machine
+LOOK = 0.5  # time after which the workers are looked at, where no result has come [s]
 
 ENCRYPTED = ("tls://", "wss://")
 

@@ -13,8 +13,7 @@ from jaxtank.plants.faults import Faults
 from tuning.falsification.attacked import Attacked, of_plant
 from tuning.views import Result
 
-TOLERANCE = 1e-9
-"""Share of a limit by which rounding may pass it."""
+TOLERANCE = 1e-9  # share of a limit by which rounding may pass it
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)

@@ -155,9 +155,7 @@ def attack(
 
 
 class Limits(NamedTuple):
-    """(n,) limits [cm], (n,) levels below which starts lie [cm], and the certificates, None without
-    a filter whose settings are known.
-    """
+    """Limits (n,) [cm], levels (n,) below which starts lie [cm], certificates (None: no filter)."""
 
     limit: np.ndarray
     ceiling: np.ndarray
@@ -180,9 +178,7 @@ def limits_of(case: Case) -> Limits:
 
 
 def _rises(case, reach):
-    """(n,) what each level can rise by between two samples [cm] while no level passes `reach` (n,)
-    [cm]: b_max u_max dt and what flows in; nan for a plant that is no network.
-    """
+    """Largest rises (n,) of levels below `reach` between two samples [cm]; nan for no network."""
     safety_filter = filter_or_design(case)
     if safety_filter is None:
         return np.full(len(reach), np.nan)
@@ -267,9 +263,7 @@ def _in_batches(function, size, *arrays):
 
 
 def _points(attacked, draws, rng):
-    """{variable: (draws, ...)}: half of the draws at corners of the box, half inside; half of them
-    with coefficients and reading errors that are constant in time.
-    """
+    """{variable: (draws, ...)}: half at corners of the box; half constant in time."""
     points = {}
     corner, steady = np.arange(draws) % 2 == 0, np.arange(draws) // 2 % 2 == 0
     for name, shape in attacked.shapes.items():
@@ -286,8 +280,7 @@ def _points(attacked, draws, rng):
     return points
 
 
-SHORTEST = 1 / 64
-"""Step at which a point counts as the top of its hill."""
+SHORTEST = 1 / 64  # step at which a point counts as the top of its hill
 
 
 class Ascent(NamedTuple):

@@ -19,14 +19,12 @@ from tuning.problem.scenarios import noisy
 from tuning.report.simulated import run_for_people
 from tuning.report.tables import number
 
-FORMATS = ("svg", "png", "pdf")
-"""File formats of a figure."""
+FORMATS = ("svg", "png", "pdf")  # file formats of a figure
 
 WIDTH, LINE = (92, 122), 0.17
 """Characters in a line of the caption below one and two columns, height of a line [inch]."""
 
-SHARE = 0.5
-"""Share from which the first of two blended controllers counts as the one at work [-]."""
+SHARE = 0.5  # share from which the first of two blended controllers counts as the one at work [-]
 
 
 class Drawn(NamedTuple):

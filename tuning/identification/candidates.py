@@ -14,8 +14,7 @@ from tuning.identification.coordinates import Coordinates, Scalar
 from tuning.identification.inputs import CURVE, played
 from tuning.identification.problem import Estimation
 
-STEP = 1e-6
-"""Change of an unknown, in its coordinate, by which slopes are computed."""
+STEP = 1e-6  # change of an unknown, in its coordinate, by which slopes are computed
 FIELD = {
     "actuator.delays": "delay",
     "actuator.lag": "lag",
@@ -29,9 +28,7 @@ subtracted from larger inputs; above a threshold the input is unchanged.
 
 
 class Candidate(NamedTuple):
-    """What may be wrong with the structure: kind and place, the name of its value, its present
-    value, and the range in which it is sought.
-    """
+    """A possible error of the structure: kind, place, name, present value, range of the search."""
 
     kind: str
     where: int
@@ -150,9 +147,7 @@ def with_exponents(plant: TankNetwork) -> TankNetwork:
 
 
 class AugmentedEstimation(Estimation):
-    """A fitted Estimation with one more unknown for each Candidate; derivatives by finite
-    differences of one compiled program.
-    """
+    """A fitted Estimation with an unknown for each Candidate; slopes by finite differences."""
 
     # The program has the plant's leaves. Sensors are applied to its levels, and dead zones, curves,
     # lags and delays to its inputs, outside of it. An exponent absent from the plant enters as its
@@ -282,9 +277,7 @@ def _is_leaf(plant, candidate):
 
 
 def _by_exponent(rig, levels):
-    """Return {name: (logs, samples, tanks) flow that the exponent of an outlet adds to first order}
-    at levels (logs, samples, tanks).
-    """
+    """Return {name: (logs, samples, tanks) flow by an outlet's exponent, to first order}."""
     plant, flows = rig.plant, {}
     h = np.maximum(levels, 1e-9)
     h = np.concatenate([0.5 * (h[:, 1:] + h[:, :-1]), h[:, -1:]], axis=1)

@@ -22,8 +22,7 @@ WITHOUT_EFFECT = {
 }
 
 
-OF_PUMPS = ("pump_gain", "split")
-"""Of a pump that is off throughout, no reading depends on these."""
+OF_PUMPS = ("pump_gain", "split")  # of a pump that is off throughout, no reading depends on these
 
 
 class Scalar(NamedTuple):
@@ -96,8 +95,7 @@ class Branches(NamedTuple):
 
 
 class Ladder(NamedTuple):
-    """Levels of the points of a sensor's curve below its last: p the logarithms of their distances,
-    so that they increase."""
+    """Levels of the points of a sensor's curve below its last: p, logarithms of their distances."""
 
     names: tuple
     top: float  # level of the last point
@@ -251,9 +249,7 @@ def default_free(loop, logs=()):
 
 
 def _without_idle(free, loop, logs):
-    """Return `free` without gain and split of a pump that is off throughout all logs, and without
-    the gain by which a log's flows became inputs.
-    """
+    """Return `free` without gain and split of a pump that is off, and without a log's own gain."""
     if not logs:
         return free
     used = np.any([np.any(log.u != 0, axis=0) for log in logs], axis=0)
@@ -271,9 +267,7 @@ def _is_flow(loop, logs, pump):
 
 
 def refuse_used(loop, logs, names):
-    """Raise InputError for parameters by which columns of a log became inputs or levels: fitted to
-    these, each would come back as it was.
-    """
+    """Raise InputError for parameters by which columns of a log became inputs or levels."""
     pumps, length, drive = loop.plant.pumps, *loop.units
     of_pumps = [(f"plant.pump_gain[{j}]", 1 + j, "flows", "inputs") for j in range(pumps)]
     for log in logs:

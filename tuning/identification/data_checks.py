@@ -15,8 +15,7 @@ from tuning.identification.simulation import changes_of
 
 RIM_MARGIN = 1.5
 """Reading, in rims of its tank, above which the column is taken to be in another unit."""
-DRIVE_MARGIN = 2.0
-"""The same of a pump's input, in its upper limits."""
+DRIVE_MARGIN = 2.0  # the same of a pump's input, in its upper limits
 FAINT = 0.015
 """Share of its range below which a pump's input, or every level, is taken to be in another unit."""
 IRREGULAR = 1.25
@@ -122,9 +121,7 @@ def with_even_times(log):
 
 
 def with_hold(log: Log) -> Log:
-    """Return a Log that states what its inputs do between samples: where samples are irregular and
-    inputs change with the readings, it is not known when, and they follow a line from row to row.
-    """
+    """Return a Log that states what its inputs do between samples: lines if irregular."""
     # A step at its row would act late, by half a step on average, as a dead time does.
     if log.hold or log.samples < FEWEST or not _irregular(log):
         return log

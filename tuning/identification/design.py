@@ -27,8 +27,7 @@ IN_TURN = "steps one pump after the other, from empty"
 SMALL = "small step of every pump at once, from steady state"
 STAGGERED = "small staggered steps, from steady state"
 BINARY = "pseudo-random binary sequence about steady state"
-REGISTER = 7
-"""Length of the shift register of the pseudo-random binary sequence: 127 bits."""
+REGISTER = 7  # length of the shift register of the pseudo-random binary sequence: 127 bits
 
 
 def prbs(bits, channel):

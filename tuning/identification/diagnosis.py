@@ -19,17 +19,12 @@ from tuning.identification.residuals import ROBUST_LIMIT, WHITE, autocorrelation
 
 ALPHA = 0.02
 """Significance level of one round of tests, divided among the candidates (Bonferroni) [-]."""
-EQUIVALENT = 6.0
-"""2 log of the likelihood ratio below which two fits count as equivalent."""
-MAX_CAUSES = 3
-"""Most causes that are named."""
-MAX_FITTED = 10
-"""Most candidates that are fitted at once."""
+EQUIVALENT = 6.0  # 2 log of the likelihood ratio below which two fits count as equivalent
+MAX_CAUSES = 3  # most causes that are named
+MAX_FITTED = 10  # most candidates that are fitted at once
 ITERATIONS = 15
-LEAST_GAIN = 0.01
-"""Reduction of the sum of squares, in its mean, below which a fit has converged."""
-STRIDE = 5
-"""Stride through the distinct inputs in the first search for a threshold [-]."""
+LEAST_GAIN = 0.01  # reduction of the sum of squares, in its mean, below which a fit has converged
+STRIDE = 5  # stride through the distinct inputs in the first search for a threshold [-]
 BAD_FIT = 3.0
 """RMS of a residual, in the noise of its channel, from which exchanged columns are tried."""
 EXCHANGE_RATIO = 0.5
@@ -115,9 +110,7 @@ def unit_of(loop, candidate):
 
 
 def fast_noise(estimation, fit):
-    """Return (channels,) noise of the residuals from sample to sample, which a slow misfit does not
-    reach.
-    """
+    """Return (channels,) noise of the residuals from sample to sample, without a slow misfit."""
     steps = np.diff(residuals_of(estimation, fit), axis=1) / np.sqrt(2.0)
     known = np.isfinite(steps)  # of no two readings in a row there is none
     squares = np.sum(steps**2, axis=(0, 1), where=known)
@@ -147,9 +140,7 @@ def _loss(kind, residual):
 
 
 def _fit(problem, chosen, start=None):
-    """Return the Trial of a bounded Levenberg-Marquardt search over the Candidates `chosen` and the
-    unknowns of the Estimation.
-    """
+    """Return the Trial of a bounded Levenberg-Marquardt search with the Candidates `chosen`."""
     z = problem.begin if start is None else start
     problem.columns = columns = np.sort([*problem.usual, *(problem.known + i for i in chosen)])
     low, high = (side[columns] for side in problem.box)
@@ -274,24 +265,19 @@ def with_candidate(trial, i):
             problem.original, start[problem.usual], problem.loss, exponents=True
         )
     if problem.candidates[i].field == "threshold":
-        return _with_threshold(trial, i)
+        problem, c, at = trial.problem, trial.problem.candidates[i], trial.problem.known + i
+        options, chosen = _thresholds(problem, c), (*trial.chosen, i)
+        value = _best_threshold(trial, i, options[::STRIDE])[1]
+        for _ in range(3):
+            near = np.argmin(np.abs(options - value))
+            value = _best_threshold(trial, i, options[max(near - STRIDE, 0) : near + STRIDE + 1])[1]
+            start = trial.point.copy()
+            start[at] = (value - c.low) / (c.high - c.low)
+            if trial.chosen == chosen and np.isclose(trial.point[at], start[at]):
+                break
+            trial = _fit(problem, chosen, start)
+        return trial
     return _fit(problem, (*trial.chosen, i), start)
-
-
-def _with_threshold(trial, i):
-    """Return the Trial with the best threshold: between the inputs about the best of a few."""
-    problem, c, at = trial.problem, trial.problem.candidates[i], trial.problem.known + i
-    options, chosen = _thresholds(problem, c), (*trial.chosen, i)
-    value = _best_threshold(trial, i, options[::STRIDE])[1]
-    for _ in range(3):
-        near = np.argmin(np.abs(options - value))
-        value = _best_threshold(trial, i, options[max(near - STRIDE, 0) : near + STRIDE + 1])[1]
-        start = trial.point.copy()
-        start[at] = (value - c.low) / (c.high - c.low)
-        if trial.chosen == chosen and np.isclose(trial.point[at], start[at]):
-            break
-        trial = _fit(problem, chosen, start)
-    return trial
 
 
 def exchanges(trial, always=False):

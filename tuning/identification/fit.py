@@ -235,9 +235,7 @@ def _partial(case, logs, hold_back, options):
 
 
 def _all(cache, partial, logs, counts, options, search):
-    """Return (Fits of the searches, whether they were interrupted, Estimation of all data, its Fit,
-    validation or None).
-    """
+    """Return (Fits, whether interrupted, Estimation of all data, its Fit, validation or None)."""
     starts, seed, settings, progress = search
     fits, interrupted = _searches(cache, partial, starts, seed, settings, progress)
     best = solve(partial, partial.unknowns(_best(fits, logs[0].name)), **settings)
@@ -254,9 +252,7 @@ def _all(cache, partial, logs, counts, options, search):
 
 
 def _in_finer_steps(partial, best, settings):
-    """Return the Fit in the steps that its values need, where these are shorter than those that the
-    values of the case needed.
-    """
+    """Return the Fit in the steps that its values need, where these are shorter."""
     try:
         finer = partial.substeps_for(partial.unknowns(best))
     except DataError:  # no number of steps is enough: the validation set and the report say so
@@ -366,9 +362,7 @@ def _searches(cache, estimation, starts, seed, settings, progress):
 
 
 def _search(cache, estimation, z, settings):
-    """Return the Fit of a first search from z; of one from the checkpoint where it ended, without
-    its residual and Jacobian.
-    """
+    """Return the Fit of a search from z, or of the checkpoint where it ended (without Jacobian)."""
     new = []
 
     def compute():
@@ -407,9 +401,7 @@ def _within_ranges(estimation, fit, settings):
 
 
 def _likeliest(likelihood, estimation, simulated, before, iterations):
-    """Return (Fit, Spread, quality, report) of the likelihood that is asked for or chosen, after a
-    Fit to simulated readings with its (Spread, quality).
-    """
+    """Return (Fit, Spread, quality, report) of the likelihood that is asked for or chosen."""
     result, report = choose_likelihood(likelihood, estimation, simulated, iterations)
     if result is None:
         return simulated, *before, report | {"noise": [float(v) for v in estimation.noise]}

@@ -113,14 +113,11 @@ def identified_plant(result):
 
 REFINED = (1, 2, 4, 5, 10, 20)
 """Divisors of the sampling period of an open loop, so that a dead time is whole samples of it."""
-NEAR = 0.02
-"""Error of a dead time, as a share of it, that whole samples may make."""
+NEAR = 0.02  # error of a dead time, as a share of it, that whole samples may make
 
 
 def _with_inputs(result):
-    """Return (the case of an Identification with the dead times and curves of its inputs, their
-    names), dead times in whole samples.
-    """
+    """Return (case with dead times, in whole samples, and curves of its inputs, their names)."""
     case, u = result.case, result.estimation.data.u
     values = {n: p["value"] for n, p in result.parameters.items() if n.split("[")[0] in STATIC}
     if not values:
@@ -154,10 +151,8 @@ KINDS = ("pi",)
 STEPS = (1.1, 0.9, 1.05, 0.95)
 """Setpoint of each output after its change, over its steady level [-]: the first that the rig can
 hold is taken."""
-LONGEST = 1e8
-"""Time by which a rig with constant inputs must have come to its steady state [s]."""
-MOST = 100_000
-"""Most samples of the proposed run."""
+LONGEST = 1e8  # time by which a rig with constant inputs must have come to its steady state [s]
+MOST = 100_000  # most samples of the proposed run
 
 
 def check_kind(kind, case):

@@ -17,10 +17,8 @@ from tuning.identification.residuals import WHITE, autocorrelation, residuals_of
 from tuning.identification.simulation import player
 
 LIKELIHOODS = ("output-error", "innovations", "auto")
-REACH = 3.0
-"""Largest change of log(noise of the readings) from its first value."""
-PROCESS = (1e-8, 1e-1)
-"""Range of the process noise, in rims per root of a second."""
+REACH = 3.0  # largest change of log(noise of the readings) from its first value
+PROCESS = (1e-8, 1e-1)  # range of the process noise, in rims per root of a second
 PROCESS_SD = 0.5
 """Prior standard deviation of a tank's log(process noise) about the mean of all tanks."""
 
@@ -83,10 +81,7 @@ def innovations(rig, dt, u, y, present, process, variance, channels, substeps):
 def sensitivities(
     rig, dt, u, y, present, p, first, noises, *, coordinates, tanks, channels, substeps
 ):
-    """Return innovations and variances (logs, samples, channels), and their derivatives by the
-    unknowns of each log: coordinates p, levels `first`, and the logarithms `noises` of the standard
-    deviations of the tanks and of the channels.
-    """
+    """Return innovations, variances (logs, samples, channels), slopes by p, `first`, `noises`."""
     shared, n = coordinates.size, rig.plant.tanks
 
     def of_log(dt, u, y, present, first):
@@ -197,9 +192,7 @@ class Likelihood:
         return rows, jacobian
 
     def start(self, fit: Fit) -> np.ndarray:
-        """Return the unknowns from which the search after a Fit to the simulated readings begins:
-        the process noise that explains how its residuals change from sample to sample.
-        """
+        """Return the start: the process noise that explains changes of a Fit's residuals."""
         est = self.estimation
         residual, steps = residuals_of(est, fit), est.data.steps[:, :-1, None]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -236,9 +229,7 @@ def fit_innovations(estimation: Estimation, fit: Fit, iterations: int) -> Innova
 def choose_likelihood(
     kind: str, estimation: Estimation, fit: Fit, iterations: int
 ) -> tuple[Any, dict]:
-    """Return (InnovationsFit, None for the fit to simulated readings; {"kind", "asked",
-    "reason", "bic", "process_noise"}). reason: "asked", "white" residuals, or "bic", the lower one.
-    """
+    """Return (InnovationsFit or None, {"kind", "asked", "reason", "bic", "process_noise"})."""
     report = {"kind": "output-error", "asked": kind, "reason": "asked", "bic": None}
     report["process_noise"] = None
     if kind == "output-error":

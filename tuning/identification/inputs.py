@@ -27,12 +27,10 @@ class Inputs(NamedTuple):
         return np.maximum(x, 1e-12) ** self.exponent * shape
 
 
-STATIC = ("actuator.delays", "plant.curves")
-"""Names of such numbers that no leaf of a rig holds."""
+STATIC = ("actuator.delays", "plant.curves")  # names of such numbers that no leaf of a rig holds
 CURVE = ("exponent", "bend", "twist")
 """Fields of Inputs that `plant.curves[j]`, `[j,1]` and `[j,2]` are."""
-POINTS = 12
-"""Points of the curve that stands for an exponent in a rig file."""
+POINTS = 12  # points of the curve that stands for an exponent in a rig file
 
 
 def with_inputs(loop: Any, values: Mapping[str, float], top: np.ndarray) -> Any:
@@ -65,10 +63,7 @@ def with_inputs(loop: Any, values: Mapping[str, float], top: np.ndarray) -> Any:
 
 
 def transformed(dt: np.ndarray, u: np.ndarray, by: Inputs, top: float) -> np.ndarray:
-    """Return the means over pieces of length dt (pieces,) of an input u (pieces,) behind a dead
-    zone, a curve that leaves the largest input `top` as it is, a lag and a delay; the first input
-    is taken to have lasted.
-    """
+    """Return means over pieces (pieces,) of an input behind dead zone, curve, lag and delay."""
     if by.threshold > 0.0:
         u = np.where(u > by.threshold, u, 0.0)
     if by.dead > 0.0:
@@ -101,9 +96,7 @@ def _lagged(dt, u, lag):
 
 
 def played(data: Any, inputs: tuple, values: Any) -> np.ndarray:
-    """Return the inputs of PaddedData behind what values (inputs,) of (field of Inputs, pump, value
-    that the data have already) say.
-    """
+    """Return inputs of PaddedData behind `values` (inputs,) of (field, pump, value in the data)."""
     if not inputs:
         return data.u
     logs, u = data.u.shape[0], np.array(data.u)

@@ -80,9 +80,7 @@ def solve(
     tolerance: float = 1e-14,
     prior: Any = None,
 ) -> Fit:
-    """Return the Fit of a search from the unknowns `start` (unknowns,) of an Estimation, or of a
-    Likelihood.
-    """
+    """Return the Fit of a search from `start` (unknowns,) of an Estimation or a Likelihood."""
     before, residual = estimation.evaluations, _Residual(estimation, start, fixed or {}, prior)
     low, high = (side[residual.free] for side in estimation.box)
     begin = np.clip(residual.point[residual.free], low, high)

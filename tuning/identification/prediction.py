@@ -26,8 +26,7 @@ from tuning.identification.residuals import autocorrelation, fit_of, residuals_o
 from tuning.identification.result import channels_of
 from tuning.views import Result
 
-LAGS = 20
-"""Lags of the test of whiteness."""
+LAGS = 20  # lags of the test of whiteness
 WIDE = 3.0
 """Standard deviation of a level, in those of its noise, below which a fit in per cent compares
 the residual with noise."""
@@ -163,9 +162,7 @@ def played(case: Case, log: Log) -> Case:
 
 
 def beside(case: Case, log: Log, run: Any) -> dict[str, Any]:
-    """Return {"name", "t", "channels"} of experiment data and the Trajectory of its `played` case:
-    of each channel its "measured" and "simulated" readings, "rmse", "nrmse_percent", "bias".
-    """
+    """Return {"name", "t", "channels"}: measured beside simulated readings, and their errors."""
     t, sensor, channels = log.t - log.t[0], case.loop.sensor, []
     inside = t <= float(run.t[-1]) * (1 + 1e-9)
     for y, tank, volts in zip(log.y[inside].T, log.tanks, log.in_volts):
@@ -236,9 +233,7 @@ def _quality(estimation, residual, start):
 
 
 def _input_correlation(estimation, residual):
-    """Return the largest correlation of residuals with an input up to LAGS samples before, as a
-    multiple of its standard deviation for independent ones; None without a change of inputs.
-    """
+    """Return the largest correlation of residuals with earlier inputs [sd], or None."""
     u = estimation.data.u
     u, largest = (u[:, :, 0] if u.ndim == 4 else u), 0.0
     for j in range(u.shape[-1]):

@@ -30,8 +30,7 @@ STARTS = ("free", "measured", "case")
 LARGEST_ERROR = 0.05
 """Share of a channel's largest reading by which halving the steps may still move a reading."""
 
-DIFFERENCE = 1e-6
-"""Change of a coordinate of an input by which slopes are computed."""
+DIFFERENCE = 1e-6  # change of a coordinate of an input by which slopes are computed
 
 LARGEST_SLOPE = 1e60
 """Sensitivity, in standard deviations per unit of a coordinate, above which a run diverged."""
@@ -135,9 +134,7 @@ class Estimation:
         self.substeps = self.substeps_for(self.nominal()) if substeps is None else int(substeps)
 
     def _prior(self):
-        """Return (names, values (n,), root (n, n) of the information) of the case's covariance, of
-        the parameters that are estimated; None without one.
-        """
+        """Return (names, values (n,), root (n, n) of the information) of the prior, or None."""
         names, matrix = self.case.covariance or ((), ())
         chosen = [i for i, name in enumerate(names) if name in self.coordinates.names]
         if not chosen:
@@ -264,9 +261,7 @@ class Estimation:
         return levels
 
     def predicted(self, z: np.ndarray, data: Any = None) -> np.ndarray:
-        """Return (logs, samples, channels) simulated readings at the unknowns z, for the inputs of
-        the PaddedData `data`, its own by default.
-        """
+        """Return (logs, samples, channels) simulated readings at z, for the inputs of `data`."""
         data = self.data if data is None else data
         return np.asarray(
             simulation.play(
@@ -285,9 +280,7 @@ class Estimation:
         return played(data, of.inputs, list(of.values(p).values())[of.leaves.size :])
 
     def by_log(self, p: np.ndarray, levels: np.ndarray, logs: Any = slice(None)) -> tuple:
-        """Return (residual (logs, samples, channels), Jacobian (.., unknowns of a log)), weighted,
-        at coordinates p, of all logs or (logs, shared), and free levels (logs, free levels).
-        """
+        """Return weighted (residual (logs, samples, channels), Jacobian) at p and free levels."""
         rig, tanks, free = self.rig, self.tanks, len(self.tanks)
         if not tanks and np.any(self.initial != self.initial[0]):
             levels, tanks = self.initial[logs], tuple(range(self.initial.shape[1]))

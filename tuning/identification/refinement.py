@@ -14,16 +14,12 @@ from tuning.identification.least_squares import solve
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import WHITE, autocorrelation
 
-FOLDS = 4
-"""Blocks of the data, each predicted by a fit to the others."""
+FOLDS = 4  # blocks of the data, each predicted by a fit to the others
 CROSS_VALIDATION_RATIO = 0.95
 """Ratio of the mean squares of the prediction errors below which a part is added [-]."""
-MOST_POINTS = 8
-"""Most points of a curve of a sensor."""
-SUBSTEPS = 8
-"""Most Runge-Kutta steps per sample while parts are compared."""
-READINGS = 20
-"""Fewest readings per point."""
+MOST_POINTS = 8  # most points of a curve of a sensor
+SUBSTEPS = 8  # most Runge-Kutta steps per sample while parts are compared
+READINGS = 20  # fewest readings per point
 
 
 class Part(NamedTuple):
@@ -164,9 +160,7 @@ class _Search:
         return fit, self.predicted(fit, chosen)
 
     def predicted(self, fit, chosen):
-        """Return (FOLDS,) sums of squares of each block's residuals under a fit to the others: one
-        Gauss-Newton step of the parameters from a Fit to all.
-        """
+        """Return (FOLDS,) squares of each block after a Gauss-Newton step to the others."""
         # what the others do not determine stays: as if each coordinate were known to within 1, and
         # the levels at the first sample, which a prediction finds from the block itself
         free = self.unknowns(chosen)
@@ -184,9 +178,7 @@ class _Search:
 
 
 def refined(result: Any, settings: Mapping[str, Any]) -> tuple[Any, dict, list[Refinement]]:
-    """Return (case, free, Refinements) of an Identification after adding the Parts that predict
-    left-out blocks of its data better.
-    """
+    """Return (case, free, Refinements) with the Parts that predict left-out blocks better."""
     free = {b.name: (b.low, b.high, b.scale) for b in result.estimation.bounds}
     if _is_white(result.estimation, result.fit):
         return result.case, free, []

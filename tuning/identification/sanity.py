@@ -7,15 +7,13 @@ import numpy as np
 from jaxtank.rig.sensors import spans_of
 from tuning.identification.experiment import Log
 
-LUCK = 1e-4
-"""Probability of equal readings in a row above which they may be chance."""
+LUCK = 1e-4  # probability of equal readings in a row above which they may be chance
 SHORTEST = 8
 """Fewest equal readings in a row that are called frozen, and fewest changes of others [-]."""
 JUMP = 8.0
 """Least jump of a spike, there and back, in noise, and over the changes beside it a half of it."""
 
-FEW = 5
-"""Most readings in a row that a spike has."""
+FEW = 5  # most readings in a row that a spike has
 
 
 class Oddity(NamedTuple):
@@ -78,9 +76,7 @@ def _of_level(log, c, ends):
 
 
 def _band(y):
-    """Return the dead band of readings that are written on change and repeated until then; 0 where
-    fewer than half repeat, or where readings are no finer than their changes.
-    """
+    """Return the dead band of readings that are written on change and repeated, else 0."""
     changes = np.abs(np.diff(y))
     changes = changes[changes > 0.0]
     if changes.size < SHORTEST or 2 * changes.size > len(y) - 1:
@@ -90,9 +86,7 @@ def _band(y):
 
 
 def _stuck(y):
-    """Return [(start, stop)] of equal readings in a row: more than the resolution makes, among
-    readings with noise, or left by a jump.
-    """
+    """Return [(start, stop)] of equal readings in a row that resolution does not explain."""
     if len(y) < 2 * SHORTEST:
         return []
     step, bend = np.diff(y), np.diff(y, 2)
@@ -136,9 +130,7 @@ def _noise(y):
 
 
 def _dips(y, quiet):
-    """Return the samples of two to FEW readings that jump away together and back, as `_spikes` of
-    one, while no input changes (quiet, between readings).
-    """
+    """Return the samples of two to FEW readings that jump away and back while inputs rest."""
     if len(y) < SHORTEST:
         return np.zeros(0, dtype=int)
     dips: list[int] = []

@@ -59,8 +59,7 @@ SWITCH = {
 }
 """{word for the state of a pump or a valve, in lower case: share of its range}."""
 # fmt: on
-GOOD_CODE = 192
-"""Least code of OPC for a good quality."""
+GOOD_CODE = 192  # least code of OPC for a good quality
 
 
 class Signal(NamedTuple):
@@ -78,9 +77,7 @@ class Signal(NamedTuple):
 
 
 def time_columns(table: Table) -> list[int]:
-    """Return the columns of the times, the last the one to read: of dates and times of day joined,
-    where they have a column each.
-    """
+    """Return the columns of the times, the last the one to read: dates and times of day joined."""
     columns = table.columns
     where = lambda holds: [i for i, column in enumerate(columns) if holds(column)]
     days = where(lambda c: is_time(c.cells[0]) and ":" not in c.cells[0])
@@ -143,9 +140,7 @@ def _wide(table, used, t):
 
 
 def _qualities(columns, rest):
-    """Return {column of qualities: what it judges} among some; TRUE and FALSE of what has no values
-    are its states.
-    """
+    """Return {column of qualities: what it judges}; TRUE and FALSE alone are states."""
     qualities = {i: name for i in rest if (name := _judged(columns[i])) is not None}
     values = [compact(columns[i].name) for i in rest if i not in qualities]
     states = [i for i in qualities if states_of(columns[i]) is not None]
@@ -159,9 +154,7 @@ def compact(text):
 
 
 def rank(text, slot, name, slots):
-    """Return how well a column's name means a slot: 3 exactly, 2 with a word for a value, 1 with
-    other words, 0 not at all. name: the rig's own, or the slot.
-    """
+    """Return how well a column's name means a slot: 3 exactly, 2 as a value, 1 in part, 0 not."""
     letter = "h" if slots[slot][0] == "h" else "u"
     if _generic(text, slots) == slot or text in (name, f"{letter}_{name}"):
         return 3 if text else 0
@@ -178,9 +171,7 @@ def rank(text, slot, name, slots):
 
 
 def states_of(column):
-    """Return (cells,) shares of a range of a column of words such as ON and OFF, NaN of a missing
-    one; None of another column.
-    """
+    """Return (cells,) shares of a range of words such as ON and OFF, NaN if missing, or None."""
     words = [cell.lower() for cell in column.cells]
     if not {*words} & SWITCH.keys() or not {*words} <= SWITCH.keys() | MISSING:
         return None
@@ -188,9 +179,7 @@ def states_of(column):
 
 
 def setpoint_of(text, names):
-    """Return the tank whose setpoint a column's name means, or None; names: {tank of each output:
-    its names}.
-    """
+    """Return the tank whose setpoint a column means, or None; names: {tank: its names}."""
     # "SP1" is of output 1, also where that is another tank; "LIC101.SP" of the tank with number 101
     spoken = re.sub(r"set[\W_]?points?", "sp", text.lower())
     parts = re.findall(r"[^\W\d_]+|\d+", spoken)

@@ -169,11 +169,8 @@ DIVERGED = (
 GRIDS = (16, 4, 1)
 """Intervals that share an input, coarse to fine: slow changes are found with few unknowns."""
 
-SETPOINTS = 8
-"""Most setpoints whose steady-state inputs are computed for a start."""
-
-ROUNDS = 8
-"""Most rounds of constraint tightening with the finest intervals."""
+SETPOINTS = 8  # most setpoints whose steady-state inputs are computed for a start
+ROUNDS = 8  # most rounds of constraint tightening with the finest intervals
 
 
 class InputSearch:
@@ -357,11 +354,8 @@ def _better(a, b, strictly=False):
     return a["cost"] < b["cost"]
 
 
-MEMORY = 12
-"""Pairs of steps and gradient changes kept."""
-
-FLAT = 5
-"""Iterations in a row without progress that end a search."""
+MEMORY = 12  # pairs of steps and gradient changes kept
+FLAT = 5  # iterations in a row without progress that end a search
 
 
 def minimise(function, z, iterations, tolerance=1e-8):

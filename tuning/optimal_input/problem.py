@@ -26,11 +26,8 @@ from tuning.optimal_input.cost import (
 TOLERANCE = 3e-5
 """Share of a limit by which it may be exceeded and still counts as held [-]: 1e-3 cm of 30 cm."""
 
-SEARCH_SAMPLES = 4000
-"""Fewest samples of the coarse clock of the search."""
-
-INTERVALS = 1200
-"""Most intervals of an input by default."""
+SEARCH_SAMPLES = 4000  # fewest samples of the coarse clock of the search
+INTERVALS = 1200  # most intervals of an input by default
 
 MOST_INTERVALS = 20_000
 

@@ -105,25 +105,6 @@ def same_rig(*cases: Case) -> bool:
 
 def _computed(case: Case, kind: str) -> tuple[Any, dict[str, Any]]:
     """Return (controller, ranges) of a kind with the first gains of `START`."""
-    known = _rig_of(case)
-    table, names = START[kind](known)
-    written = {name: np.asarray(value).tolist() for name, value in table.items()}
-    controller = controller_of({"kind": kind, **written}, case.loop)
-    loop = dataclasses.replace(case.loop, controller=controller)
-    free: dict[str, Any] = {}
-    for name in names:
-        dotted = f"controller.{name}"
-        value = np.asarray(get_value(loop, dotted))
-        if name == "K":  # a matrix, whose entries may have either sign
-            largest = 4.0 * float(np.abs(value).max())
-            free[dotted] = Free(-largest, largest, "linear")
-        else:
-            free[dotted] = around(value, describe(loop, dotted))
-    return controller, free
-
-
-def _rig_of(case: Case) -> Rig:
-    """Return the data for the first gains."""
     plant: Any = model_of(case.loop)
     pumps = (plant.pumps,)
     if plant.pumps != len(plant.outputs):
@@ -143,7 +124,21 @@ def _rig_of(case: Case) -> Rig:
     height = float(np.max(rims[np.isfinite(rims)], initial=0.0)) or float(np.max(levels))
     slow = float(np.min(-np.linalg.eigvals(A).real))
     slowest = min(1.0 / max(slow, 1e-300), case.clock.duration)
-    return Rig(A, B, C, levels, setpoint, low, high, DEVIATION * height, EFFORT * span, slowest)
+    known = Rig(A, B, C, levels, setpoint, low, high, DEVIATION * height, EFFORT * span, slowest)
+    table, names = START[kind](known)
+    written = {name: np.asarray(value).tolist() for name, value in table.items()}
+    controller = controller_of({"kind": kind, **written}, case.loop)
+    loop = dataclasses.replace(case.loop, controller=controller)
+    free: dict[str, Any] = {}
+    for name in names:
+        dotted = f"controller.{name}"
+        value = np.asarray(get_value(loop, dotted))
+        if name == "K":  # a matrix, whose entries may have either sign
+            largest = 4.0 * float(np.abs(value).max())
+            free[dotted] = Free(-largest, largest, "linear")
+        else:
+            free[dotted] = around(value, describe(loop, dotted))
+    return controller, free
 
 
 def operating_point(case: Case, plant: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -166,9 +161,7 @@ def operating_point(case: Case, plant: Any) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def _circulating(loop: Any, plant: Any, setpoint: np.ndarray) -> Any:
-    """(levels, inputs) at rest of tanks that exchange nothing with the basin, with the volume that
-    they hold at the start; None where there are none, or none is found.
-    """
+    """(levels, inputs) at rest of tanks that keep their volume; None where there is none."""
     if not isinstance(plant, TankNetwork) or not (closed := closed_circuit(plant)):
         return None
     start, outputs = np.asarray(loop.x0, dtype=float), list(plant.outputs)

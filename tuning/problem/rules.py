@@ -107,28 +107,6 @@ def closed_around(loop: Loop, tank: int, gains: "Gains") -> Loop:
     return loop._replace(A=with_integral, b=b, c=c, nested=True)
 
 
-def flow_gains(case: Case, output: int, loop: Loop) -> tuple["Gains", Loop]:
-    """Return (SIMC gains of a flow loop, the loop whose input is the setpoint of the flow).
-
-    The flow follows its input with the lag and dead time of the actuator, read a sample later; the
-    closed flow loop is a lag and a dead time of this length.
-    """
-    plant: Any = case.loop.plant
-    _, levels, inputs = operating_point(case, plant)
-
-    def flows(u: Any) -> Any:
-        return jnp.stack(list(input_flows(plant, tuple(levels), tuple(u))))
-
-    with jax.enable_x64(True):
-        slope = float(np.asarray(jax.jacfwd(flows)(jnp.asarray(inputs)))[output, output])
-    if not slope:
-        raise InputError("the input moves no flow at the last plateau")
-    dead, lag = loop.delay + loop.dt, max(loop.lag, loop.dt)
-    return Gains(lag / (slope * 2.0 * dead), lag), loop._replace(
-        b=loop.b / slope, lag=dead, nested=True
-    )
-
-
 def _slopes(case: Case, inputs: np.ndarray, output: int) -> np.ndarray:
     """Change of the inputs (m,) for a unit of the controller's output, at inputs (m,)."""
     controller = case.loop.controller
@@ -255,9 +233,7 @@ class Relay(Controller):
 
 
 def relay_experiment(case: Case, output: int, linear: Loop | None = None) -> Ultimate:
-    """Return Ku = 4 d/(pi a) and Pu of a simulated relay experiment on one loop, others open:
-    d is the amplitude of the input, a that of the level, the one that `linear` reads.
-    """
+    """Return Ku = 4 d/(pi a) and Pu of a simulated relay experiment on one loop, others open."""
     loop, plant = case.loop, case.loop.plant
     linear = loop_of(case, output) if linear is None else linear
     if linear.nested:
@@ -452,7 +428,19 @@ def _gains_of(case: Case, rule: str, output: int) -> dict[str, float]:
         return gains
 
     if isinstance(controller, FlowCascade):
-        inner, loop = flow_gains(case, output, loop)
+        plant: Any = case.loop.plant
+        _, levels, inputs = operating_point(case, plant)
+
+        def flows(u: Any) -> Any:
+            return jnp.stack(list(input_flows(plant, tuple(levels), tuple(u))))
+
+        with jax.enable_x64(True):
+            slope = float(np.asarray(jax.jacfwd(flows)(jnp.asarray(inputs)))[output, output])
+        if not slope:
+            raise InputError("the input moves no flow at the last plateau")
+        dead, lag = loop.delay + loop.dt, max(loop.lag, loop.dt)
+        inner = Gains(lag / (slope * 2.0 * dead), lag)
+        loop = loop._replace(b=loop.b / slope, lag=dead, nested=True)
         values |= _present(controller, {"inner_Kc": inner.Kc, "inner_Ti": inner.Ti})
     elif isinstance(controller, Cascade):
         tank = controller.inner[output]

@@ -100,23 +100,18 @@ def check_scenarios(
     if len(checked) > MANY:
         raise InputError(f"scenarios: {len(checked)} of them, must be at most {MANY}")
     for s in checked:
-        _check_scenario(s, free)
+        if not np.isfinite(s.weight) or s.weight <= 0:
+            raise InputError(
+                f"scenario {s.name!r}: weight = {s.weight!r} must be a finite number above 0"
+            )
+        check_whole(f"scenario {s.name!r}: seed", s.seed, 0, 2**31 - 1)
+        for name in s.values:
+            for other in free:
+                if name == other or split_index(name)[0] == other or name == split_index(other)[0]:
+                    raise InputError(f"scenario {s.name!r} sets {name}, which is free")
     if len({s.name for s in checked}) < len(checked):
         raise InputError("scenarios: two have the same name")
     return checked
-
-
-def _check_scenario(s: Scenario, free: Sequence[str]) -> None:
-    """Raise InputError for a weight, a seed or a name that cannot be used."""
-    if not np.isfinite(s.weight) or s.weight <= 0:
-        raise InputError(
-            f"scenario {s.name!r}: weight = {s.weight!r} must be a finite number above 0"
-        )
-    check_whole(f"scenario {s.name!r}: seed", s.seed, 0, 2**31 - 1)
-    for name in s.values:
-        for other in free:
-            if name == other or split_index(name)[0] == other or name == split_index(other)[0]:
-                raise InputError(f"scenario {s.name!r} sets {name}, which is free")
 
 
 def runs_of(case: Case, scenarios: Sequence[Scenario], seed: int) -> list[ScenarioRun]:

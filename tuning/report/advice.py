@@ -28,8 +28,7 @@ class Advice(NamedTuple):
     beyond: str
 
 
-FEW = 4
-"""Entries of a list in a sentence."""
+FEW = 4  # entries of a list in a sentence
 
 GIVEN = "Nothing to set: the gains are those of the case"
 """The first words where a command changes no gain."""
@@ -71,9 +70,7 @@ def error_of(before: Any, after: Any, unit: str) -> str:
 def limits_of(
     rows: Sequence[Mapping[str, Any]], heads: Sequence[str] = ("value", "margin", "at")
 ) -> Table:
-    """Return the Table of limits for the top of a page; `rows` as those of `ConstraintRow`, with
-    cells of further columns, in place of the time, as "more".
-    """
+    """Return the Table of `ConstraintRow`s for a page; "more": cells in place of the time."""
     cells = []
     for row in rows:
         at_least = MEASURES[row["measure"]].sense < 0

@@ -21,11 +21,8 @@ from tuning.report.verdict import shown
 from tuning.uncertainty.distributions import Correlated, Normal
 from tuning.uncertainty.sensitivity_study import NORMAL_WIDTH
 
-PANELS = 12
-"""Measures in the picture."""
-
-LISTED = 8
-"""Parameters in the table of a measure."""
+PANELS = 12  # measures in the picture
+LISTED = 8  # parameters in the table of a measure
 
 WIDE = 0.2
 """Width of an interval of a share of the variance above which more samples are advised [-]."""
@@ -297,8 +294,8 @@ def figures(result):
     return {name: plots.panels(draws, title, rows)}
 
 
-def table_csv(result):
-    """Return every measure and parameter as CSV, one row each; empty where there is no number."""
+def save(result, folder, command=None):
+    """Write result.json, sensitivity.csv, tornado.png or sobol.png, and report.html to `folder`."""
     quantities, heads = list(METHODS[result.method].heads), []
     for q in quantities:
         ends = ("low", "high") if "interval95" in q else ("interval95",)
@@ -314,13 +311,8 @@ def table_csv(result):
             unit = describe(result.case.loop, name)["unit"]
             more = [derivative_unit(result, c, name) for _ in local]
             writer.writerow([c.label, c.unit, name, unit, rank, *numbers, *more])
-    return out.getvalue()
-
-
-def save(result, folder, command=None):
-    """Write result.json, sensitivity.csv, tornado.png or sobol.png, and report.html to `folder`."""
     files, names, title = (
-        {"sensitivity.csv": table_csv(result)},
+        {"sensitivity.csv": out.getvalue()},
         ["tornado", "sobol"],
         METHODS[result.method].title,
     )

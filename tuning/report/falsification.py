@@ -22,8 +22,7 @@ from tuning.report.safety import start_of
 from tuning.report.simulated import run_for_people
 from tuning.report.tables import Table, Value, clean, fields
 
-REPRODUCED = 1e-9
-"""Share of a level to which the rig file must give it again."""
+REPRODUCED = 1e-9  # share of a level to which the rig file must give it again
 
 CAPTIONS = {
     "worst": "The case itself (dashed), and the run with the smallest margin to its limit.",
@@ -306,9 +305,7 @@ def figures(attack, runs=None):
 
 
 def rig_of(attack):
-    """Return (text of worst.toml or None, {"level" of its run [cm], "difference" to the level that
-    was found [cm], "same": within REPRODUCED of it, "missing": what no rig file can describe}).
-    """
+    """Return (worst.toml or None, {"level" and "difference" [cm], "same", "missing" in it})."""
     worst = attack.worst
     text, why = rig_text(attack.rig(worst))
     missing = attack.not_in_rig(worst)

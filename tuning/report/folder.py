@@ -62,9 +62,7 @@ def save(
     stale: Sequence[Path] = (),
     provenance: Mapping[str, Any] | None = None,
 ) -> list[Path]:
-    """Write result.json and `files` {name: content} to `folder`, all or none, then the pictures of
-    `draw` with `captions` {first word of their names: text} and report.html; return the paths.
-    """
+    """Write result.json and `files` {name: content}, pictures and report.html; return paths."""
     # The files are written before anything is drawn, so that they outlive a fault in a picture;
     # `stale` files of an earlier result are removed between the two. `provenance` stands in for a
     # payload without one.

@@ -18,17 +18,10 @@ from jaxtank.core.errors import InputError
 from tuning.report.document import Figure, Live, Report, Text, failed
 from tuning.report.tables import Table
 
-LARGEST = 500_000
-"""Characters of one SVG picture, above which its dense lines are rasterised."""
-
-DENSE = 800
-"""Points of a line that is rasterised where a picture is too large."""
-
-LONG = 60
-"""Characters of a text in a cell above which it is wrapped."""
-
-WIDE = 480.0
-"""Width of a picture [pt] above which it can be enlarged in a narrow window."""
+LARGEST = 500_000  # characters of one SVG picture, above which its dense lines are rasterised
+DENSE = 800  # points of a line that is rasterised where a picture is too large
+LONG = 60  # characters of a text in a cell above which it is wrapped
+WIDE = 480.0  # width of a picture [pt] above which it can be enlarged in a narrow window
 
 
 @cache
@@ -62,7 +55,7 @@ def document(report: Report, command: str | None = None, provenance: Any = ()) -
     # command, provenance: the line that made the result, and versions, machine and seed
     sections = [s for s in report.sections if getattr(s, "on", "") != "terminal"]
     top, texts = (_texts(sections, top) for top in (True, False))
-    words = [s for s in texts if _is_list(s)]
+    words = [s for s in texts if isinstance(s, Text) and s.items and s.sentences]
     pictures = [_picture(s) for s in sections if isinstance(s, Figure)]
     template = _templates().get_template("page.html")
     return template.render(
@@ -86,10 +79,6 @@ def _texts(sections, top):
 def _frames(sections):
     frames = [_frame(s.result) for s in sections if isinstance(s, Live)]
     return [frame for frame in frames if frame]
-
-
-def _is_list(section):
-    return isinstance(section, Text) and section.items and bool(section.sentences)
 
 
 def fragment(sections) -> str:

@@ -191,9 +191,7 @@ def lacking(fit):
 
 
 def marked(fit):
-    """Return the identified case; its name, with which answers begin, says what it lacks, and its
-    [covariance] whether the data reject its structure.
-    """
+    """Return the identified case with what it lacks in its name, and whether it is rejected."""
     case, lacks = fit.identified, lacking(fit)
     case = dataclasses.replace(case, rejected=_is_rejected(fit))
     name = f"{case.name}{LACKS}{listed(lacks)}"
@@ -219,8 +217,7 @@ def _named(fit, kind, where):
     return CAUSES[kind].format(tank=tanks, pump=pump)
 
 
-PUMPS = ("pump-delay", "pump-lag", "dead-zone", "pump-curve")
-"""Kinds of causes located at a pump."""
+PUMPS = ("pump-delay", "pump-lag", "dead-zone", "pump-curve")  # kinds of causes located at a pump
 
 
 LATE = ("pump-delay", "pump-lag")
@@ -459,8 +456,7 @@ def advice_of(fit):
     return Advice(f"Diagnosis: {_short_diagnosis(fit)}; {to_set}.", gives, beyond)
 
 
-SAME = 5e-4
-"""Relative change of a value below which it is not to be set [-]."""
+SAME = 5e-4  # relative change of a value below which it is not to be set [-]
 
 
 def _short_diagnosis(fit):

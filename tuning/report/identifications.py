@@ -18,8 +18,7 @@ CAPTIONS = {
     "estimates": "Estimate of each record with its 95 % interval; a record without an interval is a"
     " cross."
 }
-LISTED = 12
-"""Most records that are printed one by one; `estimates.csv` has all of them."""
+LISTED = 12  # most records that are printed one by one; `estimates.csv` has all of them
 
 
 def labels(fits):
@@ -156,8 +155,8 @@ def figures(fits):
     return {"estimates": style.picture(draw, size, rows, columns, title=title, squeeze=False)}
 
 
-def estimates_csv(fits):
-    """Return CSV text, a row a record: name, convergence, estimates, deviations, levels."""
+def save(fits, folder, command=None):
+    """Write result.json, estimates.csv, estimates.png and report.html; return their paths."""
     heads = ["record", "converged"]
     for name, unit in zip(fits.names, fits.units):
         heads += [f"{name} [{unit}]", f"sd of {name} [{unit}]"]
@@ -173,13 +172,8 @@ def estimates_csv(fits):
         numbers = [*pairs, *fits.levels[e], *fits.rmse[e]]
         cells = ["" if np.isnan(v) else f"{v:.10g}" for v in numbers]
         writer.writerow([name, int(fits.converged[e]), *cells])
-    return out.getvalue()
-
-
-def save(fits, folder, command=None):
-    """Write result.json, estimates.csv, estimates.png and report.html; return their paths."""
     files, draw, page = (
-        {"estimates.csv": estimates_csv(fits)},
+        {"estimates.csv": out.getvalue()},
         lambda: figures(fits),
         lambda: report(fits),
     )

@@ -11,8 +11,7 @@ from tuning.report.identification import sentences_on
 from tuning.report.tables import Table, Value, clean
 
 CAPTIONS = {"log": "The columns of the file, over time."}
-MOST = 12
-"""Columns that are drawn."""
+MOST = 12  # columns that are drawn
 
 
 def json_of(result):

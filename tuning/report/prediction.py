@@ -15,10 +15,8 @@ from tuning.report.tables import Table, Value, clean
 CAPTIONS = {"fit": "Measured readings (dots), the rig as it is (line), and the inputs."}
 SIDES = ("measured", "simulated")
 PREDICTED = ("predicted", "achieved")
-ROWS = 12
-"""Times at which readings are printed side by side."""
-CHANCE = 0.01
-"""Probability below which residuals are called correlated."""
+ROWS = 12  # times at which readings are printed side by side
+CHANCE = 0.01  # probability below which residuals are called correlated
 FAR = 3.0
 """Correlation, in standard deviations, above which residuals are called dependent on an input."""
 

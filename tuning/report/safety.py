@@ -23,11 +23,7 @@ def start_of(starts):
 
 
 def certificates(case):
-    """Return [{"tank", "limit", "certified", "why", "starts", "rate", "rate_bound", "gap", "reach",
-    "low"}], one for each tank, of the safety filter that the case has or could have; tanks from 1;
-    None where there is no filter for its plant. starts: None where it is not certified. low:
-    {"limit", "certified", "why"}, None without one.
-    """
+    """Return a dict per tank on the safety filter that a case has or could have, or None."""
     try:
         rows = certificates_of(case)
     except InputError:

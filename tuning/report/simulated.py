@@ -39,8 +39,7 @@ CAPTIONS = {
     " from the setpoint, the second near it.",
 }
 
-WORST = 12
-"""Limits that are listed where there are many: the tightest ones."""
+WORST = 12  # limits that are listed where there are many: the tightest ones
 
 
 def run_for_people(case, key=None, rows=3000):
@@ -69,16 +68,8 @@ BRIEF = ("rms_error", "settling_time", "overshoot_percent", "max_level", "input_
 """Measures of a run on a terminal, after those of the objective, of which there are so many."""
 
 
-def _brief(case, values):
-    """The names of the measures on a terminal: the objective's, then others, five in all."""
-    names = dict.fromkeys([*case.objective, *BRIEF])
-    return [m for m in names if m in values][: len(BRIEF)]
-
-
 def estimates_of_run(case, key):
-    """Return {"diagnosis": the faults that a bank of fault models named in a run, "coefficients":
-    the coefficients of the model that were estimated}, as far as the observer has them.
-    """
+    """Return {"diagnosis": faults, "coefficients"} that the observer of a case has estimated."""
     observer = case.loop.observer
     has_modes, names = bool(observer.mode_names(case.loop.plant)), observer.coefficients
     if not has_modes and not names:
@@ -133,7 +124,8 @@ def report(case, values, plateaus=None, every=False, estimated=None):
         more = len(limits) - len(table.rows)
         note = [f"{more} further limits have larger margins"][:more]
         sections += [table, Text(note, on="page", top=True)]
-    brief = _brief(case, values)
+    names = dict.fromkeys([*case.objective, *BRIEF])
+    brief = [m for m in names if m in values][: len(BRIEF)]
     of = {"rig_units": loop.units, "gap": True, "plant": loop.plant}
     if every:
         sections += [measure_table(values, **of), Text(undefined(values, loop.plant))]
@@ -194,11 +186,7 @@ def _margins(loop, plateaus):
 
 
 def save(case, run, payload, folder, page, command=None, gif=False, against=None, columns=None):
-    """Write result.json, trajectory.csv, pictures and report.html of one simulation to `folder`.
-
-    Files of an earlier simulation are removed. Optionally a film (`gif`) and pictures for print
-    (`columns`).
-    """
+    """Write the files of one simulation; optionally a film and pictures for print."""
     # page: function that returns the Report; against: (Case, Trajectory) of a second rig in the
     # film, run.gif, and in its still, film.png.
     from jaxtank.plots import responses

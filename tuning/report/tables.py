@@ -16,17 +16,10 @@ from jaxtank.core.jsonable import clean as clean
 from jaxtank.core.labels import label_of, place_of
 from jaxtank.core.units import DEFAULT
 
-NARROW, WIDE = 60, 100
-"""Least and most characters of a line on a terminal."""
-
-WORD = 50
-"""Characters of a word in a cell, above which it is broken."""
-
-JOINED = "\u00a0"
-"""A space at which no line is broken."""
-
-MANY = 16
-"""Entries of a measure that are printed side by side; of more, the worst."""
+NARROW, WIDE = 60, 100  # least and most characters of a line on a terminal
+WORD = 50  # characters of a word in a cell, above which it is broken
+JOINED = "\u00a0"  # a space at which no line is broken
+MANY = 16  # entries of a measure that are printed side by side; of more, the worst
 
 
 def number(value, digits=5):
@@ -100,9 +93,7 @@ def _wrapped(cell, width):
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """A table: cells are texts, numbers and Values; `gap`: after an empty line on a terminal;
-    `top`: above the parts of a page that are folded.
-    """
+    """A table of texts, numbers and Values; gap: after an empty line; top: not folded on a page."""
 
     rows: Sequence[Sequence[Any]]
     head: Sequence[str] = ()
@@ -112,9 +103,7 @@ class Table:
     top: bool = False
 
     def lines(self):
-        """Return the lines of the table as aligned columns, not wider than the terminal: cells are
-        wrapped, and columns that do not fit stand below the others, after the first column again.
-        """
+        """Return aligned, wrapped columns; those that do not fit stand below."""
         body = [[_joined(cell) for cell in row] for row in self.rows]
         rows, width = [*([list(self.head)] if self.head else []), *body], columns()
         words = lambda i: (word for row in rows for word in row[i].split(" "))

@@ -24,8 +24,7 @@ from tuning.report.folder import save as save_all
 from tuning.report.simulated import json_of_run, run_for_people
 from tuning.report.tables import Table, entries, undefined
 
-MOST = 6
-"""Number of cases in one picture: each has a different colour."""
+MOST = 6  # number of cases in one picture: each has a different colour
 
 PARTS = {"plant": "plant", "reference": "setpoints", "actuator": "pumps", "x0": "start"}
 """{part of a loop in which cases may differ: its name}."""

@@ -39,8 +39,7 @@ from tuning.report.tables import (
 from tuning.search.result import Message, row_of
 from tuning.search.tuner import rule_row
 
-COSTLIEST, MANY = 5, 12
-"""Scenarios in a table that would have more than MANY rows."""
+COSTLIEST, MANY = 5, 12  # scenarios in a table that would have more than MANY rows
 
 SIDES = ("before", "after")
 
@@ -140,9 +139,7 @@ def advice_of(result):
 
 
 def _tracking_times(result):
-    """[(name, value with unit)] of tracking times that stay while their integral times change: left
-    out of a rig file, they would follow these.
-    """
+    """[(name, value with unit)] of tracking times that stay while their integral times change."""
     controller = result.tuned.loop.controller
     tuned = {name.partition("[")[0] for name in result.parameters}
     moved = {n.partition("[")[0] for n, p in result.parameters.items() if p["before"] != p["after"]}
@@ -384,8 +381,16 @@ def _mean(values, side, digits=3, of=slice(None)):
 
 def sections_of(result):
     """Return every table of a TuningResult."""
+    rows = []
+    for name, p in result.parameters.items():
+        remark = f"at {p['at_bound']} bound" if p["at_bound"] else ""
+        ends = Value([p["lower"], p["upper"]], between=" : ")
+        change = Value(p["sensitivity_percent"], 2, "%")
+        remark = remark if p["exercised"] else "without effect, unchanged"
+        rows.append([name, p["unit"], Value(p["before"]), Value(p["after"]), ends, change, remark])
+    heads = ["parameter", "unit", "before", "after", "range", "10 % of it changes the objective by"]
     sections = [
-        replace(_parameter_table(result), top=result.answer is None),
+        replace(Table(rows, [*heads, ""], gap=True), top=result.answer is None),
         *_measure_table(result),
         *_limit_table(result),
         *_scenario_table(result),
@@ -412,19 +417,6 @@ def _rims(result):
     if result.tuned.loop.safety_filter is not None:
         return "rims are limits, for which a safety filter limits the pump inputs"
     return "rims are limits only: overflow is not simulated, and a level may rise above its rim"
-
-
-def _parameter_table(result):
-    """Every free parameter before and after, its range, and the sensitivity of the objective."""
-    rows = []
-    for name, p in result.parameters.items():
-        remark = f"at {p['at_bound']} bound" if p["at_bound"] else ""
-        ends = Value([p["lower"], p["upper"]], between=" : ")
-        change = Value(p["sensitivity_percent"], 2, "%")
-        remark = remark if p["exercised"] else "without effect, unchanged"
-        rows.append([name, p["unit"], Value(p["before"]), Value(p["after"]), ends, change, remark])
-    heads = ["parameter", "unit", "before", "after", "range", "10 % of it changes the objective by"]
-    return Table(rows, [*heads, ""], gap=True)
 
 
 def _measure_table(result):
@@ -654,8 +646,15 @@ def figures(result, runs=None):
 
     runs = runs or _runs(result)
     loop, name, unit = result.tuned.loop, result.tuned.name, cost_unit(result)
+    gains = ", ".join(
+        f"{n.removeprefix('controller.')} {number(p['before'], 4)} -> {number(p['after'], 4)}"
+        f" {p['unit']}"
+        for n, p in list(result.parameters.items())[:4]
+    )
     drawings = {
-        "responses": responses.responses(loop, runs, _title(result), _level_limits(result)),
+        "responses": responses.responses(
+            loop, runs, f"{result.tuned.name}: {gains}", _level_limits(result)
+        ),
         **plots.rig(loop.plant, runs["after"], f"{name} at the end of the tuned run"),
     }
     if rows := worst_of_scenarios(result.constraints):
@@ -707,16 +706,6 @@ def _level_limits(result):
     for tank in {c["tank"] for c in rows}:
         levels[tank - 1] = min(c["limit"] for c in rows if c["tank"] == tank)
     return levels
-
-
-def _title(result):
-    """The first gains before and after, as the title of the responses."""
-    gains = ", ".join(
-        f"{n.removeprefix('controller.')} {number(p['before'], 4)} -> {number(p['after'], 4)}"
-        f" {p['unit']}"
-        for n, p in list(result.parameters.items())[:4]
-    )
-    return f"{result.tuned.name}: {gains}"
 
 
 def _clouds(result, unit):

@@ -33,11 +33,8 @@ from tuning.uncertainty.distributions import (
 from tuning.uncertainty.sampling import clopper_pearson
 
 QUANTITIES = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
-LIKELY = 3
-"""Most likely failures that are printed."""
-
-LINES = 1 << 12
-"""Draws that are written as CSV at once."""
+LIKELY = 3  # most likely failures that are printed
+LINES = 1 << 12  # draws that are written as CSV at once
 
 INTERVALS = (
     "intervals assume independent draws: exact for random draws, mostly too wide for latin"
@@ -94,9 +91,7 @@ def json_of(ensemble):
 
 
 def remarks_of(ensemble):
-    """Return warnings on the draws: that the steps are too long for the rig before any is drawn,
-    and that they are of a rejected structure.
-    """
+    """Return warnings on the draws: steps too long for the rig, and a rejected structure."""
     drawn = ensemble.case.rejected and "identified" in ensemble.distributions
     rejected = (
         f"draws are from the [covariance] of {ensemble.case.name}, of a structure that the data of"

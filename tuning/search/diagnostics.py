@@ -43,10 +43,7 @@ TOO_LONG = "step-too-long"
 
 
 def step_warnings(tuned, values, key=None, scenarios=()):
-    """Return () where the steps of the tuned case and of its scenarios are short enough, else the
-    Message on a run that is wrong, because an explicit step was unstable near an empty tank, or on
-    what would happen to a tank that runs empty.
-    """
+    """Return Messages on steps that are unstable near an empty tank, in the case or a scenario."""
     runs = [("", tuned.loop, tuned.clock, key)]
     for run in scenarios[:CHECKED_RUNS]:
         loop = with_values(run.case.loop, values)
@@ -128,9 +125,31 @@ def curvature(search, point, idle=None):
         return None
     values, vectors = np.linalg.eigh(basis.T @ matrix @ basis)
     directions = (basis @ vectors).T
-    there = _step_of_ten_percent(problem.bounds, z, directions[0])
+    direction = directions[0]
+    flat = direction * np.sign(direction[np.argmax(np.abs(direction))])
+    largest = int(np.argmax(np.abs(flat)))
+    b = problem.bounds[largest]
+    step = np.log(1.1) / np.log(b.high / b.low) if b.scale == "log" else 0.1
+    step = step / flat[largest]  # with it the largest component changes by 10 %
+    if not 0 <= z[largest] + step * flat[largest] <= 1:
+        step = -step
+    there = np.clip(z + step * flat, 0.0, 1.0)
     gradient = point.gradient / search.scale
-    factors, rounded = _short_factors(problem.bounds, z, there, gradient, matrix)
+    # As many as leave the change of the cost, by the quadratic model, within 5 %: along a least
+    # sensitive direction a component of 1e-4 can matter, for the objective is steep beside.
+
+    def model(to):
+        return gradient @ (to - z) + 0.5 * (to - z) @ matrix @ (to - z)
+
+    factors, rounded = [], z
+    for decimals in range(2, 9):
+        ends = zip(problem.bounds, z.tolist(), there.tolist())
+        factors = [_rounded(b, old, new, decimals) for b, old, new in ends]
+        rounded = np.array(
+            [_moved(b, old, f) for b, old, f in zip(problem.bounds, z.tolist(), factors)]
+        )
+        if abs(model(rounded) - model(there)) <= 0.05 * abs(model(there)):
+            break
     costs, margins = search.evaluator.screen(np.array([z, rounded]))
     if np.all(margins[1] >= 0) and costs[1] < costs[0]:
         search.point(rounded)
@@ -167,36 +186,6 @@ def _free_directions(search, point, idle):
         return np.eye(count)
     _, sizes, rows = np.linalg.svd(np.array(fixed))
     return rows[np.sum(sizes > 1e-9 * max(sizes[0], 1e-300)) :].T
-
-
-def _step_of_ten_percent(bounds, z, direction):
-    """Return the point (P,) along a direction where its largest component has changed by 10 %."""
-    flat = direction * np.sign(direction[np.argmax(np.abs(direction))])
-    largest = int(np.argmax(np.abs(flat)))
-    b = bounds[largest]
-    step = np.log(1.1) / np.log(b.high / b.low) if b.scale == "log" else 0.1
-    step = step / flat[largest]
-    if not 0 <= z[largest] + step * flat[largest] <= 1:
-        step = -step
-    return np.clip(z + step * flat, 0.0, 1.0)
-
-
-def _short_factors(bounds, z, there, gradient, matrix):
-    """Return (factors, z of them) of the step to `there`, in as few decimals as suffice."""
-    # As many as leave the change of the cost, by the quadratic model, within 5 %: along a least
-    # sensitive direction a component of 1e-4 can matter, for the objective is steep beside.
-
-    def model(to):
-        return gradient @ (to - z) + 0.5 * (to - z) @ matrix @ (to - z)
-
-    factors, rounded = [], z
-    for decimals in range(2, 9):
-        ends = zip(bounds, z.tolist(), there.tolist())
-        factors = [_rounded(b, old, new, decimals) for b, old, new in ends]
-        rounded = np.array([_moved(b, old, f) for b, old, f in zip(bounds, z.tolist(), factors)])
-        if abs(model(rounded) - model(there)) <= 0.05 * abs(model(there)):
-            break
-    return factors, rounded
 
 
 def _rounded(b, old, new, decimals):

@@ -32,31 +32,6 @@ def adam(search, z, iterations):
     return _augmented(search, z, steps, optax.adam(schedule), descend=False)
 
 
-def minibatches(search, z, iterations, batch, rng):
-    """Return True if optax's Adam converged on `batch` scenarios, drawn anew for every step."""
-    import optax
-
-    steps = 5 * iterations
-    optimiser = optax.adam(optax.cosine_decay_schedule(0.05, steps, 0.002))
-    state, every = optimiser.init(z), max(1, steps // 10)
-    for k in range(steps):
-        point = search.evaluator.batch_point(z, batch, rng)
-        search.report(search)
-        if not point.finite:
-            z = 0.5 * (z + search.last_finite.z)
-            continue
-        scale = search.limit_scale[list(point.rows)]
-        penalty = 100.0 * np.maximum(0.0, -point.margins / scale)
-        g = point.gradient / search.scale - penalty @ (point.margin_slopes / scale[:, None])
-        g = g * min(1.0, STEEPEST / max(float(np.linalg.norm(g)), 1e-300))
-        update, state = optimiser.update(g, state, z)
-        z = np.clip(z + np.asarray(update), 0.0, 1.0)
-        if (k + 1) % every == 0:
-            search.point(z)
-    search.exhausted = True
-    return search.best is not None and optimality(search, search.best)[1] < SETTLED
-
-
 def _rounds(search):
     """Return how often the multipliers of the limits are updated."""
     return 4 if search.problem.limits else 1
@@ -123,7 +98,27 @@ def slsqp(search, z, iterations, tolerance=None):
     """Return True if sequential quadratic programming converged, on the exact maxima."""
     tolerance = search.tolerance if tolerance is None else tolerance
     if search.problem.risk == "worst" and len(search.problem.runs) > 1:
-        return _epigraph(search, z, iterations, tolerance)
+        # min t subject to cost_i <= t, which is smooth where the largest cost is not.
+
+        def known(z):
+            point = search.point(z)
+            return point if point.finite else search.last_finite
+
+        def holds(y):
+            point = known(y[:-1])
+            return np.append(y[-1] - point.run_costs / search.scale, search.margins(y[:-1])[0])
+
+        def slopes(y):
+            point = known(y[:-1])
+            costs = np.hstack(
+                [-point.run_slopes / search.scale, np.ones((len(point.run_costs), 1))]
+            )
+            rows = search.margins(y[:-1])[1].reshape(-1, len(y) - 1)
+            return np.vstack([costs, np.hstack([rows, np.zeros((len(rows), 1))])])
+
+        y = np.append(z, known(z).run_costs.max() / search.scale)
+        rows = [{"type": "ineq", "fun": holds, "jac": slopes}]
+        return _minimise(search, _last, y, [(None, None)], rows, iterations, tolerance)
     rows = {
         "type": "ineq",
         "fun": lambda z: search.margins(z)[0],
@@ -179,29 +174,6 @@ class _Watch:
         if self.since > PATIENCE:
             raise _NoProgress
         return cost, gradient
-
-
-def _epigraph(search, z, iterations, tolerance):
-    """Return True if `slsqp` of the worst scenario converged."""
-    # min t subject to cost_i <= t, which is smooth where the largest cost is not.
-
-    def known(z):
-        point = search.point(z)
-        return point if point.finite else search.last_finite
-
-    def holds(y):
-        point = known(y[:-1])
-        return np.append(y[-1] - point.run_costs / search.scale, search.margins(y[:-1])[0])
-
-    def slopes(y):
-        point = known(y[:-1])
-        costs = np.hstack([-point.run_slopes / search.scale, np.ones((len(point.run_costs), 1))])
-        rows = search.margins(y[:-1])[1].reshape(-1, len(y) - 1)
-        return np.vstack([costs, np.hstack([rows, np.zeros((len(rows), 1))])])
-
-    y = np.append(z, known(z).run_costs.max() / search.scale)
-    rows = [{"type": "ineq", "fun": holds, "jac": slopes}]
-    return _minimise(search, _last, y, [(None, None)], rows, iterations, tolerance)
 
 
 def trf(search, z, iterations, tolerance=1e-10):
@@ -361,7 +333,27 @@ def run_local(search, z, how):
     if how.batch is None:
         return METHODS[how.method](search, z, how.iterations)
     rng = np.random.default_rng([how.seed, search.start])
-    return minibatches(search, z, how.iterations, how.batch, rng)
+    import optax
+
+    steps = 5 * how.iterations
+    optimiser = optax.adam(optax.cosine_decay_schedule(0.05, steps, 0.002))
+    state, every = optimiser.init(z), max(1, steps // 10)
+    for k in range(steps):
+        point = search.evaluator.batch_point(z, how.batch, rng)
+        search.report(search)
+        if not point.finite:
+            z = 0.5 * (z + search.last_finite.z)
+            continue
+        scale = search.limit_scale[list(point.rows)]
+        penalty = 100.0 * np.maximum(0.0, -point.margins / scale)
+        g = point.gradient / search.scale - penalty @ (point.margin_slopes / scale[:, None])
+        g = g * min(1.0, STEEPEST / max(float(np.linalg.norm(g)), 1e-300))
+        update, state = optimiser.update(g, state, z)
+        z = np.clip(z + np.asarray(update), 0.0, 1.0)
+        if (k + 1) % every == 0:
+            search.point(z)
+    search.exhausted = True
+    return search.best is not None and optimality(search, search.best)[1] < SETTLED
 
 
 def search_alone(evaluator, z, number, how):

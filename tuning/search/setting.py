@@ -63,9 +63,7 @@ def midpoint_error(case: Case, clock: Clock, height: float, span: np.ndarray) ->
 
 @compiled("substeps", "arrays", keep=True)
 def _changes(plant: Any, x: Any, u: Any, dt: Any, substeps: int, arrays: bool) -> Any:
-    """Squared difference of the midpoint rule and RK4 over one sample from each state of `x`, and
-    the squared change of the level.
-    """
+    """Squared differences of midpoint rule and RK4 over a sample, and of the level."""
 
     def changes(x: Any, u: Any) -> Any:
         start, inputs = (x, u) if arrays else (tuple(x), tuple(u))

@@ -167,9 +167,7 @@ def move_back(setting: Setting, solution: Solution) -> None:
 
 
 def _first_calm(search, line, calm, ceiling, violation):
-    """The first point of a line that is calm and costs at most `ceiling`, or the end of the line
-    where this costs hardly more; None where there is none.
-    """
+    """The first calm point of a line up to `ceiling`, or its end; None where there is none."""
     for some in np.split(line, LINE // STRIDE):
         low = np.array([calm(each) for each in some])
         if not low.any():

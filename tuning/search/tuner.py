@@ -137,7 +137,13 @@ def tune(
     """
     check_case(case.case if isinstance(case, Problem) else case, seed)
     options = options_of(method, starts=starts)
-    implied = _implies_nominal(case, options)
+    reasons = {
+        "a Problem": isinstance(case, Problem),
+        "method": options.name != "auto",
+        "screening": options.screening is not None,
+        "tolerance": options.tolerance is not None,
+    }
+    implied = next((name for name, value in reasons.items() if value), None)
     if nominal is False and implied:
         raise InputError(f"{implied}: belongs to the nominal optimum (nominal=True, --nominal)")
     nominal = nominal or bool(implied)
@@ -157,17 +163,6 @@ def tune(
                     f"{name}: belongs to the default answer, not to the nominal optimum"
                 )
         return _optimum(_stated(case, seed, **stated), options, engine, **keep)
-
-
-def _implies_nominal(case: Case | Problem, options: Options) -> str | None:
-    """Return the argument that implies `nominal`; None if there is none."""
-    reasons = {
-        "a Problem": isinstance(case, Problem),
-        "method": options.name != "auto",
-        "screening": options.screening is not None,
-        "tolerance": options.tolerance is not None,
-    }
-    return next((name for name, value in reasons.items() if value), None)
 
 
 def _stated(case: Case | Problem, seed: int, **stated: Any) -> Problem:
@@ -504,9 +499,7 @@ def _result(
     steps: tuple[Message, ...],
     **parts: Any,
 ) -> TuningResult:
-    """Return the TuningResult of a search; steps : problems with the step size of the answer. One
-    whose run is wrong has not converged.
-    """
+    """Return the TuningResult of a search; steps: problems with the step size of the answer."""
     if parts["status"] == Status.CONVERGED and any(message.headline for message in steps):
         parts["status"] = Status.NOT_CONVERGED
     result = TuningResult(

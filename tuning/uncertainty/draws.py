@@ -35,10 +35,6 @@ class Draws:
             self.parts.append((name, distribution, nominal, columns))
             self.dimensions += len(labels)
             self.labels += labels
-        self._check_ranges(loop, distributions)
-
-    def _check_ranges(self, loop, distributions):
-        """Raise InputError where a distribution can leave the range of its parameter."""
         corners = [self.values(np.full((1, self.dimensions), p)) for p in (0.0, 1.0)]
         for name, d in distributions.items():
             if isinstance(d, Correlated):  # clipped

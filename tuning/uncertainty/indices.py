@@ -12,14 +12,9 @@ from scipy import stats
 LEVELS = 4
 """Levels of Morris' grid; with 4 and a step of 2/3 every level is as likely as every other."""
 
-RESAMPLES = 1000
-"""Bootstrap resamples of an interval."""
-
-BLOCK = 1 << 22
-"""Bootstrap weights held at once."""
-
-FLAT = 1e-10
-"""Standard deviation of an output, as a share of its size, that is rounding alone [-]."""
+RESAMPLES = 1000  # bootstrap resamples of an interval
+BLOCK = 1 << 22  # bootstrap weights held at once
+FLAT = 1e-10  # standard deviation of an output, as a share of its size, that is rounding alone [-]
 
 
 def sobol_points(dimensions, samples, seed):

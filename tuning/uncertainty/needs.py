@@ -52,8 +52,7 @@ def plateaus_of(case: Case) -> list[Plateau] | None:
 BLOCK = 1 << 14
 """Draws whose steady states are computed at once: a plateau takes some 100 bytes a draw."""
 
-TOLERANCE = 1e-9
-"""By how much a limit may be passed, as a share of its size: rounding."""
+TOLERANCE = 1e-9  # by how much a limit may be passed, as a share of its size: rounding
 
 
 class Needs:

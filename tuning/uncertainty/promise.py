@@ -19,17 +19,10 @@ from tuning.uncertainty.batches import batch_runner
 from tuning.uncertainty.distributions import Empirical
 from tuning.uncertainty.draws import Draws
 
-PILOT = 4096
-"""Most draws of the study that the search for failures begins from."""
-
-FURTHER = 100
-"""Most runs after the draws of the study, in numbers of them [-]."""
-
-CLIPPED = 1e-12
-"""Least and, below 1, largest probability at which a distribution is read [-]."""
-
-STEP = 1e-4
-"""Step of the differences of drawn values in the standard normal space [sd]."""
+PILOT = 4096  # most draws of the study that the search for failures begins from
+FURTHER = 100  # most runs after the draws of the study, in numbers of them [-]
+CLIPPED = 1e-12  # least and, below 1, largest probability at which a distribution is read [-]
+STEP = 1e-4  # step of the differences of drawn values in the standard normal space [sd]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -148,7 +141,11 @@ class Study(NamedTuple):
     def slopes(self, z: Any) -> Any:
         """Return ((n, K) margins, (n, K, D) their slopes) at z (n, D), LANES points at once."""
         values = self.values(z)
-        moving, jacobian = self.moving(), self._value_slopes(z)
+        columns = []
+        for move in STEP * np.eye(z.shape[1]):
+            ends = (_flat(self.values(z + sign * move)) for sign in (1.0, -1.0))
+            columns.append(np.subtract(*ends) / (2.0 * STEP))
+        moving, jacobian = self.moving(), np.stack(columns, axis=-1)
         order = tuple(_entries(values)[i] for i in moving)
         flat = _flat(values)[:, moving]
         size = rare_events.LANES
@@ -177,14 +174,6 @@ class Study(NamedTuple):
         ends = _flat(self.values(np.array([[-3.0], [3.0]]) * np.ones(self.space.dimensions)))
         return np.flatnonzero(ends[0] != ends[1])
 
-    def _value_slopes(self, z):
-        """(n, entries, D) derivatives of the drawn values at z (n, D), by differences."""
-        columns = []
-        for move in STEP * np.eye(z.shape[1]):
-            ends = (_flat(self.values(z + sign * move)) for sign in (1.0, -1.0))
-            columns.append(np.subtract(*ends) / (2.0 * STEP))
-        return np.stack(columns, axis=-1)
-
 
 def _flat(values):
     """(n, entries) of {name: (n, ...)}."""
@@ -202,8 +191,7 @@ def _entries(values):
 
 @compiled("clock", "names", "order", "seed", keep=True)
 def _sensitivities(loop, rows, seed, clock, names, order):
-    """(measures, their slopes, whether a run diverged) of runs at `rows`, a column for each of
-    `order`; all have the noise of the seed."""
+    """(measures, their slopes by `order`, whether diverged) of runs at `rows`, same noise."""
     key = None if seed is None else jax.random.key(seed)
 
     def run(values):

@@ -23,30 +23,21 @@ WIDE_RUNS, WIDE_SHARE = 256, 0.25
 """Runs of a wide normal distribution that look for regions of failure first, and their share later.
 """
 
-LANES, STEPS = 32, 20
-"""Searches at once, and their steps."""
-
-RAY = 16
-"""Runs between the origin and a failure that look for the first failure on the way."""
-
-APART = 1.0
-"""Least distance of two centres [sd]."""
-
-CENTRES = 16
-"""Most centres of a mixture."""
+LANES, STEPS = 32, 20  # searches at once, and their steps
+RAY = 16  # runs between the origin and a failure that look for the first failure on the way
+APART = 1.0  # least distance of two centres [sd]
+CENTRES = 16  # most centres of a mixture
 
 DEFENSIVE = 0.2
 """Share of the runs drawn from the distribution itself: a weight is at most its inverse [-]."""
 
-BATCH = 256
-"""Runs after which the estimate is looked at."""
+BATCH = 256  # runs after which the estimate is looked at
 
 ACCURACY, FINEST = 0.07, 0.02
 """Coefficients of variation of the probability: the usual one, and the one at which a promise that
 lies within the interval stays undecided [-]."""
 
-TURNS, FIRST_HITS = 4, 100
-"""Most mixtures that are sampled, and failures to which one is fitted."""
+TURNS, FIRST_HITS = 4, 100  # most mixtures that are sampled, and failures to which one is fitted
 
 FITTED, INFLATION = 0.7, 1.2
 """Share of the fitted parts in the parts around failures, and the factor of their variance [-]."""
@@ -111,9 +102,7 @@ class Failures(NamedTuple):
 def probability(
     margins: Margins, pilot: Any, promise: float, most: int, seed: int, progress: Any = None
 ) -> Failures:
-    """Return the probability that some margin is negative; `pilot`: (points, margins) of plain
-    runs, at most `most` further runs.
-    """
+    """Return P(some margin < 0) after `pilot` (points, margins), in up to `most` more runs."""
     z, g = pilot
     estimate = _counted(g)
     if estimate.interval95[0] > promise and estimate.variation < FEWEST_HITS**-0.5:
@@ -158,9 +147,7 @@ def _counted(g):
 
 
 def width(dimensions: int) -> float:
-    """Return the standard deviation of the wide normal distribution [sd]: most of its points lie
-    within FARTHEST of the origin.
-    """
+    """Return the standard deviation [sd] that keeps most points within FARTHEST of the origin."""
     return max(1.3, min(2.0, 6.0 / np.sqrt(dimensions)))
 
 
@@ -194,9 +181,7 @@ class Mixture(NamedTuple):
         return (weights > LARGEST_SHARE * np.sum(weights)) & ~near
 
     def fitted(self, z: Any, weights: Any) -> "Mixture":
-        """Return the mixture with most of each part around failures fitted to failures z: their
-        mean, and their variance in its direction.
-        """
+        """Return the mixture fitted to failures z: means, and variances in their directions."""
         densities, shares = self.densities(z), self.shares.copy()
         parts = (weights / np.sum(densities, axis=1))[:, None] * densities
         means, factors, likely = list(self.means), list(self.factors), np.sum(parts, axis=0)
@@ -253,10 +238,7 @@ class Sample:
         last: bool,
         progress: Any,
     ) -> bool:
-        """Run batches until the estimate is accurate or the runs are spent; return True where the
-        mixture should be improved first: after `enough` failures, or where it has no part near one
-        that counts much.
-        """
+        """Run batches until accurate or spent; return True where the mixture should be improved."""
         while True:
             self._run(count, rng)
             if progress is not None:
@@ -291,9 +273,7 @@ class Sample:
 
 
 def interval(weights: Any, largest: float) -> tuple[float, float]:
-    """Return the 95 % interval of the sum of the weights of a count (Fay and Feuer); `largest`: the
-    largest weight that a count can have, used where nothing was counted.
-    """
+    """Return the 95 % interval of a sum of weights (Fay and Feuer), `largest` of uncounted ones."""
     total, square = float(np.sum(weights)), float(np.sum(weights**2))
     chi2 = lambda p, freedom: 2.0 * float(scipy.special.gammaincinv(freedom / 2.0, p))
     low = square / (2 * total) * chi2(0.025, 2 * total**2 / square) if total else 0.0
@@ -323,8 +303,7 @@ def _failing(z, g):
 
 
 def _starts(z, g):
-    """(points (n, D), limits (n,)) to begin from: for each limit the origin, its nearest failure,
-    and a failure, or the run with the least margin, in another direction."""
+    """(points (n, D), limits (n,)): the origin, nearest failures, and others in new directions."""
     size, rows = np.linalg.norm(z, axis=1), []
     for limit in np.argsort(np.min(g, axis=0), kind="stable")[: LANES // 3]:
         cost = np.where(g[:, limit] < 0, size - 1e6, g[:, limit])

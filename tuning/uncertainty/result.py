@@ -13,11 +13,8 @@ from tuning.uncertainty.promise import Promise
 from tuning.uncertainty.sampling import clopper_pearson
 from tuning.views import Result
 
-TAIL = 0.05
-"""Share of the draws that the conditional value at risk is the mean of [-]."""
-
-LEVELS = (0.05, 0.5, 0.95)
-"""Levels of the percentiles [-]."""
+TAIL = 0.05  # share of the draws that the conditional value at risk is the mean of [-]
+LEVELS = (0.05, 0.5, 0.95)  # levels of the percentiles [-]
 
 QUANTITIES = ("mean", "mean_interval95", "sd", "p05", "p50", "p95", "cvar95", "max")
 

@@ -235,11 +235,7 @@ def check_samples(samples, method, notes):
 
 
 def _entries(case, draws, names, points, run, batch, progress):
-    """Return the measures at `points` (samples, runs, D) of the unit cube, entry by entry.
-
-    (K,) of the case's own run, (samples, runs, K) NaN where a run is not finite, and the number of
-    these runs.
-    """
+    """Return measures of the own run (K,) and of `points` (samples, runs, K), and failures."""
     # batches have one size, so that one compiled program serves; the case's own run goes first
     values = {
         name: np.concatenate([np.asarray(get_value(case.loop, name))[None], v])
@@ -285,11 +281,8 @@ def _columns(case, names, method, points, nominal, values, seed):
     return columns
 
 
-CHUNK = 16
-"""Parameters whose derivatives are computed at once."""
-
-NORMAL_WIDTH = 2.0
-"""Half-width of a normal distribution, in standard deviations [-]."""
+CHUNK = 16  # parameters whose derivatives are computed at once
+NORMAL_WIDTH = 2.0  # half-width of a normal distribution, in standard deviations [-]
 
 RUNS_AT_ONCE, SAMPLES_AT_ONCE = 64, 1 << 22
 """Runs in a batch, and most samples of all of them: each holds its signals."""

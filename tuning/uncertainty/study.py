@@ -33,8 +33,7 @@ from tuning.uncertainty.promise import Study, check_promise, promise_of
 from tuning.uncertainty.result import Ensemble
 from tuning.uncertainty.sampling import Points, spread_of
 
-FAN_DRAWS = 512
-"""Draws of a fan chart."""
+FAN_DRAWS = 512  # draws of a fan chart
 
 
 def ensemble(

@@ -5,8 +5,7 @@ from tuning.cli.steps import distributions_of, finish, open_case
 from tuning.cli.terminal import Line
 from tuning.cli.values import whole
 
-PASSED = 4
-"""Exit code where a limit is passed."""
+PASSED = 4  # exit code where a limit is passed
 
 
 def attack(args):

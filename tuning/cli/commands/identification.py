@@ -22,10 +22,8 @@ from tuning.cli.steps import (
 )
 from tuning.cli.terminal import Line
 
-LONGEST = 1e7
-"""Longest planned experiment [s]: four months."""
-PLANNED = 300.0
-"""Length of a planned experiment [s]."""
+LONGEST = 1e7  # longest planned experiment [s]: four months
+PLANNED = 300.0  # length of a planned experiment [s]
 
 STATUS = {"converged": 0, "not_converged": 3, "not_identifiable": 5, "interrupted": 130}
 
@@ -37,7 +35,16 @@ def run(args):
     _check_together(args)
     case = open_case(args) if args.case else None
     if args.inspect:
-        return _inspect(args, case)
+        from tuning.identification.inspection import inspect
+        from tuning.report import inspection
+
+        loop, columns = (None, {}) if case is None else (case.loop, dict(case.log))
+        settings = (columns | args.column, args.decimal, args.hold, args.time)
+        result = inspect(args.inspect, loop, *settings, gap=args.gap)
+        written = inspection.save(result, args.out, args.line) if args.out else []
+        print_result(args, inspection.json_of(result), lambda: printed(inspection.report(result)))
+        report_written(written, args)
+        return 5 if result.problems else 0
     return _plan(args, case) if args.plan else _identify(args, case)
 
 
@@ -145,20 +152,6 @@ def _identify(args, case):
     return interrupts.code if interrupts.stop else STATUS[result.status]
 
 
-def _inspect(args, case):
-    """Print what a file of experiment data holds, with a [log] table; returns the exit code."""
-    from tuning.identification.inspection import inspect
-    from tuning.report import inspection
-
-    loop, columns = (None, {}) if case is None else (case.loop, dict(case.log))
-    settings = (columns | args.column, args.decimal, args.hold, args.time)
-    result = inspect(args.inspect, loop, *settings, gap=args.gap)
-    written = inspection.save(result, args.out, args.line) if args.out else []
-    print_result(args, inspection.json_of(result), lambda: printed(inspection.report(result)))
-    report_written(written, args)
-    return 5 if result.problems else 0
-
-
 def predict(args):
     """Predict experiment data with a rig as it is; returns the exit code."""
     if not args.data:
@@ -172,9 +165,7 @@ def predict(args):
 
 
 def learn(args):
-    """Update a rig by the log of its last batches, and tune it on what is known then; returns the
-    exit code of the tuning.
-    """
+    """Update a rig by its last batches and tune it; returns the exit code of the tuning."""
     if not args.data:
         raise InputError("learn needs --data CSV, the log of a batch that ran with this rig")
     case = open_case(args)

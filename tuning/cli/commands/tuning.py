@@ -84,7 +84,13 @@ def tune(args):
         report_unreachable(result.tuned, written, args)
         return EXIT[result.status]
     if sweep:  # before the long search
-        _check_tradeoff(case, task, sweep)
+        from jaxtank.limits import resolve_in
+        from tuning.problem.scenarios import check_scenarios, runs_of
+
+        scenarios = case.scenarios if task["scenarios"] is None else task["scenarios"]
+        measure, values = sweep
+        runs = runs_of(case, check_scenarios(case, scenarios), task["seed"])
+        resolve_in([(run.name, run.case) for run in runs], {measure: values[0]})
     finder, case, keywords, mended = _finder(args, case, task)
     unit = tables.objective_unit(task["objective"] or case.objective, case.loop.units)
     option = None if args.robust or args.nominal or args.quiet else _goes_with_nominal(args)
@@ -144,17 +150,6 @@ def _task(args, case, seed) -> dict[str, Any]:
         "scenarios": scenarios_of(args),
         "seed": seed,
     }
-
-
-def _check_tradeoff(case, task, sweep):
-    """Raise InputError where the limit of --tradeoff is undefined in every run."""
-    from jaxtank.limits import resolve_in
-    from tuning.problem.scenarios import check_scenarios, runs_of
-
-    scenarios = case.scenarios if task["scenarios"] is None else task["scenarios"]
-    measure, values = sweep
-    runs = runs_of(case, check_scenarios(case, scenarios), task["seed"])
-    resolve_in([(run.name, run.case) for run in runs], {measure: values[0]})
 
 
 def _finder(args, case, task) -> Any:
