@@ -57,7 +57,6 @@ KINDS = {
 
 
 def script(shell):
-    """Return the completion script of a shell."""
     if shell not in SCRIPTS:
         close = nearest(shell, SCRIPTS)
         raise InputError(f"unknown shell {shell!r}{close}; must be one of {', '.join(SCRIPTS)}")

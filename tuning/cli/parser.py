@@ -127,7 +127,6 @@ ACTIONS |= {"switch": (argparse.BooleanOptionalAction, None), "once": (Once, Non
 
 
 def add(parser, option):
-    """Add an Option to a parser."""
     action, default = ACTIONS[option.kind]
     default = default if option.default is None else option.default
     text = option.help.replace("%", "%%")

@@ -171,7 +171,6 @@ class Line:
             self.show(f"run {done}/{total}")
 
     def end(self):
-        """End the line on a terminal."""
         self.ended.set()
         OPEN.discard(self)
         if self.clock is not None:

@@ -103,7 +103,6 @@ def value(text):
 
 
 def _check_decimal_comma(text, parts, numbers):
-    """Refuse a comma that may separate decimals."""
     if comma := DECIMAL_COMMA.fullmatch(text):
         sign, whole_part, digits = comma.groups()
         point = f"{sign}{whole_part.replace('.', '')}.{digits}"
@@ -166,7 +165,6 @@ def limit(text):
 
 
 def checked_measure(name):
-    """Return the name of a measure, if there is one."""
     from jaxtank.measures import check_names
 
     check_names([name])
@@ -257,7 +255,6 @@ def folder(text):
 
 
 def earlier_folder(text):
-    """Return the name of the folder of an earlier run."""
     if not os.path.isdir(folder(text)):
         raise ValueError("cannot be read as a run to go on with: there is no such folder")
     return text

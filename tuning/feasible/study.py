@@ -410,7 +410,6 @@ def find_mends(needs: Needs) -> tuple[Mend, ...]:
 
 
 def _least(good: Callable, low: float, high: float, steps: int = 14) -> float:
-    """The least number between `low`, which is not good, and `high`, which is."""
     for _ in range(steps):
         middle = 0.5 * (low + high)
         low, high = (low, middle) if good(middle) else (middle, high)

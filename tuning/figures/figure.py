@@ -57,7 +57,6 @@ FIGURES = _figures()
 
 
 def find(name: str) -> Figure:
-    """Return a figure that can be redrawn."""
     if name not in FIGURES:
         raise unknown("figure", name, FIGURES)
     figure = FIGURES[name]

@@ -70,7 +70,6 @@ def candidates_of(estimation: Estimation) -> list[Candidate]:
 
 
 def _value(rig, name, usual):
-    """Return the value of a leaf, `usual` where the rig has none."""
     part, leaf = name.split("[")[0].split(".")
     absent = getattr(getattr(rig, part), leaf, None) is None
     return usual if absent else float(np.asarray(get_value(rig, name)))
@@ -270,7 +269,6 @@ class AugmentedEstimation(Estimation):
 
 
 def _is_leaf(plant, candidate):
-    """Whether the value of a Candidate is a leaf of the plant."""
     part, _, leaf = candidate.name.split("[")[0].partition(".")
     of_plant = part == "plant" and not candidate.field
     return of_plant and getattr(plant, leaf) is not None

@@ -83,7 +83,6 @@ class Branches(NamedTuple):
         return first + second, first / (first + second)
 
     def point(self, gain, split):
-        """Return p (2,) of a gain and a split."""
         split = np.clip(split, 1e-9, 1 - 1e-9)
         return [np.log(gain * split), np.log(gain * (1 - split))]
 
@@ -141,7 +140,6 @@ class Coordinates:
 
     @property
     def leaves(self):
-        """The coordinates of leaves of the rig alone."""
         return Coordinates(self.items[: len(self.items) - len(self.inputs)])
 
     @property
@@ -259,7 +257,6 @@ def _without_idle(free, loop, logs):
 
 
 def _is_flow(loop, logs, pump):
-    """Whether a log has flows of a pump whose input is none."""
     length, drive = loop.units
     units = [unit_name(log.units[1 + pump]) for log in logs if log.units is not None]
     own = input_unit(loop.plant, pump, drive)

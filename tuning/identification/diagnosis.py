@@ -71,7 +71,6 @@ class Diagnosis(NamedTuple):
 
 
 def diagnose(estimation: Estimation, fit: Fit) -> Diagnosis:
-    """Return the Diagnosis of a fit."""
     weighted, causes = copy.copy(estimation), []
     weighted.noise = fast_noise(estimation, fit)
     z = estimation.unknowns(fit)
@@ -101,7 +100,6 @@ def diagnose(estimation: Estimation, fit: Fit) -> Diagnosis:
 
 
 def unit_of(loop, candidate):
-    """Return the unit of the value of a Candidate."""
     if candidate.kind == "pump-delay":
         return "s"
     if candidate.field == "threshold":
@@ -258,7 +256,6 @@ def _fitted(trial):
 
 
 def with_candidate(trial, i):
-    """Return the Trial with Candidate i beside those that it has."""
     problem, start = trial.problem, trial.point
     if problem.candidates[i].name in problem.by_exponent:
         problem = AugmentedEstimation(

@@ -75,7 +75,6 @@ def inspect(
 
 
 def _column(signal: Signal, slot: str = "") -> ColumnOf:
-    """Return the ColumnOf of a signal."""
     column, values, why = signal.described, np.full(len(signal.t), np.nan), ""
     try:
         states = states_of(column)

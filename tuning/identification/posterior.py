@@ -97,7 +97,6 @@ def with_draws(fit: Identification, seed: int = 0) -> Identification:
 
 
 def _values(est, z, names):
-    """The values of the parameters `names` at the unknowns z."""
     values = est.coordinates.values(z[: est.coordinates.size])
     return [values[name] for name in names]
 

@@ -38,7 +38,6 @@ class Rig:
 
 
 def rig_of(loop):
-    """Return the Rig of a loop."""
     # A constant disturbance belongs to it; one that varies belongs to another run and does not. The
     # limit of change and the transport delay of the pumps are applied by `padded`.
     _, steady, _ = parts_of(loop.disturbance)

@@ -47,7 +47,6 @@ class Lagrangian(NamedTuple):
 
 
 def scaled(lagrangian, ratio):
-    """Return a Lagrangian with its multipliers times a ratio."""
     return lagrangian._replace(
         multipliers=tuple(f * ratio for f in lagrangian.multipliers),
         integral_multipliers=lagrangian.integral_multipliers * ratio,
@@ -163,7 +162,6 @@ def _names(terms):
 
 
 def _with_inputs(loop, u):
-    """Return an open loop with other inputs."""
     signal = dataclasses.replace(loop.controller.signal, values=u)
     return dataclasses.replace(loop, controller=dataclasses.replace(loop.controller, signal=signal))
 

@@ -231,5 +231,4 @@ def _search_clock(clock, interval, delays):
 
 
 def _whole_number(x):
-    """Return whether x is a whole number, to rounding."""
     return abs(x - round(x)) <= 1e-6 * max(1.0, abs(x))

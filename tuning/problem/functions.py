@@ -136,7 +136,6 @@ def _weights(objective: Any, functions: dict[str, ms.Measure]) -> dict[str, Any]
 
 
 def _of_function(term: Any) -> Objective:
-    """Return the Objective of a bare function, which has its name."""
     if not callable(term):
         raise InputError(
             f"objective = {shortened(term)}: must be {{measure: weight}}, a tuning.Objective or a"

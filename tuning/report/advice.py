@@ -47,7 +47,6 @@ def listed(words: Sequence[str]) -> str:
 
 
 def amount(value: Any, unit: str, digits: int = 3) -> str:
-    """Return a number with its unit."""
     return _with_unit(shown(value, digits), unit)
 
 
@@ -57,7 +56,6 @@ def _with_unit(text: str, unit: str) -> str:
 
 
 def changes(before: Any, after: Any, unit: str, digits: int = 3) -> str:
-    """Return "before -> after unit"."""
     return f"{shown(before, digits)} -> {amount(after, unit, digits)}"
 
 
@@ -83,7 +81,6 @@ def limits_of(
 
 
 def of_run(case: Case, values: Mapping[str, Any]) -> Advice:
-    """Return the Advice on a run with the measures `values`."""
     rows = verdicts.limit_rows(case, values)
     broken = [row["words"] for row in rows if not row["margin"] >= 0.0]
     words = [f"limits held: {len(rows) - len(broken)} of {len(rows)}"] if rows else []

@@ -82,7 +82,6 @@ def verdict_of(result):
 
 
 def report(result):
-    """Return the Report of a ControllerComparison."""
     unit = result.case.loop.units[0]
     heads = ["controller", "gains", "filter", f"error [{unit}]", "limits broken", "travel [%]"]
     heads += ["Ms [-]", "C [us/step]"]

@@ -79,7 +79,6 @@ def per(unit, of):
 
 
 def derivative_unit(result, c, name):
-    """The unit of the derivative of a Column by a parameter."""
     return per(c.unit, describe(result.case.loop, name)["unit"])
 
 
@@ -114,7 +113,6 @@ def _sobol_notes(result):
 
 
 def report(result):
-    """Return the Report of a SensitivityResult."""
     varied = ", ".join(f"{n} {in_words(d)}" for n, d in result.distributions.items())
     samples, runs = METHODS[result.method].samples, count(result.runs, "run")
     samples = f", {result.samples} {samples}" if samples else ""

@@ -42,7 +42,6 @@ PUMPS = {
 
 
 def json_of(attack):
-    """The JSON object of `jaxtank attack --json`."""
     case, attacked = attack.case, attack.attacked
     return {
         "case": case.name,
@@ -133,7 +132,6 @@ def _outside(attack):
 
 
 def report(attack):
-    """Return the Report of an Attack."""
     worst, case = attack.worst, attack.case
     head = (
         f"{case.name}: attack from {count(attack.draws, 'draw')}, ascent of"

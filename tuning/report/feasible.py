@@ -103,7 +103,6 @@ def unreachable(study):
 
 
 def report(study):
-    """Return the Report of a Feasibility."""
     share, good = (
         study.infeasible_for_any_controller,
         study.infeasible_for_any_controller <= MATTERS,

@@ -90,7 +90,6 @@ ODD = {
 
 
 def sentences_on(oddities):
-    """Return a sentence on each oddity of experiment data."""
     return [
         ODD[odd.kind].format(**odd._asdict() | {"count": count(odd.count, "reading")})
         for odd in oddities

@@ -29,7 +29,6 @@ def labels(fits):
 
 
 def report(fits):
-    """Return the Report of Identifications."""
     converged, records = int(fits.converged.sum()), count(len(fits), "record")
     head = (
         f"{fits.case.name}: {records}, each fitted separately; {converged} converged, at most"

@@ -56,7 +56,6 @@ def _steps(result) -> dict[str, Any]:
 
 
 def report(result):
-    """Return the Report of an Inspection."""
     steps = _steps(result)
     pace = "" if steps["step"] is None else f", every {steps['step']:g} s"
     longest, step = steps["longest_step"], steps["step"]

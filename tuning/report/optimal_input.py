@@ -20,7 +20,6 @@ CAPTIONS = {"responses": "Levels and inputs of the run with the optimal inputs."
 
 
 def report(bound):
-    """Return the Report of an InputBound."""
     terms = " + ".join(f"{w:g} {m}" if w != 1 else m for m, w in bound.objective.items())
     rows = [
         [Value(g["interval_s"], 6), Value(g["cost"], 6), f"{g['excess']:.1e}"] for g in bound.grids

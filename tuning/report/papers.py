@@ -153,7 +153,6 @@ def headline(rows):
 
 
 def headline_text(rows):
-    """Return `headline` as a sentence."""
     counts: Any = headline(rows)
     numbers, claims = counts["numbers"], counts["claims"]
     return (
@@ -178,7 +177,6 @@ def ramps(rows):
 
 
 def ramps_text(rows):
-    """Return `ramps` as lines."""
     return [
         f"with setpoint ramps of {row['ramp_s']:g} s: {row['reproduced']} of {row['of']} claims"
         f" that depend on them hold, not {', '.join(row['differs']) or 'one fails'}"

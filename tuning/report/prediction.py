@@ -55,7 +55,6 @@ def verdict_of(result):
 
 
 def report(result):
-    """Return the Report of a Prediction."""
     q, logs = result.quality, result.estimation.logs
     n = result.start_samples
     start = "all readings" if n is None else f"the first {n} samples"

@@ -86,7 +86,6 @@ def _joined(cell):
 
 
 def _wrapped(cell, width):
-    """The lines of a cell."""
     lines = textwrap.wrap(cell, max(width, 1), break_on_hyphens=False) or [""]
     return [line.replace(JOINED, " ") for line in lines]
 

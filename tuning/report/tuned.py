@@ -122,7 +122,6 @@ def report(result, page=False):
 
 
 def advice_of(result):
-    """Return the Advice on a TuningResult."""
     moved = [
         f"{name} {advice.changes(p['before'], p['after'], p['unit'], 4)}"
         for name, p in result.parameters.items()
@@ -253,7 +252,6 @@ def _proof(certificate, measure, limit):
 
 
 def answer_text(answer):
-    """Return the text of an Answer alone."""
     return terminal(Report("default answer", "", None, (), of_answer(answer)))
 
 
@@ -305,7 +303,6 @@ def _of(values, gain):
 
 
 def _rule(row, names):
-    """The cells of a rule with the gains `names`."""
     gains = [Value(_of(row["parameters"], g) or np.nan, 4) for g in names]
     numbers = [row[k] for k in ("error", "travel_percent", "objective")]
     holds = {True: "yes", False: "no", None: "-"}[row["holds"]]

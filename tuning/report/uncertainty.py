@@ -105,7 +105,6 @@ def remarks_of(ensemble):
 
 
 def report(ensemble):
-    """Return the Report of an Ensemble."""
     varied = ", ".join(f"{n} {in_words(d)}" for n, d in ensemble.distributions.items())
     violations = ensemble.violations() if ensemble.limits else []
     remarks, diverged = remarks_of(ensemble), int(ensemble.failed.sum())
@@ -228,7 +227,6 @@ def _measure_table(ensemble):
 
 
 def promise_sentence(promise):
-    """Return the sentence on a Promise that can be quoted."""
     inverse = 1.0 / promise.promise
     rate = f"{100 * promise.promise:g} %"
     if abs(inverse - round(inverse)) < 1e-6 * inverse:

@@ -75,7 +75,6 @@ class Verdict:
         return self.sentence
 
     def to_json(self) -> dict[str, Any]:
-        """Return the object `verdict` of a command's JSON."""
         names = ("tracking", "limits", "plants", "robustness")
         parts = {n: None if (part := getattr(self, n)) is None else part.words for n in names}
         return {"good": self.good, "sentence": self.sentence, **parts}
@@ -87,7 +86,6 @@ def outcome(words: str, good: bool = True) -> Verdict:
 
 
 def of_run(case: Case, values: Mapping[str, Any]) -> Verdict:
-    """Return the Verdict of a run with the measures `values`."""
     rows = limit_rows(case, values)
     return Verdict(
         tracking=tracking(case.loop, values),

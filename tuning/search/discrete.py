@@ -159,7 +159,6 @@ def _check_choices(choices):
 
 
 def _variant(case, values, kinds, free):
-    """Return the Variant of one combination."""
     rest = {name: value for name, value in values.items() if name not in kinds}
     if kinds:
         kind = values[kinds[0]]

@@ -136,7 +136,6 @@ class Adam(Options):
 
 
 def options_of(method: str | Options, **changes: Any) -> Options:
-    """Return the options of a method with the `changes` that are not None."""
     if not isinstance(method, Options):
         if method not in METHODS:
             raise InputError(f"method = {method!r}: must be one of {', '.join(METHODS)}")

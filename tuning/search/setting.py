@@ -172,7 +172,6 @@ class Setting:
         return case.without_safety_filter().with_safety_filter(**settings)
 
     def without_filter(self) -> "Setting":
-        """Return the setting without a safety filter."""
         searched = self.searched.without_safety_filter()
         return self.replace(searched=searched, filter=None, certificates=())
 

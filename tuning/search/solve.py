@@ -71,7 +71,6 @@ class Plan:
 
     @classmethod
     def of(cls, options: Options, method: str, seed: int, **more: Any) -> "Plan":
-        """Return the Plan of filled options."""
         numbers = ("starts", "screening", "iterations", "tolerance")
         batch = getattr(options, "batch", None)
         stated = {n: getattr(options, n) for n in numbers}

@@ -273,7 +273,6 @@ def _default_answer(
     resume: bool,
     progress: Callable | None,
 ) -> TuningResult:
-    """Return the default answer."""
     began, samples = time.perf_counter(), options.validation
     if not samples:
         raise InputError(

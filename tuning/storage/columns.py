@@ -104,5 +104,4 @@ def column(
 
 
 def _row_bytes(empty: Array) -> int:
-    """Return the bytes of a row of an array."""
     return int(np.prod(empty.shape[1:], dtype=int)) * empty.dtype.itemsize

@@ -156,7 +156,6 @@ class Store:
         )
 
     def close(self) -> None:
-        """Close the file."""
         self.db.close()
 
     def _insert(self, key, text):
@@ -208,7 +207,6 @@ def _to_json(value: Any) -> dict[str, Any]:
 
 
 def _from_json(entry: Any) -> Any:
-    """Inverse of `_to_json`."""
     if "of" in entry:
         return {k: _from_json(v) for k, v in entry["of"].items()}
     if "all" in entry:

@@ -254,7 +254,6 @@ class Sample:
                 return False
 
     def _run(self, count, rng):
-        """Run a batch."""
         z, direct = self.mixture.draw(BATCH, rng)
         g = count.judged(z)
         hit, self.limits = np.min(g, axis=1) < 0, g.shape[1]

@@ -221,7 +221,6 @@ def _not_robust(args, case, task, choices, varied):
 
 
 def _stated(task):
-    """`task` without scenarios."""
     return {name: value for name, value in task.items() if name != "scenarios"}
 
 
