@@ -40,7 +40,7 @@ if [[ "${funcstack[1]}" == _jaxtank ]]; then _jaxtank "$@"; else compdef _jaxtan
 complete -c jaxtank -f -a '(jaxtank completion words (commandline -opc)[2..] (commandline -ct))'
 """,
 }
-KINDS = {
+KINDS = {  # kind of the values of an option, by its metavar up to "="
     "DIR": "folders",
     "CSV": "files",
     "HTML": "files",
@@ -53,7 +53,6 @@ KINDS = {
     "TYPE": "precisions",
     "MEASURE": "measures",
 }
-"""Kind of the values of an option, by its metavar up to "="."""
 
 
 def script(shell):

@@ -93,7 +93,7 @@ class Pairs(argparse.Action):
         setattr(namespace, self.dest, pairs | {name: value})
 
 
-EXAMPLES = {
+EXAMPLES = {  # {command: what may follow it}
     "list": ("", "--all"),
     "show": ("gouta2015/backstepping", "tank.toml --json"),
     "simulate": ("cascaded/pi --set controller.Kc=2", "gouta2015/ngpc --safety-filter --out run"),
@@ -117,10 +117,8 @@ EXAMPLES = {
     "cache": ("", "clear"),
     "bench": ("", "cascaded/pi --rounds 3"),
 }
-"""{command: what may follow it}."""
 
-GROUPS = {"the case": 1, "uncertain plants": 2, "machines": 3, "output": 4}
-"""{group of options: its place in the help}; those of the command alone are before them."""
+GROUPS = {"the case": 1, "uncertain plants": 2, "machines": 3, "output": 4}  # {group: place}
 
 ACTIONS = {"pairs": (Pairs, {}), "list": ("append", []), "flag": ("store_true", False)}
 ACTIONS |= {"switch": (argparse.BooleanOptionalAction, None), "once": (Once, None)}

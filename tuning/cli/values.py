@@ -7,8 +7,7 @@ from jaxtank.core.errors import InputError
 
 DECIMAL_COMMA = re.compile(r"([+-]?)(\d+|[1-9]\d{0,2}(?:\.\d{3})+),(\d+(?:[eE][+-]?\d+)?)")
 """Text that is either a list of two numbers or one number with a decimal comma: 0,05 or 1.000,5."""
-LEADING_ZERO = re.compile(r"[+-]?0\d")
-"""How the digits after a decimal comma may begin, and no number."""
+LEADING_ZERO = re.compile(r"[+-]?0\d")  # digits after a decimal comma, and no number
 
 
 def plain_number(text):

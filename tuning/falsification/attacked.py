@@ -77,8 +77,7 @@ def filter_or_design(case: Any) -> Any:
         return None
 
 
-NOT_OTHERS = ("plant", "sensor", "x0")
-"""Parts whose uncertainty is in the box of plants, the band of readings and the starts."""
+NOT_OTHERS = ("plant", "sensor", "x0")  # in the box, band and starts
 
 
 def _ends_of(loop, distributions):

@@ -267,8 +267,7 @@ def apply_mend(
 ROUNDS = 12  # times that the limits are linearised
 SWEEPS = 60  # sweeps of Hildreth's method over the linearised limits
 
-REACHED = 1e-4
-"""Excess over a limit, as a share of it, with which an answer counts as within the limits."""
+REACHED = 1e-4  # excess over a limit, as a share of it, that counts as within it
 
 
 def least_offsets(needs: Needs) -> np.ndarray:
@@ -383,18 +382,12 @@ KINDS = ("setpoints", "rims", "orifices", "pumps", "ramps")
 
 TARGET = 0.95  # share of the plants that a mend makes feasible [-]
 
-AIM = 0.956
-"""Share on the draws that it is found with: nearly two standard deviations of the share of 4,096
-others above TARGET [-].
-"""
+AIM = 0.956  # the same on the draws of the search: 2 sd of the share of 4,096 others above
 
 DESIGN = 2  # draws in the design of a change per draw that is counted: more draws, less scatter
 
-COARSE = 1024
-"""Draws with which the direction of a move of setpoints is found; its size is found with all."""
-
-FACTORS = (1.02, 1.05, 1.1, 1.2, 1.35, 1.6, 2.0, 3.0)
-"""Factors on the areas of orifices among which the smallest is looked for."""
+COARSE = 1024  # draws that give the direction of a move of setpoints; its size needs all
+FACTORS = (1.02, 1.05, 1.1, 1.2, 1.35, 1.6, 2.0, 3.0)  # on the areas of orifices
 
 FAR = 0.4  # margin, as a share of a limit, above which a change of setpoints ignores the limit
 ROUNDING = 1e-4  # margin, as a share of a limit, that a search of setpoints keeps

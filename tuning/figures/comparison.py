@@ -16,14 +16,13 @@ from tuning.figures.figure import find
 from tuning.report import papers, tables
 from tuning.views import Shown
 
-COLOURS = {
+COLOURS = {  # colour of each verdict in a notebook
     papers.REPRODUCED: "#0072B2",
     papers.FITTED: "#9A6A00",
     papers.DIFFERS: "#B8431A",
     papers.IMPOSSIBLE: "#6B6B6B",
     papers.INPUT: "#6B6B6B",
 }
-"""Colour of each verdict in a notebook."""
 
 
 class Comparison(Shown):

@@ -16,12 +16,8 @@ from tuning.identification.least_squares import Fit
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import WHITE, autocorrelation, pseudo
 
-LARGEST_DEVIATION = 0.5
-"""Standard deviation of a direction, in units of its coordinates (logarithms, shares of a range),
-above which the direction is not identifiable.
-"""
-ROUND_OFF = 1e-9
-"""Singular value, as a share of the largest, below which a direction is only round-off."""
+LARGEST_DEVIATION = 0.5  # largest standard deviation of an identifiable direction
+ROUND_OFF = 1e-9  # share of the largest singular value that is round-off
 SHARE = 0.1  # share of a direction's largest entry above which a parameter is named as part of it
 
 

@@ -13,16 +13,11 @@ from jaxtank.core.units import canonical
 from tuning.identification.experiment import Log
 from tuning.identification.simulation import changes_of
 
-RIM_MARGIN = 1.5
-"""Reading, in rims of its tank, above which the column is taken to be in another unit."""
+RIM_MARGIN = 1.5  # reading, in rims, above which a column has another unit
 DRIVE_MARGIN = 2.0  # the same of a pump's input, in its upper limits
-FAINT = 0.015
-"""Share of its range below which a pump's input, or every level, is taken to be in another unit."""
-IRREGULAR = 1.25
-"""Ratio of a long to a short step between samples (90th and 10th percentile) above which
-they do not follow the clock of a controller, which changes its outputs at its samples."""
-FEWEST = 3
-"""Fewest samples of a run that can be fitted: residuals have an autocorrelation from three on."""
+FAINT = 0.015  # share of the range below which an input, or every level, has another unit
+IRREGULAR = 1.25  # ratio of steps (90th, 10th percentile) above which samples follow no clock
+FEWEST = 3  # samples of a run that can be fitted: residuals need an autocorrelation
 
 
 def checked(log, loop, gap: float) -> list[Log]:
@@ -223,7 +218,7 @@ class Check(NamedTuple):
 
 
 UNIT = "is the column in another unit?{hint}"
-CHECKS = (
+CHECKS = (  # in this order
     Check(
         "samples",
         _few_samples,
@@ -258,4 +253,3 @@ CHECKS = (
         "every level reads 0 throughout: nothing moves that could be fitted",
     ),
 )
-"""In this order."""

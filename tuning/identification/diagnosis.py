@@ -17,18 +17,15 @@ from tuning.identification.least_squares import Fit
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import ROBUST_LIMIT, WHITE, autocorrelation, residuals_of
 
-ALPHA = 0.02
-"""Significance level of one round of tests, divided among the candidates (Bonferroni) [-]."""
+ALPHA = 0.02  # significance level of a round of tests, divided among the candidates
 EQUIVALENT = 6.0  # 2 log of the likelihood ratio below which two fits count as equivalent
 MAX_CAUSES = 3  # most causes that are named
 MAX_FITTED = 10  # most candidates that are fitted at once
 ITERATIONS = 15
 LEAST_GAIN = 0.01  # reduction of the sum of squares, in its mean, below which a fit has converged
 STRIDE = 5  # stride through the distinct inputs in the first search for a threshold [-]
-BAD_FIT = 3.0
-"""RMS of a residual, in the noise of its channel, from which exchanged columns are tried."""
-EXCHANGE_RATIO = 0.5
-"""Largest ratio of the sums of squares at which an exchange of columns is kept [-]."""
+BAD_FIT = 3.0  # RMS of a residual, in noise, from which exchanged columns are tried
+EXCHANGE_RATIO = 0.5  # largest ratio of sums of squares that keeps an exchange [-]
 
 
 class Trial(NamedTuple):

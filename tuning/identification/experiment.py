@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike
 
 from jaxtank.core.errors import DataError, InputError
 
-HOLDS = ("", "zero-order", "first-order")
-"""Inputs between samples; "": unknown, zero-order hold if samples are regular."""
+HOLDS = ("", "zero-order", "first-order")  # "": unknown, zero-order where samples are regular
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)

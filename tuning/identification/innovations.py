@@ -19,8 +19,7 @@ from tuning.identification.simulation import player
 LIKELIHOODS = ("output-error", "innovations", "auto")
 REACH = 3.0  # largest change of log(noise of the readings) from its first value
 PROCESS = (1e-8, 1e-1)  # range of the process noise, in rims per root of a second
-PROCESS_SD = 0.5
-"""Prior standard deviation of a tank's log(process noise) about the mean of all tanks."""
+PROCESS_SD = 0.5  # prior sd of a tank's log(process noise) about the mean of all
 
 
 class InnovationsFit(NamedTuple):

@@ -28,8 +28,7 @@ class Inputs(NamedTuple):
 
 
 STATIC = ("actuator.delays", "plant.curves")  # names of such numbers that no leaf of a rig holds
-CURVE = ("exponent", "bend", "twist")
-"""Fields of Inputs that `plant.curves[j]`, `[j,1]` and `[j,2]` are."""
+CURVE = ("exponent", "bend", "twist")  # `plant.curves[j]`, `[j,1]`, `[j,2]`
 POINTS = 12  # points of the curve that stands for an exponent in a rig file
 
 

@@ -10,8 +10,7 @@ from scipy import optimize
 
 from tuning.identification.residuals import ROBUST_LIMIT
 
-CHI_SQUARED_95 = 3.841458820694124
-"""95 % point of the chi-squared distribution with one degree of freedom."""
+CHI_SQUARED_95 = 3.841458820694124  # one degree of freedom
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -18,8 +18,7 @@ from tuning.identification import simulation
 from tuning.identification.confidence import Spread
 from tuning.identification.result import Identification
 
-CHAINS, WARM_UP, DRAWS = 4, 300, 500
-"""Chains, steps of each that adapt the step size, and its draws."""
+CHAINS, WARM_UP, DRAWS = 4, 300, 500  # chains; steps that adapt; draws of each
 
 OUTSIDE = -1e12  # logarithm of the density outside the ranges of the parameters
 LARGEST_RHAT = 1.05  # r-hat above which the chains have not come to the same distribution [-]

@@ -27,9 +27,7 @@ from tuning.identification.result import channels_of
 from tuning.views import Result
 
 LAGS = 20  # lags of the test of whiteness
-WIDE = 3.0
-"""Standard deviation of a level, in those of its noise, below which a fit in per cent compares
-the residual with noise."""
+WIDE = 3.0  # sd of a level, in noise, below which its fit in per cent says nothing
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)

@@ -27,13 +27,11 @@ from tuning.identification.residuals import given_noise, noise_of
 
 STARTS = ("free", "measured", "case")
 
-LARGEST_ERROR = 0.05
-"""Share of a channel's largest reading by which halving the steps may still move a reading."""
+LARGEST_ERROR = 0.05  # share of a channel's largest reading that shorter steps may change
 
 DIFFERENCE = 1e-6  # change of a coordinate of an input by which slopes are computed
 
-LARGEST_SLOPE = 1e60
-"""Sensitivity, in standard deviations per unit of a coordinate, above which a run diverged."""
+LARGEST_SLOPE = 1e60  # sensitivity, in noise per unit, above which a run diverged
 
 
 class Estimation:

@@ -15,8 +15,7 @@ from tuning.identification.problem import Estimation
 from tuning.identification.residuals import WHITE, autocorrelation
 
 FOLDS = 4  # blocks of the data, each predicted by a fit to the others
-CROSS_VALIDATION_RATIO = 0.95
-"""Ratio of the mean squares of the prediction errors below which a part is added [-]."""
+CROSS_VALIDATION_RATIO = 0.95  # of mean squares, below which a part is added [-]
 MOST_POINTS = 8  # most points of a curve of a sensor
 SUBSTEPS = 8  # most Runge-Kutta steps per sample while parts are compared
 READINGS = 20  # fewest readings per point

@@ -6,10 +6,8 @@ from jaxtank.core.errors import InputError
 
 ENOUGH = 10  # fewest second differences from which the noise of a channel is estimated
 LAGS = 60
-WHITE = 3.0
-"""Largest autocorrelation of white residuals at lag 1, in its standard deviation 1/sqrt(n)."""
-ROBUST_LIMIT = 3.0
-"""Residual, in standard deviations, beyond which a robust loss reduces its weight."""
+WHITE = 3.0  # largest autocorrelation of white residuals at lag 1, in 1/sqrt(n)
+ROBUST_LIMIT = 3.0  # residual, in noise, from which a robust loss reduces its weight
 
 
 def given_noise(noise, channels):

@@ -8,10 +8,8 @@ from jaxtank.rig.sensors import spans_of
 from tuning.identification.experiment import Log
 
 LUCK = 1e-4  # probability of equal readings in a row above which they may be chance
-SHORTEST = 8
-"""Fewest equal readings in a row that are called frozen, and fewest changes of others [-]."""
-JUMP = 8.0
-"""Least jump of a spike, there and back, in noise, and over the changes beside it a half of it."""
+SHORTEST = 8  # equal readings in a row that are called frozen, and changes of others
+JUMP = 8.0  # least jump of a spike, there and back, in noise; over its neighbours half of it
 
 FEW = 5  # most readings in a row that a spike has
 

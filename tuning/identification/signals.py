@@ -18,17 +18,15 @@ from jaxtank.core.tables import (
 )
 
 # fmt: off
-TIME = {
+TIME = {  # names of a column of times, letters and digits only
     "t", "time", "timestamp", "datetime", "date", "elapsed", "elapsedtime", "sampletime", "ts",
     "localtime", "utctime", "timeutc", "seconds", "minutes", "hours", "zeit", "zeitstempel",
     "datum", "datumzeit", "uhrzeit", "horodatage",
 }
-"""Names of a column of times, letters and digits only."""
-WORDS = {
+WORDS = {  # names of a pump's input and a level, before their number
     **dict.fromkeys(("pump", "u", "voltage", "input"), "pump"),
     **dict.fromkeys(("h", "level", "y", "tank", "x"), "h"),
 }
-"""Names of a pump's input and a level, before their number."""
 TAG = {
     "tag", "tagname", "tagid", "name", "point", "pointname", "variable", "signal", "item",
     "itemid", "sensor", "channel", "bezeichnung", "kanal", "topic", "field", "metric", "series",
@@ -46,18 +44,16 @@ MEASURED = {"pv", "val", "value", "actual", "ist", "istwert", "avg", "mean", "me
 DRIVEN = {"op", "out", "output", "cv", "mv", "co", "cmd", "command"}
 """Words of a controller that mean its output, the input of a pump."""
 GOOD = {"good", "ok", "g", "valid", "gut", "true", "normal"}
-POOR = {
+POOR = {  # first words of a quality, in lower case
     "bad", "uncertain", "questionable", "substituted", "b", "u", "poor", "invalid", "false",
     "schlecht", "unsicher",
 }
-"""First words of a quality, in lower case."""
-SWITCH = {
+SWITCH = {  # {word for the state of a pump or a valve, in lower case: share of its range}
     **dict.fromkeys(("on", "true", "running", "run", "open", "opened", "started", "start"), 1.0),
     **dict.fromkeys(("ein", "an", "wahr", "auf", "offen", "läuft", "yes", "enabled"), 1.0),
     **dict.fromkeys(("off", "false", "stopped", "stop", "closed", "close", "idle", "shut"), 0.0),
     **dict.fromkeys(("aus", "falsch", "zu", "geschlossen", "steht", "no", "disabled"), 0.0),
 }
-"""{word for the state of a pump or a valve, in lower case: share of its range}."""
 # fmt: on
 GOOD_CODE = 192  # least code of OPC for a good quality
 

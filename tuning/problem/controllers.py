@@ -27,14 +27,11 @@ from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.components import REGISTERED, ROLES, controller_of, kind_of, model_of
 from jaxtank.rig.template import around
 
-NAMES = ("controller.kind", "law.kind")
-"""Names by which a choice of the controller is known: in Python, and of the table of a rig file."""
+NAMES = ("controller.kind", "law.kind")  # of Python, and of a rig file
 
 FASTER = 10.0  # time constant of the rig / time constant of the first closed loop [-]
 
-DEVIATION, EFFORT = 0.05, 0.25
-"""A level off by the first share of the tanks' height counts as much as an input off by the second
-share of its range (Bryson's rule) [-]."""
+DEVIATION, EFFORT = 0.05, 0.25  # share of the height, of a pump's range (Bryson's rule)
 
 
 class Rig(NamedTuple):

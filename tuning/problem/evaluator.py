@@ -9,8 +9,7 @@ from tuning.problem import scenarios as sc
 from tuning.problem.problem import LANES, Point, Problem, Screened
 from tuning.storage.evaluation_log import EvaluationCache
 
-IDLE = 2**23
-"""Samples of runs that are made in vain, at most, so as to use a program that is compiled."""
+IDLE = 2**23  # samples of runs made in vain, at most, to use a compiled program
 
 
 class Blocks:

@@ -27,8 +27,7 @@ Floats = NDArray[np.float64]
 
 DIVERGED = 1e9  # size at which a cost, a margin or a slope is no longer a number to search with
 
-LANES = 256
-"""Runs without derivatives that one program makes side by side: enough to fill the vector units."""
+LANES = 256  # runs without derivatives side by side: enough to fill the vector units
 
 FORWARD_LIMIT = 60
 """Number of free parameters up to which derivatives run forward with the simulation; above,
@@ -39,10 +38,7 @@ much again as reverse mode, and a search needs fewer of them: 44 instead of 230
 
 ROOT = "rms_error_total"  # the measure that is the root of a sum of squares over all outputs
 
-RISKS = ("mean", "cvar", "worst")
-"""The cost of several scenarios: their weighted mean, the mean of the worst TAIL of them, or the
-worst.
-"""
+RISKS = ("mean", "cvar", "worst")  # weighted mean, mean of the worst TAIL, worst scenario
 
 TAIL = 0.05  # share of the scenarios that "cvar" is the mean of [-]
 

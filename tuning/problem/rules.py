@@ -38,15 +38,9 @@ from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.signals.setpoints import ramps
 from tuning.problem.controllers import operating_point
 
-CYCLES = 12
-"""Periods of the ultimate cycle that a relay experiment runs for; the last half of them counts."""
-
-EXCURSION = 0.2
-"""Amplitude of the level in a relay experiment, as a share of its distance to bottom and rim."""
-
-REFERENCE_GAIN = 0.02
-"""Gain of a loop, in 1/(initial slope times dead time), at which its margins are computed: far
-below the ultimate gain, so that the loop is stable [-]."""
+CYCLES = 12  # ultimate periods of a relay experiment; the last half of them counts
+EXCURSION = 0.2  # amplitude of a relay experiment, in distances to bottom and rim
+REFERENCE_GAIN = 0.02  # gain, in 1/(initial slope x dead time), far below the ultimate one
 
 
 class Process(NamedTuple):

@@ -34,8 +34,7 @@ LARGEST_NOISE = 2**24  # numbers of sensor noise that are kept, at most: 128 MiB
 
 Measures = dict[str, Any]  # {name: array}
 
-Shape = tuple[Any, tuple[bool, ...], int]
-"""Structure of the loop, which leaves differ, number of runs."""
+Shape = tuple[Any, tuple[bool, ...], int]  # structure, which leaves differ, runs
 
 
 def screening_clock(clock: Clock) -> Clock:

@@ -30,11 +30,8 @@ class Advice(NamedTuple):
 
 FEW = 4  # entries of a list in a sentence
 
-GIVEN = "Nothing to set: the gains are those of the case"
-"""The first words where a command changes no gain."""
-
-BEYOND = "No gain can change this"
-"""The first words of the last sentence, where something is out of reach."""
+GIVEN = "Nothing to set: the gains are those of the case"  # where no gain changes
+BEYOND = "No gain can change this"  # where something is out of reach
 
 REACHABLE = "Nothing is out of reach of the gains: every setpoint can be held"
 """The first words where nothing is."""

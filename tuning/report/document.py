@@ -77,8 +77,7 @@ class Report:
         return [*first, *self.sections]
 
 
-BOLD, GOOD, BAD, END = "\033[1m", "\033[1;32m", "\033[1;31m", "\033[0m"
-"""Colours of a terminal: headings, and verdicts."""
+BOLD, GOOD, BAD, END = "\033[1m", "\033[1;32m", "\033[1;31m", "\033[0m"  # headings, verdicts
 
 
 def terminal(report: Report, colour: bool = False, advice: bool = False) -> str:

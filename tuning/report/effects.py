@@ -24,8 +24,7 @@ from tuning.uncertainty.sensitivity_study import NORMAL_WIDTH
 PANELS = 12  # measures in the picture
 LISTED = 8  # parameters in the table of a measure
 
-WIDE = 0.2
-"""Width of an interval of a share of the variance above which more samples are advised [-]."""
+WIDE = 0.2  # width of an interval of a variance's share that asks for more samples [-]
 
 
 class Method(NamedTuple):
@@ -142,8 +141,7 @@ def report(result):
     )
 
 
-SIZES = {"local": "effect", "morris": "mu_star", "sobol": "total"}
-"""{method: quantity that ranks parameters}."""
+SIZES = {"local": "effect", "morris": "mu_star", "sobol": "total"}  # ranks parameters
 
 
 def advice_of(result):

@@ -10,11 +10,8 @@ from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
 from tuning.report.tables import Table, Value, clean, fields, number
 
-LISTED = 0.005
-"""Share of the plants from which on a need is a row of the study's table; JSON has all [-]."""
-
-MATTERS = 0.05
-"""The same for a default answer, and the share of unreachable setpoints that needs no mend [-]."""
+LISTED = 0.005  # share of the plants from which on a need is a row of a table [-]
+MATTERS = 0.05  # the same for a default answer; unreachable share that needs no mend [-]
 
 CAPTIONS = {
     "needs": "What the steady states at the plateaus need: of the nominal plant, and exceeded by"

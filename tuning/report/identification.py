@@ -39,8 +39,7 @@ REJECTED = (
     "these data reject the structure of the rig: intervals and [covariance] are those of a rejected"
     " structure (rejected = true in rig.toml) and hold for no plant of another"
 )
-DOUBT = 1e-3
-"""Probability of a change from the prior below which data and prior contradict each other."""
+DOUBT = 1e-3  # probability of a change below which data and prior contradict each other
 
 
 def not_identifiable(direction):
@@ -73,7 +72,7 @@ def sentences_of(fit):
     return words
 
 
-ODD = {
+ODD = {  # {kind of an oddity in experiment data: sentence}
     "frozen": "{log}: {where} is frozen at {value:.6g} {unit} for {count} from {first:g} s on,"
     " while inputs or other levels move: leave these cells empty",
     "saturated": "{log}: {where} stays at {value:.6g} {unit} for {count} from {first:g} s on, an"
@@ -86,7 +85,6 @@ ODD = {
     "still": "{log}: {where} is {value:.6g} {unit} throughout: its gain is known only from the"
     " balance with the other flows",
 }
-"""{kind of an oddity in experiment data: sentence}"""
 
 
 def sentences_on(oddities):
@@ -96,7 +94,7 @@ def sentences_on(oddities):
     ]
 
 
-CAUSES = {
+CAUSES = {  # {kind of a cause: what the data need}
     "pump-delay": "a dead time of {pump}",
     "pump-lag": "a lag of {pump}",
     "dead-zone": "a dead zone of {pump}",
@@ -109,8 +107,7 @@ CAUSES = {
     "area": "an area of {tank} that differs from the rig's",
     "swapped": "the columns of {tank} exchanged",
 }
-"""{kind of a cause: what the data need}"""
-EXPERIMENTS = {
+EXPERIMENTS = {  # {kind of a cause: experiment that distinguishes it}
     "pump-delay": "steps of the pump, sampled faster",
     "pump-lag": "steps of the pump, sampled faster",
     "dead-zone": "the pump held at three inputs or more, one of them near 0",
@@ -123,7 +120,6 @@ EXPERIMENTS = {
     "area": "a known volume added with the outlets shut",
     "swapped": "a step of one pump, and which reading moves first",
 }
-"""{kind of a cause: experiment that distinguishes it}"""
 
 
 def diagnosis_of(fit):
@@ -219,8 +215,7 @@ def _named(fit, kind, where):
 PUMPS = ("pump-delay", "pump-lag", "dead-zone", "pump-curve")  # kinds of causes located at a pump
 
 
-LATE = ("pump-delay", "pump-lag")
-"""Those that look like inputs which follow no line from row to row."""
+LATE = ("pump-delay", "pump-lag")  # look like inputs on no line from row to row
 
 
 def _amount(cause):
@@ -308,13 +303,12 @@ def _likelihood(fit):
     return [words]
 
 
-PARTS = {
+PARTS = {  # {kind of a part that was added to a rig: what it is}
     "sensor-curve": "a curve of the sensor of {}",
     "outlet-exponent": "an exponent of an outlet of {}",
     "outlet-linear": "a linear outlet of {}, beside the other",
     "area": "the cross-section of {}",
 }
-"""{kind of a part that was added to a rig: what it is}"""
 
 
 def _refinements(fit):

@@ -26,16 +26,14 @@ from tuning.report.tables import Table, Value, clean
 NUMBER, CLAIM = "number", "claim"
 REPRODUCED, FITTED, DIFFERS = "reproduced", "fitted", "differs"
 IMPOSSIBLE, INPUT = "not reproducible", "input"
-VERDICTS = {
+VERDICTS = {  # {verdict of a row: its meaning}
     REPRODUCED: "within the tolerance of its row, or a claim that holds",
     FITTED: "near the printed number because an assumption was chosen for it: no evidence",
     DIFFERS: "measured, and different or true in part only: the row says why",
     IMPOSSIBLE: "cannot be measured: the row says what is missing",
     INPUT: "a number that our case has from the paper: no evidence",
 }
-"""{verdict of a row: its meaning}."""
-SAME = 1e-9
-"""Relative difference [-] below which a number was not measured: it is the printed one, set."""
+SAME = 1e-9  # relative difference below which a number was not measured, but set [-]
 
 
 def runner(paper):

@@ -17,8 +17,7 @@ SIDES = ("measured", "simulated")
 PREDICTED = ("predicted", "achieved")
 ROWS = 12  # times at which readings are printed side by side
 CHANCE = 0.01  # probability below which residuals are called correlated
-FAR = 3.0
-"""Correlation, in standard deviations, above which residuals are called dependent on an input."""
+FAR = 3.0  # correlation, in sd, above which residuals depend on an input
 
 
 def sentences_of(result):

@@ -9,11 +9,10 @@ from jaxtank.safety.checker import CASE, LIMITS
 from jaxtank.safety.of_case import certificates_of
 from tuning.report.tables import Table, Value, clean
 
-PROMISE = (
+PROMISE = (  # hypotheses of the proofs, without the start
     "on any plant with parameters in the case's intervals, under any controller, while each reading"
     " is within its noise band and no fault takes a parameter out of its interval"
 )
-"""Hypotheses of the proofs, without the start."""
 
 
 def start_of(starts):

@@ -22,8 +22,7 @@ from jaxtank.signals.setpoints import Ramps
 
 UNJUDGED = (OpenLoop, OnOff)  # controllers that are not judged on tracking
 
-OFF = 0.05
-"""Share of a tank's height by which a level may miss its setpoint where it should have settled."""
+OFF = 0.05  # share of a tank's height by which a settled level may miss its setpoint
 
 SHARE = 0.5  # share of an output's largest step by which it may miss, where steps are above SMALL
 SMALL = 0.005  # share of a tank's height from which a step is one to be followed, and not noise

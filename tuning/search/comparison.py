@@ -25,8 +25,7 @@ from tuning.search.options import check_numbers, check_precision
 from tuning.search.tuner import tune
 from tuning.views import Result
 
-MISPRINTS = "-printed"
-"""End of the name of a case whose controller has a misprint of its paper; it is left out."""
+MISPRINTS = "-printed"  # end of the name of a case with a misprint, which is left out
 
 
 class Rival(NamedTuple):

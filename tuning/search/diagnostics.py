@@ -22,9 +22,7 @@ from tuning.search.result import Lost, Message
 CHECKED_RUNS = 16  # scenarios that are run, at most, to look for a step that is too long
 STEP = 1e-4  # step of the differences of the gradient, in the unit cube [-]
 
-OFF = 0.1
-"""Distance from the setpoint at the end of a plateau, as a share of the change that led to it,
-from which an output does not follow: twice the band of the settling time [-]."""
+OFF = 0.1  # distance from a setpoint, in its last change: twice the settling band [-]
 
 WORSE = 2.0  # factor by which that distance must have grown to be called a change for the worse [-]
 LATE = 0.1  # share of a plateau, at its end, over which the distance is averaged [-]

@@ -105,11 +105,10 @@ def _batch(most: int, count: int) -> int:
 
 FRESH = 256  # plants on which an answer is judged
 
-NOMINAL = (
+NOMINAL = (  # measures of the nominal plant, which runs in addition to the plants
     *("rms_error_total", "rms_error", "settling_time", "recovery_time"),
     *("steady_state_error", "steady_state_swing", "time_of_steady_state_error"),
 )
-"""Measures of the nominal plant, which runs in addition to the plants."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)

@@ -68,14 +68,8 @@ FRAGILE, PEAK = 2.5, 2.0
 """Sensitivity peak Ms above which a loop is near the edge of its stability, and above which a loop
 that became less robust is reported [-]: textbooks recommend 1.4 to 2."""
 
-INSENSITIVE = 0.5
-"""Change of the objective [%] for 10 % of a parameter, below which the objective is called
-insensitive to the parameter.
-"""
-
-CHATTER = 10.0
-"""Growth of the total variation of the inputs, or of their rms change per sample, above which it is
-reported [-]."""
+INSENSITIVE = 0.5  # change of the objective for 10 % of a parameter that is not felt [%]
+CHATTER = 10.0  # reported growth of the inputs' total variation, or rms change [-]
 
 Messages = Iterator[Message]
 

@@ -10,10 +10,7 @@ from tuning.problem.problem import DIVERGED, ROOT
 from tuning.search.driver import LOWER_BY, SETTLED, CoarseSearch, Search, optimality
 from tuning.search.screening import MEMBERS, distinct_starts, evolution_size, evolve, sobol
 
-STEEPEST = 10.0
-"""Largest gradient, of the scaled cost per unit of z, that a first-order method is given: a steep
-cost near instability should turn it back, and not move it far away.
-"""
+STEEPEST = 10.0  # largest gradient for a first-order method: a step must not go far away
 
 
 def lbfgs(search, z, iterations):
@@ -78,17 +75,10 @@ kink a line search does not end by itself [-].
 
 ITERATION_LIMIT = 9  # status of scipy's SLSQP that has used up its iterations
 
-COARSE_TOLERANCE = 1e-4
-"""Tolerance of the search at a tenth of the samples, whose own error is larger [-]."""
-
-EXACT = 1e-8
-"""Tolerance of a search up to which Gauss-Newton goes on to rounding: it takes few steps there."""
-
-RESTORED = 5
-"""Points from which the least violation is searched for, where no search met the limits."""
-
-NEAR, HALVINGS = 0.1, 10
-"""Largest violation of a point that `approach` moves towards [-], and number of halvings."""
+COARSE_TOLERANCE = 1e-4  # at a tenth of the samples, whose own error is larger [-]
+EXACT = 1e-8  # up to it Gauss-Newton goes on to rounding: it takes few steps there
+RESTORED = 5  # points from which the least violation is sought, where none holds
+NEAR, HALVINGS = 0.1, 10  # largest violation that `approach` starts from [-], halvings
 
 MANY = 4  # number of parameters from which "auto" tries Gauss-Newton before it considers limits
 UNCONSTRAINED = ("trf", "coarse-trf")  # those that ignore limits

@@ -162,7 +162,7 @@ def check_numbers(low: int = 1, **numbers: Any) -> None:
             )
 
 
-METHODS: dict[str, Options] = {
+METHODS: dict[str, Options] = {  # options by the name of their method
     "auto": Options(),
     "trf": TRF(),
     "coarse-trf": TRF(coarse=True),
@@ -170,4 +170,3 @@ METHODS: dict[str, Options] = {
     "lbfgs": LBFGS(),
     "adam": Adam(),
 }
-"""Options by the name of their method."""

@@ -33,15 +33,11 @@ from tuning.uncertainty.distributions import stated as stated_of
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import probabilities, spread_of
 
-LARGEST_ERROR = 1e-3
-"""Largest `midpoint_error` with which the midpoint rule is used [-]: a fiftieth of the 5 % by which
-flows differ from plant to plant."""
+LARGEST_ERROR = 1e-3  # largest `midpoint_error`: a fiftieth of the spread of flows [-]
 
 STATES = 256  # states and inputs at which both are compared
 
-LOWEST = 0.05
-"""Least level of these states, as a share of the height [-]: closer to empty, stability limits the
-step, which is checked separately."""
+LOWEST = 0.05  # least level of these states [-]: near empty, stability limits the step
 
 
 def midpoint_error(case: Case, clock: Clock, height: float, span: np.ndarray) -> float:

@@ -20,9 +20,7 @@ values may be an earlier answer, which may cost WORTH already, with slightly dif
 
 FINE = 0.1  # share of WORTH to which the cost with some gains at their first values is searched [-]
 
-LINE, STRIDE = 32, 8
-"""Values that are tried between a gain's best and its first value, and how
-many of these values are run at once."""
+LINE, STRIDE = 32, 8  # values between best and first gain; how many run at once
 
 
 class Subspace(Search):

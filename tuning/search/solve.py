@@ -35,18 +35,14 @@ from tuning.search.screening import (
     sobol,
 )
 
-RENEWED = 3
-"""How often a search is begun again from where it stopped before conditions of an optimum hold."""
+RENEWED = 3  # times that a search begins again before conditions of an optimum hold
 
 AGREE = 1e-3  # two searches whose objectives differ by less than this share agree [-]
 SAME = 1e-9  # share of the cost by which two programs that compute it may differ, by rounding [-]
 FRESH = 2  # new Sobol points, as multiples of the members of a differential evolution
 
-TRIED = 8
-"""Members of a differential evolution of which the first that is no chaotic run is a start."""
-
-MISLED = 0.1
-"""Share by which the cost of a coarse run may differ from the true one to be searched with [-]."""
+TRIED = 8  # members of a differential evolution among which a start is found
+MISLED = 0.1  # share by which a coarse run's cost may differ from the true one [-]
 
 POLISHED = 1e-12  # tolerance of the last search, from the best point [-]
 

@@ -49,13 +49,8 @@ from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
 from tuning.storage.fingerprint import fingerprint
 from tuning.uncertainty.validation import summary_of, validate
 
-TOLERANCE = 1e-4
-"""Change of the cost, as a share of its first value, at which a search on drawn plants has
-converged: their mean is itself known to a few percent only [-]."""
-
-AGREE = 0.01
-"""Two searches whose costs differ by less than this share agree [-]: the mean of 32 plants is known
-to a few percent."""
+TOLERANCE = 1e-4  # relative change of the cost at convergence: a mean of drawn plants [-]
+AGREE = 0.01  # relative difference of two costs that agree: a mean of 32 plants [-]
 
 DEFAULT = {"starts": 4, "screening": 32, "iterations": 40, "validation": FRESH}
 NOMINAL = {"starts": 8, "screening": 64, "iterations": 60, "validation": 64}

@@ -17,19 +17,13 @@ from tuning.cluster.engine import connect
 from tuning.cluster.sent import received, sent
 from tuning.problem.scenarios import noisy
 
-BATCH = 256
-"""Draws in a batch, on each device: enough to fill the vector units, few enough for the cache."""
+BATCH = 256  # draws in a batch, on each device: fills vector units, fits the cache
 
 NOISE = 1 << 27  # bytes of sensor noise that a batch may hold: long noisy runs have smaller batches
 FAN_BATCH, FAN_ROWS = 64, 240  # draws simulated at once, and time stamps, of a fan chart
 
-WORK = 1 << 24
-"""Samples of all runs of a batch from which it is a separate task [-]: 0.1 s of work, while the
-command and the scheduler need 5 ms for a task.
-"""
-
-SHARES = 16
-"""Least number of tasks, where there are as many batches: workers end at about the same time."""
+WORK = 1 << 24  # samples of a batch that is a task: 0.1 s of work, overhead 5 ms [-]
+SHARES = 16  # least number of tasks: workers end at about the same time
 
 CUTS = (0.05, 0.25, 0.5, 0.75, 0.95)  # quantiles of a fan chart [-]
 

@@ -9,8 +9,7 @@ estimator, its table 2 (f).
 import numpy as np
 from scipy import stats
 
-LEVELS = 4
-"""Levels of Morris' grid; with 4 and a step of 2/3 every level is as likely as every other."""
+LEVELS = 4  # of Morris' grid; with a step of 2/3 all levels are equally likely
 
 RESAMPLES = 1000  # bootstrap resamples of an interval
 BLOCK = 1 << 22  # bootstrap weights held at once

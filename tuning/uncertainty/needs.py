@@ -49,8 +49,7 @@ def plateaus_of(case: Case) -> list[Plateau] | None:
     return plateaus
 
 
-BLOCK = 1 << 14
-"""Draws whose steady states are computed at once: a plateau takes some 100 bytes a draw."""
+BLOCK = 1 << 14  # draws whose steady states are computed at once: 100 bytes each
 
 TOLERANCE = 1e-9  # by how much a limit may be passed, as a share of its size: rounding
 

@@ -16,38 +16,25 @@ import scipy  # its parts are imported when they are first used
 
 from tuning.uncertainty.sampling import clopper_pearson
 
-FARTHEST = 7.0
-"""Distance from the origin at which a search ends: beyond lie 1e-12 of the plants [sd]."""
-
-WIDE_RUNS, WIDE_SHARE = 256, 0.25
-"""Runs of a wide normal distribution that look for regions of failure first, and their share later.
-"""
+FARTHEST = 7.0  # where a search ends: beyond lie 1e-12 of the plants [sd]
+WIDE_RUNS, WIDE_SHARE = 256, 0.25  # of a wide normal distribution: first, later
 
 LANES, STEPS = 32, 20  # searches at once, and their steps
 RAY = 16  # runs between the origin and a failure that look for the first failure on the way
 APART = 1.0  # least distance of two centres [sd]
 CENTRES = 16  # most centres of a mixture
 
-DEFENSIVE = 0.2
-"""Share of the runs drawn from the distribution itself: a weight is at most its inverse [-]."""
+DEFENSIVE = 0.2  # share of runs of the distribution itself: bounds the weights
 
 BATCH = 256  # runs after which the estimate is looked at
 
-ACCURACY, FINEST = 0.07, 0.02
-"""Coefficients of variation of the probability: the usual one, and the one at which a promise that
-lies within the interval stays undecided [-]."""
+ACCURACY, FINEST = 0.07, 0.02  # variation of the probability: usual, undecided [-]
 
 TURNS, FIRST_HITS = 4, 100  # most mixtures that are sampled, and failures to which one is fitted
 
-FITTED, INFLATION = 0.7, 1.2
-"""Share of the fitted parts in the parts around failures, and the factor of their variance [-]."""
-
-LARGEST_SHARE, FEWEST_HITS = 0.1, 20
-"""Share of one run in the probability from which its region gets a centre, and the number of
-failures before that is judged."""
-
-LEVEL_RUNS, KEPT_SHARE, LEVELS = 500, 0.1, 7
-"""Subset simulation: runs of a level, share of them that the next begins from, most levels."""
+FITTED, INFLATION = 0.7, 1.2  # share of fitted parts, factor of their variance [-]
+LARGEST_SHARE, FEWEST_HITS = 0.1, 20  # of one run that gets a centre; failures
+LEVEL_RUNS, KEPT_SHARE, LEVELS = 500, 0.1, 7  # of subset simulation
 
 
 class Margins(NamedTuple):

@@ -26,11 +26,8 @@ from tuning.views import Result
 
 METHODS = ("local", "morris", "sobol")
 
-SAMPLES = {"local": None, "morris": 32, "sobol": 512}
-"""Default number of trajectories of Morris and of base points of Sobol."""
-
-LEAST, MOST = {"morris": 4, "sobol": 16}, 1 << 20
-"""Fewest samples that an interval can be computed from, and most that are taken."""
+SAMPLES = {"local": None, "morris": 32, "sobol": 512}  # trajectories, base points
+LEAST, MOST = {"morris": 4, "sobol": 16}, 1 << 20  # fewest and most samples
 
 RANKED_BY = {"local": "effect", "morris": "mu_star", "sobol": "total"}
 
@@ -284,8 +281,7 @@ def _columns(case, names, method, points, nominal, values, seed):
 CHUNK = 16  # parameters whose derivatives are computed at once
 NORMAL_WIDTH = 2.0  # half-width of a normal distribution, in standard deviations [-]
 
-RUNS_AT_ONCE, SAMPLES_AT_ONCE = 64, 1 << 22
-"""Runs in a batch, and most samples of all of them: each holds its signals."""
+RUNS_AT_ONCE, SAMPLES_AT_ONCE = 64, 1 << 22  # of a batch
 
 UNUSABLE = (
     "a derivative is not finite, or runs contradict it by orders of magnitude, as in a chaotic or"
