@@ -95,9 +95,13 @@ def _published(case: Case, kind: str) -> tuple[Any, dict[str, Any]] | None:
 
 def same_rig(*cases: Case) -> bool:
     """Return whether two cases have the same plant and pumps."""
-    trees = [jax.tree.flatten((case.loop.plant, case.loop.actuator)) for case in cases]
-    (leaves, form), (others, other_form) = trees
-    return form == other_form and all(np.array_equal(a, b) for a, b in zip(leaves, others))
+    return equal(*((case.loop.plant, case.loop.actuator) for case in cases))
+
+
+def equal(a: Any, b: Any) -> bool:
+    """Return whether two parts of a loop are the same in structure and every number."""
+    (leaves, form), (others, other) = jax.tree.flatten(a), jax.tree.flatten(b)
+    return form == other and all(np.array_equal(x, y) for x, y in zip(leaves, others))
 
 
 def _computed(case: Case, kind: str) -> tuple[Any, dict[str, Any]]:

@@ -8,9 +8,7 @@ from tuning.problem import provenance
 from tuning.report import verdict as verdicts
 from tuning.report.advice import Advice, amount, of_nominal_plant
 from tuning.report.document import Report, Text
-from tuning.report.folder import earlier
-from tuning.report.folder import save as save_all
-from tuning.report.tables import Table, Value, clean
+from tuning.report.tables import Table, Value, clean, fields
 
 CAPTIONS = {
     "controllers": "Mean error of each controller on the plants where every setpoint is reachable."
@@ -39,19 +37,11 @@ def _row(rival):
     """The JSON object of a Rival."""
     judged = rival.judged.to_json()
     return {
-        "name": rival.name,
-        "kind": rival.kind,
-        "gains": rival.gains,
-        "tuned": rival.tuned,
+        **fields(rival, "name kind gains tuned error violations step_us"),
+        **{name: judged[name] for name in ("objective", "failed", "travel_percent")},
         "filter": rival.filtered,
-        "error": rival.error,
-        "objective": judged["objective"],
-        "violations": rival.violations,
-        "failed": judged["failed"],
-        "travel_percent": judged["travel_percent"],
         "sensitivity_peak": rival.peak,
         "why": rival.why or None,
-        "step_us": rival.step_us,
     }
 
 
@@ -165,10 +155,3 @@ def figures(result):
         ax.grid(True, axis="x", alpha=0.3)
 
     return {"controllers": picture(errors, (7.6, max(1.9, 0.8 + 0.32 * len(names))))}
-
-
-def save(result, folder, command=None):
-    """Write result.json, the picture and report.html of a ControllerComparison to a folder."""
-    draw, page = lambda: figures(result), lambda: report(result)
-    stale = earlier(folder, CAPTIONS)
-    return save_all(folder, json_of(result), {}, draw, page, CAPTIONS, command, stale)

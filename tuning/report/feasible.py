@@ -3,11 +3,9 @@
 import dataclasses
 
 from jaxtank.core.labels import label_of, short
-from tuning.problem import provenance
 from tuning.report import advice
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
-from tuning.report.folder import save as save_all
 from tuning.report.tables import Table, Value, clean, fields, number
 
 LISTED = 0.005  # share of the plants from which on a need is a row of a table [-]
@@ -100,10 +98,8 @@ def unreachable(study):
 
 
 def report(study):
-    share, good = (
-        study.infeasible_for_any_controller,
-        study.infeasible_for_any_controller <= MATTERS,
-    )
+    share = study.infeasible_for_any_controller
+    good = share <= MATTERS
     mends = [f"  {m.what}: {' '.join(m.options)}" for m in study.mends]
     if mends:
         mends = ["Every setpoint is reachable on 95 % of the plants with one of:", *mends]
@@ -140,10 +136,3 @@ def figures(study):
         ax.legend()
 
     return {"needs": picture(draw, (6.0, 1.0 + 0.5 * len(rows)))} if rows else {}
-
-
-def save(study, folder, command=None):
-    """Write result.json, needs.png and report.html to `folder`; return their paths."""
-    draw, page = lambda: figures(study), lambda: report(study)
-    of = provenance.provenance(study.case, study.seed)
-    return save_all(folder, json_of(study), {}, draw, page, CAPTIONS, command, provenance=of)

@@ -8,6 +8,7 @@ from typing import Any
 from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import write_folder
+from tuning.problem.provenance import provenance as provenance_of
 from tuning.report.document import Figure, Report, failed
 from tuning.report.tables import dumps
 
@@ -49,6 +50,16 @@ def earlier(folder: str | Path, names: Any) -> list[Path]:
     """Return report.html and the pictures `names` of an earlier result in `folder`."""
     page = Path(folder) / "report.html"
     return [page, *(page.with_name(f"{name}.png") for name in names)] if page.is_file() else []
+
+
+def save_result(home: Any, result: Any, folder: str | Path, command: str | None) -> list[Path]:
+    """Write the files of a result by the functions of its report module `home`."""
+    payload, files = home.json_of(result), getattr(home, "files_of", lambda _: {})(result)
+    draw, page = lambda: home.figures(result), lambda: home.report(result)
+    of = payload.get("provenance") or provenance_of(result.case, getattr(result, "seed", 0))
+    captions = home.captions_of(result) if hasattr(home, "captions_of") else home.CAPTIONS
+    stale = earlier(folder, captions)
+    return save(folder, payload, files, draw, page, captions, command, stale, of)
 
 
 def save(

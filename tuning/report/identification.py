@@ -21,7 +21,7 @@ from tuning.report.advice import Advice, changes, listed
 from tuning.report.document import Report, Text
 from tuning.report.folder import earlier, rig_text
 from tuning.report.folder import save as save_all
-from tuning.report.tables import Table, Value, clean, fields
+from tuning.report.tables import Table, Value, clean, csv_text, fields
 
 CAPTIONS = {
     "fit": "Measured readings (dots), the fitted rig (line), and the inputs of the pumps.",
@@ -213,8 +213,7 @@ def _named(fit, kind, where):
 
 
 PUMPS = ("pump-delay", "pump-lag", "dead-zone", "pump-curve")  # kinds of causes located at a pump
-
-
+FIT = ("rmse", "nrmse_percent")
 LATE = ("pump-delay", "pump-lag")  # look like inputs on no line from row to row
 
 
@@ -517,15 +516,11 @@ def _validation(fit):
     v = fit.validation
     if not v:
         return []
+    sides = {"fitted": v["fitted"], "validation": v["held_back"]}
     rows = [
-        [
-            name,
-            words,
-            Value(v[side]["rmse"][c], 4, unit),
-            Value(v[side]["nrmse_percent"][c], 3, "%"),
-        ]
+        [name, side, Value(q["rmse"][c], 4, unit), Value(q["nrmse_percent"][c], 3, "%")]
         for c, (name, unit) in enumerate(fit.channels)
-        for side, words in (("fitted", "fitted"), ("held_back", "validation"))
+        for side, q in sides.items()
     ]
     head = (
         f"fit to the first {', '.join(map(str, v['samples']))} samples, validated on the rest by"
@@ -567,9 +562,7 @@ def json_of(fit):
         "message": "; ".join(sentences_of(fit)),
         "diagnosis": diagnosis_of(fit),
         **fields(fit, "parameters remedies validation profile starts wall_s"),
-        "fit": clean(
-            {k: quality[k] for k in ("rmse", "nrmse_percent", "residual_autocorrelation")}
-        ),
+        "fit": {n: clean(quality[n]) for n in (*FIT, "residual_autocorrelation")},
         "channels": [
             {"name": n, "unit": u, "noise": s} for (n, u), s in zip(fit.channels, quality["noise"])
         ],
@@ -611,13 +604,12 @@ def fit_csv(fit):
     heads = ["log", "t [s]", *(f"pump{j + 1} [{drive}]" for j in range(est.data.u.shape[-1]))]
     for name, unit in fit.channels:
         heads += [f"{name} measured [{unit}]", f"{name} simulated [{unit}]"]
-    lines = [",".join(heads)]
+    rows = [heads]
     for e, log in enumerate(est.logs):
         for k in range(log.samples):
             readings = np.column_stack([est.data.y[e, k], simulated[e, k]]).ravel()
-            numbers = ["" if np.isnan(v) else f"{v:.10g}" for v in (log.t[k], *log.u[k], *readings)]
-            lines.append(",".join([str(e + 1), *numbers]))
-    return "\n".join(lines) + "\n"
+            rows.append([e + 1, log.t[k], *log.u[k], *readings])
+    return csv_text(rows)
 
 
 def save(fit, folder, command=None):

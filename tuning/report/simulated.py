@@ -86,31 +86,22 @@ def estimates_of_run(case, key):
 def _coefficients(rows):
     """The section on the coefficients that were estimated."""
     heads = ["estimated coefficient", "in the model", "at the end", "change [%]"]
-    table = [
-        [
-            row["name"],
-            Value(row["model"], 5, row["unit"]),
-            Value(row["estimate"], 5, row["unit"]),
-            Value(100.0 * (row["estimate"] / row["model"] - 1.0), 3),
-        ]
-        for row in rows
-    ]
+    table = []
+    for row in rows:
+        values, ratio = [row["model"], row["estimate"]], row["estimate"] / row["model"]
+        cells = [Value(v, 5, row["unit"]) for v in values]
+        table.append([row["name"], *cells, Value(100.0 * (ratio - 1.0), 3)])
     return [Table(table, heads)]
 
 
 def _diagnosis(diagnosis):
     """The section on the faults that were named."""
     heads = ["diagnosed fault", "from [s]", "to [s]", "size", "probability [-]"]
-    rows = [
-        [
-            d["fault"],
-            Value(d["from_s"], 5),
-            Value(d["to_s"], 5),
-            "" if d["size"] is None else Value(d["size"], 3, d["unit"].strip("-")),
-            Value(d["probability"], 3),
-        ]
-        for d in diagnosis
-    ]
+    rows = []
+    for d in diagnosis:
+        size = "" if d["size"] is None else Value(d["size"], 3, d["unit"].strip("-"))
+        times = Value(d["from_s"], 5), Value(d["to_s"], 5)
+        rows.append([d["fault"], *times, size, Value(d["probability"], 3)])
     return [Table(rows, heads)] if rows else [Text(["no fault is diagnosed"], gap=True)]
 
 

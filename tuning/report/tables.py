@@ -1,6 +1,8 @@
 """Numbers, tables and JSON of results, for people and for programs."""
 
+import csv
 import dataclasses
+import io
 import itertools
 import json
 import math
@@ -221,6 +223,14 @@ def measures_json(measures):
 def fields(result, names):
     """Return {name: value of that attribute, as JSON takes it} of several names in one text."""
     return {name: clean(getattr(result, name)) for name in names.split()}
+
+
+def csv_text(rows):
+    """Return rows of texts and numbers as CSV text; NaN is empty."""
+    cell = lambda v: v if isinstance(v, (str, int)) else "" if np.isnan(v) else f"{v:.10g}"
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows([cell(v) for v in row] for row in rows)
+    return out.getvalue()
 
 
 def dumps(table):

@@ -428,14 +428,8 @@ def _measure_table(result):
     rows = [["objective", cost_unit(result), *(Value(objective[side]) for side in SIDES)]]
     for m in listed:
         after = numbers(measures["after"][m], 5 if "level" in m else 4)
-        rows.append(
-            [
-                m,
-                unit_text(m, units, result.tuned.loop.plant),
-                numbers(measures["before"][m], 4),
-                after,
-            ]
-        )
+        unit = unit_text(m, units, result.tuned.loop.plant)
+        rows.append([m, unit, numbers(measures["before"][m], 4), after])
     weighted = " + ".join(m if w == 1 else f"{w:g} {m}" for m, w in terms.items())
     before, after = ({m: measures[side][m] for m in listed} for side in SIDES)
     lines = [f"objective: {weighted}{_runs_of(result, bool(listed))}"]

@@ -274,16 +274,10 @@ def _promise_sections(ensemble):
 
 
 def _violation_table(violations):
-    rows = [
-        [
-            v["name"],
-            Value(v["limit"], unit=v["unit"]),
-            v["count"],
-            Value(v["probability"], 4),
-            Value(v["interval95"], 4, between=" : "),
-        ]
-        for v in violations
-    ]
+    rows = []
+    for v in violations:
+        shares = Value(v["probability"], 4), Value(v["interval95"], 4, between=" : ")
+        rows.append([v["name"], Value(v["limit"], unit=v["unit"]), v["count"], *shares])
     heads = ["limit", "value", "broken in", "probability", "95 % interval"]
     return Table(rows, heads, gap=True, top=True)
 

@@ -216,7 +216,8 @@ def _remedy(task: Task, attempt: Attempt, checks: Checks | None, coarse: bool) -
         return "fine step"
     if after.held.all():
         return ""
-    if task.may_filter and setting.filter is None and _levels_broken(after):
+    levels_broken = any(r["broken"] and r["limit"].measure in LEVELS for r in after.worst())
+    if task.may_filter and setting.filter is None and levels_broken:
         return "safety filter"
     search = solution.search
     return "tighter limits" if checks and search and search.violation(solution.point) == 0 else ""
@@ -302,7 +303,3 @@ def _misled(cost: float, after: Judged) -> bool:
         return True
     ratio = float(np.mean(after.cost[good])) / cost if cost > 0 else 1.0
     return not 1.0 / MISLED < ratio < MISLED
-
-
-def _levels_broken(after: Judged) -> bool:
-    return any(row["broken"] and row["limit"].measure in LEVELS for row in after.worst())

@@ -115,22 +115,26 @@ def tune_choices(
 
 def _row(variant, result):
     """Return the row of one combination; result : None where it does not fit."""
-    objective, after = {"before": None, "after": None}, {}
-    if result is not None:
-        objective = {side: result.objective[side] for side in objective}
-        after = {n: p["after"] for n, p in result.parameters.items()}
-    return {
-        "values": variant.values,
-        "status": UNFIT if result is None else str(result.status),
-        "objective": objective,
-        "parameters": after,
-        "reason": variant.why if result is None else None,
-    }
+    objective: dict[str, Any] = {"before": None, "after": None}
+    row = {"values": variant.values, "status": UNFIT, "objective": objective, "parameters": {}}
+    if result is None:
+        return row | {"reason": variant.why}
+    objective = {side: result.objective[side] for side in objective}
+    after = {n: p["after"] for n, p in result.parameters.items()}
+    row |= {"status": str(result.status), "objective": objective, "parameters": after}
+    return row | {"reason": None}
 
 
 def _variants(case, choices, free):
     """Return the Variants of all combinations. Raises InputError for one that cannot be."""
-    _check_choices(choices)
+    if not isinstance(choices, Mapping):
+        raise InputError(
+            f"choices = {shortened(choices)}: must be {{name: [values to try]}}, as"
+            ' {"controller.kind": ["pid", "lqi"]}'
+        )
+    for name, values in choices.items():
+        if not isinstance(values, (list, tuple)) or not values:
+            raise InputError(f"choices {name}: must be a list of values to try")
     combinations = list(itertools.product(*choices.values()))
     if len(combinations) > MANY:
         raise InputError(f"choices: {len(combinations)} combinations, must be at most {MANY}")
@@ -145,17 +149,6 @@ def _variants(case, choices, free):
         if kinds and not any(rig.has(variant.loop, name) for variant in fitting):
             bounds(fitting[0].loop, {name: free[name]})  # raises, with the nearest name
     return variants
-
-
-def _check_choices(choices):
-    if not isinstance(choices, Mapping):
-        raise InputError(
-            f"choices = {shortened(choices)}: must be {{name: [values to try]}}, as"
-            ' {"controller.kind": ["pid", "lqi"]}'
-        )
-    for name, values in choices.items():
-        if not isinstance(values, (list, tuple)) or not values:
-            raise InputError(f"choices {name}: must be a list of values to try")
 
 
 def _variant(case, values, kinds, free):

@@ -171,13 +171,10 @@ class _Sweep:
         screened, _ = screen(search.evaluator, screening, seed)
         points = [p for p in self.known.values() if p.finite]
         margins = [search.problem.margins(p.measures) for p in points]
-        return Population(
-            np.concatenate([screened.zs, [p.z for p in points]]),
-            np.concatenate([screened.costs, [p.cost for p in points]]),
-            np.concatenate(
-                [screened.margins, np.reshape(margins, (len(points), screened.margins.shape[1]))]
-            ),
-        )
+        margins = np.reshape(margins, (len(points), screened.margins.shape[1]))
+        known = ([p.z for p in points], [p.cost for p in points], margins)
+        first = (screened.zs, screened.costs, screened.margins)
+        return Population(*map(np.concatenate, zip(first, known)))
 
 
 def _row(problem, value, answer, z):

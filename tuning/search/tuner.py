@@ -184,7 +184,6 @@ def _optimum(
     lp.check(case.loop, case.clock, key)
     plan = Plan.of(options, _method(options, problem), problem.seed, engine=engine)
     first, start = problem.start(), problem.own_values()
-    # a start that is not finite is an input error, reported by evaluate
     before = run_measures(case.loop, case.clock, key, problem.needed)
     _check_start(problem, before, first)
     check_sent(engine, problem)
@@ -211,16 +210,14 @@ def _optimum(
         for side, loop in (("before", case.loop), ("after", tuned.loop)):
             measures[side] = measures[side] | margin_measures(loop, case.clock)
     summary, cloud = None, None
-    if options.validation and not solution.interrupted and _varies(problem):
+    varies = case.uncertain or case.covariance or any(r.key is not None for r in problem.runs)
+    if options.validation and not solution.interrupted and varies:
         summary, cloud = validate(problem, start, values, options.validation, plan.seed)
     scenarios = problem.runs if problem.scenarios else ()
     objective = {side: problem.total(table) for side, table in tables.items()}
+    steps = diagnostics.step_warnings(tuned, values, key, scenarios)
     result = _result(
-        evaluator,
-        solution,
-        values,
-        began,
-        diagnostics.step_warnings(tuned, values, key, scenarios),
+        *(evaluator, solution, values, began, steps),
         case=case,
         tuned=tuned,
         method=plan.method,
@@ -238,16 +235,9 @@ def _optimum(
     return result
 
 
-def _varies(problem: Problem) -> bool:
-    """Return True if a validation run can differ from the nominal one."""
-    case = problem.case
-    stated = bool(case.uncertain or case.covariance)
-    return stated or any(run.key is not None for run in problem.runs)
-
-
 def _setting(case, objective, limits, distributions, safety_filter):
     """Return the Setting of a default answer, before a filter is taken for levels near a limit."""
-    if safety_filter and not case.safety:  # asked for here: the case as given has none
+    if safety_filter and not case.safety:
         case = case.without_safety_filter()
     setting = setting_of(case, objective, limits, distributions)
     return setting.without_filter() if safety_filter is False else setting
@@ -298,27 +288,21 @@ def _default_answer(
     setting, solution = attempt.setting, attempt.solution
     if attempt.number:  # the plants that asked for another search do not judge it
         before = judge(_unfiltered(setting), samples, seed, round_=attempt.number)
-    # Ctrl-C before the first search
-    evaluator = attempt.evaluator or Evaluator(stated)
+    evaluator = attempt.evaluator or Evaluator(stated)  # Ctrl-C before the first search
     problem = evaluator.problem
     values = values_of(problem, solution)
     answer = _answer(attempt, problem, before, values)
     solution.least = True  # of the limits on plants that judged
     first = solution.search.point(problem.start()) if solution.search is not None else None
-    rules = ()
-    if not solution.interrupted:
-        rules = rule_rows(setting, samples, seed, attempt.number, gains, reasons)
+    known = setting, samples, seed, attempt.number, gains, reasons
     sides = {"before": first, "after": solution.point}
+    steps = diagnostics.step_warnings(setting.tuned(values), values)
     result = _result(
-        evaluator,
-        solution,
-        values,
-        began,
-        diagnostics.step_warnings(setting.tuned(values), values),
+        *(evaluator, solution, values, began, steps),
         method="default answer",
         status=solution.status(answer.held, answer.lost),
         tables={side: [] if p is None else list(p.measures) for side, p in sides.items()},
-        rules=rules,
+        rules=() if solution.interrupted else rule_rows(*known),
         **_judged_parts(answer, values),
     )
     log.close()
@@ -336,8 +320,7 @@ def _with_rule(
     """What is free; else the gains, about those of a rule too where one of these is outside."""
     if free is not None or case.free or not gains:
         return free
-    ranges, about = gain_ranges(case.loop), dict[str, Free]()
-    outside = False
+    ranges, about, outside = gain_ranges(case.loop), dict[str, Free](), False
     for name, (low, high, scale) in ranges.items():
         gain = gains.get(name, 0.0)
         if low * high > 0.0 and low * gain > 0.0:
@@ -349,8 +332,7 @@ def _with_rule(
 
 def _gains_of_rules(case: Case) -> tuple[dict[str, dict[str, float]], dict[str, str]]:
     """({rule: gains}, {rule: why it has none}) of a case; of another controller, none of both."""
-    gains: dict[str, dict[str, float]] = {}
-    reasons: dict[str, str] = {}
+    gains, reasons = dict[str, dict[str, float]](), dict[str, str]()
     for rule in () if refusal(case) else RULES:
         try:
             gains[rule] = rule_gains(case, rule)
@@ -385,14 +367,9 @@ def rule_rows(
 def rule_row(rule: str, gains: Mapping[str, float], judged: Judged | None) -> dict[str, Any]:
     """Return a row of `TuningResult.rules`; judged : None where a rule has no gains."""
     means = {} if judged is None else judged.to_json()
-    return {
-        "rule": rule,
-        "parameters": gains,
-        "error": means.get("error"),
-        "holds": None if judged is None else bool(judged.held.all()),
-        "objective": means.get("objective"),
-        "travel_percent": means.get("travel_percent"),
-    }
+    numbers = {name: means.get(name) for name in ("error", "objective", "travel_percent")}
+    holds = None if judged is None else bool(judged.held.all())
+    return {"rule": rule, "parameters": gains, "holds": holds, **numbers}
 
 
 def _with_gains(setting: Setting, gains: Mapping[str, float]) -> Setting:
@@ -442,15 +419,9 @@ def tune_by_rule(
     began = time.perf_counter()
     check_precision()
     objective, limits = as_measures(objective, limits)
-    if safety_filter and not case.safety:
-        case = case.without_safety_filter()
-    setting = setting_of(case, objective, limits, distributions)
-    if safety_filter is False:
-        setting = setting.without_filter()
+    setting = _setting(case, objective, limits, distributions, safety_filter)
     gains = rule_gains(case, rule)
-    ranges = {
-        name: Free(*_around(get_value(case.loop, name), gain)) for name, gain in gains.items()
-    }
+    ranges = {n: Free(*_around(get_value(case.loop, n), gain)) for n, gain in gains.items()}
     stated = setting.searched, ranges, setting.objective, setting.case.limits
     evaluator = Evaluator(Problem(*stated, None, seed))
     before = judge(_unfiltered(setting), validation, seed)
@@ -462,12 +433,9 @@ def tune_by_rule(
     attempt = Attempt(setting, evaluator=evaluator, after=after)
     answer = _answer(attempt, evaluator.problem, before, gains)
     status = Status.CONVERGED if answer.held else Status.INFEASIBLE
+    steps = diagnostics.step_warnings(setting.tuned(gains), gains)
     return _result(
-        evaluator,
-        attempt.solution,
-        gains,
-        began,
-        diagnostics.step_warnings(setting.tuned(gains), gains),
+        *(evaluator, attempt.solution, gains, began, steps),
         method=f"rule {rule}",
         status=Status.NOT_CONVERGED if answer.held and answer.lost else status,
         tables={"before": [], "after": []},
@@ -525,18 +493,18 @@ def _judged_parts(answer: Answer, values: Mapping[str, float]) -> dict[str, Any]
     setting, sides = answer.setting, {"before": answer.before, "after": answer.after}
     costs: dict[str, Any] = {side: _mean(plants) for side, plants in sides.items()}
     summary, cloud = _validation(answer)
-    return {
-        "case": setting.case,
-        "tuned": setting.tuned(values),
-        "objective": costs | {"terms": dict(setting.objective)},
-        "measures": dict(answer.measures),
-        "constraints": _rows(answer),
-        "symmetry": None,
-        "validation": summary,
-        "cloud": cloud,
-        "lost": answer.lost,
-        "answer": answer,
-    }
+    return dict(
+        case=setting.case,
+        tuned=setting.tuned(values),
+        objective=costs | {"terms": dict(setting.objective)},
+        measures=dict(answer.measures),
+        constraints=_rows(answer),
+        symmetry=None,
+        validation=summary,
+        cloud=cloud,
+        lost=answer.lost,
+        answer=answer,
+    )
 
 
 def _what(problem, validation, command, more):
@@ -639,14 +607,11 @@ def _answer(
     """Return the Answer: the judged cases, the validation plants, and the run of the case."""
     setting, solution, after = attempt.setting, attempt.solution, attempt.after
     start, case = problem.own_values(), setting.case
-    nominal = {
-        "before": _nominal(case, before, problem.needed),
-        "after": _nominal(setting.tuned(values), after, problem.needed),
-    }
+    sides = {"before": (case, before), "after": (setting.tuned(values), after)}
+    nominal = {side: _nominal(*of, problem.needed) for side, of in sides.items()}
     runs = runs_of(setting.tuned(start), (), 0)
-    near = matters(setting, before, NEAR)
-    if after is not None:
-        near = near | matters(setting, after, NEAR)
+    judged = [plants for plants in (before, after) if plants is not None]
+    near = np.any([matters(setting, plants, NEAR) for plants in judged], axis=0)
     levels = limited_levels(case)
     fixed = np.zeros(len(start), dtype=bool) if solution.kept is None else solution.kept
     feasible = None  # where levels have no limits, or it is not known
