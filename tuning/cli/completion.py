@@ -110,7 +110,6 @@ def names():
 
 
 def _lines():
-    """Return the lines of names.txt: "KIND WORD", of a case with a tab and its title."""
     return NAMES.read_text(encoding="utf-8").splitlines()
 
 
@@ -149,5 +148,4 @@ def gather():
 
 
 def refresh():
-    """Write names.txt anew."""
     NAMES.write_text(gather(), encoding="utf-8")

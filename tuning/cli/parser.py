@@ -24,7 +24,6 @@ class Parser(argparse.ArgumentParser):
     problems: list[str] = []  # of all parsers
 
     def error(self, message):
-        """Raise InputError with the message."""
         raise InputError("; ".join([*self.problems, message]))
 
     def _get_value(self, action, arg_string):
@@ -64,7 +63,6 @@ class Parser(argparse.ArgumentParser):
 
 
 def name_of(action):
-    """Return the name of an argument in messages."""
     return action.option_strings[0] if action.option_strings else action.metavar
 
 

@@ -10,7 +10,6 @@ FILTER = "safety_filter."
 
 
 def note(args, sentence):
-    """Print a note on stderr, unless --quiet."""
     if not args.quiet:
         print(f"jaxtank: note: {sentence}", file=sys.stderr)
 

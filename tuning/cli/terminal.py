@@ -18,15 +18,12 @@ class Forgiving(io.RawIOBase):
         self.descriptor = descriptor
 
     def writable(self):
-        """Return True."""
         return True
 
     def fileno(self):
-        """Return the descriptor."""
         return self.descriptor
 
     def isatty(self):
-        """Return whether it is a terminal."""
         return os.isatty(self.descriptor)
 
     def write(self, data):

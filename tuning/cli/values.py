@@ -41,7 +41,6 @@ def seconds(name):
 
 
 def number(text):
-    """Return a float."""
     return float(plain_number(text))
 
 

@@ -357,7 +357,6 @@ class Attacked:
 
 
 def of_plant(coefficient: Coefficient) -> bool:
-    """Return whether a coefficient is an entry of an array of the plant."""
     return coefficient.name.startswith("plant.") and len(split_index(coefficient.name)[1]) == 1
 
 

@@ -39,7 +39,6 @@ class Found:
 
     @property
     def passed(self) -> bool:
-        """Whether the level found is above the limit."""
         return self.level > self.limit * (1.0 + TOLERANCE)
 
 

@@ -139,7 +139,6 @@ def of_nominal_plant(case: Case) -> tuple[PlateauNeed, ...] | None:
 
 
 def can_judge(case: Case) -> bool:
-    """Return whether the steady states of a case at its setpoints are known."""
     return not unjudged(case)
 
 

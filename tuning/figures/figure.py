@@ -34,7 +34,6 @@ class Figure(NamedTuple):
 
     @property
     def name(self) -> str:
-        """As it is named in a command: "gouta2015/6"."""
         return f"{self.paper}/{self.number}"
 
 

@@ -187,7 +187,6 @@ class AugmentedEstimation(Estimation):
             self.by_exponent = _by_exponent(self.rig_at(z), self._levels(self.begin[None])[0])
 
     def rig_at(self, z):
-        """Return the Rig at the unknowns z, its candidates as they are."""
         return self.original.rig_at(z)
 
     def exchanged(self, a: int, b: int, z: np.ndarray) -> "AugmentedEstimation":

@@ -35,16 +35,13 @@ class Scalar(NamedTuple):
 
     @property
     def names(self):
-        """(1,) name of the value."""
         return (self.name,)
 
     @property
     def box(self):
-        """(low, high) of the coordinate."""
         return [(np.log(self.low), np.log(self.high)) if self.scale == "log" else (0.0, 1.0)]
 
     def values(self, p, exp):
-        """Return (value,) at (p,)."""
         return (exp(p[0]) if self.scale == "log" else self.low + p[0] * (self.high - self.low),)
 
     def point(self, value):
@@ -54,7 +51,6 @@ class Scalar(NamedTuple):
         return [(value - self.low) / (self.high - self.low)]
 
     def slopes(self, p):
-        """Return [[d value / dp]]."""
         return [[np.exp(p[0]) if self.scale == "log" else self.high - self.low]]
 
 
@@ -69,12 +65,10 @@ class Branches(NamedTuple):
 
     @property
     def names(self):
-        """(2,) names of the values."""
         return (self.gain, self.split)
 
     @property
     def box(self):
-        """(low, high) of each coordinate."""
         return [tuple(np.log(self.first)), tuple(np.log(self.second))]
 
     def values(self, p, exp):
@@ -101,7 +95,6 @@ class Ladder(NamedTuple):
 
     @property
     def box(self):
-        """(low, high) of each coordinate."""
         return [(np.log(1e-3 * self.top), np.log(self.top))] * len(self.names)
 
     def values(self, p, exp):
@@ -113,11 +106,9 @@ class Ladder(NamedTuple):
         return tuple(reversed(levels))
 
     def point(self, *levels):
-        """Return p of levels."""
         return np.log(np.maximum(np.diff([*levels, self.top]), 1e-300)).tolist()
 
     def slopes(self, p):
-        """Return d level / dp."""
         return np.triu(np.tile(-np.exp(p), (len(p), 1)))
 
 
@@ -135,7 +126,6 @@ class Coordinates:
 
     @property
     def size(self):
-        """Number of coordinates [-]."""
         return len(self.names)
 
     @property
@@ -284,5 +274,4 @@ def refuse_used(loop, logs, names):
 
 
 def nominal(loop, names):
-    """Return {name: value} of a loop as floats."""
     return {name: float(np.asarray(get_value(loop, name))) for name in names}

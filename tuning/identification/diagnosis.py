@@ -177,37 +177,11 @@ def _shares(problem, residual):
 
 
 def _effective(problem, residual):
-    """Return how many of the readings are independent."""
     return max(sum(n * share for n, share in _shares(problem, residual)), 4.0)
 
 
 def _is_white(trial):
-    """Whether half of the readings of each channel or more are independent."""
     return all(share > 0.5 for _, share in _shares(trial.problem, trial.residual))
-
-
-def _scores(trial):
-    """Return (candidates,) by how much a step of each reduces the sum of squares."""
-    problem, J, r = trial.problem, trial.jacobian, trial.residual
-    extra = np.delete(np.arange(problem.size), problem.usual)
-    inside = [*problem.usual, *extra[list(trial.chosen)]]
-    basis, _ = np.linalg.qr(J[:, inside])
-    columns = J[:, extra]
-    # twice: once leaves round-off in columns that are nearly in the basis
-    orthogonal = columns - basis @ (basis.T @ columns)
-    orthogonal -= basis @ (basis.T @ orthogonal)
-    r = r - basis @ (basis.T @ r)
-    size, whole = np.sum(orthogonal**2, axis=0), np.sum(columns**2, axis=0)
-    apart = size > 1e-9 * np.maximum(whole, 1e-300)
-    steps = np.where(apart, -(orthogonal.T @ r) / np.where(apart, size, 1.0), 0.0)
-    share = trial.point[extra]
-    outside = (share < 1e-9) & (steps < 0.0) | (share > 1 - 1e-9) & (steps > 0.0)
-    steps[outside | np.isin(np.arange(len(extra)), trial.chosen)] = 0.0
-    gains = steps**2 * size
-    for i, c in enumerate(problem.candidates):
-        if c.field == "threshold" and i not in trial.chosen:
-            gains[i] = _best_threshold(trial, i, _thresholds(problem, c)[::STRIDE], basis)[0]
-    return gains
 
 
 def _thresholds(problem, candidate):
@@ -246,7 +220,25 @@ def passes(trial, before):
 
 def _fitted(trial):
     """Return Trials with one more Candidate each, those of the largest scores that pass."""
-    gains = _scores(trial)
+    problem, J, r = trial.problem, trial.jacobian, trial.residual
+    extra = np.delete(np.arange(problem.size), problem.usual)
+    inside = [*problem.usual, *extra[list(trial.chosen)]]
+    basis, _ = np.linalg.qr(J[:, inside])
+    columns = J[:, extra]
+    # twice: once leaves round-off in columns that are nearly in the basis
+    orthogonal = columns - basis @ (basis.T @ columns)
+    orthogonal -= basis @ (basis.T @ orthogonal)
+    r = r - basis @ (basis.T @ r)
+    size, whole = np.sum(orthogonal**2, axis=0), np.sum(columns**2, axis=0)
+    apart = size > 1e-9 * np.maximum(whole, 1e-300)
+    steps = np.where(apart, -(orthogonal.T @ r) / np.where(apart, size, 1.0), 0.0)
+    share = trial.point[extra]
+    outside = (share < 1e-9) & (steps < 0.0) | (share > 1 - 1e-9) & (steps > 0.0)
+    steps[outside | np.isin(np.arange(len(extra)), trial.chosen)] = 0.0
+    gains = steps**2 * size
+    for i, c in enumerate(problem.candidates):
+        if c.field == "threshold" and i not in trial.chosen:
+            gains[i] = _best_threshold(trial, i, _thresholds(problem, c)[::STRIDE], basis)[0]
     variance = trial.loss / max(len(trial.residual) - trial.problem.size, 1)
     promising = [i for i in np.argsort(-gains) if gains[i] > variance * _limit(trial.problem)]
     return [with_candidate(trial, int(i)) for i in promising[:MAX_FITTED]]

@@ -214,6 +214,5 @@ def _check_samples(data):
 
 
 def check_hold(hold: str) -> None:
-    """Raise InputError for what inputs cannot do between samples."""
     if hold not in HOLDS:
         raise InputError(f"hold = {hold!r}: must be one of {', '.join(HOLDS[1:])}")

@@ -128,11 +128,9 @@ class Likelihood:
 
     @property
     def size(self) -> int:
-        """Number of unknowns [-]."""
         return self.box[0].size
 
     def split(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (coordinates, levels) of the unknowns z."""
         return self.estimation.split(z[: self.estimation.size])
 
     def prior_rows(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -29,7 +29,6 @@ class ColumnOf(NamedTuple):
 
     @property
     def count(self) -> int:
-        """Numbers that are present."""
         return int(np.isfinite(self.values).sum())
 
 

@@ -128,12 +128,25 @@ def predict(
         first = Estimation(case, parts, {}, samples=estimation.mask.shape[1], **settings)
     fit = solve(first, first.nominal())
     residual = residuals_of(estimation, fit)
+    start = start_samples or 0
+    y, quality = estimation.data.y, fit_of(estimation.data.y, residual)
+    after = fit_of(y[:, start:], residual[:, start:])
+    tests = {"bias": [], "residual_autocorrelation": [], "white": [], "input_correlation": []}
+    sd = np.nanstd(np.where(np.isnan(residual), np.nan, y), axis=(0, 1)) / estimation.noise
+    for r in np.moveaxis(residual, -1, 0):
+        rho, n = autocorrelation(r, LAGS), int(np.isfinite(r).sum())
+        # Ljung and Box (Biometrika 65, 1978, 297)
+        statistic = n * (n + 2) * np.sum(rho[1:] ** 2 / np.maximum(n - np.arange(1, len(rho)), 1))
+        tests["bias"].append(float(np.nanmean(r)) if n else None)
+        tests["residual_autocorrelation"].append(float(rho[1]) if len(rho) > 1 else None)
+        tests["white"].append(float(chi2.sf(statistic, len(rho) - 1)) if n > LAGS else None)
+        tests["input_correlation"].append(_input_correlation(estimation, r))
     return Prediction(
         case=case,
         estimation=estimation,
         fit=fit,
         start_samples=start_samples,
-        quality=_quality(estimation, residual, start_samples or 0),
+        quality={**quality, **tests, "after_start": after, "level_sd_in_noise": sd.tolist()},
         levels=estimation.first_levels(estimation.unknowns(fit)),
     )
 
@@ -211,23 +224,6 @@ def achieved(case: Case, log: Log) -> list[dict[str, Any]]:
         row["lowest"] = {s: float(np.nanmin(h)) for s, h in sides.items()}
         rows.append(row)
     return rows
-
-
-def _quality(estimation, residual, start):
-    """Return the measures and tests of residuals (logs, samples, channels)."""
-    y, quality = estimation.data.y, fit_of(estimation.data.y, residual)
-    after = fit_of(y[:, start:], residual[:, start:])
-    tests = {"bias": [], "residual_autocorrelation": [], "white": [], "input_correlation": []}
-    sd = np.nanstd(np.where(np.isnan(residual), np.nan, y), axis=(0, 1)) / estimation.noise
-    for r in np.moveaxis(residual, -1, 0):
-        rho, n = autocorrelation(r, LAGS), int(np.isfinite(r).sum())
-        # Ljung and Box (Biometrika 65, 1978, 297)
-        statistic = n * (n + 2) * np.sum(rho[1:] ** 2 / np.maximum(n - np.arange(1, len(rho)), 1))
-        tests["bias"].append(float(np.nanmean(r)) if n else None)
-        tests["residual_autocorrelation"].append(float(rho[1]) if len(rho) > 1 else None)
-        tests["white"].append(float(chi2.sf(statistic, len(rho) - 1)) if n > LAGS else None)
-        tests["input_correlation"].append(_input_correlation(estimation, r))
-    return {**quality, **tests, "after_start": after, "level_sd_in_noise": sd.tolist()}
 
 
 def _input_correlation(estimation, residual):

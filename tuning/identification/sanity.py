@@ -50,7 +50,6 @@ def oddities(log: Log, loop=None) -> list[Oddity]:
 
 
 def _still(t, u):
-    """Yield (kind, samples, first time, value) of an input that never changes."""
     if len(u) > 1 and np.ptp(u) == 0.0:
         yield "still" if u[0] else "off", len(u), t[0], u[0]
 

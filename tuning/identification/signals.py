@@ -68,7 +68,6 @@ class Signal(NamedTuple):
 
     @property
     def described(self) -> Column:
-        """The column with its header, name and unit."""
         return self.table.columns[self.column]
 
 
@@ -145,7 +144,6 @@ def _qualities(columns, rest):
 
 
 def compact(text):
-    """Return the letters and digits of a name, in lower case."""
     return re.sub(r"[\W_]+", "", text.lower())
 
 
@@ -204,7 +202,6 @@ def _within(name, parts):
 
 
 def _digits(name):
-    """Return the last number in a name, "" without one."""
     return (re.findall(r"\d+", name) or [""])[-1]
 
 
@@ -229,7 +226,6 @@ def _judged(column):
 
 
 def _word(mark):
-    """Return the first word of a quality, in lower case."""
     return re.split(r"[\s,;(\[]+", mark.strip().lower())[0]
 
 

@@ -157,7 +157,6 @@ def _search_cost(u, loop, clock, terms, lagrangian):
 
 
 def _names(terms):
-    """Return the measures that a run accumulates."""
     return tuple(dict.fromkeys([*(m for m, _ in terms.objective), *(m for m, _ in terms.integral)]))
 
 

@@ -101,7 +101,6 @@ class InputProblem:
         )
 
     def project(self, u):
-        """Return inputs (pumps, ..) projected onto the pumps' limits."""
         return np.clip(u, self.low[:, None], self.high[:, None])
 
     def loop(self):
@@ -112,7 +111,6 @@ class InputProblem:
         )
 
     def value_and_gradient(self, u, lagrangian):
-        """Return (search cost, gradient (pumps, intervals)) on the coarse clock."""
         return value_and_gradient(self.loop(), self.coarse, self.terms, u, lagrangian)
 
     def excesses(self, u, interval, clock, lagrangian):

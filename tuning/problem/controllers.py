@@ -94,7 +94,6 @@ def _published(case: Case, kind: str) -> tuple[Any, dict[str, Any]] | None:
 
 
 def same_rig(*cases: Case) -> bool:
-    """Return whether two cases have the same plant and pumps."""
     return equal(*((case.loop.plant, case.loop.actuator) for case in cases))
 
 

@@ -451,5 +451,4 @@ def _gains_of(case: Case, rule: str, output: int) -> dict[str, float]:
 
 
 def _present(controller: Any, values: dict[str, float]) -> dict[str, float]:
-    """`values` of the gains that a controller has."""
     return {name: value for name, value in values.items() if getattr(controller, name) is not None}

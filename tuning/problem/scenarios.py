@@ -87,7 +87,6 @@ class Group(NamedTuple):
 
 
 def noisy(case: Case) -> bool:
-    """Return True if a run of the case draws noise."""
     return draws_bursts(case.loop) or bool(np.any(np.asarray(case.loop.sensor.noise) > 0))
 
 
@@ -196,12 +195,10 @@ def at_once(function: Callable[[Any], Any], tasks: Sequence[Any]) -> list[Any]:
 
 
 def processors() -> int:
-    """Return the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _is_sequential(structure: Any, leaves: Any) -> bool:
-    """Return whether the runs of a group are done in sequence."""
     return jax.tree.unflatten(structure, leaves).sequential
 
 
@@ -283,7 +280,6 @@ def _mapped(function: Callable[..., Any], leaves: Any, keys: Any, shape: Shape) 
 
 
 def _first_axis(value: Any) -> Any:
-    """Return an array with an axis for its one run in front."""
     return value[None]
 
 

@@ -48,7 +48,6 @@ def amount(value: Any, unit: str, digits: int = 3) -> str:
 
 
 def _with_unit(text: str, unit: str) -> str:
-    """Return the text of a number with its unit, alone where it has none."""
     return text if unit in ("", "-") else f"{text} {unit}"
 
 

@@ -67,7 +67,6 @@ class Report:
 
     @property
     def title(self) -> str:
-        """The name, and what was done."""
         return ": ".join(filter(None, [self.name, self.what]))
 
     @property

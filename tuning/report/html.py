@@ -26,7 +26,6 @@ WIDE = 480.0  # width of a picture [pt] above which it can be enlarged in a narr
 
 @cache
 def _style():
-    """The style sheet of a page."""
     return Markup(Path(__file__).with_name("page.css").read_text(encoding="utf-8"))
 
 
@@ -116,7 +115,6 @@ def unbroken(sentence):
 
 
 def identifier(name):
-    """Return `name` as an id of HTML and SVG."""
     return re.sub(r"[^a-z0-9]+", "-", str(name).lower()).strip("-") or "picture"
 
 
@@ -162,5 +160,4 @@ def _saved(figure, name):
 
 
 def alone(figure, name):
-    """Return a matplotlib figure as the text of an SVG file."""
     return svg(figure, name).replace("<svg", '<svg xmlns="http://www.w3.org/2000/svg"', 1) + "\n"

@@ -175,7 +175,6 @@ def _longest_change(log):
 
 
 def _option(cause):
-    """Return a cause as --accept takes it."""
     return f"{cause.kind}:{','.join(map(str, np.ravel(cause.where)))}"
 
 
@@ -194,7 +193,6 @@ def marked(fit):
 
 
 def _is_rejected(fit):
-    """Whether the data reject the structure of the rig."""
     return fit.status != "interrupted" and not fit.structure.clean
 
 

@@ -149,10 +149,8 @@ def json_of(result):
 
 
 def figures(result):
-    """Return {"fit": matplotlib Figure}, or "fit_1", .. of several logs."""
     return draw_log(result, "measured and predicted")
 
 
 def files_of(result):
-    """Return {"fit.csv": readings measured and predicted}."""
     return {"fit.csv": fit_csv(result)}

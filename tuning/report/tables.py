@@ -146,7 +146,6 @@ class Table:
 
 
 def table(rows, head=()):
-    """Return rows as the text of aligned columns."""
     return str(Table(rows, head))
 
 

@@ -298,7 +298,6 @@ def _rules(result):
 
 
 def _of(values, gain):
-    """The entries of a gain in {name: value}."""
     return [v for n, v in values.items() if n.startswith(f"controller.{gain}[")]
 
 

@@ -115,7 +115,12 @@ def report(ensemble):
         words = f"{count(finite, 'run')} finite: a standard deviation and an interval of the mean"
         sections.append(Text([f"{words} need two finite runs"], gap=True))
     if violations:
-        sections.append(_violation_table(violations))
+        rows = []
+        for v in violations:
+            shares = Value(v["probability"], 4), Value(v["interval95"], 4, between=" : ")
+            rows.append([v["name"], Value(v["limit"], unit=v["unit"]), v["count"], *shares])
+        heads = ["limit", "value", "broken in", "probability", "95 % interval"]
+        sections.append(Table(rows, heads, gap=True, top=True))
     lines = [f"{INTERVALS} (these draws are {ensemble.method})"] * (ensemble.method != "random")
     lines.append(
         f"{count(diverged, 'run')} diverged: counted as breaking every limit, left out of all"
@@ -271,15 +276,6 @@ def _promise_sections(ensemble):
         heads = [f"failure at {failure['distance']:.2f} sd" for failure in likely]
         sections.append(Table(rows, ["parameter", "unit", "nominal", *heads], gap=True))
     return sections
-
-
-def _violation_table(violations):
-    rows = []
-    for v in violations:
-        shares = Value(v["probability"], 4), Value(v["interval95"], 4, between=" : ")
-        rows.append([v["name"], Value(v["limit"], unit=v["unit"]), v["count"], *shares])
-    heads = ["limit", "value", "broken in", "probability", "95 % interval"]
-    return Table(rows, heads, gap=True, top=True)
 
 
 def in_words(d):

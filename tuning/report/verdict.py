@@ -60,7 +60,6 @@ class Verdict:
 
     @property
     def good(self) -> bool:
-        """True where every part is."""
         return all(part.good for part in self._parts)
 
     @property
@@ -246,7 +245,6 @@ def limit_rows(case: Case, values: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _share(row):
-    """The margin of a limit as a share of its size."""
     return row["margin"] / (row.get("scale") or abs(row["limit"]) or 1.0)
 
 

@@ -41,12 +41,10 @@ class Rival(NamedTuple):
 
     @property
     def tuned(self) -> bool:
-        """Whether the gains are those of the default answer."""
         return self.gains == "tuned"
 
     @property
     def filtered(self) -> bool:
-        """Whether a safety filter stands in front of the controller."""
         return self.case.loop.safety_filter is not None
 
     @property
@@ -63,12 +61,10 @@ class Rival(NamedTuple):
 
     @property
     def violations(self) -> int:
-        """Number of plants on which a limit is broken."""
         return int((~self.judged.held).sum())
 
     @property
     def holds(self) -> bool:
-        """Whether every limit holds on every plant."""
         return bool(self.judged.held.all())
 
     def words(self) -> str:

@@ -100,11 +100,9 @@ class Checks:
         return max((v / sizes[k] for k, v in self.tightening.items() if v > 0.0), default=0.0)
 
     def limits(self) -> dict[str, Any]:
-        """Return {measure: value} tightened."""
         return tightened(self.problem.loop.plant, self.stated, self.tightening)
 
     def scenarios(self) -> list[Scenario]:
-        """Return the added plants."""
         return [self.problem.scenarios[i]._replace(weight=LIGHT) for i in self.added]
 
     def runs(self, share: float) -> list[ScenarioRun]:

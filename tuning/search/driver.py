@@ -88,7 +88,6 @@ class Search:
         return float(self.violations(point.margins))
 
     def violations(self, margins: Any) -> Any:
-        """Return (...,) the largest violation of margins (..., limits), as `violation`."""
         return np.max(-margins / self.limit_scale, axis=-1, initial=0.0)
 
     def return_to_start(self) -> bool:

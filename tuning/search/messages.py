@@ -92,7 +92,6 @@ def first_of(parts: list[str]) -> str:
 
 
 def against_limit(c: ConstraintRow, digits: int = 6) -> str:
-    """Return a value and its limit in words."""
     return f"{c.name} is {c.amount()}, limit {c.limit:.{digits}g} {c.unit}"
 
 

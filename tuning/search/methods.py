@@ -139,7 +139,6 @@ def _minimise(search, function, y, more, constraints, iterations, tolerance):
 
 
 def _last(y):
-    """Return (the last of y, its gradient), which is minimised as a bound of other values."""
     return y[-1], np.eye(len(y))[-1]
 
 

@@ -94,7 +94,6 @@ class Setting:
     certificates: tuple = ()
 
     def replace(self, **changes: Any) -> "Setting":
-        """Return a copy with the named fields changed."""
         return dataclasses.replace(self, **changes)
 
     @property
@@ -105,7 +104,6 @@ class Setting:
 
     @property
     def plants_vary(self) -> bool:
-        """True if parameters other than those of the sensors vary from run to run."""
         return any(not name.startswith("sensor.") for name in self.distributions)
 
     @property
@@ -115,7 +113,6 @@ class Setting:
 
     @property
     def cost_unit(self) -> str | None:
-        """Unit of the default cost; None for a custom objective."""
         return None if self.own_objective else f"{self.case.loop.units[0]}^2"
 
     def coarse(self) -> Case:
@@ -263,10 +260,8 @@ def _with_box(case, distributions):
 
 
 def is_stated(case: Case) -> bool:
-    """Return True if a case states its uncertain parameters."""
     return bool(case.uncertain) or case.covariance is not None
 
 
 def plants_of(case: Case) -> dict[str, Any]:
-    """Return {name: distribution} of the uncertain parameters of a case."""
     return spread_of(case.replace(uncertain=uncertain_shares(case)))

@@ -74,7 +74,6 @@ class Plan:
 
     @property
     def local(self) -> Local:
-        """How each local search runs."""
         return Local(self.method, self.iterations, self.tolerance, self.batch, self.seed)
 
 
@@ -105,7 +104,6 @@ class Solution:
 
     @property
     def point(self) -> Any:
-        """The Point of the answer; None where none is finite."""
         return self.best if self.search is None or self.z is None else self.search.point(self.z)
 
     def status(self, feasible: bool, lost: Sequence[Lost] = ()) -> Status:
@@ -177,7 +175,6 @@ class Stages:
 
     @property
     def violated(self) -> bool:
-        """True if the best point violates a limit."""
         return self.search.best is not None and self.search.violation(self.search.best) > 0
 
     @property

@@ -88,7 +88,6 @@ class Needs:
         self.high = np.concatenate([top, of("actuator.high")], axis=1)
 
     def first(self, count: int) -> "Needs":
-        """Return the Needs of the first `count` plants."""
         return Needs(self.case, {n: v[:count] for n, v in self.values.items()}, self.limits)
 
     def at(self, setpoints: Any = None) -> np.ndarray:
@@ -106,7 +105,6 @@ class Needs:
         return np.where(np.isfinite(over), over, np.inf)
 
     def feasible(self, needed: Any = None, low: Any = None, high: Any = None) -> np.ndarray:
-        """Return (N,) True where every plateau has a steady state within the limits."""
         return ~np.any(self.excess(needed, low, high) > 0, axis=(1, 2))
 
 

@@ -18,7 +18,6 @@ def clopper_pearson(count, samples, level=0.95):
 
 
 def probabilities(method, dimensions, samples, seed):
-    """Return points of the open unit cube."""
     return Points(method, dimensions, samples, seed).rows(0, samples)
 
 

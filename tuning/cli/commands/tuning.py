@@ -239,7 +239,6 @@ def _goes_with_nominal(args):
 
 
 def _is_nominal(args):
-    """Return True if --nominal is given or implied."""
     return args.nominal or _goes_with_nominal(args) is not None
 
 
