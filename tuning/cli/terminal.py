@@ -157,9 +157,10 @@ class Line:
         print(f"\r{text[:78]:<78}", end="", file=sys.stderr, flush=True)
 
     def compiling(self, what, seconds):
-        """Print, on a terminal only, that `what` is compiled before anything else is to be seen."""
+        """Print, on a terminal only, that `what` is compiled; return the line."""
         if self.terminal:
             self.show(f"compiling {what}, about {seconds} s")
+        return self
 
     def runs(self, done, total):
         """Print the number of runs done; where it is no terminal, at each tenth of them only."""

@@ -78,14 +78,10 @@ def predict(
 
     Parameters
     ----------
-    case : Case or Plant
-        The rig.
-    log : Log or sequence of Log
-        Experiment data, of `tuning.log` or `tuning.read_log`.
+    case, log, gap
+        As in `identify`.
     start_samples : int, optional
         Samples at the beginning of each log that its first levels follow from; all by default.
-    gap : float
-        Longest step between samples, in usual steps.
 
     Returns
     -------

@@ -44,23 +44,12 @@ class Estimation:
 
     Parameters
     ----------
-    case : Case
-        The rig.
+    case, free, start, noise, substeps, prior
+        As in `identify`; tanks without readings start from the case's levels unless free.
     logs : sequence of Log
         Experiment data of this rig.
-    free : mapping, optional
-        {name: (low, high)} or {name: (low, high, "log" or "linear")}; `default_free` if omitted.
-    start : {"free", "measured", "case"}
-        Levels at the first sample: estimated, measured, or from the case. Tanks that are not
-        measured start from the case's levels unless they are free.
-    noise : (channels,) array, optional
-        Standard deviation that weights each channel; estimated from the data if omitted.
-    substeps : int, optional
-        Runge-Kutta steps per sample; found by halving if omitted.
     samples : int
         Least length that the data are padded to.
-    prior : bool
-        Whether the `covariance` of the case counts: that of an earlier identification.
     inputs : sequence
         (Bound, (field of Inputs, pump, value that the rig has)) of dead times, lags, dead zones and
         curves to estimate.

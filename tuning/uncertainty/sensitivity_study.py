@@ -92,12 +92,8 @@ def sensitivity(
         `distributions` [-].
     seed : int
         Of the points and of the sensor noise, which is the same in every run.
-    batch : int or None
-        Runs at once.
-    devices : int
-        Of this process; they share the batches, and the results have the same bits.
-    cluster : str, distributed.Client, concurrent.futures.Executor or None
-        Run the batches of morris and sobol on workers, to the same bits, as in `ensemble`.
+    batch, devices, cluster
+        As in `ensemble`, to the same bits; workers run the batches of morris and sobol.
     progress : callable or None
         Called with (runs done, runs in all).
 

@@ -14,6 +14,7 @@ from tuning.cli.steps import (
     finish,
     note,
     open_case,
+    picked,
     print_result,
     printed,
     report_unreachable,
@@ -123,27 +124,15 @@ def _identify(args, case):
 
     line, interrupts = Line(args.quiet), Interrupts()
     result = identify(
-        case,
-        logs,
-        args.free or None,
-        start=args.start,
-        starts=args.starts,
-        seed=args.seed,
-        hold_back=args.hold_back,
-        noise=args.noise,
-        loss=args.loss,
-        profile=args.profile,
-        iterations=args.iterations,
-        gap=args.gap,
+        *(case, logs, args.free or None),
+        **picked(args, "start starts seed hold_back noise loss profile iterations gap law"),
+        **picked(args, "refine likelihood"),
         checkpoint=args.out,
         resume=args.resumed,
         progress=interrupts.check,
         ready=ready,
-        law=args.law,
         prior=not args.no_prior,
         accept=args.accept or (),
-        refine=args.refine,
-        likelihood=args.likelihood,
     )
     if args.posterior == "hmc" and result.identifiable and not interrupts.stop:
         result = posterior.with_draws(result, args.seed)
@@ -176,9 +165,9 @@ def learn(args):
     from tuning.report.identification import marked
     from tuning.report.prediction import achieved_table, setpoints_used
 
-    logs, line = read_logs(args, case), Line(args.quiet)
+    logs = read_logs(args, case)
     rows = [row | {"data": log.name} for log in logs for row in achieved(case, log)]
-    line.compiling("the simulation and its derivatives", 10)
+    line = Line(args.quiet).compiling("the simulation and its derivatives", 10)
     fit = tuning.identify(case, logs, gap=args.gap, seed=args.seed)
     parts: dict[str, Any] = {"identification": fit}
     line.end()
@@ -295,10 +284,8 @@ def _voltage(args, case):
     if args.voltage is None:
         return None
     high = [float(v) for v in case.loop.actuator.high]
-    inside = len(args.voltage) == len(high) and all(
-        0 < v <= top for v, top in zip(args.voltage, high)
-    )
-    if not inside:
+    inside = [0 < v <= top for v, top in zip(args.voltage, high)]
+    if len(args.voltage) != len(high) or not all(inside):
         raise InputError(
             f"--voltage {args.voltage}: must be {len(high)} numbers above 0 and at most"
             f" {', '.join(f'{v:g}' for v in high)} {case.loop.units[1]}"

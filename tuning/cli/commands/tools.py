@@ -10,7 +10,7 @@ from jaxtank.core.errors import InputError, nearest
 from jaxtank.core.files import check_folder, write_folder
 from jaxtank.core.text import printable
 from tuning.cli.options import COMMON, SEEDS, Command, Option
-from tuning.cli.steps import finish, print_result, printed, report_written, use_float64
+from tuning.cli.steps import finish, picked, print_result, printed, report_written, use_float64
 from tuning.cli.terminal import Line
 from tuning.cli.values import folder, whole
 
@@ -63,13 +63,11 @@ def compare(args):
 
         if args.markdown:
             raise InputError("--markdown: is of published numbers, not of --controllers")
-        line = Line(args.quiet)
-        line.compiling("the simulation and its derivatives", 15)
+        line = Line(args.quiet).compiling("the simulation and its derivatives", 15)
         result = compare_controllers(
             rig.check(rig.open_case(args.paper)),
             kinds=args.kind or None,
-            samples=args.samples,
-            seed=args.seed,
+            **picked(args, "samples seed"),
             progress=lambda name: line.show(f"{name}: search and judging"),
         )
         line.end()

@@ -24,6 +24,7 @@ from tuning.cli.steps import (
     finish,
     limits_of,
     open_case,
+    picked,
     report_unreachable,
     scenarios_of,
 )
@@ -110,16 +111,8 @@ def tune(args):
 
 def _ruled(args, case, task):
     """The gains of a tuning rule, judged like an answer."""
-    others = {
-        "--nominal": args.nominal,
-        "--robust": args.robust,
-        "--mend": args.mend,
-        "--free": args.free,
-        "--starts": args.starts,
-        "--iterations": args.iterations,
-        "--resume": args.resumed,
-    }
-    option = _goes_with_nominal(args) or next((n for n, v in others.items() if v), None)
+    others = picked(args, "nominal robust mend free starts iterations resume")
+    option = _goes_with_nominal(args) or next((f"--{n}" for n, v in others.items() if v), None)
     if option:
         raise InputError(
             f"--rule {args.rule}: computes gains and searches none: leave out {option}"
@@ -130,12 +123,10 @@ def _ruled(args, case, task):
     return tune_by_rule(
         case,
         args.rule,
-        objective=task["objective"],
-        limits=task["limits"],
+        **{name: task[name] for name in ("objective", "limits", "seed")},
         distributions=_varied(args, case),
         safety_filter=args.safety_filter,
         validation=FRESH if args.validation is None else args.validation,
-        seed=task["seed"],
     )
 
 
@@ -171,13 +162,9 @@ def _finder(args, case, task) -> Any:
     if task["scenarios"] == ():  # --scenario none: plants of the case's own run alone
         case = case.replace(scenarios=())
     task["scenarios"] = None
-    keywords = {
-        "distributions": varied,
-        "risk": args.robust,
-        "samples": args.samples or 64,
-        "fresh": args.fresh or 1024,
-        "back_off": args.back_off or 0.0,
-    }
+    given = picked(args, "samples fresh back_off")
+    keywords = {name: value for name, value in given.items() if value is not None}
+    keywords |= {"distributions": varied, "risk": args.robust}
     return tune_robust, case, _stated(task) | keywords, None
 
 
@@ -226,16 +213,8 @@ def _stated(task):
 
 def _goes_with_nominal(args):
     """Return the first option given that goes with --nominal alone; None without."""
-    options = {
-        "--scenario": args.scenario,
-        "--method": args.method != "auto",
-        "--screening": args.screening is not None,
-        "--batch": args.batch is not None,
-        "--choose": args.choose,
-        "--tradeoff": args.tradeoff is not None,
-        "--bound": args.bound,
-    }
-    return next((name for name, value in options.items() if value), None)
+    options = picked(args, "scenario method screening batch choose tradeoff bound")
+    return next((f"--{name}" for name, v in options.items() if v and v != "auto"), None)
 
 
 def _is_nominal(args):
@@ -253,8 +232,7 @@ def _options(args):
                 f"batch = {args.batch}: only method adam draws scenarios, not {method}"
             )
         method = "adam"
-    names = ("validation", "starts", "screening", "iterations", "cluster")
-    numbers = {name: getattr(args, name) for name in names}
+    numbers = picked(args, "validation starts screening iterations cluster")
     return options_of(method, **numbers, **({} if args.batch is None else {"batch": args.batch}))
 
 
