@@ -202,8 +202,7 @@ def tradeoff(text):
         raise ValueError(
             "must be MEASURE=LOW:HIGH or MEASURE=LOW:HIGH:N, LOW below HIGH, N from 2 to 50"
         )
-    values = [low + (high - low) * i / (count - 1) for i in range(count)]
-    return checked_measure(measure), values
+    return checked_measure(measure), [low + (high - low) * i / (count - 1) for i in range(count)]
 
 
 def knots(text):

@@ -182,8 +182,7 @@ class Course:
         for name, v in zip(self.names, now):
             field, (index,) = split_index(name)
             value = getattr(plant, field)
-            entries = changed.setdefault(field, [value[i] for i in range(np.shape(value)[0])])
-            entries[index] = v
+            changed.setdefault(field, [value[i] for i in range(np.shape(value)[0])])[index] = v
         plant = dataclasses.replace(plant, **{f: tuple(e) for f, e in changed.items()})
         return plant if self.then is None else self.then.apply(plant, then)
 
@@ -393,8 +392,7 @@ def _without_controller(loop, clock):
 def programs(attacked: Attacked) -> tuple[Any, Any]:
     """Compiled batches: (values) -> Levels; (variables, tanks) -> ((levels, Levels), slopes)."""
     slopes = jax.value_and_grad(attacked.objective, has_aux=True)
-    run = jax.jit(jax.vmap(attacked.levels))
-    return run, jax.jit(jax.vmap(slopes))
+    return jax.jit(jax.vmap(attacked.levels)), jax.jit(jax.vmap(slopes))
 
 
 def batch_size(attacked: Attacked, runs: int) -> int:

@@ -171,8 +171,7 @@ def limits_of(case: Case) -> Limits:
         return Limits(limit, limit, None)
     limit = np.asarray(safety_filter.limit, dtype=float)
     if case.safety is None:  # made by hand
-        spare = np.asarray(getattr(safety_filter, "spare", 0.0))
-        return Limits(limit + spare, limit, None)
+        return Limits(limit + np.asarray(getattr(safety_filter, "spare", 0.0)), limit, None)
     rows = certificates_of(case)
     return Limits(np.array([row.limit for row in rows]), limit, rows)
 
@@ -218,8 +217,7 @@ class _Search:
 
     def levels(self, values):
         """((runs, n) highest levels [cm], (runs, n) their times [s]) of values (runs, ...)."""
-        size = batch_size(self.attacked, min(64, self.draws + 1))
-        return _in_batches(self.run, size, values)
+        return _in_batches(self.run, batch_size(self.attacked, min(64, self.draws + 1)), values)
 
     def screen(self):
         """Return (variables of the draws, levels (draws + 1, n)); row 0 is the unchanged case."""

@@ -509,8 +509,7 @@ def _rims(needs: Needs) -> Mend | None:
     """Return raised rims; None if rims differ from plant to plant. Limits below a rim stay."""
     if np.ptp(needs.rim, axis=0).any():
         return None
-    tanks = needs.rim.shape[1]
-    return _raised(needs, "rims", "plant.rim", 0, np.flatnonzero(needs.at_rim), tanks)
+    return _raised(needs, "rims", "plant.rim", 0, np.flatnonzero(needs.at_rim), needs.rim.shape[1])
 
 
 def _pumps(needs: Needs) -> Mend | None:

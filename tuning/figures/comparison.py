@@ -123,8 +123,7 @@ def compare(*names: str) -> Comparison:
     with warnings.catch_warnings(record=True) as noted, ThreadPoolExecutor(2) as pool:
         warnings.simplefilter("always")
         pages = dict(zip(chosen, pool.map(papers.measure, chosen)))
-    notes = dict.fromkeys(str(note.message) for note in noted)
-    return Comparison(pages, tuple(notes))
+    return Comparison(pages, tuple(dict.fromkeys(str(note.message) for note in noted)))
 
 
 def redraw(name: str) -> Any:

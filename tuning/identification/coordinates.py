@@ -200,8 +200,7 @@ def free_bounds(loop, free):
             )
         if split_index(name)[0] in WITHOUT_EFFECT:
             raise InputError(f"free {name}: no reading depends on it in a way that could be fitted")
-    spec = {n: (*v, "log" if v[0] > 0 else "linear")[:3] for n, v in free.items()}
-    ranges = bounds(loop, spec)
+    ranges = bounds(loop, {n: (*v, "log" if v[0] > 0 else "linear")[:3] for n, v in free.items()})
     feeds: Any = getattr(loop.plant, "feeds", ())
     idle = {f"plant.split[{j}]" for j, (_, second) in enumerate(feeds) if second is None}
     for name in idle & set(free):

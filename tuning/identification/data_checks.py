@@ -121,8 +121,7 @@ def with_hold(log: Log) -> Log:
     if log.hold or log.samples < FEWEST or not _irregular(log):
         return log
     changed = changes_of(log.u)
-    unsure = changed[np.isfinite(log.y[changed]).any(axis=1)]
-    if 2 * len(unsure) <= len(changed):
+    if 2 * len(changed[np.isfinite(log.y[changed]).any(axis=1)]) <= len(changed):
         return log
     note = (
         f"{log.name}: samples come irregularly and inputs change from one to the next: they are"

@@ -179,8 +179,7 @@ class Likelihood:
         with np.errstate(all="ignore"):
             v, S, dv, dS = self.at(z)
             a, dS = v / np.sqrt(S), dS / S[:, None]
-            channel = np.nonzero(self.estimation.mask)[2]
-            b = np.sqrt(np.log(S) + self.shift[channel])
+            b = np.sqrt(np.log(S) + self.shift[np.nonzero(self.estimation.mask)[2]])
             da = dv / np.sqrt(S)[:, None] - 0.5 * a[:, None] * dS
             rows = np.concatenate([a, b, self.alike @ z])
             jacobian = np.concatenate([da, 0.5 * dS / b[:, None], self.alike])
@@ -237,8 +236,7 @@ def choose_likelihood(
             f"likelihood = {kind!r} cannot estimate {names}: accept it with output-error first,"
             " then identify with the rig.toml that is written"
         )
-    residual = residuals_of(estimation, fit)
-    count, channels = int(estimation.mask.sum()), np.moveaxis(residual, -1, 0)
+    count, channels = int(estimation.mask.sum()), np.moveaxis(residuals_of(estimation, fit), -1, 0)
     limit = WHITE / np.sqrt(count / len(channels))
     if kind == "auto" and all(abs(autocorrelation(r, 1)[1]) < limit for r in channels):
         return None, report | {"reason": "white"}

@@ -43,8 +43,7 @@ def with_inputs(loop: Any, values: Mapping[str, float], top: np.ndarray) -> Any:
         if base == "actuator.delays":
             delays[j] = max(value, 0.0)
         else:
-            field = CURVE[more[0] if more else 0]
-            shapes[j] = shapes.get(j, Inputs())._replace(**{field: value})
+            shapes[j] = shapes.get(j, Inputs())._replace(**{CURVE[more[0] if more else 0]: value})
     for j, shape in shapes.items():
         u = top[j] * np.linspace(0.0, 1.0, POINTS) ** 2
         flow = np.maximum.accumulate(np.where(u > 0.0, top[j] * shape.curve(u / top[j]), 0.0))

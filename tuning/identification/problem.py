@@ -104,8 +104,7 @@ class Estimation:
         self.prior_weight = 1.0  # the standard deviation of the residual, once it is known
         self.rig = simulation.rig_of(loop)
         courses = simulation.courses_of(logs, loop.actuator, case.clock.dt)
-        delays = simulation.delays_of(loop.actuator)
-        self.data = simulation.padded(logs, delays, samples, courses)
+        self.data = simulation.padded(logs, simulation.delays_of(loop.actuator), samples, courses)
         self.initial = self._initial_levels(start)  # (logs, tanks), before any is estimated
         self.tanks = tuple(range(loop.plant.tanks)) if start == "free" else ()
         channels = len(self.data.channels)
@@ -189,8 +188,7 @@ class Estimation:
         """(low, high) of every unknown: coordinates, then levels as shares of their rims."""
         low, high = self.coordinates.box
         plant, tanks, scale = self.case.loop.plant, list(self.tanks), self.level_scale
-        past = 1.0 if getattr(plant, "overflow", False) else 1.5
-        top = np.asarray(plant.rim)[tanks] * past
+        top = np.asarray(plant.rim)[tanks] * (1.0 if getattr(plant, "overflow", False) else 1.5)
         top = np.maximum(top, self.initial[:, tanks].max(axis=0, initial=0.0))
         return (
             np.concatenate([low, np.zeros(scale.size)]),
@@ -229,8 +227,7 @@ class Estimation:
     def split(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (coordinates (shared,), levels (logs, free levels) in the rig's unit) of z."""
         shared = self.coordinates.size
-        levels = z[shared:] * self.level_scale
-        return z[:shared], levels.reshape(len(self.logs), len(self.tanks))
+        return z[:shared], (z[shared:] * self.level_scale).reshape(len(self.logs), len(self.tanks))
 
     def unknowns(self, fit: Any) -> np.ndarray:
         """Return (unknowns,) of a Fit, the inverse of `split`."""

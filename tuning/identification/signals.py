@@ -175,8 +175,7 @@ def states_of(column):
 def setpoint_of(text, names):
     """Return the tank whose setpoint a column means, or None; names: {tank: its names}."""
     # "SP1" is of output 1, also where that is another tank; "LIC101.SP" of the tank with number 101
-    spoken = re.sub(r"set[\W_]?points?", "sp", text.lower())
-    parts = re.findall(r"[^\W\d_]+|\d+", spoken)
+    parts = re.findall(r"[^\W\d_]+|\d+", re.sub(r"set[\W_]?points?", "sp", text.lower()))
     rest, tanks = [part for part in parts if part not in SETPOINT], [*names]
     if len(rest) == len(parts):
         return None

@@ -68,8 +68,7 @@ def with_kind(case: Case, kind: str) -> Case:
     controller, gains = _published(case, kind) or _computed(case, kind)
     loop = dataclasses.replace(case.loop, controller=controller)
     others = {n: f for n, f in case.free.items() if not n.startswith("controller.")}
-    changed = case.replace(loop=loop, free={**gains, **others}, symmetry=None)
-    return rig.check(rig.filtered(changed))
+    return rig.check(rig.filtered(case.replace(loop=loop, free={**gains, **others}, symmetry=None)))
 
 
 def _is_kind(controller: Any, kind: str) -> bool:
@@ -204,8 +203,7 @@ def _pid(known: Rig) -> Any:
         raise InputError("controller kind pid: a pump does not change its output")
     rates = np.sort(np.abs(np.linalg.eigvals(known.A).real))
     others = float(np.sum(1.0 / rates[1:][rates[1:] > 0.0])) if n > 1 else 0.0
-    theta = np.where(np.abs(direct) > 0.0, 0.0, 0.5 * others)
-    lag = T / FASTER + theta
+    lag = T / FASTER + np.where(np.abs(direct) > 0.0, 0.0, 0.5 * others)
     return {"Kc": T / (steady * lag), "Ti": np.minimum(T, 4.0 * lag)}, ("Kc", "Ti")
 
 

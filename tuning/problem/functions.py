@@ -127,8 +127,7 @@ def _weights(objective: Any, functions: dict[str, ms.Measure]) -> dict[str, Any]
     for term, weight in terms:
         name = term
         if not (isinstance(term, str) and table):
-            custom = term if isinstance(term, Objective) else _of_function(term)
-            name = _enter(custom, functions)
+            name = _enter(term if isinstance(term, Objective) else _of_function(term), functions)
         if name in weights:
             raise InputError(f"objective {name} is given twice")
         weights[name] = weight
@@ -154,8 +153,7 @@ def _limited(limits: Any, functions: dict[str, ms.Measure]) -> dict[str, Any]:
             " list of both"
         )
     limited: dict[str, Any] = {}
-    entries = cast(Any, [limits] if isinstance(limits, Constraint) else limits)
-    for entry in entries:
+    for entry in cast(Any, [limits] if isinstance(limits, Constraint) else limits):
         table = {entry.name: entry.limit} if isinstance(entry, Constraint) else entry
         if not isinstance(table, Mapping):
             raise InputError(

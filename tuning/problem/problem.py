@@ -298,8 +298,7 @@ class Problem:
         """Return groups of about `count` runs drawn by rng: as many of every group each time."""
         groups: list[sc.Group] = []
         for group in self.groups:
-            share = round(count * len(group.runs) / len(self.runs))
-            size = min(len(group.runs), max(1, share))
+            size = min(len(group.runs), max(1, round(count * len(group.runs) / len(self.runs))))
             groups.append(sc.take(group, np.sort(rng.choice(len(group.runs), size, replace=False))))
         return groups
 

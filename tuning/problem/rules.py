@@ -75,8 +75,7 @@ def loop_of(case: Case, output: int, tank: int | None = None) -> Loop:
     """Return the linear model of one loop at the last plateau, of the level of `tank` if named."""
     bank, plant = cast(Any, case.loop.actuator), case.loop.plant
     _, levels, inputs = operating_point(case, plant)
-    inflow = steady_inflow(case.loop)
-    linear = linearise_compiled(plant, levels, inputs, inflow)
+    linear = linearise_compiled(plant, levels, inputs, steady_inflow(case.loop))
     A, B, C = (np.asarray(v, dtype=float) for v in linear)
     slopes = _slopes(case, inputs, output)
     lags = np.broadcast_to(0.0 if bank.lag is None else np.asarray(bank.lag), slopes.shape)
@@ -245,8 +244,7 @@ def relay_experiment(case: Case, output: int, linear: Loop | None = None) -> Ult
     room = 0.5 * np.min(np.minimum(high - inputs, inputs - low)[acting] / np.abs(slopes[acting]))
     near = min(middle, max(float(np.asarray(plant.rim)[tank]) - middle, 0.0))
     # by the describing function the level then moves by EXCURSION of the way
-    most = EXCURSION * (near or middle) * math.pi * abs(expected.gain) / 4.0
-    size = float(min(room, most))
+    size = float(min(room, EXCURSION * (near or middle) * math.pi * abs(expected.gain) / 4.0))
     if not 0.0 < size < math.inf:
         raise InputError("a relay has no room: the input is at a limit in the steady state")
     amplitude = slopes * math.copysign(size, expected.gain)

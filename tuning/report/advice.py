@@ -39,8 +39,7 @@ REACHABLE = "Nothing is out of reach of the gains: every setpoint can be held"
 
 def listed(words: Sequence[str]) -> str:
     """Return words as a list, of more than FEW the first ones and how many others."""
-    more = f" and {len(words) - FEW} more" if len(words) > FEW else ""
-    return ", ".join(words[:FEW]) + more
+    return ", ".join(words[:FEW]) + (f" and {len(words) - FEW} more" if len(words) > FEW else "")
 
 
 def amount(value: Any, unit: str, digits: int = 3) -> str:

@@ -170,8 +170,7 @@ def _structure(fit):
 
 def _longest_change(log):
     """The longest time between rows over which an input changes [s]."""
-    changes = np.any(np.diff(log.u, axis=0) != 0, axis=1)
-    return np.max(np.diff(log.t), where=changes, initial=0.0)
+    return np.max(np.diff(log.t), where=np.any(np.diff(log.u, axis=0) != 0, axis=1), initial=0.0)
 
 
 def _option(cause):

@@ -150,8 +150,7 @@ def json_of(runs: list[Run], seed: int) -> dict[str, Any]:
     rows = [
         {**json_of_run(run.case, run.measures, seed), "differs": list(run.differs)} for run in runs
     ]
-    advice = list(advice_of(runs))
-    return {"verdict": verdict_of(runs).to_json(), "advice": advice, "cases": rows}
+    return {"verdict": verdict_of(runs).to_json(), "advice": list(advice_of(runs)), "cases": rows}
 
 
 def verdict_of(runs: list[Run]) -> verdicts.Verdict:

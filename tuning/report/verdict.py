@@ -180,8 +180,7 @@ def not_tracking(
     if tracked is None or failed.all():
         return None
     unknown = ~np.isfinite(tracked.rms)
-    wrong = unknown | tracked.off | tracked.loose | tracked.stuck
-    return np.any(wrong, axis=-1) & ~failed
+    return np.any(unknown | tracked.off | tracked.loose | tracked.stuck, axis=-1) & ~failed
 
 
 def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:

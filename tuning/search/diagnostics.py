@@ -176,8 +176,7 @@ def _second_derivative(search, z):
 def _free_directions(search, point, idle):
     """Return an orthonormal basis (P, free) of the directions no active limit or bound fixes."""
     z, count = point.z, len(point.z)
-    active = search.scaled_margins(point)[0] < 1e-4
-    fixed = list(point.margin_slopes[active])
+    fixed = list(point.margin_slopes[search.scaled_margins(point)[0] < 1e-4])
     still = np.zeros(count, dtype=bool) if idle is None else idle
     fixed += [np.eye(count)[i] for i in range(count) if z[i] < 1e-6 or z[i] > 1 - 1e-6 or still[i]]
     if not fixed:

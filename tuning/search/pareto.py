@@ -141,8 +141,7 @@ class _Sweep:
         answers = self.answers
         for k in reversed(range(len(answers))):
             if k + 1 < len(answers) and not answers[k + 1].violation:
-                nearby = self._solve(self.problems[k], answers[k + 1].best.z)
-                answers[k] = answers[k].better(nearby)
+                answers[k] = answers[k].better(self._solve(self.problems[k], answers[k + 1].best.z))
             search = answers[k].search
             screened = self._candidates(search, screening, seed)
             other = best_screened(search, screened)
@@ -150,8 +149,7 @@ class _Sweep:
                 answers[k] = _Answer.of(search, slsqp(search, other, self.iterations))
             if answers[k].violation and search.best is not None:
                 find_feasible(search, screened, self.iterations, seed)
-                done = slsqp(search, search.best.z, self.iterations)
-                answers[k] = _Answer.of(search, done)
+                answers[k] = _Answer.of(search, slsqp(search, search.best.z, self.iterations))
             approach(search)
             self.known.update(search.memory)
 

@@ -149,8 +149,7 @@ class Population(NamedTuple):
 def evolution_size(search, screened):
     """Return (members, generations) of a differential evolution, within RUNS coarse runs."""
     members = min(max(len(screened.zs), FEWEST), MEMBERS)
-    few = RUNS // (members * len(search.problem.runs))
-    return members, max(2, min(GENERATIONS, few))
+    return members, max(2, min(GENERATIONS, RUNS // (members * len(search.problem.runs))))
 
 
 def evolve(search, zs, generations, seed, coarse=True):

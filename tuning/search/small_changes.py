@@ -192,8 +192,7 @@ def _descended(setting, solution, highest):
         norm = float(np.linalg.norm(slope))
         if not 0.0 < norm < np.inf:
             break
-        steps = np.arange(1, STRIDE + 1)[:, None] * SPAN
-        line = np.clip(z - steps * slope / norm, 0.0, 1.0)
+        line = np.clip(z - (np.arange(1, STRIDE + 1)[:, None] * SPAN) * slope / norm, 0.0, 1.0)
         costs, margins = search.evaluator.screen(line)
         fit = (costs <= ceiling) & (search.violations(margins) <= violation)
         for each, fits in zip(line, fit):

@@ -645,8 +645,7 @@ def _nominal(case, plants, needed):
 
     if plants is None or not plants.nominal:
         return make()
-    names = (*reported_names(case.loop, of_run), *margins)
-    return Deferred(names, plants.nominal | margins, make)
+    return Deferred((*reported_names(case.loop, of_run), *margins), plants.nominal | margins, make)
 
 
 def _mean(plants: Judged | None) -> float:
@@ -677,5 +676,4 @@ def _validation(answer):
     )
     failed = sides[0].failed | sides[1].failed
     spread = {n: getattr(d, "relative", None) for n, d in setting.distributions.items()}
-    limits = resolve_limits(setting.case)
-    return summary_of(limits, cost, holds, level, failed, spread, True)
+    return summary_of(resolve_limits(setting.case), cost, holds, level, failed, spread, True)

@@ -68,8 +68,7 @@ def _check_names(loop, name, distribution, taken):
     for label in distribution.names if isinstance(distribution, Correlated) else (name,):
         base, index = split_index(label)
         entry = base, index  # "a[00]" is "a[0]"
-        clash = any(b == base and (not index or not i or i == index) for b, i in taken)
-        if clash:
+        if any(b == base and (not index or not i or i == index) for b, i in taken):
             raise InputError(f"uncertain {label} is given twice")
         if describe(loop, label)["kind"] == "static":
             raise InputError(

@@ -107,8 +107,7 @@ class Study(NamedTuple):
             for v in self.limits
         )
         measures = tuple(dict.fromkeys(limit.measure for limit in limits))
-        case = self.case.replace(loop=loop)
-        return self._replace(case=case, limits=limits, measures=measures)
+        return self._replace(case=self.case.replace(loop=loop), limits=limits, measures=measures)
 
     def values(self, z: Any) -> dict[str, Any]:
         """Return {name: (n, ...)} at points z (n, D)."""
@@ -216,8 +215,7 @@ def promise_of(
         return None
     explored, drawn = study.explored(), min(len(failed), PILOT)
     z = scipy.special.ndtri(points.rows(0, drawn))
-    measures = {m: table[m][:drawn] for m in study.measures}
-    pilot = z, study.margins(measures, failed[:drawn])
+    pilot = z, study.margins({m: table[m][:drawn] for m in study.measures}, failed[:drawn])
     used = len(failed)
 
     def runs(of, run):

@@ -323,8 +323,7 @@ def _nearest(count, z, limits):
         if not np.any(active):
             break
         trial = z + share[:, None] * step
-        far = np.linalg.norm(trial, axis=1, keepdims=True)
-        trial = trial * np.minimum(1.0, FARTHEST / far)
+        trial = trial * np.minimum(1.0, FARTHEST / np.linalg.norm(trial, axis=1, keepdims=True))
         new = slopes(trial)
         weight = 2.0 * np.linalg.norm(z + step, axis=1) / size + 1.0 / size
         merit = lambda z, g, w=weight: 0.5 * np.sum(z**2, axis=1) + w * np.abs(g)

@@ -87,8 +87,7 @@ def read_logs(args, case):
     """Return the experiment data of --data; what they take for granted goes to stderr."""
     from tuning.identification.csv_log import read_log
 
-    columns = dict(case.log) | args.column
-    settings = (columns, args.decimal, args.hold, args.time)
+    settings = (dict(case.log) | args.column, args.decimal, args.hold, args.time)
     logs = [read_log(path, case.loop, *settings) for path in args.data]
     for log in logs:
         for sentence in log.notes:
