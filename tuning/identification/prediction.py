@@ -55,7 +55,7 @@ class Prediction(Result):
     estimation: Estimation
     fit: Fit
     start_samples: int | None
-    quality: dict[str, list[Any]]
+    quality: dict[str, Any]
     levels: np.ndarray
 
     @property

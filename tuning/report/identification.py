@@ -601,7 +601,7 @@ def fit_csv(fit):
     heads = ["log", "t [s]", *(f"pump{j + 1} [{drive}]" for j in range(est.data.u.shape[-1]))]
     for name, unit in fit.channels:
         heads += [f"{name} measured [{unit}]", f"{name} simulated [{unit}]"]
-    rows = [heads]
+    rows: list[list[Any]] = [heads]
     for e, log in enumerate(est.logs):
         for k in range(log.samples):
             readings = np.column_stack([est.data.y[e, k], simulated[e, k]]).ravel()

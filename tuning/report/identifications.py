@@ -1,6 +1,7 @@
 """The report of Identifications: many records, each fitted separately."""
 
 import functools
+from typing import Any
 
 import numpy as np
 
@@ -160,7 +161,7 @@ def files_of(fits):
     label = functools.partial(reading_label, fits.case.loop.plant)
     heads += [f"{label(i)} at the first sample [{length}]" for i in range(fits.levels.shape[1])]
     heads += [f"RMS residual of {name} [{unit}]" for name, unit in fits.channels]
-    rows = [heads]
+    rows: list[list[Any]] = [heads]
     for e, name in enumerate(labels(fits)):
         pairs = np.column_stack([fits.values[e], fits.sd[e]]).ravel()
         rows.append([name, int(fits.converged[e]), *pairs, *fits.levels[e], *fits.rmse[e]])

@@ -127,14 +127,7 @@ def _row(variant, result):
 
 def _variants(case, choices, free):
     """Return the Variants of all combinations. Raises InputError for one that cannot be."""
-    if not isinstance(choices, Mapping):
-        raise InputError(
-            f"choices = {shortened(choices)}: must be {{name: [values to try]}}, as"
-            ' {"controller.kind": ["pid", "lqi"]}'
-        )
-    for name, values in choices.items():
-        if not isinstance(values, (list, tuple)) or not values:
-            raise InputError(f"choices {name}: must be a list of values to try")
+    _check_choices(choices)
     combinations = list(itertools.product(*choices.values()))
     if len(combinations) > MANY:
         raise InputError(f"choices: {len(combinations)} combinations, must be at most {MANY}")
@@ -149,6 +142,17 @@ def _variants(case, choices, free):
         if kinds and not any(rig.has(variant.loop, name) for variant in fitting):
             bounds(fitting[0].loop, {name: free[name]})  # raises, with the nearest name
     return variants
+
+
+def _check_choices(choices):
+    if not isinstance(choices, Mapping):
+        raise InputError(
+            f"choices = {shortened(choices)}: must be {{name: [values to try]}}, as"
+            ' {"controller.kind": ["pid", "lqi"]}'
+        )
+    for name, values in choices.items():
+        if not isinstance(values, (list, tuple)) or not values:
+            raise InputError(f"choices {name}: must be a list of values to try")
 
 
 def _variant(case, values, kinds, free):

@@ -210,8 +210,7 @@ def _optimum(
         for side, loop in (("before", case.loop), ("after", tuned.loop)):
             measures[side] = measures[side] | margin_measures(loop, case.clock)
     summary, cloud = None, None
-    varies = case.uncertain or case.covariance or any(r.key is not None for r in problem.runs)
-    if options.validation and not solution.interrupted and varies:
+    if options.validation and not solution.interrupted and _varies(problem):
         summary, cloud = validate(problem, start, values, options.validation, plan.seed)
     scenarios = problem.runs if problem.scenarios else ()
     objective = {side: problem.total(table) for side, table in tables.items()}
@@ -233,6 +232,12 @@ def _optimum(
     )
     evaluator.cache.close()
     return result
+
+
+def _varies(problem: Problem) -> bool:
+    """Return True if a validation run can differ from the nominal one."""
+    case, noisy_runs = problem.case, any(run.key is not None for run in problem.runs)
+    return bool(case.uncertain or case.covariance) or noisy_runs
 
 
 def _setting(case, objective, limits, distributions, safety_filter):
@@ -608,7 +613,7 @@ def _answer(
     setting, solution, after = attempt.setting, attempt.solution, attempt.after
     start, case = problem.own_values(), setting.case
     sides = {"before": (case, before), "after": (setting.tuned(values), after)}
-    nominal = {side: _nominal(*of, problem.needed) for side, of in sides.items()}
+    nominal = {s: _nominal(own, plants, problem.needed) for s, (own, plants) in sides.items()}
     runs = runs_of(setting.tuned(start), (), 0)
     judged = [plants for plants in (before, after) if plants is not None]
     near = np.any([matters(setting, plants, NEAR) for plants in judged], axis=0)
