@@ -286,13 +286,12 @@ class Problem:
 
     def point(self, z: Any) -> Point:
         """Return the Point at z (P,): every scenario at its own step, with derivatives."""
-        z = np.clip(np.asarray(z, dtype=float), 0.0, 1.0)
-        return Point(z, *self._point(z, self.groups))
+        return self._point(z, self.groups)
 
     def coarse_point(self, z: Any) -> Point:
         """Return the Point at z (P,) with a tenth of the samples: a start for a search."""
-        z = np.clip(np.asarray(z, dtype=float), 0.0, 1.0)
-        return Point(z, *self._point(z, [g.at(sc.coarse_clock(g.clock)) for g in self.groups]))
+        groups = [g.at(sc.coarse_clock(g.clock)) for g in self.groups]
+        return self._point(z, groups)
 
     def batch(self, count: int, rng: np.random.Generator) -> list[sc.Group]:
         """Return groups of about `count` runs drawn by rng: as many of every group each time."""
@@ -304,14 +303,14 @@ class Problem:
 
     def batch_point(self, z: Any, groups: Sequence[sc.Group]) -> Point:
         """Return the Point at z (P,) of the runs of `batch` alone."""
-        z = np.clip(np.asarray(z, dtype=float), 0.0, 1.0)
         runs = {i for group in groups for i in group.runs}
         rows = tuple(i for i, limit in enumerate(self.limits) if limit.run in runs)
-        return Point(z, *self._point(z, groups), rows=rows)
+        return self._point(z, groups)._replace(rows=rows)
 
     @np.errstate(over="ignore", invalid="ignore")  # Point.finite reports what diverges
-    def _point(self, z: Floats, groups: Sequence[sc.Group]) -> tuple[Any, ...]:
-        """Return the fields of the Point at z after z itself, of the runs in `groups` alone."""
+    def _point(self, z: Any, groups: Sequence[sc.Group]) -> Point:
+        """Return the Point at z of the runs in `groups` alone."""
+        z = np.clip(np.asarray(z, dtype=float), 0.0, 1.0)
         table, slopes, matrices, diverged = self._derivatives(z, groups)
         run = sorted(table)
         limits = [limit for limit in self.limits if limit.run in table]
@@ -325,10 +324,11 @@ class Problem:
             [sum(w * slopes[i][m].sum(axis=0) for m, w in self.objective.items()) for i in run]
         )
         shares = self.shares(costs, run)
-        matrix = sum(s * matrices[i] for s, i in zip(shares, run))
+        matrix: Any = sum(s * matrices[i] for s, i in zip(shares, run))
         cost = np.nan if diverged else float(shares @ costs)
         measures = tuple(table[i] for i in run)
-        return cost, shares @ rates, matrix, margins, margin_slopes, measures, costs, rates
+        gradient = shares @ rates
+        return Point(z, cost, gradient, matrix, margins, margin_slopes, measures, costs, rates)
 
     def _derivatives(
         self, z: Floats, groups: Sequence[sc.Group]

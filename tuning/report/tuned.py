@@ -385,13 +385,18 @@ def sections_of(result):
         remark = remark if p["exercised"] else "without effect, unchanged"
         rows.append([name, p["unit"], Value(p["before"]), Value(p["after"]), ends, change, remark])
     heads = ["parameter", "unit", "before", "after", "range", "10 % of it changes the objective by"]
+    lines = []
+    for c in result.choices:
+        values = ", ".join(f"{n} = {v}" for n, v in c["values"].items())
+        lines.append([values, c["status"], *map(Value, c["objective"].values())])
+    columns = [f"objective {side} [{cost_unit(result)}]" for side in SIDES]
     sections = [
         replace(Table(rows, [*heads, ""], gap=True), top=result.answer is None),
         *_measure_table(result),
         *_limit_table(result),
         *_scenario_table(result),
         *_validation_table(result),
-        *_choice_table(result),
+        *([Table(lines, ["choice", "status", *columns], gap=True)] if lines else []),
         *_tradeoff_table(result),
     ]
     if result.bound is not None:
@@ -570,15 +575,6 @@ def _improved(checked):
         f" ({100 * checked['comparable']:.3g} %); there tuning improved the objective in"
         f" {100 * share:.0f} %"
     )
-
-
-def _choice_table(result):
-    rows = []
-    for c in result.choices:
-        values = ", ".join(f"{n} = {v}" for n, v in c["values"].items())
-        rows.append([values, c["status"], *map(Value, c["objective"].values())])
-    heads = [f"objective {side} [{cost_unit(result)}]" for side in SIDES]
-    return [Table(rows, ["choice", "status", *heads], gap=True)] if rows else []
 
 
 def _tradeoff_table(result):

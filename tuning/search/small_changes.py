@@ -188,7 +188,13 @@ def _descended(setting, solution, highest):
     ceiling, violation = point.cost + PRICE * abs(point.cost), search.violation(point)
     free, calmer, lowest = ~np.asarray(solution.kept), z, highest
     for _ in range(ROUNDS):
-        slope = _peak_slope(setting, problem, z) * free
+        rate = np.zeros(len(z))
+        for i, unit in enumerate(np.eye(len(z))):
+            ends = [np.clip(z + sign * SPAN * unit, 0.0, 1.0) for sign in (1.0, -1.0)]
+            up, down = (np.log(_peak(setting, problem, end)) for end in ends)
+            if np.isfinite(up - down):
+                rate[i] = (up - down) / (ends[0] - ends[1])[i]
+        slope = rate * free
         norm = float(np.linalg.norm(slope))
         if not 0.0 < norm < np.inf:
             break
@@ -205,17 +211,6 @@ def _descended(setting, solution, highest):
                 return calmer, lowest
         z = line[-1]
     return calmer, lowest
-
-
-def _peak_slope(setting, problem, z):
-    """Return (P,) the slope of the logarithm of Ms at z, by differences; 0 where it has none."""
-    slope = np.zeros(len(z))
-    for i, unit in enumerate(np.eye(len(z))):
-        ends = [np.clip(z + sign * SPAN * unit, 0.0, 1.0) for sign in (1.0, -1.0)]
-        up, down = (np.log(_peak(setting, problem, end)) for end in ends)
-        if np.isfinite(up - down):
-            slope[i] = (up - down) / (ends[0] - ends[1])[i]
-    return slope
 
 
 def _peak(setting, problem, z):
