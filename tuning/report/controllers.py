@@ -78,29 +78,18 @@ def report(result):
     rows = []
     for rival in result.rivals:
         travel = rival.judged.to_json()["travel_percent"]
-        rows.append(
-            [
-                rival.name,
-                rival.gains,
-                "yes" if rival.filtered else "no",
-                Value(rival.error, 4),
-                f"{rival.violations} of {result.samples}",
-                Value(travel, 3),
-                Value(rival.peak, 3),
-                Value(rival.step_us, 3),
-            ]
-        )
+        judged = [Value(rival.error, 4), f"{rival.violations} of {result.samples}"]
+        numbers = [Value(v, 3) for v in (travel, rival.peak, rival.step_us)]
+        filtered = "yes" if rival.filtered else "no"
+        rows.append([rival.name, rival.gains, filtered, *judged, *numbers])
     notes = [
         "error: mean total rms error of the plants where every setpoint is reachable",
         "travel: rms change of the inputs per sample, as a share of their range",
         "Ms: largest sensitivity peak at the plateaus of the nominal plant",
         "C: time of a step of the controller alone, without the filter",
-        *(
-            [f"not for this rig: {', '.join(result.refused)} (reasons: --json)"]
-            if result.refused
-            else []
-        ),
     ]
+    if result.refused:
+        notes.append(f"not for this rig: {', '.join(result.refused)} (reasons: --json)")
     return Report(
         result.case.name,
         "controllers",

@@ -188,18 +188,12 @@ def _scope(attack):
 def _levels(attack):
     """The table of the levels of each tank."""
     unit, proved = attack.case.loop.units[0], {None: "-", True: "yes", False: "no"}
-    rows = [
-        [
-            short(attack.case.loop.plant, "tank", tank.tank),
-            Value(tank.limit, 6),
-            proved[tank.certified],
-            *(Value(v, 6) for v in (tank.nominal, tank.drawn, tank.level)),
-            Value(tank.margin, 3),
-            Value(tank.time_s),
-            "passed" if tank.passed else "holds",
-        ]
-        for tank in attack.found
-    ]
+    rows = []
+    for tank in attack.found:
+        name = short(attack.case.loop.plant, "tank", tank.tank)
+        reached = [Value(v, 6) for v in (tank.nominal, tank.drawn, tank.level)]
+        end = [Value(tank.margin, 3), Value(tank.time_s), "passed" if tank.passed else "holds"]
+        rows.append([name, Value(tank.limit, 6), proved[tank.certified], *reached, *end])
     levels = [f"{name} [{unit}]" for name in ("nominal", "draws", "highest", "margin")]
     heads = ["tank", f"limit [{unit}]", "proved", *levels, "at [s]", ""]
     return Table(rows, heads, gap=True, top=True)

@@ -64,19 +64,13 @@ def _part(case, row):
 
 def needs(study, least=LISTED):
     """Return the Table of needed levels that at least `least` of the plants cannot reach."""
-    rows = [
-        [
-            Value(row.setpoints, 6, study.case.loop.units[0], ", "),
-            short(study.case.loop.plant, "tank", row.tank - 1)
-            if row.pump is None
-            else _part(study.case, row),
-            *(Value(v, 3, row.unit) for v in (row.needed, row.needed_p95)),
-            Value(row.limit, 6, row.unit),
-            Value(*_percent(row.share), "%"),
-        ]
-        for row in study.plateaus
-        if row.share >= least
-    ]
+    rows, loop = [], study.case.loop
+    for row in (row for row in study.plateaus if row.share >= least):
+        tank = row.pump is None and short(loop.plant, "tank", row.tank - 1)
+        needed = [Value(v, 3, row.unit) for v in (row.needed, row.needed_p95)]
+        ends = [Value(row.limit, 6, row.unit), Value(*_percent(row.share), "%")]
+        setpoints = Value(row.setpoints, 6, loop.units[0], ", ")
+        rows.append([setpoints, tank or _part(study.case, row), *needed, *ends])
     heads = ["setpoints", "tank", "needed", "needed, 95 %", "limit", "not reachable"]
     return [Table(rows, heads)] if rows else []
 

@@ -87,6 +87,11 @@ def fragment(sections) -> str:
     return f"<div>{''.join(map(part, texts))}</div>"
 
 
+def rendered(template, counts, **parts) -> str:
+    """Return a template of this folder with a finished table `counts` and parts to be escaped."""
+    return _templates().get_template(template).render(counts=Markup(counts), **parts)
+
+
 def _frame(result):
     """The live page of a result or a Case in a frame; "" where it cannot be run in a browser."""
     from jaxtank.live.page import frame, live_page

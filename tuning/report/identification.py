@@ -52,10 +52,8 @@ def sentences_of(fit):
     """Return sentences: how an identification ended, and what it needs next."""
     agree = sum(s["agrees"] for s in fit.starts)
     words = [*_ending(fit), f"{agree} of {len(fit.starts)} starts ended in the same place"]
-    words += _residuals(fit)
-    words += _likelihood(fit)
-    words += _refinements(fit)
-    words += _prior(fit) + _posterior(fit)
+    for sentences in (_residuals, _likelihood, _refinements, _prior, _posterior):
+        words += sentences(fit)
     words += [
         f"{n} ends at its bound, {p['value']:.4g} {p['unit']}: no interval"
         for n, p in fit.parameters.items()
@@ -128,10 +126,9 @@ def diagnosis_of(fit):
         return {"clean": None, "causes": [], "sentence": "not tested: interrupted"}
     causes = []
     for cause in fit.structure.causes:
-        row = cause._asdict()
-        row["equivalent"] = [{"kind": kind, "where": where} for kind, where in cause.equivalent]
-        del row["name"]
-        causes.append(clean(row))
+        row = {name: value for name, value in cause._asdict().items() if name != "name"}
+        alike = [{"kind": kind, "where": where} for kind, where in cause.equivalent]
+        causes.append(clean(row | {"equivalent": alike}))
     return {"clean": fit.structure.clean, "causes": causes, "sentence": "; ".join(_structure(fit))}
 
 
@@ -141,25 +138,20 @@ def _structure(fit):
     if fit.structure.clean:
         return ["no test rejects the structure of the rig"]
     for cause in causes:
-        which = _option(cause)
-        value = f", {_amount(cause)}" if cause.value is not None else ""
-        need = _named(fit, cause.kind, cause.where)
-        words.append(f"the data require {need}{value}; to add it to the rig: --accept {which}")
+        to_add = f"to add it to the rig: --accept {_option(cause)}"
+        words.append(f"the data require {_needed(fit, cause)}; {to_add}")
         others = [_named(fit, kind, where) for kind, where in cause.equivalent]
         logs = [log for log in fit.estimation.logs if log.hold == "first-order"]
         late = cause.value if cause.kind in LATE and cause.value is not None else np.inf
         if any(late < _longest_change(log) for log in logs):
             others.append("inputs that step at each row (--hold zero-order)")
         if others:
-            tell = EXPERIMENTS[cause.kind]
             words.append(
                 f"these data cannot distinguish it from {' or '.join(others)}; an experiment that"
-                f" can: {tell}"
+                f" can: {EXPERIMENTS[cause.kind]}"
             )
     if not fit.structure.white:
-        residual = (
-            "the residual after these causes" if causes else f"the residual ({_explained(fit)})"
-        )
+        residual = "the residual " + ("after these causes" if causes else f"({_explained(fit)})")
         words.append(
             f"{residual} is not white, and none of the tested causes explains it; possible: an"
             " inflow that varies without a column, or a part that the rig does not have (--refine"
@@ -214,14 +206,17 @@ FIT = ("rmse", "nrmse_percent")
 LATE = ("pump-delay", "pump-lag")  # look like inputs on no line from row to row
 
 
-def _amount(cause):
-    """Return the value of a cause with its interval."""
+def _needed(fit, cause):
+    """Return a cause in words, with its value and interval where it has one."""
+    need = _named(fit, cause.kind, cause.where)
+    if cause.value is None:
+        return need
     unit = "" if cause.unit == "-" else f" {cause.unit}"
     present = cause.present if cause.kind in ("leak", "area", "outlet-exponent", "inflow") else 0.0
     beside = f" instead of {present:.4g}" if present else ""
     words = "between inputs " if cause.interval95 is None else ""
     low, high = cause.interval95 or cause.between
-    return f"{cause.value:.4g}{unit}{beside} ({words}{low:.4g} .. {high:.4g})"
+    return f"{need}, {cause.value:.4g}{unit}{beside} ({words}{low:.4g} .. {high:.4g})"
 
 
 def verdict_of(fit):
@@ -289,12 +284,10 @@ def _likelihood(fit):
     words = f"likelihood: {chosen['kind']}, {why}"
     if chosen["kind"] == "innovations":
         unit, plant = fit.case.loop.units[0], fit.case.loop.plant
-        process = ", ".join(
-            f"{label_of(plant, 'tank', i)} {sd:.2g}" for i, sd in enumerate(chosen["process_noise"])
-        )
-        noise = ", ".join(
-            f"{name} {sd:.3g} {of}" for (name, of), sd in zip(fit.channels, fit.quality["noise"])
-        )
+        gained = enumerate(chosen["process_noise"])
+        process = ", ".join(f"{label_of(plant, 'tank', i)} {sd:.2g}" for i, sd in gained)
+        readings = zip(fit.channels, fit.quality["noise"])
+        noise = ", ".join(f"{name} {sd:.3g} {of}" for (name, of), sd in readings)
         words += f"; process noise [{unit}/s^0.5]: {process}; noise of the readings: {noise}"
     return [words]
 
@@ -429,11 +422,8 @@ def advice_of(fit):
         to_set = f"set nothing: the search {ended}"
     elif lacking(fit):
         to_set = "set nothing: the values below are those of a rig without what the data require"
-    rest = [
-        f"{name} {verdicts.shown(rmse)} {unit}"
-        for (name, unit), rmse in zip(fit.channels, fit.quality["rmse"])
-        if rmse is not None
-    ]
+    errors = zip(fit.channels, fit.quality["rmse"])
+    rest = [f"{n} {verdicts.shown(rmse)} {unit}" for (n, unit), rmse in errors if rmse is not None]
     unknown = [n for n, p in fit.parameters.items() if not p["interval95"]]
     beyond = (
         "Nothing stays open: every parameter has an interval, which holds if areas and scales of"
@@ -456,11 +446,7 @@ def _short_diagnosis(fit):
         return "the structure of the rig explains the data"
     if not fit.structure.causes:
         return "the residual is more than noise, and no tested cause explains it"
-    words = [
-        _named(fit, cause.kind, cause.where)
-        + (f", {_amount(cause)}" if cause.value is not None else "")
-        for cause in fit.structure.causes
-    ]
+    words = [_needed(fit, cause) for cause in fit.structure.causes]
     return f"the data require {' and '.join(words[:2])}{' and more' * (len(words) > 2)} (--accept)"
 
 
@@ -717,11 +703,8 @@ def plan_report(case, experiments, best, plan):
     known = [None if c is None or c > 1e15 else c for c in conditions]
     rows.append(["condition of J'J", "", *(Value(c, 3) for c in known)])
     levels = plan["levels"]
-    measured = (
-        "every level"
-        if levels is None
-        else ", ".join(reading_label(case.loop.plant, i) for i in levels)
-    )
+    labels = [reading_label(case.loop.plant, i) for i in levels or ()]
+    measured = "every level" if levels is None else ", ".join(labels)
     head = (
         f"{case.name}: standard deviations that {plan['duration']:g} s, {measured} read every"
         f" {plan['dt']:g} s with noise of {plan['noise']:g} {case.loop.units[0]} would leave"

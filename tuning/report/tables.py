@@ -168,17 +168,14 @@ def unit_text(measure, rig_units, plant=None):
 def limit_table(rows, gap=False):
     """Return the Table of limits, rows as those of `ConstraintRow`."""
     timed = any(row["time_s"] is not None for row in rows)
-    cells = [
-        [
-            row["name"],
-            row["unit"],
-            (">= " if ms.MEASURES[row["measure"]].sense < 0 else "<= ") + number(row["limit"], 7),
-            Value(row["value"], 7),
-            Value(row["margin"], 3) if row["reason"] is None else "undefined",
-            *(["-" if row["time_s"] is None else f"{row['time_s']:.2f} s"] if timed else []),
-        ]
-        for row in rows
-    ]
+    cells = []
+    for row in rows:
+        side = ">= " if ms.MEASURES[row["measure"]].sense < 0 else "<= "
+        margin = Value(row["margin"], 3) if row["reason"] is None else "undefined"
+        time = "-" if row["time_s"] is None else f"{row['time_s']:.2f} s"
+        bound = side + number(row["limit"], 7)
+        values = [Value(row["value"], 7), margin, *([time] if timed else [])]
+        cells.append([row["name"], row["unit"], bound, *values])
     heads = ["limit", "unit", "limit", "value", "margin", *(["reached at"] if timed else [])]
     return Table(cells, heads, gap)
 

@@ -19,6 +19,7 @@ from jaxtank.core.labels import label_of, labels_of
 from jaxtank.limits import draws, dry_level, limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.signals.setpoints import Ramps
+from tuning.search.result import row_of
 
 UNJUDGED = (OpenLoop, OnOff)  # controllers that are not judged on tracking
 
@@ -220,26 +221,12 @@ def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
 def limit_rows(case: Case, values: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the limits of a run as fields of `ConstraintRow`, the tightest first."""
     rows = []
-    for limit in resolve_limits(case):
-        if limit.measure not in values:
-            continue
+    for limit in (limit for limit in resolve_limits(case) if limit.measure in values):
         entry = lambda name, i=limit.index: float(np.ravel(values[name])[i])
         reached = ms.MEASURES[limit.measure].reached
-        rows.append(
-            {
-                "name": limit.label,
-                "words": limit.words,
-                "measure": limit.measure,
-                "unit": ms.unit(limit.measure, case.loop.units),
-                "limit": float(limit.value),
-                "value": entry(limit.measure),
-                "margin": limit.margin(values),
-                "scale": limit_scale(limit, case.loop),
-                "reason": None if np.isfinite(entry(limit.measure)) else "undefined",
-                "tank": limit.index + 1 if ms.MEASURES[limit.measure].per == "tank" else None,
-                "time_s": entry(reached) if reached in values else None,
-            }
-        )
+        time_s = entry(reached) if reached in values else None
+        row = row_of(limit, case.loop, entry(limit.measure), time_s=time_s).to_json()
+        rows.append(row | {"scale": limit_scale(limit, case.loop)})
     return sorted(rows, key=_share)
 
 
