@@ -12,18 +12,14 @@ LEADING_ZERO = re.compile(r"[+-]?0\d")  # digits after a decimal comma, and no n
 
 def plain_number(text):
     """Return an int where `text` is written as one and a float can hold it, else a float."""
-    if "_" in text:
-        raise ValueError("must be a number")
-    try:
-        value = int(text)
-        float(value)
-        return value
-    except (ValueError, OverflowError):
-        pass
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError("must be a number") from None
+    for read in (int, float) if "_" not in text else ():
+        try:
+            value = read(text)
+            float(value)
+            return value
+        except (ValueError, OverflowError):
+            continue
+    raise ValueError("must be a number")
 
 
 def seconds(name):

@@ -135,14 +135,9 @@ def _outlets(plant):
 
 def with_exponents(plant: TankNetwork) -> TankNetwork:
     """Return a plant whose outlets have exponents, 0.5 where there was none."""
-    return dataclasses.replace(
-        plant,
-        **{
-            f"{opening}_exponent": np.full(len(tanks), 0.5)
-            for opening, tanks in _outlets(plant).items()
-            if tanks and getattr(plant, f"{opening}_exponent") is None
-        },
-    )
+    sizes = {f"{opening}_exponent": len(tanks) for opening, tanks in _outlets(plant).items()}
+    absent = [name for name, size in sizes.items() if size and getattr(plant, name) is None]
+    return dataclasses.replace(plant, **{name: np.full(sizes[name], 0.5) for name in absent})
 
 
 class AugmentedEstimation(Estimation):
@@ -242,10 +237,9 @@ class AugmentedEstimation(Estimation):
         rows = []
         for z, h in zip(points, self._levels(points)):
             values = self.coordinates.values(z[: self.coordinates.size])
-            values = {name: v for name, v in values.items() if name.startswith("sensor.")}
-            sensor = with_values(
-                self.sensor, {n.removeprefix("sensor."): v for n, v in values.items()}
-            )
+            head = "sensor."
+            values = {n.removeprefix(head): v for n, v in values.items() if n.startswith(head)}
+            sensor = with_values(self.sensor, values)
             y = [sensor.reading_of(i, h[..., i], volts) for i, volts in self.data.channels]
             rows.append((np.stack(y, axis=-1) / self.noise)[self.mask])
         return np.stack(rows)
@@ -257,10 +251,8 @@ class AugmentedEstimation(Estimation):
         points = np.tile(z, (1 + len(lanes), 1))
         points[1 + lanes, self.columns] += STEP
         y = self.simulated(points)
-        residual, jacobian = (
-            y[0] - (self.data.y / self.noise)[self.mask],
-            np.zeros((y.shape[1], self.size)),
-        )
+        residual = y[0] - (self.data.y / self.noise)[self.mask]
+        jacobian = np.zeros((y.shape[1], self.size))
         jacobian[:, self.columns] = (y[1:] - y[0]).T / STEP
         if not np.all(np.isfinite(jacobian)):
             return np.full_like(residual, np.nan), np.zeros_like(jacobian)

@@ -301,11 +301,8 @@ def _cause(best, before, options):
     name, unit, present = "", "", None
     if best.chosen:
         c = best.problem.candidates[best.chosen[-1]]
-        name, present, unit = (
-            c.name,
-            c.null,
-            unit_of(with_leaves(best.problem.case.loop, [c.name]), c),
-        )
+        name, present = c.name, c.null
+        unit = unit_of(with_leaves(best.problem.case.loop, [c.name]), c)
     bic = best.better(before) - float(np.log(best.effective)) * bool(best.chosen)
     return Cause(kind, where, name, unit, None, None, None, present, bic, equivalent)
 

@@ -459,13 +459,9 @@ def _best(fits, name):
 
 def _starts(fits):
     """Cost and effort of each search, and whether it has found the minimum of the best."""
-    best = min((fit for fit in fits if np.isfinite(fit.cost)), key=lambda fit: fit.cost)
+    least = min(fit.cost for fit in fits if np.isfinite(fit.cost)) * AGREE + 1e-12
     return [
-        {
-            "cost": fit.cost,
-            "evaluations": fit.evaluations,
-            "agrees": bool(fit.cost <= best.cost * AGREE + 1e-12),
-        }
+        {"cost": fit.cost, "evaluations": fit.evaluations, "agrees": bool(fit.cost <= least)}
         for fit in fits
     ]
 
@@ -528,15 +524,12 @@ def _within_ranges(estimation, fit, settings):
     """Return (Estimation, Fit) with every value in its range."""
     # branch gains may leave the ranges of gain and split: the same search in these themselves
     values = estimation.coordinates.values(fit.p)
-    if all(
-        b.low - 1e-9 * abs(b.high) <= values[b.name] <= b.high + 1e-9 * abs(b.high)
-        for b in estimation.bounds
-    ):
+    within = lambda b, rest: b.low - rest <= values[b.name] <= b.high + rest
+    if all(within(b, 1e-9 * abs(b.high)) for b in estimation.bounds):
         return estimation, fit
     plain = estimation.without_branch_gains()
-    start = np.concatenate(
-        [plain.coordinates.point(values), fit.levels.ravel() / plain.level_scale]
-    )
+    levels = fit.levels.ravel() / plain.level_scale
+    start = np.concatenate([plain.coordinates.point(values), levels])
     return plain, solve(plain, np.clip(start, *plain.box), **settings)
 
 

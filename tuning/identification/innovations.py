@@ -116,10 +116,8 @@ class Likelihood:
         noise = np.log(estimation.noise)
         low, high = estimation.box
         ends = [np.log(rim * end) for end in PROCESS]
-        self.box = (
-            np.concatenate([low, ends[0], noise - REACH]),
-            np.concatenate([high, ends[1], noise + REACH]),
-        )
+        sides = ([low, ends[0], noise - REACH], [high, ends[1], noise + REACH])
+        self.box = tuple(map(np.concatenate, sides))
         self.shift = 1.0 - 2.0 * (noise - REACH)
         # else the noise of a tank of which few readings tell would often be estimated as 0
         first, n = estimation.size, rim.size
@@ -143,8 +141,7 @@ class Likelihood:
         est, data = self.estimation, self.estimation.data
         levels, tanks = est.first_levels(z[: est.size]), est.tanks
         rig, shared, free = est.rig, est.coordinates.size, len(est.tanks)
-        if not tanks:
-            tanks = tuple(range(levels.shape[1]))
+        tanks = tanks or tuple(range(levels.shape[1]))
         results, slopes = sensitivities(
             rig,
             data.dt,
@@ -195,12 +192,10 @@ class Likelihood:
             gained = np.diff(residual, axis=1) ** 2 / np.where(steps > 0, steps, np.nan)
         usual = np.median(steps[steps > 0])
         noise = est.noise**2
-        rates = np.maximum(
-            np.nanmean(gained, axis=(0, 1)) - 2 * noise / usual, 0.01 * noise / usual
-        )
-        gains = [
-            float(est.rig.sensor.gain[tank]) if volts else 1.0 for tank, volts in est.data.channels
-        ]
+        rates = np.nanmean(gained, axis=(0, 1)) - 2 * noise / usual
+        rates = np.maximum(rates, 0.01 * noise / usual)
+        gain = est.rig.sensor.gain
+        gains = [float(gain[tank]) if volts else 1.0 for tank, volts in est.data.channels]
         process = 0.5 * np.log(np.mean(rates * np.square(gains)))
         tanks = est.case.loop.plant.tanks
         z = np.concatenate([est.unknowns(fit), np.full(tanks, process), np.log(est.noise)])
@@ -246,12 +241,8 @@ def choose_likelihood(
         present = [r[np.isfinite(r)] for r in channels]
         simple = sum(r.size * (np.log(2 * np.pi * np.mean(r**2)) + 1) for r in present)
         k = estimation.size + len(channels)
-        bic = {
-            "output-error": float(simple + k * np.log(count)),
-            "innovations": float(
-                -2 * result.log_likelihood + (k + result.process.size) * np.log(count)
-            ),
-        }
+        more = -2 * result.log_likelihood + (k + result.process.size) * np.log(count)
+        bic = {"output-error": float(simple + k * np.log(count)), "innovations": float(more)}
         report |= {"reason": "bic", "bic": bic}
         if bic["output-error"] <= bic["innovations"]:
             return None, report

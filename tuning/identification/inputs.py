@@ -47,9 +47,8 @@ def with_inputs(loop: Any, values: Mapping[str, float], top: np.ndarray) -> Any:
     for j, shape in shapes.items():
         u = top[j] * np.linspace(0.0, 1.0, POINTS) ** 2
         flow = np.maximum.accumulate(np.where(u > 0.0, top[j] * shape.curve(u / top[j]), 0.0))
-        rises = np.flatnonzero(
-            np.diff(flow, prepend=-1.0) > 0.0
-        )  # of two that are level, the first
+        # of two that are level, the first
+        rises = np.flatnonzero(np.diff(flow, prepend=-1.0) > 0.0)
         points = ((float(f"{v:.7g}") for v in column[rises]) for column in (u, flow))
         curves[j] = tuple(zip(*points))
     least = float(delays.min())

@@ -42,11 +42,9 @@ class Refinement(NamedTuple):
 def parts_of(estimation: Estimation) -> list[Part]:
     """Return the Parts that the rig of an estimation could have."""
     loop, taken = estimation.case.loop, {b.name for b in estimation.bounds}
-    parts = [
-        part
-        for c, (tank, volts) in enumerate(estimation.data.channels)
-        if (part := _sensor_curve(loop.sensor, estimation.data.y[..., c], tank, volts)) is not None
-    ]
+    read = zip(np.moveaxis(estimation.data.y, -1, 0), estimation.data.channels)
+    curves = (_sensor_curve(loop.sensor, y, *channel) for y, channel in read)
+    parts = [part for part in curves if part is not None]
     plant: Any = loop.plant
     if type(plant) is not TankNetwork:
         return parts
@@ -56,12 +54,8 @@ def parts_of(estimation: Estimation) -> list[Part]:
         parts.append(Part("area", tank, {name: (area / 5, area * 5, "log")}, lambda loop: loop))
     for kind, sources in (("drain", range(plant.tanks)), ("orifice", [a for a, _ in plant.links])):
         areas = np.asarray(getattr(plant, kind))
-        parts += [
-            part
-            for k, tank in enumerate(sources)
-            if areas[k] > 0
-            for part in _outlet(plant, f"plant.{kind}", k, tank, float(areas[k]))
-        ]
+        for k, tank in ((k, tank) for k, tank in enumerate(sources) if areas[k] > 0):
+            parts += _outlet(plant, f"plant.{kind}", k, tank, float(areas[k]))
     return [part for part in parts if not part.free.keys() & taken]
 
 
@@ -77,14 +71,10 @@ def _outlet(plant, kind, k, tank, area):
         absent = getattr(loop.plant, name.removeprefix("plant.")) is None
         return with_values(loop, {name: every}) if absent else loop
 
+    linear = lambda loop: with_values(loop, {other: 1e3 * usual})
     return [
         Part("outlet-exponent", tank, {f"{name}[{k}]": (0.1, 1.5, "linear")}, with_exponents),
-        Part(
-            "outlet-linear",
-            tank,
-            {other: (0.1 * usual, 1e4 * usual, "log")},
-            lambda loop: with_values(loop, {other: 1e3 * usual}),
-        ),
+        Part("outlet-linear", tank, {other: (0.1 * usual, 1e4 * usual, "log")}, linear),
     ]
 
 
@@ -114,10 +104,8 @@ def _sensor_curve(sensor, y, tank, volts):
             levels[tank] = readings[tank] = every[tank]
         else:
             levels = readings = every
-        sensor = dataclasses.replace(
-            sensor, curve_level=number(levels), curve_reading=number(readings)
-        )
-        return dataclasses.replace(loop, sensor=sensor)
+        curve = {"curve_level": number(levels), "curve_reading": number(readings)}
+        return dataclasses.replace(loop, sensor=dataclasses.replace(sensor, **curve))
 
     return Part("sensor-curve", tank, dict.fromkeys(names, ends), with_curve)
 
@@ -190,9 +178,8 @@ def refined(result: Any, settings: Mapping[str, Any]) -> tuple[Any, dict, list[R
         start = search.problem.unknowns(fit)
         trials = [(search.fit([*chosen, k], start), k) for k in others]
         (trial, after), k = min(trials, key=lambda t: t[0][1].sum())
-        if not (
-            after.sum() < CROSS_VALIDATION_RATIO * best.sum() and (after < best).sum() > FOLDS / 2
-        ):
+        less = after.sum() < CROSS_VALIDATION_RATIO * best.sum()
+        if not less or (after < best).sum() <= FOLDS / 2:
             break
         part = search.parts[k]
         added.append(Refinement(part.kind, part.where, root(best), root(after)))

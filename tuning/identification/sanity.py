@@ -135,9 +135,8 @@ def _dips(y, quiet):
     jumps, step = np.sign(step) * (np.abs(step) > JUMP * noise), np.abs(step)
     for n in range(2, FEW + 1):
         there, back = jumps[1 : len(y) - n - 2], jumps[1 + n : len(y) - 2]
-        for k in 1 + np.flatnonzero(
-            there * back < 0
-        ):  # the last before them; k + n + 1 is the first after
+        # k: the last before them; k + n + 1 is the first after
+        for k in 1 + np.flatnonzero(there * back < 0):
             around, away = y[[k, k + n + 1]], y[k + 1 : k + n + 1]
             jump = np.abs(away - around.mean()).min()
             beside = max(step[k - 1], step[k + n + 1], np.ptp(around))

@@ -191,17 +191,14 @@ def _of_number(parts, names):
         return []  # FIC101: of a flow
     if not beside and 0 < int(number) <= len(names):
         return [[*names][int(number) - 1]]
-    return [i for i, of in names.items() if any(number == _digits(n) for n in of)]
+    digits = lambda name: (re.findall(r"\d+", name) or [""])[-1]
+    return [i for i, of in names.items() if any(number == digits(n) for n in of)]
 
 
 def _within(name, parts):
     """Whether parts of a text in a row make up a name."""
     ends = range(len(parts) + 1)
     return any("".join(parts[a:b]) == name for a in ends for b in ends[a + 1 :])
-
-
-def _digits(name):
-    return (re.findall(r"\d+", name) or [""])[-1]
 
 
 def _generic(stem, slots):
