@@ -16,6 +16,7 @@ lazy.HOMES.update(
     # functions
     fragment="tuning.report.html",
     live_page_of="tuning.report.live",
+    save_result="tuning.report.folder",
     Table="tuning.report.tables",
     terminal="tuning.report.document",
     # results

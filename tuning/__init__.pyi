@@ -1,5 +1,5 @@
 from jaxtank.bounds import Bound as Bound
-from tuning.falsification.result import Attack as Attack
+from tuning.falsification.study import Attack as Attack
 from tuning.falsification.study import attack as attack
 from tuning.feasible.result import Feasibility as Feasibility
 from tuning.feasible.result import Mend as Mend
@@ -53,6 +53,6 @@ from tuning.uncertainty.distributions import LogUniform as LogUniform
 from tuning.uncertainty.distributions import Normal as Normal
 from tuning.uncertainty.distributions import Uniform as Uniform
 from tuning.uncertainty.distributions import empirical as empirical
-from tuning.uncertainty.result import Ensemble as Ensemble
 from tuning.uncertainty.sensitivity_study import sensitivity as sensitivity
+from tuning.uncertainty.study import Ensemble as Ensemble
 from tuning.uncertainty.study import ensemble as ensemble

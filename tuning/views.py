@@ -70,7 +70,10 @@ class Result(Shown):
     def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
         """Write result.json, tables, pictures and report.html to `folder`; return their paths."""
         check_folder(folder)
-        return self._report().save(self, folder, command)
+        module = self._report()
+        if hasattr(module, "save"):
+            return module.save(self, folder, command)
+        return call("save_result", module, self, folder, command)
 
 
 def _first_picture(result: Any) -> bytes | None:

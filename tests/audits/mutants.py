@@ -1,7 +1,7 @@
 """One change of the code at a time, and whether a default test notices it.
 
     python tests/audits/mutants.py jaxtank/safety [COUNT [SEED]]
-    python tests/audits/mutants.py tuning/uncertainty/result.py 40 7
+    python tests/audits/mutants.py tuning/uncertainty/study.py 40 7
 
 Works on a copy of the tracked files. The tests that mirror a folder (TESTS names others) run once,
 line by line; then COUNT places (20) are drawn from the lines that they reach, each is changed in

@@ -40,7 +40,7 @@ if [[ "${funcstack[1]}" == _jaxtank ]]; then _jaxtank "$@"; else compdef _jaxtan
 complete -c jaxtank -f -a '(jaxtank completion words (commandline -opc)[2..] (commandline -ct))'
 """,
 }
-KINDS = {
+KINDS = {  # kind of the values of an option, by its metavar up to "="
     "DIR": "folders",
     "CSV": "files",
     "HTML": "files",
@@ -53,11 +53,9 @@ KINDS = {
     "TYPE": "precisions",
     "MEASURE": "measures",
 }
-"""Kind of the values of an option, by its metavar up to "="."""
 
 
 def script(shell):
-    """Return the completion script of a shell."""
     if shell not in SCRIPTS:
         close = nearest(shell, SCRIPTS)
         raise InputError(f"unknown shell {shell!r}{close}; must be one of {', '.join(SCRIPTS)}")
@@ -112,7 +110,6 @@ def names():
 
 
 def _lines():
-    """Return the lines of names.txt: "KIND WORD", of a case with a tab and its title."""
     return NAMES.read_text(encoding="utf-8").splitlines()
 
 
@@ -151,5 +148,4 @@ def gather():
 
 
 def refresh():
-    """Write names.txt anew."""
     NAMES.write_text(gather(), encoding="utf-8")

@@ -16,9 +16,7 @@ import time
 
 SIGNALS = {_signal.SIGINT: b"interrupted", _signal.SIGTERM: b"terminated"}
 
-SAME = 0.3
-"""Time within which a signal that comes twice is one [s]: `timeout` sends it to the program and to
-its group."""
+SAME = 0.3  # time within which a signal that comes twice is one [s], as of `timeout`
 
 _searches = []  # the Interrupts that takes the signals, if any
 _before = []  # functions that are called before the process ends

@@ -60,7 +60,11 @@ def _command(argv):
     terminal.phase.show("importing")
     args.line = shlex.join(["jaxtank", *(sys.argv[1:] if argv is None else argv)])
     if argv is None and COMMANDS[args.command].compiles:
-        _keep_programs(args)
+        from jaxtank.xla.program_cache import keep_for_this_process
+
+        why = keep_for_this_process()
+        if why and not getattr(args, "quiet", False):
+            print(f"jaxtank: note: compiled programs are not kept: {why}", file=sys.stderr)
     with hold(args.out, leaving=interrupts.before_leaving), interrupts.restored():
         code = args.run(args)
         sys.stdout.flush()  # print the answer before Ctrl-C is again allowed to end the program
@@ -77,15 +81,6 @@ def _with_cluster_notes(show_other):
             show_other(message, category, *where)
 
     return show
-
-
-def _keep_programs(args):
-    """Read compiled programs from the cache, and write new ones to it."""
-    from jaxtank.xla.program_cache import keep_for_this_process
-
-    why = keep_for_this_process()
-    if why and not getattr(args, "quiet", False):
-        print(f"jaxtank: note: compiled programs are not kept: {why}", file=sys.stderr)
 
 
 def _failed(error):

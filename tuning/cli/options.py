@@ -33,7 +33,6 @@ class Command(NamedTuple):
 
 
 def grouped(group: str, *options: Option) -> tuple[Option, ...]:
-    """Return options under one heading of the help."""
     return tuple(option._replace(group=group) for option in options)
 
 

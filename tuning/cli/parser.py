@@ -24,7 +24,6 @@ class Parser(argparse.ArgumentParser):
     problems: list[str] = []  # of all parsers
 
     def error(self, message):
-        """Raise InputError with the message."""
         raise InputError("; ".join([*self.problems, message]))
 
     def _get_value(self, action, arg_string):
@@ -64,7 +63,6 @@ class Parser(argparse.ArgumentParser):
 
 
 def name_of(action):
-    """Return the name of an argument in messages."""
     return action.option_strings[0] if action.option_strings else action.metavar
 
 
@@ -93,7 +91,7 @@ class Pairs(argparse.Action):
         setattr(namespace, self.dest, pairs | {name: value})
 
 
-EXAMPLES = {
+EXAMPLES = {  # {command: what may follow it}
     "list": ("", "--all"),
     "show": ("gouta2015/backstepping", "tank.toml --json"),
     "simulate": ("cascaded/pi --set controller.Kc=2", "gouta2015/ngpc --safety-filter --out run"),
@@ -117,17 +115,14 @@ EXAMPLES = {
     "cache": ("", "clear"),
     "bench": ("", "cascaded/pi --rounds 3"),
 }
-"""{command: what may follow it}."""
 
-GROUPS = {"the case": 1, "uncertain plants": 2, "machines": 3, "output": 4}
-"""{group of options: its place in the help}; those of the command alone are before them."""
+GROUPS = {"the case": 1, "uncertain plants": 2, "machines": 3, "output": 4}  # {group: place}
 
 ACTIONS = {"pairs": (Pairs, {}), "list": ("append", []), "flag": ("store_true", False)}
 ACTIONS |= {"switch": (argparse.BooleanOptionalAction, None), "once": (Once, None)}
 
 
 def add(parser, option):
-    """Add an Option to a parser."""
     action, default = ACTIONS[option.kind]
     default = default if option.default is None else option.default
     text = option.help.replace("%", "%%")

@@ -10,9 +10,13 @@ FILTER = "safety_filter."
 
 
 def note(args, sentence):
-    """Print a note on stderr, unless --quiet."""
     if not args.quiet:
         print(f"jaxtank: note: {sentence}", file=sys.stderr)
+
+
+def picked(args, names):
+    """Return {name: value} of several arguments, named in one text."""
+    return {name: getattr(args, name) for name in names.split()}
 
 
 def use_float64():
@@ -29,7 +33,6 @@ def open_case(args):
     from jaxtank.loop import tank_bottom
 
     phase.show("opening the case")
-
     opened = rig.open_case(args.case)
     args.values = rig.by_rig_name(opened.loop, args.values)
     for option in ("free", "vary"):
@@ -96,11 +99,8 @@ def _not_proved(case):
 
     rows = certificates_of(case)
     high = [("limit", row.tank, row.reason) for row in rows if not row.certified]
-    low = [
-        ("low limit", row.tank, row.low_reason)
-        for row in rows
-        if row.low > 0.0 and not row.low_certified
-    ]
+    unproved = (row for row in rows if row.low > 0.0 and not row.low_certified)
+    low = [("low limit", row.tank, row.low_reason) for row in unproved]
     return [
         f"safety filter: the {limit} of {label_of(case.loop.plant, 'tank', tank)} is not proved:"
         f" {reason}"
@@ -124,9 +124,8 @@ def limits_of(args, case):
 
     limits = {} if "none" in args.limit else dict(case.limits)
     limits |= {name: limit for name, limit in args.limit.items() if "." not in name}
-    limits = rig.check_limits(
-        case.loop, {m: limit for m, limit in limits.items() if limit is not None}
-    )
+    stated = {m: limit for m, limit in limits.items() if limit is not None}
+    limits = rig.check_limits(case.loop, stated)
     entries = {name: limit for name, limit in args.limit.items() if "." in name}
     return limits | rig.check_limits(case.loop, entries, limits)
 
@@ -187,10 +186,7 @@ def use_devices(args):
 
 
 def print_result(args, payload, text, done=""):
-    """Print a JSON object under --json, else what `text()` returns.
-
-    `done` : the sentence of the verdict of a command that judges nothing.
-    """
+    """Print a JSON object under --json, else `text()`; done: a verdict where nothing is judged."""
     if not args.json:
         shown = text()
     else:
@@ -221,9 +217,8 @@ def finish(result, args):
     try:
         written = result.save(args.out, args.line) if args.out else []
     finally:  # a full disk costs the files, not the printed result; and the checkpoint is kept
-        print_result(
-            args, result.to_json() if args.json else None, lambda: printed(result.report())
-        )
+        payload = result.to_json() if args.json else None
+        print_result(args, payload, lambda: printed(result.report()))
     if args.out and hasattr(args, "resume") and getattr(result, "status", "") != "interrupted":
         from tuning.storage.store import discard
 

@@ -18,15 +18,12 @@ class Forgiving(io.RawIOBase):
         self.descriptor = descriptor
 
     def writable(self):
-        """Return True."""
         return True
 
     def fileno(self):
-        """Return the descriptor."""
         return self.descriptor
 
     def isatty(self):
-        """Return whether it is a terminal."""
         return os.isatty(self.descriptor)
 
     def write(self, data):
@@ -71,9 +68,7 @@ def coloured(stream):
 
 
 class Phase:
-    """What goes on before, between and after lines of progress, on a terminal: once it has taken
-    DELAY it is shown with its seconds, and it is erased when anything else is written.
-    """
+    """Work that a terminal shows with its seconds, after DELAY, between lines of progress."""
 
     DELAY = 0.7  # s
 
@@ -117,8 +112,7 @@ class Phase:
 
 phase = Phase()
 
-OPEN: set["Line"] = set()
-"""Lines of progress that have not ended."""
+OPEN: set["Line"] = set()  # lines of progress that have not ended
 
 
 def end_lines():
@@ -129,9 +123,7 @@ def end_lines():
 
 
 class Line:
-    """Progress on stderr: one line that is overwritten on a terminal, with the seconds since it
-    appeared; few lines elsewhere.
-    """
+    """Progress on stderr: one line, overwritten on a terminal; few lines elsewhere."""
 
     def __init__(self, quiet):
         self.quiet, self.terminal = quiet, sys.stderr.isatty()
@@ -165,9 +157,10 @@ class Line:
         print(f"\r{text[:78]:<78}", end="", file=sys.stderr, flush=True)
 
     def compiling(self, what, seconds):
-        """Print, on a terminal only, that `what` is compiled before anything else is to be seen."""
+        """Print, on a terminal only, that `what` is compiled; return the line."""
         if self.terminal:
             self.show(f"compiling {what}, about {seconds} s")
+        return self
 
     def runs(self, done, total):
         """Print the number of runs done; where it is no terminal, at each tenth of them only."""
@@ -176,7 +169,6 @@ class Line:
             self.show(f"run {done}/{total}")
 
     def end(self):
-        """End the line on a terminal."""
         self.ended.set()
         OPEN.discard(self)
         if self.clock is not None:

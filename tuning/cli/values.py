@@ -7,24 +7,19 @@ from jaxtank.core.errors import InputError
 
 DECIMAL_COMMA = re.compile(r"([+-]?)(\d+|[1-9]\d{0,2}(?:\.\d{3})+),(\d+(?:[eE][+-]?\d+)?)")
 """Text that is either a list of two numbers or one number with a decimal comma: 0,05 or 1.000,5."""
-LEADING_ZERO = re.compile(r"[+-]?0\d")
-"""How the digits after a decimal comma may begin, and no number."""
+LEADING_ZERO = re.compile(r"[+-]?0\d")  # digits after a decimal comma, and no number
 
 
 def plain_number(text):
     """Return an int where `text` is written as one and a float can hold it, else a float."""
-    if "_" in text:
-        raise ValueError("must be a number")
-    try:
-        value = int(text)
-        float(value)
-        return value
-    except (ValueError, OverflowError):
-        pass
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError("must be a number") from None
+    for read in (int, float) if "_" not in text else ():
+        try:
+            value = read(text)
+            float(value)
+            return value
+        except (ValueError, OverflowError):
+            continue
+    raise ValueError("must be a number")
 
 
 def seconds(name):
@@ -42,7 +37,6 @@ def seconds(name):
 
 
 def number(text):
-    """Return a float."""
     return float(plain_number(text))
 
 
@@ -103,7 +97,6 @@ def value(text):
 
 
 def _check_decimal_comma(text, parts, numbers):
-    """Refuse a comma that may separate decimals."""
     if comma := DECIMAL_COMMA.fullmatch(text):
         sign, whole_part, digits = comma.groups()
         point = f"{sign}{whole_part.replace('.', '')}.{digits}"
@@ -150,8 +143,7 @@ def span(text):
     return low, high, scale or ("log" if low > 0 else "linear")
 
 
-free_range = pair(span, "NAME=LOW:HIGH")
-"""What reads (name, range) of --free."""
+free_range = pair(span, "NAME=LOW:HIGH")  # what reads (name, range) of --free
 
 
 def limit(text):
@@ -167,7 +159,6 @@ def limit(text):
 
 
 def checked_measure(name):
-    """Return the name of a measure, if there is one."""
     from jaxtank.measures import check_names
 
     check_names([name])
@@ -207,8 +198,7 @@ def tradeoff(text):
         raise ValueError(
             "must be MEASURE=LOW:HIGH or MEASURE=LOW:HIGH:N, LOW below HIGH, N from 2 to 50"
         )
-    values = [low + (high - low) * i / (count - 1) for i in range(count)]
-    return checked_measure(measure), values
+    return checked_measure(measure), [low + (high - low) * i / (count - 1) for i in range(count)]
 
 
 def knots(text):
@@ -258,7 +248,6 @@ def folder(text):
 
 
 def earlier_folder(text):
-    """Return the name of the folder of an earlier run."""
     if not os.path.isdir(folder(text)):
         raise ValueError("cannot be read as a run to go on with: there is no such folder")
     return text

@@ -12,16 +12,64 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, 
 from typing import Any
 
 from jaxtank.core.errors import InputError
-from tuning.cluster.local import local_workers
 
-CONNECT = 8.0
-"""Time within which a scheduler must answer [s]."""
+SETTINGS = {  # settings of Dask, whatever the user has set
+    "distributed.comm.require-encryption": True,  # no connection without a key of this run
+    "distributed.scheduler.http.routes": [],  # no pages
+    "distributed.worker.http.routes": [],
+    "distributed.worker.profile.enabled": False,  # it takes 5 % of the core time
+    "distributed.admin.tick.interval": "1s",
+}
 
-AT_ONCE = 1024
-"""Largest number of tasks under way at once, and of workers on one machine."""
 
-LOOK = 0.5
-"""Time after which the workers are looked at, where no result has come [s]."""
+@contextlib.contextmanager
+def local_workers(count):
+    """Run a Dask scheduler, and `count` workers of one thread as processes of this machine."""
+    import distributed
+    import jax
+    from dask import config
+
+    try:
+        security = distributed.Security.temporary()
+    except ImportError:
+        raise InputError(
+            "cluster local: needs keys for its connections: pip install cryptography, or"
+            ' ".[cluster]"'
+        ) from None
+    compiler: Any = jax.config  # a worker uses the compiled programs that this process keeps
+    programs = {"JAX_COMPILATION_CACHE_DIR": compiler.jax_compilation_cache_dir}
+    with config.set(SETTINGS), _without_script():
+        cluster = distributed.LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            host="127.0.0.1",
+            protocol="tls",
+            security=security,
+            dashboard_address="127.0.0.1:0",
+            scheduler_kwargs={"dashboard": False},
+            memory_limit=0,
+            env={name: folder for name, folder in programs.items() if folder},
+            silence_logs=logging.CRITICAL,
+        )
+    with cluster:
+        for nanny in cluster.workers.values():
+            nanny.auto_restart = False
+        yield cluster
+
+
+@contextlib.contextmanager
+def _without_script():
+    """Hide the user's script from processes that start: they would run it anew."""
+    script, sys.modules["__main__"] = sys.modules["__main__"], types.ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script
+
+
+CONNECT = 8.0  # time within which a scheduler must answer [s]
+AT_ONCE = 1024  # largest number of tasks under way at once, and of workers on one machine
+LOOK = 0.5  # time after which the workers are looked at, where no result has come [s]
 
 ENCRYPTED = ("tls://", "wss://")
 
@@ -32,11 +80,10 @@ class ClusterWarning(UserWarning):
     """Something about a cluster that a user should know; the command prints it as a note."""
 
 
-TASKS = {
+TASKS = {  # {name of a task: module and function}; names, texts, numbers and arrays are sent to it
     "batches": ("tuning.uncertainty.batches", "batches"),
     "search": ("tuning.search.methods", "search_task"),
 }
-"""{name of a task: module and function}; names, texts, numbers and arrays are sent to it."""
 
 
 def call(task, x64, *arguments):

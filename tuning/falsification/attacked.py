@@ -77,8 +77,7 @@ def filter_or_design(case: Any) -> Any:
         return None
 
 
-NOT_OTHERS = ("plant", "sensor", "x0")
-"""Parts whose uncertainty is in the box of plants, the band of readings and the starts."""
+NOT_OTHERS = ("plant", "sensor", "x0")  # in the box, band and starts
 
 
 def _ends_of(loop, distributions):
@@ -159,9 +158,7 @@ class PumpPlan(Controller):
 
 @component
 class Course:
-    """Entries of the plant whose values are constant over windows of equal length, unknown to
-    controller and filter; takes the place of a loop's `Faults`, which follow in `then`.
-    """
+    """Entries of the plant, constant over equal windows and unknown to controller and filter."""
 
     value: Any = leaf(
         "-", "value of each entry in each window, in its own unit", shape=("window", "entry")
@@ -185,8 +182,7 @@ class Course:
         for name, v in zip(self.names, now):
             field, (index,) = split_index(name)
             value = getattr(plant, field)
-            entries = changed.setdefault(field, [value[i] for i in range(np.shape(value)[0])])
-            entries[index] = v
+            changed.setdefault(field, [value[i] for i in range(np.shape(value)[0])])[index] = v
         plant = dataclasses.replace(plant, **{f: tuple(e) for f, e in changed.items()})
         return plant if self.then is None else self.then.apply(plant, then)
 
@@ -197,17 +193,12 @@ def _window(clock, length, count):
     return jnp.clip(window, 0, count - 1)
 
 
-SWITCHES = 64
-"""Windows of the commands in place of a controller's."""
-
-MEMORY = 1 << 29
-"""Bytes that the states of a batch of runs may take for reverse mode."""
+SWITCHES = 64  # windows of the commands in place of a controller's
+MEMORY = 1 << 29  # bytes that the states of a batch of runs may take for reverse mode
 
 
 class Levels(NamedTuple):
-    """Of a run: the highest level to which each tank rose from one sample to the next (n,) [cm],
-    and when (n,) [s]; the last level of a tank that never rose. The start itself does not count.
-    """
+    """Highest level to which each tank rose after the start (n,) [cm], and when (n,) [s]."""
 
     highest: Any
     time: Any
@@ -293,9 +284,7 @@ class Attacked:
         return values
 
     def _start(self, z):
-        """Levels (n,) [cm] at t = 0. With a row of second order, the tanks above are lowered until
-        g >= 0: no filter can stop what has already been let in.
-        """
+        """Levels (n,) [cm] at t = 0; tanks above a row of second order are lowered until g >= 0."""
         safety_filter = self.case.loop.safety_filter
         x = [top * share for top, share in zip(self.ceiling, z)]
         if not isinstance(safety_filter, SafetyFilter):
@@ -367,14 +356,11 @@ class Attacked:
 
 
 def of_plant(coefficient: Coefficient) -> bool:
-    """Return whether a coefficient is an entry of an array of the plant."""
     return coefficient.name.startswith("plant.") and len(split_index(coefficient.name)[1]) == 1
 
 
 def reading_band(loop: ClosedLoop) -> np.ndarray:
-    """Return the (n,) largest error of readings [cm]: of the sensor's noise (6 standard
-    deviations), ADC and offset, or the band of the safety filter where that is wider.
-    """
+    """Largest errors (n,) of readings [cm]: noise (6 sd), ADC and offset, or the filter's band."""
     sensor, safety_filter = loop.sensor, loop.safety_filter
     band = band_of(sensor) if isinstance(sensor, LevelSensor) else 6.0 * np.asarray(sensor.noise)
     band = np.broadcast_to(band, (loop.plant.tanks,))
@@ -404,12 +390,9 @@ def _without_controller(loop, clock):
 
 
 def programs(attacked: Attacked) -> tuple[Any, Any]:
-    """Return two compiled functions of batches: (values) -> Levels, and (variables, tanks) ->
-    ((level of each one's tank, Levels), its slopes by the variables).
-    """
+    """Compiled batches: (values) -> Levels; (variables, tanks) -> ((levels, Levels), slopes)."""
     slopes = jax.value_and_grad(attacked.objective, has_aux=True)
-    run = jax.jit(jax.vmap(attacked.levels))
-    return run, jax.jit(jax.vmap(slopes))
+    return jax.jit(jax.vmap(attacked.levels)), jax.jit(jax.vmap(slopes))
 
 
 def batch_size(attacked: Attacked, runs: int) -> int:

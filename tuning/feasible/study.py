@@ -139,7 +139,6 @@ def of_nominal_plant(case: Case) -> tuple[PlateauNeed, ...] | None:
 
 
 def can_judge(case: Case) -> bool:
-    """Return whether the steady states of a case at its setpoints are known."""
     return not unjudged(case)
 
 
@@ -264,20 +263,14 @@ def apply_mend(
     return mended, mend
 
 
-ROUNDS = 12
-"""Times that the limits are linearised."""
+ROUNDS = 12  # times that the limits are linearised
+SWEEPS = 60  # sweeps of Hildreth's method over the linearised limits
 
-SWEEPS = 60
-"""Sweeps of Hildreth's method over the linearised limits."""
-
-REACHED = 1e-4
-"""Excess over a limit, as a share of it, with which an answer counts as within the limits."""
+REACHED = 1e-4  # excess over a limit, as a share of it, that counts as within it
 
 
 def least_offsets(needs: Needs) -> np.ndarray:
-    """Return (N, P) least distance of a steady state within the limits from each plateau's
-    setpoints [cm, Euclidean over outputs]; NaN where none was found.
-    """
+    """Return (N, P) distances of the nearest steady states within limits [cm]; NaN: none found."""
     # by sequential quadratic programming from y = r, all plants at once: the limits are linearised
     # at y, and r is projected onto them by Hildreth's method (dual coordinate ascent).
     r = np.broadcast_to(needs.setpoints, (needs.count, *needs.setpoints.shape[1:]))
@@ -334,8 +327,7 @@ def _projected(r, rows, ends):
     return y
 
 
-STEPS = 9
-"""Runs of a bisection: to 1/500 of its first interval."""
+STEPS = 9  # runs of a bisection: to 1/500 of its first interval
 
 
 def mended_ramp(case: Case) -> Mend | None:
@@ -387,31 +379,18 @@ def _holds(case, ramp):
 
 KINDS = ("setpoints", "rims", "orifices", "pumps", "ramps")
 
-TARGET = 0.95
-"""Share of the plants that a mend makes feasible [-]."""
+TARGET = 0.95  # share of the plants that a mend makes feasible [-]
 
-AIM = 0.956
-"""Share on the draws that it is found with: nearly two standard deviations of the share of 4,096
-others above TARGET [-].
-"""
+AIM = 0.956  # the same on the draws of the search: 2 sd of the share of 4,096 others above
 
-DESIGN = 2
-"""Draws in the design of a change per draw that is counted: more draws, less scatter."""
+DESIGN = 2  # draws in the design of a change per draw that is counted: more draws, less scatter
 
-COARSE = 1024
-"""Draws with which the direction of a move of setpoints is found; its size is found with all."""
+COARSE = 1024  # draws that give the direction of a move of setpoints; its size needs all
+FACTORS = (1.02, 1.05, 1.1, 1.2, 1.35, 1.6, 2.0, 3.0)  # on the areas of orifices
 
-FACTORS = (1.02, 1.05, 1.1, 1.2, 1.35, 1.6, 2.0, 3.0)
-"""Factors on the areas of orifices among which the smallest is looked for."""
-
-FAR = 0.4
-"""Margin, as a share of a limit, above which a change of setpoints ignores the limit."""
-
-ROUNDING = 1e-4
-"""Margin, as a share of a limit, that a search of setpoints keeps."""
-
-LARGEST = 1e6
-"""Excess, as a share of a limit, that stands for no steady state."""
+FAR = 0.4  # margin, as a share of a limit, above which a change of setpoints ignores the limit
+ROUNDING = 1e-4  # margin, as a share of a limit, that a search of setpoints keeps
+LARGEST = 1e6  # excess, as a share of a limit, that stands for no steady state
 
 
 def find_mends(needs: Needs) -> tuple[Mend, ...]:
@@ -423,7 +402,6 @@ def find_mends(needs: Needs) -> tuple[Mend, ...]:
 
 
 def _least(good: Callable, low: float, high: float, steps: int = 14) -> float:
-    """The least number between `low`, which is not good, and `high`, which is."""
     for _ in range(steps):
         middle = 0.5 * (low + high)
         low, high = (low, middle) if good(middle) else (middle, high)
@@ -443,8 +421,7 @@ def _rounded(value: float, old: float, digits: int = 2) -> float:
 
 # setpoints
 
-MANY = 24
-"""Setpoints up to which their least change is searched for; nobody sets more by hand."""
+MANY = 24  # setpoints up to which their least change is searched for; nobody sets more by hand
 
 
 def _setpoints(needs: Needs) -> Mend | None:
@@ -532,8 +509,7 @@ def _rims(needs: Needs) -> Mend | None:
     """Return raised rims; None if rims differ from plant to plant. Limits below a rim stay."""
     if np.ptp(needs.rim, axis=0).any():
         return None
-    tanks = needs.rim.shape[1]
-    return _raised(needs, "rims", "plant.rim", 0, np.flatnonzero(needs.at_rim), tanks)
+    return _raised(needs, "rims", "plant.rim", 0, np.flatnonzero(needs.at_rim), needs.rim.shape[1])
 
 
 def _pumps(needs: Needs) -> Mend | None:

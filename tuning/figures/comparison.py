@@ -2,7 +2,6 @@
 and `tuning.redraw`: a figure of a paper by our runs. Imported as names of `tuning`.
 """
 
-import html
 import warnings
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
@@ -16,14 +15,13 @@ from tuning.figures.figure import find
 from tuning.report import papers, tables
 from tuning.views import Shown
 
-COLOURS = {
+COLOURS = {  # colour of each verdict in a notebook
     papers.REPRODUCED: "#0072B2",
     papers.FITTED: "#9A6A00",
     papers.DIFFERS: "#B8431A",
     papers.IMPOSSIBLE: "#6B6B6B",
     papers.INPUT: "#6B6B6B",
 }
-"""Colour of each verdict in a notebook."""
 
 
 class Comparison(Shown):
@@ -77,10 +75,13 @@ class Comparison(Shown):
         return "\n".join([counts, str(papers.verdict_of(self.pages)), *self.notes])
 
     def _repr_html_(self) -> str:
+        from tuning.report.html import rendered
+
         counts = html_table(self._counts(), ["paper", *papers.VERDICTS])
-        folded = (_folded(name, page["rows"]) for name, page in self.pages.items())
-        head = f"<p>{html.escape(str(papers.verdict_of(self.pages)))}</p>"
-        return head + counts + "".join(folded) + _noted(self.notes)
+        rows = {name: list(map(_cells, page["rows"])) for name, page in self.pages.items()}
+        heads = ("quantity", "unit", "published", "measured", "verdict", "where", "why")
+        parts = {"verdict": papers.verdict_of(self.pages), "heads": heads, "colours": COLOURS}
+        return rendered("comparison.html", counts, papers=rows, notes=self.notes, **parts)
 
     def _counts(self) -> list[list[Any]]:
         """Rows of paper and number of rows of each verdict, and their sums."""
@@ -124,8 +125,7 @@ def compare(*names: str) -> Comparison:
     with warnings.catch_warnings(record=True) as noted, ThreadPoolExecutor(2) as pool:
         warnings.simplefilter("always")
         pages = dict(zip(chosen, pool.map(papers.measure, chosen)))
-    notes = dict.fromkeys(str(note.message) for note in noted)
-    return Comparison(pages, tuple(notes))
+    return Comparison(pages, tuple(dict.fromkeys(str(note.message) for note in noted)))
 
 
 def redraw(name: str) -> Any:
@@ -157,32 +157,9 @@ def redraw(name: str) -> Any:
     return drawing.draw(figure, drawing.run(figure))
 
 
-def _folded(name: str, rows: list[dict[str, Any]]) -> str:
-    """The rows of a paper, folded, each with a coloured verdict."""
-    head = "".join(
-        f"<th>{word}</th>"
-        for word in ("quantity", "unit", "published", "measured", "verdict", "where", "why")
-    )
-    body = "".join(_line(row) for row in rows)
-    return (
-        f"<details><summary>{html.escape(name)}: {len(rows)} rows</summary>"
-        f"<table><tr>{head}</tr>{body}</table></details>"
-    )
-
-
-def _noted(notes: tuple[str, ...]) -> str:
-    """Warnings of the runs, folded; nothing where there are none."""
-    lines = "".join(f"<p>{html.escape(note)}</p>" for note in notes)
-    heading = f"warnings of the runs: {len(notes)}"
-    return f"<details><summary>{heading}</summary>{lines}</details>" if notes else ""
-
-
-def _line(row: dict[str, Any]) -> str:
-    word = row["verdict"]
-    texts = [row["quantity"], row["unit"], _number(row["published"]), _number(row["measured"])]
-    start = "".join(f"<td>{html.escape(str(cell))}</td>" for cell in texts)
-    end = "".join(f"<td>{html.escape(str(cell))}</td>" for cell in (row["where"], row["reason"]))
-    return f'<tr>{start}<td style="color:{COLOURS[word]}"><b>{html.escape(word)}</b></td>{end}</tr>'
+def _cells(row: dict[str, Any]) -> list[str]:
+    numbers = [_number(row["published"]), _number(row["measured"])]
+    return [row["quantity"], row["unit"], *numbers, row["verdict"], row["where"], row["reason"]]
 
 
 def _number(value: Any) -> str:

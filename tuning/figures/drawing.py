@@ -19,14 +19,11 @@ from tuning.problem.scenarios import noisy
 from tuning.report.simulated import run_for_people
 from tuning.report.tables import number
 
-FORMATS = ("svg", "png", "pdf")
-"""File formats of a figure."""
+FORMATS = ("svg", "png", "pdf")  # file formats of a figure
 
-WIDTH, LINE = (92, 122), 0.17
-"""Characters in a line of the caption below one and two columns, height of a line [inch]."""
+WIDTH, LINE = (92, 122), 0.17  # characters of a caption's line, its height [inch]
 
-SHARE = 0.5
-"""Share from which the first of two blended controllers counts as the one at work [-]."""
+SHARE = 0.5  # share from which the first of two blended controllers counts as the one at work [-]
 
 
 class Drawn(NamedTuple):
@@ -195,13 +192,12 @@ def _membership_panels(case, _):
 
 
 OF_ALL_RUNS = {"levels": _level_panels, "errors": _error_panels, "inputs": _input_panels}
-OF_FIRST_RUN = {
+OF_FIRST_RUN = {  # {kind of panel: its drawings}
     "estimates": _estimate_panels,
     "shares": _share_panels,
     "setpoints": _setpoint_panels,
     "memberships": _membership_panels,
 }
-"""{kind of panel: its drawings}."""
 
 
 def _setpoints(ax, case, trajectory):

@@ -34,7 +34,6 @@ class Figure(NamedTuple):
 
     @property
     def name(self) -> str:
-        """As it is named in a command: "gouta2015/6"."""
         return f"{self.paper}/{self.number}"
 
 
@@ -57,7 +56,6 @@ FIGURES = _figures()
 
 
 def find(name: str) -> Figure:
-    """Return a figure that can be redrawn."""
     if name not in FIGURES:
         raise unknown("figure", name, FIGURES)
     figure = FIGURES[name]

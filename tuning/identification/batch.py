@@ -18,12 +18,9 @@ from tuning.identification.problem import Estimation
 from tuning.identification.residuals import quality
 from tuning.identification.result import Identifications, channels_of
 
-MEMORY = 256 * 2**20
-"""Bytes of sensitivities held at once: the logs are simulated in chunks that fit."""
-STATIONARY = 1e-10
-"""Share of the cost below which the predicted gain of a full step ends a fit."""
-STUCK = 1e12
-"""Damping above which a fit has stopped without converging."""
+MEMORY = 256 * 2**20  # bytes of sensitivities held at once, in chunks of logs
+STATIONARY = 1e-10  # share of the cost below which the predicted gain of a full step ends a fit
+STUCK = 1e12  # damping above which a fit has stopped without converging
 
 
 def identify_many(

@@ -14,8 +14,7 @@ from tuning.identification.coordinates import Coordinates, Scalar
 from tuning.identification.inputs import CURVE, played
 from tuning.identification.problem import Estimation
 
-STEP = 1e-6
-"""Change of an unknown, in its coordinate, by which slopes are computed."""
+STEP = 1e-6  # change of an unknown, in its coordinate, by which slopes are computed
 FIELD = {
     "actuator.delays": "delay",
     "actuator.lag": "lag",
@@ -29,9 +28,7 @@ subtracted from larger inputs; above a threshold the input is unchanged.
 
 
 class Candidate(NamedTuple):
-    """What may be wrong with the structure: kind and place, the name of its value, its present
-    value, and the range in which it is sought.
-    """
+    """A possible error of the structure: kind, place, name, present value, range of the search."""
 
     kind: str
     where: int
@@ -73,7 +70,6 @@ def candidates_of(estimation: Estimation) -> list[Candidate]:
 
 
 def _value(rig, name, usual):
-    """Return the value of a leaf, `usual` where the rig has none."""
     part, leaf = name.split("[")[0].split(".")
     absent = getattr(getattr(rig, part), leaf, None) is None
     return usual if absent else float(np.asarray(get_value(rig, name)))
@@ -139,20 +135,13 @@ def _outlets(plant):
 
 def with_exponents(plant: TankNetwork) -> TankNetwork:
     """Return a plant whose outlets have exponents, 0.5 where there was none."""
-    return dataclasses.replace(
-        plant,
-        **{
-            f"{opening}_exponent": np.full(len(tanks), 0.5)
-            for opening, tanks in _outlets(plant).items()
-            if tanks and getattr(plant, f"{opening}_exponent") is None
-        },
-    )
+    sizes = {f"{opening}_exponent": len(tanks) for opening, tanks in _outlets(plant).items()}
+    absent = [name for name, size in sizes.items() if size and getattr(plant, name) is None]
+    return dataclasses.replace(plant, **{name: np.full(sizes[name], 0.5) for name in absent})
 
 
 class AugmentedEstimation(Estimation):
-    """A fitted Estimation with one more unknown for each Candidate; derivatives by finite
-    differences of one compiled program.
-    """
+    """A fitted Estimation with an unknown for each Candidate; slopes by finite differences."""
 
     # The program has the plant's leaves. Sensors are applied to its levels, and dead zones, curves,
     # lags and delays to its inputs, outside of it. An exponent absent from the plant enters as its
@@ -193,7 +182,6 @@ class AugmentedEstimation(Estimation):
             self.by_exponent = _by_exponent(self.rig_at(z), self._levels(self.begin[None])[0])
 
     def rig_at(self, z):
-        """Return the Rig at the unknowns z, its candidates as they are."""
         return self.original.rig_at(z)
 
     def exchanged(self, a: int, b: int, z: np.ndarray) -> "AugmentedEstimation":
@@ -249,10 +237,9 @@ class AugmentedEstimation(Estimation):
         rows = []
         for z, h in zip(points, self._levels(points)):
             values = self.coordinates.values(z[: self.coordinates.size])
-            values = {name: v for name, v in values.items() if name.startswith("sensor.")}
-            sensor = with_values(
-                self.sensor, {n.removeprefix("sensor."): v for n, v in values.items()}
-            )
+            head = "sensor."
+            values = {n.removeprefix(head): v for n, v in values.items() if n.startswith(head)}
+            sensor = with_values(self.sensor, values)
             y = [sensor.reading_of(i, h[..., i], volts) for i, volts in self.data.channels]
             rows.append((np.stack(y, axis=-1) / self.noise)[self.mask])
         return np.stack(rows)
@@ -264,10 +251,8 @@ class AugmentedEstimation(Estimation):
         points = np.tile(z, (1 + len(lanes), 1))
         points[1 + lanes, self.columns] += STEP
         y = self.simulated(points)
-        residual, jacobian = (
-            y[0] - (self.data.y / self.noise)[self.mask],
-            np.zeros((y.shape[1], self.size)),
-        )
+        residual = y[0] - (self.data.y / self.noise)[self.mask]
+        jacobian = np.zeros((y.shape[1], self.size))
         jacobian[:, self.columns] = (y[1:] - y[0]).T / STEP
         if not np.all(np.isfinite(jacobian)):
             return np.full_like(residual, np.nan), np.zeros_like(jacobian)
@@ -275,16 +260,13 @@ class AugmentedEstimation(Estimation):
 
 
 def _is_leaf(plant, candidate):
-    """Whether the value of a Candidate is a leaf of the plant."""
     part, _, leaf = candidate.name.split("[")[0].partition(".")
     of_plant = part == "plant" and not candidate.field
     return of_plant and getattr(plant, leaf) is not None
 
 
 def _by_exponent(rig, levels):
-    """Return {name: (logs, samples, tanks) flow that the exponent of an outlet adds to first order}
-    at levels (logs, samples, tanks).
-    """
+    """Return {name: (logs, samples, tanks) flow by an outlet's exponent, to first order}."""
     plant, flows = rig.plant, {}
     h = np.maximum(levels, 1e-9)
     h = np.concatenate([0.5 * (h[:, 1:] + h[:, :-1]), h[:, -1:]], axis=1)

@@ -16,14 +16,9 @@ from tuning.identification.least_squares import Fit
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import WHITE, autocorrelation, pseudo
 
-LARGEST_DEVIATION = 0.5
-"""Standard deviation of a direction, in units of its coordinates (logarithms, shares of a range),
-above which the direction is not identifiable.
-"""
-ROUND_OFF = 1e-9
-"""Singular value, as a share of the largest, below which a direction is only round-off."""
-SHARE = 0.1
-"""Share of a direction's largest entry above which a parameter is named as part of it."""
+LARGEST_DEVIATION = 0.5  # largest standard deviation of an identifiable direction
+ROUND_OFF = 1e-9  # share of the largest singular value that is round-off
+SHARE = 0.1  # share of a direction's largest entry above which a parameter is named as part of it
 
 
 class Spread:
@@ -61,7 +56,11 @@ class Spread:
         self.at_bound &= ~self.unidentifiable
         self.without_interval = self._with_partners(self.unidentifiable | self.at_bound)
         self.quantile = float(student.ppf(0.975, self.freedom))  # 95 %, two-sided
-        self.values_covariance = self._covariance_of_values()
+        est = self.estimation
+        full = np.zeros((est.size, est.size))
+        full[np.ix_(self.estimated, self.estimated)] = self.covariance
+        slopes: Any = block_diag(est.coordinates.slopes(self.fit.p), np.diag(est.level_scale))
+        self.values_covariance = slopes @ full @ slopes.T
         self.sd = np.sqrt(np.diag(self.values_covariance))
 
     def _decompose(self, estimated):
@@ -80,10 +79,7 @@ class Spread:
         self.open_axes = (sd > LARGEST_DEVIATION) | round_off
 
     def _set_covariance(self, correlation):
-        """Set `covariance` of the `estimated` unknowns, and `widened`.
-
-        correlation : autocorrelation of the residuals at lag 1, for each channel.
-        """
+        """Set `covariance` and `widened`; correlation: of each channel's residuals at lag 1."""
         n = self.fit.residual.size
         s, vt = self.singular[~self.open_axes], self.axes[~self.open_axes]
         inverse = (vt.T / s**2) @ vt
@@ -93,7 +89,28 @@ class Spread:
         if max(map(abs, correlation), default=0.0) <= white_noise:
             return
         earlier = self.scale * self.earlier.T @ self.earlier
-        for middle in (self._newey_west() * n / self.freedom, self._first_order()):
+        estimation, size = self.estimation, self.estimated.size
+        shape, dt = estimation.mask.shape, estimation.data.steps
+        residual, slopes = np.full(shape, np.nan), np.zeros((*shape, size))
+        residual[estimation.mask] = self.residual
+        slopes[estimation.mask] = self.fit.jacobian[:, self.estimated]
+        samples = np.mean([log.samples for log in estimation.logs])
+        steps, total = dt / np.median(dt[dt > 0]), np.zeros((size, size))
+        for c in range(shape[-1]):
+            rho = autocorrelation(residual[..., c], 1)[1]
+            rho = float(np.clip(rho + (1 + 4 * rho) / samples, 0.0, 0.999))
+            variance = np.nanmean(residual[..., c] ** 2) * self.fit.residual.size / self.freedom
+            J = slopes[:, :, c]
+            # sum over all earlier samples of rho^(time difference / median step) J
+            if np.ptp(steps[dt > 0]) < 1e-6:
+                before = lfilter([0.0, rho], [1.0, -rho], J, axis=1)
+            else:
+                before = np.zeros_like(J)
+                for k in range(1, shape[1]):
+                    before[:, k] = (before[:, k - 1] + J[:, k - 1]) * rho ** steps[:, k - 1, None]
+            product = np.einsum("eki,ekj->ij", J, before)
+            total += variance * (np.einsum("eki,ekj->ij", J, J) + product + product.T)
+        for middle in (self._newey_west() * n / self.freedom, total):
             sandwich = inverse @ (middle + earlier) @ inverse
             ratio = np.sqrt(np.maximum(np.diag(sandwich), 0) / np.maximum(np.diag(white), 1e-300))
             if ratio.size and np.median(ratio) > self.widened:
@@ -118,39 +135,6 @@ class Spread:
         window = np.cumsum(score, axis=1)
         window[:, lags + 1 :] -= window[:, : -lags - 1].copy()
         return np.einsum("eki,ekj->ij", window, window) / (lags + 1)
-
-    def _first_order(self):
-        """Return J' C J; within a channel C is rho^(time difference / median step)."""
-        estimation, size = self.estimation, self.estimated.size
-        shape, dt = estimation.mask.shape, estimation.data.steps
-        residual, slopes = np.full(shape, np.nan), np.zeros((*shape, size))
-        residual[estimation.mask] = self.residual
-        slopes[estimation.mask] = self.fit.jacobian[:, self.estimated]
-        samples = np.mean([log.samples for log in estimation.logs])
-        steps, total = dt / np.median(dt[dt > 0]), np.zeros((size, size))
-        for c in range(shape[-1]):
-            rho = autocorrelation(residual[..., c], 1)[1]
-            rho = float(np.clip(rho + (1 + 4 * rho) / samples, 0.0, 0.999))
-            variance = np.nanmean(residual[..., c] ** 2) * self.fit.residual.size / self.freedom
-            J = slopes[:, :, c]
-            # sum over all earlier samples of rho^(time difference / median step) J
-            if np.ptp(steps[dt > 0]) < 1e-6:
-                before = lfilter([0.0, rho], [1.0, -rho], J, axis=1)
-            else:
-                before = np.zeros_like(J)
-                for k in range(1, shape[1]):
-                    before[:, k] = (before[:, k - 1] + J[:, k - 1]) * rho ** steps[:, k - 1, None]
-            product = np.einsum("eki,ekj->ij", J, before)
-            total += variance * (np.einsum("eki,ekj->ij", J, J) + product + product.T)
-        return total
-
-    def _covariance_of_values(self):
-        """Return (unknowns, unknowns) covariance in the rig's units, zero for fixed unknowns."""
-        est = self.estimation
-        full = np.zeros((est.size, est.size))
-        full[np.ix_(self.estimated, self.estimated)] = self.covariance
-        slopes: Any = block_diag(est.coordinates.slopes(self.fit.p), np.diag(est.level_scale))
-        return slopes @ full @ slopes.T
 
     def _with_partners(self, flags):
         """Return `flags` (unknowns,); if one gain of a branch pair has the flag, both have it."""

@@ -22,8 +22,7 @@ WITHOUT_EFFECT = {
 }
 
 
-OF_PUMPS = ("pump_gain", "split")
-"""Of a pump that is off throughout, no reading depends on these."""
+OF_PUMPS = ("pump_gain", "split")  # of a pump that is off throughout, no reading depends on these
 
 
 class Scalar(NamedTuple):
@@ -36,16 +35,13 @@ class Scalar(NamedTuple):
 
     @property
     def names(self):
-        """(1,) name of the value."""
         return (self.name,)
 
     @property
     def box(self):
-        """(low, high) of the coordinate."""
         return [(np.log(self.low), np.log(self.high)) if self.scale == "log" else (0.0, 1.0)]
 
     def values(self, p, exp):
-        """Return (value,) at (p,)."""
         return (exp(p[0]) if self.scale == "log" else self.low + p[0] * (self.high - self.low),)
 
     def point(self, value):
@@ -55,7 +51,6 @@ class Scalar(NamedTuple):
         return [(value - self.low) / (self.high - self.low)]
 
     def slopes(self, p):
-        """Return [[d value / dp]]."""
         return [[np.exp(p[0]) if self.scale == "log" else self.high - self.low]]
 
 
@@ -70,12 +65,10 @@ class Branches(NamedTuple):
 
     @property
     def names(self):
-        """(2,) names of the values."""
         return (self.gain, self.split)
 
     @property
     def box(self):
-        """(low, high) of each coordinate."""
         return [tuple(np.log(self.first)), tuple(np.log(self.second))]
 
     def values(self, p, exp):
@@ -84,7 +77,6 @@ class Branches(NamedTuple):
         return first + second, first / (first + second)
 
     def point(self, gain, split):
-        """Return p (2,) of a gain and a split."""
         split = np.clip(split, 1e-9, 1 - 1e-9)
         return [np.log(gain * split), np.log(gain * (1 - split))]
 
@@ -96,15 +88,13 @@ class Branches(NamedTuple):
 
 
 class Ladder(NamedTuple):
-    """Levels of the points of a sensor's curve below its last: p the logarithms of their distances,
-    so that they increase."""
+    """Levels of the points of a sensor's curve below its last: p, logarithms of their distances."""
 
     names: tuple
     top: float  # level of the last point
 
     @property
     def box(self):
-        """(low, high) of each coordinate."""
         return [(np.log(1e-3 * self.top), np.log(self.top))] * len(self.names)
 
     def values(self, p, exp):
@@ -116,11 +106,9 @@ class Ladder(NamedTuple):
         return tuple(reversed(levels))
 
     def point(self, *levels):
-        """Return p of levels."""
         return np.log(np.maximum(np.diff([*levels, self.top]), 1e-300)).tolist()
 
     def slopes(self, p):
-        """Return d level / dp."""
         return np.triu(np.tile(-np.exp(p), (len(p), 1)))
 
 
@@ -138,12 +126,10 @@ class Coordinates:
 
     @property
     def size(self):
-        """Number of coordinates [-]."""
         return len(self.names)
 
     @property
     def leaves(self):
-        """The coordinates of leaves of the rig alone."""
         return Coordinates(self.items[: len(self.items) - len(self.inputs)])
 
     @property
@@ -214,8 +200,7 @@ def free_bounds(loop, free):
             )
         if split_index(name)[0] in WITHOUT_EFFECT:
             raise InputError(f"free {name}: no reading depends on it in a way that could be fitted")
-    spec = {n: (*v, "log" if v[0] > 0 else "linear")[:3] for n, v in free.items()}
-    ranges = bounds(loop, spec)
+    ranges = bounds(loop, {n: (*v, "log" if v[0] > 0 else "linear")[:3] for n, v in free.items()})
     feeds: Any = getattr(loop.plant, "feeds", ())
     idle = {f"plant.split[{j}]" for j, (_, second) in enumerate(feeds) if second is None}
     for name in idle & set(free):
@@ -251,9 +236,7 @@ def default_free(loop, logs=()):
 
 
 def _without_idle(free, loop, logs):
-    """Return `free` without gain and split of a pump that is off throughout all logs, and without
-    the gain by which a log's flows became inputs.
-    """
+    """Return `free` without gain and split of a pump that is off, and without a log's own gain."""
     if not logs:
         return free
     used = np.any([np.any(log.u != 0, axis=0) for log in logs], axis=0)
@@ -263,7 +246,6 @@ def _without_idle(free, loop, logs):
 
 
 def _is_flow(loop, logs, pump):
-    """Whether a log has flows of a pump whose input is none."""
     length, drive = loop.units
     units = [unit_name(log.units[1 + pump]) for log in logs if log.units is not None]
     own = input_unit(loop.plant, pump, drive)
@@ -271,9 +253,7 @@ def _is_flow(loop, logs, pump):
 
 
 def refuse_used(loop, logs, names):
-    """Raise InputError for parameters by which columns of a log became inputs or levels: fitted to
-    these, each would come back as it was.
-    """
+    """Raise InputError for parameters by which columns of a log became inputs or levels."""
     pumps, length, drive = loop.plant.pumps, *loop.units
     of_pumps = [(f"plant.pump_gain[{j}]", 1 + j, "flows", "inputs") for j in range(pumps)]
     for log in logs:
@@ -293,5 +273,4 @@ def refuse_used(loop, logs, names):
 
 
 def nominal(loop, names):
-    """Return {name: value} of a loop as floats."""
     return {name: float(np.asarray(get_value(loop, name))) for name in names}

@@ -44,8 +44,7 @@ from tuning.identification.signals import (
 )
 
 KINDS = {"pump": "pump", "h": "level"}
-SHARE = r"(%|mA)(?: of (.+))?"
-"""Units of a reading in a span, which may be stated."""
+SHARE = r"(%|mA)(?: of (.+))?"  # units of a reading in a span, which may be stated
 
 
 class LogError(DataError):
@@ -174,9 +173,7 @@ class LogFile:
         self.suggested[question.setting] = question.answers
 
     def _times(self, order: str) -> tuple[np.ndarray, list[int]]:
-        """Return (times [s] of the rows, columns they are in); rows that come newest first are
-        turned round.
-        """
+        """Return (times [s] of the rows, columns they are in), the newest row last."""
         columns, t = self.table.columns, np.arange(len(self.table.lines), dtype=float)
         if "t" in self.named:
             used = self._found(self.named["t"][0], "t", columns)

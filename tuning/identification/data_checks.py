@@ -13,17 +13,11 @@ from jaxtank.core.units import canonical
 from tuning.identification.experiment import Log
 from tuning.identification.simulation import changes_of
 
-RIM_MARGIN = 1.5
-"""Reading, in rims of its tank, above which the column is taken to be in another unit."""
-DRIVE_MARGIN = 2.0
-"""The same of a pump's input, in its upper limits."""
-FAINT = 0.015
-"""Share of its range below which a pump's input, or every level, is taken to be in another unit."""
-IRREGULAR = 1.25
-"""Ratio of a long to a short step between samples (90th and 10th percentile) above which
-they do not follow the clock of a controller, which changes its outputs at its samples."""
-FEWEST = 3
-"""Fewest samples of a run that can be fitted: residuals have an autocorrelation from three on."""
+RIM_MARGIN = 1.5  # reading, in rims, above which a column has another unit
+DRIVE_MARGIN = 2.0  # the same of a pump's input, in its upper limits
+FAINT = 0.015  # share of the range below which an input, or every level, has another unit
+IRREGULAR = 1.25  # ratio of steps (90th, 10th percentile) above which samples follow no clock
+FEWEST = 3  # samples of a run that can be fitted: residuals need an autocorrelation
 
 
 def checked(log, loop, gap: float) -> list[Log]:
@@ -122,15 +116,12 @@ def with_even_times(log):
 
 
 def with_hold(log: Log) -> Log:
-    """Return a Log that states what its inputs do between samples: where samples are irregular and
-    inputs change with the readings, it is not known when, and they follow a line from row to row.
-    """
+    """Return a Log that states what its inputs do between samples: lines if irregular."""
     # A step at its row would act late, by half a step on average, as a dead time does.
     if log.hold or log.samples < FEWEST or not _irregular(log):
         return log
     changed = changes_of(log.u)
-    unsure = changed[np.isfinite(log.y[changed]).any(axis=1)]
-    if 2 * len(unsure) <= len(changed):
+    if 2 * len(changed[np.isfinite(log.y[changed]).any(axis=1)]) <= len(changed):
         return log
     note = (
         f"{log.name}: samples come irregularly and inputs change from one to the next: they are"
@@ -226,7 +217,7 @@ class Check(NamedTuple):
 
 
 UNIT = "is the column in another unit?{hint}"
-CHECKS = (
+CHECKS = (  # in this order
     Check(
         "samples",
         _few_samples,
@@ -261,4 +252,3 @@ CHECKS = (
         "every level reads 0 throughout: nothing moves that could be fitted",
     ),
 )
-"""In this order."""

@@ -27,8 +27,7 @@ IN_TURN = "steps one pump after the other, from empty"
 SMALL = "small step of every pump at once, from steady state"
 STAGGERED = "small staggered steps, from steady state"
 BINARY = "pseudo-random binary sequence about steady state"
-REGISTER = 7
-"""Length of the shift register of the pseudo-random binary sequence: 127 bits."""
+REGISTER = 7  # length of the shift register of the pseudo-random binary sequence: 127 bits
 
 
 def prbs(bits, channel):
@@ -194,7 +193,20 @@ def compare_experiments(
                 f"{name}: the simulation diverges with samples every {data.steps[0, 0]:g} s; take a"
                 " shorter duration"
             )
-        rows[name] = _precision(coordinates, p, values, jacobian)
+        deviations, names = coordinates.size, coordinates.names
+        _, s, vt = np.linalg.svd(jacobian, full_matrices=False)
+        slopes = coordinates.slopes(p)
+        determined = s > 1e-9 * s.max()
+        inverse = (vt[determined].T / s[determined] ** 2) @ vt[determined]
+        sd = np.sqrt(np.diag(slopes @ inverse[:deviations, :deviations] @ slopes.T))
+        unidentifiable = np.abs(vt[~determined]).max(axis=0, initial=0.0)[:deviations] > 0.1
+        scaled = jacobian[:, :deviations] @ np.linalg.inv(slopes) * [values[n] for n in names]
+        singular = np.linalg.svd(scaled, compute_uv=False)
+        rows[name] = {
+            "sd": {n: None if u else float(v) for n, v, u in zip(names, sd, unidentifiable)},
+            "condition": float((singular[0] / singular[-1]) ** 2) if singular[-1] > 0 else None,
+            "open": [n for n, u in zip(names, unidentifiable) if u],
+        }
     return Experiments(case, rows)
 
 
@@ -225,24 +237,6 @@ def _jacobian(rig, coordinates, p, data, x0, substeps):
     return np.asarray(slopes)[0]
 
 
-def _precision(coordinates, p, values, jacobian):
-    """Return {"sd", "condition", "open"} from the weighted sensitivities of one experiment."""
-    size, names = coordinates.size, coordinates.names
-    _, s, vt = np.linalg.svd(jacobian, full_matrices=False)
-    slopes = coordinates.slopes(p)
-    determined = s > 1e-9 * s.max()
-    inverse = (vt[determined].T / s[determined] ** 2) @ vt[determined]
-    sd = np.sqrt(np.diag(slopes @ inverse[:size, :size] @ slopes.T))
-    unidentifiable = np.abs(vt[~determined]).max(axis=0, initial=0.0)[:size] > 0.1
-    scaled = jacobian[:, :size] @ np.linalg.inv(slopes) * [values[n] for n in names]
-    singular = np.linalg.svd(scaled, compute_uv=False)
-    return {
-        "sd": {n: None if u else float(v) for n, v, u in zip(names, sd, unidentifiable)},
-        "condition": float((singular[0] / singular[-1]) ** 2) if singular[-1] > 0 else None,
-        "open": [n for n, u in zip(names, unidentifiable) if u],
-    }
-
-
 def most_informative(experiments):
     """Return the experiment with the least product of deviations; None if none identifies all."""
     sd = {name: list(row["sd"].values()) for name, row in experiments.items()}
@@ -255,7 +249,17 @@ def remedies(estimation, fit, spread):
     z, sentences = estimation.unknowns(fit), []
     noise = np.sqrt(max(spread.scale, 1e-12))
     for name, experiment in _alternatives(estimation, z):
-        sd = _largest_deviation(estimation, z, experiment, noise)
+        t, u, x0, tanks = experiment
+        expected = dict.fromkeys(tanks, float(np.mean(estimation.noise)))
+        channels = zip(estimation.data.channels, estimation.noise)
+        expected |= {tank: float(sd) for (tank, volts), sd in channels if not volts}
+        coordinates, steps = estimation.coordinates, 2 * estimation.substeps
+        data = _data(t, u, tanks, estimation.case)
+        jacobian = _jacobian(estimation.rig, coordinates, estimation.split(z)[0], data, x0, steps)
+        weight = noise * np.array([expected[i] for i in tanks])[:, None]
+        jacobian = (jacobian[..., : coordinates.size] / weight).reshape(-1, coordinates.size)
+        s = np.linalg.svd(jacobian, compute_uv=False)
+        sd = float(1 / s[-1]) if s[-1] > 1e-9 * s[0] else None
         if sd is not None and sd < LARGEST_DEVIATION:
             sentences.append(f"{name} (largest standard deviation of a direction {100 * sd:.2g} %)")
     directions = spread.directions()
@@ -283,18 +287,3 @@ def _alternatives(estimation, z):
     inputs = candidates(fitted, duration=duration, dt=dt, voltage=voltage, size=0.3 * voltage)
     for name in (STAGGERED, IN_TURN):
         yield name.replace("small ", ""), (*inputs[name], measured)
-
-
-def _largest_deviation(estimation, z, experiment, scale):
-    """Return the largest standard deviation of a direction; None if one is not identifiable."""
-    t, u, x0, tanks = experiment
-    noise = dict.fromkeys(tanks, float(np.mean(estimation.noise)))
-    channels = zip(estimation.data.channels, estimation.noise)
-    noise |= {tank: float(sd) for (tank, volts), sd in channels if not volts}
-    coordinates, steps = estimation.coordinates, 2 * estimation.substeps
-    data = _data(t, u, tanks, estimation.case)
-    jacobian = _jacobian(estimation.rig, coordinates, estimation.split(z)[0], data, x0, steps)
-    weight = scale * np.array([noise[i] for i in tanks])[:, None]
-    jacobian = (jacobian[..., : coordinates.size] / weight).reshape(-1, coordinates.size)
-    s = np.linalg.svd(jacobian, compute_uv=False)
-    return float(1 / s[-1]) if s[-1] > 1e-9 * s[0] else None

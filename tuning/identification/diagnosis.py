@@ -17,23 +17,15 @@ from tuning.identification.least_squares import Fit
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import ROBUST_LIMIT, WHITE, autocorrelation, residuals_of
 
-ALPHA = 0.02
-"""Significance level of one round of tests, divided among the candidates (Bonferroni) [-]."""
-EQUIVALENT = 6.0
-"""2 log of the likelihood ratio below which two fits count as equivalent."""
-MAX_CAUSES = 3
-"""Most causes that are named."""
-MAX_FITTED = 10
-"""Most candidates that are fitted at once."""
+ALPHA = 0.02  # significance level of a round of tests, divided among the candidates
+EQUIVALENT = 6.0  # 2 log of the likelihood ratio below which two fits count as equivalent
+MAX_CAUSES = 3  # most causes that are named
+MAX_FITTED = 10  # most candidates that are fitted at once
 ITERATIONS = 15
-LEAST_GAIN = 0.01
-"""Reduction of the sum of squares, in its mean, below which a fit has converged."""
-STRIDE = 5
-"""Stride through the distinct inputs in the first search for a threshold [-]."""
-BAD_FIT = 3.0
-"""RMS of a residual, in the noise of its channel, from which exchanged columns are tried."""
-EXCHANGE_RATIO = 0.5
-"""Largest ratio of the sums of squares at which an exchange of columns is kept [-]."""
+LEAST_GAIN = 0.01  # reduction of the sum of squares, in its mean, below which a fit has converged
+STRIDE = 5  # stride through the distinct inputs in the first search for a threshold [-]
+BAD_FIT = 3.0  # RMS of a residual, in noise, from which exchanged columns are tried
+EXCHANGE_RATIO = 0.5  # largest ratio of sums of squares that keeps an exchange [-]
 
 
 class Trial(NamedTuple):
@@ -76,7 +68,6 @@ class Diagnosis(NamedTuple):
 
 
 def diagnose(estimation: Estimation, fit: Fit) -> Diagnosis:
-    """Return the Diagnosis of a fit."""
     weighted, causes = copy.copy(estimation), []
     weighted.noise = fast_noise(estimation, fit)
     z = estimation.unknowns(fit)
@@ -106,7 +97,6 @@ def diagnose(estimation: Estimation, fit: Fit) -> Diagnosis:
 
 
 def unit_of(loop, candidate):
-    """Return the unit of the value of a Candidate."""
     if candidate.kind == "pump-delay":
         return "s"
     if candidate.field == "threshold":
@@ -115,9 +105,7 @@ def unit_of(loop, candidate):
 
 
 def fast_noise(estimation, fit):
-    """Return (channels,) noise of the residuals from sample to sample, which a slow misfit does not
-    reach.
-    """
+    """Return (channels,) noise of the residuals from sample to sample, without a slow misfit."""
     steps = np.diff(residuals_of(estimation, fit), axis=1) / np.sqrt(2.0)
     known = np.isfinite(steps)  # of no two readings in a row there is none
     squares = np.sum(steps**2, axis=(0, 1), where=known)
@@ -147,9 +135,7 @@ def _loss(kind, residual):
 
 
 def _fit(problem, chosen, start=None):
-    """Return the Trial of a bounded Levenberg-Marquardt search over the Candidates `chosen` and the
-    unknowns of the Estimation.
-    """
+    """Return the Trial of a bounded Levenberg-Marquardt search with the Candidates `chosen`."""
     z = problem.begin if start is None else start
     problem.columns = columns = np.sort([*problem.usual, *(problem.known + i for i in chosen)])
     low, high = (side[columns] for side in problem.box)
@@ -191,37 +177,11 @@ def _shares(problem, residual):
 
 
 def _effective(problem, residual):
-    """Return how many of the readings are independent."""
     return max(sum(n * share for n, share in _shares(problem, residual)), 4.0)
 
 
 def _is_white(trial):
-    """Whether half of the readings of each channel or more are independent."""
     return all(share > 0.5 for _, share in _shares(trial.problem, trial.residual))
-
-
-def _scores(trial):
-    """Return (candidates,) by how much a step of each reduces the sum of squares."""
-    problem, J, r = trial.problem, trial.jacobian, trial.residual
-    extra = np.delete(np.arange(problem.size), problem.usual)
-    inside = [*problem.usual, *extra[list(trial.chosen)]]
-    basis, _ = np.linalg.qr(J[:, inside])
-    columns = J[:, extra]
-    # twice: once leaves round-off in columns that are nearly in the basis
-    orthogonal = columns - basis @ (basis.T @ columns)
-    orthogonal -= basis @ (basis.T @ orthogonal)
-    r = r - basis @ (basis.T @ r)
-    size, whole = np.sum(orthogonal**2, axis=0), np.sum(columns**2, axis=0)
-    apart = size > 1e-9 * np.maximum(whole, 1e-300)
-    steps = np.where(apart, -(orthogonal.T @ r) / np.where(apart, size, 1.0), 0.0)
-    share = trial.point[extra]
-    outside = (share < 1e-9) & (steps < 0.0) | (share > 1 - 1e-9) & (steps > 0.0)
-    steps[outside | np.isin(np.arange(len(extra)), trial.chosen)] = 0.0
-    gains = steps**2 * size
-    for i, c in enumerate(problem.candidates):
-        if c.field == "threshold" and i not in trial.chosen:
-            gains[i] = _best_threshold(trial, i, _thresholds(problem, c)[::STRIDE], basis)[0]
-    return gains
 
 
 def _thresholds(problem, candidate):
@@ -260,38 +220,50 @@ def passes(trial, before):
 
 def _fitted(trial):
     """Return Trials with one more Candidate each, those of the largest scores that pass."""
-    gains = _scores(trial)
+    problem, J, r = trial.problem, trial.jacobian, trial.residual
+    extra = np.delete(np.arange(problem.size), problem.usual)
+    inside = [*problem.usual, *extra[list(trial.chosen)]]
+    basis, _ = np.linalg.qr(J[:, inside])
+    columns = J[:, extra]
+    # twice: once leaves round-off in columns that are nearly in the basis
+    orthogonal = columns - basis @ (basis.T @ columns)
+    orthogonal -= basis @ (basis.T @ orthogonal)
+    r = r - basis @ (basis.T @ r)
+    size, whole = np.sum(orthogonal**2, axis=0), np.sum(columns**2, axis=0)
+    apart = size > 1e-9 * np.maximum(whole, 1e-300)
+    steps = np.where(apart, -(orthogonal.T @ r) / np.where(apart, size, 1.0), 0.0)
+    share = trial.point[extra]
+    outside = (share < 1e-9) & (steps < 0.0) | (share > 1 - 1e-9) & (steps > 0.0)
+    steps[outside | np.isin(np.arange(len(extra)), trial.chosen)] = 0.0
+    gains = steps**2 * size
+    for i, c in enumerate(problem.candidates):
+        if c.field == "threshold" and i not in trial.chosen:
+            gains[i] = _best_threshold(trial, i, _thresholds(problem, c)[::STRIDE], basis)[0]
     variance = trial.loss / max(len(trial.residual) - trial.problem.size, 1)
     promising = [i for i in np.argsort(-gains) if gains[i] > variance * _limit(trial.problem)]
     return [with_candidate(trial, int(i)) for i in promising[:MAX_FITTED]]
 
 
 def with_candidate(trial, i):
-    """Return the Trial with Candidate i beside those that it has."""
     problem, start = trial.problem, trial.point
     if problem.candidates[i].name in problem.by_exponent:
         problem = AugmentedEstimation(
             problem.original, start[problem.usual], problem.loss, exponents=True
         )
     if problem.candidates[i].field == "threshold":
-        return _with_threshold(trial, i)
+        problem, c, at = trial.problem, trial.problem.candidates[i], trial.problem.known + i
+        options, chosen = _thresholds(problem, c), (*trial.chosen, i)
+        value = _best_threshold(trial, i, options[::STRIDE])[1]
+        for _ in range(3):
+            near = np.argmin(np.abs(options - value))
+            value = _best_threshold(trial, i, options[max(near - STRIDE, 0) : near + STRIDE + 1])[1]
+            start = trial.point.copy()
+            start[at] = (value - c.low) / (c.high - c.low)
+            if trial.chosen == chosen and np.isclose(trial.point[at], start[at]):
+                break
+            trial = _fit(problem, chosen, start)
+        return trial
     return _fit(problem, (*trial.chosen, i), start)
-
-
-def _with_threshold(trial, i):
-    """Return the Trial with the best threshold: between the inputs about the best of a few."""
-    problem, c, at = trial.problem, trial.problem.candidates[i], trial.problem.known + i
-    options, chosen = _thresholds(problem, c), (*trial.chosen, i)
-    value = _best_threshold(trial, i, options[::STRIDE])[1]
-    for _ in range(3):
-        near = np.argmin(np.abs(options - value))
-        value = _best_threshold(trial, i, options[max(near - STRIDE, 0) : near + STRIDE + 1])[1]
-        start = trial.point.copy()
-        start[at] = (value - c.low) / (c.high - c.low)
-        if trial.chosen == chosen and np.isclose(trial.point[at], start[at]):
-            break
-        trial = _fit(problem, chosen, start)
-    return trial
 
 
 def exchanges(trial, always=False):
@@ -329,11 +301,8 @@ def _cause(best, before, options):
     name, unit, present = "", "", None
     if best.chosen:
         c = best.problem.candidates[best.chosen[-1]]
-        name, present, unit = (
-            c.name,
-            c.null,
-            unit_of(with_leaves(best.problem.case.loop, [c.name]), c),
-        )
+        name, present = c.name, c.null
+        unit = unit_of(with_leaves(best.problem.case.loop, [c.name]), c)
     bic = best.better(before) - float(np.log(best.effective)) * bool(best.chosen)
     return Cause(kind, where, name, unit, None, None, None, present, bic, equivalent)
 

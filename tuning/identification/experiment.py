@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike
 
 from jaxtank.core.errors import DataError, InputError
 
-HOLDS = ("", "zero-order", "first-order")
-"""Inputs between samples; "": unknown, zero-order hold if samples are regular."""
+HOLDS = ("", "zero-order", "first-order")  # "": unknown, zero-order where samples are regular
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -215,6 +214,5 @@ def _check_samples(data):
 
 
 def check_hold(hold: str) -> None:
-    """Raise InputError for what inputs cannot do between samples."""
     if hold not in HOLDS:
         raise InputError(f"hold = {hold!r}: must be one of {', '.join(HOLDS[1:])}")

@@ -2,23 +2,33 @@
 sensitivities from several starts.
 """
 
+import copy
 import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
+from jaxtank.bounds import Bound
 from jaxtank.case import Case, check_case
-from jaxtank.core.errors import DataError, InputError
+from jaxtank.core.errors import DataError, InputError, unknown
 from jaxtank.plants.base import Plant
-from tuning.identification.acceptance import accept_causes, place_of
+from tuning.identification.candidates import AugmentedEstimation, with_leaves
 from tuning.identification.confidence import Spread, at_search_bounds
 from tuning.identification.data_checks import checked, first_samples
 from tuning.identification.design import remedies
+from tuning.identification.diagnosis import (
+    exchanges,
+    fast_noise,
+    passes,
+    trial_at,
+    unit_of,
+    with_candidate,
+)
 from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare, check_kind
 from tuning.identification.innovations import LIKELIHOODS, choose_likelihood
@@ -32,9 +42,139 @@ from tuning.problem.status import Status
 from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
 from tuning.storage.fingerprint import digest, fingerprint
 
+CAUSE_KINDS = (
+    *("pump-delay", "pump-lag", "dead-zone", "pump-curve", "sensor-offset", "sensor-scale"),
+    *("leak", "outlet-exponent", "inflow", "area", "swapped"),
+)
+
+
+def place_of(text: str) -> tuple[str, tuple]:
+    """Return (kind, place from 1 or ()) of a text such as "pump-delay" or "swapped:1,2"."""
+    kind, _, place = str(text).partition(":")
+    numbers = place.split(",") if place else []
+    if kind not in CAUSE_KINDS:
+        raise unknown("cause to accept", kind, CAUSE_KINDS)
+    if not all(number.isascii() and number.isdigit() for number in numbers):
+        raise InputError(
+            f"accept {text!r}: the place must be the number of a pump or tank, from 1, as {kind}:1;"
+            " swapped takes two tanks, swapped:1,2"
+        )
+    return kind, tuple(map(int, numbers))
+
+
+class AcceptedStructure(NamedTuple):
+    """A structure that was accepted: what to identify again, and from where."""
+
+    case: Any
+    logs: list
+    free: dict[str, tuple]
+    inputs: list[tuple[Bound, tuple]]
+    begin: dict[str, float]
+
+
+def accept_causes(
+    estimation: Estimation, fit: Fit, places: list[tuple[str, tuple]]
+) -> AcceptedStructure:
+    """Return what `places`, (kind, place from 1 or ()) each, make of an identification."""
+    weighted, logs = copy.copy(estimation), list(estimation.logs)
+    weighted.noise = fast_noise(estimation, fit)
+    problem = AugmentedEstimation(weighted, estimation.unknowns(fit), fit.loss)
+    trial = trial_at(problem, (), problem.begin)
+    # an exchange is fitted without the other causes, so it comes first
+    for kind, where in sorted(places, key=lambda place: place[0] != "swapped"):
+        if kind == "swapped":
+            trial = _best_exchange(trial, where)
+            logs = [_exchanged_log(log, trial.problem.swapped) for log in logs]
+        else:
+            trial = _best_of_kind(trial, kind, where)
+    chosen = [trial.problem.candidates[i] for i in trial.chosen]
+    of = trial.problem.coordinates
+    values = of.values(trial.point[: of.size])
+    known = {*estimation.coordinates.names, *(c.name for c in chosen)}
+    loop = with_leaves(estimation.case.loop, [c.name for c in chosen])
+    inputs = [c for c in chosen if c.field not in ("", "threshold")]
+    leaves = {c.name: (c.low, c.high, "linear") for c in chosen if not c.field}
+    loop = _with_thresholds(loop, chosen, values)
+    bound = lambda c: Bound(c.name, c.low, c.high, "linear", unit_of(loop, c))
+    return AcceptedStructure(
+        case=estimation.case.replace(loop=loop, log=_columns(estimation, logs)),
+        logs=logs,
+        free={b.name: (b.low, b.high, b.scale) for b in estimation.bounds} | leaves,
+        inputs=[(bound(c), (c.field, c.where, c.null)) for c in inputs],
+        begin={n: float(v) for n, v in values.items() if n in known},
+    )
+
+
+def _with_thresholds(loop, chosen, values):
+    """Return a loop with the thresholds among the chosen Candidates, which no search estimates."""
+    rows = [c for c in chosen if c.field == "threshold"]
+    if not rows:
+        return loop
+    dead_zone = np.zeros(loop.actuator.pumps)
+    for c in rows:
+        dead_zone[c.where] = values[c.name]
+    actuator = dataclasses.replace(loop.actuator, dead_zone=dead_zone, dead_zone_kind="plain")
+    return dataclasses.replace(loop, actuator=actuator)
+
+
+def _best_of_kind(trial, kind, where):
+    """Return the Trial with a Candidate of a kind at a place from 1, or at the best one."""
+    candidates = trial.problem.candidates
+    options = [i for i, c in enumerate(candidates) if c.kind == kind]
+    chosen = [i for i in options if where in ((), (candidates[i].where + 1,))]
+    if not chosen:
+        places = ", ".join(f"{kind}:{candidates[i].where + 1}" for i in options)
+        raise InputError(
+            f"accept {':'.join([kind, *map(str, where)])}: "
+            + (f"must be one of {places}" if places else "already free, or of no part of this rig")
+        )
+    best = min((with_candidate(trial, i) for i in chosen), key=lambda t: t.loss)
+    return _with_all(best) if kind == "pump-curve" else best
+
+
+def _with_all(trial):
+    """Return the Trial with all coefficients of its last cause that the data ask for."""
+    candidates = trial.problem.candidates
+    place = candidates[trial.chosen[-1]][:2]
+    while True:
+        others = [i for i, c in enumerate(candidates) if c[:2] == place and i not in trial.chosen]
+        larger = min(
+            (with_candidate(trial, i) for i in others), key=lambda t: t.loss, default=trial
+        )
+        if not passes(larger, trial):
+            return trial
+        trial = larger
+
+
+def _best_exchange(trial, where):
+    """Return the Trial with two channels exchanged: those of tanks `where`, or the best pair."""
+    options = [t for t in exchanges(trial, always=True)
+               if sorted(where) in ([], sorted(i + 1 for i in t.problem.swapped))]  # fmt: skip
+    if not options:
+        place = f":{','.join(map(str, where))}" if where else ""
+        raise InputError(f"accept swapped{place}: needs two measured levels in the same unit")
+    return min(options, key=lambda t: t.loss)
+
+
+def _columns(estimation, logs):
+    """Return the [log] table of a case with the headers of the columns that were exchanged."""
+    columns = dict(estimation.case.log)
+    for old, log in zip(estimation.logs, logs):
+        moved = log.headers is not None and log.tanks != old.tanks
+        for header, a, b in zip((log.headers or ())[1 + log.u.shape[1] :], old.tanks, log.tanks):
+            if moved and a != b:
+                columns[f"h{b + 1}"] = header
+    return columns
+
+
+def _exchanged_log(log, tanks):
+    """Return a Log whose readings of two tanks are each the other's."""
+    other = dict(zip(tanks, tanks[::-1]))
+    return dataclasses.replace(log, tanks=tuple(other.get(i, i) for i in log.tanks))
+
+
 LOSSES = ("linear", "soft_l1", "huber")
-AGREE = 1.001
-"""Factor between the sums of squares of two searches below which they found the same minimum."""
+AGREE = 1.001  # ratio of the sums of squares of two searches with the same minimum
 
 
 def identify(
@@ -235,9 +375,7 @@ def _partial(case, logs, hold_back, options):
 
 
 def _all(cache, partial, logs, counts, options, search):
-    """Return (Fits of the searches, whether they were interrupted, Estimation of all data, its Fit,
-    validation or None).
-    """
+    """Return (Fits, whether interrupted, Estimation of all data, its Fit, validation or None)."""
     starts, seed, settings, progress = search
     fits, interrupted = _searches(cache, partial, starts, seed, settings, progress)
     best = solve(partial, partial.unknowns(_best(fits, logs[0].name)), **settings)
@@ -254,9 +392,7 @@ def _all(cache, partial, logs, counts, options, search):
 
 
 def _in_finer_steps(partial, best, settings):
-    """Return the Fit in the steps that its values need, where these are shorter than those that the
-    values of the case needed.
-    """
+    """Return the Fit in the steps that its values need, where these are shorter."""
     try:
         finer = partial.substeps_for(partial.unknowns(best))
     except DataError:  # no number of steps is enough: the validation set and the report say so
@@ -323,13 +459,9 @@ def _best(fits, name):
 
 def _starts(fits):
     """Cost and effort of each search, and whether it has found the minimum of the best."""
-    best = min((fit for fit in fits if np.isfinite(fit.cost)), key=lambda fit: fit.cost)
+    least = min(fit.cost for fit in fits if np.isfinite(fit.cost)) * AGREE + 1e-12
     return [
-        {
-            "cost": fit.cost,
-            "evaluations": fit.evaluations,
-            "agrees": bool(fit.cost <= best.cost * AGREE + 1e-12),
-        }
+        {"cost": fit.cost, "evaluations": fit.evaluations, "agrees": bool(fit.cost <= least)}
         for fit in fits
     ]
 
@@ -366,9 +498,7 @@ def _searches(cache, estimation, starts, seed, settings, progress):
 
 
 def _search(cache, estimation, z, settings):
-    """Return the Fit of a first search from z; of one from the checkpoint where it ended, without
-    its residual and Jacobian.
-    """
+    """Return the Fit of a search from z, or of the checkpoint where it ended (without Jacobian)."""
     new = []
 
     def compute():
@@ -394,22 +524,17 @@ def _within_ranges(estimation, fit, settings):
     """Return (Estimation, Fit) with every value in its range."""
     # branch gains may leave the ranges of gain and split: the same search in these themselves
     values = estimation.coordinates.values(fit.p)
-    if all(
-        b.low - 1e-9 * abs(b.high) <= values[b.name] <= b.high + 1e-9 * abs(b.high)
-        for b in estimation.bounds
-    ):
+    within = lambda b, rest: b.low - rest <= values[b.name] <= b.high + rest
+    if all(within(b, 1e-9 * abs(b.high)) for b in estimation.bounds):
         return estimation, fit
     plain = estimation.without_branch_gains()
-    start = np.concatenate(
-        [plain.coordinates.point(values), fit.levels.ravel() / plain.level_scale]
-    )
+    levels = fit.levels.ravel() / plain.level_scale
+    start = np.concatenate([plain.coordinates.point(values), levels])
     return plain, solve(plain, np.clip(start, *plain.box), **settings)
 
 
 def _likeliest(likelihood, estimation, simulated, before, iterations):
-    """Return (Fit, Spread, quality, report) of the likelihood that is asked for or chosen, after a
-    Fit to simulated readings with its (Spread, quality).
-    """
+    """Return (Fit, Spread, quality, report) of the likelihood that is asked for or chosen."""
     result, report = choose_likelihood(likelihood, estimation, simulated, iterations)
     if result is None:
         return simulated, *before, report | {"noise": [float(v) for v in estimation.noise]}

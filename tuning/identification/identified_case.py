@@ -28,8 +28,7 @@ from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps, ramps
 from tuning.identification.inputs import STATIC, with_inputs
 
-LACKS = ", lacks "
-"""Between the name of a rig and causes that the data require and the rig does not have."""
+LACKS = ", lacks "  # between the name of a rig and causes that it does not have
 
 
 def bare(plant):
@@ -111,16 +110,12 @@ def identified_plant(result):
     )
 
 
-REFINED = (1, 2, 4, 5, 10, 20)
-"""Divisors of the sampling period of an open loop, so that a dead time is whole samples of it."""
-NEAR = 0.02
-"""Error of a dead time, as a share of it, that whole samples may make."""
+REFINED = (1, 2, 4, 5, 10, 20)  # divisors of the sampling period for whole dead times
+NEAR = 0.02  # error of a dead time, as a share of it, that whole samples may make
 
 
 def _with_inputs(result):
-    """Return (the case of an Identification with the dead times and curves of its inputs, their
-    names), dead times in whole samples.
-    """
+    """Return (case with dead times, in whole samples, and curves of its inputs, their names)."""
     case, u = result.case, result.estimation.data.u
     values = {n: p["value"] for n, p in result.parameters.items() if n.split("[")[0] in STATIC}
     if not values:
@@ -151,13 +146,9 @@ def _with_earlier(covariance, result):
 
 
 KINDS = ("pi",)
-STEPS = (1.1, 0.9, 1.05, 0.95)
-"""Setpoint of each output after its change, over its steady level [-]: the first that the rig can
-hold is taken."""
-LONGEST = 1e8
-"""Time by which a rig with constant inputs must have come to its steady state [s]."""
-MOST = 100_000
-"""Most samples of the proposed run."""
+STEPS = (1.1, 0.9, 1.05, 0.95)  # first feasible new setpoint over its level [-]
+LONGEST = 1e8  # time by which a rig with constant inputs must have come to its steady state [s]
+MOST = 100_000  # most samples of the proposed run
 
 
 def check_kind(kind, case):

@@ -17,12 +17,9 @@ from tuning.identification.residuals import WHITE, autocorrelation, residuals_of
 from tuning.identification.simulation import player
 
 LIKELIHOODS = ("output-error", "innovations", "auto")
-REACH = 3.0
-"""Largest change of log(noise of the readings) from its first value."""
-PROCESS = (1e-8, 1e-1)
-"""Range of the process noise, in rims per root of a second."""
-PROCESS_SD = 0.5
-"""Prior standard deviation of a tank's log(process noise) about the mean of all tanks."""
+REACH = 3.0  # largest change of log(noise of the readings) from its first value
+PROCESS = (1e-8, 1e-1)  # range of the process noise, in rims per root of a second
+PROCESS_SD = 0.5  # prior sd of a tank's log(process noise) about the mean of all
 
 
 class InnovationsFit(NamedTuple):
@@ -83,10 +80,7 @@ def innovations(rig, dt, u, y, present, process, variance, channels, substeps):
 def sensitivities(
     rig, dt, u, y, present, p, first, noises, *, coordinates, tanks, channels, substeps
 ):
-    """Return innovations and variances (logs, samples, channels), and their derivatives by the
-    unknowns of each log: coordinates p, levels `first`, and the logarithms `noises` of the standard
-    deviations of the tanks and of the channels.
-    """
+    """Return innovations, variances (logs, samples, channels), slopes by p, `first`, `noises`."""
     shared, n = coordinates.size, rig.plant.tanks
 
     def of_log(dt, u, y, present, first):
@@ -122,10 +116,8 @@ class Likelihood:
         noise = np.log(estimation.noise)
         low, high = estimation.box
         ends = [np.log(rim * end) for end in PROCESS]
-        self.box = (
-            np.concatenate([low, ends[0], noise - REACH]),
-            np.concatenate([high, ends[1], noise + REACH]),
-        )
+        sides = ([low, ends[0], noise - REACH], [high, ends[1], noise + REACH])
+        self.box = tuple(map(np.concatenate, sides))
         self.shift = 1.0 - 2.0 * (noise - REACH)
         # else the noise of a tank of which few readings tell would often be estimated as 0
         first, n = estimation.size, rim.size
@@ -134,11 +126,9 @@ class Likelihood:
 
     @property
     def size(self) -> int:
-        """Number of unknowns [-]."""
         return self.box[0].size
 
     def split(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (coordinates, levels) of the unknowns z."""
         return self.estimation.split(z[: self.estimation.size])
 
     def prior_rows(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -151,8 +141,7 @@ class Likelihood:
         est, data = self.estimation, self.estimation.data
         levels, tanks = est.first_levels(z[: est.size]), est.tanks
         rig, shared, free = est.rig, est.coordinates.size, len(est.tanks)
-        if not tanks:
-            tanks = tuple(range(levels.shape[1]))
+        tanks = tanks or tuple(range(levels.shape[1]))
         results, slopes = sensitivities(
             rig,
             data.dt,
@@ -187,8 +176,7 @@ class Likelihood:
         with np.errstate(all="ignore"):
             v, S, dv, dS = self.at(z)
             a, dS = v / np.sqrt(S), dS / S[:, None]
-            channel = np.nonzero(self.estimation.mask)[2]
-            b = np.sqrt(np.log(S) + self.shift[channel])
+            b = np.sqrt(np.log(S) + self.shift[np.nonzero(self.estimation.mask)[2]])
             da = dv / np.sqrt(S)[:, None] - 0.5 * a[:, None] * dS
             rows = np.concatenate([a, b, self.alike @ z])
             jacobian = np.concatenate([da, 0.5 * dS / b[:, None], self.alike])
@@ -197,21 +185,17 @@ class Likelihood:
         return rows, jacobian
 
     def start(self, fit: Fit) -> np.ndarray:
-        """Return the unknowns from which the search after a Fit to the simulated readings begins:
-        the process noise that explains how its residuals change from sample to sample.
-        """
+        """Return the start: the process noise that explains changes of a Fit's residuals."""
         est = self.estimation
         residual, steps = residuals_of(est, fit), est.data.steps[:, :-1, None]
         with np.errstate(divide="ignore", invalid="ignore"):
             gained = np.diff(residual, axis=1) ** 2 / np.where(steps > 0, steps, np.nan)
         usual = np.median(steps[steps > 0])
         noise = est.noise**2
-        rates = np.maximum(
-            np.nanmean(gained, axis=(0, 1)) - 2 * noise / usual, 0.01 * noise / usual
-        )
-        gains = [
-            float(est.rig.sensor.gain[tank]) if volts else 1.0 for tank, volts in est.data.channels
-        ]
+        rates = np.nanmean(gained, axis=(0, 1)) - 2 * noise / usual
+        rates = np.maximum(rates, 0.01 * noise / usual)
+        gain = est.rig.sensor.gain
+        gains = [float(gain[tank]) if volts else 1.0 for tank, volts in est.data.channels]
         process = 0.5 * np.log(np.mean(rates * np.square(gains)))
         tanks = est.case.loop.plant.tanks
         z = np.concatenate([est.unknowns(fit), np.full(tanks, process), np.log(est.noise)])
@@ -236,9 +220,7 @@ def fit_innovations(estimation: Estimation, fit: Fit, iterations: int) -> Innova
 def choose_likelihood(
     kind: str, estimation: Estimation, fit: Fit, iterations: int
 ) -> tuple[Any, dict]:
-    """Return (InnovationsFit, None for the fit to simulated readings; {"kind", "asked",
-    "reason", "bic", "process_noise"}). reason: "asked", "white" residuals, or "bic", the lower one.
-    """
+    """Return (InnovationsFit or None, {"kind", "asked", "reason", "bic", "process_noise"})."""
     report = {"kind": "output-error", "asked": kind, "reason": "asked", "bic": None}
     report["process_noise"] = None
     if kind == "output-error":
@@ -249,8 +231,7 @@ def choose_likelihood(
             f"likelihood = {kind!r} cannot estimate {names}: accept it with output-error first,"
             " then identify with the rig.toml that is written"
         )
-    residual = residuals_of(estimation, fit)
-    count, channels = int(estimation.mask.sum()), np.moveaxis(residual, -1, 0)
+    count, channels = int(estimation.mask.sum()), np.moveaxis(residuals_of(estimation, fit), -1, 0)
     limit = WHITE / np.sqrt(count / len(channels))
     if kind == "auto" and all(abs(autocorrelation(r, 1)[1]) < limit for r in channels):
         return None, report | {"reason": "white"}
@@ -260,12 +241,8 @@ def choose_likelihood(
         present = [r[np.isfinite(r)] for r in channels]
         simple = sum(r.size * (np.log(2 * np.pi * np.mean(r**2)) + 1) for r in present)
         k = estimation.size + len(channels)
-        bic = {
-            "output-error": float(simple + k * np.log(count)),
-            "innovations": float(
-                -2 * result.log_likelihood + (k + result.process.size) * np.log(count)
-            ),
-        }
+        more = -2 * result.log_likelihood + (k + result.process.size) * np.log(count)
+        bic = {"output-error": float(simple + k * np.log(count)), "innovations": float(more)}
         report |= {"reason": "bic", "bic": bic}
         if bic["output-error"] <= bic["innovations"]:
             return None, report

@@ -27,12 +27,9 @@ class Inputs(NamedTuple):
         return np.maximum(x, 1e-12) ** self.exponent * shape
 
 
-STATIC = ("actuator.delays", "plant.curves")
-"""Names of such numbers that no leaf of a rig holds."""
-CURVE = ("exponent", "bend", "twist")
-"""Fields of Inputs that `plant.curves[j]`, `[j,1]` and `[j,2]` are."""
-POINTS = 12
-"""Points of the curve that stands for an exponent in a rig file."""
+STATIC = ("actuator.delays", "plant.curves")  # names of such numbers that no leaf of a rig holds
+CURVE = ("exponent", "bend", "twist")  # `plant.curves[j]`, `[j,1]`, `[j,2]`
+POINTS = 12  # points of the curve that stands for an exponent in a rig file
 
 
 def with_inputs(loop: Any, values: Mapping[str, float], top: np.ndarray) -> Any:
@@ -46,14 +43,12 @@ def with_inputs(loop: Any, values: Mapping[str, float], top: np.ndarray) -> Any:
         if base == "actuator.delays":
             delays[j] = max(value, 0.0)
         else:
-            field = CURVE[more[0] if more else 0]
-            shapes[j] = shapes.get(j, Inputs())._replace(**{field: value})
+            shapes[j] = shapes.get(j, Inputs())._replace(**{CURVE[more[0] if more else 0]: value})
     for j, shape in shapes.items():
         u = top[j] * np.linspace(0.0, 1.0, POINTS) ** 2
         flow = np.maximum.accumulate(np.where(u > 0.0, top[j] * shape.curve(u / top[j]), 0.0))
-        rises = np.flatnonzero(
-            np.diff(flow, prepend=-1.0) > 0.0
-        )  # of two that are level, the first
+        # of two that are level, the first
+        rises = np.flatnonzero(np.diff(flow, prepend=-1.0) > 0.0)
         points = ((float(f"{v:.7g}") for v in column[rises]) for column in (u, flow))
         curves[j] = tuple(zip(*points))
     least = float(delays.min())
@@ -65,10 +60,7 @@ def with_inputs(loop: Any, values: Mapping[str, float], top: np.ndarray) -> Any:
 
 
 def transformed(dt: np.ndarray, u: np.ndarray, by: Inputs, top: float) -> np.ndarray:
-    """Return the means over pieces of length dt (pieces,) of an input u (pieces,) behind a dead
-    zone, a curve that leaves the largest input `top` as it is, a lag and a delay; the first input
-    is taken to have lasted.
-    """
+    """Return means over pieces (pieces,) of an input behind dead zone, curve, lag and delay."""
     if by.threshold > 0.0:
         u = np.where(u > by.threshold, u, 0.0)
     if by.dead > 0.0:
@@ -101,9 +93,7 @@ def _lagged(dt, u, lag):
 
 
 def played(data: Any, inputs: tuple, values: Any) -> np.ndarray:
-    """Return the inputs of PaddedData behind what values (inputs,) of (field of Inputs, pump, value
-    that the data have already) say.
-    """
+    """Return inputs of PaddedData behind `values` (inputs,) of (field, pump, value in the data)."""
     if not inputs:
         return data.u
     logs, u = data.u.shape[0], np.array(data.u)

@@ -29,7 +29,6 @@ class ColumnOf(NamedTuple):
 
     @property
     def count(self) -> int:
-        """Numbers that are present."""
         return int(np.isfinite(self.values).sum())
 
 
@@ -75,7 +74,6 @@ def inspect(
 
 
 def _column(signal: Signal, slot: str = "") -> ColumnOf:
-    """Return the ColumnOf of a signal."""
     column, values, why = signal.described, np.full(len(signal.t), np.nan), ""
     try:
         states = states_of(column)

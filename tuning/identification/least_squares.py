@@ -10,8 +10,7 @@ from scipy import optimize
 
 from tuning.identification.residuals import ROBUST_LIMIT
 
-CHI_SQUARED_95 = 3.841458820694124
-"""95 % point of the chi-squared distribution with one degree of freedom."""
+CHI_SQUARED_95 = 3.841458820694124  # one degree of freedom
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -80,9 +79,7 @@ def solve(
     tolerance: float = 1e-14,
     prior: Any = None,
 ) -> Fit:
-    """Return the Fit of a search from the unknowns `start` (unknowns,) of an Estimation, or of a
-    Likelihood.
-    """
+    """Return the Fit of a search from `start` (unknowns,) of an Estimation or a Likelihood."""
     before, residual = estimation.evaluations, _Residual(estimation, start, fixed or {}, prior)
     low, high = (side[residual.free] for side in estimation.box)
     begin = np.clip(residual.point[residual.free], low, high)

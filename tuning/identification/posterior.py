@@ -18,14 +18,10 @@ from tuning.identification import simulation
 from tuning.identification.confidence import Spread
 from tuning.identification.result import Identification
 
-CHAINS, WARM_UP, DRAWS = 4, 300, 500
-"""Chains, steps of each that adapt the step size, and its draws."""
+CHAINS, WARM_UP, DRAWS = 4, 300, 500  # chains; steps that adapt; draws of each
 
-OUTSIDE = -1e12
-"""Logarithm of the density outside the ranges of the parameters."""
-
-LARGEST_RHAT = 1.05
-"""R-hat above which the chains have not come to the same distribution [-]."""
+OUTSIDE = -1e12  # logarithm of the density outside the ranges of the parameters
+LARGEST_RHAT = 1.05  # r-hat above which the chains have not come to the same distribution [-]
 
 
 class Posterior(NamedTuple):
@@ -100,7 +96,6 @@ def with_draws(fit: Identification, seed: int = 0) -> Identification:
 
 
 def _values(est, z, names):
-    """The values of the parameters `names` at the unknowns z."""
     values = est.coordinates.values(z[: est.coordinates.size])
     return [values[name] for name in names]
 
@@ -140,7 +135,23 @@ def _chains(keys, arrays, static):
     library = blackjax()
 
     def density(w):
-        return _density(w, arrays, static)
+        z = arrays["at"].at[arrays["estimated"]].add(arrays["factor"] @ w)
+        shared, first = static.coordinates.size, arrays["initial"]
+        dt, u, measured = arrays["data"]
+        values = static.coordinates.values(z[:shared])
+        if static.tanks:
+            levels = (z[shared:] * arrays["scale"]).reshape(len(first), len(static.tanks))
+            first = first.at[:, jnp.array(static.tanks)].set(levels)
+        rig = with_values(arrays["rig"], values)
+        y = simulation.play(rig, dt, u, first, channels=static.channels, substeps=static.substeps)
+        square = jnp.sum(((y - measured) * arrays["weights"]) ** 2)
+        if static.prior:
+            mean, root = arrays["prior"]
+            change = jnp.stack([values[name] for name in static.prior]) - mean
+            square += jnp.sum((root @ change) ** 2)
+        (low, high), edge = arrays["box"], 1e-9
+        inside = jnp.all((z >= low - edge) & (z <= high + edge))
+        return jnp.where(inside, -0.5 * square / arrays["variance"], OUTSIDE)
 
     def chain(key):
         first, warm, later = jax.random.split(key, 3)
@@ -156,25 +167,3 @@ def _chains(keys, arrays, static):
         return jax.lax.scan(move, state, jax.random.split(later, DRAWS))[1]
 
     return jax.vmap(chain)(keys)
-
-
-def _density(w, arrays, static):
-    """The logarithm of the posterior at w (n,), standard deviations of its Laplace approximation
-    away from the estimates.
-    """
-    z = arrays["at"].at[arrays["estimated"]].add(arrays["factor"] @ w)
-    shared, (dt, u, measured), first = static.coordinates.size, arrays["data"], arrays["initial"]
-    values = static.coordinates.values(z[:shared])
-    if static.tanks:
-        levels = (z[shared:] * arrays["scale"]).reshape(len(first), len(static.tanks))
-        first = first.at[:, jnp.array(static.tanks)].set(levels)
-    rig = with_values(arrays["rig"], values)
-    y = simulation.play(rig, dt, u, first, channels=static.channels, substeps=static.substeps)
-    square = jnp.sum(((y - measured) * arrays["weights"]) ** 2)
-    if static.prior:
-        mean, root = arrays["prior"]
-        change = jnp.stack([values[name] for name in static.prior]) - mean
-        square += jnp.sum((root @ change) ** 2)
-    (low, high), edge = arrays["box"], 1e-9
-    inside = jnp.all((z >= low - edge) & (z <= high + edge))
-    return jnp.where(inside, -0.5 * square / arrays["variance"], OUTSIDE)

@@ -26,11 +26,8 @@ from tuning.identification.residuals import autocorrelation, fit_of, residuals_o
 from tuning.identification.result import channels_of
 from tuning.views import Result
 
-LAGS = 20
-"""Lags of the test of whiteness."""
-WIDE = 3.0
-"""Standard deviation of a level, in those of its noise, below which a fit in per cent compares
-the residual with noise."""
+LAGS = 20  # lags of the test of whiteness
+WIDE = 3.0  # sd of a level, in noise, below which its fit in per cent says nothing
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
@@ -58,7 +55,7 @@ class Prediction(Result):
     estimation: Estimation
     fit: Fit
     start_samples: int | None
-    quality: dict[str, list[Any]]
+    quality: dict[str, Any]
     levels: np.ndarray
 
     @property
@@ -81,14 +78,10 @@ def predict(
 
     Parameters
     ----------
-    case : Case or Plant
-        The rig.
-    log : Log or sequence of Log
-        Experiment data, of `tuning.log` or `tuning.read_log`.
+    case, log, gap
+        As in `identify`.
     start_samples : int, optional
         Samples at the beginning of each log that its first levels follow from; all by default.
-    gap : float
-        Longest step between samples, in usual steps.
 
     Returns
     -------
@@ -131,12 +124,25 @@ def predict(
         first = Estimation(case, parts, {}, samples=estimation.mask.shape[1], **settings)
     fit = solve(first, first.nominal())
     residual = residuals_of(estimation, fit)
+    start = start_samples or 0
+    y, quality = estimation.data.y, fit_of(estimation.data.y, residual)
+    after = fit_of(y[:, start:], residual[:, start:])
+    tests = {"bias": [], "residual_autocorrelation": [], "white": [], "input_correlation": []}
+    sd = np.nanstd(np.where(np.isnan(residual), np.nan, y), axis=(0, 1)) / estimation.noise
+    for r in np.moveaxis(residual, -1, 0):
+        rho, n = autocorrelation(r, LAGS), int(np.isfinite(r).sum())
+        # Ljung and Box (Biometrika 65, 1978, 297)
+        statistic = n * (n + 2) * np.sum(rho[1:] ** 2 / np.maximum(n - np.arange(1, len(rho)), 1))
+        tests["bias"].append(float(np.nanmean(r)) if n else None)
+        tests["residual_autocorrelation"].append(float(rho[1]) if len(rho) > 1 else None)
+        tests["white"].append(float(chi2.sf(statistic, len(rho) - 1)) if n > LAGS else None)
+        tests["input_correlation"].append(_input_correlation(estimation, r))
     return Prediction(
         case=case,
         estimation=estimation,
         fit=fit,
         start_samples=start_samples,
-        quality=_quality(estimation, residual, start_samples or 0),
+        quality={**quality, **tests, "after_start": after, "level_sd_in_noise": sd.tolist()},
         levels=estimation.first_levels(estimation.unknowns(fit)),
     )
 
@@ -163,9 +169,7 @@ def played(case: Case, log: Log) -> Case:
 
 
 def beside(case: Case, log: Log, run: Any) -> dict[str, Any]:
-    """Return {"name", "t", "channels"} of experiment data and the Trajectory of its `played` case:
-    of each channel its "measured" and "simulated" readings, "rmse", "nrmse_percent", "bias".
-    """
+    """Return {"name", "t", "channels"}: measured beside simulated readings, and their errors."""
     t, sensor, channels = log.t - log.t[0], case.loop.sensor, []
     inside = t <= float(run.t[-1]) * (1 + 1e-9)
     for y, tank, volts in zip(log.y[inside].T, log.tanks, log.in_volts):
@@ -218,27 +222,8 @@ def achieved(case: Case, log: Log) -> list[dict[str, Any]]:
     return rows
 
 
-def _quality(estimation, residual, start):
-    """Return the measures and tests of residuals (logs, samples, channels)."""
-    y, quality = estimation.data.y, fit_of(estimation.data.y, residual)
-    after = fit_of(y[:, start:], residual[:, start:])
-    tests = {"bias": [], "residual_autocorrelation": [], "white": [], "input_correlation": []}
-    sd = np.nanstd(np.where(np.isnan(residual), np.nan, y), axis=(0, 1)) / estimation.noise
-    for r in np.moveaxis(residual, -1, 0):
-        rho, n = autocorrelation(r, LAGS), int(np.isfinite(r).sum())
-        # Ljung and Box (Biometrika 65, 1978, 297)
-        statistic = n * (n + 2) * np.sum(rho[1:] ** 2 / np.maximum(n - np.arange(1, len(rho)), 1))
-        tests["bias"].append(float(np.nanmean(r)) if n else None)
-        tests["residual_autocorrelation"].append(float(rho[1]) if len(rho) > 1 else None)
-        tests["white"].append(float(chi2.sf(statistic, len(rho) - 1)) if n > LAGS else None)
-        tests["input_correlation"].append(_input_correlation(estimation, r))
-    return {**quality, **tests, "after_start": after, "level_sd_in_noise": sd.tolist()}
-
-
 def _input_correlation(estimation, residual):
-    """Return the largest correlation of residuals with an input up to LAGS samples before, as a
-    multiple of its standard deviation for independent ones; None without a change of inputs.
-    """
+    """Return the largest correlation of residuals with earlier inputs [sd], or None."""
     u = estimation.data.u
     u, largest = (u[:, :, 0] if u.ndim == 4 else u), 0.0
     for j in range(u.shape[-1]):

@@ -27,14 +27,11 @@ from tuning.identification.residuals import given_noise, noise_of
 
 STARTS = ("free", "measured", "case")
 
-LARGEST_ERROR = 0.05
-"""Share of a channel's largest reading by which halving the steps may still move a reading."""
+LARGEST_ERROR = 0.05  # share of a channel's largest reading that shorter steps may change
 
-DIFFERENCE = 1e-6
-"""Change of a coordinate of an input by which slopes are computed."""
+DIFFERENCE = 1e-6  # change of a coordinate of an input by which slopes are computed
 
-LARGEST_SLOPE = 1e60
-"""Sensitivity, in standard deviations per unit of a coordinate, above which a run diverged."""
+LARGEST_SLOPE = 1e60  # sensitivity, in noise per unit, above which a run diverged
 
 
 class Estimation:
@@ -47,23 +44,12 @@ class Estimation:
 
     Parameters
     ----------
-    case : Case
-        The rig.
+    case, free, start, noise, substeps, prior
+        As in `identify`; tanks without readings start from the case's levels unless free.
     logs : sequence of Log
         Experiment data of this rig.
-    free : mapping, optional
-        {name: (low, high)} or {name: (low, high, "log" or "linear")}; `default_free` if omitted.
-    start : {"free", "measured", "case"}
-        Levels at the first sample: estimated, measured, or from the case. Tanks that are not
-        measured start from the case's levels unless they are free.
-    noise : (channels,) array, optional
-        Standard deviation that weights each channel; estimated from the data if omitted.
-    substeps : int, optional
-        Runge-Kutta steps per sample; found by halving if omitted.
     samples : int
         Least length that the data are padded to.
-    prior : bool
-        Whether the `covariance` of the case counts: that of an earlier identification.
     inputs : sequence
         (Bound, (field of Inputs, pump, value that the rig has)) of dead times, lags, dead zones and
         curves to estimate.
@@ -118,8 +104,7 @@ class Estimation:
         self.prior_weight = 1.0  # the standard deviation of the residual, once it is known
         self.rig = simulation.rig_of(loop)
         courses = simulation.courses_of(logs, loop.actuator, case.clock.dt)
-        delays = simulation.delays_of(loop.actuator)
-        self.data = simulation.padded(logs, delays, samples, courses)
+        self.data = simulation.padded(logs, simulation.delays_of(loop.actuator), samples, courses)
         self.initial = self._initial_levels(start)  # (logs, tanks), before any is estimated
         self.tanks = tuple(range(loop.plant.tanks)) if start == "free" else ()
         channels = len(self.data.channels)
@@ -135,9 +120,7 @@ class Estimation:
         self.substeps = self.substeps_for(self.nominal()) if substeps is None else int(substeps)
 
     def _prior(self):
-        """Return (names, values (n,), root (n, n) of the information) of the case's covariance, of
-        the parameters that are estimated; None without one.
-        """
+        """Return (names, values (n,), root (n, n) of the information) of the prior, or None."""
         names, matrix = self.case.covariance or ((), ())
         chosen = [i for i, name in enumerate(names) if name in self.coordinates.names]
         if not chosen:
@@ -205,8 +188,7 @@ class Estimation:
         """(low, high) of every unknown: coordinates, then levels as shares of their rims."""
         low, high = self.coordinates.box
         plant, tanks, scale = self.case.loop.plant, list(self.tanks), self.level_scale
-        past = 1.0 if getattr(plant, "overflow", False) else 1.5
-        top = np.asarray(plant.rim)[tanks] * past
+        top = np.asarray(plant.rim)[tanks] * (1.0 if getattr(plant, "overflow", False) else 1.5)
         top = np.maximum(top, self.initial[:, tanks].max(axis=0, initial=0.0))
         return (
             np.concatenate([low, np.zeros(scale.size)]),
@@ -245,8 +227,7 @@ class Estimation:
     def split(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (coordinates (shared,), levels (logs, free levels) in the rig's unit) of z."""
         shared = self.coordinates.size
-        levels = z[shared:] * self.level_scale
-        return z[:shared], levels.reshape(len(self.logs), len(self.tanks))
+        return z[:shared], (z[shared:] * self.level_scale).reshape(len(self.logs), len(self.tanks))
 
     def unknowns(self, fit: Any) -> np.ndarray:
         """Return (unknowns,) of a Fit, the inverse of `split`."""
@@ -264,9 +245,7 @@ class Estimation:
         return levels
 
     def predicted(self, z: np.ndarray, data: Any = None) -> np.ndarray:
-        """Return (logs, samples, channels) simulated readings at the unknowns z, for the inputs of
-        the PaddedData `data`, its own by default.
-        """
+        """Return (logs, samples, channels) simulated readings at z, for the inputs of `data`."""
         data = self.data if data is None else data
         return np.asarray(
             simulation.play(
@@ -285,9 +264,7 @@ class Estimation:
         return played(data, of.inputs, list(of.values(p).values())[of.leaves.size :])
 
     def by_log(self, p: np.ndarray, levels: np.ndarray, logs: Any = slice(None)) -> tuple:
-        """Return (residual (logs, samples, channels), Jacobian (.., unknowns of a log)), weighted,
-        at coordinates p, of all logs or (logs, shared), and free levels (logs, free levels).
-        """
+        """Return weighted (residual (logs, samples, channels), Jacobian) at p and free levels."""
         rig, tanks, free = self.rig, self.tanks, len(self.tanks)
         if not tanks and np.any(self.initial != self.initial[0]):
             levels, tanks = self.initial[logs], tuple(range(self.initial.shape[1]))

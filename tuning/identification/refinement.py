@@ -14,16 +14,11 @@ from tuning.identification.least_squares import solve
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import WHITE, autocorrelation
 
-FOLDS = 4
-"""Blocks of the data, each predicted by a fit to the others."""
-CROSS_VALIDATION_RATIO = 0.95
-"""Ratio of the mean squares of the prediction errors below which a part is added [-]."""
-MOST_POINTS = 8
-"""Most points of a curve of a sensor."""
-SUBSTEPS = 8
-"""Most Runge-Kutta steps per sample while parts are compared."""
-READINGS = 20
-"""Fewest readings per point."""
+FOLDS = 4  # blocks of the data, each predicted by a fit to the others
+CROSS_VALIDATION_RATIO = 0.95  # of mean squares, below which a part is added [-]
+MOST_POINTS = 8  # most points of a curve of a sensor
+SUBSTEPS = 8  # most Runge-Kutta steps per sample while parts are compared
+READINGS = 20  # fewest readings per point
 
 
 class Part(NamedTuple):
@@ -47,11 +42,9 @@ class Refinement(NamedTuple):
 def parts_of(estimation: Estimation) -> list[Part]:
     """Return the Parts that the rig of an estimation could have."""
     loop, taken = estimation.case.loop, {b.name for b in estimation.bounds}
-    parts = [
-        part
-        for c, (tank, volts) in enumerate(estimation.data.channels)
-        if (part := _sensor_curve(loop.sensor, estimation.data.y[..., c], tank, volts)) is not None
-    ]
+    read = zip(np.moveaxis(estimation.data.y, -1, 0), estimation.data.channels)
+    curves = (_sensor_curve(loop.sensor, y, *channel) for y, channel in read)
+    parts = [part for part in curves if part is not None]
     plant: Any = loop.plant
     if type(plant) is not TankNetwork:
         return parts
@@ -61,12 +54,8 @@ def parts_of(estimation: Estimation) -> list[Part]:
         parts.append(Part("area", tank, {name: (area / 5, area * 5, "log")}, lambda loop: loop))
     for kind, sources in (("drain", range(plant.tanks)), ("orifice", [a for a, _ in plant.links])):
         areas = np.asarray(getattr(plant, kind))
-        parts += [
-            part
-            for k, tank in enumerate(sources)
-            if areas[k] > 0
-            for part in _outlet(plant, f"plant.{kind}", k, tank, float(areas[k]))
-        ]
+        for k, tank in ((k, tank) for k, tank in enumerate(sources) if areas[k] > 0):
+            parts += _outlet(plant, f"plant.{kind}", k, tank, float(areas[k]))
     return [part for part in parts if not part.free.keys() & taken]
 
 
@@ -82,14 +71,10 @@ def _outlet(plant, kind, k, tank, area):
         absent = getattr(loop.plant, name.removeprefix("plant.")) is None
         return with_values(loop, {name: every}) if absent else loop
 
+    linear = lambda loop: with_values(loop, {other: 1e3 * usual})
     return [
         Part("outlet-exponent", tank, {f"{name}[{k}]": (0.1, 1.5, "linear")}, with_exponents),
-        Part(
-            "outlet-linear",
-            tank,
-            {other: (0.1 * usual, 1e4 * usual, "log")},
-            lambda loop: with_values(loop, {other: 1e3 * usual}),
-        ),
+        Part("outlet-linear", tank, {other: (0.1 * usual, 1e4 * usual, "log")}, linear),
     ]
 
 
@@ -119,10 +104,8 @@ def _sensor_curve(sensor, y, tank, volts):
             levels[tank] = readings[tank] = every[tank]
         else:
             levels = readings = every
-        sensor = dataclasses.replace(
-            sensor, curve_level=number(levels), curve_reading=number(readings)
-        )
-        return dataclasses.replace(loop, sensor=sensor)
+        curve = {"curve_level": number(levels), "curve_reading": number(readings)}
+        return dataclasses.replace(loop, sensor=dataclasses.replace(sensor, **curve))
 
     return Part("sensor-curve", tank, dict.fromkeys(names, ends), with_curve)
 
@@ -164,9 +147,7 @@ class _Search:
         return fit, self.predicted(fit, chosen)
 
     def predicted(self, fit, chosen):
-        """Return (FOLDS,) sums of squares of each block's residuals under a fit to the others: one
-        Gauss-Newton step of the parameters from a Fit to all.
-        """
+        """Return (FOLDS,) squares of each block after a Gauss-Newton step to the others."""
         # what the others do not determine stays: as if each coordinate were known to within 1, and
         # the levels at the first sample, which a prediction finds from the block itself
         free = self.unknowns(chosen)
@@ -184,9 +165,7 @@ class _Search:
 
 
 def refined(result: Any, settings: Mapping[str, Any]) -> tuple[Any, dict, list[Refinement]]:
-    """Return (case, free, Refinements) of an Identification after adding the Parts that predict
-    left-out blocks of its data better.
-    """
+    """Return (case, free, Refinements) with the Parts that predict left-out blocks better."""
     free = {b.name: (b.low, b.high, b.scale) for b in result.estimation.bounds}
     if _is_white(result.estimation, result.fit):
         return result.case, free, []
@@ -199,9 +178,8 @@ def refined(result: Any, settings: Mapping[str, Any]) -> tuple[Any, dict, list[R
         start = search.problem.unknowns(fit)
         trials = [(search.fit([*chosen, k], start), k) for k in others]
         (trial, after), k = min(trials, key=lambda t: t[0][1].sum())
-        if not (
-            after.sum() < CROSS_VALIDATION_RATIO * best.sum() and (after < best).sum() > FOLDS / 2
-        ):
+        less = after.sum() < CROSS_VALIDATION_RATIO * best.sum()
+        if not less or (after < best).sum() <= FOLDS / 2:
             break
         part = search.parts[k]
         added.append(Refinement(part.kind, part.where, root(best), root(after)))

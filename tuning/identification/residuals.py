@@ -4,13 +4,10 @@ import numpy as np
 
 from jaxtank.core.errors import InputError
 
-ENOUGH = 10
-"""Fewest second differences from which the noise of a channel is estimated."""
+ENOUGH = 10  # fewest second differences from which the noise of a channel is estimated
 LAGS = 60
-WHITE = 3.0
-"""Largest autocorrelation of white residuals at lag 1, in its standard deviation 1/sqrt(n)."""
-ROBUST_LIMIT = 3.0
-"""Residual, in standard deviations, beyond which a robust loss reduces its weight."""
+WHITE = 3.0  # largest autocorrelation of white residuals at lag 1, in 1/sqrt(n)
+ROBUST_LIMIT = 3.0  # residual, in noise, from which a robust loss reduces its weight
 
 
 def given_noise(noise, channels):
@@ -120,9 +117,7 @@ def _lagged(v, lags):
 
 
 def pseudo(fit):
-    """Return (rows,) pseudo-residuals psi(r) / mean psi'(r) (Huber, Robust Statistics,
-    1981, 7.6).
-    """
+    """Return (rows,) pseudo-residuals psi(r) / mean psi'(r) (Huber, Robust Statistics, 7.6)."""
     r, limit = fit.residual, ROBUST_LIMIT
     if fit.loss == "huber":
         inside = np.abs(r) < limit

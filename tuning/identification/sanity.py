@@ -7,15 +7,11 @@ import numpy as np
 from jaxtank.rig.sensors import spans_of
 from tuning.identification.experiment import Log
 
-LUCK = 1e-4
-"""Probability of equal readings in a row above which they may be chance."""
-SHORTEST = 8
-"""Fewest equal readings in a row that are called frozen, and fewest changes of others [-]."""
-JUMP = 8.0
-"""Least jump of a spike, there and back, in noise, and over the changes beside it a half of it."""
+LUCK = 1e-4  # probability of equal readings in a row above which they may be chance
+SHORTEST = 8  # equal readings in a row that are called frozen, and changes of others
+JUMP = 8.0  # least jump of a spike, there and back, in noise; over its neighbours half of it
 
-FEW = 5
-"""Most readings in a row that a spike has."""
+FEW = 5  # most readings in a row that a spike has
 
 
 class Oddity(NamedTuple):
@@ -54,7 +50,6 @@ def oddities(log: Log, loop=None) -> list[Oddity]:
 
 
 def _still(t, u):
-    """Yield (kind, samples, first time, value) of an input that never changes."""
     if len(u) > 1 and np.ptp(u) == 0.0:
         yield "still" if u[0] else "off", len(u), t[0], u[0]
 
@@ -78,9 +73,7 @@ def _of_level(log, c, ends):
 
 
 def _band(y):
-    """Return the dead band of readings that are written on change and repeated until then; 0 where
-    fewer than half repeat, or where readings are no finer than their changes.
-    """
+    """Return the dead band of readings that are written on change and repeated, else 0."""
     changes = np.abs(np.diff(y))
     changes = changes[changes > 0.0]
     if changes.size < SHORTEST or 2 * changes.size > len(y) - 1:
@@ -90,9 +83,7 @@ def _band(y):
 
 
 def _stuck(y):
-    """Return [(start, stop)] of equal readings in a row: more than the resolution makes, among
-    readings with noise, or left by a jump.
-    """
+    """Return [(start, stop)] of equal readings in a row that resolution does not explain."""
     if len(y) < 2 * SHORTEST:
         return []
     step, bend = np.diff(y), np.diff(y, 2)
@@ -136,9 +127,7 @@ def _noise(y):
 
 
 def _dips(y, quiet):
-    """Return the samples of two to FEW readings that jump away together and back, as `_spikes` of
-    one, while no input changes (quiet, between readings).
-    """
+    """Return the samples of two to FEW readings that jump away and back while inputs rest."""
     if len(y) < SHORTEST:
         return np.zeros(0, dtype=int)
     dips: list[int] = []
@@ -146,9 +135,8 @@ def _dips(y, quiet):
     jumps, step = np.sign(step) * (np.abs(step) > JUMP * noise), np.abs(step)
     for n in range(2, FEW + 1):
         there, back = jumps[1 : len(y) - n - 2], jumps[1 + n : len(y) - 2]
-        for k in 1 + np.flatnonzero(
-            there * back < 0
-        ):  # the last before them; k + n + 1 is the first after
+        # k: the last before them; k + n + 1 is the first after
+        for k in 1 + np.flatnonzero(there * back < 0):
             around, away = y[[k, k + n + 1]], y[k + 1 : k + n + 1]
             jump = np.abs(away - around.mean()).min()
             beside = max(step[k - 1], step[k + n + 1], np.ptp(around))

@@ -18,17 +18,15 @@ from jaxtank.core.tables import (
 )
 
 # fmt: off
-TIME = {
+TIME = {  # names of a column of times, letters and digits only
     "t", "time", "timestamp", "datetime", "date", "elapsed", "elapsedtime", "sampletime", "ts",
     "localtime", "utctime", "timeutc", "seconds", "minutes", "hours", "zeit", "zeitstempel",
     "datum", "datumzeit", "uhrzeit", "horodatage",
 }
-"""Names of a column of times, letters and digits only."""
-WORDS = {
+WORDS = {  # names of a pump's input and a level, before their number
     **dict.fromkeys(("pump", "u", "voltage", "input"), "pump"),
     **dict.fromkeys(("h", "level", "y", "tank", "x"), "h"),
 }
-"""Names of a pump's input and a level, before their number."""
 TAG = {
     "tag", "tagname", "tagid", "name", "point", "pointname", "variable", "signal", "item",
     "itemid", "sensor", "channel", "bezeichnung", "kanal", "topic", "field", "metric", "series",
@@ -46,21 +44,18 @@ MEASURED = {"pv", "val", "value", "actual", "ist", "istwert", "avg", "mean", "me
 DRIVEN = {"op", "out", "output", "cv", "mv", "co", "cmd", "command"}
 """Words of a controller that mean its output, the input of a pump."""
 GOOD = {"good", "ok", "g", "valid", "gut", "true", "normal"}
-POOR = {
+POOR = {  # first words of a quality, in lower case
     "bad", "uncertain", "questionable", "substituted", "b", "u", "poor", "invalid", "false",
     "schlecht", "unsicher",
 }
-"""First words of a quality, in lower case."""
-SWITCH = {
+SWITCH = {  # {word for the state of a pump or a valve, in lower case: share of its range}
     **dict.fromkeys(("on", "true", "running", "run", "open", "opened", "started", "start"), 1.0),
     **dict.fromkeys(("ein", "an", "wahr", "auf", "offen", "läuft", "yes", "enabled"), 1.0),
     **dict.fromkeys(("off", "false", "stopped", "stop", "closed", "close", "idle", "shut"), 0.0),
     **dict.fromkeys(("aus", "falsch", "zu", "geschlossen", "steht", "no", "disabled"), 0.0),
 }
-"""{word for the state of a pump or a valve, in lower case: share of its range}."""
 # fmt: on
-GOOD_CODE = 192
-"""Least code of OPC for a good quality."""
+GOOD_CODE = 192  # least code of OPC for a good quality
 
 
 class Signal(NamedTuple):
@@ -73,14 +68,11 @@ class Signal(NamedTuple):
 
     @property
     def described(self) -> Column:
-        """The column with its header, name and unit."""
         return self.table.columns[self.column]
 
 
 def time_columns(table: Table) -> list[int]:
-    """Return the columns of the times, the last the one to read: of dates and times of day joined,
-    where they have a column each.
-    """
+    """Return the columns of the times, the last the one to read: dates and times of day joined."""
     columns = table.columns
     where = lambda holds: [i for i, column in enumerate(columns) if holds(column)]
     days = where(lambda c: is_time(c.cells[0]) and ":" not in c.cells[0])
@@ -143,9 +135,7 @@ def _wide(table, used, t):
 
 
 def _qualities(columns, rest):
-    """Return {column of qualities: what it judges} among some; TRUE and FALSE of what has no values
-    are its states.
-    """
+    """Return {column of qualities: what it judges}; TRUE and FALSE alone are states."""
     qualities = {i: name for i in rest if (name := _judged(columns[i])) is not None}
     values = [compact(columns[i].name) for i in rest if i not in qualities]
     states = [i for i in qualities if states_of(columns[i]) is not None]
@@ -154,14 +144,11 @@ def _qualities(columns, rest):
 
 
 def compact(text):
-    """Return the letters and digits of a name, in lower case."""
     return re.sub(r"[\W_]+", "", text.lower())
 
 
 def rank(text, slot, name, slots):
-    """Return how well a column's name means a slot: 3 exactly, 2 with a word for a value, 1 with
-    other words, 0 not at all. name: the rig's own, or the slot.
-    """
+    """Return how well a column's name means a slot: 3 exactly, 2 as a value, 1 in part, 0 not."""
     letter = "h" if slots[slot][0] == "h" else "u"
     if _generic(text, slots) == slot or text in (name, f"{letter}_{name}"):
         return 3 if text else 0
@@ -178,9 +165,7 @@ def rank(text, slot, name, slots):
 
 
 def states_of(column):
-    """Return (cells,) shares of a range of a column of words such as ON and OFF, NaN of a missing
-    one; None of another column.
-    """
+    """Return (cells,) shares of a range of words such as ON and OFF, NaN if missing, or None."""
     words = [cell.lower() for cell in column.cells]
     if not {*words} & SWITCH.keys() or not {*words} <= SWITCH.keys() | MISSING:
         return None
@@ -188,12 +173,9 @@ def states_of(column):
 
 
 def setpoint_of(text, names):
-    """Return the tank whose setpoint a column's name means, or None; names: {tank of each output:
-    its names}.
-    """
+    """Return the tank whose setpoint a column means, or None; names: {tank: its names}."""
     # "SP1" is of output 1, also where that is another tank; "LIC101.SP" of the tank with number 101
-    spoken = re.sub(r"set[\W_]?points?", "sp", text.lower())
-    parts = re.findall(r"[^\W\d_]+|\d+", spoken)
+    parts = re.findall(r"[^\W\d_]+|\d+", re.sub(r"set[\W_]?points?", "sp", text.lower()))
     rest, tanks = [part for part in parts if part not in SETPOINT], [*names]
     if len(rest) == len(parts):
         return None
@@ -209,18 +191,14 @@ def _of_number(parts, names):
         return []  # FIC101: of a flow
     if not beside and 0 < int(number) <= len(names):
         return [[*names][int(number) - 1]]
-    return [i for i, of in names.items() if any(number == _digits(n) for n in of)]
+    digits = lambda name: (re.findall(r"\d+", name) or [""])[-1]
+    return [i for i, of in names.items() if any(number == digits(n) for n in of)]
 
 
 def _within(name, parts):
     """Whether parts of a text in a row make up a name."""
     ends = range(len(parts) + 1)
     return any("".join(parts[a:b]) == name for a in ends for b in ends[a + 1 :])
-
-
-def _digits(name):
-    """Return the last number in a name, "" without one."""
-    return (re.findall(r"\d+", name) or [""])[-1]
 
 
 def _generic(stem, slots):
@@ -244,7 +222,6 @@ def _judged(column):
 
 
 def _word(mark):
-    """Return the first word of a quality, in lower case."""
     return re.split(r"[\s,;(\[]+", mark.strip().lower())[0]
 
 

@@ -38,7 +38,6 @@ class Rig:
 
 
 def rig_of(loop):
-    """Return the Rig of a loop."""
     # A constant disturbance belongs to it; one that varies belongs to another run and does not. The
     # limit of change and the transport delay of the pumps are applied by `padded`.
     _, steady, _ = parts_of(loop.disturbance)
@@ -79,9 +78,7 @@ class PaddedData(NamedTuple):
 
 
 def padded(logs, delays: Any = 0.0, samples=0, courses=None):
-    """Return the PaddedData of a list of Log, of at least `samples` samples; courses: `courses_of`
-    each log, its inputs as they are by default.
-    """
+    """Return the PaddedData of Logs, of `samples` samples or more; courses: `courses_of` each."""
     # An input reaches its tank after the delay [s] of its pump, also between samples. Truncated
     # data padded to the length of the whole run through the same compiled program.
     channels = tuple(sorted({pair for log in logs for pair in zip(log.tanks, log.in_volts)}))
@@ -103,9 +100,7 @@ def padded(logs, delays: Any = 0.0, samples=0, courses=None):
 
 
 def courses_of(logs, actuator, dt):
-    """Return (times [s], inputs) of each pump of each Log: its commands within the limits, as the
-    pumps of a rig with sampling period dt [s] follow them at their `rate`; None without a rate.
-    """
+    """Return (times [s], inputs) of each pump of each Log behind its `rate`; None without one."""
     if actuator.rate is None:
         return None
     rates = np.broadcast_to(np.asarray(actuator.rate, dtype=float), logs[0].u.shape[1])
@@ -116,14 +111,11 @@ def courses_of(logs, actuator, dt):
     ]
 
 
-MOST_PIECES = 4
-"""Pieces of a sample at most for the ramp of a slow pump: each is compiled."""
+MOST_PIECES = 4  # pieces of a sample at most for the ramp of a slow pump: each is compiled
 
 
 def _followed(log, u, rate, dt):
-    """Return (times [s], inputs) of a pump that follows u (samples,) at a rate per second; inputs
-    that never move faster are those that the pump had, and stay. It starts at the first one.
-    """
+    """Return (times [s], inputs) of a pump that follows u (samples,) at a rate per second."""
     steps = np.diff(log.t)
     if np.all(np.abs(np.diff(u)) <= rate * steps * (1 + 1e-6)):
         return log.t, u
@@ -153,10 +145,7 @@ def _averaged(samples, t, u):
 
 
 def _pieces(log, courses, delays):
-    """Return (samples, pieces) lengths [s] and (samples, pieces, pumps) inputs of a Log: the steps
-    between its samples, cut where an input (times, values) that reaches the tanks after its pump's
-    delay [s] changes.
-    """
+    """Return lengths [s] and inputs of the pieces of each sample, cut where an input changes."""
     near = 1e-9 * max(1.0, float(np.max(delays)), float(np.abs(log.t).max()))
     linear = log.hold == "first-order"
     cuts = [_cuts(t, u, linear, delay) for (t, u), delay in zip(courses, delays)]
@@ -196,9 +185,7 @@ def changes_of(u):
 
 
 def player(rig, dt, u, substeps):
-    """Return (levels, state of the pumps, (levels, state, pieces of a sample, further inflows) ->
-    both one sample later, pieces of all samples).
-    """
+    """Return (levels, pumps, function of one sample, pieces of all samples)."""
     if dt.ndim == 1:
         dt, u = dt[:, None], u[:, None]
     x, d = tuple(rig.x0[i] + 0.0 * dt[0, 0] for i in range(rig.plant.tanks)), None
@@ -240,9 +227,7 @@ def player(rig, dt, u, substeps):
 
 
 def readings(rig, dt, u, channels, substeps, flows=None):
-    """Return (samples, channels) readings without noise, in the channels' units; levels where there
-    are no channels. flows : (samples, tanks) inflows beside the rig's own.
-    """
+    """Return (samples, channels) readings without noise; levels where there are no channels."""
     x, state, stepped, pieces = player(rig, dt, u, substeps)
     entering = None if flows is None else tuple(flows[:, i] for i in range(rig.plant.tanks))
 
@@ -257,9 +242,7 @@ def readings(rig, dt, u, channels, substeps, flows=None):
 
 @compiled("coordinates", "tanks", "channels", "substeps", keep=True)
 def sensitivities(rig, dt, u, p, first, *, coordinates, tanks, channels, substeps):
-    """Return (logs, samples, channels) readings and their derivatives by the unknowns of each log:
-    coordinates p, of all logs or (logs, coordinates), then levels `first` (logs, tanks).
-    """
+    """Return readings (logs, samples, channels) and their slopes by p, then levels `first`."""
     shared = coordinates.size
 
     def of_log(dt, u, p, first):
@@ -277,9 +260,7 @@ def sensitivities(rig, dt, u, p, first, *, coordinates, tanks, channels, substep
 
 @compiled("coordinates", "substeps", keep=True)
 def variants(rig, dt, u, flows, p, first, *, coordinates, substeps):
-    """Return (variants, logs, samples, tanks) levels of a Rig at coordinates p (variants, shared),
-    for inputs u, further inflows `flows` and levels `first` of each variant and log.
-    """
+    """Return (variants, logs, samples, tanks) levels of a Rig at p, for inputs, flows, starts."""
 
     def of_log(dt, u, flows, p, first):
         r = dataclasses.replace(with_values(rig, coordinates.values(p)), x0=first)

@@ -47,7 +47,6 @@ class Lagrangian(NamedTuple):
 
 
 def scaled(lagrangian, ratio):
-    """Return a Lagrangian with its multipliers times a ratio."""
     return lagrangian._replace(
         multipliers=tuple(f * ratio for f in lagrangian.multipliers),
         integral_multipliers=lagrangian.integral_multipliers * ratio,
@@ -158,12 +157,10 @@ def _search_cost(u, loop, clock, terms, lagrangian):
 
 
 def _names(terms):
-    """Return the measures that a run accumulates."""
     return tuple(dict.fromkeys([*(m for m, _ in terms.objective), *(m for m, _ in terms.integral)]))
 
 
 def _with_inputs(loop, u):
-    """Return an open loop with other inputs."""
     signal = dataclasses.replace(loop.controller.signal, values=u)
     return dataclasses.replace(loop, controller=dataclasses.replace(loop.controller, signal=signal))
 

@@ -27,14 +27,11 @@ from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.components import REGISTERED, ROLES, controller_of, kind_of, model_of
 from jaxtank.rig.template import around
 
-NAMES = ("controller.kind", "law.kind")
-"""Names by which a choice of the controller is known: in Python, and of the table of a rig file."""
+NAMES = ("controller.kind", "law.kind")  # of Python, and of a rig file
 
 FASTER = 10.0  # time constant of the rig / time constant of the first closed loop [-]
 
-DEVIATION, EFFORT = 0.05, 0.25
-"""A level off by the first share of the tanks' height counts as much as an input off by the second
-share of its range (Bryson's rule) [-]."""
+DEVIATION, EFFORT = 0.05, 0.25  # share of the height, of a pump's range (Bryson's rule)
 
 
 class Rig(NamedTuple):
@@ -71,8 +68,7 @@ def with_kind(case: Case, kind: str) -> Case:
     controller, gains = _published(case, kind) or _computed(case, kind)
     loop = dataclasses.replace(case.loop, controller=controller)
     others = {n: f for n, f in case.free.items() if not n.startswith("controller.")}
-    changed = case.replace(loop=loop, free={**gains, **others}, symmetry=None)
-    return rig.check(rig.filtered(changed))
+    return rig.check(rig.filtered(case.replace(loop=loop, free={**gains, **others}, symmetry=None)))
 
 
 def _is_kind(controller: Any, kind: str) -> bool:
@@ -97,33 +93,17 @@ def _published(case: Case, kind: str) -> tuple[Any, dict[str, Any]] | None:
 
 
 def same_rig(*cases: Case) -> bool:
-    """Return whether two cases have the same plant and pumps."""
-    trees = [jax.tree.flatten((case.loop.plant, case.loop.actuator)) for case in cases]
-    (leaves, form), (others, other_form) = trees
-    return form == other_form and all(np.array_equal(a, b) for a, b in zip(leaves, others))
+    return equal(*((case.loop.plant, case.loop.actuator) for case in cases))
+
+
+def equal(a: Any, b: Any) -> bool:
+    """Return whether two parts of a loop are the same in structure and every number."""
+    (leaves, form), (others, other) = jax.tree.flatten(a), jax.tree.flatten(b)
+    return form == other and all(np.array_equal(x, y) for x, y in zip(leaves, others))
 
 
 def _computed(case: Case, kind: str) -> tuple[Any, dict[str, Any]]:
     """Return (controller, ranges) of a kind with the first gains of `START`."""
-    known = _rig_of(case)
-    table, names = START[kind](known)
-    written = {name: np.asarray(value).tolist() for name, value in table.items()}
-    controller = controller_of({"kind": kind, **written}, case.loop)
-    loop = dataclasses.replace(case.loop, controller=controller)
-    free: dict[str, Any] = {}
-    for name in names:
-        dotted = f"controller.{name}"
-        value = np.asarray(get_value(loop, dotted))
-        if name == "K":  # a matrix, whose entries may have either sign
-            largest = 4.0 * float(np.abs(value).max())
-            free[dotted] = Free(-largest, largest, "linear")
-        else:
-            free[dotted] = around(value, describe(loop, dotted))
-    return controller, free
-
-
-def _rig_of(case: Case) -> Rig:
-    """Return the data for the first gains."""
     plant: Any = model_of(case.loop)
     pumps = (plant.pumps,)
     if plant.pumps != len(plant.outputs):
@@ -143,7 +123,21 @@ def _rig_of(case: Case) -> Rig:
     height = float(np.max(rims[np.isfinite(rims)], initial=0.0)) or float(np.max(levels))
     slow = float(np.min(-np.linalg.eigvals(A).real))
     slowest = min(1.0 / max(slow, 1e-300), case.clock.duration)
-    return Rig(A, B, C, levels, setpoint, low, high, DEVIATION * height, EFFORT * span, slowest)
+    known = Rig(A, B, C, levels, setpoint, low, high, DEVIATION * height, EFFORT * span, slowest)
+    table, names = START[kind](known)
+    written = {name: np.asarray(value).tolist() for name, value in table.items()}
+    controller = controller_of({"kind": kind, **written}, case.loop)
+    loop = dataclasses.replace(case.loop, controller=controller)
+    free: dict[str, Any] = {}
+    for name in names:
+        dotted = f"controller.{name}"
+        value = np.asarray(get_value(loop, dotted))
+        if name == "K":  # a matrix, whose entries may have either sign
+            largest = 4.0 * float(np.abs(value).max())
+            free[dotted] = Free(-largest, largest, "linear")
+        else:
+            free[dotted] = around(value, describe(loop, dotted))
+    return controller, free
 
 
 def operating_point(case: Case, plant: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -166,9 +160,7 @@ def operating_point(case: Case, plant: Any) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def _circulating(loop: Any, plant: Any, setpoint: np.ndarray) -> Any:
-    """(levels, inputs) at rest of tanks that exchange nothing with the basin, with the volume that
-    they hold at the start; None where there are none, or none is found.
-    """
+    """(levels, inputs) at rest of tanks that keep their volume; None where there is none."""
     if not isinstance(plant, TankNetwork) or not (closed := closed_circuit(plant)):
         return None
     start, outputs = np.asarray(loop.x0, dtype=float), list(plant.outputs)
@@ -211,8 +203,7 @@ def _pid(known: Rig) -> Any:
         raise InputError("controller kind pid: a pump does not change its output")
     rates = np.sort(np.abs(np.linalg.eigvals(known.A).real))
     others = float(np.sum(1.0 / rates[1:][rates[1:] > 0.0])) if n > 1 else 0.0
-    theta = np.where(np.abs(direct) > 0.0, 0.0, 0.5 * others)
-    lag = T / FASTER + theta
+    lag = T / FASTER + np.where(np.abs(direct) > 0.0, 0.0, 0.5 * others)
     return {"Kc": T / (steady * lag), "Ti": np.minimum(T, 4.0 * lag)}, ("Kc", "Ti")
 
 

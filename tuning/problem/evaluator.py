@@ -9,8 +9,7 @@ from tuning.problem import scenarios as sc
 from tuning.problem.problem import LANES, Point, Problem, Screened
 from tuning.storage.evaluation_log import EvaluationCache
 
-IDLE = 2**23
-"""Samples of runs that are made in vain, at most, so as to use a program that is compiled."""
+IDLE = 2**23  # samples of runs made in vain, at most, to use a compiled program
 
 
 class Blocks:
@@ -42,7 +41,6 @@ class Evaluator:
         self.blocks = Blocks(len(problem.runs))
 
     def screen(self, zs: Any, coarse: bool = False) -> Screened:
-        """Return `Problem.screen`."""
         zs = np.asarray(zs, dtype=float)
         self.simulations += len(zs) * len(self.problem.runs)
         samples = max(group.clock.samples for group in self.problem.groups)
@@ -53,17 +51,14 @@ class Evaluator:
         return costs.copy(), margins.copy()
 
     def point(self, z: Any) -> Point:
-        """Return `Problem.point`."""
         point = self._counted("point", z, len(self.problem.runs), self.problem.point)
         self.non_finite += not point.finite
         return point
 
     def coarse_point(self, z: Any) -> Point:
-        """Return `Problem.coarse_point`."""
         return self._counted("coarse", z, len(self.problem.runs), self.problem.coarse_point)
 
     def batch_point(self, z: Any, batch: int, rng: np.random.Generator) -> Point:
-        """Return the Point of about `batch` runs drawn by rng."""
         groups = self.problem.batch(batch, rng)
         runs = np.array([i for group in groups for i in group.runs], dtype=float)
         evaluate = functools.partial(self.problem.batch_point, groups=groups)

@@ -127,8 +127,7 @@ def _weights(objective: Any, functions: dict[str, ms.Measure]) -> dict[str, Any]
     for term, weight in terms:
         name = term
         if not (isinstance(term, str) and table):
-            custom = term if isinstance(term, Objective) else _of_function(term)
-            name = _enter(custom, functions)
+            name = _enter(term if isinstance(term, Objective) else _of_function(term), functions)
         if name in weights:
             raise InputError(f"objective {name} is given twice")
         weights[name] = weight
@@ -136,7 +135,6 @@ def _weights(objective: Any, functions: dict[str, ms.Measure]) -> dict[str, Any]
 
 
 def _of_function(term: Any) -> Objective:
-    """Return the Objective of a bare function, which has its name."""
     if not callable(term):
         raise InputError(
             f"objective = {shortened(term)}: must be {{measure: weight}}, a tuning.Objective or a"
@@ -155,8 +153,7 @@ def _limited(limits: Any, functions: dict[str, ms.Measure]) -> dict[str, Any]:
             " list of both"
         )
     limited: dict[str, Any] = {}
-    entries = cast(Any, [limits] if isinstance(limits, Constraint) else limits)
-    for entry in entries:
+    for entry in cast(Any, [limits] if isinstance(limits, Constraint) else limits):
         table = {entry.name: entry.limit} if isinstance(entry, Constraint) else entry
         if not isinstance(table, Mapping):
             raise InputError(

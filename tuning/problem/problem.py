@@ -27,8 +27,7 @@ Floats = NDArray[np.float64]
 
 DIVERGED = 1e9  # size at which a cost, a margin or a slope is no longer a number to search with
 
-LANES = 256
-"""Runs without derivatives that one program makes side by side: enough to fill the vector units."""
+LANES = 256  # runs without derivatives side by side: enough to fill the vector units
 
 FORWARD_LIMIT = 60
 """Number of free parameters up to which derivatives run forward with the simulation; above,
@@ -39,10 +38,7 @@ much again as reverse mode, and a search needs fewer of them: 44 instead of 230
 
 ROOT = "rms_error_total"  # the measure that is the root of a sum of squares over all outputs
 
-RISKS = ("mean", "cvar", "worst")
-"""The cost of several scenarios: their weighted mean, the mean of the worst TAIL of them, or the
-worst.
-"""
+RISKS = ("mean", "cvar", "worst")  # weighted mean, mean of the worst TAIL, worst scenario
 
 TAIL = 0.05  # share of the scenarios that "cvar" is the mean of [-]
 
@@ -290,33 +286,31 @@ class Problem:
 
     def point(self, z: Any) -> Point:
         """Return the Point at z (P,): every scenario at its own step, with derivatives."""
-        z = np.clip(np.asarray(z, dtype=float), 0.0, 1.0)
-        return Point(z, *self._point(z, self.groups))
+        return self._point(z, self.groups)
 
     def coarse_point(self, z: Any) -> Point:
         """Return the Point at z (P,) with a tenth of the samples: a start for a search."""
-        z = np.clip(np.asarray(z, dtype=float), 0.0, 1.0)
-        return Point(z, *self._point(z, [g.at(sc.coarse_clock(g.clock)) for g in self.groups]))
+        groups = [g.at(sc.coarse_clock(g.clock)) for g in self.groups]
+        return self._point(z, groups)
 
     def batch(self, count: int, rng: np.random.Generator) -> list[sc.Group]:
         """Return groups of about `count` runs drawn by rng: as many of every group each time."""
         groups: list[sc.Group] = []
         for group in self.groups:
-            share = round(count * len(group.runs) / len(self.runs))
-            size = min(len(group.runs), max(1, share))
+            size = min(len(group.runs), max(1, round(count * len(group.runs) / len(self.runs))))
             groups.append(sc.take(group, np.sort(rng.choice(len(group.runs), size, replace=False))))
         return groups
 
     def batch_point(self, z: Any, groups: Sequence[sc.Group]) -> Point:
         """Return the Point at z (P,) of the runs of `batch` alone."""
-        z = np.clip(np.asarray(z, dtype=float), 0.0, 1.0)
         runs = {i for group in groups for i in group.runs}
         rows = tuple(i for i, limit in enumerate(self.limits) if limit.run in runs)
-        return Point(z, *self._point(z, groups), rows=rows)
+        return self._point(z, groups)._replace(rows=rows)
 
     @np.errstate(over="ignore", invalid="ignore")  # Point.finite reports what diverges
-    def _point(self, z: Floats, groups: Sequence[sc.Group]) -> tuple[Any, ...]:
-        """Return the fields of the Point at z after z itself, of the runs in `groups` alone."""
+    def _point(self, z: Any, groups: Sequence[sc.Group]) -> Point:
+        """Return the Point at z of the runs in `groups` alone."""
+        z = np.clip(np.asarray(z, dtype=float), 0.0, 1.0)
         table, slopes, matrices, diverged = self._derivatives(z, groups)
         run = sorted(table)
         limits = [limit for limit in self.limits if limit.run in table]
@@ -330,10 +324,11 @@ class Problem:
             [sum(w * slopes[i][m].sum(axis=0) for m, w in self.objective.items()) for i in run]
         )
         shares = self.shares(costs, run)
-        matrix = sum(s * matrices[i] for s, i in zip(shares, run))
+        matrix: Any = sum(s * matrices[i] for s, i in zip(shares, run))
         cost = np.nan if diverged else float(shares @ costs)
         measures = tuple(table[i] for i in run)
-        return cost, shares @ rates, matrix, margins, margin_slopes, measures, costs, rates
+        gradient = shares @ rates
+        return Point(z, cost, gradient, matrix, margins, margin_slopes, measures, costs, rates)
 
     def _derivatives(
         self, z: Floats, groups: Sequence[sc.Group]

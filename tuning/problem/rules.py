@@ -38,15 +38,9 @@ from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.signals.setpoints import ramps
 from tuning.problem.controllers import operating_point
 
-CYCLES = 12
-"""Periods of the ultimate cycle that a relay experiment runs for; the last half of them counts."""
-
-EXCURSION = 0.2
-"""Amplitude of the level in a relay experiment, as a share of its distance to bottom and rim."""
-
-REFERENCE_GAIN = 0.02
-"""Gain of a loop, in 1/(initial slope times dead time), at which its margins are computed: far
-below the ultimate gain, so that the loop is stable [-]."""
+CYCLES = 12  # ultimate periods of a relay experiment; the last half of them counts
+EXCURSION = 0.2  # amplitude of a relay experiment, in distances to bottom and rim
+REFERENCE_GAIN = 0.02  # gain, in 1/(initial slope x dead time), far below the ultimate one
 
 
 class Process(NamedTuple):
@@ -81,8 +75,7 @@ def loop_of(case: Case, output: int, tank: int | None = None) -> Loop:
     """Return the linear model of one loop at the last plateau, of the level of `tank` if named."""
     bank, plant = cast(Any, case.loop.actuator), case.loop.plant
     _, levels, inputs = operating_point(case, plant)
-    inflow = steady_inflow(case.loop)
-    linear = linearise_compiled(plant, levels, inputs, inflow)
+    linear = linearise_compiled(plant, levels, inputs, steady_inflow(case.loop))
     A, B, C = (np.asarray(v, dtype=float) for v in linear)
     slopes = _slopes(case, inputs, output)
     lags = np.broadcast_to(0.0 if bank.lag is None else np.asarray(bank.lag), slopes.shape)
@@ -105,28 +98,6 @@ def closed_around(loop: Loop, tank: int, gains: "Gains") -> Loop:
     with_integral[n, :n] = -integral * inner
     b, c = np.append(b, integral), np.append(loop.c, 0.0)
     return loop._replace(A=with_integral, b=b, c=c, nested=True)
-
-
-def flow_gains(case: Case, output: int, loop: Loop) -> tuple["Gains", Loop]:
-    """Return (SIMC gains of a flow loop, the loop whose input is the setpoint of the flow).
-
-    The flow follows its input with the lag and dead time of the actuator, read a sample later; the
-    closed flow loop is a lag and a dead time of this length.
-    """
-    plant: Any = case.loop.plant
-    _, levels, inputs = operating_point(case, plant)
-
-    def flows(u: Any) -> Any:
-        return jnp.stack(list(input_flows(plant, tuple(levels), tuple(u))))
-
-    with jax.enable_x64(True):
-        slope = float(np.asarray(jax.jacfwd(flows)(jnp.asarray(inputs)))[output, output])
-    if not slope:
-        raise InputError("the input moves no flow at the last plateau")
-    dead, lag = loop.delay + loop.dt, max(loop.lag, loop.dt)
-    return Gains(lag / (slope * 2.0 * dead), lag), loop._replace(
-        b=loop.b / slope, lag=dead, nested=True
-    )
 
 
 def _slopes(case: Case, inputs: np.ndarray, output: int) -> np.ndarray:
@@ -255,9 +226,7 @@ class Relay(Controller):
 
 
 def relay_experiment(case: Case, output: int, linear: Loop | None = None) -> Ultimate:
-    """Return Ku = 4 d/(pi a) and Pu of a simulated relay experiment on one loop, others open:
-    d is the amplitude of the input, a that of the level, the one that `linear` reads.
-    """
+    """Return Ku = 4 d/(pi a) and Pu of a simulated relay experiment on one loop, others open."""
     loop, plant = case.loop, case.loop.plant
     linear = loop_of(case, output) if linear is None else linear
     if linear.nested:
@@ -275,8 +244,7 @@ def relay_experiment(case: Case, output: int, linear: Loop | None = None) -> Ult
     room = 0.5 * np.min(np.minimum(high - inputs, inputs - low)[acting] / np.abs(slopes[acting]))
     near = min(middle, max(float(np.asarray(plant.rim)[tank]) - middle, 0.0))
     # by the describing function the level then moves by EXCURSION of the way
-    most = EXCURSION * (near or middle) * math.pi * abs(expected.gain) / 4.0
-    size = float(min(room, most))
+    size = float(min(room, EXCURSION * (near or middle) * math.pi * abs(expected.gain) / 4.0))
     if not 0.0 < size < math.inf:
         raise InputError("a relay has no room: the input is at a limit in the steady state")
     amplitude = slopes * math.copysign(size, expected.gain)
@@ -452,7 +420,19 @@ def _gains_of(case: Case, rule: str, output: int) -> dict[str, float]:
         return gains
 
     if isinstance(controller, FlowCascade):
-        inner, loop = flow_gains(case, output, loop)
+        plant: Any = case.loop.plant
+        _, levels, inputs = operating_point(case, plant)
+
+        def flows(u: Any) -> Any:
+            return jnp.stack(list(input_flows(plant, tuple(levels), tuple(u))))
+
+        with jax.enable_x64(True):
+            slope = float(np.asarray(jax.jacfwd(flows)(jnp.asarray(inputs)))[output, output])
+        if not slope:
+            raise InputError("the input moves no flow at the last plateau")
+        dead, lag = loop.delay + loop.dt, max(loop.lag, loop.dt)
+        inner = Gains(lag / (slope * 2.0 * dead), lag)
+        loop = loop._replace(b=loop.b / slope, lag=dead, nested=True)
         values |= _present(controller, {"inner_Kc": inner.Kc, "inner_Ti": inner.Ti})
     elif isinstance(controller, Cascade):
         tank = controller.inner[output]
@@ -469,5 +449,4 @@ def _gains_of(case: Case, rule: str, output: int) -> dict[str, float]:
 
 
 def _present(controller: Any, values: dict[str, float]) -> dict[str, float]:
-    """`values` of the gains that a controller has."""
     return {name: value for name, value in values.items() if getattr(controller, name) is not None}

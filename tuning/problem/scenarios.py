@@ -34,8 +34,7 @@ LARGEST_NOISE = 2**24  # numbers of sensor noise that are kept, at most: 128 MiB
 
 Measures = dict[str, Any]  # {name: array}
 
-Shape = tuple[Any, tuple[bool, ...], int]
-"""Structure of the loop, which leaves differ, number of runs."""
+Shape = tuple[Any, tuple[bool, ...], int]  # structure, which leaves differ, runs
 
 
 def screening_clock(clock: Clock) -> Clock:
@@ -88,7 +87,6 @@ class Group(NamedTuple):
 
 
 def noisy(case: Case) -> bool:
-    """Return True if a run of the case draws noise."""
     return draws_bursts(case.loop) or bool(np.any(np.asarray(case.loop.sensor.noise) > 0))
 
 
@@ -100,23 +98,18 @@ def check_scenarios(
     if len(checked) > MANY:
         raise InputError(f"scenarios: {len(checked)} of them, must be at most {MANY}")
     for s in checked:
-        _check_scenario(s, free)
+        if not np.isfinite(s.weight) or s.weight <= 0:
+            raise InputError(
+                f"scenario {s.name!r}: weight = {s.weight!r} must be a finite number above 0"
+            )
+        check_whole(f"scenario {s.name!r}: seed", s.seed, 0, 2**31 - 1)
+        for name in s.values:
+            for other in free:
+                if name == other or split_index(name)[0] == other or name == split_index(other)[0]:
+                    raise InputError(f"scenario {s.name!r} sets {name}, which is free")
     if len({s.name for s in checked}) < len(checked):
         raise InputError("scenarios: two have the same name")
     return checked
-
-
-def _check_scenario(s: Scenario, free: Sequence[str]) -> None:
-    """Raise InputError for a weight, a seed or a name that cannot be used."""
-    if not np.isfinite(s.weight) or s.weight <= 0:
-        raise InputError(
-            f"scenario {s.name!r}: weight = {s.weight!r} must be a finite number above 0"
-        )
-    check_whole(f"scenario {s.name!r}: seed", s.seed, 0, 2**31 - 1)
-    for name in s.values:
-        for other in free:
-            if name == other or split_index(name)[0] == other or name == split_index(other)[0]:
-                raise InputError(f"scenario {s.name!r} sets {name}, which is free")
 
 
 def runs_of(case: Case, scenarios: Sequence[Scenario], seed: int) -> list[ScenarioRun]:
@@ -202,12 +195,10 @@ def at_once(function: Callable[[Any], Any], tasks: Sequence[Any]) -> list[Any]:
 
 
 def processors() -> int:
-    """Return the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _is_sequential(structure: Any, leaves: Any) -> bool:
-    """Return whether the runs of a group are done in sequence."""
     return jax.tree.unflatten(structure, leaves).sequential
 
 
@@ -289,7 +280,6 @@ def _mapped(function: Callable[..., Any], leaves: Any, keys: Any, shape: Shape) 
 
 
 def _first_axis(value: Any) -> Any:
-    """Return an array with an axis for its one run in front."""
     return value[None]
 
 

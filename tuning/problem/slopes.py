@@ -15,8 +15,7 @@ from tuning.problem.problem import Point, Problem
 
 STEPS = (1e-3, 3e-4)  # lengths of the two secants, as shares of a range [-]
 
-ORDERS = 2.0
-"""Orders of magnitude by which a derivative must exceed every secant to be contradicted [-]."""
+ORDERS = 2.0  # orders of magnitude by which a contradicted slope exceeds every secant
 
 ROUNDING = 1e-9  # share of a value by which rounding may change it from run to run [-]
 

@@ -10,13 +10,9 @@ class Status(enum.StrEnum):
     NOT_CONVERGED not_converged
     """
 
-    CONVERGED = "converged"
-    """A search came to its end, and every limit holds."""
+    CONVERGED = "converged"  # a search came to its end, and every limit holds
     NOT_CONVERGED = "not_converged"
     """No search came to its end, or the conditions of an optimum do not hold."""
-    INFEASIBLE = "infeasible"
-    """The least violation of the limits was found, and it is not zero."""
-    NOT_IDENTIFIABLE = "not_identifiable"
-    """The data do not determine every parameter (`identify`)."""
-    INTERRUPTED = "interrupted"
-    """Ctrl-C ended the search; the result is the best point so far."""
+    INFEASIBLE = "infeasible"  # the least violation of the limits was found, and it is not zero
+    NOT_IDENTIFIABLE = "not_identifiable"  # the data do not determine every parameter (`identify`)
+    INTERRUPTED = "interrupted"  # ctrl-C ended the search; the result is the best point so far

@@ -28,14 +28,10 @@ class Advice(NamedTuple):
     beyond: str
 
 
-FEW = 4
-"""Entries of a list in a sentence."""
+FEW = 4  # entries of a list in a sentence
 
-GIVEN = "Nothing to set: the gains are those of the case"
-"""The first words where a command changes no gain."""
-
-BEYOND = "No gain can change this"
-"""The first words of the last sentence, where something is out of reach."""
+GIVEN = "Nothing to set: the gains are those of the case"  # where no gain changes
+BEYOND = "No gain can change this"  # where something is out of reach
 
 REACHABLE = "Nothing is out of reach of the gains: every setpoint can be held"
 """The first words where nothing is."""
@@ -43,22 +39,18 @@ REACHABLE = "Nothing is out of reach of the gains: every setpoint can be held"
 
 def listed(words: Sequence[str]) -> str:
     """Return words as a list, of more than FEW the first ones and how many others."""
-    more = f" and {len(words) - FEW} more" if len(words) > FEW else ""
-    return ", ".join(words[:FEW]) + more
+    return ", ".join(words[:FEW]) + (f" and {len(words) - FEW} more" if len(words) > FEW else "")
 
 
 def amount(value: Any, unit: str, digits: int = 3) -> str:
-    """Return a number with its unit."""
     return _with_unit(shown(value, digits), unit)
 
 
 def _with_unit(text: str, unit: str) -> str:
-    """Return the text of a number with its unit, alone where it has none."""
     return text if unit in ("", "-") else f"{text} {unit}"
 
 
 def changes(before: Any, after: Any, unit: str, digits: int = 3) -> str:
-    """Return "before -> after unit"."""
     return f"{shown(before, digits)} -> {amount(after, unit, digits)}"
 
 
@@ -71,9 +63,7 @@ def error_of(before: Any, after: Any, unit: str) -> str:
 def limits_of(
     rows: Sequence[Mapping[str, Any]], heads: Sequence[str] = ("value", "margin", "at")
 ) -> Table:
-    """Return the Table of limits for the top of a page; `rows` as those of `ConstraintRow`, with
-    cells of further columns, in place of the time, as "more".
-    """
+    """Return the Table of `ConstraintRow`s for a page; "more": cells in place of the time."""
     cells = []
     for row in rows:
         at_least = MEASURES[row["measure"]].sense < 0
@@ -86,7 +76,6 @@ def limits_of(
 
 
 def of_run(case: Case, values: Mapping[str, Any]) -> Advice:
-    """Return the Advice on a run with the measures `values`."""
     rows = verdicts.limit_rows(case, values)
     broken = [row["words"] for row in rows if not row["margin"] >= 0.0]
     words = [f"limits held: {len(rows) - len(broken)} of {len(rows)}"] if rows else []

@@ -50,6 +50,7 @@ def json_of(case):
     """Return the JSON object of `jaxtank show --json`."""
     preset, loop = _preset(case), case.loop
     published = preset.published if preset else {}
+    inner = getattr(loop.controller, "law", None)
     return {
         "case": case.name,
         "title": case.title,
@@ -59,7 +60,8 @@ def json_of(case):
         "plant": type(loop.plant).__name__,
         "names": {kind: list(names) for kind, names in case.names.items()},
         "equations": equations(loop.plant, loop.disturbance is not None),
-        "law": _class_of(loop.controller),
+        "law": type(loop.controller).__name__
+        + (f"({type(inner).__name__})" if inner is not None else ""),
         "observer": type(loop.observer).__name__,
         "parameters": _parameters(case, preset),
         "free": {n: list(Free(*spec)) for n, spec in case.free.items()},
@@ -96,10 +98,7 @@ def _parameters(case, preset):
 
 
 def report(case, word=""):
-    """Return the Report of a case: its rig, its loop, free parameters, and every parameter.
-
-    word : what a command takes for the case, of a rig file its path.
-    """
+    """Return the Report of a case; word: its name, or the path of its file."""
     page, preset, loop = json_of(case), _preset(case), case.loop
     title = f"{page['case']}: {page['title']}"
     head = [title, *([preset.citation, f"notes: {page['notes']}"] if preset else [])]
@@ -178,9 +177,7 @@ def _paper(case, preset, page):
 
 
 def _docstring(part, loop, heading=""):
-    """The description of a component's class: its docstring up to the numpydoc sections, units in
-    brackets in those of the rig.
-    """
+    """The docstring of a component's class up to numpydoc sections, in units of the rig."""
     lines, prose = [], []
     description = SECTION.split(inspect.cleandoc(type(part).__doc__ or ""), maxsplit=1)[0]
     description = BRACKETED.sub(lambda unit: f"[{local(unit[1], loop.units)}]", description)
@@ -194,11 +191,6 @@ def _docstring(part, loop, heading=""):
         long = len(line) > columns()
         lines += textwrap.wrap(line.strip(), columns(), **indents) if long else [line.rstrip()]
     return Text(lines[:-1], gap=True, heading=heading, layout=True)
-
-
-def _class_of(controller):
-    inner = getattr(controller, "law", None)
-    return type(controller).__name__ + (f"({type(inner).__name__})" if inner is not None else "")
 
 
 def _tuned(case, preset, parameters):

@@ -8,9 +8,7 @@ from tuning.problem import provenance
 from tuning.report import verdict as verdicts
 from tuning.report.advice import Advice, amount, of_nominal_plant
 from tuning.report.document import Report, Text
-from tuning.report.folder import earlier
-from tuning.report.folder import save as save_all
-from tuning.report.tables import Table, Value, clean
+from tuning.report.tables import Table, Value, clean, fields
 
 CAPTIONS = {
     "controllers": "Mean error of each controller on the plants where every setpoint is reachable."
@@ -39,19 +37,11 @@ def _row(rival):
     """The JSON object of a Rival."""
     judged = rival.judged.to_json()
     return {
-        "name": rival.name,
-        "kind": rival.kind,
-        "gains": rival.gains,
-        "tuned": rival.tuned,
+        **fields(rival, "name kind gains tuned error violations step_us"),
+        **{name: judged[name] for name in ("objective", "failed", "travel_percent")},
         "filter": rival.filtered,
-        "error": rival.error,
-        "objective": judged["objective"],
-        "violations": rival.violations,
-        "failed": judged["failed"],
-        "travel_percent": judged["travel_percent"],
         "sensitivity_peak": rival.peak,
         "why": rival.why or None,
-        "step_us": rival.step_us,
     }
 
 
@@ -82,36 +72,24 @@ def verdict_of(result):
 
 
 def report(result):
-    """Return the Report of a ControllerComparison."""
     unit = result.case.loop.units[0]
     heads = ["controller", "gains", "filter", f"error [{unit}]", "limits broken", "travel [%]"]
     heads += ["Ms [-]", "C [us/step]"]
     rows = []
     for rival in result.rivals:
         travel = rival.judged.to_json()["travel_percent"]
-        rows.append(
-            [
-                rival.name,
-                rival.gains,
-                "yes" if rival.filtered else "no",
-                Value(rival.error, 4),
-                f"{rival.violations} of {result.samples}",
-                Value(travel, 3),
-                Value(rival.peak, 3),
-                Value(rival.step_us, 3),
-            ]
-        )
+        judged = [Value(rival.error, 4), f"{rival.violations} of {result.samples}"]
+        numbers = [Value(v, 3) for v in (travel, rival.peak, rival.step_us)]
+        filtered = "yes" if rival.filtered else "no"
+        rows.append([rival.name, rival.gains, filtered, *judged, *numbers])
     notes = [
         "error: mean total rms error of the plants where every setpoint is reachable",
         "travel: rms change of the inputs per sample, as a share of their range",
         "Ms: largest sensitivity peak at the plateaus of the nominal plant",
         "C: time of a step of the controller alone, without the filter",
-        *(
-            [f"not for this rig: {', '.join(result.refused)} (reasons: --json)"]
-            if result.refused
-            else []
-        ),
     ]
+    if result.refused:
+        notes.append(f"not for this rig: {', '.join(result.refused)} (reasons: --json)")
     return Report(
         result.case.name,
         "controllers",
@@ -166,10 +144,3 @@ def figures(result):
         ax.grid(True, axis="x", alpha=0.3)
 
     return {"controllers": picture(errors, (7.6, max(1.9, 0.8 + 0.32 * len(names))))}
-
-
-def save(result, folder, command=None):
-    """Write result.json, the picture and report.html of a ControllerComparison to a folder."""
-    draw, page = lambda: figures(result), lambda: report(result)
-    stale = earlier(folder, CAPTIONS)
-    return save_all(folder, json_of(result), {}, draw, page, CAPTIONS, command, stale)

@@ -67,7 +67,6 @@ class Report:
 
     @property
     def title(self) -> str:
-        """The name, and what was done."""
         return ": ".join(filter(None, [self.name, self.what]))
 
     @property
@@ -77,8 +76,7 @@ class Report:
         return [*first, *self.sections]
 
 
-BOLD, GOOD, BAD, END = "\033[1m", "\033[1;32m", "\033[1;31m", "\033[0m"
-"""Colours of a terminal: headings, and verdicts."""
+BOLD, GOOD, BAD, END = "\033[1m", "\033[1;32m", "\033[1;31m", "\033[0m"  # headings, verdicts
 
 
 def terminal(report: Report, colour: bool = False, advice: bool = False) -> str:

@@ -1,8 +1,6 @@
 """The report of a sensitivity study: text, JSON, CSV, picture, page and folder."""
 
-import csv
 import dataclasses
-import io
 from typing import NamedTuple
 
 import numpy as np
@@ -13,22 +11,16 @@ from tuning.problem import provenance
 from tuning.report import advice
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
-from tuning.report.folder import earlier
-from tuning.report.folder import save as save_all
-from tuning.report.tables import Table, Value, clean, fields, number
+from tuning.report.tables import Table, Value, clean, csv_text, fields, number
 from tuning.report.uncertainty import in_words
 from tuning.report.verdict import shown
 from tuning.uncertainty.distributions import Correlated, Normal
 from tuning.uncertainty.sensitivity_study import NORMAL_WIDTH
 
-PANELS = 12
-"""Measures in the picture."""
+PANELS = 12  # measures in the picture
+LISTED = 8  # parameters in the table of a measure
 
-LISTED = 8
-"""Parameters in the table of a measure."""
-
-WIDE = 0.2
-"""Width of an interval of a share of the variance above which more samples are advised [-]."""
+WIDE = 0.2  # width of an interval of a variance's share that asks for more samples [-]
 
 
 class Method(NamedTuple):
@@ -82,7 +74,6 @@ def per(unit, of):
 
 
 def derivative_unit(result, c, name):
-    """The unit of the derivative of a Column by a parameter."""
     return per(c.unit, describe(result.case.loop, name)["unit"])
 
 
@@ -117,7 +108,6 @@ def _sobol_notes(result):
 
 
 def report(result):
-    """Return the Report of a SensitivityResult."""
     varied = ", ".join(f"{n} {in_words(d)}" for n, d in result.distributions.items())
     samples, runs = METHODS[result.method].samples, count(result.runs, "run")
     samples = f", {result.samples} {samples}" if samples else ""
@@ -147,8 +137,7 @@ def report(result):
     )
 
 
-SIZES = {"local": "effect", "morris": "mu_star", "sobol": "total"}
-"""{method: quantity that ranks parameters}."""
+SIZES = {"local": "effect", "morris": "mu_star", "sobol": "total"}  # ranks parameters
 
 
 def advice_of(result):
@@ -297,33 +286,26 @@ def figures(result):
     return {name: plots.panels(draws, title, rows)}
 
 
-def table_csv(result):
-    """Return every measure and parameter as CSV, one row each; empty where there is no number."""
+def captions_of(result):
+    """Return {name of a picture: its caption}."""
+    title = METHODS[result.method].title
+    return dict.fromkeys(("tornado", "sobol"), f"{title[0].upper()}{title[1:]}.")
+
+
+def files_of(result):
+    """Return {"sensitivity.csv": a row for each measure and parameter}."""
     quantities, heads = list(METHODS[result.method].heads), []
     for q in quantities:
         ends = ("low", "high") if "interval95" in q else ("interval95",)
         heads += [q.replace("interval95", end) for end in ends]
-    local, out = ["derivative unit"] if result.method == "local" else [], io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["measure", "unit", "parameter", "parameter unit", "rank", *heads, *local])
+    local = ["derivative unit"] if result.method == "local" else []
+    rows = [["measure", "unit", "parameter", "parameter unit", "rank", *heads, *local]]
     for c in result.columns:
         for rank, i in enumerate(result.order(c), start=1):
             name = result.parameters[i]
             values = np.concatenate([np.ravel(c.effects[q][i]) for q in quantities])
-            numbers = [f"{v:.10g}" if np.isfinite(v) else "" for v in values]
+            numbers = np.where(np.isfinite(values), values, np.nan)
             unit = describe(result.case.loop, name)["unit"]
             more = [derivative_unit(result, c, name) for _ in local]
-            writer.writerow([c.label, c.unit, name, unit, rank, *numbers, *more])
-    return out.getvalue()
-
-
-def save(result, folder, command=None):
-    """Write result.json, sensitivity.csv, tornado.png or sobol.png, and report.html to `folder`."""
-    files, names, title = (
-        {"sensitivity.csv": table_csv(result)},
-        ["tornado", "sobol"],
-        METHODS[result.method].title,
-    )
-    captions = dict.fromkeys(names, f"{title[0].upper()}{title[1:]}.")
-    draw, page, stale = lambda: figures(result), lambda: report(result), earlier(folder, names)
-    return save_all(folder, json_of(result), files, draw, page, captions, command, stale)
+            rows.append([c.label, c.unit, name, unit, rank, *numbers, *more])
+    return {"sensitivity.csv": csv_text(rows)}

@@ -22,8 +22,7 @@ from tuning.report.safety import start_of
 from tuning.report.simulated import run_for_people
 from tuning.report.tables import Table, Value, clean, fields
 
-REPRODUCED = 1e-9
-"""Share of a level to which the rig file must give it again."""
+REPRODUCED = 1e-9  # share of a level to which the rig file must give it again
 
 CAPTIONS = {
     "worst": "The case itself (dashed), and the run with the smallest margin to its limit.",
@@ -43,7 +42,6 @@ PUMPS = {
 
 
 def json_of(attack):
-    """The JSON object of `jaxtank attack --json`."""
     case, attacked = attack.case, attack.attacked
     return {
         "case": case.name,
@@ -134,7 +132,6 @@ def _outside(attack):
 
 
 def report(attack):
-    """Return the Report of an Attack."""
     worst, case = attack.worst, attack.case
     head = (
         f"{case.name}: attack from {count(attack.draws, 'draw')}, ascent of"
@@ -191,18 +188,12 @@ def _scope(attack):
 def _levels(attack):
     """The table of the levels of each tank."""
     unit, proved = attack.case.loop.units[0], {None: "-", True: "yes", False: "no"}
-    rows = [
-        [
-            short(attack.case.loop.plant, "tank", tank.tank),
-            Value(tank.limit, 6),
-            proved[tank.certified],
-            *(Value(v, 6) for v in (tank.nominal, tank.drawn, tank.level)),
-            Value(tank.margin, 3),
-            Value(tank.time_s),
-            "passed" if tank.passed else "holds",
-        ]
-        for tank in attack.found
-    ]
+    rows = []
+    for tank in attack.found:
+        name = short(attack.case.loop.plant, "tank", tank.tank)
+        reached = [Value(v, 6) for v in (tank.nominal, tank.drawn, tank.level)]
+        end = [Value(tank.margin, 3), Value(tank.time_s), "passed" if tank.passed else "holds"]
+        rows.append([name, Value(tank.limit, 6), proved[tank.certified], *reached, *end])
     levels = [f"{name} [{unit}]" for name in ("nominal", "draws", "highest", "margin")]
     heads = ["tank", f"limit [{unit}]", "proved", *levels, "at [s]", ""]
     return Table(rows, heads, gap=True, top=True)
@@ -306,9 +297,7 @@ def figures(attack, runs=None):
 
 
 def rig_of(attack):
-    """Return (text of worst.toml or None, {"level" of its run [cm], "difference" to the level that
-    was found [cm], "same": within REPRODUCED of it, "missing": what no rig file can describe}).
-    """
+    """Return (worst.toml or None, {"level" and "difference" [cm], "same", "missing" in it})."""
     worst = attack.worst
     text, why = rig_text(attack.rig(worst))
     missing = attack.not_in_rig(worst)

@@ -3,18 +3,13 @@
 import dataclasses
 
 from jaxtank.core.labels import label_of, short
-from tuning.problem import provenance
 from tuning.report import advice
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
-from tuning.report.folder import save as save_all
 from tuning.report.tables import Table, Value, clean, fields, number
 
-LISTED = 0.005
-"""Share of the plants from which on a need is a row of the study's table; JSON has all [-]."""
-
-MATTERS = 0.05
-"""The same for a default answer, and the share of unreachable setpoints that needs no mend [-]."""
+LISTED = 0.005  # share of the plants from which on a need is a row of a table [-]
+MATTERS = 0.05  # the same for a default answer; unreachable share that needs no mend [-]
 
 CAPTIONS = {
     "needs": "What the steady states at the plateaus need: of the nominal plant, and exceeded by"
@@ -69,19 +64,13 @@ def _part(case, row):
 
 def needs(study, least=LISTED):
     """Return the Table of needed levels that at least `least` of the plants cannot reach."""
-    rows = [
-        [
-            Value(row.setpoints, 6, study.case.loop.units[0], ", "),
-            short(study.case.loop.plant, "tank", row.tank - 1)
-            if row.pump is None
-            else _part(study.case, row),
-            *(Value(v, 3, row.unit) for v in (row.needed, row.needed_p95)),
-            Value(row.limit, 6, row.unit),
-            Value(*_percent(row.share), "%"),
-        ]
-        for row in study.plateaus
-        if row.share >= least
-    ]
+    rows, loop = [], study.case.loop
+    for row in (row for row in study.plateaus if row.share >= least):
+        tank = row.pump is None and short(loop.plant, "tank", row.tank - 1)
+        needed = [Value(v, 3, row.unit) for v in (row.needed, row.needed_p95)]
+        ends = [Value(row.limit, 6, row.unit), Value(*_percent(row.share), "%")]
+        setpoints = Value(row.setpoints, 6, loop.units[0], ", ")
+        rows.append([setpoints, tank or _part(study.case, row), *needed, *ends])
     heads = ["setpoints", "tank", "needed", "needed, 95 %", "limit", "not reachable"]
     return [Table(rows, heads)] if rows else []
 
@@ -103,11 +92,8 @@ def unreachable(study):
 
 
 def report(study):
-    """Return the Report of a Feasibility."""
-    share, good = (
-        study.infeasible_for_any_controller,
-        study.infeasible_for_any_controller <= MATTERS,
-    )
+    share = study.infeasible_for_any_controller
+    good = share <= MATTERS
     mends = [f"  {m.what}: {' '.join(m.options)}" for m in study.mends]
     if mends:
         mends = ["Every setpoint is reachable on 95 % of the plants with one of:", *mends]
@@ -144,10 +130,3 @@ def figures(study):
         ax.legend()
 
     return {"needs": picture(draw, (6.0, 1.0 + 0.5 * len(rows)))} if rows else {}
-
-
-def save(study, folder, command=None):
-    """Write result.json, needs.png and report.html to `folder`; return their paths."""
-    draw, page = lambda: figures(study), lambda: report(study)
-    of = provenance.provenance(study.case, study.seed)
-    return save_all(folder, json_of(study), {}, draw, page, CAPTIONS, command, provenance=of)

@@ -8,6 +8,7 @@ from typing import Any
 from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import write_folder
+from tuning.problem.provenance import provenance as provenance_of
 from tuning.report.document import Figure, Report, failed
 from tuning.report.tables import dumps
 
@@ -51,6 +52,16 @@ def earlier(folder: str | Path, names: Any) -> list[Path]:
     return [page, *(page.with_name(f"{name}.png") for name in names)] if page.is_file() else []
 
 
+def save_result(home: Any, result: Any, folder: str | Path, command: str | None) -> list[Path]:
+    """Write the files of a result by the functions of its report module `home`."""
+    payload, files = home.json_of(result), getattr(home, "files_of", lambda _: {})(result)
+    draw, page = lambda: home.figures(result), lambda: home.report(result)
+    of = payload.get("provenance") or provenance_of(result.case, getattr(result, "seed", 0))
+    captions = home.captions_of(result) if hasattr(home, "captions_of") else home.CAPTIONS
+    stale = earlier(folder, captions)
+    return save(folder, payload, files, draw, page, captions, command, stale, of)
+
+
 def save(
     folder: str | Path,
     payload: Any,
@@ -62,9 +73,7 @@ def save(
     stale: Sequence[Path] = (),
     provenance: Mapping[str, Any] | None = None,
 ) -> list[Path]:
-    """Write result.json and `files` {name: content} to `folder`, all or none, then the pictures of
-    `draw` with `captions` {first word of their names: text} and report.html; return the paths.
-    """
+    """Write result.json and `files` {name: content}, pictures and report.html; return paths."""
     # The files are written before anything is drawn, so that they outlive a fault in a picture;
     # `stale` files of an earlier result are removed between the two. `provenance` stands in for a
     # payload without one.

@@ -18,22 +18,14 @@ from jaxtank.core.errors import InputError
 from tuning.report.document import Figure, Live, Report, Text, failed
 from tuning.report.tables import Table
 
-LARGEST = 500_000
-"""Characters of one SVG picture, above which its dense lines are rasterised."""
-
-DENSE = 800
-"""Points of a line that is rasterised where a picture is too large."""
-
-LONG = 60
-"""Characters of a text in a cell above which it is wrapped."""
-
-WIDE = 480.0
-"""Width of a picture [pt] above which it can be enlarged in a narrow window."""
+LARGEST = 500_000  # characters of one SVG picture, above which its dense lines are rasterised
+DENSE = 800  # points of a line that is rasterised where a picture is too large
+LONG = 60  # characters of a text in a cell above which it is wrapped
+WIDE = 480.0  # width of a picture [pt] above which it can be enlarged in a narrow window
 
 
 @cache
 def _style():
-    """The style sheet of a page."""
     return Markup(Path(__file__).with_name("page.css").read_text(encoding="utf-8"))
 
 
@@ -62,7 +54,7 @@ def document(report: Report, command: str | None = None, provenance: Any = ()) -
     # command, provenance: the line that made the result, and versions, machine and seed
     sections = [s for s in report.sections if getattr(s, "on", "") != "terminal"]
     top, texts = (_texts(sections, top) for top in (True, False))
-    words = [s for s in texts if _is_list(s)]
+    words = [s for s in texts if isinstance(s, Text) and s.items and s.sentences]
     pictures = [_picture(s) for s in sections if isinstance(s, Figure)]
     template = _templates().get_template("page.html")
     return template.render(
@@ -88,15 +80,16 @@ def _frames(sections):
     return [frame for frame in frames if frame]
 
 
-def _is_list(section):
-    return isinstance(section, Text) and section.items and bool(section.sentences)
-
-
 def fragment(sections) -> str:
     """Return Texts and Tables as HTML for a notebook."""
     part = _templates().get_template("parts.html").module.__dict__["part"]
     texts = [s for s in sections if isinstance(s, (Text, Table)) and s.on != "page"]
     return f"<div>{''.join(map(part, texts))}</div>"
+
+
+def rendered(template, counts, **parts) -> str:
+    """Return a template of this folder with a finished table `counts` and parts to be escaped."""
+    return _templates().get_template(template).render(counts=Markup(counts), **parts)
 
 
 def _frame(result):
@@ -127,7 +120,6 @@ def unbroken(sentence):
 
 
 def identifier(name):
-    """Return `name` as an id of HTML and SVG."""
     return re.sub(r"[^a-z0-9]+", "-", str(name).lower()).strip("-") or "picture"
 
 
@@ -173,5 +165,4 @@ def _saved(figure, name):
 
 
 def alone(figure, name):
-    """Return a matplotlib figure as the text of an SVG file."""
     return svg(figure, name).replace("<svg", '<svg xmlns="http://www.w3.org/2000/svg"', 1) + "\n"

@@ -21,7 +21,7 @@ from tuning.report.advice import Advice, changes, listed
 from tuning.report.document import Report, Text
 from tuning.report.folder import earlier, rig_text
 from tuning.report.folder import save as save_all
-from tuning.report.tables import Table, Value, clean, fields
+from tuning.report.tables import Table, Value, clean, csv_text, fields
 
 CAPTIONS = {
     "fit": "Measured readings (dots), the fitted rig (line), and the inputs of the pumps.",
@@ -39,8 +39,7 @@ REJECTED = (
     "these data reject the structure of the rig: intervals and [covariance] are those of a rejected"
     " structure (rejected = true in rig.toml) and hold for no plant of another"
 )
-DOUBT = 1e-3
-"""Probability of a change from the prior below which data and prior contradict each other."""
+DOUBT = 1e-3  # probability of a change below which data and prior contradict each other
 
 
 def not_identifiable(direction):
@@ -53,10 +52,8 @@ def sentences_of(fit):
     """Return sentences: how an identification ended, and what it needs next."""
     agree = sum(s["agrees"] for s in fit.starts)
     words = [*_ending(fit), f"{agree} of {len(fit.starts)} starts ended in the same place"]
-    words += _residuals(fit)
-    words += _likelihood(fit)
-    words += _refinements(fit)
-    words += _prior(fit) + _posterior(fit)
+    for sentences in (_residuals, _likelihood, _refinements, _prior, _posterior):
+        words += sentences(fit)
     words += [
         f"{n} ends at its bound, {p['value']:.4g} {p['unit']}: no interval"
         for n, p in fit.parameters.items()
@@ -73,7 +70,7 @@ def sentences_of(fit):
     return words
 
 
-ODD = {
+ODD = {  # {kind of an oddity in experiment data: sentence}
     "frozen": "{log}: {where} is frozen at {value:.6g} {unit} for {count} from {first:g} s on,"
     " while inputs or other levels move: leave these cells empty",
     "saturated": "{log}: {where} stays at {value:.6g} {unit} for {count} from {first:g} s on, an"
@@ -86,18 +83,16 @@ ODD = {
     "still": "{log}: {where} is {value:.6g} {unit} throughout: its gain is known only from the"
     " balance with the other flows",
 }
-"""{kind of an oddity in experiment data: sentence}"""
 
 
 def sentences_on(oddities):
-    """Return a sentence on each oddity of experiment data."""
     return [
         ODD[odd.kind].format(**odd._asdict() | {"count": count(odd.count, "reading")})
         for odd in oddities
     ]
 
 
-CAUSES = {
+CAUSES = {  # {kind of a cause: what the data need}
     "pump-delay": "a dead time of {pump}",
     "pump-lag": "a lag of {pump}",
     "dead-zone": "a dead zone of {pump}",
@@ -110,8 +105,7 @@ CAUSES = {
     "area": "an area of {tank} that differs from the rig's",
     "swapped": "the columns of {tank} exchanged",
 }
-"""{kind of a cause: what the data need}"""
-EXPERIMENTS = {
+EXPERIMENTS = {  # {kind of a cause: experiment that distinguishes it}
     "pump-delay": "steps of the pump, sampled faster",
     "pump-lag": "steps of the pump, sampled faster",
     "dead-zone": "the pump held at three inputs or more, one of them near 0",
@@ -124,7 +118,6 @@ EXPERIMENTS = {
     "area": "a known volume added with the outlets shut",
     "swapped": "a step of one pump, and which reading moves first",
 }
-"""{kind of a cause: experiment that distinguishes it}"""
 
 
 def diagnosis_of(fit):
@@ -133,10 +126,9 @@ def diagnosis_of(fit):
         return {"clean": None, "causes": [], "sentence": "not tested: interrupted"}
     causes = []
     for cause in fit.structure.causes:
-        row = cause._asdict()
-        row["equivalent"] = [{"kind": kind, "where": where} for kind, where in cause.equivalent]
-        del row["name"]
-        causes.append(clean(row))
+        row = {name: value for name, value in cause._asdict().items() if name != "name"}
+        alike = [{"kind": kind, "where": where} for kind, where in cause.equivalent]
+        causes.append(clean(row | {"equivalent": alike}))
     return {"clean": fit.structure.clean, "causes": causes, "sentence": "; ".join(_structure(fit))}
 
 
@@ -146,25 +138,20 @@ def _structure(fit):
     if fit.structure.clean:
         return ["no test rejects the structure of the rig"]
     for cause in causes:
-        which = _option(cause)
-        value = f", {_amount(cause)}" if cause.value is not None else ""
-        need = _named(fit, cause.kind, cause.where)
-        words.append(f"the data require {need}{value}; to add it to the rig: --accept {which}")
+        to_add = f"to add it to the rig: --accept {_option(cause)}"
+        words.append(f"the data require {_needed(fit, cause)}; {to_add}")
         others = [_named(fit, kind, where) for kind, where in cause.equivalent]
         logs = [log for log in fit.estimation.logs if log.hold == "first-order"]
         late = cause.value if cause.kind in LATE and cause.value is not None else np.inf
         if any(late < _longest_change(log) for log in logs):
             others.append("inputs that step at each row (--hold zero-order)")
         if others:
-            tell = EXPERIMENTS[cause.kind]
             words.append(
                 f"these data cannot distinguish it from {' or '.join(others)}; an experiment that"
-                f" can: {tell}"
+                f" can: {EXPERIMENTS[cause.kind]}"
             )
     if not fit.structure.white:
-        residual = (
-            "the residual after these causes" if causes else f"the residual ({_explained(fit)})"
-        )
+        residual = "the residual " + ("after these causes" if causes else f"({_explained(fit)})")
         words.append(
             f"{residual} is not white, and none of the tested causes explains it; possible: an"
             " inflow that varies without a column, or a part that the rig does not have (--refine"
@@ -175,12 +162,10 @@ def _structure(fit):
 
 def _longest_change(log):
     """The longest time between rows over which an input changes [s]."""
-    changes = np.any(np.diff(log.u, axis=0) != 0, axis=1)
-    return np.max(np.diff(log.t), where=changes, initial=0.0)
+    return np.max(np.diff(log.t), where=np.any(np.diff(log.u, axis=0) != 0, axis=1), initial=0.0)
 
 
 def _option(cause):
-    """Return a cause as --accept takes it."""
     return f"{cause.kind}:{','.join(map(str, np.ravel(cause.where)))}"
 
 
@@ -191,9 +176,7 @@ def lacking(fit):
 
 
 def marked(fit):
-    """Return the identified case; its name, with which answers begin, says what it lacks, and its
-    [covariance] whether the data reject its structure.
-    """
+    """Return the identified case with what it lacks in its name, and whether it is rejected."""
     case, lacks = fit.identified, lacking(fit)
     case = dataclasses.replace(case, rejected=_is_rejected(fit))
     name = f"{case.name}{LACKS}{listed(lacks)}"
@@ -201,7 +184,6 @@ def marked(fit):
 
 
 def _is_rejected(fit):
-    """Whether the data reject the structure of the rig."""
     return fit.status != "interrupted" and not fit.structure.clean
 
 
@@ -219,22 +201,22 @@ def _named(fit, kind, where):
     return CAUSES[kind].format(tank=tanks, pump=pump)
 
 
-PUMPS = ("pump-delay", "pump-lag", "dead-zone", "pump-curve")
-"""Kinds of causes located at a pump."""
+PUMPS = ("pump-delay", "pump-lag", "dead-zone", "pump-curve")  # kinds of causes located at a pump
+FIT = ("rmse", "nrmse_percent")
+LATE = ("pump-delay", "pump-lag")  # look like inputs on no line from row to row
 
 
-LATE = ("pump-delay", "pump-lag")
-"""Those that look like inputs which follow no line from row to row."""
-
-
-def _amount(cause):
-    """Return the value of a cause with its interval."""
+def _needed(fit, cause):
+    """Return a cause in words, with its value and interval where it has one."""
+    need = _named(fit, cause.kind, cause.where)
+    if cause.value is None:
+        return need
     unit = "" if cause.unit == "-" else f" {cause.unit}"
     present = cause.present if cause.kind in ("leak", "area", "outlet-exponent", "inflow") else 0.0
     beside = f" instead of {present:.4g}" if present else ""
     words = "between inputs " if cause.interval95 is None else ""
     low, high = cause.interval95 or cause.between
-    return f"{cause.value:.4g}{unit}{beside} ({words}{low:.4g} .. {high:.4g})"
+    return f"{need}, {cause.value:.4g}{unit}{beside} ({words}{low:.4g} .. {high:.4g})"
 
 
 def verdict_of(fit):
@@ -302,23 +284,20 @@ def _likelihood(fit):
     words = f"likelihood: {chosen['kind']}, {why}"
     if chosen["kind"] == "innovations":
         unit, plant = fit.case.loop.units[0], fit.case.loop.plant
-        process = ", ".join(
-            f"{label_of(plant, 'tank', i)} {sd:.2g}" for i, sd in enumerate(chosen["process_noise"])
-        )
-        noise = ", ".join(
-            f"{name} {sd:.3g} {of}" for (name, of), sd in zip(fit.channels, fit.quality["noise"])
-        )
+        gained = enumerate(chosen["process_noise"])
+        process = ", ".join(f"{label_of(plant, 'tank', i)} {sd:.2g}" for i, sd in gained)
+        readings = zip(fit.channels, fit.quality["noise"])
+        noise = ", ".join(f"{name} {sd:.3g} {of}" for (name, of), sd in readings)
         words += f"; process noise [{unit}/s^0.5]: {process}; noise of the readings: {noise}"
     return [words]
 
 
-PARTS = {
+PARTS = {  # {kind of a part that was added to a rig: what it is}
     "sensor-curve": "a curve of the sensor of {}",
     "outlet-exponent": "an exponent of an outlet of {}",
     "outlet-linear": "a linear outlet of {}, beside the other",
     "area": "the cross-section of {}",
 }
-"""{kind of a part that was added to a rig: what it is}"""
 
 
 def _refinements(fit):
@@ -443,11 +422,8 @@ def advice_of(fit):
         to_set = f"set nothing: the search {ended}"
     elif lacking(fit):
         to_set = "set nothing: the values below are those of a rig without what the data require"
-    rest = [
-        f"{name} {verdicts.shown(rmse)} {unit}"
-        for (name, unit), rmse in zip(fit.channels, fit.quality["rmse"])
-        if rmse is not None
-    ]
+    errors = zip(fit.channels, fit.quality["rmse"])
+    rest = [f"{n} {verdicts.shown(rmse)} {unit}" for (n, unit), rmse in errors if rmse is not None]
     unknown = [n for n, p in fit.parameters.items() if not p["interval95"]]
     beyond = (
         "Nothing stays open: every parameter has an interval, which holds if areas and scales of"
@@ -459,8 +435,7 @@ def advice_of(fit):
     return Advice(f"Diagnosis: {_short_diagnosis(fit)}; {to_set}.", gives, beyond)
 
 
-SAME = 5e-4
-"""Relative change of a value below which it is not to be set [-]."""
+SAME = 5e-4  # relative change of a value below which it is not to be set [-]
 
 
 def _short_diagnosis(fit):
@@ -471,11 +446,7 @@ def _short_diagnosis(fit):
         return "the structure of the rig explains the data"
     if not fit.structure.causes:
         return "the residual is more than noise, and no tested cause explains it"
-    words = [
-        _named(fit, cause.kind, cause.where)
-        + (f", {_amount(cause)}" if cause.value is not None else "")
-        for cause in fit.structure.causes
-    ]
+    words = [_needed(fit, cause) for cause in fit.structure.causes]
     return f"the data require {' and '.join(words[:2])}{' and more' * (len(words) > 2)} (--accept)"
 
 
@@ -528,15 +499,11 @@ def _validation(fit):
     v = fit.validation
     if not v:
         return []
+    sides = {"fitted": v["fitted"], "validation": v["held_back"]}
     rows = [
-        [
-            name,
-            words,
-            Value(v[side]["rmse"][c], 4, unit),
-            Value(v[side]["nrmse_percent"][c], 3, "%"),
-        ]
+        [name, side, Value(q["rmse"][c], 4, unit), Value(q["nrmse_percent"][c], 3, "%")]
         for c, (name, unit) in enumerate(fit.channels)
-        for side, words in (("fitted", "fitted"), ("held_back", "validation"))
+        for side, q in sides.items()
     ]
     head = (
         f"fit to the first {', '.join(map(str, v['samples']))} samples, validated on the rest by"
@@ -578,9 +545,7 @@ def json_of(fit):
         "message": "; ".join(sentences_of(fit)),
         "diagnosis": diagnosis_of(fit),
         **fields(fit, "parameters remedies validation profile starts wall_s"),
-        "fit": clean(
-            {k: quality[k] for k in ("rmse", "nrmse_percent", "residual_autocorrelation")}
-        ),
+        "fit": {n: clean(quality[n]) for n in (*FIT, "residual_autocorrelation")},
         "channels": [
             {"name": n, "unit": u, "noise": s} for (n, u), s in zip(fit.channels, quality["noise"])
         ],
@@ -622,13 +587,12 @@ def fit_csv(fit):
     heads = ["log", "t [s]", *(f"pump{j + 1} [{drive}]" for j in range(est.data.u.shape[-1]))]
     for name, unit in fit.channels:
         heads += [f"{name} measured [{unit}]", f"{name} simulated [{unit}]"]
-    lines = [",".join(heads)]
+    rows: list[list[Any]] = [heads]
     for e, log in enumerate(est.logs):
         for k in range(log.samples):
             readings = np.column_stack([est.data.y[e, k], simulated[e, k]]).ravel()
-            numbers = ["" if np.isnan(v) else f"{v:.10g}" for v in (log.t[k], *log.u[k], *readings)]
-            lines.append(",".join([str(e + 1), *numbers]))
-    return "\n".join(lines) + "\n"
+            rows.append([e + 1, log.t[k], *log.u[k], *readings])
+    return csv_text(rows)
 
 
 def save(fit, folder, command=None):
@@ -739,11 +703,8 @@ def plan_report(case, experiments, best, plan):
     known = [None if c is None or c > 1e15 else c for c in conditions]
     rows.append(["condition of J'J", "", *(Value(c, 3) for c in known)])
     levels = plan["levels"]
-    measured = (
-        "every level"
-        if levels is None
-        else ", ".join(reading_label(case.loop.plant, i) for i in levels)
-    )
+    labels = [reading_label(case.loop.plant, i) for i in levels or ()]
+    measured = "every level" if levels is None else ", ".join(labels)
     head = (
         f"{case.name}: standard deviations that {plan['duration']:g} s, {measured} read every"
         f" {plan['dt']:g} s with noise of {plan['noise']:g} {case.loop.units[0]} would leave"

@@ -1,8 +1,7 @@
 """The report of Identifications: many records, each fitted separately."""
 
-import csv
 import functools
-import io
+from typing import Any
 
 import numpy as np
 
@@ -11,15 +10,13 @@ from jaxtank.core.text import count
 from tuning.problem import provenance
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
-from tuning.report.folder import save as save_all
-from tuning.report.tables import Table, Value, clean
+from tuning.report.tables import Table, Value, clean, csv_text
 
 CAPTIONS = {
     "estimates": "Estimate of each record with its 95 % interval; a record without an interval is a"
     " cross."
 }
-LISTED = 12
-"""Most records that are printed one by one; `estimates.csv` has all of them."""
+LISTED = 12  # most records that are printed one by one; `estimates.csv` has all of them
 
 
 def labels(fits):
@@ -30,7 +27,6 @@ def labels(fits):
 
 
 def report(fits):
-    """Return the Report of Identifications."""
     converged, records = int(fits.converged.sum()), count(len(fits), "record")
     head = (
         f"{fits.case.name}: {records}, each fitted separately; {converged} converged, at most"
@@ -156,8 +152,8 @@ def figures(fits):
     return {"estimates": style.picture(draw, size, rows, columns, title=title, squeeze=False)}
 
 
-def estimates_csv(fits):
-    """Return CSV text, a row a record: name, convergence, estimates, deviations, levels."""
+def files_of(fits):
+    """Return {"estimates.csv": a row for each record}."""
     heads = ["record", "converged"]
     for name, unit in zip(fits.names, fits.units):
         heads += [f"{name} [{unit}]", f"sd of {name} [{unit}]"]
@@ -165,22 +161,8 @@ def estimates_csv(fits):
     label = functools.partial(reading_label, fits.case.loop.plant)
     heads += [f"{label(i)} at the first sample [{length}]" for i in range(fits.levels.shape[1])]
     heads += [f"RMS residual of {name} [{unit}]" for name, unit in fits.channels]
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(heads)
+    rows: list[list[Any]] = [heads]
     for e, name in enumerate(labels(fits)):
         pairs = np.column_stack([fits.values[e], fits.sd[e]]).ravel()
-        numbers = [*pairs, *fits.levels[e], *fits.rmse[e]]
-        cells = ["" if np.isnan(v) else f"{v:.10g}" for v in numbers]
-        writer.writerow([name, int(fits.converged[e]), *cells])
-    return out.getvalue()
-
-
-def save(fits, folder, command=None):
-    """Write result.json, estimates.csv, estimates.png and report.html; return their paths."""
-    files, draw, page = (
-        {"estimates.csv": estimates_csv(fits)},
-        lambda: figures(fits),
-        lambda: report(fits),
-    )
-    return save_all(folder, json_of(fits), files, draw, page, CAPTIONS, command)
+        rows.append([name, int(fits.converged[e]), *pairs, *fits.levels[e], *fits.rmse[e]])
+    return {"estimates.csv": csv_text(rows)}

@@ -11,8 +11,7 @@ from tuning.report.identification import sentences_on
 from tuning.report.tables import Table, Value, clean
 
 CAPTIONS = {"log": "The columns of the file, over time."}
-MOST = 12
-"""Columns that are drawn."""
+MOST = 12  # columns that are drawn
 
 
 def json_of(result):
@@ -57,7 +56,6 @@ def _steps(result) -> dict[str, Any]:
 
 
 def report(result):
-    """Return the Report of an Inspection."""
     steps = _steps(result)
     pace = "" if steps["step"] is None else f", every {steps['step']:g} s"
     longest, step = steps["longest_step"], steps["step"]

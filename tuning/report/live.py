@@ -13,9 +13,7 @@ from tuning.problem.functions import as_measures
 
 
 def live_page_of(result: Any, plants: int | None = None) -> LivePage:
-    """Return the LivePage of a result of `tuning`: of its case, or of the tuned one with the values
-    before and after as states to start from.
-    """
+    """Return the LivePage of a result: of its case, or of the tuned one before and after."""
     # Raises InputError for a result without a case, and a case that cannot be run in a browser.
     case, tuned = getattr(result, "case", None), getattr(result, "tuned", None)
     if case is None:

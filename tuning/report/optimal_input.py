@@ -5,10 +5,8 @@ import io
 import jax
 import numpy as np
 
-from tuning.problem import provenance
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
-from tuning.report.folder import save as save_all
 from tuning.report.tables import Table, Value, fields, number
 
 TITLE = "perfect-information open-loop optimum"
@@ -20,7 +18,6 @@ CAPTIONS = {"responses": "Levels and inputs of the run with the optimal inputs."
 
 
 def report(bound):
-    """Return the Report of an InputBound."""
     terms = " + ".join(f"{w:g} {m}" if w != 1 else m for m, w in bound.objective.items())
     rows = [
         [Value(g["interval_s"], 6), Value(g["cost"], 6), f"{g['excess']:.1e}"] for g in bound.grids
@@ -93,13 +90,10 @@ def figures(bound):
     return {"responses": responses.responses(bound.case.loop, runs, f"{bound.case.name}: {TITLE}")}
 
 
-def save(bound, folder, command=None):
-    """Write result.json, inputs.csv, responses.png and report.html; return their paths."""
+def files_of(bound):
+    """Return {"inputs.csv": the time from which each input is held, and the inputs}."""
     drive, out = bound.case.loop.units[1], io.StringIO()
     heads = ["t [s]", *(f"pump{j + 1} [{drive}]" for j in range(bound.u.shape[1]))]
-    # the time from which each input is held, and the inputs
     rows = np.column_stack([np.arange(len(bound.u)) * bound.interval, bound.u])
     np.savetxt(out, rows, "%.10g", ",", header=",".join(heads), comments="")
-    files, of = {"inputs.csv": out.getvalue()}, provenance.provenance(bound.case, 0)
-    draw, page = lambda: figures(bound), lambda: report(bound)
-    return save_all(folder, json_of(bound), files, draw, page, CAPTIONS, command, provenance=of)
+    return {"inputs.csv": out.getvalue()}

@@ -26,16 +26,14 @@ from tuning.report.tables import Table, Value, clean
 NUMBER, CLAIM = "number", "claim"
 REPRODUCED, FITTED, DIFFERS = "reproduced", "fitted", "differs"
 IMPOSSIBLE, INPUT = "not reproducible", "input"
-VERDICTS = {
+VERDICTS = {  # {verdict of a row: its meaning}
     REPRODUCED: "within the tolerance of its row, or a claim that holds",
     FITTED: "near the printed number because an assumption was chosen for it: no evidence",
     DIFFERS: "measured, and different or true in part only: the row says why",
     IMPOSSIBLE: "cannot be measured: the row says what is missing",
     INPUT: "a number that our case has from the paper: no evidence",
 }
-"""{verdict of a row: its meaning}."""
-SAME = 1e-9
-"""Relative difference [-] below which a number was not measured: it is the printed one, set."""
+SAME = 1e-9  # relative difference below which a number was not measured, but set [-]
 
 
 def runner(paper):
@@ -69,25 +67,19 @@ def cost(case):
 
 
 def verdict(published, measured):
-    """Return (one of VERDICTS, measured value or text, reason) of one published quantity, for which
-    a number, a tuple, a Sample, a Claim or None was measured.
-    """
+    """Return (one of VERDICTS, measured value or text, reason) of one published quantity."""
     if measured is None:
         return IMPOSSIBLE, None, published.reason
     if isinstance(measured, Claim):
-        return _verdict_on_claim(published, measured)
+        reason, fitted = published.reason, published.fitted
+        if measured.verdict == "not reproduced":
+            return DIFFERS, measured.text, reason
+        if fitted:
+            return FITTED, measured.text, f"{fitted}; {reason}".rstrip("; ")
+        if measured.verdict == REPRODUCED:
+            return REPRODUCED, measured.text, ""  # the text has the numbers
+        return DIFFERS, measured.text, f"in part: {reason}"
     return _verdict_on_number(published, measured)
-
-
-def _verdict_on_claim(published, measured):
-    reason, fitted = published.reason, published.fitted
-    if measured.verdict == "not reproduced":
-        return DIFFERS, measured.text, reason
-    if fitted:
-        return FITTED, measured.text, f"{fitted}; {reason}".rstrip("; ")
-    if measured.verdict == REPRODUCED:
-        return REPRODUCED, measured.text, ""  # the text has the numbers
-    return DIFFERS, measured.text, f"in part: {reason}"
 
 
 def _verdict_on_number(published, measured):
@@ -112,9 +104,7 @@ def _verdict_on_number(published, measured):
 
 
 def measure(paper):
-    """Return the comparison of a paper: {"paper", "citation", "notes", "headline", "ramps",
-    "rows"}.
-    """
+    """Return {"paper", "citation", "notes", "headline", "ramps", "rows"} of a paper."""
     # The keys of a row: quantity, kind ("number" or "claim"), unit, where, published, measured,
     # deviation (of one run, where several were made with noise), verdict, reason, ramp_s (duration
     # of the setpoint ramps of its runs [s], where the paper prints none) and by_ramp (its verdict
@@ -152,11 +142,7 @@ def measure(paper):
 
 
 def headline(rows):
-    """Return how many printed numbers, and how many claims in words, were reproduced, of how many.
-
-    {"numbers" and "claims": {"reproduced", "fitted", "differs", "of"}, "input", "not
-    reproducible"}: numbers of rows, where "of" is the sum of the three before it.
-    """
+    """Return {"numbers" and "claims": {"reproduced", "fitted", "differs", "of"}, ...}."""
     counts, tally = {}, Counter((row["kind"], row["verdict"]) for row in rows)
     for name, kind in (("numbers", NUMBER), ("claims", CLAIM)):
         counts[name] = {word: tally[kind, word] for word in (REPRODUCED, FITTED, DIFFERS)}
@@ -165,7 +151,6 @@ def headline(rows):
 
 
 def headline_text(rows):
-    """Return `headline` as a sentence."""
     counts: Any = headline(rows)
     numbers, claims = counts["numbers"], counts["claims"]
     return (
@@ -176,9 +161,7 @@ def headline_text(rows):
 
 
 def ramps(rows):
-    """Return [{"ramp_s", "reproduced", "of", "differs"}] of the claims that depend on the duration
-    of the setpoint ramps: the same claims for each duration; [] where there are none.
-    """
+    """Return [{"ramp_s", "reproduced", "of", "differs"}] of claims that depend on ramps."""
     by_ramp = {row["quantity"]: row["by_ramp"] for row in rows if row.get("by_ramp")}
     return [
         {
@@ -192,7 +175,6 @@ def ramps(rows):
 
 
 def ramps_text(rows):
-    """Return `ramps` as lines."""
     return [
         f"with setpoint ramps of {row['ramp_s']:g} s: {row['reproduced']} of {row['of']} claims"
         f" that depend on them hold, not {', '.join(row['differs']) or 'one fails'}"

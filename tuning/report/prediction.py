@@ -8,19 +8,15 @@ from tuning.identification.prediction import WIDE
 from tuning.problem import provenance
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
-from tuning.report.folder import save as save_all
 from tuning.report.identification import draw_log, fit_csv
 from tuning.report.tables import Table, Value, clean
 
 CAPTIONS = {"fit": "Measured readings (dots), the rig as it is (line), and the inputs."}
 SIDES = ("measured", "simulated")
 PREDICTED = ("predicted", "achieved")
-ROWS = 12
-"""Times at which readings are printed side by side."""
-CHANCE = 0.01
-"""Probability below which residuals are called correlated."""
-FAR = 3.0
-"""Correlation, in standard deviations, above which residuals are called dependent on an input."""
+ROWS = 12  # times at which readings are printed side by side
+CHANCE = 0.01  # probability below which residuals are called correlated
+FAR = 3.0  # correlation, in sd, above which residuals depend on an input
 
 
 def sentences_of(result):
@@ -57,18 +53,12 @@ def verdict_of(result):
 
 
 def report(result):
-    """Return the Report of a Prediction."""
-    q, logs = result.quality, result.estimation.logs
-    n = result.start_samples
+    q, logs, n = result.quality, result.estimation.logs, result.start_samples
     start = "all readings" if n is None else f"the first {n} samples"
+    columns = zip(result.channels, q["rmse"], q["after_start"]["rmse"], q["nrmse_percent"])
     rows = [
-        [
-            name,
-            Value(q["rmse"][c], 4, unit),
-            Value(q["after_start"]["rmse"][c], 4, unit),
-            Value(q["nrmse_percent"][c], 3, "%"),
-        ]
-        for c, (name, unit) in enumerate(result.channels)
+        [name, Value(whole, 4, unit), Value(after, 4, unit), Value(share, 3, "%")]
+        for (name, unit), whole, after, share in columns
     ]
     names = ", ".join(log.name for log in logs)
     samples = sum(log.samples for log in logs)
@@ -100,11 +90,9 @@ def with_data(report, compared):
          Value(c["nrmse_percent"], 3, "%")]
         for c in channels
     ]  # fmt: skip
-    tables = [
-        Text([f"inputs of {compared['name']}, from its first readings on"], gap=True),
-        Table(quality, ["reading", "RMSE", "mean residual", "fit"]),
-        Table(rows, ["t [s]", *heads], gap=True),
-    ]
+    head = Text([f"inputs of {compared['name']}, from its first readings on"], gap=True)
+    errors = Table(quality, ["reading", "RMSE", "mean residual", "fit"])
+    tables = [head, errors, Table(rows, ["t [s]", *heads], gap=True)]
     return dataclasses.replace(report, sections=[*report.sections, *tables])
 
 
@@ -161,12 +149,8 @@ def json_of(result):
 
 
 def figures(result):
-    """Return {"fit": matplotlib Figure}, or "fit_1", .. of several logs."""
     return draw_log(result, "measured and predicted")
 
 
-def save(result, folder, command=None):
-    """Write result.json, fit.csv, pictures and report.html; return their paths."""
-    draw, page = (lambda: figures(result)), (lambda: report(result))
-    files = {"fit.csv": fit_csv(result)}
-    return save_all(folder, json_of(result), files, draw, page, CAPTIONS, command)
+def files_of(result):
+    return {"fit.csv": fit_csv(result)}

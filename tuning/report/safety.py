@@ -9,11 +9,10 @@ from jaxtank.safety.checker import CASE, LIMITS
 from jaxtank.safety.of_case import certificates_of
 from tuning.report.tables import Table, Value, clean
 
-PROMISE = (
+PROMISE = (  # hypotheses of the proofs, without the start
     "on any plant with parameters in the case's intervals, under any controller, while each reading"
     " is within its noise band and no fault takes a parameter out of its interval"
 )
-"""Hypotheses of the proofs, without the start."""
 
 
 def start_of(starts):
@@ -23,11 +22,7 @@ def start_of(starts):
 
 
 def certificates(case):
-    """Return [{"tank", "limit", "certified", "why", "starts", "rate", "rate_bound", "gap", "reach",
-    "low"}], one for each tank, of the safety filter that the case has or could have; tanks from 1;
-    None where there is no filter for its plant. starts: None where it is not certified. low:
-    {"limit", "certified", "why"}, None without one.
-    """
+    """Return a dict per tank on the safety filter that a case has or could have, or None."""
     try:
         rows = certificates_of(case)
     except InputError:

@@ -39,8 +39,7 @@ CAPTIONS = {
     " from the setpoint, the second near it.",
 }
 
-WORST = 12
-"""Limits that are listed where there are many: the tightest ones."""
+WORST = 12  # limits that are listed where there are many: the tightest ones
 
 
 def run_for_people(case, key=None, rows=3000):
@@ -69,16 +68,8 @@ BRIEF = ("rms_error", "settling_time", "overshoot_percent", "max_level", "input_
 """Measures of a run on a terminal, after those of the objective, of which there are so many."""
 
 
-def _brief(case, values):
-    """The names of the measures on a terminal: the objective's, then others, five in all."""
-    names = dict.fromkeys([*case.objective, *BRIEF])
-    return [m for m in names if m in values][: len(BRIEF)]
-
-
 def estimates_of_run(case, key):
-    """Return {"diagnosis": the faults that a bank of fault models named in a run, "coefficients":
-    the coefficients of the model that were estimated}, as far as the observer has them.
-    """
+    """Return {"diagnosis": faults, "coefficients"} that the observer of a case has estimated."""
     observer = case.loop.observer
     has_modes, names = bool(observer.mode_names(case.loop.plant)), observer.coefficients
     if not has_modes and not names:
@@ -95,31 +86,22 @@ def estimates_of_run(case, key):
 def _coefficients(rows):
     """The section on the coefficients that were estimated."""
     heads = ["estimated coefficient", "in the model", "at the end", "change [%]"]
-    table = [
-        [
-            row["name"],
-            Value(row["model"], 5, row["unit"]),
-            Value(row["estimate"], 5, row["unit"]),
-            Value(100.0 * (row["estimate"] / row["model"] - 1.0), 3),
-        ]
-        for row in rows
-    ]
+    table = []
+    for row in rows:
+        values, ratio = [row["model"], row["estimate"]], row["estimate"] / row["model"]
+        cells = [Value(v, 5, row["unit"]) for v in values]
+        table.append([row["name"], *cells, Value(100.0 * (ratio - 1.0), 3)])
     return [Table(table, heads)]
 
 
 def _diagnosis(diagnosis):
     """The section on the faults that were named."""
     heads = ["diagnosed fault", "from [s]", "to [s]", "size", "probability [-]"]
-    rows = [
-        [
-            d["fault"],
-            Value(d["from_s"], 5),
-            Value(d["to_s"], 5),
-            "" if d["size"] is None else Value(d["size"], 3, d["unit"].strip("-")),
-            Value(d["probability"], 3),
-        ]
-        for d in diagnosis
-    ]
+    rows = []
+    for d in diagnosis:
+        size = "" if d["size"] is None else Value(d["size"], 3, d["unit"].strip("-"))
+        times = Value(d["from_s"], 5), Value(d["to_s"], 5)
+        rows.append([d["fault"], *times, size, Value(d["probability"], 3)])
     return [Table(rows, heads)] if rows else [Text(["no fault is diagnosed"], gap=True)]
 
 
@@ -133,7 +115,8 @@ def report(case, values, plateaus=None, every=False, estimated=None):
         more = len(limits) - len(table.rows)
         note = [f"{more} further limits have larger margins"][:more]
         sections += [table, Text(note, on="page", top=True)]
-    brief = _brief(case, values)
+    names = dict.fromkeys([*case.objective, *BRIEF])
+    brief = [m for m in names if m in values][: len(BRIEF)]
     of = {"rig_units": loop.units, "gap": True, "plant": loop.plant}
     if every:
         sections += [measure_table(values, **of), Text(undefined(values, loop.plant))]
@@ -194,11 +177,7 @@ def _margins(loop, plateaus):
 
 
 def save(case, run, payload, folder, page, command=None, gif=False, against=None, columns=None):
-    """Write result.json, trajectory.csv, pictures and report.html of one simulation to `folder`.
-
-    Files of an earlier simulation are removed. Optionally a film (`gif`) and pictures for print
-    (`columns`).
-    """
+    """Write the files of one simulation; optionally a film and pictures for print."""
     # page: function that returns the Report; against: (Case, Trajectory) of a second rig in the
     # film, run.gif, and in its still, film.png.
     from jaxtank.plots import responses

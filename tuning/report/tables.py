@@ -1,6 +1,8 @@
 """Numbers, tables and JSON of results, for people and for programs."""
 
+import csv
 import dataclasses
+import io
 import itertools
 import json
 import math
@@ -16,17 +18,10 @@ from jaxtank.core.jsonable import clean as clean
 from jaxtank.core.labels import label_of, place_of
 from jaxtank.core.units import DEFAULT
 
-NARROW, WIDE = 60, 100
-"""Least and most characters of a line on a terminal."""
-
-WORD = 50
-"""Characters of a word in a cell, above which it is broken."""
-
-JOINED = "\u00a0"
-"""A space at which no line is broken."""
-
-MANY = 16
-"""Entries of a measure that are printed side by side; of more, the worst."""
+NARROW, WIDE = 60, 100  # least and most characters of a line on a terminal
+WORD = 50  # characters of a word in a cell, above which it is broken
+JOINED = "\u00a0"  # a space at which no line is broken
+MANY = 16  # entries of a measure that are printed side by side; of more, the worst
 
 
 def number(value, digits=5):
@@ -93,16 +88,13 @@ def _joined(cell):
 
 
 def _wrapped(cell, width):
-    """The lines of a cell."""
     lines = textwrap.wrap(cell, max(width, 1), break_on_hyphens=False) or [""]
     return [line.replace(JOINED, " ") for line in lines]
 
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """A table: cells are texts, numbers and Values; `gap`: after an empty line on a terminal;
-    `top`: above the parts of a page that are folded.
-    """
+    """A table of texts, numbers and Values; gap: after an empty line; top: not folded on a page."""
 
     rows: Sequence[Sequence[Any]]
     head: Sequence[str] = ()
@@ -112,9 +104,7 @@ class Table:
     top: bool = False
 
     def lines(self):
-        """Return the lines of the table as aligned columns, not wider than the terminal: cells are
-        wrapped, and columns that do not fit stand below the others, after the first column again.
-        """
+        """Return aligned, wrapped columns; those that do not fit stand below."""
         body = [[_joined(cell) for cell in row] for row in self.rows]
         rows, width = [*([list(self.head)] if self.head else []), *body], columns()
         words = lambda i: (word for row in rows for word in row[i].split(" "))
@@ -156,7 +146,6 @@ class Table:
 
 
 def table(rows, head=()):
-    """Return rows as the text of aligned columns."""
     return str(Table(rows, head))
 
 
@@ -179,17 +168,14 @@ def unit_text(measure, rig_units, plant=None):
 def limit_table(rows, gap=False):
     """Return the Table of limits, rows as those of `ConstraintRow`."""
     timed = any(row["time_s"] is not None for row in rows)
-    cells = [
-        [
-            row["name"],
-            row["unit"],
-            (">= " if ms.MEASURES[row["measure"]].sense < 0 else "<= ") + number(row["limit"], 7),
-            Value(row["value"], 7),
-            Value(row["margin"], 3) if row["reason"] is None else "undefined",
-            *(["-" if row["time_s"] is None else f"{row['time_s']:.2f} s"] if timed else []),
-        ]
-        for row in rows
-    ]
+    cells = []
+    for row in rows:
+        side = ">= " if ms.MEASURES[row["measure"]].sense < 0 else "<= "
+        margin = Value(row["margin"], 3) if row["reason"] is None else "undefined"
+        time = "-" if row["time_s"] is None else f"{row['time_s']:.2f} s"
+        bound = side + number(row["limit"], 7)
+        values = [Value(row["value"], 7), margin, *([time] if timed else [])]
+        cells.append([row["name"], row["unit"], bound, *values])
     heads = ["limit", "unit", "limit", "value", "margin", *(["reached at"] if timed else [])]
     return Table(cells, heads, gap)
 
@@ -233,6 +219,14 @@ def measures_json(measures):
 def fields(result, names):
     """Return {name: value of that attribute, as JSON takes it} of several names in one text."""
     return {name: clean(getattr(result, name)) for name in names.split()}
+
+
+def csv_text(rows):
+    """Return rows of texts and numbers as CSV text; NaN is empty."""
+    cell = lambda v: v if isinstance(v, (str, int)) else "" if np.isnan(v) else f"{v:.10g}"
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows([cell(v) for v in row] for row in rows)
+    return out.getvalue()
 
 
 def dumps(table):

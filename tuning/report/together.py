@@ -16,6 +16,7 @@ from jaxtank.core.labels import numbered
 from jaxtank.core.text import count
 from jaxtank.loop.trajectory import csv
 from tuning.problem import provenance, reported
+from tuning.problem.controllers import equal
 from tuning.problem.scenarios import noisy
 from tuning.report import verdict as verdicts
 from tuning.report.advice import GIVEN, Advice, amount, of_nominal_plant
@@ -24,8 +25,7 @@ from tuning.report.folder import save as save_all
 from tuning.report.simulated import json_of_run, run_for_people
 from tuning.report.tables import Table, entries, undefined
 
-MOST = 6
-"""Number of cases in one picture: each has a different colour."""
+MOST = 6  # number of cases in one picture: each has a different colour
 
 PARTS = {"plant": "plant", "reference": "setpoints", "actuator": "pumps", "x0": "start"}
 """{part of a loop in which cases may differ: its name}."""
@@ -88,20 +88,12 @@ def _sizes(case):
 
 def _differences(first, case):
     """Words for the parts in which a case differs from the first, other than its controller."""
-    differ = lambda part: not _equal(getattr(first.loop, part), getattr(case.loop, part))
+    differ = lambda part: not equal(getattr(first.loop, part), getattr(case.loop, part))
     words = [word for part, word in PARTS.items() if differ(part)]
     if first.clock.dt != case.clock.dt:
         words.append(f"sampling period ({case.clock.dt:g} s for {first.clock.dt:g} s)")
     used = f"(those of {first.name} are used)"
     return (*words, *(f"{word} {used}" for part, word in SHARED.items() if differ(part)))
-
-
-def _equal(a, b):
-    """Whether two parts of a loop have the same structure and numbers."""
-    if jax.tree.structure(a) != jax.tree.structure(b):
-        return False
-    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b))
-    return all(np.shape(x) == np.shape(y) and np.array_equal(x, y) for x, y in pairs)
 
 
 def report(runs: list[Run]) -> Report:
@@ -158,8 +150,7 @@ def json_of(runs: list[Run], seed: int) -> dict[str, Any]:
     rows = [
         {**json_of_run(run.case, run.measures, seed), "differs": list(run.differs)} for run in runs
     ]
-    advice = list(advice_of(runs))
-    return {"verdict": verdict_of(runs).to_json(), "advice": advice, "cases": rows}
+    return {"verdict": verdict_of(runs).to_json(), "advice": list(advice_of(runs)), "cases": rows}
 
 
 def verdict_of(runs: list[Run]) -> verdicts.Verdict:
@@ -175,11 +166,8 @@ def save(runs: list[Run], folder: str | Path, seed: int, command: str | None = N
     check_folder(folder)
     keys = [jax.random.key(seed) if noisy(run.case) else None for run in runs]
     trajectories = {r.case.name: run_for_people(r.case, key) for r, key in zip(runs, keys)}
-    loop, title, of = (
-        runs[0].case.loop,
-        ", ".join(trajectories),
-        provenance.provenance(runs[0].case, seed),
-    )
+    loop, title = runs[0].case.loop, ", ".join(trajectories)
+    of = provenance.provenance(runs[0].case, seed)
     # without what a file name cannot hold
     file = lambda name: re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip(".-") or "case"
     files = {f"{file(name)}.csv": csv(run, loop.units) for name, run in trajectories.items()}

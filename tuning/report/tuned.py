@@ -39,8 +39,7 @@ from tuning.report.tables import (
 from tuning.search.result import Message, row_of
 from tuning.search.tuner import rule_row
 
-COSTLIEST, MANY = 5, 12
-"""Scenarios in a table that would have more than MANY rows."""
+COSTLIEST, MANY = 5, 12  # scenarios in a table that would have more than MANY rows
 
 SIDES = ("before", "after")
 
@@ -123,7 +122,6 @@ def report(result, page=False):
 
 
 def advice_of(result):
-    """Return the Advice on a TuningResult."""
     moved = [
         f"{name} {advice.changes(p['before'], p['after'], p['unit'], 4)}"
         for name, p in result.parameters.items()
@@ -140,9 +138,7 @@ def advice_of(result):
 
 
 def _tracking_times(result):
-    """[(name, value with unit)] of tracking times that stay while their integral times change: left
-    out of a rig file, they would follow these.
-    """
+    """[(name, value with unit)] of tracking times that stay while their integral times change."""
     controller = result.tuned.loop.controller
     tuned = {name.partition("[")[0] for name in result.parameters}
     moved = {n.partition("[")[0] for n, p in result.parameters.items() if p["before"] != p["after"]}
@@ -256,7 +252,6 @@ def _proof(certificate, measure, limit):
 
 
 def answer_text(answer):
-    """Return the text of an Answer alone."""
     return terminal(Report("default answer", "", None, (), of_answer(answer)))
 
 
@@ -303,12 +298,10 @@ def _rules(result):
 
 
 def _of(values, gain):
-    """The entries of a gain in {name: value}."""
     return [v for n, v in values.items() if n.startswith(f"controller.{gain}[")]
 
 
 def _rule(row, names):
-    """The cells of a rule with the gains `names`."""
     gains = [Value(_of(row["parameters"], g) or np.nan, 4) for g in names]
     numbers = [row[k] for k in ("error", "travel_percent", "objective")]
     holds = {True: "yes", False: "no", None: "-"}[row["holds"]]
@@ -384,13 +377,26 @@ def _mean(values, side, digits=3, of=slice(None)):
 
 def sections_of(result):
     """Return every table of a TuningResult."""
+    rows = []
+    for name, p in result.parameters.items():
+        remark = f"at {p['at_bound']} bound" if p["at_bound"] else ""
+        ends = Value([p["lower"], p["upper"]], between=" : ")
+        change = Value(p["sensitivity_percent"], 2, "%")
+        remark = remark if p["exercised"] else "without effect, unchanged"
+        rows.append([name, p["unit"], Value(p["before"]), Value(p["after"]), ends, change, remark])
+    heads = ["parameter", "unit", "before", "after", "range", "10 % of it changes the objective by"]
+    lines = []
+    for c in result.choices:
+        values = ", ".join(f"{n} = {v}" for n, v in c["values"].items())
+        lines.append([values, c["status"], *map(Value, c["objective"].values())])
+    columns = [f"objective {side} [{cost_unit(result)}]" for side in SIDES]
     sections = [
-        replace(_parameter_table(result), top=result.answer is None),
+        replace(Table(rows, [*heads, ""], gap=True), top=result.answer is None),
         *_measure_table(result),
         *_limit_table(result),
         *_scenario_table(result),
         *_validation_table(result),
-        *_choice_table(result),
+        *([Table(lines, ["choice", "status", *columns], gap=True)] if lines else []),
         *_tradeoff_table(result),
     ]
     if result.bound is not None:
@@ -414,19 +420,6 @@ def _rims(result):
     return "rims are limits only: overflow is not simulated, and a level may rise above its rim"
 
 
-def _parameter_table(result):
-    """Every free parameter before and after, its range, and the sensitivity of the objective."""
-    rows = []
-    for name, p in result.parameters.items():
-        remark = f"at {p['at_bound']} bound" if p["at_bound"] else ""
-        ends = Value([p["lower"], p["upper"]], between=" : ")
-        change = Value(p["sensitivity_percent"], 2, "%")
-        remark = remark if p["exercised"] else "without effect, unchanged"
-        rows.append([name, p["unit"], Value(p["before"]), Value(p["after"]), ends, change, remark])
-    heads = ["parameter", "unit", "before", "after", "range", "10 % of it changes the objective by"]
-    return Table(rows, [*heads, ""], gap=True)
-
-
 def _measure_table(result):
     """The objective and the measures of the case's own run, and a line on which run they are of."""
     units, objective, measures = result.tuned.loop.units, result.objective, result.measures
@@ -439,14 +432,8 @@ def _measure_table(result):
     rows = [["objective", cost_unit(result), *(Value(objective[side]) for side in SIDES)]]
     for m in listed:
         after = numbers(measures["after"][m], 5 if "level" in m else 4)
-        rows.append(
-            [
-                m,
-                unit_text(m, units, result.tuned.loop.plant),
-                numbers(measures["before"][m], 4),
-                after,
-            ]
-        )
+        unit = unit_text(m, units, result.tuned.loop.plant)
+        rows.append([m, unit, numbers(measures["before"][m], 4), after])
     weighted = " + ".join(m if w == 1 else f"{w:g} {m}" for m, w in terms.items())
     before, after = ({m: measures[side][m] for m in listed} for side in SIDES)
     lines = [f"objective: {weighted}{_runs_of(result, bool(listed))}"]
@@ -590,15 +577,6 @@ def _improved(checked):
     )
 
 
-def _choice_table(result):
-    rows = []
-    for c in result.choices:
-        values = ", ".join(f"{n} = {v}" for n, v in c["values"].items())
-        rows.append([values, c["status"], *map(Value, c["objective"].values())])
-    heads = [f"objective {side} [{cost_unit(result)}]" for side in SIDES]
-    return [Table(rows, ["choice", "status", *heads], gap=True)] if rows else []
-
-
 def _tradeoff_table(result):
     if not result.tradeoff:
         return []
@@ -654,8 +632,15 @@ def figures(result, runs=None):
 
     runs = runs or _runs(result)
     loop, name, unit = result.tuned.loop, result.tuned.name, cost_unit(result)
+    gains = ", ".join(
+        f"{n.removeprefix('controller.')} {number(p['before'], 4)} -> {number(p['after'], 4)}"
+        f" {p['unit']}"
+        for n, p in list(result.parameters.items())[:4]
+    )
     drawings = {
-        "responses": responses.responses(loop, runs, _title(result), _level_limits(result)),
+        "responses": responses.responses(
+            loop, runs, f"{result.tuned.name}: {gains}", _level_limits(result)
+        ),
         **plots.rig(loop.plant, runs["after"], f"{name} at the end of the tuned run"),
     }
     if rows := worst_of_scenarios(result.constraints):
@@ -707,16 +692,6 @@ def _level_limits(result):
     for tank in {c["tank"] for c in rows}:
         levels[tank - 1] = min(c["limit"] for c in rows if c["tank"] == tank)
     return levels
-
-
-def _title(result):
-    """The first gains before and after, as the title of the responses."""
-    gains = ", ".join(
-        f"{n.removeprefix('controller.')} {number(p['before'], 4)} -> {number(p['after'], 4)}"
-        f" {p['unit']}"
-        for n, p in list(result.parameters.items())[:4]
-    )
-    return f"{result.tuned.name}: {gains}"
 
 
 def _clouds(result, unit):

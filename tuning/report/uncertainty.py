@@ -33,11 +33,8 @@ from tuning.uncertainty.distributions import (
 from tuning.uncertainty.sampling import clopper_pearson
 
 QUANTITIES = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
-LIKELY = 3
-"""Most likely failures that are printed."""
-
-LINES = 1 << 12
-"""Draws that are written as CSV at once."""
+LIKELY = 3  # most likely failures that are printed
+LINES = 1 << 12  # draws that are written as CSV at once
 
 INTERVALS = (
     "intervals assume independent draws: exact for random draws, mostly too wide for latin"
@@ -94,9 +91,7 @@ def json_of(ensemble):
 
 
 def remarks_of(ensemble):
-    """Return warnings on the draws: that the steps are too long for the rig before any is drawn,
-    and that they are of a rejected structure.
-    """
+    """Return warnings on the draws: steps too long for the rig, and a rejected structure."""
     drawn = ensemble.case.rejected and "identified" in ensemble.distributions
     rejected = (
         f"draws are from the [covariance] of {ensemble.case.name}, of a structure that the data of"
@@ -110,7 +105,6 @@ def remarks_of(ensemble):
 
 
 def report(ensemble):
-    """Return the Report of an Ensemble."""
     varied = ", ".join(f"{n} {in_words(d)}" for n, d in ensemble.distributions.items())
     violations = ensemble.violations() if ensemble.limits else []
     remarks, diverged = remarks_of(ensemble), int(ensemble.failed.sum())
@@ -121,7 +115,12 @@ def report(ensemble):
         words = f"{count(finite, 'run')} finite: a standard deviation and an interval of the mean"
         sections.append(Text([f"{words} need two finite runs"], gap=True))
     if violations:
-        sections.append(_violation_table(violations))
+        rows = []
+        for v in violations:
+            shares = Value(v["probability"], 4), Value(v["interval95"], 4, between=" : ")
+            rows.append([v["name"], Value(v["limit"], unit=v["unit"]), v["count"], *shares])
+        heads = ["limit", "value", "broken in", "probability", "95 % interval"]
+        sections.append(Table(rows, heads, gap=True, top=True))
     lines = [f"{INTERVALS} (these draws are {ensemble.method})"] * (ensemble.method != "random")
     lines.append(
         f"{count(diverged, 'run')} diverged: counted as breaking every limit, left out of all"
@@ -233,7 +232,6 @@ def _measure_table(ensemble):
 
 
 def promise_sentence(promise):
-    """Return the sentence on a Promise that can be quoted."""
     inverse = 1.0 / promise.promise
     rate = f"{100 * promise.promise:g} %"
     if abs(inverse - round(inverse)) < 1e-6 * inverse:
@@ -278,21 +276,6 @@ def _promise_sections(ensemble):
         heads = [f"failure at {failure['distance']:.2f} sd" for failure in likely]
         sections.append(Table(rows, ["parameter", "unit", "nominal", *heads], gap=True))
     return sections
-
-
-def _violation_table(violations):
-    rows = [
-        [
-            v["name"],
-            Value(v["limit"], unit=v["unit"]),
-            v["count"],
-            Value(v["probability"], 4),
-            Value(v["interval95"], 4, between=" : "),
-        ]
-        for v in violations
-    ]
-    heads = ["limit", "value", "broken in", "probability", "95 % interval"]
-    return Table(rows, heads, gap=True, top=True)
 
 
 def in_words(d):

@@ -19,26 +19,19 @@ from jaxtank.core.labels import label_of, labels_of
 from jaxtank.limits import draws, dry_level, limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.signals.setpoints import Ramps
+from tuning.search.result import row_of
 
-UNJUDGED = (OpenLoop, OnOff)
-"""Controllers that are not judged on tracking."""
+UNJUDGED = (OpenLoop, OnOff)  # controllers that are not judged on tracking
 
-OFF = 0.05
-"""Share of a tank's height by which a level may miss its setpoint where it should have settled."""
+OFF = 0.05  # share of a tank's height by which a settled level may miss its setpoint
 
-SHARE = 0.5
-"""Share of an output's largest step by which it may miss, where steps are above SMALL."""
-
-SMALL = 0.005
-"""Share of a tank's height from which a step is one to be followed, and not noise."""
-
-SATURATED = 0.5
-"""Share of the samples at a pump limit from which a large RMS error is no transient."""
+SHARE = 0.5  # share of an output's largest step by which it may miss, where steps are above SMALL
+SMALL = 0.005  # share of a tank's height from which a step is one to be followed, and not noise
+SATURATED = 0.5  # share of the samples at a pump limit from which a large RMS error is no transient
 
 WHEN = "time_of_steady_state_error"
 
-EXACT = 1e-4
-"""Share of a tank's height below which a miss is not worth a number."""
+EXACT = 1e-4  # share of a tank's height below which a miss is not worth a number
 
 
 class Part(NamedTuple):
@@ -68,7 +61,6 @@ class Verdict:
 
     @property
     def good(self) -> bool:
-        """True where every part is."""
         return all(part.good for part in self._parts)
 
     @property
@@ -82,7 +74,6 @@ class Verdict:
         return self.sentence
 
     def to_json(self) -> dict[str, Any]:
-        """Return the object `verdict` of a command's JSON."""
         names = ("tracking", "limits", "plants", "robustness")
         parts = {n: None if (part := getattr(self, n)) is None else part.words for n in names}
         return {"good": self.good, "sentence": self.sentence, **parts}
@@ -94,7 +85,6 @@ def outcome(words: str, good: bool = True) -> Verdict:
 
 
 def of_run(case: Case, values: Mapping[str, Any]) -> Verdict:
-    """Return the Verdict of a run with the measures `values`."""
     rows = limit_rows(case, values)
     return Verdict(
         tracking=tracking(case.loop, values),
@@ -104,9 +94,7 @@ def of_run(case: Case, values: Mapping[str, Any]) -> Verdict:
 
 
 def beyond(case: Case, values: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return what is wrong though no limit of `rows` names it: a level above its rim, liquid that
-    spills over it, a pump that draws from an empty tank.
-    """
+    """Return what no limit of `rows` names: levels above rims, spilling, pumps that draw air."""
     loop, plant = case.loop, cast(Any, case.loop.plant)
     if "max_level" not in values or not hasattr(plant, "rim"):
         return []
@@ -145,9 +133,7 @@ def _dry_pumps(case, values, rims):
 
 
 class _Tracked(NamedTuple):
-    """Tracking of a run, or of many (leading axes): (..., outputs) numbers, and where they are too
-    large.
-    """
+    """Tracking of runs: (..., outputs) numbers, and where they are too large."""
 
     swing: Any  # to either side of the setpoint at the end of a plateau
     missed: Any  # larger of swing and error at the end of a plateau, NaN where there is none
@@ -190,21 +176,16 @@ def _allowed(loop, heights):
 def not_tracking(
     loop: ClosedLoop, values: Mapping[str, Any], failed: np.ndarray
 ) -> np.ndarray | None:
-    """Return for which of many runs that have not failed `tracking` is not good, (N,) of measures
-    (N, ...); None where runs are not judged on tracking, or all have failed.
-    """
+    """Return (N,) which of many runs that have not failed do not track; None where unjudged."""
     tracked = _tracked(loop, values)
     if tracked is None or failed.all():
         return None
     unknown = ~np.isfinite(tracked.rms)
-    wrong = unknown | tracked.off | tracked.loose | tracked.stuck
-    return np.any(wrong, axis=-1) & ~failed
+    return np.any(unknown | tracked.off | tracked.loose | tracked.stuck, axis=-1) & ~failed
 
 
 def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
-    """Return how near the controlled levels come to their setpoints: at the end of each plateau,
-    where they may swing about it, and by their RMS errors where a setpoint has none.
-    """
+    """Return how near levels come to setpoints: at plateaus, else by their RMS errors."""
     tracked = _tracked(loop, values)
     if tracked is None:
         return None
@@ -240,38 +221,21 @@ def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
 def limit_rows(case: Case, values: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the limits of a run as fields of `ConstraintRow`, the tightest first."""
     rows = []
-    for limit in resolve_limits(case):
-        if limit.measure not in values:
-            continue
+    for limit in (limit for limit in resolve_limits(case) if limit.measure in values):
         entry = lambda name, i=limit.index: float(np.ravel(values[name])[i])
         reached = ms.MEASURES[limit.measure].reached
-        rows.append(
-            {
-                "name": limit.label,
-                "words": limit.words,
-                "measure": limit.measure,
-                "unit": ms.unit(limit.measure, case.loop.units),
-                "limit": float(limit.value),
-                "value": entry(limit.measure),
-                "margin": limit.margin(values),
-                "scale": limit_scale(limit, case.loop),
-                "reason": None if np.isfinite(entry(limit.measure)) else "undefined",
-                "tank": limit.index + 1 if ms.MEASURES[limit.measure].per == "tank" else None,
-                "time_s": entry(reached) if reached in values else None,
-            }
-        )
+        time_s = entry(reached) if reached in values else None
+        row = row_of(limit, case.loop, entry(limit.measure), time_s=time_s).to_json()
+        rows.append(row | {"scale": limit_scale(limit, case.loop)})
     return sorted(rows, key=_share)
 
 
 def _share(row):
-    """The margin of a limit as a share of its size."""
     return row["margin"] / (row.get("scale") or abs(row["limit"]) or 1.0)
 
 
 def limits(rows: Sequence[Mapping[str, Any]], more: Sequence[str] = ()) -> Part | None:
-    """Return which limit is the tightest or broken, by how much and when, and what is wrong beside
-    them; None without any.
-    """
+    """Return which limit is tightest or broken, and what else is wrong; None without any."""
     part = _of_limits(rows) if rows else None
     if not more:
         return part
@@ -379,9 +343,7 @@ def _judged(answer):
 
 
 def shown(value: Any, digits: int = 3) -> str:
-    """Return a number as the live page writes it (`shown` of core.js): rounded half up, with an
-    exponent below 0.001 and from a million on.
-    """
+    """Return a number as the live page writes it (`shown` of core.js), rounded half up."""
     value = float(value)
     if not math.isfinite(value):
         return "–"

@@ -6,9 +6,8 @@
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from jaxtank import presets, rig
@@ -19,14 +18,13 @@ from jaxtank.core.errors import InputError, unknown
 from jaxtank.export.timing import step_time
 from jaxtank.loop.margins import stability_margins
 from jaxtank.rig.components import kind_of
-from tuning.problem.controllers import START, same_rig, with_kind
+from tuning.problem.controllers import START, equal, same_rig, with_kind
 from tuning.search.judged import FRESH, Judged, validate
 from tuning.search.options import check_numbers, check_precision
 from tuning.search.tuner import tune
 from tuning.views import Result
 
-MISPRINTS = "-printed"
-"""End of the name of a case whose controller has a misprint of its paper; it is left out."""
+MISPRINTS = "-printed"  # end of the name of a case with a misprint, which is left out
 
 
 class Rival(NamedTuple):
@@ -43,12 +41,10 @@ class Rival(NamedTuple):
 
     @property
     def tuned(self) -> bool:
-        """Whether the gains are those of the default answer."""
         return self.gains == "tuned"
 
     @property
     def filtered(self) -> bool:
-        """Whether a safety filter stands in front of the controller."""
         return self.case.loop.safety_filter is not None
 
     @property
@@ -65,12 +61,10 @@ class Rival(NamedTuple):
 
     @property
     def violations(self) -> int:
-        """Number of plants on which a limit is broken."""
         return int((~self.judged.held).sum())
 
     @property
     def holds(self) -> bool:
-        """Whether every limit holds on every plant."""
         return bool(self.judged.held.all())
 
     def words(self) -> str:
@@ -160,14 +154,8 @@ def _of_paper(case: Case) -> list[Case] | None:
         and not isinstance(other.loop.controller, OpenLoop)
         and other.clock == case.clock
         and same_rig(other, case)
-        and all(_equal(getattr(other.loop, p), getattr(case.loop, p)) for p in parts)
+        and all(equal(getattr(other.loop, p), getattr(case.loop, p)) for p in parts)
     ]
-
-
-def _equal(a: Any, b: Any) -> bool:
-    """Whether two parts of a loop are the same in structure and every number."""
-    (leaves, form), (others, other) = jax.tree.flatten(a), jax.tree.flatten(b)
-    return form == other and all(np.array_equal(x, y) for x, y in zip(leaves, others))
 
 
 def _peak(case: Case) -> tuple[float | None, str]:
@@ -250,15 +238,12 @@ def compare_controllers(
         except InputError as error:  # a law that this rig's plateaus do not admit
             refused[name] = str(error)
     if not rivals:
-        raise InputError(f"{case.name}: no controller fits this rig: {_reasons(refused)}")
+        reasons = "; ".join(f"{name}: {why}" for name, why in refused.items())
+        raise InputError(f"{case.name}: no controller fits this rig: {reasons}")
     rivals.sort(key=order)
     return ControllerComparison(
         case=case, rivals=tuple(rivals), refused=refused, samples=samples, seed=seed
     )
-
-
-def _reasons(refused: dict[str, str]) -> str:
-    return "; ".join(f"{name}: {why}" for name, why in refused.items())
 
 
 def _judged(name: str, gains: str, case: Case, samples: int, seed: int) -> Iterator[Rival]:

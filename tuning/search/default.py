@@ -22,33 +22,21 @@ from tuning.search.solve import Plan, Solution, Stages
 
 CHECKED = 256  # plants that are looked at
 
-SEED = 20_011
-"""Seed of these plants and their noise, for any seed of a search: the same limits are active."""
+SEED = 20_011  # of these plants and their noise, whatever the seed of the search
 
 ADDED = 8  # validation plants that are added to the plants of the search
 WORST = 2  # of each limit, the plants that come nearest to it are added, as many as this
 
-SHARE = 0.4
-"""Tightening of a limit, as a share of the distance from the 90 % quantile over the plants to their
-worst [-]: a new plant may be worse than all of these."""
+SHARE = 0.4  # tightening of a limit, from the 90 % quantile of the plants to their worst [-]
 
 LARGEST = 0.25  # largest tightening, as a share of the limit [-]
 LIGHT = 1e-9  # weight of an added plant in the cost [-]: it serves the limits alone
 
-ATTEMPTS = 4
-"""Largest number of answers that are judged: with a filter, at the true step, tighter limits."""
-
-ROUNDS = 4
-"""Searches for an answer, at most, until it holds the limits on the plants that are looked at."""
-
-MISLED = 1.5
-"""Ratio of the costs at the true and at the coarse step above which the coarse one misleads [-]."""
-
-TIGHTER = 1.2
-"""Factor on the violation of a limit by which it is tightened further for the next search [-]."""
-
-LEVELS = ("max_level", "overflow_volume")
-"""Measures that a safety filter on levels keeps within their limits."""
+ATTEMPTS = 4  # answers that are judged: with a filter, at the true step, tighter limits
+ROUNDS = 4  # most searches until an answer holds the limits on the plants looked at
+MISLED = 1.5  # ratio of the costs at true and coarse step above which the coarse one misleads
+TIGHTER = 1.2  # factor on the violation of a limit, for the next search [-]
+LEVELS = ("max_level", "overflow_volume")  # that a safety filter keeps
 
 Key = tuple[str, int]  # (measure, entry) of a limit
 
@@ -112,11 +100,9 @@ class Checks:
         return max((v / sizes[k] for k, v in self.tightening.items() if v > 0.0), default=0.0)
 
     def limits(self) -> dict[str, Any]:
-        """Return {measure: value} tightened."""
         return tightened(self.problem.loop.plant, self.stated, self.tightening)
 
     def scenarios(self) -> list[Scenario]:
-        """Return the added plants."""
         return [self.problem.scenarios[i]._replace(weight=LIGHT) for i in self.added]
 
     def runs(self, share: float) -> list[ScenarioRun]:
@@ -228,7 +214,8 @@ def _remedy(task: Task, attempt: Attempt, checks: Checks | None, coarse: bool) -
         return "fine step"
     if after.held.all():
         return ""
-    if task.may_filter and setting.filter is None and _levels_broken(after):
+    levels_broken = any(r["broken"] and r["limit"].measure in LEVELS for r in after.worst())
+    if task.may_filter and setting.filter is None and levels_broken:
         return "safety filter"
     search = solution.search
     return "tighter limits" if checks and search and search.violation(solution.point) == 0 else ""
@@ -314,7 +301,3 @@ def _misled(cost: float, after: Judged) -> bool:
         return True
     ratio = float(np.mean(after.cost[good])) / cost if cost > 0 else 1.0
     return not 1.0 / MISLED < ratio < MISLED
-
-
-def _levels_broken(after: Judged) -> bool:
-    return any(row["broken"] and row["limit"].measure in LEVELS for row in after.worst())

@@ -22,9 +22,7 @@ from tuning.search.result import Lost, Message
 CHECKED_RUNS = 16  # scenarios that are run, at most, to look for a step that is too long
 STEP = 1e-4  # step of the differences of the gradient, in the unit cube [-]
 
-OFF = 0.1
-"""Distance from the setpoint at the end of a plateau, as a share of the change that led to it,
-from which an output does not follow: twice the band of the settling time [-]."""
+OFF = 0.1  # distance from a setpoint, in its last change: twice the settling band [-]
 
 WORSE = 2.0  # factor by which that distance must have grown to be called a change for the worse [-]
 LATE = 0.1  # share of a plateau, at its end, over which the distance is averaged [-]
@@ -43,10 +41,7 @@ TOO_LONG = "step-too-long"
 
 
 def step_warnings(tuned, values, key=None, scenarios=()):
-    """Return () where the steps of the tuned case and of its scenarios are short enough, else the
-    Message on a run that is wrong, because an explicit step was unstable near an empty tank, or on
-    what would happen to a tank that runs empty.
-    """
+    """Return Messages on steps that are unstable near an empty tank, in the case or a scenario."""
     runs = [("", tuned.loop, tuned.clock, key)]
     for run in scenarios[:CHECKED_RUNS]:
         loop = with_values(run.case.loop, values)
@@ -128,9 +123,31 @@ def curvature(search, point, idle=None):
         return None
     values, vectors = np.linalg.eigh(basis.T @ matrix @ basis)
     directions = (basis @ vectors).T
-    there = _step_of_ten_percent(problem.bounds, z, directions[0])
+    direction = directions[0]
+    flat = direction * np.sign(direction[np.argmax(np.abs(direction))])
+    largest = int(np.argmax(np.abs(flat)))
+    b = problem.bounds[largest]
+    step = np.log(1.1) / np.log(b.high / b.low) if b.scale == "log" else 0.1
+    step = step / flat[largest]  # with it the largest component changes by 10 %
+    if not 0 <= z[largest] + step * flat[largest] <= 1:
+        step = -step
+    there = np.clip(z + step * flat, 0.0, 1.0)
     gradient = point.gradient / search.scale
-    factors, rounded = _short_factors(problem.bounds, z, there, gradient, matrix)
+    # As many as leave the change of the cost, by the quadratic model, within 5 %: along a least
+    # sensitive direction a component of 1e-4 can matter, for the objective is steep beside.
+
+    def model(to):
+        return gradient @ (to - z) + 0.5 * (to - z) @ matrix @ (to - z)
+
+    factors, rounded = [], z
+    for decimals in range(2, 9):
+        ends = zip(problem.bounds, z.tolist(), there.tolist())
+        factors = [_rounded(b, old, new, decimals) for b, old, new in ends]
+        rounded = np.array(
+            [_moved(b, old, f) for b, old, f in zip(problem.bounds, z.tolist(), factors)]
+        )
+        if abs(model(rounded) - model(there)) <= 0.05 * abs(model(there)):
+            break
     costs, margins = search.evaluator.screen(np.array([z, rounded]))
     if np.all(margins[1] >= 0) and costs[1] < costs[0]:
         search.point(rounded)
@@ -159,44 +176,13 @@ def _second_derivative(search, z):
 def _free_directions(search, point, idle):
     """Return an orthonormal basis (P, free) of the directions no active limit or bound fixes."""
     z, count = point.z, len(point.z)
-    active = search.scaled_margins(point)[0] < 1e-4
-    fixed = list(point.margin_slopes[active])
+    fixed = list(point.margin_slopes[search.scaled_margins(point)[0] < 1e-4])
     still = np.zeros(count, dtype=bool) if idle is None else idle
     fixed += [np.eye(count)[i] for i in range(count) if z[i] < 1e-6 or z[i] > 1 - 1e-6 or still[i]]
     if not fixed:
         return np.eye(count)
     _, sizes, rows = np.linalg.svd(np.array(fixed))
     return rows[np.sum(sizes > 1e-9 * max(sizes[0], 1e-300)) :].T
-
-
-def _step_of_ten_percent(bounds, z, direction):
-    """Return the point (P,) along a direction where its largest component has changed by 10 %."""
-    flat = direction * np.sign(direction[np.argmax(np.abs(direction))])
-    largest = int(np.argmax(np.abs(flat)))
-    b = bounds[largest]
-    step = np.log(1.1) / np.log(b.high / b.low) if b.scale == "log" else 0.1
-    step = step / flat[largest]
-    if not 0 <= z[largest] + step * flat[largest] <= 1:
-        step = -step
-    return np.clip(z + step * flat, 0.0, 1.0)
-
-
-def _short_factors(bounds, z, there, gradient, matrix):
-    """Return (factors, z of them) of the step to `there`, in as few decimals as suffice."""
-    # As many as leave the change of the cost, by the quadratic model, within 5 %: along a least
-    # sensitive direction a component of 1e-4 can matter, for the objective is steep beside.
-
-    def model(to):
-        return gradient @ (to - z) + 0.5 * (to - z) @ matrix @ (to - z)
-
-    factors, rounded = [], z
-    for decimals in range(2, 9):
-        ends = zip(bounds, z.tolist(), there.tolist())
-        factors = [_rounded(b, old, new, decimals) for b, old, new in ends]
-        rounded = np.array([_moved(b, old, f) for b, old, f in zip(bounds, z.tolist(), factors)])
-        if abs(model(rounded) - model(there)) <= 0.05 * abs(model(there)):
-            break
-    return factors, rounded
 
 
 def _rounded(b, old, new, decimals):

@@ -115,17 +115,14 @@ def tune_choices(
 
 def _row(variant, result):
     """Return the row of one combination; result : None where it does not fit."""
-    objective, after = {"before": None, "after": None}, {}
-    if result is not None:
-        objective = {side: result.objective[side] for side in objective}
-        after = {n: p["after"] for n, p in result.parameters.items()}
-    return {
-        "values": variant.values,
-        "status": UNFIT if result is None else str(result.status),
-        "objective": objective,
-        "parameters": after,
-        "reason": variant.why if result is None else None,
-    }
+    objective: dict[str, Any] = {"before": None, "after": None}
+    row = {"values": variant.values, "status": UNFIT, "objective": objective, "parameters": {}}
+    if result is None:
+        return row | {"reason": variant.why}
+    objective = {side: result.objective[side] for side in objective}
+    after = {n: p["after"] for n, p in result.parameters.items()}
+    row |= {"status": str(result.status), "objective": objective, "parameters": after}
+    return row | {"reason": None}
 
 
 def _variants(case, choices, free):
@@ -159,7 +156,6 @@ def _check_choices(choices):
 
 
 def _variant(case, values, kinds, free):
-    """Return the Variant of one combination."""
     rest = {name: value for name, value in values.items() if name not in kinds}
     if kinds:
         kind = values[kinds[0]]

@@ -10,20 +10,9 @@ from tuning.problem.evaluator import Evaluator
 from tuning.problem.problem import DIVERGED, Point
 from tuning.problem.slopes import SlopeCheck, check_slope
 
-TIGHTENING = 1e-6
-"""Share of its limit by which a search keeps a measure inside it, so that the reported value is not
-above by round-off [-].
-"""
-
-SETTLED = 0.02
-"""KKT residual, of the scaled cost per unit of z, below which a first-order method counts as
-converged.
-"""
-
-SLOPING = 0.05
-"""KKT residual, of the scaled cost per unit of z, above which `downhill` looks for a lower
-point.
-"""
+TIGHTENING = 1e-6  # share of a limit by which a search stays inside it: round-off [-]
+SETTLED = 0.02  # KKT residual (scaled cost per unit of z) of a converged first-order method
+SLOPING = 0.05  # KKT residual above which `downhill` looks for a lower point
 
 STRIDES = (3e-2, 1e-2, 3e-3, 1e-3, 1e-4)
 """Steps along the gradient that is left, in the unit cube, at which `downhill` looks for a lower
@@ -35,8 +24,7 @@ UNSTABLE = 1.0 / STRIDES[-1]
 least of STRIDES: the derivative of an unstable or chaotic run, exact, and of no use for a step.
 """
 
-LOWER_BY = 1e-4
-"""Share by which the cost must fall for a point to count as lower than one at a kink [-]."""
+LOWER_BY = 1e-4  # share by which a cost must fall to count as lower at a kink [-]
 
 
 class Search:
@@ -100,7 +88,6 @@ class Search:
         return float(self.violations(point.margins))
 
     def violations(self, margins: Any) -> Any:
-        """Return (...,) the largest violation of margins (..., limits), as `violation`."""
         return np.max(-margins / self.limit_scale, axis=-1, initial=0.0)
 
     def return_to_start(self) -> bool:

@@ -105,11 +105,10 @@ def _batch(most: int, count: int) -> int:
 
 FRESH = 256  # plants on which an answer is judged
 
-NOMINAL = (
+NOMINAL = (  # measures of the nominal plant, which runs in addition to the plants
     *("rms_error_total", "rms_error", "settling_time", "recovery_time"),
     *("steady_state_error", "steady_state_swing", "time_of_steady_state_error"),
 )
-"""Measures of the nominal plant, which runs in addition to the plants."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
@@ -275,14 +274,9 @@ def judge(setting: Setting, samples: int, seed: int, round_: int = 0) -> Judged:
     names = [m for m in dict.fromkeys(names) if ms.serves(m, case.loop)]
     names += [limit.measure for limit in limits]
     quiet = [m for m in NOMINAL if ms.serves(m, case.loop)] if not noisy(setting.case) else []
-    plants = run_plants(
-        case,
-        setting.distributions,
-        samples,
-        (SEED_OFFSET + seed + 104_729 * round_) % 2**31,
-        tuple(dict.fromkeys([*names, *quiet])),
-        bool(quiet),
-    )
+    seed = (SEED_OFFSET + seed + 104_729 * round_) % 2**31
+    asked = tuple(dict.fromkeys([*names, *quiet]))
+    plants = run_plants(case, setting.distributions, samples, seed, asked, bool(quiet))
     measures = {m: plants.measures[m] for m in dict.fromkeys(names)}
     rows = {m: v.reshape(samples, -1) for m, v in measures.items()}
     cost = sum(w * rows[m].sum(axis=1) for m, w in setting.objective.items())
@@ -295,18 +289,16 @@ def judge(setting: Setting, samples: int, seed: int, round_: int = 0) -> Judged:
         travel=np.sqrt(np.mean(changes**2, axis=1)),
         held=~(plants.failed | np.any(past, axis=0)) if past else ~plants.failed,
         failed=plants.failed,
-        infeasible=_infeasible(setting.case, plants.values),
+        # (N,) True where no controller can hold a setpoint; None where that is not known
+        infeasible=~can_follow(setting.case, plants.values, setting.case.limits)
+        if can_judge(setting.case)
+        else None,
         limits=limits,
         measures=measures,
         nominal=plants.nominal,
         unit=setting.case.loop.units[0],
         runs="plants" if setting.plants_vary else setting.runs,
     )
-
-
-def _infeasible(case, values):
-    """Return (N,) True where no controller can hold a setpoint; None where that is not known."""
-    return ~can_follow(case, values, case.limits) if can_judge(case) else None
 
 
 def matters(setting: Setting, plants: Judged, near: float) -> np.ndarray:
@@ -387,16 +379,12 @@ class Answer(Shown):
         share: dict[str, Any] = {"share": None, "interval95": None, "samples": 0}
         if self.after is not None and self.after.limits:
             share = self.after.share_held()
-        return {
-            "limits_on_validation": share["share"],
-            "interval95": share["interval95"],
-            "samples": share["samples"],
-            "certified": [
-                {"tank": row.tank + 1, "certified": bool(row.certified), "why": row.reason}
-                | {"starts": row.starts or None}
-                for row in self.setting.certificates
-            ],
-        }
+        certified = [
+            {"tank": row.tank + 1, "certified": bool(row.certified), "why": row.reason}
+            | {"starts": row.starts or None}
+            for row in self.setting.certificates
+        ]
+        return {"limits_on_validation": share.pop("share"), **share, "certified": certified}
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON entries for plants, noise and safety filter."""

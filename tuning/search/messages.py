@@ -70,23 +70,17 @@ FRAGILE, PEAK = 2.5, 2.0
 """Sensitivity peak Ms above which a loop is near the edge of its stability, and above which a loop
 that became less robust is reported [-]: textbooks recommend 1.4 to 2."""
 
-INSENSITIVE = 0.5
-"""Change of the objective [%] for 10 % of a parameter, below which the objective is called
-insensitive to the parameter.
-"""
-
-CHATTER = 10.0
-"""Growth of the total variation of the inputs, or of their rms change per sample, above which it is
-reported [-]."""
-
-Messages = Iterator[Message]
+INSENSITIVE = 0.5  # change of the objective for 10 % of a parameter that is not felt [%]
+CHATTER = 10.0  # reported growth of the inputs' total variation, or rms change [-]
 
 
 def messages_of(result: TuningResult) -> tuple[Message, ...]:
     """Return the findings about a result, most important first; those on its step stay first."""
     first = [m for m in result.messages if m.code == "step-too-long"]
-    rules = [r for r, of in RULES if of in (ANY, OPTIMUM if result.answer is None else ANSWER)]
-    return (*first, *(message for rule in rules for message in rule(result)))
+    those = (ANY, OPTIMUM if result.answer is None else ANSWER)
+    rules = [(function, code) for function, of, code in RULES if of in those]
+    found = ((code, m) for function, code in rules for m in function(result))
+    return (*first, *(Message(code, m) if isinstance(m, str) else m for code, m in found))
 
 
 def violated(result: TuningResult) -> list[ConstraintRow]:
@@ -100,10 +94,24 @@ def first_of(parts: list[str]) -> str:
 
 
 def against_limit(c: ConstraintRow, digits: int = 6) -> str:
-    """Return a value and its limit in words."""
     return f"{c.name} is {c.amount()}, limit {c.limit:.{digits}g} {c.unit}"
 
 
+ANY, OPTIMUM, ANSWER = "any", "optimum", "answer"
+"""Results to which a rule applies: all; `--nominal` and `--robust`; default answers."""
+
+Messages = Iterator[Message | str]
+
+RULES: list[tuple[Callable[[TuningResult], Messages], str, str]] = []
+"""Every (rule, results to which it applies, code of its texts), most important first."""
+
+
+def rule(of: str, code: str = ""):
+    """Add a function that yields texts with a code, or Messages, to RULES."""
+    return lambda function: RULES.append((function, of, code)) or function
+
+
+@rule(OPTIMUM)
 def _on_new_plants(result: TuningResult) -> Messages:
     known = result.certificate
     if known is None:
@@ -139,6 +147,7 @@ def _on_new_plants(result: TuningResult) -> Messages:
         )
 
 
+@rule(ANY)
 def _near_the_edge(result: TuningResult) -> Messages:
     """The answer's linearised loop is unstable, or nearly so."""
     sides = (result.measures[side] for side in ("before", "after"))
@@ -159,16 +168,17 @@ def _near_the_edge(result: TuningResult) -> Messages:
     )
 
 
+@rule(ANSWER, "sensitivity-peak")
 def _less_robust(result: TuningResult) -> Messages:
     peaks = [float(m.get("sensitivity_peak", np.nan)) for m in result.measures.values()]
     if len(peaks) == 2 and max(PEAK, 1.05 * peaks[0]) < peaks[1] <= FRAGILE:
-        yield Message(
-            "sensitivity-peak",
+        yield (
             f"the sensitivity peak of the linearised loop is {peaks[1]:.3g}, {peaks[0]:.3g} before:"
-            f" --limit sensitivity_peak={PEAK:g} bounds it",
+            f" --limit sensitivity_peak={PEAK:g} bounds it"
         )
 
 
+@rule(OPTIMUM)
 def _total_variation(result: TuningResult) -> Messages:
     before, after = (float(result.measures[k]["input_travel"].sum()) for k in ("before", "after"))
     if after > CHATTER * before > 0:
@@ -183,6 +193,7 @@ def _total_variation(result: TuningResult) -> Messages:
         )
 
 
+@rule(ANSWER)
 def _busier(result: TuningResult) -> Messages:
     before, after = result.answer.before, result.answer.after
     if after is None or after.failed.all():
@@ -197,23 +208,24 @@ def _busier(result: TuningResult) -> Messages:
         )
 
 
+@rule(ANY, "input-chatters")
 def _chatters(result: TuningResult) -> Messages:
     problem, values = result.problem, result.measures.get("after", {})
-    for sentence in reported.chatter(problem.loop, problem.clock, values):
-        yield Message("input-chatters", sentence)
+    yield from reported.chatter(problem.loop, problem.clock, values)
 
 
+@rule(OPTIMUM, "no-feasible-point-found")
 def _no_feasible_point(result: TuningResult) -> Messages:
     missed = violated(result)
     if result.status == Status.NOT_CONVERGED and missed:
-        yield Message(
-            "no-feasible-point-found",
+        yield (
             "no point that meets every limit was found before the search ended"
             f" ({against_limit(missed[0])}): more --iterations,"
-            " --starts or --screening may find one",
+            " --starts or --screening may find one"
         )
 
 
+@rule(OPTIMUM, "infeasible")
 def _infeasible(result: TuningResult) -> Messages:
     if result.status != Status.INFEASIBLE:
         return
@@ -229,9 +241,10 @@ def _infeasible(result: TuningResult) -> Messages:
     least = (
         f"; the largest violation, {-100 * share:.3g} % of its limit, is the least that was found"
     )
-    yield Message("infeasible", text if worst.reason else text + least)
+    yield text if worst.reason else text + least
 
 
+@rule(ANY, "interrupted")
 def _interrupted(result: TuningResult) -> Messages:
     if result.status == Status.INTERRUPTED:
         words = "this is the best point so far"
@@ -239,9 +252,10 @@ def _interrupted(result: TuningResult) -> Messages:
             validated = result.answer.after is not None
             words = "of the search before this one" if validated else "not yet validated"
             words = f"these are the best gains so far, {words}"
-        yield Message("interrupted", f"interrupted: {words}")
+        yield f"interrupted: {words}"
 
 
+@rule(ANSWER, "limit-violated-out-of-sample")
 def _violated_on_plants(result: TuningResult) -> Messages:
     answer = result.answer
     if answer.after is None or answer.held:
@@ -256,13 +270,13 @@ def _violated_on_plants(result: TuningResult) -> Messages:
     )
     if answer.setting.filter is None and any(c.measure == "max_level" for c in worst):
         remedy = "--safety-filter keeps levels below their limits"
-    yield Message(
-        "limit-violated-out-of-sample",
+    yield (
         f"limits hold on {int(answer.after.held.sum())} of {answer.after.samples}"
-        f" {answer.setting.runs} ({'; '.join(parts)}): {remedy}",
+        f" {answer.setting.runs} ({'; '.join(parts)}): {remedy}"
     )
 
 
+@rule(ANY, "no-longer-follows")
 def _no_longer_follows(result: TuningResult) -> Messages:
     forced = any(c.active for c in result.constraints)
     remedy = (
@@ -271,25 +285,25 @@ def _no_longer_follows(result: TuningResult) -> Messages:
         else "weigh the error in the objective or narrow the ranges (--objective, --free)"
     )
     for x in result.lost:
-        yield Message(
-            "no-longer-follows",
+        yield (
             f"output {x.output} no longer follows its setpoint: at the end of a plateau it is"
             f" {x.after:.3g} {x.unit} off ({100 * x.share:.3g} % of the setpoint change),"
-            f" {x.before:.3g} {x.unit} before tuning; {remedy}",
+            f" {x.before:.3g} {x.unit} before tuning; {remedy}"
         )
 
 
+@rule(ANSWER, "not-converged")
 def _not_agreed(result: TuningResult) -> Messages:
     ruled = not result.starts and result.method.startswith("rule ")
     if result.status != Status.INTERRUPTED and not result.answer.agreed and not ruled:
-        yield Message(
-            "not-converged",
+        yield (
             "no two of the local searches ended within 1 % of each other, and differential"
             " evolution found better points: raise --starts or --iterations, or narrow the ranges"
-            " (--free)",
+            " (--free)"
         )
 
 
+@rule(ANY, "slope-not-usable")
 def _slope_not_usable(result: TuningResult) -> Messages:
     """At the answer and at the values before tuning; once where these are the same."""
     places = {"answer": "the answer", "start": "the values before tuning"}
@@ -302,13 +316,22 @@ def _slope_not_usable(result: TuningResult) -> Messages:
         times = (
             "is not finite" if check.orders is None else f"is 1e{check.orders:.0f} times as large"
         )
-        yield Message(
-            "slope-not-usable",
+        yield (
             f"at {words} the loop is chaotic or unstable: runs near this point give"
             f" a slope of the objective of {check.secants[0]:.2g} per range of a parameter, the"
             f" exact derivative {times}; it was not used: other starts and differential evolution"
-            f" {role}",
+            f" {role}"
         )
+
+
+@rule(ANSWER, "limit-not-certified")
+def _certificates(result: TuningResult) -> Messages:
+    for row in result.answer.setting.certificates:
+        if not row.certified:
+            yield (
+                f"the limit of {label_of(result.problem.loop.plant, 'tank', row.tank)} is not"
+                f" proved: {row.reason}"
+            )
 
 
 def _flat(result: TuningResult) -> bool:
@@ -316,16 +339,17 @@ def _flat(result: TuningResult) -> bool:
     return result.optimality["gradient_norm"] == 0.0 and result.objective["after"] != 0.0
 
 
+@rule(OPTIMUM, "objective-without-slope")
 def _without_slope(result: TuningResult) -> Messages:
     if result.status != Status.INFEASIBLE and _flat(result):
-        yield Message(
-            "objective-without-slope",
+        yield (
             "the gradient of the objective is zero here: the objective changes in steps, as times"
             " and counts do, and a search by gradients cannot show that this is its minimum; add a"
-            " smooth measure to the objective",
+            " smooth measure to the objective"
         )
 
 
+@rule(OPTIMUM)
 def _gradient_left(result: TuningResult) -> Messages:
     residual, kink = result.optimality["kkt_residual"], result.status == Status.CONVERGED
     ended = kink or result.status == Status.NOT_CONVERGED
@@ -341,6 +365,7 @@ def _gradient_left(result: TuningResult) -> Messages:
         )
 
 
+@rule(OPTIMUM, "not-converged")
 def _not_converged(result: TuningResult) -> Messages:
     """Why a search that violates no limit did not converge, and the remedy."""
     zero, probe = result.optimality["gradient_norm"] == 0.0, result.probe or {"lower": 0}
@@ -380,17 +405,16 @@ def _not_converged(result: TuningResult) -> Messages:
             " optimum do not hold there; try more --starts or other starting values",
         ),
     )
-    yield Message("not-converged", next(text for holds, text in reasons if holds))
+    yield next(text for holds, text in reasons if holds)
 
 
+@rule(OPTIMUM, "nothing-better-found")
 def _nothing_better(result: TuningResult) -> Messages:
     if result.status == Status.CONVERGED and result.probe:
-        yield Message(
-            "nothing-better-found",
-            f"differential evolution found nothing better in {result.probe['runs']} runs",
-        )
+        yield f"differential evolution found nothing better in {result.probe['runs']} runs"
 
 
+@rule(OPTIMUM, "start-violates-limit")
 def _start_violates(result: TuningResult) -> Messages:
     rows = [c for c in constraint_rows(result.problem, result.tables["before"]) if c.margin < 0]
     parts = [
@@ -398,13 +422,13 @@ def _start_violates(result: TuningResult) -> Messages:
         for c in rows
     ]
     if parts and not violated(result):
-        yield Message(
-            "start-violates-limit",
+        yield (
             f"the starting values violate a limit ({first_of(parts)}), so the"
-            " objectives before and after do not compare",
+            " objectives before and after do not compare"
         )
 
 
+@rule(OPTIMUM, "limit-not-applicable")
 def _not_applicable(result: TuningResult) -> Messages:
     """Entries of a limited measure that are undefined in every run."""
     keys, plant = {limit.key for limit in result.problem.limits}, result.problem.loop.plant
@@ -414,13 +438,13 @@ def _not_applicable(result: TuningResult) -> Messages:
         for i in range(ms.entries(measure, plant)):
             if (measure, i) in keys:
                 continue
-            yield Message(
-                "limit-not-applicable",
+            yield (
                 f"{entry_label(plant, measure, 'output', i)} is not limited: the setpoint has no"
-                " step",
+                " step"
             )
 
 
+@rule(OPTIMUM)
 def _active(result: TuningResult) -> Messages:
     for c in result.constraints:
         if c.active:
@@ -433,27 +457,18 @@ def _active(result: TuningResult) -> Messages:
         yield Message("no-limit-active", "no limit is active")
 
 
-def _certificates(result: TuningResult) -> Messages:
-    for row in result.answer.setting.certificates:
-        if not row.certified:
-            yield Message(
-                "limit-not-certified",
-                f"the limit of {label_of(result.problem.loop.plant, 'tank', row.tank)} is not"
-                f" proved: {row.reason}",
-            )
-
-
+@rule(ANY, "parameter-not-exercised")
 def _not_exercised(result: TuningResult) -> Messages:
     idle = [n for n in result if not result[n].exercised]
     if idle:
         values = ", ".join(f"{n} {result[n].after:g} {result[n].unit}" for n in idle)
-        yield Message(
-            "parameter-not-exercised",
+        yield (
             f"{values} {'has' if len(idle) == 1 else 'have'} no effect in any run: any value in the"
-            " range gives the same run, so the start value is kept",
+            " range gives the same run, so the start value is kept"
         )
 
 
+@rule(ANY)
 def _at_bound_or_insensitive(result: TuningResult) -> Messages:
     for name in result:
         p = result[name]
@@ -475,75 +490,17 @@ def _at_bound_or_insensitive(result: TuningResult) -> Messages:
             )
 
 
-def _least_sensitive(result: TuningResult) -> Messages:
-    parts: list[str] = []
-    least = result.curvature["least_sensitive"] if result.curvature else {"factors": {}}
-    for b, factor in zip(result.problem.bounds, least["factors"].values()):
-        if b.scale == "log" and factor != 1:
-            parts.append(f"{b.name} x {factor:.10g}")
-        elif b.scale != "log" and factor != 0:
-            parts.append(f"{b.name} {factor:+.10g}{'' if b.unit == '-' else f' {b.unit}'}")
-    if parts:
-        together = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} with {parts[-1]}"
-        yield Message(
-            "least-sensitive-direction",
-            f"least sensitive direction: {together} changes the objective by"
-            f" {least['changes_percent']:.2g} %",
-        )
-
-
-def _agreement(result: TuningResult) -> Messages:
-    feasible = [o["cost"] for o in result.starts if o["violation"] == 0.0]
-    if not feasible:  # nothing to agree on
-        return
-    alike = sum(cost <= min(feasible) * (1.0 + AGREE) for cost in feasible)
-    searches = count(len(result.starts), "search")
-    yield Message(
-        "starts-agree", f"{alike} of {searches} ended within 0.1 % of the best objective found"
-    )
-    if result.symmetry and result.symmetry["objective"] is not None:
-        yield Message("permutation-symmetry", _symmetry(result))
-
-
-def _symmetry(result: TuningResult) -> str:
-    """Return the equivalent answer in words."""
-    image: Any = result.symmetry
-    gains = ", ".join(f"{n} {v:.3g}" for n, v in image["values"].items())
-    above = 100 * (image["objective"] / result.objective["after"] - 1)
-    side = f"an objective {abs(above):.2g} % {'above' if above > 0 else 'below'}"
-    same = "the same objective" if abs(above) < 1e-3 else side
-    searches = len(image["starts"])
-    ended = f", {searches} of the searches ended there and count as this answer" * (searches > 0)
-    return f"permutation symmetry: {image['words']}: {gains} gives {same}{ended}"
-
-
-def _out_of_sample(result: TuningResult) -> Messages:
-    summary = result.validation if result.certificate is None else None
-    share = summary["limits_held"]["after"] if summary else None
-    problem = result.problem
-    if summary and share is not None and share < 1.0 and problem.limits:
-        plain = not problem.loop.safety_filter and "max_level" in {
-            x.measure for x in problem.limits
-        }
-        caps = "--safety-filter keeps levels below their limits, " if plain else ""
-        runs = summary["samples"] - summary["failed"]
-        yield Message(
-            "limit-violated-out-of-sample",
-            f"limits hold on {round(share * runs)} of {runs} validation plants:"
-            f" {caps}--robust tunes for perturbed plants",
-        )
-
-
+@rule(ANSWER, "constraints-tightened")
 def _tightened(result: TuningResult) -> Messages:
     answer = result.answer
     if answer.tightened and not all(answer.kept.values()):
-        yield Message(
-            "constraints-tightened",
+        yield (
             f"the search tightened limits by up to {100 * answer.tightened:.2g} %, so that they"
-            " hold on validation plants",
+            " hold on validation plants"
         )
 
 
+@rule(ANSWER)
 def _assumed(result: TuningResult) -> Messages:
     setting = result.answer.setting
     if setting.assumed:
@@ -569,6 +526,7 @@ def _assumed(result: TuningResult) -> Messages:
         )
 
 
+@rule(ANSWER, "limit-idle")
 def _idle(result: TuningResult) -> Messages:
     if result.answer.idle:
         idle = [number - 1 for number in result.answer.idle]
@@ -578,62 +536,81 @@ def _idle(result: TuningResult) -> Messages:
         words = f"limits of {tanks} are not active: no plant comes within 10 % of them"
         if len(result.answer.idle) == 1:
             words = f"the limit of {tanks} is not active: no plant comes within 10 % of it"
-        yield Message("limit-idle", words)
+        yield words
 
 
+@rule(OPTIMUM, "least-sensitive-direction")
+def _least_sensitive(result: TuningResult) -> Messages:
+    parts: list[str] = []
+    least = result.curvature["least_sensitive"] if result.curvature else {"factors": {}}
+    for b, factor in zip(result.problem.bounds, least["factors"].values()):
+        if b.scale == "log" and factor != 1:
+            parts.append(f"{b.name} x {factor:.10g}")
+        elif b.scale != "log" and factor != 0:
+            parts.append(f"{b.name} {factor:+.10g}{'' if b.unit == '-' else f' {b.unit}'}")
+    if parts:
+        together = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} with {parts[-1]}"
+        yield (
+            f"least sensitive direction: {together} changes the objective by"
+            f" {least['changes_percent']:.2g} %"
+        )
+
+
+def _symmetry(result: TuningResult) -> str:
+    """Return the equivalent answer in words."""
+    image: Any = result.symmetry
+    gains = ", ".join(f"{n} {v:.3g}" for n, v in image["values"].items())
+    above = 100 * (image["objective"] / result.objective["after"] - 1)
+    side = f"an objective {abs(above):.2g} % {'above' if above > 0 else 'below'}"
+    same = "the same objective" if abs(above) < 1e-3 else side
+    searches = len(image["starts"])
+    ended = f", {searches} of the searches ended there and count as this answer" * (searches > 0)
+    return f"permutation symmetry: {image['words']}: {gains} gives {same}{ended}"
+
+
+@rule(OPTIMUM)
+def _agreement(result: TuningResult) -> Messages:
+    feasible = [o["cost"] for o in result.starts if o["violation"] == 0.0]
+    if not feasible:  # nothing to agree on
+        return
+    alike = sum(cost <= min(feasible) * (1.0 + AGREE) for cost in feasible)
+    searches = count(len(result.starts), "search")
+    yield Message(
+        "starts-agree", f"{alike} of {searches} ended within 0.1 % of the best objective found"
+    )
+    if result.symmetry and result.symmetry["objective"] is not None:
+        yield Message("permutation-symmetry", _symmetry(result))
+
+
+@rule(OPTIMUM, "limit-violated-out-of-sample")
+def _out_of_sample(result: TuningResult) -> Messages:
+    summary = result.validation if result.certificate is None else None
+    share = summary["limits_held"]["after"] if summary else None
+    problem = result.problem
+    if summary and share is not None and share < 1.0 and problem.limits:
+        limited = any(limit.measure == "max_level" for limit in problem.limits)
+        plain = limited and not problem.loop.safety_filter
+        caps = "--safety-filter keeps levels below their limits, " if plain else ""
+        runs = summary["samples"] - summary["failed"]
+        yield (
+            f"limits hold on {round(share * runs)} of {runs} validation plants:"
+            f" {caps}--robust tunes for perturbed plants"
+        )
+
+
+@rule(OPTIMUM, "screened-at-true-step")
 def _screened_again(result: TuningResult) -> Messages:
     redone = result.evaluations["redone_at_true_step"]
     if redone:
-        yield Message(
-            "screened-at-true-step",
+        yield (
             f"{count(redone, 'screening point')} diverged at the coarse step of the screening and"
             f" {'was' if redone == 1 else 'were'} run again at the case's own step: no action is"
-            " needed",
+            " needed"
         )
 
 
+@rule(OPTIMUM, "non-finite-points")
 def _non_finite(result: TuningResult) -> Messages:
     points = result.evaluations["non_finite"]
     if points:
-        yield Message(
-            "non-finite-points", f"{count(points, 'trial point')} gave non-finite numbers, rejected"
-        )
-
-
-ANY, OPTIMUM, ANSWER = "any", "optimum", "answer"
-"""Results to which a rule applies: all; `--nominal` and `--robust`; default answers."""
-
-RULES: tuple[tuple[Callable[[TuningResult], Messages], str], ...] = (
-    (_on_new_plants, OPTIMUM),
-    (_near_the_edge, ANY),
-    (_less_robust, ANSWER),
-    (_total_variation, OPTIMUM),
-    (_busier, ANSWER),
-    (_chatters, ANY),
-    (_no_feasible_point, OPTIMUM),
-    (_infeasible, OPTIMUM),
-    (_interrupted, ANY),
-    (_violated_on_plants, ANSWER),
-    (_no_longer_follows, ANY),
-    (_not_agreed, ANSWER),
-    (_slope_not_usable, ANY),
-    (_certificates, ANSWER),
-    (_without_slope, OPTIMUM),
-    (_gradient_left, OPTIMUM),
-    (_not_converged, OPTIMUM),
-    (_nothing_better, OPTIMUM),
-    (_start_violates, OPTIMUM),
-    (_not_applicable, OPTIMUM),
-    (_active, OPTIMUM),
-    (_not_exercised, ANY),
-    (_at_bound_or_insensitive, ANY),
-    (_tightened, ANSWER),
-    (_assumed, ANSWER),
-    (_idle, ANSWER),
-    (_least_sensitive, OPTIMUM),
-    (_agreement, OPTIMUM),
-    (_out_of_sample, OPTIMUM),
-    (_screened_again, OPTIMUM),
-    (_non_finite, OPTIMUM),
-)
-"""Every rule, most important first."""
+        yield f"{count(points, 'trial point')} gave non-finite numbers, rejected"

@@ -10,10 +10,7 @@ from tuning.problem.problem import DIVERGED, ROOT
 from tuning.search.driver import LOWER_BY, SETTLED, CoarseSearch, Search, optimality
 from tuning.search.screening import MEMBERS, distinct_starts, evolution_size, evolve, sobol
 
-STEEPEST = 10.0
-"""Largest gradient, of the scaled cost per unit of z, that a first-order method is given: a steep
-cost near instability should turn it back, and not move it far away.
-"""
+STEEPEST = 10.0  # largest gradient for a first-order method: a step must not go far away
 
 
 def lbfgs(search, z, iterations):
@@ -30,31 +27,6 @@ def adam(search, z, iterations):
     steps = 5 * iterations
     schedule = optax.cosine_decay_schedule(0.05, max(steps // _rounds(search), 1), 0.002)
     return _augmented(search, z, steps, optax.adam(schedule), descend=False)
-
-
-def minibatches(search, z, iterations, batch, rng):
-    """Return True if optax's Adam converged on `batch` scenarios, drawn anew for every step."""
-    import optax
-
-    steps = 5 * iterations
-    optimiser = optax.adam(optax.cosine_decay_schedule(0.05, steps, 0.002))
-    state, every = optimiser.init(z), max(1, steps // 10)
-    for k in range(steps):
-        point = search.evaluator.batch_point(z, batch, rng)
-        search.report(search)
-        if not point.finite:
-            z = 0.5 * (z + search.last_finite.z)
-            continue
-        scale = search.limit_scale[list(point.rows)]
-        penalty = 100.0 * np.maximum(0.0, -point.margins / scale)
-        g = point.gradient / search.scale - penalty @ (point.margin_slopes / scale[:, None])
-        g = g * min(1.0, STEEPEST / max(float(np.linalg.norm(g)), 1e-300))
-        update, state = optimiser.update(g, state, z)
-        z = np.clip(z + np.asarray(update), 0.0, 1.0)
-        if (k + 1) % every == 0:
-            search.point(z)
-    search.exhausted = True
-    return search.best is not None and optimality(search, search.best)[1] < SETTLED
 
 
 def _rounds(search):
@@ -103,17 +75,10 @@ kink a line search does not end by itself [-].
 
 ITERATION_LIMIT = 9  # status of scipy's SLSQP that has used up its iterations
 
-COARSE_TOLERANCE = 1e-4
-"""Tolerance of the search at a tenth of the samples, whose own error is larger [-]."""
-
-EXACT = 1e-8
-"""Tolerance of a search up to which Gauss-Newton goes on to rounding: it takes few steps there."""
-
-RESTORED = 5
-"""Points from which the least violation is searched for, where no search met the limits."""
-
-NEAR, HALVINGS = 0.1, 10
-"""Largest violation of a point that `approach` moves towards [-], and number of halvings."""
+COARSE_TOLERANCE = 1e-4  # at a tenth of the samples, whose own error is larger [-]
+EXACT = 1e-8  # up to it Gauss-Newton goes on to rounding: it takes few steps there
+RESTORED = 5  # points from which the least violation is sought, where none holds
+NEAR, HALVINGS = 0.1, 10  # largest violation that `approach` starts from [-], halvings
 
 MANY = 4  # number of parameters from which "auto" tries Gauss-Newton before it considers limits
 UNCONSTRAINED = ("trf", "coarse-trf")  # those that ignore limits
@@ -123,7 +88,27 @@ def slsqp(search, z, iterations, tolerance=None):
     """Return True if sequential quadratic programming converged, on the exact maxima."""
     tolerance = search.tolerance if tolerance is None else tolerance
     if search.problem.risk == "worst" and len(search.problem.runs) > 1:
-        return _epigraph(search, z, iterations, tolerance)
+        # min t subject to cost_i <= t, which is smooth where the largest cost is not.
+
+        def known(z):
+            point = search.point(z)
+            return point if point.finite else search.last_finite
+
+        def holds(y):
+            point = known(y[:-1])
+            return np.append(y[-1] - point.run_costs / search.scale, search.margins(y[:-1])[0])
+
+        def slopes(y):
+            point = known(y[:-1])
+            costs = np.hstack(
+                [-point.run_slopes / search.scale, np.ones((len(point.run_costs), 1))]
+            )
+            rows = search.margins(y[:-1])[1].reshape(-1, len(y) - 1)
+            return np.vstack([costs, np.hstack([rows, np.zeros((len(rows), 1))])])
+
+        y = np.append(z, known(z).run_costs.max() / search.scale)
+        rows = [{"type": "ineq", "fun": holds, "jac": slopes}]
+        return _minimise(search, _last, y, [(None, None)], rows, iterations, tolerance)
     rows = {
         "type": "ineq",
         "fun": lambda z: search.margins(z)[0],
@@ -154,7 +139,6 @@ def _minimise(search, function, y, more, constraints, iterations, tolerance):
 
 
 def _last(y):
-    """Return (the last of y, its gradient), which is minimised as a bound of other values."""
     return y[-1], np.eye(len(y))[-1]
 
 
@@ -179,29 +163,6 @@ class _Watch:
         if self.since > PATIENCE:
             raise _NoProgress
         return cost, gradient
-
-
-def _epigraph(search, z, iterations, tolerance):
-    """Return True if `slsqp` of the worst scenario converged."""
-    # min t subject to cost_i <= t, which is smooth where the largest cost is not.
-
-    def known(z):
-        point = search.point(z)
-        return point if point.finite else search.last_finite
-
-    def holds(y):
-        point = known(y[:-1])
-        return np.append(y[-1] - point.run_costs / search.scale, search.margins(y[:-1])[0])
-
-    def slopes(y):
-        point = known(y[:-1])
-        costs = np.hstack([-point.run_slopes / search.scale, np.ones((len(point.run_costs), 1))])
-        rows = search.margins(y[:-1])[1].reshape(-1, len(y) - 1)
-        return np.vstack([costs, np.hstack([rows, np.zeros((len(rows), 1))])])
-
-    y = np.append(z, known(z).run_costs.max() / search.scale)
-    rows = [{"type": "ineq", "fun": holds, "jac": slopes}]
-    return _minimise(search, _last, y, [(None, None)], rows, iterations, tolerance)
 
 
 def trf(search, z, iterations, tolerance=1e-10):
@@ -361,7 +322,27 @@ def run_local(search, z, how):
     if how.batch is None:
         return METHODS[how.method](search, z, how.iterations)
     rng = np.random.default_rng([how.seed, search.start])
-    return minibatches(search, z, how.iterations, how.batch, rng)
+    import optax
+
+    steps = 5 * how.iterations
+    optimiser = optax.adam(optax.cosine_decay_schedule(0.05, steps, 0.002))
+    state, every = optimiser.init(z), max(1, steps // 10)
+    for k in range(steps):
+        point = search.evaluator.batch_point(z, how.batch, rng)
+        search.report(search)
+        if not point.finite:
+            z = 0.5 * (z + search.last_finite.z)
+            continue
+        scale = search.limit_scale[list(point.rows)]
+        penalty = 100.0 * np.maximum(0.0, -point.margins / scale)
+        g = point.gradient / search.scale - penalty @ (point.margin_slopes / scale[:, None])
+        g = g * min(1.0, STEEPEST / max(float(np.linalg.norm(g)), 1e-300))
+        update, state = optimiser.update(g, state, z)
+        z = np.clip(z + np.asarray(update), 0.0, 1.0)
+        if (k + 1) % every == 0:
+            search.point(z)
+    search.exhausted = True
+    return search.best is not None and optimality(search, search.best)[1] < SETTLED
 
 
 def search_alone(evaluator, z, number, how):

@@ -136,7 +136,6 @@ class Adam(Options):
 
 
 def options_of(method: str | Options, **changes: Any) -> Options:
-    """Return the options of a method with the `changes` that are not None."""
     if not isinstance(method, Options):
         if method not in METHODS:
             raise InputError(f"method = {method!r}: must be one of {', '.join(METHODS)}")
@@ -163,7 +162,7 @@ def check_numbers(low: int = 1, **numbers: Any) -> None:
             )
 
 
-METHODS: dict[str, Options] = {
+METHODS: dict[str, Options] = {  # options by the name of their method
     "auto": Options(),
     "trf": TRF(),
     "coarse-trf": TRF(coarse=True),
@@ -171,4 +170,3 @@ METHODS: dict[str, Options] = {
     "lbfgs": LBFGS(),
     "adam": Adam(),
 }
-"""Options by the name of their method."""

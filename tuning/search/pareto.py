@@ -141,8 +141,7 @@ class _Sweep:
         answers = self.answers
         for k in reversed(range(len(answers))):
             if k + 1 < len(answers) and not answers[k + 1].violation:
-                nearby = self._solve(self.problems[k], answers[k + 1].best.z)
-                answers[k] = answers[k].better(nearby)
+                answers[k] = answers[k].better(self._solve(self.problems[k], answers[k + 1].best.z))
             search = answers[k].search
             screened = self._candidates(search, screening, seed)
             other = best_screened(search, screened)
@@ -150,8 +149,7 @@ class _Sweep:
                 answers[k] = _Answer.of(search, slsqp(search, other, self.iterations))
             if answers[k].violation and search.best is not None:
                 find_feasible(search, screened, self.iterations, seed)
-                done = slsqp(search, search.best.z, self.iterations)
-                answers[k] = _Answer.of(search, done)
+                answers[k] = _Answer.of(search, slsqp(search, search.best.z, self.iterations))
             approach(search)
             self.known.update(search.memory)
 
@@ -171,13 +169,10 @@ class _Sweep:
         screened, _ = screen(search.evaluator, screening, seed)
         points = [p for p in self.known.values() if p.finite]
         margins = [search.problem.margins(p.measures) for p in points]
-        return Population(
-            np.concatenate([screened.zs, [p.z for p in points]]),
-            np.concatenate([screened.costs, [p.cost for p in points]]),
-            np.concatenate(
-                [screened.margins, np.reshape(margins, (len(points), screened.margins.shape[1]))]
-            ),
-        )
+        margins = np.reshape(margins, (len(points), screened.margins.shape[1]))
+        known = ([p.z for p in points], [p.cost for p in points], margins)
+        first = (screened.zs, screened.costs, screened.margins)
+        return Population(*map(np.concatenate, zip(first, known)))
 
 
 def _row(problem, value, answer, z):

@@ -42,9 +42,7 @@ class Certificate(NamedTuple):
 
     scenarios: int  # N plants in the search
     support: int  # of those, the support scenarios
-    # probability of breaking a limit, at most, with confidence 1 - 1e-6 (Campi, Garatti, Ramponi
-    # 2018)
-    bound: float
+    bound: float  # probability of breaking a limit (Campi, Garatti, Ramponi 2018)
     fresh: int  # new plants run afterwards
     broken: int  # of those, how many violated a limit
     interval95: list  # Clopper and Pearson
@@ -84,15 +82,7 @@ def scenario_bound(scenarios, support, beta=CONFIDENCE):
         raise InputError(f"support = {support}: must be from 0 to the {scenarios} scenarios")
     if support >= scenarios:
         return 1.0
-    log = (
-        math.log(beta)
-        - math.log(scenarios)
-        - (
-            math.lgamma(scenarios + 1)
-            - math.lgamma(support + 1)
-            - math.lgamma(scenarios - support + 1)
-        )
-    )
+    log = math.log(beta / scenarios) - math.log(math.comb(scenarios, support))
     return 1.0 - math.exp(log / (scenarios - support))
 
 
@@ -168,7 +158,7 @@ def tune_robust(
         # the certificate is for the run of the case, the answer is judged on its scenarios
         summary = cloud = None
         if case.scenarios:
-            broken = int(run(result.tuned, ())[1].sum())
+            broken = int((~run(result.tuned, ()).held).sum())
         else:
             summary, cloud, broken = _on_new_plants(result, judge, run, distributions)
     if case.scenarios and chosen.validation and result.status != "interrupted":
@@ -193,22 +183,10 @@ def _tightened(case, limits, share):
 
 
 def _run(distributions, limits, fresh, seed, cluster, case, names):
-    """Return (Ensemble of new plants, (fresh,) True where one violates a limit or diverges)."""
-    plants = ensemble(
-        case,
-        distributions,
-        samples=fresh,
-        key=(SEED_OFFSET + seed) % 2**31,
-        measures=names,
-        limits=limits,
-        fan=False,
-        cluster=cluster,
-    )
-    past = [
-        limit.margins(plants.measures[limit.measure].reshape(fresh, -1)[:, limit.index]) < 0
-        for limit in plants.limits
-    ]
-    return plants, plants.failed | np.any(past, axis=0) if past else plants.failed
+    """Return the Ensemble of new plants."""
+    options = {"measures": names, "limits": limits, "fan": False, "cluster": cluster}
+    key = (SEED_OFFSET + seed) % 2**31
+    return ensemble(case, distributions, samples=fresh, key=key, **options)
 
 
 def _on_new_plants(result, judge, run, distributions):
@@ -218,11 +196,11 @@ def _on_new_plants(result, judge, run, distributions):
     weights = judge.objective.items()
     costs = [
         sum(w * plants.measures[m].reshape(plants.samples, -1).sum(axis=1) for m, w in weights)
-        for plants, _ in sides
+        for plants in sides
     ]
-    holds = np.stack([~past for _, past in sides], axis=1)
-    levels = np.stack([plants.measures["max_level"] for plants, _ in sides], axis=1)
-    failed = sides[0][0].failed | sides[1][0].failed
+    holds = np.stack([plants.held for plants in sides], axis=1)
+    levels = np.stack([plants.measures["max_level"] for plants in sides], axis=1)
+    failed = sides[0].failed | sides[1].failed
     spread = {n: getattr(d, "relative", None) for n, d in distributions.items()}
     noise = judge.runs[0].key is not None
     costs = np.stack(costs, axis=1)
@@ -232,11 +210,8 @@ def _on_new_plants(result, judge, run, distributions):
 
 def _support(result):
     """Return how many plants determine the answer: at a limit or, by risk, at the largest cost."""
-    support = {
-        c.scenario
-        for c, scale in zip(result.constraints, result.problem.limit_scales)
-        if c.margin < 1e-3 * scale
-    }
+    scaled = zip(result.constraints, result.problem.limit_scales)
+    support = {c.scenario for c, scale in scaled if c.margin < 1e-3 * scale}
     if result.problem.risk != "mean":
         costs = np.array([result.problem.cost(row) for row in result.tables["after"]])
         share = result.problem.shares(costs, range(len(costs)))

@@ -20,24 +20,14 @@ from jaxtank.loop.steady import steady_state
 from jaxtank.loop.step import step
 from tuning.problem.scenarios import screening_clock
 
-FEWEST, MEMBERS = 32, 64
-"""Members of a differential evolution, at least and at most: else as many as were screened."""
+FEWEST, MEMBERS = 32, 64  # of a differential evolution: as many as were screened
 
 GENERATIONS, RUNS = 14, 100_000  # its generations, and its coarse runs, at most
 MUCH = 1e12  # merit of a point that violates a limit: above every cost (see `DIVERGED`) [-]
 
-CROSSED = 0.9
-"""Share of the parameters that a member of the differential evolution takes from its move [-]."""
-
-AFFORDED = 2**23
-"""Samples of all runs of a screening up to which it is done at the true step: faster than to
-compile what finds out whether the coarse one misleads.
-"""
-
-LARGEST_STATE = 60
-"""Numbers in the loop's state above which its stability is not computed: eigenvalues cost their
-cube.
-"""
+CROSSED = 0.9  # share of parameters that a member takes from its move [-]
+AFFORDED = 2**23  # samples up to which a screening is done at the true step: no compiling
+LARGEST_STATE = 60  # numbers above which stability is not computed: cubic cost
 
 
 def sobol(count, dimensions, seed):
@@ -159,8 +149,7 @@ class Population(NamedTuple):
 def evolution_size(search, screened):
     """Return (members, generations) of a differential evolution, within RUNS coarse runs."""
     members = min(max(len(screened.zs), FEWEST), MEMBERS)
-    few = RUNS // (members * len(search.problem.runs))
-    return members, max(2, min(GENERATIONS, few))
+    return members, max(2, min(GENERATIONS, RUNS // (members * len(search.problem.runs))))
 
 
 def evolve(search, zs, generations, seed, coarse=True):

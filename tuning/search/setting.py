@@ -33,15 +33,11 @@ from tuning.uncertainty.distributions import stated as stated_of
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import probabilities, spread_of
 
-LARGEST_ERROR = 1e-3
-"""Largest `midpoint_error` with which the midpoint rule is used [-]: a fiftieth of the 5 % by which
-flows differ from plant to plant."""
+LARGEST_ERROR = 1e-3  # largest `midpoint_error`: a fiftieth of the spread of flows [-]
 
 STATES = 256  # states and inputs at which both are compared
 
-LOWEST = 0.05
-"""Least level of these states, as a share of the height [-]: closer to empty, stability limits the
-step, which is checked separately."""
+LOWEST = 0.05  # least level of these states [-]: near empty, stability limits the step
 
 
 def midpoint_error(case: Case, clock: Clock, height: float, span: np.ndarray) -> float:
@@ -63,9 +59,7 @@ def midpoint_error(case: Case, clock: Clock, height: float, span: np.ndarray) ->
 
 @compiled("substeps", "arrays", keep=True)
 def _changes(plant: Any, x: Any, u: Any, dt: Any, substeps: int, arrays: bool) -> Any:
-    """Squared difference of the midpoint rule and RK4 over one sample from each state of `x`, and
-    the squared change of the level.
-    """
+    """Squared differences of midpoint rule and RK4 over a sample, and of the level."""
 
     def changes(x: Any, u: Any) -> Any:
         start, inputs = (x, u) if arrays else (tuple(x), tuple(u))
@@ -100,7 +94,6 @@ class Setting:
     certificates: tuple = ()
 
     def replace(self, **changes: Any) -> "Setting":
-        """Return a copy with the named fields changed."""
         return dataclasses.replace(self, **changes)
 
     @property
@@ -111,7 +104,6 @@ class Setting:
 
     @property
     def plants_vary(self) -> bool:
-        """True if parameters other than those of the sensors vary from run to run."""
         return any(not name.startswith("sensor.") for name in self.distributions)
 
     @property
@@ -121,7 +113,6 @@ class Setting:
 
     @property
     def cost_unit(self) -> str | None:
-        """Unit of the default cost; None for a custom objective."""
         return None if self.own_objective else f"{self.case.loop.units[0]}^2"
 
     def coarse(self) -> Case:
@@ -174,7 +165,6 @@ class Setting:
         return case.without_safety_filter().with_safety_filter(**settings)
 
     def without_filter(self) -> "Setting":
-        """Return the setting without a safety filter."""
         searched = self.searched.without_safety_filter()
         return self.replace(searched=searched, filter=None, certificates=())
 
@@ -270,10 +260,8 @@ def _with_box(case, distributions):
 
 
 def is_stated(case: Case) -> bool:
-    """Return True if a case states its uncertain parameters."""
     return bool(case.uncertain) or case.covariance is not None
 
 
 def plants_of(case: Case) -> dict[str, Any]:
-    """Return {name: distribution} of the uncertain parameters of a case."""
     return spread_of(case.replace(uncertain=uncertain_shares(case)))

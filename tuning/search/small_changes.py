@@ -20,9 +20,7 @@ values may be an earlier answer, which may cost WORTH already, with slightly dif
 
 FINE = 0.1  # share of WORTH to which the cost with some gains at their first values is searched [-]
 
-LINE, STRIDE = 32, 8
-"""Values that are tried between a gain's best and its first value, and how
-many of these values are run at once."""
+LINE, STRIDE = 32, 8  # values between best and first gain; how many run at once
 
 
 class Subspace(Search):
@@ -167,9 +165,7 @@ def move_back(setting: Setting, solution: Solution) -> None:
 
 
 def _first_calm(search, line, calm, ceiling, violation):
-    """The first point of a line that is calm and costs at most `ceiling`, or the end of the line
-    where this costs hardly more; None where there is none.
-    """
+    """The first calm point of a line up to `ceiling`, or its end; None where there is none."""
     for some in np.split(line, LINE // STRIDE):
         low = np.array([calm(each) for each in some])
         if not low.any():
@@ -192,12 +188,17 @@ def _descended(setting, solution, highest):
     ceiling, violation = point.cost + PRICE * abs(point.cost), search.violation(point)
     free, calmer, lowest = ~np.asarray(solution.kept), z, highest
     for _ in range(ROUNDS):
-        slope = _peak_slope(setting, problem, z) * free
+        rate = np.zeros(len(z))
+        for i, unit in enumerate(np.eye(len(z))):
+            ends = [np.clip(z + sign * SPAN * unit, 0.0, 1.0) for sign in (1.0, -1.0)]
+            up, down = (np.log(_peak(setting, problem, end)) for end in ends)
+            if np.isfinite(up - down):
+                rate[i] = (up - down) / (ends[0] - ends[1])[i]
+        slope = rate * free
         norm = float(np.linalg.norm(slope))
         if not 0.0 < norm < np.inf:
             break
-        steps = np.arange(1, STRIDE + 1)[:, None] * SPAN
-        line = np.clip(z - steps * slope / norm, 0.0, 1.0)
+        line = np.clip(z - (np.arange(1, STRIDE + 1)[:, None] * SPAN) * slope / norm, 0.0, 1.0)
         costs, margins = search.evaluator.screen(line)
         fit = (costs <= ceiling) & (search.violations(margins) <= violation)
         for each, fits in zip(line, fit):
@@ -210,17 +211,6 @@ def _descended(setting, solution, highest):
                 return calmer, lowest
         z = line[-1]
     return calmer, lowest
-
-
-def _peak_slope(setting, problem, z):
-    """Return (P,) the slope of the logarithm of Ms at z, by differences; 0 where it has none."""
-    slope = np.zeros(len(z))
-    for i, unit in enumerate(np.eye(len(z))):
-        ends = [np.clip(z + sign * SPAN * unit, 0.0, 1.0) for sign in (1.0, -1.0)]
-        up, down = (np.log(_peak(setting, problem, end)) for end in ends)
-        if np.isfinite(up - down):
-            slope[i] = (up - down) / (ends[0] - ends[1])[i]
-    return slope
 
 
 def _peak(setting, problem, z):

@@ -35,18 +35,14 @@ from tuning.search.screening import (
     sobol,
 )
 
-RENEWED = 3
-"""How often a search is begun again from where it stopped before conditions of an optimum hold."""
+RENEWED = 3  # times that a search begins again before conditions of an optimum hold
 
 AGREE = 1e-3  # two searches whose objectives differ by less than this share agree [-]
 SAME = 1e-9  # share of the cost by which two programs that compute it may differ, by rounding [-]
 FRESH = 2  # new Sobol points, as multiples of the members of a differential evolution
 
-TRIED = 8
-"""Members of a differential evolution of which the first that is no chaotic run is a start."""
-
-MISLED = 0.1
-"""Share by which the cost of a coarse run may differ from the true one to be searched with [-]."""
+TRIED = 8  # members of a differential evolution among which a start is found
+MISLED = 0.1  # share by which a coarse run's cost may differ from the true one [-]
 
 POLISHED = 1e-12  # tolerance of the last search, from the best point [-]
 
@@ -71,7 +67,6 @@ class Plan:
 
     @classmethod
     def of(cls, options: Options, method: str, seed: int, **more: Any) -> "Plan":
-        """Return the Plan of filled options."""
         numbers = ("starts", "screening", "iterations", "tolerance")
         batch = getattr(options, "batch", None)
         stated = {n: getattr(options, n) for n in numbers}
@@ -79,7 +74,6 @@ class Plan:
 
     @property
     def local(self) -> Local:
-        """How each local search runs."""
         return Local(self.method, self.iterations, self.tolerance, self.batch, self.seed)
 
 
@@ -110,7 +104,6 @@ class Solution:
 
     @property
     def point(self) -> Any:
-        """The Point of the answer; None where none is finite."""
         return self.best if self.search is None or self.z is None else self.search.point(self.z)
 
     def status(self, feasible: bool, lost: Sequence[Lost] = ()) -> Status:
@@ -182,7 +175,6 @@ class Stages:
 
     @property
     def violated(self) -> bool:
-        """True if the best point violates a limit."""
         return self.search.best is not None and self.search.violation(self.search.best) > 0
 
     @property

@@ -49,13 +49,8 @@ from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
 from tuning.storage.fingerprint import fingerprint
 from tuning.uncertainty.validation import summary_of, validate
 
-TOLERANCE = 1e-4
-"""Change of the cost, as a share of its first value, at which a search on drawn plants has
-converged: their mean is itself known to a few percent only [-]."""
-
-AGREE = 0.01
-"""Two searches whose costs differ by less than this share agree [-]: the mean of 32 plants is known
-to a few percent."""
+TOLERANCE = 1e-4  # relative change of the cost at convergence: a mean of drawn plants [-]
+AGREE = 0.01  # relative difference of two costs that agree: a mean of 32 plants [-]
 
 DEFAULT = {"starts": 4, "screening": 32, "iterations": 40, "validation": FRESH}
 NOMINAL = {"starts": 8, "screening": 64, "iterations": 60, "validation": 64}
@@ -137,7 +132,13 @@ def tune(
     """
     check_case(case.case if isinstance(case, Problem) else case, seed)
     options = options_of(method, starts=starts)
-    implied = _implies_nominal(case, options)
+    reasons = {
+        "a Problem": isinstance(case, Problem),
+        "method": options.name != "auto",
+        "screening": options.screening is not None,
+        "tolerance": options.tolerance is not None,
+    }
+    implied = next((name for name, value in reasons.items() if value), None)
     if nominal is False and implied:
         raise InputError(f"{implied}: belongs to the nominal optimum (nominal=True, --nominal)")
     nominal = nominal or bool(implied)
@@ -157,17 +158,6 @@ def tune(
                     f"{name}: belongs to the default answer, not to the nominal optimum"
                 )
         return _optimum(_stated(case, seed, **stated), options, engine, **keep)
-
-
-def _implies_nominal(case: Case | Problem, options: Options) -> str | None:
-    """Return the argument that implies `nominal`; None if there is none."""
-    reasons = {
-        "a Problem": isinstance(case, Problem),
-        "method": options.name != "auto",
-        "screening": options.screening is not None,
-        "tolerance": options.tolerance is not None,
-    }
-    return next((name for name, value in reasons.items() if value), None)
 
 
 def _stated(case: Case | Problem, seed: int, **stated: Any) -> Problem:
@@ -194,7 +184,6 @@ def _optimum(
     lp.check(case.loop, case.clock, key)
     plan = Plan.of(options, _method(options, problem), problem.seed, engine=engine)
     first, start = problem.start(), problem.own_values()
-    # a start that is not finite is an input error, reported by evaluate
     before = run_measures(case.loop, case.clock, key, problem.needed)
     _check_start(problem, before, first)
     check_sent(engine, problem)
@@ -225,12 +214,9 @@ def _optimum(
         summary, cloud = validate(problem, start, values, options.validation, plan.seed)
     scenarios = problem.runs if problem.scenarios else ()
     objective = {side: problem.total(table) for side, table in tables.items()}
+    steps = diagnostics.step_warnings(tuned, values, key, scenarios)
     result = _result(
-        evaluator,
-        solution,
-        values,
-        began,
-        diagnostics.step_warnings(tuned, values, key, scenarios),
+        *(evaluator, solution, values, began, steps),
         case=case,
         tuned=tuned,
         method=plan.method,
@@ -250,14 +236,13 @@ def _optimum(
 
 def _varies(problem: Problem) -> bool:
     """Return True if a validation run can differ from the nominal one."""
-    case = problem.case
-    stated = bool(case.uncertain or case.covariance)
-    return stated or any(run.key is not None for run in problem.runs)
+    case, noisy_runs = problem.case, any(run.key is not None for run in problem.runs)
+    return bool(case.uncertain or case.covariance) or noisy_runs
 
 
 def _setting(case, objective, limits, distributions, safety_filter):
     """Return the Setting of a default answer, before a filter is taken for levels near a limit."""
-    if safety_filter and not case.safety:  # asked for here: the case as given has none
+    if safety_filter and not case.safety:
         case = case.without_safety_filter()
     setting = setting_of(case, objective, limits, distributions)
     return setting.without_filter() if safety_filter is False else setting
@@ -278,7 +263,6 @@ def _default_answer(
     resume: bool,
     progress: Callable | None,
 ) -> TuningResult:
-    """Return the default answer."""
     began, samples = time.perf_counter(), options.validation
     if not samples:
         raise InputError(
@@ -309,27 +293,21 @@ def _default_answer(
     setting, solution = attempt.setting, attempt.solution
     if attempt.number:  # the plants that asked for another search do not judge it
         before = judge(_unfiltered(setting), samples, seed, round_=attempt.number)
-    # Ctrl-C before the first search
-    evaluator = attempt.evaluator or Evaluator(stated)
+    evaluator = attempt.evaluator or Evaluator(stated)  # Ctrl-C before the first search
     problem = evaluator.problem
     values = values_of(problem, solution)
     answer = _answer(attempt, problem, before, values)
     solution.least = True  # of the limits on plants that judged
     first = solution.search.point(problem.start()) if solution.search is not None else None
-    rules = ()
-    if not solution.interrupted:
-        rules = rule_rows(setting, samples, seed, attempt.number, gains, reasons)
+    known = setting, samples, seed, attempt.number, gains, reasons
     sides = {"before": first, "after": solution.point}
+    steps = diagnostics.step_warnings(setting.tuned(values), values)
     result = _result(
-        evaluator,
-        solution,
-        values,
-        began,
-        diagnostics.step_warnings(setting.tuned(values), values),
+        *(evaluator, solution, values, began, steps),
         method="default answer",
         status=solution.status(answer.held, answer.lost),
         tables={side: [] if p is None else list(p.measures) for side, p in sides.items()},
-        rules=rules,
+        rules=() if solution.interrupted else rule_rows(*known),
         **_judged_parts(answer, values),
     )
     log.close()
@@ -347,8 +325,7 @@ def _with_rule(
     """What is free; else the gains, about those of a rule too where one of these is outside."""
     if free is not None or case.free or not gains:
         return free
-    ranges, about = gain_ranges(case.loop), dict[str, Free]()
-    outside = False
+    ranges, about, outside = gain_ranges(case.loop), dict[str, Free](), False
     for name, (low, high, scale) in ranges.items():
         gain = gains.get(name, 0.0)
         if low * high > 0.0 and low * gain > 0.0:
@@ -360,8 +337,7 @@ def _with_rule(
 
 def _gains_of_rules(case: Case) -> tuple[dict[str, dict[str, float]], dict[str, str]]:
     """({rule: gains}, {rule: why it has none}) of a case; of another controller, none of both."""
-    gains: dict[str, dict[str, float]] = {}
-    reasons: dict[str, str] = {}
+    gains, reasons = dict[str, dict[str, float]](), dict[str, str]()
     for rule in () if refusal(case) else RULES:
         try:
             gains[rule] = rule_gains(case, rule)
@@ -396,14 +372,9 @@ def rule_rows(
 def rule_row(rule: str, gains: Mapping[str, float], judged: Judged | None) -> dict[str, Any]:
     """Return a row of `TuningResult.rules`; judged : None where a rule has no gains."""
     means = {} if judged is None else judged.to_json()
-    return {
-        "rule": rule,
-        "parameters": gains,
-        "error": means.get("error"),
-        "holds": None if judged is None else bool(judged.held.all()),
-        "objective": means.get("objective"),
-        "travel_percent": means.get("travel_percent"),
-    }
+    numbers = {name: means.get(name) for name in ("error", "objective", "travel_percent")}
+    holds = None if judged is None else bool(judged.held.all())
+    return {"rule": rule, "parameters": gains, "holds": holds, **numbers}
 
 
 def _with_gains(setting: Setting, gains: Mapping[str, float]) -> Setting:
@@ -453,15 +424,9 @@ def tune_by_rule(
     began = time.perf_counter()
     check_precision()
     objective, limits = as_measures(objective, limits)
-    if safety_filter and not case.safety:
-        case = case.without_safety_filter()
-    setting = setting_of(case, objective, limits, distributions)
-    if safety_filter is False:
-        setting = setting.without_filter()
+    setting = _setting(case, objective, limits, distributions, safety_filter)
     gains = rule_gains(case, rule)
-    ranges = {
-        name: Free(*_around(get_value(case.loop, name), gain)) for name, gain in gains.items()
-    }
+    ranges = {n: Free(*_around(get_value(case.loop, n), gain)) for n, gain in gains.items()}
     stated = setting.searched, ranges, setting.objective, setting.case.limits
     evaluator = Evaluator(Problem(*stated, None, seed))
     before = judge(_unfiltered(setting), validation, seed)
@@ -473,12 +438,9 @@ def tune_by_rule(
     attempt = Attempt(setting, evaluator=evaluator, after=after)
     answer = _answer(attempt, evaluator.problem, before, gains)
     status = Status.CONVERGED if answer.held else Status.INFEASIBLE
+    steps = diagnostics.step_warnings(setting.tuned(gains), gains)
     return _result(
-        evaluator,
-        attempt.solution,
-        gains,
-        began,
-        diagnostics.step_warnings(setting.tuned(gains), gains),
+        *(evaluator, attempt.solution, gains, began, steps),
         method=f"rule {rule}",
         status=Status.NOT_CONVERGED if answer.held and answer.lost else status,
         tables={"before": [], "after": []},
@@ -504,9 +466,7 @@ def _result(
     steps: tuple[Message, ...],
     **parts: Any,
 ) -> TuningResult:
-    """Return the TuningResult of a search; steps : problems with the step size of the answer. One
-    whose run is wrong has not converged.
-    """
+    """Return the TuningResult of a search; steps: problems with the step size of the answer."""
     if parts["status"] == Status.CONVERGED and any(message.headline for message in steps):
         parts["status"] = Status.NOT_CONVERGED
     result = TuningResult(
@@ -538,18 +498,18 @@ def _judged_parts(answer: Answer, values: Mapping[str, float]) -> dict[str, Any]
     setting, sides = answer.setting, {"before": answer.before, "after": answer.after}
     costs: dict[str, Any] = {side: _mean(plants) for side, plants in sides.items()}
     summary, cloud = _validation(answer)
-    return {
-        "case": setting.case,
-        "tuned": setting.tuned(values),
-        "objective": costs | {"terms": dict(setting.objective)},
-        "measures": dict(answer.measures),
-        "constraints": _rows(answer),
-        "symmetry": None,
-        "validation": summary,
-        "cloud": cloud,
-        "lost": answer.lost,
-        "answer": answer,
-    }
+    return dict(
+        case=setting.case,
+        tuned=setting.tuned(values),
+        objective=costs | {"terms": dict(setting.objective)},
+        measures=dict(answer.measures),
+        constraints=_rows(answer),
+        symmetry=None,
+        validation=summary,
+        cloud=cloud,
+        lost=answer.lost,
+        answer=answer,
+    )
 
 
 def _what(problem, validation, command, more):
@@ -652,14 +612,11 @@ def _answer(
     """Return the Answer: the judged cases, the validation plants, and the run of the case."""
     setting, solution, after = attempt.setting, attempt.solution, attempt.after
     start, case = problem.own_values(), setting.case
-    nominal = {
-        "before": _nominal(case, before, problem.needed),
-        "after": _nominal(setting.tuned(values), after, problem.needed),
-    }
+    sides = {"before": (case, before), "after": (setting.tuned(values), after)}
+    nominal = {s: _nominal(own, plants, problem.needed) for s, (own, plants) in sides.items()}
     runs = runs_of(setting.tuned(start), (), 0)
-    near = matters(setting, before, NEAR)
-    if after is not None:
-        near = near | matters(setting, after, NEAR)
+    judged = [plants for plants in (before, after) if plants is not None]
+    near = np.any([matters(setting, plants, NEAR) for plants in judged], axis=0)
     levels = limited_levels(case)
     fixed = np.zeros(len(start), dtype=bool) if solution.kept is None else solution.kept
     feasible = None  # where levels have no limits, or it is not known
@@ -693,8 +650,7 @@ def _nominal(case, plants, needed):
 
     if plants is None or not plants.nominal:
         return make()
-    names = (*reported_names(case.loop, of_run), *margins)
-    return Deferred(names, plants.nominal | margins, make)
+    return Deferred((*reported_names(case.loop, of_run), *margins), plants.nominal | margins, make)
 
 
 def _mean(plants: Judged | None) -> float:
@@ -725,5 +681,4 @@ def _validation(answer):
     )
     failed = sides[0].failed | sides[1].failed
     spread = {n: getattr(d, "relative", None) for n, d in setting.distributions.items()}
-    limits = resolve_limits(setting.case)
-    return summary_of(limits, cost, holds, level, failed, spread, True)
+    return summary_of(resolve_limits(setting.case), cost, holds, level, failed, spread, True)

@@ -11,11 +11,8 @@ from numpy.typing import NDArray
 from jaxtank.core.errors import InputError
 from tuning.storage.store import Folder
 
-IN_MEMORY = 1 << 24
-"""Bytes of all arrays up to which they are held in memory."""
-
-ROWS = 1 << 14
-"""Rows that are read at once."""
+IN_MEMORY = 1 << 24  # bytes of all arrays up to which they are held in memory
+ROWS = 1 << 14  # rows that are read at once
 
 Array = NDArray[Any]
 
@@ -107,5 +104,4 @@ def column(
 
 
 def _row_bytes(empty: Array) -> int:
-    """Return the bytes of a row of an array."""
     return int(np.prod(empty.shape[1:], dtype=int)) * empty.dtype.itemsize

@@ -21,7 +21,6 @@ class EvaluationCache:
         return self.found[key]
 
     def enter(self, kind: str, key: str, result: Any) -> None:
-        """Enter a result under its key, unless there is one."""
         if key not in self.found:
             self.found[key] = self.keep(kind, key, result)
 

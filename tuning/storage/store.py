@@ -57,7 +57,17 @@ class Store:
         self.head = json.dumps(self.problem)
         if afresh and not resume:
             discard(folder)
-        self._check_file(resume)
+        try:
+            if why := refusal(self.path, LARGEST_FILE):
+                raise InputError(f"{str(self.path)!r} {why}, so it is no checkpoint")
+        except OSError:
+            if resume and not untouched(self.folder):
+                why = f"there is no {NAME}"
+                if (self.folder / "result.json").exists():
+                    why = "that run had ended, and its result is in result.json"
+                raise InputError(
+                    f"--resume: {str(self.folder)!r} holds no checkpoint to continue: {why}"
+                ) from None
         with self._one_line(UNWRITABLE):
             self.folder.mkdir(parents=True, exist_ok=True)
             self.db = sqlite3.connect(
@@ -75,20 +85,6 @@ class Store:
         except BaseException:
             self.close()
             raise
-
-    def _check_file(self, resume):
-        """Raise InputError for a path that is no file, and for one that is missing."""
-        try:
-            if why := refusal(self.path, LARGEST_FILE):
-                raise InputError(f"{str(self.path)!r} {why}, so it is no checkpoint")
-        except OSError:
-            if resume and not untouched(self.folder):
-                why = f"there is no {NAME}"
-                if (self.folder / "result.json").exists():
-                    why = "that run had ended, and its result is in result.json"
-                raise InputError(
-                    f"--resume: {str(self.folder)!r} holds no checkpoint to continue: {why}"
-                ) from None
 
     def _check_tables(self):
         """Raise InputError unless the file is a whole database of one table, or of none."""
@@ -160,7 +156,6 @@ class Store:
         )
 
     def close(self) -> None:
-        """Close the file."""
         self.db.close()
 
     def _insert(self, key, text):
@@ -212,7 +207,6 @@ def _to_json(value: Any) -> dict[str, Any]:
 
 
 def _from_json(entry: Any) -> Any:
-    """Inverse of `_to_json`."""
     if "of" in entry:
         return {k: _from_json(v) for k, v in entry["of"].items()}
     if "all" in entry:

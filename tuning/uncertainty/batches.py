@@ -17,25 +17,15 @@ from tuning.cluster.engine import connect
 from tuning.cluster.sent import received, sent
 from tuning.problem.scenarios import noisy
 
-BATCH = 256
-"""Draws in a batch, on each device: enough to fill the vector units, few enough for the cache."""
+BATCH = 256  # draws in a batch, on each device: fills vector units, fits the cache
 
-NOISE = 1 << 27
-"""Bytes of sensor noise that a batch may hold: long noisy runs have smaller batches."""
+NOISE = 1 << 27  # bytes of sensor noise that a batch may hold: long noisy runs have smaller batches
+FAN_BATCH, FAN_ROWS = 64, 240  # draws simulated at once, and time stamps, of a fan chart
 
-FAN_BATCH, FAN_ROWS = 64, 240
-"""Draws simulated at once, and time stamps, of a fan chart."""
+WORK = 1 << 24  # samples of a batch that is a task: 0.1 s of work, overhead 5 ms [-]
+SHARES = 16  # least number of tasks: workers end at about the same time
 
-WORK = 1 << 24
-"""Samples of all runs of a batch from which it is a separate task [-]: 0.1 s of work, while the
-command and the scheduler need 5 ms for a task.
-"""
-
-SHARES = 16
-"""Least number of tasks, where there are as many batches: workers end at about the same time."""
-
-CUTS = (0.05, 0.25, 0.5, 0.75, 0.95)
-"""Quantiles of a fan chart [-]."""
+CUTS = (0.05, 0.25, 0.5, 0.75, 0.95)  # quantiles of a fan chart [-]
 
 
 def check_devices(devices):
@@ -64,10 +54,7 @@ def batch_size(case, noisy, samples):
 
 @contextlib.contextmanager
 def batch_runner(case, names, seed, devices, cluster):
-    """Give run(numbers, inputs, size), which yields (number, measures) of each batch.
-
-    inputs(number) returns the values of the `size` draws of a batch, and their indices.
-    """
+    """Give run(numbers, inputs, size), which yields (number, measures); inputs(number): values."""
 
     def on_devices(numbers, inputs, size):
         # Each device has a thread, and runs the program of a single device. One program
@@ -96,10 +83,7 @@ def batches(text, names, seed, inputs):
 
 
 def run_batch(case, names, seed, values, indices, device=None):
-    """Return {measure: (batch, ...), "failed": (batch,)} of a case at `values`.
-
-    Draw i has the noise of fold_in(seed, i); indices None: all have the noise of the seed.
-    """
+    """Return {measure: (batch, ...), "failed"} at `values`; draw i has noise fold_in(seed, i)."""
     indices = None if indices is None else indices.astype(np.uint32)
     values, indices = jax.device_put((values, indices), device)
     measures = _run(case.loop, values, indices, seed, case.clock, names)

@@ -364,13 +364,12 @@ def stated(distributions):
     return checked
 
 
-FORMS = {
+FORMS = {  # {(kind, count of numbers): their fields}
     ("uniform", 2): ("low", "high"),
     ("loguniform", 2): ("low", "high"),
     ("loguniform", 1): ("factor",),
     ("normal", 2): ("mean", "sd"),
 }
-"""{(kind, count of numbers): their fields}."""
 
 
 def parse(name, text):

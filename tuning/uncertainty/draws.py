@@ -35,10 +35,6 @@ class Draws:
             self.parts.append((name, distribution, nominal, columns))
             self.dimensions += len(labels)
             self.labels += labels
-        self._check_ranges(loop, distributions)
-
-    def _check_ranges(self, loop, distributions):
-        """Raise InputError where a distribution can leave the range of its parameter."""
         corners = [self.values(np.full((1, self.dimensions), p)) for p in (0.0, 1.0)]
         for name, d in distributions.items():
             if isinstance(d, Correlated):  # clipped
@@ -72,8 +68,7 @@ def _check_names(loop, name, distribution, taken):
     for label in distribution.names if isinstance(distribution, Correlated) else (name,):
         base, index = split_index(label)
         entry = base, index  # "a[00]" is "a[0]"
-        clash = any(b == base and (not index or not i or i == index) for b, i in taken)
-        if clash:
+        if any(b == base and (not index or not i or i == index) for b, i in taken):
             raise InputError(f"uncertain {label} is given twice")
         if describe(loop, label)["kind"] == "static":
             raise InputError(

@@ -49,11 +49,9 @@ def plateaus_of(case: Case) -> list[Plateau] | None:
     return plateaus
 
 
-BLOCK = 1 << 14
-"""Draws whose steady states are computed at once: a plateau takes some 100 bytes a draw."""
+BLOCK = 1 << 14  # draws whose steady states are computed at once: 100 bytes each
 
-TOLERANCE = 1e-9
-"""By how much a limit may be passed, as a share of its size: rounding."""
+TOLERANCE = 1e-9  # by how much a limit may be passed, as a share of its size: rounding
 
 
 class Needs:
@@ -90,7 +88,6 @@ class Needs:
         self.high = np.concatenate([top, of("actuator.high")], axis=1)
 
     def first(self, count: int) -> "Needs":
-        """Return the Needs of the first `count` plants."""
         return Needs(self.case, {n: v[:count] for n, v in self.values.items()}, self.limits)
 
     def at(self, setpoints: Any = None) -> np.ndarray:
@@ -108,7 +105,6 @@ class Needs:
         return np.where(np.isfinite(over), over, np.inf)
 
     def feasible(self, needed: Any = None, low: Any = None, high: Any = None) -> np.ndarray:
-        """Return (N,) True where every plateau has a steady state within the limits."""
         return ~np.any(self.excess(needed, low, high) > 0, axis=(1, 2))
 
 

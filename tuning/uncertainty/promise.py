@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -14,22 +15,377 @@ from jaxtank.core.tree import is_real
 from jaxtank.limits import UNDEFINED_MARGIN, Limit, limit_scale, without_overflow
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.xla.jit import compiled
-from tuning.uncertainty import rare_events
 from tuning.uncertainty.batches import batch_runner
 from tuning.uncertainty.distributions import Empirical
 from tuning.uncertainty.draws import Draws
+from tuning.uncertainty.sampling import clopper_pearson
 
-PILOT = 4096
-"""Most draws of the study that the search for failures begins from."""
+FARTHEST = 7.0  # where a search ends: beyond lie 1e-12 of the plants [sd]
+WIDE_RUNS, WIDE_SHARE = 256, 0.25  # of a wide normal distribution: first, later
 
-FURTHER = 100
-"""Most runs after the draws of the study, in numbers of them [-]."""
+LANES, STEPS = 32, 20  # searches at once, and their steps
+RAY = 16  # runs between the origin and a failure that look for the first failure on the way
+APART = 1.0  # least distance of two centres [sd]
+CENTRES = 16  # most centres of a mixture
 
-CLIPPED = 1e-12
-"""Least and, below 1, largest probability at which a distribution is read [-]."""
+DEFENSIVE = 0.2  # share of runs of the distribution itself: bounds the weights
 
-STEP = 1e-4
-"""Step of the differences of drawn values in the standard normal space [sd]."""
+BATCH = 256  # runs after which the estimate is looked at
+
+ACCURACY, FINEST = 0.07, 0.02  # variation of the probability: usual, undecided [-]
+
+TURNS, FIRST_HITS = 4, 100  # most mixtures that are sampled, and failures to which one is fitted
+
+FITTED, INFLATION = 0.7, 1.2  # share of fitted parts, factor of their variance [-]
+LARGEST_SHARE, FEWEST_HITS = 0.1, 20  # of one run that gets a centre; failures
+LEVEL_RUNS, KEPT_SHARE, LEVELS = 500, 0.1, 7  # of subset simulation
+
+
+class Margins(NamedTuple):
+    """Margins to K limits at points (n, D) of the standard normal space, negative where broken."""
+
+    judged: Callable[[Any], Any]  # (n, K) of a run with its own noise
+    explored: Callable[[Any], Any]  # (n, K) of the function that the searches look at
+    slopes: Callable[[Any], Any]  # ((n, K), (n, K, D)) of `explored` and its derivatives
+
+
+@dataclasses.dataclass
+class Counted:
+    """Margins whose runs are counted."""
+
+    margins: Margins
+    runs: int = 0
+    gradients: int = 0
+
+    def judged(self, z: Any) -> Any:
+        self.runs += len(z)
+        return self.margins.judged(z)
+
+    def explored(self, z: Any) -> Any:
+        self.runs += len(z)
+        return self.margins.explored(z)
+
+    def slopes(self, z: Any) -> Any:
+        self.gradients += len(z)
+        return self.margins.slopes(z)
+
+
+class Estimate(NamedTuple):
+    """A probability by weighted runs."""
+
+    probability: float
+    interval95: tuple[float, float]
+    variation: float  # coefficient of variation, inf without a failure [-]
+    shares: Any  # (K,) share of the failures in which each limit is the one broken most
+    plain: int  # runs that were drawn from the distribution itself
+
+
+class Failures(NamedTuple):
+    """What `probability` returns."""
+
+    estimate: Estimate
+    centres: Any  # (k, D) most likely failures, the nearest to the origin first
+    runs: int
+    gradients: int
+    subset: float | None  # probability by subset simulation, where the slopes led nowhere
+
+
+def probability(
+    margins: Margins, pilot: Any, promise: float, most: int, seed: int, progress: Any = None
+) -> Failures:
+    """Return P(some margin < 0) after `pilot` (points, margins), in up to `most` more runs."""
+    z, g = pilot
+    estimate = _counted(g)
+    if estimate.interval95[0] > promise and estimate.variation < FEWEST_HITS**-0.5:
+        return Failures(estimate, _failing(z, g)[:1], 0, 0, None)
+    rng, count, subset = np.random.default_rng([seed, 7]), Counted(margins), None
+    wide = width(z.shape[1]) * rng.standard_normal((WIDE_RUNS, z.shape[1]))
+    z, g = np.concatenate([z, wide]), np.concatenate([g, count.explored(wide)])
+    centres = search(count, z, g)
+    if not len(centres) and _plain_runs(promise) > 2 * LEVELS * LEVEL_RUNS:
+        subset, failing = subset_simulation(count, z.shape[1], rng)
+        if len(failing):
+            centres = _pulled(count, failing)
+    mixture, fitted = mixture_of(centres), False
+    sample = Sample(mixture, len(pilot[0]))
+    for turn in range(TURNS):
+        last = turn == TURNS - 1
+        enough = np.inf if fitted or last else FIRST_HITS
+        if not sample.draw(count, promise, most, rng, enough, last, progress):
+            break
+        apart = mixture.apart(sample.hits, sample.weights)
+        if np.any(apart):
+            centres = _distinct(np.concatenate([centres, _refined(count, sample.hits[apart])]))
+            mixture = mixture_of(centres)
+        else:
+            mixture, fitted = mixture.fitted(sample.hits, sample.weights), True
+        sample = Sample(mixture, len(pilot[0]))
+    return Failures(sample.estimate(), centres, count.runs, count.gradients, subset)
+
+
+def _plain_runs(promise):
+    """Runs of the distribution itself without a failure that show a promise to be kept."""
+    return int(np.ceil(np.log(0.025) / np.log1p(-promise)))
+
+
+def _counted(g):
+    """The Estimate of plain runs with margins g (n, K)."""
+    n, worst = len(g), np.argmin(g, axis=1)[np.min(g, axis=1) < 0]
+    hits, (low, high) = len(worst), clopper_pearson(len(worst), n)
+    shares = np.bincount(worst, minlength=g.shape[1]) / max(hits, 1)
+    variation = np.sqrt((1.0 - hits / n) / hits) if hits else np.inf
+    return Estimate(hits / n, (low, high), float(variation), shares, n)
+
+
+def width(dimensions: int) -> float:
+    """Return the standard deviation [sd] that keeps most points within FARTHEST of the origin."""
+    return max(1.3, min(2.0, 6.0 / np.sqrt(dimensions)))
+
+
+class Mixture(NamedTuple):
+    """Normal densities: around the origin, a wide one, and some around failures."""
+
+    shares: Any  # (k,), of which the first is the least share of the distribution itself
+    means: Any  # (k, D)
+    factors: Any  # (k, D, D) lower Cholesky factors of the covariances
+
+    def draw(self, n: int, rng: np.random.Generator) -> tuple[Any, int]:
+        """Return (points (n, D), how many were drawn from the distribution itself)."""
+        which = rng.choice(len(self.shares), size=n, p=self.shares)
+        moves = rng.standard_normal((n, self.means.shape[1]))
+        z = self.means[which] + np.einsum("nij,nj->ni", self.factors[which], moves)
+        return z, int(np.sum(which == 0))
+
+    def densities(self, z: Any) -> Any:
+        """Return (n, k) densities at points z (n, D) over the standard normal one."""
+        columns = []
+        for share, mean, factor in zip(*self):
+            back = scipy.linalg.solve_triangular(factor, (z - mean).T, lower=True)
+            exponent = 0.5 * (np.sum(z**2, axis=1) - np.sum(back**2, axis=0))
+            volume = np.prod(np.diag(factor))
+            columns.append(share * np.exp(np.minimum(exponent, 700.0)) / volume)
+        return np.stack(columns, axis=1)
+
+    def apart(self, z: Any, weights: Any) -> Any:
+        """Return which failures z (n, D) count much and are near to no part around failures."""
+        near = np.sum(self.densities(z)[:, 2:], axis=1) * weights > 0.5
+        return (weights > LARGEST_SHARE * np.sum(weights)) & ~near
+
+    def fitted(self, z: Any, weights: Any) -> "Mixture":
+        """Return the mixture fitted to failures z: means, and variances in their directions."""
+        densities, shares = self.densities(z), self.shares.copy()
+        parts = (weights / np.sum(densities, axis=1))[:, None] * densities
+        means, factors, likely = list(self.means), list(self.factors), np.sum(parts, axis=0)
+        for k in np.flatnonzero(likely > 1e-3 * np.sum(likely)):
+            if k < 2:
+                continue
+            mean = parts[:, k] @ z / likely[k]
+            along = mean / np.linalg.norm(mean)
+            variance = parts[:, k] @ ((z - mean) @ along) ** 2 / likely[k]
+            change = min(1.0, INFLATION * variance) - 1.0
+            spread = np.eye(len(mean)) + change * np.outer(along, along)
+            share = FITTED * np.sum(self.shares[2:]) * likely[k] / np.sum(likely[2:])
+            shares[k] *= 1.0 - FITTED
+            shares = np.append(shares, share)
+            means.append(mean)
+            factors.append(np.linalg.cholesky(spread))
+        return Mixture(shares / np.sum(shares), np.array(means), np.array(factors))
+
+
+def mixture_of(centres: Any) -> Mixture:
+    """Return the Mixture around the origin and centres (k, D)."""
+    k, n = np.shape(centres)
+    if not k:
+        return Mixture(np.ones(1), np.zeros((1, n)), np.eye(n)[None])
+    likely = scipy.special.ndtr(-np.linalg.norm(centres, axis=-1))
+    parts = 0.5 * likely / max(likely.sum(), 1e-300) + 0.5 / k
+    shares = np.array([DEFENSIVE, WIDE_SHARE, *(1.0 - DEFENSIVE - WIDE_SHARE) * parts])
+    sizes = np.where(np.arange(k + 2) == 1, width(n), 1.0)
+    means = np.concatenate([np.zeros((2, n)), centres])
+    return Mixture(shares / shares.sum(), means, sizes[:, None, None] * np.eye(n))
+
+
+class Sample:
+    """Runs at points of a Mixture: those that fail, with their weights."""
+
+    def __init__(self, mixture: Mixture, plain: int):
+        self.mixture, self.plain, self.runs = mixture, plain, 0
+        self.hits: Any = np.zeros((0, mixture.means.shape[1]))
+        self.worst: Any = np.zeros(0, dtype=int)
+        self.limits = 1
+
+    @property
+    def weights(self) -> Any:
+        """Weights of the failures, of the distribution over the mixture."""
+        return 1.0 / np.sum(self.mixture.densities(self.hits), axis=1)
+
+    def draw(
+        self,
+        count: Any,
+        promise: float,
+        most: int,
+        rng: Any,
+        enough: float,
+        last: bool,
+        progress: Any,
+    ) -> bool:
+        """Run batches until accurate or spent; return True where the mixture should be improved."""
+        while True:
+            self._run(count, rng)
+            if progress is not None:
+                progress(count.runs)
+            w = self.weights
+            alone = not last and len(w) >= FEWEST_HITS and np.any(self.mixture.apart(self.hits, w))
+            if alone or len(w) >= enough:
+                return True
+            estimate = self.estimate()
+            decided = not estimate.interval95[0] <= promise <= estimate.interval95[1]
+            accurate = estimate.variation <= (ACCURACY if decided else FINEST)
+            if accurate or (decided and not len(w)) or count.runs + BATCH > most:
+                return False
+
+    def _run(self, count, rng):
+        z, direct = self.mixture.draw(BATCH, rng)
+        g = count.judged(z)
+        hit, self.limits = np.min(g, axis=1) < 0, g.shape[1]
+        self.runs, self.plain = self.runs + BATCH, self.plain + direct
+        self.hits = np.concatenate([self.hits, z[hit]])
+        self.worst = np.append(self.worst, np.argmin(g[hit], axis=1))
+
+    def estimate(self) -> Estimate:
+        """Return the Estimate by the failures so far."""
+        w = self.weights
+        ends = interval(w / self.runs, 1.0 / (self.mixture.shares[0] * self.runs))
+        total = max(np.sum(w), 1e-300)
+        variation = float(np.sqrt(np.sum(w**2)) / total) if len(w) else np.inf
+        shares = np.bincount(self.worst, w, self.limits) / total
+        return Estimate(float(np.sum(w) / self.runs), ends, variation, shares, self.plain)
+
+
+def interval(weights: Any, largest: float) -> tuple[float, float]:
+    """Return the 95 % interval of a sum of weights (Fay and Feuer), `largest` of uncounted ones."""
+    total, square = float(np.sum(weights)), float(np.sum(weights**2))
+    chi2 = lambda p, freedom: 2.0 * float(scipy.special.gammaincinv(freedom / 2.0, p))
+    low = square / (2 * total) * chi2(0.025, 2 * total**2 / square) if total else 0.0
+    weight = float(np.max(weights)) if total else largest
+    total, square = total + weight, square + weight**2
+    high = float(square / (2 * total) * chi2(0.975, 2 * total**2 / square))
+    return low, min(1.0, high)
+
+
+def search(count: Any, z: Any, g: Any) -> Any:
+    """Return (k, D) most likely failures, the nearest first; (z, g): runs to begin from."""
+    starts, limits = _starts(z, g)
+    return _pulled(count, np.concatenate([_nearest(count, starts, limits), _failing(z, g)]))
+
+
+def _refined(count, z):
+    """Most likely failures near failures z."""
+    g = count.explored(z)
+    return _pulled(count, np.concatenate([_nearest(count, z, np.argmin(g, axis=1)), z]))
+
+
+def _failing(z, g):
+    """Runs that fail, of each limit the nearest to the origin, the nearest of all first."""
+    broken, size = g < 0, np.linalg.norm(z, axis=1)
+    nearest = np.argmin(np.where(broken, size[:, None], np.inf), axis=0)[np.any(broken, axis=0)]
+    return z[nearest[np.argsort(size[nearest], kind="stable")]]
+
+
+def _starts(z, g):
+    """(points (n, D), limits (n,)): the origin, nearest failures, and others in new directions."""
+    size, rows = np.linalg.norm(z, axis=1), []
+    for limit in np.argsort(np.min(g, axis=0), kind="stable")[: LANES // 3]:
+        cost = np.where(g[:, limit] < 0, size - 1e6, g[:, limit])
+        first = np.argmin(cost)
+        beside = z @ z[first] > 0.5 * size * size[first]
+        rows += [(np.zeros(z.shape[1]), limit), (z[first], limit)]
+        rows.append((z[np.argmin(np.where(beside, np.inf, cost))], limit))
+    points, limits = zip(*rows)
+    return np.array(points), np.array(limits)
+
+
+@np.errstate(all="ignore")  # slopes may be 0 or infinite
+def _nearest(count, z, limits):
+    """Points (n, D) at which the margins to `limits` (n,) are 0, nearest to the origin."""
+    rows = np.arange(len(z))
+
+    def slopes(z):
+        g, s = count.slopes(z)
+        g, s = g[rows, limits], s[rows, limits]
+        size = np.sum(s**2, axis=1)
+        usable = np.isfinite(g) & np.isfinite(size) & (size > 0)
+        step = ((np.sum(s * z, axis=1) - g) / size)[:, None] * s - z
+        long = np.linalg.norm(step, axis=1, keepdims=True)
+        step = np.where(usable[:, None], step * np.minimum(1.0, 3.0 / long), 0.0)
+        return g, np.sqrt(size), np.nan_to_num(step)
+
+    g, size, step = slopes(z)
+    share = np.ones(len(z))
+    for _ in range(STEPS):
+        active = (np.linalg.norm(share[:, None] * step, axis=1) > 0.05) & (share > 1 / 64)
+        if not np.any(active):
+            break
+        trial = z + share[:, None] * step
+        trial = trial * np.minimum(1.0, FARTHEST / np.linalg.norm(trial, axis=1, keepdims=True))
+        new = slopes(trial)
+        weight = 2.0 * np.linalg.norm(z + step, axis=1) / size + 1.0 / size
+        merit = lambda z, g, w=weight: 0.5 * np.sum(z**2, axis=1) + w * np.abs(g)
+        better = active & (merit(trial, new[0]) < merit(z, g))
+        z = np.where(better[:, None], trial, z)
+        g, size = np.where(better, new[0], g), np.where(better, new[1], size)
+        step = np.where(better[:, None], new[2], step)
+        share = np.where(better, 1.0, 0.5 * share)
+    return z
+
+
+def _pulled(count, z):
+    """Centres: the first failures on the rays from the origin through z (n, D) and a little on."""
+    z = _distinct(z[np.linalg.norm(z, axis=1) > 0.0])
+    if not len(z):
+        return z
+    shares = 1.1 * np.arange(1, RAY + 1) / RAY
+    rays = z[:, None] * shares[:, None]
+    g = count.explored(rays.reshape(-1, z.shape[1]))
+    failed = (np.min(g, axis=1) < 0).reshape(len(z), RAY)
+    first = np.argmax(failed, axis=1)
+    return _distinct(rays[np.arange(len(z)), first][np.any(failed, axis=1)])
+
+
+def _distinct(z):
+    """Points that lie apart, the nearest to the origin first."""
+    kept: list[Any] = []
+    for point in z[np.argsort(np.linalg.norm(z, axis=1), kind="stable")]:
+        if all(np.linalg.norm(point - other) > APART for other in kept) and len(kept) < CENTRES:
+            kept.append(point)
+    return np.array(kept).reshape(-1, z.shape[1])
+
+
+def subset_simulation(count: Any, dimensions: int, rng: np.random.Generator) -> tuple[float, Any]:
+    """Return (probability, points that fail); 0 and none where no level reaches a failure."""
+    z = rng.standard_normal((LEVEL_RUNS, dimensions))
+    g, share, seeds = np.min(count.explored(z), axis=1), 1.0, int(KEPT_SHARE * LEVEL_RUNS)
+    for _ in range(LEVELS):
+        order = np.argsort(g, kind="stable")
+        level = g[order[seeds - 1]]
+        if level < 0 or g[order[0]] == level:  # reached, or flat
+            break
+        share, z, g = share * KEPT_SHARE, z[order[:seeds]], g[order[:seeds]]
+        chains = [(z, g)]
+        for _ in range(LEVEL_RUNS // seeds - 1):
+            moved = 0.8 * z + 0.6 * rng.standard_normal(z.shape)  # keeps the normal distribution
+            new = np.min(count.explored(moved), axis=1)
+            inside = new <= level
+            z, g = np.where(inside[:, None], moved, z), np.where(inside, new, g)
+            chains.append((z, g))
+        z, g = (np.concatenate(parts) for parts in zip(*chains))
+    return share * float(np.mean(g < 0)), z[g < 0]
+
+
+PILOT = 4096  # most draws of the study that the search for failures begins from
+FURTHER = 100  # most runs after the draws of the study, in numbers of them [-]
+CLIPPED = 1e-12  # least and, below 1, largest probability at which a distribution is read [-]
+STEP = 1e-4  # step of the differences of drawn values in the standard normal space [sd]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -114,8 +470,7 @@ class Study(NamedTuple):
             for v in self.limits
         )
         measures = tuple(dict.fromkeys(limit.measure for limit in limits))
-        case = self.case.replace(loop=loop)
-        return self._replace(case=case, limits=limits, measures=measures)
+        return self._replace(case=self.case.replace(loop=loop), limits=limits, measures=measures)
 
     def values(self, z: Any) -> dict[str, Any]:
         """Return {name: (n, ...)} at points z (n, D)."""
@@ -148,10 +503,14 @@ class Study(NamedTuple):
     def slopes(self, z: Any) -> Any:
         """Return ((n, K) margins, (n, K, D) their slopes) at z (n, D), LANES points at once."""
         values = self.values(z)
-        moving, jacobian = self.moving(), self._value_slopes(z)
+        columns = []
+        for move in STEP * np.eye(z.shape[1]):
+            ends = (_flat(self.values(z + sign * move)) for sign in (1.0, -1.0))
+            columns.append(np.subtract(*ends) / (2.0 * STEP))
+        moving, jacobian = self.moving(), np.stack(columns, axis=-1)
         order = tuple(_entries(values)[i] for i in moving)
         flat = _flat(values)[:, moving]
-        size = rare_events.LANES
+        size = LANES
         parts = []
         for k in range(0, len(z), size):
             rows = flat[np.minimum(np.arange(k, k + size), len(z) - 1)]
@@ -177,14 +536,6 @@ class Study(NamedTuple):
         ends = _flat(self.values(np.array([[-3.0], [3.0]]) * np.ones(self.space.dimensions)))
         return np.flatnonzero(ends[0] != ends[1])
 
-    def _value_slopes(self, z):
-        """(n, entries, D) derivatives of the drawn values at z (n, D), by differences."""
-        columns = []
-        for move in STEP * np.eye(z.shape[1]):
-            ends = (_flat(self.values(z + sign * move)) for sign in (1.0, -1.0))
-            columns.append(np.subtract(*ends) / (2.0 * STEP))
-        return np.stack(columns, axis=-1)
-
 
 def _flat(values):
     """(n, entries) of {name: (n, ...)}."""
@@ -202,8 +553,7 @@ def _entries(values):
 
 @compiled("clock", "names", "order", "seed", keep=True)
 def _sensitivities(loop, rows, seed, clock, names, order):
-    """(measures, their slopes, whether a run diverged) of runs at `rows`, a column for each of
-    `order`; all have the noise of the seed."""
+    """(measures, their slopes by `order`, whether diverged) of runs at `rows`, same noise."""
     key = None if seed is None else jax.random.key(seed)
 
     def run(values):
@@ -228,8 +578,7 @@ def promise_of(
         return None
     explored, drawn = study.explored(), min(len(failed), PILOT)
     z = scipy.special.ndtri(points.rows(0, drawn))
-    measures = {m: table[m][:drawn] for m in study.measures}
-    pilot = z, study.margins(measures, failed[:drawn])
+    pilot = z, study.margins({m: table[m][:drawn] for m in study.measures}, failed[:drawn])
     used = len(failed)
 
     def runs(of, run):
@@ -245,8 +594,8 @@ def promise_of(
 
     with runner(study) as run, contextlib.ExitStack() as stack:
         other = run if explored is study else stack.enter_context(runner(explored))
-        margins = rare_events.Margins(runs(study, run), runs(explored, other), explored.slopes)
-        result = rare_events.probability(
+        margins = Margins(runs(study, run), runs(explored, other), explored.slopes)
+        result = probability(
             margins,
             pilot,
             promise,

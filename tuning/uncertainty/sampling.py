@@ -6,8 +6,7 @@ import scipy  # its parts are imported when they are first used
 from jaxtank.core.errors import InputError
 from tuning.uncertainty.distributions import Correlated, Uniform
 
-METHODS = ("random", "latin", "sobol")
-"""Ways to draw points."""
+METHODS = ("random", "latin", "sobol")  # ways to draw points
 
 
 def clopper_pearson(count, samples, level=0.95):
@@ -19,7 +18,6 @@ def clopper_pearson(count, samples, level=0.95):
 
 
 def probabilities(method, dimensions, samples, seed):
-    """Return points of the open unit cube."""
     return Points(method, dimensions, samples, seed).rows(0, samples)
 
 

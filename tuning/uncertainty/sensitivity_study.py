@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
+from scipy import stats
 
 from jaxtank import measures as ms
 from jaxtank.case import Case, check_case
@@ -17,20 +18,128 @@ from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
 from tuning.cluster.engine import check_cluster
 from tuning.problem.slopes import contradicted
-from tuning.uncertainty import indices
 from tuning.uncertainty.batches import batch_runner, check_devices, seed_of
 from tuning.uncertainty.distributions import Correlated, Discrete, Normal, stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import spread_of
 from tuning.views import Result
 
+LEVELS = 4  # of Morris' grid; with a step of 2/3 all levels are equally likely
+
+RESAMPLES = 1000  # bootstrap resamples of an interval
+BLOCK = 1 << 22  # bootstrap weights held at once
+FLAT = 1e-10  # standard deviation of an output, as a share of its size, that is rounding alone [-]
+
+
+def sobol_points(dimensions, samples, seed):
+    """Return the points that `sobol_indices` needs."""
+    sequence = stats.qmc.Sobol(2 * dimensions, scramble=True, rng=np.random.default_rng(seed))
+    base = sequence.random(samples)
+    a, b = base[:, :dimensions], base[:, dimensions:]
+    points = np.repeat(a[:, None], dimensions + 2, axis=1)
+    points[:, -1] = b
+    for j in range(dimensions):
+        points[:, j + 1, j] = b[:, j]
+    return points
+
+
+def sobol_indices(y, seed=0):
+    """Return the shares of the variance of y that each input has: alone and in all."""
+    # S_j = mean(f(B) (f(A_Bj) - f(A))) / V, T_j = mean((f(A) - f(A_Bj))^2) / (2 V), V the variance
+    # over A and B. A row with an output that is not finite is left out whole, so that what remains
+    # stays paired. Source: Saltelli et al. 2010, table 2 (b) and (f).
+    y = np.asarray(y, dtype=float)
+    dimensions, rows = y.shape[1] - 2, y[np.isfinite(y).all(axis=1)]
+    unknown = {"": np.full(dimensions, np.nan), "_interval95": np.full((dimensions, 2), np.nan)}
+    indices: dict = {f"{n}{part}": v for n in ("first", "total") for part, v in unknown.items()}
+    indices["kept"] = len(rows)
+    if len(rows) < 2:
+        return {**indices, "sd": np.nan}
+    size = np.abs(rows).max() or 1.0
+    rows = rows / size  # what is squared must not overflow
+    rows = rows - rows.mean()  # an output far from 0 would spoil the first-order products
+    a, mixed, b = rows[:, :1], rows[:, 1:-1], rows[:, -1:]
+    terms = np.hstack(
+        [b * (mixed - a), 0.5 * (a - mixed) ** 2, 0.5 * (a + b), 0.5 * (a * a + b * b)]
+    )
+
+    def shares(means):
+        variance = means[..., -1:] - means[..., -2:-1] ** 2
+        return means[..., :-2] / np.where(variance > 0, variance, np.nan), variance
+
+    point, variance = shares(terms.mean(axis=0))
+    if not variance[0] > FLAT**2:
+        return {**indices, "sd": 0.0}
+    ends = np.nanquantile(shares(bootstrap_means(terms, seed))[0], (0.025, 0.975), axis=0).T
+    for name, entries in (("first", slice(dimensions)), ("total", slice(dimensions, None))):
+        indices |= {name: point[entries], f"{name}_interval95": ends[entries]}
+    return {**indices, "sd": float(size * np.sqrt(variance[0]))}
+
+
+def bootstrap_means(terms, seed, resamples=RESAMPLES):
+    """Return (resamples, ...) means of `terms` (n, ...) over n rows drawn with replacement."""
+    n, rng, means = len(terms), np.random.default_rng(seed), []
+    rows = max(1, BLOCK // n)
+    for start in range(0, resamples, rows):
+        count = min(rows, resamples - start)
+        picks = rng.integers(n, size=(count, n)) + n * np.arange(count)[:, None]
+        weights = np.bincount(picks.ravel(), minlength=count * n).reshape(count, n)
+        means.append(weights @ terms / n)
+    return np.concatenate(means)
+
+
+def morris_points(dimensions, trajectories, seed, levels=LEVELS):
+    """Return the points that `morris_effects` needs."""
+    rng, step = np.random.default_rng(seed), levels / (2.0 * (levels - 1))
+    base = rng.integers(levels, size=(trajectories, dimensions)) / (levels - 1)
+    moved = np.clip(np.where(base < 0.5, base + step, base - step), 0.0, 1.0)
+    # when each coordinate moves
+    turn = rng.permuted(np.tile(np.arange(dimensions), (trajectories, 1)), axis=1)
+    return np.where(
+        np.arange(dimensions + 1)[:, None] > turn[:, None, :], moved[:, None, :], base[:, None, :]
+    )
+
+
+# outputs near the largest number come out as not finite
+@np.errstate(over="ignore", invalid="ignore")
+def morris_effects(points, y):
+    """Return the elementary effects: change of y over the step, per unit of the cube."""
+    y = np.where(np.isfinite(y), y, np.nan)
+    change = np.diff(points, axis=1)
+    mover = np.abs(change).argmax(axis=2)
+    step = np.take_along_axis(change, mover[..., None], axis=2)[..., 0]
+    effects = np.empty(mover.shape)
+    np.put_along_axis(effects, mover, np.diff(y, axis=1) / step, axis=1)
+    return effects
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def morris_indices(effects):
+    """Return mean, mean size and standard deviation of the elementary effects of each input."""
+    dimensions = effects.shape[1]
+    indices = {k: np.full(dimensions, np.nan) for k in ("mu", "mu_star", "sigma")}
+    indices |= {
+        k: np.full((dimensions, 2), np.nan) for k in ("mu_interval95", "mu_star_interval95")
+    }
+    indices["kept"] = np.isfinite(effects).sum(axis=0)
+    for j, column in enumerate(effects.T):
+        finite = column[np.isfinite(column)]
+        if len(finite) < 2:
+            continue
+        half = stats.t.ppf(0.975, len(finite) - 1) / np.sqrt(len(finite))
+        indices["sigma"][j] = finite.std(ddof=1)
+        for name, values in (("mu", finite), ("mu_star", np.abs(finite))):
+            mean, sd = values.mean(), values.std(ddof=1)
+            indices[name][j] = mean
+            indices[f"{name}_interval95"][j] = mean - half * sd, mean + half * sd
+    indices["mu_star_interval95"] = np.maximum(indices["mu_star_interval95"], 0.0)
+    return indices
+
+
 METHODS = ("local", "morris", "sobol")
 
-SAMPLES = {"local": None, "morris": 32, "sobol": 512}
-"""Default number of trajectories of Morris and of base points of Sobol."""
-
-LEAST, MOST = {"morris": 4, "sobol": 16}, 1 << 20
-"""Fewest samples that an interval can be computed from, and most that are taken."""
+SAMPLES = {"local": None, "morris": 32, "sobol": 512}  # trajectories, base points
+LEAST, MOST = {"morris": 4, "sobol": 16}, 1 << 20  # fewest and most samples
 
 RANKED_BY = {"local": "effect", "morris": "mu_star", "sobol": "total"}
 
@@ -75,7 +184,7 @@ def sensitivity(
     """Return how sensitive measures of a case are to its uncertain parameters.
 
     Sources: Morris, Technometrics 33(2) 1991, 161; Saltelli et al., Comput. Phys. Commun. 181(2)
-    2010, 259 (see `tuning.uncertainty.indices`).
+    2010, 259 (see `sobol_indices`).
 
     Parameters
     ----------
@@ -95,12 +204,8 @@ def sensitivity(
         `distributions` [-].
     seed : int
         Of the points and of the sensor noise, which is the same in every run.
-    batch : int or None
-        Runs at once.
-    devices : int
-        Of this process; they share the batches, and the results have the same bits.
-    cluster : str, distributed.Client, concurrent.futures.Executor or None
-        Run the batches of morris and sobol on workers, to the same bits, as in `ensemble`.
+    batch, devices, cluster
+        As in `ensemble`, to the same bits; workers run the batches of morris and sobol.
     progress : callable or None
         Called with (runs done, runs in all).
 
@@ -155,7 +260,7 @@ def sensitivity(
         if cluster is not None:
             notes.append("the local method takes one run: the cluster is not used")
     else:
-        make = indices.morris_points if method == "morris" else indices.sobol_points
+        make = morris_points if method == "morris" else sobol_points
         points = make(draws.dimensions, samples, seed)
         runs = points.shape[0] * points.shape[1]
         with batch_runner(case, names, noise, devices, cluster) as run:
@@ -235,11 +340,7 @@ def check_samples(samples, method, notes):
 
 
 def _entries(case, draws, names, points, run, batch, progress):
-    """Return the measures at `points` (samples, runs, D) of the unit cube, entry by entry.
-
-    (K,) of the case's own run, (samples, runs, K) NaN where a run is not finite, and the number of
-    these runs.
-    """
+    """Return measures of the own run (K,) and of `points` (samples, runs, K), and failures."""
     # batches have one size, so that one compiled program serves; the case's own run goes first
     values = {
         name: np.concatenate([np.asarray(get_value(case.loop, name))[None], v])
@@ -272,9 +373,9 @@ def _columns(case, names, method, points, nominal, values, seed):
     for k, (measure, label, unit) in enumerate(entries_of(case, names)):
         y, reason = values[..., k], ""
         if method == "sobol":
-            effects = indices.sobol_indices(y, seed)
+            effects = sobol_indices(y, seed)
         else:
-            effects = indices.morris_indices(indices.morris_effects(points, y))
+            effects = morris_indices(morris_effects(points, y))
         known = np.isfinite(effects[RANKED_BY[method]])
         if not known.all():
             few = np.min(effects["kept"]) < 2
@@ -285,14 +386,10 @@ def _columns(case, names, method, points, nominal, values, seed):
     return columns
 
 
-CHUNK = 16
-"""Parameters whose derivatives are computed at once."""
+CHUNK = 16  # parameters whose derivatives are computed at once
+NORMAL_WIDTH = 2.0  # half-width of a normal distribution, in standard deviations [-]
 
-NORMAL_WIDTH = 2.0
-"""Half-width of a normal distribution, in standard deviations [-]."""
-
-RUNS_AT_ONCE, SAMPLES_AT_ONCE = 64, 1 << 22
-"""Runs in a batch, and most samples of all of them: each holds its signals."""
+RUNS_AT_ONCE, SAMPLES_AT_ONCE = 64, 1 << 22  # of a batch
 
 UNUSABLE = (
     "a derivative is not finite, or runs contradict it by orders of magnitude, as in a chaotic or"

@@ -8,8 +8,7 @@ from tuning.problem.scenarios import ScenarioRun, groups_of, values_of
 from tuning.uncertainty.distributions import Correlated
 from tuning.uncertainty.draws import Draws
 
-SEED_OFFSET = 1_000_003
-"""Offset between the seeds of the validation set and the seeds of the search."""
+SEED_OFFSET = 1_000_003  # between the seeds of validation and search
 
 SIDES = ("before", "after")
 

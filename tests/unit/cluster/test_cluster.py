@@ -24,8 +24,7 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from tuning.cluster import engine as engines
-from tuning.cluster.engine import connect
-from tuning.cluster.local import local_workers
+from tuning.cluster.engine import connect, local_workers
 from tuning.cluster.sent import received, sent
 from tuning.problem.functions import as_measures
 from tuning.uncertainty import batches

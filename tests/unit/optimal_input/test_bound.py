@@ -13,8 +13,7 @@ import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from tuning.optimal_input.cost import open_loop
-from tuning.optimal_input.perfect_information import bound, minimise
-from tuning.optimal_input.problem import TOLERANCE, InputProblem
+from tuning.optimal_input.perfect_information import TOLERANCE, InputProblem, bound, minimise
 
 
 def short(paper, name, values=None, duration=60.0):

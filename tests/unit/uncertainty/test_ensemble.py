@@ -28,8 +28,8 @@ from tuning.storage.store import NAME, Store
 from tuning.uncertainty import validation
 from tuning.uncertainty.distributions import parse, stated
 from tuning.uncertainty.draws import Draws
-from tuning.uncertainty.result import _statistics
 from tuning.uncertainty.sampling import clopper_pearson, probabilities
+from tuning.uncertainty.study import _statistics
 
 SHORT = {"clock.dt": 0.1, "clock.duration": 60.0, "sensor.noise": 0.02}
 TWO = {"plant.drain": tuning.Uniform(relative=0.1), "controller.k1": tuning.Normal(relative=0.2)}

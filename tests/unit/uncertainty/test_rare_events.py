@@ -5,7 +5,7 @@ import pytest
 from helpers import command
 from scipy import stats
 
-from tuning.uncertainty import rare_events
+from tuning.uncertainty import promise as rare_events
 
 SIDE = np.array([0.6, 0.8, 0.0])
 

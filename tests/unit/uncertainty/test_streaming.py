@@ -12,8 +12,8 @@ from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from tuning.storage import columns
 from tuning.storage.columns import Columns, column
-from tuning.uncertainty.result import QUANTITIES, Ensemble
 from tuning.uncertainty.sampling import Points
+from tuning.uncertainty.study import QUANTITIES, Ensemble
 
 MEASURES = ("rms_error", "max_level")
 SPREAD = {"plant.drain": 0.05, "plant.pump_gain": tuning.Normal(relative=0.05)}

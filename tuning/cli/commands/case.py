@@ -87,8 +87,7 @@ def simulate(args):
     from tuning.report import simulated
 
     key_of = lambda case: jax.random.key(args.seed) if noisy(case) else None
-    key, line = key_of(case), Line(args.quiet)
-    line.compiling("the simulation", 5)
+    key, line = key_of(case), Line(args.quiet).compiling("the simulation", 5)
     sentences = halving_warnings(case.loop, case.clock, key)
     measures = dict(reported.run_measures(case.loop, case.clock, key))
     line.end()
@@ -99,8 +98,7 @@ def simulate(args):
     plateaus = stability_margins(case.loop, case.clock) if args.margins else None
     measures |= reported.margin_measures(case.loop, case.clock) if args.margins else {}
     payload = simulated.json_of_run(case, measures, args.seed, plateaus)
-    estimated = simulated.estimates_of_run(case, key)
-    payload |= estimated
+    payload |= (estimated := simulated.estimates_of_run(case, key))
     page = lambda: simulated.report(case, measures, plateaus, args.all, estimated)
     if log is not None:
         page = _with_data(case, log, key, payload, page)
@@ -171,8 +169,7 @@ def _simulate_together(args):
     cases = [open_case(argparse.Namespace(**{**vars(args), "case": name})) for name in names]
     from tuning.report import together
 
-    line = Line(args.quiet)
-    line.compiling("the simulations", 5 * len(cases))
+    line = Line(args.quiet).compiling("the simulations", 5 * len(cases))
     runs = together.run_together(cases, args.seed)
     line.end()
     phase.show("writing results and pictures")

@@ -26,8 +26,7 @@ def explore(args):
     case = open_case(args)
     from jaxtank.live.page import live_page
 
-    line = Line(args.quiet)
-    line.compiling("the page", 10)
+    line = Line(args.quiet).compiling("the page", 10)
     live = live_page(case, source=args.case if args.case.endswith(".toml") else None)
     line.end()
     live.save(path)

@@ -1,12 +1,11 @@
 """`jaxtank attack`: the plant, start and reading errors that drive levels highest."""
 
 from tuning.cli.options import CASE, COMMON, RUN, UNCERTAIN, Command, Option
-from tuning.cli.steps import distributions_of, finish, open_case
+from tuning.cli.steps import distributions_of, finish, open_case, picked
 from tuning.cli.terminal import Line
 from tuning.cli.values import whole
 
-PASSED = 4
-"""Exit code where a limit is passed."""
+PASSED = 4  # exit code where a limit is passed
 
 
 def attack(args):
@@ -15,18 +14,11 @@ def attack(args):
     distributions = distributions_of(args, case)
     from tuning.falsification import study
 
-    line = Line(args.quiet)
-    line.compiling("the simulation and its derivatives", 15)
+    line = Line(args.quiet).compiling("the simulation and its derivatives", 15)
     result = study.attack(
         case,
         distributions,
-        starts=args.starts,
-        iterations=args.iterations,
-        seed=args.seed,
-        windows=args.windows,
-        draws=args.draws,
-        pumps=args.pumps,
-        start=args.start,
+        **picked(args, "starts iterations seed windows draws pumps start"),
         noise=not args.constant_errors,
         progress=lambda done, total: line.show(f"step {done}/{total}"),
     )

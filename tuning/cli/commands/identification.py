@@ -14,6 +14,7 @@ from tuning.cli.steps import (
     finish,
     note,
     open_case,
+    picked,
     print_result,
     printed,
     report_unreachable,
@@ -22,10 +23,8 @@ from tuning.cli.steps import (
 )
 from tuning.cli.terminal import Line
 
-LONGEST = 1e7
-"""Longest planned experiment [s]: four months."""
-PLANNED = 300.0
-"""Length of a planned experiment [s]."""
+LONGEST = 1e7  # longest planned experiment [s]: four months
+PLANNED = 300.0  # length of a planned experiment [s]
 
 STATUS = {"converged": 0, "not_converged": 3, "not_identifiable": 5, "interrupted": 130}
 
@@ -37,7 +36,16 @@ def run(args):
     _check_together(args)
     case = open_case(args) if args.case else None
     if args.inspect:
-        return _inspect(args, case)
+        from tuning.identification.inspection import inspect
+        from tuning.report import inspection
+
+        loop, columns = (None, {}) if case is None else (case.loop, dict(case.log))
+        settings = (columns | args.column, args.decimal, args.hold, args.time)
+        result = inspect(args.inspect, loop, *settings, gap=args.gap)
+        written = inspection.save(result, args.out, args.line) if args.out else []
+        print_result(args, inspection.json_of(result), lambda: printed(inspection.report(result)))
+        report_written(written, args)
+        return 5 if result.problems else 0
     return _plan(args, case) if args.plan else _identify(args, case)
 
 
@@ -79,8 +87,7 @@ def read_logs(args, case):
     """Return the experiment data of --data; what they take for granted goes to stderr."""
     from tuning.identification.csv_log import read_log
 
-    columns = dict(case.log) | args.column
-    settings = (columns, args.decimal, args.hold, args.time)
+    settings = (dict(case.log) | args.column, args.decimal, args.hold, args.time)
     logs = [read_log(path, case.loop, *settings) for path in args.data]
     for log in logs:
         for sentence in log.notes:
@@ -116,47 +123,21 @@ def _identify(args, case):
 
     line, interrupts = Line(args.quiet), Interrupts()
     result = identify(
-        case,
-        logs,
-        args.free or None,
-        start=args.start,
-        starts=args.starts,
-        seed=args.seed,
-        hold_back=args.hold_back,
-        noise=args.noise,
-        loss=args.loss,
-        profile=args.profile,
-        iterations=args.iterations,
-        gap=args.gap,
+        *(case, logs, args.free or None),
+        **picked(args, "start starts seed hold_back noise loss profile iterations gap law"),
+        **picked(args, "refine likelihood"),
         checkpoint=args.out,
         resume=args.resumed,
         progress=interrupts.check,
         ready=ready,
-        law=args.law,
         prior=not args.no_prior,
         accept=args.accept or (),
-        refine=args.refine,
-        likelihood=args.likelihood,
     )
     if args.posterior == "hmc" and result.identifiable and not interrupts.stop:
         result = posterior.with_draws(result, args.seed)
     line.end()
     _report_next(args, result, finish(result, args))
     return interrupts.code if interrupts.stop else STATUS[result.status]
-
-
-def _inspect(args, case):
-    """Print what a file of experiment data holds, with a [log] table; returns the exit code."""
-    from tuning.identification.inspection import inspect
-    from tuning.report import inspection
-
-    loop, columns = (None, {}) if case is None else (case.loop, dict(case.log))
-    settings = (columns | args.column, args.decimal, args.hold, args.time)
-    result = inspect(args.inspect, loop, *settings, gap=args.gap)
-    written = inspection.save(result, args.out, args.line) if args.out else []
-    print_result(args, inspection.json_of(result), lambda: printed(inspection.report(result)))
-    report_written(written, args)
-    return 5 if result.problems else 0
 
 
 def predict(args):
@@ -172,9 +153,7 @@ def predict(args):
 
 
 def learn(args):
-    """Update a rig by the log of its last batches, and tune it on what is known then; returns the
-    exit code of the tuning.
-    """
+    """Update a rig by its last batches and tune it; returns the exit code of the tuning."""
     if not args.data:
         raise InputError("learn needs --data CSV, the log of a batch that ran with this rig")
     case = open_case(args)
@@ -185,9 +164,9 @@ def learn(args):
     from tuning.report.identification import marked
     from tuning.report.prediction import achieved_table, setpoints_used
 
-    logs, line = read_logs(args, case), Line(args.quiet)
+    logs = read_logs(args, case)
     rows = [row | {"data": log.name} for log in logs for row in achieved(case, log)]
-    line.compiling("the simulation and its derivatives", 10)
+    line = Line(args.quiet).compiling("the simulation and its derivatives", 10)
     fit = tuning.identify(case, logs, gap=args.gap, seed=args.seed)
     parts: dict[str, Any] = {"identification": fit}
     line.end()
@@ -304,10 +283,8 @@ def _voltage(args, case):
     if args.voltage is None:
         return None
     high = [float(v) for v in case.loop.actuator.high]
-    inside = len(args.voltage) == len(high) and all(
-        0 < v <= top for v, top in zip(args.voltage, high)
-    )
-    if not inside:
+    inside = [0 < v <= top for v, top in zip(args.voltage, high)]
+    if len(args.voltage) != len(high) or not all(inside):
         raise InputError(
             f"--voltage {args.voltage}: must be {len(high)} numbers above 0 and at most"
             f" {', '.join(f'{v:g}' for v in high)} {case.loop.units[1]}"

@@ -2,7 +2,7 @@
 
 from tuning.cli import values
 from tuning.cli.options import CASE, COMMON, DEVICES, RESUME, RUN, UNCERTAIN, Command, Option
-from tuning.cli.steps import distributions_of, finish, limits_of, open_case, use_devices
+from tuning.cli.steps import distributions_of, finish, limits_of, open_case, picked, use_devices
 from tuning.cli.terminal import Line
 
 ANSWERS = {"kept": 0, "not kept": 4, "undecided": 3}
@@ -14,19 +14,14 @@ def uncertainty(args):
     case = open_case(args)
     from tuning.uncertainty.study import ensemble
 
-    line = Line(args.quiet)
-    line.compiling("the simulation", 5)
+    line = Line(args.quiet).compiling("the simulation", 5)
     result = ensemble(
         case,
         distributions_of(args, case),
-        samples=args.samples,
+        **picked(args, "samples draws promise devices cluster"),
         key=args.seed,
-        draws=args.draws,
         measures=tuple(args.measure) or None,
         limits=limits_of(args, case),
-        promise=args.promise,
-        devices=args.devices,
-        cluster=args.cluster,
         checkpoint=args.out,
         resume=args.resumed,
         progress=lambda done: line.show(f"{done} draws"),
@@ -43,20 +38,11 @@ def sensitivity(args):
     distributions = distributions_of(args, case)
     from tuning.uncertainty import sensitivity_study as study
 
-    line = Line(args.quiet)
     derivatives = " and its derivatives" if args.method == "local" else ""
-    line.compiling(f"the simulation{derivatives}", 5)
-    result = study.sensitivity(
-        case,
-        distributions,
-        method=args.method,
-        measures=args.measure or None,
-        samples=args.samples,
-        seed=args.seed,
-        devices=args.devices,
-        cluster=args.cluster,
-        progress=line.runs,
-    )
+    line = Line(args.quiet).compiling(f"the simulation{derivatives}", 5)
+    same = picked(args, "method samples seed devices cluster")
+    measures = args.measure or None
+    result = study.sensitivity(case, distributions, measures=measures, progress=line.runs, **same)
     line.end()
     finish(result, args)
     return 0

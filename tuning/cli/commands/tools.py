@@ -10,7 +10,7 @@ from jaxtank.core.errors import InputError, nearest
 from jaxtank.core.files import check_folder, write_folder
 from jaxtank.core.text import printable
 from tuning.cli.options import COMMON, SEEDS, Command, Option
-from tuning.cli.steps import finish, print_result, printed, report_written, use_float64
+from tuning.cli.steps import finish, picked, print_result, printed, report_written, use_float64
 from tuning.cli.terminal import Line
 from tuning.cli.values import folder, whole
 
@@ -58,7 +58,21 @@ def compare(args):
     """
     use_float64()
     if args.controllers:
-        return _controllers(args)
+        from jaxtank import rig
+        from tuning.search.comparison import compare_controllers
+
+        if args.markdown:
+            raise InputError("--markdown: is of published numbers, not of --controllers")
+        line = Line(args.quiet).compiling("the simulation and its derivatives", 15)
+        result = compare_controllers(
+            rig.check(rig.open_case(args.paper)),
+            kinds=args.kind or None,
+            **picked(args, "samples seed"),
+            progress=lambda name: line.show(f"{name}: search and judging"),
+        )
+        line.end()
+        finish(result, args)
+        return 0
     from jaxtank import presets
     from tuning.report import papers as report
 
@@ -74,27 +88,6 @@ def compare(args):
     text = report.markdown if args.markdown else lambda rows: printed(report.report(rows))
     print_result(args, report.json_of(rows), lambda: text(rows))
     report_written(written, args)
-    return 0
-
-
-def _controllers(args):
-    """Print every controller that fits a rig, tuned and judged alike."""
-    from jaxtank import rig
-    from tuning.search.comparison import compare_controllers
-
-    if args.markdown:
-        raise InputError("--markdown: is of published numbers, not of --controllers")
-    line = Line(args.quiet)
-    line.compiling("the simulation and its derivatives", 15)
-    result = compare_controllers(
-        rig.check(rig.open_case(args.paper)),
-        kinds=args.kind or None,
-        samples=args.samples,
-        seed=args.seed,
-        progress=lambda name: line.show(f"{name}: search and judging"),
-    )
-    line.end()
-    finish(result, args)
     return 0
 
 

@@ -24,6 +24,7 @@ from tuning.cli.steps import (
     finish,
     limits_of,
     open_case,
+    picked,
     report_unreachable,
     scenarios_of,
 )
@@ -84,7 +85,13 @@ def tune(args):
         report_unreachable(result.tuned, written, args)
         return EXIT[result.status]
     if sweep:  # before the long search
-        _check_tradeoff(case, task, sweep)
+        from jaxtank.limits import resolve_in
+        from tuning.problem.scenarios import check_scenarios, runs_of
+
+        scenarios = case.scenarios if task["scenarios"] is None else task["scenarios"]
+        measure, values = sweep
+        runs = runs_of(case, check_scenarios(case, scenarios), task["seed"])
+        resolve_in([(run.name, run.case) for run in runs], {measure: values[0]})
     finder, case, keywords, mended = _finder(args, case, task)
     unit = tables.objective_unit(task["objective"] or case.objective, case.loop.units)
     option = None if args.robust or args.nominal or args.quiet else _goes_with_nominal(args)
@@ -104,16 +111,8 @@ def tune(args):
 
 def _ruled(args, case, task):
     """The gains of a tuning rule, judged like an answer."""
-    others = {
-        "--nominal": args.nominal,
-        "--robust": args.robust,
-        "--mend": args.mend,
-        "--free": args.free,
-        "--starts": args.starts,
-        "--iterations": args.iterations,
-        "--resume": args.resumed,
-    }
-    option = _goes_with_nominal(args) or next((n for n, v in others.items() if v), None)
+    others = picked(args, "nominal robust mend free starts iterations resume")
+    option = _goes_with_nominal(args) or next((f"--{n}" for n, v in others.items() if v), None)
     if option:
         raise InputError(
             f"--rule {args.rule}: computes gains and searches none: leave out {option}"
@@ -124,12 +123,10 @@ def _ruled(args, case, task):
     return tune_by_rule(
         case,
         args.rule,
-        objective=task["objective"],
-        limits=task["limits"],
+        **{name: task[name] for name in ("objective", "limits", "seed")},
         distributions=_varied(args, case),
         safety_filter=args.safety_filter,
         validation=FRESH if args.validation is None else args.validation,
-        seed=task["seed"],
     )
 
 
@@ -144,17 +141,6 @@ def _task(args, case, seed) -> dict[str, Any]:
         "scenarios": scenarios_of(args),
         "seed": seed,
     }
-
-
-def _check_tradeoff(case, task, sweep):
-    """Raise InputError where the limit of --tradeoff is undefined in every run."""
-    from jaxtank.limits import resolve_in
-    from tuning.problem.scenarios import check_scenarios, runs_of
-
-    scenarios = case.scenarios if task["scenarios"] is None else task["scenarios"]
-    measure, values = sweep
-    runs = runs_of(case, check_scenarios(case, scenarios), task["seed"])
-    resolve_in([(run.name, run.case) for run in runs], {measure: values[0]})
 
 
 def _finder(args, case, task) -> Any:
@@ -176,13 +162,9 @@ def _finder(args, case, task) -> Any:
     if task["scenarios"] == ():  # --scenario none: plants of the case's own run alone
         case = case.replace(scenarios=())
     task["scenarios"] = None
-    keywords = {
-        "distributions": varied,
-        "risk": args.robust,
-        "samples": args.samples or 64,
-        "fresh": args.fresh or 1024,
-        "back_off": args.back_off or 0.0,
-    }
+    given = picked(args, "samples fresh back_off")
+    keywords = {name: value for name, value in given.items() if value is not None}
+    keywords |= {"distributions": varied, "risk": args.robust}
     return tune_robust, case, _stated(task) | keywords, None
 
 
@@ -226,26 +208,16 @@ def _not_robust(args, case, task, choices, varied):
 
 
 def _stated(task):
-    """`task` without scenarios."""
     return {name: value for name, value in task.items() if name != "scenarios"}
 
 
 def _goes_with_nominal(args):
     """Return the first option given that goes with --nominal alone; None without."""
-    options = {
-        "--scenario": args.scenario,
-        "--method": args.method != "auto",
-        "--screening": args.screening is not None,
-        "--batch": args.batch is not None,
-        "--choose": args.choose,
-        "--tradeoff": args.tradeoff is not None,
-        "--bound": args.bound,
-    }
-    return next((name for name, value in options.items() if value), None)
+    options = picked(args, "scenario method screening batch choose tradeoff bound")
+    return next((f"--{name}" for name, v in options.items() if v and v != "auto"), None)
 
 
 def _is_nominal(args):
-    """Return True if --nominal is given or implied."""
     return args.nominal or _goes_with_nominal(args) is not None
 
 
@@ -260,8 +232,7 @@ def _options(args):
                 f"batch = {args.batch}: only method adam draws scenarios, not {method}"
             )
         method = "adam"
-    names = ("validation", "starts", "screening", "iterations", "cluster")
-    numbers = {name: getattr(args, name) for name in names}
+    numbers = picked(args, "validation starts screening iterations cluster")
     return options_of(method, **numbers, **({} if args.batch is None else {"batch": args.batch}))
 
 
