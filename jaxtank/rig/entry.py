@@ -225,11 +225,6 @@ def read_value(key, label: str, value: Any, sizes: Sizes) -> Any:
     return READ[key.kind](key, label, value, sizes)
 
 
-def _reading(key, label, value, sizes):
-    """A number, or a text such as "80 %", which waits for the span of its sensor."""
-    return value if is_reading(value) else _number(key, label, value, sizes)
-
-
 def _span(key, label, value, sizes):
     value = converted(label, value, key.meta(sizes.units)["unit"])
     if not (is_finite(value) and np.shape(value) == (2,)):
@@ -238,6 +233,8 @@ def _span(key, label, value, sizes):
 
 
 def _number(key, label, value, sizes):
+    if key.kind == "reading" and is_reading(value):  # "80 %" waits for the span of its sensor
+        return value
     meta = key.meta(sizes.units)
     value = converted(label, value, meta["unit"])
     if not is_plain(value):
@@ -258,12 +255,6 @@ def _integer(key, label, value, sizes):
     if not (inside and float(value).is_integer()):
         raise refusal(label, value, f"be {_within('a whole number', key.meta(sizes.units))}")
     return int(value)
-
-
-def _flag(key, label, value, sizes):
-    if not isinstance(value, bool):
-        raise refusal(label, value, "be true or false")
-    return value
 
 
 def _texts(key, label, value, sizes):
@@ -299,19 +290,14 @@ def _list(key, label, value, sizes):
 
 def _array(key, label, value, sizes):
     """An array; one number for an array of one entry per pump, tank or output fills it."""
-    value = converted(label, value, key.meta(sizes.units)["unit"])
+    meta = key.meta(sizes.units)
+    value = converted(label, value, meta["unit"])
     if not is_numeric(value):
-        numbers = f"a number or a list of numbers{unit(key.meta(sizes.units))}"
-        raise refusal(label, value, f"be {numbers}")
+        raise refusal(label, value, f"be a number or a list of numbers{unit(meta)}")
     array, shape = number(value), sizes_of_shape(key.shape, sizes.counts) or ()
+    if key.kind == "scalar" and array.ndim:
+        raise refusal(label, value, f"be one number{unit(meta)}")
     return np.full(shape, array) if len(shape) == 1 and array.ndim == 0 else array
-
-
-def _scalar(key, label, value, sizes):
-    array = _array(key, label, value, sizes)
-    if array.ndim:
-        raise refusal(label, value, f"be one number{unit(key.meta(sizes.units))}")
-    return array
 
 
 def _tank(key, label, value, sizes):
@@ -328,7 +314,10 @@ def _tank(key, label, value, sizes):
 
 def _tanks(key, label, value, sizes):
     if not isinstance(value, list):
-        raise refusal(label, value, f"be a list of tanks, counted from 1 to {sizes.tanks}")
+        of = f"tanks, counted from 1 to {sizes.tanks}" if key.kind == "tanks" else "inputs"
+        raise refusal(label, value, f"be a list of {of}")
+    if key.kind == "inputs":
+        return tuple(_input(label, v, sizes) for v in value)
     return tuple(_tank(key, label, tank, sizes) for tank in value)
 
 
@@ -348,12 +337,6 @@ def _sequence(key, label, value, sizes):
         raise refusal(label, value, "be a list of inputs for each output, as [[1, 2], [3]]")
     rows = value if nested else [value]
     return tuple(tuple(_input(label, v, sizes) for v in row) for row in rows)
-
-
-def _inputs(key, label, value, sizes):
-    if not isinstance(value, list):
-        raise refusal(label, value, "be a list of inputs")
-    return tuple(_input(label, v, sizes) for v in value)
 
 
 def _pair(key, label, value, sizes):
@@ -378,17 +361,12 @@ def different(label, value, tanks):
     return tanks
 
 
-def _are_points(value):
-    """True for a list of at least two pairs."""
-    is_pair = lambda point: isinstance(point, list) and len(point) == 2
-    return isinstance(value, list) and len(value) > 1 and all(map(is_pair, value))
-
-
 def _curve(key, label, value, sizes):
     """Points ((x, y), ...) with increasing x, or the name of one of the key's choices."""
     if isinstance(value, str) and hyphened(value) in (key.choices or ()):
         return hyphened(value)
-    if not _are_points(value):
+    is_pair = lambda point: isinstance(point, list) and len(point) == 2
+    if not (isinstance(value, list) and len(value) > 1 and all(map(is_pair, value))):
         names = "".join(f'"{choice}", ' for choice in key.choices or ())
         columns = key.local_unit(sizes.units)
         raise refusal(label, value, f"be {names}or a list of points [{columns}]: {key.doc}")
@@ -402,32 +380,33 @@ def _curve(key, label, value, sizes):
     return points
 
 
-def _table(key, label, value, sizes):
-    if not isinstance(value, dict):
-        raise refusal(label, value, f"be a table: {key.doc}")
+def _of_type(key, label, value, sizes):
+    if not isinstance(value, bool if key.kind == "flag" else dict):
+        must = "true or false" if key.kind == "flag" else f"a table: {key.doc}"
+        raise refusal(label, value, f"be {must}")
     return value
 
 
 READ = {
     "number": _number,
-    "reading": _reading,
+    "reading": _number,
     "span": _span,
     "integer": _integer,
-    "flag": _flag,
+    "flag": _of_type,
     "choice": lambda key, label, value, sizes: static_value(label, value, key.meta(), str),
     "text": lambda key, label, value, sizes: name_of(label, value),
     "texts": _texts,
     "list": _list,
     "array": _array,
-    "scalar": _scalar,
+    "scalar": _array,
     "tank": _tank,
     "tanks": _tanks,
     "sequence": _sequence,
-    "inputs": _inputs,
+    "inputs": _tanks,
     "pair": _pair,
     "feed": _feed,
     "curve": _curve,
-    "table": _table,
+    "table": _of_type,
     "any": lambda key, label, value, sizes: value,
 }
 """{kind: function (key, label, value, sizes)} that reads and checks a value of a rig file."""
@@ -548,17 +527,13 @@ def lines_of(
     """Return the lines of a section's keys that have a value, in the order of its schema; names:
     those of the tanks.
     """
-    return [
-        Line(k.name, written(k, values[k.name], names), _meta_of(k, values[k.name], units))
-        for k in section.keys
-        if values.get(k.name) is not None
-    ]
-
-
-def _meta_of(key, value, units):
-    """The metadata of a value; a name instead of a curve has no unit."""
-    meta = key.meta(units)
-    return {**meta, "unit": "-"} if key.kind == "curve" and isinstance(value, str) else meta
+    lines = []
+    for key in (key for key in section.keys if values.get(key.name) is not None):
+        value, meta = values[key.name], key.meta(units)
+        if key.kind == "curve" and isinstance(value, str):  # a name instead of a curve
+            meta["unit"] = "-"
+        lines.append(Line(key.name, written(key, value, names), meta))
+    return lines
 
 
 def block_of(
@@ -577,15 +552,9 @@ def suggestion(section: Section, values: Mapping[str, Any], units=DEFAULT) -> Bl
 
 def terse(block: Block) -> list[str]:
     """Return the lines of a terse file: title, and "name = value  # [unit] doc" of what is on."""
-    return [block.title] * bool(block.title) + [
-        f"{line.name} = {toml(line.value)}" + (f"  # {note}" if (note := _note(line.meta)) else "")
-        for line in block.lines
-        if line.on
-    ]
-
-
-def _note(meta):
-    return " ".join(filter(None, [unit(meta).strip(), meta["doc"]]))
+    note = lambda meta: " ".join(filter(None, [unit(meta).strip(), meta["doc"]]))
+    rows = [(f"{e.name} = {toml(e.value)}", note(e.meta)) for e in block.lines if e.on]
+    return [block.title] * bool(block.title) + ["  # ".join(filter(None, row)) for row in rows]
 
 
 def toml(value: Any) -> str:

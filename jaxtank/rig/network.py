@@ -45,20 +45,17 @@ MOST = 5000
 
 def names_in(table):
     """{name: index} of the [[tank]] tables that have a name, and of those of their sensors."""
+    is_name = lambda value: isinstance(value, str) and value != ""
     rows = [row for row in table["tank"] if isinstance(row, dict)]
-    names = {t["name"]: i for i, t in enumerate(rows) if _is_name(t.get("name"))}
+    names = {t["name"]: i for i, t in enumerate(rows) if is_name(t.get("name"))}
     sensors = [row for row in table.get("sensors", []) if isinstance(row, dict)]
     for i, row in enumerate(sensors):
         tank = row.get("tank", i + 1)
         index = names.get(tank) if isinstance(tank, str) else None
         index = tank - 1 if isinstance(tank, int) else index
-        if _is_name(row.get("name")) and index is not None:
+        if is_name(row.get("name")) and index is not None:
             names.setdefault(row["name"], index)
     return names
-
-
-def _is_name(value):
-    return isinstance(value, str) and value != ""
 
 
 def build(table):
@@ -66,7 +63,9 @@ def build(table):
     table = _with_drains({**table, **{name: _list(table, name) for name in LISTS}})
     units = _units(table.get("units", list(DEFAULT)))
     sizes = Sizes(len(table["tank"]), units=units)
-    table["pump"] = [_with_gain(row, units) for row in table["pump"]]
+    if flow_per_input(units):  # an input that is a flow: a pump that says nothing has gain = 1
+        bare = lambda row: isinstance(row, dict) and not {"gain", "curve"} & row.keys()
+        table["pump"] = [row | {"gain": 1.0} if bare(row) else row for row in table["pump"]]
     table["sensors"] = sensor_rows(table, sizes.tanks)
     sizes = sizes._replace(names=names_in(table))
     entries, more = _read(table, sizes)
@@ -74,13 +73,19 @@ def build(table):
     leaves, levels = leaves_of(entries["sensors"], rims, noise, levels)
     columns = _columns(entries) | {"x0": levels}
     columns |= {f"sensor.{name}": value for name, value in leaves.items()}
-    outputs = more.pop("outputs") if "outputs" in more else _usual_outputs(entries)
+    # else the tanks that the pumps fill first, or which they empty; without pumps, the valves
+    pumps = entries["pump"]
+    ends = [p.get("from") if p["to"][0] is None else p["to"][0] for p in pumps]
+    usual = tuple(dict.fromkeys(ends or [valve["from"] for valve in entries["valve"]]))
+    outputs = more.pop("outputs", usual)
     if not outputs:
         raise InputError("plant.outputs = []: must be a list of at least one tank")
     if any("port" in row for row in table["spill"]):  # else such an opening would do nothing
         more = {"overflow": True, **more}
     plant = network(**_keywords(columns), **more, outputs=outputs, units=units)
-    names = with_names(_names(entries), entries["sensors"], sizes.tanks)
+    called = ((kind, tuple(row["name"] for row in entries[kind])) for kind in ("tank", *INPUTS))
+    named = tuple((kind, names) for kind, names in called if any(names))
+    names = with_names(named, entries["sensors"], sizes.tanks)
     plant = dataclasses.replace(plant, names=names)
     control = table.get("controller", {})
     return Case(
@@ -186,16 +191,16 @@ def _vessel(where, tank, units):
         extent, area, shape = _table_of_sections(where, shape, sizes)
     else:
         extent = tank["rim"] if kind == "prism" else sizes.get("height", sizes.get("diameter"))
-        area = _largest_section(sizes)
+        disc = _disc(sizes["diameter"]) if "diameter" in sizes else sizes.get("area", 0.0)
+        area = sizes["diameter"] * sizes["length"] if "length" in sizes else disc
     return {"area": area, "shape": shape, "height": extent, "rim": tank.get("rim", extent)}
 
 
 def _name_rim(where, tank, units):
     """Call the height of an upright tank its rim."""
-    if "height" in tank and "rim" in tank:
-        raise InputError(
-            f"{where}: height and rim are the same of an upright tank: give one of them"
-        )
+    if {"height", "rim"} <= tank.keys():
+        twice = "height and rim are the same of an upright tank"
+        raise InputError(f"{where}: {twice}: give one of them")
     if "height" in tank:
         tank["rim"] = tank.pop("height")
     if "rim" not in tank:
@@ -210,13 +215,6 @@ def _table_of_sections(where, shape, sizes):
         raise refusal(f"{where}: shape", shape, rule)
     points = tuple((h / levels[-1], a / max(areas)) for h, a in shape)
     return sizes.get("height", levels[-1]), sizes.get("area", max(areas)), points
-
-
-def _largest_section(sizes):
-    """Return the largest cross-section of a shape that has a name."""
-    if "length" in sizes:
-        return sizes["diameter"] * sizes["length"]
-    return _disc(sizes["diameter"]) if "diameter" in sizes else sizes.get("area", 0.0)
 
 
 def _with_volume(where, tank):
@@ -242,14 +240,6 @@ def _with_volume(where, tank):
 def _disc(diameter):
     """Area of a disc [cm^2]."""
     return math.pi / 4.0 * diameter**2
-
-
-def _usual_outputs(entries):
-    """The tanks that the pumps fill first, or which they empty; without pumps, the valves."""
-    ends: list[Any] = [
-        pump.get("from") if pump["to"][0] is None else pump["to"][0] for pump in entries["pump"]
-    ]
-    return tuple(dict.fromkeys(ends or [valve["from"] for valve in entries["valve"]]))
 
 
 def _list(table, name):
@@ -296,13 +286,10 @@ def _columns(entries) -> dict[str, Any]:
 def _keywords(columns):
     """Keywords of `network` of the columns of a plant."""
     keywords = _fields(columns, "plant")
-    for option, group in (
-        ("port", "ports"),
-        ("exponent", "exponents"),
-        ("resistance", "resistances"),
-    ):
+    for option in ("port", "exponent", "resistance"):
         names = [name for name in keywords if name.endswith(f"_{option}")]
-        keywords[group] = {name.removesuffix(f"_{option}"): keywords.pop(name) for name in names}
+        of = {name.removesuffix(f"_{option}"): keywords.pop(name) for name in names}
+        keywords[f"{option}s"] = of
     return keywords
 
 
@@ -340,11 +327,8 @@ def _loop(plant, columns, control, observer):
     # a bias that is left out is computed once all values are set (rig/read.py)
     controller = controller_of(control, loop, number(inputs["initial"]))
     loop = dataclasses.replace(loop, controller=controller)
-    return (
-        loop
-        if observer is None
-        else dataclasses.replace(loop, observer=observer_of(observer, loop))
-    )
+    parts = {} if observer is None else {"observer": observer_of(observer, loop)}
+    return dataclasses.replace(loop, **parts)
 
 
 def _numbers(values):
@@ -357,12 +341,6 @@ def _units(value):
         raise refusal("units", value, 'be [length, pump input], as ["cm", "V"]')
     length, drive = (name_of("units: entry", v) for v in value)
     return check_units("units", (length, drive))
-
-
-def _names(entries):
-    """((kind, names), ...) of the kinds of which one has a name."""
-    names = ((kind, tuple(entry["name"] for entry in entries[kind])) for kind in ("tank", *INPUTS))
-    return tuple((kind, each) for kind, each in names if any(each))
 
 
 def _check_names(entries):
@@ -405,12 +383,6 @@ def _check_spills(spills, rows):
 
 FLOW_MARGIN = 2.0
 """Factor by which a pump may deliver more or less than the flow that its input asks for."""
-
-
-def _with_gain(row, units):
-    """A row of [[pump]] with gain = 1 where its input is a flow and it says nothing of its own."""
-    bare = isinstance(row, dict) and not {"gain", "curve"} & row.keys()
-    return {**row, "gain": 1.0} if bare and flow_per_input(units) else row
 
 
 def _flow_gain(where, gain, flow, units):
@@ -470,13 +442,11 @@ def _check_pumps(rows, pumps, units):
 
 def _check_monotone(label, points, least=None):
     """Raise InputError for points of a curve that rise and fall, or lie below `least`."""
-    heights = [y for _, y in points or ()]
+    heights, rows = [y for _, y in points or ()], [list(p) for p in points or ()]
     if heights not in (sorted(heights), sorted(heights, reverse=True)):
-        raise refusal(
-            label, [list(p) for p in points], "rise or fall all along: a curve that turns"
-        )
+        raise refusal(label, rows, "rise or fall all along: a curve that turns")
     if least is not None and min(heights, default=least) < least:
-        raise refusal(label, [list(p) for p in points], f"be at least {least:g}")
+        raise refusal(label, rows, f"be at least {least:g}")
 
 
 def _check_valves(valves, units):

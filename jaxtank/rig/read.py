@@ -118,20 +118,15 @@ def loads(text: str, words: str = "rig file", folder: str | Path = "") -> Case:
     try:
         return from_table(table, folder)
     except InputError as error:
-        located = type(error)(f"{words}: {_located(error, text)}")
+        lines, sentences = lines_of(text), []
+        for part in error.parts or (error,):
+            line = line_of(lines, part.place) if part.place else None
+            sentences.append(f"line {line}: {part}" if line else str(part))
+        located = type(error)(f"{words}: {'; '.join(sentences)}")
         located.parts = error.parts
         raise located from None
     except RecursionError:
         raise InputError(f"{words}: a value is nested too deeply") from None
-
-
-def _located(error, text):
-    """The problems of a file, each with its line."""
-    lines, sentences = lines_of(text), []
-    for part in error.parts or (error,):
-        line = line_of(lines, part.place) if part.place else None
-        sentences.append(f"line {line}: {part}" if line else str(part))
-    return "; ".join(sentences)
 
 
 def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
@@ -140,12 +135,10 @@ def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
     """
     table = with_clock(with_inputs(tables.resolved(renamed(table), Path(folder))))
     case = start_of(table)
-    dotted = [key for key in ("values", "free", "uncertain") if key in table]
-    names = {
-        key: by_rig_name(case.loop, by_dotted_name(table[key], key), key != "uncertain")
-        for key in dotted
-    }
-    table = {**table, **names}
+    for key in ("values", "free", "uncertain"):
+        if key in table:
+            dotted = by_dotted_name(table[key], key)
+            table = {**table, key: by_rig_name(case.loop, dotted, key != "uncertain")}
     values = with_models(case.loop, table.get("values", {}))
     case, values = _with_bias(case, values, table)
     case = set_and_schedule(case, values, table.get("schedule", {}))
@@ -207,7 +200,7 @@ def with_inputs(table):
 
 def filtered(case: Case, on: bool | None = None, changes: Mapping[str, Any] | None = None) -> Case:
     """Return the case with the safety filter of its settings and `changes`, or without it."""
-    changes = read_entry(SECTIONS["safety_filter"], changes or {}, sizes_of(case.loop))
+    changes = _filter_settings(case, changes or {})
     if (case.safety is None and not on) or on is False:
         if changes:
             raise InputError(
@@ -276,19 +269,20 @@ def start_of(table):
     if "sensors" in table:
         with problems.collect():
             check_stated(table, loop)
-    for name in ("sensor", "actuator"):
-        if name in table:
+    parts = {
+        "sensor": lambda row: components.instrument_of("sensor", row, loop),
+        "actuator": lambda row: components.instrument_of("actuator", row, loop),
+        "reference": lambda row: signals.reference_of(row, loop),
+        "disturbance": lambda _: signals.disturbance_of(table, loop),
+        "inflow": lambda _: signals.disturbance_of(table, loop),
+        "fault": lambda rows: signals.faults_of(rows, loop, dotted_name),
+    }
+    fields = {"inflow": "disturbance", "fault": "faults"}
+    for name, read in parts.items():
+        field = fields.get(name, name)
+        if name in table and field not in changes:
             with problems.collect():
-                changes[name] = components.instrument_of(name, table[name], loop)
-    if "reference" in table:
-        with problems.collect():
-            changes["reference"] = signals.reference_of(table["reference"], loop)
-    if "disturbance" in table or "inflow" in table:
-        with problems.collect():
-            changes["disturbance"] = signals.disturbance_of(table, loop)
-    if "fault" in table:
-        with problems.collect():
-            changes["faults"] = signals.faults_of(table["fault"], loop, dotted_name)
+                changes[field] = read(table[name])
     problems.check()
     top.pop("units", None)
     return case.replace(loop=dataclasses.replace(loop, **changes), **top)
@@ -303,25 +297,26 @@ def _start(table, problems):
     if problems and lists and "tank" in table and "case" not in table:
         with problems.collect():
             network.build(table)
-    if problems:
-        _check_others(table, problems)
-    problems.check()
+    _check_others(table, problems)
     if "case" in top:
         case = presets.find(top.pop("case"))
         if "sensors" in table:
-            case = case.replace(loop=_with_sensors(case.loop, table))
+            rows, sizes = sensor_rows(table, case.loop.plant.tanks), sizes_of(case.loop)
+            rows = read_entries(SECTIONS["sensors"], {"sensors": rows}, sizes)
+            rows = complete_rows(rows, sizes.tanks, sizes.units[0])
+            case = case.replace(loop=with_sensors(case.loop, rows))
         case = _with_parts(case, table)
     else:
         with problems.collect():
             case = network.build(table)
-        if problems:
-            _check_others(table, problems)
-        problems.check()
+        _check_others(table, problems)
     return case, top
 
 
 def _check_others(table, problems):
-    """Add what is wrong in the other tables of a file whose rig is wrong already."""
+    """Raise the problems of a rig, if any, with what is wrong in the other tables of its file."""
+    if not problems:
+        return
     for name in ("controller", "observer"):
         with problems.collect((name, None, None)):
             components.check_keys(name, table)
@@ -333,6 +328,7 @@ def _check_others(table, problems):
                     check_names([key])
                 elif key not in SECTIONS[name].names:
                     raise unknown_key(SECTIONS[name], key, name)
+    problems.check()
 
 
 def _top(table):
@@ -354,12 +350,6 @@ def _top(table):
             tables = f"a list of tables, [[{name}]]" if sections[name].many else "a table"
             problems.append(refusal(name, value, f"be {tables}"))
     problems.check()
-    _check_start(table)
-    return top
-
-
-def _check_start(table):
-    """Raise InputError unless a file has either a case or tanks."""
     tables = [name for name in TANKWISE if name in table]
     if "case" in table and tables:
         raise InputError(
@@ -371,13 +361,7 @@ def _check_start(table):
             'a rig file needs case = "paper/case" to start from (`jaxtank list` prints them), or'
             " [[tank]] to describe a rig"
         )
-
-
-def _with_sensors(loop, table):
-    """A preset's loop with the [[sensor]] tables of a file."""
-    rows, sizes = sensor_rows(table, loop.plant.tanks), sizes_of(loop)
-    rows = read_entries(SECTIONS["sensors"], {"sensors": rows}, sizes)
-    return with_sensors(loop, complete_rows(rows, sizes.tanks, sizes.units[0]))
+    return top
 
 
 def _with_parts(case, table):

@@ -2,8 +2,8 @@
 
 import dataclasses
 import re
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -69,10 +69,18 @@ def readings(label: str, name: str, value: Any, unit: str, axes: Any, loop: Any)
     the index of one of those (of a gain an output, else a tank). Other values are returned.
     """
     texts = list(value) if isinstance(value, (list, tuple)) else [value]
-    convert = _conversion(label, name, unit, axes, loop)
-    if convert is None or not any(map(convert.applies, texts)):
+    if unit == local("V/cm", loop.units):
+        applies = lambda v: isinstance(v, str) and _GAIN.fullmatch(v.strip()) is not None
+        to_number = lambda text, i: _gain(label, text, loop, i)
+    elif unit == loop.units[0] and name in LEVELS + WIDTHS:
+        tanks = loop.plant.outputs if axes == "output" else range(loop.plant.tanks)
+        applies = is_reading
+        to_number = lambda text, i: level_of(text, spans_of(loop)[tanks[i]], name in WIDTHS)
+    else:
         return value
-    apply = lambda v, i: convert.to_number(v, i) if convert.applies(v) else v
+    if not any(map(applies, texts)):
+        return value
+    apply = lambda v, i: to_number(v, i) if applies(v) else v
     count = loop.plant.tanks if axes == "tank" else len(loop.plant.outputs)
     if isinstance(axes, int):
         each = [apply(v, axes) for v in texts]
@@ -81,28 +89,6 @@ def readings(label: str, name: str, value: Any, unit: str, axes: Any, loop: Any)
         each = [apply(value, i) for i in range(count)]
         return each[0] if len(set(each)) == 1 else each
     return [apply(v, i) if i < count else v for i, v in enumerate(texts)]
-
-
-class Conversion(NamedTuple):
-    """Which texts of a value are in % or mA, and (text, index) -> number."""
-
-    applies: Callable[[Any], bool]
-    to_number: Callable[[str, int], float]
-
-
-def _conversion(label, name, unit, axes, loop):
-    """The Conversion of a value by its name and unit; None of one that is no level and no gain."""
-    if unit == local("V/cm", loop.units):
-        return Conversion(_is_gain, lambda text, i: _gain(label, text, loop, i))
-    if unit != loop.units[0] or name not in LEVELS + WIDTHS:
-        return None
-    tanks = loop.plant.outputs if axes == "output" else range(loop.plant.tanks)
-    to_level = lambda text, i: level_of(text, spans_of(loop)[tanks[i]], name in WIDTHS)
-    return Conversion(is_reading, to_level)
-
-
-def _is_gain(value):
-    return isinstance(value, str) and _GAIN.fullmatch(value.strip()) is not None
 
 
 def _gain(label, text, loop, output):
@@ -132,27 +118,24 @@ def leaves_of(rows, rims, noise, levels=()):
     Of a tank without a row, or with one that has only a name, the sensor has no ends. noise and
     levels : of each tank, numbers or texts in % of its span.
     """
-    low, high, offset = np.full(len(rims), -np.inf), np.full(len(rims), np.inf), [0.0] * len(rims)
-    scale = [1.0] * len(rims)
-    noise = list(noise)
+    low, high = np.full(len(rims), -np.inf), np.full(len(rims), np.inf)
+    usual = {"noise": list(noise), "offset": [0.0] * len(rims), "scale": [1.0] * len(rims)}
+    leaves = {k: v for k, v in usual.items() if k == "noise" or any(k in row for row in rows)}
     for row in rows:
         tank = row["tank"]
         if "span" in row or row["unit"] in ("%", "mA"):
             low[tank], high[tank] = row.get("span", (0.0, rims[tank]))
-        noise[tank], offset[tank] = row.get("noise", noise[tank]), row.get("offset", 0.0)
-        scale[tank] = row.get("scale", 1.0)
+        for name, values in leaves.items():
+            values[tank] = row.get(name, values[tank])
     spans = _spans(low, high, rims)
-    number_of = lambda v, span, width: level_of(v, span, width) if is_reading(v) else v
-    leaves = {"noise": [number_of(v, span, True) for v, span in zip(noise, spans)]}
+    numbers = lambda values, width: [
+        level_of(v, span, width) if is_reading(v) else v for v, span in zip(values, spans)
+    ]
+    leaves = {name: numbers(values, True) for name, values in leaves.items()}
     if np.any(np.isfinite(high)):
         leaves |= {"low": low, "high": high}
-    if any("offset" in row for row in rows):
-        leaves["offset"] = [number_of(v, span, True) for v, span in zip(offset, spans)]
-    if any("scale" in row for row in rows):
-        leaves["scale"] = scale
     leaves |= _curves(rows, len(rims))
-    levels = [number_of(v, span, False) for v, span in zip(levels, spans)]
-    return {name: number(value) for name, value in leaves.items()}, levels
+    return {n: number(value) for n, value in leaves.items()}, numbers(levels, False)
 
 
 def _curves(rows, tanks):
@@ -222,7 +205,9 @@ def _with_unit(row):
 
 def check_stated(table, loop):
     """Raise InputError for setpoints and gains without a unit where a sensor reads in % or mA."""
-    units = {row["tank"]: row.get("unit") for row in _with_tanks(table, loop)}
+    rows = enumerate(sensor_rows(table, loop.plant.tanks))
+    at = lambda row, i: index_of("sensor", loop.plant, "tank", row.get("tank", i + 1))
+    units = {at(row, i): row.get("unit") for i, row in rows}
     units = [units.get(tank) for tank in loop.plant.outputs]
     spans, length, problems = spans_of(loop), loop.units[0], []
     of = lambda value: value if isinstance(value, list) else [value] * len(units)
@@ -255,13 +240,6 @@ def check_stated(table, loop):
         raise InputError("; ".join(problems))
 
 
-def _with_tanks(table, loop):
-    """Rows of [[sensor]] with the index of each tank."""
-    rows = sensor_rows(table, loop.plant.tanks)
-    at = lambda row, i: index_of("sensor", loop.plant, "tank", row.get("tank", i + 1))
-    return [{**row, "tank": at(row, i)} for i, row in enumerate(rows)]
-
-
 def complete_rows(rows: list[dict[str, Any]], tanks: int, length: str) -> list[dict[str, Any]]:
     """Return rows of [[sensor]] with their tanks, after input validation."""
     problems: list[str] = []
@@ -284,16 +262,11 @@ def complete_rows(rows: list[dict[str, Any]], tanks: int, length: str) -> list[d
         same = [str(i + 1) for i, row in enumerate(rows) if row["tank"] == tank]
         if len(same) > 1:
             problems.append(f"sensors {' and '.join(same)} read one tank: give one of them")
-    problems += _turning(rows)
-    if problems:
-        raise InputError("; ".join(problems))
-    return rows
-
-
-def _turning(rows):
-    """What is wrong with the curves of rows of [[sensor]]."""
-    return [
+    problems += [
         f"sensor {i + 1}: curve: its readings must increase with the level"
         for i, row in enumerate(rows)
         if np.any(np.diff([reading for _, reading in row.get("curve", ())]) <= 0)
     ]
+    if problems:
+        raise InputError("; ".join(problems))
+    return rows

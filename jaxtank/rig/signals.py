@@ -62,16 +62,15 @@ def ramps_of(section, table, old, words, sizes):
     """Return the Ramps of a table; what it leaves out is as in `old`. words: channel and value."""
     values = read_entry(section, _over(section, ramp_values(old), table), sizes)
     label, of = f"{section.name}.changes", section["changes"].meta(sizes.units)["unit"]
-    initial = values["initial"].tolist()
+    initial, plant = values["initial"].tolist(), sizes.plant
     if columns := _columns_of(section.name, table):
-        names = columns.chosen(table.get("column"), words[0], sizes.plant, len(initial))
-        units = [
-            input_unit(sizes.plant, i, of) if words[0] == "pump" else of
-            for i in range(len(initial))
-        ]
-        spans = [spans_of(sizes.loop)[i] for i in sizes.plant.outputs]
-        spans = None if words[0] == "pump" else spans
-        times, rows = columns.read(names, dict(enumerate(units)), spans)
+        names = columns.chosen(table.get("column"), words[0], plant, len(initial))
+        units, spans = dict.fromkeys(range(len(initial)), of), None
+        if words[0] == "pump":
+            units = {i: input_unit(plant, i, of) for i in units}
+        else:
+            spans = [spans_of(sizes.loop)[i] for i in plant.outputs]
+        times, rows = columns.read(names, units, spans)
         if "initial" not in table:  # the first row holds before its time
             initial = [float(rows[i][0]) if i in rows else v for i, v in enumerate(initial)]
         changes = tables.changes_of(times, rows, initial)
@@ -149,12 +148,9 @@ def _plain_changes(changes, channels):
         return None
     t, which, value = (np.array(column, dtype=float) for column in zip(*changes))
     fine = np.all(np.isfinite(t) & np.isfinite(value)) and np.all(np.diff(t) >= 0.0)
-    if not fine or which.min() < 1 or which.max() > channels:
-        return None
-    places = [(time, i - 1) for time, i, _ in changes]
-    if len(set(places)) < len(places):
-        return None
-    return [(*place, row[2]) for place, row in zip(places, changes)]
+    fine = fine and which.min() >= 1 and which.max() <= channels
+    twice = len({(time, i) for time, i, _ in changes}) < len(changes)
+    return [(time, i - 1, v) for time, i, v in changes] if fine and not twice else None
 
 
 def ramp_values(signal):
@@ -229,34 +225,20 @@ def _inflows(entries, steady, sizes):
     with problems.collect():
         pulses = read_entries(SECTIONS["inflow"], {"inflow": pulses}, sizes)
     problems.check()
-    first = None
+    first, names = None, ("time", "duration", "tank", "volume")
     if pulses:
-        first = inflow_pulses(sizes.tanks, [_pulse(e) for e in pulses])
+        first = inflow_pulses(sizes.tanks, [tuple(e[name] for name in names) for e in pulses])
         flows = np.asarray(steady.level).tolist() if isinstance(steady, Constant) else []
         steady = steady if any(flows) and not courses else None
         if courses:  # beside pulses and a table it is a table of one row
             courses += [(tank, [0.0], [flow], "hold") for tank, flow in enumerate(flows) if flow]
-    return first, steady, _table(courses, sizes.tanks)
-
-
-def _table(courses, tanks):
-    """The InflowTable of courses, None of none."""
-    if not courses:
-        return None
-    *_, between = zip(*courses)
-    return inflow_table(tanks, [course[:3] for course in courses], between)
-
-
-def _pulse(entry):
-    """(time, duration, tank, volume) of a table of [[inflow]]."""
-    return entry["time"], entry["duration"], entry["tank"], entry["volume"]
+    rows, between = [course[:3] for course in courses], [course[3] for course in courses]
+    return first, steady, inflow_table(sizes.tanks, rows, tuple(between)) if courses else None
 
 
 def _is_course(entry):
     """Whether a table of [[inflow]] is a measured inflow, and no pulse."""
-    return isinstance(entry, dict) and any(
-        key in entry for key in ("csv", "changes", "column", "flow")
-    )
+    return isinstance(entry, dict) and bool({"csv", "changes", "column", "flow"} & entry.keys())
 
 
 def _course(entry, sizes, index):
@@ -292,7 +274,9 @@ def faults_of(entries, loop, dotted):
             try:
                 _check_kind(entries[i])
                 if "sensor" in e:
-                    sensors.append(_sensor_fault(e, entries[i], sizes))
+                    size = _size_of(e["kind"], e["sensor"], entries[i], sizes)
+                    row = (e["sensor"], e["kind"], e["start"], e["end"], e.get("every", 0.0))
+                    sensors.append((SensorFault(*row), size))
                     faults(plant, (), sensors[-1:])
                     continue
                 values = (e[name] for name in ("start", "end", "factor", "extra"))
@@ -326,19 +310,13 @@ def _check_kind(entry):
         raise InputError(f"{' and '.join(sorted(more))} is not for {words}: leave it out")
 
 
-def _sensor_fault(values, entry, sizes):
-    """(SensorFault, size) of an entry of [[fault]]."""
-    tank, kind, size = values["sensor"], values["kind"], 0.0
-    if kind != "freeze":
-        key = Key("size", unit="cm/s" if kind == "drift" else "cm", low=NOT_BELOW.get(kind))
-        size = readings("size", "size", entry["size"], sizes.units[0], tank, sizes.loop)
-        size = read_value(key, "size", size, sizes)
-    row = (tank, kind, values["start"], values["end"], values.get("every", 0.0))
-    return SensorFault(*row), size
-
-
-NOT_BELOW = {"noise": 0.0}
-"""{kind of a fault of a sensor: its least size}."""
+def _size_of(kind, tank, entry, sizes):
+    """The size of a fault of a sensor."""
+    if kind == "freeze":
+        return 0.0
+    unit, low = "cm/s" if kind == "drift" else "cm", 0.0 if kind == "noise" else None
+    size = readings("size", "size", entry["size"], sizes.units[0], tank, sizes.loop)
+    return read_value(Key("size", unit=unit, low=low), "size", size, sizes)
 
 
 def entry_named(of, plant):
@@ -359,7 +337,13 @@ def disturbance_tables(disturbance):
     steady, pulse = SECTIONS["disturbance"], SECTIONS["inflow"]
     if isinstance(disturbance, Sum):
         parts = [disturbance_tables(part) for part in (disturbance.first, disturbance.second)]
-        return None if None in parts else _merged([row for part in parts for row in part])
+        if None in parts:
+            return None
+        rows, keys = [row for part in parts for row in part], {}
+        for section, values in rows:
+            keys |= values if section is steady else {}
+        others = [row for row in rows if row[0] is not steady]
+        return [(steady, keys), *others] if keys else others
     if isinstance(disturbance, Constant):
         return [(steady, {"inflow": disturbance.level})]
     if isinstance(disturbance, InflowTable):
@@ -373,14 +357,6 @@ def disturbance_tables(disturbance):
     rows = zip(disturbance.events, np.asarray(disturbance.volume).tolist())
     pulses = [dict(zip(pulse.names, (*event, volume))) for event, volume in rows]
     return [(steady, {"window": disturbance.window}), *((pulse, values) for values in pulses)]
-
-
-def _merged(tables):
-    """Tables of a disturbance with one [disturbance], of the keys of all."""
-    steady = SECTIONS["disturbance"]
-    keys = {key: v for section, values in tables if section is steady for key, v in values.items()}
-    others = [row for row in tables if row[0] is not steady]
-    return [(steady, keys), *others] if keys else others
 
 
 def fault_tables(part):

@@ -52,11 +52,8 @@ class Columns:
                 f"{self.label}{self.table.name}: {len(self.table.lines)} rows: must be at most"
                 f" {MOST}; keep those at which a value changes"
             )
-        self.time = self._find(keys["time"]) if "time" in keys else self._usual_time()
-
-    def _usual_time(self) -> int:
-        names = [column.name.lower() for column in self.table.columns]
-        return next((i for i, name in enumerate(names) if name in TIMES), 0)
+        usual = (i for i, c in enumerate(self.table.columns) if c.name.lower() in TIMES)
+        self.time = self._find(keys["time"]) if "time" in keys else next(usual, 0)
 
     def _find(self, text: Any) -> int:
         """Index of the column of a header, with or without its unit."""
@@ -142,7 +139,12 @@ class Columns:
             columns[self.time] = column._replace(unit="s")
             bare = table._replace(columns=columns)
         try:
-            t = _seconds(table, bare, self.time)
+            try:
+                t = seconds(table, self.time)
+            except DataError:  # numbers without a unit that are no days or epochs
+                if bare is table:
+                    raise
+                t = seconds(bare, self.time)
         except DataError as error:
             raise InputError(f"{self.label}{error}") from None
         where = lambda k: f"{self.label}{table.where(self.time, k)}: {column.cells[k]!r}"
@@ -179,16 +181,6 @@ class Columns:
             needed = "have no unit" if base == "-" else f"be in {base}, or a unit of its dimension"
             raise InputError(f"{self.label}{self.table.where(place)}: {unit!r}: must {needed}")
         return values * size
-
-
-def _seconds(table: Table, bare: Table, column: int) -> np.ndarray:
-    """Times [s] of a column: numbers without a unit that are no days or epochs are seconds."""
-    try:
-        return seconds(table, column)
-    except DataError:
-        if bare is table:
-            raise
-        return seconds(bare, column)
 
 
 def changes_of(times: Any, values: Mapping[int, Any], initial: Any) -> list[tuple]:

@@ -206,19 +206,14 @@ def check_limits(
             many = f", or {count} of them" if count > 1 else ""
             rim = ', or "rim"' if measure == "max_level" else ""
             raise refusal(f"limit {measure}", value, f"be a finite number [{unit}]{many}{rim}")
-        _check_range(measure, value, "" if unit == "-" else f" {unit}")
+        spec, unit = MEASURES[measure], "" if unit == "-" else f" {unit}"
+        for sign, words, end in ((1.0, "least", spec.low), (-1.0, "most", spec.high)):
+            if end is not None and np.any(sign * np.asarray(value) < sign * end):
+                raise InputError(
+                    f"limit {measure} = {shortened(value)}{unit}: must be at {words} {end:g}{unit};"
+                    " no run has a value beyond"
+                )
     return checked
-
-
-def _check_range(measure, value, unit):
-    """Raise InputError for a limit beyond what a run can have."""
-    spec = MEASURES[measure]
-    for sign, words, end in ((1.0, "least", spec.low), (-1.0, "most", spec.high)):
-        if end is not None and np.any(sign * np.asarray(value) < sign * end):
-            raise InputError(
-                f"limit {measure} = {shortened(value)}{unit}: must be at {words} {end:g}{unit}; no"
-                " run has a value beyond"
-            )
 
 
 def _limit(loop, measure, label, value, spans=None):
@@ -341,21 +336,20 @@ def free_of(loop, table):
 
 def scenarios_of(case, tables):
     """The Scenarios of the [[scenario]] tables, each of which can be run."""
-    return tuple(_scenario(case, table, i) for i, table in enumerate(tables))
-
-
-def _scenario(case, table, index):
-    entry = read_entry(SECTIONS["scenario"], table, sizes_of(case.loop), index)
-    name = entry.pop("name", f"scenario {index + 1}")
-    try:
-        values = by_dotted_name(entry.pop("values"), "scenario.values")
-        set_scenario(case, values)
-    except EquilibriumError:
-        pass  # `check` names the plateau without one; where that is allowed, `tune` refuses
-    except InputError as error:
-        raise type(error)(f"scenario {name!r}: {error}") from None
-    values = {n: tuple(v) if isinstance(v, list) else v for n, v in values.items()}
-    return Scenario(name, values, **entry)
+    scenarios = []
+    for i, table in enumerate(tables):
+        entry = read_entry(SECTIONS["scenario"], table, sizes_of(case.loop), i)
+        name = entry.pop("name", f"scenario {i + 1}")
+        try:
+            values = by_dotted_name(entry.pop("values"), "scenario.values")
+            set_scenario(case, values)
+        except EquilibriumError:
+            pass  # `check` names the plateau without one; where that is allowed, `tune` refuses
+        except InputError as error:
+            raise type(error)(f"scenario {name!r}: {error}") from None
+        values = {n: tuple(v) if isinstance(v, list) else v for n, v in values.items()}
+        scenarios.append(Scenario(name, values, **entry))
+    return tuple(scenarios)
 
 
 LOG_SETTINGS = {"decimal": (".", ","), "time": ORDERS, "hold": ("zero-order", "first-order")}
@@ -384,7 +378,10 @@ def check_log(plant, table):
     found by its name.
     """
     table = dict(table)
-    apart, units = (dict(_subtable(table.pop(key, {}), key)) for key in ("columns", "units"))
+    apart, units = (table.pop(key, {}) for key in ("columns", "units"))
+    for key, part in (("columns", apart), ("units", units)):
+        if not isinstance(part, dict):
+            raise refusal(f"log {key}", part, "be a table")
     table |= apart | {key: [apart.get(key, ""), unit] for key, unit in units.items()}
     keys, columns, headers = log_keys(plant), {}, {}
     for key, spec in table.items():
@@ -395,8 +392,11 @@ def check_log(plant, table):
             continue
         if key not in keys:
             raise unknown("key of [log]", key, [*keys, *LOG_SETTINGS])
-        columns[key] = _header_and_unit(key, spec)
-        header = columns[key] if isinstance(columns[key], str) else columns[key][0]
+        pair = [spec] if isinstance(spec, str) else spec
+        good = isinstance(pair, (list, tuple)) and 1 <= len(pair) <= 2
+        if not (good and all(isinstance(v, str) for v in pair) and pair[-1].strip()):
+            raise refusal(f"log {key}", spec, "be a column's header, or [header, unit]")
+        header, columns[key] = pair[0], pair[0] if len(pair) == 1 else tuple(pair)
         if header in headers and header not in ("", "none"):
             raise InputError(
                 f"log {key} = {shortened(header)}: that column is {headers[header]} already"
@@ -405,21 +405,6 @@ def check_log(plant, table):
             raise InputError(f"log {key}: {keys[key]} is given twice")
         headers[header] = key
     return columns
-
-
-def _header_and_unit(key, spec):
-    """Return a header, or (header, unit), of a line of [log]."""
-    pair = [spec] if isinstance(spec, str) else spec
-    good = isinstance(pair, (list, tuple)) and 1 <= len(pair) <= 2
-    if not (good and all(isinstance(v, str) for v in pair) and pair[-1].strip()):
-        raise refusal(f"log {key}", spec, "be a column's header, or [header, unit]")
-    return pair[0] if len(pair) == 1 else tuple(pair)
-
-
-def _subtable(table, key):
-    if not isinstance(table, dict):
-        raise refusal(f"log {key}", table, "be a table")
-    return table
 
 
 def check_covariance(loop, table):

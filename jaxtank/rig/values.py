@@ -90,11 +90,14 @@ def dotted_name(loop: ClosedLoop, name: str) -> str:
 def _of_entries(loop, name, base, inner):
     """`dotted_name` of a parameter and what its brackets hold: names, or numbers from 0."""
     axes = describe(loop, base).get("shape", ())
-    entries = [
-        entry if entry.isdigit() else _index_of(name, loop.plant, axis, entry)
-        for entry, axis in zip(inner, axes)
-        if axis in ("tank", "pump", "output", "feed", "valve")
-    ]
+    plant, entries = loop.plant, []
+    for entry, axis in zip(inner, axes):
+        axis = "pump" if axis == "feed" else axis
+        # a gain of an output is also called by the pump that moves it
+        paired = axis == "output" and plant.pumps == len(plant.outputs)
+        axis = "pump" if paired and entry not in names_of(plant, axis) else axis
+        if axis in ("tank", "pump", "output", "valve"):
+            entries.append(entry if entry.isdigit() else index_of(name, plant, axis, entry))
     return f"{base}[{','.join(map(str, entries))}]" if len(entries) == len(axes) else name
 
 
@@ -146,14 +149,6 @@ def _axes(loop, name, meta):
     return loop.plant.outputs[index[0]] if index[0] < len(loop.plant.outputs) else 0
 
 
-def _index_of(name, plant, axis, entry):
-    """Index of a named entry; a gain of an output is also called by the pump that moves it."""
-    axis = "pump" if axis == "feed" else axis
-    paired = axis == "output" and plant.pumps == len(plant.outputs)
-    axis = "pump" if paired and entry not in names_of(plant, axis) else axis
-    return index_of(name, plant, axis, entry)
-
-
 def by_rig_name(
     loop: ClosedLoop, values: Mapping[str, Any], convert: bool = True
 ) -> dict[str, Any]:
@@ -165,11 +160,7 @@ def by_rig_name(
         dotted = dotted_name(loop, name)
         if dotted in renamed:
             raise InputError(f"{name} is given twice, as {dotted} too: give it once")
-        if (
-            convert
-            and name != dotted
-            and not (isinstance(value, str) and _RELATIVE.fullmatch(value.strip()))
-        ):
+        if convert and name != dotted and _relative(value) is None:
             value = in_unit(loop, name, dotted, value)
         renamed[dotted] = value
     return renamed
@@ -302,8 +293,12 @@ def overlap(name: str, other: str) -> bool:
 
 def is_change(value: Any) -> bool:
     """Return whether the value of a scenario is a factor or an offset on the case's own."""
-    match = _RELATIVE.fullmatch(value.strip()) if isinstance(value, str) else None
+    match = _relative(value)
     return match is not None and match["default"] is None
+
+
+def _relative(value):
+    return _RELATIVE.fullmatch(value.strip()) if isinstance(value, str) else None
 
 
 def _is_steady(name, value):
@@ -315,7 +310,7 @@ def _absolute(case, name, value):
     current = _number_of(case, name) if isinstance(value, str) else None
     if current is None or _is_steady(name, value):
         return value
-    match = _RELATIVE.fullmatch(value.strip())
+    match = _relative(value)
     if match is None and NUMBER.match(value.strip()):
         with contextlib.suppress(InputError):  # the refusal below names relative changes too
             if name.startswith("clock."):
@@ -338,11 +333,11 @@ def _number_of(case, name):
     """The number or array that `name` is in a case, None where it is no number."""
     if name.startswith("clock."):
         value: Any = getattr(case.clock, name.removeprefix("clock."), None)
-    elif _meta(case, name)["kind"] == "leaf":
+        return value if is_plain(value) else None
+    if _meta(case, name)["kind"] == "leaf":
         return get_value(case.loop, name)
-    else:
-        value = _static_of(case.loop, name)
-    return value if is_numeric(value) and np.ndim(value) == 0 else None
+    value = _static_of(case.loop, name)
+    return value if is_plain(value) else None
 
 
 def _static_of(loop, name):
@@ -502,9 +497,8 @@ def schedule_table(loop):
 def _with_schedule(case, table):
     """Return `schedule` of a table as `schedule_table` makes it."""
     gains = read_entry(SECTIONS["schedule"], table, sizes_of(case.loop))["gains"]
-    for gain in gains:
-        if gains.count(gain) > 1:
-            raise InputError(f"schedule.gains: {gain} is scheduled twice: name it once")
+    if twice := [gain for gain in gains if gains.count(gain) > 1]:
+        raise InputError(f"schedule.gains: {twice[0]} is scheduled twice: name it once")
     if not isinstance(table["knots"], list):
         raise InputError(f"schedule.knots = {table['knots']!r}: must be a list of numbers")
     return schedule(case, dict.fromkeys(gains, table["variable"]), table["knots"])
@@ -514,10 +508,10 @@ def _entries(loop, name):
     """The scalars that a name stands for, without the "controller."."""
     names = [n for n in parameters(loop) if n.startswith(CONTROLLER)]
     try:
-        kind = describe(loop, name)["kind"] if name.startswith(CONTROLLER) else None
+        kind = describe(loop, name)["kind"]
     except InputError:
         kind = None
-    if kind is None:
+    if kind is None or not name.startswith(CONTROLLER):
         raise unknown("gain", name, names)
     inner = name.removeprefix(CONTROLLER)
     if kind == "static" or split_index(name)[1]:

@@ -64,14 +64,9 @@ def _in_use(tree):
     return {name for name, value, meta in walk(tree) if meta.get("like") and value is not None}
 
 
-def _same_parts(loop, other):
-    """Names of the components that `other` has in the same structure as `loop`."""
-    pairs = [(name, getattr(loop, name), getattr(other, name)) for name in components.ROLES]
-    return [
-        name
-        for name, part, theirs in pairs
-        if structure(part) == structure(theirs) and _in_use(theirs) <= _in_use(part)
-    ]
+def _alike(part, other):
+    """Whether the values of a file make `part` of `other`."""
+    return structure(part) == structure(other) and _in_use(other) <= _in_use(part)
 
 
 PARTS = {
@@ -117,14 +112,18 @@ def sections(case, tankwise=False):
 def _sections(case, origin):
     """`sections` of a case as a preset with changes; tank by tank where `origin` is None."""
     loop = unscheduled(case.loop)
-    same = _same_parts(loop, origin.loop) if origin else ()
+    parts = components.ROLES if origin else ()
+    same = [n for n in parts if _alike(getattr(loop, n), getattr(origin.loop, n))]
     top, *built = _building(case, loop, origin, same)
     text = "\n".join(line for block in (top, *built) for line in terse(block))
     base = start_of(renamed(tomllib.loads(text)))
     alike = structure(_without_tables(loop)) == structure(_without_tables(base.loop))
     if not alike or not _in_use(base.loop) <= _in_use(loop):
         raise InputError("its controller or observer has another model than its rig")
-    top.lines.extend(_reachable(case, base))
+    if why := unreachable(case) if case.reachable else None:
+        top.lines.append(Line("reachable", False, {"unit": "-", "doc": why}))
+    elif case.reachable != base.reachable:
+        top.lines.extend(lines_of(SECTIONS[""], {"reachable": case.reachable}))
     if base.scenarios and not case.scenarios:
         top.lines.append(_none("scenario", "none of the preset's runs"))
     table = schedule_table(case.loop)
@@ -136,15 +135,6 @@ def _sections(case, origin):
 def _none(name, doc="none"):
     """The line of a list or table that a preset has and the case does not."""
     return Line(name, {} if name == "sine" else [], {"unit": "-", "doc": doc})
-
-
-def _reachable(case, base):
-    """The line `reachable` where it is not as in `base`."""
-    why = unreachable(case) if case.reachable else None
-    if why:
-        return [Line("reachable", False, {"unit": "-", "doc": why})]
-    values = {"reachable": case.reachable} if case.reachable != base.reachable else {}
-    return lines_of(SECTIONS[""], values)
 
 
 def _building(case, loop, origin, same):
@@ -166,7 +156,8 @@ def _building(case, loop, origin, same):
     if disturbing is None:
         raise InputError("its disturbance has no table")
     if origin is None:  # a steady inflow is a key of the tanks
-        disturbing = _without_steady_inflow(disturbing)
+        rest = [(s, {k: v for k, v in row.items() if k != "inflow"}) for s, row in disturbing]
+        disturbing = [(section, row) for section, row in rest if row]
     tables = [*disturbing, *signals.fault_tables(loop.faults)]
     emptied = [
         _none(name)
@@ -174,17 +165,7 @@ def _building(case, loop, origin, same):
         if getattr(loop, field) is None and getattr(start, field, None) is not None
     ]
     first = Block("", [*lines_of(SECTIONS[""], top, units), *emptied])
-    return [
-        first,
-        *blocks,
-        *(block_of(section, values, units, names) for section, values in tables),
-    ]
-
-
-def _without_steady_inflow(tables):
-    """Tables of a disturbance without what the tanks say."""
-    rest = [(section, {k: v for k, v in row.items() if k != "inflow"}) for section, row in tables]
-    return [(section, row) for section, row in rest if row]
+    return [first, *blocks, *(block_of(s, values, units, names) for s, values in tables)]
 
 
 def _of_rig(section, number, values, units, names):
@@ -229,13 +210,9 @@ def _values(case, base, tankwise, same):
         line = _line(case, name, value, meta, _is_built(case, name, tankwise, same), base)
         if line is not None:
             groups.setdefault(part, []).append(line)
-    groups["clock"] = [
-        Line(toml(f"clock.{name}"), getattr(case.clock, name), meta) for name, meta in CLOCK.items()
-    ]
-    return [
-        Block("[values]", []),
-        *(Block("", lines, (PARTS[part],)) for part, lines in groups.items()),
-    ]
+    clock = CLOCK.items()
+    groups["clock"] = [Line(toml(f"clock.{n}"), getattr(case.clock, n), meta) for n, meta in clock]
+    return [Block("[values]", []), *(Block("", rows, (PARTS[p],)) for p, rows in groups.items())]
 
 
 def _settable(case):
@@ -421,7 +398,7 @@ def complete(case: Case, tankwise: bool = False) -> str:
     if any(line.name == "sine" for block in blocks for line in block.lines):
         titles.add("[reference.sine]")
     blocks += template.suggestions(case, titles)
-    return _text([HEAD.splitlines()] + [_commented(block) for block in blocks])
+    return _text([HEAD.splitlines(), *map(_commented, blocks)])
 
 
 def short(case: Case) -> str:
@@ -464,25 +441,18 @@ def _different(blocks, preset, case):
     tables, same, in_values, different = _by_title(blocks), _by_title(preset), False, []
     for block in blocks:
         in_values = block.title == "[values]" or (in_values and not block.title)
-        if in_values:
-            lines = _new_first(block.lines, known, suggested)
-        elif block.on and (
-            block.title in ("", *SHORT) or tables[block.title] != same.get(block.title)
+        lines = [line for line in block.lines if line.on]
+        if in_values:  # new lines, then those that are suggested, commented out
+            new = [line for line in lines if not set(terse(Block("", [line]))) <= known]
+            old = [n for n in lines if n not in new and n.name.strip('"') in suggested]
+            lines = new + [line._replace(on=False) for line in old]
+        elif not block.on or (
+            block.title not in ("", *SHORT) and tables[block.title] == same.get(block.title)
         ):
-            lines = [line for line in block.lines if line.on]
-        else:
             continue
         if lines or block.title:
             different.append(block._replace(lines=lines))
     return different
-
-
-def _new_first(lines, known, suggested):
-    """Lines of [values] that are not `known`, then those that are `suggested`, commented out."""
-    lines = [line for line in lines if line.on]
-    new = [line for line in lines if not set(terse(Block("", [line]))) <= known]
-    old = [line for line in lines if line not in new]
-    return new + [line._replace(on=False) for line in old if line.name.strip('"') in suggested]
 
 
 def _by_title(blocks):
