@@ -4,6 +4,7 @@ import functools
 import hashlib
 import io
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -142,39 +143,26 @@ BUILD = """<?xml version="1.0" encoding="UTF-8"?>
 
 def _rows(program, numbers, third):
     """The variables as elements: numbers, time, the switch of manual operation."""
-    rows = [(_row3 if third else _row2)(i, v) for i, v in enumerate(numbers)]
-    words = {"valueReference": len(numbers) + 1, "causality": "independent"}
-    time = _attributes(name="time", **words, variability="continuous")
-    two = f"    <ScalarVariable{time}><Real/></ScalarVariable>"
-    rows.append(f"    <Float64{time}/>" if third else two)
-    if program.plant:
-        return rows
-    words = {"valueReference": len(numbers), "causality": "input", "variability": "discrete"}
-    switch = _attributes(name=MANUAL, **words, description="true: u is manual_input")
-    two = f'    <ScalarVariable{switch}><Boolean start="false"/></ScalarVariable>'
-    return [*rows, f'    <Boolean{switch} start="false"/>' if third else two]
+    real, rows = "Float64" if third else "Real", []
 
+    def add(kind, name, i, causality, variability, words=None, **value):
+        outer = {"name": name, "valueReference": i, "causality": causality}
+        outer |= {"variability": variability, "description": words}
+        outer, inner = _attributes(**outer), _attributes(**value)
+        one, two = f"<{kind}{outer}{inner}/>", f"<ScalarVariable{outer}><{kind}{inner}/>"
+        rows.append(f"    {one if third else f'{two}</ScalarVariable>'}")
 
-def _parts(v):
-    """(attributes of a variable, attributes of its value)."""
-    variability = "tunable" if v.causality == "parameter" else "discrete"
-    outer = {"causality": v.causality, "variability": variability, "description": v.words}
-    inner = {"unit": None if v.unit == "-" else v.unit, "min": _number(v.low)}
-    inner |= {"max": _number(v.high)}
-    if v.causality != "output":
-        inner |= {"start": _number(v.start)}
-    return outer, inner
-
-
-def _row3(i, v):
-    outer, inner = _parts(v)
-    return f"    <Float64{_attributes(name=v.name, valueReference=i, **outer, **inner)}/>"
-
-
-def _row2(i, v):
-    outer, inner = _parts(v)
-    words = _attributes(name=v.name, valueReference=i, **outer)
-    return f"    <ScalarVariable{words}><Real{_attributes(**inner)}/></ScalarVariable>"
+    for i, v in enumerate(numbers):
+        variability = "tunable" if v.causality == "parameter" else "discrete"
+        value = {"unit": None if v.unit == "-" else v.unit, "min": _number(v.low)}
+        value |= {"max": _number(v.high)}
+        value |= {} if v.causality == "output" else {"start": _number(v.start)}
+        add(real, v.name, i, v.causality, variability, v.words, **value)
+    add(real, "time", len(numbers) + 1, "independent", "continuous")
+    if not program.plant:
+        words = "true: u is manual_input"
+        add("Boolean", MANUAL, len(numbers), "input", "discrete", words, start="false")
+    return rows
 
 
 CORE = """
@@ -264,19 +252,14 @@ static int set(Model *m, const uint32_t *refs, size_t n, const double *values)
 """
 
 THIRD = """
-EXPORT const char *fmi3GetVersion(void);
 const char *fmi3GetVersion(void) { return "3.0"; }
 
-EXPORT void *fmi3InstantiateCoSimulation(void);
 void *fmi3InstantiateCoSimulation(void) { return make(); }
 
-EXPORT void fmi3FreeInstance(Model *m);
 void fmi3FreeInstance(Model *m) { free(m); }
 
-EXPORT int fmi3Reset(Model *m);
 int fmi3Reset(Model *m) { reset(m); return OK; }
 
-EXPORT int fmi3EnterInitializationMode(Model *m, bool b, double e, double t, bool s, double end);
 int fmi3EnterInitializationMode(Model *m, bool b, double e, double t, bool s, double end)
 {
     (void)b; (void)e; (void)s; (void)end;
@@ -284,22 +267,18 @@ int fmi3EnterInitializationMode(Model *m, bool b, double e, double t, bool s, do
     return OK;
 }
 
-EXPORT int fmi3ExitInitializationMode(Model *m);
 int fmi3ExitInitializationMode(Model *m) { begin(m); return OK; }
 
-EXPORT int fmi3GetFloat64(Model *m, const uint32_t *refs, size_t n, double *values, size_t many);
 int fmi3GetFloat64(Model *m, const uint32_t *refs, size_t n, double *values, size_t many)
 {
     return many == n ? get(m, refs, n, values) : ERROR;
 }
 
-EXPORT int fmi3SetFloat64(Model *m, const uint32_t *refs, size_t n, const double *v, size_t many);
 int fmi3SetFloat64(Model *m, const uint32_t *refs, size_t n, const double *v, size_t many)
 {
     return many == n ? set(m, refs, n, v) : ERROR;
 }
 
-EXPORT int fmi3GetBoolean(Model *m, const uint32_t *refs, size_t n, bool *values, size_t many);
 int fmi3GetBoolean(Model *m, const uint32_t *refs, size_t n, bool *values, size_t many)
 {
     for (size_t k = 0; k < n; ++k) {
@@ -309,7 +288,6 @@ int fmi3GetBoolean(Model *m, const uint32_t *refs, size_t n, bool *values, size_
     return OK;
 }
 
-EXPORT int fmi3SetBoolean(Model *m, const uint32_t *refs, size_t n, const bool *v, size_t many);
 int fmi3SetBoolean(Model *m, const uint32_t *refs, size_t n, const bool *v, size_t many)
 {
     for (size_t k = 0; k < n; ++k) {
@@ -319,8 +297,6 @@ int fmi3SetBoolean(Model *m, const uint32_t *refs, size_t n, const bool *v, size
     return OK;
 }
 
-EXPORT int fmi3DoStep(Model *m, double t, double h, bool no, bool *event, bool *stop, bool *early,
-                      double *last);
 int fmi3DoStep(Model *m, double t, double h, bool no, bool *event, bool *stop, bool *early,
                double *last)
 {
@@ -333,22 +309,16 @@ int fmi3DoStep(Model *m, double t, double h, bool no, bool *event, bool *stop, b
 """
 
 SECOND = """
-EXPORT const char *fmi2GetTypesPlatform(void);
 const char *fmi2GetTypesPlatform(void) { return "default"; }
 
-EXPORT const char *fmi2GetVersion(void);
 const char *fmi2GetVersion(void) { return "2.0"; }
 
-EXPORT void *fmi2Instantiate(void);
 void *fmi2Instantiate(void) { return make(); }
 
-EXPORT void fmi2FreeInstance(Model *m);
 void fmi2FreeInstance(Model *m) { free(m); }
 
-EXPORT int fmi2Reset(Model *m);
 int fmi2Reset(Model *m) { reset(m); return OK; }
 
-EXPORT int fmi2SetupExperiment(Model *m, int b, double e, double t, int s, double end);
 int fmi2SetupExperiment(Model *m, int b, double e, double t, int s, double end)
 {
     (void)b; (void)e; (void)s; (void)end;
@@ -356,22 +326,18 @@ int fmi2SetupExperiment(Model *m, int b, double e, double t, int s, double end)
     return OK;
 }
 
-EXPORT int fmi2ExitInitializationMode(Model *m);
 int fmi2ExitInitializationMode(Model *m) { begin(m); return OK; }
 
-EXPORT int fmi2GetReal(Model *m, const uint32_t *refs, size_t n, double *values);
 int fmi2GetReal(Model *m, const uint32_t *refs, size_t n, double *values)
 {
     return get(m, refs, n, values);
 }
 
-EXPORT int fmi2SetReal(Model *m, const uint32_t *refs, size_t n, const double *values);
 int fmi2SetReal(Model *m, const uint32_t *refs, size_t n, const double *values)
 {
     return set(m, refs, n, values);
 }
 
-EXPORT int fmi2GetBoolean(Model *m, const uint32_t *refs, size_t n, int *values);
 int fmi2GetBoolean(Model *m, const uint32_t *refs, size_t n, int *values)
 {
     for (size_t k = 0; k < n; ++k) {
@@ -381,7 +347,6 @@ int fmi2GetBoolean(Model *m, const uint32_t *refs, size_t n, int *values)
     return OK;
 }
 
-EXPORT int fmi2SetBoolean(Model *m, const uint32_t *refs, size_t n, const int *values);
 int fmi2SetBoolean(Model *m, const uint32_t *refs, size_t n, const int *values)
 {
     for (size_t k = 0; k < n; ++k) {
@@ -391,7 +356,6 @@ int fmi2SetBoolean(Model *m, const uint32_t *refs, size_t n, const int *values)
     return OK;
 }
 
-EXPORT int fmi2DoStep(Model *m, double t, double h, int no);
 int fmi2DoStep(Model *m, double t, double h, int no) { (void)no; return advance(m, t, h); }
 """
 
@@ -448,7 +412,15 @@ def interface(program: Any, name: str, version: str) -> str:
         f"FINE(fmi{major}{f})" for f in FINE[major]
     ]
     text = CORE.lstrip().format(**words)
-    return "\n".join([text, (THIRD if major == "3" else SECOND).strip(), "", *stubs, ""])
+    return "\n".join([text, _exported(THIRD if major == "3" else SECOND), "", *stubs, ""])
+
+
+def _exported(text):
+    """C functions, an empty line between two, each below its declaration."""
+    blocks = text.strip().split("\n\n")
+    heads = (re.split(r"\s\{", block, maxsplit=1)[0] for block in blocks)
+    heads = (head.replace("\n", "\n" + " " * len("EXPORT ")) for head in heads)
+    return "\n\n".join(f"EXPORT {head};\n{block}" for head, block in zip(heads, blocks))
 
 
 def place_of(version: str) -> tuple[str, str] | None:

@@ -138,13 +138,6 @@ def _called(eqn):
     return next((p for p in parameters if p is not None), None)
 
 
-def lower(f, arguments):
-    """Return (statements, outputs) of a function."""
-    lowered = lower_all(f, arguments)
-    outputs = [np.asarray(v, dtype=object) for v in jax.tree.leaves(lowered.outputs)]
-    return lowered.statements, outputs
-
-
 class Lowered(NamedTuple):
     """Result of `lower_all`."""
 
@@ -156,7 +149,7 @@ class Lowered(NamedTuple):
 
 
 def lower_all(f, arguments, writer=None):
-    """Return the Lowered form of a function: `lower`, with the outputs as the tree they are."""
+    """Return the Lowered form of a function."""
     closed, shape = jax.make_jaxpr(f, return_shape=True)(*arguments.values())
     writer, moved = writer or Writer(), written(closed.jaxpr)
     inputs, starts = [], {}

@@ -79,34 +79,17 @@ def _out_kind(eqn):
     return kind_of(eqn.outvars[0].aval.dtype)
 
 
-def _elementwise(op):
-    """The rule of an operation on one element of each operand."""
+def _elementwise(op, whole=None):
+    """The rule of an operation on one element of each operand, `whole` on whole numbers."""
 
     def rule(writer, eqn, operands):
         kind = TRUTH if op in TRUTHS else _out_kind(eqn)
-        return [arrays.each(writer, kind, op, operands, _kinds(eqn))]
+        if eqn.primitive.name == "xor" and _out_kind(eqn) != TRUTH:
+            raise no_code("it uses the operation xor of whole numbers")
+        name = whole or op if kind == WHOLE else op
+        return [arrays.each(writer, kind, name, operands, _kinds(eqn))]
 
     return rule
-
-
-def _whole_or_real(whole, real):
-    """The rule of an operation that whole numbers round towards zero."""
-
-    def rule(writer, eqn, operands):
-        op = whole if _out_kind(eqn) == WHOLE else real
-        return _elementwise(op)(writer, eqn, operands)
-
-    return rule
-
-
-def _xor(writer, eqn, operands):
-    if _out_kind(eqn) != TRUTH:
-        raise no_code("it uses the operation xor of whole numbers")
-    return _elementwise("ne")(writer, eqn, operands)
-
-
-def _same(writer, eqn, operands):
-    return operands
 
 
 def _convert(writer, eqn, operands):
@@ -124,14 +107,11 @@ def _broadcast(x, shape, broadcast_dimensions, **_):
     return np.broadcast_to(x.reshape(sizes), shape)
 
 
-def _slice(x, start_indices, limit_indices, strides):
-    steps = strides or (1,) * x.ndim
-    return x[tuple(map(slice, start_indices, limit_indices, steps))]
-
-
 PLACED = {
     "squeeze": lambda x, dimensions: np.squeeze(x, dimensions),
-    "slice": _slice,
+    "slice": lambda x, start_indices, limit_indices, strides: x[
+        tuple(map(slice, start_indices, limit_indices, strides or (1,) * x.ndim))
+    ],
     "broadcast_in_dim": _broadcast,
 }
 """Moves of one array, by numpy: jax takes half a second for those of a loop."""
@@ -176,7 +156,6 @@ def _gather(writer, eqn, operands):
 
 def _integer_power(writer, eqn, operands):
     y = eqn.params["y"]
-
     out, unit = operands[0], np.array(1.0, dtype=object)
     for _ in range(abs(y) - 1):
         out = arrays.each(writer, REAL, "mul", [out, operands[0]], [REAL] * 2)
@@ -198,7 +177,6 @@ def _select(writer, eqn, operands):
 
 def chosen(writer, index, values, kind):
     """Return values[i] where `index` is i (below 0 as 0, past the end as the last)."""
-
     out = values[0]
     for i, value in enumerate(values[1:], start=1):
         past = arrays.each(writer, TRUTH, "ge", [index, np.array(i, dtype=object)], [WHOLE] * 2)
@@ -295,15 +273,6 @@ def product(writer, a, b, dimensions):
         return functools.reduce(plus, others, times(*first))
 
     return filled((A.shape[0], B.shape[1]), inner).reshape(shape)
-
-
-def _product(writer, eqn, operands):
-    return [product(writer, *operands, dimensions=eqn.params["dimension_numbers"])]
-
-
-def _factorise(writer, eqn, operands):
-    n = operands[0].shape[-1]
-    return [writer.matrix("cholesky", operands, (n,), (n, n))]
 
 
 def _triangular(writer, eqn, operands):
@@ -503,14 +472,9 @@ def _while(writer, eqn, operands):
 
 def _most(test):
     """The passes of a loop that goes on while a counter is below a number, None if it has none."""
-    bounds = [
-        int(eqn.invars[1].val)
-        for eqn in test.eqns
-        if eqn.primitive.name == "lt"
-        and isinstance(eqn.invars[1], Literal)
-        and kind_of(eqn.invars[1].aval.dtype) == WHOLE
-    ]
-    return min(bounds, default=None)
+    ends = [eqn.invars[1] for eqn in test.eqns if eqn.primitive.name == "lt"]
+    ends = [e for e in ends if isinstance(e, Literal) and kind_of(e.aval.dtype) == WHOLE]
+    return min((int(e.val) for e in ends), default=None)
 
 
 def _loop(writer, kinds, starts, count, body, most=None, tables=()):
@@ -632,7 +596,7 @@ NOT_PRIMITIVES = {"quotient", "remainder", "real", "whole", "truth"}
 
 RULES = {
     **{op: _elementwise(op) for op in {*FUNCTIONS, *OPERATORS} - NOT_PRIMITIVES},
-    **dict.fromkeys(UNCHANGED, _same),
+    **dict.fromkeys(UNCHANGED, lambda writer, eqn, operands: operands),
     **dict.fromkeys(MOVES.split(), _move),
     **{f"reduce_{name}": _reduce(op) for name, op in REDUCTIONS.items()},
     **{f"cum{name}": _cumulate(REDUCTIONS[name]) for name in ("sum", "prod", "max", "min")},
@@ -641,21 +605,21 @@ RULES = {
     "argmin": _position(largest=False),
     "clamp": _clamp,
     "convert_element_type": _convert,
-    "div": _whole_or_real("quotient", "div"),
+    "div": _elementwise("div", whole="quotient"),
     "le_to": _elementwise("le"),
     "lt_to": _elementwise("lt"),
     "integer_pow": _integer_power,
-    "rem": _whole_or_real("remainder", "rem"),
+    "rem": _elementwise("rem", whole="remainder"),
     "select_n": _select,
-    "xor": _xor,
+    "xor": _elementwise("ne"),
     "cond": _cond,
     "scan": _scan,
     "while": _while,
     "dynamic_slice": _read,
     "gather": _gather,
     "dynamic_update_slice": _write,
-    "dot_general": _product,
-    "cholesky": _factorise,
+    "dot_general": lambda writer, eqn, o: [product(writer, *o, eqn.params["dimension_numbers"])],
+    "cholesky": lambda writer, eqn, operands: [_cholesky(writer, *operands).T],
     "triangular_solve": _triangular,
     "custom_linear_solve": _linear_solve,
     "lu": _lu,

@@ -12,22 +12,7 @@ from jaxtank.core.labels import labels_of, names_of
 from jaxtank.core.tree import parameters, walk
 from jaxtank.core.units import local
 from jaxtank.export.program import CONTROL, PLANT
-from jaxtank.export.statements import (
-    REAL,
-    TRUTH,
-    WHOLE,
-    Array,
-    Define,
-    Each,
-    Loop,
-    Matrix,
-    Ref,
-    Store,
-    Until,
-    Vector,
-    View,
-    size_of,
-)
+from jaxtank.export.statements import REAL, TRUTH, WHOLE, Ref, Vector, View, size_of
 
 WIDTH = 126
 """Length of a line of an array, without its indentation."""
@@ -118,16 +103,8 @@ class Printer:
 
     def lines(self, statements, indent="    "):
         """Return the lines of a list of statements."""
-        methods = {
-            Define: self._define,
-            Array: self._array,
-            Each: self._each,
-            Matrix: self._matrix,
-            Store: self._store,
-            Until: self._until,
-            Loop: self._loop,
-        }
-        return [indent + line for s in statements for line in methods[type(s)](s)]
+        method = lambda s: getattr(self, f"_{type(s).__name__.lower()}")
+        return [indent + line for s in statements for line in method(s)(s)]
 
     def _set(self, template, kind, name, value):
         return template.format(kind=self.kinds[kind], name=name, value=value)
@@ -221,13 +198,8 @@ class Printer:
 
     def _copy(self, vector, name, source):
         """The lines that copy an array."""
-        text = [
-            self.put.format(
-                place=self._entry_at(name, 0, [1], ["e0"]),
-                value=self._entry_at(source, 0, [1], ["e0"]),
-            )
-        ]
-        return self._around((vector.size,), ["e0"], text)
+        place, value = (self._entry_at(n, 0, [1], ["e0"]) for n in (name, source))
+        return self._around((vector.size,), ["e0"], [self.put.format(place=place, value=value)])
 
     def _store(self, s):
         if not self.store:

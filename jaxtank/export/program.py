@@ -232,12 +232,8 @@ def _lowered(case, plant, adjustable):
     roots = PLANT if plant else CONTROL
     leaves = {n: v for n, v in traced_leaves(case).items() if n.split(".")[0] in roots}
     real = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.result_type(float))
-    tanks, pumps, outputs = (
-        case.loop.plant.tanks,
-        case.loop.plant.pumps,
-        len(case.loop.plant.outputs),
-    )
-    r = {"r": outputs, "dr": outputs, "ddr": outputs}
+    tanks, pumps = case.loop.plant.tanks, case.loop.plant.pumps
+    r = dict.fromkeys(("r", "dr", "ddr"), len(case.loop.plant.outputs))
     sizes = {"u": pumps, "d": tanks} if plant else {"y": tanks, **r}
     arguments: dict[str, Any] = {} if plant else {"t": real()}
     arguments |= {name: real(size) for name, size in sizes.items()}

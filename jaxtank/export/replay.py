@@ -122,13 +122,11 @@ def read(path: str | Path, export: Export) -> tuple[Log, list[str]]:
             f" before; the export runs every {export.dt:.6g} s: log every period (of a simulation"
             f" --set clock.duration={ROWS * export.dt:.6g} or less, which saves all samples)"
         )
-    dr, ddr = _rates(arrays["r"], export.dt), np.zeros_like(arrays["r"])
-    if len(groups.get("dr", [])) == export.sizes[1]:
-        dr = array("dr", groups["dr"])
-    if len(groups.get("ddr", [])) == export.sizes[1]:
-        ddr = array("ddr", groups["ddr"])
-    log = Log(t, arrays["y"], arrays["r"], dr, ddr, arrays["u"])
-    return log, [table.columns[i].name for i in chosen["u"]]
+    arrays |= {"dr": _rates(arrays["r"], export.dt), "ddr": np.zeros_like(arrays["r"])}
+    for key in ("dr", "ddr"):
+        if len(groups.get(key, [])) == export.sizes[1]:
+            arrays[key] = array(key, groups[key])
+    return Log(t, **arrays), [table.columns[i].name for i in chosen["u"]]
 
 
 def _refuse_twice(table, columns):
@@ -203,22 +201,16 @@ static void copy({name}_real *a, const double *b, int n) {{
     for (int i = 0; i < n; ++i) a[i] = ({name}_real)b[i];
 }}
 #define OUT __attribute__((visibility("default")))
-OUT void sizes(int *n);
-void sizes(int *n) {{ n[0] = {upper}_TANKS; n[1] = {upper}_OUTPUTS; n[2] = {upper}_PUMPS; }}
-OUT const char *unit(int i);
-const char *unit(int i) {{ return {units}; }}
-OUT double period(void);
-double period(void) {{ return {name}_dt; }}
-OUT void begin(const double *y);
-void begin(const double *y) {{
+OUT void sizes(int *n) {{ n[0] = {upper}_TANKS; n[1] = {upper}_OUTPUTS; n[2] = {upper}_PUMPS; }}
+OUT const char *unit(int i) {{ return {units}; }}
+OUT double period(void) {{ return {name}_dt; }}
+OUT void begin(const double *y) {{
     {name}_real a[{upper}_TANKS];
     copy(a, y, {upper}_TANKS);
     {name}_init(&state, 0, a, 0);
 }}
 OUT void step(double t, const double *y, const double *r, const double *dr, const double *ddr,
-              double *u);
-void step(double t, const double *y, const double *r, const double *dr, const double *ddr,
-          double *u) {{
+              double *u) {{
     {name}_real a[{upper}_TANKS], b[{upper}_OUTPUTS], c[{upper}_OUTPUTS], d[{upper}_OUTPUTS],
         e[{upper}_PUMPS];
     copy(a, y, {upper}_TANKS);
@@ -371,9 +363,8 @@ def _run_fmu(code, major, references, dt, log):
 
     def put(name, row):
         n, values = len(row), (ctypes.c_double * len(row))(*row)
-        getattr(code, f"fmi{major}Set{real}")(
-            model, refs[name], ctypes.c_size_t(n), values, *more(n)
-        )
+        call = getattr(code, f"fmi{major}Set{real}")
+        call(model, refs[name], ctypes.c_size_t(n), values, *more(n))
 
     def take(n):
         values = (ctypes.c_double * n)()

@@ -22,11 +22,6 @@ class Define(NamedTuple):
     op: str
     args: tuple
 
-    @property
-    def reads(self):
-        """Names of the variables that it reads."""
-        return names(self.args)
-
 
 class Vector(NamedTuple):
     """The kind of an array of `size` entries that a loop carries."""
@@ -61,12 +56,6 @@ class Each(NamedTuple):
     offset: Any = 0
     steps: tuple = ()  # strides in it, where not row by row
 
-    @property
-    def reads(self):
-        """Names of the variables that it reads."""
-        views = {a.name for a in self.args if isinstance(a, View)}
-        return names(entries_read(self)) | views | ({self.array} if self.array else set())
-
 
 class Array(NamedTuple):
     """An array with its entries."""
@@ -74,11 +63,6 @@ class Array(NamedTuple):
     name: str
     entries: tuple
     kind: str = REAL
-
-    @property
-    def reads(self):
-        """Names of the variables that it reads."""
-        return names(self.entries)
 
 
 class Matrix(NamedTuple):
@@ -92,11 +76,6 @@ class Matrix(NamedTuple):
     operands: tuple
     sizes: tuple
 
-    @property
-    def reads(self):
-        """Names of the variables that it reads."""
-        return set(self.operands)
-
 
 class Store(NamedTuple):
     """array[index] = value, in place; `name` is what the array is called from then on."""
@@ -106,21 +85,11 @@ class Store(NamedTuple):
     index: Any
     value: Any
 
-    @property
-    def reads(self):
-        """Names of the variables that it reads, the array as it was among them."""
-        return {self.array} | names([self.index, self.value])
-
 
 class Until(NamedTuple):
     """The end of a loop: leave it unless `test`, a variable, is true."""
 
     test: Any
-
-    @property
-    def reads(self):
-        """Names of the variables that it reads."""
-        return names([self.test])
 
 
 class Loop(NamedTuple):
@@ -132,12 +101,6 @@ class Loop(NamedTuple):
     new: tuple
     most: int | None = None  # passes after which a loop without a count has ended
 
-    @property
-    def reads(self):
-        """Names of the variables that it reads, in its body too."""
-        inside = set().union(*(s.reads for s in self.body))
-        return inside | names(self.new) | names(start for _, _, start in self.carried)
-
 
 Statement = Define | Array | Each | Matrix | Store | Until | Loop
 
@@ -148,6 +111,17 @@ def names(entries: Iterable) -> set[str]:
     return {e.name for e in variables} | {
         e.index.name for e in variables if isinstance(e.index, Ref)
     }
+
+
+def reads(s: Statement) -> set[str]:
+    """Return the names of the variables that a statement reads, of a loop in its body too."""
+    if isinstance(s, Loop):
+        inside = set().union(*map(reads, s.body))
+        return inside | names(s.new) | names(start for *_, start in s.carried)
+    if isinstance(s, Matrix):
+        return set(s.operands)
+    array = s.array if isinstance(s, Each) else ""
+    return names(entries_read(s)) | ({array} if array else set())
 
 
 def every(statements: Iterable[Statement]) -> Iterator[Statement]:
@@ -173,7 +147,7 @@ def used(statements: list[Statement], read: set[str]) -> list[Statement]:
             s = s._replace(body=used(s.body, names(s.new)))
         elif not isinstance(s, Until) and s.name not in read:
             continue
-        read |= s.reads
+        read |= reads(s)
         needed.append(s)
     return needed[::-1]
 
@@ -187,7 +161,7 @@ def hoisted(statements: Iterable[Statement]) -> list[Statement]:
             continue
         inside, body = {name for _, name, _ in s.carried}, []
         for inner in hoisted(s.body):
-            free = isinstance(inner, Define | Array | Each) and not inner.reads & inside
+            free = isinstance(inner, Define | Array | Each) and not reads(inner) & inside
             if free:
                 out.append(inner)
                 continue
@@ -208,7 +182,7 @@ def ranks(statements: Sequence[Statement], inputs: Mapping[str, int]) -> dict[st
     """Return {name: rank} of every variable: the largest rank of its operands."""
     rank_of = dict(inputs)
     for s in statements:
-        read = s.reads if not isinstance(s, Loop) else s.reads - local(s)
+        read = reads(s) - local(s) if isinstance(s, Loop) else reads(s)
         rank = max((rank_of[n] for n in read), default=0)
         if isinstance(s, Store):
             rank = max(rank, rank_of[s.array])

@@ -16,6 +16,7 @@ from jaxtank.export.statements import (
     Vector,
     array_kinds,
     every,
+    reads,
 )
 
 LARGEST = {"double": "1.7976931348623157E+308", "float": "3.4028234E+38"}
@@ -328,7 +329,7 @@ def _interface(printer, program):
 def _variables(printer, program, statements):
     """Declarations of the state and of what the statements compute."""
     real = printer.kinds[REAL]
-    tables = [s for s in statements if isinstance(s, Array) and not s.reads]
+    tables = [s for s in statements if isinstance(s, Array) and not reads(s)]
     types = {n: printer.kinds[kind] for n, kind in printer.kind_of.items()}
     sized = array_kinds(s for s in statements if s not in tables)
     types |= {n: _array(vector.size, printer.kinds[vector.kind]) for n, vector in sized.items()}

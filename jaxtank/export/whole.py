@@ -233,7 +233,7 @@ def order(statements: list[Statement], ref: Ref) -> int:
     return next((i for i, s in enumerate(statements) if ref.name in defined(s)), -1)
 
 
-LOOSE, CHOICE, TIGHT = 1, 2, 20
+CHOICE, TIGHT = 2, 20
 BINARY = {
     "or": ("||", 3),
     "and": ("&&", 4),

@@ -142,9 +142,7 @@ def facts_of(case: Case, filtered: Case | None = None) -> dict[str, Any]:
     10.0
     """
     with jax.enable_x64(True):
-        return _facts(
-            case, [whole_loop(variant) for variant in (case, filtered) if variant is not None]
-        )
+        return _facts(case, [whole_loop(c) for c in (case, filtered) if c is not None])
 
 
 def _packed(facts: dict[str, Any]) -> dict[str, Any]:
@@ -174,9 +172,8 @@ def data(value: Any) -> str:
 def squares_of(objective: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
     """Return ((measure, weight), ...) of the Gauss-Newton matrix of an objective."""
     squares = tuple((m, w) for m, w in objective.items() if m in ms.squares())
-    return (
-        (("mean_square_error", 1.0),) if "rms_error_total" in objective or not squares else squares
-    )
+    errors_alone = "rms_error_total" in objective or not squares
+    return (("mean_square_error", 1.0),) if errors_alone else squares
 
 
 def _lean(case: Case) -> WholeLoop:
@@ -245,6 +242,8 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
     loop, clock, plant = case.loop, case.clock, case.loop.plant
     free = bounds(loop, case.free) if case.free else []
     length, drive = loop.units
+    # the sliders of all loops, those of the first where several have one
+    homes = {leaf: variant.case for variant in reversed(loops) for leaf in variant.leaves}
     return {
         "case": case.name,
         "title": case.title,
@@ -253,7 +252,10 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         "duration": clock.duration,
         "samples": clock.samples,
         "save_every_default": max(1, clock.samples // ROWS),
-        "tanks": _tanks(case),
+        "tanks": [
+            {"name": label_of(plant, "tank", i), "rim": rim if np.isfinite(rim) else None}
+            for i, rim in enumerate(map(float, np.broadcast_to(plant.rim, (plant.tanks,))))
+        ],
         "outputs": [int(i) for i in plant.outputs],
         "pumps": [
             {
@@ -264,7 +266,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
             }
             for j in range(plant.pumps)
         ],
-        "leaves": _leaves(loops),
+        "leaves": [leaf_of(homes[n], *n) for n in sorted(homes, key=lambda leaf: leaf[0])],
         "setpoints": _setpoints(loop),
         "draws": draws(case),
         "measures": [_measure(case, m, entries) for m, entries in loops[-1].measures.items()],
@@ -293,26 +295,8 @@ def _setpoints(loop):
     if not isinstance(reference, Ramps):
         return []
     first = [[f"reference.initial[{i}]", i, 0.0] for i in range(reference.channels)]
-    later = [
-        [f"reference.targets[{k}]", channel, float(time)]
-        for k, (time, channel) in enumerate(reference.changes)
-    ]
-    return first + later
-
-
-def _tanks(case):
-    plant = case.loop.plant
-    rims = [float(v) for v in np.broadcast_to(np.asarray(plant.rim), (plant.tanks,))]
-    return [
-        {"name": label_of(plant, "tank", i), "rim": rim if np.isfinite(rim) else None}
-        for i, rim in enumerate(rims)
-    ]
-
-
-def _leaves(loops):
-    """The sliders of all loops, those of the first where several have one."""
-    homes = {leaf: variant.case for variant in reversed(loops) for leaf in variant.leaves}
-    return [leaf_of(homes[leaf], *leaf) for leaf in sorted(homes, key=lambda leaf: leaf[0])]
+    later = enumerate(reference.changes)
+    return first + [[f"reference.targets[{k}]", i, float(time)] for k, (time, i) in later]
 
 
 def _measure(case, name, entries):
@@ -359,7 +343,7 @@ INFINITE = {math.inf: "Infinity", -math.inf: "-Infinity"}
 
 def leaf_of(case: Case, name: str, index: tuple[int, ...]) -> dict[str, Any]:
     """Return the slider of one number of a loop, as a JSON object."""
-    full = f"{name}[{','.join(map(str, index))}]" if index else name
+    full = _name(name, index)
     meta = describe(case.loop, full)
     value = float(np.asarray(get_value(case.loop, full)))
     group = GROUPS.get(name.split(".")[0], name.split(".")[0])

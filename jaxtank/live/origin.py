@@ -2,7 +2,7 @@
 
 import contextlib
 import shlex
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,28 +37,24 @@ def origin_of(case, source=None):
             words = _static(case, known)
     if source is None or known is None or words is None:
         return Origin(shlex.quote(source or NEW), {}, case.safety is not None, "")
-    differing, current = {}, entries(case.loop, parameters(case.loop))
-    for name, value in entries(known.loop, parameters(known.loop)).items():
-        if current[name] != value:
-            differing[name] = value
-    words = " ".join([shlex.quote(source), *words])
-    return Origin(words, differing, known.safety is not None, _guard(case, known))
-
-
-def _guard(case, known):
-    """--set of the settings of the safety filter of a case that its origin does not have."""
-    before: dict[str, Any] = dict(known.safety or {})
-    words = []
+    current, before = entries(case.loop, parameters(case.loop)), dict(known.safety or {})
+    origin = entries(known.loop, parameters(known.loop)).items()
+    differing = {name: value for name, value in origin if current[name] != value}
+    guard: list[str] = []  # settings of the safety filter that the origin does not have
     for key, value in (case.safety or {}).items():
         if key not in before or not np.array_equal(before[key], value):
             text = f"[{','.join(map(str, value))}]" if np.ndim(value) else str(value)
-            words += ["--set", shlex.quote(f"safety_filter.{key}={text}")]
-    return " ".join(words)
+            guard += ["--set", shlex.quote(f"safety_filter.{key}={text}")]
+    words = " ".join([shlex.quote(source), *words])
+    return Origin(words, differing, known.safety is not None, " ".join(guard))
 
 
 def _static(case, known):
     """--set of the static fields and the clock that differ; None where the structure does."""
-    mine, theirs = (dict(_fields(c.loop)) for c in (case, known))
+    mine, theirs = (
+        {n: v for n, v, _ in walk(c.loop, kind="static") if not n.startswith(GUARD)}
+        for c in (case, known)
+    )
     if _shapes(case.loop) != _shapes(known.loop) or mine.keys() != theirs.keys():
         return None
     changes = {name: value for name, value in mine.items() if value != theirs[name]}
@@ -78,12 +74,6 @@ def _shapes(loop):
     return {n: np.shape(v) for n, v in parameters(loop).items() if not n.startswith(GUARD)}
 
 
-def _fields(loop):
-    for name, value, _ in walk(loop, kind="static"):
-        if not name.startswith(GUARD):
-            yield name, value
-
-
 def entries(loop, values):
     """Return {name of one entry: number} of {dotted name: number or array}."""
     numbers, leaves = {}, parameters(loop)
@@ -93,10 +83,9 @@ def entries(loop, values):
         shape = np.shape(leaves[name]) if name in leaves else ()
         if not shape:
             numbers[name] = float(np.ravel(value)[0])
-        else:
-            array = np.broadcast_to(np.asarray(value, dtype=float), shape)
-            for index, entry in np.ndenumerate(array):
-                numbers[f"{name}[{','.join(map(str, index))}]"] = float(entry)
+            continue
+        for index, entry in np.ndenumerate(np.broadcast_to(np.asarray(value, float), shape)):
+            numbers[f"{name}[{','.join(map(str, index))}]"] = float(entry)
     return numbers
 
 

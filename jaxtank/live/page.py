@@ -1,8 +1,6 @@
 """The live page as text: one HTML file that asks nothing of any network, everything in it escaped.
 
-Beside it lie the parts of the page:
-page.html, page.css, core.js, charts.js, rig.js, runner.js, page.js, worker.js, tune.js, and uPlot
-in vendor/.
+The HTML, CSS and JavaScript files beside it are the parts of the page.
 """
 
 import base64
@@ -141,30 +139,27 @@ def _breaks(case):
         faults.append({"name": name, "leaf": leaf, "factor": factor, "value": None, "text": text})
 
     values = {n: np.ravel(v) for n, v in parameters(case.loop).items()}
+    used = lambda leaf: np.flatnonzero(values.get(leaf, ())).tolist()
     for j in range(np.size(values.get("plant.pump_gain", ()))):
         add(f"pump {j + 1} at 70 %", f"plant.pump_gain[{j}]", 0.7, "the pump delivers 70 %")
-    for i, area in enumerate(values.get("plant.drain", ())):
-        if area > 0:
-            text = f"the outlet of tank {i + 1} is {100 * (LEAK - 1):.0f} % wider"
-            add(f"leak in tank {i + 1}", f"plant.drain[{i}]", LEAK, text)
-    for k, area in enumerate(values.get("plant.orifice", ())):
-        if area > 0:
-            source, sink = (tank + 1 for tank in plant.links[k])
-            text = f"the valve from tank {source} to tank {sink} is stuck, 40 % open"
-            add(f"stuck valve {source} to {sink}", f"plant.orifice[{k}]", 0.4, text)
-    for k, area in enumerate(values.get("plant.pipe", ())):
-        if area > 0:
-            first, other = (tank + 1 for tank in plant.pipes[k])
-            text = f"the pipe between tanks {first} and {other} is blocked, 40 % open"
-            add(f"blocked pipe {first} to {other}", f"plant.pipe[{k}]", 0.4, text)
+    for i in used("plant.drain"):
+        text = f"the outlet of tank {i + 1} is {100 * (LEAK - 1):.0f} % wider"
+        add(f"leak in tank {i + 1}", f"plant.drain[{i}]", LEAK, text)
+    for k in used("plant.orifice"):
+        source, sink = (tank + 1 for tank in plant.links[k])
+        text = f"the valve from tank {source} to tank {sink} is stuck, 40 % open"
+        add(f"stuck valve {source} to {sink}", f"plant.orifice[{k}]", 0.4, text)
+    for k in used("plant.pipe"):
+        first, other = (tank + 1 for tank in plant.pipes[k])
+        text = f"the pipe between tanks {first} and {other} is blocked, 40 % open"
+        add(f"blocked pipe {first} to {other}", f"plant.pipe[{k}]", 0.4, text)
     for k in range(np.size(values.get("plant.valve", ()))):
         valve = label_of(plant, "pump", len(plant.feeds) + k)
         text = f"{valve} passes 40 % of the flow of its opening"
         add(f"clogged {valve}", f"plant.valve[{k}]", 0.4, text)
-    for k, volume in enumerate(values.get("disturbance.volume", ())):
-        if volume:
-            text = "three times the volume of this inflow disturbance"
-            add(f"inflow pulse {k + 1} times 3", f"disturbance.volume[{k}]", 3.0, text)
+    for k in used("disturbance.volume"):
+        text = "three times the volume of this inflow disturbance"
+        add(f"inflow pulse {k + 1} times 3", f"disturbance.volume[{k}]", 3.0, text)
     return faults
 
 
@@ -187,7 +182,8 @@ def _worker():
 
 def assemble(engine_text, name, data):
     """Return the page as text."""
-    uplot, core, scripts = _read("vendor/uPlot.iife.min.js"), _script("core"), _own()
+    uplot, core = _read("vendor/uPlot.iife.min.js"), _script("core")
+    scripts = "\n".join(map(_script, SCRIPTS))
     # the scripts of the page are one function, as loader.js joins them
     run = [engine_text, uplot, f'(() => {{"use strict";\n{core}\n{scripts}\n}})();', _loader()]
     policy = "; ".join(
@@ -248,12 +244,6 @@ def _script(name):
     """Return a script of this package without indentation, blank lines and comment lines."""
     lines = (line.strip() for line in _read(f"{name}.js").splitlines())
     return "\n".join(line for line in lines if line and not line.startswith("//"))
-
-
-@cache
-def _own():
-    """The scripts of the page but core.js."""
-    return "\n".join(map(_script, SCRIPTS))
 
 
 @cache

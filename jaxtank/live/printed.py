@@ -38,9 +38,12 @@ class Printed:
         both = every(loop.statements)
         self.arrays = {s.name for s in both if isinstance(s, Array | Matrix)}
         self.state = self._live()
-        self.moving = self._moving()
-        self.measured = self._measured()
-        self.kept, self.again = self._kept()
+        self.moving = used(self._ranked(MOVING), names(self._outputs()))
+        self.measured = used(self._ranked(MOVING), names(self._measures()))
+        needed = refs(self.moving, self._outputs())
+        needed = {e for e in needed if self.rank[e.name] == TIMED and e.name != "k"}
+        # data that is stored for every sample, and data that is computed again from it
+        self.kept, self.again = kept_in_time(self._ranked(TIMED), needed, self.rank)
         self.crossing = {
             "signals": self._alone(self._timed(), self.kept),
             "run": self._alone([*self.again, *self.moving], self._outputs()),
@@ -49,8 +52,7 @@ class Printed:
 
     def text(self) -> str:
         """Return the four functions as an object, without the helpers that they call."""
-        functions = [self._lead(), self._signals(), self._run(), self._read()]
-        return "\n".join(functions)
+        return "\n".join([self._lead(), self._signals(), self._run(), self._read()])
 
     def streams(self) -> list[Ref]:
         """Return the precomputed data of each sample, in the order of S."""
@@ -89,20 +91,6 @@ class Printed:
     def _timed(self):
         return used(self._ranked(TIMED), names(self.kept))
 
-    def _moving(self):
-        return used(self._ranked(MOVING), names(self._outputs()))
-
-    def _measured(self):
-        return used(self._ranked(MOVING), names(self._measures()))
-
-    def _kept(self):
-        """Data that is stored for every sample, and data that is computed again from it."""
-        needed = refs(self.moving, self._outputs())
-        needed = {e for e in needed if self.rank[e.name] == TIMED and e.name != "k"}
-        timed = self._ranked(TIMED)
-        stored, again = kept_in_time(timed, needed, self.rank)
-        return stored, again
-
     def _alone(self, statements: list[Statement], outputs: Iterable[Any]) -> list[Ref]:
         """Values of rank ALONE that are read: numbers, then whole arrays as Refs without index."""
         numbers = {e for e in refs(statements, outputs) if self.rank[e.name] == ALONE}
@@ -122,11 +110,11 @@ class Printed:
         text = Text({"p": "p"}, short_names(FIXED))
         lines = text.write(alone, outputs, hold=outputs)
         groups = [*self.crossing.values(), [self.loop.first[i] for i in self.state]]
-        parts = [self._numbers(text, group) for group in groups]
-        delays = [
-            f"new Float64Array({size}).fill({text.of(self.loop.first[i])})"
-            for i, size in self._line_sizes().items()
-        ]
+        parts, delays = [self._numbers(text, group) for group in groups], []
+        for i in sorted(self.loop.lines):
+            root = self.loop.after[i].name
+            size = sum(isinstance(e, Ref) and e.name == root for e in self.loop.after)
+            delays.append(f"new Float64Array({size}).fill({text.of(self.loop.first[i])})")
         lines.append(f"return[{','.join(parts)},[{','.join(delays)}]];")
         return function("lead", "p", lines)
 
@@ -137,31 +125,15 @@ class Printed:
         out = f"Float64Array.of({','.join(map(text.of, numbers))})"
         return f"Object.assign({out},{{A:[{','.join(whole)}]}})" if whole else out
 
-    def _line_sizes(self):
-        """{entry of c at which a line begins: its size}."""
-        ends = [*sorted(self.loop.lines), len(self.loop.first)]
-        root = {start: self.loop.after[start].name for start in self.loop.lines}
-        return {
-            start: sum(isinstance(e, Ref) and e.name == root[start] for e in self.loop.after)
-            for start in ends[:-1]
-        }
-
     def _begin(self, name, extra):
-        """Return the first lines of a function, and its Text with the numbers it reads."""
-        text = Text(extra, short_names(FIXED))
-        return text, self._unpacked(text, self.crossing[name], "q")
-
-    def _unpacked(self, text, group, source):
-        """Lines that give names to what `_numbers` has put together."""
-        lines, numbers = [], [e for e in group if not self._is_array(e)]
-        for entries, where in (
-            (numbers, source),
-            ([e for e in group if self._is_array(e)], f"{source}.A"),
-        ):
+        """The Text of a function, and its first lines: names of what `_numbers` put together."""
+        text, lines = Text(extra, short_names(FIXED)), []
+        for whole, where in ((False, "q"), (True, "q.A")):
+            entries = [e for e in self.crossing[name] if self._is_array(e) == whole]
             variables = [next(text.names) for _ in entries]
-            text.given.update(zip([e.name if self._is_array(e) else e for e in entries], variables))
+            text.given.update(zip([e.name if whole else e for e in entries], variables))
             lines += [f"const[{','.join(variables)}]={where};"] if variables else []
-        return lines
+        return text, lines
 
     def _signals(self):
         text, lines = self._begin("signals", {Ref("k"): "k"})
@@ -198,24 +170,13 @@ class Printed:
         text.given |= dict(zip(self.loop.lines.values(), delays))
         lines.append(f"let[{','.join(state)}]=c;")
         lines += [f"const[{','.join(delays)}]=L;"] if delays else []
-        body = [
-            f"const {variable}={array}[k];"
-            for variable, array in self._given(text, streams, streams_read)
-        ]
-        deviates = [Ref("n", i) for i in range(len(noise))]
-        body += [
-            f"const {variable}={array}[k];"
-            for variable, array in self._given(text, deviates, noise)
-        ]
+        body, deviates = [], (Ref("n", i) for i in range(len(noise)))
+        for e, array in zip([*streams, *deviates], [*streams_read, *noise]):
+            text.given[e] = next(text.names)
+            body.append(f"const {text.given[e]}={array}[k];")
         outputs = self._outputs()
         body += text.write([*self.again, *self.moving], outputs, hold=outputs)
         return text, lines, body, state
-
-    def _given(self, text, entries, arrays):
-        """Yield (variable, array) of the data that is read at each sample."""
-        for e, array in zip(entries, arrays):
-            text.given[e] = next(text.names)
-            yield text.given[e], array
 
     def _next(self, text):
         """Lines that replace the last state by the next one."""

@@ -113,17 +113,6 @@ def highest_level(rate, top):
     return low
 
 
-def theorem_of(setting, tank):
-    """What proves the limit of a tank without a second-order row."""
-    if not setting.rates.pumps[tank]:
-        return "no pump, and its inflow cannot pass the limit"
-    if setting.lag > 0.0:
-        return "Theorem 4"
-    if setting.predicted:
-        return "Theorem 5"
-    return "Theorem 3" if setting.delay > 0.0 else "Theorem 1"
-
-
 def _conditions(setting, tank, limits, bound, start, reach):
     """(holds, reason) of what proves the limit of one tank."""
     # limits : the Chosen of the rig; start : (n,) highest levels at t = 0 [cm], or None; reach :

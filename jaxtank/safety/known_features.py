@@ -85,46 +85,48 @@ def first_failure(conditions: Iterable[tuple[Any, str]]) -> str:
 
 def unknown_feature(parts: Mapping[str, Any], box: Mapping[str, Any], known: Known = PLAIN) -> str:
     """The first feature that is not on the closed list, or a number that is none; or ""."""
-    why = first_failure(_known_classes(parts, known))
-    why = why or first_failure(_known_fields(parts, known))
-    return why or first_failure(_known_names(box, known))
+    return first_failure(_features(parts, box, known))
 
 
-def _known_classes(parts, known):
+def _features(parts, box, known):
+    """(holds, reason) of the classes of all parts, of their fields, of the names of a box."""
     for part, kind in CLASSES.items():
         value = parts.get(part)
         if part in parts:
             yield type(value) is kind, f"not covered: {part} of class {type(value).__name__}"
-    kind = type(parts["safety_filter"])
+    safety_filter = parts["safety_filter"]
+    kind = type(safety_filter)
     same = (kind.__module__, kind.__name__) == known.filter
     yield same, f"not covered: safety filter of class {kind.__name__}"
-    for end in ("least", "most"):
-        kind = type(getattr(parts["safety_filter"], end))
-        network = kind is TankNetwork
-        yield network, f"not covered: safety_filter.{end} of class {kind.__name__}"
-
-
-def _known_fields(parts, known):
-    safety_filter = parts["safety_filter"]
     ends = {f"safety_filter.{end}": getattr(safety_filter, end) for end in ("least", "most")}
+    for end, plant in ends.items():
+        network = type(plant) is TankNetwork
+        yield network, f"not covered: {end} of class {type(plant).__name__}"
     for part, value in {**parts, **ends}.items():
         fields = known.fields["plant" if part in ends else part]
         for name in (field.name for field in dataclasses.fields(value)):
             entry = getattr(value, name)
-            yield name in fields or _neutral(entry), f"not covered: {part}.{name}"
+            neutral = entry is None or entry is False or (isinstance(entry, tuple) and not entry)
+            yield name in fields or neutral, f"not covered: {part}.{name}"
             number = name not in fields or not _has_nan(entry)
             yield number, f"not covered: {part}.{name} is no number"
-
-
-def _known_names(box, known):
-    for name, ends in box.items():
+    for name, interval in box.items():
         covered = name.partition("[")[0] in known.uncertain or name.startswith(HARMLESS)
         yield covered, f"not covered: uncertain {name}"
-        yield not any(map(_has_nan, ends)), f"not covered: uncertain {name} is no number"
+        yield not any(map(_has_nan, interval)), f"not covered: uncertain {name} is no number"
 
 
-def _neutral(entry):
-    return entry is None or entry is False or (isinstance(entry, tuple) and not entry)
+def span_of(box, name, value):
+    """(lower, upper) of a leaf over the {name or name[i]: (lower, upper)} of a box."""
+    value = np.asarray(0.0 if value is None else value, dtype=float)
+    low, high = value.copy(), value.copy()
+    for other, (lower, upper) in box.items():
+        base, _, entry = other.partition("[")
+        if base == name:
+            at = int(entry.rstrip("]")) if entry else ...
+            low[at] = np.minimum(low[at], np.asarray(lower, dtype=float))
+            high[at] = np.maximum(high[at], np.asarray(upper, dtype=float))
+    return low, high
 
 
 def _has_nan(entry):

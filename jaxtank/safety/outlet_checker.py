@@ -7,7 +7,6 @@ It works on the final numbers with its own formulas; Theorem 6 of README.md of t
 import functools
 import math
 from collections.abc import Mapping
-from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +14,7 @@ import scipy  # its parts are imported when they are first used
 
 from jaxtank.core.labels import label_of
 from jaxtank.safety.checker import CASE, LIMITS, Verdict
-from jaxtank.safety.known_features import OUTLETS, first_failure, readable, unknown_feature
+from jaxtank.safety.known_features import OUTLETS, first_failure, readable, span_of, unknown_feature
 
 PARTS = 500
 """Intervals of readings on which floors and caps are compared."""
@@ -62,11 +61,12 @@ def check(
     parts |= {} if faults is None else {"faults": faults}
     tanks = len(np.atleast_1d(outlet_filter.limit))
     why = unknown_feature(parts, box, OUTLETS)
-    rig = None if why else _Rig(outlet_filter, plant, actuator, sensor, hold, substeps, box)
-    if rig is not None:
-        why = first_failure(_covered(rig, pulses, faults, inflow))
-    if rig is None or why:
-        return tuple(Verdict(i, False, why, CASE, False, why) for i in range(tanks))
+    not_proved = lambda why: tuple(Verdict(i, False, why, CASE, False, why) for i in range(tanks))
+    if why:
+        return not_proved(why)
+    rig = _Rig(outlet_filter, plant, actuator, sensor, hold, substeps, box)
+    if why := first_failure(_covered(rig, pulses, faults, inflow)):
+        return not_proved(why)
     upper, lower = _joint(rig)
     whole = not any(upper) and not any(why for why, low in zip(lower, rig.low) if low > 0.0)
     starts = LIMITS if whole else CASE
@@ -86,11 +86,9 @@ def _root(h, knee):
     return math.sqrt(h) if h >= knee else math.sqrt(knee) * h / knee * (1.5 - 0.5 * h / knee)
 
 
-def _power(h, exponent, knee):
-    if h >= knee:
-        return h**exponent
+def _power(h, p, knee):
     y = h / knee
-    return knee**exponent * max(y * (2.0 - exponent + (exponent - 1.0) * y), 0.0)
+    return h**p if y >= 1.0 else knee**p * max(y * (2.0 - p + (p - 1.0) * y), 0.0)
 
 
 def _volume(shape, area, extent, h):
@@ -140,7 +138,8 @@ class _Rig:
     def __init__(self, outlet_filter, plant, actuator, sensor, hold, substeps, box):
         self.filter, self.plant, self.actuator = outlet_filter, plant, actuator
         self.label = functools.partial(label_of, plant, "tank")
-        self.hold, self.step, self.box = float(hold), hold / substeps, dict(box)
+        self.hold, self.step = float(hold), hold / substeps
+        self.span = functools.partial(span_of, dict(box))
         self.weak, self.strong = outlet_filter.least, outlet_filter.most
         n, m = len(np.atleast_1d(plant.rim)), len(plant.feeds)
         self.n, self.m, self.inputs = n, m, m + len(plant.valves)
@@ -153,22 +152,10 @@ class _Rig:
         self.range = [[self.demand(j, v) for j, v in enumerate(end)] for end in self.ends]
         self.begin = [full(end) for end in box.get("x0", (0.0, 0.0))]
         self.needed, self.top = readable(sensor, self.span, full)
-        self.shallow = {}  # by tank, as far as computed
+        self.shallow = functools.cache(functools.partial(_shallow, self))
         order = [(*row, False) for row in outlet_filter.low_rows]
         order += [(*row, True) for row in outlet_filter.upper_rows]
         self.rows = [_Row(i, up, tuple(movers), k) for k, (i, movers, up) in enumerate(order)]
-
-    def span(self, name, value):
-        """(lower, upper) of a leaf over the box."""
-        value = np.asarray(0.0 if value is None else value, dtype=float)
-        low, high = value.copy(), value.copy()
-        for other, (lower, upper) in self.box.items():
-            base, _, entry = other.partition("[")
-            if base == name:
-                at = int(entry.rstrip("]")) if entry else ...
-                low[at] = np.minimum(low[at], np.asarray(lower, dtype=float))
-                high[at] = np.maximum(high[at], np.asarray(upper, dtype=float))
-        return low, high
 
     def demand(self, j, u):
         k = j - self.m
@@ -407,11 +394,7 @@ def _joint(rig):
         low = np.where([bool(why) for why in lower], 0.0, rig.low)
         bounds = _Bounds(high, low)
         after = [
-            [
-                why
-                or first_failure(chain(_kept(rig, i, bounds, up), _relied_on(rig, i, bounds, up)))
-                for i, why in enumerate(reasons)
-            ]
+            [why or first_failure(_kept(rig, i, bounds, up)) for i, why in enumerate(reasons)]
             for reasons, up in ((upper, True), (lower, False))
         ]
         if after == [upper, lower]:
@@ -438,19 +421,16 @@ def _kept(rig, i, bounds, upper):
     reason = f"{passing:.3g} {unit}^3/s more may {words} than its inputs can balance"
     yield passing <= ROUNDING * max(abs(rest), 1e-9), reason
     for k in sorted({i} | near):
-        sure = rig.empty[k] >= _shallow(rig, k) * (1.0 - ROUNDING)
+        sure = rig.empty[k] >= rig.shallow(k) * (1.0 - ROUNDING)
         yield sure, f"{rig.label(k)} may run empty within a step"
     if row is not None:
         yield from _row_holds(rig, row, bounds, near)
+    # last: of two tanks that rely on each other the answer names what the first of them lacks
+    yield from _relied_on(rig, row, bounds, upper, sorted(near))
 
 
-def _relied_on(rig, i, bounds, upper):
-    """(holds, reason): the levels of neighbours are within what one limit counts on. Asked last: of
-    two tanks that rely on each other the answer names what the first of them lacks.
-    """
-    if not upper and rig.low[i] <= 0.0:
-        return
-    near = sorted(rig.neighbours(i, upper))
+def _relied_on(rig, row, bounds, upper, near):
+    """(holds, reason): the levels of neighbours are within what one limit counts on."""
     for k in near:
         word = f"relies on {rig.label(k)}"
         yield math.isfinite(bounds.high[k]), f"{word}, which has no upper bound"
@@ -458,7 +438,7 @@ def _relied_on(rig, i, bounds, upper):
         yield bounds.high[k] <= rig.reach[k] * (1.0 + ROUNDING), f"{word}, not proved"
         yield bounds.low[k] >= rig.bottom[k], f"{word}, whose low limit is not proved"
         yield upper or bounds.high[k] <= rig.limit[k], f"{word}, not proved"
-    for k in near if rig.row(i, upper) is not None else ():
+    for k in near if row is not None else ():
         any_change = _any_change(rig, k, min(rig.climb[k], rig.drop[k]))
         for j in () if any_change else sorted(rig.neighbours(k)):
             word = f"limit of {rig.label(j)}, not proved"
@@ -505,12 +485,6 @@ def _fastest(rig, k, upper):
 
 def _shallow(rig, i):
     """The level [cm] below which a tank may hold less than it gives in a step."""
-    if i not in rig.shallow:
-        rig.shallow[i] = _shallow_level(rig, i)
-    return rig.shallow[i]
-
-
-def _shallow_level(rig, i):
     empty, none = rig.empty, np.zeros(rig.n)
     rig.empty = none
     levels, last = np.linspace(0.0, rig.limit[i], FINE + 1), 0.0
@@ -556,11 +530,8 @@ def _compatible(rig, row, later, bounds):
         eps = rig.band[r.tank]
         edges = np.linspace(bounds.low[r.tank] - eps, bounds.high[r.tank] + eps, PARTS + 1)
         pairs = zip(edges[1:], edges[:-1]) if r.upper else zip(edges[:-1], edges[1:])
-        found = []
-        for reading, level in pairs:
-            effects, allowed = rig.allowed(r, reading, level)
-            found.append(_bound(effects[j], allowed, ends))
-        return np.array(found)
+        rows = (rig.allowed(r, reading, level) for reading, level in pairs)
+        return np.array([_bound(effects[j], allowed, ends) for effects, allowed in rows])
 
     mine, theirs = demands(row), demands(later)
     floors, caps = (mine, theirs) if ups[0][j] else (theirs, mine)
