@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,16 +24,15 @@ def check_gains(controller, gains):
     """Check that each of `gains` names a number among the leaves of a controller, once."""
     if not gains:
         raise InputError("a schedule needs at least one gain")
-    names = [n for n in parameters(controller)]
+    names = parameters(controller)
     for gain in gains:
         if gains.count(gain) > 1:
             raise InputError(f"gain {gain} is scheduled twice")
         try:
             meta = describe(controller, gain)
         except InputError:
-            raise unknown(
-                "gain", f"controller.{gain}", [f"controller.{n}" for n in names]
-            ) from None
+            known = [f"controller.{n}" for n in names]
+            raise unknown("gain", f"controller.{gain}", known) from None
         if meta["kind"] == "static":
             raise InputError(
                 f"gain controller.{gain}: cannot be scheduled, it is part of the compiled program"
@@ -82,10 +82,8 @@ def interpolate(at, knots, values):
     count, intervals = np.shape(values)[0], np.shape(knots)[0] - 1
     parts = [portion(at, knots[j], knots[j + 1]) for j in range(intervals)]
     slope = lambda i, j: (values[i, j + 1] - values[i, j]) / (knots[j + 1] - knots[j])
-    return tuple(
-        sum((slope(i, j) * parts[j] for j in range(intervals)), start=values[i, 0])
-        for i in range(count)
-    )
+    rises = lambda i: (slope(i, j) * parts[j] for j in range(intervals))
+    return tuple(sum(rises(i), start=values[i, 0]) for i in range(count))
 
 
 @component
@@ -147,17 +145,11 @@ class Scheduled(Controller):
     def _on_setpoint(self):
         return self.variable.startswith("r")
 
-    @property
-    def allocates(self) -> bool:
-        return self.law.allocates
-
-    @property
-    def reads_inflow(self) -> bool:
-        return self.law.reads_inflow
-
-    @property
-    def reads_flow(self) -> bool:
-        return self.law.reads_flow
+    allocates = property(attrgetter("law.allocates"))
+    reads_inflow = property(attrgetter("law.reads_inflow"))
+    reads_flow = property(attrgetter("law.reads_flow"))
+    limits_levels = property(attrgetter("law.limits_levels"))
+    reads_ahead = property(attrgetter("law.reads_ahead"))
 
     @pointwise
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
@@ -174,19 +166,9 @@ class Scheduled(Controller):
     def slack(self, state: Any) -> Any:
         return self.law.slack(state.inner)
 
-    @property
-    def limits_levels(self) -> bool:
-        return self.law.limits_levels
-
-    @property
-    def reads_ahead(self) -> bool:
-        return self.law.reads_ahead
-
     def init(self, x0: tuple, u0: tuple) -> Any:
-        return Memory(
-            inner=self._without_gains().init(x0, u0),
-            at=() if self._on_setpoint else x0[self._index],
-        )
+        at = () if self._on_setpoint else x0[self._index]
+        return Memory(inner=self._without_gains().init(x0, u0), at=at)
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         at = tick.r[self._index] if self._on_setpoint else estimate.x[self._index]
@@ -211,34 +193,22 @@ class Scheduled(Controller):
 
     def input_metric(self, estimate: Estimate) -> tuple | None:
         # the setpoint is not available here: `check` refuses gains that would need it
-        inner = (
-            self._without_gains()
-            if self._on_setpoint
-            else self._controller_at(estimate.x[self._index])
-        )
-        return inner.input_metric(estimate)
+        if self._on_setpoint:
+            return self._without_gains().input_metric(estimate)
+        return self._controller_at(estimate.x[self._index]).input_metric(estimate)
 
     def metadata_of(self, field: str) -> dict[str, Any]:
         """Return changes of a field's metadata: values have units and ranges of their gains."""
         if field != "values":
             return {}
-        rows = []
-        for gain in self.gains:
-            meta = describe(self.law, gain)
-            rows.append(
-                {**meta, "doc": f"{meta['doc']}: controller.law.{gain} at a knot", "like": None}
-            )
+        metas = {gain: describe(self.law, gain) for gain in self.gains}
+        words = lambda gain, meta: f"{meta['doc']}: controller.law.{gain} at a knot"
+        rows = tuple({**m, "doc": words(gain, m), "like": None} for gain, m in metas.items())
         doc = f"each gain at each knot; a row each for {', '.join(self.gains)}"
-        every = {
-            "doc": doc,
-            "unit": ", ".join(dict.fromkeys(m["unit"] for m in rows)),
-            "rows": tuple(rows),
-        }
-        if rows and all(
-            m["low"] == rows[0]["low"] and m["strict"] == rows[0]["strict"] for m in rows
-        ):
-            every |= {"low": rows[0]["low"], "strict": rows[0]["strict"]}
-        return every
+        units = ", ".join(dict.fromkeys(m["unit"] for m in rows))
+        ends = [{name: m[name] for name in ("low", "strict")} for m in rows]
+        same = ends[0] if ends and all(end == ends[0] for end in ends) else {}
+        return {"doc": doc, "unit": units, "rows": rows, **same}
 
     def check(self, reference: Signal) -> None:
         check_gains(self.law, self.gains)
