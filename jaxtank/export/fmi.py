@@ -20,6 +20,7 @@ from jaxtank.core.labels import input_unit, label_of
 from jaxtank.core.units import local
 from jaxtank.export.c import C, print_c
 from jaxtank.export.printer import note_of
+from jaxtank.export.statements import template
 
 SIGNALS = {
     "y": ("tank", "cm", "reading"),
@@ -165,200 +166,6 @@ def _rows(program, numbers, third):
     return rows
 
 
-CORE = """
-#include "{name}.h"
-#include <math.h>
-#include <stdbool.h>
-#include <stddef.h>
-#include <stdint.h>
-#include <stdlib.h>
-
-#if defined(_WIN32)
-#define EXPORT __declspec(dllexport)
-#else
-#define EXPORT __attribute__((visibility("default")))
-#endif
-
-enum {{ OK = 0, ERROR = 3, PARAMETERS = {parameters}, NUMBERS = {numbers} }};
-
-typedef struct {{
-    {name}_state state;
-    {name}_parameters p;
-    double v[NUMBERS - PARAMETERS]; /* inputs, then outputs */
-    double t;
-    bool manual, begun;
-}} Model;
-
-static void reset(Model *m)
-{{
-    static const double start[NUMBERS - PARAMETERS] = {{{start}}};
-    m->p = {name}_defaults;
-    for (int i = 0; i < NUMBERS - PARAMETERS; ++i) m->v[i] = start[i];
-    m->t = 0.0;
-    m->manual = m->begun = false;
-}}
-
-static Model *make(void)
-{{
-    Model *m = calloc(1, sizeof *m);
-    if (m) reset(m);
-    return m;
-}}
-
-static void begin(Model *m)
-{{
-    {init};
-    m->begun = true;
-}}
-
-static int advance(Model *m, double t, double h)
-{{
-    const int periods = (int)(h / {name}_dt + 0.5);
-    const double rest = h - periods * {name}_dt;
-    if (periods < 1 || rest > 1e-6 * {name}_dt || rest < -1e-6 * {name}_dt) return ERROR;
-    for (int i = 0; i < periods; ++i) {step};
-    m->t = t + h;
-    return OK;
-}}
-
-static double *at(Model *m, uint32_t i)
-{{
-    if (i < PARAMETERS) return (double *)&m->p + i;
-    return i < NUMBERS ? m->v + (i - PARAMETERS) : i == NUMBERS + 1 ? &m->t : NULL;
-}}
-
-static int get(Model *m, const uint32_t *refs, size_t n, double *values)
-{{
-    if (!m->begun) begin(m);
-    for (size_t k = 0; k < n; ++k) {{
-        if (!at(m, refs[k])) return ERROR;
-        values[k] = *at(m, refs[k]);
-    }}
-    return OK;
-}}
-
-static int set(Model *m, const uint32_t *refs, size_t n, const double *values)
-{{
-    for (size_t k = 0; k < n; ++k) {{
-        if (!at(m, refs[k])) return ERROR;
-        *at(m, refs[k]) = values[k];
-    }}
-    return OK;
-}}
-
-/* functions that this FMU has not: the arguments are not read */
-#define NONE(name) EXPORT int name(void); int name(void) {{ return ERROR; }}
-#define FINE(name) EXPORT int name(void); int name(void) {{ return OK; }}
-"""
-
-THIRD = """
-const char *fmi3GetVersion(void) { return "3.0"; }
-
-void *fmi3InstantiateCoSimulation(void) { return make(); }
-
-void fmi3FreeInstance(Model *m) { free(m); }
-
-int fmi3Reset(Model *m) { reset(m); return OK; }
-
-int fmi3EnterInitializationMode(Model *m, bool b, double e, double t, bool s, double end)
-{
-    (void)b; (void)e; (void)s; (void)end;
-    m->t = t;
-    return OK;
-}
-
-int fmi3ExitInitializationMode(Model *m) { begin(m); return OK; }
-
-int fmi3GetFloat64(Model *m, const uint32_t *refs, size_t n, double *values, size_t many)
-{
-    return many == n ? get(m, refs, n, values) : ERROR;
-}
-
-int fmi3SetFloat64(Model *m, const uint32_t *refs, size_t n, const double *v, size_t many)
-{
-    return many == n ? set(m, refs, n, v) : ERROR;
-}
-
-int fmi3GetBoolean(Model *m, const uint32_t *refs, size_t n, bool *values, size_t many)
-{
-    for (size_t k = 0; k < n; ++k) {
-        if (refs[k] != NUMBERS || many != n) return ERROR;
-        values[k] = m->manual;
-    }
-    return OK;
-}
-
-int fmi3SetBoolean(Model *m, const uint32_t *refs, size_t n, const bool *v, size_t many)
-{
-    for (size_t k = 0; k < n; ++k) {
-        if (refs[k] != NUMBERS || many != n) return ERROR;
-        m->manual = v[k];
-    }
-    return OK;
-}
-
-int fmi3DoStep(Model *m, double t, double h, bool no, bool *event, bool *stop, bool *early,
-               double *last)
-{
-    (void)no;
-    const int status = advance(m, t, h);
-    *event = *stop = *early = false;
-    *last = m->t;
-    return status;
-}
-"""
-
-SECOND = """
-const char *fmi2GetTypesPlatform(void) { return "default"; }
-
-const char *fmi2GetVersion(void) { return "2.0"; }
-
-void *fmi2Instantiate(void) { return make(); }
-
-void fmi2FreeInstance(Model *m) { free(m); }
-
-int fmi2Reset(Model *m) { reset(m); return OK; }
-
-int fmi2SetupExperiment(Model *m, int b, double e, double t, int s, double end)
-{
-    (void)b; (void)e; (void)s; (void)end;
-    m->t = t;
-    return OK;
-}
-
-int fmi2ExitInitializationMode(Model *m) { begin(m); return OK; }
-
-int fmi2GetReal(Model *m, const uint32_t *refs, size_t n, double *values)
-{
-    return get(m, refs, n, values);
-}
-
-int fmi2SetReal(Model *m, const uint32_t *refs, size_t n, const double *values)
-{
-    return set(m, refs, n, values);
-}
-
-int fmi2GetBoolean(Model *m, const uint32_t *refs, size_t n, int *values)
-{
-    for (size_t k = 0; k < n; ++k) {
-        if (refs[k] != NUMBERS) return ERROR;
-        values[k] = m->manual;
-    }
-    return OK;
-}
-
-int fmi2SetBoolean(Model *m, const uint32_t *refs, size_t n, const int *values)
-{
-    for (size_t k = 0; k < n; ++k) {
-        if (refs[k] != NUMBERS) return ERROR;
-        m->manual = values[k] != 0;
-    }
-    return OK;
-}
-
-int fmi2DoStep(Model *m, double t, double h, int no) { (void)no; return advance(m, t, h); }
-"""
-
 _TYPES = "Float32 Int8 UInt8 Int16 UInt16 Int32 UInt32 Int64 UInt64 String Binary Clock"
 _NONE3 = """
 InstantiateModelExchange InstantiateScheduledExecution GetNumberOfVariableDependencies
@@ -411,8 +218,8 @@ def interface(program: Any, name: str, version: str) -> str:
     stubs = [f"NONE(fmi{major}{f})" for f in NONE[major]] + [
         f"FINE(fmi{major}{f})" for f in FINE[major]
     ]
-    text = CORE.lstrip().format(**words)
-    return "\n".join([text, _exported(THIRD if major == "3" else SECOND), "", *stubs, ""])
+    calls = _exported(template(f"fmi{major}.c"))
+    return "\n".join([template("fmi.c", **words), calls, "", *stubs, ""])
 
 
 def _exported(text):

@@ -22,6 +22,7 @@ from jaxtank.core.tables import is_time, numbers, read_table, seconds, unit_name
 from jaxtank.core.text import printable
 from jaxtank.core.units import canonical
 from jaxtank.export.fmi import compiler, library, place_of
+from jaxtank.export.statements import template
 
 GROUPS = re.compile(r"(y|h|r|dr|ddr|applied|u|pump)(?:\d+|_.+)", re.IGNORECASE)
 """Names of columns: of "y1" or "y_LT101" the first part is the signal."""
@@ -194,36 +195,6 @@ def _rates(r, dt):
     return np.where(same(before) | same(after), ahead, 0.0)
 
 
-HARNESS = """
-#include "{name}.h"
-static {name}_state state;
-static void copy({name}_real *a, const double *b, int n) {{
-    for (int i = 0; i < n; ++i) a[i] = ({name}_real)b[i];
-}}
-#define OUT __attribute__((visibility("default")))
-OUT void sizes(int *n) {{ n[0] = {upper}_TANKS; n[1] = {upper}_OUTPUTS; n[2] = {upper}_PUMPS; }}
-OUT const char *unit(int i) {{ return {units}; }}
-OUT double period(void) {{ return {name}_dt; }}
-OUT void begin(const double *y) {{
-    {name}_real a[{upper}_TANKS];
-    copy(a, y, {upper}_TANKS);
-    {name}_init(&state, 0, a, 0);
-}}
-OUT void step(double t, const double *y, const double *r, const double *dr, const double *ddr,
-              double *u) {{
-    {name}_real a[{upper}_TANKS], b[{upper}_OUTPUTS], c[{upper}_OUTPUTS], d[{upper}_OUTPUTS],
-        e[{upper}_PUMPS];
-    copy(a, y, {upper}_TANKS);
-    copy(b, r, {upper}_OUTPUTS);
-    copy(c, dr, {upper}_OUTPUTS);
-    copy(d, ddr, {upper}_OUTPUTS);
-    {name}_step(&state, 0, ({name}_real)t, a, b, c, d, 0, e);
-    for (int i = 0; i < {upper}_PUMPS; ++i) u[i] = e[i];
-}}
-"""
-"""Functions of double precision around an export in C."""
-
-
 @contextlib.contextmanager
 def _loaded(binary, suffix) -> Iterator[ctypes.CDLL]:
     """A shared library in this process, which stays loaded."""
@@ -244,7 +215,8 @@ def _load_c(path):
     files = {p.name: p.read_text(errors="replace") for p in (path, header)}
     stated = f" {name}_units[" in files[header.name]
     units = f"{name}_units[i]" if stated else "(void)i, (const char *)0"
-    harness = HARNESS.format(name=name, upper=name.upper(), units=units)
+    # functions of double precision around the export
+    harness = template("replay.c", name=name, upper=name.upper(), units=units)
     binary = library({**files, "replay.c": harness})
     if binary is None:
         raise InputError(
@@ -269,25 +241,13 @@ def _load_c(path):
         yield Export(code.period(), (sizes[0], sizes[1], sizes[2]), run, units)
 
 
-SCRIPT = """
-const law = require(process.argv[1]);
-if (process.argv[2] === "facts")
-    console.log(JSON.stringify([law.dt, law.tanks, law.outputs, law.pumps, law.units || []]));
-else {
-    const d = JSON.parse(require("fs").readFileSync(0)), s = law.init(d.y[0]);
-    const step = (t, k) => law.step(s, t, d.y[k], d.r[k], d.dr[k], d.ddr[k]);
-    console.log(JSON.stringify(d.t.map(step)));
-}
-"""
-
-
 @contextlib.contextmanager
 def _load_javascript(path):
     if shutil.which("node") is None:
         raise InputError(f"{printable(path.name)}: needs node, which runs JavaScript")
 
     def node(what, text=""):
-        words = ["node", "-e", SCRIPT, str(path.resolve()), what]
+        words = ["node", "-e", template("replay.js"), str(path.resolve()), what]
         done = subprocess.run(words, input=text, capture_output=True, text=True, check=False)
         with contextlib.suppress(ValueError):
             return json.loads(done.stdout) if done.returncode == 0 else None

@@ -1,10 +1,13 @@
 """The statements of exported code, on scalars: output of lowering, input of the printers."""
 
 import math
+import string
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 REAL, WHOLE, TRUTH = "real", "whole", "truth"
+MATRIX_OPERATIONS = ("product", "cholesky", "forward", "backward", "solve")
 
 
 class Ref(NamedTuple):
@@ -103,6 +106,17 @@ class Loop(NamedTuple):
 
 
 Statement = Define | Array | Each | Matrix | Store | Until | Loop
+
+
+def template(file: str, **words: Any) -> str:
+    """Return a file of the folder templates, with `words` in place of ${word}."""
+    text = (Path(__file__).parent / "templates" / file).read_text("utf-8")
+    return string.Template(text).substitute(words) if words else text
+
+
+def parts(file: str) -> list[str]:
+    """Return the functions of a file of the folder templates, a line break before each."""
+    return [f"\n{part.strip()}" for part in template(file).split("\n\n")]
 
 
 def names(entries: Iterable) -> set[str]:
