@@ -4,8 +4,10 @@ import contextlib
 import importlib
 import importlib.util
 import sys
+from pathlib import Path
 from typing import Any
 
+import matplotlib
 import matplotlib.pyplot as plt
 from matplotlib.patches import Rectangle
 
@@ -49,20 +51,14 @@ SHARE = "#56B4E9"
 WATER, GLASS = "#9CCEEB", "0.35"
 """Colours of the liquid and of the walls of a tank in drawings of a rig."""
 
-STYLE: dict[Any, Any] = {
-    "font.size": 9,
-    "axes.titlesize": 9,
-    "axes.grid": True,
-    "grid.color": "0.9",
-    "grid.linewidth": 0.6,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "legend.frameon": False,
-    "legend.fontsize": 8,
-    "figure.dpi": 110,
-    "savefig.dpi": 130,
-    "svg.fonttype": "none",
-}
+
+def _settings(file: str) -> dict[Any, Any]:
+    """The settings of matplotlib in a style sheet of this folder."""
+    sheet = Path(__file__).with_name(file)
+    return dict(matplotlib.rc_params_from_file(sheet, use_default_template=False))
+
+
+STYLE = _settings("screen.mplstyle")
 
 WIDTHS = {1: 3.5, 2: 7.16}
 """{columns of a journal: width of a figure [inch]}: one column, and two with the gap between them
@@ -75,22 +71,7 @@ TALLEST = 9.0
 PANEL = 2.2
 """Width of a panel in a figure for a journal, at least [inch]."""
 
-PRINT: dict[Any, Any] = {
-    "font.family": "STIXGeneral",  # like Times, and comes with matplotlib
-    "mathtext.fontset": "stix",
-    "text.usetex": False,
-    "font.size": 8,
-    "axes.titlesize": 8,
-    "figure.titlesize": 8,
-    "legend.fontsize": 7.5,
-    "xtick.labelsize": 7.5,
-    "ytick.labelsize": 7.5,
-    "axes.linewidth": 0.6,
-    "hatch.linewidth": 0.6,
-    "savefig.dpi": 300,
-    "svg.fonttype": "path",  # the same wherever it is set
-    "pdf.fonttype": 42,
-}
+PRINT = _settings("journal.mplstyle")
 """Settings of figures for a journal, over STYLE: letters of 7.5 to 8 points, no LaTeX."""
 
 _COLUMNS: list[int] = []  # of a journal, innermost last: figures are made for it

@@ -1,7 +1,9 @@
 """Values of a rig file, read and written by their Key: kinds, ranges, units, lines of TOML."""
 
 import contextlib
+import tomllib
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -139,76 +141,7 @@ UNTURNED = {
 }
 """{whether a kind without `action` switches: what turns its inputs}."""
 
-WORDS = {
-    "cone": '[[tank]] shape = "cone" with height and diameter',
-    "sphere": '[[tank]] shape = "sphere" with diameter',
-    "cylinder": "[[tank]] diameter and rim",
-    "radius": "diameter",
-    "sp": "[reference] initial and changes",
-    "pv": "[plant] outputs: the tanks whose levels are controlled",
-    "op": "[[pump]] or [[valve]], whose input the controller moves",
-    "mv": "[[pump]] or [[valve]], whose input the controller moves",
-    "kp": "Kc",
-    "ki": "Ti: Kp/Ki of a controller Kp e + Ki integral(e)",
-    "kd": "Td: Kd/Kp of a controller with Kd de/dt",
-    "tau_i": "Ti",
-    "tn": "Ti",
-    "reset": "Ti",
-    "tau_d": "Td",
-    "tv": "Td",
-    "action": "action of [controller]: direct or reverse",
-    "transmitter": "[[sensor]] with tank, unit, span",
-    "range": "span of [[sensor]], low and high of [[pump]]",
-    "bottom_area": "area",
-    "max_flow": "high: the largest input, with units = [length, flow]",
-    "capacity": "rim and area of [[tank]], high of [[pump]]",
-    "duration": "duration at the top of the file",
-    "dt": "dt at the top of the file",
-    "sample_time": "dt at the top of the file",
-    "initial_level": "level",
-    "setpoint": "[reference] initial and changes",
-    "outlet": "drain of [[tank]], or a [[valve]] where its opening is an input",
-    "leak": "inflow of [[tank]], below 0",
-    "demand": "inflow of [[tank]], below 0",
-    "weir": "[[spill]] with port",
-    "opening": "initial of [[valve]]",
-    "cv": "area of [[valve]]: flow = area sqrt(2 g head)",
-    "kv": "area of [[valve]]: flow = area sqrt(2 g head)",
-    "resistance": "linear of [[orifice]], drain_linear of [[tank]]",
-    "power": "exponent of [[orifice]], drain_exponent of [[tank]]",
-    "head": "curve_head of [[pump]]: [[lift, share of the flow], ...]",
-    "reservoir": "[[tank]] with a large area",
-    "source": "from",
-    "sink": "to",
-    "flow": "curve of [[pump]]: [[input, flow], ...]",
-    "hysteresis": "on or off: levels at which an input goes to high, and to low",
-    "dead_time": "delay",
-    "deadtime": "delay",
-    "stroke_time": "rate",
-    "stroke": "low or high",
-    "check_valve": "check",
-    "safety": "[safety_filter]",
-    "pump.ramp": "rate",
-    "pump.flow": "gain or curve: flow per unit of the input, or [[input, flow], ...]",
-    "pump.head_curve": "curve_head: [[lift, share of the flow], ...]",
-    "pump.deadband": "dead_zone",
-    "valve.r": "rangeability",
-    "valve.stroke": 'rate: the full travel over its time, as "1.667 %/s" of 60 s',
-    "valve.stroke_time": 'rate: the full travel over its time, as "1.667 %/s" of 60 s',
-    "valve.curve": "characteristic: [[opening from 0 to 1, share], ...]",
-    "valve.diameter": "area: C pi/4 diameter^2, C the discharge coefficient",
-    "orifice.diameter": "area: C pi/4 diameter^2, C the discharge coefficient",
-    "pipe.diameter": "area: C pi/4 diameter^2, C the discharge coefficient",
-    "pipe.from": "between: the two tanks that it joins",
-    "pipe.to": "between: the two tanks that it joins",
-    "inflow.flow": "changes: [[time, flow], ...]; inflow of [[tank]] where it is constant; or time,"
-    " duration and volume of a pulse",
-    "inflow.initial": "changes: [[time, flow], ...]; inflow of [[tank]] where it is constant",
-    "tank.width": "area",
-    "tank.drain_diameter": "drain: C pi/4 diameter^2, C the discharge coefficient",
-    "max": "high",
-    "min": "low",
-}
+WORDS = tomllib.loads(Path(__file__).with_name("words.toml").read_text("utf-8"))
 """{word of the field that is no key, or "table.word": what to write}."""
 
 
