@@ -86,9 +86,7 @@ def solve_soft(H, f, A, l, u, G, room, penalty, span):
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(5,))
 def minimum(H, f, G, l, u, active):
-    """Return the Face of the minimum. The first `active` rows are the last variables, which start
-    at their lower end, 0, with f > 0; H joins them to no others.
-    """
+    """Return the Face of the minimum; the first `active` rows are slacks that start at 0."""
     size, rows = f.shape[0], G.shape[0]
     index, slots = np.arange(rows), np.arange(size)
     whole = jnp.pad(_inverse(H[: size - active, : size - active]), (0, active))

@@ -62,9 +62,7 @@ def margins(loop: OpenLoop, slopes: bool = True) -> Margins:
 
 
 def _is_stable(still: OpenLoop, form: OpenLoop) -> Any:
-    """True if the closed loop is stable; with a dead time by the number of its unstable poles: the
-    winding of its characteristic polynomial, as a share of z^degree, along |z| = 1 + RADIUS.
-    """
+    """True if the closed loop is stable; with dead time by the winding along |z| = 1 + RADIUS."""
     if not np.any(still.dead):
         return fr.is_stable(still.A - still.B @ still.C)
     slow = jnp.exp(jnp.linspace(np.log(1e-3 * fr.RADIUS), np.log(LOWEST * np.pi), 24)[:-1])

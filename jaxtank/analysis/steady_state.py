@@ -527,9 +527,7 @@ def _roots_of(levels, knee):
 
 
 def levels_of(speeds: Any, weight: Any, knee: Any) -> Any:
-    """Return the levels of efflux speeds v: v |v|/(2 g) = v |v|/weight, and below the knee by the
-    inverse of `smooth_sqrt`.
-    """
+    """Return the levels of efflux speeds v: v |v|/weight; of roots below the knee their inverse."""
     root = np.clip(np.abs(speeds) / np.sqrt(weight * knee), 0.0, 1.0)
     laminar = knee * np.sign(speeds) * (1.5 - np.sqrt(2.25 - 2.0 * root))
     return np.where(root < 1.0, laminar, speeds * np.abs(speeds) / weight)

@@ -1,6 +1,4 @@
-"""Explicit nonlinear predictive control of tanks that each have their own pump, with a disturbance
-estimate (gouta2022, sec. 3 and 4).
-"""
+"""Explicit nonlinear predictive control, a pump for each tank (gouta2022, sec. 3 and 4)."""
 
 from collections.abc import Sequence
 from typing import Any

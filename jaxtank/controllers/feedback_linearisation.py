@@ -1,6 +1,4 @@
-"""Inversion that both controllers of gouta2015 share: from demanded output accelerations to
-voltages.
-"""
+"""Inversion that controllers share: from demanded output accelerations to voltages."""
 
 from typing import Any, NamedTuple
 

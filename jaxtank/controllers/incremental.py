@@ -1,6 +1,4 @@
-"""Base of the linear predictive controllers of khalid: the incremental model, the quadratic cost,
-the constraints, and the sampled controller.
-"""
+"""Base of the linear predictive controllers of khalid: incremental model, cost, constraints."""
 
 import abc
 import dataclasses

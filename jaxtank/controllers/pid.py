@@ -1,6 +1,4 @@
-"""PI, PID and fractional PI, one loop per pump, with or without feed-forward (gouta2022, Table 4;
-gouta2022 notes S4.5).
-"""
+"""PI, PID and fractional PI, one loop per pump (gouta2022, Table 4; gouta2022 notes S4.5)."""
 
 import functools
 import operator

@@ -1,7 +1,4 @@
-"""A controller and its observer as one source file without dependencies: `export` and `register`.
-
-The file is made from the step function that is simulated.
-"""
+"""A controller and its observer as one source file, made from the step that is simulated."""
 
 import re
 from collections.abc import Callable, Collection, Mapping

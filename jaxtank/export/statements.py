@@ -228,9 +228,7 @@ def of_rank(
 
 
 def refs(statements: Iterable[Statement], entries: Iterable = ()) -> set[Ref]:
-    """Return every Ref that statements and entries read, without those that a loop has inside; of
-    an array that is read at a variable index, the array and the index.
-    """
+    """Return every Ref that statements and entries read, with arrays and indices apart."""
     read = {e for e in entries if isinstance(e, Ref)}
     for s in statements:
         if isinstance(s, Loop):

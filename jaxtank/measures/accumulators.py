@@ -1,7 +1,4 @@
-"""State of the measures in the time loop: running sums, extremes and times.
-
-`measures.catalogue` names what it reads of them.
-"""
+"""State of the measures in the time loop: running sums, extremes and times."""
 
 import operator
 from collections.abc import Callable
@@ -205,15 +202,12 @@ def settled(last, outside):
 
 
 def _moves(r, before):
-    """Whether a setpoint has changed by more than rounding: compiled code may fuse k dt - t0, that
-    of a page does not.
-    """
+    """Whether a setpoint has changed by more than rounding, by which pages and XLA differ."""
     return magnitude(r - before) > 4.0 * jnp.finfo(jnp.result_type(r)).eps * magnitude(r)
 
 
 def _update_plateau(run, state, sample, context):
-    """Per output (setpoint, |error|, time and whether it was constant at the last sample; the
-    largest error at the end of a plateau so far, its time)."""
+    """Per output (setpoint, |error|, time, constant; largest error at a plateau's end, when)."""
 
     def update(r, e, before):
         setpoint, error, time, constant, worst, when = before

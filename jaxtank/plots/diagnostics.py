@@ -1,7 +1,4 @@
-"""Pictures of phase planes, saturation, estimates, margins and trade-offs.
-
-Each function draws on given matplotlib axes and returns them.
-"""
+"""Pictures of phase planes, saturation, estimates, margins and trade-offs, on given axes."""
 
 import numpy as np
 
@@ -138,9 +135,7 @@ def margins(ax, rows):
 
 
 def tradeoff(ax, points, measure, unit, cost_unit):
-    """Draw the best objective over the limit of a measure; crosses: none that holds it
-    was found.
-    """
+    """Draw the best objective over the limit of a measure; crosses: none that holds it."""
     points = sorted(points, key=lambda p: p["limit"])
 
     def plot(some, marker, **look):

@@ -71,9 +71,7 @@ def place(plant):
 
 
 def jets(plant, where):
-    """Return [(tank, path ((x, y), ...), name of the outlet's area)] of the free jets from the
-    bottoms of the tanks: into the tanks below, and into the basin. A closed orifice has none.
-    """
+    """Return [(tank, path ((x, y), ...), name of its area)] of the free jets that are open."""
     paths, orifices = [], np.asarray(plant.orifice, dtype=float)
     for i, box in enumerate(where.boxes):
         links = [(sink, k) for k, (source, sink) in enumerate(plant.links) if source == i]

@@ -1,7 +1,4 @@
-"""A large rig at a glance: tanks as cells in reading order, the fullest ones named.
-
-Draws on given matplotlib axes.
-"""
+"""A large rig at a glance: tanks as cells in reading order, the fullest ones named."""
 
 import math
 

@@ -1,8 +1,4 @@
-"""Pictures of runs over time, of a search and its objective, and of sensitivities.
-
-Each function draws on given matplotlib axes and returns them; `responses` and `panels` make whole
-figures.
-"""
+"""Pictures of runs over time, of a search and its objective, and of sensitivities."""
 
 import itertools
 import textwrap
@@ -167,9 +163,7 @@ def _other_tanks(loop, trajectories):
 
 
 def _worst_outputs(loop, trajectories):
-    """([(output, its tank)], pumps, a line of the title on those left out): of many, the outputs
-    with the largest errors and the pumps that move most.
-    """
+    """([(output, its tank)], pumps, a line of the title on those left out), the worst of many."""
     outputs, pumps = list(enumerate(loop.plant.outputs)), list(range(loop.plant.pumps))
     note = ""
     if len(outputs) > SHOWN:

@@ -94,9 +94,7 @@ def png(figure: Any) -> bytes:
 
 
 def for_journal(drawings: Mapping[str, Any], columns: int = 1) -> dict[str, bytes]:
-    """Return {file name: bytes} of {name: figure} as SVG and as PNG of 300 dpi, in the width of one
-    or two columns of a journal; the figures are closed.
-    """
+    """Return {file name: bytes} of {name: figure} as SVG and PNG for a journal; closes them."""
     # Figures that `style.for_print` has not made are scaled to that width.
     files: dict[str, bytes] = {}
     for name, figure in drawings.items():

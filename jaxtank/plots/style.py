@@ -100,9 +100,7 @@ def width(usual):
 
 
 def beside(most):
-    """Return how many panels stand beside each other: as many as a journal's columns take, or
-    `most`.
-    """
+    """Return how many panels stand beside each other: `most`, or what a journal's columns take."""
     return min(most, max(1, int(width(0.0) / PANEL))) if _COLUMNS else most
 
 
@@ -176,9 +174,7 @@ def grid(rows, columns, size, **more):
 
 
 def picture(draw, size, rows=1, columns=1, legend=0, title="", **more):
-    """Return a figure of `size` [inch] on whose axes `draw` has drawn; `legend`: most columns of
-    one legend below, with each label once, 0 for none.
-    """
+    """Return a figure of `size` [inch] that `draw` draws on; `legend`: columns of one, or 0."""
     with styled():
         figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", **more)
         draw(axes)

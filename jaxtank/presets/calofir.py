@@ -1,7 +1,4 @@
-"""Calofir and others: two coupled tanks in metres, backstepping.
-
-The derivation is in `notes/calofir.md`.
-"""
+"""Calofir and others: two coupled tanks in metres, backstepping (notes/calofir.md)."""
 
 import dataclasses
 import functools

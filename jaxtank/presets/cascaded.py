@@ -1,7 +1,4 @@
-"""The public benchmark "Cascaded tanks with overflow" (Schoukens, Mattsson, Wigren, Noel 2016).
-
-Two tanks, one pump, all in volts. The derivation is in `notes/cascaded.md`.
-"""
+""" "Cascaded tanks with overflow" (Schoukens, Mattsson, Wigren, Noel 2016; notes/cascaded.md)."""
 
 import functools
 from typing import Any

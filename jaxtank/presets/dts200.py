@@ -1,7 +1,4 @@
-"""The three-tank laboratory rig DTS200: two pumps, two pipes, leaks; PI.
-
-The derivation is in `notes/dts200.md`.
-"""
+"""The three-tank laboratory rig DTS200: two pumps, two pipes, leaks; PI (notes/dts200.md)."""
 
 import functools
 from typing import Any

@@ -1,7 +1,4 @@
-"""Gouta, Hadj Said, M'sahli (2015): state-coupled four-tank, NGPC and backstepping.
-
-The derivation is in `notes/gouta2015.md`.
-"""
+"""Gouta, Hadj Said, M'sahli (2015): state-coupled four-tank (notes/gouta2015.md)."""
 
 import dataclasses
 import functools

@@ -1,7 +1,4 @@
-"""Gouta, Al-Ashek, Saad (2022): coupled two-tank rig, ENMPC, CHADPC; PI, PID, fractional PI.
-
-The derivation is in `notes/gouta2022.md`.
-"""
+"""Gouta, Al-Ashek, Saad (2022): coupled two-tank rig, ENMPC, CHADPC, PI (notes/gouta2022.md)."""
 
 import dataclasses
 import functools

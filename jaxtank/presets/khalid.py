@@ -1,7 +1,4 @@
-"""Khalid, Kadri: linear predictive control of coupled tanks, GPC and Laguerre functions.
-
-The derivation is in `notes/khalid.md`.
-"""
+"""Khalid, Kadri: coupled tanks, GPC and Laguerre functions (notes/khalid.md)."""
 
 import functools
 import math

@@ -1,7 +1,4 @@
-"""Mirakhorli, Farrokhi (2016): non-minimum phase quadruple tank, sliding mode, state feedback.
-
-The derivation is in `notes/mirakhorli.md`.
-"""
+"""Mirakhorli, Farrokhi (2016): non-minimum phase quadruple tank (notes/mirakhorli.md)."""
 
 import dataclasses
 import functools

@@ -35,9 +35,7 @@ from jaxtank.signals.setpoints import Ramps, ramps
 
 
 class Role(NamedTuple):
-    """A part of the loop: abstract class, {kind: class}, fields that its section may leave out, and
-    the class that needs no section.
-    """
+    """A part of the loop; `kept`: fields its section may leave out; `default`: needs no section."""
 
     base: type
     classes: dict

@@ -444,9 +444,7 @@ class Line(NamedTuple):
 
 
 class Block(NamedTuple):
-    """A table of a rig file; title: "[values]" or "" for lines that go on; prose: sentences above
-    it; on: False: commented out as a whole.
-    """
+    """A table of a rig file; prose: sentences above it; on: False where it is commented out."""
 
     title: str
     lines: list
@@ -457,9 +455,7 @@ class Block(NamedTuple):
 def lines_of(
     section: Section, values: Mapping[str, Any], units=DEFAULT, names: Sequence[str] = ()
 ) -> list[Line]:
-    """Return the lines of a section's keys that have a value, in the order of its schema; names:
-    those of the tanks.
-    """
+    """Return the lines of a section's keys that have a value; names: those of the tanks."""
     lines = []
     for key in (key for key in section.keys if values.get(key.name) is not None):
         value, meta = values[key.name], key.meta(units)

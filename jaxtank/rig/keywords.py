@@ -84,9 +84,7 @@ def Rig(**tables: Any) -> Case:
 
 
 def _plain(value: Any) -> Any:
-    """A value as the reader of TOML gives it: arrays and tuples as lists, paths as texts, without
-    None.
-    """
+    """A value as the reader of TOML gives it: lists, paths as texts, without None."""
     if isinstance(value, Mapping):
         return {k: _plain(v) for k, v in value.items() if v is not None}
     if isinstance(value, list | tuple):

@@ -1,6 +1,4 @@
-"""A rig described tank by tank in a rig file: [[tank]], [[orifice]], [[pipe]], [[spill]], [[pump]],
-[[valve]] and [plant]; read to a Case and written from a loop.
-"""
+"""A rig described tank by tank in a rig file: read to a Case and written from a loop."""
 
 import dataclasses
 import functools
@@ -386,9 +384,7 @@ FLOW_MARGIN = 2.0
 
 
 def _flow_gain(where, gain, flow, units):
-    """The flow per unit of an input that is a flow itself, of a gain that is either that (within
-    FLOW_MARGIN) or the share of the flow that the pump delivers.
-    """
+    """The flow per unit of an input that is a flow, of a gain that may be a share of it."""
     length, drive = units
     near = lambda size: 1 / FLOW_MARGIN <= size <= FLOW_MARGIN
     if gain <= 0.0 or (gain != 1.0 and near(gain / flow)):
@@ -404,10 +400,7 @@ def _flow_gain(where, gain, flow, units):
 
 
 def _check_pumps(rows, pumps, units):
-    """Raise InputError for limits in the wrong order, for a split without two tanks, for a pump
-    that joins no tank, and for curves that turn; gains of inputs that are flows become those of the
-    rig.
-    """
+    """Raise InputError for pumps that cannot be; gains of inputs that are flows are completed."""
     drive, flow = units[1], flow_per_input(units)
     for i, (pump, row) in enumerate(zip(pumps, rows)):
         pump.setdefault("to", (None, None))
@@ -450,9 +443,7 @@ def _check_monotone(label, points, least=None):
 
 
 def _check_valves(valves, units):
-    """Raise InputError for a valve whose stops or characteristic are none; the upper stop of one
-    that has none is full open.
-    """
+    """Raise InputError for stops or characteristics that are none; full open is the upper stop."""
     full, drive = full_open(units), unit(SECTIONS["valve"]["high"].meta(units))
     for i, valve in enumerate(valves):
         high = valve.setdefault("high", full)
@@ -510,9 +501,7 @@ def _values_of(loop, name, i):
 
 
 def _sensor_entries(loop, tanks):
-    """The tables [[sensor]] of a loop: names, and spans in its unit of length; the noise is theirs
-    instead of the tanks'.
-    """
+    """The tables [[sensor]] of a loop: names, spans, and the noise instead of the tanks'."""
     low, high = (getattr(loop.sensor, end, None) for end in ("low", "high"))
     rows = []
     for i in range(loop.plant.tanks):

@@ -1,6 +1,7 @@
 """From a rig file to a Case."""
 
 import dataclasses
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,7 +28,6 @@ from jaxtank.rig.entry import (
     sizes_of,
     unknown_key,
 )
-from jaxtank.rig.lines import line_of, lines_of
 from jaxtank.rig.schema import INPUTS, LISTS, SECTIONS, TANKWISE
 from jaxtank.rig.sensors import check_stated, complete_rows, sensor_rows, with_sensors
 from jaxtank.rig.values import (
@@ -40,6 +40,49 @@ from jaxtank.rig.values import (
     with_bottom,
     with_models,
 )
+
+_HEADER = re.compile(r"\s*\[(\[?)\s*\"?([\w.-]+)\"?\s*\]")
+_KEY = re.compile(r"\s*\"?([\w.\[\]-]+)\"?\s*=")
+_TEXT = re.compile(r"\"(?:\\.|[^\"\\])*\"|'[^']*'")
+
+Place = tuple[str, int | None, str | None]
+"""(section, index of its table from 0, key); None where there is none."""
+
+
+def lines_of(text: str) -> dict[Place, int]:
+    """Return {place: number of its line, from 1} of a rig file, as far as a scan by lines finds."""
+    lines: dict[Place, int] = {}
+    counts: dict[str, int] = {}
+    section, index, depth = "", None, 0
+    for number, line in enumerate(text.splitlines(), 1):
+        bare = _TEXT.sub('""', line).partition("#")[0]
+        header, key = _HEADER.match(line), _KEY.match(line)
+        if header and depth == 0:
+            section, index = header[2], None
+            if header[1]:
+                index = counts[section] = counts.get(section, -1) + 1
+            lines.setdefault((section, index, None), number)
+        elif key and depth == 0:
+            lines.setdefault((section, index, key[1]), number)
+        if depth == 0 and key and not section:
+            inline = key[1]
+        if not section and (key or depth):  # tank = [{ ... }, { ... }]
+            for _ in range(bare.count("{")):
+                counts[inline] = counts.get(inline, -1) + 1
+                lines.setdefault((inline, counts[inline], None), number)
+            lines.setdefault((inline, None, None), number)
+        depth = max(depth + bare.count("[") - bare.count("]") if not header else 0, 0)
+    return lines
+
+
+def line_of(lines: dict[Place, int], place: Any) -> int | None:
+    """Return the line of a place, else of its table; None where that is not known."""
+    section, index, key = place
+    names = [section, "sensor"] if section == "sensors" else [section]
+    names += {"controller": ["law"], "inflow": ["pour"]}.get(section, [])
+    tries = [(n, i, k) for k in (key, None) for n in names for i in (index, None)]
+    tries += [("", None, section), ("", None, key)]
+    return next((lines[t] for t in tries if t in lines), None)
 
 
 def open_case(name: str) -> Case:
@@ -232,9 +275,7 @@ TUNING = {
 
 
 def _check_twice(table):
-    """Raise InputError for numbers of tanks and pumps that their own tables and the section of what
-    they belong to, [disturbance], [sensor] or [actuator], give differently; all at once.
-    """
+    """Raise InputError for numbers that [[tank]] or [[pump]] and another section both give."""
     problems = []
     for name in ("tank", *INPUTS):
         entries = table.get(name, [])
@@ -258,9 +299,7 @@ def _check_twice(table):
 
 
 def start_of(table):
-    """Return the Case of the tables that build: case or tanks, controller, observer,
-    instruments, reference, disturbance and faults; before any value is set.
-    """
+    """Return the Case of the tables that build it, before any value is set."""
     problems = Problems()
     case, top = _start(table, problems)
     loop, changes = case.loop, {}
@@ -332,9 +371,7 @@ def _check_others(table, problems):
 
 
 def _top(table):
-    """The values at the top of a rig file; InputError for a section or key that is unknown or of
-    another kind, and unless there is either a case or a tank.
-    """
+    """The values at the top of a rig file; InputError for unknown or misplaced sections or keys."""
     first = SECTIONS[""]
     sections = {n: section for n, section in SECTIONS.items() if n and "." not in n}
     table = {n: v for n, v in table.items() if n != "sensors" or isinstance(v, list)}

@@ -1,6 +1,4 @@
-"""What moves a rig besides its controller, as tables of a rig file: [reference], [reference.sine],
-[inputs], [disturbance], [[inflow]] and [[fault]].
-"""
+"""[reference], [inputs], [disturbance], [[inflow]] and [[fault]] of a rig file as signals."""
 
 import dataclasses
 
@@ -94,9 +92,7 @@ def _columns_of(where, table):
 
 
 def _named(label, changes, kind, sizes, unit):
-    """Changes with the numbers of outputs or pumps for their names, and of times and values with a
-    unit; of one output or pump a change may have none.
-    """
+    """Changes with numbers for the names of outputs or pumps, and for texts with a unit."""
     rows, alone = [], (sizes.outputs if kind == "output" else sizes.pumps) == 1
     for change in changes if isinstance(changes, list) else ():
         if isinstance(change, list) and len(change) == 2 and alone:
@@ -139,9 +135,7 @@ def _changes(label, changes, words, channels):
 
 
 def _plain_changes(changes, channels):
-    """`_changes` of a list that is right, by arrays: a year of hours is read at once. None of
-    another.
-    """
+    """`_changes` of a list that is right, by arrays, for a year of hours; None of another."""
     if not isinstance(changes, list) or not changes:
         return None
     if any(type(row) is not list or list(map(type, row)) != [float, int, float] for row in changes):

@@ -1,6 +1,4 @@
-"""Suggestions of a complete rig file, commented out: what else could be set, each line of which can
-be used unchanged.
-"""
+"""Suggestions of a complete rig file, commented out, each of which can be used unchanged."""
 
 import numpy as np
 
@@ -106,9 +104,7 @@ def uncertain(case):
 
 
 def suggestions(case, titles):
-    """Return the Blocks of tables that a case does not have, as they could be; titles: of those
-    that it has, and names of lists that it has emptied.
-    """
+    """Return the Blocks that a case could have; titles: of those it has or has emptied."""
     titles = titles - {section.title for section in SECTIONS.values() if section.many}
     blocks = []
     for name, values in _examples(case).items():

@@ -1,6 +1,4 @@
-"""Input validation of the sections on tuning: limits, objective, what is free and
-uncertain, covariance, scenarios, columns of experiment data.
-"""
+"""Input validation of the sections on tuning, scenarios and columns of experiment data."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -73,9 +71,7 @@ def check(case: Case) -> Case:
 
 
 def check_setpoints(case: Case) -> None:
-    """Raise InputError for setpoints that a sensor whose readings end cannot read; a start below
-    them, of an empty tank, is allowed.
-    """
+    """Raise InputError for setpoints that no sensor can read; a start below them is allowed."""
     loop, reference = case.loop, steps(case.loop.reference)
     low, high = (getattr(loop.sensor, name, None) for name in ("low", "high"))
     controller = getattr(loop.controller, "law", loop.controller)
@@ -135,9 +131,7 @@ def unreachable(case: Case) -> str | None:
 
 
 def _doubtful(loop: ClosedLoop, plateaus: np.ndarray) -> np.ndarray:
-    """The plateaus that may have no steady state: of a long table not those that linear algebra
-    finds fine, or of a rig with elements or pipes the extremes and MANY of the others.
-    """
+    """The plateaus that may have no steady state; of long tables a choice."""
     plant: Any = loop.plant
     if len(plateaus) <= MANY:
         return plateaus

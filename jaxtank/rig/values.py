@@ -123,9 +123,7 @@ def _of_table(plant, kind, part, key):
 
 
 def in_unit(loop: ClosedLoop, label: str, name: str, value: Any) -> Any:
-    """Return the value of a parameter with texts such as "5 min" as numbers of its unit; of levels
-    and gains also texts in % of the span of a sensor.
-    """
+    """Return the value of a parameter with texts, as "5 min" or "80 %", as numbers of its unit."""
     meta = describe(loop, name)
     texts: Any = value if isinstance(value, (list, tuple)) else [value]
     part, _, field = split_index(name)[0].rpartition(".")

@@ -1,6 +1,4 @@
-"""Warnings about a case that can run but is hardly meant: reported by the commands, never
-refused.
-"""
+"""Warnings about a case that can run but is hardly meant: reported, never refused."""
 
 import numpy as np
 
@@ -133,9 +131,7 @@ def _overlapping(case):
 
 
 def _unseen(case):
-    """On what happens between samples: faults, a sine and pulses' windows that hold none, and
-    changes that another one follows before the next sample.
-    """
+    """On faults, sines and pulses between two samples, and changes replaced before the next one."""
     loop, clock = case.loop, case.clock
     between = f"no sample, every {clock.dt:g} s, lies in it: it has no effect"
     if loop.faults is not None:
@@ -223,9 +219,7 @@ def _pumps(case):
 
 
 def _standing(case):
-    """On pumps with a dead time, lag or rate that stood still before t = 0, though the level of the
-    start needs an input.
-    """
+    """On late pumps that stood still before t = 0, though the level of the start needs an input."""
     bank, (_, drive) = case.loop.actuator, case.loop.units
     part = getattr(case.loop.controller, "law", case.loop.controller)
     if not isinstance(part, PID) or np.shape(part.bias) != (case.loop.plant.pumps,):
@@ -280,9 +274,7 @@ def _signs(case):
 
 
 def _wrong_ways(plant, part, name, gain, acts, places):
-    """Sentences on the gain of an output whose inputs act against its level, acts: {input: 1 where
-    it fills the tank, -1 where it empties it}; places: (output, tank).
-    """
+    """Sentences on a gain whose inputs act the wrong way; acts: {input: 1 fills, -1 empties}."""
     effects = {j: -act if j in part.reversed_inputs else act for j, act in acts.items()}
     if isinstance(part, SplitRange) and {-1, 1} <= set(effects.values()):
         yield _both_ways(plant, part, acts, gain, places)

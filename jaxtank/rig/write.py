@@ -88,9 +88,7 @@ PARTS = {
 
 
 def sections(case, tankwise=False):
-    """Return the Blocks of a case: as its preset with changes where that describes it, else tank by
-    tank.
-    """
+    """Return the Blocks of a case: as its preset with changes, else tank by tank."""
     if case.loop.safety_filter is not None and case.safety is None:
         raise InputError(
             f"{case.name}: cannot be written as a rig file: its safety filter is not that of"
@@ -169,9 +167,7 @@ def _building(case, loop, origin, same):
 
 
 def _of_rig(section, number, values, units, names):
-    """The Block of a table of a rig; one without a name has a suggestion of one, and the first of
-    a list what it could have beside.
-    """
+    """The Block of a table of a rig, with suggestions of a name and of further keys."""
     block = block_of(section, values, units, names)
     if values.get("name") == "":
         block.lines[0] = block.lines[0]._replace(value=f"{section.name} {number}", on=False)
@@ -432,9 +428,7 @@ def short(case: Case) -> str:
 
 
 def _different(blocks, preset, case):
-    """The Blocks of a file that differ from its preset's, and those that SHORT names; of [values]
-    also, as suggestions, what is free, the clock and the noise.
-    """
+    """The Blocks that differ from the preset's, those of SHORT, and suggestions of [values]."""
     suggested = {name.split("[")[0] for name in case.free}
     suggested |= {"clock.dt", "clock.duration", "sensor.noise"}
     known = {line for block in preset for line in terse(block)}

@@ -63,9 +63,7 @@ def uncovered(widths: Widths) -> list[str]:
 
 
 def interval(part: Any, name: str, widths: Widths) -> tuple:
-    """Return the (least, largest) value of a leaf of an instrument, such as "actuator.lag"; 0 where
-    it is not in use.
-    """
+    """Return the (least, largest) value of a leaf such as "actuator.lag"; 0 where not in use."""
     value = getattr(part, name.partition(".")[2], None)
     return spread(0.0 if value is None else value, name, widths)
 
@@ -98,9 +96,7 @@ def intervals(widths: Widths, parts: Mapping[str, Any]) -> dict[str, tuple]:
 
 
 def widths_of(part: Any, spread: Mapping[str, float]) -> dict[str, np.ndarray]:
-    """Return the half widths of `box_of` for parameters of a plant or an instrument that may be off
-    by a share of their value.
-    """
+    """Return the half widths of `box_of` for parameters that may be off by a share."""
     widths = {}
     for name, share in spread.items():
         if not 0.0 <= share < 1.0:
@@ -126,9 +122,7 @@ def narrow_band(sensor: LevelSensor, band: np.ndarray, unit: str, widths: Widths
 
 
 def band_of(sensor: LevelSensor, sigmas: float = SIGMAS, widths: Widths = NONE) -> np.ndarray:
-    """Return the (n,) band of readings [cm]: 6 standard deviations, half an ADC step, offset, and
-    the level below which a sensor reads nothing; each the largest over the box.
-    """
+    """Return the (n,) band of readings [cm]: noise, ADC, offset, lower end; largest of the box."""
     ends = lambda leaf: interval(sensor, f"sensor.{leaf}", widths)
     band = sigmas * ends("noise")[1]
     if sensor.offset is not None:

@@ -294,9 +294,7 @@ def _ends(safety_filter):
 
 
 class _Hypotheses(NamedTuple):
-    """Assumptions on all tanks (n,): upper bounds of the levels [cm], whether a tank never
-    overflows, largest levels at t = 0 [cm]; and whether these are the case's start.
-    """
+    """Assumptions on all tanks (n,): upper bounds [cm], no overflow, largest start [cm]."""
 
     bounds: np.ndarray
     dry: np.ndarray
@@ -313,9 +311,7 @@ class _JointResult(NamedTuple):
 
 
 def _joint(rig, start, claimed):
-    """The largest set of tanks whose limits are kept together, from `start` or (None) from any
-    levels at or below the claimed limits (n,) [cm].
-    """
+    """The largest set of tanks whose limits are kept together, from `start`, or from any levels."""
     level = np.array(rig.limit)  # before volumes that enter besides
     if start is None:
         free = [i for i in range(rig.tanks) if i not in rig.held]
@@ -354,9 +350,7 @@ def _reason(rig, i, alone, together, lost):
 
 
 def _stays(rig, i, at):
-    """What keeps the level of a tank below its `reach`, whatever its pumps do: "flows", or the
-    "rim" over which the rest overflows; or "".
-    """
+    """What keeps a level below its `reach`, whatever its pumps do: "flows", the "rim", or ""."""
     top = rig.reach[i] - rig.spare[i]
     if not (at.begin[i] <= top * (1.0 + 1e-12) and math.isfinite(top) and top > 0.0):
         return ""
@@ -399,9 +393,7 @@ def _ringed(spills, tank):
 
 
 def _upper(rig, i, level, at):
-    """(why the limit of a tank is not proved with the others at their bounds, or ""; the
-    theorem).
-    """
+    """(why a limit is not proved with the other tanks at their bounds, or ""; the theorem)."""
     if not at.begin[i] <= level * (1.0 + 1e-12):
         unit = rig.unit
         return f"start at {at.begin[i]:.4g} {unit}, above the limit {level:.4g} {unit}", ""
@@ -607,9 +599,7 @@ def _late(rig, i, level, lag, at):
 
 
 def _row_inflow(rig, i, inputs):
-    """Largest rise rate [cm/s] by pumps at `inputs` (m) [V]; for a divided row, that of all pumps
-    if each used the same part of its share as the pump that uses the largest part.
-    """
+    """Largest rise rate [cm/s] by pumps at `inputs` (m) [V]; of a divided row by one share."""
     if i not in rig.divided:
         return rig.pumped(i, inputs)
     full, shares = rig.pumped(i, rig.capped), [0.0]
@@ -627,9 +617,7 @@ def _far(rig, k):
 
 
 def _sigma(kappa, lag, age):
-    """(the largest sigma [1/s] with kappa <= r(sigma) = sigma (1 - tau sigma) e^(-sigma a), 0 if
-    none; the largest r).
-    """
+    """(largest sigma with kappa <= r(sigma) = sigma (1 - tau sigma) e^(-sigma a), or 0; max r)."""
     rate = lambda sigma: sigma * (1.0 - lag * sigma) * math.exp(-sigma * age)
     slope = lambda sigma: (1.0 - 2.0 * lag * sigma) - age * sigma * (1.0 - lag * sigma)
     best = _bisected(lambda sigma: slope(sigma) > 0.0, 0.0, 1.0 / lag)

@@ -58,9 +58,7 @@ def choose(setting, noise, plant, requested, rate, bound, start):
 
 
 def _filled_levels(setting, requested, start):
-    """(n,) levels [cm] to which full pumps fill the tanks at most, no tank above its requested
-    limit or its start; inf for tanks with pipes.
-    """
+    """(n,) levels [cm] to which full pumps fill the tanks at most; inf for tanks with pipes."""
     filled, rates = np.full(len(requested), np.inf), setting.rates
     piped = {tank for tank, *_ in rates.pipes}
     for _ in filled:
@@ -119,9 +117,7 @@ def _limits(setting, heights, kappa, unsettled=frozenset()):
 
 
 def _lowering(setting, tank, limits, excess):
-    """(factor by which the levels of the tanks above must be lower, those tanks), none where that
-    does not mend the rim condition of a tank.
-    """
+    """(factor on the levels of the tanks above, those tanks); none where that does not help."""
     levels, sources = limits + setting.spare, setting.sources(tank)
     pressed = sum(most * setting.root(levels[j]) for j, most in sources)
     margin = pressed - excess  # what the sources may bring
@@ -142,9 +138,7 @@ def _rim_condition(setting, tank, heights):
 
 
 def _second_order(setting, tank, heights, kappa):
-    """(k1 [1/s], "") for a tank that the pumps above it can hold, or (0, the failed condition, ""
-    for a tank with a pump).
-    """
+    """(k1 [1/s], "") for a tank that pumps above can hold, else (0, the failed condition)."""
     if setting.rates.pumps[tank]:
         return 0.0, ""
     failure = first_failure(_second_order_conditions(setting, tank, heights, kappa))

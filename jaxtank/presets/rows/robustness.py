@@ -71,9 +71,7 @@ def of_plants(case, spread):
 
 
 def everything(run):
-    """Return ({(controller, spread): Study}, {controller: total RMS error of the nominal plant
-    [cm]}); run: as of `jaxtank.presets.paper.Preset`.
-    """
+    """Return ({(controller, spread): Study}, {controller: nominal total RMS error [cm]})."""
     studies, nominal = {}, {}
     for controller in CONTROLLERS:
         case, trajectory = run(controller, SETTING)
