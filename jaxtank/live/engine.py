@@ -467,8 +467,6 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
     loop, clock, plant = case.loop, case.clock, case.loop.plant
     free = bounds(loop, case.free) if case.free else []
     length, drive = loop.units
-    # the sliders of all loops, those of the first where several have one
-    homes = {leaf: variant.case for variant in reversed(loops) for leaf in variant.leaves}
     return {
         "case": case.name,
         "title": case.title,
@@ -477,10 +475,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         "duration": clock.duration,
         "samples": clock.samples,
         "save_every_default": max(1, clock.samples // ROWS),
-        "tanks": [
-            {"name": label_of(plant, "tank", i), "rim": rim if np.isfinite(rim) else None}
-            for i, rim in enumerate(map(float, np.broadcast_to(plant.rim, (plant.tanks,))))
-        ],
+        "tanks": _tanks(plant),
         "outputs": [int(i) for i in plant.outputs],
         "pumps": [
             {
@@ -491,7 +486,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
             }
             for j in range(plant.pumps)
         ],
-        "leaves": [leaf_of(homes[n], *n) for n in sorted(homes, key=lambda leaf: leaf[0])],
+        "leaves": _leaves(loops),
         "setpoints": _setpoints(loop),
         "draws": draws(case),
         "measures": [_measure(case, m, entries) for m, entries in loops[-1].measures.items()],
@@ -512,6 +507,18 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         "noise": draws_bursts(loop) or bool(np.any(np.asarray(loop.sensor.noise) > 0)),
         "tracks": not isinstance(loop.controller, OpenLoop | OnOff),
     }
+
+
+def _tanks(plant):
+    rims = enumerate(map(float, np.broadcast_to(plant.rim, (plant.tanks,))))
+    rim = lambda value: value if np.isfinite(value) else None
+    return [{"name": label_of(plant, "tank", i), "rim": rim(value)} for i, value in rims]
+
+
+def _leaves(loops):
+    """The sliders of all loops, those of the first where several have one."""
+    homes = {leaf: variant.case for variant in reversed(loops) for leaf in variant.leaves}
+    return [leaf_of(homes[leaf], *leaf) for leaf in sorted(homes, key=lambda leaf: leaf[0])]
 
 
 def _setpoints(loop):

@@ -66,7 +66,7 @@ def origin_of(case, source=None):
     differing = {name: value for name, value in origin if current[name] != value}
     guard: list[str] = []  # settings of the safety filter that the origin does not have
     for key, value in (case.safety or {}).items():
-        if key not in before or not np.array_equal(before[key], value):
+        if not np.array_equal(before.get(key, ()), value):
             text = f"[{','.join(map(str, value))}]" if np.ndim(value) else str(value)
             guard += ["--set", shlex.quote(f"safety_filter.{key}={text}")]
     words = " ".join([shlex.quote(source), *words])

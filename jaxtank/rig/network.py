@@ -71,19 +71,13 @@ def build(table):
     leaves, levels = leaves_of(entries["sensors"], rims, noise, levels)
     columns = _columns(entries) | {"x0": levels}
     columns |= {f"sensor.{name}": value for name, value in leaves.items()}
-    # else the tanks that the pumps fill first, or which they empty; without pumps, the valves
-    pumps = entries["pump"]
-    ends = [p.get("from") if p["to"][0] is None else p["to"][0] for p in pumps]
-    usual = tuple(dict.fromkeys(ends or [valve["from"] for valve in entries["valve"]]))
-    outputs = more.pop("outputs", usual)
+    outputs = more.pop("outputs", _usual_outputs(entries))
     if not outputs:
         raise InputError("plant.outputs = []: must be a list of at least one tank")
     if any("port" in row for row in table["spill"]):  # else such an opening would do nothing
         more = {"overflow": True, **more}
     plant = network(**_keywords(columns), **more, outputs=outputs, units=units)
-    called = ((kind, tuple(row["name"] for row in entries[kind])) for kind in ("tank", *INPUTS))
-    named = tuple((kind, names) for kind, names in called if any(names))
-    names = with_names(named, entries["sensors"], sizes.tanks)
+    names = with_names(_names(entries), entries["sensors"], sizes.tanks)
     plant = dataclasses.replace(plant, names=names)
     control = table.get("controller", {})
     return Case(
@@ -339,6 +333,18 @@ def _units(value):
         raise refusal("units", value, 'be [length, pump input], as ["cm", "V"]')
     length, drive = (name_of("units: entry", v) for v in value)
     return check_units("units", (length, drive))
+
+
+def _names(entries):
+    """((kind, names), ...) of the kinds of which one has a name."""
+    names = ((kind, tuple(row["name"] for row in entries[kind])) for kind in ("tank", *INPUTS))
+    return tuple((kind, each) for kind, each in names if any(each))
+
+
+def _usual_outputs(entries):
+    """The tanks that the pumps fill first, or which they empty; without pumps, the valves."""
+    ends = [p.get("from") if p["to"][0] is None else p["to"][0] for p in entries["pump"]]
+    return tuple(dict.fromkeys(ends or [valve["from"] for valve in entries["valve"]]))
 
 
 def _check_names(entries):

@@ -387,6 +387,12 @@ def _top(table):
             tables = f"a list of tables, [[{name}]]" if sections[name].many else "a table"
             problems.append(refusal(name, value, f"be {tables}"))
     problems.check()
+    _check_start(table)
+    return top
+
+
+def _check_start(table):
+    """Raise InputError unless a file has either a case or tanks."""
     tables = [name for name in TANKWISE if name in table]
     if "case" in table and tables:
         raise InputError(
@@ -398,7 +404,6 @@ def _top(table):
             'a rig file needs case = "paper/case" to start from (`jaxtank list` prints them), or'
             " [[tank]] to describe a rig"
         )
-    return top
 
 
 def _with_parts(case, table):

@@ -69,15 +69,7 @@ def readings(label: str, name: str, value: Any, unit: str, axes: Any, loop: Any)
     the index of one of those (of a gain an output, else a tank). Other values are returned.
     """
     texts = list(value) if isinstance(value, (list, tuple)) else [value]
-    if unit == local("V/cm", loop.units):
-        applies = lambda v: isinstance(v, str) and _GAIN.fullmatch(v.strip()) is not None
-        to_number = lambda text, i: _gain(label, text, loop, i)
-    elif unit == loop.units[0] and name in LEVELS + WIDTHS:
-        tanks = loop.plant.outputs if axes == "output" else range(loop.plant.tanks)
-        applies = is_reading
-        to_number = lambda text, i: level_of(text, spans_of(loop)[tanks[i]], name in WIDTHS)
-    else:
-        return value
+    applies, to_number = _conversion(label, name, unit, axes, loop)
     if not any(map(applies, texts)):
         return value
     apply = lambda v, i: to_number(v, i) if applies(v) else v
@@ -89,6 +81,18 @@ def readings(label: str, name: str, value: Any, unit: str, axes: Any, loop: Any)
         each = [apply(value, i) for i in range(count)]
         return each[0] if len(set(each)) == 1 else each
     return [apply(v, i) if i < count else v for i, v in enumerate(texts)]
+
+
+def _conversion(label, name, unit, axes, loop):
+    """(which texts of a level or a gain are in % or mA, function of such a text and an index)."""
+    if unit == local("V/cm", loop.units):
+        is_gain = lambda v: isinstance(v, str) and _GAIN.fullmatch(v.strip()) is not None
+        return is_gain, lambda text, i: _gain(label, text, loop, i)
+    if unit != loop.units[0] or name not in LEVELS + WIDTHS:
+        return lambda v: False, float
+    tanks = loop.plant.outputs if axes == "output" else range(loop.plant.tanks)
+    width = name in WIDTHS
+    return is_reading, lambda text, i: level_of(text, spans_of(loop)[tanks[i]], width)
 
 
 def _gain(label, text, loop, output):
@@ -262,11 +266,14 @@ def complete_rows(rows: list[dict[str, Any]], tanks: int, length: str) -> list[d
         same = [str(i + 1) for i, row in enumerate(rows) if row["tank"] == tank]
         if len(same) > 1:
             problems.append(f"sensors {' and '.join(same)} read one tank: give one of them")
-    problems += [
-        f"sensor {i + 1}: curve: its readings must increase with the level"
-        for i, row in enumerate(rows)
-        if np.any(np.diff([reading for _, reading in row.get("curve", ())]) <= 0)
-    ]
+    problems += _turning(rows)
     if problems:
         raise InputError("; ".join(problems))
     return rows
+
+
+def _turning(rows):
+    """What is wrong with the curves of rows of [[sensor]]."""
+    curves = ([reading for _, reading in row.get("curve", ())] for row in rows)
+    turning = [i for i, curve in enumerate(curves) if np.any(np.diff(curve) <= 0)]
+    return [f"sensor {i + 1}: curve: its readings must increase with the level" for i in turning]

@@ -226,8 +226,12 @@ def _inflows(entries, steady, sizes):
         steady = steady if any(flows) and not courses else None
         if courses:  # beside pulses and a table it is a table of one row
             courses += [(tank, [0.0], [flow], "hold") for tank, flow in enumerate(flows) if flow]
+    return first, steady, _table(courses, sizes.tanks) if courses else None
+
+
+def _table(courses, tanks):
     rows, between = [course[:3] for course in courses], [course[3] for course in courses]
-    return first, steady, inflow_table(sizes.tanks, rows, tuple(between)) if courses else None
+    return inflow_table(tanks, rows, tuple(between))
 
 
 def _is_course(entry):
@@ -331,13 +335,7 @@ def disturbance_tables(disturbance):
     steady, pulse = SECTIONS["disturbance"], SECTIONS["inflow"]
     if isinstance(disturbance, Sum):
         parts = [disturbance_tables(part) for part in (disturbance.first, disturbance.second)]
-        if None in parts:
-            return None
-        rows, keys = [row for part in parts for row in part], {}
-        for section, values in rows:
-            keys |= values if section is steady else {}
-        others = [row for row in rows if row[0] is not steady]
-        return [(steady, keys), *others] if keys else others
+        return None if None in parts else _merged([row for part in parts for row in part])
     if isinstance(disturbance, Constant):
         return [(steady, {"inflow": disturbance.level})]
     if isinstance(disturbance, InflowTable):
@@ -351,6 +349,15 @@ def disturbance_tables(disturbance):
     rows = zip(disturbance.events, np.asarray(disturbance.volume).tolist())
     pulses = [dict(zip(pulse.names, (*event, volume))) for event, volume in rows]
     return [(steady, {"window": disturbance.window}), *((pulse, values) for values in pulses)]
+
+
+def _merged(tables):
+    """Tables of a disturbance with one [disturbance], of the keys of all."""
+    steady, keys = SECTIONS["disturbance"], {}
+    for section, values in tables:
+        keys |= values if section is steady else {}
+    others = [row for row in tables if row[0] is not steady]
+    return [(steady, keys), *others] if keys else others
 
 
 def fault_tables(part):

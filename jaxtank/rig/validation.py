@@ -200,14 +200,19 @@ def check_limits(
             many = f", or {count} of them" if count > 1 else ""
             rim = ', or "rim"' if measure == "max_level" else ""
             raise refusal(f"limit {measure}", value, f"be a finite number [{unit}]{many}{rim}")
-        spec, unit = MEASURES[measure], "" if unit == "-" else f" {unit}"
-        for sign, words, end in ((1.0, "least", spec.low), (-1.0, "most", spec.high)):
-            if end is not None and np.any(sign * np.asarray(value) < sign * end):
-                raise InputError(
-                    f"limit {measure} = {shortened(value)}{unit}: must be at {words} {end:g}{unit};"
-                    " no run has a value beyond"
-                )
+        _check_range(measure, value, "" if unit == "-" else f" {unit}")
     return checked
+
+
+def _check_range(measure, value, unit):
+    """Raise InputError for a limit beyond what a run can have."""
+    spec = MEASURES[measure]
+    for sign, words, end in ((1.0, "least", spec.low), (-1.0, "most", spec.high)):
+        if end is not None and np.any(sign * np.asarray(value) < sign * end):
+            raise InputError(
+                f"limit {measure} = {shortened(value)}{unit}: must be at {words} {end:g}{unit}; no"
+                " run has a value beyond"
+            )
 
 
 def _limit(loop, measure, label, value, spans=None):
@@ -386,11 +391,7 @@ def check_log(plant, table):
             continue
         if key not in keys:
             raise unknown("key of [log]", key, [*keys, *LOG_SETTINGS])
-        pair = [spec] if isinstance(spec, str) else spec
-        good = isinstance(pair, (list, tuple)) and 1 <= len(pair) <= 2
-        if not (good and all(isinstance(v, str) for v in pair) and pair[-1].strip()):
-            raise refusal(f"log {key}", spec, "be a column's header, or [header, unit]")
-        header, columns[key] = pair[0], pair[0] if len(pair) == 1 else tuple(pair)
+        header, columns[key] = _header_and_unit(key, spec)
         if header in headers and header not in ("", "none"):
             raise InputError(
                 f"log {key} = {shortened(header)}: that column is {headers[header]} already"
@@ -399,6 +400,15 @@ def check_log(plant, table):
             raise InputError(f"log {key}: {keys[key]} is given twice")
         headers[header] = key
     return columns
+
+
+def _header_and_unit(key, spec):
+    """(header, header or (header, unit)) of a line of [log]."""
+    pair = [spec] if isinstance(spec, str) else spec
+    good = isinstance(pair, (list, tuple)) and 1 <= len(pair) <= 2
+    if not (good and all(isinstance(v, str) for v in pair) and pair[-1].strip()):
+        raise refusal(f"log {key}", spec, "be a column's header, or [header, unit]")
+    return pair[0], pair[0] if len(pair) == 1 else tuple(pair)
 
 
 def check_covariance(loop, table):

@@ -152,15 +152,20 @@ def _unseen(case):
             if time < clock.duration and not _holds_sample(time, time + window, clock):
                 yield f"disturbance.window = {window:g} s after the pulse at {time:g} s: {between}"
     for name, part in (("reference", loop.reference), ("inputs", loop.controller)):
-        signal, before = steps(getattr(part, "signal", part)), {}
-        for time, channel in () if signal is None or signal.ramp > 0.0 else signal.changes:
-            last = before.get(channel)
-            if last is not None and index(last, clock) == index(time, clock):
-                yield (
-                    f"{name}: the change of {channel + 1} at {last:g} s is followed by another one"
-                    f" at {time:g} s before the next sample, every {clock.dt:g} s: it has no effect"
-                )
-            before[channel] = time
+        yield from _replaced(name, steps(getattr(part, "signal", part)), clock)
+
+
+def _replaced(name, signal, clock):
+    """On changes of a channel that another one follows before the next sample."""
+    before = {}
+    for time, channel in () if signal is None or signal.ramp > 0.0 else signal.changes:
+        last = before.get(channel)
+        if last is not None and index(last, clock) == index(time, clock):
+            yield (
+                f"{name}: the change of {channel + 1} at {last:g} s is followed by another one at"
+                f" {time:g} s before the next sample, every {clock.dt:g} s: it has no effect"
+            )
+        before[channel] = time
 
 
 def _holds_sample(start, end, clock):

@@ -154,8 +154,7 @@ def _building(case, loop, origin, same):
     if disturbing is None:
         raise InputError("its disturbance has no table")
     if origin is None:  # a steady inflow is a key of the tanks
-        rest = [(s, {k: v for k, v in row.items() if k != "inflow"}) for s, row in disturbing]
-        disturbing = [(section, row) for section, row in rest if row]
+        disturbing = _without_steady_inflow(disturbing)
     tables = [*disturbing, *signals.fault_tables(loop.faults)]
     emptied = [
         _none(name)
@@ -164,6 +163,11 @@ def _building(case, loop, origin, same):
     ]
     first = Block("", [*lines_of(SECTIONS[""], top, units), *emptied])
     return [first, *blocks, *(block_of(s, values, units, names) for s, values in tables)]
+
+
+def _without_steady_inflow(tables):
+    rest = [(section, {k: v for k, v in row.items() if k != "inflow"}) for section, row in tables]
+    return [(section, row) for section, row in rest if row]
 
 
 def _of_rig(section, number, values, units, names):
@@ -436,10 +440,8 @@ def _different(blocks, preset, case):
     for block in blocks:
         in_values = block.title == "[values]" or (in_values and not block.title)
         lines = [line for line in block.lines if line.on]
-        if in_values:  # new lines, then those that are suggested, commented out
-            new = [line for line in lines if not set(terse(Block("", [line]))) <= known]
-            old = [n for n in lines if n not in new and n.name.strip('"') in suggested]
-            lines = new + [line._replace(on=False) for line in old]
+        if in_values:
+            lines = _new_first(lines, known, suggested)
         elif not block.on or (
             block.title not in ("", *SHORT) and tables[block.title] == same.get(block.title)
         ):
@@ -447,6 +449,13 @@ def _different(blocks, preset, case):
         if lines or block.title:
             different.append(block._replace(lines=lines))
     return different
+
+
+def _new_first(lines, known, suggested):
+    """Lines of [values] that are not `known`, then those that are `suggested`, commented out."""
+    new = [line for line in lines if not set(terse(Block("", [line]))) <= known]
+    old = [n for n in lines if n not in new and n.name.strip('"') in suggested]
+    return new + [line._replace(on=False) for line in old]
 
 
 def _by_title(blocks):

@@ -321,16 +321,14 @@ def _joint(rig, start, claimed):
     dry, alone = np.ones(rig.tanks, dtype=bool), None
     while True:
         bounds = np.full(rig.tanks, np.inf)
-        for i in bounded | inside:
-            bounds[i] = level[i] + rig.spare[i] if i in inside else rig.reach[i]
+        bounds[list(bounded)] = rig.reach[list(bounded)]
+        bounds[list(inside)] = (level + rig.spare)[list(inside)]
         still = dry & (bounds <= rig.rim * (1.0 + 1e-12))
         at = _Hypotheses(bounds, still, begin, start is not None)
         upper = [_upper(rig, i, level[i], at) for i in range(rig.tanks)]
         alone = alone or upper
         outside = {i for i in inside if upper[i][0]}
-        stays = {i: _stays(rig, i, at) for i in bounded - inside}
-        loose = {i for i, how in stays.items() if not how}
-        wet = {i for i, how in stays.items() if how != "flows" and dry[i]}
+        loose, wet = _loose_and_wet(rig, bounded - inside, at, dry)
         if not (outside or loose or wet):
             break
         inside, bounded, dry = inside - outside, bounded - loose, dry.copy()
@@ -338,6 +336,13 @@ def _joint(rig, start, claimed):
     lost = set(range(rig.tanks)) - inside
     reasons = [_reason(rig, i, alone[i][0], upper[i][0], lost) for i in range(rig.tanks)]
     return _JointResult(reasons, [theorem for _, theorem in upper], bounds)
+
+
+def _loose_and_wet(rig, tanks, at, dry):
+    """Those of `tanks` without a bound, and those that may overflow though counted as `dry`."""
+    stays = {i: _stays(rig, i, at) for i in tanks}
+    loose = {i for i, how in stays.items() if not how}
+    return loose, {i for i, how in stays.items() if how != "flows" and dry[i]}
 
 
 def _reason(rig, i, alone, together, lost):

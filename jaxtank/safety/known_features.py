@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterable, Mapping
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -85,11 +86,11 @@ def first_failure(conditions: Iterable[tuple[Any, str]]) -> str:
 
 def unknown_feature(parts: Mapping[str, Any], box: Mapping[str, Any], known: Known = PLAIN) -> str:
     """The first feature that is not on the closed list, or a number that is none; or ""."""
-    return first_failure(_features(parts, box, known))
+    return first_failure(chain(_features(parts, known), _known_names(box, known)))
 
 
-def _features(parts, box, known):
-    """(holds, reason) of the classes of all parts, of their fields, of the names of a box."""
+def _features(parts, known):
+    """(holds, reason) of the classes of all parts, and of their fields."""
     for part, kind in CLASSES.items():
         value = parts.get(part)
         if part in parts:
@@ -110,6 +111,9 @@ def _features(parts, box, known):
             yield name in fields or neutral, f"not covered: {part}.{name}"
             number = name not in fields or not _has_nan(entry)
             yield number, f"not covered: {part}.{name} is no number"
+
+
+def _known_names(box, known):
     for name, interval in box.items():
         covered = name.partition("[")[0] in known.uncertain or name.startswith(HARMLESS)
         yield covered, f"not covered: uncertain {name}"
