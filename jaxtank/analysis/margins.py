@@ -9,16 +9,13 @@ import numpy as np
 from jaxtank.analysis import frequency as fr
 from jaxtank.analysis.frequency import OpenLoop
 
-POINTS = 224
-"""Frequencies of the grid, evenly spaced in their logarithm."""
+POINTS = 224  # frequencies of the grid, evenly spaced in their logarithm
 
-DELAYED = 96
-"""Further frequencies with a dead time, evenly spaced up to TURN rad of its phase."""
+DELAYED = 96  # further frequencies with a dead time, evenly spaced up to TURN rad of its phase
 
 TURN = 50.0
 
-LOWEST = 1e-7
-"""Lowest frequency of the grid, as a share of the Nyquist frequency [-]."""
+LOWEST = 1e-7  # lowest frequency of the grid, as a share of the Nyquist frequency [-]
 
 ZOOMS, ZOOM = 5, 15
 """A bracket on the grid is narrowed by a factor of 7 or more ZOOMS times, with ZOOM points."""

@@ -14,8 +14,7 @@ from jaxtank.core.labels import label_of, labels_of
 from jaxtank.core.numerics import lower_clip, smooth_signed_sqrt, smooth_sqrt
 from jaxtank.plants import elements
 
-STEPS = 200
-"""Steps at most; ten to thirty suffice where there is a steady state."""
+STEPS = 200  # steps at most; ten to thirty suffice where there is a steady state
 
 
 class Balance:

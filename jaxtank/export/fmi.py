@@ -35,8 +35,7 @@ SIGNALS = {
 }
 """{argument of a step: (what it has an entry for, unit of a rig in cm and V, what it is)}."""
 
-NAMES = {"w": "manual_input"}
-"""{argument: its name in the FMU, where that is another}."""
+NAMES = {"w": "manual_input"}  # {argument: its name in the FMU, where that is another}
 
 MANUAL = "manual"
 

@@ -18,8 +18,7 @@ from jaxtank.export.statements import (
     parts,
 )
 
-MISSING = ("erf", "erfc")
-"""Functions that most languages have and JavaScript has not."""
+MISSING = ("erf", "erfc")  # functions that most languages have and JavaScript has not
 
 
 class JavaScript(Printer):

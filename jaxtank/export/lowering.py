@@ -646,10 +646,8 @@ class Writer:
     # scopes: the statements of the function and of the loops that are open; known: in each of them,
     # {operation: its Ref}, so that nothing is computed twice.
 
-    large = 300
-    """Number of multiplications in a matrix product above which it is a loop."""
-    sparse = False
-    """Whether multiplications by the number 0 are not counted."""
+    large = 300  # number of multiplications in a matrix product above which it is a loop
+    sparse = False  # whether multiplications by the number 0 are not counted
 
     def __init__(self, loops=False):
         self.counter, self.scopes, self.known = 0, [[]], [{}]
@@ -765,8 +763,7 @@ class Lowered(NamedTuple):
     """Result of `lower_all`."""
 
     statements: list
-    outputs: Any
-    """Results of the function, with arrays of Refs and numbers instead of arrays."""
+    outputs: Any  # results of the function, with arrays of Refs and numbers instead of arrays
     lines: dict
     """{Ref of the first entry of a Line, an array that is read or written at an index: name}."""
 

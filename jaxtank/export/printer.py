@@ -14,8 +14,7 @@ from jaxtank.core.units import local
 from jaxtank.export.program import CONTROL, PLANT
 from jaxtank.export.statements import REAL, TRUTH, WHOLE, Ref, Vector, View, size_of
 
-WIDTH = 126
-"""Length of a line of an array, without its indentation."""
+WIDTH = 126  # length of a line of an array, without its indentation
 
 OPERATIONS = {
     "add": "{0} + {1}",
@@ -49,8 +48,7 @@ class Printer:
     kinds: Mapping[str, str] = {REAL: "", WHOLE: "", TRUTH: ""}
     rename: Mapping[str, str] = {}
     """{argument of the program (s, t, y, r, dr, ddr, u): its name in the language}."""
-    first = 0
-    """Index of the first entry of an array."""
+    first = 0  # index of the first entry of an array
     entry = "{0}[{1}]"
     real = "{0}"
     when, close_when = "if ({0})", ""
@@ -68,10 +66,8 @@ class Printer:
     """
     counted, endless, end = "for i = 1:{0}", "while true", "end"
     """`endless` "": the language has loops of a bounded number of passes alone."""
-    store = ""
-    """A Store statement, of name, array, index and value; "": the language has none."""
-    places: Mapping[Ref, str] = {}
-    """{Ref: its text, where that is another than its name}."""
+    store = ""  # a Store statement, of name, array, index and value; "": the language has none
+    places: Mapping[Ref, str] = {}  # {Ref: its text, where that is another than its name}
     until = "if not ({0}) break"
 
     def value(self, e):

@@ -28,18 +28,15 @@ GROUPS = re.compile(r"(y|h|r|dr|ddr|applied|u|pump)(?:\d+|_.+)", re.IGNORECASE)
 """Names of columns: of "y1" or "y_LT101" the first part is the signal."""
 
 
-ROWS = 5000
-"""Samples of a run all of which `jaxtank simulate --out` saves."""
+ROWS = 5000  # samples of a run all of which `jaxtank simulate --out` saves
 
 
 class Export(NamedTuple):
     """A controller as functions."""
 
     dt: float
-    sizes: tuple[int, int, int]
-    """Numbers of levels, setpoints, inputs."""
-    run: Any
-    """Function of a Log that returns the inputs (samples, inputs)."""
+    sizes: tuple[int, int, int]  # numbers of levels, setpoints, inputs
+    run: Any  # function of a Log that returns the inputs (samples, inputs)
     units: tuple[str, ...] = ()
     """Of levels and setpoints, and of each input; () of an export that does not tell."""
 
@@ -58,23 +55,10 @@ class Log(NamedTuple):
 def replay(path: str | Path, data: str | Path) -> dict[str, Any]:
     """Return the largest difference of each input between a log and an export run against it.
 
-    Parameters
-    ----------
-    path : an exported controller: NAME.c (with NAME.h beside it), NAME.js or NAME.fmu
-    data : log with one row a period: t [s], y1, .. (or h1, ..), r1, .., u1, .. (or pump1, ..),
-        and applied1, .. where pumps have a lag, delay or dead zone behind the inputs of the
-        controller; units in heads, or in a row below them, are converted to those of the export
-
-    Returns
-    -------
-    {"samples": number of rows, "inputs": [{"name", "largest_difference", "time_s"}]}
-
-    Raises
-    ------
-    InputError
-        For a file that is no export or needs a program that is not at hand.
-    DataError
-        For a log that does not suit the export.
+    path : NAME.c (with NAME.h beside it), NAME.js or NAME.fmu; data : log with one row a period: t,
+    y1, .. (or h1, ..), r1, .., u1, .. (or pump1, ..), and applied1, .. behind which pumps have a
+    lag, delay or dead zone. Raises InputError for a file that is no export, DataError for a log
+    that does not suit it.
     """
     path = Path(path)
     loaders = {".c": _load_c, ".js": _load_javascript, ".fmu": _load_fmu}

@@ -12,11 +12,9 @@ from jaxtank.core.errors import InputError
 from jaxtank.export.source import files
 from jaxtank.export.statements import template
 
-STEPS, ROUNDS = 20_000, 5
-"""Steps in a round, at most, and rounds, of which the fastest counts."""
+STEPS, ROUNDS = 20_000, 5  # steps in a round, at most, and rounds, of which the fastest counts
 
-LONGEST = 0.2
-"""Seconds after which a round ends."""
+LONGEST = 0.2  # seconds after which a round ends
 
 
 def step_time(case: Case) -> tuple[float | None, str]:

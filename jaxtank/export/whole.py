@@ -46,8 +46,7 @@ SAVED = ("x", "y", "r", "u", "command", "spilled", "d_hat")
 """Fields of a Trajectory that are stored at each sample."""
 
 
-LARGEST = 24
-"""Tanks of a loop that is written as code."""
+LARGEST = 24  # tanks of a loop that is written as code
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,21 +54,14 @@ class WholeLoop:
     """The statements of one sample, in order, and what they lead to."""
 
     case: Case
-    leaves: tuple[tuple[str, tuple[int, ...]], ...]
-    """(dotted name, index in it) of each entry of p."""
+    leaves: tuple[tuple[str, tuple[int, ...]], ...]  # (dotted name, index in it) of each entry of p
     statements: list[Statement]
-    first: list[Any]
-    """Entries of c before the first sample."""
-    after: list[Any]
-    """Entries of c after a sample."""
-    saved: dict[str, list[Any]]
-    """{field of `SAVED`, or "errors": its entries at a sample}."""
-    weights: list[tuple[str, float]]
-    """(measure, weight of the square) of each of the errors."""
-    measures: dict[str, list[Any]]
-    """{measure: its entries}, read of c after the last sample."""
-    lines: dict[int, str]
-    """{entry of c at which a Line begins: its name}."""
+    first: list[Any]  # entries of c before the first sample
+    after: list[Any]  # entries of c after a sample
+    saved: dict[str, list[Any]]  # {field of `SAVED`, or "errors": its entries at a sample}
+    weights: list[tuple[str, float]]  # (measure, weight of the square) of each of the errors
+    measures: dict[str, list[Any]]  # {measure: its entries}, read of c after the last sample
+    lines: dict[int, str]  # {entry of c at which a Line begins: its name}
 
 
 def served(case: Case) -> tuple[str, ...]:
@@ -262,8 +254,7 @@ _MATHS = """
 abs max min pow atan2 sign sqrt exp log tanh sin cos floor ceil log1p expm1 tan asin acos atan sinh
 cosh asinh acosh atanh cbrt trunc
 """
-MATHS = _MATHS.split()
-"""Functions of Math that a text has by their own names."""
+MATHS = _MATHS.split()  # functions of Math that a text has by their own names
 
 FORMS = {
     "square": "{0}*{0}",

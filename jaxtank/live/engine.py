@@ -50,8 +50,7 @@ from jaxtank.xla.normal import DENOMINATOR, NUMERATOR
 
 ALONE, TIMED, MOVING = 0, 1, 2
 """Ranks of values: from the numbers of the loop alone, also from time, also from the state."""
-FIXED = frozenset({"every", *"pkcqoSNLRK"})
-"""Names of arguments of the printed functions."""
+FIXED = frozenset({"every", *"pkcqoSNLRK"})  # names of arguments of the printed functions
 
 
 class Printed:
@@ -256,12 +255,10 @@ def maths(text: str) -> str:
     return f"const{{{','.join(m for m in MATHS if f'{m}(' in text)}}}=Math;"
 
 
-ROWS = 3000
-"""Approximate number of rows of a plotted run, as in `jaxtank simulate --out`."""
+ROWS = 3000  # approximate number of rows of a plotted run, as in `jaxtank simulate --out`
 ALWAYS = ("rms_error_total", "max_level")
 """Measures of a search whatever a case minimises and limits."""
-SHARED = ("unit", "doc", "group")
-"""Fields that all entries of one array share."""
+SHARED = ("unit", "doc", "group")  # fields that all entries of one array share
 
 GROUPS = {
     "controller": "controller",
@@ -301,8 +298,7 @@ WIDE = {"controller": (0.2, 5.0), "observer": (0.2, 5.0), "plant": (0.5, 1.5), "
 """{group: ends of a slider as multiples of a value that has no bounds}; (0, 2) of the others."""
 ABOVE = 1e-3
 """Lower end of a slider above a lower bound that is excluded, as a share of the range [-]."""
-NOISE = 0.02
-"""Upper end of the sliders of noise, as a share of the height of the tanks [-]."""
+NOISE = 0.02  # upper end of the sliders of noise, as a share of the height of the tanks [-]
 
 
 def program_of(case: Case) -> tuple[WholeLoop, str]:
@@ -317,27 +313,7 @@ def engine(
     filtered: Case | None = None,
     printed: Callable[[Case], tuple[WholeLoop, str]] = program_of,
 ) -> str:
-    """Return a text of JavaScript that defines makeEngine(), which runs the loop of a case.
-
-    Parameters
-    ----------
-    case : Case
-    filtered : Case, optional
-        The same with its safety filter, to be switched on and off.
-    printed : callable
-        `program_of`, or a function that remembers its results.
-
-    Raises
-    ------
-    InputError
-        For a loop that has no code of single samples (`jaxtank.export.whole`).
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> "function makeEngine()" in engine(presets.find("cascaded/pi"))
-    True
-    """
+    """Return JavaScript that defines makeEngine(), which runs a case, or `filtered` when switched on."""
     with jax.enable_x64(True):
         parts = [printed(variant) for variant in (case, filtered) if variant is not None]
         facts = _facts(case, [loop for loop, _ in parts])
@@ -360,14 +336,7 @@ def engine(
 
 
 def facts_of(case: Case, filtered: Case | None = None) -> dict[str, Any]:
-    """Return the data of the loop of a case without its code, as a JSON object.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> facts_of(presets.find("cascaded/pi"))["pumps"][0]["upper"]
-    10.0
-    """
+    """Return the data of the loop of a case without its code, as a JSON object."""
     with jax.enable_x64(True):
         return _facts(case, [whole_loop(c) for c in (case, filtered) if c is not None])
 

@@ -35,11 +35,9 @@ from jaxtank.loop.trajectory import stride
 from jaxtank.plants.vessels import shape_name
 from jaxtank.plots.layout import jets, overflows, pipes, place, valves
 
-GUARD = "safety_filter."
-"""Prefix of the names of a safety filter."""
+GUARD = "safety_filter."  # prefix of the names of a safety filter
 
-NEW = "rig.toml"
-"""Name of the rig file to which a case without a name is copied."""
+NEW = "rig.toml"  # name of the rig file to which a case without a name is copied
 
 
 class Origin(NamedTuple):
@@ -130,17 +128,13 @@ LARGEST = 117_000
 DIGITS = str.maketrans("&<>`", ",.:[")
 """Digits of base 85 that HTML reads as something else, and what stands for them (inflate.js)."""
 
-END = "\0"
-"""Separator between the packed parts of a page; JSON escapes it."""
+END = "\0"  # separator between the packed parts of a page; JSON escapes it
 
-KEPT = 8
-"""Engines that are kept in memory."""
+KEPT = 8  # engines that are kept in memory
 
-PLANTS, MOST_PLANTS = 64, 2000
-"""Number of plants in the band of a page: by default, and at most."""
+PLANTS, MOST_PLANTS = 64, 2000  # number of plants in the band of a page: by default, and at most
 
-LEAK = 1.5
-"""Factor of an outlet that leaks [-]."""
+LEAK = 1.5  # factor of an outlet that leaks [-]
 
 _KEPT = {}
 
@@ -371,8 +365,7 @@ def _path(path):
     return [_rounded(point) for point in path]
 
 
-HEIGHT = 900
-"""Height of the page inside another one [px]."""
+HEIGHT = 900  # height of the page inside another one [px]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,8 +11,7 @@ from jaxtank.core.numerics import lower_clip, magnitude
 from jaxtank.core.records import Sample
 from jaxtank.core.vectors import each
 
-BAND = 0.05
-"""Half width of the recovery band, as a share of the setpoint [-]."""
+BAND = 0.05  # half width of the recovery band, as a share of the setpoint [-]
 
 
 class Run(NamedTuple):
@@ -221,11 +220,7 @@ def _update_plateau(run, state, sample, context):
 
 
 def _update_swing(run, state, sample, context):
-    """Per output (setpoint, whether it was constant at the last sample; samples of its plateau, at
-    how many the next part of it begins; largest errors above and below in this part and in the
-    one before; largest swing of a plateau so far). A part ends when the plateau is a fifth longer
-    than at its begin.
-    """
+    """Per output what `swing_of` needs: parts of a plateau, each a fifth longer than at its begin."""
 
     def update(r, e, before):
         setpoint, constant, count, end, above, below, above_old, below_old, worst = before

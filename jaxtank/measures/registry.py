@@ -306,10 +306,8 @@ def _missing(loop: Any) -> frozenset[str]:
     return frozenset(field for field in has if not has[field])
 
 
-States = dict[str, Any]
-"""{accumulator: its state}"""
-Weights = Sequence[tuple[str, float]]
-"""(measure, weight) of sums of squares"""
+States = dict[str, Any]  # {accumulator: its state}
+Weights = Sequence[tuple[str, float]]  # (measure, weight) of sums of squares
 
 
 def needs(names: Sequence[str]) -> tuple[str, ...]:

@@ -21,14 +21,11 @@ from jaxtank.plots.schematic import HALO, depth, mark, mark_height, schematic
 from jaxtank.plots.spills import Lost, Stack, headroom, spilled
 from jaxtank.plots.style import PUMPS, TUNED, WATER, box, plain, styled
 
-RATE = 12
-"""Pictures per second: enough for liquid, which moves slowly."""
+RATE = 12  # pictures per second: enough for liquid, which moves slowly
 
-LONGEST = 60.0
-"""Of an animation [s]."""
+LONGEST = 60.0  # of an animation [s]
 
-STILLS = 4
-"""Moments of a still."""
+STILLS = 4  # moments of a still
 
 
 def animate(loop, trajectory, path, seconds=8, against=None, titles=()):
@@ -175,8 +172,7 @@ def _check(loop, run):
         )
 
 
-BAR = 0.6
-"""Height of a pump's bar from its lower to its upper limit."""
+BAR = 0.6  # height of a pump's bar from its lower to its upper limit
 
 
 class _Stage:

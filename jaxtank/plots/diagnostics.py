@@ -5,8 +5,7 @@ import numpy as np
 from jaxtank.core.labels import label_of, labels_of
 from jaxtank.plots.style import AFTER, BEFORE, BEYOND, FORBIDDEN, OTHER, REFERENCE, plain
 
-SLICES = 240
-"""Intervals of time in a strip of `saturation`."""
+SLICES = 240  # intervals of time in a strip of `saturation`
 
 
 def phase(ax, runs, tanks, rims=None, unit="cm", plant=None):
@@ -111,8 +110,7 @@ def share(ax, run, pump, of=("sliding mode", "state feedback"), plant=None):
     return ax
 
 
-MANY = 16
-"""Largest number of limits in a picture of margins: those with the smallest margins."""
+MANY = 16  # largest number of limits in a picture of margins: those with the smallest margins
 
 
 def margins(ax, rows):

@@ -7,8 +7,7 @@ import numpy as np
 PITCH = 1.7
 """From the middle of one tank to that of the next in its row, in heights of the tallest tank."""
 
-STOREY = 1.75
-"""From the bottom of one row of tanks to the bottom of the next."""
+STOREY = 1.75  # from the bottom of one row of tanks to the bottom of the next
 
 
 class Box(NamedTuple):

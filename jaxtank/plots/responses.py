@@ -31,14 +31,11 @@ from jaxtank.plots.style import (
     width,
 )
 
-BARS = 14
-"""Bars in a picture at most; the smallest are left out, and the title gives their number."""
+BARS = 14  # bars in a picture at most; the smallest are left out, and the title gives their number
 
-COLUMNS = 4
-"""Panels beside each other."""
+COLUMNS = 4  # panels beside each other
 
-SHOWN = 16
-"""Tanks between, outputs and pumps that are drawn each; of more, those that matter."""
+SHOWN = 16  # tanks between, outputs and pumps that are drawn each; of more, those that matter
 
 
 def level(
@@ -69,8 +66,7 @@ def level(
     return ax
 
 
-HEADROOM = 1.05
-"""End of the axis of a level over what it has to show [-]."""
+HEADROOM = 1.05  # end of the axis of a level over what it has to show [-]
 
 
 def _highest(runs, tank):

@@ -20,8 +20,7 @@ from jaxtank.plots.style import RUNS, TALLEST, WIDTHS, for_print, picture, plain
 SOFTWARE = {"Software": None}
 """Metadata of a PNG file: nothing that differs from machine to machine."""
 
-SMALL = 62
-"""Pixels per inch of the small picture that a notebook shows below a result."""
+SMALL = 62  # pixels per inch of the small picture that a notebook shows below a result
 
 
 def figures(run: Any) -> dict[str, Any]:

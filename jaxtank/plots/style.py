@@ -65,11 +65,9 @@ WIDTHS = {1: 3.5, 2: 7.16}
 (IEEE's author guidelines on graphics: 3.5 and 7.16 inch).
 """
 
-TALLEST = 9.0
-"""Height of a figure for a journal, at most [inch]."""
+TALLEST = 9.0  # height of a figure for a journal, at most [inch]
 
-PANEL = 2.2
-"""Width of a panel in a figure for a journal, at least [inch]."""
+PANEL = 2.2  # width of a panel in a figure for a journal, at least [inch]
 
 PRINT = _settings("journal.mplstyle")
 """Settings of figures for a journal, over STYLE: letters of 7.5 to 8 points, no LaTeX."""

@@ -24,8 +24,7 @@ from jaxtank.plots.style import (
     width,
 )
 
-CUT = 0.05
-"""Share of the plants below a bar, and above it [-]."""
+CUT = 0.05  # share of the plants below a bar, and above it [-]
 
 
 def fan(loop, bands, title, limits=None):

@@ -87,8 +87,7 @@ ROLES = {
 }
 """{section, which is also the field of the loop: Role}; `register` adds classes."""
 
-REGISTERED: set[str] = set()
-"""Kinds that were added by `register`."""
+REGISTERED: set[str] = set()  # kinds that were added by `register`
 
 GROUP = "jaxtank.components"
 """Entry points by which an installed package names its classes: kind = "package.module:Class"."""
@@ -192,8 +191,7 @@ def _unwritable(field):
     return ""
 
 
-USUAL = {"spread": 0.0}
-"""Defaults of fields that a rig file may leave out."""
+USUAL = {"spread": 0.0}  # defaults of fields that a rig file may leave out
 
 TRACKING = 30.0
 """Tracking time of a PID of a rig file that has none [s]; of a PI it is its integral time."""
@@ -208,8 +206,7 @@ WITHOUT = {
 }
 """{kind: fields that its table has not}: of a PID under a name of its own; keys of [[pump]]."""
 
-INPUTS = ("sequence", "reverse", "lead", "follow")
-"""Static fields that hold inputs, not tanks."""
+INPUTS = ("sequence", "reverse", "lead", "follow")  # static fields that hold inputs, not tanks
 
 LIMITED = ("on-off", "split-range", "ratio", "nmpc")
 """Kinds whose `low` and `high` are by default the limits of the actuator."""

@@ -18,8 +18,7 @@ from jaxtank.core.units import DEFAULT
 from jaxtank.rig.schema import NEEDED, PARTS, SECTIONS, Key, Section
 from jaxtank.rig.sensors import is_reading, readings
 
-LARGEST = 1e300
-"""Magnitude of a number of a rig file: products of two stay finite for most."""
+LARGEST = 1e300  # magnitude of a number of a rig file: products of two stay finite for most
 
 
 class Sizes(NamedTuple):

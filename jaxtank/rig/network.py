@@ -37,8 +37,7 @@ from jaxtank.rig.signals import parts_of
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
 
-MOST = 5000
-"""Tanks that a rig file may have; as many pumps, valves, orifices, pipes and spills."""
+MOST = 5000  # tanks that a rig file may have; as many pumps, valves, orifices, pipes and spills
 
 
 def names_in(table):

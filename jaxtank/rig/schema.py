@@ -18,8 +18,7 @@ from jaxtank.plants.network import TankNetwork
 from jaxtank.signals.inflows import InflowPulses
 from jaxtank.signals.setpoints import Ramps, Sine
 
-NEEDED: Any = object()
-"""Default of a key that a file must have."""
+NEEDED: Any = object()  # default of a key that a file must have
 
 PARTS: dict[str, Any] = {"plant": TankNetwork, "actuator": PumpBank, "sensor": LevelSensor}
 """{part of the loop: class} whose fields a rig that is described tank by tank gives."""
@@ -134,8 +133,7 @@ def _sections() -> dict[str, Section]:
     }
 
 
-SECTIONS = _sections()
-"""{name: Section} of a rig file, in the order in which it is written."""
+SECTIONS = _sections()  # {name: Section} of a rig file, in the order in which it is written
 
 OPEN_LOOP = SECTIONS.pop("open-loop").keys
 """[controller] of kind "open-loop"; of other kinds the keys are the fields of the class."""
@@ -149,8 +147,7 @@ SHARE = Key("share", "share", low=0.0, high=1.0, strict=True, default=0.05)
 LISTS = tuple(name for name, section in SECTIONS.items() if section.per)
 """Sections with a table for each tank, orifice, pipe, spill, pump and valve."""
 
-INPUTS = ("pump", "valve")
-"""Lists whose tables are the inputs of a rig, in this order."""
+INPUTS = ("pump", "valve")  # lists whose tables are the inputs of a rig, in this order
 
 TANKWISE = (*LISTS, "plant", "units")
 """What describes a rig tank by tank, and is not given beside `case`."""

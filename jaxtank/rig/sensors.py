@@ -26,8 +26,7 @@ _GAIN = re.compile(rf"(?P<number>{NUMBER.pattern})\s*(?P<unit>.*\S)\s*/\s*%")
 
 _LOOP = re.compile(r"\s*4\s*(?:mA)?\s*(?:\.{2,3}|…|-|–|to)\s*20\s*mA\s*")
 
-CURRENTS = (4.0, 20.0)
-"""Current of a sensor at the ends of its span [mA]."""
+CURRENTS = (4.0, 20.0)  # current of a sensor at the ends of its span [mA]
 
 
 def spans_of(loop: Any) -> list[tuple[float, float]]:
@@ -63,11 +62,7 @@ def in_span(value: Any, unit: str, span: tuple[float, float], width: bool = Fals
 
 
 def readings(label: str, name: str, value: Any, unit: str, axes: Any, loop: Any) -> Any:
-    """Return a value with its texts in % or mA of a span as numbers of the rig's unit.
-
-    name : of the key or parameter; axes : "output" or "tank", of which it has one entry each, or
-    the index of one of those (of a gain an output, else a tank). Other values are returned.
-    """
+    """Return a value with texts in % or mA as numbers; axes: "output", "tank", or the index of one."""
     texts = list(value) if isinstance(value, (list, tuple)) else [value]
     applies, to_number = _conversion(label, name, unit, axes, loop)
     if not any(map(applies, texts)):
@@ -117,11 +112,7 @@ def _gain(label, text, loop, output):
 
 
 def leaves_of(rows, rims, noise, levels=()):
-    """({leaf of the sensor: (n,)}, levels without texts) of rows of [[sensor]], each with its tank.
-
-    Of a tank without a row, or with one that has only a name, the sensor has no ends. noise and
-    levels : of each tank, numbers or texts in % of its span.
-    """
+    """({leaf of the sensor: (n,)}, levels without texts) of rows of [[sensor]], each with its tank."""
     low, high = np.full(len(rims), -np.inf), np.full(len(rims), np.inf)
     usual = {"noise": list(noise), "offset": [0.0] * len(rims), "scale": [1.0] * len(rims)}
     leaves = {k: v for k, v in usual.items() if k == "noise" or any(k in row for row in rows)}

@@ -15,8 +15,7 @@ from jaxtank.rig.sensors import in_span
 
 KEYS = ("csv", "column", "time", "decimal")
 """Keys of a table of a rig file that name a file in place of `changes`."""
-MOST = 100_000
-"""Rows of a table, so that a rig file that holds them can be read again."""
+MOST = 100_000  # rows of a table, so that a rig file that holds them can be read again
 TIMES = ("t", "time", "zeit", "timestamp", "date", "datetime")
 """Names of the column of times where none is given; else it is the first one."""
 

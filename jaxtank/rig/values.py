@@ -46,8 +46,7 @@ from jaxtank.rig.signals import steps
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
 """Where controller and observer hold the plant's parameters, by the same names."""
 
-STEADY = ("x0", "actuator.initial", "reference.initial")
-"""What a scenario may have as "steady"."""
+STEADY = ("x0", "actuator.initial", "reference.initial")  # what a scenario may have as "steady"
 
 _NUMBER = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 _RELATIVE = re.compile(

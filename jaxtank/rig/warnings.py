@@ -18,8 +18,7 @@ from jaxtank.rig.signals import parts_of, steps
 from jaxtank.rig.values import has
 from jaxtank.signals.setpoints import Sine, index
 
-LEAST_SHARE = 0.01
-"""Share of a measured inflow below which its gain is hardly meant [-]."""
+LEAST_SHARE = 0.01  # share of a measured inflow below which its gain is hardly meant [-]
 
 STILL = 0.02
 """Share of a pump's range by which its input before t = 0 may miss that of the start [-]."""
@@ -88,8 +87,7 @@ def _late(case):
             yield f"{late} of {len(events)} {name} come after the end of the run at {end:g} s"
 
 
-MEASURED = 10
-"""Rows from which on a table of inflow is taken as measured, and no list of steps."""
+MEASURED = 10  # rows from which on a table of inflow is taken as measured, and no list of steps
 
 
 def _short_tables(case):

@@ -13,8 +13,7 @@ from jaxtank.core.tree import split_index
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants.tank_network import TankNetwork
 
-SIGMAS = 6.0
-"""Standard deviations of the sensor noise in the band."""
+SIGMAS = 6.0  # standard deviations of the sensor noise in the band
 
 LEAST_SIGMAS = 5.0
 """Standard deviations of the noise below which a band of the user's own is not relied on."""

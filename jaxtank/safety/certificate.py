@@ -31,8 +31,7 @@ from jaxtank.safety.low_limits import check_low, failed_low
 from jaxtank.safety.upper_limits import choose, rate_bound
 from jaxtank.safety.worst_case import rates_of
 
-UNKNOWN = 1e6
-"""Stands for a level [cm] or a time [s] without a bound."""
+UNKNOWN = 1e6  # stands for a level [cm] or a time [s] without a bound
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,10 +24,8 @@ from jaxtank.safety.known_features import (
 
 LIMITS, CASE = "limits", "case"
 """Levels at t = 0 for which a verdict holds: any at or below the limits, or the case's start."""
-SHALLOW = 0.05
-"""a0 of Theorem 2 as a share of the root of the limit."""
-PARTS = 1000
-"""Intervals of readings on which least inputs and caps are compared."""
+SHALLOW = 0.05  # a0 of Theorem 2 as a share of the root of the limit
+PARTS = 1000  # intervals of readings on which least inputs and caps are compared
 ROUNDING = 1e-9
 
 

@@ -34,8 +34,7 @@ UNCERTAIN = {
 }
 
 
-SIGMAS = 5.0
-"""Standard deviations of the noise that a band must have at least."""
+SIGMAS = 5.0  # standard deviations of the noise that a band must have at least
 
 
 class Known(NamedTuple):

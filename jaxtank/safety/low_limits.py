@@ -6,8 +6,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.safety.conditions import first_failure
 from jaxtank.safety.worst_case import PLAIN, rise
 
-INTERVALS = 400
-"""Intervals of readings on which least inputs and caps are compared."""
+INTERVALS = 400  # intervals of readings on which least inputs and caps are compared
 
 
 def check_low(low, limits, length):

@@ -23,12 +23,10 @@ from jaxtank.signals.inflows import InflowPulses
 
 FLOWS = ("drain", "orifice", "pipe", "pump_gain", "split", "valve")
 """Leaves of a plant that may change in time: the volume in a tank does not depend on them."""
-UNKNOWN = (*FLOWS, "extent")
-"""Leaves that are uncertain by SPREAD where a case names none."""
+UNKNOWN = (*FLOWS, "extent")  # leaves that are uncertain by SPREAD where a case names none
 HARMLESS = ("controller.", "observer.", "reference.")
 """What may be uncertain without a change of the box: limits hold under any controller."""
-SPREAD = 0.05
-"""Share by which every flow may be off where a case does not say what is uncertain."""
+SPREAD = 0.05  # share by which every flow may be off where a case does not say what is uncertain
 PROBABILITY = 0.99
 """Share of a normal distribution in the ellipsoid whose box stands for a covariance."""
 

@@ -16,13 +16,10 @@ from jaxtank.core.labels import label_of
 from jaxtank.safety.checker import CASE, LIMITS, Verdict
 from jaxtank.safety.known_features import OUTLETS, first_failure, readable, span_of, unknown_feature
 
-PARTS = 500
-"""Intervals of readings on which floors and caps are compared."""
-FINE = 4000
-"""Levels at which a tank is tested for holding what it gives in a step."""
+PARTS = 500  # intervals of readings on which floors and caps are compared
+FINE = 4000  # levels at which a tank is tested for holding what it gives in a step
 ROUNDING = 1e-9
-UNKNOWN = 1e6
-"""Level [cm] from which a filter's bound of a level is none."""
+UNKNOWN = 1e6  # level [cm] from which a filter's bound of a level is none
 BOXED = ("area", "drain", "orifice", "pipe", "pump_gain", "split", "gravity", "valve", "extent")
 """Parameters of the plant that may lie anywhere between those of the filter's two plants."""
 

@@ -19,10 +19,8 @@ from jaxtank.safety.outlet_checker import check
 from jaxtank.safety.outlets import OutletFilter
 from jaxtank.safety.upper_limits import FASTEST, SHARE_OF_HOLD
 
-UNKNOWN = 1e6
-"""Stands for a level [cm] without a bound."""
-PARTS = 400
-"""Levels at which a tank is tested for holding what it gives in a step."""
+UNKNOWN = 1e6  # stands for a level [cm] without a bound
+PARTS = 400  # levels at which a tank is tested for holding what it gives in a step
 
 
 def outlet_design(
@@ -44,14 +42,7 @@ def outlet_design(
     draws: bool = False,
     faults: Any = None,
 ) -> tuple[OutletFilter, tuple[TankCertificate, ...]]:
-    """Return a filter for a rig of outlets, and the certificate of each tank; arguments as of
-    `design`.
-
-    Raises
-    ------
-    InputError
-        for a pump curve or a valve characteristic of points, whose inverse the filter has not
-    """
+    """Return a filter for a rig of outlets, and its certificates; arguments as of `design`."""
     n = plant.tanks
     _check_inverses(plant)
     least, most = box_of(plant, widths)

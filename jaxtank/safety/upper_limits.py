@@ -7,21 +7,17 @@ import numpy as np
 from jaxtank.safety.conditions import Chosen, first_failure, settle, steepest
 from jaxtank.safety.filter import SHALLOW
 
-MARGIN = 0.9
-"""Share of D = sum c_j o_j / 2 that the choice of k1 counts on."""
-SWEEPS = 500
-"""Sweeps over all tanks after which limits that still fall count as not to be kept."""
+MARGIN = 0.9  # share of D = sum c_j o_j / 2 that the choice of k1 counts on
+SWEEPS = 500  # sweeps over all tanks after which limits that still fall count as not to be kept
 LEAST = 1e-3
 """Share of a limit below which it is not lowered: a ring of orifices may lower limits to 0."""
 FASTEST = 2.0
 """Default of kappa at most [1/s]: faster approaches gain less than they move the pumps."""
-SHARE_OF_HOLD = 0.5
-"""kappa T of the default; proved up to 1."""
+SHARE_OF_HOLD = 0.5  # kappa T of the default; proved up to 1
 QUIET = 0.01
 """Standard deviation of the change of a capped pump's input that noise may cause from sample to
 sample, as a share of its range, at the default."""
-BELOW_BOUND = 0.9
-"""Share of the largest rate that is proved, of the default."""
+BELOW_BOUND = 0.9  # share of the largest rate that is proved, of the default
 
 
 def rate_bound(hold: float, delay: float = 0.0, lag: float = 0.0) -> float:
