@@ -183,7 +183,7 @@ def flat(tree: Any) -> list[Any]:
 
 
 def program(case: Case, plant: bool = False, adjustable: bool = True) -> Program:
-    """Return the Program of a case; `adjustable`: its numbers are parameters, with manual operation."""
+    """Return the Program of a case; `adjustable`: its numbers are parameters of the code."""
     traced = _lowered(case, plant, adjustable)
     begun, done, sizes, leaves = traced
     results, after = done.outputs

@@ -313,7 +313,7 @@ def engine(
     filtered: Case | None = None,
     printed: Callable[[Case], tuple[WholeLoop, str]] = program_of,
 ) -> str:
-    """Return JavaScript that defines makeEngine(), which runs a case, or `filtered` when switched on."""
+    """Return JavaScript that defines makeEngine(), which runs a case and the same `filtered`."""
     with jax.enable_x64(True):
         parts = [printed(variant) for variant in (case, filtered) if variant is not None]
         facts = _facts(case, [loop for loop, _ in parts])

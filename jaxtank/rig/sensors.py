@@ -62,7 +62,7 @@ def in_span(value: Any, unit: str, span: tuple[float, float], width: bool = Fals
 
 
 def readings(label: str, name: str, value: Any, unit: str, axes: Any, loop: Any) -> Any:
-    """Return a value with texts in % or mA as numbers; axes: "output", "tank", or the index of one."""
+    """Return a value with texts in % or mA as numbers; axes: "output", "tank", or an index."""
     texts = list(value) if isinstance(value, (list, tuple)) else [value]
     applies, to_number = _conversion(label, name, unit, axes, loop)
     if not any(map(applies, texts)):
@@ -112,7 +112,7 @@ def _gain(label, text, loop, output):
 
 
 def leaves_of(rows, rims, noise, levels=()):
-    """({leaf of the sensor: (n,)}, levels without texts) of rows of [[sensor]], each with its tank."""
+    """({leaf of the sensor: (n,)}, levels without texts) of rows of [[sensor]] with their tanks."""
     low, high = np.full(len(rims), -np.inf), np.full(len(rims), np.inf)
     usual = {"noise": list(noise), "offset": [0.0] * len(rims), "scale": [1.0] * len(rims)}
     leaves = {k: v for k, v in usual.items() if k == "noise" or any(k in row for row in rows)}
