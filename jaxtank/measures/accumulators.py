@@ -220,7 +220,7 @@ def _update_plateau(run, state, sample, context):
 
 
 def _update_swing(run, state, sample, context):
-    """Per output what `swing_of` reads: parts of a plateau, which ends a fifth longer than begun."""
+    """Per output what `swing_of` reads: parts of a plateau, each a fifth longer than begun."""
 
     def update(r, e, before):
         setpoint, constant, count, end, above, below, above_old, below_old, worst = before

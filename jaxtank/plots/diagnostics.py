@@ -101,11 +101,8 @@ def share(ax, run, pump, of=("sliding mode", "state feedback"), plant=None):
     first = run.share[:, pump]
     ax.fill_between(run.t, 0.0, first, color=BEFORE, alpha=0.55, linewidth=0, label=of[0])
     ax.fill_between(run.t, first, 1.0, color=AFTER, alpha=0.35, linewidth=0, label=of[1])
-    ax.set(
-        title=f"input of {plain(label_of(plant, 'pump', pump))}",
-        ylabel="share [-]",
-        ylim=(0.0, 1.0),
-    )
+    ax.set(title=f"input of {plain(label_of(plant, 'pump', pump))}", ylabel="share [-]")
+    ax.set_ylim(0.0, 1.0)
     ax.margins(x=0.0)
     return ax
 

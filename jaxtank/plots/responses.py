@@ -78,9 +78,8 @@ def voltage(ax, runs, pump, low, high, unit="V", plant=None):
     lines(ax, runs, "u", pump)
     ax.set(title=plain(label_of(plant, "pump", pump)))
     ax.set(ylabel=f"input [{unit}]" if unit != "V" else "voltage [V]")
-    lowest, highest = (
-        f([f(run.u[:, pump]) for run, _, _ in runs.values()]) for f in (np.min, np.max)
-    )
+    drawn = [run.u[:, pump] for run, _, _ in runs.values()]
+    lowest, highest = min(map(np.min, drawn)), max(map(np.max, drawn))
     if highest - lowest >= 0.1 * (high - low):  # limits far away are not shown
         margin = 0.06 * (high - low)
         ax.axhspan(low - margin, low, **BEYOND)
@@ -93,9 +92,8 @@ def error(ax, runs, output, tank, unit="cm", plant=None):
     """Draw the tracking error of one output."""
     lines(ax, runs, "e", output)
     ax.axhline(0.0, color=REFERENCE, linewidth=0.8, linestyle=":")
-    ax.set(
-        title=f"tracking error of {plain(label_of(plant, 'tank', tank))}", ylabel=f"h - r [{unit}]"
-    )
+    name = plain(label_of(plant, "tank", tank))
+    ax.set(title=f"tracking error of {name}", ylabel=f"h - r [{unit}]")
     return ax
 
 
@@ -150,10 +148,8 @@ def _other_tanks(loop, trajectories):
     others = [i for i in range(loop.plant.tanks) if i not in loop.plant.outputs]
     if len(others) <= SHOWN:
         return others, ""
-    near = {
-        i: max(float(np.max(run.x[:, i])) for run in trajectories.values()) / _at(loop.plant.rim, i)
-        for i in others
-    }
+    highest = lambda i: max(float(np.max(run.x[:, i])) for run in trajectories.values())
+    near = {i: highest(i) / _at(loop.plant.rim, i) for i in others}
     note = f"\nof the {len(others)} tanks between, the {SHOWN} that come nearest to their rims"
     return sorted(sorted(others, key=near.__getitem__)[-SHOWN:]), note
 

@@ -99,9 +99,8 @@ def widths_of(part: Any, spread: Mapping[str, float]) -> dict[str, np.ndarray]:
     widths = {}
     for name, share in spread.items():
         if not 0.0 <= share < 1.0:
-            raise InputError(
-                f"safety_filter: spread of {name} = {share:g}: must be from 0 to below 1"
-            )
+            spread_of = f"safety_filter: spread of {name}"
+            raise InputError(f"{spread_of} = {share:g}: must be from 0 to below 1")
         field, entry = split_index(name.rpartition(".")[2])
         value = np.abs(np.asarray(getattr(part, field, 0.0), dtype=float))
         widths[name] = share * value[entry]
@@ -111,13 +110,9 @@ def widths_of(part: Any, spread: Mapping[str, float]) -> dict[str, np.ndarray]:
 def narrow_band(sensor: LevelSensor, band: np.ndarray, unit: str, widths: Widths) -> list[str]:
     """Return for each tank why a band cannot be relied on, "" where it can."""
     least = band_of(sensor, LEAST_SIGMAS, widths) + 0.0 * band
-    words = (
-        f"below {LEAST_SIGMAS:g} standard deviations of the noise, half an ADC step and the offset"
-    )
-    return [
-        f"noise band {b:.3g} {unit} {words}, {m:.3g} {unit}" if b < m * (1.0 - 1e-9) else ""
-        for b, m in zip(band, least)
-    ]
+    words = f"{LEAST_SIGMAS:g} standard deviations of the noise, half an ADC step and the offset"
+    reason = lambda b, m: f"noise band {b:.3g} {unit} below {words}, {m:.3g} {unit}"
+    return [reason(b, m) if b < m * (1.0 - 1e-9) else "" for b, m in zip(band, least)]
 
 
 def band_of(sensor: LevelSensor, sigmas: float = SIGMAS, widths: Widths = NONE) -> np.ndarray:

@@ -280,10 +280,8 @@ def _predicted(setting, widths):
 def _of_pumps(actuator, dead, widths):
     """The fields of Setting that describe the pumps, of dead zones `dead` [V]."""
     leaves = ("low", "high", "initial", "delay", "lag")
-    least, most = (
-        dict(zip(leaves, ends))
-        for ends in zip(*(interval(actuator, f"actuator.{leaf}", widths) for leaf in leaves))
-    )
+    ends = zip(*(interval(actuator, f"actuator.{leaf}", widths) for leaf in leaves))
+    least, most = (dict(zip(leaves, end)) for end in ends)
     delay, lag = float(most["delay"]), float(np.max(most["lag"]))
     under_way = delay > 0.0 or lag > 0.0
     above = np.any(most["initial"] > least["high"])

@@ -479,15 +479,10 @@ def _readable(rig, i, bounds):
         reason = f"may move liquid above {dead:.4g} V, {counts} {rig.offset[j]:.4g} V"
         yield rig.offset[j] <= dead * (1.0 + 1e-12), f"pump {j + 1} {reason}"
     age = float(rig.filter.age)
-    yield (
-        not near or age >= rig.delay[1] * (1.0 - ROUNDING),
-        f"dead time {rig.delay[1]:.4g} s, {counts} {age:.4g} s",
-    )
-    beyond = any(
-        rig.under_way[j] > max(rig.capped[j], 0.0) or rig.high[j] > rig.capped[j]
-        for k in near
-        for j in rig.gains[k]
-    )
+    reason = f"dead time {rig.delay[1]:.4g} s, {counts} {age:.4g} s"
+    yield not near or age >= rig.delay[1] * (1.0 - ROUNDING), reason
+    most = np.maximum(rig.high, np.where(rig.under_way > 0.0, rig.under_way, -np.inf))
+    beyond = any(most[j] > rig.capped[j] for k in near for j in rig.gains[k])
     reason = "not covered: a pump of a tank beside it may run above its upper limit"
     yield age >= 1e5 or not beyond, reason
 
@@ -701,11 +696,9 @@ def _lower(rig, i, proved, begin, upper):
     reason = "not covered: a low limit kept by several pumps that may run backwards"
     yield forwards, reason
     edges = np.linspace(low - eps, upper.bounds[i] + eps, PARTS + 1)
-    needed = [
-        -rig.fall(i, b + eps, rig.bottom) - kappa * (a - eps - low)
-        for a, b in zip(edges[:-1], edges[1:])
-    ]
-    needed = np.minimum(needed, full)
+    pairs = zip(edges[:-1], edges[1:])
+    needs = lambda a, b: -rig.fall(i, b + eps, rig.bottom) - kappa * (a - eps - low)
+    needed = np.minimum([needs(a, b) for a, b in pairs], full)
     share = min(a / b for a, b in gains.values() if b > 0.0)
     allowed = np.all(needed <= share * _caps(rig, i, edges) + 1e-12)
     yield allowed, "floor above cap: the upper limit is kept first"
@@ -717,11 +710,8 @@ def _caps(rig, i, edges):
     if i not in rig.held:
         return np.full(len(edges) - 1, np.inf)
     eps = rig.band[i]
-    allowed = [
-        rig.rate[i] * (rig.limit[i] - b - eps) - rig.rise(i, a - eps, rig.reach)
-        for a, b in zip(edges[:-1], edges[1:])
-    ]
-    return np.maximum(allowed, 0.0)
+    room = rig.rate[i] * (rig.limit[i] - edges[1:] - eps)
+    return np.maximum(room - [rig.rise(i, a - eps, rig.reach) for a in edges[:-1]], 0.0)
 
 
 def _caps_of_others(rig, i, needed):

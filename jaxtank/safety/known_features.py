@@ -51,11 +51,9 @@ class Known(NamedTuple):
 
 PLAIN = Known(("jaxtank.safety.filter", "SafetyFilter"), KNOWN, UNCERTAIN)
 STATIC = ("sources", "curves", "lift_curves", "valves", "characteristics", "one_way", "shapes")
-FIXED = ("rangeability", "spill_port", "valve_port", "pipe_port") + tuple(
-    f"{opening}_{option}"
-    for opening in ("drain", "orifice")
-    for option in ("port", "exponent", "resistance")
-)
+FIXED = ("rangeability", "spill_port", "valve_port", "pipe_port")
+FIXED += ("drain_port", "drain_exponent", "drain_resistance")
+FIXED += ("orifice_port", "orifice_exponent", "orifice_resistance")
 OUTLETS = Known(
     filter=("jaxtank.safety.outlets", "OutletFilter"),
     fields={
@@ -145,10 +143,8 @@ def readable(sensor, span, full):
     """((n,) least band, (n,) highest level that is read for certain [cm]); `span` of a leaf over
     the box, `full` makes it (n,).
     """
-    ends = {
-        name: span(f"sensor.{name}", getattr(sensor, name))
-        for name in ("noise", "offset", "low", "high", "gain", "full_scale")
-    }
+    names = ("noise", "offset", "low", "high", "gain", "full_scale")
+    ends = {name: span(f"sensor.{name}", getattr(sensor, name)) for name in names}
     needed = full(SIGMAS * ends["noise"][1]) + np.maximum(*map(np.abs, ends["offset"]))
     top = full(np.inf if sensor.high is None else ends["high"][0])
     if sensor.low is not None:  # a lower level is read as this one

@@ -221,10 +221,8 @@ class _Rig:
     def piped(self, k, i, h, others, upper):
         """Harm of pipe k to tank i at one of its ends."""
         (other,) = set(self.plant.pipes[k]) - {i}
-        weak, strong = (
-            self.joined(end, end.pipe, end.pipe_port, k, h, others[other])
-            for end in (self.weak, self.strong)
-        )
+        flow = lambda end: self.joined(end, end.pipe, end.pipe_port, k, h, others[other])
+        weak, strong = flow(self.weak), flow(self.strong)
         if upper:
             return -(self.sure(i, h, weak) if weak >= 0.0 else strong)
         return strong if strong >= 0.0 else self.sure(other, others[other], weak)
@@ -264,10 +262,8 @@ class _Rig:
         """Effect of valve k on tank i."""
         (a, b), ends = self.plant.valves[k], (self.weak, self.strong)
         if b is not None:
-            flow = self.joined(
-                self.strong, self.strong.valve, self.strong.valve_port, k, h,
-                others[b if i == a else a],
-            )  # fmt: skip
+            strong, other = self.strong, others[b if i == a else a]
+            flow = self.joined(strong, strong.valve, strong.valve_port, k, h, other)
             if self.plant.one_way[k] and (flow > 0.0) != (i == a):
                 flow = 0.0
             return max(-flow if upper else flow, 0.0), 0.0, False
@@ -454,10 +450,8 @@ def _row_holds(rig, row, bounds, near):
         yield rig.band[k] >= rig.needed[k] * (1.0 - ROUNDING), narrow
         reason = f"{rig.label(k)} may rise above what its sensor can read, {rig.top[k]:.4g} {unit}"
         # one without a bound is a limit that another one relies on
-        yield (
-            not math.isfinite(bounds.high[k]) or bounds.high[k] <= rig.top[k] * (1.0 + 1e-12),
-            reason,
-        )
+        bound = bounds.high[k]
+        yield not math.isfinite(bound) or bound <= rig.top[k] * (1.0 + 1e-12), reason
     for k in sorted(near):
         rates = [_fastest(rig, k, up) * rig.hold for up in (True, False)]
         for counted, most in zip((rig.climb[k], rig.drop[k]), rates):
@@ -488,10 +482,8 @@ def _shallow(rig, i):
     for k in range(FINE, 0, -1):
         h = levels[k]
         gives = rig.harm(i, h, none, False) + rig.draw[i]
-        gives += sum(
-            max(0.0, *(_done(effect, end[j]) for end in rig.range))
-            for j, effect in rig.effects(i, h, none, False).items()
-        )
+        effects = rig.effects(i, h, none, False).items()
+        gives += sum(max(0.0, *(_done(e, end[j]) for end in rig.range)) for j, e in effects)
         if rig.step * gives > rig.room(i, 0.0, h) * (1.0 + ROUNDING):
             last = levels[min(k + 1, FINE)]
             break
@@ -510,10 +502,8 @@ def _bound(effect, allowed, ends):
 
 def _compatible(rig, row, later, bounds):
     """(holds, reason): a later row does not undo what a row has moved."""
-    ups = [
-        {j: e[2] for j, e in rig.effects(r.tank, rig.limit[r.tank], rig.reach, r.upper).items()}
-        for r in (row, later)
-    ]
+    effects_of = lambda r: rig.effects(r.tank, rig.limit[r.tank], rig.reach, r.upper)
+    ups = [{j: e[2] for j, e in effects_of(r).items()} for r in (row, later)]
     against = [j for j in set(row.movers) & set(later.movers) if ups[0][j] != ups[1][j]]
     if not against:
         return

@@ -142,10 +142,9 @@ def _finished(base, ranges, hold, shaped):
     able |= {(i, False): _able(base, i, ranges, False) for i in tanks if base.low[i] > 0.0}
     chosen = _chosen(base, able)
     rows = lambda upper: tuple((i, m) for (i, u), m in chosen.items() if u == upper and m)
-    steps = {
-        name: np.where(shaped, UNKNOWN, [_step(base, i, ranges, up, hold) for i in tanks])
-        for name, up in (("climb", True), ("drop", False))
-    }
+    step = lambda up: [_step(base, i, ranges, up, hold) for i in tanks]
+    changes = {"climb": step(True), "drop": step(False)}
+    steps = {name: np.where(shaped, UNKNOWN, change) for name, change in changes.items()}
     return dataclasses.replace(base, upper_rows=rows(True), low_rows=rows(False), **steps)
 
 
@@ -162,10 +161,8 @@ def _check_inverses(plant):
 
 def _ranges(base, actuator):
     """([low], [high]) demands of the inputs."""
-    inputs = range(actuator.pumps)
-    return [
-        [float(base.demand(j, end[j])) for j in inputs] for end in (actuator.low, actuator.high)
-    ]
+    demands = lambda end: [float(base.demand(j, end[j])) for j in range(actuator.pumps)]
+    return [demands(actuator.low), demands(actuator.high)]
 
 
 def _worst(effects, ranges, movers=()):
