@@ -303,10 +303,9 @@ def _curve(key, label, value, sizes):
         columns = key.local_unit(sizes.units)
         raise refusal(label, value, f"be {names}or a list of points [{columns}]: {key.doc}")
     columns = [Key(key.name, unit=unit) for unit in key.unit.split(", ")]
-    points = tuple(
-        tuple(_number(c, f"{label} point {k + 1}", v, sizes) for c, v in zip(columns, point))
-        for k, point in enumerate(value)
-    )
+    entry = lambda k, c, v: _number(c, f"{label} point {k + 1}", v, sizes)
+    rows = enumerate(value)
+    points = tuple(tuple(entry(k, c, v) for c, v in zip(columns, row)) for k, row in rows)
     if any(after[0] <= before[0] for before, after in zip(points, points[1:])):
         raise refusal(label, value, "have points whose first numbers increase")
     return points
@@ -367,9 +366,8 @@ def _from_one(numbers):
 def name_of(where, value):
     """`value` if it can be a name: a text of one line without control characters."""
     if not isinstance(value, str) or not value.isprintable():
-        raise refusal(
-            where, value, "be a text" + " of printable characters" * isinstance(value, str)
-        )
+        more = " of printable characters" * isinstance(value, str)
+        raise refusal(where, value, f"be a text{more}")
     return value
 
 

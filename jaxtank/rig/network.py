@@ -470,11 +470,8 @@ def entries_of(loop):
     plant = loop.plant
     if not isinstance(plant, TankNetwork):
         raise InputError(f"its {type(plant).__name__} has no name in a rig file")
-    entries = [
-        (SECTIONS[name], i + 1, _values_of(loop, name, i))
-        for name in LISTS
-        for i in range(len(getattr(plant, SECTIONS[name].per)))
-    ]
+    places = [(n, i) for n in LISTS for i in range(len(getattr(plant, SECTIONS[n].per)))]
+    entries = [(SECTIONS[name], i + 1, _values_of(loop, name, i)) for name, i in places]
     more = {key.name: getattr(plant, key.name) for key in SECTIONS["plant"].keys}
     tanks = [values for section, _, values in entries if section.name == "tank"]
     return [*entries, *_sensor_entries(loop, tanks), (SECTIONS["plant"], 1, more)]
@@ -485,11 +482,8 @@ def _values_of(loop, name, i):
     plant, section = loop.plant, SECTIONS[name]
     # valves are the inputs after the pumps
     j = i + len(plant.feeds) * (name == "valve")
-    values = {
-        key.name: _entry_of(loop, key.target, i if key.target.startswith("plant.") else j)
-        for key in section.keys
-        if key.target
-    }
+    entry = lambda target: _entry_of(loop, target, i if target.startswith("plant.") else j)
+    values = {key.name: entry(key.target) for key in section.keys if key.target}
     usual = {key.name: key.default for key in section.keys if key.like}
     values = {k: v for k, v in values.items() if k not in usual or v != usual[k]}
     if name in ("tank", *INPUTS):

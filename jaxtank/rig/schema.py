@@ -110,9 +110,9 @@ def type_of(field: dataclasses.Field[Any]) -> Any:
 
 def _key(name: str, row: dict[str, Any]) -> Key:
     """The Key of a row of schema.toml."""
-    values: dict[str, Any] = {
-        k: tuple(v) if k in ("shape", "choices") else v for k, v in row.items()
-    }
+    values: dict[str, Any] = dict(row)
+    for name_of_many in {"shape", "choices"} & row.keys():
+        values[name_of_many] = tuple(row[name_of_many])
     if values.pop("optional", False):
         values["default"] = None
     if "of" not in values:
@@ -125,12 +125,8 @@ def _key(name: str, row: dict[str, Any]) -> Key:
 
 def _sections() -> dict[str, Section]:
     tables = tomllib.loads(Path(__file__).with_name("schema.toml").read_text("utf-8"))
-    return {
-        name: Section(
-            name, **{**table, "keys": tuple(_key(*row) for row in table.get("keys", {}).items())}
-        )
-        for name, table in tables.items()
-    }
+    keys = {n: tuple(_key(*row) for row in t.get("keys", {}).items()) for n, t in tables.items()}
+    return {name: Section(name, **table | {"keys": keys[name]}) for name, table in tables.items()}
 
 
 SECTIONS = _sections()  # {name: Section} of a rig file, in the order in which it is written

@@ -339,11 +339,10 @@ def disturbance_tables(disturbance):
     if isinstance(disturbance, Constant):
         return [(steady, {"inflow": disturbance.level})]
     if isinstance(disturbance, InflowTable):
-        return [
-            (INFLOW_TABLE, {"tank": tank, "changes": rows, "interpolate": between})
-            for tank, between, times, flows in disturbance.tables()
-            for rows in [[[t, q] for t, q in zip(times.tolist(), np.asarray(flows).tolist())]]
-        ]
+        rows = lambda *columns: np.array(columns, dtype=float).T.tolist()
+        keys = ("tank", "interpolate", "changes")
+        tables = ((i, between, rows(t, flows)) for i, between, t, flows in disturbance.tables())
+        return [(INFLOW_TABLE, dict(zip(keys, table))) for table in tables]
     if not isinstance(disturbance, InflowPulses):
         return None
     rows = zip(disturbance.events, np.asarray(disturbance.volume).tolist())

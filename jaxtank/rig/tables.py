@@ -59,14 +59,10 @@ class Columns:
         if not isinstance(text, str):
             raise refusal(f"{self.label}column", text, "be the name of a column")
         columns, stem = self.table.columns, split_header(text)[0]
-        tests = (
-            lambda c: c.header == text,
-            lambda c: c.name == text,
-            lambda c: c.name == stem,
-            lambda c: c.name.lower() == stem.lower(),
-        )
-        for test in tests:
-            places = [i for i, column in enumerate(columns) if test(column)]
+        names = [c.name for c in columns]
+        lists = [c.header for c in columns], names, names, [name.lower() for name in names]
+        for each, wanted in zip(lists, (text, text, stem, stem.lower())):
+            places = [i for i, name in enumerate(each) if name == wanted]
             if len(places) > 1:
                 raise InputError(
                     f"{self.label}{self.table.name}, line {self.table.head}: {len(places)} columns"
@@ -91,14 +87,10 @@ class Columns:
             return self._usual(kind, plant, count)
         texts = column if isinstance(column, list) else [column]
         if len(texts) != count:
-            example = ", ".join(
-                f'{name_of(plant, kind, i) or i + 1} = "..."' for i in range(min(count, 2))
-            )
-            raise refusal(
-                f"{self.label}column",
-                column,
-                f"be a column for each of {count} {kind}s, or {{ {example} }} for some of them",
-            )
+            names = [name_of(plant, kind, i) or i + 1 for i in range(min(count, 2))]
+            example = ", ".join(f'{name} = "..."' for name in names)
+            must = f"be a column for each of {count} {kind}s, or {{ {example} }} for some of them"
+            raise refusal(f"{self.label}column", column, must)
         return dict(enumerate(texts))
 
     def _usual(self, kind: str, plant: Any, count: int) -> dict[int, str]:
@@ -187,7 +179,6 @@ def changes_of(times: Any, values: Mapping[int, Any], initial: Any) -> list[tupl
     changes = []
     for channel, column in values.items():
         before = np.concatenate([[initial[channel]], column[:-1]])
-        changes += [
-            (float(times[k]), channel, float(column[k])) for k in np.flatnonzero(column != before)
-        ]
+        moves = np.flatnonzero(column != before)
+        changes += [(float(times[k]), channel, float(column[k])) for k in moves]
     return sorted(changes)

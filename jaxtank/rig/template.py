@@ -96,11 +96,9 @@ def _rounded(value):
 def uncertain(case):
     """Lines of the plant's parameters whose spread is not given."""
     known = {n.split("[")[0] for n in case.uncertain}
-    return [
-        Line(toml(name), SHARE.default, of_uncertain(case, name), False)
-        for name, value in parameters(case.loop).items()
-        if name.startswith("plant.") and name not in known and np.any(np.asarray(value) != 0)
-    ]
+    nonzero = (n for n, v in parameters(case.loop).items() if np.any(np.asarray(v) != 0))
+    names = [n for n in nonzero if n.startswith("plant.") and n not in known]
+    return [Line(toml(n), SHARE.default, of_uncertain(case, n), False) for n in names]
 
 
 def suggestions(case, titles):

@@ -226,10 +226,8 @@ def _limit(loop, measure, label, value, spans=None):
     texts = texts * len(spans) if len(texts) == 1 else texts
     if len(texts) != len(spans):
         raise refusal(label, value, f"be a limit, or {len(spans)} of them")
-    return [
-        level_of(v, span, width) if is_reading(v) else converted(label, v, of)
-        for v, span in zip(texts, spans)
-    ]
+    one = lambda v, span: level_of(v, span, width) if is_reading(v) else converted(label, v, of)
+    return [one(v, span) for v, span in zip(texts, spans)]
 
 
 def _spans(loop, kind):
@@ -318,11 +316,8 @@ def free_of(loop, table):
         if isinstance(spec, list):
             label, entry = f"free {name}", scheduled_names(loop, name)[0]
             ends = [in_unit(loop, label, entry, end) for end in spec[:2]]
-            ends = [
-                v[0] if isinstance(end, str) and isinstance(v, list) else v
-                for v, end in zip(ends, spec)
-            ]
-            spec = [*ends, *spec[2:]]
+            alone = lambda v, end: v[0] if isinstance(end, str) and isinstance(v, list) else v
+            spec = [*map(alone, ends, spec), *spec[2:]]
         good = isinstance(spec, list) and len(spec) in (2, 3)
         good = good and all(is_numeric(v) and np.ndim(v) == 0 for v in spec[:2])
         if not good or spec[2:] not in ([], ["log"], ["linear"]):

@@ -408,9 +408,8 @@ def _set_static(tree, name, path, value, meta):
     if len(path) > 1:
         new = _set_static(old, name, path[1:], value, meta)
     elif isinstance(old, tuple):
-        raise InputError(
-            f"{name} is the topology of the rig and cannot be set: choose another case"
-        )
+        cannot = "is the topology of the rig and cannot be set: choose another case"
+        raise InputError(f"{name} {cannot}")
     else:
         new = static_value(name, value, meta, type(old))
     return dataclasses.replace(tree, **{path[0]: new})
@@ -430,9 +429,8 @@ def schedule(case, gains, knots):
     check_gains(part, tuple(names))
     variable, *others = dict.fromkeys(gains.values())
     if others:
-        raise InputError(
-            f"schedule variables {', '.join(map(str, gains.values()))}: must be one for all gains"
-        )
+        variables = ", ".join(map(str, gains.values()))
+        raise InputError(f"schedule variables {variables}: must be one for all gains")
     check_variable(variable, len(loop.plant.outputs), loop.plant.tanks)
     check_knots(knots)
     knots = number(knots)
@@ -440,9 +438,8 @@ def schedule(case, gains, knots):
     for name in names:
         if not split_index(name)[1]:
             part = _without(part, name.split("."))
-    controller = Scheduled(
-        law=part, knots=knots, values=values, gains=tuple(names), variable=variable
-    )
+    gains_at = {"knots": knots, "values": values, "gains": tuple(names)}
+    controller = Scheduled(law=part, **gains_at, variable=variable)
     controller.check(loop.reference)
     free = _free(case, names, knots.size)
     return case.replace(loop=dataclasses.replace(loop, controller=controller), free=free)
@@ -484,11 +481,8 @@ def schedule_table(loop):
     part = loop.controller
     if not isinstance(part, Scheduled):
         return {}
-    return {
-        "gains": [CONTROLLER + g for g in part.gains],
-        "variable": part.variable,
-        "knots": np.asarray(part.knots).tolist(),
-    }
+    gains, knots = [CONTROLLER + g for g in part.gains], np.asarray(part.knots).tolist()
+    return {"gains": gains, "variable": part.variable, "knots": knots}
 
 
 def _with_schedule(case, table):
@@ -513,10 +507,8 @@ def _entries(loop, name):
     inner = name.removeprefix(CONTROLLER)
     if kind == "static" or split_index(name)[1]:
         return [inner]
-    return [
-        inner + (f"[{','.join(map(str, i))}]" if i else "")
-        for i in np.ndindex(np.shape(get_value(loop, name)))
-    ]
+    places = np.ndindex(np.shape(get_value(loop, name)))
+    return [inner + (f"[{','.join(map(str, i))}]" if i else "") for i in places]
 
 
 def _without(tree, path):

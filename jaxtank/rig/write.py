@@ -292,10 +292,8 @@ def _tuning(case):
         of_measures = about is template.of_measure
         # functions of Python are left out of the file, commented out
         off, key = (unreadable(values), str) if of_measures else ((), toml)
-        lines = [
-            Line(key(name), text(value), about(case, name), name not in off)
-            for name, value in values.items()
-        ]
+        rows = values.items()
+        lines = [Line(key(n), text(v), about(case, n), n not in off) for n, v in rows]
         on = title != "objective" or any(line.on for line in lines)
         blocks.append(Block(SECTIONS[title].title, [*lines, *more], on=on))
     if case.covariance is not None:
@@ -436,15 +434,15 @@ def _different(blocks, preset, case):
     suggested = {name.split("[")[0] for name in case.free}
     suggested |= {"clock.dt", "clock.duration", "sensor.noise"}
     known = {line for block in preset for line in terse(block)}
-    tables, same, in_values, different = _by_title(blocks), _by_title(preset), False, []
+    same, in_values, different = _by_title(preset), False, []
+    alike = {title for title, rows in _by_title(blocks).items() if rows == same.get(title)}
+    alike -= {"", *SHORT}
     for block in blocks:
         in_values = block.title == "[values]" or (in_values and not block.title)
         lines = [line for line in block.lines if line.on]
         if in_values:
             lines = _new_first(lines, known, suggested)
-        elif not block.on or (
-            block.title not in ("", *SHORT) and tables[block.title] == same.get(block.title)
-        ):
+        elif not block.on or block.title in alike:
             continue
         if lines or block.title:
             different.append(block._replace(lines=lines))
