@@ -123,9 +123,8 @@ def leaves_of(rows, rims, noise, levels=()):
         for name, values in leaves.items():
             values[tank] = row.get(name, values[tank])
     spans = _spans(low, high, rims)
-    numbers = lambda values, width: [
-        level_of(v, span, width) if is_reading(v) else v for v, span in zip(values, spans)
-    ]
+    one = lambda v, span, width: level_of(v, span, width) if is_reading(v) else v
+    numbers = lambda values, width: [one(v, span, width) for v, span in zip(values, spans)]
     leaves = {name: numbers(values, True) for name, values in leaves.items()}
     if np.any(np.isfinite(high)):
         leaves |= {"low": low, "high": high}
@@ -155,9 +154,8 @@ def curve_of(sensor: Any, tank: int) -> list[list[float]] | None:
     if getattr(sensor, "curve_level", None) is None:
         return None
     levels, readings = (np.asarray(v[tank]) for v in (sensor.curve_level, sensor.curve_reading))
-    return (
-        None if np.array_equal(levels, readings) else np.column_stack([levels, readings]).tolist()
-    )
+    same = np.array_equal(levels, readings)
+    return None if same else np.column_stack([levels, readings]).tolist()
 
 
 def with_sensors(loop, rows):
@@ -244,9 +242,8 @@ def complete_rows(rows: list[dict[str, Any]], tanks: int, length: str) -> list[d
         row.setdefault("tank", i)
         row.setdefault("unit", length)
         if row["unit"] not in ("%", "mA", length) and factor(row["unit"], length) is None:
-            problems.append(
-                str(unknown(f"unit of sensor {i + 1}", row["unit"], ["%", "mA", *LENGTHS]))
-            )
+            known = ["%", "mA", *LENGTHS]
+            problems.append(str(unknown(f"unit of sensor {i + 1}", row["unit"], known)))
         if "span" in row and not row["span"][0] < row["span"][1]:
             low, high = row["span"]
             problems.append(

@@ -136,9 +136,7 @@ def _doubtful(loop: ClosedLoop, plateaus: np.ndarray) -> np.ndarray:
     if len(plateaus) <= MANY:
         return plateaus
     if not (plant.plain and plant.pumps == len(plant.outputs)) or plant.pipes:
-        extremes = [
-            f(plateaus[:, i]) for i in range(plateaus.shape[1]) for f in (np.argmin, np.argmax)
-        ]
+        extremes = np.concatenate([plateaus.argmin(axis=0), plateaus.argmax(axis=0)])
         some = np.linspace(0, len(plateaus) - 1, MANY).astype(int)
         return plateaus[np.unique([*extremes, *some])]
     inflow: Any = steady_inflow(loop)

@@ -156,11 +156,9 @@ def _building(case, loop, origin, same):
     if origin is None:  # a steady inflow is a key of the tanks
         disturbing = _without_steady_inflow(disturbing)
     tables = [*disturbing, *signals.fault_tables(loop.faults)]
-    emptied = [
-        _none(name)
-        for name, field in (("inflow", "disturbance"), ("fault", "faults"))
-        if getattr(loop, field) is None and getattr(start, field, None) is not None
-    ]
+    gone = lambda field: getattr(loop, field) is None and getattr(start, field, None) is not None
+    lists = {"inflow": "disturbance", "fault": "faults"}
+    emptied = [_none(name) for name, field in lists.items() if gone(field)]
     first = Block("", [*lines_of(SECTIONS[""], top, units), *emptied])
     return [first, *blocks, *(block_of(s, values, units, names) for s, values in tables)]
 
@@ -425,14 +423,14 @@ def short(case: Case) -> str:
     if origin is None or blocks[0].lines[0].name != "case":
         return complete(case)
     head = f"# {origin.title}; `jaxtank init {origin.name}` without --short prints every key"
-    different = _different(blocks, sections(origin), case)
+    suggested = {name.split("[")[0] for name in case.free}
+    suggested |= {"clock.dt", "clock.duration", "sensor.noise"}
+    different = _different(blocks, sections(origin), suggested)
     return _text([[head], *(_commented(block._replace(prose=())) for block in different)])
 
 
-def _different(blocks, preset, case):
+def _different(blocks, preset, suggested):
     """The Blocks that differ from the preset's, those of SHORT, and suggestions of [values]."""
-    suggested = {name.split("[")[0] for name in case.free}
-    suggested |= {"clock.dt", "clock.duration", "sensor.noise"}
     known = {line for block in preset for line in terse(block)}
     same, in_values, different = _by_title(preset), False, []
     alike = {title for title, rows in _by_title(blocks).items() if rows == same.get(title)}

@@ -166,10 +166,8 @@ def _start_allowed(setting, tank, limits, begin, reach):
         others[k] = min(reach[k], begin[k] + age * fastest)
     entering, h = setting.under_way(tank), begin[tank]
     # the allowed inflow is concave in the level, except for the step at `empty`
-    allowed = min(
-        kappa * (top - h) - setting.rise(tank, h, others),
-        kappa * (top - min(h, setting.rates.empty[tank])) - setting.rise(tank, 0.0, others),
-    )
+    allowed = kappa * (top - min(h, setting.rates.empty[tank])) - setting.rise(tank, 0.0, others)
+    allowed = min(kappa * (top - h) - setting.rise(tank, h, others), allowed)
     reason = f"{entering:.3g} {setting.unit}/s under way, {max(allowed, 0.0):.3g} allowed"
     holds = entering <= max(allowed * (1.0 + 1e-9), setting.unstoppable(tank))
     return holds, f"(S) start: {reason}"
