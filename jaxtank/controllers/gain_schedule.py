@@ -82,11 +82,8 @@ def _outside_the_step(traced, on_setpoint):
         if use.reached:
             return f"the controller uses it before the loop starts (in its {name})"
     estimate = Estimate(x=traced.x, d=traced.x)
-    if (
-        on_setpoint
-        and traced.empty.allocates
-        and traced.method("input_metric", estimate)[0].reached
-    ):
+    allocates = on_setpoint and traced.empty.allocates
+    if allocates and traced.method("input_metric", estimate)[0].reached:
         return (
             "the controller's input_metric depends on it and does not receive the setpoint:"
             " schedule it on a level"

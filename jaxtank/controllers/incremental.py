@@ -175,10 +175,8 @@ class LinearPredictive(Controller):
         Omega, Psi, basis = self.design(dt)
         steps = basis[: self.ahead]
         rows = jnp.concatenate([steps, jnp.cumsum(steps, axis=0)]).reshape(-1, Omega.shape[0])
-        limit, low, high = (
-            jnp.stack([v[i] for i in range(self.model.pumps)])
-            for v in (self.du_limit, self.u_low, self.u_high)
-        )
+        stacked = lambda v: jnp.stack([v[i] for i in range(self.model.pumps)])
+        limit, low, high = map(stacked, (self.du_limit, self.u_low, self.u_high))
         u = jnp.stack(last_inputs)
         lower = jnp.concatenate([jnp.tile(-limit, self.ahead), jnp.tile(low - u, self.ahead)])
         upper = jnp.concatenate([jnp.tile(limit, self.ahead), jnp.tile(high - u, self.ahead)])

@@ -132,17 +132,12 @@ class Text:
         program, name, real = self.program, self.name, self.real
         begin = f"{name}_init takes levels and inputs before the first period (NULL: of the case)."
         begin = f"{name}_init gives those at t = 0." if program.plant else begin
-        sizes = {
-            "STATE": max(program.state, 1),
-            "TANKS": program.tanks,
-            "OUTPUTS": program.outputs,
-            "PUMPS": program.pumps,
-        }
-        facts = ", ".join(f"{name.upper()}_{key} = {value}" for key, value in sizes.items())
-        prepared = (
-            [f"    {real} c[{program.kept}]; /* results of p alone */"] if program.kept else []
-        )
-        prepared += [f"    {name}_parameters p;"] if program.prepare else []
+        counts = max(program.state, 1), program.tanks, program.outputs, program.pumps
+        sizes = zip(("STATE", "TANKS", "OUTPUTS", "PUMPS"), counts)
+        facts = ", ".join(f"{name.upper()}_{key} = {value}" for key, value in sizes)
+        kept = f"    {real} c[{program.kept}]; /* results of p alone */"
+        prepared = [kept] * bool(program.kept)
+        prepared += [f"    {name}_parameters p;"] * bool(program.prepare)
         zero = "d" if program.plant else "dr, ddr"
         return "\n".join(
             [
@@ -287,11 +282,8 @@ class Text:
         ]
 
     def _results(self, printer, results):
-        return [
-            f"    {v}[{j}] = {printer.value(e)};"
-            for v, entries in results.items()
-            for j, e in enumerate(entries)
-        ]
+        rows = [(v, j, e) for v, entries in results.items() for j, e in enumerate(entries)]
+        return [f"    {v}[{j}] = {printer.value(e)};" for v, j, e in rows]
 
     def _step(self):
         program, name, real, printer = self.program, self.name, self.real, self.printer

@@ -214,9 +214,8 @@ def interface(program: Any, name: str, version: str) -> str:
     words |= {"start": ", ".join(C().value(v.start) for v in numbers[parameters:])}
     words |= {"init": f"{name}_init({init})", "step": f"{name}_step({step})"}
     major = version[0]
-    stubs = [f"NONE(fmi{major}{f})" for f in NONE[major]] + [
-        f"FINE(fmi{major}{f})" for f in FINE[major]
-    ]
+    stubs = [f"NONE(fmi{major}{f})" for f in NONE[major]]
+    stubs += [f"FINE(fmi{major}{f})" for f in FINE[major]]
     calls = _exported(template(f"fmi{major}.c"))
     return "\n".join([template("fmi.c", **words), calls, "", *stubs, ""])
 
@@ -231,11 +230,8 @@ def _exported(text):
 
 def place_of(version: str) -> tuple[str, str] | None:
     """Return (folder of binaries in an FMU, suffix) of this machine, None where it has none."""
-    system = {
-        "linux": ("linux", ".so"),
-        "darwin": ("darwin", ".dylib"),
-        "win32": ("windows", ".dll"),
-    }
+    system = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib")}
+    system |= {"win32": ("windows", ".dll")}
     machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(platform.machine().lower())
     name, suffix = system.get(sys.platform, ("", ""))
     if not name:

@@ -95,18 +95,11 @@ def print_javascript(program, name, precision):
     """Return a Program as the text of a JavaScript file."""
     printer = JavaScript()
     begin = f"{name}.init(y, u) returns the state; u: inputs before the first sample, optional."
-    initial = ", ".join(
-        printer.value(float(v)) for v in np.ravel(program.case.loop.actuator.initial)
-    )
-    sizes = {
-        "dt": program.case.clock.dt,
-        "state": program.state,
-        "tanks": program.tanks,
-        "outputs": program.outputs,
-        "pumps": program.pumps,
-    }
-    facts = ", ".join(f"{key}: {printer.value(value)}" for key, value in sizes.items())
     loop = program.case.loop
+    initial = ", ".join(printer.value(float(v)) for v in np.ravel(loop.actuator.initial))
+    counts = program.state, program.tanks, program.outputs, program.pumps
+    sizes = zip(("dt", "state", "tanks", "outputs", "pumps"), (program.case.clock.dt, *counts))
+    facts = ", ".join(f"{key}: {printer.value(value)}" for key, value in sizes)
     facts += f", units: {json.dumps(signal_units(loop.plant, loop.units))}"
     first = ", ".join(map(printer.as_real, program.first))
     lines = [

@@ -341,10 +341,8 @@ def _operations(jaxpr):
 def _blocks(a):
     """Yield (matrix (n, n), places (n, k) in the vector) of each group of equal diagonal blocks."""
     size = len(a)
-    meet = np.array([[not (is_number(e) and e == 0) for e in row] for row in a]) | np.eye(
-        size, dtype=bool
-    )
-    meet = meet | meet.T
+    meet = np.array([[not (is_number(e) and e == 0) for e in row] for row in a])
+    meet = meet | meet.T | np.eye(size, dtype=bool)
     for _ in range(size.bit_length()):
         meet = meet @ meet
     groups = {}
@@ -423,10 +421,9 @@ def _counted(writer, eqn, consts, carry, sequences):
         *carried, counter = carried[:many], carried[many:-1], carried[-1].item()
         k = writer.define(WHOLE, "sub", p["length"] - 1, counter) if p["reverse"] else counter
         start = lambda size: writer.define(WHOLE, "mul", k, size)
-        rows = [
-            arrays.part_of(writer, kind, name, start(math.prod(s.shape[1:])), s.shape[1:])
-            for kind, name, s in zip(read, tables, sequences)
-        ]
+        of = lambda kind, name, shape: (writer, kind, name, start(math.prod(shape)), shape)
+        shapes = (s.shape[1:] for s in sequences)
+        rows = [arrays.part_of(*of(*table)) for table in zip(read, tables, shapes)]
         out = writer.run(closed.jaxpr, closed.consts, [*consts, *carried[0], *rows])
         after = [
             arrays.put(writer, kind, table.flat[0].name, start(row.size), row)
@@ -534,9 +531,8 @@ def written(jaxpr):
 
 def line_of(array):
     """Return the name of the line that holds exactly the elements of an array, else None."""
-    whole = array.ndim == 1 and all(
-        isinstance(e, Ref) and e.index == i for i, e in enumerate(array)
-    )
+    places = enumerate(array)
+    whole = array.ndim == 1 and all(isinstance(e, Ref) and e.index == i for i, e in places)
     same = {e.name for e in array.ravel()} if whole else set()
     return same.pop() if len(same) == 1 else None
 
@@ -563,10 +559,8 @@ def _chosen_slice(writer, eqn, array, index):
     moving = [d for d, i in enumerate(index) if not is_number(i) and array.shape[d] > sizes[d]]
     if len(moving) > 1 or array.size > SMALL:
         raise no_code("it reads an array at an index that it computes")
-    starts = [
-        0 if not is_number(i) else min(max(i, 0), n - m)
-        for i, n, m in zip(index, array.shape, sizes)
-    ]
+    start = lambda i, n, m: min(max(i, 0), n - m) if is_number(i) else 0
+    starts = list(map(start, index, array.shape, sizes))
     ranges = [slice(i, i + m) for i, m in zip(starts, sizes)]
     if not moving:
         return array[tuple(ranges)]
@@ -693,14 +687,9 @@ class Writer:
 
     def run(self, jaxpr, consts, arguments):
         """Return the outputs of a jaxpr, arrays of elements, as its `arguments` are."""
-        values = {
-            **dict(zip(jaxpr.constvars, map(elements, consts))),
-            **dict(zip(jaxpr.invars, arguments)),
-        }
-
-        def read(v):
-            return elements(v.val) if isinstance(v, Literal) else values[v]
-
+        values = dict(zip(jaxpr.constvars, map(elements, consts)))
+        values |= dict(zip(jaxpr.invars, arguments))
+        read = lambda v: elements(v.val) if isinstance(v, Literal) else values[v]
         for eqn in jaxpr.eqns:
             out = self.equation(eqn, [read(v) for v in eqn.invars])
             for v, value in zip(eqn.outvars, out):

@@ -76,11 +76,9 @@ def replay(path: str | Path, data: str | Path) -> dict[str, Any]:
         inputs = export.run(log)
     apart = np.abs(inputs - log.u)
     at = np.argmax(apart, axis=0)
-    rows = [
-        {"name": name, "largest_difference": float(apart[k, j]), "time_s": float(log.t[k])}
-        for j, (name, k) in enumerate(zip(columns, at))
-    ]
-    return {"samples": len(log.t), "inputs": rows}
+    keys = ("name", "largest_difference", "time_s")
+    rows = zip(columns, map(float, apart.max(axis=0)), map(float, log.t[at]))
+    return {"samples": len(log.t), "inputs": [dict(zip(keys, row)) for row in rows]}
 
 
 def read(path: str | Path, export: Export) -> tuple[Log, list[str]]:

@@ -122,9 +122,8 @@ def parts(file: str) -> list[str]:
 def names(entries: Iterable) -> set[str]:
     """Return the names of the variables among numbers and Refs."""
     variables = [e for e in entries if isinstance(e, Ref)]
-    return {e.name for e in variables} | {
-        e.index.name for e in variables if isinstance(e.index, Ref)
-    }
+    indices = {e.index.name for e in variables if isinstance(e.index, Ref)}
+    return {e.name for e in variables} | indices
 
 
 def reads(s: Statement) -> set[str]:

@@ -238,15 +238,10 @@ def _variables(printer, program, statements):
     passing = {"next": kept["state"]} | _helpers(printer, statements)
     for n, kind in types.items():
         (kept if n in lasting else passing)[n] = kind
-    constant = {
-        s.name: f"{_array(len(s.entries), printer.kinds[s.kind])}{_initial(printer, s.entries)}"
-        for s in tables
-    }
-    return [
-        *(_block("VAR CONSTANT", constant) if constant else []),
-        *_block("VAR", kept),
-        *_block("VAR_TEMP", passing),
-    ]
+    size_of = lambda s: _array(len(s.entries), printer.kinds[s.kind])
+    constant = {s.name: f"{size_of(s)}{_initial(printer, s.entries)}" for s in tables}
+    lines = _block("VAR CONSTANT", constant) if constant else []
+    return [*lines, *_block("VAR", kept), *_block("VAR_TEMP", passing)]
 
 
 def _block(kind, variables):

@@ -109,6 +109,8 @@ def whole_loop(
     with rolled():
         lowered = lower_all(sample_of(case, carried_names, squares), shapes, WholeWriter())
     before, after, saved, values, errors = lowered.outputs
+    run = run_of(case.loop, case.clock)
+    weights_of = lambda measure, weight: ms.residual_weights(run, ((measure, weight),))
     return WholeLoop(
         case=case,
         leaves=entries_of(shapes["p"]),
@@ -116,11 +118,7 @@ def whole_loop(
         first=flat(before),
         after=flat(after),
         saved={"errors": flat(errors)} if squares else {f: flat(saved[f]) for f in SAVED},
-        weights=[
-            (m, float(w))
-            for m, weight in squares
-            for w in ms.residual_weights(run_of(case.loop, case.clock), ((m, weight),))
-        ],
+        weights=[(m, float(w)) for m, weight in squares for w in weights_of(m, weight)],
         measures={m: flat(values[m]) for m in names},
         lines={start.index: name for start, name in lowered.lines.items()},
     )
@@ -397,17 +395,11 @@ class Text:
         carried = [self._named(name) for _, name, _ in s.carried]
         lines = [f"let {n}={v};" for n, v in zip(carried, starts)]
         counter = next(self.names)
-        lines.append(
-            "for(;;){"
-            if s.count is None
-            else f"for(let {counter}=0;{counter}<{s.count};++{counter}){{"
-        )
+        counted = f"for(let {counter}=0;{counter}<{s.count};++{counter}){{"
+        lines.append("for(;;){" if s.count is None else counted)
         lines += self._block(s.body)
-        new = [
-            (n, self.of(e))
-            for n, e in zip(carried, s.new)
-            if self.given.get(getattr(e, "name", "")) != n
-        ]
+        moves = lambda n, e: self.given.get(getattr(e, "name", "")) != n
+        new = [(n, self.of(e)) for n, e in zip(carried, s.new) if moves(n, e)]
         temporary = [next(self.names) for _ in new]
         lines += [f"const {t}={e};" for t, (_, e) in zip(temporary, new)]
         return [*lines, *(f"{n}={t};" for t, (n, _) in zip(temporary, new)), "}"]

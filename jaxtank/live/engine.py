@@ -396,14 +396,11 @@ def _task(loops: list[WholeLoop]) -> dict[str, Any]:
         loop = dataclasses.replace(case.loop, safety_filter=safety_filter)
         guard = {n: v for n, v in parameters(loop).items() if n.startswith("safety_filter.")}
         values, proved = values | guard, all(row.certified for row in rows)
-    entries = {
-        _name(name, index): float(v)
-        for name, array in values.items()
-        for index, v in np.ndenumerate(np.asarray(array, dtype=float))
-        if np.isfinite(v)
-    }
-    objective = {m: float(w) for m, w in _objective(loops[0].case).items()}
-    entries = {n: v for n, v in entries.items() if n in known}
+    objective, entries = {m: float(w) for m, w in _objective(loops[0].case).items()}, {}
+    for name, array in values.items():
+        for index, v in np.ndenumerate(np.asarray(array, dtype=float)):
+            if np.isfinite(v) and _name(name, index) in known:
+                entries[_name(name, index)] = float(v)
     return {"objective": objective, "values": entries, "proved": proved}
 
 
@@ -417,9 +414,8 @@ def _program(loop: WholeLoop, search: str = "") -> str:
         "leaves": [_name(*leaf) for leaf in loop.leaves],
         "weights": loop.weights,
     }
-    return (
-        f"(()=>{{{printed.text()}\nreturn{{lead,signals,run,read,...{data(facts)},{search}}};}})()"
-    )
+    result = f"{{lead,signals,run,read,...{data(facts)},{search}}}"
+    return f"(()=>{{{printed.text()}\nreturn{result};}})()"
 
 
 def _name(name, index):

@@ -73,10 +73,8 @@ def origin_of(case, source=None):
 
 def _static(case, known):
     """--set of the static fields and the clock that differ; None where the structure does."""
-    mine, theirs = (
-        {n: v for n, v, _ in walk(c.loop, kind="static") if not n.startswith(GUARD)}
-        for c in (case, known)
-    )
+    fields = lambda c: {n: v for n, v, _ in walk(c.loop, kind="static") if not n.startswith(GUARD)}
+    mine, theirs = fields(case), fields(known)
     if _shapes(case.loop) != _shapes(known.loop) or mine.keys() != theirs.keys():
         return None
     changes = {name: value for name, value in mine.items() if value != theirs[name]}

@@ -125,9 +125,8 @@ def _sum_of_squares(size, term, refers_to=""):
 
 def _lasting(term):
     """`term` of the samples that last for dt: the terms of an integral over the run."""
-    return lambda run, sample, *context: each(
-        lambda v: run.lasting(sample, v), term(run, sample, *context)
-    )
+    held = lambda run, sample: lambda v: run.lasting(sample, v)
+    return lambda run, sample, *context: each(held(run, sample), term(run, sample, *context))
 
 
 def _extreme(size, pick, better, worst, refers_to=""):
@@ -146,12 +145,8 @@ def _extreme(size, pick, better, worst, refers_to=""):
 
 def _excess(run, command):
     """How far a command is outside its limits [V], 0 inside."""
-    return each(
-        lambda v, low, high: jnp.where(v > high, v - high, jnp.where(v < low, low - v, 0.0)),
-        command,
-        run.low,
-        run.high,
-    )
+    past = lambda v, low, high: jnp.where(v > high, v - high, jnp.where(v < low, low - v, 0.0))
+    return each(past, command, run.low, run.high)
 
 
 def _saturation_excess(run, sample):
@@ -162,12 +157,8 @@ def _saturation_excess(run, sample):
 
 
 def _outside(run, sample):
-    return each(
-        lambda v, low, high: jnp.where((v < low) | (v > high), 1.0, 0.0),
-        sample.command,
-        run.low,
-        run.high,
-    )
+    past = lambda v, low, high: jnp.where((v < low) | (v > high), 1.0, 0.0)
+    return each(past, sample.command, run.low, run.high)
 
 
 def _overshoot(sample, context):
@@ -316,11 +307,8 @@ def _sum_of_changes(term, residual=None):
         sums = each(lambda d, s: plus(s, term(d)), _changes(state, sample), state[1])
         return sample.u, sums, jnp.zeros_like(state[2])
 
-    return Accumulator(
-        lambda run: (_filled(run, "pumps"), _sums(run, "pumps"), run.zero == 0.0),
-        update,
-        residual=residual,
-    )
+    start = lambda run: (_filled(run, "pumps"), _sums(run, "pumps"), run.zero == 0.0)
+    return Accumulator(start, update, residual=residual)
 
 
 def _magnitudes(vector):

@@ -242,14 +242,10 @@ def entry_units(name: str, plant: Any) -> str | list[str]:
     if MEASURES[name].per != "pump" or not getattr(plant, "valves", ()):
         return unit(name, (length, drive))
     drives = [input_unit(plant, j, drive) for j in range(plant.pumps)]
-    units = [_powers(unit(name, (length, each))) for each in drives]
+    bare = re.compile(r"-(\^-?\d+)?").fullmatch  # of what has no unit: "-^2 s" is "s"
+    texts = (unit(name, (length, each)).split(" ") for each in drives)
+    units = [" ".join(v for v in factors if not bare(v)) or "-" for factors in texts]
     return units[0] if len(set(units)) == 1 else units
-
-
-def _powers(text: str) -> str:
-    """A unit without factors "-", of what has none: "-^2 s" is "s"."""
-    factors = [factor for factor in text.split(" ") if not re.fullmatch(r"-(\^-?\d+)?", factor)]
-    return " ".join(factors) or "-"
 
 
 def entries(name: str, plant: Any) -> int:
@@ -368,9 +364,8 @@ def read(run: Run, states: States, names: Sequence[str]) -> dict[str, Any]:
     for name in names:
         spec = MEASURES[name]
         if run.arrays and not spec.arrays:
-            rows = {
-                a: _rows_of(states[a]) if ACCUMULATORS[a].rows else states[a] for a in spec.needs
-            }
+            of = lambda a: _rows_of(states[a]) if ACCUMULATORS[a].rows else states[a]
+            rows = {a: of(a) for a in spec.needs}
             values[name] = spec.read(_in_tuples(run), rows)
         else:
             values[name] = spec.read(run, states)
