@@ -421,9 +421,9 @@ def _counted(writer, eqn, consts, carry, sequences):
         *carried, counter = carried[:many], carried[many:-1], carried[-1].item()
         k = writer.define(WHOLE, "sub", p["length"] - 1, counter) if p["reverse"] else counter
         start = lambda size: writer.define(WHOLE, "mul", k, size)
-        of = lambda kind, name, shape: (writer, kind, name, start(math.prod(shape)), shape)
+        part = lambda kind, name, s: arrays.part_of(writer, kind, name, start(math.prod(s)), s)
         shapes = (s.shape[1:] for s in sequences)
-        rows = [arrays.part_of(*of(*table)) for table in zip(read, tables, shapes)]
+        rows = [part(kind, name, shape) for kind, name, shape in zip(read, tables, shapes)]
         out = writer.run(closed.jaxpr, closed.consts, [*consts, *carried[0], *rows])
         after = [
             arrays.put(writer, kind, table.flat[0].name, start(row.size), row)
@@ -482,7 +482,7 @@ def _while(writer, eqn, operands):
 
 def _most(test):
     """The passes of a loop that goes on while a counter is below a number, None if it has none."""
-    ends = [eqn.invars[1] for eqn in test.eqns if eqn.primitive.name == "lt"]
+    ends: list[Any] = [eqn.invars[1] for eqn in test.eqns if eqn.primitive.name == "lt"]
     ends = [e for e in ends if isinstance(e, Literal) and kind_of(e.aval.dtype) == WHOLE]
     return min((int(e.val) for e in ends), default=None)
 

@@ -131,8 +131,8 @@ def _scene(loop, trajectory, seconds, against, titles):
     width = 4.6 if len(pairs) == 1 else 3.9
     figure = plt.figure(figsize=(width * len(pairs), min(6.0, width * shape + 0.8)), dpi=80)
     names = [*titles, *[""] * len(pairs)]
-    places = [(k, len(pairs)) for k in range(len(pairs))]
-    stages = [_Stage(figure, at, *pair, name) for at, pair, name in zip(places, pairs, names)]
+    rows = enumerate(zip(pairs, names))
+    stages = [_Stage(figure, (k, len(pairs)), rig, run, n) for k, ((rig, run), n) in rows]
     raised = max(stage.ax.get_ylim()[1] - stage.where.top for stage in stages)
     for stage in stages:  # to one scale
         stage.ax.set_ylim(top=stage.where.top + raised)

@@ -163,8 +163,8 @@ def _with_pumps(plant, boxes, rows, width):
     most = max(sides.count("left"), sides.count("right"))
     edge = 0.75 + 0.5 * max(0, most - 1)
     top = max([b.y + b.height for b in boxes] + [p[1][1] for _, _, p in risers]) + 0.3
-    ends = {"left": -edge, "right": width + edge, "bottom": -1.12, "top": top}
-    return Layout(*map(tuple, (boxes, pumps, risers, suctions)), **ends)
+    parts = (tuple(part) for part in (boxes, pumps, risers, suctions))
+    return Layout._make((*parts, -edge, width + edge, -1.12, top))
 
 
 def _side(plant, boxes, width, j):

@@ -131,9 +131,9 @@ def _maker(kind: str) -> Any:
     spell = lambda name: f"{name}_" if name == "from" else name
     parameters, rows = [], []
     for key in section.keys:
-        kind = PLACED if key.name == "name" else inspect.Parameter.KEYWORD_ONLY
+        place = PLACED if key.name == "name" else inspect.Parameter.KEYWORD_ONLY
         default = inspect.Parameter.empty if key.default is NEEDED else key.default
-        parameters.append(inspect.Parameter(spell(key.name), kind, default=default))
+        parameters.append(inspect.Parameter(spell(key.name), place, default=default))
         words = ", ".join(filter(None, [key.doc, allowed(key.meta())]))
         rows.append(f"{spell(key.name)} : {words}{unit(key.meta())}")
     example = EXAMPLES[kind]

@@ -84,7 +84,7 @@ def _conversion(label, name, unit, axes, loop):
         is_gain = lambda v: isinstance(v, str) and _GAIN.fullmatch(v.strip()) is not None
         return is_gain, lambda text, i: _gain(label, text, loop, i)
     if unit != loop.units[0] or name not in LEVELS + WIDTHS:
-        return lambda v: False, float
+        return lambda v: False, lambda text, i: text
     tanks = loop.plant.outputs if axes == "output" else range(loop.plant.tanks)
     width = name in WIDTHS
     return is_reading, lambda text, i: level_of(text, spans_of(loop)[tanks[i]], width)

@@ -63,7 +63,7 @@ def ramps_of(section, table, old, words, sizes):
     initial, plant = values["initial"].tolist(), sizes.plant
     if columns := _columns_of(section.name, table):
         names = columns.chosen(table.get("column"), words[0], plant, len(initial))
-        units, spans = dict.fromkeys(range(len(initial)), of), None
+        units, spans = {i: of for i in range(len(initial))}, None
         if words[0] == "pump":
             units = {i: input_unit(plant, i, of) for i in units}
         else:

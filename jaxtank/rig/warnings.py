@@ -403,8 +403,8 @@ def _differences(case, holder, model, prefix):
         if value is None or other is None or np.shape(other) != np.shape(value):
             continue
         pairs = {f"plant.{name}": value, prefix + name: other}
-        same = (has(preset, n) and np.array_equal(get_value(preset, n), pairs[n]) for n in pairs)
-        if preset and all(same):
+        same = lambda loop, n, v: has(loop, n) and np.array_equal(get_value(loop, n), v)
+        if preset and all(same(preset, n, v) for n, v in pairs.items()):
             continue  # a difference that the preset itself has is meant
         plant, other = np.asarray(value, dtype=float), np.asarray(other, dtype=float)
         allowed, words = _uncertainty(case, f"plant.{name}", plant)
