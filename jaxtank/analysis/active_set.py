@@ -86,9 +86,7 @@ def solve_soft(H, f, A, l, u, G, room, penalty, span):
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(5,))
 def minimum(H, f, G, l, u, active):
-    """Return the Face of the minimum. The first `active` rows are the last variables, which start
-    at their lower end, 0, with f > 0; H joins them to no others.
-    """
+    """Return the Face of the minimum; the first `active` rows are slacks that start at 0."""
     size, rows = f.shape[0], G.shape[0]
     index, slots = np.arange(rows), np.arange(size)
     whole = jnp.pad(_inverse(H[: size - active, : size - active]), (0, active))
@@ -141,9 +139,8 @@ def minimum(H, f, G, l, u, active):
             image=face.image + (scale * tilt)[:, None] * line,
         )
         dropped = entry(face.row, leaving)
-        candidates = jnp.where(
-            joins, candidates & (index != number), candidates | (index == dropped)
-        )
+        ahead, again = candidates & (index != number), candidates | (index == dropped)
+        candidates = jnp.where(joins, ahead, again)
         multiplier = jnp.where(joins, 0.0, candidate.multiplier + step)
         candidate = Candidate(number, jnp.where(joins, 0.0, side), multiplier)
         return jnp.where(feasible, count + 1, PASSES * size), new, candidates, candidate
@@ -212,10 +209,6 @@ def _slope(active, data, tangents):
         lambda _, right: _solve_on(fixed, jax.lax.stop_gradient(H), *right),
         symmetric=True,
     )
-    zeros = jax.tree.map(_zero_tangent, face)
-    return face, zeros._replace(x=x, multiplier=-y)
-
-
-def _zero_tangent(v):
-    whole = jnp.issubdtype(v.dtype, jnp.integer)
-    return np.zeros(v.shape, jax.dtypes.float0) if whole else jnp.zeros_like(v)
+    whole = lambda v: jnp.issubdtype(v.dtype, jnp.integer)
+    still = lambda v: np.zeros(v.shape, jax.dtypes.float0) if whole(v) else jnp.zeros_like(v)
+    return face, jax.tree.map(still, face)._replace(x=x, multiplier=-y)

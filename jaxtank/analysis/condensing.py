@@ -8,9 +8,7 @@ import jax.numpy as jnp
 
 
 def slopes_along(onward: Callable[..., Any], x: Any, u: Any, *more: Any) -> jax.Array:
-    """Return (samples, n + m, n) derivatives of onward(x, u, ...) (n,) by each entry of x and u, at
-    the rows of x (samples, n), u (samples, m) and `more`.
-    """
+    """Return (samples, n + m, n) derivatives of onward(x, u, ...) (n,) at rows of x, u, `more`."""
     n, unit = x.shape[1], jnp.eye(x.shape[1] + u.shape[1])
 
     def slopes(x, u, *more):
@@ -22,9 +20,7 @@ def slopes_along(onward: Callable[..., Any], x: Any, u: Any, *more: Any) -> jax.
 
 
 def condensed(slopes: Any, basis: Any, first: Any) -> Any:
-    """Return (samples, n, K) derivatives by K variables of the states after each sample, from
-    `slopes` (samples, n + m, n), and those of the first state (n, K) and of inputs (samples, m, K).
-    """
+    """Return (samples, n, K) derivatives of the states by K variables, from those of one step."""
 
     def grow(S, now):
         slope, b = now  # (n + m, n), (m, K)

@@ -9,8 +9,7 @@ import numpy as np
 RADIUS = 1e-7
 """How far outside the unit circle encirclements are counted: a growth below it is none [-]."""
 
-SQUARINGS = 40
-"""A matrix is raised to the power 2^SQUARINGS to find its spectral radius."""
+SQUARINGS = 40  # a matrix is raised to the power 2^SQUARINGS to find its spectral radius
 
 
 class OpenLoop(NamedTuple):

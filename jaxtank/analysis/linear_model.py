@@ -36,9 +36,8 @@ def linearise(plant, x, u, inflow=None):
     """
     x, u = jnp.asarray(x, dtype=float), jnp.asarray(u, dtype=float)
     d = None if inflow is None else tuple(inflow)
-    A, B = jax.jacfwd(
-        lambda x, u: jnp.stack(plant.derivative(0.0, tuple(x), tuple(u), d)), argnums=(0, 1)
-    )(x, u)
+    rates = lambda x, u: jnp.stack(plant.derivative(0.0, tuple(x), tuple(u), d))
+    A, B = jax.jacfwd(rates, argnums=(0, 1))(x, u)
     return A, B, jnp.eye(plant.tanks)[np.array(plant.outputs)]
 
 
@@ -115,11 +114,8 @@ def transmission_zeros(A, B, C):
     finite = np.abs(beta) > 1e-10 * np.abs(alpha)
     zeros = alpha[finite] / beta[finite]
     zeros = zeros[np.argsort(-zeros.real)]
-    return (
-        zeros.real
-        if np.all(np.abs(zeros.imag) < 1e-9 * np.abs(zeros).max(initial=1e-300))
-        else zeros
-    )
+    real = np.all(np.abs(zeros.imag) < 1e-9 * np.abs(zeros).max(initial=1e-300))
+    return zeros.real if real else zeros
 
 
 def zero_direction(A, B, C, zero):

@@ -9,16 +9,13 @@ import numpy as np
 from jaxtank.analysis import frequency as fr
 from jaxtank.analysis.frequency import OpenLoop
 
-POINTS = 224
-"""Frequencies of the grid, evenly spaced in their logarithm."""
+POINTS = 224  # frequencies of the grid, evenly spaced in their logarithm
 
-DELAYED = 96
-"""Further frequencies with a dead time, evenly spaced up to TURN rad of its phase."""
+DELAYED = 96  # further frequencies with a dead time, evenly spaced up to TURN rad of its phase
 
 TURN = 50.0
 
-LOWEST = 1e-7
-"""Lowest frequency of the grid, as a share of the Nyquist frequency [-]."""
+LOWEST = 1e-7  # lowest frequency of the grid, as a share of the Nyquist frequency [-]
 
 ZOOMS, ZOOM = 5, 15
 """A bracket on the grid is narrowed by a factor of 7 or more ZOOMS times, with ZOOM points."""
@@ -62,9 +59,7 @@ def margins(loop: OpenLoop, slopes: bool = True) -> Margins:
 
 
 def _is_stable(still: OpenLoop, form: OpenLoop) -> Any:
-    """True if the closed loop is stable; with a dead time by the number of its unstable poles: the
-    winding of its characteristic polynomial, as a share of z^degree, along |z| = 1 + RADIUS.
-    """
+    """True if the closed loop is stable; with dead time by the winding along |z| = 1 + RADIUS."""
     if not np.any(still.dead):
         return fr.is_stable(still.A - still.B @ still.C)
     slow = jnp.exp(jnp.linspace(np.log(1e-3 * fr.RADIUS), np.log(LOWEST * np.pi), 24)[:-1])

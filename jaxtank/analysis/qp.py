@@ -59,14 +59,6 @@ def solve(H, f, G, l, u, iterations=MOST):
     return unit * interior_point(*inside, iterations).x
 
 
-def _solver(A):
-    """Return the function b -> A^-1 b, whose derivatives follow from the linear system."""
-    factored = factor(jax.lax.stop_gradient(A))
-    return lambda b: jax.lax.custom_linear_solve(
-        lambda x: A @ x, b, lambda _, b: substitute(factored, b), symmetric=True
-    )
-
-
 def scaled(H, f, G, l, u):
     """(unit (n,), the programme of z = x / unit): with a Hessian of unit diagonal, rows of length
     1, and a z of the order of 1, for what the iterates begin and end with are plain numbers. The
@@ -137,7 +129,11 @@ def _implicit(point, data, moved):
         return H @ x + f + G.T @ (lu - ll), row * (G @ x - (up * u + low * l) / both)
 
     a, b = (-r for r in jax.jvp(residual, tuple(data), tuple(moved))[1])
-    solved = _solver(_normal(H, G, point))
+    normal = _normal(H, G, point)
+    factored = factor(jax.lax.stop_gradient(normal))
+    solved = lambda b: jax.lax.custom_linear_solve(  # b -> normal^-1 b
+        lambda x: normal @ x, b, lambda _, b: substitute(factored, b), symmetric=True
+    )
 
     def corrected(solution, _):
         dx, v = solution
@@ -145,9 +141,8 @@ def _implicit(point, data, moved):
         step = solved(rest + A.T @ (over / D))
         return (dx + step, v + (A @ step - over) / D), None
 
-    return jax.lax.scan(
-        corrected, (jnp.zeros_like(a), jnp.zeros_like(b)), None, length=1 + CORRECTIONS
-    )[0][0]
+    start = jnp.zeros_like(a), jnp.zeros_like(b)
+    return jax.lax.scan(corrected, start, None, length=1 + CORRECTIONS)[0][0]
 
 
 def interior_point(H, f, G, l, u, iterations=MOST):
@@ -155,18 +150,15 @@ def interior_point(H, f, G, l, u, iterations=MOST):
     x = jnp.zeros_like(f)
     multipliers = jnp.full(G.shape[0], 0.1, f.dtype)
     rounding = 64.0 * jnp.finfo(f.dtype).eps * jnp.maximum(1.0, jnp.maximum(jnp.abs(u), jnp.abs(l)))
-    start = Point(
-        x, jnp.maximum(u - G @ x, 0.1), jnp.maximum(G @ x - l, 0.1), multipliers, multipliers
-    )
+    slacks = jnp.maximum(u - G @ x, 0.1), jnp.maximum(G @ x - l, 0.1)
+    start = Point(x, *slacks, multipliers, multipliers)
     data = H, f, G, l, u
 
     def under_way(state):
         k, p = state
         worst = jnp.max(jnp.stack([jnp.max(jnp.abs(r)) for r in _residuals(p, *data)]))
-        off = [
-            jnp.max(jnp.abs(s * lam - MU_MIN) - rounding * lam)
-            for s, lam in ((p.su, p.lu), (p.sl, p.ll))
-        ]
+        pairs = (p.su, p.lu), (p.sl, p.ll)
+        off = [jnp.max(jnp.abs(s * lam - MU_MIN) - rounding * lam) for s, lam in pairs]
         return (k < iterations) & ~((jnp.maximum(*off) < OFF * MU_MIN) & (worst < RESIDUAL))
 
     def advance(state):
@@ -174,17 +166,12 @@ def interior_point(H, f, G, l, u, iterations=MOST):
         new = _iterate(p, *data)
         # where no point is feasible the multipliers grow until they overflow: the last finite ones
         # are kept
-        good = (
-            jnp.sum(jnp.abs(new.x))
-            + jnp.sum(new.lu)
-            + jnp.sum(new.ll)
-            + jnp.sum(new.su)
-            + jnp.sum(new.sl)
-            < 1e300
-        )
-        return jnp.where(good, k + 1, iterations), jax.tree.map(
-            lambda a, b: jnp.where(good, b, a), p, new
-        )
+        size = jnp.sum(jnp.abs(new.x))
+        for part in (new.lu, new.ll, new.su, new.sl):
+            size = size + jnp.sum(part)
+        good = size < 1e300
+        count = jnp.where(good, k + 1, iterations)
+        return count, jax.tree.map(lambda a, b: jnp.where(good, b, a), p, new)
 
     return jax.lax.while_loop(under_way, advance, (jnp.int32(0), start))[1]
 
@@ -235,8 +222,6 @@ def _normal(H, G, p):
 
 def _reach(p, step, back):
     """The largest share <= 1 of `step` that keeps slacks and multipliers positive, by `back`."""
-    shares = [
-        jnp.min(jnp.where(d < 0, -back * v / jnp.where(d < 0, d, -1.0), 1.0))
-        for v, d in zip(p[1:], step[1:])
-    ]
+    share = lambda v, d: jnp.where(d < 0, -back * v / jnp.where(d < 0, d, -1.0), 1.0)
+    shares = [jnp.min(share(v, d)) for v, d in zip(p[1:], step[1:])]
     return jnp.minimum(1.0, jnp.min(jnp.stack(shares)))

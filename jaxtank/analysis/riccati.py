@@ -37,7 +37,8 @@ def discrete_lyapunov(A, Q):
 
 def riccati(A, B, Q, R):
     """Return the stabilising P (n, n) of A'P + P A - P B R^-1 B'P + Q = 0."""
-    P = jax.lax.stop_gradient(_riccati_by_sign(*(jax.lax.stop_gradient(a) for a in (A, B, Q, R))))
+    still = jax.lax.stop_gradient
+    P = still(_riccati_by_sign(*map(still, (A, B, Q, R))))
     K = jnp.linalg.solve(R, B.T @ P)
     closed = A - B @ K
     return _symmetric(lyapunov(closed.T, Q + K.T @ R @ K))
@@ -71,9 +72,8 @@ def lqr(A, B, Q, R):
 
 def discrete_riccati(A, B, Q, R):
     """Return the stabilising P (n, n) of P = A'P A - A'P B (R + B'P B)^-1 B'P A + Q."""
-    P = jax.lax.stop_gradient(
-        _discrete_riccati_by_doubling(*(jax.lax.stop_gradient(a) for a in (A, B, Q, R)))
-    )
+    still = jax.lax.stop_gradient
+    P = still(_discrete_riccati_by_doubling(*map(still, (A, B, Q, R))))
     K = jnp.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
     return _symmetric(discrete_lyapunov((A - B @ K).T, Q + K.T @ R @ K))
 
@@ -87,10 +87,8 @@ def _discrete_riccati_by_doubling(A, B, Q, R):
         AW = A @ W
         return AW @ A, _symmetric(G + AW @ G @ A.T), _symmetric(H + A.T @ H @ W @ A)
 
-    start = (A, B @ jnp.linalg.solve(R, B.T), Q)
-    return jax.lax.fori_loop(
-        0, DOUBLINGS, double, jax.tree.map(lambda a: a + 0.0 * Q[0, 0], start)
-    )[2]
+    start = tuple(a + 0.0 * Q[0, 0] for a in (A, B @ jnp.linalg.solve(R, B.T), Q))
+    return jax.lax.fori_loop(0, DOUBLINGS, double, start)[2]
 
 
 def _symmetric(P):

@@ -24,8 +24,7 @@ def flow_leaves(plant: Any) -> tuple[str, ...]:
     return FLOWS + tuple(name for name in more if getattr(plant, name) is not None)
 
 
-ITERATIONS = 60
-"""Newton steps at most, for networks with pipes."""
+ITERATIONS = 60  # Newton steps at most, for networks with pipes
 
 
 class SteadyStates:

@@ -14,8 +14,7 @@ from jaxtank.core.labels import label_of, labels_of
 from jaxtank.core.numerics import lower_clip, smooth_signed_sqrt, smooth_sqrt
 from jaxtank.plants import elements
 
-STEPS = 200
-"""Steps at most; ten to thirty suffice where there is a steady state."""
+STEPS = 200  # steps at most; ten to thirty suffice where there is a steady state
 
 
 class Balance:
@@ -498,10 +497,9 @@ def _free_discharge(plant, y, words, inflow):
     """(levels, inputs) of a network without pipes in its steady state; inputs may be negative."""
     with np.errstate(all="ignore"):  # an overflow is reported below
         try:
-            roots = _roots_of(np.asarray(y, dtype=float), float(plant.knee))
-            speeds, u = _from_known_speeds(
-                plant, np.sqrt(2.0 * float(plant.gravity)) * roots, np, inflow
-            )
+            known = _roots_of(np.asarray(y, dtype=float), float(plant.knee))
+            known = np.sqrt(2.0 * float(plant.gravity)) * known
+            speeds, u = _from_known_speeds(plant, known, np, inflow)
         except np.linalg.LinAlgError:
             speeds = u = np.array([np.nan])
         x = levels_of(np.maximum(speeds, 0.0), 2.0 * float(plant.gravity), plant.knee)
@@ -527,9 +525,7 @@ def _roots_of(levels, knee):
 
 
 def levels_of(speeds: Any, weight: Any, knee: Any) -> Any:
-    """Return the levels of efflux speeds v: v |v|/(2 g) = v |v|/weight, and below the knee by the
-    inverse of `smooth_sqrt`.
-    """
+    """Return the levels of efflux speeds v: v |v|/weight; of roots below the knee their inverse."""
     root = np.clip(np.abs(speeds) / np.sqrt(weight * knee), 0.0, 1.0)
     laminar = knee * np.sign(speeds) * (1.5 - np.sqrt(2.25 - 2.0 * root))
     return np.where(root < 1.0, laminar, speeds * np.abs(speeds) / weight)
@@ -549,21 +545,16 @@ def _balanced(plant, y, words, inflow, shared, held):
     if not plant.plain or shared is not None or held:
         return _rest_of_elements(plant, y, words, inflow, shared, held)
     check_rest(plant, "equilibrium")
-    speed = (
-        float(np.max(np.abs(plant.drain)))
-        / float(np.min(plant.area))
-        * np.sqrt(2.0 * float(plant.gravity) * (float(np.max(y)) or 1.0))
-    )
+    speed = np.sqrt(2.0 * float(plant.gravity) * (float(np.max(y)) or 1.0))
+    speed = float(np.max(np.abs(plant.drain))) / float(np.min(plant.area)) * speed
     tolerance = 1e-9 * max(speed, 1e-12)
     try:
         # an area of 1e-300, say, overflows on the way: the check below reports it
         with np.errstate(all="ignore"):
-            many = plant.tanks >= vectors.FROM
-            x, u, rates = (
-                balanced(plant, y, 1e-5 * tolerance, inflow)
-                if many
-                else _by_dense(plant, y, inflow)
-            )
+            if plant.tanks >= vectors.FROM:
+                x, u, rates = balanced(plant, y, 1e-5 * tolerance, inflow)
+            else:
+                x, u, rates = _by_dense(plant, y, inflow)
     except (ValueError, np.linalg.LinAlgError):  # not finite where it starts, or on the way
         raise EquilibriumError(f"{words} have no steady state") from None
     if not np.max(np.abs(rates)) < tolerance:
@@ -582,11 +573,9 @@ def _rest_of_elements(plant, y, words, inflow, shared, held):
         exact = jax.tree.map(lambda v: np.asarray(v, dtype=float), (plant, y, inflow, shared))
         rest = _at_rest(*exact[:3], shared=exact[3], held=held)
         x, u, imbalance = jax.tree.map(np.asarray, rest)
-        flows = [  # those at work may all be 0: a valve closed, a pump off
-            float(np.abs(s.flow))
-            for inputs in (u, _middle(plant))
-            for s in elements.streams(exact[0], x, inputs)
-        ]
+        # those at work may all be 0: a valve closed, a pump off
+        streams = (elements.streams(exact[0], x, inputs) for inputs in (u, _middle(plant)))
+        flows = [float(np.abs(s.flow)) for each in streams for s in each]
     if not imbalance <= 1e-9 * max(flows):
         raise EquilibriumError(f"{words} have no steady state")
     return np.array(x), np.array(u)
@@ -615,14 +604,7 @@ def _by_dense(plant, y, inflow):
         return np.concatenate([by_x[:, free] * (2.0 * scale * z[: len(free)]), by_u / gain], axis=1)
 
     start = np.concatenate([np.full(len(free), 0.9), np.full(plant.pumps, 1e-3 * scale)])
-    solution = scipy.optimize.least_squares(
-        residual,
-        start,
-        jac=jacobian,
-        xtol=1e-15,
-        ftol=1e-15,
-        gtol=1e-15,
-        x_scale="jac",
-        max_nfev=500,
-    )
+    tolerances = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
+    settings = {"jac": jacobian, **tolerances, "x_scale": "jac", "max_nfev": 500}
+    solution = scipy.optimize.least_squares(residual, start, **settings)
     return (*split(solution.x), solution.fun)

@@ -112,18 +112,14 @@ class Cascade(PID):
         asked, outer = PID.step(self, state.outer, tick, estimate)
         setpoint = self._within(asked)
         readings = self.inner_readings(tick, estimate)
-        command, inner = self.inner_loop.step(
-            state.inner, tick._replace(r=setpoint, inflow=()), readings
-        )
+        at_inner = tick._replace(r=setpoint, inflow=())
+        command, inner = self.inner_loop.step(state.inner, at_inner, readings)
         return command, Memory(outer, inner, asked, setpoint)
 
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         inner = self.inner_loop.track(state.inner, tick, command, applied)
-        reached = self._within(
-            each(
-                lambda s, v, u, k: s + (u - v) / k, state.setpoint, command, applied, self.inner_Kc
-            )
-        )
+        moved = lambda s, v, u, k: s + (u - v) / k
+        reached = self._within(each(moved, state.setpoint, command, applied, self.inner_Kc))
         outer = PID.track(self, state.outer, tick, state.asked, reached)
         return state._replace(outer=outer, inner=inner)
 

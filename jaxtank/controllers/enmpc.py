@@ -1,6 +1,4 @@
-"""Explicit nonlinear predictive control of tanks that each have their own pump, with a disturbance
-estimate (gouta2022, sec. 3 and 4).
-"""
+"""Explicit nonlinear predictive control, a pump for each tank (gouta2022, sec. 3 and 4)."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -66,18 +64,12 @@ class ENMPC(Controller):
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         c2, k = authority(self.model), 1.5 / self.Tp
         f = drift(self.model, estimate.x)
-        sign, times = (
-            (1.0 if self.drift == "derived" else -1.0),
-            COMPENSATIONS.index(self.compensation),
-        )
+        sign = 1.0 if self.drift == "derived" else -1.0
+        times = COMPENSATIONS.index(self.compensation)
         d = estimate.d if times and estimate.d else (0.0,) * len(f)
         e = tuple(estimate.x[i] - r for i, r in zip(self.model.outputs, tick.r))
-        return (
-            tuple(
-                -(k * e[i] + sign * f[i] - tick.dr[i] + times * d[i]) / c2[i] for i in range(len(f))
-            ),
-            state,
-        )
+        asked = lambda i: k * e[i] + sign * f[i] - tick.dr[i] + times * d[i]
+        return tuple(-asked(i) / c2[i] for i in range(len(f))), state
 
     @property
     def ignores_disturbance(self) -> bool:

@@ -1,6 +1,4 @@
-"""Inversion that both controllers of gouta2015 share: from demanded output accelerations to
-voltages.
-"""
+"""Inversion that controllers share: from demanded output accelerations to voltages."""
 
 from typing import Any, NamedTuple
 
@@ -36,9 +34,7 @@ def check_inverted(model, holder="controller"):
 def check_own_pumps(model, every=True, holder="controller"):
     """Check that pump j fills the j-th controlled tank alone."""
     check_inverted(model, holder)
-    if tuple(first for first, _ in model.feeds) != model.outputs or any(
-        second is not None for _, second in model.feeds
-    ):
+    if model.feeds != tuple((tank, None) for tank in model.outputs):
         raise InputError(
             f"{holder}.model must have one pump per controlled tank, in the same order: this"
             f" {holder} inverts it tank by tank"
@@ -122,21 +118,15 @@ def input_metric(c, s3, s4):
     (gouta2015 eq. 26; gouta2015 notes S4.5).
     """
     p, q = 0.5 * c.c8 / s3, 0.5 * c.c10 / s4
-    return (
-        p * p * (c.c2**2 + c.c5**2),
-        p * q * (c.c2 * c.c3 + c.c5 * c.c6),
-        q * q * (c.c3**2 + c.c6**2),
-    )
+    g12 = p * q * (c.c2 * c.c3 + c.c5 * c.c6)
+    return p * p * (c.c2**2 + c.c5**2), g12, q * q * (c.c3**2 + c.c6**2)
 
 
 def check_state_coupled(model, reference):
     """Check the model and the reference of a controller of gouta2015."""
     check_inverted(model)
-    if (
-        model.links != STATE_COUPLED_LINKS
-        or model.feeds != STATE_COUPLED_FEEDS
-        or model.outputs != (0, 1)
-    ):
+    shape = model.links, model.feeds, model.outputs
+    if shape != (STATE_COUPLED_LINKS, STATE_COUPLED_FEEDS, (0, 1)):
         raise InputError(
             "controller.model must be a state-coupled four-tank (plants.state_coupled_four_tank):"
             " this controller inverts it"

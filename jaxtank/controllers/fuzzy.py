@@ -94,10 +94,8 @@ class FuzzyBlend(Controller):
         if estimate.d:
             h0, u0 = steady_under(self.model, h0, u0, estimate.d)
         design = (self.model, self.surface, self.ks, self.phi, self.switch, self.form)
-        far = [
-            clip(u, self.low[i], self.high[i])
-            for i, u in enumerate(slide(*design, estimate.x, tick.r, u0, state, estimate.d))
-        ]
+        sliding = slide(*design, estimate.x, tick.r, u0, state, estimate.d)
+        far = [clip(u, self.low[i], self.high[i]) for i, u in enumerate(sliding)]
         near = feedback(self.K, estimate.x, h0, u0)
         share = self.shares(tuple(estimate.x), tuple(tick.r))
         return tuple(n + m * (f - n) for m, f, n in zip(share, far, near)), state

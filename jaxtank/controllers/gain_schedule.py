@@ -1,12 +1,15 @@
 """Gain schedules: gains of a controller as piecewise-linear functions of a setpoint or a level."""
 
+import functools
 import re
 from collections.abc import Sequence
+from operator import attrgetter
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.analysis.schedulable import refusal
 from jaxtank.controllers.base import Controller
 from jaxtank.core.checks import check_value
 from jaxtank.core.clock import Clock, pointwise
@@ -15,6 +18,99 @@ from jaxtank.core.numerics import portion
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, describe, get_value, leaf, parameters, static, with_values
 from jaxtank.signals.base import Signal
+from jaxtank.xla.reachability import use_of
+
+
+def refusal(controller, gains, gain, on_setpoint, channels):
+    """Return why `gain` cannot be scheduled together with the other `gains`, or None."""
+    # Derived from the traced methods of the controller, not from its values.
+    leaves, structure = jax.tree.flatten(controller)
+    return _refusal(
+        structure, tuple(np.shape(v) for v in leaves), gains, gain, on_setpoint, channels
+    )
+
+
+# a check of a loop comes before every run, and the answer depends on no value
+@functools.lru_cache(maxsize=256)
+def _refusal(structure, shapes, gains, gain, on_setpoint, channels):
+    try:
+        traced = _Traced(structure, shapes, gains, gain, channels)
+        return _outside_the_step(traced, on_setpoint) or _in_the_step(traced)
+    except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError):
+        return "the controller branches on its value with Python's if, which cannot be traced"
+
+
+class _Traced:
+    """Methods of a controller traced for placeholders: which of them depend on one gain."""
+
+    def __init__(self, structure, shapes, gains, gain, channels):
+        self.number = jax.ShapeDtypeStruct((), jnp.result_type(float))
+        self.structure, self.gain = structure, gain
+        self.leaves = [jax.ShapeDtypeStruct(s, self.number.dtype) for s in shapes]
+        self.others = [g for g in gains if g != gain]
+        self.empty = jax.tree.unflatten(structure, self.leaves)
+        model = getattr(self.empty, "model", None)
+        tanks, pumps = (channels, channels) if model is None else (model.tanks, model.pumps)
+        self.x, self.u, self.r = ((self.number,) * n for n in (tanks, pumps, channels))
+        self.before = self._before()
+
+    def method(self, name, *args, **fixed):
+        """Return the use of the gain in one method, and the shapes of its results."""
+
+        def f(value, rest, leaves, *args):
+            values = {self.gain: value, **dict(zip(self.others, rest))}
+            controller = with_values(jax.tree.unflatten(self.structure, leaves), values)
+            return getattr(controller, name)(*args, **fixed)
+
+        arguments = (self.number, (self.number,) * len(self.others), self.leaves, *args)
+        return use_of(f, *arguments), jax.eval_shape(f, *arguments)
+
+    def _before(self):
+        """Return {method that runs before the loop: (use of the gain, shapes of its results)}."""
+        samples = 3
+        along = (jax.ShapeDtypeStruct((samples,), self.number.dtype),) * len(self.r)
+        return {
+            "prepare": self.method("prepare", along, along, along),
+            "inputs": self.method("inputs", clock=Clock(dt=1.0, duration=samples - 1.0)),
+            "init": self.method("init", self.x, self.u),
+        }
+
+
+def _outside_the_step(traced, on_setpoint):
+    """Return why a gain cannot be scheduled that acts elsewhere than in `step`, or None."""
+    for name, (use, _) in traced.before.items():
+        if use.reached:
+            return f"the controller uses it before the loop starts (in its {name})"
+    estimate = Estimate(x=traced.x, d=traced.x)
+    allocates = on_setpoint and traced.empty.allocates
+    if allocates and traced.method("input_metric", estimate)[0].reached:
+        return (
+            "the controller's input_metric depends on it and does not receive the setpoint:"
+            " schedule it on a level"
+        )
+    return None
+
+
+def _in_the_step(traced):
+    """Return why a gain cannot be scheduled for what `step` and `track` compute, or None."""
+    number, x, r = traced.number, traced.x, traced.r
+    plan, signals, state = (shapes for _, shapes in traced.before.values())
+    row = lambda tree: jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape[1:], v.dtype), tree)
+    tick = Tick(t=number, r=r, dr=r, ddr=r, dt=number, plan=row(plan), own=row(signals))
+    tick = tick._replace(inflow=x, flow=traced.u)
+    step, (command, state) = traced.method("step", state, tick, Estimate(x=x, d=x))
+    track, _ = traced.method("track", state, tick, command, traced.u)
+    absent = parameters(traced.empty).get(traced.gain.split("[")[0], 0.0)
+    own_size = int(np.prod(np.shape(absent), dtype=int))
+    if step.looped or track.looped or max(step.largest, track.largest) > own_size:
+        return (
+            "the controller uses it in its design (matrices, or a loop), which would then be"
+            " repeated at every sample"
+        )
+    if not (step.reached or track.reached):
+        return "the controller does not use it"
+    return None
+
 
 VARIABLE = re.compile(r"[rh][1-9]\d*")
 
@@ -23,16 +119,15 @@ def check_gains(controller, gains):
     """Check that each of `gains` names a number among the leaves of a controller, once."""
     if not gains:
         raise InputError("a schedule needs at least one gain")
-    names = [n for n in parameters(controller)]
+    names = parameters(controller)
     for gain in gains:
         if gains.count(gain) > 1:
             raise InputError(f"gain {gain} is scheduled twice")
         try:
             meta = describe(controller, gain)
         except InputError:
-            raise unknown(
-                "gain", f"controller.{gain}", [f"controller.{n}" for n in names]
-            ) from None
+            known = [f"controller.{n}" for n in names]
+            raise unknown("gain", f"controller.{gain}", known) from None
         if meta["kind"] == "static":
             raise InputError(
                 f"gain controller.{gain}: cannot be scheduled, it is part of the compiled program"
@@ -82,10 +177,8 @@ def interpolate(at, knots, values):
     count, intervals = np.shape(values)[0], np.shape(knots)[0] - 1
     parts = [portion(at, knots[j], knots[j + 1]) for j in range(intervals)]
     slope = lambda i, j: (values[i, j + 1] - values[i, j]) / (knots[j + 1] - knots[j])
-    return tuple(
-        sum((slope(i, j) * parts[j] for j in range(intervals)), start=values[i, 0])
-        for i in range(count)
-    )
+    rises = lambda i: (slope(i, j) * parts[j] for j in range(intervals))
+    return tuple(sum(rises(i), start=values[i, 0]) for i in range(count))
 
 
 @component
@@ -147,17 +240,11 @@ class Scheduled(Controller):
     def _on_setpoint(self):
         return self.variable.startswith("r")
 
-    @property
-    def allocates(self) -> bool:
-        return self.law.allocates
-
-    @property
-    def reads_inflow(self) -> bool:
-        return self.law.reads_inflow
-
-    @property
-    def reads_flow(self) -> bool:
-        return self.law.reads_flow
+    allocates = property(attrgetter("law.allocates"))
+    reads_inflow = property(attrgetter("law.reads_inflow"))
+    reads_flow = property(attrgetter("law.reads_flow"))
+    limits_levels = property(attrgetter("law.limits_levels"))
+    reads_ahead = property(attrgetter("law.reads_ahead"))
 
     @pointwise
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
@@ -174,19 +261,9 @@ class Scheduled(Controller):
     def slack(self, state: Any) -> Any:
         return self.law.slack(state.inner)
 
-    @property
-    def limits_levels(self) -> bool:
-        return self.law.limits_levels
-
-    @property
-    def reads_ahead(self) -> bool:
-        return self.law.reads_ahead
-
     def init(self, x0: tuple, u0: tuple) -> Any:
-        return Memory(
-            inner=self._without_gains().init(x0, u0),
-            at=() if self._on_setpoint else x0[self._index],
-        )
+        at = () if self._on_setpoint else x0[self._index]
+        return Memory(inner=self._without_gains().init(x0, u0), at=at)
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         at = tick.r[self._index] if self._on_setpoint else estimate.x[self._index]
@@ -211,34 +288,22 @@ class Scheduled(Controller):
 
     def input_metric(self, estimate: Estimate) -> tuple | None:
         # the setpoint is not available here: `check` refuses gains that would need it
-        inner = (
-            self._without_gains()
-            if self._on_setpoint
-            else self._controller_at(estimate.x[self._index])
-        )
-        return inner.input_metric(estimate)
+        if self._on_setpoint:
+            return self._without_gains().input_metric(estimate)
+        return self._controller_at(estimate.x[self._index]).input_metric(estimate)
 
     def metadata_of(self, field: str) -> dict[str, Any]:
         """Return changes of a field's metadata: values have units and ranges of their gains."""
         if field != "values":
             return {}
-        rows = []
-        for gain in self.gains:
-            meta = describe(self.law, gain)
-            rows.append(
-                {**meta, "doc": f"{meta['doc']}: controller.law.{gain} at a knot", "like": None}
-            )
+        metas = {gain: describe(self.law, gain) for gain in self.gains}
+        words = lambda gain, meta: f"{meta['doc']}: controller.law.{gain} at a knot"
+        rows = tuple({**m, "doc": words(gain, m), "like": None} for gain, m in metas.items())
         doc = f"each gain at each knot; a row each for {', '.join(self.gains)}"
-        every = {
-            "doc": doc,
-            "unit": ", ".join(dict.fromkeys(m["unit"] for m in rows)),
-            "rows": tuple(rows),
-        }
-        if rows and all(
-            m["low"] == rows[0]["low"] and m["strict"] == rows[0]["strict"] for m in rows
-        ):
-            every |= {"low": rows[0]["low"], "strict": rows[0]["strict"]}
-        return every
+        units = ", ".join(dict.fromkeys(m["unit"] for m in rows))
+        ends = [{name: m[name] for name in ("low", "strict")} for m in rows]
+        same = ends[0] if ends and all(end == ends[0] for end in ends) else {}
+        return {"doc": doc, "unit": units, "rows": rows, **same}
 
     def check(self, reference: Signal) -> None:
         check_gains(self.law, self.gains)

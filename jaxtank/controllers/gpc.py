@@ -50,9 +50,8 @@ class GPC(LinearPredictive):
 
     def basis(self) -> jax.Array:
         pumps = self.model.pumps
-        return jnp.eye(self.Np * pumps)[:, : self.Nc * pumps].reshape(
-            self.Np, pumps, self.Nc * pumps
-        )
+        free = self.Nc * pumps
+        return jnp.eye(self.Np * pumps)[:, :free].reshape(self.Np, pumps, free)
 
     def check(self, reference: Signal) -> None:
         super().check(reference)

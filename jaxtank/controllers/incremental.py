@@ -1,6 +1,4 @@
-"""Base of the linear predictive controllers of khalid: the incremental model, the quadratic cost,
-the constraints, and the sampled controller.
-"""
+"""Base of the linear predictive controllers of khalid: incremental model, cost, constraints."""
 
 import abc
 import dataclasses
@@ -44,11 +42,8 @@ def incremental_model(model, operating_point, dt, inputs=None):
     Am, Bm = zero_order_hold(Ac, Bc, dt)
     n, q = Am.shape[0], Cm.shape[0]
     A = jnp.block([[Am, jnp.zeros((n, q))], [Cm @ Am, jnp.eye(q)]])
-    return (
-        A,
-        jnp.concatenate([Bm, Cm @ Bm]),
-        jnp.concatenate([jnp.zeros((q, n)), jnp.eye(q)], axis=1),
-    )
+    B = jnp.concatenate([Bm, Cm @ Bm])
+    return A, B, jnp.concatenate([jnp.zeros((q, n)), jnp.eye(q)], axis=1)
 
 
 def quadratic_cost(A, B, C, q, r_w, basis):
@@ -66,10 +61,8 @@ def quadratic_cost(A, B, C, q, r_w, basis):
         phi, power = carry
         phi, power = A @ phi + B @ increments, A @ power
         outputs = C @ phi
-        return (phi, power), (
-            outputs.T @ (q[:, None] * outputs),
-            outputs.T @ (q[:, None] * (C @ power)),
-        )
+        square = outputs.T @ (q[:, None] * outputs)
+        return (phi, power), (square, outputs.T @ (q[:, None] * (C @ power)))
 
     start = jnp.zeros((n, variables)), jnp.eye(n)
     _, (squares, products) = jax.lax.scan(next_sample, start, basis)
@@ -142,9 +135,8 @@ class LinearPredictive(Controller):
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         x = estimate.x
-        error = self._change(state, tick, estimate) + [
-            x[i] - r for i, r in zip(self.model.outputs, tick.r)
-        ]
+        error = self._change(state, tick, estimate)
+        error += [x[i] - r for i, r in zip(self.model.outputs, tick.r)]
         pumps = range(self.model.pumps)
         if self.mode == "constrained":
             du = self._constrained(state.u, jnp.stack(error), tick.dt)
@@ -170,9 +162,8 @@ class LinearPredictive(Controller):
         """Return dx_m (n): the change of each level since the last sample [cm]."""
         if not estimate.d:
             return [a - b for a, b in zip(estimate.x, state.x)]
-        A, _, _ = linearise(
-            dataclasses.replace(self.model, knee=THRESHOLD), self.operating_point, self._inputs()
-        )
+        model = dataclasses.replace(self.model, knee=THRESHOLD)
+        A, _, _ = linearise(model, self.operating_point, self._inputs())
         tanks = range(self.model.tanks)
         W = zero_order_hold(-A, jnp.eye(len(tanks)), tick.dt)[1]
         rates = self.model.derivative(tick.t, tuple(estimate.x), tuple(state.u), None)
@@ -184,10 +175,8 @@ class LinearPredictive(Controller):
         Omega, Psi, basis = self.design(dt)
         steps = basis[: self.ahead]
         rows = jnp.concatenate([steps, jnp.cumsum(steps, axis=0)]).reshape(-1, Omega.shape[0])
-        limit, low, high = (
-            jnp.stack([v[i] for i in range(self.model.pumps)])
-            for v in (self.du_limit, self.u_low, self.u_high)
-        )
+        stacked = lambda v: jnp.stack([v[i] for i in range(self.model.pumps)])
+        limit, low, high = map(stacked, (self.du_limit, self.u_low, self.u_high))
         u = jnp.stack(last_inputs)
         lower = jnp.concatenate([jnp.tile(-limit, self.ahead), jnp.tile(low - u, self.ahead)])
         upper = jnp.concatenate([jnp.tile(limit, self.ahead), jnp.tile(high - u, self.ahead)])
@@ -205,12 +194,8 @@ class LinearPredictive(Controller):
         if self.mode != "constrained":
             return
         unit = self.model.units[1]
-        pumps = zip(
-            *(
-                np.asarray(v, dtype=float)
-                for v in (self.u_low, self.u_high, actuator.initial, actuator.low, actuator.high)
-            )
-        )
+        ends = self.u_low, self.u_high, actuator.initial, actuator.low, actuator.high
+        pumps = zip(*(np.asarray(v, dtype=float) for v in ends))
         for i, (low, high, initial, pump_low, pump_high) in enumerate(pumps):
             limits = f"controller.u_low = {low:g} {unit} to controller.u_high = {high:g} {unit}"
             if not low <= initial <= high:

@@ -183,11 +183,11 @@ class NMPC(Controller):
         f = times(Y.T, weight.reshape(-1) * e) + times(moves.T, effort * du)
         rows, low, high = self._input_rows(plan, tick.dt)
         limit = jnp.asarray(self.limit)
-        size_of = jax.lax.stop_gradient(jnp.maximum(jnp.abs(x).max(), _finite(limit).max()))
+        finite = lambda v: jnp.where(jnp.isfinite(v), jnp.abs(v), 0.0)
+        size_of = jax.lax.stop_gradient(jnp.maximum(jnp.abs(x).max(), finite(limit).max()))
         room = jnp.minimum(limit - x, SPAN * size_of)
-        change, slack = solve_soft(
-            2.0 * H, 2.0 * f, rows, low, high, S, room, self.penalty, SPAN * size_of
-        )
+        data = 2.0 * H, 2.0 * f, rows, low, high, S, room
+        change, slack = solve_soft(*data, self.penalty, SPAN * size_of)
         return plan._replace(knots=plan.knots + change, slack=jnp.max(slack))
 
     def _predict(self, tick, estimate, inputs, basis):
@@ -265,7 +265,3 @@ class NMPC(Controller):
             raise InputError(
                 f"controller.moves = {self.moves}: must be at most controller.N = {self.N}"
             )
-
-
-def _finite(values):
-    return jnp.where(jnp.isfinite(values), jnp.abs(values), 0.0)

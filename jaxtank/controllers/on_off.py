@@ -74,18 +74,15 @@ class OnOff(Controller):
         return False
 
     def init(self, x0: tuple, u0: tuple) -> Any:
-        on_at_first = each(
-            lambda u, low, high: abs(u - high) < abs(u - low), u0, self.low, self.high
-        )
-        return each(lambda on, zero: jnp.where(on, 1.0, 0.0) + 0.0 * zero, on_at_first, zeros(u0))
+        nearer = lambda u, low, high: abs(u - high) < abs(u - low)
+        on = each(nearer, u0, self.low, self.high)
+        return each(lambda on, zero: jnp.where(on, 1.0, 0.0) + 0.0 * zero, on, zeros(u0))
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         levels = take(estimate.x, self.model.outputs)
         running = each(switched, levels, self.on, self.off, state)
-        inputs = each(
-            lambda on, low, high: jnp.where(on > 0.5, high, low), running, self.low, self.high
-        )
-        return inputs, running
+        pick = lambda on, low, high: jnp.where(on > 0.5, high, low)
+        return each(pick, running, self.low, self.high), running
 
     def check_inputs(self) -> None:
         """Raise InputError unless each output has its pump or valve."""

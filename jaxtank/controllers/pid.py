@@ -1,6 +1,4 @@
-"""PI, PID and fractional PI, one loop per pump, with or without feed-forward (gouta2022, Table 4;
-gouta2022 notes S4.5).
-"""
+"""PI, PID and fractional PI, one loop per pump (gouta2022, Table 4; gouta2022 notes S4.5)."""
 
 import functools
 import operator
@@ -51,16 +49,12 @@ def oustaloup(g):
     # Zeros wb (wh/wb)^((j + N + (1-g)/2)/(2N+1)), poles with (1+g)/2, j = -N .. N, gain wh^g
     # (Oustaloup 2000; gouta2022 notes S4.5).
     j = np.arange(2 * SECTIONS + 1)
-    at = lambda shift: (
-        LOWEST * (HIGHEST / LOWEST) ** ((j + 0.5 * (1.0 + shift)) / (2 * SECTIONS + 1))
-    )
+    share = lambda shift: (j + 0.5 * (1.0 + shift)) / (2 * SECTIONS + 1)
+    at = lambda shift: LOWEST * (HIGHEST / LOWEST) ** share(shift)
     zeros, poles, gain = at(-g), at(g), HIGHEST**g
     apart = jnp.where(np.eye(j.size, dtype=bool), 1.0, poles[None, :] - poles[:, None])
-    return (
-        gain,
-        poles,
-        gain * jnp.prod(zeros[None, :] - poles[:, None], axis=1) / jnp.prod(apart, axis=1),
-    )
+    residues = gain * jnp.prod(zeros[None, :] - poles[:, None], axis=1) / jnp.prod(apart, axis=1)
+    return gain, poles, residues
 
 
 @component
@@ -188,9 +182,8 @@ class PID(Controller):
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
         if not self.feed_forward:
             return ()
-        return tuple(
-            (rate - f) / c for rate, f, c in zip(dr, drift(self.model, r), authority(self.model))
-        )
+        rows = zip(dr, drift(self.model, r), authority(self.model))
+        return tuple((rate - f) / c for rate, f, c in rows)
 
     @property
     def reads_model(self) -> bool:
@@ -248,13 +241,8 @@ class PID(Controller):
             N = () if self.N is None else (self.N,)
             of = lambda n: n[0] if n else FILTER
             v = each(lambda v, k, y, s, *n: v - (of(n) * k) * (y - s), v, Kc, y, slow, *N)
-            slow = each(
-                lambda y, s, Td, *n: s + (1.0 - jnp.exp(-tick.dt * of(n) / Td)) * (y - s),
-                y,
-                slow,
-                self.Td,
-                *N,
-            )
+            lag = lambda y, s, Td, *n: s + (1.0 - jnp.exp(-tick.dt * of(n) / Td)) * (y - s)
+            slow = each(lag, y, slow, self.Td, *N)
         return v, state._replace(slow=slow, error=e)
 
     def _counted(self, e: Any) -> Any:
@@ -276,31 +264,18 @@ class PID(Controller):
         several = np.shape(self.Ti)[-1:] != (1,)
         finite = lambda Ti: jnp.where(jnp.isinf(Ti), 1.0, Ti) if several else Ti
         unless_infinite = lambda Ti, i: jnp.where(jnp.isinf(Ti), 0.0, i) if several else i
+        signals = command, applied, state.error
         if self.anti_windup == "back-calculation":
-            w = each(
-                lambda v, u, e, Ti, Tt, Kc: e + (finite(Ti) / (Tt * Kc)) * (u - v),
-                command,
-                applied,
-                state.error,
-                self.Ti,
-                self.Tt,
-                Kc,
-            )
+            tracked = lambda v, u, e, Ti, Tt, Kc: e + (finite(Ti) / (Tt * Kc)) * (u - v)
+            w = each(tracked, *signals, self.Ti, self.Tt, Kc)
         elif self.anti_windup == "conditioned":
-            conditioned = lambda v, u, e, Kc: e + (u - v) / Kc
-            w = each(conditioned, command, applied, state.error, Kc)
+            w = each(lambda v, u, e, Kc: e + (u - v) / Kc, *signals, Kc)
         else:
             clamped = lambda v, u, e, Kc: jnp.where(Kc * e * (v - u) > 0.0, 0.0, e)
-            w = each(clamped, command, applied, state.error, Kc)
+            w = each(clamped, *signals, Kc)
         if self.order is None:
-            integral = each(
-                lambda w, i, Kc, Ti: unless_infinite(Ti, i + (tick.dt * Kc / finite(Ti)) * w),
-                w,
-                state.integral,
-                Kc,
-                self.Ti,
-            )
-            return state._replace(integral=integral)
+            moved = lambda w, i, Kc, Ti: unless_infinite(Ti, i + (tick.dt * Kc / finite(Ti)) * w)
+            return state._replace(integral=each(moved, w, state.integral, Kc, self.Ti))
         return self._fractional(state, tick, w)
 
     def transfer(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
@@ -332,9 +307,8 @@ class PID(Controller):
             enter = residues * (1.0 - keep) / poles
             rate = gain * error + sum(state.sections[i])
             integral.append(state.integral[i] + tick.dt * Kc[i] * Ti[i] ** -order[i] * rate)
-            sections.append(
-                tuple(keep[j] * s + enter[j] * error for j, s in enumerate(state.sections[i]))
-            )
+            now = enumerate(state.sections[i])
+            sections.append(tuple(keep[j] * s + enter[j] * error for j, s in now))
         return state._replace(integral=tuple(integral), sections=tuple(sections))
 
     def check(self, reference: Signal) -> None:

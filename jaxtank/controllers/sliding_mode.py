@@ -1,6 +1,4 @@
-"""Sliding-mode control of the quadruple tank (mirakhorli sec. 4.1), as printed and in a form that
-can work.
-"""
+"""Sliding-mode control of the quadruple tank (mirakhorli sec. 4.1), as printed and corrected."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple

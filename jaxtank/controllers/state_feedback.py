@@ -1,6 +1,4 @@
-"""State feedback around the steady state of the setpoint (mirakhorli sec. 4.2), and the same with
-integral action.
-"""
+"""State feedback around the setpoint's steady state (mirakhorli sec. 4.2), also integral."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -57,12 +57,8 @@ class TwoTankBackstepping(Controller):
         = a in the paper, whose tanks are equal.
         """
         w = jnp.sqrt(2.0 * self.model.gravity)
-        A1, A3 = self.model.area[0], self.model.area[1]
-        return (
-            self.model.pipe[0] * w / A1,
-            self.model.pipe[0] * w / A3,
-            self.model.drain[1] * w / A3,
-        )
+        A1, A3, pipe = self.model.area[0], self.model.area[1], self.model.pipe[0]
+        return pipe * w / A1, pipe * w / A3, self.model.drain[1] * w / A3
 
     @pointwise
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:

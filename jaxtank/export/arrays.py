@@ -7,8 +7,7 @@ import numpy as np
 from jaxtank.export.simplify import is_number, simplified
 from jaxtank.export.statements import REAL, Each, Ref, View
 
-LOOPED = 16
-"""Operations on single entries from which one on arrays is a loop."""
+LOOPED = 16  # operations on single entries from which one on arrays is a loop
 
 FEW = 12
 """Largest number of blocks from which a large array is joined; of more, its entries are listed."""

@@ -6,7 +6,17 @@ import numpy as np
 
 from jaxtank.core.labels import signal_units
 from jaxtank.export.printer import FUNCTIONS, OPERATIONS, Printer, field_of, header, note_of
-from jaxtank.export.statements import REAL, TRUTH, WHOLE, Matrix, Ref, Store, every
+from jaxtank.export.statements import (
+    MATRIX_OPERATIONS,
+    REAL,
+    TRUTH,
+    WHOLE,
+    Matrix,
+    Ref,
+    Store,
+    every,
+    parts,
+)
 
 WHOLES = {"sign": "({0} > 0) - ({0} < 0)", "abs": "{0} < 0 ? -{0} : {0}"}
 """Operations on whole numbers whose result is one, where those on real ones give a real one."""
@@ -80,87 +90,7 @@ class C(Printer):
         return [f"static {first}" if fixed else first, *others]
 
 
-MATRICES = {
-    "product": """
-static void product(int m, int k, int n, const real *a, const real *b, real *out)
-{
-    for (int i = 0; i < m; ++i)
-        for (int j = 0; j < n; ++j) {
-            real s = 0;
-            for (int l = 0; l < k; ++l) s += a[i * k + l] * b[l * n + j];
-            out[i * n + j] = s;
-        }
-}
-""",
-    "cholesky": """
-static void cholesky(int n, const real *a, real *out)
-{
-    for (int j = 0; j < n; ++j)
-        for (int i = 0; i < n; ++i) {
-            real s = a[i * n + j];
-            if (i < j) { out[i * n + j] = 0; continue; }
-            for (int l = 0; l < j; ++l) s -= out[i * n + l] * out[j * n + l];
-            out[i * n + j] = i == j ? SQRT(s) : s / out[j * n + j];
-        }
-}
-""",
-    "forward": """
-static void forward(int n, int k, const real *a, const real *b, real *out)
-{
-    for (int c = 0; c < k; ++c)
-        for (int i = 0; i < n; ++i) {
-            real s = b[i * k + c];
-            for (int l = 0; l < i; ++l) s -= a[i * n + l] * out[l * k + c];
-            out[i * k + c] = s / a[i * n + i];
-        }
-}
-""",
-    "backward": """
-static void backward(int n, int k, const real *a, const real *b, real *out)
-{
-    for (int c = 0; c < k; ++c)
-        for (int i = n - 1; i >= 0; --i) {
-            real s = b[i * k + c];
-            for (int l = i + 1; l < n; ++l) s -= a[l * n + i] * out[l * k + c];
-            out[i * k + c] = s / a[i * n + i];
-        }
-}
-""",
-    "solve": """
-static void solve(int n, int k, const real *a, const real *b, real *out)
-{
-    real A[LARGEST];
-    for (int i = 0; i < n * n; ++i) A[i] = a[i];
-    for (int i = 0; i < n * k; ++i) out[i] = b[i];
-    for (int j = 0; j < n; ++j) {
-        int best = j;
-        for (int i = j + 1; i < n; ++i)
-            if (FABS(A[i * n + j]) > FABS(A[best * n + j])) best = i;
-        for (int l = 0; l < n; ++l) {
-            const real old = A[j * n + l];
-            A[j * n + l] = A[best * n + l];
-            A[best * n + l] = old;
-        }
-        for (int c = 0; c < k; ++c) {
-            const real old = out[j * k + c];
-            out[j * k + c] = out[best * k + c];
-            out[best * k + c] = old;
-        }
-        for (int i = j + 1; i < n; ++i) {
-            const real f = A[i * n + j] / A[j * n + j];
-            for (int l = j; l < n; ++l) A[i * n + l] -= f * A[j * n + l];
-            for (int c = 0; c < k; ++c) out[i * k + c] -= f * out[j * k + c];
-        }
-    }
-    for (int c = 0; c < k; ++c)
-        for (int i = n - 1; i >= 0; --i) {
-            real s = out[i * k + c];
-            for (int l = i + 1; l < n; ++l) s -= A[i * n + l] * out[l * k + c];
-            out[i * k + c] = s / A[i * n + i];
-        }
-}
-""",
-}
+MATRICES = dict(zip(MATRIX_OPERATIONS, parts("functions.c")))
 """{matrix operation: a function of its sizes, its operands, row by row, and its result}."""
 
 MANUAL = " * manual: inputs that an operator sets; NULL in automatic operation."
@@ -202,17 +132,12 @@ class Text:
         program, name, real = self.program, self.name, self.real
         begin = f"{name}_init takes levels and inputs before the first period (NULL: of the case)."
         begin = f"{name}_init gives those at t = 0." if program.plant else begin
-        sizes = {
-            "STATE": max(program.state, 1),
-            "TANKS": program.tanks,
-            "OUTPUTS": program.outputs,
-            "PUMPS": program.pumps,
-        }
-        facts = ", ".join(f"{name.upper()}_{key} = {value}" for key, value in sizes.items())
-        prepared = (
-            [f"    {real} c[{program.kept}]; /* results of p alone */"] if program.kept else []
-        )
-        prepared += [f"    {name}_parameters p;"] if program.prepare else []
+        counts = max(program.state, 1), program.tanks, program.outputs, program.pumps
+        sizes = zip(("STATE", "TANKS", "OUTPUTS", "PUMPS"), counts)
+        facts = ", ".join(f"{name.upper()}_{key} = {value}" for key, value in sizes)
+        kept = f"    {real} c[{program.kept}]; /* results of p alone */"
+        prepared = [kept] * bool(program.kept)
+        prepared += [f"    {name}_parameters p;"] * bool(program.prepare)
         zero = "d" if program.plant else "dr, ddr"
         return "\n".join(
             [
@@ -357,11 +282,8 @@ class Text:
         ]
 
     def _results(self, printer, results):
-        return [
-            f"    {v}[{j}] = {printer.value(e)};"
-            for v, entries in results.items()
-            for j, e in enumerate(entries)
-        ]
+        rows = [(v, j, e) for v, entries in results.items() for j, e in enumerate(entries)]
+        return [f"    {v}[{j}] = {printer.value(e)};" for v, j, e in rows]
 
     def _step(self):
         program, name, real, printer = self.program, self.name, self.real, self.printer

@@ -4,6 +4,7 @@ import functools
 import hashlib
 import io
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from jaxtank.core.labels import input_unit, label_of
 from jaxtank.core.units import local
 from jaxtank.export.c import C, print_c
 from jaxtank.export.printer import note_of
+from jaxtank.export.statements import template
 
 SIGNALS = {
     "y": ("tank", "cm", "reading"),
@@ -33,8 +35,7 @@ SIGNALS = {
 }
 """{argument of a step: (what it has an entry for, unit of a rig in cm and V, what it is)}."""
 
-NAMES = {"w": "manual_input"}
-"""{argument: its name in the FMU, where that is another}."""
+NAMES = {"w": "manual_input"}  # {argument: its name in the FMU, where that is another}
 
 MANUAL = "manual"
 
@@ -142,258 +143,27 @@ BUILD = """<?xml version="1.0" encoding="UTF-8"?>
 
 def _rows(program, numbers, third):
     """The variables as elements: numbers, time, the switch of manual operation."""
-    rows = [(_row3 if third else _row2)(i, v) for i, v in enumerate(numbers)]
-    words = {"valueReference": len(numbers) + 1, "causality": "independent"}
-    time = _attributes(name="time", **words, variability="continuous")
-    two = f"    <ScalarVariable{time}><Real/></ScalarVariable>"
-    rows.append(f"    <Float64{time}/>" if third else two)
-    if program.plant:
-        return rows
-    words = {"valueReference": len(numbers), "causality": "input", "variability": "discrete"}
-    switch = _attributes(name=MANUAL, **words, description="true: u is manual_input")
-    two = f'    <ScalarVariable{switch}><Boolean start="false"/></ScalarVariable>'
-    return [*rows, f'    <Boolean{switch} start="false"/>' if third else two]
+    real, rows = "Float64" if third else "Real", []
 
+    def add(kind, name, i, causality, variability, words=None, **value):
+        outer = {"name": name, "valueReference": i, "causality": causality}
+        outer |= {"variability": variability, "description": words}
+        outer, inner = _attributes(**outer), _attributes(**value)
+        one, two = f"<{kind}{outer}{inner}/>", f"<ScalarVariable{outer}><{kind}{inner}/>"
+        rows.append(f"    {one if third else f'{two}</ScalarVariable>'}")
 
-def _parts(v):
-    """(attributes of a variable, attributes of its value)."""
-    variability = "tunable" if v.causality == "parameter" else "discrete"
-    outer = {"causality": v.causality, "variability": variability, "description": v.words}
-    inner = {"unit": None if v.unit == "-" else v.unit, "min": _number(v.low)}
-    inner |= {"max": _number(v.high)}
-    if v.causality != "output":
-        inner |= {"start": _number(v.start)}
-    return outer, inner
+    for i, v in enumerate(numbers):
+        variability = "tunable" if v.causality == "parameter" else "discrete"
+        value = {"unit": None if v.unit == "-" else v.unit, "min": _number(v.low)}
+        value |= {"max": _number(v.high)}
+        value |= {} if v.causality == "output" else {"start": _number(v.start)}
+        add(real, v.name, i, v.causality, variability, v.words, **value)
+    add(real, "time", len(numbers) + 1, "independent", "continuous")
+    if not program.plant:
+        words = "true: u is manual_input"
+        add("Boolean", MANUAL, len(numbers), "input", "discrete", words, start="false")
+    return rows
 
-
-def _row3(i, v):
-    outer, inner = _parts(v)
-    return f"    <Float64{_attributes(name=v.name, valueReference=i, **outer, **inner)}/>"
-
-
-def _row2(i, v):
-    outer, inner = _parts(v)
-    words = _attributes(name=v.name, valueReference=i, **outer)
-    return f"    <ScalarVariable{words}><Real{_attributes(**inner)}/></ScalarVariable>"
-
-
-CORE = """
-#include "{name}.h"
-#include <math.h>
-#include <stdbool.h>
-#include <stddef.h>
-#include <stdint.h>
-#include <stdlib.h>
-
-#if defined(_WIN32)
-#define EXPORT __declspec(dllexport)
-#else
-#define EXPORT __attribute__((visibility("default")))
-#endif
-
-enum {{ OK = 0, ERROR = 3, PARAMETERS = {parameters}, NUMBERS = {numbers} }};
-
-typedef struct {{
-    {name}_state state;
-    {name}_parameters p;
-    double v[NUMBERS - PARAMETERS]; /* inputs, then outputs */
-    double t;
-    bool manual, begun;
-}} Model;
-
-static void reset(Model *m)
-{{
-    static const double start[NUMBERS - PARAMETERS] = {{{start}}};
-    m->p = {name}_defaults;
-    for (int i = 0; i < NUMBERS - PARAMETERS; ++i) m->v[i] = start[i];
-    m->t = 0.0;
-    m->manual = m->begun = false;
-}}
-
-static Model *make(void)
-{{
-    Model *m = calloc(1, sizeof *m);
-    if (m) reset(m);
-    return m;
-}}
-
-static void begin(Model *m)
-{{
-    {init};
-    m->begun = true;
-}}
-
-static int advance(Model *m, double t, double h)
-{{
-    const int periods = (int)(h / {name}_dt + 0.5);
-    const double rest = h - periods * {name}_dt;
-    if (periods < 1 || rest > 1e-6 * {name}_dt || rest < -1e-6 * {name}_dt) return ERROR;
-    for (int i = 0; i < periods; ++i) {step};
-    m->t = t + h;
-    return OK;
-}}
-
-static double *at(Model *m, uint32_t i)
-{{
-    if (i < PARAMETERS) return (double *)&m->p + i;
-    return i < NUMBERS ? m->v + (i - PARAMETERS) : i == NUMBERS + 1 ? &m->t : NULL;
-}}
-
-static int get(Model *m, const uint32_t *refs, size_t n, double *values)
-{{
-    if (!m->begun) begin(m);
-    for (size_t k = 0; k < n; ++k) {{
-        if (!at(m, refs[k])) return ERROR;
-        values[k] = *at(m, refs[k]);
-    }}
-    return OK;
-}}
-
-static int set(Model *m, const uint32_t *refs, size_t n, const double *values)
-{{
-    for (size_t k = 0; k < n; ++k) {{
-        if (!at(m, refs[k])) return ERROR;
-        *at(m, refs[k]) = values[k];
-    }}
-    return OK;
-}}
-
-/* functions that this FMU has not: the arguments are not read */
-#define NONE(name) EXPORT int name(void); int name(void) {{ return ERROR; }}
-#define FINE(name) EXPORT int name(void); int name(void) {{ return OK; }}
-"""
-
-THIRD = """
-EXPORT const char *fmi3GetVersion(void);
-const char *fmi3GetVersion(void) { return "3.0"; }
-
-EXPORT void *fmi3InstantiateCoSimulation(void);
-void *fmi3InstantiateCoSimulation(void) { return make(); }
-
-EXPORT void fmi3FreeInstance(Model *m);
-void fmi3FreeInstance(Model *m) { free(m); }
-
-EXPORT int fmi3Reset(Model *m);
-int fmi3Reset(Model *m) { reset(m); return OK; }
-
-EXPORT int fmi3EnterInitializationMode(Model *m, bool b, double e, double t, bool s, double end);
-int fmi3EnterInitializationMode(Model *m, bool b, double e, double t, bool s, double end)
-{
-    (void)b; (void)e; (void)s; (void)end;
-    m->t = t;
-    return OK;
-}
-
-EXPORT int fmi3ExitInitializationMode(Model *m);
-int fmi3ExitInitializationMode(Model *m) { begin(m); return OK; }
-
-EXPORT int fmi3GetFloat64(Model *m, const uint32_t *refs, size_t n, double *values, size_t many);
-int fmi3GetFloat64(Model *m, const uint32_t *refs, size_t n, double *values, size_t many)
-{
-    return many == n ? get(m, refs, n, values) : ERROR;
-}
-
-EXPORT int fmi3SetFloat64(Model *m, const uint32_t *refs, size_t n, const double *v, size_t many);
-int fmi3SetFloat64(Model *m, const uint32_t *refs, size_t n, const double *v, size_t many)
-{
-    return many == n ? set(m, refs, n, v) : ERROR;
-}
-
-EXPORT int fmi3GetBoolean(Model *m, const uint32_t *refs, size_t n, bool *values, size_t many);
-int fmi3GetBoolean(Model *m, const uint32_t *refs, size_t n, bool *values, size_t many)
-{
-    for (size_t k = 0; k < n; ++k) {
-        if (refs[k] != NUMBERS || many != n) return ERROR;
-        values[k] = m->manual;
-    }
-    return OK;
-}
-
-EXPORT int fmi3SetBoolean(Model *m, const uint32_t *refs, size_t n, const bool *v, size_t many);
-int fmi3SetBoolean(Model *m, const uint32_t *refs, size_t n, const bool *v, size_t many)
-{
-    for (size_t k = 0; k < n; ++k) {
-        if (refs[k] != NUMBERS || many != n) return ERROR;
-        m->manual = v[k];
-    }
-    return OK;
-}
-
-EXPORT int fmi3DoStep(Model *m, double t, double h, bool no, bool *event, bool *stop, bool *early,
-                      double *last);
-int fmi3DoStep(Model *m, double t, double h, bool no, bool *event, bool *stop, bool *early,
-               double *last)
-{
-    (void)no;
-    const int status = advance(m, t, h);
-    *event = *stop = *early = false;
-    *last = m->t;
-    return status;
-}
-"""
-
-SECOND = """
-EXPORT const char *fmi2GetTypesPlatform(void);
-const char *fmi2GetTypesPlatform(void) { return "default"; }
-
-EXPORT const char *fmi2GetVersion(void);
-const char *fmi2GetVersion(void) { return "2.0"; }
-
-EXPORT void *fmi2Instantiate(void);
-void *fmi2Instantiate(void) { return make(); }
-
-EXPORT void fmi2FreeInstance(Model *m);
-void fmi2FreeInstance(Model *m) { free(m); }
-
-EXPORT int fmi2Reset(Model *m);
-int fmi2Reset(Model *m) { reset(m); return OK; }
-
-EXPORT int fmi2SetupExperiment(Model *m, int b, double e, double t, int s, double end);
-int fmi2SetupExperiment(Model *m, int b, double e, double t, int s, double end)
-{
-    (void)b; (void)e; (void)s; (void)end;
-    m->t = t;
-    return OK;
-}
-
-EXPORT int fmi2ExitInitializationMode(Model *m);
-int fmi2ExitInitializationMode(Model *m) { begin(m); return OK; }
-
-EXPORT int fmi2GetReal(Model *m, const uint32_t *refs, size_t n, double *values);
-int fmi2GetReal(Model *m, const uint32_t *refs, size_t n, double *values)
-{
-    return get(m, refs, n, values);
-}
-
-EXPORT int fmi2SetReal(Model *m, const uint32_t *refs, size_t n, const double *values);
-int fmi2SetReal(Model *m, const uint32_t *refs, size_t n, const double *values)
-{
-    return set(m, refs, n, values);
-}
-
-EXPORT int fmi2GetBoolean(Model *m, const uint32_t *refs, size_t n, int *values);
-int fmi2GetBoolean(Model *m, const uint32_t *refs, size_t n, int *values)
-{
-    for (size_t k = 0; k < n; ++k) {
-        if (refs[k] != NUMBERS) return ERROR;
-        values[k] = m->manual;
-    }
-    return OK;
-}
-
-EXPORT int fmi2SetBoolean(Model *m, const uint32_t *refs, size_t n, const int *values);
-int fmi2SetBoolean(Model *m, const uint32_t *refs, size_t n, const int *values)
-{
-    for (size_t k = 0; k < n; ++k) {
-        if (refs[k] != NUMBERS) return ERROR;
-        m->manual = values[k] != 0;
-    }
-    return OK;
-}
-
-EXPORT int fmi2DoStep(Model *m, double t, double h, int no);
-int fmi2DoStep(Model *m, double t, double h, int no) { (void)no; return advance(m, t, h); }
-"""
 
 _TYPES = "Float32 Int8 UInt8 Int16 UInt16 Int32 UInt32 Int64 UInt64 String Binary Clock"
 _NONE3 = """
@@ -444,20 +214,24 @@ def interface(program: Any, name: str, version: str) -> str:
     words |= {"start": ", ".join(C().value(v.start) for v in numbers[parameters:])}
     words |= {"init": f"{name}_init({init})", "step": f"{name}_step({step})"}
     major = version[0]
-    stubs = [f"NONE(fmi{major}{f})" for f in NONE[major]] + [
-        f"FINE(fmi{major}{f})" for f in FINE[major]
-    ]
-    text = CORE.lstrip().format(**words)
-    return "\n".join([text, (THIRD if major == "3" else SECOND).strip(), "", *stubs, ""])
+    stubs = [f"NONE(fmi{major}{f})" for f in NONE[major]]
+    stubs += [f"FINE(fmi{major}{f})" for f in FINE[major]]
+    calls = _exported(template(f"fmi{major}.c"))
+    return "\n".join([template("fmi.c", **words), calls, "", *stubs, ""])
+
+
+def _exported(text):
+    """C functions, an empty line between two, each below its declaration."""
+    blocks = text.strip().split("\n\n")
+    heads = (re.split(r"\s\{", block, maxsplit=1)[0] for block in blocks)
+    heads = (head.replace("\n", "\n" + " " * len("EXPORT ")) for head in heads)
+    return "\n\n".join(f"EXPORT {head};\n{block}" for head, block in zip(heads, blocks))
 
 
 def place_of(version: str) -> tuple[str, str] | None:
     """Return (folder of binaries in an FMU, suffix) of this machine, None where it has none."""
-    system = {
-        "linux": ("linux", ".so"),
-        "darwin": ("darwin", ".dylib"),
-        "win32": ("windows", ".dll"),
-    }
+    system = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib")}
+    system |= {"win32": ("windows", ".dll")}
     machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(platform.machine().lower())
     name, suffix = system.get(sys.platform, ("", ""))
     if not name:

@@ -5,16 +5,633 @@ broadcasts) costs nothing, what depends on constants alone is computed here, and
 left out. Loops (`jax.lax.scan`, `jax.lax.while_loop`) and products of large matrices stay loops.
 """
 
+import functools
+import math
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
 
-from jaxtank.export.arrays import FEW, assembled, copied, elements_of, place_of
-from jaxtank.export.primitives import NAMED, RULES, constant, elements, kind_of, no_code, written
-from jaxtank.export.simplify import is_number, simplified
-from jaxtank.export.statements import REAL, Array, Define, Matrix, Ref, names, used
+from jaxtank.core.errors import InputError
+from jaxtank.export import arrays
+from jaxtank.export.arrays import FEW, LOOPED, assembled, copied, elements_of, filled, place_of
+from jaxtank.export.simplify import FUNCTIONS, OPERATORS, is_number, simplified
+from jaxtank.export.statements import (
+    REAL,
+    TRUTH,
+    WHOLE,
+    Array,
+    Define,
+    Loop,
+    Matrix,
+    Ref,
+    Store,
+    Until,
+    Vector,
+    names,
+    used,
+)
+
+REDUCTIONS = {"sum": "add", "prod": "mul", "max": "max", "min": "min", "and": "and", "or": "or"}
+"""{what reduces an array: the operation on two of its elements}."""
+
+TRUTHS = {"lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite"}
+"""Operations whose result is true or false."""
+
+
+def no_code(reason):
+    """Return the InputError for a controller that cannot be exported."""
+    return InputError(f"this controller cannot be exported: {reason}")
+
+
+def kind_of(dtype):
+    """Return the kind of variable, REAL, WHOLE or TRUTH, that holds an element of this type."""
+    if jnp.issubdtype(dtype, jnp.floating):
+        return REAL
+    return TRUTH if dtype == jnp.bool_ else WHOLE
+
+
+def elements(value):
+    """Return the numbers of an array as Python numbers, in an array of objects."""
+    array = np.asarray(value)
+    plain = {REAL: float, WHOLE: int, TRUTH: bool}[kind_of(array.dtype)]
+    return filled(array.shape, lambda i: plain(array[i]))
+
+
+def each(f, *arrays):
+    """Return f of the elements of arrays, which are broadcast against each other."""
+    arrays = np.broadcast_arrays(*arrays)
+    return filled(arrays[0].shape, lambda i: f(*(a[i] for a in arrays)))
+
+
+def constant(eqn, operands):
+    """Return the result of an operation on numbers, computed by jax."""
+    name = eqn.primitive.name
+    if name in PLACED:
+        return _move(None, eqn, operands)
+    values = [_numbers(o, v) for o, v in zip(operands, eqn.invars)]
+    if name == "convert_element_type":
+        return [elements(values[0].astype(eqn.outvars[0].aval.dtype))]
+    bound = eqn.primitive.get_bind_params(eqn.params)
+    functions, params = bound if isinstance(bound, tuple) else ((), bound)
+    with jax.ensure_compile_time_eval():
+        out = eqn.primitive.bind(*functions, *map(jnp.asarray, values), **params)
+    return [elements(v) for v in (out if eqn.primitive.multiple_results else [out])]
+
+
+def _numbers(operand, variable):
+    """The numbers of an operand as an array of the variable's type."""
+    return np.array(operand.tolist(), dtype=variable.aval.dtype).reshape(variable.aval.shape)
+
+
+def _kinds(eqn):
+    """The kinds of the operands."""
+    return [kind_of(v.aval.dtype) for v in eqn.invars]
+
+
+def _out_kind(eqn):
+    return kind_of(eqn.outvars[0].aval.dtype)
+
+
+def _elementwise(op, whole=None):
+    """The rule of an operation on one element of each operand, `whole` on whole numbers."""
+
+    def rule(writer, eqn, operands):
+        kind = TRUTH if op in TRUTHS else _out_kind(eqn)
+        if eqn.primitive.name == "xor" and _out_kind(eqn) != TRUTH:
+            raise no_code("it uses the operation xor of whole numbers")
+        name = whole or op if kind == WHOLE else op
+        return [arrays.each(writer, kind, name, operands, _kinds(eqn))]
+
+    return rule
+
+
+def _convert(writer, eqn, operands):
+    kind, kinds = _out_kind(eqn), _kinds(eqn)
+    if kinds[0] == kind:
+        return operands
+    return [arrays.each(writer, kind, kind, operands, kinds)]
+
+
+def _broadcast(x, shape, broadcast_dimensions, **_):
+    """`x` with its axes at `broadcast_dimensions` of `shape`, repeated along the others."""
+    sizes = [1] * len(shape)
+    for axis, size in zip(broadcast_dimensions, x.shape):
+        sizes[axis] = size
+    return np.broadcast_to(x.reshape(sizes), shape)
+
+
+PLACED = {
+    "squeeze": lambda x, dimensions: np.squeeze(x, dimensions),
+    "slice": lambda x, start_indices, limit_indices, strides: x[
+        tuple(map(slice, start_indices, limit_indices, strides or (1,) * x.ndim))
+    ],
+    "broadcast_in_dim": _broadcast,
+}
+"""Moves of one array, by numpy: jax takes half a second for those of a loop."""
+
+
+def _move(writer, eqn, operands):
+    """The elements that an operation only moves, found by moving their numbers."""
+    if eqn.primitive.name in PLACED:
+        return [PLACED[eqn.primitive.name](operands[0], **eqn.params)]
+    table, ids = [], []
+    for o, v in zip(operands, eqn.invars):
+        if v in eqn.invars[INDICES.get(eqn.primitive.name, slice(0))]:
+            if not all(map(is_number, o.ravel())):
+                raise no_code("it reads an array at an index that it computes")
+            ids.append(_numbers(o, v))
+            continue
+        ids.append(np.arange(len(table), len(table) + o.size, dtype=np.int64).reshape(o.shape))
+        table += list(o.ravel())
+    with jax.ensure_compile_time_eval():
+        params = eqn.primitive.get_bind_params(eqn.params)
+        out = eqn.primitive.bind(*map(jnp.asarray, ids), **params)
+    outs = out if eqn.primitive.multiple_results else [out]
+    return [each(lambda i: table[int(i)], np.asarray(v)) for v in outs]
+
+
+def _gather(writer, eqn, operands):
+    """The rows of an array at indices that are computed, or elements that are only moved."""
+    table, index = operands
+    numbers, sizes = eqn.params["dimension_numbers"], eqn.params["slice_sizes"]
+    rows = numbers.start_index_map == numbers.collapsed_slice_dims == (0,)
+    rows = rows and sizes == (1, *table.shape[1:]) and index.ndim == 2
+    if not (writer.loops and rows) or all(map(is_number, index.flat)):
+        return _move(writer, eqn, operands)
+    kind, out = _out_kind(eqn), np.empty((len(index), *table.shape[1:]), dtype=object)
+    name = arrays.whole_of(writer, kind, table)
+    for i, (k,) in enumerate(index):
+        k = writer.define(WHOLE, "min", writer.define(WHOLE, "max", k, 0), len(table) - 1)
+        offset = writer.define(WHOLE, "mul", k, math.prod(table.shape[1:]))
+        out[i] = arrays.part_of(writer, kind, name, offset, table.shape[1:])[()]
+    return [out]
+
+
+def _integer_power(writer, eqn, operands):
+    y = eqn.params["y"]
+    out, unit = operands[0], np.array(1.0, dtype=object)
+    for _ in range(abs(y) - 1):
+        out = arrays.each(writer, REAL, "mul", [out, operands[0]], [REAL] * 2)
+    return [arrays.each(writer, REAL, "div", [unit, out], [REAL] * 2) if y < 0 else out]
+
+
+def _clamp(writer, eqn, operands):
+    kind, (low, x, high) = _out_kind(eqn), operands
+    above = arrays.each(writer, kind, "max", [x, low], [kind] * 2)
+    return [arrays.each(writer, kind, "min", [above, high], [kind] * 2)]
+
+
+def _select(writer, eqn, operands):
+    kind = _out_kind(eqn)
+    if len(operands) == 3:
+        return [arrays.each(writer, kind, "select", operands, _kinds(eqn))]
+    return [chosen(writer, operands[0], operands[1:], kind)]
+
+
+def chosen(writer, index, values, kind):
+    """Return values[i] where `index` is i (below 0 as 0, past the end as the last)."""
+    out = values[0]
+    for i, value in enumerate(values[1:], start=1):
+        past = arrays.each(writer, TRUTH, "ge", [index, np.array(i, dtype=object)], [WHOLE] * 2)
+        out = arrays.each(writer, kind, "select", [past, out, value], [TRUTH, kind, kind])
+    return out
+
+
+def _reduce(op):
+    """The rule of a reduction over axes."""
+
+    def rule(writer, eqn, operands):
+        (array,), axes, kind = operands, eqn.params["axes"], _out_kind(eqn)
+        others = [i for i in range(array.ndim) if i not in axes]
+        rows = array.transpose(*others, *axes)
+        if writer.loops and array.size >= LOOPED:
+            return [arrays.reduced(writer, kind, op, rows, len(axes), kind)]
+        rows = rows.reshape(*(array.shape[i] for i in others), -1)
+        both = lambda a, b: writer.define(kind, op, a, b)
+        return [filled(rows.shape[:-1], lambda i: functools.reduce(both, rows[i]))]
+
+    return rule
+
+
+def _cumulate(op):
+    """The rule of running sums, products, largest or smallest elements along an axis."""
+
+    def rule(writer, eqn, operands):
+        axis, kind = eqn.params["axis"], _out_kind(eqn)
+        out = np.moveaxis(operands[0].copy(), axis, -1)
+        rows = out[..., ::-1] if eqn.params["reverse"] else out
+        for i in np.ndindex(rows.shape):
+            if i[-1] > 0:
+                rows[i] = writer.define(kind, op, rows[(*i[:-1], i[-1] - 1)], rows[i])
+        return [np.moveaxis(out, -1, axis)]
+
+    return rule
+
+
+def _position(largest):
+    """The rule of the first position of the largest (smallest) element along an axis."""
+
+    def rule(writer, eqn, operands):
+        kind = kind_of(eqn.invars[0].aval.dtype)
+
+        def better(e, best):
+            if kind != TRUTH:
+                return writer.define(TRUTH, "gt" if largest else "lt", e, best)
+            yes, no = (e, best) if largest else (best, e)
+            return writer.define(TRUTH, "and", yes, writer.define(TRUTH, "not", no))
+
+        rows = np.moveaxis(operands[0], eqn.params["axes"][0], -1)
+        if writer.loops and rows.size >= LOOPED:
+            op = "argmax" if largest else "argmin"
+            return [arrays.reduced(writer, WHOLE, op, rows, 1, kind)]
+
+        def place(i):
+            best, at = rows[i][0], 0
+            for k, e in enumerate(rows[i][1:], start=1):
+                take = better(e, best)
+                at = writer.define(WHOLE, "select", take, at, k)
+                best = writer.define(kind, "select", take, best, e)
+            return at
+
+        return [filled(rows.shape[:-1], place)]
+
+    return rule
+
+
+def _multiplications(A, B, sparse):
+    """Number of products of two elements in A B; sparse: without those with the number 0."""
+    if not sparse:
+        return A.shape[0] * A.shape[1] * B.shape[1]
+    some = lambda M: np.array([[not (is_number(e) and e == 0) for e in row] for row in M], int)
+    return int(np.sum(some(A) @ some(B)))
+
+
+def product(writer, a, b, dimensions):
+    """Return the elements of a product of two arrays."""
+    (contracted, right), batches = dimensions
+    if any(batches):
+        raise no_code("it multiplies stacks of matrices")
+    rows = [i for i in range(a.ndim) if i not in contracted]
+    columns = [i for i in range(b.ndim) if i not in right]
+    A = a.transpose(*rows, *contracted).reshape(int(np.prod([a.shape[i] for i in rows])), -1)
+    B = b.transpose(*right, *columns).reshape(A.shape[1], -1)
+    shape = tuple(a.shape[i] for i in rows) + tuple(b.shape[i] for i in columns)
+    if _multiplications(A, B, writer.sparse) > writer.large:
+        return writer.matrix("product", (A, B), (*A.shape, B.shape[1]), shape)
+    times = lambda a, b: writer.define(REAL, "mul", a, b)
+    plus = lambda total, pair: writer.define(REAL, "add", total, times(*pair))
+
+    def inner(at):
+        first, *others = zip(A[at[0]], B[:, at[1]])
+        return functools.reduce(plus, others, times(*first))
+
+    return filled((A.shape[0], B.shape[1]), inner).reshape(shape)
+
+
+def _triangular(writer, eqn, operands):
+    (a, b), params = operands, eqn.params
+    if params["unit_diagonal"] or params["conjugate_a"]:
+        raise no_code("a triangular solve of an unusual kind")
+    transposed = params["transpose_a"]
+    if not params["left_side"]:  # x A = b is A' x' = b'
+        b, transposed = b.T, not transposed
+    operation = "forward" if params["lower"] != transposed else "backward"
+    x = writer.matrix(operation, (a if params["lower"] else a.T, b), b.shape, b.shape)
+    return [x if params["left_side"] else x.T]
+
+
+def _linear_solve(writer, eqn, operands):
+    """Solves with the matrix of a linear function, found by applying it to unit vectors."""
+    # Numbers that do not meet in it (several right sides) are solved for apart.
+    lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
+    right = operands[sum(lengths) :]
+    first, inner = lengths.matvec + lengths.vecmat, jaxprs.solve
+    if not any(e.primitive.name in ("lu", "triangular_solve") for e in _operations(inner.jaxpr)):
+        return writer.run(inner.jaxpr, inner.consts, [*operands[first:][: lengths.solve], *right])
+    if len(right) != 1:
+        raise no_code("it solves for several arrays at once")
+    b, shape = right[0].ravel(), right[0].shape
+    if all(is_number(e) and e == 0 for e in b):
+        return right
+    closed, consts = jaxprs.matvec, operands[: lengths.matvec]
+    columns = []
+    for i in range(b.size):
+        unit = elements(np.eye(b.size)[i])
+        (column,) = writer.run(closed.jaxpr, closed.consts, [*consts, unit.reshape(shape)])
+        columns.append(column.ravel())
+    a, x = np.stack(columns, axis=1), np.empty(b.size, dtype=object)
+    for matrix, places in _blocks(a):
+        n, k = places.shape
+        x[places] = writer.matrix("solve", (matrix, b[places]), (n, k), (n, k))
+    return [x.reshape(shape)]
+
+
+def _operations(jaxpr):
+    """Yield the operations of a jaxpr and of those that it calls."""
+    for eqn in jaxpr.eqns:
+        yield eqn
+        for inner in eqn.params.values():
+            if hasattr(inner, "jaxpr"):
+                yield from _operations(inner.jaxpr)
+
+
+def _blocks(a):
+    """Yield (matrix (n, n), places (n, k) in the vector) of each group of equal diagonal blocks."""
+    size = len(a)
+    meet = np.array([[not (is_number(e) and e == 0) for e in row] for row in a])
+    meet = meet | meet.T | np.eye(size, dtype=bool)
+    for _ in range(size.bit_length()):
+        meet = meet @ meet
+    groups = {}
+    for first in range(size):
+        group = np.flatnonzero(meet[first])
+        if group[0] == first:
+            block = a[np.ix_(group, group)]
+            groups.setdefault(tuple(block.ravel()), (block, []))[1].append(group)
+    for block, places in groups.values():
+        yield block, np.stack(places, axis=1)
+
+
+def _lu(writer, eqn, operands):
+    """The factors of a matrix, which `_linear_solve` does not read."""
+    return [operands[0], *(np.zeros(v.aval.shape, dtype=object) for v in eqn.outvars[1:])]
+
+
+def _cholesky(writer, a):
+    n = a.shape[0]
+    return writer.matrix("cholesky", (a,), (n,), (n, n)).T
+
+
+def _cholesky_solve(writer, upper, b):
+    n = len(b)
+    y = writer.matrix("forward", (upper.T, b), (n, 1), (n,))
+    return writer.matrix("backward", (upper.T, y), (n, 1), (n,))
+
+
+def weighted_squares(writer, g, weight):
+    scaled = arrays.each(writer, REAL, "mul", [g, weight[:, None]], [REAL] * 2)
+    return product(writer, scaled.T, g, (((1,), (0,)), ((), ())))
+
+
+def _cond(writer, eqn, operands):
+    """All branches are computed, because none has an effect, and one is chosen."""
+    branches = [writer.run(b.jaxpr, b.consts, operands[1:]) for b in eqn.params["branches"]]
+    out = []
+    for variable, *values in zip(eqn.outvars, *branches):
+        out.append(chosen(writer, operands[0], values, kind_of(variable.aval.dtype)))
+    return out
+
+
+def _scan(writer, eqn, operands):
+    p = eqn.params
+    first, last = p["num_consts"], p["num_consts"] + p["num_carry"]
+    closed, sequences = p["jaxpr"], operands[last:]
+    if writer.loops:
+        return _counted(writer, eqn, operands[:first], operands[first:last], sequences)
+    if len(eqn.outvars) > p["num_carry"]:
+        return _unrolled(writer, p, operands[:first], operands[first:last], sequences)
+    starts, read = operands[first:last], lambda *counter: []
+    if sequences:
+        starts = [*starts, np.array(0, dtype=object)]
+        read = _reader(writer, sequences, eqn.invars[last:], p["reverse"])
+
+    def body(carried):
+        carry, counter = (carried[:-1], carried[-1:]) if sequences else (carried, [])
+        out = writer.run(closed.jaxpr, closed.consts, [*operands[:first], *carry, *read(*counter)])
+        if sequences:
+            out = [*out, filled((), lambda _: writer.define(WHOLE, "add", counter[0].item(), 1))]
+        return out
+
+    kinds = [kind_of(v.aval.dtype) for v in eqn.outvars] + [WHOLE] * bool(sequences)
+    return _loop(writer, kinds, starts, p["length"], body)[: len(eqn.outvars)]
+
+
+def _counted(writer, eqn, consts, carry, sequences):
+    """The results of a scan as a loop that reads and writes its sequences row by row."""
+    p, many = eqn.params, len(carry)
+    closed, kinds = p["jaxpr"], [kind_of(v.aval.dtype) for v in eqn.outvars]
+    read = [kind_of(v.aval.dtype) for v in eqn.invars[len(consts) + many :]]
+    tables = [arrays.copied(writer, k, s) for k, s in zip(read, sequences)]
+    blank = [filled(v.aval.shape, lambda _: 0) for v in eqn.outvars[many:]]
+
+    def body(carried):
+        *carried, counter = carried[:many], carried[many:-1], carried[-1].item()
+        k = writer.define(WHOLE, "sub", p["length"] - 1, counter) if p["reverse"] else counter
+        start = lambda size: writer.define(WHOLE, "mul", k, size)
+        part = lambda kind, name, s: arrays.part_of(writer, kind, name, start(math.prod(s)), s)
+        shapes = (s.shape[1:] for s in sequences)
+        rows = [part(kind, name, shape) for kind, name, shape in zip(read, tables, shapes)]
+        out = writer.run(closed.jaxpr, closed.consts, [*consts, *carried[0], *rows])
+        after = [
+            arrays.put(writer, kind, table.flat[0].name, start(row.size), row)
+            for kind, table, row in zip(kinds[many:], carried[1], out[many:])
+        ]
+        after = [elements_of(name, table.shape) for name, table in zip(after, blank)]
+        return [*out[:many], *after, filled((), lambda _: writer.define(WHOLE, "add", counter, 1))]
+
+    starts = [*carry, *blank, np.array(0, dtype=object)]
+    tabled = range(many, many + len(blank))
+    return _loop(writer, [*kinds, WHOLE], starts, p["length"], body, tables=tabled)[:-1]
+
+
+def _unrolled(writer, p, consts, carry, sequences):
+    """The results of a loop that writes sequences, pass by pass."""
+    passes, rows = range(p["length"]), []
+    for i in reversed(passes) if p["reverse"] else passes:
+        inputs = [*consts, *carry, *(s[i] for s in sequences)]
+        out = writer.run(p["jaxpr"].jaxpr, p["jaxpr"].consts, inputs)
+        carry = out[: p["num_carry"]]
+        rows.append(out[p["num_carry"] :])
+    rows = rows[::-1] if p["reverse"] else rows
+    return [*carry, *(np.stack(column) for column in zip(*rows))]
+
+
+def _reader(writer, sequences, variables, backwards):
+    """Return a function of the loop counter that gives the elements of sequences in that pass."""
+    arrays = []
+    for rows, v in zip(sequences, variables):
+        rows = rows[::-1] if backwards else rows
+        names = filled(rows.shape[1:], lambda i, rows=rows: writer.array(rows[(slice(None), *i)]))
+        arrays.append((kind_of(v.aval.dtype), names))
+
+    def entry(name, kind, counter):
+        ref = Ref(name, counter.item())
+        return ref if kind == REAL else writer.define(kind, kind, ref)
+
+    return lambda counter: [
+        each(lambda name, kind=kind: entry(name, kind, counter), names) for kind, names in arrays
+    ]
+
+
+def _while(writer, eqn, operands):
+    p = eqn.params
+    test, body = p["cond_jaxpr"], p["body_jaxpr"]
+    first, last = p["cond_nconsts"], p["cond_nconsts"] + p["body_nconsts"]
+
+    def tested_body(carried):
+        (on,) = writer.run(test.jaxpr, test.consts, [*operands[:first], *carried])
+        writer.scopes[-1].append(Until(on.item()))
+        return writer.run(body.jaxpr, body.consts, [*operands[first:last], *carried])
+
+    kinds = [kind_of(v.aval.dtype) for v in eqn.outvars]
+    return _loop(writer, kinds, operands[last:], None, tested_body, _most(test.jaxpr))
+
+
+def _most(test):
+    """The passes of a loop that goes on while a counter is below a number, None if it has none."""
+    ends: list[Any] = [eqn.invars[1] for eqn in test.eqns if eqn.primitive.name == "lt"]
+    ends = [e for e in ends if isinstance(e, Literal) and kind_of(e.aval.dtype) == WHOLE]
+    return min((int(e.val) for e in ends), default=None)
+
+
+def _loop(writer, kinds, starts, count, body, most=None, tables=()):
+    """The carried variables after a loop of body(carried); tables: places of those as arrays."""
+    carried, variables, whole = [], [], []
+    for i, (kind, start) in enumerate(zip(kinds, starts)):
+        whole.append(i in tables or (writer.loops and start.size >= LOOPED))
+        if whole[-1]:
+            name, vector = writer.new_array(kind, start.size), Vector(kind, start.size)
+            variables.append(elements_of(name, start.shape))
+            carried.append((vector, name, Ref(arrays.whole_of(writer, kind, start))))
+            continue
+        refs = filled(start.shape, lambda _: Ref(writer.fresh("c")))
+        carried += [(kind, ref.name, e) for ref, e in zip(refs.ravel(), start.ravel())]
+        variables.append(refs)
+    writer.scopes.append([])
+    writer.known.append({})
+    before, new = {name for kind, name, _ in carried if isinstance(kind, Vector)}, []
+    for kind, is_whole, o in zip(kinds, whole, body(variables)):
+        new += [Ref(arrays.whole_of(writer, kind, o, before))] if is_whole else list(o.ravel())
+    statements = writer.scopes.pop()
+    writer.known.pop()
+    writer.scopes[-1].append(Loop(count, tuple(carried), statements, tuple(new), most))
+    return variables
+
+
+SMALL = 64
+"""Number of entries up to which an array that is read at a computed index is a choice of values."""
+
+
+def written(jaxpr):
+    """Return the inputs of a jaxpr that it writes to at an index that it computes."""
+    inputs, variables = set(jaxpr.invars), set()
+    for eqn in jaxpr.eqns:
+        operands = [None if isinstance(v, Literal) else v for v in eqn.invars]
+        if eqn.primitive.name == "dynamic_update_slice" and len(eqn.invars[0].aval.shape) == 1:
+            variables.add(operands[0])
+        elif eqn.primitive.name in ("jit", "pjit"):
+            inner = eqn.params["jaxpr"].jaxpr
+            inside = written(inner)
+            variables |= {v for v, variable in zip(operands, inner.invars) if variable in inside}
+    return variables & inputs
+
+
+def line_of(array):
+    """Return the name of the line that holds exactly the elements of an array, else None."""
+    places = enumerate(array)
+    whole = array.ndim == 1 and all(isinstance(e, Ref) and e.index == i for i, e in places)
+    same = {e.name for e in array.ravel()} if whole else set()
+    return same.pop() if len(same) == 1 else None
+
+
+def _read(writer, eqn, operands):
+    array, *index = operands
+    if all(is_number(i.item()) for i in index):
+        return RULES["slice"](writer, eqn, operands)
+    name, sizes = line_of(array), eqn.params["slice_sizes"]
+    if writer.loops and name is None and sizes[1:] == array.shape[1:]:
+        kind, rows = _out_kind(eqn), array.shape[0] - sizes[0]
+        start = writer.define(WHOLE, "min", writer.define(WHOLE, "max", index[0].item(), 0), rows)
+        offset = writer.define(WHOLE, "mul", start, array.size // array.shape[0])
+        table = arrays.whole_of(writer, kind, array)
+        return [arrays.part_of(writer, kind, table, offset, tuple(sizes))]
+    if name is None or sizes != (1,):
+        return [_chosen_slice(writer, eqn, array, [i.item() for i in index])]
+    return [filled((1,), lambda _: writer.define(REAL, "item", Ref(name), index[0].item()))]
+
+
+def _chosen_slice(writer, eqn, array, index):
+    """A slice of a small array whose place along one axis is computed: one of all there are."""
+    sizes = eqn.params["slice_sizes"]
+    moving = [d for d, i in enumerate(index) if not is_number(i) and array.shape[d] > sizes[d]]
+    if len(moving) > 1 or array.size > SMALL:
+        raise no_code("it reads an array at an index that it computes")
+    start = lambda i, n, m: min(max(i, 0), n - m) if is_number(i) else 0
+    starts = list(map(start, index, array.shape, sizes))
+    ranges = [slice(i, i + m) for i, m in zip(starts, sizes)]
+    if not moving:
+        return array[tuple(ranges)]
+    (d,) = moving
+    choices = []
+    for i in range(array.shape[d] - sizes[d] + 1):
+        ranges[d] = slice(i, i + sizes[d])
+        choices.append(array[tuple(ranges)])
+    at = filled(choices[0].shape, lambda _: index[d])
+    return chosen(writer, at, choices, _out_kind(eqn))
+
+
+def _write(writer, eqn, operands):
+    array, update, index = operands
+    name = line_of(array)
+    if name is None or update.shape != (1,):
+        raise no_code("it writes to an array at an index")
+    new = writer.fresh("l")
+    writer.scopes[-1].append(Store(new, name, index.item(), update[0]))
+    return [elements_of(new, (array.size,))]
+
+
+INDICES = {"gather": slice(1, 2), "dynamic_slice": slice(1, None), "scatter": slice(1, 2)}
+"""{primitive that reads or writes at indices: its operands that are indices}."""
+
+MOVES = """
+broadcast_in_dim reshape transpose squeeze expand_dims slice concatenate pad rev stack unstack tile
+split gather dynamic_slice scatter
+"""
+"""Primitives that only move elements."""
+
+UNCHANGED = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "reduce_precision")
+"""Primitives that return their operands."""
+
+NOT_PRIMITIVES = {"quotient", "remainder", "real", "whole", "truth"}
+"""Operations that no primitive of jax is called by."""
+
+RULES = {
+    **{op: _elementwise(op) for op in {*FUNCTIONS, *OPERATORS} - NOT_PRIMITIVES},
+    **dict.fromkeys(UNCHANGED, lambda writer, eqn, operands: operands),
+    **dict.fromkeys(MOVES.split(), _move),
+    **{f"reduce_{name}": _reduce(op) for name, op in REDUCTIONS.items()},
+    **{f"cum{name}": _cumulate(REDUCTIONS[name]) for name in ("sum", "prod", "max", "min")},
+    "add_any": _elementwise("add"),
+    "argmax": _position(largest=True),
+    "argmin": _position(largest=False),
+    "clamp": _clamp,
+    "convert_element_type": _convert,
+    "div": _elementwise("div", whole="quotient"),
+    "le_to": _elementwise("le"),
+    "lt_to": _elementwise("lt"),
+    "integer_pow": _integer_power,
+    "rem": _elementwise("rem", whole="remainder"),
+    "select_n": _select,
+    "xor": _elementwise("ne"),
+    "cond": _cond,
+    "scan": _scan,
+    "while": _while,
+    "dynamic_slice": _read,
+    "gather": _gather,
+    "dynamic_update_slice": _write,
+    "dot_general": lambda writer, eqn, o: [product(writer, *o, eqn.params["dimension_numbers"])],
+    "cholesky": lambda writer, eqn, operands: [_cholesky(writer, *operands).T],
+    "triangular_solve": _triangular,
+    "custom_linear_solve": _linear_solve,
+    "lu": _lu,
+}
+"""{primitive of jax: function (writer, equation, operands) -> list of arrays of elements}."""
+
+NAMED = {f.__name__: f for f in (_cholesky, _cholesky_solve, weighted_squares)}
+"""{function of `jaxtank.analysis.qp`: function (writer, *operands) -> array of elements}."""
 
 
 class Writer:
@@ -23,10 +640,8 @@ class Writer:
     # scopes: the statements of the function and of the loops that are open; known: in each of them,
     # {operation: its Ref}, so that nothing is computed twice.
 
-    large = 300
-    """Number of multiplications in a matrix product above which it is a loop."""
-    sparse = False
-    """Whether multiplications by the number 0 are not counted."""
+    large = 300  # number of multiplications in a matrix product above which it is a loop
+    sparse = False  # whether multiplications by the number 0 are not counted
 
     def __init__(self, loops=False):
         self.counter, self.scopes, self.known = 0, [[]], [{}]
@@ -72,14 +687,9 @@ class Writer:
 
     def run(self, jaxpr, consts, arguments):
         """Return the outputs of a jaxpr, arrays of elements, as its `arguments` are."""
-        values = {
-            **dict(zip(jaxpr.constvars, map(elements, consts))),
-            **dict(zip(jaxpr.invars, arguments)),
-        }
-
-        def read(v):
-            return elements(v.val) if isinstance(v, Literal) else values[v]
-
+        values = dict(zip(jaxpr.constvars, map(elements, consts)))
+        values |= dict(zip(jaxpr.invars, arguments))
+        read = lambda v: elements(v.val) if isinstance(v, Literal) else values[v]
         for eqn in jaxpr.eqns:
             out = self.equation(eqn, [read(v) for v in eqn.invars])
             for v, value in zip(eqn.outvars, out):
@@ -138,25 +748,17 @@ def _called(eqn):
     return next((p for p in parameters if p is not None), None)
 
 
-def lower(f, arguments):
-    """Return (statements, outputs) of a function."""
-    lowered = lower_all(f, arguments)
-    outputs = [np.asarray(v, dtype=object) for v in jax.tree.leaves(lowered.outputs)]
-    return lowered.statements, outputs
-
-
 class Lowered(NamedTuple):
     """Result of `lower_all`."""
 
     statements: list
-    outputs: Any
-    """Results of the function, with arrays of Refs and numbers instead of arrays."""
+    outputs: Any  # results of the function, with arrays of Refs and numbers instead of arrays
     lines: dict
     """{Ref of the first entry of a Line, an array that is read or written at an index: name}."""
 
 
 def lower_all(f, arguments, writer=None):
-    """Return the Lowered form of a function: `lower`, with the outputs as the tree they are."""
+    """Return the Lowered form of a function."""
     closed, shape = jax.make_jaxpr(f, return_shape=True)(*arguments.values())
     writer, moved = writer or Writer(), written(closed.jaxpr)
     inputs, starts = [], {}

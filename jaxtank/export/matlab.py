@@ -1,7 +1,7 @@
 """Controllers as a MATLAB function."""
 
 from jaxtank.export.printer import FUNCTIONS, OPERATIONS, Printer, header
-from jaxtank.export.statements import Define, every, matrix_operations
+from jaxtank.export.statements import MATRIX_OPERATIONS, Define, every, matrix_operations, parts
 
 
 class Matlab(Printer):
@@ -40,37 +40,8 @@ class Matlab(Printer):
 
 
 # the statements store arrays by rows, MATLAB by columns: reshape gives the transpose
-MATRICES = {
-    "product": """
-function out = product_(m, k, n, a, b)
-    c = reshape(b, n, k) * reshape(a, k, m);
-    out = c(:).';
-end""",
-    "cholesky": """
-function out = cholesky_(n, a)
-    c = chol(reshape(a, n, n));
-    out = c(:).';
-end""",
-    "forward": """
-function out = forward_(n, k, a, b)
-    c = (reshape(a, n, n).' \\ reshape(b, k, n).').';
-    out = c(:).';
-end""",
-    "backward": """
-function out = backward_(n, k, a, b)
-    c = (reshape(a, n, n) \\ reshape(b, k, n).').';
-    out = c(:).';
-end""",
-}
-
-PICK = """
-function out = pick(condition, yes, no)
-    if condition
-        out = yes;
-    else
-        out = no;
-    end
-end"""
+*_MATRICES, PICK = parts("functions.m")
+MATRICES = dict(zip(MATRIX_OPERATIONS, _MATRICES))
 
 _RESERVED = """
 break case catch classdef continue else elseif end for function global if otherwise parfor

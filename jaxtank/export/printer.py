@@ -12,25 +12,9 @@ from jaxtank.core.labels import labels_of, names_of
 from jaxtank.core.tree import parameters, walk
 from jaxtank.core.units import local
 from jaxtank.export.program import CONTROL, PLANT
-from jaxtank.export.statements import (
-    REAL,
-    TRUTH,
-    WHOLE,
-    Array,
-    Define,
-    Each,
-    Loop,
-    Matrix,
-    Ref,
-    Store,
-    Until,
-    Vector,
-    View,
-    size_of,
-)
+from jaxtank.export.statements import REAL, TRUTH, WHOLE, Ref, Vector, View, size_of
 
-WIDTH = 126
-"""Length of a line of an array, without its indentation."""
+WIDTH = 126  # length of a line of an array, without its indentation
 
 OPERATIONS = {
     "add": "{0} + {1}",
@@ -64,8 +48,7 @@ class Printer:
     kinds: Mapping[str, str] = {REAL: "", WHOLE: "", TRUTH: ""}
     rename: Mapping[str, str] = {}
     """{argument of the program (s, t, y, r, dr, ddr, u): its name in the language}."""
-    first = 0
-    """Index of the first entry of an array."""
+    first = 0  # index of the first entry of an array
     entry = "{0}[{1}]"
     real = "{0}"
     when, close_when = "if ({0})", ""
@@ -83,10 +66,8 @@ class Printer:
     """
     counted, endless, end = "for i = 1:{0}", "while true", "end"
     """`endless` "": the language has loops of a bounded number of passes alone."""
-    store = ""
-    """A Store statement, of name, array, index and value; "": the language has none."""
-    places: Mapping[Ref, str] = {}
-    """{Ref: its text, where that is another than its name}."""
+    store = ""  # a Store statement, of name, array, index and value; "": the language has none
+    places: Mapping[Ref, str] = {}  # {Ref: its text, where that is another than its name}
     until = "if not ({0}) break"
 
     def value(self, e):
@@ -118,16 +99,8 @@ class Printer:
 
     def lines(self, statements, indent="    "):
         """Return the lines of a list of statements."""
-        methods = {
-            Define: self._define,
-            Array: self._array,
-            Each: self._each,
-            Matrix: self._matrix,
-            Store: self._store,
-            Until: self._until,
-            Loop: self._loop,
-        }
-        return [indent + line for s in statements for line in methods[type(s)](s)]
+        method = lambda s: getattr(self, f"_{type(s).__name__.lower()}")
+        return [indent + line for s in statements for line in method(s)(s)]
 
     def _set(self, template, kind, name, value):
         return template.format(kind=self.kinds[kind], name=name, value=value)
@@ -221,13 +194,8 @@ class Printer:
 
     def _copy(self, vector, name, source):
         """The lines that copy an array."""
-        text = [
-            self.put.format(
-                place=self._entry_at(name, 0, [1], ["e0"]),
-                value=self._entry_at(source, 0, [1], ["e0"]),
-            )
-        ]
-        return self._around((vector.size,), ["e0"], text)
+        place, value = (self._entry_at(n, 0, [1], ["e0"]) for n in (name, source))
+        return self._around((vector.size,), ["e0"], [self.put.format(place=place, value=value)])
 
     def _store(self, s):
         if not self.store:

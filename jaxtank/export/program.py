@@ -40,8 +40,7 @@ CONTROL = ("controller", "observer", "actuator", "safety_filter")
 PLANT = ("plant", "sensor", "actuator", "faults", "disturbance", "x0")
 """Parts of a loop whose numbers are parameters of the code of a controller, and of a plant."""
 
-INLINE = 100
-"""Statements up to which values of the parameters alone are computed in every sample."""
+INLINE = 100  # statements up to which values of the parameters alone are computed in every sample
 
 
 def scalars(array: Any) -> tuple[Any, ...]:
@@ -74,11 +73,7 @@ def control(loop: Any, dt: float) -> tuple[Any, Any]:
 
 
 def physics(case: Case, loop: Any) -> tuple[Any, Any]:
-    """Return (step, begin) of the plant with its pumps and gauges, as `control` of the controller.
-
-    step(state, u, d) -> ((y, h, spilled), state): readings and levels after a sample with inputs u
-    (pumps,) and inflows d (tanks,) besides those of the case; begin() -> ((y, h, spilled), state).
-    """
+    """(step(state, u, d), begin()) of the plant with pumps and gauges, both -> (results, state)."""
     clock, n = case.clock, loop.plant.tanks
 
     def now(k):
@@ -120,20 +115,14 @@ class Program:
     """The statements of the two functions of a case, and the sizes of their arguments."""
 
     case: Case
-    inputs: dict[str, int]
-    """{name: size} of the arguments of a step, without state and time."""
-    outputs_of: dict[str, list[Any]]
-    """{name: entries} of the results of a step."""
-    state: int
-    """Number of entries of the state."""
+    inputs: dict[str, int]  # {name: size} of the arguments of a step, without state and time
+    outputs_of: dict[str, list[Any]]  # {name: entries} of the results of a step
+    state: int  # number of entries of the state
     begin: list[Statement]
-    first: list[Any]
-    """Entries of the first state."""
-    start: dict[str, list[Any]]
-    """{name: entries} of the results before the first sample."""
+    first: list[Any]  # entries of the first state
+    start: dict[str, list[Any]]  # {name: entries} of the results before the first sample
     step: list[Statement]
-    after: list[Any]
-    """Entries of the state after the step."""
+    after: list[Any]  # entries of the state after the step
     parameters: tuple[Parameter, ...] = ()
     entries: tuple[tuple[str, tuple[int, ...]], ...] = ()
     """(name of a parameter, index in it) of each entry of p."""
@@ -194,11 +183,7 @@ def flat(tree: Any) -> list[Any]:
 
 
 def program(case: Case, plant: bool = False, adjustable: bool = True) -> Program:
-    """Return the Program of a case: of its controller, or of its plant.
-
-    With `adjustable` its numbers are parameters, and a controller has manual operation; otherwise
-    they are constants, and results of them alone are computed here.
-    """
+    """Return the Program of a case; `adjustable`: its numbers are parameters of the code."""
     traced = _lowered(case, plant, adjustable)
     begun, done, sizes, leaves = traced
     results, after = done.outputs
@@ -232,12 +217,8 @@ def _lowered(case, plant, adjustable):
     roots = PLANT if plant else CONTROL
     leaves = {n: v for n, v in traced_leaves(case).items() if n.split(".")[0] in roots}
     real = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.result_type(float))
-    tanks, pumps, outputs = (
-        case.loop.plant.tanks,
-        case.loop.plant.pumps,
-        len(case.loop.plant.outputs),
-    )
-    r = {"r": outputs, "dr": outputs, "ddr": outputs}
+    tanks, pumps = case.loop.plant.tanks, case.loop.plant.pumps
+    r = dict.fromkeys(("r", "dr", "ddr"), len(case.loop.plant.outputs))
     sizes = {"u": pumps, "d": tanks} if plant else {"y": tanks, **r}
     arguments: dict[str, Any] = {} if plant else {"t": real()}
     arguments |= {name: real(size) for name, size in sizes.items()}

@@ -22,23 +22,21 @@ from jaxtank.core.tables import is_time, numbers, read_table, seconds, unit_name
 from jaxtank.core.text import printable
 from jaxtank.core.units import canonical
 from jaxtank.export.fmi import compiler, library, place_of
+from jaxtank.export.statements import template
 
 GROUPS = re.compile(r"(y|h|r|dr|ddr|applied|u|pump)(?:\d+|_.+)", re.IGNORECASE)
 """Names of columns: of "y1" or "y_LT101" the first part is the signal."""
 
 
-ROWS = 5000
-"""Samples of a run all of which `jaxtank simulate --out` saves."""
+ROWS = 5000  # samples of a run all of which `jaxtank simulate --out` saves
 
 
 class Export(NamedTuple):
     """A controller as functions."""
 
     dt: float
-    sizes: tuple[int, int, int]
-    """Numbers of levels, setpoints, inputs."""
-    run: Any
-    """Function of a Log that returns the inputs (samples, inputs)."""
+    sizes: tuple[int, int, int]  # numbers of levels, setpoints, inputs
+    run: Any  # function of a Log that returns the inputs (samples, inputs)
     units: tuple[str, ...] = ()
     """Of levels and setpoints, and of each input; () of an export that does not tell."""
 
@@ -57,23 +55,10 @@ class Log(NamedTuple):
 def replay(path: str | Path, data: str | Path) -> dict[str, Any]:
     """Return the largest difference of each input between a log and an export run against it.
 
-    Parameters
-    ----------
-    path : an exported controller: NAME.c (with NAME.h beside it), NAME.js or NAME.fmu
-    data : log with one row a period: t [s], y1, .. (or h1, ..), r1, .., u1, .. (or pump1, ..),
-        and applied1, .. where pumps have a lag, delay or dead zone behind the inputs of the
-        controller; units in heads, or in a row below them, are converted to those of the export
-
-    Returns
-    -------
-    {"samples": number of rows, "inputs": [{"name", "largest_difference", "time_s"}]}
-
-    Raises
-    ------
-    InputError
-        For a file that is no export or needs a program that is not at hand.
-    DataError
-        For a log that does not suit the export.
+    path : NAME.c (with NAME.h beside it), NAME.js or NAME.fmu; data : log with one row a period: t,
+    y1, .. (or h1, ..), r1, .., u1, .. (or pump1, ..), and applied1, .. behind which pumps have a
+    lag, delay or dead zone. Raises InputError for a file that is no export, DataError for a log
+    that does not suit it.
     """
     path = Path(path)
     loaders = {".c": _load_c, ".js": _load_javascript, ".fmu": _load_fmu}
@@ -91,11 +76,9 @@ def replay(path: str | Path, data: str | Path) -> dict[str, Any]:
         inputs = export.run(log)
     apart = np.abs(inputs - log.u)
     at = np.argmax(apart, axis=0)
-    rows = [
-        {"name": name, "largest_difference": float(apart[k, j]), "time_s": float(log.t[k])}
-        for j, (name, k) in enumerate(zip(columns, at))
-    ]
-    return {"samples": len(log.t), "inputs": rows}
+    keys = ("name", "largest_difference", "time_s")
+    rows = zip(columns, map(float, apart.max(axis=0)), map(float, log.t[at]))
+    return {"samples": len(log.t), "inputs": [dict(zip(keys, row)) for row in rows]}
 
 
 def read(path: str | Path, export: Export) -> tuple[Log, list[str]]:
@@ -122,13 +105,11 @@ def read(path: str | Path, export: Export) -> tuple[Log, list[str]]:
             f" before; the export runs every {export.dt:.6g} s: log every period (of a simulation"
             f" --set clock.duration={ROWS * export.dt:.6g} or less, which saves all samples)"
         )
-    dr, ddr = _rates(arrays["r"], export.dt), np.zeros_like(arrays["r"])
-    if len(groups.get("dr", [])) == export.sizes[1]:
-        dr = array("dr", groups["dr"])
-    if len(groups.get("ddr", [])) == export.sizes[1]:
-        ddr = array("ddr", groups["ddr"])
-    log = Log(t, arrays["y"], arrays["r"], dr, ddr, arrays["u"])
-    return log, [table.columns[i].name for i in chosen["u"]]
+    arrays |= {"dr": _rates(arrays["r"], export.dt), "ddr": np.zeros_like(arrays["r"])}
+    for key in ("dr", "ddr"):
+        if len(groups.get(key, [])) == export.sizes[1]:
+            arrays[key] = array(key, groups[key])
+    return Log(t, **arrays), [table.columns[i].name for i in chosen["u"]]
 
 
 def _refuse_twice(table, columns):
@@ -196,42 +177,6 @@ def _rates(r, dt):
     return np.where(same(before) | same(after), ahead, 0.0)
 
 
-HARNESS = """
-#include "{name}.h"
-static {name}_state state;
-static void copy({name}_real *a, const double *b, int n) {{
-    for (int i = 0; i < n; ++i) a[i] = ({name}_real)b[i];
-}}
-#define OUT __attribute__((visibility("default")))
-OUT void sizes(int *n);
-void sizes(int *n) {{ n[0] = {upper}_TANKS; n[1] = {upper}_OUTPUTS; n[2] = {upper}_PUMPS; }}
-OUT const char *unit(int i);
-const char *unit(int i) {{ return {units}; }}
-OUT double period(void);
-double period(void) {{ return {name}_dt; }}
-OUT void begin(const double *y);
-void begin(const double *y) {{
-    {name}_real a[{upper}_TANKS];
-    copy(a, y, {upper}_TANKS);
-    {name}_init(&state, 0, a, 0);
-}}
-OUT void step(double t, const double *y, const double *r, const double *dr, const double *ddr,
-              double *u);
-void step(double t, const double *y, const double *r, const double *dr, const double *ddr,
-          double *u) {{
-    {name}_real a[{upper}_TANKS], b[{upper}_OUTPUTS], c[{upper}_OUTPUTS], d[{upper}_OUTPUTS],
-        e[{upper}_PUMPS];
-    copy(a, y, {upper}_TANKS);
-    copy(b, r, {upper}_OUTPUTS);
-    copy(c, dr, {upper}_OUTPUTS);
-    copy(d, ddr, {upper}_OUTPUTS);
-    {name}_step(&state, 0, ({name}_real)t, a, b, c, d, 0, e);
-    for (int i = 0; i < {upper}_PUMPS; ++i) u[i] = e[i];
-}}
-"""
-"""Functions of double precision around an export in C."""
-
-
 @contextlib.contextmanager
 def _loaded(binary, suffix) -> Iterator[ctypes.CDLL]:
     """A shared library in this process, which stays loaded."""
@@ -252,7 +197,8 @@ def _load_c(path):
     files = {p.name: p.read_text(errors="replace") for p in (path, header)}
     stated = f" {name}_units[" in files[header.name]
     units = f"{name}_units[i]" if stated else "(void)i, (const char *)0"
-    harness = HARNESS.format(name=name, upper=name.upper(), units=units)
+    # functions of double precision around the export
+    harness = template("replay.c", name=name, upper=name.upper(), units=units)
     binary = library({**files, "replay.c": harness})
     if binary is None:
         raise InputError(
@@ -277,25 +223,13 @@ def _load_c(path):
         yield Export(code.period(), (sizes[0], sizes[1], sizes[2]), run, units)
 
 
-SCRIPT = """
-const law = require(process.argv[1]);
-if (process.argv[2] === "facts")
-    console.log(JSON.stringify([law.dt, law.tanks, law.outputs, law.pumps, law.units || []]));
-else {
-    const d = JSON.parse(require("fs").readFileSync(0)), s = law.init(d.y[0]);
-    const step = (t, k) => law.step(s, t, d.y[k], d.r[k], d.dr[k], d.ddr[k]);
-    console.log(JSON.stringify(d.t.map(step)));
-}
-"""
-
-
 @contextlib.contextmanager
 def _load_javascript(path):
     if shutil.which("node") is None:
         raise InputError(f"{printable(path.name)}: needs node, which runs JavaScript")
 
     def node(what, text=""):
-        words = ["node", "-e", SCRIPT, str(path.resolve()), what]
+        words = ["node", "-e", template("replay.js"), str(path.resolve()), what]
         done = subprocess.run(words, input=text, capture_output=True, text=True, check=False)
         with contextlib.suppress(ValueError):
             return json.loads(done.stdout) if done.returncode == 0 else None
@@ -371,9 +305,8 @@ def _run_fmu(code, major, references, dt, log):
 
     def put(name, row):
         n, values = len(row), (ctypes.c_double * len(row))(*row)
-        getattr(code, f"fmi{major}Set{real}")(
-            model, refs[name], ctypes.c_size_t(n), values, *more(n)
-        )
+        call = getattr(code, f"fmi{major}Set{real}")
+        call(model, refs[name], ctypes.c_size_t(n), values, *more(n))
 
     def take(n):
         values = (ctypes.c_double * n)()

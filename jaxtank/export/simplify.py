@@ -68,22 +68,10 @@ def _select(condition, no, yes):
     return no if (no is yes or no == yes) and type(no) is type(yes) else None
 
 
-def _add(a, b):
-    return b if _is(a, 0) else a if _is(b, 0) else None
-
-
-def _sub(a, b):
-    return a if _is(b, 0) else 0.0 if a == b else None
-
-
 def _mul(a, b):
     if _is(a, 1) or _is(b, 1):
         return b if _is(a, 1) else a
     return 0.0 if _is(a, 0) or _is(b, 0) else None
-
-
-def _div(a, b):
-    return a if _is(b, 1) else 0.0 if _is(a, 0) else None
 
 
 def _and(a, b):
@@ -93,5 +81,12 @@ def _and(a, b):
     return other if number else False
 
 
-RULES = {"select": _select, "add": _add, "sub": _sub, "mul": _mul, "div": _div, "and": _and}
+RULES = {
+    "select": _select,
+    "add": lambda a, b: b if _is(a, 0) else a if _is(b, 0) else None,
+    "sub": lambda a, b: a if _is(b, 0) else 0.0 if a == b else None,
+    "mul": _mul,
+    "div": lambda a, b: a if _is(b, 1) else 0.0 if _is(a, 0) else None,
+    "and": _and,
+}
 """{operation: function of its arguments that returns a shorter form, or None}."""

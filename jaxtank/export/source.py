@@ -1,7 +1,4 @@
-"""A controller and its observer as one source file without dependencies: `export` and `register`.
-
-The file is made from the step function that is simulated.
-"""
+"""A controller and its observer as one source file, made from the step that is simulated."""
 
 import re
 from collections.abc import Callable, Collection, Mapping
@@ -211,11 +208,8 @@ def _checked_name(case, option, reserved):
     """The name of the functions. Raises InputError for one that the language does not allow."""
     name = option or function_name(case)
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,50}", name):
-        source = (
-            f"--name {option!r}"
-            if option
-            else f"{case.name!r} gives no name for the function; --name NAME"
-        )
+        unnamed = f"{case.name!r} gives no name for the function; --name NAME"
+        source = f"--name {option!r}" if option else unnamed
         raise InputError(
             f"{source}: must be letters, digits and _, begin with a letter and have at most 51"
             " characters"

@@ -1,10 +1,13 @@
 """The statements of exported code, on scalars: output of lowering, input of the printers."""
 
 import math
+import string
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 REAL, WHOLE, TRUTH = "real", "whole", "truth"
+MATRIX_OPERATIONS = ("product", "cholesky", "forward", "backward", "solve")
 
 
 class Ref(NamedTuple):
@@ -21,11 +24,6 @@ class Define(NamedTuple):
     name: str
     op: str
     args: tuple
-
-    @property
-    def reads(self):
-        """Names of the variables that it reads."""
-        return names(self.args)
 
 
 class Vector(NamedTuple):
@@ -61,12 +59,6 @@ class Each(NamedTuple):
     offset: Any = 0
     steps: tuple = ()  # strides in it, where not row by row
 
-    @property
-    def reads(self):
-        """Names of the variables that it reads."""
-        views = {a.name for a in self.args if isinstance(a, View)}
-        return names(entries_read(self)) | views | ({self.array} if self.array else set())
-
 
 class Array(NamedTuple):
     """An array with its entries."""
@@ -74,11 +66,6 @@ class Array(NamedTuple):
     name: str
     entries: tuple
     kind: str = REAL
-
-    @property
-    def reads(self):
-        """Names of the variables that it reads."""
-        return names(self.entries)
 
 
 class Matrix(NamedTuple):
@@ -92,11 +79,6 @@ class Matrix(NamedTuple):
     operands: tuple
     sizes: tuple
 
-    @property
-    def reads(self):
-        """Names of the variables that it reads."""
-        return set(self.operands)
-
 
 class Store(NamedTuple):
     """array[index] = value, in place; `name` is what the array is called from then on."""
@@ -106,21 +88,11 @@ class Store(NamedTuple):
     index: Any
     value: Any
 
-    @property
-    def reads(self):
-        """Names of the variables that it reads, the array as it was among them."""
-        return {self.array} | names([self.index, self.value])
-
 
 class Until(NamedTuple):
     """The end of a loop: leave it unless `test`, a variable, is true."""
 
     test: Any
-
-    @property
-    def reads(self):
-        """Names of the variables that it reads."""
-        return names([self.test])
 
 
 class Loop(NamedTuple):
@@ -132,22 +104,37 @@ class Loop(NamedTuple):
     new: tuple
     most: int | None = None  # passes after which a loop without a count has ended
 
-    @property
-    def reads(self):
-        """Names of the variables that it reads, in its body too."""
-        inside = set().union(*(s.reads for s in self.body))
-        return inside | names(self.new) | names(start for _, _, start in self.carried)
-
 
 Statement = Define | Array | Each | Matrix | Store | Until | Loop
+
+
+def template(file: str, **words: Any) -> str:
+    """Return a file of the folder templates, with `words` in place of ${word}."""
+    text = (Path(__file__).parent / "templates" / file).read_text("utf-8")
+    return string.Template(text).substitute(words) if words else text
+
+
+def parts(file: str) -> list[str]:
+    """Return the functions of a file of the folder templates, a line break before each."""
+    return [f"\n{part.strip()}" for part in template(file).split("\n\n")]
 
 
 def names(entries: Iterable) -> set[str]:
     """Return the names of the variables among numbers and Refs."""
     variables = [e for e in entries if isinstance(e, Ref)]
-    return {e.name for e in variables} | {
-        e.index.name for e in variables if isinstance(e.index, Ref)
-    }
+    indices = {e.index.name for e in variables if isinstance(e.index, Ref)}
+    return {e.name for e in variables} | indices
+
+
+def reads(s: Statement) -> set[str]:
+    """Return the names of the variables that a statement reads, of a loop in its body too."""
+    if isinstance(s, Loop):
+        inside = set().union(*map(reads, s.body))
+        return inside | names(s.new) | names(start for *_, start in s.carried)
+    if isinstance(s, Matrix):
+        return set(s.operands)
+    array = s.array if isinstance(s, Each) else ""
+    return names(entries_read(s)) | ({array} if array else set())
 
 
 def every(statements: Iterable[Statement]) -> Iterator[Statement]:
@@ -173,7 +160,7 @@ def used(statements: list[Statement], read: set[str]) -> list[Statement]:
             s = s._replace(body=used(s.body, names(s.new)))
         elif not isinstance(s, Until) and s.name not in read:
             continue
-        read |= s.reads
+        read |= reads(s)
         needed.append(s)
     return needed[::-1]
 
@@ -187,7 +174,7 @@ def hoisted(statements: Iterable[Statement]) -> list[Statement]:
             continue
         inside, body = {name for _, name, _ in s.carried}, []
         for inner in hoisted(s.body):
-            free = isinstance(inner, Define | Array | Each) and not inner.reads & inside
+            free = isinstance(inner, Define | Array | Each) and not reads(inner) & inside
             if free:
                 out.append(inner)
                 continue
@@ -208,7 +195,7 @@ def ranks(statements: Sequence[Statement], inputs: Mapping[str, int]) -> dict[st
     """Return {name: rank} of every variable: the largest rank of its operands."""
     rank_of = dict(inputs)
     for s in statements:
-        read = s.reads if not isinstance(s, Loop) else s.reads - local(s)
+        read = reads(s) - local(s) if isinstance(s, Loop) else reads(s)
         rank = max((rank_of[n] for n in read), default=0)
         if isinstance(s, Store):
             rank = max(rank, rank_of[s.array])
@@ -240,9 +227,7 @@ def of_rank(
 
 
 def refs(statements: Iterable[Statement], entries: Iterable = ()) -> set[Ref]:
-    """Return every Ref that statements and entries read, without those that a loop has inside; of
-    an array that is read at a variable index, the array and the index.
-    """
+    """Return every Ref that statements and entries read, with arrays and indices apart."""
     read = {e for e in entries if isinstance(e, Ref)}
     for s in statements:
         if isinstance(s, Loop):

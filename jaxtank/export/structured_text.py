@@ -4,6 +4,7 @@ import numpy as np
 
 from jaxtank.export.printer import OPERATIONS, Printer, field_of, header, note_of
 from jaxtank.export.statements import (
+    MATRIX_OPERATIONS,
     REAL,
     TRUTH,
     WHOLE,
@@ -16,6 +17,8 @@ from jaxtank.export.statements import (
     Vector,
     array_kinds,
     every,
+    parts,
+    reads,
 )
 
 LARGEST = {"double": "1.7976931348623157E+308", "float": "3.4028234E+38"}
@@ -125,112 +128,7 @@ class StructuredText(Printer):
         return MATRICES[s.op].strip().format(**words, **sizes, **ends).split("\n")
 
 
-MATRICES = {
-    "product": """
-FOR i := 0 TO {m_} DO
-    FOR j := 0 TO {n_} DO
-        sum := 0.0;
-        FOR l := 0 TO {k_} DO
-            sum := sum + {a}[i * {k} + l] * {b}[l * {n} + j];
-        END_FOR;
-        {x}[i * {n} + j] := sum;
-    END_FOR;
-END_FOR;
-""",
-    "cholesky": """
-FOR j := 0 TO {n_} DO
-    FOR i := 0 TO {n_} DO
-        sum := {a}[i * {n} + j];
-        FOR l := 0 TO {n_} DO
-            IF l < j AND i >= j THEN
-                sum := sum - {x}[i * {n} + l] * {x}[j * {n} + l];
-            END_IF;
-        END_FOR;
-        IF i < j THEN
-            {x}[i * {n} + j] := 0.0;
-        ELSIF i = j THEN
-            {x}[i * {n} + j] := SQRT(sum);
-        ELSE
-            {x}[i * {n} + j] := sum / {x}[j * {n} + j];
-        END_IF;
-    END_FOR;
-END_FOR;
-""",
-    "forward": """
-FOR j := 0 TO {k_} DO
-    FOR i := 0 TO {n_} DO
-        sum := {b}[i * {k} + j];
-        FOR l := 0 TO {n_} DO
-            IF l < i THEN
-                sum := sum - {a}[i * {n} + l] * {x}[l * {k} + j];
-            END_IF;
-        END_FOR;
-        {x}[i * {k} + j] := sum / {a}[i * {n} + i];
-    END_FOR;
-END_FOR;
-""",
-    "backward": """
-FOR j := 0 TO {k_} DO
-    FOR i := {n_} TO 0 BY -1 DO
-        sum := {b}[i * {k} + j];
-        FOR l := 0 TO {n_} DO
-            IF l > i THEN
-                sum := sum - {a}[l * {n} + i] * {x}[l * {k} + j];
-            END_IF;
-        END_FOR;
-        {x}[i * {k} + j] := sum / {a}[i * {n} + i];
-    END_FOR;
-END_FOR;
-""",
-    "solve": """
-FOR i := 0 TO {n} * {n} - 1 DO
-    work[i] := {a}[i];
-END_FOR;
-FOR i := 0 TO {n} * {k} - 1 DO
-    {x}[i] := {b}[i];
-END_FOR;
-FOR j := 0 TO {n_} DO
-    best := j;
-    FOR i := 0 TO {n_} DO
-        IF i > j AND ABS(work[i * {n} + j]) > ABS(work[best * {n} + j]) THEN
-            best := i;
-        END_IF;
-    END_FOR;
-    FOR l := 0 TO {n_} DO
-        sum := work[j * {n} + l];
-        work[j * {n} + l] := work[best * {n} + l];
-        work[best * {n} + l] := sum;
-    END_FOR;
-    FOR l := 0 TO {k_} DO
-        sum := {x}[j * {k} + l];
-        {x}[j * {k} + l] := {x}[best * {k} + l];
-        {x}[best * {k} + l] := sum;
-    END_FOR;
-    FOR i := 0 TO {n_} DO
-        IF i > j THEN
-            sum := work[i * {n} + j] / work[j * {n} + j];
-            FOR l := 0 TO {n_} DO
-                work[i * {n} + l] := work[i * {n} + l] - sum * work[j * {n} + l];
-            END_FOR;
-            FOR l := 0 TO {k_} DO
-                {x}[i * {k} + l] := {x}[i * {k} + l] - sum * {x}[j * {k} + l];
-            END_FOR;
-        END_IF;
-    END_FOR;
-END_FOR;
-FOR j := 0 TO {k_} DO
-    FOR i := {n_} TO 0 BY -1 DO
-        sum := {x}[i * {k} + j];
-        FOR l := 0 TO {n_} DO
-            IF l > i THEN
-                sum := sum - work[i * {n} + l] * {x}[l * {k} + j];
-            END_IF;
-        END_FOR;
-        {x}[i * {k} + j] := sum / work[i * {n} + i];
-    END_FOR;
-END_FOR;
-""",
-}
+MATRICES = dict(zip(MATRIX_OPERATIONS, parts("functions.st")))
 """{matrix operation: loops over its operands, row by row}."""
 
 _RESERVED = """
@@ -328,7 +226,7 @@ def _interface(printer, program):
 def _variables(printer, program, statements):
     """Declarations of the state and of what the statements compute."""
     real = printer.kinds[REAL]
-    tables = [s for s in statements if isinstance(s, Array) and not s.reads]
+    tables = [s for s in statements if isinstance(s, Array) and not reads(s)]
     types = {n: printer.kinds[kind] for n, kind in printer.kind_of.items()}
     sized = array_kinds(s for s in statements if s not in tables)
     types |= {n: _array(vector.size, printer.kinds[vector.kind]) for n, vector in sized.items()}
@@ -340,15 +238,10 @@ def _variables(printer, program, statements):
     passing = {"next": kept["state"]} | _helpers(printer, statements)
     for n, kind in types.items():
         (kept if n in lasting else passing)[n] = kind
-    constant = {
-        s.name: f"{_array(len(s.entries), printer.kinds[s.kind])}{_initial(printer, s.entries)}"
-        for s in tables
-    }
-    return [
-        *(_block("VAR CONSTANT", constant) if constant else []),
-        *_block("VAR", kept),
-        *_block("VAR_TEMP", passing),
-    ]
+    size_of = lambda s: _array(len(s.entries), printer.kinds[s.kind])
+    constant = {s.name: f"{size_of(s)}{_initial(printer, s.entries)}" for s in tables}
+    lines = _block("VAR CONSTANT", constant) if constant else []
+    return [*lines, *_block("VAR", kept), *_block("VAR_TEMP", passing)]
 
 
 def _block(kind, variables):

@@ -46,8 +46,7 @@ SAVED = ("x", "y", "r", "u", "command", "spilled", "d_hat")
 """Fields of a Trajectory that are stored at each sample."""
 
 
-LARGEST = 24
-"""Tanks of a loop that is written as code."""
+LARGEST = 24  # tanks of a loop that is written as code
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,21 +54,14 @@ class WholeLoop:
     """The statements of one sample, in order, and what they lead to."""
 
     case: Case
-    leaves: tuple[tuple[str, tuple[int, ...]], ...]
-    """(dotted name, index in it) of each entry of p."""
+    leaves: tuple[tuple[str, tuple[int, ...]], ...]  # (dotted name, index in it) of each entry of p
     statements: list[Statement]
-    first: list[Any]
-    """Entries of c before the first sample."""
-    after: list[Any]
-    """Entries of c after a sample."""
-    saved: dict[str, list[Any]]
-    """{field of `SAVED`, or "errors": its entries at a sample}."""
-    weights: list[tuple[str, float]]
-    """(measure, weight of the square) of each of the errors."""
-    measures: dict[str, list[Any]]
-    """{measure: its entries}, read of c after the last sample."""
-    lines: dict[int, str]
-    """{entry of c at which a Line begins: its name}."""
+    first: list[Any]  # entries of c before the first sample
+    after: list[Any]  # entries of c after a sample
+    saved: dict[str, list[Any]]  # {field of `SAVED`, or "errors": its entries at a sample}
+    weights: list[tuple[str, float]]  # (measure, weight of the square) of each of the errors
+    measures: dict[str, list[Any]]  # {measure: its entries}, read of c after the last sample
+    lines: dict[int, str]  # {entry of c at which a Line begins: its name}
 
 
 def served(case: Case) -> tuple[str, ...]:
@@ -117,6 +109,8 @@ def whole_loop(
     with rolled():
         lowered = lower_all(sample_of(case, carried_names, squares), shapes, WholeWriter())
     before, after, saved, values, errors = lowered.outputs
+    run = run_of(case.loop, case.clock)
+    weights_of = lambda measure, weight: ms.residual_weights(run, ((measure, weight),))
     return WholeLoop(
         case=case,
         leaves=entries_of(shapes["p"]),
@@ -124,11 +118,7 @@ def whole_loop(
         first=flat(before),
         after=flat(after),
         saved={"errors": flat(errors)} if squares else {f: flat(saved[f]) for f in SAVED},
-        weights=[
-            (m, float(w))
-            for m, weight in squares
-            for w in ms.residual_weights(run_of(case.loop, case.clock), ((m, weight),))
-        ],
+        weights=[(m, float(w)) for m, weight in squares for w in weights_of(m, weight)],
         measures={m: flat(values[m]) for m in names},
         lines={start.index: name for start, name in lowered.lines.items()},
     )
@@ -233,7 +223,7 @@ def order(statements: list[Statement], ref: Ref) -> int:
     return next((i for i, s in enumerate(statements) if ref.name in defined(s)), -1)
 
 
-LOOSE, CHOICE, TIGHT = 1, 2, 20
+CHOICE, TIGHT = 2, 20
 BINARY = {
     "or": ("||", 3),
     "and": ("&&", 4),
@@ -262,8 +252,7 @@ _MATHS = """
 abs max min pow atan2 sign sqrt exp log tanh sin cos floor ceil log1p expm1 tan asin acos atan sinh
 cosh asinh acosh atanh cbrt trunc
 """
-MATHS = _MATHS.split()
-"""Functions of Math that a text has by their own names."""
+MATHS = _MATHS.split()  # functions of Math that a text has by their own names
 
 FORMS = {
     "square": "{0}*{0}",
@@ -406,17 +395,11 @@ class Text:
         carried = [self._named(name) for _, name, _ in s.carried]
         lines = [f"let {n}={v};" for n, v in zip(carried, starts)]
         counter = next(self.names)
-        lines.append(
-            "for(;;){"
-            if s.count is None
-            else f"for(let {counter}=0;{counter}<{s.count};++{counter}){{"
-        )
+        counted = f"for(let {counter}=0;{counter}<{s.count};++{counter}){{"
+        lines.append("for(;;){" if s.count is None else counted)
         lines += self._block(s.body)
-        new = [
-            (n, self.of(e))
-            for n, e in zip(carried, s.new)
-            if self.given.get(getattr(e, "name", "")) != n
-        ]
+        moves = lambda n, e: self.given.get(getattr(e, "name", "")) != n
+        new = [(n, self.of(e)) for n, e in zip(carried, s.new) if moves(n, e)]
         temporary = [next(self.names) for _ in new]
         lines += [f"const {t}={e};" for t, (_, e) in zip(temporary, new)]
         return [*lines, *(f"{n}={t};" for t, (n, _) in zip(temporary, new)), "}"]

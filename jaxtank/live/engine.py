@@ -1,16 +1,13 @@
-"""The engine of a live page: a closed loop as JavaScript text, and what is known of it as data.
-
-The text needs no page: node runs it too.
-"""
+"""A closed loop as JavaScript text, which needs no page, and what is known of it as data."""
 
 import dataclasses
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from importlib import resources
 from itertools import chain
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -21,20 +18,247 @@ from jaxtank.case import Case, Free
 from jaxtank.controllers import OnOff, OpenLoop
 from jaxtank.core.labels import input_unit, label_of, place_of
 from jaxtank.core.tree import describe, get_value, parameters
-from jaxtank.export.whole import WholeLoop, library, whole_loop
+from jaxtank.export.statements import (
+    TRUTH,
+    Array,
+    Define,
+    Matrix,
+    Ref,
+    Statement,
+    every,
+    hoisted,
+    names,
+    of_rank,
+    ranks,
+    refs,
+    used,
+)
+from jaxtank.export.whole import (
+    MATHS,
+    Text,
+    WholeLoop,
+    kept_in_time,
+    library,
+    short_names,
+    whole_loop,
+)
 from jaxtank.limits import draws, limit_scale, resolve_limits
-from jaxtank.live.printed import Printed, maths
 from jaxtank.loop.closed_loop import draws_bursts
 from jaxtank.signals.setpoints import Ramps
 from jaxtank.task import default_cost, has_own_objective, input_range, sensor_noise, with_noise
 from jaxtank.xla.normal import DENOMINATOR, NUMERATOR
 
-ROWS = 3000
-"""Approximate number of rows of a plotted run, as in `jaxtank simulate --out`."""
+ALONE, TIMED, MOVING = 0, 1, 2
+"""Ranks of values: from the numbers of the loop alone, also from time, also from the state."""
+FIXED = frozenset({"every", *"pkcqoSNLRK"})  # names of arguments of the printed functions
+
+
+class Printed:
+    """The printed functions of a WholeLoop."""
+
+    def __init__(self, loop: WholeLoop):
+        self.loop, self.statements = loop, hoisted(loop.statements)
+        lines = dict.fromkeys(loop.lines.values(), MOVING)
+        given = {"p": ALONE, "k": TIMED, "c": MOVING, "n": MOVING, **lines}
+        self.rank = ranks(self.statements, given)
+        self.truths = {s.name for s in self.statements if isinstance(s, Define) and s.kind == TRUTH}
+        both = every(loop.statements)
+        self.arrays = {s.name for s in both if isinstance(s, Array | Matrix)}
+        self.state = self._live()
+        self.moving = used(self._ranked(MOVING), names(self._outputs()))
+        self.measured = used(self._ranked(MOVING), names(self._measures()))
+        needed = refs(self.moving, self._outputs())
+        needed = {e for e in needed if self.rank[e.name] == TIMED and e.name != "k"}
+        # data that is stored for every sample, and data that is computed again from it
+        self.kept, self.again = kept_in_time(self._ranked(TIMED), needed, self.rank)
+        self.crossing = {
+            "signals": self._alone(self._timed(), self.kept),
+            "run": self._alone([*self.again, *self.moving], self._outputs()),
+            "read": self._alone(self.measured, self._measures()),
+        }
+
+    def text(self) -> str:
+        """Return the four functions as an object, without the helpers that they call."""
+        return "\n".join([self._lead(), self._signals(), self._run(), self._read()])
+
+    def streams(self) -> list[Ref]:
+        """Return the precomputed data of each sample, in the order of S."""
+        return sorted(self.kept)
+
+    def _live(self):
+        """The entries of c, without delay lines, that what is saved or measured depends on."""
+        results = [*self._saved(), *self._measures(), *(self.loop.after[i] for i in self._levels())]
+        lines = [self.loop.after[i] for i in self.loop.lines]
+        every, live = self._ranked(MOVING), []
+        while True:
+            after = [*results, *lines, *(self.loop.after[i] for i in live)]
+            read = refs(used(every, names(after)), after)
+            new = sorted(cast(int, e.index) for e in read if e.name == "c")
+            if new == live:
+                return live
+            live = new
+
+    def _outputs(self):
+        after = [self.loop.after[i] for i in (*self.state, *self.loop.lines)]
+        return [*after, *self._saved()]
+
+    def _saved(self):
+        return [e for entries in self.loop.saved.values() for e in entries]
+
+    def _measures(self):
+        return [e for entries in self.loop.measures.values() for e in entries]
+
+    def _levels(self):
+        """Indices of the levels in c: their sum is not finite if the run has diverged."""
+        return range(self.loop.case.loop.plant.tanks)
+
+    def _ranked(self, rank):
+        return of_rank(self.statements, self.rank, rank)
+
+    def _timed(self):
+        return used(self._ranked(TIMED), names(self.kept))
+
+    def _alone(self, statements: list[Statement], outputs: Iterable[Any]) -> list[Ref]:
+        """Values of rank ALONE that are read: numbers, then whole arrays as Refs without index."""
+        numbers = {e for e in refs(statements, outputs) if self.rank[e.name] == ALONE}
+        read = {o for s in every(statements) if isinstance(s, Matrix) for o in s.operands}
+        whole = {Ref(name) for name in read if self.rank.get(name) == ALONE}
+        return [*sorted(numbers, key=place), *sorted(whole)]
+
+    def _is_array(self, e):
+        return e.index is None and e.name in self.arrays
+
+    def _lead(self):
+        outputs = [self.loop.first[i] for i in self.state]
+        outputs += [self.loop.first[i] for i in self.loop.lines]
+        for group_read in self.crossing.values():
+            outputs += group_read
+        alone = used(self._ranked(ALONE), names(outputs))
+        text = Text({"p": "p"}, short_names(FIXED))
+        lines = text.write(alone, outputs, hold=outputs)
+        groups = [*self.crossing.values(), [self.loop.first[i] for i in self.state]]
+        parts, delays = [self._numbers(text, group) for group in groups], []
+        for i in sorted(self.loop.lines):
+            root = self.loop.after[i].name
+            size = sum(isinstance(e, Ref) and e.name == root for e in self.loop.after)
+            delays.append(f"new Float64Array({size}).fill({text.of(self.loop.first[i])})")
+        lines.append(f"return[{','.join(parts)},[{','.join(delays)}]];")
+        return function("lead", "p", lines)
+
+    def _numbers(self, text, group):
+        """Numbers as one array, with whole arrays, if any, as its property A."""
+        numbers = [e for e in group if not (isinstance(e, Ref) and self._is_array(e))]
+        whole = [text.given[e.name] for e in group if isinstance(e, Ref) and self._is_array(e)]
+        out = f"Float64Array.of({','.join(map(text.of, numbers))})"
+        return f"Object.assign({out},{{A:[{','.join(whole)}]}})" if whole else out
+
+    def _begin(self, name, extra):
+        """The Text of a function, and its first lines: names of what `_numbers` put together."""
+        text, lines = Text(extra, short_names(FIXED)), []
+        for whole, where in ((False, "q"), (True, "q.A")):
+            entries = [e for e in self.crossing[name] if self._is_array(e) == whole]
+            variables = [next(text.names) for _ in entries]
+            text.given.update(zip([e.name if whole else e for e in entries], variables))
+            lines += [f"const[{','.join(variables)}]={where};"] if variables else []
+        return text, lines
+
+    def _signals(self):
+        text, lines = self._begin("signals", {Ref("k"): "k"})
+        streams = self.streams()
+        variables = [next(text.names) for _ in streams]
+        if variables:
+            lines.append(f"const[{','.join(variables)}]=S;")
+        body = text.write(self._timed(), streams)
+        values = (text.of(e) for e in streams)
+        body += [f"{a}[k]={v if v[0] == '+' else f'+{v}'};" for a, v in zip(variables, values)]
+        lines += ["for(;k<K;++k){", *body, "}"] if variables else []
+        return function("signals", "q,k,K,S", lines)
+
+    def _run(self):
+        text, lines, body, state = self._sample()
+        rows = [f"R[o++]={self._real(e)}{text.of(e)};" for e in self._saved()]
+        body += ["if(k%every===0){", *rows, "}", *self._next(text)]
+        lines += ["let o=0;", "for(;k<K;++k){", *body, "}"]
+        lines += [f"c[{j}]={variable};" for j, variable in enumerate(state)]
+        return function("run", "q,c,L,S,N,k,K,every,R", [*lines, "return o;"])
+
+    def _sample(self):
+        """Return (Text, lines in front of the loop, lines of a sample, variables of the state)."""
+        text, lines = self._begin("run", {Ref("k"): "k"})
+        streams = self.streams()
+        streams_read = [next(text.names) for _ in streams]
+        noise = [next(text.names) for _ in range(self.loop.case.loop.plant.tanks)]
+        if streams_read:
+            lines.append(f"const[{','.join(streams_read)}]=S;")
+        lines.append(f"const[{','.join(noise)}]=N;")
+        state = [next(text.names) for _ in self.state]
+        text.given |= {Ref("c", i): variable for i, variable in zip(self.state, state)}
+        delays = [next(text.names) for _ in self.loop.lines]
+        text.given |= dict(zip(self.loop.lines.values(), delays))
+        lines.append(f"let[{','.join(state)}]=c;")
+        lines += [f"const[{','.join(delays)}]=L;"] if delays else []
+        body, deviates = [], (Ref("n", i) for i in range(len(noise)))
+        for e, array in zip([*streams, *deviates], [*streams_read, *noise]):
+            text.given[e] = next(text.names)
+            body.append(f"const {text.given[e]}={array}[k];")
+        outputs = self._outputs()
+        body += text.write([*self.again, *self.moving], outputs, hold=outputs)
+        return text, lines, body, state
+
+    def _next(self, text):
+        """Lines that replace the last state by the next one."""
+        moved = []
+        for i in self.state:
+            e, name = self.loop.after[i], text.given[Ref("c", i)]
+            if e != Ref("c", i):
+                moved.append((name, text.of(e), self._real(e)))
+        old = {name for name, *_ in moved}
+        temporary = {value: next(text.names) for _, value, _ in moved if value in old}
+        first = [f"const {new}={value};" for value, new in temporary.items()]
+        return first + [f"{n}={sign}{temporary.get(v, v)};" for n, v, sign in moved]
+
+    def _real(self, e):
+        """Prefix that converts a truth value to a number; "" for a number."""
+        return "+" if isinstance(e, Ref) and e.name in self.truths else ""
+
+    def _read(self):
+        text, lines = self._begin("read", {})
+        state = [next(text.names) for _ in self.state]
+        text.given |= {Ref("c", i): variable for i, variable in zip(self.state, state)}
+        lines.append(f"const[{','.join(state)}]=c;")
+        outputs = self._measures()
+        lines += text.write(self.measured, outputs, hold=outputs)
+        return function("read", "q,c", [*lines, f"return[{','.join(map(text.of, outputs))}];"])
+
+
+def place(e: Ref) -> tuple[str, Any]:
+    """Return the sort key of Refs."""
+    return e.name, -1 if e.index is None else e.index
+
+
+def function(name: str, arguments: str, lines: Iterable[str]) -> str:
+    """Return a function as text, with constants that follow each other in one statement."""
+    short: list[str] = []
+    constant = False
+    for line in lines:
+        now = line.startswith(("const ", "const[")) and line.endswith(";")
+        if now and constant:
+            short[-1] = short[-1][:-1] + ","
+            line = line.removeprefix("const").lstrip()
+        short.append(line)
+        constant = now
+    return f"function {name}({arguments}){{" + "\n".join(short) + "}"
+
+
+def maths(text: str) -> str:
+    """Return the line that gives the functions of Math in `text` their own names."""
+    return f"const{{{','.join(m for m in MATHS if f'{m}(' in text)}}}=Math;"
+
+
+ROWS = 3000  # approximate number of rows of a plotted run, as in `jaxtank simulate --out`
 ALWAYS = ("rms_error_total", "max_level")
 """Measures of a search whatever a case minimises and limits."""
-SHARED = ("unit", "doc", "group")
-"""Fields that all entries of one array share."""
+SHARED = ("unit", "doc", "group")  # fields that all entries of one array share
 
 GROUPS = {
     "controller": "controller",
@@ -74,8 +298,7 @@ WIDE = {"controller": (0.2, 5.0), "observer": (0.2, 5.0), "plant": (0.5, 1.5), "
 """{group: ends of a slider as multiples of a value that has no bounds}; (0, 2) of the others."""
 ABOVE = 1e-3
 """Lower end of a slider above a lower bound that is excluded, as a share of the range [-]."""
-NOISE = 0.02
-"""Upper end of the sliders of noise, as a share of the height of the tanks [-]."""
+NOISE = 0.02  # upper end of the sliders of noise, as a share of the height of the tanks [-]
 
 
 def program_of(case: Case) -> tuple[WholeLoop, str]:
@@ -90,27 +313,7 @@ def engine(
     filtered: Case | None = None,
     printed: Callable[[Case], tuple[WholeLoop, str]] = program_of,
 ) -> str:
-    """Return a text of JavaScript that defines makeEngine(), which runs the loop of a case.
-
-    Parameters
-    ----------
-    case : Case
-    filtered : Case, optional
-        The same with its safety filter, to be switched on and off.
-    printed : callable
-        `program_of`, or a function that remembers its results.
-
-    Raises
-    ------
-    InputError
-        For a loop that has no code of single samples (`jaxtank.export.whole`).
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> "function makeEngine()" in engine(presets.find("cascaded/pi"))
-    True
-    """
+    """Return JavaScript that defines makeEngine(), which runs a case and the same `filtered`."""
     with jax.enable_x64(True):
         parts = [printed(variant) for variant in (case, filtered) if variant is not None]
         facts = _facts(case, [loop for loop, _ in parts])
@@ -133,18 +336,9 @@ def engine(
 
 
 def facts_of(case: Case, filtered: Case | None = None) -> dict[str, Any]:
-    """Return the data of the loop of a case without its code, as a JSON object.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> facts_of(presets.find("cascaded/pi"))["pumps"][0]["upper"]
-    10.0
-    """
+    """Return the data of the loop of a case without its code, as a JSON object."""
     with jax.enable_x64(True):
-        return _facts(
-            case, [whole_loop(variant) for variant in (case, filtered) if variant is not None]
-        )
+        return _facts(case, [whole_loop(c) for c in (case, filtered) if c is not None])
 
 
 def _packed(facts: dict[str, Any]) -> dict[str, Any]:
@@ -174,9 +368,8 @@ def data(value: Any) -> str:
 def squares_of(objective: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
     """Return ((measure, weight), ...) of the Gauss-Newton matrix of an objective."""
     squares = tuple((m, w) for m, w in objective.items() if m in ms.squares())
-    return (
-        (("mean_square_error", 1.0),) if "rms_error_total" in objective or not squares else squares
-    )
+    errors_alone = "rms_error_total" in objective or not squares
+    return (("mean_square_error", 1.0),) if errors_alone else squares
 
 
 def _lean(case: Case) -> WholeLoop:
@@ -194,9 +387,7 @@ def _objective(case: Case) -> Mapping[str, float]:
 
 
 def _task(loops: list[WholeLoop]) -> dict[str, Any]:
-    """What a search on plants changes, as `jaxtank tune` does: the objective, and values {leaf:
-    number} of the sensor noise, and of the safety filter that is designed for this noise.
-    """
+    """What a search on plants changes: the objective, noise, and the safety filter for it."""
     case, known = loops[-1].case, {_name(*leaf) for loop in loops for leaf in loop.leaves}
     noisy = with_noise(case.without_safety_filter(), sensor_noise(case)[0])
     values, proved = {"sensor.noise": noisy.loop.sensor.noise}, False
@@ -205,14 +396,11 @@ def _task(loops: list[WholeLoop]) -> dict[str, Any]:
         loop = dataclasses.replace(case.loop, safety_filter=safety_filter)
         guard = {n: v for n, v in parameters(loop).items() if n.startswith("safety_filter.")}
         values, proved = values | guard, all(row.certified for row in rows)
-    entries = {
-        _name(name, index): float(v)
-        for name, array in values.items()
-        for index, v in np.ndenumerate(np.asarray(array, dtype=float))
-        if np.isfinite(v)
-    }
-    objective = {m: float(w) for m, w in _objective(loops[0].case).items()}
-    entries = {n: v for n, v in entries.items() if n in known}
+    objective, entries = {m: float(w) for m, w in _objective(loops[0].case).items()}, {}
+    for name, array in values.items():
+        for index, v in np.ndenumerate(np.asarray(array, dtype=float)):
+            if np.isfinite(v) and _name(name, index) in known:
+                entries[_name(name, index)] = float(v)
     return {"objective": objective, "values": entries, "proved": proved}
 
 
@@ -226,9 +414,8 @@ def _program(loop: WholeLoop, search: str = "") -> str:
         "leaves": [_name(*leaf) for leaf in loop.leaves],
         "weights": loop.weights,
     }
-    return (
-        f"(()=>{{{printed.text()}\nreturn{{lead,signals,run,read,...{data(facts)},{search}}};}})()"
-    )
+    result = f"{{lead,signals,run,read,...{data(facts)},{search}}}"
+    return f"(()=>{{{printed.text()}\nreturn{result};}})()"
 
 
 def _name(name, index):
@@ -253,7 +440,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         "duration": clock.duration,
         "samples": clock.samples,
         "save_every_default": max(1, clock.samples // ROWS),
-        "tanks": _tanks(case),
+        "tanks": _tanks(plant),
         "outputs": [int(i) for i in plant.outputs],
         "pumps": [
             {
@@ -287,32 +474,26 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
     }
 
 
-def _setpoints(loop):
-    """[[parameter, output, the time from which it is the setpoint]], where the setpoints step."""
-    reference = loop.reference
-    if not isinstance(reference, Ramps):
-        return []
-    first = [[f"reference.initial[{i}]", i, 0.0] for i in range(reference.channels)]
-    later = [
-        [f"reference.targets[{k}]", channel, float(time)]
-        for k, (time, channel) in enumerate(reference.changes)
-    ]
-    return first + later
-
-
-def _tanks(case):
-    plant = case.loop.plant
-    rims = [float(v) for v in np.broadcast_to(np.asarray(plant.rim), (plant.tanks,))]
-    return [
-        {"name": label_of(plant, "tank", i), "rim": rim if np.isfinite(rim) else None}
-        for i, rim in enumerate(rims)
-    ]
+def _tanks(plant):
+    rims = enumerate(map(float, np.broadcast_to(plant.rim, (plant.tanks,))))
+    rim = lambda value: value if np.isfinite(value) else None
+    return [{"name": label_of(plant, "tank", i), "rim": rim(value)} for i, value in rims]
 
 
 def _leaves(loops):
     """The sliders of all loops, those of the first where several have one."""
     homes = {leaf: variant.case for variant in reversed(loops) for leaf in variant.leaves}
     return [leaf_of(homes[leaf], *leaf) for leaf in sorted(homes, key=lambda leaf: leaf[0])]
+
+
+def _setpoints(loop):
+    """[[parameter, output, the time from which it is the setpoint]], where the setpoints step."""
+    reference = loop.reference
+    if not isinstance(reference, Ramps):
+        return []
+    first = [[f"reference.initial[{i}]", i, 0.0] for i in range(reference.channels)]
+    later = enumerate(reference.changes)
+    return first + [[f"reference.targets[{k}]", i, float(time)] for k, (time, i) in later]
 
 
 def _measure(case, name, entries):
@@ -359,7 +540,7 @@ INFINITE = {math.inf: "Infinity", -math.inf: "-Infinity"}
 
 def leaf_of(case: Case, name: str, index: tuple[int, ...]) -> dict[str, Any]:
     """Return the slider of one number of a loop, as a JSON object."""
-    full = f"{name}[{','.join(map(str, index))}]" if index else name
+    full = _name(name, index)
     meta = describe(case.loop, full)
     value = float(np.asarray(get_value(case.loop, full)))
     group = GROUPS.get(name.split(".")[0], name.split(".")[0])

@@ -1,39 +1,122 @@
 """The live page as text: one HTML file that asks nothing of any network, everything in it escaped.
 
-Beside it lie the parts of the page:
-page.html, page.css, core.js, charts.js, rig.js, runner.js, page.js, worker.js, tune.js, and uPlot
-in vendor/.
+The HTML, CSS and JavaScript files beside it are the parts of the page.
 """
 
 import base64
+import contextlib
 import dataclasses
 import hashlib
 import html
 import json
 import re
+import shlex
 import zlib
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxtank import rig
+from jaxtank import presets, rig
 from jaxtank.bounds import bounds, free_of
 from jaxtank.case import uncertain_shares
 from jaxtank.core import VERSION
 from jaxtank.core.checks import check_whole
+from jaxtank.core.clock import CLOCK_UNITS
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import write_folder
 from jaxtank.core.labels import label_of
-from jaxtank.core.tree import get_value, parameters
+from jaxtank.core.tree import get_value, parameters, walk
 from jaxtank.export.whole import check_pointwise
 from jaxtank.live.engine import engine, program_of
-from jaxtank.live.origin import both, entries, origin_of
 from jaxtank.loop.closed_loop import takes_arrays
 from jaxtank.loop.trajectory import stride
 from jaxtank.plants.vessels import shape_name
 from jaxtank.plots.layout import jets, overflows, pipes, place, valves
+
+GUARD = "safety_filter."  # prefix of the names of a safety filter
+
+NEW = "rig.toml"  # name of the rig file to which a case without a name is copied
+
+
+class Origin(NamedTuple):
+    """How `jaxtank simulate` makes a case."""
+
+    words: str
+    values: dict[str, float]
+    filtered: bool
+    guard: str
+
+
+def origin_of(case, source=None):
+    """Return the Origin of a case."""
+    source = source or (case.name if case.name in presets.names() else None)
+    known, words = None, None
+    if source is not None:
+        with contextlib.suppress(InputError):  # the file has gone
+            known = rig.open_case(source)
+            words = _static(case, known)
+    if source is None or known is None or words is None:
+        return Origin(shlex.quote(source or NEW), {}, case.safety is not None, "")
+    current, before = entries(case.loop, parameters(case.loop)), dict(known.safety or {})
+    origin = entries(known.loop, parameters(known.loop)).items()
+    differing = {name: value for name, value in origin if current[name] != value}
+    guard: list[str] = []  # settings of the safety filter that the origin does not have
+    for key, value in (case.safety or {}).items():
+        if not np.array_equal(before.get(key, ()), value):
+            text = f"[{','.join(map(str, value))}]" if np.ndim(value) else str(value)
+            guard += ["--set", shlex.quote(f"safety_filter.{key}={text}")]
+    words = " ".join([shlex.quote(source), *words])
+    return Origin(words, differing, known.safety is not None, " ".join(guard))
+
+
+def _static(case, known):
+    """--set of the static fields and the clock that differ; None where the structure does."""
+    fields = lambda c: {n: v for n, v, _ in walk(c.loop, kind="static") if not n.startswith(GUARD)}
+    mine, theirs = fields(case), fields(known)
+    if _shapes(case.loop) != _shapes(known.loop) or mine.keys() != theirs.keys():
+        return None
+    changes = {name: value for name, value in mine.items() if value != theirs[name]}
+    if any(value is None or isinstance(value, tuple) for value in changes.values()):
+        return None
+    for name in CLOCK_UNITS:
+        if getattr(case.clock, name) != getattr(known.clock, name):
+            changes[f"clock.{name}"] = getattr(case.clock, name)
+    words = []
+    for name, value in changes.items():
+        text = str(value).lower() if isinstance(value, bool) else value
+        words += ["--set", shlex.quote(f"{name}={text}")]
+    return words
+
+
+def _shapes(loop):
+    return {n: np.shape(v) for n, v in parameters(loop).items() if not n.startswith(GUARD)}
+
+
+def entries(loop, values):
+    """Return {name of one entry: number} of {dotted name: number or array}."""
+    numbers, leaves = {}, parameters(loop)
+    for name, value in values.items():
+        if name.startswith(GUARD):
+            continue
+        shape = np.shape(leaves[name]) if name in leaves else ()
+        if not shape:
+            numbers[name] = float(np.ravel(value)[0])
+            continue
+        for index, entry in np.ndenumerate(np.broadcast_to(np.asarray(value, float), shape)):
+            numbers[f"{name}[{','.join(map(str, index))}]"] = float(entry)
+    return numbers
+
+
+def both(case):
+    """Return (case without a safety filter, the same with one or None, whether it has one now)."""
+    has = case.loop.safety_filter is not None
+    try:
+        return case.without_safety_filter(), case if has else rig.filtered(case, on=True), has
+    except InputError:  # nothing to keep, or no way to
+        return case, None, has
+
 
 HERE = Path(__file__).parent
 SCRIPTS = ("charts", "rig", "runner", "page")
@@ -43,17 +126,13 @@ LARGEST = 117_000
 DIGITS = str.maketrans("&<>`", ",.:[")
 """Digits of base 85 that HTML reads as something else, and what stands for them (inflate.js)."""
 
-END = "\0"
-"""Separator between the packed parts of a page; JSON escapes it."""
+END = "\0"  # separator between the packed parts of a page; JSON escapes it
 
-KEPT = 8
-"""Engines that are kept in memory."""
+KEPT = 8  # engines that are kept in memory
 
-PLANTS, MOST_PLANTS = 64, 2000
-"""Number of plants in the band of a page: by default, and at most."""
+PLANTS, MOST_PLANTS = 64, 2000  # number of plants in the band of a page: by default, and at most
 
-LEAK = 1.5
-"""Factor of an outlet that leaks [-]."""
+LEAK = 1.5  # factor of an outlet that leaks [-]
 
 _KEPT = {}
 
@@ -141,30 +220,27 @@ def _breaks(case):
         faults.append({"name": name, "leaf": leaf, "factor": factor, "value": None, "text": text})
 
     values = {n: np.ravel(v) for n, v in parameters(case.loop).items()}
+    used = lambda leaf: np.flatnonzero(values.get(leaf, ())).tolist()
     for j in range(np.size(values.get("plant.pump_gain", ()))):
         add(f"pump {j + 1} at 70 %", f"plant.pump_gain[{j}]", 0.7, "the pump delivers 70 %")
-    for i, area in enumerate(values.get("plant.drain", ())):
-        if area > 0:
-            text = f"the outlet of tank {i + 1} is {100 * (LEAK - 1):.0f} % wider"
-            add(f"leak in tank {i + 1}", f"plant.drain[{i}]", LEAK, text)
-    for k, area in enumerate(values.get("plant.orifice", ())):
-        if area > 0:
-            source, sink = (tank + 1 for tank in plant.links[k])
-            text = f"the valve from tank {source} to tank {sink} is stuck, 40 % open"
-            add(f"stuck valve {source} to {sink}", f"plant.orifice[{k}]", 0.4, text)
-    for k, area in enumerate(values.get("plant.pipe", ())):
-        if area > 0:
-            first, other = (tank + 1 for tank in plant.pipes[k])
-            text = f"the pipe between tanks {first} and {other} is blocked, 40 % open"
-            add(f"blocked pipe {first} to {other}", f"plant.pipe[{k}]", 0.4, text)
+    for i in used("plant.drain"):
+        text = f"the outlet of tank {i + 1} is {100 * (LEAK - 1):.0f} % wider"
+        add(f"leak in tank {i + 1}", f"plant.drain[{i}]", LEAK, text)
+    for k in used("plant.orifice"):
+        source, sink = (tank + 1 for tank in plant.links[k])
+        text = f"the valve from tank {source} to tank {sink} is stuck, 40 % open"
+        add(f"stuck valve {source} to {sink}", f"plant.orifice[{k}]", 0.4, text)
+    for k in used("plant.pipe"):
+        first, other = (tank + 1 for tank in plant.pipes[k])
+        text = f"the pipe between tanks {first} and {other} is blocked, 40 % open"
+        add(f"blocked pipe {first} to {other}", f"plant.pipe[{k}]", 0.4, text)
     for k in range(np.size(values.get("plant.valve", ()))):
         valve = label_of(plant, "pump", len(plant.feeds) + k)
         text = f"{valve} passes 40 % of the flow of its opening"
         add(f"clogged {valve}", f"plant.valve[{k}]", 0.4, text)
-    for k, volume in enumerate(values.get("disturbance.volume", ())):
-        if volume:
-            text = "three times the volume of this inflow disturbance"
-            add(f"inflow pulse {k + 1} times 3", f"disturbance.volume[{k}]", 3.0, text)
+    for k in used("disturbance.volume"):
+        text = "three times the volume of this inflow disturbance"
+        add(f"inflow pulse {k + 1} times 3", f"disturbance.volume[{k}]", 3.0, text)
     return faults
 
 
@@ -187,7 +263,8 @@ def _worker():
 
 def assemble(engine_text, name, data):
     """Return the page as text."""
-    uplot, core, scripts = _read("vendor/uPlot.iife.min.js"), _script("core"), _own()
+    uplot, core = _read("vendor/uPlot.iife.min.js"), _script("core")
+    scripts = "\n".join(map(_script, SCRIPTS))
     # the scripts of the page are one function, as loader.js joins them
     run = [engine_text, uplot, f'(() => {{"use strict";\n{core}\n{scripts}\n}})();', _loader()]
     policy = "; ".join(
@@ -251,12 +328,6 @@ def _script(name):
 
 
 @cache
-def _own():
-    """The scripts of the page but core.js."""
-    return "\n".join(map(_script, SCRIPTS))
-
-
-@cache
 def _loader():
     """The script that unpacks the others, with the licence of third-party code."""
     licence = "/* Packed in this page: uPlot 1.6.32, copyright (c) 2022 Leon Sorokin, MIT licence:"
@@ -292,8 +363,7 @@ def _path(path):
     return [_rounded(point) for point in path]
 
 
-HEIGHT = 900
-"""Height of the page inside another one [px]."""
+HEIGHT = 900  # height of the page inside another one [px]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,8 +1,7 @@
 """Numbers that describe a run, accumulated in the time loop: memory does not grow with its length.
 
 `catalogue` holds the measures, `accumulators` their state in the time loop, `registry` what is
-known of them by name, `running` what the loop calls, `functions` those that are a function of a
-whole run.
+known of them by name and what the loop calls, `functions` those that are a function of a whole run.
 """
 
 from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context, Run, Worst
@@ -13,18 +12,23 @@ from jaxtank.measures.registry import (
     entries,
     entry_units,
     linear,
+    needs,
     of_loop,
     placed,
+    read,
     refers_to,
     register,
     reported,
+    residual_weights,
+    residuals,
     serves,
     squares,
+    start,
     times,
     unit,
     unreadable,
+    update,
 )
-from jaxtank.measures.running import needs, read, residual_weights, residuals, start, update
 
 __all__ = [
     "ACCUMULATORS",

@@ -1,7 +1,4 @@
-"""State of the measures in the time loop: running sums, extremes and times.
-
-`measures.catalogue` names what it reads of them.
-"""
+"""State of the measures in the time loop: running sums, extremes and times."""
 
 import operator
 from collections.abc import Callable
@@ -14,8 +11,7 @@ from jaxtank.core.numerics import lower_clip, magnitude
 from jaxtank.core.records import Sample
 from jaxtank.core.vectors import each
 
-BAND = 0.05
-"""Half width of the recovery band, as a share of the setpoint [-]."""
+BAND = 0.05  # half width of the recovery band, as a share of the setpoint [-]
 
 
 class Run(NamedTuple):
@@ -129,9 +125,8 @@ def _sum_of_squares(size, term, refers_to=""):
 
 def _lasting(term):
     """`term` of the samples that last for dt: the terms of an integral over the run."""
-    return lambda run, sample, *context: each(
-        lambda v: run.lasting(sample, v), term(run, sample, *context)
-    )
+    held = lambda run, sample: lambda v: run.lasting(sample, v)
+    return lambda run, sample, *context: each(held(run, sample), term(run, sample, *context))
 
 
 def _extreme(size, pick, better, worst, refers_to=""):
@@ -150,12 +145,8 @@ def _extreme(size, pick, better, worst, refers_to=""):
 
 def _excess(run, command):
     """How far a command is outside its limits [V], 0 inside."""
-    return each(
-        lambda v, low, high: jnp.where(v > high, v - high, jnp.where(v < low, low - v, 0.0)),
-        command,
-        run.low,
-        run.high,
-    )
+    past = lambda v, low, high: jnp.where(v > high, v - high, jnp.where(v < low, low - v, 0.0))
+    return each(past, command, run.low, run.high)
 
 
 def _saturation_excess(run, sample):
@@ -166,12 +157,8 @@ def _saturation_excess(run, sample):
 
 
 def _outside(run, sample):
-    return each(
-        lambda v, low, high: jnp.where((v < low) | (v > high), 1.0, 0.0),
-        sample.command,
-        run.low,
-        run.high,
-    )
+    past = lambda v, low, high: jnp.where((v < low) | (v > high), 1.0, 0.0)
+    return each(past, sample.command, run.low, run.high)
 
 
 def _overshoot(sample, context):
@@ -205,15 +192,12 @@ def settled(last, outside):
 
 
 def _moves(r, before):
-    """Whether a setpoint has changed by more than rounding: compiled code may fuse k dt - t0, that
-    of a page does not.
-    """
+    """Whether a setpoint has changed by more than rounding, by which pages and XLA differ."""
     return magnitude(r - before) > 4.0 * jnp.finfo(jnp.result_type(r)).eps * magnitude(r)
 
 
 def _update_plateau(run, state, sample, context):
-    """Per output (setpoint, |error|, time and whether it was constant at the last sample; the
-    largest error at the end of a plateau so far, its time)."""
+    """Per output (setpoint, |error|, time, constant; largest error at a plateau's end, when)."""
 
     def update(r, e, before):
         setpoint, error, time, constant, worst, when = before
@@ -227,11 +211,7 @@ def _update_plateau(run, state, sample, context):
 
 
 def _update_swing(run, state, sample, context):
-    """Per output (setpoint, whether it was constant at the last sample; samples of its plateau, at
-    how many the next part of it begins; largest errors above and below in this part and in the
-    one before; largest swing of a plateau so far). A part ends when the plateau is a fifth longer
-    than at its begin.
-    """
+    """Per output what `swing_of` reads: parts of a plateau, each a fifth longer than begun."""
 
     def update(r, e, before):
         setpoint, constant, count, end, above, below, above_old, below_old, worst = before
@@ -327,11 +307,8 @@ def _sum_of_changes(term, residual=None):
         sums = each(lambda d, s: plus(s, term(d)), _changes(state, sample), state[1])
         return sample.u, sums, jnp.zeros_like(state[2])
 
-    return Accumulator(
-        lambda run: (_filled(run, "pumps"), _sums(run, "pumps"), run.zero == 0.0),
-        update,
-        residual=residual,
-    )
+    start = lambda run: (_filled(run, "pumps"), _sums(run, "pumps"), run.zero == 0.0)
+    return Accumulator(start, update, residual=residual)
 
 
 def _magnitudes(vector):

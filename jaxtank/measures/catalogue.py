@@ -85,9 +85,8 @@ def _integral(run):
 
 def _measure(unit, per, accumulator, read, doc, **facts) -> Measure:
     """A measure of one accumulator, whose state is what `read` takes."""
-    return Measure(
-        unit, per, (accumulator,), lambda run, acc: read(run, acc[accumulator]), doc, **facts
-    )
+    read_state = lambda run, states: read(run, states[accumulator])
+    return Measure(unit, per, (accumulator,), read_state, doc, **facts)
 
 
 def _root_mean(unit, per, accumulator, doc, **facts) -> Measure:
@@ -113,9 +112,8 @@ def _scaled(unit, per, accumulator, scale, doc, **facts) -> Measure:
 
 def _summed(accumulator, doc) -> Measure:
     """A volume of each tank."""
-    return _measure(
-        "cm^3", "tank", accumulator, lambda run, sums: _stacked(sums), doc, by_input=True
-    )
+    read = lambda run, sums: _stacked(sums)
+    return _measure("cm^3", "tank", accumulator, read, doc, by_input=True)
 
 
 def _sum_of_squares(unit, per, accumulator, scale, doc) -> Measure:
@@ -411,9 +409,8 @@ SUMMARY = (
 )
 """Measures in an ensemble's summary unless others are named, in order."""
 
-TRACKED = (
-    *("steady_state_error", "steady_state_swing", "rms_error", "max_level", "saturated_fraction"),
-)
+TRACKED = ("steady_state_error", "steady_state_swing", "rms_error", "max_level")
+TRACKED += ("saturated_fraction",)
 """Measures by which a run is judged on tracking."""
 
 

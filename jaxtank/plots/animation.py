@@ -4,7 +4,7 @@ import hashlib
 import io
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -21,14 +21,11 @@ from jaxtank.plots.schematic import HALO, depth, mark, mark_height, schematic
 from jaxtank.plots.spills import Lost, Stack, headroom, spilled
 from jaxtank.plots.style import PUMPS, TUNED, WATER, box, plain, styled
 
-RATE = 12
-"""Pictures per second: enough for liquid, which moves slowly."""
+RATE = 12  # pictures per second: enough for liquid, which moves slowly
 
-LONGEST = 60.0
-"""Of an animation [s]."""
+LONGEST = 60.0  # of an animation [s]
 
-STILLS = 4
-"""Moments of a still."""
+STILLS = 4  # moments of a still
 
 
 def animate(loop, trajectory, path, seconds=8, against=None, titles=()):
@@ -43,14 +40,15 @@ def animate(loop, trajectory, path, seconds=8, against=None, titles=()):
 def film(loop, trajectory, seconds=8, against=None, titles=()):
     """Return (a GIF as bytes, a still as the bytes of a PNG file): the still shows four moments."""
     with styled():
-        scene = _scene(loop, trajectory, seconds, against, titles)
+        figure, times, draw = _scene(loop, trajectory, seconds, against, titles)
+        canvas: Any = figure.canvas
         pictures = []
-        for t in scene.times:
-            scene.draw(t)
-            scene.figure.canvas.draw()
-            pixels = np.asarray(scene.figure.canvas.buffer_rgba())[:, :, :3]
+        for t in times:
+            draw(t)
+            canvas.draw()
+            pixels = np.asarray(canvas.buffer_rgba())[:, :, :3]
             pictures.append(Image.fromarray(np.ascontiguousarray(pixels)))
-        plt.close(scene.figure)
+        plt.close(figure)
     return gif(pictures), still(pictures)
 
 
@@ -59,11 +57,10 @@ def to_html(loop, trajectory, seconds=8, against=None, titles=()):
     # It is complete: fonts and scripts are not loaded from the network. Parameters and errors as of
     # `animate`.
     with styled({"animation.embed_limit": 20.0, "figure.dpi": 80, "savefig.dpi": 80}):
-        scene = _scene(loop, trajectory, seconds, against, titles)
-        options = {"frames": scene.times, "interval": 1000 / RATE, "cache_frame_data": False}
-        animation = FuncAnimation(scene.figure, scene.draw, **options)
-        page = animation.to_jshtml(fps=RATE)
-        plt.close(scene.figure)
+        figure, times, draw = _scene(loop, trajectory, seconds, against, titles)
+        options = {"frames": times, "interval": 1000 / RATE, "cache_frame_data": False}
+        page = FuncAnimation(figure, draw, **options).to_jshtml(fps=RATE)
+        plt.close(figure)
     # matplotlib takes the pictures on its buttons from the network
     page = re.sub(r"<link\b[^>]*>\s*", "", page)
     for name, sign in SIGNS.items():
@@ -120,16 +117,8 @@ def still(pictures):
     return out.getvalue()
 
 
-class _Scene(NamedTuple):
-    """A figure, the times of its pictures, and what draws one of them."""
-
-    figure: Any
-    times: Any
-    draw: Any
-
-
 def _scene(loop, trajectory, seconds, against, titles):
-    """A _Scene of one rig, or of two beside each other."""
+    """(figure, times of its pictures, what draws one of them) of one rig, or of two."""
     if not (isinstance(seconds, (int, float)) and 1 <= seconds <= LONGEST):
         raise InputError(f"seconds = {seconds!r}: an animation may last 1 to {LONGEST:g} s")
     pairs = [(loop, trajectory), *([] if against is None else [against])]
@@ -142,10 +131,8 @@ def _scene(loop, trajectory, seconds, against, titles):
     width = 4.6 if len(pairs) == 1 else 3.9
     figure = plt.figure(figsize=(width * len(pairs), min(6.0, width * shape + 0.8)), dpi=80)
     names = [*titles, *[""] * len(pairs)]
-    stages = [
-        _Stage(figure, (k, len(pairs)), rig, run, name)
-        for k, ((rig, run), name) in enumerate(zip(pairs, names))
-    ]
+    rows = enumerate(zip(pairs, names))
+    stages = [_Stage(figure, (k, len(pairs)), rig, run, n) for k, ((rig, run), n) in rows]
     raised = max(stage.ax.get_ylim()[1] - stage.where.top for stage in stages)
     for stage in stages:  # to one scale
         stage.ax.set_ylim(top=stage.where.top + raised)
@@ -160,7 +147,7 @@ def _scene(loop, trajectory, seconds, against, titles):
         for stage in stages:
             stage.draw(t)
 
-    return _Scene(figure, np.linspace(0.0, end, frames), draw)
+    return figure, np.linspace(0.0, end, frames), draw
 
 
 def _check(loop, run):
@@ -175,8 +162,7 @@ def _check(loop, run):
         )
 
 
-BAR = 0.6
-"""Height of a pump's bar from its lower to its upper limit."""
+BAR = 0.6  # height of a pump's bar from its lower to its upper limit
 
 
 class _Stage:
@@ -186,9 +172,8 @@ class _Stage:
         number, of = place_of  # of the rig in the figure, and how many there are
         self.loop, self.where = loop, place(loop.plant)
         self.t, self.x, self.r, self.u = (np.asarray(v) for v in (run.t, run.x, run.r, run.u))
-        self.low, self.high = (
-            np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high)
-        )
+        ends = loop.actuator.low, loop.actuator.high
+        self.low, self.high = (np.asarray(v, dtype=float) for v in ends)
         self.spilled = spilled(loop.plant, run)
         inch = 1.0 / figure.get_size_inches()[1]  # as a share of the height
         high = 1.0 - (0.78 if title else 0.56) * inch
@@ -228,10 +213,8 @@ class _Stage:
 
 def _moving(ax, loop, where):
     """The artists that move: water in each tank, marks of setpoints, a bar for each pump."""
-    water = [
-        box(ax, (tank.x, tank.y), (tank.width, 0.0), facecolor=WATER, zorder=1.6)
-        for tank in where.boxes
-    ]
+    look = {"facecolor": WATER, "zorder": 1.6}
+    water = [box(ax, (tank.x, tank.y), (tank.width, 0.0), **look) for tank in where.boxes]
     marks, bars = [mark(ax, where.boxes[i], 0.0) for i in loop.plant.outputs], []
     frame = {"facecolor": "white", "edgecolor": "0.5", "linewidth": 0.8, "zorder": 3}
     for j, (x, y) in enumerate(where.pumps):

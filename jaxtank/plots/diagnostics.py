@@ -1,15 +1,11 @@
-"""Pictures of phase planes, saturation, estimates, margins and trade-offs.
-
-Each function draws on given matplotlib axes and returns them.
-"""
+"""Pictures of phase planes, saturation, estimates, margins and trade-offs, on given axes."""
 
 import numpy as np
 
 from jaxtank.core.labels import label_of, labels_of
 from jaxtank.plots.style import AFTER, BEFORE, BEYOND, FORBIDDEN, OTHER, REFERENCE, plain
 
-SLICES = 240
-"""Intervals of time in a strip of `saturation`."""
+SLICES = 240  # intervals of time in a strip of `saturation`
 
 
 def phase(ax, runs, tanks, rims=None, unit="cm", plant=None):
@@ -105,17 +101,13 @@ def share(ax, run, pump, of=("sliding mode", "state feedback"), plant=None):
     first = run.share[:, pump]
     ax.fill_between(run.t, 0.0, first, color=BEFORE, alpha=0.55, linewidth=0, label=of[0])
     ax.fill_between(run.t, first, 1.0, color=AFTER, alpha=0.35, linewidth=0, label=of[1])
-    ax.set(
-        title=f"input of {plain(label_of(plant, 'pump', pump))}",
-        ylabel="share [-]",
-        ylim=(0.0, 1.0),
-    )
+    ax.set(title=f"input of {plain(label_of(plant, 'pump', pump))}", ylabel="share [-]")
+    ax.set_ylim(0.0, 1.0)
     ax.margins(x=0.0)
     return ax
 
 
-MANY = 16
-"""Largest number of limits in a picture of margins: those with the smallest margins."""
+MANY = 16  # largest number of limits in a picture of margins: those with the smallest margins
 
 
 def margins(ax, rows):
@@ -138,9 +130,7 @@ def margins(ax, rows):
 
 
 def tradeoff(ax, points, measure, unit, cost_unit):
-    """Draw the best objective over the limit of a measure; crosses: none that holds it
-    was found.
-    """
+    """Draw the best objective over the limit of a measure; crosses: none that holds it."""
     points = sorted(points, key=lambda p: p["limit"])
 
     def plot(some, marker, **look):

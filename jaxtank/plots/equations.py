@@ -69,9 +69,8 @@ def _volumes(plant):
     length = plant.units[0]
     for i in range(plant.tanks):
         if shape := shape_name(plant, i):
-            sizes = (
-                f"area {float(plant.area[i]):g} {length}^2, to {float(plant.extent[i]):g} {length}"
-            )
+            area, extent = float(plant.area[i]), float(plant.extent[i])
+            sizes = f"area {area:g} {length}^2, to {extent:g} {length}"
             yield f"  V{i + 1}(h{i + 1}): volume of a {shape} ({sizes})"
         elif plant.shapes:
             yield f"  V{i + 1} = {float(plant.area[i]):.4g} h{i + 1}"
@@ -138,10 +137,9 @@ def _through_valves(plant, root):
     for k, (source, sink) in enumerate(plant.valves):
         u = f"u{len(plant.feeds) + k + 1}"
         u = f"{u}/100" if full_open(plant.units) == 100.0 else u
-        share = {
-            "linear": u,
-            "equal-percentage": f"{float(plant.rangeability[k]):g}^({u} - 1)",
-        }.get(plant.characteristics[k], f"c{k + 1}({u})")
+        power = f"{float(plant.rangeability[k]):g}^({u} - 1)"
+        kinds = {"linear": u, "equal-percentage": power}
+        share = kinds.get(plant.characteristics[k], f"c{k + 1}({u})")
         head, ends = _head(plant, "valve", k, source), ("valve", k, source, sink)
         flow = f"q({head})" if sink is None else _apart(plant, *ends)
         direction = " one way" if plant.one_way[k] and sink is not None else ""
@@ -195,11 +193,8 @@ def _pump_flows(plant, i):
 
 def _outlets(plant, i, root):
     """The outlets of tank i, which all depend on its level, as one term."""
-    areas = {
-        f"s{i + 1}{sink + 1}": float(plant.orifice[k])
-        for k, (source, sink) in enumerate(plant.links)
-        if source == i
-    }
+    links = enumerate(plant.links)
+    areas = {f"s{i + 1}{b + 1}": float(plant.orifice[k]) for k, (a, b) in links if a == i}
     if float(plant.drain[i]) != 0.0:
         areas[f"a{i + 1}"] = float(plant.drain[i])
     if areas:

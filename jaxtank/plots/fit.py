@@ -1,7 +1,4 @@
-"""Pictures of a fit to experiment data.
-
-Each function draws on given matplotlib axes and returns them.
-"""
+"""Pictures of a fit to experiment data, on given axes."""
 
 import itertools
 

@@ -7,8 +7,7 @@ import numpy as np
 PITCH = 1.7
 """From the middle of one tank to that of the next in its row, in heights of the tallest tank."""
 
-STOREY = 1.75
-"""From the bottom of one row of tanks to the bottom of the next."""
+STOREY = 1.75  # from the bottom of one row of tanks to the bottom of the next
 
 
 class Box(NamedTuple):
@@ -71,9 +70,7 @@ def place(plant):
 
 
 def jets(plant, where):
-    """Return [(tank, path ((x, y), ...), name of the outlet's area)] of the free jets from the
-    bottoms of the tanks: into the tanks below, and into the basin. A closed orifice has none.
-    """
+    """Return [(tank, path ((x, y), ...), name of its area)] of the free jets that are open."""
     paths, orifices = [], np.asarray(plant.orifice, dtype=float)
     for i, box in enumerate(where.boxes):
         links = [(sink, k) for k, (source, sink) in enumerate(plant.links) if source == i]
@@ -166,16 +163,8 @@ def _with_pumps(plant, boxes, rows, width):
     most = max(sides.count("left"), sides.count("right"))
     edge = 0.75 + 0.5 * max(0, most - 1)
     top = max([b.y + b.height for b in boxes] + [p[1][1] for _, _, p in risers]) + 0.3
-    return Layout(
-        boxes=tuple(boxes),
-        pumps=tuple(pumps),
-        risers=tuple(risers),
-        suctions=tuple(suctions),
-        left=-edge,
-        right=width + edge,
-        bottom=-1.12,
-        top=top,
-    )
+    parts = (tuple(part) for part in (boxes, pumps, risers, suctions))
+    return Layout._make((*parts, -edge, width + edge, -1.12, top))
 
 
 def _side(plant, boxes, width, j):

@@ -1,7 +1,4 @@
-"""A large rig at a glance: tanks as cells in reading order, the fullest ones named.
-
-Draws on given matplotlib axes.
-"""
+"""A large rig at a glance: tanks as cells in reading order, the fullest ones named."""
 
 import math
 
@@ -11,14 +8,11 @@ from matplotlib.patches import Rectangle
 
 from jaxtank.plots.style import AFTER, FORBIDDEN, GLASS, PUMPS, WATER, write
 
-LARGEST = 24
-"""Tanks up to which a rig is drawn part by part."""
+LARGEST = 24  # tanks up to which a rig is drawn part by part
 
-NAMED = 12
-"""Tanks, outputs or pumps that a picture of many names at most: the worst ones."""
+NAMED = 12  # tanks, outputs or pumps that a picture of many names at most: the worst ones
 
-CELL, PITCH = 0.62, 1.0
-"""Side of a cell, and distance from one to the next."""
+CELL, PITCH = 0.62, 1.0  # side of a cell, and distance from one to the next
 
 
 def worst(values, most=NAMED):

@@ -1,8 +1,4 @@
-"""Pictures of runs over time, of a search and its objective, and of sensitivities.
-
-Each function draws on given matplotlib axes and returns them; `responses` and `panels` make whole
-figures.
-"""
+"""Pictures of runs over time, of a search and its objective, and of sensitivities."""
 
 import itertools
 import textwrap
@@ -35,14 +31,11 @@ from jaxtank.plots.style import (
     width,
 )
 
-BARS = 14
-"""Bars in a picture at most; the smallest are left out, and the title gives their number."""
+BARS = 14  # bars in a picture at most; the smallest are left out, and the title gives their number
 
-COLUMNS = 4
-"""Panels beside each other."""
+COLUMNS = 4  # panels beside each other
 
-SHOWN = 16
-"""Tanks between, outputs and pumps that are drawn each; of more, those that matter."""
+SHOWN = 16  # tanks between, outputs and pumps that are drawn each; of more, those that matter
 
 
 def level(
@@ -73,8 +66,7 @@ def level(
     return ax
 
 
-HEADROOM = 1.05
-"""End of the axis of a level over what it has to show [-]."""
+HEADROOM = 1.05  # end of the axis of a level over what it has to show [-]
 
 
 def _highest(runs, tank):
@@ -86,9 +78,8 @@ def voltage(ax, runs, pump, low, high, unit="V", plant=None):
     lines(ax, runs, "u", pump)
     ax.set(title=plain(label_of(plant, "pump", pump)))
     ax.set(ylabel=f"input [{unit}]" if unit != "V" else "voltage [V]")
-    lowest, highest = (
-        f([f(run.u[:, pump]) for run, _, _ in runs.values()]) for f in (np.min, np.max)
-    )
+    drawn = [run.u[:, pump] for run, _, _ in runs.values()]
+    lowest, highest = min(map(np.min, drawn)), max(map(np.max, drawn))
     if highest - lowest >= 0.1 * (high - low):  # limits far away are not shown
         margin = 0.06 * (high - low)
         ax.axhspan(low - margin, low, **BEYOND)
@@ -101,9 +92,8 @@ def error(ax, runs, output, tank, unit="cm", plant=None):
     """Draw the tracking error of one output."""
     lines(ax, runs, "e", output)
     ax.axhline(0.0, color=REFERENCE, linewidth=0.8, linestyle=":")
-    ax.set(
-        title=f"tracking error of {plain(label_of(plant, 'tank', tank))}", ylabel=f"h - r [{unit}]"
-    )
+    name = plain(label_of(plant, "tank", tank))
+    ax.set(title=f"tracking error of {name}", ylabel=f"h - r [{unit}]")
     return ax
 
 
@@ -158,18 +148,14 @@ def _other_tanks(loop, trajectories):
     others = [i for i in range(loop.plant.tanks) if i not in loop.plant.outputs]
     if len(others) <= SHOWN:
         return others, ""
-    near = {
-        i: max(float(np.max(run.x[:, i])) for run in trajectories.values()) / _at(loop.plant.rim, i)
-        for i in others
-    }
+    highest = lambda i: max(float(np.max(run.x[:, i])) for run in trajectories.values())
+    near = {i: highest(i) / _at(loop.plant.rim, i) for i in others}
     note = f"\nof the {len(others)} tanks between, the {SHOWN} that come nearest to their rims"
     return sorted(sorted(others, key=near.__getitem__)[-SHOWN:]), note
 
 
 def _worst_outputs(loop, trajectories):
-    """([(output, its tank)], pumps, a line of the title on those left out): of many, the outputs
-    with the largest errors and the pumps that move most.
-    """
+    """([(output, its tank)], pumps, a line of the title on those left out), the worst of many."""
     outputs, pumps = list(enumerate(loop.plant.outputs)), list(range(loop.plant.pumps))
     note = ""
     if len(outputs) > SHOWN:

@@ -20,8 +20,7 @@ from jaxtank.plots.style import RUNS, TALLEST, WIDTHS, for_print, picture, plain
 SOFTWARE = {"Software": None}
 """Metadata of a PNG file: nothing that differs from machine to machine."""
 
-SMALL = 62
-"""Pixels per inch of the small picture that a notebook shows below a result."""
+SMALL = 62  # pixels per inch of the small picture that a notebook shows below a result
 
 
 def figures(run: Any) -> dict[str, Any]:
@@ -94,9 +93,7 @@ def png(figure: Any) -> bytes:
 
 
 def for_journal(drawings: Mapping[str, Any], columns: int = 1) -> dict[str, bytes]:
-    """Return {file name: bytes} of {name: figure} as SVG and as PNG of 300 dpi, in the width of one
-    or two columns of a journal; the figures are closed.
-    """
+    """Return {file name: bytes} of {name: figure} as SVG and PNG for a journal; closes them."""
     # Figures that `style.for_print` has not made are scaled to that width.
     files: dict[str, bytes] = {}
     for name, figure in drawings.items():

@@ -1,7 +1,4 @@
-"""A rig drawn from its topology: tanks, pumps and their splits, outlets, pipes, overflow, basin.
-
-Draws on given matplotlib axes.
-"""
+"""A rig drawn from its topology: tanks, pumps and splits, outlets, pipes, overflow, basin."""
 
 from typing import Any
 

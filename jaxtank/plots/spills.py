@@ -1,8 +1,4 @@
-"""What leaves a tank over its rim: volumes, words for them, and how they are drawn.
-
-A rig whose overflow is simulated (`plant.overflow`) counts the volume lost; in other rigs a level
-rises past its rim, and the volume above the rim is what the tank cannot hold.
-"""
+"""What leaves a tank over its rim, or is above it: volumes, words, drawings."""
 
 from typing import Any, NamedTuple
 

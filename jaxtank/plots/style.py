@@ -4,8 +4,10 @@ import contextlib
 import importlib
 import importlib.util
 import sys
+from pathlib import Path
 from typing import Any
 
+import matplotlib
 import matplotlib.pyplot as plt
 from matplotlib.patches import Rectangle
 
@@ -49,48 +51,25 @@ SHARE = "#56B4E9"
 WATER, GLASS = "#9CCEEB", "0.35"
 """Colours of the liquid and of the walls of a tank in drawings of a rig."""
 
-STYLE: dict[Any, Any] = {
-    "font.size": 9,
-    "axes.titlesize": 9,
-    "axes.grid": True,
-    "grid.color": "0.9",
-    "grid.linewidth": 0.6,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "legend.frameon": False,
-    "legend.fontsize": 8,
-    "figure.dpi": 110,
-    "savefig.dpi": 130,
-    "svg.fonttype": "none",
-}
+
+def _settings(file: str) -> dict[Any, Any]:
+    """The settings of matplotlib in a style sheet of this folder."""
+    sheet = Path(__file__).with_name(file)
+    return dict(matplotlib.rc_params_from_file(sheet, use_default_template=False))
+
+
+STYLE = _settings("screen.mplstyle")
 
 WIDTHS = {1: 3.5, 2: 7.16}
 """{columns of a journal: width of a figure [inch]}: one column, and two with the gap between them
 (IEEE's author guidelines on graphics: 3.5 and 7.16 inch).
 """
 
-TALLEST = 9.0
-"""Height of a figure for a journal, at most [inch]."""
+TALLEST = 9.0  # height of a figure for a journal, at most [inch]
 
-PANEL = 2.2
-"""Width of a panel in a figure for a journal, at least [inch]."""
+PANEL = 2.2  # width of a panel in a figure for a journal, at least [inch]
 
-PRINT: dict[Any, Any] = {
-    "font.family": "STIXGeneral",  # like Times, and comes with matplotlib
-    "mathtext.fontset": "stix",
-    "text.usetex": False,
-    "font.size": 8,
-    "axes.titlesize": 8,
-    "figure.titlesize": 8,
-    "legend.fontsize": 7.5,
-    "xtick.labelsize": 7.5,
-    "ytick.labelsize": 7.5,
-    "axes.linewidth": 0.6,
-    "hatch.linewidth": 0.6,
-    "savefig.dpi": 300,
-    "svg.fonttype": "path",  # the same wherever it is set
-    "pdf.fonttype": 42,
-}
+PRINT = _settings("journal.mplstyle")
 """Settings of figures for a journal, over STYLE: letters of 7.5 to 8 points, no LaTeX."""
 
 _COLUMNS: list[int] = []  # of a journal, innermost last: figures are made for it
@@ -119,9 +98,7 @@ def width(usual):
 
 
 def beside(most):
-    """Return how many panels stand beside each other: as many as a journal's columns take, or
-    `most`.
-    """
+    """Return how many panels stand beside each other: `most`, or what a journal's columns take."""
     return min(most, max(1, int(width(0.0) / PANEL))) if _COLUMNS else most
 
 
@@ -195,9 +172,7 @@ def grid(rows, columns, size, **more):
 
 
 def picture(draw, size, rows=1, columns=1, legend=0, title="", **more):
-    """Return a figure of `size` [inch] on whose axes `draw` has drawn; `legend`: most columns of
-    one legend below, with each label once, 0 for none.
-    """
+    """Return a figure of `size` [inch] that `draw` draws on; `legend`: columns of one, or 0."""
     with styled():
         figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", **more)
         draw(axes)

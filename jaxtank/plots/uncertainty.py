@@ -24,14 +24,11 @@ from jaxtank.plots.style import (
     width,
 )
 
-CUT = 0.05
-"""Share of the plants below a bar, and above it [-]."""
+CUT = 0.05  # share of the plants below a bar, and above it [-]
 
 
 def fan(loop, bands, title, limits=None):
-    """Return a figure of the quantiles of levels over many draws, with setpoints, rims and limits
-    {tank: highest level}.
-    """
+    """Return a figure of quantiles of levels over many draws, with limits {tank: highest level}."""
     tanks = loop.plant.tanks
     columns = beside(min(2, tanks))
     rows = -(-tanks // columns)

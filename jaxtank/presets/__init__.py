@@ -102,13 +102,9 @@ def load(paper: str) -> Preset:
 def _load(paper):
     preset = _ADDED.get(paper) or importlib.import_module(f"jaxtank.presets.{paper}").preset()
     spread = {name: share for name, (share, _) in preset.uncertain.items()}
-    cases = Cases(
-        {
-            name: case.replace(uncertain=spread, origin=case.name)
-            for name, case in preset.cases.items()
-        }
-    )
-    return dataclasses.replace(preset, cases=cases)
+    known = lambda case: case.replace(uncertain=spread, origin=case.name)
+    cases = {name: known(case) for name, case in preset.cases.items()}
+    return dataclasses.replace(preset, cases=Cases(cases))
 
 
 class Cases(dict):

@@ -1,7 +1,4 @@
-"""Calofir and others: two coupled tanks in metres, backstepping.
-
-The derivation is in `notes/calofir.md`.
-"""
+"""Calofir and others: two coupled tanks in metres, backstepping (notes/calofir.md)."""
 
 import dataclasses
 import functools
@@ -33,7 +30,7 @@ def settling(trajectory):
 def measured_rows(run):
     """Return {quantity: Claim} of the published rows, but for what cannot be measured."""
     (case, plain), hurt = run("backstepping"), run("backstepping-perturbed")[1]
-    runs = [run("backstepping", _gains(*pair))[1] for pair in GAINS]
+    runs = [run("backstepping", dict(zip(KS, pair)))[1] for pair in GAINS]
     times = [settling(t) for t in runs]
     limits = [float(case.loop.actuator.low[0]), float(case.loop.actuator.high[0])]
     full = [100.0 * float(np.isin(t.u, limits).mean()) for t in runs]
@@ -74,10 +71,6 @@ def measured_rows(run):
             " if above 0.001 m)",
         ),
     }
-
-
-def _gains(phi, y):
-    return {"controller.K_phi": phi, "controller.K_y": y}
 
 
 A, C1, C2 = 0.0154, 1.0167e-4, 1.7253e-4  # sec. 3.1 [m^2], sec. 3.2 [m^2.5/s]
@@ -144,11 +137,8 @@ def same_everywhere(run, values):
     """Return the largest difference between two decays of h3 - h3r, as a share of the step."""
     shares = []
     for level in STEP:
-        start = {
-            "reference.initial": level,
-            "reference.targets": [level, level + 0.1],
-            "x0": [level, KAPPA * level],
-        }
+        start = {"reference.initial": level, "reference.targets": [level, level + 0.1]}
+        start |= {"x0": [level, KAPPA * level]}
         t = run("backstepping", {**start, **values})[1]
         shares.append((t.x[600:, 1] - KAPPA * (level + 0.1)) / (KAPPA * 0.1))
     return float(np.abs(shares[0] - shares[1]).max())
@@ -168,10 +158,8 @@ def measured(run):
     open_shift = (constant - constant_flow(case))[ends]
     reacts = (np.abs(shift) < 0.5 * np.abs(open_shift)) & (push * open_shift < 0.0)
     offsets = hurt.e[ends, 0]
-    unlimited, limited = (
-        same_everywhere(run, {"actuator.low": -1.0, "actuator.high": 1.0}),
-        same_everywhere(run, {}),
-    )
+    unlimited = same_everywhere(run, {"actuator.low": -1.0, "actuator.high": 1.0})
+    limited = same_everywhere(run, {})
     dry = run("backstepping", {"x0": [0.0, 0.0], "controller.difference_floor": 1e-12})[1]
     return {
         "c1": float(plant.pipe[0]) * w,

@@ -1,7 +1,4 @@
-"""The public benchmark "Cascaded tanks with overflow" (Schoukens, Mattsson, Wigren, Noel 2016).
-
-Two tanks, one pump, all in volts. The derivation is in `notes/cascaded.md`.
-"""
+""" "Cascaded tanks with overflow" (Schoukens, Mattsson, Wigren, Noel 2016; notes/cascaded.md)."""
 
 import functools
 from typing import Any
@@ -78,9 +75,8 @@ def playback(pump, level):
     # The recorded level is the reference, so that the tracking error is the simulation error.
     controller = OpenLoop(signal=Table(values=number([pump]), period=PERIOD))
     reference = Table(values=number([level]), period=PERIOD)
-    return loop(controller, reference, START), Clock(
-        dt=PERIOD, duration=PERIOD * (len(pump) - 1), substeps=4
-    )
+    clock = Clock(dt=PERIOD, duration=PERIOD * (len(pump) - 1), substeps=4)
+    return loop(controller, reference, START), clock
 
 
 def steady_state(level):
@@ -93,9 +89,8 @@ def steady_state(level):
 
 def measured(run):
     """Return measured values of the published rows without a record (see `paper.Preset`)."""
-    case, flood = run(
-        "open-loop", {"controller.signal.initial": 10.0, "controller.signal.targets": 10.0}
-    )
+    names = ("controller.signal.initial", "controller.signal.targets")
+    case, flood = run("open-loop", dict.fromkeys(names, 10.0))
     return {"plant.rim": float(flood.x[-1].min()), "record, sampling period": float(case.clock.dt)}
 
 

@@ -1,7 +1,4 @@
-"""The three-tank laboratory rig DTS200: two pumps, two pipes, leaks; PI.
-
-The derivation is in `notes/dts200.md`.
-"""
+"""The three-tank laboratory rig DTS200: two pumps, two pipes, leaks; PI (notes/dts200.md)."""
 
 import functools
 from typing import Any
@@ -74,9 +71,7 @@ def measured(run):
     plant = run("pi")[0].loop.plant
     levels = np.array(POINT)
     speed = np.sqrt(2 * 981.0)
-    through, out, back = (
-        c * PIPE * speed * np.sqrt(d) for c, d in zip(COEFFICIENTS, (15.0, 15.0, 15.0))
-    )
+    through, out, back = (c * PIPE * speed * np.sqrt(15.0) for c in COEFFICIENTS)
     A, B, _ = linearise(plant, levels, np.array([through, out - back]))
     rest, flows = equilibrium(plant, levels[:2])
     return {

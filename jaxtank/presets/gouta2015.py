@@ -1,7 +1,4 @@
-"""Gouta, Hadj Said, M'sahli (2015): state-coupled four-tank, NGPC and backstepping.
-
-The derivation is in `notes/gouta2015.md`.
-"""
+"""Gouta, Hadj Said, M'sahli (2015): state-coupled four-tank (notes/gouta2015.md)."""
 
 import dataclasses
 import functools
@@ -214,10 +211,8 @@ def _theorem(run, far):
         "reference.targets": [(12.0, 10.0)[output] for _, output in changes],
     }
     starts = ([3.0, 3.0, 3.0, 3.0], [20.0, 2.0, 1.0, 25.0], [1.0, 18.0, 28.0, 1.0])
-    ends = [
-        float(np.abs(run("backstepping", {**constant, "x0": list(x0)}, 100)[1].e[-1]).max())
-        for x0 in starts
-    ]
+    runs = (run("backstepping", {**constant, "x0": list(x0)}, 100)[1] for x0 in starts)
+    ends = [float(np.abs(t.e[-1]).max()) for t in runs]
     moving = float(np.abs(far.e).max())
     return Claim(
         (max(ends) < 1e-3, moving < 0.1),
@@ -251,12 +246,8 @@ def _margins(run):
     for name in ("ngpc", "backstepping"):
         case = run(name)[0]
         margins = [p.margins for p in stability_margins(case.loop, case.clock) if p.margins]
-        worst.append(
-            (
-                max(float(m.sensitivity_peak) for m in margins),
-                min(float(np.min(m.delay_margin)) for m in margins),
-            )
-        )
+        peaks = [float(m.sensitivity_peak) for m in margins]
+        worst.append((max(peaks), min(float(np.min(m.delay_margin)) for m in margins)))
     (peak, delay), (peak_b, delay_b) = worst
     return Claim(
         (peak_b < peak, delay_b > delay),
@@ -385,14 +376,10 @@ def _changes(trajectory):
 
 def _setpoints(reference):
     """Setpoints of each output, one output after the other [cm]."""
-    return tuple(
-        float(level)
-        for output, start in enumerate(reference.initial)
-        for level in (
-            start,
-            *(v for (_, i), v in zip(reference.changes, reference.targets) if i == output),
-        )
-    )
+    rows = list(zip(reference.changes, reference.targets))
+    later = lambda output: (v for (_, i), v in rows if i == output)
+    starts = enumerate(reference.initial)
+    return tuple(float(v) for output, start in starts for v in (start, *later(output)))
 
 
 def measured(run):

@@ -1,7 +1,4 @@
-"""Gouta, Al-Ashek, Saad (2022): coupled two-tank rig, ENMPC, CHADPC; PI, PID, fractional PI.
-
-The derivation is in `notes/gouta2022.md`.
-"""
+"""Gouta, Al-Ashek, Saad (2022): coupled two-tank rig, ENMPC, CHADPC, PI (notes/gouta2022.md)."""
 
 import dataclasses
 import functools
@@ -96,9 +93,8 @@ def trapezoids():
     # Slopes that last 40 s are two of 20 s (notes S3.3, assumed but for 330 to 560 s).
     first = [(20.0, 8.0), (330.0, 14.0), (790.0, 12.0), (810.0, 10.0), (1250.0, 12.0)]
     second = [(20.0, 8.0), (560.0, 14.0), (1020.0, 12.0), (1040.0, 10.0)]
-    return ramps(
-        (1.0, 1.0), [(t, 0, v) for t, v in first] + [(t, 1, v) for t, v in second], ramp=20.0
-    )
+    changes = [(t, i, v) for i, rows in enumerate((first, second)) for t, v in rows]
+    return ramps((1.0, 1.0), changes, ramp=20.0)
 
 
 def _exchanged(values):
@@ -108,9 +104,8 @@ def _exchanged(values):
     if "controller.Tp" not in values or not rates:
         return {}
     mean = float(np.exp(np.mean(np.log(rates))))
-    return {
-        n: 1.5 / mean if n == "controller.Tp" else 1.5 / values["controller.Tp"] for n in values
-    }
+    other = lambda name: mean if name == "controller.Tp" else values["controller.Tp"]
+    return {name: 1.5 / other(name) for name in values}
 
 
 SYMMETRY = Symmetry("the gain k = 1.5/Tp and the observer's l exchange roles", _exchanged)
@@ -324,11 +319,9 @@ def _inputs(enmpc, chadpc):
     t = chadpc
     period = (t.t >= 100.0) & (t.t < 350.0)
     alike = [float(np.corrcoef(t.applied[period, i], t.x[period, 0])[0, 1]) for i in (0, 1)]
-    least = [
-        float(run.applied[(run.t >= begin) & (run.t < begin + 5.0), pump].min())
-        for run in (enmpc, chadpc)
-        for begin, pump in ((500.0, 1), (700.0, 0))
-    ]
+    after = lambda run, begin: (run.t >= begin) & (run.t < begin + 5.0)
+    pairs = [(run, *pulse) for run in (enmpc, chadpc) for pulse in PULSE_TIMES]
+    least = [float(run.applied[after(run, begin), pump].min()) for run, pump, begin in pairs]
     return {
         "u2 in antiphase to h1": Claim(
             (alike[0] > 0.9, alike[1] < -0.9),
@@ -441,10 +434,8 @@ def _others(run):
     """The controllers of Table 4 on one rig, without delay and with 0.5 s."""
     names = {"ENMPC": "enmpc", "CHADPC": "chadpc", "PI": "pi", "PID": "pid"}
     names |= {"fractional PI with feed-forward": "fopi-ff"}
-    late, soon = (
-        {label: total(run(name, {"actuator.delay": delay})[1]) for label, name in names.items()}
-        for delay in (0.5, 0.0)
-    )
+    error = lambda name, delay: total(run(name, {"actuator.delay": delay})[1])
+    late, soon = ({n: error(name, t) for n, name in names.items()} for t in (0.5, 0.0))
 
     def best(errors):
         ours = max(errors["ENMPC"], errors["CHADPC"])
@@ -481,12 +472,8 @@ def _rises(case, run):
     by_level = 100.0 * rises / before
     row = printed("gouta2022")["published"]["rise of tank 2 and 1 by an inflow pulse"]
     agree = [np.allclose(v, row.value, rtol=0.03) for v in (by_volume, by_level)]
-    return Claim(
-        agree,
-        "volume over area {:.1f}, {:.1f} %; simulated levels {:.1f}, {:.1f} %".format(
-            *by_volume, *by_level
-        ),
-    )
+    words = "volume over area {:.1f}, {:.1f} %; simulated levels {:.1f}, {:.1f} %"
+    return Claim(agree, words.format(*by_volume, *by_level))
 
 
 def measured(run):
@@ -506,10 +493,8 @@ def measured(run):
 
 def _tables(run, enmpc, chadpc):
     """The numbers of Tables 3 and 4, on the ideal rig and on one like the paper's."""
-    fitted = {
-        name: [figures(run(f"{name.lower()}-fitted", {}, 1, seed)[1]) for seed in SEEDS]
-        for name in ("ENMPC", "CHADPC")
-    }
+    numbers_of = lambda name: (figures(run(f"{name}-fitted", {}, 1, seed)[1]) for seed in SEEDS)
+    fitted = {name: list(numbers_of(name.lower())) for name in ("ENMPC", "CHADPC")}
     keys = {"error": "RMS error", "voltage": "RMS voltage"}
     more = {"settling": "settling time", "recovery": "recovery time"}
     ideal = {"ENMPC": figures(enmpc), "CHADPC": figures(chadpc)}

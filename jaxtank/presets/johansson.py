@@ -1,7 +1,4 @@
-"""Johansson (2000): the quadruple-tank process with an adjustable zero, decentralised PI.
-
-The derivation is in `notes/johansson.md`.
-"""
+"""Johansson (2000): quadruple tank with an adjustable zero, PI (notes/johansson.md)."""
 
 import functools
 from typing import Any

@@ -1,7 +1,4 @@
-"""Khalid, Kadri: linear predictive control of coupled tanks, GPC and Laguerre functions.
-
-The derivation is in `notes/khalid.md`.
-"""
+"""Khalid, Kadri: coupled tanks, GPC and Laguerre functions (notes/khalid.md)."""
 
 import functools
 import math
@@ -31,10 +28,8 @@ HALF = 300.0  # half period of the pulses (notes A5) [s]
 # Ts, 600 samples (notes A1, S3), Runge-Kutta steps of 0.25 s
 CLOCK = Clock(dt=2.0, duration=1198.0, substeps=8)
 
-MIDDLE = {
-    1: (0.30, 0.06),
-    2: (0.06, 0.075),
-}  # where the model is linearised: the middle of the pulse, by number of pumps (notes A4) [m]
+# where the model is linearised: the middle of the pulse, by number of pumps (notes A4) [m]
+MIDDLE = {1: (0.30, 0.06), 2: (0.06, 0.075)}
 
 # scenario: (pumps, (low, high) of each output [m], start (H1, H2) [m], delay of the last output's
 # pulses [s])
@@ -92,11 +87,9 @@ def steady_input(pumps, x):
     """Return the inputs (pumps,) [U0] that hold the levels x = (H1, H2) [m] (notes S2.2)."""
     alpha = [CHANNEL * a * math.sqrt(2 * GRAVITY) / U0 for a in DISCHARGE]
     between = alpha[2] * math.copysign(math.sqrt(abs(x[0] - x[1])), x[0] - x[1])
-    return (
-        (between,)
-        if pumps == 1
-        else (alpha[0] * math.sqrt(x[0]) + between, alpha[1] * math.sqrt(x[1]) - between)
-    )
+    if pumps == 1:
+        return (between,)
+    return alpha[0] * math.sqrt(x[0]) + between, alpha[1] * math.sqrt(x[1]) - between
 
 
 def scenario(name):
@@ -106,11 +99,8 @@ def scenario(name):
     for channel, (low, high) in enumerate(spans):
         begin = delay if channel == len(spans) - 1 else 0.0
         changes += [(begin + k * HALF, channel, low if k % 2 else high) for k in range(4)]
-    return (
-        ramps([low for low, _ in spans], changes, ramp=0.0),
-        number(x0),
-        number(steady_input(pumps, x0)),
-    )
+    reference = ramps([low for low, _ in spans], changes, ramp=0.0)
+    return reference, number(x0), number(steady_input(pumps, x0))
 
 
 def build(kind, where=None, mode="unconstrained"):
@@ -160,23 +150,18 @@ def from_empty(name):
 def _pulses(case):
     """(low, high) of each output's pulses [m]."""
     reference = case.loop.reference
-    levels = [
-        [float(v) for (_, i), v in zip(reference.changes, reference.targets) if i == output]
-        for output in range(reference.channels)
-    ]
+    rows = [(i, float(v)) for (_, i), v in zip(reference.changes, reference.targets)]
+    levels = [[v for i, v in rows if i == output] for output in range(reference.channels)]
     return tuple(end for each in levels for end in (min(each), max(each)))
 
 
 def _cost(loops):
     """The claim on the computational cost of Laguerre functions; loops: by case."""
-    count = {
-        name: loop.plant.pumps * getattr(loop.controller, "N", getattr(loop.controller, "Nc", 0))
-        for name, loop in loops.items()
-    }
+    each = lambda controller: getattr(controller, "N", getattr(controller, "Nc", 0))
+    count = {name: loop.plant.pumps * each(loop.controller) for name, loop in loops.items()}
     gains = {name: np.asarray(loop.controller.gain(CLOCK.dt)) for name, loop in loops.items()}
-    fixed = {  # du = -K x_e
-        name: operations(jax.make_jaxpr(jnp.matmul)(K, K[0]).jaxpr) for name, K in gains.items()
-    }
+    product = lambda K: jax.make_jaxpr(jnp.matmul)(K, K[0]).jaxpr  # du = -K x_e
+    fixed = {name: operations(product(K)) for name, K in gains.items()}
     programme = {name: _programme(loop) for name, loop in loops.items()}
     order = ("laguerre", "gpc", "gpc-nc30")
     return Claim(
@@ -209,11 +194,8 @@ def edges(reference, run, dt=2.0):
     """Return the response of each output to the edges of its pulses, (rising, falling)."""
     responses, levels = [], np.asarray(run.r) + np.asarray(run.e)
     for channel in range(reference.channels):
-        steps = [
-            (round(t / dt), float(v))
-            for (t, i), v in zip(reference.changes, reference.targets)
-            if i == channel
-        ]
+        rows = zip(reference.changes, reference.targets)
+        steps = [(round(t / dt), float(v)) for (t, i), v in rows if i == channel]
         before = [float(reference.initial[channel]), *(v for _, v in steps)]
         ends = [*(k for k, _ in steps[1:]), len(run.t)]
         past, slow = {1: [], -1: []}, {1: [], -1: []}
@@ -299,10 +281,9 @@ def _claims(responses, long, beyond, shoot, laguerre, two):
     low = [] if under is None else [under[name][0] for name in SISO[:3]]
     gain = 1.0 - top[3] / top[2]
     fall = f"; undershoot at most {max(low):.2g} %" if low else ""
-    both = "; ".join(
-        "{:.2f}, {:.2f} mm and {:.1f}, {:.1f} % with {}".format(*error[n], *over[n], words)
-        for n, words in zip(MIMO, ("GPC", "Laguerre functions"))
-    )
+    form = "{:.2f}, {:.2f} mm and {:.1f}, {:.1f} % with {}"
+    named = zip(MIMO, ("GPC", "Laguerre functions"))
+    both = "; ".join(form.format(*error[n], *over[n], words) for n, words in named)
     return {
         long: Claim(
             (rms[1] < rms[0], top[1] <= top[0]),
@@ -340,9 +321,8 @@ def preset():
             free = ["controller.r_w"] + (["controller.a"] if controller is Laguerre else [])
             # the parameter with the largest effect for one pump (notes S10): overshoot falls where
             # the model is linearised at a high level
-            free += (
-                ["controller.operating_point[1]"] if loop.plant.pumps == 1 else ["controller.q[1]"]
-            )
+            largest = "operating_point" if loop.plant.pumps == 1 else "q"
+            free += [f"controller.{largest}[1]"]
             cases[kind + suffix] = Case(
                 name=f"khalid/{kind}{suffix}",
                 title=f"coupled tanks, {title}"

@@ -1,7 +1,4 @@
-"""Mirakhorli, Farrokhi (2016): non-minimum phase quadruple tank, sliding mode, state feedback.
-
-The derivation is in `notes/mirakhorli.md`.
-"""
+"""Mirakhorli, Farrokhi (2016): non-minimum phase quadruple tank (notes/mirakhorli.md)."""
 
 import dataclasses
 import functools
@@ -44,10 +41,10 @@ def plant(split=SPLIT):
 def sliding(model, printed=False):
     """Return the sliding-mode controller: as printed (sec. 6), or corrected (notes S4.4)."""
     if printed:
-        return SlidingMode(
-            model=model, surface=10.0, ks=1.0, phi=0.1, form="printed", switch="sign"
-        )
-    return SlidingMode(model=model, surface=0.05, ks=0.03, phi=0.1, form="corrected", switch="tanh")
+        gains: Any = {"surface": 10.0, "ks": 1.0, "form": "printed", "switch": "sign"}
+    else:
+        gains = {"surface": 0.05, "ks": 0.03, "form": "corrected", "switch": "tanh"}
+    return SlidingMode(model=model, phi=0.1, **gains)
 
 
 def blend(model):
@@ -145,11 +142,9 @@ def tuning_scenarios():
         "gamma 1 -10 %": {"plant.split[0]": "x0.9"},
     }
     noise = {"sensor.noise": "0.05 if zero"}
-    runs = [
-        ("own start", noise),
-        *((name, {**steady, **change, **noise}) for name, change in off.items()),
-    ]
-    return tuple(Scenario(name, values, seed=11 + i) for i, (name, values) in enumerate(runs))
+    runs = {"own start": noise, **{name: {**steady, **v, **noise} for name, v in off.items()}}
+    rows = enumerate(runs.items())
+    return tuple(Scenario(name, values, seed=11 + i) for i, (name, values) in rows)
 
 
 def build(kind, warm=False):
@@ -176,17 +171,12 @@ def response(trajectory, output=0):
 
     low, high = (first(h[0] + share * (r - h[0])) for share in (0.1, 0.9))
     outside = np.flatnonzero(np.abs(h - r) > 0.05 * r)
+    never = outside.size and outside[-1] == len(t) - 1
     return {
         "overshoot": float(100.0 * (h.max() - r) / r),
         "rise": None if high is None or low is None else high - low,
         "arrival": first(r),
-        "settling": (
-            None
-            if outside.size and outside[-1] == len(t) - 1
-            else float(t[outside[-1]])
-            if outside.size
-            else 0.0
-        ),
+        "settling": None if never else float(t[outside[-1]]) if outside.size else 0.0,
         "mean_square": float(np.mean((h - r) ** 2) / r**2),
     }
 
@@ -289,9 +279,8 @@ def _table_3(run, assumed):
                 never = value is None and isinstance(target, str)
                 value = Claim(never, _text(value, unit))
             rows[f"{name}, {controller}"] = value
-            near += [
-                _near(responses[case][quantity], target) for case in SAME_CONTROLLER[controller]
-            ]
+            values = (responses[case][quantity] for case in SAME_CONTROLLER[controller])
+            near += [_near(each, target) for each in values]
         cases = [case for cases in SAME_CONTROLLER.values() for case in cases]
         each = ", ".join(f"{_text(responses[case][quantity], unit)} in {case}" for case in cases)
         words.append(f"{name} {each}")
@@ -347,11 +336,8 @@ CHATTER_COST = {"rms_error_total": 1.0, "input_travel": 1e-3}
 def steady_error(run, kind, values):
     """Return the mean error (2,) [cm] of the last 100 s of 400 s."""
     x0, u0 = equilibrium(plant(), SETPOINT)
-    start = {
-        "x0": x0.tolist(),
-        "actuator.initial": u0.tolist(),
-        "reference.initial": list(SETPOINT),
-    }
+    start = {"x0": x0.tolist(), "actuator.initial": u0.tolist()}
+    start |= {"reference.initial": list(SETPOINT)}
     return run(kind, {**start, **values})[1].e[-1000:].mean(axis=0)
 
 
@@ -367,10 +353,8 @@ def measured(run):
 
 
 def _chattering(run):
-    variation = {
-        kind: float(np.abs(np.diff(run(kind)[1].u, axis=0)).sum())
-        for kind in ("sfc", "hybrid", "smc-printed")
-    }
+    total = lambda kind: float(np.abs(np.diff(run(kind)[1].u, axis=0)).sum())
+    variation = {kind: total(kind) for kind in ("sfc", "hybrid", "smc-printed")}
     return Claim(
         (variation["smc-printed"] > 1e3, variation["hybrid"] < 100.0),
         f"total variation of the inputs in 400 s: {variation['smc-printed']:.0f} V as printed,"
@@ -384,10 +368,8 @@ def _steady_errors(run):
     narrow = {"plant.drain": [0.7 * 0.50265, 0.50265, 0.0, 0.0]}
     stronger = {"plant.pump_gain": [1.3 * 27.43, 19.55]}
     relay = {**RELAY, "controller.b": 3.0, "controller.w": 1.0}
-    sfc, hybrid, corrected = (
-        steady_error(run, kind, {**narrow, **more})[0]
-        for kind, more in (("sfc", {}), ("hybrid", relay), ("hybrid", {}))
-    )
+    error = lambda kind, more: steady_error(run, kind, {**narrow, **more})[0]
+    sfc, hybrid, corrected = error("sfc", {}), error("hybrid", relay), error("hybrid", {})
     pump = {kind: steady_error(run, kind, stronger) for kind in ("sfc", "hybrid", "lqi")}
     parked = np.abs(steady_error(run, "hybrid", {**narrow, **relay}))
     exact = float(np.abs(steady_error(run, "sfc", {})).max())
@@ -420,12 +402,9 @@ def _fitted(name, case):
     """The case `name` of FITTED, made of the one that it starts from."""
     loop, blend = fitted(name), ("controller.b", "controller.w")
     more = {"free": {p: TUNABLE[p] for p in blend}, "objective": CHATTER_COST, "scenarios": ()}
-    return case.replace(
-        name=f"mirakhorli/{name}",
-        title=f"{case.title}; rig fitted to Table 3",
-        loop=loop,
-        **(more if name.startswith("hybrid") else {}),
-    )
+    more |= {} if name.startswith("hybrid") else {f: getattr(case, f) for f in more}
+    title = f"{case.title}; rig fitted to Table 3"
+    return case.replace(name=f"mirakhorli/{name}", title=title, loop=loop, **more)
 
 
 @functools.cache

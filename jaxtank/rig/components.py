@@ -35,9 +35,7 @@ from jaxtank.signals.setpoints import Ramps, ramps
 
 
 class Role(NamedTuple):
-    """A part of the loop: abstract class, {kind: class}, fields that its section may leave out, and
-    the class that needs no section.
-    """
+    """A part of the loop; `kept`: fields its section may leave out; `default`: needs no section."""
 
     base: type
     classes: dict
@@ -89,8 +87,7 @@ ROLES = {
 }
 """{section, which is also the field of the loop: Role}; `register` adds classes."""
 
-REGISTERED: set[str] = set()
-"""Kinds that were added by `register`."""
+REGISTERED: set[str] = set()  # kinds that were added by `register`
 
 GROUP = "jaxtank.components"
 """Entry points by which an installed package names its classes: kind = "package.module:Class"."""
@@ -194,8 +191,7 @@ def _unwritable(field):
     return ""
 
 
-USUAL = {"spread": 0.0}
-"""Defaults of fields that a rig file may leave out."""
+USUAL = {"spread": 0.0}  # defaults of fields that a rig file may leave out
 
 TRACKING = 30.0
 """Tracking time of a PID of a rig file that has none [s]; of a PI it is its integral time."""
@@ -210,8 +206,7 @@ WITHOUT = {
 }
 """{kind: fields that its table has not}: of a PID under a name of its own; keys of [[pump]]."""
 
-INPUTS = ("sequence", "reverse", "lead", "follow")
-"""Static fields that hold inputs, not tanks."""
+INPUTS = ("sequence", "reverse", "lead", "follow")  # static fields that hold inputs, not tanks
 
 LIMITED = ("on-off", "split-range", "ratio", "nmpc")
 """Kinds whose `low` and `high` are by default the limits of the actuator."""
@@ -301,7 +296,8 @@ def with_bias(controller, loop, inputs, names=BIASES):
     if isinstance(controller, controllers.SplitRange | controllers.Ratio):
         biases["bias"] = controller.total(inputs)
     if isinstance(controller, controllers.Cascade):
-        levels = _steady_levels(loop)
+        steady = _steady(loop)
+        levels = np.asarray(loop.x0 if steady is None else steady[0], dtype=float)
         readings = levels[list(controller.inner)]
         if isinstance(controller, controllers.FlowCascade):
             readings = input_flows(loop.plant, levels, loop.actuator.driving(tuple(inputs)))
@@ -313,14 +309,13 @@ def with_bias(controller, loop, inputs, names=BIASES):
     return dataclasses.replace(controller, **known)
 
 
-def _steady_levels(loop):
-    """Levels (n,) of the steady state with the outputs of x0; x0 without one."""
-    start = np.asarray(loop.x0, dtype=float)
+def _steady(loop):
+    """(levels (n,), inputs (m,)) of the steady state with the outputs of x0, None without one."""
     try:
-        outputs = start[list(loop.plant.outputs)]
-        return np.asarray(steady_state(loop, outputs, inflow=start_inflow)[0], dtype=float)
+        outputs = np.asarray(loop.x0, dtype=float)[list(loop.plant.outputs)]
+        return steady_state(loop, outputs, inflow=start_inflow)
     except (EquilibriumError, InputError, FloatingPointError):
-        return start
+        return None
 
 
 def observer_of(table, loop):
@@ -346,9 +341,8 @@ def model_of(loop):
 
 def instrument_of(name, table, loop):
     """Return the sensor or actuator of a table; `kept` fields that it leaves out are the loop's."""
-    role = ROLES[name]
-    offered = {key: getattr(getattr(loop, name), key) for key in role.kept}
-    return component(name, table, loop, offered)
+    kept = {key: getattr(getattr(loop, name), key) for key in ROLES[name].kept}
+    return component(name, table, loop, kept)
 
 
 def component(name, table, loop, offered, model=None):
@@ -364,8 +358,11 @@ def component(name, table, loop, offered, model=None):
         table = {**{k: v for k, v in offered.items() if k in section.names}, **table}
     values = read_entry(section, table, sizes_of(loop), title=f"{section.title} {kind}")
     del values["kind"]
-    if issubclass(cls, controllers.PID):
-        _track(kind, values)
+    windup = values.get("anti_windup") in ("clamping", "conditioned")
+    Ti = values.get("Ti") if issubclass(cls, controllers.PID) and not windup else None
+    if Ti is not None and "Tt" not in values:
+        full = np.full(np.shape(Ti), TRACKING)
+        values["Tt"] = full if kind == "pid" else np.where(np.isinf(Ti), TRACKING, Ti)
     return cls(**values, **({"model": plant} if "model" in cls.__dataclass_fields__ else {}))
 
 
@@ -409,24 +406,12 @@ def check_keys(name, table):
     problems.check()
 
 
-def _track(kind, values):
-    """Add the tracking time of a PID of a rig file that leaves it out."""
-    Ti = values.get("Ti")
-    if Ti is None or "Tt" in values or values.get("anti_windup") in ("clamping", "conditioned"):
-        return
-    values["Tt"] = np.full(np.shape(Ti), TRACKING)
-    if kind != "pid":
-        values["Tt"] = np.where(np.isinf(Ti), TRACKING, Ti)
-
-
 def steady_bias(loop, known: bool | list[bool] = False):
     """Return (m,) inputs that hold the outputs at x0; those before t = 0 if `known`."""
-    bank, start = loop.actuator, np.asarray(loop.x0)[list(loop.plant.outputs)]
-    try:
-        steady = np.clip(steady_state(loop, start, inflow=start_inflow)[1], bank.low, bank.high)
-    except (EquilibriumError, InputError, FloatingPointError):
+    bank, steady = loop.actuator, _steady(loop)
+    if steady is None:
         return bank.initial
-    return number(np.where(known, bank.initial, steady))
+    return number(np.where(known, bank.initial, np.clip(steady[1], bank.low, bank.high)))
 
 
 def leaves_out(table, values):

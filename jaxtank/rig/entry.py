@@ -1,7 +1,9 @@
 """Values of a rig file, read and written by their Key: kinds, ranges, units, lines of TOML."""
 
 import contextlib
+import tomllib
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,8 +18,7 @@ from jaxtank.core.units import DEFAULT
 from jaxtank.rig.schema import NEEDED, PARTS, SECTIONS, Key, Section
 from jaxtank.rig.sensors import is_reading, readings
 
-LARGEST = 1e300
-"""Magnitude of a number of a rig file: products of two stay finite for most."""
+LARGEST = 1e300  # magnitude of a number of a rig file: products of two stay finite for most
 
 
 class Sizes(NamedTuple):
@@ -139,76 +140,7 @@ UNTURNED = {
 }
 """{whether a kind without `action` switches: what turns its inputs}."""
 
-WORDS = {
-    "cone": '[[tank]] shape = "cone" with height and diameter',
-    "sphere": '[[tank]] shape = "sphere" with diameter',
-    "cylinder": "[[tank]] diameter and rim",
-    "radius": "diameter",
-    "sp": "[reference] initial and changes",
-    "pv": "[plant] outputs: the tanks whose levels are controlled",
-    "op": "[[pump]] or [[valve]], whose input the controller moves",
-    "mv": "[[pump]] or [[valve]], whose input the controller moves",
-    "kp": "Kc",
-    "ki": "Ti: Kp/Ki of a controller Kp e + Ki integral(e)",
-    "kd": "Td: Kd/Kp of a controller with Kd de/dt",
-    "tau_i": "Ti",
-    "tn": "Ti",
-    "reset": "Ti",
-    "tau_d": "Td",
-    "tv": "Td",
-    "action": "action of [controller]: direct or reverse",
-    "transmitter": "[[sensor]] with tank, unit, span",
-    "range": "span of [[sensor]], low and high of [[pump]]",
-    "bottom_area": "area",
-    "max_flow": "high: the largest input, with units = [length, flow]",
-    "capacity": "rim and area of [[tank]], high of [[pump]]",
-    "duration": "duration at the top of the file",
-    "dt": "dt at the top of the file",
-    "sample_time": "dt at the top of the file",
-    "initial_level": "level",
-    "setpoint": "[reference] initial and changes",
-    "outlet": "drain of [[tank]], or a [[valve]] where its opening is an input",
-    "leak": "inflow of [[tank]], below 0",
-    "demand": "inflow of [[tank]], below 0",
-    "weir": "[[spill]] with port",
-    "opening": "initial of [[valve]]",
-    "cv": "area of [[valve]]: flow = area sqrt(2 g head)",
-    "kv": "area of [[valve]]: flow = area sqrt(2 g head)",
-    "resistance": "linear of [[orifice]], drain_linear of [[tank]]",
-    "power": "exponent of [[orifice]], drain_exponent of [[tank]]",
-    "head": "curve_head of [[pump]]: [[lift, share of the flow], ...]",
-    "reservoir": "[[tank]] with a large area",
-    "source": "from",
-    "sink": "to",
-    "flow": "curve of [[pump]]: [[input, flow], ...]",
-    "hysteresis": "on or off: levels at which an input goes to high, and to low",
-    "dead_time": "delay",
-    "deadtime": "delay",
-    "stroke_time": "rate",
-    "stroke": "low or high",
-    "check_valve": "check",
-    "safety": "[safety_filter]",
-    "pump.ramp": "rate",
-    "pump.flow": "gain or curve: flow per unit of the input, or [[input, flow], ...]",
-    "pump.head_curve": "curve_head: [[lift, share of the flow], ...]",
-    "pump.deadband": "dead_zone",
-    "valve.r": "rangeability",
-    "valve.stroke": 'rate: the full travel over its time, as "1.667 %/s" of 60 s',
-    "valve.stroke_time": 'rate: the full travel over its time, as "1.667 %/s" of 60 s',
-    "valve.curve": "characteristic: [[opening from 0 to 1, share], ...]",
-    "valve.diameter": "area: C pi/4 diameter^2, C the discharge coefficient",
-    "orifice.diameter": "area: C pi/4 diameter^2, C the discharge coefficient",
-    "pipe.diameter": "area: C pi/4 diameter^2, C the discharge coefficient",
-    "pipe.from": "between: the two tanks that it joins",
-    "pipe.to": "between: the two tanks that it joins",
-    "inflow.flow": "changes: [[time, flow], ...]; inflow of [[tank]] where it is constant; or time,"
-    " duration and volume of a pulse",
-    "inflow.initial": "changes: [[time, flow], ...]; inflow of [[tank]] where it is constant",
-    "tank.width": "area",
-    "tank.drain_diameter": "drain: C pi/4 diameter^2, C the discharge coefficient",
-    "max": "high",
-    "min": "low",
-}
+WORDS = tomllib.loads(Path(__file__).with_name("words.toml").read_text("utf-8"))
 """{word of the field that is no key, or "table.word": what to write}."""
 
 
@@ -225,11 +157,6 @@ def read_value(key, label: str, value: Any, sizes: Sizes) -> Any:
     return READ[key.kind](key, label, value, sizes)
 
 
-def _reading(key, label, value, sizes):
-    """A number, or a text such as "80 %", which waits for the span of its sensor."""
-    return value if is_reading(value) else _number(key, label, value, sizes)
-
-
 def _span(key, label, value, sizes):
     value = converted(label, value, key.meta(sizes.units)["unit"])
     if not (is_finite(value) and np.shape(value) == (2,)):
@@ -238,6 +165,8 @@ def _span(key, label, value, sizes):
 
 
 def _number(key, label, value, sizes):
+    if key.kind == "reading" and is_reading(value):  # "80 %" waits for the span of its sensor
+        return value
     meta = key.meta(sizes.units)
     value = converted(label, value, meta["unit"])
     if not is_plain(value):
@@ -258,12 +187,6 @@ def _integer(key, label, value, sizes):
     if not (inside and float(value).is_integer()):
         raise refusal(label, value, f"be {_within('a whole number', key.meta(sizes.units))}")
     return int(value)
-
-
-def _flag(key, label, value, sizes):
-    if not isinstance(value, bool):
-        raise refusal(label, value, "be true or false")
-    return value
 
 
 def _texts(key, label, value, sizes):
@@ -299,19 +222,14 @@ def _list(key, label, value, sizes):
 
 def _array(key, label, value, sizes):
     """An array; one number for an array of one entry per pump, tank or output fills it."""
-    value = converted(label, value, key.meta(sizes.units)["unit"])
+    meta = key.meta(sizes.units)
+    value = converted(label, value, meta["unit"])
     if not is_numeric(value):
-        numbers = f"a number or a list of numbers{unit(key.meta(sizes.units))}"
-        raise refusal(label, value, f"be {numbers}")
+        raise refusal(label, value, f"be a number or a list of numbers{unit(meta)}")
     array, shape = number(value), sizes_of_shape(key.shape, sizes.counts) or ()
+    if key.kind == "scalar" and array.ndim:
+        raise refusal(label, value, f"be one number{unit(meta)}")
     return np.full(shape, array) if len(shape) == 1 and array.ndim == 0 else array
-
-
-def _scalar(key, label, value, sizes):
-    array = _array(key, label, value, sizes)
-    if array.ndim:
-        raise refusal(label, value, f"be one number{unit(key.meta(sizes.units))}")
-    return array
 
 
 def _tank(key, label, value, sizes):
@@ -328,7 +246,10 @@ def _tank(key, label, value, sizes):
 
 def _tanks(key, label, value, sizes):
     if not isinstance(value, list):
-        raise refusal(label, value, f"be a list of tanks, counted from 1 to {sizes.tanks}")
+        of = f"tanks, counted from 1 to {sizes.tanks}" if key.kind == "tanks" else "inputs"
+        raise refusal(label, value, f"be a list of {of}")
+    if key.kind == "inputs":
+        return tuple(_input(label, v, sizes) for v in value)
     return tuple(_tank(key, label, tank, sizes) for tank in value)
 
 
@@ -348,12 +269,6 @@ def _sequence(key, label, value, sizes):
         raise refusal(label, value, "be a list of inputs for each output, as [[1, 2], [3]]")
     rows = value if nested else [value]
     return tuple(tuple(_input(label, v, sizes) for v in row) for row in rows)
-
-
-def _inputs(key, label, value, sizes):
-    if not isinstance(value, list):
-        raise refusal(label, value, "be a list of inputs")
-    return tuple(_input(label, v, sizes) for v in value)
 
 
 def _pair(key, label, value, sizes):
@@ -378,56 +293,51 @@ def different(label, value, tanks):
     return tanks
 
 
-def _are_points(value):
-    """True for a list of at least two pairs."""
-    is_pair = lambda point: isinstance(point, list) and len(point) == 2
-    return isinstance(value, list) and len(value) > 1 and all(map(is_pair, value))
-
-
 def _curve(key, label, value, sizes):
     """Points ((x, y), ...) with increasing x, or the name of one of the key's choices."""
     if isinstance(value, str) and hyphened(value) in (key.choices or ()):
         return hyphened(value)
-    if not _are_points(value):
+    is_pair = lambda point: isinstance(point, list) and len(point) == 2
+    if not (isinstance(value, list) and len(value) > 1 and all(map(is_pair, value))):
         names = "".join(f'"{choice}", ' for choice in key.choices or ())
         columns = key.local_unit(sizes.units)
         raise refusal(label, value, f"be {names}or a list of points [{columns}]: {key.doc}")
     columns = [Key(key.name, unit=unit) for unit in key.unit.split(", ")]
-    points = tuple(
-        tuple(_number(c, f"{label} point {k + 1}", v, sizes) for c, v in zip(columns, point))
-        for k, point in enumerate(value)
-    )
+    entry = lambda k, c, v: _number(c, f"{label} point {k + 1}", v, sizes)
+    rows = enumerate(value)
+    points = tuple(tuple(entry(k, c, v) for c, v in zip(columns, row)) for k, row in rows)
     if any(after[0] <= before[0] for before, after in zip(points, points[1:])):
         raise refusal(label, value, "have points whose first numbers increase")
     return points
 
 
-def _table(key, label, value, sizes):
-    if not isinstance(value, dict):
-        raise refusal(label, value, f"be a table: {key.doc}")
+def _of_type(key, label, value, sizes):
+    if not isinstance(value, bool if key.kind == "flag" else dict):
+        must = "true or false" if key.kind == "flag" else f"a table: {key.doc}"
+        raise refusal(label, value, f"be {must}")
     return value
 
 
 READ = {
     "number": _number,
-    "reading": _reading,
+    "reading": _number,
     "span": _span,
     "integer": _integer,
-    "flag": _flag,
+    "flag": _of_type,
     "choice": lambda key, label, value, sizes: static_value(label, value, key.meta(), str),
     "text": lambda key, label, value, sizes: name_of(label, value),
     "texts": _texts,
     "list": _list,
     "array": _array,
-    "scalar": _scalar,
+    "scalar": _array,
     "tank": _tank,
     "tanks": _tanks,
     "sequence": _sequence,
-    "inputs": _inputs,
+    "inputs": _tanks,
     "pair": _pair,
     "feed": _feed,
     "curve": _curve,
-    "table": _table,
+    "table": _of_type,
     "any": lambda key, label, value, sizes: value,
 }
 """{kind: function (key, label, value, sizes)} that reads and checks a value of a rig file."""
@@ -456,9 +366,8 @@ def _from_one(numbers):
 def name_of(where, value):
     """`value` if it can be a name: a text of one line without control characters."""
     if not isinstance(value, str) or not value.isprintable():
-        raise refusal(
-            where, value, "be a text" + " of printable characters" * isinstance(value, str)
-        )
+        more = " of printable characters" * isinstance(value, str)
+        raise refusal(where, value, f"be a text{more}")
     return value
 
 
@@ -532,9 +441,7 @@ class Line(NamedTuple):
 
 
 class Block(NamedTuple):
-    """A table of a rig file; title: "[values]" or "" for lines that go on; prose: sentences above
-    it; on: False: commented out as a whole.
-    """
+    """A table of a rig file; prose: sentences above it; on: False where it is commented out."""
 
     title: str
     lines: list
@@ -545,20 +452,14 @@ class Block(NamedTuple):
 def lines_of(
     section: Section, values: Mapping[str, Any], units=DEFAULT, names: Sequence[str] = ()
 ) -> list[Line]:
-    """Return the lines of a section's keys that have a value, in the order of its schema; names:
-    those of the tanks.
-    """
-    return [
-        Line(k.name, written(k, values[k.name], names), _meta_of(k, values[k.name], units))
-        for k in section.keys
-        if values.get(k.name) is not None
-    ]
-
-
-def _meta_of(key, value, units):
-    """The metadata of a value; a name instead of a curve has no unit."""
-    meta = key.meta(units)
-    return {**meta, "unit": "-"} if key.kind == "curve" and isinstance(value, str) else meta
+    """Return the lines of a section's keys that have a value; names: those of the tanks."""
+    lines = []
+    for key in (key for key in section.keys if values.get(key.name) is not None):
+        value, meta = values[key.name], key.meta(units)
+        if key.kind == "curve" and isinstance(value, str):  # a name instead of a curve
+            meta["unit"] = "-"
+        lines.append(Line(key.name, written(key, value, names), meta))
+    return lines
 
 
 def block_of(
@@ -577,15 +478,9 @@ def suggestion(section: Section, values: Mapping[str, Any], units=DEFAULT) -> Bl
 
 def terse(block: Block) -> list[str]:
     """Return the lines of a terse file: title, and "name = value  # [unit] doc" of what is on."""
-    return [block.title] * bool(block.title) + [
-        f"{line.name} = {toml(line.value)}" + (f"  # {note}" if (note := _note(line.meta)) else "")
-        for line in block.lines
-        if line.on
-    ]
-
-
-def _note(meta):
-    return " ".join(filter(None, [unit(meta).strip(), meta["doc"]]))
+    note = lambda meta: " ".join(filter(None, [unit(meta).strip(), meta["doc"]]))
+    rows = [(f"{e.name} = {toml(e.value)}", note(e.meta)) for e in block.lines if e.on]
+    return [block.title] * bool(block.title) + ["  # ".join(filter(None, row)) for row in rows]
 
 
 def toml(value: Any) -> str:

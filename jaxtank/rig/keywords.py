@@ -3,6 +3,7 @@
 Signatures and docstrings of the tables are made from the schema; keywords.pyi has them for editors.
 """
 
+import functools
 import inspect
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,11 +17,8 @@ from jaxtank.rig.entry import Problems, refusal, unit, unknown_key
 from jaxtank.rig.read import from_table
 from jaxtank.rig.schema import LISTS, NEEDED, SECTIONS
 
-KEYWORDS = {
-    f"{name.removesuffix('s')}s" if section.many else name: name
-    for name, section in SECTIONS.items()
-}
-KEYWORDS = {k: name for k, name in KEYWORDS.items() if name.isidentifier()}
+_spelt = lambda name: f"{name.removesuffix('s')}s" if SECTIONS[name].many else name
+KEYWORDS = {_spelt(name): name for name in SECTIONS if name.isidentifier()}
 KEYWORDS |= {name: name for name in SECTIONS[""].names}
 """{keyword of `Rig`: table or key of a rig file}, beside those of the clock."""
 
@@ -70,12 +68,8 @@ def Rig(**tables: Any) -> Case:
     >>> run.x.shape, rig.names["pump"]
     ((241, 1), ('P101',))
     """
-    problems = Problems(
-        unknown("keyword of Rig", name, [*KEYWORDS, *CLOCK])
-        for name in tables
-        if name not in KEYWORDS and name not in CLOCK
-    )
-    problems.check()
+    known = [*KEYWORDS, *CLOCK]
+    Problems(unknown("keyword of Rig", name, known) for name in tables if name not in known).check()
     table = {KEYWORDS.get(k, k): _plain(v) for k, v in tables.items() if v is not None}
     for name in ("reference", "inputs"):
         if isinstance(table.get(name), list):
@@ -84,9 +78,7 @@ def Rig(**tables: Any) -> Case:
 
 
 def _plain(value: Any) -> Any:
-    """A value as the reader of TOML gives it: arrays and tuples as lists, paths as texts, without
-    None.
-    """
+    """A value as the reader of TOML gives it: lists, paths as texts, without None."""
     if isinstance(value, Mapping):
         return {k: _plain(v) for k, v in value.items() if v is not None}
     if isinstance(value, list | tuple):
@@ -119,6 +111,9 @@ EXAMPLES: dict[str, dict[str, Any]] = {
 """{table: keywords of the example in its docstring}."""
 
 
+PLACED = inspect.Parameter.POSITIONAL_OR_KEYWORD
+
+
 def _maker(kind: str) -> Any:
     """The function that returns a table `kind` of a rig from keywords, such as Tank."""
     section, named = SECTIONS[kind], "name" in SECTIONS[kind].names
@@ -134,21 +129,13 @@ def _maker(kind: str) -> Any:
         return keys
 
     spell = lambda name: f"{name}_" if name == "from" else name
-    parameters = [
-        inspect.Parameter(
-            spell(key.name),
-            inspect.Parameter.POSITIONAL_OR_KEYWORD
-            if key.name == "name"
-            else inspect.Parameter.KEYWORD_ONLY,
-            default=inspect.Parameter.empty if key.default is NEEDED else key.default,
-        )
-        for key in section.keys
-    ]
-    rows = [
-        f"{spell(key.name)} : {', '.join(filter(None, [key.doc, allowed(key.meta())]))}"
-        f"{unit(key.meta())}"
-        for key in section.keys
-    ]
+    parameters, rows = [], []
+    for key in section.keys:
+        place = PLACED if key.name == "name" else inspect.Parameter.KEYWORD_ONLY
+        default = inspect.Parameter.empty if key.default is NEEDED else key.default
+        parameters.append(inspect.Parameter(spell(key.name), place, default=default))
+        words = ", ".join(filter(None, [key.doc, allowed(key.meta())]))
+        rows.append(f"{spell(key.name)} : {words}{unit(key.meta())}")
     example = EXAMPLES[kind]
     call = ", ".join(f"{k}={v!r}" for k, v in example.items())
     result = {k.removesuffix("_"): v for k, v in example.items()}
@@ -168,10 +155,7 @@ def _maker(kind: str) -> Any:
     return table
 
 
-Rig.__signature__ = inspect.Signature(  # pyright: ignore[reportFunctionMemberAccess]
-    [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None)
-        for name in [*KEYWORDS, *CLOCK]
-    ]
-)
+_parameter = functools.partial(inspect.Parameter, kind=inspect.Parameter.KEYWORD_ONLY, default=None)
+_signature = inspect.Signature([_parameter(name) for name in [*KEYWORDS, *CLOCK]])
+Rig.__signature__ = _signature  # pyright: ignore[reportFunctionMemberAccess]
 Tank, Orifice, Pipe, Spill, Pump, Valve = map(_maker, LISTS)

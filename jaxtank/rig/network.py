@@ -1,6 +1,4 @@
-"""A rig described tank by tank in a rig file: [[tank]], [[orifice]], [[pipe]], [[spill]], [[pump]],
-[[valve]] and [plant]; read to a Case and written from a loop.
-"""
+"""A rig described tank by tank in a rig file: read to a Case and written from a loop."""
 
 import dataclasses
 import functools
@@ -39,26 +37,22 @@ from jaxtank.rig.signals import parts_of
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
 
-MOST = 5000
-"""Tanks that a rig file may have; as many pumps, valves, orifices, pipes and spills."""
+MOST = 5000  # tanks that a rig file may have; as many pumps, valves, orifices, pipes and spills
 
 
 def names_in(table):
     """{name: index} of the [[tank]] tables that have a name, and of those of their sensors."""
+    is_name = lambda value: isinstance(value, str) and value != ""
     rows = [row for row in table["tank"] if isinstance(row, dict)]
-    names = {t["name"]: i for i, t in enumerate(rows) if _is_name(t.get("name"))}
+    names = {t["name"]: i for i, t in enumerate(rows) if is_name(t.get("name"))}
     sensors = [row for row in table.get("sensors", []) if isinstance(row, dict)]
     for i, row in enumerate(sensors):
         tank = row.get("tank", i + 1)
         index = names.get(tank) if isinstance(tank, str) else None
         index = tank - 1 if isinstance(tank, int) else index
-        if _is_name(row.get("name")) and index is not None:
+        if is_name(row.get("name")) and index is not None:
             names.setdefault(row["name"], index)
     return names
-
-
-def _is_name(value):
-    return isinstance(value, str) and value != ""
 
 
 def build(table):
@@ -66,7 +60,9 @@ def build(table):
     table = _with_drains({**table, **{name: _list(table, name) for name in LISTS}})
     units = _units(table.get("units", list(DEFAULT)))
     sizes = Sizes(len(table["tank"]), units=units)
-    table["pump"] = [_with_gain(row, units) for row in table["pump"]]
+    if flow_per_input(units):  # an input that is a flow: a pump that says nothing has gain = 1
+        bare = lambda row: isinstance(row, dict) and not {"gain", "curve"} & row.keys()
+        table["pump"] = [row | {"gain": 1.0} if bare(row) else row for row in table["pump"]]
     table["sensors"] = sensor_rows(table, sizes.tanks)
     sizes = sizes._replace(names=names_in(table))
     entries, more = _read(table, sizes)
@@ -74,7 +70,7 @@ def build(table):
     leaves, levels = leaves_of(entries["sensors"], rims, noise, levels)
     columns = _columns(entries) | {"x0": levels}
     columns |= {f"sensor.{name}": value for name, value in leaves.items()}
-    outputs = more.pop("outputs") if "outputs" in more else _usual_outputs(entries)
+    outputs = more.pop("outputs", _usual_outputs(entries))
     if not outputs:
         raise InputError("plant.outputs = []: must be a list of at least one tank")
     if any("port" in row for row in table["spill"]):  # else such an opening would do nothing
@@ -186,16 +182,16 @@ def _vessel(where, tank, units):
         extent, area, shape = _table_of_sections(where, shape, sizes)
     else:
         extent = tank["rim"] if kind == "prism" else sizes.get("height", sizes.get("diameter"))
-        area = _largest_section(sizes)
+        disc = _disc(sizes["diameter"]) if "diameter" in sizes else sizes.get("area", 0.0)
+        area = sizes["diameter"] * sizes["length"] if "length" in sizes else disc
     return {"area": area, "shape": shape, "height": extent, "rim": tank.get("rim", extent)}
 
 
 def _name_rim(where, tank, units):
     """Call the height of an upright tank its rim."""
-    if "height" in tank and "rim" in tank:
-        raise InputError(
-            f"{where}: height and rim are the same of an upright tank: give one of them"
-        )
+    if {"height", "rim"} <= tank.keys():
+        twice = "height and rim are the same of an upright tank"
+        raise InputError(f"{where}: {twice}: give one of them")
     if "height" in tank:
         tank["rim"] = tank.pop("height")
     if "rim" not in tank:
@@ -210,13 +206,6 @@ def _table_of_sections(where, shape, sizes):
         raise refusal(f"{where}: shape", shape, rule)
     points = tuple((h / levels[-1], a / max(areas)) for h, a in shape)
     return sizes.get("height", levels[-1]), sizes.get("area", max(areas)), points
-
-
-def _largest_section(sizes):
-    """Return the largest cross-section of a shape that has a name."""
-    if "length" in sizes:
-        return sizes["diameter"] * sizes["length"]
-    return _disc(sizes["diameter"]) if "diameter" in sizes else sizes.get("area", 0.0)
 
 
 def _with_volume(where, tank):
@@ -242,14 +231,6 @@ def _with_volume(where, tank):
 def _disc(diameter):
     """Area of a disc [cm^2]."""
     return math.pi / 4.0 * diameter**2
-
-
-def _usual_outputs(entries):
-    """The tanks that the pumps fill first, or which they empty; without pumps, the valves."""
-    ends: list[Any] = [
-        pump.get("from") if pump["to"][0] is None else pump["to"][0] for pump in entries["pump"]
-    ]
-    return tuple(dict.fromkeys(ends or [valve["from"] for valve in entries["valve"]]))
 
 
 def _list(table, name):
@@ -296,13 +277,10 @@ def _columns(entries) -> dict[str, Any]:
 def _keywords(columns):
     """Keywords of `network` of the columns of a plant."""
     keywords = _fields(columns, "plant")
-    for option, group in (
-        ("port", "ports"),
-        ("exponent", "exponents"),
-        ("resistance", "resistances"),
-    ):
+    for option in ("port", "exponent", "resistance"):
         names = [name for name in keywords if name.endswith(f"_{option}")]
-        keywords[group] = {name.removesuffix(f"_{option}"): keywords.pop(name) for name in names}
+        of = {name.removesuffix(f"_{option}"): keywords.pop(name) for name in names}
+        keywords[f"{option}s"] = of
     return keywords
 
 
@@ -340,11 +318,8 @@ def _loop(plant, columns, control, observer):
     # a bias that is left out is computed once all values are set (rig/read.py)
     controller = controller_of(control, loop, number(inputs["initial"]))
     loop = dataclasses.replace(loop, controller=controller)
-    return (
-        loop
-        if observer is None
-        else dataclasses.replace(loop, observer=observer_of(observer, loop))
-    )
+    parts = {} if observer is None else {"observer": observer_of(observer, loop)}
+    return dataclasses.replace(loop, **parts)
 
 
 def _numbers(values):
@@ -361,8 +336,14 @@ def _units(value):
 
 def _names(entries):
     """((kind, names), ...) of the kinds of which one has a name."""
-    names = ((kind, tuple(entry["name"] for entry in entries[kind])) for kind in ("tank", *INPUTS))
+    names = ((kind, tuple(row["name"] for row in entries[kind])) for kind in ("tank", *INPUTS))
     return tuple((kind, each) for kind, each in names if any(each))
+
+
+def _usual_outputs(entries):
+    """The tanks that the pumps fill first, or which they empty; without pumps, the valves."""
+    ends = [p.get("from") if p["to"][0] is None else p["to"][0] for p in entries["pump"]]
+    return tuple(dict.fromkeys(ends or [valve["from"] for valve in entries["valve"]]))
 
 
 def _check_names(entries):
@@ -407,16 +388,8 @@ FLOW_MARGIN = 2.0
 """Factor by which a pump may deliver more or less than the flow that its input asks for."""
 
 
-def _with_gain(row, units):
-    """A row of [[pump]] with gain = 1 where its input is a flow and it says nothing of its own."""
-    bare = isinstance(row, dict) and not {"gain", "curve"} & row.keys()
-    return {**row, "gain": 1.0} if bare and flow_per_input(units) else row
-
-
 def _flow_gain(where, gain, flow, units):
-    """The flow per unit of an input that is a flow itself, of a gain that is either that (within
-    FLOW_MARGIN) or the share of the flow that the pump delivers.
-    """
+    """The flow per unit of an input that is a flow, of a gain that may be a share of it."""
     length, drive = units
     near = lambda size: 1 / FLOW_MARGIN <= size <= FLOW_MARGIN
     if gain <= 0.0 or (gain != 1.0 and near(gain / flow)):
@@ -432,10 +405,7 @@ def _flow_gain(where, gain, flow, units):
 
 
 def _check_pumps(rows, pumps, units):
-    """Raise InputError for limits in the wrong order, for a split without two tanks, for a pump
-    that joins no tank, and for curves that turn; gains of inputs that are flows become those of the
-    rig.
-    """
+    """Raise InputError for pumps that cannot be; gains of inputs that are flows are completed."""
     drive, flow = units[1], flow_per_input(units)
     for i, (pump, row) in enumerate(zip(pumps, rows)):
         pump.setdefault("to", (None, None))
@@ -470,19 +440,15 @@ def _check_pumps(rows, pumps, units):
 
 def _check_monotone(label, points, least=None):
     """Raise InputError for points of a curve that rise and fall, or lie below `least`."""
-    heights = [y for _, y in points or ()]
+    heights, rows = [y for _, y in points or ()], [list(p) for p in points or ()]
     if heights not in (sorted(heights), sorted(heights, reverse=True)):
-        raise refusal(
-            label, [list(p) for p in points], "rise or fall all along: a curve that turns"
-        )
+        raise refusal(label, rows, "rise or fall all along: a curve that turns")
     if least is not None and min(heights, default=least) < least:
-        raise refusal(label, [list(p) for p in points], f"be at least {least:g}")
+        raise refusal(label, rows, f"be at least {least:g}")
 
 
 def _check_valves(valves, units):
-    """Raise InputError for a valve whose stops or characteristic are none; the upper stop of one
-    that has none is full open.
-    """
+    """Raise InputError for stops or characteristics that are none; full open is the upper stop."""
     full, drive = full_open(units), unit(SECTIONS["valve"]["high"].meta(units))
     for i, valve in enumerate(valves):
         high = valve.setdefault("high", full)
@@ -504,11 +470,8 @@ def entries_of(loop):
     plant = loop.plant
     if not isinstance(plant, TankNetwork):
         raise InputError(f"its {type(plant).__name__} has no name in a rig file")
-    entries = [
-        (SECTIONS[name], i + 1, _values_of(loop, name, i))
-        for name in LISTS
-        for i in range(len(getattr(plant, SECTIONS[name].per)))
-    ]
+    places = [(n, i) for n in LISTS for i in range(len(getattr(plant, SECTIONS[n].per)))]
+    entries = [(SECTIONS[name], i + 1, _values_of(loop, name, i)) for name, i in places]
     more = {key.name: getattr(plant, key.name) for key in SECTIONS["plant"].keys}
     tanks = [values for section, _, values in entries if section.name == "tank"]
     return [*entries, *_sensor_entries(loop, tanks), (SECTIONS["plant"], 1, more)]
@@ -519,11 +482,8 @@ def _values_of(loop, name, i):
     plant, section = loop.plant, SECTIONS[name]
     # valves are the inputs after the pumps
     j = i + len(plant.feeds) * (name == "valve")
-    values = {
-        key.name: _entry_of(loop, key.target, i if key.target.startswith("plant.") else j)
-        for key in section.keys
-        if key.target
-    }
+    entry = lambda target: _entry_of(loop, target, i if target.startswith("plant.") else j)
+    values = {key.name: entry(key.target) for key in section.keys if key.target}
     usual = {key.name: key.default for key in section.keys if key.like}
     values = {k: v for k, v in values.items() if k not in usual or v != usual[k]}
     if name in ("tank", *INPUTS):
@@ -540,9 +500,7 @@ def _values_of(loop, name, i):
 
 
 def _sensor_entries(loop, tanks):
-    """The tables [[sensor]] of a loop: names, and spans in its unit of length; the noise is theirs
-    instead of the tanks'.
-    """
+    """The tables [[sensor]] of a loop: names, spans, and the noise instead of the tanks'."""
     low, high = (getattr(loop.sensor, end, None) for end in ("low", "high"))
     rows = []
     for i in range(loop.plant.tanks):

@@ -1,6 +1,7 @@
 """From a rig file to a Case."""
 
 import dataclasses
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,7 +28,6 @@ from jaxtank.rig.entry import (
     sizes_of,
     unknown_key,
 )
-from jaxtank.rig.lines import line_of, lines_of
 from jaxtank.rig.schema import INPUTS, LISTS, SECTIONS, TANKWISE
 from jaxtank.rig.sensors import check_stated, complete_rows, sensor_rows, with_sensors
 from jaxtank.rig.values import (
@@ -40,6 +40,49 @@ from jaxtank.rig.values import (
     with_bottom,
     with_models,
 )
+
+_HEADER = re.compile(r"\s*\[(\[?)\s*\"?([\w.-]+)\"?\s*\]")
+_KEY = re.compile(r"\s*\"?([\w.\[\]-]+)\"?\s*=")
+_TEXT = re.compile(r"\"(?:\\.|[^\"\\])*\"|'[^']*'")
+
+Place = tuple[str, int | None, str | None]
+"""(section, index of its table from 0, key); None where there is none."""
+
+
+def lines_of(text: str) -> dict[Place, int]:
+    """Return {place: number of its line, from 1} of a rig file, as far as a scan by lines finds."""
+    lines: dict[Place, int] = {}
+    counts: dict[str, int] = {}
+    section, index, depth = "", None, 0
+    for number, line in enumerate(text.splitlines(), 1):
+        bare = _TEXT.sub('""', line).partition("#")[0]
+        header, key = _HEADER.match(line), _KEY.match(line)
+        if header and depth == 0:
+            section, index = header[2], None
+            if header[1]:
+                index = counts[section] = counts.get(section, -1) + 1
+            lines.setdefault((section, index, None), number)
+        elif key and depth == 0:
+            lines.setdefault((section, index, key[1]), number)
+        if depth == 0 and key and not section:
+            inline = key[1]
+        if not section and (key or depth):  # tank = [{ ... }, { ... }]
+            for _ in range(bare.count("{")):
+                counts[inline] = counts.get(inline, -1) + 1
+                lines.setdefault((inline, counts[inline], None), number)
+            lines.setdefault((inline, None, None), number)
+        depth = max(depth + bare.count("[") - bare.count("]") if not header else 0, 0)
+    return lines
+
+
+def line_of(lines: dict[Place, int], place: Any) -> int | None:
+    """Return the line of a place, else of its table; None where that is not known."""
+    section, index, key = place
+    names = [section, "sensor"] if section == "sensors" else [section]
+    names += {"controller": ["law"], "inflow": ["pour"]}.get(section, [])
+    tries = [(n, i, k) for k in (key, None) for n in names for i in (index, None)]
+    tries += [("", None, section), ("", None, key)]
+    return next((lines[t] for t in tries if t in lines), None)
 
 
 def open_case(name: str) -> Case:
@@ -118,20 +161,15 @@ def loads(text: str, words: str = "rig file", folder: str | Path = "") -> Case:
     try:
         return from_table(table, folder)
     except InputError as error:
-        located = type(error)(f"{words}: {_located(error, text)}")
+        lines, sentences = lines_of(text), []
+        for part in error.parts or (error,):
+            line = line_of(lines, part.place) if part.place else None
+            sentences.append(f"line {line}: {part}" if line else str(part))
+        located = type(error)(f"{words}: {'; '.join(sentences)}")
         located.parts = error.parts
         raise located from None
     except RecursionError:
         raise InputError(f"{words}: a value is nested too deeply") from None
-
-
-def _located(error, text):
-    """The problems of a file, each with its line."""
-    lines, sentences = lines_of(text), []
-    for part in error.parts or (error,):
-        line = line_of(lines, part.place) if part.place else None
-        sentences.append(f"line {line}: {part}" if line else str(part))
-    return "; ".join(sentences)
 
 
 def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
@@ -140,12 +178,10 @@ def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
     """
     table = with_clock(with_inputs(tables.resolved(renamed(table), Path(folder))))
     case = start_of(table)
-    dotted = [key for key in ("values", "free", "uncertain") if key in table]
-    names = {
-        key: by_rig_name(case.loop, by_dotted_name(table[key], key), key != "uncertain")
-        for key in dotted
-    }
-    table = {**table, **names}
+    for key in ("values", "free", "uncertain"):
+        if key in table:
+            dotted = by_dotted_name(table[key], key)
+            table = {**table, key: by_rig_name(case.loop, dotted, key != "uncertain")}
     values = with_models(case.loop, table.get("values", {}))
     case, values = _with_bias(case, values, table)
     case = set_and_schedule(case, values, table.get("schedule", {}))
@@ -207,7 +243,7 @@ def with_inputs(table):
 
 def filtered(case: Case, on: bool | None = None, changes: Mapping[str, Any] | None = None) -> Case:
     """Return the case with the safety filter of its settings and `changes`, or without it."""
-    changes = read_entry(SECTIONS["safety_filter"], changes or {}, sizes_of(case.loop))
+    changes = _filter_settings(case, changes or {})
     if (case.safety is None and not on) or on is False:
         if changes:
             raise InputError(
@@ -239,9 +275,7 @@ TUNING = {
 
 
 def _check_twice(table):
-    """Raise InputError for numbers of tanks and pumps that their own tables and the section of what
-    they belong to, [disturbance], [sensor] or [actuator], give differently; all at once.
-    """
+    """Raise InputError for numbers that [[tank]] or [[pump]] and another section both give."""
     problems = []
     for name in ("tank", *INPUTS):
         entries = table.get(name, [])
@@ -265,9 +299,7 @@ def _check_twice(table):
 
 
 def start_of(table):
-    """Return the Case of the tables that build: case or tanks, controller, observer,
-    instruments, reference, disturbance and faults; before any value is set.
-    """
+    """Return the Case of the tables that build it, before any value is set."""
     problems = Problems()
     case, top = _start(table, problems)
     loop, changes = case.loop, {}
@@ -276,19 +308,20 @@ def start_of(table):
     if "sensors" in table:
         with problems.collect():
             check_stated(table, loop)
-    for name in ("sensor", "actuator"):
-        if name in table:
+    parts = {
+        "sensor": lambda row: components.instrument_of("sensor", row, loop),
+        "actuator": lambda row: components.instrument_of("actuator", row, loop),
+        "reference": lambda row: signals.reference_of(row, loop),
+        "disturbance": lambda _: signals.disturbance_of(table, loop),
+        "inflow": lambda _: signals.disturbance_of(table, loop),
+        "fault": lambda rows: signals.faults_of(rows, loop, dotted_name),
+    }
+    fields = {"inflow": "disturbance", "fault": "faults"}
+    for name, read in parts.items():
+        field = fields.get(name, name)
+        if name in table and field not in changes:
             with problems.collect():
-                changes[name] = components.instrument_of(name, table[name], loop)
-    if "reference" in table:
-        with problems.collect():
-            changes["reference"] = signals.reference_of(table["reference"], loop)
-    if "disturbance" in table or "inflow" in table:
-        with problems.collect():
-            changes["disturbance"] = signals.disturbance_of(table, loop)
-    if "fault" in table:
-        with problems.collect():
-            changes["faults"] = signals.faults_of(table["fault"], loop, dotted_name)
+                changes[field] = read(table[name])
     problems.check()
     top.pop("units", None)
     return case.replace(loop=dataclasses.replace(loop, **changes), **top)
@@ -303,25 +336,26 @@ def _start(table, problems):
     if problems and lists and "tank" in table and "case" not in table:
         with problems.collect():
             network.build(table)
-    if problems:
-        _check_others(table, problems)
-    problems.check()
+    _check_others(table, problems)
     if "case" in top:
         case = presets.find(top.pop("case"))
         if "sensors" in table:
-            case = case.replace(loop=_with_sensors(case.loop, table))
+            rows, sizes = sensor_rows(table, case.loop.plant.tanks), sizes_of(case.loop)
+            rows = read_entries(SECTIONS["sensors"], {"sensors": rows}, sizes)
+            rows = complete_rows(rows, sizes.tanks, sizes.units[0])
+            case = case.replace(loop=with_sensors(case.loop, rows))
         case = _with_parts(case, table)
     else:
         with problems.collect():
             case = network.build(table)
-        if problems:
-            _check_others(table, problems)
-        problems.check()
+        _check_others(table, problems)
     return case, top
 
 
 def _check_others(table, problems):
-    """Add what is wrong in the other tables of a file whose rig is wrong already."""
+    """Raise the problems of a rig, if any, with what is wrong in the other tables of its file."""
+    if not problems:
+        return
     for name in ("controller", "observer"):
         with problems.collect((name, None, None)):
             components.check_keys(name, table)
@@ -333,12 +367,11 @@ def _check_others(table, problems):
                     check_names([key])
                 elif key not in SECTIONS[name].names:
                     raise unknown_key(SECTIONS[name], key, name)
+    problems.check()
 
 
 def _top(table):
-    """The values at the top of a rig file; InputError for a section or key that is unknown or of
-    another kind, and unless there is either a case or a tank.
-    """
+    """The values at the top of a rig file; InputError for unknown or misplaced sections or keys."""
     first = SECTIONS[""]
     sections = {n: section for n, section in SECTIONS.items() if n and "." not in n}
     table = {n: v for n, v in table.items() if n != "sensors" or isinstance(v, list)}
@@ -371,13 +404,6 @@ def _check_start(table):
             'a rig file needs case = "paper/case" to start from (`jaxtank list` prints them), or'
             " [[tank]] to describe a rig"
         )
-
-
-def _with_sensors(loop, table):
-    """A preset's loop with the [[sensor]] tables of a file."""
-    rows, sizes = sensor_rows(table, loop.plant.tanks), sizes_of(loop)
-    rows = read_entries(SECTIONS["sensors"], {"sensors": rows}, sizes)
-    return with_sensors(loop, complete_rows(rows, sizes.tanks, sizes.units[0]))
 
 
 def _with_parts(case, table):

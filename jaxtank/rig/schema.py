@@ -18,8 +18,7 @@ from jaxtank.plants.network import TankNetwork
 from jaxtank.signals.inflows import InflowPulses
 from jaxtank.signals.setpoints import Ramps, Sine
 
-NEEDED: Any = object()
-"""Default of a key that a file must have."""
+NEEDED: Any = object()  # default of a key that a file must have
 
 PARTS: dict[str, Any] = {"plant": TankNetwork, "actuator": PumpBank, "sensor": LevelSensor}
 """{part of the loop: class} whose fields a rig that is described tank by tank gives."""
@@ -111,9 +110,9 @@ def type_of(field: dataclasses.Field[Any]) -> Any:
 
 def _key(name: str, row: dict[str, Any]) -> Key:
     """The Key of a row of schema.toml."""
-    values: dict[str, Any] = {
-        k: tuple(v) if k in ("shape", "choices") else v for k, v in row.items()
-    }
+    values: dict[str, Any] = dict(row)
+    for name_of_many in {"shape", "choices"} & row.keys():
+        values[name_of_many] = tuple(row[name_of_many])
     if values.pop("optional", False):
         values["default"] = None
     if "of" not in values:
@@ -126,16 +125,11 @@ def _key(name: str, row: dict[str, Any]) -> Key:
 
 def _sections() -> dict[str, Section]:
     tables = tomllib.loads(Path(__file__).with_name("schema.toml").read_text("utf-8"))
-    return {
-        name: Section(
-            name, **{**table, "keys": tuple(_key(*row) for row in table.get("keys", {}).items())}
-        )
-        for name, table in tables.items()
-    }
+    keys = {n: tuple(_key(*row) for row in t.get("keys", {}).items()) for n, t in tables.items()}
+    return {name: Section(name, **table | {"keys": keys[name]}) for name, table in tables.items()}
 
 
-SECTIONS = _sections()
-"""{name: Section} of a rig file, in the order in which it is written."""
+SECTIONS = _sections()  # {name: Section} of a rig file, in the order in which it is written
 
 OPEN_LOOP = SECTIONS.pop("open-loop").keys
 """[controller] of kind "open-loop"; of other kinds the keys are the fields of the class."""
@@ -149,8 +143,7 @@ SHARE = Key("share", "share", low=0.0, high=1.0, strict=True, default=0.05)
 LISTS = tuple(name for name, section in SECTIONS.items() if section.per)
 """Sections with a table for each tank, orifice, pipe, spill, pump and valve."""
 
-INPUTS = ("pump", "valve")
-"""Lists whose tables are the inputs of a rig, in this order."""
+INPUTS = ("pump", "valve")  # lists whose tables are the inputs of a rig, in this order
 
 TANKWISE = (*LISTS, "plant", "units")
 """What describes a rig tank by tank, and is not given beside `case`."""

@@ -2,8 +2,8 @@
 
 import dataclasses
 import re
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -26,8 +26,7 @@ _GAIN = re.compile(rf"(?P<number>{NUMBER.pattern})\s*(?P<unit>.*\S)\s*/\s*%")
 
 _LOOP = re.compile(r"\s*4\s*(?:mA)?\s*(?:\.{2,3}|…|-|–|to)\s*20\s*mA\s*")
 
-CURRENTS = (4.0, 20.0)
-"""Current of a sensor at the ends of its span [mA]."""
+CURRENTS = (4.0, 20.0)  # current of a sensor at the ends of its span [mA]
 
 
 def spans_of(loop: Any) -> list[tuple[float, float]]:
@@ -63,16 +62,12 @@ def in_span(value: Any, unit: str, span: tuple[float, float], width: bool = Fals
 
 
 def readings(label: str, name: str, value: Any, unit: str, axes: Any, loop: Any) -> Any:
-    """Return a value with its texts in % or mA of a span as numbers of the rig's unit.
-
-    name : of the key or parameter; axes : "output" or "tank", of which it has one entry each, or
-    the index of one of those (of a gain an output, else a tank). Other values are returned.
-    """
+    """Return a value with texts in % or mA as numbers; axes: "output", "tank", or an index."""
     texts = list(value) if isinstance(value, (list, tuple)) else [value]
-    convert = _conversion(label, name, unit, axes, loop)
-    if convert is None or not any(map(convert.applies, texts)):
+    applies, to_number = _conversion(label, name, unit, axes, loop)
+    if not any(map(applies, texts)):
         return value
-    apply = lambda v, i: convert.to_number(v, i) if convert.applies(v) else v
+    apply = lambda v, i: to_number(v, i) if applies(v) else v
     count = loop.plant.tanks if axes == "tank" else len(loop.plant.outputs)
     if isinstance(axes, int):
         each = [apply(v, axes) for v in texts]
@@ -83,26 +78,16 @@ def readings(label: str, name: str, value: Any, unit: str, axes: Any, loop: Any)
     return [apply(v, i) if i < count else v for i, v in enumerate(texts)]
 
 
-class Conversion(NamedTuple):
-    """Which texts of a value are in % or mA, and (text, index) -> number."""
-
-    applies: Callable[[Any], bool]
-    to_number: Callable[[str, int], float]
-
-
 def _conversion(label, name, unit, axes, loop):
-    """The Conversion of a value by its name and unit; None of one that is no level and no gain."""
+    """(which texts of a level or a gain are in % or mA, function of such a text and an index)."""
     if unit == local("V/cm", loop.units):
-        return Conversion(_is_gain, lambda text, i: _gain(label, text, loop, i))
+        is_gain = lambda v: isinstance(v, str) and _GAIN.fullmatch(v.strip()) is not None
+        return is_gain, lambda text, i: _gain(label, text, loop, i)
     if unit != loop.units[0] or name not in LEVELS + WIDTHS:
-        return None
+        return lambda v: False, lambda text, i: text
     tanks = loop.plant.outputs if axes == "output" else range(loop.plant.tanks)
-    to_level = lambda text, i: level_of(text, spans_of(loop)[tanks[i]], name in WIDTHS)
-    return Conversion(is_reading, to_level)
-
-
-def _is_gain(value):
-    return isinstance(value, str) and _GAIN.fullmatch(value.strip()) is not None
+    width = name in WIDTHS
+    return is_reading, lambda text, i: level_of(text, spans_of(loop)[tanks[i]], width)
 
 
 def _gain(label, text, loop, output):
@@ -127,32 +112,24 @@ def _gain(label, text, loop, output):
 
 
 def leaves_of(rows, rims, noise, levels=()):
-    """({leaf of the sensor: (n,)}, levels without texts) of rows of [[sensor]], each with its tank.
-
-    Of a tank without a row, or with one that has only a name, the sensor has no ends. noise and
-    levels : of each tank, numbers or texts in % of its span.
-    """
-    low, high, offset = np.full(len(rims), -np.inf), np.full(len(rims), np.inf), [0.0] * len(rims)
-    scale = [1.0] * len(rims)
-    noise = list(noise)
+    """({leaf of the sensor: (n,)}, levels without texts) of rows of [[sensor]] with their tanks."""
+    low, high = np.full(len(rims), -np.inf), np.full(len(rims), np.inf)
+    usual = {"noise": list(noise), "offset": [0.0] * len(rims), "scale": [1.0] * len(rims)}
+    leaves = {k: v for k, v in usual.items() if k == "noise" or any(k in row for row in rows)}
     for row in rows:
         tank = row["tank"]
         if "span" in row or row["unit"] in ("%", "mA"):
             low[tank], high[tank] = row.get("span", (0.0, rims[tank]))
-        noise[tank], offset[tank] = row.get("noise", noise[tank]), row.get("offset", 0.0)
-        scale[tank] = row.get("scale", 1.0)
+        for name, values in leaves.items():
+            values[tank] = row.get(name, values[tank])
     spans = _spans(low, high, rims)
-    number_of = lambda v, span, width: level_of(v, span, width) if is_reading(v) else v
-    leaves = {"noise": [number_of(v, span, True) for v, span in zip(noise, spans)]}
+    one = lambda v, span, width: level_of(v, span, width) if is_reading(v) else v
+    numbers = lambda values, width: [one(v, span, width) for v, span in zip(values, spans)]
+    leaves = {name: numbers(values, True) for name, values in leaves.items()}
     if np.any(np.isfinite(high)):
         leaves |= {"low": low, "high": high}
-    if any("offset" in row for row in rows):
-        leaves["offset"] = [number_of(v, span, True) for v, span in zip(offset, spans)]
-    if any("scale" in row for row in rows):
-        leaves["scale"] = scale
     leaves |= _curves(rows, len(rims))
-    levels = [number_of(v, span, False) for v, span in zip(levels, spans)]
-    return {name: number(value) for name, value in leaves.items()}, levels
+    return {n: number(value) for n, value in leaves.items()}, numbers(levels, False)
 
 
 def _curves(rows, tanks):
@@ -177,9 +154,8 @@ def curve_of(sensor: Any, tank: int) -> list[list[float]] | None:
     if getattr(sensor, "curve_level", None) is None:
         return None
     levels, readings = (np.asarray(v[tank]) for v in (sensor.curve_level, sensor.curve_reading))
-    return (
-        None if np.array_equal(levels, readings) else np.column_stack([levels, readings]).tolist()
-    )
+    same = np.array_equal(levels, readings)
+    return None if same else np.column_stack([levels, readings]).tolist()
 
 
 def with_sensors(loop, rows):
@@ -222,7 +198,9 @@ def _with_unit(row):
 
 def check_stated(table, loop):
     """Raise InputError for setpoints and gains without a unit where a sensor reads in % or mA."""
-    units = {row["tank"]: row.get("unit") for row in _with_tanks(table, loop)}
+    rows = enumerate(sensor_rows(table, loop.plant.tanks))
+    at = lambda row, i: index_of("sensor", loop.plant, "tank", row.get("tank", i + 1))
+    units = {at(row, i): row.get("unit") for i, row in rows}
     units = [units.get(tank) for tank in loop.plant.outputs]
     spans, length, problems = spans_of(loop), loop.units[0], []
     of = lambda value: value if isinstance(value, list) else [value] * len(units)
@@ -255,13 +233,6 @@ def check_stated(table, loop):
         raise InputError("; ".join(problems))
 
 
-def _with_tanks(table, loop):
-    """Rows of [[sensor]] with the index of each tank."""
-    rows = sensor_rows(table, loop.plant.tanks)
-    at = lambda row, i: index_of("sensor", loop.plant, "tank", row.get("tank", i + 1))
-    return [{**row, "tank": at(row, i)} for i, row in enumerate(rows)]
-
-
 def complete_rows(rows: list[dict[str, Any]], tanks: int, length: str) -> list[dict[str, Any]]:
     """Return rows of [[sensor]] with their tanks, after input validation."""
     problems: list[str] = []
@@ -271,9 +242,8 @@ def complete_rows(rows: list[dict[str, Any]], tanks: int, length: str) -> list[d
         row.setdefault("tank", i)
         row.setdefault("unit", length)
         if row["unit"] not in ("%", "mA", length) and factor(row["unit"], length) is None:
-            problems.append(
-                str(unknown(f"unit of sensor {i + 1}", row["unit"], ["%", "mA", *LENGTHS]))
-            )
+            known = ["%", "mA", *LENGTHS]
+            problems.append(str(unknown(f"unit of sensor {i + 1}", row["unit"], known)))
         if "span" in row and not row["span"][0] < row["span"][1]:
             low, high = row["span"]
             problems.append(
@@ -292,8 +262,6 @@ def complete_rows(rows: list[dict[str, Any]], tanks: int, length: str) -> list[d
 
 def _turning(rows):
     """What is wrong with the curves of rows of [[sensor]]."""
-    return [
-        f"sensor {i + 1}: curve: its readings must increase with the level"
-        for i, row in enumerate(rows)
-        if np.any(np.diff([reading for _, reading in row.get("curve", ())]) <= 0)
-    ]
+    curves = ([reading for _, reading in row.get("curve", ())] for row in rows)
+    turning = [i for i, curve in enumerate(curves) if np.any(np.diff(curve) <= 0)]
+    return [f"sensor {i + 1}: curve: its readings must increase with the level" for i in turning]

@@ -1,6 +1,4 @@
-"""What moves a rig besides its controller, as tables of a rig file: [reference], [reference.sine],
-[inputs], [disturbance], [[inflow]] and [[fault]].
-"""
+"""[reference], [inputs], [disturbance], [[inflow]] and [[fault]] of a rig file as signals."""
 
 import dataclasses
 
@@ -62,16 +60,15 @@ def ramps_of(section, table, old, words, sizes):
     """Return the Ramps of a table; what it leaves out is as in `old`. words: channel and value."""
     values = read_entry(section, _over(section, ramp_values(old), table), sizes)
     label, of = f"{section.name}.changes", section["changes"].meta(sizes.units)["unit"]
-    initial = values["initial"].tolist()
+    initial, plant = values["initial"].tolist(), sizes.plant
     if columns := _columns_of(section.name, table):
-        names = columns.chosen(table.get("column"), words[0], sizes.plant, len(initial))
-        units = [
-            input_unit(sizes.plant, i, of) if words[0] == "pump" else of
-            for i in range(len(initial))
-        ]
-        spans = [spans_of(sizes.loop)[i] for i in sizes.plant.outputs]
-        spans = None if words[0] == "pump" else spans
-        times, rows = columns.read(names, dict(enumerate(units)), spans)
+        names = columns.chosen(table.get("column"), words[0], plant, len(initial))
+        units, spans = {i: of for i in range(len(initial))}, None
+        if words[0] == "pump":
+            units = {i: input_unit(plant, i, of) for i in units}
+        else:
+            spans = [spans_of(sizes.loop)[i] for i in plant.outputs]
+        times, rows = columns.read(names, units, spans)
         if "initial" not in table:  # the first row holds before its time
             initial = [float(rows[i][0]) if i in rows else v for i, v in enumerate(initial)]
         changes = tables.changes_of(times, rows, initial)
@@ -95,9 +92,7 @@ def _columns_of(where, table):
 
 
 def _named(label, changes, kind, sizes, unit):
-    """Changes with the numbers of outputs or pumps for their names, and of times and values with a
-    unit; of one output or pump a change may have none.
-    """
+    """Changes with numbers for the names of outputs or pumps, and for texts with a unit."""
     rows, alone = [], (sizes.outputs if kind == "output" else sizes.pumps) == 1
     for change in changes if isinstance(changes, list) else ():
         if isinstance(change, list) and len(change) == 2 and alone:
@@ -140,21 +135,16 @@ def _changes(label, changes, words, channels):
 
 
 def _plain_changes(changes, channels):
-    """`_changes` of a list that is right, by arrays: a year of hours is read at once. None of
-    another.
-    """
+    """`_changes` of a list that is right, by arrays, for a year of hours; None of another."""
     if not isinstance(changes, list) or not changes:
         return None
     if any(type(row) is not list or list(map(type, row)) != [float, int, float] for row in changes):
         return None
     t, which, value = (np.array(column, dtype=float) for column in zip(*changes))
     fine = np.all(np.isfinite(t) & np.isfinite(value)) and np.all(np.diff(t) >= 0.0)
-    if not fine or which.min() < 1 or which.max() > channels:
-        return None
-    places = [(time, i - 1) for time, i, _ in changes]
-    if len(set(places)) < len(places):
-        return None
-    return [(*place, row[2]) for place, row in zip(places, changes)]
+    fine = fine and which.min() >= 1 and which.max() <= channels
+    twice = len({(time, i) for time, i, _ in changes}) < len(changes)
+    return [(time, i - 1, v) for time, i, v in changes] if fine and not twice else None
 
 
 def ramp_values(signal):
@@ -229,34 +219,24 @@ def _inflows(entries, steady, sizes):
     with problems.collect():
         pulses = read_entries(SECTIONS["inflow"], {"inflow": pulses}, sizes)
     problems.check()
-    first = None
+    first, names = None, ("time", "duration", "tank", "volume")
     if pulses:
-        first = inflow_pulses(sizes.tanks, [_pulse(e) for e in pulses])
+        first = inflow_pulses(sizes.tanks, [tuple(e[name] for name in names) for e in pulses])
         flows = np.asarray(steady.level).tolist() if isinstance(steady, Constant) else []
         steady = steady if any(flows) and not courses else None
         if courses:  # beside pulses and a table it is a table of one row
             courses += [(tank, [0.0], [flow], "hold") for tank, flow in enumerate(flows) if flow]
-    return first, steady, _table(courses, sizes.tanks)
+    return first, steady, _table(courses, sizes.tanks) if courses else None
 
 
 def _table(courses, tanks):
-    """The InflowTable of courses, None of none."""
-    if not courses:
-        return None
-    *_, between = zip(*courses)
-    return inflow_table(tanks, [course[:3] for course in courses], between)
-
-
-def _pulse(entry):
-    """(time, duration, tank, volume) of a table of [[inflow]]."""
-    return entry["time"], entry["duration"], entry["tank"], entry["volume"]
+    rows, between = [course[:3] for course in courses], [course[3] for course in courses]
+    return inflow_table(tanks, rows, tuple(between))
 
 
 def _is_course(entry):
     """Whether a table of [[inflow]] is a measured inflow, and no pulse."""
-    return isinstance(entry, dict) and any(
-        key in entry for key in ("csv", "changes", "column", "flow")
-    )
+    return isinstance(entry, dict) and bool({"csv", "changes", "column", "flow"} & entry.keys())
 
 
 def _course(entry, sizes, index):
@@ -292,7 +272,9 @@ def faults_of(entries, loop, dotted):
             try:
                 _check_kind(entries[i])
                 if "sensor" in e:
-                    sensors.append(_sensor_fault(e, entries[i], sizes))
+                    size = _size_of(e["kind"], e["sensor"], entries[i], sizes)
+                    row = (e["sensor"], e["kind"], e["start"], e["end"], e.get("every", 0.0))
+                    sensors.append((SensorFault(*row), size))
                     faults(plant, (), sensors[-1:])
                     continue
                 values = (e[name] for name in ("start", "end", "factor", "extra"))
@@ -326,19 +308,13 @@ def _check_kind(entry):
         raise InputError(f"{' and '.join(sorted(more))} is not for {words}: leave it out")
 
 
-def _sensor_fault(values, entry, sizes):
-    """(SensorFault, size) of an entry of [[fault]]."""
-    tank, kind, size = values["sensor"], values["kind"], 0.0
-    if kind != "freeze":
-        key = Key("size", unit="cm/s" if kind == "drift" else "cm", low=NOT_BELOW.get(kind))
-        size = readings("size", "size", entry["size"], sizes.units[0], tank, sizes.loop)
-        size = read_value(key, "size", size, sizes)
-    row = (tank, kind, values["start"], values["end"], values.get("every", 0.0))
-    return SensorFault(*row), size
-
-
-NOT_BELOW = {"noise": 0.0}
-"""{kind of a fault of a sensor: its least size}."""
+def _size_of(kind, tank, entry, sizes):
+    """The size of a fault of a sensor."""
+    if kind == "freeze":
+        return 0.0
+    unit, low = "cm/s" if kind == "drift" else "cm", 0.0 if kind == "noise" else None
+    size = readings("size", "size", entry["size"], sizes.units[0], tank, sizes.loop)
+    return read_value(Key("size", unit=unit, low=low), "size", size, sizes)
 
 
 def entry_named(of, plant):
@@ -363,11 +339,10 @@ def disturbance_tables(disturbance):
     if isinstance(disturbance, Constant):
         return [(steady, {"inflow": disturbance.level})]
     if isinstance(disturbance, InflowTable):
-        return [
-            (INFLOW_TABLE, {"tank": tank, "changes": rows, "interpolate": between})
-            for tank, between, times, flows in disturbance.tables()
-            for rows in [[[t, q] for t, q in zip(times.tolist(), np.asarray(flows).tolist())]]
-        ]
+        rows = lambda *columns: np.array(columns, dtype=float).T.tolist()
+        keys = ("tank", "interpolate", "changes")
+        tables = ((i, between, rows(t, flows)) for i, between, t, flows in disturbance.tables())
+        return [(INFLOW_TABLE, dict(zip(keys, table))) for table in tables]
     if not isinstance(disturbance, InflowPulses):
         return None
     rows = zip(disturbance.events, np.asarray(disturbance.volume).tolist())
@@ -377,8 +352,9 @@ def disturbance_tables(disturbance):
 
 def _merged(tables):
     """Tables of a disturbance with one [disturbance], of the keys of all."""
-    steady = SECTIONS["disturbance"]
-    keys = {key: v for section, values in tables if section is steady for key, v in values.items()}
+    steady, keys = SECTIONS["disturbance"], {}
+    for section, values in tables:
+        keys |= values if section is steady else {}
     others = [row for row in tables if row[0] is not steady]
     return [(steady, keys), *others] if keys else others
 

@@ -15,8 +15,7 @@ from jaxtank.rig.sensors import in_span
 
 KEYS = ("csv", "column", "time", "decimal")
 """Keys of a table of a rig file that name a file in place of `changes`."""
-MOST = 100_000
-"""Rows of a table, so that a rig file that holds them can be read again."""
+MOST = 100_000  # rows of a table, so that a rig file that holds them can be read again
 TIMES = ("t", "time", "zeit", "timestamp", "date", "datetime")
 """Names of the column of times where none is given; else it is the first one."""
 
@@ -52,25 +51,18 @@ class Columns:
                 f"{self.label}{self.table.name}: {len(self.table.lines)} rows: must be at most"
                 f" {MOST}; keep those at which a value changes"
             )
-        self.time = self._find(keys["time"]) if "time" in keys else self._usual_time()
-
-    def _usual_time(self) -> int:
-        names = [column.name.lower() for column in self.table.columns]
-        return next((i for i, name in enumerate(names) if name in TIMES), 0)
+        usual = (i for i, c in enumerate(self.table.columns) if c.name.lower() in TIMES)
+        self.time = self._find(keys["time"]) if "time" in keys else next(usual, 0)
 
     def _find(self, text: Any) -> int:
         """Index of the column of a header, with or without its unit."""
         if not isinstance(text, str):
             raise refusal(f"{self.label}column", text, "be the name of a column")
         columns, stem = self.table.columns, split_header(text)[0]
-        tests = (
-            lambda c: c.header == text,
-            lambda c: c.name == text,
-            lambda c: c.name == stem,
-            lambda c: c.name.lower() == stem.lower(),
-        )
-        for test in tests:
-            places = [i for i, column in enumerate(columns) if test(column)]
+        names = [c.name for c in columns]
+        lists = [c.header for c in columns], names, names, [name.lower() for name in names]
+        for each, wanted in zip(lists, (text, text, stem, stem.lower())):
+            places = [i for i, name in enumerate(each) if name == wanted]
             if len(places) > 1:
                 raise InputError(
                     f"{self.label}{self.table.name}, line {self.table.head}: {len(places)} columns"
@@ -95,14 +87,10 @@ class Columns:
             return self._usual(kind, plant, count)
         texts = column if isinstance(column, list) else [column]
         if len(texts) != count:
-            example = ", ".join(
-                f'{name_of(plant, kind, i) or i + 1} = "..."' for i in range(min(count, 2))
-            )
-            raise refusal(
-                f"{self.label}column",
-                column,
-                f"be a column for each of {count} {kind}s, or {{ {example} }} for some of them",
-            )
+            names = [name_of(plant, kind, i) or i + 1 for i in range(min(count, 2))]
+            example = ", ".join(f'{name} = "..."' for name in names)
+            must = f"be a column for each of {count} {kind}s, or {{ {example} }} for some of them"
+            raise refusal(f"{self.label}column", column, must)
         return dict(enumerate(texts))
 
     def _usual(self, kind: str, plant: Any, count: int) -> dict[int, str]:
@@ -142,7 +130,12 @@ class Columns:
             columns[self.time] = column._replace(unit="s")
             bare = table._replace(columns=columns)
         try:
-            t = _seconds(table, bare, self.time)
+            try:
+                t = seconds(table, self.time)
+            except DataError:  # numbers without a unit that are no days or epochs
+                if bare is table:
+                    raise
+                t = seconds(bare, self.time)
         except DataError as error:
             raise InputError(f"{self.label}{error}") from None
         where = lambda k: f"{self.label}{table.where(self.time, k)}: {column.cells[k]!r}"
@@ -181,22 +174,11 @@ class Columns:
         return values * size
 
 
-def _seconds(table: Table, bare: Table, column: int) -> np.ndarray:
-    """Times [s] of a column: numbers without a unit that are no days or epochs are seconds."""
-    try:
-        return seconds(table, column)
-    except DataError:
-        if bare is table:
-            raise
-        return seconds(bare, column)
-
-
 def changes_of(times: Any, values: Mapping[int, Any], initial: Any) -> list[tuple]:
     """Return [(time [s], channel from 0, value)] of the rows at which a channel changes."""
     changes = []
     for channel, column in values.items():
         before = np.concatenate([[initial[channel]], column[:-1]])
-        changes += [
-            (float(times[k]), channel, float(column[k])) for k in np.flatnonzero(column != before)
-        ]
+        moves = np.flatnonzero(column != before)
+        changes += [(float(times[k]), channel, float(column[k])) for k in moves]
     return sorted(changes)

@@ -1,6 +1,4 @@
-"""Suggestions of a complete rig file, commented out: what else could be set, each line of which can
-be used unchanged.
-"""
+"""Suggestions of a complete rig file, commented out, each of which can be used unchanged."""
 
 import numpy as np
 
@@ -98,17 +96,13 @@ def _rounded(value):
 def uncertain(case):
     """Lines of the plant's parameters whose spread is not given."""
     known = {n.split("[")[0] for n in case.uncertain}
-    return [
-        Line(toml(name), SHARE.default, of_uncertain(case, name), False)
-        for name, value in parameters(case.loop).items()
-        if name.startswith("plant.") and name not in known and np.any(np.asarray(value) != 0)
-    ]
+    nonzero = (n for n, v in parameters(case.loop).items() if np.any(np.asarray(v) != 0))
+    names = [n for n in nonzero if n.startswith("plant.") and n not in known]
+    return [Line(toml(n), SHARE.default, of_uncertain(case, n), False) for n in names]
 
 
 def suggestions(case, titles):
-    """Return the Blocks of tables that a case does not have, as they could be; titles: of those
-    that it has, and names of lists that it has emptied.
-    """
+    """Return the Blocks that a case could have; titles: of those it has or has emptied."""
     titles = titles - {section.title for section in SECTIONS.values() if section.many}
     blocks = []
     for name, values in _examples(case).items():
@@ -127,8 +121,12 @@ def _examples(case):
     # a sine changes the names of the reference, which a scenario may have
     named = any(name.startswith("reference.") for s in case.scenarios for name in s.values)
     volume = float(np.asarray(plant.area)[0] * np.asarray(plant.rim)[0])
+    control, sensor = loop.controller, loop.sensor
+    known = components.kind_of("controller", control) is not None  # no Scheduled
+    known = known and is_component(getattr(control, "model", None))
+    unspanned = isinstance(sensor, LevelSensor) and sensor.low is None
     return {
-        "controller": _controller(loop),
+        "controller": _component("controller", control) if known else None,
         "schedule": _schedule(case),
         "observer": _observer(loop),
         "reference.sine": {"amplitude": 0.0, "period": instant(0.1), "end": instant(1), "output": 1}
@@ -147,28 +145,13 @@ def _examples(case):
             "end": instant(0.7),
             "factor": 0.6,
         },
-        "sensors": _sensors(loop),
+        "sensors": {"tank": 0, "span": [0.0, float(np.ravel(plant.rim)[0])]} if unspanned else None,
         "covariance": None if case.covariance else _covariance(case),
         "safety_filter": {"limit": np.asarray(plant.rim)}
         if case.safety is None and isinstance(plant, TankNetwork) and plant.plain
         else None,
         "scenario": {"name": "noisy", "seed": 1, "values": {"sensor.noise": 0.0}},
     }
-
-
-def _sensors(loop):
-    """A span from the bottom to the rim of the first tank; None where there is one."""
-    if not isinstance(loop.sensor, LevelSensor) or loop.sensor.low is not None:
-        return None
-    return {"tank": 0, "span": [0.0, float(np.ravel(loop.plant.rim)[0])]}
-
-
-def _controller(loop):
-    """The loop's own controller, as a start for another."""
-    part = loop.controller
-    known = components.kind_of("controller", part) is not None  # no Scheduled
-    model = is_component(getattr(part, "model", None))
-    return _component("controller", part) if known and model else None
 
 
 def _component(name, part):

@@ -1,6 +1,4 @@
-"""Input validation of the sections on tuning: limits, objective, what is free and
-uncertain, covariance, scenarios, columns of experiment data.
-"""
+"""Input validation of the sections on tuning, scenarios and columns of experiment data."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -73,9 +71,7 @@ def check(case: Case) -> Case:
 
 
 def check_setpoints(case: Case) -> None:
-    """Raise InputError for setpoints that a sensor whose readings end cannot read; a start below
-    them, of an empty tank, is allowed.
-    """
+    """Raise InputError for setpoints that no sensor can read; a start below them is allowed."""
     loop, reference = case.loop, steps(case.loop.reference)
     low, high = (getattr(loop.sensor, name, None) for name in ("low", "high"))
     controller = getattr(loop.controller, "law", loop.controller)
@@ -135,16 +131,12 @@ def unreachable(case: Case) -> str | None:
 
 
 def _doubtful(loop: ClosedLoop, plateaus: np.ndarray) -> np.ndarray:
-    """The plateaus that may have no steady state: of a long table not those that linear algebra
-    finds fine, or of a rig with elements or pipes the extremes and MANY of the others.
-    """
+    """The plateaus that may have no steady state; of long tables a choice."""
     plant: Any = loop.plant
     if len(plateaus) <= MANY:
         return plateaus
     if not (plant.plain and plant.pumps == len(plant.outputs)) or plant.pipes:
-        extremes = [
-            f(plateaus[:, i]) for i in range(plateaus.shape[1]) for f in (np.argmin, np.argmax)
-        ]
+        extremes = np.concatenate([plateaus.argmin(axis=0), plateaus.argmax(axis=0)])
         some = np.linspace(0, len(plateaus) - 1, MANY).astype(int)
         return plateaus[np.unique([*extremes, *some])]
     inflow: Any = steady_inflow(loop)
@@ -232,10 +224,8 @@ def _limit(loop, measure, label, value, spans=None):
     texts = texts * len(spans) if len(texts) == 1 else texts
     if len(texts) != len(spans):
         raise refusal(label, value, f"be a limit, or {len(spans)} of them")
-    return [
-        level_of(v, span, width) if is_reading(v) else converted(label, v, of)
-        for v, span in zip(texts, spans)
-    ]
+    one = lambda v, span: level_of(v, span, width) if is_reading(v) else converted(label, v, of)
+    return [one(v, span) for v, span in zip(texts, spans)]
 
 
 def _spans(loop, kind):
@@ -324,11 +314,8 @@ def free_of(loop, table):
         if isinstance(spec, list):
             label, entry = f"free {name}", scheduled_names(loop, name)[0]
             ends = [in_unit(loop, label, entry, end) for end in spec[:2]]
-            ends = [
-                v[0] if isinstance(end, str) and isinstance(v, list) else v
-                for v, end in zip(ends, spec)
-            ]
-            spec = [*ends, *spec[2:]]
+            alone = lambda v, end: v[0] if isinstance(end, str) and isinstance(v, list) else v
+            spec = [*map(alone, ends, spec), *spec[2:]]
         good = isinstance(spec, list) and len(spec) in (2, 3)
         good = good and all(is_numeric(v) and np.ndim(v) == 0 for v in spec[:2])
         if not good or spec[2:] not in ([], ["log"], ["linear"]):
@@ -341,21 +328,20 @@ def free_of(loop, table):
 
 def scenarios_of(case, tables):
     """The Scenarios of the [[scenario]] tables, each of which can be run."""
-    return tuple(_scenario(case, table, i) for i, table in enumerate(tables))
-
-
-def _scenario(case, table, index):
-    entry = read_entry(SECTIONS["scenario"], table, sizes_of(case.loop), index)
-    name = entry.pop("name", f"scenario {index + 1}")
-    try:
-        values = by_dotted_name(entry.pop("values"), "scenario.values")
-        set_scenario(case, values)
-    except EquilibriumError:
-        pass  # `check` names the plateau without one; where that is allowed, `tune` refuses
-    except InputError as error:
-        raise type(error)(f"scenario {name!r}: {error}") from None
-    values = {n: tuple(v) if isinstance(v, list) else v for n, v in values.items()}
-    return Scenario(name, values, **entry)
+    scenarios = []
+    for i, table in enumerate(tables):
+        entry = read_entry(SECTIONS["scenario"], table, sizes_of(case.loop), i)
+        name = entry.pop("name", f"scenario {i + 1}")
+        try:
+            values = by_dotted_name(entry.pop("values"), "scenario.values")
+            set_scenario(case, values)
+        except EquilibriumError:
+            pass  # `check` names the plateau without one; where that is allowed, `tune` refuses
+        except InputError as error:
+            raise type(error)(f"scenario {name!r}: {error}") from None
+        values = {n: tuple(v) if isinstance(v, list) else v for n, v in values.items()}
+        scenarios.append(Scenario(name, values, **entry))
+    return tuple(scenarios)
 
 
 LOG_SETTINGS = {"decimal": (".", ","), "time": ORDERS, "hold": ("zero-order", "first-order")}
@@ -384,7 +370,10 @@ def check_log(plant, table):
     found by its name.
     """
     table = dict(table)
-    apart, units = (dict(_subtable(table.pop(key, {}), key)) for key in ("columns", "units"))
+    apart, units = (table.pop(key, {}) for key in ("columns", "units"))
+    for key, part in (("columns", apart), ("units", units)):
+        if not isinstance(part, dict):
+            raise refusal(f"log {key}", part, "be a table")
     table |= apart | {key: [apart.get(key, ""), unit] for key, unit in units.items()}
     keys, columns, headers = log_keys(plant), {}, {}
     for key, spec in table.items():
@@ -395,8 +384,7 @@ def check_log(plant, table):
             continue
         if key not in keys:
             raise unknown("key of [log]", key, [*keys, *LOG_SETTINGS])
-        columns[key] = _header_and_unit(key, spec)
-        header = columns[key] if isinstance(columns[key], str) else columns[key][0]
+        header, columns[key] = _header_and_unit(key, spec)
         if header in headers and header not in ("", "none"):
             raise InputError(
                 f"log {key} = {shortened(header)}: that column is {headers[header]} already"
@@ -408,18 +396,12 @@ def check_log(plant, table):
 
 
 def _header_and_unit(key, spec):
-    """Return a header, or (header, unit), of a line of [log]."""
+    """(header, header or (header, unit)) of a line of [log]."""
     pair = [spec] if isinstance(spec, str) else spec
     good = isinstance(pair, (list, tuple)) and 1 <= len(pair) <= 2
     if not (good and all(isinstance(v, str) for v in pair) and pair[-1].strip()):
         raise refusal(f"log {key}", spec, "be a column's header, or [header, unit]")
-    return pair[0] if len(pair) == 1 else tuple(pair)
-
-
-def _subtable(table, key):
-    if not isinstance(table, dict):
-        raise refusal(f"log {key}", table, "be a table")
-    return table
+    return pair[0], pair[0] if len(pair) == 1 else tuple(pair)
 
 
 def check_covariance(loop, table):

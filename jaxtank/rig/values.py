@@ -46,8 +46,7 @@ from jaxtank.rig.signals import steps
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
 """Where controller and observer hold the plant's parameters, by the same names."""
 
-STEADY = ("x0", "actuator.initial", "reference.initial")
-"""What a scenario may have as "steady"."""
+STEADY = ("x0", "actuator.initial", "reference.initial")  # what a scenario may have as "steady"
 
 _NUMBER = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 _RELATIVE = re.compile(
@@ -90,11 +89,14 @@ def dotted_name(loop: ClosedLoop, name: str) -> str:
 def _of_entries(loop, name, base, inner):
     """`dotted_name` of a parameter and what its brackets hold: names, or numbers from 0."""
     axes = describe(loop, base).get("shape", ())
-    entries = [
-        entry if entry.isdigit() else _index_of(name, loop.plant, axis, entry)
-        for entry, axis in zip(inner, axes)
-        if axis in ("tank", "pump", "output", "feed", "valve")
-    ]
+    plant, entries = loop.plant, []
+    for entry, axis in zip(inner, axes):
+        axis = "pump" if axis == "feed" else axis
+        # a gain of an output is also called by the pump that moves it
+        paired = axis == "output" and plant.pumps == len(plant.outputs)
+        axis = "pump" if paired and entry not in names_of(plant, axis) else axis
+        if axis in ("tank", "pump", "output", "valve"):
+            entries.append(entry if entry.isdigit() else index_of(name, plant, axis, entry))
     return f"{base}[{','.join(map(str, entries))}]" if len(entries) == len(axes) else name
 
 
@@ -120,9 +122,7 @@ def _of_table(plant, kind, part, key):
 
 
 def in_unit(loop: ClosedLoop, label: str, name: str, value: Any) -> Any:
-    """Return the value of a parameter with texts such as "5 min" as numbers of its unit; of levels
-    and gains also texts in % of the span of a sensor.
-    """
+    """Return the value of a parameter with texts, as "5 min" or "80 %", as numbers of its unit."""
     meta = describe(loop, name)
     texts: Any = value if isinstance(value, (list, tuple)) else [value]
     part, _, field = split_index(name)[0].rpartition(".")
@@ -146,14 +146,6 @@ def _axes(loop, name, meta):
     return loop.plant.outputs[index[0]] if index[0] < len(loop.plant.outputs) else 0
 
 
-def _index_of(name, plant, axis, entry):
-    """Index of a named entry; a gain of an output is also called by the pump that moves it."""
-    axis = "pump" if axis == "feed" else axis
-    paired = axis == "output" and plant.pumps == len(plant.outputs)
-    axis = "pump" if paired and entry not in names_of(plant, axis) else axis
-    return index_of(name, plant, axis, entry)
-
-
 def by_rig_name(
     loop: ClosedLoop, values: Mapping[str, Any], convert: bool = True
 ) -> dict[str, Any]:
@@ -165,11 +157,7 @@ def by_rig_name(
         dotted = dotted_name(loop, name)
         if dotted in renamed:
             raise InputError(f"{name} is given twice, as {dotted} too: give it once")
-        if (
-            convert
-            and name != dotted
-            and not (isinstance(value, str) and _RELATIVE.fullmatch(value.strip()))
-        ):
+        if convert and name != dotted and _relative(value) is None:
             value = in_unit(loop, name, dotted, value)
         renamed[dotted] = value
     return renamed
@@ -302,8 +290,12 @@ def overlap(name: str, other: str) -> bool:
 
 def is_change(value: Any) -> bool:
     """Return whether the value of a scenario is a factor or an offset on the case's own."""
-    match = _RELATIVE.fullmatch(value.strip()) if isinstance(value, str) else None
+    match = _relative(value)
     return match is not None and match["default"] is None
+
+
+def _relative(value):
+    return _RELATIVE.fullmatch(value.strip()) if isinstance(value, str) else None
 
 
 def _is_steady(name, value):
@@ -315,7 +307,7 @@ def _absolute(case, name, value):
     current = _number_of(case, name) if isinstance(value, str) else None
     if current is None or _is_steady(name, value):
         return value
-    match = _RELATIVE.fullmatch(value.strip())
+    match = _relative(value)
     if match is None and NUMBER.match(value.strip()):
         with contextlib.suppress(InputError):  # the refusal below names relative changes too
             if name.startswith("clock."):
@@ -338,11 +330,11 @@ def _number_of(case, name):
     """The number or array that `name` is in a case, None where it is no number."""
     if name.startswith("clock."):
         value: Any = getattr(case.clock, name.removeprefix("clock."), None)
-    elif _meta(case, name)["kind"] == "leaf":
+        return value if is_plain(value) else None
+    if _meta(case, name)["kind"] == "leaf":
         return get_value(case.loop, name)
-    else:
-        value = _static_of(case.loop, name)
-    return value if is_numeric(value) and np.ndim(value) == 0 else None
+    value = _static_of(case.loop, name)
+    return value if is_plain(value) else None
 
 
 def _static_of(loop, name):
@@ -416,9 +408,8 @@ def _set_static(tree, name, path, value, meta):
     if len(path) > 1:
         new = _set_static(old, name, path[1:], value, meta)
     elif isinstance(old, tuple):
-        raise InputError(
-            f"{name} is the topology of the rig and cannot be set: choose another case"
-        )
+        cannot = "is the topology of the rig and cannot be set: choose another case"
+        raise InputError(f"{name} {cannot}")
     else:
         new = static_value(name, value, meta, type(old))
     return dataclasses.replace(tree, **{path[0]: new})
@@ -438,9 +429,8 @@ def schedule(case, gains, knots):
     check_gains(part, tuple(names))
     variable, *others = dict.fromkeys(gains.values())
     if others:
-        raise InputError(
-            f"schedule variables {', '.join(map(str, gains.values()))}: must be one for all gains"
-        )
+        variables = ", ".join(map(str, gains.values()))
+        raise InputError(f"schedule variables {variables}: must be one for all gains")
     check_variable(variable, len(loop.plant.outputs), loop.plant.tanks)
     check_knots(knots)
     knots = number(knots)
@@ -448,9 +438,8 @@ def schedule(case, gains, knots):
     for name in names:
         if not split_index(name)[1]:
             part = _without(part, name.split("."))
-    controller = Scheduled(
-        law=part, knots=knots, values=values, gains=tuple(names), variable=variable
-    )
+    gains_at = {"knots": knots, "values": values, "gains": tuple(names)}
+    controller = Scheduled(law=part, **gains_at, variable=variable)
     controller.check(loop.reference)
     free = _free(case, names, knots.size)
     return case.replace(loop=dataclasses.replace(loop, controller=controller), free=free)
@@ -492,19 +481,15 @@ def schedule_table(loop):
     part = loop.controller
     if not isinstance(part, Scheduled):
         return {}
-    return {
-        "gains": [CONTROLLER + g for g in part.gains],
-        "variable": part.variable,
-        "knots": np.asarray(part.knots).tolist(),
-    }
+    gains, knots = [CONTROLLER + g for g in part.gains], np.asarray(part.knots).tolist()
+    return {"gains": gains, "variable": part.variable, "knots": knots}
 
 
 def _with_schedule(case, table):
     """Return `schedule` of a table as `schedule_table` makes it."""
     gains = read_entry(SECTIONS["schedule"], table, sizes_of(case.loop))["gains"]
-    for gain in gains:
-        if gains.count(gain) > 1:
-            raise InputError(f"schedule.gains: {gain} is scheduled twice: name it once")
+    if twice := [gain for gain in gains if gains.count(gain) > 1]:
+        raise InputError(f"schedule.gains: {twice[0]} is scheduled twice: name it once")
     if not isinstance(table["knots"], list):
         raise InputError(f"schedule.knots = {table['knots']!r}: must be a list of numbers")
     return schedule(case, dict.fromkeys(gains, table["variable"]), table["knots"])
@@ -514,18 +499,16 @@ def _entries(loop, name):
     """The scalars that a name stands for, without the "controller."."""
     names = [n for n in parameters(loop) if n.startswith(CONTROLLER)]
     try:
-        kind = describe(loop, name)["kind"] if name.startswith(CONTROLLER) else None
+        kind = describe(loop, name)["kind"]
     except InputError:
         kind = None
-    if kind is None:
+    if kind is None or not name.startswith(CONTROLLER):
         raise unknown("gain", name, names)
     inner = name.removeprefix(CONTROLLER)
     if kind == "static" or split_index(name)[1]:
         return [inner]
-    return [
-        inner + (f"[{','.join(map(str, i))}]" if i else "")
-        for i in np.ndindex(np.shape(get_value(loop, name)))
-    ]
+    places = np.ndindex(np.shape(get_value(loop, name)))
+    return [inner + (f"[{','.join(map(str, i))}]" if i else "") for i in places]
 
 
 def _without(tree, path):

@@ -1,6 +1,4 @@
-"""Warnings about a case that can run but is hardly meant: reported by the commands, never
-refused.
-"""
+"""Warnings about a case that can run but is hardly meant: reported, never refused."""
 
 import numpy as np
 
@@ -17,10 +15,10 @@ from jaxtank.loop.estimate_notes import is_unused
 from jaxtank.loop.tank_bottom import is_open
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.signals import parts_of, steps
+from jaxtank.rig.values import has
 from jaxtank.signals.setpoints import Sine, index
 
-LEAST_SHARE = 0.01
-"""Share of a measured inflow below which its gain is hardly meant [-]."""
+LEAST_SHARE = 0.01  # share of a measured inflow below which its gain is hardly meant [-]
 
 STILL = 0.02
 """Share of a pump's range by which its input before t = 0 may miss that of the start [-]."""
@@ -75,13 +73,13 @@ def _late(case):
     """On changes of the reference and inflow pulses after the end of the run."""
     loop, end = case.loop, case.clock.duration
     signal, *_ = parts_of(loop.disturbance)
-    pulses = () if signal is None else signal.onset
-    faults = () if loop.faults is None else [start for _, start, _ in loop.faults.events]
+    ramps = [steps(s) for s in (loop.reference, getattr(loop.controller, "signal", None))]
+    setpoints, inputs = ([] if s is None else [time for time, _ in s.changes] for s in ramps)
     times = {
-        "changes of the reference": _change_times(loop.reference),
-        "changes of the inputs": _change_times(getattr(loop.controller, "signal", None)),
-        "inflow pulses": pulses,
-        "faults": faults,
+        "changes of the reference": setpoints,
+        "changes of the inputs": inputs,
+        "inflow pulses": () if signal is None else signal.onset,
+        "faults": [start for _, start, _ in loop.faults.events] if loop.faults else (),
     }
     for name, events in times.items():
         late = sum(time >= end for time in events)
@@ -89,8 +87,7 @@ def _late(case):
             yield f"{late} of {len(events)} {name} come after the end of the run at {end:g} s"
 
 
-MEASURED = 10
-"""Rows from which on a table of inflow is taken as measured, and no list of steps."""
+MEASURED = 10  # rows from which on a table of inflow is taken as measured, and no list of steps
 
 
 def _short_tables(case):
@@ -113,12 +110,6 @@ def _short_tables(case):
             )
 
 
-def _change_times(signal):
-    """Times of the changes of a signal of ramps [s]."""
-    signal = steps(signal)
-    return () if signal is None else [time for time, _ in signal.changes]
-
-
 def _overlapping(case):
     """On changes of an output that begin before the one before is over."""
     reference = steps(case.loop.reference)
@@ -138,9 +129,7 @@ def _overlapping(case):
 
 
 def _unseen(case):
-    """On what happens between samples: faults, a sine and pulses' windows that hold none, and
-    changes that another one follows before the next sample.
-    """
+    """On faults, sines and pulses between two samples, and changes replaced before the next one."""
     loop, clock = case.loop, case.clock
     between = f"no sample, every {clock.dt:g} s, lies in it: it has no effect"
     if loop.faults is not None:
@@ -160,22 +149,14 @@ def _unseen(case):
         for time in pulses.onset:
             if time < clock.duration and not _holds_sample(time, time + window, clock):
                 yield f"disturbance.window = {window:g} s after the pulse at {time:g} s: {between}"
-    for name, signal in (("reference", loop.reference), ("inputs", loop.controller)):
-        yield from _replaced(name, steps(getattr(signal, "signal", signal)), clock)
-
-
-def _holds_sample(start, end, clock):
-    """Whether a sample of the run is at or after `start` [s] and before `end` [s]."""
-    first = index(start, clock)
-    return first * clock.dt < end - 1e-7 * clock.dt and first < clock.samples
+    for name, part in (("reference", loop.reference), ("inputs", loop.controller)):
+        yield from _replaced(name, steps(getattr(part, "signal", part)), clock)
 
 
 def _replaced(name, signal, clock):
     """On changes of a channel that another one follows before the next sample."""
-    if signal is None or float(signal.ramp) > 0.0:
-        return
     before = {}
-    for time, channel in signal.changes:
+    for time, channel in () if signal is None or signal.ramp > 0.0 else signal.changes:
         last = before.get(channel)
         if last is not None and index(last, clock) == index(time, clock):
             yield (
@@ -183,6 +164,12 @@ def _replaced(name, signal, clock):
                 f" {time:g} s before the next sample, every {clock.dt:g} s: it has no effect"
             )
         before[channel] = time
+
+
+def _holds_sample(start, end, clock):
+    """Whether a sample of the run is at or after `start` [s] and before `end` [s]."""
+    first = index(start, clock)
+    return first * clock.dt < end - 1e-7 * clock.dt and first < clock.samples
 
 
 def _above_rims(case):
@@ -235,9 +222,7 @@ def _pumps(case):
 
 
 def _standing(case):
-    """On pumps with a dead time, lag or rate that stood still before t = 0, though the level of the
-    start needs an input.
-    """
+    """On late pumps that stood still before t = 0, though the level of the start needs an input."""
     bank, (_, drive) = case.loop.actuator, case.loop.units
     part = getattr(case.loop.controller, "law", case.loop.controller)
     if not isinstance(part, PID) or np.shape(part.bias) != (case.loop.plant.pumps,):
@@ -275,8 +260,11 @@ def _signs(case):
     part, plant = getattr(case.loop.controller, "law", case.loop.controller), case.loop.plant
     if not isinstance(part, PID) or not isinstance(plant, TankNetwork):
         return
-    name, gains, tanks_of = _acting(part)
-    ends = _ends(plant)
+    name, gains, tanks_of = "Kc", part.signed_gain, part.model.outputs
+    if isinstance(part, Cascade) and part.inner:
+        name, gains, tanks_of = "inner_Kc", part.inner_Kc, part.inner
+    sources = plant.sources or (None,) * len(plant.feeds)  # (source, sink, ...) of each input
+    ends = [(source, *feed) for source, feed in zip(sources, plant.feeds)] + list(plant.valves)
     reached = [_downstream(plant, (i for i in tanks if i is not None)) for tanks in ends]
     for i, tank in enumerate(tanks_of):
         members = part.inputs_of(i)
@@ -289,28 +277,19 @@ def _signs(case):
 
 
 def _wrong_ways(plant, part, name, gain, acts, places):
-    """Sentences on the gain of an output whose inputs act against its level, acts: {input: 1 where
-    it fills the tank, -1 where it empties it}; places: (output, tank).
-    """
+    """Sentences on a gain whose inputs act the wrong way; acts: {input: 1 fills, -1 empties}."""
     effects = {j: -act if j in part.reversed_inputs else act for j, act in acts.items()}
     if isinstance(part, SplitRange) and {-1, 1} <= set(effects.values()):
         yield _both_ways(plant, part, acts, gain, places)
         return
-    output, tank = places
+    output, tank = (label_of(plant, kind, i) for kind, i in zip(("output", "tank"), places))
     for j, effect in effects.items():
         if gain * effect < 0.0:
-            yield _wrong_sign(plant, name, gain, (output, j, tank), acts[j])
-
-
-def _wrong_sign(plant, name, gain, places, acts):
-    """The sentence on a gain of an output by a pump, places: (output, pump, tank)."""
-    output, pump, tank = (
-        label_of(plant, kind, i) for kind, i in zip(("output", "pump", "tank"), places)
-    )
-    return (
-        f"{name} of {output} = {gain:g}: {pump} {'fills' if acts > 0 else 'empties'} {tank}, and"
-        " this sign drives its level away from the setpoint: change the sign"
-    )
+            does = f"{label_of(plant, 'pump', j)} {'fills' if acts[j] > 0 else 'empties'} {tank}"
+            yield (
+                f"{name} of {output} = {gain:g}: {does}, and this sign drives its level away from"
+                " the setpoint: change the sign"
+            )
 
 
 def _both_ways(plant, part, acts, gain, places):
@@ -327,19 +306,6 @@ def _both_ways(plant, part, acts, gain, places):
         f" {gain:g} brings its level to the setpoint through each of them: {write}"
         + (", and change the sign of controller.Kc" if gain < 0.0 else "")
     )
-
-
-def _acting(part):
-    """(name, gains, tanks) of the loops of a PID that move the inputs."""
-    if isinstance(part, Cascade) and part.inner:
-        return "inner_Kc", part.inner_Kc, part.inner
-    return "Kc", part.signed_gain, part.model.outputs
-
-
-def _ends(plant):
-    """(source, sink, ...) of each input."""
-    sources = plant.sources or (None,) * len(plant.feeds)
-    return [(source, *feed) for source, feed in zip(sources, plant.feeds)] + list(plant.valves)
 
 
 def _downstream(plant, tanks):
@@ -434,11 +400,12 @@ def _differences(case, holder, model, prefix):
     preset = presets.find(case.origin).loop if case.origin else None
     for name, value, meta in walk(case.loop.plant):
         other = theirs.get(name)
-        pairs = {f"plant.{name}": value, prefix + name: other}
-        if preset and all(_has(preset, n, v) for n, v in pairs.items()):
-            continue  # a difference that the preset itself has is meant
         if value is None or other is None or np.shape(other) != np.shape(value):
             continue
+        pairs = {f"plant.{name}": value, prefix + name: other}
+        same = lambda loop, n, v: has(loop, n) and np.array_equal(get_value(loop, n), v)
+        if preset and all(same(preset, n, v) for n, v in pairs.items()):
+            continue  # a difference that the preset itself has is meant
         plant, other = np.asarray(value, dtype=float), np.asarray(other, dtype=float)
         allowed, words = _uncertainty(case, f"plant.{name}", plant)
         if np.any(np.abs(other - plant) > np.maximum(allowed, 1e-9 * np.abs(plant))):
@@ -449,14 +416,6 @@ def _differences(case, holder, model, prefix):
                 f" unless that is meant, set {prefix}{name} = {_listed(plant)} too (in a rig file a"
                 " model that is left out follows the plant)"
             )
-
-
-def _has(loop, name, value):
-    """Whether parameter `name` of a loop has this value."""
-    try:
-        return value is not None and np.array_equal(get_value(loop, name), value)
-    except ValueError:  # InputError: the preset has no such parameter
-        return False
 
 
 def _uncertainty(case, name, value):

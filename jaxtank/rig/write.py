@@ -64,14 +64,9 @@ def _in_use(tree):
     return {name for name, value, meta in walk(tree) if meta.get("like") and value is not None}
 
 
-def _same_parts(loop, other):
-    """Names of the components that `other` has in the same structure as `loop`."""
-    pairs = [(name, getattr(loop, name), getattr(other, name)) for name in components.ROLES]
-    return [
-        name
-        for name, part, theirs in pairs
-        if structure(part) == structure(theirs) and _in_use(theirs) <= _in_use(part)
-    ]
+def _alike(part, other):
+    """Whether the values of a file make `part` of `other`."""
+    return structure(part) == structure(other) and _in_use(other) <= _in_use(part)
 
 
 PARTS = {
@@ -93,9 +88,7 @@ PARTS = {
 
 
 def sections(case, tankwise=False):
-    """Return the Blocks of a case: as its preset with changes where that describes it, else tank by
-    tank.
-    """
+    """Return the Blocks of a case: as its preset with changes, else tank by tank."""
     if case.loop.safety_filter is not None and case.safety is None:
         raise InputError(
             f"{case.name}: cannot be written as a rig file: its safety filter is not that of"
@@ -117,14 +110,18 @@ def sections(case, tankwise=False):
 def _sections(case, origin):
     """`sections` of a case as a preset with changes; tank by tank where `origin` is None."""
     loop = unscheduled(case.loop)
-    same = _same_parts(loop, origin.loop) if origin else ()
+    parts = components.ROLES if origin else ()
+    same = [n for n in parts if _alike(getattr(loop, n), getattr(origin.loop, n))]
     top, *built = _building(case, loop, origin, same)
     text = "\n".join(line for block in (top, *built) for line in terse(block))
     base = start_of(renamed(tomllib.loads(text)))
     alike = structure(_without_tables(loop)) == structure(_without_tables(base.loop))
     if not alike or not _in_use(base.loop) <= _in_use(loop):
         raise InputError("its controller or observer has another model than its rig")
-    top.lines.extend(_reachable(case, base))
+    if why := unreachable(case) if case.reachable else None:
+        top.lines.append(Line("reachable", False, {"unit": "-", "doc": why}))
+    elif case.reachable != base.reachable:
+        top.lines.extend(lines_of(SECTIONS[""], {"reachable": case.reachable}))
     if base.scenarios and not case.scenarios:
         top.lines.append(_none("scenario", "none of the preset's runs"))
     table = schedule_table(case.loop)
@@ -136,15 +133,6 @@ def _sections(case, origin):
 def _none(name, doc="none"):
     """The line of a list or table that a preset has and the case does not."""
     return Line(name, {} if name == "sine" else [], {"unit": "-", "doc": doc})
-
-
-def _reachable(case, base):
-    """The line `reachable` where it is not as in `base`."""
-    why = unreachable(case) if case.reachable else None
-    if why:
-        return [Line("reachable", False, {"unit": "-", "doc": why})]
-    values = {"reachable": case.reachable} if case.reachable != base.reachable else {}
-    return lines_of(SECTIONS[""], values)
 
 
 def _building(case, loop, origin, same):
@@ -168,29 +156,20 @@ def _building(case, loop, origin, same):
     if origin is None:  # a steady inflow is a key of the tanks
         disturbing = _without_steady_inflow(disturbing)
     tables = [*disturbing, *signals.fault_tables(loop.faults)]
-    emptied = [
-        _none(name)
-        for name, field in (("inflow", "disturbance"), ("fault", "faults"))
-        if getattr(loop, field) is None and getattr(start, field, None) is not None
-    ]
+    gone = lambda field: getattr(loop, field) is None and getattr(start, field, None) is not None
+    lists = {"inflow": "disturbance", "fault": "faults"}
+    emptied = [_none(name) for name, field in lists.items() if gone(field)]
     first = Block("", [*lines_of(SECTIONS[""], top, units), *emptied])
-    return [
-        first,
-        *blocks,
-        *(block_of(section, values, units, names) for section, values in tables),
-    ]
+    return [first, *blocks, *(block_of(s, values, units, names) for s, values in tables)]
 
 
 def _without_steady_inflow(tables):
-    """Tables of a disturbance without what the tanks say."""
     rest = [(section, {k: v for k, v in row.items() if k != "inflow"}) for section, row in tables]
     return [(section, row) for section, row in rest if row]
 
 
 def _of_rig(section, number, values, units, names):
-    """The Block of a table of a rig; one without a name has a suggestion of one, and the first of
-    a list what it could have beside.
-    """
+    """The Block of a table of a rig, with suggestions of a name and of further keys."""
     block = block_of(section, values, units, names)
     if values.get("name") == "":
         block.lines[0] = block.lines[0]._replace(value=f"{section.name} {number}", on=False)
@@ -229,13 +208,9 @@ def _values(case, base, tankwise, same):
         line = _line(case, name, value, meta, _is_built(case, name, tankwise, same), base)
         if line is not None:
             groups.setdefault(part, []).append(line)
-    groups["clock"] = [
-        Line(toml(f"clock.{name}"), getattr(case.clock, name), meta) for name, meta in CLOCK.items()
-    ]
-    return [
-        Block("[values]", []),
-        *(Block("", lines, (PARTS[part],)) for part, lines in groups.items()),
-    ]
+    clock = CLOCK.items()
+    groups["clock"] = [Line(toml(f"clock.{n}"), getattr(case.clock, n), meta) for n, meta in clock]
+    return [Block("[values]", []), *(Block("", rows, (PARTS[p],)) for p, rows in groups.items())]
 
 
 def _settable(case):
@@ -315,10 +290,8 @@ def _tuning(case):
         of_measures = about is template.of_measure
         # functions of Python are left out of the file, commented out
         off, key = (unreadable(values), str) if of_measures else ((), toml)
-        lines = [
-            Line(key(name), text(value), about(case, name), name not in off)
-            for name, value in values.items()
-        ]
+        rows = values.items()
+        lines = [Line(key(n), text(v), about(case, n), n not in off) for n, v in rows]
         on = title != "objective" or any(line.on for line in lines)
         blocks.append(Block(SECTIONS[title].title, [*lines, *more], on=on))
     if case.covariance is not None:
@@ -421,7 +394,7 @@ def complete(case: Case, tankwise: bool = False) -> str:
     if any(line.name == "sine" for block in blocks for line in block.lines):
         titles.add("[reference.sine]")
     blocks += template.suggestions(case, titles)
-    return _text([HEAD.splitlines()] + [_commented(block) for block in blocks])
+    return _text([HEAD.splitlines(), *map(_commented, blocks)])
 
 
 def short(case: Case) -> str:
@@ -450,27 +423,24 @@ def short(case: Case) -> str:
     if origin is None or blocks[0].lines[0].name != "case":
         return complete(case)
     head = f"# {origin.title}; `jaxtank init {origin.name}` without --short prints every key"
-    different = _different(blocks, sections(origin), case)
+    suggested = {name.split("[")[0] for name in case.free}
+    suggested |= {"clock.dt", "clock.duration", "sensor.noise"}
+    different = _different(blocks, sections(origin), suggested)
     return _text([[head], *(_commented(block._replace(prose=())) for block in different)])
 
 
-def _different(blocks, preset, case):
-    """The Blocks of a file that differ from its preset's, and those that SHORT names; of [values]
-    also, as suggestions, what is free, the clock and the noise.
-    """
-    suggested = {name.split("[")[0] for name in case.free}
-    suggested |= {"clock.dt", "clock.duration", "sensor.noise"}
+def _different(blocks, preset, suggested):
+    """The Blocks that differ from the preset's, those of SHORT, and suggestions of [values]."""
     known = {line for block in preset for line in terse(block)}
-    tables, same, in_values, different = _by_title(blocks), _by_title(preset), False, []
+    same, in_values, different = _by_title(preset), False, []
+    alike = {title for title, rows in _by_title(blocks).items() if rows == same.get(title)}
+    alike -= {"", *SHORT}
     for block in blocks:
         in_values = block.title == "[values]" or (in_values and not block.title)
+        lines = [line for line in block.lines if line.on]
         if in_values:
-            lines = _new_first(block.lines, known, suggested)
-        elif block.on and (
-            block.title in ("", *SHORT) or tables[block.title] != same.get(block.title)
-        ):
-            lines = [line for line in block.lines if line.on]
-        else:
+            lines = _new_first(lines, known, suggested)
+        elif not block.on or block.title in alike:
             continue
         if lines or block.title:
             different.append(block._replace(lines=lines))
@@ -479,10 +449,9 @@ def _different(blocks, preset, case):
 
 def _new_first(lines, known, suggested):
     """Lines of [values] that are not `known`, then those that are `suggested`, commented out."""
-    lines = [line for line in lines if line.on]
     new = [line for line in lines if not set(terse(Block("", [line]))) <= known]
-    old = [line for line in lines if line not in new]
-    return new + [line._replace(on=False) for line in old if line.name.strip('"') in suggested]
+    old = [n for n in lines if n not in new and n.name.strip('"') in suggested]
+    return new + [line._replace(on=False) for line in old]
 
 
 def _by_title(blocks):

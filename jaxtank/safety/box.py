@@ -13,8 +13,7 @@ from jaxtank.core.tree import split_index
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants.tank_network import TankNetwork
 
-SIGMAS = 6.0
-"""Standard deviations of the sensor noise in the band."""
+SIGMAS = 6.0  # standard deviations of the sensor noise in the band
 
 LEAST_SIGMAS = 5.0
 """Standard deviations of the noise below which a band of the user's own is not relied on."""
@@ -63,9 +62,7 @@ def uncovered(widths: Widths) -> list[str]:
 
 
 def interval(part: Any, name: str, widths: Widths) -> tuple:
-    """Return the (least, largest) value of a leaf of an instrument, such as "actuator.lag"; 0 where
-    it is not in use.
-    """
+    """Return the (least, largest) value of a leaf such as "actuator.lag"; 0 where not in use."""
     value = getattr(part, name.partition(".")[2], None)
     return spread(0.0 if value is None else value, name, widths)
 
@@ -98,15 +95,12 @@ def intervals(widths: Widths, parts: Mapping[str, Any]) -> dict[str, tuple]:
 
 
 def widths_of(part: Any, spread: Mapping[str, float]) -> dict[str, np.ndarray]:
-    """Return the half widths of `box_of` for parameters of a plant or an instrument that may be off
-    by a share of their value.
-    """
+    """Return the half widths of `box_of` for parameters that may be off by a share."""
     widths = {}
     for name, share in spread.items():
         if not 0.0 <= share < 1.0:
-            raise InputError(
-                f"safety_filter: spread of {name} = {share:g}: must be from 0 to below 1"
-            )
+            spread_of = f"safety_filter: spread of {name}"
+            raise InputError(f"{spread_of} = {share:g}: must be from 0 to below 1")
         field, entry = split_index(name.rpartition(".")[2])
         value = np.abs(np.asarray(getattr(part, field, 0.0), dtype=float))
         widths[name] = share * value[entry]
@@ -116,19 +110,13 @@ def widths_of(part: Any, spread: Mapping[str, float]) -> dict[str, np.ndarray]:
 def narrow_band(sensor: LevelSensor, band: np.ndarray, unit: str, widths: Widths) -> list[str]:
     """Return for each tank why a band cannot be relied on, "" where it can."""
     least = band_of(sensor, LEAST_SIGMAS, widths) + 0.0 * band
-    words = (
-        f"below {LEAST_SIGMAS:g} standard deviations of the noise, half an ADC step and the offset"
-    )
-    return [
-        f"noise band {b:.3g} {unit} {words}, {m:.3g} {unit}" if b < m * (1.0 - 1e-9) else ""
-        for b, m in zip(band, least)
-    ]
+    words = f"{LEAST_SIGMAS:g} standard deviations of the noise, half an ADC step and the offset"
+    reason = lambda b, m: f"noise band {b:.3g} {unit} below {words}, {m:.3g} {unit}"
+    return [reason(b, m) if b < m * (1.0 - 1e-9) else "" for b, m in zip(band, least)]
 
 
 def band_of(sensor: LevelSensor, sigmas: float = SIGMAS, widths: Widths = NONE) -> np.ndarray:
-    """Return the (n,) band of readings [cm]: 6 standard deviations, half an ADC step, offset, and
-    the level below which a sensor reads nothing; each the largest over the box.
-    """
+    """Return the (n,) band of readings [cm]: noise, ADC, offset, lower end; largest of the box."""
     ends = lambda leaf: interval(sensor, f"sensor.{leaf}", widths)
     band = sigmas * ends("noise")[1]
     if sensor.offset is not None:

@@ -31,8 +31,7 @@ from jaxtank.safety.low_limits import check_low, failed_low
 from jaxtank.safety.upper_limits import choose, rate_bound
 from jaxtank.safety.worst_case import rates_of
 
-UNKNOWN = 1e6
-"""Stands for a level [cm] or a time [s] without a bound."""
+UNKNOWN = 1e6  # stands for a level [cm] or a time [s] without a bound
 
 
 @dataclasses.dataclass(frozen=True)
@@ -281,10 +280,8 @@ def _predicted(setting, widths):
 def _of_pumps(actuator, dead, widths):
     """The fields of Setting that describe the pumps, of dead zones `dead` [V]."""
     leaves = ("low", "high", "initial", "delay", "lag")
-    least, most = (
-        dict(zip(leaves, ends))
-        for ends in zip(*(interval(actuator, f"actuator.{leaf}", widths) for leaf in leaves))
-    )
+    ends = zip(*(interval(actuator, f"actuator.{leaf}", widths) for leaf in leaves))
+    least, most = (dict(zip(leaves, end)) for end in ends)
     delay, lag = float(most["delay"]), float(np.max(most["lag"]))
     under_way = delay > 0.0 or lag > 0.0
     above = np.any(most["initial"] > least["high"])

@@ -18,15 +18,14 @@ from jaxtank.safety.known_features import (
     SIGMAS,
     first_failure,
     readable,
+    span_of,
     unknown_feature,
 )
 
 LIMITS, CASE = "limits", "case"
 """Levels at t = 0 for which a verdict holds: any at or below the limits, or the case's start."""
-SHALLOW = 0.05
-"""a0 of Theorem 2 as a share of the root of the limit."""
-PARTS = 1000
-"""Intervals of readings on which least inputs and caps are compared."""
+SHALLOW = 0.05  # a0 of Theorem 2 as a share of the root of the limit
+PARTS = 1000  # intervals of readings on which least inputs and caps are compared
 ROUNDING = 1e-9
 
 
@@ -70,7 +69,9 @@ def check(
         return not_proved(why)
     rig = _Rig(safety_filter, plant, actuator, sensor, hold, substeps, box, faults)
     rig.disturbed(inflow, volume, draws)
-    least, start = _span_of_start(start, box)
+    least = start
+    if start is not None and "x0" in box:
+        least, start = (np.asarray(v, dtype=float) for v in box["x0"])
     claimed = rig.limit + rig.spare if limits is None else np.asarray(limits, float)
     if why := rig.uncovered():
         return not_proved(why)
@@ -78,13 +79,6 @@ def check(
     upper = from_any if start is None else _joint(rig, np.asarray(start, float), claimed)
     lows = _joint_low(rig, least, upper)
     return tuple(_verdict(rig, i, from_any, upper, lows[i]) for i in range(tanks))
-
-
-def _span_of_start(start, box):
-    """(least, largest) levels at t = 0 (n,) [cm], or (None, None)."""
-    if start is None or "x0" not in box:
-        return start, start
-    return tuple(np.asarray(v, dtype=float) for v in box["x0"])
 
 
 def _verdict(rig, i, from_any, upper, low_reason):
@@ -97,12 +91,6 @@ def _verdict(rig, i, from_any, upper, low_reason):
         low_holds=bool(limited and not low_reason),
         low_reason=low_reason or ("Low limits" if limited else ""),
     )
-
-
-def _at(name):
-    """(name without its index, index of its entry or ...)."""
-    base, _, entry = name.partition("[")
-    return base, int(entry.rstrip("]")) if entry else ...
 
 
 def _root(h, knee):
@@ -136,23 +124,12 @@ class _Rig:
         for name in ("held", "kept", "divided", "running"):
             setattr(self, name, set(getattr(safety_filter, name, ())))
         self.predicted = int(safety_filter.predicted)
-        self.box, self.faults = dict(box), faults
+        self.faults, self.span = faults, functools.partial(span_of, dict(box))
         self.rim, self.highest_rim = (full(v) for v in self.span("plant.rim", plant.rim))
         self.caught = self.span("plant.caught", plant.caught)[1]
         self._coefficients(safety_filter.least, safety_filter.most, hold / substeps)
         self._pumps(actuator, full)
         self.needed, self.top = readable(sensor, self.span, full)
-
-    def span(self, name, value):
-        """(lower, upper) of a leaf over the box."""
-        value = np.asarray(0.0 if value is None else value, dtype=float)
-        low, high = value.copy(), value.copy()
-        for other, (lower, upper) in self.box.items():
-            base, at = _at(other)
-            if base == name:
-                low[at] = np.minimum(low[at], np.asarray(lower, float))
-                high[at] = np.maximum(high[at], np.asarray(upper, float))
-        return low, high
 
     def _coefficients(self, least, most, step):
         plant, n = self.plant, self.tanks
@@ -272,7 +249,8 @@ class _Rig:
         counted = {name: (low.copy(), high.copy()) for name, (low, high) in ends.items()}
         entries = () if faults is None else zip(faults.windows, faults.factor, faults.extra)
         for (name, *_), factor, extra in entries:
-            field, at = _at(name)
+            field, _, entry = name.partition("[")
+            at = int(entry.rstrip("]")) if entry else ...
             yield field in ends, f"not covered: fault of plant.{name}"
             low, high = (end[at] for end in ends[field])
             moved = factor * low + extra, factor * high + extra
@@ -314,9 +292,7 @@ def _ends(safety_filter):
 
 
 class _Hypotheses(NamedTuple):
-    """Assumptions on all tanks (n,): upper bounds of the levels [cm], whether a tank never
-    overflows, largest levels at t = 0 [cm]; and whether these are the case's start.
-    """
+    """Assumptions on all tanks (n,): upper bounds [cm], no overflow, largest start [cm]."""
 
     bounds: np.ndarray
     dry: np.ndarray
@@ -333,9 +309,7 @@ class _JointResult(NamedTuple):
 
 
 def _joint(rig, start, claimed):
-    """The largest set of tanks whose limits are kept together, from `start` or (None) from any
-    levels at or below the claimed limits (n,) [cm].
-    """
+    """The largest set of tanks whose limits are kept together, from `start`, or from any levels."""
     level = np.array(rig.limit)  # before volumes that enter besides
     if start is None:
         free = [i for i in range(rig.tanks) if i not in rig.held]
@@ -344,7 +318,9 @@ def _joint(rig, start, claimed):
     inside, bounded = set(range(rig.tanks)), set(range(rig.tanks))
     dry, alone = np.ones(rig.tanks, dtype=bool), None
     while True:
-        bounds = _bounds(rig, level, inside, bounded)
+        bounds = np.full(rig.tanks, np.inf)
+        bounds[list(bounded)] = rig.reach[list(bounded)]
+        bounds[list(inside)] = (level + rig.spare)[list(inside)]
         still = dry & (bounds <= rig.rim * (1.0 + 1e-12))
         at = _Hypotheses(bounds, still, begin, start is not None)
         upper = [_upper(rig, i, level[i], at) for i in range(rig.tanks)]
@@ -358,14 +334,6 @@ def _joint(rig, start, claimed):
     lost = set(range(rig.tanks)) - inside
     reasons = [_reason(rig, i, alone[i][0], upper[i][0], lost) for i in range(rig.tanks)]
     return _JointResult(reasons, [theorem for _, theorem in upper], bounds)
-
-
-def _bounds(rig, level, inside, bounded):
-    """(n,) upper bounds of the levels [cm] where the tanks `inside` keep their limits."""
-    bounds = np.full(rig.tanks, np.inf)
-    for i in bounded | inside:
-        bounds[i] = level[i] + rig.spare[i] if i in inside else rig.reach[i]
-    return bounds
 
 
 def _loose_and_wet(rig, tanks, at, dry):
@@ -385,9 +353,7 @@ def _reason(rig, i, alone, together, lost):
 
 
 def _stays(rig, i, at):
-    """What keeps the level of a tank below its `reach`, whatever its pumps do: "flows", or the
-    "rim" over which the rest overflows; or "".
-    """
+    """What keeps a level below its `reach`, whatever its pumps do: "flows", the "rim", or ""."""
     top = rig.reach[i] - rig.spare[i]
     if not (at.begin[i] <= top * (1.0 + 1e-12) and math.isfinite(top) and top > 0.0):
         return ""
@@ -430,11 +396,14 @@ def _ringed(spills, tank):
 
 
 def _upper(rig, i, level, at):
-    """(why the limit of a tank is not proved with the others at their bounds, or ""; the
-    theorem).
-    """
-    if why := first_failure(_begins(rig, i, level, at)):
+    """(why a limit is not proved with the other tanks at their bounds, or ""; the theorem)."""
+    if not at.begin[i] <= level * (1.0 + 1e-12):
+        unit = rig.unit
+        return f"start at {at.begin[i]:.4g} {unit}, above the limit {level:.4g} {unit}", ""
+    if why := first_failure(_entering(rig, i, at)):
         return why, ""
+    if not all(math.isfinite(at.bounds[k]) for k in rig.neighbours(i)):
+        return "a tank beside it has no bound", ""
     if i in rig.held:
         return _upper_of_row(rig, i, level, at)
     theorem = "full pumps stay below" if rig.gains[i] else ""
@@ -461,14 +430,6 @@ def _upper_of_row(rig, i, level, at):
         return first_failure(_predicted(rig, i, level, at)), "Theorem 5"
     theorem = "Theorem 4" if lag > 0.0 else "Theorem 3"
     return first_failure(_late(rig, i, level, lag, at)), theorem
-
-
-def _begins(rig, i, level, at):
-    reason = f"start at {at.begin[i]:.4g} {rig.unit}, above the limit {level:.4g} {rig.unit}"
-    yield at.begin[i] <= level * (1.0 + 1e-12), reason
-    yield from _entering(rig, i, at)
-    bounded = all(math.isfinite(at.bounds[k]) for k in rig.neighbours(i))
-    yield bounded, "a tank beside it has no bound"
 
 
 def _rate_of_hold(rig, i, what):
@@ -518,15 +479,10 @@ def _readable(rig, i, bounds):
         reason = f"may move liquid above {dead:.4g} V, {counts} {rig.offset[j]:.4g} V"
         yield rig.offset[j] <= dead * (1.0 + 1e-12), f"pump {j + 1} {reason}"
     age = float(rig.filter.age)
-    yield (
-        not near or age >= rig.delay[1] * (1.0 - ROUNDING),
-        f"dead time {rig.delay[1]:.4g} s, {counts} {age:.4g} s",
-    )
-    beyond = any(
-        rig.under_way[j] > max(rig.capped[j], 0.0) or rig.high[j] > rig.capped[j]
-        for k in near
-        for j in rig.gains[k]
-    )
+    reason = f"dead time {rig.delay[1]:.4g} s, {counts} {age:.4g} s"
+    yield not near or age >= rig.delay[1] * (1.0 - ROUNDING), reason
+    most = np.maximum(rig.high, np.where(rig.under_way > 0.0, rig.under_way, -np.inf))
+    beyond = any(most[j] > rig.capped[j] for k in near for j in rig.gains[k])
     reason = "not covered: a pump of a tank beside it may run above its upper limit"
     yield age >= 1e5 or not beyond, reason
 
@@ -567,7 +523,10 @@ def _second_order(rig, i, at):
         yield rest > most * a0, f"(C3) {rest:.3g} not above {most * a0:.3g} {unit}/s"
     reason = f"(C2) k1 H = {k1 * top:.4g} below F = {full:.4g} {unit}/s"
     yield k1 * top >= full * (1.0 - ROUNDING), reason
-    star = _falling(rig.out[i], k1, top, full, knee)
+    # the least level h* from which out s(h) + k1 (H - h) is below F up to H, H if none: it is
+    # concave in h and at 0 not below F, so there is one crossing
+    falling = lambda h: rig.out[i] * s(h) + k1 * (top - h)
+    star = top if falling(top) >= full else _bisected(lambda h: falling(h) >= full, 0.0, top)
     drained = sum(0.5 * most * rig.out[j] for j, most in sources.items())
     steep = k1 * k1 * (top - star)
     reason = f"(C1) k1^2 (H - h*) = {steep:.4g} above D = {drained:.4g} {unit}/s^2"
@@ -580,14 +539,6 @@ def _second_order(rig, i, at):
     g = rig.out[i] * s(at.begin[i]) + k1 * (top - at.begin[i])
     g -= sum(most * max(s(at.begin[j]), a0) for j, most in sources.items())
     yield g >= -1e-12 * full, "start: the tanks above hold more than can be stopped in time"
-
-
-def _falling(out, k1, top, full, knee):
-    """The least level h* [cm] from which out s(h) + k1 (H - h) is below F up to H, H if none."""
-    f = lambda h: out * _root(h, knee) + k1 * (top - h)
-    if f(top) >= full:
-        return top
-    return _bisected(lambda h: f(h) >= full, 0.0, top)  # f is concave and f(0) >= F: one crossing
 
 
 def _bisected(below, low, high):
@@ -619,12 +570,10 @@ def _late(rig, i, level, lag, at):
         yield shallow <= 0.25 * level, reason
         far = all(_far(rig, k) for k in rig.neighbours(i))
         yield far, "not covered: lag where the rates of other tanks bound their levels"
-        sigma, bound = _sigma(kappa, lag, age), _rate(_best(lag, age), lag, age)
+        sigma, bound = _sigma(kappa, lag, age)
         yield sigma > 0.0, f"kappa {kappa:.4g} above its bound {bound:.4g} 1/s"
-        filled, most = (
-            _row_inflow(rig, i, rig.most) + rig.rise(i, 0.0, at.bounds),
-            0.75 * sigma * level,
-        )
+        filled = _row_inflow(rig, i, rig.most) + rig.rise(i, 0.0, at.bounds)
+        most = 0.75 * sigma * level
         reason = f"(F) {filled:.3g} {unit}/s may enter, above 3/4 sigma H = {most:.3g}"
         yield filled <= most, reason
     else:
@@ -635,7 +584,12 @@ def _late(rig, i, level, lag, at):
     allowed = -rig.rise(i, level, at.bounds)  # by (N), at or below H
     if at.of_case:
         # concave in the level on either side of `empty`
-        others = at.bounds if lag > 0.0 else _soon(rig, at)
+        others = at.bounds
+        if lag == 0.0:  # levels that the tanks can have until the first input of the filter ends
+            most = rig.delay[1] + rig.hold
+            fastest = lambda k: rig.pumped(k, rig.most) + max(rig.rise(k, 0.0, at.bounds), 0.0)
+            risen = [at.begin[k] + rig.spare[k] + most * fastest(k) for k in range(rig.tanks)]
+            others = np.minimum(at.bounds, risen)
         ends = {0.0, *(min(at.begin[i], h) for h in (np.nextafter(empty, 0.0), empty, level))}
         allowed = min(kappa * (level - h) - rig.rise(i, h, others) for h in ends)
     reason = f"{entering:.4g} {unit}/s under way, {max(allowed, 0.0):.4g} allowed"
@@ -643,9 +597,7 @@ def _late(rig, i, level, lag, at):
 
 
 def _row_inflow(rig, i, inputs):
-    """Largest rise rate [cm/s] by pumps at `inputs` (m) [V]; for a divided row, that of all pumps
-    if each used the same part of its share as the pump that uses the largest part.
-    """
+    """Largest rise rate [cm/s] by pumps at `inputs` (m) [V]; of a divided row by one share."""
     if i not in rig.divided:
         return rig.pumped(i, inputs)
     full, shares = rig.pumped(i, rig.capped), [0.0]
@@ -656,36 +608,20 @@ def _row_inflow(rig, i, inputs):
     return max(shares)
 
 
-def _soon(rig, at):
-    """(n,) levels [cm] that the tanks can have until the first input of the filter ends."""
-    age = rig.delay[1] + rig.hold
-    fastest = lambda k: rig.pumped(k, rig.most) + max(rig.rise(k, 0.0, at.bounds), 0.0)
-    risen = [at.begin[k] + rig.spare[k] + age * fastest(k) for k in range(rig.tanks)]
-    return np.minimum(at.bounds, risen)
-
-
 def _far(rig, k):
     """Whether the filter bounds the level of tank k by its `reach` alone, whatever it reads."""
     rate = rig.pumped(k, rig.capped) + max(rig.rise(k, 0.0, rig.reach), 0.0)
     return (rig.hold + float(rig.filter.age)) * rate + rig.spare[k] >= rig.reach[k]
 
 
-def _rate(sigma, lag, age):
-    return sigma * (1.0 - lag * sigma) * math.exp(-sigma * age)
-
-
-def _best(lag, age):
-    """The sigma that allows the largest kappa: where the slope of `_rate` is 0."""
-    slope = lambda sigma: (1.0 - 2.0 * lag * sigma) - age * sigma * (1.0 - lag * sigma)
-    return _bisected(lambda sigma: slope(sigma) > 0.0, 0.0, 1.0 / lag)
-
-
 def _sigma(kappa, lag, age):
-    """The largest sigma [1/s] with kappa <= sigma (1 - tau sigma) e^(-sigma a), 0 if none."""
-    best = _best(lag, age)
-    if not kappa <= _rate(best, lag, age) * (1.0 + 1e-12):
-        return 0.0
-    return _bisected(lambda sigma: _rate(sigma, lag, age) >= kappa, best, 1.0 / lag)
+    """(largest sigma with kappa <= r(sigma) = sigma (1 - tau sigma) e^(-sigma a), or 0; max r)."""
+    rate = lambda sigma: sigma * (1.0 - lag * sigma) * math.exp(-sigma * age)
+    slope = lambda sigma: (1.0 - 2.0 * lag * sigma) - age * sigma * (1.0 - lag * sigma)
+    best = _bisected(lambda sigma: slope(sigma) > 0.0, 0.0, 1.0 / lag)
+    if not kappa <= rate(best) * (1.0 + 1e-12):
+        return 0.0, rate(best)
+    return _bisected(lambda sigma: rate(sigma) >= kappa, best, 1.0 / lag), rate(best)
 
 
 def _predicted(rig, i, level, at):
@@ -760,11 +696,9 @@ def _lower(rig, i, proved, begin, upper):
     reason = "not covered: a low limit kept by several pumps that may run backwards"
     yield forwards, reason
     edges = np.linspace(low - eps, upper.bounds[i] + eps, PARTS + 1)
-    needed = [
-        -rig.fall(i, b + eps, rig.bottom) - kappa * (a - eps - low)
-        for a, b in zip(edges[:-1], edges[1:])
-    ]
-    needed = np.minimum(needed, full)
+    pairs = zip(edges[:-1], edges[1:])
+    needs = lambda a, b: -rig.fall(i, b + eps, rig.bottom) - kappa * (a - eps - low)
+    needed = np.minimum([needs(a, b) for a, b in pairs], full)
     share = min(a / b for a, b in gains.values() if b > 0.0)
     allowed = np.all(needed <= share * _caps(rig, i, edges) + 1e-12)
     yield allowed, "floor above cap: the upper limit is kept first"
@@ -776,11 +710,8 @@ def _caps(rig, i, edges):
     if i not in rig.held:
         return np.full(len(edges) - 1, np.inf)
     eps = rig.band[i]
-    allowed = [
-        rig.rate[i] * (rig.limit[i] - b - eps) - rig.rise(i, a - eps, rig.reach)
-        for a, b in zip(edges[:-1], edges[1:])
-    ]
-    return np.maximum(allowed, 0.0)
+    room = rig.rate[i] * (rig.limit[i] - edges[1:] - eps)
+    return np.maximum(room - [rig.rise(i, a - eps, rig.reach) for a in edges[:-1]], 0.0)
 
 
 def _caps_of_others(rig, i, needed):

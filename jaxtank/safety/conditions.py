@@ -54,9 +54,7 @@ class Setting(NamedTuple):
         return [(j, most) for j, sink, _, most in self.rates.links if sink == tank]
 
     def pumped(self, tank, inputs):
-        """What pumps at `inputs` (m,) [V] bring at most [cm/s]; with a divided row the total at
-        which the pump that needs most of its share has it.
-        """
+        """What pumps at `inputs` (m,) [V] bring at most [cm/s]; of a divided row by one share."""
         gains = [(j, b) for j, (_, b) in self.rates.pumps[tank].items() if b > 0.0]
         if tank not in self.divided:
             return sum(b * max(inputs[j], 0.0) for j, b in gains)
@@ -84,10 +82,7 @@ class Setting(NamedTuple):
 
 
 class Chosen(NamedTuple):
-    """kappa [1/s], limits (n,) [cm], k1 (n,) [1/s], which tanks full pumps cannot fill, [the
-    condition of each tank that failed, or ""], and levels that no tank passes (n,) [cm], all before
-    volumes that enter besides.
-    """
+    """kappa, limits, k1, tanks full pumps cannot fill, failed conditions, levels never passed."""
 
     rate: float
     heights: np.ndarray
@@ -111,17 +106,6 @@ def highest_level(rate, top):
         mid = 0.5 * (low + high)
         low, high = (mid, high) if rate(mid) > 0.0 else (low, mid)
     return low
-
-
-def theorem_of(setting, tank):
-    """What proves the limit of a tank without a second-order row."""
-    if not setting.rates.pumps[tank]:
-        return "no pump, and its inflow cannot pass the limit"
-    if setting.lag > 0.0:
-        return "Theorem 4"
-    if setting.predicted:
-        return "Theorem 5"
-    return "Theorem 3" if setting.delay > 0.0 else "Theorem 1"
 
 
 def _conditions(setting, tank, limits, bound, start, reach):
@@ -182,10 +166,8 @@ def _start_allowed(setting, tank, limits, begin, reach):
         others[k] = min(reach[k], begin[k] + age * fastest)
     entering, h = setting.under_way(tank), begin[tank]
     # the allowed inflow is concave in the level, except for the step at `empty`
-    allowed = min(
-        kappa * (top - h) - setting.rise(tank, h, others),
-        kappa * (top - min(h, setting.rates.empty[tank])) - setting.rise(tank, 0.0, others),
-    )
+    allowed = kappa * (top - min(h, setting.rates.empty[tank])) - setting.rise(tank, 0.0, others)
+    allowed = min(kappa * (top - h) - setting.rise(tank, h, others), allowed)
     reason = f"{entering:.3g} {setting.unit}/s under way, {max(allowed, 0.0):.3g} allowed"
     holds = entering <= max(allowed * (1.0 + 1e-9), setting.unstoppable(tank))
     return holds, f"(S) start: {reason}"
@@ -251,9 +233,7 @@ def _relied_on(setting, tank, limits, reasons, reach):
 
 
 def _reach(setting, heights, reasons, plant, start):
-    """(n,) levels that no tank passes [cm]: H where certified, else where its inflow can rest, or
-    its start.
-    """
+    """(n,) levels that no tank passes [cm]: H where certified, else its rest or its start."""
     begin = heights if start is None else np.maximum(heights, start)
     rim = np.asarray(plant.rim, dtype=float)
     highest = np.maximum(rim, begin) if plant.overflow else np.full(len(heights), np.inf)
@@ -269,9 +249,7 @@ def _reach(setting, heights, reasons, plant, start):
 
 
 def spills(setting, plant, limits, start):
-    """((n,) what falls at most into each tank from rims [cm^3/s], (n) features that no theorem
-    covers). A tank spills unless it is proved for a limit at or below its rim.
-    """
+    """((n,) what falls at most into each tank from rims [cm^3/s], (n) features not covered)."""
     (least, most), uncovered = plant, list(setting.uncovered)
     falls = np.zeros(len(uncovered))
     for k, (source, sink) in enumerate(least.spills):

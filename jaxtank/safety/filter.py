@@ -165,13 +165,8 @@ class SafetyFilter:
         """
         n, r = self.least.tanks, rates_of(self.least, self.most, self.inflow, hold, self.draw)
         fastest = [self._fastest(r, i, high) for i in range(n)]
-        above = [
-            jnp.minimum(
-                self.reach[i], y[i] + self.band[i] + (hold + self.age) * fastest[i] + self.spare[i]
-            )
-            for i in range(n)
-        ]
-        above = materialised(above)
+        risen = lambda i: y[i] + self.band[i] + (hold + self.age) * fastest[i] + self.spare[i]
+        above = materialised([jnp.minimum(self.reach[i], risen(i)) for i in range(n)])
         rows, below = [], self._lowest(r, y, hold, low) if self.predicted else []
         for i in self.held:
             if r.pumps[i]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterable, Mapping
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,8 +34,7 @@ UNCERTAIN = {
 }
 
 
-SIGMAS = 5.0
-"""Standard deviations of the noise that a band must have at least."""
+SIGMAS = 5.0  # standard deviations of the noise that a band must have at least
 
 
 class Known(NamedTuple):
@@ -51,11 +51,9 @@ class Known(NamedTuple):
 
 PLAIN = Known(("jaxtank.safety.filter", "SafetyFilter"), KNOWN, UNCERTAIN)
 STATIC = ("sources", "curves", "lift_curves", "valves", "characteristics", "one_way", "shapes")
-FIXED = ("rangeability", "spill_port", "valve_port", "pipe_port") + tuple(
-    f"{opening}_{option}"
-    for opening in ("drain", "orifice")
-    for option in ("port", "exponent", "resistance")
-)
+FIXED = ("rangeability", "spill_port", "valve_port", "pipe_port")
+FIXED += ("drain_port", "drain_exponent", "drain_resistance")
+FIXED += ("orifice_port", "orifice_exponent", "orifice_resistance")
 OUTLETS = Known(
     filter=("jaxtank.safety.outlets", "OutletFilter"),
     fields={
@@ -85,46 +83,51 @@ def first_failure(conditions: Iterable[tuple[Any, str]]) -> str:
 
 def unknown_feature(parts: Mapping[str, Any], box: Mapping[str, Any], known: Known = PLAIN) -> str:
     """The first feature that is not on the closed list, or a number that is none; or ""."""
-    why = first_failure(_known_classes(parts, known))
-    why = why or first_failure(_known_fields(parts, known))
-    return why or first_failure(_known_names(box, known))
+    return first_failure(chain(_features(parts, known), _known_names(box, known)))
 
 
-def _known_classes(parts, known):
+def _features(parts, known):
+    """(holds, reason) of the classes of all parts, and of their fields."""
     for part, kind in CLASSES.items():
         value = parts.get(part)
         if part in parts:
             yield type(value) is kind, f"not covered: {part} of class {type(value).__name__}"
-    kind = type(parts["safety_filter"])
+    safety_filter = parts["safety_filter"]
+    kind = type(safety_filter)
     same = (kind.__module__, kind.__name__) == known.filter
     yield same, f"not covered: safety filter of class {kind.__name__}"
-    for end in ("least", "most"):
-        kind = type(getattr(parts["safety_filter"], end))
-        network = kind is TankNetwork
-        yield network, f"not covered: safety_filter.{end} of class {kind.__name__}"
-
-
-def _known_fields(parts, known):
-    safety_filter = parts["safety_filter"]
     ends = {f"safety_filter.{end}": getattr(safety_filter, end) for end in ("least", "most")}
+    for end, plant in ends.items():
+        network = type(plant) is TankNetwork
+        yield network, f"not covered: {end} of class {type(plant).__name__}"
     for part, value in {**parts, **ends}.items():
         fields = known.fields["plant" if part in ends else part]
         for name in (field.name for field in dataclasses.fields(value)):
             entry = getattr(value, name)
-            yield name in fields or _neutral(entry), f"not covered: {part}.{name}"
+            neutral = entry is None or entry is False or (isinstance(entry, tuple) and not entry)
+            yield name in fields or neutral, f"not covered: {part}.{name}"
             number = name not in fields or not _has_nan(entry)
             yield number, f"not covered: {part}.{name} is no number"
 
 
 def _known_names(box, known):
-    for name, ends in box.items():
+    for name, interval in box.items():
         covered = name.partition("[")[0] in known.uncertain or name.startswith(HARMLESS)
         yield covered, f"not covered: uncertain {name}"
-        yield not any(map(_has_nan, ends)), f"not covered: uncertain {name} is no number"
+        yield not any(map(_has_nan, interval)), f"not covered: uncertain {name} is no number"
 
 
-def _neutral(entry):
-    return entry is None or entry is False or (isinstance(entry, tuple) and not entry)
+def span_of(box, name, value):
+    """(lower, upper) of a leaf over the {name or name[i]: (lower, upper)} of a box."""
+    value = np.asarray(0.0 if value is None else value, dtype=float)
+    low, high = value.copy(), value.copy()
+    for other, (lower, upper) in box.items():
+        base, _, entry = other.partition("[")
+        if base == name:
+            at = int(entry.rstrip("]")) if entry else ...
+            low[at] = np.minimum(low[at], np.asarray(lower, dtype=float))
+            high[at] = np.maximum(high[at], np.asarray(upper, dtype=float))
+    return low, high
 
 
 def _has_nan(entry):
@@ -140,10 +143,8 @@ def readable(sensor, span, full):
     """((n,) least band, (n,) highest level that is read for certain [cm]); `span` of a leaf over
     the box, `full` makes it (n,).
     """
-    ends = {
-        name: span(f"sensor.{name}", getattr(sensor, name))
-        for name in ("noise", "offset", "low", "high", "gain", "full_scale")
-    }
+    names = ("noise", "offset", "low", "high", "gain", "full_scale")
+    ends = {name: span(f"sensor.{name}", getattr(sensor, name)) for name in names}
     needed = full(SIGMAS * ends["noise"][1]) + np.maximum(*map(np.abs, ends["offset"]))
     top = full(np.inf if sensor.high is None else ends["high"][0])
     if sensor.low is not None:  # a lower level is read as this one

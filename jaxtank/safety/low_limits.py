@@ -6,8 +6,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.safety.conditions import first_failure
 from jaxtank.safety.worst_case import PLAIN, rise
 
-INTERVALS = 400
-"""Intervals of readings on which least inputs and caps are compared."""
+INTERVALS = 400  # intervals of readings on which least inputs and caps are compared
 
 
 def check_low(low, limits, length):
@@ -25,9 +24,8 @@ def failed_low(setting, low, chosen, start):
     there is none] and (n,) the levels below which no tank falls for certain [cm].
     """
     tanks = range(len(low))
-    reasons = [
-        first_failure(_alone(setting, i, low, chosen, start)) if low[i] > 0.0 else "" for i in tanks
-    ]
+    alone = lambda i: first_failure(_alone(setting, i, low, chosen, start))
+    reasons = [alone(i) if low[i] > 0.0 else "" for i in tanks]
     while True:
         bottom = np.array([0.0 if reasons[i] else low[i] for i in tanks])
         before, reasons = reasons, list(reasons)
@@ -61,9 +59,8 @@ def _beside_others(setting, tank, low, bottom, chosen):
     gains, band = setting.rates.pumps[tank], setting.band[tank]
     full = sum(least * max(setting.weakest[j], 0.0) for j, (least, _) in gains.items())
     falling = -setting.fall(tank, low[tank], bottom)
-    reason = (
-        f"{falling:.3g} {setting.unit}/s may leave at the low limit, {full:.3g} enter for certain"
-    )
+    leaves = f"{falling:.3g} {setting.unit}/s may leave at the low limit"
+    reason = f"{leaves}, {full:.3g} enter for certain"
     yield falling <= full * (1.0 + 1e-12), reason
     if not gains:
         return

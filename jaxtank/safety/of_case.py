@@ -23,12 +23,10 @@ from jaxtank.signals.inflows import InflowPulses
 
 FLOWS = ("drain", "orifice", "pipe", "pump_gain", "split", "valve")
 """Leaves of a plant that may change in time: the volume in a tank does not depend on them."""
-UNKNOWN = (*FLOWS, "extent")
-"""Leaves that are uncertain by SPREAD where a case names none."""
+UNKNOWN = (*FLOWS, "extent")  # leaves that are uncertain by SPREAD where a case names none
 HARMLESS = ("controller.", "observer.", "reference.")
 """What may be uncertain without a change of the box: limits hold under any controller."""
-SPREAD = 0.05
-"""Share by which every flow may be off where a case does not say what is uncertain."""
+SPREAD = 0.05  # share by which every flow may be off where a case does not say what is uncertain
 PROBABILITY = 0.99
 """Share of a normal distribution in the ellipsoid whose box stands for a covariance."""
 
@@ -147,10 +145,9 @@ def _not_proved(row, reason):
 def _equal(first, second):
     """Whether two filters have the same structure and, to rounding, the same numbers."""
     (a, structure), (b, other) = jax.tree.flatten(first), jax.tree.flatten(second)
-    same = lambda x, y: np.allclose(x, y, rtol=1e-9, atol=0.0, equal_nan=True)
-    return structure == other and all(
-        np.shape(x) == np.shape(y) and same(x, y) for x, y in zip(a, b)
-    )
+    near = lambda x, y: np.allclose(x, y, rtol=1e-9, atol=0.0, equal_nan=True)
+    same = lambda x, y: np.shape(x) == np.shape(y) and near(x, y)
+    return structure == other and all(map(same, a, b))
 
 
 def _box(case, widths):
@@ -220,10 +217,9 @@ def _beyond(case, safety_filter):
         if part != "plant":
             continue
         field, entry = split_index(leaf)
-        value, least, most = (
-            np.asarray(getattr(plant, field), dtype=float)[entry]
-            for plant in (case.loop.plant, safety_filter.least, safety_filter.most)
-        )
+        plants = case.loop.plant, safety_filter.least, safety_filter.most
+        leaves = (np.asarray(getattr(plant, field), dtype=float) for plant in plants)
+        value, least, most = (leaf[entry] for leaf in leaves)
         half = np.asarray(half) * (1.0 - 1e-9)
         top = np.minimum(value + half, 1.0) if field in ("split", "caught") else value + half
         if np.any(value - half < least) or np.any(top > most):

@@ -7,7 +7,6 @@ It works on the final numbers with its own formulas; Theorem 6 of README.md of t
 import functools
 import math
 from collections.abc import Mapping
-from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,15 +14,12 @@ import scipy  # its parts are imported when they are first used
 
 from jaxtank.core.labels import label_of
 from jaxtank.safety.checker import CASE, LIMITS, Verdict
-from jaxtank.safety.known_features import OUTLETS, first_failure, readable, unknown_feature
+from jaxtank.safety.known_features import OUTLETS, first_failure, readable, span_of, unknown_feature
 
-PARTS = 500
-"""Intervals of readings on which floors and caps are compared."""
-FINE = 4000
-"""Levels at which a tank is tested for holding what it gives in a step."""
+PARTS = 500  # intervals of readings on which floors and caps are compared
+FINE = 4000  # levels at which a tank is tested for holding what it gives in a step
 ROUNDING = 1e-9
-UNKNOWN = 1e6
-"""Level [cm] from which a filter's bound of a level is none."""
+UNKNOWN = 1e6  # level [cm] from which a filter's bound of a level is none
 BOXED = ("area", "drain", "orifice", "pipe", "pump_gain", "split", "gravity", "valve", "extent")
 """Parameters of the plant that may lie anywhere between those of the filter's two plants."""
 
@@ -62,11 +58,12 @@ def check(
     parts |= {} if faults is None else {"faults": faults}
     tanks = len(np.atleast_1d(outlet_filter.limit))
     why = unknown_feature(parts, box, OUTLETS)
-    rig = None if why else _Rig(outlet_filter, plant, actuator, sensor, hold, substeps, box)
-    if rig is not None:
-        why = first_failure(_covered(rig, pulses, faults, inflow))
-    if rig is None or why:
-        return tuple(Verdict(i, False, why, CASE, False, why) for i in range(tanks))
+    not_proved = lambda why: tuple(Verdict(i, False, why, CASE, False, why) for i in range(tanks))
+    if why:
+        return not_proved(why)
+    rig = _Rig(outlet_filter, plant, actuator, sensor, hold, substeps, box)
+    if why := first_failure(_covered(rig, pulses, faults, inflow)):
+        return not_proved(why)
     upper, lower = _joint(rig)
     whole = not any(upper) and not any(why for why, low in zip(lower, rig.low) if low > 0.0)
     starts = LIMITS if whole else CASE
@@ -86,11 +83,9 @@ def _root(h, knee):
     return math.sqrt(h) if h >= knee else math.sqrt(knee) * h / knee * (1.5 - 0.5 * h / knee)
 
 
-def _power(h, exponent, knee):
-    if h >= knee:
-        return h**exponent
+def _power(h, p, knee):
     y = h / knee
-    return knee**exponent * max(y * (2.0 - exponent + (exponent - 1.0) * y), 0.0)
+    return h**p if y >= 1.0 else knee**p * max(y * (2.0 - p + (p - 1.0) * y), 0.0)
 
 
 def _volume(shape, area, extent, h):
@@ -140,7 +135,8 @@ class _Rig:
     def __init__(self, outlet_filter, plant, actuator, sensor, hold, substeps, box):
         self.filter, self.plant, self.actuator = outlet_filter, plant, actuator
         self.label = functools.partial(label_of, plant, "tank")
-        self.hold, self.step, self.box = float(hold), hold / substeps, dict(box)
+        self.hold, self.step = float(hold), hold / substeps
+        self.span = functools.partial(span_of, dict(box))
         self.weak, self.strong = outlet_filter.least, outlet_filter.most
         n, m = len(np.atleast_1d(plant.rim)), len(plant.feeds)
         self.n, self.m, self.inputs = n, m, m + len(plant.valves)
@@ -153,22 +149,10 @@ class _Rig:
         self.range = [[self.demand(j, v) for j, v in enumerate(end)] for end in self.ends]
         self.begin = [full(end) for end in box.get("x0", (0.0, 0.0))]
         self.needed, self.top = readable(sensor, self.span, full)
-        self.shallow = {}  # by tank, as far as computed
+        self.shallow = functools.cache(functools.partial(_shallow, self))
         order = [(*row, False) for row in outlet_filter.low_rows]
         order += [(*row, True) for row in outlet_filter.upper_rows]
         self.rows = [_Row(i, up, tuple(movers), k) for k, (i, movers, up) in enumerate(order)]
-
-    def span(self, name, value):
-        """(lower, upper) of a leaf over the box."""
-        value = np.asarray(0.0 if value is None else value, dtype=float)
-        low, high = value.copy(), value.copy()
-        for other, (lower, upper) in self.box.items():
-            base, _, entry = other.partition("[")
-            if base == name:
-                at = int(entry.rstrip("]")) if entry else ...
-                low[at] = np.minimum(low[at], np.asarray(lower, dtype=float))
-                high[at] = np.maximum(high[at], np.asarray(upper, dtype=float))
-        return low, high
 
     def demand(self, j, u):
         k = j - self.m
@@ -237,10 +221,8 @@ class _Rig:
     def piped(self, k, i, h, others, upper):
         """Harm of pipe k to tank i at one of its ends."""
         (other,) = set(self.plant.pipes[k]) - {i}
-        weak, strong = (
-            self.joined(end, end.pipe, end.pipe_port, k, h, others[other])
-            for end in (self.weak, self.strong)
-        )
+        flow = lambda end: self.joined(end, end.pipe, end.pipe_port, k, h, others[other])
+        weak, strong = flow(self.weak), flow(self.strong)
         if upper:
             return -(self.sure(i, h, weak) if weak >= 0.0 else strong)
         return strong if strong >= 0.0 else self.sure(other, others[other], weak)
@@ -280,10 +262,8 @@ class _Rig:
         """Effect of valve k on tank i."""
         (a, b), ends = self.plant.valves[k], (self.weak, self.strong)
         if b is not None:
-            flow = self.joined(
-                self.strong, self.strong.valve, self.strong.valve_port, k, h,
-                others[b if i == a else a],
-            )  # fmt: skip
+            strong, other = self.strong, others[b if i == a else a]
+            flow = self.joined(strong, strong.valve, strong.valve_port, k, h, other)
             if self.plant.one_way[k] and (flow > 0.0) != (i == a):
                 flow = 0.0
             return max(-flow if upper else flow, 0.0), 0.0, False
@@ -407,11 +387,7 @@ def _joint(rig):
         low = np.where([bool(why) for why in lower], 0.0, rig.low)
         bounds = _Bounds(high, low)
         after = [
-            [
-                why
-                or first_failure(chain(_kept(rig, i, bounds, up), _relied_on(rig, i, bounds, up)))
-                for i, why in enumerate(reasons)
-            ]
+            [why or first_failure(_kept(rig, i, bounds, up)) for i, why in enumerate(reasons)]
             for reasons, up in ((upper, True), (lower, False))
         ]
         if after == [upper, lower]:
@@ -438,19 +414,16 @@ def _kept(rig, i, bounds, upper):
     reason = f"{passing:.3g} {unit}^3/s more may {words} than its inputs can balance"
     yield passing <= ROUNDING * max(abs(rest), 1e-9), reason
     for k in sorted({i} | near):
-        sure = rig.empty[k] >= _shallow(rig, k) * (1.0 - ROUNDING)
+        sure = rig.empty[k] >= rig.shallow(k) * (1.0 - ROUNDING)
         yield sure, f"{rig.label(k)} may run empty within a step"
     if row is not None:
         yield from _row_holds(rig, row, bounds, near)
+    # last: of two tanks that rely on each other the answer names what the first of them lacks
+    yield from _relied_on(rig, row, bounds, upper, sorted(near))
 
 
-def _relied_on(rig, i, bounds, upper):
-    """(holds, reason): the levels of neighbours are within what one limit counts on. Asked last: of
-    two tanks that rely on each other the answer names what the first of them lacks.
-    """
-    if not upper and rig.low[i] <= 0.0:
-        return
-    near = sorted(rig.neighbours(i, upper))
+def _relied_on(rig, row, bounds, upper, near):
+    """(holds, reason): the levels of neighbours are within what one limit counts on."""
     for k in near:
         word = f"relies on {rig.label(k)}"
         yield math.isfinite(bounds.high[k]), f"{word}, which has no upper bound"
@@ -458,7 +431,7 @@ def _relied_on(rig, i, bounds, upper):
         yield bounds.high[k] <= rig.reach[k] * (1.0 + ROUNDING), f"{word}, not proved"
         yield bounds.low[k] >= rig.bottom[k], f"{word}, whose low limit is not proved"
         yield upper or bounds.high[k] <= rig.limit[k], f"{word}, not proved"
-    for k in near if rig.row(i, upper) is not None else ():
+    for k in near if row is not None else ():
         any_change = _any_change(rig, k, min(rig.climb[k], rig.drop[k]))
         for j in () if any_change else sorted(rig.neighbours(k)):
             word = f"limit of {rig.label(j)}, not proved"
@@ -477,10 +450,8 @@ def _row_holds(rig, row, bounds, near):
         yield rig.band[k] >= rig.needed[k] * (1.0 - ROUNDING), narrow
         reason = f"{rig.label(k)} may rise above what its sensor can read, {rig.top[k]:.4g} {unit}"
         # one without a bound is a limit that another one relies on
-        yield (
-            not math.isfinite(bounds.high[k]) or bounds.high[k] <= rig.top[k] * (1.0 + 1e-12),
-            reason,
-        )
+        bound = bounds.high[k]
+        yield not math.isfinite(bound) or bound <= rig.top[k] * (1.0 + 1e-12), reason
     for k in sorted(near):
         rates = [_fastest(rig, k, up) * rig.hold for up in (True, False)]
         for counted, most in zip((rig.climb[k], rig.drop[k]), rates):
@@ -505,22 +476,14 @@ def _fastest(rig, k, upper):
 
 def _shallow(rig, i):
     """The level [cm] below which a tank may hold less than it gives in a step."""
-    if i not in rig.shallow:
-        rig.shallow[i] = _shallow_level(rig, i)
-    return rig.shallow[i]
-
-
-def _shallow_level(rig, i):
     empty, none = rig.empty, np.zeros(rig.n)
     rig.empty = none
     levels, last = np.linspace(0.0, rig.limit[i], FINE + 1), 0.0
     for k in range(FINE, 0, -1):
         h = levels[k]
         gives = rig.harm(i, h, none, False) + rig.draw[i]
-        gives += sum(
-            max(0.0, *(_done(effect, end[j]) for end in rig.range))
-            for j, effect in rig.effects(i, h, none, False).items()
-        )
+        effects = rig.effects(i, h, none, False).items()
+        gives += sum(max(0.0, *(_done(e, end[j]) for end in rig.range)) for j, e in effects)
         if rig.step * gives > rig.room(i, 0.0, h) * (1.0 + ROUNDING):
             last = levels[min(k + 1, FINE)]
             break
@@ -539,10 +502,8 @@ def _bound(effect, allowed, ends):
 
 def _compatible(rig, row, later, bounds):
     """(holds, reason): a later row does not undo what a row has moved."""
-    ups = [
-        {j: e[2] for j, e in rig.effects(r.tank, rig.limit[r.tank], rig.reach, r.upper).items()}
-        for r in (row, later)
-    ]
+    effects_of = lambda r: rig.effects(r.tank, rig.limit[r.tank], rig.reach, r.upper)
+    ups = [{j: e[2] for j, e in effects_of(r).items()} for r in (row, later)]
     against = [j for j in set(row.movers) & set(later.movers) if ups[0][j] != ups[1][j]]
     if not against:
         return
@@ -556,11 +517,8 @@ def _compatible(rig, row, later, bounds):
         eps = rig.band[r.tank]
         edges = np.linspace(bounds.low[r.tank] - eps, bounds.high[r.tank] + eps, PARTS + 1)
         pairs = zip(edges[1:], edges[:-1]) if r.upper else zip(edges[:-1], edges[1:])
-        found = []
-        for reading, level in pairs:
-            effects, allowed = rig.allowed(r, reading, level)
-            found.append(_bound(effects[j], allowed, ends))
-        return np.array(found)
+        rows = (rig.allowed(r, reading, level) for reading, level in pairs)
+        return np.array([_bound(effects[j], allowed, ends) for effects, allowed in rows])
 
     mine, theirs = demands(row), demands(later)
     floors, caps = (mine, theirs) if ups[0][j] else (theirs, mine)

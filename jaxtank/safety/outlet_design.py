@@ -19,10 +19,8 @@ from jaxtank.safety.outlet_checker import check
 from jaxtank.safety.outlets import OutletFilter
 from jaxtank.safety.upper_limits import FASTEST, SHARE_OF_HOLD
 
-UNKNOWN = 1e6
-"""Stands for a level [cm] without a bound."""
-PARTS = 400
-"""Levels at which a tank is tested for holding what it gives in a step."""
+UNKNOWN = 1e6  # stands for a level [cm] without a bound
+PARTS = 400  # levels at which a tank is tested for holding what it gives in a step
 
 
 def outlet_design(
@@ -44,14 +42,7 @@ def outlet_design(
     draws: bool = False,
     faults: Any = None,
 ) -> tuple[OutletFilter, tuple[TankCertificate, ...]]:
-    """Return a filter for a rig of outlets, and the certificate of each tank; arguments as of
-    `design`.
-
-    Raises
-    ------
-    InputError
-        for a pump curve or a valve characteristic of points, whose inverse the filter has not
-    """
+    """Return a filter for a rig of outlets, and its certificates; arguments as of `design`."""
     n = plant.tanks
     _check_inverses(plant)
     least, most = box_of(plant, widths)
@@ -151,10 +142,9 @@ def _finished(base, ranges, hold, shaped):
     able |= {(i, False): _able(base, i, ranges, False) for i in tanks if base.low[i] > 0.0}
     chosen = _chosen(base, able)
     rows = lambda upper: tuple((i, m) for (i, u), m in chosen.items() if u == upper and m)
-    steps = {
-        name: np.where(shaped, UNKNOWN, [_step(base, i, ranges, up, hold) for i in tanks])
-        for name, up in (("climb", True), ("drop", False))
-    }
+    step = lambda up: [_step(base, i, ranges, up, hold) for i in tanks]
+    changes = {"climb": step(True), "drop": step(False)}
+    steps = {name: np.where(shaped, UNKNOWN, change) for name, change in changes.items()}
     return dataclasses.replace(base, upper_rows=rows(True), low_rows=rows(False), **steps)
 
 
@@ -171,10 +161,8 @@ def _check_inverses(plant):
 
 def _ranges(base, actuator):
     """([low], [high]) demands of the inputs."""
-    inputs = range(actuator.pumps)
-    return [
-        [float(base.demand(j, end[j])) for j in inputs] for end in (actuator.low, actuator.high)
-    ]
+    demands = lambda end: [float(base.demand(j, end[j])) for j in range(actuator.pumps)]
+    return [demands(actuator.low), demands(actuator.high)]
 
 
 def _worst(effects, ranges, movers=()):

@@ -7,21 +7,17 @@ import numpy as np
 from jaxtank.safety.conditions import Chosen, first_failure, settle, steepest
 from jaxtank.safety.filter import SHALLOW
 
-MARGIN = 0.9
-"""Share of D = sum c_j o_j / 2 that the choice of k1 counts on."""
-SWEEPS = 500
-"""Sweeps over all tanks after which limits that still fall count as not to be kept."""
+MARGIN = 0.9  # share of D = sum c_j o_j / 2 that the choice of k1 counts on
+SWEEPS = 500  # sweeps over all tanks after which limits that still fall count as not to be kept
 LEAST = 1e-3
 """Share of a limit below which it is not lowered: a ring of orifices may lower limits to 0."""
 FASTEST = 2.0
 """Default of kappa at most [1/s]: faster approaches gain less than they move the pumps."""
-SHARE_OF_HOLD = 0.5
-"""kappa T of the default; proved up to 1."""
+SHARE_OF_HOLD = 0.5  # kappa T of the default; proved up to 1
 QUIET = 0.01
 """Standard deviation of the change of a capped pump's input that noise may cause from sample to
 sample, as a share of its range, at the default."""
-BELOW_BOUND = 0.9
-"""Share of the largest rate that is proved, of the default."""
+BELOW_BOUND = 0.9  # share of the largest rate that is proved, of the default
 
 
 def rate_bound(hold: float, delay: float = 0.0, lag: float = 0.0) -> float:
@@ -58,9 +54,7 @@ def choose(setting, noise, plant, requested, rate, bound, start):
 
 
 def _filled_levels(setting, requested, start):
-    """(n,) levels [cm] to which full pumps fill the tanks at most, no tank above its requested
-    limit or its start; inf for tanks with pipes.
-    """
+    """(n,) levels [cm] to which full pumps fill the tanks at most; inf for tanks with pipes."""
     filled, rates = np.full(len(requested), np.inf), setting.rates
     piped = {tank for tank, *_ in rates.pipes}
     for _ in filled:
@@ -119,9 +113,7 @@ def _limits(setting, heights, kappa, unsettled=frozenset()):
 
 
 def _lowering(setting, tank, limits, excess):
-    """(factor by which the levels of the tanks above must be lower, those tanks), none where that
-    does not mend the rim condition of a tank.
-    """
+    """(factor on the levels of the tanks above, those tanks); none where that does not help."""
     levels, sources = limits + setting.spare, setting.sources(tank)
     pressed = sum(most * setting.root(levels[j]) for j, most in sources)
     margin = pressed - excess  # what the sources may bring
@@ -142,9 +134,7 @@ def _rim_condition(setting, tank, heights):
 
 
 def _second_order(setting, tank, heights, kappa):
-    """(k1 [1/s], "") for a tank that the pumps above it can hold, or (0, the failed condition, ""
-    for a tank with a pump).
-    """
+    """(k1 [1/s], "") for a tank that pumps above can hold, else (0, the failed condition)."""
     if setting.rates.pumps[tank]:
         return 0.0, ""
     failure = first_failure(_second_order_conditions(setting, tank, heights, kappa))

@@ -65,15 +65,11 @@ def of_plants(case, spread):
     """Return the Study of a case's controller."""
     values = coefficients(case.loop.plant, spread)
     measures, errors, failed = _runs(case.loop, values, case.clock, round(EVERY / case.clock.dt))
-    return Study(
-        {m: np.asarray(v) for m, v in measures.items()}, np.asarray(errors), np.asarray(failed)
-    )
+    return Study(*jax.tree.map(np.asarray, (measures, errors, failed)))
 
 
 def everything(run):
-    """Return ({(controller, spread): Study}, {controller: total RMS error of the nominal plant
-    [cm]}); run: as of `jaxtank.presets.paper.Preset`.
-    """
+    """Return ({(controller, spread): Study}, {controller: nominal total RMS error [cm]})."""
     studies, nominal = {}, {}
     for controller in CONTROLLERS:
         case, trajectory = run(controller, SETTING)
@@ -87,9 +83,8 @@ def interval(values, of=np.mean, draws=2000):
     """Return (estimate, low, high) of a statistic of (N,) or (N, k), by resampling plants."""
     values = np.asarray(values, dtype=float)
     picks = np.random.default_rng(0).integers(0, len(values), (draws, len(values)))
-    return float(of(values, axis=0)), *(
-        float(v) for v in np.quantile([of(values[p], axis=0) for p in picks], (0.025, 0.975))
-    )
+    ends = np.quantile([of(values[p], axis=0) for p in picks], (0.025, 0.975))
+    return float(of(values, axis=0)), *map(float, ends)
 
 
 def exact(count, total):
@@ -122,9 +117,8 @@ def _each_spread(texts):
 
 def _both(pair):
     """Means of both controllers [cm] as text."""
-    return ", ".join(
-        f"{name} {printed(t, 'cm')}" for name, t in zip(("NGPC", "backstepping"), pair)
-    )
+    named = zip(("NGPC", "backstepping"), pair)
+    return ", ".join(f"{name} {printed(triple, 'cm')}" for name, triple in named)
 
 
 def _growth(nominal):

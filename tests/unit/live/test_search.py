@@ -13,8 +13,7 @@ from jaxtank import measures as ms
 from jaxtank import presets, rig
 from jaxtank.limits import limit_scale, resolve_limits
 from jaxtank.live.engine import engine
-from jaxtank.live.origin import both
-from jaxtank.live.page import _script, _worker, data_of
+from jaxtank.live.page import _script, _worker, both, data_of
 from tuning.report import verdict as verdicts
 from tuning.search.judged import judge
 from tuning.search.setting import setting_of
