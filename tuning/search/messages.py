@@ -73,6 +73,8 @@ that became less robust is reported [-]: textbooks recommend 1.4 to 2."""
 INSENSITIVE = 0.5  # change of the objective for 10 % of a parameter that is not felt [%]
 CHATTER = 10.0  # reported growth of the inputs' total variation, or rms change [-]
 
+BUSY = 0.2  # rms change of inputs per sample from which on they chatter, as a share of range [-]
+
 
 def messages_of(result: TuningResult) -> tuple[Message, ...]:
     """Return the findings about a result, most important first; those on its step stay first."""
@@ -208,10 +210,23 @@ def _busier(result: TuningResult) -> Messages:
         )
 
 
-@rule(ANY, "input-chatters")
+@rule(OPTIMUM, "input-chatters")
 def _chatters(result: TuningResult) -> Messages:
     problem, values = result.problem, result.measures.get("after", {})
     yield from reported.chatter(problem.loop, problem.clock, values)
+
+
+@rule(ANSWER, "input-chatters")
+def _chatters_on_plants(result: TuningResult) -> Messages:
+    after = result.answer.after
+    if after is None or after.failed.all():
+        return
+    travel = float(np.nanmean(after.travel))
+    if travel > BUSY:
+        yield (
+            f"the inputs chatter: their rms change per sample is {100 * travel:.2g} % of their"
+            " range (a filter of the derivative or the sensor; --objective input_travel=...)"
+        )
 
 
 @rule(OPTIMUM, "no-feasible-point-found")
