@@ -279,7 +279,7 @@ def _claims(responses, long, beyond, shoot, laguerre, two):
     error, over, under = responses
     rms, top = ([values[name][0] for name in SISO] for values in (error, over))
     low = [] if under is None else [under[name][0] for name in SISO[:3]]
-    gain = 1.0 - top[3] / top[2]
+    gain = 1.0 - top[3] / top[2] if top[2] > 0.0 else 0.0
     fall = f"; undershoot at most {max(low):.2g} %" if low else ""
     form = "{:.2f}, {:.2f} mm and {:.1f}, {:.1f} % with {}"
     named = zip(MIMO, ("GPC", "Laguerre functions"))

@@ -56,6 +56,9 @@ def test_slopes_of_the_default_cost(name):
     if name.startswith(("gouta2015", "gouta2022")):
         case = rig.set_values(case, SHORT)
     present = parameters(case.loop)
+    if np.size(present.get("controller.horizon", ())) == 1 and "nmpc" in name:
+        # one of whole samples is a kink: slopes from above and below differ by a thousandth
+        case = rig.set_values(case, {"controller.horizon": 0.993 * present["controller.horizon"]})
     whole = {
         n: spec
         for n, spec in paper.tunable.items()
