@@ -14,6 +14,7 @@ from jaxtank.limits import limited_levels
 from jaxtank.loop.trajectory import csv
 from tuning.problem.problem import TAIL
 from tuning.problem.rules import ORDER
+from tuning.problem.tracking import not_tracking
 from tuning.report import advice, feasible, optimal_input
 from tuning.report import verdict as verdicts
 from tuning.report.document import Live, Report, Text, terminal
@@ -285,16 +286,20 @@ def _rules(result):
         for g in names
         for i, v in enumerate(np.ravel(get_value(loop, f"controller.{g}")).tolist())
     }
-    answer = rule_row("this answer", gains, result.answer.after)
+    answer = rule_row(loop, "this answer", gains, result.answer.after)
     head = [f"{g} [{describe(loop, f'controller.{g}')['unit']}]" for g in names]
     cost = "cost" if unit == "-" else f"cost [{unit}]"
-    table = Table(
-        [_rule(row, names) for row in (answer, *result.rules)],
-        ["tuning rules", *head, f"error [{loop.units[0]}]", "change [%]", cost, "holds"],
-        True,
-    )
+    head = ["tuning rules", *head, f"error [{loop.units[0]}]", "change [%]", cost, "holds"]
+    every = (answer, *result.rules)
+    rows = [_rule(row, names) for row in every]
     reasons = dict.fromkeys(row["why"] for row in result.rules if row["why"])
-    return [table, *([Text(list(reasons))] if reasons else [])]
+    if any(row["setpoints_lost"] for row in every):
+        head.append("off")
+        for cells, row in zip(rows, every):
+            cells.append("-" if row["setpoints_lost"] is None else str(row["setpoints_lost"]))
+        n, runs = result.answer.after.samples, result.answer.setting.runs
+        reasons[f"off: on how many of {n} {runs} the setpoints are not kept"] = None
+    return [Table(rows, head, True), *([Text(list(reasons))] if reasons else [])]
 
 
 def _of(values, gain):
@@ -336,7 +341,7 @@ def _shares(answer, sides):
     if answer.before.limits:
         rows.append(["plants that violate a limit", *(share(~s.held) for s in sides)])
     loop = answer.setting.case.loop
-    flags = [verdicts.not_tracking(loop, s.measures, s.failed) for s in sides]
+    flags = [not_tracking(loop, s.measures, s.failed) for s in sides]
     lost = [astray for astray in flags if astray is not None]
     if len(lost) == len(sides) and np.any(lost):
         rows.append(["plants that do not keep to their setpoints", *map(share, lost)])
@@ -534,11 +539,12 @@ def _validation_table(result):
     for side in SIDES:
         if (share := checked["limits_held"][side]) is not None:
             costs = [Value(checked["objective"][side][k]) for k in ("mean", "p05", "p50", "p95")]
-            rows.append([side, *costs, *([f"{100 * share:.0f} %"] if limited else [])])
+            kept = f"{100 * checked['setpoints_kept'][side]:.0f} %"
+            rows.append([side, *costs, *([f"{100 * share:.0f} %"] if limited else []), kept])
     if not rows:
         return [Text([f"validation runs: all {checked['samples']} failed"], gap=True)]
     heads = [f"on {checked['samples']} validation runs", "mean objective", "5 %", "median", "95 %"]
-    heads += ["all limits held in"] if limited else []
+    heads += ["all limits held in"] * limited + ["setpoints kept in"]
     spread = checked["spread"].items()
     perturbed = [n if share is None else f"{n} +-{100 * share:g} %" for n, share in spread]
     perturbed = ", ".join(perturbed) or "nothing of the plant"

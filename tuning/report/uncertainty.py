@@ -14,6 +14,7 @@ from jaxtank.core.text import count
 from jaxtank.core.tree import describe, get_value
 from jaxtank.loop import step_size
 from tuning.problem import provenance
+from tuning.problem.tracking import not_tracking
 from tuning.report import advice
 from tuning.report import verdict as verdicts
 from tuning.report.document import Live, Report, Text
@@ -184,7 +185,7 @@ def verdict_of(ensemble):
         words = f"{diverged} of {count(samples, 'run')} diverged"
         parts["outcome"] = verdicts.Part(words, False)
     columns = {n: np.asarray(ensemble.measures[n]) for n in ms.TRACKED if n in known}
-    lost = verdicts.not_tracking(ensemble.case.loop, columns, ensemble.failed)
+    lost = not_tracking(ensemble.case.loop, columns, ensemble.failed)
     if lost is not None and not lost.any():
         parts["tracking"] = verdicts.Part("every draw keeps to its setpoints")
     elif lost is not None:

@@ -14,20 +14,11 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.case import Case
-from jaxtank.controllers import OnOff, OpenLoop
 from jaxtank.core.labels import label_of, labels_of
 from jaxtank.limits import draws, dry_level, limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import ClosedLoop
-from jaxtank.signals.setpoints import Ramps
+from tuning.problem.tracking import not_tracking, tracked_of
 from tuning.search.result import row_of
-
-UNJUDGED = (OpenLoop, OnOff)  # controllers that are not judged on tracking
-
-OFF = 0.05  # share of a tank's height by which a settled level may miss its setpoint
-
-SHARE = 0.5  # share of an output's largest step by which it may miss, where steps are above SMALL
-SMALL = 0.005  # share of a tank's height from which a step is one to be followed, and not noise
-SATURATED = 0.5  # share of the samples at a pump limit from which a large RMS error is no transient
 
 WHEN = "time_of_steady_state_error"
 
@@ -132,61 +123,9 @@ def _dry_pumps(case, values, rims):
             yield f"{tank}, from which {pump} draws, runs empty"
 
 
-class _Tracked(NamedTuple):
-    """Tracking of runs: (..., outputs) numbers, and where they are too large."""
-
-    swing: Any  # to either side of the setpoint at the end of a plateau
-    missed: Any  # larger of swing and error at the end of a plateau, NaN where there is none
-    rms: Any
-    heights: Any
-    allowed: Any
-    off: Any  # misses its setpoint at the end of a plateau
-    loose: Any  # large RMS error, with no plateau
-    stuck: Any  # large RMS error, with a pump at a limit in most samples
-
-
-def _tracked(loop: ClosedLoop, values: Mapping[str, Any]) -> _Tracked | None:
-    if isinstance(loop.controller, UNJUDGED) or not set(ms.TRACKED) <= set(values):
-        return None
-    plant: Any = loop.plant
-    outputs = list(plant.outputs)
-    row = lambda name: np.atleast_1d(np.asarray(values[name], dtype=float))
-    rims = np.broadcast_to(plant.rim, plant.tanks)[outputs]
-    heights = np.where(np.isfinite(rims), rims, np.abs(row("max_level")[..., outputs]))
-    heights = np.where(heights > 0.0, heights, 1.0)  # of tanks without a rim their highest levels
-    swing, rms = row("steady_state_swing"), row("rms_error")
-    missed, allowed = np.maximum(row("steady_state_error"), swing), _allowed(loop, heights)
-    large, moving = rms > OFF * heights, np.isnan(missed)
-    busy = np.max(row("saturated_fraction"), axis=-1, keepdims=True, initial=0.0) > SATURATED
-    masks = ~moving & (missed > allowed), moving & large, large & busy
-    return _Tracked(swing, missed, rms, heights, allowed, *masks)
-
-
-def _allowed(loop, heights):
-    """(..., outputs) errors that may stay: OFF of a height, and SHARE of the largest step."""
-    reference: Any = loop.reference
-    allowed = OFF * heights
-    if not isinstance(reference, Ramps):
-        return allowed
-    outputs = heights.shape[-1]
-    steps = np.ptp(np.array([np.broadcast_to(v, outputs) for v in reference.held()]), axis=0)
-    return np.where(steps > SMALL * heights, np.minimum(allowed, SHARE * steps), allowed)
-
-
-def not_tracking(
-    loop: ClosedLoop, values: Mapping[str, Any], failed: np.ndarray
-) -> np.ndarray | None:
-    """Return (N,) which of many runs that have not failed do not track; None where unjudged."""
-    tracked = _tracked(loop, values)
-    if tracked is None or failed.all():
-        return None
-    unknown = ~np.isfinite(tracked.rms)
-    return np.any(unknown | tracked.off | tracked.loose | tracked.stuck, axis=-1) & ~failed
-
-
 def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
     """Return how near levels come to setpoints: at plateaus, else by their RMS errors."""
-    tracked = _tracked(loop, values)
+    tracked = tracked_of(loop, values)
     if tracked is None:
         return None
     unit, plant = loop.units[0], loop.plant
@@ -293,24 +232,32 @@ def of_tuning(result: Any) -> Verdict:
     ]
     return Verdict(
         outcome=Part(result.headline.replace("_", " "), result.success),
-        tracking=_tracking_of_answer(case.loop, values, answer),
+        tracking=_tracking_of_answer(case.loop, values, answer, result.validation),
         limits=limits(rows, beyond(case, values, rows)),
         plants=_validated(result) if answer is None else _judged(answer),
         robustness=robustness(values),
     )
 
 
-def _tracking_of_answer(loop, values, answer):
+def _tracking_of_answer(loop, values, answer, runs):
     """The tracking of its own run, and on how many validation plants it is not good."""
     nominal = tracking(loop, values)
+    if nominal is not None and answer is None and runs and runs["setpoints_kept"]["after"]:
+        kept, samples = runs["setpoints_kept"]["after"], runs["samples"] - runs["failed"]
+        lost = round((1.0 - kept) * samples)
+        words = f"{lost} of {samples} validation runs do not keep to their setpoints"
+        return _joined(nominal, words) if lost else nominal
     if nominal is None or answer is None or answer.after is None:
         return nominal
     after = answer.after
     lost = not_tracking(loop, after.measures, after.failed)
     if lost is None or not lost.any():
         return nominal
-    joint = ", but " if nominal.good else "; "
-    return Part(nominal.words + joint + astray(lost, answer.setting.runs, after.infeasible), False)
+    return _joined(nominal, astray(lost, answer.setting.runs, after.infeasible))
+
+
+def _joined(nominal, words):
+    return Part(nominal.words + (", but " if nominal.good else "; ") + words, False)
 
 
 def astray(lost: np.ndarray, runs: str, infeasible: np.ndarray | None) -> str:

@@ -16,6 +16,7 @@ from jaxtank.rig import check_limits
 from tuning.cluster.engine import connect
 from tuning.problem.functions import as_measures
 from tuning.problem.problem import Problem
+from tuning.problem.tracking import lost_runs
 from tuning.search.messages import messages_of
 from tuning.search.options import Options, check_numbers, check_precision, options_of
 from tuning.search.result import TuningResult
@@ -191,7 +192,8 @@ def _run(distributions, limits, fresh, seed, cluster, case, names):
 
 def _on_new_plants(result, judge, run, distributions):
     """Return (summary, cloud, how many violate a limit after tuning) on new plants."""
-    names = tuple(dict.fromkeys([*judge.objective, "max_level"]))
+    tracked = [name for name in ms.TRACKED if ms.serves(name, judge.loop)]
+    names = tuple(dict.fromkeys([*judge.objective, "max_level", *tracked]))
     sides = [run(case, names) for case in (result.case, result.tuned)]
     weights = judge.objective.items()
     costs = [
@@ -204,7 +206,9 @@ def _on_new_plants(result, judge, run, distributions):
     spread = {n: getattr(d, "relative", None) for n, d in distributions.items()}
     noise = judge.runs[0].key is not None
     costs = np.stack(costs, axis=1)
-    summary = summary_of(judge.limits, costs, holds, levels, failed, spread, noise)
+    lost = [lost_runs(judge.loop, plants.measures, plants.failed) for plants in sides]
+    astray = np.stack(lost, axis=1)
+    summary = summary_of(judge.limits, costs, holds, levels, failed, spread, noise, astray)
     return *summary, int((~holds[:, 1]).sum())
 
 

@@ -16,6 +16,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.limits import limited_levels, resolve_limits
 from jaxtank.loop import run as lp
+from jaxtank.loop.closed_loop import ClosedLoop
 from tuning.cluster.ahead import check_sent
 from tuning.cluster.engine import Engine, connect
 from tuning.feasible.study import can_judge, feasibility
@@ -34,6 +35,7 @@ from tuning.problem.rules import RULES, refusal, rule_gains
 from tuning.problem.scenarios import noisy, runs_of
 from tuning.problem.slopes import check_slopes
 from tuning.problem.status import Status
+from tuning.problem.tracking import lost_runs
 from tuning.search import diagnostics
 from tuning.search.default import Attempt, Task, attempts, values_of
 from tuning.search.driver import named_optimality
@@ -365,16 +367,22 @@ def rule_rows(
                 judgement = judge(_with_gains(setting, gains[rule]), samples, seed, round_)
             except InputError as error:
                 why = str(error)
-        rows.append(rule_row(rule, gains.get(rule, {}), judgement) | {"why": why})
+        rows.append(
+            rule_row(setting.case.loop, rule, gains.get(rule, {}), judgement) | {"why": why}
+        )
     return tuple(rows)
 
 
-def rule_row(rule: str, gains: Mapping[str, float], judged: Judged | None) -> dict[str, Any]:
+def rule_row(
+    loop: ClosedLoop, rule: str, gains: Mapping[str, float], judged: Judged | None
+) -> dict[str, Any]:
     """Return a row of `TuningResult.rules`; judged : None where a rule has no gains."""
     means = {} if judged is None else judged.to_json()
+    lost = None if judged is None else int(lost_runs(loop, judged.measures, judged.failed).sum())
     numbers = {name: means.get(name) for name in ("error", "objective", "travel_percent")}
     holds = None if judged is None else bool(judged.held.all())
-    return {"rule": rule, "parameters": gains, "holds": holds, **numbers}
+    limits = {"holds": holds, "setpoints_lost": lost}
+    return {"rule": rule, "parameters": gains, **limits, **numbers}
 
 
 def _with_gains(setting: Setting, gains: Mapping[str, float]) -> Setting:
@@ -681,4 +689,6 @@ def _validation(answer):
     )
     failed = sides[0].failed | sides[1].failed
     spread = {n: getattr(d, "relative", None) for n, d in setting.distributions.items()}
-    return summary_of(resolve_limits(setting.case), cost, holds, level, failed, spread, True)
+    astray = np.stack([lost_runs(setting.case.loop, s.measures, s.failed) for s in sides], axis=1)
+    limits = resolve_limits(setting.case)
+    return summary_of(limits, cost, holds, level, failed, spread, True, astray)

@@ -3,8 +3,10 @@
 import jax
 import numpy as np
 
+from jaxtank import measures as ms
 from jaxtank.core.tree import get_value, with_values
 from tuning.problem.scenarios import ScenarioRun, groups_of, values_of
+from tuning.problem.tracking import lost_runs
 from tuning.uncertainty.distributions import Correlated
 from tuning.uncertainty.draws import Draws
 
@@ -40,9 +42,10 @@ def validate(problem, before, after, samples, seed):
     runs, scenarios = perturbed(problem, samples, seed), len(problem.runs)
     points = {n: np.array([before[n], after[n]]) for n in problem.names}
     costs, feasible = np.zeros((samples, 2)), np.ones((samples, 2), dtype=bool)
-    diverged = np.zeros(samples, dtype=bool)
+    diverged, astray = np.zeros(samples, dtype=bool), np.zeros((samples, 2), dtype=bool)
     levels = np.zeros((samples, 2, problem.loop.plant.tanks))
-    names = tuple(dict.fromkeys([*problem.needed, "max_level"]))
+    tracked = [name for name in ms.TRACKED if ms.serves(name, problem.loop)]
+    names = tuple(dict.fromkeys([*problem.needed, "max_level", *tracked]))
     for group in groups_of(runs):
         measures, flags = values_of(group, names, points)
         measures, flags = {m: np.asarray(v) for m, v in measures.items()}, np.asarray(flags)
@@ -53,12 +56,13 @@ def validate(problem, before, after, samples, seed):
                 row = {m: v[side, j] for m, v in measures.items()}
                 costs[i, side], levels[i, side] = problem.cost(row), row["max_level"]
                 feasible[i, side] = all(limit.margin(row) >= 0 for limit in limits)
+                astray[i, side] = lost_runs(runs[i].case.loop, row, diverged[i])
     noise = any(run.key is not None for run in runs)
     spread = {n: float(s) for n, s in problem.case.uncertain.items()}
-    return summary_of(problem.limits, costs, feasible, levels, diverged, spread, noise)
+    return summary_of(problem.limits, costs, feasible, levels, diverged, spread, noise, astray)
 
 
-def summary_of(limits, costs, feasible, levels, diverged, spread, noise):
+def summary_of(limits, costs, feasible, levels, diverged, spread, noise, astray):
     """Return (summary, cloud) of runs before and after tuning, on the same draws."""
     good = ~diverged & np.isfinite(costs).all(axis=1)
     both = good & feasible.all(axis=1)
@@ -70,6 +74,7 @@ def summary_of(limits, costs, feasible, levels, diverged, spread, noise):
         "objective": {name: _quantiles(costs[good, side]) for side, name in enumerate(SIDES)},
         "better_share": _share(costs[good, 1] < costs[good, 0]),
         "limits_held": {name: _share(feasible[good, side]) for side, name in enumerate(SIDES)},
+        "setpoints_kept": {name: _share(~astray[good, side]) for side, name in enumerate(SIDES)},
         "comparable": _share(both[good]),
         "better_share_of_comparable": _share(costs[both, 1] < costs[both, 0]),
     }
