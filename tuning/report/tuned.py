@@ -294,11 +294,10 @@ def _rules(result):
     rows = [_rule(row, names) for row in every]
     reasons = dict.fromkeys(row["why"] for row in result.rules if row["why"])
     if any(row["setpoints_lost"] for row in every):
-        head.append("off")
+        head.append("misses setpoints on")
         for cells, row in zip(rows, every):
-            cells.append("-" if row["setpoints_lost"] is None else str(row["setpoints_lost"]))
-        n, runs = result.answer.after.samples, result.answer.setting.runs
-        reasons[f"off: on how many of {n} {runs} the setpoints are not kept"] = None
+            lost, n = row["setpoints_lost"], result.answer.after.samples
+            cells.append("-" if lost is None else f"{lost} of {n}")
     return [Table(rows, head, True), *([Text(list(reasons))] if reasons else [])]
 
 
