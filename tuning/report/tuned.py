@@ -294,10 +294,9 @@ def _rules(result):
     rows = [_rule(row, names) for row in every]
     reasons = dict.fromkeys(row["why"] for row in result.rules if row["why"])
     if any(row["setpoints_lost"] for row in every):
-        head.append("misses setpoints on")
+        head.append(f"missed (of {result.answer.after.samples})")
         for cells, row in zip(rows, every):
-            lost, n = row["setpoints_lost"], result.answer.after.samples
-            cells.append("-" if lost is None else f"{lost} of {n}")
+            cells.append("-" if row["setpoints_lost"] is None else str(row["setpoints_lost"]))
     return [Table(rows, head, True), *([Text(list(reasons))] if reasons else [])]
 
 
