@@ -183,7 +183,8 @@ class TuningResult(Result):
     slopes : {"start", "answer": SlopeCheck} whether runs beside these points bear the exact slopes
         out; an answer whose slope they contradict is not converged.
     rules : of a PI or PID controller, what tuning rules give on the plants of the answer: one dict
-        for each rule, {"rule", "parameters": {name: value}, "error" [unit of length], "holds"}.
+        for each rule, {"rule", "parameters": {name: value}, "error" [unit of length], "holds",
+        "setpoints_lost": on how many plants}.
     answer : the `tuning.Answer` of a default answer: its plants, noise and safety filter.
 
     Examples

@@ -368,3 +368,20 @@ def test_tune_says_on_how_many_plants_setpoints_are_not_kept():
     share = f"{100 * low.mean():.3g} %"
     table = str(result.answer)
     assert re.search(rf"do not keep to their setpoints +[.0-9]+ % +{share}", table)
+    lost = [row["setpoints_lost"] for row in result.rules if row["parameters"]]
+    assert lost and min(lost) >= low.sum() and "missed" in str(result)
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_other_answers_say_on_how_many_runs_setpoints_are_not_kept(robust):
+    """The pump of the test above, by the nominal optimum and by that of a few plants."""
+    weak = ONE_TANK.replace("high = 2.0", "high = 0.66").replace("= 40.0", "= 400.0")
+    case = rig.loads(weak).replace(uncertain={"plant.drain": 0.05}, safety=None)
+    if robust:
+        result = tuning.tune_robust(case, samples=4, fresh=64, method=tuning.Options(starts=1))
+    else:
+        result = tuning.tune(tuning.Problem(case), tuning.Options(starts=1, validation=64))
+    kept, finite = result.validation["setpoints_kept"]["after"], 64 - result.validation["failed"]
+    verdict = verdicts.of_tuning(result)
+    assert 0.1 < kept < 0.9 and not verdict.tracking.good and not verdict.good
+    assert f"{round((1 - kept) * finite)} of {finite} validation runs" in verdict.tracking.words
