@@ -14,7 +14,7 @@ from jaxtank.core.text import count
 from jaxtank.core.tree import describe, get_value
 from jaxtank.loop import step_size
 from tuning.problem import provenance
-from tuning.problem.tracking import not_tracking
+from tuning.problem.tracking import UNJUDGED, not_tracking
 from tuning.report import advice
 from tuning.report import verdict as verdicts
 from tuning.report.document import Live, Report, Text
@@ -186,7 +186,12 @@ def verdict_of(ensemble):
         parts["outcome"] = verdicts.Part(words, False)
     columns = {n: np.asarray(ensemble.measures[n]) for n in ms.TRACKED if n in known}
     lost = not_tracking(ensemble.case.loop, columns, ensemble.failed)
-    if lost is not None and not lost.any():
+    loop = ensemble.case.loop
+    missing = [n for n in ms.TRACKED if n not in known and ms.serves(n, loop)]
+    if missing and not isinstance(loop.controller, UNJUDGED):
+        words = f"setpoints are not judged without {' and '.join(missing[:2])}"
+        parts["tracking"] = verdicts.Part(words)
+    elif lost is not None and not lost.any():
         parts["tracking"] = verdicts.Part("every draw keeps to its setpoints")
     elif lost is not None:
         first = {n: v[np.argmax(lost)] for n, v in columns.items()}
