@@ -84,9 +84,8 @@ def feasibility(
     began = time.perf_counter()
     distributions = spread_of(case) if distributions is None else stated(distributions)
     draws = Draws(case.loop, distributions)
-    needs_of = lambda count: Needs(
-        case, draws.values(probabilities("sobol", draws.dimensions, count, seed)), limits
-    )
+    points = lambda count: probabilities("sobol", draws.dimensions, count, seed)
+    needs_of = lambda count: Needs(case, draws.values(points(count)), limits)
     needs = needs_of(samples)
     excess = needs.excess()
     infeasible = np.any(excess > 0, axis=(1, 2))

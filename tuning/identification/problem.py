@@ -247,16 +247,9 @@ class Estimation:
     def predicted(self, z: np.ndarray, data: Any = None) -> np.ndarray:
         """Return (logs, samples, channels) simulated readings at z, for the inputs of `data`."""
         data = self.data if data is None else data
-        return np.asarray(
-            simulation.play(
-                self.rig_at(z),
-                data.dt,
-                self.inputs_at(self.split(z)[0], data),
-                self.first_levels(z),
-                channels=data.channels,
-                substeps=self.substeps,
-            )
-        )
+        static = {"channels": data.channels, "substeps": self.substeps}
+        u, first = self.inputs_at(self.split(z)[0], data), self.first_levels(z)
+        return np.asarray(simulation.play(self.rig_at(z), data.dt, u, first, **static))
 
     def inputs_at(self, p: np.ndarray, data: Any) -> np.ndarray:
         """Return (logs, samples, .., pumps) inputs of PaddedData at coordinates p."""
@@ -271,17 +264,10 @@ class Estimation:
         elif not tanks:
             rig = dataclasses.replace(rig, x0=self.initial[0])
         of = self.coordinates.leaves
-        y, slopes = simulation.sensitivities(
-            rig,
-            self.data.dt[logs],
-            self.inputs_at(p, self.data)[logs] if self.coordinates.inputs else self.data.u[logs],
-            p[..., : of.size],
-            levels,
-            coordinates=of,
-            tanks=tanks,
-            channels=self.data.channels,
-            substeps=self.substeps,
-        )
+        u = self.inputs_at(p, self.data) if self.coordinates.inputs else self.data.u
+        run = (rig, self.data.dt[logs], u[logs], p[..., : of.size], levels)
+        static = {"tanks": tanks, "channels": self.data.channels, "substeps": self.substeps}
+        y, slopes = simulation.sensitivities(*run, coordinates=of, **static)
         shared, slopes = self.coordinates.size, np.array(slopes)[..., : of.size + free]
         if shared > of.size:
             slopes = np.insert(slopes, [of.size], self._by_inputs(p, levels, y), axis=-1)

@@ -54,8 +54,7 @@ def json_of(attack):
         "coefficients": {
             c.name: fields(c, "nominal low high varies") for c in attacked.coefficients
         },
-        **fields(attacked, "windows pumps start"),
-        "reading_band": clean(attacked.band),
+        **fields(attacked, "windows pumps start reading_band=band"),
         **fields(attack, "starts draws history wall_s"),
         "remarks": remarks_of(attack),
         "provenance": provenance.provenance(case, attack.seed),
@@ -67,10 +66,10 @@ def _row(attack, tank):
     return {
         "tank": tank.tank + 1,
         **fields(tank, "level limit time_s margin passed certified nominal drawn"),
+        **fields(tank, "rise_between_samples=rise"),
         "parameters": clean(attack.parameters(tank)),
         "why": tank.reason or None,
         "starts": tank.starts or None,
-        "rise_between_samples": clean(tank.rise),
     }
 
 

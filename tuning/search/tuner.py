@@ -13,6 +13,7 @@ from jaxtank import measures as ms
 from jaxtank.bounds import WIDE, gain_ranges
 from jaxtank.case import Case, Free, check_case
 from jaxtank.core.errors import InputError
+from jaxtank.core.jsonable import fields
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.limits import limited_levels, resolve_limits
 from jaxtank.loop import run as lp
@@ -472,20 +473,15 @@ def _result(
     result = TuningResult(
         parameters=_parameters(evaluator, solution, values),
         evaluations={
-            "simulations": evaluator.simulations,
-            "gradients": evaluator.gradients,
-            "non_finite": evaluator.non_finite,
+            **fields(evaluator, "simulations gradients non_finite"),
             "redone_at_true_step": solution.redone,
         },
         wall_s=0.0,
         history=solution.search.history if solution.search else [],
-        starts=solution.starts,
+        **{n: getattr(solution, n) for n in ("starts", "curvature", "probe", "slopes")},
         optimality=named_optimality(solution.search, solution.point),
-        curvature=solution.curvature,
         provenance=provenance(parts["case"], evaluator.problem.seed),
         problem=evaluator.problem,
-        probe=solution.probe,
-        slopes=solution.slopes,
         messages=steps,
         **parts,
     )
