@@ -291,15 +291,11 @@ def least_offsets(needs: Needs) -> np.ndarray:
         best = np.minimum(best, distance)
         if round_ == ROUNDS:
             break
-        slopes = np.stack(
-            [
-                (few.at(y + step * axis) - few.at(y - step * axis))
-                / size
-                / (2.0 * step * axis).sum(-1)[..., None]
-                for axis in np.eye(r.shape[2])
-            ],
-            axis=-1,
-        )
+        columns = []
+        for move in step * np.eye(r.shape[2])[:, None, None]:
+            change = (few.at(y + move) - few.at(y - move)) / size
+            columns.append(change / (2.0 * move).sum(-1)[..., None])
+        slopes = np.stack(columns, axis=-1)
         rows = np.concatenate([slopes, -slopes], axis=2)
         ends = np.concatenate([high - needed, needed - low], axis=2)
         ends = ends + np.einsum("spqm,spm->spq", rows, y)

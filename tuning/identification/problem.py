@@ -190,10 +190,8 @@ class Estimation:
         plant, tanks, scale = self.case.loop.plant, list(self.tanks), self.level_scale
         top = np.asarray(plant.rim)[tanks] * (1.0 if getattr(plant, "overflow", False) else 1.5)
         top = np.maximum(top, self.initial[:, tanks].max(axis=0, initial=0.0))
-        return (
-            np.concatenate([low, np.zeros(scale.size)]),
-            np.concatenate([high, np.tile(top, len(self.logs)) / scale]),
-        )
+        highest = np.tile(top, len(self.logs)) / scale
+        return np.concatenate([low, np.zeros(scale.size)]), np.concatenate([high, highest])
 
     @property
     def of_inputs(self) -> dict[str, float]:

@@ -133,12 +133,8 @@ def tune(
     """
     check_case(case.case if isinstance(case, Problem) else case, seed)
     options = options_of(method, starts=starts)
-    reasons = {
-        "a Problem": isinstance(case, Problem),
-        "method": options.name != "auto",
-        "screening": options.screening is not None,
-        "tolerance": options.tolerance is not None,
-    }
+    reasons = {"a Problem": isinstance(case, Problem), "method": options.name != "auto"}
+    reasons |= {n: getattr(options, n) is not None for n in ("screening", "tolerance")}
     implied = next((name for name, value in reasons.items() if value), None)
     if nominal is False and implied:
         raise InputError(f"{implied}: belongs to the nominal optimum (nominal=True, --nominal)")
@@ -510,14 +506,13 @@ def _judged_parts(answer: Answer, values: Mapping[str, float]) -> dict[str, Any]
 
 def _what(problem, validation, command, more):
     """Return the fingerprint of a search."""
+    scenarios = [(s.name, sorted(s.values.items()), s.seed, s.weight) for s in problem.scenarios]
     return fingerprint(
         problem.case,
         command=command,
         free=problem.bounds,
-        objective=problem.objective,
-        limits=problem.limits,
-        scenarios=[(s.name, sorted(s.values.items()), s.seed, s.weight) for s in problem.scenarios],
-        risk=problem.risk,
+        **{name: getattr(problem, name) for name in ("objective", "limits", "risk")},
+        scenarios=scenarios,
         validation=validation,
         **digests(problem.loop, problem.clock, problem.needed),
         **{n: v for n, v in more.items() if n != "engine"},
@@ -538,9 +533,7 @@ def _parameters(evaluator, solution, values):
         b.name: {
             "before": start[b.name],
             "after": values[b.name],
-            "unit": b.unit,
-            "lower": b.low,
-            "upper": b.high,
+            **fields(b, "unit lower=low upper=high"),
             "at_bound": "lower" if z < 1e-6 else "upper" if z > 1 - 1e-6 else None,
             "sensitivity_percent": percent,
             "exercised": not still,
