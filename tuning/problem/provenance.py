@@ -23,9 +23,12 @@ def provenance(case: Case, seed: int | None) -> dict[str, Any]:
     import scipy
 
     return {
-        **{m.__name__: m.__version__ for m in (jaxtank, jax, np, scipy)},
+        "jaxtank": jaxtank.__version__,
         "python": platform.python_version(),
+        "jax": jax.__version__,
         "jaxlib": jaxlib.version.__version__,
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
         "optax": metadata.version("optax"),  # its import takes 0.07 s
         "backend": jax.default_backend(),
         "dtype": str(jax.numpy.result_type(float)),
