@@ -66,10 +66,10 @@ def _row(attack, tank):
     return {
         "tank": tank.tank + 1,
         **fields(tank, "level limit time_s margin passed certified nominal drawn"),
-        **fields(tank, "rise_between_samples=rise"),
         "parameters": clean(attack.parameters(tank)),
         "why": tank.reason or None,
         "starts": tank.starts or None,
+        **fields(tank, "rise_between_samples=rise"),
     }
 
 

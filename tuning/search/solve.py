@@ -233,8 +233,8 @@ class Stages:
         _, cost, violation, end = reached
         start = {"from": search.problem.values(z), "to": search.problem.values(end)}
         start |= {"cost": cost, "violation": violation, "evaluations": len(mine)}
-        start |= {"converged": converged and usable is not False, "slope_usable": usable}
-        starts.append(start | {"exhausted": search.exhausted})
+        start |= {"converged": converged and usable is not False, "exhausted": search.exhausted}
+        starts.append(start | {"slope_usable": usable})
 
     def finish(self) -> None:
         """Search a last time from the best point, and find out whether it is an optimum."""
