@@ -122,11 +122,12 @@ def measure(paper):
             {
                 "quantity": name,
                 "kind": CLAIM if isinstance(printed.value, str) else NUMBER,
-                **fields(printed, "unit where published=value ramp_s=ramp"),
+                **fields(printed, "unit where published=value"),
                 "measured": clean(number),
                 "deviation": clean(value.deviation) if isinstance(value, Sample) else None,
                 "verdict": word,
                 "reason": reason,
+                "ramp_s": printed.ramp,
                 "by_ramp": {f"{ramp:g}": word_of(holds) for ramp, holds in by_ramp.items()},
             }
         )
