@@ -6,6 +6,12 @@ from typing import Any, cast
 import numpy as np
 
 
+def fields(result: Any, names: str) -> dict[str, Any]:
+    """Return {key: attribute, as JSON takes it} of words "key" or "key=attribute" in one text."""
+    pairs = (word.partition("=") for word in names.split())
+    return {key: clean(getattr(result, name or key)) for key, _, name in pairs}
+
+
 def clean(value: Any) -> Any:
     """Return `value` for JSON: arrays as lists, NaN and infinity as None."""
     if isinstance(value, dict):

@@ -119,14 +119,8 @@ def measure(rounds=7):
             f"these runs are on {origin['backend']}: a single loop is a chain of small steps and"
             " belongs on a CPU"
         )
-    return {
-        "steps": first.clock.samples,
-        "rounds": rounds,
-        "rows": rows,
-        "provenance": origin,
-        **beside,
-        "notes": notes,
-    }
+    figures = {"steps": first.clock.samples, "rounds": rounds, "rows": rows, **beside}
+    return figures | {"provenance": origin, "notes": notes}
 
 
 C_LOOP = "C loop, backstepping"
@@ -141,16 +135,13 @@ def _calls(cases) -> dict[str, Callable[[], Any]]:
         measures = lp.evaluate(with_values(first.loop, values), first.clock, MEASURES)
         return measures["rms_error_total"]
 
-    bind = functools.partial
-    return {
-        **{
-            name: bind(lp.evaluate, case.loop, case.clock, MEASURES) for name, case in cases.items()
-        },
-        "jacfwd for 2 gains": bind(jax.jit(jax.jacfwd(error)), gains),
-        "gradient, Gauss-Newton and maxima for 2 gains": bind(
-            lp.sensitivities, first.loop, first.clock, MEASURES, gains
-        ),
+    bind, both = functools.partial, "gradient, Gauss-Newton and maxima for 2 gains"
+    runs: dict[str, Any] = {
+        n: bind(lp.evaluate, case.loop, case.clock, MEASURES) for n, case in cases.items()
     }
+    runs["jacfwd for 2 gains"] = bind(jax.jit(jax.jacfwd(error)), gains)
+    runs[both] = bind(lp.sensitivities, first.loop, first.clock, MEASURES, gains)
+    return runs
 
 
 def text(figures):

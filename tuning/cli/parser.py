@@ -7,15 +7,8 @@ import textwrap
 from jaxtank.core.errors import InputError, nearest
 from tuning.cli.commands import case, explore, falsification, identification, studies, tools, tuning
 
-COMMANDS = {
-    **case.COMMANDS,
-    **explore.COMMANDS,
-    **tuning.COMMANDS,
-    **studies.COMMANDS,
-    **falsification.COMMANDS,
-    **identification.COMMANDS,
-    **tools.COMMANDS,
-}
+MODULES = (case, explore, tuning, studies, falsification, identification, tools)
+COMMANDS = {name: command for m in MODULES for name, command in m.COMMANDS.items()}
 
 
 class Parser(argparse.ArgumentParser):
@@ -154,16 +147,15 @@ def parser():
     group = top.add_subparsers(dest="command", metavar="COMMAND")
     for name, command in COMMANDS.items():
         places = [_place(o) for o in command.options if not o.flag.startswith("-")]
+        words = command.description or f"{command.help[0].upper()}{command.help[1:]}."
+        examples = ["examples:", *(f"  jaxtank {name} {e}" for e in EXAMPLES.get(name, ()))]
+        more = f"\n\n{_filled(command.epilog)}" if command.epilog else ""
         sub = group.add_parser(
             name,
             help=command.help,
-            description=_filled(command.description)
-            or _filled(f"{command.help[0].upper()}{command.help[1:]}."),
+            description=_filled(words),
             usage=" ".join([f"jaxtank {name}", *places, "[options]"]),
-            epilog="\n".join(
-                ["examples:", *(f"  jaxtank {name} {e}" for e in EXAMPLES.get(name, ()))]
-            )
-            + (f"\n\n{_filled(command.epilog)}" if command.epilog else ""),
+            epilog="\n".join(examples) + more,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         groups = {}

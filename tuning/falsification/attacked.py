@@ -237,15 +237,14 @@ class Attacked:
             **({"noise": (tanks, case.clock.samples)} if noisy else {}),
             **({"command": (SWITCHES, loop.plant.pumps)} if self.pumps == "random" else {}),
         }
-        for name, value in {
-            "original": original,
-            "physical_rims": physical_rims,
-            "case": case.replace(loop=loop),
-            "coefficients": [*varying, *constant],
-            "band": band,
-            "shapes": shapes,
-        }.items():
-            object.__setattr__(self, name, value)
+        vars(self).update(  # the fields of a frozen class
+            original=original,
+            physical_rims=physical_rims,
+            case=case.replace(loop=loop),
+            coefficients=[*varying, *constant],
+            band=band,
+            shapes=shapes,
+        )
 
     def nominal(self) -> dict[str, np.ndarray]:
         """Return the values (see `values`) of the unchanged case, without reading errors."""
@@ -379,10 +378,8 @@ def _without_controller(loop, clock):
     low, high = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
     if not np.all(np.isfinite([low, high])):
         raise InputError("attack: pumps other than the case's own need finite limits of the pumps")
-    plan = PumpPlan(
-        command=np.repeat(high[None], SWITCHES, axis=0),
-        length=(clock.duration + clock.dt) / SWITCHES,
-    )
+    length = (clock.duration + clock.dt) / SWITCHES
+    plan = PumpPlan(command=np.repeat(high[None], SWITCHES, axis=0), length=length)
     actuator = loop.actuator
     if actuator.allocates:  # by a controller's cost, which a plan has not
         actuator = dataclasses.replace(actuator, saturation="clip")

@@ -269,38 +269,24 @@ def attack(
             "attack searches the errors of readings itself: leave out [[fault]] with sensor"
         )
     limits = limits_of(case)
-    attacked = Attacked(
-        case=case,
-        coefficients=coefficients_of(case, distributions),
-        windows=windows,
-        pumps=pumps,
-        start=start,
-        noise=noise,
-        ceiling=limits.ceiling,
-    )
+    kinds = {"windows": windows, "pumps": pumps, "start": start, "noise": noise}
+    coefficients = coefficients_of(case, distributions)
+    attacked = Attacked(case=case, coefficients=coefficients, ceiling=limits.ceiling, **kinds)
     search = _Search(attacked, draws, starts, iterations, seed, progress)
     points, levels = search.screen()
     climbed = search.climb(points, levels)
     rises = _rises(case, np.maximum(limits.limit, climbed.level))
-    rows = limits.rows or (None,) * len(rises)
+    numbers = {"limit": limits.limit, "nominal": levels[0], "drawn": levels[1:].max(axis=0)}
+    numbers |= {"level": climbed.level, "time_s": climbed.time, "rise": rises}
+    found: list[Found] = []
+    for i, row in enumerate(limits.rows or (None,) * len(rises)):
+        proof: dict[str, Any] = {"certified": None, "reason": "", "starts": ""}
+        proof = {name: getattr(row, name) for name in proof} if row else proof
+        of_tank: dict[str, Any] = {name: float(column[i]) for name, column in numbers.items()}
+        found.append(Found(tank=i, values=climbed.values[i], **proof, **of_tank))
     return Attack(
         attacked=attacked,
-        found=tuple(
-            Found(
-                tank=i,
-                limit=float(limits.limit[i]),
-                certified=row and row.certified,
-                reason=row.reason if row else "",
-                starts=row.starts if row else "",
-                nominal=float(levels[0, i]),
-                drawn=float(levels[1:, i].max()),
-                level=float(climbed.level[i]),
-                time_s=float(climbed.time[i]),
-                rise=float(rises[i]),
-                values=climbed.values[i],
-            )
-            for i, row in enumerate(rows)
-        ),
+        found=tuple(found),
         history=climbed.history,
         starts=starts,
         draws=draws,

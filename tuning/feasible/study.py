@@ -84,9 +84,8 @@ def feasibility(
     began = time.perf_counter()
     distributions = spread_of(case) if distributions is None else stated(distributions)
     draws = Draws(case.loop, distributions)
-    needs_of = lambda count: Needs(
-        case, draws.values(probabilities("sobol", draws.dimensions, count, seed)), limits
-    )
+    points = lambda count: probabilities("sobol", draws.dimensions, count, seed)
+    needs_of = lambda count: Needs(case, draws.values(points(count)), limits)
     needs = needs_of(samples)
     excess = needs.excess()
     infeasible = np.any(excess > 0, axis=(1, 2))
@@ -292,15 +291,11 @@ def least_offsets(needs: Needs) -> np.ndarray:
         best = np.minimum(best, distance)
         if round_ == ROUNDS:
             break
-        slopes = np.stack(
-            [
-                (few.at(y + step * axis) - few.at(y - step * axis))
-                / size
-                / (2.0 * step * axis).sum(-1)[..., None]
-                for axis in np.eye(r.shape[2])
-            ],
-            axis=-1,
-        )
+        columns = []
+        for move in step * np.eye(r.shape[2])[:, None, None]:
+            change = (few.at(y + move) - few.at(y - move)) / size
+            columns.append(change / (2.0 * move).sum(-1)[..., None])
+        slopes = np.stack(columns, axis=-1)
         rows = np.concatenate([slopes, -slopes], axis=2)
         ends = np.concatenate([high - needed, needed - low], axis=2)
         ends = ends + np.einsum("spqm,spm->spq", rows, y)

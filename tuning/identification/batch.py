@@ -120,27 +120,14 @@ def _estimates(problem, e, z, residual, jacobian):
     errors = np.where(alone.mask, -residual * problem.noise, np.nan)
     if not np.all(np.isfinite(jacobian)):  # diverged: nothing is identifiable
         residual, jacobian = np.zeros_like(residual), np.zeros_like(jacobian)
-    fit = Fit(
-        p=p,
-        levels=levels,
-        cost=0.0,
-        residual=residual[alone.mask[0]],
-        jacobian=jacobian[alone.mask[0]],
-        evaluations=0,
-        status=0,
-    )
+    fit = Fit(p, levels, 0.0, residual[alone.mask[0]], jacobian[alone.mask[0]], 0, 0)
     spread, values = Spread(alone, fit), coordinates.values(p)
     covariance = spread.values_covariance
     absent = spread.without_interval
     covariance[absent], covariance[:, absent] = np.nan, np.nan
     half = spread.quantile * np.sqrt(np.diag(covariance))[: coordinates.size]
-    return (
-        np.array([values[n] for n in coordinates.names]),
-        covariance,
-        alone.first_levels(z)[0],
-        half,
-        quality(alone.data.y, errors),
-    )
+    of_names, first = np.array([values[n] for n in coordinates.names]), alone.first_levels(z)[0]
+    return of_names, covariance, first, half, quality(alone.data.y, errors)
 
 
 class _Batch:

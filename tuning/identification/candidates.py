@@ -205,16 +205,11 @@ class AugmentedEstimation(Estimation):
             # the last is filled up: one compiled program
             rows = points[np.arange(begin, begin + self.lanes).clip(max=len(points) - 1)]
             values = [self.coordinates.values(z[: self.coordinates.size]) for z in rows]
-            levels = simulation.variants(
-                self.rig,
-                self.data.dt,
-                np.stack([self._inputs(v) for v in values]),
-                np.stack([self._flows(v) for v in values]),
-                rows[:, self.inside_at],
-                np.stack([self.first_levels(z) for z in rows]),
-                coordinates=self.inside,
-                substeps=self.substeps,
-            )
+            u, flows = (np.stack(list(map(of, values))) for of in (self._inputs, self._flows))
+            first = np.stack([self.first_levels(z) for z in rows])
+            run = (self.rig, self.data.dt, u, flows, rows[:, self.inside_at], first)
+            static = {"coordinates": self.inside, "substeps": self.substeps}
+            levels = simulation.variants(*run, **static)
             parts.append(np.asarray(levels)[: len(points) - begin])
         return np.concatenate(parts)
 

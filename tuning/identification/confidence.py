@@ -9,6 +9,7 @@ from scipy.linalg import block_diag, qr
 from scipy.signal import lfilter
 from scipy.stats import t as student
 
+from jaxtank.core.jsonable import fields
 from jaxtank.core.tree import describe
 from tuning.identification.coordinates import nominal
 from tuning.identification.inputs import STATIC
@@ -152,19 +153,15 @@ class Spread:
             i = est.coordinates.names.index(b.name)
             value, half = float(values[b.name]), self.quantile * float(self.sd[i])
             interval = _within(describe(est.case.loop, b.name), value - half, value + half)
+            at_bound, known = bool(self.at_bound[i]), not self.without_interval[i]
             rows[b.name] = {
                 "before": before[b.name],
                 "value": value,
-                "unit": b.unit,
-                "lower": b.low,
-                "upper": b.high,
+                **fields(b, "unit lower=low upper=high"),
                 "sd": None if self.without_interval[i] else float(self.sd[i]),
                 "interval95": None if self.without_interval[i] else interval,
-                "identifiable": bool(
-                    not self.unidentifiable[i]
-                    and (self.at_bound[i] or not self.without_interval[i])
-                ),
-                "at_bound": bool(self.at_bound[i]),
+                "identifiable": not self.unidentifiable[i] and (at_bound or known),
+                "at_bound": at_bound,
             }
         return rows
 

@@ -223,18 +223,9 @@ def _data(t, u, tanks, case):
 
 def _jacobian(rig, coordinates, p, data, x0, substeps):
     """Return (samples, measured tanks, unknowns) sensitivities of the readings of one run."""
-    slopes = simulation.sensitivities(
-        rig,
-        data.dt,
-        data.u,
-        p,
-        x0[None],
-        coordinates=coordinates,
-        tanks=tuple(range(x0.size)),
-        channels=data.channels,
-        substeps=substeps,
-    )[1]
-    return np.asarray(slopes)[0]
+    static = {"channels": data.channels, "tanks": tuple(range(x0.size)), "substeps": substeps}
+    run = (rig, data.dt, data.u, p, x0[None])
+    return np.asarray(simulation.sensitivities(*run, coordinates=coordinates, **static)[1])[0]
 
 
 def most_informative(experiments):

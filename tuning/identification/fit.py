@@ -508,16 +508,8 @@ def _search(cache, estimation, z, settings):
     p, levels, cost, evaluations, status = cache.recall("search", [z], compute)
     if new:
         return new[0]
-    return Fit(
-        p=p,
-        levels=levels,
-        cost=cost,
-        residual=np.zeros(0),
-        jacobian=np.zeros((0, estimation.size)),
-        evaluations=int(evaluations),
-        status=int(status),
-        loss=settings["loss"],
-    )
+    rows, counts = (np.zeros(0), np.zeros((0, estimation.size))), (int(evaluations), int(status))
+    return Fit(p, levels, cost, *rows, *counts, loss=settings["loss"])
 
 
 def _within_ranges(estimation, fit, settings):

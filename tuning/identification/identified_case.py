@@ -35,32 +35,20 @@ def bare(plant):
     """Return a Case around a plant: ideal pumps and sensors, empty tanks, no controller."""
     n, m = plant.tanks, plant.pumps
     zero = number(np.zeros(m))
+    nothing: Any = dict.fromkeys(("low", "stop", "initial"), zero)
+    top = number(np.max(plant.rim))
     loop = ClosedLoop(
         plant=plant,
-        sensor=LevelSensor(
-            gain=number(np.ones(n)), noise=number(np.zeros(n)), full_scale=number(np.max(plant.rim))
-        ),
+        sensor=LevelSensor(gain=number(np.ones(n)), noise=number(np.zeros(n)), full_scale=top),
         observer=Direct(),
         controller=OpenLoop(signal=Constant(level=zero)),
-        actuator=PumpBank(
-            low=zero,
-            high=number(np.full(m, np.inf)),
-            stop=zero,
-            pulse=number(np.ones(m)),
-            initial=zero,
-        ),
+        actuator=PumpBank(high=number(np.full(m, np.inf)), pulse=number(np.ones(m)), **nothing),
         reference=Constant(level=number(np.zeros(len(plant.outputs)))),
         x0=number(np.zeros(n)),
     )
-    return Case(
-        name="plant",
-        title="a plant without a controller",
-        loop=loop,
-        clock=Clock(),
-        limits={},
-        free={},
-        objective={},
-    )
+    empty: Any = {name: {} for name in ("limits", "free", "objective")}
+    title = "a plant without a controller"
+    return Case(name="plant", title=title, loop=loop, clock=Clock(), **empty)
 
 
 def proposed(result):
@@ -192,14 +180,13 @@ def with_pi(case, inputs):
     open_loop = dataclasses.replace(loop, controller=OpenLoop(signal=loop.reference))
     controller = controller_of(table, open_loop)
     ours = lambda name: name.startswith("controller.")
-    free = {n: f for n, f in case.free.items() if not ours(n)} | {
-        "controller.Kc": Free(float(Kc.min() / 30), float(Kc.max() * 30))
-        if Kc.min() > 0  # else a valve in an outlet
-        else Free(
-            float(Kc.min() * 30), float(Kc.max() * (30 if Kc.max() > 0 else 1 / 30)), "linear"
-        ),
-        "controller.Ti": Free(float(Ti.min() / 10), float(Ti.max() * 10)),
-    }
+    least, most = float(Kc.min()), float(Kc.max())
+    ends: Any = (least / 30, most * 30)
+    if least <= 0:  # a valve in an outlet
+        ends = (least * 30, most * (30 if most > 0 else 1 / 30), "linear")
+    free = {n: f for n, f in case.free.items() if not ours(n)}
+    free["controller.Kc"] = Free(*ends)
+    free["controller.Ti"] = Free(float(Ti.min() / 10), float(Ti.max() * 10))
     case = case.replace(
         loop=dataclasses.replace(loop, controller=controller),
         free=free,

@@ -142,20 +142,10 @@ class Likelihood:
         levels, tanks = est.first_levels(z[: est.size]), est.tanks
         rig, shared, free = est.rig, est.coordinates.size, len(est.tanks)
         tanks = tanks or tuple(range(levels.shape[1]))
-        results, slopes = sensitivities(
-            rig,
-            data.dt,
-            data.u,
-            np.where(est.mask, data.y, 0.0),
-            est.mask,
-            self.split(z)[0],
-            levels,
-            z[est.size :],
-            coordinates=est.coordinates,
-            tanks=tanks,
-            channels=data.channels,
-            substeps=est.substeps,
-        )
+        run = (rig, data.dt, data.u, np.where(est.mask, data.y, 0.0), est.mask)
+        at = (self.split(z)[0], levels, z[est.size :])
+        static = {"tanks": tanks, "channels": data.channels, "substeps": est.substeps}
+        results, slopes = sensitivities(*run, *at, coordinates=est.coordinates, **static)
         self.evaluations += 1
         parts, jacobians = [np.asarray(v)[est.mask] for v in results], []
         log = np.broadcast_to(np.arange(len(est.logs))[:, None, None], est.mask.shape)[est.mask]

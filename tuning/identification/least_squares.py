@@ -13,7 +13,7 @@ from tuning.identification.residuals import ROBUST_LIMIT
 CHI_SQUARED_95 = 3.841458820694124  # one degree of freedom
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True)
 class Fit:
     """Where a search ended."""
 
@@ -87,36 +87,20 @@ def solve(
     rows, jacobian = np.zeros(0), np.zeros((0, estimation.size))
     if np.all(np.isfinite(residual.at(begin)[0])):
         # with a wide range scipy's step to the edge of its trust region overflows
+        ends = dict.fromkeys(("xtol", "gtol"), min(1e-8, 1e2 * tolerance)) | {"ftol": tolerance}
+        options: Any = {"loss": loss, "f_scale": ROBUST_LIMIT, "max_nfev": iterations, **ends}
+        box = (low - 1e-12, high + 1e-12)
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             solution = optimize.least_squares(
-                residual.value,
-                begin,
-                cast(Any, residual.slope),
-                bounds=(low - 1e-12, high + 1e-12),
-                x_scale=1.0,
-                loss=loss,
-                f_scale=ROBUST_LIMIT,
-                xtol=min(1e-8, 1e2 * tolerance),
-                ftol=tolerance,
-                gtol=min(1e-8, 1e2 * tolerance),
-                max_nfev=iterations,
+                residual.value, begin, cast(Any, residual.slope), bounds=box, **options
             )
         end[residual.free] = np.clip(solution.x, low, high)
         rows, jacobian = estimation.residual_and_jacobian(end)
         cost = float(solution.cost) if prior is None else 0.5 * float(rows @ rows)
         status = solution.status
     p, levels = estimation.split(end)
-    return Fit(
-        p=p.copy(),
-        levels=levels,
-        cost=cost,
-        residual=rows,
-        jacobian=jacobian,
-        evaluations=estimation.evaluations - before,
-        status=status,
-        loss=loss,
-        z=end,
-    )
+    count = estimation.evaluations - before
+    return Fit(p.copy(), levels, cost, rows, jacobian, count, status, loss=loss, z=end)
 
 
 def profile_likelihood(estimation, fit, spread, loss="linear", points=11, reach=3.0):

@@ -190,10 +190,8 @@ class Estimation:
         plant, tanks, scale = self.case.loop.plant, list(self.tanks), self.level_scale
         top = np.asarray(plant.rim)[tanks] * (1.0 if getattr(plant, "overflow", False) else 1.5)
         top = np.maximum(top, self.initial[:, tanks].max(axis=0, initial=0.0))
-        return (
-            np.concatenate([low, np.zeros(scale.size)]),
-            np.concatenate([high, np.tile(top, len(self.logs)) / scale]),
-        )
+        highest = np.tile(top, len(self.logs)) / scale
+        return np.concatenate([low, np.zeros(scale.size)]), np.concatenate([high, highest])
 
     @property
     def of_inputs(self) -> dict[str, float]:
@@ -247,16 +245,9 @@ class Estimation:
     def predicted(self, z: np.ndarray, data: Any = None) -> np.ndarray:
         """Return (logs, samples, channels) simulated readings at z, for the inputs of `data`."""
         data = self.data if data is None else data
-        return np.asarray(
-            simulation.play(
-                self.rig_at(z),
-                data.dt,
-                self.inputs_at(self.split(z)[0], data),
-                self.first_levels(z),
-                channels=data.channels,
-                substeps=self.substeps,
-            )
-        )
+        static = {"channels": data.channels, "substeps": self.substeps}
+        u, first = self.inputs_at(self.split(z)[0], data), self.first_levels(z)
+        return np.asarray(simulation.play(self.rig_at(z), data.dt, u, first, **static))
 
     def inputs_at(self, p: np.ndarray, data: Any) -> np.ndarray:
         """Return (logs, samples, .., pumps) inputs of PaddedData at coordinates p."""
@@ -271,17 +262,10 @@ class Estimation:
         elif not tanks:
             rig = dataclasses.replace(rig, x0=self.initial[0])
         of = self.coordinates.leaves
-        y, slopes = simulation.sensitivities(
-            rig,
-            self.data.dt[logs],
-            self.inputs_at(p, self.data)[logs] if self.coordinates.inputs else self.data.u[logs],
-            p[..., : of.size],
-            levels,
-            coordinates=of,
-            tanks=tanks,
-            channels=self.data.channels,
-            substeps=self.substeps,
-        )
+        u = self.inputs_at(p, self.data) if self.coordinates.inputs else self.data.u
+        run = (rig, self.data.dt[logs], u[logs], p[..., : of.size], levels)
+        static = {"tanks": tanks, "channels": self.data.channels, "substeps": self.substeps}
+        y, slopes = simulation.sensitivities(*run, coordinates=of, **static)
         shared, slopes = self.coordinates.size, np.array(slopes)[..., : of.size + free]
         if shared > of.size:
             slopes = np.insert(slopes, [of.size], self._by_inputs(p, levels, y), axis=-1)

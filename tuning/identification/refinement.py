@@ -121,14 +121,9 @@ class _Search:
         loop, free = self.loop, {b.name: (b.low, b.high, b.scale) for b in before.bounds}
         for part in self.parts:
             loop, free = part.attach(loop), free | part.free
-        self.problem = Estimation(
-            result.case.replace(loop=loop, covariance=None),
-            before.logs,
-            free,
-            "free" if before.tanks else "case",
-            before.noise,
-            min(before.substeps, SUBSTEPS),
-        )
+        case = result.case.replace(loop=loop, covariance=None)
+        first, substeps = "free" if before.tanks else "case", min(before.substeps, SUBSTEPS)
+        self.problem = Estimation(case, before.logs, free, first, before.noise, substeps)
         self.problem.initial = before.first_levels(before.unknowns(result.fit))
         self.start = self.problem.nominal()
         names = self.problem.coordinates.names

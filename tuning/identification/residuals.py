@@ -68,11 +68,8 @@ def residuals_of(estimation, fit):
 
 def quality(y, residual):
     """Return {"rmse", "nrmse_percent", "residual_autocorrelation"} of each channel."""
-    return fit_of(y, residual) | {
-        "residual_autocorrelation": [
-            float(autocorrelation(r, 1)[1]) for r in np.moveaxis(residual, -1, 0)
-        ]
-    }
+    rho = [float(autocorrelation(r, 1)[1]) for r in np.moveaxis(residual, -1, 0)]
+    return fit_of(y, residual) | {"residual_autocorrelation": rho}
 
 
 def fit_of(y, residual):
@@ -130,11 +127,8 @@ def pseudo(fit):
 
 def validate(estimation, partial, fit, counts):
     """Return how a fit of `partial` to the first samples of each log predicts the rest."""
-    residual = np.where(
-        estimation.mask,
-        estimation.data.y - partial.predicted(partial.unknowns(fit), estimation.data),
-        np.nan,
-    )
+    predicted = partial.predicted(partial.unknowns(fit), estimation.data)
+    residual = np.where(estimation.mask, estimation.data.y - predicted, np.nan)
     first = (np.arange(residual.shape[1]) < np.array(counts)[:, None])[..., None]
     return {
         "samples": [int(n) for n in counts],

@@ -193,13 +193,9 @@ def ultimate_of(loop: Loop) -> Ultimate:
     size = n + bool(loop.lag)
     gain = REFERENCE_GAIN / (process.gain * process.delay)
     with jax.enable_x64(True):
-        edge = _margins(
-            jnp.asarray(transition[:size, :size]),
-            jnp.asarray(transition[:size, n + 1 :] * gain),
-            jnp.asarray(np.append(loop.c, np.zeros(size - n))[None]),
-            round(loop.delay / loop.dt),
-            loop.dt,
-        )
+        read = np.append(loop.c, np.zeros(size - n))[None]
+        matrices = (transition[:size, :size], transition[:size, n + 1 :] * gain, read)
+        edge = _margins(*map(jnp.asarray, matrices), round(loop.delay / loop.dt), loop.dt)
     factor, frequency = float(edge.gain_margin[0]), float(edge.gain_frequency[0])
     if not (bool(edge.stable) and 0.0 < factor < math.inf and frequency > 0.0):
         raise InputError("the loop has no ultimate gain")

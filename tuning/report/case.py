@@ -60,8 +60,7 @@ def json_of(case):
         "plant": type(loop.plant).__name__,
         "names": {kind: list(names) for kind, names in case.names.items()},
         "equations": equations(loop.plant, loop.disturbance is not None),
-        "law": type(loop.controller).__name__
-        + (f"({type(inner).__name__})" if inner is not None else ""),
+        "law": type(loop.controller).__name__ + f"({type(inner).__name__})" * (inner is not None),
         "observer": type(loop.observer).__name__,
         "parameters": _parameters(case, preset),
         "free": {n: list(Free(*spec)) for n, spec in case.free.items()},
@@ -86,14 +85,8 @@ def _parameters(case, preset):
         if value is None and name.rpartition(".")[0].endswith(("plant", "model")):
             continue  # parts that this rig does not have
         low, high = list(Free(*ranges[name]))[:2] if name in ranges else (None, None)
-        parameters[name] = {
-            "value": clean(value),
-            "unit": meta["unit"],
-            "low": low,
-            "high": high,
-            "static": kind == "static",
-            "about": meta["doc"],
-        }
+        row = {"value": clean(value), "unit": meta["unit"], "low": low, "high": high}
+        parameters[name] = row | {"static": kind == "static", "about": meta["doc"]}
     return parameters
 
 

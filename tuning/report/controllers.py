@@ -38,9 +38,8 @@ def _row(rival):
     judged = rival.judged.to_json()
     return {
         **fields(rival, "name kind gains tuned error violations step_us"),
+        **fields(rival, "filter=filtered sensitivity_peak=peak"),
         **{name: judged[name] for name in ("objective", "failed", "travel_percent")},
-        "filter": rival.filtered,
-        "sensitivity_peak": rival.peak,
         "why": rival.why or None,
     }
 

@@ -54,8 +54,7 @@ def json_of(attack):
         "coefficients": {
             c.name: fields(c, "nominal low high varies") for c in attacked.coefficients
         },
-        **fields(attacked, "windows pumps start"),
-        "reading_band": clean(attacked.band),
+        **fields(attacked, "windows pumps start reading_band=band"),
         **fields(attack, "starts draws history wall_s"),
         "remarks": remarks_of(attack),
         "provenance": provenance.provenance(case, attack.seed),
@@ -70,7 +69,7 @@ def _row(attack, tank):
         "parameters": clean(attack.parameters(tank)),
         "why": tank.reason or None,
         "starts": tank.starts or None,
-        "rise_between_samples": clean(tank.rise),
+        **fields(tank, "rise_between_samples=rise"),
     }
 
 
@@ -259,11 +258,9 @@ def settings(attack, tank):
     """Return the run of `tank` as --set options, coefficients as in the window of its peak."""
     clock, windows = attack.case.clock, attack.attacked.windows
     at = min(int(tank.time_s * windows / (clock.duration + clock.dt)), windows - 1)
-    values = {
-        name: value[at] if isinstance(value, list) else value
-        for name, value in attack.parameters(tank).items()
-        if not name.startswith("sensor.")
-    }
+    every = attack.parameters(tank).items()
+    known = {name: value for name, value in every if not name.startswith("sensor.")}
+    values = {n: value[at] if isinstance(value, list) else value for n, value in known.items()}
     return " ".join(f"--set {shlex.quote(f'{name}={value:.6g}')}" for name, value in values.items())
 
 

@@ -85,6 +85,12 @@ ODD = {  # {kind of an oddity in experiment data: sentence}
 }
 
 
+def oddities_json(oddities):
+    """Return the JSON objects of oddities, each with its sentence."""
+    pairs = zip(oddities, sentences_on(oddities))
+    return [clean(odd._asdict() | {"sentence": sentence}) for odd, sentence in pairs]
+
+
 def sentences_on(oddities):
     return [
         ODD[odd.kind].format(**odd._asdict() | {"count": count(odd.count, "reading")})
@@ -544,35 +550,24 @@ def json_of(fit):
         "success": fit.status == "converged",
         "message": "; ".join(sentences_of(fit)),
         "diagnosis": diagnosis_of(fit),
-        **fields(fit, "parameters remedies validation profile starts wall_s"),
+        **fields(fit, "parameters remedies validation profile starts wall_s prior likelihood"),
+        **fields(fit, "initial_levels=levels free_combinations=directions"),
         "fit": {n: clean(quality[n]) for n in (*FIT, "residual_autocorrelation")},
         "channels": [
             {"name": n, "unit": u, "noise": s} for (n, u), s in zip(fit.channels, quality["noise"])
         ],
         "intervals_widened": quality["widened"],
-        "prior": clean(fit.prior),
-        "likelihood": clean(fit.likelihood),
         "refinements": [
             clean(part._asdict() | {"where": part.where + 1}) for part in fit.refinements
         ],
         "posterior": None
         if fit.posterior is None
         else {"draws": len(fit.posterior.values), **fields(fit.posterior, "rhat effective")},
-        "oddities": [
-            clean(odd._asdict() | {"sentence": sentence})
-            for odd, sentence in zip(fit.oddities, sentences_on(fit.oddities))
-        ],
-        "initial_levels": clean(fit.levels),
+        "oddities": oddities_json(fit.oddities),
         "covariance": {"names": list(free[0]), "matrix": np.asarray(free[1]).tolist()},
         "correlation": {"names": list(names), "matrix": correlation.tolist()},
-        "free_combinations": clean(fit.directions),
         "data": [
-            {
-                "name": log.name,
-                "samples": log.samples,
-                "readings": int(np.isfinite(log.y).sum()),
-                "notes": list(log.notes),
-            }
+            fields(log, "name samples notes") | {"readings": int(np.isfinite(log.y).sum())}
             for log in est.logs
         ],
         "substeps": est.substeps,

@@ -7,8 +7,8 @@ import numpy as np
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
-from tuning.report.identification import sentences_on
-from tuning.report.tables import Table, Value, clean
+from tuning.report.identification import oddities_json, sentences_on
+from tuning.report.tables import Table, Value, clean, fields
 
 CAPTIONS = {"log": "The columns of the file, over time."}
 MOST = 12  # columns that are drawn
@@ -24,10 +24,9 @@ def json_of(result):
             "time": {"header": result.time, "samples": len(result.t), **steps},
             "columns": [
                 {
-                    "header": c.header,
+                    **fields(c, "header values=count"),
                     "slot": c.slot or None,
                     "unit": c.unit or None,
-                    "values": c.count,
                     "missing": len(c.values) - c.count,
                     "low": np.nanmin(c.values) if c.count else None,
                     "high": np.nanmax(c.values) if c.count else None,
@@ -36,12 +35,8 @@ def json_of(result):
                 for c in result.columns
             ],
             "log": result.table,
-            "oddities": [
-                odd._asdict() | {"sentence": sentence}
-                for odd, sentence in zip(result.oddities, sentences_on(result.oddities))
-            ],
-            "notes": result.notes,
-            "problems": result.problems,
+            "oddities": oddities_json(result.oddities),
+            **fields(result, "notes problems"),
         }
     )
 

@@ -73,8 +73,7 @@ def json_of(bound):
     names = "cost objective measures constraints holds closed_loop gain_percent source grids slope"
     return {
         "verdict": verdict_of(bound).to_json(),
-        **fields(bound, f"{names} interrupted wall_s"),
-        "interval_s": bound.interval,
+        **fields(bound, f"{names} interrupted wall_s interval_s=interval"),
         "intervals": len(bound.u),
         "evaluations": fields(bound, "simulations gradients iterations"),
         "note": NOTE,

@@ -21,7 +21,7 @@ from tuning.report.advice import Advice, listed
 from tuning.report.document import Live, Report, Text
 from tuning.report.folder import earlier
 from tuning.report.folder import save as save_all
-from tuning.report.tables import Table, Value, clean
+from tuning.report.tables import Table, Value, clean, fields
 
 NUMBER, CLAIM = "number", "claim"
 REPRODUCED, FITTED, DIFFERS = "reproduced", "fitted", "differs"
@@ -105,13 +105,9 @@ def _verdict_on_number(published, measured):
 
 def measure(paper):
     """Return {"paper", "citation", "notes", "headline", "ramps", "rows"} of a paper."""
-    # The keys of a row: quantity, kind ("number" or "claim"), unit, where, published, measured,
-    # deviation (of one run, where several were made with noise), verdict, reason, ramp_s (duration
-    # of the setpoint ramps of its runs [s], where the paper prints none) and by_ramp (its verdict
-    # with each duration).
-    # A parameter that the paper prints is compared with the value in the preset's first case that
-    # has it. Raises InputError for an unknown paper, and KeyError if the preset measures something
-    # that it does not list as published.
+    # deviation: of one run, where several were made with noise; ramp_s: duration of the setpoint
+    # ramps [s], where the paper prints none; by_ramp: the verdict with each duration. A parameter
+    # that the paper prints is compared with the value in the first case that has it.
     preset = presets.load(paper)
     measured = preset.measured(runner(paper))
     if stray := set(measured) - set(preset.published):
@@ -126,9 +122,7 @@ def measure(paper):
             {
                 "quantity": name,
                 "kind": CLAIM if isinstance(printed.value, str) else NUMBER,
-                "unit": printed.unit,
-                "where": printed.where,
-                "published": clean(printed.value),
+                **fields(printed, "unit where published=value"),
                 "measured": clean(number),
                 "deviation": clean(value.deviation) if isinstance(value, Sample) else None,
                 "verdict": word,

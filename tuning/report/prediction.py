@@ -9,7 +9,7 @@ from tuning.problem import provenance
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.identification import draw_log, fit_csv
-from tuning.report.tables import Table, Value, clean
+from tuning.report.tables import Table, Value, clean, fields
 
 CAPTIONS = {"fit": "Measured readings (dots), the rig as it is (line), and the inputs."}
 SIDES = ("measured", "simulated")
@@ -138,10 +138,7 @@ def json_of(result):
             "start_samples": result.start_samples,
             "initial_levels": np.asarray(result.levels).tolist(),
             "channels": [{"name": name, "unit": unit} for name, unit in result.channels],
-            "data": [
-                {"name": log.name, "samples": log.samples, "notes": list(log.notes)}
-                for log in result.estimation.logs
-            ],
+            "data": [fields(log, "name samples notes") for log in result.estimation.logs],
             "message": "; ".join(sentences_of(result)),
             "provenance": provenance.provenance(result.case, None),
         }

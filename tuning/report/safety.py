@@ -7,7 +7,7 @@ from jaxtank.core.labels import short
 from jaxtank.core.units import local
 from jaxtank.safety.checker import CASE, LIMITS
 from jaxtank.safety.of_case import certificates_of
-from tuning.report.tables import Table, Value, clean
+from tuning.report.tables import Table, Value, fields
 
 PROMISE = (  # hypotheses of the proofs, without the start
     "on any plant with parameters in the case's intervals, under any controller, while each reading"
@@ -27,20 +27,13 @@ def certificates(case):
         rows = certificates_of(case)
     except InputError:
         return None
+    low = lambda row: fields(row, "limit=low certified=low_certified why=low_reason")
     return [
         {
             "tank": row.tank + 1,
-            "limit": row.limit,
-            "certified": row.certified,
-            "why": row.reason,
+            **fields(row, "limit certified why=reason rate rate_bound gap reach"),
             "starts": row.starts or None,
-            "rate": clean(row.rate),
-            "rate_bound": clean(row.rate_bound),
-            "gap": clean(row.gap),
-            "reach": clean(row.reach),
-            "low": {"limit": row.low, "certified": row.low_certified, "why": row.low_reason}
-            if row.low > 0.0
-            else None,
+            "low": low(row) if row.low > 0.0 else None,
         }
         for row in rows
     ]

@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.jsonable import clean as clean
+from jaxtank.core.jsonable import fields as fields
 from jaxtank.core.labels import label_of, place_of
 from jaxtank.core.units import DEFAULT
 
@@ -214,11 +215,6 @@ def measures_json(measures):
     """Return measures as JSON; None for those undefined for the case (`reasons` has the cause)."""
     known = {m: v for m, v in measures.items() if m not in ms.times()}
     return {**dict.fromkeys(_unserved()), **clean(known)}
-
-
-def fields(result, names):
-    """Return {name: value of that attribute, as JSON takes it} of several names in one text."""
-    return {name: clean(getattr(result, name)) for name in names.split()}
 
 
 def csv_text(rows):

@@ -54,6 +54,8 @@ CAPTIONS = {
 def json_of(ensemble):
     """The JSON object of `jaxtank uncertainty --json`."""
     summary, feasible = clean(ensemble.summary()), ensemble.infeasible
+    fields_of = lambda d: {k: v for k, v in dataclasses.asdict(d).items() if k != "draws"}
+    stated = lambda d: {"kind": type(d).__name__, **clean(fields_of(d))}
     payload = {
         "case": ensemble.case.name,
         "verdict": verdict_of(ensemble).to_json(),
@@ -61,13 +63,7 @@ def json_of(ensemble):
         "failed": int(ensemble.failed.sum()),
         "infeasible": None if feasible is None else int(feasible.sum()),
         "draws": ensemble.method,
-        "distributions": {
-            n: {
-                "kind": type(d).__name__,
-                **clean({k: v for k, v in dataclasses.asdict(d).items() if k != "draws"}),
-            }
-            for n, d in ensemble.distributions.items()
-        },
+        "distributions": {n: stated(d) for n, d in ensemble.distributions.items()},
         "measures": summary,
         "units": {m: ms.entry_units(m, ensemble.case.loop.plant) for m in ensemble.measures},
         "violations": clean(ensemble.violations()),

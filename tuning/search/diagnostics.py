@@ -284,14 +284,10 @@ def _farthest(loop, clock, key, i) -> tuple[float, float]:
     errors = np.asarray(lp.simulate(loop, clock, key, save_every=every).e)[:, i]
     setpoints, changes = _setpoints(loop, clock)
     setpoint = np.asarray(setpoints[i])[::every][: len(errors)]
-    target, step = (
-        (setpoint, 0 * setpoint)
-        if changes is None
-        else (
-            np.broadcast_to(np.asarray(v), (clock.samples,))[::every][: len(errors)]
-            for v in changes[i][:2]
-        )
-    )
+    target, step = setpoint, 0 * setpoint
+    if changes is not None:
+        courses = (np.broadcast_to(np.asarray(v), (clock.samples,)) for v in changes[i][:2])
+        target, step = (course[::every][: len(errors)] for course in courses)
     ends = [*np.flatnonzero(np.diff(target)), len(errors) - 1] if changes else [len(errors) - 1]
     worst = (0.0, 0.0)
     for first, last in zip([-1, *ends], ends):

@@ -149,19 +149,14 @@ def reporter(progress: Callable | None, starts: int, unit: str | None = None) ->
     def report(search: Search) -> None:
         if progress is None or not search.history:
             return
-        best, last = search.best, search.history[-1]
-        event = {
-            "start": search.start,
-            "starts": starts,
-            "evaluations": len(search.history),
-            "cost": last[1],
-            "violation": last[2],
-            "best": None if best is None else best.cost,
-            "best_violation": None if best is None else search.violation(best),
-            "values": None if best is None else search.problem.values(best.z),
-            "unit": unit,  # of the cost, None: the usual one of the case
-        }
-        progress(event)
+        best, (_, cost, violation, _) = search.best, search.history[-1]
+        event: dict[str, Any] = dict.fromkeys(("best", "best_violation", "values"))
+        if best is not None:
+            event = {"best": best.cost, "best_violation": search.violation(best)}
+            event["values"] = search.problem.values(best.z)
+        event |= {"start": search.start, "starts": starts, "evaluations": len(search.history)}
+        # unit: of the cost, None: the usual one of the case
+        progress(event | {"cost": cost, "violation": violation, "unit": unit})
 
     return report
 

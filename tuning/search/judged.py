@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.case import Case, check_case
-from jaxtank.core.jsonable import clean
+from jaxtank.core.jsonable import clean, fields
 from jaxtank.core.tree import get_value
 from jaxtank.limits import limited_levels, resolve_limits
 from jaxtank.loop import run as lp
@@ -390,9 +390,7 @@ class Answer(Shown):
         """Return the JSON entries for plants, noise and safety filter."""
         return clean(
             {
-                "noise": self.setting.noise,
-                "noise_assumed": self.setting.assumed,
-                "plants_stated": self.setting.stated,
+                **fields(self.setting, "noise noise_assumed=assumed plants_stated=stated"),
                 "objective": dict(self.setting.objective),
                 "safety_filter": self.setting.filter,
                 "nominal_error": {  # of the run whose measures the JSON has, to the last digit
@@ -400,10 +398,8 @@ class Answer(Shown):
                 },
                 "plants": {name: side.to_json() for name, side in self.sides.items()},
                 "kept": [name for name, stays in self.kept.items() if stays],
-                "idle_limits_of_tanks": list(self.idle),
-                "limits_tightened": self.tightened,
-                "search_dt_s": self.coarse_dt,
-                "search_integrator": self.integrator,
+                **fields(self, "idle_limits_of_tanks=idle limits_tightened=tightened"),
+                **fields(self, "search_dt_s=coarse_dt search_integrator=integrator"),
                 "mended": None if self.mended is None else dict(self.mended.set),
             }
         )

@@ -123,15 +123,10 @@ def slsqp(search, z, iterations, tolerance=None):
 
 def _minimise(search, function, y, more, constraints, iterations, tolerance):
     """Return True if SLSQP converged from y in [0, 1], the last ones in the ranges `more`."""
-    done = scipy.optimize.minimize(
-        function,
-        y,
-        jac=True,
-        method="SLSQP",
-        bounds=[(0.0, 1.0)] * (len(y) - len(more)) + more,
-        constraints=constraints,
-        options={"maxiter": iterations, "ftol": tolerance},
-    )
+    box = [(0.0, 1.0)] * (len(y) - len(more)) + more
+    rules = {"bounds": box, "constraints": constraints, "jac": True, "method": "SLSQP"}
+    options = {"maxiter": iterations, "ftol": tolerance}
+    done = scipy.optimize.minimize(function, y, options=options, **rules)
     search.exhausted = done.status == ITERATION_LIMIT
     # 8: no further descent along the search direction, which is how a solver ends at the precision
     # of a kinked cost
@@ -189,17 +184,10 @@ def trf(search, z, iterations, tolerance=1e-10):
         rest = max(value - head @ head / excess, 0.0) ** 0.5
         return np.append(head / excess**0.5, rest), np.vstack([root.T * excess**0.5, 0 * z])
 
-    done = scipy.optimize.least_squares(
-        lambda z: model(z)[0],
-        np.clip(z, 1e-9, 1 - 1e-9),
-        jac=lambda z: model(z)[1],
-        bounds=(0.0, 1.0),
-        method="trf",
-        ftol=tolerance,
-        xtol=tolerance,
-        gtol=tolerance,
-        max_nfev=iterations,
-    )
+    value, slopes = (lambda z: model(z)[0]), (lambda z: model(z)[1])
+    options = dict.fromkeys(("ftol", "xtol", "gtol"), tolerance) | {"max_nfev": iterations}
+    inside = np.clip(z, 1e-9, 1 - 1e-9)
+    done = scipy.optimize.least_squares(value, inside, jac=slopes, bounds=(0.0, 1.0), **options)
     search.exhausted = done.status == 0
     return bool(done.success)
 

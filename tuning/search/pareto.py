@@ -179,10 +179,7 @@ def _row(problem, value, answer, z):
     """Return one row of `tradeoff`; z (P,): what to name where nothing finite was found."""
     best, violation = answer.best, answer.violation
     done = "converged" if answer.converged else "not_converged"
-    return {
-        "limit": value,
-        "status": "infeasible" if violation > 0 else done,
-        "objective": np.nan if best is None else float(best.cost),
-        "violation": float(violation),
-        "parameters": problem.values(z if best is None else best.z),
-    }
+    objective, at = (np.nan, z) if best is None else (float(best.cost), best.z)
+    status = "infeasible" if violation > 0 else done
+    row = {"limit": value, "status": status, "objective": objective}
+    return row | {"violation": float(violation), "parameters": problem.values(at)}

@@ -125,9 +125,8 @@ class ConstraintRow:
 
     def amount(self) -> str:
         """Return the value with its unit, or why it has none."""
-        return (
-            f"{self.value:.6g} {self.unit}" if self.reason is None else f"undefined ({self.reason})"
-        )
+        known = self.reason is None
+        return f"{self.value:.6g} {self.unit}" if known else f"undefined ({self.reason})"
 
     def to_json(self) -> dict[str, Any]:
         """Return the row as a dict, in the order of its fields."""
@@ -267,21 +266,13 @@ def constraint_rows(
     """Return a ConstraintRow for each limit of the problem."""
     rows, multipliers = [], multipliers or {}
     for limit in problem.limits:
-        entry = lambda table, name, limit=limit: float(
-            np.ravel(table[limit.run][name])[limit.index]
-        )
-        reached = ms.MEASURES[limit.measure].reached
-        rows.append(
-            row_of(
-                limit,
-                problem.runs[limit.run].case.loop,
-                entry(after, limit.measure),
-                before=None if before is None else entry(before, limit.measure),
-                time_s=entry(after, reached) if reached else None,
-                scenario=limit.scenario or None,
-                multiplier=multipliers.get(limit.label, 0.0),
-            )
-        )
+        entry = lambda table, name, x=limit: float(np.ravel(table[x.run][name])[x.index])
+        reached, loop = ms.MEASURES[limit.measure].reached, problem.runs[limit.run].case.loop
+        more: dict[str, Any] = {"scenario": limit.scenario or None}
+        more["before"] = None if before is None else entry(before, limit.measure)
+        more["time_s"] = entry(after, reached) if reached else None
+        more["multiplier"] = multipliers.get(limit.label, 0.0)
+        rows.append(row_of(limit, loop, entry(after, limit.measure), **more))
     return rows
 
 

@@ -142,9 +142,8 @@ class Setting:
             safety_filter, rows = plain.safety_design(**settings)
             # a level that matters may be kept below its limit for the sake of another one
             reached = np.ones(len(limits), dtype=bool) if near is None else near
-            lowered = any(
-                reached[row.tank] and row.limit < 0.999 * limits[row.tank] for row in rows
-            )
+            lowers = lambda row: reached[row.tank] and row.limit < 0.999 * limits[row.tank]
+            lowered = any(map(lowers, rows))
             if lowered and not np.all(reached):
                 limit = np.where(reached, limits, FREE * height(self.case))
                 settings = {"limit": limit.tolist()} | settings
@@ -172,11 +171,9 @@ class Setting:
         """Return the case as given with `values`, the filter, and the objective of the search."""
         loop = with_values(self.case.loop, values)
         case = self.case.replace(loop=loop, objective=dict(self.objective))
-        return (
-            case.without_safety_filter()
-            if self.filter is None
-            else self._filtered(case, self.filter)
-        )
+        if self.filter is None:
+            return case.without_safety_filter()
+        return self._filtered(case, self.filter)
 
 
 def scenarios_of(case, distributions=None, samples=64, seed=0):

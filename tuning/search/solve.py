@@ -230,18 +230,11 @@ class Stages:
         if np.array_equal(reached[3], z):
             check = search.slope(search.point(z))
         usable = None if check is None else check.usable
-        starts.append(
-            {
-                "from": search.problem.values(z),
-                "to": search.problem.values(reached[3]),
-                "cost": reached[1],
-                "violation": reached[2],
-                "evaluations": len(mine),
-                "converged": converged and usable is not False,
-                "exhausted": search.exhausted,
-                "slope_usable": usable,
-            }
-        )
+        _, cost, violation, end = reached
+        start = {"from": search.problem.values(z), "to": search.problem.values(end)}
+        start |= {"cost": cost, "violation": violation, "evaluations": len(mine)}
+        start |= {"converged": converged and usable is not False, "exhausted": search.exhausted}
+        starts.append(start | {"slope_usable": usable})
 
     def finish(self) -> None:
         """Search a last time from the best point, and find out whether it is an optimum."""

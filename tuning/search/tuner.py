@@ -13,6 +13,7 @@ from jaxtank import measures as ms
 from jaxtank.bounds import WIDE, gain_ranges
 from jaxtank.case import Case, Free, check_case
 from jaxtank.core.errors import InputError
+from jaxtank.core.jsonable import fields
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.limits import limited_levels, resolve_limits
 from jaxtank.loop import run as lp
@@ -134,12 +135,8 @@ def tune(
     """
     check_case(case.case if isinstance(case, Problem) else case, seed)
     options = options_of(method, starts=starts)
-    reasons = {
-        "a Problem": isinstance(case, Problem),
-        "method": options.name != "auto",
-        "screening": options.screening is not None,
-        "tolerance": options.tolerance is not None,
-    }
+    reasons = {"a Problem": isinstance(case, Problem), "method": options.name != "auto"}
+    reasons |= {n: getattr(options, n) is not None for n in ("screening", "tolerance")}
     implied = next((name for name, value in reasons.items() if value), None)
     if nominal is False and implied:
         raise InputError(f"{implied}: belongs to the nominal optimum (nominal=True, --nominal)")
@@ -480,20 +477,15 @@ def _result(
     result = TuningResult(
         parameters=_parameters(evaluator, solution, values),
         evaluations={
-            "simulations": evaluator.simulations,
-            "gradients": evaluator.gradients,
-            "non_finite": evaluator.non_finite,
+            **fields(evaluator, "simulations gradients non_finite"),
             "redone_at_true_step": solution.redone,
         },
         wall_s=0.0,
         history=solution.search.history if solution.search else [],
-        starts=solution.starts,
+        **{n: getattr(solution, n) for n in ("starts", "curvature", "probe", "slopes")},
         optimality=named_optimality(solution.search, solution.point),
-        curvature=solution.curvature,
         provenance=provenance(parts["case"], evaluator.problem.seed),
         problem=evaluator.problem,
-        probe=solution.probe,
-        slopes=solution.slopes,
         messages=steps,
         **parts,
     )
@@ -522,14 +514,13 @@ def _judged_parts(answer: Answer, values: Mapping[str, float]) -> dict[str, Any]
 
 def _what(problem, validation, command, more):
     """Return the fingerprint of a search."""
+    scenarios = [(s.name, sorted(s.values.items()), s.seed, s.weight) for s in problem.scenarios]
     return fingerprint(
         problem.case,
         command=command,
         free=problem.bounds,
-        objective=problem.objective,
-        limits=problem.limits,
-        scenarios=[(s.name, sorted(s.values.items()), s.seed, s.weight) for s in problem.scenarios],
-        risk=problem.risk,
+        **{name: getattr(problem, name) for name in ("objective", "limits", "risk")},
+        scenarios=scenarios,
         validation=validation,
         **digests(problem.loop, problem.clock, problem.needed),
         **{n: v for n, v in more.items() if n != "engine"},
@@ -550,9 +541,7 @@ def _parameters(evaluator, solution, values):
         b.name: {
             "before": start[b.name],
             "after": values[b.name],
-            "unit": b.unit,
-            "lower": b.low,
-            "upper": b.high,
+            **fields(b, "unit lower=low upper=high"),
             "at_bound": "lower" if z < 1e-6 else "upper" if z > 1 - 1e-6 else None,
             "sensitivity_percent": percent,
             "exercised": not still,

@@ -138,14 +138,8 @@ def fan_of(case, values, seed):
     finite = np.isfinite(x).all(axis=(1, 2))
     if not finite.any():
         return None
-    return {
-        "t": t[0],
-        "r": r[0],
-        "x": np.quantile(x[finite], CUTS, axis=0),
-        "u": np.quantile(u[finite], CUTS, axis=0),
-        "draws": int(finite.sum()),
-        "of": size,
-    }
+    fan = {name: np.quantile(v[finite], CUTS, axis=0) for name, v in {"x": x, "u": u}.items()}
+    return {"t": t[0], "r": r[0], **fan, "draws": int(finite.sum()), "of": size}
 
 
 @compiled("seed", "clock", "every", keep=True)

@@ -463,12 +463,9 @@ class Study(NamedTuple):
         if loop is self.case.loop:
             return self
         rim = np.asarray(loop.plant.rim, dtype=float)
-        limits = tuple(
-            Limit("max_level", v.index, float(rim[v.index]), name=v.name)
-            if v.measure == "overflow_volume"
-            else v
-            for v in self.limits
-        )
+        spills = lambda v: v.measure == "overflow_volume"
+        level = lambda v: Limit("max_level", v.index, float(rim[v.index]), name=v.name)
+        limits = tuple(level(v) if spills(v) else v for v in self.limits)
         measures = tuple(dict.fromkeys(limit.measure for limit in limits))
         return self._replace(case=self.case.replace(loop=loop), limits=limits, measures=measures)
 
@@ -494,10 +491,8 @@ class Study(NamedTuple):
             return self.values(z[rows]), first + np.arange(k * size, (k + 1) * size)
 
         batches = dict(run(range(-(-len(z) // size)), inputs, size))
-        joined = {
-            n: np.concatenate([batches[k][n] for k in sorted(batches)])[: len(z)]
-            for n in batches[0]
-        }
+        parts = [batches[k] for k in sorted(batches)]
+        joined = {n: np.concatenate([part[n] for part in parts])[: len(z)] for n in batches[0]}
         return self.margins(joined, joined.pop("failed") > 0)
 
     def slopes(self, z: Any) -> Any:
@@ -514,20 +509,15 @@ class Study(NamedTuple):
         parts = []
         for k in range(0, len(z), size):
             rows = flat[np.minimum(np.arange(k, k + size), len(z) - 1)]
-            parts.append(
-                _sensitivities(
-                    self.case.loop, tuple(rows.T), self.noise, self.case.clock, self.measures, order
-                )
-            )
+            run = (self.case.loop, tuple(rows.T), self.noise, self.case.clock)
+            parts.append(_sensitivities(*run, self.measures, order))
         measures, rates, failed = jax.tree.map(
             lambda *v: np.concatenate([np.asarray(part) for part in v])[: len(z)], *parts
         )
-        slopes = [
-            -limit.sign
-            / limit_scale(limit, self.case.loop)
-            * rates[limit.measure].reshape(len(z), -1, len(order))[:, limit.index]
-            for limit in self.limits
-        ]
+        slopes = []
+        for limit in self.limits:
+            rate = rates[limit.measure].reshape(len(z), -1, len(order))[:, limit.index]
+            slopes.append(-limit.sign / limit_scale(limit, self.case.loop) * rate)
         slopes = np.einsum("nkp,npd->nkd", np.stack(slopes, axis=1), jacobian[:, moving])
         return self.margins(measures, failed), slopes
 
@@ -595,14 +585,9 @@ def promise_of(
     with runner(study) as run, contextlib.ExitStack() as stack:
         other = run if explored is study else stack.enter_context(runner(explored))
         margins = Margins(runs(study, run), runs(explored, other), explored.slopes)
-        result = probability(
-            margins,
-            pilot,
-            promise,
-            FURTHER * len(failed),
-            study.seed,
-            progress and (lambda done: progress(done + len(failed))),
-        )
+        report = progress and (lambda done: progress(done + len(failed)))
+        most = FURTHER * len(failed)
+        result = probability(margins, pilot, promise, most, study.seed, report)
     estimate, (low, high) = result.estimate, result.estimate.interval95
     shares = sorted(zip(estimate.shares, study.limits), key=lambda pair: -pair[0])
     return Promise(

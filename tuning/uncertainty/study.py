@@ -117,18 +117,10 @@ class Ensemble(Result):
         """
         rows, n = [], self.samples
         for limit in self.limits:
-            count = int(np.sum(self._broken(limit)))
-            rows.append(
-                {
-                    "name": limit.label,
-                    "words": limit.words,
-                    "limit": limit.value,
-                    "unit": ms.unit(limit.measure, self.case.loop.units),
-                    "count": count,
-                    "probability": count / n,
-                    "interval95": clopper_pearson(count, n),
-                }
-            )
+            count, unit = int(np.sum(self._broken(limit))), self.case.loop.units
+            row = {"name": limit.label, "words": limit.words, "limit": limit.value}
+            row |= {"unit": ms.unit(limit.measure, unit), "count": count, "probability": count / n}
+            rows.append(row | {"interval95": clopper_pearson(count, n)})
         return rows
 
     def _broken(self, limit):
