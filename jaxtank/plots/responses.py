@@ -185,14 +185,9 @@ def _rows(loop, runs, which, limits):
         top = HEADROOM * max([highest, *(b for b in bounds if b and highest > 0.6 * b)])
         return top if np.isfinite(top) else 0.0
 
-    def error_of(i, k):
-        return lambda ax: error(ax, runs, k, i, length, loop.plant)
-
-    def voltage_of(j):
-        ends = float(low[j]), float(high[j])
-        unit = input_unit(loop.plant, j, drive)
-        return lambda ax: voltage(ax, runs, j, *ends, unit, loop.plant)
-
+    ends = lambda j: (float(low[j]), float(high[j]), input_unit(loop.plant, j, drive))
+    error_of = lambda i, k: lambda ax: error(ax, runs, k, i, length, loop.plant)
+    voltage_of = lambda j: lambda ax: voltage(ax, runs, j, *ends(j), loop.plant)
     kinds = [
         [level_of(i, k) for k, i in outputs],
         [error_of(i, k) for k, i in outputs],

@@ -30,7 +30,10 @@ def schematic(ax, plant, levels=None, setpoints=None, lost=None):
     if plant.tanks > LARGEST:
         return overview(ax, plant, levels)
     where = place(plant)
-    _basin(ax, where)
+    low, high, bottom = where.left + 0.06, where.right - 0.06, where.bottom + 0.06
+    box(ax, (low, bottom), (high - low, 0.14), facecolor=WATER, alpha=0.5, zorder=0)
+    ax.plot([low, low, high, high], [-0.82, bottom, bottom, -0.82], color=GLASS, linewidth=1.4)
+    write(ax, (low + high) / 2, bottom + 0.07, "basin")
     _pipework(ax, plant, where)
     for start, end, y in pipes(plant, where):
         for wide, colour, layer in ((6.5, GLASS, 1.7), (3.5, WATER, 1.8)):
@@ -118,14 +121,6 @@ def _above(ax, plant, where, levels, lost):
 
 def _colour(pump):
     return PUMPS[pump % len(PUMPS)]
-
-
-def _basin(ax, where):
-    low, high, bottom = where.left + 0.06, where.right - 0.06, where.bottom + 0.06
-    box(ax, (low, bottom), (high - low, 0.14), facecolor=WATER, alpha=0.5, zorder=0)
-    walls = [low, low, high, high], [-0.82, bottom, bottom, -0.82]
-    ax.plot(*walls, color=GLASS, linewidth=1.4)
-    write(ax, (low + high) / 2, bottom + 0.07, "basin")
 
 
 def _tank(ax, plant, i, tank, level):

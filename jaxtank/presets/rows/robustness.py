@@ -61,13 +61,6 @@ def _runs(loop, values, clock, every):
     return jax.vmap(one)(values)
 
 
-def of_plants(case, spread):
-    """Return the Study of a case's controller."""
-    values = coefficients(case.loop.plant, spread)
-    measures, errors, failed = _runs(case.loop, values, case.clock, round(EVERY / case.clock.dt))
-    return Study(*jax.tree.map(np.asarray, (measures, errors, failed)))
-
-
 def everything(run):
     """Return ({(controller, spread): Study}, {controller: nominal total RMS error [cm]})."""
     studies, nominal = {}, {}
@@ -75,7 +68,9 @@ def everything(run):
         case, trajectory = run(controller, SETTING)
         nominal[controller] = float(np.sqrt((trajectory.e**2).mean(axis=0).sum()))
         for spread in SPREADS:
-            studies[controller, spread] = of_plants(case, spread)
+            values, every = coefficients(case.loop.plant, spread), round(EVERY / case.clock.dt)
+            runs = _runs(case.loop, values, case.clock, every)
+            studies[controller, spread] = Study(*jax.tree.map(np.asarray, runs))
     return studies, nominal
 
 
