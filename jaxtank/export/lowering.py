@@ -48,9 +48,7 @@ def no_code(reason):
 
 def kind_of(dtype):
     """Return the kind of variable, REAL, WHOLE or TRUTH, that holds an element of this type."""
-    if jnp.issubdtype(dtype, jnp.floating):
-        return REAL
-    return TRUTH if dtype == jnp.bool_ else WHOLE
+    return REAL if jnp.issubdtype(dtype, jnp.floating) else TRUTH if dtype == jnp.bool_ else WHOLE
 
 
 def elements(value):
@@ -110,9 +108,7 @@ def _elementwise(op, whole=None):
 
 def _convert(writer, eqn, operands):
     kind, kinds = _out_kind(eqn), _kinds(eqn)
-    if kinds[0] == kind:
-        return operands
-    return [arrays.each(writer, kind, kind, operands, kinds)]
+    return operands if kinds[0] == kind else [arrays.each(writer, kind, kind, operands, kinds)]
 
 
 def _broadcast(x, shape, broadcast_dimensions, **_):
@@ -555,10 +551,8 @@ def _chosen_slice(writer, eqn, array, index):
     if not moving:
         return array[tuple(ranges)]
     (d,) = moving
-    choices = []
-    for i in range(array.shape[d] - sizes[d] + 1):
-        ranges[d] = slice(i, i + sizes[d])
-        choices.append(array[tuple(ranges)])
+    windows = (slice(i, i + sizes[d]) for i in range(array.shape[d] - sizes[d] + 1))
+    choices = [array[(*ranges[:d], window, *ranges[d + 1 :])] for window in windows]
     at = filled(choices[0].shape, lambda _: index[d])
     return chosen(writer, at, choices, _out_kind(eqn))
 

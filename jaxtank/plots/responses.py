@@ -222,13 +222,8 @@ def convergence(ax, history, unit, limited):
         ax.axvline(index[start == s][0] - 0.5, color="0.85", linewidth=0.8, zorder=0)
     ax.set(xlabel="evaluation (grey lines: next start)", ylabel=f"objective [{unit}]")
     ax.set_title("convergence")
-    _limit_height(ax, cost[np.isfinite(cost)])
-    ax.legend(loc="best", framealpha=0.8, frameon=True, edgecolor="none")
-    return ax
-
-
-def _limit_height(ax, cost):
-    """Cut the axis above the first and most of the costs: outliers would compress the rest."""
+    cost = cost[np.isfinite(cost)]
+    # outliers would compress the rest: the first and most of the costs are in the picture
     top = max(float(np.quantile(cost, 0.95)), float(cost[0]))
     high = min(float(cost.max()), 1.5 * top) if top > 0 else float(cost.max())
     if high > 5 * cost.min() > 0:
@@ -237,6 +232,8 @@ def _limit_height(ax, cost):
         low = None if ax.get_yscale() == "log" else cost.min() - 0.05 * (high - cost.min())
         ax.set_ylim(low, high)
         ax.set_title(f"convergence ({int((cost > high).sum())} evaluations above the picture)")
+    ax.legend(loc="best", framealpha=0.8, frameon=True, edgecolor="none")
+    return ax
 
 
 def curve(ax, values, cost, violation, bound, unit, before, after):

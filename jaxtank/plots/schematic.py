@@ -39,7 +39,12 @@ def schematic(ax, plant, levels=None, setpoints=None, lost=None):
         for wide, colour, layer in ((6.5, GLASS, 1.7), (3.5, WATER, 1.8)):
             line = {"color": colour, "linewidth": wide, "zorder": layer}
             ax.plot([start, end], [y, y], solid_capstyle="butt", **line)
-    _jets(ax, plant, where)
+    for tank, path, _ in jets(plant, where):  # into the tanks below, and into the basin
+        ax.plot(*np.array(path).T, **JET)
+        (x, start), y = path[0], where.boxes[tank].y
+        if start < y:  # from an orifice in the bottom
+            spout = [(x - 0.06, y), (x + 0.06, y), (x + 0.025, y - 0.07), (x - 0.025, y - 0.07)]
+            ax.add_patch(Polygon(spout, facecolor=GLASS, zorder=3))
     for _, path in overflows(plant, where):
         ax.plot(*np.array(path).T, color=AFTER, linewidth=1.3, linestyle=(0, (1, 1.2)), zorder=2)
         x, y = path[1][0] - 0.04, (path[1][1] + path[2][1]) / 2
@@ -183,13 +188,3 @@ def _shares(ax, plant, where):
         (x, y), (end, _) = path[1], path[2]
         away, side = (0.06, "left") if end > x else (-0.06, "right")
         write(ax, x + away, y + 0.02, f"{100 * share:.3g} %", 7, f"{side} bottom", "0.15")
-
-
-def _jets(ax, plant, where):
-    """Free jets from the bottom of each tank: into the tanks below it, and into the basin."""
-    for tank, path, _ in jets(plant, where):
-        ax.plot(*np.array(path).T, **JET)
-        (x, start), y = path[0], where.boxes[tank].y
-        if start < y:  # from an orifice in the bottom
-            spout = [(x - 0.06, y), (x + 0.06, y), (x + 0.025, y - 0.07), (x - 0.025, y - 0.07)]
-            ax.add_patch(Polygon(spout, facecolor=GLASS, zorder=3))
