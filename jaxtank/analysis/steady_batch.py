@@ -147,10 +147,7 @@ class SteadyStates:
     def _imbalance(self, x):
         """(N, P) flow that no inputs can balance, as a norm."""
         flow, _ = self._flows(x)
-        inverse = np.linalg.pinv(self.pumps)[:, None]
-        inputs = np.einsum(
-            "spmn,spn->spm", np.broadcast_to(inverse, (*flow.shape[:2], *inverse.shape[2:])), flow
-        )
+        inputs = np.einsum("smn,spn->spm", np.linalg.pinv(self.pumps), flow)
         return np.linalg.norm(flow - np.einsum("snm,spm->spn", self.pumps, inputs), axis=2)
 
     def _flows(self, x):
@@ -160,7 +157,9 @@ class SteadyStates:
         flow = np.einsum("sij,spj->spi", self.efflux, root) * w[..., None] + self.inflow[:, None]
         slope = self.efflux[:, None] * steep[:, :, None] * w[..., None, None]
         for k, (upper, other) in enumerate(plant.pipes):
-            s, ds = _signed_root(x[..., upper] - x[..., other], plant.knee)
+            z = x[..., upper] - x[..., other]
+            square = z * z + plant.knee * plant.knee  # `smooth_signed_sqrt` and its slope
+            s, ds = z / square**0.25, (1.0 - 0.5 * z * z / square) / square**0.25
             size = self.leaves["pipe"][:, k, None] * w
             for tank, sign in ((upper, -1.0), (other, 1.0)):
                 flow[..., tank] += sign * size * s
@@ -206,9 +205,3 @@ def _root(h, knee):
     laminar = (1.5 * h / knee - 0.5 * np.minimum(x, 1.0) ** 2) * knee**0.5
     slope = (1.5 - np.minimum(x, 1.0)) * knee**-0.5
     return np.where(deep, root, laminar), np.where(deep, 0.5 / root, slope)
-
-
-def _signed_root(z, knee):
-    """`smooth_signed_sqrt` and its slope."""
-    square = z * z + knee * knee
-    return z / square**0.25, (1.0 - 0.5 * z * z / square) / square**0.25

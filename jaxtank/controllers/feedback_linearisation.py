@@ -118,8 +118,8 @@ def input_metric(c, s3, s4):
     (gouta2015 eq. 26; gouta2015 notes S4.5).
     """
     p, q = 0.5 * c.c8 / s3, 0.5 * c.c10 / s4
-    g12 = p * q * (c.c2 * c.c3 + c.c5 * c.c6)
-    return p * p * (c.c2**2 + c.c5**2), g12, q * q * (c.c3**2 + c.c6**2)
+    g11 = p * p * (c.c2**2 + c.c5**2)
+    return g11, p * q * (c.c2 * c.c3 + c.c5 * c.c6), q * q * (c.c3**2 + c.c6**2)
 
 
 def check_state_coupled(model, reference):

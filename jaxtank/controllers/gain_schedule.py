@@ -107,9 +107,7 @@ def _in_the_step(traced):
             "the controller uses it in its design (matrices, or a loop), which would then be"
             " repeated at every sample"
         )
-    if not (step.reached or track.reached):
-        return "the controller does not use it"
-    return None
+    return None if step.reached or track.reached else "the controller does not use it"
 
 
 VARIABLE = re.compile(r"[rh][1-9]\d*")

@@ -152,17 +152,13 @@ class PID(Controller):
         concrete = isinstance(Ti, np.ndarray | jax.Array) and not isinstance(Ti, Tracer)
         if not concrete or not np.size(Ti):
             return
-        endless = self._endless()
+        Tt = cast(Any, self.Tt)  # Ti may be as good as infinite beside it
+        tracking = isinstance(Tt, np.ndarray | jax.Array) and not isinstance(Tt, Tracer)
+        endless = np.isinf(np.asarray(Ti)) | (np.asarray(ENDLESS * Tt <= Ti) if tracking else False)
         if np.all(endless):
             object.__setattr__(self, "Ti", None)  # no state that never moves
         elif np.any(endless) and np.shape(Ti)[-1] > 1:  # `track` reads inf of several loops alone
             object.__setattr__(self, "Ti", np.where(endless, np.inf, Ti))
-
-    def _endless(self) -> Any:
-        """Whether each integral time is as good as infinite beside the tracking time."""
-        Ti, Tt = np.asarray(cast(Any, self.Ti)), cast(Any, self.Tt)
-        tracking = isinstance(Tt, np.ndarray | jax.Array) and not isinstance(Tt, Tracer)
-        return np.isinf(Ti) | (np.asarray(ENDLESS * Tt <= Ti) if tracking else False)
 
     @property
     def arrays(self) -> bool:

@@ -48,9 +48,7 @@ def no_code(reason):
 
 def kind_of(dtype):
     """Return the kind of variable, REAL, WHOLE or TRUTH, that holds an element of this type."""
-    if jnp.issubdtype(dtype, jnp.floating):
-        return REAL
-    return TRUTH if dtype == jnp.bool_ else WHOLE
+    return REAL if jnp.issubdtype(dtype, jnp.floating) else TRUTH if dtype == jnp.bool_ else WHOLE
 
 
 def elements(value):
@@ -110,9 +108,7 @@ def _elementwise(op, whole=None):
 
 def _convert(writer, eqn, operands):
     kind, kinds = _out_kind(eqn), _kinds(eqn)
-    if kinds[0] == kind:
-        return operands
-    return [arrays.each(writer, kind, kind, operands, kinds)]
+    return operands if kinds[0] == kind else [arrays.each(writer, kind, kind, operands, kinds)]
 
 
 def _broadcast(x, shape, broadcast_dimensions, **_):
@@ -355,11 +351,6 @@ def _blocks(a):
         yield block, np.stack(places, axis=1)
 
 
-def _lu(writer, eqn, operands):
-    """The factors of a matrix, which `_linear_solve` does not read."""
-    return [operands[0], *(np.zeros(v.aval.shape, dtype=object) for v in eqn.outvars[1:])]
-
-
 def _cholesky(writer, a):
     n = a.shape[0]
     return writer.matrix("cholesky", (a,), (n,), (n, n)).T
@@ -379,10 +370,8 @@ def weighted_squares(writer, g, weight):
 def _cond(writer, eqn, operands):
     """All branches are computed, because none has an effect, and one is chosen."""
     branches = [writer.run(b.jaxpr, b.consts, operands[1:]) for b in eqn.params["branches"]]
-    out = []
-    for variable, *values in zip(eqn.outvars, *branches):
-        out.append(chosen(writer, operands[0], values, kind_of(variable.aval.dtype)))
-    return out
+    pick = lambda v, *values: chosen(writer, operands[0], values, kind_of(v.aval.dtype))
+    return list(map(pick, eqn.outvars, *branches))
 
 
 def _scan(writer, eqn, operands):
@@ -477,14 +466,11 @@ def _while(writer, eqn, operands):
         return writer.run(body.jaxpr, body.consts, [*operands[first:last], *carried])
 
     kinds = [kind_of(v.aval.dtype) for v in eqn.outvars]
-    return _loop(writer, kinds, operands[last:], None, tested_body, _most(test.jaxpr))
-
-
-def _most(test):
-    """The passes of a loop that goes on while a counter is below a number, None if it has none."""
-    ends: list[Any] = [eqn.invars[1] for eqn in test.eqns if eqn.primitive.name == "lt"]
-    ends = [e for e in ends if isinstance(e, Literal) and kind_of(e.aval.dtype) == WHOLE]
-    return min((int(e.val) for e in ends), default=None)
+    # the passes of a loop that goes on while a counter is below a number
+    ends = [e.invars[1] for e in test.jaxpr.eqns if e.primitive.name == "lt"]
+    is_whole = lambda e: isinstance(e, Literal) and kind_of(np.result_type(e.val)) == WHOLE
+    most = min((int(e.val) for e in filter(is_whole, ends)), default=None)
+    return _loop(writer, kinds, operands[last:], None, tested_body, most)
 
 
 def _loop(writer, kinds, starts, count, body, most=None, tables=()):
@@ -565,10 +551,8 @@ def _chosen_slice(writer, eqn, array, index):
     if not moving:
         return array[tuple(ranges)]
     (d,) = moving
-    choices = []
-    for i in range(array.shape[d] - sizes[d] + 1):
-        ranges[d] = slice(i, i + sizes[d])
-        choices.append(array[tuple(ranges)])
+    windows = (slice(i, i + sizes[d]) for i in range(array.shape[d] - sizes[d] + 1))
+    choices = [array[(*ranges[:d], window, *ranges[d + 1 :])] for window in windows]
     at = filled(choices[0].shape, lambda _: index[d])
     return chosen(writer, at, choices, _out_kind(eqn))
 
@@ -622,11 +606,14 @@ RULES = {
     "dynamic_slice": _read,
     "gather": _gather,
     "dynamic_update_slice": _write,
-    "dot_general": lambda writer, eqn, o: [product(writer, *o, eqn.params["dimension_numbers"])],
+    "dot_general": lambda writer, eqn, o: [
+        product(writer, o[0], o[1], eqn.params["dimension_numbers"])
+    ],
     "cholesky": lambda writer, eqn, operands: [_cholesky(writer, *operands).T],
     "triangular_solve": _triangular,
     "custom_linear_solve": _linear_solve,
-    "lu": _lu,
+    # of the factors of a matrix, which `_linear_solve` does not read
+    "lu": lambda writer, eqn, o: [o[0], *(np.zeros(v.aval.shape, object) for v in eqn.outvars[1:])],
 }
 """{primitive of jax: function (writer, equation, operands) -> list of arrays of elements}."""
 

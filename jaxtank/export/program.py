@@ -234,10 +234,7 @@ def _lowered(case, plant, adjustable):
     # the first state may have another type than the next ones: a number of the controller, an array
     # of the run
     ran = initial(case.loop, case.clock)
-    if plant:
-        ran = jax.eval_shape(functions({})[1])[1]
-    else:
-        ran = ran.observer, ran.controller
+    ran = jax.eval_shape(functions({})[1])[1] if plant else (ran.observer, ran.controller)
     state = jax.tree.map(lambda a: jax.ShapeDtypeStruct(np.shape(a), jnp.result_type(a)), ran)
     before = {} if plant else {"y": real(tanks), "u": real(pumps)}
     # other controllers have arrays of a few entries

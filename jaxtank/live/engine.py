@@ -250,11 +250,6 @@ def function(name: str, arguments: str, lines: Iterable[str]) -> str:
     return f"function {name}({arguments}){{" + "\n".join(short) + "}"
 
 
-def maths(text: str) -> str:
-    """Return the line that gives the functions of Math in `text` their own names."""
-    return f"const{{{','.join(m for m in MATHS if f'{m}(' in text)}}}=Math;"
-
-
 ROWS = 3000  # approximate number of rows of a plotted run, as in `jaxtank simulate --out`
 ALWAYS = ("rms_error_total", "max_level")
 """Measures of a search whatever a case minimises and limits."""
@@ -319,7 +314,8 @@ def engine(
         facts = _facts(case, [loop for loop, _ in parts])
         programs = ",\n".join(text for _, text in parts)
         functions = "\n".join(map(bare, library(programs)))
-    programs = f"(()=>{{{maths(functions + programs)}\n{functions}\nreturn[{programs}];}})()"
+    named = ",".join(m for m in MATHS if f"{m}(" in functions + programs)
+    programs = f"(()=>{{const{{{named}}}=Math;\n{functions}\nreturn[{programs}];}})()"
     driver = resources.files("jaxtank.live").joinpath("engine.js").read_text(encoding="utf-8")
     return "\n".join(
         [
@@ -543,9 +539,8 @@ def leaf_of(case: Case, name: str, index: tuple[int, ...]) -> dict[str, Any]:
     full = _name(name, index)
     meta = describe(case.loop, full)
     value = float(np.asarray(get_value(case.loop, full)))
-    group = GROUPS.get(name.split(".")[0], name.split(".")[0])
-    if ".model." in name:
-        group = "model"
+    part = name.split(".")[0]
+    group = "model" if ".model." in name else GROUPS.get(part, part)
     finite = math.isfinite(value)
     lower, upper = _ends(case, name, full, value, meta, group) if finite else (None, None)
     return {

@@ -97,9 +97,7 @@ def _rows(run, size, *values):
 
 def _sums(run, size):
     """Empty sums, one per output, tank or pump."""
-    if run.arrays:
-        return nothing(_filled(run, size))
-    return (nothing(run.zero),) * getattr(run, size)
+    return nothing(_filled(run, size)) if run.arrays else (nothing(run.zero),) * getattr(run, size)
 
 
 def _sum(size, term):
@@ -143,17 +141,13 @@ def _extreme(size, pick, better, worst, refers_to=""):
     return Accumulator(lambda run: _rows(run, size, worst, 0.0), update, refers_to, rows=True)
 
 
-def _excess(run, command):
-    """How far a command is outside its limits [V], 0 inside."""
-    past = lambda v, low, high: jnp.where(v > high, v - high, jnp.where(v < low, low - v, 0.0))
-    return each(past, command, run.low, run.high)
-
-
 def _saturation_excess(run, sample):
     # x/(1+x) of x = excess / span: gouta2015 notes S10; bounded, so that one outlier does not
     # dominate a cost
     span = each(lambda low, high: high - low, run.low, run.high)
-    return each(lambda x, s: x / (s + x), _excess(run, sample.command), span)
+    past = lambda v, low, high: jnp.where(v > high, v - high, jnp.where(v < low, low - v, 0.0))
+    excess = each(past, sample.command, run.low, run.high)
+    return each(lambda x, s: x / (s + x), excess, span)
 
 
 def _outside(run, sample):

@@ -381,19 +381,14 @@ def _in_form(accumulator: Accumulator, run: Run, sample: Sample, context: Contex
     """(run, sample, context) with vectors in the form that an accumulator takes."""
     if accumulator.arrays or not run.arrays:
         return run, sample, context
-    return _in_tuples(run), *_in_scalars(sample, context)
+    window = None if context.window is None else _rows_of(context.window)
+    context = context._replace(window=window, steady=scalars(context.steady))
+    alone = {"t": sample.t, "filtered": sample.filtered, "slack": sample.slack}
+    vectors = {f: scalars(v) for f, v in sample._asdict().items() if f not in alone}
+    return _in_tuples(run), Sample(**alone, **vectors), context
 
 
 def _in_tuples(run: Run) -> Run:
     """`run` with tuples of scalars as vectors."""
     low, high, rim = (scalars(v) for v in (run.low, run.high, run.rim))
     return run._replace(low=low, high=high, rim=rim, arrays=False)
-
-
-def _in_scalars(sample: Sample, context: Context) -> tuple[Sample, Context]:
-    """The same with tuples of scalars as vectors."""
-    window = None if context.window is None else _rows_of(context.window)
-    context = context._replace(window=window, steady=scalars(context.steady))
-    alone = {"t": sample.t, "filtered": sample.filtered, "slack": sample.slack}
-    vectors = {f: scalars(v) for f, v in sample._asdict().items() if f not in alone}
-    return Sample(**alone, **vectors), context

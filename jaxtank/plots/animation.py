@@ -186,8 +186,16 @@ class _Stage:
         name = plain(one_line(title, 60))
         figure.text(middle, 1.0 - 0.25 * inch, name, va="top", fontweight="bold", **words)
         self.words = figure.text(middle, 0.1 * inch, "", va="bottom", **words)
-        self.water, self.marks, self.bars = _moving(ax, loop, self.where)
         most, tanks = self.spilled.most, self.where.boxes
+        look = {"facecolor": WATER, "zorder": 1.6}
+        self.water = [box(ax, (tank.x, tank.y), (tank.width, 0.0), **look) for tank in tanks]
+        self.marks, self.bars = [mark(ax, tanks[i], 0.0) for i in loop.plant.outputs], []
+        frame = {"facecolor": "white", "edgecolor": "0.5", "linewidth": 0.8, "zorder": 3}
+        for j, (x, y) in enumerate(self.where.pumps):
+            corner = (x + (0.08 if x < 0 else -0.2), y + 0.3)
+            box(ax, corner, (0.12, BAR), **frame)
+            look = {"facecolor": PUMPS[j % len(PUMPS)], "zorder": 4}
+            self.bars.append(box(ax, corner, (0.12, 0.0), **look))
         area, unit = np.asarray(loop.plant.area, dtype=float), self.spilled.unit
         gone = self.spilled.simulated
         above = lambda i: Lost(ax, tanks[i], unit) if gone else Stack(ax, tanks[i], float(area[i]))
@@ -209,17 +217,3 @@ class _Stage:
             share = (self.u[k, j] - self.low[j]) / (self.high[j] - self.low[j])
             bar.set_height(BAR * float(np.clip(share, 0.0, 1.0)))
         self.words.set_text(self.spilled.words(k))
-
-
-def _moving(ax, loop, where):
-    """The artists that move: water in each tank, marks of setpoints, a bar for each pump."""
-    look = {"facecolor": WATER, "zorder": 1.6}
-    water = [box(ax, (tank.x, tank.y), (tank.width, 0.0), **look) for tank in where.boxes]
-    marks, bars = [mark(ax, where.boxes[i], 0.0) for i in loop.plant.outputs], []
-    frame = {"facecolor": "white", "edgecolor": "0.5", "linewidth": 0.8, "zorder": 3}
-    for j, (x, y) in enumerate(where.pumps):
-        corner = (x + (0.08 if x < 0 else -0.2), y + 0.3)
-        box(ax, corner, (0.12, BAR), **frame)
-        look = {"facecolor": PUMPS[j % len(PUMPS)], "zorder": 4}
-        bars.append(box(ax, corner, (0.12, 0.0), **look))
-    return water, marks, bars

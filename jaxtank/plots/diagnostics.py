@@ -42,8 +42,12 @@ def saturation(ax, runs, low, high, plant=None):
             of = f", {plain(name)}" if len(runs) > 1 else ""
             names.append(f"{plain(label_of(plant, 'pump', j))}{of}\n{up} up, {down} down")
             ax.axhline(y, color="0.7", linewidth=0.8)
+            count = min(SLICES, len(t))
+            edges = np.linspace(t[0], t[-1], count + 1)
+            index = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, count - 1)
+            samples = np.maximum(np.bincount(index, minlength=count), 1)
             for mask, (_, colour, sign) in zip(masks, colours):
-                edges, share = _slices(t, mask)
+                share = np.bincount(index, mask, count) / samples
                 end = y + sign * 0.42 * np.append(share, share[-1])
                 ax.fill_between(edges, y, end, step="post", color=colour, linewidth=0)
     for label, colour, _ in colours:
@@ -53,15 +57,6 @@ def saturation(ax, runs, low, high, plant=None):
     ax.set(xlabel="time [s]", title="commands that the pumps could not follow")
     ax.set_ylim(min(heights) - 0.6, max(heights) + 0.6)
     return ax
-
-
-def _slices(t, mask):
-    """(edges of intervals [s], share of each in which the mask holds)."""
-    count = min(SLICES, len(t))
-    edges = np.linspace(t[0], t[-1], count + 1)
-    index = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, count - 1)
-    samples = np.maximum(np.bincount(index, minlength=count), 1)
-    return edges, np.bincount(index, mask, count) / samples
 
 
 def estimate(ax, run, tank, unit="cm", plant=None):

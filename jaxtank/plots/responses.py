@@ -185,14 +185,9 @@ def _rows(loop, runs, which, limits):
         top = HEADROOM * max([highest, *(b for b in bounds if b and highest > 0.6 * b)])
         return top if np.isfinite(top) else 0.0
 
-    def error_of(i, k):
-        return lambda ax: error(ax, runs, k, i, length, loop.plant)
-
-    def voltage_of(j):
-        ends = float(low[j]), float(high[j])
-        unit = input_unit(loop.plant, j, drive)
-        return lambda ax: voltage(ax, runs, j, *ends, unit, loop.plant)
-
+    ends = lambda j: (float(low[j]), float(high[j]), input_unit(loop.plant, j, drive))
+    error_of = lambda i, k: lambda ax: error(ax, runs, k, i, length, loop.plant)
+    voltage_of = lambda j: lambda ax: voltage(ax, runs, j, *ends(j), loop.plant)
     kinds = [
         [level_of(i, k) for k, i in outputs],
         [error_of(i, k) for k, i in outputs],
@@ -227,13 +222,8 @@ def convergence(ax, history, unit, limited):
         ax.axvline(index[start == s][0] - 0.5, color="0.85", linewidth=0.8, zorder=0)
     ax.set(xlabel="evaluation (grey lines: next start)", ylabel=f"objective [{unit}]")
     ax.set_title("convergence")
-    _limit_height(ax, cost[np.isfinite(cost)])
-    ax.legend(loc="best", framealpha=0.8, frameon=True, edgecolor="none")
-    return ax
-
-
-def _limit_height(ax, cost):
-    """Cut the axis above the first and most of the costs: outliers would compress the rest."""
+    cost = cost[np.isfinite(cost)]
+    # outliers would compress the rest: the first and most of the costs are in the picture
     top = max(float(np.quantile(cost, 0.95)), float(cost[0]))
     high = min(float(cost.max()), 1.5 * top) if top > 0 else float(cost.max())
     if high > 5 * cost.min() > 0:
@@ -242,6 +232,8 @@ def _limit_height(ax, cost):
         low = None if ax.get_yscale() == "log" else cost.min() - 0.05 * (high - cost.min())
         ax.set_ylim(low, high)
         ax.set_title(f"convergence ({int((cost > high).sum())} evaluations above the picture)")
+    ax.legend(loc="best", framealpha=0.8, frameon=True, edgecolor="none")
+    return ax
 
 
 def curve(ax, values, cost, violation, bound, unit, before, after):

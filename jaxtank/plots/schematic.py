@@ -30,13 +30,21 @@ def schematic(ax, plant, levels=None, setpoints=None, lost=None):
     if plant.tanks > LARGEST:
         return overview(ax, plant, levels)
     where = place(plant)
-    _basin(ax, where)
+    low, high, bottom = where.left + 0.06, where.right - 0.06, where.bottom + 0.06
+    box(ax, (low, bottom), (high - low, 0.14), facecolor=WATER, alpha=0.5, zorder=0)
+    ax.plot([low, low, high, high], [-0.82, bottom, bottom, -0.82], color=GLASS, linewidth=1.4)
+    write(ax, (low + high) / 2, bottom + 0.07, "basin")
     _pipework(ax, plant, where)
     for start, end, y in pipes(plant, where):
         for wide, colour, layer in ((6.5, GLASS, 1.7), (3.5, WATER, 1.8)):
             line = {"color": colour, "linewidth": wide, "zorder": layer}
             ax.plot([start, end], [y, y], solid_capstyle="butt", **line)
-    _jets(ax, plant, where)
+    for tank, path, _ in jets(plant, where):  # into the tanks below, and into the basin
+        ax.plot(*np.array(path).T, **JET)
+        (x, start), y = path[0], where.boxes[tank].y
+        if start < y:  # from an orifice in the bottom
+            spout = [(x - 0.06, y), (x + 0.06, y), (x + 0.025, y - 0.07), (x - 0.025, y - 0.07)]
+            ax.add_patch(Polygon(spout, facecolor=GLASS, zorder=3))
     for _, path in overflows(plant, where):
         ax.plot(*np.array(path).T, color=AFTER, linewidth=1.3, linestyle=(0, (1, 1.2)), zorder=2)
         x, y = path[1][0] - 0.04, (path[1][1] + path[2][1]) / 2
@@ -120,14 +128,6 @@ def _colour(pump):
     return PUMPS[pump % len(PUMPS)]
 
 
-def _basin(ax, where):
-    low, high, bottom = where.left + 0.06, where.right - 0.06, where.bottom + 0.06
-    box(ax, (low, bottom), (high - low, 0.14), facecolor=WATER, alpha=0.5, zorder=0)
-    walls = [low, low, high, high], [-0.82, bottom, bottom, -0.82]
-    ax.plot(*walls, color=GLASS, linewidth=1.4)
-    write(ax, (low + high) / 2, bottom + 0.07, "basin")
-
-
 def _tank(ax, plant, i, tank, level):
     """A tank with its walls, its liquid, its number and its rim."""
     unit, controlled = plant.units[0], i in plant.outputs
@@ -188,13 +188,3 @@ def _shares(ax, plant, where):
         (x, y), (end, _) = path[1], path[2]
         away, side = (0.06, "left") if end > x else (-0.06, "right")
         write(ax, x + away, y + 0.02, f"{100 * share:.3g} %", 7, f"{side} bottom", "0.15")
-
-
-def _jets(ax, plant, where):
-    """Free jets from the bottom of each tank: into the tanks below it, and into the basin."""
-    for tank, path, _ in jets(plant, where):
-        ax.plot(*np.array(path).T, **JET)
-        (x, start), y = path[0], where.boxes[tank].y
-        if start < y:  # from an orifice in the bottom
-            spout = [(x - 0.06, y), (x + 0.06, y), (x + 0.025, y - 0.07), (x - 0.025, y - 0.07)]
-            ax.add_patch(Polygon(spout, facecolor=GLASS, zorder=3))

@@ -39,9 +39,11 @@ def outside(trajectory):
 
 def measured_rows(run):
     """Return {quantity: measured value} of the rows that can be measured."""
-    far = run("backstepping")[1]
+    far, claims = run("backstepping")[1], {ramp: _claims(run, ramp) for ramp in RAMPS}
+    # with the ramps of the cases, and whether they hold with each other
+    holds = lambda name: {ramp: claims[ramp][name].holds for ramp in RAMPS}
     return {
-        **_by_ramp(run),
+        **{n: dataclasses.replace(c, by_ramp=holds(n)) for n, c in claims[OWN].items()},
         "disturbance rejection": _inflow(run),
         "fluctuations with backstepping": _fluctuations(run, far),
         "Theorem 1": _theorem(run, far),
@@ -51,15 +53,6 @@ def measured_rows(run):
 
 
 PAIR = ("ngpc", "backstepping")
-
-
-def _by_ramp(run):
-    """The claims of BY_RAMP with the ramps of the cases, and whether they hold with each other."""
-    claims = {ramp: _claims(run, ramp) for ramp in RAMPS}
-    return {
-        name: dataclasses.replace(claim, by_ramp={r: claims[r][name].holds for r in RAMPS})
-        for name, claim in claims[OWN].items()
-    }
 
 
 def _claims(run, ramp):

@@ -139,12 +139,9 @@ MIMO = ("gpc-mimo", "laguerre-mimo")
 def from_empty(name):
     """Return the values that make scenario `name` of notes S3 of a case with its pumps."""
     reference, x0, u0 = scenario(name)
-    return {
-        "reference.initial": np.asarray(reference.initial).tolist(),
-        "reference.targets": np.asarray(reference.targets).tolist(),
-        "x0": np.asarray(x0).tolist(),
-        "actuator.initial": np.asarray(u0).tolist(),
-    }
+    names = ("reference.initial", "reference.targets", "x0", "actuator.initial")
+    arrays = reference.initial, reference.targets, x0, u0
+    return {name: np.asarray(value).tolist() for name, value in zip(names, arrays)}
 
 
 def _pulses(case):

@@ -198,10 +198,11 @@ def measured_rows(run, assumed):
     settled = [assumed[name]["settling"] for name in ("SFC", "hybrid")]
     cases = {name: response(run(kinds[0])[1])["arrival"] for name, kinds in SAME_CONTROLLER.items()}
     error = float(np.abs(run("hybrid")[1].e[-1]).max())
+    slowest = lambda t: None not in t.values() and max(t["SMC"], t["hybrid"]) < t["SFC"]
     return {
         **_table_3(run, assumed),
         "SFC rises more slowly": Claim(
-            [_slowest(times) for times in (rise, cases)],
+            [slowest(times) for times in (rise, cases)],
             f"first at 12 cm: {_times(rise)} under the assumptions of notes S7.2; {_times(cases)}"
             " with the cases as they are",
         ),
@@ -216,11 +217,6 @@ def measured_rows(run, assumed):
         "hybrid against SMC and SFC": _once_tuned(run),
         **_linear(run("sfc")[0].loop),
     }
-
-
-def _slowest(times):
-    """Whether SFC is at the setpoint last; times: {controller: s, None where it never is}."""
-    return None not in times.values() and max(times["SMC"], times["hybrid"]) < times["SFC"]
 
 
 def _times(times):

@@ -377,9 +377,8 @@ def _kind_in(name, table):
     kinds = _kinds(role, kind) if isinstance(kind, str) else role.classes
     if not isinstance(kind, str) or kind not in role.classes:
         raise unknown(f"{name} kind", str(kind), kinds)
-    if role.classes[kind] is controllers.PID and "lead" in table:
-        return "ratio"  # of which no input follows: those that do not lead stand still
-    return kind
+    # a ratio of which no input follows: those that do not lead stand still
+    return "ratio" if role.classes[kind] is controllers.PID and "lead" in table else kind
 
 
 def with_kind(name, table):

@@ -161,10 +161,9 @@ def loads(text: str, words: str = "rig file", folder: str | Path = "") -> Case:
     try:
         return from_table(table, folder)
     except InputError as error:
-        lines, sentences = lines_of(text), []
-        for part in error.parts or (error,):
-            line = line_of(lines, part.place) if part.place else None
-            sentences.append(f"line {line}: {part}" if line else str(part))
+        lines, parts = lines_of(text), error.parts or (error,)
+        at = [(line_of(lines, part.place) if part.place else None, part) for part in parts]
+        sentences = [f"line {line}: {part}" if line else str(part) for line, part in at]
         located = type(error)(f"{words}: {'; '.join(sentences)}")
         located.parts = error.parts
         raise located from None

@@ -354,7 +354,13 @@ def set_and_schedule(case: Case, values: Mapping[str, Any], table: Mapping[str, 
         # names of the schedule exist only after it
         names = {name for kind in ("leaf", "static") for name, _, _ in walk(case.loop, kind=kind)}
         first = [n for n in values if n.split("[")[0] in names or n.startswith("clock.")]
-        case = _with_schedule(set_values(case, {n: values[n] for n in first}), table)
+        case = set_values(case, {n: values[n] for n in first})
+        gains = read_entry(SECTIONS["schedule"], table, sizes_of(case.loop))["gains"]
+        if twice := [gain for gain in gains if gains.count(gain) > 1]:
+            raise InputError(f"schedule.gains: {twice[0]} is scheduled twice: name it once")
+        if not isinstance(table["knots"], list):
+            raise InputError(f"schedule.knots = {table['knots']!r}: must be a list of numbers")
+        case = schedule(case, dict.fromkeys(gains, table["variable"]), table["knots"])
         values = {n: v for n, v in values.items() if n not in first}
     return set_values(case, values)
 
@@ -483,16 +489,6 @@ def schedule_table(loop):
         return {}
     gains, knots = [CONTROLLER + g for g in part.gains], np.asarray(part.knots).tolist()
     return {"gains": gains, "variable": part.variable, "knots": knots}
-
-
-def _with_schedule(case, table):
-    """Return `schedule` of a table as `schedule_table` makes it."""
-    gains = read_entry(SECTIONS["schedule"], table, sizes_of(case.loop))["gains"]
-    if twice := [gain for gain in gains if gains.count(gain) > 1]:
-        raise InputError(f"schedule.gains: {twice[0]} is scheduled twice: name it once")
-    if not isinstance(table["knots"], list):
-        raise InputError(f"schedule.knots = {table['knots']!r}: must be a list of numbers")
-    return schedule(case, dict.fromkeys(gains, table["variable"]), table["knots"])
 
 
 def _entries(loop, name):

@@ -154,7 +154,13 @@ def _box(case, widths):
     """({parameter: half width} of the box that the case describes, with `widths` instead of
     the plant's, the factor by which inflow disturbances may be larger than they are).
     """
-    box = {} if case.covariance is None else _box_of_covariance(*case.covariance)
+    box = {}
+    if case.covariance is not None:  # the ellipsoid of estimates that holds with PROBABILITY
+        names, matrix = case.covariance
+        at = [i for i, name in enumerate(names) if not name.startswith(HARMLESS)]
+        sigma = np.sqrt(np.diag(np.asarray(matrix, dtype=float)))[at]
+        reach = np.sqrt(2.0 * scipy.special.gammaincinv(0.5 * max(len(at), 1), PROBABILITY))
+        box = dict(zip([names[i] for i in at], reach * sigma))
     if widths is None:
         for name, half in widths_of(case.loop.plant, _plant_shares(case)).items():
             box[name] = np.maximum(half, box.get(name, 0.0))
@@ -172,14 +178,6 @@ def _box(case, widths):
         owner = case.loop if name.startswith("x0") else getattr(case.loop, part, None)
         box |= widths_of(owner, {name: share})
     return box, more
-
-
-def _box_of_covariance(names, matrix):
-    """{parameter: half width} of the ellipsoid of estimates that holds with PROBABILITY."""
-    at = [i for i, name in enumerate(names) if not name.startswith(HARMLESS)]
-    sigma = np.sqrt(np.diag(np.asarray(matrix, dtype=float)))[at]
-    reach = np.sqrt(2.0 * scipy.special.gammaincinv(0.5 * max(len(at), 1), PROBABILITY))
-    return dict(zip([names[i] for i in at], reach * sigma))
 
 
 def _plant_shares(case):

@@ -195,17 +195,13 @@ def _chosen(base, able):
     others = np.zeros(base.least.tanks)
     for (tank, upper), sets in sorted(able.items(), key=lambda item: len(item[1]) or 99):
         effects = base.effects(tank, base.limit[tank], others, upper)
-        agree = (m for m in sets if _agrees(m, effects, directions))
+        known = {j: directions.get(j, effect.up) == effect.up for j, effect in effects.items()}
+        agree = (m for m in sets if all(known[j] for j in m))
         movers = next(agree, (sets or [tuple(effects)])[0])
         chosen[tank, upper] = movers
         directions |= {j: effects[j].up for j in movers if j not in directions}
     # of two rows that oppose each other the last holds: those that no input can keep come first
     return dict(sorted(chosen.items(), key=lambda item: (bool(able[item[0]]), item[0])))
-
-
-def _agrees(movers, effects, directions):
-    """Whether no row that is chosen moves one of the inputs the other way."""
-    return all(directions.get(j, effects[j].up) == effects[j].up for j in movers)
 
 
 def _step(base, tank, ranges, upper, hold):

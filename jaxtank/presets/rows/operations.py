@@ -32,14 +32,10 @@ def operations(jaxpr: Any) -> int:
         elif name.startswith(("reduce_", "cum")):
             count += math.prod(eqn.invars[0].aval.shape)
         passes = eqn.params.get("length", 1) if name == "scan" else 1
-        count += passes * sum(operations(inner) for inner in _inner(eqn.params))
+        parts = jax.tree.leaves([*eqn.params.values()], is_leaf=lambda part: hasattr(part, "eqns"))
+        inner = (getattr(part, "jaxpr", part) for part in parts if hasattr(part, "eqns"))
+        count += passes * sum(map(operations, inner))
     return count
-
-
-def _inner(params: Any) -> list[Any]:
-    """The jaxprs among the parameters of a primitive."""
-    parts = jax.tree.leaves(list(params.values()), is_leaf=lambda part: hasattr(part, "eqns"))
-    return [getattr(part, "jaxpr", part) for part in parts if hasattr(part, "eqns")]
 
 
 def sample_operations(loop: ClosedLoop, clock: Clock) -> int:
