@@ -74,6 +74,8 @@ READ = {
     ("jaxtank.core.tables", "_sheet", "ZipFile"): "sizes of the parts of an Excel file, in memory,"
     " before openpyxl reads them",
     ("jaxtank.rig.schema", "_sections", "read_text"): "a table of the package",
+    ("jaxtank.rig.entry", "", "read_text"): "words.toml of the package",
+    ("jaxtank.export.statements", "template", "read_text"): "a template of the package",
     ("jaxtank.presets.paper", "printed", "read_text"): "the numbers of a paper, of the package",
     ("tuning.bench.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",
     ("tuning.figures.figure", "_figures", "read_text"): "figures.toml of the package",
@@ -231,7 +233,21 @@ def test_the_wheel_holds_the_two_packages_and_nothing_else(built):
     there = "tuning/bench/floor.c tuning/cli/names.txt jaxtank/README.md tuning/README.md"
     assert set(there.split()) <= packed
     assert {n.rsplit(".", 1)[1] for n in packed} == {
-        *("py", "pyi", "c", "css", "html", "js", "md", "toml", "txt", "typed")
+        *(
+            "py",
+            "pyi",
+            "c",
+            "m",
+            "st",
+            "css",
+            "html",
+            "js",
+            "md",
+            "mplstyle",
+            "toml",
+            "txt",
+            "typed",
+        )
     }
     assert license_there and "METADATA" in info and "jaxtank = tuning.cli.main:main" in entry
 
