@@ -281,23 +281,24 @@ def _rules(result):
     """The table of tuning rules beside the answer, and why some of them have no gains."""
     loop, unit = result.tuned.loop, cost_unit(result)
     names = [g for g in ORDER if g != "Tt" and any(_of(r["parameters"], g) for r in result.rules)]
-    gains = {
-        f"controller.{g}[{i}]": v
-        for g in names
-        for i, v in enumerate(np.ravel(get_value(loop, f"controller.{g}")).tolist())
-    }
-    answer = rule_row(loop, "this answer", gains, result.answer.after)
+    answer = rule_row(loop, "this answer", _gains(loop, names), result.answer.after)
     head = [f"{g} [{describe(loop, f'controller.{g}')['unit']}]" for g in names]
     cost = "cost" if unit == "-" else f"cost [{unit}]"
     head = ["tuning rules", *head, f"error [{loop.units[0]}]", "change [%]", cost, "holds"]
     every = (answer, *result.rules)
     rows = [_rule(row, names) for row in every]
-    reasons = dict.fromkeys(row["why"] for row in result.rules if row["why"])
-    if any(row["setpoints_lost"] for row in every):
+    missed = [row["setpoints_lost"] for row in every]
+    if any(missed):
         head.append(f"missed (of {result.answer.after.samples})")
-        for cells, row in zip(rows, every):
-            cells.append("-" if row["setpoints_lost"] is None else str(row["setpoints_lost"]))
+        rows = [[*cells, "-" if n is None else str(n)] for cells, n in zip(rows, missed)]
+    reasons = dict.fromkeys(row["why"] for row in result.rules if row["why"])
     return [Table(rows, head, True), *([Text(list(reasons))] if reasons else [])]
+
+
+def _gains(loop, names):
+    """{dotted name: value} of every entry of some gains of a controller."""
+    values = {g: np.ravel(get_value(loop, f"controller.{g}")).tolist() for g in names}
+    return {f"controller.{g}[{i}]": v for g, row in values.items() for i, v in enumerate(row)}
 
 
 def _of(values, gain):

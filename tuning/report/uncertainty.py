@@ -176,25 +176,12 @@ def advice_of(ensemble):
 def verdict_of(ensemble):
     """Return the Verdict of an Ensemble: the limit that is broken most often, and the draws."""
     samples, violations = ensemble.samples, ensemble.violations()
-    diverged, parts, known = int(ensemble.failed.sum()), {}, ensemble.measures
+    diverged, parts = int(ensemble.failed.sum()), {}
     if diverged:
         words = f"{diverged} of {count(samples, 'run')} diverged"
         parts["outcome"] = verdicts.Part(words, False)
-    columns = {n: np.asarray(ensemble.measures[n]) for n in ms.TRACKED if n in known}
-    lost = not_tracking(ensemble.case.loop, columns, ensemble.failed)
-    loop = ensemble.case.loop
-    missing = [n for n in ms.TRACKED if n not in known and ms.serves(n, loop)]
-    if missing and not isinstance(loop.controller, UNJUDGED):
-        words = f"setpoints are not judged without {' and '.join(missing[:2])}"
-        parts["tracking"] = verdicts.Part(words)
-    elif lost is not None and not lost.any():
-        parts["tracking"] = verdicts.Part("every draw keeps to its setpoints")
-    elif lost is not None:
-        first = {n: v[np.argmax(lost)] for n, v in columns.items()}
-        example = verdicts.tracking(ensemble.case.loop, first)
-        many = verdicts.astray(lost, "draws", ensemble.infeasible)
-        words = many if example is None else f"{many}, as: {example.words}"
-        parts["tracking"] = verdicts.Part(words, False)
+    if (part := _tracking(ensemble)) is not None:
+        parts["tracking"] = part
     if violations:
         worst = max(violations, key=lambda v: v["count"])
         held, share = int(ensemble.held.sum()), verdicts.shown(100 * worst["probability"])
@@ -210,6 +197,23 @@ def verdict_of(ensemble):
     if not parts:
         return verdicts.outcome(f"{count(samples, 'draw')}, no limits to judge them by")
     return verdicts.Verdict(**parts)
+
+
+def _tracking(ensemble):
+    """Whether every draw keeps to its setpoints; None where none are followed."""
+    loop, known = ensemble.case.loop, ensemble.measures
+    missing = [n for n in ms.TRACKED if n not in known and ms.serves(n, loop)]
+    if missing and not isinstance(loop.controller, UNJUDGED):
+        return verdicts.Part(f"setpoints are not judged without {' and '.join(missing[:2])}")
+    columns = {n: np.asarray(known[n]) for n in ms.TRACKED if n in known}
+    lost = not_tracking(loop, columns, ensemble.failed)
+    if lost is None:
+        return None
+    if not lost.any():
+        return verdicts.Part("every draw keeps to its setpoints")
+    example = verdicts.tracking(loop, {n: v[np.argmax(lost)] for n, v in columns.items()})
+    many = verdicts.astray(lost, "draws", ensemble.infeasible)
+    return verdicts.Part(many if example is None else f"{many}, as: {example.words}", False)
 
 
 def _measure_table(ensemble):
