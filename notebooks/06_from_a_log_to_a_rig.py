@@ -263,13 +263,13 @@ figures = higher.plot()
 # ## Gains, a safety filter, and C
 #
 # `tuning.tune` looks for gains on plants drawn from the covariance, with noise and a price on the
-# motion of the pump, and judges them on 256 others. Where a level comes near its limit, a safety filter
+# motion of the pump, and judges them on 64 others. Where a level comes near its limit, a safety filter
 # stands between controller and pump.
 #
 # **Guess first:** which gain would you choose, between the proposed one and 1.0?
 
 # %%
-answer = tuning.tune(found.identified)
+answer = tuning.tune(found.identified, tuning.Options(validation=64))
 answer
 
 # %% [markdown]

@@ -49,17 +49,18 @@ def advance(
         return unzipped(x, each(added, x, excess, changes))
 
     def substep(j, before):
-        start, rounded, spilled, shortfall = before
-        x, excess = moved(j, start, rounded, d)
+        x, excess, spilled, shortfall = before
         if not plant.overflow_within:
+            x, excess = moved(j, x, excess, d)
             shortfall = each(operator.add, shortfall, plant.shortfall(x))
             x, over = plant.spill(x)
         else:
             # Overflow at the end of a step is of first order: a full tank stands above its rim
             # until then and gives too much through its outlets, one below a weir stands half a
-            # step's overflow too high. So the step is taken again with it as in- and outflows
-            within = overflowing(plant, x)
-            x, excess = moved(j, start, rounded, entering(d, within, h))
+            # step's overflow too high. So what overflows at the rates of the start, all there is
+            # at rest, leaves and enters within the step, and at its end what differs from that
+            within = overflowing(plant, t + j * h, x, u, d, h)
+            x, excess = moved(j, x, excess, entering(d, within, h))
             shortfall = each(operator.add, shortfall, plant.shortfall(x))
             x, over = plant.spill(x, within)
         return Advanced(x, excess, each(operator.add, spilled, over), shortfall)
@@ -73,10 +74,15 @@ def advance(
     return advanced
 
 
-def overflowing(plant, x):
-    """Volumes (n,) that overflow brings to each tank that stands at levels `x`, or takes."""
-    full = each(lambda h: lower_clip(h, 0.0), x) if plant.bottom else x
-    stored = plant.stored if plant.by_volume else lambda x: each(operator.mul, x, plant.area)
+def overflowing(plant, t, x, u, d, h):
+    """Volumes (n,) that overflow brings to each tank within `h` [s], or takes, by Euler's rule."""
+    if plant.by_volume:
+        stored, levels = plant.stored, plant.levels
+        after = levels(_along(stored(x), plant.net_flows(h)(t, x, u, d), h))
+    else:
+        stored = lambda levels: each(operator.mul, levels, plant.area)
+        after = _along(x, _field(plant, h)(t, x, u, d), h)
+    full = each(lambda v: lower_clip(v, 0.0), after) if plant.bottom else after
     return each(operator.sub, stored(plant.spill(full)[0]), stored(full))
 
 
