@@ -62,7 +62,8 @@ def advance(
             within = overflowing(plant, t + j * h, x, u, d, h)
             x, excess = moved(j, x, excess, entering(d, within, h))
             shortfall = each(operator.add, shortfall, plant.shortfall(x))
-            x, over = plant.spill(x, within)
+            network: Any = plant
+            x, over = network.spill(x, within)
         return Advanced(x, excess, each(operator.add, spilled, over), shortfall)
 
     if rolled and not (isinstance(substeps, int) and substeps == 1):
