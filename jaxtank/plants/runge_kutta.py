@@ -39,7 +39,7 @@ def advance(
     excess: Sequence[Any] = (),
     rolled: bool = False,
 ) -> Advanced:
-    """Return the plant's levels a sample later, with overflow after each of its substeps."""
+    """Return the plant's levels a sample later, with what overflowed in its substeps."""
     h = dt / substeps
 
     def moved(j, x, excess, d):
@@ -55,10 +55,10 @@ def advance(
             shortfall = each(operator.add, shortfall, plant.shortfall(x))
             x, over = plant.spill(x)
         else:
-            # Overflow at the end of a step is of first order: a full tank stands above its rim
-            # until then and gives too much through its outlets, one below a weir stands half a
-            # step's overflow too high. So what overflows at the rates of the start, all there is
-            # at rest, leaves and enters within the step, and at its end what differs from that
+            # If all overflow moved at the end of a step, a full tank would stand above its rim
+            # until then and a tank below a weir would stand too high, by half of what falls into
+            # it in a step. The overflow at the rates of the start is therefore an outflow and an
+            # inflow of the step, and only what differs from it moves at the end: none at rest
             within = overflowing(plant, t + j * h, x, u, d, h)
             x, excess = moved(j, x, excess, entering(d, within, h))
             shortfall = each(operator.add, shortfall, plant.shortfall(x))

@@ -399,7 +399,7 @@ class TankNetwork(Plant):
 
     @property
     def overflow_within(self) -> bool:
-        return self.overflow
+        return self.overflow and type(self).spill is TankNetwork.spill  # a class may have its own
 
     @property
     def by_volume(self) -> bool:

@@ -2,12 +2,14 @@
 with one tank.
 """
 
+import numpy as np
 import pytest
 from helpers import RIGS
 
 import tuning
-from jaxtank import rig
+from jaxtank import presets, rig
 from tuning.cli import main
+from tuning.problem import reported
 from tuning.search.result import ConstraintRow
 
 ONE_TANK = str(RIGS / "watertank.toml")
@@ -70,3 +72,11 @@ def test_simulate_says_that_inputs_chatter(capsys):
     assert "the input of pump 1 chatters: it changes by 100 %" in capsys.readouterr().err
     assert main.main(["simulate", "mirakhorli/smc"]) == 0
     assert "chatters" not in capsys.readouterr().err
+
+
+def test_an_open_loop_does_not_chatter_whatever_it_plays():
+    case = presets.find("mirakhorli/smc-printed")
+    busy = {"input_travel": np.array([1e6, 1e6])}
+    assert "chatters" in reported.chatter(case.loop, case.clock, busy)[0]
+    case = presets.find("cascaded/open-loop")
+    assert reported.chatter(case.loop, case.clock, {"input_travel": np.array([1e6])}) == []

@@ -17,6 +17,7 @@ from jaxtank.loop.closed_loop import ClosedLoop, zero_of
 from jaxtank.loop.margins import worst
 from tuning.problem import scenarios as sc
 from tuning.problem.problem import Problem
+from tuning.problem.tracking import UNJUDGED
 
 
 def run_measures(
@@ -33,9 +34,13 @@ to chatter [-]. Of the preset cases only the relay of mirakhorli passes 0.01."""
 
 
 def chatter(loop: ClosedLoop, clock: Clock, values: Mapping[str, Any]) -> list[str]:
-    """Return a sentence where an input of a run with measures `values` changes all the time."""
-    low, high = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
-    travel = np.ravel(values.get("input_travel", 0.0)) / (clock.samples * (high - low))
+    """Return a sentence where a controller moves an input at every sample; `values`: measures."""
+    if isinstance(loop.controller, UNJUDGED) or "input_travel" not in values:
+        return []
+    pumps, bank = loop.plant.pumps, loop.actuator
+    low, high = (np.broadcast_to(np.asarray(v, float), pumps) for v in (bank.low, bank.high))
+    most = clock.samples * (high - low)
+    travel = np.divide(values["input_travel"], most, out=np.zeros_like(most), where=most > 0.0)
     j = int(np.argmax(travel))
     if not travel[j] > CHATTER:
         return []

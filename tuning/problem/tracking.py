@@ -36,6 +36,7 @@ class Tracked(NamedTuple):
 
 
 def tracked_of(loop: ClosedLoop, values: Mapping[str, Any]) -> Tracked | None:
+    """Return the Tracked of one run or many; None of a controller that follows no setpoint."""
     if isinstance(loop.controller, UNJUDGED) or not set(ms.TRACKED) <= set(values):
         return None
     plant: Any = loop.plant

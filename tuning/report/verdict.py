@@ -242,10 +242,11 @@ def of_tuning(result: Any) -> Verdict:
 def _tracking_of_answer(loop, values, answer, runs):
     """The tracking of its own run, and on how many validation plants it is not good."""
     nominal = tracking(loop, values)
-    if nominal is not None and answer is None and runs and runs["setpoints_kept"]["after"]:
-        kept, samples = runs["setpoints_kept"]["after"], runs["samples"] - runs["failed"]
-        lost = round((1.0 - kept) * samples)
-        words = f"{lost} of {samples} validation runs do not keep to their setpoints"
+    share = runs["setpoints_kept"]["after"] if runs and answer is None else None
+    if nominal is not None and share is not None:
+        finite = runs["samples"] - runs["failed"]
+        lost = round((1.0 - share) * finite)
+        words = f"{lost} of {finite} validation runs do not keep to their setpoints"
         return _joined(nominal, words) if lost else nominal
     if nominal is None or answer is None or answer.after is None:
         return nominal

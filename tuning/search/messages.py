@@ -71,7 +71,7 @@ FRAGILE, PEAK = 2.5, 2.0
 that became less robust is reported [-]: textbooks recommend 1.4 to 2."""
 
 INSENSITIVE = 0.5  # change of the objective for 10 % of a parameter that is not felt [%]
-CHATTER = 10.0  # reported growth of the inputs' total variation, or rms change [-]
+GROWTH = 10.0  # reported growth of the inputs' total variation, or rms change [-]
 
 BUSY = 0.2  # rms change of inputs per sample from which on they chatter, as a share of range [-]
 
@@ -183,7 +183,7 @@ def _less_robust(result: TuningResult) -> Messages:
 @rule(OPTIMUM)
 def _total_variation(result: TuningResult) -> Messages:
     before, after = (float(result.measures[k]["input_travel"].sum()) for k in ("before", "after"))
-    if after > CHATTER * before > 0:
+    if after > GROWTH * before > 0:
         times = f"{after / before:.0f} times that before"
         unit = ms.unit("input_travel", result.problem.loop.units)
         yield Message(
@@ -201,7 +201,7 @@ def _busier(result: TuningResult) -> Messages:
     if after is None or after.failed.all():
         return
     old, new = float(np.nanmean(before.travel)), float(np.nanmean(after.travel))
-    if new > CHATTER * old > 0:
+    if new > GROWTH * old > 0:
         yield Message(
             "input-total-variation",
             f"the rms change of the inputs per sample is {100 * new:.2g} % of their range,"

@@ -1,12 +1,16 @@
 """Overflow leaves, and enters the tank below, while it flows and not when a step ends."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxtank import component
 from jaxtank.plants.network import network
 from jaxtank.plants.runge_kutta import advance
+from jaxtank.plants.tank_network import TankNetwork
 
 GRAVITY, FLOW, DRAIN = 981.0, 180.0, 1.5
 BELOW = (FLOW / DRAIN) ** 2 / (2.0 * GRAVITY)  # Torricelli: the level whose outflow is FLOW
@@ -108,3 +112,15 @@ def test_a_full_tank_loses_what_its_outlet_does_not_carry(dt):
     carried = 4.0 * (2.0 * GRAVITY * 120.0) ** 0.5
     assert levels[0] == 120.0
     assert lost[0] == pytest.approx((3000.0 - carried) * 1800.0, rel=1e-4)
+
+
+def test_a_class_with_a_spill_of_its_own_is_asked_as_before():
+    @component
+    class Lidded(TankNetwork):
+        def spill(self, x):
+            return x, tuple(0.0 * v for v in x)
+
+    plain = weir()
+    fields = {f.name: getattr(plain, f.name) for f in dataclasses.fields(plain)}
+    levels, lost = after(Lidded(**fields), (40.0, 10.0), (6.0,), 1.0, 10)
+    assert levels[0] == pytest.approx(40.0 + 10.0 * FLOW / 200.0) and not lost.any()

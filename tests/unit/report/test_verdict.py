@@ -385,3 +385,6 @@ def test_other_answers_say_on_how_many_runs_setpoints_are_not_kept(robust):
     verdict = verdicts.of_tuning(result)
     assert 0.1 < kept < 0.9 and not verdict.tracking.good and not verdict.good
     assert f"{round((1 - kept) * finite)} of {finite} validation runs" in verdict.tracking.words
+    none = result.validation | {"setpoints_kept": {"before": 1.0, "after": 0.0}}
+    words = verdicts.of_tuning(result.replace(validation=none)).tracking.words
+    assert f"{finite} of {finite} validation runs" in words
