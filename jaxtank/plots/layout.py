@@ -125,13 +125,14 @@ def valves(plant, where):
 
 
 def overflows(plant, where):
-    """Return [(tank, path ((x, y), ...))] of what runs over a rim into another tank."""
-    paths = []
-    for tank, into in plant.spills:
+    """Return [(tank, path ((x, y), ...))] of what overflows from one tank into another."""
+    paths, ports = [], getattr(plant, "spill_port", None)
+    for k, (tank, into) in enumerate(plant.spills):
         source, sink = where.boxes[tank], where.boxes[into]
-        x, rim = source.x - 0.13, source.y + source.height
+        height = source.height if ports is None else float(ports[k]) * source.scale
+        x, brim = source.x - 0.13, source.y + min(height, source.height)
         end = (sink.x + 0.12 * sink.width, sink.y + sink.height * 0.97)
-        start = ((source.x, rim), (x, rim - 0.05), (x, sink.y + sink.height + 0.25))
+        start = ((source.x, brim), (x, brim - 0.05), (x, sink.y + sink.height + 0.25))
         paths.append((tank, (*start, end)))
     return paths
 

@@ -91,7 +91,9 @@ def cloud(ax, pairs, feasible, name, unit, limit=None):
         ax.axvline(limit, color=FORBIDDEN, linewidth=1.0)
         ax.axhline(limit, color=FORBIDDEN, linewidth=1.0, label=f"limit {limit:g} {unit}")
     ax.set(xlabel=f"{name} before [{unit}]", ylabel=f"{name} after [{unit}]")
-    ax.set(xlim=(low, high), ylim=(low, high), aspect="equal")
+    if low < high:  # else matplotlib's own, about the one number
+        ax.set(xlim=(low, high), ylim=(low, high))
+    ax.set(aspect="equal")
     ax.set_axisbelow(True)
     return ax
 

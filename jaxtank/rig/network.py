@@ -141,6 +141,7 @@ def _read(table, sizes):
         lambda: _check_names(entries),
         lambda: _check_links(rows, entries, sizes.units),
         lambda: _check_spills(entries["spill"], rows["spill"]),
+        lambda: _check_ports(entries["spill"], entries["tank"], sizes.units[0]),
         lambda: _check_pumps(rows["pump"], entries["pump"], sizes.units),
         lambda: _check_valves(entries["valve"], sizes.units),
     ]
@@ -381,6 +382,18 @@ def _check_spills(spills, rows):
                 f"spill {' and '.join(str(k + 1) for k in same)}, from tank {source + 1}: caught is"
                 f" {total:g} in sum, 1 where it is left out: give each its share of what passes the"
                 " rim, from 0 to 1 in sum"
+            )
+
+
+def _check_ports(spills, tanks, length):
+    """Raise InputError for an overflow opening above the rim of its tank."""
+    for k, spill in enumerate(spills):
+        rim, port = tanks[spill["from"]].get("rim"), spill.get("port")
+        if None not in (rim, port) and port > rim:
+            raise InputError(
+                f"spill {k + 1}: port = {port:g} {length} is above the rim of tank"
+                f" {spill['from'] + 1}, {rim:g} {length}: liquid passes the rim first; give a port"
+                " at or below the rim, or leave it out"
             )
 
 

@@ -66,7 +66,9 @@ def check(case: Case) -> Case:
     run.check(case.loop, case.clock, key=jax.ShapeDtypeStruct((), np.uint32))
     check_setpoints(case)
     if case.reachable and (why := unreachable(case)):
-        raise EquilibriumError(f"{why}; with reachable = false the file is run without this check")
+        raise EquilibriumError(
+            f"{why}; reachable = false at the top of the file leaves this check out"
+        )
     return case
 
 
@@ -118,8 +120,11 @@ def unreachable(case: Case) -> str | None:
     varies = inflow is not None and inflow.is_table  # a level may be reached for a while
     if isinstance(controller, OpenLoop | OnOff):  # which follow no setpoint
         return None
-    closed = isinstance(plant, TankNetwork) and closed_circuit(plant)  # what it holds decides
-    if isinstance(reference, Ramps) and square and not varies and not closed:
+    # what it holds decides, or what overflows from one tank into another
+    open_ended = isinstance(plant, TankNetwork) and (
+        closed_circuit(plant) or (plant.overflow and plant.spills)
+    )
+    if isinstance(reference, Ramps) and square and not varies and not open_ended:
         plateaus = reference.plateaus(case.clock.duration)
         _, first = np.unique(plateaus, axis=0, return_index=True)
         for values in _doubtful(case.loop, plateaus[np.sort(first)]):

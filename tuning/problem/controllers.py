@@ -156,7 +156,10 @@ def operating_point(case: Case, plant: Any) -> tuple[np.ndarray, np.ndarray, np.
                 continue
             levels, inputs = rest
         return np.asarray(setpoint, dtype=float), levels, inputs
-    raise InputError("no setpoint has a steady state at which first gains could be computed")
+    without = " without overflow" if plant.overflow else ""
+    raise InputError(
+        f"no setpoint has a steady state{without} at which first gains could be computed"
+    )
 
 
 def _circulating(loop: Any, plant: Any, setpoint: np.ndarray) -> Any:

@@ -12,7 +12,7 @@ from jaxtank.core.labels import labels_of
 from jaxtank.core.text import count
 from jaxtank.core.tree import get_value, split_index
 from jaxtank.loop.steady import sharing, steady_inflow
-from jaxtank.plants.elements import closed_circuit, unregulated
+from jaxtank.plants.elements import brims, closed_circuit, unregulated
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig import check_limits
 from jaxtank.signals.base import Constant, Sum
@@ -124,7 +124,26 @@ def unjudged(case: Case) -> str:
         return f"{names(tanks)} no outflow that rises with the level, and fills or runs empty"
     if plant.pumps != len(plant.outputs) and sharing(case.loop) is None:
         return f"it has {count(plant.pumps, 'input')} and {count(len(plant.outputs), 'output')}"
-    return "" if plateaus_of(case) else "its setpoints are never held for a while"
+    return (
+        _needs_overflow(case) if plateaus_of(case) else "its setpoints are never held for a while"
+    )
+
+
+def _needs_overflow(case: Case) -> str:
+    """Why it is not known, where a tank may need what another overflows; "" elsewhere."""
+    loop: Any = case.loop
+    plant = loop.plant
+    if not (plant.overflow and plant.spills):
+        return ""
+    flow = steady_inflow(loop)
+    states = SteadyStates(plant, {}, 0.0 if flow is None else np.asarray(flow), sharing(loop))
+    levels = states.at([plateau.values for plateau in plateaus_of(case) or ()])[0][0]
+    full = [source for source, _ in plant.spills]
+    below = levels[:, full] <= np.array(brims(plant), dtype=float)[full]
+    if np.all(levels >= 0.0) and below.all():
+        return ""
+    tanks = labels_of(plant, "tank", sorted(set(full)))
+    return f"steady states do not count what overflows from {tanks} into another tank"
 
 
 def _varies(inflow: Any) -> bool:

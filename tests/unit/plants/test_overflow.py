@@ -7,10 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxtank import component
+import jaxtank
+from jaxtank import component, presets, rig
+from jaxtank.core.errors import InputError
 from jaxtank.plants.network import network
 from jaxtank.plants.runge_kutta import advance
 from jaxtank.plants.tank_network import TankNetwork
+from tuning.uncertainty.needs import unjudged
 
 GRAVITY, FLOW, DRAIN = 981.0, 180.0, 1.5
 BELOW = (FLOW / DRAIN) ** 2 / (2.0 * GRAVITY)  # Torricelli: the level whose outflow is FLOW
@@ -124,3 +127,27 @@ def test_a_class_with_a_spill_of_its_own_is_asked_as_before():
     fields = {f.name: getattr(plain, f.name) for f in dataclasses.fields(plain)}
     levels, lost = after(Lidded(**fields), (40.0, 10.0), (6.0,), 1.0, 10)
     assert levels[0] == pytest.approx(40.0 + 10.0 * FLOW / 200.0) and not lost.any()
+
+
+WEIR = """
+units = ["cm", "V"]
+tank = [{ area = 200.0, rim = 50.0, level = 38.0, drain = 0.3 },
+        { area = 150.0, rim = 20.0, level = 4.0, drain = 1.5 }]
+spill = [{ from = 1, to = 2, port = 40.0 }]
+pump = [{ gain = 30.0, to = 1, high = 12.0, initial = 6.0 }]
+plant = { overflow = true, outputs = [2] }
+controller = { kind = "pi", Kc = 2.0, Ti = 60.0 }
+reference = { initial = [4.0], changes = [[120.0, 1, 8.0]] }
+values = { "clock.dt" = 1.0, "clock.duration" = 600.0 }
+"""
+
+
+def test_setpoints_that_need_an_overflow_are_not_called_out_of_reach():
+    """The setpoint of 8 cm is held, by what passes the weir: no steady state without it."""
+    case = rig.loads(WEIR)
+    run = jaxtank.simulate(rig.check(case))
+    assert run.x[-1, 0] == 40.0 and run.x[-1, 1] == pytest.approx(8.0, abs=0.05)
+    assert "overflows from tank 1" in unjudged(case)
+    assert not unjudged(presets.find("cascaded/pi"))  # which needs no overflow
+    with pytest.raises(InputError, match="port = 60 cm is above the rim of tank 1, 50 cm"):
+        rig.loads(WEIR.replace("port = 40.0", "port = 60.0"))

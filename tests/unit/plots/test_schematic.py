@@ -13,7 +13,7 @@ from matplotlib.patches import Rectangle
 from jaxtank import presets
 from jaxtank.plants.network import network
 from jaxtank.plots import style
-from jaxtank.plots.layout import place, storeys
+from jaxtank.plots.layout import overflows, place, storeys
 from jaxtank.plots.schematic import schematic
 
 NAMES = "gouta2015/ngpc gouta2022/enmpc mirakhorli/sfc calofir/backstepping cascaded/pi"
@@ -117,3 +117,22 @@ def test_a_rig_whose_tanks_feed_each_other_is_drawn_all_the_same(ax):
     assert len(storeys(rig)) == 3
     schematic(ax, rig)
     assert sum(t.startswith("tank ") for t in words(ax)) == 3
+
+
+def test_an_overflow_begins_at_its_opening():
+    """Half of the height of its tank, whose rim is where a level may rise to."""
+    plant = network(
+        area=[1.0, 1.0],
+        drain=[0.1, 0.1],
+        rim=[20.0, 20.0],
+        pump_gain=1.0,
+        feeds=[(0, None)],
+        spills=[(0, 1)],
+        caught=1.0,
+        ports={"spill": [10.0]},
+        overflow=True,
+    )
+    where = place(plant)
+    ((tank, path),) = overflows(plant, where)
+    box = where.boxes[tank]
+    assert path[0][1] == pytest.approx(box.y + 0.5 * box.height)
