@@ -149,8 +149,8 @@ def _rows(program, numbers, third):
         outer = {"name": name, "valueReference": i, "causality": causality}
         outer |= {"variability": variability, "description": words}
         outer, inner = _attributes(**outer), _attributes(**value)
-        one, two = f"<{kind}{outer}{inner}/>", f"<ScalarVariable{outer}><{kind}{inner}/>"
-        rows.append(f"    {one if third else f'{two}</ScalarVariable>'}")
+        fmi3, fmi2 = f"<{kind}{outer}{inner}/>", f"<ScalarVariable{outer}><{kind}{inner}/>"
+        rows.append(f"    {fmi3 if third else f'{fmi2}</ScalarVariable>'}")
 
     for i, v in enumerate(numbers):
         variability = "tunable" if v.causality == "parameter" else "discrete"

@@ -123,8 +123,8 @@ def _sum_of_squares(size, term, refers_to=""):
 
 def _lasting(term):
     """`term` of the samples that last for dt: the terms of an integral over the run."""
-    held = lambda run, sample: lambda v: run.lasting(sample, v)
-    return lambda run, sample, *context: each(held(run, sample), term(run, sample, *context))
+    lasting = lambda run, sample: lambda v: run.lasting(sample, v)
+    return lambda run, sample, *context: each(lasting(run, sample), term(run, sample, *context))
 
 
 def _extreme(size, pick, better, worst, refers_to=""):

@@ -123,8 +123,8 @@ def leaves_of(rows, rims, noise, levels=()):
         for name, values in leaves.items():
             values[tank] = row.get(name, values[tank])
     spans = _spans(low, high, rims)
-    one = lambda v, span, width: level_of(v, span, width) if is_reading(v) else v
-    numbers = lambda values, width: [one(v, span, width) for v, span in zip(values, spans)]
+    level = lambda v, span, width: level_of(v, span, width) if is_reading(v) else v
+    numbers = lambda values, width: [level(v, span, width) for v, span in zip(values, spans)]
     leaves = {name: numbers(values, True) for name, values in leaves.items()}
     if np.any(np.isfinite(high)):
         leaves |= {"low": low, "high": high}

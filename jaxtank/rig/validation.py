@@ -229,8 +229,8 @@ def _limit(loop, measure, label, value, spans=None):
     texts = texts * len(spans) if len(texts) == 1 else texts
     if len(texts) != len(spans):
         raise refusal(label, value, f"be a limit, or {len(spans)} of them")
-    one = lambda v, span: level_of(v, span, width) if is_reading(v) else converted(label, v, of)
-    return [one(v, span) for v, span in zip(texts, spans)]
+    level = lambda v, span: level_of(v, span, width) if is_reading(v) else converted(label, v, of)
+    return [level(v, span) for v, span in zip(texts, spans)]
 
 
 def _spans(loop, kind):

@@ -77,10 +77,10 @@ def report(result):
     rows = []
     for rival in result.rivals:
         travel = rival.judged.to_json()["travel_percent"]
-        judged = [Value(rival.error, 4), f"{rival.violations} of {result.samples}"]
+        outcome = [Value(rival.error, 4), f"{rival.violations} of {result.samples}"]
         numbers = [Value(v, 3) for v in (travel, rival.peak, rival.step_us)]
         filtered = "yes" if rival.filtered else "no"
-        rows.append([rival.name, rival.gains, filtered, *judged, *numbers])
+        rows.append([rival.name, rival.gains, filtered, *outcome, *numbers])
     notes = [
         "error: mean total rms error of the plants where every setpoint is reachable",
         "travel: rms change of the inputs per sample, as a share of their range",

@@ -610,10 +610,10 @@ def _answer(
     setting, solution, after = attempt.setting, attempt.solution, attempt.after
     start, case = problem.own_values(), setting.case
     sides = {"before": (case, before), "after": (setting.tuned(values), after)}
-    nominal = {s: _nominal(own, plants, problem.needed) for s, (own, plants) in sides.items()}
+    nominal = {s: _nominal(tuned, plants, problem.needed) for s, (tuned, plants) in sides.items()}
     runs = runs_of(setting.tuned(start), (), 0)
-    judged = [plants for plants in (before, after) if plants is not None]
-    near = np.any([matters(setting, plants, NEAR) for plants in judged], axis=0)
+    validated = [plants for plants in (before, after) if plants is not None]
+    near = np.any([matters(setting, plants, NEAR) for plants in validated], axis=0)
     levels = limited_levels(case)
     fixed = np.zeros(len(start), dtype=bool) if solution.kept is None else solution.kept
     feasible = None  # where levels have no limits, or it is not known
