@@ -138,12 +138,24 @@ def _needs_overflow(case: Case) -> str:
     flow = steady_inflow(loop)
     states = SteadyStates(plant, {}, 0.0 if flow is None else np.asarray(flow), sharing(loop))
     levels = states.at([plateau.values for plateau in plateaus_of(case) or ()])[0][0]
-    full = [source for source, _ in plant.spills]
-    below = levels[:, full] <= np.array(brims(plant), dtype=float)[full]
-    if np.all(levels >= 0.0) and below.all():
+    full = sorted({source for source, _ in plant.spills})
+    brim = np.array(brims(plant), dtype=float)[full]
+    above = np.any(levels[:, full] > brim, axis=0)
+    if np.all(levels >= 0.0) and not above.any():
         return ""
-    tanks = labels_of(plant, "tank", sorted(set(full)))
+    if np.any(above & _must_not_overflow(case)[full]):  # then no such setpoint is within limits
+        return ""
+    tanks = labels_of(plant, "tank", full)
     return f"steady states do not count what overflows from {tanks} into another tank"
+
+
+def _must_not_overflow(case: Case) -> np.ndarray:
+    """Where a limit of the case keeps a tank below its brim: (n,) booleans."""
+    level: Any = check_limits(case.loop, case.limits).get("max_level", np.nan)
+    if isinstance(level, str):
+        return np.ones(case.loop.plant.tanks, dtype=bool)
+    rim, brim = (np.array(v, dtype=float) for v in (case.loop.plant.rim, brims(case.loop.plant)))
+    return (np.asarray(level) <= brim) | (np.asarray(level) >= rim)
 
 
 def _varies(inflow: Any) -> bool:
