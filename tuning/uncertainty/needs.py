@@ -140,7 +140,7 @@ def _needs_overflow(case: Case) -> str:
     levels = states.at([plateau.values for plateau in plateaus_of(case) or ()])[0][0]
     full = sorted({source for source, _ in plant.spills})
     brim = np.array(brims(plant), dtype=float)[full]
-    above = np.any(levels[:, full] > brim, axis=0)
+    above = ~np.all(levels[:, full] <= brim, axis=0)  # or without a steady state
     if np.all(levels >= 0.0) and not above.any():
         return ""
     if np.any(above & _must_not_overflow(case)[full]):  # then no such setpoint is within limits
