@@ -151,11 +151,16 @@ def _needs_overflow(case: Case) -> str:
 
 def _must_not_overflow(case: Case) -> np.ndarray:
     """Where a limit of the case keeps a tank below its brim: (n,) booleans."""
-    level: Any = check_limits(case.loop, case.limits).get("max_level", np.nan)
-    if isinstance(level, str):
-        return np.ones(case.loop.plant.tanks, dtype=bool)
-    rim, brim = (np.array(v, dtype=float) for v in (case.loop.plant.rim, brims(case.loop.plant)))
-    return (np.asarray(level) <= brim) | (np.asarray(level) >= rim)
+    plant: Any = case.loop.plant
+    if "max_level" not in case.limits:
+        return np.zeros(plant.tanks, dtype=bool)
+    level: Any = check_limits(case.loop, case.limits)["max_level"]
+    rim, brim = (np.array(v, dtype=float) for v in (plant.rim, brims(plant)))
+    level = rim if isinstance(level, str) else np.asarray(level, dtype=float)
+    lost = np.ones(plant.tanks)  # share of the overflow that no tank catches
+    for (source, _), share in zip(plant.spills, np.asarray(plant.caught, dtype=float)):
+        lost[source] -= share
+    return (level <= brim) & (level < rim) | (level >= rim) & (lost > TOLERANCE)
 
 
 def _varies(inflow: Any) -> bool:

@@ -148,9 +148,16 @@ def test_setpoints_that_need_an_overflow_are_not_called_out_of_reach():
     run = jaxtank.simulate(rig.check(case))
     assert run.x[-1, 0] == 40.0 and run.x[-1, 1] == pytest.approx(8.0, abs=0.05)
     assert "overflows from tank 1" in unjudged(case)
-    for limit, known in (("[45.0, 20.0]", False), ("[30.0, 20.0]", True), ('"rim"', True)):
-        limited = rig.loads(WEIR + f"\nlimits = {{ max_level = {limit} }}\n")
-        assert (not unjudged(limited)) == known  # out of reach where tank 1 must not overflow
+    lossy = WEIR.replace("port = 40.0", "port = 40.0, caught = 0.9")
+    # out of reach where tank 1 must not overflow, or where what it loses must not be lost
+    for text, limit, known in (
+        (WEIR, "[45.0, 20.0]", False),
+        (WEIR, "[30.0, 20.0]", True),
+        (WEIR, '"rim"', False),
+        (lossy, '"rim"', True),
+    ):
+        limited = rig.loads(f"{text}\nlimits = {{ max_level = {limit} }}\n")
+        assert (not unjudged(limited)) == known
     assert not unjudged(presets.find("cascaded/pi"))  # which needs no overflow
     with pytest.raises(InputError, match="port = 60 cm is above the rim of tank 1, 50 cm"):
         rig.loads(WEIR.replace("port = 40.0", "port = 60.0"))
