@@ -68,6 +68,7 @@ GAINS: dict[type, tuple[str, ...]] = {
     controllers.Cascade: ("Kc", "Ti", "Td", "inner_Kc", "inner_Ti"),
     controllers.FlowCascade: ("Kc", "Ti", "Td", "inner_Kc", "inner_Ti"),
     controllers.Override: ("Kc", "Ti", "Td"),  # a weak loop on the limit costs an objective nothing
+    controllers.ReferenceGovernor: ("Kc", "Ti", "Td"),
     controllers.StateFeedback: ("K",),
     controllers.LQI: ("Q", "R"),
     controllers.NGPC: ("Tp",),

@@ -15,6 +15,7 @@ from jaxtank.controllers.open_loop import OpenLoop
 from jaxtank.controllers.override import Override
 from jaxtank.controllers.pid import PID
 from jaxtank.controllers.ratio import Ratio
+from jaxtank.controllers.reference_governor import ReferenceGovernor
 from jaxtank.controllers.sliding_mode import SlidingMode
 from jaxtank.controllers.split_range import SplitRange
 from jaxtank.controllers.state_feedback import LQI, StateFeedback
@@ -37,6 +38,7 @@ __all__ = [
     "OpenLoop",
     "Override",
     "Ratio",
+    "ReferenceGovernor",
     "Scheduled",
     "SlidingMode",
     "SplitRange",

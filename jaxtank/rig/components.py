@@ -55,6 +55,7 @@ ROLES = {
             "flow-cascade": controllers.FlowCascade,
             "override": controllers.Override,
             "ratio": controllers.Ratio,
+            "reference-governor": controllers.ReferenceGovernor,
             "on-off": controllers.OnOff,
             "state-feedback": controllers.StateFeedback,
             "lqi": controllers.LQI,
@@ -201,6 +202,7 @@ WITHOUT = {
     "p": ("Ti", "Td", "order", "Tt", "b", "anti_windup", "N"),
     "pi": ("Td", "order", "N"),
     "ratio": ("feed_forward",),
+    "reference-governor": ("feed_forward", "order"),
     "cascade": ("feed_forward", "order"),
     "flow-cascade": ("feed_forward", "order", "inner"),
 }
@@ -208,7 +210,7 @@ WITHOUT = {
 
 INPUTS = ("sequence", "reverse", "lead", "follow")  # static fields that hold inputs, not tanks
 
-LIMITED = ("on-off", "split-range", "ratio", "nmpc")
+LIMITED = ("on-off", "split-range", "ratio", "reference-governor", "nmpc")
 """Kinds whose `low` and `high` are by default the limits of the actuator."""
 
 LENGTHS = {"level_floor": 0.01, "difference_floor": 0.01, "penalty": 1e3}

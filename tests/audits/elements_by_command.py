@@ -218,6 +218,10 @@ RIGS = {
         'kind = "override", Kc = 200.0, Ti = 200.0, bias = 37.0, limited = ["LT102"],'
         " limit = [0.35], limit_Kc = [300.0], limit_Ti = [200.0]"
     ),
+    "reference governor": controlled(
+        'kind = "reference-governor", Kc = 200.0, Ti = 200.0, bias = 37.0, horizon = 600.0,'
+        " limit = [0.6, 0.35]"
+    ),
     "split range": controlled(
         'kind = "split-range", Kc = 200.0, Ti = 200.0',
         pump=TWO["pump"].replace('"LT102"', '"LT101"'),

@@ -369,8 +369,8 @@ def refusal(case: Case) -> str:
     controller, plant = case.loop.controller, case.loop.plant
     if not isinstance(controller, PID) or not isinstance(plant, TankNetwork):
         return (
-            "is for controllers of the kinds p, pi, pid, split-range, ratio, override and cascade"
-            f" on a TankNetwork, and not for {type(controller).__name__} on"
+            "is for controllers of the kinds p, pi, pid, split-range, ratio, override, cascade and"
+            f" reference-governor on a TankNetwork, and not for {type(controller).__name__} on"
             f" {type(plant).__name__}"
         )
     if controller.order is not None:

@@ -1,8 +1,9 @@
-"""Cascade, override, ratio and feed-forward of a measured inflow, against simulations in plain
-Python whose integrals are lags of what is applied (external reset).
+"""Cascade, override, ratio, reference governor and feed-forward of a measured inflow, against
+simulations in plain Python whose integrals are lags of what is applied (external reset).
 """
 
 import math
+import re
 
 import jax
 import numpy as np
@@ -35,23 +36,36 @@ values = {{ "clock.dt" = {DT}, "clock.duration" = {DT * (SAMPLES - 1)} }}
 """
 
 
+def kind(table):
+    return table["kind"]
+
+
 def loads(text=RIG, **table):
     return rig.loads(f"{text}controller = {rig.toml(table)}")
 
 
-def simulated(control, dead=0):
+def rates(h, u, d):
+    flow = [a * np.sqrt(2 * GRAVITY * v) for a, v in zip((ORIFICE, DRAIN), h)]
+    return (GAIN * u + d - flow[0]) / UPPER, (flow[0] - flow[1]) / LOWER
+
+
+def after(h, u, d, dt):
+    """Levels after dt by the classical method of order 4."""
+    k1 = rates(h, u, d)
+    k2 = rates([v + 0.5 * dt * s for v, s in zip(h, k1)], u, d)
+    k3 = rates([v + 0.5 * dt * s for v, s in zip(h, k2)], u, d)
+    k4 = rates([v + dt * s for v, s in zip(h, k3)], u, d)
+    return tuple(v + dt / 6 * (a + 2 * b + 2 * c + e) for v, a, b, c, e in zip(h, k1, k2, k3, k4))
+
+
+def simulated(control, dead=0, pulse=PULSE):
     """(levels, inputs) of the two tanks under control(k, h, r, d, q) -> input and applied(u)."""
     h, line, q = (1.0, 1.0), [START] * (dead + 1), GAIN * START
     levels, inputs = [], []
-
-    def rates(h, u, d):
-        flow = [a * math.sqrt(2 * GRAVITY * v) for a, v in zip((ORIFICE, DRAIN), h)]
-        return (GAIN * u + d - flow[0]) / UPPER, (flow[0] - flow[1]) / LOWER
-
     for k in range(SAMPLES):
         t = k * DT
         r = 1.0 if t < 10.0 else 2.2 if t < 80.0 else 0.9
-        d = PULSE if 110.0 <= t < 130.0 else 0.0
+        d = pulse if 110.0 <= t < 130.0 else 0.0
         command, reset = control(h, r, d, q)
         u = min(max(command, 0.0), 1.0)
         reset(u)
@@ -59,11 +73,7 @@ def simulated(control, dead=0):
         inputs.append(u)
         line.append(u)
         acting = line[-1 - dead]
-        k1 = rates(h, acting, d)
-        k2 = rates([v + 0.5 * DT * s for v, s in zip(h, k1)], acting, d)
-        k3 = rates([v + 0.5 * DT * s for v, s in zip(h, k2)], acting, d)
-        k4 = rates([v + DT * s for v, s in zip(h, k3)], acting, d)
-        h = tuple(v + DT / 6 * (a + 2 * b + 2 * c + e) for v, a, b, c, e in zip(h, k1, k2, k3, k4))
+        h = after(h, acting, d, DT)
         q = GAIN * acting
     return np.array(levels), np.array(inputs)
 
@@ -102,6 +112,8 @@ CASCADE |= {"inner_Ti": 15.0, "inner_high": 4.0}
 FLOW = {"kind": "flow-cascade", "Kc": 0.1, "Ti": 80.0, "inner_Kc": 2.0, "inner_Ti": 1.5}
 OVERRIDE = {"kind": "override", "Kc": 2.0, "Ti": 40.0, "limited": ["upper"], "limit": 1.6}
 OVERRIDE |= {"limit_Kc": 3.0, "limit_Ti": 10.0}
+GOVERNOR = {"kind": "reference-governor", "Kc": 2.0, "Ti": 40.0, "limit": [2.4, math.inf]}
+GOVERNOR |= {"lowest": [0.7, -math.inf], "horizon": 60.0, "samples": 30}
 
 
 def test_a_cascade_of_levels_is_that_of_two_lags_of_what_is_applied():
@@ -150,12 +162,61 @@ def test_an_override_resets_both_integrals_by_what_is_applied(select):
     assert 20 < sum(choices) < SAMPLES - 20  # each of them is selected for a while
 
 
+def most_excess(h, lagged, r):
+    """Largest excess over 2.4 m or under 0.7 m of the first level in the responses to r (9,)."""
+    h, most, period = tuple(v + 0 * r for v in h), -np.inf + 0 * r, 60.0 / 30
+    for _ in range(30):
+        u = np.clip(lagged + 2.0 * (r - h[1]), 0.0, 1.0)
+        lagged = lagged + period / 40.0 * (u - lagged)
+        h = after(h, u, 0.0, period)
+        most = np.maximum(most, np.maximum(h[0] - 2.4, 0.7 - h[0]))
+    return most
+
+
+def allowed(h, lagged, before, r):
+    """The governed setpoint: nine shares of the way, then nine where a limit is met."""
+    shares = np.arange(9) / 8
+    for _ in range(2):
+        most = most_excess(h, lagged, before + shares * (r - before))
+        over = np.flatnonzero(most > 0.0)
+        if most[0] > 0.0:
+            return before + shares[np.argmin(most)] * (r - before)
+        if not len(over):
+            return before + shares[-1] * (r - before)
+        j = over[0] - 1
+        share = shares[j] - most[j] * (shares[j + 1] - shares[j]) / (most[j + 1] - most[j])
+        shares = shares[j] + np.arange(9) / 8 * (shares[j + 1] - shares[j])
+    return before + share * (r - before)
+
+
+def test_a_reference_governor_keeps_levels_within_limits_that_its_pid_passes():
+    steps = re.sub("inflow = .*", "", RIG)  # a pulse that cannot be predicted
+    case = loads(steps, **GOVERNOR)
+    run = jaxtank.simulate(case.loop, case.clock)
+    pi, setpoint = Reset(2.0, 40.0, START), [1.0]
+
+    def control(h, r, d, q):
+        setpoint.append(allowed(h, pi.lagged, setpoint[-1], r))
+        return pi.output(setpoint[-1] - h[1]), pi.reset
+
+    levels, inputs = simulated(control, pulse=0.0)
+    np.testing.assert_allclose(np.asarray(run.x), levels, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(np.asarray(run.applied)[:, 0], inputs, rtol=0, atol=1e-8)
+    alone = loads(steps, kind="pi", Kc=2.0, Ti=40.0)
+    without = np.asarray(jaxtank.simulate(alone.loop, alone.clock).x)
+    assert without[:, 0].max() > 2.9 and without[:, 0].min() < 0.6
+    slack = float(jaxtank.evaluate(case, ["limit_slack"])["limit_slack"])
+    assert levels[:, 0].max() < 2.4 + slack + 1e-3 and levels[:, 0].min() > 0.7 - slack - 1e-3
+    assert slack < 0.005
+    assert setpoint[-1] == pytest.approx(0.9, abs=1e-9)  # which the limits allow at last
+
+
 @pytest.mark.slow_for("flow-cascade")
-@pytest.mark.parametrize("table", [CASCADE, FLOW, OVERRIDE], ids=lambda table: table["kind"])
+@pytest.mark.parametrize("table", [CASCADE, FLOW, OVERRIDE, GOVERNOR], ids=kind)
 def test_derivatives_are_differences_of_runs_at_the_limits_too(table):
     case = loads(**table)
-    names = ["controller.Kc", "controller.Ti", next(n for n in table if n[-3:] in ("_Kc",))]
-    names[2] = f"controller.{names[2]}"
+    third = next((n for n in table if n.endswith("_Kc")), "limit")
+    names = ["controller.Kc", "controller.Ti", f"controller.{third}"]
 
     def error(values):
         loop = jaxtank.with_values(case.loop, dict(zip(names, values)))
@@ -228,7 +289,7 @@ def test_a_direct_action_is_a_negative_gain():
 RATIO = {"kind": "ratio", "Kc": 1.0, "Ti": 30.0}
 
 
-@pytest.mark.parametrize("table", [CASCADE, FLOW, OVERRIDE, RATIO], ids=lambda table: table["kind"])
+@pytest.mark.parametrize("table", [CASCADE, FLOW, OVERRIDE, RATIO, GOVERNOR], ids=kind)
 def test_a_kind_is_written_back_and_has_ranges_to_tune_in(table):
     case = loads(**table)
     assert_same_case(rig.loads(rig.dump(case)), case)
@@ -248,6 +309,9 @@ def test_a_kind_is_written_back_and_has_ranges_to_tune_in(table):
         (FLOW | {"inner": [1]}, "'inner'"),
         (OVERRIDE | {"anti_windup": "clamping"}, "clamping"),
         (OVERRIDE | {"limited": [1, 2]}, r"controller\.limited"),
+        (GOVERNOR | {"limit": math.inf, "lowest": -math.inf}, "no tank has a limit"),
+        (GOVERNOR | {"lowest": 2.5}, r"controller\.lowest"),
+        (GOVERNOR | {"feed_forward": True}, "feed_forward"),
         (RATIO | {"follow": [1]}, r"controller\.follow"),
         ({"kind": "p", "Kc": 1.0, "gap_gain": 0.5}, r"controller\.deadband"),
         ({"kind": "pid", "Kc": 1.0, "N": 5.0}, r"controller\.Td"),

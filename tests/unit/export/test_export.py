@@ -677,6 +677,7 @@ def test_a_matrix_operation_without_counterpart_is_refused(language):
 
 CASCADE = {"kind": "cascade", "Kc": 3.0, "Ti": 60.0, "inner": [1], "inner_Kc": 1.5}
 OVERRIDE = {"kind": "override", "Kc": 2.0, "Ti": 40.0, "limited": [1], "limit": 1.6}
+GOVERNOR = {"kind": "reference-governor", "Kc": 2.0, "Ti": 40.0, "limit": [2.4, math.inf]}
 
 
 @pytest.mark.slow_for("cascade")
@@ -686,6 +687,7 @@ OVERRIDE = {"kind": "override", "Kc": 2.0, "Ti": 40.0, "limited": [1], "limit": 
     [
         CASCADE | {"inner_Ti": 15.0},
         OVERRIDE | {"limit_Kc": 3.0, "limit_Ti": 10.0},
+        GOVERNOR | {"horizon": 60.0, "samples": 30},
         {"kind": "pid", "Kc": 2.0, "Ti": 30.0, "Td": 2.0, "N": 5.0, "error_span": 0.5},
     ],
     ids=lambda table: table["kind"],
