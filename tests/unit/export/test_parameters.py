@@ -92,6 +92,7 @@ TABLES = [
     {"kind": "cascade", "Kc": 3.0, "inner": [1], "inner_Kc": 1.5, "inner_Ti": 15.0},
     {"kind": "override", "Kc": 2.0, "Ti": 40.0, "limited": [1], "limit": 1.6, "limit_Kc": 3.0}
     | {"limit_Ti": 10.0},
+    {"kind": "reference-governor", "Kc": 2.0, "Ti": 30.0, "limit": [9.0, 2.0], "horizon": 60.0},
 ]
 
 
