@@ -28,7 +28,7 @@ const state = {
   broken: new Set(), // names of data.breaks
   free: new Set(entriesOf(info.free)),
 };
-const view = { from: 0, to: info.duration, at: info.duration };
+const view = { from: 0, to: info.duration, at: info.duration, cursors: { A: null, B: null } };
 const pins = []; // {name, run, words: what differs from the case}
 const unseen = new Set(); // keys of the legend that are switched off
 const framed = window !== window.parent; // in a report or a notebook
@@ -202,6 +202,7 @@ function show() {
     });
   });
   showTables();
+  showCursors();
   atTime(view.at);
   if (!offer.done) offer(current);
   if (!worker && !due) tested(current);
@@ -212,10 +213,12 @@ function onTimes(other, what, index) {
   return other.t.length === current.t.length ? values : interpolated(other.t, values, current.t);
 }
 
+const sampleAt = (time) => clamp(indexOf(current.t, time + 1e-9) - 1, 0, current.t.length - 1);
+
 function atTime(time) {
   view.at = clamp(time, 0, info.duration);
   if (!current) return;
-  const k = Math.min(Math.max(indexOf(current.t, view.at + 1e-9) - 1, 0), current.t.length - 1);
+  const k = sampleAt(view.at);
   const column = (list) => list.map((values) => values[k]);
   const h = column(current.h), r = column(current.r), u = column(current.u);
   const share = u.map((v, j) => {
@@ -235,6 +238,40 @@ function atTime(time) {
   $("now").textContent = `${shown(view.at, 5)} s`;
   $("time").value = Math.round((1000 * view.at) / info.duration);
   $("time").setAttribute("aria-valuetext", `${shown(view.at, 5)} seconds`);
+}
+
+// --- cursors: every line that is shown, read at one or two times ----------------------------------
+
+let earlier = view.cursors; // before the last click
+
+// again: by the second of two clicks, which are no cursor
+function setCursor(name, time, again = false) {
+  if (!current) return;
+  if (!again) earlier = view.cursors;
+  view.cursors = again ? earlier : { ...earlier, [name]: time === null ? null : current.t[sampleAt(time)] };
+  show();
+}
+
+function clearCursors() {
+  view.cursors = { A: null, B: null };
+  show();
+}
+
+function showCursors() {
+  const { A, B } = view.cursors, set = Object.keys(view.cursors).filter((name) => view.cursors[name] !== null);
+  const row = (head, values, digits) => ({
+    head, cells: [...values, ...(set.length > 1 ? [values[1] - values[0]] : [])].map((value) => shown(value, digits)),
+  });
+  const times = set.map((name) => view.cursors[name]);
+  const line = (head, { t }, values) => row(head, interpolated(t, values, times));
+  const lines = charts.flatMap(({ spec: { name, what, index, output, unit } }) => [
+    line(`${name} [${unit}]`, current, current[what][index]),
+    ...(what === "h" && output >= 0 && !unseen.has("setpoint") ? [line(`${name}, setpoint [${unit}]`, current, current.r[output])] : []),
+    ...pins.filter((pin) => !unseen.has(pin.name)).map((pin) => line(`${name}, ${pin.name} [${unit}]`, pin.run, pin.run[what][index])),
+  ]);
+  fill($("cursors"), "Cursors", ["", ...set, ...(set.length > 1 ? ["B − A"] : [])], set.length ? [row("time [s]", times, 6), ...lines] : []);
+  $("cursor-a").setAttribute("aria-pressed", String(A !== null));
+  $("cursor-b").setAttribute("aria-pressed", String(B !== null));
 }
 
 function zoom(from, to) {
@@ -776,6 +813,7 @@ function reset() {
   pins.length = 0;
   bands = null;
   $("plants").setAttribute("aria-pressed", String(data.band));
+  clearCursors();
   zoom(0, info.duration);
   makeLegend();
   refresh();
@@ -900,7 +938,8 @@ function makeCharts() {
     zoom(from, to);
     setTimeout(() => (drawn = false));
   };
-  const on = { cursor: atTime, zoom: once, whole: () => zoom(0, info.duration), handle: handleOf, drag: setLeaf };
+  const on = { cursor: atTime, zoom: once, whole: () => zoom(0, info.duration), handle: handleOf, drag: setLeaf,
+    mark: setCursor };
   const { length } = info.units;
   info.tanks.forEach((tank, i) => {
     const rim = rimOf(i), output = info.outputs.indexOf(i);
@@ -914,7 +953,7 @@ function makeCharts() {
         limits.push({ value, words: `limit ${shown(value)} ${length}` });
     }
     charts.push(makeChart($("panels"), {
-      kind: "level", what: "h", index: i, output, unit: length, zero: true, limits,
+      kind: "level", name: tank.name, what: "h", index: i, output, unit: length, zero: true, limits,
       get forbidden() { return rimOf(i); }, title: `${tank.name}${output >= 0 ? ", controlled" : ""} [${length}]`,
     }, view, on));
   });
@@ -924,11 +963,16 @@ function makeCharts() {
       get words() { return end === "upper" ? `at most ${shown(pumpOf(j).upper)} ${pump.unit}` : ""; },
     }));
     charts.push(makeChart($("panels"), {
-      kind: "input", what: "u", index: j, unit: pump.unit, zero: true, title: `${pump.name} [${pump.unit}]`,
+      kind: "input", name: pump.name, what: "u", index: j, unit: pump.unit, zero: true, title: `${pump.name} [${pump.unit}]`,
       limits: ends.filter(({ value }) => Number.isFinite(value) && Math.abs(value) < 100 * (1 + Math.abs(info.pumps[j].typical ?? 1))),
     }, view, on));
   });
   $("panels").dataset.count = charts.length;
+  // beside the charts, which do not move when it appears; where they fill the width below them
+  const narrow = matchMedia("(max-width: 700px)");
+  const place = () => (narrow.matches ? $("runs").append($("cursors")) : $("side").prepend($("cursors")));
+  narrow.addEventListener("change", place);
+  place();
   new ResizeObserver(() => {
     charts.forEach((chart) => chart.size());
     show();
@@ -990,6 +1034,9 @@ function listen() {
   });
   $("time").addEventListener("input", () => moveCursor((Number($("time").value) / 1000) * info.duration));
   $("play").addEventListener("click", () => play($("play").getAttribute("aria-pressed") !== "true"));
+  for (const name of ["A", "B"]) $(`cursor-${name.toLowerCase()}`).addEventListener("click", () =>
+    setCursor(name, view.cursors[name] === null ? view.at : null));
+  document.addEventListener("keydown", ({ key, target }) => key === "Escape" && target !== $("search") && clearCursors());
   $("closer").addEventListener("click", () => {
     const half = (view.to - view.from) / 4;
     zoom(view.at - half, view.at + half);

@@ -1,18 +1,32 @@
 """What a hand does on the live page: drags, keys of the legend, pins and missions."""
 
+import numpy as np
 import pytest
 from browser import chromium, opened
 
+import jaxtank
 from jaxtank import presets
+from jaxtank.core.tree import with_values
 from jaxtank.live.engine import facts_of
 from jaxtank.live.page import page
 
 
 @pytest.fixture(scope="module")
-def live(tmp_path_factory):
+def browser():
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
     path = tmp_path_factory.mktemp("live") / "page.html"
     path.write_text(page(presets.find("cascaded/pi")), encoding="utf-8")
-    with chromium() as browser, opened(browser, path) as page_open:
+    return path
+
+
+@pytest.fixture(scope="module")
+def live(browser, written):
+    with opened(browser, written) as page_open:
         yield page_open
 
 
@@ -71,6 +85,88 @@ def test_pins_say_what_differs_are_read_at_the_cursor_and_hidden_by_their_key(li
     live.page.locator("button.key.pin0").click()
     assert " ".join(name) not in live.text(".panel .reading")
     assert live.page.locator("button.key.pin0").get_attribute("aria-pressed") == "false"
+
+
+def at_cursors(live):
+    """{row of the table of cursors: its numbers}."""
+    rows = live("[...document.querySelectorAll('#cursors tbody tr')].map((row) => "
+                "[...row.cells].map((cell) => cell.textContent))")  # fmt: skip
+    return {head: [float(number) for number in numbers] for head, *numbers in rows}
+
+
+def of_library(times, values=()):
+    """What the table of cursors must hold, by a simulation of the library."""
+    case = presets.find("cascaded/pi")
+    run = jaxtank.simulate(with_values(case.loop, dict(values)), case.clock)
+    k = np.searchsorted(np.asarray(run.t), np.asarray(times) - 1e-6)
+    columns = [run.x[k, 0], run.x[k, 1], run.r[k, 0], run.u[k, 0]]
+    return [[*map(float, column), float(column[1] - column[0])] for column in columns]
+
+
+def test_two_cursors_read_every_line_that_is_shown_and_their_difference(live):
+    live.page.click("#reset")
+    chart = live.page.locator(".u-over").nth(1).bounding_box()
+    width, y = chart["width"], chart["y"] + chart["height"] / 2
+    live.page.mouse.click(chart["x"] + 0.3 * width, y)
+    assert list(at_cursors(live)) == ["time [s]", "tank 1 [V]", "tank 2 [V]",
+                                      "tank 2, setpoint [V]", "pump 1 [V]"]  # fmt: skip
+    live.page.keyboard.down("Shift")
+    live.page.mouse.click(chart["x"] + 0.75 * width, y)
+    live.page.keyboard.up("Shift")
+    read = at_cursors(live)
+    first, second, between = read.pop("time [s]")
+    np.testing.assert_allclose([first, second, between], [840, 2100, 1260], atol=8.0)
+    np.testing.assert_allclose(list(read.values()), of_library([first, second]), rtol=6e-4)
+    assert live("jaxtank.state().shown") == [0, 2800], "a click is no zoom"
+    # of the run that is shown, with the pin beside it, and without what the legend hides
+    live.page.click("#pin")
+    box = live.page.locator("input[type=number][aria-label^='controller.Kc[0]']")
+    box.fill("0.5")
+    live.page.wait_for_timeout(400)
+    now = at_cursors(live)
+    pinned = [now.pop(head) for head in list(now) if ", run" in head]
+    wanted = of_library([first, second], {"controller.Kc": [0.5]})
+    np.testing.assert_allclose([*now.values()][1:], wanted, rtol=6e-4)
+    np.testing.assert_allclose(pinned, np.delete(list(read.values()), 2, axis=0), rtol=1e-9)
+    live.page.locator("button.key.setpoint").click()
+    live.page.locator("button.key.pin0").click()
+    assert [head for head in at_cursors(live) if "," in head] == []
+    live.page.locator("button.key.setpoint").click()
+    # two clicks show the whole run and set no cursor; Escape takes both away
+    live.page.mouse.dblclick(chart["x"] + 0.5 * width, y)
+    assert at_cursors(live)["time [s]"] == [first, second, between]
+    live.page.keyboard.press("Escape")
+    assert at_cursors(live) == {}
+
+
+def test_cursors_are_set_by_keyboard_and_by_a_finger_on_a_narrow_page(browser, written):
+    options = {"viewport": {"width": 390, "height": 850}, "has_touch": True}
+    with opened(browser, written, **options) as live:
+        for key, button in (("Home", "a"), ("End", "b")):
+            live.page.focus("#time")
+            live.page.keyboard.press(key)
+            live.page.focus(f"#cursor-{button}")
+            live.page.keyboard.press("Enter")
+        assert at_cursors(live)["time [s]"] == [0.0, 2800.0, 2800.0]
+        assert live("document.documentElement.scrollWidth") <= 390
+        live.page.focus("#cursor-a")
+        live.page.keyboard.press("Enter")
+        assert at_cursors(live)["time [s]"] == [2800.0]
+        chart = live.page.locator(".u-over").first.bounding_box()
+        where = {"x": chart["x"] + 0.25 * chart["width"], "y": chart["y"] + 40}
+        session = live.page.context.new_cdp_session(live.page)
+        touch = lambda kind, points: session.send(
+            "Input.dispatchTouchEvent", {"type": kind, "touchPoints": points}
+        )
+        touch("touchStart", [where])
+        live.page.wait_for_timeout(700)
+        touch("touchEnd", [])
+        np.testing.assert_allclose(at_cursors(live)["time [s]"], [700.0], rtol=0.02)
+        live.page.wait_for_timeout(600)  # else it is the second of two
+        live.page.touchscreen.tap(where["x"] - 20, where["y"])
+        live.page.wait_for_timeout(100)
+        first, second, _ = at_cursors(live)["time [s]"]
+        assert first < second - 50
 
 
 def test_the_mission_of_a_fault_ends_with_the_button_of_that_fault(live):
