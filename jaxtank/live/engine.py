@@ -275,19 +275,26 @@ NOUNS = {
     "actuator.low": "lower limit",
     "actuator.stop": "stopping input",
     "controller.du_limit": "largest change",
+    "controller.held": "constant input",
     "controller.high": "upper limit",
     "controller.low": "lower limit",
+    "controller.signal.initial": "input",
+    "controller.signal.level": "input",
     "controller.u_high": "upper limit",
     "controller.u_low": "lower limit",
     "plant.drain": "outlet",
     "plant.orifice": "outlet",
     "plant.pump_gain": "gain",
+    "plant.valve": "area",
     "reference.initial": "setpoint",
     "sensor.gain": "sensor gain",
     "sensor.noise": "noise",
     "x0": "starting level",
 }
 """What a person reads for a field; of the others its name."""
+
+INPUTS = ("controller.held", "controller.signal.initial", "controller.signal.level")
+"""Fields with an entry for each input: their sliders have its range."""
 
 WIDE = {"controller": (0.2, 5.0), "observer": (0.2, 5.0), "plant": (0.5, 1.5), "pumps": (0.5, 1.5)}
 """{group: ends of a slider as multiples of a value that has no bounds}; (0, 2) of the others."""
@@ -571,6 +578,11 @@ def words_of(loop: Any, name: str, index: tuple[int, ...]) -> str:
         return f"{noun} of {place_of(plant, 'output', i)}{start}"
     if kind in ("tank", "output", "pump", "feed") and not others:
         return f"{noun} of {place_of(plant, 'pump' if kind == 'feed' else kind, i)}"
+    if name in INPUTS and not others:
+        start = " at first" * bool(getattr(getattr(loop.controller, "signal", 0), "changes", ()))
+        return f"{noun} of {label_of(plant, 'pump', i)}{start}"
+    if kind == "valve" and not others:
+        return f"{noun} of {label_of(plant, 'pump', len(plant.feeds) + i)}"
     ends = {"orifice": ("links", "of {} into {}"), "pipe": ("pipes", "between {} and {}")}
     if kind in ends:
         pairs, place = ends[kind]
@@ -587,7 +599,10 @@ def _ends(case, name, full, value, meta, group):
             return min(low, value), max(high, value)
     rim = np.asarray(case.loop.plant.rim, dtype=float)
     height = float(np.max(rim[np.isfinite(rim)], initial=0.0)) or 1.0
-    if name == "sensor.noise":
+    actuator, entry = case.loop.actuator, full.removeprefix(f"{name}[").removesuffix("]")
+    if name in INPUTS and entry.isdigit() and np.isfinite(actuator.high[int(entry)]):
+        low, high = float(actuator.low[int(entry)]), float(actuator.high[int(entry)])
+    elif name == "sensor.noise":
         low, high = 0.0, max(NOISE * height, 2.0 * value)
     elif group in ("reference", "initial") and meta["unit"] == case.loop.units[0]:
         low, high = 0.0, max(height, value)

@@ -233,7 +233,7 @@ function atTime(time) {
     const target = what === "h" && output >= 0 ? `, setpoint ${shown(r[output])}` : "";
     const others = pins.filter((pin) => !unseen.has(pin.name))
       .map((pin) => `, ${pin.name} ${shown(onTimes(pin.run, what, index)[k])}`).join("");
-    read(`${shown((what === "h" ? h : u)[index])} ${unit}${target}${others}`);
+    read(`${shown((what === "h" ? h : u)[index])}${unit === "-" ? "" : ` ${unit}`}${target}${others}`);
   });
   $("now").textContent = `${shown(view.at, 5)} s`;
   $("time").value = Math.round((1000 * view.at) / info.duration);
@@ -265,9 +265,9 @@ function showCursors() {
   const times = set.map((name) => view.cursors[name]);
   const line = (head, { t }, values) => row(head, interpolated(t, values, times));
   const lines = charts.flatMap(({ spec: { name, what, index, output, unit } }) => [
-    line(`${name} [${unit}]`, current, current[what][index]),
-    ...(what === "h" && output >= 0 && !unseen.has("setpoint") ? [line(`${name}, setpoint [${unit}]`, current, current.r[output])] : []),
-    ...pins.filter((pin) => !unseen.has(pin.name)).map((pin) => line(`${name}, ${pin.name} [${unit}]`, pin.run, pin.run[what][index])),
+    line(bracketed(name, unit), current, current[what][index]),
+    ...(what === "h" && output >= 0 && !unseen.has("setpoint") ? [line(bracketed(`${name}, setpoint`, unit), current, current.r[output])] : []),
+    ...pins.filter((pin) => !unseen.has(pin.name)).map((pin) => line(bracketed(`${name}, ${pin.name}`, unit), pin.run, pin.run[what][index])),
   ]);
   fill($("cursors"), "Cursors", ["", ...set, ...(set.length > 1 ? ["B − A"] : [])], set.length ? [row("time [s]", times, 6), ...lines] : []);
   $("cursor-a").setAttribute("aria-pressed", String(A !== null));
@@ -286,6 +286,8 @@ const cells = (value) =>
   (typeof value === "number" || value === null || value === undefined ? [value] : Array.from(value))
     .map((v) => shown(v)).join(", ");
 
+const bracketed = (name, unit) => (unit && unit !== "-" ? `${name} [${unit}]` : name);
+
 function showTables() {
   const margins = marginsOf(limitsNow(), current.measures), { sentence, good } = verdict(current);
   $("verdict").textContent = sentence;
@@ -299,7 +301,7 @@ function showTables() {
     bad: margin < 0,
   })));
   const rows = info.measures.filter((m) => current.measures[m.name] !== undefined).map((m) => ({
-    head: `${m.name}${m.unit && m.unit !== "-" ? ` [${m.unit}]` : ""}`,
+    head: bracketed(m.name, m.unit),
     title: m.doc,
     cells: [cells(current.measures[m.name]), ...(pinned ? [cells(pinned.run.measures[m.name])] : [])],
   }));
@@ -963,7 +965,7 @@ function makeCharts() {
       get words() { return end === "upper" ? `at most ${shown(pumpOf(j).upper)} ${pump.unit}` : ""; },
     }));
     charts.push(makeChart($("panels"), {
-      kind: "input", name: pump.name, what: "u", index: j, unit: pump.unit, zero: true, title: `${pump.name} [${pump.unit}]`,
+      kind: "input", name: pump.name, what: "u", index: j, unit: pump.unit, zero: true, title: bracketed(pump.name, pump.unit),
       limits: ends.filter(({ value }) => Number.isFinite(value) && Math.abs(value) < 100 * (1 + Math.abs(info.pumps[j].typical ?? 1))),
     }, view, on));
   });
@@ -1084,10 +1086,11 @@ function start() {
   document.title = `${info.case}: live`;
   $("foot").textContent = `jaxtank ${data.version}: ${info.samples} samples of ${shown(info.dt)} s. Charts by uPlot (MIT).`;
   $("link").hidden = framed;
+  $("tune").hidden = $("nominal").hidden = !info.free.length;
   $("plants").textContent = `${data.plants} plant${data.plants > 1 ? "s" : ""}`;
   $("plants").setAttribute("aria-pressed", String(data.band));
   if (!info.filter.present) $("filter-row").hidden = true;
-  const movable = (name) => byName.has(name) && { value: () => inForce(name), set: (value) => setLeaf(name, value), leaf: byName.get(name) };
+  const movable = (name) => byName.has(name) && { value: () => valueOf(name), set: (value) => setLeaf(name, value), leaf: byName.get(name) };
   if (data.rig) rig = makeRig($("rig"), data.rig, info, movable);
   else $("rig").parentNode.hidden = true;
   makeSliders();

@@ -5,10 +5,34 @@ import pytest
 from browser import chromium, opened
 
 import jaxtank
-from jaxtank import presets
-from jaxtank.core.tree import with_values
+from jaxtank import presets, rig
+from jaxtank.core.tree import get_value, with_values
 from jaxtank.live.engine import facts_of
 from jaxtank.live.page import page
+
+VALVES = """
+units = ["cm", "V"]
+tank = [
+    { name = "T1", area = 100.0, rim = 30.0, level = 8.0 },
+    { name = "T2", area = 100.0, rim = 30.0, level = 6.0, drain = 0.1 },
+    { name = "T3", area = 60.0, rim = 20.0, level = 5.0, drain = 0.3 },
+]
+pipe = [{ between = ["T1", "T2"], area = 0.6 }]
+orifice = [{ from = "T2", to = "T3", area = 0.2 }]
+valve = [
+    { name = "HV1", from = "T1", area = 0.5, initial = 0.5 },
+    { name = "FV2", from = "T2", area = 0.5, initial = 0.5 },
+]
+pump = [{ name = "P1", to = "T1", gain = 10.0, high = 12.0, initial = 8.0 }]
+plant = { outputs = ["T1", "T2"] }
+CONTROLLER
+values = { "clock.dt" = 0.5, "clock.duration" = 400.0 }
+"""
+LOOP = """
+reference = { initial = [8.0, 6.0], changes = [[60.0, 1, 9.0]] }
+controller = { kind = "pid", Kc = [1.6, -0.1], Ti = 60.0, lead = ["P1", "FV2"] }
+"""
+BY_HAND = 'controller = { kind = "open-loop", initial = [11.0, 0.3, 0.2] }'
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +95,53 @@ def test_a_setpoint_is_dragged_in_its_chart_and_a_rim_in_both_pictures(live):
     drag(live, grip["x"] + grip["width"] / 2, grip["y"] + grip["height"] / 2, 15)
     (name, value), *others = live("Object.entries(jaxtank.state().values)")
     assert name == "plant.rim[0]" and value > before[name] and not others
+
+
+def openings(live):
+    """{valve: opening in %} of the drawing."""
+    words = live.page.locator("#rig text.small").all_text_contents()
+    return {word.split()[0]: float(word.split()[1]) for word in words if word.endswith("%")}
+
+
+@pytest.mark.parametrize(("control", "by_hand"), [(LOOP, {"HV1"}), (BY_HAND, {"HV1", "FV2"})])
+def test_outlets_pipes_and_valves_of_a_custom_rig_are_dragged(browser, tmp_path, control, by_hand):
+    """A valve that a controller moves shows its opening at the cursor and is no handle."""
+    case = rig.loads(VALVES.replace("CONTROLLER", control))
+    path = tmp_path / "page.html"
+    path.write_text(page(case), encoding="utf-8")
+    with opened(browser, path) as live:
+        _, *valves = map(float, 100 * jaxtank.simulate(case.loop, case.clock).u[-1])
+        assert openings(live) == pytest.approx(dict(zip(["HV1", "FV2"], valves)), rel=6e-3)
+        handles = live.page.locator("#rig polyline.handle")
+        names = [title.removesuffix(": drag up or down") for title in handles.all_text_contents()]
+        fixed = {"pipe between T1 and T2", "outlet of T2 into T3", "outlet of T2", "outlet of T3"}
+        assert fixed < set(names) and len(names) == 4 + len(by_hand)
+        moved = {name for name in ("HV1", "FV2") if any(n.endswith(name) for n in names)}
+        assert moved == by_hand and live.page.is_visible("#tune") == (control is LOOP)
+        for handle, name in enumerate(names):
+            where = live(
+                "(k) => { const line = document.querySelectorAll('#rig polyline.handle')[k];"
+                "const { x, y } = line.getPointAtLength(line.getTotalLength() * 0.9);"
+                "const at = new DOMPoint(x, y).matrixTransform(line.getScreenCTM());"
+                "return [at.x, at.y]; }",
+                handle,
+            )
+            live.page.click("#reset")
+            drag(live, *where, 8)
+            ((leaf, value),) = live("Object.entries(jaxtank.state().values)")
+            box = live.page.locator(f"input[type=number][aria-label^='{leaf}']")
+            before = float(np.asarray(get_value(case.loop, leaf)))
+            assert value > before and float(box.input_value()) == pytest.approx(value), name
+            label = live.page.locator(f".row[data-leaf='{leaf}'] label").first.text_content()
+            assert label.startswith(name)
+            run = jaxtank.simulate(with_values(case.loop, {leaf: value}), case.clock)
+            live.page.wait_for_timeout(200)
+            levels = live.page.locator("#rig .value").all_text_contents()
+            np.testing.assert_allclose([float(text.split()[0]) for text in levels], run.x[-1],
+                                       rtol=6e-3)  # fmt: skip
+            head, low, high = "highest level of T2", *np.sort(run.x[:, 1])[[0, -1]]
+            row = live.page.locator("#margins tr", has_text=head).inner_text()
+            assert float(row.split()[-2]) == pytest.approx(high, rel=1e-3) and low < high
 
 
 def test_pins_say_what_differs_are_read_at_the_cursor_and_hidden_by_their_key(live):
