@@ -61,12 +61,20 @@ const pumpOf = (j) => ({
 
 const limitsNow = () => limitsIn(info, inForce);
 
-// engine.run, as this page prints its measures
+// engine.run, as this page prints its measures; of: what it is the run of
 function runOf({ values, options: own }) {
-  const found = engine.run(values, own);
-  if (!own.filter) delete found.measures.filter_active_fraction;
-  return found;
+  return printed(engine.run(values, own), values, own);
 }
+
+function printed(found, values, own) {
+  if (!own.filter) delete found.measures.filter_active_fraction;
+  return Object.assign(found, { values, of: keyOf(values, own) });
+}
+
+const keyOf = (values, { seed, filter }) => JSON.stringify([values, seed, filter]);
+
+// the value of a leaf in a run, which sliders may have left
+const within = ({ values }) => (name, otherwise) => values[name] ?? byName.get(name)?.value ?? otherwise;
 
 const request = (values, every) => ({ values, options: { ...options(), every } });
 
@@ -88,10 +96,9 @@ const SLOW = 1000; // a run that takes longer waits for the button [ms]
 let asked = false, resting = 0, due = false, slow = false, done = 0;
 
 const runner = makeRunner(newWorker, runOf, {
-  done(found, { options: own }, milliseconds) {
+  done(found, { values, options: own }, milliseconds) {
     took = milliseconds;
-    if (!own.filter) delete found.measures.filter_active_fraction;
-    current = found;
+    current = printed(found, values, own);
     due = runner.busy;
     slow = (done += 1) > 1 && milliseconds > SLOW; // the first is compiled while it runs
     $("run").textContent = `Run (${shown(milliseconds / 1000, 2)} s)`;
@@ -106,7 +113,7 @@ const runner = makeRunner(newWorker, runOf, {
     });
   },
   failed(text) {
-    due = runner.busy;
+    due = true; // the picture is of other values
     mark();
     impossible(text);
     rest();
@@ -118,7 +125,7 @@ function mark() {
   $("run").hidden = !slow;
   $("run").disabled = runner.busy;
   $("slow-note").hidden = !slow;
-  $("panels").classList.toggle("stale", slow && due);
+  for (const id of ["verdict", "cursors", "panels", "margins", "measures"]) $(id).classList.toggle("stale", due);
 }
 
 function touch(every = data.drawn, pressed = false) {
@@ -145,7 +152,7 @@ function rest() {
 function settle() {
   if (runner.busy) return;
   const rows = ((view.to - view.from) / info.dt) / data.drawn;
-  if (rows < 400 && data.drawn > 1 && current && current.t.length < info.samples && !slow) touch(1);
+  if (rows < 400 && !due && data.drawn > 1 && current && current.t.length < info.samples && !slow) touch(1);
   if (!framed) history.replaceState(null, "", linkOf(linked(), leaves));
   describe();
   if (!folded.isConnected) fold();
@@ -289,9 +296,9 @@ const cells = (value) =>
 const bracketed = (name, unit) => (unit && unit !== "-" ? `${name} [${unit}]` : name);
 
 function showTables() {
-  const margins = marginsOf(limitsNow(), current.measures), { sentence, good } = verdict(current);
+  const margins = marginsOf(limitsIn(info, within(current)), current.measures), { sentence, good } = verdict(current);
   $("verdict").textContent = sentence;
-  $("verdict").className = good ? "good" : "bad";
+  $("verdict").className = `${good ? "good" : "bad"}${due ? " stale" : ""}`;
   if (!good) reveal(margins[0]);
   const pinned = pins[pins.length - 1];
   fill($("margins"), "Limits", ["", "value", "margin"], margins.map(({ limit, value, margin }) => ({
@@ -319,8 +326,8 @@ function reveal(tightest) {
   $("panels").scrollLeft = named.figure.offsetLeft - $("panels").offsetLeft;
 }
 
-// the verdict on a run, with its plants where they were simulated
-const verdict = (found) => verdictOf(info, inForce, found, bands);
+// the verdict on a run, with the plants about it where they were simulated
+const verdict = (found) => verdictOf(info, within(found), found, found.of === keyOf(effective(), options()) ? bands : null);
 
 // a name that may be broken after each "_"
 const broken = (text) => text.split(/(?<=_)/).flatMap((part, i) => (i ? [make("wbr"), part] : [part]));
@@ -673,12 +680,15 @@ function tuneNow(plants = null) {
         noteFilter();
       }
       apply(found);
-      current = run() ?? current; // not one of other values beside these plants
+      runner.drop(); // of other values than these plants
+      current = run() ?? current;
       if (varied) {
         bands = { ...found.plants, words: keptWords(found.plants) };
         $("plants").setAttribute("aria-pressed", "true");
         makeLegend();
       }
+      due = false;
+      show();
       touch(data.drawn, true);
       const holds = (varied && info.limits.length ? `; limits hold on ${kept} of ${count} other plants` : "") +
         (varied && found.plants.astray ? `; ${astrayWords(found.plants)}` : "");

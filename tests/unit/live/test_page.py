@@ -402,6 +402,24 @@ def test_tune_is_on_plants_and_judged_on_others(browser, written):
         assert "keep every limit" not in live.text("#legend")  # of other values
 
 
+@pytest.mark.parametrize("plants", [None, 1])
+def test_no_verdict_of_another_run_stands_beside_the_answer_of_a_search(browser, written, plants):
+    with opened(browser, written) as live:
+        live("""() => {
+            const verdict = document.querySelector("#verdict"), told = (window.told = []);
+            const note = () => document.querySelector("#message").textContent.startsWith("Tuned") &&
+                told.push(verdict.textContent);
+            new MutationObserver(note).observe(document.body,
+                { subtree: true, childList: true, characterData: true });
+        }""")
+        before = live.text("#verdict")
+        live("(plants) => jaxtank.tune({ plants })", plants)
+        live.page.wait_for_timeout(700)
+        told, last = live("told"), live.text("#verdict")
+        assert told and set(told) == {last} and last != before
+        assert last == live("jaxtank.verdict().sentence")
+
+
 @pytest.mark.slow
 def test_sliders_do_not_wait_for_a_run_and_a_pin_is_of_the_sliders(browser, written):
     with opened(browser, written) as live:

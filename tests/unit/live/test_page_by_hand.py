@@ -26,7 +26,7 @@ valve = [
 pump = [{ name = "P1", to = "T1", gain = 10.0, high = 12.0, initial = 8.0 }]
 plant = { outputs = ["T1", "T2"] }
 CONTROLLER
-values = { "clock.dt" = 0.5, "clock.duration" = 400.0 }
+values = { "clock.dt" = 0.5, "clock.duration" = 400.0, "clock.substeps" = 2 }
 """
 LOOP = """
 reference = { initial = [8.0, 6.0], changes = [[60.0, 1, 9.0]] }
