@@ -16,7 +16,7 @@ from jaxtank import measures as ms
 from jaxtank.bounds import bounds
 from jaxtank.case import Case, Free
 from jaxtank.controllers import OnOff, OpenLoop
-from jaxtank.core.labels import input_unit, label_of, place_of
+from jaxtank.core.labels import input_unit, label_of, place_of, symbol
 from jaxtank.core.tree import describe, get_value, parameters
 from jaxtank.export.statements import (
     TRUTH,
@@ -444,6 +444,14 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         "samples": clock.samples,
         "save_every_default": max(1, clock.samples // ROWS),
         "tanks": _tanks(plant),
+        "columns": {
+            kind: [symbol(plant, "", kind, i) for i in range(count)]
+            for kind, count in (
+                ("tank", plant.tanks),
+                ("output", len(plant.outputs)),
+                ("pump", plant.pumps),
+            )
+        },
         "outputs": [int(i) for i in plant.outputs],
         "pumps": [
             {
@@ -545,6 +553,9 @@ def leaf_of(case: Case, name: str, index: tuple[int, ...]) -> dict[str, Any]:
     """Return the slider of one number of a loop, as a JSON object."""
     full = _name(name, index)
     meta = describe(case.loop, full)
+    unit, drive = meta["unit"], case.loop.units[1]
+    if index and meta.get("shape") == ("pump",) and unit == drive:  # or that of a valve's opening
+        unit = input_unit(case.loop.plant, index[0], drive)
     value = float(np.asarray(get_value(case.loop, full)))
     part = name.split(".")[0]
     group = "model" if ".model." in name else GROUPS.get(part, part)
@@ -553,7 +564,7 @@ def leaf_of(case: Case, name: str, index: tuple[int, ...]) -> dict[str, Any]:
     return {
         "name": full,
         "label": words_of(case.loop, name, index),
-        "unit": meta["unit"],
+        "unit": unit,
         "doc": meta["doc"],
         "value": value if finite else None,
         "infinite": INFINITE.get(value),

@@ -767,12 +767,15 @@ function download(name, blob) {
   setTimeout(() => URL.revokeObjectURL(url), 1000);
 }
 
-// the charts as one picture, two in a row, their titles above them
+// the charts as one picture, two in a row, their titles above them, below all the keys of the lines
 function png() {
   const all = charts.map(({ figure, spec }) => ({ canvas: figure.querySelector("canvas"), title: spec.title }));
   const scale = devicePixelRatio, head = 22 * scale, across = all.length > 2 ? 2 : 1;
   const width = Math.max(...all.map(({ canvas }) => canvas.width)), height = head + Math.max(...all.map(({ canvas }) => canvas.height));
-  const whole = make("canvas", { width: across * width, height: Math.ceil(all.length / across) * height });
+  const keys = [["this run", "--run"], ["setpoint", "--setpoint"], ...pins.map((pin, i) => [`${pin.name}: ${pin.words}`, `--pin${i}`, pin.name])]
+    .filter(([name, , own = name]) => !unseen.has(own));
+  const below = Math.ceil(all.length / across) * height;
+  const whole = make("canvas", { width: across * width, height: below + head * keys.length });
   const ctx = whole.getContext("2d");
   ctx.fillStyle = colour("--back");
   ctx.fillRect(0, 0, whole.width, whole.height);
@@ -783,6 +786,10 @@ function png() {
     ctx.fillText(title, x + 8 * scale, y + 15 * scale);
     ctx.drawImage(canvas, x, y + head);
   });
+  keys.forEach(([words, name], i) => {
+    ctx.fillStyle = colour(name);
+    ctx.fillText(`— ${words}`, 8 * scale, below + 15 * scale + i * head);
+  });
   whole.toBlob((blob) => download(`${fileName}.png`, blob), "image/png");
 }
 
@@ -790,7 +797,7 @@ const fileName = info.case.replace(/[^\w-]+/g, "-");
 
 const csv = () => {
   const found = run(effective(), data.every);
-  return found && csvOf(found, info.units);
+  return found && csvOf(found, info);
 };
 
 // the command that repeats the run: all that differs from the preset or the file

@@ -9,6 +9,7 @@ from jaxtank import presets, rig
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.live.engine import facts_of
 from jaxtank.live.page import page
+from jaxtank.loop.trajectory import csv
 
 VALVES = """
 units = ["cm", "V"]
@@ -238,6 +239,38 @@ def test_cursors_are_set_by_keyboard_and_by_a_finger_on_a_narrow_page(browser, w
         live.page.wait_for_timeout(100)
         first, second, _ = at_cursors(live)["time [s]"]
         assert first < second - 50
+
+
+def test_files_of_a_custom_rig_have_its_names_and_its_keys_and_titles_stay(browser, tmp_path):
+    text = VALVES.replace("CONTROLLER", LOOP).replace('"T1"', '"north buffer tank LT101"')
+    case = rig.loads(text)
+    path = tmp_path / "page.html"
+    path.write_text(page(case), encoding="utf-8")
+    with opened(browser, path, accept_downloads=True) as live:
+        run = jaxtank.simulate(case.loop, case.clock)
+        wanted = csv(run, case.loop.units, case.loop.plant).splitlines()[0]
+        assert live("jaxtank.csv()").splitlines()[0] == wanted
+        assert (
+            live("makeEngine().info.leaves.find((one) => one.name === 'controller.held[1]').unit")
+            == "-"
+        )
+        heights = []
+        for _ in range(2):
+            with live.page.expect_download() as got:
+                live.page.click("#png")
+            heights.append(int.from_bytes(got.value.path().read_bytes()[20:24], "big"))
+            for _ in range(3):
+                live.page.click("#pin")
+        assert heights[1] - heights[0] == 3 * 22  # a key for each pin
+        widths = "[...document.querySelectorAll('.panel .name')].map((one) => one.clientWidth)"
+        assert min(live(widths)) > 20, "a title gives way to readings"
+        live.page.focus("#cursor-a")
+        live.page.keyboard.press("Enter")
+        live.page.emulate_media(media="print")
+        assert live("document.querySelector('#cursors').scrollHeight") == live(
+            "document.querySelector('#cursors').clientHeight"
+        )
+        assert not live.page.get_by_label("remove run 1").is_visible()
 
 
 def test_the_mission_of_a_fault_ends_with_the_button_of_that_fault(live):
