@@ -584,22 +584,28 @@ def words_of(loop: Any, name: str, index: tuple[int, ...]) -> str:
     if name == "reference.targets" and hasattr(loop.reference, "changes"):
         time, channel = loop.reference.changes[i]
         return f"setpoint of {place_of(plant, 'output', channel)} from {time:.5g} s"
+    where = _place(loop, name, kind if not others or kind == "channel" else "", i)
+    return f"{noun} {where}" if where else f"{noun} {', '.join(str(k + 1) for k in index)}"
+
+
+def _place(loop, name, kind, i):
+    """Where entry `i` of a field belongs: "of LT102", "between LT101 and LT102"; "" for nowhere."""
+    plant = loop.plant
+    if name in INPUTS:
+        start = " at first" * bool(getattr(getattr(loop.controller, "signal", 0), "changes", ()))
+        return f"of {label_of(plant, 'pump', i)}{start}"
     if kind == "channel" and name.startswith("reference."):
         start = " at first" * (name == "reference.initial")
-        return f"{noun} of {place_of(plant, 'output', i)}{start}"
-    if kind in ("tank", "output", "pump", "feed") and not others:
-        return f"{noun} of {place_of(plant, 'pump' if kind == 'feed' else kind, i)}"
-    if name in INPUTS and not others:
-        start = " at first" * bool(getattr(getattr(loop.controller, "signal", 0), "changes", ()))
-        return f"{noun} of {label_of(plant, 'pump', i)}{start}"
-    if kind == "valve" and not others:
-        return f"{noun} of {label_of(plant, 'pump', len(plant.feeds) + i)}"
+        return f"of {place_of(plant, 'output', i)}{start}"
+    if kind in ("tank", "output", "pump", "feed"):
+        return f"of {place_of(plant, 'pump' if kind == 'feed' else kind, i)}"
+    if kind == "valve":
+        return f"of {label_of(plant, 'pump', len(plant.feeds) + i)}"
     ends = {"orifice": ("links", "of {} into {}"), "pipe": ("pipes", "between {} and {}")}
-    if kind in ends:
-        pairs, place = ends[kind]
-        tanks = (label_of(plant, "tank", k) for k in getattr(plant, pairs)[i])
-        return f"{noun} {place.format(*tanks)}"
-    return f"{noun} {', '.join(str(k + 1) for k in index)}"
+    if kind not in ends:
+        return ""
+    pairs, place = ends[kind]
+    return place.format(*(label_of(plant, "tank", k) for k in getattr(plant, pairs)[i]))
 
 
 def _ends(case, name, full, value, meta, group):
