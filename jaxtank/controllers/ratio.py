@@ -80,6 +80,12 @@ class Ratio(PID):
     def _followers(self) -> list[int]:
         return [j for j in range(self.model.pumps) if j not in self.lead]
 
+    @property
+    def by_hand(self) -> list[int]:
+        """Inputs that stay as `held` has them."""
+        followers = self._followers()
+        return followers[len(self.follow) + len(self.follow_inflow) :]
+
     def shared(self, v: Any, inflow: Any = ()) -> tuple[Any, ...]:
         """Return the inputs (m,) of PID outputs v (outputs,) and measured inflows (n,), if any."""
         held: Any = self.held

@@ -11,9 +11,9 @@ function colour(name) {
   return colours.get(name);
 }
 
-// One panel. spec: {title, name, unit, limits: [{value, words}], forbidden: above it, zero}
+// One panel. view: {from, to, cursors: {A, B}}; spec: {title, name, unit, limits: [{value, words}], forbidden: above it, zero}
 // on: {cursor(time), zoom(from, to), whole(), handle(spec, time, near) -> {name} or null: what is dragged,
-// drag(name, value)}; series: band low, band high, pins, setpoint, run
+// drag(name, value), mark(cursor, time, again)}; series: band low, band high, pins, setpoint, run
 function makeChart(host, spec, view, on) {
   const title = make("span", { class: "name" }, spec.title);
   const reading = make("span", { class: "reading" });
@@ -61,7 +61,7 @@ function makeChart(host, spec, view, on) {
       },
       hooks: {
         drawClear: [(u) => forbidden(u, spec)],
-        draw: [(u) => marks(u, spec)],
+        draw: [(u) => marks(u, spec), (u) => cursorLines(u, view)],
         setCursor: [(u) => u.cursor.event && u.cursor.left >= 0 && on.cursor(u.posToVal(u.cursor.left, "x"))],
         setSelect: [
           (u) => {
@@ -92,6 +92,32 @@ function makeChart(host, spec, view, on) {
   });
   for (const end of ["pointerup", "pointercancel"]) plot.over.addEventListener(end, () => (held = null));
   box.addEventListener("mousedown", (event) => held && event.stopPropagation(), true); // not a zoom
+  // a click sets cursor A; with shift, or by a long press of a finger, B
+  let press = null, waiting = 0;
+  const timeOf = (event) => plot.posToVal(event.clientX - plot.over.getBoundingClientRect().left, "x");
+  const letGo = () => {
+    press = null;
+    clearTimeout(waiting);
+  };
+  plot.over.addEventListener("pointerdown", (event) => {
+    letGo();
+    if (event.button !== 0) return;
+    press = event;
+    if (event.pointerType === "touch" && !held) waiting = setTimeout(() => {
+      letGo();
+      on.mark("B", timeOf(event), false);
+    }, LONG_PRESS);
+  });
+  plot.over.addEventListener("pointermove", (event) => {
+    const least = event.pointerType === "touch" ? 12 : 4; // pixels of a drag
+    if (press && Math.hypot(event.clientX - press.clientX, event.clientY - press.clientY) > least) letGo();
+  });
+  plot.over.addEventListener("pointercancel", letGo);
+  plot.over.addEventListener("contextmenu", (event) => event.pointerType === "touch" && event.preventDefault());
+  box.addEventListener("click", (event) => { // before uPlot, which takes a press on a line for a drag
+    if (press) on.mark(event.shiftKey ? "B" : "A", timeOf(event), event.detail > 1);
+    letGo();
+  }, true);
   const show = (k, yes) => plot.series[k].show !== yes && plot.setSeries(k, { show: yes }, false);
   return {
     spec,
@@ -138,6 +164,7 @@ function makeChart(host, spec, view, on) {
   };
 }
 
+const LONG_PRESS = 500; // milliseconds
 const FONT = "11px system-ui, sans-serif";
 
 // the range of the vertical axis: all values, the limits that come near, and zero for levels
@@ -161,6 +188,24 @@ function forbidden(u, spec) {
   if (y <= bbox.top) return;
   ctx.fillStyle = colour("--beyond");
   ctx.fillRect(bbox.left, bbox.top, bbox.width, y - bbox.top);
+}
+
+function cursorLines(u, { cursors }) {
+  const { ctx, bbox } = u;
+  ctx.save();
+  ctx.strokeStyle = ctx.fillStyle = colour("--text");
+  ctx.lineWidth = devicePixelRatio;
+  ctx.font = `bold ${11 * devicePixelRatio}px system-ui, sans-serif`;
+  for (const [name, time] of Object.entries(cursors)) {
+    const x = time === null ? -1 : u.valToPos(time, "x", true);
+    if (x < bbox.left || x > bbox.left + bbox.width) continue;
+    ctx.beginPath();
+    ctx.moveTo(x, bbox.top);
+    ctx.lineTo(x, bbox.top + bbox.height);
+    ctx.stroke();
+    ctx.fillText(name, x + 3 * devicePixelRatio, bbox.top + 10 * devicePixelRatio);
+  }
+  ctx.restore();
 }
 
 function marks(u, spec) {

@@ -150,15 +150,15 @@ function tomlOf(text, leaves, values, filter) {
 }
 
 // a run as CSV, with the columns of trajectory.csv that the engine has
-function csvOf(run, units) {
+function csvOf(run, { units, pumps, columns: known }) {
   const columns = [["t [s]", run.t]];
-  const add = (name, unit, list) =>
-    (list || []).forEach((values, i) => columns.push([`${name}${i + 1} [${unit}]`, values]));
+  const add = (name, unit, list, kind = "tank") =>
+    (list || []).forEach((values, i) => columns.push([`${name}${known[kind][i]} [${kind === "pump" ? pumps[i].unit : unit}]`, values]));
   add("h", units.length, run.h);
   add("y", units.length, run.y);
-  add("r", units.length, run.r);
-  add("u", units.drive, run.u);
-  add("command", units.drive, run.command);
+  add("r", units.length, run.r, "output");
+  add("u", units.drive, run.u, "pump");
+  add("command", units.drive, run.command, "pump");
   add("spilled", units.length === "-" ? "-" : `${units.length}^3`, run.spilled);
   if (run.d_hat && run.d_hat.some((d) => d.some((v) => v !== 0)))
     add("d_hat", `${units.length}/s`, run.d_hat);

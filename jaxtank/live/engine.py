@@ -16,7 +16,7 @@ from jaxtank import measures as ms
 from jaxtank.bounds import bounds
 from jaxtank.case import Case, Free
 from jaxtank.controllers import OnOff, OpenLoop
-from jaxtank.core.labels import input_unit, label_of, place_of
+from jaxtank.core.labels import input_unit, label_of, place_of, symbol
 from jaxtank.core.tree import describe, get_value, parameters
 from jaxtank.export.statements import (
     TRUTH,
@@ -275,19 +275,26 @@ NOUNS = {
     "actuator.low": "lower limit",
     "actuator.stop": "stopping input",
     "controller.du_limit": "largest change",
+    "controller.held": "constant input",
     "controller.high": "upper limit",
     "controller.low": "lower limit",
+    "controller.signal.initial": "input",
+    "controller.signal.level": "input",
     "controller.u_high": "upper limit",
     "controller.u_low": "lower limit",
     "plant.drain": "outlet",
     "plant.orifice": "outlet",
     "plant.pump_gain": "gain",
+    "plant.valve": "area",
     "reference.initial": "setpoint",
     "sensor.gain": "sensor gain",
     "sensor.noise": "noise",
     "x0": "starting level",
 }
 """What a person reads for a field; of the others its name."""
+
+INPUTS = ("controller.held", "controller.signal.initial", "controller.signal.level")
+"""Fields with an entry for each input: their sliders have its range."""
 
 WIDE = {"controller": (0.2, 5.0), "observer": (0.2, 5.0), "plant": (0.5, 1.5), "pumps": (0.5, 1.5)}
 """{group: ends of a slider as multiples of a value that has no bounds}; (0, 2) of the others."""
@@ -437,6 +444,14 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         "samples": clock.samples,
         "save_every_default": max(1, clock.samples // ROWS),
         "tanks": _tanks(plant),
+        "columns": {
+            kind: [symbol(plant, "", kind, i) for i in range(count)]
+            for kind, count in (
+                ("tank", plant.tanks),
+                ("output", len(plant.outputs)),
+                ("pump", plant.pumps),
+            )
+        },
         "outputs": [int(i) for i in plant.outputs],
         "pumps": [
             {
@@ -538,6 +553,9 @@ def leaf_of(case: Case, name: str, index: tuple[int, ...]) -> dict[str, Any]:
     """Return the slider of one number of a loop, as a JSON object."""
     full = _name(name, index)
     meta = describe(case.loop, full)
+    unit, drive = meta["unit"], case.loop.units[1]
+    if index and meta.get("shape") == ("pump",) and unit == drive:  # or that of a valve's opening
+        unit = input_unit(case.loop.plant, index[0], drive)
     value = float(np.asarray(get_value(case.loop, full)))
     part = name.split(".")[0]
     group = "model" if ".model." in name else GROUPS.get(part, part)
@@ -546,7 +564,7 @@ def leaf_of(case: Case, name: str, index: tuple[int, ...]) -> dict[str, Any]:
     return {
         "name": full,
         "label": words_of(case.loop, name, index),
-        "unit": meta["unit"],
+        "unit": unit,
         "doc": meta["doc"],
         "value": value if finite else None,
         "infinite": INFINITE.get(value),
@@ -566,17 +584,28 @@ def words_of(loop: Any, name: str, index: tuple[int, ...]) -> str:
     if name == "reference.targets" and hasattr(loop.reference, "changes"):
         time, channel = loop.reference.changes[i]
         return f"setpoint of {place_of(plant, 'output', channel)} from {time:.5g} s"
+    where = _place(loop, name, kind if not others or kind == "channel" else "", i)
+    return f"{noun} {where}" if where else f"{noun} {', '.join(str(k + 1) for k in index)}"
+
+
+def _place(loop, name, kind, i):
+    """Where entry `i` of a field belongs: "of LT102", "between LT101 and LT102"; "" for nowhere."""
+    plant = loop.plant
+    if name in INPUTS:
+        start = " at first" * bool(getattr(getattr(loop.controller, "signal", 0), "changes", ()))
+        return f"of {label_of(plant, 'pump', i)}{start}"
     if kind == "channel" and name.startswith("reference."):
         start = " at first" * (name == "reference.initial")
-        return f"{noun} of {place_of(plant, 'output', i)}{start}"
-    if kind in ("tank", "output", "pump", "feed") and not others:
-        return f"{noun} of {place_of(plant, 'pump' if kind == 'feed' else kind, i)}"
+        return f"of {place_of(plant, 'output', i)}{start}"
+    if kind in ("tank", "output", "pump", "feed"):
+        return f"of {place_of(plant, 'pump' if kind == 'feed' else kind, i)}"
+    if kind == "valve":
+        return f"of {label_of(plant, 'pump', len(plant.feeds) + i)}"
     ends = {"orifice": ("links", "of {} into {}"), "pipe": ("pipes", "between {} and {}")}
-    if kind in ends:
-        pairs, place = ends[kind]
-        tanks = (label_of(plant, "tank", k) for k in getattr(plant, pairs)[i])
-        return f"{noun} {place.format(*tanks)}"
-    return f"{noun} {', '.join(str(k + 1) for k in index)}"
+    if kind not in ends:
+        return ""
+    pairs, place = ends[kind]
+    return place.format(*(label_of(plant, "tank", k) for k in getattr(plant, pairs)[i]))
 
 
 def _ends(case, name, full, value, meta, group):
@@ -587,7 +616,10 @@ def _ends(case, name, full, value, meta, group):
             return min(low, value), max(high, value)
     rim = np.asarray(case.loop.plant.rim, dtype=float)
     height = float(np.max(rim[np.isfinite(rim)], initial=0.0)) or 1.0
-    if name == "sensor.noise":
+    actuator, entry = case.loop.actuator, full.removeprefix(f"{name}[").removesuffix("]")
+    if name in INPUTS and entry.isdigit() and np.isfinite(actuator.high[int(entry)]):
+        low, high = float(actuator.low[int(entry)]), float(actuator.high[int(entry)])
+    elif name == "sensor.noise":
         low, high = 0.0, max(NOISE * height, 2.0 * value)
     elif group in ("reference", "initial") and meta["unit"] == case.loop.units[0]:
         low, high = 0.0, max(height, value)

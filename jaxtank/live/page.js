@@ -28,7 +28,7 @@ const state = {
   broken: new Set(), // names of data.breaks
   free: new Set(entriesOf(info.free)),
 };
-const view = { from: 0, to: info.duration, at: info.duration };
+const view = { from: 0, to: info.duration, at: info.duration, cursors: { A: null, B: null } };
 const pins = []; // {name, run, words: what differs from the case}
 const unseen = new Set(); // keys of the legend that are switched off
 const framed = window !== window.parent; // in a report or a notebook
@@ -61,12 +61,20 @@ const pumpOf = (j) => ({
 
 const limitsNow = () => limitsIn(info, inForce);
 
-// engine.run, as this page prints its measures
+// engine.run, as this page prints its measures; of: what it is the run of
 function runOf({ values, options: own }) {
-  const found = engine.run(values, own);
-  if (!own.filter) delete found.measures.filter_active_fraction;
-  return found;
+  return printed(engine.run(values, own), values, own);
 }
+
+function printed(found, values, own) {
+  if (!own.filter) delete found.measures.filter_active_fraction;
+  return Object.assign(found, { values, of: keyOf(values, own) });
+}
+
+const keyOf = (values, { seed, filter }) => JSON.stringify([values, seed, filter]);
+
+// the value of a leaf in a run, which sliders may have left
+const within = ({ values }) => (name, otherwise) => values[name] ?? byName.get(name)?.value ?? otherwise;
 
 const request = (values, every) => ({ values, options: { ...options(), every } });
 
@@ -88,10 +96,9 @@ const SLOW = 1000; // a run that takes longer waits for the button [ms]
 let asked = false, resting = 0, due = false, slow = false, done = 0;
 
 const runner = makeRunner(newWorker, runOf, {
-  done(found, { options: own }, milliseconds) {
+  done(found, { values, options: own }, milliseconds) {
     took = milliseconds;
-    if (!own.filter) delete found.measures.filter_active_fraction;
-    current = found;
+    current = printed(found, values, own);
     due = runner.busy;
     slow = (done += 1) > 1 && milliseconds > SLOW; // the first is compiled while it runs
     $("run").textContent = `Run (${shown(milliseconds / 1000, 2)} s)`;
@@ -106,7 +113,7 @@ const runner = makeRunner(newWorker, runOf, {
     });
   },
   failed(text) {
-    due = runner.busy;
+    due = true; // the picture is of other values
     mark();
     impossible(text);
     rest();
@@ -118,7 +125,7 @@ function mark() {
   $("run").hidden = !slow;
   $("run").disabled = runner.busy;
   $("slow-note").hidden = !slow;
-  $("panels").classList.toggle("stale", slow && due);
+  for (const id of ["verdict", "cursors", "panels", "margins", "measures"]) $(id).classList.toggle("stale", due);
 }
 
 function touch(every = data.drawn, pressed = false) {
@@ -145,7 +152,7 @@ function rest() {
 function settle() {
   if (runner.busy) return;
   const rows = ((view.to - view.from) / info.dt) / data.drawn;
-  if (rows < 400 && data.drawn > 1 && current && current.t.length < info.samples && !slow) touch(1);
+  if (rows < 400 && !due && data.drawn > 1 && current && current.t.length < info.samples && !slow) touch(1);
   if (!framed) history.replaceState(null, "", linkOf(linked(), leaves));
   describe();
   if (!folded.isConnected) fold();
@@ -202,6 +209,7 @@ function show() {
     });
   });
   showTables();
+  showCursors();
   atTime(view.at);
   if (!offer.done) offer(current);
   if (!worker && !due) tested(current);
@@ -212,10 +220,12 @@ function onTimes(other, what, index) {
   return other.t.length === current.t.length ? values : interpolated(other.t, values, current.t);
 }
 
+const sampleAt = (time) => clamp(indexOf(current.t, time + 1e-9) - 1, 0, current.t.length - 1);
+
 function atTime(time) {
   view.at = clamp(time, 0, info.duration);
   if (!current) return;
-  const k = Math.min(Math.max(indexOf(current.t, view.at + 1e-9) - 1, 0), current.t.length - 1);
+  const k = sampleAt(view.at);
   const column = (list) => list.map((values) => values[k]);
   const h = column(current.h), r = column(current.r), u = column(current.u);
   const share = u.map((v, j) => {
@@ -230,11 +240,45 @@ function atTime(time) {
     const target = what === "h" && output >= 0 ? `, setpoint ${shown(r[output])}` : "";
     const others = pins.filter((pin) => !unseen.has(pin.name))
       .map((pin) => `, ${pin.name} ${shown(onTimes(pin.run, what, index)[k])}`).join("");
-    read(`${shown((what === "h" ? h : u)[index])} ${unit}${target}${others}`);
+    read(`${shown((what === "h" ? h : u)[index])}${unit === "-" ? "" : ` ${unit}`}${target}${others}`);
   });
   $("now").textContent = `${shown(view.at, 5)} s`;
   $("time").value = Math.round((1000 * view.at) / info.duration);
   $("time").setAttribute("aria-valuetext", `${shown(view.at, 5)} seconds`);
+}
+
+// --- cursors: every line that is shown, read at one or two times ----------------------------------
+
+let earlier = view.cursors; // before the last click
+
+// again: by the second of two clicks, which are no cursor
+function setCursor(name, time, again = false) {
+  if (!current) return;
+  if (!again) earlier = view.cursors;
+  view.cursors = again ? earlier : { ...earlier, [name]: time === null ? null : current.t[sampleAt(time)] };
+  show();
+}
+
+function clearCursors() {
+  view.cursors = { A: null, B: null };
+  show();
+}
+
+function showCursors() {
+  const { A, B } = view.cursors, set = Object.keys(view.cursors).filter((name) => view.cursors[name] !== null);
+  const row = (head, values, digits) => ({
+    head, cells: [...values, ...(set.length > 1 ? [values[1] - values[0]] : [])].map((value) => shown(value, digits)),
+  });
+  const times = set.map((name) => view.cursors[name]);
+  const line = (head, { t }, values) => row(head, interpolated(t, values, times));
+  const lines = charts.flatMap(({ spec: { name, what, index, output, unit } }) => [
+    line(bracketed(name, unit), current, current[what][index]),
+    ...(what === "h" && output >= 0 && !unseen.has("setpoint") ? [line(bracketed(`${name}, setpoint`, unit), current, current.r[output])] : []),
+    ...pins.filter((pin) => !unseen.has(pin.name)).map((pin) => line(bracketed(`${name}, ${pin.name}`, unit), pin.run, pin.run[what][index])),
+  ]);
+  fill($("cursors"), "Cursors", ["", ...set, ...(set.length > 1 ? ["B − A"] : [])], set.length ? [row("time [s]", times, 6), ...lines] : []);
+  $("cursor-a").setAttribute("aria-pressed", String(A !== null));
+  $("cursor-b").setAttribute("aria-pressed", String(B !== null));
 }
 
 function zoom(from, to) {
@@ -249,10 +293,12 @@ const cells = (value) =>
   (typeof value === "number" || value === null || value === undefined ? [value] : Array.from(value))
     .map((v) => shown(v)).join(", ");
 
+const bracketed = (name, unit) => (unit && unit !== "-" ? `${name} [${unit}]` : name);
+
 function showTables() {
-  const margins = marginsOf(limitsNow(), current.measures), { sentence, good } = verdict(current);
+  const margins = marginsOf(limitsIn(info, within(current)), current.measures), { sentence, good } = verdict(current);
   $("verdict").textContent = sentence;
-  $("verdict").className = good ? "good" : "bad";
+  $("verdict").className = `${good ? "good" : "bad"}${due ? " stale" : ""}`;
   if (!good) reveal(margins[0]);
   const pinned = pins[pins.length - 1];
   fill($("margins"), "Limits", ["", "value", "margin"], margins.map(({ limit, value, margin }) => ({
@@ -262,7 +308,7 @@ function showTables() {
     bad: margin < 0,
   })));
   const rows = info.measures.filter((m) => current.measures[m.name] !== undefined).map((m) => ({
-    head: `${m.name}${m.unit && m.unit !== "-" ? ` [${m.unit}]` : ""}`,
+    head: bracketed(m.name, m.unit),
     title: m.doc,
     cells: [cells(current.measures[m.name]), ...(pinned ? [cells(pinned.run.measures[m.name])] : [])],
   }));
@@ -280,8 +326,8 @@ function reveal(tightest) {
   $("panels").scrollLeft = named.figure.offsetLeft - $("panels").offsetLeft;
 }
 
-// the verdict on a run, with its plants where they were simulated
-const verdict = (found) => verdictOf(info, inForce, found, bands);
+// the verdict on a run, with the plants about it where they were simulated
+const verdict = (found) => verdictOf(info, within(found), found, found.of === keyOf(effective(), options()) ? bands : null);
 
 // a name that may be broken after each "_"
 const broken = (text) => text.split(/(?<=_)/).flatMap((part, i) => (i ? [make("wbr"), part] : [part]));
@@ -634,12 +680,15 @@ function tuneNow(plants = null) {
         noteFilter();
       }
       apply(found);
-      current = run() ?? current; // not one of other values beside these plants
+      runner.drop(); // of other values than these plants
+      current = run() ?? current;
       if (varied) {
         bands = { ...found.plants, words: keptWords(found.plants) };
         $("plants").setAttribute("aria-pressed", "true");
         makeLegend();
       }
+      due = false;
+      show();
       touch(data.drawn, true);
       const holds = (varied && info.limits.length ? `; limits hold on ${kept} of ${count} other plants` : "") +
         (varied && found.plants.astray ? `; ${astrayWords(found.plants)}` : "");
@@ -718,12 +767,15 @@ function download(name, blob) {
   setTimeout(() => URL.revokeObjectURL(url), 1000);
 }
 
-// the charts as one picture, two in a row, their titles above them
+// the charts as one picture, two in a row, their titles above them, below all the keys of the lines
 function png() {
   const all = charts.map(({ figure, spec }) => ({ canvas: figure.querySelector("canvas"), title: spec.title }));
   const scale = devicePixelRatio, head = 22 * scale, across = all.length > 2 ? 2 : 1;
   const width = Math.max(...all.map(({ canvas }) => canvas.width)), height = head + Math.max(...all.map(({ canvas }) => canvas.height));
-  const whole = make("canvas", { width: across * width, height: Math.ceil(all.length / across) * height });
+  const keys = [["this run", "--run"], ["setpoint", "--setpoint"], ...pins.map((pin, i) => [`${pin.name}: ${pin.words}`, `--pin${i}`, pin.name])]
+    .filter(([name, , own = name]) => !unseen.has(own));
+  const below = Math.ceil(all.length / across) * height;
+  const whole = make("canvas", { width: across * width, height: below + head * keys.length });
   const ctx = whole.getContext("2d");
   ctx.fillStyle = colour("--back");
   ctx.fillRect(0, 0, whole.width, whole.height);
@@ -734,6 +786,10 @@ function png() {
     ctx.fillText(title, x + 8 * scale, y + 15 * scale);
     ctx.drawImage(canvas, x, y + head);
   });
+  keys.forEach(([words, name], i) => {
+    ctx.fillStyle = colour(name);
+    ctx.fillText(`— ${words}`, 8 * scale, below + 15 * scale + i * head);
+  });
   whole.toBlob((blob) => download(`${fileName}.png`, blob), "image/png");
 }
 
@@ -741,7 +797,7 @@ const fileName = info.case.replace(/[^\w-]+/g, "-");
 
 const csv = () => {
   const found = run(effective(), data.every);
-  return found && csvOf(found, info.units);
+  return found && csvOf(found, info);
 };
 
 // the command that repeats the run: all that differs from the preset or the file
@@ -776,6 +832,7 @@ function reset() {
   pins.length = 0;
   bands = null;
   $("plants").setAttribute("aria-pressed", String(data.band));
+  clearCursors();
   zoom(0, info.duration);
   makeLegend();
   refresh();
@@ -900,7 +957,8 @@ function makeCharts() {
     zoom(from, to);
     setTimeout(() => (drawn = false));
   };
-  const on = { cursor: atTime, zoom: once, whole: () => zoom(0, info.duration), handle: handleOf, drag: setLeaf };
+  const on = { cursor: atTime, zoom: once, whole: () => zoom(0, info.duration), handle: handleOf, drag: setLeaf,
+    mark: setCursor };
   const { length } = info.units;
   info.tanks.forEach((tank, i) => {
     const rim = rimOf(i), output = info.outputs.indexOf(i);
@@ -914,7 +972,7 @@ function makeCharts() {
         limits.push({ value, words: `limit ${shown(value)} ${length}` });
     }
     charts.push(makeChart($("panels"), {
-      kind: "level", what: "h", index: i, output, unit: length, zero: true, limits,
+      kind: "level", name: tank.name, what: "h", index: i, output, unit: length, zero: true, limits,
       get forbidden() { return rimOf(i); }, title: `${tank.name}${output >= 0 ? ", controlled" : ""} [${length}]`,
     }, view, on));
   });
@@ -924,11 +982,16 @@ function makeCharts() {
       get words() { return end === "upper" ? `at most ${shown(pumpOf(j).upper)} ${pump.unit}` : ""; },
     }));
     charts.push(makeChart($("panels"), {
-      kind: "input", what: "u", index: j, unit: pump.unit, zero: true, title: `${pump.name} [${pump.unit}]`,
+      kind: "input", name: pump.name, what: "u", index: j, unit: pump.unit, zero: true, title: bracketed(pump.name, pump.unit),
       limits: ends.filter(({ value }) => Number.isFinite(value) && Math.abs(value) < 100 * (1 + Math.abs(info.pumps[j].typical ?? 1))),
     }, view, on));
   });
   $("panels").dataset.count = charts.length;
+  // beside the charts, which do not move when it appears; where they fill the width below them
+  const narrow = matchMedia("(max-width: 700px)");
+  const place = () => (narrow.matches ? $("runs").append($("cursors")) : $("side").prepend($("cursors")));
+  narrow.addEventListener("change", place);
+  place();
   new ResizeObserver(() => {
     charts.forEach((chart) => chart.size());
     show();
@@ -990,6 +1053,9 @@ function listen() {
   });
   $("time").addEventListener("input", () => moveCursor((Number($("time").value) / 1000) * info.duration));
   $("play").addEventListener("click", () => play($("play").getAttribute("aria-pressed") !== "true"));
+  for (const name of ["A", "B"]) $(`cursor-${name.toLowerCase()}`).addEventListener("click", () =>
+    setCursor(name, view.cursors[name] === null ? view.at : null));
+  document.addEventListener("keydown", ({ key, target }) => key === "Escape" && target !== $("search") && clearCursors());
   $("closer").addEventListener("click", () => {
     const half = (view.to - view.from) / 4;
     zoom(view.at - half, view.at + half);
@@ -1037,10 +1103,11 @@ function start() {
   document.title = `${info.case}: live`;
   $("foot").textContent = `jaxtank ${data.version}: ${info.samples} samples of ${shown(info.dt)} s. Charts by uPlot (MIT).`;
   $("link").hidden = framed;
+  $("tune").hidden = $("nominal").hidden = !info.free.length;
   $("plants").textContent = `${data.plants} plant${data.plants > 1 ? "s" : ""}`;
   $("plants").setAttribute("aria-pressed", String(data.band));
   if (!info.filter.present) $("filter-row").hidden = true;
-  const movable = (name) => byName.has(name) && { value: () => inForce(name), set: (value) => setLeaf(name, value), leaf: byName.get(name) };
+  const movable = (name) => byName.has(name) && { value: () => valueOf(name), set: (value) => setLeaf(name, value), leaf: byName.get(name) };
   if (data.rig) rig = makeRig($("rig"), data.rig, info, movable);
   else $("rig").parentNode.hidden = true;
   makeSliders();

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtank import presets, rig
 from jaxtank.bounds import bounds, free_of
 from jaxtank.case import uncertain_shares
+from jaxtank.controllers import OpenLoop
 from jaxtank.core import VERSION
 from jaxtank.core.checks import check_whole
 from jaxtank.core.clock import CLOCK_UNITS
@@ -120,7 +121,7 @@ def both(case):
 
 HERE = Path(__file__).parent
 SCRIPTS = ("charts", "rig", "runner", "page")
-LARGEST = 117_000
+LARGEST = 120_000
 """Characters of a page above which the safety filter that a case has not is left out."""
 
 DIGITS = str.maketrans("&<>`", ",.:[")
@@ -141,7 +142,8 @@ def page(case, presets=(), source=None, plants=None):
     """Return the live page of a case as the text of an HTML file; `plants` plants shown at once."""
     check_pointwise(case)
     case = case.replace(free=dict(free_of(case)))
-    bounds(case.loop, case.free)
+    if case.free:  # a loop without feedback has nothing to tune
+        bounds(case.loop, case.free)
     off, on, filtered = both(case)
     data = data_of(case, presets, source, plants)
     try:
@@ -199,7 +201,7 @@ def data_of(case, presets=(), source=None, plants=None):
         "every": stride(case.clock.samples),
         "drawn": stride(case.clock.samples, 6000),
         "toml": toml,
-        "rig": drawing(case.loop.plant),
+        "rig": drawing(case.loop),
         "scenarios": len(case.scenarios or ()),
         "presets": [
             {"name": name, "values": entries(case.loop, values), "filter": on, "text": name}
@@ -336,8 +338,21 @@ def _loader():
     return "\n".join([*parts, "})();"])
 
 
-def drawing(plant):
+def _by_hand(loop):
+    """{input: name of the number that alone sets it}, of those that no controller moves."""
+    if isinstance(loop.controller, OpenLoop):
+        signal = loop.controller.signal
+        name = (
+            "controller.signal.level" if hasattr(signal, "level") else "controller.signal.initial"
+        )
+        moved = {channel for _, channel in getattr(signal, "changes", ())}
+        return {j: f"{name}[{j}]" for j in range(loop.plant.pumps) if j not in moved}
+    return {j: f"controller.held[{j}]" for j in getattr(loop.controller, "by_hand", ())}
+
+
+def drawing(loop):
     """Return the positions of all parts of a rig, in heights of its tallest tank."""
+    plant, hand = loop.plant, _by_hand(loop)
     if not hasattr(plant, "links"):
         return None
     where = place(plant)
@@ -345,9 +360,12 @@ def drawing(plant):
         "boxes": [_rounded(box) for box in where.boxes],
         "pumps": [_rounded(p) for p in where.pumps],
         "risers": [[pump, tank, _path(path)] for pump, tank, path in where.risers],
-        "pipes": [_rounded(p) for p in pipes(plant, where)],
+        "pipes": [[*_rounded(ends), name] for *ends, name in pipes(plant, where)],
         "suctions": [[pump, tank, _path(path)] for pump, tank, path in where.suctions],
-        "valves": [[tank, _path(path), _rounded(at)] for tank, path, at in valves(plant, where)],
+        "valves": [
+            [_path(path), _rounded(at), hand.get(len(plant.feeds) + k)]
+            for k, (_, path, at) in enumerate(valves(plant, where))
+        ],
         "shapes": [shape_name(plant, i) for i in range(plant.tanks)],
         "jets": [[tank, _path(path), name] for tank, path, name in jets(plant, where)],
         "overflows": [[tank, _path(path)] for tank, path in overflows(plant, where)],

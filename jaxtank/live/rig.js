@@ -29,17 +29,17 @@ function makeRig(svg, rig, info, movable) {
     [right - 0.06, -0.82]], "glass");
   const risers = rig.risers.map(([pump, , path]) => [pump, line(path, `riser pump${pump % 4}`)]);
   rig.suctions.forEach(([pump, , path]) => line(path, `riser suction pump${pump % 4}`));
-  const valves = rig.valves.map(([, path, [x, y]], k) => {
+  const valves = rig.valves.map(([path, [x, y], name], k) => {
     const across = path[0][1] === path[1][1] && path[0][1] === y;
     const node = line(path, "jet");
     const wings = [-1, 1].map((s) => across ? [[x, y], [x + s * 0.1, y + 0.07], [x + s * 0.1, y - 0.07]]
       : [[x, y], [x + 0.07, y + s * 0.1], [x - 0.07, y + s * 0.1]]);
     wings.forEach((wing) => add("polygon", { points: points(wing), class: "valve" }));
-    add("text", { x: X(x) + (across ? 0 : 12), y: Y(y) - (across ? 12 : -4), class: "halo small",
-      "text-anchor": across ? "middle" : "start" }, info.pumps[rig.pumps.length + k].name);
-    return [rig.pumps.length + k, node];
+    const words = add("text", { x: X(x) + (across ? 0 : 12), y: Y(y) - (across ? 12 : -4), class: "halo small",
+      "text-anchor": across ? "middle" : "start" });
+    return { j: rig.pumps.length + k, node, words, x, y, name };
   });
-  const jets = rig.jets.map(([tank, path]) => [tank, line(path, "jet")]);
+  const jets = rig.jets.map(([tank, path, name]) => ({ tank, node: line(path, "jet"), name }));
   const spills = rig.overflows.map(([tank, path]) => [tank, line(path, "spill")]);
   const tanks = rig.boxes.map(([x, y, width, height, scale], i) => {
     const place = { x: X(x), width: width * UNIT };
@@ -47,10 +47,8 @@ function makeRig(svg, rig, info, movable) {
     const water = add("rect", { class: "water", ...place, y: Y(y), height: 0 });
     return { x, y, width, height, scale, inside, water, controlled: info.outputs.includes(i) };
   });
-  rig.pipes.forEach(([x0, x1, y]) => {
-    line([[x0, y], [x1, y]], "pipe");
-    line([[x0, y], [x1, y]], "pipe inner");
-  });
+  const pipes = rig.pipes.map(([x0, x1, y, name]) =>
+    ({ name, nodes: ["pipe", "pipe inner"].map((kind) => line([[x0, y], [x1, y]], kind)) }));
   tanks.forEach((tank, i) => {
     const { x, y, width, height } = tank;
     const wall = [[x, y + height], [x, y], [x + width, y], [x + width, y + height]];
@@ -68,7 +66,7 @@ function makeRig(svg, rig, info, movable) {
       class: `rotor pump${j % 4}` });
     add("text", { x: X(x), y: Y(y) - 22, "text-anchor": "middle", class: "halo small" }, `${j + 1}`);
   });
-  // a rim or an outlet follows a pointer: moved(start value, pixels of the drawing upwards) is its next value
+  // a rim, an outlet, a pipe or a valve follows a pointer: moved(start value, pixels of the drawing upwards) is its next value
   function handle(node, name, moved) {
     const one = movable(name);
     if (!one) return;
@@ -93,7 +91,18 @@ function makeRig(svg, rig, info, movable) {
     const name = movable(`plant.rim[${i}]`) ? `plant.rim[${i}]` : "plant.rim";
     handle(grip, name, (value, up) => value + up / UNIT / tank.scale);
   });
-  rig.jets.forEach(([, path, name]) => handle(add("polyline", { points: points(path), class: "grip", fill: "none" }), name, opened));
+  const grip = (path) => add("polyline", { points: points(path), class: "grip", fill: "none" });
+  rig.jets.forEach(([, path, name]) => handle(grip(path), name, opened));
+  rig.pipes.forEach(([x0, x1, y, name]) => handle(grip([[x0, y], [x1, y]]), name, opened));
+  valves.forEach(({ j, x, y, name }) => {
+    const { lower, upper } = info.pumps[j];
+    handle(grip([[x, y + 0.1], [x, y - 0.1]]), name, (value, up) => clamp(value + (up / UNIT) * (upper - lower), lower, upper));
+  });
+  // as wide as its slider says, beside what it is in the case
+  const widen = (node, name, width) => {
+    const one = movable(name);
+    if (one) node.style.strokeWidth = `${width * clamp(Math.sqrt(one.value() / one.leaf.value), 0.3, 3)}px`;
+  };
   return {
     update(now) {
       tanks.forEach((tank, i) => {
@@ -119,8 +128,17 @@ function makeRig(svg, rig, info, movable) {
         tank.mark.setAttribute("points", points(arrow));
       });
       risers.forEach(([pump, node]) => node.setAttribute("stroke-opacity", 0.25 + 0.75 * now.share[pump]));
-      valves.forEach(([j, node]) => node.setAttribute("stroke-opacity", 0.2 + 0.8 * clamp(now.share[j], 0, 1)));
-      jets.forEach(([tank, node]) => {
+      valves.forEach(({ j, node, words }) => {
+        const { name, unit } = info.pumps[j];
+        node.setAttribute("stroke-opacity", 0.2 + 0.8 * clamp(now.share[j], 0, 1));
+        words.textContent = `${name} ${shown(unit === "%" ? now.u[j] : 100 * now.u[j], 3)} %`;
+      });
+      pipes.forEach(({ nodes: [outer, inner], name }) => {
+        widen(outer, name, 14);
+        widen(inner, name, 8);
+      });
+      jets.forEach(({ tank, node, name }) => {
+        widen(node, name, 2.5);
         const part = now.h[tank] / now.rims[tank] || 0;
         node.setAttribute("stroke-opacity", clamp(0.15 + Math.sqrt(Math.max(part, 0)), 0, 1));
       });

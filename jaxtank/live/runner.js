@@ -3,7 +3,7 @@
 // make(): a new worker of worker.js; alone(request): the same run without one, where there is none
 // on: {done(run, request, milliseconds), failed(text)}
 function makeRunner(make, alone, on) {
-  let worker = null, busy = null, next = null;
+  let worker = null, busy = null, next = null, old = null;
 
   function here(request) {
     const start = performance.now();
@@ -18,6 +18,7 @@ function makeRunner(make, alone, on) {
     const request = busy;
     busy = null;
     if (next) send(next); // before the answer is drawn, so that both are done at the same time
+    if (request === old) return;
     if (answer.kind === "run") on.done(answer.run, request, answer.milliseconds);
     else on.failed(answer.text);
   }
@@ -48,6 +49,7 @@ function makeRunner(make, alone, on) {
       if (busy) next = request;
       else send(request);
     },
+    drop() { old = busy; }, // the run that is under way is not shown
     get busy() { return busy !== null; },
   };
 }

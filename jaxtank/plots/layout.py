@@ -91,12 +91,13 @@ def jets(plant, where):
 
 
 def pipes(plant, where):
-    """Return [(left end, right end, height)] of the pipes that are open, below the surface."""
+    """Return [(left end, right end, height, name of its area)] of the pipes that are open."""
     lines = []
-    for pair, area in zip(plant.pipes, np.asarray(plant.pipe, dtype=float)):
+    for k, (pair, area) in enumerate(zip(plant.pipes, np.asarray(plant.pipe, dtype=float))):
         if area > 0:
             west, east = sorted((where.boxes[tank] for tank in pair), key=lambda b: b.x)
-            lines.append((west.x + west.width, east.x, max(west.y, east.y) + 0.08))
+            height = max(west.y, east.y) + 0.08  # below the surface
+            lines.append((west.x + west.width, east.x, height, f"plant.pipe[{k}]"))
     return lines
 
 
@@ -109,7 +110,7 @@ def valves(plant, where):
         side = box.x + box.width
         if sink is None:
             x, y = side + 0.24 + 0.14 * order, box.y + 0.05 + 0.1 * order
-            lines.append((source, ((side, y), (x, y), (x, -0.93)), (x, min(y - 0.17, -0.12))))
+            lines.append((source, ((side, y), (x, y), (x, -0.93)), (x, y - 0.17)))
             continue
         other = where.boxes[sink]
         if box.y == other.y:

@@ -35,7 +35,7 @@ def schematic(ax, plant, levels=None, setpoints=None, lost=None):
     ax.plot([low, low, high, high], [-0.82, bottom, bottom, -0.82], color=GLASS, linewidth=1.4)
     write(ax, (low + high) / 2, bottom + 0.07, "basin")
     _pipework(ax, plant, where)
-    for start, end, y in pipes(plant, where):
+    for start, end, y, _ in pipes(plant, where):
         for wide, colour, layer in ((6.5, GLASS, 1.7), (3.5, WATER, 1.8)):
             line = {"color": colour, "linewidth": wide, "zorder": layer}
             ax.plot([start, end], [y, y], solid_capstyle="butt", **line)

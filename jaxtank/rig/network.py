@@ -387,7 +387,7 @@ def _check_spills(spills, rows):
 
 def _check_ports(spills, tanks, length):
     """Raise InputError for an overflow opening above the rim of its tank."""
-    for k, spill in enumerate(spills):
+    for k, spill in enumerate(spills if tanks else ()):  # none where a tank is refused
         rim, port = tanks[spill["from"]].get("rim"), spill.get("port")
         if None not in (rim, port) and port > rim:
             raise InputError(

@@ -31,6 +31,8 @@ ACTIONS = {
     "#whole": 3,
     "#play": 2,
     "#time": 4,
+    "#cursor-a": 3,
+    "#cursor-b": 3,
     "#legend button": 2,
 }
 """{what is done: how often}."""
@@ -74,6 +76,19 @@ CORE
     same(row.cells[0].textContent, row.cells[1].textContent, shown(margins[i].value));
     same(row.cells[0].textContent, row.cells[2].textContent, shown(margins[i].margin, 3));
   });
+  const [times, ...read] = [...document.querySelectorAll("#cursors tbody tr")]
+    .map((row) => [...row.cells].map((cell) => cell.textContent));
+  if (times) {
+    const fine = engine.run(values, { filter, seed, every: 1 });
+    const set = times.length === 4 ? [1, 2] : [1]; // columns, without that of differences
+    const line = (name, unit, list) => {
+      const head = unit === "-" ? name : `${name} [${unit}]`;
+      const at = (k) => shown(interpolated(fine.t, list, [Number(times[k])])[0]);
+      for (const k of set) same(`cursor, ${head}`, read.find(([h]) => h === head)?.[k], at(k));
+    };
+    info.tanks.forEach(({ name }, i) => line(name, info.units.length, fine.h[i]));
+    info.pumps.forEach(({ name, unit }, j) => line(name, unit, fine.u[j]));
+  }
   const count = text("#legend").match(/of (\\d+) plants, (\\d+) keep/);
   const astray = Number(text("#legend").match(/(\\d+) miss their setpoints/)?.[1] ?? 0);
   const plants = count && { count: Number(count[1]), kept: Number(count[2]), astray };

@@ -83,6 +83,7 @@ def test_axe_finds_nothing_serious(browser, written, scheme, width):
     with opened(browser, written, viewport=view, color_scheme=scheme) as live:
         live("document.querySelectorAll('details').forEach((one) => (one.open = true))")
         live.page.click("#pin")
+        live.page.click("#cursor-a")
         live.page.wait_for_timeout(400)
         found = axe.Axe().run(live.page).response["violations"]
         assert [v["id"] for v in found if v["impact"] in ("serious", "critical")] == []
@@ -400,6 +401,24 @@ def test_tune_is_on_plants_and_judged_on_others(browser, written):
         live.page.click("#undo")
         assert live("jaxtank.state().values") == start
         assert "keep every limit" not in live.text("#legend")  # of other values
+
+
+@pytest.mark.parametrize("plants", [None, 1])
+def test_no_verdict_of_another_run_stands_beside_the_answer_of_a_search(browser, written, plants):
+    with opened(browser, written) as live:
+        live("""() => {
+            const verdict = document.querySelector("#verdict"), told = (window.told = []);
+            const note = () => document.querySelector("#message").textContent.startsWith("Tuned") &&
+                told.push(verdict.textContent);
+            new MutationObserver(note).observe(document.body,
+                { subtree: true, childList: true, characterData: true });
+        }""")
+        before = live.text("#verdict")
+        live("(plants) => jaxtank.tune({ plants })", plants)
+        live.page.wait_for_timeout(700)
+        told, last = live("told"), live.text("#verdict")
+        assert told and set(told) == {last} and last != before
+        assert last == live("jaxtank.verdict().sentence")
 
 
 @pytest.mark.slow

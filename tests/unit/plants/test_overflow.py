@@ -161,3 +161,5 @@ def test_setpoints_that_need_an_overflow_are_not_called_out_of_reach():
     assert not unjudged(presets.find("cascaded/pi"))  # which needs no overflow
     with pytest.raises(InputError, match="port = 60 cm is above the rim of tank 1, 50 cm"):
         rig.loads(WEIR.replace("port = 40.0", "port = 60.0"))
+    with pytest.raises(InputError, match="rim"):
+        rig.loads(WEIR.replace("rim = 50.0", "rim = -50.0"))

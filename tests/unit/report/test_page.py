@@ -377,6 +377,21 @@ def test_a_browser_opens_the_page_without_complaint_and_pictures_fit_a_phone(
     page.close()
 
 
+def test_a_table_of_limits_with_long_names_fits_a_phone(browser, tmp_path):
+    name = "steady-state error of intermediate_storage_LT102"
+    limits = [[name, "<= 0.5 cm", "0.1153 cm", "0.385 cm", "59.5 s"]]
+    heads, levels = ["limit", "", "value", "margin", "at"], [[31.4, 33.09, 16.15, 14.1]] * 2
+    measures = [["max_level", "cm", *(Value(each) for each in levels)]]
+    tables = [Table(limits, heads), Table(measures, ["measure", "unit", "before", "after"])]
+    (tmp_path / "report.html").write_text(rendered(*tables), encoding="utf-8")
+    page = browser.new_page(viewport={"width": 390, "height": 900})
+    page.goto((tmp_path / "report.html").as_uri())
+    page.evaluate("document.querySelectorAll('details').forEach((one) => (one.open = true))")
+    widths = "[...document.querySelectorAll('.scroll')].map((e) => [e.scrollWidth, e.clientWidth])"
+    assert all(0 < whole <= seen for whole, seen in page.evaluate(widths))
+    page.close()
+
+
 @pytest.mark.slow
 def test_no_column_of_a_page_of_claims_is_cut(browser, tmp_path):
     """A box of the page is as wide as what it holds: nothing has to be pushed aside to be read."""
