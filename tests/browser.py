@@ -46,6 +46,12 @@ class Opened:
             self.page.wait_for_timeout(50)
         raise AssertionError(f"never true: {script}; message: {self.text('#message')}")
 
+    def rest(self, least=0.2):
+        """Wait until the charts show the run of the sliders, `least` seconds at the least."""
+        self.page.wait_for_timeout(1000 * least)
+        self.wait("!document.querySelector('#panels.stale')")
+        self.page.wait_for_timeout(100)  # a frame is drawn after its run
+
     def text(self, selector):
         return self.page.text_content(selector)
 

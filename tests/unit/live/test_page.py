@@ -61,7 +61,7 @@ def set_all(live, values):
         box = live.page.locator(f'input[type=number][aria-label^="{name}"]')
         box.evaluate("node => (node.closest('details').open = true)")
         box.fill(str(value))
-    live.page.wait_for_timeout(400)
+    live.rest()
 
 
 def test_the_page_is_one_small_file_that_asks_for_nothing(browser, written):
@@ -84,7 +84,7 @@ def test_axe_finds_nothing_serious(browser, written, scheme, width):
         live("document.querySelectorAll('details').forEach((one) => (one.open = true))")
         live.page.click("#pin")
         live.page.click("#cursor-a")
-        live.page.wait_for_timeout(400)
+        live.rest(0.4)
         found = axe.Axe().run(live.page).response["violations"]
         assert [v["id"] for v in found if v["impact"] in ("serious", "critical")] == []
         assert live("document.documentElement.scrollWidth") <= width
@@ -112,7 +112,7 @@ def test_the_copied_rig_file_gives_the_same_run(browser, written):
     values = {k: v for k, v in SETTINGS.items() if not k.startswith("sensor")}
     with opened(browser, written) as live:
         here = live("(values) => jaxtank.run(values)", values)
-        live.page.wait_for_timeout(400)
+        live.rest(0.4)
         case = rig.loads(live("jaxtank.toml()"))
     assert case.loop.plant.rim.tolist() == [9.5, 10.0]
     there = jaxtank.simulate(case.loop, case.clock)
@@ -126,11 +126,11 @@ def test_a_slider_moves_the_run_and_a_double_click_takes_it_back(browser, writte
         own.focus()
         for _ in range(8):
             own.press("PageUp")
-        live.page.wait_for_timeout(300)
+        live.rest(0.3)
         assert live("jaxtank.state().values")["controller.Kc[0]"] > 2.0
         assert live.text("#measures") != before and "Kc" in live.page.url
         own.dblclick()
-        live.page.wait_for_timeout(300)
+        live.rest(0.3)
         assert live("jaxtank.state().values") == {} and live.text("#measures") == before
 
 
@@ -149,7 +149,7 @@ def test_a_link_brings_back_the_state_and_a_false_one_is_refused(browser, writte
     with opened(browser, written, f"#v1&{MANY}&seed=3&filter=0") as live:
         state = live("jaxtank.state()")
         assert state["values"] == SETTINGS and state["seed"] == 3 and state["filter"] is False
-        live.page.wait_for_timeout(400)
+        live.rest(0.4)
         link = live("location.hash")
     with opened(browser, written, link) as live:
         assert live("jaxtank.state()") == state
@@ -179,7 +179,7 @@ def test_what_is_broken_changes_the_plant_alone(browser, written):
     with opened(browser, written) as live:
         live.page.click("#breaks summary")
         live.page.click("text=pump 1 at 70 %")
-        live.page.wait_for_timeout(300)
+        live.rest(0.3)
         values = live("jaxtank.state().values")
         gain = float(presets.find("cascaded/pi").loop.plant.pump_gain[0])
         assert values == {"plant.pump_gain[0]": pytest.approx(0.7 * gain)}
@@ -465,7 +465,7 @@ def test_whatever_changes_the_loop_ends_a_search(browser, written, change):
             assert text.startswith("Tuning stopped: the loop was changed; ") or "Tuned" in text
             assert values["plant.rim[0]"] == 9.0
         if change == "reset":
-            live.page.wait_for_timeout(300)
+            live.rest(0.3)
             assert live("jaxtank.state().values") == {} and text == "Reset to the case."
 
 

@@ -60,7 +60,7 @@ def drag(live, x, y, up):
     live.page.mouse.down()
     live.page.mouse.move(x, y - up, steps=4)
     live.page.mouse.up()
-    live.page.wait_for_timeout(300)
+    live.rest()
 
 
 def height_of_line(live, chart, part):
@@ -136,7 +136,7 @@ def test_outlets_pipes_and_valves_of_a_custom_rig_are_dragged(browser, tmp_path,
             label = live.page.locator(f".row[data-leaf='{leaf}'] label").first.text_content()
             assert label.startswith(name)
             run = jaxtank.simulate(with_values(case.loop, {leaf: value}), case.clock)
-            live.page.wait_for_timeout(200)
+            live.rest()
             levels = live.page.locator("#rig .value").all_text_contents()
             np.testing.assert_allclose([float(text.split()[0]) for text in levels], run.x[-1],
                                        rtol=6e-3)  # fmt: skip
@@ -194,7 +194,7 @@ def test_two_cursors_read_every_line_that_is_shown_and_their_difference(live):
     live.page.click("#pin")
     box = live.page.locator("input[type=number][aria-label^='controller.Kc[0]']")
     box.fill("0.5")
-    live.page.wait_for_timeout(400)
+    live.rest()
     now = at_cursors(live)
     pinned = [now.pop(head) for head in list(now) if ", run" in head]
     wanted = of_library([first, second], {"controller.Kc": [0.5]})
