@@ -95,6 +95,8 @@ def _claims(result):
     """Whether each claim of the paper survives; without a paper, where the case's own stands."""
     names = list(dict.fromkeys(rival.name for rival in result.rivals))
     own = result.own
+    if len(names) == 1:
+        return
     claims = {n: w for n, w in (result.claims or {}).items() if n in names}
     if not claims:
         if result.claims == {}:
