@@ -178,24 +178,22 @@ def gathered(writer, kind, array):
     zeros = groups.pop((float, "0.0"), None)
     if len(groups) > max(FEW, array.size // LOOPED):
         return None
-    blocks = [(e, entry, affine(np.array(rows))) for e, entry, rows in groups.values()]
-    if any(block is None for *_, block in blocks):
-        return None
-    views = [_view(e, entry, block) for e, entry, block in blocks]
+    views = []
+    for e, entry, rows in groups.values():
+        block = affine(np.array(rows))
+        if block is None:
+            return None
+        strides = tuple(stride for _, stride in block[2])
+        views.append((View(e.name, block[1][1], strides) if entry else e, *block))
     name = writer.new_array(kind, array.size)
-    if len(blocks) == 1 and zeros is None:
-        writer.scopes[-1].append(Each(kind, name, blocks[0][-1][0], "same", (views[0],)))
+    if len(views) == 1 and zeros is None:
+        view, shape, *_ = views[0]
+        writer.scopes[-1].append(Each(kind, name, shape, "same", (view,)))
         return name
     writer.scopes[-1].append(Each(kind, name, (array.size,), "same", (0.0,)))
-    for view, (*_, (shape, (offset, _), strides)) in zip(views, blocks):
+    for view, shape, (offset, _), strides in views:
         name = _put_view(writer, kind, name, offset, shape, view, [d for d, _ in strides])
     return copied(writer, kind, elements_of(name, array.shape))
-
-
-def _view(e, entry, block):
-    """What an `Each` reads of a block of entries of one array, or of one number."""
-    _, (_, start), strides = block
-    return View(e.name, start, tuple(stride for _, stride in strides)) if entry else e
 
 
 def affine(rows):
