@@ -81,7 +81,10 @@ def _margin(result):
     if other.violations > best.violations:
         return f"next: {_stands(other, result.unit)}"
     less = 100.0 * (1.0 - best.error / other.error)
-    return f"that is {less:.2g} % less than the next, {_stands(other, result.unit)}"
+    words = f"that is {less:.2g} % less than the next, {_stands(other, result.unit)}"
+    if not (best.travel and other.travel):
+        return words
+    return f"{words}, with {best.travel / other.travel:.2g} times its changes of the inputs"
 
 
 def _stands(rival, unit):
@@ -166,34 +169,42 @@ def figures(result):
     """Return matplotlib figures {"controllers": errors of all Rivals}."""
     from jaxtank.plots.style import picture
 
+    def draw(ax):
+        draw_errors(ax, result)
+        ax.legend(*legend(), loc="upper left", bbox_to_anchor=(1.0, 1.0))
+
     count = len({rival.name for rival in result.rivals})
-    draw = lambda ax: draw_errors(ax, result)
     return {"controllers": picture(draw, (7.6, max(1.9, 0.8 + 0.32 * count)))}
 
 
-def draw_errors(ax, result, legend=True):
-    """Draw the errors of all Rivals, a row for each controller."""
+def _point(tuned, filtered, colour="0.3") -> dict[str, Any]:
+    """The style of a Rival."""
+    face = colour if tuned else "none"
+    return {"marker": "s" if filtered else "o", "color": colour, "markerfacecolor": face}
+
+
+def legend():
+    """Return the lines and the words of the legend of `draw_errors`."""
     from matplotlib.lines import Line2D
 
+    sides = ((False, False), (True, False), (False, True), (True, True))
+    words = ("first gains", "tuned", "first gains, safety filter", "tuned, safety filter")
+    return [Line2D([], [], linestyle="none", **_point(*side)) for side in sides], words
+
+
+def draw_errors(ax, result):
+    """Draw the errors of all Rivals, a row for each controller."""
     names = list(dict.fromkeys(rival.name for rival in result.rivals))
     rivals = [rival for rival in result.rivals if rival.error is not None]
-
-    def point(tuned, filtered, colour="0.3") -> dict[str, Any]:
-        face = colour if tuned else "none"
-        return {"marker": "s" if filtered else "o", "color": colour, "markerfacecolor": face}
-
     for rival in rivals:
-        style = point(rival.tuned, rival.filtered, "C0" if rival.holds else "C3")
+        style = _point(rival.tuned, rival.filtered, "C0" if rival.holds else "C3")
         ax.plot(rival.error, names.index(rival.name), linestyle="none", **style)
-    if legend:
-        sides = ((False, False), (True, False), (False, True), (True, True))
-        words = ("first gains", "tuned", "first gains, safety filter", "tuned, safety filter")
-        handles = [Line2D([], [], linestyle="none", **point(*side)) for side in sides]
-        ax.legend(handles, words, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     ax.set_yticks(np.arange(len(names)), names)
     ax.set_ylim(len(names) - 0.5, -0.5)
     values = [rival.error for rival in rivals]
     if values and max(values) > 10.0 * min(values):
         ax.set_xscale("log")
+    else:
+        ax.locator_params(axis="x", nbins=5)
     ax.set_xlabel(f"mean total rms error [{result.unit}]")
     ax.grid(True, axis="x", alpha=0.3)
