@@ -170,11 +170,7 @@ def gathered(writer, kind, array):
     """Return the name of an array that loops fill from regular places; None where they are many."""
     if all(map(is_number, array.flat)):
         return None
-    groups = {}
-    for place, e in enumerate(array.ravel()):
-        entry = isinstance(e, Ref) and e.name in writer.sizes and not isinstance(e.index, Ref)
-        key = ("entry", e.name) if entry else (type(e), repr(e))  # repr: -0.0 is not 0.0
-        groups.setdefault(key, (e, entry, []))[-1].append((place, e.index if entry else 0))
+    groups = _sources(writer, array)
     zeros = groups.pop((float, "0.0"), None)
     if len(groups) > max(FEW, array.size // LOOPED):
         return None
@@ -194,6 +190,16 @@ def gathered(writer, kind, array):
     for view, shape, (offset, _), strides in views:
         name = _put_view(writer, kind, name, offset, shape, view, [d for d, _ in strides])
     return copied(writer, kind, elements_of(name, array.shape))
+
+
+def _sources(writer, array):
+    """{array or number: (first element, whether it is an entry of an array, (place, index)s)}."""
+    groups = {}
+    for place, e in enumerate(array.ravel()):
+        entry = isinstance(e, Ref) and e.name in writer.sizes and not isinstance(e.index, Ref)
+        key = ("entry", e.name) if entry else (type(e), repr(e))  # repr: -0.0 is not 0.0
+        groups.setdefault(key, (e, entry, []))[-1].append((place, e.index if entry else 0))
+    return groups
 
 
 def affine(rows):

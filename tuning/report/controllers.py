@@ -97,23 +97,26 @@ def _stands(rival, unit):
 def _claims(result):
     """Whether each claim of the paper survives; without a paper, where the case's own stands."""
     names = list(dict.fromkeys(rival.name for rival in result.rivals))
-    own = result.own
     if len(names) == 1:
         return
     claims = {n: w for n, w in (result.claims or {}).items() if n in names}
-    if not claims:
-        if result.claims == {}:
-            yield "its paper calls no controller the best"
-        if own is not None and own.name != result.best.name:
-            yield f"the case's own controller at its best: {_stands(own, result.unit)}"
-    published = [r for r in result.rivals if r.gains == "published" and not r.filtered]
     for name, section in claims.items():
-        first = published[0].name == name if len(published) > 1 else None
-        outcome = OUTCOMES[first, name == result.best.name]
-        yield f"the paper's claim that {name} is the best ({section}) {outcome}"
-        if name != result.best.name:
-            stands = _stands(next(r for r in result.rivals if r.name == name), result.unit)
-            yield f"{stands}, is number {names.index(name) + 1} of {len(names)} controllers"
+        yield from _claim(result, name, section, names)
+    if result.claims == {}:
+        yield "its paper calls no controller the best"
+    if not claims and result.own is not None and result.own.name != result.best.name:
+        yield f"the case's own controller at its best: {_stands(result.own, result.unit)}"
+
+
+def _claim(result, name, section, names):
+    """Whether the claim that a controller is the best holds at published gains, and of all."""
+    published = [r for r in result.rivals if r.gains == "published" and not r.filtered]
+    first = published[0].name == name if len(published) > 1 else None
+    outcome = OUTCOMES[first, name == result.best.name]
+    yield f"the paper's claim that {name} is the best ({section}) {outcome}"
+    if name != result.best.name:
+        stands = _stands(next(r for r in result.rivals if r.name == name), result.unit)
+        yield f"{stands}, is number {names.index(name) + 1} of {len(names)} controllers"
 
 
 def verdict_of(result):
