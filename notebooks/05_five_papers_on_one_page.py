@@ -226,6 +226,9 @@ hold = jaxtank.analysis.equilibrium(hybrid.loop.plant, (12.0, 12.0))[1][0] / 1.0
 #   {{values["21.2 cm²"]["rms_error_total"]:.2f}} cm. It would change no steady level.
 # - Two columns of one table can contradict each other: the overshoots ask for {{by_overshoot:.1f}} V, the rise times
 #   for less than any limit that was tried. A paper that prints the limits of its pumps can be checked.
+# - Which controller is the best on these rigs once all of them are tuned, and whether the claim of its paper survives,
+#   is another question: `jaxtank compare --controllers RIG`, with tables and a picture in
+#   `tests/benchmarks/README.md` (Every controller).
 #
 # ## Exercises
 #

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxtank import presets
+from jaxtank import presets, rig
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.export import source
 from jaxtank.export.program import program
@@ -64,6 +64,15 @@ RANKS = [
     "tuning.cli",
 ]
 RANK = {folder: rank for rank, folders in enumerate(RANKS) for folder in folders.split()}
+
+
+PROGRAMMES = {"gouta2015/nmpc": 220, "moving_horizon": 220}
+"""{case that solves programmes in the loop: samples that are replayed by slow interpreters}."""
+
+
+def opened(name):
+    """A case of a paper ("paper/case"), or of a rig file of the tests, by its name alone."""
+    return presets.find(name) if "/" in name else rig.open_case(str(RIGS / f"{name}.toml"))
 
 
 def faulty_pictures(usual):

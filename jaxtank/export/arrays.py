@@ -115,9 +115,14 @@ def part_of(writer, kind, name, offset, shape):
 
 def put(writer, kind, name, offset, array, steps=()):
     """Return what the array `name` is called after `array` was written into it."""
-    new, views = writer.fresh("l"), (view_of(writer, array, kind),)
+    view = view_of(writer, array, kind)
+    return _put_view(writer, kind, name, offset, array.shape, view, steps)
+
+
+def _put_view(writer, kind, name, offset, shape, view, steps):
+    new = writer.fresh("l")
     writer.sizes[new] = writer.sizes[name]
-    statement = Each(kind, new, array.shape, "same", views, (), name, offset, steps)
+    statement = Each(kind, new, shape, "same", (view,), (), name, offset, tuple(steps))
     writer.scopes[-1].append(statement)
     return new
 
@@ -159,6 +164,58 @@ def _blocks(writer, array, offset, steps):
     yield from _blocks(writer, array.take(range(count), axis=d), offset, steps)
     rest = array.take(range(count, array.shape[d]), axis=d)
     yield from _blocks(writer, rest, offset + count * steps[d], steps)
+
+
+def gathered(writer, kind, array):
+    """Return the name of an array that loops fill from regular places; None where they are many."""
+    if all(map(is_number, array.flat)):
+        return None
+    groups = _sources(writer, array)
+    zeros = groups.pop((float, "0.0"), None)
+    if len(groups) > max(FEW, array.size // LOOPED):
+        return None
+    views = []
+    for e, entry, rows in groups.values():
+        block = affine(np.array(rows))
+        if block is None:
+            return None
+        strides = tuple(stride for _, stride in block[2])
+        views.append((View(e.name, block[1][1], strides) if entry else e, *block))
+    name = writer.new_array(kind, array.size)
+    if len(views) == 1 and zeros is None:
+        view, shape, *_ = views[0]
+        writer.scopes[-1].append(Each(kind, name, shape, "same", (view,)))
+        return name
+    writer.scopes[-1].append(Each(kind, name, (array.size,), "same", (0.0,)))
+    for view, shape, (offset, _), strides in views:
+        name = _put_view(writer, kind, name, offset, shape, view, [d for d, _ in strides])
+    return copied(writer, kind, elements_of(name, array.shape))
+
+
+def _sources(writer, array):
+    """{array or number: (first element, whether it is an entry of an array, (place, index)s)}."""
+    groups = {}
+    for place, e in enumerate(array.ravel()):
+        entry = isinstance(e, Ref) and e.name in writer.sizes and not isinstance(e.index, Ref)
+        key = ("entry", e.name) if entry else (type(e), repr(e))  # repr: -0.0 is not 0.0
+        groups.setdefault(key, (e, entry, []))[-1].append((place, e.index if entry else 0))
+    return groups
+
+
+def affine(rows):
+    """Return (shape, first row, strides) of rows of numbers that counters give, None for others."""
+    first, shape, strides = tuple(map(int, rows[0])), [], []
+    while len(rows) > 1:
+        step = rows[1] - rows[0]
+        breaks = np.flatnonzero((np.diff(rows, axis=0) != step).any(axis=1))
+        count = int(breaks[0]) + 1 if len(breaks) else len(rows)
+        blocks = rows.reshape(-1, count, 2) if len(rows) % count == 0 else None
+        if blocks is None or (blocks - blocks[:, :1] != blocks[0] - blocks[0, 0]).any():
+            return None
+        shape.append(count)
+        strides.append(tuple(map(int, step)))
+        rows = blocks[:, 0]
+    return tuple(shape[::-1]) or (1,), first, strides[::-1] or [(0, 0)]
 
 
 def whole_of(writer, kind, array, changing=()):

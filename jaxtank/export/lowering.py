@@ -16,7 +16,16 @@ from jax.extend.core import Literal
 
 from jaxtank.core.errors import InputError
 from jaxtank.export import arrays
-from jaxtank.export.arrays import FEW, LOOPED, assembled, copied, elements_of, filled, place_of
+from jaxtank.export.arrays import (
+    FEW,
+    LOOPED,
+    assembled,
+    copied,
+    elements_of,
+    filled,
+    gathered,
+    place_of,
+)
 from jaxtank.export.simplify import FUNCTIONS, OPERATORS, is_number, simplified
 from jaxtank.export.statements import (
     REAL,
@@ -655,6 +664,10 @@ class Writer:
 
     def array(self, entries, kind=REAL):
         """Return the name of an array with these entries (any shape, row by row)."""
+        if self.loops and kind == REAL and entries.size > 4 * FEW:
+            joined = gathered(self, kind, entries)
+            if joined is not None:
+                return joined
         name = self.fresh("a")
         self.sizes[name] = entries.size
         self.scopes[-1].append(Array(name, tuple(entries.ravel()), kind))

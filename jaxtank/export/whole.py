@@ -137,7 +137,8 @@ def check_pointwise(case: Case) -> None:
         part = "controller nmpc" if case.loop.controller.sequential else "observer moving-horizon"
         raise InputError(
             f"{case.name}: its {part} solves quadratic programmes, whose code for a page has"
-            " megabytes; `jaxtank export --lang c` writes controller and observer alone"
+            " megabytes; `jaxtank simulate --gif` draws a run, and `jaxtank export` writes"
+            " controller and observer alone, in each of its languages"
         )
     signals = {
         "setpoints": case.loop.reference,

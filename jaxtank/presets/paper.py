@@ -118,6 +118,8 @@ class Preset:
     tunable : {parameter: Free}
     uncertain : {parameter: (spread as a share of it, why)}
     departures : sentences, each on what differs from the paper and why
+    best : {name of a case: section} of controllers that the paper calls better than all others that
+        it compares; several where sections contradict each other, {} where it compares none
 
     Examples
     --------
@@ -135,6 +137,7 @@ class Preset:
     tunable: Mapping[str, Free]
     uncertain: Mapping[str, tuple]
     departures: tuple
+    best: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def notes(self) -> Path:
@@ -180,4 +183,5 @@ def printed(paper: str) -> dict[str, Any]:
         "published": {name: Published(**row) for name, row in rows.items()},
         "uncertain": {name: tuple(entry) for name, entry in table["uncertain"].items()},
         "departures": tuple(table["departures"]),
+        "best": table.get("best", {}),
     }

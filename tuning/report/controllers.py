@@ -37,32 +37,86 @@ def _row(rival):
     """The JSON object of a Rival."""
     judged = rival.judged.to_json()
     return {
-        **fields(rival, "name kind gains tuned error violations step_us"),
-        **fields(rival, "filter=filtered sensitivity_peak=peak"),
+        **fields(rival, "name kind gains tuned error violations step_us parameters"),
+        **fields(rival, "filter=filtered sensitivity_peak=peak input_travel=travel"),
         **{name: judged[name] for name in ("objective", "failed", "travel_percent")},
         "why": rival.why or None,
     }
 
 
 def sentence(result):
-    """Return who wins, by how much, and where the case's own controller stands."""
-    unit, best, own = result.case.loop.units[0], result.best, result.own
-    if best.error is None:
+    """Return who wins, by how much, and whether the claim of the paper survives tuning."""
+    if result.best.error is None:
         return "no controller has a finite run on a plant where every setpoint is reachable"
-    words = f"{best.words()}: least error ({best.error:.3g} {unit}) of those that hold every limit"
-    words += f" on {result.samples} of {result.samples} plants"
-    if not best.holds:
-        words = f"no controller holds every limit; {best.words()} breaks one on fewest plants"
-        words += f" ({best.violations} of {result.samples}), error {best.error:.3g} {unit}"
-    if best.name == own.name:
-        rivals = [r for r in result.rivals if r.name != own.name and r.holds == best.holds]
-        if rivals and rivals[0].error is not None:
-            return f"{words}; next: {rivals[0].words()} ({rivals[0].error:.3g} {unit})"
-        return f"{words}; no other controller does as well"
-    stands = "no finite run" if own.error is None else f"{own.error:.3g} {unit}"
-    if own.violations:
-        stands += f", a limit broken on {own.violations} plants"
-    return f"{words}; the case's own controller at its best ({own.words()}): {stands}"
+    return "; ".join([_winner(result), _margin(result), *_claims(result)])
+
+
+OUTCOMES = {  # (best at published gains, None where one alone has some; best of all): words
+    (True, True): "holds at published gains and survives tuning of its rivals",
+    (True, False): "holds at published gains and does not survive tuning of its rivals",
+    (False, True): "fails at published gains and holds once all are tuned",
+    (False, False): "fails at published gains, and once all are tuned",
+    (None, True): "survives tuning of its rivals",
+    (None, False): "does not survive tuning of its rivals",
+}
+
+
+def _winner(result):
+    """Who wins, with its error and the limits."""
+    best, error = result.best, amount(result.best.error, result.unit)
+    if best.holds:
+        return f"{best.words()}, wins: error {error}, every limit held on {result.samples} plants"
+    return (
+        f"no controller holds every limit; {best.words()}, wins: a limit broken on"
+        f" {best.violations} of {result.samples} plants, error {error}"
+    )
+
+
+def _margin(result):
+    """By how much the winner is better than the next controller."""
+    best = result.best
+    other = next((r for r in result.rivals if r.name != best.name and r.error is not None), None)
+    if other is None:
+        return "no other controller was compared, or none has a finite run"
+    if other.violations > best.violations:
+        return f"next: {_stands(other, result.unit)}"
+    less = 100.0 * (1.0 - best.error / other.error)
+    words = f"that is {less:.2g} % less than the next, {_stands(other, result.unit)}"
+    if not (best.travel and other.travel):
+        return words
+    return f"{words}, with {best.travel / other.travel:.2g} times its changes of the inputs"
+
+
+def _stands(rival, unit):
+    """A Rival with its error and the plants on which it breaks a limit."""
+    error = "no finite run" if rival.error is None else amount(rival.error, unit)
+    broken = f", a limit broken on {rival.violations} plants" if rival.violations else ""
+    return f"{rival.words()} ({error}{broken})"
+
+
+def _claims(result):
+    """Whether each claim of the paper survives; without a paper, where the case's own stands."""
+    names = list(dict.fromkeys(rival.name for rival in result.rivals))
+    if len(names) == 1:
+        return
+    claims = {n: w for n, w in (result.claims or {}).items() if n in names}
+    for name, section in claims.items():
+        yield from _claim(result, name, section, names)
+    if result.claims == {}:
+        yield "its paper calls no controller the best"
+    if not claims and result.own is not None and result.own.name != result.best.name:
+        yield f"the case's own controller at its best: {_stands(result.own, result.unit)}"
+
+
+def _claim(result, name, section, names):
+    """Whether the claim that a controller is the best holds at published gains, and of all."""
+    published = [r for r in result.rivals if r.gains == "published" and not r.filtered]
+    first = published[0].name == name if len(published) > 1 else None
+    outcome = OUTCOMES[first, name == result.best.name]
+    yield f"the paper's claim that {name} is the best ({section}) {outcome}"
+    if name != result.best.name:
+        stands = _stands(next(r for r in result.rivals if r.name == name), result.unit)
+        yield f"{stands}, is number {names.index(name) + 1} of {len(names)} controllers"
 
 
 def verdict_of(result):
@@ -73,17 +127,18 @@ def verdict_of(result):
 def report(result):
     unit = result.case.loop.units[0]
     heads = ["controller", "gains", "filter", f"error [{unit}]", "limits broken", "travel [%]"]
-    heads += ["Ms [-]", "C [us/step]"]
+    heads += [f"total [{result.case.loop.units[1]}]", "Ms [-]", "C [us/step]"]
     rows = []
     for rival in result.rivals:
         travel = rival.judged.to_json()["travel_percent"]
         outcome = [Value(rival.error, 4), f"{rival.violations} of {result.samples}"]
-        numbers = [Value(v, 3) for v in (travel, rival.peak, rival.step_us)]
+        numbers = [Value(v, 3) for v in (travel, rival.travel, rival.peak, rival.step_us)]
         filtered = "yes" if rival.filtered else "no"
         rows.append([rival.name, rival.gains, filtered, *outcome, *numbers])
     notes = [
         "error: mean total rms error of the plants where every setpoint is reachable",
         "travel: rms change of the inputs per sample, as a share of their range",
+        "total: total variation of all inputs over the run, mean of the same plants as the error",
         "Ms: largest sensitivity peak at the plateaus of the nominal plant",
         "C: time of a step of the controller alone, without the filter",
     ]
@@ -115,31 +170,44 @@ def advice_of(result):
 
 def figures(result):
     """Return matplotlib figures {"controllers": errors of all Rivals}."""
-    from matplotlib.lines import Line2D
-
     from jaxtank.plots.style import picture
 
+    def draw(ax):
+        draw_errors(ax, result)
+        ax.legend(*legend(), loc="upper left", bbox_to_anchor=(1.0, 1.0))
+
+    count = len({rival.name for rival in result.rivals})
+    return {"controllers": picture(draw, (7.6, max(1.9, 0.8 + 0.32 * count)))}
+
+
+def _point(tuned, filtered, colour="0.3") -> dict[str, Any]:
+    """The style of a Rival."""
+    face = colour if tuned else "none"
+    return {"marker": "s" if filtered else "o", "color": colour, "markerfacecolor": face}
+
+
+def legend():
+    """Return the lines and the words of the legend of `draw_errors`."""
+    from matplotlib.lines import Line2D
+
+    sides = ((False, False), (True, False), (False, True), (True, True))
+    words = ("first gains", "tuned", "first gains, safety filter", "tuned, safety filter")
+    return [Line2D([], [], linestyle="none", **_point(*side)) for side in sides], words
+
+
+def draw_errors(ax, result):
+    """Draw the errors of all Rivals, a row for each controller."""
     names = list(dict.fromkeys(rival.name for rival in result.rivals))
     rivals = [rival for rival in result.rivals if rival.error is not None]
-
-    def point(tuned, filtered, colour="0.3") -> dict[str, Any]:
-        face = colour if tuned else "none"
-        return {"marker": "s" if filtered else "o", "color": colour, "markerfacecolor": face}
-
-    def errors(ax):
-        for rival in rivals:
-            style = point(rival.tuned, rival.filtered, "C0" if rival.holds else "C3")
-            ax.plot(rival.error, names.index(rival.name), linestyle="none", **style)
-        sides = ((False, False), (True, False), (False, True), (True, True))
-        words = ("first gains", "tuned", "first gains, safety filter", "tuned, safety filter")
-        handles = [Line2D([], [], linestyle="none", **point(*side)) for side in sides]
-        ax.legend(handles, words, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-        ax.set_yticks(np.arange(len(names)), names)
-        ax.set_ylim(len(names) - 0.5, -0.5)
-        values = [rival.error for rival in rivals]
-        if values and max(values) > 10.0 * min(values):
-            ax.set_xscale("log")
-        ax.set_xlabel(f"mean total rms error [{result.case.loop.units[0]}]")
-        ax.grid(True, axis="x", alpha=0.3)
-
-    return {"controllers": picture(errors, (7.6, max(1.9, 0.8 + 0.32 * len(names))))}
+    for rival in rivals:
+        style = _point(rival.tuned, rival.filtered, "C0" if rival.holds else "C3")
+        ax.plot(rival.error, names.index(rival.name), linestyle="none", **style)
+    ax.set_yticks(np.arange(len(names)), names)
+    ax.set_ylim(len(names) - 0.5, -0.5)
+    values = [rival.error for rival in rivals]
+    if values and max(values) > 10.0 * min(values):
+        ax.set_xscale("log")
+    else:
+        ax.locator_params(axis="x", nbins=5)
+    ax.set_xlabel(f"mean total rms error [{result.unit}]")
+    ax.grid(True, axis="x", alpha=0.3)

@@ -6,7 +6,7 @@
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,15 +15,18 @@ from jaxtank.bounds import free_of
 from jaxtank.case import Case, check_case
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.tree import get_value
 from jaxtank.export.timing import step_time
 from jaxtank.loop.margins import stability_margins
 from jaxtank.rig.components import kind_of
 from tuning.problem.controllers import START, equal, same_rig, with_kind
-from tuning.search.judged import FRESH, Judged, validate
+from tuning.search.judged import FRESH, Judged, judge
 from tuning.search.options import check_numbers, check_precision
+from tuning.search.setting import setting_of
 from tuning.search.tuner import tune
 from tuning.views import Result
 
+TRAVEL = "input_travel"
 MISPRINTS = "-printed"  # end of the name of a case with a misprint, which is left out
 
 
@@ -56,8 +59,22 @@ class Rival(NamedTuple):
     @property
     def error(self) -> float | None:
         """Mean total rms error of the plants where every setpoint is reachable [unit of length]."""
+        return self._mean(self.judged.error)
+
+    @property
+    def travel(self) -> float | None:
+        """Mean over the same plants of the total variation of all inputs [unit of the inputs]."""
+        values = self.judged.measures.get(TRAVEL)
+        return None if values is None else self._mean(values.reshape(len(values), -1).sum(axis=1))
+
+    def _mean(self, values: np.ndarray) -> float | None:
         good = self.followers & ~self.judged.failed
-        return float(np.mean(self.judged.error[good])) if good.any() else None
+        return float(np.mean(values[good])) if good.any() else None
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Return {dotted name: value} of the tunable parameters."""
+        return {n: np.asarray(get_value(self.case.loop, n)).tolist() for n in free_of(self.case)}
 
     @property
     def violations(self) -> int:
@@ -105,9 +122,20 @@ class ControllerComparison(Result):
         return self.rivals[0]
 
     @property
-    def own(self) -> Rival:
-        """The best Rival with the controller of the case itself."""
-        return next(r for r in self.rivals if r.name == self.case_name)
+    def own(self) -> Rival | None:
+        """The best Rival with the controller of the case itself; None where it is left out."""
+        return next((r for r in self.rivals if r.name == self.case_name), None)
+
+    @property
+    def unit(self) -> str:
+        """Unit of the errors."""
+        return str(self.case.loop.units[0])
+
+    @property
+    def claims(self) -> dict[str, str] | None:
+        """{controller that the paper of the case calls best: section}; None without a paper."""
+        paper, _, _ = self.case.name.partition("/")
+        return dict(presets.load(paper).best) if paper in presets.PAPERS else None
 
     @property
     def case_name(self) -> str:
@@ -259,4 +287,5 @@ def _judged(name: str, gains: str, case: Case, samples: int, seed: int) -> Itera
             sides.append(judged if judged.loop.safety_filter else plain.with_safety_filter())
         for side in sides:
             peak, why = _peak(side)
-            yield Rival(name, kind, origin, side, validate(side, samples, seed), peak, step, why)
+            runs = judge(setting_of(side), samples, seed, more=(TRAVEL,))
+            yield Rival(name, kind, origin, side, runs, peak, step, why)

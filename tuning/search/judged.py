@@ -266,11 +266,13 @@ def validate(
     return judge(setting_of(case, objective, limits, distributions), samples, seed)
 
 
-def judge(setting: Setting, samples: int, seed: int, round_: int = 0) -> Judged:
-    """Return how the searched case of a setting does on `samples` plants."""
+def judge(
+    setting: Setting, samples: int, seed: int, round_: int = 0, more: Sequence[str] = ()
+) -> Judged:
+    """Return how the searched case of a setting does on `samples` plants, with measures `more`."""
     case = setting.searched
     limits = resolve_limits(case, setting.case.limits)
-    names = [*setting.objective, *COST, "rms_error_total", "mean_square_travel", *ms.TRACKED]
+    names = [*setting.objective, *COST, "rms_error_total", "mean_square_travel", *ms.TRACKED, *more]
     names = [m for m in dict.fromkeys(names) if ms.serves(m, case.loop)]
     names += [limit.measure for limit in limits]
     quiet = [m for m in NOMINAL if ms.serves(m, case.loop)] if not noisy(setting.case) else []

@@ -6,10 +6,10 @@ import shutil
 import jax
 import numpy as np
 import pytest
-from helpers import signals_of
+from helpers import opened, signals_of
 
 import jaxtank
-from jaxtank import presets, rig
+from jaxtank import rig
 from jaxtank.export.source import files
 
 fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed")
@@ -24,7 +24,7 @@ SAMPLES = 200
 @functools.cache
 def case_and_run(name, delay=0.0):
     """A case without noise, and its run of 200 samples as host arrays."""
-    case = presets.find(name)
+    case = opened(name)
     values = {"clock.duration": (SAMPLES - 1) * case.clock.dt, "sensor.noise": 0.0}
     case = rig.set_values(case, {**values, "actuator.delay": delay * case.clock.dt})
     return case, jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock))
@@ -94,7 +94,8 @@ def looped(case, run, controller, plant):
             for name in (
                 *("gouta2015/backstepping-boxqp", "gouta2022/chadpc", "gouta2022/fopi"),
                 *("calofir/backstepping-perturbed", "dts200/pi-faults", "mirakhorli/lqi"),
-                *("khalid/gpc-nc2-constrained", "khalid/laguerre"),
+                *("khalid/gpc-nc2-constrained", "khalid/laguerre", "gouta2015/nmpc"),
+                "moving_horizon",
             )
         ),
     ],

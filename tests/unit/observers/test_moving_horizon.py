@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from helpers import Compiled, estimates_along, needs_gcc, rk4, signals_of
+from helpers import RIGS, Compiled, estimates_along, needs_gcc, rk4, signals_of
 from scipy.optimize import least_squares, lsq_linear
 
 import jaxtank
@@ -182,18 +182,8 @@ def test_variances_that_are_0_are_refused():
             with_values(observer, {name: 0.0}).check(TANKS)
 
 
-RIG = """
-tank = [{area = 5.0, rim = 8.0, level = 0.2},
-        {area = 4.0, rim = 8.0, level = 0.2, drain = 0.06}]
-orifice = [{from = 1, to = 2, area = 0.05}]
-pump = [{to = 1, gain = 1.0, high = 9.0, initial = 1.0}]
-plant = {outputs = [2]}
-controller = {kind = "pi", Kc = 0.5, Ti = 20.0}
-reference = {initial = [0.1], changes = [[20.0, 1, 0.02]]}
-observer = {kind = "extended-kalman", process = 0.02, measurement = 0.05, measured = [2]}
-values = {sensor.noise = 0.2, clock.dt = 0.5, clock.duration = 40.0}
-"""
-WINDOW = RIG.replace('"extended-kalman"', '"moving-horizon", samples = 4')
+WINDOW = (RIGS / "moving_horizon.toml").read_text()
+RIG = WINDOW.replace('"moving-horizon", samples = 4', '"extended-kalman"')
 
 
 @pytest.mark.slow

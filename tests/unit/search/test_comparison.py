@@ -1,5 +1,6 @@
 """Every controller that fits a rig, tuned and judged on the same plants."""
 
+import dataclasses
 import shutil
 
 import numpy as np
@@ -33,9 +34,11 @@ def judged(errors, broken=(), failed=(), infeasible=None):
     )
 
 
-def comparison_of(*rows):
-    case = presets.find("cascaded/pi")
-    rivals = [Rival(name, name, "tuned", case, runs, 1.3, None) for name, runs in rows]
+def comparison_of(*rows, name="cascaded/pi"):
+    """Rows: (controller, Judged) of tuned gains, or with the origin of its gains."""
+    case = presets.find(name)
+    rows = [(*row, "tuned")[:3] for row in rows]
+    rivals = [Rival(n, n, gains, case, runs, 1.3, None) for n, runs, gains in rows]
     rivals.sort(key=comparison.order)
     return ControllerComparison(case=case, rivals=tuple(rivals), refused={}, samples=N, seed=0)
 
@@ -61,6 +64,59 @@ def test_error_counts_plants_that_can_follow():
     assert rival.violations == 1  # the run that diverged
     (nobody,) = comparison_of(("pi", judged([1.0] * N, infeasible=range(N)))).rivals
     assert nobody.error is None
+
+
+def published_and_tuned(**errors):
+    """Rows of controllers, each with its errors at published and at tuned gains."""
+    sides = ("published", "tuned")
+    rows = ((n, e, side) for n, two in errors.items() for e, side in zip(two, sides))
+    return [(n, judged([e] * N), side) for n, e, side in rows if e is not None]
+
+
+@pytest.mark.parametrize(
+    ("errors", "outcome", "margin"),
+    [
+        ({"hybrid": (3.0, 1.0), "sfc": (4.0, 2.0)}, (True, True), "50 % less"),
+        ({"hybrid": (3.0, 2.0), "sfc": (4.0, 1.5)}, (True, False), "25 % less"),
+        ({"hybrid": (4.0, 2.0), "sfc": (3.0, 1.0)}, (False, False), "50 % less"),
+        ({"hybrid": (4.0, 1.0), "sfc": (3.0, 2.0)}, (False, True), "50 % less"),
+        ({"hybrid": (4.0, 2.0), "lqi": (None, 1.0)}, (None, False), "50 % less"),
+        ({"hybrid": (4.0, 1.0), "lqi": (None, 2.0)}, (None, True), "50 % less"),
+    ],
+)
+def test_the_sentence_says_whether_the_claim_of_the_paper_survives(errors, outcome, margin):
+    result = comparison_of(*published_and_tuned(**errors), name="mirakhorli/hybrid")
+    sentence = report.sentence(result)
+    assert f"hybrid is the best (sec. 6) {report.OUTCOMES[outcome]}" in sentence
+    assert margin in sentence and ("is number 2 of 2" in sentence) is not outcome[1]
+    assert report.json_of(result)["sentence"] == sentence
+
+
+def test_every_claim_of_a_best_controller_names_a_case():
+    for paper in presets.PAPERS:
+        preset = presets.load(paper)
+        assert set(preset.best) <= set(preset.cases)
+    assert set(presets.load("gouta2015").best) == {"backstepping", "ngpc"}
+
+
+def test_one_controller_alone_is_no_test_of_a_claim():
+    result = comparison_of(*published_and_tuned(hybrid=(2.0, 1.0)), name="mirakhorli/hybrid")
+    assert "claim" not in report.sentence(result)
+
+
+def test_a_comparison_without_the_own_controller_has_a_sentence():
+    result = comparison_of(("lqi", judged([1.0] * N)), ("gpc", judged([2.0] * N, broken=[0])))
+    assert result.own is None and result.best.name == "lqi"
+    assert "lqi" in report.sentence(result) and "on 1 plant" in report.sentence(result)
+
+
+def test_total_travel_is_that_of_plants_that_can_follow():
+    runs = judged([1.0, 2.0, 3.0, 4.0], failed=[3], infeasible=[2])
+    travel = np.array([[1.0, 2.0], [3.0, 4.0], [50.0, 60.0], [7.0, 8.0]])
+    runs = dataclasses.replace(runs, measures={comparison.TRAVEL: travel})
+    (rival,) = comparison_of(("pi", runs)).rivals
+    assert rival.travel == pytest.approx((3.0 + 7.0) / 2)
+    assert report.json_of(comparison_of(("pi", runs)))["controllers"][0]["input_travel"] == 5.0
 
 
 def test_a_paper_brings_its_controllers_and_rules_bring_others():
