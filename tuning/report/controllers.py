@@ -51,23 +51,38 @@ def sentence(result):
     return "; ".join([_winner(result), _margin(result), *_claims(result)])
 
 
-OUTCOMES = {  # (best at published gains, None where one alone has some; best of all): words
-    (True, True): "holds at published gains and survives tuning of its rivals",
-    (True, False): "holds at published gains and does not survive tuning of its rivals",
-    (False, True): "fails at published gains and holds once all are tuned",
-    (False, False): "fails at published gains, and once all are tuned",
-    (None, True): "survives tuning of its rivals",
-    (None, False): "does not survive tuning of its rivals",
+TIE = 0.01  # controllers whose errors differ by less are as good as each other
+
+OUTCOMES = {  # {place of what a paper calls the best: words at published gains, and of all}
+    "first": ("holds at published gains", "survives tuning of its rivals"),
+    "tie": ("is a tie at published gains", "is a tie once all are tuned"),
+    "behind": ("fails at published gains", "does not survive tuning of its rivals"),
 }
+
+
+def place(rivals, name):
+    """Return where a controller stands among Rivals, best first: a key of OUTCOMES."""
+    best, of_name = rivals[0], next(r for r in rivals if r.name == name)
+    near = [r for r in rivals if _as_good(r, best)]
+    if of_name not in near:
+        return "behind"
+    return "first" if all(r.name == name for r in near) else "tie"
+
+
+def _as_good(rival, best):
+    if rival.violations != best.violations or None in (rival.error, best.error):
+        return rival is best
+    return rival.error <= (1.0 + TIE) * best.error
 
 
 def _winner(result):
     """Who wins, with its error and the limits."""
     best, error = result.best, amount(result.best.error, result.unit)
+    wins = "wins" if place(result.rivals, best.name) == "first" else "is first in a tie"
     if best.holds:
-        return f"{best.words()}, wins: error {error}, every limit held on {result.samples} plants"
+        return f"{best.words()}, {wins}: error {error}, every limit held on {result.samples} plants"
     return (
-        f"no controller holds every limit; {best.words()}, wins: a limit broken on"
+        f"no controller holds every limit; {best.words()}, {wins}: a limit broken on"
         f" {best.violations} of {result.samples} plants, error {error}"
     )
 
@@ -111,9 +126,10 @@ def _claims(result):
 def _claim(result, name, section, names):
     """Whether the claim that a controller is the best holds at published gains, and of all."""
     published = [r for r in result.rivals if r.gains == "published" and not r.filtered]
-    first = published[0].name == name if len(published) > 1 else None
-    outcome = OUTCOMES[first, name == result.best.name]
-    yield f"the paper's claim that {name} is the best ({section}) {outcome}"
+    at_published, of_all = OUTCOMES[place(result.rivals, name)][1], ""
+    if len({r.name for r in published}) > 1:
+        at_published, of_all = OUTCOMES[place(published, name)][0], f" and {at_published}"
+    yield f"the paper's claim that {name} is the best ({section}) {at_published}{of_all}"
     if name != result.best.name:
         stands = _stands(next(r for r in result.rivals if r.name == name), result.unit)
         yield f"{stands}, is number {names.index(name) + 1} of {len(names)} controllers"

@@ -76,19 +76,26 @@ def published_and_tuned(**errors):
 @pytest.mark.parametrize(
     ("errors", "outcome", "margin"),
     [
-        ({"hybrid": (3.0, 1.0), "sfc": (4.0, 2.0)}, (True, True), "50 % less"),
-        ({"hybrid": (3.0, 2.0), "sfc": (4.0, 1.5)}, (True, False), "25 % less"),
-        ({"hybrid": (4.0, 2.0), "sfc": (3.0, 1.0)}, (False, False), "50 % less"),
-        ({"hybrid": (4.0, 1.0), "sfc": (3.0, 2.0)}, (False, True), "50 % less"),
-        ({"hybrid": (4.0, 2.0), "lqi": (None, 1.0)}, (None, False), "50 % less"),
-        ({"hybrid": (4.0, 1.0), "lqi": (None, 2.0)}, (None, True), "50 % less"),
+        ({"hybrid": (3.0, 1.0), "sfc": (4.0, 2.0)}, ("first", "first"), "50 % less"),
+        ({"hybrid": (3.0, 2.0), "sfc": (4.0, 1.5)}, ("first", "behind"), "25 % less"),
+        ({"hybrid": (4.0, 2.0), "sfc": (3.0, 1.0)}, ("behind", "behind"), "50 % less"),
+        ({"hybrid": (4.0, 1.0), "sfc": (3.0, 2.0)}, ("behind", "first"), "50 % less"),
+        ({"hybrid": (4.0, 2.0), "lqi": (None, 1.0)}, (None, "behind"), "50 % less"),
+        ({"hybrid": (4.0, 1.0), "lqi": (None, 2.0)}, (None, "first"), "50 % less"),
+        ({"hybrid": (3.0, 1.0), "sfc": (3.02, 1.005)}, ("tie", "tie"), "0.5 % less"),
+        ({"hybrid": (3.02, 1.005), "sfc": (3.0, 1.0)}, ("tie", "tie"), "0.5 % less"),
     ],
 )
 def test_the_sentence_says_whether_the_claim_of_the_paper_survives(errors, outcome, margin):
     result = comparison_of(*published_and_tuned(**errors), name="mirakhorli/hybrid")
     sentence = report.sentence(result)
-    assert f"hybrid is the best (sec. 6) {report.OUTCOMES[outcome]}" in sentence
-    assert margin in sentence and ("is number 2 of 2" in sentence) is not outcome[1]
+    at_published, of_all = outcome
+    words = [report.OUTCOMES[at_published][0]] if at_published else []
+    words = " and ".join([*words, report.OUTCOMES[of_all][1]])
+    assert f"hybrid is the best (sec. 6) {words}" in sentence
+    assert margin in sentence and ("in a tie" in sentence) == (of_all == "tie")
+    leads = errors["hybrid"][1] < min(e[1] for n, e in errors.items() if n != "hybrid")
+    assert ("is number 2 of 2" in sentence) is not leads
     assert report.json_of(result)["sentence"] == sentence
 
 
