@@ -192,7 +192,7 @@ def _descended(setting, solution, highest):
         for i, unit in enumerate(np.eye(len(z))):
             ends = [np.clip(z + sign * SPAN * unit, 0.0, 1.0) for sign in (1.0, -1.0)]
             up, down = (np.log(_peak(setting, problem, end)) for end in ends)
-            if np.isfinite(up - down):
+            if np.isfinite(up) and np.isfinite(down):
                 rate[i] = (up - down) / (ends[0] - ends[1])[i]
         slope = rate * free
         norm = float(np.linalg.norm(slope))
