@@ -479,8 +479,13 @@ function fold() {
   trying.onmessage = ({ data: answer }) => {
     end();
     if (answer.kind !== "effects") return;
-    rows.forEach(({ row, home }, name) => (answer.without.includes(name) ? folded : home).append(row));
-    $("groups").append(folded);
+    const below = new Map(); // {place: the row that stands next in it}; a row that stays keeps its focus
+    for (const [name, { row, home }] of [...rows].reverse()) {
+      const place = answer.without.includes(name) ? folded : home;
+      if (row.parentNode !== place) place.insertBefore(row, below.get(place) ?? null);
+      below.set(place, row);
+    }
+    if (folded !== $("groups").lastElementChild) $("groups").append(folded);
     for (const group of $("groups").children) {
       const count = group.querySelectorAll(".row").length;
       group.querySelector("summary .unit").textContent = ` ${count}`;

@@ -608,6 +608,25 @@ def test_limits_and_verdict_follow_the_slider_of_a_rim(browser, one_tank):
         assert "≤ 2.5 cm" in row
 
 
+def test_a_number_being_typed_outlives_the_folding_of_others(browser, one_tank):
+    with opened(browser, one_tank) as live:
+        assert live("document.querySelector('#idle') === null")
+        box = live.page.locator('input[type=number][aria-label^="plant.rim[0]"]')
+        box.evaluate("node => (node.closest('details').open = true)")
+        box.focus()
+        box.evaluate("node => (node.value = '2.75')")  # typed, not entered
+        live.wait("document.querySelector('#idle')")
+        assert box.evaluate("node => [node === document.activeElement, node.value]") == [
+            True,
+            "2.75",
+        ]
+        names = "[...document.querySelectorAll('#groups > details:not(#idle) .row[data-leaf]')]"
+        shown = live(f"{names}.map((row) => row.dataset.leaf)")
+        order = live("jaxtank.names.filter((name) => name.startsWith('plant.'))")
+        plant = [name for name in shown if name.startswith("plant.")]
+        assert plant == [name for name in order if name in plant]
+
+
 def test_a_tank_is_drawn_as_high_as_its_rim(browser, written):
     with opened(browser, written) as live:
         set_all(live, {"plant.rim[0]": 5.0})
