@@ -215,7 +215,7 @@ def test_a_reference_governor_keeps_levels_within_limits_that_its_pid_passes():
     assert setpoint[-1] == pytest.approx(0.9, abs=1e-9)  # which the limits allow at last
 
 
-@pytest.mark.slow_for("flow-cascade")
+@pytest.mark.slow_for("flow-cascade", "override")
 @pytest.mark.parametrize("table", [CASCADE, FLOW, OVERRIDE, GOVERNOR], ids=kind)
 def test_derivatives_are_differences_of_runs_at_the_limits_too(table):
     case = loads(**table)

@@ -104,7 +104,12 @@ def openings(live):
     return {word.split()[0]: float(word.split()[1]) for word in words if word.endswith("%")}
 
 
-@pytest.mark.parametrize(("control", "by_hand"), [(LOOP, {"HV1"}), (BY_HAND, {"HV1", "FV2"})])
+@pytest.mark.slow_for("open loop")
+@pytest.mark.parametrize(
+    ("control", "by_hand"),
+    [(LOOP, {"HV1"}), (BY_HAND, {"HV1", "FV2"})],
+    ids=["closed loop", "open loop"],
+)
 def test_outlets_pipes_and_valves_of_a_custom_rig_are_dragged(browser, tmp_path, control, by_hand):
     """A valve that a controller moves shows its opening at the cursor and is no handle."""
     case = rig.loads(VALVES.replace("CONTROLLER", control))
