@@ -208,11 +208,15 @@ def legend():
 
     sides = ((False, False), (True, False), (False, True), (True, True))
     words = ("first gains", "tuned", "first gains, safety filter", "tuned, safety filter")
-    return [Line2D([], [], linestyle="none", **_point(*side)) for side in sides], words
+    points = [_point(*side) for side in sides] + [_point(True, False, "C3")]
+    lines = [Line2D([], [], linestyle="none", **point) for point in points]
+    return lines, (*words, "red: a limit is broken")
 
 
 def draw_errors(ax, result):
     """Draw the errors of all Rivals, a row for each controller."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     names = list(dict.fromkeys(rival.name for rival in result.rivals))
     rivals = [rival for rival in result.rivals if rival.error is not None]
     for rival in rivals:
@@ -223,6 +227,9 @@ def draw_errors(ax, result):
     values = [rival.error for rival in rivals]
     if values and max(values) > 10.0 * min(values):
         ax.set_xscale("log")
+        ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        ax.xaxis.set_minor_formatter(NullFormatter())
     else:
         ax.locator_params(axis="x", nbins=5)
     ax.set_xlabel(f"mean total rms error [{result.unit}]")
