@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from jaxtank.controllers.pid import PID
 from jaxtank.core.checks import check_order
@@ -177,6 +178,7 @@ class ReferenceGovernor(PID):
     def check_gains(self) -> None:
         PID.check_gains(self)
         check_order("controller", self, "low", "high")
+        self._check_period()
         limit, lowest = self.limit, self.lowest
         if not (isinstance(limit, np.ndarray) and isinstance(lowest, np.ndarray)):
             return  # traced
@@ -190,4 +192,17 @@ class ReferenceGovernor(PID):
         if not np.any(np.isfinite(np.concatenate([limit, lowest]))):
             raise InputError(
                 "controller.limit: no tank has a limit; give the largest level of at least one"
+            )
+
+    def _check_period(self) -> None:
+        """Raise InputError where a predicted sample is longer than an integral time."""
+        horizon, Ti = self.horizon, self.Ti
+        if Ti is None or any(isinstance(v, Tracer) for v in (horizon, Ti)):
+            return
+        period, least = float(horizon) / self.samples, float(np.min(np.asarray(Ti)))
+        if period > least:
+            raise InputError(
+                f"controller.samples = {self.samples}: a predicted sample, horizon/samples ="
+                f" {period:.4g} s, is longer than controller.Ti = {least:.4g} s: needs at least"
+                f" {int(np.ceil(float(horizon) / least))} samples"
             )

@@ -54,9 +54,9 @@ def sentence(result):
 TIE = 0.01  # controllers whose errors differ by less are as good as each other
 
 OUTCOMES = {  # {place of what a paper calls the best: words at published gains, and of all}
-    "first": ("holds at published gains", "survives tuning of its rivals"),
+    "first": ("holds at published gains", "holds once all are tuned"),
     "tie": ("is a tie at published gains", "is a tie once all are tuned"),
-    "behind": ("fails at published gains", "does not survive tuning of its rivals"),
+    "behind": ("fails at published gains", "fails once all are tuned"),
 }
 
 
@@ -96,10 +96,10 @@ def _margin(result):
     if other.violations > best.violations:
         return f"next: {_stands(other, result.unit)}"
     less = 100.0 * (1.0 - best.error / other.error)
-    words = f"that is {less:.2g} % less than the next, {_stands(other, result.unit)}"
+    words = f"that is {less:.2g} % less than the next controller, {_stands(other, result.unit)}"
     if not (best.travel and other.travel):
         return words
-    return f"{words}, with {best.travel / other.travel:.2g} times its changes of the inputs"
+    return f"{words}, at {best.travel / other.travel:.2g} times its total variation of the inputs"
 
 
 def _stands(rival, unit):
@@ -128,7 +128,7 @@ def _claim(result, name, section, names):
     published = [r for r in result.rivals if r.gains == "published" and not r.filtered]
     at_published, of_all = OUTCOMES[place(result.rivals, name)][1], ""
     if len({r.name for r in published}) > 1:
-        at_published, of_all = OUTCOMES[place(published, name)][0], f" and {at_published}"
+        at_published, of_all = OUTCOMES[place(published, name)][0], f", and {at_published}"
     yield f"the paper's claim that {name} is the best ({section}) {at_published}{of_all}"
     if name != result.best.name:
         stands = _stands(next(r for r in result.rivals if r.name == name), result.unit)
@@ -152,7 +152,8 @@ def report(result):
         filtered = "yes" if rival.filtered else "no"
         rows.append([rival.name, rival.gains, filtered, *outcome, *numbers])
     notes = [
-        "error: mean total rms error of the plants where every setpoint is reachable",
+        "error: mean total rms error of the plants where every setpoint is reachable; rows are"
+        " ordered by limits broken, then by it; tuning weighs the changes of the inputs too",
         "travel: rms change of the inputs per sample, as a share of their range",
         "total: total variation of all inputs over the run, mean of the same plants as the error",
         "Ms: largest sensitivity peak at the plateaus of the nominal plant",

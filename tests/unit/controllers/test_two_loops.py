@@ -14,6 +14,7 @@ import jaxtank
 from jaxtank import rig
 from jaxtank.bounds import gain_ranges
 from jaxtank.core.errors import InputError
+from tuning.problem.reported import own_limits, run_measures
 
 DT, SAMPLES, GRAVITY, DEAD = 0.5, 400, 9.81, 2
 UPPER, LOWER, ORIFICE, DRAIN, GAIN = 1.0, 0.5, 0.01, 0.01, 0.1
@@ -215,6 +216,21 @@ def test_a_reference_governor_keeps_levels_within_limits_that_its_pid_passes():
     assert setpoint[-1] == pytest.approx(0.9, abs=1e-9)  # which the limits allow at last
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, []),
+        ({"horizon": 4.0}, ["upper rises to"]),
+        ({"limit": [9.0, 2.0]}, ["setpoint 2.2 m of lower is beyond"]),
+    ],
+)
+def test_a_limit_of_the_controller_that_is_passed_or_in_the_way_is_named(changes, said):
+    case = loads(re.sub("inflow = .*", "", RIG), **(GOVERNOR | changes))
+    sentences = own_limits(case.loop, run_measures(case.loop, case.clock, None))
+    assert all(any(words in one for one in sentences) for words in said)
+    assert bool(sentences) == bool(said)
+
+
 @pytest.mark.slow_for("flow-cascade", "override")
 @pytest.mark.parametrize("table", [CASCADE, FLOW, OVERRIDE, GOVERNOR], ids=kind)
 def test_derivatives_are_differences_of_runs_at_the_limits_too(table):
@@ -315,6 +331,7 @@ def test_a_kind_is_written_back_and_has_ranges_to_tune_in(table):
         (OVERRIDE | {"limited": [1, 2]}, r"controller\.limited"),
         (GOVERNOR | {"limit": math.inf, "lowest": -math.inf}, "no tank has a limit"),
         (GOVERNOR | {"lowest": 2.5}, r"controller\.lowest"),
+        (GOVERNOR | {"samples": 1}, "needs at least 2 samples"),
         (GOVERNOR | {"feed_forward": True}, "feed_forward"),
         (RATIO | {"follow": [1]}, r"controller\.follow"),
         ({"kind": "p", "Kc": 1.0, "gap_gain": 0.5}, r"controller\.deadband"),

@@ -91,7 +91,7 @@ def test_the_sentence_says_whether_the_claim_of_the_paper_survives(errors, outco
     sentence = report.sentence(result)
     at_published, of_all = outcome
     words = [report.OUTCOMES[at_published][0]] if at_published else []
-    words = " and ".join([*words, report.OUTCOMES[of_all][1]])
+    words = ", and ".join([*words, report.OUTCOMES[of_all][1]])
     assert f"hybrid is the best (sec. 6) {words}" in sentence
     assert margin in sentence and ("in a tie" in sentence) == (of_all == "tie")
     leads = errors["hybrid"][1] < min(e[1] for n, e in errors.items() if n != "hybrid")

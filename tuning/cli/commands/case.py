@@ -93,6 +93,7 @@ def simulate(args):
     line.end()
     phase.show("checking the run")
     sentences += reported.chatter(case.loop, case.clock, measures)
+    sentences += reported.own_limits(case.loop, measures)
     for sentence in [*sentences, *_notes_on_run(case, measures, key)]:
         note(args, sentence)
     plateaus = stability_margins(case.loop, case.clock) if args.margins else None
